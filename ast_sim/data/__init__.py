@@ -1,0 +1,1 @@
+"""Scenes, trajectories, dataset files, graphs and the pairs that a model is trained on."""

@@ -1,0 +1,1 @@
+"""Export, reports and pictures. Nothing here imports torch."""
