@@ -1,1 +1,1 @@
-"""Scenes, trajectories, dataset files, graphs and the pairs that a model is trained on."""
+"""Scenes, trajectories, the dataset file and its sampling; `scene`, `file` and `convert` need no torch."""
