@@ -1,0 +1,164 @@
+"""Trajectories as files that ParaView opens: a PVD series of VTU files, or one temporal VTKHDF file."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import h5py
+import meshio
+import numpy as np
+
+from ast_sim.data.scene import Trajectory
+from ast_sim.errors import AstSimError
+from ast_sim.view.fields import Fields, fields
+
+VTK_TRIANGLE, VTK_TETRA = 5, 10
+CELL_NAME = {3: "triangle", 4: "tetra"}
+
+
+def write(
+    path: str | os.PathLike[str],
+    trajectory: Trajectory,
+    prediction: Trajectory | None = None,
+    time_step: float = 1.0,
+) -> None:
+    """Write a trajectory, or with `prediction` the predicted one and its errors against it, for ParaView.
+
+    The suffix chooses the format: `.pvd` is a collection beside a folder of the same name that holds one binary VTU
+    file a frame; `.vtkhdf` is one file (VTKHDF 2.0, temporal UnstructuredGrid, the mesh stored once). Frame i stands
+    at the time i * time_step.
+
+    Point fields: displacement [m, from rest], node_type, body; von_mises [Pa] at nodes or cells, wherever the stress
+    lives. With a prediction the geometry is the predicted one, and there are error (vector), error_magnitude and
+    von_mises_error, all prediction minus truth; frames beyond the end of a shorter prediction are left out.
+
+    Nothing half-written is ever left under the final name.
+
+    Raises:
+        AstSimError: the suffix is not supported, the prediction is of another scene, or the file cannot be written.
+    """
+    path = Path(path)
+    writers = {".pvd": _write_pvd, ".vtkhdf": _write_vtkhdf}
+    if path.suffix not in writers:
+        raise AstSimError(f"{path}: cannot export to {path.suffix or 'no suffix'!r}; use {' or '.join(writers)}")
+    shown = fields(trajectory, prediction)
+    try:
+        writers[path.suffix](path, trajectory.scene.elements, shown, time_step)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise AstSimError(f"{path} cannot be written: {reason}; nothing was left there") from error
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary name in the folder of `path`, which takes its place at the end and is removed on an error."""
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    try:
+        yield temporary
+        with open(temporary, "rb") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _write_pvd(path: Path, elements: np.ndarray, shown: Fields, time_step: float) -> None:
+    folder = path.with_suffix("")
+    names = [f"frame_{frame:05d}.vtu" for frame in range(len(shown.position))]
+    with _replacing_folder(folder) as temporary:
+        for frame, name in enumerate(names):
+            _write_vtu(temporary / name, elements, shown, frame)
+    lines = [
+        f'    <DataSet timestep="{frame * time_step!r}" part="0" file="{_escape(folder.name)}/{name}"/>'
+        for frame, name in enumerate(names)
+    ]
+    head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">\n  <Collection>'
+    with replacing(path) as temporary:
+        temporary.write_text("\n".join([head, *lines, "  </Collection>", "</VTKFile>", ""]), encoding="utf-8")
+
+
+def _write_vtu(path: Path, elements: np.ndarray, shown: Fields, frame: int) -> None:
+    mesh = meshio.Mesh(
+        shown.position[frame],
+        [(CELL_NAME[elements.shape[1]], elements)],
+        point_data={**{name: values[frame] for name, values in shown.point.items()}, **shown.static},
+        cell_data={name: [values[frame]] for name, values in shown.cell.items()},
+    )
+    meshio.write(path, mesh, file_format="vtu", binary=True)
+
+
+@contextlib.contextmanager
+def _replacing_folder(folder: Path) -> Iterator[Path]:
+    """A temporary folder that takes the place of `folder`, which must be absent or hold an earlier series."""
+    if folder.exists() and not (folder.is_dir() and all(f.match("frame_*.vtu") for f in folder.iterdir())):
+        raise AstSimError(f"{folder} is in the way of the VTU files: it holds other files; choose another name")
+    token = secrets.token_hex(4)
+    temporary, old = (folder.with_name(f".{folder.name}.{kind}.{token}") for kind in ("new", "old"))
+    try:
+        temporary.mkdir()
+        yield temporary
+        if folder.exists():
+            folder.rename(old)
+        temporary.rename(folder)
+    except BaseException:
+        if old.exists() and not folder.exists():
+            old.rename(folder)
+        raise
+    finally:
+        for leftover in (temporary, old):
+            shutil.rmtree(leftover, ignore_errors=True)
+
+
+def _write_vtkhdf(path: Path, elements: np.ndarray, shown: Fields, time_step: float) -> None:
+    with replacing(path) as temporary, h5py.File(temporary, "w") as file:
+        root = file.create_group("VTKHDF")
+        root.attrs["Version"] = np.array([2, 0], dtype=np.int64)
+        root.attrs.create("Type", b"UnstructuredGrid", dtype=h5py.string_dtype("ascii", len("UnstructuredGrid")))
+        _write_mesh(root, elements, shown.position)
+        _write_steps(root, shown, time_step)
+
+
+def _write_mesh(root: h5py.Group, elements: np.ndarray, position: np.ndarray) -> None:
+    """The one part of the mesh, whose connectivity serves every time step, and the points of all steps in a row."""
+    frames, nodes = position.shape[:2]
+    count, corners = elements.shape
+    root["NumberOfPoints"] = np.array([nodes], dtype=np.int64)
+    root["NumberOfCells"] = np.array([count], dtype=np.int64)
+    root["NumberOfConnectivityIds"] = np.array([elements.size], dtype=np.int64)
+    root["Connectivity"] = elements.astype(np.int64).reshape(-1)
+    root["Offsets"] = np.arange(count + 1, dtype=np.int64) * corners
+    root["Types"] = np.full(count, {3: VTK_TRIANGLE, 4: VTK_TETRA}[corners], dtype=np.uint8)
+    root.create_dataset("Points", data=position.reshape(frames * nodes, 3), chunks=(nodes, 3), compression="gzip")
+
+
+def _write_steps(root: h5py.Group, shown: Fields, time_step: float) -> None:
+    """The times, and for every step where its points and fields start in the arrays that hold all steps in a row."""
+    frames, nodes = shown.position.shape[:2]
+    start, zero = np.arange(frames, dtype=np.int64), np.zeros(frames, dtype=np.int64)
+    steps = root.create_group("Steps")
+    steps.attrs["NSteps"] = np.int64(frames)
+    steps["Values"] = np.arange(frames) * float(time_step)
+    steps["NumberOfParts"] = zero + 1
+    steps["PartOffsets"] = zero
+    steps["PointOffsets"] = start * nodes
+    steps["CellOffsets"] = zero[:, None]
+    steps["ConnectivityIdOffsets"] = zero[:, None]
+    for group, moving in (("PointData", shown.point), ("CellData", shown.cell)):
+        data, offsets = root.create_group(group), steps.create_group(f"{group}Offsets")
+        for name, values in moving.items():
+            rows = values.shape[1]
+            flat = values.reshape(frames * rows, *values.shape[2:])
+            data.create_dataset(name, data=flat, chunks=(rows, *flat.shape[1:]), compression="gzip")
+            offsets[name] = start * rows
+    for name, values in shown.static.items():
+        root["PointData"][name] = values
+        steps["PointDataOffsets"][name] = zero
+
+
+def _escape(text: str) -> str:
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")

@@ -1,0 +1,114 @@
+"""What a trajectory, and the prediction of it, show: displacement, von Mises stress and the errors of both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ast_sim.data.scene import LOCAL_FACES, NodeType, Scene, Trajectory
+from ast_sim.errors import AstSimError
+
+
+@dataclass(frozen=True, eq=False)
+class Fields:
+    """The fields of S frames over a scene of N nodes and E elements.
+
+    Attributes:
+        position: [S, N, 3], where the nodes are drawn.
+        static: name -> [N], constant in time.
+        point: name -> [S, N] or [S, N, 3].
+        cell: name -> [S, E].
+    """
+
+    position: np.ndarray
+    static: dict[str, np.ndarray]
+    point: dict[str, np.ndarray]
+    cell: dict[str, np.ndarray]
+
+
+def fields(truth: Trajectory, prediction: Trajectory | None = None) -> Fields:
+    """The fields of a trajectory or, with a prediction of it, those of the prediction and its errors.
+
+    Displacements are taken from the rest positions, errors are prediction minus truth. A prediction that is shorter
+    than the truth gives as many frames as it has.
+    """
+    shown = truth if prediction is None else prediction
+    if prediction is not None:
+        require_same_scene(truth, prediction)
+    frames = min(truth.num_frames, shown.num_frames)
+    position = shown.position[:frames]
+    point = {"displacement": position - truth.scene.rest_position}
+    cell: dict[str, np.ndarray] = {}
+    if prediction is not None:
+        point["error"] = position - truth.position[:frames]
+        point["error_magnitude"] = np.linalg.norm(point["error"], axis=2)
+    if shown.stress is not None:
+        place = point if stress_at(shown) == "node" else cell
+        place["von_mises"] = shown.stress[:frames, :, 0]
+        if prediction is not None and truth.stress is not None and truth.stress.shape[1] == shown.stress.shape[1]:
+            place["von_mises_error"] = place["von_mises"] - truth.stress[:frames, :, 0]
+    static = {"node_type": truth.scene.node_type, "body": truth.scene.body}
+    return Fields(position, static, point, cell)
+
+
+def require_same_scene(truth: Trajectory, prediction: Trajectory) -> None:
+    """Raise AstSimError unless both have the same numbers of nodes and elements."""
+    sizes = [(t.scene.num_nodes, t.scene.num_elements) for t in (truth, prediction)]
+    if sizes[0] != sizes[1]:
+        (n, e), (n_found, e_found) = sizes
+        raise AstSimError(
+            f"the prediction has {n_found} nodes and {e_found} elements, but the truth has {n} and {e}: "
+            "give the prediction of this very scene"
+        )
+
+
+def stress_at(trajectory: Trajectory) -> str:
+    """Where the stress lives: "none", "node" or "element" ("node" where the numbers of both are equal)."""
+    if trajectory.stress is None:
+        return "none"
+    return "node" if trajectory.stress.shape[1] == trajectory.scene.num_nodes else "element"
+
+
+def is_planar(scene: Scene) -> bool:
+    """Whether the scene is two-dimensional: triangles that all lie at z = 0."""
+    return scene.elements.shape[1] == 3 and not scene.rest_position[:, 2].any()
+
+
+def surface_owners(scene: Scene, surface: np.ndarray) -> np.ndarray:
+    """[F] int64: the element that each triangle of `Scene.surface()` [F, 3] belongs to."""
+    if scene.elements.shape[1] == 3:
+        return np.arange(len(surface))
+    faces = scene.elements[:, np.array(LOCAL_FACES)].reshape(-1, 3)
+    both = np.sort(np.concatenate([faces, surface]), axis=1)
+    _, first, same = np.unique(both, axis=0, return_index=True, return_inverse=True)
+    return first[same.reshape(-1)[len(faces) :]] // len(LOCAL_FACES)
+
+
+def displacement_rmse(truth: Trajectory, position: np.ndarray) -> np.ndarray:
+    """[S] float64: per frame, the root mean square over NORMAL nodes and coordinates of `position` [S, N, 3] - truth.
+
+    A scene without NORMAL nodes gives zeros.
+    """
+    normal = truth.scene.node_type == NodeType.NORMAL
+    difference = position[:, normal].astype(np.float64) - truth.position[: len(position), normal]
+    return _root_mean_square(difference)
+
+
+def stress_rmse(truth: Trajectory, stress: np.ndarray) -> np.ndarray:
+    """[S] float64: per frame, the root mean square of `stress` [S, N or E, 1] - truth, outside the obstacles."""
+    inside = deforming_rows(truth)
+    return _root_mean_square(stress[:, inside].astype(np.float64) - truth.stress[: len(stress), inside])
+
+
+def deforming_rows(trajectory: Trajectory) -> np.ndarray:
+    """The stress rows (bool [N] or [E]) that do not belong to an obstacle; an element does if all its nodes do."""
+    obstacle = trajectory.scene.node_type == NodeType.OBSTACLE
+    if stress_at(trajectory) == "element":
+        obstacle = obstacle[trajectory.scene.elements].all(axis=1)
+    return ~obstacle
+
+
+def _root_mean_square(difference: np.ndarray) -> np.ndarray:
+    values = difference.reshape(len(difference), -1)
+    return np.sqrt((values**2).sum(axis=1) / max(values.shape[1], 1))

@@ -1,0 +1,139 @@
+"""ParaView's own readers (through pyvista) read back what was written, number for number."""
+
+from __future__ import annotations
+
+import errno
+
+import meshio
+import numpy as np
+import pytest
+import pyvista
+from view_scenes import plate, strip
+from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
+
+from ast_sim.data.scene import Trajectory
+from ast_sim.errors import AstSimError
+from ast_sim.view import export
+
+CELL_TYPE = {3: pyvista.CellType.TRIANGLE, 4: pyvista.CellType.TETRA}
+
+
+def read(path):
+    """The times and the meshes of a series, with VTK's own readers, which are those of ParaView."""
+    reader = pyvista.get_reader(path)
+    meshes = []
+    if path.suffix == ".pvd":
+        for index in range(len(reader.time_values)):
+            reader.set_active_time_point(index)
+            meshes.append(reader.read()[0])
+        return list(reader.time_values), meshes
+    reader = reader.reader
+    reader.UpdateInformation()
+    # VTK announces no times for a file of one step.
+    times = reader.GetOutputInformation(0).Get(vtkStreamingDemandDrivenPipeline.TIME_STEPS()) or (0.0,)
+    for time in times:
+        reader.UpdateTimeStep(time)
+        meshes.append(pyvista.wrap(reader.GetOutputDataObject(0)).copy())
+    return list(times), meshes
+
+
+def same(found, expected):
+    """Equal in value and in precision."""
+    assert found.dtype == expected.dtype
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("suffix", [".pvd", ".vtkhdf"])
+@pytest.mark.parametrize("truth", [plate(5), plate(3, stress="element"), plate(2, stress="none"), strip(4), plate(1)])
+def test_trajectory_reads_back(tmp_path, suffix, truth):
+    path = tmp_path / f"plate & <ball>{suffix}"
+    export.write(path, truth, time_step=0.1)
+    times, meshes = read(path)
+    assert times == [i * 0.1 for i in range(truth.num_frames)]
+    scene, at_nodes = truth.scene, truth.stress is not None and truth.stress.shape[1] == truth.scene.num_nodes
+    for frame, mesh in enumerate(meshes):
+        same(mesh.points, truth.position[frame])
+        k = scene.elements.shape[1]
+        assert (mesh.celltypes == CELL_TYPE[k]).all()
+        np.testing.assert_array_equal(mesh.cells.reshape(-1, k + 1)[:, 1:], scene.elements)
+        same(mesh.point_data["displacement"], truth.position[frame] - scene.rest_position)
+        same(mesh.point_data["node_type"], scene.node_type)
+        same(mesh.point_data["body"], scene.body)
+        if truth.stress is None:
+            assert "von_mises" not in mesh.point_data and "von_mises" not in mesh.cell_data
+        else:
+            same((mesh.point_data if at_nodes else mesh.cell_data)["von_mises"], truth.stress[frame, :, 0])
+
+
+@pytest.mark.parametrize("suffix", [".pvd", ".vtkhdf"])
+@pytest.mark.parametrize("stress", ["node", "element"])
+def test_prediction_carries_its_errors(tmp_path, suffix, stress):
+    truth, prediction = plate(5, stress=stress), plate(5, stress=stress, seed=1)
+    short = Trajectory(truth.scene, prediction.position[:3], prediction.stress[:3], {"status": "truncated"})
+    path = tmp_path / f"prediction{suffix}"
+    export.write(path, truth, short)
+    times, meshes = read(path)
+    assert times == [0.0, 1.0, 2.0]
+    for frame, mesh in enumerate(meshes):
+        error = prediction.position[frame] - truth.position[frame]
+        same(mesh.points, prediction.position[frame])
+        same(mesh.point_data["error"], error)
+        np.testing.assert_allclose(mesh.point_data["error_magnitude"], np.sqrt((error**2).sum(1)), rtol=1e-6)
+        data = mesh.point_data if stress == "node" else mesh.cell_data
+        same(data["von_mises"], prediction.stress[frame, :, 0])
+        same(data["von_mises_error"], prediction.stress[frame, :, 0] - truth.stress[frame, :, 0])
+    assert np.abs(meshes[2].point_data["error"]).max() > 1e-3
+
+
+@pytest.mark.parametrize("suffix", [".pvd", ".vtkhdf"])
+def test_a_second_export_replaces_the_first(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    export.write(path, plate(4))
+    export.write(path, strip(2))
+    times, meshes = read(path)
+    assert times == [0.0, 1.0]
+    assert meshes[0].n_points == strip().scene.num_nodes
+    expected = {"a.pvd", "a", "a/frame_00000.vtu", "a/frame_00001.vtu"} if suffix == ".pvd" else {"a.vtkhdf"}
+    assert {str(f.relative_to(tmp_path)) for f in tmp_path.rglob("*")} == expected
+
+
+@pytest.mark.parametrize("suffix", [".pvd", ".vtkhdf"])
+def test_a_failed_export_leaves_the_former_one(tmp_path, monkeypatch, suffix):
+    path = tmp_path / f"a{suffix}"
+    export.write(path, strip(3))
+    before = {f: f.read_bytes() for f in tmp_path.rglob("*") if f.is_file()}
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(export, "_write_vtu" if suffix == ".pvd" else "_write_steps", full)
+    with pytest.raises(AstSimError, match=r"a\.\w+ cannot be written: No space left on device"):
+        export.write(path, plate(5))
+    assert {f: f.read_bytes() for f in tmp_path.rglob("*") if f.is_file()} == before
+
+
+def test_other_files_in_the_folder_are_not_touched(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "thesis.tex").write_text("mine")
+    with pytest.raises(AstSimError, match="in the way"):
+        export.write(tmp_path / "a.pvd", strip())
+    assert (tmp_path / "a" / "thesis.tex").read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["a.stl", "a", "a.PVD"])
+def test_unknown_suffix_names_the_supported_ones(tmp_path, name):
+    with pytest.raises(AstSimError, match=r"\.pvd or \.vtkhdf"):
+        export.write(tmp_path / name, strip())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_prediction_of_another_scene_is_refused(tmp_path):
+    with pytest.raises(AstSimError, match="59 nodes and 82 elements"):
+        export.write(tmp_path / "a.pvd", plate(2), strip(2))
+
+
+def test_vtu_files_stand_alone(tmp_path):
+    truth = plate(2)
+    export.write(tmp_path / "a.pvd", truth)
+    mesh = meshio.read(tmp_path / "a" / "frame_00001.vtu")
+    same(mesh.points, truth.position[1])
