@@ -147,6 +147,7 @@ class Dataset:
             raise
         self._scenes: dict[tuple[str, int], Scene] = {}
         self._frames: dict[tuple[str, int], tuple[np.ndarray, np.ndarray | None]] = {}
+        self._lengths: dict[tuple[str, int], int] = {}
         self._kept: dict[str, bool] = {}  # whether the split is small enough to be kept in memory
         self._kind: tuple[int, int] | None = None
 
@@ -198,7 +199,10 @@ class Dataset:
 
     def num_frames(self, split: str, index: int) -> int:
         """The number of frames of a trajectory."""
-        return self._shape(split, index, "position")[0]
+        key = (split, index)
+        if key not in self._lengths:
+            self._lengths[key] = self._shape(split, index, "position")[0]
+        return self._lengths[key]
 
     def frames(self, split: str, index: int, start: int, stop: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Frames start to stop - 1: position [stop - start, N, 3] and stress [stop - start, N or E, 1] or None."""

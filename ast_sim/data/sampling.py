@@ -1,0 +1,133 @@
+"""The pairs of frames that a model is trained on, as a pure function of a seed and a step number."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ast_sim.data.batch import Batch, Target
+from ast_sim.data.file import Dataset
+from ast_sim.data.graph import Graph
+from ast_sim.errors import DatasetError
+
+# Separate the random numbers of the order from those of the noise.
+_ORDER, _NOISE = 0, 1
+
+
+@dataclass(frozen=True, eq=False)
+class _Member:
+    """A trajectory: what its pairs share.
+
+    noisy: [N, 3] float32, 1 where noise acts (NORMAL nodes; not z in a plane scene), else 0.
+    """
+
+    graph: Graph
+    noisy: np.ndarray
+    prescribed: np.ndarray
+
+
+class PairSampler:
+    """Draws batches of frame pairs (t, t + 1) of a split; each epoch is a new random order of all pairs.
+
+    White Gaussian noise n of standard deviation `noise` (in units of length) is added to p_t of the NORMAL nodes. It
+    depends on seed, epoch and pair alone, not on the batch that the pair is in. The target's next position is
+    p_{t+1} + (1 - gamma) n (MeshGraphNets, add_noise), so that
+
+        increment     p_{t+1} - p_t - gamma n
+        acceleration  p_{t+1} - 2 p_t + p_{t-1} - (1 + gamma) n
+
+    and gamma = 1 leads back to the true next position. Scenes whose z is 0 throughout get no noise in z.
+
+    Raises:
+        DatasetError: the split has no pair, or a sample cannot be read.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        split: str,
+        *,
+        batch_size: int,
+        seed: int,
+        noise: float,
+        element_nodes: bool,
+        dynamic: bool,
+        gamma: float,
+    ) -> None:
+        self._dataset, self._split, self._batch_size, self._seed = dataset, split, batch_size, seed
+        self._noise, self._element_nodes, self._dynamic, self._gamma = noise, element_nodes, dynamic, gamma
+        self._first = 1 if dynamic else 0  # the acceleration needs a frame before t
+        frames = np.array([dataset.num_frames(split, i) for i in range(dataset.count(split))], np.int64)
+        self._starts = np.concatenate([[0], np.cumsum(np.maximum(frames - 1 - self._first, 0))])
+        if self.num_pairs == 0:
+            raise DatasetError(
+                f"{dataset.path}: {split} has no trajectory of at least {2 + self._first} frames to draw pairs from"
+            )
+        self._members: dict[int, _Member] = {}
+        self._order = lru_cache(maxsize=2)(self._draw_order)
+
+    @property
+    def num_pairs(self) -> int:
+        """The number of pairs in an epoch."""
+        return int(self._starts[-1])
+
+    def batch(self, step: int) -> tuple[Batch, Target]:
+        """The batch of a step: places step * batch_size onward in the endless sequence of epochs."""
+        first = step * self._batch_size
+        draws = [divmod(place, self.num_pairs) for place in range(first, first + self._batch_size)]
+        return self._assemble([(epoch, int(self._order(epoch)[place])) for epoch, place in draws])
+
+    def _draw_order(self, epoch: int) -> np.ndarray:
+        return np.random.default_rng([self._seed, _ORDER, epoch]).permutation(self.num_pairs)
+
+    def _assemble(self, pairs: list[tuple[int, int]]) -> tuple[Batch, Target]:
+        """The batch of the pairs (epoch, number)."""
+        members, names, positions, previous, boundary, motions = [], [], [], [], [], []
+        stresses, next_stresses = [], []
+        for epoch, pair in pairs:
+            index = int(np.searchsorted(self._starts, pair, side="right")) - 1
+            t = pair - int(self._starts[index]) + self._first
+            member = self._member(index)
+            position, stress = self._dataset.frames(self._split, index, t - self._first, t + 2)
+            before, now, after = position[0], position[-2], position[-1]
+            increment = after - now
+            noise = self._draw_noise(epoch, pair, member)
+            members.append(member)
+            names.append(f"{self._split}/{index:06d} frame {t}")
+            positions.append(now + noise)
+            boundary.append(np.where(member.prescribed, increment, np.float32(0)))
+            if self._dynamic:
+                previous.append(before)
+                motions.append(increment - (now - before) - np.float32(1 + self._gamma) * noise)
+            else:
+                motions.append(increment - np.float32(self._gamma) * noise)
+            if stress is not None:
+                stresses.append(stress[-2])
+                next_stresses.append(stress[-1])
+        graph = Graph.concatenate([member.graph for member in members])
+        batch = Batch(graph, _join(positions), _join(previous), _join(boundary), _join(stresses), names)
+        return batch, Target(_join(motions), _join(next_stresses))
+
+    def _draw_noise(self, epoch: int, pair: int, member: _Member) -> np.ndarray:
+        generator = np.random.default_rng([self._seed, _NOISE, epoch, pair])
+        noise = generator.standard_normal(member.noisy.shape, np.float32)
+        return noise * (np.float32(self._noise) * member.noisy)
+
+    def _member(self, index: int) -> _Member:
+        if index not in self._members:
+            scene = self._dataset.scene(self._split, index)
+            position, _ = self._dataset.frames(self._split, index, 0, self._dataset.num_frames(self._split, index))
+            noisy = np.repeat(~scene.prescribed[:, None], 3, axis=1).astype(np.float32)
+            if not scene.rest_position[:, 2].any() and not position[:, :, 2].any():
+                noisy[:, 2] = 0
+            graph = Graph.from_scene(scene, self._element_nodes)
+            self._members[index] = _Member(graph, noisy, scene.prescribed[:, None])
+        return self._members[index]
+
+
+def _join(arrays: list[np.ndarray]) -> Tensor | None:
+    return torch.from_numpy(np.concatenate(arrays)) if arrays else None
