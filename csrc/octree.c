@@ -1,0 +1,341 @@
+/* Linear octrees: the cells of points by Morton key.
+ *
+ * The Morton key of cell (x, y, z) interleaves the bits, x first: ... x1 y1 z1 x0 y0 z0. A shift by 3 is the parent's key, and the
+ * cells of any aligned cube of 2^m cells a side are a contiguous run of the sorted keys.
+ *
+ * Work is cut into fixed chunks of the flat arrays, whatever the scenes, and every result is an integer that does not depend on the
+ * chunks. Scratch: slots 1 and 2 of the calling thread hold the keys being sorted and the other half of the sort, then the counts of
+ * the chunks; slot 3 of each thread holds the histograms of its sort.
+ */
+#include <math.h>
+
+#include "ast.h"
+#include "simd.h"
+
+enum { OCTREE_CHUNK = 1 << 13, OCTREE_TILE = 64 };
+
+static int64_t octree_chunks(int64_t n) { return (n + OCTREE_CHUNK - 1) / OCTREE_CHUNK; }
+
+/* The scene of row i: the last b with offsets[b] <= i. */
+static int64_t octree_scene_of(const int64_t *offsets, int64_t B, int64_t i) {
+  int64_t low = 0, high = B;
+  while (high - low > 1) {
+    const int64_t middle = (low + high) / 2;
+    if (offsets[middle] <= i) low = middle;
+    else high = middle;
+  }
+  return low;
+}
+
+/* The number of bits of n. */
+static int octree_bits(uint64_t n) {
+  int bits = 0;
+  for (; n; n >>= 1) bits++;
+  return bits;
+}
+
+/* ---- Morton keys ---- */
+
+/* Bit i of x < 2^21 goes to bit 3i. */
+AST_INLINE uint64_t octree_spread(uint64_t x) {
+  x = (x | x << 32) & 0x001f00000000ffff;
+  x = (x | x << 16) & 0x001f0000ff0000ff;
+  x = (x | x << 8) & 0x100f00f00f00f00f;
+  x = (x | x << 4) & 0x10c30c30c30c30c3;
+  return (x | x << 2) & 0x1249249249249249;
+}
+
+/* The inverse: bit 3i goes to bit i. */
+AST_INLINE uint64_t octree_gather(uint64_t x) {
+  x &= 0x1249249249249249;
+  x = (x | x >> 2) & 0x10c30c30c30c30c3;
+  x = (x | x >> 4) & 0x100f00f00f00f00f;
+  x = (x | x >> 8) & 0x001f0000ff0000ff;
+  x = (x | x >> 16) & 0x001f00000000ffff;
+  return (x | x >> 32) & 0x1fffff;
+}
+
+typedef struct {
+  const float *positions;
+  int64_t N;
+  const double *center;
+  double half_width;
+  int depth;
+  uint64_t *keys;
+} octree_key_job;
+
+/* u = (p - center + half_width) / (2 half_width), which is in [0, 1] inside the cube. */
+static ast_status octree_check_node(const octree_key_job *s, int64_t n) {
+  ast_status status = AST_OK;
+  for (int a = 0; a < 3; a++) {
+    const float p = s->positions[3 * n + a];
+    const double u = (p - s->center[a] + s->half_width) / (2 * s->half_width);
+    if (!isfinite(p)) return AST_NOT_FINITE;
+    if (!(u >= -1e-6 && u <= 1 + 1e-6)) status = AST_OUTSIDE;
+  }
+  return status;
+}
+
+/* min(floor(u 2^depth), 2^depth - 1) = floor(min(u 2^depth, 2^depth - 1)), and truncation is floor above 0: so the clamp comes
+ * first, in double, and no value overflows the conversion, not even NaN. */
+static ast_status octree_key_task(int64_t index, void *context) {
+  const octree_key_job *s = context;
+  const int64_t end = min64(s->N, (index + 1) * OCTREE_CHUNK);
+  const double cells = (double)(1 << s->depth), last = cells - 1, h = s->half_width, width = 2 * h;
+  double center[3 * OCTREE_TILE];
+  int32_t cell[3 * OCTREE_TILE];
+  uint64_t x[OCTREE_TILE], y[OCTREE_TILE], z[OCTREE_TILE];
+  double inside = 1;
+  for (int i = 0; i < 3 * OCTREE_TILE; i++) center[i] = s->center[i % 3];
+  for (int64_t begin = index * OCTREE_CHUNK; begin < end; begin += OCTREE_TILE) {
+    const int num = (int)min64(OCTREE_TILE, end - begin);
+    const float *p = s->positions + 3 * begin;
+    for (int i = 0; i < 3 * num; i++) {
+      const double u = (p[i] - center[i] + h) / width;
+      inside = (u >= -1e-6) & (u <= 1 + 1e-6) ? inside : 0;
+      double v = u * cells;
+      v = v < last ? v : last;
+      v = v > 0 ? v : 0;
+      cell[i] = (int32_t)v;
+    }
+    for (int i = 0; i < num; i++) {
+      x[i] = (uint64_t)cell[3 * i];
+      y[i] = (uint64_t)cell[3 * i + 1];
+      z[i] = (uint64_t)cell[3 * i + 2];
+    }
+    uint64_t *key = s->keys + begin;
+    for (int i = 0; i < num; i++) key[i] = octree_spread(x[i]) << 2 | octree_spread(y[i]) << 1 | octree_spread(z[i]);
+  }
+  return inside == 1 ? AST_OK : AST_OUTSIDE;
+}
+
+typedef struct {
+  const int64_t *keys;
+  int64_t C;
+  int32_t *coordinates;
+} octree_coordinates_job;
+
+static ast_status octree_coordinates_task(int64_t index, void *context) {
+  const octree_coordinates_job *s = context;
+  for (int64_t c = index * OCTREE_CHUNK; c < min64(s->C, (index + 1) * OCTREE_CHUNK); c++) {
+    const uint64_t key = (uint64_t)s->keys[c];
+    for (int a = 0; a < 3; a++) s->coordinates[3 * c + a] = (int32_t)octree_gather(key >> (2 - a));
+  }
+  return AST_OK;
+}
+
+static ast_status octree_coordinates(const int64_t *restrict keys, int64_t C, int32_t *restrict coordinates) {
+  octree_coordinates_job job = {keys, C, coordinates};
+  return ast_parallel(octree_chunks(C), octree_coordinates_task, &job);
+}
+
+/* ---- sort ---- */
+
+/* Rows to sort by key, stably: one word key << index_bits | index where that fits in 64 bits, else a key and an index. */
+typedef struct {
+  const int64_t *offsets;
+  int64_t N;
+  int index_bits; /* of the row within its scene; 0: not packed */
+  bool packed;
+  uint64_t *keys, *other; /* [N], or [2N] if not packed: the indices follow */
+} octree_sort_job;
+
+enum { OCTREE_MAX_DIGIT = 11, OCTREE_HISTOGRAM = 6 << OCTREE_MAX_DIGIT }; /* 63 bits in 6 digits of 11, or 8 of 8 */
+
+/* One pass of the LSD radix sort, by the digit (key >> shift) & mask; count[d] is where digit d starts. */
+AST_INLINE void octree_scatter(const uint64_t *keys, const uint64_t *nodes, uint64_t *keys_out, uint64_t *nodes_out, int64_t n, int shift,
+                               uint64_t mask, int64_t *count, const bool packed) {
+  for (int64_t i = 0; i < n; i++) {
+    const int64_t to = count[keys[i] >> shift & mask]++;
+    keys_out[to] = keys[i];
+    if (!packed) nodes_out[to] = nodes[i];
+  }
+}
+
+/* Sorts n rows by the bits low..high-1 of their keys, the only ones that differ. The result is in `keys` (and `nodes`). */
+AST_INLINE ast_status octree_radix_sort(uint64_t *keys, uint64_t *nodes, uint64_t *keys_other, uint64_t *nodes_other, int64_t n, int low,
+                                        int high, const bool packed) {
+  const int max_digit = n < 1 << 12 ? 8 : n < 1 << 20 ? OCTREE_MAX_DIGIT : 9;
+  const int passes = (high - low + max_digit - 1) / max_digit;
+  if (!passes) return AST_OK;
+  const int digit = (high - low + passes - 1) / passes;
+  const uint64_t mask = (1ull << digit) - 1;
+  int64_t *count = ast_scratch(3, OCTREE_HISTOGRAM * (int64_t)sizeof *count);
+  if (!count) return AST_NO_MEMORY;
+  memset(count, 0, sizeof *count * (size_t)passes << digit);
+  for (int64_t i = 0; i < n; i++)
+    for (int pass = 0; pass < passes; pass++) count[(uint64_t)pass << digit | (keys[i] >> (low + pass * digit) & mask)]++;
+  const uint64_t *const home = keys;
+  for (int pass = 0; pass < passes; pass++) {
+    const int shift = low + pass * digit;
+    int64_t *from = count + ((int64_t)pass << digit), total = 0;
+    if (from[keys[0] >> shift & mask] == n) continue;
+    for (uint64_t d = 0; d <= mask; d++) {
+      const int64_t rows = from[d];
+      from[d] = total;
+      total += rows;
+    }
+    octree_scatter(keys, nodes, keys_other, nodes_other, n, shift, mask, from, packed);
+    uint64_t *swap = keys;
+    keys = keys_other;
+    keys_other = swap;
+    swap = nodes;
+    nodes = nodes_other;
+    nodes_other = swap;
+  }
+  if (keys != home) {
+    memcpy(keys_other, keys, sizeof *keys * (size_t)n);
+    if (!packed) memcpy(nodes_other, nodes, sizeof *nodes * (size_t)n);
+  }
+  return AST_OK;
+}
+
+static ast_status octree_sort_task(int64_t b, void *context) {
+  const octree_sort_job *s = context;
+  const int64_t begin = s->offsets[b], n = s->offsets[b + 1] - begin;
+  if (n == 0) return AST_OK;
+  uint64_t *keys = s->keys + begin, *other = s->other + begin, differ = 0;
+  for (int64_t i = 0; i < n; i++) differ |= keys[i] ^ keys[0];
+  int low = 0;
+  while (differ && !(differ >> low & 1)) low++;
+  const int high = octree_bits(differ);
+  if (s->packed) {
+    for (int64_t i = 0; i < n; i++) keys[i] = keys[i] << s->index_bits | (uint64_t)i;
+    return octree_radix_sort(keys, NULL, other, NULL, n, low + s->index_bits, high + s->index_bits, true);
+  }
+  for (int64_t i = 0; i < n; i++) keys[s->N + i] = (uint64_t)i;
+  return octree_radix_sort(keys, keys + s->N, other, other + s->N, n, low, high, false);
+}
+
+/* ---- runs of equal keys ---- */
+
+/* The runs of equal sorted[i] >> shift within each scene. */
+typedef struct {
+  const uint64_t *sorted;
+  int shift;
+  const int64_t *offsets;
+  int64_t B, N;
+  int64_t *chunk_runs;    /* [chunks + 1]: the runs that start in each chunk, then their running sums */
+  int64_t *keys, *starts; /* of each run */
+} octree_run_job;
+
+/* Of the rows begin..end-1, in one scene, those that start a run; the scene starts at `first`. */
+AST_INLINE int octree_heads(const octree_run_job *s, int64_t begin, int64_t end, int64_t first, int32_t *heads) {
+  int num = 0;
+  for (int64_t i = begin; i < end; i++) {
+    heads[num] = (int32_t)(i - begin);
+    num += i == first || s->sorted[i] >> s->shift != s->sorted[i - 1] >> s->shift;
+  }
+  return num;
+}
+
+AST_INLINE void octree_runs_of_chunk(const octree_run_job *s, int64_t chunk, const bool write) {
+  const int64_t end = min64(s->N, (chunk + 1) * OCTREE_CHUNK);
+  int64_t b = octree_scene_of(s->offsets, s->B, chunk * OCTREE_CHUNK), run = write ? s->chunk_runs[chunk] : 0;
+  int32_t heads[OCTREE_TILE];
+  for (int64_t i = chunk * OCTREE_CHUNK, next; i < end; i = next) {
+    while (s->offsets[b + 1] <= i) b++;
+    next = min64(min64(end, s->offsets[b + 1]), i + OCTREE_TILE);
+    const int num = octree_heads(s, i, next, s->offsets[b], heads);
+    for (int j = 0; write && j < num; j++) {
+      s->keys[run + j] = (int64_t)(s->sorted[i + heads[j]] >> s->shift);
+      s->starts[run + j] = i + heads[j];
+    }
+    run += num;
+  }
+  if (!write) s->chunk_runs[chunk] = run;
+}
+
+static ast_status octree_count_runs_task(int64_t chunk, void *context) {
+  octree_runs_of_chunk(context, chunk, false);
+  return AST_OK;
+}
+
+static ast_status octree_write_runs_task(int64_t chunk, void *context) {
+  octree_runs_of_chunk(context, chunk, true);
+  return AST_OK;
+}
+
+/* The keys and starts of all runs, starts closed by N, and the first run of each scene. */
+static ast_status octree_runs(const uint64_t *sorted, int shift, const int64_t *offsets, int64_t B, int64_t *keys, int64_t *starts,
+                              int64_t *run_offsets) {
+  const int64_t N = offsets[B], chunks = octree_chunks(N);
+  octree_run_job job = {sorted, shift, offsets, B, N, ast_scratch(2, (chunks + 1) * (int64_t)sizeof(int64_t)), keys, starts};
+  if (!job.chunk_runs) return AST_NO_MEMORY;
+  ast_parallel(chunks, octree_count_runs_task, &job);
+  int64_t runs = 0;
+  for (int64_t i = 0; i < chunks; i++) {
+    const int64_t here = job.chunk_runs[i];
+    job.chunk_runs[i] = runs;
+    runs += here;
+  }
+  ast_parallel(chunks, octree_write_runs_task, &job);
+  starts[runs] = N;
+  for (int64_t b = 0, low = 0; b <= B; b++) {
+    for (int64_t high = runs; low < high;) {
+      const int64_t middle = (low + high) / 2;
+      if (starts[middle] < offsets[b]) low = middle + 1;
+      else high = middle;
+    }
+    run_offsets[b] = low;
+  }
+  return AST_OK;
+}
+
+/* ---- build ---- */
+
+typedef struct {
+  const octree_sort_job *sort;
+  const int64_t *offsets, *cell_offsets, *node_offsets;
+  int64_t B, C;
+  int64_t *node_cell, *node_order;
+} octree_node_job;
+
+static ast_status octree_node_task(int64_t chunk, void *context) {
+  const octree_node_job *s = context;
+  const octree_sort_job *sort = s->sort;
+  const uint64_t *index = sort->packed ? sort->keys : sort->keys + sort->N;
+  const uint64_t mask = sort->packed ? (1ull << sort->index_bits) - 1 : UINT64_MAX;
+  const int64_t end = min64(s->C, (chunk + 1) * OCTREE_CHUNK);
+  int64_t b = octree_scene_of(s->cell_offsets, s->B, chunk * OCTREE_CHUNK);
+  for (int64_t c = chunk * OCTREE_CHUNK; c < end; c++) {
+    while (s->cell_offsets[b + 1] <= c) b++;
+    for (int64_t i = s->node_offsets[c]; i < s->node_offsets[c + 1]; i++) {
+      const int64_t node = s->offsets[b] + (int64_t)(index[i] & mask);
+      s->node_order[i] = node;
+      s->node_cell[node] = c;
+    }
+  }
+  return AST_OK;
+}
+
+static ast_status octree_build(const float *restrict positions, const int64_t *restrict offsets, int64_t B, const double center[3],
+                               double half_width, int depth, int64_t *restrict keys, int64_t *restrict cell_offsets,
+                               int64_t *restrict node_cell, int64_t *restrict node_order, int64_t *restrict node_offsets,
+                               int64_t *bad_node) {
+  const int64_t N = offsets[B];
+  memset(cell_offsets, 0, sizeof *cell_offsets * (size_t)(B + 1));
+  node_offsets[0] = 0;
+  if (N == 0) return AST_OK;
+  int64_t largest = 0;
+  for (int64_t b = 0; b < B; b++) largest = max64(largest, offsets[b + 1] - offsets[b]);
+  const int index_bits = octree_bits((uint64_t)(largest - 1));
+  const bool packed = 3 * depth + index_bits <= 64;
+  const int64_t bytes = (packed ? 1 : 2) * N * (int64_t)sizeof(uint64_t);
+  octree_sort_job sort = {offsets, N, index_bits, packed, ast_scratch(1, bytes), ast_scratch(2, bytes)};
+  if (!sort.keys || !sort.other) return AST_NO_MEMORY;
+
+  octree_key_job key = {positions, N, center, half_width, depth, sort.keys};
+  ast_status status = ast_parallel(octree_chunks(N), octree_key_task, &key);
+  if (status != AST_OK) {
+    int64_t n = 0;
+    while ((status = octree_check_node(&key, n)) == AST_OK) n++;
+    *bad_node = n;
+    return status;
+  }
+  status = ast_parallel(B, octree_sort_task, &sort);
+  if (status == AST_OK) status = octree_runs(sort.keys, packed ? index_bits : 0, offsets, B, keys, node_offsets, cell_offsets);
+  if (status != AST_OK) return status;
+  octree_node_job node = {&sort, offsets, cell_offsets, node_offsets, B, cell_offsets[B], node_cell, node_order};
+  return ast_parallel(octree_chunks(node.C), octree_node_task, &node);
+}
