@@ -1,0 +1,105 @@
+"""What the data decides before training: its scales, the settings that follow from them, the learning rates."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+
+import numpy as np
+
+from ast_sim.data.file import Dataset
+from ast_sim.data.scene import NodeType
+from ast_sim.errors import ConfigError, TrainingError
+from ast_sim.measures import SquaredError, rmse_pooled
+from ast_sim.run import TrainConfig
+
+MEASURED_TRAJECTORIES = 100  # training trajectories that the scales of the data are measured on, at most
+
+
+@dataclasses.dataclass(frozen=True)
+class DataScales:
+    """Lengths that decide whether a model can learn, measured on NORMAL nodes of the training split.
+
+    Attributes:
+        displacement, increment: root mean square per coordinate, over all frames.
+        spacing: mean length of the edges of the deforming bodies at rest.
+        nodes: median number of nodes of a scene.
+        trajectories, pairs: how many the training split has.
+    """
+
+    displacement: float
+    increment: float
+    spacing: float
+    nodes: int
+    trajectories: int
+    pairs: int
+
+
+def measure(dataset: Dataset) -> DataScales:
+    """Measure the training split; on at most MEASURED_TRAJECTORIES, evenly spread."""
+    count = dataset.count("train")
+    if count == 0:
+        raise TrainingError(f"{dataset.path} has no trajectories to train on: the split train is empty")
+    displacement, increment, lengths, nodes = [], [], [], []
+    for index in np.unique(np.linspace(0, count - 1, min(count, MEASURED_TRAJECTORIES)).astype(int)):
+        trajectory = dataset.load("train", int(index))
+        scene, position = trajectory.scene, trajectory.position
+        normal = scene.node_type == NodeType.NORMAL
+        displacement.append(SquaredError.between(position, scene.rest_position, normal))
+        increment.append(SquaredError.between(position[1:], position[:-1], normal))
+        edges = scene.edges()
+        edges = edges[(scene.node_type[edges] != NodeType.OBSTACLE).all(axis=1)]
+        lengths.append(np.linalg.norm(scene.rest_position[edges[:, 0]] - scene.rest_position[edges[:, 1]], axis=1))
+        nodes.append(scene.num_nodes)
+    return DataScales(
+        displacement=rmse_pooled(displacement),
+        increment=rmse_pooled(increment),
+        spacing=float(np.concatenate(lengths).mean(dtype=np.float64)),
+        nodes=int(np.median(nodes)),
+        trajectories=count,
+        pairs=sum(max(0, dataset.num_frames("train", index) - 1) for index in range(count)),
+    )
+
+
+def resolve_training(config: TrainConfig, scales: DataScales, dynamic: bool) -> TrainConfig:
+    """Fill in what the settings leave to the data.
+
+    Raises:
+        ConfigError: naming a setting out of its range.
+    """
+    for key, least in (("batch_size", 1), ("accumulate", 1), ("epochs", 1), ("log_every", 1), ("keep", 1), ("seed", 0)):
+        if getattr(config, key) < least:
+            raise ConfigError(f"train.{key} is {getattr(config, key)}; it must be at least {least}")
+    for key in ("steps", "validate_every", "checkpoint_every"):
+        if getattr(config, key) is not None and getattr(config, key) < 1:
+            raise ConfigError(f"train.{key} is {getattr(config, key)}; it must be at least 1")
+    scenes = config.batch_size * config.accumulate
+    epoch = math.ceil(scales.pairs / scenes)
+    steps = config.steps if config.steps is not None else config.epochs * epoch
+    validate_every = config.validate_every or max(1, steps // 10)
+    derived = {
+        "steps": steps,
+        "peak_rate": 1e-4 * math.sqrt(scenes / 2),
+        "warmup": min(2000, steps // 20),
+        "decay": steps if config.steps is not None else steps + epoch,
+        "noise": 0.45 * scales.displacement,
+        "noise_gamma": 0.1 if dynamic else 1.0,
+        "validate_every": validate_every,
+        "checkpoint_every": validate_every,
+    }
+    missing = {key: value for key, value in derived.items() if getattr(config, key) is None}
+    return dataclasses.replace(config, **missing)
+
+
+def learning_rate(config: TrainConfig, step: int) -> float:
+    """The rate of step 0, 1, ...: linear from 1e-4 of the peak over `warmup` steps, then a cosine to 0 at `decay`."""
+    if step < config.warmup:
+        return config.peak_rate * (1e-4 + (1 - 1e-4) * step / config.warmup)
+    phase = (step - config.warmup) / max(1, config.decay - config.warmup)
+    return 0.5 * config.peak_rate * (1 + math.cos(math.pi * min(1.0, phase)))
+
+
+def step_seed(seed: int, step: int) -> int:
+    """The seed of a step's dropout: 63 bits of a hash of both numbers."""
+    return int.from_bytes(hashlib.sha256(f"{seed}:{step}".encode()).digest()[:8], "little") >> 1

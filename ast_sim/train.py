@@ -1,0 +1,320 @@
+"""Training: noisy frame pairs, a warm-up and a cosine, validation by rollout, checkpoints that resume bit for bit.
+
+Everything random is a function of (seed, step): the order of the pairs and their noise by `PairSampler`, dropout by
+seeding torch before each step. So weights, optimizer state and the step number are all that a checkpoint needs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import errno
+import hashlib
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ast_sim import checkpoint
+from ast_sim.config import override
+from ast_sim.data.file import Dataset
+from ast_sim.data.sampling import PairSampler
+from ast_sim.errors import ConfigError, TrainingError
+from ast_sim.measures import SquaredError, rmse_sequence
+from ast_sim.model.ast import build_model
+from ast_sim.model.config import PRESETS, resolve
+from ast_sim.monitor import Clock, Progress, StopSignals, duration
+from ast_sim.rollout import rollouts
+from ast_sim.run import Metrics, RunConfig, TrainConfig, has_config, read_config, write_config
+from ast_sim.schedule import DataScales, learning_rate, measure, resolve_training, step_seed
+
+CONSTANT = 1e-3  # the output is constant if its standard deviation over nodes is below this share of the targets'
+
+
+def configure(data: Path, preset: str, assignments: Sequence[str] = ()) -> RunConfig:
+    """The settings of a preset with `--set` assignments; what they leave to the data is filled in by `train`.
+
+    Raises:
+        ConfigError: naming the nearest preset or key that there is.
+    """
+    if preset not in PRESETS:
+        near = difflib.get_close_matches(preset, PRESETS, 1, 0)
+        raise ConfigError(f"there is no preset {preset!r}: did you mean {near[0]}? There are {', '.join(PRESETS)}")
+    chosen = PRESETS[preset]
+    return override(RunConfig(chosen.model, TrainConfig(**chosen.train), str(data)), list(assignments))
+
+
+def train(run: Path, config: RunConfig | None = None, resume: bool = False) -> None:
+    """Train a model in the run folder `run`, or go on with the one there.
+
+    Args:
+        config: the settings, as given; None takes those of the run that is resumed. With `resume` they must agree.
+        resume: go on after the newest checkpoint, if there is one.
+
+    Raises:
+        TrainingError: a loss or gradient that is not finite, a full disk, a folder that holds a run already.
+        ConfigError: settings that are out of range, or differ from those of the run that is resumed.
+        CheckpointError: another process trains in this folder, or no checkpoint there can be read.
+        SystemExit: SIGINT (130) or SIGTERM (143) came; the step was finished and a checkpoint written.
+    """
+    run = Path(run)
+    try:
+        run.mkdir(parents=True, exist_ok=True)
+        with checkpoint.lock(run), StopSignals() as signals:
+            saved = read_config(run) if has_config(run) else None
+            if saved is not None and not resume:
+                raise TrainingError(f"{run} already holds a run: go on with --resume, or choose another folder")
+            if saved is None and config is None:
+                raise TrainingError(f"{run} holds no run to resume: name the dataset to start one")
+            with Dataset((config or saved).data) as dataset:
+                scales = measure(dataset)
+                resolved = _resolve(config, dataset, scales) if config is not None else saved
+                if saved is None:
+                    write_config(run, resolved)
+                else:
+                    _require_same(run, saved, resolved)
+                _Training(run, resolved, dataset, scales, signals).go()
+    except OSError as error:
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        advice = ": the last checkpoint is whole; make room, then go on with --resume" if full else ""
+        raise TrainingError(f"{run}: {error}{advice}") from error
+
+
+def _resolve(config: RunConfig, dataset: Dataset, scales: DataScales) -> RunConfig:
+    model = resolve(config.model, dataset.info, dataset.material_width, scales.spacing)
+    training = resolve_training(config.train, scales, model.dynamic)
+    return RunConfig(model=model, train=training, data=str(Path(config.data).resolve()))
+
+
+def _require_same(run: Path, saved: RunConfig, asked: RunConfig) -> None:
+    """Raise ConfigError naming the first setting that differs (the place of the data may)."""
+    for part in ("model", "train"):
+        old, new = getattr(saved, part), getattr(asked, part)
+        for key in (field.name for field in dataclasses.fields(old)):
+            if getattr(old, key) != getattr(new, key):
+                raise ConfigError(
+                    f"{run} was started with {part}.{key} = {getattr(old, key)!r}, not {getattr(new, key)!r}:"
+                    " resume without settings, or train in another folder"
+                )
+
+
+class _Training:
+    """The state of one training: model, optimizer, where it stands, and what it tells."""
+
+    def __init__(
+        self, run: Path, config: RunConfig, dataset: Dataset, scales: DataScales, signals: StopSignals
+    ) -> None:
+        self.run, self.config, self.dataset, self.signals = run, config, dataset, signals
+        self.options = config.train
+        torch.manual_seed(self.options.seed)
+        self.model = build_model(config.model)
+        self.sampler = PairSampler(
+            dataset,
+            "train",
+            batch_size=self.options.batch_size,
+            seed=self.options.seed,
+            noise=self.options.noise,
+            element_nodes=bool(config.model.element_inputs),
+            dynamic=config.model.dynamic,
+            gamma=self.options.noise_gamma,
+        )
+        self.parameters = dict(self.model.named_parameters())
+        self.optimizer = torch.optim.AdamW(self.parameters.values(), lr=0.0, weight_decay=0.0, fused=True)
+        self.metrics = Metrics(run)
+        self.clock = Clock()
+        self.step = 0
+        self.sums: dict[str, float] = {}  # of the steps since the last line of metrics
+        self._introduce(scales)
+
+    def _introduce(self, scales: DataScales) -> None:
+        options, model = self.options, self.config.model
+        epochs = options.steps * options.batch_size * options.accumulate / self.sampler.num_pairs
+        side = model.cell_side
+        rms, spacing = max(scales.increment, 1e-300), max(scales.spacing, 1e-300)
+        unit = self.dataset.info.length_unit
+        print(f"parameters  {sum(p.numel() for p in self.parameters.values()):,}")
+        print(f"data        {scales.trajectories:,} scenes of about {scales.nodes:,} nodes, {scales.pairs:,} pairs")
+        print(
+            f"steps       {options.steps:,} of {options.batch_size * options.accumulate} scenes each:"
+            f" {epochs:.3g} epochs"
+        )
+        print(
+            f"noise       {options.noise:.3g} {unit} = {options.noise / rms:.2g} x rms increment"
+            f" = {options.noise / spacing:.2g} x mesh spacing"
+        )
+        print(f"cell side   {side:.3g} {unit} = {side / spacing:.2g} x mesh spacing", flush=True)
+
+    def go(self) -> None:
+        """Train from the newest checkpoint, or from the beginning, to the last step."""
+        options = self.options
+        self._restore()
+        self.model.train()
+        self.progress = Progress(options.steps, self.step, "steps")
+        try:
+            if self.step and self._due(options.validate_every) and not self.metrics.validated(self.step):
+                self._validate()
+            self.clock = Clock()
+            while self.step < options.steps:
+                self._advance()
+                if self._due(options.log_every):
+                    self._log()
+                validates = self._due(options.validate_every)
+                if validates or self._due(options.checkpoint_every) or self.signals.received:
+                    self._save()
+                self._stop_if_asked()
+                self.clock.step()
+                if validates:
+                    self._validate()
+        finally:
+            self.progress.close()
+
+    def _due(self, every: int) -> bool:
+        return self.step % every == 0 or self.step == self.options.steps
+
+    def _stop_if_asked(self) -> None:
+        if self.signals.received:
+            self.progress.line(f"stopped after step {self.step:,}: go on with --resume")
+            raise SystemExit(128 + self.signals.received)
+
+    def _advance(self) -> None:
+        """One optimizer step, on the gradients of `accumulate` batches."""
+        options = self.options
+        torch.manual_seed(step_seed(options.seed, self.step))
+        rate = learning_rate(options, self.step)
+        self.optimizer.zero_grad()
+        names: list[str] = []
+        values: dict[str, float] = {}
+        for part in range(options.accumulate):
+            batch, target = self.sampler.batch(self.step * options.accumulate + part)
+            losses = self.model.loss(batch, target, options.stress_weight)
+            loss = losses["loss"]
+            if not loss.isfinite():
+                raise self._not_finite("loss", float(loss.detach()), batch.names)
+            (loss / options.accumulate).backward()
+            names += batch.names
+            for key, value in losses.items():
+                values[key] = values.get(key, 0.0) + float(value.detach()) / options.accumulate
+        norm = float(torch.nn.utils.clip_grad_norm_(self.parameters.values(), options.clip))
+        if not math.isfinite(norm):
+            raise self._not_finite("norm of the gradient", norm, names)
+        self.optimizer.param_groups[0]["lr"] = rate
+        self.optimizer.step()
+        self.step += 1
+        self.progress.advance()
+        values |= {"grad_norm": norm, "clipped_share": float(norm > options.clip), "steps": 1}
+        for key, value in values.items():
+            self.sums[key] = self.sums.get(key, 0.0) + value
+
+    def _not_finite(self, what: str, value: float, names: list[str]) -> TrainingError:
+        last = checkpoint.latest(self.run)
+        kept = f"the last good checkpoint is {last}" if last else "there is no checkpoint yet"
+        return TrainingError(
+            f"the {what} of step {self.step + 1} is {value}, so the step was not taken: look at {', '.join(names)},"
+            f" or train anew with a lower train.peak_rate ({self.options.peak_rate:.3g} here); {kept}"
+        )
+
+    def _log(self) -> None:
+        count = self.sums.pop("steps")
+        means = {key: value / count for key, value in self.sums.items()}
+        self.sums = {}
+        rate = learning_rate(self.options, self.step - 1)
+        seconds = self.clock.seconds_per_step
+        self.metrics.append({"step": self.step, **means, "rate": rate, "seconds": seconds})
+        stress = f", stress {means['stress']:.4f}" if "stress" in means else ""
+        to_go = self.clock.to_go(self.options.steps - self.step, self._validations_to_go())
+        self.progress.show(
+            f"step {self.step:,}/{self.options.steps:,}: loss {means['loss']:.4f}, motion {means['motion']:.4f}"
+            f"{stress}, {1000 * seconds:.1f} ms a step, {to_go} to go"
+        )
+        if means["spread"] < CONSTANT:
+            # A decoder whose units all died gives every node the same output, and never recovers.
+            self.progress.line(
+                "warning: the predicted motion is the same at all nodes: the decoder is dead. Train anew with another"
+                " train.seed, a lower train.peak_rate, or more train.noise"
+            )
+
+    def _validations_to_go(self) -> int:
+        if not self.dataset.count("valid"):
+            return 0
+        every = self.options.validate_every
+        return math.ceil(self.options.steps / every) - (self.step - 1) // every
+
+    def _validate(self) -> None:
+        """Roll out the validation scenes; the checkpoint of this step is the best if their error is the lowest."""
+        count = min(self.dataset.count("valid"), self.options.validate_scenes)
+        if count == 0:
+            return
+        truths = [self.dataset.load("valid", index) for index in range(count)]
+        names = [f"valid/{index:06d}" for index in range(count)]
+        results = rollouts(self.model, truths, names, progress=lambda frame: self._stop_if_asked())
+        record: dict[str, Any] = {"step": self.step}
+        failure = next((result.failure for result in results if result.failure), None)
+        if failure is None:
+            pairs = list(zip(results, truths, strict=True))
+            error = rmse_sequence([_motion_error(r.position, t, r.given) for r, t in pairs])
+            hold = rmse_sequence([_motion_error(t.position[r.given - 1], t, r.given) for r, t in pairs])
+            record |= {"valid_rmse": error, "valid_hold_still": hold}
+            best = error < self.metrics.best()
+            if best:
+                checkpoint.mark_best(self.run, self.step)
+            share = f" = {error / hold:.2f} of hold still" if hold else ""
+            unit = self.dataset.info.length_unit
+            text = f"rollout error {error:.3g} {unit}{share}{', the best so far' if best else ''}"
+        else:
+            record |= {"valid_rmse": None, "failure": failure}
+            text = f"rollout failed: {failure}"
+        seconds = self.clock.validation()
+        self.metrics.append({**record, "seconds": seconds})
+        self.progress.line(f"validation after step {self.step:,}: {text} ({duration(seconds)})")
+
+    def _save(self) -> None:
+        optimizer = {}
+        for name, parameter in self.parameters.items():
+            for key, value in self.optimizer.state[parameter].items():
+                optimizer[f"{name}.{key}"] = value
+        state = {"step": self.step, "sums": self.sums, "data": self._fingerprint()}
+        checkpoint.save(
+            self.run, self.step, model=self.model.state_dict(), optimizer=optimizer, state=state, keep=self.options.keep
+        )
+
+    def _restore(self) -> None:
+        """Take up the newest checkpoint; without one, take the statistics of the data and begin."""
+        path = checkpoint.latest(self.run)
+        if path is None:
+            self.metrics.forget_after(0)
+            batches = range(math.ceil(self.options.statistics_pairs / self.options.batch_size))
+            self.model.fit_statistics(self.sampler.batch(index) for index in batches)
+            return
+        weights, optimizer, state = checkpoint.load(path)
+        if state["data"] != self._fingerprint():
+            raise TrainingError(
+                f"{self.dataset.path} is not the dataset that {self.run} was trained on so far: bring that one back,"
+                " or train in another folder"
+            )
+        self.model.load_state_dict(weights)
+        for name, parameter in self.parameters.items():
+            prefix = f"{name}."
+            self.optimizer.state[parameter] = {
+                key.removeprefix(prefix): value for key, value in optimizer.items() if key.rpartition(".")[0] == name
+            }
+        self.step, self.sums = state["step"], state["sums"]
+        self.metrics.forget_after(self.step)
+        print(f"going on after step {self.step:,}", flush=True)
+
+    def _fingerprint(self) -> dict[str, Any]:
+        """What tells one dataset from another without reading it whole."""
+        info = repr(self.dataset.info).encode()
+        return {
+            "bytes": Path(self.dataset.path).stat().st_size,
+            "info": hashlib.sha256(info).hexdigest(),
+            "splits": dict(self.dataset.splits),
+        }
+
+
+def _motion_error(position: np.ndarray, truth: Any, given: int) -> SquaredError:
+    """Error of the frames after the given ones on NORMAL nodes; `position` [S, N, 3], or [N, 3] for one that stays."""
+    predicted = position[given:] if position.ndim == 3 else position
+    return SquaredError.between(predicted, truth.position[given:], ~truth.scene.prescribed)
