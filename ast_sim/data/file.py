@@ -349,6 +349,8 @@ class Dataset:
     def _read_frames(self, split: str, index: int, start: int, stop: int) -> tuple[np.ndarray, np.ndarray | None]:
         name, group, scene = self._name(split, index), self._group(split, index), self.scene(split, index)
         count = self.num_frames(split, index)
+        if count == 0:
+            raise DatasetError(f"{name}: position has no frames")
         position = self._read(group, "position", slice(start, stop))
         require_array(name, "position", position, np.float32, (stop - start, scene.num_nodes, 3))
         require_finite_frames(name, "position", "node", position, start)

@@ -1,0 +1,77 @@
+"""Small scenes and trajectories that the data tests share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from ast_sim.data.file import DatasetWriter
+from ast_sim.data.layout import DatasetInfo
+from ast_sim.data.scene import NodeType, Scene, Trajectory
+
+
+def two_tetrahedra(**changes) -> Scene:
+    """Two tetrahedra that share the face 1, 2, 3; node 0 is a handle, node 4 an obstacle."""
+    arrays = {
+        "rest_position": np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], np.float32),
+        "elements": np.array([[0, 1, 2, 3], [1, 2, 3, 4]], np.int32),
+        "node_type": np.array([NodeType.HANDLE, 0, 0, 0, NodeType.OBSTACLE], np.uint8),
+        "body": np.array([0, 0, 0, 0, 1], np.int32),
+    }
+    return Scene(**{**arrays, **changes})
+
+
+def block(nx: int, ny: int, nz: int, material: np.ndarray | None = None) -> Scene:
+    """A block of nx x ny x nz unit cubes, six tetrahedra each; the nodes with x = 0 are handles."""
+    points = np.stack(np.meshgrid(*(np.arange(n + 1) for n in (nx, ny, nz)), indexing="ij"), -1).reshape(-1, 3)
+    number = np.arange(len(points)).reshape(nx + 1, ny + 1, nz + 1)
+    corner = {
+        (i, j, k): number[i : i + nx, j : j + ny, k : k + nz].ravel() for i in (0, 1) for j in (0, 1) for k in (0, 1)
+    }
+    # Each tetrahedron follows one path of the three axes from corner 000 to corner 111.
+    paths = [((1, 0, 0), (1, 1, 0)), ((1, 0, 0), (1, 0, 1)), ((0, 1, 0), (1, 1, 0))]
+    paths += [((0, 1, 0), (0, 1, 1)), ((0, 0, 1), (1, 0, 1)), ((0, 0, 1), (0, 1, 1))]
+    elements = [np.stack([corner[0, 0, 0], corner[a], corner[b], corner[1, 1, 1]], 1) for a, b in paths]
+    return Scene(
+        rest_position=points.astype(np.float32),
+        elements=np.concatenate(elements).astype(np.int32),
+        node_type=np.where(points[:, 0] == 0, NodeType.HANDLE, NodeType.NORMAL).astype(np.uint8),
+        body=np.zeros(len(points), np.int32),
+        material=material,
+    )
+
+
+def trajectory(scene: Scene, frames: int, seed: int = 0, stress: str = "none", **attributes) -> Trajectory:
+    """A random walk of the nodes, and random stress at the location."""
+    generator = np.random.default_rng(seed)
+    steps = 0.01 * generator.standard_normal((frames, scene.num_nodes, 3))
+    rows = {"none": 0, "node": scene.num_nodes, "element": scene.num_elements}[stress]
+    return Trajectory(
+        scene=scene,
+        position=(scene.rest_position + np.cumsum(steps, axis=0)).astype(np.float32),
+        stress=generator.random((frames, rows, 1), np.float32) if rows else None,
+        attributes={"seed": seed, **attributes},
+    )
+
+
+def info(**changes) -> DatasetInfo:
+    values = {
+        "family": "test",
+        "integration": "quasi_static",
+        "stress_location": "none",
+        "domain_center": (0.5, 0.5, 0.5),
+        "domain_half_width": 2.0,
+        "contact_radius": 0.01,
+        "time_step": 0.0,
+    }
+    return DatasetInfo(**{**values, **changes})
+
+
+def write(path, trajectories: dict[str, Iterable[Trajectory]], **changes):
+    """A dataset file of these trajectories; returns its path."""
+    with DatasetWriter(path, info(**changes)) as writer:
+        for split, members in trajectories.items():
+            for member in members:
+                writer.add(split, member)
+    return path

@@ -1,0 +1,226 @@
+"""The sampler: every pair once an epoch, noise where and as strong as asked, targets by hand."""
+
+import numpy as np
+import pytest
+import torch
+from data_samples import block, trajectory, two_tetrahedra, write
+
+from ast_sim.data.file import Dataset
+from ast_sim.data.sampling import PairSampler
+from ast_sim.data.scene import NodeType, Scene, Trajectory
+from ast_sim.errors import DatasetError
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    """Three trajectories of different meshes with 5, 2 and 4 frames: 4 + 1 + 3 pairs."""
+    members = [
+        trajectory(block(2, 1, 1), 5, seed=1, stress="node"),
+        trajectory(two_tetrahedra(), 2, seed=2, stress="node"),
+        trajectory(block(1, 1, 1), 4, seed=3, stress="node"),
+    ]
+    with Dataset(write(tmp_path / "d.h5", {"train": members}, stress_location="node")) as dataset:
+        yield dataset
+
+
+def sampler(dataset, **changes) -> PairSampler:
+    options = {"batch_size": 4, "seed": 0, "noise": 0.0, "element_nodes": False, "dynamic": False, "gamma": 1.0}
+    return PairSampler(dataset, "train", **{**options, **changes})
+
+
+def names(sampler, steps) -> list[str]:
+    return [name for step in steps for name in sampler.batch(step)[0].names]
+
+
+PAIRS = sorted(
+    [f"train/000000 frame {t}" for t in range(4)]
+    + ["train/000001 frame 0"]
+    + [f"train/000002 frame {t}" for t in range(3)]
+)
+
+
+def test_each_epoch_has_every_pair_once_in_a_new_order(dataset):
+    draws = sampler(dataset)
+    assert draws.num_pairs == 8
+    first, second = names(draws, (0, 1)), names(draws, (2, 3))
+    assert sorted(first) == sorted(second) == PAIRS and first != second
+    # The sequence does not depend on how it is cut into batches; batches may reach into the next epoch.
+    assert names(sampler(dataset, batch_size=3), range(6))[:16] == first + second
+    assert names(sampler(dataset, batch_size=16), [0]) == first + second
+    assert names(sampler(dataset, seed=1), (0, 1)) != first
+
+
+def test_inertia_needs_a_frame_before(dataset):
+    draws = sampler(dataset, dynamic=True, gamma=0.1, batch_size=5)
+    expected = [f"train/000000 frame {t}" for t in (1, 2, 3)] + [f"train/000002 frame {t}" for t in (1, 2)]
+    assert draws.num_pairs == 5 and sorted(names(draws, [0])) == expected
+
+
+def parts(batch):
+    """(name, slice of nodes) of each scene."""
+    offsets = batch.graph.node_offsets.tolist()
+    return [(name, slice(a, b)) for name, a, b in zip(batch.names, offsets, offsets[1:], strict=False)]
+
+
+def frame_of(name: str) -> tuple[int, int]:
+    return int(name[6:12]), int(name.rpartition(" ")[2])
+
+
+def test_without_noise_everything_is_as_in_the_file(dataset):
+    draws = sampler(dataset)
+    for step in range(2):
+        batch, target = draws.batch(step)
+        assert batch.previous_position is None
+        for name, nodes in parts(batch):
+            index, t = frame_of(name)
+            truth = dataset.load("train", index)
+            position, prescribed = truth.position, truth.scene.prescribed
+            assert np.array_equal(batch.position[nodes], position[t])
+            assert np.array_equal(target.motion[nodes], position[t + 1] - position[t])
+            expected = np.where(prescribed[:, None], position[t + 1] - position[t], 0)
+            assert prescribed.any() and np.array_equal(batch.boundary_motion[nodes], expected)
+            assert np.array_equal(batch.stress[nodes], truth.stress[t])
+            assert np.array_equal(target.stress[nodes], truth.stress[t + 1])
+            assert np.array_equal(batch.graph.rest_position[nodes], truth.scene.rest_position)
+            for tensor in (batch.position, batch.boundary_motion, target.motion, target.stress):
+                assert tensor.dtype == torch.float32
+
+
+@pytest.mark.parametrize("gamma", [1.0, 0.1, 0.0])
+def test_the_increment_undoes_the_share_gamma_of_the_noise(dataset, gamma):
+    for step in range(2):
+        clean, clean_target = sampler(dataset).batch(step)
+        noisy, target = sampler(dataset, noise=0.02, gamma=gamma).batch(step)
+        noise = noisy.position - clean.position
+        # p_t + n + motion = p_{t+1} + (1 - gamma) n
+        torch.testing.assert_close(
+            noisy.position + target.motion,
+            clean.position + clean_target.motion + (1 - gamma) * noise,
+            rtol=0,
+            atol=1e-6,
+        )
+        assert noise.abs().max() > 0.02
+        assert torch.equal(target.motion[noisy.graph.prescribed], clean_target.motion[noisy.graph.prescribed])
+        assert torch.equal(noisy.boundary_motion, clean.boundary_motion)
+
+
+@pytest.mark.parametrize("gamma", [1.0, 0.1])
+def test_the_acceleration_with_noise(dataset, gamma):
+    options = {"dynamic": True, "batch_size": 5}
+    clean, _ = sampler(dataset, **options).batch(0)
+    noisy, target = sampler(dataset, noise=0.02, gamma=gamma, **options).batch(0)
+    assert torch.equal(noisy.previous_position, clean.previous_position)  # the noise is on p_t alone
+    noise = noisy.position - clean.position
+    for name, nodes in parts(noisy):
+        index, t = frame_of(name)
+        position = torch.from_numpy(dataset.load("train", index).position.copy())
+        assert torch.equal(noisy.previous_position[nodes], position[t - 1])
+        # 2 p_t - p_{t-1} + a = p_{t+1} + (1 - gamma) n, with the noisy p_t
+        reached = 2 * noisy.position[nodes] - noisy.previous_position[nodes] + target.motion[nodes]
+        torch.testing.assert_close(reached, position[t + 1] + (1 - gamma) * noise[nodes], rtol=0, atol=1e-6)
+
+
+def test_a_hand_calculation(tmp_path):
+    """One node moves 1 -> 3 -> 4 in x: increment 1, acceleration -1; noise n = p' - p_t shifts them by hand."""
+    scene = two_tetrahedra(node_type=np.array([NodeType.HANDLE, 0, 0, 0, 0], np.uint8))
+    position = np.repeat(scene.rest_position[None], 3, axis=0)
+    position[:, 4] = [[1, 1, 1], [3, 1, 1], [4, 1, 1]]
+    with Dataset(write(tmp_path / "d.h5", {"train": [Trajectory(scene, position)]})) as dataset:
+        draws = sampler(dataset, dynamic=True, noise=0.5, gamma=0.1, batch_size=1)
+        batch, target = draws.batch(0)
+        n = float(batch.position[4, 0]) - 3
+        assert abs(n) > 1e-3
+        assert float(batch.previous_position[4, 0]) == 1
+        assert float(target.motion[4, 0]) == pytest.approx(-1 - 1.1 * n, abs=1e-5)
+        draws = sampler(dataset, noise=0.5, gamma=0.1, batch_size=2)
+        batch, target = draws.batch(0)
+        at = batch.names.index("train/000000 frame 1")
+        n = float(batch.position[5 * at + 4, 0]) - 3
+        assert float(target.motion[5 * at + 4, 0]) == pytest.approx(1 - 0.1 * n, abs=1e-5)
+
+
+def test_noise_is_white_gaussian_on_normal_nodes_only(tmp_path):
+    scene = block(9, 9, 9)
+    still = Trajectory(scene, np.repeat(scene.rest_position[None], 21, axis=0))
+    with Dataset(write(tmp_path / "d.h5", {"train": [still]})) as dataset:
+        draws = sampler(dataset, noise=0.003, batch_size=20)
+        batch, target = draws.batch(0)
+        noise = (batch.position - batch.graph.rest_position).reshape(20, 1000, 3)
+        assert torch.equal(noise[:, scene.prescribed], torch.zeros(20, 100, 3))
+        # The float32 coordinates round the noise by up to 5e-7.
+        noise = noise[:, ~scene.prescribed].double() / 0.003
+        count = noise.numel()
+        assert abs(float(noise.mean())) < 4 / count**0.5
+        assert abs(float((noise**2).mean()) - 1) < 4 * (2 / count) ** 0.5
+        assert abs(float((noise**4).mean()) - 3) < 4 * (96 / count) ** 0.5
+        for axis in range(3):  # between frames, between neighbouring nodes, between coordinates
+            product = noise * noise.roll(1, dims=axis)
+            assert abs(float(product.mean())) < 4 / count**0.5
+
+
+def test_the_noise_of_a_pair_does_not_depend_on_its_batch(dataset):
+    alone = sampler(dataset, noise=0.01, batch_size=1)
+    together = sampler(dataset, noise=0.01, batch_size=8)
+    whole, whole_target = together.batch(0)
+    found = {}
+    for step in range(8):
+        batch, target = alone.batch(step)
+        found[batch.names[0]] = (batch, target)
+    for name, nodes in parts(whole):
+        batch, target = found[name]
+        assert torch.equal(whole.position[nodes], batch.position)
+        assert torch.equal(whole_target.motion[nodes], target.motion)
+    # Another epoch, or another seed, has other noise on the same pair.
+    again, _ = together.batch(1)
+    other, _ = sampler(dataset, noise=0.01, batch_size=8, seed=9).batch(0)
+    for batch in (again, other):
+        for name, nodes in parts(batch):
+            assert not torch.equal(batch.position[nodes], found[name][0].position)
+
+
+def test_a_batch_is_a_pure_function_of_seed_and_step(dataset):
+    one, other = sampler(dataset, noise=0.01), sampler(dataset, noise=0.01)
+    for step in (5, 0, 1000, 0):
+        torch.manual_seed(step)
+        np.random.seed(step)
+        first, first_target = one.batch(step)
+        second, second_target = other.batch(step)
+        assert first.names == second.names
+        assert torch.equal(first.position, second.position)
+        assert torch.equal(first_target.motion, second_target.motion)
+
+
+def test_what_a_batch_holds_is_its_own(dataset):
+    draws = sampler(dataset)
+    batch, target = draws.batch(0)
+    batch.position.fill_(7)
+    target.motion.fill_(7)
+    batch, target = draws.batch(0)
+    assert not (batch.position == 7).any() and not (target.motion == 7).any()
+    assert not (dataset.load("train", 0).position == 7).any()
+
+
+def test_a_plane_scene_keeps_its_plane(tmp_path):
+    scene = Scene(
+        rest_position=np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32),
+        elements=np.array([[0, 1, 2]], np.int32),
+        node_type=np.zeros(3, np.uint8),
+        body=np.zeros(3, np.int32),
+    )
+    flat = Trajectory(scene, np.stack([scene.rest_position, 2 * scene.rest_position]))
+    bent = Trajectory(scene, flat.position + np.array([[[0, 0, 0]], [[0, 0, 1]]], np.float32))
+    with Dataset(write(tmp_path / "d.h5", {"train": [flat, bent]})) as dataset:
+        batch, _ = sampler(dataset, noise=0.1, batch_size=2).batch(0)
+        for name, nodes in parts(batch):
+            noise = batch.position[nodes] - batch.graph.rest_position[nodes]
+            assert (noise[:, :2] != 0).all()
+            assert bool((noise[:, 2] == 0).all()) == (frame_of(name)[0] == 0)
+
+
+def test_a_split_without_pairs_is_an_error(tmp_path):
+    single = trajectory(block(1, 1, 1), 1)
+    with Dataset(write(tmp_path / "d.h5", {"train": [single]})) as dataset:
+        with pytest.raises(DatasetError, match="train has no trajectory of at least 2 frames"):
+            sampler(dataset)
+        with pytest.raises(DatasetError, match="train has no trajectory of at least 3 frames"):
+            sampler(dataset, dynamic=True)
