@@ -102,10 +102,10 @@ def stress_rmse(truth: Trajectory, stress: np.ndarray) -> np.ndarray:
 
 
 def deforming_rows(trajectory: Trajectory) -> np.ndarray:
-    """The stress rows (bool [N] or [E]) that do not belong to an obstacle; an element does if all its nodes do."""
+    """The stress rows (bool [N] or [E]) that do not belong to an obstacle; an element does if any of its nodes does."""
     obstacle = trajectory.scene.node_type == NodeType.OBSTACLE
     if stress_at(trajectory) == "element":
-        obstacle = obstacle[trajectory.scene.elements].all(axis=1)
+        obstacle = obstacle[trajectory.scene.elements].any(axis=1)
     return ~obstacle
 
 

@@ -1,0 +1,206 @@
+"""The report: one self-contained HTML page with moving scenes, error curves, tables and the facts of the run.
+
+The page needs no network: styles, scripts, plotly and all data are inside, and its content security policy lets a
+browser run these scripts only and load nothing. The data are packed arrays (`encode`), drawn by the scripts beside
+this file.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from ast_sim.data.scene import Trajectory
+from ast_sim.errors import AstSimError, require
+from ast_sim.view import tables
+from ast_sim.view.encode import encode_scene, finite_json, motion_bytes
+from ast_sim.view.export import replacing
+
+SCRIPTS = ("common.js", "viewer.js", "charts.js", "page.js")
+MOTION_BYTES = 3_600_000  # of all scenes together; longer ones show every n-th frame
+MIN_FRAMES = 12  # which a scene keeps however large it is
+MAX_RUNS = 6  # a page draws one panel a run, and browsers allow 16 at most
+
+
+@dataclass(frozen=True, eq=False)
+class ReportScene:
+    """A test scene to be shown: `name` as in the evaluation's samples, `label` why it was chosen ("median")."""
+
+    name: str
+    label: str
+    truth: Trajectory
+    prediction: Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class ReportRun:
+    """What the report says of one run.
+
+    Attributes:
+        name: as readers shall know the run.
+        scenes: predictions to be shown.
+        evaluation: what `ast-sim evaluate --json` writes, or None.
+        metrics: the lines of `metrics.jsonl`.
+        facts: model, parameters, data, seeds, in the order to be shown; the evaluation adds its own.
+    """
+
+    name: str
+    scenes: Sequence[ReportScene]
+    evaluation: Mapping[str, Any] | None = None
+    metrics: Sequence[Mapping[str, Any]] = ()
+    facts: Mapping[str, str] = field(default_factory=dict)
+
+
+def representative(errors: Mapping[str, float]) -> list[tuple[str, str]]:
+    """The (label, name) of the best, the median and the worst of scenes by error; of fewer than three, all of them.
+
+    A scene whose error is not finite (a rollout that failed) is worse than any other.
+    """
+    ranked = sorted(errors, key=lambda name: (not errors[name] < float("inf"), errors[name], name))
+    if len(ranked) < 3:
+        return list(zip(["Best", "Worst"] if len(ranked) == 2 else ["Only scene"], ranked, strict=False))
+    return [("Best", ranked[0]), ("Median", ranked[(len(ranked) - 1) // 2]), ("Worst", ranked[-1])]
+
+
+def write(path: str | os.PathLike[str], runs: Sequence[ReportRun], title: str) -> None:
+    """Write the report of one run, or of several side by side, as one HTML file.
+
+    Scenes of several runs are matched by name; the truth and the label are those of the first run that has it.
+
+    Raises:
+        AstSimError: no run, too many, a prediction of another scene than its truth, or the file cannot be written.
+        MissingExtra: plotly is not installed.
+    """
+    path = Path(path)
+    if not 1 <= len(runs) <= MAX_RUNS:
+        raise AstSimError(f"a report shows 1 to {MAX_RUNS} runs, not {len(runs)}")
+    page = render(runs, title)
+    try:
+        with replacing(path) as temporary:
+            temporary.write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise AstSimError(f"{path} cannot be written: {error.strerror or error}; nothing was left there") from error
+
+
+def render(runs: Sequence[ReportRun], title: str) -> str:
+    """The text of the page."""
+    (offline,) = require("view", "plotly.offline")
+    plotly = offline.get_plotlyjs()
+    script = '"use strict";\n(() => {\n' + "\n".join(_template(name) for name in SCRIPTS) + "})();\n"
+    policy = (
+        "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
+        f"script-src {_digest(plotly)} {_digest(script)}; base-uri 'none'; form-action 'none'"
+    )
+    parts = {
+        "title": html.escape(title),
+        "policy": policy,
+        "style": _template("page.css"),
+        "data": _json(page_data(runs)),
+        "plotly": plotly,
+        "script": script,
+    }
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _template("page.html"))
+
+
+def page_data(runs: Sequence[ReportRun]) -> dict[str, Any]:
+    """Everything that the page's scripts show, as JSON."""
+    names = _distinct([run.name for run in runs])
+    evaluations = [dict(run.evaluation) if run.evaluation else None for run in runs]
+    scenes, samples = _scenes(runs), tables.samples(evaluations, names)
+    errors = dict(zip(samples["names"], samples["runs"][0], strict=True)) if samples else {}
+    for scene in scenes:
+        scene["error"] = errors.get(scene["name"])
+    return finite_json(
+        {
+            "lead": _lead(runs, names),
+            "tiles": tables.tiles(evaluations[0]) if len(runs) == 1 else [],
+            "comparison": tables.comparison(names, evaluations),
+            "units": tables.units(evaluations),
+            "scenes": scenes,
+            "scenesNote": _scenes_note(scenes, evaluations[0]),
+            "tables": tables.measure_tables(names if len(runs) > 1 else ["AST"], evaluations),
+            "samples": samples,
+            "runs": [_run(run, name) for run, name in zip(runs, names, strict=True)],
+            "footer": "Made by ast_sim. This page is one file and loads nothing from anywhere.",
+        }
+    )
+
+
+def _run(run: ReportRun, name: str) -> dict[str, Any]:
+    training, validation = tables.training_curves(run.metrics)
+    facts = {**run.facts, **tables.evaluation_facts(dict(run.evaluation) if run.evaluation else None)}
+    rows = [[key, str(value)] for key, value in facts.items()]
+    return {"name": name, "training": training, "validation": validation, "facts": rows}
+
+
+def _scenes(runs: Sequence[ReportRun]) -> list[dict[str, Any]]:
+    """The scenes of all runs, in order of their first appearance, each with one prediction (or None) a run."""
+    first: dict[str, ReportScene] = {}
+    for run in runs:
+        for scene in run.scenes:
+            first.setdefault(scene.name, scene)
+    by_run = [{scene.name: scene.prediction for scene in run.scenes} for run in runs]
+    cost = {
+        name: motion_bytes(scene.truth) * (1 + sum(name in predictions for predictions in by_run))
+        for name, scene in first.items()
+    }
+    total = sum(cost[name] * scene.truth.num_frames for name, scene in first.items())
+    encoded = []
+    for name, scene in first.items():
+        frames = scene.truth.num_frames
+        stride = max(1, min(-(-total // MOTION_BYTES), (frames - 1) // (MIN_FRAMES - 1)))
+        predictions = [predictions.get(name) for predictions in by_run]
+        encoded.append({"name": name, "label": scene.label, **encode_scene(scene.truth, predictions, stride)})
+    return encoded
+
+
+def _scenes_note(scenes: Sequence[dict[str, Any]], evaluation: dict[str, Any] | None) -> str:
+    count = len((evaluation or {}).get("samples") or [])
+    note = ""
+    if {"Best", "Median", "Worst"} <= {scene["label"] for scene in scenes} and count:
+        note = (
+            f"The best, the median and the worst of all {count} test scenes, by the displacement error of the rollout."
+        )
+    if any(len(scene["frames"]) < scene["total"] for scene in scenes):
+        note += " Long scenes show evenly spaced frames only, to keep the page small; the curves have all frames."
+    return note.strip()
+
+
+def _lead(runs: Sequence[ReportRun], names: Sequence[str]) -> str:
+    if len(runs) > 1:
+        return f"Runs compared: {', '.join(names)}."
+    return f"Run {names[0]}: scenes that the model never saw, predicted from their first frame and the obstacle’s path."
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """The names, numbered where one appears again."""
+    counts: dict[str, int] = {}
+    result = []
+    for name in names:
+        counts[name] = counts.get(name, 0) + 1
+        result.append(name if counts[name] == 1 else f"{name} ({counts[name]})")
+    return result
+
+
+def _template(name: str) -> str:
+    return resources.files("ast_sim.view").joinpath(name).read_text(encoding="utf-8")
+
+
+def _digest(script: str) -> str:
+    """The source expression of a content security policy that allows this very script."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'"
+
+
+def _json(data: Any) -> str:
+    """JSON that may stand in a script element: no "<", so nothing inside can end the element or open another."""
+    text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
