@@ -1,0 +1,90 @@
+"""Farthest point sampling: a few cells that cover all others.
+
+Legend: B scenes, C cells, S samples.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ast_sim.ops import library
+from ast_sim.ops.library import array, check_offsets
+
+EXTENT = 1 << 21  # squared distances of smaller differences are exact in float64, and in int32 where they are small
+
+
+def _out_offsets(offsets: Tensor, num: int) -> Tensor:
+    out = torch.zeros_like(offsets)
+    torch.cumsum(offsets.diff().clamp(max=num), 0, out=out[1:])
+    return out
+
+
+def _sample_scene(points: Tensor, num: int) -> Tensor:
+    distance = torch.full_like(points[:, 0], torch.iinfo(torch.int64).max)
+    picks = [torch.zeros_like(distance[0])]
+    while len(picks) < num:
+        distance = torch.minimum(distance, (points - points[picks[-1]]).square().sum(1))
+        distance[picks[-1]] = -1
+        picks.append(distance.argmax())
+    return torch.stack(picks)
+
+
+def _sample_reference(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
+    if coordinates.dim() != 2 or coordinates.shape[1] != 3:
+        raise ValueError(f"farthest_point_sample: coordinates must have shape [*, 3], not {tuple(coordinates.shape)}")
+    if coordinates.dtype != torch.int32:
+        raise TypeError(f"farthest_point_sample: coordinates must be int32, not {coordinates.dtype}")
+    check_offsets("farthest_point_sample", "offsets", offsets, len(coordinates))
+    picks = [offsets[:0]]
+    for scene, (begin, end) in enumerate(zip(offsets.tolist(), offsets[1:].tolist(), strict=False)):
+        points = coordinates[begin:end].long()
+        if len(points) and (points.amax(0) - points.amin(0)).max() >= EXTENT:
+            raise ValueError(f"farthest_point_sample: coordinates of scene {scene} differ by 2^21 or more")
+        few = end - begin <= num
+        picks.append(begin + (torch.arange(end - begin, device=points.device) if few else _sample_scene(points, num)))
+    return torch.cat(picks), _out_offsets(offsets, num)
+
+
+def _sample_kernel(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
+    check_offsets("farthest_point_sample", "offsets", offsets, coordinates.shape[0])
+    out_offsets = _out_offsets(offsets, num)
+    indices = offsets.new_empty(int(out_offsets[-1]))
+    library._C.farthest_point_sample(array(coordinates), array(offsets), num, array(out_offsets), array(indices))
+    return indices, out_offsets
+
+
+def _sample_fake(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
+    return offsets.new_empty(torch.library.get_ctx().new_dynamic_size()), torch.empty_like(offsets)
+
+
+_sample = library.define(
+    "farthest_point_sample(Tensor coordinates, Tensor offsets, int num) -> (Tensor, Tensor)",
+    _sample_kernel,
+    _sample_reference,
+    _sample_fake,
+)
+
+
+def farthest_point_sample(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
+    """Exact greedy farthest point sampling of each scene.
+
+    The first sample is the scene's first point; each further one is the point whose distance to the samples so far is
+    largest, the lowest index of several. Where only duplicates of samples are left, the lowest unused index follows. A
+    scene with at most `num` points gives all of them in order. Distances are exact.
+
+    Args:
+        coordinates: [C, 3] int32; fast where points that follow each other are near each other, as in Morton order.
+        offsets: [B + 1] int64, from 0 to C; the points of scene b are offsets[b]:offsets[b + 1].
+        num: samples of a scene, at least 1.
+
+    Returns:
+        The samples' indices into coordinates, [S] int64, and their offsets, [B + 1] int64.
+
+    Raises:
+        ValueError: for num < 1, for offsets that are not as above, and for a scene whose coordinates differ by 2^21 or
+            more.
+    """
+    if num < 1:
+        raise ValueError(f"farthest_point_sample: num must be at least 1, not {num}")
+    return _sample(coordinates, offsets, num)
