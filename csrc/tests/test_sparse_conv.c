@@ -1,0 +1,185 @@
+/* sparse_conv, its transposed form and its weight gradient against three loops in double.
+ *
+ * Accuracy: the largest error is at most twice that of the same loops in float plus 1e-6 of the largest value.
+ */
+#include "check.h"
+
+enum { OFFSETS = 27 };
+
+typedef struct {
+  int64_t sources, destinations, offsets[OFFSETS + 1];
+  int64_t *source, *destination;
+} pair_list;
+
+/* A destination has a pair in a group with the given probability; its source is any row of the same part of the rows, of
+ * which there are `parts` (the scenes of a batch). */
+static pair_list new_pairs(int64_t sources, int64_t destinations, double density, int64_t parts) {
+  pair_list p = {.sources = sources, .destinations = destinations};
+  p.source = malloc((size_t)(OFFSETS * destinations + 1) * sizeof(int64_t));
+  p.destination = malloc((size_t)(OFFSETS * destinations + 1) * sizeof(int64_t));
+  CHECK(p.source && p.destination, "no memory");
+  int64_t n = 0;
+  for (int k = 0; k < OFFSETS; k++) {
+    for (int64_t d = 0; d < destinations; d++) {
+      if (sources < parts || random_unit() >= density || k == 5) continue; /* group 5 is empty */
+      const int64_t part = d * parts / destinations, first = part * sources / parts, last = (part + 1) * sources / parts;
+      p.source[n] = first + (int64_t)(random_bits() % (uint64_t)(last - first));
+      p.destination[n++] = d;
+    }
+    p.offsets[k + 1] = n;
+  }
+  return p;
+}
+
+static float *random_floats(int64_t n) {
+  float *x = malloc((size_t)(n + 1) * sizeof *x);
+  CHECK(x, "no memory");
+  for (int64_t i = 0; i < n; i++) x[i] = random_float();
+  return x;
+}
+
+static float *unwritten(int64_t n) {
+  float *x = random_floats(n);
+  memset(x, 0xff, (size_t)n * sizeof *x);
+  return x;
+}
+
+static float *convolve(const ast_kernels *kernels, const pair_list *p, const float *x, const float *weight, int64_t C_in, int64_t C_out,
+                       bool transposed) {
+  float *out = unwritten(p->destinations * C_out);
+  const ast_pairs pairs = {p->offsets, p->source, p->destination};
+  CHECK(kernels->sparse_conv(x, weight, C_in, C_out, transposed, pairs, p->destinations, out) == AST_OK, "status");
+  return out;
+}
+
+static float *weight_gradient(const ast_kernels *kernels, const pair_list *p, const float *x, const float *dout, int64_t C_in,
+                              int64_t C_out) {
+  float *dweight = unwritten(OFFSETS * C_in * C_out);
+  const ast_pairs pairs = {p->offsets, p->source, p->destination};
+  CHECK(kernels->sparse_conv_weight(x, dout, C_in, C_out, pairs, dweight) == AST_OK, "status");
+  return dweight;
+}
+
+#define FORMULA(name, real)                                                                                                 \
+  static void name(const pair_list *p, const float *x, const float *weight, const float *dout, int64_t C_in, int64_t C_out, \
+                   bool transposed, real *out, real *dweight) {                                                             \
+    for (int64_t k = 0; k < OFFSETS; k++)                                                                                   \
+      for (int64_t i = p->offsets[k]; i < p->offsets[k + 1]; i++)                                                           \
+        for (int64_t a = 0; a < C_in; a++)                                                                                  \
+          for (int64_t b = 0; b < C_out; b++) {                                                                             \
+            const real w = (real)weight[k * C_in * C_out + (transposed ? b * C_in + a : a * C_out + b)];                    \
+            const real x_pa = (real)x[p->source[i] * C_in + a];                                                             \
+            out[p->destination[i] * C_out + b] += x_pa * w;                                                                 \
+            dweight[(k * C_in + a) * C_out + b] += x_pa * (real)dout[p->destination[i] * C_out + b];                        \
+          }                                                                                                                 \
+  }
+FORMULA(formula, double)
+FORMULA(formula_float, float)
+
+static void compare(const char *what, const float *got, const double *exact, const float *plain, int64_t n) {
+  double error = 0, plain_error = 0, largest = 0;
+  for (int64_t i = 0; i < n; i++) {
+    CHECK(isfinite(got[i]), "%s[%lld] is %g", what, (long long)i, (double)got[i]);
+    error = fmax(error, fabs((double)got[i] - exact[i]));
+    plain_error = fmax(plain_error, fabs((double)plain[i] - exact[i]));
+    largest = fmax(largest, fabs(exact[i]));
+  }
+  CHECK(error <= 2 * plain_error + 1e-6 * largest, "%s is off by %g of %g, plain float by %g", what, error, largest, plain_error);
+}
+
+static void check_case(const ast_kernels *kernels, int64_t sources, int64_t destinations, int64_t C_in, int64_t C_out, bool transposed) {
+  pair_list p = new_pairs(sources, destinations, 0.2, 1);
+  const int64_t n = destinations * C_out, m = OFFSETS * C_in * C_out;
+  float *x = random_floats(sources * C_in), *weight = random_floats(m), *dout = random_floats(n);
+  double *exact = calloc((size_t)(n + m + 1), sizeof *exact);
+  float *plain = calloc((size_t)(n + m + 1), sizeof *plain);
+  CHECK(exact && plain, "no memory");
+  formula(&p, x, weight, dout, C_in, C_out, transposed, exact, exact + n);
+  formula_float(&p, x, weight, dout, C_in, C_out, transposed, plain, plain + n);
+  float *out = convolve(kernels, &p, x, weight, C_in, C_out, transposed), *dweight = weight_gradient(kernels, &p, x, dout, C_in, C_out);
+  compare("out", out, exact, plain, n);
+  compare("dweight", dweight, exact + n, plain + n, m);
+  free(p.source), free(p.destination), free(x), free(weight), free(dout), free(exact), free(plain), free(out), free(dweight);
+}
+
+static void test_accuracy(const ast_kernels *kernels) {
+  static const int64_t channels[][2] = {{0, 3}, {3, 0}, {1, 1}, {1, 16}, {3, 5}, {16, 8}, {17, 33}, {64, 64}, {65, 130}};
+  static const int64_t rows[][2] = {{0, 0}, {0, 3}, {4, 0}, {1, 1}, {2, 2}, {9, 300}, {700, 129}};
+  for (int c = 0; c < 9; c++)
+    for (int r = 0; r < 7; r++) check_case(kernels, rows[r][0], rows[r][1], channels[c][0], channels[c][1], (c + r) % 2);
+}
+
+/* The transposed form is the adjoint: <conv(x), y> = <x, conv'(y)>, with the pairs of conv' sorted by the other end. */
+static void test_adjoint(const ast_kernels *kernels) {
+  const int64_t C_in = 24, C_out = 40, n = 200;
+  pair_list p = new_pairs(n, n, 0, 1), q = new_pairs(n, n, 0, 1);
+  int64_t num = 0;
+  for (int k = 0; k < OFFSETS; k++) { /* destination = source + k */
+    for (int64_t i = 0; i + k < n; i++, num++) {
+      p.source[num] = q.destination[num] = i;
+      p.destination[num] = q.source[num] = i + k;
+    }
+    p.offsets[k + 1] = q.offsets[k + 1] = num;
+  }
+  float *x = random_floats(n * C_in), *y = random_floats(n * C_out), *weight = random_floats(OFFSETS * C_in * C_out);
+  float *out = convolve(kernels, &p, x, weight, C_in, C_out, false), *back = convolve(kernels, &q, y, weight, C_out, C_in, true);
+  double left = 0, right = 0, magnitude = 0;
+  for (int64_t i = 0; i < n * C_out; i++) left += (double)out[i] * (double)y[i], magnitude += fabs((double)out[i] * (double)y[i]);
+  for (int64_t i = 0; i < n * C_in; i++) right += (double)x[i] * (double)back[i];
+  CHECK(fabs(left - right) <= 1e-6 * magnitude, "%.9g and %.9g", left, right);
+  free(p.source), free(p.destination), free(q.source), free(q.destination), free(x), free(y), free(weight), free(out), free(back);
+}
+
+/* A scene alone gives the bits that it gives in a batch, and a NaN in another scene does not reach it. */
+static void test_batch(const ast_kernels *kernels) {
+  const int64_t C_in = 20, C_out = 36, sources = 900, destinations = 3000;
+  pair_list both = new_pairs(sources, destinations, 0.1, 2), one = {.sources = sources / 2, .destinations = destinations / 2};
+  one.source = malloc((size_t)both.offsets[OFFSETS] * sizeof(int64_t)),
+  one.destination = malloc((size_t)both.offsets[OFFSETS] * sizeof(int64_t));
+  CHECK(one.source && one.destination, "no memory");
+  int64_t n = 0;
+  for (int k = 0; k < OFFSETS; k++) {
+    for (int64_t i = both.offsets[k]; i < both.offsets[k + 1]; i++)
+      if (both.destination[i] >= one.destinations) {
+        one.source[n] = both.source[i] - one.sources;
+        one.destination[n++] = both.destination[i] - one.destinations;
+      }
+    one.offsets[k + 1] = n;
+  }
+  float *x = random_floats(sources * C_in), *weight = random_floats(OFFSETS * C_in * C_out);
+  for (int64_t i = 0; i < one.sources * C_in; i += 7) x[i] = NAN;
+  float *batch = convolve(kernels, &both, x, weight, C_in, C_out, false);
+  float *alone = convolve(kernels, &one, x + one.sources * C_in, weight, C_in, C_out, false);
+  for (int64_t i = 0; i < one.destinations * C_out; i++) CHECK(isfinite(alone[i]), "out[%lld]", (long long)i);
+  CHECK(!memcmp(alone, batch + one.destinations * C_out, (size_t)(one.destinations * C_out) * sizeof *alone), "not the same bits");
+  free(both.source), free(both.destination), free(one.source), free(one.destination), free(x), free(weight), free(batch), free(alone);
+}
+
+/* The pool that this run is on gives what the calling thread alone gives. */
+static void test_threads(const ast_kernels *kernels) {
+  const int64_t C_in = 70, C_out = 32, n = 2500;
+  pair_list p = new_pairs(n, n, 0.1, 1);
+  float *x = random_floats(n * C_in), *dout = random_floats(n * C_out), *weight = random_floats(OFFSETS * C_in * C_out), *out[2],
+        *dweight[2];
+  for (int i = 0; i < 2; i++) {
+    if (i) ast_set_pool(NULL, NULL);
+    out[i] = convolve(kernels, &p, x, weight, C_in, C_out, false);
+    dweight[i] = weight_gradient(kernels, &p, x, dout, C_in, C_out);
+  }
+  CHECK(!memcmp(out[0], out[1], (size_t)(n * C_out) * sizeof(float)), "threads change the result");
+  CHECK(!memcmp(dweight[0], dweight[1], (size_t)(OFFSETS * C_in * C_out) * sizeof(float)), "threads change the weight gradient");
+  free(p.source), free(p.destination), free(x), free(dout), free(weight);
+  for (int i = 0; i < 2; i++) free(out[i]), free(dweight[i]);
+}
+
+static void test(const ast_kernels *kernels) {
+  test_accuracy(kernels);
+  test_adjoint(kernels);
+  test_batch(kernels);
+  test_threads(kernels); /* last: it takes the pool away */
+}
+
+int main(void) {
+  on_every_table(test);
+  return 0;
+}
