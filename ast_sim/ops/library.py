@@ -1,0 +1,130 @@
+"""How a kernel of the C core becomes a torch op.
+
+Every op has two bodies of the same meaning: the C kernel, for float32 on the CPU, and a composition of torch ops, which
+is its reference in the tests and runs for any other device or dtype, or everywhere with AST_SIM_BACKEND=torch.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+BACKEND = os.environ.get("AST_SIM_BACKEND", "c")
+if BACKEND not in ("c", "torch"):
+    raise ImportError(f"AST_SIM_BACKEND={BACKEND} is unknown: choose c or torch")
+
+_library = torch.library.Library("ast_sim", "DEF")
+
+
+def _share_torch_threads() -> None:
+    """Hand torch's thread pool (C symbols of libtorch_cpu since torch 2.10) to the C core; else it is serial."""
+    name = {"darwin": "libtorch_cpu.dylib", "win32": "torch_cpu.dll"}.get(sys.platform, "libtorch_cpu.so")
+    try:
+        library = ctypes.CDLL(str(Path(torch.__file__).parent / "lib" / name))
+        pool = [library.torch_parallel_for, library.torch_get_num_threads]
+    except (OSError, AttributeError):
+        return
+    _C.set_pool(*(ctypes.cast(function, ctypes.c_void_p).value for function in pool))
+
+
+if BACKEND == "c":
+    from ast_sim import _C
+
+    _share_torch_threads()
+
+
+def define(schema: str, kernel: Callable, reference: Callable, fake: Callable) -> torch._ops.OpOverload:
+    """Register the op `ast_sim::<schema>`.
+
+    Args:
+        schema: name and signature in torch's schema language; functional, fresh outputs only.
+        kernel: the body over the C core; called with CPU tensors whose floating ones are all float32.
+        reference: the same as a composition of torch ops, for any device and dtype.
+        fake: the shapes of the outputs, for tracing.
+    """
+    name = schema.split("(")[0]
+
+    def on_cpu(*args):
+        floats = [x for x in args if isinstance(x, torch.Tensor) and x.is_floating_point()]
+        if BACKEND == "torch" or any(x.dtype != torch.float32 for x in floats):
+            return reference(*args)
+        for x in args:
+            if isinstance(x, torch.Tensor) and x.device.type != "cpu":
+                raise ValueError(f"{name}: all tensors must lie on one device, found {x.device} beside cpu")
+        return kernel(*args)
+
+    _library.define(schema)
+    _library.impl(name, on_cpu, "CPU")
+    _library.impl(name, reference, "CompositeExplicitAutograd")
+    torch.library.register_fake(f"ast_sim::{name}", fake, lib=_library)
+    torch.library.register_autocast(f"ast_sim::{name}", "cpu", torch.float32, lib=_library)
+    return getattr(torch.ops.ast_sim, name).default
+
+
+def differentiate(op: torch._ops.OpOverload, setup_context: Callable, backward: Callable) -> None:
+    """Register the gradient of an op; `backward` calls ops only, so that it can be traced."""
+    torch.library.register_autograd(op.name(), backward, setup_context=setup_context, lib=_library)
+
+
+def array(x: torch.Tensor) -> np.ndarray:
+    """The tensor as an aligned, contiguous NumPy array, without a copy where it already is one."""
+    x = x.detach().contiguous()
+    if x.data_ptr() % x.element_size():
+        x = x.clone()
+    return x.numpy()
+
+
+def check_offsets(op: str, name: str, offsets: torch.Tensor, rows: int) -> None:
+    """Raise ValueError unless offsets, int64 [B + 1], start with 0, never fall and end at the number of rows."""
+    if offsets.dtype != torch.int64:
+        raise TypeError(f"{op}: {name} must be int64, not {offsets.dtype}")
+    if offsets.dim() != 1:
+        raise ValueError(f"{op}: {name} must have shape [*], not {tuple(offsets.shape)}")
+    if len(offsets) < 1 or offsets[0] != 0:
+        raise ValueError(f"{op}: {name} must start with 0")
+    falls = (offsets.diff() < 0).nonzero()
+    if len(falls):
+        at = int(falls[0]) + 1
+        raise ValueError(f"{op}: {name} must never fall, but falls to {int(offsets[at])} at {at}")
+    if offsets[-1] != rows:
+        raise ValueError(f"{op}: {name} must end at the number of rows {rows}, not {int(offsets[-1])}")
+
+
+def configuration() -> dict:
+    """What runs here: the backend, the instruction set, the threads and the versions."""
+    core = _C.configuration() if BACKEND == "c" else {}
+    return {
+        "backend": BACKEND,
+        "instruction_set": core.get("isa", "-"),
+        "supported": core.get("supported", []),
+        "threads": torch.get_num_threads(),
+        "core_threads": core.get("threads", 0),
+        "debug": core.get("debug", False),
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+        "python": sys.version.split()[0],
+    }
+
+
+def show_config() -> None:
+    """Print what runs here: the backend, the chosen instruction set, the threads and the versions."""
+    for name, value in configuration().items():
+        print(f"{name:16} {', '.join(value) if isinstance(value, list) else value}")
+
+
+def keep_memory() -> bool:
+    """Let the C library keep large freed blocks instead of giving them back to the system at every free.
+
+    Fresh pages cost more than the arithmetic on them: this can double the speed of training on the CPU, at the price of
+    a process that holds its peak memory. Process-wide; returns whether it had an effect (glibc only).
+    AST_SIM_KEEP_MEMORY=0 turns it off.
+    """
+    if BACKEND == "torch" or os.environ.get("AST_SIM_KEEP_MEMORY") == "0":
+        return False
+    return _C.keep_memory()

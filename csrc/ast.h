@@ -1,0 +1,125 @@
+/* The public C interface of the ast_sim core: status codes, types and one contract per kernel.
+ *
+ * Nothing here knows Python, torch or OpenMP. Sizes and indices are int64_t. Float arrays are float32, row major and dense
+ * unless a row stride is an argument. Ragged batches are concatenated; `offsets` [B+1] starts at 0, never falls and ends at
+ * the number of rows. Inputs are never changed and outputs are written in full. The caller has checked shapes, offsets and
+ * index ranges (module.c does it for Python); a kernel checks only what it alone can see, such as a point outside the cube.
+ *
+ * Legend: B scenes, N nodes, C cells, T tokens, F channels, C_in and C_out channels of a convolution, H heads, D channels of a head.
+ */
+#ifndef AST_H
+#define AST_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+typedef enum {
+  AST_OK = 0,
+  AST_NO_MEMORY,  /* scratch memory could not be had; outputs are undefined */
+  AST_NOT_FINITE, /* octree: a position is NaN or infinite */
+  AST_OUTSIDE,    /* octree: a position lies outside the cube; farthest_point_sample: a scene is 2^21 or more wide */
+  AST_MISMATCH,   /* octree_pairs: pair_offsets are not those of the neighbours */
+} ast_status;
+
+/* The sizes of one attention: query rows of scene b attend to all key rows of scene b. */
+typedef struct {
+  int64_t B, H, D;
+  const int64_t *q_offsets, *k_offsets; /* [B+1] */
+  int64_t q_stride, k_stride, v_stride; /* floats from one row of q, k, v to the next, at least H*D */
+  float scale;
+  double dropout_p; /* weights are dropped with this probability, 0 <= p < 1 */
+  uint64_t seed;    /* of the counter-based generator: key (seed), counter (scene, head, query, key) */
+} ast_attention;
+
+/* The pairs of a sparse convolution, grouped by kernel offset: group k is [offsets[k], offsets[k+1]) for k < 27.
+ * Within a group `destination` rises strictly, so no two pairs of a group write the same row. */
+typedef struct {
+  const int64_t *offsets;              /* [28] */
+  const int64_t *source, *destination; /* [offsets[27]] */
+} ast_pairs;
+
+/* One table per instruction set; every entry has the same contract on each. */
+typedef struct {
+  const char *isa;
+  int vector_bytes;
+
+  /* out[c] = sum (or mean) of x[node_order[j]] for node_offsets[c] <= j < node_offsets[c+1], in that order; 0 if empty.
+   * x [N,F], node_order [node_offsets[C]], out [C,F]. */
+  ast_status (*segment_sum)(const float *restrict x, int64_t F, const int64_t *restrict node_order, const int64_t *restrict node_offsets,
+                            int64_t C, bool mean, float *restrict out);
+  /* The adjoint: dx[node_order[j]] = dout[c] (over the number of rows of c if mean). node_order is a permutation of 0..N-1. */
+  ast_status (*segment_spread)(const float *restrict dout, int64_t F, const int64_t *restrict node_order,
+                               const int64_t *restrict node_offsets, int64_t C, bool mean, float *restrict dx);
+
+  /* Cells of `positions` [N,3] in the cube center +- half_width cut into 2^depth parts per axis, 0 <= depth <= 21.
+   * Index per axis: floor((p - center + half_width) / (2 half_width) * 2^depth) in double, clamped to [0, 2^depth - 1];
+   * Morton key with x as the most significant axis. Capacity: keys [N], node_offsets [N+1]; cells in use: cell_offsets[B].
+   * node_order is stable: by scene, key, node. On AST_NOT_FINITE and AST_OUTSIDE (beyond 1e-6 of the width of the cube)
+   * *bad_node is the first such node. */
+  ast_status (*octree_build)(const float *restrict positions, const int64_t *restrict offsets, int64_t B, const double center[3],
+                             double half_width, int depth, int64_t *restrict keys, int64_t *restrict cell_offsets,
+                             int64_t *restrict node_cell, int64_t *restrict node_order, int64_t *restrict node_offsets, int64_t *bad_node);
+  /* coordinates [C,3]: x, y and z of each cell, 0..2^21 - 1. */
+  ast_status (*octree_coordinates)(const int64_t *restrict keys, int64_t C, int32_t *restrict coordinates);
+  /* The next coarser level of cells keys [C_fine] (ascending within a scene). Capacity: coarse_keys [C_fine], first_child
+   * [C_fine+1], neighbours [C_fine,8]; cells in use: coarse_offsets[B]. first_child[p] is the first fine cell of coarse cell p.
+   * neighbours[p][4i+2j+k] is the coarse cell of the same scene at P - (i,j,k), or -1. pair_offsets [28] counts, as running
+   * sums, the pairs (fine, coarse) with fine = 2 P + (a,b,c), grouped by kernel offset 9(a+1) + 3(b+1) + (c+1). */
+  ast_status (*octree_coarsen)(const int64_t *restrict keys, const int64_t *restrict offsets, int64_t B, int64_t *restrict coarse_keys,
+                               int64_t *restrict coarse_offsets, int64_t *restrict first_child, int64_t *restrict neighbours,
+                               int64_t *restrict pair_offsets);
+  /* Those pairs twice: (fine, coarse) with coarse rising within each group, and (fine_by_fine, coarse_by_fine) with fine
+   * rising within each group. Each array [pair_offsets[27]]. */
+  ast_status (*octree_pairs)(const int64_t *restrict keys, int64_t C_fine, const int64_t *restrict first_child,
+                             const int64_t *restrict neighbours, int64_t C_coarse, const int64_t *restrict pair_offsets,
+                             int64_t *restrict fine, int64_t *restrict coarse, int64_t *restrict fine_by_fine,
+                             int64_t *restrict coarse_by_fine);
+
+  /* Exact greedy farthest point sampling of coordinates [C,3], per scene min(num, C_b) indices (into the
+   * whole array) from out_offsets[b] on: the first is the scene's first point, ties go to the lowest index, and once all
+   * distances are 0 the lowest unused index follows. A scene with at most `num` points gives all of them, ascending.
+   * AST_OUTSIDE if two coordinates of a scene differ by 2^21 or more. */
+  ast_status (*farthest_point_sample)(const int32_t *restrict coordinates, const int64_t *restrict offsets, int64_t B, int64_t num,
+                                      const int64_t *restrict out_offsets, int64_t *restrict indices);
+
+  /* out[destination] += x[source] W_k over all pairs of group k, groups in ascending order. weight [27,C_in,C_out]; with `transposed`
+   * weight [27,C_out,C_in] is used as W_k^T. x [*,C_in], out [num_out,C_out]; rows without pairs are 0. */
+  ast_status (*sparse_conv)(const float *restrict x, const float *restrict weight, int64_t C_in, int64_t C_out, bool transposed,
+                            ast_pairs pairs, int64_t num_out, float *restrict out);
+  /* dweight[k] = sum over the pairs of group k of x[source]^T dout[destination], in the order of the pairs. dweight [27,C_in,C_out]. */
+  ast_status (*sparse_conv_weight)(const float *restrict x, const float *restrict dout, int64_t C_in, int64_t C_out, ast_pairs pairs,
+                                   float *restrict dweight);
+
+  /* out[q,h] = sum_k P[q,h,k] v[k,h], P = dropout(softmax_k(x)) of the scores x = scale q[q,h] . k[k,h]; maximum = max_k x and
+   * sum = sum_k exp(x - maximum), so that log sum exp is maximum + log(sum). q [Tq,H,D], k and v [Tk,H,D], out [Tq,H,D] dense,
+   * maximum and sum [Tq,H]; D is a multiple of 16, at most 128. Without keys: out 0, maximum -inf, sum 0. A row with a NaN or
+   * +inf score, or with only -inf, is NaN in all outputs. */
+  ast_status (*attention)(const ast_attention *s, const float *restrict q, const float *restrict k, const float *restrict v,
+                          float *restrict out, float *restrict maximum, float *restrict sum);
+  /* Its gradients, P recomputed from maximum and sum. dq [Tq,H,D], dk and dv [Tk,H,D] dense. */
+  ast_status (*attention_backward)(const ast_attention *s, const float *restrict q, const float *restrict k, const float *restrict v,
+                                   const float *restrict out, const float *restrict maximum, const float *restrict sum,
+                                   const float *restrict dout, float *restrict dq, float *restrict dk, float *restrict dv);
+} ast_kernels;
+
+/* dispatch.c: the table of an instruction set by name ("base", "avx2", "avx512"), or of the best one if name is NULL.
+ * NULL if it was not compiled in or the processor and system do not support it. */
+const ast_kernels *ast_select(const char *name);
+
+/* parallel.c: runs task(i, context) for 0 <= i < tasks, on the threads of the pool if one was set, and returns the first
+ * status by index that is not AST_OK. Tasks are handed out dynamically: a task must depend on its index alone. */
+typedef ast_status (*ast_task)(int64_t index, void *context);
+ast_status ast_parallel(int64_t tasks, ast_task task, void *context);
+/* The pool: torch's own (torch_parallel_for, torch_get_num_threads), handed over as pointers; NULL means serial. */
+typedef int32_t (*ast_parallel_for)(int64_t begin, int64_t end, int64_t grain, void (*body)(int64_t, int64_t, void *), void *context);
+typedef int32_t (*ast_num_threads)(uint32_t *num);
+void ast_set_pool(ast_parallel_for parallel_for, ast_num_threads num_threads);
+int64_t ast_threads(void);
+
+/* memory.c: scratch of the calling thread, 64-byte aligned and kept between calls; one per slot. NULL if memory is out. */
+enum { AST_SLOTS = 8 };
+void *ast_scratch(int slot, int64_t bytes);
+/* Lets the C library keep large freed blocks (glibc): fresh pages cost more than the arithmetic. True if it had an effect. */
+bool ast_keep_memory(void);
+
+#endif

@@ -1,0 +1,35 @@
+/* All kernels of one instruction set as one translation unit: isa_*.c names the set and includes this file. Everything is
+ * static, so that code for a newer processor can never be picked by the linker for an older one. */
+#include "ast.h"
+#include "simd.h"
+#include "gemm.h"
+
+#include "attention.c"
+#include "fps.c"
+#include "octree.c"
+#include "coarsen.c" /* after octree.c, whose runs it uses */
+#include "segment.c"
+#include "sparse_conv.c"
+
+#define AST_TABLE_OF(isa)  ast_kernels_##isa
+#define AST_TABLE(isa)     AST_TABLE_OF(isa)
+#define AST_STRING_OF(isa) #isa
+#define AST_STRING(isa)    AST_STRING_OF(isa)
+
+extern const ast_kernels AST_TABLE(AST_ISA);
+
+const ast_kernels AST_TABLE(AST_ISA) = {
+    .isa = AST_STRING(AST_ISA),
+    .vector_bytes = AST_VECTOR_BYTES,
+    .segment_sum = segment_sum,
+    .segment_spread = segment_spread,
+    .octree_build = octree_build,
+    .octree_coordinates = octree_coordinates,
+    .octree_coarsen = octree_coarsen,
+    .octree_pairs = octree_pairs,
+    .farthest_point_sample = farthest_point_sample,
+    .sparse_conv = sparse_conv,
+    .sparse_conv_weight = sparse_conv_weight,
+    .attention = attention,
+    .attention_backward = attention_backward,
+};

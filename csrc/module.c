@@ -1,0 +1,604 @@
+/* The Python module ast_sim._C: checks every argument, then calls a kernel with the GIL released.
+ *
+ * Arrays are NumPy arrays of exact dtype, aligned and row major; outputs are allocated by the caller. A message names the op,
+ * the argument and the offending value. With AST_SIM_DEBUG=1 outputs are filled with NaN (integers: -1) before the kernel
+ * runs, and inputs are compared with copies afterwards.
+ */
+#define PY_SSIZE_T_CLEAN
+#define Py_LIMITED_API 0x030B0000
+#include <Python.h>
+
+#define NPY_NO_DEPRECATED_API NPY_2_0_API_VERSION
+#define NPY_TARGET_VERSION    NPY_1_23_API_VERSION
+#include <numpy/arrayobject.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "ast.h"
+
+static const ast_kernels *kernels;
+static bool debug;
+
+/* ---- arguments ---- */
+
+enum { FLOATS = NPY_FLOAT32, INTS = NPY_INT64, SMALL_INTS = NPY_INT32 };
+enum { MAX_ARRAYS = 12, MAX_SHAPE = 4, ANY = -1 };
+
+typedef struct {
+  const char *name;
+  PyArrayObject *array;
+  void *data;
+  int64_t shape[MAX_SHAPE];
+  int64_t row_stride; /* in items */
+  bool output;
+  void *copy; /* debug: what an input held before the call */
+} argument;
+
+typedef struct {
+  const char *op;
+  PyObject *const *objects;
+  int next;
+  argument arrays[MAX_ARRAYS];
+  int num_arrays;
+} call;
+
+static bool start(call *c, const char *op, PyObject *const *objects, Py_ssize_t num, int arity) {
+  *c = (call){.op = op, .objects = objects};
+  if (num == arity) return true;
+  PyErr_Format(PyExc_TypeError, "%s takes %d arguments, not %zd", op, arity, num);
+  return false;
+}
+
+static bool fail(const call *c, PyObject *type, const char *format, ...) {
+  va_list values;
+  va_start(values, format);
+  PyObject *text = PyUnicode_FromFormatV(format, values);
+  va_end(values);
+  if (text) PyErr_Format(type, "%s: %U", c->op, text);
+  Py_XDECREF(text);
+  return false;
+}
+
+static const char *type_name(int type) { return type == FLOATS ? "float32" : type == INTS ? "int64" : "int32"; }
+
+static bool check_layout(const call *c, const argument *a, bool strided_rows) {
+  PyArrayObject *array = a->array;
+  const npy_intp item = PyArray_ITEMSIZE(array);
+  npy_intp expected = item;
+  if (!PyArray_ISBEHAVED_RO(array)) return fail(c, PyExc_ValueError, "%s must be aligned and in native byte order", a->name);
+  for (int d = PyArray_NDIM(array) - 1; d >= 0; d--) {
+    const npy_intp stride = PyArray_STRIDE(array, d), length = PyArray_DIM(array, d);
+    const bool free_stride = strided_rows && d == 0 && stride >= expected && stride % item == 0;
+    if (PyArray_SIZE(array) && length > 1 && stride != expected && !free_stride)
+      return fail(c, PyExc_ValueError, "%s must be contiguous", a->name);
+    expected *= length;
+  }
+  return true;
+}
+
+/* The next argument as an array of this type and shape; ANY lengths are free. NULL if it does not fit. */
+static argument *take(call *c, const char *name, int type, bool output, bool strided_rows, int ndim, ...) {
+  PyObject *object = c->objects[c->next++];
+  argument *a = &c->arrays[c->num_arrays];
+  *a = (argument){.name = name, .output = output};
+  if (!PyArray_Check(object)) {
+    fail(c, PyExc_TypeError, "%s must be a NumPy array, not %R", name, (PyObject *)Py_TYPE(object));
+    return NULL;
+  }
+  a->array = (PyArrayObject *)object;
+  if (PyArray_TYPE(a->array) != type) {
+    fail(c, PyExc_TypeError, "%s must be %s, not %R", name, type_name(type), (PyObject *)PyArray_DESCR(a->array));
+    return NULL;
+  }
+  bool fits = PyArray_NDIM(a->array) == ndim;
+  va_list lengths;
+  va_start(lengths, ndim);
+  char wanted[96] = "";
+  for (int d = 0; d < ndim; d++) {
+    const int64_t length = va_arg(lengths, int64_t);
+    const size_t used = strlen(wanted);
+    if (length == ANY) snprintf(wanted + used, sizeof wanted - used, "%s*", d ? ", " : "");
+    else snprintf(wanted + used, sizeof wanted - used, "%s%lld", d ? ", " : "", (long long)length);
+    if (!fits) continue;
+    a->shape[d] = PyArray_DIM(a->array, d);
+    if (length != ANY && a->shape[d] != length) fits = false;
+  }
+  va_end(lengths);
+  if (!fits) {
+    PyObject *shape = PyObject_GetAttrString(object, "shape");
+    if (shape) fail(c, PyExc_ValueError, "%s must have shape [%s], not %R", name, wanted, shape);
+    Py_XDECREF(shape);
+    return NULL;
+  }
+  if (output && !PyArray_ISWRITEABLE(a->array)) {
+    fail(c, PyExc_ValueError, "%s must be writeable", name);
+    return NULL;
+  }
+  if (!check_layout(c, a, strided_rows)) return NULL;
+  a->data = PyArray_DATA(a->array);
+  a->row_stride = ndim && a->shape[0] > 1 ? PyArray_STRIDE(a->array, 0) / PyArray_ITEMSIZE(a->array) : 0;
+  for (int d = 1; a->shape[0] <= 1 && d < ndim; d++) a->row_stride = (d == 1 ? 1 : a->row_stride) * a->shape[d];
+  c->num_arrays++;
+  return a;
+}
+
+#define IN(c, name, type, ndim, ...)  take(c, name, type, false, false, ndim, __VA_ARGS__)
+#define IN_ROWS(c, name, ndim, ...)   take(c, name, FLOATS, false, true, ndim, __VA_ARGS__)
+#define OUT(c, name, type, ndim, ...) take(c, name, type, true, false, ndim, __VA_ARGS__)
+#define FREE                          ((int64_t)ANY)
+
+static bool take_int(call *c, const char *name, int64_t low, int64_t high, int64_t *out) {
+  *out = PyLong_AsLongLong(c->objects[c->next++]);
+  if (*out == -1 && PyErr_Occurred()) return false;
+  if (*out < low || *out > high)
+    return fail(c, PyExc_ValueError, "%s must lie in %lld..%lld, not %lld", name, (long long)low, (long long)high, (long long)*out);
+  return true;
+}
+
+static bool take_float(call *c, double *out) {
+  *out = PyFloat_AsDouble(c->objects[c->next++]);
+  return !(*out == -1 && PyErr_Occurred());
+}
+
+static bool check_offsets(const call *c, const argument *a, int64_t rows) {
+  const int64_t *offsets = a->data, n = a->shape[0];
+  if (n < 1 || offsets[0] != 0) return fail(c, PyExc_ValueError, "%s must start with 0", a->name);
+  for (int64_t i = 1; i < n; i++)
+    if (offsets[i] < offsets[i - 1])
+      return fail(c, PyExc_ValueError, "%s must never fall, but falls to %lld at %lld", a->name, (long long)offsets[i], (long long)i);
+  if (offsets[n - 1] != rows)
+    return fail(c, PyExc_ValueError, "%s must end at the number of rows %lld, not %lld", a->name, (long long)rows,
+                (long long)offsets[n - 1]);
+  return true;
+}
+
+static bool check_indices(const call *c, const argument *a, int64_t length, int64_t bound) {
+  const int64_t *index = a->data;
+  for (int64_t i = 0; i < length; i++)
+    if (index[i] < 0 || index[i] >= bound)
+      return fail(c, PyExc_ValueError, "%s[%lld] = %lld is not an index below %lld", a->name, (long long)i, (long long)index[i],
+                  (long long)bound);
+  return true;
+}
+
+static bool check_permutation(const call *c, const argument *a, int64_t n) {
+  if (!check_indices(c, a, n, n)) return false;
+  const int64_t *index = a->data;
+  uint8_t *seen = ast_scratch(0, n / 8 + 1);
+  if (!seen) return PyErr_NoMemory(), false;
+  memset(seen, 0, (size_t)(n / 8 + 1));
+  for (int64_t i = 0; i < n; i++) {
+    const uint8_t bit = (uint8_t)(1u << (index[i] & 7));
+    if (seen[index[i] >> 3] & bit)
+      return fail(c, PyExc_ValueError, "%s must be a permutation, but holds %lld twice", a->name, (long long)index[i]);
+    seen[index[i] >> 3] |= bit;
+  }
+  return true;
+}
+
+/* Group k of the pairs is offsets[k]..offsets[k+1]; destinations rise strictly within it. */
+static bool check_pairs(const call *c, const argument *offsets, const argument *source, int64_t sources, const argument *destination,
+                        int64_t destinations, bool rising) {
+  if (!check_offsets(c, offsets, source->shape[0]) || !check_indices(c, source, source->shape[0], sources) ||
+      !check_indices(c, destination, destination->shape[0], destinations))
+    return false;
+  const int64_t *offset = offsets->data, *index = destination->data;
+  for (int64_t k = 0; rising && k < 27; k++)
+    for (int64_t i = offset[k] + 1; i < offset[k + 1]; i++)
+      if (index[i] <= index[i - 1])
+        return fail(c, PyExc_ValueError, "%s must rise strictly within each kernel offset, but does not at %lld", destination->name,
+                    (long long)i);
+  return true;
+}
+
+/* ---- around a kernel ---- */
+
+static bool begin(call *c) {
+  for (int i = 0; debug && i < c->num_arrays; i++) {
+    argument *a = &c->arrays[i];
+    const size_t size = (size_t)PyArray_NBYTES(a->array);
+    if (a->output) {
+      if (size) memset(a->data, 0xff, size); /* all bits set: NaN, and -1 as an integer */
+    } else if (size && PyArray_IS_C_CONTIGUOUS(a->array)) {
+      if (!(a->copy = malloc(size))) return PyErr_NoMemory(), false;
+      memcpy(a->copy, a->data, size);
+    }
+  }
+  return true;
+}
+
+static bool end(call *c, ast_status status) {
+  bool ok = !PyErr_Occurred();
+  for (int i = 0; i < c->num_arrays; i++) {
+    argument *a = &c->arrays[i];
+    if (!a->copy) continue;
+    if (ok && memcmp(a->copy, a->data, (size_t)PyArray_NBYTES(a->array)))
+      ok = fail(c, PyExc_AssertionError, "the kernel changed its input %s", a->name);
+    free(a->copy);
+  }
+  if (ok && status == AST_NO_MEMORY) return PyErr_NoMemory(), false;
+  return ok;
+}
+
+/* Runs `expression` without the GIL between the two; leaves the function if anything failed. */
+#define KERNEL(c, status, expression)      \
+  do {                                     \
+    (status) = AST_OK;                     \
+    if (begin(&(c))) {                     \
+      Py_BEGIN_ALLOW_THREADS;              \
+      (status) = (expression);             \
+      Py_END_ALLOW_THREADS;                \
+    }                                      \
+    if (!end(&(c), (status))) return NULL; \
+  } while (0)
+
+/* ---- segments ---- */
+
+static PyObject *segment(const char *op, PyObject *const *objects, Py_ssize_t num, bool spread) {
+  call c;
+  argument *x, *order, *offsets, *out;
+  int64_t mean;
+  ast_status status;
+  if (!start(&c, op, objects, num, 5) || !(x = IN(&c, "x", FLOATS, 2, FREE, FREE)) ||
+      !(order = IN(&c, "node_order", INTS, 1, spread ? FREE : x->shape[0])) ||
+      !(offsets = IN(&c, "node_offsets", INTS, 1, spread ? x->shape[0] + 1 : FREE)) || !take_int(&c, "mean", 0, 1, &mean) ||
+      !check_offsets(&c, offsets, order->shape[0]) ||
+      !(out = OUT(&c, "out", FLOATS, 2, spread ? order->shape[0] : offsets->shape[0] - 1, x->shape[1])) ||
+      !check_permutation(&c, order, order->shape[0]))
+    return NULL;
+  KERNEL(c, status,
+         (spread ? kernels->segment_spread : kernels->segment_sum)(x->data, x->shape[1], order->data, offsets->data, offsets->shape[0] - 1,
+                                                                   mean, out->data));
+  Py_RETURN_NONE;
+}
+
+static PyObject *segment_sum(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  return segment("segment_sum", objects, num, false);
+}
+
+static PyObject *segment_spread(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  return segment("segment_spread", objects, num, true);
+}
+
+/* ---- octree ---- */
+
+static PyObject *octree_error(const call *c, ast_status status, const float *p, int64_t node, double half_width) {
+  char text[200];
+  int used =
+      snprintf(text, sizeof text, "positions[%lld] = (%.9g, %.9g, %.9g) ", (long long)node, (double)p[0], (double)p[1], (double)p[2]);
+  if (status == AST_NOT_FINITE) snprintf(text + used, sizeof text - (size_t)used, "is not finite");
+  else snprintf(text + used, sizeof text - (size_t)used, "lies outside the domain of half width %.9g", half_width);
+  fail(c, PyExc_ValueError, "%s", text);
+  return NULL;
+}
+
+static PyObject *octree_build(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  call c;
+  argument *positions, *offsets, *keys, *cell_offsets, *node_cell, *node_order, *node_offsets;
+  double center[3], half_width;
+  int64_t depth, bad = -1;
+  ast_status status;
+  if (!start(&c, "octree", objects, num, 12) || !(positions = IN(&c, "positions", FLOATS, 2, FREE, (int64_t)3)) ||
+      !(offsets = IN(&c, "offsets", INTS, 1, FREE)) || !check_offsets(&c, offsets, positions->shape[0]) || !take_float(&c, &center[0]) ||
+      !take_float(&c, &center[1]) || !take_float(&c, &center[2]) || !take_float(&c, &half_width) || !take_int(&c, "depth", 0, 21, &depth))
+    return NULL;
+  if (!(half_width > 0 && half_width < 1e300)) {
+    PyErr_SetString(PyExc_ValueError, "octree: half_width must be positive and finite");
+    return NULL;
+  }
+  for (int a = 0; a < 3; a++)
+    if (!(center[a] > -1e300 && center[a] < 1e300)) {
+      PyErr_SetString(PyExc_ValueError, "octree: center must be finite");
+      return NULL;
+    }
+  const int64_t N = positions->shape[0], B = offsets->shape[0] - 1;
+  if (!(keys = OUT(&c, "keys", INTS, 1, N)) || !(cell_offsets = OUT(&c, "cell_offsets", INTS, 1, B + 1)) ||
+      !(node_cell = OUT(&c, "node_cell", INTS, 1, N)) || !(node_order = OUT(&c, "node_order", INTS, 1, N)) ||
+      !(node_offsets = OUT(&c, "node_offsets", INTS, 1, N + 1)))
+    return NULL;
+  KERNEL(c, status,
+         kernels->octree_build(positions->data, offsets->data, B, center, half_width, (int)depth, keys->data, cell_offsets->data,
+                               node_cell->data, node_order->data, node_offsets->data, &bad));
+  if (status != AST_OK) return octree_error(&c, status, (const float *)positions->data + 3 * bad, bad, half_width);
+  Py_RETURN_NONE;
+}
+
+/* Keys that rise strictly within each scene. */
+static bool check_keys(const call *c, const argument *keys, const argument *offsets) {
+  const int64_t *key = keys->data, *offset = offsets->data;
+  for (int64_t b = 0; b + 1 < offsets->shape[0]; b++)
+    for (int64_t i = offset[b]; i < offset[b + 1]; i++)
+      if (key[i] < 0 || (i > offset[b] && key[i] <= key[i - 1]))
+        return fail(c, PyExc_ValueError, "%s must be at least 0 and rise strictly within each scene, but %s[%lld] is %lld", keys->name,
+                    keys->name, (long long)i, (long long)key[i]);
+  return true;
+}
+
+static PyObject *octree_coordinates(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  call c;
+  argument *keys, *coordinates;
+  ast_status status;
+  if (!start(&c, "octree_coordinates", objects, num, 2) || !(keys = IN(&c, "keys", INTS, 1, FREE)) ||
+      !(coordinates = OUT(&c, "coordinates", SMALL_INTS, 2, keys->shape[0], (int64_t)3)))
+    return NULL;
+  KERNEL(c, status, kernels->octree_coordinates(keys->data, keys->shape[0], coordinates->data));
+  Py_RETURN_NONE;
+}
+
+static PyObject *octree_coarsen(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  call c;
+  argument *keys, *offsets, *coarse_keys, *coarse_offsets, *first_child, *neighbours, *pair_offsets;
+  ast_status status;
+  if (!start(&c, "octree_coarsen", objects, num, 7) || !(keys = IN(&c, "keys", INTS, 1, FREE)) ||
+      !(offsets = IN(&c, "cell_offsets", INTS, 1, FREE)) || !check_offsets(&c, offsets, keys->shape[0]) || !check_keys(&c, keys, offsets) ||
+      !(coarse_keys = OUT(&c, "coarse_keys", INTS, 1, keys->shape[0])) ||
+      !(coarse_offsets = OUT(&c, "coarse_offsets", INTS, 1, offsets->shape[0])) ||
+      !(first_child = OUT(&c, "first_child", INTS, 1, keys->shape[0] + 1)) ||
+      !(neighbours = OUT(&c, "neighbours", INTS, 2, keys->shape[0], (int64_t)8)) ||
+      !(pair_offsets = OUT(&c, "pair_offsets", INTS, 1, (int64_t)28)))
+    return NULL;
+  KERNEL(c, status,
+         kernels->octree_coarsen(keys->data, offsets->data, offsets->shape[0] - 1, coarse_keys->data, coarse_offsets->data,
+                                 first_child->data, neighbours->data, pair_offsets->data));
+  Py_RETURN_NONE;
+}
+
+static PyObject *octree_pairs(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  call c;
+  argument *keys, *first_child, *neighbours, *pair_offsets, *out[4];
+  ast_status status;
+  if (!start(&c, "octree_pairs", objects, num, 8) || !(keys = IN(&c, "keys", INTS, 1, FREE)) ||
+      !(first_child = IN(&c, "first_child", INTS, 1, FREE)) || !check_offsets(&c, first_child, keys->shape[0]) ||
+      !(neighbours = IN(&c, "neighbours", INTS, 2, first_child->shape[0] - 1, (int64_t)8)) ||
+      !(pair_offsets = IN(&c, "pair_offsets", INTS, 1, (int64_t)28)))
+    return NULL;
+  const int64_t *pairs = pair_offsets->data, *near = neighbours->data;
+  if (!check_offsets(&c, pair_offsets, pairs[27])) return NULL;
+  for (int64_t i = 0; i < 8 * neighbours->shape[0]; i++)
+    if (near[i] < -1 || near[i] >= neighbours->shape[0]) {
+      fail(&c, PyExc_ValueError, "neighbours[%lld] holds %lld, which is no coarse cell", (long long)(i / 8), (long long)near[i]);
+      return NULL;
+    }
+  static const char *const names[4] = {"fine", "coarse", "fine_by_fine", "coarse_by_fine"};
+  for (int i = 0; i < 4; i++)
+    if (!(out[i] = OUT(&c, names[i], INTS, 1, pairs[27]))) return NULL;
+  KERNEL(c, status,
+         kernels->octree_pairs(keys->data, keys->shape[0], first_child->data, neighbours->data, first_child->shape[0] - 1, pairs,
+                               out[0]->data, out[1]->data, out[2]->data, out[3]->data));
+  if (status == AST_OK) Py_RETURN_NONE;
+  fail(&c, PyExc_ValueError, "pair_offsets are not those of the neighbours");
+  return NULL;
+}
+
+/* ---- farthest point sampling ---- */
+
+/* The first scene with two coordinates on one axis that differ by 2^21 or more, or -1. */
+static int64_t too_wide(const int32_t *coordinates, const int64_t *offsets, int64_t B) {
+  for (int64_t b = 0; b < B; b++)
+    for (int a = 0; a < 3; a++) {
+      int64_t low = INT64_MAX, high = INT64_MIN;
+      for (int64_t i = offsets[b]; i < offsets[b + 1]; i++) {
+        const int64_t x = coordinates[3 * i + a];
+        low = x < low ? x : low;
+        high = x > high ? x : high;
+      }
+      if (offsets[b] < offsets[b + 1] && high - low >= 1 << 21) return b;
+    }
+  return -1;
+}
+
+static PyObject *farthest_point_sample(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  call c;
+  argument *coordinates, *offsets, *out_offsets, *indices;
+  int64_t tokens;
+  ast_status status;
+  if (!start(&c, "farthest_point_sample", objects, num, 5) || !(coordinates = IN(&c, "coordinates", SMALL_INTS, 2, FREE, (int64_t)3)) ||
+      !(offsets = IN(&c, "offsets", INTS, 1, FREE)) || !check_offsets(&c, offsets, coordinates->shape[0]) ||
+      !take_int(&c, "num", 1, INT64_MAX, &tokens) || !(out_offsets = IN(&c, "out_offsets", INTS, 1, offsets->shape[0])))
+    return NULL;
+  const int64_t *from = offsets->data, *to = out_offsets->data, B = offsets->shape[0] - 1;
+  for (int64_t b = 0; b < B; b++) {
+    const int64_t points = from[b + 1] - from[b];
+    if (to[0] == 0 && to[b + 1] - to[b] == (points < tokens ? points : tokens)) continue;
+    fail(&c, PyExc_ValueError, "out_offsets must hold min(num, points) rows for scene %lld", (long long)b);
+    return NULL;
+  }
+  if (!(indices = OUT(&c, "indices", INTS, 1, to[B]))) return NULL;
+  KERNEL(c, status, kernels->farthest_point_sample(coordinates->data, from, B, tokens, to, indices->data));
+  if (status == AST_OK) Py_RETURN_NONE;
+  const int64_t scene = too_wide(coordinates->data, from, B);
+  fail(&c, PyExc_ValueError, "coordinates of scene %lld differ by 2^21 or more", (long long)scene);
+  return NULL;
+}
+
+/* ---- sparse convolution ---- */
+
+static PyObject *sparse_conv(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  call c;
+  argument *x, *weight, *offsets, *source, *destination, *out;
+  int64_t transposed;
+  ast_status status;
+  if (!start(&c, "sparse_conv", objects, num, 7) || !(x = IN(&c, "x", FLOATS, 2, FREE, FREE)) ||
+      !(weight = IN(&c, "weight", FLOATS, 3, (int64_t)27, FREE, FREE)) || !take_int(&c, "transposed", 0, 1, &transposed) ||
+      !(offsets = IN(&c, "pair_offsets", INTS, 1, (int64_t)28)) || !(source = IN(&c, "source", INTS, 1, FREE)) ||
+      !(destination = IN(&c, "destination", INTS, 1, source->shape[0])) ||
+      !(out = OUT(&c, "out", FLOATS, 2, FREE, weight->shape[transposed ? 1 : 2])) ||
+      !check_pairs(&c, offsets, source, x->shape[0], destination, out->shape[0], true))
+    return NULL;
+  if (x->shape[1] != weight->shape[transposed ? 2 : 1]) {
+    fail(&c, PyExc_ValueError, "x has %lld channels, weight takes %lld", (long long)x->shape[1],
+         (long long)weight->shape[transposed ? 2 : 1]);
+    return NULL;
+  }
+  const ast_pairs pairs = {offsets->data, source->data, destination->data};
+  KERNEL(c, status, kernels->sparse_conv(x->data, weight->data, x->shape[1], out->shape[1], transposed, pairs, out->shape[0], out->data));
+  Py_RETURN_NONE;
+}
+
+static PyObject *sparse_conv_weight(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  call c;
+  argument *x, *dout, *offsets, *source, *destination, *dweight;
+  ast_status status;
+  if (!start(&c, "sparse_conv_weight", objects, num, 6) || !(x = IN(&c, "x", FLOATS, 2, FREE, FREE)) ||
+      !(dout = IN(&c, "dout", FLOATS, 2, FREE, FREE)) || !(offsets = IN(&c, "pair_offsets", INTS, 1, (int64_t)28)) ||
+      !(source = IN(&c, "source", INTS, 1, FREE)) || !(destination = IN(&c, "destination", INTS, 1, source->shape[0])) ||
+      !(dweight = OUT(&c, "dweight", FLOATS, 3, (int64_t)27, x->shape[1], dout->shape[1])) ||
+      !check_pairs(&c, offsets, source, x->shape[0], destination, dout->shape[0], false))
+    return NULL;
+  const ast_pairs pairs = {offsets->data, source->data, destination->data};
+  KERNEL(c, status, kernels->sparse_conv_weight(x->data, dout->data, x->shape[1], dout->shape[1], pairs, dweight->data));
+  Py_RETURN_NONE;
+}
+
+/* ---- attention ---- */
+
+static bool take_attention(call *c, ast_attention *s, argument **q, argument **k, argument **v) {
+  argument *q_offsets, *k_offsets;
+  double scale;
+  if (!(*q = IN_ROWS(c, "q", 3, FREE, FREE, FREE)) || !(*k = IN_ROWS(c, "k", 3, FREE, (*q)->shape[1], (*q)->shape[2])) ||
+      !(*v = IN_ROWS(c, "v", 3, (*k)->shape[0], (*q)->shape[1], (*q)->shape[2])) || !(q_offsets = IN(c, "q_offsets", INTS, 1, FREE)) ||
+      !(k_offsets = IN(c, "k_offsets", INTS, 1, q_offsets->shape[0])) || !check_offsets(c, q_offsets, (*q)->shape[0]) ||
+      !check_offsets(c, k_offsets, (*k)->shape[0]) || !take_float(c, &scale) || !take_float(c, &s->dropout_p))
+    return false;
+  s->seed = PyLong_AsUnsignedLongLongMask(c->objects[c->next++]);
+  if (PyErr_Occurred()) return false;
+  s->D = (*q)->shape[2];
+  if (s->D % 16 || s->D < 16 || s->D > 128)
+    return fail(c, PyExc_ValueError, "the head dimension must be a multiple of 16 up to 128, not %lld", (long long)s->D);
+  if (!(s->dropout_p >= 0 && s->dropout_p < 1)) return fail(c, PyExc_ValueError, "dropout_p must lie in [0, 1)");
+  s->B = q_offsets->shape[0] - 1;
+  s->H = (*q)->shape[1];
+  s->q_offsets = q_offsets->data;
+  s->k_offsets = k_offsets->data;
+  s->q_stride = (*q)->row_stride;
+  s->k_stride = (*k)->row_stride;
+  s->v_stride = (*v)->row_stride;
+  s->scale = (float)scale;
+  return true;
+}
+
+static PyObject *attention(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  call c;
+  argument *q, *k, *v, *out, *maximum, *sum;
+  ast_attention s;
+  ast_status status;
+  if (!start(&c, "attention", objects, num, 11) || !take_attention(&c, &s, &q, &k, &v) ||
+      !(out = OUT(&c, "out", FLOATS, 3, q->shape[0], s.H, s.D)) || !(maximum = OUT(&c, "maximum", FLOATS, 2, q->shape[0], s.H)) ||
+      !(sum = OUT(&c, "sum", FLOATS, 2, q->shape[0], s.H)))
+    return NULL;
+  KERNEL(c, status, kernels->attention(&s, q->data, k->data, v->data, out->data, maximum->data, sum->data));
+  Py_RETURN_NONE;
+}
+
+static PyObject *attention_backward(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  call c;
+  argument *q, *k, *v, *out, *maximum, *sum, *dout, *dq, *dk, *dv;
+  ast_attention s;
+  ast_status status;
+  if (!start(&c, "attention_backward", objects, num, 15) || !take_attention(&c, &s, &q, &k, &v)) return NULL;
+  const int64_t Tq = q->shape[0], Tk = k->shape[0];
+  if (!(out = IN(&c, "out", FLOATS, 3, Tq, s.H, s.D)) || !(maximum = IN(&c, "maximum", FLOATS, 2, Tq, s.H)) ||
+      !(sum = IN(&c, "sum", FLOATS, 2, Tq, s.H)) || !(dout = IN(&c, "dout", FLOATS, 3, Tq, s.H, s.D)) ||
+      !(dq = OUT(&c, "dq", FLOATS, 3, Tq, s.H, s.D)) || !(dk = OUT(&c, "dk", FLOATS, 3, Tk, s.H, s.D)) ||
+      !(dv = OUT(&c, "dv", FLOATS, 3, Tk, s.H, s.D)))
+    return NULL;
+  KERNEL(c, status,
+         kernels->attention_backward(&s, q->data, k->data, v->data, out->data, maximum->data, sum->data, dout->data, dq->data, dk->data,
+                                     dv->data));
+  Py_RETURN_NONE;
+}
+
+/* ---- the process ---- */
+
+/* The addresses of torch_parallel_for and torch_get_num_threads. */
+static PyObject *set_pool(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  call c;
+  if (!start(&c, "set_pool", objects, num, 2)) return NULL;
+  const uintptr_t parallel_for = (uintptr_t)PyLong_AsUnsignedLongLong(objects[0]);
+  const uintptr_t num_threads = (uintptr_t)PyLong_AsUnsignedLongLong(objects[1]);
+  if (PyErr_Occurred()) return NULL;
+  ast_set_pool((ast_parallel_for)parallel_for, (ast_num_threads)num_threads);
+  Py_RETURN_NONE;
+}
+
+static PyObject *keep_memory(PyObject *self, PyObject *unused) {
+  (void)self, (void)unused;
+  return PyBool_FromLong(ast_keep_memory());
+}
+
+static PyObject *configuration(PyObject *self, PyObject *unused) {
+  (void)self, (void)unused;
+  static const char *const names[] = {"base", "avx2", "avx512"};
+  PyObject *supported = PyList_New(0);
+  for (int i = 0; supported && i < 3; i++) {
+    if (!ast_select(names[i])) continue;
+    PyObject *name = PyUnicode_FromString(names[i]);
+    if (!name || PyList_Append(supported, name)) Py_CLEAR(supported);
+    Py_XDECREF(name);
+  }
+  if (!supported) return NULL;
+  return Py_BuildValue("{s:s,s:N,s:L,s:O}", "isa", kernels->isa, "supported", supported, "threads", (long long)ast_threads(), "debug",
+                       debug ? Py_True : Py_False);
+}
+
+#define FAST(name, text) {#name, (PyCFunction)(void (*)(void))name, METH_FASTCALL, text}
+
+static PyMethodDef methods[] = {
+    FAST(segment_sum, "segment_sum(x, node_order, node_offsets, mean, out)"),
+    FAST(segment_spread, "segment_spread(dout, node_order, node_offsets, mean, dx)"),
+    FAST(octree_build,
+         "octree_build(positions, offsets, cx, cy, cz, half_width, depth, keys, cell_offsets, node_cell, node_order, "
+         "node_offsets)"),
+    FAST(octree_coordinates, "octree_coordinates(keys, coordinates)"),
+    FAST(octree_coarsen, "octree_coarsen(keys, cell_offsets, coarse_keys, coarse_offsets, first_child, neighbours, pair_offsets)"),
+    FAST(octree_pairs, "octree_pairs(keys, first_child, neighbours, pair_offsets, fine, coarse, fine_by_fine, coarse_by_fine)"),
+    FAST(farthest_point_sample, "farthest_point_sample(coordinates, offsets, num, out_offsets, indices)"),
+    FAST(sparse_conv, "sparse_conv(x, weight, transposed, pair_offsets, source, destination, out)"),
+    FAST(sparse_conv_weight, "sparse_conv_weight(x, dout, pair_offsets, source, destination, dweight)"),
+    FAST(attention, "attention(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, out, maximum, sum)"),
+    FAST(attention_backward,
+         "attention_backward(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, out, maximum, sum, dout, dq, "
+         "dk, dv)"),
+    FAST(set_pool, "set_pool(parallel_for, num_threads): addresses of torch's thread pool, 0 for serial"),
+    {"keep_memory", keep_memory, METH_NOARGS, "Let the C library keep freed blocks; whether it had an effect."},
+    {"configuration", configuration, METH_NOARGS, "The chosen instruction set, the supported ones, the threads, the debug mode."},
+    {NULL, NULL, 0, NULL},
+};
+
+static int execute(PyObject *module) {
+  (void)module;
+  import_array1(-1);
+  const char *wanted = getenv("AST_SIM_ISA"), *check = getenv("AST_SIM_DEBUG");
+  debug = check && !strcmp(check, "1");
+  kernels = ast_select(wanted && *wanted ? wanted : NULL);
+  if (kernels) return 0;
+  PyErr_Format(PyExc_ImportError, "AST_SIM_ISA=%s is not supported by this processor and build; unset it or choose base, avx2 or avx512",
+               wanted);
+  return -1;
+}
+
+static PyModuleDef_Slot slots[] = {{Py_mod_exec, execute}, {0, NULL}};
+
+static struct PyModuleDef definition = {
+    .m_base = PyModuleDef_HEAD_INIT,
+    .m_name = "_C",
+    .m_doc = "The C core of ast_sim. Use ast_sim.ops instead.",
+    .m_methods = methods,
+    .m_slots = slots,
+};
+
+PyMODINIT_FUNC PyInit__C(void) { return PyModuleDef_Init(&definition); }

@@ -1,0 +1,54 @@
+/* segment_sum and segment_spread against a double loop, at sizes around every block. */
+#include "check.h"
+
+static void compare(const ast_kernels *kernels, int64_t N, int64_t C, int64_t F, bool mean) {
+  float *x = malloc((size_t)(N * F + 1) * 4), *out = malloc((size_t)(C * F + 1) * 4), *back = malloc((size_t)(N * F + 1) * 4);
+  int64_t *order = malloc((size_t)(N + 1) * 8), *offsets = malloc((size_t)(C + 1) * 8);
+  for (int64_t i = 0; i < N * F; i++) x[i] = random_float();
+  for (int64_t i = 0; i < N; i++) order[i] = i;
+  for (int64_t i = N - 1; i > 0; i--) {
+    const int64_t j = (int64_t)(random_bits() % (uint64_t)(i + 1)), o = order[i];
+    order[i] = order[j];
+    order[j] = o;
+  }
+  offsets[0] = 0;
+  for (int64_t c = 1; c <= C; c++) {
+    const int64_t left = N - offsets[c - 1];
+    offsets[c] = c == C ? N : offsets[c - 1] + (int64_t)(random_bits() % (uint64_t)(left / 2 + 1));
+  }
+  memset(out, 0xff, (size_t)(C * F) * 4);
+  memset(back, 0xff, (size_t)(N * F) * 4);
+  CHECK(kernels->segment_sum(x, F, order, offsets, C, mean, out) == AST_OK, "status");
+  CHECK(kernels->segment_spread(out, F, order, offsets, C, mean, back) == AST_OK, "status");
+  for (int64_t c = 0; c < C; c++)
+    for (int64_t f = 0; f < F; f++) {
+      const double count = mean && offsets[c + 1] > offsets[c] ? (double)(offsets[c + 1] - offsets[c]) : 1;
+      double sum = 0, magnitude = 0;
+      for (int64_t j = offsets[c]; j < offsets[c + 1]; j++) {
+        sum += (double)x[order[j] * F + f];
+        magnitude += fabs((double)x[order[j] * F + f]);
+        const float expected = out[c * F + f] * (float)(1 / (float)count);
+        CHECK(back[order[j] * F + f] == expected, "row %lld", (long long)order[j]);
+      }
+      CHECK(fabs((double)out[c * F + f] - sum / count) <= 1e-7 * (double)(offsets[c + 1] - offsets[c] + 2) * magnitude / count + 0.0,
+            "N %lld C %lld F %lld: %g", (long long)N, (long long)C, (long long)F, (double)out[c * F + f]);
+    }
+  free(x), free(out), free(back), free(order), free(offsets);
+}
+
+static void test(const ast_kernels *kernels) {
+  static const int64_t channels[] = {0, 1, 2, 3, 4, 15, 16, 17, 64, 128, 131};
+  for (int f = 0; f < 11; f++)
+    for (int mean = 0; mean < 2; mean++) {
+      compare(kernels, 0, 0, channels[f], mean);
+      compare(kernels, 0, 3, channels[f], mean);
+      compare(kernels, 1, 1, channels[f], mean);
+      compare(kernels, 2, 5, channels[f], mean);
+      compare(kernels, 1001, 257, channels[f], mean);
+    }
+}
+
+int main(void) {
+  on_every_table(test);
+  return 0;
+}

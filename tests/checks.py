@@ -1,0 +1,78 @@
+"""Checks that the tests of all ops share: the accuracy rule, equality over threads and instruction sets."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+
+def _with_gradients(
+    function: Callable, inputs: Sequence, cotangents: list[Tensor] | None
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Outputs, then gradients of sum(output * cotangent) for every floating input."""
+    leaves = [x.detach().requires_grad_() if isinstance(x, Tensor) and x.is_floating_point() else x for x in inputs]
+    outputs = function(*leaves)
+    outputs = [outputs] if isinstance(outputs, Tensor) else list(outputs)
+    if cotangents is None:
+        generator = torch.Generator().manual_seed(7)
+        cotangents = [torch.randn(x.shape, generator=generator, dtype=torch.float64) for x in outputs]
+    total = sum((x * c.to(x.dtype)).sum() for x, c in zip(outputs, cotangents, strict=True))
+    wanted = [x for x in leaves if isinstance(x, Tensor) and x.requires_grad]
+    gradients = torch.autograd.grad(total, wanted) if wanted and total.requires_grad else []
+    return [x.detach() for x in outputs] + list(gradients), cotangents
+
+
+def assert_accurate(op: Callable, reference: Callable, inputs: Sequence) -> None:
+    """The accuracy rule: e(C) <= 2 e(T) + 1e-6 * largest magnitude, for all outputs and gradients.
+
+    e(C) and e(T) are the largest errors of the op and of the float32 composition against the float64 composition.
+    """
+    double = [x.double() if isinstance(x, Tensor) and x.is_floating_point() else x for x in inputs]
+    exact, cotangents = _with_gradients(reference, double, None)
+    composed, _ = _with_gradients(reference, inputs, cotangents)
+    fused, _ = _with_gradients(op, inputs, cotangents)
+    assert len(fused) == len(composed) == len(exact)
+    for i, (c, t, e) in enumerate(zip(fused, composed, exact, strict=True)):
+        assert c.dtype == torch.float32 and c.shape == e.shape, (i, c.dtype, c.shape, e.shape)
+        if not e.numel():
+            continue
+        assert torch.isfinite(c).all(), f"result {i} is not finite"
+        error_c, error_t = float((c.double() - e).abs().max()), float((t.double() - e).abs().max())
+        bound = 2 * error_t + 1e-6 * float(e.abs().max())
+        assert error_c <= bound, (
+            f"result {i}: error {error_c:.3g} exceeds 2 x {error_t:.3g} + 1e-6 x magnitude = {bound:.3g}"
+        )
+
+
+def assert_same_for_threads(function: Callable[[], Sequence[Tensor]]) -> None:
+    """Bit for bit equal results with 1 and 2 threads, and from run to run."""
+    before = torch.get_num_threads()
+    try:
+        results = []
+        for threads in (1, 2, 2):
+            torch.set_num_threads(threads)
+            results.append([x.detach().clone() for x in function()])
+    finally:
+        torch.set_num_threads(before)
+    for other in results[1:]:
+        for x, y in zip(results[0], other, strict=True):
+            assert torch.equal(x.contiguous().view(torch.uint8), y.contiguous().view(torch.uint8))
+
+
+def instruction_sets() -> list[str]:
+    """The instruction sets that this processor supports, of those compiled in."""
+    from ast_sim.ops.library import configuration
+
+    return configuration()["supported"]
+
+
+def run_python(code: str, **environment: str) -> str:
+    """Standard output of Python code in a process of its own, with these environment variables."""
+    result = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | environment, capture_output=True, text=True, timeout=300
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout

@@ -1,0 +1,6 @@
+"""What every test shares: the debug mode of the binding is on, and few threads are used."""
+
+import os
+
+os.environ.setdefault("AST_SIM_DEBUG", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "2")
