@@ -16,12 +16,13 @@ import secrets
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import h5py
 import numpy as np
 
 from ast_sim.data.disk import Disk, sync_folder
+from ast_sim.data.guard import GuardedFile
 from ast_sim.data.layout import (
     ARRAYS,
     FORMAT,
@@ -30,23 +31,20 @@ from ast_sim.data.layout import (
     SPLITS,
     VERSION,
     DatasetInfo,
-    plain_value,
     scene_kind,
     write_attributes,
 )
 from ast_sim.data.scene import AttributeValue, Scene, Trajectory, require_array, require_finite_frames
-from ast_sim.errors import AstSimError, DatasetError
+from ast_sim.errors import DatasetError
 
 CACHE_BYTES = 1 << 30  # splits up to this size are kept in memory after their first reading
-
-# What h5py raises on a damaged file.
-_READ_ERRORS = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError, IndexError, MemoryError)
 
 
 class DatasetWriter:
     """Writes a dataset; the file appears under its name, whole, when the `with` block ends without an error.
 
-    Until then it grows under a temporary name in the same folder, which is removed on an error.
+    Until then it grows under a temporary name in the same folder, which is removed on an error. `info` is written at
+    the end and may be replaced before: the domain is often known only when all positions are.
 
     Raises:
         DatasetError: a trajectory that does not pass its checks, a full disk, a folder that cannot be written.
@@ -66,7 +64,6 @@ class DatasetWriter:
             raise DatasetError(f"{self.path}: cannot be written: {error}") from error
         # Version 1.10 of the format has checksums on all of its structures.
         self._file = h5py.File(self._disk, "w", libver=("v110", "v110"))
-        write_attributes(self._file, info.attributes())
 
     def add(self, split: str, trajectory: Trajectory) -> None:
         """Append a trajectory to the split "train", "valid" or "test"."""
@@ -107,18 +104,26 @@ class DatasetWriter:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:
-            with self._writing() if kind is None else contextlib.suppress(Exception):
-                self._file.close()
-                self._disk.sync()
-                self._disk.close()
             if kind is None:
-                os.replace(self._temporary, self.path)
-                sync_folder(self.path.parent)
-        except OSError as error:
-            raise DatasetError(f"{self.path}: cannot be written: {error}") from error
+                self._finish()
         finally:
+            with contextlib.suppress(Exception):
+                self._file.close()
             self._disk.close()
             self._temporary.unlink(missing_ok=True)
+
+    def _finish(self) -> None:
+        with self._writing():
+            self.info.check(str(self.path))
+            write_attributes(self._file, self.info.attributes())
+            self._file.close()
+            self._disk.sync()
+            self._disk.close()
+        try:
+            os.replace(self._temporary, self.path)
+            sync_folder(self.path.parent)
+        except OSError as error:
+            raise DatasetError(f"{self.path}: cannot be written: {error}") from error
 
 
 class Dataset:
@@ -133,14 +138,10 @@ class Dataset:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
-        with self._reading("the file"):
-            if not self.path.is_file():
-                raise DatasetError(f"{self.path}: there is no such file")
-            self._bytes = self.path.stat().st_size
-            self._file = h5py.File(self.path, "r", locking=False)
+        self._file = GuardedFile(self.path)
         try:
             self.info = self._read_info()
-            with self._reading("the list of samples"):
+            with self._file.reading("the list of samples"):
                 self.splits = {split: self._count(split) for split in SPLITS}
         except BaseException:
             self.close()
@@ -181,11 +182,9 @@ class Dataset:
         key = (split, index)
         if key not in self._scenes:
             group = self._group(split, index)
-            arrays = {
-                name: self._read(group, name)
-                for name in ("rest_position", "elements", "node_type", "body", "material")
-                if name in group or name not in OPTIONAL
-            }
+            with self._file.reading(f"sample {split}/{index:06d}"):
+                present = [name for name in ARRAYS if name not in FRAMED and (name in group or name not in OPTIONAL)]
+            arrays = {name: self._read(group, name) for name in present}
             scene = Scene(**arrays)
             scene.check(self._name(split, index))
             self._kind = self._kind or scene_kind(scene)
@@ -224,7 +223,7 @@ class Dataset:
 
     def attributes(self, split: str, index: int) -> dict[str, AttributeValue]:
         """The status and the solver's records of a trajectory."""
-        return self._read_attributes(self._group(split, index), self._name(split, index))
+        return self._file.attributes(self._group(split, index), self._name(split, index))
 
     def _first_kind(self) -> tuple[int, int]:
         if self._kind is None:
@@ -237,21 +236,8 @@ class Dataset:
     def _name(self, split: str, index: int) -> str:
         return f"{self.path}: {split}/{index:06d}"
 
-    @contextlib.contextmanager
-    def _reading(self, what: str) -> Iterator[None]:
-        """Turn whatever h5py raises on a damaged file into a DatasetError."""
-        try:
-            yield
-        except AstSimError:
-            raise
-        except _READ_ERRORS as error:
-            text = " ".join(str(error).split()) or type(error).__name__
-            raise DatasetError(
-                f"{self.path}: {what} cannot be read; the file is damaged or no dataset of ast_sim ({text})"
-            ) from error
-
     def _read_info(self) -> DatasetInfo:
-        values = self._read_attributes(self._file, str(self.path))
+        values = self._file.attributes(self._file.root, str(self.path))
         if values.get("format") != FORMAT:
             raise DatasetError(f"{self.path}: is no dataset of ast_sim (its attribute format is not {FORMAT!r})")
         if values.get("version") != VERSION:
@@ -266,7 +252,7 @@ class Dataset:
                 raise DatasetError(f"{self.path}: the attribute {key} is {found}; must be a {wanted.__name__}")
         known = {item.name: values[item.name] for item in fields(DatasetInfo)}
         known["domain_center"] = tuple(known["domain_center"])
-        with self._reading("the attribute generator"):
+        with self._file.reading("the attribute generator"):
             known["generator"] = json.loads(known["generator"])
             if not isinstance(known["generator"], dict):
                 raise DatasetError(f"{self.path}: the attribute generator must be a JSON object")
@@ -274,32 +260,10 @@ class Dataset:
         info.check(str(self.path))
         return info
 
-    def _read_attributes(self, group: h5py.Group, name: str) -> dict[str, AttributeValue]:
-        values = {}
-        with self._reading(f"an attribute of {name}"):
-            for key in group.attrs:
-                stored = group.attrs.get_id(key)
-                if math.prod(stored.shape) * stored.dtype.itemsize > self._bytes or len(stored.shape) > 1:
-                    raise DatasetError(f"{name}: the attribute {key} is larger than the file or no list")
-                values[key] = plain_value(group.attrs[key])
-        return values
-
-    def _child(self, group: h5py.Group, key: str, kind: type) -> Any:
-        """A member that lies in this very file: no link to elsewhere."""
-        name = f"{self.path}: {group.name.strip('/')}/{key}".replace(" /", " ")
-        if key not in group:
-            raise DatasetError(f"{name} is missing")
-        if not isinstance(group.get(key, getlink=True), h5py.HardLink):
-            raise DatasetError(f"{name} is a link to somewhere else, which is not followed")
-        child = group[key]
-        if not isinstance(child, kind):
-            raise DatasetError(f"{name} is no {kind.__name__.lower()}")
-        return child
-
     def _count(self, split: str) -> int:
-        if split not in self._file:
+        if split not in self._file.root:
             return 0
-        group = self._child(self._file, split, h5py.Group)
+        group = self._file.child(self._file.root, split, h5py.Group)
         count = len(group)
         for index, key in enumerate(sorted(group)):
             if key != f"{index:06d}":
@@ -310,41 +274,19 @@ class Dataset:
         count = self.count(split)
         if not 0 <= index < count:
             raise DatasetError(f"{self.path}: there is no sample {index} in {split}, which has {count}")
-        with self._reading(f"sample {split}/{index:06d}"):
-            return self._child(self._child(self._file, split, h5py.Group), f"{index:06d}", h5py.Group)
-
-    def _array(self, group: h5py.Group, key: str) -> h5py.Dataset:
-        """An array of a sample, its dtype, rank and size checked before anything is allocated."""
-        dtype, rank = ARRAYS[key]
-        array = self._child(group, key, h5py.Dataset)
-        name = f"{self.path}: {group.name.strip('/')}/{key}"
-        if array.dtype != dtype or array.ndim != rank:
-            raise DatasetError(f"{name} is {array.dtype} with {array.ndim} axes; must be {np.dtype(dtype)} with {rank}")
-        if array.is_virtual or array.external:
-            raise DatasetError(f"{name} keeps its numbers in another file, which is not followed")
-        properties = array.id.get_create_plist()
-        filters = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
-        if any(code != h5py.h5z.FILTER_FLETCHER32 for code in filters):
-            raise DatasetError(f"{name} is compressed; write the file without compression (h5repack -f FLET)")
-        item = array.dtype.itemsize
-        for shape in (array.shape, array.chunks or ()):
-            if math.prod(shape) * item > self._bytes:
-                raise DatasetError(
-                    f"{name} declares the shape {list(shape)}, {math.prod(shape) * item} bytes,"
-                    f" but the file has {self._bytes}: it is truncated or damaged"
-                )
-        return array
+        with self._file.reading(f"sample {split}/{index:06d}"):
+            return self._file.child(self._file.child(self._file.root, split, h5py.Group), f"{index:06d}", h5py.Group)
 
     def _read(self, group: h5py.Group, key: str, frames: slice = slice(None)) -> np.ndarray:
-        with self._reading(f"{group.name.strip('/')}/{key}"):
-            value = self._array(group, key)[frames]
+        with self._file.reading(f"{group.name.strip('/')}/{key}"):
+            value = self._file.array(group, key)[frames]
         value.flags.writeable = False
         return value
 
     def _shape(self, split: str, index: int, key: str) -> tuple[int, ...]:
         group = self._group(split, index)
-        with self._reading(f"{split}/{index:06d}/{key}"):
-            return self._array(group, key).shape
+        with self._file.reading(f"{split}/{index:06d}/{key}"):
+            return self._file.array(group, key).shape
 
     def _read_frames(self, split: str, index: int, start: int, stop: int) -> tuple[np.ndarray, np.ndarray | None]:
         name, group, scene = self._name(split, index), self._group(split, index), self.scene(split, index)
@@ -369,5 +311,5 @@ class Dataset:
         if split not in self._kept:
             keys = ("position",) if self.info.stress_location == "none" else FRAMED
             sizes = (4 * math.prod(self._shape(split, i, key)) for i in range(self.splits[split]) for key in keys)
-            self._kept[split] = sum(sizes) <= min(CACHE_BYTES, self._bytes)
+            self._kept[split] = sum(sizes) <= min(CACHE_BYTES, self._file.size)
         return self._kept[split]
