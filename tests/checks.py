@@ -3,8 +3,10 @@
 import os
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -60,6 +62,19 @@ def assert_same_for_threads(function: Callable[[], Sequence[Tensor]]) -> None:
     for other in results[1:]:
         for x, y in zip(results[0], other, strict=True):
             assert torch.equal(x.contiguous().view(torch.uint8), y.contiguous().view(torch.uint8))
+
+
+def misaligned_read_only(x: Tensor) -> Tensor:
+    """The same values at an odd address, in memory that must not be written."""
+    buffer = np.empty(x.numel() * x.element_size() + 1, dtype=np.uint8)
+    values = buffer[1:].view(x.numpy().dtype).reshape(x.shape)
+    values[:] = x.numpy()
+    values.setflags(write=False)
+    with warnings.catch_warnings():  # torch says once a process that it does not support such memory
+        warnings.simplefilter("ignore")
+        out = torch.from_numpy(values)
+    assert out.data_ptr() % out.element_size()
+    return out
 
 
 def instruction_sets() -> list[str]:

@@ -207,6 +207,14 @@ def _after_reference(keys: Tensor, scenes: Tensor) -> Tensor:
 def _coarsen_reference(keys: Tensor, cell_offsets: Tensor):
     check_offsets("octree_coarsen", "cell_offsets", cell_offsets, len(keys))
     scenes = _scene_of(cell_offsets)
+    wrong = keys < 0
+    wrong[1:] |= (keys[1:] <= keys[:-1]) & (scenes[1:] == scenes[:-1])
+    if wrong.any():
+        at = int(wrong.nonzero()[0])
+        raise ValueError(
+            "octree_coarsen: keys must be at least 0 and rise strictly within each scene, but"
+            f" keys[{at}] is {int(keys[at])}"
+        )
     rows = torch.arange(len(keys), device=keys.device)
     coarse_keys, coarse_offsets, node_offsets, node_cell = _runs(keys >> 3, scenes, cell_offsets, rows)
     after = _after_reference(coarse_keys, _scene_of(coarse_offsets))

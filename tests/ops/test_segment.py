@@ -1,11 +1,12 @@
 """segment_sum, segment_mean, gather and EdgeSet against their compositions and their contracts."""
 
 import hashlib
+import warnings
 
 import numpy as np
 import pytest
 import torch
-from checks import assert_accurate, assert_same_for_threads, instruction_sets, run_python
+from checks import assert_accurate, assert_same_for_threads, instruction_sets, misaligned_read_only, run_python
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -125,12 +126,7 @@ def test_unusual_layouts_and_unchanged_inputs():
     wide = torch.randn(60, 16)
     wide[:, ::2] = x
     transposed = x.t().contiguous().t()
-    buffer = torch.empty(60 * 8 * 4 + 1, dtype=torch.uint8)
-    misaligned = buffer[1:].numpy().view(np.float32).reshape(60, 8)
-    misaligned[:] = x.numpy()
-    misaligned.setflags(write=False)
-    with pytest.warns(UserWarning):
-        read_only = torch.from_numpy(misaligned)
+    read_only = misaligned_read_only(x)
     for y in (wide[:, ::2], transposed, read_only):
         before = y.clone()
         assert torch.equal(segment_sum(y, order, offsets), expected) and torch.equal(y, before)
