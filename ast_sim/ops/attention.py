@@ -1,0 +1,216 @@
+"""Attention within scenes of a ragged batch, without a score matrix in memory.
+
+Legend: B scenes, T tokens (Tq of queries, Tk of keys), H heads, D channels of a head.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ast_sim.ops import library
+from ast_sim.ops.library import array, check_offsets
+
+# ---- dropout: the generator of the C core in torch ----
+
+_ROTATIONS = ((10, 26), (11, 21), (13, 27), (23, 5), (6, 20), (17, 11), (25, 10), (18, 20))
+_WORD = 0xFFFFFFFF
+
+
+def _rotate(x: Tensor, n: int) -> Tensor:
+    return (x << n | x >> (32 - n)) & _WORD
+
+
+def _threefry(key: list[Tensor], x: list[Tensor]) -> list[Tensor]:
+    """Threefry-4x32 of 12 rounds (Salmon et al., Parallel random numbers: as easy as 1, 2, 3, 2011), in int64."""
+    key = [*key, key[0] ^ key[1] ^ key[2] ^ key[3] ^ 0x1BD11BDA]
+    x = [(word + k) & _WORD for word, k in zip(x, key, strict=False)]
+    for i in range(12):
+        a, b = (3, 1) if i % 2 else (1, 3)
+        x[0] = (x[0] + x[a]) & _WORD
+        x[a] = _rotate(x[a], _ROTATIONS[i % 8][0]) ^ x[0]
+        x[2] = (x[2] + x[b]) & _WORD
+        x[b] = _rotate(x[b], _ROTATIONS[i % 8][1]) ^ x[2]
+        if i % 4 == 3:
+            s = i // 4 + 1
+            x = [(x[j] + key[(j + s) % 5] + (s if j == 3 else 0)) & _WORD for j in range(4)]
+    return x
+
+
+def dropout_factors(p: float, seed: int, scene: int, shape: tuple[int, int, int], like: Tensor) -> Tensor:
+    """The factors, 0 or 1 / (share kept), that attention puts on the weights of a scene: [H, Tq, Tk].
+
+    They depend on seed, scene, head, query and key alone. A weight is dropped if its 16 random bits lie below
+    round(65536 p): the share kept is within 1e-5 of 1 - p. Key 128 g + 16 slot + lane takes half slot % 2 of word
+    slot // 2 of counter (16 g + lane, query).
+    """
+    heads, queries, keys = shape
+    threshold = min(65535, int(p * 65536 + 0.5))
+    head, query, group = (torch.arange(n, device=like.device) for n in (heads, queries, -(-keys // 128) * 16))
+    zero = torch.zeros_like(head)[:, None, None]
+    words = [zero + (seed & _WORD), zero + (seed >> 32 & _WORD), zero + scene, head[:, None, None]]
+    words = _threefry(words, [group + zero, query[:, None] + zero, zero, zero])
+    bits = torch.stack([words[slot // 2] >> slot % 2 * 16 & 0xFFFF for slot in range(8)], -2)
+    bits = bits.reshape(heads, queries, 8, -1, 16).transpose(2, 3).reshape(heads, queries, -1)[:, :, :keys]
+    return (bits >= threshold).to(like.dtype) * (65536 / (65536 - threshold))
+
+
+# ---- composition ----
+
+
+def _check(op: str, q: Tensor, k: Tensor, v: Tensor, q_offsets: Tensor, k_offsets: Tensor, dropout_p: float) -> None:
+    if q.dim() != 3 or k.dim() != 3 or k.shape[1:] != q.shape[1:] or k.shape != v.shape:
+        raise ValueError(
+            f"{op}: q, k and v must have shapes [Tq, H, D], [Tk, H, D] and [Tk, H, D],"
+            f" not {tuple(q.shape)}, {tuple(k.shape)} and {tuple(v.shape)}"
+        )
+    if q.shape[2] % 16 or not 16 <= q.shape[2] <= 128:
+        raise ValueError(f"{op}: the head dimension must be a multiple of 16 up to 128, not {q.shape[2]}")
+    if not 0 <= dropout_p < 1:
+        raise ValueError(f"{op}: dropout_p must lie in [0, 1)")
+    check_offsets(op, "q_offsets", q_offsets, len(q))
+    check_offsets(op, "k_offsets", k_offsets, len(k))
+    if len(q_offsets) != len(k_offsets):
+        raise ValueError(f"{op}: k_offsets must have shape [{len(q_offsets)}], not ({len(k_offsets)},)")
+
+
+def _scenes(q_offsets: Tensor, k_offsets: Tensor) -> Iterator[tuple[int, slice, slice]]:
+    """Index, query rows and key rows of each scene that has both."""
+    q, k = q_offsets.tolist(), k_offsets.tolist()
+    for b in range(len(q) - 1):
+        if q[b] < q[b + 1] and k[b] < k[b + 1]:
+            yield b, slice(q[b], q[b + 1]), slice(k[b], k[b + 1])
+
+
+def _scores(q: Tensor, k: Tensor, scale: float) -> Tensor:
+    return torch.einsum("qhd,khd->hqk", q * scale, k)
+
+
+def _factors(scores: Tensor, dropout_p: float, seed: int, scene: int) -> Tensor | float:
+    return dropout_factors(dropout_p, seed, scene, tuple(scores.shape), scores) if dropout_p else 1.0
+
+
+def _reference(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed):
+    _check("attention", q, k, v, q_offsets, k_offsets, dropout_p)
+    out, maximum = torch.zeros_like(q), torch.full_like(q[:, :, 0], -torch.inf)
+    total = torch.zeros_like(maximum)
+    for b, i, j in _scenes(q_offsets, k_offsets):
+        x = _scores(q[i], k[j], scale)
+        m = x.detach().amax(2, keepdim=True)
+        weights = (x - m).exp()
+        sums = weights.sum(2, keepdim=True)
+        weights = weights / sums * _factors(x, dropout_p, seed, b)
+        out[i] = torch.einsum("hqk,khd->qhd", weights, v[j])
+        maximum[i], total[i] = (torch.where(sums > 0, y, torch.nan)[:, :, 0].T for y in (m, sums))
+    return out, maximum, total
+
+
+def _backward_reference(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, out, maximum, total, dout):
+    _check("attention_backward", q, k, v, q_offsets, k_offsets, dropout_p)
+    dq, dk, dv = torch.zeros_like(q), torch.zeros_like(k), torch.zeros_like(v)
+    for b, i, j in _scenes(q_offsets, k_offsets):
+        x = _scores(q[i], k[j], scale)
+        weights = (x - maximum[i].T[:, :, None]).exp() / total[i].T[:, :, None]
+        factors = _factors(x, dropout_p, seed, b)
+        dweights = factors * torch.einsum("qhd,khd->hqk", dout[i], v[j])
+        dx = scale * weights * (dweights - (dout[i] * out[i]).sum(2).T[:, :, None])
+        dq[i] = torch.einsum("hqk,khd->qhd", dx, k[j])
+        dk[j] = torch.einsum("hqk,qhd->khd", dx, q[i])
+        dv[j] = torch.einsum("hqk,qhd->khd", weights * factors, dout[i])
+    return dq, dk, dv
+
+
+# ---- C core ----
+
+
+def _rows(x: Tensor) -> np.ndarray:
+    """As an array whose rows may lie apart, like those of a slice of a fused projection; copied only otherwise."""
+    dense = x.dim() == 3 and x.stride(2) == 1 and x.stride(1) == x.shape[2] and x.stride(0) >= x.shape[1] * x.shape[2]
+    return x.detach().numpy() if dense and x.data_ptr() % 4 == 0 else array(x)
+
+
+def _kernel(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed):
+    out, maximum = q.new_empty(q.shape), q.new_empty(q.shape[:2])
+    total = torch.empty_like(maximum)
+    inputs = (_rows(q), _rows(k), _rows(v), array(q_offsets), array(k_offsets), scale, dropout_p, seed)
+    library._C.attention(*inputs, out.numpy(), maximum.numpy(), total.numpy())
+    return out, maximum, total
+
+
+def _backward_kernel(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, out, maximum, total, dout):
+    dq, dk, dv = (x.new_empty(x.shape) for x in (q, k, v))
+    inputs = (_rows(q), _rows(k), _rows(v), array(q_offsets), array(k_offsets), scale, dropout_p, seed)
+    saved = (array(out), array(maximum), array(total), array(dout))
+    library._C.attention_backward(*inputs, *saved, dq.numpy(), dk.numpy(), dv.numpy())
+    return dq, dk, dv
+
+
+def _fake(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed):
+    return q.new_empty(q.shape), q.new_empty(q.shape[:2]), q.new_empty(q.shape[:2])
+
+
+def _backward_fake(q, k, v, *_):
+    return q.new_empty(q.shape), k.new_empty(k.shape), v.new_empty(v.shape)
+
+
+_INPUTS = "Tensor q, Tensor k, Tensor v, Tensor q_offsets, Tensor k_offsets, float scale, float dropout_p, int seed"
+_attention = library.define(f"attention({_INPUTS}) -> (Tensor, Tensor, Tensor)", _kernel, _reference, _fake)
+_attention_backward = library.define(
+    f"attention_backward({_INPUTS}, Tensor out, Tensor maximum, Tensor total, Tensor dout) -> (Tensor, Tensor, Tensor)",
+    _backward_kernel,
+    _backward_reference,
+    _backward_fake,
+)
+
+
+def _save(ctx, inputs, output) -> None:
+    ctx.save_for_backward(*inputs[:5], *output)
+    ctx.settings = inputs[5:]
+    ctx.mark_non_differentiable(*output[1:])
+
+
+def _gradient(ctx, dout, *_):
+    *inputs, out, maximum, total = ctx.saved_tensors
+    return *_attention_backward(*inputs, *ctx.settings, out, maximum, total, dout), None, None, None, None, None
+
+
+library.differentiate(_attention, _save, _gradient)
+
+
+def attention(
+    q: Tensor,
+    k: Tensor,
+    v: Tensor,
+    q_offsets: Tensor,
+    k_offsets: Tensor,
+    scale: float | None = None,
+    dropout_p: float = 0.0,
+    seed: int = 0,
+) -> tuple[Tensor, Tensor]:
+    """softmax(scale q k^T) v of each scene and head, with dropout on the weights.
+
+    Memory is in proportion to the tokens, forward and backward. Every scene's result is the same bits for any number
+    of threads and, without dropout, in any batch; dropout depends on the index of the scene too.
+
+    Args:
+        q: [Tq, H, D]; rows may lie apart, as in a slice of a fused projection. D is a multiple of 16 up to 128.
+        k, v: [Tk, H, D], likewise.
+        q_offsets, k_offsets: [B + 1] int64; the queries of scene b are q_offsets[b]:q_offsets[b + 1], and so its keys.
+        scale: of the scores; D^-1/2 by default.
+        dropout_p: the probability with which a weight is dropped, 0 <= p < 1; the others are scaled up.
+        seed: of the dropout, 64 bits; the same seed drops the same weights.
+
+    Returns:
+        out [Tq, H, D] and the log sum exp of the scores [Tq, H], which carries no gradient. A scene without keys gives
+        0 and -inf. A row with a NaN or +inf score, or with only -inf, is NaN.
+
+    Raises:
+        ValueError: for shapes, offsets or a dropout_p that are not as above.
+    """
+    scale = q.shape[-1] ** -0.5 if scale is None else float(scale)
+    seed = (seed + (1 << 63)) % (1 << 64) - (1 << 63)
+    out, maximum, total = _attention(q, k, v, q_offsets, k_offsets, scale, float(dropout_p), seed)
+    return out, maximum + total.log()

@@ -1,0 +1,163 @@
+"""Convolutions of kernel 3x3x3 and stride 2 between a level of an octree and the next coarser one.
+
+Legend: C_fine and C_coarse cells, I and O channels in and out, P pairs of cells that the kernel connects.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from ast_sim.ops import library
+from ast_sim.ops.library import array, check_offsets
+from ast_sim.ops.octree import CellMap
+
+OFFSETS = 27
+
+
+def _check(op: str, pair_offsets: Tensor, source: Tensor, sources: int, destination: Tensor, destinations: int) -> None:
+    if pair_offsets.shape != (OFFSETS + 1,) or source.shape != destination.shape:
+        raise ValueError(
+            f"{op}: pair_offsets must have shape [{OFFSETS + 1}] and destination that of source {tuple(source.shape)},"
+            f" not {tuple(pair_offsets.shape)} and {tuple(destination.shape)}"
+        )
+    check_offsets(op, "pair_offsets", pair_offsets, len(source))
+    for name, index, bound in (("source", source, sources), ("destination", destination, destinations)):
+        wrong = ((index < 0) | (index >= bound)).nonzero()
+        if len(wrong):
+            at = int(wrong[0])
+            raise ValueError(f"{op}: {name}[{at}] = {int(index[at])} is not an index below {bound}")
+
+
+def _groups(pair_offsets: Tensor, source: Tensor, destination: Tensor):
+    """Kernel offset, sources and destinations of each group that has pairs."""
+    offsets = pair_offsets.tolist()
+    for k in range(OFFSETS):
+        if offsets[k] < offsets[k + 1]:
+            pairs = slice(offsets[k], offsets[k + 1])
+            yield k, source[pairs], destination[pairs]
+
+
+def _reference(x, weight, transposed, pair_offsets, source, destination, back_source, back_destination, num_out):
+    if x.dim() != 2 or weight.dim() != 3 or len(weight) != OFFSETS:
+        raise ValueError(
+            f"sparse_conv: x must have shape [*, *] and weight [{OFFSETS}, *, *],"
+            f" not {tuple(x.shape)} and {tuple(weight.shape)}"
+        )
+    weight = weight.mT if transposed else weight
+    if x.shape[1] != weight.shape[1]:
+        raise ValueError(f"sparse_conv: x has {x.shape[1]} channels, weight takes {weight.shape[1]}")
+    _check("sparse_conv", pair_offsets, source, len(x), destination, num_out)
+    out = x.new_zeros(num_out, weight.shape[2])
+    for k, i, j in _groups(pair_offsets, source, destination):
+        out = out.index_add(0, j, x.index_select(0, i) @ weight[k])
+    return out
+
+
+def _weight_reference(x, dout, pair_offsets, source, destination):
+    _check("sparse_conv_weight", pair_offsets, source, len(x), destination, len(dout))
+    dweight = x.new_zeros(OFFSETS, x.shape[1], dout.shape[1])
+    for k, i, j in _groups(pair_offsets, source, destination):
+        dweight[k] = x.index_select(0, i).T @ dout.index_select(0, j)
+    return dweight
+
+
+def _kernel(x, weight, transposed, pair_offsets, source, destination, back_source, back_destination, num_out):
+    out = x.new_empty(num_out, weight.shape[1 if transposed else -1])
+    library._C.sparse_conv(
+        array(x), array(weight), transposed, array(pair_offsets), array(source), array(destination), array(out)
+    )
+    return out
+
+
+def _weight_kernel(x, dout, pair_offsets, source, destination):
+    dweight = x.new_empty(OFFSETS, x.shape[-1], dout.shape[-1])
+    library._C.sparse_conv_weight(
+        array(x), array(dout), array(pair_offsets), array(source), array(destination), array(dweight)
+    )
+    return dweight
+
+
+def _fake(x, weight, transposed, pair_offsets, source, destination, back_source, back_destination, num_out):
+    return x.new_empty(num_out, weight.shape[1 if transposed else 2])
+
+
+def _weight_fake(x, dout, pair_offsets, source, destination):
+    return x.new_empty(OFFSETS, x.shape[1], dout.shape[1])
+
+
+# The pairs come twice: (source, destination) sorted by destination, and (back_source, back_destination), which are the
+# destinations and sources of the same pairs sorted by source, for the gradient with respect to x.
+_conv = library.define(
+    "sparse_conv(Tensor x, Tensor weight, bool transposed, Tensor pair_offsets, Tensor source, Tensor destination,"
+    " Tensor back_source, Tensor back_destination, SymInt num_out) -> Tensor",
+    _kernel,
+    _reference,
+    _fake,
+)
+_conv_weight = library.define(
+    "sparse_conv_weight(Tensor x, Tensor dout, Tensor pair_offsets, Tensor source, Tensor destination) -> Tensor",
+    _weight_kernel,
+    _weight_reference,
+    _weight_fake,
+)
+
+
+def _save(ctx, inputs, output) -> None:
+    x, weight, ctx.transposed, *pairs, _ = inputs
+    ctx.save_for_backward(x, weight, *pairs)
+
+
+def _gradient(ctx, dout):
+    x, weight, pair_offsets, source, destination, back_source, back_destination = ctx.saved_tensors
+    dx = dweight = None
+    if ctx.needs_input_grad[0]:
+        lists = (back_source, back_destination, source, destination)
+        dx = _conv(dout, weight, not ctx.transposed, pair_offsets, *lists, x.shape[0])
+    if ctx.needs_input_grad[1] and ctx.transposed:
+        dweight = _conv_weight(dout, x, pair_offsets, destination, source)
+    elif ctx.needs_input_grad[1]:
+        dweight = _conv_weight(x, dout, pair_offsets, source, destination)
+    return dx, dweight, None, None, None, None, None, None, None
+
+
+library.differentiate(_conv, _save, _gradient)
+
+
+def sparse_conv(x: Tensor, weight: Tensor, map: CellMap) -> Tensor:
+    """Convolution of stride 2: out[X] = sum over (a, b, c) in {-1, 0, 1}^3 of x[2 X + (a, b, c)] W_k.
+
+    Args:
+        x: [C_fine, I], features of the cells of a level.
+        weight: [27, I, O]; W_k belongs to kernel offset k = 9(a+1) + 3(b+1) + (c+1).
+        map: `Octree.coarsen()` of that level.
+
+    Returns:
+        [C_coarse, O]. A cell that does not exist contributes nothing.
+
+    Raises:
+        ValueError: for shapes that do not fit each other or the map.
+    """
+    if x.shape[0] != map.num_fine:
+        raise ValueError(f"sparse_conv: x has {x.shape[0]} rows for {map.num_fine} fine cells")
+    pairs = (map.fine, map.coarse_index, map.coarse_by_fine, map.fine_by_fine)
+    return _conv(x, weight, False, map.pair_offsets, *pairs, len(map.coarse.keys))
+
+
+def sparse_conv_transposed(x: Tensor, weight: Tensor, map: CellMap) -> Tensor:
+    """The adjoint pattern: out[2 X + (a, b, c)] = sum over the coarse cells X of x[X] W_k.
+
+    Args:
+        x: [C_coarse, I], features of the cells of the coarser level.
+        weight: [27, I, O].
+        map: `Octree.coarsen()` of the finer level.
+
+    Returns:
+        [C_fine, O].
+
+    Raises:
+        ValueError: for shapes that do not fit each other or the map.
+    """
+    if x.shape[0] != len(map.coarse.keys):
+        raise ValueError(f"sparse_conv_transposed: x has {x.shape[0]} rows for {len(map.coarse.keys)} coarse cells")
+    pairs = (map.coarse_by_fine, map.fine_by_fine, map.fine, map.coarse_index)
+    return _conv(x, weight, False, map.pair_offsets, *pairs, map.num_fine)
