@@ -247,6 +247,37 @@ def test_a_disk_that_fails_leaves_the_previous_checkpoint(tmp_path, monkeypatch,
     require_content(tmp_path / "checkpoints" / "step-1", 1)
 
 
+def test_a_full_disk_leaves_the_previous_checkpoint(tmp_path):
+    """A file system of 256 KiB where the system lets us mount one, else a limit on the size of files."""
+    program = """
+import resource, sys, torch
+from ast_sim import checkpoint
+from ast_sim.errors import CheckpointError
+if sys.argv[2] != "0":
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
+checkpoint.save(sys.argv[1], 1, model={"w": torch.ones(100)}, optimizer={}, state={"step": 1})
+try:
+    checkpoint.save(sys.argv[1], 2, model={"w": torch.ones(100_000)}, optimizer={}, state={"step": 2})
+except CheckpointError as error:
+    print(error)
+print(checkpoint.load(checkpoint.latest(sys.argv[1]))[2])
+"""
+    run = tmp_path / "run"
+    run.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=256k", "none", str(run)]
+    mounted = os.geteuid() == 0 and subprocess.run(mount, capture_output=True).returncode == 0
+    try:
+        command = [sys.executable, "-W", "error", "-c", program, str(run), "0" if mounted else str(256 << 10)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+        message, state = done.stdout.splitlines()
+        assert "step-2: the checkpoint cannot be written: [Errno" in message and state == "{'step': 1}"
+        assert ("No space left" in message) == mounted and done.stderr == ""
+        assert steps(run) == [1]
+    finally:
+        if mounted:
+            subprocess.run(["umount", str(run)], check=True)
+
+
 def test_a_state_that_json_cannot_hold_is_refused(tmp_path):
     save(tmp_path, 1)
     for state in ({"loss": float("nan")}, {"x": object()}):

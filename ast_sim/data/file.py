@@ -34,7 +34,7 @@ from ast_sim.data.layout import (
     scene_kind,
     write_attributes,
 )
-from ast_sim.data.scene import AttributeValue, Scene, Trajectory, require_array, require_finite_frames
+from ast_sim.data.scene import AttributeValue, Scene, Trajectory, require_finite_frames
 from ast_sim.errors import DatasetError
 
 CACHE_BYTES = 1 << 30  # splits up to this size are kept in memory after their first reading
@@ -148,6 +148,7 @@ class Dataset:
             raise
         self._scenes: dict[tuple[str, int], Scene] = {}
         self._frames: dict[tuple[str, int], tuple[np.ndarray, np.ndarray | None]] = {}
+        self._open: dict[tuple[str, int], dict[str, h5py.Dataset]] = {}
         self._lengths: dict[tuple[str, int], int] = {}
         self._kept: dict[str, bool] = {}  # whether the split is small enough to be kept in memory
         self._kind: tuple[int, int] | None = None
@@ -277,9 +278,9 @@ class Dataset:
         with self._file.reading(f"sample {split}/{index:06d}"):
             return self._file.child(self._file.child(self._file.root, split, h5py.Group), f"{index:06d}", h5py.Group)
 
-    def _read(self, group: h5py.Group, key: str, frames: slice = slice(None)) -> np.ndarray:
+    def _read(self, group: h5py.Group, key: str) -> np.ndarray:
         with self._file.reading(f"{group.name.strip('/')}/{key}"):
-            value = self._file.array(group, key)[frames]
+            value = self._file.array(group, key)[()]
         value.flags.writeable = False
         return value
 
@@ -288,24 +289,35 @@ class Dataset:
         with self._file.reading(f"{split}/{index:06d}/{key}"):
             return self._file.array(group, key).shape
 
+    def _framed(self, split: str, index: int) -> dict[str, h5py.Dataset]:
+        """The arrays of a trajectory that have frames, open and with the shapes that its scene asks for."""
+        key = (split, index)
+        if key not in self._open:
+            name, group, scene = self._name(split, index), self._group(split, index), self.scene(split, index)
+            location, count = self.info.stress_location, self.num_frames(split, index)
+            if count == 0:
+                raise DatasetError(f"{name}: position has no frames")
+            shapes = {"position": (count, scene.num_nodes, 3)}
+            if location != "none":
+                shapes["stress"] = (count, scene.num_nodes if location == "node" else scene.num_elements, 1)
+            with self._file.reading(f"sample {split}/{index:06d}"):
+                arrays = {array: self._file.array(group, array) for array in shapes}
+            for array, shape in shapes.items():
+                if arrays[array].shape != shape:
+                    found = list(arrays[array].shape)
+                    raise DatasetError(f"{name}: {array} has the shape {found}, must be {list(shape)}")
+            self._open[key] = arrays
+        return self._open[key]
+
     def _read_frames(self, split: str, index: int, start: int, stop: int) -> tuple[np.ndarray, np.ndarray | None]:
-        name, group, scene = self._name(split, index), self._group(split, index), self.scene(split, index)
-        count = self.num_frames(split, index)
-        if count == 0:
-            raise DatasetError(f"{name}: position has no frames")
-        position = self._read(group, "position", slice(start, stop))
-        require_array(name, "position", position, np.float32, (stop - start, scene.num_nodes, 3))
-        require_finite_frames(name, "position", "node", position, start)
-        location = self.info.stress_location
-        if location == "none":
-            return position, None
-        rows = scene.num_nodes if location == "node" else scene.num_elements
-        if self._shape(split, index, "stress") != (count, rows, 1):
-            found = list(self._shape(split, index, "stress"))
-            raise DatasetError(f"{name}: stress has the shape {found}, must be [{count}, {rows}, 1]")
-        stress = self._read(group, "stress", slice(start, stop))
-        require_finite_frames(name, "stress", location, stress, start)
-        return position, stress
+        found: dict[str, np.ndarray] = {}
+        for key, array in self._framed(split, index).items():
+            with self._file.reading(f"{split}/{index:06d}/{key}"):
+                found[key] = array[start:stop]
+            row = "element" if key == "stress" and self.info.stress_location == "element" else "node"
+            require_finite_frames(self._name(split, index), key, row, found[key], start)
+            found[key].flags.writeable = False
+        return found["position"], found.get("stress")
 
     def _keeps(self, split: str) -> bool:
         if split not in self._kept:

@@ -29,7 +29,8 @@ class GuardedFile:
             if not self.path.is_file():
                 raise DatasetError(f"{self.path}: there is no such file")
             self.size = self.path.stat().st_size
-            self.root = h5py.File(self.path, "r", locking=False)
+            # Chunks are read once each: a cache of them would cost 1 MiB for every array that is open.
+            self.root = h5py.File(self.path, "r", locking=False, rdcc_nbytes=0)
 
     def close(self) -> None:
         self.root.close()
