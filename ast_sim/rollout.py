@@ -6,7 +6,6 @@ Scenes roll out together as one ragged batch; a scene that ends or fails leaves 
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -148,8 +147,9 @@ class _RollingScene:
         """Find how often the domain must double around its centre to hold the positions of a frame."""
         center = torch.tensor(self.config.domain_center, dtype=torch.float64)
         distance = (position.double() - center).abs().amax(dim=1)
-        ratio = float(distance.max()) / self.config.domain_half_width
-        self.doublings = math.ceil(math.log2(ratio)) if ratio > 1 else 0
+        self.doublings = 0
+        while float(distance.max()) > self.config.domain_half_width * 2.0**self.doublings:
+            self.doublings += 1
         if self.config.L_cell + self.doublings > MAX_LEVEL:
             self.failure = (
                 f"{self.name}: node {int(distance.argmax())} is {float(distance.max()):.3g} from the centre of the"

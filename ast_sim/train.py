@@ -22,7 +22,7 @@ from ast_sim import checkpoint
 from ast_sim.config import override
 from ast_sim.data.file import Dataset
 from ast_sim.data.sampling import PairSampler
-from ast_sim.errors import ConfigError, TrainingError
+from ast_sim.errors import ConfigError, DatasetError, TrainingError
 from ast_sim.measures import SquaredError, rmse_sequence
 from ast_sim.model.ast import build_model
 from ast_sim.model.config import PRESETS, resolve
@@ -126,6 +126,7 @@ class _Training:
         self.metrics = Metrics(run)
         self.clock = Clock()
         self.step = 0
+        self.fingerprint = self._fingerprint()
         self.sums: dict[str, float] = {}  # of the steps since the last line of metrics
         self._introduce(scales)
 
@@ -189,7 +190,10 @@ class _Training:
         values: dict[str, float] = {}
         for part in range(options.accumulate):
             batch, target = self.sampler.batch(self.step * options.accumulate + part)
-            losses = self.model.loss(batch, target, options.stress_weight)
+            try:
+                losses = self.model.loss(batch, target, options.stress_weight)
+            except DatasetError as error:
+                raise DatasetError(f"{self.dataset.path}: in one of {', '.join(batch.names)}: {error}") from error
             loss = losses["loss"]
             if not loss.isfinite():
                 raise self._not_finite("loss", float(loss.detach()), batch.names)
@@ -275,7 +279,7 @@ class _Training:
         for name, parameter in self.parameters.items():
             for key, value in self.optimizer.state[parameter].items():
                 optimizer[f"{name}.{key}"] = value
-        state = {"step": self.step, "sums": self.sums, "data": self._fingerprint()}
+        state = {"step": self.step, "sums": self.sums, "data": self.fingerprint}
         checkpoint.save(
             self.run, self.step, model=self.model.state_dict(), optimizer=optimizer, state=state, keep=self.options.keep
         )
@@ -289,7 +293,7 @@ class _Training:
             self.model.fit_statistics(self.sampler.batch(index) for index in batches)
             return
         weights, optimizer, state = checkpoint.load(path)
-        if state["data"] != self._fingerprint():
+        if state["data"] != self.fingerprint:
             raise TrainingError(
                 f"{self.dataset.path} is not the dataset that {self.run} was trained on so far: bring that one back,"
                 " or train in another folder"
@@ -304,14 +308,13 @@ class _Training:
         self.metrics.forget_after(self.step)
         print(f"going on after step {self.step:,}", flush=True)
 
-    def _fingerprint(self) -> dict[str, Any]:
-        """What tells one dataset from another without reading it whole."""
-        info = repr(self.dataset.info).encode()
-        return {
-            "bytes": Path(self.dataset.path).stat().st_size,
-            "info": hashlib.sha256(info).hexdigest(),
-            "splits": dict(self.dataset.splits),
-        }
+    def _fingerprint(self) -> str:
+        """Tells one dataset from another without reading it whole; recorded times and the file's place do not count."""
+        digest = hashlib.sha256(repr((self.dataset.info, self.dataset.splits)).encode())
+        for index in (0, self.dataset.count("train") - 1):
+            position, _ = self.dataset.frames("train", index, 0, self.dataset.num_frames("train", index))
+            digest.update(np.ascontiguousarray(position).tobytes())
+        return digest.hexdigest()
 
 
 def _motion_error(position: np.ndarray, truth: Any, given: int) -> SquaredError:

@@ -1,0 +1,281 @@
+"""The command line: `ast-sim COMMAND`. Errors that a user can act on are one line on stderr and exit code 2.
+
+Everything heavy is imported by the command that needs it, so that help is immediate.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shlex
+import sys
+import warnings
+from pathlib import Path
+from typing import Any, NoReturn
+
+from ast_sim import __version__
+from ast_sim.errors import AstSimError, ConfigError, DatasetError, RolloutError
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong with the arguments in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+
+class _TrainParser(_Parser):
+    """Its help ends with every setting that `--set` knows; these are imported only then."""
+
+    def format_help(self) -> str:
+        from ast_sim import config
+        from ast_sim.model.config import PRESETS
+        from ast_sim.run import RunConfig
+
+        lines = [super().format_help(), f"presets: {', '.join(PRESETS)}", "", "settings for --set, and their defaults:"]
+        for setting in config.settings(RunConfig):
+            if setting.help:
+                lines.append(f"  {setting.key}={setting.default}  ({setting.type})\n        {setting.help}")
+        return "\n".join(lines) + "\n"
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run a command; returns the exit code."""
+    args = _build_parser().parse_args(argv)
+    warnings.showwarning = _show_warning
+    try:
+        args.run(args)
+        sys.stdout.flush()
+        return 0
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:
+        # The reader of our output has gone; what Python flushes at exit must not complain either.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    except (AstSimError, OSError) as error:
+        if args.debug:
+            raise
+        print(f"ast-sim {args.command}: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+
+
+def _show_warning(message: Warning | str, *_: Any) -> None:
+    print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
+
+
+def _build_parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="ast-sim", description="Learned simulation of deforming bodies in contact.")
+    parser.add_argument("--version", action="version", version=f"ast_sim {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def command(name: str, run: Any, help: str, kind: type[_Parser] = _Parser) -> _Parser:
+        commands._parser_class = kind
+        sub = commands.add_parser(name, help=help, description=help[0].upper() + help[1:] + ".")
+        sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        sub.set_defaults(run=run)
+        return sub
+
+    demo = command("demo", _demo, "generate a small dataset, train on it, roll out its test scenes, write a report")
+    demo.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="folder for everything (demo)")
+    demo.add_argument("--quick", action="store_true", help="fewer scenes and steps: 90 seconds on 2 cores")
+    demo.add_argument("--seed", type=_at_least(0), default=0, help="of scenes and training (0)")
+
+    generate = command("generate", _generate, "simulate scenes with the bundled contact FEM; restarts where it stopped")
+    generate.add_argument("family", metavar="FAMILY", help="kind of scenes: deforming_plate")
+    generate.add_argument("--out", type=Path, required=True, metavar="FILE", help="dataset to write (.h5)")
+    generate.add_argument("--count", type=_at_least(1), required=True, metavar="N", help="training scenes")
+    generate.add_argument("--valid", type=_at_least(0), metavar="N", help="validation scenes (a tenth of N)")
+    generate.add_argument("--test", type=_at_least(0), metavar="N", help="test scenes (a tenth of N)")
+    generate.add_argument("--nodes", type=_at_least(1), metavar="N", help="nodes of a scene, about")
+    generate.add_argument("--seed", type=_at_least(0), default=0, help="the scenes follow from it (0)")
+    generate.add_argument("--workers", type=_at_least(1), metavar="W", help="processes (one a core)")
+
+    _add_convert(command("convert", _convert, "import simulations of other programs (PVD collections, VTU series)"))
+
+    info = command("info", _info, "tell what is in a dataset or a run, and check it")
+    info.add_argument("path", type=Path, metavar="FILE_OR_RUN")
+    info.add_argument("--json", action="store_true", help="as JSON")
+
+    train = command("train", _train, "train a model", _TrainParser)
+    train.add_argument("data", metavar="DATA", nargs="?", type=Path, help="dataset; not needed with --resume")
+    train.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder")
+    train.add_argument("--preset", metavar="P", help="settings to start from (tiny)")
+    train.add_argument("--set", action="append", default=[], metavar="k=v", help="change a setting; may be repeated")
+    train.add_argument("--resume", action="store_true", help="go on after the last checkpoint, if there is one")
+
+    evaluate = command("evaluate", _evaluate, "measure a run's errors and speed on a dataset")
+    evaluate.add_argument("run_folder", type=Path, metavar="RUN")
+    evaluate.add_argument("data", type=Path, metavar="DATA")
+    evaluate.add_argument("--split", choices=("train", "valid", "test"), default="test")
+    evaluate.add_argument("--json", type=Path, metavar="FILE", help="write all figures there too")
+
+    rollout = command("rollout", _rollout, "predict a trajectory from its first frame")
+    rollout.add_argument("run_folder", type=Path, metavar="RUN")
+    rollout.add_argument("data", type=Path, metavar="DATA")
+    rollout.add_argument("--split", choices=("train", "valid", "test"), default="test")
+    rollout.add_argument("--index", type=_at_least(0), required=True, metavar="I", help="which trajectory")
+    rollout.add_argument("--out", type=Path, required=True, metavar="FILE", help="ends in .h5, .pvd or .vtkhdf")
+
+    report = command("report", _report, "write one page with moving scenes, error curves and tables")
+    report.add_argument("run_folders", type=Path, nargs="+", metavar="RUN")
+    report.add_argument("--out", type=Path, required=True, metavar="FILE.html")
+    report.add_argument("--data", type=Path, metavar="DATA", help="dataset (the one that each run was trained on)")
+    return parser
+
+
+def _add_convert(convert: _Parser) -> None:
+    convert.add_argument(
+        "source", type=Path, metavar="SOURCE", help="one simulation (.pvd, or a folder of .vtu), or a folder of several"
+    )
+    convert.add_argument("--out", type=Path, required=True, metavar="FILE", help="dataset to write (.h5)")
+    fields = convert.add_argument_group("names of the fields in the files")
+    for name, help in (
+        ("displacement", "point field, from rest; without one the points themselves move"),
+        ("stress", "von Mises stress, a point or a cell field"),
+        ("node-type", "point field: 0 normal, 1 obstacle, 3 handle"),
+        ("obstacle", "point field, not zero at the nodes of obstacles"),
+        ("handle", "point field, not zero at nodes whose motion is prescribed"),
+        ("body", "point field that numbers the bodies"),
+    ):
+        fields.add_argument(f"--{name}", metavar="NAME", help=help)
+    fields.add_argument("--material", nargs="+", default=[], metavar="NAME", help="cell fields with one number each")
+    kind = convert.add_argument_group("what the dataset says of itself")
+    kind.add_argument("--shares", nargs=3, type=float, default=[0.8, 0.1, 0.1], metavar=("TRAIN", "VALID", "TEST"))
+    kind.add_argument("--seed", type=_at_least(0), default=0, help="of the draw for the splits (0)")
+    kind.add_argument("--dynamic", action="store_true", help="inertia matters: the acceleration is predicted")
+    kind.add_argument("--contact-radius", type=float, default=0.0, metavar="R")
+    kind.add_argument("--time-step", type=float, default=0.0, metavar="SECONDS")
+    kind.add_argument("--length-unit", default="m", metavar="UNIT")
+
+
+def _at_least(least: int) -> Any:
+    def number(text: str) -> int:
+        value = int(text)
+        if value < least:
+            raise argparse.ArgumentTypeError(f"{value} is below {least}")
+        return value
+
+    number.__name__ = "whole number"
+    return number
+
+
+def _demo(args: argparse.Namespace) -> None:
+    from ast_sim.demo import demo
+
+    demo(args.out, quick=args.quick, seed=args.seed)
+
+
+def _generate(args: argparse.Namespace) -> None:
+    from ast_sim.simulate.generate import generate
+
+    tenth = -(-args.count // 10)
+    counts = {
+        "train": args.count,
+        "valid": tenth if args.valid is None else args.valid,
+        "test": tenth if args.test is None else args.test,
+    }
+    made = generate(args.family, args.out, counts, args.seed, args.nodes, args.workers)
+    print(f"{made.path}: {', '.join(f'{count} {split}' for split, count in made.counts.items())}")
+    if made.truncated:
+        print(f"stopped before their last frame: {', '.join(made.truncated)}")
+
+
+def _convert(args: argparse.Namespace) -> None:
+    from ast_sim.data.convert import convert
+    from ast_sim.data.series import FieldNames
+
+    counts = convert(
+        args.source,
+        args.out,
+        names=FieldNames(
+            args.displacement, args.stress, args.node_type, args.obstacle, args.handle, args.body, tuple(args.material)
+        ),
+        splits=dict(zip(("train", "valid", "test"), args.shares, strict=True)),
+        seed=args.seed,
+        integration="dynamic" if args.dynamic else "quasi_static",
+        contact_radius=args.contact_radius,
+        time_step=args.time_step,
+        length_unit=args.length_unit,
+        progress=print,
+    )
+    print(f"{args.out}: {', '.join(f'{count} {split}' for split, count in counts.items())}")
+
+
+def _info(args: argparse.Namespace) -> None:
+    from ast_sim.info import describe, text
+
+    found = describe(args.path)
+    print(json.dumps(found, indent=1) if args.json else text(found))
+
+
+def _train(args: argparse.Namespace) -> None:
+    from ast_sim import keep_memory
+    from ast_sim.train import configure, train
+
+    keep_memory()
+    if args.data is None and not args.resume:
+        raise ConfigError("name the dataset to train on, or --resume the run in --out")
+    if args.data is None and (args.preset or args.set):
+        raise ConfigError("settings are those of the run that is resumed: leave --preset and --set out")
+    # A run that is resumed keeps its settings; given ones are compared with them.
+    config = None
+    if args.data is not None:
+        config = configure(args.data, args.preset or "tiny", args.set)
+    train(args.out, config, resume=args.resume)
+    print(f"run: {args.out}")
+
+
+def _evaluate(args: argparse.Namespace) -> None:
+    from ast_sim import keep_memory
+    from ast_sim.evaluate import table
+    from ast_sim.results import evaluate_run, open_run, write_json
+
+    keep_memory()
+    with open_run(args.run_folder, args.data) as run:
+        found = evaluate_run(run, args.split, _command_line())
+    print(table(found))
+    if args.json is not None:
+        write_json(args.json, found)
+        print(f"all figures: {args.json}")
+
+
+def _rollout(args: argparse.Namespace) -> None:
+    from ast_sim import keep_memory
+    from ast_sim.results import SUFFIXES, open_run, predict, write_prediction
+
+    if args.out.suffix not in SUFFIXES:
+        raise ConfigError(f"--out {args.out}: a prediction is written as {', '.join(SUFFIXES)}: name it so")
+    keep_memory()
+    with open_run(args.run_folder, args.data) as run:
+        count = run.dataset.count(args.split)
+        if args.index >= count:
+            raise DatasetError(f"{args.data}: there is no {args.split}/{args.index:06d}: the split has {count}")
+        truth, result = predict(run, args.split, args.index)
+        write_prediction(run, truth, result, f"{args.split}/{args.index:06d}", args.out)
+    if result.failure is not None:
+        raise RolloutError(f"{result.failure}, in {args.out}")
+    steps = len(result.seconds)
+    print(f"{args.out}: {steps} frames predicted, {1000 * sum(result.seconds) / steps:.3g} ms each")
+
+
+def _report(args: argparse.Namespace) -> None:
+    from ast_sim import keep_memory
+    from ast_sim.results import evaluate_run, open_run, report_run, write_report
+
+    keep_memory()
+    shown = []
+    for folder in args.run_folders:
+        with open_run(folder, args.data) as run:
+            shown.append(report_run(run, evaluate_run(run, "test", _command_line())))
+    write_report(args.out, shown, "Learned simulation: predictions and errors")
+    print(f"report: {args.out}")
+
+
+def _command_line() -> str:
+    return shlex.join(["ast-sim", *sys.argv[1:]])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

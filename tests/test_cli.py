@@ -1,0 +1,286 @@
+"""The command line: every command on real files, and every kind of bad input as one line and exit code 2."""
+
+import json
+import os
+import subprocess
+import sys
+
+import h5py
+import numpy as np
+import pytest
+import toy
+
+from ast_sim.cli import main
+from ast_sim.data.file import Dataset
+
+SMALL = [
+    "train.steps=6", "train.batch_size=2", "train.log_every=2", "train.statistics_pairs=4", "model.hidden=16",
+    "model.decoder_hidden=16", "model.d_token=16", "model.heads=1", "model.head_dim=16", "model.ffn_inner=16",
+    "model.L_SA=1",
+]  # fmt: skip
+SET = [part for assignment in SMALL for part in ("--set", assignment)]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A dataset and a run on it."""
+    folder = tmp_path_factory.mktemp("cli")
+    data = toy.write(folder / "toy.h5")
+    assert main(["train", str(data), "--out", str(folder / "run"), *SET]) == 0
+    return data, folder / "run"
+
+
+def fails(capsys, *arguments) -> str:
+    """Run a command that must fail with one line on stderr; returns the line."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stopped:
+        sys.exit(main([str(argument) for argument in arguments]))
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2
+    assert error.count("\n") == 1, error
+    return error
+
+
+# What the commands do
+
+
+def test_help_lists_every_command_and_imports_no_torch():
+    code = (
+        "import sys; from ast_sim.cli import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit: pass\n"
+        "assert not {'torch', 'numpy', 'h5py'} & set(sys.modules), sorted(sys.modules)"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    for name in ("demo", "generate", "convert", "info", "train", "evaluate", "rollout", "report"):
+        assert f"\n    {name} " in found.stdout
+
+
+def test_train_help_explains_every_setting(capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "--help"])
+    shown = capsys.readouterr().out
+    assert "train.batch_size=48" in shown
+    assert "model.L_SA=12" in shown
+    assert "deforming_plate" in shown
+
+
+def test_info_of_a_dataset(trained, capsys):
+    data, _ = trained
+    assert main(["info", str(data), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["kind"] == "dataset"
+    assert facts["integration"] == "quasi_static"
+    assert {split: values["trajectories"] for split, values in facts["splits"].items()} == {
+        "train": 3, "valid": 2, "test": 2,
+    }  # fmt: skip
+    train = facts["splits"]["train"]
+    assert train["nodes"] == [48, 58]  # 5 x 4 x 2 or 5 x 5 x 2 of the plate and 8 of the block
+    assert train["frames"] == [7, 7]
+    assert train["node_types"] == {"NORMAL": 24 + 30 + 24, "OBSTACLE": 24, "HANDLE": 16 + 20 + 16}
+    assert train["truncated"] == train["outside_domain"] == []
+    assert main(["info", str(data)]) == 0
+    assert "stress_location" in capsys.readouterr().out
+
+
+def test_info_of_a_run(trained, capsys):
+    _, run = trained
+    assert main(["info", str(run), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["kind"] == "run"
+    assert facts["latest_checkpoint"] == "step-6"
+    assert facts["train"]["steps"] == 6
+    assert facts["best_validation"]["valid_rmse"] > 0
+
+
+def test_evaluate_prints_a_table_and_writes_all_figures(trained, tmp_path, capsys):
+    data, run = trained
+    assert main(["evaluate", str(run), str(data), "--json", str(tmp_path / "evaluation.json")]) == 0
+    shown = capsys.readouterr().out
+    assert "hold_still" in shown and "stress_frame_mean" in shown
+    found = json.loads((tmp_path / "evaluation.json").read_text())
+    assert set(found) >= {"command", "commit", "processor", "versions", "run", "data", "split", "samples", "summary"}
+    assert found["split"] == "test"
+    assert [sample["name"] for sample in found["samples"]] == ["test/000000", "test/000001"]
+
+
+@pytest.mark.parametrize("name", ["prediction.h5", "prediction.pvd", "prediction.vtkhdf"])
+def test_rollout_writes_the_format_that_the_name_asks_for(trained, tmp_path, capsys, name):
+    data, run = trained
+    out = tmp_path / "new" / name
+    assert main(["rollout", str(run), str(data), "--index", "1", "--out", str(out)]) == 0
+    assert "6 frames predicted" in capsys.readouterr().out
+    with Dataset(data) as dataset:
+        truth = dataset.load("test", 1)
+    if name.endswith(".h5"):
+        with Dataset(out) as dataset:
+            prediction = dataset.load("test", 0)
+        assert np.array_equal(prediction.scene.elements, truth.scene.elements)
+        prescribed = truth.scene.prescribed
+        assert np.array_equal(prediction.position[:, prescribed], truth.position[:, prescribed])
+        assert prediction.attributes["source"].endswith("toy.h5: test/000001")
+        assert prediction.attributes["status"] == "complete"
+    elif name.endswith(".vtkhdf"):
+        with h5py.File(out) as file:
+            assert file["VTKHDF/Steps"].attrs["NSteps"] == 7
+    else:
+        assert out.read_text().count("<DataSet ") == 7
+
+
+def test_a_failing_rollout_keeps_the_frames_before(trained, tmp_path, capsys, monkeypatch):
+    import torch
+
+    from ast_sim.model.simulator import Prediction, Simulator
+
+    real, calls = Simulator.predict, []
+
+    def predict(self, batch):
+        calls.append(batch)
+        prediction = real(self, batch)
+        if len(calls) < 3:
+            return prediction
+        return Prediction(torch.full_like(prediction.motion, torch.inf), prediction.stress)
+
+    monkeypatch.setattr(Simulator, "predict", predict)
+    data, run = trained
+    out = tmp_path / "prediction.h5"
+    error = fails(capsys, "rollout", run, data, "--index", 0, "--out", out)
+    assert "in frame 3 is not finite" in error and str(out) in error
+    with Dataset(out) as dataset:
+        assert dataset.num_frames("test", 0) == 3
+        assert dataset.attributes("test", 0)["status"] == "truncated"
+
+
+def test_report_is_one_page(trained, tmp_path, capsys):
+    _, run = trained
+    assert main(["report", str(run), "--out", str(tmp_path / "pages" / "report.html")]) == 0
+    page = (tmp_path / "pages" / "report.html").read_text()
+    assert page.startswith("<!")
+    assert "test/000001" in page
+
+
+def test_a_series_of_another_program_becomes_a_dataset(tmp_path, capsys):
+    from ast_sim.view import export
+
+    (tmp_path / "results").mkdir()
+    for seed in range(3):
+        export.write(tmp_path / "results" / f"case{seed}.pvd", toy.plate(seed))
+    shares = ["--shares", "0.34", "0.33", "0.33"]
+    assert main(["convert", str(tmp_path / "results"), "--out", str(tmp_path / "own.h5"), *shares]) == 0
+    assert "1 train, 1 valid, 1 test" in capsys.readouterr().out
+    with Dataset(tmp_path / "own.h5") as dataset:
+        assert dataset.info.stress_location == "node"
+        assert dataset.num_frames("test", 0) == 7
+
+
+def test_resume_without_a_dataset_takes_that_of_the_run(trained, capsys):
+    _, run = trained
+    assert main(["train", "--out", str(run), "--resume"]) == 0
+    assert "going on after step 6" in capsys.readouterr().out
+
+
+# What is wrong, in one line
+
+
+def test_unknown_keys_presets_and_commands_name_what_there_is(trained, tmp_path, capsys):
+    data, _ = trained
+    out = ("--out", tmp_path / "run")
+    assert "train.batch_size" in fails(capsys, "train", data, *out, "--set", "train.batchsize=3")
+    assert "train.steps" in fails(capsys, "train", data, *out, "--set", "train.steps=many")
+    assert "did you mean tiny" in fails(capsys, "train", data, *out, "--preset", "tny")
+    assert "invalid choice" in fails(capsys, "trian")
+    assert "--set" in fails(capsys, "train", "--out", tmp_path / "run", "--resume", "--set", "train.steps=3")
+    assert not (tmp_path / "run").exists()
+
+
+def test_damaged_datasets(trained, tmp_path, capsys):
+    data, _ = trained
+    whole = data.read_bytes()
+    (tmp_path / "short.h5").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "text.h5").write_text("positions: 1 2 3\n")
+    for name in ("short.h5", "text.h5", "absent.h5"):
+        for command in (("info",), ("train", "--out", tmp_path / "run")):
+            assert name in fails(capsys, *command, tmp_path / name)
+
+
+def spoiled(data, path, array, index, value):
+    path.write_bytes(data.read_bytes())
+    with h5py.File(path, "r+") as file:
+        file[f"train/000001/{array}"][index] = value
+    return path
+
+
+def test_a_position_that_is_nan_names_file_sample_frame_and_node(trained, tmp_path, capsys):
+    path = spoiled(trained[0], tmp_path / "nan.h5", "position", (3, 17, 0), np.nan)
+    for command in (("info", path), ("train", path, "--out", tmp_path / "run")):
+        error = fails(capsys, *command)
+        assert "nan.h5" in error and "train/000001" in error and "frame 3" in error and "node 17" in error
+
+
+def test_an_index_out_of_range_names_file_sample_and_element(trained, tmp_path, capsys):
+    path = spoiled(trained[0], tmp_path / "index.h5", "elements", (5, 2), 999)
+    error = fails(capsys, "train", path, "--out", tmp_path / "run")
+    assert "index.h5" in error and "train/000001" in error and "element 5 refers to node 999" in error
+
+
+def test_a_node_outside_the_domain_names_the_samples_and_the_node(trained, tmp_path, capsys):
+    path = tmp_path / "outside.h5"
+    path.write_bytes(trained[0].read_bytes())
+    with h5py.File(path, "r+") as file:
+        file.attrs["domain_half_width"] = 0.15
+    error = fails(capsys, "train", path, "--out", tmp_path / "run", *SET)
+    assert "outside.h5" in error and "train/00000" in error and "domain_half_width" in error
+    assert main(["info", str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["splits"]["train"]["outside_domain"] == [0, 1, 2]
+
+
+def test_missing_extras_name_the_pip_line(trained, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ipctk", None)
+    monkeypatch.setitem(sys.modules, "plotly", None)
+    monkeypatch.setitem(sys.modules, "plotly.offline", None)
+    error = fails(capsys, "generate", "deforming_plate", "--out", tmp_path / "plates.h5", "--count", 1)
+    assert 'pip install "ast_sim[simulate]"' in error
+    error = fails(capsys, "report", trained[1], "--out", tmp_path / "report.html")
+    assert 'pip install "ast_sim[view]"' in error
+
+
+def test_a_folder_that_is_no_run_and_a_dataset_of_another_kind(trained, tmp_path, capsys):
+    data, run = trained
+    assert "not a run folder" in fails(capsys, "evaluate", tmp_path, data)
+    other = toy.write(tmp_path / "other.h5", stress=False)
+    error = fails(capsys, "evaluate", run, other)
+    assert "stress_location none" in error and "other.h5" in error
+    assert "the split has 2" in fails(capsys, "rollout", run, data, "--index", 2, "--out", tmp_path / "x.h5")
+    assert ".vtkhdf" in fails(capsys, "rollout", run, data, "--index", 0, "--out", tmp_path / "x.obj")
+
+
+def test_arguments_out_of_range(tmp_path, capsys):
+    assert "0 is below 1" in fails(capsys, "generate", "deforming_plate", "--out", tmp_path / "a.h5", "--count", 0)
+    assert "ball" in fails(capsys, "generate", "ball", "--out", tmp_path / "a.h5", "--count", 1)
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(trained, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert "file" in fails(capsys, "train", trained[0], "--out", tmp_path / "file" / "run")
+    assert "file" in fails(capsys, "report", trained[1], "--out", tmp_path / "file" / "report.html")
+
+
+def test_debug_shows_the_traceback(tmp_path):
+    from ast_sim.errors import DatasetError
+
+    with pytest.raises(DatasetError):
+        main(["info", str(tmp_path / "absent.h5"), "--debug"])
+
+
+def test_a_reader_that_goes_away_is_no_error(trained):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "ast_sim.cli", "info", str(trained[0])], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    process.stdout.close()
+    assert process.stderr.read() == b""
+    assert process.wait() == 141
+
+
+def test_the_command_needs_no_terminal_and_no_home(trained):
+    environment = {key: value for key, value in os.environ.items() if key != "HOME"}
+    subprocess.run([sys.executable, "-m", "ast_sim.cli", "info", str(trained[0])], check=True, env=environment)

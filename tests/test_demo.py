@@ -1,0 +1,99 @@
+"""The demonstration at its smallest: real simulations, a few steps of training, every file, the same numbers again."""
+
+import json
+import shutil
+
+import pytest
+
+from ast_sim import demo
+from ast_sim.cli import main
+from ast_sim.data.file import Dataset
+from ast_sim.demo import FULL, QUICK, Size, headlines
+
+TINY = Size(train=1, valid=1, test=1, steps=4)
+FILES = ("report.html", "prediction.pvd", "picture.png", "evaluation.json", "data.h5", "run/config.toml")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """The folder of a demonstration."""
+    folder = tmp_path_factory.mktemp("demo") / "demo"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demo, "QUICK", TINY)
+        assert main(["demo", "--quick", "--out", str(folder)]) == 0
+    return folder
+
+
+def figures(folder) -> dict:
+    """The evaluation without what a clock or a place decides."""
+    found = json.loads((folder / "evaluation.json").read_text())
+    for sample in found["samples"]:
+        del sample["model_seconds_per_step"], sample["solver_seconds_per_step"]
+    return {key: found[key] for key in ("samples", "summary", "failures", "step")}
+
+
+def test_everything_is_made(made):
+    for name in FILES:
+        assert (made / name).stat().st_size > 0, name
+    assert (made / "picture.png").read_bytes().startswith(b"\x89PNG")
+    with Dataset(made / "data.h5") as dataset:
+        assert dataset.splits == {"train": 1, "valid": 1, "test": 1}
+    found = json.loads((made / "evaluation.json").read_text())
+    assert found["command"].startswith("ast-sim ")
+    assert found["speedup"] > 0
+    assert found["step"] in (1, 2, 3, 4)
+
+
+def test_again_in_the_same_folder_reuses_the_parts_and_other_settings_are_refused(made, monkeypatch, capsys):
+    monkeypatch.setattr(demo, "QUICK", TINY)
+    before = figures(made)
+    weights = (made / "run" / "checkpoints" / "step-4" / "manifest.json").read_bytes()
+    assert main(["demo", "--quick", "--out", str(made)]) == 0
+    shown = capsys.readouterr().out
+    assert "going on after step 4" in shown
+    for name in FILES[:4]:
+        assert str(made / name) in shown
+    assert figures(made) == before
+    assert (made / "run" / "checkpoints" / "step-4" / "manifest.json").read_bytes() == weights
+    assert main(["demo", "--quick", "--out", str(made), "--seed", "1"]) == 2
+    assert "data.h5 exists and holds other data" in capsys.readouterr().err
+    monkeypatch.setattr(demo, "QUICK", Size(train=1, valid=1, test=1, steps=5))
+    assert main(["demo", "--quick", "--out", str(made)]) == 2
+    assert "train.steps = 4, not 5" in capsys.readouterr().err
+
+
+def test_the_same_seed_gives_the_same_numbers_elsewhere(made, tmp_path, monkeypatch):
+    monkeypatch.setattr(demo, "QUICK", TINY)
+    (tmp_path / "again").mkdir()
+    shutil.copy(made / "data.h5", tmp_path / "again")  # that scenes are the same again is tested with the solver
+    demo.demo(tmp_path / "again", quick=True)
+    assert figures(tmp_path / "again") == figures(made)
+
+
+def test_headlines_are_shares_of_the_trivial_predictors():
+    def summary(quantity, nodes, value):
+        return {quantity: {"rollout_all": {nodes: {"rmse_sequence": value}}}}
+
+    found = {
+        "length_unit": "m",
+        "stress_unit": "Pa",
+        "summary": {
+            "ast": {**summary("displacement", "normal", 0.002), **summary("stress", "deforming", 600.0)},
+            "hold_still": summary("displacement", "normal", 0.01),
+            "stress_frame_mean": summary("stress", "deforming", 1000.0),
+        },
+        "failures": 1,
+        "samples": [{}, {}],
+        "speedup": 12.345,
+    }
+    assert headlines(found) == [
+        "displacement error over whole rollouts: 0.002 m, 20 % of that of holding still",
+        "stress error over whole rollouts: 600 Pa, 60 % of that of each frame's true mean",
+        "1 of 2 rollouts failed",
+        "speed: 12.3 times as fast as the solver on the same scenes",
+    ]
+
+
+def test_the_sizes_of_the_demonstration():
+    assert (FULL.train, FULL.valid, FULL.test) == (100, 8, 10)
+    assert QUICK.train < FULL.train and QUICK.steps < FULL.steps
