@@ -1,6 +1,7 @@
 """Importing the results of other programs: PVD collections and folders of VTU files, as meshio writes them."""
 
 import os
+import random
 import subprocess
 import sys
 
@@ -299,6 +300,28 @@ def test_what_a_frame_lacks_is_named(tmp_path, make, names, message):
     make(tmp_path / "a.vtu")
     with pytest.raises(DatasetError, match=f"{tmp_path}/a.vtu: .*{message}"):
         read(tmp_path / "a.vtu", **names)
+
+
+@pytest.mark.parametrize("options", [{"binary": False}, {"compression": None}, {}])
+def test_a_damaged_frame_is_an_error_or_other_numbers_but_nothing_else(tmp_path, options, capfd):
+    """VTU has no checksums: a flipped bit may change a number, but never raises anything but a DatasetError."""
+    path = tmp_path / "a.vtu"
+    frame(point={"von_mises": np.arange(8.0)}, **options)(path)
+    capfd.readouterr()  # what meshio prints of writing text
+    data, refused = path.read_bytes(), 0
+    generator = random.Random(0)
+    for attempt in range(60):
+        changed = bytearray(data[: generator.randrange(len(data))] if attempt % 3 == 0 else data)
+        if attempt % 3:
+            changed[generator.randrange(len(data))] ^= 1 << generator.randrange(8)
+        path.write_bytes(changed)
+        try:
+            read(path).check()
+        except DatasetError as error:
+            assert str(path) in str(error) and "\n" not in str(error)
+            refused += 1
+    assert refused > 20
+    assert capfd.readouterr() == ("", "")
 
 
 def test_a_displacement_that_does_not_fit_is_named(tmp_path):
