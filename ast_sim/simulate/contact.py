@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ast_sim.errors import MissingExtra, require
+from ast_sim.errors import MissingExtra, SimulationError, require
 
 IPCTK_VERSION = "1.5"
 # Candidate pairs stay valid while no vertex has moved further than this share of dhat from where they were collected.
@@ -31,6 +31,31 @@ def load_ipctk():
         )
     ipctk.set_num_threads(1)
     return ipctk
+
+
+def self_test() -> None:
+    """Check on two tetrahedra that ipctk means what this module takes it to mean.
+
+    Raises:
+        MissingExtra: as `load_ipctk`.
+        SimulationError: a gap or a gradient of the barrier that is not what it should be.
+    """
+    tetrahedron = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.3, 1]])
+    position = np.concatenate([tetrahedron, [0.05, 0.1, 1.05] + tetrahedron @ np.diag([1, 1, 0.5])])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    contact = Contact(position, np.concatenate([faces, faces + 4]), np.repeat([0, 1], 4), dhat=0.1, stiffness=3.0)
+
+    def state(shift: np.ndarray) -> ContactState:
+        contact.collision_free_fraction(position, position + shift)
+        return contact.at(position + shift)
+
+    direction = 1e-6 * np.sin(np.arange(24)).reshape(8, 3)
+    difference = (state(direction).energy() - state(-direction).energy()) / 2
+    derivative = float(np.vdot(state(0 * direction).gradient(), direction))
+    if not (derivative != 0 and abs(difference - derivative) <= 1e-5 * abs(derivative)):
+        raise SimulationError(f"ipctk's barrier gradient is {derivative:.9g}, its differences say {difference:.9g}")
+    if abs(contact.gap(position) - 0.05) > 1e-9:
+        raise SimulationError(f"ipctk gives the distance {contact.gap(position):.9g} for 0.05")
 
 
 class Contact:

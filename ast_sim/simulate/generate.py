@@ -26,7 +26,7 @@ from typing import Any, TextIO
 import ast_sim
 from ast_sim.data.file import SPLITS, Dataset, DatasetWriter
 from ast_sim.errors import SimulationError
-from ast_sim.simulate.contact import load_ipctk
+from ast_sim.simulate.contact import self_test
 from ast_sim.simulate.progress import Progress
 from ast_sim.simulate.samples import family_module, load_sample, sample_path
 
@@ -77,10 +77,10 @@ def generate(
         MissingExtra: ipctk is not installed.
     """
     module = family_module(family)
-    load_ipctk()
+    self_test()
     counts = _checked_counts(COUNTS if counts is None else counts)
     nodes = module.DEFAULT_NODES if nodes is None else nodes
-    workers = len(os.sched_getaffinity(0)) if workers is None else workers
+    workers = _available_cores() if workers is None else workers
     for name, value, least in (("seed", seed, 0), ("nodes", nodes, module.MINIMUM_NODES), ("workers", workers, 1)):
         if value < least:
             raise SimulationError(f"{name} is {value}; must be at least {least}")
@@ -105,6 +105,12 @@ def generate(
     return Generated(out, counts, truncated)
 
 
+def _available_cores() -> int:
+    if hasattr(os, "sched_getaffinity"):  # not on macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def _checked_counts(counts: dict[str, int]) -> dict[str, int]:
     unknown = set(counts) - set(SPLITS)
     if unknown:
@@ -121,10 +127,10 @@ def _settings(family: str, seed: int, nodes: int) -> dict[str, Any]:
     return {
         "program": f"ast_sim {ast_sim.__version__}",
         "versions": versions,
-        "command": f"ast-sim generate {family} --seed {seed} --nodes {nodes}",
         "family": family,
         "seed": seed,
         "nodes": nodes,
+        "command": f"ast-sim generate {family} --seed {seed} --nodes {nodes}",
         "licence": "CC0-1.0",
     }
 

@@ -1,7 +1,7 @@
 """Structured tetrahedral meshes: a plate with holes and the rigid obstacles that press on it.
 
 All are grids of hexahedral cells, each cut into six tetrahedra (Kuhn's subdivision), so no mesh generator is needed.
-Legend: N nodes, E tetrahedra, F triangles; lengths in metres.
+Legend: N nodes, E tetrahedra; lengths in metres.
 """
 
 from __future__ import annotations
@@ -9,9 +9,6 @@ from __future__ import annotations
 from itertools import permutations
 
 import numpy as np
-
-# Faces of a tetrahedron with positive volume, each with its normal pointing out.
-TETRAHEDRON_FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 
 
 def kuhn_tetrahedra() -> np.ndarray:
@@ -102,16 +99,3 @@ def cylinder(radius: float, half_length: float, cells: int) -> tuple[np.ndarray,
     """Cylinder along x centred at the origin: positions [N,3], tetrahedra [E,4]; cells along each direction."""
     x, elements = _cube(cells)
     return np.concatenate([x[:, :1] * half_length, _round(x[:, 1:]) * radius], axis=1), elements
-
-
-def surface(elements: np.ndarray) -> np.ndarray:
-    """Boundary triangles [F,3] of tetrahedra [E,4], normals pointing out: the faces that only one element has."""
-    faces = elements[:, TETRAHEDRON_FACES].reshape(-1, 3)
-    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    return faces[np.sort(first[count == 1])]
-
-
-def volumes(position: np.ndarray, elements: np.ndarray) -> np.ndarray:
-    """Signed volumes [E] of tetrahedra, in cubic metres."""
-    edges = position[elements[:, 1:]] - position[elements[:, :1]]
-    return np.linalg.det(edges) / 6

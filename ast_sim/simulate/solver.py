@@ -33,15 +33,15 @@ class SolverSettings:
     """When a load step has converged and when it is given up.
 
     Attributes:
-        step_tolerance: largest component of the last Newton step, in metres.
         force_tolerance: largest component of the residual of the free nodes, relative to the mean element force.
+        step_tolerance: largest component of a Newton step that is rounding and ends the iteration, in metres.
         max_moves: Newton steps to bring the prescribed nodes to their targets.
         max_iterations: Newton steps to equilibrium.
         max_halvings: how often a load step is halved.
     """
 
-    step_tolerance: float = 2e-6
-    force_tolerance: float = 1e-3
+    force_tolerance: float = 1e-4
+    step_tolerance: float = 1e-9
     max_moves: int = 8
     max_iterations: int = 60
     max_halvings: int = 5
@@ -79,7 +79,7 @@ class QuasiStatic:
         self.settings = settings or SolverSettings()
         self.newton_iterations = 0
         self.projections = 0
-        self._system = _BandedSystem(elasticity, prescribed)
+        self._system = BandedSystem(elasticity, prescribed)
         contact.collision_free_fraction(position, position)
         self._state = self._evaluate(np.array(position, float))
 
@@ -202,7 +202,7 @@ class QuasiStatic:
         raise NotConverged("no lower energy along the Newton direction")
 
 
-class _BandedSystem:
+class BandedSystem:
     """The stiffness matrix of the free nodes in LAPACK's lower band storage, and its Cholesky factor.
 
     Entry (i, j), i >= j, of the n free degrees of freedom stands at [j, i - j] of an array [n, width + 1].

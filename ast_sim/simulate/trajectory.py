@@ -20,7 +20,7 @@ from ast_sim.simulate.material import NeoHookean
 from ast_sim.simulate.solver import QuasiStatic, SolverSettings
 
 # Sum of all reactions over the sum of their magnitudes, up to which a frame counts as balanced.
-REACTION_TOLERANCE = 1e-3
+REACTION_TOLERANCE = 1e-4
 # Reactions below those of this strain, times Young's modulus, are as good as none.
 RESTING_STRAIN = 1e-3
 
