@@ -181,7 +181,7 @@ def _displacement_range(truth: Trajectory, surface: Surface) -> Json:
     return _color_range(np.linalg.norm(moved, axis=2), share=1.0)
 
 
-def _color_range(values: np.ndarray, share: float = 0.998) -> Json:
+def _color_range(values: np.ndarray, share: float = 0.99) -> Json:
     """Colours run from 0 to `max`; `clipped` says that the largest 1 - `share` of the values lie above it."""
     largest = float(values.max(initial=0.0))
     upper = float(np.quantile(values, share)) if values.size else 0.0

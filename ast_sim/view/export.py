@@ -16,6 +16,7 @@ import numpy as np
 from ast_sim.data.scene import Trajectory
 from ast_sim.errors import AstSimError
 from ast_sim.view.fields import Fields, fields
+from ast_sim.view.files import explained, replacing
 
 VTK_TRIANGLE, VTK_TETRA = 5, 10
 CELL_NAME = {3: "triangle", 4: "tetra"}
@@ -47,24 +48,8 @@ def write(
     if path.suffix not in writers:
         raise AstSimError(f"{path}: cannot export to {path.suffix or 'no suffix'!r}; use {' or '.join(writers)}")
     shown = fields(trajectory, prediction)
-    try:
+    with explained(path):
         writers[path.suffix](path, trajectory.scene.elements, shown, time_step)
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise AstSimError(f"{path} cannot be written: {reason}; nothing was left there") from error
-
-
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A temporary name in the folder of `path`, which takes its place at the end and is removed on an error."""
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
-    try:
-        yield temporary
-        with open(temporary, "rb") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _write_pvd(path: Path, elements: np.ndarray, shown: Fields, time_step: float) -> None:

@@ -20,7 +20,7 @@ function measureTable({ title, unit, columns, rows, runs }) {
       const kind = [index < runs ? "run" : "", value === best ? "best" : ""].join(" ").trim();
       return element("td", { class: kind || null }, digits(value === null ? null : value / nice.scale), ...(ratio ? [" ", element("small", {}, ratio)] : []));
     });
-    return element("tr", {}, element("th", { scope: "row" }, label, note ? element("small", {}, note) : null), ...cells);
+    return element("tr", {}, element("th", { scope: "row" }, label, ...(note ? [" ", element("small", {}, note)] : [])), ...cells);
   });
   return table(["", ...columns], lines, { title: nice.name ? `${title} (${nice.name})` : title });
 }
@@ -55,7 +55,7 @@ function samplesTable({ names, order, table: columns }, scenes) {
   const labels = Object.fromEntries(scenes.map((scene) => [scene.name, scene.label]));
   const units = columns.map(({ values, unit }) => niceUnit(Math.max(...values.filter(Number.isFinite), 0), unit));
   const rows = order.map((index) => element("tr", {},
-    element("th", { scope: "row" }, names[index], labels[names[index]] ? element("small", {}, `shown above: ${labels[names[index]]}`) : null),
+    element("th", { scope: "row" }, names[index], ...(labels[names[index]] ? [" ", element("small", {}, `shown above: ${labels[names[index]].toLowerCase()}`)] : [])),
     ...columns.map(({ values, unit }, column) => {
       const value = values[index];
       return element("td", {}, unit ? digits(value === null ? null : value / units[column].scale) : (value === null ? "–" : String(value)));

@@ -23,9 +23,9 @@ from ast_sim.data.scene import Trajectory
 from ast_sim.errors import AstSimError, require
 from ast_sim.view import tables
 from ast_sim.view.encode import encode_scene, finite_json, motion_bytes
-from ast_sim.view.export import replacing
+from ast_sim.view.files import explained, replacing
 
-SCRIPTS = ("common.js", "viewer.js", "charts.js", "page.js")
+SCRIPTS = ("common.js", "panel.js", "viewer.js", "charts.js", "page.js")
 MOTION_BYTES = 3_600_000  # of all scenes together; longer ones show every n-th frame
 MIN_FRAMES = 12  # which a scene keeps however large it is
 MAX_RUNS = 6  # a page draws one panel a run, and browsers allow 16 at most
@@ -84,11 +84,8 @@ def write(path: str | os.PathLike[str], runs: Sequence[ReportRun], title: str) -
     if not 1 <= len(runs) <= MAX_RUNS:
         raise AstSimError(f"a report shows 1 to {MAX_RUNS} runs, not {len(runs)}")
     page = render(runs, title)
-    try:
-        with replacing(path) as temporary:
-            temporary.write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise AstSimError(f"{path} cannot be written: {error.strerror or error}; nothing was left there") from error
+    with explained(path), replacing(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
 
 
 def render(runs: Sequence[ReportRun], title: str) -> str:

@@ -83,7 +83,9 @@ def tiles(evaluation: Json | None) -> list[Json]:
             continue
         reference = lookup(evaluation, "summary", trivial, *path)
         detail = "full rollout, rmse_sequence"
-        if error is not None and reference:
+        if error is None:
+            detail = "no figure, as a rollout failed"
+        elif reference:
             detail = f"{100 * error / reference:.0f} % of “{TRIVIAL[quantity][trivial].lower()}”, full rollout"
         found.append({"label": title, "value": error, "unit": unit[quantity], "detail": detail})
     return found + _speed_tiles(evaluation) + _scope_tiles(evaluation)

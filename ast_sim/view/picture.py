@@ -1,0 +1,168 @@
+"""A still picture: truth and prediction of one scene at the frame of largest displacement.
+
+Drawn by matplotlib's Agg from triangles that are projected and sorted here. A VTK window off screen would shade
+better, but its wheels need the system's EGL or Mesa libraries, which a bare server lacks; this needs none.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from ast_sim.data.scene import NodeType, Trajectory
+from ast_sim.errors import AstSimError, require
+from ast_sim.view.encode import finite_frames
+from ast_sim.view.fields import is_planar, require_same_scene, stress_at, surface_owners
+from ast_sim.view.files import explained, replacing
+
+EYE = np.array([-0.62, -1.32, 0.78])  # from where a solid scene is seen, in units of its diagonal
+LIGHT = np.array([-0.35, -0.45, 0.82])
+OBSTACLE_COLOR = (0.47, 0.51, 0.56, 0.38)
+MESH_COLOR = (0.05, 0.08, 0.12, 0.5)
+INK = "#16202c"
+PARTS = 4  # each triangle side is cut into so many, for colours that change within it
+PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"))
+
+
+def write(path: str | os.PathLike[str], truth: Trajectory, prediction: Trajectory, length_unit: str = "m") -> None:
+    """Write a PNG of the truth beside the prediction, coloured by von Mises stress (Pa) or else by displacement.
+
+    The frame is the one where the truth moves farthest, among those that the prediction has. Both sides share the
+    colour scale, which ends where 1 % of the truth's triangles lie above.
+
+    Raises:
+        AstSimError: the prediction is of another scene or has no frame, or the file cannot be written.
+        MissingExtra: matplotlib (which comes with pyvista) is not installed.
+    """
+    path = Path(path)
+    require_same_scene(truth, prediction)
+    frames = min(truth.num_frames, finite_frames(prediction))
+    if frames == 0:
+        raise AstSimError("the prediction has no frame that could be drawn")
+    moved = np.linalg.norm(truth.position[:frames] - truth.scene.rest_position, axis=2)
+    frame = int(moved[:, truth.scene.node_type != NodeType.OBSTACLE].max(axis=1, initial=0.0).argmax())
+    figure = _figure(truth, prediction, frame, length_unit)
+    with explained(path), replacing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=144)
+
+
+def _figure(truth: Trajectory, prediction: Trajectory, frame: int, length_unit: str):
+    figures, agg, cm, colors = require(
+        "view", "matplotlib.figure", "matplotlib.backends.backend_agg", "matplotlib.cm", "matplotlib.colors"
+    )
+    figure = figures.Figure(figsize=(10, 4), facecolor="white")
+    agg.FigureCanvasAgg(figure)
+    by_stress = truth.stress is not None and stress_at(prediction) == stress_at(truth)
+    label, unit = ("von Mises stress", "Pa") if by_stress else ("Displacement", length_unit)
+    values = [_corner_values(side, frame, by_stress) for side in (truth, prediction)]
+    body = ~_obstacle_triangles(truth)
+    upper = float(np.quantile(values[0][body], 0.99)) if body.any() else 0.0
+    upper = upper or float(values[0].max(initial=0.0)) or 1.0
+    scale, prefix = next(((s, p) for s, p in PREFIXES if upper >= s), PREFIXES[-1])
+    color_map = cm.ScalarMappable(colors.Normalize(0, upper / scale), "plasma" if by_stress else "viridis")
+    view = _View(truth)
+    for column, (side, name) in enumerate(((truth, "Truth (finite elements)"), (prediction, "Prediction (AST)"))):
+        axes = figure.add_axes((0.01 + 0.5 * column, 0.18, 0.48, 0.73))
+        _draw(axes, view, side.position[frame], color_map, values[column] / scale)
+        figure.text(0.25 + 0.5 * column, 0.93, name, fontsize=12.5, fontweight="bold", color=INK, ha="center")
+    place = figure.add_axes((0.3, 0.125, 0.4, 0.028))
+    bar = figure.colorbar(color_map, cax=place, orientation="horizontal", extend="max")
+    bar.set_label(f"{label} ({prefix}{unit}), frame {frame}", color=INK)
+    bar.outline.set_visible(False)
+    bar.ax.tick_params(colors=INK, length=2)
+    return figure
+
+
+class _View:
+    """A perspective camera on a scene: the same for truth and prediction, fitted to the deforming bodies' box."""
+
+    def __init__(self, truth: Trajectory) -> None:
+        low, high = truth.position.min(axis=(0, 1)).astype(float), truth.position.max(axis=(0, 1)).astype(float)
+        self.center = (low + high) / 2
+        self.size = max(float(np.linalg.norm(high - low)), 1e-9)
+        self.planar = is_planar(truth.scene)
+        self.closed = truth.scene.elements.shape[1] == 4
+        self.triangles = truth.scene.surface()
+        self.obstacle = _obstacle_triangles(truth)
+        forward = np.array([0.0, 0.0, -1.0]) if self.planar else -EYE / np.linalg.norm(EYE)
+        up = np.array([0.0, 1.0, 0.0]) if self.planar else np.array([0.0, 0.0, 1.0])
+        right = np.cross(forward, up)
+        right /= np.linalg.norm(right)
+        self.axes = np.stack([right, np.cross(right, forward), forward])
+
+    def project(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Picture coordinates [..., 2] and distance from the eye [...] of points [..., 3]."""
+        local = (position - self.center) / self.size @ self.axes.T
+        distance = local[..., 2] + (1e3 if self.planar else 2 * np.linalg.norm(EYE))
+        return local[..., :2] / distance[..., None], distance
+
+
+def _obstacle_triangles(trajectory: Trajectory) -> np.ndarray:
+    return (trajectory.scene.node_type == NodeType.OBSTACLE)[trajectory.scene.surface()].all(axis=1)
+
+
+def _corner_values(trajectory: Trajectory, frame: int, by_stress: bool) -> np.ndarray:
+    """[F, 3]: the coloured quantity at the corners of the surface triangles."""
+    scene = trajectory.scene
+    surface = scene.surface()
+    if not by_stress:
+        return np.linalg.norm(trajectory.position[frame] - scene.rest_position, axis=1)[surface]
+    stress = trajectory.stress[frame, :, 0]
+    if stress_at(trajectory) == "node":
+        return stress[surface]
+    return np.repeat(stress[surface_owners(scene, surface), None], 3, axis=1)
+
+
+def _draw(axes, view: _View, position: np.ndarray, color_map, values: np.ndarray) -> None:
+    """Draw the triangles that face the eye from far to near, each as small ones with its edges on top."""
+    from matplotlib.collections import PolyCollection
+
+    corners = position[view.triangles].astype(float)
+    flat, distance = view.project(corners)
+    side = flat[:, 1:] - flat[:, :1]
+    facing = side[:, 0, 0] * side[:, 1, 1] - side[:, 0, 1] * side[:, 1, 0] > 0
+    shown = facing if view.closed else np.ones(len(facing), dtype=bool)
+    shade = _shade(corners)
+    weights = _subdivision()
+    polygons, faces, edges = [], [], []
+    for triangle in sorted(np.flatnonzero(shown), key=lambda t: -distance[t].mean()):
+        if view.obstacle[triangle]:
+            polygons.append(flat[triangle])
+            faces.append(OBSTACLE_COLOR)
+            edges.append((0, 0, 0, 0))
+            continue
+        color = color_map.to_rgba((weights @ values[triangle]).mean(axis=1))
+        color[:, :3] *= shade[triangle]
+        polygons += [*(weights @ flat[triangle]), flat[triangle]]
+        faces += [*color, (0, 0, 0, 0)]
+        edges += [*color, MESH_COLOR]
+    axes.add_collection(PolyCollection(polygons, facecolors=faces, edgecolors=edges, linewidths=0.4))
+    every, _ = view.project(position)
+    low, high = every.min(axis=0), every.max(axis=0)
+    middle, reach = (low + high) / 2, 0.53 * (high - low)
+    axes.set_xlim(middle[0] - reach[0], middle[0] + reach[0])
+    axes.set_ylim(middle[1] - reach[1], middle[1] + reach[1])
+    axes.set_aspect("equal")
+    axes.axis("off")
+
+
+def _shade(corners: np.ndarray) -> np.ndarray:
+    """[F]: Lambert's law with much ambient light, so that colours can still be compared with the scale."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normal, axis=1)
+    cosine = normal @ (LIGHT / np.linalg.norm(LIGHT)) / np.where(length == 0, 1, length)
+    return 0.74 + 0.26 * np.clip(np.abs(cosine), 0, 1)
+
+
+def _subdivision() -> np.ndarray:
+    """[PARTS^2, 3, 3]: the barycentric coordinates of the corners of the small triangles within a triangle."""
+    grid = {(i, j): np.array([PARTS - i - j, i, j]) / PARTS for i in range(PARTS + 1) for j in range(PARTS + 1 - i)}
+    small = []
+    for i, j in grid:
+        if (i + 1, j) in grid and (i, j + 1) in grid:
+            small.append([grid[i, j], grid[i + 1, j], grid[i, j + 1]])
+        if (i + 1, j + 1) in grid:
+            small.append([grid[i + 1, j], grid[i + 1, j + 1], grid[i, j + 1]])
+    return np.array(small)
