@@ -24,11 +24,11 @@ def _rotate(x: Tensor, n: int) -> Tensor:
     return (x << n | x >> (32 - n)) & _WORD
 
 
-def _threefry(key: list[Tensor], x: list[Tensor]) -> list[Tensor]:
-    """Threefry-4x32 of 12 rounds (Salmon et al., Parallel random numbers: as easy as 1, 2, 3, 2011), in int64."""
+def _threefry(rounds: int, key: list[Tensor], x: list[Tensor]) -> list[Tensor]:
+    """Threefry-4x32 (Salmon et al., Parallel random numbers: as easy as 1, 2, 3, 2011), in int64."""
     key = [*key, key[0] ^ key[1] ^ key[2] ^ key[3] ^ 0x1BD11BDA]
     x = [(word + k) & _WORD for word, k in zip(x, key, strict=False)]
-    for i in range(12):
+    for i in range(rounds):
         a, b = (3, 1) if i % 2 else (1, 3)
         x[0] = (x[0] + x[a]) & _WORD
         x[a] = _rotate(x[a], _ROTATIONS[i % 8][0]) ^ x[0]
@@ -48,13 +48,16 @@ def dropout_factors(p: float, seed: int, scene: int, shape: tuple[int, int, int]
     slot // 2 of counter (16 g + lane, query).
     """
     heads, queries, keys = shape
+    blocks = -(-keys // 128)
     threshold = min(65535, int(p * 65536 + 0.5))
-    head, query, group = (torch.arange(n, device=like.device) for n in (heads, queries, -(-keys // 128) * 16))
+    head, query, group = (torch.arange(n, device=like.device) for n in (heads, queries, 16 * blocks))
     zero = torch.zeros_like(head)[:, None, None]
     words = [zero + (seed & _WORD), zero + (seed >> 32 & _WORD), zero + scene, head[:, None, None]]
-    words = _threefry(words, [group + zero, query[:, None] + zero, zero, zero])
+    words = _threefry(12, words, [group + zero, query[:, None] + zero, zero, zero])
     bits = torch.stack([words[slot // 2] >> slot % 2 * 16 & 0xFFFF for slot in range(8)], -2)
-    bits = bits.reshape(heads, queries, 8, -1, 16).transpose(2, 3).reshape(heads, queries, -1)[:, :, :keys]
+    bits = (
+        bits.reshape(heads, queries, 8, blocks, 16).transpose(2, 3).reshape(heads, queries, 128 * blocks)[:, :, :keys]
+    )
     return (bits >= threshold).to(like.dtype) * (65536 / (65536 - threshold))
 
 
@@ -71,10 +74,10 @@ def _check(op: str, q: Tensor, k: Tensor, v: Tensor, q_offsets: Tensor, k_offset
         raise ValueError(f"{op}: the head dimension must be a multiple of 16 up to 128, not {q.shape[2]}")
     if not 0 <= dropout_p < 1:
         raise ValueError(f"{op}: dropout_p must lie in [0, 1)")
-    check_offsets(op, "q_offsets", q_offsets, len(q))
-    check_offsets(op, "k_offsets", k_offsets, len(k))
     if len(q_offsets) != len(k_offsets):
         raise ValueError(f"{op}: k_offsets must have shape [{len(q_offsets)}], not ({len(k_offsets)},)")
+    check_offsets(op, "q_offsets", q_offsets, len(q))
+    check_offsets(op, "k_offsets", k_offsets, len(k))
 
 
 def _scenes(q_offsets: Tensor, k_offsets: Tensor) -> Iterator[tuple[int, slice, slice]]:
