@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 import pytest
 import toy
+from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim.cli import main
 from ast_sim.data.file import Dataset

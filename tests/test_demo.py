@@ -4,6 +4,7 @@ import json
 import shutil
 
 import pytest
+from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import demo
 from ast_sim.cli import main

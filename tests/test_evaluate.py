@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import toy
+from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim.data.file import Dataset, DatasetWriter
 from ast_sim.data.scene import NodeType, Scene, Trajectory

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 import toy
+from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim.data.batch import Batch
 from ast_sim.data.scene import Trajectory

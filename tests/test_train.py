@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import toy
+from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import checkpoint, run, train
 from ast_sim.config import override
