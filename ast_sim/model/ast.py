@@ -1,0 +1,120 @@
+"""Adaptive Spatial Tokenization (paper, section Overall Architecture), as docs/model.md states it.
+
+    mesh --m2m or e2m--> mesh --M2C--> cells --OCNN--> coarse cells --CrossAttn--> tokens --L_SA x SelfAttn--> tokens
+    tokens --CrossAttn--> coarse cells --OCNN transposed--> cells --C2M--> mesh --decoder--> motion (--M2E--> stress)
+
+Legend: N nodes, E elements, C cells, T tokens.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from ast_sim.data.batch import Batch
+from ast_sim.model import features as inputs
+from ast_sim.model.cells import Cells, SparseConv, build_cells
+from ast_sim.model.config import ModelConfig
+from ast_sim.model.features import Feature, FeatureSet, widths_of
+from ast_sim.model.message_passing import MessagePassing
+from ast_sim.model.mlp import MLP
+from ast_sim.model.simulator import Prediction, Simulator
+from ast_sim.model.transformer import AttentionBlock, PositionEmbedding
+from ast_sim.ops.edges import EdgeSet
+from ast_sim.ops.fps import farthest_point_sample
+from ast_sim.ops.segment import segment_mean
+
+
+class AST(Simulator):
+    """Only what the scene requires is built: element parts with element inputs, convolutions with l_ocnn > 0."""
+
+    def __init__(self, config: ModelConfig):
+        super().__init__(config)
+        c, width = config, config.hidden
+        self.node_inputs = FeatureSet(widths_of(c, "node"))
+        self.edge_inputs = FeatureSet(widths_of(c, "edge"))
+        self.node_encoder = MLP(self.node_inputs.width, width, width, c.factorized)
+        if c.element_inputs:
+            self.element_inputs = FeatureSet(widths_of(c, "element"))
+            self.element_encoder = MLP(self.element_inputs.width, width, width, c.factorized)
+            self.e2m = self._message_passing("e2m", self.edge_inputs.width)
+        else:
+            self.m2m = self._message_passing("m2m", self.edge_inputs.width)
+        self.m2c = self._message_passing("m2c")
+        self.c2m = self._message_passing("c2m")
+        self.down = nn.ModuleList(SparseConv(width, up=False) for _ in range(c.l_ocnn))
+        self.up = nn.ModuleList(SparseConv(width, up=True) for _ in range(c.l_ocnn))
+        self.lift = nn.Linear(width, c.d_token)
+        self.position_embedding = PositionEmbedding(c.d_token, c.L_cell - c.l_ocnn)
+        self.to_tokens = AttentionBlock(c, cross=True)
+        self.processor = nn.ModuleList(AttentionBlock(c, cross=False) for _ in range(c.L_SA))
+        self.to_cells = AttentionBlock(c, cross=True)
+        self.lower = nn.Linear(c.d_token, width)
+        self.decoder = MLP(2 * width, c.decoder_hidden, 4 if c.stress == "node" else 3, c.factorized)
+        if c.stress == "element":
+            self.m2e = self._message_passing("m2e")
+            self.element_decoder = MLP(width, c.decoder_hidden, 1, c.factorized)
+
+    def _message_passing(self, name: str, edge_inputs: int = 0) -> MessagePassing:
+        return MessagePassing(self.config.hidden, edge_inputs, name in self.config.residual, self.config.factorized)
+
+    def _edge_features(self, batch: Batch) -> tuple[EdgeSet, list[Feature]]:
+        graph, rest, now = batch.graph, batch.graph.rest_position, batch.position
+        if not self.config.element_inputs:
+            return graph.m2m, inputs.edge_features(self.config, graph.m2m, (rest, rest), (now, now))
+        senders = (graph.element_mean(rest), graph.element_mean(now))
+        return graph.e2m, inputs.edge_features(self.config, graph.e2m, (senders[0], rest), (senders[1], now))
+
+    def observe(self, batch: Batch) -> None:
+        """Add the batch to the statistics of the inputs."""
+        self.node_inputs.observe(inputs.node_features(self.config, batch))
+        self.edge_inputs.observe(self._edge_features(batch)[1])
+        if self.config.element_inputs:
+            self.element_inputs.observe(inputs.element_features(self.config, batch))
+
+    def forward(self, batch: Batch) -> Prediction:
+        """Normalised outputs for the frame after `batch`."""
+        encoded = self.node_encoder(self.node_inputs(inputs.node_features(self.config, batch)))
+        elements = None
+        edges, edge_features = self._edge_features(batch)
+        edge_features = self.edge_inputs(edge_features)
+        if self.config.element_inputs:
+            elements = self.element_encoder(self.element_inputs(inputs.element_features(self.config, batch)))
+            mesh = self.e2m(edges, elements, encoded, edge_features)
+        else:
+            mesh = self.m2m(edges, encoded, encoded, edge_features)
+
+        cells = build_cells(self.config, batch.position, batch.graph.node_offsets, may_grow=not self.training)
+        mesh = self.c2m(cells.to_mesh(), self._through_cells(cells, mesh), mesh)
+
+        out = self.decoder(torch.cat([mesh, encoded], dim=1))
+        stress = out[:, 3:] if self.config.stress == "node" else None
+        if self.config.stress == "element":
+            stress = self.element_decoder(self.m2e(batch.graph.m2e, mesh, elements))
+        return Prediction(out[:, :3], stress)
+
+    def _through_cells(self, cells: Cells, mesh: Tensor) -> Tensor:
+        """Mesh features [N, hidden] -> cell features [C, hidden] after the tokens have exchanged information."""
+        finest = cells.finest
+        mean = segment_mean(mesh, finest.node_order, finest.node_offsets)
+        x = self.m2c(cells.from_mesh(), mesh, mean)
+        for convolve, step in zip(self.down, cells.maps, strict=True):
+            x = convolve(x, step)
+        x = self.lower(self._through_tokens(cells, self.position_embedding(self.lift(x), cells.centers())))
+        for convolve, step in zip(self.up, reversed(cells.maps), strict=True):
+            x = convolve(x, step)
+        return x
+
+    def _through_tokens(self, cells: Cells, x: Tensor) -> Tensor:
+        """Embedded cells [C, d_token] -> tokens, processed -> [C, d_token]."""
+        level = cells.coarsest
+        chosen, token_offsets = farthest_point_sample(level.coordinates(), level.cell_offsets, self.config.num_tokens)
+        tokens = self.to_tokens(x[chosen], token_offsets, x, level.cell_offsets)
+        for block in self.processor:
+            tokens = block(tokens, token_offsets)
+        return self.to_cells(x, level.cell_offsets, tokens, token_offsets)
+
+
+def build_model(config: ModelConfig) -> Simulator:
+    """The model of a resolved configuration."""
+    return AST(config)

@@ -1,0 +1,105 @@
+"""From mesh to cells and back: the octree on the current positions, and the convolutions that coarsen it.
+
+Legend: N nodes, C cells, B scenes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from ast_sim.errors import DatasetError, RolloutError
+from ast_sim.model.config import ModelConfig
+from ast_sim.ops.edges import EdgeSet
+from ast_sim.ops.octree import CellMap, Octree, octree
+from ast_sim.ops.sparse_conv import sparse_conv, sparse_conv_transposed
+
+
+@dataclass(frozen=True)
+class Cells:
+    """The cells of one batch at level L, and the levels above them that become tokens.
+
+    Attributes:
+        finest: the octree of level L, over the mesh nodes.
+        maps: l_ocnn steps from finer to coarser cells.
+        growth: how often the domain was doubled to hold all nodes.
+    """
+
+    finest: Octree
+    maps: list[CellMap]
+    growth: int
+
+    @property
+    def coarsest(self) -> Octree:
+        return self.maps[-1].coarse if self.maps else self.finest
+
+    def centers(self) -> Tensor:
+        """[C, 3] centres of the coarsest cells, in half widths of the domain before it grew."""
+        return self.coarsest.centers() * 2.0**self.growth
+
+    def from_mesh(self) -> EdgeSet:
+        """M2C: every node to its cell."""
+        o, nodes = self.finest, torch.arange(len(self.finest.node_cell) + 1)
+        order = torch.empty_like(o.node_order)
+        order[o.node_order] = nodes[:-1]
+        return EdgeSet(o.node_order, o.node_cell[o.node_order], o.node_offsets, order, nodes)
+
+    def to_mesh(self) -> EdgeSet:
+        """C2M: every cell to its nodes."""
+        o, nodes = self.finest, torch.arange(len(self.finest.node_cell) + 1)
+        return EdgeSet(o.node_cell, nodes[:-1], nodes, o.node_order, o.node_offsets)
+
+
+def _growth(config: ModelConfig, position: Tensor) -> int:
+    """How often the domain must double around its centre to hold all positions."""
+    center = torch.tensor(config.domain_center, dtype=torch.float64)
+    reach = float((position.double() - center).abs().max()) if len(position) else 0.0
+    growth = 0
+    while reach > config.domain_half_width * 2.0**growth and config.L_cell + growth <= 21:
+        growth += 1
+    return growth
+
+
+def build_cells(config: ModelConfig, position: Tensor, offsets: Tensor, may_grow: bool) -> Cells:
+    """The octree over positions [N, 3] of the scenes of `offsets`.
+
+    With `may_grow` (a rollout) the domain doubles around its centre and L grows by one until all nodes lie inside, so
+    the size of a cell never changes; the same cells come out as without the doubling.
+
+    Raises:
+        DatasetError: a node lies outside the domain or is not finite, and the domain may not grow.
+        RolloutError: the same where it may: not finite, or so far away that L would pass 21.
+    """
+    growth = _growth(config, position) if may_grow and bool(torch.isfinite(position).all()) else 0
+    error = RolloutError if may_grow else DatasetError
+    depth = config.L_cell + growth
+    if depth > 21:
+        raise error(
+            f"a node is so far from the domain centre {config.domain_center} that the octree would pass level 21"
+        )
+    try:
+        finest = octree(position, offsets, config.domain_center, config.domain_half_width * 2.0**growth, depth)
+    except ValueError as problem:
+        advice = (
+            "" if may_grow else "; give the dataset a domain_half_width that holds all frames and the training noise"
+        )
+        raise error(f"{problem}{advice}") from problem
+    maps: list[CellMap] = []
+    for _ in range(config.l_ocnn):
+        maps.append((maps[-1].coarse if maps else finest).coarsen())
+    return Cells(finest, maps, growth)
+
+
+class SparseConv(nn.Module):
+    """One convolution over cells, kernel 3 x 3 x 3, stride 2; `up` is the adjoint pattern, from coarse to fine."""
+
+    def __init__(self, width: int, up: bool):
+        super().__init__()
+        self.convolve = sparse_conv_transposed if up else sparse_conv
+        self.weight = nn.Parameter(nn.init.xavier_uniform_(torch.empty(27 * width, width)).view(27, width, width))
+        self.bias = nn.Parameter(torch.zeros(width))
+
+    def forward(self, x: Tensor, cell_map: CellMap) -> Tensor:
+        return self.convolve(x, self.weight, cell_map) + self.bias

@@ -1,0 +1,54 @@
+"""One step of message passing over one edge set (paper, equation Message-Passing).
+
+    e'_ij = LN(f_e(e_ij, v_i, v_j)),    v'_j = LN(f_v(v_j, sum_i e'_ij))
+
+Two identities of linear maps spare work without changing the result. The first layer of f_e acts on its inputs
+separately, W [e, v_s, v_r] = W_e e + W_s v_s + W_r v_r, so W_s and W_r are applied to nodes, not to edges. And the
+last layer of the edge encoder, e = A h + a, is used nowhere else, so W_e e = (W_e A) h + W_e a is one product instead
+of two.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ast_sim.model.mlp import MLP
+from ast_sim.ops.edges import EdgeSet
+
+
+class MessagePassing(nn.Module):
+    """Messages from senders to receivers, both of width `hidden`.
+
+    Args:
+        hidden: width of the features.
+        edge_inputs: width of the raw edge features, encoded by an MLP of their own; 0 for the edge-free form.
+        residual: add the receivers to the result.
+        factorized: random weight factorization of the MLPs.
+    """
+
+    def __init__(self, hidden: int, edge_inputs: int, residual: bool, factorized: bool):
+        super().__init__()
+        self.hidden, self.residual = hidden, residual
+        self.edge_encoder = MLP(edge_inputs, hidden, hidden, factorized) if edge_inputs else None
+        self.f_e = MLP((3 if edge_inputs else 2) * hidden, hidden, hidden, factorized)
+        self.f_v = MLP(2 * hidden, hidden, hidden, factorized)
+        self.norm_e = nn.LayerNorm(hidden)
+        self.norm_v = nn.LayerNorm(hidden)
+
+    def forward(
+        self, edges: EdgeSet, senders: Tensor, receivers: Tensor, edge_features: Tensor | None = None
+    ) -> Tensor:
+        """senders [S, hidden], receivers [R, hidden], edge_features [M, edge_inputs] -> [R, hidden]."""
+        *of_edge, of_sender, of_receiver = self.f_e.first.weight.split(self.hidden, dim=1)
+        z = edges.from_senders(F.linear(senders, of_sender))
+        z = z + edges.from_receivers(F.linear(receivers, of_receiver, self.f_e.first.bias))
+        if of_edge:
+            h = F.relu(self.edge_encoder.first(edge_features))
+            last = self.edge_encoder.second
+            z = z + F.linear(h, of_edge[0] @ last.weight, of_edge[0] @ last.bias)
+        messages = self.norm_e(self.f_e.second(F.relu(z)))
+        total = edges.sum_at_receivers(messages)
+        out = self.norm_v(self.f_v(torch.cat([receivers, total], dim=1)))
+        return receivers + out if self.residual else out

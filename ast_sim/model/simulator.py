@@ -1,0 +1,91 @@
+"""What every learned simulator shares: normalised targets, the loss, prediction in physical units and integration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from ast_sim.data.batch import Batch, Target
+from ast_sim.data.scene import NodeType
+from ast_sim.model.config import ModelConfig
+from ast_sim.model.normalizer import Normalizer
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """motion [N, 3]: increment or acceleration; stress [N or E, 1] at the next frame, if the scene has one."""
+
+    motion: Tensor
+    stress: Tensor | None
+
+
+class Simulator(nn.Module):
+    """Base of the models. A model implements `forward` (normalised outputs) and `observe` (its input statistics)."""
+
+    def __init__(self, config: ModelConfig):
+        super().__init__()
+        self.config = config
+        self.motion_normalizer = Normalizer("vector")
+        self.stress_normalizer = Normalizer("scalar") if config.stress != "none" else None
+
+    def forward(self, batch: Batch) -> Prediction:
+        raise NotImplementedError
+
+    def observe(self, batch: Batch) -> None:
+        raise NotImplementedError
+
+    def _stressed(self, batch: Batch) -> Tensor:
+        """Rows whose stress counts: nodes that are no obstacle, or elements with no obstacle node."""
+        obstacle = batch.graph.node_type == NodeType.OBSTACLE
+        if self.config.stress == "element":
+            return ~obstacle[batch.graph.elements].any(dim=1)
+        return ~obstacle
+
+    @torch.no_grad()
+    def fit_statistics(self, batches: Iterable[tuple[Batch, Target]]) -> None:
+        """Fix the statistics of inputs and targets, in float64, from batches drawn as trained on (with noise)."""
+        for batch, target in batches:
+            self.observe(batch)
+            self.motion_normalizer.observe(target.motion[batch.graph.normal])
+            if self.stress_normalizer is not None:
+                self.stress_normalizer.observe(target.stress[self._stressed(batch)])
+        for module in self.modules():
+            if isinstance(module, Normalizer):
+                module.fix()
+
+    def loss(self, batch: Batch, target: Target, stress_weight: float = 0.01) -> dict[str, Tensor]:
+        """Mean squared errors on normalised targets: motion of NORMAL nodes, stress of everything but obstacles.
+
+        Returns:
+            "motion", "stress" (if there is one) and "loss" = motion + stress_weight * stress; "spread", the standard
+            deviation of the predicted motion over the nodes: 0 means a dead decoder.
+        """
+        prediction = self(batch)
+        normal = batch.graph.normal
+        motion = prediction.motion[normal]
+        error = motion - self.motion_normalizer(target.motion[normal])
+        losses = {"motion": error.square().mean()}
+        losses["loss"] = losses["motion"]
+        losses["spread"] = motion.detach().std(dim=0).mean() if len(motion) > 1 else motion.new_ones(())
+        if self.stress_normalizer is not None:
+            rows = self._stressed(batch)
+            error = prediction.stress[rows] - self.stress_normalizer(target.stress[rows])
+            losses["stress"] = error.square().mean()
+            losses["loss"] = losses["loss"] + stress_weight * losses["stress"]
+        return losses
+
+    @torch.inference_mode()
+    def predict(self, batch: Batch) -> Prediction:
+        """The outputs in physical units: lengths in the dataset's unit, stress in pascal."""
+        prediction = self(batch)
+        stress = self.stress_normalizer.inverse(prediction.stress) if self.stress_normalizer is not None else None
+        return Prediction(self.motion_normalizer.inverse(prediction.motion), stress)
+
+    def integrate(self, batch: Batch, motion: Tensor) -> Tensor:
+        """[N, 3] next positions: p + v, or 2 p - p_previous + a. Prescribed nodes are the caller's."""
+        if self.config.dynamic:
+            return 2 * batch.position - batch.previous_position + motion
+        return batch.position + motion

@@ -1,0 +1,74 @@
+"""Position embedding and the pre-norm attention blocks on cells and tokens (paper, section Transformer)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ast_sim.model.config import ModelConfig
+from ast_sim.ops.attention import attention
+
+
+class PositionEmbedding(nn.Module):
+    """c + Linear([x, sin(2^j pi x), cos(2^j pi x)]) per axis, j = 0..7.
+
+    At the centres of the cells of level L every frequency with j >= L is constant, so it is left out.
+    """
+
+    def __init__(self, width: int, level: int):
+        super().__init__()
+        self.register_buffer("frequency", math.pi * 2.0 ** torch.arange(min(8, level)), persistent=False)
+        self.project = nn.Linear(3 * (1 + 2 * min(8, level)), width)
+
+    def forward(self, features: Tensor, centers: Tensor) -> Tensor:
+        """features [C, width], centers [C, 3] in units of the half width of the domain -> [C, width]."""
+        phase = (centers[:, :, None] * self.frequency).flatten(1)
+        return features + self.project(torch.cat([centers, phase.sin(), phase.cos()], dim=1))
+
+
+class FeedForward(nn.Module):
+    """GEGLU (Shazeer 2020): W_2 (a * gelu(b)) with [a, b] = W_1 LN(x), then dropout."""
+
+    def __init__(self, config: ModelConfig):
+        super().__init__()
+        self.norm = nn.LayerNorm(config.d_token)
+        self.first = nn.Linear(config.d_token, 2 * config.ffn_inner)
+        self.second = nn.Linear(config.ffn_inner, config.d_token)
+        self.dropout = config.dropout
+
+    def forward(self, x: Tensor) -> Tensor:
+        value, gate = self.first(self.norm(x)).chunk(2, dim=1)
+        return F.dropout(self.second(value * F.gelu(gate)), self.dropout, self.training)
+
+
+class AttentionBlock(nn.Module):
+    """x + attention(LN(x), LN(context)), then x + FFN(LN(x)); without `cross` the context is x itself."""
+
+    def __init__(self, config: ModelConfig, cross: bool):
+        super().__init__()
+        inner = config.heads * config.head_dim
+        self.heads, self.dropout = config.heads, config.dropout
+        self.norm = nn.LayerNorm(config.d_token)
+        self.norm_context = nn.LayerNorm(config.d_token) if cross else None
+        self.query = nn.Linear(config.d_token, inner, bias=False)
+        self.key_value = nn.Linear(config.d_token, 2 * inner, bias=False)
+        self.out = nn.Linear(inner, config.d_token)
+        self.feed_forward = FeedForward(config)
+
+    def forward(
+        self, x: Tensor, offsets: Tensor, context: Tensor | None = None, context_offsets: Tensor | None = None
+    ) -> Tensor:
+        """x [T, d_token] in the scenes of `offsets`, context [C, d_token] in those of `context_offsets` -> as x."""
+        normed = self.norm(x)
+        source = normed if self.norm_context is None else self.norm_context(context)
+        query = self.query(normed).unflatten(1, (self.heads, -1))
+        key, value = self.key_value(source).unflatten(1, (2, self.heads, -1)).unbind(1)
+        dropout = self.dropout if self.training else 0.0
+        seed = int(torch.randint(2**62, (1,))) if dropout else 0
+        source_offsets = offsets if self.norm_context is None else context_offsets
+        mixed, _ = attention(query, key, value, offsets, source_offsets, dropout_p=dropout, seed=seed)
+        x = x + self.out(mixed.flatten(1))
+        return x + self.feed_forward(x)

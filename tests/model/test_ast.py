@@ -1,0 +1,322 @@
+"""The model as a whole and part by part, against the formulas of docs/model.md."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from checks import run_python
+from stand_ins import trajectory, write
+
+from ast_sim.data.batch import Batch
+from ast_sim.data.file import Dataset
+from ast_sim.data.graph import Graph
+from ast_sim.data.sampling import PairSampler
+from ast_sim.data.scene import NodeType
+from ast_sim.errors import ConfigError, DatasetError, RolloutError
+from ast_sim.model.ast import build_model
+from ast_sim.model.cells import build_cells
+from ast_sim.model.config import PRESETS, ModelConfig, resolve
+from ast_sim.model.message_passing import MessagePassing
+from ast_sim.model.mlp import FactorizedLinear
+from ast_sim.model.normalizer import Normalizer
+from ast_sim.model.transformer import AttentionBlock, PositionEmbedding
+from ast_sim.ops.edges import EdgeSet
+
+SMALL = {"hidden": 32, "decoder_hidden": 16, "d_token": 32, "heads": 2, "head_dim": 16, "ffn_inner": 32, "L_SA": 2}
+
+
+def small(family: str, **changes) -> ModelConfig:
+    """The family's preset with narrow layers: the same parts, quick to run."""
+    config = replace(PRESETS[family].model, **SMALL)
+    if family == "deforming_plate":
+        config = replace(config, stress="node")
+    return replace(config, **changes)
+
+
+def sampler(path, config: ModelConfig, noise: float = 1e-3) -> PairSampler:
+    return PairSampler(
+        Dataset(path), "train", batch_size=2, seed=0, noise=noise, element_nodes=bool(config.element_inputs),
+        dynamic=config.dynamic, gamma=1.0,
+    )  # fmt: skip
+
+
+def batch_of(config: ModelConfig, *seeds: int, family: str = "deforming_plate") -> Batch:
+    scenes = [trajectory(family, seed) for seed in seeds]
+    graph = Graph.concatenate([Graph.from_scene(t.scene, bool(config.element_inputs)) for t in scenes])
+    now, after, before = (torch.from_numpy(np.concatenate([t.position[i] for t in scenes])) for i in (2, 3, 1))
+    motion = torch.where(graph.prescribed[:, None], after - now, 0.0)
+    stress = (
+        torch.from_numpy(np.concatenate([t.stress[2] for t in scenes])) if "stress" in config.element_inputs else None
+    )
+    return Batch(graph, now, before if config.dynamic else None, motion, stress, [f"scene {seed}" for seed in seeds])
+
+
+@pytest.mark.parametrize("family", ["deforming_plate", "sphere_simple", "abcd", "abcd_xl"])
+def test_every_preset_takes_a_training_step(family, tmp_path):
+    """The full-size preset on a structured scene of its family's kind: finite loss, and a step that lowers it."""
+    torch.manual_seed(0)
+    path = write(tmp_path / "data.h5", family)
+    with Dataset(path) as dataset:
+        material = trajectory(family).scene.material
+        config = resolve(PRESETS[family].model, dataset.info, 0 if material is None else 1, 0.08)
+    assert config.stress == {"deforming_plate": "node", "abcd_xl": "element"}.get(family, "none")
+    model, pairs = build_model(replace(config, dropout=0.0)), sampler(path, config)
+    model.fit_statistics(pairs.batch(i) for i in range(3))
+    batch, target = pairs.batch(0)
+    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-4, weight_decay=0.0)
+    losses = []
+    for _ in range(4):
+        optimizer.zero_grad()
+        loss = model.loss(batch, target)["loss"]
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+    assert all(np.isfinite(losses)) and losses[-1] < losses[0], losses
+    without = [name for name, p in model.named_parameters() if p.grad is None]
+    assert not without, without
+
+
+@pytest.mark.parametrize("family", ["deforming_plate", "sphere_simple", "abcd", "abcd_xl"])
+def test_c_core_and_torch_composition_agree(family, tmp_path):
+    """The same weights and batch give the same outputs and gradients on both backends."""
+    config = small(family, dropout=0.0, **({"L_cell": 7, "l_ocnn": 3} if family == "abcd_xl" else {}))
+    config = replace(config, stress="element") if family == "abcd_xl" else config
+    code = f"""
+import sys, torch
+sys.path[:0] = ["tests", "tests/model"]
+from test_ast import *
+torch.manual_seed(1)
+config = {config!r}
+model = build_model(config)
+batch = batch_of(config, 0, 1, family={family!r})
+out = model(batch)
+value = out.motion.square().sum() + (0 if out.stress is None else out.stress.square().sum())
+value.backward()
+gradient = torch.cat([p.grad.flatten() for p in model.parameters()])
+torch.save([out.motion.detach(), gradient], sys.argv[1] if len(sys.argv) > 1 else {str(tmp_path)!r} + "/" + BACKEND)
+"""
+    for backend in ("c", "torch"):
+        run_python(f"BACKEND = {backend!r}\n{code}", AST_SIM_BACKEND=backend)
+    ours, reference = (torch.load(tmp_path / name, weights_only=True) for name in ("c", "torch"))
+    for x, y in zip(ours, reference, strict=True):
+        assert float((x - y).abs().max()) <= 2e-5 * float(y.abs().max()), (x - y).abs().max() / y.abs().max()
+
+
+def test_scene_alone_equals_scene_in_a_batch():
+    torch.manual_seed(0)
+    config = small("deforming_plate")
+    model = build_model(config).eval()
+    both, alone = model(batch_of(config, 0, 1)), [model(batch_of(config, seed)) for seed in (0, 1)]
+    for name in ("motion", "stress"):
+        joined = torch.cat([getattr(x, name) for x in alone])
+        torch.testing.assert_close(getattr(both, name), joined, rtol=1e-4, atol=1e-5)
+
+
+def test_bitwise_equal_from_run_to_run():
+    """Outputs and gradients, with dropout, for one number of threads (torch's own products depend on that number)."""
+    torch.manual_seed(0)
+    config = small("deforming_plate", dropout=0.1)
+    model, batch = build_model(config), batch_of(small("deforming_plate"), 0, 1)
+
+    def step():
+        torch.manual_seed(5)
+        model.zero_grad()
+        out = model(batch)
+        (out.motion.square().sum() + out.stress.sum()).backward()
+        return [out.motion.detach(), *(p.grad.clone() for p in model.parameters())]
+
+    for first, second in zip(step(), step(), strict=True):
+        assert torch.equal(first, second)
+
+
+def test_bodies_exchange_information_through_cells():
+    """A change of the obstacle's motion changes the plate's prediction, though no edge joins them."""
+    torch.manual_seed(0)
+    config = small("deforming_plate")
+    model = build_model(config).eval()
+    batch = batch_of(config, 0)
+    obstacle = batch.graph.node_type == NodeType.OBSTACLE
+    moved = replace(batch, boundary_motion=torch.where(obstacle[:, None], 0.05, batch.boundary_motion))
+    difference = (model(moved).motion - model(batch).motion)[batch.graph.normal].abs().amax(dim=1)
+    assert float(difference.detach().min()) > 0
+
+
+def test_message_passing_is_the_formula():
+    """Split first layer and folded encoder against LN(f_e([e, v_s, v_r])) and LN(f_v([v_r, sum])) as written."""
+    torch.manual_seed(0)
+    generator = torch.Generator().manual_seed(1)
+    senders, receivers = (
+        torch.randint(0, 9, (40,), generator=generator),
+        torch.randint(0, 7, (40,), generator=generator),
+    )
+    edges = EdgeSet.from_pairs(senders, receivers, 9, 7)
+    v_s, v_r, raw = torch.randn(9, 16).double(), torch.randn(7, 16).double(), torch.randn(40, 8).double()
+    for residual in (False, True):
+        step = MessagePassing(16, 8, residual, factorized=True).double()
+        for p in step.parameters():
+            torch.nn.init.normal_(p)
+        e = step.edge_encoder(raw)
+        message = step.norm_e(step.f_e(torch.cat([e, v_s[edges.senders], v_r[edges.receivers]], dim=1)))
+        total = torch.zeros(7, 16).double().index_add_(0, edges.receivers, message)
+        expected = step.norm_v(step.f_v(torch.cat([v_r, total], dim=1))) + (v_r if residual else 0)
+        torch.testing.assert_close(step(edges, v_s, v_r, raw), expected, rtol=1e-10, atol=1e-10)
+    free = MessagePassing(16, 0, False, factorized=False).double()
+    message = free.norm_e(free.f_e(torch.cat([v_s[edges.senders], v_r[edges.receivers]], dim=1)))
+    total = torch.zeros(7, 16).double().index_add_(0, edges.receivers, message)
+    torch.testing.assert_close(free(edges, v_s, v_r), free.norm_v(free.f_v(torch.cat([v_r, total], dim=1))))
+
+
+def test_attention_block_is_the_formula():
+    torch.manual_seed(0)
+    config = small("deforming_plate", dropout=0.0)
+    block = AttentionBlock(config, cross=True)
+    x, context = torch.randn(5, 32), torch.randn(11, 32)
+    out = block(x, torch.tensor([0, 5]), context, torch.tensor([0, 11]))
+    q = block.query(block.norm(x)).view(5, 2, 16).transpose(0, 1)
+    k, v = block.key_value(block.norm_context(context)).view(11, 2, 2, 16).permute(1, 2, 0, 3)
+    mixed = ((q @ k.transpose(1, 2) / 4).softmax(-1) @ v).transpose(0, 1).reshape(5, 32)
+    y = x + block.out(mixed)
+    a, b = block.feed_forward.first(block.feed_forward.norm(y)).chunk(2, dim=1)
+    torch.testing.assert_close(out, y + block.feed_forward.second(a * F.gelu(b)), rtol=1e-4, atol=1e-5)
+
+
+def test_random_weight_factorization():
+    torch.manual_seed(0)
+    layer = FactorizedLinear(400, 600)
+    logs = layer.g.detach().log()
+    assert abs(float(logs.mean()) - 1.0) < 0.02 and abs(float(logs.std()) - 0.1) < 0.01
+    glorot = (6 / (400 + 600)) ** 0.5
+    weight = layer.weight.detach()
+    assert float(weight.abs().max()) <= glorot * 1.0001 and float(weight.std()) == pytest.approx(
+        glorot / 3**0.5, rel=0.02
+    )
+    assert float(layer.bias.detach().abs().max()) == 0
+
+
+def test_position_embedding_drops_constant_frequencies():
+    """At cell centres of level 3 the frequencies 2^j pi with j >= 3 are constant; those below are not."""
+    centers = (torch.arange(8) + 0.5) / 4 - 1
+    for j in range(8):
+        wave = torch.stack([torch.sin(2.0**j * torch.pi * centers), torch.cos(2.0**j * torch.pi * centers)])
+        assert (float(wave.std(dim=1).max()) > 0.1) == (j < 3), j
+    embedding = PositionEmbedding(16, level=3)
+    assert embedding.project.in_features == 3 * (1 + 2 * 3)
+    assert PositionEmbedding(16, level=12).project.in_features == 51
+    x = torch.zeros(2, 16)
+    inputs = torch.tensor([[0.25, -0.5, 0.75], [0.0, 0.0, 0.0]])
+    phase = torch.cat(
+        [inputs]
+        + [f(inputs[:, :, None] * torch.pi * torch.tensor([1.0, 2, 4])).flatten(1) for f in (torch.sin, torch.cos)],
+        1,
+    )
+    torch.testing.assert_close(embedding(x, inputs), embedding.project(phase))
+
+
+def test_normalizers_by_hand():
+    vector, scalar, constant = Normalizer("vector"), Normalizer("scalar"), Normalizer("scalar")
+    vector.observe(torch.tensor([[3.0, 0.0, 0.0], [0.0, 4.0, 0.0]]))
+    scalar.observe(torch.tensor([[1.0], [2.0]]))
+    scalar.observe(torch.tensor([[6.0]]))
+    constant.observe(torch.full((5, 1), 7.0))
+    for normalizer in (vector, scalar, constant):
+        normalizer.fix()
+    assert float(vector.mean) == 0 and float(vector.scale) == pytest.approx((25 / 6) ** 0.5)
+    assert float(scalar.mean) == 3 and float(scalar.scale) == pytest.approx((14 / 3) ** 0.5)
+    assert float(constant.mean) == 7 and float(constant.scale) == 1
+    x = torch.randn(4, 1)
+    torch.testing.assert_close(scalar.inverse(scalar(x)), x)
+
+
+def test_statistics_do_not_suffer_cancellation():
+    """1e6 samples around 1e4 with deviation 1: float32 sums of squares would lose all digits."""
+    normalizer = Normalizer("scalar")
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(10):
+        normalizer.observe(1e4 + torch.randn(100_000, generator=generator))
+    normalizer.fix()
+    assert float(normalizer.scale) == pytest.approx(1.0, rel=5e-3)
+
+
+def test_loss_counts_the_right_nodes(tmp_path):
+    torch.manual_seed(0)
+    config = small("deforming_plate", dropout=0.0)
+    path = write(tmp_path / "data.h5", "deforming_plate")
+    model, pairs = build_model(config), sampler(path, config)
+    model.fit_statistics(pairs.batch(i) for i in range(3))
+    batch, target = pairs.batch(0)
+    losses = model.loss(batch, target, stress_weight=0.3)
+    out = model(batch)
+    normal, free = batch.graph.normal, batch.graph.node_type != NodeType.OBSTACLE
+    motion = (out.motion - target.motion / model.motion_normalizer.scale)[normal].square().mean()
+    stress = (out.stress - model.stress_normalizer(target.stress))[free].square().mean()
+    torch.testing.assert_close(losses["motion"], motion)
+    torch.testing.assert_close(losses["stress"], stress)
+    torch.testing.assert_close(losses["loss"], motion + 0.3 * stress)
+
+
+def test_domain_grows_in_a_rollout_and_cells_keep_their_size():
+    config = small("deforming_plate", L_cell=4)
+    position = torch.rand(200, 3) * 0.8 - 0.4
+    offsets = torch.tensor([0, 200])
+    inside = build_cells(config, position, offsets, may_grow=True)
+    far = torch.cat([position, torch.tensor([[2.5, 0.0, 0.0]])])
+    grown = build_cells(config, far, torch.tensor([0, 201]), may_grow=True)
+    assert (inside.growth, grown.growth) == (0, 2) and grown.finest.depth == 6
+
+    def groups(cells):
+        return {
+            tuple(nodes.tolist()) for nodes in cells.finest.node_order.split(cells.finest.node_offsets.diff().tolist())
+        }
+
+    assert groups(grown) == groups(inside) | {(200,)}
+    centers = grown.centers()[grown.finest.node_cell]
+    assert float((centers - far).abs().max()) <= 2.0**-4 + 1e-6
+    with pytest.raises(DatasetError, match=r"positions\[200\].*outside.*domain_half_width"):
+        build_cells(config, far, torch.tensor([0, 201]), may_grow=False)
+    with pytest.raises(RolloutError, match="pass level 21"):
+        build_cells(config, far * 1e7, torch.tensor([0, 201]), may_grow=True)
+    far[3, 1] = float("nan")
+    with pytest.raises(RolloutError, match=r"positions\[3\].*not finite"):
+        build_cells(config, far, torch.tensor([0, 201]), may_grow=True)
+
+
+def test_mesh_and_cell_edges():
+    position = torch.rand(50, 3) - 0.5
+    cells = build_cells(small("deforming_plate", L_cell=3), position, torch.tensor([0, 30, 50]), may_grow=False)
+    num = len(cells.finest.keys)
+    nodes = torch.arange(50)
+    again = EdgeSet.from_pairs(nodes, cells.finest.node_cell, 50, num)
+    back = EdgeSet.from_pairs(cells.finest.node_cell, nodes, num, 50)
+    for ours, expected in ((cells.from_mesh(), again), (cells.to_mesh(), back)):
+        for name in EdgeSet.__dataclass_fields__:
+            assert torch.equal(getattr(ours, name), getattr(expected, name)), name
+
+
+def test_integration():
+    quasi = build_model(small("deforming_plate"))
+    dynamic = build_model(small("sphere_simple"))
+    batch = batch_of(small("deforming_plate"), 0)
+    motion = torch.randn_like(batch.position)
+    assert torch.equal(quasi.integrate(batch, motion), batch.position + motion)
+    moving = replace(batch, previous_position=batch.position - 0.25)
+    torch.testing.assert_close(dynamic.integrate(moving, motion), batch.position + 0.25 + motion)
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"node_inputs": ("displacment",)}, "displacment"),
+        ({"element_inputs": ("stress",)}, "stress on elements"),
+        ({"node_inputs": ("velocity",)}, "dynamic"),
+        ({"node_inputs": ("material",)}, "no material"),
+        ({"stress": "element", "element_inputs": ()}, "element nodes"),
+        ({"head_dim": 24}, "multiple of 16"),
+        ({"residual": ("m2x",)}, "m2x"),
+        ({"L_cell": 3, "l_ocnn": 4}, "l_ocnn"),
+    ],
+)
+def test_settings_that_do_not_fit(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        ModelConfig(**changes)
