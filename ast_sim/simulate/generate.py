@@ -12,28 +12,22 @@ import fcntl
 import importlib.metadata
 import json
 import os
-import selectors
 import shutil
-import signal
-import subprocess
-import sys
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import ast_sim
-from ast_sim.data.file import SPLITS, Dataset, DatasetWriter
+from ast_sim.data.file import SPLITS, Dataset, DatasetInfo, DatasetWriter
 from ast_sim.errors import SimulationError
 from ast_sim.simulate.contact import self_test
+from ast_sim.simulate.pool import run_all
 from ast_sim.simulate.progress import Progress
-from ast_sim.simulate.samples import family_module, load_sample, sample_path
+from ast_sim.simulate.samples import Sample, family_module, load_sample, sample_name, sample_path
 
 COUNTS = {"train": 100, "valid": 8, "test": 10}
-_SINGLE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
-Sample = tuple[str, int]  # split and index in it
 
 
 @dataclass(frozen=True)
@@ -93,15 +87,15 @@ def generate(
     with _locked(parts, settings):
         missing = [sample for sample in samples if not _is_readable(sample_path(parts, *sample))]
         with Progress(len(samples), len(samples) - len(missing), "scenes", progress) as bar:
-            failures = _run(missing, parts, (family, str(seed), str(nodes)), workers, bar)
+            failures = run_all(missing, parts, (family, str(seed), str(nodes)), workers, bar)
         if failures:
-            listing = "; ".join(f"{split}/{index:06d}: {text}" for (split, index), text in failures.items())
+            listing = "; ".join(f"{sample_name(*sample)}: {text}" for sample, text in list(failures.items())[:3])
             raise SimulationError(
                 f"{len(failures)} of {len(samples)} samples failed ({listing}). The others are kept in {parts}:"
                 " the same command goes on from there"
             )
         truncated = _merge(out, parts, samples, replace(module.INFO, generator={**settings, "counts": counts}))
-    shutil.rmtree(parts)
+        shutil.rmtree(parts)
     return Generated(out, counts, truncated)
 
 
@@ -149,7 +143,7 @@ def _existing(out: Path, settings: dict[str, Any], counts: dict[str, int]) -> Ge
         if difference:
             raise SimulationError(f"{out} exists and holds other data ({difference}): remove it or choose another name")
         names = [(split, index) for split in SPLITS for index in range(dataset.count(split))]
-        truncated = [_name(*sample) for sample in names if dataset.attributes(*sample)["status"] == "truncated"]
+        truncated = [sample_name(*sample) for sample in names if dataset.attributes(*sample)["status"] == "truncated"]
     return Generated(out, counts, truncated)
 
 
@@ -195,113 +189,12 @@ def _is_readable(path: Path) -> bool:
     return True
 
 
-def _name(split: str, index: int) -> str:
-    return f"{split}/{index:06d}"
-
-
-def _merge(out: Path, parts: Path, samples: list[Sample], info) -> list[str]:
+def _merge(out: Path, parts: Path, samples: list[Sample], info: DatasetInfo) -> list[str]:
     truncated = []
     with DatasetWriter(out, info) as writer:
         for sample in samples:
             trajectory = load_sample(sample_path(parts, *sample))
             writer.add(sample[0], trajectory)
             if trajectory.attributes["status"] == "truncated":
-                truncated.append(_name(*sample))
+                truncated.append(sample_name(*sample))
     return truncated
-
-
-class _Worker:
-    """One worker process and the sample that it is at."""
-
-    def __init__(self, parts: Path, arguments: tuple[str, ...]) -> None:
-        # Not multiprocessing: its spawned children import the script of the parent again, and torch with it.
-        root = str(Path(ast_sim.__file__).parent.parent)
-        path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "ast_sim.simulate.worker", str(parts), *arguments],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env={**os.environ, **dict.fromkeys(_SINGLE_THREAD, "1"), "PYTHONPATH": path},
-            text=True,
-            bufsize=1,
-        )
-        self.sample: Sample | None = None
-
-    @property
-    def answers(self) -> TextIO:
-        return self.process.stdout
-
-    def give(self, sample: Sample) -> None:
-        self.sample = sample
-        with contextlib.suppress(BrokenPipeError):  # a dead worker is noticed by the end of its answers
-            self.process.stdin.write(f"{sample[0]} {sample[1]}\n")
-
-    def receive(self) -> dict[str, Any]:
-        """The answer to the sample given; how the process ended, as an error, if there is none."""
-        line = self.answers.readline()
-        if line:
-            return json.loads(line)
-        code = self.process.wait()
-        ended = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-        return {"error": f"its worker process {ended}", "fatal": False, "dead": True}
-
-    def stop(self) -> None:
-        self.process.kill()
-        self.process.wait()
-        self.process.stdout.close()
-        with contextlib.suppress(BrokenPipeError):
-            self.process.stdin.close()
-
-
-def _run(
-    samples: list[Sample], parts: Path, arguments: tuple[str, ...], workers: int, bar: Progress
-) -> dict[Sample, str]:
-    """Make the samples; returns those that failed, with the reason.
-
-    A worker that dies costs the sample that it was at and is replaced.
-
-    Raises:
-        SimulationError: an error that all samples would meet, such as a full disk.
-    """
-    waiting, failures = list(reversed(samples)), {}
-    selector = selectors.DefaultSelector()
-    active: list[_Worker] = []
-
-    def start_worker() -> None:
-        worker = _Worker(parts, arguments)
-        active.append(worker)
-        selector.register(worker.answers, selectors.EVENT_READ, worker)
-        worker.give(waiting.pop())
-
-    def end_worker(worker: _Worker) -> None:
-        selector.unregister(worker.answers)
-        active.remove(worker)
-        worker.stop()
-
-    try:
-        while waiting and len(active) < workers:
-            start_worker()
-        while active:
-            for key, _ in selector.select():
-                worker = key.data
-                answer = worker.receive()
-                if answer.get("fatal"):
-                    raise SimulationError(f"{_name(*worker.sample)} cannot be written: {answer['error']}")
-                if "error" in answer:
-                    failures[worker.sample] = answer["error"]
-                    bar.note(
-                        f"{_name(*worker.sample)} failed: {answer['error']}\n{answer.get('traceback', '')}".strip()
-                    )
-                else:
-                    bar.advance()
-                if waiting and not answer.get("dead"):
-                    worker.give(waiting.pop())
-                    continue
-                end_worker(worker)
-                if waiting:
-                    start_worker()
-    finally:
-        for worker in list(active):
-            end_worker(worker)
-        selector.close()
-    return failures

@@ -21,6 +21,8 @@ from ast_sim.simulate import deforming_plate
 # A family is a module with INFO, DEFAULT_NODES and simulate(rng, nodes) -> Trajectory.
 FAMILIES: dict[str, ModuleType] = {"deforming_plate": deforming_plate}
 
+Sample = tuple[str, int]  # split and index in it
+
 _SCENE = ("rest_position", "elements", "node_type", "body", "material")
 
 
@@ -41,6 +43,11 @@ def make_sample(family: str, seed: int, split: str, index: int, nodes: int) -> T
     trajectory = family_module(family).simulate(np.random.default_rng(sequence), nodes)
     trajectory.attributes.update(seed=seed, index=index)
     return trajectory
+
+
+def sample_name(split: str, index: int) -> str:
+    """The name of a sample in messages, that of its group in the dataset file."""
+    return f"{split}/{index:06d}"
 
 
 def sample_path(folder: Path, split: str, index: int) -> Path:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import sys
 import traceback
 from pathlib import Path
@@ -20,7 +19,6 @@ from ast_sim.simulate.samples import make_sample, sample_path, save_sample
 
 def main() -> None:
     """Serve until the standard input ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when to stop
     folder, family, seed, nodes = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
     parent = os.getppid()
     # Answers go to the real standard output, which nothing else may write to.

@@ -15,6 +15,7 @@ import ast_sim
 from ast_sim.data.file import Dataset
 from ast_sim.errors import MissingExtra, SimulationError
 from ast_sim.simulate import generate as generate_module
+from ast_sim.simulate import pool
 from ast_sim.simulate.generate import generate
 from ast_sim.simulate.progress import Progress
 from ast_sim.simulate.samples import load_sample, make_sample, sample_path, save_sample
@@ -105,8 +106,8 @@ def test_a_killed_run_goes_on_to_the_same_dataset(undisturbed, tmp_path, monkeyp
     there = {path.name for path in parts.glob("*.npz")}
     assert "train-000000.npz" in there and len(there) < 5
     sample_path(parts, "test", 0).write_bytes(b"PK\x03\x04 not a sample")  # made anew, not trusted
-    asked, run = [], generate_module._run
-    monkeypatch.setattr(generate_module, "_run", lambda samples, *rest: asked.extend(samples) or run(samples, *rest))
+    asked, run = [], pool.run_all
+    monkeypatch.setattr(generate_module, "run_all", lambda samples, *rest: asked.extend(samples) or run(samples, *rest))
     generate("deforming_plate", out, COUNTS, seed=5, nodes=NODES, workers=2, progress=False)
     assert_same(out, undisturbed)
     assert ("train", 0) not in asked and ("test", 0) in asked  # finished samples are not made again
@@ -115,14 +116,14 @@ def test_a_killed_run_goes_on_to_the_same_dataset(undisturbed, tmp_path, monkeyp
 
 def test_a_worker_that_is_killed_costs_its_sample_only(tmp_path, monkeypatch, capfd):
     out = tmp_path / "plates.h5"
-    give = generate_module._Worker.give
+    give = pool.Worker.give
 
     def kill_at_second(worker, sample):
         give(worker, sample)
         if sample == ("train", 1):
             os.kill(worker.process.pid, signal.SIGKILL)
 
-    monkeypatch.setattr(generate_module._Worker, "give", kill_at_second)
+    monkeypatch.setattr(pool.Worker, "give", kill_at_second)
     with pytest.raises(SimulationError, match=r"1 of 5 samples failed \(train/000001: .* killed by SIGKILL\)"):
         generate("deforming_plate", out, COUNTS, seed=5, nodes=NODES, workers=1)
     assert "train/000001 failed" in capfd.readouterr().err
@@ -131,13 +132,13 @@ def test_a_worker_that_is_killed_costs_its_sample_only(tmp_path, monkeypatch, ca
 
 
 def test_an_exception_in_a_worker_is_reported_and_the_others_go_on(tmp_path, monkeypatch, capfd):
-    give = generate_module._Worker.give
+    give = pool.Worker.give
 
     def unreadable(worker, sample):
         give(worker, ("train", -1) if sample == ("train", 0) else sample)  # a negative index is no seed
         worker.sample = sample
 
-    monkeypatch.setattr(generate_module._Worker, "give", unreadable)
+    monkeypatch.setattr(pool.Worker, "give", unreadable)
     with pytest.raises(SimulationError, match=r"1 of 2 samples failed \(train/000000: ValueError"):
         generate("deforming_plate", tmp_path / "a.h5", {"train": 2}, nodes=NODES, workers=1)
     assert "Traceback" in capfd.readouterr().err
@@ -145,7 +146,7 @@ def test_an_exception_in_a_worker_is_reported_and_the_others_go_on(tmp_path, mon
 
 
 def test_a_disk_that_cannot_be_written_stops_the_run(tmp_path, monkeypatch):
-    give = generate_module._Worker.give
+    give = pool.Worker.give
 
     def remove_folder(worker, sample):
         for path in (tmp_path / "a.h5.parts").glob("*"):
@@ -153,7 +154,7 @@ def test_a_disk_that_cannot_be_written_stops_the_run(tmp_path, monkeypatch):
         (tmp_path / "a.h5.parts").rmdir()
         give(worker, sample)
 
-    monkeypatch.setattr(generate_module._Worker, "give", remove_folder)
+    monkeypatch.setattr(pool.Worker, "give", remove_folder)
     with pytest.raises(SimulationError, match="train/000000 cannot be written: FileNotFoundError"):
         generate("deforming_plate", tmp_path / "a.h5", {"train": 2}, nodes=NODES, workers=1, progress=False)
 
@@ -231,7 +232,7 @@ def test_the_solver_and_its_workers_need_no_torch():
 
 
 def test_workers_have_one_thread_each(tmp_path):
-    worker = generate_module._Worker(tmp_path, ("deforming_plate", "0", "80"))
+    worker = pool.Worker(tmp_path, ("deforming_plate", "0", "80"))
     worker.give(("train", 0))
     assert worker.receive() == {"status": "complete"}
     environment = pathlib.Path(f"/proc/{worker.process.pid}/environ").read_bytes().split(b"\0")
