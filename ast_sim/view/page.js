@@ -69,7 +69,7 @@ function factTables(runs) {
   const keys = [...new Set(runs.flatMap((run) => run.facts.map(([key]) => key)))];
   const facts = runs.map((run) => Object.fromEntries(run.facts));
   const rows = keys.map((key) => element("tr", {}, element("th", { scope: "row" }, key),
-    ...facts.map((fact) => element("td", { class: /^(Command|Commit|Run|Data file)$/.test(key) ? "code" : null }, fact[key] ?? "–"))));
+    ...facts.map((fact) => element("td", { class: /^(.*[Cc]ommand|Commit|Run|Data file)$/.test(key) ? "code" : null }, fact[key] ?? "–"))));
   return table(several ? ["", ...runs.map((run) => run.name)] : [], rows, { className: "facts" });
 }
 

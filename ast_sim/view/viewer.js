@@ -12,9 +12,10 @@ class Viewer {
     this.panels.forEach((panel, index) => this.follow(panel, index));
     COLORS.displacement.unit = data.units.displacement;
     COLORS.stress.unit = data.units.stress;
-    this.controls();
+    const first = Math.max(0, data.scenes.findIndex((scene) => scene.label === "Median"));
+    this.controls(first);
     onThemeChange.push(() => this.draw());
-    this.choose(0);
+    this.choose(first);
   }
 
   get scene() {
@@ -181,7 +182,7 @@ class Viewer {
     requestAnimationFrame(advance);
   }
 
-  controls() {
+  controls(first) {
     byId("play").addEventListener("click", () => (this.state.playing ? this.pause() : this.play()));
     byId("frame").addEventListener("input", (event) => this.step(Number(event.target.value) - this.state.frame));
     byId("mesh-lines").addEventListener("change", (event) => { this.state.lines = event.target.checked; this.draw(); });
@@ -190,7 +191,7 @@ class Viewer {
     byId("reset-view").addEventListener("click", () => this.resetView());
     byId("scene-choice").append(...this.data.scenes.map((scene, index) => {
       const error = withUnit(scene.error, this.data.units.displacement);
-      return segment("scene", scene.label, error.unit ? `${error.text} ${error.unit}` : null, index === 0, () => this.choose(index));
+      return segment("scene", scene.label, error.unit ? `${error.text} ${error.unit}` : null, index === first, () => this.choose(index));
     }));
     const keys = {
       " ": () => byId("play").click(), ArrowLeft: () => this.step(-1), ArrowRight: () => this.step(1),

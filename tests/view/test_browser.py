@@ -34,6 +34,8 @@ def page(browser, tmp_path_factory):
     path = tmp_path_factory.mktemp("report") / "report.html"
     write(path, [ReportRun(HOSTILE, scenes, evaluation(errors), metrics(), {"Model": HOSTILE})], HOSTILE)
     show(browser, path)
+    assert texts(browser, "#scene-choice input:checked + span") == ["Median 2.00 mm"]
+    choose(browser, "scene", 0)
     return path
 
 
@@ -265,7 +267,10 @@ def test_several_runs_side_by_side(browser, tmp_path):
         ReportRun("ast", both[:1], evaluation({"a": 3e-3}, scale=2.0), metrics(200)),
     ]
     write(tmp_path / "report.html", runs, "Two runs")
+    browser.prefer(color_scheme="light", reduced_motion="no-preference")
     show(browser, tmp_path / "report.html")
+    browser.wait("report.viewer.state.playing && report.viewer.state.frame >= 2")  # it starts by itself
+    browser.click("#play")
     visible = ".panel:not([hidden]) b"
     assert texts(browser, visible) == ["Truth", "Prediction of ast", "Prediction of ast (2)"]
     to_frame(browser, 2)
