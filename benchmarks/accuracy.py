@@ -1,0 +1,123 @@
+"""The worst error of every float op against float64, beside that of its torch composition: writes docs/accuracy.md.
+
+`python -m benchmarks.accuracy`. For each op, many random inputs of many sizes and magnitudes; e(C) is the largest error
+of the op and e(T) that of the float32 composition, both relative to the largest magnitude of the exact result. The rule
+that every op must meet is e(C) <= 2 e(T) + 1e-6.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import torch
+
+from ast_sim.ops import attention, segment, sparse_conv
+from ast_sim.ops.library import configuration
+from ast_sim.ops.octree import octree
+from tests.checks import errors
+
+SEEDS = 12
+OUT = Path(__file__).parent.parent / "docs" / "accuracy.md"
+
+# op, composition, inputs, and the names of the results: outputs, then gradients
+Case = tuple[Callable, Callable, list, list[str]]
+
+
+def segments(seed: int) -> Iterator[tuple[str, Case]]:
+    g = torch.Generator().manual_seed(seed)
+    rows, groups, width = (int(torch.randint(1, n, (1,), generator=g)) for n in (5000, 400, 200))
+    order = torch.randperm(rows, generator=g)
+    offsets = torch.cat([torch.tensor([0]), torch.randint(0, rows + 1, (groups - 1,), generator=g).sort().values])
+    offsets = torch.cat([offsets, torch.tensor([rows])])
+    x, dout = torch.randn(rows, width, generator=g), torch.randn(groups, width, generator=g)
+    for name, mean in (("segment_sum", False), ("segment_mean", True)):
+        yield (
+            name,
+            (
+                lambda x, mean=mean: segment._sum(x, order, offsets, mean),
+                lambda x, mean=mean: segment._sum_reference(x, order, offsets, mean),
+                [x],
+                ["out", "dx"],
+            ),
+        )
+    index = torch.randint(0, groups, (rows,), generator=g)
+    by_row = index.argsort(stable=True)
+    starts = torch.cat([torch.tensor([0]), torch.bincount(index, minlength=groups).cumsum(0)])
+    yield "gather", (lambda y: segment.gather(y, index, by_row, starts), lambda y: y[index], [dout], ["out", "dx"])
+
+
+def attentions(seed: int) -> Iterator[tuple[str, Case]]:
+    g = torch.Generator().manual_seed(seed)
+    sizes = torch.randint(1, 600, (2, 2), generator=g)
+    heads, width = (1, 2, 4)[seed % 3], (16, 32, 64, 128)[seed % 4]
+    q, k, v = (torch.randn(int(n.sum()), heads, width, generator=g) for n in (sizes[0], sizes[1], sizes[1]))
+    q = q * 4.0 ** (seed % 3)
+    offsets = [torch.cat([torch.tensor([0]), n.cumsum(0)]) for n in sizes]
+    for name, p in (("attention", 0.0), ("attention, dropout 0.1", 0.1)):
+        settings = (width**-0.5, p, seed)
+        yield (
+            name,
+            (
+                lambda q, k, v, s=settings: attention.attention(q, k, v, *offsets, *s)[0],
+                lambda q, k, v, s=settings: attention._reference(q, k, v, *offsets, *s)[0],
+                [q, k, v],
+                ["out", "dq", "dk", "dv"],
+            ),
+        )
+
+
+def convolutions(seed: int) -> Iterator[tuple[str, Case]]:
+    g = torch.Generator().manual_seed(seed)
+    points = torch.rand(int(torch.randint(1, 3000, (1,), generator=g)), 3, generator=g) * 2 - 1
+    level = octree(points, torch.tensor([0, len(points)]), (0.0, 0.0, 0.0), 1.0, 2 + seed % 6)
+    cells = level.coarsen()
+    widths = [int(n) for n in torch.randint(1, 160, (2,), generator=g)]
+    weight = torch.randn(27, *widths, generator=g)
+    for name, op, rows, pairs, out in (
+        ("sparse_conv", sparse_conv.sparse_conv, cells.num_fine,
+         (cells.fine, cells.coarse_index, cells.coarse_by_fine, cells.fine_by_fine), len(cells.coarse.keys)),
+        ("sparse_conv_transposed", sparse_conv.sparse_conv_transposed, len(cells.coarse.keys),
+         (cells.coarse_by_fine, cells.fine_by_fine, cells.fine, cells.coarse_index), cells.num_fine),
+    ):  # fmt: skip
+        yield (
+            name,
+            (
+                lambda x, w, op=op: op(x, w, cells),
+                lambda x, w, pairs=pairs, out=out: sparse_conv._reference(x, w, False, cells.pair_offsets, *pairs, out),
+                [torch.randn(rows, widths[0], generator=g), weight],
+                ["out", "dx", "dweight"],
+            ),
+        )
+
+
+def main() -> None:
+    worst: dict[tuple[str, str], tuple[float, float, float]] = {}
+    for seed in range(SEEDS):
+        for family in (segments, attentions, convolutions):
+            for name, (op, reference, inputs, results) in family(seed):
+                for result, (c, t, magnitude) in zip(results, errors(op, reference, inputs), strict=True):
+                    c, t = c / max(magnitude, 1e-300), t / max(magnitude, 1e-300)
+                    share = c / (2 * t + 1e-6)
+                    worst[name, result] = max(worst.get((name, result), (-1.0, 0.0, 0.0)), (share, c, t))
+    facts = configuration()
+    lines = [
+        "# Accuracy",
+        "",
+        f"Made by `python -m benchmarks.accuracy`: the worst of {SEEDS} random inputs an op, relative to the largest",
+        "magnitude of the exact (float64) result. e(C) is the error of the C kernel, e(T) that of the float32 torch",
+        "composition on the same input. The rule is e(C) <= 2 e(T) + 1e-6: the share of the bound is at most 1.",
+        f"Instruction set {facts['instruction_set']}, torch {facts['torch']}. Octree, neighbours, pairs and farthest",
+        "point sampling are exact.",
+        "",
+        "| op | result | e(C) | e(T) | share of the bound |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    lines += [f"| {op} | {result} | {c:.1e} | {t:.1e} | {s:.2f} |" for (op, result), (s, c, t) in worst.items()]
+    OUT.write_text("\n".join(lines) + "\n")
+    print("\n".join(lines))
+    assert all(share <= 1 for share, _, _ in worst.values()), "an op breaks the accuracy rule"
+
+
+if __name__ == "__main__":
+    main()
