@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
@@ -18,6 +18,7 @@ class Case:
         items: things processed in a call (points, pairs, rows), or None.
         flops: useful floating point operations in a call, or None.
         check: raises AssertionError unless ours and the peers agree.
+        missing: peers that cannot run here, by name, with the reason.
     """
 
     op: str
@@ -27,3 +28,4 @@ class Case:
     items: int | None
     flops: float | None
     check: Callable[[], None]
+    missing: dict[str, str] = field(default_factory=dict)

@@ -1,0 +1,148 @@
+"""Times every op against its torch composition and the best peers that can be installed.
+
+`python -m benchmarks.kernels --json FILE`. Within a case ours and the peers take turns, so that other load on the
+machine meets all of them; every sample is kept. Results are compared before any time is taken.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+
+import torch
+
+import ast_sim
+from ast_sim.evaluate import provenance
+from ast_sim.ops.library import configuration
+from benchmarks.case import Case
+
+FAMILIES = ("octree", "fps", "sparse_conv", "attention", "segment")
+SHORTEST = 2e-3  # seconds of a sample at least: faster calls are repeated within it
+
+
+def peak(threads: int) -> dict[str, float] | None:
+    """Float32 GF/s of register-only multiply-adds on 1 and on all threads; None without a C compiler."""
+    with tempfile.TemporaryDirectory() as folder:
+        program = Path(folder) / "peak"
+        source = Path(__file__).with_name("peak.c")
+        try:
+            build = ["cc", "-O3", "-march=native", "-ffp-contract=fast", "-pthread", str(source), "-o", str(program)]
+            subprocess.run(build, check=True)
+            out = subprocess.run([str(program), str(threads)], check=True, capture_output=True, text=True).stdout
+        except (OSError, subprocess.CalledProcessError):
+            return None
+    one, all_threads = (float(x) for x in out.split())
+    return {"1": one, str(threads): all_threads}
+
+
+def seconds_of(function: Callable[[], object], calls: int) -> float:
+    start = time.perf_counter()
+    for _ in range(calls):
+        function()
+    return (time.perf_counter() - start) / calls
+
+
+def measure(case: Case, repeats: int, limit: float | None) -> dict:
+    """One record: all samples in seconds a call, of ours and of each peer, their minima, medians and ratios."""
+    case.check()
+    functions = {"ours": case.ours, **case.peers}
+    calls = {name: max(1, round(SHORTEST / seconds_of(f, 1))) for name, f in functions.items()}
+    samples: dict[str, list[float]] = {name: [] for name in functions}
+    for _ in range(repeats):
+        for name, function in functions.items():
+            samples[name].append(seconds_of(function, calls[name]))
+    best = {name: min(x) for name, x in samples.items()}
+    median = {name: statistics.median(x) for name, x in samples.items()}
+    record = {
+        "op": case.op,
+        "shape": case.shape,
+        "threads": torch.get_num_threads(),
+        "ours": {"min": best["ours"], "median": median["ours"], "samples": samples["ours"]},
+        "peers": {
+            name: {
+                "min": best[name],
+                "median": median[name],
+                "ratio_of_min": best[name] / best["ours"],
+                "ratio_of_median": median[name] / median["ours"],
+                "samples": samples[name],
+            }
+            for name in case.peers
+        },
+        "missing": case.missing,
+    }
+    if case.items:
+        record["nanoseconds_per_item"] = best["ours"] / case.items * 1e9
+    if case.flops:
+        record["gflops"] = case.flops / best["ours"] / 1e9
+        record["share_of_peak"] = record["gflops"] / limit if limit else None
+    return record
+
+
+def line_of(record: dict) -> str:
+    rate = f"{record['gflops']:.0f} GF/s" if "gflops" in record else ""
+    if record.get("share_of_peak"):
+        rate += f" ({record['share_of_peak']:.0%} of peak)"
+    if "nanoseconds_per_item" in record:
+        rate += f" {record['nanoseconds_per_item']:.1f} ns/item"
+    ours = record["ours"]
+    text = f"{record['op']}, {record['shape']}: {ours['min'] * 1e3:.3f} ms, median {ours['median'] * 1e3:.3f}, {rate}"
+    for name, peer in record["peers"].items():
+        text += f"\n    {name}: {peer['min'] * 1e3:.3f} ms, {peer['ratio_of_min']:.2f} x ours"
+        text += f" (medians {peer['ratio_of_median']:.2f} x)"
+    for name, reason in record["missing"].items():
+        text += f"\n    {name}: not measured, {reason}"
+    return text
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, required=True, metavar="FILE", help="write all records and samples here")
+    parser.add_argument("--threads", type=int, default=2, help="threads of torch and of the core (%(default)s)")
+    parser.add_argument("--repeats", type=int, default=20, help="samples of each function (%(default)s)")
+    parser.add_argument("--families", nargs="+", choices=FAMILIES, default=FAMILIES, help="only these")
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    ast_sim.keep_memory()
+    limits = peak(arguments.threads)
+    records: list[dict] = []
+    for family in arguments.families:
+        try:
+            module = importlib.import_module(f"benchmarks.{family}")
+        except ImportError as error:
+            records.append({"op": family, "missing": {str(error.name): f"cannot be imported: {error}"}})
+            print(f"{family}: not measured, {error}", flush=True)
+            continue
+        for case in module.cases():
+            records.append(measure(case, arguments.repeats, limits and limits[str(arguments.threads)]))
+            print(line_of(records[-1]), flush=True)
+    versions = {name: metadata.version(name) for name in ("fpsample", "spconv") if _installed(name)}
+    result = {
+        **provenance(" ".join(["python -m benchmarks.kernels", *sys.argv[1:]])),
+        "configuration": configuration(),
+        "peer_versions": versions,
+        "peak_gflops_by_threads": limits,
+        "records": records,
+    }
+    arguments.json.parent.mkdir(parents=True, exist_ok=True)
+    arguments.json.write_text(json.dumps(result, indent=1) + "\n")
+
+
+def _installed(name: str) -> bool:
+    try:
+        metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+if __name__ == "__main__":
+    main()
