@@ -14,11 +14,13 @@
 enum { FPS_LANES = 16, FPS_EXTENT = 1 << 21 };
 
 #define T         int32_t
+#define INTEGER   int32_t
 #define FPS(name) fps_narrow_##name
 #define FPS_FAR   INT32_MAX
 #include "fps_scan.h"
 
 #define T         double
+#define INTEGER   int64_t
 #define FPS(name) fps_wide_##name
 #define FPS_FAR   0x1p62
 #include "fps_scan.h"

@@ -1,10 +1,23 @@
-/* Farthest point sampling of one scene, included by fps.c once per type T of coordinates and squared distances, which are exact in T:
- * FPS(name) makes the names of that type. All inner loops run over FPS_LANES items, so that they become vectors. */
+/* Farthest point sampling of one scene, included by fps.c once per type T of coordinates and squared distances, which are exact in T;
+ * INTEGER is the integer of its size, FPS(name) makes the names of that type. Blocks come in groups of FPS_LANES, a whole number of vectors
+ * of T. */
 
-/* Points in blocks of consecutive ones, padded with points of distance -1, which no distance is below; the number of blocks is
- * padded with empty ones to whole groups of FPS_LANES. */
+typedef T FPS(vector) __attribute__((vector_size(AST_VECTOR_BYTES), aligned(sizeof(T)), may_alias));
+typedef INTEGER FPS(mask) __attribute__((vector_size(AST_VECTOR_BYTES))); /* of a comparison: -1 is true */
+enum { FPS(width) = AST_VECTOR_BYTES / sizeof(T), FPS(parts) = FPS_LANES / FPS(width) };
+
+AST_INLINE FPS(vector) FPS(select)(FPS(mask) mask, FPS(vector) a, FPS(vector) b) {
+  return (FPS(vector))(((FPS(mask))a & mask) | ((FPS(mask))b & ~mask));
+}
+AST_INLINE FPS(vector) FPS(max)(FPS(vector) a, FPS(vector) b) { return FPS(select)(a > b, a, b); }
+AST_INLINE FPS(vector) FPS(min)(FPS(vector) a, FPS(vector) b) { return FPS(select)(a < b, a, b); }
+AST_INLINE FPS(vector) FPS(load)(const T *p) { return *(const FPS(vector) *)p; }
+AST_INLINE void FPS(store)(T *p, FPS(vector) x) { *(FPS(vector) *)p = x; }
+
+/* Points in blocks of consecutive ones, padded with points of distance 0, which no distance is below and which are never farthest; the
+ * number of blocks is padded with empty ones to whole groups. */
 typedef struct {
-  int64_t size, groups;   /* points of a block; groups of blocks */
+  int64_t size, groups;   /* points of a block, a multiple of FPS_LANES; groups of blocks */
   T *point[3], *distance; /* of each point, from the samples so far */
   T *low[3], *high[3];    /* of each block: its bounding box */
   T *farthest;            /* of each block: its largest distance */
@@ -15,89 +28,122 @@ static int64_t FPS(bytes)(int64_t n, int64_t size) {
   return blocks * (4 * size + 7) * (int64_t)sizeof(T);
 }
 
+/* The points of block b, relative to the origin, and its bounding box. The rows past the last point repeat it. */
+static void FPS(fill)(const FPS(blocks) * s, const int32_t *coordinates, int64_t n, const int32_t origin[3], int64_t b) {
+  const int64_t begin = b * s->size, points = n - begin < s->size ? n - begin : s->size;
+  const int32_t *in = coordinates + 3 * begin;
+  for (int a = 0; a < 3; a++) {
+    T *restrict point = s->point[a] + begin;
+    for (int64_t i = 0; i < points; i++) point[i] = (T)(in[3 * i + a] - origin[a]);
+    for (int64_t i = points; i < s->size; i++) point[i] = point[points - 1];
+    FPS(vector) low = FPS(load)(point), high = low;
+    for (int64_t i = FPS(width); i < s->size; i += FPS(width)) {
+      low = FPS(min)(low, FPS(load)(point + i));
+      high = FPS(max)(high, FPS(load)(point + i));
+    }
+    s->low[a][b] = low[0];
+    s->high[a][b] = high[0];
+    for (int l = 1; l < FPS(width); l++) {
+      s->low[a][b] = low[l] < s->low[a][b] ? low[l] : s->low[a][b];
+      s->high[a][b] = high[l] > s->high[a][b] ? high[l] : s->high[a][b];
+    }
+  }
+  for (int64_t i = 0; i < s->size; i++) s->distance[begin + i] = i < points ? FPS_FAR : 0;
+  s->farthest[b] = FPS_FAR;
+}
+
 static FPS(blocks) FPS(cut)(const int32_t *coordinates, int64_t n, const int32_t origin[3], int64_t size, void *memory) {
-  const int64_t blocks = round_up((n + size - 1) / size, FPS_LANES), points = blocks * size;
+  const int64_t used = (n + size - 1) / size, blocks = round_up(used, FPS_LANES), points = blocks * size;
   T *next = memory;
   FPS(blocks) s = {.size = size, .groups = blocks / FPS_LANES, .distance = next, .farthest = next + points};
   next += points + blocks;
   for (int a = 0; a < 3; a++, next += points + 2 * blocks) {
-    T *const point = s.point[a] = next, *const low = s.low[a] = next + points, *const high = s.high[a] = next + points + blocks;
-    for (int64_t i = 0; i < n; i++) point[i] = (T)(coordinates[3 * i + a] - origin[a]);
-    for (int64_t i = n; i < points; i++) point[i] = point[n - 1];
-    for (int64_t b = 0; b < blocks; b++) {
-      low[b] = high[b] = point[b * size];
-      for (int64_t i = b * size; i < (b + 1) * size; i++) {
-        low[b] = point[i] < low[b] ? point[i] : low[b];
-        high[b] = point[i] > high[b] ? point[i] : high[b];
-      }
-    }
+    s.point[a] = next;
+    s.low[a] = next + points;
+    s.high[a] = next + points + blocks;
   }
-  for (int64_t i = 0; i < points; i++) s.distance[i] = i < n ? FPS_FAR : -1;
-  for (int64_t b = 0; b < blocks; b++) s.farthest[b] = b * size < n ? FPS_FAR : -1;
+  for (int64_t b = 0; b < used; b++) FPS(fill)(&s, coordinates, n, origin, b);
+  for (int64_t b = used; b < blocks; b++) {
+    for (int a = 0; a < 3; a++) s.low[a][b] = s.high[a][b] = 0;
+    s.farthest[b] = 0;
+  }
   return s;
 }
 
 /* Brings the distances of block b up to date with the sample at p; returns the largest. */
-static T FPS(rescan)(const FPS(blocks) * s, int64_t b, T px, T py, T pz) {
-  const T *restrict x = s->point[0] + b * s->size, *restrict y = s->point[1] + b * s->size, *restrict z = s->point[2] + b * s->size;
-  T *restrict distance = s->distance + b * s->size, farthest[FPS_LANES], result = -1;
-  for (int l = 0; l < FPS_LANES; l++) farthest[l] = -1;
-  for (int64_t i = 0; i < s->size; i += FPS_LANES)
-    for (int l = 0; l < FPS_LANES; l++) {
-      const T dx = x[i + l] - px, dy = y[i + l] - py, dz = z[i + l] - pz, d = dx * dx + dy * dy + dz * dz;
-      const T least = d < distance[i + l] ? d : distance[i + l];
-      distance[i + l] = least;
-      farthest[l] = least > farthest[l] ? least : farthest[l];
-    }
-  for (int l = 0; l < FPS_LANES; l++) result = farthest[l] > result ? farthest[l] : result;
+AST_INLINE T FPS(rescan)(const FPS(blocks) * s, int64_t b, T px, T py, T pz) {
+  const T *x = s->point[0] + b * s->size, *y = s->point[1] + b * s->size, *z = s->point[2] + b * s->size;
+  T *distance = s->distance + b * s->size;
+  FPS(vector) farthest = {0};
+  for (int64_t i = 0; i < s->size; i += FPS(width)) {
+    const FPS(vector) dx = FPS(load)(x + i) - px, dy = FPS(load)(y + i) - py, dz = FPS(load)(z + i) - pz;
+    const FPS(vector) least = FPS(min)(FPS(load)(distance + i), dx * dx + dy * dy + dz * dz);
+    FPS(store)(distance + i, least);
+    farthest = FPS(max)(farthest, least);
+  }
+  T result = 0;
+  for (int l = 0; l < FPS(width); l++) result = farthest[l] > result ? farthest[l] : result;
   return result;
 }
 
-/* Which blocks of group g hold a point that may be nearer to p than to the samples so far: those whose box is nearer than their
+/* Lists the blocks of group g that may hold a point nearer to p than to the samples so far: those whose box is nearer than their
  * farthest point. All others keep every distance. */
-AST_INLINE bool FPS(reach)(const FPS(blocks) * s, int64_t g, T px, T py, T pz, T reached[FPS_LANES]) {
-  const T *restrict lx = s->low[0] + g * FPS_LANES, *restrict ly = s->low[1] + g * FPS_LANES, *restrict lz = s->low[2] + g * FPS_LANES;
-  const T *restrict hx = s->high[0] + g * FPS_LANES, *restrict hy = s->high[1] + g * FPS_LANES, *restrict hz = s->high[2] + g * FPS_LANES;
-  const T *restrict farthest = s->farthest + g * FPS_LANES;
-  T any = 0;
-  for (int l = 0; l < FPS_LANES; l++) {
-    T dx = lx[l] - px > px - hx[l] ? lx[l] - px : px - hx[l], dy = ly[l] - py > py - hy[l] ? ly[l] - py : py - hy[l],
-      dz = lz[l] - pz > pz - hz[l] ? lz[l] - pz : pz - hz[l];
-    dx = dx > 0 ? dx : 0;
-    dy = dy > 0 ? dy : 0;
-    dz = dz > 0 ? dz : 0;
-    reached[l] = dx * dx + dy * dy + dz * dz < farthest[l] ? 1 : 0;
+AST_INLINE int FPS(reach)(const FPS(blocks) * s, int64_t g, T px, T py, T pz, int32_t list[FPS_LANES]) {
+  FPS(mask) reached[FPS(parts)], any = {0};
+#pragma GCC unroll 8
+  for (int v = 0; v < FPS(parts); v++) {
+    const int64_t b = g * FPS_LANES + v * FPS(width);
+    const FPS(vector) zero = {0};
+    const FPS(vector) dx = FPS(max)(FPS(max)(FPS(load)(s->low[0] + b) - px, px - FPS(load)(s->high[0] + b)), zero);
+    const FPS(vector) dy = FPS(max)(FPS(max)(FPS(load)(s->low[1] + b) - py, py - FPS(load)(s->high[1] + b)), zero);
+    const FPS(vector) dz = FPS(max)(FPS(max)(FPS(load)(s->low[2] + b) - pz, pz - FPS(load)(s->high[2] + b)), zero);
+    reached[v] = dx * dx + dy * dy + dz * dz < FPS(load)(s->farthest + b);
+    any |= reached[v];
   }
-  for (int l = 0; l < FPS_LANES; l++) any += reached[l];
-  return any > 0;
+  uint64_t word[AST_VECTOR_BYTES / 8], all = 0;
+  memcpy(word, &any, sizeof any);
+  for (int i = 0; i < AST_VECTOR_BYTES / 8; i++) all |= word[i];
+  if (!all) return 0;
+  int num = 0;
+  for (int v = 0; v < FPS(parts); v++)
+    for (int l = 0; l < FPS(width); l++) {
+      list[num] = v * FPS(width) + l;
+      num -= (int)reached[v][l]; /* true is -1 */
+    }
+  return num;
 }
 
 /* Adds point `pick` to the samples. Returns the point that is now farthest from them, the first of several, or -1 if all distances
  * are 0. */
 static int64_t FPS(step)(const FPS(blocks) * s, int64_t pick) {
   const T px = s->point[0][pick], py = s->point[1][pick], pz = s->point[2][pick];
-  T best[FPS_LANES] = {0}, group[FPS_LANES] = {0}, reached[FPS_LANES], value = 0;
-  int64_t block = 0;
+  FPS(vector) best[FPS(parts)] = {0}, group[FPS(parts)] = {0};
+  int32_t list[FPS_LANES];
   for (int64_t g = 0; g < s->groups; g++) {
-    T *restrict farthest = s->farthest + g * FPS_LANES;
-    if (FPS(reach)(s, g, px, py, pz, reached))
-      for (int l = 0; l < FPS_LANES; l++)
-        if (reached[l] > 0) farthest[l] = FPS(rescan)(s, g * FPS_LANES + l, px, py, pz);
-    for (int l = 0; l < FPS_LANES; l++) {
-      group[l] = farthest[l] > best[l] ? (T)g : group[l];
-      best[l] = farthest[l] > best[l] ? farthest[l] : best[l];
+    T *farthest = s->farthest + g * FPS_LANES;
+    const int num = FPS(reach)(s, g, px, py, pz, list);
+    for (int i = 0; i < num; i++) farthest[list[i]] = FPS(rescan)(s, g * FPS_LANES + list[i], px, py, pz);
+#pragma GCC unroll 8
+    for (int v = 0; v < FPS(parts); v++) {
+      const FPS(vector) here = FPS(load)(farthest + v * FPS(width));
+      group[v] = FPS(select)(here > best[v], (FPS(vector)){0} + (T)g, group[v]);
+      best[v] = FPS(max)(best[v], here);
     }
   }
-  for (int l = 0; l < FPS_LANES; l++) {
-    const int64_t b = (int64_t)group[l] * FPS_LANES + l;
-    if (best[l] > value || (best[l] == value && b < block)) block = b;
-    if (best[l] > value) value = best[l];
-  }
+  T value = 0;
+  int64_t block = 0;
+  for (int v = 0; v < FPS(parts); v++)
+    for (int l = 0; l < FPS(width); l++) {
+      const int64_t b = (int64_t)group[v][l] * FPS_LANES + v * FPS(width) + l;
+      if (best[v][l] > value || (best[v][l] == value && b < block)) block = b;
+      if (best[v][l] > value) value = best[v][l];
+    }
   if (!(value > 0)) return -1;
   for (pick = block * s->size; s->distance[pick] < value;) pick++;
   return pick;
 }
 
 #undef T
+#undef INTEGER
 #undef FPS
 #undef FPS_FAR
