@@ -182,15 +182,18 @@ AST_INLINE void octree_pairs_by_coarse(const octree_pair_job *s, int64_t chunk, 
 AST_INLINE void octree_pairs_by_fine(const octree_pair_job *s, int64_t chunk, int64_t *next, const bool write) {
   const octree_group_table groups = octree_groups();
   for (int64_t Q = chunk * OCTREE_CHUNK; Q < min64(s->C, (chunk + 1) * OCTREE_CHUNK); Q++)
-    for (int64_t f = s->first_child[Q]; f < s->first_child[Q + 1]; f++)
-      for (int d = 0; d < 8; d++) {
-        const int k = groups.of[s->keys[f] & 7][d];
+    for (int64_t f = s->first_child[Q]; f < s->first_child[Q + 1]; f++) {
+      const int octant = (int)(s->keys[f] & 7);
+      for (int d = octant;; d = (d - 1) & octant) { /* all subsets of its bits */
         const int64_t P = s->after[8 * Q + d];
-        if (k < 0 || P < 0) continue;
-        const int64_t to = next[k]++;
-        if (write) s->fine[1][to] = f;
-        if (write) s->coarse[1][to] = P;
+        if (P >= 0) {
+          const int64_t to = next[groups.of[octant][d]]++;
+          if (write) s->fine[1][to] = f;
+          if (write) s->coarse[1][to] = P;
+        }
+        if (d == 0) break;
       }
+    }
 }
 
 /* Tasks: the chunks by coarse cell, then those by fine cell. */

@@ -85,14 +85,14 @@ static ast_status octree_key_task(int64_t index, void *context) {
   double center[3 * OCTREE_TILE];
   int32_t cell[3 * OCTREE_TILE];
   uint64_t x[OCTREE_TILE], y[OCTREE_TILE], z[OCTREE_TILE];
-  double inside = 1;
+  int64_t inside = -1;
   for (int i = 0; i < 3 * OCTREE_TILE; i++) center[i] = s->center[i % 3];
   for (int64_t begin = index * OCTREE_CHUNK; begin < end; begin += OCTREE_TILE) {
     const int num = (int)min64(OCTREE_TILE, end - begin);
     const float *p = s->positions + 3 * begin;
     for (int i = 0; i < 3 * num; i++) {
       const double u = (p[i] - center[i] + h) / width;
-      inside = (u >= -1e-6) & (u <= 1 + 1e-6) ? inside : 0;
+      inside &= (u >= -1e-6) & (u <= 1 + 1e-6) ? -1 : 0;
       double v = u * cells;
       v = v < last ? v : last;
       v = v > 0 ? v : 0;
@@ -106,7 +106,7 @@ static ast_status octree_key_task(int64_t index, void *context) {
     uint64_t *key = s->keys + begin;
     for (int i = 0; i < num; i++) key[i] = octree_spread(x[i]) << 2 | octree_spread(y[i]) << 1 | octree_spread(z[i]);
   }
-  return inside == 1 ? AST_OK : AST_OUTSIDE;
+  return inside ? AST_OK : AST_OUTSIDE;
 }
 
 typedef struct {
