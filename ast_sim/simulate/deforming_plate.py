@@ -23,6 +23,7 @@ DEFAULT_NODES = 400
 MINIMUM_NODES = 80
 MATERIAL = NeoHookean(young=1e6, poisson=0.4)
 DHAT = 1e-3
+CLAMP_MARGIN = 0.05  # metres that the obstacle stays away from the clamps, seen from above
 SHAPES = ("ball", "cylinder", "block")
 INFO = DatasetInfo(
     family="deforming_plate",
@@ -76,7 +77,7 @@ def draw(rng: np.random.Generator, nodes: int = DEFAULT_NODES) -> PlateCase:
 
 
 def _try_draw(rng: np.random.Generator, nodes: int) -> PlateCase | None:
-    """One draw; None if its holes overlap or the obstacle would come down on one of them."""
+    """One draw; None if its holes overlap, or if the obstacle does not fit or would come down on a hole."""
     refinement = np.sqrt(DEFAULT_NODES / nodes)  # two layers of elements: nodes grow with the area
     spacing = rng.uniform(0.036, 0.044) * refinement
     size = rng.uniform([0.42, 0.24, 0.025], [0.54, 0.40, 0.045])
@@ -88,11 +89,14 @@ def _try_draw(rng: np.random.Generator, nodes: int) -> PlateCase | None:
     shape, obstacle, obstacle_elements = _draw_obstacle(rng, max(2, round(3 / refinement)))
     travel = _draw_travel(rng)
     lowest = obstacle[np.argmin(obstacle[:, 2])]
-    # `aim`: where the lowest point of the obstacle meets the plate. It is solid, and so far from the clamps that the
-    # obstacle stays between them: nothing gives way where it would press on a clamped node.
-    reach = np.abs(obstacle[:, 0] - lowest[0]).max() + np.abs(travel[:, 0]).max()
-    room = np.array([0.7 * (size[0] / 2 - reach), 0.35 * size[1]])
-    aim = rng.uniform(-1, 1, 2) * room
+    # `aim`: where the lowest point of the obstacle meets the plate. It is solid, and the obstacle stays well between
+    # the clamps: nothing gives way where it would press on a clamped node.
+    first, last = obstacle[:, 0].min() + travel[:, 0].min(), obstacle[:, 0].max() + travel[:, 0].max()
+    left, right = CLAMP_MARGIN - size[0] / 2 - first, size[0] / 2 - CLAMP_MARGIN - last
+    if left > right:
+        return None
+    along = (left + right) / 2 + 0.35 * rng.uniform(-1, 1) * (right - left)
+    aim = np.array([along + lowest[0], 0.35 * rng.uniform(-1, 1) * size[1]])
     if not all(np.hypot(*(aim - hole[:2])) >= hole[2] + spacing / 2 for hole in holes):
         return None
     gap = rng.uniform(0.004, 0.015)
