@@ -89,7 +89,10 @@ class Progress:
         else:
             self._bar.write(text)
 
-    def close(self) -> None:
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
         self._bar.close()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from ast_sim.data.scene import Trajectory
 from ast_sim.errors import AstSimError, ConfigError
 from ast_sim.evaluate import evaluate, provenance
 from ast_sim.model.simulator import Simulator
+from ast_sim.monitor import Progress
 from ast_sim.rollout import Rollout, rollouts
 from ast_sim.run import Metrics, RunConfig, load_model
 from ast_sim.view import export, report
@@ -52,17 +53,17 @@ def open_run(run: Path, data: Path | None = None) -> Iterator[TrainedRun]:
         yield TrainedRun(Path(run), settings, step, model, dataset)
 
 
-def evaluate_run(
-    run: TrainedRun, split: str, command: str, progress: Callable[[str], None] | None = None
-) -> dict[str, Any]:
-    """What `ast-sim evaluate --json` writes: `evaluate` with its provenance."""
+def evaluate_run(run: TrainedRun, split: str, command: str) -> dict[str, Any]:
+    """What `ast-sim evaluate --json` writes: `evaluate` with its provenance; shows a bar on a terminal."""
+    with Progress(run.dataset.count(split), 0, "scenes") as bar:
+        result = evaluate(run.model, run.dataset, split, lambda name: bar.advance())
     return {
         **provenance(command),
         "run": str(run.path),
         "step": run.step,
         "data": str(run.dataset.path),
         "split": split,
-        **evaluate(run.model, run.dataset, split, progress),
+        **result,
     }
 
 

@@ -153,8 +153,7 @@ class _Training:
         options = self.options
         self._restore()
         self.model.train()
-        self.progress = Progress(options.steps, self.step, "steps")
-        try:
+        with Progress(options.steps, self.step, "steps") as self.progress:
             if self.step and self._due(options.validate_every) and not self.metrics.validated(self.step):
                 self._validate()
             self.clock = Clock()
@@ -169,8 +168,6 @@ class _Training:
                 self.clock.step()
                 if validates:
                     self._validate()
-        finally:
-            self.progress.close()
 
     def _due(self, every: int) -> bool:
         return self.step % every == 0 or self.step == self.options.steps
