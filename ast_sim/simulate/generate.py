@@ -169,8 +169,11 @@ def _locked(parts: Path, settings: dict[str, Any]) -> Iterator[None]:
                 )
         else:
             temporary = path.with_suffix(".tmp")
-            temporary.write_text(json.dumps(settings))
-            os.replace(temporary, path)
+            try:
+                temporary.write_text(json.dumps(settings))
+                os.replace(temporary, path)
+            except OSError as error:
+                raise SimulationError(f"{path} cannot be written: {error}") from error
         yield
 
 

@@ -78,7 +78,6 @@ class QuasiStatic:
         self.elasticity, self.contact, self.prescribed = elasticity, contact, prescribed
         self.settings = settings or SolverSettings()
         self.newton_iterations = 0
-        self.projections = 0
         self._system = BandedSystem(elasticity, prescribed)
         contact.collision_free_fraction(position, position)
         self._state = self._evaluate(np.array(position, float))
@@ -142,7 +141,6 @@ class QuasiStatic:
             contact = state.contact.hessian(project)
             if self._system.factorise(stiffness, contact):
                 break
-            self.projections += 1
         else:
             raise NotConverged("the projected Hessian is singular")
         if increment is None:
