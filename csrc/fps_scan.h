@@ -14,8 +14,8 @@ AST_INLINE FPS(vector) FPS(min)(FPS(vector) a, FPS(vector) b) { return FPS(selec
 AST_INLINE FPS(vector) FPS(load)(const T *p) { return *(const FPS(vector) *)p; }
 AST_INLINE void FPS(store)(T *p, FPS(vector) x) { *(FPS(vector) *)p = x; }
 
-/* Points in blocks of consecutive ones, padded with points of distance 0, which no distance is below and which are never farthest; the
- * number of blocks is padded with empty ones to whole groups. */
+/* Points in blocks of consecutive ones, padded with copies of the last point, which comes first of them; the number of blocks is padded
+ * to whole groups with empty ones of distance 0, which are never farthest. */
 typedef struct {
   int64_t size, groups;   /* points of a block, a multiple of FPS_LANES; groups of blocks */
   T *point[3], *distance; /* of each point, from the samples so far */
@@ -28,7 +28,7 @@ static int64_t FPS(bytes)(int64_t n, int64_t size) {
   return blocks * (4 * size + 7) * (int64_t)sizeof(T);
 }
 
-/* The points of block b, relative to the origin, and its bounding box. The rows past the last point repeat it. */
+/* The points of block b, relative to the origin, and its bounding box. */
 static void FPS(fill)(const FPS(blocks) * s, const int32_t *coordinates, int64_t n, const int32_t origin[3], int64_t b) {
   const int64_t begin = b * s->size, points = n - begin < s->size ? n - begin : s->size;
   const int32_t *in = coordinates + 3 * begin;
@@ -48,7 +48,7 @@ static void FPS(fill)(const FPS(blocks) * s, const int32_t *coordinates, int64_t
       s->high[a][b] = high[l] > s->high[a][b] ? high[l] : s->high[a][b];
     }
   }
-  for (int64_t i = 0; i < s->size; i++) s->distance[begin + i] = i < points ? FPS_FAR : 0;
+  for (int64_t i = 0; i < s->size; i++) s->distance[begin + i] = FPS_FAR;
   s->farthest[b] = FPS_FAR;
 }
 
