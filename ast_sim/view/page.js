@@ -61,7 +61,7 @@ function samplesTable({ names, order, table: columns }, scenes) {
       return element("td", {}, unit ? digits(value === null ? null : value / units[column].scale) : (value === null ? "–" : String(value)));
     })));
   const heads = columns.map(({ label, unit }, column) => (unit ? `${label} (${units[column].name})` : label));
-  return element("details", {}, element("summary", {}, `The figures of all ${names.length} scenes`), table(["Scene", ...heads], rows));
+  return element("details", {}, element("summary", {}, `The figures of all ${names.length} scenes`), table(["Scene", ...heads], rows, { className: "dense" }));
 }
 
 function factTables(runs) {

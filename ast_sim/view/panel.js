@@ -109,7 +109,7 @@ class Panel {
       const position = coordinates(body, motion.body, frame);
       traces.push(this.surface(scene, motion, frame, color, position));
       // Just above the surface, which would hide half of each line otherwise.
-      const [x, y, z] = lines ? edgeLines(body.edges, lifted(position, body.corners, 0.002 * scene.size)) : [[], [], []];
+      const [x, y, z] = lines ? edgeLines(body.edges, lifted(position, body.corners, 0.0011 * scene.size)) : [[], [], []];
       traces.push({ type: "scatter3d", mode: "lines", x, y, z, line: { color: cssColor("mesh-line"), width: 1.5 }, hoverinfo: "skip" });
     }
     if (obstacle) {

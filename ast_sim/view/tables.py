@@ -172,14 +172,17 @@ def samples(evaluations: Sequence[Json | None], names: Sequence[str]) -> Json | 
         {"label": "Nodes", "unit": None, "values": first("nodes")},
         {"label": "Frames", "unit": None, "values": first("frames")},
     ]
-    for run, name in enumerate(names):
-        suffix = f", {name}" if len(names) > 1 else ""
-        stress = values(run, "stress", MODEL, "rollout_all", "deforming")
-        seconds = values(run, "model_seconds_per_step")
-        columns.append({"label": f"Displacement RMSE{suffix}", "unit": unit["displacement"], "values": runs[run]})
-        columns.append({"label": f"Stress RMSE{suffix}", "unit": unit["stress"], "values": stress})
-        columns.append({"label": f"Time per step{suffix}", "unit": "s", "values": seconds})
+
+    def add(label: str, unit: str, per_run: list[list[Any]]) -> None:
+        for name, numbers in zip(names, per_run, strict=True):
+            suffix = f", {name}" if len(names) > 1 else ""
+            columns.append({"label": label + suffix, "unit": unit, "values": numbers})
+
+    every = range(len(lists))
+    add("Displacement", unit["displacement"], runs)
     columns.append({"label": "Hold still", "unit": unit["displacement"], "values": trivial})
+    add("Stress", unit["stress"], [values(run, "stress", MODEL, "rollout_all", "deforming") for run in every])
+    add("Model’s step", "s", [values(run, "model_seconds_per_step") for run in every])
     columns.append({"label": "Solver’s step", "unit": "s", "values": first("solver_seconds_per_step")})
     return {
         "names": scenes,

@@ -33,7 +33,7 @@ FLAGS = (
     "--remote-debugging-port=0",
     "--remote-allow-origins=*",
 )
-PATIENCE = 60.0  # seconds until something that should happen counts as missing
+PATIENCE = 180.0  # seconds until something that should happen counts as missing
 
 
 class Browser:

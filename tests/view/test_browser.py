@@ -39,12 +39,13 @@ def page(browser, tmp_path_factory):
     return path
 
 
-def show(browser, path):
+def show(browser, path, still=True):
     browser.errors.clear()
     browser.requests.clear()
     browser.open(path)
     browser.wait("document.documentElement.dataset.ready === 'true'")
-    settle(browser)
+    if still:
+        settle(browser)
 
 
 def settle(browser):
@@ -268,9 +269,10 @@ def test_several_runs_side_by_side(browser, tmp_path):
     ]
     write(tmp_path / "report.html", runs, "Two runs")
     browser.prefer(color_scheme="light", reduced_motion="no-preference")
-    show(browser, tmp_path / "report.html")
+    show(browser, tmp_path / "report.html", still=False)
     browser.wait("report.viewer.state.playing && report.viewer.state.frame >= 2")  # it starts by itself
     browser.click("#play")
+    settle(browser)
     visible = ".panel:not([hidden]) b"
     assert texts(browser, visible) == ["Truth", "Prediction of ast", "Prediction of ast (2)"]
     to_frame(browser, 2)

@@ -124,6 +124,9 @@ def test_scenes_are_ranked_and_failures_come_last():
     assert [found["names"][i] for i in found["order"]] == ["c", "a", "b"]
     assert found["runs"] == [[3e-3, None, 1e-3]]
     assert found["trivial"] == [6e-3] * 3
+    labels = [column["label"] for column in found["table"]]
+    assert labels == ["Nodes", "Frames", "Displacement", "Hold still", "Stress", "Model’s step", "Solver’s step"]
+    assert found["table"][5]["values"] == [0.002, None, 0.002]
 
 
 def test_tiles_state_ratio_speed_and_failures():
