@@ -19,14 +19,14 @@
 #include "simd.h"
 
 enum {
-  QUERIES = 128,   /* a forward task: one scene and head, this many queries; packed keys are shared among them */
-  QUERY_TILE = 64, /* rows of the tile of scores */
-  KEYS = 256,      /* columns of the tile, forward */
-  KEYS_BACKWARD = 128,
+  QUERIES = 256,   /* a forward task: one scene and head, this many queries; packed keys are shared among them */
+  QUERY_TILE = 64, /* rows and */
+  KEYS = 128,      /* columns of the tile of scores */
   MAX_D = 128,
   ROW = MAX_D + 16, /* floats from row to row of copied queries and the like: no power of two, which would crowd few cache sets */
   DROPOUT_KEYS = 128
 };
+_Static_assert(KEYS % DROPOUT_KEYS == 0, "a block of keys holds whole groups of the dropout mask");
 static const float LOG2_E = 0x1.715476p+0f;
 
 /* ---- dropout ---- */
@@ -130,9 +130,12 @@ AST_INLINE float weights_of(float *x, int64_t padded, float maximum, int32_t shi
 
 static float largest(float *x, int64_t n, int64_t padded) {
   for (int64_t j = n; j < padded; j++) x[j] = -INFINITY;
-  vf m = vsplat(-INFINITY);
-  for (int64_t j = 0; j < padded; j += VW) m = vmax(vload(x + j), m);
-  return vlargest(m);
+  vf even = vsplat(-INFINITY), odd = even; /* two chains: a maximum waits for the one before */
+  for (int64_t j = 0; j < padded; j += GEMM_COLUMNS) {
+    even = vmax(vload(x + j), even);
+    odd = vmax(vload(x + j + VW), odd);
+  }
+  return vlargest(vmax(even, odd));
 }
 
 /* The block of n keys from k0 on, for the tile of `rows` queries from i0 on. */
@@ -224,13 +227,13 @@ typedef struct {
 } backward_job;
 
 typedef struct {
-  float keys[MAX_D * (KEYS_BACKWARD + GEMM_COLUMNS)], values[MAX_D * (KEYS_BACKWARD + GEMM_COLUMNS)]; /* K^T, V^T, packed */
-  float key_rows[KEYS_BACKWARD * ROW];                                                                /* scale K */
-  float value_rows[KEYS_BACKWARD * ROW];                                                              /* gain V */
-  float queries[QUERY_TILE * ROW], dout[QUERY_TILE * ROW];                                            /* scale Q, y */
-  float scores[QUERY_TILE * KEYS_BACKWARD], dscores[QUERY_TILE * KEYS_BACKWARD];                      /* at first: y and out, packed */
-  float dk[KEYS_BACKWARD * MAX_D], dv[KEYS_BACKWARD * MAX_D];
-  int32_t keep[KEYS_BACKWARD];
+  float keys[MAX_D * (KEYS + GEMM_COLUMNS)], values[MAX_D * (KEYS + GEMM_COLUMNS)]; /* K^T, V^T, packed */
+  float key_rows[KEYS * ROW];                                                       /* scale K */
+  float value_rows[KEYS * ROW];                                                     /* gain V */
+  float queries[QUERY_TILE * ROW], dout[QUERY_TILE * ROW];                          /* scale Q, y */
+  float scores[QUERY_TILE * KEYS], dscores[QUERY_TILE * KEYS];                      /* at first: y and out, packed */
+  float dk[KEYS * MAX_D], dv[KEYS * MAX_D];
+  int32_t keep[KEYS];
 } backward_scratch;
 
 /* sums[i] = a_i . b_i, each added in the order of gemm; a and b packed, sums [rows] up to whole panels */
@@ -267,11 +270,11 @@ static void backward_tile(const backward_job *job, backward_scratch *t, int64_t 
     gemm_pack(job->out + (q0 * H + h) * D, 1, H * D, D, rows, t->dscores);
     row_products(t->scores, t->dscores, rows, D, delta + i0);
   }
-  gemm(rows, padded, D, (gemm_a){t->queries, ROW, 1}, gemm_packed(t->keys, D), t->scores, KEYS_BACKWARD, false);
-  gemm(rows, padded, D, (gemm_a){t->dout, ROW, 1}, gemm_packed(t->values, D), t->dscores, KEYS_BACKWARD, false);
+  gemm(rows, padded, D, (gemm_a){t->queries, ROW, 1}, gemm_packed(t->keys, D), t->scores, KEYS, false);
+  gemm(rows, padded, D, (gemm_a){t->dout, ROW, 1}, gemm_packed(t->values, D), t->dscores, KEYS, false);
   for (int64_t i = 0; i < rows; i++) {
     const float maximum = job->maximum[(q0 + i) * H + h], share = 1 / job->sum[(q0 + i) * H + h];
-    float *x = t->scores + i * KEYS_BACKWARD, *dx = t->dscores + i * KEYS_BACKWARD;
+    float *x = t->scores + i * KEYS, *dx = t->dscores + i * KEYS;
     if (d->threshold) {
       dropout_mask(d, i0 + i, k0, n, t->keep);
       gradients_of(x, dx, padded, maximum, share, delta[i0 + i], t->keep);
@@ -279,9 +282,9 @@ static void backward_tile(const backward_job *job, backward_scratch *t, int64_t 
       gradients_of(x, dx, padded, maximum, share, delta[i0 + i], NULL);
     }
   }
-  gemm(n, D, rows, (gemm_a){t->scores, 1, KEYS_BACKWARD}, gemm_rows(t->dout, ROW), t->dv, D, i0 > 0);
-  gemm(n, D, rows, (gemm_a){t->dscores, 1, KEYS_BACKWARD}, gemm_rows(t->queries, ROW), t->dk, D, i0 > 0);
-  gemm(rows, D, n, (gemm_a){t->dscores, KEYS_BACKWARD, 1}, gemm_rows(t->key_rows, ROW), job->dq + (q0 * H + h) * D, H * D, k0 > 0);
+  gemm(n, D, rows, (gemm_a){t->scores, 1, KEYS}, gemm_rows(t->dout, ROW), t->dv, D, i0 > 0);
+  gemm(n, D, rows, (gemm_a){t->dscores, 1, KEYS}, gemm_rows(t->queries, ROW), t->dk, D, i0 > 0);
+  gemm(rows, D, n, (gemm_a){t->dscores, KEYS, 1}, gemm_rows(t->key_rows, ROW), job->dq + (q0 * H + h) * D, H * D, k0 > 0);
 }
 
 static ast_status backward_task(int64_t index, void *context) {
@@ -299,8 +302,8 @@ static ast_status backward_task(int64_t index, void *context) {
   float *delta = ast_scratch(7, round_up(queries, QUERY_TILE) * (int64_t)sizeof *delta);
   if (!t || !delta) return AST_NO_MEMORY;
   const dropout d = dropout_of(s, b, h);
-  for (int64_t k0 = 0; k0 < keys; k0 += KEYS_BACKWARD) {
-    const int64_t n = min64(KEYS_BACKWARD, keys - k0), row = k_first + k0;
+  for (int64_t k0 = 0; k0 < keys; k0 += KEYS) {
+    const int64_t n = min64(KEYS, keys - k0), row = k_first + k0;
     const float *k = job->k + row * s->k_stride + h * D, *v = job->v + row * s->v_stride + h * D;
     gemm_pack(k, 1, s->k_stride, D, n, t->keys);
     copy_rows(v, s->v_stride, n, D, d.gain, t->value_rows);
