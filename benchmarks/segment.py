@@ -1,10 +1,11 @@
-"""Sums over segments, and the gather whose gradient they are, beside index_add_ and scatter_add_."""
+"""Sums over segments, in stored order and by a permutation (the gradient of a gather), beside torch's scatters."""
 
 from __future__ import annotations
 
 import torch
 
 from ast_sim.ops.edges import EdgeSet
+from ast_sim.ops.segment import segment_sum
 from benchmarks.case import Case
 
 SIZES = [(3000, 500, 64), (300_000, 50_000, 128)]  # edges, nodes, channels
@@ -42,13 +43,11 @@ def _sum(edges: int, nodes: int, channels: int) -> Case:
 
 
 def _gather_gradient(edges: int, nodes: int, channels: int) -> Case:
-    """dx of x[senders]: the rows of each sender lie far apart."""
+    """The gradient of x[senders]: the rows of each sender lie far apart."""
     edge_set, dout = _edges(edges, nodes), torch.randn(edges, channels)
-    x = torch.randn(nodes, channels, requires_grad=True)
-    out = edge_set.from_senders(x)
+    peers = _peers(edge_set.senders, dout, nodes)
 
     def ours():
-        return torch.autograd.grad(out, x, dout, retain_graph=True)[0]
+        return segment_sum(dout, edge_set.sender_order, edge_set.sender_offsets)
 
-    peers = _peers(edge_set.senders, dout, nodes)
-    return _case("gather, backward", ours, peers, edges, nodes, channels)
+    return _case("segment_sum by a permutation", ours, peers, edges, nodes, channels)

@@ -111,12 +111,14 @@ static ast_status conv_weight_task(int64_t index, void *context) {
   float *x = ast_scratch(5, (PAIRS * (CHANNEL_BLOCK + row) + CHANNEL_BLOCK * padded) * (int64_t)sizeof *x);
   if (!x) return AST_NO_MEMORY;
   float *dout = x + PAIRS * CHANNEL_BLOCK, *sum = dout + PAIRS * row;
-  memset(dout, 0, (size_t)(PAIRS * row + rows * padded) * sizeof *dout);
-  for (int64_t i = pairs->offsets[k]; i < pairs->offsets[k + 1]; i += PAIRS) {
-    const int64_t n = min64(PAIRS, pairs->offsets[k + 1] - i);
+  const int64_t begin = pairs->offsets[k], end = pairs->offsets[k + 1];
+  if (padded > C_out) memset(dout, 0, (size_t)(PAIRS * row) * sizeof *dout);
+  if (begin == end) memset(sum, 0, (size_t)(rows * padded) * sizeof *sum);
+  for (int64_t i = begin; i < end; i += PAIRS) {
+    const int64_t n = min64(PAIRS, end - i);
     gather_rows(job->x + first, C_in, rows, pairs->source + i, n, x, CHANNEL_BLOCK);
     gather_rows(job->dout, C_out, C_out, pairs->destination + i, n, dout, row);
-    gemm(rows, padded, n, (gemm_a){x, 1, CHANNEL_BLOCK}, gemm_rows(dout, row), sum, padded, true);
+    gemm(rows, padded, n, (gemm_a){x, 1, CHANNEL_BLOCK}, gemm_rows(dout, row), sum, padded, i > begin);
   }
   for (int64_t i = 0; i < rows; i++) memcpy(job->dweight + (k * C_in + first + i) * C_out, sum + i * padded, (size_t)C_out * sizeof *sum);
   return AST_OK;
