@@ -35,6 +35,7 @@ def page(browser, tmp_path_factory):
     write(path, [ReportRun(HOSTILE, scenes, evaluation(errors), metrics(), {"Model": HOSTILE})], HOSTILE)
     show(browser, path)
     assert texts(browser, "#scene-choice input:checked + span") == ["Median 2.00 mm"]
+    assert browser.evaluate("report.viewer.state.playing") is False  # motion is unwanted here
     choose(browser, "scene", 0)
     return path
 
@@ -268,11 +269,7 @@ def test_several_runs_side_by_side(browser, tmp_path):
         ReportRun("ast", both[:1], evaluation({"a": 3e-3}, scale=2.0), metrics(200)),
     ]
     write(tmp_path / "report.html", runs, "Two runs")
-    browser.prefer(color_scheme="light", reduced_motion="no-preference")
-    show(browser, tmp_path / "report.html", still=False)
-    browser.wait("report.viewer.state.playing && report.viewer.state.frame >= 2")  # it starts by itself
-    browser.click("#play")
-    settle(browser)
+    show(browser, tmp_path / "report.html")
     visible = ".panel:not([hidden]) b"
     assert texts(browser, visible) == ["Truth", "Prediction of ast", "Prediction of ast (2)"]
     to_frame(browser, 2)
@@ -284,4 +281,15 @@ def test_several_runs_side_by_side(browser, tmp_path):
     assert texts(browser, visible) == ["Truth", "Prediction of ast"]
     choose(browser, "scene", 0)
     assert drawn(browser.picture(".panel:nth-child(3) .stage")) > 0.05
+    assert browser.errors == []
+
+
+def test_it_plays_by_itself_unless_motion_is_unwanted(browser, tmp_path):
+    write(tmp_path / "report.html", [ReportRun("run", [ReportScene("a", "Only scene", strip(4), strip(4))])], "Strip")
+    browser.prefer(color_scheme="light", reduced_motion="no-preference")
+    show(browser, tmp_path / "report.html", still=False)
+    browser.wait("report.viewer.state.playing && report.viewer.state.frame >= 2")
+    browser.click("#play")
+    settle(browser)
+    browser.prefer(color_scheme="light", reduced_motion="reduce")
     assert browser.errors == []
