@@ -1,7 +1,6 @@
 """segment_sum, segment_mean, gather and EdgeSet against their compositions and their contracts."""
 
 import hashlib
-import warnings
 
 import numpy as np
 import pytest
