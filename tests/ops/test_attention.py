@@ -1,11 +1,9 @@
 """attention against its composition, its contract, and the generator of its dropout against the paper's."""
 
-import warnings
-
 import numpy as np
 import pytest
 import torch
-from checks import assert_accurate, assert_same_for_threads, instruction_sets, run_python
+from checks import assert_accurate, assert_same_for_threads, instruction_sets, misaligned_read_only, run_python
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -297,14 +295,7 @@ def test_unusual_layouts_and_unchanged_inputs():
     wide = torch.randn(60, 4, 32)
     wide[:, :, ::2] = q
     transposed = q.transpose(0, 1).contiguous().transpose(0, 1)
-    buffer = np.empty(60 * 64 * 4 + 1, dtype=np.uint8)
-    misaligned = buffer[1:].view(np.float32).reshape(60, 4, 16)
-    misaligned[:] = q.numpy()
-    misaligned.setflags(write=False)
-    with warnings.catch_warnings():  # torch warns of read-only arrays, once a process
-        warnings.simplefilter("ignore")
-        read_only = torch.from_numpy(misaligned)
-    for x in (wide[:, :, ::2], transposed, read_only):
+    for x in (wide[:, :, ::2], transposed, misaligned_read_only(q)):
         before = x.clone()
         assert torch.equal(attention(x, k, v, *offsets)[0], expected) and torch.equal(x, before)
     one = k[:1].expand(60, 4, 16)

@@ -1,11 +1,8 @@
 """sparse_conv and sparse_conv_transposed against a dense convolution, their compositions and their contracts."""
 
-import warnings
-
-import numpy as np
 import pytest
 import torch
-from checks import assert_accurate, assert_same_for_threads, instruction_sets, run_python
+from checks import assert_accurate, assert_same_for_threads, instruction_sets, misaligned_read_only, run_python
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -197,14 +194,7 @@ def test_unusual_layouts_and_unchanged_inputs():
     wide = torch.randn(n, 16)
     wide[:, ::2] = x
     transposed = x.t().contiguous().t()
-    buffer = np.empty(n * 8 * 4 + 1, dtype=np.uint8)
-    misaligned = buffer[1:].view(np.float32).reshape(n, 8)
-    misaligned[:] = x.numpy()
-    misaligned.setflags(write=False)
-    with warnings.catch_warnings():  # torch warns of read-only arrays, once a process
-        warnings.simplefilter("ignore")
-        read_only = torch.from_numpy(misaligned)
-    for y in (wide[:, ::2], transposed, read_only):
+    for y in (wide[:, ::2], transposed, misaligned_read_only(x)):
         before = y.clone()
         assert torch.equal(sparse_conv(y, weight, map), expected) and torch.equal(y, before)
     one = x[:1].expand(n, 8)
