@@ -41,6 +41,7 @@ def measure(dataset: Dataset) -> DataScales:
     count = dataset.count("train")
     if count == 0:
         raise TrainingError(f"{dataset.path} has no trajectories to train on: the split train is empty")
+    given = 2 if dataset.info.integration == "dynamic" else 1  # frames before the first that can be a target
     displacement, increment, lengths, nodes = [], [], [], []
     for index in np.unique(np.linspace(0, count - 1, min(count, MEASURED_TRAJECTORIES)).astype(int)):
         trajectory = dataset.load("train", int(index))
@@ -58,7 +59,7 @@ def measure(dataset: Dataset) -> DataScales:
         spacing=float(np.concatenate(lengths).mean(dtype=np.float64)),
         nodes=int(np.median(nodes)),
         trajectories=count,
-        pairs=sum(max(0, dataset.num_frames("train", index) - 1) for index in range(count)),
+        pairs=sum(max(0, dataset.num_frames("train", index) - given) for index in range(count)),
     )
 
 

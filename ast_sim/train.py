@@ -37,14 +37,23 @@ CONSTANT = 1e-3  # the output is constant if its standard deviation over nodes i
 def configure(data: Path, preset: str, assignments: Sequence[str] = ()) -> RunConfig:
     """The settings of a preset with `--set` assignments; what they leave to the data is filled in by `train`.
 
+    What kind of dataset it is counts from the start, since it decides which inputs there can be.
+
     Raises:
-        ConfigError: naming the nearest preset or key that there is.
+        ConfigError: naming the nearest preset or key that there is, or an input that the dataset does not have.
+        DatasetError: the dataset cannot be read.
     """
     if preset not in PRESETS:
         near = difflib.get_close_matches(preset, PRESETS, 1, 0)
         raise ConfigError(f"there is no preset {preset!r}: did you mean {near[0]}? There are {', '.join(PRESETS)}")
     chosen = PRESETS[preset]
-    return override(RunConfig(chosen.model, TrainConfig(**chosen.train), str(data)), list(assignments))
+    with Dataset(data) as dataset:
+        kind = [
+            f"model.integration={dataset.info.integration}",
+            f"model.stress={dataset.info.stress_location}",
+            f"model.material_width={dataset.material_width}",
+        ]
+    return override(RunConfig(chosen.model, TrainConfig(**chosen.train), str(data)), [*kind, *assignments])
 
 
 def train(run: Path, config: RunConfig | None = None, resume: bool = False) -> None:

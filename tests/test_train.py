@@ -106,9 +106,33 @@ def test_a_preset_that_does_not_exist_names_the_nearest():
         train.configure("data.h5", "deforming_plaet")
 
 
-def test_an_unknown_setting_names_the_nearest():
+def test_an_unknown_setting_names_the_nearest(data):
     with pytest.raises(ConfigError, match=r"train\.batch_size"):
-        train.configure("data.h5", "tiny", ["train.batchsize=3"])
+        train.configure(data, "tiny", ["train.batchsize=3"])
+
+
+def test_the_kind_of_the_dataset_decides_which_inputs_there_can_be(data, tmp_path):
+    dynamic = toy.write(tmp_path / "dynamic.h5", dynamic=True)
+    config = train.configure(dynamic, "tiny", ["model.node_inputs=velocity,displacement"])
+    assert config.model.integration == "dynamic"
+    assert config.model.node_inputs == ("velocity", "displacement")
+    with pytest.raises(ConfigError, match="velocity"):
+        train.configure(data, "tiny", ["model.node_inputs=velocity"])
+
+
+def test_a_dynamic_dataset_is_trained_with_two_given_frames(tmp_path):
+    dynamic = toy.write(tmp_path / "dynamic.h5", dynamic=True)
+    small = ["model.hidden=16", "model.d_token=16", "model.L_SA=1", "train.steps=3", "train.batch_size=2"]
+    train.train(tmp_path / "run", train.configure(dynamic, "tiny", ["model.node_inputs=velocity", *small]))
+    model, resolved, _ = run.load_model(tmp_path / "run")
+    assert model.config.dynamic
+    assert resolved.train.noise_gamma == 0.1
+    record = next(record for record in Metrics(tmp_path / "run") if "valid_rmse" in record)
+    with Dataset(dynamic) as dataset:
+        assert measure(dataset).pairs == 3 * 5  # 7 frames, of which 5 follow two others
+        truths = [dataset.load("valid", index) for index in range(2)]
+    moved = [t.position[2:, ~t.scene.prescribed].astype(float) - t.position[1, ~t.scene.prescribed] for t in truths]
+    assert record["valid_hold_still"] == pytest.approx(np.mean([math.sqrt((m**2).mean()) for m in moved]))
 
 
 # The loop
