@@ -119,6 +119,8 @@ PRESETS = {
 def resolve(config: ModelConfig, info: DatasetInfo, material_width: int, mesh_spacing: float) -> ModelConfig:
     """The configuration with everything that the dataset decides filled in.
 
+    A stress on elements needs element nodes: without element inputs in the configuration, displacement is taken.
+
     Args:
         config: of a preset, with or without overrides.
         info: of the dataset.
@@ -132,8 +134,10 @@ def resolve(config: ModelConfig, info: DatasetInfo, material_width: int, mesh_sp
     if depth is None:
         side = config.cell_spacings * mesh_spacing
         depth = min(max(round(1 + math.log2(info.domain_half_width / side)), config.l_ocnn + 1), 21)
+    needs_elements = info.stress_location == "element" and not config.element_inputs
     return replace(
         config,
+        element_inputs=("displacement",) if needs_elements else config.element_inputs,
         L_cell=depth,
         integration=info.integration,
         stress=info.stress_location,

@@ -10,7 +10,7 @@ from checks import run_python
 from stand_ins import trajectory, write
 
 from ast_sim.data.batch import Batch
-from ast_sim.data.file import Dataset
+from ast_sim.data.file import Dataset, DatasetInfo
 from ast_sim.data.graph import Graph
 from ast_sim.data.sampling import PairSampler
 from ast_sim.data.scene import NodeType
@@ -292,6 +292,17 @@ def test_mesh_and_cell_edges():
     for ours, expected in ((cells.from_mesh(), again), (cells.to_mesh(), back)):
         for name in EdgeSet.__dataclass_fields__:
             assert torch.equal(getattr(ours, name), getattr(expected, name)), name
+
+
+def test_what_the_dataset_decides():
+    """Level by mesh spacing, a stress on elements with the element nodes that it needs, domain and kind of dynamics."""
+    info = DatasetInfo("own", "quasi_static", "element", (1.0, 2.0, 3.0), 4.0, 0.01, 0.0)
+    config = resolve(PRESETS["tiny"].model, info, 2, mesh_spacing=0.1)
+    assert config.element_inputs == ("displacement",) and config.stress == "element" and config.material_width == 2
+    assert config.domain_center == (1.0, 2.0, 3.0) and config.domain_half_width == 4.0
+    assert config.L_cell == 6 and config.cell_side == pytest.approx(0.125)  # 1 + log2(4 / 0.15) = 5.7
+    nodal = resolve(PRESETS["tiny"].model, replace(info, stress_location="node"), 0, mesh_spacing=0.1)
+    assert nodal.element_inputs == () and nodal.stress == "node"
 
 
 def test_integration():
