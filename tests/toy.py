@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from meshes import box
 from torch import Tensor, nn
 
 from ast_sim.data.batch import Batch
@@ -18,9 +19,6 @@ from ast_sim.data.file import DatasetInfo, DatasetWriter
 from ast_sim.data.scene import NodeType, Scene, Trajectory
 from ast_sim.model.config import ModelConfig, resolve
 from ast_sim.model.simulator import Prediction, Simulator
-
-# Kuhn's subdivision of a hexahedron into six tetrahedra around the diagonal from corner 0 to corner 7.
-KUHN = np.array([(0, 1, 3, 7), (0, 3, 2, 7), (0, 2, 6, 7), (0, 6, 4, 7), (0, 4, 5, 7), (0, 5, 1, 7)])
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -30,15 +28,6 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
-
-
-def box(cells: tuple[int, int, int], size: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes [N, 3] and tetrahedra [E, 4] of a box centred at the origin."""
-    axes = [np.linspace(-s / 2, s / 2, n + 1) for s, n in zip(size, cells, strict=True)]
-    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    index = np.arange(len(nodes)).reshape([n + 1 for n in cells])
-    corners = [index[x : x + cells[0], y : y + cells[1], z : z + cells[2]].ravel() for z, y, x in np.ndindex(2, 2, 2)]
-    return nodes, np.stack(corners, axis=1)[:, KUHN].reshape(-1, 4)
 
 
 def plate(seed: int = 0, frames: int = 7, dynamic: bool = False, stress: bool = True) -> Trajectory:

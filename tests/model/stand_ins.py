@@ -1,20 +1,10 @@
 """Structured scenes of each family's kind, with invented motion: enough to run a model, not to judge one."""
 
 import numpy as np
+from meshes import box
 
 from ast_sim.data.file import DatasetInfo, DatasetWriter
 from ast_sim.data.scene import NodeType, Scene, Trajectory
-
-KUHN = np.array([(0, 1, 3, 7), (0, 3, 2, 7), (0, 2, 6, 7), (0, 6, 4, 7), (0, 4, 5, 7), (0, 5, 1, 7)])
-
-
-def box(cells, size, center) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes [N, 3] and tetrahedra [E, 4] of a box."""
-    axes = [np.linspace(-s / 2, s / 2, n + 1) + c for s, n, c in zip(size, cells, center, strict=True)]
-    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    index = np.arange(len(nodes)).reshape([n + 1 for n in cells])
-    corners = [index[x : x + cells[0], y : y + cells[1], z : z + cells[2]].ravel() for z, y, x in np.ndindex(2, 2, 2)]
-    return nodes, np.stack(corners, axis=1)[:, KUHN].reshape(-1, 4)
 
 
 def sheet(cells, size, height) -> tuple[np.ndarray, np.ndarray]:

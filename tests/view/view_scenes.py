@@ -3,21 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from meshes import box
 
 from ast_sim.data.scene import NodeType, Scene, Trajectory
 
-# Kuhn's subdivision of a hexahedron into six tetrahedra around the diagonal from corner 0 to corner 7.
-KUHN = np.array([(0, 1, 3, 7), (0, 3, 2, 7), (0, 2, 6, 7), (0, 6, 4, 7), (0, 4, 5, 7), (0, 5, 1, 7)])
 RADIUS = 0.05
-
-
-def box(shape: tuple[int, int, int], size: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes [N, 3] and tetrahedra [E, 4] of a box of `shape` cells, centred at the origin."""
-    axes = [np.linspace(-s / 2, s / 2, n + 1) for s, n in zip(size, shape, strict=True)]
-    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    index = np.arange(len(nodes)).reshape([n + 1 for n in shape])
-    corners = [index[x : x + shape[0], y : y + shape[1], z : z + shape[2]].ravel() for z, y, x in np.ndindex(2, 2, 2)]
-    return nodes, np.stack(corners, axis=1)[:, KUHN].reshape(-1, 4)
 
 
 def plate(frames: int = 9, depth: float = 0.04, stress: str = "node", seed: int | None = None) -> Trajectory:
