@@ -43,6 +43,7 @@ class _TrainParser(_Parser):
 def main(argv: list[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     args = _build_parser().parse_args(argv)
+    args.command_line = shlex.join(["ast-sim", *(sys.argv[1:] if argv is None else argv)])
     warnings.showwarning = _show_warning
     try:
         args.run(args)
@@ -234,7 +235,7 @@ def _evaluate(args: argparse.Namespace) -> None:
 
     keep_memory()
     with open_run(args.run_folder, args.data) as run:
-        found = evaluate_run(run, args.split, _command_line())
+        found = evaluate_run(run, args.split, args.command_line)
     print(table(found))
     if args.json is not None:
         write_json(args.json, found)
@@ -268,13 +269,9 @@ def _report(args: argparse.Namespace) -> None:
     shown = []
     for folder in args.run_folders:
         with open_run(folder, args.data) as run:
-            shown.append(report_run(run, evaluate_run(run, "test", _command_line())))
+            shown.append(report_run(run, evaluate_run(run, "test", args.command_line)))
     write_report(args.out, shown, "Learned simulation: predictions and errors")
     print(f"report: {args.out}")
-
-
-def _command_line() -> str:
-    return shlex.join(["ast-sim", *sys.argv[1:]])
 
 
 if __name__ == "__main__":

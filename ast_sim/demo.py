@@ -7,7 +7,6 @@ seen. Run again in the same folder it goes on where it stopped; other settings a
 from __future__ import annotations
 
 import shlex
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,7 +57,7 @@ def demo(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
 
     with open_run(run_folder, data) as run:
         _announce(3, f"predicting the {size.test} test scenes, which the model has not seen")
-        found = evaluate_run(run, "test", shlex.join(["ast-sim", *sys.argv[1:]]))
+        found = evaluate_run(run, "test", _command(out, quick, seed))
         write_json(out / "evaluation.json", found)
         _announce(4, "writing the report")
         _write_pages(run, out, found)
@@ -72,6 +71,10 @@ def demo(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
     print(f"run         {run_folder}")
     print(f"in all {duration(time.perf_counter() - started)}", flush=True)
     return found
+
+
+def _command(out: Path, quick: bool, seed: int) -> str:
+    return shlex.join(["ast-sim", "demo", "--out", str(out), *(["--quick"] if quick else []), "--seed", str(seed)])
 
 
 def _announce(number: int, text: str) -> None:
