@@ -80,7 +80,8 @@ def _case(points: int, depth: int, backward: bool) -> Case:
             for a, b in zip(call(), peer(), strict=True):
                 wrong = int(((a - b).abs() > 1e-3 + 1e-4 * b.abs()).flatten(1).any(1).sum())
                 # Threads of spconv's scatter now and then overwrite each other's sums: some of its rows are wrong.
-                assert wrong <= (len(a) / 1000 if name == "spconv" else 0), f"{wrong} rows differ from {name}"
+                allowed = max(16, len(a) // 1000) if name == "spconv" else 0
+                assert wrong <= allowed, f"{wrong} rows differ from {name}"
 
     num_pairs = len(map.fine)
     shape = f"{map.num_fine} cells to {len(map.coarse.keys)}, {num_pairs} pairs, {CHANNELS} channels"
