@@ -6,7 +6,9 @@ import base64
 import io
 import itertools
 import json
+import os
 import shutil
+import signal
 import subprocess
 import tempfile
 import time
@@ -47,11 +49,14 @@ class Browser:
     def __init__(self, width: int = 1280, height: int = 900) -> None:
         program = next((found for name in NAMES if (found := shutil.which(name))), None)
         assert program, f"the tests of the report need a browser: install Debian's chromium (looked for {NAMES})"
-        self._folder = tempfile.TemporaryDirectory(prefix="ast_sim_browser_")
+        # The browser's own processes may still write while they end: what they leave is no failure of a test.
+        self._folder = tempfile.TemporaryDirectory(prefix="ast_sim_browser_", ignore_cleanup_errors=True)
         flags = [*FLAGS, f"--window-size={width},{height}", f"--user-data-dir={self._folder.name}"]
         self._log = Path(self._folder.name, "stderr.txt")
         with open(self._log, "wb") as log:
-            self._process = subprocess.Popen([program, *flags, "about:blank"], stdout=log, stderr=log)
+            self._process = subprocess.Popen(
+                [program, *flags, "about:blank"], stdout=log, stderr=log, start_new_session=True
+            )
         self.errors: list[str] = []
         self.requests: list[str] = []
         self._numbers = itertools.count(1)
@@ -69,7 +74,7 @@ class Browser:
         self.close()
 
     def close(self) -> None:
-        self._process.kill()
+        os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
         self._folder.cleanup()
 
