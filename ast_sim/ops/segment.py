@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ast_sim.ops import library
-from ast_sim.ops.library import array
+from ast_sim.ops.library import array, check_offsets
 
 
 def _segment_of(node_offsets: Tensor) -> Tensor:
@@ -25,8 +25,7 @@ def _scale(node_offsets: Tensor, mean: bool, dtype: torch.dtype) -> Tensor:
 def _check(op: str, x: Tensor, node_order: Tensor, node_offsets: Tensor) -> None:
     if x.dim() != 2 or node_order.shape != (x.shape[0],):
         raise ValueError(f"{op}: x must be [N, F] and node_order [N], not {list(x.shape)} and {list(node_order.shape)}")
-    if len(node_offsets) < 1 or node_offsets[0] != 0 or node_offsets[-1] != len(x) or (node_offsets.diff() < 0).any():
-        raise ValueError(f"{op}: node_offsets must start at 0, never fall and end at the number of rows {len(x)}")
+    check_offsets(op, "node_offsets", node_offsets, len(x))
     if not torch.equal(node_order.sort().values, torch.arange(len(x), device=x.device)):
         raise ValueError(f"{op}: node_order must be a permutation")
 
