@@ -70,10 +70,9 @@ typedef struct {
                                int64_t *restrict pair_offsets);
   /* Those pairs twice: (fine, coarse) with coarse rising within each group, and (fine_by_fine, coarse_by_fine) with fine
    * rising within each group. Each array [pair_offsets[27]]. */
-  ast_status (*octree_pairs)(const int64_t *restrict keys, int64_t C_fine, const int64_t *restrict first_child,
-                             const int64_t *restrict neighbours, int64_t C_coarse, const int64_t *restrict pair_offsets,
-                             int64_t *restrict fine, int64_t *restrict coarse, int64_t *restrict fine_by_fine,
-                             int64_t *restrict coarse_by_fine);
+  ast_status (*octree_pairs)(const int64_t *restrict keys, const int64_t *restrict first_child, const int64_t *restrict neighbours,
+                             int64_t C_coarse, const int64_t *restrict pair_offsets, int64_t *restrict fine, int64_t *restrict coarse,
+                             int64_t *restrict fine_by_fine, int64_t *restrict coarse_by_fine);
 
   /* Exact greedy farthest point sampling of coordinates [C,3], per scene min(num, C_b) indices (into the
    * whole array) from out_offsets[b] on: the first is the scene's first point, ties go to the lowest index, and once all

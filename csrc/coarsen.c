@@ -252,11 +252,9 @@ static ast_status octree_after_task(int64_t chunk, void *context) {
   return AST_OK;
 }
 
-static ast_status octree_pairs(const int64_t *restrict keys, int64_t C_fine, const int64_t *restrict first_child,
-                               const int64_t *restrict neighbours, int64_t C_coarse, const int64_t *restrict pair_offsets,
-                               int64_t *restrict fine, int64_t *restrict coarse, int64_t *restrict fine_by_fine,
-                               int64_t *restrict coarse_by_fine) {
-  (void)C_fine;
+static ast_status octree_pairs(const int64_t *restrict keys, const int64_t *restrict first_child, const int64_t *restrict neighbours,
+                               int64_t C_coarse, const int64_t *restrict pair_offsets, int64_t *restrict fine, int64_t *restrict coarse,
+                               int64_t *restrict fine_by_fine, int64_t *restrict coarse_by_fine) {
   const int64_t chunks = octree_chunks(C_coarse);
   if (chunks == 0) return AST_OK;
   octree_after_job after = {neighbours, C_coarse, ast_scratch(1, 8 * C_coarse * (int64_t)sizeof(int64_t))};

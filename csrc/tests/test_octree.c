@@ -136,8 +136,7 @@ static void check_coarsen(const ast_kernels *kernels, int64_t *keys, int64_t *of
 
   int64_t *pair[4];
   for (int i = 0; i < 4; i++) pair[i] = ints(pair_offsets[27]);
-  CHECK(kernels->octree_pairs(keys, fine, first_child, neighbours, C, pair_offsets, pair[0], pair[1], pair[2], pair[3]) == AST_OK, "%s",
-        what);
+  CHECK(kernels->octree_pairs(keys, first_child, neighbours, C, pair_offsets, pair[0], pair[1], pair[2], pair[3]) == AST_OK, "%s", what);
   for (int64_t k = 0, by_fine = 0; k < 27; k++) {
     const int64_t step[3] = {k / 9 - 1, k / 3 % 3 - 1, k % 3 - 1};
     for (int64_t b = 0; b < B; b++) {
@@ -166,7 +165,7 @@ static void check_coarsen(const ast_kernels *kernels, int64_t *keys, int64_t *of
   }
   if (C > 0) {
     pair_offsets[27]--;
-    CHECK(kernels->octree_pairs(keys, fine, first_child, neighbours, C, pair_offsets, pair[0], pair[1], pair[2], pair[3]) == AST_MISMATCH,
+    CHECK(kernels->octree_pairs(keys, first_child, neighbours, C, pair_offsets, pair[0], pair[1], pair[2], pair[3]) == AST_MISMATCH,
           "%s: wrong pair_offsets", what);
   }
   memcpy(keys, coarse_keys, (size_t)C * sizeof *keys);

@@ -1,0 +1,239 @@
+/* How the module takes its arguments apart: every array is checked for type, shape, layout and index range before a kernel sees it.
+ *
+ * Arrays are NumPy arrays of exact dtype, aligned and row major; outputs are allocated by the caller. A message names the op,
+ * the argument and the offending value. In debug mode outputs are filled with NaN (integers: -1) before the kernel runs, and
+ * inputs are compared with copies afterwards. Included by module.c alone.
+ */
+#ifndef AST_ARGUMENTS_H
+#define AST_ARGUMENTS_H
+
+#define PY_SSIZE_T_CLEAN
+#define Py_LIMITED_API 0x030B0000
+#include <Python.h>
+
+#define NPY_NO_DEPRECATED_API NPY_2_0_API_VERSION
+#define NPY_TARGET_VERSION    NPY_1_23_API_VERSION
+#include <numpy/arrayobject.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "ast.h"
+
+static bool debug; /* AST_SIM_DEBUG=1 */
+
+/* ---- arguments ---- */
+
+enum { FLOATS = NPY_FLOAT32, INTS = NPY_INT64, SMALL_INTS = NPY_INT32 };
+enum { MAX_ARRAYS = 12, MAX_SHAPE = 4, ANY = -1 };
+
+typedef struct {
+  const char *name;
+  PyArrayObject *array;
+  void *data;
+  int64_t shape[MAX_SHAPE];
+  int64_t row_stride; /* in items */
+  bool output;
+  void *copy; /* debug: what an input held before the call */
+} argument;
+
+typedef struct {
+  const char *op;
+  PyObject *const *objects;
+  int next;
+  argument arrays[MAX_ARRAYS];
+  int num_arrays;
+} call;
+
+static bool start(call *c, const char *op, PyObject *const *objects, Py_ssize_t num, int arity) {
+  *c = (call){.op = op, .objects = objects};
+  if (num == arity) return true;
+  PyErr_Format(PyExc_TypeError, "%s takes %d arguments, not %zd", op, arity, num);
+  return false;
+}
+
+static bool fail(const call *c, PyObject *type, const char *format, ...) {
+  va_list values;
+  va_start(values, format);
+  PyObject *text = PyUnicode_FromFormatV(format, values);
+  va_end(values);
+  if (text) PyErr_Format(type, "%s: %U", c->op, text);
+  Py_XDECREF(text);
+  return false;
+}
+
+static const char *type_name(int type) { return type == FLOATS ? "float32" : type == INTS ? "int64" : "int32"; }
+
+static bool check_layout(const call *c, const argument *a, bool strided_rows) {
+  PyArrayObject *array = a->array;
+  const npy_intp item = PyArray_ITEMSIZE(array);
+  npy_intp expected = item;
+  if (!PyArray_ISBEHAVED_RO(array)) return fail(c, PyExc_ValueError, "%s must be aligned and in native byte order", a->name);
+  for (int d = PyArray_NDIM(array) - 1; d >= 0; d--) {
+    const npy_intp stride = PyArray_STRIDE(array, d), length = PyArray_DIM(array, d);
+    const bool free_stride = strided_rows && d == 0 && stride >= expected && stride % item == 0;
+    if (PyArray_SIZE(array) && length > 1 && stride != expected && !free_stride)
+      return fail(c, PyExc_ValueError, "%s must be contiguous", a->name);
+    expected *= length;
+  }
+  return true;
+}
+
+/* The next argument as an array of this type and shape; ANY lengths are free. NULL if it does not fit. */
+static argument *take(call *c, const char *name, int type, bool output, bool strided_rows, int ndim, ...) {
+  PyObject *object = c->objects[c->next++];
+  argument *a = &c->arrays[c->num_arrays];
+  *a = (argument){.name = name, .output = output};
+  if (!PyArray_Check(object)) {
+    fail(c, PyExc_TypeError, "%s must be a NumPy array, not %R", name, (PyObject *)Py_TYPE(object));
+    return NULL;
+  }
+  a->array = (PyArrayObject *)object;
+  if (PyArray_TYPE(a->array) != type) {
+    fail(c, PyExc_TypeError, "%s must be %s, not %R", name, type_name(type), (PyObject *)PyArray_DESCR(a->array));
+    return NULL;
+  }
+  bool fits = PyArray_NDIM(a->array) == ndim;
+  va_list lengths;
+  va_start(lengths, ndim);
+  char wanted[96] = "";
+  for (int d = 0; d < ndim; d++) {
+    const int64_t length = va_arg(lengths, int64_t);
+    const size_t used = strlen(wanted);
+    if (length == ANY) snprintf(wanted + used, sizeof wanted - used, "%s*", d ? ", " : "");
+    else snprintf(wanted + used, sizeof wanted - used, "%s%lld", d ? ", " : "", (long long)length);
+    if (!fits) continue;
+    a->shape[d] = PyArray_DIM(a->array, d);
+    if (length != ANY && a->shape[d] != length) fits = false;
+  }
+  va_end(lengths);
+  if (!fits) {
+    PyObject *shape = PyObject_GetAttrString(object, "shape");
+    if (shape) fail(c, PyExc_ValueError, "%s must have shape [%s], not %R", name, wanted, shape);
+    Py_XDECREF(shape);
+    return NULL;
+  }
+  if (output && !PyArray_ISWRITEABLE(a->array)) {
+    fail(c, PyExc_ValueError, "%s must be writeable", name);
+    return NULL;
+  }
+  if (!check_layout(c, a, strided_rows)) return NULL;
+  a->data = PyArray_DATA(a->array);
+  a->row_stride = ndim && a->shape[0] > 1 ? PyArray_STRIDE(a->array, 0) / PyArray_ITEMSIZE(a->array) : 0;
+  for (int d = 1; a->shape[0] <= 1 && d < ndim; d++) a->row_stride = (d == 1 ? 1 : a->row_stride) * a->shape[d];
+  c->num_arrays++;
+  return a;
+}
+
+#define IN(c, name, type, ndim, ...)  take(c, name, type, false, false, ndim, __VA_ARGS__)
+#define IN_ROWS(c, name, ndim, ...)   take(c, name, FLOATS, false, true, ndim, __VA_ARGS__)
+#define OUT(c, name, type, ndim, ...) take(c, name, type, true, false, ndim, __VA_ARGS__)
+#define FREE                          ((int64_t)ANY)
+
+static bool take_int(call *c, const char *name, int64_t low, int64_t high, int64_t *out) {
+  *out = PyLong_AsLongLong(c->objects[c->next++]);
+  if (*out == -1 && PyErr_Occurred()) return false;
+  if (*out < low || *out > high)
+    return fail(c, PyExc_ValueError, "%s must lie in %lld..%lld, not %lld", name, (long long)low, (long long)high, (long long)*out);
+  return true;
+}
+
+static bool take_float(call *c, double *out) {
+  *out = PyFloat_AsDouble(c->objects[c->next++]);
+  return !(*out == -1 && PyErr_Occurred());
+}
+
+static bool check_offsets(const call *c, const argument *a, int64_t rows) {
+  const int64_t *offsets = a->data, n = a->shape[0];
+  if (n < 1 || offsets[0] != 0) return fail(c, PyExc_ValueError, "%s must start with 0", a->name);
+  for (int64_t i = 1; i < n; i++)
+    if (offsets[i] < offsets[i - 1])
+      return fail(c, PyExc_ValueError, "%s must never fall, but falls to %lld at %lld", a->name, (long long)offsets[i], (long long)i);
+  if (offsets[n - 1] != rows)
+    return fail(c, PyExc_ValueError, "%s must end at the number of rows %lld, not %lld", a->name, (long long)rows,
+                (long long)offsets[n - 1]);
+  return true;
+}
+
+static bool check_indices(const call *c, const argument *a, int64_t length, int64_t bound) {
+  const int64_t *index = a->data;
+  for (int64_t i = 0; i < length; i++)
+    if (index[i] < 0 || index[i] >= bound)
+      return fail(c, PyExc_ValueError, "%s[%lld] = %lld is not an index below %lld", a->name, (long long)i, (long long)index[i],
+                  (long long)bound);
+  return true;
+}
+
+static bool check_permutation(const call *c, const argument *a, int64_t n) {
+  if (!check_indices(c, a, n, n)) return false;
+  const int64_t *index = a->data;
+  uint8_t *seen = ast_scratch(0, n / 8 + 1);
+  if (!seen) return PyErr_NoMemory(), false;
+  memset(seen, 0, (size_t)(n / 8 + 1));
+  for (int64_t i = 0; i < n; i++) {
+    const uint8_t bit = (uint8_t)(1u << (index[i] & 7));
+    if (seen[index[i] >> 3] & bit)
+      return fail(c, PyExc_ValueError, "%s must be a permutation, but holds %lld twice", a->name, (long long)index[i]);
+    seen[index[i] >> 3] |= bit;
+  }
+  return true;
+}
+
+/* Group k of the pairs is offsets[k]..offsets[k+1]; destinations rise strictly within it. */
+static bool check_pairs(const call *c, const argument *offsets, const argument *source, int64_t sources, const argument *destination,
+                        int64_t destinations, bool rising) {
+  if (!check_offsets(c, offsets, source->shape[0]) || !check_indices(c, source, source->shape[0], sources) ||
+      !check_indices(c, destination, destination->shape[0], destinations))
+    return false;
+  const int64_t *offset = offsets->data, *index = destination->data;
+  for (int64_t k = 0; rising && k < 27; k++)
+    for (int64_t i = offset[k] + 1; i < offset[k + 1]; i++)
+      if (index[i] <= index[i - 1])
+        return fail(c, PyExc_ValueError, "%s must rise strictly within each kernel offset, but does not at %lld", destination->name,
+                    (long long)i);
+  return true;
+}
+
+/* ---- around a kernel ---- */
+
+static bool begin(call *c) {
+  for (int i = 0; debug && i < c->num_arrays; i++) {
+    argument *a = &c->arrays[i];
+    const size_t size = (size_t)PyArray_NBYTES(a->array);
+    if (a->output) {
+      if (size) memset(a->data, 0xff, size); /* all bits set: NaN, and -1 as an integer */
+    } else if (size && PyArray_IS_C_CONTIGUOUS(a->array)) {
+      if (!(a->copy = malloc(size))) return PyErr_NoMemory(), false;
+      memcpy(a->copy, a->data, size);
+    }
+  }
+  return true;
+}
+
+static bool end(call *c, ast_status status) {
+  bool ok = !PyErr_Occurred();
+  for (int i = 0; i < c->num_arrays; i++) {
+    argument *a = &c->arrays[i];
+    if (!a->copy) continue;
+    if (ok && memcmp(a->copy, a->data, (size_t)PyArray_NBYTES(a->array)))
+      ok = fail(c, PyExc_AssertionError, "the kernel changed its input %s", a->name);
+    free(a->copy);
+  }
+  if (ok && status == AST_NO_MEMORY) return PyErr_NoMemory(), false;
+  return ok;
+}
+
+/* Runs `expression` without the GIL between the two; leaves the function if anything failed. */
+#define KERNEL(c, status, expression)      \
+  do {                                     \
+    (status) = AST_OK;                     \
+    if (begin(&(c))) {                     \
+      Py_BEGIN_ALLOW_THREADS;              \
+      (status) = (expression);             \
+      Py_END_ALLOW_THREADS;                \
+    }                                      \
+    if (!end(&(c), (status))) return NULL; \
+  } while (0)
+
+#endif
