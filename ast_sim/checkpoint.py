@@ -24,7 +24,7 @@ import safetensors.torch
 from safetensors import SafetensorError
 from torch import Tensor
 
-from ast_sim.data.disk import sync_folder, write_synced
+from ast_sim.data.disk import replacing, sync_folder, write_synced
 from ast_sim.errors import CheckpointError
 
 FILES = ("model.safetensors", "optimizer.safetensors", "state.json")
@@ -140,14 +140,10 @@ def mark_best(run_dir: str | os.PathLike[str], step: int) -> None:
     name = f"step-{step}"
     if not (run_dir / _FOLDER / name).is_dir():
         raise CheckpointError(f"{run_dir}: there is no checkpoint {name} to mark as the best")
-    temporary = run_dir / f"{_TEMPORARY}{_BEST}"
     try:
-        temporary.unlink(missing_ok=True)  # left by a kill
-        write_synced(temporary, f"{name}\n".encode())
-        os.replace(temporary, run_dir / _BEST)
-        sync_folder(run_dir)
+        with replacing(run_dir / _BEST) as temporary:
+            write_synced(temporary, f"{name}\n".encode())
     except OSError as error:
-        temporary.unlink(missing_ok=True)
         raise CheckpointError(f"{run_dir / _BEST}: cannot be written: {error}") from error
 
 

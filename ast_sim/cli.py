@@ -105,6 +105,9 @@ def _build_parser() -> argparse.ArgumentParser:
     train.add_argument("--preset", metavar="P", help="settings to start from (tiny)")
     train.add_argument("--set", action="append", default=[], metavar="k=v", help="change a setting; may be repeated")
     train.add_argument("--resume", action="store_true", help="go on after the last checkpoint, if there is one")
+    train.add_argument(
+        "--profile", type=_at_least(1), metavar="N", help="print where the time of N steps goes, and end"
+    )
 
     evaluate = command("evaluate", _evaluate, "measure a run's errors and speed on a dataset")
     evaluate.add_argument("run_folder", type=Path, metavar="RUN")
@@ -224,8 +227,9 @@ def _train(args: argparse.Namespace) -> None:
     config = None
     if args.data is not None:
         config = configure(args.data, args.preset or "tiny", args.set)
-    train(args.out, config, resume=args.resume)
-    print(f"run: {args.out}")
+    train(args.out, config, resume=args.resume, profile_steps=args.profile or 0)
+    if args.profile is None:
+        print(f"run: {args.out}")
 
 
 def _evaluate(args: argparse.Namespace) -> None:

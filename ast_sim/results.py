@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from ast_sim.data.disk import replacing
 from ast_sim.data.file import Dataset, DatasetWriter
 from ast_sim.data.scene import Trajectory
 from ast_sim.errors import AstSimError, ConfigError
@@ -71,7 +72,7 @@ def write_json(path: Path, values: dict[str, Any]) -> None:
     """Write a JSON file whole or not at all."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with export.replacing(path) as temporary:
+        with replacing(path) as temporary:
             temporary.write_text(json.dumps(values, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     except OSError as error:
         raise AstSimError(f"{path} cannot be written: {error.strerror or error}; nothing was left there") from error

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ast_sim import checkpoint, config
+from ast_sim.data.disk import replacing
 from ast_sim.errors import CheckpointError
 from ast_sim.model.ast import build_model
 from ast_sim.model.config import ModelConfig
@@ -74,13 +75,9 @@ def read_config(run: Path) -> RunConfig:
 
 
 def write_config(run: Path, settings: RunConfig) -> None:
-    """Write the settings under a temporary name, then rename: there is a whole file or none."""
-    temporary = run / f".{CONFIG}.tmp"
-    with open(temporary, "w", encoding="utf-8") as file:
-        file.write(config.to_toml(settings))
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, run / CONFIG)
+    """Write the settings: there is a whole file or none."""
+    with replacing(run / CONFIG) as temporary:
+        temporary.write_text(config.to_toml(settings), encoding="utf-8")
 
 
 def load_model(run: Path) -> tuple[Simulator, RunConfig, int]:
@@ -127,12 +124,8 @@ class Metrics:
     def forget_after(self, step: int) -> None:
         """Drop the lines of later steps: those that training is about to do again."""
         lines = [json.dumps(record) + "\n" for record in self if record["step"] <= step]
-        temporary = self.path.with_name(f".{METRICS}.tmp")
-        with open(temporary, "w", encoding="utf-8") as file:
-            file.writelines(lines)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, self.path)
+        with replacing(self.path) as temporary:
+            temporary.write_text("".join(lines), encoding="utf-8")
 
     def best(self) -> float:
         """The lowest validation error so far; infinity before the first."""

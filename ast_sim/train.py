@@ -27,6 +27,7 @@ from ast_sim.measures import SquaredError, rmse_sequence
 from ast_sim.model.ast import build_model
 from ast_sim.model.config import PRESETS, resolve
 from ast_sim.monitor import Clock, Progress, StopSignals, duration
+from ast_sim.profile import profile, table
 from ast_sim.rollout import rollouts
 from ast_sim.run import Metrics, RunConfig, TrainConfig, has_config, read_config, write_config
 from ast_sim.schedule import DataScales, learning_rate, measure, resolve_training, step_seed
@@ -56,12 +57,13 @@ def configure(data: Path, preset: str, assignments: Sequence[str] = ()) -> RunCo
     return override(RunConfig(chosen.model, TrainConfig(**chosen.train), str(data)), [*kind, *assignments])
 
 
-def train(run: Path, config: RunConfig | None = None, resume: bool = False) -> None:
+def train(run: Path, config: RunConfig | None = None, resume: bool = False, profile_steps: int = 0) -> None:
     """Train a model in the run folder `run`, or go on with the one there.
 
     Args:
         config: the settings, as given; None takes those of the run that is resumed. With `resume` they must agree.
         resume: go on after the newest checkpoint, if there is one.
+        profile_steps: print where the time of so many steps goes, instead of training; nothing of them is kept.
 
     Raises:
         TrainingError: a loss or gradient that is not finite, a full disk, a folder that holds a run already.
@@ -85,7 +87,11 @@ def train(run: Path, config: RunConfig | None = None, resume: bool = False) -> N
                     write_config(run, resolved)
                 else:
                     _require_same(run, saved, resolved)
-                _Training(run, resolved, dataset, scales, signals).go()
+                training = _Training(run, resolved, dataset, scales, signals)
+                if profile_steps:
+                    training.profile(profile_steps)
+                else:
+                    training.go()
     except OSError as error:
         full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
         advice = ": the last checkpoint is whole; make room, then go on with --resume" if full else ""
@@ -157,6 +163,12 @@ class _Training:
         )
         print(f"cell side   {side:.3g} {unit} = {side / spacing:.2g} x mesh spacing", flush=True)
 
+    def profile(self, steps: int) -> None:
+        """Print where the time of training steps goes."""
+        self._restore()
+        self.model.train()
+        print(table(profile(self._advance, steps)))
+
     def go(self) -> None:
         """Train from the newest checkpoint, or from the beginning, to the last step."""
         options = self.options
@@ -168,6 +180,7 @@ class _Training:
             self.clock = Clock()
             while self.step < options.steps:
                 self._advance()
+                self.progress.advance()
                 if self._due(options.log_every):
                     self._log()
                 validates = self._due(options.validate_every)
@@ -213,7 +226,6 @@ class _Training:
         self.optimizer.param_groups[0]["lr"] = rate
         self.optimizer.step()
         self.step += 1
-        self.progress.advance()
         values |= {"grad_norm": norm, "clipped_share": float(norm > options.clip), "steps": 1}
         for key, value in values.items():
             self.sums[key] = self.sums.get(key, 0.0) + value

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import ast_sim
+from ast_sim.data.disk import replacing
 from ast_sim.data.file import SPLITS, Dataset, DatasetInfo, DatasetWriter
 from ast_sim.errors import SimulationError
 from ast_sim.simulate.contact import self_test
@@ -168,10 +169,9 @@ def _locked(parts: Path, settings: dict[str, Any]) -> Iterator[None]:
                     f"{parts} holds samples of other settings ({difference}): give those, or remove the folder"
                 )
         else:
-            temporary = path.with_suffix(".tmp")
             try:
-                temporary.write_text(json.dumps(settings))
-                os.replace(temporary, path)
+                with replacing(path) as temporary:
+                    temporary.write_text(json.dumps(settings))
             except OSError as error:
                 raise SimulationError(f"{path} cannot be written: {error}") from error
         yield

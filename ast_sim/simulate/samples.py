@@ -7,12 +7,12 @@ at all.
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 
+from ast_sim.data.disk import replacing
 from ast_sim.data.file import SPLITS
 from ast_sim.data.scene import Scene, Trajectory
 from ast_sim.errors import SimulationError
@@ -56,20 +56,13 @@ def sample_path(folder: Path, split: str, index: int) -> Path:
 
 
 def save_sample(path: Path, trajectory: Trajectory) -> None:
-    """Write a sample to a temporary name, sync and rename."""
+    """Write a sample: there is a whole file or none."""
     scene = {key: getattr(trajectory.scene, key) for key in _SCENE if getattr(trajectory.scene, key) is not None}
     arrays = {**scene, "position": trajectory.position, "attributes": np.array(json.dumps(trajectory.attributes))}
     if trajectory.stress is not None:
         arrays["stress"] = trajectory.stress
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "wb") as file:
-            np.savez(file, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, **arrays)
 
 
 def load_sample(path: Path) -> Trajectory:

@@ -13,10 +13,11 @@ import h5py
 import meshio
 import numpy as np
 
+from ast_sim.data.disk import replacing
 from ast_sim.data.scene import Trajectory
 from ast_sim.errors import AstSimError
 from ast_sim.view.fields import Fields, fields
-from ast_sim.view.files import explained, replacing
+from ast_sim.view.files import explained
 
 VTK_TRIANGLE, VTK_TETRA = 5, 10
 CELL_NAME = {3: "triangle", 4: "tetra"}

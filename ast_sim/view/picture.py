@@ -11,11 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
+from ast_sim.data.disk import replacing
 from ast_sim.data.scene import NodeType, Trajectory
 from ast_sim.errors import AstSimError, require
 from ast_sim.view.encode import finite_frames
 from ast_sim.view.fields import is_planar, require_same_scene, stress_at, surface_owners
-from ast_sim.view.files import explained, replacing
+from ast_sim.view.files import explained
 
 EYE = np.array([-0.62, -1.32, 0.78])  # from where a solid scene is seen, in units of its diagonal
 LIGHT = np.array([-0.35, -0.45, 0.82])

@@ -19,11 +19,12 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from ast_sim.data.disk import replacing
 from ast_sim.data.scene import Trajectory
 from ast_sim.errors import AstSimError, require
 from ast_sim.view import tables
 from ast_sim.view.encode import encode_scene, finite_json, motion_bytes
-from ast_sim.view.files import explained, replacing
+from ast_sim.view.files import explained
 
 SCRIPTS = ("common.js", "panel.js", "viewer.js", "charts.js", "page.js")
 MOTION_BYTES = 3_600_000  # of all scenes together; longer ones show every n-th frame

@@ -1,0 +1,144 @@
+"""Where the time of a step goes: kernels of the C core, their binding, torch's own ops, autograd, Python."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from torch.profiler import ProfilerActivity
+from torch.profiler import profile as torch_profile
+
+from ast_sim.ops import library
+
+WARM_UP = 3  # steps that are not counted: they fill caches
+TORCH_OPS = 15  # that are listed by name, the costliest first
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Calls and seconds a step of one thing. `kind`: kernel, torch, binding, autograd or python."""
+
+    kind: str
+    name: str
+    calls: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The mean step.
+
+    Attributes:
+        entries: by falling time within each kind; their times add up to `profiled_seconds`.
+        seconds: of a step that is not watched.
+        profiled_seconds: of a step that is.
+    """
+
+    entries: list[Entry]
+    seconds: float
+    profiled_seconds: float
+
+    def share(self, kind: str) -> float:
+        """The part of a step that entries of this kind take."""
+        return sum(entry.seconds for entry in self.entries if entry.kind == kind) / self.profiled_seconds
+
+
+class _TimedCore:
+    """The C core with a clock around every kernel."""
+
+    def __init__(self, core: Any) -> None:
+        self._core = core
+        self.nanoseconds: dict[str, int] = defaultdict(int)
+        self.calls: dict[str, int] = defaultdict(int)
+
+    def __getattr__(self, name: str) -> Callable:
+        function = getattr(self._core, name)
+
+        def timed(*arguments: Any) -> Any:
+            start = time.perf_counter_ns()
+            try:
+                return function(*arguments)
+            finally:
+                self.nanoseconds[name] += time.perf_counter_ns() - start
+                self.calls[name] += 1
+
+        setattr(self, name, timed)
+        return timed
+
+
+@contextmanager
+def _timed_core() -> Iterator[_TimedCore]:
+    if library.BACKEND == "torch":
+        yield _TimedCore(None)
+        return
+    core = library._C
+    library._C = _TimedCore(core)
+    try:
+        yield library._C
+    finally:
+        library._C = core
+
+
+def profile(step: Callable[[], object], steps: int) -> Profile:
+    """Time `steps` calls of `step`, and watch as many more. What a step does to its surroundings is done."""
+    for _ in range(WARM_UP):
+        step()
+    seconds = _seconds_of(step, steps)
+    with _timed_core() as core, torch_profile(activities=[ProfilerActivity.CPU]) as watched:
+        profiled = _seconds_of(step, steps)
+    kernels = [
+        Entry("kernel", name, core.calls[name] / steps, t * 1e-9 / steps) for name, t in core.nanoseconds.items()
+    ]
+    ops: dict[str, list[Entry]] = {"torch": [], "binding": [], "autograd": []}
+    for event in watched.key_averages():
+        if event.key.startswith("Optimizer."):
+            continue  # a span of Python around ops that are listed
+        kind = "binding" if "ast_sim" in event.key else "torch" if event.key.startswith("aten::") else "autograd"
+        ops[kind].append(Entry(kind, event.key, event.count / steps, event.self_cpu_time_total * 1e-6 / steps))
+    binding = sum(entry.seconds for entry in ops["binding"]) - sum(entry.seconds for entry in kernels)
+    entries = [
+        *_sorted(kernels),
+        *_with_rest(_sorted(ops["torch"]), TORCH_OPS),
+        Entry("binding", "around kernels", sum(entry.calls for entry in ops["binding"]), max(binding, 0.0)),
+        *_with_rest(_sorted(ops["autograd"]), 0),
+    ]
+    python = profiled - sum(entry.seconds for entry in entries)
+    return Profile([*entries, Entry("python", "everything else", 1, max(python, 0.0))], seconds, profiled)
+
+
+def _seconds_of(step: Callable[[], object], steps: int) -> float:
+    start = time.perf_counter()
+    for _ in range(steps):
+        step()
+    return (time.perf_counter() - start) / steps
+
+
+def _sorted(entries: list[Entry]) -> list[Entry]:
+    return sorted(entries, key=lambda entry: -entry.seconds)
+
+
+def _with_rest(entries: list[Entry], named: int) -> list[Entry]:
+    """The first `named` entries, and the others as one."""
+    rest = entries[named:]
+    if not rest:
+        return entries
+    name = "others" if named else "engine"
+    return entries[:named] + [Entry(rest[0].kind, name, sum(e.calls for e in rest), sum(e.seconds for e in rest))]
+
+
+def table(found: Profile) -> str:
+    """The profile as lines of text."""
+    lines = [
+        f"{1e3 * found.seconds:.2f} ms a step, {1e3 * found.profiled_seconds:.2f} ms while watched; shares of that:",
+        f"{'':9}{'':42}{'calls':>8}{'ms':>10}{'share':>9}",
+    ]
+    for e in found.entries:
+        share = e.seconds / found.profiled_seconds
+        lines.append(f"{e.kind:9}{e.name:42.42}{e.calls:8.4g}{1e3 * e.seconds:10.3f}{share:9.1%}")
+    kinds = ("kernel", "torch", "binding", "autograd", "python")
+    lines.append("in all   " + ", ".join(f"{kind} {found.share(kind):.1%}" for kind in kinds))
+    return "\n".join(lines)
