@@ -27,6 +27,7 @@ from ast_sim.measures import SquaredError, rmse_sequence
 from ast_sim.model.ast import build_model
 from ast_sim.model.config import PRESETS, resolve
 from ast_sim.monitor import Clock, Progress, StopSignals, duration
+from ast_sim.optimizer import Optimizer
 from ast_sim.profile import profile, table
 from ast_sim.rollout import rollouts
 from ast_sim.run import Metrics, RunConfig, TrainConfig, has_config, read_config, write_config
@@ -82,12 +83,12 @@ def train(run: Path, config: RunConfig | None = None, resume: bool = False, prof
                 raise TrainingError(f"{run} holds no run to resume: name the dataset to start one")
             with Dataset((config or saved).data) as dataset:
                 scales = measure(dataset)
-                resolved = _resolve(config, dataset, scales) if config is not None else saved
+                resolved = resolve_run(config, dataset, scales) if config is not None else saved
                 if saved is None:
                     write_config(run, resolved)
                 else:
                     _require_same(run, saved, resolved)
-                training = _Training(run, resolved, dataset, scales, signals)
+                training = Training(run, resolved, dataset, scales, signals)
                 if profile_steps:
                     training.profile(profile_steps)
                 else:
@@ -98,7 +99,8 @@ def train(run: Path, config: RunConfig | None = None, resume: bool = False, prof
         raise TrainingError(f"{run}: {error}{advice}") from error
 
 
-def _resolve(config: RunConfig, dataset: Dataset, scales: DataScales) -> RunConfig:
+def resolve_run(config: RunConfig, dataset: Dataset, scales: DataScales) -> RunConfig:
+    """The settings with everything filled in that they leave to the data."""
     model = resolve(config.model, dataset.info, dataset.material_width, scales.spacing)
     training = resolve_training(config.train, scales, model.dynamic)
     return RunConfig(model=model, train=training, data=str(Path(config.data).resolve()))
@@ -116,8 +118,11 @@ def _require_same(run: Path, saved: RunConfig, asked: RunConfig) -> None:
                 )
 
 
-class _Training:
-    """The state of one training: model, optimizer, where it stands, and what it tells."""
+class Training:
+    """The state of one training: model, optimizer, where it stands, and what it tells.
+
+    `prepare`, then `advance` step by step is what `go` does, without records, checkpoints and validation.
+    """
 
     def __init__(
         self, run: Path, config: RunConfig, dataset: Dataset, scales: DataScales, signals: StopSignals
@@ -136,8 +141,7 @@ class _Training:
             dynamic=config.model.dynamic,
             gamma=self.options.noise_gamma,
         )
-        self.parameters = dict(self.model.named_parameters())
-        self.optimizer = torch.optim.AdamW(self.parameters.values(), lr=0.0, weight_decay=0.0, fused=True)
+        self.optimizer = Optimizer(self.model)
         self.metrics = Metrics(run)
         self.clock = Clock()
         self.step = 0
@@ -151,7 +155,7 @@ class _Training:
         side = model.cell_side
         rms, spacing = max(scales.increment, 1e-300), max(scales.spacing, 1e-300)
         unit = self.dataset.info.length_unit
-        print(f"parameters  {sum(p.numel() for p in self.parameters.values()):,}")
+        print(f"parameters  {sum(p.numel() for p in self.model.parameters()):,}")
         print(f"data        {scales.trajectories:,} scenes of about {scales.nodes:,} nodes, {scales.pairs:,} pairs")
         print(
             f"steps       {options.steps:,} of {options.batch_size * options.accumulate} scenes each:"
@@ -163,23 +167,26 @@ class _Training:
         )
         print(f"cell side   {side:.3g} {unit} = {side / spacing:.2g} x mesh spacing", flush=True)
 
-    def profile(self, steps: int) -> None:
-        """Print where the time of training steps goes."""
+    def prepare(self) -> None:
+        """Take up the newest checkpoint; without one, the statistics of the data."""
         self._restore()
         self.model.train()
-        print(table(profile(self._advance, steps)))
+
+    def profile(self, steps: int) -> None:
+        """Print where the time of training steps goes."""
+        self.prepare()
+        print(table(profile(self.advance, steps)))
 
     def go(self) -> None:
         """Train from the newest checkpoint, or from the beginning, to the last step."""
         options = self.options
-        self._restore()
-        self.model.train()
+        self.prepare()
         with Progress(options.steps, self.step, "steps") as self.progress:
             if self.step and self._due(options.validate_every) and not self.metrics.validated(self.step):
                 self._validate()
             self.clock = Clock()
             while self.step < options.steps:
-                self._advance()
+                self.advance()
                 self.progress.advance()
                 if self._due(options.log_every):
                     self._log()
@@ -199,12 +206,11 @@ class _Training:
             self.progress.line(f"stopped after step {self.step:,}: go on with --resume")
             raise SystemExit(128 + self.signals.received)
 
-    def _advance(self) -> None:
+    def advance(self) -> None:
         """One optimizer step, on the gradients of `accumulate` batches."""
         options = self.options
         torch.manual_seed(step_seed(options.seed, self.step))
-        rate = learning_rate(options, self.step)
-        self.optimizer.zero_grad()
+        self.optimizer.zero_gradient()
         names: list[str] = []
         values: dict[str, float] = {}
         for part in range(options.accumulate):
@@ -220,11 +226,10 @@ class _Training:
             names += batch.names
             for key, value in losses.items():
                 values[key] = values.get(key, 0.0) + float(value.detach()) / options.accumulate
-        norm = float(torch.nn.utils.clip_grad_norm_(self.parameters.values(), options.clip))
+        norm = self.optimizer.clip(options.clip)
         if not math.isfinite(norm):
             raise self._not_finite("norm of the gradient", norm, names)
-        self.optimizer.param_groups[0]["lr"] = rate
-        self.optimizer.step()
+        self.optimizer.step(learning_rate(options, self.step))
         self.step += 1
         values |= {"grad_norm": norm, "clipped_share": float(norm > options.clip), "steps": 1}
         for key, value in values.items():
@@ -293,17 +298,17 @@ class _Training:
         self.progress.line(f"validation after step {self.step:,}: {text} ({duration(seconds)})")
 
     def _save(self) -> None:
-        optimizer = {}
-        for name, parameter in self.parameters.items():
-            for key, value in self.optimizer.state[parameter].items():
-                optimizer[f"{name}.{key}"] = value
         state = {"step": self.step, "sums": self.sums, "data": self.fingerprint}
         checkpoint.save(
-            self.run, self.step, model=self.model.state_dict(), optimizer=optimizer, state=state, keep=self.options.keep
+            self.run,
+            self.step,
+            model=self.model.state_dict(),
+            optimizer=self.optimizer.state(),
+            state=state,
+            keep=self.options.keep,
         )
 
     def _restore(self) -> None:
-        """Take up the newest checkpoint; without one, take the statistics of the data and begin."""
         path = checkpoint.latest(self.run)
         if path is None:
             self.metrics.forget_after(0)
@@ -317,11 +322,7 @@ class _Training:
                 " or train in another folder"
             )
         self.model.load_state_dict(weights)
-        for name, parameter in self.parameters.items():
-            prefix = f"{name}."
-            self.optimizer.state[parameter] = {
-                key.removeprefix(prefix): value for key, value in optimizer.items() if key.rpartition(".")[0] == name
-            }
+        self.optimizer.restore(optimizer)
         self.step, self.sums = state["step"], state["sums"]
         self.metrics.forget_after(self.step)
         print(f"going on after step {self.step:,}", flush=True)

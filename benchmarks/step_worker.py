@@ -1,0 +1,113 @@
+"""The process of one backend in benchmarks.training_step: requests on stdin, answers on stdout, in lines of JSON."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+import ast_sim
+from ast_sim.data.file import Dataset
+from ast_sim.data.graph import Graph
+from ast_sim.monitor import StopSignals
+from ast_sim.ops import library
+from ast_sim.profile import profile
+from ast_sim.rollout import make_batch, predict_next
+from ast_sim.schedule import measure
+from ast_sim.train import Training, configure, resolve_run
+from benchmarks.flops import FORMULAS
+
+KINDS = ("kernel", "torch", "binding", "autograd", "python")
+M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = -3, -1  # malloc.h of glibc
+
+
+class Setup(NamedTuple):
+    """What a worker trains: a dataset, a preset and its settings; `folder` is for what it writes."""
+
+    data: str
+    preset: str
+    settings: list[str]
+    folder: str
+
+
+def keep_memory() -> None:
+    """As the product does it, for both backends."""
+    if library.BACKEND == "c":
+        ast_sim.keep_memory()
+    else:
+        libc = ctypes.CDLL(None)
+        libc.mallopt(M_MMAP_THRESHOLD, 1 << 30)
+        libc.mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
+
+
+def mean_seconds(step: Callable[[], object], count: int) -> float:
+    start = time.perf_counter()
+    for _ in range(count):
+        step()
+    return (time.perf_counter() - start) / count
+
+
+def shares(step: Callable[[], object], count: int) -> dict[str, float]:
+    found = profile(step, count)
+    return {kind: found.share(kind) for kind in KINDS}
+
+
+def rollout_step(training: Training) -> Callable[[], object]:
+    """A call that predicts the second frame of the first test scene."""
+    truth = training.dataset.load("test", 0)
+    config = training.config.model
+    graph = Graph.from_scene(truth.scene, bool(config.element_inputs))
+    first, second = torch.from_numpy(truth.position[:2].copy()).unbind(0)
+    stress = None if truth.stress is None else torch.from_numpy(truth.stress[0].copy())
+
+    def step() -> None:
+        training.model.eval()
+        with torch.inference_mode():
+            batch = make_batch(training.model, graph, first, None, second, stress, ["test/000000 frame 0"])
+            predict_next(training.model, batch, second)
+        training.model.train()
+
+    return step
+
+
+def flops_of(step: Callable[[], object]) -> int:
+    """Useful floating point operations: matrix products and what benchmarks.flops counts of our ops."""
+    with FlopCounterMode(display=False, custom_mapping=FORMULAS) as counter:
+        step()
+    return counter.get_total_flops()
+
+
+def main() -> None:
+    setup = Setup(**json.loads(sys.argv[1]))
+    keep_memory()
+    out, sys.stdout = sys.stdout, sys.stderr  # what training prints is no answer
+    with Dataset(Path(setup.data)) as dataset, tempfile.TemporaryDirectory(dir=setup.folder) as run:
+        scales = measure(dataset)
+        config = resolve_run(configure(Path(setup.data), setup.preset, setup.settings), dataset, scales)
+        training = Training(Path(run), config, dataset, scales, StopSignals())
+        training.prepare()
+        roll = rollout_step(training)
+        answers: dict[str, Callable[[int], object]] = {
+            "step": lambda count: mean_seconds(training.advance, count),
+            "rollout": lambda count: mean_seconds(roll, count),
+            "profile": lambda count: shares(training.advance, count),
+            "profile_rollout": lambda count: shares(roll, count),
+            "flops": lambda count: flops_of(training.advance),
+            "resident": lambda count: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+        }
+        for line in sys.stdin:
+            request = json.loads(line)
+            print(json.dumps({"answer": answers[request["what"]](request["count"])}), file=out, flush=True)
+
+
+if __name__ == "__main__":
+    main()
