@@ -20,6 +20,7 @@ import torch
 
 from ast_sim import checkpoint
 from ast_sim.config import override
+from ast_sim.data.ahead import Ahead
 from ast_sim.data.file import Dataset
 from ast_sim.data.sampling import PairSampler
 from ast_sim.errors import ConfigError, DatasetError, TrainingError
@@ -88,11 +89,11 @@ def train(run: Path, config: RunConfig | None = None, resume: bool = False, prof
                     write_config(run, resolved)
                 else:
                     _require_same(run, saved, resolved)
-                training = Training(run, resolved, dataset, scales, signals)
-                if profile_steps:
-                    training.profile(profile_steps)
-                else:
-                    training.go()
+                with Training(run, resolved, dataset, scales, signals) as training:
+                    if profile_steps:
+                        training.profile(profile_steps)
+                    else:
+                        training.go()
     except OSError as error:
         full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
         advice = ": the last checkpoint is whole; make room, then go on with --resume" if full else ""
@@ -121,7 +122,8 @@ def _require_same(run: Path, saved: RunConfig, asked: RunConfig) -> None:
 class Training:
     """The state of one training: model, optimizer, where it stands, and what it tells.
 
-    `prepare`, then `advance` step by step is what `go` does, without records, checkpoints and validation.
+    `prepare`, then `advance` step by step is what `go` does, without records, checkpoints and validation. A context
+    manager, since it draws batches in a thread.
     """
 
     def __init__(
@@ -141,6 +143,7 @@ class Training:
             dynamic=config.model.dynamic,
             gamma=self.options.noise_gamma,
         )
+        self.ahead = Ahead(self.sampler)
         self.optimizer = Optimizer(self.model)
         self.metrics = Metrics(run)
         self.clock = Clock()
@@ -148,6 +151,12 @@ class Training:
         self.fingerprint = self._fingerprint()
         self.sums: dict[str, float] = {}  # of the steps since the last line of metrics
         self._introduce(scales)
+
+    def __enter__(self) -> Training:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.ahead.__exit__(*error)
 
     def _introduce(self, scales: DataScales) -> None:
         options, model = self.options, self.config.model
@@ -214,7 +223,7 @@ class Training:
         names: list[str] = []
         values: dict[str, float] = {}
         for part in range(options.accumulate):
-            batch, target = self.sampler.batch(self.step * options.accumulate + part)
+            batch, target = self.ahead.batch(self.step * options.accumulate + part)
             try:
                 losses = self.model.loss(batch, target, options.stress_weight)
             except DatasetError as error:
@@ -274,6 +283,7 @@ class Training:
         count = min(self.dataset.count("valid"), self.options.validate_scenes)
         if count == 0:
             return
+        self.ahead.wait()
         truths = [self.dataset.load("valid", index) for index in range(count)]
         names = [f"valid/{index:06d}" for index in range(count)]
         results = rollouts(self.model, truths, names, progress=lambda frame: self._stop_if_asked())

@@ -9,6 +9,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
 
@@ -90,10 +91,12 @@ def main() -> None:
     setup = Setup(**json.loads(sys.argv[1]))
     keep_memory()
     out, sys.stdout = sys.stdout, sys.stderr  # what training prints is no answer
-    with Dataset(Path(setup.data)) as dataset, tempfile.TemporaryDirectory(dir=setup.folder) as run:
+    with ExitStack() as stack:
+        dataset = stack.enter_context(Dataset(Path(setup.data)))
+        run = stack.enter_context(tempfile.TemporaryDirectory(dir=setup.folder))
         scales = measure(dataset)
         config = resolve_run(configure(Path(setup.data), setup.preset, setup.settings), dataset, scales)
-        training = Training(Path(run), config, dataset, scales, StopSignals())
+        training = stack.enter_context(Training(Path(run), config, dataset, scales, StopSignals()))
         training.prepare()
         roll = rollout_step(training)
         answers: dict[str, Callable[[int], object]] = {

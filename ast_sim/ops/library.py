@@ -39,7 +39,45 @@ if BACKEND == "c":
     _share_torch_threads()
 
 
-def define(schema: str, kernel: Callable, reference: Callable, fake: Callable) -> torch._ops.OpOverload:
+class Op:
+    """An op as its users call it; `overload` is what torch knows of it.
+
+    A call goes through torch's dispatcher only where something may stand between the caller and the kernel: tracing, a
+    dispatch mode, autocast, functorch, other devices and dtypes. For plain float32 tensors on the CPU the dispatcher
+    would cost more than a small kernel takes.
+    """
+
+    def __init__(self, name: str, overload: torch._ops.OpOverload, kernel: Callable) -> None:
+        self.name, self.overload, self.kernel = name, overload, kernel
+        self.function: type[torch.autograd.Function] | None = None  # set by `differentiate`
+
+    def __call__(self, *args):
+        tensors = [x for x in args if isinstance(x, torch.Tensor)]
+        if torch.compiler.is_compiling() or not _is_plain(tensors):
+            return self.overload(*args)
+        if self.function and torch.is_grad_enabled() and any(x.requires_grad for x in tensors):
+            return self.function.apply(*args)
+        return self.kernel(*args)
+
+
+def _is_plain(tensors: list[torch.Tensor]) -> bool:
+    """Whether nothing but the kernel itself would have to see these arguments."""
+    return (
+        BACKEND == "c"
+        and all(
+            type(x) in (torch.Tensor, torch.nn.Parameter)
+            and x.device.type == "cpu"
+            and (x.dtype == torch.float32 or not x.is_floating_point())
+            for x in tensors
+        )
+        and not torch._C._len_torch_dispatch_stack()
+        and not torch._C._are_functorch_transforms_active()
+        and not torch.is_autocast_enabled("cpu")
+        and not torch.jit.is_tracing()
+    )
+
+
+def define(schema: str, kernel: Callable, reference: Callable, fake: Callable) -> Op:
     """Register the op `ast_sim::<schema>`.
 
     Args:
@@ -64,12 +102,16 @@ def define(schema: str, kernel: Callable, reference: Callable, fake: Callable) -
     _library.impl(name, reference, "CompositeExplicitAutograd")
     torch.library.register_fake(f"ast_sim::{name}", fake, lib=_library)
     torch.library.register_autocast(f"ast_sim::{name}", "cpu", torch.float32, lib=_library)
-    return getattr(torch.ops.ast_sim, name).default
+    return Op(name, getattr(torch.ops.ast_sim, name).default, kernel)
 
 
-def differentiate(op: torch._ops.OpOverload, setup_context: Callable, backward: Callable) -> None:
+def differentiate(op: Op, setup_context: Callable, backward: Callable) -> None:
     """Register the gradient of an op; `backward` calls ops only, so that it can be traced."""
-    torch.library.register_autograd(op.name(), backward, setup_context=setup_context, lib=_library)
+    torch.library.register_autograd(op.overload.name(), backward, setup_context=setup_context, lib=_library)
+    body = {"forward": op.kernel, "setup_context": setup_context, "backward": backward}
+    op.function = type(
+        f"ast_sim_{op.name}", (torch.autograd.Function,), {key: staticmethod(value) for key, value in body.items()}
+    )
 
 
 def array(x: torch.Tensor) -> np.ndarray:

@@ -258,10 +258,10 @@ def test_every_instruction_set():
 def test_opcheck():
     q, k, v, *offsets = case([5, 4], [6, 3], 2, 16)
     leaves = [x.requires_grad_() for x in (q, k, v)]
-    torch.library.opcheck(ops._attention, (*leaves, *offsets, 0.25, 0.1, 3))
+    torch.library.opcheck(ops._attention.overload, (*leaves, *offsets, 0.25, 0.1, 3))
     out, maximum, total = ops._attention(*(x.detach() for x in leaves), *offsets, 0.25, 0.1, 3)
     inputs = (q.detach(), k.detach(), v.detach(), *offsets, 0.25, 0.1, 3, out, maximum, total, torch.randn(out.shape))
-    torch.library.opcheck(ops._attention_backward, inputs)
+    torch.library.opcheck(ops._attention_backward.overload, inputs)
 
 
 @pytest.mark.parametrize("wanted", [(0,), (1,), (2,), (0, 2)])

@@ -138,7 +138,7 @@ def test_every_instruction_set_and_backend():
 
 
 def test_opcheck():
-    torch.library.opcheck(fps._sample, (random_points(40, 9), torch.tensor([0, 15, 40]), 8))
+    torch.library.opcheck(fps._sample.overload, (random_points(40, 9), torch.tensor([0, 15, 40]), 8))
 
 
 def test_unusual_layouts_and_unchanged_inputs():

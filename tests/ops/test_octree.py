@@ -241,9 +241,9 @@ def test_every_instruction_set_and_backend():
 def test_opcheck():
     positions, offsets = cloud("random", 40).requires_grad_(), torch.tensor([0, 15, 40])
     tree = octree(positions, offsets, ORIGIN, 1, 3)
-    torch.library.opcheck(ops._octree, (positions, offsets, list(ORIGIN), 1.0, 3))
-    torch.library.opcheck(ops._coordinates, (tree.keys,))
-    torch.library.opcheck(ops._coarsen, (tree.keys, tree.cell_offsets))
+    torch.library.opcheck(ops._octree.overload, (positions, offsets, list(ORIGIN), 1.0, 3))
+    torch.library.opcheck(ops._coordinates.overload, (tree.keys,))
+    torch.library.opcheck(ops._coarsen.overload, (tree.keys, tree.cell_offsets))
 
 
 def test_traced_sizes_depend_on_data():

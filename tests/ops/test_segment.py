@@ -107,10 +107,11 @@ def test_scene_alone_equals_scene_in_batch():
 def test_opcheck():
     x, order, offsets = case(30, 4, 5)
     index = torch.tensor([3, 0, 0, 2])
-    torch.library.opcheck(segment._sum, (x.requires_grad_(), order, offsets, True))
-    torch.library.opcheck(segment._spread, (torch.randn(4, 5, requires_grad=True), order, offsets, False))
+    torch.library.opcheck(segment._sum.overload, (x.requires_grad_(), order, offsets, True))
+    torch.library.opcheck(segment._spread.overload, (torch.randn(4, 5, requires_grad=True), order, offsets, False))
     torch.library.opcheck(
-        segment._rows, (torch.randn(4, 5, requires_grad=True), index, index.argsort(), torch.tensor([0, 2, 2, 3, 4]))
+        segment._rows.overload,
+        (torch.randn(4, 5, requires_grad=True), index, index.argsort(), torch.tensor([0, 2, 2, 3, 4])),
     )
 
 

@@ -161,9 +161,9 @@ def test_opcheck():
     map = level(40)
     x, weight = (leaf.requires_grad_() for leaf in features(map.num_fine, (3, 5)))
     lists = (map.pair_offsets, map.fine, map.coarse_index, map.coarse_by_fine, map.fine_by_fine)
-    torch.library.opcheck(ops._conv, (x, weight, False, *lists, len(map.coarse.keys)))
+    torch.library.opcheck(ops._conv.overload, (x, weight, False, *lists, len(map.coarse.keys)))
     dout = torch.randn(len(map.coarse.keys), 5)
-    torch.library.opcheck(ops._conv_weight, (x.detach(), dout, *lists[:3]))
+    torch.library.opcheck(ops._conv_weight.overload, (x.detach(), dout, *lists[:3]))
 
 
 def test_gradients_in_float64():

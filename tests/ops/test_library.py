@@ -1,0 +1,62 @@
+"""An op gives the same whether it is called directly or through torch's dispatcher, and whoever must see it does."""
+
+import pytest
+import torch
+from torch.fx.experimental.proxy_tensor import make_fx
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from ast_sim.ops import segment
+
+ORDER, OFFSETS = torch.tensor([2, 0, 1]), torch.tensor([0, 2, 3])
+
+
+class Seen(TorchDispatchMode):
+    """Writes down the ops that pass."""
+
+    def __init__(self):
+        super().__init__()
+        self.names = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.names.append(str(func))
+        return func(*args, **(kwargs or {}))
+
+
+def test_both_ways_give_the_same_with_gradients():
+    results = []
+    for op in (segment._sum, segment._sum.overload):
+        x = torch.arange(6.0).view(3, 2).requires_grad_()
+        out = op(x, ORDER, OFFSETS, True)
+        (gradient,) = torch.autograd.grad(out, x, torch.tensor([[1.0, 2.0], [3.0, 4.0]]))
+        results.append((out, gradient))
+    for found in results:
+        assert torch.equal(found[0], torch.tensor([[2.0, 3.0], [2.0, 3.0]]))
+        assert torch.equal(found[1], torch.tensor([[0.5, 1.0], [3.0, 4.0], [0.5, 1.0]]))
+
+
+def test_no_gradient_is_kept_where_none_is_asked_for():
+    x = torch.ones(3, 2, requires_grad=True)
+    with torch.no_grad():
+        assert not segment.segment_sum(x, ORDER, OFFSETS).requires_grad
+    assert not segment.segment_sum(x.detach(), ORDER, OFFSETS).requires_grad
+    assert segment.segment_sum(x, ORDER, OFFSETS).requires_grad
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
+def test_other_dtypes_take_the_composition(dtype):
+    out = segment.segment_sum(torch.ones(3, 2, dtype=dtype), ORDER, OFFSETS)
+    assert out.dtype == dtype and torch.equal(out, torch.tensor([[2, 2], [1, 1]], dtype=dtype))
+
+
+def test_autocast_brings_low_precision_to_float32():
+    with torch.autocast("cpu", torch.bfloat16):
+        assert segment.segment_sum(torch.ones(3, 2, dtype=torch.bfloat16), ORDER, OFFSETS).dtype == torch.float32
+
+
+def test_modes_and_tracers_see_the_op():
+    x = torch.ones(3, 2)
+    with Seen() as seen:
+        segment.segment_sum(x, ORDER, OFFSETS)
+    assert seen.names == ["ast_sim.segment_sum.default"]
+    traced = make_fx(lambda x: segment.segment_sum(x, ORDER, OFFSETS))(x)
+    assert torch.ops.ast_sim.segment_sum.default in [node.target for node in traced.graph.nodes]
