@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -82,6 +83,7 @@ def rollouts(
         if trajectory.num_frames <= given:
             raise RolloutError(f"{name} has {trajectory.num_frames} frames; a rollout needs at least {given + 1}")
     scenes = [_RollingScene(model, t, name, given, steps) for t, name in zip(trajectories, names, strict=True)]
+    concatenate = lru_cache(maxsize=4)(lambda *graphs: Graph.concatenate(list(graphs)))
     training = model.training
     model.eval()
     try:
@@ -89,7 +91,7 @@ def rollouts(
             for frame in range(given, max(scene.end for scene in scenes)):
                 running = [scene for scene in scenes if scene.runs_at(frame)]
                 for together in _same_domain(running):
-                    _step(model, together, frame)
+                    _step(model, together, frame, concatenate)
                 if progress is not None and running:
                     progress(frame)
     finally:
@@ -170,12 +172,12 @@ def _same_domain(scenes: list[_RollingScene]) -> Iterator[list[_RollingScene]]:
     return iter(groups.values())
 
 
-def _step(model: Simulator, scenes: list[_RollingScene], frame: int) -> None:
-    """Predict the frame of all scenes at once."""
+def _step(model: Simulator, scenes: list[_RollingScene], frame: int, concatenate: Callable[..., Graph]) -> None:
+    """Predict the frame of all scenes at once; `concatenate` makes one graph of theirs."""
     start = time.perf_counter()
     batch = make_batch(
         model,
-        Graph.concatenate([scene.graph for scene in scenes]),
+        concatenate(*(scene.graph for scene in scenes)),
         position=torch.cat([scene.positions[-1] for scene in scenes]),
         previous=torch.cat([scene.positions[-2] for scene in scenes]) if scenes[0].given == 2 else None,
         target=torch.cat([scene.script[frame] for scene in scenes]),

@@ -23,47 +23,60 @@ class Graph:
     Attributes:
         rest_position: [N, 3] float32.
         node_type: [N] int64, values of `NodeType`.
+        one_hot: [N, 3] float32, 1 in the column of the node's type in the order of `NodeType`.
         elements: [E, k] int64, node numbers within the batch.
         material: [E, m] float32 or None.
+        node_material: [N, m] float32, the mean over the elements at each node, or None.
         node_offsets, element_offsets: [B + 1] int64, where each scene's nodes and elements start and end.
         m2m: node to node, every element edge once in both directions; None with element nodes.
         e2m, m2e: element to each of its nodes, and the reverse; None without element nodes.
+        rest_edges: [M, 4] float32, `edge_vectors` of e2m (elements at the mean of their nodes) or m2m at rest.
     """
 
     rest_position: Tensor
     node_type: Tensor
+    one_hot: Tensor
     elements: Tensor
     material: Tensor | None
+    node_material: Tensor | None
     node_offsets: Tensor
     element_offsets: Tensor
     m2m: EdgeSet | None
     e2m: EdgeSet | None
     m2e: EdgeSet | None
+    rest_edges: Tensor
 
     @staticmethod
     def from_scene(scene: Scene, element_nodes: bool) -> Graph:
         """The graph of one scene: e2m and m2e if elements are nodes of their own, else m2m."""
         n, e = scene.num_nodes, scene.num_elements
         elements = torch.from_numpy(scene.elements.astype("int64"))
+        rest, node_type = torch.tensor(scene.rest_position), torch.from_numpy(scene.node_type.astype("int64"))
+        material = None if scene.material is None else torch.tensor(scene.material)
         m2m = e2m = m2e = None
         if element_nodes:
             nodes = elements.reshape(-1)
             owners = torch.arange(e).repeat_interleave(elements.shape[1])
             e2m = EdgeSet.from_pairs(owners, nodes, e, n)
             m2e = EdgeSet.from_pairs(nodes, owners, n, e)
+            rest_edges = edge_vectors(e2m, _element_mean(elements, rest), rest)
         else:
             first, second = torch.from_numpy(scene.edges().astype("int64")).unbind(1)
             m2m = EdgeSet.from_pairs(torch.cat([first, second]), torch.cat([second, first]), n, n)
+            rest_edges = edge_vectors(m2m, rest, rest)
         return Graph(
-            rest_position=torch.tensor(scene.rest_position),
-            node_type=torch.from_numpy(scene.node_type.astype("int64")),
+            rest_position=rest,
+            node_type=node_type,
+            one_hot=torch.stack([node_type == kind for kind in NodeType], dim=1).float(),
             elements=elements,
-            material=None if scene.material is None else torch.tensor(scene.material),
+            material=material,
+            node_material=None if material is None else _node_mean(elements, material, n),
             node_offsets=torch.tensor([0, n]),
             element_offsets=torch.tensor([0, e]),
             m2m=m2m,
             e2m=e2m,
             m2e=m2e,
+            rest_edges=rest_edges,
         )
 
     @staticmethod
@@ -75,8 +88,10 @@ class Graph:
         return Graph(
             rest_position=torch.cat([g.rest_position for g in graphs]),
             node_type=torch.cat([g.node_type for g in graphs]),
+            one_hot=torch.cat([g.one_hot for g in graphs]),
             elements=torch.cat([g.elements + shift for g, shift in zip(graphs, nodes, strict=False)]),
             material=None if graphs[0].material is None else torch.cat([g.material for g in graphs]),
+            node_material=None if graphs[0].material is None else torch.cat([g.node_material for g in graphs]),
             node_offsets=_concatenate_offsets([g.node_offsets for g in graphs], nodes),
             element_offsets=_concatenate_offsets(
                 [g.element_offsets for g in graphs], list(accumulate((len(g.elements) for g in graphs), initial=0))
@@ -84,11 +99,17 @@ class Graph:
             m2m=None if graphs[0].m2m is None else EdgeSet.concatenate([g.m2m for g in graphs]),
             e2m=None if graphs[0].e2m is None else EdgeSet.concatenate([g.e2m for g in graphs]),
             m2e=None if graphs[0].m2e is None else EdgeSet.concatenate([g.m2e for g in graphs]),
+            rest_edges=torch.cat([g.rest_edges for g in graphs]),
         )
 
     @property
     def num_scenes(self) -> int:
         return len(self.node_offsets) - 1
+
+    @property
+    def edges(self) -> EdgeSet:
+        """The edge set that carries features: e2m with element nodes, else m2m."""
+        return self.m2m if self.e2m is None else self.e2m
 
     @cached_property
     def prescribed(self) -> Tensor:
@@ -96,14 +117,41 @@ class Graph:
         return self.node_type != NodeType.NORMAL
 
     @cached_property
-    def normal(self) -> Tensor:
-        """[N] bool: the nodes that a model moves."""
-        return self.node_type == NodeType.NORMAL
+    def normal_nodes(self) -> Tensor:
+        """[*] int64: the nodes that a model moves."""
+        return (self.node_type == NodeType.NORMAL).nonzero()[:, 0]
+
+    @cached_property
+    def solid_nodes(self) -> Tensor:
+        """[*] int64: the nodes of no obstacle, which have a stress."""
+        return (self.node_type != NodeType.OBSTACLE).nonzero()[:, 0]
+
+    @cached_property
+    def solid_elements(self) -> Tensor:
+        """[*] int64: the elements with no obstacle node."""
+        return (self.node_type != NodeType.OBSTACLE)[self.elements].all(dim=1).nonzero()[:, 0]
 
     def element_mean(self, x: Tensor) -> Tensor:
         """[N, F] -> [E, F]: the mean over the nodes of each element."""
-        e, k = self.elements.shape
-        return x.index_select(0, self.elements.reshape(-1)).view(e, k, -1).mean(dim=1)
+        return _element_mean(self.elements, x)
+
+
+def edge_vectors(edges: EdgeSet, senders: Tensor, receivers: Tensor) -> Tensor:
+    """[M, 4]: d = sender - receiver and |d|, from positions [S, 3] and [R, 3]."""
+    d = senders.index_select(0, edges.senders) - receivers.index_select(0, edges.receivers)
+    return torch.cat([d, torch.linalg.vector_norm(d, dim=1, keepdim=True)], dim=1)
+
+
+def _element_mean(elements: Tensor, x: Tensor) -> Tensor:
+    e, k = elements.shape
+    return x.index_select(0, elements.reshape(-1)).view(e, k, -1).mean(dim=1)
+
+
+def _node_mean(elements: Tensor, x: Tensor, num: int) -> Tensor:
+    """[E, F] -> [num, F]: the mean over the elements at each node; 0 where there is none."""
+    nodes, share = elements.flatten(), x.repeat_interleave(elements.shape[1], dim=0)
+    total = share.new_zeros(num, share.shape[1]).index_add_(0, nodes, share)
+    return total / torch.bincount(nodes, minlength=num).clamp(min=1)[:, None]
 
 
 def _concatenate_offsets(offsets: list[Tensor], shifts: list[int]) -> Tensor:

@@ -15,12 +15,10 @@ from ast_sim.data.batch import Batch
 from ast_sim.model import features as inputs
 from ast_sim.model.cells import Cells, SparseConv, build_cells
 from ast_sim.model.config import ModelConfig
-from ast_sim.model.features import Feature, FeatureSet, widths_of
 from ast_sim.model.message_passing import MessagePassing
 from ast_sim.model.mlp import MLP
 from ast_sim.model.simulator import Prediction, Simulator
 from ast_sim.model.transformer import AttentionBlock, PositionEmbedding
-from ast_sim.ops.edges import EdgeSet
 from ast_sim.ops.fps import farthest_point_sample
 from ast_sim.ops.segment import segment_mean
 
@@ -31,11 +29,11 @@ class AST(Simulator):
     def __init__(self, config: ModelConfig):
         super().__init__(config)
         c, width = config, config.hidden
-        self.node_inputs = FeatureSet(widths_of(c, "node"))
-        self.edge_inputs = FeatureSet(widths_of(c, "edge"))
+        self.node_inputs = inputs.normalizer_of(c, "node")
+        self.edge_inputs = inputs.normalizer_of(c, "edge")
         self.node_encoder = MLP(self.node_inputs.width, width, width, c.factorized)
         if c.element_inputs:
-            self.element_inputs = FeatureSet(widths_of(c, "element"))
+            self.element_inputs = inputs.normalizer_of(c, "element")
             self.element_encoder = MLP(self.element_inputs.width, width, width, c.factorized)
             self.e2m = self._message_passing("e2m", self.edge_inputs.width)
         else:
@@ -58,17 +56,10 @@ class AST(Simulator):
     def _message_passing(self, name: str, edge_inputs: int = 0) -> MessagePassing:
         return MessagePassing(self.config.hidden, edge_inputs, name in self.config.residual, self.config.factorized)
 
-    def _edge_features(self, batch: Batch) -> tuple[EdgeSet, list[Feature]]:
-        graph, rest, now = batch.graph, batch.graph.rest_position, batch.position
-        if not self.config.element_inputs:
-            return graph.m2m, inputs.edge_features(self.config, graph.m2m, (rest, rest), (now, now))
-        senders = (graph.element_mean(rest), graph.element_mean(now))
-        return graph.e2m, inputs.edge_features(self.config, graph.e2m, (senders[0], rest), (senders[1], now))
-
     def observe(self, batch: Batch) -> None:
         """Add the batch to the statistics of the inputs."""
         self.node_inputs.observe(inputs.node_features(self.config, batch))
-        self.edge_inputs.observe(self._edge_features(batch)[1])
+        self.edge_inputs.observe(inputs.edge_features(self.config, batch))
         if self.config.element_inputs:
             self.element_inputs.observe(inputs.element_features(self.config, batch))
 
@@ -76,8 +67,7 @@ class AST(Simulator):
         """Normalised outputs for the frame after `batch`."""
         encoded = self.node_encoder(self.node_inputs(inputs.node_features(self.config, batch)))
         elements = None
-        edges, edge_features = self._edge_features(batch)
-        edge_features = self.edge_inputs(edge_features)
+        edges, edge_features = batch.graph.edges, self.edge_inputs(inputs.edge_features(self.config, batch))
         if self.config.element_inputs:
             elements = self.element_encoder(self.element_inputs(inputs.element_features(self.config, batch)))
             mesh = self.e2m(edges, elements, encoded, edge_features)

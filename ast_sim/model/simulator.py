@@ -9,9 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from ast_sim.data.batch import Batch, Target
-from ast_sim.data.scene import NodeType
 from ast_sim.model.config import ModelConfig
-from ast_sim.model.normalizer import Normalizer
+from ast_sim.model.normalizer import FeatureNormalizer, Normalizer
 
 
 @dataclass(frozen=True)
@@ -39,21 +38,18 @@ class Simulator(nn.Module):
 
     def _stressed(self, batch: Batch) -> Tensor:
         """Rows whose stress counts: nodes that are no obstacle, or elements with no obstacle node."""
-        obstacle = batch.graph.node_type == NodeType.OBSTACLE
-        if self.config.stress == "element":
-            return ~obstacle[batch.graph.elements].any(dim=1)
-        return ~obstacle
+        return batch.graph.solid_elements if self.config.stress == "element" else batch.graph.solid_nodes
 
     @torch.no_grad()
     def fit_statistics(self, batches: Iterable[tuple[Batch, Target]]) -> None:
         """Fix the statistics of inputs and targets, in float64, from batches drawn as trained on (with noise)."""
         for batch, target in batches:
             self.observe(batch)
-            self.motion_normalizer.observe(target.motion[batch.graph.normal])
+            self.motion_normalizer.observe(target.motion[batch.graph.normal_nodes])
             if self.stress_normalizer is not None:
                 self.stress_normalizer.observe(target.stress[self._stressed(batch)])
         for module in self.modules():
-            if isinstance(module, Normalizer):
+            if isinstance(module, Normalizer | FeatureNormalizer):
                 module.fix()
 
     def loss(self, batch: Batch, target: Target, stress_weight: float = 0.01) -> dict[str, Tensor]:
@@ -64,15 +60,16 @@ class Simulator(nn.Module):
             deviation of the predicted motion over the nodes: 0 means a dead decoder.
         """
         prediction = self(batch)
-        normal = batch.graph.normal
-        motion = prediction.motion[normal]
-        error = motion - self.motion_normalizer(target.motion[normal])
+        normal = batch.graph.normal_nodes
+        motion = prediction.motion.index_select(0, normal)
+        error = motion - self.motion_normalizer(target.motion.index_select(0, normal))
         losses = {"motion": error.square().mean()}
         losses["loss"] = losses["motion"]
         losses["spread"] = motion.detach().std(dim=0).mean() if len(motion) > 1 else motion.new_ones(())
         if self.stress_normalizer is not None:
             rows = self._stressed(batch)
-            error = prediction.stress[rows] - self.stress_normalizer(target.stress[rows])
+            stress = prediction.stress.index_select(0, rows)
+            error = stress - self.stress_normalizer(target.stress.index_select(0, rows))
             losses["stress"] = error.square().mean()
             losses["loss"] = losses["loss"] + stress_weight * losses["stress"]
         return losses

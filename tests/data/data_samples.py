@@ -11,17 +11,6 @@ from ast_sim.data.layout import DatasetInfo
 from ast_sim.data.scene import NodeType, Scene, Trajectory
 
 
-def two_tetrahedra(**changes) -> Scene:
-    """Two tetrahedra that share the face 1, 2, 3; node 0 is a handle, node 4 an obstacle."""
-    arrays = {
-        "rest_position": np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], np.float32),
-        "elements": np.array([[0, 1, 2, 3], [1, 2, 3, 4]], np.int32),
-        "node_type": np.array([NodeType.HANDLE, 0, 0, 0, NodeType.OBSTACLE], np.uint8),
-        "body": np.array([0, 0, 0, 0, 1], np.int32),
-    }
-    return Scene(**{**arrays, **changes})
-
-
 def block(nx: int, ny: int, nz: int, material: np.ndarray | None = None) -> Scene:
     """A block of nx x ny x nz unit cubes, six tetrahedra each; the nodes with x = 0 are handles."""
     points = np.stack(np.meshgrid(*(np.arange(n + 1) for n in (nx, ny, nz)), indexing="ij"), -1).reshape(-1, 3)

@@ -4,7 +4,8 @@ import threading
 
 import pytest
 import torch
-from data_samples import trajectory, two_tetrahedra, write
+from data_samples import trajectory, write
+from meshes import two_tetrahedra
 
 from ast_sim.data.ahead import Ahead
 from ast_sim.data.file import Dataset

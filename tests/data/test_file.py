@@ -10,7 +10,8 @@ import sys
 import h5py
 import numpy as np
 import pytest
-from data_samples import block, info, trajectory, two_tetrahedra, write
+from data_samples import block, info, trajectory, write
+from meshes import two_tetrahedra
 
 from ast_sim.data import file as dataset_file
 from ast_sim.data.file import Dataset, DatasetWriter
@@ -233,7 +234,7 @@ def test_every_truncation_is_an_error(tmp_path):
 
 FLIPS = """
 import sys
-sys.path.insert(0, sys.argv[1])
+sys.path[:0] = [sys.argv[1], sys.argv[1] + "/.."]
 from test_file import flip_and_read
 flip_and_read(sys.argv[2], sys.argv[3], range(int(sys.argv[4]), int(sys.argv[5])))
 print("done")

@@ -4,7 +4,8 @@ import dataclasses
 
 import numpy as np
 import torch
-from data_samples import block, two_tetrahedra
+from data_samples import block
+from meshes import two_tetrahedra
 
 from ast_sim.data.graph import Graph
 from ast_sim.ops.edges import EdgeSet
@@ -34,7 +35,7 @@ def test_element_edges_of_two_tetrahedra():
 def test_masks_and_element_means():
     graph = Graph.from_scene(two_tetrahedra(), element_nodes=True)
     assert graph.prescribed.tolist() == [True, False, False, False, True]
-    assert graph.normal.tolist() == [False, True, True, True, False]
+    assert graph.normal_nodes.tolist() == [1, 2, 3]
     means = graph.element_mean(graph.rest_position)
     torch.testing.assert_close(means, torch.tensor([[0.25] * 3, [0.5] * 3]), rtol=0, atol=0)
 

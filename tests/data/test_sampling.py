@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from data_samples import block, trajectory, two_tetrahedra, write
+from data_samples import block, trajectory, write
+from meshes import two_tetrahedra
 
 from ast_sim.data.file import Dataset
 from ast_sim.data.sampling import PairSampler

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from data_samples import block, trajectory, two_tetrahedra
+from data_samples import block, trajectory
+from meshes import two_tetrahedra
 
 from ast_sim.data.scene import NodeType, Scene, Trajectory
 from ast_sim.errors import DatasetError

@@ -141,7 +141,7 @@ def test_bodies_exchange_information_through_cells():
     batch = batch_of(config, 0)
     obstacle = batch.graph.node_type == NodeType.OBSTACLE
     moved = replace(batch, boundary_motion=torch.where(obstacle[:, None], 0.05, batch.boundary_motion))
-    difference = (model(moved).motion - model(batch).motion)[batch.graph.normal].abs().amax(dim=1)
+    difference = (model(moved).motion - model(batch).motion)[batch.graph.normal_nodes].abs().amax(dim=1)
     assert float(difference.detach().min()) > 0
 
 
@@ -250,7 +250,7 @@ def test_loss_counts_the_right_nodes(tmp_path):
     batch, target = pairs.batch(0)
     losses = model.loss(batch, target, stress_weight=0.3)
     out = model(batch)
-    normal, free = batch.graph.normal, batch.graph.node_type != NodeType.OBSTACLE
+    normal, free = batch.graph.normal_nodes, batch.graph.node_type != NodeType.OBSTACLE
     motion = (out.motion - target.motion / model.motion_normalizer.scale)[normal].square().mean()
     stress = (out.stress - model.stress_normalizer(target.stress))[free].square().mean()
     torch.testing.assert_close(losses["motion"], motion)
