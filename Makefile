@@ -68,7 +68,7 @@ tools:
 	    || echo "cannot install$$missing: the tests that need them will fail"; \
 	fi
 
-build/check/%.passed: csrc/tests/test_%.c csrc/tests/check.h $(C_SOURCES) | tools
+build/check/%.passed: csrc/tests/test_%.c $(wildcard csrc/tests/*.h) $(C_SOURCES) | tools
 	@mkdir -p build/check
 	@set -e; \
 	build() { \

@@ -5,16 +5,10 @@
  */
 #include "check.h"
 
-/* n floats of NaN: what a kernel leaves unwritten shows. */
-static float *new_floats(int64_t n) {
-  float *x = malloc((size_t)(n + 1) * sizeof *x);
-  CHECK(x, "no memory");
-  for (int64_t i = 0; i < n; i++) x[i] = NAN;
-  return x;
-}
-static float *random_floats(int64_t n, float amplitude) {
-  float *x = new_floats(n);
-  for (int64_t i = 0; i < n; i++) x[i] = amplitude * random_float();
+/* random floats in -amplitude..amplitude */
+static float *floats_of(int64_t n, float amplitude) {
+  float *x = random_floats(n);
+  for (int64_t i = 0; i < n; i++) x[i] *= amplitude;
   return x;
 }
 static bool same_bits(const void *a, const void *b, int64_t floats) { return memcmp(a, b, (size_t)floats * sizeof(float)) == 0; }
@@ -36,10 +30,10 @@ static problem new_problem(int64_t B, const int64_t *queries, const int64_t *key
     a.q_offsets[b + 1] = a.Tq += queries[b];
     a.k_offsets[b + 1] = a.Tk += keys[b];
   }
-  a.q = random_floats(a.Tq * H * D, amplitude);
-  a.k = random_floats(a.Tk * H * D, amplitude);
-  a.v = random_floats(a.Tk * H * D, 1);
-  a.dout = random_floats(a.Tq * H * D, 1);
+  a.q = floats_of(a.Tq * H * D, amplitude);
+  a.k = floats_of(a.Tk * H * D, amplitude);
+  a.v = random_floats(a.Tk * H * D);
+  a.dout = random_floats(a.Tq * H * D);
   return a;
 }
 
@@ -54,16 +48,22 @@ static answer new_answer(const problem *a) {
                   new_floats(a->Tq * row), new_floats(a->Tk * row),  new_floats(a->Tk * row)};
 }
 
-static answer solve(const ast_kernels *kernels, const problem *a) {
-  const ast_attention s = sizes_of(a);
+/* Both directions, on q, k and v with rows of their own strides. */
+static answer solve_rows(const ast_kernels *kernels, const problem *a, ast_attention s, const float *q, const float *k, const float *v) {
   const answer r = new_answer(a);
-  CHECK(kernels->attention(&s, a->q, a->k, a->v, r.out, r.maximum, r.sum) == AST_OK, "status");
-  CHECK(kernels->attention_backward(&s, a->q, a->k, a->v, r.out, r.maximum, r.sum, a->dout, r.dq, r.dk, r.dv) == AST_OK, "status");
+  s.q_offsets = copy_ints(a->q_offsets, a->B + 1), s.k_offsets = copy_ints(a->k_offsets, a->B + 1);
+  READ_ONLY(q, k, v, a->dout, s.q_offsets, s.k_offsets);
+  CHECK(kernels->attention(&s, q, k, v, r.out, r.maximum, r.sum) == AST_OK, "status");
+  READ_ONLY(r.out, r.maximum, r.sum);
+  CHECK(kernels->attention_backward(&s, q, k, v, r.out, r.maximum, r.sum, a->dout, r.dq, r.dk, r.dv) == AST_OK, "status");
+  WRITABLE(q, k, v, a->dout);
+  FREE(s.q_offsets, s.k_offsets);
   return r;
 }
+static answer solve(const ast_kernels *kernels, const problem *a) { return solve_rows(kernels, a, sizes_of(a), a->q, a->k, a->v); }
 
-static void free_problem(problem a) { free(a.q), free(a.k), free(a.v), free(a.dout); }
-static void free_answer(answer r) { free(r.out), free(r.maximum), free(r.sum), free(r.dq), free(r.dk), free(r.dv); }
+static void free_problem(problem a) { FREE(a.q, a.k, a.v, a.dout); }
+static void free_answer(answer r) { FREE(r.out, r.maximum, r.sum, r.dq, r.dk, r.dv); }
 
 /* ---- the formula ---- */
 
@@ -171,9 +171,10 @@ static void check_against_formula(const problem *a, const answer *r, double fact
   formula_float(a, plain[0], plain[1], plain[2], plain[3], plain[4]);
   for (int i = 0; i < 5; i++) {
     compare(names[i], got[i], exact[i], plain[i], sizes[i], factor);
-    free(exact[i]), free(plain[i]);
+    free(exact[i]);
+    FREE(plain[i]);
   }
-  free(lse);
+  FREE(lse);
 }
 
 /* ---- tests ---- */
@@ -299,17 +300,13 @@ static void test_row_strides(const ast_kernels *kernels) {
     memcpy(fused + i * 3 * row + row, a.k + i * row, (size_t)row * sizeof(float));
     memcpy(fused + i * 3 * row + 2 * row, a.v + i * row, (size_t)row * sizeof(float));
   }
-  answer dense = solve(kernels, &a), sliced = new_answer(&a);
   ast_attention s = sizes_of(&a);
   s.q_stride = s.k_stride = s.v_stride = 3 * row;
-  CHECK(kernels->attention(&s, fused, fused + row, fused + 2 * row, sliced.out, sliced.maximum, sliced.sum) == AST_OK, "status");
-  CHECK(kernels->attention_backward(&s, fused, fused + row, fused + 2 * row, sliced.out, sliced.maximum, sliced.sum, a.dout, sliced.dq,
-                                    sliced.dk, sliced.dv) == AST_OK,
-        "status");
+  answer dense = solve(kernels, &a), sliced = solve_rows(kernels, &a, s, fused, fused + row, fused + 2 * row);
   CHECK(same_bits(dense.out, sliced.out, tokens * row) && same_bits(dense.dq, sliced.dq, tokens * row) &&
             same_bits(dense.dk, sliced.dk, tokens * row) && same_bits(dense.dv, sliced.dv, tokens * row),
         "strides change the result");
-  free(fused);
+  FREE(fused);
   free_answer(dense), free_answer(sliced), free_problem(a);
 }
 

@@ -14,16 +14,9 @@ typedef struct {
   int64_t *keys, *cell_offsets, *node_cell, *node_order, *node_offsets;
 } tree;
 
-static int64_t *ints(int64_t n) {
-  int64_t *p = malloc((size_t)(n + 1) * sizeof *p);
-  CHECK(p, "no memory");
-  memset(p, 0xff, (size_t)(n + 1) * sizeof *p);
-  return p;
-}
+static tree new_tree(int64_t N, int64_t B) { return (tree){new_ints(N), new_ints(B + 1), new_ints(N), new_ints(N), new_ints(N + 1)}; }
 
-static tree new_tree(int64_t N, int64_t B) { return (tree){ints(N), ints(B + 1), ints(N), ints(N), ints(N + 1)}; }
-
-static void free_tree(tree t) { free(t.keys), free(t.cell_offsets), free(t.node_cell), free(t.node_order), free(t.node_offsets); }
+static void free_tree(tree t) { FREE(t.keys, t.cell_offsets, t.node_cell, t.node_order, t.node_offsets); }
 
 /* ---- oracle of the build ---- */
 
@@ -64,9 +57,11 @@ static int by_scene_key_node(const void *a, const void *b) {
 static void check_build(const ast_kernels *kernels, cloud s, const double center[3], double half_width, int depth, const char *what) {
   tree t = new_tree(s.N, s.B);
   int64_t bad = -1, c = -1;
+  READ_ONLY(s.positions, s.offsets);
   CHECK(kernels->octree_build(s.positions, s.offsets, s.B, center, half_width, depth, t.keys, t.cell_offsets, t.node_cell, t.node_order,
                               t.node_offsets, &bad) == AST_OK,
         "%s", what);
+  WRITABLE(s.positions, s.offsets);
   entry *sorted = malloc((size_t)(s.N + 1) * sizeof *sorted);
   for (int64_t b = 0; b < s.B; b++)
     for (int64_t i = s.offsets[b]; i < s.offsets[b + 1]; i++)
@@ -84,14 +79,18 @@ static void check_build(const ast_kernels *kernels, cloud s, const double center
     CHECK(t.node_cell[sorted[i].node] == c, "%s: node %lld", what, (long long)sorted[i].node);
   }
   CHECK(t.cell_offsets[s.B] == c, "%s: %lld cells, not %lld", what, (long long)t.cell_offsets[s.B], (long long)c);
-  int32_t *coordinates = malloc((size_t)(c + 1) * 12);
-  CHECK(kernels->octree_coordinates(t.keys, c, coordinates) == AST_OK, "%s", what);
+  int32_t *coordinates = new_small_ints(3 * c);
+  int64_t *keys = copy_ints(t.keys, c);
+  READ_ONLY(keys);
+  CHECK(kernels->octree_coordinates(keys, c, coordinates) == AST_OK, "%s", what);
   for (int64_t i = 0; i < c; i++) {
     int64_t cell[3];
     separate(t.keys[i], cell);
     for (int a = 0; a < 3; a++) CHECK(coordinates[3 * i + a] == cell[a], "%s: cell %lld", what, (long long)i);
   }
-  free(coordinates), free(sorted), free_tree(t);
+  free(sorted);
+  FREE(coordinates, keys);
+  free_tree(t);
 }
 
 /* ---- oracle of the coarser level and its pairs ---- */
@@ -112,11 +111,15 @@ static int64_t find(const int64_t *keys, const int64_t *offsets, int64_t scene, 
 /* One step of coarsening; the coarse cells replace keys and offsets. */
 static void check_coarsen(const ast_kernels *kernels, int64_t *keys, int64_t *offsets, int64_t B, const char *what) {
   const int64_t fine = offsets[B];
-  int64_t *coarse_keys = ints(fine), *coarse_offsets = ints(B + 1), *first_child = ints(fine + 1), *neighbours = ints(8 * fine);
-  int64_t pair_offsets[28], cell[3], other[3], pairs = 0;
-  CHECK(kernels->octree_coarsen(keys, offsets, B, coarse_keys, coarse_offsets, first_child, neighbours, pair_offsets) == AST_OK, "%s",
-        what);
-  int64_t C = 0;
+  int64_t *fine_keys = copy_ints(keys, fine), *coarse_keys = new_ints(fine), *coarse_offsets = new_ints(B + 1);
+  int64_t *all_children = new_ints(fine + 1), *all_neighbours = new_ints(8 * fine), *pair_offsets = new_ints(28);
+  int64_t cell[3], other[3], pairs = 0;
+  READ_ONLY(fine_keys, offsets);
+  CHECK(kernels->octree_coarsen(fine_keys, offsets, B, coarse_keys, coarse_offsets, all_children, all_neighbours, pair_offsets) == AST_OK,
+        "%s", what);
+  WRITABLE(offsets);
+  int64_t C = 0, *first_child = copy_ints(all_children, coarse_offsets[B] + 1),
+          *neighbours = copy_ints(all_neighbours, 8 * coarse_offsets[B]);
   for (int64_t b = 0; b < B; b++) {
     CHECK(coarse_offsets[b] == C, "%s: scene %lld", what, (long long)b);
     for (int64_t f = offsets[b]; f < offsets[b + 1]; f++) {
@@ -135,8 +138,10 @@ static void check_coarsen(const ast_kernels *kernels, int64_t *keys, int64_t *of
       }
 
   int64_t *pair[4];
-  for (int i = 0; i < 4; i++) pair[i] = ints(pair_offsets[27]);
-  CHECK(kernels->octree_pairs(keys, first_child, neighbours, C, pair_offsets, pair[0], pair[1], pair[2], pair[3]) == AST_OK, "%s", what);
+  for (int i = 0; i < 4; i++) pair[i] = new_ints(pair_offsets[27]);
+  READ_ONLY(first_child, neighbours, pair_offsets);
+  CHECK(kernels->octree_pairs(fine_keys, first_child, neighbours, C, pair_offsets, pair[0], pair[1], pair[2], pair[3]) == AST_OK, "%s",
+        what);
   for (int64_t k = 0, by_fine = 0; k < 27; k++) {
     const int64_t step[3] = {k / 9 - 1, k / 3 % 3 - 1, k % 3 - 1};
     for (int64_t b = 0; b < B; b++) {
@@ -164,14 +169,15 @@ static void check_coarsen(const ast_kernels *kernels, int64_t *keys, int64_t *of
     CHECK(pair_offsets[k + 1] == pairs && pairs == by_fine, "%s: offset %lld has %lld pairs", what, (long long)k, (long long)pairs);
   }
   if (C > 0) {
+    WRITABLE(pair_offsets);
     pair_offsets[27]--;
-    CHECK(kernels->octree_pairs(keys, first_child, neighbours, C, pair_offsets, pair[0], pair[1], pair[2], pair[3]) == AST_MISMATCH,
+    CHECK(kernels->octree_pairs(fine_keys, first_child, neighbours, C, pair_offsets, pair[0], pair[1], pair[2], pair[3]) == AST_MISMATCH,
           "%s: wrong pair_offsets", what);
   }
   memcpy(keys, coarse_keys, (size_t)C * sizeof *keys);
   memcpy(offsets, coarse_offsets, (size_t)(B + 1) * sizeof *offsets);
-  for (int i = 0; i < 4; i++) free(pair[i]);
-  free(coarse_keys), free(coarse_offsets), free(first_child), free(neighbours);
+  FREE(pair[0], pair[1], pair[2], pair[3], fine_keys, coarse_keys, coarse_offsets, first_child, neighbours);
+  FREE(all_children, all_neighbours, pair_offsets);
 }
 
 static void check_levels(const ast_kernels *kernels, cloud s, const double center[3], double half_width, int depth, int levels,
@@ -188,14 +194,14 @@ static void check_levels(const ast_kernels *kernels, cloud s, const double cente
 /* ---- clouds ---- */
 
 static cloud new_cloud(int64_t N, int64_t B) {
-  cloud s = {N, B, ints(B + 1), malloc((size_t)(3 * N + 1) * sizeof(float))};
+  cloud s = {N, B, new_ints(B + 1), new_floats(3 * N)};
   s.offsets[0] = 0;
   for (int64_t b = 1; b <= B; b++) /* some scenes are empty; the last takes the rest */
     s.offsets[b] = b == B ? N : b % 3 == 2 ? s.offsets[b - 1] : s.offsets[b - 1] + (N - s.offsets[b - 1]) / 2;
   return s;
 }
 
-static void free_cloud(cloud s) { free(s.offsets), free(s.positions); }
+static void free_cloud(cloud s) { FREE(s.offsets, s.positions); }
 
 enum { RANDOM, COINCIDENT, COLLINEAR, PLANAR, LATTICE, EDGES, SPHERE, SHAPES };
 static const char *const shapes[] = {"random", "coincident", "collinear", "planar", "lattice", "edges", "sphere"};

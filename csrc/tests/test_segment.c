@@ -2,9 +2,8 @@
 #include "check.h"
 
 static void compare(const ast_kernels *kernels, int64_t N, int64_t C, int64_t F, bool mean) {
-  float *x = malloc((size_t)(N * F + 1) * 4), *out = malloc((size_t)(C * F + 1) * 4), *back = malloc((size_t)(N * F + 1) * 4);
-  int64_t *order = malloc((size_t)(N + 1) * 8), *offsets = malloc((size_t)(C + 1) * 8);
-  for (int64_t i = 0; i < N * F; i++) x[i] = random_float();
+  float *x = random_floats(N * F), *out = new_floats(C * F), *back = new_floats(N * F);
+  int64_t *order = new_ints(N), *offsets = new_ints(C + 1);
   for (int64_t i = 0; i < N; i++) order[i] = i;
   for (int64_t i = N - 1; i > 0; i--) {
     const int64_t j = (int64_t)(random_bits() % (uint64_t)(i + 1)), o = order[i];
@@ -16,9 +15,9 @@ static void compare(const ast_kernels *kernels, int64_t N, int64_t C, int64_t F,
     const int64_t left = N - offsets[c - 1];
     offsets[c] = c == C ? N : offsets[c - 1] + (int64_t)(random_bits() % (uint64_t)(left / 2 + 1));
   }
-  memset(out, 0xff, (size_t)(C * F) * 4);
-  memset(back, 0xff, (size_t)(N * F) * 4);
+  READ_ONLY(x, order, offsets);
   CHECK(kernels->segment_sum(x, F, order, offsets, C, mean, out) == AST_OK, "status");
+  READ_ONLY(out);
   CHECK(kernels->segment_spread(out, F, order, offsets, C, mean, back) == AST_OK, "status");
   for (int64_t c = 0; c < C; c++)
     for (int64_t f = 0; f < F; f++) {
@@ -33,7 +32,7 @@ static void compare(const ast_kernels *kernels, int64_t N, int64_t C, int64_t F,
       CHECK(fabs((double)out[c * F + f] - sum / count) <= 1e-7 * (double)(offsets[c + 1] - offsets[c] + 2) * magnitude / count + 0.0,
             "N %lld C %lld F %lld: %g", (long long)N, (long long)C, (long long)F, (double)out[c * F + f]);
     }
-  free(x), free(out), free(back), free(order), free(offsets);
+  FREE(x, out, back, order, offsets);
 }
 
 static void test(const ast_kernels *kernels) {

@@ -11,6 +11,14 @@ typedef struct {
   int64_t *source, *destination;
 } pair_list;
 
+/* The pairs of a list as they are handed to a kernel: in buffers of just their size. */
+static ast_pairs exact_pairs(const pair_list *p) {
+  const int64_t n = p->offsets[OFFSETS];
+  const ast_pairs pairs = {copy_ints(p->offsets, OFFSETS + 1), copy_ints(p->source, n), copy_ints(p->destination, n)};
+  READ_ONLY(pairs.offsets, pairs.source, pairs.destination);
+  return pairs;
+}
+
 /* A destination has a pair in a group with the given probability; its source is any row of the same part of the rows, of
  * which there are `parts` (the scenes of a batch). */
 static pair_list new_pairs(int64_t sources, int64_t destinations, double density, int64_t parts) {
@@ -31,32 +39,25 @@ static pair_list new_pairs(int64_t sources, int64_t destinations, double density
   return p;
 }
 
-static float *random_floats(int64_t n) {
-  float *x = malloc((size_t)(n + 1) * sizeof *x);
-  CHECK(x, "no memory");
-  for (int64_t i = 0; i < n; i++) x[i] = random_float();
-  return x;
-}
-
-static float *unwritten(int64_t n) {
-  float *x = random_floats(n);
-  memset(x, 0xff, (size_t)n * sizeof *x);
-  return x;
-}
-
 static float *convolve(const ast_kernels *kernels, const pair_list *p, const float *x, const float *weight, int64_t C_in, int64_t C_out,
                        bool transposed) {
-  float *out = unwritten(p->destinations * C_out);
-  const ast_pairs pairs = {p->offsets, p->source, p->destination};
+  float *out = new_floats(p->destinations * C_out);
+  const ast_pairs pairs = exact_pairs(p);
+  READ_ONLY(x, weight);
   CHECK(kernels->sparse_conv(x, weight, C_in, C_out, transposed, pairs, p->destinations, out) == AST_OK, "status");
+  WRITABLE(x, weight);
+  FREE(pairs.offsets, pairs.source, pairs.destination);
   return out;
 }
 
 static float *weight_gradient(const ast_kernels *kernels, const pair_list *p, const float *x, const float *dout, int64_t C_in,
                               int64_t C_out) {
-  float *dweight = unwritten(OFFSETS * C_in * C_out);
-  const ast_pairs pairs = {p->offsets, p->source, p->destination};
+  float *dweight = new_floats(OFFSETS * C_in * C_out);
+  const ast_pairs pairs = exact_pairs(p);
+  READ_ONLY(x, dout);
   CHECK(kernels->sparse_conv_weight(x, dout, C_in, C_out, pairs, dweight) == AST_OK, "status");
+  WRITABLE(x, dout);
+  FREE(pairs.offsets, pairs.source, pairs.destination);
   return dweight;
 }
 
@@ -99,7 +100,8 @@ static void check_case(const ast_kernels *kernels, int64_t sources, int64_t dest
   float *out = convolve(kernels, &p, x, weight, C_in, C_out, transposed), *dweight = weight_gradient(kernels, &p, x, dout, C_in, C_out);
   compare("out", out, exact, plain, n);
   compare("dweight", dweight, exact + n, plain + n, m);
-  free(p.source), free(p.destination), free(x), free(weight), free(dout), free(exact), free(plain), free(out), free(dweight);
+  free(p.source), free(p.destination), free(exact), free(plain);
+  FREE(x, weight, dout, out, dweight);
 }
 
 static void test_accuracy(const ast_kernels *kernels) {
@@ -127,7 +129,8 @@ static void test_adjoint(const ast_kernels *kernels) {
   for (int64_t i = 0; i < n * C_out; i++) left += (double)out[i] * (double)y[i], magnitude += fabs((double)out[i] * (double)y[i]);
   for (int64_t i = 0; i < n * C_in; i++) right += (double)x[i] * (double)back[i];
   CHECK(fabs(left - right) <= 1e-6 * magnitude, "%.9g and %.9g", left, right);
-  free(p.source), free(p.destination), free(q.source), free(q.destination), free(x), free(y), free(weight), free(out), free(back);
+  free(p.source), free(p.destination), free(q.source), free(q.destination);
+  FREE(x, y, weight, out, back);
 }
 
 /* A scene alone gives the bits that it gives in a batch, and a NaN in another scene does not reach it. */
@@ -152,7 +155,8 @@ static void test_batch(const ast_kernels *kernels) {
   float *alone = convolve(kernels, &one, x + one.sources * C_in, weight, C_in, C_out, false);
   for (int64_t i = 0; i < one.destinations * C_out; i++) CHECK(isfinite(alone[i]), "out[%lld]", (long long)i);
   CHECK(!memcmp(alone, batch + one.destinations * C_out, (size_t)(one.destinations * C_out) * sizeof *alone), "not the same bits");
-  free(both.source), free(both.destination), free(one.source), free(one.destination), free(x), free(weight), free(batch), free(alone);
+  free(both.source), free(both.destination), free(one.source), free(one.destination);
+  FREE(x, weight, batch, alone);
 }
 
 /* The pool that this run is on gives what the calling thread alone gives. */
@@ -168,8 +172,8 @@ static void test_threads(const ast_kernels *kernels) {
   }
   CHECK(!memcmp(out[0], out[1], (size_t)(n * C_out) * sizeof(float)), "threads change the result");
   CHECK(!memcmp(dweight[0], dweight[1], (size_t)(OFFSETS * C_in * C_out) * sizeof(float)), "threads change the weight gradient");
-  free(p.source), free(p.destination), free(x), free(dout), free(weight);
-  for (int i = 0; i < 2; i++) free(out[i]), free(dweight[i]);
+  free(p.source), free(p.destination);
+  FREE(x, dout, weight, out[0], out[1], dweight[0], dweight[1]);
 }
 
 static void test(const ast_kernels *kernels) {
