@@ -34,7 +34,17 @@ INSTRUCTION_SETS = {
     ],
 }
 HEADERS = [str(path) for path in sorted(Path("csrc").glob("*.h"))]
-KERNELS = ["kernels.c", "octree.c", "coarsen.c", "fps.c", "sparse_conv.c", "attention.c", "segment.c"]
+KERNELS = [
+    "kernels.c",
+    "octree.c",
+    "coarsen.c",
+    "fps.c",
+    "sparse_conv.c",
+    "attention.c",
+    "segment.c",
+    "message.c",
+    "message_backward.c",
+]
 
 
 def compiles(flags: list[str]) -> bool:

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import torch
 
-from ast_sim.ops import attention, segment, sparse_conv
+from ast_sim.ops import attention, message, segment, sparse_conv
+from ast_sim.ops.edges import EdgeSet
 from ast_sim.ops.library import configuration
 from ast_sim.ops.octree import octree
 from tests.checks import errors
@@ -91,10 +92,42 @@ def convolutions(seed: int) -> Iterator[tuple[str, Case]]:
         )
 
 
+def messages(seed: int) -> Iterator[tuple[str, Case]]:
+    g = torch.Generator().manual_seed(seed)
+    senders, receivers = (int(torch.randint(1, 2000, (1,), generator=g)) for _ in range(2))
+    pairs = (torch.randint(0, n, (4 * receivers,), generator=g) for n in (senders, receivers))
+    edges = EdgeSet.from_pairs(*pairs, senders, receivers)
+    width = (16, 40, 64, 128)[seed % 4]
+    shapes = [(senders, width), (receivers, width), (width, width), (width,), (width,), (width,)]
+    plain = [torch.randn(shape, generator=g) * (shape[0] ** -0.5 if i == 2 else 1) for i, shape in enumerate(shapes)]
+    shapes = [(len(edges), 8), (width, 8), (width,), (width, width)]
+    encoder = [torch.randn(shape, generator=g) * (width**-0.5 if i == 3 else 1) for i, shape in enumerate(shapes)]
+    lists = (edges.senders, edges.receivers)
+    results = ["out", "dof_senders", "dof_receivers", "dW2", "db2", "dgamma", "dbeta"]
+    yield (
+        "message_sum",
+        (
+            lambda P, Q, *layer: message.message_sum(edges, P, Q, None, None, *layer),
+            lambda P, Q, *layer: message._compose(P, Q, None, None, *layer, *lists)[0],
+            plain,
+            results,
+        ),
+    )
+    yield (
+        "message_sum, encoder",
+        (
+            lambda P, Q, a, b, c, d, e, *x: message.message_sum(edges, P, Q, e, tuple(x), a, b, c, d),
+            lambda P, Q, a, b, c, d, e, *x: message._compose(P, Q, e, tuple(x), a, b, c, d, *lists)[0],
+            [*plain, *encoder],
+            [*results, "dedge_features", "dA1", "da1", "dA2"],
+        ),
+    )
+
+
 def main() -> None:
     worst: dict[tuple[str, str], tuple[float, float, float]] = {}
     for seed in range(SEEDS):
-        for family in (segments, attentions, convolutions):
+        for family in (segments, attentions, convolutions, messages):
             for name, (op, reference, inputs, results) in family(seed):
                 for result, (c, t, magnitude) in zip(results, errors(op, reference, inputs), strict=True):
                     c, t = c / max(magnitude, 1e-300), t / max(magnitude, 1e-300)

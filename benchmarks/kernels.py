@@ -25,7 +25,7 @@ from ast_sim.evaluate import provenance
 from ast_sim.ops.library import configuration
 from benchmarks.case import Case
 
-FAMILIES = ("octree", "fps", "sparse_conv", "attention", "segment")
+FAMILIES = ("octree", "fps", "sparse_conv", "attention", "segment", "message")
 SHORTEST = 2e-3  # seconds of a sample at least: faster calls are repeated within it
 
 

@@ -26,7 +26,7 @@ static bool debug; /* AST_SIM_DEBUG=1 */
 /* ---- arguments ---- */
 
 enum { FLOATS = NPY_FLOAT32, INTS = NPY_INT64, SMALL_INTS = NPY_INT32 };
-enum { MAX_ARRAYS = 12, MAX_SHAPE = 4, ANY = -1 };
+enum { MAX_ARRAYS = 28, MAX_SHAPE = 4, ANY = -1 };
 
 typedef struct {
   const char *name;

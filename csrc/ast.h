@@ -38,6 +38,22 @@ typedef struct {
   const int64_t *source, *destination; /* [offsets[27]] */
 } ast_pairs;
 
+/* One step of message passing over M edges from S senders to R receivers (message.c). Edges are sorted by receiver. */
+typedef struct {
+  int64_t M, S, R;
+  int64_t E, H, F, F2; /* channels: raw edge features, encoder's hidden layer (0 without an encoder), first layer, messages */
+  const int64_t *senders, *receivers, *receiver_offsets; /* [M], [M] ascending, [R+1] */
+  const float *of_senders, *of_receivers;                /* [S,F], [R,F]: their shares of the first layer */
+  const float *edge_features;                            /* [M,E] */
+  const float *A1, *a1, *A2;                             /* [H,E], [H], [F,H] */
+  const float *W2, *b2, *gamma, *beta;                   /* [F2,F], [F2], [F2], [F2] */
+} ast_message;
+
+/* Its gradients, of the shapes of the inputs; edge_features may be NULL. */
+typedef struct {
+  float *of_senders, *of_receivers, *edge_features, *A1, *a1, *A2, *W2, *b2, *gamma, *beta;
+} ast_message_gradients;
+
 /* One table per instruction set; every entry has the same contract on each. */
 typedef struct {
   const char *isa;
@@ -99,6 +115,13 @@ typedef struct {
   ast_status (*attention_backward)(const ast_attention *s, const float *restrict q, const float *restrict k, const float *restrict v,
                                    const float *restrict out, const float *restrict maximum, const float *restrict sum,
                                    const float *restrict dout, float *restrict dq, float *restrict dk, float *restrict dv);
+
+  /* sum[r] = sum over the edges m into r, in stored order, of messages[m] = LN(W2 relu(z_m) + b2; gamma, beta), where
+   * z_m = of_senders[s] + of_receivers[r] + A2 relu(A1 e_m + a1); 0 without edges. sum [R,F2]; messages [M,F2] or NULL. */
+  ast_status (*message)(const ast_message *s, float *restrict sum, float *restrict messages);
+  /* Its gradients, layers recomputed. dsum [R,F2], dmessages [M,F2] or NULL. */
+  ast_status (*message_backward)(const ast_message *s, const float *restrict dsum, const float *restrict dmessages,
+                                 const ast_message_gradients *out);
 } ast_kernels;
 
 /* dispatch.c: the table of an instruction set by name ("base", "avx2", "avx512"), or of the best one if name is NULL.

@@ -10,6 +10,8 @@
 #include "coarsen.c" /* after octree.c, whose runs it uses */
 #include "segment.c"
 #include "sparse_conv.c"
+#include "message.c"
+#include "message_backward.c" /* after message.c, whose tiles it uses */
 
 #define AST_TABLE_OF(isa)  ast_kernels_##isa
 #define AST_TABLE(isa)     AST_TABLE_OF(isa)
@@ -32,4 +34,6 @@ const ast_kernels AST_TABLE(AST_ISA) = {
     .sparse_conv_weight = sparse_conv_weight,
     .attention = attention,
     .attention_backward = attention_backward,
+    .message = message,
+    .message_backward = message_backward,
 };

@@ -290,6 +290,94 @@ static PyObject *attention_backward(PyObject *self, PyObject *const *objects, Py
   Py_RETURN_NONE;
 }
 
+/* ---- message passing ---- */
+
+static bool check_receivers(const call *c, const argument *receivers, const argument *offsets) {
+  const int64_t *receiver = receivers->data, *offset = offsets->data;
+  for (int64_t r = 0; r + 1 < offsets->shape[0]; r++)
+    for (int64_t m = offset[r]; m < offset[r + 1]; m++)
+      if (receiver[m] != r)
+        return fail(c, PyExc_ValueError, "receivers[%lld] is %lld, but receiver_offsets say %lld", (long long)m, (long long)receiver[m],
+                    (long long)r);
+  return true;
+}
+
+static bool take_message(call *c, ast_message *s) {
+  argument *P, *Q, *e, *A1, *a1, *A2, *W2, *b2, *gamma, *beta, *senders, *receivers, *offsets;
+  if (!(P = IN(c, "of_senders", FLOATS, 2, FREE, FREE)) || !(Q = IN(c, "of_receivers", FLOATS, 2, FREE, P->shape[1])) ||
+      !(e = IN(c, "edge_features", FLOATS, 2, FREE, FREE)) || !(A1 = IN(c, "A1", FLOATS, 2, FREE, e->shape[1])) ||
+      !(a1 = IN(c, "a1", FLOATS, 1, A1->shape[0])) || !(A2 = IN(c, "A2", FLOATS, 2, P->shape[1], A1->shape[0])) ||
+      !(W2 = IN(c, "W2", FLOATS, 2, FREE, P->shape[1])) || !(b2 = IN(c, "b2", FLOATS, 1, W2->shape[0])) ||
+      !(gamma = IN(c, "gamma", FLOATS, 1, W2->shape[0])) || !(beta = IN(c, "beta", FLOATS, 1, W2->shape[0])) ||
+      !(senders = IN(c, "senders", INTS, 1, e->shape[0])) || !(receivers = IN(c, "receivers", INTS, 1, e->shape[0])) ||
+      !(offsets = IN(c, "receiver_offsets", INTS, 1, Q->shape[0] + 1)) || !check_offsets(c, offsets, e->shape[0]) ||
+      !check_indices(c, senders, e->shape[0], P->shape[0]) || !check_receivers(c, receivers, offsets))
+    return false;
+  *s = (ast_message){
+      .M = e->shape[0],
+      .S = P->shape[0],
+      .R = Q->shape[0],
+      .E = e->shape[1],
+      .H = A1->shape[0],
+      .F = P->shape[1],
+      .F2 = W2->shape[0],
+      .senders = senders->data,
+      .receivers = receivers->data,
+      .receiver_offsets = offsets->data,
+      .of_senders = P->data,
+      .of_receivers = Q->data,
+      .edge_features = e->data,
+      .A1 = A1->data,
+      .a1 = a1->data,
+      .A2 = A2->data,
+      .W2 = W2->data,
+      .b2 = b2->data,
+      .gamma = gamma->data,
+      .beta = beta->data,
+  };
+  return true;
+}
+
+/* An array [M, width], or [0, width] where it is not given or not wanted. */
+static bool check_rows(const call *c, const argument *a, int64_t M) {
+  if (a->shape[0] == 0 || a->shape[0] == M) return true;
+  return fail(c, PyExc_ValueError, "%s must have 0 or %lld rows, not %lld", a->name, (long long)M, (long long)a->shape[0]);
+}
+
+static PyObject *message(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  call c;
+  argument *sum, *messages;
+  ast_message s;
+  ast_status status;
+  if (!start(&c, "message", objects, num, 15) || !take_message(&c, &s) || !(sum = OUT(&c, "sum", FLOATS, 2, s.R, s.F2)) ||
+      !(messages = OUT(&c, "messages", FLOATS, 2, FREE, s.F2)) || !check_rows(&c, messages, s.M))
+    return NULL;
+  KERNEL(c, status, kernels->message(&s, sum->data, messages->shape[0] ? messages->data : NULL));
+  Py_RETURN_NONE;
+}
+
+static PyObject *message_backward(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  call c;
+  argument *dsum, *dmessages, *P, *Q, *e, *A1, *a1, *A2, *W2, *b2, *gamma, *beta;
+  ast_message s;
+  ast_status status;
+  if (!start(&c, "message_backward", objects, num, 25) || !take_message(&c, &s) || !(dsum = IN(&c, "dsum", FLOATS, 2, s.R, s.F2)) ||
+      !(dmessages = IN(&c, "dmessages", FLOATS, 2, FREE, s.F2)) || !check_rows(&c, dmessages, s.M) ||
+      !(P = OUT(&c, "dof_senders", FLOATS, 2, s.S, s.F)) || !(Q = OUT(&c, "dof_receivers", FLOATS, 2, s.R, s.F)) ||
+      !(e = OUT(&c, "dedge_features", FLOATS, 2, FREE, s.E)) || !check_rows(&c, e, s.M) || !(A1 = OUT(&c, "dA1", FLOATS, 2, s.H, s.E)) ||
+      !(a1 = OUT(&c, "da1", FLOATS, 1, s.H)) || !(A2 = OUT(&c, "dA2", FLOATS, 2, s.F, s.H)) ||
+      !(W2 = OUT(&c, "dW2", FLOATS, 2, s.F2, s.F)) || !(b2 = OUT(&c, "db2", FLOATS, 1, s.F2)) ||
+      !(gamma = OUT(&c, "dgamma", FLOATS, 1, s.F2)) || !(beta = OUT(&c, "dbeta", FLOATS, 1, s.F2)))
+    return NULL;
+  const ast_message_gradients out = {
+      P->data, Q->data, e->shape[0] ? e->data : NULL, A1->data, a1->data, A2->data, W2->data, b2->data, gamma->data, beta->data,
+  };
+  KERNEL(c, status, kernels->message_backward(&s, dsum->data, dmessages->shape[0] ? dmessages->data : NULL, &out));
+  Py_RETURN_NONE;
+}
+
 /* ---- the process ---- */
 
 /* The addresses of torch_parallel_for and torch_get_num_threads. */
@@ -342,6 +430,12 @@ static PyMethodDef methods[] = {
     FAST(attention_backward,
          "attention_backward(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, out, maximum, sum, dout, dq, "
          "dk, dv)"),
+    FAST(message,
+         "message(of_senders, of_receivers, edge_features, A1, a1, A2, W2, b2, gamma, beta, senders, receivers, receiver_offsets, "
+         "sum, messages)"),
+    FAST(message_backward,
+         "message_backward(of_senders, of_receivers, edge_features, A1, a1, A2, W2, b2, gamma, beta, senders, receivers, "
+         "receiver_offsets, dsum, dmessages, then the gradients in the order of the inputs)"),
     FAST(set_pool, "set_pool(parallel_for, num_threads): addresses of torch's thread pool, 0 for serial"),
     {"keep_memory", keep_memory, METH_NOARGS, "Let the C library keep freed blocks; whether it had an effect."},
     {"configuration", configuration, METH_NOARGS, "The chosen instruction set, the supported ones, the threads, the debug mode."},

@@ -1,0 +1,235 @@
+"""One step of message passing over a set of edges, fused: encoder, two layers, LayerNorm and the sum at the receivers.
+
+    z_m = of_senders[s] + of_receivers[r] + A2 relu(A1 e_m + a1)
+    message_m = LayerNorm(W2 relu(z_m) + b2; gamma, beta),    sum_r = sum of the messages over the edges into r
+
+The C kernel keeps no array of the width of a feature per edge, neither within a call nor for the gradients: those
+recompute the layers.
+
+Legend: M edges, S senders, R receivers, E raw edge features, H channels of the encoder's hidden layer, F channels of
+the first layer, F2 channels of a message.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ast_sim.ops import library
+from ast_sim.ops.edges import EdgeSet
+from ast_sim.ops.library import array, check_offsets
+
+EPS = 1e-5
+Encoder = tuple[Tensor, Tensor, Tensor]
+
+
+def _compose(of_senders, of_receivers, edge_features, encoder, W2, b2, gamma, beta, senders, receivers):
+    """(sum, messages) as torch ops that hold every layer of every edge."""
+    z = of_senders.index_select(0, senders) + of_receivers.index_select(0, receivers)
+    if encoder is not None:
+        A1, a1, A2 = encoder
+        z = z + F.linear(F.relu(F.linear(edge_features, A1, a1)), A2)
+    messages = F.layer_norm(F.linear(F.relu(z), W2, b2), (len(b2),), gamma, beta, EPS)
+    return messages.new_zeros(len(of_receivers), len(b2)).index_add(0, receivers, messages), messages
+
+
+def _check(
+    of_senders, of_receivers, edge_features, A1, a1, A2, W2, b2, gamma, beta, senders, receivers, offsets
+) -> None:
+    """The checks of the C module, for the composition."""
+    edges, inputs = edge_features.shape if edge_features.dim() == 2 else (-1, -1)
+    channels = of_senders.shape[1] if of_senders.dim() == 2 else -1
+    hidden, out = len(a1), len(b2)
+    for name, x, shape in (
+        ("of_senders", of_senders, (len(of_senders), channels)),
+        ("of_receivers", of_receivers, (len(of_receivers), channels)),
+        ("edge_features", edge_features, (edges, inputs)),
+        ("A1", A1, (hidden, inputs)),
+        ("a1", a1, (hidden,)),
+        ("A2", A2, (channels, hidden)),
+        ("W2", W2, (out, channels)),
+        ("b2", b2, (out,)),
+        ("gamma", gamma, (out,)),
+        ("beta", beta, (out,)),
+        ("senders", senders, (edges,)),
+        ("receivers", receivers, (edges,)),
+        ("receiver_offsets", offsets, (len(of_receivers) + 1,)),
+    ):
+        if x.shape != shape:
+            wanted = ", ".join("*" if n < 0 else str(n) for n in shape)
+            raise ValueError(f"message: {name} must have shape [{wanted}], not {tuple(x.shape)}")
+    check_offsets("message", "receiver_offsets", offsets, edges)
+    wrong = ((senders < 0) | (senders >= len(of_senders))).nonzero()
+    if len(wrong):
+        at = int(wrong[0])
+        raise ValueError(f"message: senders[{at}] = {int(senders[at])} is not an index below {len(of_senders)}")
+    wrong = (receivers != torch.arange(len(of_receivers)).to(offsets).repeat_interleave(offsets.diff())).nonzero()
+    if len(wrong):
+        at = int(wrong[0])
+        raise ValueError(f"message: receivers[{at}] is {int(receivers[at])}, but receiver_offsets say otherwise")
+
+
+def _reference(
+    of_senders, of_receivers, edge_features, A1, a1, A2, W2, b2, gamma, beta, senders, receivers, offsets, with_messages
+):
+    inputs = (of_senders, of_receivers, edge_features, A1, a1, A2, W2, b2, gamma, beta)
+    _check(*inputs, senders, receivers, offsets)
+    total, messages = _compose(*inputs[:3], (A1, a1, A2), *inputs[6:], senders, receivers)
+    return total, messages if with_messages else messages.new_empty(0, len(b2))
+
+
+def _kernel(of_senders, of_receivers, edge_features, *weights_and_edges):
+    *weights_and_edges, with_messages = weights_and_edges
+    width = len(weights_and_edges[4])
+    total = of_receivers.new_empty(of_receivers.shape[0], width)
+    messages = of_receivers.new_empty(len(edge_features) if with_messages else 0, width)
+    inputs = (of_senders, of_receivers, edge_features, *weights_and_edges)
+    library._C.message(*(array(x) for x in inputs), array(total), array(messages))
+    return total, messages
+
+
+def _fake(of_senders, of_receivers, edge_features, A1, a1, A2, W2, b2, *edges):
+    total = of_receivers.new_empty(of_receivers.shape[0], b2.shape[0])
+    return total, of_receivers.new_empty(edge_features.shape[0] if edges[-1] else 0, b2.shape[0])
+
+
+def _backward_reference(
+    dsum, dmessages, P, Q, e, A1, a1, A2, W2, b2, gamma, beta, senders, receivers, offsets, wants_edges
+):
+    _check(P, Q, e, A1, a1, A2, W2, b2, gamma, beta, senders, receivers, offsets)
+    h = F.relu(F.linear(e, A1, a1))
+    x = F.relu(P.index_select(0, senders) + Q.index_select(0, receivers) + F.linear(h, A2))
+    y = F.linear(x, W2, b2)
+    _, mean, rstd = torch.native_layer_norm(y, (len(b2),), gamma, beta, EPS)
+    g = dsum.index_select(0, receivers)
+    if len(dmessages):
+        g = g + dmessages
+    dy, dgamma, dbeta = torch.ops.aten.native_layer_norm_backward(
+        g, y, (len(b2),), mean, rstd, gamma, beta, (True, True, True)
+    )
+    dz = (dy @ W2) * (x > 0)
+    dc = (dz @ A2) * (h > 0)
+    return (
+        torch.zeros_like(P).index_add_(0, senders, dz),
+        torch.zeros_like(Q).index_add_(0, receivers, dz),
+        dc @ A1 if wants_edges else e.new_empty(0, e.shape[1]),
+        dc.T @ e,
+        dc.sum(0),
+        dz.T @ h,
+        dy.T @ x,
+        dy.sum(0),
+        dgamma,
+        dbeta,
+    )
+
+
+def _outputs(inputs, wants_edges: bool) -> list[Tensor]:
+    """Empty tensors for the gradients of the ten float inputs."""
+    shapes = [x.shape for x in inputs]
+    if not wants_edges:
+        shapes[2] = (0, shapes[2][1])
+    return [x.new_empty(shape) for x, shape in zip(inputs, shapes, strict=True)]
+
+
+def _backward_kernel(dsum, dmessages, *inputs):
+    *inputs, wants_edges = inputs
+    out = _outputs(inputs[:10], wants_edges)
+    library._C.message_backward(*(array(x) for x in (*inputs, dsum, dmessages, *out)))
+    return tuple(out)
+
+
+def _backward_fake(dsum, dmessages, *inputs):
+    return tuple(_outputs(inputs[:10], inputs[-1]))
+
+
+_INPUTS = (
+    "Tensor of_senders, Tensor of_receivers, Tensor edge_features, Tensor A1, Tensor a1, Tensor A2,"
+    " Tensor W2, Tensor b2, Tensor gamma, Tensor beta, Tensor senders, Tensor receivers, Tensor receiver_offsets"
+)
+_message = library.define(f"message({_INPUTS}, bool with_messages) -> (Tensor, Tensor)", _kernel, _reference, _fake)
+_message_backward = library.define(
+    f"message_backward(Tensor dsum, Tensor dmessages, {_INPUTS}, bool wants_edges) -> ({', '.join(['Tensor'] * 10)})",
+    _backward_kernel,
+    _backward_reference,
+    _backward_fake,
+)
+
+
+def _save(ctx, inputs, output) -> None:
+    *tensors, ctx.with_messages = inputs
+    ctx.save_for_backward(*tensors)
+
+
+def _gradient(ctx, dsum, dmessages):
+    if not ctx.with_messages:
+        dmessages = dsum.new_empty(0, dsum.shape[1])
+    wants_edges = ctx.needs_input_grad[2]
+    gradients = list(_message_backward(dsum, dmessages, *ctx.saved_tensors, wants_edges))
+    if not wants_edges:
+        gradients[2] = None
+    return *gradients, None, None, None, None
+
+
+library.differentiate(_message, _save, _gradient)
+
+
+def _call(edges: EdgeSet, of_senders, of_receivers, edge_features, encoder, W2, b2, gamma, beta, with_messages: bool):
+    if (edge_features is None) != (encoder is None):
+        raise ValueError("message: edge_features and encoder must be given together or not at all")
+    if library.BACKEND == "torch":
+        inputs = (of_senders, of_receivers, edge_features, encoder, W2, b2, gamma, beta)
+        return _compose(*inputs, edges.senders, edges.receivers)
+    if encoder is None:
+        edge_features = of_senders.new_empty(len(edges), 0)
+        encoder = (of_senders.new_empty(0, 0), of_senders.new_empty(0), of_senders.new_empty(of_senders.shape[-1], 0))
+    lists = (edges.senders, edges.receivers, edges.receiver_offsets)
+    return _message(of_senders, of_receivers, edge_features, *encoder, W2, b2, gamma, beta, *lists, with_messages)
+
+
+def message_sum(
+    edges: EdgeSet,
+    of_senders: Tensor,
+    of_receivers: Tensor,
+    edge_features: Tensor | None,
+    encoder: Encoder | None,
+    W2: Tensor,
+    b2: Tensor,
+    gamma: Tensor,
+    beta: Tensor,
+) -> Tensor:
+    """Sum of LayerNorm(W2 relu(z_m) + b2) over the edges into each receiver, in stored order.
+
+    Args:
+        edges: M edges from S senders to R receivers.
+        of_senders: [S, F], the senders' share of the first layer, W_s v_s.
+        of_receivers: [R, F], the receivers' share and the constant.
+        edge_features: [M, E], or None without an encoder.
+        encoder: A1 [H, E], a1 [H] and A2 [F, H], or None.
+        W2: [F2, F], as `torch.nn.Linear` holds it.
+        b2: [F2].
+        gamma: [F2], weight of the LayerNorm.
+        beta: [F2], its bias.
+
+    Returns:
+        [R, F2]; 0 for a receiver without edges.
+
+    Raises:
+        ValueError: for shapes that do not fit each other or the edges.
+    """
+    return _call(edges, of_senders, of_receivers, edge_features, encoder, W2, b2, gamma, beta, False)[0]
+
+
+def message_edges(
+    edges: EdgeSet,
+    of_senders: Tensor,
+    of_receivers: Tensor,
+    edge_features: Tensor | None,
+    encoder: Encoder | None,
+    W2: Tensor,
+    b2: Tensor,
+    gamma: Tensor,
+    beta: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """`message_sum` and the messages [M, F2] themselves, for models that carry them on along the edges."""
+    return _call(edges, of_senders, of_receivers, edge_features, encoder, W2, b2, gamma, beta, True)

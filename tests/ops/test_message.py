@@ -1,0 +1,282 @@
+"""message_sum and message_edges against their composition and their contracts."""
+
+import pytest
+import torch
+from checks import assert_accurate, assert_same_for_threads, instruction_sets, misaligned_read_only, run_python
+from torch import Tensor
+
+from ast_sim.ops import message as ops
+from ast_sim.ops.edges import EdgeSet
+from ast_sim.ops.message import message_edges, message_sum
+
+
+def random_edges(edges: int, senders: int, receivers: int, seed: int = 0) -> EdgeSet:
+    g = torch.Generator().manual_seed(seed)
+    pairs = (torch.randint(0, max(n, 1), (edges if n else 0,), generator=g) for n in (senders, receivers))
+    return EdgeSet.from_pairs(*pairs, senders, receivers)
+
+
+def inputs_of(edges: EdgeSet, width: int, hidden: int = 0, raw: int = 0, out: int | None = None, seed: int = 1) -> list:
+    """of_senders, of_receivers, edge_features, A1, a1, A2, W2, b2, gamma, beta; no encoder if hidden is 0."""
+    g = torch.Generator().manual_seed(seed)
+    out = width if out is None else out
+    senders, receivers = len(edges.sender_offsets) - 1, len(edges.receiver_offsets) - 1
+
+    def normal(*shape: int, scale: float = 1.0) -> Tensor:
+        return scale * torch.randn(*shape, generator=g)
+
+    encoder = [normal(hidden, raw), normal(hidden), normal(width, hidden, scale=hidden**-0.5)] if hidden else [None] * 3
+    return [
+        normal(senders, width),
+        normal(receivers, width),
+        normal(len(edges), raw) if hidden else None,
+        *encoder,
+        normal(out, width, scale=width**-0.5),
+        normal(out),
+        1 + normal(out, scale=0.1),
+        normal(out),
+    ]
+
+
+def fused(edges: EdgeSet, function=message_sum):
+    def call(P, Q, e, A1, a1, A2, *layer):
+        return function(edges, P, Q, e, None if e is None else (A1, a1, A2), *layer)
+
+    return call
+
+
+def composed(edges: EdgeSet, with_messages: bool = False):
+    def call(P, Q, e, A1, a1, A2, *layer):
+        encoder = None if e is None else (A1, a1, A2)
+        both = ops._compose(P, Q, e, encoder, *layer, edges.senders, edges.receivers)
+        return both if with_messages else both[0]
+
+    return call
+
+
+SIZES = [(0, 3, 2), (0, 0, 0), (1, 1, 1), (2, 1, 3), (95, 7, 5), (97, 300, 200), (700, 60, 1), (4000, 500, 700)]
+WIDTHS = [(16, 16, 3, 16), (24, 40, 8, 40), (1, 1, 1, 1), (33, 7, 16, 65), (128, 128, 8, 128), (64, 0, 0, 64)]
+
+
+@pytest.mark.parametrize("width, hidden, raw, out", [*WIDTHS, (40, 0, 0, 24), (16, 16, 0, 16)])
+@pytest.mark.parametrize("size", SIZES)
+def test_accuracy(size, width, hidden, raw, out):
+    edges = random_edges(*size)
+    assert_accurate(fused(edges), composed(edges), inputs_of(edges, width, hidden, raw, out))
+
+
+@pytest.mark.parametrize("width, hidden, raw, out", WIDTHS)
+@pytest.mark.parametrize("size", [(0, 3, 2), (2, 1, 3), (700, 60, 50)])
+def test_accuracy_of_messages(size, width, hidden, raw, out):
+    edges = random_edges(*size)
+    assert_accurate(fused(edges, message_edges), composed(edges, True), inputs_of(edges, width, hidden, raw, out))
+
+
+def test_accuracy_over_several_rounds():
+    edges = random_edges(40_000, 3000, 2000)
+    assert_accurate(fused(edges), composed(edges), inputs_of(edges, 32, 16, 4))
+
+
+def test_values_by_hand():
+    """Two channels: LayerNorm gives +-1, up to eps, whatever the layers say."""
+    edges = EdgeSet.from_pairs(torch.tensor([0, 1, 1]), torch.tensor([2, 0, 2]), 2, 3)
+    P, Q = torch.tensor([[1.0, 0.0], [0.0, 3.0]]), torch.zeros(3, 2)
+    layer = (torch.eye(2), torch.zeros(2), torch.tensor([1.0, 10.0]), torch.tensor([0.0, 1.0]))
+    total = message_sum(edges, P, Q, None, None, *layer)
+    expected = torch.tensor([[-1.0, 11.0], [0.0, 0.0], [0.0, 2.0]])
+    torch.testing.assert_close(total, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_sums_run_in_stored_order():
+    edges = random_edges(500, 20, 5)
+    inputs = inputs_of(edges, 16, 16, 2)
+    total, messages = fused(edges, message_edges)(*inputs)
+    assert torch.equal(total, fused(edges)(*inputs))
+    for r in range(5):
+        expected = torch.zeros(16)
+        for m in range(int(edges.receiver_offsets[r]), int(edges.receiver_offsets[r + 1])):
+            expected = expected + messages[m]
+        assert torch.equal(total[r], expected)
+
+
+def test_one_receiver_and_one_sender_of_all_edges():
+    index, zero = torch.arange(3000), torch.zeros(3000, dtype=torch.int64)
+    for edges in (EdgeSet.from_pairs(index, zero, 3000, 1), EdgeSet.from_pairs(zero, index, 1, 3000)):
+        assert_accurate(fused(edges), composed(edges), inputs_of(edges, 32, 16, 4))
+
+
+@pytest.mark.parametrize("special", [float("nan"), float("inf"), -float("inf"), 3.4e38, 1e30, 1e-30, 1e-42])
+def test_extreme_values_stay_with_their_edges(special):
+    edges = random_edges(300, 40, 30)
+    inputs = inputs_of(edges, 24, 16, 3)
+    wanted = [x.clone().requires_grad_() for x in inputs[:2]]
+    expected = fused(edges)(*wanted, *inputs[2:])
+    gradients = torch.autograd.grad(expected.sum(), wanted)
+    inputs[0][7] = special
+    leaves = [x.clone().requires_grad_() for x in inputs[:2]]
+    out = fused(edges)(*leaves, *inputs[2:])
+    mine = edges.receivers[edges.senders == 7].unique()
+    others = torch.ones(30, dtype=torch.bool).index_fill(0, mine, False)
+    assert torch.equal(out[others], expected[others])
+    exact = composed(edges)(*(x.double() for x in inputs))
+    if special != special or abs(special) == float("inf"):
+        assert torch.equal(out.isnan(), exact.isnan()) and out.isnan().any() == (special != -torch.inf)
+    elif abs(special) < 1:
+        torch.testing.assert_close(out.double(), exact, rtol=1e-4, atol=1e-4)
+    of_senders = torch.autograd.grad(out.sum(), leaves)[0]
+    untouched = torch.ones(40, dtype=torch.bool).index_fill(0, torch.tensor([7]), False)
+    assert torch.equal(of_senders[untouched], gradients[0][untouched])
+
+
+def test_scene_alone_equals_scene_in_batch():
+    """Also the gradients of both nodes' shares, whatever comes before in the batch."""
+    scenes = [random_edges(n, 150, 200, seed=n) for n in (4000, 0, 333, 20_000, 17)]
+    both = EdgeSet.concatenate(scenes)
+    inputs = inputs_of(both, 40, 24, 5)
+    leaves = [x.clone().requires_grad_() for x in inputs[:3]]
+    total = fused(both)(*leaves, *inputs[3:])
+    dsum = torch.randn(total.shape)
+    expected = [total, *torch.autograd.grad(total, leaves, dsum)]
+    starts = [0, 0, 0, 0]
+    for edges in scenes:
+        rows = [slice(at, at + n) for at, n in zip(starts, (200, 150, 200, len(edges)), strict=True)]
+        starts = [x.stop for x in rows]
+        leaves = [x[part].clone().requires_grad_() for x, part in zip(inputs[:3], rows[1:], strict=True)]
+        total = fused(edges)(*leaves, *inputs[3:])
+        for x, y, part in zip([total, *torch.autograd.grad(total, leaves, dsum[rows[0]])], expected, rows, strict=True):
+            assert torch.equal(x, y[part])
+
+
+@pytest.mark.parametrize("size", [(5000, 700, 600), (30_000, 700, 600)])
+def test_bitwise_equal_for_threads(size):
+    edges = random_edges(*size)
+    inputs = inputs_of(edges, 40, 24, 5)
+    dsum = torch.randn(size[2], 40)
+
+    def function():
+        leaves = [x.clone().requires_grad_() for x in inputs]
+        out = fused(edges)(*leaves)
+        return out, *torch.autograd.grad(out, leaves, dsum)
+
+    assert_same_for_threads(function)
+
+
+CODE = """
+import sys; sys.path[:0] = ["tests", "tests/ops"]
+from checks import assert_accurate
+from test_message import composed, fused, inputs_of, message_edges, random_edges
+edges = random_edges(1500, 200, 150)
+for widths in ((24, 40, 8, 40), (33, 7, 16, 65), (128, 128, 8, 128), (64, 0, 0, 64)):
+    assert_accurate(fused(edges), composed(edges), inputs_of(edges, *widths))
+    assert_accurate(fused(edges, message_edges), composed(edges, True), inputs_of(edges, *widths))
+from ast_sim.ops.library import configuration
+print(configuration()["instruction_set"])
+"""
+
+
+def test_every_instruction_set():
+    for isa in instruction_sets():
+        assert run_python(CODE, AST_SIM_ISA=isa).strip() == isa
+
+
+TORCH = """
+import sys, torch; sys.path[:0] = ["tests", "tests/ops"]
+from test_message import composed, fused, inputs_of, message_edges, random_edges
+edges = random_edges(150, 20, 15)
+for widths in ((24, 40, 8, 40), (64, 0, 0, 64)):
+    inputs = inputs_of(edges, *widths)
+    out = fused(edges)(*(None if x is None else x.requires_grad_() for x in inputs))
+    assert torch.equal(out, composed(edges)(*inputs)) and "message" not in out.grad_fn.name().lower()
+    assert fused(edges, message_edges)(*inputs)[1].shape == (150, widths[-1])
+"""
+
+
+def test_torch_backend_is_the_composition_under_autograd():
+    run_python(TORCH, AST_SIM_BACKEND="torch")
+
+
+@pytest.mark.parametrize("with_messages", [False, True])
+def test_opcheck(with_messages):
+    edges = random_edges(30, 4, 5)
+    inputs = [x.requires_grad_() for x in inputs_of(edges, 6, 5, 3)]
+    lists = (edges.senders, edges.receivers, edges.receiver_offsets)
+    torch.library.opcheck(ops._message, (*inputs, *lists, with_messages))
+    values = [x.detach() for x in inputs]
+    dmessages = torch.randn(30 if with_messages else 0, 6)
+    torch.library.opcheck(ops._message_backward, (torch.randn(5, 6), dmessages, *values, *lists, with_messages))
+
+
+def test_gradients_in_float64():
+    edges = random_edges(12, 4, 5)
+    inputs = [x.double().requires_grad_() for x in inputs_of(edges, 4, 3, 2)]
+    assert torch.autograd.gradcheck(fused(edges, message_edges), inputs)
+    inputs = inputs_of(edges, 4)
+    floats = [x.double().requires_grad_() for x in inputs if x is not None]
+    assert torch.autograd.gradcheck(lambda P, Q, *layer: fused(edges)(P, Q, *[None] * 4, *layer), floats)
+
+
+@pytest.mark.parametrize("wanted", [(0,), (1,), (2,), (3, 5), (6,), (8, 9), (0, 2, 4, 7)])
+def test_any_subset_requires_grad(wanted):
+    edges = random_edges(200, 30, 40)
+    inputs = inputs_of(edges, 24, 16, 3)
+    every = [x.clone().requires_grad_() for x in inputs]
+    fused(edges)(*every).square().sum().backward()
+    for i in wanted:
+        inputs[i].requires_grad_()
+    fused(edges)(*inputs).square().sum().backward()
+    for i, x in enumerate(inputs):
+        assert torch.equal(x.grad, every[i].grad) if i in wanted else x.grad is None
+
+
+def test_messages_alone_are_differentiated():
+    edges = random_edges(200, 30, 40)
+    inputs = inputs_of(edges, 24, 16, 3)
+    assert_accurate(lambda *x: fused(edges, message_edges)(*x)[1], lambda *x: composed(edges, True)(*x)[1], inputs)
+
+
+def test_unusual_layouts_and_unchanged_inputs():
+    edges = random_edges(200, 30, 40)
+    inputs = inputs_of(edges, 24, 16, 4)
+    expected = fused(edges)(*inputs)
+    for i, x in enumerate(inputs):
+        strange = [misaligned_read_only(x), torch.stack([x, x], -1)[..., 0]]
+        for y in [*strange, x.t().contiguous().t()] if x.dim() == 2 else strange:
+            before = y.clone()
+            assert torch.equal(fused(edges)(*inputs[:i], y, *inputs[i + 1 :]), expected) and torch.equal(y, before)
+    one = inputs[0][:1].expand(30, 24)
+    assert torch.equal(fused(edges)(one, *inputs[1:]), fused(edges)(one.clone(), *inputs[1:]))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_errors_name_op_argument_and_value(dtype):
+    edges = random_edges(30, 4, 5)
+    floats = [x.to(dtype) for x in inputs_of(edges, 6, 5, 3)]
+    inputs = [*floats, edges.senders, edges.receivers, edges.receiver_offsets]
+
+    def call(i: int, changed: Tensor):
+        return ops._message(*inputs[:i], changed, *inputs[i + 1 :], False)
+
+    beyond, other = edges.senders.clone(), edges.receivers.clone()
+    beyond[3], other[4] = 4, 9
+    for message, i, changed in (
+        (r"of_senders must have shape", 0, floats[0][0]),
+        (r"of_receivers must have shape \[(\*|5), 6\]", 1, floats[1][:, 1:]),
+        (r"edge_features must have shape|A1 must have shape", 2, floats[2][:, 1:]),
+        (r"A1 must have shape|a1 must have shape", 3, floats[3][1:]),
+        (r"[aA]1 must have shape", 4, floats[4][1:]),
+        (r"A2 must have shape \[6, 5\]", 5, floats[5][1:]),
+        (r"W2 must have shape|b2 must have shape", 6, floats[6][1:]),
+        (r"b2 must have shape|W2 must have shape", 7, floats[7][1:]),
+        (r"gamma must have shape \[6\]", 8, floats[8][1:]),
+        (r"beta must have shape \[6\]", 9, floats[9][1:]),
+        (r"senders must have shape \[30\]", 10, edges.senders[1:]),
+        (r"senders\[3\] = 4 is not an index below 4", 10, beyond),
+        (r"receivers\[4\] is 9", 11, other),
+        (r"receiver_offsets must have shape \[6\]", 12, edges.receiver_offsets[1:]),
+        (r"receiver_offsets must end at the number of rows 30", 12, edges.receiver_offsets.clamp(max=7)),
+    ):
+        with pytest.raises(ValueError, match=message) as error:
+            call(i, changed)
+        assert "message" in str(error.value)
+    with pytest.raises(ValueError, match="together"):
+        message_sum(edges, floats[0], floats[1], None, tuple(floats[3:6]), *floats[6:])
