@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from ast_sim.model.mlp import MLP
 from ast_sim.ops.edges import EdgeSet
+from ast_sim.ops.message import message_sum
 
 
 class MessagePassing(nn.Module):
@@ -42,13 +43,21 @@ class MessagePassing(nn.Module):
     ) -> Tensor:
         """senders [S, hidden], receivers [R, hidden], edge_features [M, edge_inputs] -> [R, hidden]."""
         *of_edge, of_sender, of_receiver = self.f_e.first.weight.split(self.hidden, dim=1)
-        z = edges.from_senders(F.linear(senders, of_sender))
-        z = z + edges.from_receivers(F.linear(receivers, of_receiver, self.f_e.first.bias))
+        constant, encoder = self.f_e.first.bias, None
         if of_edge:
-            h = F.relu(self.edge_encoder.first(edge_features))
-            last = self.edge_encoder.second
-            z = z + F.linear(h, of_edge[0] @ last.weight, of_edge[0] @ last.bias)
-        messages = self.norm_e(self.f_e.second(F.relu(z)))
-        total = edges.sum_at_receivers(messages)
+            first, last = self.edge_encoder.first, self.edge_encoder.second
+            encoder = (first.weight, first.bias, of_edge[0] @ last.weight)
+            constant = torch.addmv(constant, of_edge[0], last.bias)
+        total = message_sum(
+            edges,
+            F.linear(senders, of_sender),
+            F.linear(receivers, of_receiver, constant),
+            edge_features,
+            encoder,
+            self.f_e.second.weight,
+            self.f_e.second.bias,
+            self.norm_e.weight,
+            self.norm_e.bias,
+        )
         out = self.norm_v(self.f_v(torch.cat([receivers, total], dim=1)))
         return receivers + out if self.residual else out

@@ -200,10 +200,12 @@ def test_opcheck(with_messages):
     edges = random_edges(30, 4, 5)
     inputs = [x.requires_grad_() for x in inputs_of(edges, 6, 5, 3)]
     lists = (edges.senders, edges.receivers, edges.receiver_offsets)
-    torch.library.opcheck(ops._message, (*inputs, *lists, with_messages))
+    torch.library.opcheck(ops._message.overload, (*inputs, *lists, with_messages))
     values = [x.detach() for x in inputs]
     dmessages = torch.randn(30 if with_messages else 0, 6)
-    torch.library.opcheck(ops._message_backward, (torch.randn(5, 6), dmessages, *values, *lists, with_messages))
+    torch.library.opcheck(
+        ops._message_backward.overload, (torch.randn(5, 6), dmessages, *values, *lists, with_messages)
+    )
 
 
 def test_gradients_in_float64():
