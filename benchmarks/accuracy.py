@@ -31,7 +31,7 @@ def segments(seed: int) -> Iterator[tuple[str, Case]]:
     order = torch.randperm(rows, generator=g)
     offsets = torch.cat([torch.tensor([0]), torch.randint(0, rows + 1, (groups - 1,), generator=g).sort().values])
     offsets = torch.cat([offsets, torch.tensor([rows])])
-    x, dout = torch.randn(rows, width, generator=g), torch.randn(groups, width, generator=g)
+    x = torch.randn(rows, width, generator=g)
     for name, mean in (("segment_sum", False), ("segment_mean", True)):
         yield (
             name,
@@ -42,10 +42,6 @@ def segments(seed: int) -> Iterator[tuple[str, Case]]:
                 ["out", "dx"],
             ),
         )
-    index = torch.randint(0, groups, (rows,), generator=g)
-    by_row = index.argsort(stable=True)
-    starts = torch.cat([torch.tensor([0]), torch.bincount(index, minlength=groups).cumsum(0)])
-    yield "gather", (lambda y: segment.gather(y, index, by_row, starts), lambda y: y[index], [dout], ["out", "dx"])
 
 
 def attentions(seed: int) -> Iterator[tuple[str, Case]]:

@@ -44,7 +44,7 @@ def _nodes_to_cells(nodes: int) -> tuple[str, EdgeSet, int]:
 
 def _case(name: str, edges: EdgeSet, raw: int, backward: bool) -> Case:
     g = torch.Generator().manual_seed(0)
-    senders, receivers = len(edges.sender_offsets) - 1, len(edges.receiver_offsets) - 1
+    senders, receivers = edges.num_senders, edges.num_receivers
 
     def normal(*shape: int, scale: float = 1.0) -> torch.Tensor:
         return scale * torch.randn(*shape, generator=g)

@@ -99,7 +99,7 @@ class AST(Simulator):
         """Embedded cells [C, d_token] -> tokens, processed -> [C, d_token]."""
         level = cells.coarsest
         chosen, token_offsets = farthest_point_sample(level.coordinates(), level.cell_offsets, self.config.num_tokens)
-        tokens = self.to_tokens(x[chosen], token_offsets, x, level.cell_offsets)
+        tokens = self.to_tokens(x.index_select(0, chosen), token_offsets, x, level.cell_offsets)
         for block in self.processor:
             tokens = block(tokens, token_offsets)
         return self.to_cells(x, level.cell_offsets, tokens, token_offsets)

@@ -41,15 +41,13 @@ class Cells:
 
     def from_mesh(self) -> EdgeSet:
         """M2C: every node to its cell."""
-        o, nodes = self.finest, torch.arange(len(self.finest.node_cell) + 1)
-        order = torch.empty_like(o.node_order)
-        order[o.node_order] = nodes[:-1]
-        return EdgeSet(o.node_order, o.node_cell[o.node_order], o.node_offsets, order, nodes)
+        o = self.finest
+        return EdgeSet(o.node_order, o.node_cell.index_select(0, o.node_order), o.node_offsets, len(o.node_cell))
 
     def to_mesh(self) -> EdgeSet:
         """C2M: every cell to its nodes."""
         o, nodes = self.finest, torch.arange(len(self.finest.node_cell) + 1)
-        return EdgeSet(o.node_cell, nodes[:-1], nodes, o.node_order, o.node_offsets)
+        return EdgeSet(o.node_cell, nodes[:-1], nodes, len(o.keys))
 
 
 def _growth(config: ModelConfig, position: Tensor) -> int:

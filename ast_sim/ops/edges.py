@@ -1,17 +1,14 @@
 """A set of directed edges, sorted once, over which messages are passed many times.
 
-Legend: M edges, S senders, R receivers, F channels.
+Legend: M edges, S senders, R receivers.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from torch import Tensor
-
-from ast_sim.ops.segment import gather, segment_sum
 
 
 def offsets_of(index: Tensor, num: int) -> Tensor:
@@ -23,21 +20,19 @@ def offsets_of(index: Tensor, num: int) -> Tensor:
 
 @dataclass(frozen=True)
 class EdgeSet:
-    """Directed edges by receiver, then sender, with the order by sender beside it.
+    """Directed edges by receiver, then sender.
 
     Attributes:
         senders: [M] int64.
         receivers: [M] int64, ascending.
         receiver_offsets: [R + 1] int64; the edges into r are receiver_offsets[r]:receiver_offsets[r + 1].
-        sender_order: [M] int64, the edges sorted by sender.
-        sender_offsets: [S + 1] int64; the edges out of s are sender_order[sender_offsets[s]:sender_offsets[s + 1]].
+        num_senders: S.
     """
 
     senders: Tensor
     receivers: Tensor
     receiver_offsets: Tensor
-    sender_order: Tensor
-    sender_offsets: Tensor
+    num_senders: int
 
     @staticmethod
     def from_pairs(senders: Tensor, receivers: Tensor, num_senders: int, num_receivers: int) -> EdgeSet:
@@ -53,14 +48,7 @@ class EdgeSet:
                 raise ValueError(f"EdgeSet: {name}[{at}] = {int(index[at])} is not an index below {num}")
         order = torch.argsort(receivers * max(num_senders, 1) + senders, stable=True)
         senders, receivers = senders[order], receivers[order]
-        sender_order = torch.argsort(senders, stable=True)
-        return EdgeSet(
-            senders,
-            receivers,
-            offsets_of(receivers, num_receivers),
-            sender_order,
-            offsets_of(senders[sender_order], num_senders),
-        )
+        return EdgeSet(senders, receivers, offsets_of(receivers, num_receivers), num_senders)
 
     @staticmethod
     def concatenate(sets: list[EdgeSet]) -> EdgeSet:
@@ -68,33 +56,19 @@ class EdgeSet:
         if len(sets) == 1:
             return sets[0]
         senders, receivers, edges = 0, 0, 0
-        parts: list[list[Tensor]] = [[], [], [sets[0].receiver_offsets[:1]], [], [sets[0].sender_offsets[:1]]]
+        parts: list[list[Tensor]] = [[], [], [sets[0].receiver_offsets[:1]]]
         for s in sets:
             parts[0].append(s.senders + senders)
             parts[1].append(s.receivers + receivers)
             parts[2].append(s.receiver_offsets[1:] + edges)
-            parts[3].append(s.sender_order + edges)
-            parts[4].append(s.sender_offsets[1:] + edges)
-            senders += len(s.sender_offsets) - 1
-            receivers += len(s.receiver_offsets) - 1
-            edges += len(s.senders)
-        return EdgeSet(*(torch.cat(part) for part in parts))
+            senders += s.num_senders
+            receivers += s.num_receivers
+            edges += len(s)
+        return EdgeSet(*(torch.cat(part) for part in parts), senders)
+
+    @property
+    def num_receivers(self) -> int:
+        return len(self.receiver_offsets) - 1
 
     def __len__(self) -> int:
         return len(self.senders)
-
-    @cached_property
-    def _stored_order(self) -> Tensor:
-        return torch.arange(len(self.senders), device=self.senders.device)
-
-    def from_senders(self, x: Tensor) -> Tensor:
-        """[S, F] -> [M, F]: the row of each edge's sender."""
-        return gather(x, self.senders, self.sender_order, self.sender_offsets)
-
-    def from_receivers(self, x: Tensor) -> Tensor:
-        """[R, F] -> [M, F]: the row of each edge's receiver."""
-        return gather(x, self.receivers, self._stored_order, self.receiver_offsets)
-
-    def sum_at_receivers(self, x: Tensor) -> Tensor:
-        """[M, F] -> [R, F]: the sum over the edges into each receiver, in stored order; 0 without edges."""
-        return segment_sum(x, self._stored_order, self.receiver_offsets)

@@ -1,6 +1,6 @@
-"""Sums and means over the rows of each segment, and rows gathered by index: the two halves of message passing.
+"""Sums and means over the rows of each segment, such as the nodes of each cell.
 
-Legend: N rows, C segments, F channels, M gathered rows.
+Legend: N rows, C segments, F channels.
 """
 
 from __future__ import annotations
@@ -63,29 +63,14 @@ def _spread_fake(dout: Tensor, node_order: Tensor, node_offsets: Tensor, mean: b
     return dout.new_empty(node_order.shape[0], dout.shape[1])
 
 
-def _gather(x: Tensor, index: Tensor, order: Tensor, offsets: Tensor) -> Tensor:
-    return x.index_select(0, index)
-
-
-def _gather_fake(x: Tensor, index: Tensor, order: Tensor, offsets: Tensor) -> Tensor:
-    return x.new_empty(index.shape[0], x.shape[1])
-
-
 _SEGMENTS = "Tensor node_order, Tensor node_offsets, bool mean) -> Tensor"
 _sum = library.define(f"segment_sum(Tensor x, {_SEGMENTS}", _sum_kernel, _sum_reference, _sum_fake)
 _spread = library.define(f"segment_spread(Tensor dout, {_SEGMENTS}", _spread_kernel, _spread_reference, _spread_fake)
-_rows = library.define(
-    "gather_rows(Tensor x, Tensor index, Tensor order, Tensor offsets) -> Tensor", _gather, _gather, _gather_fake
-)
 
 
 def _save_segments(ctx, inputs, output) -> None:
     _, node_order, node_offsets, ctx.mean = inputs
     ctx.save_for_backward(node_order, node_offsets)
-
-
-def _save_order(ctx, inputs, output) -> None:
-    ctx.save_for_backward(*inputs[2:])
 
 
 library.differentiate(
@@ -94,7 +79,6 @@ library.differentiate(
 library.differentiate(
     _spread, _save_segments, lambda ctx, grad: (_sum(grad, *ctx.saved_tensors, ctx.mean), None, None, None)
 )
-library.differentiate(_rows, _save_order, lambda ctx, grad: (_sum(grad, *ctx.saved_tensors, False), None, None, None))
 
 
 def segment_sum(x: Tensor, node_order: Tensor, node_offsets: Tensor) -> Tensor:
@@ -117,18 +101,3 @@ def segment_sum(x: Tensor, node_order: Tensor, node_offsets: Tensor) -> Tensor:
 def segment_mean(x: Tensor, node_order: Tensor, node_offsets: Tensor) -> Tensor:
     """`segment_sum` divided by the number of rows of each segment; an empty segment is 0."""
     return _sum(x, node_order, node_offsets, True)
-
-
-def gather(x: Tensor, index: Tensor, order: Tensor, offsets: Tensor) -> Tensor:
-    """Rows x[index], with a gradient that is a segment sum instead of a serial scatter.
-
-    Args:
-        x: [N, F].
-        index: [M] int64 rows of x.
-        order: [M] int64, the positions in `index` sorted by the row they name.
-        offsets: [N + 1] int64; row n is named at order[offsets[n]:offsets[n + 1]].
-
-    Returns:
-        [M, F].
-    """
-    return _rows(x, index, order, offsets)

@@ -20,7 +20,7 @@ def inputs_of(edges: EdgeSet, width: int, hidden: int = 0, raw: int = 0, out: in
     """of_senders, of_receivers, edge_features, A1, a1, A2, W2, b2, gamma, beta; no encoder if hidden is 0."""
     g = torch.Generator().manual_seed(seed)
     out = width if out is None else out
-    senders, receivers = len(edges.sender_offsets) - 1, len(edges.receiver_offsets) - 1
+    senders, receivers = edges.num_senders, edges.num_receivers
 
     def normal(*shape: int, scale: float = 1.0) -> Tensor:
         return scale * torch.randn(*shape, generator=g)

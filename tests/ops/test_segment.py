@@ -1,4 +1,4 @@
-"""segment_sum, segment_mean, gather and EdgeSet against their compositions and their contracts."""
+"""segment_sum and segment_mean against their compositions and their contracts."""
 
 import hashlib
 
@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ast_sim.ops import segment
-from ast_sim.ops.edges import EdgeSet
-from ast_sim.ops.segment import gather, segment_mean, segment_sum
+from ast_sim.ops.segment import segment_mean, segment_sum
 
 
 def case(rows: int, segments: int, channels: int, seed: int = 0):
@@ -106,13 +105,8 @@ def test_scene_alone_equals_scene_in_batch():
 
 def test_opcheck():
     x, order, offsets = case(30, 4, 5)
-    index = torch.tensor([3, 0, 0, 2])
     torch.library.opcheck(segment._sum.overload, (x.requires_grad_(), order, offsets, True))
     torch.library.opcheck(segment._spread.overload, (torch.randn(4, 5, requires_grad=True), order, offsets, False))
-    torch.library.opcheck(
-        segment._rows.overload,
-        (torch.randn(4, 5, requires_grad=True), index, index.argsort(), torch.tensor([0, 2, 2, 3, 4])),
-    )
 
 
 def test_gradients_in_float64():
@@ -151,36 +145,3 @@ def test_errors_name_op_argument_and_value(change, message):
     with pytest.raises((ValueError, TypeError), match=message) as error:
         segment_sum(*change(*case(30, 4, 5)))
     assert "segment_sum" in str(error.value)
-
-
-def test_gather_and_edge_sets():
-    generator = torch.Generator().manual_seed(1)
-    senders, receivers = (torch.randint(0, n, (50,), generator=generator) for n in (7, 9))
-    edges = EdgeSet.from_pairs(senders, receivers, 7, 9)
-    assert torch.equal(edges.receivers, receivers.sort().values)
-    pairs = sorted(zip(receivers.tolist(), senders.tolist(), strict=True))
-    assert list(zip(edges.receivers.tolist(), edges.senders.tolist(), strict=True)) == pairs
-    x, y = torch.randn(7, 4), torch.randn(9, 4)
-    assert_accurate(edges.from_senders, lambda x: x[edges.senders], [x])
-    assert_accurate(edges.from_receivers, lambda y: y[edges.receivers], [y])
-    messages = torch.randn(50, 4)
-    expected = torch.zeros(9, 4).index_add_(0, edges.receivers, messages)
-    torch.testing.assert_close(edges.sum_at_receivers(messages), expected)
-    both = EdgeSet.concatenate([edges, edges])
-    again = EdgeSet.from_pairs(both.senders, both.receivers, 14, 18)
-    for name in EdgeSet.__dataclass_fields__:
-        assert torch.equal(getattr(both, name), getattr(again, name)), name
-
-
-def test_edge_sets_without_edges_and_with_wrong_indices():
-    empty = torch.empty(0, dtype=torch.int64)
-    edges = EdgeSet.from_pairs(empty, empty, 3, 2)
-    assert len(edges) == 0 and edges.sum_at_receivers(torch.empty(0, 4)).tolist() == [[0.0] * 4] * 2
-    with pytest.raises(ValueError, match=r"senders\[1\] = 3 is not an index below 3"):
-        EdgeSet.from_pairs(torch.tensor([0, 3]), torch.tensor([0, 1]), 3, 2)
-
-
-def test_gather_needs_no_gradient():
-    x = torch.randn(3, 2)
-    index = torch.tensor([2, 2, 0])
-    assert torch.equal(gather(x, index, index.argsort(), torch.tensor([0, 1, 1, 3])), x[index])

@@ -1,0 +1,36 @@
+"""Edge sets: sorted by receiver, then sender; several as one; wrong indices."""
+
+import pytest
+import torch
+
+from ast_sim.ops.edges import EdgeSet
+
+
+def test_edges_are_sorted_by_receiver_then_sender():
+    generator = torch.Generator().manual_seed(1)
+    senders, receivers = (torch.randint(0, n, (50,), generator=generator) for n in (7, 9))
+    edges = EdgeSet.from_pairs(senders, receivers, 7, 9)
+    pairs = sorted(zip(receivers.tolist(), senders.tolist(), strict=True))
+    assert list(zip(edges.receivers.tolist(), edges.senders.tolist(), strict=True)) == pairs
+    assert edges.receiver_offsets.tolist() == [sum(r < n for r, _ in pairs) for n in range(10)]
+    assert (edges.num_senders, edges.num_receivers, len(edges)) == (7, 9, 50)
+
+
+def test_several_sets_as_one_have_shifted_indices():
+    one = EdgeSet.from_pairs(torch.tensor([0, 2]), torch.tensor([1, 0]), 3, 2)
+    other = EdgeSet.from_pairs(torch.tensor([1, 0, 1]), torch.tensor([0, 2, 2]), 2, 3)
+    both = EdgeSet.concatenate([one, other, one])
+    assert both.senders.tolist() == [2, 0, 4, 3, 4, 7, 5] and both.receivers.tolist() == [0, 1, 2, 4, 4, 5, 6]
+    assert both.receiver_offsets.tolist() == [0, 1, 2, 3, 3, 5, 6, 7]
+    assert (both.num_senders, both.num_receivers) == (8, 7)
+    assert EdgeSet.concatenate([one]) is one
+
+
+def test_no_edges_and_wrong_indices():
+    empty = torch.empty(0, dtype=torch.int64)
+    edges = EdgeSet.from_pairs(empty, empty, 3, 2)
+    assert len(edges) == 0 and edges.receiver_offsets.tolist() == [0, 0, 0]
+    with pytest.raises(ValueError, match=r"senders\[1\] = 3 is not an index below 3"):
+        EdgeSet.from_pairs(torch.tensor([0, 3]), torch.tensor([0, 1]), 3, 2)
+    with pytest.raises(ValueError, match=r"receivers\[0\] = -1 is not an index below 2"):
+        EdgeSet.from_pairs(torch.tensor([0, 2]), torch.tensor([-1, 1]), 3, 2)
