@@ -34,17 +34,7 @@ INSTRUCTION_SETS = {
     ],
 }
 HEADERS = [str(path) for path in sorted(Path("csrc").glob("*.h"))]
-KERNELS = [
-    "kernels.c",
-    "octree.c",
-    "coarsen.c",
-    "fps.c",
-    "sparse_conv.c",
-    "attention.c",
-    "segment.c",
-    "message.c",
-    "message_backward.c",
-]
+SOURCES = [str(path) for path in sorted(Path("csrc").glob("*.c"))]
 
 
 def compiles(flags: list[str]) -> bool:
@@ -69,7 +59,7 @@ libraries = [
         {
             "sources": [f"csrc/isa_{isa}.c"],
             "cflags": FLAGS + flags,
-            "obj_deps": {"": HEADERS + [f"csrc/{name}" for name in KERNELS]},
+            "obj_deps": {"": HEADERS + SOURCES},
         },
     )
     for isa, flags in sets.items()
