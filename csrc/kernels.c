@@ -5,6 +5,7 @@
 #include "gemm.h"
 
 #include "attention.c"
+#include "attention_backward.c"
 #include "fps.c"
 #include "octree.c"
 #include "coarsen.c" /* after octree.c, whose runs it uses */

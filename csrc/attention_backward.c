@@ -1,0 +1,275 @@
+/* The gradients of attention, its weights recomputed, without a Tq x Tk array.
+ *
+ * With y = dout, P the weights, Z the dropout factors (0 or 1/keep) and . the product by elements,
+ *   dV = (P . Z)^T y,   dS = P . (Z . (y V^T) - rowsum(y . out)),   dQ = scale dS K,   dK = scale dS^T Q.
+ * P is recomputed as exp(x - m) / l; the log sum exp in one float would be off by 5e-4 where it is 1e4. Where one weight is 1 and the
+ * others vanish, dS is exactly 0: both terms are rounded alike.
+ *
+ * A task takes a chunk of queries against all blocks of keys, then the next chunk: each score is computed once and dQ, dK and dV
+ * grow in the second cache. A scene of few tasks is cut over its longer side; each part but the first leaves its share of the
+ * gradient of the shorter side, added in the order of the parts. All sizes depend on the scene's own, as in the forward pass.
+ *
+ * Cost: 10 Tq Tk D flops a head in five products. Memory: at most PARTED_TASKS times the shorter side of the largest scene.
+ */
+#include "ast.h"
+#include "attention_tiles.h"
+#include "dropout.h"
+
+enum {
+  CHUNK = 256,         /* queries whose panels, rows and gradients are kept in the second cache */
+  SQUARE = 128,        /* of these, against a block of keys: */
+  BACKWARD_TASKS = 16, /* a scene with fewer tasks is cut */
+  BACKWARD_PART = 512, /* into parts of at least so many keys or queries */
+};
+_Static_assert(CHUNK % SQUARE == 0 && SQUARE % (int)LANES == 0, "chunks hold whole squares, squares whole panels");
+
+typedef struct {
+  int64_t parts, part_rows;          /* rows of a part: queries if there are more of them than keys, else keys */
+  int64_t first_task, first_partial; /* tasks, and floats of the partial gradients, before this scene */
+} backward_cut;
+
+typedef struct {
+  const ast_attention *s;
+  const float *q, *k, *v, *out, *maximum, *sum, *dout;
+  float *dq, *dk, *dv;
+  const backward_cut *cuts; /* [B+1] */
+  float *partials;
+} backward_job;
+
+typedef struct {
+  float keys[KEYS * ROW], values[KEYS * ROW]; /* K, gain V */
+  float dk[KEYS * ROW], dv[KEYS * ROW];
+  float weights[KEYS * ROW], dscores[KEYS * ROW];                /* P . keep and dS as [key][query] of a square */
+  float query_panels[CHUNK * MAX_D], dout_panels[CHUNK * MAX_D]; /* scale Q and y */
+  float queries[CHUNK * ROW], dout[CHUNK * ROW], dq[CHUNK * ROW];
+  float maximum[CHUNK], share[CHUNK], delta[CHUNK]; /* m, 1 / l, rowsum(y . out) */
+} backward_scratch;
+
+/* The scene, head, queries and keys of a task, and where its gradients go: rows [.][stride]. */
+typedef struct {
+  int64_t b, h, first_query, queries, first_key, keys;
+  float *dq, *dk, *dv;
+  int64_t dq_stride, dk_stride;
+} backward_range;
+
+/* ---- a square of queries against a block of keys ---- */
+
+/* c[i][j] += sum_k a_ik b[k][j], rows of b and c ROW apart */
+AST_INLINE void add_tile(const int rows, int64_t i, const int vectors, int64_t K, const float *a, const int64_t a_row,
+                         const int64_t a_column, const float *b, float *c) {
+  vf sum[TILE][2];
+  tile_product(rows, vectors, K, a + i * a_row, a_row, a_column, b, ROW, sum);
+#pragma GCC unroll 12
+  for (int r = 0; r < rows; r++)
+#pragma GCC unroll 2
+    for (int j = 0; j < vectors; j++) {
+      float *to = c + (i + r) * ROW + j * VW;
+      vstore(to, vload(to) + sum[r][j]);
+    }
+}
+
+AST_INLINE void add_product(int64_t M, int64_t N, int64_t K, const float *a, const int64_t a_row, const int64_t a_column, const float *b,
+                            float *c) {
+  int64_t j = 0;
+  for (; j + 2 * VW <= N; j += 2 * VW) EACH_TILE(M, add_tile, 2, K, a, a_row, a_column, b + j, c + j)
+  if (j < N) EACH_TILE(M, add_tile, 1, K, a, a_row, a_column, b + j, c + j)
+}
+
+/* C [M,N] += A B with A row by row, and with A given as its transpose; M a multiple of ROW_STEP, N one of VW. */
+static void add_rows_product(int64_t M, int64_t N, int64_t K, const float *a, const float *b, float *c) {
+  add_product(M, N, K, a, ROW, 1, b, c);
+}
+static void add_columns_product(int64_t M, int64_t N, int64_t K, const float *a, const float *b, float *c) {
+  add_product(M, N, K, a, 1, ROW, b, c);
+}
+
+/* Score x and gain y V^T become P . keep and dS; words NULL: all are kept. */
+AST_INLINE void gradient(float *x, float *dx, vf maximum, vf share, vf delta, const dropout *d, const vu *words, int slot) {
+  const vf p = share * vexp(vload(x) - maximum, 0), dp = vload(dx);
+  vstore(x, words ? dropout_keep(d, words, slot, p) : p);
+  vstore(dx, p * ((words ? dropout_keep(d, words, slot, dp) : dp) - delta));
+}
+
+/* Weights and their gradients of the panel of queries from i on, of those in the scratch; k0 the first of n keys of the scene. */
+static void backward_panel(backward_scratch *t, int64_t i, int64_t query, int64_t k0, int64_t n, int64_t D, const dropout *d) {
+  float *x = t->weights + i % SQUARE, *dx = t->dscores + i % SQUARE;
+  EACH_TILE(round_up(n, ROW_STEP), scores_tile, D, t->keys, t->query_panels + i * D, x, ROW, NULL)
+  EACH_TILE(round_up(n, ROW_STEP), scores_tile, D, t->values, t->dout_panels + i * D, dx, ROW, NULL)
+  for (int64_t c = 0; c < LANES; c += VW) {
+    const vf maximum = vload(t->maximum + i + c), share = vload(t->share + i + c), delta = vload(t->delta + i + c);
+    if (!d->threshold) {
+      for (int64_t j = 0; j < n; j++) gradient(x + j * ROW + c, dx + j * ROW + c, maximum, share, delta, d, NULL, 0);
+      continue;
+    }
+    for (int64_t lane = 0; lane < min64(n, DROPOUT_LANES); lane++) {
+      vu words[4];
+      dropout_words(d, query + c, k0, lane, words);
+#pragma GCC unroll 8
+      for (int slot = 0; slot < DROPOUT_SLOTS; slot++) {
+        const int64_t j = lane + slot * DROPOUT_LANES;
+        if (j >= n) break;
+        gradient(x + j * ROW + c, dx + j * ROW + c, maximum, share, delta, d, words, slot);
+      }
+    }
+  }
+}
+
+/* ---- tasks ---- */
+
+/* The queries q0..q0+rows of the scene of `range`: panels, rows, m, 1 / l and delta. */
+static void load_queries(const backward_job *job, const backward_range *range, int64_t first, int64_t rows, backward_scratch *t) {
+  const ast_attention *s = job->s;
+  const int64_t H = s->H, D = s->D, h = range->h, q0 = s->q_offsets[range->b] + first;
+  const float *q = job->q + q0 * s->q_stride + h * D, *dout = job->dout + (q0 * H + h) * D, *out = job->out + (q0 * H + h) * D;
+  copy_rows(q, s->q_stride, rows, D, s->scale, t->queries);
+  copy_rows(dout, H * D, rows, D, 1, t->dout);
+  fill_rows(0, ROW, round_up(rows, ROW_STEP), D, t->dq);
+  for (int64_t i = 0; i < rows; i += LANES) {
+    float *panel = t->dout_panels + i * D;
+    pack_panel(t->queries + i * ROW, ROW, rows - i, D, 1, t->query_panels + i * D);
+    pack_panel(t->dout + i * ROW, ROW, rows - i, D, 1, panel);
+    for (int64_t c = 0; c < LANES; c += VW) {
+      vf sum = {0}; /* in the order of the products, so that a weight of 1 leaves dS = 0 */
+      for (int64_t e = 0; e < D; e += VW) {
+        vf x[VW];
+        load_transposed(out + (i + c) * H * D + e, H * D, rows - i - c, x);
+#pragma GCC unroll 16
+        for (int j = 0; j < VW; j++) sum += vload(panel + (e + j) * LANES + c) * x[j];
+      }
+      vstore(t->delta + i + c, sum);
+    }
+    for (int64_t j = i; j < i + LANES; j++) {
+      t->maximum[j] = j < rows ? job->maximum[(q0 + j) * H + h] : 0;
+      t->share[j] = j < rows ? 1 / job->sum[(q0 + j) * H + h] : 0;
+    }
+  }
+}
+
+/* to = (to +) factor from, rows of `from` ROW apart */
+static void put_rows(const float *from, int64_t rows, int64_t D, float factor, bool add, float *to, int64_t stride) {
+  for (int64_t i = 0; i < rows; i++)
+    for (int64_t d = 0; d < D; d += VW) {
+      const vf x = factor * vload(from + i * ROW + d);
+      vstore(to + i * stride + d, add ? vload(to + i * stride + d) + x : x);
+    }
+}
+
+/* The queries first..first+rows, which the scratch holds, against the block of n keys from k0 on, all counted from the scene's first. */
+static void backward_block(const backward_job *job, const backward_range *range, int64_t first, int64_t rows, int64_t k0, int64_t n,
+                           const dropout *d, backward_scratch *t) {
+  const ast_attention *s = job->s;
+  const int64_t D = s->D, row = s->k_offsets[range->b] + k0, whole = round_up(n, ROW_STEP);
+  copy_rows(job->k + row * s->k_stride + range->h * D, s->k_stride, n, D, 1, t->keys);
+  copy_rows(job->v + row * s->v_stride + range->h * D, s->v_stride, n, D, d->gain, t->values);
+  fill_rows(0, ROW, whole, D, t->dk);
+  fill_rows(0, ROW, whole, D, t->dv);
+  for (int64_t i0 = 0; i0 < rows; i0 += SQUARE) {
+    const int64_t width = min64(SQUARE, rows - i0);
+    for (int64_t i = i0; i < i0 + width; i += LANES) backward_panel(t, i, first + i, k0, n, D, d);
+    add_rows_product(whole, D, width, t->weights, t->dout + i0 * ROW, t->dv);
+    add_rows_product(whole, D, width, t->dscores, t->queries + i0 * ROW, t->dk);
+    add_columns_product(round_up(width, ROW_STEP), D, n, t->dscores, t->keys, t->dq + i0 * ROW);
+  }
+  const int64_t to = (k0 - range->first_key) * range->dk_stride;
+  put_rows(t->dk, n, D, 1, first > range->first_query, range->dk + to, range->dk_stride);
+  put_rows(t->dv, n, D, d->gain, first > range->first_query, range->dv + to, range->dk_stride);
+}
+
+static backward_cut cut_backward(const ast_attention *s, int64_t b) {
+  const int64_t queries = s->q_offsets[b + 1] - s->q_offsets[b], keys = s->k_offsets[b + 1] - s->k_offsets[b];
+  const int64_t longer = max64(queries, keys), step = queries > keys ? CHUNK : KEYS;
+  const int64_t wanted = max64(min64(BACKWARD_TASKS / max64(s->H, 1), longer / BACKWARD_PART), 1);
+  backward_cut cut = {.part_rows = round_up((longer + wanted - 1) / wanted, step)};
+  cut.parts = longer ? (longer + cut.part_rows - 1) / cut.part_rows : 1;
+  return cut;
+}
+
+/* Floats of one partial gradient of the scene: of dq, or of dk and dv. */
+static int64_t partial_size(const ast_attention *s, int64_t b) {
+  const int64_t queries = s->q_offsets[b + 1] - s->q_offsets[b], keys = s->k_offsets[b + 1] - s->k_offsets[b];
+  return s->D * (queries > keys ? 2 * keys : queries);
+}
+
+static int64_t scene_of(const backward_job *job, int64_t task) {
+  int64_t b = 0, last = job->s->B - 1; /* the last scene that has at most `task` tasks before it */
+  while (b < last) {
+    const int64_t middle = (b + last + 1) / 2;
+    if (job->cuts[middle].first_task <= task) b = middle;
+    else last = middle - 1;
+  }
+  return b;
+}
+
+static backward_range find_range(const backward_job *job, int64_t index) {
+  const ast_attention *s = job->s;
+  const int64_t b = scene_of(job, index), H = s->H, D = s->D, q0 = s->q_offsets[b], k0 = s->k_offsets[b];
+  const backward_cut *cut = job->cuts + b;
+  const int64_t h = (index - cut->first_task) / cut->parts, part = (index - cut->first_task) % cut->parts;
+  backward_range r = {.b = b, .h = h, .queries = s->q_offsets[b + 1] - q0, .keys = s->k_offsets[b + 1] - k0};
+  const bool by_queries = r.queries > r.keys;
+  const int64_t before = part * cut->part_rows;
+  float *partial = job->partials + cut->first_partial + (h * (cut->parts - 1) + part - 1) * partial_size(s, b);
+  if (by_queries) r.first_query = before, r.queries = min64(cut->part_rows, r.queries - before);
+  else r.first_key = before, r.keys = min64(cut->part_rows, r.keys - before);
+  const int64_t q_at = ((q0 + r.first_query) * H + h) * D, k_at = ((k0 + r.first_key) * H + h) * D;
+  r.dq = job->dq + q_at, r.dk = job->dk + k_at, r.dv = job->dv + k_at;
+  r.dq_stride = r.dk_stride = H * D;
+  if (part > 0 && by_queries) r.dk = partial, r.dv = partial + r.keys * D, r.dk_stride = D;
+  if (part > 0 && !by_queries) r.dq = partial, r.dq_stride = D;
+  return r;
+}
+
+static ast_status backward_task(int64_t index, void *context) {
+  const backward_job *job = context;
+  const backward_range r = find_range(job, index);
+  const int64_t D = job->s->D;
+  if (r.keys == 0) fill_rows(0, r.dq_stride, r.queries, D, r.dq);
+  if (r.queries == 0) fill_rows(0, r.dk_stride, r.keys, D, r.dk), fill_rows(0, r.dk_stride, r.keys, D, r.dv);
+  if (r.keys == 0 || r.queries == 0) return AST_OK;
+  backward_scratch *t = ast_scratch(5, sizeof *t);
+  if (!t) return AST_NO_MEMORY;
+  const dropout d = dropout_of(job->s, r.b, r.h);
+  for (int64_t i = 0; i < r.queries; i += CHUNK) {
+    const int64_t rows = min64(CHUNK, r.queries - i), first = r.first_query + i;
+    load_queries(job, &r, first, rows, t);
+    for (int64_t k0 = 0; k0 < r.keys; k0 += KEYS) backward_block(job, &r, first, rows, r.first_key + k0, min64(KEYS, r.keys - k0), &d, t);
+    put_rows(t->dq, rows, D, job->s->scale, false, r.dq + i * r.dq_stride, r.dq_stride);
+  }
+  return AST_OK;
+}
+
+/* Adds the partial gradients of scene index / H and head index % H to what the first part left. */
+static ast_status add_partials_task(int64_t index, void *context) {
+  const backward_job *job = context;
+  const ast_attention *s = job->s;
+  const int64_t H = s->H, D = s->D, b = index / H, h = index % H, size = partial_size(s, b), parts = job->cuts[b].parts;
+  const int64_t q0 = s->q_offsets[b], queries = s->q_offsets[b + 1] - q0, k0 = s->k_offsets[b], keys = s->k_offsets[b + 1] - k0;
+  for (int64_t part = 1; part < parts; part++) {
+    const float *partial = job->partials + job->cuts[b].first_partial + (h * (parts - 1) + part - 1) * size;
+    for (int64_t i = 0; i < size / D; i++) {
+      float *to = queries <= keys ? job->dq + ((q0 + i) * H + h) * D
+                  : i < keys      ? job->dk + ((k0 + i) * H + h) * D
+                                  : job->dv + ((k0 + i - keys) * H + h) * D;
+      for (int64_t e = 0; e < D; e += VW) vstore(to + e, vload(to + e) + vload(partial + i * D + e));
+    }
+  }
+  return AST_OK;
+}
+
+static ast_status attention_backward(const ast_attention *s, const float *restrict q, const float *restrict k, const float *restrict v,
+                                     const float *restrict out, const float *restrict maximum, const float *restrict sum,
+                                     const float *restrict dout, float *restrict dq, float *restrict dk, float *restrict dv) {
+  backward_cut *cuts = ast_scratch(6, (s->B + 1) * (int64_t)sizeof *cuts), next = {0};
+  if (!cuts) return AST_NO_MEMORY;
+  for (int64_t b = 0; b < s->B; b++) {
+    cuts[b] = cut_backward(s, b);
+    cuts[b].first_task = next.first_task, cuts[b].first_partial = next.first_partial;
+    next.first_task += s->H * cuts[b].parts;
+    next.first_partial += s->H * (cuts[b].parts - 1) * partial_size(s, b);
+  }
+  float *partials = ast_scratch(7, next.first_partial * (int64_t)sizeof *partials);
+  if (!partials) return AST_NO_MEMORY;
+  backward_job job = {s, q, k, v, out, maximum, sum, dout, dq, dk, dv, cuts, partials};
+  const ast_status status = ast_parallel(next.first_task, backward_task, &job);
+  return status == AST_OK && next.first_partial ? ast_parallel(s->B * s->H, add_partials_task, &job) : status;
+}

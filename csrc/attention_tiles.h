@@ -1,0 +1,180 @@
+/* What attention and its gradient are built of: scores with queries across the lanes, and products on register tiles.
+ *
+ * A panel is LANES queries; its scores are held transposed, x[key][query], so that maximum, sum and dropout of a row of the
+ * softmax are operations between vectors, never within one. Every array that a product reads row by row has rows ROW floats
+ * apart: a constant, so that a tile needs one pointer for each operand, and no power of two, which would crowd few cache sets.
+ * Products add in rising order of the summed index, in every tile alike: a score has the same bits forward and backward.
+ *
+ * Legend: n keys of a block, D channels of a head; A read by broadcast, B in vectors, C in TILE x 2 vectors of registers.
+ */
+#ifndef AST_ATTENTION_TILES_H
+#define AST_ATTENTION_TILES_H
+
+#include <math.h>
+
+#include "simd.h"
+
+#if AST_VECTOR_BYTES == 64
+enum { TILE = 12 }; /* rows of C: 24 accumulators + 2 of B + 1 of A in 32 registers */
+#elif AST_VECTOR_BYTES == 32
+enum { TILE = 6 }; /* 12 + 2 + 1 in 16 registers */
+#else
+enum { TILE = 4 }; /* 8 + 2 + 1, and one for the product that has no FMA */
+#endif
+
+enum {
+  LANES = 2 * VW,   /* queries of a panel */
+  KEYS = 128,       /* keys of a block: the scores of a panel stay in the first cache */
+  MAX_D = 128,      /* channels of a head */
+  ROW = MAX_D + 16, /* floats from row to row */
+  ROW_STEP = 4,     /* products compute rows in multiples of this: 90 keys cost 92 */
+};
+
+/* ---- register tiles ---- */
+
+/* Rows of the next tile when `rest`, a multiple of ROW_STEP, are left: no tile of 4 follows one of 12. */
+AST_INLINE int64_t next_tile(int64_t rest) {
+  if (TILE == 12) return rest == 16 ? 8 : rest >= 12 ? 12 : rest >= 8 ? 8 : 4;
+  if (TILE == 6) return rest >= 6 && rest != 8 ? 6 : 4;
+  return 4;
+}
+
+/* Runs f(rows, i, ...) with a constant number of rows for the tiles i..i+rows of all n rows. */
+#define EACH_TILE(n, f, ...)                                     \
+  for (int64_t tile_ = 0, rows_; tile_ < (n); tile_ += rows_) {  \
+    rows_ = next_tile((n) - tile_);                              \
+    if (rows_ == TILE) f(TILE, tile_, __VA_ARGS__);              \
+    else if (TILE == 12 && rows_ == 8) f(8, tile_, __VA_ARGS__); \
+    else f(4, tile_, __VA_ARGS__);                               \
+  }
+
+/* sum_ij = sum_k a[i a_row + k a_column] b[k b_row + j], j over `vectors` vectors */
+AST_INLINE void tile_product(const int rows, const int vectors, int64_t K, const float *a, const int64_t a_row, const int64_t a_column,
+                             const float *b, const int64_t b_row, vf sum[TILE][2]) {
+#pragma GCC unroll 12
+  for (int i = 0; i < rows; i++)
+#pragma GCC unroll 2
+    for (int j = 0; j < vectors; j++) sum[i][j] = (vf){0};
+  for (int64_t k = 0; k < K; k++) {
+    vf b_k[2];
+#pragma GCC unroll 2
+    for (int j = 0; j < vectors; j++) b_k[j] = vload(b + k * b_row + j * VW);
+#pragma GCC unroll 12
+    for (int i = 0; i < rows; i++) {
+      const vf a_ik = vsplat(a[i * a_row + k * a_column]);
+#pragma GCC unroll 2
+      for (int j = 0; j < vectors; j++) sum[i][j] += a_ik * b_k[j];
+    }
+  }
+}
+
+/* ---- scores ---- */
+
+/* x[key][query] = a[key] . b[query] over the channels for a tile of keys, x_row floats from row to row; raises largest[2],
+ * unless NULL, to the scores' maximum. */
+AST_INLINE void scores_tile(const int rows, int64_t i, int64_t D, const float *a, const float *b, float *x, const int64_t x_row,
+                            vf *largest) {
+  vf sum[TILE][2];
+  tile_product(rows, 2, D, a + i * ROW, ROW, 1, b, LANES, sum);
+#pragma GCC unroll 12
+  for (int r = 0; r < rows; r++)
+#pragma GCC unroll 2
+    for (int j = 0; j < 2; j++) {
+      vstore(x + (i + r) * x_row + j * VW, sum[r][j]);
+      if (largest) largest[j] = vmax(sum[r][j], largest[j]);
+    }
+}
+
+/* ---- rows and panels ---- */
+
+/* e^x 2^-shift within 1 ULP for x < 88: 0 where the result would be below 2^-125 (also for -inf), NaN for NaN. */
+AST_INLINE vf vexp(vf x, int32_t shift) {
+  const float log2_e = 0x1.715476p+0f, magic = 0x1.8p23f + (float)(127 - shift);
+  const vf rounded =
+      x * log2_e + magic; /* its low bits: n + 127 - shift, the exponent of 2^(n - shift), n the integer nearest to x log2 e */
+  const vf f = x * log2_e - (rounded - magic);
+  vf p = 0x1.41fbbcp-13f * f + 0x1.5f3e52p-10f; /* 2^f on [-1/2, 1/2], minimax with p(0) = 1 */
+  p = p * f + 0x1.3b2d4cp-7f;
+  p = p * f + 0x1.c6aee8p-5f;
+  p = p * f + 0x1.ebfbdcp-3f;
+  p = p * f + 0x1.62e430p-1f;
+  p = p * f + 1.0f;
+  const vf power = (vf)((vu)rounded << 23);
+  return (vf)((vi)(p * power) & ~(x < (float)(shift - 125) * 0x1.62e430p-1f));
+}
+
+#if AST_VECTOR_BYTES == 64
+#define INTERLEAVE_LOW(a, b)  __builtin_shufflevector(a, b, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23)
+#define INTERLEAVE_HIGH(a, b) __builtin_shufflevector(a, b, 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31)
+#elif AST_VECTOR_BYTES == 32
+#define INTERLEAVE_LOW(a, b)  __builtin_shufflevector(a, b, 0, 8, 1, 9, 2, 10, 3, 11)
+#define INTERLEAVE_HIGH(a, b) __builtin_shufflevector(a, b, 4, 12, 5, 13, 6, 14, 7, 15)
+#else
+#define INTERLEAVE_LOW(a, b)  __builtin_shufflevector(a, b, 0, 4, 1, 5)
+#define INTERLEAVE_HIGH(a, b) __builtin_shufflevector(a, b, 2, 6, 3, 7)
+#endif
+
+/* x_ij <-> x_ji: each pass rotates the bits of the index (i, j) by one, log2(VW) passes exchange i and j. */
+AST_INLINE void vtranspose(vf x[VW]) {
+#pragma GCC unroll 4
+  for (int pass = 1; pass < VW; pass *= 2) {
+    vf y[VW];
+#pragma GCC unroll 8
+    for (int i = 0; i < VW / 2; i++) {
+      y[2 * i] = INTERLEAVE_LOW(x[i], x[i + VW / 2]);
+      y[2 * i + 1] = INTERLEAVE_HIGH(x[i], x[i + VW / 2]);
+    }
+#pragma GCC unroll 16
+    for (int i = 0; i < VW; i++) x[i] = y[i];
+  }
+}
+
+/* x_dj = from[j][d] for VW rows and VW channels; rows from `rows` on are 0 and not read */
+AST_INLINE void load_transposed(const float *from, int64_t stride, int64_t rows, vf x[VW]) {
+#pragma GCC unroll 16
+  for (int j = 0; j < VW; j++) x[j] = j < rows ? vload(from + j * stride) : (vf){0};
+  vtranspose(x);
+}
+
+/* panel[d][query] = factor from[query][d] for at most LANES rows; the panel's other queries are 0 */
+static void pack_panel(const float *from, int64_t stride, int64_t rows, int64_t D, float factor, float *panel) {
+  for (int64_t j = 0; j < LANES; j += VW)
+    for (int64_t d = 0; d < D; d += VW) {
+      vf x[VW];
+      load_transposed(from + j * stride + d, stride, rows - j, x);
+#pragma GCC unroll 16
+      for (int i = 0; i < VW; i++) vstore(panel + (d + i) * LANES + j, factor * x[i]);
+    }
+}
+
+/* to[query][d] = factor[query] panel[d][query], for at most LANES rows */
+static void unpack_panel(const float *panel, const float *factor, int64_t rows, int64_t D, float *to, int64_t stride) {
+  for (int64_t j = 0; j < min64(rows, LANES); j += VW)
+    for (int64_t d = 0; d < D; d += VW) {
+      vf x[VW];
+#pragma GCC unroll 16
+      for (int i = 0; i < VW; i++) x[i] = vload(factor + j) * vload(panel + (d + i) * LANES + j);
+      vtranspose(x);
+      for (int64_t i = 0; i < min64(VW, rows - j); i++) vstore(to + (j + i) * stride + d, x[i]);
+    }
+}
+
+/* to[i] = factor from[i], rows ROW apart, and once more the last of them up to a whole ROW_STEP: a key that comes twice changes
+ * no maximum */
+static void copy_rows(const float *from, int64_t stride, int64_t rows, int64_t D, float factor, float *to) {
+  for (int64_t i = 0; i < round_up(rows, ROW_STEP); i++)
+    for (int64_t d = 0; d < D; d += VW) vstore(to + i * ROW + d, factor * vload(from + min64(i, rows - 1) * stride + d));
+}
+
+static void fill_rows(float value, int64_t stride, int64_t rows, int64_t D, float *to) {
+  for (int64_t i = 0; i < rows; i++)
+    for (int64_t d = 0; d < D; d++) to[i * stride + d] = value;
+}
+
+/* Asks for rows that the next block will copy; reading them where they are used would wait for memory. */
+static void prefetch_rows(const float *from, int64_t stride, int64_t rows, int64_t D) {
+  for (int64_t i = 0; i < rows; i++)
+    for (int64_t d = 0; d < D; d += 16) __builtin_prefetch(from + i * stride + d, 0, 2);
+}
+
+#endif
