@@ -1,149 +1,177 @@
-/* Farthest point sampling of one scene, included by fps.c once per type T of coordinates and squared distances, which are exact in T;
- * INTEGER is the integer of its size, FPS(name) makes the names of that type. Blocks come in groups of FPS_LANES, a whole number of vectors
- * of T. */
+/* Farthest point sampling of one scene, included by fps.c once per type T of squared distances and type COORDINATE of coordinates relative
+ * to the middle of the scene; FPS(name) makes the names of that type. The loops over points are written for the compiler to vectorise. */
 
-typedef T FPS(vector) __attribute__((vector_size(AST_VECTOR_BYTES), aligned(sizeof(T)), may_alias));
-typedef INTEGER FPS(mask) __attribute__((vector_size(AST_VECTOR_BYTES))); /* of a comparison: -1 is true */
-enum { FPS(width) = AST_VECTOR_BYTES / sizeof(T), FPS(parts) = FPS_LANES / FPS(width) };
-
-AST_INLINE FPS(vector) FPS(select)(FPS(mask) mask, FPS(vector) a, FPS(vector) b) {
-  return (FPS(vector))(((FPS(mask))a & mask) | ((FPS(mask))b & ~mask));
-}
-AST_INLINE FPS(vector) FPS(max)(FPS(vector) a, FPS(vector) b) { return FPS(select)(a > b, a, b); }
-AST_INLINE FPS(vector) FPS(min)(FPS(vector) a, FPS(vector) b) { return FPS(select)(a < b, a, b); }
-AST_INLINE FPS(vector) FPS(load)(const T *p) { return *(const FPS(vector) *)p; }
-AST_INLINE void FPS(store)(T *p, FPS(vector) x) { *(FPS(vector) *)p = x; }
-
-/* Points in blocks of consecutive ones, padded with copies of the last point, which comes first of them; the number of blocks is padded
- * to whole groups with empty ones of distance 0, which are never farthest. */
+/* Points in blocks of consecutive ones, the last block padded with copies of the last point, which comes first of them. */
 typedef struct {
-  int64_t size, groups;   /* points of a block, a multiple of FPS_LANES; groups of blocks */
-  T *point[3], *distance; /* of each point, from the samples so far */
-  T *low[3], *high[3];    /* of each block: its bounding box */
-  T *farthest;            /* of each block: its largest distance */
-} FPS(blocks);
+  int64_t size, blocks;   /* points of a block, a multiple of FPS_TILE */
+  int64_t *seen;          /* [blocks] the number of samples that the block has seen */
+  T *distances;           /* [blocks,size] from those */
+  COORDINATE *points;     /* [blocks,3,size] */
+  COORDINATE *boxes;      /* [blocks,6]: lowest x, y, z, highest x, y, z */
+  COORDINATE *samples[3]; /* x, y, z of all samples so far; followed by FPS_TILE items that are read but do not matter */
+  fps_tournament tournament;
+} FPS(scene);
 
-static int64_t FPS(bytes)(int64_t n, int64_t size) {
-  const int64_t blocks = round_up((n + size - 1) / size, FPS_LANES);
-  return blocks * (4 * size + 7) * (int64_t)sizeof(T);
+/* Room for the blocks and the samples of a scene; no points in it yet. */
+static bool FPS(reserve)(FPS(scene) * s, int64_t n, int64_t num, int64_t size) {
+  const int64_t blocks = (n + size - 1) / size, samples = num + FPS_TILE;
+  int64_t leaves = 1;
+  while (leaves < blocks) leaves *= 2;
+  const int64_t large = 2 * leaves + blocks, middle = blocks * size, small = blocks * (3 * size + 6) + 3 * samples;
+  int64_t *memory = ast_scratch(1, large * 8 + middle * (int64_t)sizeof(T) + small * (int64_t)sizeof(COORDINATE));
+  if (!memory) return false;
+  *s = (FPS(scene)){.size = size, .blocks = blocks, .seen = memory + 2 * leaves, .tournament = {leaves, memory}};
+  s->distances = (T *)(memory + large);
+  s->points = (COORDINATE *)(s->distances + middle);
+  s->boxes = s->points + 3 * blocks * size;
+  for (int a = 0; a < 3; a++) s->samples[a] = s->boxes + 6 * blocks + a * samples;
+  memset(s->samples[0], 0, 3 * (size_t)samples * sizeof(COORDINATE));
+  return true;
 }
 
-/* The points of block b, relative to the origin, and its bounding box. */
-static void FPS(fill)(const FPS(blocks) * s, const int32_t *coordinates, int64_t n, const int32_t origin[3], int64_t b) {
-  const int64_t begin = b * s->size, points = n - begin < s->size ? n - begin : s->size;
-  const int32_t *in = coordinates + 3 * begin;
-  for (int a = 0; a < 3; a++) {
-    T *restrict point = s->point[a] + begin;
-    for (int64_t i = 0; i < points; i++) point[i] = (T)(in[3 * i + a] - origin[a]);
-    for (int64_t i = points; i < s->size; i++) point[i] = point[points - 1];
-    FPS(vector) low = FPS(load)(point), high = low;
-    for (int64_t i = FPS(width); i < s->size; i += FPS(width)) {
-      low = FPS(min)(low, FPS(load)(point + i));
-      high = FPS(max)(high, FPS(load)(point + i));
+AST_INLINE T FPS(square)(int32_t x, int32_t y, int32_t z) { return (T)x * x + (T)y * y + (T)z * z; }
+
+/* Brings the distances of block b up to date with `num` samples; returns the largest. */
+AST_INLINE T FPS(pass)(const FPS(scene) * s, int64_t b, const int32_t *list, const int num) {
+  const int64_t size = s->size;
+  const COORDINATE *restrict x = s->points + 3 * size * b, *restrict y = x + size, *restrict z = y + size;
+  T *restrict distances = s->distances + size * b, farthest = 0;
+  COORDINATE p[4], q[4], r[4];
+  for (int k = 0; k < num; k++) p[k] = s->samples[0][list[k]], q[k] = s->samples[1][list[k]], r[k] = s->samples[2][list[k]];
+  for (int64_t i = 0; i < size; i++) {
+    T least = distances[i];
+#pragma GCC unroll 4
+    for (int k = 0; k < num; k++) {
+      const T square = FPS(square)(x[i] - p[k], y[i] - q[k], z[i] - r[k]);
+      least = square < least ? square : least;
     }
-    s->low[a][b] = low[0];
-    s->high[a][b] = high[0];
-    for (int l = 1; l < FPS(width); l++) {
-      s->low[a][b] = low[l] < s->low[a][b] ? low[l] : s->low[a][b];
-      s->high[a][b] = high[l] > s->high[a][b] ? high[l] : s->high[a][b];
+    distances[i] = least;
+    farthest = least > farthest ? least : farthest;
+  }
+  return farthest;
+}
+
+/* ... with all of a list, at least one, several in a pass. */
+static T FPS(scan)(const FPS(scene) * s, int64_t b, const int32_t *list, int num) {
+  for (; num > 4; num -= 4, list += 4) FPS(pass)(s, b, list, 4);
+  switch (num) {
+    case 1:
+      return FPS(pass)(s, b, list, 1);
+    case 2:
+      return FPS(pass)(s, b, list, 2);
+    case 3:
+      return FPS(pass)(s, b, list, 3);
+    default:
+      return FPS(pass)(s, b, list, 4);
+  }
+}
+
+/* Which of the samples i..i+31 are nearer to the box than `bound`, as bits. */
+AST_INLINE uint32_t FPS(near)(const FPS(scene) * s, const COORDINATE *box, T bound, int64_t i) {
+  const COORDINATE *x = s->samples[0] + i, *y = s->samples[1] + i, *z = s->samples[2] + i;
+  uint32_t bits = 0;
+  for (int l = 0; l < 32; l++) {
+    int32_t d[3] = {x[l], y[l], z[l]};
+#pragma GCC unroll 3
+    for (int a = 0; a < 3; a++) {
+      const int32_t below = box[a] - d[a], above = d[a] - box[3 + a], outside = below > above ? below : above;
+      d[a] = outside > 0 ? outside : 0;
     }
+    bits |= FPS(square)(d[0], d[1], d[2]) < bound ? fps_bits[l] : 0;
   }
-  for (int64_t i = 0; i < s->size; i++) s->distance[begin + i] = FPS_FAR;
-  s->farthest[b] = FPS_FAR;
+  return bits;
 }
 
-static FPS(blocks) FPS(cut)(const int32_t *coordinates, int64_t n, const int32_t origin[3], int64_t size, void *memory) {
-  const int64_t used = (n + size - 1) / size, blocks = round_up(used, FPS_LANES), points = blocks * size;
-  T *next = memory;
-  FPS(blocks) s = {.size = size, .groups = blocks / FPS_LANES, .distance = next, .farthest = next + points};
-  next += points + blocks;
-  for (int a = 0; a < 3; a++, next += points + 2 * blocks) {
-    s.point[a] = next;
-    s.low[a] = next + points;
-    s.high[a] = next + points + blocks;
-  }
-  for (int64_t b = 0; b < used; b++) FPS(fill)(&s, coordinates, n, origin, b);
-  for (int64_t b = used; b < blocks; b++) {
-    for (int a = 0; a < 3; a++) s.low[a][b] = s.high[a][b] = 0;
-    s.farthest[b] = 0;
-  }
-  return s;
-}
-
-/* Brings the distances of block b up to date with the sample at p; returns the largest. */
-AST_INLINE T FPS(rescan)(const FPS(blocks) * s, int64_t b, T px, T py, T pz) {
-  const T *x = s->point[0] + b * s->size, *y = s->point[1] + b * s->size, *z = s->point[2] + b * s->size;
-  T *distance = s->distance + b * s->size;
-  FPS(vector) farthest = {0};
-  for (int64_t i = 0; i < s->size; i += FPS(width)) {
-    const FPS(vector) dx = FPS(load)(x + i) - px, dy = FPS(load)(y + i) - py, dz = FPS(load)(z + i) - pz;
-    const FPS(vector) least = FPS(min)(FPS(load)(distance + i), dx * dx + dy * dy + dz * dz);
-    FPS(store)(distance + i, least);
-    farthest = FPS(max)(farthest, least);
-  }
-  T result = 0;
-  for (int l = 0; l < FPS(width); l++) result = farthest[l] > result ? farthest[l] : result;
-  return result;
-}
-
-/* Lists the blocks of group g that may hold a point nearer to p than to the samples so far: those whose box is nearer than their
- * farthest point. All others keep every distance. */
-AST_INLINE int FPS(reach)(const FPS(blocks) * s, int64_t g, T px, T py, T pz, int32_t list[FPS_LANES]) {
-  FPS(mask) reached[FPS(parts)], any = {0};
-#pragma GCC unroll 8
-  for (int v = 0; v < FPS(parts); v++) {
-    const int64_t b = g * FPS_LANES + v * FPS(width);
-    const FPS(vector) zero = {0};
-    const FPS(vector) dx = FPS(max)(FPS(max)(FPS(load)(s->low[0] + b) - px, px - FPS(load)(s->high[0] + b)), zero);
-    const FPS(vector) dy = FPS(max)(FPS(max)(FPS(load)(s->low[1] + b) - py, py - FPS(load)(s->high[1] + b)), zero);
-    const FPS(vector) dz = FPS(max)(FPS(max)(FPS(load)(s->low[2] + b) - pz, pz - FPS(load)(s->high[2] + b)), zero);
-    reached[v] = dx * dx + dy * dy + dz * dz < FPS(load)(s->farthest + b);
-    any |= reached[v];
-  }
-  uint64_t word[AST_VECTOR_BYTES / 8], all = 0;
-  memcpy(word, &any, sizeof any);
-  for (int i = 0; i < AST_VECTOR_BYTES / 8; i++) all |= word[i];
-  if (!all) return 0;
+/* Shows block b, whose bound is `bound`, the samples that it has not seen of the first `taken`; returns its new bound. */
+static T FPS(update)(const FPS(scene) * s, int64_t b, T bound, int64_t taken) {
+  const COORDINATE *box = s->boxes + 6 * b;
+  int32_t list[128];
   int num = 0;
-  for (int v = 0; v < FPS(parts); v++)
-    for (int l = 0; l < FPS(width); l++) {
-      list[num] = v * FPS(width) + l;
-      num -= (int)reached[v][l]; /* true is -1 */
+  for (int64_t i = s->seen[b]; i < taken; i += 64) {
+    uint64_t bits = FPS(near)(s, box, bound, i);
+    if (taken - i > 32) bits |= (uint64_t)FPS(near)(s, box, bound, i + 32) << 32;
+    if (taken - i < 64) bits &= (1ull << (taken - i)) - 1;
+    while (bits) {
+      const int l = __builtin_ctzll(bits);
+      list[num++] = (int32_t)i + l;
+      bits ^= 1ull << l;
     }
-  return num;
+    if (num == 0 || (num < 64 && i + 64 < taken)) continue;
+    bound = FPS(scan)(s, b, list, num);
+    num = 0;
+  }
+  s->seen[b] = taken;
+  return bound;
 }
 
-/* Adds point `pick` to the samples. Returns the point that is now farthest from them, the first of several, or -1 if all distances
- * are 0. */
-static int64_t FPS(step)(const FPS(blocks) * s, int64_t pick) {
-  const T px = s->point[0][pick], py = s->point[1][pick], pz = s->point[2][pick];
-  FPS(vector) best[FPS(parts)] = {0}, group[FPS(parts)] = {0};
-  int32_t list[FPS_LANES];
-  for (int64_t g = 0; g < s->groups; g++) {
-    T *farthest = s->farthest + g * FPS_LANES;
-    const int num = FPS(reach)(s, g, px, py, pz, list);
-    for (int i = 0; i < num; i++) farthest[list[i]] = FPS(rescan)(s, g * FPS_LANES + list[i], px, py, pz);
-#pragma GCC unroll 8
-    for (int v = 0; v < FPS(parts); v++) {
-      const FPS(vector) here = FPS(load)(farthest + v * FPS(width));
-      group[v] = FPS(select)(here > best[v], (FPS(vector)){0} + (T)g, group[v]);
-      best[v] = FPS(max)(best[v], here);
-    }
+/* The points of block b, its bounding box, and the distances from the first sample; returns the largest. */
+static T FPS(fill)(const FPS(scene) * s, const int32_t *coordinates, int64_t n, const int32_t origin[3], int64_t b) {
+  const int64_t size = s->size, begin = b * size, points = min64(n - begin, size);
+  const int32_t *restrict in = coordinates + 3 * begin;
+  COORDINATE *restrict x = s->points + 3 * size * b, *restrict y = x + size, *restrict z = y + size;
+  for (int64_t i = 0; i < points; i++) {
+    x[i] = (COORDINATE)(in[3 * i] - origin[0]);
+    y[i] = (COORDINATE)(in[3 * i + 1] - origin[1]);
+    z[i] = (COORDINATE)(in[3 * i + 2] - origin[2]);
   }
-  T value = 0;
-  int64_t block = 0;
-  for (int v = 0; v < FPS(parts); v++)
-    for (int l = 0; l < FPS(width); l++) {
-      const int64_t b = (int64_t)group[v][l] * FPS_LANES + v * FPS(width) + l;
-      if (best[v][l] > value || (best[v][l] == value && b < block)) block = b;
-      if (best[v][l] > value) value = best[v][l];
+  for (int64_t i = points; i < size; i++) x[i] = x[points - 1], y[i] = y[points - 1], z[i] = z[points - 1];
+  for (int a = 0; a < 3; a++) {
+    const COORDINATE *p = x + a * size;
+    COORDINATE low = p[0], high = p[0];
+    for (int64_t i = 0; i < size; i++) {
+      low = p[i] < low ? p[i] : low;
+      high = p[i] > high ? p[i] : high;
     }
-  if (!(value > 0)) return -1;
-  for (pick = block * s->size; s->distance[pick] < value;) pick++;
-  return pick;
+    s->boxes[6 * b + a] = low;
+    s->boxes[6 * b + 3 + a] = high;
+  }
+  const COORDINATE px = s->samples[0][0], py = s->samples[1][0], pz = s->samples[2][0];
+  T *restrict distances = s->distances + begin, farthest = 0;
+  for (int64_t i = 0; i < size; i++) {
+    distances[i] = FPS(square)(x[i] - px, y[i] - py, z[i] - pz);
+    farthest = distances[i] > farthest ? distances[i] : farthest;
+  }
+  s->seen[b] = 1;
+  return farthest;
+}
+
+/* The first point of block b at this distance, counted within the block. */
+static int64_t FPS(find)(const FPS(scene) * s, int64_t b, T distance) {
+  const T *distances = s->distances + s->size * b, size = (T)s->size;
+  T first = size;
+  for (T i = 0; i < size; i++) {
+    const T here = distances[i] == distance ? i : size;
+    first = here < first ? here : first;
+  }
+  return first;
+}
+
+/* Writes the indices of the samples, from `begin` on, until there are num or all distances are 0. Returns their number, 0 without memory.
+ */
+static int64_t FPS(sample)(const int32_t *coordinates, int64_t n, const int32_t origin[3], int64_t begin, int64_t num, int64_t *indices) {
+  FPS(scene) s;
+  if (!FPS(reserve)(&s, n, num, fps_block_size(n))) return 0;
+  const fps_tournament t = s.tournament;
+  for (int a = 0; a < 3; a++) s.samples[a][0] = (COORDINATE)(coordinates[a] - origin[a]);
+  for (int64_t b = 0; b < t.leaves; b++) t.keys[t.leaves + b] = b < s.blocks ? fps_key(FPS(fill)(&s, coordinates, n, origin, b), b) : -1;
+  for (int64_t i = t.leaves - 1; i > 0; i--) t.keys[i] = max64(t.keys[2 * i], t.keys[2 * i + 1]);
+  indices[0] = begin;
+  int64_t taken = 1;
+  while (taken < num) {
+    const int64_t b = fps_key_block(t.keys[1]);
+    const T bound = (T)fps_key_bound(t.keys[1]);
+    if (bound == 0) break;
+    if (s.seen[b] < taken) {
+      fps_replay(t, fps_key(FPS(update)(&s, b, bound, taken), b));
+      continue;
+    }
+    const int64_t i = FPS(find)(&s, b, bound);
+    for (int a = 0; a < 3; a++) s.samples[a][taken] = s.points[(3 * b + a) * s.size + i];
+    indices[taken++] = begin + b * s.size + i;
+  }
+  return taken;
 }
 
 #undef T
-#undef INTEGER
+#undef COORDINATE
 #undef FPS
-#undef FPS_FAR

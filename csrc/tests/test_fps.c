@@ -91,7 +91,7 @@ static void test_shapes(const ast_kernels *kernels) {
 }
 
 static void test_large_blocks(const ast_kernels *kernels) {
-  enum { N = 10001 };
+  enum { N = 20001 };
   const int64_t offsets[] = {0, N};
   int32_t *points = new_small_ints(3 * N);
   for (int shape = 0; shape < SHAPES; shape++) {
