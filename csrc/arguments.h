@@ -19,6 +19,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#undef I /* of complex.h, which NumPy includes: here it is a number of inputs */
 #include "ast.h"
 
 static bool debug; /* AST_SIM_DEBUG=1 */
@@ -130,6 +131,10 @@ static argument *take(call *c, const char *name, int type, bool output, bool str
 #define IN_ROWS(c, name, ndim, ...)   take(c, name, FLOATS, false, true, ndim, __VA_ARGS__)
 #define OUT(c, name, type, ndim, ...) take(c, name, type, true, false, ndim, __VA_ARGS__)
 #define FREE                          ((int64_t)ANY)
+
+/* The argument that `expression` takes, or one without data where None is given. */
+static argument absent;
+#define OPTIONAL(c, expression) ((c)->objects[(c)->next] == Py_None ? ((c)->next++, &absent) : (expression))
 
 static bool take_int(call *c, const char *name, int64_t low, int64_t high, int64_t *out) {
   *out = PyLong_AsLongLong(c->objects[c->next++]);

@@ -5,7 +5,8 @@
  * the number of rows. Inputs are never changed and outputs are written in full. The caller has checked shapes, offsets and
  * index ranges (module.c does it for Python); a kernel checks only what it alone can see, such as a point outside the cube.
  *
- * Legend: B scenes, N nodes, C cells, T tokens, F channels, C_in and C_out channels of a convolution, H heads, D channels of a head.
+ * Legend: B scenes, N nodes, C cells, T tokens, F channels, C_in and C_out channels of a convolution, H heads, D channels of a head,
+ * M rows of a linear layer, I and O its inputs and outputs.
  */
 #ifndef AST_H
 #define AST_H
@@ -53,6 +54,15 @@ typedef struct {
 typedef struct {
   float *of_senders, *of_receivers, *edge_features, *A1, *a1, *A2, *W2, *b2, *gamma, *beta;
 } ast_message_gradients;
+/* What follows the product of a linear layer: nothing, max(0, z), or a . gelu(b) for z = [a, b], a and b of half the columns. */
+typedef enum { AST_IDENTITY = 0, AST_RELU, AST_GEGLU } ast_activation;
+
+/* The sizes of a linear layer on x [M,I] with weight [O,I]: z = x W^T + bias is [M,O], the output has O columns, or O/2 for GEGLU. */
+typedef struct {
+  int64_t M, I, O;
+  int64_t x_stride, residual_stride, dout_stride; /* floats from row to row */
+  ast_activation activation;
+} ast_linear;
 
 /* One table per instruction set; every entry has the same contract on each. */
 typedef struct {
@@ -122,6 +132,14 @@ typedef struct {
   /* Its gradients, layers recomputed. dsum [R,F2], dmessages [M,F2] or NULL. */
   ast_status (*message_backward)(const ast_message *s, const float *restrict dsum, const float *restrict dmessages,
                                  const ast_message_gradients *out);
+  /* out = act(z) + residual with z = x W^T + bias; bias [O] and residual may be NULL, and so z [M,O], if it is not wanted. */
+  ast_status (*linear)(const ast_linear *s, const float *restrict x, const float *restrict weight, const float *restrict bias,
+                       const float *restrict residual, float *restrict out, float *restrict z);
+  /* Its gradients dx [M,I], dweight [O,I] and dbias [O], each NULL if it is not wanted. z is recomputed if it is NULL; for ReLU
+   * max(0, z) will do. */
+  ast_status (*linear_backward)(const ast_linear *s, const float *restrict dout, const float *restrict x, const float *restrict weight,
+                                const float *restrict bias, const float *restrict z, float *restrict dx, float *restrict dweight,
+                                float *restrict dbias);
 } ast_kernels;
 
 /* dispatch.c: the table of an instruction set by name ("base", "avx2", "avx512"), or of the best one if name is NULL.

@@ -50,33 +50,30 @@ AST_INLINE void gemm_transpose4(const float *in, int64_t in_row, float *out) {
   for (int k = 0; k < 4; k++) *(v4_unaligned *)(out + k * GEMM_COLUMNS) = y[k];
 }
 
-/* panels of B_kj = b[k*row + j*column], j < N, padded with zeros to whole panels */
-static void gemm_pack(const float *b, int64_t row, int64_t column, int64_t K, int64_t N, float *panels) {
-  for (int64_t j0 = 0; j0 < N; j0 += GEMM_COLUMNS, panels += K * GEMM_COLUMNS) {
-    const int64_t width = min64(GEMM_COLUMNS, N - j0);
-    const int64_t wide = row == 1 && width == GEMM_COLUMNS ? K / 4 * 4 : 0;
-    for (int64_t k = 0; k < wide; k += 4)
+/* One panel of B_kj = b[k*row + j*column], j < N <= `width`, padded with zeros: `width` columns of the GEMM_COLUMNS of a panel. */
+AST_INLINE void gemm_pack_columns(const float *b, int64_t row, int64_t column, int64_t K, int64_t N, const int64_t width, float *panel) {
+  const int64_t wide = row == 1 && N == width ? K / 4 * 4 : 0;
+  for (int64_t k = 0; k < wide; k += 4)
 #pragma GCC unroll 8
-      for (int64_t j = 0; j < GEMM_COLUMNS; j += 4) gemm_transpose4(b + k + (j0 + j) * column, column, panels + k * GEMM_COLUMNS + j);
-    for (int64_t k = wide; k < K; k++) {
-      float *out = panels + k * GEMM_COLUMNS;
-      const float *in = b + k * row + j0 * column;
-      if (column == 1) memcpy(out, in, (size_t)width * sizeof *out);
-      else
-        for (int64_t j = 0; j < width; j++) out[j] = in[j * column];
-      for (int64_t j = width; j < GEMM_COLUMNS; j++) out[j] = 0;
-    }
+    for (int64_t j = 0; j < width; j += 4) gemm_transpose4(b + k + j * column, column, panel + k * GEMM_COLUMNS + j);
+  for (int64_t k = wide; k < K; k++) {
+    float *out = panel + k * GEMM_COLUMNS;
+    const float *in = b + k * row;
+    if (column == 1) memcpy(out, in, (size_t)N * sizeof *out);
+    else
+      for (int64_t j = 0; j < N; j++) out[j] = in[j * column];
+    for (int64_t j = N; j < width; j++) out[j] = 0;
   }
 }
 
-/* One register tile: `rows` and `vectors` are constants at every call, so that the loops over them unroll. */
-AST_INLINE void gemm_tile(const int rows, const int vectors, int64_t K, gemm_a a, const float *b, int64_t b_row, float *c, int64_t c_row,
-                          bool add) {
-  vf sum[GEMM_ROWS][2];
-#pragma GCC unroll 12
-  for (int i = 0; i < rows; i++)
-#pragma GCC unroll 2
-    for (int j = 0; j < vectors; j++) sum[i][j] = (vf){0};
+/* panels of B_kj = b[k*row + j*column], j < N, padded with zeros to whole panels */
+static void gemm_pack(const float *b, int64_t row, int64_t column, int64_t K, int64_t N, float *panels) {
+  for (int64_t j = 0; j < N; j += GEMM_COLUMNS)
+    gemm_pack_columns(b + j * column, row, column, K, min64(GEMM_COLUMNS, N - j), GEMM_COLUMNS, panels + j * K);
+}
+
+/* sum_ij += sum_k A_ik B_kj in registers: `rows` and `vectors` are constants at every call, so that the loops over them unroll. */
+AST_INLINE void gemm_sums(const int rows, const int vectors, int64_t K, gemm_a a, const float *b, int64_t b_row, vf sum[GEMM_ROWS][2]) {
   for (int64_t k = 0; k < K; k++) {
     vf b_k[2];
 #pragma GCC unroll 2
@@ -88,6 +85,17 @@ AST_INLINE void gemm_tile(const int rows, const int vectors, int64_t K, gemm_a a
       for (int j = 0; j < vectors; j++) sum[i][j] += a_ik * b_k[j];
     }
   }
+}
+
+/* One register tile. */
+AST_INLINE void gemm_tile(const int rows, const int vectors, int64_t K, gemm_a a, const float *b, int64_t b_row, float *c, int64_t c_row,
+                          bool add) {
+  vf sum[GEMM_ROWS][2];
+#pragma GCC unroll 12
+  for (int i = 0; i < rows; i++)
+#pragma GCC unroll 2
+    for (int j = 0; j < vectors; j++) sum[i][j] = (vf){0};
+  gemm_sums(rows, vectors, K, a, b, b_row, sum);
 #pragma GCC unroll 12
   for (int i = 0; i < rows; i++)
 #pragma GCC unroll 2
@@ -104,6 +112,7 @@ AST_INLINE void gemm_strip(const int vectors, int64_t M, int64_t K, gemm_a a, co
   for (; i + (rows) <= M; i += (rows)) \
   gemm_tile(rows, vectors, K, (gemm_a){a.data + i * a.row, a.row, a.column}, b, b_row, c + i * c_row, c_row, add)
   GEMM_STEP(GEMM_ROWS);
+  if (GEMM_ROWS > 8) GEMM_STEP(8);
   GEMM_STEP(4);
   GEMM_STEP(2);
   GEMM_STEP(1);

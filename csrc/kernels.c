@@ -13,6 +13,7 @@
 #include "sparse_conv.c"
 #include "message.c"
 #include "message_backward.c" /* after message.c, whose tiles it uses */
+#include "linear.c"
 
 #define AST_TABLE_OF(isa)  ast_kernels_##isa
 #define AST_TABLE(isa)     AST_TABLE_OF(isa)
@@ -37,4 +38,6 @@ const ast_kernels AST_TABLE(AST_ISA) = {
     .attention_backward = attention_backward,
     .message = message,
     .message_backward = message_backward,
+    .linear = linear,
+    .linear_backward = linear_backward,
 };

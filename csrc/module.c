@@ -378,6 +378,66 @@ static PyObject *message_backward(PyObject *self, PyObject *const *objects, Py_s
   Py_RETURN_NONE;
 }
 
+/* ---- linear ---- */
+
+static bool check_geglu(const call *c, const ast_linear *s) {
+  if (s->activation == AST_GEGLU && s->O % 2)
+    return fail(c, PyExc_ValueError, "geglu takes an even number of outputs, not %lld", (long long)s->O);
+  return true;
+}
+
+static PyObject *linear(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  call c;
+  argument *x, *weight, *bias, *residual, *out, *z;
+  int64_t activation;
+  ast_status status;
+  if (!start(&c, "linear", objects, num, 7) || !(x = IN_ROWS(&c, "x", 2, FREE, FREE)) ||
+      !(weight = IN(&c, "weight", FLOATS, 2, FREE, x->shape[1])) || !(bias = OPTIONAL(&c, IN(&c, "bias", FLOATS, 1, weight->shape[0]))) ||
+      !(residual = OPTIONAL(&c, IN_ROWS(&c, "residual", 2, x->shape[0], FREE))) ||
+      !take_int(&c, "activation", AST_IDENTITY, AST_GEGLU, &activation))
+    return NULL;
+  const int64_t M = x->shape[0], O = weight->shape[0];
+  const ast_linear s = {.M = M,
+                        .I = x->shape[1],
+                        .O = O,
+                        .x_stride = x->row_stride,
+                        .residual_stride = residual->row_stride,
+                        .activation = (ast_activation)activation};
+  const int64_t columns = activation == AST_GEGLU ? O / 2 : O;
+  if (!check_geglu(&c, &s) || !(out = OUT(&c, "out", FLOATS, 2, M, columns)) || !(z = OPTIONAL(&c, OUT(&c, "z", FLOATS, 2, M, O))))
+    return NULL;
+  if (residual->data && residual->shape[1] != columns) {
+    fail(&c, PyExc_ValueError, "residual must have %lld columns, not %lld", (long long)columns, (long long)residual->shape[1]);
+    return NULL;
+  }
+  KERNEL(c, status, kernels->linear(&s, x->data, weight->data, bias->data, residual->data, out->data, z->data));
+  Py_RETURN_NONE;
+}
+
+static PyObject *linear_backward(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  call c;
+  argument *dout, *x, *weight, *bias, *z, *dx, *dweight, *dbias;
+  int64_t activation;
+  ast_status status;
+  if (!start(&c, "linear_backward", objects, num, 9) || !(x = IN_ROWS(&c, "x", 2, FREE, FREE)) ||
+      !(weight = IN(&c, "weight", FLOATS, 2, FREE, x->shape[1])) || !(bias = OPTIONAL(&c, IN(&c, "bias", FLOATS, 1, weight->shape[0]))) ||
+      !(z = OPTIONAL(&c, IN(&c, "z", FLOATS, 2, x->shape[0], weight->shape[0]))) ||
+      !take_int(&c, "activation", AST_IDENTITY, AST_GEGLU, &activation))
+    return NULL;
+  ast_linear s = {
+      .M = x->shape[0], .I = x->shape[1], .O = weight->shape[0], .x_stride = x->row_stride, .activation = (ast_activation)activation};
+  if (!check_geglu(&c, &s) || !(dout = IN_ROWS(&c, "dout", 2, s.M, activation == AST_GEGLU ? s.O / 2 : s.O)) ||
+      !(dx = OPTIONAL(&c, OUT(&c, "dx", FLOATS, 2, s.M, s.I))) || !(dweight = OPTIONAL(&c, OUT(&c, "dweight", FLOATS, 2, s.O, s.I))) ||
+      !(dbias = OPTIONAL(&c, OUT(&c, "dbias", FLOATS, 1, s.O))))
+    return NULL;
+  s.dout_stride = dout->row_stride;
+  KERNEL(c, status,
+         kernels->linear_backward(&s, dout->data, x->data, weight->data, bias->data, z->data, dx->data, dweight->data, dbias->data));
+  Py_RETURN_NONE;
+}
+
 /* ---- the process ---- */
 
 /* The addresses of torch_parallel_for and torch_get_num_threads. */
@@ -436,6 +496,10 @@ static PyMethodDef methods[] = {
     FAST(message_backward,
          "message_backward(of_senders, of_receivers, edge_features, A1, a1, A2, W2, b2, gamma, beta, senders, receivers, "
          "receiver_offsets, dsum, dmessages, then the gradients in the order of the inputs)"),
+    FAST(linear, "linear(x, weight, bias, residual, activation, out, z); bias, residual and z may be None"),
+    FAST(linear_backward,
+         "linear_backward(x, weight, bias, z, activation, dout, dx, dweight, dbias); bias, z and the gradients that are not wanted may be "
+         "None"),
     FAST(set_pool, "set_pool(parallel_for, num_threads): addresses of torch's thread pool, 0 for serial"),
     {"keep_memory", keep_memory, METH_NOARGS, "Let the C library keep freed blocks; whether it had an effect."},
     {"configuration", configuration, METH_NOARGS, "The chosen instruction set, the supported ones, the threads, the debug mode."},

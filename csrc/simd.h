@@ -29,31 +29,70 @@ AST_INLINE vf vload(const float *p) { return *(const vf_unaligned *)p; }
 AST_INLINE void vstore(float *p, vf x) { *(vf_unaligned *)p = x; }
 AST_INLINE vf vsplat(float x) { return x - (vf){0}; } /* x - 0 keeps -0 */
 
-/* The first n < VW floats; the others are 0 and are not read. */
+/* The first n < VW floats; the others are 0 and are not read. In pieces of fixed size: a copy of variable size is a call. */
 AST_INLINE vf vload_part(const float *p, int64_t n) {
   vf x = {0};
-  memcpy(&x, p, (size_t)n * sizeof *p);
+  float *to = (float *)&x;
+#pragma GCC unroll 4
+  for (int piece = VW / 2; piece; piece /= 2)
+    if (n & piece) {
+      memcpy(to, p, (size_t)piece * sizeof *p);
+      to += piece, p += piece;
+    }
   return x;
 }
-AST_INLINE void vstore_part(float *p, vf x, int64_t n) { memcpy(p, &x, (size_t)n * sizeof *p); }
+AST_INLINE void vstore_part(float *p, vf x, int64_t n) {
+  const float *from = (const float *)&x;
+#pragma GCC unroll 4
+  for (int piece = VW / 2; piece; piece /= 2)
+    if (n & piece) {
+      memcpy(p, from, (size_t)piece * sizeof *p);
+      from += piece, p += piece;
+    }
+}
+/* The first min(n, VW) floats; none if n <= 0. */
+AST_INLINE vf vload_upto(const float *p, int64_t n) { return n >= VW ? vload(p) : n > 0 ? vload_part(p, n) : (vf){0}; }
+AST_INLINE void vstore_upto(float *p, vf x, int64_t n) {
+  if (n >= VW) vstore(p, x);
+  else if (n > 0) vstore_part(p, x, n);
+}
 
 /* a where the mask is set (-1), b where it is not (0) */
 AST_INLINE vf vselect(vi mask, vf a, vf b) { return (vf)((mask & (vi)a) | (~mask & (vi)b)); }
 AST_INLINE vf vmax(vf a, vf b) { return vselect(a > b, a, b); } /* b where either is NaN */
 
+#if AST_VECTOR_BYTES == 64
+static const vi LANE_INDICES = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+#elif AST_VECTOR_BYTES == 32
+static const vi LANE_INDICES = {0, 1, 2, 3, 4, 5, 6, 7};
+#else
+static const vi LANE_INDICES = {0, 1, 2, 3};
+#endif
+
+/* lane i becomes lane i ^ distance, a power of two; the loops of vsum and vlargest are written out for constant shuffles */
+AST_INLINE vf vswap(vf x, const int distance) {
+#ifdef __clang__
+  vf y;
+  for (int i = 0; i < VW; i++) y[i] = x[i ^ distance];
+  return y;
+#else
+  return __builtin_shuffle(x, LANE_INDICES ^ distance);
+#endif
+}
+
 /* Sum and maximum over the lanes, always paired the same way; a NaN loses against anything in the maximum. */
 AST_INLINE float vsum(vf x) {
-#pragma GCC unroll 4
-  for (int half = VW / 2; half; half /= 2)
-#pragma GCC unroll 8
-    for (int i = 0; i < half; i++) x[i] += x[i + half];
+  x += vswap(x, VW / 2);
+  x += vswap(x, VW / 4);
+  if (VW >= 8) x += vswap(x, VW / 8);
+  if (VW >= 16) x += vswap(x, 1);
   return x[0];
 }
 AST_INLINE float vlargest(vf x) {
-#pragma GCC unroll 4
-  for (int half = VW / 2; half; half /= 2)
-#pragma GCC unroll 8
-    for (int i = 0; i < half; i++) x[i] = x[i] > x[i + half] ? x[i] : x[i + half];
+  x = vmax(x, vswap(x, VW / 2));
+  x = vmax(x, vswap(x, VW / 4));
+  if (VW >= 8) x = vmax(x, vswap(x, VW / 8));
+  if (VW >= 16) x = vmax(x, vswap(x, 1));
   return x[0];
 }
 
@@ -71,6 +110,26 @@ AST_INLINE vf vexp2(vf x, int32_t shift) {
   const vf power = (vf)((vu)rounded << 23);
   return (vf)((vi)(p * power) & ~(x < (float)(shift - 125)));
 }
+
+/* The distribution function of the normal distribution, (1 + erf(x / sqrt 2)) / 2, and its density. */
+AST_INLINE vf vnormal(vf x) {
+  const vf z = x * 0x1.6a09e6p-1f, t = vselect(z < 0, -z, z), s = z * z;
+  vf near = -0x1.38e000p-11f * s + 0x1.471a58p-8f; /* erf(z) = z + z p(z^2) where |z| is below 475/512, */
+  near = near * s - 0x1.b691b2p-6f;
+  near = near * s + 0x1.ce1c44p-4f;
+  near = near * s - 0x1.812700p-2f;
+  near = near * s + 0x1.06eba8p-3f;
+  near = near * z + z;
+  vf far = -0x1.220000p-16f * t + 0x1.91cfb2p-12f; /* log(1 - erf(t)) = -t + t q(t) elsewhere, minimax */
+  far = far * s + (-0x1.fd1438p-9f * t + 0x1.8d6342p-6f);
+  far = far * t - 0x1.b55cb8p-4f;
+  far = far * t - 0x1.450aa0p-1f;
+  far = far * t - 0x1.079d0cp-3f;
+  far = far * t - t;
+  const vf tail = vexp2(far * 0x1.715476p+0f, 1);
+  return vselect(t > 475.0f / 512, vselect(z < 0, tail, 1 - tail), 0.5f * near + 0.5f);
+}
+AST_INLINE vf vnormal_density(vf x) { return 0x1.988454p-2f * vexp2(x * x * -0x1.715476p-1f, 0); }
 
 AST_INLINE int64_t min64(int64_t a, int64_t b) { return a < b ? a : b; }
 AST_INLINE int64_t max64(int64_t a, int64_t b) { return a > b ? a : b; }

@@ -1,0 +1,243 @@
+/* linear and linear_backward against the formula in double, on every instruction set, serial and on a pool.
+ *
+ * Accuracy: the largest error is at most twice that of the same formula in plain float plus 1e-6 of the largest value.
+ */
+#include "check.h"
+
+/* n floats of NaN: what a kernel leaves unwritten shows. */
+static float *new_floats(int64_t n) {
+  float *x = malloc((size_t)(n + 1) * sizeof *x);
+  CHECK(x, "no memory");
+  for (int64_t i = 0; i < n; i++) x[i] = NAN;
+  return x;
+}
+static float *random_floats(int64_t n, float amplitude) {
+  float *x = new_floats(n);
+  for (int64_t i = 0; i < n; i++) x[i] = amplitude * random_float();
+  return x;
+}
+static bool same_bits(const void *a, const void *b, int64_t floats) { return memcmp(a, b, (size_t)floats * sizeof(float)) == 0; }
+
+enum { RESULTS = 4 }; /* out, dx, dweight, dbias */
+static const char *const names[RESULTS] = {"out", "dx", "dweight", "dbias"};
+
+typedef struct {
+  ast_linear s;
+  int64_t columns, sizes[RESULTS];
+  float *x, *weight, *bias, *residual, *dout;
+} problem;
+
+typedef struct {
+  float *of[RESULTS], *z;
+} answer;
+
+static problem new_problem(int64_t M, int64_t I, int64_t O, ast_activation activation, float amplitude) {
+  problem a = {.s = {M, I, O, I, 0, 0, activation}, .columns = activation == AST_GEGLU ? O / 2 : O};
+  a.s.residual_stride = a.s.dout_stride = a.columns;
+  const int64_t sizes[RESULTS] = {M * a.columns, M * I, O * I, O};
+  memcpy(a.sizes, sizes, sizeof sizes);
+  a.x = random_floats(M * I, amplitude), a.weight = random_floats(O * I, 1), a.bias = random_floats(O, 1);
+  a.residual = random_floats(M * a.columns, 1), a.dout = random_floats(M * a.columns, 1);
+  return a;
+}
+
+static void free_problem(problem a) { free(a.x), free(a.weight), free(a.bias), free(a.residual), free(a.dout); }
+
+static answer solve(const ast_kernels *kernels, const problem *a, bool save) {
+  answer r;
+  for (int i = 0; i < RESULTS; i++) r.of[i] = new_floats(a->sizes[i]);
+  r.z = new_floats(a->s.M * a->s.O);
+  CHECK(kernels->linear(&a->s, a->x, a->weight, a->bias, a->residual, r.of[0], save ? r.z : NULL) == AST_OK, "status");
+  CHECK(kernels->linear_backward(&a->s, a->dout, a->x, a->weight, a->bias, save ? r.z : NULL, r.of[1], r.of[2], r.of[3]) == AST_OK,
+        "status");
+  return r;
+}
+
+static void free_answer(answer r) {
+  for (int i = 0; i < RESULTS; i++) free(r.of[i]);
+  free(r.z);
+}
+
+/* The results in the type `real`. */
+#define FORMULA(name, real, ERF, EXP)                                                               \
+  static void name(const problem *a, real *out, real *dx, real *dweight, real *dbias) {             \
+    const int64_t I = a->s.I, O = a->s.O, N = a->columns;                                           \
+    real *z = calloc((size_t)O * 2 + 1, sizeof *z), *dz = z + O;                                    \
+    for (int64_t j = 0; j < a->s.M * I; j++) dx[j] = 0;                                             \
+    for (int64_t j = 0; j < O * I; j++) dweight[j] = 0;                                             \
+    for (int64_t j = 0; j < O; j++) dbias[j] = 0;                                                   \
+    for (int64_t i = 0; i < a->s.M; i++) {                                                          \
+      for (int64_t o = 0; o < O; o++) {                                                             \
+        z[o] = (real)a->bias[o];                                                                    \
+        for (int64_t k = 0; k < I; k++) z[o] += (real)a->x[i * I + k] * (real)a->weight[o * I + k]; \
+      }                                                                                             \
+      for (int64_t j = 0; j < N; j++) {                                                             \
+        const real y = (real)a->dout[i * N + j];                                                    \
+        real act = z[j];                                                                            \
+        if (a->s.activation == AST_GEGLU) {                                                         \
+          const real b = z[N + j], phi = (real)0.5 * (1 + ERF(b * (real)0.70710678118654752));      \
+          act = z[j] * b * phi;                                                                     \
+          dz[j] = y * b * phi;                                                                      \
+          dz[N + j] = y * z[j] * (phi + b * EXP(-b * b / 2) * (real)0.3989422804014327);            \
+        } else if (a->s.activation == AST_RELU) {                                                   \
+          act = z[j] <= 0 ? 0 : z[j];                                                               \
+          dz[j] = z[j] <= 0 ? 0 : y;                                                                \
+        } else {                                                                                    \
+          dz[j] = y;                                                                                \
+        }                                                                                           \
+        out[i * N + j] = act + (real)a->residual[i * N + j];                                        \
+      }                                                                                             \
+      for (int64_t o = 0; o < O; o++) {                                                             \
+        dbias[o] += dz[o];                                                                          \
+        for (int64_t k = 0; k < I; k++) {                                                           \
+          dx[i * I + k] += dz[o] * (real)a->weight[o * I + k];                                      \
+          dweight[o * I + k] += dz[o] * (real)a->x[i * I + k];                                      \
+        }                                                                                           \
+      }                                                                                             \
+    }                                                                                               \
+    free(z);                                                                                        \
+  }
+FORMULA(formula, double, erf, exp)
+FORMULA(formula_float, float, erff, expf)
+
+static void compare(const char *what, const float *got, const double *exact, const float *plain, int64_t n) {
+  double error = 0, plain_error = 0, largest = 0;
+  for (int64_t i = 0; i < n; i++) {
+    CHECK(isfinite(got[i]), "%s[%lld] is %g, not %g", what, (long long)i, (double)got[i], exact[i]);
+    error = fmax(error, fabs((double)got[i] - exact[i]));
+    plain_error = fmax(plain_error, fabs((double)plain[i] - exact[i]));
+    largest = fmax(largest, fabs(exact[i]));
+  }
+  CHECK(error <= 2 * plain_error + 1e-6 * largest, "%s is off by %g of %g, plain float by %g", what, error, largest, plain_error);
+}
+
+static void check_against_formula(const problem *a, const answer *r) {
+  double *exact[RESULTS];
+  float *plain[RESULTS];
+  for (int i = 0; i < RESULTS; i++) {
+    exact[i] = calloc((size_t)a->sizes[i] + 1, sizeof(double));
+    plain[i] = new_floats(a->sizes[i]);
+  }
+  formula(a, exact[0], exact[1], exact[2], exact[3]);
+  formula_float(a, plain[0], plain[1], plain[2], plain[3]);
+  for (int i = 0; i < RESULTS; i++) {
+    compare(names[i], r->of[i], exact[i], plain[i], a->sizes[i]);
+    free(exact[i]), free(plain[i]);
+  }
+}
+
+/* Both ways of cutting the gradient of the weight, and all kinds of tails. */
+static void test_accuracy(const ast_kernels *kernels) {
+  static const int64_t sizes[][3] = {{0, 3, 4},    {1, 1, 2},    {2, 1, 2},      {1, 17, 34},  {7, 5, 6},
+                                     {12, 16, 32}, {13, 33, 64}, {95, 3, 128},   {96, 60, 2},  {97, 128, 30},
+                                     {193, 64, 8}, {300, 12, 4}, {41, 130, 200}, {400, 9, 66}, {128, 96, 256}};
+  for (size_t i = 0; i < sizeof sizes / sizeof *sizes; i++)
+    for (int activation = 0; activation < 3; activation++) {
+      problem a = new_problem(sizes[i][0], sizes[i][1], sizes[i][2], (ast_activation)activation, i % 2 ? 1 : 3);
+      for (int save = 0; save < 2; save++) {
+        answer r = solve(kernels, &a, save);
+        check_against_formula(&a, &r);
+        free_answer(r);
+      }
+      free_problem(a);
+    }
+}
+
+/* A row's results are the same bits wherever it stands and whoever computes it; those of the weight for any threads. */
+static void test_same_bits(const ast_kernels *kernels) {
+  for (int activation = 0; activation < 3; activation++) {
+    problem a = new_problem(700, 40, 70, (ast_activation)activation, 1);
+    answer all = solve(kernels, &a, false), again = solve(kernels, &a, true);
+    for (int i = 0; i < RESULTS; i++) CHECK(same_bits(all.of[i], again.of[i], a.sizes[i]), "%s differs if z is kept", names[i]);
+    for (int64_t first = 0; first < 700; first += 233) {
+      problem one = a;
+      one.s.M = 1 + first / 17;
+      if (first + one.s.M > 700) one.s.M = 1;
+      one.x += first * one.s.I, one.residual += first * one.columns, one.dout += first * one.columns;
+      one.sizes[0] = one.s.M * one.columns, one.sizes[1] = one.s.M * one.s.I;
+      answer r = solve(kernels, &one, false);
+      CHECK(same_bits(r.of[0], all.of[0] + first * one.columns, one.sizes[0]), "out of %lld rows alone", (long long)one.s.M);
+      CHECK(same_bits(r.of[1], all.of[1] + first * one.s.I, one.sizes[1]), "dx of %lld rows alone", (long long)one.s.M);
+      free_answer(r);
+    }
+    free_answer(all), free_answer(again), free_problem(a);
+  }
+}
+
+static void test_same_bits_on_threads(const ast_kernels *kernels) {
+  static const int64_t sizes[][3] = {{700, 40, 70}, {100, 130, 300}, {90, 128, 128}};
+  for (int i = 0; i < 3; i++) {
+    problem a = new_problem(sizes[i][0], sizes[i][1], sizes[i][2], AST_GEGLU, 1);
+    answer first = solve(kernels, &a, false), again = solve(kernels, &a, false);
+    ast_set_pool(NULL, NULL);
+    answer serial = solve(kernels, &a, false);
+    ast_set_pool(check_parallel_for, check_num_threads);
+    for (int j = 0; j < RESULTS; j++) {
+      CHECK(same_bits(first.of[j], again.of[j], a.sizes[j]), "%s changes from run to run", names[j]);
+      CHECK(same_bits(first.of[j], serial.of[j], a.sizes[j]), "%s changes with the threads", names[j]);
+    }
+    free_answer(first), free_answer(again), free_answer(serial), free_problem(a);
+  }
+}
+
+/* Rows that lie apart, and gradients that are not wanted. */
+static void test_strides_and_absent_arrays(const ast_kernels *kernels) {
+  const int64_t M = 100, I = 20, O = 18, apart = 50;
+  problem a = new_problem(M, I, O, AST_RELU, 1);
+  answer dense = solve(kernels, &a, false);
+  float *wide = new_floats(M * apart);
+  for (int64_t i = 0; i < M; i++) {
+    memcpy(wide + i * apart, a.x + i * I, (size_t)I * sizeof *wide);
+    memcpy(wide + i * apart + I, a.dout + i * O, (size_t)O * sizeof *wide);
+  }
+  ast_linear s = a.s;
+  s.x_stride = s.dout_stride = apart;
+  float *dx = new_floats(M * I), *dweight = new_floats(O * I), *dbias = new_floats(O), *out = new_floats(M * O);
+  CHECK(kernels->linear(&s, wide, a.weight, a.bias, a.residual, out, NULL) == AST_OK, "status");
+  CHECK(same_bits(out, dense.of[0], M * O), "strides change the result");
+  CHECK(kernels->linear_backward(&s, wide + I, wide, a.weight, a.bias, NULL, dx, NULL, NULL) == AST_OK, "status");
+  CHECK(same_bits(dx, dense.of[1], M * I), "dx alone");
+  CHECK(kernels->linear_backward(&s, wide + I, wide, a.weight, a.bias, NULL, NULL, dweight, NULL) == AST_OK, "status");
+  CHECK(same_bits(dweight, dense.of[2], O * I), "dweight alone");
+  CHECK(kernels->linear_backward(&s, wide + I, wide, a.weight, a.bias, NULL, NULL, NULL, dbias) == AST_OK, "status");
+  CHECK(same_bits(dbias, dense.of[3], O), "dbias alone");
+  memset(a.bias, 0, (size_t)O * sizeof *a.bias), memset(a.residual, 0, (size_t)(M * O) * sizeof *a.residual);
+  answer zero = solve(kernels, &a, false);
+  CHECK(kernels->linear(&s, wide, a.weight, NULL, NULL, out, NULL) == AST_OK, "status");
+  CHECK(same_bits(out, zero.of[0], M * O), "without bias and residual");
+  free(wide), free(dx), free(dweight), free(dbias), free(out);
+  free_answer(dense), free_answer(zero), free_problem(a);
+}
+
+/* A row that is not finite touches no other; the padding never shows. */
+static void test_not_finite(const ast_kernels *kernels) {
+  static const float values[3] = {NAN, INFINITY, -INFINITY};
+  for (int activation = 0; activation < 3; activation++)
+    for (int i = 0; i < 3; i++) {
+      problem a = new_problem(50, 5, 6, (ast_activation)activation, 1);
+      answer clean = solve(kernels, &a, false);
+      a.x[31 * 5 + 2] = values[i];
+      answer r = solve(kernels, &a, false);
+      CHECK(same_bits(r.of[0], clean.of[0], 31 * a.columns) && same_bits(r.of[1], clean.of[1], 31 * 5), "rows before");
+      CHECK(same_bits(r.of[0] + 32 * a.columns, clean.of[0] + 32 * a.columns, 18 * a.columns), "rows after");
+      for (int64_t j = 0; j < a.columns; j++) {
+        const float out = r.of[0][31 * a.columns + j];
+        CHECK(!isfinite(out) || activation != AST_IDENTITY, "out is %g", (double)out);
+        CHECK(isnan(out) || i > 0, "a NaN is lost");
+      }
+      free_answer(clean), free_answer(r), free_problem(a);
+    }
+}
+
+static void test(const ast_kernels *kernels) {
+  test_accuracy(kernels);
+  test_same_bits(kernels);
+  test_strides_and_absent_arrays(kernels);
+  test_not_finite(kernels);
+  if (ast_threads() > 1) test_same_bits_on_threads(kernels);
+}
+
+int main(void) {
+  on_every_table(test);
+  return 0;
+}
