@@ -8,13 +8,13 @@ Legend: N nodes, E elements, C cells, T tokens.
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor, nn
 
 from ast_sim.data.batch import Batch
 from ast_sim.model import features as inputs
 from ast_sim.model.cells import Cells, SparseConv, build_cells
 from ast_sim.model.config import ModelConfig
+from ast_sim.model.linear import Linear
 from ast_sim.model.message_passing import MessagePassing
 from ast_sim.model.mlp import MLP
 from ast_sim.model.simulator import Prediction, Simulator
@@ -42,12 +42,12 @@ class AST(Simulator):
         self.c2m = self._message_passing("c2m")
         self.down = nn.ModuleList(SparseConv(width, up=False) for _ in range(c.l_ocnn))
         self.up = nn.ModuleList(SparseConv(width, up=True) for _ in range(c.l_ocnn))
-        self.lift = nn.Linear(width, c.d_token)
+        self.lift = Linear(width, c.d_token)
         self.position_embedding = PositionEmbedding(c.d_token, c.L_cell - c.l_ocnn)
         self.to_tokens = AttentionBlock(c, cross=True)
         self.processor = nn.ModuleList(AttentionBlock(c, cross=False) for _ in range(c.L_SA))
         self.to_cells = AttentionBlock(c, cross=True)
-        self.lower = nn.Linear(c.d_token, width)
+        self.lower = Linear(c.d_token, width)
         self.decoder = MLP(2 * width, c.decoder_hidden, 4 if c.stress == "node" else 3, c.factorized)
         if c.stress == "element":
             self.m2e = self._message_passing("m2e")
@@ -77,7 +77,7 @@ class AST(Simulator):
         cells = build_cells(self.config, batch.position, batch.graph.node_offsets, may_grow=not self.training)
         mesh = self.c2m(cells.to_mesh(), self._through_cells(cells, mesh), mesh)
 
-        out = self.decoder(torch.cat([mesh, encoded], dim=1))
+        out = self.decoder(mesh, beside=encoded)
         stress = out[:, 3:] if self.config.stress == "node" else None
         if self.config.stress == "element":
             stress = self.element_decoder(self.m2e(batch.graph.m2e, mesh, elements))

@@ -11,11 +11,11 @@ of two.
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ast_sim.model.mlp import MLP
 from ast_sim.ops.edges import EdgeSet
+from ast_sim.ops.linear import linear
 from ast_sim.ops.message import message_sum
 
 
@@ -50,8 +50,8 @@ class MessagePassing(nn.Module):
             constant = torch.addmv(constant, of_edge[0], last.bias)
         total = message_sum(
             edges,
-            F.linear(senders, of_sender),
-            F.linear(receivers, of_receiver, constant),
+            linear(senders, of_sender),
+            linear(receivers, of_receiver, constant),
             edge_features,
             encoder,
             self.f_e.second.weight,
@@ -59,5 +59,5 @@ class MessagePassing(nn.Module):
             self.norm_e.weight,
             self.norm_e.bias,
         )
-        out = self.norm_v(self.f_v(torch.cat([receivers, total], dim=1)))
-        return receivers + out if self.residual else out
+        residual = receivers if self.residual else None
+        return self.f_v(receivers, beside=total, norm=self.norm_v, residual=residual)

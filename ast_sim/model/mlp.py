@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
+
+from ast_sim.ops.linear import linear
 
 
 class FactorizedLinear(nn.Module):
@@ -26,18 +27,15 @@ class FactorizedLinear(nn.Module):
     def weight(self) -> Tensor:
         return self.g[:, None] * self.V
 
-    def forward(self, x: Tensor) -> Tensor:
-        return F.linear(x, self.weight, self.bias)
 
-
-def linear(inputs: int, outputs: int, factorized: bool) -> nn.Module:
+def layer(inputs: int, outputs: int, factorized: bool) -> nn.Module:
     """A layer of an MLP: factorized, or plain with the same start W = Glorot uniform, b = 0."""
     if factorized:
         return FactorizedLinear(inputs, outputs)
-    layer = nn.Linear(inputs, outputs)
-    nn.init.xavier_uniform_(layer.weight)
-    nn.init.zeros_(layer.bias)
-    return layer
+    plain = nn.Linear(inputs, outputs)
+    nn.init.xavier_uniform_(plain.weight)
+    nn.init.zeros_(plain.bias)
+    return plain
 
 
 class MLP(nn.Module):
@@ -45,8 +43,19 @@ class MLP(nn.Module):
 
     def __init__(self, inputs: int, hidden: int, outputs: int, factorized: bool):
         super().__init__()
-        self.first = linear(inputs, hidden, factorized)
-        self.second = linear(hidden, outputs, factorized)
+        self.first = layer(inputs, hidden, factorized)
+        self.second = layer(hidden, outputs, factorized)
 
-    def forward(self, x: Tensor) -> Tensor:
-        return self.second(F.relu(self.first(x)))
+    def forward(
+        self, x: Tensor, beside: Tensor | None = None, norm: nn.LayerNorm | None = None, residual: Tensor | None = None
+    ) -> Tensor:
+        """LN(W_2 relu(W_1 [x, beside] + b_1) + b_2) + residual, without LayerNorm and residual where there is none.
+
+        x [M, I], beside [M, J] with I + J inputs, residual [M, outputs] -> [M, outputs].
+        """
+        x = x if beside is None else torch.cat([x, beside], dim=1)
+        hidden = linear(x, self.first.weight, self.first.bias, "relu")
+        if norm is None:
+            return linear(hidden, self.second.weight, self.second.bias, residual=residual)
+        out = norm(linear(hidden, self.second.weight, self.second.bias))
+        return out if residual is None else out + residual

@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ast_sim.model.config import ModelConfig
+from ast_sim.model.linear import Linear
 from ast_sim.ops.attention import attention
 
 
@@ -21,27 +22,30 @@ class PositionEmbedding(nn.Module):
     def __init__(self, width: int, level: int):
         super().__init__()
         self.register_buffer("frequency", math.pi * 2.0 ** torch.arange(min(8, level)), persistent=False)
-        self.project = nn.Linear(3 * (1 + 2 * min(8, level)), width)
+        self.project = Linear(3 * (1 + 2 * min(8, level)), width)
 
     def forward(self, features: Tensor, centers: Tensor) -> Tensor:
         """features [C, width], centers [C, 3] in units of the half width of the domain -> [C, width]."""
         phase = (centers[:, :, None] * self.frequency).flatten(1)
-        return features + self.project(torch.cat([centers, phase.sin(), phase.cos()], dim=1))
+        waves = torch.cat([centers, phase.sin(), phase.cos()], dim=1)
+        return self.project(waves, residual=features)
 
 
 class FeedForward(nn.Module):
-    """GEGLU (Shazeer 2020): W_2 (a * gelu(b)) with [a, b] = W_1 LN(x), then dropout."""
+    """x + GEGLU (Shazeer 2020): W_2 (a * gelu(b)) with [a, b] = W_1 LN(x), and dropout before the sum."""
 
     def __init__(self, config: ModelConfig):
         super().__init__()
         self.norm = nn.LayerNorm(config.d_token)
-        self.first = nn.Linear(config.d_token, 2 * config.ffn_inner)
-        self.second = nn.Linear(config.ffn_inner, config.d_token)
+        self.first = Linear(config.d_token, 2 * config.ffn_inner)
+        self.second = Linear(config.ffn_inner, config.d_token)
         self.dropout = config.dropout
 
     def forward(self, x: Tensor) -> Tensor:
-        value, gate = self.first(self.norm(x)).chunk(2, dim=1)
-        return F.dropout(self.second(value * F.gelu(gate)), self.dropout, self.training)
+        hidden = self.first(self.norm(x), "geglu")
+        if self.training and self.dropout:
+            return x + F.dropout(self.second(hidden), self.dropout)
+        return self.second(hidden, residual=x)
 
 
 class AttentionBlock(nn.Module):
@@ -53,9 +57,9 @@ class AttentionBlock(nn.Module):
         self.heads, self.dropout = config.heads, config.dropout
         self.norm = nn.LayerNorm(config.d_token)
         self.norm_context = nn.LayerNorm(config.d_token) if cross else None
-        self.query = nn.Linear(config.d_token, inner, bias=False)
-        self.key_value = nn.Linear(config.d_token, 2 * inner, bias=False)
-        self.out = nn.Linear(inner, config.d_token)
+        self.query = Linear(config.d_token, inner, bias=False)
+        self.key_value = Linear(config.d_token, 2 * inner, bias=False)
+        self.out = Linear(inner, config.d_token)
         self.feed_forward = FeedForward(config)
 
     def forward(
@@ -70,5 +74,4 @@ class AttentionBlock(nn.Module):
         seed = int(torch.randint(2**62, (1,))) if dropout else 0
         source_offsets = offsets if self.norm_context is None else context_offsets
         mixed, _ = attention(query, key, value, offsets, source_offsets, dropout_p=dropout, seed=seed)
-        x = x + self.out(mixed.flatten(1))
-        return x + self.feed_forward(x)
+        return self.feed_forward(self.out(mixed.flatten(1), residual=x))

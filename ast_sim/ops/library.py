@@ -44,14 +44,17 @@ class Op:
 
     A call goes through torch's dispatcher only where something may stand between the caller and the kernel: tracing, a
     dispatch mode, autocast, functorch, other devices and dtypes. For plain float32 tensors on the CPU the dispatcher
-    would cost more than a small kernel takes.
+    would cost more than a small kernel takes. With AST_SIM_BACKEND=torch an op is its composition, which torch
+    differentiates as it would any other code.
     """
 
-    def __init__(self, name: str, overload: torch._ops.OpOverload, kernel: Callable) -> None:
-        self.name, self.overload, self.kernel = name, overload, kernel
+    def __init__(self, name: str, overload: torch._ops.OpOverload, kernel: Callable, reference: Callable) -> None:
+        self.name, self.overload, self.kernel, self.reference = name, overload, kernel, reference
         self.function: type[torch.autograd.Function] | None = None  # set by `differentiate`
 
     def __call__(self, *args):
+        if BACKEND == "torch":
+            return self.reference(*args)
         tensors = [x for x in args if isinstance(x, torch.Tensor)]
         if torch.compiler.is_compiling() or not _is_plain(tensors):
             return self.overload(*args)
@@ -63,8 +66,7 @@ class Op:
 def _is_plain(tensors: list[torch.Tensor]) -> bool:
     """Whether nothing but the kernel itself would have to see these arguments."""
     return (
-        BACKEND == "c"
-        and all(
+        all(
             type(x) in (torch.Tensor, torch.nn.Parameter)
             and x.device.type == "cpu"
             and (x.dtype == torch.float32 or not x.is_floating_point())
@@ -102,7 +104,7 @@ def define(schema: str, kernel: Callable, reference: Callable, fake: Callable) -
     _library.impl(name, reference, "CompositeExplicitAutograd")
     torch.library.register_fake(f"ast_sim::{name}", fake, lib=_library)
     torch.library.register_autocast(f"ast_sim::{name}", "cpu", torch.float32, lib=_library)
-    return Op(name, getattr(torch.ops.ast_sim, name).default, kernel)
+    return Op(name, getattr(torch.ops.ast_sim, name).default, kernel, reference)
 
 
 def differentiate(op: Op, setup_context: Callable, backward: Callable) -> None:
