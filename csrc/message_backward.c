@@ -7,9 +7,10 @@
  *   dP_s = sum of dz_m over the edges from s,   dQ_r = sum of dz_m over the edges into r
  *
  * Edges come in rounds. First the tasks of a round, each a run of tiles, put dz into a buffer and add to weight gradients of
- * their own, of which there are at most SHARES. Then other tasks add the rows of the buffer to dP and dQ: each owns the rows
- * with the same index modulo PARTS and goes through the edges of the round in stored order, so that each sum runs in stored
- * order whatever the rounds, tasks, threads and other scenes. At the end the weight gradients of the shares are added up in order.
+ * their own, of which there are at most SHARES. Then other tasks add the rows of the buffer to dQ, each for a run of receivers,
+ * and to dP, each for the senders with the same index modulo PARTS. All go through their edges in stored order, so that each
+ * sum runs in stored order whatever the rounds, tasks, threads and other scenes. At the end the weight gradients of the shares are added up
+ * in order.
  *
  * Cost per edge: the forward flops again, and twice as many for the two products per layer (but E H once, unless de is wanted).
  * Memory: at most SHARES sums of weight gradients and SHARES * SHARE_TILES * MESSAGE_TILE rows of dz, 19 MB at 128 channels.
@@ -39,6 +40,8 @@ typedef struct {
   float *W2, *A2, *A1;              /* in panels, as the products with dy, dz and dc read them */
   float *dz;                        /* of the edges of this round, rows w.row apart */
   float *shares;                    /* [SHARES] */
+  int64_t *part_offsets;            /* [tasks, PARTS + 1] places in by_part */
+  int32_t *by_part;                 /* the edges of each task, less `begin`, by the part of their sender */
   int64_t share_size, tasks, edges; /* floats of a share; tasks of a round; edges of a task */
   int64_t begin, end;               /* the edges of this round */
 } message_backward_job;
@@ -138,6 +141,19 @@ static void message_tile_backward(const message_backward_job *job, int64_t first
   for (int64_t i = 0; i < n; i++) memcpy(job->out->edge_features + (first + i) * E, de + i * row, (size_t)E * sizeof *de);
 }
 
+/* Sorts the edges of a task by the part of their sender, in stored order within each. */
+static void message_sort_by_part(const message_backward_job *job, int64_t begin, int64_t end, int64_t *part_offsets) {
+  const int64_t *senders = job->w.s->senders;
+  int64_t next[PARTS] = {0};
+  for (int64_t m = begin; m < end; m++) next[senders[m] % PARTS]++;
+  part_offsets[0] = begin - job->begin;
+  for (int64_t p = 0; p < PARTS; p++) {
+    part_offsets[p + 1] = part_offsets[p] + next[p];
+    next[p] = part_offsets[p];
+  }
+  for (int64_t m = begin; m < end; m++) job->by_part[next[senders[m] % PARTS]++] = (int32_t)(m - job->begin);
+}
+
 static ast_status message_backward_task(int64_t index, void *context) {
   const message_backward_job *job = context;
   const int64_t begin = job->begin + index * job->edges, end = min64(job->end, begin + job->edges);
@@ -146,6 +162,7 @@ static ast_status message_backward_task(int64_t index, void *context) {
   if (!message_new_tile(&job->w, &t)) return AST_NO_MEMORY;
   if (!job->begin) memset(memory, 0, (size_t)job->share_size * sizeof *memory);
   const message_sums sums = message_sums_at(job->w.s, memory);
+  message_sort_by_part(job, begin, end, job->part_offsets + index * (PARTS + 1));
   for (int64_t m = begin; m < end; m += MESSAGE_TILE) {
     const int64_t n = min64(MESSAGE_TILE, end - m), ahead = min64(MESSAGE_TILE, end - m - n);
     message_tile_backward(job, m, n, ahead, &t, &sums);
@@ -153,26 +170,53 @@ static ast_status message_backward_task(int64_t index, void *context) {
   return AST_OK;
 }
 
-/* out[index_m] += dz_m for the edges of the round whose row is of this part; the first round clears the part before. */
-static void message_add_rows(const message_backward_job *job, const int64_t *index, int64_t rows, int64_t part, float *out) {
-  const int64_t F = job->w.s->F;
-  for (int64_t r = part; !job->begin && r < rows; r += PARTS) memset(out + r * F, 0, (size_t)F * sizeof *out);
-  for (int64_t m = job->begin; m < job->end; m++) {
-    const int64_t next = index[min64(m + ROWS_AHEAD, job->end - 1)], r = index[m];
-    if (next % PARTS == part)
-      for (int64_t c = 0; c < F; c += 16) __builtin_prefetch(out + next * F + c, 1);
-    if (r % PARTS != part) continue;
+/* dP of the senders of a part; the first round clears them before. */
+static void message_add_to_senders(const message_backward_job *job, int64_t part) {
+  const ast_message *s = job->w.s;
+  const int64_t F = s->F, *senders = s->senders + job->begin;
+  for (int64_t r = part; !job->begin && r < s->S; r += PARTS) memset(job->out->of_senders + r * F, 0, (size_t)F * sizeof(float));
+  for (int64_t task = 0; task * job->edges < job->end - job->begin; task++) {
+    const int64_t *offsets = job->part_offsets + task * (PARTS + 1), last = offsets[part + 1];
+    for (int64_t i = offsets[part]; i < last; i++) {
+      const float *next = job->out->of_senders + senders[job->by_part[min64(i + ROWS_AHEAD, last - 1)]] * F;
+      for (int64_t c = 0; c < F; c += 16) __builtin_prefetch(next + c, 1);
+      const float *dz = job->dz + job->by_part[i] * job->w.row;
+      float *dP = job->out->of_senders + senders[job->by_part[i]] * F;
+      for (int64_t c = 0; c < F; c += VW) message_store(dP, c, F, message_load(dP, c, F) + vload(dz + c));
+    }
+  }
+}
+
+/* The first edge from m on that is not of the same receiver as the one before it. */
+static int64_t message_next_receiver(const ast_message *s, int64_t m) { return m == 0 ? 0 : s->receiver_offsets[s->receivers[m - 1] + 1]; }
+
+/* dQ of the receivers whose first edge in this round is in a part of it. A row is cleared before its first edge of all, together
+ * with those between it and the row before. */
+static void message_add_to_receivers(const message_backward_job *job, int64_t part) {
+  const ast_message *s = job->w.s;
+  const int64_t F = s->F, edges = job->end - job->begin;
+  int64_t begin = job->begin + part * edges / PARTS, end = job->begin + (part + 1) * edges / PARTS;
+  if (part) begin = message_next_receiver(s, begin);
+  if (part + 1 < PARTS) end = message_next_receiver(s, end);
+  for (int64_t m = begin; m < min64(end, job->end); m++) {
+    const int64_t r = s->receivers[m];
     const float *dz = job->dz + (m - job->begin) * job->w.row;
-    float *to = out + r * F;
-    for (int64_t c = 0; c < F; c += VW) message_store(to, c, F, message_load(to, c, F) + vload(dz + c));
+    float *dQ = job->out->of_receivers + r * F;
+    if (m == s->receiver_offsets[r]) {
+      const int64_t before = m ? s->receivers[m - 1] + 1 : 0;
+      memset(job->out->of_receivers + before * F, 0, (size_t)((r + 1 - before) * F) * sizeof *dQ);
+    }
+    for (int64_t c = 0; c < F; c += VW) message_store(dQ, c, F, message_load(dQ, c, F) + vload(dz + c));
+  }
+  if (end == s->M && part + 1 == PARTS) { /* receivers behind the last edge */
+    const int64_t before = s->M ? s->receivers[s->M - 1] + 1 : 0;
+    memset(job->out->of_receivers + before * F, 0, (size_t)((s->R - before) * F) * sizeof(float));
   }
 }
 
 static ast_status message_rows_task(int64_t index, void *context) {
-  const message_backward_job *job = context;
-  const ast_message *s = job->w.s;
-  if (index < PARTS) message_add_rows(job, s->senders, s->S, index, job->out->of_senders);
-  else message_add_rows(job, s->receivers, s->R, index - PARTS, job->out->of_receivers);
+  if (index < PARTS) message_add_to_senders(context, index);
+  else message_add_to_receivers(context, index - PARTS);
   return AST_OK;
 }
 
@@ -237,10 +281,13 @@ static ast_status message_backward(const ast_message *s, const float *restrict d
   gemm_pack(s->A2, s->H, 1, s->F, s->H, job.A2);
   gemm_pack(s->A1, s->E, 1, s->H, s->E, job.A1);
 
-  const int64_t sums = job.tasks * job.share_size, rows = min64(s->M, job.tasks * job.edges) * job.w.row;
-  job.shares = ast_scratch(7, (sums + rows) * (int64_t)sizeof *job.shares);
+  const int64_t round = job.tasks * job.edges, floats = job.tasks * job.share_size + round * job.w.row;
+  const int64_t offsets = job.tasks * (PARTS + 1) * (int64_t)sizeof *job.part_offsets;
+  job.shares = ast_scratch(7, floats * (int64_t)sizeof *job.shares + offsets + round * (int64_t)sizeof *job.by_part);
   if (!job.shares) return AST_NO_MEMORY;
-  job.dz = job.shares + sums;
+  job.dz = job.shares + job.tasks * job.share_size;
+  job.part_offsets = (int64_t *)(job.shares + floats);
+  job.by_part = (int32_t *)(job.part_offsets + job.tasks * (PARTS + 1));
   if (!s->M) memset(job.shares, 0, (size_t)job.share_size * sizeof *job.shares);
   ast_status status = message_backward_rounds(&job);
   if (status == AST_OK) status = ast_parallel((job.share_size + REDUCE_CHUNK - 1) / REDUCE_CHUNK, message_reduce_task, &job);
