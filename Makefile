@@ -7,11 +7,7 @@ TORCH := $(shell sed -n 's/^torch==/torch==/p' constraints.txt)
 PIP := $(BIN)/pip install --quiet --constraint constraints.txt
 C_SOURCES := $(wildcard csrc/*.c csrc/*.h)
 C_TESTS := $(patsubst csrc/tests/test_%.c,%,$(wildcard csrc/tests/test_*.c))
-C_COMMON := csrc/dispatch.c csrc/parallel.c csrc/memory.c csrc/isa_base.c
-C_FLAGS := -std=gnu11 -fno-math-errno -fno-trapping-math -Wall -Wextra -Wconversion -Wshadow -Wno-maybe-uninitialized -Werror -pthread
-SANITIZE := -O1 -g -fsanitize=address,undefined,float-cast-overflow -fno-sanitize-recover=all
-AVX2 := -mavx2 -mfma
-AVX512 := -mavx512f -mavx512bw -mavx512dq -mavx512vl -mfma -mprefer-vector-width=512
+C_TEST_HEADERS := $(wildcard csrc/tests/*.h)
 X86 := $(filter x86_64,$(shell uname -m))
 
 .PHONY: demo test check lint bench tools clean
@@ -37,8 +33,8 @@ lint: $(VENV)/tested
 	$(BIN)/lint-imports
 	$(BIN)/clang-format --dry-run --Werror csrc/*.c csrc/*.h csrc/tests/*.c csrc/tests/*.h
 
-# The C tests, which need no Python: optimised, under the address and undefined behaviour sanitizers, and under valgrind.
-# `wide` compiles the 64-byte source for AVX2, so that its logic is tested where there is no AVX-512.
+# The C tests, which need no Python: optimised, under the address and undefined behaviour sanitizers, under the thread sanitizer,
+# and under valgrind. `wide` compiles the 64-byte source for AVX2, so that its logic is tested where there is no AVX-512.
 check: $(addprefix build/check/,$(addsuffix .passed,$(C_TESTS)))
 
 # torch first and by exact version: a range could fetch gigabytes of CUDA packages.
@@ -61,34 +57,59 @@ $(VENV)/benched: $(VENV)/installed
 
 # System programs that the tests use; installed where this is allowed, otherwise the tests say what is missing.
 tools:
-	@missing=; command -v chromium >/dev/null || missing="$$missing chromium"; command -v valgrind >/dev/null || missing="$$missing valgrind"; \
+	@missing=; for tool in chromium valgrind clang; do command -v $$tool >/dev/null || missing="$$missing $$tool"; done; \
+	ls $$(clang -print-resource-dir 2>/dev/null)/lib/linux/*fuzzer* >/dev/null 2>&1 || missing="$$missing libclang-rt-14-dev"; \
 	if [ -n "$$missing" ]; then \
 	  echo "installing$$missing"; \
 	  (apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -qq -y $$missing >/dev/null) \
 	    || echo "cannot install$$missing: the tests that need them will fail"; \
 	fi
 
-build/check/%.passed: csrc/tests/test_%.c $(wildcard csrc/tests/*.h) $(C_SOURCES) | tools
-	@mkdir -p build/check
-	@set -e; \
-	build() { \
-	  out=$$1; shift; objects=; \
-	  if [ -n "$(X86)" ]; then \
-	    $(CC) $(C_FLAGS) $$1 $(AVX2) -c csrc/isa_avx2.c -o $$out.avx2.o; \
-	    $(CC) $(C_FLAGS) $$1 $(AVX512) -c csrc/isa_avx512.c -o $$out.avx512.o; \
-	    objects="-DAST_HAVE_AVX2 -DAST_HAVE_AVX512 $$out.avx2.o $$out.avx512.o"; \
-	  fi; \
-	  $(CC) $(C_FLAGS) $$1 $$2 $(C_COMMON) $< $$objects -lm -o $$out; \
-	}; \
-	name=build/check/$*; \
-	build $$name "-O3"; echo "$*"; ./$$name; \
-	build $$name-sanitized "$(SANITIZE)"; echo "$* (sanitizers)"; ASAN_OPTIONS=detect_leaks=1 ./$$name-sanitized; \
-	if [ -n "$(X86)" ]; then \
-	  $(CC) $(C_FLAGS) -Wno-psabi -O2 $(AVX2) -DAST_VECTOR_BYTES=64 $(C_COMMON) $< -lm -o $$name-wide; \
-	  echo "$* (64 byte vectors on AVX2)"; ./$$name-wide; \
-	fi; \
-	build $$name-valgrind "-O1 -g"; echo "$* (valgrind)"; \
-	AST_TEST_QUICK=1 valgrind --quiet --error-exitcode=1 --leak-check=full ./$$name-valgrind
+# ---- the builds of the C tests ----
+
+C_FLAGS := -std=gnu11 -fno-math-errno -fno-trapping-math -pthread
+SANITIZE := address,undefined,float-cast-overflow
+GCC := $(CC) $(C_FLAGS) -Wall -Wextra -Wconversion -Wshadow -Wno-maybe-uninitialized -Werror
+CLANG := clang $(C_FLAGS) -w
+COMPILE_plain := $(GCC) -O3
+COMPILE_sanitized := $(GCC) -O1 -g -fsanitize=$(SANITIZE) -fno-sanitize-recover=all
+COMPILE_races := $(CLANG) -O1 -g -fsanitize=thread
+COMPILE_valgrind := $(GCC) -O1 -g
+COMPILE_wide := $(GCC) -O2 -Wno-psabi -mavx2 -mfma -DAST_VECTOR_BYTES=64
+
+CORE := isa_base dispatch parallel memory
+BUILDS := plain sanitized races valgrind
+ifneq ($(X86),)
+CORE_X86 := isa_avx2 isa_avx512
+BUILDS += wide
+FLAGS_isa_avx2 := -mavx2 -mfma
+FLAGS_isa_avx512 := -mavx512f -mavx512bw -mavx512dq -mavx512vl -mfma -mprefer-vector-width=512
+FLAGS_dispatch := -DAST_HAVE_AVX2 -DAST_HAVE_AVX512
+endif
+# Every allocation of this test passes through functions of its own.
+LINK_test_no_memory := -Wl,--wrap=malloc,--wrap=calloc,--wrap=realloc,--wrap=aligned_alloc,--wrap=posix_memalign,--wrap=free
+
+# build/check/BUILD: the core as a library, and a program for each test.
+define BUILD
+build/check/$(1)/%.o: csrc/%.c $(C_SOURCES) | tools
+	@mkdir -p $$(@D)
+	@$(COMPILE_$(1)) $$(FLAGS_$$*) -c $$< -o $$@
+build/check/$(1)/core.a: $(patsubst %,build/check/$(1)/%.o,$(CORE) $(if $(filter wide,$(1)),,$(CORE_X86)))
+	@ar rcs $$@ $$^
+$(patsubst %,build/check/$(1)/test_%,$(C_TESTS)): build/check/$(1)/test_%: csrc/tests/test_%.c $(C_TEST_HEADERS) build/check/$(1)/core.a
+	@$(COMPILE_$(1)) $$< build/check/$(1)/core.a -lm $$(LINK_test_$$*) -o $$@
+endef
+$(foreach build,$(BUILDS),$(eval $(call BUILD,$(build))))
+build/check/wide/%.o: FLAGS_dispatch :=
+
+# The thread sanitizer finds no room for its shadow memory where addresses are too random.
+build/check/%.passed: $(addsuffix /test_%,$(addprefix build/check/,$(BUILDS)))
+	@run() { echo "$* ($$1)"; shift; "$$@"; }; set -e; \
+	run optimised build/check/plain/test_$*; \
+	run "address and undefined behaviour sanitizers" env ASAN_OPTIONS=detect_leaks=1 build/check/sanitized/test_$*; \
+	run "thread sanitizer" env AST_TEST_QUICK=1 $$(setarch -R true 2>/dev/null && echo setarch -R) build/check/races/test_$*; \
+	run valgrind env AST_TEST_QUICK=1 valgrind --quiet --error-exitcode=1 --leak-check=full build/check/valgrind/test_$*; \
+	$(if $(X86),run "64 byte vectors on AVX2" build/check/wide/test_$*)
 	@touch $@
 
 clean:

@@ -29,7 +29,7 @@ static int num_buffers;
 static bool buffers_at_start;
 
 /* `size` bytes, all set: NaN as floats and -1 as integers, so that what a kernel leaves unwritten shows. */
-__attribute__((unused)) static void *new_buffer(size_t size) {
+static void *new_buffer(size_t size) {
   const size_t page = (size_t)sysconf(_SC_PAGESIZE), pages_size = (size + page - 1) / page * page;
   CHECK(num_buffers < MOST_BUFFERS, "more than %d buffers", MOST_BUFFERS);
   buffer *b = &buffers[num_buffers++];
@@ -75,16 +75,14 @@ static void free_buffers(const void *const *data, size_t num) {
 #define WRITABLE(...)    protect_buffers(BUFFER_LIST(__VA_ARGS__), PROT_READ | PROT_WRITE)
 #define FREE(...)        free_buffers(BUFFER_LIST(__VA_ARGS__))
 
-__attribute__((unused)) static float *new_floats(int64_t n) { return new_buffer((size_t)n * sizeof(float)); }
-__attribute__((unused)) static int64_t *new_ints(int64_t n) { return new_buffer((size_t)n * sizeof(int64_t)); }
-__attribute__((unused)) static int32_t *new_small_ints(int64_t n) { return new_buffer((size_t)n * sizeof(int32_t)); }
-__attribute__((unused)) static float *random_floats(int64_t n) {
+static float *new_floats(int64_t n) { return new_buffer((size_t)n * sizeof(float)); }
+static int64_t *new_ints(int64_t n) { return new_buffer((size_t)n * sizeof(int64_t)); }
+static int32_t *new_small_ints(int64_t n) { return new_buffer((size_t)n * sizeof(int32_t)); }
+static float *random_floats(int64_t n) {
   float *x = new_floats(n);
   for (int64_t i = 0; i < n; i++) x[i] = random_float();
   return x;
 }
-__attribute__((unused)) static int64_t *copy_ints(const int64_t *values, int64_t n) {
-  return memcpy(new_ints(n), values, (size_t)n * sizeof *values);
-}
+static int64_t *copy_ints(const int64_t *values, int64_t n) { return memcpy(new_ints(n), values, (size_t)n * sizeof *values); }
 
 #endif

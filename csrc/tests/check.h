@@ -11,6 +11,8 @@
 
 #include "../ast.h"
 
+#pragma GCC diagnostic ignored "-Wunused-function" /* no test uses all of these */
+
 #define CHECK(condition, ...)                                         \
   do {                                                                \
     if (!(condition)) {                                               \
@@ -23,14 +25,14 @@
 
 /* splitmix64 */
 static uint64_t check_state = 1;
-__attribute__((unused)) static uint64_t random_bits(void) {
+static uint64_t random_bits(void) {
   uint64_t z = (check_state += 0x9e3779b97f4a7c15u);
   z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9u;
   z = (z ^ (z >> 27)) * 0x94d049bb133111ebu;
   return z ^ (z >> 31);
 }
-__attribute__((unused)) static double random_unit(void) { return (double)(random_bits() >> 11) * 0x1p-53; }
-__attribute__((unused)) static float random_float(void) { return (float)(2 * random_unit() - 1); }
+static double random_unit(void) { return (double)(random_bits() >> 11) * 0x1p-53; }
+static float random_float(void) { return (float)(2 * random_unit() - 1); }
 
 #include "buffers.h"
 #include "pool.h"
@@ -39,7 +41,7 @@ enum { CHECK_THREADS = 4 };
 
 /* Runs `test` on every table of kernels that this processor supports: on the calling thread, with buffers that end at a page,
  * and on a pool, with buffers that start at one. */
-__attribute__((unused)) static void on_every_table(void (*test)(const ast_kernels *)) {
+static void on_every_table(void (*test)(const ast_kernels *)) {
   static const char *const names[] = {"base", "avx2", "avx512"};
   for (int i = 0; i < 3; i++) {
     const ast_kernels *kernels = ast_select(names[i]);

@@ -47,7 +47,7 @@ static int32_t pool_threads(uint32_t *num) {
 }
 
 /* Lets the kernels run on this many threads, from here to pool_stop. */
-__attribute__((unused)) static void pool_start(uint32_t threads) {
+static void pool_start(uint32_t threads) {
   CHECK(threads >= 1 && threads <= MOST_THREADS, "%u threads", threads);
   pool.threads = threads, pool.stopped = false;
   CHECK(!pthread_barrier_init(&pool.start, NULL, threads) && !pthread_barrier_init(&pool.finish, NULL, threads), "no barrier");
@@ -55,7 +55,7 @@ __attribute__((unused)) static void pool_start(uint32_t threads) {
   ast_set_pool(pool_for, pool_threads);
 }
 
-__attribute__((unused)) static void pool_stop(void) {
+static void pool_stop(void) {
   ast_set_pool(NULL, NULL);
   pool.stopped = true;
   pthread_barrier_wait(&pool.start);

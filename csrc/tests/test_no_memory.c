@@ -1,0 +1,265 @@
+/* Every allocation of a kernel fails in turn: the kernel says AST_NO_MEMORY, leaks nothing, and gives its usual result when it is
+ * called again.
+ *
+ * The linker sends the allocations of the whole program through the functions below (--wrap, see the Makefile). Each attempt is made
+ * by fresh threads, which have no scratch memory yet. A new kernel is one function here and one line of `cases`.
+ */
+#include <errno.h>
+#include <limits.h>
+#include <stdatomic.h>
+
+#include "check.h"
+
+/* ---- allocations that fail ---- */
+
+static atomic_bool armed, all_after; /* count allocations; all after the failing one fail too */
+static atomic_long allocations, failing, failures, living;
+
+static bool fails(void) {
+  if (!atomic_load(&armed)) return false;
+  const long n = atomic_fetch_add(&allocations, 1), wanted = atomic_load(&failing);
+  const bool now = atomic_load(&all_after) ? n >= wanted : n == wanted;
+  if (now) atomic_fetch_add(&failures, 1);
+  return now;
+}
+
+static void *counted(void *p) {
+  if (p) atomic_fetch_add(&living, 1);
+  return p;
+}
+
+void *__real_malloc(size_t), *__real_calloc(size_t, size_t), *__real_realloc(void *, size_t), *__real_aligned_alloc(size_t, size_t);
+int __real_posix_memalign(void **, size_t, size_t);
+void __real_free(void *);
+void *__wrap_malloc(size_t), *__wrap_calloc(size_t, size_t), *__wrap_realloc(void *, size_t), *__wrap_aligned_alloc(size_t, size_t);
+int __wrap_posix_memalign(void **, size_t, size_t);
+void __wrap_free(void *);
+
+void *__wrap_malloc(size_t size) { return fails() ? NULL : counted(__real_malloc(size)); }
+void *__wrap_calloc(size_t num, size_t size) { return fails() ? NULL : counted(__real_calloc(num, size)); }
+void *__wrap_aligned_alloc(size_t alignment, size_t size) { return fails() ? NULL : counted(__real_aligned_alloc(alignment, size)); }
+void *__wrap_realloc(void *p, size_t size) {
+  if (fails()) return NULL;
+  return p ? __real_realloc(p, size) : counted(__real_realloc(p, size));
+}
+int __wrap_posix_memalign(void **p, size_t alignment, size_t size) {
+  if (fails()) return ENOMEM;
+  const int error = __real_posix_memalign(p, alignment, size);
+  if (!error) counted(*p);
+  return error;
+}
+void __wrap_free(void *p) {
+  if (p) atomic_fetch_sub(&living, 1);
+  __real_free(p);
+}
+
+/* ---- one small problem a kernel ---- */
+
+typedef struct {
+  ast_status status;
+  uint64_t digest; /* of all outputs, if the status is AST_OK */
+} outcome;
+
+#define KERNEL(call) (atomic_store(&armed, true), (call))
+
+/* Ends the count that KERNEL began, reads the outputs and frees all buffers. */
+static outcome finish(ast_status status, const void *const *outputs, size_t num_outputs) {
+  atomic_store(&armed, false);
+  outcome result = {status, 0xcbf29ce484222325u};
+  for (size_t i = 0; status == AST_OK && i < num_outputs; i++) {
+    const buffer *b = buffer_of(outputs[i]);
+    for (size_t j = 0; j + 4 <= b->size; j += 4) {
+      uint32_t word;
+      memcpy(&word, b->data + j, sizeof word);
+      result.digest = (result.digest ^ word) * 0x100000001b3u;
+    }
+  }
+  while (num_buffers) free_buffers((const void *[]){buffers[0].data}, 1);
+  return result;
+}
+#define FINISH(status, ...) finish(status, BUFFER_LIST(__VA_ARGS__))
+
+/* 0, step, 2 step, ... */
+static int64_t *even_offsets(int64_t num, int64_t step) {
+  int64_t *offsets = new_ints(num + 1);
+  for (int64_t i = 0; i <= num; i++) offsets[i] = i * step;
+  return offsets;
+}
+
+static outcome segment(const ast_kernels *kernels, bool spread) {
+  enum { F = 131, C = 300, N = 3 * C };
+  int64_t *offsets = even_offsets(C, 3), *order = even_offsets(N - 1, 1);
+  float *x = random_floats((spread ? C : N) * F), *out = new_floats((spread ? N : C) * F);
+  return FINISH(KERNEL((spread ? kernels->segment_spread : kernels->segment_sum)(x, F, order, offsets, C, true, out)), out);
+}
+static outcome segment_sum(const ast_kernels *kernels) { return segment(kernels, false); }
+static outcome segment_spread(const ast_kernels *kernels) { return segment(kernels, true); }
+
+static outcome octree_build(const ast_kernels *kernels, int depth) {
+  enum { B = 3, N = 9000 };
+  const double center[3] = {0, 0, 0};
+  float *positions = random_floats(3 * N);
+  int64_t *offsets = even_offsets(B, N / B), *keys = new_ints(N), *cell_offsets = new_ints(B + 1), *node_cell = new_ints(N);
+  int64_t *node_order = new_ints(N), *node_offsets = new_ints(N + 1), bad = -1;
+  return FINISH(
+      KERNEL(kernels->octree_build(positions, offsets, B, center, 1, depth, keys, cell_offsets, node_cell, node_order, node_offsets, &bad)),
+      keys, cell_offsets, node_cell, node_order, node_offsets);
+}
+static outcome octree_build_packed(const ast_kernels *kernels) { return octree_build(kernels, 12); }
+static outcome octree_build_wide(const ast_kernels *kernels) { return octree_build(kernels, 21); }
+
+/* Every fourth cell of a grid, by its keys: several chunks of coarse cells. */
+static outcome octree_coarsen(const ast_kernels *kernels) {
+  enum { B = 2, C = 34000 };
+  int64_t *keys = new_ints(C), *offsets = even_offsets(B, C / B), *coarse_keys = new_ints(C), *coarse_offsets = new_ints(B + 1);
+  int64_t *first_child = new_ints(C + 1), *neighbours = new_ints(8 * C), *pair_offsets = new_ints(28);
+  for (int64_t i = 0; i < C; i++) keys[i] = 4 * (i % (C / B));
+  return FINISH(KERNEL(kernels->octree_coarsen(keys, offsets, B, coarse_keys, coarse_offsets, first_child, neighbours, pair_offsets)),
+                coarse_keys, coarse_offsets, first_child, neighbours, pair_offsets);
+}
+
+/* Coarse cells far from each other, with a child each: the only pairs are those of offset 13. */
+static outcome octree_pairs(const ast_kernels *kernels) {
+  enum { C = 9000 };
+  int64_t *keys = new_ints(C), *first_child = even_offsets(C, 1), *neighbours = new_ints(8 * C), *pair_offsets = new_ints(28), *out[4];
+  for (int64_t i = 0; i < C; i++) keys[i] = 64 * i, neighbours[8 * i] = i;
+  for (int k = 0; k < 28; k++) pair_offsets[k] = k > 13 ? C : 0;
+  for (int i = 0; i < 4; i++) out[i] = new_ints(C);
+  return FINISH(KERNEL(kernels->octree_pairs(keys, first_child, neighbours, C, pair_offsets, out[0], out[1], out[2], out[3])), out[0],
+                out[1], out[2], out[3]);
+}
+
+static outcome sample(const ast_kernels *kernels, int64_t extent) {
+  enum { B = 6, N = 200, NUM = 20 };
+  int32_t *points = new_small_ints(3 * N * B);
+  int64_t *offsets = even_offsets(B, N), *out_offsets = even_offsets(B, NUM), *indices = new_ints(B * NUM);
+  for (int64_t i = 0; i < 3 * N * B; i++) points[i] = (int32_t)(random_bits() % (uint64_t)extent);
+  return FINISH(KERNEL(kernels->farthest_point_sample(points, offsets, B, NUM, out_offsets, indices)), indices);
+}
+static outcome sample_narrow(const ast_kernels *kernels) { return sample(kernels, 1 << 12); }
+static outcome sample_wide(const ast_kernels *kernels) { return sample(kernels, 1 << 20); }
+
+enum { CELLS = 300, PAIR_GROUPS = 27, C_IN = 70, C_OUT = 20 };
+
+/* In group k the pairs (q + k, q). */
+static ast_pairs diagonal_pairs(void) {
+  int64_t *offsets = new_ints(PAIR_GROUPS + 1), *source = new_ints(PAIR_GROUPS * CELLS), *destination = new_ints(PAIR_GROUPS * CELLS);
+  for (int64_t k = 0; k <= PAIR_GROUPS; k++) offsets[k] = k * CELLS;
+  for (int64_t i = 0; i < PAIR_GROUPS * CELLS; i++) destination[i] = i % CELLS, source[i] = (i % CELLS + i / CELLS) % CELLS;
+  return (ast_pairs){offsets, source, destination};
+}
+
+static outcome sparse_conv(const ast_kernels *kernels) {
+  const ast_pairs pairs = diagonal_pairs();
+  float *x = random_floats(CELLS * C_IN), *weight = random_floats(PAIR_GROUPS * C_IN * C_OUT), *out = new_floats(CELLS * C_OUT);
+  return FINISH(KERNEL(kernels->sparse_conv(x, weight, C_IN, C_OUT, false, pairs, CELLS, out)), out);
+}
+
+static outcome sparse_conv_weight(const ast_kernels *kernels) {
+  const ast_pairs pairs = diagonal_pairs();
+  float *x = random_floats(CELLS * C_IN), *dout = random_floats(CELLS * C_OUT), *dweight = new_floats(PAIR_GROUPS * C_IN * C_OUT);
+  return FINISH(KERNEL(kernels->sparse_conv_weight(x, dout, C_IN, C_OUT, pairs, dweight)), dweight);
+}
+
+enum { SCENES = 2, QUERIES = 270, KEYS = 140, H = 2, D = 16, ROW = H * D };
+
+static ast_attention attention_sizes(void) {
+  return (ast_attention){SCENES, H, D, even_offsets(SCENES, QUERIES), even_offsets(SCENES, KEYS), ROW, ROW, ROW, 0.25f, 0.1, 5};
+}
+
+static outcome attention(const ast_kernels *kernels) {
+  const ast_attention s = attention_sizes();
+  float *q = random_floats(SCENES * QUERIES * ROW), *k = random_floats(SCENES * KEYS * ROW), *v = random_floats(SCENES * KEYS * ROW);
+  float *out = new_floats(SCENES * QUERIES * ROW), *maximum = new_floats(SCENES * QUERIES * H), *sum = new_floats(SCENES * QUERIES * H);
+  return FINISH(KERNEL(kernels->attention(&s, q, k, v, out, maximum, sum)), out, maximum, sum);
+}
+
+static outcome attention_backward(const ast_kernels *kernels) {
+  const ast_attention s = attention_sizes();
+  float *q = random_floats(SCENES * QUERIES * ROW), *k = random_floats(SCENES * KEYS * ROW), *v = random_floats(SCENES * KEYS * ROW);
+  float *out = random_floats(SCENES * QUERIES * ROW), *maximum = new_floats(SCENES * QUERIES * H), *sum = new_floats(SCENES * QUERIES * H);
+  float *dout = random_floats(SCENES * QUERIES * ROW), *dq = new_floats(SCENES * QUERIES * ROW);
+  float *dk = new_floats(SCENES * KEYS * ROW), *dv = new_floats(SCENES * KEYS * ROW);
+  for (int64_t i = 0; i < SCENES * QUERIES * H; i++) maximum[i] = 4, sum[i] = KEYS;
+  return FINISH(KERNEL(kernels->attention_backward(&s, q, k, v, out, maximum, sum, dout, dq, dk, dv)), dq, dk, dv);
+}
+
+static const struct {
+  const char *name;
+  outcome (*run)(const ast_kernels *);
+} cases[] = {
+    {"segment_sum", segment_sum},
+    {"segment_spread", segment_spread},
+    {"octree_build", octree_build_packed},
+    {"octree_build, wide keys", octree_build_wide},
+    {"octree_coarsen", octree_coarsen},
+    {"octree_pairs", octree_pairs},
+    {"farthest_point_sample", sample_narrow},
+    {"farthest_point_sample, wide", sample_wide},
+    {"sparse_conv", sparse_conv},
+    {"sparse_conv_weight", sparse_conv_weight},
+    {"attention", attention},
+    {"attention_backward", attention_backward},
+};
+
+/* ---- attempts ---- */
+
+typedef struct {
+  const ast_kernels *kernels;
+  outcome (*run)(const ast_kernels *);
+  bool threaded;
+  outcome first, again; /* with the allocation that fails, and without */
+  long failures;
+} attempt;
+
+/* From a thread of its own: the case with the allocation that fails, then once more on the same threads. */
+static void *make_attempt(void *p) {
+  attempt *a = p;
+  if (a->threaded) pool_start(CHECK_THREADS);
+  atomic_store(&allocations, 0), atomic_store(&failures, 0);
+  check_state = 1;
+  a->first = a->run(a->kernels);
+  a->failures = atomic_load(&failures);
+  atomic_store(&failing, LONG_MAX);
+  check_state = 1;
+  a->again = a->run(a->kernels);
+  if (a->threaded) pool_stop();
+  return NULL;
+}
+
+static attempt attempt_in_thread(const ast_kernels *kernels, outcome (*run)(const ast_kernels *), bool threaded, long n) {
+  attempt a = {.kernels = kernels, .run = run, .threaded = threaded};
+  pthread_t thread;
+  const long before = atomic_load(&living);
+  atomic_store(&failing, n);
+  CHECK(!pthread_create(&thread, NULL, make_attempt, &a) && !pthread_join(thread, NULL), "no thread");
+  CHECK(atomic_load(&living) == before, "%ld blocks are not freed", atomic_load(&living) - before);
+  return a;
+}
+
+static void test(const ast_kernels *kernels) {
+  const bool threaded = ast_threads() > 1;
+  if (threaded) pool_stop(); /* each attempt starts a fresh pool */
+  for (size_t i = 0; i < sizeof cases / sizeof *cases; i++) {
+    const attempt usual = attempt_in_thread(kernels, cases[i].run, threaded, LONG_MAX);
+    const uint64_t digest = usual.first.digest;
+    CHECK(usual.first.status == AST_OK && usual.again.status == AST_OK && usual.again.digest == digest, "%s", cases[i].name);
+    for (int mode = 0; mode < 2; mode++) {
+      atomic_store(&all_after, mode == 1);
+      for (long n = 0;; n++) {
+        const attempt a = attempt_in_thread(kernels, cases[i].run, threaded, n);
+        CHECK(a.first.status == (a.failures ? AST_NO_MEMORY : AST_OK), "%s, allocation %ld: status %d", cases[i].name, n,
+              (int)a.first.status);
+        CHECK(a.again.status == AST_OK && a.again.digest == digest && (a.failures || a.first.digest == digest),
+              "%s, allocation %ld: another result", cases[i].name, n);
+        if (!a.failures) break;
+      }
+    }
+  }
+  if (threaded) pool_start(CHECK_THREADS);
+}
+
+int main(void) {
+  on_every_table(test);
+  return 0;
+}
