@@ -80,10 +80,12 @@ def convolutions(seed: int) -> Iterator[tuple[str, Case]]:
         yield (
             name,
             (
-                lambda x, w, op=op: op(x, w, cells),
-                lambda x, w, pairs=pairs, out=out: sparse_conv._reference(x, w, False, cells.pair_offsets, *pairs, out),
-                [torch.randn(rows, widths[0], generator=g), weight],
-                ["out", "dx", "dweight"],
+                lambda x, w, b, op=op: op(x, w, cells, b),
+                lambda x, w, b, pairs=pairs, out=out: sparse_conv._reference(
+                    x, w, b, False, cells.pair_offsets, *pairs, out
+                ),
+                [torch.randn(rows, widths[0], generator=g), weight, torch.randn(widths[1], generator=g)],
+                ["out", "dx", "dweight", "dbias"],
             ),
         )
 

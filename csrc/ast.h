@@ -107,11 +107,11 @@ typedef struct {
   ast_status (*farthest_point_sample)(const int32_t *restrict coordinates, const int64_t *restrict offsets, int64_t B, int64_t num,
                                       const int64_t *restrict out_offsets, int64_t *restrict indices);
 
-  /* out[destination] += x[source] W_k over all pairs of group k, groups in ascending order. weight [27,C_in,C_out]; with `transposed`
-   * weight [27,C_out,C_in] is used as W_k^T. x [*,C_in], out [num_out,C_out]; rows without pairs are 0. */
-  ast_status (*sparse_conv)(const float *restrict x, const float *restrict weight, int64_t C_in, int64_t C_out, bool transposed,
-                            ast_pairs pairs, int64_t num_out, float *restrict out);
-  /* dweight[k] = sum over the pairs of group k of x[source]^T dout[destination], in the order of the pairs. dweight [27,C_in,C_out]. */
+  /* out = bias, then out[destination] += x[source] W_k over all pairs of group k, groups in ascending order. weight [27,C_in,C_out];
+   * with `transposed` weight [27,C_out,C_in] is used as W_k^T. x [*,C_in], bias [C_out] or NULL for 0, out [num_out,C_out]. */
+  ast_status (*sparse_conv)(const float *restrict x, const float *restrict weight, const float *restrict bias, int64_t C_in, int64_t C_out,
+                            bool transposed, ast_pairs pairs, int64_t num_out, float *restrict out);
+  /* dweight[k] = sum over the pairs of group k of x[source]^T dout[destination]. dweight [27,C_in,C_out]. */
   ast_status (*sparse_conv_weight)(const float *restrict x, const float *restrict dout, int64_t C_in, int64_t C_out, ast_pairs pairs,
                                    float *restrict dweight);
 
@@ -140,6 +140,8 @@ typedef struct {
   ast_status (*linear_backward)(const ast_linear *s, const float *restrict dout, const float *restrict x, const float *restrict weight,
                                 const float *restrict bias, const float *restrict z, float *restrict dx, float *restrict dweight,
                                 float *restrict dbias);
+  /* out[f] = sum of x[n,f] over n, rows in blocks whose sums are added in order: the gradient of a bias. x [N,F], out [F]. */
+  ast_status (*column_sum)(const float *restrict x, int64_t N, int64_t F, float *restrict out);
 } ast_kernels;
 
 /* dispatch.c: the table of an instruction set by name ("base", "avx2", "avx512"), or of the best one if name is NULL.

@@ -14,6 +14,7 @@
 #include "message.c"
 #include "message_backward.c" /* after message.c, whose tiles it uses */
 #include "linear.c"
+#include "sparse_conv_weight.c" /* after sparse_conv.c, whose constants it uses */
 
 #define AST_TABLE_OF(isa)  ast_kernels_##isa
 #define AST_TABLE(isa)     AST_TABLE_OF(isa)
@@ -40,4 +41,5 @@ const ast_kernels AST_TABLE(AST_ISA) = {
     .message_backward = message_backward,
     .linear = linear,
     .linear_backward = linear_backward,
+    .column_sum = column_sum,
 };

@@ -33,6 +33,18 @@ static PyObject *segment_spread(PyObject *self, PyObject *const *objects, Py_ssi
   return segment("segment_spread", objects, num, true);
 }
 
+static PyObject *column_sum(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  call c;
+  argument *x, *out;
+  ast_status status;
+  if (!start(&c, "column_sum", objects, num, 2) || !(x = IN(&c, "x", FLOATS, 2, FREE, FREE)) ||
+      !(out = OUT(&c, "out", FLOATS, 1, x->shape[1])))
+    return NULL;
+  KERNEL(c, status, kernels->column_sum(x->data, x->shape[0], x->shape[1], out->data));
+  Py_RETURN_NONE;
+}
+
 /* ---- octree ---- */
 
 static PyObject *octree_error(const call *c, ast_status status, const float *p, int64_t node, double half_width) {
@@ -194,13 +206,13 @@ static PyObject *farthest_point_sample(PyObject *self, PyObject *const *objects,
 static PyObject *sparse_conv(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
   (void)self;
   call c;
-  argument *x, *weight, *offsets, *source, *destination, *out;
+  argument *x, *weight, *bias, *offsets, *source, *destination, *out;
   int64_t transposed;
   ast_status status;
-  if (!start(&c, "sparse_conv", objects, num, 7) || !(x = IN(&c, "x", FLOATS, 2, FREE, FREE)) ||
-      !(weight = IN(&c, "weight", FLOATS, 3, (int64_t)27, FREE, FREE)) || !take_int(&c, "transposed", 0, 1, &transposed) ||
-      !(offsets = IN(&c, "pair_offsets", INTS, 1, (int64_t)28)) || !(source = IN(&c, "source", INTS, 1, FREE)) ||
-      !(destination = IN(&c, "destination", INTS, 1, source->shape[0])) ||
+  if (!start(&c, "sparse_conv", objects, num, 8) || !(x = IN(&c, "x", FLOATS, 2, FREE, FREE)) ||
+      !(weight = IN(&c, "weight", FLOATS, 3, (int64_t)27, FREE, FREE)) || !(bias = IN(&c, "bias", FLOATS, 1, FREE)) ||
+      !take_int(&c, "transposed", 0, 1, &transposed) || !(offsets = IN(&c, "pair_offsets", INTS, 1, (int64_t)28)) ||
+      !(source = IN(&c, "source", INTS, 1, FREE)) || !(destination = IN(&c, "destination", INTS, 1, source->shape[0])) ||
       !(out = OUT(&c, "out", FLOATS, 2, FREE, weight->shape[transposed ? 1 : 2])) ||
       !check_pairs(&c, offsets, source, x->shape[0], destination, out->shape[0], true))
     return NULL;
@@ -209,8 +221,15 @@ static PyObject *sparse_conv(PyObject *self, PyObject *const *objects, Py_ssize_
          (long long)weight->shape[transposed ? 2 : 1]);
     return NULL;
   }
+  if (bias->shape[0] && bias->shape[0] != out->shape[1]) {
+    fail(&c, PyExc_ValueError, "bias must have shape [%lld], or [0] for none, not [%lld]", (long long)out->shape[1],
+         (long long)bias->shape[0]);
+    return NULL;
+  }
   const ast_pairs pairs = {offsets->data, source->data, destination->data};
-  KERNEL(c, status, kernels->sparse_conv(x->data, weight->data, x->shape[1], out->shape[1], transposed, pairs, out->shape[0], out->data));
+  KERNEL(c, status,
+         kernels->sparse_conv(x->data, weight->data, bias->shape[0] ? bias->data : NULL, x->shape[1], out->shape[1], transposed, pairs,
+                              out->shape[0], out->data));
   Py_RETURN_NONE;
 }
 
@@ -484,7 +503,7 @@ static PyMethodDef methods[] = {
     FAST(octree_coarsen, "octree_coarsen(keys, cell_offsets, coarse_keys, coarse_offsets, first_child, neighbours, pair_offsets)"),
     FAST(octree_pairs, "octree_pairs(keys, first_child, neighbours, pair_offsets, fine, coarse, fine_by_fine, coarse_by_fine)"),
     FAST(farthest_point_sample, "farthest_point_sample(coordinates, offsets, num, out_offsets, indices)"),
-    FAST(sparse_conv, "sparse_conv(x, weight, transposed, pair_offsets, source, destination, out)"),
+    FAST(sparse_conv, "sparse_conv(x, weight, bias, transposed, pair_offsets, source, destination, out)"),
     FAST(sparse_conv_weight, "sparse_conv_weight(x, dout, pair_offsets, source, destination, dweight)"),
     FAST(attention, "attention(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, out, maximum, sum)"),
     FAST(attention_backward,
@@ -500,6 +519,7 @@ static PyMethodDef methods[] = {
     FAST(linear_backward,
          "linear_backward(x, weight, bias, z, activation, dout, dx, dweight, dbias); bias, z and the gradients that are not wanted may be "
          "None"),
+    FAST(column_sum, "column_sum(x, out)"),
     FAST(set_pool, "set_pool(parallel_for, num_threads): addresses of torch's thread pool, 0 for serial"),
     {"keep_memory", keep_memory, METH_NOARGS, "Let the C library keep freed blocks; whether it had an effect."},
     {"configuration", configuration, METH_NOARGS, "The chosen instruction set, the supported ones, the threads, the debug mode."},

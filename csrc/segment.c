@@ -1,6 +1,11 @@
-/* Sums and means over the rows of each segment, and the adjoint.
+/* Sums and means over the rows of each segment, and the adjoint; the sum over all rows.
  *
- * out_c = sum_{j in segment c} x_{order(j)}, in the stored order, so the result depends on neither threads nor batch.
+ *   segment_sum: out_c = s_c sum_{j in segment c} x_{order(j)}       segment_spread: dx_{order(j)} = s_c dout_c
+ *   column_sum:  out = sum_n x_n
+ *
+ * N rows n, C segments c, F channels; s_c is 1, or 1 over the rows of c. N F operations on 4 (N + C) F bytes: memory is the limit. A
+ * segment is summed in the stored order, so the result depends on neither threads nor batch. The sum over all rows goes by blocks of
+ * COLUMN_ROWS, whose sums are then added in order.
  */
 #include "ast.h"
 #include "simd.h"
@@ -66,4 +71,36 @@ static ast_status segment_spread(const float *restrict dout, int64_t F, const in
                                  const int64_t *restrict node_offsets, int64_t C, bool mean, float *restrict dx) {
   segment_job job = segment_plan(dout, F, node_order, node_offsets, C, mean, dx);
   return ast_parallel((C + job.rows - 1) / job.rows, segment_spread_task, &job);
+}
+
+/* ---- the sum over all rows ---- */
+
+enum { COLUMN_ROWS = 512 };
+
+typedef struct {
+  const float *x;
+  int64_t N, F;
+  float *sums; /* [blocks, F] */
+} column_job;
+
+static void add_rows(const float *restrict x, int64_t rows, int64_t F, float *restrict sum) {
+  for (int64_t f = 0; f < F; f++) sum[f] = 0;
+  for (int64_t n = 0; n < rows; n++)
+    for (int64_t f = 0; f < F; f++) sum[f] += x[n * F + f];
+}
+
+static ast_status column_sum_task(int64_t index, void *context) {
+  const column_job *s = context;
+  const int64_t first = index * COLUMN_ROWS;
+  add_rows(s->x + first * s->F, min64(COLUMN_ROWS, s->N - first), s->F, s->sums + index * s->F);
+  return AST_OK;
+}
+
+static ast_status column_sum(const float *restrict x, int64_t N, int64_t F, float *restrict out) {
+  const int64_t blocks = (N + COLUMN_ROWS - 1) / COLUMN_ROWS;
+  column_job job = {x, N, F, ast_scratch(6, blocks * F * (int64_t)sizeof *job.sums)};
+  if (!job.sums) return AST_NO_MEMORY;
+  const ast_status status = ast_parallel(blocks, column_sum_task, &job);
+  if (status == AST_OK) add_rows(job.sums, blocks, F, out);
+  return status;
 }

@@ -1,34 +1,29 @@
-/* Sparse convolution over listed pairs of cells, and its weight gradient.
+/* Sparse convolution over listed pairs of cells.
  *
- *   out_q = sum_k sum_{(p,q) in group k} x_p W_k        dW_k = sum_{(p,q) in group k} x_p^T dout_q
+ *   out_q = bias + sum_k sum_{(p,q) in group k} x_p W_k
  *
- * Only pairs that exist are touched. Forward, a task owns a range of destinations: in each group its pairs are a contiguous
- * run, since destinations rise; it gathers their sources, multiplies them with the packed W_k and adds into its rows. Groups
- * follow in ascending order, so a row's sum depends on neither the ranges, the threads nor the other scenes. The gradient with
- * respect to x is the same kernel with the lists exchanged and W_k^T. A task of the weight gradient owns a block of rows of
- * one dW_k and takes the group's pairs in order.
+ * k < 27 kernel offsets, p source and q destination cells, P pairs, I = C_in and O = C_out channels. 2 P I O operations; only
+ * pairs that exist are touched.
+ *
+ * W_k is packed into panels once a call. A task owns a range of destinations (and, where there are few, some of the columns). In each
+ * group its pairs are a contiguous run, since destinations rise. It takes them tile by tile: rows of x are multiplied where they lie,
+ * and the products added to the rows of out, or to the bias at a row's first contribution, while the rows of the next tile are fetched.
+ * Groups follow in ascending order and a sum over I is never split: the bits of a row depend on neither the ranges, the threads nor the
+ * other scenes.
+ *
+ * The gradient with respect to x is the same kernel with the lists exchanged and W_k^T.
  */
 #include "ast.h"
 #include "gemm.h"
+#include "row_tile.h"
 #include "simd.h"
 
 enum {
   OFFSETS = 27,
-  PAIRS = 96,         /* pairs gathered at a time */
-  LEAST_ROWS = 128,   /* destinations a task: fewer would read the weights too often, */
-  MOST_ROWS = 1024,   /* more would not stay in the cache */
-  CHANNEL_BLOCK = 64, /* rows of dW_k a task */
-  AHEAD = 8           /* rows by which prefetching runs ahead */
+  PAIR_TILE = 48,    /* pairs at a time: 24 KB at 128 channels, beside 16 KB of a panel of weights in L1 */
+  TASK_PAIRS = 4096, /* pairs a task, about: fewer would read the weights too often */
+  LEAST_TASKS = 8
 };
-
-/* to[i] = from[index[i]], `width` floats each, rows to_row apart */
-static void gather_rows(const float *from, int64_t row, int64_t width, const int64_t *index, int64_t n, float *to, int64_t to_row) {
-  for (int64_t i = 0; i < n; i++) {
-    const float *next = from + index[min64(i + AHEAD, n - 1)] * row;
-    for (int64_t c = 0; c < width; c += 16) __builtin_prefetch(next + c);
-    memcpy(to + i * to_row, from + index[i] * row, (size_t)width * sizeof *to);
-  }
-}
 
 /* the first i in [begin, end) with values[i] >= bound, or end */
 static int64_t lower_bound(const int64_t *values, int64_t begin, int64_t end, int64_t bound) {
@@ -41,91 +36,141 @@ static int64_t lower_bound(const int64_t *values, int64_t begin, int64_t end, in
 }
 
 typedef struct {
-  const float *x, *weight;
+  const float *x, *weight, *bias;
   float *packed; /* W_k in panels, [27] */
-  int64_t C_in, C_out, num_out, rows;
+  int64_t C_in, C_out, num_out;
+  int64_t rows, columns; /* of a task */
+  int64_t column_tasks;
   bool transposed;
   ast_pairs pairs;
   float *out;
 } conv_job;
 
-static ast_status pack_task(int64_t k, void *context) {
+/* Packs one panel of one W_k. */
+static ast_status conv_pack_task(int64_t index, void *context) {
   const conv_job *job = context;
-  const int64_t C_in = job->C_in, C_out = job->C_out;
+  const int64_t C_in = job->C_in, C_out = job->C_out, panels = round_up(C_out, GEMM_COLUMNS) / GEMM_COLUMNS;
+  const int64_t k = index / panels, column = index % panels * GEMM_COLUMNS;
   if (job->pairs.offsets[k] == job->pairs.offsets[k + 1]) return AST_OK;
-  gemm_pack(job->weight + k * C_in * C_out, job->transposed ? 1 : C_out, job->transposed ? C_in : 1, C_in, C_out,
-            job->packed + k * gemm_packed_size(C_in, C_out));
+  const float *weight = job->weight + k * C_in * C_out + column * (job->transposed ? C_in : 1);
+  gemm_pack(weight, job->transposed ? 1 : C_out, job->transposed ? C_in : 1, C_in, min64(GEMM_COLUMNS, C_out - column),
+            job->packed + k * gemm_packed_size(C_in, C_out) + column * C_in);
   return AST_OK;
+}
+
+/* The tiles of a task, in order: pairs [first, first + n) of group k. */
+typedef struct {
+  int64_t begin[OFFSETS], end[OFFSETS]; /* the task's pairs in each group */
+  int64_t k, first, n;
+} conv_walk;
+
+static void conv_advance(conv_walk *w) {
+  w->first += w->n;
+  while (w->k < OFFSETS && w->first == w->end[w->k])
+    if (++w->k < OFFSETS) w->first = w->begin[w->k];
+  w->n = w->k < OFFSETS ? min64(PAIR_TILE, w->end[w->k] - w->first) : 0;
+}
+
+static conv_walk conv_start(const ast_pairs *pairs, int64_t first, int64_t last) {
+  conv_walk w = {.k = 0};
+  for (int64_t k = 0; k < OFFSETS; k++) {
+    w.begin[k] = lower_bound(pairs->destination, pairs->offsets[k], pairs->offsets[k + 1], first);
+    w.end[k] = lower_bound(pairs->destination, w.begin[k], pairs->offsets[k + 1], last);
+  }
+  w.first = w.begin[0];
+  conv_advance(&w);
+  return w;
+}
+
+/* Rows of a tile; base is the bias where out has no contribution yet, else out. */
+typedef struct {
+  const float *x[PAIR_TILE], *base[PAIR_TILE];
+  float *out[PAIR_TILE];
+} conv_rows;
+
+static void conv_point(const conv_job *job, const conv_walk *tile, int64_t first_row, const float *bias, uint8_t *seen, conv_rows *r) {
+  for (int64_t i = 0; i < tile->n; i++) {
+    const int64_t q = job->pairs.destination[tile->first + i];
+    r->x[i] = job->x + job->pairs.source[tile->first + i] * job->C_in;
+    r->out[i] = job->out + q * job->C_out;
+    r->base[i] = seen[q - first_row] ? r->out[i] : bias;
+    seen[q - first_row] = 1;
+  }
+}
+
+/* Multiplies the rows of a tile strip by strip and panel by panel, while those of the next are fetched. */
+static void conv_tile(const conv_job *job, const conv_walk *tile, const conv_rows *rows, const conv_walk *next, const conv_rows *next_rows,
+                      int64_t column, int64_t columns) {
+  const int64_t C_in = job->C_in, C_out = job->C_out, n = tile->n;
+  const float *weight = job->packed + tile->k * gemm_packed_size(C_in, C_out);
+  const int64_t strips = row_strips(n), parts = strips * ((columns + GEMM_COLUMNS - 1) / GEMM_COLUMNS);
+  for (int64_t c = column, part = 0; c < column + columns; c += GEMM_COLUMNS)
+    for (int64_t s = 0; s < strips; s++, part++) {
+      const int64_t i = n * s / strips, f = next->n * part / parts, f_end = next->n * (part + 1) / parts;
+      const row_pointers pointers = {rows->x + i, rows->base + i, rows->out + i};
+      const row_fetch fetch = {next_rows->x + f, next_rows->out + f, f_end - f};
+      row_panel(n * (s + 1) / strips - i, min64(GEMM_COLUMNS, C_out - c), C_in, pointers, fetch, weight + c * C_in, c);
+    }
 }
 
 static ast_status conv_task(int64_t index, void *context) {
   const conv_job *job = context;
-  const ast_pairs *pairs = &job->pairs;
-  const int64_t C_in = job->C_in, C_out = job->C_out, padded = round_up(C_out, VW);
-  const int64_t first = index * job->rows, last = min64(job->num_out, first + job->rows);
-  float *gathered = ast_scratch(5, PAIRS * (C_in + padded) * (int64_t)sizeof *gathered), *product = gathered + PAIRS * C_in;
-  if (!gathered) return AST_NO_MEMORY;
-  memset(job->out + first * C_out, 0, (size_t)((last - first) * C_out) * sizeof *job->out);
-  for (int64_t k = 0; k < OFFSETS; k++) {
-    const int64_t begin = lower_bound(pairs->destination, pairs->offsets[k], pairs->offsets[k + 1], first);
-    const int64_t end = lower_bound(pairs->destination, begin, pairs->offsets[k + 1], last);
-    const gemm_b weight = gemm_packed(job->packed + k * gemm_packed_size(C_in, C_out), C_in);
-    for (int64_t i = begin; i < end; i += PAIRS) {
-      const int64_t n = min64(PAIRS, end - i);
-      gather_rows(job->x, C_in, C_in, pairs->source + i, n, gathered, C_in);
-      gemm(n, padded, C_in, (gemm_a){gathered, C_in, 1}, weight, product, padded, false);
-      for (int64_t j = 0; j < n; j++) {
-        float *out = job->out + pairs->destination[i + j] * C_out;
-        for (int64_t c = 0; c < C_out; c++) out[c] += product[j * padded + c];
-      }
-    }
+  const int64_t C_out = job->C_out;
+  const int64_t first = index / job->column_tasks * job->rows, last = min64(job->num_out, first + job->rows);
+  const int64_t column = index % job->column_tasks * job->columns, columns = min64(job->columns, C_out - column);
+  float *bias = ast_scratch(5, C_out * (int64_t)sizeof *bias + job->rows);
+  if (!bias) return AST_NO_MEMORY;
+  uint8_t *seen = (uint8_t *)(bias + C_out);
+  if (job->bias) memcpy(bias, job->bias, (size_t)C_out * sizeof *bias);
+  else memset(bias, 0, (size_t)C_out * sizeof *bias);
+  memset(seen, 0, (size_t)(last - first));
+  conv_rows rows[2];
+  conv_walk tile = conv_start(&job->pairs, first, last);
+  conv_point(job, &tile, first, bias, seen, &rows[0]);
+  for (int i = 0; tile.n; i = !i) {
+    conv_walk next = tile;
+    conv_advance(&next);
+    conv_point(job, &next, first, bias, seen, &rows[!i]);
+    conv_tile(job, &tile, &rows[i], &next, &rows[!i], column, columns);
+    tile = next;
   }
+  for (int64_t row = first; row < last; row++)
+    if (!seen[row - first]) memcpy(job->out + row * C_out + column, bias + column, (size_t)columns * sizeof *bias);
   return AST_OK;
 }
 
-static ast_status sparse_conv(const float *restrict x, const float *restrict weight, int64_t C_in, int64_t C_out, bool transposed,
-                              ast_pairs pairs, int64_t num_out, float *restrict out) {
+/* Sizes of the tasks. Where there are few pairs, ranges of rows (each reads all weights) and of columns (each reads all pairs) make
+ * up LEAST_TASKS so that the least is read. */
+static void conv_cut(conv_job *job) {
+  const int64_t num_pairs = job->pairs.offsets[OFFSETS], panels = round_up(job->C_out, GEMM_COLUMNS) / GEMM_COLUMNS;
+  int64_t row_tasks = num_pairs / TASK_PAIRS, column_tasks = 1;
+  if (row_tasks < LEAST_TASKS) {
+    while (column_tasks < min64(panels, LEAST_TASKS) && column_tasks * num_pairs < LEAST_TASKS / 2 / column_tasks * OFFSETS * job->C_out)
+      column_tasks *= 2;
+    row_tasks = LEAST_TASKS / column_tasks;
+  }
+  row_tasks = min64(row_tasks, job->num_out);
+  job->rows = (job->num_out + row_tasks - 1) / row_tasks;
+  job->columns = (panels + column_tasks - 1) / column_tasks * GEMM_COLUMNS;
+  job->column_tasks = (job->C_out + job->columns - 1) / job->columns;
+}
+
+static ast_status sparse_conv(const float *restrict x, const float *restrict weight, const float *restrict bias, int64_t C_in,
+                              int64_t C_out, bool transposed, ast_pairs pairs, int64_t num_out, float *restrict out) {
+  if (num_out == 0 || C_out == 0) return AST_OK;
   float *packed = ast_scratch(6, OFFSETS * gemm_packed_size(C_in, C_out) * (int64_t)sizeof *packed);
   if (!packed) return AST_NO_MEMORY;
-  const int64_t rows = min64(MOST_ROWS, max64(LEAST_ROWS, num_out / (4 * ast_threads())));
-  conv_job job = {x, weight, packed, C_in, C_out, num_out, rows, transposed, pairs, out};
-  const ast_status status = ast_parallel(OFFSETS, pack_task, &job);
-  return status == AST_OK ? ast_parallel((num_out + rows - 1) / rows, conv_task, &job) : status;
-}
-
-/* ---- weight gradient ---- */
-
-typedef struct {
-  const float *x, *dout;
-  int64_t C_in, C_out, blocks;
-  ast_pairs pairs;
-  float *dweight;
-} conv_weight_job;
-
-static ast_status conv_weight_task(int64_t index, void *context) {
-  const conv_weight_job *job = context;
-  const ast_pairs *pairs = &job->pairs;
-  const int64_t k = index / job->blocks, first = index % job->blocks * CHANNEL_BLOCK, rows = min64(CHANNEL_BLOCK, job->C_in - first);
-  const int64_t C_in = job->C_in, C_out = job->C_out, padded = round_up(C_out, VW);
-  const int64_t row = padded + 16; /* seldom a power of two, which would crowd few cache sets */
-  float *x = ast_scratch(5, (PAIRS * (CHANNEL_BLOCK + row) + CHANNEL_BLOCK * padded) * (int64_t)sizeof *x);
-  if (!x) return AST_NO_MEMORY;
-  float *dout = x + PAIRS * CHANNEL_BLOCK, *sum = dout + PAIRS * row;
-  const int64_t begin = pairs->offsets[k], end = pairs->offsets[k + 1];
-  if (padded > C_out) memset(dout, 0, (size_t)(PAIRS * row) * sizeof *dout);
-  if (begin == end) memset(sum, 0, (size_t)(rows * padded) * sizeof *sum);
-  for (int64_t i = begin; i < end; i += PAIRS) {
-    const int64_t n = min64(PAIRS, end - i);
-    gather_rows(job->x + first, C_in, rows, pairs->source + i, n, x, CHANNEL_BLOCK);
-    gather_rows(job->dout, C_out, C_out, pairs->destination + i, n, dout, row);
-    gemm(rows, padded, n, (gemm_a){x, 1, CHANNEL_BLOCK}, gemm_rows(dout, row), sum, padded, i > begin);
-  }
-  for (int64_t i = 0; i < rows; i++) memcpy(job->dweight + (k * C_in + first + i) * C_out, sum + i * padded, (size_t)C_out * sizeof *sum);
-  return AST_OK;
-}
-
-static ast_status sparse_conv_weight(const float *restrict x, const float *restrict dout, int64_t C_in, int64_t C_out, ast_pairs pairs,
-                                     float *restrict dweight) {
-  conv_weight_job job = {x, dout, C_in, C_out, (C_in + CHANNEL_BLOCK - 1) / CHANNEL_BLOCK, pairs, dweight};
-  return ast_parallel(OFFSETS * job.blocks, conv_weight_task, &job);
+  conv_job job = {.x = x,
+                  .weight = weight,
+                  .bias = bias,
+                  .packed = packed,
+                  .C_in = C_in,
+                  .C_out = C_out,
+                  .num_out = num_out,
+                  .transposed = transposed,
+                  .pairs = pairs,
+                  .out = out};
+  conv_cut(&job);
+  const ast_status status = ast_parallel(OFFSETS * (round_up(C_out, GEMM_COLUMNS) / GEMM_COLUMNS), conv_pack_task, &job);
+  return status == AST_OK ? ast_parallel((num_out + job.rows - 1) / job.rows * job.column_tasks, conv_task, &job) : status;
 }

@@ -100,4 +100,4 @@ class SparseConv(nn.Module):
         self.bias = nn.Parameter(torch.zeros(width))
 
     def forward(self, x: Tensor, cell_map: CellMap) -> Tensor:
-        return self.convolve(x, self.weight, cell_map) + self.bias
+        return self.convolve(x, self.weight, cell_map, self.bias)

@@ -63,9 +63,28 @@ def _spread_fake(dout: Tensor, node_order: Tensor, node_offsets: Tensor, mean: b
     return dout.new_empty(node_order.shape[0], dout.shape[1])
 
 
+def _column_sum_reference(x: Tensor) -> Tensor:
+    if x.dim() != 2:
+        raise ValueError(f"column_sum: x must have shape [*, *], not {tuple(x.shape)}")
+    return x.sum(0)
+
+
+def _column_sum_kernel(x: Tensor) -> Tensor:
+    out = x.new_empty(x.shape[-1:])
+    library._C.column_sum(array(x), array(out))
+    return out
+
+
+def _column_sum_fake(x: Tensor) -> Tensor:
+    return x.new_empty(x.shape[1])
+
+
 _SEGMENTS = "Tensor node_order, Tensor node_offsets, bool mean) -> Tensor"
 _sum = library.define(f"segment_sum(Tensor x, {_SEGMENTS}", _sum_kernel, _sum_reference, _sum_fake)
 _spread = library.define(f"segment_spread(Tensor dout, {_SEGMENTS}", _spread_kernel, _spread_reference, _spread_fake)
+_column_sum = library.define(
+    "column_sum(Tensor x) -> Tensor", _column_sum_kernel, _column_sum_reference, _column_sum_fake
+)
 
 
 def _save_segments(ctx, inputs, output) -> None:
@@ -78,6 +97,11 @@ library.differentiate(
 )
 library.differentiate(
     _spread, _save_segments, lambda ctx, grad: (_sum(grad, *ctx.saved_tensors, ctx.mean), None, None, None)
+)
+library.differentiate(
+    _column_sum,
+    lambda ctx, inputs, output: setattr(ctx, "rows", inputs[0].shape[0]),
+    lambda ctx, grad: grad.expand(ctx.rows, -1),
 )
 
 
@@ -101,3 +125,8 @@ def segment_sum(x: Tensor, node_order: Tensor, node_offsets: Tensor) -> Tensor:
 def segment_mean(x: Tensor, node_order: Tensor, node_offsets: Tensor) -> Tensor:
     """`segment_sum` divided by the number of rows of each segment; an empty segment is 0."""
     return _sum(x, node_order, node_offsets, True)
+
+
+def column_sum(x: Tensor) -> Tensor:
+    """Sum over the rows of x [N, F]: [F]. Unlike torch's, its bits do not depend on the number of threads."""
+    return _column_sum(x)

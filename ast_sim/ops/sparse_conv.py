@@ -10,6 +10,7 @@ from torch import Tensor
 from ast_sim.ops import library
 from ast_sim.ops.library import array, check_offsets
 from ast_sim.ops.octree import CellMap
+from ast_sim.ops.segment import column_sum
 
 OFFSETS = 27
 
@@ -37,7 +38,7 @@ def _groups(pair_offsets: Tensor, source: Tensor, destination: Tensor):
             yield k, source[pairs], destination[pairs]
 
 
-def _reference(x, weight, transposed, pair_offsets, source, destination, back_source, back_destination, num_out):
+def _reference(x, weight, bias, transposed, pair_offsets, source, destination, back_source, back_destination, num_out):
     if x.dim() != 2 or weight.dim() != 3 or len(weight) != OFFSETS:
         raise ValueError(
             f"sparse_conv: x must have shape [*, *] and weight [{OFFSETS}, *, *],"
@@ -46,11 +47,13 @@ def _reference(x, weight, transposed, pair_offsets, source, destination, back_so
     weight = weight.mT if transposed else weight
     if x.shape[1] != weight.shape[1]:
         raise ValueError(f"sparse_conv: x has {x.shape[1]} channels, weight takes {weight.shape[1]}")
+    if bias is not None and bias.shape != weight.shape[2:]:
+        raise ValueError(f"sparse_conv: bias must have shape [{weight.shape[2]}], not {list(bias.shape)}")
     _check("sparse_conv", pair_offsets, source, len(x), destination, num_out)
     out = x.new_zeros(num_out, weight.shape[2])
     for k, i, j in _groups(pair_offsets, source, destination):
         out = out.index_add(0, j, x.index_select(0, i) @ weight[k])
-    return out
+    return out if bias is None else out + bias
 
 
 def _weight_reference(x, dout, pair_offsets, source, destination):
@@ -61,11 +64,11 @@ def _weight_reference(x, dout, pair_offsets, source, destination):
     return dweight
 
 
-def _kernel(x, weight, transposed, pair_offsets, source, destination, back_source, back_destination, num_out):
+def _kernel(x, weight, bias, transposed, pair_offsets, source, destination, back_source, back_destination, num_out):
     out = x.new_empty(num_out, weight.shape[1 if transposed else -1])
-    library._C.sparse_conv(
-        array(x), array(weight), transposed, array(pair_offsets), array(source), array(destination), array(out)
-    )
+    bias = x.new_empty(0) if bias is None else bias
+    pairs = (array(pair_offsets), array(source), array(destination))
+    library._C.sparse_conv(array(x), array(weight), array(bias), transposed, *pairs, array(out))
     return out
 
 
@@ -77,7 +80,7 @@ def _weight_kernel(x, dout, pair_offsets, source, destination):
     return dweight
 
 
-def _fake(x, weight, transposed, pair_offsets, source, destination, back_source, back_destination, num_out):
+def _fake(x, weight, bias, transposed, pair_offsets, source, destination, back_source, back_destination, num_out):
     return x.new_empty(num_out, weight.shape[1 if transposed else 2])
 
 
@@ -88,8 +91,8 @@ def _weight_fake(x, dout, pair_offsets, source, destination):
 # The pairs come twice: (source, destination) sorted by destination, and (back_source, back_destination), which are the
 # destinations and sources of the same pairs sorted by source, for the gradient with respect to x.
 _conv = library.define(
-    "sparse_conv(Tensor x, Tensor weight, bool transposed, Tensor pair_offsets, Tensor source, Tensor destination,"
-    " Tensor back_source, Tensor back_destination, SymInt num_out) -> Tensor",
+    "sparse_conv(Tensor x, Tensor weight, Tensor? bias, bool transposed, Tensor pair_offsets, Tensor source,"
+    " Tensor destination, Tensor back_source, Tensor back_destination, SymInt num_out) -> Tensor",
     _kernel,
     _reference,
     _fake,
@@ -103,33 +106,36 @@ _conv_weight = library.define(
 
 
 def _save(ctx, inputs, output) -> None:
-    x, weight, ctx.transposed, *pairs, _ = inputs
+    x, weight, _, ctx.transposed, *pairs, _ = inputs
     ctx.save_for_backward(x, weight, *pairs)
 
 
 def _gradient(ctx, dout):
     x, weight, pair_offsets, source, destination, back_source, back_destination = ctx.saved_tensors
-    dx = dweight = None
+    dx = dweight = dbias = None
     if ctx.needs_input_grad[0]:
         lists = (back_source, back_destination, source, destination)
-        dx = _conv(dout, weight, not ctx.transposed, pair_offsets, *lists, x.shape[0])
+        dx = _conv(dout, weight, None, not ctx.transposed, pair_offsets, *lists, x.shape[0])
     if ctx.needs_input_grad[1] and ctx.transposed:
         dweight = _conv_weight(dout, x, pair_offsets, destination, source)
     elif ctx.needs_input_grad[1]:
         dweight = _conv_weight(x, dout, pair_offsets, source, destination)
-    return dx, dweight, None, None, None, None, None, None, None
+    if ctx.needs_input_grad[2]:
+        dbias = column_sum(dout)
+    return dx, dweight, dbias, None, None, None, None, None, None, None
 
 
 library.differentiate(_conv, _save, _gradient)
 
 
-def sparse_conv(x: Tensor, weight: Tensor, map: CellMap) -> Tensor:
-    """Convolution of stride 2: out[X] = sum over (a, b, c) in {-1, 0, 1}^3 of x[2 X + (a, b, c)] W_k.
+def sparse_conv(x: Tensor, weight: Tensor, map: CellMap, bias: Tensor | None = None) -> Tensor:
+    """Convolution of stride 2: out[X] = bias + sum over (a, b, c) in {-1, 0, 1}^3 of x[2 X + (a, b, c)] W_k.
 
     Args:
         x: [C_fine, I], features of the cells of a level.
         weight: [27, I, O]; W_k belongs to kernel offset k = 9(a+1) + 3(b+1) + (c+1).
         map: `Octree.coarsen()` of that level.
+        bias: [O], or None for 0.
 
     Returns:
         [C_coarse, O]. A cell that does not exist contributes nothing.
@@ -140,16 +146,17 @@ def sparse_conv(x: Tensor, weight: Tensor, map: CellMap) -> Tensor:
     if x.shape[0] != map.num_fine:
         raise ValueError(f"sparse_conv: x has {x.shape[0]} rows for {map.num_fine} fine cells")
     pairs = (map.fine, map.coarse_index, map.coarse_by_fine, map.fine_by_fine)
-    return _conv(x, weight, False, map.pair_offsets, *pairs, len(map.coarse.keys))
+    return _conv(x, weight, bias, False, map.pair_offsets, *pairs, len(map.coarse.keys))
 
 
-def sparse_conv_transposed(x: Tensor, weight: Tensor, map: CellMap) -> Tensor:
-    """The adjoint pattern: out[2 X + (a, b, c)] = sum over the coarse cells X of x[X] W_k.
+def sparse_conv_transposed(x: Tensor, weight: Tensor, map: CellMap, bias: Tensor | None = None) -> Tensor:
+    """The adjoint pattern: out[2 X + (a, b, c)] = bias + sum over the coarse cells X of x[X] W_k.
 
     Args:
         x: [C_coarse, I], features of the cells of the coarser level.
         weight: [27, I, O].
         map: `Octree.coarsen()` of the finer level.
+        bias: [O], or None for 0.
 
     Returns:
         [C_fine, O].
@@ -160,4 +167,4 @@ def sparse_conv_transposed(x: Tensor, weight: Tensor, map: CellMap) -> Tensor:
     if x.shape[0] != len(map.coarse.keys):
         raise ValueError(f"sparse_conv_transposed: x has {x.shape[0]} rows for {len(map.coarse.keys)} coarse cells")
     pairs = (map.coarse_by_fine, map.fine_by_fine, map.fine, map.coarse_index)
-    return _conv(x, weight, False, map.pair_offsets, *pairs, map.num_fine)
+    return _conv(x, weight, bias, False, map.pair_offsets, *pairs, map.num_fine)

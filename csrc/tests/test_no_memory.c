@@ -152,7 +152,7 @@ static ast_pairs diagonal_pairs(void) {
 static outcome sparse_conv(const ast_kernels *kernels) {
   const ast_pairs pairs = diagonal_pairs();
   float *x = random_floats(CELLS * C_IN), *weight = random_floats(PAIR_GROUPS * C_IN * C_OUT), *out = new_floats(CELLS * C_OUT);
-  return FINISH(KERNEL(kernels->sparse_conv(x, weight, C_IN, C_OUT, false, pairs, CELLS, out)), out);
+  return FINISH(KERNEL(kernels->sparse_conv(x, weight, NULL, C_IN, C_OUT, false, pairs, CELLS, out)), out);
 }
 
 static outcome sparse_conv_weight(const ast_kernels *kernels) {

@@ -35,6 +35,19 @@ static void compare(const ast_kernels *kernels, int64_t N, int64_t C, int64_t F,
   FREE(x, out, back, order, offsets);
 }
 
+static void sum_columns(const ast_kernels *kernels, int64_t N, int64_t F) {
+  float *x = malloc((size_t)(N * F + 1) * 4), *out = malloc((size_t)(F + 1) * 4);
+  for (int64_t i = 0; i < N * F; i++) x[i] = random_float();
+  memset(out, 0xff, (size_t)F * 4);
+  CHECK(kernels->column_sum(x, N, F, out) == AST_OK, "status");
+  for (int64_t f = 0; f < F; f++) {
+    double sum = 0, magnitude = 0;
+    for (int64_t n = 0; n < N; n++) sum += (double)x[n * F + f], magnitude += fabs((double)x[n * F + f]);
+    CHECK(fabs((double)out[f] - sum) <= 1e-6 * magnitude, "N %lld F %lld: %g", (long long)N, (long long)F, (double)out[f]);
+  }
+  free(x), free(out);
+}
+
 static void test(const ast_kernels *kernels) {
   static const int64_t channels[] = {0, 1, 2, 3, 4, 15, 16, 17, 64, 128, 131};
   for (int f = 0; f < 11; f++)
@@ -45,6 +58,9 @@ static void test(const ast_kernels *kernels) {
       compare(kernels, 2, 5, channels[f], mean);
       compare(kernels, 1001, 257, channels[f], mean);
     }
+  static const int64_t rows[] = {0, 1, 511, 513, 2000};
+  for (int f = 0; f < 11; f++)
+    for (int n = 0; n < 5; n++) sum_columns(kernels, rows[n], channels[f]);
 }
 
 int main(void) {

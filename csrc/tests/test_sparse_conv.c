@@ -39,12 +39,12 @@ static pair_list new_pairs(int64_t sources, int64_t destinations, double density
   return p;
 }
 
-static float *convolve(const ast_kernels *kernels, const pair_list *p, const float *x, const float *weight, int64_t C_in, int64_t C_out,
-                       bool transposed) {
+static float *convolve(const ast_kernels *kernels, const pair_list *p, const float *x, const float *weight, const float *bias, int64_t C_in,
+                       int64_t C_out, bool transposed) {
   float *out = new_floats(p->destinations * C_out);
   const ast_pairs pairs = exact_pairs(p);
   READ_ONLY(x, weight);
-  CHECK(kernels->sparse_conv(x, weight, C_in, C_out, transposed, pairs, p->destinations, out) == AST_OK, "status");
+  CHECK(kernels->sparse_conv(x, weight, bias, C_in, C_out, transposed, pairs, p->destinations, out) == AST_OK, "status");
   WRITABLE(x, weight);
   FREE(pairs.offsets, pairs.source, pairs.destination);
   return out;
@@ -61,18 +61,19 @@ static float *weight_gradient(const ast_kernels *kernels, const pair_list *p, co
   return dweight;
 }
 
-#define FORMULA(name, real)                                                                                                 \
-  static void name(const pair_list *p, const float *x, const float *weight, const float *dout, int64_t C_in, int64_t C_out, \
-                   bool transposed, real *out, real *dweight) {                                                             \
-    for (int64_t k = 0; k < OFFSETS; k++)                                                                                   \
-      for (int64_t i = p->offsets[k]; i < p->offsets[k + 1]; i++)                                                           \
-        for (int64_t a = 0; a < C_in; a++)                                                                                  \
-          for (int64_t b = 0; b < C_out; b++) {                                                                             \
-            const real w = (real)weight[k * C_in * C_out + (transposed ? b * C_in + a : a * C_out + b)];                    \
-            const real x_pa = (real)x[p->source[i] * C_in + a];                                                             \
-            out[p->destination[i] * C_out + b] += x_pa * w;                                                                 \
-            dweight[(k * C_in + a) * C_out + b] += x_pa * (real)dout[p->destination[i] * C_out + b];                        \
-          }                                                                                                                 \
+#define FORMULA(name, real)                                                                                                     \
+  static void name(const pair_list *p, const float *x, const float *weight, const float *bias, const float *dout, int64_t C_in, \
+                   int64_t C_out, bool transposed, real *out, real *dweight) {                                                  \
+    for (int64_t i = 0; bias && i < p->destinations * C_out; i++) out[i] = (real)bias[i % C_out];                               \
+    for (int64_t k = 0; k < OFFSETS; k++)                                                                                       \
+      for (int64_t i = p->offsets[k]; i < p->offsets[k + 1]; i++)                                                               \
+        for (int64_t a = 0; a < C_in; a++)                                                                                      \
+          for (int64_t b = 0; b < C_out; b++) {                                                                                 \
+            const real w = (real)weight[k * C_in * C_out + (transposed ? b * C_in + a : a * C_out + b)];                        \
+            const real x_pa = (real)x[p->source[i] * C_in + a];                                                                 \
+            out[p->destination[i] * C_out + b] += x_pa * w;                                                                     \
+            dweight[(k * C_in + a) * C_out + b] += x_pa * (real)dout[p->destination[i] * C_out + b];                            \
+          }                                                                                                                     \
   }
 FORMULA(formula, double)
 FORMULA(formula_float, float)
@@ -91,17 +92,19 @@ static void compare(const char *what, const float *got, const double *exact, con
 static void check_case(const ast_kernels *kernels, int64_t sources, int64_t destinations, int64_t C_in, int64_t C_out, bool transposed) {
   pair_list p = new_pairs(sources, destinations, 0.2, 1);
   const int64_t n = destinations * C_out, m = OFFSETS * C_in * C_out;
-  float *x = random_floats(sources * C_in), *weight = random_floats(m), *dout = random_floats(n);
+  float *x = random_floats(sources * C_in), *weight = random_floats(m), *dout = random_floats(n), *bias = random_floats(C_out);
+  const float *used = (C_in + destinations) % 2 ? bias : NULL;
   double *exact = calloc((size_t)(n + m + 1), sizeof *exact);
   float *plain = calloc((size_t)(n + m + 1), sizeof *plain);
   CHECK(exact && plain, "no memory");
-  formula(&p, x, weight, dout, C_in, C_out, transposed, exact, exact + n);
-  formula_float(&p, x, weight, dout, C_in, C_out, transposed, plain, plain + n);
-  float *out = convolve(kernels, &p, x, weight, C_in, C_out, transposed), *dweight = weight_gradient(kernels, &p, x, dout, C_in, C_out);
+  formula(&p, x, weight, used, dout, C_in, C_out, transposed, exact, exact + n);
+  formula_float(&p, x, weight, used, dout, C_in, C_out, transposed, plain, plain + n);
+  float *out = convolve(kernels, &p, x, weight, used, C_in, C_out, transposed);
+  float *dweight = weight_gradient(kernels, &p, x, dout, C_in, C_out);
   compare("out", out, exact, plain, n);
   compare("dweight", dweight, exact + n, plain + n, m);
   free(p.source), free(p.destination), free(exact), free(plain);
-  FREE(x, weight, dout, out, dweight);
+  FREE(x, weight, bias, dout, out, dweight);
 }
 
 static void test_accuracy(const ast_kernels *kernels) {
@@ -109,6 +112,8 @@ static void test_accuracy(const ast_kernels *kernels) {
   static const int64_t rows[][2] = {{0, 0}, {0, 3}, {4, 0}, {1, 1}, {2, 2}, {9, 300}, {700, 129}};
   for (int c = 0; c < 9; c++)
     for (int r = 0; r < 7; r++) check_case(kernels, rows[r][0], rows[r][1], channels[c][0], channels[c][1], (c + r) % 2);
+  check_case(kernels, 900, 50000, 3, 5, false); /* ranges of rows, and groups in parts */
+  check_case(kernels, 50, 3, 3, 150, true);     /* ranges of columns */
 }
 
 /* The transposed form is the adjoint: <conv(x), y> = <x, conv'(y)>, with the pairs of conv' sorted by the other end. */
@@ -124,7 +129,8 @@ static void test_adjoint(const ast_kernels *kernels) {
     p.offsets[k + 1] = q.offsets[k + 1] = num;
   }
   float *x = random_floats(n * C_in), *y = random_floats(n * C_out), *weight = random_floats(OFFSETS * C_in * C_out);
-  float *out = convolve(kernels, &p, x, weight, C_in, C_out, false), *back = convolve(kernels, &q, y, weight, C_out, C_in, true);
+  float *out = convolve(kernels, &p, x, weight, NULL, C_in, C_out, false);
+  float *back = convolve(kernels, &q, y, weight, NULL, C_out, C_in, true);
   double left = 0, right = 0, magnitude = 0;
   for (int64_t i = 0; i < n * C_out; i++) left += (double)out[i] * (double)y[i], magnitude += fabs((double)out[i] * (double)y[i]);
   for (int64_t i = 0; i < n * C_in; i++) right += (double)x[i] * (double)back[i];
@@ -135,7 +141,7 @@ static void test_adjoint(const ast_kernels *kernels) {
 
 /* A scene alone gives the bits that it gives in a batch, and a NaN in another scene does not reach it. */
 static void test_batch(const ast_kernels *kernels) {
-  const int64_t C_in = 20, C_out = 36, sources = 900, destinations = 3000;
+  const int64_t C_in = 20, C_out = 36, sources = 900, destinations = 16000;
   pair_list both = new_pairs(sources, destinations, 0.1, 2), one = {.sources = sources / 2, .destinations = destinations / 2};
   one.source = malloc((size_t)both.offsets[OFFSETS] * sizeof(int64_t)),
   one.destination = malloc((size_t)both.offsets[OFFSETS] * sizeof(int64_t));
@@ -151,8 +157,8 @@ static void test_batch(const ast_kernels *kernels) {
   }
   float *x = random_floats(sources * C_in), *weight = random_floats(OFFSETS * C_in * C_out);
   for (int64_t i = 0; i < one.sources * C_in; i += 7) x[i] = NAN;
-  float *batch = convolve(kernels, &both, x, weight, C_in, C_out, false);
-  float *alone = convolve(kernels, &one, x + one.sources * C_in, weight, C_in, C_out, false);
+  float *batch = convolve(kernels, &both, x, weight, NULL, C_in, C_out, false);
+  float *alone = convolve(kernels, &one, x + one.sources * C_in, weight, NULL, C_in, C_out, false);
   for (int64_t i = 0; i < one.destinations * C_out; i++) CHECK(isfinite(alone[i]), "out[%lld]", (long long)i);
   CHECK(!memcmp(alone, batch + one.destinations * C_out, (size_t)(one.destinations * C_out) * sizeof *alone), "not the same bits");
   free(both.source), free(both.destination), free(one.source), free(one.destination);
@@ -161,13 +167,13 @@ static void test_batch(const ast_kernels *kernels) {
 
 /* The pool that this run is on gives what the calling thread alone gives. */
 static void test_threads(const ast_kernels *kernels) {
-  const int64_t C_in = 70, C_out = 32, n = 2500;
-  pair_list p = new_pairs(n, n, 0.1, 1);
+  const int64_t C_in = 70, C_out = 32, n = 20000;
+  pair_list p = new_pairs(n, n, 0.5, 1);
   float *x = random_floats(n * C_in), *dout = random_floats(n * C_out), *weight = random_floats(OFFSETS * C_in * C_out), *out[2],
         *dweight[2];
   for (int i = 0; i < 2; i++) {
     if (i) ast_set_pool(NULL, NULL);
-    out[i] = convolve(kernels, &p, x, weight, C_in, C_out, false);
+    out[i] = convolve(kernels, &p, x, weight, NULL, C_in, C_out, false);
     dweight[i] = weight_gradient(kernels, &p, x, dout, C_in, C_out);
   }
   CHECK(!memcmp(out[0], out[1], (size_t)(n * C_out) * sizeof(float)), "threads change the result");

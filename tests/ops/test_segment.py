@@ -109,6 +109,16 @@ def test_opcheck():
     torch.library.opcheck(segment._spread.overload, (torch.randn(4, 5, requires_grad=True), order, offsets, False))
 
 
+@pytest.mark.parametrize("rows, channels", [(0, 3), (1, 1), (3, 0), (511, 17), (512, 128), (5000, 33)])
+def test_column_sum(rows, channels):
+    x = torch.randn(rows, channels)
+    assert_accurate(segment.column_sum, segment._column_sum_reference, [x])
+    assert_same_for_threads(lambda: [segment.column_sum(x)])
+    torch.library.opcheck(segment._column_sum.overload, (x.requires_grad_(),))
+    with pytest.raises(ValueError, match="column_sum: x must have shape"):
+        segment.column_sum(x[None])
+
+
 def test_gradients_in_float64():
     x, order, offsets = case(9, 4, 3)
     assert torch.autograd.gradcheck(lambda x: segment_mean(x, order, offsets), x.double().requires_grad_())

@@ -25,12 +25,12 @@ def features(cells: int, weights: tuple[int, int], seed: int = 1) -> tuple[Tenso
 
 def composed(map: CellMap):
     lists = (map.pair_offsets, map.fine, map.coarse_index, map.coarse_by_fine, map.fine_by_fine)
-    return lambda x, weight: ops._reference(x, weight, False, *lists, len(map.coarse.keys))
+    return lambda x, weight, bias=None: ops._reference(x, weight, bias, False, *lists, len(map.coarse.keys))
 
 
 def composed_transposed(map: CellMap):
     lists = (map.pair_offsets, map.coarse_by_fine, map.fine_by_fine, map.fine, map.coarse_index)
-    return lambda x, weight: ops._reference(x, weight, False, *lists, map.num_fine)
+    return lambda x, weight, bias=None: ops._reference(x, weight, bias, False, *lists, map.num_fine)
 
 
 CHANNELS = [(1, 1), (3, 5), (16, 8), (17, 33), (64, 64), (128, 96)]
@@ -104,9 +104,17 @@ def test_scene_alone_equals_scene_in_batch():
     both = octree(positions, torch.tensor([0, 400, 400, 900]), *box).coarsen()
     alone = octree(positions[400:], torch.tensor([0, 500]), *box).coarsen()
     x, weight = features(both.num_fine, (24, 40))
-    first = both.num_fine - alone.num_fine
-    expected = sparse_conv(x, weight, both)[int(both.coarse.cell_offsets[2]) :]
-    assert torch.equal(sparse_conv(x[first:], weight, alone), expected)
+    first, first_coarse = both.num_fine - alone.num_fine, int(both.coarse.cell_offsets[2])
+    mine = x[first:].clone().requires_grad_()
+    x.requires_grad_()
+    out, expected = sparse_conv(mine, weight, alone), sparse_conv(x, weight, both)
+    assert torch.equal(out, expected[first_coarse:])
+    dout = torch.randn_like(expected)
+    (dx,), (expected_dx,) = (
+        torch.autograd.grad(out, mine, dout[first_coarse:]),
+        torch.autograd.grad(expected, x, dout),
+    )
+    assert torch.equal(dx, expected_dx[first:])
 
 
 def test_empty_levels_give_empty_outputs_and_zero_gradients():
@@ -128,25 +136,28 @@ def test_no_channels(channels):
 
 
 def test_bitwise_equal_for_threads():
-    map = level(6000, depth=6)
-    x, weight = features(map.num_fine, (40, 24))
-    dout = torch.randn(len(map.coarse.keys), 24)
+    for nodes, depth in ((60, 3), (6000, 6), (60000, 5)):  # the last has groups that are cut into parts
+        map = level(nodes, depth=depth)
+        x, weight = features(map.num_fine, (40, 24))
+        dout = torch.randn(len(map.coarse.keys), 24)
 
-    def function():
-        leaves = [x.clone().requires_grad_(), weight.clone().requires_grad_()]
-        out = sparse_conv(*leaves, map)
-        return out, *torch.autograd.grad(out, leaves, dout)
+        def function(x=x, weight=weight, dout=dout, map=map):
+            leaves = [x.clone().requires_grad_(), weight.clone().requires_grad_(), torch.zeros(24, requires_grad=True)]
+            out = with_bias(sparse_conv, map)(*leaves)
+            return out, *torch.autograd.grad(out, leaves, dout)
 
-    assert_same_for_threads(function)
+        assert_same_for_threads(function)
 
 
 CODE = """
 import sys; sys.path[:0] = ["tests", "tests/ops"]
 from checks import assert_accurate
-from test_sparse_conv import composed, features, level, sparse_conv
+import torch
+from test_sparse_conv import composed, features, level, sparse_conv, with_bias
 map = level(700, 30)
 for channels in ((3, 5), (64, 48)):
-    assert_accurate(lambda x, w: sparse_conv(x, w, map), composed(map), features(map.num_fine, channels))
+    inputs = (*features(map.num_fine, channels), torch.randn(channels[1]))
+    assert_accurate(with_bias(sparse_conv, map), composed(map), inputs)
 from ast_sim.ops.library import configuration
 print(configuration()["instruction_set"])
 """
@@ -161,9 +172,45 @@ def test_opcheck():
     map = level(40)
     x, weight = (leaf.requires_grad_() for leaf in features(map.num_fine, (3, 5)))
     lists = (map.pair_offsets, map.fine, map.coarse_index, map.coarse_by_fine, map.fine_by_fine)
-    torch.library.opcheck(ops._conv.overload, (x, weight, False, *lists, len(map.coarse.keys)))
+    for bias in (None, torch.randn(5, requires_grad=True)):
+        torch.library.opcheck(ops._conv.overload, (x, weight, bias, False, *lists, len(map.coarse.keys)))
     dout = torch.randn(len(map.coarse.keys), 5)
     torch.library.opcheck(ops._conv_weight.overload, (x.detach(), dout, *lists[:3]))
+
+
+def with_bias(function, map: CellMap):
+    return lambda x, weight, bias: function(x, weight, map, bias)
+
+
+@pytest.mark.parametrize("channels", [(1, 1), (3, 5), (17, 33), (64, 48)])
+@pytest.mark.parametrize("nodes", [(1,), (700, 0, 5)])
+def test_bias(nodes, channels):
+    """Also rows without pairs hold the bias."""
+    map = level(*nodes)
+    bias = torch.linspace(-1, 2, channels[1])
+    inputs = (*features(map.num_fine, channels), bias)
+    assert_accurate(with_bias(sparse_conv, map), composed(map), inputs)
+    inputs = (*features(len(map.coarse.keys), channels), bias)
+    assert_accurate(with_bias(sparse_conv_transposed, map), composed_transposed(map), inputs)
+    x, weight = features(map.num_fine, channels)
+    none = torch.zeros(28, dtype=torch.int64), *[torch.zeros(0, dtype=torch.int64)] * 4
+    assert torch.equal(ops._conv(x, weight, bias, False, *none, 7), bias.expand(7, -1))
+    assert torch.equal(ops._conv(x, weight, None, False, *none, 7), torch.zeros(7, channels[1]))
+
+
+def test_every_row_alone_gives_the_bits_it_gives_among_all():
+    """Ranges, tiles and strips are cut by size: a cut never shows."""
+    map = level(3000, depth=5)
+    x, weight = features(map.num_fine, (40, 33))
+    bias = torch.randn(33)
+    expected = sparse_conv(x, weight, map, bias)
+    for row in (0, 1, 700, len(expected) - 1):
+        mine = map.coarse_index == row
+        counts = torch.stack([mine[a:b].sum() for a, b in zip(map.pair_offsets, map.pair_offsets[1:], strict=False)])
+        offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+        sources = map.fine[mine]
+        alone = ops._conv(x, weight, bias, False, offsets, sources, sources * 0, sources, sources * 0, 1)
+        assert torch.equal(alone[0], expected[row])
 
 
 def test_gradients_in_float64():
@@ -171,19 +218,21 @@ def test_gradients_in_float64():
     x, weight = (leaf.double().requires_grad_() for leaf in features(map.num_fine, (2, 3)))
     assert torch.autograd.gradcheck(lambda x, w: sparse_conv(x, w, map), (x, weight))
     y, weight = (leaf.double().requires_grad_() for leaf in features(len(map.coarse.keys), (2, 3)))
-    assert torch.autograd.gradcheck(lambda y, w: sparse_conv_transposed(y, w, map), (y, weight))
+    bias = torch.randn(3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(with_bias(sparse_conv_transposed, map), (y, weight, bias))
 
 
-@pytest.mark.parametrize("wanted", [(0,), (1,)])
+@pytest.mark.parametrize("wanted", [(0,), (1,), (2,), (0, 2), (1, 2)])
 def test_any_subset_requires_grad(wanted):
     map = level(100)
-    inputs = features(map.num_fine, (6, 7))
+    x, weight = features(map.num_fine, (6, 7))
+    inputs = (x, weight, torch.randn(7))
     every = [x.clone().requires_grad_() for x in inputs]
-    sparse_conv(*every, map).square().sum().backward()
+    with_bias(sparse_conv, map)(*every).square().sum().backward()
     for i in wanted:
         inputs[i].requires_grad_()
-    sparse_conv(*inputs, map).square().sum().backward()
-    for i in range(2):
+    with_bias(sparse_conv, map)(*inputs).square().sum().backward()
+    for i in range(3):
         assert torch.equal(inputs[i].grad, every[i].grad) if i in wanted else inputs[i].grad is None
 
 
@@ -209,8 +258,8 @@ def test_errors_name_op_argument_and_value(dtype):
     lists = [map.pair_offsets, map.fine, map.coarse_index, map.coarse_by_fine, map.fine_by_fine]
     num = len(map.coarse.keys)
 
-    def call(x=x, weight=weight, num=num, **changes):
-        return ops._conv(x, weight, False, *[changes.get(str(i), value) for i, value in enumerate(lists)], num)
+    def call(x=x, weight=weight, bias=None, num=num, **changes):
+        return ops._conv(x, weight, bias, False, *[changes.get(str(i), value) for i, value in enumerate(lists)], num)
 
     changed = map.fine.clone()
     changed[5] = map.num_fine
@@ -218,6 +267,7 @@ def test_errors_name_op_argument_and_value(dtype):
         "x must have shape": lambda: call(x=x[0]),
         r"weight (must have shape )?\[27, \*, \*\]": lambda: call(weight=weight[1:]),
         "x has 7 channels, weight takes 8": lambda: call(x=x[:, 1:]),
+        r"bias must have shape \[6\].*, not \[5\]": lambda: call(bias=x.new_zeros(5)),
         "pair_offsets must end at the number of rows": lambda: call(**{"0": map.pair_offsets.clamp(max=3)}),
         rf"source\[5\] = {map.num_fine} is not an index below {map.num_fine}": lambda: call(**{"1": changed}),
         rf"is not an index below {num - 1}": lambda: call(num=num - 1),
