@@ -55,27 +55,32 @@ class Op:
     def __call__(self, *args):
         if BACKEND == "torch":
             return self.reference(*args)
-        tensors = [x for x in args if isinstance(x, torch.Tensor)]
-        if torch.compiler.is_compiling() or not _is_plain(tensors):
+        if torch.compiler.is_compiling():
             return self.overload(*args)
-        if self.function and torch.is_grad_enabled() and any(x.requires_grad for x in tensors):
+        wants_gradient = False
+        for x in args:
+            if isinstance(x, torch.Tensor):
+                if type(x) not in _PLAIN_TYPES or x.dtype not in _PLAIN_DTYPES or not x.is_cpu:
+                    return self.overload(*args)
+                wants_gradient = wants_gradient or x.requires_grad
+        if _is_watched():
+            return self.overload(*args)
+        if wants_gradient and self.function and torch.is_grad_enabled():
             return self.function.apply(*args)
         return self.kernel(*args)
 
 
-def _is_plain(tensors: list[torch.Tensor]) -> bool:
-    """Whether nothing but the kernel itself would have to see these arguments."""
+_PLAIN_TYPES = (torch.Tensor, torch.nn.Parameter)
+_PLAIN_DTYPES = (torch.float32, torch.int64, torch.int32)
+
+
+def _is_watched() -> bool:
+    """Whether a mode, a transform or a tracer must see the op."""
     return (
-        all(
-            type(x) in (torch.Tensor, torch.nn.Parameter)
-            and x.device.type == "cpu"
-            and (x.dtype == torch.float32 or not x.is_floating_point())
-            for x in tensors
-        )
-        and not torch._C._len_torch_dispatch_stack()
-        and not torch._C._are_functorch_transforms_active()
-        and not torch.is_autocast_enabled("cpu")
-        and not torch.jit.is_tracing()
+        torch._C._len_torch_dispatch_stack() > 0
+        or torch._C._are_functorch_transforms_active()
+        or torch.is_autocast_enabled("cpu")
+        or torch.jit.is_tracing()
     )
 
 
@@ -110,18 +115,21 @@ def define(schema: str, kernel: Callable, reference: Callable, fake: Callable) -
 def differentiate(op: Op, setup_context: Callable, backward: Callable) -> None:
     """Register the gradient of an op; `backward` calls ops only, so that it can be traced."""
     torch.library.register_autograd(op.overload.name(), backward, setup_context=setup_context, lib=_library)
-    body = {"forward": op.kernel, "setup_context": setup_context, "backward": backward}
-    op.function = type(
-        f"ast_sim_{op.name}", (torch.autograd.Function,), {key: staticmethod(value) for key, value in body.items()}
-    )
+
+    def forward(ctx, *args):
+        output = op.kernel(*args)
+        setup_context(ctx, args, output)
+        return output
+
+    body = {"forward": staticmethod(forward), "backward": staticmethod(backward)}
+    op.function = type(f"ast_sim_{op.name}", (torch.autograd.Function,), body)
 
 
 def array(x: torch.Tensor) -> np.ndarray:
     """The tensor as an aligned, contiguous NumPy array, without a copy where it already is one."""
-    x = x.detach().contiguous()
-    if x.data_ptr() % x.element_size():
-        x = x.clone()
-    return x.numpy()
+    if not x.is_contiguous() or x.data_ptr() % x.element_size():
+        x = x.detach().clone(memory_format=torch.contiguous_format)
+    return x.detach().numpy() if x.requires_grad else x.numpy()
 
 
 def check_offsets(op: str, name: str, offsets: torch.Tensor, rows: int) -> None:
