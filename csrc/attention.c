@@ -16,11 +16,11 @@
 #include "dropout.h"
 
 enum {
-  QUERIES = 256,     /* of a task, which share the copies of its keys; the panels stay in the second cache */
+  QUERIES = 512,     /* of a task, which share the copies of its keys; the panels stay in the second cache */
   PARTED_TASKS = 16, /* a scene with fewer tasks is cut over its keys as well, */
   PART_KEYS = 1024,  /* into parts of at least so many */
 };
-_Static_assert(QUERIES % LANES == 0 && KEYS % DROPOUT_KEYS == 0, "tasks hold whole panels, blocks whole groups of the dropout mask");
+_Static_assert(QUERIES % LANES == 0 && (int)KEYS == DROPOUT_KEYS, "tasks hold whole panels, blocks one group of the dropout");
 
 typedef struct {
   int64_t chunks, parts, part_keys;               /* of queries; of keys; keys of a part */
@@ -43,6 +43,7 @@ typedef struct {
 typedef struct {
   float keys[KEYS * ROW], values[KEYS * ROW];
   float scores[KEYS * LANES];
+  dropout_words words[2];
   float queries[QUERIES * MAX_D]; /* scale Q in panels */
   float out[QUERIES * MAX_D], maximum[QUERIES], sum[QUERIES];
 } forward_scratch;
@@ -74,6 +75,8 @@ AST_INLINE void values_tile(const int rows, int64_t i, int64_t n, const float *v
     }
 }
 
+TILE_FUNCTIONS(values_tile, (int64_t i, int64_t n, const float *v, const float *p, const vf fade[2], float *out), i, n, v, p, fade, out)
+
 /* Scores x become exp(x - base) 2^-shift; their sums over the n keys. */
 AST_INLINE void weights(float *x, int64_t n, const vf base[2], int32_t shift, vf sum[2]) {
   for (int64_t j = 0; j < n; j++)
@@ -86,22 +89,18 @@ AST_INLINE void weights(float *x, int64_t n, const vf base[2], int32_t shift, vf
 }
 
 /* The same, with those weights that are dropped 0; the sums are of all. */
-AST_INLINE void dropped_weights(float *x, int64_t n, const vf base[2], int32_t shift, const dropout *d, int64_t query, int64_t group,
-                                vf sum[2]) {
-  for (int64_t lane = 0; lane < min64(n, DROPOUT_LANES); lane++)
-#pragma GCC unroll 2
-    for (int c = 0; c < 2; c++) {
-      vu words[4];
-      dropout_words(d, query + c * VW, group, lane, words);
+AST_INLINE void dropped_weights(float *x, int64_t n, const vf base[2], int32_t shift, const dropout *d, dropout_words words[2], vf sum[2]) {
+  const vu threshold = (vu){0} + (d->threshold << 16);
 #pragma GCC unroll 8
-      for (int slot = 0; slot < DROPOUT_SLOTS; slot++) {
-        const int64_t j = lane + slot * DROPOUT_LANES;
-        if (j >= n) break;
-        const vf p = vexp(vload(x + j * LANES + c * VW) - base[c], shift);
+  for (int slot = 0; slot < DROPOUT_SLOTS; slot++)
+    for (int64_t lane = 0; lane < min64(n - slot * DROPOUT_LANES, DROPOUT_LANES); lane++)
+#pragma GCC unroll 2
+      for (int c = 0; c < 2; c++) {
+        float *to = x + (slot * DROPOUT_LANES + lane) * LANES + c * VW;
+        const vf p = vexp(vload(to) - base[c], shift);
         sum[c] += p;
-        vstore(x + j * LANES + c * VW, dropout_keep(d, words, slot, p));
+        vstore(to, dropout_keep(words[c][lane], slot, threshold, p));
       }
-    }
 }
 
 /* Takes n keys, k0 the first of them in the scene, into the state of panel p. */
@@ -118,8 +117,12 @@ static void forward_panel(forward_scratch *t, const forward_state *state, int64_
     fade[c] = vexp(before - base[c], 0);
     vstore(m + c * VW, now);
   }
-  if (d->threshold) dropped_weights(t->scores, n, base, shift, d, query, k0, sum);
-  else weights(t->scores, n, base, shift, sum);
+  if (d->threshold) {
+    for (int64_t c = 0; c < 2; c++) dropout_draw(d, query + c * VW, k0, n, t->words[c]);
+    dropped_weights(t->scores, n, base, shift, d, t->words, sum);
+  } else {
+    weights(t->scores, n, base, shift, sum);
+  }
 #pragma GCC unroll 2
   for (int c = 0; c < 2; c++) vstore(l + c * VW, vload(l + c * VW) * fade[c] + sum[c]);
   EACH_TILE(D, values_tile, n, t->values, t->scores, fade, state->out + p * LANES * D)
@@ -199,9 +202,9 @@ static ast_status forward_task(int64_t index, void *context) {
   const int64_t panels = (rows + LANES - 1) / LANES, share = (KEYS + panels - 1) / panels;
   for (int64_t p = 0; p < panels; p++)
     pack_panel(job->q + (q0 + p * LANES) * s->q_stride + h * D, s->q_stride, rows - p * LANES, D, s->scale, t->queries + p * LANES * D);
-  fill_rows(0, 1, panels * LANES * D, 1, state.out);
-  fill_rows(0, 1, panels * LANES, 1, state.sum);
-  fill_rows(-INFINITY, 1, panels * LANES, 1, state.maximum);
+  fill_rows(0, 0, 1, panels * LANES * D, state.out);
+  fill_rows(0, 0, 1, panels * LANES, state.sum);
+  fill_rows(-INFINITY, 0, 1, panels * LANES, state.maximum);
   for (int64_t k0 = 0; k0 < task.keys; k0 += KEYS) {
     const int64_t n = min64(KEYS, task.keys - k0), row = s->k_offsets[task.b] + task.first_key + k0;
     const float *k = job->k + row * s->k_stride + h * D, *v = job->v + row * s->v_stride + h * D;
@@ -209,8 +212,8 @@ static ast_status forward_task(int64_t index, void *context) {
     copy_rows(v, s->v_stride, n, D, 1, t->values);
     for (int64_t p = 0; p < panels; p++) {
       const int64_t next = KEYS + p * share, ahead = min64(share, task.keys - k0 - next);
-      prefetch_rows(k + next * s->k_stride, s->k_stride, ahead, D);
-      prefetch_rows(v + next * s->v_stride, s->v_stride, ahead, D);
+      prefetch_rows(k + next * s->k_stride, s->k_stride, ahead, D, 0);
+      prefetch_rows(v + next * s->v_stride, s->v_stride, ahead, D, 0);
       forward_panel(t, &state, p, task.first_query + p * LANES, task.first_key + k0, n, D, task.shift, &d);
     }
   }

@@ -42,6 +42,7 @@ typedef struct {
   float weights[KEYS * ROW], dscores[KEYS * ROW];                /* P . keep and dS as [key][query] of a square */
   float query_panels[CHUNK * MAX_D], dout_panels[CHUNK * MAX_D]; /* scale Q and y */
   float queries[CHUNK * ROW], dout[CHUNK * ROW], dq[CHUNK * ROW];
+  dropout_words words;
   float maximum[CHUNK], share[CHUNK], delta[CHUNK]; /* m, 1 / l, rowsum(y . out) */
 } backward_scratch;
 
@@ -68,26 +69,34 @@ AST_INLINE void add_tile(const int rows, int64_t i, const int vectors, int64_t K
     }
 }
 
-AST_INLINE void add_product(int64_t M, int64_t N, int64_t K, const float *a, const int64_t a_row, const int64_t a_column, const float *b,
-                            float *c) {
-  int64_t j = 0;
-  for (; j + 2 * VW <= N; j += 2 * VW) EACH_TILE(M, add_tile, 2, K, a, a_row, a_column, b + j, c + j)
-  if (j < N) EACH_TILE(M, add_tile, 1, K, a, a_row, a_column, b + j, c + j)
-}
+#define ADD_TILE(name, vectors, a_row, a_column)                                                         \
+  AST_INLINE void name(const int rows, int64_t i, int64_t K, const float *a, const float *b, float *c) { \
+    add_tile(rows, i, vectors, K, a, a_row, a_column, b, c);                                             \
+  }                                                                                                      \
+  TILE_FUNCTIONS(name, (int64_t i, int64_t K, const float *a, const float *b, float *c), i, K, a, b, c)
+ADD_TILE(rows_tile, 2, ROW, 1)
+ADD_TILE(rows_tile_narrow, 1, ROW, 1)
+ADD_TILE(columns_tile, 2, 1, ROW)
+ADD_TILE(columns_tile_narrow, 1, 1, ROW)
+#undef ADD_TILE
 
 /* C [M,N] += A B with A row by row, and with A given as its transpose; M a multiple of ROW_STEP, N one of VW. */
 static void add_rows_product(int64_t M, int64_t N, int64_t K, const float *a, const float *b, float *c) {
-  add_product(M, N, K, a, ROW, 1, b, c);
+  int64_t j = 0;
+  for (; j + 2 * VW <= N; j += 2 * VW) EACH_TILE(M, rows_tile, K, a, b + j, c + j)
+  if (j < N) EACH_TILE(M, rows_tile_narrow, K, a, b + j, c + j)
 }
 static void add_columns_product(int64_t M, int64_t N, int64_t K, const float *a, const float *b, float *c) {
-  add_product(M, N, K, a, 1, ROW, b, c);
+  int64_t j = 0;
+  for (; j + 2 * VW <= N; j += 2 * VW) EACH_TILE(M, columns_tile, K, a, b + j, c + j)
+  if (j < N) EACH_TILE(M, columns_tile_narrow, K, a, b + j, c + j)
 }
 
 /* Score x and gain y V^T become P . keep and dS; words NULL: all are kept. */
-AST_INLINE void gradient(float *x, float *dx, vf maximum, vf share, vf delta, const dropout *d, const vu *words, int slot) {
+AST_INLINE void gradient(float *x, float *dx, vf maximum, vf share, vf delta, const vu *words, int slot, vu threshold) {
   const vf p = share * vexp(vload(x) - maximum, 0), dp = vload(dx);
-  vstore(x, words ? dropout_keep(d, words, slot, p) : p);
-  vstore(dx, p * ((words ? dropout_keep(d, words, slot, dp) : dp) - delta));
+  vstore(x, words ? dropout_keep(words, slot, threshold, p) : p);
+  vstore(dx, p * ((words ? dropout_keep(words, slot, threshold, dp) : dp) - delta));
 }
 
 /* Weights and their gradients of the panel of queries from i on, of those in the scratch; k0 the first of n keys of the scene. */
@@ -95,22 +104,20 @@ static void backward_panel(backward_scratch *t, int64_t i, int64_t query, int64_
   float *x = t->weights + i % SQUARE, *dx = t->dscores + i % SQUARE;
   EACH_TILE(round_up(n, ROW_STEP), scores_tile, D, t->keys, t->query_panels + i * D, x, ROW, NULL)
   EACH_TILE(round_up(n, ROW_STEP), scores_tile, D, t->values, t->dout_panels + i * D, dx, ROW, NULL)
+  const vu threshold = (vu){0} + (d->threshold << 16);
   for (int64_t c = 0; c < LANES; c += VW) {
     const vf maximum = vload(t->maximum + i + c), share = vload(t->share + i + c), delta = vload(t->delta + i + c);
     if (!d->threshold) {
-      for (int64_t j = 0; j < n; j++) gradient(x + j * ROW + c, dx + j * ROW + c, maximum, share, delta, d, NULL, 0);
+      for (int64_t j = 0; j < n; j++) gradient(x + j * ROW + c, dx + j * ROW + c, maximum, share, delta, NULL, 0, threshold);
       continue;
     }
-    for (int64_t lane = 0; lane < min64(n, DROPOUT_LANES); lane++) {
-      vu words[4];
-      dropout_words(d, query + c, k0, lane, words);
+    dropout_draw(d, query + c, k0, n, t->words);
 #pragma GCC unroll 8
-      for (int slot = 0; slot < DROPOUT_SLOTS; slot++) {
-        const int64_t j = lane + slot * DROPOUT_LANES;
-        if (j >= n) break;
-        gradient(x + j * ROW + c, dx + j * ROW + c, maximum, share, delta, d, words, slot);
+    for (int slot = 0; slot < DROPOUT_SLOTS; slot++)
+      for (int64_t lane = 0; lane < min64(n - slot * DROPOUT_LANES, DROPOUT_LANES); lane++) {
+        const int64_t j = slot * DROPOUT_LANES + lane;
+        gradient(x + j * ROW + c, dx + j * ROW + c, maximum, share, delta, t->words[lane], slot, threshold);
       }
-    }
   }
 }
 
@@ -159,18 +166,27 @@ static void backward_block(const backward_job *job, const backward_range *range,
                            const dropout *d, backward_scratch *t) {
   const ast_attention *s = job->s;
   const int64_t D = s->D, row = s->k_offsets[range->b] + k0, whole = round_up(n, ROW_STEP);
-  copy_rows(job->k + row * s->k_stride + range->h * D, s->k_stride, n, D, 1, t->keys);
-  copy_rows(job->v + row * s->v_stride + range->h * D, s->v_stride, n, D, d->gain, t->values);
+  const float *k = job->k + row * s->k_stride + range->h * D, *v = job->v + row * s->v_stride + range->h * D;
+  copy_rows(k, s->k_stride, n, D, 1, t->keys);
+  copy_rows(v, s->v_stride, n, D, d->gain, t->values);
   fill_rows(0, ROW, whole, D, t->dk);
   fill_rows(0, ROW, whole, D, t->dv);
+  const int64_t to = (k0 - range->first_key) * range->dk_stride, left = range->first_key + range->keys - k0 - KEYS;
+  const int64_t panels = (rows + LANES - 1) / LANES, share = (KEYS + panels - 1) / panels;
   for (int64_t i0 = 0; i0 < rows; i0 += SQUARE) {
     const int64_t width = min64(SQUARE, rows - i0);
-    for (int64_t i = i0; i < i0 + width; i += LANES) backward_panel(t, i, first + i, k0, n, D, d);
+    for (int64_t i = i0; i < i0 + width; i += LANES) {
+      const int64_t at = i / LANES * share;
+      prefetch_rows(k + (KEYS + at) * s->k_stride, s->k_stride, min64(share, left - at), D, 0);
+      prefetch_rows(v + (KEYS + at) * s->v_stride, s->v_stride, min64(share, left - at), D, 0);
+      prefetch_rows(range->dk + to + at * range->dk_stride, range->dk_stride, min64(share, n - at), D, 1);
+      prefetch_rows(range->dv + to + at * range->dk_stride, range->dk_stride, min64(share, n - at), D, 1);
+      backward_panel(t, i, first + i, k0, n, D, d);
+    }
     add_rows_product(whole, D, width, t->weights, t->dout + i0 * ROW, t->dv);
     add_rows_product(whole, D, width, t->dscores, t->queries + i0 * ROW, t->dk);
     add_columns_product(round_up(width, ROW_STEP), D, n, t->dscores, t->keys, t->dq + i0 * ROW);
   }
-  const int64_t to = (k0 - range->first_key) * range->dk_stride;
   put_rows(t->dk, n, D, 1, first > range->first_query, range->dk + to, range->dk_stride);
   put_rows(t->dv, n, D, d->gain, first > range->first_query, range->dv + to, range->dk_stride);
 }

@@ -39,13 +39,19 @@ AST_INLINE int64_t next_tile(int64_t rest) {
   return 4;
 }
 
-/* Runs f(rows, i, ...) with a constant number of rows for the tiles i..i+rows of all n rows. */
-#define EACH_TILE(n, f, ...)                                     \
-  for (int64_t tile_ = 0, rows_; tile_ < (n); tile_ += rows_) {  \
-    rows_ = next_tile((n) - tile_);                              \
-    if (rows_ == TILE) f(TILE, tile_, __VA_ARGS__);              \
-    else if (TILE == 12 && rows_ == 8) f(8, tile_, __VA_ARGS__); \
-    else f(4, tile_, __VA_ARGS__);                               \
+/* Functions of their own for the tiles of TILE, 8 and 4 rows of `f`: inlined, their loops would compete for registers. */
+#define TILE_FUNCTIONS(f, parameters, ...)                                                     \
+  static __attribute__((noinline)) void f##_whole parameters { f(TILE, __VA_ARGS__); }         \
+  static __attribute__((noinline)) void f##_8 parameters { f(TILE < 8 ? 4 : 8, __VA_ARGS__); } \
+  static __attribute__((noinline)) void f##_4 parameters { f(4, __VA_ARGS__); }
+
+/* Calls them for the tiles i..i+rows of all n rows. */
+#define EACH_TILE(n, f, ...)                                    \
+  for (int64_t tile_ = 0, rows_; tile_ < (n); tile_ += rows_) { \
+    rows_ = next_tile((n) - tile_);                             \
+    if (rows_ == TILE) f##_whole(tile_, __VA_ARGS__);           \
+    else if (rows_ == 8) f##_8(tile_, __VA_ARGS__);             \
+    else f##_4(tile_, __VA_ARGS__);                             \
   }
 
 /* sum_ij = sum_k a[i a_row + k a_column] b[k b_row + j], j over `vectors` vectors */
@@ -79,11 +85,19 @@ AST_INLINE void scores_tile(const int rows, int64_t i, int64_t D, const float *a
 #pragma GCC unroll 12
   for (int r = 0; r < rows; r++)
 #pragma GCC unroll 2
-    for (int j = 0; j < 2; j++) {
-      vstore(x + (i + r) * x_row + j * VW, sum[r][j]);
-      if (largest) largest[j] = vmax(sum[r][j], largest[j]);
-    }
+    for (int j = 0; j < 2; j++) vstore(x + (i + r) * x_row + j * VW, sum[r][j]);
+  if (!largest) return;
+#pragma GCC unroll 2
+  for (int j = 0; j < 2; j++) {
+    vf m = largest[j];
+#pragma GCC unroll 12
+    for (int r = 0; r < rows; r++) m = vmax(sum[r][j], m);
+    largest[j] = m;
+  }
 }
+
+TILE_FUNCTIONS(scores_tile, (int64_t i, int64_t D, const float *a, const float *b, float *x, int64_t x_row, vf *largest), i, D, a, b, x,
+               x_row, largest)
 
 /* ---- rows and panels ---- */
 
@@ -171,10 +185,10 @@ static void fill_rows(float value, int64_t stride, int64_t rows, int64_t D, floa
     for (int64_t d = 0; d < D; d++) to[i * stride + d] = value;
 }
 
-/* Asks for rows that the next block will copy; reading them where they are used would wait for memory. */
-static void prefetch_rows(const float *from, int64_t stride, int64_t rows, int64_t D) {
+/* Asks for the lines of rows that will soon be read, or written: at their use each would wait for memory. */
+AST_INLINE void prefetch_rows(const float *from, int64_t stride, int64_t rows, int64_t D, const int write) {
   for (int64_t i = 0; i < rows; i++)
-    for (int64_t d = 0; d < D; d += 16) __builtin_prefetch(from + i * stride + d, 0, 2);
+    for (int64_t d = 0; d < D; d += 16) __builtin_prefetch(from + i * stride + d, write, 2);
 }
 
 #endif

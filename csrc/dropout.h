@@ -47,21 +47,28 @@ AST_INLINE void threefry(const uint32_t key[5], vu x[4]) {
   }
 }
 
-/* The words of VW queries from `query` on, for the keys group + 16 slot + lane; `group` is a multiple of DROPOUT_KEYS. */
-AST_INLINE void dropout_words(const dropout *d, int64_t query, int64_t group, int64_t lane, vu x[4]) {
+/* The words of VW queries and DROPOUT_KEYS keys, as [lane][word]. */
+typedef vu dropout_words[DROPOUT_LANES][4];
+
+/* Those of the queries from `query` and the keys from `group` on, a multiple of DROPOUT_KEYS; lanes up to n only. Drawn ahead of
+ * their use: a loop of nothing else keeps several counters in flight, each of which is a long chain of dependent operations. */
+AST_INLINE void dropout_draw(const dropout *d, int64_t query, int64_t group, int64_t n, dropout_words words) {
   vu queries;
 #pragma GCC unroll 16
   for (int i = 0; i < VW; i++) queries[i] = (uint32_t)i;
-  x[0] = (vu){0} + (uint32_t)(group / DROPOUT_SLOTS + lane);
-  x[1] = queries + (uint32_t)query;
-  x[2] = x[3] = (vu){0};
-  threefry(d->key, x);
+  queries += (uint32_t)query;
+  for (int64_t lane = 0; lane < min64(n, DROPOUT_LANES); lane++) {
+    vu x[4] = {(vu){0} + (uint32_t)(group / DROPOUT_SLOTS + lane), queries, {0}, {0}};
+    threefry(d->key, x);
+#pragma GCC unroll 4
+    for (int i = 0; i < 4; i++) words[lane][i] = x[i];
+  }
 }
 
-/* x where the weight is kept, 0 where it is dropped. */
-AST_INLINE vf dropout_keep(const dropout *d, const vu words[4], int slot, vf x) {
+/* x where the weight of slot is kept, 0 where it is dropped; threshold in the upper half of the word. */
+AST_INLINE vf dropout_keep(const vu words[4], int slot, vu threshold, vf x) {
   const vu bits = slot % 2 ? words[slot / 2] : words[slot / 2] << 16; /* the half word on top: what is below it decides nothing */
-  return (vf)((vi)x & (vi)(bits >= (vu){0} + (d->threshold << 16)));
+  return (vf)((vi)x & (vi)(bits >= threshold));
 }
 
 #endif

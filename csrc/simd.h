@@ -59,7 +59,13 @@ AST_INLINE void vstore_upto(float *p, vf x, int64_t n) {
 
 /* a where the mask is set (-1), b where it is not (0) */
 AST_INLINE vf vselect(vi mask, vf a, vf b) { return (vf)((mask & (vi)a) | (~mask & (vi)b)); }
-AST_INLINE vf vmax(vf a, vf b) { return vselect(a > b, a, b); } /* b where either is NaN */
+/* b where either is NaN; by elements in a loop that stays one, which compilers turn into the instruction of that meaning */
+AST_INLINE vf vmax(vf a, vf b) {
+  vf x;
+#pragma GCC unroll 1
+  for (int i = 0; i < VW; i++) x[i] = a[i] > b[i] ? a[i] : b[i];
+  return x;
+}
 
 #if AST_VECTOR_BYTES == 64
 static const vi LANE_INDICES = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
