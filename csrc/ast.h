@@ -6,7 +6,7 @@
  * index ranges (module.c does it for Python); a kernel checks only what it alone can see, such as a point outside the cube.
  *
  * Legend: B scenes, N nodes, C cells, T tokens, F channels, C_in and C_out channels of a convolution, H heads, D channels of a head,
- * M rows of a linear layer, I and O its inputs and outputs.
+ * M rows of a linear layer, I and O its inputs and outputs, H hidden units.
  */
 #ifndef AST_H
 #define AST_H
@@ -63,6 +63,25 @@ typedef struct {
   int64_t x_stride, residual_stride, dout_stride; /* floats from row to row */
   ast_activation activation;
 } ast_linear;
+
+/* Two dense layers: h = max(0, [x, beside] weight1^T + bias1), y = h weight2^T + bias2, then LayerNorm if there is a gamma. */
+typedef struct {
+  int64_t M, I, I2, H, O;                                        /* beside [M,I2] may be NULL, with I2 = 0 */
+  int64_t x_stride, beside_stride, residual_stride, dout_stride; /* floats from row to row */
+  const float *x, *beside;
+  const float *weight1, *bias1, *weight2, *bias2; /* [H,I+I2], [H], [O,H], [O]; a bias may be NULL */
+  const float *gamma, *beta;                      /* [O], both or none NULL */
+} ast_mlp;
+
+/* What the forward pass may keep for the backward pass: h [M,H], y normalized [M,O] and its factors [M], each NULL if it is not. */
+typedef struct {
+  float *hidden, *normalized, *scale;
+} ast_mlp_kept;
+
+/* Gradients, each NULL if it is not wanted. */
+typedef struct {
+  float *x, *beside, *weight1, *bias1, *weight2, *bias2, *gamma, *beta;
+} ast_mlp_gradients;
 
 /* One table per instruction set; every entry has the same contract on each. */
 typedef struct {
@@ -142,6 +161,10 @@ typedef struct {
                                 float *restrict dbias);
   /* out[f] = sum of x[n,f] over n, rows in blocks whose sums are added in order: the gradient of a bias. x [N,F], out [F]. */
   ast_status (*column_sum)(const float *restrict x, int64_t N, int64_t F, float *restrict out);
+  /* out [M,O] = y, or LayerNorm(y), + residual, which may be NULL. */
+  ast_status (*mlp)(const ast_mlp *s, const float *restrict residual, float *restrict out, ast_mlp_kept kept);
+  /* Its gradients; what was not kept is computed again. */
+  ast_status (*mlp_backward)(const ast_mlp *s, const float *restrict dout, ast_mlp_kept kept, ast_mlp_gradients gradients);
 } ast_kernels;
 
 /* dispatch.c: the table of an instruction set by name ("base", "avx2", "avx512"), or of the best one if name is NULL.

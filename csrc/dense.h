@@ -6,7 +6,7 @@
  * while a block of some 100 rows of A stays in the cache, and what follows the product happens in its registers, so that every
  * output is written once. For GEGLU a panel holds VW outputs of the first half of W beside the same ones of the second half.
  *
- * An element is one chain of multiply-adds over rising k, from the bias on, whatever tile it falls into: a row's result depends
+ * An element is one chain of multiply-adds over rising k, then the bias, whatever tile it falls into: a row's result depends
  * on neither its place, the batch nor the threads.
  */
 #ifndef AST_DENSE_H
@@ -127,11 +127,13 @@ AST_INLINE void dense_tile(const int rows, const int vectors, const dense_layer 
     __builtin_prefetch(line, 1);
     if (vectors == 2) __builtin_prefetch(line + VW, 1);
 #pragma GCC unroll 2
-    for (int v = 0; v < vectors; v++) sum[i][v] = vload(bias + v * VW);
+    for (int v = 0; v < vectors; v++) sum[i][v] = (vf){0};
   }
   gemm_sums(rows, vectors, l->K, (gemm_a){a.data + i0 * a.row, a.row, a.column}, l->panels + p * l->K * GEMM_COLUMNS, GEMM_COLUMNS, sum);
 #pragma GCC unroll 12
   for (int i = 0; i < rows; i++) {
+#pragma GCC unroll 2
+    for (int v = 0; v < vectors; v++) sum[i][v] += vload(bias + v * VW); /* last: a large bias costs the sum no digits */
     if (vectors == 2 && l->paired) {
       dense_finish_pair(l, e, i0 + i, j, sum[i][0], sum[i][1], n);
     } else {
@@ -169,12 +171,16 @@ static void dense_copy_rows(const float *from, int64_t from_row, int64_t rows, i
     for (int64_t j = 0; j < n; j += VW) vstore(to + i * to_row + j, vload_upto(from + i * from_row + j, n - j));
 }
 
-/* sums[j] += sum_i x_ij, n padded to whole vectors: the sum of the rows first, so that long sums stay accurate */
+/* sums[j] += sum_i x_ij, n padded to whole vectors: four short chains over the rows first, so that long sums stay accurate */
 static void dense_add_rows(const float *x, int64_t row, int64_t rows, int64_t n, float *sums) {
   for (int64_t j = 0; j < n; j += VW) {
-    vf sum = {0};
-    for (int64_t i = 0; i < rows; i++) sum += vload(x + i * row + j);
-    vstore(sums + j, vload(sums + j) + sum);
+    vf chain[4] = {{0}};
+    int64_t i = 0;
+    for (; i + 4 <= rows; i += 4)
+#pragma GCC unroll 4
+      for (int c = 0; c < 4; c++) chain[c] += vload(x + (i + c) * row + j);
+    for (; i < rows; i++) chain[0] += vload(x + i * row + j);
+    vstore(sums + j, vload(sums + j) + ((chain[0] + chain[1]) + (chain[2] + chain[3])));
   }
 }
 

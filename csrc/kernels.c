@@ -15,6 +15,7 @@
 #include "message_backward.c" /* after message.c, whose tiles it uses */
 #include "linear.c"
 #include "sparse_conv_weight.c" /* after sparse_conv.c, whose constants it uses */
+#include "mlp.c"
 
 #define AST_TABLE_OF(isa)  ast_kernels_##isa
 #define AST_TABLE(isa)     AST_TABLE_OF(isa)
@@ -42,4 +43,6 @@ const ast_kernels AST_TABLE(AST_ISA) = {
     .linear = linear,
     .linear_backward = linear_backward,
     .column_sum = column_sum,
+    .mlp = mlp,
+    .mlp_backward = mlp_backward,
 };

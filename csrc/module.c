@@ -457,6 +457,85 @@ static PyObject *linear_backward(PyObject *self, PyObject *const *objects, Py_ss
   Py_RETURN_NONE;
 }
 
+/* x, beside, weight1, bias1, weight2, bias2, gamma, beta */
+static bool take_mlp(call *c, ast_mlp *s) {
+  argument *x, *beside, *weight1, *bias1, *weight2, *bias2, *gamma, *beta;
+  if (!(x = IN_ROWS(c, "x", 2, FREE, FREE)) || !(beside = OPTIONAL(c, IN_ROWS(c, "beside", 2, x->shape[0], FREE))) ||
+      !(weight1 = IN(c, "weight1", FLOATS, 2, FREE, x->shape[1] + beside->shape[1])) ||
+      !(bias1 = OPTIONAL(c, IN(c, "bias1", FLOATS, 1, weight1->shape[0]))) ||
+      !(weight2 = IN(c, "weight2", FLOATS, 2, FREE, weight1->shape[0])) ||
+      !(bias2 = OPTIONAL(c, IN(c, "bias2", FLOATS, 1, weight2->shape[0]))) ||
+      !(gamma = OPTIONAL(c, IN(c, "gamma", FLOATS, 1, weight2->shape[0]))) ||
+      !(beta = OPTIONAL(c, IN(c, "beta", FLOATS, 1, weight2->shape[0]))))
+    return false;
+  if (!gamma->data != !beta->data) return fail(c, PyExc_ValueError, "gamma and beta go together");
+  *s = (ast_mlp){.M = x->shape[0],
+                 .I = x->shape[1],
+                 .I2 = beside->shape[1],
+                 .H = weight1->shape[0],
+                 .O = weight2->shape[0],
+                 .x_stride = x->row_stride,
+                 .beside_stride = beside->row_stride,
+                 .x = x->data,
+                 .beside = beside->data,
+                 .weight1 = weight1->data,
+                 .bias1 = bias1->data,
+                 .weight2 = weight2->data,
+                 .bias2 = bias2->data,
+                 .gamma = gamma->data,
+                 .beta = beta->data};
+  return true;
+}
+
+/* What is kept between the passes, each None if it is not: h, y normalized and its factors. */
+static bool take_kept(call *c, const ast_mlp *s, bool output, ast_mlp_kept *kept) {
+  argument *hidden, *normalized, *scale;
+  if (!(hidden = OPTIONAL(c, take(c, "hidden", FLOATS, output, false, 2, s->M, s->H))) ||
+      !(normalized = OPTIONAL(c, take(c, "normalized", FLOATS, output, false, 2, s->M, s->O))) ||
+      !(scale = OPTIONAL(c, take(c, "scale", FLOATS, output, false, 1, s->M))))
+    return false;
+  if (!normalized->data != !scale->data) return fail(c, PyExc_ValueError, "normalized and scale go together");
+  *kept = (ast_mlp_kept){hidden->data, normalized->data, scale->data};
+  return true;
+}
+
+static PyObject *mlp(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  call c;
+  argument *residual, *out;
+  ast_mlp s;
+  ast_mlp_kept kept;
+  ast_status status;
+  if (!start(&c, "mlp", objects, num, 13) || !take_mlp(&c, &s) || !(residual = OPTIONAL(&c, IN_ROWS(&c, "residual", 2, s.M, s.O))) ||
+      !(out = OUT(&c, "out", FLOATS, 2, s.M, s.O)) || !take_kept(&c, &s, true, &kept))
+    return NULL;
+  s.residual_stride = residual->row_stride;
+  KERNEL(c, status, kernels->mlp(&s, residual->data, out->data, kept));
+  Py_RETURN_NONE;
+}
+
+static PyObject *mlp_backward(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  call c;
+  argument *dout, *dx, *dbeside, *dweight1, *dbias1, *dweight2, *dbias2, *dgamma, *dbeta;
+  ast_mlp s;
+  ast_mlp_kept kept;
+  ast_status status;
+  if (!start(&c, "mlp_backward", objects, num, 20) || !take_mlp(&c, &s) || !(dout = IN_ROWS(&c, "dout", 2, s.M, s.O)) ||
+      !take_kept(&c, &s, false, &kept) || !(dx = OPTIONAL(&c, OUT(&c, "dx", FLOATS, 2, s.M, s.I))) ||
+      !(dbeside = OPTIONAL(&c, OUT(&c, "dbeside", FLOATS, 2, s.M, s.I2))) ||
+      !(dweight1 = OPTIONAL(&c, OUT(&c, "dweight1", FLOATS, 2, s.H, s.I + s.I2))) ||
+      !(dbias1 = OPTIONAL(&c, OUT(&c, "dbias1", FLOATS, 1, s.H))) || !(dweight2 = OPTIONAL(&c, OUT(&c, "dweight2", FLOATS, 2, s.O, s.H))) ||
+      !(dbias2 = OPTIONAL(&c, OUT(&c, "dbias2", FLOATS, 1, s.O))) || !(dgamma = OPTIONAL(&c, OUT(&c, "dgamma", FLOATS, 1, s.O))) ||
+      !(dbeta = OPTIONAL(&c, OUT(&c, "dbeta", FLOATS, 1, s.O))))
+    return NULL;
+  s.dout_stride = dout->row_stride;
+  const ast_mlp_gradients gradients = {dx->data,       dbeside->data, dweight1->data, dbias1->data,
+                                       dweight2->data, dbias2->data,  dgamma->data,   dbeta->data};
+  KERNEL(c, status, kernels->mlp_backward(&s, dout->data, kept, gradients));
+  Py_RETURN_NONE;
+}
+
 /* ---- the process ---- */
 
 /* The addresses of torch_parallel_for and torch_get_num_threads. */
@@ -520,6 +599,12 @@ static PyMethodDef methods[] = {
          "linear_backward(x, weight, bias, z, activation, dout, dx, dweight, dbias); bias, z and the gradients that are not wanted may be "
          "None"),
     FAST(column_sum, "column_sum(x, out)"),
+    FAST(mlp,
+         "mlp(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual, out, hidden, normalized, scale); all but x, the weights "
+         "and out may be None"),
+    FAST(mlp_backward,
+         "mlp_backward(x, beside, weight1, bias1, weight2, bias2, gamma, beta, dout, hidden, normalized, scale, dx, dbeside, dweight1, "
+         "dbias1, dweight2, dbias2, dgamma, dbeta); all but x, the weights and dout may be None"),
     FAST(set_pool, "set_pool(parallel_for, num_threads): addresses of torch's thread pool, 0 for serial"),
     {"keep_memory", keep_memory, METH_NOARGS, "Let the C library keep freed blocks; whether it had an effect."},
     {"configuration", configuration, METH_NOARGS, "The chosen instruction set, the supported ones, the threads, the debug mode."},

@@ -1,0 +1,183 @@
+"""Two dense layers with a ReLU between them and a LayerNorm behind them.
+
+Legend: M rows, I and I2 inputs, H hidden units, O outputs.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ast_sim.ops import library
+from ast_sim.ops.library import array
+from ast_sim.ops.linear import _array, _check_rows, _check_shapes, _check_vectors, _given, _outputs, _rows
+
+EPSILON = 1e-5
+SAVED = 1 << 25  # elements of hidden units and outputs up to which they are kept for the gradient, not computed again
+
+
+def _check(x, beside, weight1, bias1, weight2, bias2, gamma, beta) -> None:
+    if x.dim() != 2 or (beside is not None and (beside.dim() != 2 or len(beside) != len(x))):
+        shapes = tuple(x.shape), None if beside is None else tuple(beside.shape)
+        raise ValueError(f"mlp: x and beside must be matrices of equally many rows, not {shapes[0]} and {shapes[1]}")
+    _check_shapes("mlp", x, weight1, x.shape[1] + (0 if beside is None else beside.shape[1]))
+    _check_shapes("mlp", x, weight2, weight1.shape[0])
+    _check_vectors("mlp", {"bias1": bias1}, weight1.shape[0])
+    _check_vectors("mlp", {"bias2": bias2, "gamma": gamma, "beta": beta}, weight2.shape[0])
+    if (gamma is None) != (beta is None):
+        raise ValueError("mlp: gamma and beta go together")
+
+
+def _hidden(x, beside, weight1, bias1) -> Tensor:
+    return F.relu(F.linear(x if beside is None else torch.cat([x, beside], dim=1), weight1, bias1))
+
+
+def _normalized(y: Tensor) -> tuple[Tensor, Tensor]:
+    """y normalized over its columns, and the factors [M]."""
+    centred = y - y.mean(1, keepdim=True)
+    scale = (centred.square().mean(1) + EPSILON).rsqrt()
+    return centred * scale[:, None], scale
+
+
+# ---- composition ----
+
+
+def _reference(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual, save):
+    _check(x, beside, weight1, bias1, weight2, bias2, gamma, beta)
+    hidden = _hidden(x, beside, weight1, bias1)
+    out = F.linear(hidden, weight2, bias2)
+    _check_rows("mlp", "residual", residual, *out.shape)
+    kept = [x.new_empty(0) for _ in range(3)]
+    if save:
+        kept[0] = hidden
+    if gamma is not None:
+        if save:
+            kept[1:] = _normalized(out)
+        out = F.layer_norm(out, out.shape[1:], gamma, beta, EPSILON)
+    return out if residual is None else out + residual, *kept
+
+
+def _backward_reference(
+    dout, x, beside, weight1, bias1, weight2, bias2, gamma, beta, hidden, normalized, scale, wanted
+):
+    hidden = _hidden(x, beside, weight1, bias1) if hidden is None else hidden
+    dgamma = dbeta = dy = dout
+    if gamma is not None:
+        if normalized is None:
+            normalized, scale = _normalized(F.linear(hidden, weight2, bias2))
+        dgamma, dbeta, dn = (dout * normalized).sum(0), dout.sum(0), dout * gamma
+        dy = dn - dn.mean(1, keepdim=True) - normalized * (dn * normalized).mean(1, keepdim=True)
+        dy = dy * scale[:, None]
+    dz = (dy @ weight2).masked_fill(hidden <= 0, 0)
+    inputs = x if beside is None else torch.cat([x, beside], dim=1)
+    dinputs = dz @ weight1
+    gradients = [dinputs[:, : x.shape[1]], dinputs[:, x.shape[1] :], dz.mT @ inputs, dz.sum(0), dy.mT @ hidden]
+    gradients += [dy.sum(0), dgamma, dbeta]
+    return tuple(g.clone() if want else x.new_empty(0) for g, want in zip(gradients, wanted, strict=True))
+
+
+# ---- C core ----
+
+
+def _kernel(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual, save):
+    _check(x, beside, weight1, bias1, weight2, bias2, gamma, beta)
+    out, *kept = _fake(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual, save)
+    _check_rows("mlp", "residual", residual, *out.shape)
+    inputs = (_rows(x), _rows(beside), array(weight1), _array(bias1), array(weight2), _array(bias2))
+    norm = save and gamma is not None
+    library._C.mlp(
+        *inputs, _array(gamma), _array(beta), _rows(residual), out.numpy(), *_given([save, norm, norm], kept)
+    )
+    return out, *kept
+
+
+def _backward_kernel(dout, x, beside, weight1, bias1, weight2, bias2, gamma, beta, hidden, normalized, scale, wanted):
+    outputs = _backward_fake(
+        dout, x, beside, weight1, bias1, weight2, bias2, gamma, beta, hidden, normalized, scale, wanted
+    )
+    inputs = (_rows(x), _rows(beside), array(weight1), _array(bias1), array(weight2), _array(bias2))
+    kept = (_array(hidden), _array(normalized), _array(scale))
+    library._C.mlp_backward(*inputs, _array(gamma), _array(beta), _rows(dout), *kept, *_given(wanted, outputs))
+    return outputs
+
+
+def _fake(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual, save):
+    rows, hidden, columns = x.shape[0], weight1.shape[0], weight2.shape[0]
+    norm = save and gamma is not None
+    kept = _outputs(x, [save, norm, norm], [(rows, hidden), (rows, columns), (rows,)])
+    return x.new_empty(rows, columns), *kept
+
+
+def _backward_fake(dout, x, beside, weight1, bias1, weight2, bias2, gamma, beta, hidden, normalized, scale, wanted):
+    columns = weight2.shape[:1]
+    beside_shape = (0,) if beside is None else beside.shape
+    shapes = [x.shape, beside_shape, weight1.shape, weight1.shape[:1], weight2.shape, columns, columns, columns]
+    return tuple(_outputs(x, wanted, shapes))
+
+
+_LAYERS = "Tensor weight1, Tensor? bias1, Tensor weight2, Tensor? bias2"
+_INPUTS = f"Tensor x, Tensor? beside, {_LAYERS}, Tensor? gamma, Tensor? beta"
+_mlp = library.define(
+    f"mlp({_INPUTS}, Tensor? residual, bool save) -> (Tensor, Tensor, Tensor, Tensor)", _kernel, _reference, _fake
+)
+_mlp_backward = library.define(
+    f"mlp_backward(Tensor dout, {_INPUTS}, Tensor? hidden, Tensor? normalized, Tensor? scale, bool[8] wanted)"
+    " -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)",
+    _backward_kernel,
+    _backward_reference,
+    _backward_fake,
+)
+
+
+def _save(ctx, inputs, output) -> None:
+    *tensors, _, save = inputs
+    ctx.mark_non_differentiable(*output[1:])
+    norm = save and inputs[6] is not None
+    kept = [x if is_kept else None for x, is_kept in zip(output[1:], [save, norm, norm], strict=True)]
+    ctx.save_for_backward(*tensors, *kept)
+
+
+def _gradient(ctx, dout, *_):
+    wanted = list(ctx.needs_input_grad[:8])
+    gradients = _mlp_backward(dout, *ctx.saved_tensors, wanted) if any(wanted) else [None] * 8
+    gradients = [g if want else None for g, want in zip(gradients, wanted, strict=True)]
+    return *gradients, dout if ctx.needs_input_grad[8] else None, None
+
+
+library.differentiate(_mlp, _save, _gradient)
+
+
+def mlp(
+    x: Tensor,
+    weight1: Tensor,
+    bias1: Tensor | None,
+    weight2: Tensor,
+    bias2: Tensor | None,
+    beside: Tensor | None = None,
+    norm: tuple[Tensor, Tensor] | None = None,
+    residual: Tensor | None = None,
+) -> Tensor:
+    """LN(W2 relu(W1 [x, beside] + b1) + b2) + residual in one pass; LN is left out without `norm`.
+
+    A row's result depends on that row alone, bit for bit; the gradients are the same for any number of threads. The
+    hidden units of many rows are computed again for the gradient, not kept (SAVED).
+
+    Args:
+        x: [M, I]; rows may lie apart, as in a slice of columns.
+        weight1, bias1: [H, I + I2] and [H] or None.
+        weight2, bias2: [O, H] and [O] or None.
+        beside: [M, I2]: more inputs, as if concatenated to x.
+        norm: gamma and beta of the LayerNorm, [O] each (epsilon 1e-5).
+        residual: [M, O].
+
+    Returns:
+        [M, O].
+
+    Raises:
+        ValueError: for shapes that are not as above.
+    """
+    tensors = (x, beside, weight1, bias1, weight2, bias2, *(norm or (None, None)))
+    small = x.shape[0] * (weight1.shape[0] + weight2.shape[0]) <= SAVED
+    save = small and torch.is_grad_enabled() and any(y is not None and y.requires_grad for y in tensors)
+    return _mlp(*tensors, residual, save)[0]
