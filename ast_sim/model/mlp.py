@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from ast_sim.ops.linear import linear
+from ast_sim.ops.mlp import mlp
 
 
 class FactorizedLinear(nn.Module):
@@ -53,9 +53,5 @@ class MLP(nn.Module):
 
         x [M, I], beside [M, J] with I + J inputs, residual [M, outputs] -> [M, outputs].
         """
-        x = x if beside is None else torch.cat([x, beside], dim=1)
-        hidden = linear(x, self.first.weight, self.first.bias, "relu")
-        if norm is None:
-            return linear(hidden, self.second.weight, self.second.bias, residual=residual)
-        out = norm(linear(hidden, self.second.weight, self.second.bias))
-        return out if residual is None else out + residual
+        weights = (self.first.weight, self.first.bias, self.second.weight, self.second.bias)
+        return mlp(x, *weights, beside, None if norm is None else (norm.weight, norm.bias), residual)
