@@ -218,7 +218,7 @@ class Training:
     def advance(self) -> None:
         """One optimizer step, on the gradients of `accumulate` batches."""
         options = self.options
-        torch.manual_seed(step_seed(options.seed, self.step))
+        torch.default_generator.manual_seed(step_seed(options.seed, self.step))  # torch.manual_seed asks all devices
         self.optimizer.zero_gradient()
         names: list[str] = []
         values: dict[str, float] = {}

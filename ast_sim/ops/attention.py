@@ -172,10 +172,13 @@ _attention_backward = library.define(
 def _save(ctx, inputs, output) -> None:
     ctx.save_for_backward(*inputs[:5], *output)
     ctx.settings = inputs[5:]
+    ctx.set_materialize_grads(False)  # nothing comes back through the others
     ctx.mark_non_differentiable(*output[1:])
 
 
 def _gradient(ctx, dout, *_):
+    if dout is None:
+        return (None,) * len(ctx.needs_input_grad)
     *inputs, out, maximum, total = ctx.saved_tensors
     return *_attention_backward(*inputs, *ctx.settings, out, maximum, total, dout), None, None, None, None, None
 

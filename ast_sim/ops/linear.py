@@ -152,6 +152,7 @@ _linear_backward = library.define(
 def _save_linear(ctx, inputs, output) -> None:
     x, weight, bias, residual, ctx.activation, save = inputs
     out, z = output
+    ctx.set_materialize_grads(False)  # nothing comes back through the others
     ctx.mark_non_differentiable(z)
     if not save:  # ReLU alone leaves in its output what its gradient needs
         z = out if ctx.activation == "relu" and residual is None else None
@@ -159,6 +160,8 @@ def _save_linear(ctx, inputs, output) -> None:
 
 
 def _linear_gradient(ctx, dout, _):
+    if dout is None:
+        return (None,) * len(ctx.needs_input_grad)
     x, weight, bias, z = ctx.saved_tensors
     wanted = list(ctx.needs_input_grad[:3])
     gradients = [None] * 3

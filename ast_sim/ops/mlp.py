@@ -132,6 +132,7 @@ _mlp_backward = library.define(
 
 def _save(ctx, inputs, output) -> None:
     *tensors, _, save = inputs
+    ctx.set_materialize_grads(False)  # nothing comes back through the others
     ctx.mark_non_differentiable(*output[1:])
     norm = save and inputs[6] is not None
     kept = [x if is_kept else None for x, is_kept in zip(output[1:], [save, norm, norm], strict=True)]
@@ -139,6 +140,8 @@ def _save(ctx, inputs, output) -> None:
 
 
 def _gradient(ctx, dout, *_):
+    if dout is None:
+        return (None,) * len(ctx.needs_input_grad)
     wanted = list(ctx.needs_input_grad[:8])
     gradients = _mlp_backward(dout, *ctx.saved_tensors, wanted) if any(wanted) else [None] * 8
     gradients = [g if want else None for g, want in zip(gradients, wanted, strict=True)]
