@@ -1,14 +1,14 @@
 /* Message passing over the edges of a graph, fused: no array of the width of a feature is written per edge.
  *
  *   h_m = relu(A1 e_m + a1)                          edge encoder, absent if H = 0
- *   z_m = P_s(m) + Q_r(m) + A2 h_m                   first layer; P and Q are its products with senders and receivers
- *   y_m = W2 relu(z_m) + b2                          second layer
+ *   x_m = relu(P_s(m) + Q_r(m) + A2 h_m)             first layer; P and Q are its products with senders and receivers
+ *   y_m = W2 x_m + b2                                second layer
  *   out_m = gamma (y_m - mean y_m) / sqrt(var y_m + eps) + beta,     sum_r = sum of out_m over the edges m into r
  *
  * Edges are sorted by receiver. A task owns a range of receivers with about the same number of edges as any other and goes
- * through them in tiles of MESSAGE_TILE edges, whose h, relu(z) and y stay in the second-level cache. The mean is subtracted
- * before squares are summed. Sums run in stored order and a row of a product does not depend on its neighbours in a tile, so
- * neither tiles, tasks, threads nor the other scenes of a batch change a bit.
+ * through them in tiles of MESSAGE_TILE edges, whose h, x and y stay in the second-level cache; while it multiplies, it fetches
+ * the rows of P of the next tile. The mean is subtracted before squares are summed. Sums run in stored order and a row of a
+ * product does not depend on its neighbours in a tile, so neither tiles, tasks, threads nor other scenes of a batch change a bit.
  *
  * Cost per edge: 2 (E H + H F + F F2) flops, a row of P read from anywhere in memory, rows of Q and of the sum in order.
  * Memory: 3 tiles a thread and the packed weights.
@@ -16,130 +16,114 @@
 #include <math.h>
 
 #include "ast.h"
+#include "dense.h"
 #include "gemm.h"
 #include "simd.h"
 
 enum {
-  MESSAGE_TILE = 96,
-  LEAST_EDGES = 2 * MESSAGE_TILE, /* a task, unless that leaves too few tasks to balance */
-  MOST_EDGES = 16 * MESSAGE_TILE,
-  MESSAGE_TASKS = 8, /* so many at least, if there are edges enough for one tile each */
+  MESSAGE_TILE = 96,              /* a multiple of GEMM_ROWS */
+  LEAST_EDGES = 2 * MESSAGE_TILE, /* a task, */
+  MOST_EDGES = 16 * MESSAGE_TILE, /* and */
+  MESSAGE_TASKS = 8               /* so many tasks if they have at least that many edges */
 };
 static const float MESSAGE_EPS = 1e-5f;
 
-/* Channels c to c + VW of a row of `width` floats without padding; beyond its end 0 is read and nothing written. */
-AST_INLINE vf message_load(const float *row, int64_t c, int64_t width) {
-  return c + VW <= width ? vload(row + c) : vload_part(row + c, width - c);
-}
-AST_INLINE void message_store(float *row, int64_t c, int64_t width, vf x) {
-  if (c + VW <= width) vstore(row + c, x);
-  else vstore_part(row + c, x, width - c);
-}
-AST_INLINE vf message_relu(vf x) { return vselect(x < 0, (vf){0}, x); } /* keeps NaN */
-
-/* The weights as the products read them, once a call: matrices in panels, vectors padded with zeros to whole vectors. */
 typedef struct {
   const ast_message *s;
-  int64_t row; /* floats from one row of a tile to the next: seldom a power of two, which would crowd few cache sets */
-  float *A1, *A2, *W2;
-  float *a1, *b2, *gamma, *beta;
+  int64_t row;           /* floats from one row of a tile to the next */
+  dense_layer layers[6]; /* packed once a call: A1 with a1, A2, W2 with b2; for the gradients W2^T, A2^T, A1^T */
 } message_weights;
 
-static float *message_place(float **to, float *memory, int64_t size) {
-  *to = memory;
-  return memory + round_up(size, 16);
+enum { MESSAGE_A1, MESSAGE_A2, MESSAGE_W2, MESSAGE_W2_BACK, MESSAGE_A2_BACK, MESSAGE_A1_BACK };
+
+static ast_status message_pack(const ast_message *s, bool gradients, message_weights *w) {
+  *w = (message_weights){.s = s, .row = round_up(max64(s->H, max64(s->F, s->F2)), VW) + DENSE_APART};
+  w->layers[MESSAGE_A1] = (dense_layer){.weight = s->A1, .row = 1, .column = s->E, .bias = s->a1, .K = s->E, .N = s->H};
+  w->layers[MESSAGE_A2] = (dense_layer){.weight = s->A2, .row = 1, .column = s->H, .K = s->H, .N = s->F};
+  w->layers[MESSAGE_W2] = (dense_layer){.weight = s->W2, .row = 1, .column = s->F, .bias = s->b2, .K = s->F, .N = s->F2};
+  w->layers[MESSAGE_W2_BACK] = (dense_layer){.weight = s->W2, .row = s->F, .column = 1, .K = s->F2, .N = s->F};
+  w->layers[MESSAGE_A2_BACK] = (dense_layer){.weight = s->A2, .row = s->H, .column = 1, .K = s->F, .N = s->H};
+  w->layers[MESSAGE_A1_BACK] = (dense_layer){.weight = s->A1, .row = s->E, .column = 1, .K = s->H, .N = s->E};
+  return dense_pack(w->layers, gradients ? 6 : 3, 6);
 }
 
-static void message_pad(const float *from, int64_t n, float *to) {
-  memcpy(to, from, (size_t)n * sizeof *to);
-  memset(to + n, 0, (size_t)(round_up(n, VW) - n) * sizeof *to);
-}
-
-/* Floats that message_pack needs. */
-static int64_t message_packed_size(const ast_message *s) {
-  return gemm_packed_size(s->E, s->H) + gemm_packed_size(s->H, s->F) + gemm_packed_size(s->F, s->F2) + s->H + 3 * s->F2 + 7 * 16 + 4 * VW;
-}
-
-static message_weights message_pack(const ast_message *s, float *memory) {
-  message_weights w = {.s = s, .row = round_up(max64(s->H, max64(s->F, s->F2)), VW) + 16};
-  memory = message_place(&w.A1, memory, gemm_packed_size(s->E, s->H));
-  memory = message_place(&w.A2, memory, gemm_packed_size(s->H, s->F));
-  memory = message_place(&w.W2, memory, gemm_packed_size(s->F, s->F2));
-  memory = message_place(&w.a1, memory, round_up(s->H, VW));
-  memory = message_place(&w.b2, memory, round_up(s->F2, VW));
-  memory = message_place(&w.gamma, memory, round_up(s->F2, VW));
-  message_place(&w.beta, memory, round_up(s->F2, VW));
-  gemm_pack(s->A1, 1, s->E, s->E, s->H, w.A1);
-  gemm_pack(s->A2, 1, s->H, s->H, s->F, w.A2);
-  gemm_pack(s->W2, 1, s->F, s->F, s->F2, w.W2);
-  message_pad(s->a1, s->H, w.a1);
-  message_pad(s->b2, s->F2, w.b2);
-  message_pad(s->gamma, s->F2, w.gamma);
-  message_pad(s->beta, s->F2, w.beta);
-  return w;
+/* out = a layer on n rows of A, followed by ReLU or set to 0 where `hidden` is 0 */
+static void message_layer(const message_weights *w, int layer, int64_t n, gemm_a a, dense_end end) {
+  dense_rows(&w->layers[layer], 0, dense_panels(&w->layers[layer]), n, a, end);
 }
 
 typedef struct {
-  float *h, *x, *y; /* [MESSAGE_TILE, row]: the encoder's hidden layer, relu(z), and W2 relu(z) without b2; 4 rows behind it */
+  float *h, *x, *y; /* [MESSAGE_TILE, row], their padding undefined */
+  float *columns;   /* [4, row] */
 } message_tile;
 
 static bool message_new_tile(const message_weights *w, message_tile *t) {
   const int64_t size = MESSAGE_TILE * w->row;
   float *memory = ast_scratch(5, (3 * size + 4 * w->row) * (int64_t)sizeof *memory);
-  *t = (message_tile){memory, memory + size, memory + 2 * size};
+  *t = (message_tile){memory, memory + size, memory + 2 * size, memory + 3 * size};
   return memory != NULL;
 }
 
-/* x = relu(z): P_s + Q_r added to the product in x if there is one */
-AST_INLINE void message_gather(const message_weights *w, int64_t first, int64_t n, int64_t ahead, bool add, float *tile) {
+/* One register tile of x: channels of panel p of the edges from m on. P + Q comes last: large values cost the product no digits. */
+AST_INLINE void message_first_tile(const int rows, const int vectors, const message_weights *w, int64_t p, int64_t m, const float *h,
+                                   float *x) {
   const ast_message *s = w->s;
-  for (int64_t i = 0; i < n; i++) {
-    const float *P = s->of_senders + s->senders[first + i] * s->F, *Q = s->of_receivers + s->receivers[first + i] * s->F;
-    float *x = tile + i * w->row;
-    for (int64_t c = 0; c < s->F; c += VW) {
-      const vf z = message_load(P, c, s->F) + message_load(Q, c, s->F);
-      vstore(x + c, message_relu(add ? vload(x + c) + z : z));
+  const int64_t c = p * GEMM_COLUMNS, n = s->F - c;
+  vf sum[GEMM_ROWS][2];
+#pragma GCC unroll 12
+  for (int i = 0; i < rows; i++) {
+    const float *next = s->of_senders + s->senders[min64(m + i + MESSAGE_TILE, s->M - 1)] * s->F + c;
+#pragma GCC unroll 2
+    for (int v = 0; v < vectors; v++) {
+      sum[i][v] = (vf){0};
+      __builtin_prefetch(next + v * VW);
     }
   }
-  for (int64_t i = 0; i < ahead; i++) {
-    const float *next = s->of_senders + s->senders[first + n + i] * s->F;
-    for (int64_t c = 0; c < s->F; c += 16) __builtin_prefetch(next + c);
+  gemm_sums(rows, vectors, s->H, (gemm_a){h, w->row, 1}, w->layers[MESSAGE_A2].panels + c * s->H, GEMM_COLUMNS, sum);
+#pragma GCC unroll 12
+  for (int i = 0; i < rows; i++) {
+    const float *P = s->of_senders + s->senders[m + i] * s->F + c, *Q = s->of_receivers + s->receivers[m + i] * s->F + c;
+#pragma GCC unroll 2
+    for (int v = 0; v < vectors; v++) {
+      const vf z = vload_upto(P + v * VW, n - v * VW) + vload_upto(Q + v * VW, n - v * VW) + sum[i][v];
+      vstore(x + i * w->row + c + v * VW, vmax((vf){0}, z));
+    }
   }
 }
 
-/* All layers of edges first to first + n; `ahead` edges follow them, whose senders are prefetched. */
-static void message_layers(const message_weights *w, int64_t first, int64_t n, int64_t ahead, const message_tile *t) {
-  const ast_message *s = w->s;
-  const int64_t H = round_up(s->H, VW), F = round_up(s->F, VW), F2 = round_up(s->F2, VW), row = w->row;
-  if (H) {
-    gemm(n, H, s->E, (gemm_a){s->edge_features + first * s->E, s->E, 1}, gemm_packed(w->A1, s->E), t->h, row, false);
-    for (int64_t i = 0; i < n; i++)
-      for (int64_t c = 0; c < H; c += VW) vstore(t->h + i * row + c, message_relu(vload(t->h + i * row + c) + vload(w->a1 + c)));
-    gemm(n, F, s->H, (gemm_a){t->h, row, 1}, gemm_packed(w->A2, s->H), t->x, row, false);
-    message_gather(w, first, n, ahead, true, t->x);
-  } else {
-    message_gather(w, first, n, ahead, false, t->x);
-  }
-  gemm(n, F2, s->F, (gemm_a){t->x, row, 1}, gemm_packed(w->W2, s->F), t->y, row, false);
+AST_INLINE void message_first_strip(const int vectors, const message_weights *w, int64_t p, int64_t first, int64_t n,
+                                    const message_tile *t) {
+  int64_t i = 0;
+#define MESSAGE_STEP(rows) \
+  for (; i + (rows) <= n; i += (rows)) message_first_tile(rows, vectors, w, p, first + i, t->h + i * w->row, t->x + i * w->row)
+  MESSAGE_STEP(GEMM_ROWS);
+  if (GEMM_ROWS > 8) MESSAGE_STEP(8);
+  MESSAGE_STEP(4);
+  MESSAGE_STEP(2);
+  MESSAGE_STEP(1);
+#undef MESSAGE_STEP
 }
 
-/* y + b2 minus its mean in place, padding excepted; returns 1 / sqrt(variance + eps). */
-AST_INLINE float message_center(const message_weights *w, float *y) {
-  const int64_t F2 = w->s->F2;
-  vf total = {0}, squares = {0}, mean;
-  for (int64_t c = 0; c < F2; c += VW) {
-    const vf x = vload(y + c) + vload(w->b2 + c);
-    vstore(y + c, x);
-    total += x;
+/* h, x and y of edges first to first + n */
+static void message_layers(const message_weights *w, int64_t first, int64_t n, const message_tile *t) {
+  const ast_message *s = w->s;
+  const gemm_a e = {s->edge_features + first * s->E, s->E, 1};
+  message_layer(w, MESSAGE_A1, n, e, (dense_end){.activation = AST_RELU, .out = t->h, .out_row = w->row});
+  for (int64_t p = 0; p * GEMM_COLUMNS < s->F; p++) {
+    if (s->F - p * GEMM_COLUMNS > VW) message_first_strip(2, w, p, first, n, t);
+    else message_first_strip(1, w, p, first, n, t);
   }
-  mean = vsplat(vsum(total) / (float)F2);
+  message_layer(w, MESSAGE_W2, n, (gemm_a){t->x, w->row, 1}, (dense_end){.out = t->y, .out_row = w->row});
+}
+
+/* Subtracts the mean from y, padded with zeros then; returns 1 / sqrt(variance + eps). */
+AST_INLINE float message_center(int64_t F2, float *y) {
+  vf total = {0}, squares = {0};
+  for (int64_t c = 0; c < F2; c += VW) total += vload_upto(y + c, F2 - c);
+  const float mean = vsum(total) / (float)F2;
   for (int64_t c = 0; c < F2; c += VW) {
-    if (c + VW > F2) { /* what pads the last vector stays 0 */
-      vf part = {0};
-      memcpy(&part, &mean, (size_t)(F2 - c) * sizeof(float));
-      mean = part;
-    }
-    const vf x = vload(y + c) - mean;
+    vf x = vload(y + c) - mean;
+    if (c + VW > F2) x = (vf)((vi)x & (LANE_INDICES < (int32_t)(F2 - c)));
     vstore(y + c, x);
     squares += x * x;
   }
@@ -166,14 +150,15 @@ static int64_t first_receiver(const ast_message *s, int64_t edge) {
 }
 
 static void message_out(const message_job *job, int64_t m, float *y) {
-  const message_weights *w = &job->w;
-  const int64_t F2 = w->s->F2;
-  const float inverse = message_center(w, y);
-  float *sum = job->sum + w->s->receivers[m] * F2;
+  const ast_message *s = job->w.s;
+  const int64_t F2 = s->F2;
+  const float inverse = message_center(F2, y);
+  float *sum = job->sum + s->receivers[m] * F2;
   for (int64_t c = 0; c < F2; c += VW) {
-    const vf out = vload(y + c) * inverse * vload(w->gamma + c) + vload(w->beta + c);
-    message_store(sum, c, F2, message_load(sum, c, F2) + out);
-    if (job->messages) message_store(job->messages + m * F2, c, F2, out);
+    const int64_t n = F2 - c;
+    const vf out = vload(y + c) * inverse * vload_upto(s->gamma + c, n) + vload_upto(s->beta + c, n);
+    vstore_upto(sum + c, vload_upto(sum + c, n) + out, n);
+    if (job->messages) vstore_upto(job->messages + m * F2 + c, out, n);
   }
 }
 
@@ -187,17 +172,17 @@ static ast_status message_task(int64_t index, void *context) {
   if (!message_new_tile(&job->w, &t)) return AST_NO_MEMORY;
   memset(job->sum + begin * s->F2, 0, (size_t)((end - begin) * s->F2) * sizeof *job->sum);
   for (int64_t m = s->receiver_offsets[begin]; m < last; m += MESSAGE_TILE) {
-    const int64_t n = min64(MESSAGE_TILE, last - m), ahead = min64(MESSAGE_TILE, last - m - n);
-    message_layers(&job->w, m, n, ahead, &t);
+    const int64_t n = min64(MESSAGE_TILE, last - m);
+    message_layers(&job->w, m, n, &t);
     for (int64_t i = 0; i < n; i++) message_out(job, m + i, t.y + i * job->w.row);
   }
   return AST_OK;
 }
 
 static ast_status message(const ast_message *s, float *restrict sum, float *restrict messages) {
-  float *memory = ast_scratch(6, message_packed_size(s) * (int64_t)sizeof *memory);
-  if (!memory) return AST_NO_MEMORY;
-  const int64_t edges = min64(MOST_EDGES, max64(LEAST_EDGES, s->M / MESSAGE_TASKS));
-  message_job job = {message_pack(s, memory), max64(1, s->M / edges), sum, messages};
+  message_job job = {.sum = sum, .messages = messages};
+  const ast_status status = message_pack(s, false, &job.w);
+  if (status != AST_OK) return status;
+  job.tasks = max64(1, s->M / min64(MOST_EDGES, max64(LEAST_EDGES, s->M / MESSAGE_TASKS)));
   return ast_parallel(job.tasks, message_task, &job);
 }
