@@ -12,7 +12,10 @@ from ast_sim.ops.attention import _reference, attention
 from benchmarks.case import Case
 
 # scenes, queries and keys of a scene, heads, channels of a head
-SIZES = [(4, 90, 90, 4, 32), (1, 512, 512, 8, 64), (1, 512, 8192, 8, 64), (1, 8192, 512, 8, 64)]
+SMALL = [(4, 90, 90, 4, 32), (4, 90, 360, 4, 32), (4, 360, 90, 4, 32)]
+FORWARD = [(1, 512, 512, 8, 64), (1, 512, 100_000, 8, 64), (1, 100_000, 512, 8, 64), (1, 4096, 4096, 8, 64)]
+TRAINING = [(1, 512, 512, 8, 64), (1, 512, 8192, 8, 64), (1, 4096, 4096, 8, 64)]
+LARGEST = 4e9  # bytes of arrays of all scores that a peer may hold
 TOLERANCE = {"rtol": 1e-4, "atol": 1e-5}
 
 
@@ -40,7 +43,15 @@ def _without_gradients(function: Callable[..., Tensor], inputs: list[Tensor]) ->
 
 
 def cases() -> list[Case]:
-    return [_case(size, p, backward) for size in SIZES for backward in (False, True) for p in (0.0, 0.1)]
+    wanted = [(size, p, backward) for size in SMALL for backward in (False, True) for p in (0.0, 0.1)]
+    wanted += [(size, 0.0, False) for size in FORWARD]
+    wanted += [(size, 0.1, True) for size in TRAINING]
+    return [_case(*one) for one in wanted]
+
+
+def _bytes_of_composition(scenes: int, queries: int, keys: int, heads: int, p: float, backward: bool) -> int:
+    """Of the arrays of scores alive at once: scores, weights, mask and dropped weights; backward, their gradients."""
+    return 4 * scenes * heads * queries * keys * (2 + 2 * (p > 0) + 3 * backward)
 
 
 def _case(size: tuple[int, int, int, int, int], p: float, backward: bool) -> Case:
@@ -58,19 +69,18 @@ def _case(size: tuple[int, int, int, int, int], p: float, backward: bool) -> Cas
     def sdpa(q, k, v):
         return scaled_dot_product_attention(q, k, v, dropout_p=p)
 
+    functions, missing = {"torch SDPA": sdpa}, {}
+    if _bytes_of_composition(scenes, queries, keys, heads, p, backward) <= LARGEST:
+        functions["torch composition"] = lambda *x: _composition(*x, p)
+    else:
+        missing["torch composition"] = f"its arrays of scores exceed {LARGEST / 1e9:.0f} GB"
     views, dviews = [batched(x) for x in (q, k, v)], batched(dout)
     if backward:
         call = _with_gradients(ours, [q, k, v], dout)
-        peers = {
-            "torch SDPA": _with_gradients(sdpa, views, dviews),
-            "torch composition": _with_gradients(lambda *x: _composition(*x, p), views, dviews),
-        }
+        peers = {name: _with_gradients(function, views, dviews) for name, function in functions.items()}
     else:
         call = _without_gradients(ours, [q, k, v])
-        peers = {
-            "torch SDPA": _without_gradients(sdpa, views),
-            "torch composition": _without_gradients(lambda *x: _composition(*x, p), views),
-        }
+        peers = {name: _without_gradients(function, views) for name, function in functions.items()}
 
     def check() -> None:
         """Without dropout against the peers; with it one head against the composition that draws the same mask."""
@@ -94,4 +104,5 @@ def _case(size: tuple[int, int, int, int, int], p: float, backward: bool) -> Cas
         None,
         (14 if backward else 4) * scenes * heads * queries * keys * width,
         check,
+        missing,
     )

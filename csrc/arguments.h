@@ -130,6 +130,7 @@ static argument *take(call *c, const char *name, int type, bool output, bool str
 #define IN(c, name, type, ndim, ...)  take(c, name, type, false, false, ndim, __VA_ARGS__)
 #define IN_ROWS(c, name, ndim, ...)   take(c, name, FLOATS, false, true, ndim, __VA_ARGS__)
 #define OUT(c, name, type, ndim, ...) take(c, name, type, true, false, ndim, __VA_ARGS__)
+#define OUT_ROWS(c, name, ndim, ...)  take(c, name, FLOATS, true, true, ndim, __VA_ARGS__)
 #define FREE                          ((int64_t)ANY)
 
 /* The argument that `expression` takes, or one without data where None is given. */
@@ -206,8 +207,9 @@ static bool begin(call *c) {
   for (int i = 0; debug && i < c->num_arrays; i++) {
     argument *a = &c->arrays[i];
     const size_t size = (size_t)PyArray_NBYTES(a->array);
-    if (a->output) {
-      if (size) memset(a->data, 0xff, size); /* all bits set: NaN, and -1 as an integer */
+    if (a->output) { /* all bits set: NaN, and -1 as an integer */
+      const size_t rows = size ? (size_t)a->shape[0] : 0, stride = (size_t)PyArray_STRIDE(a->array, 0);
+      for (size_t row = 0; row < rows; row++) memset((char *)a->data + row * stride, 0xff, size / rows);
     } else if (size && PyArray_IS_C_CONTIGUOUS(a->array)) {
       if (!(a->copy = malloc(size))) return PyErr_NoMemory(), false;
       memcpy(a->copy, a->data, size);

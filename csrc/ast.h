@@ -25,8 +25,9 @@ typedef enum {
 /* The sizes of one attention: query rows of scene b attend to all key rows of scene b. */
 typedef struct {
   int64_t B, H, D;
-  const int64_t *q_offsets, *k_offsets; /* [B+1] */
-  int64_t q_stride, k_stride, v_stride; /* floats from one row of q, k, v to the next, at least H*D */
+  const int64_t *q_offsets, *k_offsets;    /* [B+1] */
+  int64_t q_stride, k_stride, v_stride;    /* floats from one row of q, k, v to the next, at least H*D */
+  int64_t dq_stride, dk_stride, dv_stride; /* the same of the gradients */
   float scale;
   double dropout_p; /* weights are dropped with this probability, 0 <= p < 1 */
   uint64_t seed;    /* of the counter-based generator: key (seed), counter (scene, head, query, key) */
@@ -140,7 +141,7 @@ typedef struct {
    * +inf score, or with only -inf, is NaN in all outputs. */
   ast_status (*attention)(const ast_attention *s, const float *restrict q, const float *restrict k, const float *restrict v,
                           float *restrict out, float *restrict maximum, float *restrict sum);
-  /* Its gradients, P recomputed from maximum and sum. dq [Tq,H,D], dk and dv [Tk,H,D] dense. */
+  /* Its gradients, P recomputed from maximum and sum. dq [Tq,H,D], dk and dv [Tk,H,D]. */
   ast_status (*attention_backward)(const ast_attention *s, const float *restrict q, const float *restrict k, const float *restrict v,
                                    const float *restrict out, const float *restrict maximum, const float *restrict sum,
                                    const float *restrict dout, float *restrict dq, float *restrict dk, float *restrict dv);

@@ -32,26 +32,26 @@ typedef struct {
   const float *q, *k, *v;
   float *out, *maximum, *sum;
   const forward_cut *cuts; /* [B+1] */
-  float *partials;         /* of PARTIAL(D) floats */
+  float *partials;         /* of PARTIAL floats */
 } forward_job;
 
-/* What a task knows of its queries, in panels: o [panel][D][LANES], m and l [query]. */
+/* What a task knows of its queries: o [query][ROW], m and l [query]. */
 typedef struct {
   float *out, *maximum, *sum;
 } forward_state;
 
 typedef struct {
   float keys[KEYS * ROW], values[KEYS * ROW];
-  float scores[KEYS * LANES];
+  float scores[KEYS * ROW];
   dropout_words words[2];
   float queries[QUERIES * MAX_D]; /* scale Q in panels */
-  float out[QUERIES * MAX_D], maximum[QUERIES], sum[QUERIES];
+  float out[QUERIES * ROW], maximum[QUERIES], sum[QUERIES];
 } forward_scratch;
 
-static int64_t partial_floats(int64_t D) { return QUERIES * (D + 2); }
+enum { PARTIAL = QUERIES * (ROW + 2) }; /* floats of the state that a part leaves */
 
-static forward_state partial_state(float *partial, int64_t D) {
-  return (forward_state){partial, partial + QUERIES * D, partial + QUERIES * (D + 1)};
+static forward_state partial_state(float *partial) {
+  return (forward_state){partial, partial + QUERIES * ROW, partial + QUERIES * (ROW + 1)};
 }
 
 /* The scene, head, queries and keys of a task. */
@@ -62,29 +62,14 @@ typedef struct {
 
 /* ---- a panel against a block of keys ---- */
 
-/* o[d][query] = fade o + sum_key v[key][d] p[key][query] for a tile of channels */
-AST_INLINE void values_tile(const int rows, int64_t i, int64_t n, const float *v, const float *p, const vf fade[2], float *out) {
-  vf sum[TILE][2];
-  tile_product(rows, 2, n, v + i, 1, ROW, p, LANES, sum);
-#pragma GCC unroll 12
-  for (int r = 0; r < rows; r++)
-#pragma GCC unroll 2
-    for (int j = 0; j < 2; j++) {
-      float *o = out + (i + r) * LANES + j * VW;
-      vstore(o, fade[j] * vload(o) + sum[r][j]);
-    }
-}
-
-TILE_FUNCTIONS(values_tile, (int64_t i, int64_t n, const float *v, const float *p, const vf fade[2], float *out), i, n, v, p, fade, out)
-
 /* Scores x become exp(x - base) 2^-shift; their sums over the n keys. */
 AST_INLINE void weights(float *x, int64_t n, const vf base[2], int32_t shift, vf sum[2]) {
   for (int64_t j = 0; j < n; j++)
 #pragma GCC unroll 2
     for (int c = 0; c < 2; c++) {
-      const vf p = vexp(vload(x + j * LANES + c * VW) - base[c], shift);
+      const vf p = vexp(vload(x + j * ROW + c * VW) - base[c], shift);
       sum[c] += p;
-      vstore(x + j * LANES + c * VW, p);
+      vstore(x + j * ROW + c * VW, p);
     }
 }
 
@@ -96,25 +81,25 @@ AST_INLINE void dropped_weights(float *x, int64_t n, const vf base[2], int32_t s
     for (int64_t lane = 0; lane < min64(n - slot * DROPOUT_LANES, DROPOUT_LANES); lane++)
 #pragma GCC unroll 2
       for (int c = 0; c < 2; c++) {
-        float *to = x + (slot * DROPOUT_LANES + lane) * LANES + c * VW;
+        float *to = x + (slot * DROPOUT_LANES + lane) * ROW + c * VW;
         const vf p = vexp(vload(to) - base[c], shift);
         sum[c] += p;
         vstore(to, dropout_keep(words[c][lane], slot, threshold, p));
       }
 }
 
-/* Takes n keys, k0 the first of them in the scene, into the state of panel p. */
-static void forward_panel(forward_scratch *t, const forward_state *state, int64_t p, int64_t query, int64_t k0, int64_t n, int64_t D,
-                          int32_t shift, const dropout *d) {
-  float *m = state->maximum + p * LANES, *l = state->sum + p * LANES;
-  const float *queries = t->queries + p * LANES * D;
-  vf largest[2] = {vsplat(-INFINITY), vsplat(-INFINITY)}, base[2], fade[2], sum[2] = {{0}};
-  EACH_TILE(round_up(n, ROW_STEP), scores_tile, D, t->keys, queries, t->scores, LANES, largest)
+/* Takes n keys, k0 the first of them in the scene, into the state of a panel, the queries i0..i0+rows of the task. */
+static void forward_panel(forward_scratch *t, const forward_state *state, int64_t i0, int64_t rows, int64_t query, int64_t k0, int64_t n,
+                          int64_t D, int32_t shift, bool first, const dropout *d) {
+  float *m = state->maximum + i0, *l = state->sum + i0, fade[LANES];
+  const float *queries = t->queries + i0 * D;
+  vf largest[2] = {vsplat(-INFINITY), vsplat(-INFINITY)}, base[2], sum[2] = {{0}};
+  EACH_TILE(round_up(n, ROW_STEP), scores_tile, D, t->keys, queries, t->scores, largest)
 #pragma GCC unroll 2
   for (int c = 0; c < 2; c++) {
     const vf before = vload(m + c * VW), now = vmax(largest[c], before);
     base[c] = vselect(now == -INFINITY, (vf){0}, now); /* only -inf so far: weights 0, not NaN */
-    fade[c] = vexp(before - base[c], 0);
+    vstore(fade + c * VW, vexp(before - base[c], 0));
     vstore(m + c * VW, now);
   }
   if (d->threshold) {
@@ -124,8 +109,8 @@ static void forward_panel(forward_scratch *t, const forward_state *state, int64_
     weights(t->scores, n, base, shift, sum);
   }
 #pragma GCC unroll 2
-  for (int c = 0; c < 2; c++) vstore(l + c * VW, vload(l + c * VW) * fade[c] + sum[c]);
-  EACH_TILE(D, values_tile, n, t->values, t->scores, fade, state->out + p * LANES * D)
+  for (int c = 0; c < 2; c++) vstore(l + c * VW, vload(l + c * VW) * vload(fade + c * VW) + sum[c]);
+  columns_product(round_up(rows, ROW_STEP), D, n, t->scores, t->values, state->out + i0 * ROW, (update){first, fade});
 }
 
 /* ---- tasks ---- */
@@ -163,7 +148,7 @@ static forward_task_of find_task(const forward_job *job, int64_t index, bool mer
 static float *partial_of(const forward_job *job, const forward_task_of *t, int64_t part) {
   const forward_cut *cut = job->cuts + t->b;
   const int64_t number = (t->h * cut->chunks + t->first_query / QUERIES) * cut->parts + part;
-  return job->partials + (cut->first_partial + number) * partial_floats(job->s->D);
+  return job->partials + (cut->first_partial + number) * PARTIAL;
 }
 
 /* out = gain o / l, maximum and sum of the task's queries */
@@ -171,15 +156,13 @@ static void finish(const forward_job *job, const forward_task_of *t, const forwa
   const ast_attention *s = job->s;
   const int64_t H = s->H, D = s->D, q0 = s->q_offsets[t->b] + t->first_query;
   const float gain = dropout_of(s, t->b, t->h).gain;
-  float factor[LANES];
-  for (int64_t i0 = 0; i0 < t->rows; i0 += LANES) {
-    for (int64_t i = 0; i < LANES; i++) factor[i] = gain / (state->sum[i0 + i] > 0 ? state->sum[i0 + i] : NAN);
-    unpack_panel(state->out + i0 * D, factor, t->rows - i0, D, job->out + ((q0 + i0) * H + t->h) * D, H * D);
-  }
+  const float whole = (float)((int64_t)1 << t->shift);
   for (int64_t i = 0; i < t->rows; i++) {
     const float l = state->sum[i] > 0 ? state->sum[i] : NAN;
     job->maximum[(q0 + i) * H + t->h] = l > 0 ? state->maximum[i] : NAN;
-    job->sum[(q0 + i) * H + t->h] = ldexpf(l, t->shift);
+    job->sum[(q0 + i) * H + t->h] = whole * l;
+    float *out = job->out + ((q0 + i) * H + t->h) * D;
+    for (int64_t d = 0; d < D; d += VW) vstore(out + d, gain / l * vload(state->out + i * ROW + d));
   }
 }
 
@@ -197,12 +180,11 @@ static ast_status forward_task(int64_t index, void *context) {
   forward_scratch *t = ast_scratch(5, sizeof *t);
   if (!t) return AST_NO_MEMORY;
   const bool whole = job->cuts[task.b].parts == 1;
-  const forward_state state = whole ? (forward_state){t->out, t->maximum, t->sum} : partial_state(partial_of(job, &task, task.part), D);
+  const forward_state state = whole ? (forward_state){t->out, t->maximum, t->sum} : partial_state(partial_of(job, &task, task.part));
   const dropout d = dropout_of(s, task.b, h);
   const int64_t panels = (rows + LANES - 1) / LANES, share = (KEYS + panels - 1) / panels;
   for (int64_t p = 0; p < panels; p++)
     pack_panel(job->q + (q0 + p * LANES) * s->q_stride + h * D, s->q_stride, rows - p * LANES, D, s->scale, t->queries + p * LANES * D);
-  fill_rows(0, 0, 1, panels * LANES * D, state.out);
   fill_rows(0, 0, 1, panels * LANES, state.sum);
   fill_rows(-INFINITY, 0, 1, panels * LANES, state.maximum);
   for (int64_t k0 = 0; k0 < task.keys; k0 += KEYS) {
@@ -214,7 +196,8 @@ static ast_status forward_task(int64_t index, void *context) {
       const int64_t next = KEYS + p * share, ahead = min64(share, task.keys - k0 - next);
       prefetch_rows(k + next * s->k_stride, s->k_stride, ahead, D, 0);
       prefetch_rows(v + next * s->v_stride, s->v_stride, ahead, D, 0);
-      forward_panel(t, &state, p, task.first_query + p * LANES, task.first_key + k0, n, D, task.shift, &d);
+      forward_panel(t, &state, p * LANES, min64(LANES, rows - p * LANES), task.first_query + p * LANES, task.first_key + k0, n, D,
+                    task.shift, k0 == 0, &d);
     }
   }
   if (whole) finish(job, &task, &state);
@@ -226,20 +209,23 @@ static ast_status merge_task(int64_t index, void *context) {
   const forward_job *job = context;
   const forward_task_of task = find_task(job, index, true);
   const int64_t D = job->s->D, parts = job->cuts[task.b].parts;
-  const forward_state into = partial_state(partial_of(job, &task, 0), D);
+  const forward_state into = partial_state(partial_of(job, &task, 0));
   for (int64_t part = 1; part < parts; part++) {
-    const forward_state from = partial_state(partial_of(job, &task, part), D);
+    const forward_state from = partial_state(partial_of(job, &task, part));
+    float fade[QUERIES], weight[QUERIES];
     for (int64_t i = 0; i < task.rows; i += VW) {
-      const int64_t panel = i / LANES * LANES * D + i % LANES;
       const vf before = vload(into.maximum + i), other = vload(from.maximum + i), now = vmax(other, before);
-      const vf base = vselect(now == -INFINITY, (vf){0}, now), fade = vexp(before - base, 0), weight = vexp(other - base, 0);
+      const vf base = vselect(now == -INFINITY, (vf){0}, now);
+      vstore(fade + i, vexp(before - base, 0));
+      vstore(weight + i, vexp(other - base, 0));
       vstore(into.maximum + i, now);
-      vstore(into.sum + i, vload(into.sum + i) * fade + vload(from.sum + i) * weight);
-      for (int64_t d = 0; d < D; d++) {
-        float *o = into.out + panel + d * LANES;
-        vstore(o, vload(o) * fade + vload(from.out + panel + d * LANES) * weight);
-      }
+      vstore(into.sum + i, vload(into.sum + i) * vload(fade + i) + vload(from.sum + i) * vload(weight + i));
     }
+    for (int64_t i = 0; i < task.rows; i++)
+      for (int64_t d = 0; d < D; d += VW) {
+        float *o = into.out + i * ROW + d;
+        vstore(o, vload(o) * fade[i] + vload(from.out + i * ROW + d) * weight[i]);
+      }
   }
   finish(job, &task, &into);
   return AST_OK;
@@ -257,7 +243,7 @@ static ast_status attention(const ast_attention *s, const float *restrict q, con
     if (cut->parts > 1) next.first_merge += s->H * cut->chunks, next.first_partial += s->H * cut->chunks * cut->parts;
   }
   cuts[s->B] = next;
-  float *partials = ast_scratch(7, next.first_partial * partial_floats(s->D) * (int64_t)sizeof *partials);
+  float *partials = ast_scratch(7, next.first_partial * PARTIAL * (int64_t)sizeof *partials);
   if (!partials) return AST_NO_MEMORY;
   forward_job job = {s, q, k, v, out, maximum, sum, cuts, partials};
   const ast_status status = ast_parallel(next.first_task, forward_task, &job);

@@ -50,47 +50,10 @@ typedef struct {
 typedef struct {
   int64_t b, h, first_query, queries, first_key, keys;
   float *dq, *dk, *dv;
-  int64_t dq_stride, dk_stride;
+  int64_t dq_stride, dk_stride, dv_stride;
 } backward_range;
 
 /* ---- a square of queries against a block of keys ---- */
-
-/* c[i][j] += sum_k a_ik b[k][j], rows of b and c ROW apart */
-AST_INLINE void add_tile(const int rows, int64_t i, const int vectors, int64_t K, const float *a, const int64_t a_row,
-                         const int64_t a_column, const float *b, float *c) {
-  vf sum[TILE][2];
-  tile_product(rows, vectors, K, a + i * a_row, a_row, a_column, b, ROW, sum);
-#pragma GCC unroll 12
-  for (int r = 0; r < rows; r++)
-#pragma GCC unroll 2
-    for (int j = 0; j < vectors; j++) {
-      float *to = c + (i + r) * ROW + j * VW;
-      vstore(to, vload(to) + sum[r][j]);
-    }
-}
-
-#define ADD_TILE(name, vectors, a_row, a_column)                                                         \
-  AST_INLINE void name(const int rows, int64_t i, int64_t K, const float *a, const float *b, float *c) { \
-    add_tile(rows, i, vectors, K, a, a_row, a_column, b, c);                                             \
-  }                                                                                                      \
-  TILE_FUNCTIONS(name, (int64_t i, int64_t K, const float *a, const float *b, float *c), i, K, a, b, c)
-ADD_TILE(rows_tile, 2, ROW, 1)
-ADD_TILE(rows_tile_narrow, 1, ROW, 1)
-ADD_TILE(columns_tile, 2, 1, ROW)
-ADD_TILE(columns_tile_narrow, 1, 1, ROW)
-#undef ADD_TILE
-
-/* C [M,N] += A B with A row by row, and with A given as its transpose; M a multiple of ROW_STEP, N one of VW. */
-static void add_rows_product(int64_t M, int64_t N, int64_t K, const float *a, const float *b, float *c) {
-  int64_t j = 0;
-  for (; j + 2 * VW <= N; j += 2 * VW) EACH_TILE(M, rows_tile, K, a, b + j, c + j)
-  if (j < N) EACH_TILE(M, rows_tile_narrow, K, a, b + j, c + j)
-}
-static void add_columns_product(int64_t M, int64_t N, int64_t K, const float *a, const float *b, float *c) {
-  int64_t j = 0;
-  for (; j + 2 * VW <= N; j += 2 * VW) EACH_TILE(M, columns_tile, K, a, b + j, c + j)
-  if (j < N) EACH_TILE(M, columns_tile_narrow, K, a, b + j, c + j)
-}
 
 /* Score x and gain y V^T become P . keep and dS; words NULL: all are kept. */
 AST_INLINE void gradient(float *x, float *dx, vf maximum, vf share, vf delta, const vu *words, int slot, vu threshold) {
@@ -102,8 +65,8 @@ AST_INLINE void gradient(float *x, float *dx, vf maximum, vf share, vf delta, co
 /* Weights and their gradients of the panel of queries from i on, of those in the scratch; k0 the first of n keys of the scene. */
 static void backward_panel(backward_scratch *t, int64_t i, int64_t query, int64_t k0, int64_t n, int64_t D, const dropout *d) {
   float *x = t->weights + i % SQUARE, *dx = t->dscores + i % SQUARE;
-  EACH_TILE(round_up(n, ROW_STEP), scores_tile, D, t->keys, t->query_panels + i * D, x, ROW, NULL)
-  EACH_TILE(round_up(n, ROW_STEP), scores_tile, D, t->values, t->dout_panels + i * D, dx, ROW, NULL)
+  EACH_TILE(round_up(n, ROW_STEP), scores_tile, D, t->keys, t->query_panels + i * D, x, NULL)
+  EACH_TILE(round_up(n, ROW_STEP), scores_tile, D, t->values, t->dout_panels + i * D, dx, NULL)
   const vu threshold = (vu){0} + (d->threshold << 16);
   for (int64_t c = 0; c < LANES; c += VW) {
     const vf maximum = vload(t->maximum + i + c), share = vload(t->share + i + c), delta = vload(t->delta + i + c);
@@ -130,7 +93,6 @@ static void load_queries(const backward_job *job, const backward_range *range, i
   const float *q = job->q + q0 * s->q_stride + h * D, *dout = job->dout + (q0 * H + h) * D, *out = job->out + (q0 * H + h) * D;
   copy_rows(q, s->q_stride, rows, D, s->scale, t->queries);
   copy_rows(dout, H * D, rows, D, 1, t->dout);
-  fill_rows(0, ROW, round_up(rows, ROW_STEP), D, t->dq);
   for (int64_t i = 0; i < rows; i += LANES) {
     float *panel = t->dout_panels + i * D;
     pack_panel(t->queries + i * ROW, ROW, rows - i, D, 1, t->query_panels + i * D);
@@ -169,9 +131,8 @@ static void backward_block(const backward_job *job, const backward_range *range,
   const float *k = job->k + row * s->k_stride + range->h * D, *v = job->v + row * s->v_stride + range->h * D;
   copy_rows(k, s->k_stride, n, D, 1, t->keys);
   copy_rows(v, s->v_stride, n, D, d->gain, t->values);
-  fill_rows(0, ROW, whole, D, t->dk);
-  fill_rows(0, ROW, whole, D, t->dv);
-  const int64_t to = (k0 - range->first_key) * range->dk_stride, left = range->first_key + range->keys - k0 - KEYS;
+  float *dk = range->dk + (k0 - range->first_key) * range->dk_stride, *dv = range->dv + (k0 - range->first_key) * range->dv_stride;
+  const int64_t left = range->first_key + range->keys - k0 - KEYS;
   const int64_t panels = (rows + LANES - 1) / LANES, share = (KEYS + panels - 1) / panels;
   for (int64_t i0 = 0; i0 < rows; i0 += SQUARE) {
     const int64_t width = min64(SQUARE, rows - i0);
@@ -179,16 +140,16 @@ static void backward_block(const backward_job *job, const backward_range *range,
       const int64_t at = i / LANES * share;
       prefetch_rows(k + (KEYS + at) * s->k_stride, s->k_stride, min64(share, left - at), D, 0);
       prefetch_rows(v + (KEYS + at) * s->v_stride, s->v_stride, min64(share, left - at), D, 0);
-      prefetch_rows(range->dk + to + at * range->dk_stride, range->dk_stride, min64(share, n - at), D, 1);
-      prefetch_rows(range->dv + to + at * range->dk_stride, range->dk_stride, min64(share, n - at), D, 1);
+      prefetch_rows(dk + at * range->dk_stride, range->dk_stride, min64(share, n - at), D, 1);
+      prefetch_rows(dv + at * range->dv_stride, range->dv_stride, min64(share, n - at), D, 1);
       backward_panel(t, i, first + i, k0, n, D, d);
     }
-    add_rows_product(whole, D, width, t->weights, t->dout + i0 * ROW, t->dv);
-    add_rows_product(whole, D, width, t->dscores, t->queries + i0 * ROW, t->dk);
-    add_columns_product(round_up(width, ROW_STEP), D, n, t->dscores, t->keys, t->dq + i0 * ROW);
+    rows_product(whole, D, width, t->weights, t->dout + i0 * ROW, t->dv, (update){.set = i0 == 0});
+    rows_product(whole, D, width, t->dscores, t->queries + i0 * ROW, t->dk, (update){.set = i0 == 0});
+    columns_product(round_up(width, ROW_STEP), D, n, t->dscores, t->keys, t->dq + i0 * ROW, (update){.set = k0 == range->first_key});
   }
-  put_rows(t->dk, n, D, 1, first > range->first_query, range->dk + to, range->dk_stride);
-  put_rows(t->dv, n, D, d->gain, first > range->first_query, range->dv + to, range->dk_stride);
+  put_rows(t->dk, n, D, 1, first > range->first_query, dk, range->dk_stride);
+  put_rows(t->dv, n, D, d->gain, first > range->first_query, dv, range->dv_stride);
 }
 
 static backward_cut cut_backward(const ast_attention *s, int64_t b) {
@@ -218,7 +179,7 @@ static int64_t scene_of(const backward_job *job, int64_t task) {
 
 static backward_range find_range(const backward_job *job, int64_t index) {
   const ast_attention *s = job->s;
-  const int64_t b = scene_of(job, index), H = s->H, D = s->D, q0 = s->q_offsets[b], k0 = s->k_offsets[b];
+  const int64_t b = scene_of(job, index), D = s->D, q0 = s->q_offsets[b], k0 = s->k_offsets[b];
   const backward_cut *cut = job->cuts + b;
   const int64_t h = (index - cut->first_task) / cut->parts, part = (index - cut->first_task) % cut->parts;
   backward_range r = {.b = b, .h = h, .queries = s->q_offsets[b + 1] - q0, .keys = s->k_offsets[b + 1] - k0};
@@ -227,10 +188,10 @@ static backward_range find_range(const backward_job *job, int64_t index) {
   float *partial = job->partials + cut->first_partial + (h * (cut->parts - 1) + part - 1) * partial_size(s, b);
   if (by_queries) r.first_query = before, r.queries = min64(cut->part_rows, r.queries - before);
   else r.first_key = before, r.keys = min64(cut->part_rows, r.keys - before);
-  const int64_t q_at = ((q0 + r.first_query) * H + h) * D, k_at = ((k0 + r.first_key) * H + h) * D;
-  r.dq = job->dq + q_at, r.dk = job->dk + k_at, r.dv = job->dv + k_at;
-  r.dq_stride = r.dk_stride = H * D;
-  if (part > 0 && by_queries) r.dk = partial, r.dv = partial + r.keys * D, r.dk_stride = D;
+  r.dq = job->dq + (q0 + r.first_query) * s->dq_stride + h * D, r.dq_stride = s->dq_stride;
+  r.dk = job->dk + (k0 + r.first_key) * s->dk_stride + h * D, r.dk_stride = s->dk_stride;
+  r.dv = job->dv + (k0 + r.first_key) * s->dv_stride + h * D, r.dv_stride = s->dv_stride;
+  if (part > 0 && by_queries) r.dk = partial, r.dv = partial + r.keys * D, r.dk_stride = r.dv_stride = D;
   if (part > 0 && !by_queries) r.dq = partial, r.dq_stride = D;
   return r;
 }
@@ -240,7 +201,7 @@ static ast_status backward_task(int64_t index, void *context) {
   const backward_range r = find_range(job, index);
   const int64_t D = job->s->D;
   if (r.keys == 0) fill_rows(0, r.dq_stride, r.queries, D, r.dq);
-  if (r.queries == 0) fill_rows(0, r.dk_stride, r.keys, D, r.dk), fill_rows(0, r.dk_stride, r.keys, D, r.dv);
+  if (r.queries == 0) fill_rows(0, r.dk_stride, r.keys, D, r.dk), fill_rows(0, r.dv_stride, r.keys, D, r.dv);
   if (r.keys == 0 || r.queries == 0) return AST_OK;
   backward_scratch *t = ast_scratch(5, sizeof *t);
   if (!t) return AST_NO_MEMORY;
@@ -263,10 +224,10 @@ static ast_status add_partials_task(int64_t index, void *context) {
   for (int64_t part = 1; part < parts; part++) {
     const float *partial = job->partials + job->cuts[b].first_partial + (h * (parts - 1) + part - 1) * size;
     for (int64_t i = 0; i < size / D; i++) {
-      float *to = queries <= keys ? job->dq + ((q0 + i) * H + h) * D
-                  : i < keys      ? job->dk + ((k0 + i) * H + h) * D
-                                  : job->dv + ((k0 + i - keys) * H + h) * D;
-      for (int64_t e = 0; e < D; e += VW) vstore(to + e, vload(to + e) + vload(partial + i * D + e));
+      float *to = queries <= keys ? job->dq + (q0 + i) * s->dq_stride
+                  : i < keys      ? job->dk + (k0 + i) * s->dk_stride
+                                  : job->dv + (k0 + i - keys) * s->dv_stride;
+      for (int64_t e = h * D; e < h * D + D; e += VW) vstore(to + e, vload(to + e) + vload(partial + i * D + e - h * D));
     }
   }
   return AST_OK;

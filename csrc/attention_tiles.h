@@ -74,18 +74,14 @@ AST_INLINE void tile_product(const int rows, const int vectors, int64_t K, const
   }
 }
 
-/* ---- scores ---- */
-
-/* x[key][query] = a[key] . b[query] over the channels for a tile of keys, x_row floats from row to row; raises largest[2],
- * unless NULL, to the scores' maximum. */
-AST_INLINE void scores_tile(const int rows, int64_t i, int64_t D, const float *a, const float *b, float *x, const int64_t x_row,
-                            vf *largest) {
+/* x[key][query] = a[key] . b[query] over the channels for a tile of keys; raises largest[2], unless NULL, to the scores' maximum. */
+AST_INLINE void scores_tile(const int rows, int64_t i, int64_t D, const float *a, const float *b, float *x, vf *largest) {
   vf sum[TILE][2];
   tile_product(rows, 2, D, a + i * ROW, ROW, 1, b, LANES, sum);
 #pragma GCC unroll 12
   for (int r = 0; r < rows; r++)
 #pragma GCC unroll 2
-    for (int j = 0; j < 2; j++) vstore(x + (i + r) * x_row + j * VW, sum[r][j]);
+    for (int j = 0; j < 2; j++) vstore(x + (i + r) * ROW + j * VW, sum[r][j]);
   if (!largest) return;
 #pragma GCC unroll 2
   for (int j = 0; j < 2; j++) {
@@ -95,9 +91,66 @@ AST_INLINE void scores_tile(const int rows, int64_t i, int64_t D, const float *a
     largest[j] = m;
   }
 }
+TILE_FUNCTIONS(scores_tile, (int64_t i, int64_t D, const float *a, const float *b, float *x, vf *largest), i, D, a, b, x, largest)
 
-TILE_FUNCTIONS(scores_tile, (int64_t i, int64_t D, const float *a, const float *b, float *x, int64_t x_row, vf *largest), i, D, a, b, x,
-               x_row, largest)
+/* What becomes of c as a product comes to it: c = product, c += product, or row i of c = factor[i] c + product. */
+typedef struct {
+  bool set;
+  const float *factor; /* or NULL */
+} update;
+
+/* c[i][j] is updated by sum_k a_ik b[k][j], rows of b and c ROW apart */
+AST_INLINE void product_tile(const int rows, int64_t i, const int vectors, int64_t K, const float *a, const int64_t a_row,
+                             const int64_t a_column, const float *b, float *c, update how) {
+  vf sum[TILE][2];
+  tile_product(rows, vectors, K, a + i * a_row, a_row, a_column, b, ROW, sum);
+  c += i * ROW;
+  if (how.set) {
+#pragma GCC unroll 12
+    for (int r = 0; r < rows; r++)
+#pragma GCC unroll 2
+      for (int j = 0; j < vectors; j++) vstore(c + r * ROW + j * VW, sum[r][j]);
+  } else if (how.factor) {
+#pragma GCC unroll 12
+    for (int r = 0; r < rows; r++)
+#pragma GCC unroll 2
+      for (int j = 0; j < vectors; j++) {
+        float *to = c + r * ROW + j * VW;
+        vstore(to, how.factor[i + r] * vload(to) + sum[r][j]);
+      }
+  } else {
+#pragma GCC unroll 12
+    for (int r = 0; r < rows; r++)
+#pragma GCC unroll 2
+      for (int j = 0; j < vectors; j++) {
+        float *to = c + r * ROW + j * VW;
+        vstore(to, vload(to) + sum[r][j]);
+      }
+  }
+}
+
+#define PRODUCT_TILE(name, vectors, a_row, a_column)                                                                 \
+  AST_INLINE void name(const int rows, int64_t i, int64_t K, const float *a, const float *b, float *c, update how) { \
+    product_tile(rows, i, vectors, K, a, a_row, a_column, b, c, how);                                                \
+  }                                                                                                                  \
+  TILE_FUNCTIONS(name, (int64_t i, int64_t K, const float *a, const float *b, float *c, update how), i, K, a, b, c, how)
+PRODUCT_TILE(rows_tile, 2, ROW, 1)
+PRODUCT_TILE(rows_tile_narrow, 1, ROW, 1)
+PRODUCT_TILE(columns_tile, 2, 1, ROW)
+PRODUCT_TILE(columns_tile_narrow, 1, 1, ROW)
+#undef PRODUCT_TILE
+
+/* C [M,N] is updated by A B with A row by row, and with A given as its transpose; M a multiple of ROW_STEP, N one of VW. */
+static void rows_product(int64_t M, int64_t N, int64_t K, const float *a, const float *b, float *c, update how) {
+  int64_t j = 0;
+  for (; j + 2 * VW <= N; j += 2 * VW) EACH_TILE(M, rows_tile, K, a, b + j, c + j, how)
+  if (j < N) EACH_TILE(M, rows_tile_narrow, K, a, b + j, c + j, how)
+}
+static void columns_product(int64_t M, int64_t N, int64_t K, const float *a, const float *b, float *c, update how) {
+  int64_t j = 0;
+  for (; j + 2 * VW <= N; j += 2 * VW) EACH_TILE(M, columns_tile, K, a, b + j, c + j, how)
+  if (j < N) EACH_TILE(M, columns_tile_narrow, K, a, b + j, c + j, how)
+}
 
 /* ---- rows and panels ---- */
 
@@ -158,18 +211,6 @@ static void pack_panel(const float *from, int64_t stride, int64_t rows, int64_t 
       load_transposed(from + j * stride + d, stride, rows - j, x);
 #pragma GCC unroll 16
       for (int i = 0; i < VW; i++) vstore(panel + (d + i) * LANES + j, factor * x[i]);
-    }
-}
-
-/* to[query][d] = factor[query] panel[d][query], for at most LANES rows */
-static void unpack_panel(const float *panel, const float *factor, int64_t rows, int64_t D, float *to, int64_t stride) {
-  for (int64_t j = 0; j < min64(rows, LANES); j += VW)
-    for (int64_t d = 0; d < D; d += VW) {
-      vf x[VW];
-#pragma GCC unroll 16
-      for (int i = 0; i < VW; i++) x[i] = vload(factor + j) * vload(panel + (d + i) * LANES + j);
-      vtranspose(x);
-      for (int64_t i = 0; i < min64(VW, rows - j); i++) vstore(to + (j + i) * stride + d, x[i]);
     }
 }
 

@@ -300,9 +300,12 @@ static PyObject *attention_backward(PyObject *self, PyObject *const *objects, Py
   const int64_t Tq = q->shape[0], Tk = k->shape[0];
   if (!(out = IN(&c, "out", FLOATS, 3, Tq, s.H, s.D)) || !(maximum = IN(&c, "maximum", FLOATS, 2, Tq, s.H)) ||
       !(sum = IN(&c, "sum", FLOATS, 2, Tq, s.H)) || !(dout = IN(&c, "dout", FLOATS, 3, Tq, s.H, s.D)) ||
-      !(dq = OUT(&c, "dq", FLOATS, 3, Tq, s.H, s.D)) || !(dk = OUT(&c, "dk", FLOATS, 3, Tk, s.H, s.D)) ||
-      !(dv = OUT(&c, "dv", FLOATS, 3, Tk, s.H, s.D)))
+      !(dq = OUT_ROWS(&c, "dq", 3, Tq, s.H, s.D)) || !(dk = OUT_ROWS(&c, "dk", 3, Tk, s.H, s.D)) ||
+      !(dv = OUT_ROWS(&c, "dv", 3, Tk, s.H, s.D)))
     return NULL;
+  s.dq_stride = dq->row_stride;
+  s.dk_stride = dk->row_stride;
+  s.dv_stride = dv->row_stride;
   KERNEL(c, status,
          kernels->attention_backward(&s, q->data, k->data, v->data, out->data, maximum->data, sum->data, dout->data, dq->data, dk->data,
                                      dv->data));

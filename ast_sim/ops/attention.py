@@ -5,7 +5,7 @@ Legend: B scenes, T tokens (Tq of queries, Tk of keys), H heads, D channels of a
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
@@ -143,47 +143,104 @@ def _kernel(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed):
     return out, maximum, total
 
 
-def _backward_kernel(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, out, maximum, total, dout):
-    dq, dk, dv = (x.new_empty(x.shape) for x in (q, k, v))
+def _backward_kernel(gradients, q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, out, maximum, total, dout):
+    """Writes the gradients of q, k and v into `gradients`, whose rows may lie apart."""
     inputs = (_rows(q), _rows(k), _rows(v), array(q_offsets), array(k_offsets), scale, dropout_p, seed)
     saved = (array(out), array(maximum), array(total), array(dout))
-    library._C.attention_backward(*inputs, *saved, dq.numpy(), dk.numpy(), dv.numpy())
-    return dq, dk, dv
+    library._C.attention_backward(*inputs, *saved, *(x.numpy() for x in gradients))
 
 
-def _fake(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed):
-    return q.new_empty(q.shape), q.new_empty(q.shape[:2]), q.new_empty(q.shape[:2])
+# ---- ops ----
 
 
-def _backward_fake(q, k, v, *_):
-    return q.new_empty(q.shape), k.new_empty(k.shape), v.new_empty(v.shape)
+def _define(name: str, schema: str, split: Callable, together: Callable):
+    """One op and its gradient, for one way in which q, k and v lie in tensors.
+
+    Args:
+        name: of the op.
+        schema: its tensors in torch's schema language; their gradients are tensors of the same shapes.
+        split: from these tensors, or from tensors of their shapes, to q, k and v: views, so that nothing is copied.
+        together: from the gradients of q, k and v to those of the tensors; the composition has no views to write to.
+    """
+    num = schema.count("Tensor")
+
+    def kernel(*arguments):
+        return _kernel(*split(*arguments[:num]), *arguments[num:])
+
+    def reference(*arguments):
+        return _reference(*split(*arguments[:num]), *arguments[num:])
+
+    def fake(*arguments):
+        q = split(*arguments[:num])[0]
+        return q.new_empty(q.shape), q.new_empty(q.shape[:2]), q.new_empty(q.shape[:2])
+
+    def backward_kernel(*arguments):
+        gradients = backward_fake(*arguments)
+        _backward_kernel(split(*gradients), *split(*arguments[:num]), *arguments[num:])
+        return gradients if num > 1 else gradients[0]
+
+    def backward_reference(*arguments):
+        return together(*_backward_reference(*split(*arguments[:num]), *arguments[num:]))
+
+    def backward_fake(*arguments):
+        return tuple(x.new_empty(x.shape) for x in arguments[:num])
+
+    arguments = f"{schema}, Tensor q_offsets, Tensor k_offsets, float scale, float dropout_p, int seed"
+    outputs = ", ".join(["Tensor"] * num)
+    op = library.define(f"{name}({arguments}) -> (Tensor, Tensor, Tensor)", kernel, reference, fake)
+    backward = library.define(
+        f"{name}_backward({arguments}, Tensor out, Tensor maximum, Tensor total, Tensor dout) -> ({outputs})",
+        backward_kernel,
+        backward_reference,
+        backward_fake if num > 1 else lambda *arguments: backward_fake(*arguments)[0],
+    )
+
+    def save(ctx, inputs, output) -> None:
+        ctx.save_for_backward(*inputs[: num + 2], *output)
+        ctx.settings = inputs[num + 2 :]
+        ctx.set_materialize_grads(False)  # nothing comes back through the others
+        ctx.mark_non_differentiable(*output[1:])
+
+    def gradient(ctx, dout, *_):
+        if dout is None:
+            return (None,) * len(ctx.needs_input_grad)
+        *arguments, out, maximum, total = ctx.saved_tensors
+        gradients = backward(*arguments, *ctx.settings, out, maximum, total, dout)
+        return *(gradients if num > 1 else (gradients,)), None, None, None, None, None
+
+    library.differentiate(op, save, gradient)
+    return op, backward
 
 
-_INPUTS = "Tensor q, Tensor k, Tensor v, Tensor q_offsets, Tensor k_offsets, float scale, float dropout_p, int seed"
-_attention = library.define(f"attention({_INPUTS}) -> (Tensor, Tensor, Tensor)", _kernel, _reference, _fake)
-_attention_backward = library.define(
-    f"attention_backward({_INPUTS}, Tensor out, Tensor maximum, Tensor total, Tensor dout) -> (Tensor, Tensor, Tensor)",
-    _backward_kernel,
-    _backward_reference,
-    _backward_fake,
+def _split_key_value(q: Tensor, key_value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    if key_value.dim() != 4 or key_value.shape[1] != 2:
+        raise ValueError(f"attention_kv: key_value must have shape [Tk, 2, H, D], not {tuple(key_value.shape)}")
+    return q, key_value[:, 0], key_value[:, 1]
+
+
+def _split_qkv(qkv: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    if qkv.dim() != 4 or qkv.shape[1] != 3:
+        raise ValueError(f"attention_qkv: qkv must have shape [T, 3, H, D], not {tuple(qkv.shape)}")
+    return qkv[:, 0], qkv[:, 1], qkv[:, 2]
+
+
+_attention, _attention_backward = _define(
+    "attention", "Tensor q, Tensor k, Tensor v", lambda q, k, v: (q, k, v), lambda dq, dk, dv: (dq, dk, dv)
+)
+_attention_kv, _attention_kv_backward = _define(
+    "attention_kv",
+    "Tensor q, Tensor key_value",
+    _split_key_value,
+    lambda dq, dk, dv: (dq, torch.stack([dk, dv], 1)),
+)
+_attention_qkv, _attention_qkv_backward = _define(
+    "attention_qkv", "Tensor qkv", _split_qkv, lambda dq, dk, dv: torch.stack([dq, dk, dv], 1)
 )
 
 
-def _save(ctx, inputs, output) -> None:
-    ctx.save_for_backward(*inputs[:5], *output)
-    ctx.settings = inputs[5:]
-    ctx.set_materialize_grads(False)  # nothing comes back through the others
-    ctx.mark_non_differentiable(*output[1:])
-
-
-def _gradient(ctx, dout, *_):
-    if dout is None:
-        return (None,) * len(ctx.needs_input_grad)
-    *inputs, out, maximum, total = ctx.saved_tensors
-    return *_attention_backward(*inputs, *ctx.settings, out, maximum, total, dout), None, None, None, None, None
-
-
-library.differentiate(_attention, _save, _gradient)
+def _seed(seed: int) -> int:
+    """As the signed 64 bits that torch's ops take."""
+    return (seed + (1 << 63)) % (1 << 64) - (1 << 63)
 
 
 def attention(
@@ -217,6 +274,33 @@ def attention(
         ValueError: for shapes, offsets or a dropout_p that are not as above.
     """
     scale = q.shape[-1] ** -0.5 if scale is None else float(scale)
-    seed = (seed + (1 << 63)) % (1 << 64) - (1 << 63)
-    out, maximum, total = _attention(q, k, v, q_offsets, k_offsets, scale, float(dropout_p), seed)
+    out, maximum, total = _attention(q, k, v, q_offsets, k_offsets, scale, float(dropout_p), _seed(seed))
     return out, maximum + total.log()
+
+
+def cross_attention(
+    q: Tensor,
+    key_value: Tensor,
+    q_offsets: Tensor,
+    k_offsets: Tensor,
+    scale: float | None = None,
+    dropout_p: float = 0.0,
+    seed: int = 0,
+) -> Tensor:
+    """`attention` over keys and values side by side in one tensor [Tk, 2, H, D], as a projection leaves them.
+
+    The gradient comes in the same layout: nothing is copied in either direction. Returns out [Tq, H, D] alone.
+    """
+    scale = q.shape[-1] ** -0.5 if scale is None else float(scale)
+    return _attention_kv(q, key_value, q_offsets, k_offsets, scale, float(dropout_p), _seed(seed))[0]
+
+
+def self_attention(
+    qkv: Tensor, offsets: Tensor, scale: float | None = None, dropout_p: float = 0.0, seed: int = 0
+) -> Tensor:
+    """`attention` of the tokens of each scene among themselves, their q, k and v in one tensor [T, 3, H, D].
+
+    The gradient comes in the same layout: nothing is copied in either direction. Returns out [T, H, D] alone.
+    """
+    scale = qkv.shape[-1] ** -0.5 if scale is None else float(scale)
+    return _attention_qkv(qkv, offsets, offsets, scale, float(dropout_p), _seed(seed))[0]
