@@ -98,55 +98,67 @@ typedef struct {
   float *z; /* what enters the activation, or NULL: [*, N], paired [*, 2N], dense */
 } dense_end;
 
-AST_INLINE void dense_finish(const dense_layer *l, const dense_end *e, int64_t i, int64_t j, vf z, int64_t n) {
-  if (e->z) vstore_upto(e->z + i * l->N + j, z, n);
-  if (e->activation == AST_RELU) z = vmax((vf){0}, z);
-  if (e->hidden) z = (vf)((vi)z & ~(vload_upto(e->hidden + i * e->hidden_row + j, n) <= 0));
-  if (e->residual) z += vload_upto(e->residual + i * e->residual_row + j, n);
-  vstore_upto(e->out + i * e->out_row + j, z, n);
-}
-
-AST_INLINE void dense_finish_pair(const dense_layer *l, const dense_end *e, int64_t i, int64_t j, vf a, vf b, int64_t n) {
-  if (e->z) {
-    vstore_upto(e->z + i * 2 * l->N + j, a, n);
-    vstore_upto(e->z + (i * 2 + 1) * l->N + j, b, n);
+/* What follows the product of a tile: columns from j on of `rows` rows from i on, of which n are real. Out of line, as it is long. */
+static __attribute__((noinline)) void dense_finish(const dense_layer *l, const dense_end *e, int64_t rows, int64_t vectors, int64_t i,
+                                                   int64_t j, int64_t n, const float *sums, const float *bias) {
+  for (const int64_t end = i + rows; i < end; i++, sums += GEMM_COLUMNS) {
+    if (l->paired) {
+      const vf a = vload(sums) + vload(bias), b = vload(sums + VW) + vload(bias + VW);
+      vf z = a * (b * vnormal(b));
+      if (e->z) {
+        vstore_upto(e->z + i * 2 * l->N + j, a, n);
+        vstore_upto(e->z + (i * 2 + 1) * l->N + j, b, n);
+      }
+      if (e->residual) z += vload_upto(e->residual + i * e->residual_row + j, n);
+      vstore_upto(e->out + i * e->out_row + j, z, n);
+      continue;
+    }
+    for (int64_t v = 0; v < vectors * VW; v += VW) {
+      vf z = vload(sums + v) + vload(bias + v); /* last: a large bias costs the sum no digits */
+      if (e->z) vstore_upto(e->z + i * l->N + j + v, z, n - v);
+      if (e->activation == AST_RELU) z = vmax((vf){0}, z);
+      if (e->hidden) z = (vf)((vi)z & ~(vload_upto(e->hidden + i * e->hidden_row + j + v, n - v) <= 0));
+      if (e->residual) z += vload_upto(e->residual + i * e->residual_row + j + v, n - v);
+      vstore_upto(e->out + i * e->out_row + j + v, z, n - v);
+    }
   }
-  vf z = a * (b * vnormal(b));
-  if (e->residual) z += vload_upto(e->residual + i * e->residual_row + j, n);
-  vstore_upto(e->out + i * e->out_row + j, z, n);
 }
 
 /* One register tile: rows i.. of panel p. */
 AST_INLINE void dense_tile(const int rows, const int vectors, const dense_layer *l, int64_t p, int64_t i0, gemm_a a, const dense_end *e) {
-  const int64_t j = p * dense_panel_width(l), n = l->N - j;
-  const float *bias = l->panels_bias + p * GEMM_COLUMNS;
+  const int64_t j = p * dense_panel_width(l);
   vf sum[GEMM_ROWS][2];
 #pragma GCC unroll 12
   for (int i = 0; i < rows; i++) {
-    float *line = e->out + (i0 + i) * e->out_row + j;
+    const float *line = e->out + (i0 + i) * e->out_row + j;
     __builtin_prefetch(line, 1);
     if (vectors == 2) __builtin_prefetch(line + VW, 1);
 #pragma GCC unroll 2
     for (int v = 0; v < vectors; v++) sum[i][v] = (vf){0};
   }
   gemm_sums(rows, vectors, l->K, (gemm_a){a.data + i0 * a.row, a.row, a.column}, l->panels + p * l->K * GEMM_COLUMNS, GEMM_COLUMNS, sum);
+  float sums[GEMM_ROWS * GEMM_COLUMNS] __attribute__((aligned(64)));
 #pragma GCC unroll 12
-  for (int i = 0; i < rows; i++) {
+  for (int i = 0; i < rows; i++)
 #pragma GCC unroll 2
-    for (int v = 0; v < vectors; v++) sum[i][v] += vload(bias + v * VW); /* last: a large bias costs the sum no digits */
-    if (vectors == 2 && l->paired) {
-      dense_finish_pair(l, e, i0 + i, j, sum[i][0], sum[i][1], n);
-    } else {
-#pragma GCC unroll 2
-      for (int v = 0; v < vectors; v++) dense_finish(l, e, i0 + i, j + v * VW, sum[i][v], n - v * VW);
-    }
-  }
+    for (int v = 0; v < vectors; v++) vstore(sums + i * GEMM_COLUMNS + v * VW, sum[i][v]);
+  dense_finish(l, e, rows, vectors, i0, j, l->N - j, sums, l->panels_bias + p * GEMM_COLUMNS);
 }
 
-AST_INLINE void dense_strip(const int vectors, const dense_layer *l, int64_t p, int64_t rows, gemm_a a, const dense_end *e) {
+/* Rows of A that will be read soon, columns begin <= k < end, into the second cache. */
+AST_INLINE void dense_prefetch(gemm_a a, int64_t first, int64_t last, int64_t begin, int64_t end) {
+  for (int64_t i = first; i < last; i++)
+    for (int64_t k = begin; k < end; k += 16) __builtin_prefetch(a.data + i * a.row + k, 0, 2);
+}
+
+AST_INLINE void dense_strip(const int vectors, const dense_layer *l, int64_t p, int64_t rows, gemm_a a, const dense_end *e, int64_t ahead,
+                            int64_t begin, int64_t end) {
   int64_t i = 0;
-#define DENSE_STEP(num) \
-  for (; i + (num) <= rows; i += (num)) dense_tile(num, vectors, l, p, i, a, e)
+#define DENSE_STEP(num)                                                             \
+  for (; i + (num) <= rows; i += (num)) {                                           \
+    dense_prefetch(a, rows + i, min64(rows + i + (num), rows + ahead), begin, end); \
+    dense_tile(num, vectors, l, p, i, a, e);                                        \
+  }
   DENSE_STEP(GEMM_ROWS);
   if (GEMM_ROWS > 8) DENSE_STEP(8);
   DENSE_STEP(4);
@@ -155,11 +167,13 @@ AST_INLINE void dense_strip(const int vectors, const dense_layer *l, int64_t p, 
 #undef DENSE_STEP
 }
 
-/* Panels first <= p < last of the layer on `rows` rows of A. */
-static void dense_rows(const dense_layer *l, int64_t first, int64_t last, int64_t rows, gemm_a a, dense_end e) {
+/* Panels first <= p < last of the layer on `rows` rows of A; `ahead` rows of A behind them are fetched meanwhile. */
+static void dense_rows(const dense_layer *l, int64_t first, int64_t last, int64_t rows, gemm_a a, dense_end e, int64_t ahead) {
+  const int64_t share = round_up((l->K + last - first - 1) / max64(1, last - first), 16);
   for (int64_t p = first; p < last; p++) {
-    if (l->paired || l->N - p * GEMM_COLUMNS > VW) dense_strip(2, l, p, rows, a, &e);
-    else dense_strip(1, l, p, rows, a, &e);
+    const int64_t begin = min64(l->K, (p - first) * share), end = min64(l->K, begin + share);
+    if (l->paired || l->N - p * GEMM_COLUMNS > VW) dense_strip(2, l, p, rows, a, &e, ahead, begin, end);
+    else dense_strip(1, l, p, rows, a, &e, ahead, begin, end);
   }
 }
 

@@ -56,7 +56,8 @@ static ast_status linear_task(int64_t index, void *context) {
                            .residual = job->residual ? job->residual + i * s->residual_stride : NULL,
                            .residual_row = s->residual_stride,
                            .z = job->z ? job->z + i * s->O : NULL};
-    dense_rows(&job->layer, first_panel, last_panel, min64(DENSE_ROWS, last - i), (gemm_a){job->x + i * s->x_stride, s->x_stride, 1}, end);
+    dense_rows(&job->layer, first_panel, last_panel, min64(DENSE_ROWS, last - i), (gemm_a){job->x + i * s->x_stride, s->x_stride, 1}, end,
+               max64(0, min64(DENSE_ROWS, s->M - i - DENSE_ROWS)));
   }
   return AST_OK;
 }
@@ -112,13 +113,13 @@ static void linear_backward_rows(const linear_backward_job *job, int64_t first, 
     linear_activation(s, rows, job->z + first * s->O, s->O, dout, dz, job->dz_row);
   } else {
     const dense_end end = {.out = dz, .out_row = job->dz_row};
-    dense_rows(&job->layers[0], 0, dense_panels(&job->layers[0]), rows, (gemm_a){x_rows, s->x_stride, 1}, end);
+    dense_rows(&job->layers[0], 0, dense_panels(&job->layers[0]), rows, (gemm_a){x_rows, s->x_stride, 1}, end, 0);
     linear_activation(s, rows, dz, job->dz_row, dout, dz, job->dz_row);
   }
   if (job->dbias) dense_add_rows(dz, job->dz_row, rows, s->O, dbias);
   if (job->dweight) dense_copy_rows(x_rows, s->x_stride, rows, s->I, x, job->x_row);
   const dense_end end = {.out = job->dx + first * s->I, .out_row = s->I};
-  if (job->dx) dense_rows(&job->layers[1], 0, dense_panels(&job->layers[1]), rows, (gemm_a){dz, job->dz_row, 1}, end);
+  if (job->dx) dense_rows(&job->layers[1], 0, dense_panels(&job->layers[1]), rows, (gemm_a){dz, job->dz_row, 1}, end, 0);
 }
 
 /* By rows: a chunk, its part of dW and dbias. */

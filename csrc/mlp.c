@@ -97,17 +97,18 @@ static ast_status mlp_task(int64_t index, void *context) {
       a = (gemm_a){input, job->input_row, 1};
     }
     const dense_end first = {.activation = AST_RELU, .out = hidden, .out_row = hidden_row};
-    dense_rows(&job->layers[0], 0, dense_panels(&job->layers[0]), rows, a, first);
+    dense_rows(&job->layers[0], 0, dense_panels(&job->layers[0]), rows, a, first,
+               s->beside ? 0 : max64(0, min64(DENSE_ROWS, s->M - i - DENSE_ROWS)));
     a = (gemm_a){hidden, hidden_row, 1};
     if (s->gamma) {
-      dense_rows(&job->layers[1], 0, dense_panels(&job->layers[1]), rows, a, (dense_end){.out = y, .out_row = job->y_row});
+      dense_rows(&job->layers[1], 0, dense_panels(&job->layers[1]), rows, a, (dense_end){.out = y, .out_row = job->y_row}, 0);
       mlp_norm_rows(job, i, rows, y);
     } else {
       const dense_end second = {.out = job->out + i * s->O,
                                 .out_row = s->O,
                                 .residual = job->residual ? job->residual + i * s->residual_stride : NULL,
                                 .residual_row = s->residual_stride};
-      dense_rows(&job->layers[1], 0, dense_panels(&job->layers[1]), rows, a, second);
+      dense_rows(&job->layers[1], 0, dense_panels(&job->layers[1]), rows, a, second, 0);
     }
   }
   return AST_OK;
@@ -183,13 +184,13 @@ static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_
     dense_copy_rows(job->kept.hidden + first * s->H, s->H, rows, s->H, hidden, job->hidden_row);
   } else {
     const dense_end end = {.activation = AST_RELU, .out = hidden, .out_row = job->hidden_row};
-    dense_rows(&job->layers[0], 0, dense_panels(&job->layers[0]), rows, inputs, end);
+    dense_rows(&job->layers[0], 0, dense_panels(&job->layers[0]), rows, inputs, end, 0);
   }
   if (!s->gamma) {
     dense_copy_rows(job->dout + first * s->dout_stride, s->dout_stride, rows, s->O, y, job->y_row);
   } else {
     const dense_end end = {.out = y, .out_row = job->y_row};
-    if (!job->kept.normalized) dense_rows(&job->layers[1], 0, dense_panels(&job->layers[1]), rows, units, end);
+    if (!job->kept.normalized) dense_rows(&job->layers[1], 0, dense_panels(&job->layers[1]), rows, units, end, 0);
     float *of_block = y + DENSE_ROWS * job->y_row; /* sums of the block first, so that long sums stay accurate */
     memset(of_block, 0, 2 * (size_t)sums[4].row * sizeof *of_block);
     mlp_norm_gradient(job, first, rows, y, of_block, of_block + sums[4].row);
@@ -201,14 +202,14 @@ static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_
   if (sums[3].to) dense_add_rows(y, job->y_row, rows, s->O, partials + sums[3].at);
   if (!job->into_hidden) return;
   const dense_end masked = {.out = hidden, .out_row = job->hidden_row, .hidden = hidden, .hidden_row = job->hidden_row};
-  dense_rows(&job->layers[2], 0, dense_panels(&job->layers[2]), rows, (gemm_a){y, job->y_row, 1}, masked);
+  dense_rows(&job->layers[2], 0, dense_panels(&job->layers[2]), rows, (gemm_a){y, job->y_row, 1}, masked, 0);
   if (sums[0].to)
     gemm(s->H, sums[0].row, rows, (gemm_a){hidden, 1, job->hidden_row}, gemm_rows(input, job->input_row), partials + sums[0].at,
          sums[0].row, add);
   if (sums[1].to) dense_add_rows(hidden, job->hidden_row, rows, s->H, partials + sums[1].at);
   const dense_end x = {.out = job->g.x + first * s->I, .out_row = s->I}, beside = {.out = job->g.beside + first * s->I2, .out_row = s->I2};
-  if (job->g.x) dense_rows(&job->layers[3], 0, dense_panels(&job->layers[3]), rows, units, x);
-  if (job->g.beside) dense_rows(&job->layers[4], 0, dense_panels(&job->layers[4]), rows, units, beside);
+  if (job->g.x) dense_rows(&job->layers[3], 0, dense_panels(&job->layers[3]), rows, units, x, 0);
+  if (job->g.beside) dense_rows(&job->layers[4], 0, dense_panels(&job->layers[4]), rows, units, beside, 0);
 }
 
 static ast_status mlp_backward_task(int64_t index, void *context) {
