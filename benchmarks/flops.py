@@ -56,6 +56,22 @@ def _attention_backward(*inputs, **_) -> int:
     return _attention(*inputs) * 5 // 2
 
 
+def _cross_attention(q: Tensor, key_value: Tensor, *rest, **_) -> int:
+    return _attention(q, key_value, key_value, *rest)
+
+
+def _cross_attention_backward(*inputs, **_) -> int:
+    return _cross_attention(*inputs) * 5 // 2
+
+
+def _self_attention(qkv: Tensor, *rest, **_) -> int:
+    return _attention(qkv[:, 0], qkv, qkv, *rest)
+
+
+def _self_attention_backward(*inputs, **_) -> int:
+    return _self_attention(*inputs) * 5 // 2
+
+
 def _sparse_conv(x: Tensor, weight: Tensor, bias, transposed, pair_offsets: Tensor, *_, **__) -> int:
     return _product(int(pair_offsets[-1]), *weight.shape[1:])
 
@@ -79,6 +95,10 @@ FORMULAS = {
     ops.message_backward: _raw(_message_backward),
     ops.attention: _raw(_attention),
     ops.attention_backward: _raw(_attention_backward),
+    ops.attention_kv: _raw(_cross_attention),
+    ops.attention_kv_backward: _raw(_cross_attention_backward),
+    ops.attention_qkv: _raw(_self_attention),
+    ops.attention_qkv_backward: _raw(_self_attention_backward),
     ops.sparse_conv: _raw(_sparse_conv),
     ops.sparse_conv_weight: _raw(_sparse_conv_weight),
 }

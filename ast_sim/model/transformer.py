@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from ast_sim.model.config import ModelConfig
 from ast_sim.model.linear import Linear
-from ast_sim.ops.attention import attention
+from ast_sim.ops.attention import cross_attention, self_attention
 
 
 class PositionEmbedding(nn.Module):
@@ -49,16 +49,19 @@ class FeedForward(nn.Module):
 
 
 class AttentionBlock(nn.Module):
-    """x + attention(LN(x), LN(context)), then x + FFN(LN(x)); without `cross` the context is x itself."""
+    """x + attention(LN(x), LN(context)), then the feed-forward part; the context of a self-attention is x itself."""
 
     def __init__(self, config: ModelConfig, cross: bool):
         super().__init__()
         inner = config.heads * config.head_dim
         self.heads, self.dropout = config.heads, config.dropout
         self.norm = nn.LayerNorm(config.d_token)
-        self.norm_context = nn.LayerNorm(config.d_token) if cross else None
-        self.query = Linear(config.d_token, inner, bias=False)
-        self.key_value = Linear(config.d_token, 2 * inner, bias=False)
+        if cross:
+            self.norm_context = nn.LayerNorm(config.d_token)
+            self.query = Linear(config.d_token, inner, bias=False)
+            self.key_value = Linear(config.d_token, 2 * inner, bias=False)
+        else:
+            self.query_key_value = Linear(config.d_token, 3 * inner, bias=False)
         self.out = Linear(inner, config.d_token)
         self.feed_forward = FeedForward(config)
 
@@ -66,12 +69,13 @@ class AttentionBlock(nn.Module):
         self, x: Tensor, offsets: Tensor, context: Tensor | None = None, context_offsets: Tensor | None = None
     ) -> Tensor:
         """x [T, d_token] in the scenes of `offsets`, context [C, d_token] in those of `context_offsets` -> as x."""
-        normed = self.norm(x)
-        source = normed if self.norm_context is None else self.norm_context(context)
-        query = self.query(normed).unflatten(1, (self.heads, -1))
-        key, value = self.key_value(source).unflatten(1, (2, self.heads, -1)).unbind(1)
         dropout = self.dropout if self.training else 0.0
-        seed = int(torch.randint(2**62, (1,))) if dropout else 0
-        source_offsets = offsets if self.norm_context is None else context_offsets
-        mixed, _ = attention(query, key, value, offsets, source_offsets, dropout_p=dropout, seed=seed)
+        options = {"dropout_p": dropout, "seed": int(torch.randint(2**62, (1,))) if dropout else 0}
+        if context is None:
+            together = self.query_key_value(self.norm(x)).unflatten(1, (3, self.heads, -1))
+            mixed = self_attention(together, offsets, **options)
+        else:
+            query = self.query(self.norm(x)).unflatten(1, (self.heads, -1))
+            key_value = self.key_value(self.norm_context(context)).unflatten(1, (2, self.heads, -1))
+            mixed = cross_attention(query, key_value, offsets, context_offsets, **options)
         return self.feed_forward(self.out(mixed.flatten(1), residual=x))

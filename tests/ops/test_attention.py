@@ -315,15 +315,15 @@ def test_fused_projections_are_read_and_their_gradients_written_in_place():
 def test_opcheck_of_fused_projections():
     q, k, v, *offsets = case([5, 4], [6, 3], 2, 16)
     key_value, settings = torch.stack([k, v], 1), (0.25, 0.1, 3)
-    torch.library.opcheck(ops._attention_kv, (q.requires_grad_(), key_value.requires_grad_(), *offsets, *settings))
+    torch.library.opcheck(ops._attention_kv.overload, (q.requires_grad_(), key_value.requires_grad_(), *offsets, *settings))
     q, key_value = q.detach(), key_value.detach()
     saved = ops._attention_kv(q, key_value, *offsets, *settings)
     inputs = (q, key_value, *offsets, *settings, *saved, torch.randn(q.shape))
-    torch.library.opcheck(ops._attention_kv_backward, inputs)
+    torch.library.opcheck(ops._attention_kv_backward.overload, inputs)
     qkv, i = torch.randn(9, 3, 2, 16), offsets_of(5, 4)
-    torch.library.opcheck(ops._attention_qkv, (qkv.clone().requires_grad_(), i, i, *settings))
+    torch.library.opcheck(ops._attention_qkv.overload, (qkv.clone().requires_grad_(), i, i, *settings))
     saved = ops._attention_qkv(qkv, i, i, *settings)
-    torch.library.opcheck(ops._attention_qkv_backward, (qkv, i, i, *settings, *saved, torch.randn(9, 2, 16)))
+    torch.library.opcheck(ops._attention_qkv_backward.overload, (qkv, i, i, *settings, *saved, torch.randn(9, 2, 16)))
 
 
 def test_gradients_of_fused_projections_in_float64():
