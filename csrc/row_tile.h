@@ -122,6 +122,7 @@ AST_INLINE void column_tile(const int rows, const int vectors, int64_t K, column
   for (int64_t k = 0; k < K; k++) {
     __builtin_prefetch(p.next[k] + p.next_column, 0, 2);
     const float *a = p.a[k] + p.a_column, *b = p.b[k] + p.b_column;
+    __asm__("" : "+r"(a), "+r"(b)); /* as pointers, or the compiler keeps a register for each offset */
     vf b_k[2];
 #pragma GCC unroll 2
     for (int j = 0; j < vectors; j++) b_k[j] = vload(b + j * VW);
