@@ -95,3 +95,10 @@ def run_python(code: str, **environment: str) -> str:
     )
     assert result.returncode == 0, result.stderr
     return result.stdout
+
+
+def assert_same_everywhere(code: str) -> None:
+    """Code that prints a SHA-256 of its results prints the same on every instruction set and with the compositions."""
+    prints = {isa: run_python(code, AST_SIM_ISA=isa) for isa in instruction_sets()}
+    prints["torch"] = run_python(code, AST_SIM_BACKEND="torch")
+    assert "base" in prints and len(set(prints.values())) == 1 and len(prints["base"].strip()) == 64, prints
