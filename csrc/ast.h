@@ -19,7 +19,7 @@ typedef enum {
   AST_NO_MEMORY,  /* scratch memory could not be had; outputs are undefined */
   AST_NOT_FINITE, /* octree: a position is NaN or infinite */
   AST_OUTSIDE,    /* octree: a position lies outside the cube; farthest_point_sample: a scene is 2^21 or more wide */
-  AST_MISMATCH,   /* octree_pairs: pair_offsets are not those of the neighbours */
+  AST_TOO_LARGE,  /* octree_coarsen: more cells than an int32 can number */
 } ast_status;
 
 /* The sizes of one attention: query rows of scene b attend to all key rows of scene b. */
@@ -83,6 +83,17 @@ typedef struct {
 typedef struct {
   float *x, *beside, *weight1, *bias1, *weight2, *bias2, *gamma, *beta;
 } ast_mlp_gradients;
+/* A level of an octree and how it follows from the next finer one. It lies in scratch memory of the calling thread, and is valid until the
+ * next call of an octree kernel or of farthest_point_sample there. */
+typedef struct {
+  int64_t C, C_fine, B;     /* cells of this level and of the finer one, scenes */
+  int64_t *keys, *offsets;  /* [C], [B+1] as in octree_build */
+  int64_t *families;        /* [C+1]: first child << 8 | set of the octants 4x+2y+z of all children */
+  uint8_t *near;            /* [C]: whether the scene has a cell at P - (i,j,k) for any (i,j,k) of 0 and 1 but (0,0,0) */
+  int32_t (*before)[8];     /* [C,8]: where it has, those cells by 4i+2j+k, or -1 */
+  int64_t *pairs;           /* where the pairs of each chunk go; of octree_write_level alone */
+  int64_t pair_offsets[28]; /* of the pairs with the finer level, by kernel offset */
+} ast_octree_level;
 
 /* One table per instruction set; every entry has the same contract on each. */
 typedef struct {
@@ -107,18 +118,16 @@ typedef struct {
                              int64_t *restrict node_cell, int64_t *restrict node_order, int64_t *restrict node_offsets, int64_t *bad_node);
   /* coordinates [C,3]: x, y and z of each cell, 0..2^21 - 1. */
   ast_status (*octree_coordinates)(const int64_t *restrict keys, int64_t C, int32_t *restrict coordinates);
-  /* The next coarser level of cells keys [C_fine] (ascending within a scene). Capacity: coarse_keys [C_fine], first_child
-   * [C_fine+1], neighbours [C_fine,8]; cells in use: coarse_offsets[B]. first_child[p] is the first fine cell of coarse cell p.
-   * neighbours[p][4i+2j+k] is the coarse cell of the same scene at P - (i,j,k), or -1. pair_offsets [28] counts, as running
-   * sums, the pairs (fine, coarse) with fine = 2 P + (a,b,c), grouped by kernel offset 9(a+1) + 3(b+1) + (c+1). */
-  ast_status (*octree_coarsen)(const int64_t *restrict keys, const int64_t *restrict offsets, int64_t B, int64_t *restrict coarse_keys,
-                               int64_t *restrict coarse_offsets, int64_t *restrict first_child, int64_t *restrict neighbours,
-                               int64_t *restrict pair_offsets);
-  /* Those pairs twice: (fine, coarse) with coarse rising within each group, and (fine_by_fine, coarse_by_fine) with fine
-   * rising within each group. Each array [pair_offsets[27]]. */
-  ast_status (*octree_pairs)(const int64_t *restrict keys, const int64_t *restrict first_child, const int64_t *restrict neighbours,
-                             int64_t C_coarse, const int64_t *restrict pair_offsets, int64_t *restrict fine, int64_t *restrict coarse,
-                             int64_t *restrict fine_by_fine, int64_t *restrict coarse_by_fine);
+  /* The next `levels` <= 21 coarser levels of cells keys [C] (ascending within a scene), finest first, and the number of pairs
+   * (fine, coarse) with fine = 2 P + (a,b,c) of each, grouped by kernel offset 9(a+1) + 3(b+1) + (c+1). */
+  ast_status (*octree_coarsen)(const int64_t *restrict keys, const int64_t *restrict offsets, int64_t B, int levels,
+                               ast_octree_level *restrict level);
+  /* Writes a level out: keys [C], offsets [B+1], first_child [C+1], node_cell [C_fine] (the parent of each finer cell), and the pairs
+   * twice: (fine, coarse) with coarse rising within each group, and (fine_by_fine, coarse_by_fine) with fine rising within each group,
+   * each array [pair_offsets[27]]. */
+  ast_status (*octree_write_level)(const ast_octree_level *level, int64_t *restrict keys, int64_t *restrict offsets,
+                                   int64_t *restrict first_child, int64_t *restrict node_cell, int64_t *restrict fine,
+                                   int64_t *restrict coarse, int64_t *restrict fine_by_fine, int64_t *restrict coarse_by_fine);
 
   /* Exact greedy farthest point sampling of coordinates [C,3], per scene min(num, C_b) indices (into the
    * whole array) from out_offsets[b] on: the first is the scene's first point, ties go to the lowest index, and once all

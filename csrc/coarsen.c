@@ -1,284 +1,283 @@
-/* The next coarser level of an octree, and the pairs of the stride-2 convolution between the two levels.
+/* The coarser levels of an octree, all at once, and which of their cells are neighbours.
  *
- * Chunks as in octree.c, which holds what the two share. Scratch of the calling thread: slot 1 holds the cells that follow each cell,
- * slot 2 the counts of the chunks.
+ * Level 0 holds the given cells, level j+1 the parents of those of level j, the root R one cell a scene. Legend: P a cell, o = 4x+2y+z
+ * its octant (the low three bits of its key), d = 4i+2j+k a step of 0 or 1 along each axis.
+ *
+ * Cells. Cell i of level 0 starts new cells at levels 1..q, where q is the highest octal digit in which its key differs from the one
+ * before it; q = R where a scene starts. Counting each q by chunks tells where the cells of every level go, and one more pass writes them:
+ * of its parents cell i is the first child up to level q, and a further child at level q+1.
+ *
+ * Neighbours, from the root down. Octant o of P, moved by -d, is octant o^d of the cell at -(d & ~o) from P (the axes that borrow). So
+ * children find the cells before them among the children of P and of the cells before P, without a search. The children of these eight
+ * cells are 64 bits, byte d for the cell at -d; one child's eight neighbours are found in them at once. In a sparse level most cells are
+ * passed over: the lone child of a cell without neighbours has none.
+ *
+ * Cost: a few ns for each cell of each level up to the root. Work is cut into chunks as in octree.c, which holds what the two share.
+ * Scratch of the calling thread: slot 1 holds the levels, slot 2 the counts of the chunks of cells, slot 4 those of the chunks of pairs.
  */
 #include "ast.h"
 #include "simd.h"
 
-/* ---- neighbours ---- */
+#ifndef OCTREE_MAX_CELLS
+#define OCTREE_MAX_CELLS INT32_MAX /* neighbours are held as int32 */
+#endif
 
-/* Cells are handled by blocks of 8 x 8 x 8, whose keys agree from bit 9 up. A table of 9 x 9 x 9 holds the cells of a block and those
- * of the layers before it, so that the neighbours of a cell are reads at fixed distances. Of the seven blocks before this one
- * only those are searched that one of its cells looks into: few where cells are sparse. */
-enum { BLOCK_BITS = 9, BLOCK_CELLS = 512, BLOCK_TABLE = 729 };
+enum { OCTREE_LEVELS = 22, OCTREE_GROUPS = 27 }; /* the given level and at most 21 above it: a key has 63 bits */
+
+AST_INLINE unsigned octree_octants(int64_t family) { return (unsigned)family & 255; }
+AST_INLINE int64_t octree_first(int64_t family) { return family >> 8; }
+
+/* ---- cells ---- */
 
 typedef struct {
-  int16_t place[BLOCK_CELLS]; /* in the table, of a cell by the low bits of its key */
-  uint8_t low[BLOCK_CELLS];   /* axes, as bits 4x + 2y + z, along which it lies in the first layer of its block */
-  uint8_t high[BLOCK_CELLS];  /* ... in the last layer */
-  int16_t step[8];            /* in the table, from a cell to its neighbour at -(i,j,k), by 4i + 2j + k */
-} octree_block_layout;
+  int64_t next[OCTREE_LEVELS];   /* first the cells of the chunk by q; then where its next cell of each level goes */
+  uint8_t before[OCTREE_LEVELS]; /* octants for the last parent of each level that started in an earlier chunk */
+} octree_chunk;
 
 typedef struct {
   const int64_t *keys, *offsets;
   int64_t B, C;
-  const octree_block_layout *layout;
-  int64_t *neighbours;
+  int root, levels;
+  octree_chunk *chunks;
+  const ast_octree_level *level;
+} octree_cells_job;
+
+/* The levels above the given one at which cell i starts a cell; b is its scene. */
+AST_INLINE int octree_starts(const octree_cells_job *s, int64_t i, int64_t b) {
+  if (i == s->offsets[b]) return s->root;
+  return (63 - __builtin_clzll((uint64_t)(s->keys[i] ^ s->keys[i - 1]))) / 3;
+}
+
+static ast_status octree_count_cells_task(int64_t chunk, void *context) {
+  const octree_cells_job *s = context;
+  octree_chunk count = {.next = {0}};
+  int64_t b = octree_scene_of(s->offsets, s->B, chunk * OCTREE_CHUNK);
+  for (int64_t i = chunk * OCTREE_CHUNK; i < min64(s->C, (chunk + 1) * OCTREE_CHUNK); i++) {
+    while (s->offsets[b + 1] <= i) b++;
+    count.next[octree_starts(s, i, b)]++;
+  }
+  s->chunks[chunk] = count;
+  return AST_OK;
+}
+
+static ast_status octree_write_cells_task(int64_t chunk, void *context) {
+  const octree_cells_job *s = context;
+  octree_chunk own = s->chunks[chunk];
+  int64_t begin[OCTREE_LEVELS], b = octree_scene_of(s->offsets, s->B, chunk * OCTREE_CHUNK);
+  memcpy(begin, own.next, sizeof begin);
+  for (int64_t i = chunk * OCTREE_CHUNK; i < min64(s->C, (chunk + 1) * OCTREE_CHUNK); i++) {
+    while (s->offsets[b + 1] <= i) b++;
+    const int starts = octree_starts(s, i, b);
+    int64_t key = s->keys[i], child = i;
+    for (int j = 1; j <= starts; j++) {
+      const int64_t P = own.next[j]++;
+      s->level[j].families[P] = child << 8 | 1 << (key & 7);
+      key >>= 3;
+      if (j <= s->levels) s->level[j].keys[P] = key;
+      child = P;
+    }
+    if (starts == s->root) continue;
+    const int64_t parent = own.next[starts + 1] - 1;
+    if (parent >= begin[starts + 1]) s->level[starts + 1].families[parent] |= 1 << (key & 7);
+    else own.before[starts + 1] |= (uint8_t)(1 << (key & 7));
+  }
+  memcpy(s->chunks[chunk].before, own.before, sizeof own.before);
+  return AST_OK;
+}
+
+/* The level whose cells all have key 0, but at least `levels`. */
+static int octree_root(const int64_t *keys, const int64_t *offsets, int64_t B, int levels) {
+  int root = levels;
+  for (int64_t b = 0; b < B; b++)
+    while (offsets[b] < offsets[b + 1] && root < 21 && keys[offsets[b + 1] - 1] >> 3 * root) root++;
+  return root;
+}
+
+/* Turns the counts of the chunks into places: a cell with q starts cells of the levels 1..q. C[j] becomes the cells of level j. */
+static void octree_places(octree_chunk *chunks, int64_t num, int root, int64_t C[OCTREE_LEVELS]) {
+  memset(C, 0, OCTREE_LEVELS * sizeof *C);
+  for (int64_t chunk = 0; chunk < num; chunk++) {
+    int64_t starts = 0;
+    for (int j = root; j > 0; j--) {
+      starts += chunks[chunk].next[j];
+      chunks[chunk].next[j] = C[j];
+      C[j] += starts;
+    }
+  }
+}
+
+/* The first cell of each scene: of the cells above those of the finer level. */
+static void octree_scene_offsets(const ast_octree_level *s, const int64_t *fine_offsets) {
+  for (int64_t b = 0, low = 0; b <= s->B; b++) {
+    for (int64_t high = s->C; low < high;) {
+      const int64_t middle = (low + high) / 2;
+      if (octree_first(s->families[middle]) < fine_offsets[b]) low = middle + 1;
+      else high = middle;
+    }
+    s->offsets[b] = low;
+  }
+}
+
+/* ---- neighbours ---- */
+
+typedef int64_t octree_families __attribute__((vector_size(64)));
+typedef int32_t octree_cells __attribute__((vector_size(32), aligned(4), may_alias));
+typedef uint8_t octree_bytes __attribute__((vector_size(8)));
+
+/* How each octant moves by -d, for all d: byte d of a word, item d of a vector. */
+typedef struct {
+  uint64_t keep[8], copies[8]; /* (families & keep) * copies: byte d & ~octant comes to byte d */
+  uint64_t at[8], below[8];    /* bit octant ^ d, and all bits below it */
+  octree_cells from[8];        /* d & ~octant */
+} octree_moves;
+
+static octree_moves octree_all_moves(void) {
+  octree_moves m = {.keep = {0}};
+  for (int octant = 0; octant < 8; octant++)
+    for (int d = 0; d < 8; d++) {
+      if (!(d & octant)) m.keep[octant] |= 255ull << 8 * d;
+      if (!(d & ~octant)) m.copies[octant] |= 1ull << 8 * d;
+      m.at[octant] |= 1ull << (8 * d + (octant ^ d));
+      m.below[octant] |= ((1ull << (octant ^ d)) - 1) << 8 * d;
+      m.from[octant][d] = d & ~octant;
+    }
+  return m;
+}
+
+/* The number of bits in each byte. */
+AST_INLINE uint64_t octree_bits_of_bytes(uint64_t x) {
+  x -= x >> 1 & 0x5555555555555555;
+  x = (x & 0x3333333333333333) + (x >> 2 & 0x3333333333333333);
+  return (x + (x >> 4)) & 0x0f0f0f0f0f0f0f0f;
+}
+
+/* Of a cell and the cells before it, byte and item d for that at -d: the octants of the children, 0 if there is none, and the first. */
+AST_INLINE uint64_t octree_families_of(const ast_octree_level *s, int64_t P, octree_cells *first) {
+  octree_families families = {s->families[P]};
+  if (s->near[P])
+    for (int d = 1; d < 8; d++) families[d] = s->families[s->before[P][d]];
+  *first = __builtin_convertvector(families >> 8, octree_cells);
+  return (uint64_t)__builtin_convertvector(families, octree_bytes);
+}
+
+/* Places 8d + octant of the pairs of a coarse cell with the children of the cells before it: d is not 0, and the octant has its bits. */
+static const uint64_t octree_pair_places = 0x80c0a0f088ccaa00;
+
+/* The kernel offset of a pair (pairs.c) at place 8d + octant. */
+AST_INLINE int octree_group(int place) {
+  const int octant = place & 7, d = place >> 3;
+  return 9 * ((octant >> 2) - 2 * (d >> 2) + 1) + 3 * ((octant >> 1 & 1) - 2 * (d >> 1 & 1) + 1) + (octant & 1) - 2 * (d & 1) + 1;
+}
+
+typedef struct {
+  const ast_octree_level *level, *finer; /* the neighbours at `finer` follow from those at `level`; NULL: no need of them */
+  octree_moves moves;
 } octree_neighbour_job;
 
-static octree_block_layout octree_layout(void) {
-  octree_block_layout layout;
-  for (unsigned key = 0; key < BLOCK_CELLS; key++) {
-    const unsigned x = (unsigned)octree_gather(key >> 2), y = (unsigned)octree_gather(key >> 1), z = (unsigned)octree_gather(key);
-    layout.place[key] = (int16_t)(81 * (x + 1) + 9 * (y + 1) + z + 1);
-    layout.low[key] = (uint8_t)((x == 0) << 2 | (y == 0) << 1 | (z == 0));
-    layout.high[key] = (uint8_t)((x == 7) << 2 | (y == 7) << 1 | (z == 7));
+/* The cells before the children of P. */
+AST_INLINE void octree_settle(const octree_neighbour_job *job, uint64_t families, octree_cells first) {
+  int64_t f = first[0];
+  for (unsigned octants = (unsigned)families & 255; octants; octants &= octants - 1, f++) {
+    const int octant = __builtin_ctz(octants);
+    const uint64_t moved = (families & job->moves.keep[octant]) * job->moves.copies[octant], found = moved & job->moves.at[octant];
+    const octree_bytes earlier = (octree_bytes)octree_bits_of_bytes(moved & job->moves.below[octant]);
+    const octree_cells cells = __builtin_shuffle(first, job->moves.from[octant]) + __builtin_convertvector(earlier, octree_cells);
+    const octree_cells none = __builtin_convertvector((octree_bytes)found, octree_cells) == 0;
+    *(octree_cells *)job->finer->before[f] = cells | none;
+    job->finer->near[f] = found >> 8 != 0;
   }
-  for (int d = 0; d < 8; d++) layout.step[d] = (int16_t)(81 * (d >> 2) + 9 * (d >> 1 & 1) + (d & 1));
-  return layout;
-}
-
-/* The first i in [low, high) with keys[i] >= key, else high; steps of doubling length from `near` find it fast if it is close. */
-static int64_t octree_search(const int64_t *keys, int64_t low, int64_t high, int64_t key, int64_t near) {
-  near = max64(low, min64(near, high));
-  int64_t step = 1;
-  if (near < high && keys[near] < key) {
-    low = near + 1;
-    while (high - low >= step && keys[low + step - 1] < key) {
-      low += step;
-      step *= 2;
-    }
-    high = min64(high, low + step - 1);
-  } else {
-    high = near;
-    while (high - low >= step && keys[high - step] >= key) {
-      high -= step;
-      step *= 2;
-    }
-    low = max64(low, high - step + 1);
-  }
-  while (low < high) {
-    const int64_t middle = low + (high - low) / 2;
-    if (keys[middle] < key) low = middle + 1;
-    else high = middle;
-  }
-  return low;
-}
-
-/* The key of the block at -(i,j,k), d = 4i + 2j + k, or -1 if that is outside the grid. */
-static int64_t octree_block_before(int64_t block, int d) {
-  const uint64_t key = (uint64_t)block;
-  uint64_t before = 0;
-  for (int axis = 0; axis < 3; axis++) {
-    const uint64_t mask = 0x1249249249249249ull << axis, part = key & mask;
-    if (d >> axis & 1 && !part) return -1;
-    before |= d >> axis & 1 ? (part - (1ull << axis)) & mask : part;
-  }
-  return (int64_t)before;
-}
-
-/* Enters the layers of earlier blocks that the cells of this one look into. Returns the number of places filled. */
-static int octree_enter_layers(const octree_neighbour_job *s, int64_t block, unsigned looked_into, int64_t scene_begin, int64_t block_begin,
-                               int64_t near[8], int64_t table[BLOCK_TABLE], int16_t filled[BLOCK_TABLE]) {
-  int num = 0;
-  for (int d = 1; d < 8; d++) {
-    if (!(looked_into >> d & 1)) continue;
-    const int64_t before = octree_block_before(block, d);
-    if (before < 0) continue;
-    int64_t c = near[d] = octree_search(s->keys, scene_begin, block_begin, before << BLOCK_BITS, near[d]);
-    for (; c < block_begin && s->keys[c] >> BLOCK_BITS == before; c++) {
-      const int64_t in_block = s->keys[c] & (BLOCK_CELLS - 1);
-      if ((s->layout->high[in_block] & d) != d) continue;
-      const int16_t place = (int16_t)(s->layout->place[in_block] - 8 * s->layout->step[d]);
-      table[place] = c;
-      filled[num++] = place;
-    }
-  }
-  return num;
 }
 
 static ast_status octree_neighbour_task(int64_t chunk, void *context) {
-  const octree_neighbour_job *s = context;
-  const octree_block_layout *layout = s->layout;
-  const int64_t chunk_end = min64(s->C, (chunk + 1) * OCTREE_CHUNK);
-  int64_t b = octree_scene_of(s->offsets, s->B, chunk * OCTREE_CHUNK);
-  int64_t table[BLOCK_TABLE], near[8];
-  int16_t filled[BLOCK_TABLE];
-  for (int i = 0; i < BLOCK_TABLE; i++) table[i] = -1;
-  for (int d = 0; d < 8; d++) near[d] = chunk * OCTREE_CHUNK;
-  for (int64_t c = chunk * OCTREE_CHUNK, end; c < chunk_end; c = end) {
-    while (s->offsets[b + 1] <= c) b++;
-    const int64_t block = s->keys[c] >> BLOCK_BITS, scene_end = min64(chunk_end, s->offsets[b + 1]);
-    int64_t begin = c;
-    while (begin > s->offsets[b] && s->keys[begin - 1] >> BLOCK_BITS == block) begin--;
-    unsigned looked_into = 0; /* bit d: some cell's neighbour at some (i,j,k) lies in the block at -(i',j',k') = d */
-    for (end = begin; end < scene_end && s->keys[end] >> BLOCK_BITS == block; end++) {
-      const int64_t in_block = s->keys[end] & (BLOCK_CELLS - 1);
-      table[layout->place[in_block]] = end;
-      if (end >= c)
-        for (int d = 1; d < 8; d++) looked_into |= (unsigned)((layout->low[in_block] & d) == d) << d;
+  const octree_neighbour_job *job = context;
+  const ast_octree_level *s = job->level;
+  int64_t count[64] = {0};
+  for (int64_t P = chunk * OCTREE_CHUNK; P < min64(s->C, (chunk + 1) * OCTREE_CHUNK); P++) {
+    const unsigned octants = octree_octants(s->families[P]);
+    if (!s->near[P] && !(octants & (octants - 1))) {
+      count[__builtin_ctz(octants)]++;
+      if (job->finer) job->finer->near[octree_first(s->families[P])] = 0;
+      continue;
     }
-    const int num = octree_enter_layers(s, block, looked_into, s->offsets[b], begin, near, table, filled);
-    for (int64_t i = c; i < end; i++)
-      for (int d = 0; d < 8; d++) s->neighbours[8 * i + d] = table[layout->place[s->keys[i] & (BLOCK_CELLS - 1)] - layout->step[d]];
-    for (int64_t i = begin; i < end; i++) table[layout->place[s->keys[i] & (BLOCK_CELLS - 1)]] = -1;
-    for (int i = 0; i < num; i++) table[filled[i]] = -1;
+    octree_cells first;
+    const uint64_t families = octree_families_of(s, P, &first);
+    for (uint64_t places = (families & octree_pair_places) | octants; places; places &= places - 1) count[__builtin_ctzll(places)]++;
+    if (job->finer) octree_settle(job, families, first);
   }
+  for (int place = 0; s->pairs && place < 64; place++)
+    if ((octree_pair_places | 255) >> place & 1) s->pairs[OCTREE_GROUPS * chunk + octree_group(place)] = count[place];
   return AST_OK;
 }
 
-/* ---- pairs ---- */
+/* ---- all levels ---- */
 
-/* Along one axis fine = 2P + a has a = 0 if fine is even, and a = +1 (P its parent) or -1 (P the parent's successor) if it is odd.
- * So the coarse cell P pairs with the child `octant` of the cell Q at P - (i,j,k) if the octant has the bits (i,j,k), at
- * (a,b,c) = octant - 2 (i,j,k). */
-enum { OCTREE_GROUPS = 27 };
+static int64_t octree_level_bytes(int64_t C, int64_t B) { return 8 * (2 * C + B + 3) + 32 * C + round_up(C, 8); }
 
-typedef struct {
-  const int64_t *keys, *first_child;
-  const int64_t *before, *after; /* [C,8]: the coarse cells at -(i,j,k) and at +(i,j,k), or -1 */
-  int64_t C;
-  int64_t *counts; /* [2, chunks, 27]: pairs of each chunk, by coarse and by fine cell; then where they go */
-  int64_t *fine[2], *coarse[2];
-} octree_pair_job;
-
-/* The kernel offset of child `octant` at (i,j,k), or -1. */
-AST_INLINE int octree_group(int octant, int d) {
-  if ((octant & d) != d) return -1;
-  const int a = (octant >> 2) - 2 * (d >> 2), b = (octant >> 1 & 1) - 2 * (d >> 1 & 1), c = (octant & 1) - 2 * (d & 1);
-  return 9 * (a + 1) + 3 * (b + 1) + (c + 1);
+/* Takes room for C cells out of `memory`; returns what is left. */
+static char *octree_place_level(ast_octree_level *s, int64_t C, int64_t B, int64_t C_fine, char *memory) {
+  *s = (ast_octree_level){.C = C, .C_fine = C_fine, .B = B, .keys = (int64_t *)memory};
+  s->offsets = s->keys + C;
+  s->families = s->offsets + B + 2;
+  s->families[-1] = 0; /* of the cell that is not there */
+  s->families[C] = C_fine << 8;
+  s->before = (int32_t (*)[8])(s->families + C + 1);
+  s->near = (uint8_t *)(s->before + C);
+  return memory + octree_level_bytes(C, B);
 }
 
-typedef struct {
-  int8_t of[8][8]; /* [octant][d] */
-} octree_group_table;
-
-static octree_group_table octree_groups(void) {
-  octree_group_table groups;
-  for (int octant = 0; octant < 8; octant++)
-    for (int d = 0; d < 8; d++) groups.of[octant][d] = (int8_t)octree_group(octant, d);
-  return groups;
-}
-
-/* The pairs of a chunk with P rising: next[k] goes up by one for each of group k. */
-AST_INLINE void octree_pairs_by_coarse(const octree_pair_job *s, int64_t chunk, int64_t *next, const bool write) {
-  const octree_group_table groups = octree_groups();
-  for (int64_t P = chunk * OCTREE_CHUNK; P < min64(s->C, (chunk + 1) * OCTREE_CHUNK); P++)
-    for (int d = 0; d < 8; d++) {
-      const int64_t Q = s->before[8 * P + d];
-      if (Q < 0) continue;
-      for (int64_t f = s->first_child[Q]; f < s->first_child[Q + 1]; f++) {
-        const int k = groups.of[s->keys[f] & 7][d];
-        if (k < 0) continue;
-        const int64_t to = next[k]++;
-        if (write) s->fine[0][to] = f;
-        if (write) s->coarse[0][to] = P;
-      }
-    }
-}
-
-/* The same pairs for a chunk of parents Q, with the fine cell rising. */
-AST_INLINE void octree_pairs_by_fine(const octree_pair_job *s, int64_t chunk, int64_t *next, const bool write) {
-  const octree_group_table groups = octree_groups();
-  for (int64_t Q = chunk * OCTREE_CHUNK; Q < min64(s->C, (chunk + 1) * OCTREE_CHUNK); Q++)
-    for (int64_t f = s->first_child[Q]; f < s->first_child[Q + 1]; f++) {
-      const int octant = (int)(s->keys[f] & 7);
-      for (int d = octant;; d = (d - 1) & octant) { /* all subsets of its bits */
-        const int64_t P = s->after[8 * Q + d];
-        if (P >= 0) {
-          const int64_t to = next[groups.of[octant][d]]++;
-          if (write) s->fine[1][to] = f;
-          if (write) s->coarse[1][to] = P;
-        }
-        if (d == 0) break;
-      }
-    }
-}
-
-/* Tasks: the chunks by coarse cell, then those by fine cell. */
-static ast_status octree_count_pairs_task(int64_t index, void *context) {
-  const octree_pair_job *s = context;
+/* The cells of all levels up to the root, of which `level` gets all, [root + 1]. */
+static ast_status octree_all_cells(octree_cells_job *s, ast_octree_level *level) {
   const int64_t chunks = octree_chunks(s->C);
-  int64_t count[OCTREE_GROUPS] = {0};
-  if (index < chunks) octree_pairs_by_coarse(s, index, count, false);
-  else octree_pairs_by_fine(s, index - chunks, count, false);
-  memcpy(s->counts + OCTREE_GROUPS * index, count, sizeof count);
+  if (s->C > OCTREE_MAX_CELLS) return AST_TOO_LARGE;
+  s->chunks = ast_scratch(2, chunks * (int64_t)sizeof *s->chunks);
+  if (!s->chunks) return AST_NO_MEMORY;
+  ast_parallel(chunks, octree_count_cells_task, s);
+  int64_t C[OCTREE_LEVELS], bytes = 0;
+  octree_places(s->chunks, chunks, s->root, C);
+  for (int j = 1; j <= s->root; j++) bytes += octree_level_bytes(C[j], s->B);
+  char *memory = ast_scratch(1, bytes);
+  if (!memory) return AST_NO_MEMORY;
+  C[0] = s->C;
+  for (int j = 1; j <= s->root; j++) memory = octree_place_level(&level[j], C[j], s->B, C[j - 1], memory);
+  ast_parallel(chunks, octree_write_cells_task, s);
+  for (int64_t chunk = 1; chunk < chunks; chunk++)
+    for (int j = 1; j <= s->root; j++)
+      if (s->chunks[chunk].before[j]) level[j].families[s->chunks[chunk].next[j] - 1] |= s->chunks[chunk].before[j];
+  for (int j = 1; j <= s->levels; j++) octree_scene_offsets(&level[j], j == 1 ? s->offsets : level[j - 1].offsets);
   return AST_OK;
 }
 
-static ast_status octree_write_pairs_task(int64_t index, void *context) {
-  const octree_pair_job *s = context;
-  const int64_t chunks = octree_chunks(s->C);
-  int64_t *next = s->counts + OCTREE_GROUPS * index;
-  if (index < chunks) octree_pairs_by_coarse(s, index, next, true);
-  else octree_pairs_by_fine(s, index - chunks, next, true);
-  return AST_OK;
-}
-
-static ast_status octree_coarsen(const int64_t *restrict keys, const int64_t *restrict offsets, int64_t B, int64_t *restrict coarse_keys,
-                                 int64_t *restrict coarse_offsets, int64_t *restrict first_child, int64_t *restrict neighbours,
-                                 int64_t *restrict pair_offsets) {
-  ast_status status = octree_runs((const uint64_t *)keys, 3, offsets, B, coarse_keys, first_child, coarse_offsets);
-  if (status != AST_OK) return status;
-  const int64_t C = coarse_offsets[B], chunks = octree_chunks(C);
-  const octree_block_layout layout = octree_layout();
-  octree_neighbour_job neighbour = {coarse_keys, coarse_offsets, B, C, &layout, neighbours};
-  ast_parallel(chunks, octree_neighbour_task, &neighbour);
-
-  octree_pair_job pair = {.keys = keys, .first_child = first_child, .before = neighbours, .C = C};
-  pair.counts = ast_scratch(2, (OCTREE_GROUPS * chunks + 1) * (int64_t)sizeof *pair.counts);
-  if (!pair.counts) return AST_NO_MEMORY;
-  ast_parallel(chunks, octree_count_pairs_task, &pair);
-  pair_offsets[0] = 0;
+/* The place of each chunk's pairs in each group, from their numbers, and the offsets of the groups. */
+static void octree_pair_offsets(ast_octree_level *s) {
+  s->pair_offsets[0] = 0;
   for (int k = 0; k < OCTREE_GROUPS; k++) {
-    pair_offsets[k + 1] = pair_offsets[k];
-    for (int64_t i = 0; i < chunks; i++) pair_offsets[k + 1] += pair.counts[OCTREE_GROUPS * i + k];
-  }
-  return AST_OK;
-}
-
-typedef struct {
-  const int64_t *before;
-  int64_t C;
-  int64_t *after;
-} octree_after_job;
-
-/* Q = before[P][d] means P = after[Q][d]: each entry of `after` has at most one writer. */
-static ast_status octree_after_task(int64_t chunk, void *context) {
-  const octree_after_job *s = context;
-  for (int64_t i = 8 * chunk * OCTREE_CHUNK; i < 8 * min64(s->C, (chunk + 1) * OCTREE_CHUNK); i++)
-    if (s->before[i] >= 0) s->after[8 * s->before[i] + (i & 7)] = i >> 3;
-  return AST_OK;
-}
-
-static ast_status octree_pairs(const int64_t *restrict keys, const int64_t *restrict first_child, const int64_t *restrict neighbours,
-                               int64_t C_coarse, const int64_t *restrict pair_offsets, int64_t *restrict fine, int64_t *restrict coarse,
-                               int64_t *restrict fine_by_fine, int64_t *restrict coarse_by_fine) {
-  const int64_t chunks = octree_chunks(C_coarse);
-  if (chunks == 0) return AST_OK;
-  octree_after_job after = {neighbours, C_coarse, ast_scratch(1, 8 * C_coarse * (int64_t)sizeof(int64_t))};
-  octree_pair_job pair = {keys,
-                          first_child,
-                          neighbours,
-                          after.after,
-                          C_coarse,
-                          ast_scratch(2, 2 * OCTREE_GROUPS * chunks * (int64_t)sizeof(int64_t)),
-                          {fine, fine_by_fine},
-                          {coarse, coarse_by_fine}};
-  if (!after.after || !pair.counts) return AST_NO_MEMORY;
-  memset(after.after, 0xff, 8 * (size_t)C_coarse * sizeof *after.after); /* -1 */
-  ast_parallel(chunks, octree_after_task, &after);
-  ast_parallel(2 * chunks, octree_count_pairs_task, &pair);
-  for (int list = 0; list < 2; list++)
-    for (int k = 0; k < OCTREE_GROUPS; k++) {
-      int64_t next = pair_offsets[k];
-      for (int64_t i = list * chunks; i < (list + 1) * chunks; i++) {
-        const int64_t here = pair.counts[OCTREE_GROUPS * i + k];
-        pair.counts[OCTREE_GROUPS * i + k] = next;
-        next += here;
-      }
-      if (next != pair_offsets[k + 1]) return AST_MISMATCH;
+    int64_t next = s->pair_offsets[k];
+    for (int64_t chunk = 0; chunk < octree_chunks(s->C); chunk++) {
+      const int64_t here = s->pairs[OCTREE_GROUPS * chunk + k];
+      s->pairs[OCTREE_GROUPS * chunk + k] = next;
+      next += here;
     }
-  return ast_parallel(2 * chunks, octree_write_pairs_task, &pair);
+    s->pair_offsets[k + 1] = next;
+  }
+}
+
+static ast_status octree_coarsen(const int64_t *restrict keys, const int64_t *restrict offsets, int64_t B, int levels,
+                                 ast_octree_level *restrict coarser) {
+  ast_octree_level level[OCTREE_LEVELS];
+  octree_cells_job cells = {keys, offsets, B, offsets[B], octree_root(keys, offsets, B, levels), levels, NULL, level};
+  const ast_status status = octree_all_cells(&cells, level);
+  if (status != AST_OK) return status;
+  int64_t counts = 0;
+  for (int j = 1; j <= levels; j++) counts += OCTREE_GROUPS * octree_chunks(level[j].C);
+  int64_t *memory = ast_scratch(4, counts * (int64_t)sizeof *memory);
+  if (!memory) return AST_NO_MEMORY;
+  for (int j = 1; j <= levels; memory += OCTREE_GROUPS * octree_chunks(level[j++].C)) level[j].pairs = memory;
+  if (cells.root > 0) memset(level[cells.root].near, 0, (size_t)level[cells.root].C);
+  for (int j = cells.root; j > 0; j--) {
+    octree_neighbour_job neighbour = {&level[j], j > 1 ? &level[j - 1] : NULL, octree_all_moves()};
+    ast_parallel(octree_chunks(level[j].C), octree_neighbour_task, &neighbour);
+    if (j <= levels) octree_pair_offsets(&level[j]);
+  }
+  memcpy(coarser, level + 1, (size_t)levels * sizeof *coarser);
+  return AST_OK;
 }

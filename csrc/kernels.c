@@ -8,7 +8,8 @@
 #include "attention_backward.c"
 #include "fps.c"
 #include "octree.c"
-#include "coarsen.c" /* after octree.c, whose runs it uses */
+#include "coarsen.c" /* after octree.c, whose chunks it uses */
+#include "pairs.c"   /* after coarsen.c, whose levels it counts */
 #include "segment.c"
 #include "sparse_conv.c"
 #include "message.c"
@@ -32,7 +33,7 @@ const ast_kernels AST_TABLE(AST_ISA) = {
     .octree_build = octree_build,
     .octree_coordinates = octree_coordinates,
     .octree_coarsen = octree_coarsen,
-    .octree_pairs = octree_pairs,
+    .octree_write_level = octree_write_level,
     .farthest_point_sample = farthest_point_sample,
     .sparse_conv = sparse_conv,
     .sparse_conv_weight = sparse_conv_weight,

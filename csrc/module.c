@@ -3,6 +3,16 @@
 
 static const ast_kernels *kernels;
 
+static int64_t *ints_of(PyObject *array) { return PyArray_DATA((PyArrayObject *)array); }
+
+/* A new array, filled with -1 in debug mode: for outputs whose sizes follow from the values of the inputs. */
+static PyObject *new_ints(int64_t length) {
+  npy_intp shape[1] = {(npy_intp)length};
+  PyObject *array = PyArray_SimpleNew(1, shape, INTS);
+  if (array && debug) memset(ints_of(array), 0xff, (size_t)length * sizeof(int64_t));
+  return array;
+}
+
 /* ---- segments ---- */
 
 static PyObject *segment(const char *op, PyObject *const *objects, Py_ssize_t num, bool spread) {
@@ -112,51 +122,55 @@ static PyObject *octree_coordinates(PyObject *self, PyObject *const *objects, Py
   Py_RETURN_NONE;
 }
 
+/* Of a level: keys, cell_offsets, first_child, node_cell, pair_offsets, fine, coarse, fine_by_fine, coarse_by_fine. Their sizes are known
+ * only half-way, so they are made here. */
+enum { LEVEL_ARRAYS = 9 };
+
+/* Puts the arrays of a level into the list, from `at` on; false with an exception set if there is no memory. */
+static bool append_level(PyObject *list, const ast_octree_level *level, Py_ssize_t at) {
+  const int64_t pairs = level->pair_offsets[27];
+  const int64_t lengths[LEVEL_ARRAYS] = {level->C, level->B + 1, level->C + 1, level->C_fine, 28, pairs, pairs, pairs, pairs};
+  int64_t *data[LEVEL_ARRAYS];
+  for (int i = 0; i < LEVEL_ARRAYS; i++) {
+    PyObject *array = new_ints(lengths[i]);
+    if (!array) return false;
+    data[i] = ints_of(array);
+    if (PyList_SetItem(list, at + i, array)) return false;
+  }
+  memcpy(data[4], level->pair_offsets, sizeof level->pair_offsets);
+  Py_BEGIN_ALLOW_THREADS;
+  kernels->octree_write_level(level, data[0], data[1], data[2], data[3], data[5], data[6], data[7], data[8]);
+  Py_END_ALLOW_THREADS;
+  return true;
+}
+
+/* The list, filled, or NULL. It exists before the first kernel runs, and arrays are no objects of the garbage collector: so no Python
+ * code can use the thread's scratch memory while the levels lie there. */
+static PyObject *fill_levels(call *c, const argument *keys, const argument *offsets, int levels, PyObject *list) {
+  ast_octree_level level[21];
+  ast_status status;
+  KERNEL(*c, status, kernels->octree_coarsen(keys->data, offsets->data, offsets->shape[0] - 1, levels, level));
+  if (status == AST_TOO_LARGE) {
+    fail(c, PyExc_ValueError, "keys must be fewer than 2^31, not %lld", (long long)keys->shape[0]);
+    return NULL;
+  }
+  for (int j = 0; j < levels; j++)
+    if (!append_level(list, &level[j], (Py_ssize_t)j * LEVEL_ARRAYS)) return NULL;
+  return list;
+}
+
 static PyObject *octree_coarsen(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
   (void)self;
   call c;
-  argument *keys, *offsets, *coarse_keys, *coarse_offsets, *first_child, *neighbours, *pair_offsets;
-  ast_status status;
-  if (!start(&c, "octree_coarsen", objects, num, 7) || !(keys = IN(&c, "keys", INTS, 1, FREE)) ||
-      !(offsets = IN(&c, "cell_offsets", INTS, 1, FREE)) || !check_offsets(&c, offsets, keys->shape[0]) || !check_keys(&c, keys, offsets) ||
-      !(coarse_keys = OUT(&c, "coarse_keys", INTS, 1, keys->shape[0])) ||
-      !(coarse_offsets = OUT(&c, "coarse_offsets", INTS, 1, offsets->shape[0])) ||
-      !(first_child = OUT(&c, "first_child", INTS, 1, keys->shape[0] + 1)) ||
-      !(neighbours = OUT(&c, "neighbours", INTS, 2, keys->shape[0], (int64_t)8)) ||
-      !(pair_offsets = OUT(&c, "pair_offsets", INTS, 1, (int64_t)28)))
+  argument *keys, *offsets;
+  int64_t levels;
+  if (!start(&c, "octree_coarsen", objects, num, 3) || !(keys = IN(&c, "keys", INTS, 1, FREE)) ||
+      !(offsets = IN(&c, "cell_offsets", INTS, 1, FREE)) || !take_int(&c, "levels", 0, 21, &levels) ||
+      !check_offsets(&c, offsets, keys->shape[0]) || !check_keys(&c, keys, offsets))
     return NULL;
-  KERNEL(c, status,
-         kernels->octree_coarsen(keys->data, offsets->data, offsets->shape[0] - 1, coarse_keys->data, coarse_offsets->data,
-                                 first_child->data, neighbours->data, pair_offsets->data));
-  Py_RETURN_NONE;
-}
-
-static PyObject *octree_pairs(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
-  (void)self;
-  call c;
-  argument *keys, *first_child, *neighbours, *pair_offsets, *out[4];
-  ast_status status;
-  if (!start(&c, "octree_pairs", objects, num, 8) || !(keys = IN(&c, "keys", INTS, 1, FREE)) ||
-      !(first_child = IN(&c, "first_child", INTS, 1, FREE)) || !check_offsets(&c, first_child, keys->shape[0]) ||
-      !(neighbours = IN(&c, "neighbours", INTS, 2, first_child->shape[0] - 1, (int64_t)8)) ||
-      !(pair_offsets = IN(&c, "pair_offsets", INTS, 1, (int64_t)28)))
-    return NULL;
-  const int64_t *pairs = pair_offsets->data, *near = neighbours->data;
-  if (!check_offsets(&c, pair_offsets, pairs[27])) return NULL;
-  for (int64_t i = 0; i < 8 * neighbours->shape[0]; i++)
-    if (near[i] < -1 || near[i] >= neighbours->shape[0]) {
-      fail(&c, PyExc_ValueError, "neighbours[%lld] holds %lld, which is no coarse cell", (long long)(i / 8), (long long)near[i]);
-      return NULL;
-    }
-  static const char *const names[4] = {"fine", "coarse", "fine_by_fine", "coarse_by_fine"};
-  for (int i = 0; i < 4; i++)
-    if (!(out[i] = OUT(&c, names[i], INTS, 1, pairs[27]))) return NULL;
-  KERNEL(c, status,
-         kernels->octree_pairs(keys->data, first_child->data, neighbours->data, first_child->shape[0] - 1, pairs, out[0]->data,
-                               out[1]->data, out[2]->data, out[3]->data));
-  if (status == AST_OK) Py_RETURN_NONE;
-  fail(&c, PyExc_ValueError, "pair_offsets are not those of the neighbours");
-  return NULL;
+  PyObject *list = PyList_New((Py_ssize_t)levels * LEVEL_ARRAYS);
+  if (list && !fill_levels(&c, keys, offsets, (int)levels, list)) Py_CLEAR(list);
+  return list;
 }
 
 /* ---- farthest point sampling ---- */
@@ -176,29 +190,46 @@ static int64_t too_wide(const int32_t *coordinates, const int64_t *offsets, int6
   return -1;
 }
 
+/* Where the samples of each scene go: min(num, points) of each. */
+static PyObject *sample_offsets(const int64_t *offsets, int64_t B, int64_t num) {
+  PyObject *array = new_ints(B + 1);
+  if (!array) return NULL;
+  int64_t *out = ints_of(array);
+  out[0] = 0;
+  for (int64_t b = 0; b < B; b++) {
+    const int64_t points = offsets[b + 1] - offsets[b];
+    out[b + 1] = out[b] + (points < num ? points : num);
+  }
+  return array;
+}
+
+/* Both arrays, the indices filled, or NULL. */
+static PyObject *sample_into(call *c, const argument *coordinates, const argument *offsets, int64_t num, PyObject *indices,
+                             PyObject *out_offsets) {
+  const int64_t B = offsets->shape[0] - 1;
+  ast_status status;
+  KERNEL(*c, status, kernels->farthest_point_sample(coordinates->data, offsets->data, B, num, ints_of(out_offsets), ints_of(indices)));
+  if (status == AST_OK) return Py_BuildValue("OO", indices, out_offsets);
+  const int64_t scene = too_wide(coordinates->data, offsets->data, B);
+  fail(c, PyExc_ValueError, "coordinates of scene %lld differ by 2^21 or more", (long long)scene);
+  return NULL;
+}
+
 static PyObject *farthest_point_sample(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
   (void)self;
   call c;
-  argument *coordinates, *offsets, *out_offsets, *indices;
-  int64_t tokens;
-  ast_status status;
-  if (!start(&c, "farthest_point_sample", objects, num, 5) || !(coordinates = IN(&c, "coordinates", SMALL_INTS, 2, FREE, (int64_t)3)) ||
+  argument *coordinates, *offsets;
+  int64_t samples;
+  if (!start(&c, "farthest_point_sample", objects, num, 3) || !(coordinates = IN(&c, "coordinates", SMALL_INTS, 2, FREE, (int64_t)3)) ||
       !(offsets = IN(&c, "offsets", INTS, 1, FREE)) || !check_offsets(&c, offsets, coordinates->shape[0]) ||
-      !take_int(&c, "num", 1, INT64_MAX, &tokens) || !(out_offsets = IN(&c, "out_offsets", INTS, 1, offsets->shape[0])))
+      !take_int(&c, "num", 1, INT64_MAX, &samples))
     return NULL;
-  const int64_t *from = offsets->data, *to = out_offsets->data, B = offsets->shape[0] - 1;
-  for (int64_t b = 0; b < B; b++) {
-    const int64_t points = from[b + 1] - from[b];
-    if (to[0] == 0 && to[b + 1] - to[b] == (points < tokens ? points : tokens)) continue;
-    fail(&c, PyExc_ValueError, "out_offsets must hold min(num, points) rows for scene %lld", (long long)b);
-    return NULL;
-  }
-  if (!(indices = OUT(&c, "indices", INTS, 1, to[B]))) return NULL;
-  KERNEL(c, status, kernels->farthest_point_sample(coordinates->data, from, B, tokens, to, indices->data));
-  if (status == AST_OK) Py_RETURN_NONE;
-  const int64_t scene = too_wide(coordinates->data, from, B);
-  fail(&c, PyExc_ValueError, "coordinates of scene %lld differ by 2^21 or more", (long long)scene);
-  return NULL;
+  PyObject *out_offsets = sample_offsets(offsets->data, offsets->shape[0] - 1, samples);
+  PyObject *indices = out_offsets ? new_ints(ints_of(out_offsets)[offsets->shape[0] - 1]) : NULL;
+  PyObject *result = indices ? sample_into(&c, coordinates, offsets, samples, indices, out_offsets) : NULL;
+  Py_XDECREF(indices);
+  Py_XDECREF(out_offsets);
+  return result;
 }
 
 /* ---- sparse convolution ---- */
@@ -582,9 +613,8 @@ static PyMethodDef methods[] = {
          "octree_build(positions, offsets, cx, cy, cz, half_width, depth, keys, cell_offsets, node_cell, node_order, "
          "node_offsets)"),
     FAST(octree_coordinates, "octree_coordinates(keys, coordinates)"),
-    FAST(octree_coarsen, "octree_coarsen(keys, cell_offsets, coarse_keys, coarse_offsets, first_child, neighbours, pair_offsets)"),
-    FAST(octree_pairs, "octree_pairs(keys, first_child, neighbours, pair_offsets, fine, coarse, fine_by_fine, coarse_by_fine)"),
-    FAST(farthest_point_sample, "farthest_point_sample(coordinates, offsets, num, out_offsets, indices)"),
+    FAST(octree_coarsen, "octree_coarsen(keys, cell_offsets, levels) -> list of nine arrays a level"),
+    FAST(farthest_point_sample, "farthest_point_sample(coordinates, offsets, num) -> (indices, out_offsets)"),
     FAST(sparse_conv, "sparse_conv(x, weight, bias, transposed, pair_offsets, source, destination, out)"),
     FAST(sparse_conv_weight, "sparse_conv_weight(x, dout, pair_offsets, source, destination, dweight)"),
     FAST(attention, "attention(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, out, maximum, sum)"),

@@ -47,11 +47,8 @@ def _sample_reference(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[T
 
 
 def _sample_kernel(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
-    check_offsets("farthest_point_sample", "offsets", offsets, coordinates.shape[0])
-    out_offsets = _out_offsets(offsets, num)
-    indices = offsets.new_empty(int(out_offsets[-1]))
-    library._C.farthest_point_sample(array(coordinates), array(offsets), num, array(out_offsets), array(indices))
-    return indices, out_offsets
+    indices, out_offsets = library._C.farthest_point_sample(array(coordinates), array(offsets), num)
+    return torch.from_numpy(indices), torch.from_numpy(out_offsets)
 
 
 def _sample_fake(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:

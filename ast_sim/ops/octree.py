@@ -51,13 +51,24 @@ class Octree:
         Raises:
             ValueError: at depth 0.
         """
-        if self.depth == 0:
-            raise ValueError("octree: a tree of depth 0 has no coarser level")
-        keys, cell_offsets, node_offsets, node_cell, *pairs = _coarsen(self.keys, self.cell_offsets)
+        return self.coarsen_all(1)[0]
+
+    def coarsen_all(self, levels: int) -> list[CellMap]:
+        """The next coarser levels, each from the one before it; cheaper than one by one.
+
+        Raises:
+            ValueError: unless 0 <= levels <= depth.
+        """
+        if not 0 <= levels <= self.depth:
+            raise ValueError(f"octree: a tree of depth {self.depth} has no coarser level {levels} steps up")
+        parts, maps = _coarsen(self.keys, self.cell_offsets, levels), []
         order = torch.arange(len(self.keys), device=self.keys.device)
-        return CellMap(
-            Octree(keys, cell_offsets, node_cell, order, node_offsets, self.depth - 1), len(self.keys), *pairs
-        )
+        for level in range(levels):
+            keys, cell_offsets, node_offsets, node_cell, *pairs = parts[9 * level : 9 * level + 9]
+            num_fine = node_cell.shape[0]
+            coarse = Octree(keys, cell_offsets, node_cell, order[:num_fine], node_offsets, self.depth - level - 1)
+            maps.append(CellMap(coarse, num_fine, *pairs))
+        return maps
 
 
 @dataclass(frozen=True)
@@ -163,7 +174,7 @@ def _octree_kernel(positions: Tensor, offsets: Tensor, center: Sequence[float], 
     keys, node_cell, node_order = (offsets.new_empty(n) for _ in range(3))
     cell_offsets, node_offsets = torch.empty_like(offsets), offsets.new_empty(n + 1)
     outputs = (keys, cell_offsets, node_cell, node_order, node_offsets)
-    library._C.octree_build(array(positions), array(offsets), *center, half_width, depth, *(array(x) for x in outputs))
+    library._C.octree_build(array(positions), array(offsets), *center, half_width, depth, *(x.numpy() for x in outputs))
     num = int(cell_offsets[-1])
     return keys[:num], cell_offsets, node_offsets[: num + 1], node_cell, node_order
 
@@ -179,7 +190,7 @@ def _coordinates_reference(keys: Tensor) -> Tensor:
 
 def _coordinates_kernel(keys: Tensor) -> Tensor:
     coordinates = keys.new_empty(len(keys), 3, dtype=torch.int32)
-    library._C.octree_coordinates(array(keys), array(coordinates))
+    library._C.octree_coordinates(array(keys), coordinates.numpy())
     return coordinates
 
 
@@ -204,7 +215,15 @@ def _after_reference(keys: Tensor, scenes: Tensor) -> Tensor:
     return torch.where((unique[rank] == wanted) & (place[cell] == wanted_place), cell, -1)
 
 
-def _coarsen_reference(keys: Tensor, cell_offsets: Tensor):
+def _coarsen_reference(keys: Tensor, cell_offsets: Tensor, levels: int) -> list[Tensor]:
+    parts: list[Tensor] = []
+    for _ in range(levels):
+        parts += _coarsen_once(keys, cell_offsets)
+        keys, cell_offsets = parts[-9:-7]
+    return parts
+
+
+def _coarsen_once(keys: Tensor, cell_offsets: Tensor) -> tuple[Tensor, ...]:
     check_offsets("octree_coarsen", "cell_offsets", cell_offsets, len(keys))
     scenes = _scene_of(cell_offsets)
     wrong = keys < 0
@@ -240,27 +259,19 @@ def _coarsen_reference(keys: Tensor, cell_offsets: Tensor):
     )
 
 
-def _coarsen_kernel(keys: Tensor, cell_offsets: Tensor):
-    n, keys, cell_offsets = len(keys), keys.contiguous(), cell_offsets.contiguous()
-    coarse_keys, coarse_offsets = torch.empty_like(keys), torch.empty_like(cell_offsets)
-    first_child, neighbours, pair_offsets = keys.new_empty(n + 1), keys.new_empty(n, 8), keys.new_empty(28)
-    outputs = (coarse_keys, coarse_offsets, first_child, neighbours, pair_offsets)
-    library._C.octree_coarsen(array(keys), array(cell_offsets), *(array(x) for x in outputs))
-    num, num_pairs = int(coarse_offsets[-1]), int(pair_offsets[-1])
-    coarse_keys, first_child = coarse_keys[:num], first_child[: num + 1]
-    pairs = tuple(keys.new_empty(num_pairs) for _ in range(4))
-    library._C.octree_pairs(
-        array(keys), array(first_child), array(neighbours[:num]), array(pair_offsets), *(array(x) for x in pairs)
-    )
-    node_cell = torch.repeat_interleave(first_child.diff(), output_size=n)
-    return coarse_keys, coarse_offsets, first_child, node_cell, pair_offsets, *pairs
+def _coarsen_kernel(keys: Tensor, cell_offsets: Tensor, levels: int) -> list[Tensor]:
+    parts = library._C.octree_coarsen(array(keys), array(cell_offsets), levels)
+    return [torch.from_numpy(part) for part in parts]
 
 
-def _coarsen_fake(keys: Tensor, cell_offsets: Tensor):
-    ctx = torch.library.get_ctx()
-    num, num_pairs = ctx.new_dynamic_size(), ctx.new_dynamic_size()
-    sizes = (num, cell_offsets.shape[0], num + 1, keys.shape[0], 28, *[num_pairs] * 4)
-    return tuple(keys.new_empty(size) for size in sizes)
+def _coarsen_fake(keys: Tensor, cell_offsets: Tensor, levels: int) -> list[Tensor]:
+    ctx, num_fine, parts = torch.library.get_ctx(), keys.shape[0], []
+    for _ in range(levels):
+        num, num_pairs = ctx.new_dynamic_size(), ctx.new_dynamic_size()
+        sizes = (num, cell_offsets.shape[0], num + 1, num_fine, 28, *[num_pairs] * 4)
+        parts += [keys.new_empty(size) for size in sizes]
+        num_fine = num
+    return parts
 
 
 _octree = library.define(
@@ -274,8 +285,7 @@ _coordinates = library.define(
     "octree_coordinates(Tensor keys) -> Tensor", _coordinates_kernel, _coordinates_reference, _coordinates_fake
 )
 _coarsen = library.define(
-    "octree_coarsen(Tensor keys, Tensor cell_offsets)"
-    " -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)",
+    "octree_coarsen(Tensor keys, Tensor cell_offsets, int levels) -> Tensor[]",
     _coarsen_kernel,
     _coarsen_reference,
     _coarsen_fake,

@@ -111,22 +111,17 @@ static outcome octree_build_wide(const ast_kernels *kernels) { return octree_bui
 /* Every fourth cell of a grid, by its keys: several chunks of coarse cells. */
 static outcome octree_coarsen(const ast_kernels *kernels) {
   enum { B = 2, C = 34000 };
-  int64_t *keys = new_ints(C), *offsets = even_offsets(B, C / B), *coarse_keys = new_ints(C), *coarse_offsets = new_ints(B + 1);
-  int64_t *first_child = new_ints(C + 1), *neighbours = new_ints(8 * C), *pair_offsets = new_ints(28);
+  int64_t *keys = new_ints(C), *offsets = even_offsets(B, C / B);
   for (int64_t i = 0; i < C; i++) keys[i] = 4 * (i % (C / B));
-  return FINISH(KERNEL(kernels->octree_coarsen(keys, offsets, B, coarse_keys, coarse_offsets, first_child, neighbours, pair_offsets)),
-                coarse_keys, coarse_offsets, first_child, neighbours, pair_offsets);
-}
-
-/* Coarse cells far from each other, with a child each: the only pairs are those of offset 13. */
-static outcome octree_pairs(const ast_kernels *kernels) {
-  enum { C = 9000 };
-  int64_t *keys = new_ints(C), *first_child = even_offsets(C, 1), *neighbours = new_ints(8 * C), *pair_offsets = new_ints(28), *out[4];
-  for (int64_t i = 0; i < C; i++) keys[i] = 64 * i, neighbours[8 * i] = i;
-  for (int k = 0; k < 28; k++) pair_offsets[k] = k > 13 ? C : 0;
-  for (int i = 0; i < 4; i++) out[i] = new_ints(C);
-  return FINISH(KERNEL(kernels->octree_pairs(keys, first_child, neighbours, C, pair_offsets, out[0], out[1], out[2], out[3])), out[0],
-                out[1], out[2], out[3]);
+  ast_octree_level level;
+  const ast_status status = KERNEL(kernels->octree_coarsen(keys, offsets, B, 1, &level));
+  if (status != AST_OK) return finish(status, NULL, 0);
+  int64_t *coarse_keys = new_ints(level.C), *coarse_offsets = new_ints(B + 1), *first_child = new_ints(level.C + 1), *parent = new_ints(C);
+  int64_t *pairs[4];
+  for (int i = 0; i < 4; i++) pairs[i] = new_ints(level.pair_offsets[27]);
+  return FINISH(
+      kernels->octree_write_level(&level, coarse_keys, coarse_offsets, first_child, parent, pairs[0], pairs[1], pairs[2], pairs[3]),
+      coarse_keys, coarse_offsets, first_child, parent, pairs[0], pairs[1], pairs[2], pairs[3]);
 }
 
 static outcome sample(const ast_kernels *kernels, int64_t extent) {
@@ -193,7 +188,6 @@ static const struct {
     {"octree_build", octree_build_packed},
     {"octree_build, wide keys", octree_build_wide},
     {"octree_coarsen", octree_coarsen},
-    {"octree_pairs", octree_pairs},
     {"farthest_point_sample", sample_narrow},
     {"farthest_point_sample, wide", sample_wide},
     {"sparse_conv", sparse_conv},

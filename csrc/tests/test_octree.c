@@ -108,45 +108,43 @@ static int64_t find(const int64_t *keys, const int64_t *offsets, int64_t scene, 
   return at ? at - keys : -1;
 }
 
-/* One step of coarsening; the coarse cells replace keys and offsets. */
-static void check_coarsen(const ast_kernels *kernels, int64_t *keys, int64_t *offsets, int64_t B, const char *what) {
-  const int64_t fine = offsets[B];
-  int64_t *fine_keys = copy_ints(keys, fine), *coarse_keys = new_ints(fine), *coarse_offsets = new_ints(B + 1);
-  int64_t *all_children = new_ints(fine + 1), *all_neighbours = new_ints(8 * fine), *pair_offsets = new_ints(28);
-  int64_t cell[3], other[3], pairs = 0;
-  READ_ONLY(fine_keys, offsets);
-  CHECK(kernels->octree_coarsen(fine_keys, offsets, B, coarse_keys, coarse_offsets, all_children, all_neighbours, pair_offsets) == AST_OK,
-        "%s", what);
-  WRITABLE(offsets);
-  int64_t C = 0, *first_child = copy_ints(all_children, coarse_offsets[B] + 1),
-          *neighbours = copy_ints(all_neighbours, 8 * coarse_offsets[B]);
-  for (int64_t b = 0; b < B; b++) {
-    CHECK(coarse_offsets[b] == C, "%s: scene %lld", what, (long long)b);
+/* The cells of a level, its cells before each cell, and node_cell, from the keys of the finer level. */
+static void check_cells(const ast_octree_level *s, const int64_t *keys, const int64_t *offsets, tree t, const char *what) {
+  int64_t C = 0, cell[3], other[3];
+  for (int64_t b = 0; b < s->B; b++) {
+    CHECK(t.cell_offsets[b] == C, "%s: scene %lld", what, (long long)b);
     for (int64_t f = offsets[b]; f < offsets[b + 1]; f++) {
-      if (f > offsets[b] && keys[f] >> 3 == keys[f - 1] >> 3) continue;
-      CHECK(coarse_keys[C] == keys[f] >> 3 && first_child[C] == f, "%s: coarse cell %lld", what, (long long)C);
-      C++;
+      const bool first = f == offsets[b] || keys[f] >> 3 != keys[f - 1] >> 3;
+      if (first) CHECK(t.keys[C] == keys[f] >> 3 && t.node_offsets[C] == f, "%s: coarse cell %lld", what, (long long)C);
+      C += first;
+      CHECK(t.node_cell[f] == C - 1, "%s: fine cell %lld", what, (long long)f);
     }
   }
-  CHECK(coarse_offsets[B] == C && first_child[C] == fine && pair_offsets[0] == 0, "%s", what);
-  for (int64_t b = 0; b < B; b++)
-    for (int64_t P = coarse_offsets[b]; P < coarse_offsets[b + 1]; P++)
+  CHECK(s->C == C && t.cell_offsets[s->B] == C && t.node_offsets[C] == offsets[s->B], "%s", what);
+  CHECK(s->C_fine == offsets[s->B] && s->pair_offsets[0] == 0, "%s", what);
+  for (int64_t b = 0; b < s->B; b++)
+    for (int64_t P = t.cell_offsets[b]; P < t.cell_offsets[b + 1]; P++) {
+      bool near = false;
       for (int d = 0; d < 8; d++) {
-        separate(coarse_keys[P], cell);
+        separate(t.keys[P], cell);
         for (int a = 0; a < 3; a++) other[a] = cell[a] - (d >> (2 - a) & 1);
-        CHECK(neighbours[8 * P + d] == find(coarse_keys, coarse_offsets, b, other), "%s: cell %lld, neighbour %d", what, (long long)P, d);
+        const int64_t Q = find(t.keys, t.cell_offsets, b, other);
+        if (s->near[P]) CHECK(s->before[P][d] == Q, "%s: cell %lld, neighbour %d", what, (long long)P, d);
+        near |= d && Q >= 0;
       }
+      CHECK(s->near[P] == near, "%s: cell %lld", what, (long long)P);
+    }
+}
 
-  int64_t *pair[4];
-  for (int i = 0; i < 4; i++) pair[i] = new_ints(pair_offsets[27]);
-  READ_ONLY(first_child, neighbours, pair_offsets);
-  CHECK(kernels->octree_pairs(fine_keys, first_child, neighbours, C, pair_offsets, pair[0], pair[1], pair[2], pair[3]) == AST_OK, "%s",
-        what);
+/* The pairs of a level, by coarse and by fine cell. */
+static void check_pairs(const ast_octree_level *s, const int64_t *keys, const int64_t *offsets, tree t, int64_t *const pair[4],
+                        const char *what) {
+  int64_t cell[3], other[3], pairs = 0;
   for (int64_t k = 0, by_fine = 0; k < 27; k++) {
     const int64_t step[3] = {k / 9 - 1, k / 3 % 3 - 1, k % 3 - 1};
-    for (int64_t b = 0; b < B; b++) {
-      for (int64_t P = coarse_offsets[b]; P < coarse_offsets[b + 1]; P++) {
-        separate(coarse_keys[P], cell);
+    for (int64_t b = 0; b < s->B; b++) {
+      for (int64_t P = t.cell_offsets[b]; P < t.cell_offsets[b + 1]; P++) {
+        separate(t.keys[P], cell);
         for (int a = 0; a < 3; a++) other[a] = 2 * cell[a] + step[a];
         const int64_t f = find(keys, offsets, b, other);
         if (f < 0) continue;
@@ -160,34 +158,45 @@ static void check_coarsen(const ast_kernels *kernels, int64_t *keys, int64_t *of
           whole &= (cell[a] - step[a]) % 2 == 0;
           other[a] = (cell[a] - step[a]) / 2;
         }
-        const int64_t P = whole ? find(coarse_keys, coarse_offsets, b, other) : -1;
+        const int64_t P = whole ? find(t.keys, t.cell_offsets, b, other) : -1;
         if (P < 0) continue;
         CHECK(pair[2][by_fine] == f && pair[3][by_fine] == P, "%s: offset %lld, fine cell %lld", what, (long long)k, (long long)f);
         by_fine++;
       }
     }
-    CHECK(pair_offsets[k + 1] == pairs && pairs == by_fine, "%s: offset %lld has %lld pairs", what, (long long)k, (long long)pairs);
+    CHECK(s->pair_offsets[k + 1] == pairs && pairs == by_fine, "%s: offset %lld has %lld pairs", what, (long long)k, (long long)pairs);
   }
-  if (C > 0) {
-    WRITABLE(pair_offsets);
-    pair_offsets[27]--;
-    CHECK(kernels->octree_pairs(fine_keys, first_child, neighbours, C, pair_offsets, pair[0], pair[1], pair[2], pair[3]) == AST_MISMATCH,
-          "%s: wrong pair_offsets", what);
-  }
-  memcpy(keys, coarse_keys, (size_t)C * sizeof *keys);
-  memcpy(offsets, coarse_offsets, (size_t)(B + 1) * sizeof *offsets);
-  FREE(pair[0], pair[1], pair[2], pair[3], fine_keys, coarse_keys, coarse_offsets, first_child, neighbours);
-  FREE(all_children, all_neighbours, pair_offsets);
 }
 
 static void check_levels(const ast_kernels *kernels, cloud s, const double center[3], double half_width, int depth, int levels,
                          const char *what) {
   tree t = new_tree(s.N, s.B);
+  ast_octree_level level[21];
   int64_t bad;
+  READ_ONLY(s.positions, s.offsets);
   CHECK(kernels->octree_build(s.positions, s.offsets, s.B, center, half_width, depth, t.keys, t.cell_offsets, t.node_cell, t.node_order,
                               t.node_offsets, &bad) == AST_OK,
         "%s", what);
-  for (int level = 0; level < levels; level++) check_coarsen(kernels, t.keys, t.cell_offsets, s.B, what);
+  WRITABLE(s.positions, s.offsets);
+  int64_t *all_keys = t.keys;
+  t.keys = copy_ints(all_keys, t.cell_offsets[s.B]);
+  FREE(all_keys);
+  READ_ONLY(t.keys, t.cell_offsets);
+  CHECK(kernels->octree_coarsen(t.keys, t.cell_offsets, s.B, levels, level) == AST_OK, "%s", what);
+  WRITABLE(t.keys, t.cell_offsets);
+  for (int j = 0; j < levels; j++) {
+    tree coarser = {new_ints(level[j].C), new_ints(s.B + 1), new_ints(level[j].C_fine), new_ints(0), new_ints(level[j].C + 1)};
+    int64_t *pair[4];
+    for (int i = 0; i < 4; i++) pair[i] = new_ints(level[j].pair_offsets[27]);
+    CHECK(kernels->octree_write_level(&level[j], coarser.keys, coarser.cell_offsets, coarser.node_offsets, coarser.node_cell, pair[0],
+                                      pair[1], pair[2], pair[3]) == AST_OK,
+          "%s", what);
+    check_cells(&level[j], t.keys, t.cell_offsets, coarser, what);
+    check_pairs(&level[j], t.keys, t.cell_offsets, coarser, pair, what);
+    FREE(pair[0], pair[1], pair[2], pair[3]);
+    free_tree(t);
+    t = coarser;
+  }
   free_tree(t);
 }
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from checks import assert_same_for_threads, instruction_sets, misaligned_read_only, run_python
+from checks import assert_same_everywhere, assert_same_for_threads, misaligned_read_only
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -34,7 +34,7 @@ def composed(positions, offsets, center, half_width, depth) -> Octree:
 
 
 def composed_map(tree: Octree) -> CellMap:
-    keys, cell_offsets, node_offsets, node_cell, *pairs = ops._coarsen_reference(tree.keys, tree.cell_offsets)
+    keys, cell_offsets, node_offsets, node_cell, *pairs = ops._coarsen_reference(tree.keys, tree.cell_offsets, 1)
     order = torch.arange(len(tree.keys))
     return CellMap(Octree(keys, cell_offsets, node_cell, order, node_offsets, tree.depth - 1), len(tree.keys), *pairs)
 
@@ -42,9 +42,9 @@ def composed_map(tree: Octree) -> CellMap:
 def assert_levels_agree(positions, offsets, center=ORIGIN, half_width=1.0, depth=5) -> None:
     tree = octree(positions, offsets, center, half_width, depth)
     assert_equal(tree, composed(positions, offsets, center, half_width, depth))
-    for _ in range(min(depth, 4)):
-        coarser = tree.coarsen()
+    for coarser in tree.coarsen_all(min(depth, 4)):
         assert_equal(coarser, composed_map(tree))
+        assert_equal(coarser, tree.coarsen())
         tree = coarser.coarse
 
 
@@ -223,7 +223,7 @@ g = torch.Generator().manual_seed(5)
 digest = hashlib.sha256()
 for depth in (4, 12, 21):
     tree = octree(2 * torch.rand(20001, 3, generator=g) - 1, torch.tensor([0, 9, 9, 20001]), (0, 0, 0), 1, depth)
-    m = tree.coarsen()
+    m = tree.coarsen_all(2)[1]
     for x in (tree.keys, tree.cell_offsets, tree.node_cell, tree.node_order, tree.node_offsets, tree.coordinates()):
         digest.update(x.numpy().tobytes())
     for x in (m.coarse.keys, m.pair_offsets, m.fine, m.coarse_index, m.fine_by_fine, m.coarse_by_fine):
@@ -233,9 +233,7 @@ print(digest.hexdigest())
 
 
 def test_every_instruction_set_and_backend():
-    prints = {isa: run_python(CODE, AST_SIM_ISA=isa) for isa in instruction_sets()}
-    prints["torch"] = run_python(CODE, AST_SIM_BACKEND="torch")
-    assert "base" in prints and len(set(prints.values())) == 1 and len(prints["base"].strip()) == 64, prints
+    assert_same_everywhere(CODE)
 
 
 def test_opcheck():
@@ -243,7 +241,7 @@ def test_opcheck():
     tree = octree(positions, offsets, ORIGIN, 1, 3)
     torch.library.opcheck(ops._octree.overload, (positions, offsets, list(ORIGIN), 1.0, 3))
     torch.library.opcheck(ops._coordinates.overload, (tree.keys,))
-    torch.library.opcheck(ops._coarsen.overload, (tree.keys, tree.cell_offsets))
+    torch.library.opcheck(ops._coarsen.overload, (tree.keys, tree.cell_offsets, 2))
 
 
 def test_traced_sizes_depend_on_data():
@@ -272,8 +270,8 @@ def test_unusual_layouts_and_unchanged_inputs():
     expanded = positions[:1].expand(60, 3)
     assert_equal(octree(expanded, offsets, ORIGIN, 1, 4), octree(expanded.clone(), offsets, ORIGIN, 1, 4))
     keys, cell_offsets = expected.keys, expected.cell_offsets
-    strided = ops._coarsen(torch.stack([keys, keys], 1)[:, 0], torch.stack([cell_offsets] * 2, 1)[:, 0])
-    assert all(torch.equal(a, b) for a, b in zip(strided, ops._coarsen(keys, cell_offsets), strict=True))
+    strided = ops._coarsen(torch.stack([keys, keys], 1)[:, 0], torch.stack([cell_offsets] * 2, 1)[:, 0], 2)
+    assert all(torch.equal(a, b) for a, b in zip(strided, ops._coarsen(keys, cell_offsets, 2), strict=True))
 
 
 POSITIONS = cloud("random", 30)
@@ -329,15 +327,19 @@ def test_errors_name_op_argument_and_value(build, arguments, message):
 @pytest.mark.parametrize("coarsen", [ops._coarsen, ops._coarsen_reference])
 def test_errors_of_the_coarser_level(coarsen):
     with pytest.raises(ValueError, match="cell_offsets must end at the number of rows 2, not 1"):
-        coarsen(torch.tensor([1, 2]), torch.tensor([0, 1]))
+        coarsen(torch.tensor([1, 2]), torch.tensor([0, 1]), 1)
     for keys, offsets, at in (([3, 3], [0, 2], 1), ([5, 4], [0, 2], 1), ([2, 1, 0], [0, 1, 3], 2), ([-1], [0, 1], 0)):
         with pytest.raises(ValueError, match=rf"keys\[{at}\] is {keys[at]}"):
-            coarsen(torch.tensor(keys), torch.tensor(offsets))
+            coarsen(torch.tensor(keys), torch.tensor(offsets), 1)
 
 
-def test_depth_zero_has_no_coarser_level():
-    with pytest.raises(ValueError, match="depth 0 has no coarser level"):
+def test_no_level_lies_above_depth_zero():
+    with pytest.raises(ValueError, match="depth 0 has no coarser level 1 steps up"):
         octree(POSITIONS, OFFSETS, ORIGIN, 1, 0).coarsen()
+    for levels in (-1, 4):
+        with pytest.raises(ValueError, match=f"depth 3 has no coarser level {levels} steps up"):
+            octree(POSITIONS, OFFSETS, ORIGIN, 1, 3).coarsen_all(levels)
+    assert octree(POSITIONS, OFFSETS, ORIGIN, 1, 3).coarsen_all(0) == []
 
 
 @pytest.mark.parametrize("offsets", [[0], [0, 0], [0, 0, 0]])
