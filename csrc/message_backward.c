@@ -24,7 +24,7 @@ enum {
   SHARES = 16,
   SHARE_TILES = 10, /* of a task of a round */
   PARTS = 8,
-  ROWS_AHEAD = 8 /* edges by which prefetching runs ahead */
+  ROWS_AHEAD = 6 /* edges by which prefetching runs ahead */
 };
 
 /* The gradients that are sums over all edges, as tiles add to them. */
@@ -154,8 +154,11 @@ static void message_add_to_senders(const message_backward_job *job, int64_t part
   for (int64_t task = 0; task * job->edges < job->end - job->begin; task++) {
     const int64_t *offsets = job->part_offsets + task * (PARTS + 1), last = offsets[part + 1];
     for (int64_t i = offsets[part]; i < last; i++) {
-      const float *next = job->out->of_senders + senders[job->by_part[min64(i + ROWS_AHEAD, last - 1)]] * F;
-      for (int64_t c = 0; c < F; c += 16) __builtin_prefetch(next + c, 1);
+      const int32_t ahead = job->by_part[min64(i + ROWS_AHEAD, last - 1)];
+      for (int64_t c = 0; c < F; c += 16) {
+        __builtin_prefetch(job->dz + ahead * job->w.row + c);
+        __builtin_prefetch(job->out->of_senders + senders[ahead] * F + c, 1);
+      }
       const float *dz = job->dz + job->by_part[i] * job->w.row;
       float *dP = job->out->of_senders + senders[job->by_part[i]] * F;
       for (int64_t c = 0; c < F; c += VW) vstore_upto(dP + c, vload_upto(dP + c, F - c) + vload(dz + c), F - c);
