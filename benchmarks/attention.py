@@ -15,7 +15,7 @@ from benchmarks.case import Case
 SMALL = [(4, 90, 90, 4, 32), (4, 90, 360, 4, 32), (4, 360, 90, 4, 32)]
 FORWARD = [(1, 512, 512, 8, 64), (1, 512, 100_000, 8, 64), (1, 100_000, 512, 8, 64), (1, 4096, 4096, 8, 64)]
 TRAINING = [(1, 512, 512, 8, 64), (1, 512, 8192, 8, 64), (1, 4096, 4096, 8, 64)]
-LARGEST = 4e9  # bytes of arrays of all scores that a peer may hold
+LARGEST = 3e9  # bytes of arrays of all scores that a peer may hold
 TOLERANCE = {"rtol": 1e-4, "atol": 1e-5}
 
 

@@ -25,12 +25,12 @@ typedef enum {
 /* The sizes of one attention: query rows of scene b attend to all key rows of scene b. */
 typedef struct {
   int64_t B, H, D;
-  const int64_t *q_offsets, *k_offsets;    /* [B+1] */
-  int64_t q_stride, k_stride, v_stride;    /* floats from one row of q, k, v to the next, at least H*D */
-  int64_t dq_stride, dk_stride, dv_stride; /* the same of the gradients */
+  const int64_t *q_offsets, *k_offsets; /* [B+1] */
+  int64_t q_stride, k_stride, v_stride; /* floats from one row of q, k, v to the next, at least H*D */
   float scale;
-  double dropout_p; /* weights are dropped with this probability, 0 <= p < 1 */
-  uint64_t seed;    /* of the counter-based generator: key (seed), counter (scene, head, query, key) */
+  double dropout_p;                        /* weights are dropped with this probability, 0 <= p < 1 */
+  uint64_t seed;                           /* of the counter-based generator: key (seed), counter (scene, head, query, key) */
+  int64_t dq_stride, dk_stride, dv_stride; /* floats from one row of the gradients to the next; 0: H*D */
 } ast_attention;
 
 /* The pairs of a sparse convolution, grouped by kernel offset: group k is [offsets[k], offsets[k+1]) for k < 27.

@@ -9,7 +9,7 @@
  * one part; its parts leave (m, l, o), merged in their order by the same formula. All sizes depend on the scene's own numbers of
  * queries, keys and heads, so a result depends on neither threads nor batch.
  *
- * Cost: 4 Tq Tk D flops a head in two products, and some 15 operations (26 with dropout) for each 16 scores between them.
+ * Cost: 4 Tq Tk D flops a head in two products, and some 15 vector operations (26 with dropout) a vector of scores between them.
  */
 #include "ast.h"
 #include "attention_tiles.h"
@@ -24,7 +24,8 @@ _Static_assert(QUERIES % LANES == 0 && (int)KEYS == DROPOUT_KEYS, "tasks hold wh
 
 typedef struct {
   int64_t chunks, parts, part_keys;               /* of queries; of keys; keys of a part */
-  int64_t first_task, first_merge, first_partial; /* running numbers before this scene */
+  int64_t partial_rows;                           /* queries of the states that the parts leave */
+  int64_t first_task, first_merge, first_partial; /* tasks, merges and floats of such states before this scene */
 } forward_cut;
 
 typedef struct {
@@ -32,7 +33,7 @@ typedef struct {
   const float *q, *k, *v;
   float *out, *maximum, *sum;
   const forward_cut *cuts; /* [B+1] */
-  float *partials;         /* of PARTIAL floats */
+  float *partials;
 } forward_job;
 
 /* What a task knows of its queries: o [query][ROW], m and l [query]. */
@@ -48,17 +49,11 @@ typedef struct {
   float out[QUERIES * ROW], maximum[QUERIES], sum[QUERIES];
 } forward_scratch;
 
-enum { PARTIAL = QUERIES * (ROW + 2) }; /* floats of the state that a part leaves */
-
-static forward_state partial_state(float *partial) {
-  return (forward_state){partial, partial + QUERIES * ROW, partial + QUERIES * (ROW + 1)};
-}
-
 /* The scene, head, queries and keys of a task. */
 typedef struct {
   int64_t b, h, part, first_query, rows, first_key, keys;
   int32_t shift;
-} forward_task_of;
+} forward_range;
 
 /* ---- a panel against a block of keys ---- */
 
@@ -120,12 +115,13 @@ static forward_cut cut_of(const ast_attention *s, int64_t b) {
   forward_cut cut = {.chunks = (queries + QUERIES - 1) / QUERIES};
   const int64_t wanted = min64(PARTED_TASKS / max64(cut.chunks * s->H, 1), (keys + PART_KEYS - 1) / PART_KEYS);
   cut.part_keys = round_up((keys + max64(wanted, 1) - 1) / max64(wanted, 1), KEYS);
+  cut.partial_rows = min64(QUERIES, round_up(queries, LANES));
   cut.parts = keys ? (keys + cut.part_keys - 1) / cut.part_keys : 1;
   return cut;
 }
 
 /* Task `index`, counted by `first_task` or, for the merges, which are not parted, by `first_merge`. */
-static forward_task_of find_task(const forward_job *job, int64_t index, bool merge) {
+static forward_range find_forward_range(const forward_job *job, int64_t index, bool merge) {
   const ast_attention *s = job->s;
   int64_t b = 0, last = s->B - 1; /* the last scene that has at most `index` tasks before it */
   while (b < last) {
@@ -136,7 +132,7 @@ static forward_task_of find_task(const forward_job *job, int64_t index, bool mer
   const forward_cut *cut = job->cuts + b;
   const int64_t keys = s->k_offsets[b + 1] - s->k_offsets[b], parts = merge ? 1 : cut->parts;
   const int64_t local = index - (merge ? cut->first_merge : cut->first_task);
-  forward_task_of t = {.b = b, .h = local / (cut->chunks * parts), .part = local / cut->chunks % parts};
+  forward_range t = {.b = b, .h = local / (cut->chunks * parts), .part = local / cut->chunks % parts};
   t.first_query = local % cut->chunks * QUERIES;
   t.rows = min64(QUERIES, s->q_offsets[b + 1] - s->q_offsets[b] - t.first_query);
   t.first_key = t.part * cut->part_keys;
@@ -145,31 +141,32 @@ static forward_task_of find_task(const forward_job *job, int64_t index, bool mer
   return t;
 }
 
-static float *partial_of(const forward_job *job, const forward_task_of *t, int64_t part) {
+/* What `part` leaves of the task's queries. */
+static forward_state partial_of(const forward_job *job, const forward_range *t, int64_t part) {
   const forward_cut *cut = job->cuts + t->b;
-  const int64_t number = (t->h * cut->chunks + t->first_query / QUERIES) * cut->parts + part;
-  return job->partials + (cut->first_partial + number) * PARTIAL;
+  const int64_t number = (t->h * cut->chunks + t->first_query / QUERIES) * cut->parts + part, rows = cut->partial_rows;
+  float *out = job->partials + cut->first_partial + number * rows * (ROW + 2);
+  return (forward_state){out, out + rows * ROW, out + rows * (ROW + 1)};
 }
 
 /* out = gain o / l, maximum and sum of the task's queries */
-static void finish(const forward_job *job, const forward_task_of *t, const forward_state *state) {
+static void finish(const forward_job *job, const forward_range *t, const forward_state *state) {
   const ast_attention *s = job->s;
   const int64_t H = s->H, D = s->D, q0 = s->q_offsets[t->b] + t->first_query;
-  const float gain = dropout_of(s, t->b, t->h).gain;
-  const float whole = (float)((int64_t)1 << t->shift);
+  const float gain = dropout_of(s, t->b, t->h).gain, unit = (float)((int64_t)1 << t->shift);
   for (int64_t i = 0; i < t->rows; i++) {
-    const float l = state->sum[i] > 0 ? state->sum[i] : NAN;
+    const float l = state->sum[i] > 0 ? state->sum[i] : NAN, factor = gain / l;
     job->maximum[(q0 + i) * H + t->h] = l > 0 ? state->maximum[i] : NAN;
-    job->sum[(q0 + i) * H + t->h] = whole * l;
+    job->sum[(q0 + i) * H + t->h] = unit * l;
     float *out = job->out + ((q0 + i) * H + t->h) * D;
-    for (int64_t d = 0; d < D; d += VW) vstore(out + d, gain / l * vload(state->out + i * ROW + d));
+    for (int64_t d = 0; d < D; d += VW) vstore(out + d, factor * vload(state->out + i * ROW + d));
   }
 }
 
 static ast_status forward_task(int64_t index, void *context) {
   const forward_job *job = context;
   const ast_attention *s = job->s;
-  const forward_task_of task = find_task(job, index, false);
+  const forward_range task = find_forward_range(job, index, false);
   const int64_t H = s->H, D = s->D, h = task.h, rows = task.rows, q0 = s->q_offsets[task.b] + task.first_query;
   if (task.keys == 0) {
     fill_rows(0, H * D, rows, D, job->out + (q0 * H + h) * D);
@@ -180,7 +177,7 @@ static ast_status forward_task(int64_t index, void *context) {
   forward_scratch *t = ast_scratch(5, sizeof *t);
   if (!t) return AST_NO_MEMORY;
   const bool whole = job->cuts[task.b].parts == 1;
-  const forward_state state = whole ? (forward_state){t->out, t->maximum, t->sum} : partial_state(partial_of(job, &task, task.part));
+  const forward_state state = whole ? (forward_state){t->out, t->maximum, t->sum} : partial_of(job, &task, task.part);
   const dropout d = dropout_of(s, task.b, h);
   const int64_t panels = (rows + LANES - 1) / LANES, share = (KEYS + panels - 1) / panels;
   for (int64_t p = 0; p < panels; p++)
@@ -207,11 +204,11 @@ static ast_status forward_task(int64_t index, void *context) {
 /* Merges the parts of one scene, head and chunk of queries, in their order. */
 static ast_status merge_task(int64_t index, void *context) {
   const forward_job *job = context;
-  const forward_task_of task = find_task(job, index, true);
+  const forward_range task = find_forward_range(job, index, true);
   const int64_t D = job->s->D, parts = job->cuts[task.b].parts;
-  const forward_state into = partial_state(partial_of(job, &task, 0));
+  const forward_state into = partial_of(job, &task, 0);
   for (int64_t part = 1; part < parts; part++) {
-    const forward_state from = partial_state(partial_of(job, &task, part));
+    const forward_state from = partial_of(job, &task, part);
     float fade[QUERIES], weight[QUERIES];
     for (int64_t i = 0; i < task.rows; i += VW) {
       const vf before = vload(into.maximum + i), other = vload(from.maximum + i), now = vmax(other, before);
@@ -240,10 +237,12 @@ static ast_status attention(const ast_attention *s, const float *restrict q, con
     *cut = cut_of(s, b);
     cut->first_task = next.first_task, cut->first_merge = next.first_merge, cut->first_partial = next.first_partial;
     next.first_task += s->H * cut->chunks * cut->parts;
-    if (cut->parts > 1) next.first_merge += s->H * cut->chunks, next.first_partial += s->H * cut->chunks * cut->parts;
+    if (cut->parts == 1) continue;
+    next.first_merge += s->H * cut->chunks;
+    next.first_partial += s->H * cut->chunks * cut->parts * cut->partial_rows * (ROW + 2);
   }
   cuts[s->B] = next;
-  float *partials = ast_scratch(7, next.first_partial * PARTIAL * (int64_t)sizeof *partials);
+  float *partials = ast_scratch(7, next.first_partial * (int64_t)sizeof *partials);
   if (!partials) return AST_NO_MEMORY;
   forward_job job = {s, q, k, v, out, maximum, sum, cuts, partials};
   const ast_status status = ast_parallel(next.first_task, forward_task, &job);

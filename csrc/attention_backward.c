@@ -9,14 +9,14 @@
  * grow in the second cache. A scene of few tasks is cut over its longer side; each part but the first leaves its share of the
  * gradient of the shorter side, added in the order of the parts. All sizes depend on the scene's own, as in the forward pass.
  *
- * Cost: 10 Tq Tk D flops a head in five products. Memory: at most PARTED_TASKS times the shorter side of the largest scene.
+ * Cost: 10 Tq Tk D flops a head in five products. Memory: at most 2 BACKWARD_TASKS D floats for each row of the shorter side.
  */
 #include "ast.h"
 #include "attention_tiles.h"
 #include "dropout.h"
 
 enum {
-  CHUNK = 256,         /* queries whose panels, rows and gradients are kept in the second cache */
+  CHUNK = 512,         /* queries whose panels, rows and gradients are kept in the second cache */
   SQUARE = 128,        /* of these, against a block of keys: */
   BACKWARD_TASKS = 16, /* a scene with fewer tasks is cut */
   BACKWARD_PART = 512, /* into parts of at least so many keys or queries */
@@ -246,7 +246,11 @@ static ast_status attention_backward(const ast_attention *s, const float *restri
   }
   float *partials = ast_scratch(7, next.first_partial * (int64_t)sizeof *partials);
   if (!partials) return AST_NO_MEMORY;
-  backward_job job = {s, q, k, v, out, maximum, sum, dout, dq, dk, dv, cuts, partials};
+  ast_attention sizes = *s;
+  if (!sizes.dq_stride) sizes.dq_stride = s->H * s->D;
+  if (!sizes.dk_stride) sizes.dk_stride = s->H * s->D;
+  if (!sizes.dv_stride) sizes.dv_stride = s->H * s->D;
+  backward_job job = {&sizes, q, k, v, out, maximum, sum, dout, dq, dk, dv, cuts, partials};
   const ast_status status = ast_parallel(next.first_task, backward_task, &job);
   return status == AST_OK && next.first_partial ? ast_parallel(s->B * s->H, add_partials_task, &job) : status;
 }

@@ -39,8 +39,17 @@ static problem new_problem(int64_t B, const int64_t *queries, const int64_t *key
 
 static ast_attention sizes_of(const problem *a) {
   const int64_t row = a->H * a->D;
-  return (ast_attention){a->B, a->H, a->D, a->q_offsets, a->k_offsets,           row,  row,
-                         row,  row,  row,  row,          1 / sqrtf((float)a->D), a->p, 0x123456789abcdefu};
+  return (ast_attention){.B = a->B,
+                         .H = a->H,
+                         .D = a->D,
+                         .q_offsets = a->q_offsets,
+                         .k_offsets = a->k_offsets,
+                         .q_stride = row,
+                         .k_stride = row,
+                         .v_stride = row,
+                         .scale = 1 / sqrtf((float)a->D),
+                         .dropout_p = a->p,
+                         .seed = 0x123456789abcdefu};
 }
 
 static answer new_answer(const problem *a) {
