@@ -63,22 +63,23 @@ static ast_status octree_count_cells_task(int64_t chunk, void *context) {
 static ast_status octree_write_cells_task(int64_t chunk, void *context) {
   const octree_cells_job *s = context;
   octree_chunk own = s->chunks[chunk];
-  int64_t begin[OCTREE_LEVELS], b = octree_scene_of(s->offsets, s->B, chunk * OCTREE_CHUNK);
+  int64_t begin[OCTREE_LEVELS], *families[OCTREE_LEVELS], b = octree_scene_of(s->offsets, s->B, chunk * OCTREE_CHUNK);
   memcpy(begin, own.next, sizeof begin);
+  for (int j = 1; j <= s->root; j++) families[j] = s->level[j].families;
   for (int64_t i = chunk * OCTREE_CHUNK; i < min64(s->C, (chunk + 1) * OCTREE_CHUNK); i++) {
     while (s->offsets[b + 1] <= i) b++;
     const int starts = octree_starts(s, i, b);
     int64_t key = s->keys[i], child = i;
     for (int j = 1; j <= starts; j++) {
       const int64_t P = own.next[j]++;
-      s->level[j].families[P] = child << 8 | 1 << (key & 7);
+      families[j][P] = child << 8 | 1 << (key & 7);
       key >>= 3;
       if (j <= s->levels) s->level[j].keys[P] = key;
       child = P;
     }
     if (starts == s->root) continue;
     const int64_t parent = own.next[starts + 1] - 1;
-    if (parent >= begin[starts + 1]) s->level[starts + 1].families[parent] |= 1 << (key & 7);
+    if (parent >= begin[starts + 1]) families[starts + 1][parent] |= 1 << (key & 7);
     else own.before[starts + 1] |= (uint8_t)(1 << (key & 7));
   }
   memcpy(s->chunks[chunk].before, own.before, sizeof own.before);
@@ -151,7 +152,8 @@ AST_INLINE uint64_t octree_bits_of_bytes(uint64_t x) {
   return (x + (x >> 4)) & 0x0f0f0f0f0f0f0f0f;
 }
 
-/* Of a cell and the cells before it, byte and item d for that at -d: the octants of the children, 0 if there is none, and the first. */
+/* Of a cell and the cells before it, if any, byte and item d for that at -d: the octants of the children, 0 if there is none, and the
+ * first. */
 AST_INLINE uint64_t octree_families_of(const ast_octree_level *s, int64_t P, octree_cells *first) {
   octree_families families = {s->families[P]};
   if (s->near[P])
@@ -174,44 +176,54 @@ typedef struct {
   octree_moves moves;
 } octree_neighbour_job;
 
-/* The cells before the children of P. */
-AST_INLINE void octree_settle(const octree_neighbour_job *job, uint64_t families, octree_cells first) {
-  int64_t f = first[0];
-  for (unsigned octants = (unsigned)families & 255; octants; octants &= octants - 1, f++) {
-    const int octant = __builtin_ctz(octants);
-    const uint64_t moved = (families & job->moves.keep[octant]) * job->moves.copies[octant], found = moved & job->moves.at[octant];
-    const octree_bytes earlier = (octree_bytes)octree_bits_of_bytes(moved & job->moves.below[octant]);
-    const octree_cells cells = __builtin_shuffle(first, job->moves.from[octant]) + __builtin_convertvector(earlier, octree_cells);
-    const octree_cells none = __builtin_convertvector((octree_bytes)found, octree_cells) == 0;
-    *(octree_cells *)job->finer->before[f] = cells | none;
-    job->finer->near[f] = found >> 8 != 0;
+/* The cells before child f of P, whose octant this is. */
+AST_INLINE void octree_settle(const octree_neighbour_job *job, uint64_t families, octree_cells first, int octant, int64_t f) {
+  const uint64_t moved = (families & job->moves.keep[octant]) * job->moves.copies[octant], found = moved & job->moves.at[octant];
+  const octree_bytes earlier = (octree_bytes)octree_bits_of_bytes(moved & job->moves.below[octant]);
+  const octree_cells cells = __builtin_shuffle(first, job->moves.from[octant]) + __builtin_convertvector(earlier, octree_cells);
+  const octree_cells none = __builtin_convertvector((octree_bytes)found, octree_cells) == 0;
+  *(octree_cells *)job->finer->before[f] = cells | none;
+  job->finer->near[f] = found >> 8 != 0;
+}
+
+/* Counts the pairs of a chunk by place if `count`, and settles its children if there is a finer level. */
+AST_INLINE void octree_neighbours(const octree_neighbour_job *job, int64_t chunk, int64_t places[64], const bool count, const bool settle) {
+  const ast_octree_level *s = job->level;
+  for (int64_t P = chunk * OCTREE_CHUNK; P < min64(s->C, (chunk + 1) * OCTREE_CHUNK); P++) {
+    unsigned octants = octree_octants(s->families[P]);
+    int64_t f = octree_first(s->families[P]);
+    if (!s->near[P] && !(octants & (octants - 1))) {
+      if (count) places[__builtin_ctz(octants)]++;
+      if (count) s->others[P] = 0;
+      if (settle) job->finer->near[f] = 0;
+      continue;
+    }
+    octree_cells first;
+    const uint64_t families = octree_families_of(s, P, &first);
+    for (; octants; octants &= octants - 1, f++) {
+      if (count) places[__builtin_ctz(octants)]++;
+      if (settle) octree_settle(job, families, first, __builtin_ctz(octants), f);
+    }
+    if (!count) continue;
+    uint64_t others = s->others[P] = families & octree_pair_places;
+    for (; others; others &= others - 1) places[__builtin_ctzll(others)]++;
   }
 }
 
 static ast_status octree_neighbour_task(int64_t chunk, void *context) {
   const octree_neighbour_job *job = context;
-  const ast_octree_level *s = job->level;
-  int64_t count[64] = {0};
-  for (int64_t P = chunk * OCTREE_CHUNK; P < min64(s->C, (chunk + 1) * OCTREE_CHUNK); P++) {
-    const unsigned octants = octree_octants(s->families[P]);
-    if (!s->near[P] && !(octants & (octants - 1))) {
-      count[__builtin_ctz(octants)]++;
-      if (job->finer) job->finer->near[octree_first(s->families[P])] = 0;
-      continue;
-    }
-    octree_cells first;
-    const uint64_t families = octree_families_of(s, P, &first);
-    for (uint64_t places = (families & octree_pair_places) | octants; places; places &= places - 1) count[__builtin_ctzll(places)]++;
-    if (job->finer) octree_settle(job, families, first);
-  }
-  for (int place = 0; s->pairs && place < 64; place++)
-    if ((octree_pair_places | 255) >> place & 1) s->pairs[OCTREE_GROUPS * chunk + octree_group(place)] = count[place];
+  int64_t places[64] = {0}, *pairs = job->level->pairs;
+  if (!pairs) octree_neighbours(job, chunk, places, false, true);
+  else if (job->finer) octree_neighbours(job, chunk, places, true, true);
+  else octree_neighbours(job, chunk, places, true, false);
+  for (int place = 0; pairs && place < 64; place++)
+    if ((octree_pair_places | 255) >> place & 1) pairs[OCTREE_GROUPS * chunk + octree_group(place)] = places[place];
   return AST_OK;
 }
 
 /* ---- all levels ---- */
 
-static int64_t octree_level_bytes(int64_t C, int64_t B) { return 8 * (2 * C + B + 3) + 32 * C + round_up(C, 8); }
+static int64_t octree_level_bytes(int64_t C, int64_t B) { return 8 * (3 * C + B + 3) + 32 * C + round_up(C, 8); }
 
 /* Takes room for C cells out of `memory`; returns what is left. */
 static char *octree_place_level(ast_octree_level *s, int64_t C, int64_t B, int64_t C_fine, char *memory) {
@@ -220,7 +232,8 @@ static char *octree_place_level(ast_octree_level *s, int64_t C, int64_t B, int64
   s->families = s->offsets + B + 2;
   s->families[-1] = 0; /* of the cell that is not there */
   s->families[C] = C_fine << 8;
-  s->before = (int32_t (*)[8])(s->families + C + 1);
+  s->others = (uint64_t *)(s->families + C + 1);
+  s->before = (int32_t (*)[8])(s->others + C);
   s->near = (uint8_t *)(s->before + C);
   return memory + octree_level_bytes(C, B);
 }
@@ -264,6 +277,7 @@ static void octree_pair_offsets(ast_octree_level *s) {
 static ast_status octree_coarsen(const int64_t *restrict keys, const int64_t *restrict offsets, int64_t B, int levels,
                                  ast_octree_level *restrict coarser) {
   ast_octree_level level[OCTREE_LEVELS];
+  if (levels == 0) return AST_OK;
   octree_cells_job cells = {keys, offsets, B, offsets[B], octree_root(keys, offsets, B, levels), levels, NULL, level};
   const ast_status status = octree_all_cells(&cells, level);
   if (status != AST_OK) return status;
@@ -272,7 +286,7 @@ static ast_status octree_coarsen(const int64_t *restrict keys, const int64_t *re
   int64_t *memory = ast_scratch(4, counts * (int64_t)sizeof *memory);
   if (!memory) return AST_NO_MEMORY;
   for (int j = 1; j <= levels; memory += OCTREE_GROUPS * octree_chunks(level[j++].C)) level[j].pairs = memory;
-  if (cells.root > 0) memset(level[cells.root].near, 0, (size_t)level[cells.root].C);
+  memset(level[cells.root].near, 0, (size_t)level[cells.root].C);
   for (int j = cells.root; j > 0; j--) {
     octree_neighbour_job neighbour = {&level[j], j > 1 ? &level[j - 1] : NULL, octree_all_moves()};
     ast_parallel(octree_chunks(level[j].C), octree_neighbour_task, &neighbour);

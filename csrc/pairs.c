@@ -31,14 +31,10 @@ static ast_status octree_write_pairs_task(int64_t chunk, void *context) {
       job->fine[to] = job->fine_by_fine[to] = f;
       job->coarse[to] = job->coarse_by_fine[to] = job->node_cell[f] = P;
     }
-    if (!s->near[P]) continue;
-    octree_cells first;
-    const uint64_t families = octree_families_of(s, P, &first);
-    for (uint64_t places = families & octree_pair_places; places; places &= places - 1) {
-      const int place = __builtin_ctzll(places), d = place >> 3;
-      const unsigned octants = (unsigned)(families >> 8 * d) & ((1u << (place & 7)) - 1);
-      const int64_t to = next[octree_group(place)]++;
-      job->fine[to] = first[d] + __builtin_popcount(octants);
+    for (uint64_t others = s->others[P]; others; others &= others - 1) {
+      const int place = __builtin_ctzll(others);
+      const int64_t to = next[octree_group(place)]++, family = s->families[s->before[P][place >> 3]];
+      job->fine[to] = octree_first(family) + __builtin_popcount(octree_octants(family) & ((1u << (place & 7)) - 1));
       job->coarse[to] = P;
     }
   }
