@@ -152,8 +152,7 @@ AST_INLINE uint64_t octree_bits_of_bytes(uint64_t x) {
   return (x + (x >> 4)) & 0x0f0f0f0f0f0f0f0f;
 }
 
-/* Of a cell and the cells before it, if any, byte and item d for that at -d: the octants of the children, 0 if there is none, and the
- * first. */
+/* The octants of the children, 0 if there are none, and the first child: of a cell (byte and item 0) and of the cells before it (d). */
 AST_INLINE uint64_t octree_families_of(const ast_octree_level *s, int64_t P, octree_cells *first) {
   octree_families families = {s->families[P]};
   if (s->near[P])
@@ -173,20 +172,21 @@ AST_INLINE int octree_group(int place) {
 
 typedef struct {
   const ast_octree_level *level, *finer; /* the neighbours at `finer` follow from those at `level`; NULL: no need of them */
-  octree_moves moves;
+  const octree_moves *moves;
 } octree_neighbour_job;
 
 /* The cells before child f of P, whose octant this is. */
 AST_INLINE void octree_settle(const octree_neighbour_job *job, uint64_t families, octree_cells first, int octant, int64_t f) {
-  const uint64_t moved = (families & job->moves.keep[octant]) * job->moves.copies[octant], found = moved & job->moves.at[octant];
-  const octree_bytes earlier = (octree_bytes)octree_bits_of_bytes(moved & job->moves.below[octant]);
-  const octree_cells cells = __builtin_shuffle(first, job->moves.from[octant]) + __builtin_convertvector(earlier, octree_cells);
+  const octree_moves *m = job->moves;
+  const uint64_t moved = (families & m->keep[octant]) * m->copies[octant], found = moved & m->at[octant];
+  const octree_bytes earlier = (octree_bytes)octree_bits_of_bytes(moved & m->below[octant]);
+  const octree_cells cells = __builtin_shuffle(first, m->from[octant]) + __builtin_convertvector(earlier, octree_cells);
   const octree_cells none = __builtin_convertvector((octree_bytes)found, octree_cells) == 0;
   *(octree_cells *)job->finer->before[f] = cells | none;
   job->finer->near[f] = found >> 8 != 0;
 }
 
-/* Counts the pairs of a chunk by place if `count`, and settles its children if there is a finer level. */
+/* Counts the pairs of a chunk by place, if `count`, and finds the cells before its children, if `settle`. */
 AST_INLINE void octree_neighbours(const octree_neighbour_job *job, int64_t chunk, int64_t places[64], const bool count, const bool settle) {
   const ast_octree_level *s = job->level;
   for (int64_t P = chunk * OCTREE_CHUNK; P < min64(s->C, (chunk + 1) * OCTREE_CHUNK); P++) {
@@ -287,8 +287,9 @@ static ast_status octree_coarsen(const int64_t *restrict keys, const int64_t *re
   if (!memory) return AST_NO_MEMORY;
   for (int j = 1; j <= levels; memory += OCTREE_GROUPS * octree_chunks(level[j++].C)) level[j].pairs = memory;
   memset(level[cells.root].near, 0, (size_t)level[cells.root].C);
+  const octree_moves moves = octree_all_moves();
   for (int j = cells.root; j > 0; j--) {
-    octree_neighbour_job neighbour = {&level[j], j > 1 ? &level[j - 1] : NULL, octree_all_moves()};
+    octree_neighbour_job neighbour = {&level[j], j > 1 ? &level[j - 1] : NULL, &moves};
     ast_parallel(octree_chunks(level[j].C), octree_neighbour_task, &neighbour);
     if (j <= levels) octree_pair_offsets(&level[j]);
   }

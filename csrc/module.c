@@ -138,10 +138,11 @@ static bool append_level(PyObject *list, const ast_octree_level *level, Py_ssize
     if (PyList_SetItem(list, at + i, array)) return false;
   }
   memcpy(data[4], level->pair_offsets, sizeof level->pair_offsets);
+  ast_status status;
   Py_BEGIN_ALLOW_THREADS;
-  kernels->octree_write_level(level, data[0], data[1], data[2], data[3], data[5], data[6], data[7], data[8]);
+  status = kernels->octree_write_level(level, data[0], data[1], data[2], data[3], data[5], data[6], data[7], data[8]);
   Py_END_ALLOW_THREADS;
-  return true;
+  return status == AST_OK || (PyErr_NoMemory(), false);
 }
 
 /* The list, filled, or NULL. It exists before the first kernel runs, and arrays are no objects of the garbage collector: so no Python

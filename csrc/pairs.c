@@ -46,22 +46,22 @@ static ast_status octree_sort_pairs_task(int64_t k, void *context) {
   const octree_pair_job *job = context;
   const ast_octree_level *s = job->level;
   const int64_t begin = s->pair_offsets[k], end = s->pair_offsets[k + 1], words = s->C_fine / 64 + 1;
-  if (begin < end && (k / 9 == 0 || k / 3 % 3 == 0 || k % 3 == 0)) { /* some of a, b and c is -1: d > 0 */
-    uint64_t *marked = ast_scratch(3, 8 * words + 4 * s->C_fine);
-    if (!marked) return AST_NO_MEMORY;
-    int32_t *place = (int32_t *)(marked + words);
-    memset(marked, 0, 8 * (size_t)words);
-    for (int64_t i = begin; i < end; i++) {
-      marked[job->fine[i] >> 6] |= 1ull << (job->fine[i] & 63);
-      place[job->fine[i]] = (int32_t)(i - begin);
-    }
-    for (int64_t word = 0, to = begin; to < end; word++)
-      for (uint64_t bits = marked[word]; bits; bits &= bits - 1, to++) {
-        const int64_t f = 64 * word + __builtin_ctzll(bits);
-        job->fine_by_fine[to] = f;
-        job->coarse_by_fine[to] = job->coarse[begin + place[f]];
-      }
+  const bool sorted = k / 9 > 0 && k / 3 % 3 > 0 && k % 3 > 0; /* a, b and c are not -1: d = 0 */
+  if (sorted || begin == end) return AST_OK;
+  uint64_t *marked = ast_scratch(3, 8 * words + 4 * s->C_fine);
+  if (!marked) return AST_NO_MEMORY;
+  int32_t *place = (int32_t *)(marked + words);
+  memset(marked, 0, 8 * (size_t)words);
+  for (int64_t i = begin; i < end; i++) {
+    marked[job->fine[i] >> 6] |= 1ull << (job->fine[i] & 63);
+    place[job->fine[i]] = (int32_t)(i - begin);
   }
+  for (int64_t word = 0, to = begin; to < end; word++)
+    for (uint64_t bits = marked[word]; bits; bits &= bits - 1, to++) {
+      const int64_t f = 64 * word + __builtin_ctzll(bits);
+      job->fine_by_fine[to] = f;
+      job->coarse_by_fine[to] = job->coarse[begin + place[f]];
+    }
   return AST_OK;
 }
 
