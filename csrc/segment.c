@@ -10,18 +10,39 @@
 #include "ast.h"
 #include "simd.h"
 
-enum { SEGMENT_FLOATS = 1 << 15 }; /* floats of output a task: large enough to pay for the hand-over */
+enum {
+  SEGMENT_FLOATS = 1 << 15, /* floats of output a task: large enough to pay for the hand-over */
+  SEGMENT_VECTORS = 8,      /* sums in registers */
+  SEGMENT_AHEAD = 12        /* rows by which fetching runs ahead */
+};
 
 typedef struct {
   const float *x;
-  int64_t F, C, rows; /* rows: segments a task */
+  int64_t F, C, rows, last; /* rows: segments a task; last: the last place in `order` */
   const int64_t *order, *offsets;
   bool mean;
   float *out;
 } segment_job;
 
 static segment_job segment_plan(const float *x, int64_t F, const int64_t *order, const int64_t *offsets, int64_t C, bool mean, float *out) {
-  return (segment_job){x, F, C, max64(1, SEGMENT_FLOATS / max64(1, F)), order, offsets, mean, out};
+  return (segment_job){x, F, C, max64(1, SEGMENT_FLOATS / max64(1, F)), offsets[C] - 1, order, offsets, mean, out};
+}
+
+/* `vectors` vectors of one segment from channel f on: all of a row is read at once, and rows that come later are fetched. */
+AST_INLINE void segment_columns(const int vectors, const segment_job *s, int64_t begin, int64_t end, int64_t f, float scale, float *out) {
+  vf sum[SEGMENT_VECTORS];
+#pragma GCC unroll 8
+  for (int v = 0; v < vectors; v++) sum[v] = (vf){0};
+  for (int64_t j = begin; j < end; j++) {
+    const float *row = s->x + s->order[j] * s->F + f, *later = s->x + s->order[min64(j + SEGMENT_AHEAD, s->last)] * s->F + f;
+#pragma GCC unroll 8
+    for (int v = 0; v < vectors; v++) {
+      if (v * VW % 16 == 0) __builtin_prefetch(later + v * VW);
+      sum[v] += vload(row + v * VW);
+    }
+  }
+#pragma GCC unroll 8
+  for (int v = 0; v < vectors; v++) vstore(out + f + v * VW, sum[v] * scale);
 }
 
 static ast_status segment_sum_task(int64_t index, void *context) {
@@ -32,11 +53,9 @@ static ast_status segment_sum_task(int64_t index, void *context) {
     const float scale = s->mean && end > begin ? 1.0f / (float)(end - begin) : 1.0f;
     float *out = s->out + c * F;
     int64_t f = 0;
-    for (; f + VW <= F; f += VW) {
-      vf sum = {0};
-      for (int64_t j = begin; j < end; j++) sum += vload(s->x + s->order[j] * F + f);
-      vstore(out + f, sum * scale);
-    }
+    for (; f + SEGMENT_VECTORS * VW <= F; f += SEGMENT_VECTORS * VW) segment_columns(SEGMENT_VECTORS, s, begin, end, f, scale, out);
+    for (; f + 4 * VW <= F; f += 4 * VW) segment_columns(4, s, begin, end, f, scale, out);
+    for (; f + VW <= F; f += VW) segment_columns(1, s, begin, end, f, scale, out);
     for (; f < F; f++) {
       float sum = 0;
       for (int64_t j = begin; j < end; j++) sum += s->x[s->order[j] * F + f];
