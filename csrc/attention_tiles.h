@@ -229,7 +229,10 @@ static void fill_rows(float value, int64_t stride, int64_t rows, int64_t D, floa
 /* Asks for the lines of rows that will soon be read, or written: at their use each would wait for memory. */
 AST_INLINE void prefetch_rows(const float *from, int64_t stride, int64_t rows, int64_t D, const int write) {
   for (int64_t i = 0; i < rows; i++)
-    for (int64_t d = 0; d < D; d += 16) __builtin_prefetch(from + i * stride + d, write, 2);
+    for (int64_t d = 0; d < D; d += 16) {
+      if (write) __builtin_prefetch(from + i * stride + d, 1, 2);
+      else __builtin_prefetch(from + i * stride + d, 0, 2);
+    }
 }
 
 #endif

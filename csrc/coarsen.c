@@ -175,12 +175,22 @@ typedef struct {
   const octree_moves *moves;
 } octree_neighbour_job;
 
+AST_INLINE octree_cells octree_pick(octree_cells x, octree_cells from) {
+#ifdef __clang__
+  octree_cells y;
+  for (int i = 0; i < 8; i++) y[i] = x[from[i]];
+  return y;
+#else
+  return __builtin_shuffle(x, from);
+#endif
+}
+
 /* The cells before child f of P, whose octant this is. */
 AST_INLINE void octree_settle(const octree_neighbour_job *job, uint64_t families, octree_cells first, int octant, int64_t f) {
   const octree_moves *m = job->moves;
   const uint64_t moved = (families & m->keep[octant]) * m->copies[octant], found = moved & m->at[octant];
   const octree_bytes earlier = (octree_bytes)octree_bits_of_bytes(moved & m->below[octant]);
-  const octree_cells cells = __builtin_shuffle(first, m->from[octant]) + __builtin_convertvector(earlier, octree_cells);
+  const octree_cells cells = octree_pick(first, m->from[octant]) + __builtin_convertvector(earlier, octree_cells);
   const octree_cells none = __builtin_convertvector((octree_bytes)found, octree_cells) == 0;
   *(octree_cells *)job->finer->before[f] = cells | none;
   job->finer->near[f] = found >> 8 != 0;
