@@ -7,10 +7,11 @@ TORCH := $(shell sed -n 's/^torch==/torch==/p' constraints.txt)
 PIP := $(BIN)/pip install --quiet --constraint constraints.txt
 C_SOURCES := $(wildcard csrc/*.c csrc/*.h)
 C_TESTS := $(patsubst csrc/tests/test_%.c,%,$(wildcard csrc/tests/test_*.c))
+C_FUZZERS := $(patsubst csrc/tests/fuzz_%.c,%,$(wildcard csrc/tests/fuzz_*.c))
 C_TEST_HEADERS := $(wildcard csrc/tests/*.h)
 X86 := $(filter x86_64,$(shell uname -m))
 
-.PHONY: demo test check lint bench tools clean
+.PHONY: demo test check fuzz corpus lint bench tools clean
 
 demo: $(VENV)/installed
 	$(BIN)/ast-sim demo
@@ -35,7 +36,28 @@ lint: $(VENV)/tested
 
 # The C tests, which need no Python: optimised, under the address and undefined behaviour sanitizers, under the thread sanitizer,
 # and under valgrind. `wide` compiles the 64-byte source for AVX2, so that its logic is tested where there is no AVX-512.
-check: $(addprefix build/check/,$(addsuffix .passed,$(C_TESTS)))
+# The kept inputs of the fuzz targets run once more.
+check: $(addprefix build/check/,$(addsuffix .passed,$(C_TESTS))) $(addprefix build/check/fuzz_,$(addsuffix .passed,$(C_FUZZERS)))
+
+# New inputs for each fuzz target for FUZZ_SECONDS; what it finds lies in build/fuzz. FUZZ names fewer targets.
+FUZZ_SECONDS ?= 600
+FUZZ ?= $(C_FUZZERS)
+fuzz: $(addprefix build/check/fuzz/fuzz_,$(FUZZ))
+	@set -e; for name in $(FUZZ); do \
+	  mkdir -p build/fuzz/$$name csrc/tests/corpus/$$name; \
+	  echo "$$name for $(FUZZ_SECONDS) s"; \
+	  build/check/fuzz/fuzz_$$name -max_total_time=$(FUZZ_SECONDS) -max_len=200 -verbosity=0 -print_funcs=0 -print_final_stats=1 \
+	    -artifact_prefix=build/fuzz/$$name- build/fuzz/$$name csrc/tests/corpus/$$name; \
+	done
+
+# Keeps the smallest of all inputs so far that run every piece of code that they all run.
+corpus: $(addprefix build/check/fuzz/fuzz_,$(FUZZ))
+	@set -e; for name in $(FUZZ); do \
+	  rm -rf build/fuzz/merged; mkdir -p build/fuzz/$$name build/fuzz/merged csrc/tests/corpus/$$name; \
+	  build/check/fuzz/fuzz_$$name -merge=1 -use_counters=0 build/fuzz/merged csrc/tests/corpus/$$name build/fuzz/$$name 2>/dev/null; \
+	  rm -rf csrc/tests/corpus/$$name; mv build/fuzz/merged csrc/tests/corpus/$$name; \
+	  echo "$$name: $$(ls csrc/tests/corpus/$$name | wc -l) inputs"; \
+	done
 
 # torch first and by exact version: a range could fetch gigabytes of CUDA packages.
 $(VENV)/torch: constraints.txt
@@ -75,6 +97,7 @@ COMPILE_plain := $(GCC) -O3
 COMPILE_sanitized := $(GCC) -O1 -g -fsanitize=$(SANITIZE) -fno-sanitize-recover=all
 COMPILE_races := $(CLANG) -O1 -g -fsanitize=thread
 COMPILE_valgrind := $(GCC) -O1 -g
+COMPILE_fuzz := $(CLANG) -O1 -g -fsanitize=fuzzer-no-link,$(SANITIZE) -fno-sanitize-recover=all
 COMPILE_wide := $(GCC) -O2 -Wno-psabi -mavx2 -mfma -DAST_VECTOR_BYTES=64
 
 CORE := isa_base dispatch parallel memory
@@ -99,8 +122,16 @@ build/check/$(1)/core.a: $(patsubst %,build/check/$(1)/%.o,$(CORE) $(if $(filter
 $(patsubst %,build/check/$(1)/test_%,$(C_TESTS)): build/check/$(1)/test_%: csrc/tests/test_%.c $(C_TEST_HEADERS) build/check/$(1)/core.a
 	@$(COMPILE_$(1)) $$< build/check/$(1)/core.a -lm $$(LINK_test_$$*) -o $$@
 endef
-$(foreach build,$(BUILDS),$(eval $(call BUILD,$(build))))
+$(foreach build,$(BUILDS) fuzz,$(eval $(call BUILD,$(build))))
 build/check/wide/%.o: FLAGS_dispatch :=
+
+$(addprefix build/check/fuzz/fuzz_,$(C_FUZZERS)): build/check/fuzz/fuzz_%: csrc/tests/fuzz_%.c csrc/tests/test_%.c $(C_TEST_HEADERS) build/check/fuzz/core.a
+	@$(COMPILE_fuzz) -fsanitize=fuzzer $< build/check/fuzz/core.a -lm -o $@
+
+build/check/fuzz_%.passed: build/check/fuzz/fuzz_% csrc/tests/corpus/%
+	@echo "$* (kept inputs of its fuzz target)"
+	@$< -runs=0 -verbosity=0 csrc/tests/corpus/$*
+	@touch $@
 
 # The thread sanitizer finds no room for its shadow memory where addresses are too random.
 build/check/%.passed: $(addsuffix /test_%,$(addprefix build/check/,$(BUILDS)))

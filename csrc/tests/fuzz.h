@@ -1,0 +1,104 @@
+/* What the fuzz targets share: the bytes of an input become a table of kernels, sizes, offsets and numbers.
+ *
+ * An input is short. Arrays are random numbers of a seed that the input holds, with single elements replaced by what follows;
+ * an input that has ended gives zeros. A target includes the test of its kernel (FUZZ_ORACLE) for the exact results, defines
+ * fuzz(kernels), and keeps its seeds in corpus/<kernel>. `make fuzz` runs all of them.
+ */
+#ifndef AST_FUZZ_H
+#define AST_FUZZ_H
+
+#include <float.h>
+
+#include "check.h"
+
+static void fuzz(const ast_kernels *kernels);
+
+static const uint8_t *fuzz_next, *fuzz_end;
+
+static uint8_t take_byte(void) { return fuzz_next < fuzz_end ? *fuzz_next++ : 0; }
+static uint64_t take_word(int bytes) {
+  uint64_t word = 0;
+  for (int i = 0; i < bytes; i++) word = word << 8 | take_byte();
+  return word;
+}
+
+/* 0..most: any small number, or one at the edge of a block */
+static int64_t take_size(int64_t most) {
+  static const int64_t edges[] = {15, 16, 17, 31, 32, 33, 63, 64, 65, 95, 96, 97, 127, 128, 129, 255, 256, 257, 300, 511, 512, 513, 600};
+  enum { EDGES = sizeof edges / sizeof *edges };
+  const uint8_t byte = take_byte();
+  const int64_t size = byte < 256 - EDGES ? byte % 40 : edges[byte - (256 - EDGES)];
+  return size <= most ? size : size % (most + 1);
+}
+
+static int64_t take_index(int64_t n) { return (int64_t)(take_word(2) % (uint64_t)n); }
+
+/* [B+1], from 0, never falling; at most `most` rows a scene */
+static int64_t *take_offsets(int64_t B, int64_t most) {
+  int64_t *offsets = new_ints(B + 1);
+  offsets[0] = 0;
+  for (int64_t b = 0; b < B; b++) offsets[b + 1] = offsets[b] + take_size(most);
+  return offsets;
+}
+
+static float take_float(void) {
+  static const float values[] = {0.0f,     -0.0f,       1.0f,   -1.0f,   NAN,   INFINITY, -INFINITY, FLT_MAX, -FLT_MAX, FLT_MIN,
+                                 -FLT_MIN, 1.4013e-45f, 1e-40f, -1e-40f, 1e30f, -1e30f,   1e-30f,    0.5f,    1e19f,    -1e19f};
+  enum { VALUES = sizeof values / sizeof *values };
+  const uint8_t byte = take_byte();
+  if (byte < VALUES) return values[byte];
+  if (byte < 128) return (float)(byte - 74);
+  if (byte < 160) return (float)((int16_t)take_word(2)) / 256;
+  const uint32_t bits = (uint32_t)take_word(4);
+  float value;
+  memcpy(&value, &bits, sizeof value);
+  return value;
+}
+
+/* Random numbers of one of some amplitudes, then up to 7 elements as the input says. */
+static float *take_floats(int64_t n) {
+  static const float amplitudes[] = {1, 1, 0, 4, 1e-3f, 1e-40f, 1e15f, FLT_MAX};
+  float *x = new_floats(n);
+  check_state = take_word(2);
+  const uint8_t byte = take_byte();
+  for (int64_t i = 0; i < n; i++) x[i] = amplitudes[byte % 8] * random_float();
+  for (int edits = byte / 8 % 8; edits-- > 0 && n > 0;) {
+    const int64_t at = take_index(n);
+    x[at] = take_float();
+  }
+  return x;
+}
+
+static bool all_finite(const float *x, int64_t n) {
+  for (int64_t i = 0; i < n; i++)
+    if (!isfinite(x[i])) return false;
+  return true;
+}
+
+/* The largest magnitude of the finite values. */
+static double largest_finite(const float *x, int64_t n) {
+  double largest = 0;
+  for (int64_t i = 0; i < n; i++)
+    if (isfinite(x[i]) && fabs((double)x[i]) > largest) largest = fabs((double)x[i]);
+  return largest;
+}
+
+static bool same_floats(const float *a, const float *b, int64_t n) {
+  for (int64_t i = 0; i < n; i++)
+    if (memcmp(a + i, b + i, sizeof *a) && !(isnan(a[i]) && isnan(b[i]))) return false;
+  return true;
+}
+
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
+  static const char *const names[] = {"base", "avx2", "avx512"};
+  fuzz_next = data, fuzz_end = data + size;
+  const uint8_t byte = take_byte();
+  const ast_kernels *kernels = ast_select(names[byte % 3]);
+  buffers_at_start = byte / 3 % 2;
+  fuzz(kernels ? kernels : ast_select("base"));
+  CHECK(num_buffers == 0, "%d buffers are not freed", num_buffers);
+  return 0;
+}
+
+#endif

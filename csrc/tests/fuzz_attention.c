@@ -1,0 +1,62 @@
+/* Fuzzes attention and its gradients: a scene alone gives the bits that it gives in its batch, and where the scores are moderate,
+ * results are those of the formula in double within the rounding of the scores, and not finite where those are not. */
+#define main tests_of_attention
+#include "test_attention.c"
+#undef main
+
+#include "fuzz.h"
+
+static void check_alone(const ast_kernels *kernels, const problem *a, const answer *batch, int64_t b) {
+  const int64_t row = a->H * a->D, q0 = a->q_offsets[b], k0 = a->k_offsets[b];
+  problem one = {.B = 1, .H = a->H, .D = a->D, .Tq = a->q_offsets[b + 1] - q0, .Tk = a->k_offsets[b + 1] - k0, .p = a->p};
+  one.q_offsets[1] = one.Tq, one.k_offsets[1] = one.Tk;
+  one.q = a->q + q0 * row, one.k = a->k + k0 * row, one.v = a->v + k0 * row, one.dout = a->dout + q0 * row;
+  answer alone = solve(kernels, &one);
+  CHECK(same_floats(alone.out, batch->out + q0 * row, one.Tq * row) && same_floats(alone.dq, batch->dq + q0 * row, one.Tq * row) &&
+            same_floats(alone.dk, batch->dk + k0 * row, one.Tk * row) && same_floats(alone.dv, batch->dv + k0 * row, one.Tk * row) &&
+            same_floats(alone.maximum, batch->maximum + q0 * a->H, one.Tq * a->H) &&
+            same_floats(alone.sum, batch->sum + q0 * a->H, one.Tq * a->H),
+        "scene %lld differs alone and in a batch", (long long)b);
+  free_answer(alone);
+}
+
+static void compare_values(const char *what, const float *got, const double *exact, int64_t n, double bound) {
+  for (int64_t i = 0; i < n; i++)
+    CHECK(isfinite(exact[i]) ? fabs((double)got[i] - exact[i]) <= bound : !isfinite(got[i]), "%s[%lld] is %g, not %g within %g", what,
+          (long long)i, (double)got[i], exact[i], bound);
+}
+
+/* error: that of a weight, relative, from the rounding of its score */
+static void check_values(const problem *a, const answer *r) {
+  const int64_t row = a->H * a->D, queries = a->Tq * row, keys = a->Tk * row;
+  const double q = largest_finite(a->q, queries), k = largest_finite(a->k, keys), v = largest_finite(a->v, keys);
+  const double y = largest_finite(a->dout, queries), D = (double)a->D, scale = 1 / sqrt(D), score = scale * D * q * k;
+  const double error = 2e-7 * (D + 8) * score + 1e-7 * (double)(a->Tk + a->Tq + 16), gain = 1 / (1 - fmin(a->p, 0.99));
+  const double slope = 4 * gain * D * y * v * scale; /* of dS */
+  if (!(score < 40 && v < 1e10 && y < 1e10 && q < 1e10 && k < 1e10)) return;
+  double *out = calloc((size_t)(2 * queries + 2 * keys + a->Tq * a->H + 1), sizeof *out), *dq = out + queries, *dk = dq + queries;
+  double *dv = dk + keys, *lse = dv + keys;
+  CHECK(out, "no memory");
+  formula(a, out, lse, dq, dk, dv);
+  compare_values("out", r->out, out, queries, 4 * error * gain * v + 1e-37);
+  compare_values("dq", r->dq, dq, queries, 8 * error * slope * k + 1e-36);
+  compare_values("dk", r->dk, dk, keys, 8 * error * slope * q * (double)a->Tq + 1e-36);
+  compare_values("dv", r->dv, dv, keys, 8 * error * gain * y * (double)a->Tq + 1e-36);
+  free(out);
+}
+
+static void fuzz(const ast_kernels *kernels) {
+  static const double rates[] = {0, 0, 0.1, 0.9, 1e-9, 0.999999, 0.5, 0};
+  problem a = {.B = take_size(5), .H = 1 + take_byte() % 3, .D = 16 * (1 + take_byte() % 8), .p = rates[take_byte() % 8]};
+  for (int64_t b = 0; b < a.B; b++) {
+    a.q_offsets[b + 1] = a.Tq += take_size(300);
+    a.k_offsets[b + 1] = a.Tk += take_size(300);
+  }
+  const int64_t row = a.H * a.D;
+  a.q = take_floats(a.Tq * row), a.k = take_floats(a.Tk * row), a.v = take_floats(a.Tk * row), a.dout = take_floats(a.Tq * row);
+  answer r = solve(kernels, &a);
+  const int64_t b = a.B ? (a.p > 0 ? 0 : take_index(a.B)) : 0; /* with dropout a scene alone has index 0 */
+  if (a.B) check_alone(kernels, &a, &r, b);
+  check_values(&a, &r);
+  free_answer(r), free_problem(a);
+}
