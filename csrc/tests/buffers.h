@@ -54,6 +54,7 @@ static buffer *buffer_of(const void *p) {
 
 static void protect_buffers(const void *const *inputs, size_t num, int protection) {
   for (size_t i = 0; i < num; i++) {
+    if (!inputs[i]) continue;
     const buffer *b = buffer_of(inputs[i]);
     CHECK(!b->pages_size || !mprotect(b->pages, b->pages_size, protection), "mprotect");
   }
@@ -61,6 +62,7 @@ static void protect_buffers(const void *const *inputs, size_t num, int protectio
 
 static void free_buffers(const void *const *data, size_t num) {
   for (size_t i = 0; i < num; i++) {
+    if (!data[i]) continue;
     buffer *b = buffer_of(data[i]);
     for (const char *c = b->pages; c < b->pages + b->pages_size; c++)
       CHECK((c >= b->data && c < b->data + b->size) || *(const unsigned char *)c == SLACK_PATTERN, "written %td bytes from a buffer of %zu",
@@ -78,9 +80,16 @@ static void free_buffers(const void *const *data, size_t num) {
 static float *new_floats(int64_t n) { return new_buffer((size_t)n * sizeof(float)); }
 static int64_t *new_ints(int64_t n) { return new_buffer((size_t)n * sizeof(int64_t)); }
 static int32_t *new_small_ints(int64_t n) { return new_buffer((size_t)n * sizeof(int32_t)); }
+/* in -1..1 */
 static float *random_floats(int64_t n) {
   float *x = new_floats(n);
   for (int64_t i = 0; i < n; i++) x[i] = random_float();
+  return x;
+}
+/* in -amplitude..amplitude */
+static float *scaled_floats(int64_t n, float amplitude) {
+  float *x = random_floats(n);
+  for (int64_t i = 0; i < n; i++) x[i] *= amplitude;
   return x;
 }
 static int64_t *copy_ints(const int64_t *values, int64_t n) { return memcpy(new_ints(n), values, (size_t)n * sizeof *values); }

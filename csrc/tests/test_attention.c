@@ -5,12 +5,6 @@
  */
 #include "check.h"
 
-/* random floats in -amplitude..amplitude */
-static float *floats_of(int64_t n, float amplitude) {
-  float *x = random_floats(n);
-  for (int64_t i = 0; i < n; i++) x[i] *= amplitude;
-  return x;
-}
 static bool same_bits(const void *a, const void *b, int64_t floats) { return memcmp(a, b, (size_t)floats * sizeof(float)) == 0; }
 
 typedef struct {
@@ -30,8 +24,8 @@ static problem new_problem(int64_t B, const int64_t *queries, const int64_t *key
     a.q_offsets[b + 1] = a.Tq += queries[b];
     a.k_offsets[b + 1] = a.Tk += keys[b];
   }
-  a.q = floats_of(a.Tq * H * D, amplitude);
-  a.k = floats_of(a.Tk * H * D, amplitude);
+  a.q = scaled_floats(a.Tq * H * D, amplitude);
+  a.k = scaled_floats(a.Tk * H * D, amplitude);
   a.v = random_floats(a.Tk * H * D);
   a.dout = random_floats(a.Tq * H * D);
   return a;

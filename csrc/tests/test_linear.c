@@ -4,18 +4,6 @@
  */
 #include "check.h"
 
-/* n floats of NaN: what a kernel leaves unwritten shows. */
-static float *new_floats(int64_t n) {
-  float *x = malloc((size_t)(n + 1) * sizeof *x);
-  CHECK(x, "no memory");
-  for (int64_t i = 0; i < n; i++) x[i] = NAN;
-  return x;
-}
-static float *random_floats(int64_t n, float amplitude) {
-  float *x = new_floats(n);
-  for (int64_t i = 0; i < n; i++) x[i] = amplitude * random_float();
-  return x;
-}
 static bool same_bits(const void *a, const void *b, int64_t floats) { return memcmp(a, b, (size_t)floats * sizeof(float)) == 0; }
 
 enum { RESULTS = 4 }; /* out, dx, dweight, dbias */
@@ -36,26 +24,29 @@ static problem new_problem(int64_t M, int64_t I, int64_t O, ast_activation activ
   a.s.residual_stride = a.s.dout_stride = a.columns;
   const int64_t sizes[RESULTS] = {M * a.columns, M * I, O * I, O};
   memcpy(a.sizes, sizes, sizeof sizes);
-  a.x = random_floats(M * I, amplitude), a.weight = random_floats(O * I, 1), a.bias = random_floats(O, 1);
-  a.residual = random_floats(M * a.columns, 1), a.dout = random_floats(M * a.columns, 1);
+  a.x = scaled_floats(M * I, amplitude), a.weight = random_floats(O * I), a.bias = random_floats(O);
+  a.residual = random_floats(M * a.columns), a.dout = random_floats(M * a.columns);
   return a;
 }
 
-static void free_problem(problem a) { free(a.x), free(a.weight), free(a.bias), free(a.residual), free(a.dout); }
+static void free_problem(problem a) { FREE(a.x, a.weight, a.bias, a.residual, a.dout); }
 
 static answer solve(const ast_kernels *kernels, const problem *a, bool save) {
   answer r;
   for (int i = 0; i < RESULTS; i++) r.of[i] = new_floats(a->sizes[i]);
   r.z = new_floats(a->s.M * a->s.O);
+  READ_ONLY(a->x, a->weight, a->bias, a->residual, a->dout);
   CHECK(kernels->linear(&a->s, a->x, a->weight, a->bias, a->residual, r.of[0], save ? r.z : NULL) == AST_OK, "status");
+  READ_ONLY(r.z);
   CHECK(kernels->linear_backward(&a->s, a->dout, a->x, a->weight, a->bias, save ? r.z : NULL, r.of[1], r.of[2], r.of[3]) == AST_OK,
         "status");
+  WRITABLE(a->x, a->weight, a->bias, a->residual, a->dout);
   return r;
 }
 
 static void free_answer(answer r) {
-  for (int i = 0; i < RESULTS; i++) free(r.of[i]);
-  free(r.z);
+  for (int i = 0; i < RESULTS; i++) FREE(r.of[i]);
+  FREE(r.z);
 }
 
 /* The results in the type `real`. */
@@ -122,7 +113,8 @@ static void check_against_formula(const problem *a, const answer *r) {
   formula_float(a, plain[0], plain[1], plain[2], plain[3]);
   for (int i = 0; i < RESULTS; i++) {
     compare(names[i], r->of[i], exact[i], plain[i], a->sizes[i]);
-    free(exact[i]), free(plain[i]);
+    free(exact[i]);
+    FREE(plain[i]);
   }
 }
 
@@ -171,7 +163,7 @@ static void test_same_bits_on_threads(const ast_kernels *kernels) {
     answer first = solve(kernels, &a, false), again = solve(kernels, &a, false);
     ast_set_pool(NULL, NULL);
     answer serial = solve(kernels, &a, false);
-    ast_set_pool(check_parallel_for, check_num_threads);
+    ast_set_pool(pool_for, pool_threads);
     for (int j = 0; j < RESULTS; j++) {
       CHECK(same_bits(first.of[j], again.of[j], a.sizes[j]), "%s changes from run to run", names[j]);
       CHECK(same_bits(first.of[j], serial.of[j], a.sizes[j]), "%s changes with the threads", names[j]);
@@ -193,6 +185,7 @@ static void test_strides_and_absent_arrays(const ast_kernels *kernels) {
   ast_linear s = a.s;
   s.x_stride = s.dout_stride = apart;
   float *dx = new_floats(M * I), *dweight = new_floats(O * I), *dbias = new_floats(O), *out = new_floats(M * O);
+  READ_ONLY(wide, a.weight, a.bias, a.residual);
   CHECK(kernels->linear(&s, wide, a.weight, a.bias, a.residual, out, NULL) == AST_OK, "status");
   CHECK(same_bits(out, dense.of[0], M * O), "strides change the result");
   CHECK(kernels->linear_backward(&s, wide + I, wide, a.weight, a.bias, NULL, dx, NULL, NULL) == AST_OK, "status");
@@ -201,11 +194,12 @@ static void test_strides_and_absent_arrays(const ast_kernels *kernels) {
   CHECK(same_bits(dweight, dense.of[2], O * I), "dweight alone");
   CHECK(kernels->linear_backward(&s, wide + I, wide, a.weight, a.bias, NULL, NULL, NULL, dbias) == AST_OK, "status");
   CHECK(same_bits(dbias, dense.of[3], O), "dbias alone");
+  WRITABLE(a.bias, a.residual);
   memset(a.bias, 0, (size_t)O * sizeof *a.bias), memset(a.residual, 0, (size_t)(M * O) * sizeof *a.residual);
   answer zero = solve(kernels, &a, false);
   CHECK(kernels->linear(&s, wide, a.weight, NULL, NULL, out, NULL) == AST_OK, "status");
   CHECK(same_bits(out, zero.of[0], M * O), "without bias and residual");
-  free(wide), free(dx), free(dweight), free(dbias), free(out);
+  FREE(wide, dx, dweight, dbias, out);
   free_answer(dense), free_answer(zero), free_problem(a);
 }
 

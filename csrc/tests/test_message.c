@@ -4,18 +4,10 @@
  */
 #include "check.h"
 
-static float *random_floats(int64_t n, double scale) {
-  float *x = malloc((size_t)(n + 1) * sizeof *x);
-  CHECK(x, "no memory");
-  for (int64_t i = 0; i < n; i++) x[i] = (float)scale * random_float();
-  return x;
-}
-
 /* M edges whose ends lie in the same of `parts` parts of S senders and R receivers (the scenes of a batch), and random weights. */
 static ast_message new_case(int64_t M, int64_t S, int64_t R, int64_t E, int64_t H, int64_t F, int64_t F2, int64_t parts) {
-  int64_t *senders = malloc((size_t)(M + 1) * sizeof *senders), *receivers = malloc((size_t)(M + 1) * sizeof *receivers);
-  int64_t *offsets = calloc((size_t)(R + 1), sizeof *offsets);
-  CHECK(senders && receivers && offsets, "no memory");
+  int64_t *senders = new_ints(M), *receivers = new_ints(M), *offsets = new_ints(R + 1);
+  memset(offsets, 0, (size_t)(R + 1) * sizeof *offsets);
   for (int64_t m = 0; m < M; m++) offsets[m * R / M + 1]++; /* about the same number each, */
   for (int64_t r = 1; R > 5 && r < R; r += 5) {             /* but every fifth gives its edges to the one before */
     offsets[r] += offsets[r + 1];
@@ -39,25 +31,22 @@ static ast_message new_case(int64_t M, int64_t S, int64_t R, int64_t E, int64_t 
       .senders = senders,
       .receivers = receivers,
       .receiver_offsets = offsets,
-      .of_senders = random_floats(S * F, 1),
-      .of_receivers = random_floats(R * F, 1),
-      .edge_features = random_floats(M * E, 1),
-      .A1 = random_floats(H * E, 1),
-      .a1 = random_floats(H, 1),
-      .A2 = random_floats(F * H, 0.3),
-      .W2 = random_floats(F2 * F, 0.3),
-      .b2 = random_floats(F2, 1),
-      .gamma = random_floats(F2, 1),
-      .beta = random_floats(F2, 1),
+      .of_senders = random_floats(S * F),
+      .of_receivers = random_floats(R * F),
+      .edge_features = random_floats(M * E),
+      .A1 = random_floats(H * E),
+      .a1 = random_floats(H),
+      .A2 = scaled_floats(F * H, 0.3f),
+      .W2 = scaled_floats(F2 * F, 0.3f),
+      .b2 = random_floats(F2),
+      .gamma = random_floats(F2),
+      .beta = random_floats(F2),
   };
 }
 
-static void free_case(const ast_message *s) {
-  const void *const all[] = {
-      s->senders, s->receivers, s->receiver_offsets, s->of_senders, s->of_receivers, s->edge_features, s->A1, s->a1, s->A2, s->W2, s->b2,
-      s->gamma,   s->beta};
-  for (int i = 0; i < 13; i++) free((void *)(uintptr_t)all[i]);
-}
+#define CASE_BUFFERS(s)                                                                                                                   \
+  (s)->senders, (s)->receivers, (s)->receiver_offsets, (s)->of_senders, (s)->of_receivers, (s)->edge_features, (s)->A1, (s)->a1, (s)->A2, \
+      (s)->W2, (s)->b2, (s)->gamma, (s)->beta
 
 /* The sum, the messages and the ten gradients lie one after the other; at[i] is where the i-th begins. */
 enum { RESULTS = 12, SUM = 0, MESSAGES, P, Q, EDGES, A1, B1, A2, W2, B2, GAMMA, BETA };
@@ -133,14 +122,19 @@ static void layout(const ast_message *s, int64_t at[RESULTS + 1]) {
 FORMULA(formula, double, sqrt)
 FORMULA(formula_float, float, sqrtf)
 
-/* All results of the kernels, into memory that holds NaN before. */
+/* All results of the kernels, one after the other. */
 static float *run(const ast_kernels *kernels, const ast_message *s, const float *dsum, const float *dmessages, const int64_t *at) {
-  float *out = random_floats(at[RESULTS], 1);
-  memset(out, 0xff, (size_t)at[RESULTS] * sizeof *out);
-  CHECK(kernels->message(s, out, out + at[MESSAGES]) == AST_OK, "status");
-  const ast_message_gradients gradients = {out + at[P],  out + at[Q],  out + at[EDGES], out + at[A1],    out + at[B1],
-                                           out + at[A2], out + at[W2], out + at[B2],    out + at[GAMMA], out + at[BETA]};
+  float *of[RESULTS], *out = random_floats(at[RESULTS]);
+  for (int i = 0; i < RESULTS; i++) of[i] = new_floats(at[i + 1] - at[i]);
+  READ_ONLY(CASE_BUFFERS(s), dsum, dmessages);
+  CHECK(kernels->message(s, of[SUM], of[MESSAGES]) == AST_OK, "status");
+  const ast_message_gradients gradients = {of[P], of[Q], of[EDGES], of[A1], of[B1], of[A2], of[W2], of[B2], of[GAMMA], of[BETA]};
   CHECK(kernels->message_backward(s, dsum, dmessages, &gradients) == AST_OK, "status");
+  WRITABLE(CASE_BUFFERS(s), dsum, dmessages);
+  for (int i = 0; i < RESULTS; i++) {
+    memcpy(out + at[i], of[i], (size_t)(at[i + 1] - at[i]) * sizeof *out);
+    FREE(of[i]);
+  }
   return out;
 }
 
@@ -159,7 +153,7 @@ static void check_case(const ast_kernels *kernels, const int64_t *edges, const i
   const ast_message s = new_case(edges[0], edges[1], edges[2], channels[0], channels[1], channels[2], channels[3], 1);
   int64_t at[RESULTS + 1];
   layout(&s, at);
-  float *dsum = random_floats(s.R * s.F2, 1), *dmessages = with_messages ? random_floats(s.M * s.F2, 1) : NULL;
+  float *dsum = random_floats(s.R * s.F2), *dmessages = with_messages ? random_floats(s.M * s.F2) : NULL;
   double *exact = calloc((size_t)(at[RESULTS] + 1), sizeof *exact);
   float *plain = calloc((size_t)(at[RESULTS] + 1), sizeof *plain);
   CHECK(exact && plain, "no memory");
@@ -167,8 +161,8 @@ static void check_case(const ast_kernels *kernels, const int64_t *edges, const i
   formula_float(&s, dsum, dmessages, plain, at);
   float *out = run(kernels, &s, dsum, dmessages, at);
   for (int i = 0; i < RESULTS; i++) compare(names[i], out + at[i], exact + at[i], plain + at[i], at[i + 1] - at[i]);
-  free_case(&s);
-  free(dsum), free(dmessages), free(exact), free(plain), free(out);
+  free(exact), free(plain);
+  FREE(CASE_BUFFERS(&s), dsum, dmessages, out);
 }
 
 static void test_accuracy(const ast_kernels *kernels) {
@@ -184,28 +178,26 @@ static void test_batch(const ast_kernels *kernels) {
   const ast_message both = new_case(5000, 400, 600, 5, 24, 40, 20, 2);
   const int64_t M = both.M - both.receiver_offsets[300], first = both.M - M;
   ast_message one = both;
-  int64_t *index = malloc((size_t)(2 * M + 301) * sizeof *index);
-  CHECK(index, "no memory");
+  int64_t *senders = new_ints(M), *receivers = new_ints(M), *offsets = new_ints(301);
   one.M = M, one.S = 200, one.R = 300;
-  one.senders = index, one.receivers = index + M, one.receiver_offsets = index + 2 * M;
+  one.senders = senders, one.receivers = receivers, one.receiver_offsets = offsets;
   for (int64_t m = 0; m < M; m++) {
-    index[m] = both.senders[first + m] - 200;
-    index[M + m] = both.receivers[first + m] - 300;
+    senders[m] = both.senders[first + m] - 200;
+    receivers[m] = both.receivers[first + m] - 300;
   }
-  for (int64_t r = 0; r <= 300; r++) index[2 * M + r] = both.receiver_offsets[300 + r] - first;
+  for (int64_t r = 0; r <= 300; r++) offsets[r] = both.receiver_offsets[300 + r] - first;
   one.of_senders += 200 * one.F, one.of_receivers += 300 * one.F, one.edge_features += first * one.E;
   for (int64_t i = 0; i < 200 * one.F; i += 7) ((float *)(uintptr_t)both.of_senders)[i] = NAN;
   int64_t at[RESULTS + 1], at_one[RESULTS + 1];
   layout(&both, at), layout(&one, at_one);
-  float *dsum = random_floats(both.R * both.F2, 1);
+  float *dsum = random_floats(both.R * both.F2);
   float *batch = run(kernels, &both, dsum, NULL, at), *alone = run(kernels, &one, dsum + 300 * one.F2, NULL, at_one);
   for (int i = SUM; i <= EDGES; i++) {
     const int64_t n = at_one[i + 1] - at_one[i];
     for (int64_t j = 0; j < n; j++) CHECK(isfinite(alone[at_one[i] + j]), "%s[%lld]", names[i], (long long)j);
     CHECK(!memcmp(alone + at_one[i], batch + at[i + 1] - n, (size_t)n * sizeof *alone), "%s: not the same bits", names[i]);
   }
-  free_case(&both);
-  free(index), free(dsum), free(batch), free(alone);
+  FREE(CASE_BUFFERS(&both), senders, receivers, offsets, dsum, batch, alone);
 }
 
 /* The pool that this run is on gives what the calling thread alone gives. */
@@ -213,12 +205,11 @@ static void test_threads(const ast_kernels *kernels) {
   const ast_message s = new_case(18000, 700, 900, 3, 16, 24, 16, 1);
   int64_t at[RESULTS + 1];
   layout(&s, at);
-  float *dsum = random_floats(s.R * s.F2, 1), *pool = run(kernels, &s, dsum, NULL, at);
+  float *dsum = random_floats(s.R * s.F2), *threaded = run(kernels, &s, dsum, NULL, at);
   ast_set_pool(NULL, NULL);
   float *serial = run(kernels, &s, dsum, NULL, at);
-  CHECK(!memcmp(pool, serial, (size_t)at[RESULTS] * sizeof *pool), "threads change the result");
-  free_case(&s);
-  free(dsum), free(pool), free(serial);
+  CHECK(!memcmp(threaded, serial, (size_t)at[RESULTS] * sizeof *threaded), "threads change the result");
+  FREE(CASE_BUFFERS(&s), dsum, threaded, serial);
 }
 
 static void test(const ast_kernels *kernels) {

@@ -179,6 +179,70 @@ static outcome attention_backward(const ast_kernels *kernels) {
   return FINISH(KERNEL(kernels->attention_backward(&s, q, k, v, out, maximum, sum, dout, dq, dk, dv)), dq, dk, dv);
 }
 
+/* Every sender sends two edges on, every second receiver gets four. */
+static ast_message message_case(void) {
+  enum { M = 6000, S = 3000, R = 3000, E = 3, HIDDEN = 16, F = 24, F2 = 20 };
+  int64_t *senders = new_ints(M), *receivers = new_ints(M), *offsets = new_ints(R + 1);
+  for (int64_t m = 0; m < M; m++) senders[m] = (7 * m) % S, receivers[m] = m / 4 * 2;
+  for (int64_t r = 0; r <= R; r++) offsets[r] = (r + 1) / 2 * 4;
+  return (ast_message){
+      .M = M,
+      .S = S,
+      .R = R,
+      .E = E,
+      .H = HIDDEN,
+      .F = F,
+      .F2 = F2,
+      .senders = senders,
+      .receivers = receivers,
+      .receiver_offsets = offsets,
+      .of_senders = random_floats(S * F),
+      .of_receivers = random_floats(R * F),
+      .edge_features = random_floats(M * E),
+      .A1 = random_floats(HIDDEN * E),
+      .a1 = random_floats(HIDDEN),
+      .A2 = random_floats(F * HIDDEN),
+      .W2 = random_floats(F2 * F),
+      .b2 = random_floats(F2),
+      .gamma = random_floats(F2),
+      .beta = random_floats(F2),
+  };
+}
+
+static outcome message(const ast_kernels *kernels) {
+  const ast_message s = message_case();
+  float *sum = new_floats(s.R * s.F2), *messages = new_floats(s.M * s.F2);
+  return FINISH(KERNEL(kernels->message(&s, sum, messages)), sum, messages);
+}
+
+static outcome message_backward(const ast_kernels *kernels) {
+  const ast_message s = message_case();
+  const float *dsum = random_floats(s.R * s.F2), *dmessages = random_floats(s.M * s.F2);
+  const ast_message_gradients out = {new_floats(s.S * s.F), new_floats(s.R * s.F), new_floats(s.M * s.E),  new_floats(s.H * s.E),
+                                     new_floats(s.H),       new_floats(s.F * s.H), new_floats(s.F2 * s.F), new_floats(s.F2),
+                                     new_floats(s.F2),      new_floats(s.F2)};
+  const void *outputs[sizeof out / sizeof(void *)];
+  memcpy(outputs, &out, sizeof out);
+  return finish(KERNEL(kernels->message_backward(&s, dsum, dmessages, &out)), outputs, sizeof out / sizeof(void *));
+}
+
+enum { LINEAR_ROWS = 700, INPUTS = 40, OUTPUTS = 70 };
+
+static outcome linear(const ast_kernels *kernels) {
+  const ast_linear s = {LINEAR_ROWS, INPUTS, OUTPUTS, INPUTS, OUTPUTS / 2, OUTPUTS / 2, AST_GEGLU};
+  float *x = random_floats(LINEAR_ROWS * INPUTS), *weight = random_floats(OUTPUTS * INPUTS), *bias = random_floats(OUTPUTS);
+  float *residual = random_floats(LINEAR_ROWS * OUTPUTS / 2), *out = new_floats(LINEAR_ROWS * OUTPUTS / 2);
+  return FINISH(KERNEL(kernels->linear(&s, x, weight, bias, residual, out, NULL)), out);
+}
+
+static outcome linear_backward(const ast_kernels *kernels) {
+  const ast_linear s = {LINEAR_ROWS, INPUTS, OUTPUTS, INPUTS, OUTPUTS / 2, OUTPUTS / 2, AST_GEGLU};
+  float *x = random_floats(LINEAR_ROWS * INPUTS), *weight = random_floats(OUTPUTS * INPUTS), *bias = random_floats(OUTPUTS);
+  float *dout = random_floats(LINEAR_ROWS * OUTPUTS / 2), *dx = new_floats(LINEAR_ROWS * INPUTS);
+  float *dweight = new_floats(OUTPUTS * INPUTS), *dbias = new_floats(OUTPUTS);
+  return FINISH(KERNEL(kernels->linear_backward(&s, dout, x, weight, bias, NULL, dx, dweight, dbias)), dx, dweight, dbias);
+}
+
 static const struct {
   const char *name;
   outcome (*run)(const ast_kernels *);
@@ -194,6 +258,10 @@ static const struct {
     {"sparse_conv_weight", sparse_conv_weight},
     {"attention", attention},
     {"attention_backward", attention_backward},
+    {"message", message},
+    {"message_backward", message_backward},
+    {"linear", linear},
+    {"linear_backward", linear_backward},
 };
 
 /* ---- attempts ---- */
