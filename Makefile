@@ -97,7 +97,8 @@ COMPILE_plain := $(GCC) -O3
 COMPILE_sanitized := $(GCC) -O1 -g -fsanitize=$(SANITIZE) -fno-sanitize-recover=all
 COMPILE_races := $(CLANG) -O1 -g -fsanitize=thread
 COMPILE_valgrind := $(GCC) -O1 -g
-COMPILE_fuzz := $(CLANG) -O1 -g -fsanitize=fuzzer-no-link,$(SANITIZE) -fno-sanitize-recover=all
+# -O0: the optimiser takes minutes over unrolled products with all these checks in them.
+COMPILE_fuzz := $(CLANG) -O0 -g -fsanitize=fuzzer-no-link,$(SANITIZE) -fno-sanitize-recover=all
 COMPILE_wide := $(GCC) -O2 -Wno-psabi -mavx2 -mfma -DAST_VECTOR_BYTES=64
 
 CORE := isa_base dispatch parallel memory
@@ -126,7 +127,7 @@ $(foreach build,$(BUILDS) fuzz,$(eval $(call BUILD,$(build))))
 build/check/wide/%.o: FLAGS_dispatch :=
 
 $(addprefix build/check/fuzz/fuzz_,$(C_FUZZERS)): build/check/fuzz/fuzz_%: csrc/tests/fuzz_%.c csrc/tests/test_%.c $(C_TEST_HEADERS) build/check/fuzz/core.a
-	@$(COMPILE_fuzz) -fsanitize=fuzzer $< build/check/fuzz/core.a -lm -o $@
+	@$(COMPILE_fuzz) -O1 -fsanitize=fuzzer $< build/check/fuzz/core.a -lm -o $@
 
 build/check/fuzz_%.passed: build/check/fuzz/fuzz_% csrc/tests/corpus/%
 	@echo "$* (kept inputs of its fuzz target)"
