@@ -4,18 +4,6 @@
  */
 #include "check.h"
 
-/* n floats of NaN: what a kernel leaves unwritten shows. */
-static float *new_floats(int64_t n) {
-  float *x = malloc((size_t)(n + 1) * sizeof *x);
-  CHECK(x, "no memory");
-  for (int64_t i = 0; i < n; i++) x[i] = NAN;
-  return x;
-}
-static float *random_floats(int64_t n) {
-  float *x = new_floats(n);
-  for (int64_t i = 0; i < n; i++) x[i] = random_float();
-  return x;
-}
 static bool same_bits(const void *a, const void *b, int64_t floats) { return memcmp(a, b, (size_t)floats * sizeof(float)) == 0; }
 
 enum { RESULTS = 9 };
@@ -59,7 +47,7 @@ static problem new_problem(int64_t M, int64_t I, int64_t I2, int64_t H, int64_t 
 }
 
 static void free_problem(problem a) {
-  for (int i = 0; i < 10; i++) free(a.arrays[i]);
+  for (int i = 0; i < 10; i++) FREE(a.arrays[i]);
 }
 
 static answer solve(const ast_kernels *kernels, const problem *a, bool keep) {
@@ -72,14 +60,17 @@ static answer solve(const ast_kernels *kernels, const problem *a, bool keep) {
   if (keep && s->gamma) kept.normalized = normalized, kept.scale = scale;
   ast_mlp_gradients g = {r.of[1], s->beside ? r.of[2] : NULL, r.of[3], r.of[4], r.of[5], r.of[6], NULL, NULL};
   if (s->gamma) g.gamma = r.of[7], g.beta = r.of[8];
+  for (int i = 0; i < 10; i++) READ_ONLY(a->arrays[i]);
   CHECK(kernels->mlp(s, a->arrays[8], r.of[0], kept) == AST_OK, "status");
+  READ_ONLY(hidden, normalized, scale);
   CHECK(kernels->mlp_backward(s, a->arrays[9], kept, g) == AST_OK, "status");
-  free(hidden), free(normalized), free(scale);
+  for (int i = 0; i < 10; i++) WRITABLE(a->arrays[i]);
+  FREE(hidden, normalized, scale);
   return r;
 }
 
 static void free_answer(answer r) {
-  for (int i = 0; i < RESULTS; i++) free(r.of[i]);
+  for (int i = 0; i < RESULTS; i++) FREE(r.of[i]);
 }
 
 /* One row of the results in the type `real`; gradients of the weights are added to. */
@@ -179,7 +170,7 @@ static void test_same_bits(const ast_kernels *kernels) {
   answer first = solve(kernels, &a, false), kept = solve(kernels, &a, true);
   ast_set_pool(NULL, NULL);
   answer serial = solve(kernels, &a, false);
-  if (pool) ast_set_pool(check_parallel_for, check_num_threads);
+  if (pool) ast_set_pool(pool_for, pool_threads);
   for (int i = 0; i < RESULTS; i++) {
     CHECK(same_bits(first.of[i], kept.of[i], a.sizes[i]), "%s differs if hidden units are kept", names[i]);
     CHECK(same_bits(first.of[i], serial.of[i], a.sizes[i]), "%s differs with the threads", names[i]);

@@ -243,6 +243,58 @@ static outcome linear_backward(const ast_kernels *kernels) {
   return FINISH(KERNEL(kernels->linear_backward(&s, dout, x, weight, bias, NULL, dx, dweight, dbias)), dx, dweight, dbias);
 }
 
+enum { MLP_ROWS = 700, MLP_IN = 20, MLP_BESIDE = 9, MLP_HIDDEN = 40, MLP_OUT = 33 };
+
+static ast_mlp mlp_case(void) {
+  return (ast_mlp){
+      .M = MLP_ROWS,
+      .I = MLP_IN,
+      .I2 = MLP_BESIDE,
+      .H = MLP_HIDDEN,
+      .O = MLP_OUT,
+      .x_stride = MLP_IN,
+      .beside_stride = MLP_BESIDE,
+      .residual_stride = MLP_OUT,
+      .dout_stride = MLP_OUT,
+      .x = random_floats(MLP_ROWS * MLP_IN),
+      .beside = random_floats(MLP_ROWS * MLP_BESIDE),
+      .weight1 = random_floats(MLP_HIDDEN * (MLP_IN + MLP_BESIDE)),
+      .bias1 = random_floats(MLP_HIDDEN),
+      .weight2 = random_floats(MLP_OUT * MLP_HIDDEN),
+      .bias2 = random_floats(MLP_OUT),
+      .gamma = random_floats(MLP_OUT),
+      .beta = random_floats(MLP_OUT),
+  };
+}
+
+static outcome mlp(const ast_kernels *kernels) {
+  const ast_mlp s = mlp_case();
+  float *residual = random_floats(MLP_ROWS * MLP_OUT), *out = new_floats(MLP_ROWS * MLP_OUT);
+  return FINISH(KERNEL(kernels->mlp(&s, residual, out, (ast_mlp_kept){0})), out);
+}
+
+static outcome mlp_backward(const ast_kernels *kernels) {
+  const ast_mlp s = mlp_case();
+  const float *dout = random_floats(MLP_ROWS * MLP_OUT);
+  const ast_mlp_gradients out = {new_floats(MLP_ROWS * MLP_IN),
+                                 new_floats(MLP_ROWS * MLP_BESIDE),
+                                 new_floats(MLP_HIDDEN * (MLP_IN + MLP_BESIDE)),
+                                 new_floats(MLP_HIDDEN),
+                                 new_floats(MLP_OUT * MLP_HIDDEN),
+                                 new_floats(MLP_OUT),
+                                 new_floats(MLP_OUT),
+                                 new_floats(MLP_OUT)};
+  const void *outputs[sizeof out / sizeof(void *)];
+  memcpy(outputs, &out, sizeof out);
+  return finish(KERNEL(kernels->mlp_backward(&s, dout, (ast_mlp_kept){0}, out)), outputs, sizeof out / sizeof(void *));
+}
+
+static outcome column_sum(const ast_kernels *kernels) {
+  enum { N = 9000, F = 70 };
+  float *x = random_floats(N * F), *out = new_floats(F);
+  return FINISH(KERNEL(kernels->column_sum(x, N, F, out)), out);
+}
+
 static const struct {
   const char *name;
   outcome (*run)(const ast_kernels *);
@@ -262,6 +314,9 @@ static const struct {
     {"message_backward", message_backward},
     {"linear", linear},
     {"linear_backward", linear_backward},
+    {"mlp", mlp},
+    {"mlp_backward", mlp_backward},
+    {"column_sum", column_sum},
 };
 
 /* ---- attempts ---- */

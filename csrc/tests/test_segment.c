@@ -36,7 +36,7 @@ static void compare(const ast_kernels *kernels, int64_t N, int64_t C, int64_t F,
 }
 
 static void sum_columns(const ast_kernels *kernels, int64_t N, int64_t F) {
-  float *x = malloc((size_t)(N * F + 1) * 4), *out = malloc((size_t)(F + 1) * 4);
+  float *x = new_floats(N * F), *out = new_floats(F);
   for (int64_t i = 0; i < N * F; i++) x[i] = random_float();
   memset(out, 0xff, (size_t)F * 4);
   CHECK(kernels->column_sum(x, N, F, out) == AST_OK, "status");
@@ -45,7 +45,7 @@ static void sum_columns(const ast_kernels *kernels, int64_t N, int64_t F) {
     for (int64_t n = 0; n < N; n++) sum += (double)x[n * F + f], magnitude += fabs((double)x[n * F + f]);
     CHECK(fabs((double)out[f] - sum) <= 1e-6 * magnitude, "N %lld F %lld: %g", (long long)N, (long long)F, (double)out[f]);
   }
-  free(x), free(out);
+  FREE(x, out);
 }
 
 static void test(const ast_kernels *kernels) {
