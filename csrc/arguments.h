@@ -137,17 +137,27 @@ static argument *take(call *c, const char *name, int type, bool output, bool str
 static argument absent;
 #define OPTIONAL(c, expression) ((c)->objects[(c)->next] == Py_None ? ((c)->next++, &absent) : (expression))
 
+/* An integer too large for C is out of range like any other; so is a float. */
+static bool too_large(call *c, const char *name, PyObject *object) {
+  if (!PyErr_ExceptionMatches(PyExc_OverflowError)) return false;
+  PyErr_Clear();
+  return fail(c, PyExc_ValueError, "%s must not be as large as %R", name, object);
+}
+
 static bool take_int(call *c, const char *name, int64_t low, int64_t high, int64_t *out) {
-  *out = PyLong_AsLongLong(c->objects[c->next++]);
-  if (*out == -1 && PyErr_Occurred()) return false;
+  PyObject *object = c->objects[c->next++];
+  *out = PyLong_AsLongLong(object);
+  if (*out == -1 && PyErr_Occurred()) return too_large(c, name, object);
   if (*out < low || *out > high)
     return fail(c, PyExc_ValueError, "%s must lie in %lld..%lld, not %lld", name, (long long)low, (long long)high, (long long)*out);
   return true;
 }
 
 static bool take_float(call *c, double *out) {
-  *out = PyFloat_AsDouble(c->objects[c->next++]);
-  return !(*out == -1 && PyErr_Occurred());
+  PyObject *object = c->objects[c->next++];
+  *out = PyFloat_AsDouble(object);
+  if (*out == -1 && PyErr_Occurred()) return too_large(c, "a number", object);
+  return true;
 }
 
 static bool check_offsets(const call *c, const argument *a, int64_t rows) {

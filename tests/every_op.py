@@ -1,0 +1,227 @@
+"""Every op on the same few scenes, for the tests that hold for all of them.
+
+A new op is one function and one entry of OPS. The function takes scene numbers and returns, for the batch of these
+scenes, the results of each scene (outputs and gradients of its rows) and those that the scenes share (gradients of
+weights).
+"""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from ast_sim.ops.attention import attention
+from ast_sim.ops.edges import EdgeSet
+from ast_sim.ops.fps import farthest_point_sample
+from ast_sim.ops.linear import linear
+from ast_sim.ops.message import message_sum
+from ast_sim.ops.mlp import mlp
+from ast_sim.ops.octree import CellMap, Octree, octree
+from ast_sim.ops.segment import segment_mean, segment_sum
+from ast_sim.ops.sparse_conv import sparse_conv, sparse_conv_transposed
+
+Results = tuple[list[list[Tensor]], list[Tensor]]
+SIZES = [700, 1, 0, 2500, 130]  # rows of scene 0, 1, ...
+
+
+def rows(scenes: Sequence[int], *width: int, key: int = 0, sizes: Sequence[int] = SIZES) -> Tensor:
+    """Random rows of these scenes; those of a scene are the same in every batch."""
+    parts = []
+    for s in scenes:
+        g = torch.Generator().manual_seed(1000 * key + s)
+        parts.append(torch.randn(sizes[s], *width, generator=g))
+    return torch.cat(parts)
+
+
+def shared(*shape: int, key: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(7000 + key)) / 4
+
+
+def offsets_of(scenes: Sequence[int], sizes: Sequence[int] = SIZES) -> Tensor:
+    return torch.tensor([0, *(sizes[s] for s in scenes)]).cumsum(0)
+
+
+def split(x: Tensor, offsets: Tensor) -> list[Tensor]:
+    return [x[a:b] for a, b in zip(offsets[:-1], offsets[1:], strict=True)]
+
+
+def differentiated(function: Callable, inputs: Sequence[Tensor], offsets: Sequence[Tensor], out: Tensor) -> Results:
+    """The output of function(*inputs), whose scenes lie between the offsets `out`, and the gradients of all inputs.
+
+    The first inputs have rows per scene, between `offsets`, one for each; the others are shared.
+    """
+    leaves = [x.detach().requires_grad_() for x in inputs]
+    y = function(*leaves)
+    cotangent = torch.cat(
+        [torch.randn(n, *y.shape[1:], generator=torch.Generator().manual_seed(n)) for n in out.diff().tolist()]
+    )
+    gradients = torch.autograd.grad(y, leaves, cotangent)
+    per_scene = zip(
+        split(y.detach(), out), *(split(g, o) for g, o in zip(gradients, offsets, strict=False)), strict=True
+    )
+    return [list(x) for x in per_scene], list(gradients[len(offsets) :])
+
+
+def by_rows(function: Callable, inputs: Sequence[Tensor], of_rows: int, offsets: Tensor) -> Results:
+    return differentiated(function, inputs, [offsets] * of_rows, offsets)
+
+
+# ---- the ops ----
+
+
+def octree_of(scenes: Sequence[int], depth: int = 6) -> Octree:
+    return octree(rows(scenes, 3).tanh(), offsets_of(scenes), (0.0, 0.0, 0.0), 1.0, depth)
+
+
+def level_of(scenes: Sequence[int]) -> CellMap:
+    return octree_of(scenes, 4).coarsen()
+
+
+def octree_results(scenes: Sequence[int]) -> Results:
+    tree, nodes = octree_of(scenes), offsets_of(scenes)
+    found = []
+    map = tree.coarsen()
+    coarse = map.coarse
+    for b in range(len(scenes)):
+        fine, cells = slice(*tree.cell_offsets[b : b + 2]), slice(*coarse.cell_offsets[b : b + 2])
+        node = slice(*nodes[b : b + 2])
+        mine = (map.coarse_index >= cells.start) & (map.coarse_index < cells.stop)
+        found.append(
+            [
+                tree.keys[fine],
+                tree.node_cell[node] - fine.start,
+                tree.node_order[node] - node.start,
+                tree.coordinates()[fine],
+                coarse.keys[cells],
+                map.fine[mine] - fine.start,
+                map.coarse_index[mine] - cells.start,
+            ]
+        )
+    return found, [map.pair_offsets]
+
+
+def sample_results(scenes: Sequence[int]) -> Results:
+    points, offsets = (40 * rows(scenes, 3)).int(), offsets_of(scenes)
+    indices, of_samples = farthest_point_sample(points, offsets, 60)
+    return [[x - start] for x, start in zip(split(indices, of_samples), offsets[:-1], strict=True)], []
+
+
+def conv_results(scenes: Sequence[int]) -> Results:
+    map = level_of(scenes)
+    x = torch.cat([shared(int(n), 40, key=int(n)) for n in map_fine_offsets(scenes).diff()])
+    return differentiated(
+        lambda x, w: sparse_conv(x, w, map),
+        (x, shared(27, 40, 24)),
+        [map_fine_offsets(scenes)],
+        map.coarse.cell_offsets,
+    )
+
+
+def conv_transposed_results(scenes: Sequence[int]) -> Results:
+    map = level_of(scenes)
+    x = torch.cat([shared(int(n), 24, key=int(n)) for n in map.coarse.cell_offsets.diff()])
+    return differentiated(
+        lambda x, w: sparse_conv_transposed(x, w, map),
+        (x, shared(27, 24, 40)),
+        [map.coarse.cell_offsets],
+        map_fine_offsets(scenes),
+    )
+
+
+def map_fine_offsets(scenes: Sequence[int]) -> Tensor:
+    return octree_of(scenes, 4).cell_offsets
+
+
+def attention_results(scenes: Sequence[int], p: float = 0.0) -> Results:
+    keys = [90, 300, 7, 40, 600]
+    q_offsets, k_offsets = offsets_of(scenes), offsets_of(scenes, keys)
+    inputs = (
+        rows(scenes, 3, 32, key=1),
+        rows(scenes, 3, 32, key=2, sizes=keys),
+        rows(scenes, 3, 32, key=3, sizes=keys),
+    )
+    return differentiated(
+        lambda q, k, v: attention(q, k, v, q_offsets, k_offsets, 0.2, p, 5)[0],
+        inputs,
+        [q_offsets, k_offsets, k_offsets],
+        q_offsets,
+    )
+
+
+def dropout_results(scenes: Sequence[int]) -> Results:
+    return attention_results(scenes, 0.2)
+
+
+def edges_of(scenes: Sequence[int]) -> EdgeSet:
+    """About six random edges a node within each scene."""
+    sets = []
+    for s in scenes:
+        g = torch.Generator().manual_seed(s)
+        pairs = torch.randint(0, max(SIZES[s], 1), (2, 6 * SIZES[s]), generator=g)
+        sets.append(EdgeSet.from_pairs(*pairs, SIZES[s], SIZES[s]))
+    return EdgeSet.concatenate(sets)
+
+
+def message_results(scenes: Sequence[int]) -> Results:
+    edges, offsets = edges_of(scenes), offsets_of(scenes)
+    of_edges = edges.receiver_offsets[offsets]
+    features = rows(scenes, 4, key=3, sizes=[6 * n for n in SIZES])
+    weights = [
+        shared(24, 4),
+        shared(24),
+        shared(40, 24),
+        shared(36, 40),
+        shared(36, key=1),
+        shared(36),
+        shared(36, key=2),
+    ]
+    return differentiated(
+        lambda s, r, e, a, b, c, *w: message_sum(edges, s, r, e, (a, b, c), *w),
+        (rows(scenes, 40, key=1), rows(scenes, 40, key=2), features, *weights),
+        [offsets, offsets, of_edges],
+        offsets,
+    )
+
+
+def segments_of(scenes: Sequence[int]) -> tuple[Octree, Tensor]:
+    return octree_of(scenes, 3), offsets_of(scenes)
+
+
+def segment_results(scenes: Sequence[int], op: Callable) -> Results:
+    tree, nodes = segments_of(scenes)
+    return differentiated(
+        lambda x: op(x, tree.node_order, tree.node_offsets), (rows(scenes, 33),), [nodes], tree.cell_offsets
+    )
+
+
+def linear_results(scenes: Sequence[int]) -> Results:
+    inputs = (rows(scenes, 48, key=1), rows(scenes, 35, key=2), shared(70, 48), shared(70))
+    return by_rows(lambda x, residual, w, b: linear(x, w, b, "geglu", residual), inputs, 2, offsets_of(scenes))
+
+
+def mlp_results(scenes: Sequence[int]) -> Results:
+    weights = (shared(40, 57), shared(40), shared(33, 40), shared(33), shared(33, key=1), shared(33, key=2))
+    inputs = (rows(scenes, 48, key=1), rows(scenes, 9, key=2), rows(scenes, 33, key=3), *weights)
+    return by_rows(
+        lambda x, beside, residual, w, b, v, c, gamma, beta: mlp(x, w, b, v, c, beside, (gamma, beta), residual),
+        inputs,
+        3,
+        offsets_of(scenes),
+    )
+
+
+OPS: dict[str, Callable[[Sequence[int]], Results]] = {
+    "octree": octree_results,
+    "farthest_point_sample": sample_results,
+    "sparse_conv": conv_results,
+    "sparse_conv_transposed": conv_transposed_results,
+    "attention": attention_results,
+    "attention with dropout": dropout_results,
+    "message_sum": message_results,
+    "segment_sum": lambda scenes: segment_results(scenes, segment_sum),
+    "segment_mean": lambda scenes: segment_results(scenes, segment_mean),
+    "linear": linear_results,
+    "mlp": mlp_results,
+}
+BY_PLACE = {"attention with dropout"}  # the mask of a scene depends on its place in the batch
+ALL = range(len(SIZES))
