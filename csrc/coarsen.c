@@ -175,15 +175,16 @@ typedef struct {
   const octree_moves *moves;
 } octree_neighbour_job;
 
-AST_INLINE octree_cells octree_pick(octree_cells x, octree_cells from) {
+/* x[from[i]] in lane i */
 #ifdef __clang__
+static octree_cells octree_pick(octree_cells x, octree_cells from) {
   octree_cells y;
   for (int i = 0; i < 8; i++) y[i] = x[from[i]];
   return y;
-#else
-  return __builtin_shuffle(x, from);
-#endif
 }
+#else
+#define octree_pick(x, from) __builtin_shuffle(x, from)
+#endif
 
 /* The cells before child f of P, whose octant this is. */
 AST_INLINE void octree_settle(const octree_neighbour_job *job, uint64_t families, octree_cells first, int octant, int64_t f) {

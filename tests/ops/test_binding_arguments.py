@@ -170,7 +170,7 @@ def test_arguments_that_do_not_fit(name, which, changes, more):
     if more:
         arguments = arguments[:-1] if more < 0 else [*arguments, 0]
     try:
-        assert getattr(library._C, name)(*arguments) is None
+        getattr(library._C, name)(*arguments)
     except ALLOWED as error:
         assert isinstance(error, MemoryError) or str(error)
 
