@@ -24,6 +24,7 @@ import ast_sim
 from ast_sim.evaluate import provenance
 from ast_sim.ops.library import configuration
 from benchmarks.case import Case
+from benchmarks.targets import judge
 
 FAMILIES = ("octree", "fps", "sparse_conv", "attention", "segment", "message")
 SHORTEST = 2e-3  # seconds of a sample at least: faster calls are repeated within it
@@ -84,7 +85,7 @@ def measure(case: Case, repeats: int, limit: float | None) -> dict:
     if case.flops:
         record["gflops"] = case.flops / best["ours"] / 1e9
         record["share_of_peak"] = record["gflops"] / limit if limit else None
-    return record
+    return judge(record)
 
 
 def line_of(record: dict) -> str:
@@ -100,6 +101,8 @@ def line_of(record: dict) -> str:
         text += f" (medians {peer['ratio_of_median']:.2f} x)"
     for name, reason in record["missing"].items():
         text += f"\n    {name}: not measured, {reason}"
+    if record.get("reached") is not None:
+        text += f"\n    target {'reached' if record['reached'] else 'NOT reached'}"
     return text
 
 

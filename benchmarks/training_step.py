@@ -22,6 +22,7 @@ from ast_sim.evaluate import provenance
 from benchmarks import scenes
 from benchmarks.kernels import peak
 from benchmarks.step_worker import Setup
+from benchmarks.targets import judge
 
 MEMORY = 20 << 30  # bytes of address space that a worker may take
 
@@ -146,6 +147,8 @@ def line_of(record: dict) -> str:
     text += f"; Python {record['python_share']:.0%}, outside C kernels {record['outside_kernels_share']:.0%}"
     if "growth_exponent" in record:
         text += f"; cost grows with exponent {record['growth_exponent']:.3f}"
+    if record.get("reached") is not None:
+        text += f"; target {'reached' if record['reached'] else 'NOT reached'}"
     return text
 
 
@@ -171,7 +174,7 @@ def main() -> None:
                 if case.preset == "abcd_xl" and before:
                     made[0]["growth_exponent"] = growth(before[-1], made[0])
                 for record in made:
-                    print(line_of(record), flush=True)
+                    print(line_of(judge(record)), flush=True)
                 records += made
     result = {
         **provenance(" ".join(["python -m benchmarks.training_step", *sys.argv[1:]])),
