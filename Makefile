@@ -91,7 +91,7 @@ tools:
 
 C_FLAGS := -std=gnu11 -fno-math-errno -fno-trapping-math -pthread
 SANITIZE := address,undefined,float-cast-overflow
-GCC := $(CC) $(C_FLAGS) -Wall -Wextra -Wconversion -Wshadow -Wno-maybe-uninitialized -Werror
+GCC := $(CC) $(C_FLAGS) -Wall -Wextra -Wconversion -Wshadow -Wno-maybe-uninitialized -Wno-psabi -Werror
 CLANG := clang $(C_FLAGS) -w
 COMPILE_plain := $(GCC) -O3
 COMPILE_sanitized := $(GCC) -O1 -g -fsanitize=$(SANITIZE) -fno-sanitize-recover=all

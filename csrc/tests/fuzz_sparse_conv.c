@@ -32,9 +32,10 @@ static void fuzz(const ast_kernels *kernels) {
   for (int64_t i = 0; i < n; i++) abs_dout[i] = fabsf(dout[i]);
   double *exact = calloc((size_t)(n + m + 1), sizeof *exact), *magnitude = calloc((size_t)(n + m + 1), sizeof *magnitude);
   CHECK(exact && magnitude, "no memory");
-  formula(&p, x, weight, dout, C_in, C_out, transposed, exact, exact + n);
-  formula(&p, abs_x, abs_weight, abs_dout, C_in, C_out, transposed, magnitude, magnitude + n);
-  float *out = convolve(kernels, &p, x, weight, C_in, C_out, transposed), *dweight = weight_gradient(kernels, &p, x, dout, C_in, C_out);
+  formula(&p, x, weight, NULL, dout, C_in, C_out, transposed, exact, exact + n);
+  formula(&p, abs_x, abs_weight, NULL, abs_dout, C_in, C_out, transposed, magnitude, magnitude + n);
+  float *out = convolve(kernels, &p, x, weight, NULL, C_in, C_out, transposed),
+        *dweight = weight_gradient(kernels, &p, x, dout, C_in, C_out);
   compare_sums("out", out, exact, magnitude, n, OFFSETS * C_in);
   compare_sums("dweight", dweight, exact + n, magnitude + n, m, destinations);
   free(p.source), free(p.destination), free(exact), free(magnitude);
