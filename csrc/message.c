@@ -21,10 +21,10 @@
 #include "simd.h"
 
 enum {
-  MESSAGE_TILE = 96,              /* a multiple of GEMM_ROWS */
-  LEAST_EDGES = 2 * MESSAGE_TILE, /* a task, */
-  MOST_EDGES = 16 * MESSAGE_TILE, /* and */
-  MESSAGE_TASKS = 8               /* so many tasks if they have at least that many edges */
+  MESSAGE_TILE = 96, /* edges; a multiple of GEMM_ROWS */
+  MESSAGE_TASKS = 32,
+  LEAST_EDGES = 2 * MESSAGE_TILE, /* of a task, even if that makes fewer of them, */
+  MOST_EDGES = 16 * MESSAGE_TILE  /* or more */
 };
 static const float MESSAGE_EPS = 1e-5f;
 
@@ -183,6 +183,7 @@ static ast_status message(const ast_message *s, float *restrict sum, float *rest
   message_job job = {.sum = sum, .messages = messages};
   const ast_status status = message_pack(s, false, &job.w);
   if (status != AST_OK) return status;
-  job.tasks = max64(1, s->M / min64(MOST_EDGES, max64(LEAST_EDGES, s->M / MESSAGE_TASKS)));
+  const int64_t edges = min64(MOST_EDGES, max64(LEAST_EDGES, s->M / MESSAGE_TASKS));
+  job.tasks = max64(1, (s->M + edges - 1) / edges);
   return ast_parallel(job.tasks, message_task, &job);
 }

@@ -13,7 +13,7 @@
  * in order.
  *
  * Cost per edge: the forward flops again, and twice as many for the two products per layer (but E H once, unless de is wanted).
- * Memory: at most SHARES sums of weight gradients and SHARES * SHARE_TILES * MESSAGE_TILE rows of dz, 19 MB at 128 channels.
+ * Memory: at most SHARES sums of weight gradients and SHARES * SHARE_TILES * MESSAGE_TILE rows of dz, 11 MB at 128 channels.
  */
 #include "ast.h"
 #include "dense.h"
@@ -237,9 +237,10 @@ static ast_status message_backward(const ast_message *s, const float *restrict d
   message_backward_job job = {.dsum = dsum, .dmessages = dmessages, .out = out, .share_size = message_sums_size(s)};
   ast_status status = message_pack(s, true, &job.w);
   if (status != AST_OK) return status;
-  const int64_t tiles = max64(1, (s->M + MESSAGE_TILE - 1) / MESSAGE_TILE), most = min64(SHARES, tiles);
-  job.edges = MESSAGE_TILE * min64(SHARE_TILES, (tiles + most - 1) / most);
-  job.tasks = min64(most, (tiles * MESSAGE_TILE + job.edges - 1) / job.edges);
+  const int64_t tiles = max64(1, (s->M + MESSAGE_TILE - 1) / MESSAGE_TILE), most = SHARES * SHARE_TILES, rounds = (tiles + most - 1) / most;
+  const int64_t of_round = (tiles + rounds - 1) / rounds, of_task = (of_round + SHARES - 1) / SHARES;
+  job.edges = MESSAGE_TILE * of_task;
+  job.tasks = (of_round + of_task - 1) / of_task;
 
   const int64_t round = job.tasks * job.edges, shares = job.tasks * job.share_size, dz = round * job.w.row, dA1 = s->E * s->H;
   const int64_t offsets = round_up(job.tasks * (PARTS + 1), 8);
