@@ -9,8 +9,8 @@
  * Edges come in rounds. First the tasks of a round, each a run of tiles, put dz into a buffer and add to weight gradients of
  * their own, of which there are at most SHARES. Then other tasks add the rows of the buffer to dQ, each for a run of receivers,
  * and to dP, each for the senders with the same index modulo PARTS. All go through their edges in stored order, so that each
- * sum runs in stored order whatever the rounds, tasks, threads and other scenes. At the end the weight gradients of the shares are added up
- * in order.
+ * sum runs in stored order whatever the rounds, tasks, threads and other scenes. At the end the weight gradients of the shares
+ * are added up in order.
  *
  * Cost per edge: the forward flops again, and twice as many for the two products per layer (but E H once, unless de is wanted).
  * Memory: at most SHARES sums of weight gradients and SHARES * SHARE_TILES * MESSAGE_TILE rows of dz, 11 MB at 128 channels.
