@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 
-from ast_sim.ops import attention, message, segment, sparse_conv
+from ast_sim.ops import attention, linear, message, mlp, segment, sparse_conv
 from ast_sim.ops.edges import EdgeSet
 from ast_sim.ops.library import configuration
 from ast_sim.ops.octree import octree
@@ -122,10 +122,41 @@ def messages(seed: int) -> Iterator[tuple[str, Case]]:
     )
 
 
+def layers(seed: int) -> Iterator[tuple[str, Case]]:
+    g = torch.Generator().manual_seed(seed)
+    rows = int(torch.randint(1, 3000, (1,), generator=g)) * (1 if seed % 4 else 20)
+    inputs, beside, hidden, outputs = (2 * int(n) for n in torch.randint(8, 130, (4,), generator=g))
+    x, extra, dout = (torch.randn(rows, n, generator=g) for n in (inputs, beside, outputs))
+    weight, bias = torch.randn(outputs, inputs, generator=g), torch.randn(outputs, generator=g)
+    results = ["out", "dx", "dweight", "dbias"]
+    for activation in linear.ACTIVATIONS:
+        yield (
+            f"linear, {activation}",
+            (
+                lambda x, w, b, a=activation: linear.linear(x, w, b, a),
+                lambda x, w, b, a=activation: linear._linear_reference(x, w, b, None, a, False)[0],
+                [x, weight, bias],
+                results,
+            ),
+        )
+    x, extra, dout = (y[:300] for y in (x, extra, dout))  # seldom a unit so near 0 that rounding turns it on
+    w1, b1 = torch.randn(hidden, inputs + beside, generator=g), torch.randn(hidden, generator=g)
+    w2, gamma = torch.randn(outputs, hidden, generator=g), torch.randn(outputs, generator=g)
+    yield (
+        "mlp",
+        (
+            lambda x, y, w1, b1, w2, b2, c, d, r: mlp.mlp(x, w1, b1, w2, b2, y, (c, d), r),
+            lambda x, y, w1, b1, w2, b2, c, d, r: mlp._reference(x, y, w1, b1, w2, b2, c, d, r, False)[0],
+            [x, extra, w1, b1, w2, bias, gamma, bias.clone(), dout],
+            ["out", "dx", "dbeside", "dweight1", "dbias1", "dweight2", "dbias2", "dgamma", "dbeta", "dresidual"],
+        ),
+    )
+
+
 def main() -> None:
     worst: dict[tuple[str, str], tuple[float, float, float]] = {}
     for seed in range(SEEDS):
-        for family in (segments, attentions, convolutions, messages):
+        for family in (segments, attentions, convolutions, messages, layers):
             for name, (op, reference, inputs, results) in family(seed):
                 for result, (c, t, magnitude) in zip(results, errors(op, reference, inputs), strict=True):
                     c, t = c / max(magnitude, 1e-300), t / max(magnitude, 1e-300)

@@ -27,6 +27,7 @@ from benchmarks.case import Case
 from benchmarks.targets import judge
 
 FAMILIES = ("octree", "fps", "sparse_conv", "attention", "segment", "message")
+FAMILIES = ("octree", "fps", "sparse_conv", "attention", "segment", "linear")
 SHORTEST = 2e-3  # seconds of a sample at least: faster calls are repeated within it
 
 

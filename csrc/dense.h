@@ -6,8 +6,8 @@
  * while a block of some 100 rows of A stays in the cache, and what follows the product happens in its registers, so that every
  * output is written once. For GEGLU a panel holds VW outputs of the first half of W beside the same ones of the second half.
  *
- * An element is one chain of multiply-adds over rising k, then the bias, whatever tile it falls into: a row's result depends
- * on neither its place, the batch nor the threads.
+ * An element is a sum of chains of multiply-adds over rising k, cut by K alone, then the bias, whatever tile it falls into: a row's result
+ * depends on neither its place, the batch nor the threads.
  */
 #ifndef AST_DENSE_H
 #define AST_DENSE_H
@@ -19,6 +19,7 @@
 enum {
   DENSE_ROWS = 96,         /* rows of a block: a multiple of GEMM_ROWS */
   DENSE_APART = 16,        /* floats added to the rows of copied blocks: a power of two would crowd few cache sets */
+  DENSE_DEPTH = 192,       /* terms of one chain at most: its rounding errors grow with their number */
   DENSE_PACK = 1 << 16,    /* floats of weights from which several threads pack them */
   DENSE_PARTIALS = 1 << 24 /* floats at most of partial sums */
 };
@@ -29,6 +30,7 @@ typedef struct {
   const float *bias;  /* [N] or NULL; paired: [2N] */
   int64_t K, N;       /* paired: outputs of a half */
   bool paired;        /* N outputs beside N others */
+  int64_t depth;      /* terms of one chain of multiply-adds */
   float *panels;      /* [panels][K][GEMM_COLUMNS], */
   float *panels_bias; /* [panels][GEMM_COLUMNS] */
 } dense_layer;
@@ -71,6 +73,8 @@ static ast_status dense_pack(dense_layer *layers, int64_t num, int slot) {
   int64_t size = 0, panels = 0;
   for (int64_t i = 0; i < num; i++) {
     if (!layers[i].weight) layers[i].N = 0;
+    const int64_t chains = max64(1, (layers[i].K + DENSE_DEPTH - 1) / DENSE_DEPTH);
+    layers[i].depth = (layers[i].K + chains - 1) / chains;
     size += dense_packed_size(&layers[i]);
     panels += dense_panels(&layers[i]);
   }
@@ -86,6 +90,19 @@ static ast_status dense_pack(dense_layer *layers, int64_t num, int slot) {
   return AST_OK;
 }
 
+/* Rows that are needed soon; they are fetched into the second cache during the products of this one. */
+typedef struct {
+  const float *data; /* NULL: none */
+  int64_t row, rows, columns;
+} dense_next;
+
+/* The rows from `first` on of an array of M rows, as many as a block has */
+AST_INLINE dense_next dense_rows_from(const float *data, int64_t row, int64_t columns, int64_t first, int64_t M) {
+  return data && first < M ? (dense_next){data + first * row, row, min64(DENSE_ROWS, M - first), columns} : (dense_next){0};
+}
+
+enum { DENSE_NEXT = 2 };
+
 /* What happens to a product: pointers to the first row, and the floats from row to row. */
 typedef struct {
   ast_activation activation;
@@ -96,11 +113,20 @@ typedef struct {
   const float *hidden; /* or NULL; out is 0 where this is not above 0: the gradient of ReLU */
   int64_t hidden_row;
   float *z; /* what enters the activation, or NULL: [*, N], paired [*, 2N], dense */
+  dense_next next[DENSE_NEXT];
 } dense_end;
 
 /* What follows the product of a tile: columns from j on of `rows` rows from i on, of which n are real. Out of line, as it is long. */
 static __attribute__((noinline)) void dense_finish(const dense_layer *l, const dense_end *e, int64_t rows, int64_t vectors, int64_t i,
                                                    int64_t j, int64_t n, const float *sums, const float *bias) {
+  if (!e->z && !e->hidden && !e->residual && !l->paired && n >= vectors * VW) { /* the usual case in few instructions */
+    for (const int64_t end = i + rows; i < end; i++, sums += GEMM_COLUMNS)
+      for (int64_t v = 0; v < vectors * VW; v += VW) {
+        const vf z = vload(sums + v) + vload(bias + v);
+        vstore(e->out + i * e->out_row + j + v, e->activation == AST_RELU ? vmax((vf){0}, z) : z);
+      }
+    return;
+  }
   for (const int64_t end = i + rows; i < end; i++, sums += GEMM_COLUMNS) {
     if (l->paired) {
       const vf a = vload(sums) + vload(bias), b = vload(sums + VW) + vload(bias + VW);
@@ -124,42 +150,52 @@ static __attribute__((noinline)) void dense_finish(const dense_layer *l, const d
   }
 }
 
-/* One register tile: rows i.. of panel p. */
+/* One register tile: rows i.. of panel p. A long sum over k is one of short ones, in the stack between two of them. */
 AST_INLINE void dense_tile(const int rows, const int vectors, const dense_layer *l, int64_t p, int64_t i0, gemm_a a, const dense_end *e) {
   const int64_t j = p * dense_panel_width(l);
-  vf sum[GEMM_ROWS][2];
+  const float *panel = l->panels + p * l->K * GEMM_COLUMNS;
+  float sums[GEMM_ROWS * GEMM_COLUMNS] __attribute__((aligned(64)));
 #pragma GCC unroll 12
   for (int i = 0; i < rows; i++) {
     const float *line = e->out + (i0 + i) * e->out_row + j;
     __builtin_prefetch(line, 1);
     if (vectors == 2) __builtin_prefetch(line + VW, 1);
-#pragma GCC unroll 2
-    for (int v = 0; v < vectors; v++) sum[i][v] = (vf){0};
   }
-  gemm_sums(rows, vectors, l->K, (gemm_a){a.data + i0 * a.row, a.row, a.column}, l->panels + p * l->K * GEMM_COLUMNS, GEMM_COLUMNS, sum);
-  float sums[GEMM_ROWS * GEMM_COLUMNS] __attribute__((aligned(64)));
+  for (int64_t k = 0; k < l->K; k += l->depth) {
+    vf sum[GEMM_ROWS][2];
 #pragma GCC unroll 12
-  for (int i = 0; i < rows; i++)
+    for (int i = 0; i < rows; i++)
 #pragma GCC unroll 2
-    for (int v = 0; v < vectors; v++) vstore(sums + i * GEMM_COLUMNS + v * VW, sum[i][v]);
+      for (int v = 0; v < vectors; v++) sum[i][v] = (vf){0};
+    const gemm_a part = {a.data + i0 * a.row + k * a.column, a.row, a.column};
+    gemm_sums(rows, vectors, min64(l->depth, l->K - k), part, panel + k * GEMM_COLUMNS, GEMM_COLUMNS, sum);
+#pragma GCC unroll 12
+    for (int i = 0; i < rows; i++)
+#pragma GCC unroll 2
+      for (int v = 0; v < vectors; v++) {
+        float *to = sums + i * GEMM_COLUMNS + v * VW;
+        vstore(to, k ? vload(to) + sum[i][v] : sum[i][v]);
+      }
+  }
   dense_finish(l, e, rows, vectors, i0, j, l->N - j, sums, l->panels_bias + p * GEMM_COLUMNS);
 }
 
-/* Rows of A that will be read soon, columns begin <= k < end, into the second cache. */
-AST_INLINE void dense_prefetch(gemm_a a, int64_t first, int64_t last, int64_t begin, int64_t end) {
-  for (int64_t i = first; i < last; i++)
-    for (int64_t k = begin; k < end; k += 16) __builtin_prefetch(a.data + i * a.row + k, 0, 2);
+/* The share of panel p, of `panels`, in rows first.. of it */
+AST_INLINE void dense_fetch(const dense_next *next, int64_t p, int64_t panels, int64_t first, int64_t rows) {
+  const int64_t lines = (next->columns + 15) / 16, begin = lines * p / panels, end = lines * (p + 1) / panels;
+  for (int64_t i = first; i < min64(first + rows, next->rows); i++)
+    for (int64_t k = begin; k < end; k++) __builtin_prefetch(next->data + i * next->row + 16 * k, 0, 2);
 }
 
-AST_INLINE void dense_strip(const int vectors, const dense_layer *l, int64_t p, int64_t rows, gemm_a a, const dense_end *e, int64_t ahead,
-                            int64_t begin, int64_t end) {
+AST_INLINE void dense_strip(const int vectors, const dense_layer *l, int64_t p, int64_t rows, gemm_a a, const dense_end *e) {
   int64_t i = 0;
-#define DENSE_STEP(num)                                                             \
-  for (; i + (num) <= rows; i += (num)) {                                           \
-    dense_prefetch(a, rows + i, min64(rows + i + (num), rows + ahead), begin, end); \
-    dense_tile(num, vectors, l, p, i, a, e);                                        \
+#define DENSE_STEP(num) \
+  for (; i + (num) <= rows; i += (num)) dense_tile(num, vectors, l, p, i, a, e)
+  for (; i + GEMM_ROWS <= rows; i += GEMM_ROWS) {
+    for (int n = 0; n < DENSE_NEXT; n++)
+      if (e->next[n].data) dense_fetch(&e->next[n], p, dense_panels(l), i, GEMM_ROWS);
+    dense_tile(GEMM_ROWS, vectors, l, p, i, a, e);
   }
-  DENSE_STEP(GEMM_ROWS);
   if (GEMM_ROWS > 8) DENSE_STEP(8);
   DENSE_STEP(4);
   DENSE_STEP(2);
@@ -167,13 +203,11 @@ AST_INLINE void dense_strip(const int vectors, const dense_layer *l, int64_t p, 
 #undef DENSE_STEP
 }
 
-/* Panels first <= p < last of the layer on `rows` rows of A; `ahead` rows of A behind them are fetched meanwhile. */
-static void dense_rows(const dense_layer *l, int64_t first, int64_t last, int64_t rows, gemm_a a, dense_end e, int64_t ahead) {
-  const int64_t share = round_up((l->K + last - first - 1) / max64(1, last - first), 16);
+/* Panels first <= p < last of the layer on `rows` rows of A. */
+static void dense_rows(const dense_layer *l, int64_t first, int64_t last, int64_t rows, gemm_a a, dense_end e) {
   for (int64_t p = first; p < last; p++) {
-    const int64_t begin = min64(l->K, (p - first) * share), end = min64(l->K, begin + share);
-    if (l->paired || l->N - p * GEMM_COLUMNS > VW) dense_strip(2, l, p, rows, a, &e, ahead, begin, end);
-    else dense_strip(1, l, p, rows, a, &e, ahead, begin, end);
+    if (l->paired || l->N - p * GEMM_COLUMNS > VW) dense_strip(2, l, p, rows, a, &e);
+    else dense_strip(1, l, p, rows, a, &e);
   }
 }
 

@@ -55,9 +55,9 @@ static ast_status linear_task(int64_t index, void *context) {
                            .out_row = N,
                            .residual = job->residual ? job->residual + i * s->residual_stride : NULL,
                            .residual_row = s->residual_stride,
-                           .z = job->z ? job->z + i * s->O : NULL};
-    dense_rows(&job->layer, first_panel, last_panel, min64(DENSE_ROWS, last - i), (gemm_a){job->x + i * s->x_stride, s->x_stride, 1}, end,
-               max64(0, min64(DENSE_ROWS, s->M - i - DENSE_ROWS)));
+                           .z = job->z ? job->z + i * s->O : NULL,
+                           .next = {dense_rows_from(job->x, s->x_stride, s->I, i + DENSE_ROWS, s->M)}};
+    dense_rows(&job->layer, first_panel, last_panel, min64(DENSE_ROWS, last - i), (gemm_a){job->x + i * s->x_stride, s->x_stride, 1}, end);
   }
   return AST_OK;
 }
@@ -79,6 +79,7 @@ typedef struct {
   const float *dout, *x, *z;
   float *dx, *dweight, *dbias;
   dense_layer layers[2];       /* that of z, if z is recomputed, and W^T, if dx is wanted */
+  int64_t columns;             /* of dout */
   int64_t dz_row, x_row, size; /* floats of a row of the copies; of the partial sums of a chunk: dW, then dbias */
   dense_chunks chunks;
   float *partials;
@@ -113,13 +114,16 @@ static void linear_backward_rows(const linear_backward_job *job, int64_t first, 
     linear_activation(s, rows, job->z + first * s->O, s->O, dout, dz, job->dz_row);
   } else {
     const dense_end end = {.out = dz, .out_row = job->dz_row};
-    dense_rows(&job->layers[0], 0, dense_panels(&job->layers[0]), rows, (gemm_a){x_rows, s->x_stride, 1}, end, 0);
+    dense_rows(&job->layers[0], 0, dense_panels(&job->layers[0]), rows, (gemm_a){x_rows, s->x_stride, 1}, end);
     linear_activation(s, rows, dz, job->dz_row, dout, dz, job->dz_row);
   }
   if (job->dbias) dense_add_rows(dz, job->dz_row, rows, s->O, dbias);
   if (job->dweight) dense_copy_rows(x_rows, s->x_stride, rows, s->I, x, job->x_row);
-  const dense_end end = {.out = job->dx + first * s->I, .out_row = s->I};
-  if (job->dx) dense_rows(&job->layers[1], 0, dense_panels(&job->layers[1]), rows, (gemm_a){dz, job->dz_row, 1}, end, 0);
+  const dense_end end = {.out = job->dx + first * s->I,
+                         .out_row = s->I,
+                         .next = {dense_rows_from(job->dout, s->dout_stride, job->columns, first + rows, s->M),
+                                  dense_rows_from(job->x, s->x_stride, s->I, first + rows, s->M)}};
+  if (job->dx) dense_rows(&job->layers[1], 0, dense_panels(&job->layers[1]), rows, (gemm_a){dz, job->dz_row, 1}, end);
 }
 
 /* By rows: a chunk, its part of dW and dbias. */
@@ -201,6 +205,7 @@ static ast_status linear_backward(const ast_linear *s, const float *restrict dou
   job.layers[1] = (dense_layer){.weight = dx ? weight : NULL, .row = s->I, .column = 1, .K = s->O, .N = s->I};
   const ast_status status = dense_pack(job.layers, 2, 6);
   if (status != AST_OK) return status;
+  job.columns = s->activation == AST_GEGLU ? s->O / 2 : s->O;
   job.dz_row = round_up(s->O, VW) + DENSE_APART;
   job.x_row = round_up(s->I, VW) + DENSE_APART;
   job.size = s->O * round_up(s->I, VW) + round_up(s->O, VW);

@@ -36,19 +36,17 @@ static void mlp_copy_inputs(const ast_mlp *s, int64_t first, int64_t rows, float
 /* the first n lanes of x, 0 in the others */
 AST_INLINE vf mlp_lanes(vf x, int64_t n) { return n >= VW ? x : (vf)((vi)x & (LANE_INDICES < (int32_t)n)); }
 
-/* y becomes n; returns 1 / sqrt(var + eps). Only the O columns of y are read; what lies behind them in whole vectors becomes 0. */
-AST_INLINE float mlp_normalize(float *y, int64_t O) {
+/* y becomes y - mean(y), 0 behind its O columns; returns 1 / sqrt(var + eps), the factor that makes n of it. */
+AST_INLINE float mlp_centre(float *y, int64_t O, const bool whole) {
   vf sum = {0}, squares = {0};
-  for (int64_t j = 0; j < O; j += VW) sum += mlp_lanes(vload(y + j), O - j);
+  for (int64_t j = 0; j < O; j += VW) sum += whole ? vload(y + j) : mlp_lanes(vload(y + j), O - j);
   const float mean = vsum(sum) / (float)O;
   for (int64_t j = 0; j < O; j += VW) {
-    const vf d = mlp_lanes(vload(y + j) - mean, O - j);
+    const vf d = whole ? vload(y + j) - mean : mlp_lanes(vload(y + j) - mean, O - j);
     squares += d * d;
     vstore(y + j, d);
   }
-  const float scale = 1 / sqrtf(vsum(squares) / (float)O + MLP_EPSILON);
-  for (int64_t j = 0; j < O; j += VW) vstore(y + j, scale * vload(y + j));
-  return scale;
+  return 1 / sqrtf(vsum(squares) / (float)O + MLP_EPSILON);
 }
 
 /* ---- forward ---- */
@@ -62,21 +60,22 @@ typedef struct {
   int64_t rows, input_row, hidden_row, y_row; /* rows of a task; floats from row to row of its blocks */
 } mlp_job;
 
-/* out from y, which becomes n */
-static void mlp_norm_rows(const mlp_job *job, int64_t first, int64_t rows, float *y) {
+/* out from y; `whole`, a constant, says that O is a multiple of VW, so that no vector asks for its tail */
+AST_INLINE void mlp_norm_rows(const mlp_job *job, int64_t first, int64_t rows, float *y, const bool whole) {
   const ast_mlp *s = job->s;
   const int64_t O = s->O;
-  for (int64_t i = 0; i < rows; i++, y += job->y_row) {
-    const float scale = mlp_normalize(y, O);
-    if (job->kept.scale) job->kept.scale[first + i] = scale;
-    const float *residual = job->residual ? job->residual + (first + i) * s->residual_stride : NULL;
-    float *out = job->out + (first + i) * O, *normalized = job->kept.normalized ? job->kept.normalized + (first + i) * O : NULL;
+  for (int64_t i = first; i < first + rows; i++, y += job->y_row) {
+    const float scale = mlp_centre(y, O, whole);
+    const float *residual = job->residual ? job->residual + i * s->residual_stride : NULL;
+    float *out = job->out + i * O, *normalized = job->kept.normalized ? job->kept.normalized + i * O : NULL;
+    if (job->kept.scale) job->kept.scale[i] = scale;
     for (int64_t j = 0; j < O; j += VW) {
-      const vf n = vload(y + j);
-      vf value = vload_upto(s->gamma + j, O - j) * n + vload_upto(s->beta + j, O - j);
-      if (residual) value += vload_upto(residual + j, O - j);
-      vstore_upto(out + j, value, O - j);
-      if (normalized) vstore_upto(normalized + j, n, O - j);
+      const int64_t lanes = whole ? VW : O - j;
+      const vf n = scale * vload(y + j);
+      vf value = vload_upto(s->gamma + j, lanes) * n + vload_upto(s->beta + j, lanes);
+      if (residual) value += vload_upto(residual + j, lanes);
+      vstore_upto(out + j, value, lanes);
+      if (normalized) vstore_upto(normalized + j, n, lanes);
     }
   }
 }
@@ -96,19 +95,23 @@ static ast_status mlp_task(int64_t index, void *context) {
       mlp_copy_inputs(s, i, rows, input, job->input_row);
       a = (gemm_a){input, job->input_row, 1};
     }
-    const dense_end first = {.activation = AST_RELU, .out = hidden, .out_row = hidden_row};
-    dense_rows(&job->layers[0], 0, dense_panels(&job->layers[0]), rows, a, first,
-               s->beside ? 0 : max64(0, min64(DENSE_ROWS, s->M - i - DENSE_ROWS)));
+    const dense_end first = {.activation = AST_RELU,
+                             .out = hidden,
+                             .out_row = hidden_row,
+                             .next = {dense_rows_from(s->x, s->x_stride, s->I, i + DENSE_ROWS, s->M),
+                                      dense_rows_from(s->beside, s->beside_stride, s->I2, i + DENSE_ROWS, s->M)}};
+    dense_rows(&job->layers[0], 0, dense_panels(&job->layers[0]), rows, a, first);
     a = (gemm_a){hidden, hidden_row, 1};
     if (s->gamma) {
-      dense_rows(&job->layers[1], 0, dense_panels(&job->layers[1]), rows, a, (dense_end){.out = y, .out_row = job->y_row}, 0);
-      mlp_norm_rows(job, i, rows, y);
+      dense_rows(&job->layers[1], 0, dense_panels(&job->layers[1]), rows, a, (dense_end){.out = y, .out_row = job->y_row});
+      if (s->O % VW) mlp_norm_rows(job, i, rows, y, false);
+      else mlp_norm_rows(job, i, rows, y, true);
     } else {
       const dense_end second = {.out = job->out + i * s->O,
                                 .out_row = s->O,
                                 .residual = job->residual ? job->residual + i * s->residual_stride : NULL,
                                 .residual_row = s->residual_stride};
-      dense_rows(&job->layers[1], 0, dense_panels(&job->layers[1]), rows, a, second, 0);
+      dense_rows(&job->layers[1], 0, dense_panels(&job->layers[1]), rows, a, second);
     }
   }
   return AST_OK;
@@ -145,30 +148,29 @@ typedef struct {
 } mlp_backward_job;
 
 /* dy of the rows from `first` on, in the place of y, or of n, which is read if it was kept; dgamma and dbeta are added to */
-static void mlp_norm_gradient(const mlp_backward_job *job, int64_t first, int64_t rows, float *y, float *dgamma, float *dbeta) {
+AST_INLINE void mlp_norm_gradient(const mlp_backward_job *job, int64_t first, int64_t rows, float *y, float *dgamma, float *dbeta,
+                                  const bool whole) {
   const ast_mlp *s = job->s;
   const int64_t O = s->O;
   for (int64_t i = first; i < first + rows; i++, y += job->y_row) {
-    const float *dout = job->dout + i * s->dout_stride;
-    float scale;
-    if (job->kept.normalized) {
-      dense_copy_rows(job->kept.normalized + i * O, O, 1, O, y, job->y_row);
-      scale = job->kept.scale[i];
-    } else {
-      scale = mlp_normalize(y, O);
-    }
+    const float *dout = job->dout + i * s->dout_stride, *kept = job->kept.normalized ? job->kept.normalized + i * O : NULL;
+    const float scale = kept ? job->kept.scale[i] : mlp_centre(y, O, whole);
     vf sum = {0}, products = {0};
     for (int64_t j = 0; j < O; j += VW) {
-      const vf n = vload(y + j), d = vload_upto(dout + j, O - j), dn = vload_upto(s->gamma + j, O - j) * d;
+      const int64_t lanes = whole ? VW : O - j;
+      const vf n = kept ? vload_upto(kept + j, lanes) : scale * vload(y + j);
+      const vf d = vload_upto(dout + j, lanes), dn = vload_upto(s->gamma + j, lanes) * d;
       sum += dn;
       products += dn * n;
+      vstore(y + j, n);
       vstore(dgamma + j, vload(dgamma + j) + d * n);
       vstore(dbeta + j, vload(dbeta + j) + d);
     }
     const float mean = vsum(sum) / (float)O, product = vsum(products) / (float)O;
     for (int64_t j = 0; j < O; j += VW) {
-      const vf n = vload(y + j), dn = vload_upto(s->gamma + j, O - j) * vload_upto(dout + j, O - j);
-      vstore(y + j, scale * ((dn - mean) - n * product));
+      const int64_t lanes = whole ? VW : O - j;
+      const vf dn = vload_upto(s->gamma + j, lanes) * vload_upto(dout + j, lanes);
+      vstore(y + j, scale * ((dn - mean) - vload(y + j) * product));
     }
   }
 }
@@ -184,16 +186,17 @@ static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_
     dense_copy_rows(job->kept.hidden + first * s->H, s->H, rows, s->H, hidden, job->hidden_row);
   } else {
     const dense_end end = {.activation = AST_RELU, .out = hidden, .out_row = job->hidden_row};
-    dense_rows(&job->layers[0], 0, dense_panels(&job->layers[0]), rows, inputs, end, 0);
+    dense_rows(&job->layers[0], 0, dense_panels(&job->layers[0]), rows, inputs, end);
   }
   if (!s->gamma) {
     dense_copy_rows(job->dout + first * s->dout_stride, s->dout_stride, rows, s->O, y, job->y_row);
   } else {
     const dense_end end = {.out = y, .out_row = job->y_row};
-    if (!job->kept.normalized) dense_rows(&job->layers[1], 0, dense_panels(&job->layers[1]), rows, units, end, 0);
+    if (!job->kept.normalized) dense_rows(&job->layers[1], 0, dense_panels(&job->layers[1]), rows, units, end);
     float *of_block = y + DENSE_ROWS * job->y_row; /* sums of the block first, so that long sums stay accurate */
     memset(of_block, 0, 2 * (size_t)sums[4].row * sizeof *of_block);
-    mlp_norm_gradient(job, first, rows, y, of_block, of_block + sums[4].row);
+    if (s->O % VW) mlp_norm_gradient(job, first, rows, y, of_block, of_block + sums[4].row, false);
+    else mlp_norm_gradient(job, first, rows, y, of_block, of_block + sums[4].row, true);
     dense_add_rows(of_block, 0, 1, sums[4].row, partials + sums[4].at);
     dense_add_rows(of_block + sums[4].row, 0, 1, sums[5].row, partials + sums[5].at);
   }
@@ -201,15 +204,24 @@ static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_
     gemm(s->O, sums[2].row, rows, (gemm_a){y, 1, job->y_row}, gemm_rows(hidden, job->hidden_row), partials + sums[2].at, sums[2].row, add);
   if (sums[3].to) dense_add_rows(y, job->y_row, rows, s->O, partials + sums[3].at);
   if (!job->into_hidden) return;
-  const dense_end masked = {.out = hidden, .out_row = job->hidden_row, .hidden = hidden, .hidden_row = job->hidden_row};
-  dense_rows(&job->layers[2], 0, dense_panels(&job->layers[2]), rows, (gemm_a){y, job->y_row, 1}, masked, 0);
+  const dense_end masked = {.out = hidden,
+                            .out_row = job->hidden_row,
+                            .hidden = hidden,
+                            .hidden_row = job->hidden_row,
+                            .next = {dense_rows_from(s->x, s->x_stride, s->I, first + rows, s->M),
+                                     dense_rows_from(job->dout, s->dout_stride, s->O, first + rows, s->M)}};
+  dense_rows(&job->layers[2], 0, dense_panels(&job->layers[2]), rows, (gemm_a){y, job->y_row, 1}, masked);
   if (sums[0].to)
     gemm(s->H, sums[0].row, rows, (gemm_a){hidden, 1, job->hidden_row}, gemm_rows(input, job->input_row), partials + sums[0].at,
          sums[0].row, add);
   if (sums[1].to) dense_add_rows(hidden, job->hidden_row, rows, s->H, partials + sums[1].at);
-  const dense_end x = {.out = job->g.x + first * s->I, .out_row = s->I}, beside = {.out = job->g.beside + first * s->I2, .out_row = s->I2};
-  if (job->g.x) dense_rows(&job->layers[3], 0, dense_panels(&job->layers[3]), rows, units, x, 0);
-  if (job->g.beside) dense_rows(&job->layers[4], 0, dense_panels(&job->layers[4]), rows, units, beside, 0);
+  const dense_end x = {.out = job->g.x + first * s->I,
+                       .out_row = s->I,
+                       .next = {dense_rows_from(job->kept.hidden, s->H, s->H, first + rows, s->M),
+                                dense_rows_from(job->kept.normalized, s->O, s->O, first + rows, s->M)}};
+  const dense_end beside = {.out = job->g.beside + first * s->I2, .out_row = s->I2};
+  if (job->g.x) dense_rows(&job->layers[3], 0, dense_panels(&job->layers[3]), rows, units, x);
+  if (job->g.beside) dense_rows(&job->layers[4], 0, dense_panels(&job->layers[4]), rows, units, beside);
 }
 
 static ast_status mlp_backward_task(int64_t index, void *context) {

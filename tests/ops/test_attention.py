@@ -315,7 +315,9 @@ def test_fused_projections_are_read_and_their_gradients_written_in_place():
 def test_opcheck_of_fused_projections():
     q, k, v, *offsets = case([5, 4], [6, 3], 2, 16)
     key_value, settings = torch.stack([k, v], 1), (0.25, 0.1, 3)
-    torch.library.opcheck(ops._attention_kv.overload, (q.requires_grad_(), key_value.requires_grad_(), *offsets, *settings))
+    torch.library.opcheck(
+        ops._attention_kv.overload, (q.requires_grad_(), key_value.requires_grad_(), *offsets, *settings)
+    )
     q, key_value = q.detach(), key_value.detach()
     saved = ops._attention_kv(q, key_value, *offsets, *settings)
     inputs = (q, key_value, *offsets, *settings, *saved, torch.randn(q.shape))

@@ -79,6 +79,13 @@ def test_accuracy_of_small_and_large_values(amplitude, activation):
     assert_accurate(fused(activation), composed(activation), case(200, 24, 16, activation, amplitude))
 
 
+@pytest.mark.parametrize("inputs, outputs", [(193, 4), (4096, 8), (8, 4096)])
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_accuracy_of_wide_layers(inputs, outputs, activation):
+    """One chain of thousands of terms would lose a digit against sums in blocks."""
+    assert_accurate(fused(activation), composed(activation), case(64, inputs, outputs, activation))
+
+
 def test_accuracy_of_long_sums():
     """The gradients of weight and bias are sums over all rows; equal terms add up rounding errors of one sign."""
     x, weight, bias, _ = case(50_000, 4, 3)
