@@ -1,4 +1,4 @@
-/* Two dense layers with a LayerNorm behind them, and their gradients, without an array of hidden units that lives between the two.
+/* Two dense layers with a LayerNorm behind them, and their gradients; hidden units live between the two only if the caller keeps them.
  *
  *   h = max(0, [x, beside] W1^T + bias1),   y = h W2^T + bias2,   n = (y - mean(y)) / sqrt(var(y) + eps)
  *   out = gamma . n + beta + residual       (without norm: y + residual)
