@@ -32,7 +32,7 @@ static bool FPS(reserve)(FPS(scene) * s, int64_t n, int64_t num, int64_t size) {
 AST_INLINE T FPS(square)(int32_t x, int32_t y, int32_t z) { return (T)x * x + (T)y * y + (T)z * z; }
 
 /* Brings the distances of block b up to date with `num` samples; returns the largest. */
-AST_INLINE T FPS(pass)(const FPS(scene) * s, int64_t b, const int32_t *list, const int num) {
+AST_INLINE T FPS(pass)(const FPS(scene) * s, int64_t b, const int64_t *list, const int num) {
   const int64_t size = s->size;
   const COORDINATE *restrict x = s->points + 3 * size * b, *restrict y = x + size, *restrict z = y + size;
   T *restrict distances = s->distances + size * b, farthest = 0;
@@ -52,7 +52,7 @@ AST_INLINE T FPS(pass)(const FPS(scene) * s, int64_t b, const int32_t *list, con
 }
 
 /* ... with all of a list, at least one, several in a pass. */
-static T FPS(scan)(const FPS(scene) * s, int64_t b, const int32_t *list, int num) {
+static T FPS(scan)(const FPS(scene) * s, int64_t b, const int64_t *list, int num) {
   for (; num > 4; num -= 4, list += 4) FPS(pass)(s, b, list, 4);
   switch (num) {
     case 1:
@@ -85,7 +85,7 @@ AST_INLINE uint32_t FPS(near)(const FPS(scene) * s, const COORDINATE *box, T bou
 /* Shows block b, whose bound is `bound`, the samples that it has not seen of the first `taken`; returns its new bound. */
 static T FPS(update)(const FPS(scene) * s, int64_t b, T bound, int64_t taken) {
   const COORDINATE *box = s->boxes + 6 * b;
-  int32_t list[128];
+  int64_t list[128];
   int num = 0;
   for (int64_t i = s->seen[b]; i < taken; i += 64) {
     uint64_t bits = FPS(near)(s, box, bound, i);
@@ -93,7 +93,7 @@ static T FPS(update)(const FPS(scene) * s, int64_t b, T bound, int64_t taken) {
     if (taken - i < 64) bits &= (1ull << (taken - i)) - 1;
     while (bits) {
       const int l = __builtin_ctzll(bits);
-      list[num++] = (int32_t)i + l;
+      list[num++] = i + l;
       bits ^= 1ull << l;
     }
     if (num == 0 || (num < 64 && i + 64 < taken)) continue;
@@ -159,15 +159,19 @@ static int64_t FPS(sample)(const int32_t *coordinates, int64_t n, const int32_t 
   int64_t taken = 1;
   while (taken < num) {
     const int64_t b = fps_key_block(t.keys[1]);
-    const T bound = (T)fps_key_bound(t.keys[1]);
+    T bound = (T)fps_key_bound(t.keys[1]);
     if (bound == 0) break;
     if (s.seen[b] < taken) {
-      fps_replay(t, fps_key(FPS(update)(&s, b, bound, taken), b));
-      continue;
+      bound = FPS(update)(&s, b, bound, taken);
+    } else { /* it has seen all samples: the next one is here, and the block sees it at once */
+      const int64_t added = taken;
+      const int64_t i = FPS(find)(&s, b, bound);
+      for (int a = 0; a < 3; a++) s.samples[a][taken] = s.points[(3 * b + a) * s.size + i];
+      indices[taken++] = begin + b * s.size + i;
+      s.seen[b] = taken;
+      bound = FPS(scan)(&s, b, &added, 1);
     }
-    const int64_t i = FPS(find)(&s, b, bound);
-    for (int a = 0; a < 3; a++) s.samples[a][taken] = s.points[(3 * b + a) * s.size + i];
-    indices[taken++] = begin + b * s.size + i;
+    fps_replay(t, fps_key(bound, b));
   }
   return taken;
 }
