@@ -2,8 +2,8 @@
  *
  *   out_q = bias + sum_k sum_{(p,q) in group k} x_p W_k
  *
- * k < 27 kernel offsets, p source and q destination cells, P pairs, I = C_in and O = C_out channels. 2 P I O operations; only
- * pairs that exist are touched.
+ * k < 27 kernel offsets, p source and q destination cells, P pairs, I = C_in and O = C_out channels. 2 P I O operations on at most
+ * 4 P (I + 2 O) bytes: arithmetic is the limit if rows come in time. Only pairs that exist are touched; a row without pairs is the bias.
  *
  * W_k is packed into panels once a call. A task owns a range of destinations (and, where there are few, some of the columns). In each
  * group its pairs are a contiguous run, since destinations rise. It takes them tile by tile: rows of x are multiplied where they lie,
@@ -22,7 +22,7 @@ enum {
   OFFSETS = 27,
   PAIR_TILE = 48,    /* pairs at a time: 24 KB at 128 channels, beside 16 KB of a panel of weights in L1 */
   TASK_PAIRS = 4096, /* pairs a task, about: fewer would read the weights too often */
-  LEAST_TASKS = 8
+  LEAST_TASKS = 8    /* however few pairs there are */
 };
 
 /* the first i in [begin, end) with values[i] >= bound, or end */
@@ -82,7 +82,7 @@ static conv_walk conv_start(const ast_pairs *pairs, int64_t first, int64_t last)
   return w;
 }
 
-/* Rows of a tile; base is the bias where out has no contribution yet, else out. */
+/* Rows of a tile, in memory that need not hold them yet; base is the bias where out has no contribution before this one, else out. */
 typedef struct {
   const float *x[PAIR_TILE], *base[PAIR_TILE];
   float *out[PAIR_TILE];

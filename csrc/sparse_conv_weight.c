@@ -2,8 +2,8 @@
  *
  *   dW_k = sum_{(p,q) in group k} x_p^T dout_q
  *
- * k < 27 kernel offsets, p source and q destination cells, P pairs, I = C_in and O = C_out channels. 2 P I O operations; the
- * pairs of a group are read once for every CHANNEL_BLOCK of I.
+ * k < 27 kernel offsets, p source and q destination cells, P pairs, I = C_in and O = C_out channels. 2 P I O operations on
+ * 4 P (I + O) bytes, O again for each further CHANNEL_BLOCK of I.
  *
  * A group is cut evenly into parts by its size alone. A task owns a part, and a block of rows of its dW_k: it adds tile after
  * tile of pairs to sums that stay in the cache, while the rows of the next tile are fetched. The parts of a group are then added in order:
