@@ -161,7 +161,8 @@ AST_INLINE void dense_tile(const int rows, const int vectors, const dense_layer 
     __builtin_prefetch(line, 1);
     if (vectors == 2) __builtin_prefetch(line + VW, 1);
   }
-  for (int64_t k = 0; k < l->K; k += l->depth) {
+  int64_t k = 0;
+  do { /* once without inputs, too: the sums are then 0 */
     vf sum[GEMM_ROWS][2];
 #pragma GCC unroll 12
     for (int i = 0; i < rows; i++)
@@ -176,7 +177,8 @@ AST_INLINE void dense_tile(const int rows, const int vectors, const dense_layer 
         float *to = sums + i * GEMM_COLUMNS + v * VW;
         vstore(to, k ? vload(to) + sum[i][v] : sum[i][v]);
       }
-  }
+    k += l->depth;
+  } while (k < l->K);
   dense_finish(l, e, rows, vectors, i0, j, l->N - j, sums, l->panels_bias + p * GEMM_COLUMNS);
 }
 

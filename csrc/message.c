@@ -49,7 +49,7 @@ static ast_status message_pack(const ast_message *s, bool gradients, message_wei
 
 /* out = a layer on n rows of A, followed by ReLU or set to 0 where `hidden` is 0 */
 static void message_layer(const message_weights *w, int layer, int64_t n, gemm_a a, dense_end end) {
-  dense_rows(&w->layers[layer], 0, dense_panels(&w->layers[layer]), n, a, end, 0);
+  dense_rows(&w->layers[layer], 0, dense_panels(&w->layers[layer]), n, a, end);
 }
 
 typedef struct {

@@ -84,10 +84,7 @@ def build_cells(config: ModelConfig, position: Tensor, offsets: Tensor, may_grow
             "" if may_grow else "; give the dataset a domain_half_width that holds all frames and the training noise"
         )
         raise error(f"{problem}{advice}") from problem
-    maps: list[CellMap] = []
-    for _ in range(config.l_ocnn):
-        maps.append((maps[-1].coarse if maps else finest).coarsen())
-    return Cells(finest, maps, growth)
+    return Cells(finest, finest.coarsen_all(config.l_ocnn), growth)
 
 
 class SparseConv(nn.Module):
