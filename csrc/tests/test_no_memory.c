@@ -159,7 +159,17 @@ static outcome sparse_conv_weight(const ast_kernels *kernels) {
 enum { SCENES = 2, QUERIES = 270, KEYS = 140, H = 2, D = 16, ROW = H * D };
 
 static ast_attention attention_sizes(void) {
-  return (ast_attention){SCENES, H, D, even_offsets(SCENES, QUERIES), even_offsets(SCENES, KEYS), ROW, ROW, ROW, 0.25f, 0.1, 5};
+  return (ast_attention){.B = SCENES,
+                         .H = H,
+                         .D = D,
+                         .q_offsets = even_offsets(SCENES, QUERIES),
+                         .k_offsets = even_offsets(SCENES, KEYS),
+                         .q_stride = ROW,
+                         .k_stride = ROW,
+                         .v_stride = ROW,
+                         .scale = 0.25f,
+                         .dropout_p = 0.1,
+                         .seed = 5};
 }
 
 static outcome attention(const ast_kernels *kernels) {
