@@ -166,8 +166,10 @@ def _at_least(least: int) -> Any:
 
 
 def _demo(args: argparse.Namespace) -> None:
+    from ast_sim import keep_memory
     from ast_sim.demo import demo
 
+    keep_memory()
     demo(args.out, quick=args.quick, seed=args.seed)
 
 
