@@ -26,8 +26,7 @@ from ast_sim.ops.library import configuration
 from benchmarks.case import Case
 from benchmarks.targets import judge
 
-FAMILIES = ("octree", "fps", "sparse_conv", "attention", "segment", "message")
-FAMILIES = ("octree", "fps", "sparse_conv", "attention", "segment", "linear")
+FAMILIES = ("octree", "fps", "sparse_conv", "attention", "segment", "message", "linear")
 SHORTEST = 2e-3  # seconds of a sample at least: faster calls are repeated within it
 
 

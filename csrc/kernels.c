@@ -7,16 +7,16 @@
 #include "attention.c"
 #include "attention_backward.c"
 #include "fps.c"
+#include "linear.c"
+#include "message.c"
+#include "message_backward.c" /* after message.c, whose tiles it uses */
+#include "mlp.c"
 #include "octree.c"
 #include "coarsen.c" /* after octree.c, whose chunks it uses */
 #include "pairs.c"   /* after coarsen.c, whose levels it counts */
 #include "segment.c"
 #include "sparse_conv.c"
-#include "message.c"
-#include "message_backward.c" /* after message.c, whose tiles it uses */
-#include "linear.c"
 #include "sparse_conv_weight.c" /* after sparse_conv.c, whose constants it uses */
-#include "mlp.c"
 
 #define AST_TABLE_OF(isa)  ast_kernels_##isa
 #define AST_TABLE(isa)     AST_TABLE_OF(isa)
