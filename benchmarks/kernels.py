@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
 
@@ -116,27 +116,32 @@ def main() -> None:
     torch.set_num_threads(arguments.threads)
     ast_sim.keep_memory()
     limits = peak(arguments.threads)
-    records: list[dict] = []
-    for family in arguments.families:
-        try:
-            module = importlib.import_module(f"benchmarks.{family}")
-        except ImportError as error:
-            records.append({"op": family, "missing": {str(error.name): f"cannot be imported: {error}"}})
-            print(f"{family}: not measured, {error}", flush=True)
-            continue
-        for case in module.cases():
-            records.append(measure(case, arguments.repeats, limits and limits[str(arguments.threads)]))
-            print(line_of(records[-1]), flush=True)
-    versions = {name: metadata.version(name) for name in ("fpsample", "spconv") if _installed(name)}
-    result = {
+    header = {
         **provenance(" ".join(["python -m benchmarks.kernels", *sys.argv[1:]])),
         "configuration": configuration(),
-        "peer_versions": versions,
+        "peer_versions": {name: metadata.version(name) for name in ("fpsample", "spconv") if _installed(name)},
         "peak_gflops_by_threads": limits,
-        "records": records,
     }
     arguments.json.parent.mkdir(parents=True, exist_ok=True)
-    arguments.json.write_text(json.dumps(result, indent=1) + "\n")
+    records: list[dict] = []
+    for family in arguments.families:
+        for record in _measure_family(family, arguments.repeats, limits and limits[str(arguments.threads)]):
+            records.append(record)
+            # After every case, so that a long run that is cut off leaves what it found.
+            arguments.json.write_text(json.dumps({**header, "records": records}, indent=1) + "\n")
+
+
+def _measure_family(family: str, repeats: int, limit: float | None) -> Iterator[dict]:
+    try:
+        module = importlib.import_module(f"benchmarks.{family}")
+    except ImportError as error:
+        print(f"{family}: not measured, {error}", flush=True)
+        yield {"op": family, "missing": {str(error.name): f"cannot be imported: {error}"}}
+        return
+    for case in module.cases():
+        record = measure(case, repeats, limit)
+        print(line_of(record), flush=True)
+        yield record
 
 
 def _installed(name: str) -> bool:
