@@ -6,7 +6,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from torch.profiler import ProfilerActivity
@@ -33,18 +33,20 @@ class Profile:
     """The mean step.
 
     Attributes:
-        entries: by falling time within each kind; their times add up to `profiled_seconds`.
-        seconds: of a step that is not watched.
-        profiled_seconds: of a step that is.
+        entries: by falling time within each kind; their times add up to `seconds`. Kernels are timed by a clock around
+            their calls. To tell the rest apart, torch watches every op, which slows a step of small ops down: the times
+            of that step are scaled to what the kernels leave of the other.
+        seconds: of a step with nothing but the clock around kernels.
+        watched_seconds: of the step whose ops are watched.
     """
 
     entries: list[Entry]
     seconds: float
-    profiled_seconds: float
+    watched_seconds: float
 
     def share(self, kind: str) -> float:
         """The part of a step that entries of this kind take."""
-        return sum(entry.seconds for entry in self.entries if entry.kind == kind) / self.profiled_seconds
+        return sum(entry.seconds for entry in self.entries if entry.kind == kind) / self.seconds
 
 
 class _TimedCore:
@@ -87,27 +89,36 @@ def profile(step: Callable[[], object], steps: int) -> Profile:
     """Time `steps` calls of `step`, and watch as many more. What a step does to its surroundings is done."""
     for _ in range(WARM_UP):
         step()
-    seconds = _seconds_of(step, steps)
-    with _timed_core() as core, torch_profile(activities=[ProfilerActivity.CPU]) as watched:
-        profiled = _seconds_of(step, steps)
+    with _timed_core() as core:
+        seconds = _seconds_of(step, steps)
     kernels = [
         Entry("kernel", name, core.calls[name] / steps, t * 1e-9 / steps) for name, t in core.nanoseconds.items()
     ]
+    with _timed_core() as core, torch_profile(activities=[ProfilerActivity.CPU]) as watched:
+        watched_seconds = _seconds_of(step, steps)
+    within = sum(core.nanoseconds.values()) * 1e-9 / steps
+    rest = _beside_kernels(watched, steps, watched_seconds, within)
+    scale = (seconds - sum(entry.seconds for entry in kernels)) / (watched_seconds - within)
+    rest = [replace(entry, seconds=entry.seconds * scale) for entry in rest]
+    return Profile([*_sorted(kernels), *rest], seconds, watched_seconds)
+
+
+def _beside_kernels(watched: torch_profile, steps: int, seconds: float, kernels: float) -> list[Entry]:
+    """What a watched step does in `seconds` beside its kernels."""
     ops: dict[str, list[Entry]] = {"torch": [], "binding": [], "autograd": []}
     for event in watched.key_averages():
         if event.key.startswith("Optimizer."):
             continue  # a span of Python around ops that are listed
         kind = "binding" if "ast_sim" in event.key else "torch" if event.key.startswith("aten::") else "autograd"
         ops[kind].append(Entry(kind, event.key, event.count / steps, event.self_cpu_time_total * 1e-6 / steps))
-    binding = sum(entry.seconds for entry in ops["binding"]) - sum(entry.seconds for entry in kernels)
+    binding = max(sum(entry.seconds for entry in ops["binding"]) - kernels, 0.0)
     entries = [
-        *_sorted(kernels),
         *_with_rest(_sorted(ops["torch"]), TORCH_OPS),
-        Entry("binding", "around kernels", sum(entry.calls for entry in ops["binding"]), max(binding, 0.0)),
+        Entry("binding", "around kernels", sum(entry.calls for entry in ops["binding"]), binding),
         *_with_rest(_sorted(ops["autograd"]), 0),
     ]
-    python = profiled - sum(entry.seconds for entry in entries)
-    return Profile([*entries, Entry("python", "everything else", 1, max(python, 0.0))], seconds, profiled)
+    python = seconds - kernels - sum(entry.seconds for entry in entries)
+    return [*entries, Entry("python", "everything else", 1, max(python, 0.0))]
 
 
 def _seconds_of(step: Callable[[], object], steps: int) -> float:
@@ -133,11 +144,11 @@ def _with_rest(entries: list[Entry], named: int) -> list[Entry]:
 def table(found: Profile) -> str:
     """The profile as lines of text."""
     lines = [
-        f"{1e3 * found.seconds:.2f} ms a step, {1e3 * found.profiled_seconds:.2f} ms while watched; shares of that:",
+        f"{1e3 * found.seconds:.2f} ms a step ({1e3 * found.watched_seconds:.2f} ms while every op is watched)",
         f"{'':9}{'':42}{'calls':>8}{'ms':>10}{'share':>9}",
     ]
     for e in found.entries:
-        share = e.seconds / found.profiled_seconds
+        share = e.seconds / found.seconds
         lines.append(f"{e.kind:9}{e.name:42.42}{e.calls:8.4g}{1e3 * e.seconds:10.3f}{share:9.1%}")
     kinds = ("kernel", "torch", "binding", "autograd", "python")
     lines.append("in all   " + ", ".join(f"{kind} {found.share(kind):.1%}" for kind in kinds))

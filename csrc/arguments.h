@@ -1,19 +1,14 @@
 /* How the module takes its arguments apart: every array is checked for type, shape, layout and index range before a kernel sees it.
  *
- * Arrays are NumPy arrays of exact dtype, aligned and row major; outputs are allocated by the caller. A message names the op,
- * the argument and the offending value. In debug mode outputs are filled with NaN (integers: -1) before the kernel runs, and
- * inputs are compared with copies afterwards. Included by module.c alone.
+ * Arrays are NumPy arrays or tensors (view.h) of exact dtype, aligned and row major; outputs are allocated by the caller. A message
+ * names the op, the argument and the offending value. In debug mode outputs are filled with NaN (integers: -1) before the kernel
+ * runs, and inputs are compared with copies afterwards. Included by module.c alone.
  */
 #ifndef AST_ARGUMENTS_H
 #define AST_ARGUMENTS_H
 
-#define PY_SSIZE_T_CLEAN
-#define Py_LIMITED_API 0x030B0000
-#include <Python.h>
+#include "view.h"
 
-#define NPY_NO_DEPRECATED_API NPY_2_0_API_VERSION
-#define NPY_TARGET_VERSION    NPY_1_23_API_VERSION
-#include <numpy/arrayobject.h>
 #include <stdarg.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -26,16 +21,16 @@ static bool debug; /* AST_SIM_DEBUG=1 */
 
 /* ---- arguments ---- */
 
-enum { FLOATS = NPY_FLOAT32, INTS = NPY_INT64, SMALL_INTS = NPY_INT32 };
-enum { MAX_ARRAYS = 28, MAX_SHAPE = 4, ANY = -1 };
+enum { MAX_ARRAYS = 28, ANY = -1 };
 
 typedef struct {
   const char *name;
-  PyArrayObject *array;
   void *data;
   int64_t shape[MAX_SHAPE];
   int64_t row_stride; /* in items */
   bool output;
+  size_t bytes, row_bytes; /* of all elements, and from row to row */
+  bool dense;
   void *copy; /* debug: what an input held before the call */
 } argument;
 
@@ -66,63 +61,86 @@ static bool fail(const call *c, PyObject *type, const char *format, ...) {
 
 static const char *type_name(int type) { return type == FLOATS ? "float32" : type == INTS ? "int64" : "int32"; }
 
-static bool check_layout(const call *c, const argument *a, bool strided_rows) {
-  PyArrayObject *array = a->array;
-  const npy_intp item = PyArray_ITEMSIZE(array);
-  npy_intp expected = item;
-  if (!PyArray_ISBEHAVED_RO(array)) return fail(c, PyExc_ValueError, "%s must be aligned and in native byte order", a->name);
-  for (int d = PyArray_NDIM(array) - 1; d >= 0; d--) {
-    const npy_intp stride = PyArray_STRIDE(array, d), length = PyArray_DIM(array, d);
-    const bool free_stride = strided_rows && d == 0 && stride >= expected && stride % item == 0;
-    if (PyArray_SIZE(array) && length > 1 && stride != expected && !free_stride)
-      return fail(c, PyExc_ValueError, "%s must be contiguous", a->name);
-    expected *= length;
+/* Rows may lie apart if `strided_rows`. */
+static bool check_layout(const call *c, argument *a, const view *v, bool strided_rows) {
+  const int64_t size = view_size(v);
+  int64_t expected = v->item;
+  if (!v->native) return fail(c, PyExc_ValueError, "%s must be aligned and in native byte order", a->name);
+  a->dense = true;
+  for (int d = v->ndim - 1; d >= 0; d--) {
+    const int64_t stride = v->stride[d];
+    if (size && v->shape[d] > 1 && stride != expected) {
+      if (!strided_rows || d > 0 || stride < expected || stride % v->item)
+        return fail(c, PyExc_ValueError, "%s must be contiguous", a->name);
+      a->dense = false;
+    }
+    if (d == 0) a->row_bytes = (size_t)(v->shape[0] > 1 ? stride : expected);
+    expected *= v->shape[d];
   }
+  a->bytes = (size_t)(size * v->item);
+  a->row_stride = (int64_t)a->row_bytes / v->item;
   return true;
+}
+
+/* The message of an argument that is `wanted`, and not as this attribute of it says. */
+static bool fail_attribute(const call *c, PyObject *type, const char *name, const char *wanted, PyObject *object, const char *attribute) {
+  PyObject *value = PyObject_GetAttrString(object, attribute);
+  PyObject *shown = value && strcmp(attribute, "shape") == 0 ? PySequence_Tuple(value) : value;
+  if (shown) fail(c, type, "%s must %s, not %R", name, wanted, shown);
+  if (shown != value) Py_XDECREF(shown);
+  Py_XDECREF(value);
+  return false;
+}
+
+static bool fail_shape(const call *c, const char *name, PyObject *object, int ndim, va_list lengths) {
+  char wanted[120] = "have shape [";
+  for (int d = 0; d < ndim; d++) {
+    const int64_t length = va_arg(lengths, int64_t);
+    const size_t used = strlen(wanted);
+    if (length == ANY) snprintf(wanted + used, sizeof wanted - used, "%s*", d ? ", " : "");
+    else snprintf(wanted + used, sizeof wanted - used, "%s%lld", d ? ", " : "", (long long)length);
+  }
+  strncat(wanted, "]", sizeof wanted - strlen(wanted) - 1);
+  return fail_attribute(c, PyExc_ValueError, name, wanted, object, "shape");
 }
 
 /* The next argument as an array of this type and shape; ANY lengths are free. NULL if it does not fit. */
 static argument *take(call *c, const char *name, int type, bool output, bool strided_rows, int ndim, ...) {
   PyObject *object = c->objects[c->next++];
   argument *a = &c->arrays[c->num_arrays];
+  view v;
   *a = (argument){.name = name, .output = output};
-  if (!PyArray_Check(object)) {
-    fail(c, PyExc_TypeError, "%s must be a NumPy array, not %R", name, (PyObject *)Py_TYPE(object));
+  if (!view_of(object, &v)) {
+    fail(c, PyExc_TypeError, "%s must be a NumPy array or a dense tensor on the CPU, not %R", name, (PyObject *)Py_TYPE(object));
     return NULL;
   }
-  a->array = (PyArrayObject *)object;
-  if (PyArray_TYPE(a->array) != type) {
-    fail(c, PyExc_TypeError, "%s must be %s, not %R", name, type_name(type), (PyObject *)PyArray_DESCR(a->array));
+  if (v.type != type) {
+    char wanted[16];
+    snprintf(wanted, sizeof wanted, "be %s", type_name(type));
+    fail_attribute(c, PyExc_TypeError, name, wanted, object, "dtype");
     return NULL;
   }
-  bool fits = PyArray_NDIM(a->array) == ndim;
   va_list lengths;
   va_start(lengths, ndim);
-  char wanted[96] = "";
-  for (int d = 0; d < ndim; d++) {
+  bool fits = v.ndim == ndim;
+  for (int d = 0; fits && d < ndim; d++) {
     const int64_t length = va_arg(lengths, int64_t);
-    const size_t used = strlen(wanted);
-    if (length == ANY) snprintf(wanted + used, sizeof wanted - used, "%s*", d ? ", " : "");
-    else snprintf(wanted + used, sizeof wanted - used, "%s%lld", d ? ", " : "", (long long)length);
-    if (!fits) continue;
-    a->shape[d] = PyArray_DIM(a->array, d);
-    if (length != ANY && a->shape[d] != length) fits = false;
+    a->shape[d] = v.shape[d];
+    fits = length == ANY || length == a->shape[d];
   }
   va_end(lengths);
   if (!fits) {
-    PyObject *shape = PyObject_GetAttrString(object, "shape");
-    if (shape) fail(c, PyExc_ValueError, "%s must have shape [%s], not %R", name, wanted, shape);
-    Py_XDECREF(shape);
+    va_start(lengths, ndim);
+    fail_shape(c, name, object, ndim, lengths);
+    va_end(lengths);
     return NULL;
   }
-  if (output && !PyArray_ISWRITEABLE(a->array)) {
+  if (output && !v.writeable) {
     fail(c, PyExc_ValueError, "%s must be writeable", name);
     return NULL;
   }
-  if (!check_layout(c, a, strided_rows)) return NULL;
-  a->data = PyArray_DATA(a->array);
-  a->row_stride = ndim && a->shape[0] > 1 ? PyArray_STRIDE(a->array, 0) / PyArray_ITEMSIZE(a->array) : 0;
-  for (int d = 1; a->shape[0] <= 1 && d < ndim; d++) a->row_stride = (d == 1 ? 1 : a->row_stride) * a->shape[d];
+  if (!check_layout(c, a, &v, strided_rows)) return NULL;
+  a->data = v.data;
   c->num_arrays++;
   return a;
 }
@@ -216,13 +234,12 @@ static bool check_pairs(const call *c, const argument *offsets, const argument *
 static bool begin(call *c) {
   for (int i = 0; debug && i < c->num_arrays; i++) {
     argument *a = &c->arrays[i];
-    const size_t size = (size_t)PyArray_NBYTES(a->array);
     if (a->output) { /* all bits set: NaN, and -1 as an integer */
-      const size_t rows = size ? (size_t)a->shape[0] : 0, stride = (size_t)PyArray_STRIDE(a->array, 0);
-      for (size_t row = 0; row < rows; row++) memset((char *)a->data + row * stride, 0xff, size / rows);
-    } else if (size && PyArray_IS_C_CONTIGUOUS(a->array)) {
-      if (!(a->copy = malloc(size))) return PyErr_NoMemory(), false;
-      memcpy(a->copy, a->data, size);
+      const size_t rows = a->bytes ? (size_t)a->shape[0] : 0;
+      for (size_t row = 0; row < rows; row++) memset((char *)a->data + row * a->row_bytes, 0xff, a->bytes / rows);
+    } else if (a->bytes && a->dense) {
+      if (!(a->copy = malloc(a->bytes))) return PyErr_NoMemory(), false;
+      memcpy(a->copy, a->data, a->bytes);
     }
   }
   return true;
@@ -233,8 +250,7 @@ static bool end(call *c, ast_status status) {
   for (int i = 0; i < c->num_arrays; i++) {
     argument *a = &c->arrays[i];
     if (!a->copy) continue;
-    if (ok && memcmp(a->copy, a->data, (size_t)PyArray_NBYTES(a->array)))
-      ok = fail(c, PyExc_AssertionError, "the kernel changed its input %s", a->name);
+    if (ok && memcmp(a->copy, a->data, a->bytes)) ok = fail(c, PyExc_AssertionError, "the kernel changed its input %s", a->name);
     free(a->copy);
   }
   if (ok && status == AST_NO_MEMORY) return PyErr_NoMemory(), false;

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ast_sim.ops import library
-from ast_sim.ops.library import array, check_offsets
+from ast_sim.ops.library import check_offsets, dense, dense_rows
 
 # ---- dropout: the generator of the C core in torch ----
 
@@ -129,25 +128,19 @@ def _backward_reference(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, o
 # ---- C core ----
 
 
-def _rows(x: Tensor) -> np.ndarray:
-    """As an array whose rows may lie apart, like those of a slice of a fused projection; copied only otherwise."""
-    dense = x.dim() == 3 and x.stride(2) == 1 and x.stride(1) == x.shape[2] and x.stride(0) >= x.shape[1] * x.shape[2]
-    return x.detach().numpy() if dense and x.data_ptr() % 4 == 0 else array(x)
-
-
 def _kernel(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed):
     out, maximum = q.new_empty(q.shape), q.new_empty(q.shape[:2])
     total = torch.empty_like(maximum)
-    inputs = (_rows(q), _rows(k), _rows(v), array(q_offsets), array(k_offsets), scale, dropout_p, seed)
-    library._C.attention(*inputs, out.numpy(), maximum.numpy(), total.numpy())
+    inputs = (dense_rows(q), dense_rows(k), dense_rows(v), dense(q_offsets), dense(k_offsets), scale, dropout_p, seed)
+    library._C.attention(*inputs, out, maximum, total)
     return out, maximum, total
 
 
 def _backward_kernel(gradients, q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, out, maximum, total, dout):
     """Writes the gradients of q, k and v into `gradients`, whose rows may lie apart."""
-    inputs = (_rows(q), _rows(k), _rows(v), array(q_offsets), array(k_offsets), scale, dropout_p, seed)
-    saved = (array(out), array(maximum), array(total), array(dout))
-    library._C.attention_backward(*inputs, *saved, *(x.numpy() for x in gradients))
+    inputs = (dense_rows(q), dense_rows(k), dense_rows(v), dense(q_offsets), dense(k_offsets), scale, dropout_p, seed)
+    saved = (dense(out), dense(maximum), dense(total), dense(dout))
+    library._C.attention_backward(*inputs, *saved, *gradients)
 
 
 # ---- ops ----

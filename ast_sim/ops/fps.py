@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ast_sim.ops import library
-from ast_sim.ops.library import array, check_offsets
+from ast_sim.ops.library import check_offsets, dense
 
 EXTENT = 1 << 21  # squared distances of smaller differences are exact in float64, and in int32 where they are small
 
@@ -47,7 +47,7 @@ def _sample_reference(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[T
 
 
 def _sample_kernel(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
-    indices, out_offsets = library._C.farthest_point_sample(array(coordinates), array(offsets), num)
+    indices, out_offsets = library._C.farthest_point_sample(dense(coordinates), dense(offsets), num)
     return torch.from_numpy(indices), torch.from_numpy(out_offsets)
 
 

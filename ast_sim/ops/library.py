@@ -125,11 +125,24 @@ def differentiate(op: Op, setup_context: Callable, backward: Callable) -> None:
     op.function = type(f"ast_sim_{op.name}", (torch.autograd.Function,), body)
 
 
-def array(x: torch.Tensor) -> np.ndarray:
-    """The tensor as an aligned, contiguous NumPy array, without a copy where it already is one."""
-    if not x.is_contiguous() or x.data_ptr() % x.element_size():
-        x = x.detach().clone(memory_format=torch.contiguous_format)
-    return x.detach().numpy() if x.requires_grad else x.numpy()
+def dense(x: torch.Tensor | None) -> torch.Tensor | None:
+    """The tensor as the C core takes it, contiguous and aligned; a copy only where it is not. None stays None."""
+    if x is None or x.is_contiguous() and not x.data_ptr() % x.element_size() and not x.is_neg():
+        return x
+    return x.detach().resolve_neg().clone(memory_format=torch.contiguous_format)
+
+
+def dense_rows(x: torch.Tensor | None) -> torch.Tensor | None:
+    """The same where rows may lie apart, like those of a slice of columns or of a fused projection."""
+    if x is None or x.is_contiguous() or x.dim() == 0:
+        return dense(x)
+    row, *inner = x.stride()
+    length = 1
+    for n, stride in zip(reversed(x.shape[1:]), reversed(inner), strict=True):
+        if stride != length:
+            return dense(x)
+        length *= n
+    return x if row >= length and not x.data_ptr() % x.element_size() and not x.is_neg() else dense(x)
 
 
 def check_offsets(op: str, name: str, offsets: torch.Tensor, rows: int) -> None:

@@ -5,28 +5,15 @@ Legend: M rows, I inputs, H hidden units, O outputs.
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from ast_sim.ops import library
-from ast_sim.ops.library import array
+from ast_sim.ops.library import dense, dense_rows
 
 ACTIVATIONS = ("none", "relu", "geglu")
 SAVED = 1 << 24  # elements of the input of an activation up to which it is kept for the gradient, not computed again
-
-
-def _rows(x: Tensor | None) -> np.ndarray | None:
-    """As an array whose rows may lie apart, like those of a slice of columns; copied only otherwise."""
-    if x is None:
-        return None
-    dense = x.dim() == 2 and x.stride(1) == 1 and x.stride(0) >= x.shape[1] and x.data_ptr() % 4 == 0
-    return x.detach().numpy() if dense else array(x)
-
-
-def _array(x: Tensor | None) -> np.ndarray | None:
-    return None if x is None else array(x)
 
 
 def _outputs(like: Tensor, wanted: list[bool], shapes: list) -> list[Tensor]:
@@ -34,8 +21,8 @@ def _outputs(like: Tensor, wanted: list[bool], shapes: list) -> list[Tensor]:
     return [like.new_empty(tuple(shape) if want else (0,)) for want, shape in zip(wanted, shapes, strict=True)]
 
 
-def _given(wanted: list[bool], outputs: list[Tensor]) -> list[np.ndarray | None]:
-    return [x.numpy() if want else None for want, x in zip(wanted, outputs, strict=True)]
+def _given(wanted: list[bool], outputs: list[Tensor]) -> list[Tensor | None]:
+    return [x if want else None for want, x in zip(wanted, outputs, strict=True)]
 
 
 def _check_shapes(op: str, x: Tensor, weight: Tensor, inputs: int | None = None) -> None:
@@ -113,14 +100,14 @@ def _linear_kernel(x, weight, bias, residual, activation, save):
     _check_linear(x, weight, bias, activation)
     out, z = _linear_fake(x, weight, bias, residual, activation, save)
     _check_rows("linear", "residual", residual, *out.shape)
-    inputs = (_rows(x), array(weight), _array(bias), _rows(residual), ACTIVATIONS.index(activation))
-    library._C.linear(*inputs, out.numpy(), z.numpy() if save else None)
+    inputs = (dense_rows(x), dense(weight), dense(bias), dense_rows(residual), ACTIVATIONS.index(activation))
+    library._C.linear(*inputs, out, z if save else None)
     return out, z
 
 
 def _linear_backward_kernel(dout, x, weight, bias, z, activation, wanted):
     outputs = _linear_backward_fake(dout, x, weight, bias, z, activation, wanted)
-    inputs = (_rows(x), array(weight), _array(bias), _array(z), ACTIVATIONS.index(activation), _rows(dout))
+    inputs = (dense_rows(x), dense(weight), dense(bias), dense(z), ACTIVATIONS.index(activation), dense_rows(dout))
     library._C.linear_backward(*inputs, *_given(wanted, outputs))
     return outputs
 

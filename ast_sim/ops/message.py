@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ast_sim.ops import library
 from ast_sim.ops.edges import EdgeSet
-from ast_sim.ops.library import array, check_offsets
+from ast_sim.ops.library import check_offsets, dense
 
 EPS = 1e-5
 Encoder = tuple[Tensor, Tensor, Tensor]
@@ -85,7 +85,7 @@ def _kernel(of_senders, of_receivers, edge_features, *weights_and_edges):
     total = of_receivers.new_empty(of_receivers.shape[0], width)
     messages = of_receivers.new_empty(len(edge_features) if with_messages else 0, width)
     inputs = (of_senders, of_receivers, edge_features, *weights_and_edges)
-    library._C.message(*(array(x) for x in inputs), array(total), array(messages))
+    library._C.message(*(dense(x) for x in inputs), total, messages)
     return total, messages
 
 
@@ -135,7 +135,7 @@ def _outputs(inputs, wants_edges: bool) -> list[Tensor]:
 def _backward_kernel(dsum, dmessages, *inputs):
     *inputs, wants_edges = inputs
     out = _outputs(inputs[:10], wants_edges)
-    library._C.message_backward(*(array(x) for x in (*inputs, dsum, dmessages, *out)))
+    library._C.message_backward(*(dense(x) for x in (*inputs, dsum, dmessages)), *out)
     return tuple(out)
 
 

@@ -10,8 +10,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ast_sim.ops import library
-from ast_sim.ops.library import array
-from ast_sim.ops.linear import _array, _check_rows, _check_shapes, _check_vectors, _given, _outputs, _rows
+from ast_sim.ops.library import dense, dense_rows
+from ast_sim.ops.linear import _check_rows, _check_shapes, _check_vectors, _given, _outputs
 
 EPSILON = 1e-5
 SAVED = 1 << 25  # elements of hidden units and outputs up to which they are kept for the gradient, not computed again
@@ -84,11 +84,9 @@ def _kernel(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual, sa
     _check(x, beside, weight1, bias1, weight2, bias2, gamma, beta)
     out, *kept = _fake(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual, save)
     _check_rows("mlp", "residual", residual, *out.shape)
-    inputs = (_rows(x), _rows(beside), array(weight1), _array(bias1), array(weight2), _array(bias2))
+    inputs = (dense_rows(x), dense_rows(beside), dense(weight1), dense(bias1), dense(weight2), dense(bias2))
     norm = save and gamma is not None
-    library._C.mlp(
-        *inputs, _array(gamma), _array(beta), _rows(residual), out.numpy(), *_given([save, norm, norm], kept)
-    )
+    library._C.mlp(*inputs, dense(gamma), dense(beta), dense_rows(residual), out, *_given([save, norm, norm], kept))
     return out, *kept
 
 
@@ -96,9 +94,9 @@ def _backward_kernel(dout, x, beside, weight1, bias1, weight2, bias2, gamma, bet
     outputs = _backward_fake(
         dout, x, beside, weight1, bias1, weight2, bias2, gamma, beta, hidden, normalized, scale, wanted
     )
-    inputs = (_rows(x), _rows(beside), array(weight1), _array(bias1), array(weight2), _array(bias2))
-    kept = (_array(hidden), _array(normalized), _array(scale))
-    library._C.mlp_backward(*inputs, _array(gamma), _array(beta), _rows(dout), *kept, *_given(wanted, outputs))
+    inputs = (dense_rows(x), dense_rows(beside), dense(weight1), dense(bias1), dense(weight2), dense(bias2))
+    kept = (dense(hidden), dense(normalized), dense(scale))
+    library._C.mlp_backward(*inputs, dense(gamma), dense(beta), dense_rows(dout), *kept, *_given(wanted, outputs))
     return outputs
 
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ast_sim.ops import library
-from ast_sim.ops.library import array, check_offsets
+from ast_sim.ops.library import check_offsets, dense
 
 MAX_DEPTH = 21
 
@@ -174,7 +174,7 @@ def _octree_kernel(positions: Tensor, offsets: Tensor, center: Sequence[float], 
     keys, node_cell, node_order = (offsets.new_empty(n) for _ in range(3))
     cell_offsets, node_offsets = torch.empty_like(offsets), offsets.new_empty(n + 1)
     outputs = (keys, cell_offsets, node_cell, node_order, node_offsets)
-    library._C.octree_build(array(positions), array(offsets), *center, half_width, depth, *(x.numpy() for x in outputs))
+    library._C.octree_build(dense(positions), dense(offsets), *center, half_width, depth, *outputs)
     num = int(cell_offsets[-1])
     return keys[:num], cell_offsets, node_offsets[: num + 1], node_cell, node_order
 
@@ -190,7 +190,7 @@ def _coordinates_reference(keys: Tensor) -> Tensor:
 
 def _coordinates_kernel(keys: Tensor) -> Tensor:
     coordinates = keys.new_empty(len(keys), 3, dtype=torch.int32)
-    library._C.octree_coordinates(array(keys), coordinates.numpy())
+    library._C.octree_coordinates(dense(keys), coordinates)
     return coordinates
 
 
@@ -260,7 +260,7 @@ def _coarsen_once(keys: Tensor, cell_offsets: Tensor) -> tuple[Tensor, ...]:
 
 
 def _coarsen_kernel(keys: Tensor, cell_offsets: Tensor, levels: int) -> list[Tensor]:
-    parts = library._C.octree_coarsen(array(keys), array(cell_offsets), levels)
+    parts = library._C.octree_coarsen(dense(keys), dense(cell_offsets), levels)
     return [torch.from_numpy(part) for part in parts]
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ast_sim.ops import library
-from ast_sim.ops.library import array, check_offsets
+from ast_sim.ops.library import check_offsets, dense
 
 
 def _segment_of(node_offsets: Tensor) -> Tensor:
@@ -39,7 +39,7 @@ def _sum_reference(x: Tensor, node_order: Tensor, node_offsets: Tensor, mean: bo
 
 def _sum_kernel(x: Tensor, node_order: Tensor, node_offsets: Tensor, mean: bool) -> Tensor:
     out = x.new_empty(max(len(node_offsets) - 1, 0), x.shape[-1])
-    library._C.segment_sum(array(x), array(node_order), array(node_offsets), mean, array(out))
+    library._C.segment_sum(dense(x), dense(node_order), dense(node_offsets), mean, out)
     return out
 
 
@@ -55,7 +55,7 @@ def _spread_reference(dout: Tensor, node_order: Tensor, node_offsets: Tensor, me
 
 def _spread_kernel(dout: Tensor, node_order: Tensor, node_offsets: Tensor, mean: bool) -> Tensor:
     dx = dout.new_empty(len(node_order), dout.shape[1])
-    library._C.segment_spread(array(dout), array(node_order), array(node_offsets), mean, array(dx))
+    library._C.segment_spread(dense(dout), dense(node_order), dense(node_offsets), mean, dx)
     return dx
 
 
@@ -71,7 +71,7 @@ def _column_sum_reference(x: Tensor) -> Tensor:
 
 def _column_sum_kernel(x: Tensor) -> Tensor:
     out = x.new_empty(x.shape[-1:])
-    library._C.column_sum(array(x), array(out))
+    library._C.column_sum(dense(x), out)
     return out
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from ast_sim.ops import library
-from ast_sim.ops.library import array, check_offsets
+from ast_sim.ops.library import check_offsets, dense
 from ast_sim.ops.octree import CellMap
 from ast_sim.ops.segment import column_sum
 
@@ -67,15 +67,15 @@ def _weight_reference(x, dout, pair_offsets, source, destination):
 def _kernel(x, weight, bias, transposed, pair_offsets, source, destination, back_source, back_destination, num_out):
     out = x.new_empty(num_out, weight.shape[1 if transposed else -1])
     bias = x.new_empty(0) if bias is None else bias
-    pairs = (array(pair_offsets), array(source), array(destination))
-    library._C.sparse_conv(array(x), array(weight), array(bias), transposed, *pairs, array(out))
+    pairs = (dense(pair_offsets), dense(source), dense(destination))
+    library._C.sparse_conv(dense(x), dense(weight), dense(bias), transposed, *pairs, out)
     return out
 
 
 def _weight_kernel(x, dout, pair_offsets, source, destination):
     dweight = x.new_empty(OFFSETS, x.shape[-1], dout.shape[-1])
     library._C.sparse_conv_weight(
-        array(x), array(dout), array(pair_offsets), array(source), array(destination), array(dweight)
+        dense(x), dense(dout), dense(pair_offsets), dense(source), dense(destination), dweight
     )
     return dweight
 

@@ -9,9 +9,11 @@ import functools
 import every_op
 import numpy as np
 import pytest
+import torch
 from checks import run_python
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from ast_sim.ops import library
 
@@ -35,7 +37,7 @@ class Recorder:
         def call(*arguments):
             found = self.calls.setdefault(name, [])
             if len(found) < 2:
-                found.append(copy.deepcopy(arguments))
+                found.append(tuple(x.numpy().copy() if isinstance(x, torch.Tensor) else x for x in arguments))
             return getattr(self._module, name)(*arguments)
 
         return call
@@ -150,6 +152,14 @@ def spoilers(draw):
     return lambda x: with_values(x, edits) if isinstance(x, np.ndarray) else edits[0][1] - 20
 
 
+def as_tensor(x):
+    """The array as a tensor over the same memory, if torch has such a one."""
+    try:
+        return torch.from_numpy(x) if isinstance(x, np.ndarray) and x.flags.writeable else x
+    except (TypeError, ValueError):
+        return x
+
+
 def test_every_function_is_recorded():
     assert set(calls()) == set(FUNCTIONS)
 
@@ -160,8 +170,9 @@ def test_every_function_is_recorded():
     which=st.integers(0, 1),
     changes=st.lists(st.tuples(st.integers(0, 40), spoilers()), min_size=1, max_size=3),
     more=st.sampled_from([0] * 20 + [-1, 1]),
+    tensors=st.booleans(),
 )
-def test_arguments_that_do_not_fit(name, which, changes, more):
+def test_arguments_that_do_not_fit(name, which, changes, more, tensors):
     recorded = calls()[name][which % len(calls()[name])]
     arguments = [x.copy() if isinstance(x, np.ndarray) else x for x in recorded]
     for at, spoil in changes:
@@ -169,16 +180,64 @@ def test_arguments_that_do_not_fit(name, which, changes, more):
             arguments[at % len(arguments)] = spoil(arguments[at % len(arguments)])
     if more:
         arguments = arguments[:-1] if more < 0 else [*arguments, 0]
+    if tensors:
+        arguments = [as_tensor(x) for x in arguments]
     try:
         getattr(library._C, name)(*arguments)
     except ALLOWED as error:
         assert isinstance(error, MemoryError) or str(error)
 
 
+@pytest.mark.parametrize("tensors", [False, True])
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_recorded_calls_are_valid(name):
+def test_recorded_calls_are_valid(name, tensors):
     for recorded in calls()[name]:
-        getattr(library._C, name)(*copy.deepcopy(recorded))
+        arguments = copy.deepcopy(recorded)
+        getattr(library._C, name)(*(as_tensor(x) if tensors else x for x in arguments))
+
+
+class Derived(torch.Tensor):
+    pass
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda x: x,
+        lambda x: x.requires_grad_(),
+        lambda x: torch.nn.Parameter(x),
+        lambda x: x.as_subclass(Derived),
+        lambda x: torch.cat([x, x])[5:],
+        lambda x: x.numpy(),
+    ],
+)
+def test_tensors_and_arrays_of_all_kinds_are_read(change):
+    out = torch.empty(3)
+    library._C.column_sum(change(torch.arange(15.0).view(5, 3)), out)
+    assert out.tolist() == [30.0, 35.0, 40.0]
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (lambda x: x.to_sparse(), "must be a NumPy array or a dense tensor on the CPU, not <class 'torch.Tensor'>"),
+        (lambda x: x.to("meta"), "must be a NumPy array or a dense tensor on the CPU"),
+        (lambda x: FakeTensorMode().from_tensor(x), "must be a NumPy array or a dense tensor on the CPU"),
+        (lambda x: x.tolist(), "must be a NumPy array or a dense tensor on the CPU, not <class 'list'>"),
+        (lambda x: x.double(), "must be float32, not torch.float64"),
+        (lambda x: x.bfloat16(), "must be float32, not torch.bfloat16"),
+        (lambda x: x.to(torch.complex64), "must be float32, not torch.complex64"),
+        (lambda x: x.double().numpy(), r"must be float32, not dtype\('float64'\)"),
+        (lambda x: x[0], r"must have shape \[\*, \*\], not \(3,\)"),
+        (lambda x: x.view(1, 1, 1, 5, 3), r"must have shape \[\*, \*\], not \(1, 1, 1, 5, 3\)"),
+        (lambda x: x.T, "must be contiguous"),
+        (lambda x: x[:, :1].expand(5, 3), "must be contiguous"),
+        (lambda x: torch.from_numpy(misaligned(x.numpy())), "must be aligned"),
+    ],
+)
+def test_tensors_that_do_not_fit_are_refused(change, message):
+    with pytest.raises((TypeError, ValueError), match=f"column_sum: x {message}"):
+        library._C.column_sum(change(torch.arange(15.0).view(5, 3)), torch.empty(3))
 
 
 NO_MEMORY = """

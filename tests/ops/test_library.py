@@ -53,6 +53,12 @@ def test_autocast_brings_low_precision_to_float32():
         assert segment.segment_sum(torch.ones(3, 2, dtype=torch.bfloat16), ORDER, OFFSETS).dtype == torch.float32
 
 
+def test_a_negative_view_is_read_as_what_it_stands_for():
+    """The imaginary part of a conjugate is the memory of its negative, with a mark."""
+    x = torch.complex(torch.zeros(3, 2), torch.arange(6.0).view(3, 2)).conj().imag
+    assert x.is_neg() and torch.equal(segment.segment_sum(x, ORDER, OFFSETS), torch.tensor([[-4.0, -6], [-2, -3]]))
+
+
 def test_modes_and_tracers_see_the_op():
     x = torch.ones(3, 2)
     with Seen() as seen:

@@ -1,0 +1,115 @@
+/* What the module reads of an array that Python holds: a NumPy array, or a tensor of a library that offers DLPack's exchange in C.
+ *
+ * A torch tensor is looked at where it lies, by one C call and without a Python object beside it; torch has offered this since 2.10
+ * (`__dlpack_c_exchange_api__`, DLPack 1.3). Nothing is owned: a view is good while the caller holds the object. Included by
+ * arguments.h alone.
+ */
+#ifndef AST_VIEW_H
+#define AST_VIEW_H
+
+#define PY_SSIZE_T_CLEAN
+#define Py_LIMITED_API 0x030B0000
+#include <Python.h>
+
+#define NPY_NO_DEPRECATED_API NPY_2_0_API_VERSION
+#define NPY_TARGET_VERSION    NPY_1_23_API_VERSION
+#include <numpy/arrayobject.h>
+#include <stdbool.h>
+#include <stdint.h>
+
+enum { FLOATS = NPY_FLOAT32, INTS = NPY_INT64, SMALL_INTS = NPY_INT32, OTHER_TYPE = -1 };
+enum { MAX_SHAPE = 4 };
+
+typedef struct {
+  void *data; /* never NULL */
+  int type, ndim;
+  int64_t item;                                /* bytes */
+  int64_t shape[MAX_SHAPE], stride[MAX_SHAPE]; /* strides in bytes; unset where ndim is larger than MAX_SHAPE */
+  bool native, writeable;                      /* native: aligned and in this machine's byte order */
+} view;
+
+static int64_t view_size(const view *v) {
+  int64_t size = 1;
+  for (int d = 0; d < v->ndim; d++) size *= v->shape[d];
+  return size;
+}
+
+static char nothing[64]; /* where arrays without elements lie */
+
+static void view_of_array(PyArrayObject *array, view *v) {
+  *v = (view){.data = PyArray_DATA(array),
+              .type = PyArray_TYPE(array),
+              .ndim = PyArray_NDIM(array),
+              .item = PyArray_ITEMSIZE(array),
+              .native = PyArray_ISBEHAVED_RO(array),
+              .writeable = PyArray_ISWRITEABLE(array)};
+  for (int d = 0; d < v->ndim && d < MAX_SHAPE; d++) v->shape[d] = PyArray_DIM(array, d), v->stride[d] = PyArray_STRIDE(array, d);
+}
+
+/* ---- the part of DLPack's interface (dlpack.h, version 1) that takes a look at a tensor ---- */
+
+enum { DLPACK_CPU = 1, DLPACK_INT = 0, DLPACK_FLOAT = 2 };
+
+typedef struct {
+  void *data;
+  int32_t device_type, device_id, ndim;
+  uint8_t code, bits;
+  uint16_t lanes;
+  int64_t *shape, *strides; /* in items */
+  uint64_t byte_offset;
+} dlpack_tensor;
+
+typedef struct {
+  uint32_t major, minor;
+  const void *previous, *allocate, *from_object, *to_object;
+  int (*look)(void *object, dlpack_tensor *tensor); /* 0, or an exception is set; may be NULL */
+  const void *stream;
+} dlpack_exchange;
+
+/* The exchange of a type and of those derived from it, kept from call to call; NULL for what is no tensor. */
+static const dlpack_exchange *exchange_of(PyTypeObject *type) {
+  static PyTypeObject *known;
+  static const dlpack_exchange *exchange;
+  if (known && PyType_IsSubtype(type, known)) return exchange;
+  PyObject *capsule = PyObject_GetAttrString((PyObject *)type, "__dlpack_c_exchange_api__");
+  const dlpack_exchange *found = capsule ? PyCapsule_GetPointer(capsule, "dlpack_exchange_api") : NULL;
+  Py_XDECREF(capsule);
+  PyErr_Clear();
+  if (!found || found->major != 1 || !found->look) return NULL;
+  Py_INCREF(type);
+  Py_XDECREF(known);
+  known = type;
+  return exchange = found;
+}
+
+/* Whether the object is a dense tensor in this machine's memory. */
+static bool view_of_tensor(PyObject *object, view *v) {
+  const dlpack_exchange *exchange = exchange_of(Py_TYPE(object));
+  dlpack_tensor t;
+  if (!exchange) return false;
+  if (exchange->look(object, &t) != 0) return PyErr_Clear(), false;
+  if (t.device_type != DLPACK_CPU) return false;
+  const bool single = t.lanes == 1, real = t.code == DLPACK_FLOAT, integer = t.code == DLPACK_INT;
+  const int type = single && real && t.bits == 32 ? FLOATS : single && integer && t.bits == 64 ? INTS : SMALL_INTS;
+  const bool known = single && ((real && t.bits == 32) || (integer && (t.bits == 64 || t.bits == 32)));
+  const int64_t item = (t.bits * t.lanes + 7) / 8;
+  char *data = t.data ? (char *)t.data + t.byte_offset : nothing;
+  *v = (view){.data = data,
+              .type = known ? type : OTHER_TYPE,
+              .ndim = t.ndim,
+              .item = item,
+              .native = item && (uintptr_t)data % (uintptr_t)item == 0,
+              .writeable = true};
+  bool empty = false;
+  for (int d = 0; d < v->ndim; d++) empty = empty || t.shape[d] == 0;
+  for (int d = 0; d < v->ndim && d < MAX_SHAPE; d++) v->shape[d] = t.shape[d], v->stride[d] = t.strides[d] * item;
+  return t.data || empty;
+}
+
+static bool view_of(PyObject *object, view *v) {
+  if (!PyArray_Check(object)) return view_of_tensor(object, v);
+  view_of_array((PyArrayObject *)object, v);
+  return true;
+}
+
+#endif
