@@ -116,17 +116,9 @@ typedef struct {
   dense_next next[DENSE_NEXT];
 } dense_end;
 
-/* What follows the product of a tile: columns from j on of `rows` rows from i on, of which n are real. Out of line, as it is long. */
+/* What follows the product of a tile in the seldom cases: halves of a panel, z, columns from j on of which not all n are real. */
 static __attribute__((noinline)) void dense_finish(const dense_layer *l, const dense_end *e, int64_t rows, int64_t vectors, int64_t i,
                                                    int64_t j, int64_t n, const float *sums, const float *bias) {
-  if (!e->z && !e->hidden && !e->residual && !l->paired && n >= vectors * VW) { /* the usual case in few instructions */
-    for (const int64_t end = i + rows; i < end; i++, sums += GEMM_COLUMNS)
-      for (int64_t v = 0; v < vectors * VW; v += VW) {
-        const vf z = vload(sums + v) + vload(bias + v);
-        vstore(e->out + i * e->out_row + j + v, e->activation == AST_RELU ? vmax((vf){0}, z) : z);
-      }
-    return;
-  }
   for (const int64_t end = i + rows; i < end; i++, sums += GEMM_COLUMNS) {
     if (l->paired) {
       const vf a = vload(sums) + vload(bias), b = vload(sums + VW) + vload(bias + VW);
@@ -150,10 +142,30 @@ static __attribute__((noinline)) void dense_finish(const dense_layer *l, const d
   }
 }
 
+/* for all vectors of a register tile */
+#define DENSE_EACH(i, v) _Pragma("GCC unroll 12") for (int i = 0; i < rows; i++) _Pragma("GCC unroll 2") for (int v = 0; v < vectors; v++)
+
+/* The same in the usual cases, in the registers of the tile: rows from i on, whole vectors from column j on. */
+AST_INLINE void dense_finish_tile(const int rows, const int vectors, const dense_end *e, int64_t i0, int64_t j, const float *bias,
+                                  vf z[GEMM_ROWS][2]) {
+  DENSE_EACH(i, v) z[i][v] += vload(bias + v * VW);
+  if (e->activation == AST_RELU) DENSE_EACH(i, v) z[i][v] = vmax((vf){0}, z[i][v]);
+  if (e->hidden) {
+    const float *hidden = e->hidden + i0 * e->hidden_row + j;
+    DENSE_EACH(i, v) z[i][v] = (vf)((vi)z[i][v] & ~(vload(hidden + i * e->hidden_row + v * VW) <= 0));
+  }
+  if (e->residual) {
+    const float *residual = e->residual + i0 * e->residual_row + j;
+    DENSE_EACH(i, v) z[i][v] += vload(residual + i * e->residual_row + v * VW);
+  }
+  float *out = e->out + i0 * e->out_row + j;
+  DENSE_EACH(i, v) vstore(out + i * e->out_row + v * VW, z[i][v]);
+}
+
 /* One register tile: rows i.. of panel p. A long sum over k is one of short ones, in the stack between two of them. */
 AST_INLINE void dense_tile(const int rows, const int vectors, const dense_layer *l, int64_t p, int64_t i0, gemm_a a, const dense_end *e) {
   const int64_t j = p * dense_panel_width(l);
-  const float *panel = l->panels + p * l->K * GEMM_COLUMNS;
+  const float *panel = l->panels + p * l->K * GEMM_COLUMNS, *bias = l->panels_bias + p * GEMM_COLUMNS;
   float sums[GEMM_ROWS * GEMM_COLUMNS] __attribute__((aligned(64)));
 #pragma GCC unroll 12
   for (int i = 0; i < rows; i++) {
@@ -161,25 +173,23 @@ AST_INLINE void dense_tile(const int rows, const int vectors, const dense_layer 
     __builtin_prefetch(line, 1);
     if (vectors == 2) __builtin_prefetch(line + VW, 1);
   }
-  int64_t k = 0;
-  do { /* once without inputs, too: the sums are then 0 */
-    vf sum[GEMM_ROWS][2];
-#pragma GCC unroll 12
-    for (int i = 0; i < rows; i++)
-#pragma GCC unroll 2
-      for (int v = 0; v < vectors; v++) sum[i][v] = (vf){0};
+  vf sum[GEMM_ROWS][2];
+  for (int64_t k = 0;;) { /* once without inputs, too: the sums are then 0 */
+    DENSE_EACH(i, v) sum[i][v] = (vf){0};
     const gemm_a part = {a.data + i0 * a.row + k * a.column, a.row, a.column};
     gemm_sums(rows, vectors, min64(l->depth, l->K - k), part, panel + k * GEMM_COLUMNS, GEMM_COLUMNS, sum);
-#pragma GCC unroll 12
-    for (int i = 0; i < rows; i++)
-#pragma GCC unroll 2
-      for (int v = 0; v < vectors; v++) {
-        float *to = sums + i * GEMM_COLUMNS + v * VW;
-        vstore(to, k ? vload(to) + sum[i][v] : sum[i][v]);
-      }
+    if (k) DENSE_EACH(i, v) sum[i][v] += vload(sums + i * GEMM_COLUMNS + v * VW);
     k += l->depth;
-  } while (k < l->K);
-  dense_finish(l, e, rows, vectors, i0, j, l->N - j, sums, l->panels_bias + p * GEMM_COLUMNS);
+    if (k >= l->K) break;
+    DENSE_EACH(i, v) vstore(sums + i * GEMM_COLUMNS + v * VW, sum[i][v]);
+    __asm__("" : "+m"(sums)); /* or the compiler moves what is not yet known of them through other stack for every tile */
+  }
+  if (!l->paired && !e->z && l->N - j >= vectors * VW) {
+    dense_finish_tile(rows, vectors, e, i0, j, bias, sum);
+    return;
+  }
+  DENSE_EACH(i, v) vstore(sums + i * GEMM_COLUMNS + v * VW, sum[i][v]);
+  dense_finish(l, e, rows, vectors, i0, j, l->N - j, sums, bias);
 }
 
 /* The share of panel p, of `panels`, in rows first.. of it */
