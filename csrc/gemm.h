@@ -33,35 +33,66 @@ AST_INLINE gemm_b gemm_rows(const float *b, int64_t stride) { return (gemm_b){b,
 AST_INLINE gemm_b gemm_packed(const float *b, int64_t K) { return (gemm_b){b, GEMM_COLUMNS, K * GEMM_COLUMNS}; }
 AST_INLINE int64_t gemm_packed_size(int64_t K, int64_t N) { return K * round_up(N, GEMM_COLUMNS); }
 
-/* out[k][j] = in[j][k] for a block of 4 x 4, out within a panel */
-AST_INLINE void gemm_transpose4(const float *in, int64_t in_row, float *out) {
-  typedef float v4 __attribute__((vector_size(16)));
-  typedef float v4_unaligned __attribute__((vector_size(16), aligned(4), may_alias));
-  v4 x[4];
-#pragma GCC unroll 4
-  for (int j = 0; j < 4; j++) x[j] = *(const v4_unaligned *)(in + j * in_row);
-  const v4 low01 = {x[0][0], x[1][0], x[0][1], x[1][1]}, low23 = {x[2][0], x[3][0], x[2][1], x[3][1]};
-  const v4 high01 = {x[0][2], x[1][2], x[0][3], x[1][3]}, high23 = {x[2][2], x[3][2], x[2][3], x[3][3]};
-  const v4 y[4] = {{low01[0], low01[1], low23[0], low23[1]},
-                   {low01[2], low01[3], low23[2], low23[3]},
-                   {high01[0], high01[1], high23[0], high23[1]},
-                   {high01[2], high01[3], high23[2], high23[3]}};
-#pragma GCC unroll 4
-  for (int k = 0; k < 4; k++) *(v4_unaligned *)(out + k * GEMM_COLUMNS) = y[k];
+/* lanes 0 to VW - 1 of a, and VW on of b */
+AST_INLINE vf gemm_shuffle(vf a, vf b, const vi lanes) {
+#ifdef __clang__
+  vf x;
+  for (int i = 0; i < VW; i++) x[i] = lanes[i] < VW ? a[lanes[i]] : b[lanes[i] - VW];
+  return x;
+#else
+  return __builtin_shuffle(a, b, lanes);
+#endif
 }
 
-/* One panel of B_kj = b[k*row + j*column], j < N <= `width`, padded with zeros: `width` columns of the GEMM_COLUMNS of a panel. */
+/* Of the 2 x 2 blocks of `distance` lanes in rows x_i and x_(i + distance), those off the diagonal change places. */
+AST_INLINE void gemm_exchange(vf x[VW], const int distance) {
+  const vi swapped = (LANE_INDICES & distance) != 0;
+  const vi upper = LANE_INDICES + (swapped & (VW - distance)), lower = LANE_INDICES + (swapped & VW) + (~swapped & distance);
+#pragma GCC unroll 16
+  for (int i = 0; i < VW; i++)
+    if (!(i & distance)) {
+      const vf a = x[i], b = x[i + distance];
+      x[i] = gemm_shuffle(a, b, upper);
+      x[i + distance] = gemm_shuffle(a, b, lower);
+    }
+}
+
+/* out[k][j] = in[j][k] for n rows j of m columns k, both at most VW; out has VW columns within a panel, 0 from n on. */
+AST_INLINE void gemm_transpose(const float *in, int64_t in_row, const int64_t n, const int64_t m, float *out) {
+  vf x[VW];
+#pragma GCC unroll 16
+  for (int j = 0; j < VW; j++) x[j] = j < n ? vload_upto(in + j * in_row, m) : (vf){0};
+  if (VW >= 16) gemm_exchange(x, 8);
+  if (VW >= 8) gemm_exchange(x, 4);
+  gemm_exchange(x, 2);
+  gemm_exchange(x, 1);
+#pragma GCC unroll 16
+  for (int k = 0; k < VW; k++)
+    if (k < m) vstore(out + k * GEMM_COLUMNS, x[k]);
+}
+
+/* The same for blocks at the end; out of line, as it is long. */
+static __attribute__((noinline)) void gemm_transpose_part(const float *in, int64_t in_row, int64_t n, int64_t m, float *out) {
+  gemm_transpose(in, in_row, n, m, out);
+}
+
+/* One panel of B_kj = b[k*row + j*column], row or column 1, j < N <= `width`: that many of the GEMM_COLUMNS columns of a panel, padded
+ * with zeros. */
 AST_INLINE void gemm_pack_columns(const float *b, int64_t row, int64_t column, int64_t K, int64_t N, const int64_t width, float *panel) {
-  const int64_t wide = row == 1 && N == width ? K / 4 * 4 : 0;
-  for (int64_t k = 0; k < wide; k += 4)
-#pragma GCC unroll 8
-    for (int64_t j = 0; j < width; j += 4) gemm_transpose4(b + k + j * column, column, panel + k * GEMM_COLUMNS + j);
-  for (int64_t k = wide; k < K; k++) {
+  if (row == 1) {
+    for (int64_t j = 0; j < width; j += VW)
+      for (int64_t k0 = 0; k0 < K; k0 += VW) {
+        const int64_t k = max64(0, min64(k0, K - VW)); /* the last block overlaps the one before rather than end within it */
+        const float *in = b + k + j * column;
+        float *out = panel + k * GEMM_COLUMNS + j;
+        if (N - j >= VW && K >= VW) gemm_transpose(in, column, VW, VW, out);
+        else gemm_transpose_part(in, column, N - j, min64(VW, K), out);
+      }
+    return;
+  }
+  for (int64_t k = 0; k < K; k++) {
     float *out = panel + k * GEMM_COLUMNS;
-    const float *in = b + k * row;
-    if (column == 1) memcpy(out, in, (size_t)N * sizeof *out);
-    else
-      for (int64_t j = 0; j < N; j++) out[j] = in[j * column];
+    memcpy(out, b + k * row, (size_t)N * sizeof *out);
     for (int64_t j = N; j < width; j++) out[j] = 0;
   }
 }
