@@ -2,7 +2,7 @@
  *
  * Arrays are NumPy arrays or tensors (view.h) of exact dtype, aligned and row major; outputs are allocated by the caller. A message
  * names the op, the argument and the offending value. In debug mode outputs are filled with NaN (integers: -1) before the kernel
- * runs, and inputs are compared with copies afterwards. Included by module.c alone.
+ * runs, and inputs are compared with copies afterwards. Included by module.c and its module_*.h alone.
  */
 #ifndef AST_ARGUMENTS_H
 #define AST_ARGUMENTS_H
@@ -17,7 +17,8 @@
 #undef I /* of complex.h, which NumPy includes: here it is a number of inputs */
 #include "ast.h"
 
-static bool debug; /* AST_SIM_DEBUG=1 */
+static const ast_kernels *kernels; /* of the chosen instruction set */
+static bool debug;                 /* AST_SIM_DEBUG=1 */
 
 /* ---- arguments ---- */
 

@@ -195,8 +195,6 @@ def _define(name: str, schema: str, split: Callable, together: Callable):
         ctx.mark_non_differentiable(*output[1:])
 
     def gradient(ctx, dout, *_):
-        if dout is None:
-            return (None,) * len(ctx.needs_input_grad)
         *arguments, out, maximum, total = ctx.saved_tensors
         gradients = backward(*arguments, *ctx.settings, out, maximum, total, dout)
         return *(gradients if num > 1 else (gradients,)), None, None, None, None, None
@@ -231,9 +229,9 @@ _attention_qkv, _attention_qkv_backward = _define(
 )
 
 
-def _seed(seed: int) -> int:
-    """As the signed 64 bits that torch's ops take."""
-    return (seed + (1 << 63)) % (1 << 64) - (1 << 63)
+def _settings(width: int, scale: float | None, dropout_p: float, seed: int) -> tuple[float, float, int]:
+    """As the ops take them: D^-1/2 for no scale, the seed as signed 64 bits."""
+    return width**-0.5 if scale is None else float(scale), float(dropout_p), (seed + (1 << 63)) % (1 << 64) - (1 << 63)
 
 
 def attention(
@@ -266,8 +264,8 @@ def attention(
     Raises:
         ValueError: for shapes, offsets or a dropout_p that are not as above.
     """
-    scale = q.shape[-1] ** -0.5 if scale is None else float(scale)
-    out, maximum, total = _attention(q, k, v, q_offsets, k_offsets, scale, float(dropout_p), _seed(seed))
+    settings = _settings(q.shape[-1], scale, dropout_p, seed)
+    out, maximum, total = _attention(q, k, v, q_offsets, k_offsets, *settings)
     return out, maximum + total.log()
 
 
@@ -284,8 +282,7 @@ def cross_attention(
 
     The gradient comes in the same layout: nothing is copied in either direction. Returns out [Tq, H, D] alone.
     """
-    scale = q.shape[-1] ** -0.5 if scale is None else float(scale)
-    return _attention_kv(q, key_value, q_offsets, k_offsets, scale, float(dropout_p), _seed(seed))[0]
+    return _attention_kv(q, key_value, q_offsets, k_offsets, *_settings(q.shape[-1], scale, dropout_p, seed))[0]
 
 
 def self_attention(
@@ -295,5 +292,4 @@ def self_attention(
 
     The gradient comes in the same layout: nothing is copied in either direction. Returns out [T, H, D] alone.
     """
-    scale = qkv.shape[-1] ** -0.5 if scale is None else float(scale)
-    return _attention_qkv(qkv, offsets, offsets, scale, float(dropout_p), _seed(seed))[0]
+    return _attention_qkv(qkv, offsets, offsets, *_settings(qkv.shape[-1], scale, dropout_p, seed))[0]

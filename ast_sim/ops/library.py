@@ -113,15 +113,24 @@ def define(schema: str, kernel: Callable, reference: Callable, fake: Callable) -
 
 
 def differentiate(op: Op, setup_context: Callable, backward: Callable) -> None:
-    """Register the gradient of an op; `backward` calls ops only, so that it can be traced."""
-    torch.library.register_autograd(op.overload.name(), backward, setup_context=setup_context, lib=_library)
+    """Register the gradient of an op; `backward` calls ops only, so that it can be traced.
+
+    It is not called where nothing comes back, which happens if `setup_context` turned materialized zeros off.
+    """
+
+    def backward_of_some(ctx, *gradients):
+        if all(gradient is None for gradient in gradients):
+            return (None,) * len(ctx.needs_input_grad)
+        return backward(ctx, *gradients)
+
+    torch.library.register_autograd(op.overload.name(), backward_of_some, setup_context=setup_context, lib=_library)
 
     def forward(ctx, *args):
         output = op.kernel(*args)
         setup_context(ctx, args, output)
         return output
 
-    body = {"forward": staticmethod(forward), "backward": staticmethod(backward)}
+    body = {"forward": staticmethod(forward), "backward": staticmethod(backward_of_some)}
     op.function = type(f"ast_sim_{op.name}", (torch.autograd.Function,), body)
 
 

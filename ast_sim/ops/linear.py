@@ -72,8 +72,8 @@ def _linear_reference(x, weight, bias, residual, activation, save):
     z = F.linear(x, weight, bias)
     out = _activated(z, activation)
     _check_rows("linear", "residual", residual, *out.shape)
-    out = out.clone() if out is z else out
-    return out if residual is None else out + residual, z if save else x.new_empty(0)
+    out = out if residual is None else out + residual
+    return out, (z.clone() if out is z else z) if save else x.new_empty(0)
 
 
 def _linear_backward_reference(dout, x, weight, bias, z, activation, wanted):
@@ -147,8 +147,6 @@ def _save_linear(ctx, inputs, output) -> None:
 
 
 def _linear_gradient(ctx, dout, _):
-    if dout is None:
-        return (None,) * len(ctx.needs_input_grad)
     x, weight, bias, z = ctx.saved_tensors
     wanted = list(ctx.needs_input_grad[:3])
     gradients = [None] * 3

@@ -138,8 +138,6 @@ def _save(ctx, inputs, output) -> None:
 
 
 def _gradient(ctx, dout, *_):
-    if dout is None:
-        return (None,) * len(ctx.needs_input_grad)
     wanted = list(ctx.needs_input_grad[:8])
     gradients = _mlp_backward(dout, *ctx.saved_tensors, wanted) if any(wanted) else [None] * 8
     gradients = [g if want else None for g, want in zip(gradients, wanted, strict=True)]
