@@ -8,8 +8,8 @@ import resource
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -71,13 +71,19 @@ def rollout_step(training: Training) -> Callable[[], object]:
     stress = None if truth.stress is None else torch.from_numpy(truth.stress[0].copy())
 
     def step() -> None:
-        training.model.eval()
-        with torch.inference_mode():
-            batch = make_batch(training.model, graph, first, None, second, stress, ["test/000000 frame 0"])
-            predict_next(training.model, batch, second)
-        training.model.train()
+        batch = make_batch(training.model, graph, first, None, second, stress, ["test/000000 frame 0"])
+        predict_next(training.model, batch, second)
 
     return step
+
+
+@contextmanager
+def rolling_out(training: Training) -> Iterator[None]:
+    """As a rollout has it: the model for prediction, no gradients."""
+    training.model.eval()
+    with torch.inference_mode():
+        yield
+    training.model.train()
 
 
 def flops_of(step: Callable[[], object]) -> int:
@@ -99,11 +105,12 @@ def main() -> None:
         training = stack.enter_context(Training(Path(run), config, dataset, scales, StopSignals()))
         training.prepare()
         roll = rollout_step(training)
+        rolled_out = rolling_out(training)  # decorates what asks for rollout steps
         answers: dict[str, Callable[[int], object]] = {
             "step": lambda count: mean_seconds(training.advance, count),
-            "rollout": lambda count: mean_seconds(roll, count),
+            "rollout": rolled_out(lambda count: mean_seconds(roll, count)),
             "profile": lambda count: shares(training.advance, count),
-            "profile_rollout": lambda count: shares(roll, count),
+            "profile_rollout": rolled_out(lambda count: shares(roll, count)),
             "flops": lambda count: flops_of(training.advance),
             "resident": lambda count: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
         }

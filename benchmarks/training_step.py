@@ -160,6 +160,11 @@ def main() -> None:
     parser.add_argument("--cases", nargs="+", choices=scenes.CASES, default=list(scenes.CASES), help="only these")
     arguments = parser.parse_args()
     limits = peak(max(arguments.threads))
+    header = {
+        **provenance(" ".join(["python -m benchmarks.training_step", *sys.argv[1:]])),
+        "peak_gflops_by_threads": limits,
+    }
+    arguments.json.parent.mkdir(parents=True, exist_ok=True)
     records: list[dict] = []
     with tempfile.TemporaryDirectory() as folder:
         for name in arguments.cases:
@@ -176,13 +181,8 @@ def main() -> None:
                 for record in made:
                     print(line_of(judge(record)), flush=True)
                 records += made
-    result = {
-        **provenance(" ".join(["python -m benchmarks.training_step", *sys.argv[1:]])),
-        "peak_gflops_by_threads": limits,
-        "records": records,
-    }
-    arguments.json.parent.mkdir(parents=True, exist_ok=True)
-    arguments.json.write_text(json.dumps(result, indent=1) + "\n")
+                # After every case, so that a long run that is cut off leaves what it found.
+                arguments.json.write_text(json.dumps({**header, "records": records}, indent=1) + "\n")
 
 
 if __name__ == "__main__":
