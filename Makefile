@@ -46,7 +46,7 @@ fuzz: $(addprefix build/check/fuzz/fuzz_,$(FUZZ))
 	@set -e; for name in $(FUZZ); do \
 	  mkdir -p build/fuzz/$$name csrc/tests/corpus/$$name; \
 	  echo "$$name for $(FUZZ_SECONDS) s"; \
-	  build/check/fuzz/fuzz_$$name -max_total_time=$(FUZZ_SECONDS) -max_len=200 -verbosity=0 -print_funcs=0 -print_final_stats=1 \
+	  build/check/fuzz/fuzz_$$name -max_total_time=$(FUZZ_SECONDS) -max_len=200 -len_control=0 -verbosity=0 -print_funcs=0 -print_final_stats=1 \
 	    -artifact_prefix=build/fuzz/$$name- build/fuzz/$$name csrc/tests/corpus/$$name; \
 	done
 
@@ -54,7 +54,8 @@ fuzz: $(addprefix build/check/fuzz/fuzz_,$(FUZZ))
 corpus: $(addprefix build/check/fuzz/fuzz_,$(FUZZ))
 	@set -e; for name in $(FUZZ); do \
 	  rm -rf build/fuzz/merged; mkdir -p build/fuzz/$$name build/fuzz/merged csrc/tests/corpus/$$name; \
-	  build/check/fuzz/fuzz_$$name -merge=1 -use_counters=0 build/fuzz/merged csrc/tests/corpus/$$name build/fuzz/$$name 2>/dev/null; \
+	  build/check/fuzz/fuzz_$$name -merge=1 -use_counters=0 -artifact_prefix=build/fuzz/$$name- build/fuzz/merged \
+	    csrc/tests/corpus/$$name build/fuzz/$$name 2>/dev/null; \
 	  rm -rf csrc/tests/corpus/$$name; mv build/fuzz/merged csrc/tests/corpus/$$name; \
 	  echo "$$name: $$(ls csrc/tests/corpus/$$name | wc -l) inputs"; \
 	done
@@ -97,8 +98,10 @@ COMPILE_plain := $(GCC) -O3
 COMPILE_sanitized := $(GCC) -O1 -g -fsanitize=$(SANITIZE) -fno-sanitize-recover=all
 COMPILE_races := $(CLANG) -O1 -g -fsanitize=thread
 COMPILE_valgrind := $(GCC) -O1 -g
-# -O0: the optimiser takes minutes over unrolled products with all these checks in them.
-COMPILE_fuzz := $(CLANG) -O0 -g -fsanitize=fuzzer-no-link,$(SANITIZE) -fno-sanitize-recover=all
+# -O0: the optimiser takes minutes over unrolled products with all these checks in them. Comparisons are not traced, nor branches of the
+# targets themselves: the sizes that a kernel compares do not stand in an input, and the tracing took most of the time.
+COMPILE_fuzz := $(CLANG) -O0 -g -fsanitize=fuzzer-no-link,$(SANITIZE) -fno-sanitize-coverage=trace-cmp -fno-sanitize-recover=all
+COMPILE_target := $(CLANG) -O1 -g -fsanitize=$(SANITIZE) -fno-sanitize-recover=all
 COMPILE_wide := $(GCC) -O2 -Wno-psabi -mavx2 -mfma -DAST_VECTOR_BYTES=64
 
 CORE := isa_base dispatch parallel memory
@@ -127,11 +130,13 @@ $(foreach build,$(BUILDS) fuzz,$(eval $(call BUILD,$(build))))
 build/check/wide/%.o: FLAGS_dispatch :=
 
 $(addprefix build/check/fuzz/fuzz_,$(C_FUZZERS)): build/check/fuzz/fuzz_%: csrc/tests/fuzz_%.c csrc/tests/test_%.c $(C_TEST_HEADERS) build/check/fuzz/core.a
-	@$(COMPILE_fuzz) -O1 -fsanitize=fuzzer $< build/check/fuzz/core.a -lm -o $@
+	@$(COMPILE_target) -c $< -o $@.o
+	@$(COMPILE_target) -fsanitize=fuzzer $@.o build/check/fuzz/core.a -lm -o $@
 
 build/check/fuzz_%.passed: build/check/fuzz/fuzz_% csrc/tests/corpus/%
 	@echo "$* (kept inputs of its fuzz target)"
-	@$< -runs=0 -verbosity=0 csrc/tests/corpus/$*
+	@mkdir -p build/fuzz
+	@$< -runs=0 -verbosity=0 -artifact_prefix=build/fuzz/$*- csrc/tests/corpus/$*
 	@touch $@
 
 # The thread sanitizer finds no room for its shadow memory where addresses are too random.

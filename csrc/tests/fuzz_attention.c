@@ -45,15 +45,33 @@ static void check_values(const problem *a, const answer *r) {
   free(out);
 }
 
-static void fuzz(const ast_kernels *kernels) {
+enum { COST = 1 << 19 }; /* pairs of a query and a key, times channels, about */
+
+/* Scenes of any sizes, or, first, one so long in queries or in keys that it is cut over them. What their pairs cost is saved on heads,
+ * then on channels. */
+static problem take_problem(void) {
   static const double rates[] = {0, 0, 0.1, 0.9, 1e-9, 0.999999, 0.5, 0};
   problem a = {.B = take_size(5), .H = 1 + take_byte() % 3, .D = 16 * (1 + take_byte() % 8), .p = rates[take_byte() % 8]};
+  const int shape = take_byte() % 16;
+  int64_t pairs = 0;
   for (int64_t b = 0; b < a.B; b++) {
-    a.q_offsets[b + 1] = a.Tq += take_size(300);
-    a.k_offsets[b + 1] = a.Tk += take_size(300);
+    int64_t queries = take_size(160), keys = take_size(160);
+    if (b == 0 && shape == 15) queries = 500 + 2 * take_size(600), keys %= 40;
+    if (b == 0 && shape == 14) keys = 1000 + take_size(600), queries %= 40;
+    keys = within(COST / 16, queries, keys);
+    a.q_offsets[b + 1] = a.Tq += queries;
+    a.k_offsets[b + 1] = a.Tk += keys;
+    pairs += queries * keys;
   }
+  while (pairs * a.H * a.D > COST && a.H > 1) a.H--;
+  while (pairs * a.H * a.D > COST && a.D > 16) a.D -= 16;
   const int64_t row = a.H * a.D;
   a.q = take_floats(a.Tq * row), a.k = take_floats(a.Tk * row), a.v = take_floats(a.Tk * row), a.dout = take_floats(a.Tq * row);
+  return a;
+}
+
+static void fuzz(const ast_kernels *kernels) {
+  problem a = take_problem();
   answer r = solve(kernels, &a);
   const int64_t b = a.B ? (a.p > 0 ? 0 : take_index(a.B)) : 0; /* with dropout a scene alone has index 0 */
   if (a.B) check_alone(kernels, &a, &r, b);

@@ -8,7 +8,7 @@
 static void fuzz(const ast_kernels *kernels) {
   static const int64_t extents[] = {1, 2, 6, 100, 1 << 12, 26755, (1 << 21) - 1, 1 << 21};
   const int64_t B = take_size(5), num = 1 + take_size(600);
-  int64_t *offsets = take_offsets(B, 300), N = offsets[B];
+  int64_t *offsets = take_offsets(B, 600), N = offsets[B];
   int32_t *points = new_small_ints(3 * N);
   check_state = take_word(2);
   const int32_t origin = (int32_t)take_word(take_byte() % 4);

@@ -72,10 +72,13 @@ static void check_values(const ast_message *s, const float *dsum, const float *d
 }
 
 static void fuzz(const ast_kernels *kernels) {
-  ast_message s = {
-      .S = 1 + take_size(60), .R = take_size(40), .E = take_size(17), .H = take_size(65), .F = take_size(65), .F2 = take_size(65)};
+  const bool many = take_chance(); /* edges, so that the gradients go in several rounds */
+  const int64_t most = many ? 3 : 65;
+  ast_message s = {.S = 1 + take_size(60), .R = take_size(40), .E = take_size(many ? 2 : 17)};
+  s.H = take_size(most), s.F = take_size(most), s.F2 = take_size(most);
   const bool with_messages = take_byte() % 2;
   int64_t *offsets = take_offsets(s.R, 40), at[RESULTS + 1];
+  for (int64_t r = 0; many && r <= s.R; r++) offsets[r] += 400 * r;
   s.M = offsets[s.R];
   int64_t *senders = new_ints(s.M), *receivers = new_ints(s.M);
   check_state = take_word(2);

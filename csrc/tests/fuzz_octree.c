@@ -17,9 +17,11 @@ static int64_t first_bad(cloud s, const double center[3], double half_width) {
 
 static void fuzz_build(const ast_kernels *kernels) {
   const int64_t B = take_size(6);
-  const int depth = take_byte() % 22, shape = take_byte() % SHAPES;
+  const bool many = take_chance(); /* nodes, so that they are cut into chunks; few levels of them, as each is checked cell by cell */
+  const int depth = take_byte() % (many ? 7 : 22), shape = take_byte() % SHAPES;
   double center[3], half_width = 1;
   cloud s = {0, B, take_offsets(B, 300), NULL};
+  if (B) s.offsets[B] += many ? 8192 : 0;
   s.N = s.offsets[B];
   s.positions = take_floats(3 * s.N);
   const uint8_t byte = take_byte();

@@ -18,26 +18,34 @@ static void compare_sums(const char *what, const float *got, const double *exact
   }
 }
 
+static float *magnitudes(const float *x, int64_t n) {
+  float *to = new_floats(n);
+  for (int64_t i = 0; i < n; i++) to[i] = fabsf(x[i]);
+  return to;
+}
+
 static void fuzz(const ast_kernels *kernels) {
-  const int64_t sources = take_size(300), destinations = take_size(300), C_in = take_size(140), C_out = take_size(80);
-  const bool transposed = take_byte() % 2;
-  const double density = take_byte() / 255.0;
+  const bool many = take_chance(); /* pairs, so that a group is cut into parts */
+  const int64_t sources = take_size(300), destinations = take_size(300) + (many ? 8192 : 0);
+  const int options = take_byte();
+  const bool transposed = options % 2, with_bias = options / 2 % 2;
+  const double density = many ? 1 : take_byte() / 255.0;
   check_state = take_word(2);
   pair_list p = new_pairs(sources, destinations, density * density, 1);
+  const int64_t pairs = p.offsets[OFFSETS], C_in = take_size(many ? 3 : 140), wanted = take_size(many ? 3 : 80);
+  const int64_t C_out = within(1 << 20, pairs * C_in, within(1 << 11, C_in, wanted));
   const int64_t n = destinations * C_out, m = OFFSETS * C_in * C_out, num = sources * C_in;
-  float *x = take_floats(num), *weight = take_floats(m), *dout = take_floats(n);
-  float *abs_x = new_floats(num), *abs_weight = new_floats(m), *abs_dout = new_floats(n);
-  for (int64_t i = 0; i < num; i++) abs_x[i] = fabsf(x[i]);
-  for (int64_t i = 0; i < m; i++) abs_weight[i] = fabsf(weight[i]);
-  for (int64_t i = 0; i < n; i++) abs_dout[i] = fabsf(dout[i]);
+  float *x = take_floats(num), *weight = take_floats(m), *dout = take_floats(n), *bias = with_bias ? take_floats(C_out) : NULL;
+  float *abs_x = magnitudes(x, num), *abs_weight = magnitudes(weight, m), *abs_dout = magnitudes(dout, n);
+  float *abs_bias = with_bias ? magnitudes(bias, C_out) : NULL;
   double *exact = calloc((size_t)(n + m + 1), sizeof *exact), *magnitude = calloc((size_t)(n + m + 1), sizeof *magnitude);
   CHECK(exact && magnitude, "no memory");
-  formula(&p, x, weight, NULL, dout, C_in, C_out, transposed, exact, exact + n);
-  formula(&p, abs_x, abs_weight, NULL, abs_dout, C_in, C_out, transposed, magnitude, magnitude + n);
-  float *out = convolve(kernels, &p, x, weight, NULL, C_in, C_out, transposed),
+  formula(&p, x, weight, bias, dout, C_in, C_out, transposed, exact, exact + n);
+  formula(&p, abs_x, abs_weight, abs_bias, abs_dout, C_in, C_out, transposed, magnitude, magnitude + n);
+  float *out = convolve(kernels, &p, x, weight, bias, C_in, C_out, transposed),
         *dweight = weight_gradient(kernels, &p, x, dout, C_in, C_out);
-  compare_sums("out", out, exact, magnitude, n, OFFSETS * C_in);
+  compare_sums("out", out, exact, magnitude, n, OFFSETS * C_in + 1);
   compare_sums("dweight", dweight, exact + n, magnitude + n, m, destinations);
   free(p.source), free(p.destination), free(exact), free(magnitude);
-  FREE(x, weight, dout, abs_x, abs_weight, abs_dout, out, dweight);
+  FREE(x, weight, dout, bias, abs_x, abs_weight, abs_dout, abs_bias, out, dweight);
 }

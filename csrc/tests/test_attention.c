@@ -90,7 +90,7 @@ static void threefry(int rounds, const uint32_t key[4], uint32_t x[4]) {
 }
 
 static double dropout_factor(const ast_attention *s, int64_t scene, int64_t head, int64_t query, int64_t key) {
-  const uint32_t threshold = (uint32_t)lround(s->dropout_p * 65536), slot = (uint32_t)(key % 128 / 16);
+  const uint32_t threshold = (uint32_t)fmin(65535, round(s->dropout_p * 65536)), slot = (uint32_t)(key % 128 / 16);
   const uint32_t words[4] = {(uint32_t)s->seed, (uint32_t)(s->seed >> 32), (uint32_t)scene, (uint32_t)head};
   uint32_t x[4] = {(uint32_t)(key / 128 * 16 + key % 16), (uint32_t)query, 0, 0};
   threefry(12, words, x);
