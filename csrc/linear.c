@@ -119,11 +119,12 @@ static void linear_backward_rows(const linear_backward_job *job, int64_t first, 
   }
   if (job->dbias) dense_add_rows(dz, job->dz_row, rows, s->O, dbias);
   if (job->dweight) dense_copy_rows(x_rows, s->x_stride, rows, s->I, x, job->x_row);
+  if (!job->dx) return;
   const dense_end end = {.out = job->dx + first * s->I,
                          .out_row = s->I,
                          .next = {dense_rows_from(job->dout, s->dout_stride, job->columns, first + rows, s->M),
                                   dense_rows_from(job->x, s->x_stride, s->I, first + rows, s->M)}};
-  if (job->dx) dense_rows(&job->layers[1], 0, dense_panels(&job->layers[1]), rows, (gemm_a){dz, job->dz_row, 1}, end);
+  dense_rows(&job->layers[1], 0, dense_panels(&job->layers[1]), rows, (gemm_a){dz, job->dz_row, 1}, end);
 }
 
 /* By rows: a chunk, its part of dW and dbias. */

@@ -215,13 +215,17 @@ static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_
     gemm(s->H, sums[0].row, rows, (gemm_a){hidden, 1, job->hidden_row}, gemm_rows(input, job->input_row), partials + sums[0].at,
          sums[0].row, add);
   if (sums[1].to) dense_add_rows(hidden, job->hidden_row, rows, s->H, partials + sums[1].at);
-  const dense_end x = {.out = job->g.x + first * s->I,
-                       .out_row = s->I,
-                       .next = {dense_rows_from(job->kept.hidden, s->H, s->H, first + rows, s->M),
-                                dense_rows_from(job->kept.normalized, s->O, s->O, first + rows, s->M)}};
-  const dense_end beside = {.out = job->g.beside + first * s->I2, .out_row = s->I2};
-  if (job->g.x) dense_rows(&job->layers[3], 0, dense_panels(&job->layers[3]), rows, units, x);
-  if (job->g.beside) dense_rows(&job->layers[4], 0, dense_panels(&job->layers[4]), rows, units, beside);
+  if (job->g.x) {
+    const dense_end end = {.out = job->g.x + first * s->I,
+                           .out_row = s->I,
+                           .next = {dense_rows_from(job->kept.hidden, s->H, s->H, first + rows, s->M),
+                                    dense_rows_from(job->kept.normalized, s->O, s->O, first + rows, s->M)}};
+    dense_rows(&job->layers[3], 0, dense_panels(&job->layers[3]), rows, units, end);
+  }
+  if (job->g.beside) {
+    const dense_end end = {.out = job->g.beside + first * s->I2, .out_row = s->I2};
+    dense_rows(&job->layers[4], 0, dense_panels(&job->layers[4]), rows, units, end);
+  }
 }
 
 static ast_status mlp_backward_task(int64_t index, void *context) {

@@ -1,5 +1,5 @@
-/* Fuzzes linear and its gradients: rows alone give the bits that they give among others, and where all sums are moderate the results
- * are those of the formula in double within the rounding of their terms. */
+/* Fuzzes linear and its gradients: rows alone give the bits that they give among others, gradients do not depend on which others are
+ * wanted, and where all sums are moderate the results are those of the formula in double within the rounding of their terms. */
 #define main tests_of_linear
 #include "test_linear.c"
 #undef main
@@ -16,6 +16,17 @@ static void check_rows(const ast_kernels *kernels, const problem *a, const answe
   CHECK(same_floats(r.of[0], all->of[0] + first * a->columns, part.sizes[0]), "out of rows %lld + %lld", (long long)first, (long long)M);
   CHECK(same_floats(r.of[1], all->of[1] + first * a->s.I, part.sizes[1]), "dx of rows %lld + %lld", (long long)first, (long long)M);
   free_answer(r);
+}
+
+/* Only the gradients in the set `wanted`, z recomputed. */
+static void check_wanted(const ast_kernels *kernels, const problem *a, const answer *all, int wanted) {
+  float *g[RESULTS] = {0};
+  for (int i = 1; i < RESULTS; i++)
+    if (wanted >> (i - 1) & 1) g[i] = new_floats(a->sizes[i]);
+  CHECK(kernels->linear_backward(&a->s, a->dout, a->x, a->weight, a->bias, NULL, g[1], g[2], g[3]) == AST_OK, "status");
+  for (int i = 1; i < RESULTS; i++)
+    CHECK(!g[i] || same_floats(g[i], all->of[i], a->sizes[i]), "%s differs among the gradients %#x", names[i], wanted);
+  FREE(g[1], g[2], g[3]);
 }
 
 /* GEGLU multiplies a value by another; its slope is below 1.2. */
@@ -42,9 +53,11 @@ static void check_values(const problem *a, const answer *r) {
 }
 
 static void fuzz(const ast_kernels *kernels) {
-  const int64_t M = take_size(300), I = take_size(140), half = take_size(80);
+  const bool tall = take_chance(); /* so that tasks have several blocks of rows */
+  const int64_t I = take_size(tall ? 8 : 300), half = take_size(tall ? 8 : 130);
   const ast_activation activation = (ast_activation)(take_byte() % 3);
   const int64_t O = activation == AST_GEGLU ? 2 * half : half + take_byte() % 2;
+  const int64_t M = within(1 << 18, I * O, take_size(600) + (tall ? 6100 : 0));
   const uint8_t byte = take_byte();
   problem a = {.s = {M, I, O, I, 0, 0, activation}, .columns = activation == AST_GEGLU ? O / 2 : O};
   a.s.residual_stride = a.s.dout_stride = a.columns;
@@ -54,6 +67,7 @@ static void fuzz(const ast_kernels *kernels) {
   a.residual = take_floats(sizes[0]), a.dout = take_floats(sizes[0]);
   answer r = solve(kernels, &a, byte % 2);
   if (M) check_rows(kernels, &a, &r);
+  check_wanted(kernels, &a, &r, byte / 2);
   check_values(&a, &r);
   free_answer(r), free_problem(a);
 }
