@@ -54,7 +54,7 @@ fuzz: $(addprefix build/check/fuzz/fuzz_,$(FUZZ))
 corpus: $(addprefix build/check/fuzz/fuzz_,$(FUZZ))
 	@set -e; for name in $(FUZZ); do \
 	  rm -rf build/fuzz/merged; mkdir -p build/fuzz/$$name build/fuzz/merged csrc/tests/corpus/$$name; \
-	  build/check/fuzz/fuzz_$$name -merge=1 -use_counters=0 -artifact_prefix=build/fuzz/$$name- build/fuzz/merged \
+	  build/check/fuzz/fuzz_$$name -set_cover_merge=1 -use_counters=0 -artifact_prefix=build/fuzz/$$name- build/fuzz/merged \
 	    csrc/tests/corpus/$$name build/fuzz/$$name 2>/dev/null; \
 	  rm -rf csrc/tests/corpus/$$name; mv build/fuzz/merged csrc/tests/corpus/$$name; \
 	  echo "$$name: $$(ls csrc/tests/corpus/$$name | wc -l) inputs"; \
