@@ -75,7 +75,7 @@ static const vi LANE_INDICES = {0, 1, 2, 3, 4, 5, 6, 7};
 static const vi LANE_INDICES = {0, 1, 2, 3};
 #endif
 
-/* lane i becomes lane i ^ distance, a power of two; the loops of vsum and vlargest are written out for constant shuffles */
+/* lane i becomes lane i ^ distance, a power of two; the loop of vsum is written out for constant shuffles */
 AST_INLINE vf vswap(vf x, const int distance) {
 #ifdef __clang__
   vf y;
@@ -86,19 +86,12 @@ AST_INLINE vf vswap(vf x, const int distance) {
 #endif
 }
 
-/* Sum and maximum over the lanes, always paired the same way; a NaN loses against anything in the maximum. */
+/* Sum over the lanes, always paired the same way. */
 AST_INLINE float vsum(vf x) {
   x += vswap(x, VW / 2);
   x += vswap(x, VW / 4);
   if (VW >= 8) x += vswap(x, VW / 8);
   if (VW >= 16) x += vswap(x, 1);
-  return x[0];
-}
-AST_INLINE float vlargest(vf x) {
-  x = vmax(x, vswap(x, VW / 2));
-  x = vmax(x, vswap(x, VW / 4));
-  if (VW >= 8) x = vmax(x, vswap(x, VW / 8));
-  if (VW >= 16) x = vmax(x, vswap(x, 1));
   return x[0];
 }
 
