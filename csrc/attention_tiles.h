@@ -154,22 +154,6 @@ static void columns_product(int64_t M, int64_t N, int64_t K, const float *a, con
 
 /* ---- rows and panels ---- */
 
-/* e^x 2^-shift within 1 ULP for x < 88: 0 where the result would be below 2^-125 (also for -inf), NaN for NaN. */
-AST_INLINE vf vexp(vf x, int32_t shift) {
-  const float log2_e = 0x1.715476p+0f, magic = 0x1.8p23f + (float)(127 - shift);
-  const vf rounded =
-      x * log2_e + magic; /* its low bits: n + 127 - shift, the exponent of 2^(n - shift), n the integer nearest to x log2 e */
-  const vf f = x * log2_e - (rounded - magic);
-  vf p = 0x1.41fbbcp-13f * f + 0x1.5f3e52p-10f; /* 2^f on [-1/2, 1/2], minimax with p(0) = 1 */
-  p = p * f + 0x1.3b2d4cp-7f;
-  p = p * f + 0x1.c6aee8p-5f;
-  p = p * f + 0x1.ebfbdcp-3f;
-  p = p * f + 0x1.62e430p-1f;
-  p = p * f + 1.0f;
-  const vf power = (vf)((vu)rounded << 23);
-  return (vf)((vi)(p * power) & ~(x < (float)(shift - 125) * 0x1.62e430p-1f));
-}
-
 #if AST_VECTOR_BYTES == 64
 #define INTERLEAVE_LOW(a, b)  __builtin_shufflevector(a, b, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23)
 #define INTERLEAVE_HIGH(a, b) __builtin_shufflevector(a, b, 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31)

@@ -95,11 +95,11 @@ AST_INLINE float vsum(vf x) {
   return x[0];
 }
 
-/* 2^(x - shift) within 1 ULP for x < 127: 0 where the result would be below 2^-125 (also for -inf), NaN for NaN. */
-AST_INLINE vf vexp2(vf x, int32_t shift) {
+/* 2^(y - shift) with y = factor x, within 1 ULP for y < 127: 0 where x < least, NaN for NaN. */
+AST_INLINE vf vpower(vf x, const float factor, int32_t shift, float least) {
   const float magic = 0x1.8p23f + (float)(127 - shift);
-  const vf rounded = x + magic; /* its low bits: n + 127 - shift, the exponent of 2^(n - shift), n the integer nearest to x */
-  const vf f = x - (rounded - magic);
+  const vf rounded = x * factor + magic; /* its low bits: n + 127 - shift, the exponent of 2^(n - shift), n the integer nearest to y */
+  const vf f = x * factor - (rounded - magic);
   vf p = 0x1.41fbbcp-13f * f + 0x1.5f3e52p-10f; /* 2^f on [-1/2, 1/2], minimax with p(0) = 1 */
   p = p * f + 0x1.3b2d4cp-7f;
   p = p * f + 0x1.c6aee8p-5f;
@@ -107,8 +107,11 @@ AST_INLINE vf vexp2(vf x, int32_t shift) {
   p = p * f + 0x1.62e430p-1f;
   p = p * f + 1.0f;
   const vf power = (vf)((vu)rounded << 23);
-  return (vf)((vi)(p * power) & ~(x < (float)(shift - 125)));
+  return (vf)((vi)(p * power) & ~(x < least));
 }
+/* 2^(x - shift) and e^x 2^-shift: 0 where the result would be below 2^-125 (also for -inf). */
+AST_INLINE vf vexp2(vf x, int32_t shift) { return vpower(x, 1, shift, (float)(shift - 125)); }
+AST_INLINE vf vexp(vf x, int32_t shift) { return vpower(x, 0x1.715476p+0f, shift, (float)(shift - 125) * 0x1.62e430p-1f); }
 
 /* The distribution function of the normal distribution, (1 + erf(x / sqrt 2)) / 2, and its density. */
 AST_INLINE vf vnormal(vf x) {
