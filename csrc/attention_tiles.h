@@ -5,79 +5,61 @@
  * apart: a constant, so that a tile needs one pointer for each operand, and no power of two, which would crowd few cache sets.
  * Products add in rising order of the summed index, in every tile alike: a score has the same bits forward and backward.
  *
- * Legend: n keys of a block, D channels of a head; A read by broadcast, B in vectors, C in TILE x 2 vectors of registers.
+ * Legend: n keys of a block, D channels of a head; A read by broadcast, B in vectors, C in GEMM_ROWS x 2 vectors of registers.
  */
 #ifndef AST_ATTENTION_TILES_H
 #define AST_ATTENTION_TILES_H
 
 #include <math.h>
 
-#include "simd.h"
-
-#if AST_VECTOR_BYTES == 64
-enum { TILE = 12 }; /* rows of C: 24 accumulators + 2 of B + 1 of A in 32 registers */
-#elif AST_VECTOR_BYTES == 32
-enum { TILE = 6 }; /* 12 + 2 + 1 in 16 registers */
-#else
-enum { TILE = 4 }; /* 8 + 2 + 1, and one for the product that has no FMA */
-#endif
+#include "gemm.h"
 
 enum {
-  LANES = 2 * VW,   /* queries of a panel */
-  KEYS = 128,       /* keys of a block: the scores of a panel stay in the first cache */
-  MAX_D = 128,      /* channels of a head */
-  ROW = MAX_D + 16, /* floats from row to row */
-  ROW_STEP = 4,     /* products compute rows in multiples of this: 90 keys cost 92 */
+  LANES = GEMM_COLUMNS, /* queries of a panel */
+  KEYS = 128,           /* keys of a block: the scores of a panel stay in the first cache */
+  MAX_D = 128,          /* channels of a head */
+  ROW = MAX_D + 16,     /* floats from row to row */
+  ROW_STEP = 4,         /* products compute rows in multiples of this: 90 keys cost 92 */
 };
 
 /* ---- register tiles ---- */
 
 /* Rows of the next tile when `rest`, a multiple of ROW_STEP, are left: no tile of 4 follows one of 12. */
 AST_INLINE int64_t next_tile(int64_t rest) {
-  if (TILE == 12) return rest == 16 ? 8 : rest >= 12 ? 12 : rest >= 8 ? 8 : 4;
-  if (TILE == 6) return rest >= 6 && rest != 8 ? 6 : 4;
+  if (GEMM_ROWS == 12) return rest == 16 ? 8 : rest >= 12 ? 12 : rest >= 8 ? 8 : 4;
+  if (GEMM_ROWS == 6) return rest >= 6 && rest != 8 ? 6 : 4;
   return 4;
 }
 
-/* Functions of their own for the tiles of TILE, 8 and 4 rows of `f`: inlined, their loops would compete for registers. */
-#define TILE_FUNCTIONS(f, parameters, ...)                                                     \
-  static __attribute__((noinline)) void f##_whole parameters { f(TILE, __VA_ARGS__); }         \
-  static __attribute__((noinline)) void f##_8 parameters { f(TILE < 8 ? 4 : 8, __VA_ARGS__); } \
+/* Functions of their own for the tiles of GEMM_ROWS, 8 and 4 rows of `f`: inlined, their loops would compete for registers. */
+#define TILE_FUNCTIONS(f, parameters, ...)                                                          \
+  static __attribute__((noinline)) void f##_whole parameters { f(GEMM_ROWS, __VA_ARGS__); }         \
+  static __attribute__((noinline)) void f##_8 parameters { f(GEMM_ROWS < 8 ? 4 : 8, __VA_ARGS__); } \
   static __attribute__((noinline)) void f##_4 parameters { f(4, __VA_ARGS__); }
 
 /* Calls them for the tiles i..i+rows of all n rows. */
 #define EACH_TILE(n, f, ...)                                    \
   for (int64_t tile_ = 0, rows_; tile_ < (n); tile_ += rows_) { \
     rows_ = next_tile((n) - tile_);                             \
-    if (rows_ == TILE) f##_whole(tile_, __VA_ARGS__);           \
+    if (rows_ == GEMM_ROWS) f##_whole(tile_, __VA_ARGS__);      \
     else if (rows_ == 8) f##_8(tile_, __VA_ARGS__);             \
     else f##_4(tile_, __VA_ARGS__);                             \
   }
 
-/* sum_ij = sum_k a[i a_row + k a_column] b[k b_row + j], j over `vectors` vectors */
-AST_INLINE void tile_product(const int rows, const int vectors, int64_t K, const float *a, const int64_t a_row, const int64_t a_column,
-                             const float *b, const int64_t b_row, vf sum[TILE][2]) {
+/* sum_ij = sum_k A_ik b[k b_row + j], j over `vectors` vectors */
+AST_INLINE void tile_product(const int rows, const int vectors, int64_t K, gemm_a a, const float *b, const int64_t b_row,
+                             vf sum[GEMM_ROWS][2]) {
 #pragma GCC unroll 12
   for (int i = 0; i < rows; i++)
 #pragma GCC unroll 2
     for (int j = 0; j < vectors; j++) sum[i][j] = (vf){0};
-  for (int64_t k = 0; k < K; k++) {
-    vf b_k[2];
-#pragma GCC unroll 2
-    for (int j = 0; j < vectors; j++) b_k[j] = vload(b + k * b_row + j * VW);
-#pragma GCC unroll 12
-    for (int i = 0; i < rows; i++) {
-      const vf a_ik = vsplat(a[i * a_row + k * a_column]);
-#pragma GCC unroll 2
-      for (int j = 0; j < vectors; j++) sum[i][j] += a_ik * b_k[j];
-    }
-  }
+  gemm_sums(rows, vectors, K, a, b, b_row, sum);
 }
 
 /* x[key][query] = a[key] . b[query] over the channels for a tile of keys; raises largest[2], unless NULL, to the scores' maximum. */
 AST_INLINE void scores_tile(const int rows, int64_t i, int64_t D, const float *a, const float *b, float *x, vf *largest) {
-  vf sum[TILE][2];
-  tile_product(rows, 2, D, a + i * ROW, ROW, 1, b, LANES, sum);
+  vf sum[GEMM_ROWS][2];
+  tile_product(rows, 2, D, (gemm_a){a + i * ROW, ROW, 1}, b, LANES, sum);
 #pragma GCC unroll 12
   for (int r = 0; r < rows; r++)
 #pragma GCC unroll 2
@@ -102,8 +84,8 @@ typedef struct {
 /* c[i][j] is updated by sum_k a_ik b[k][j], rows of b and c ROW apart */
 AST_INLINE void product_tile(const int rows, int64_t i, const int vectors, int64_t K, const float *a, const int64_t a_row,
                              const int64_t a_column, const float *b, float *c, update how) {
-  vf sum[TILE][2];
-  tile_product(rows, vectors, K, a + i * a_row, a_row, a_column, b, ROW, sum);
+  vf sum[GEMM_ROWS][2];
+  tile_product(rows, vectors, K, (gemm_a){a + i * a_row, a_row, a_column}, b, ROW, sum);
   c += i * ROW;
   if (how.set) {
 #pragma GCC unroll 12
