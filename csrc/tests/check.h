@@ -1,4 +1,4 @@
-/* What the C tests share: a check that stops with a message, random numbers, and the run over all tables of kernels. */
+/* What the C tests share: checks that stop with a message, random numbers, and the run over all tables of kernels. */
 #ifndef AST_CHECK_H
 #define AST_CHECK_H
 
@@ -36,6 +36,18 @@ static float random_float(void) { return (float)(2 * random_unit() - 1); }
 
 #include "buffers.h"
 #include "pool.h"
+
+/* Largest errors against the exact values: at most twice that of plain float plus 1e-6 of the largest value. */
+static void check_accuracy(const char *what, const float *got, const double *exact, const float *plain, int64_t n) {
+  double error = 0, plain_error = 0, largest = 0;
+  for (int64_t i = 0; i < n; i++) {
+    CHECK(isfinite(got[i]), "%s[%lld] is %g, not %g", what, (long long)i, (double)got[i], exact[i]);
+    error = fmax(error, fabs((double)got[i] - exact[i]));
+    plain_error = fmax(plain_error, fabs((double)plain[i] - exact[i]));
+    largest = fmax(largest, fabs(exact[i]));
+  }
+  CHECK(error <= 2 * plain_error + 1e-6 * largest, "%s is off by %g of %g, plain float by %g", what, error, largest, plain_error);
+}
 
 enum { CHECK_THREADS = 4 };
 

@@ -31,7 +31,7 @@ static void fuzz(const ast_kernels *kernels) {
   const bool transposed = options % 2, with_bias = options / 2 % 2;
   const double density = many ? 1 : take_byte() / 255.0;
   check_state = take_word(2);
-  pair_list p = new_pairs(sources, destinations, density * density, 1);
+  const ast_pairs p = random_pairs(sources, destinations, density * density, 1);
   const int64_t pairs = p.offsets[OFFSETS], C_in = take_size(many ? 3 : 140), wanted = take_size(many ? 3 : 80);
   const int64_t C_out = within(1 << 20, pairs * C_in, within(1 << 11, C_in, wanted));
   const int64_t n = destinations * C_out, m = OFFSETS * C_in * C_out, num = sources * C_in;
@@ -40,12 +40,12 @@ static void fuzz(const ast_kernels *kernels) {
   float *abs_bias = with_bias ? magnitudes(bias, C_out) : NULL;
   double *exact = calloc((size_t)(n + m + 1), sizeof *exact), *magnitude = calloc((size_t)(n + m + 1), sizeof *magnitude);
   CHECK(exact && magnitude, "no memory");
-  formula(&p, x, weight, bias, dout, C_in, C_out, transposed, exact, exact + n);
-  formula(&p, abs_x, abs_weight, abs_bias, abs_dout, C_in, C_out, transposed, magnitude, magnitude + n);
-  float *out = convolve(kernels, &p, x, weight, bias, C_in, C_out, transposed),
+  formula(&p, destinations, x, weight, bias, dout, C_in, C_out, transposed, exact, exact + n);
+  formula(&p, destinations, abs_x, abs_weight, abs_bias, abs_dout, C_in, C_out, transposed, magnitude, magnitude + n);
+  float *out = convolve(kernels, &p, destinations, x, weight, bias, C_in, C_out, transposed),
         *dweight = weight_gradient(kernels, &p, x, dout, C_in, C_out);
   compare_sums("out", out, exact, magnitude, n, OFFSETS * C_in + 1);
   compare_sums("dweight", dweight, exact + n, magnitude + n, m, destinations);
-  free(p.source), free(p.destination), free(exact), free(magnitude);
-  FREE(x, weight, dout, bias, abs_x, abs_weight, abs_dout, abs_bias, out, dweight);
+  free(exact), free(magnitude);
+  FREE(PAIR_BUFFERS(&p), x, weight, dout, bias, abs_x, abs_weight, abs_dout, abs_bias, out, dweight);
 }

@@ -91,17 +91,6 @@ static void free_answer(answer r) {
 FORMULA(formula, double, erf, exp)
 FORMULA(formula_float, float, erff, expf)
 
-static void compare(const char *what, const float *got, const double *exact, const float *plain, int64_t n) {
-  double error = 0, plain_error = 0, largest = 0;
-  for (int64_t i = 0; i < n; i++) {
-    CHECK(isfinite(got[i]), "%s[%lld] is %g, not %g", what, (long long)i, (double)got[i], exact[i]);
-    error = fmax(error, fabs((double)got[i] - exact[i]));
-    plain_error = fmax(plain_error, fabs((double)plain[i] - exact[i]));
-    largest = fmax(largest, fabs(exact[i]));
-  }
-  CHECK(error <= 2 * plain_error + 1e-6 * largest, "%s is off by %g of %g, plain float by %g", what, error, largest, plain_error);
-}
-
 static void check_against_formula(const problem *a, const answer *r) {
   double *exact[RESULTS];
   float *plain[RESULTS];
@@ -112,7 +101,7 @@ static void check_against_formula(const problem *a, const answer *r) {
   formula(a, exact[0], exact[1], exact[2], exact[3]);
   formula_float(a, plain[0], plain[1], plain[2], plain[3]);
   for (int i = 0; i < RESULTS; i++) {
-    compare(names[i], r->of[i], exact[i], plain[i], a->sizes[i]);
+    check_accuracy(names[i], r->of[i], exact[i], plain[i], a->sizes[i]);
     free(exact[i]);
     FREE(plain[i]);
   }

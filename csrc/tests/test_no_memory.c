@@ -8,7 +8,7 @@
 #include <limits.h>
 #include <stdatomic.h>
 
-#include "check.h"
+#include "problems.h"
 
 /* ---- allocations that fail ---- */
 
@@ -134,25 +134,17 @@ static outcome sample(const ast_kernels *kernels, int64_t extent) {
 static outcome sample_narrow(const ast_kernels *kernels) { return sample(kernels, 1 << 12); }
 static outcome sample_wide(const ast_kernels *kernels) { return sample(kernels, 1 << 20); }
 
-enum { CELLS = 300, PAIR_GROUPS = 27, C_IN = 70, C_OUT = 20 };
-
-/* In group k the pairs (q + k, q). */
-static ast_pairs diagonal_pairs(void) {
-  int64_t *offsets = new_ints(PAIR_GROUPS + 1), *source = new_ints(PAIR_GROUPS * CELLS), *destination = new_ints(PAIR_GROUPS * CELLS);
-  for (int64_t k = 0; k <= PAIR_GROUPS; k++) offsets[k] = k * CELLS;
-  for (int64_t i = 0; i < PAIR_GROUPS * CELLS; i++) destination[i] = i % CELLS, source[i] = (i % CELLS + i / CELLS) % CELLS;
-  return (ast_pairs){offsets, source, destination};
-}
+enum { CELLS = 300, C_IN = 70, C_OUT = 20 };
 
 static outcome sparse_conv(const ast_kernels *kernels) {
-  const ast_pairs pairs = diagonal_pairs();
-  float *x = random_floats(CELLS * C_IN), *weight = random_floats(PAIR_GROUPS * C_IN * C_OUT), *out = new_floats(CELLS * C_OUT);
+  const ast_pairs pairs = random_pairs(CELLS, CELLS, 1, 1);
+  float *x = random_floats(CELLS * C_IN), *weight = random_floats(OFFSETS * C_IN * C_OUT), *out = new_floats(CELLS * C_OUT);
   return FINISH(KERNEL(kernels->sparse_conv(x, weight, NULL, C_IN, C_OUT, false, pairs, CELLS, out)), out);
 }
 
 static outcome sparse_conv_weight(const ast_kernels *kernels) {
-  const ast_pairs pairs = diagonal_pairs();
-  float *x = random_floats(CELLS * C_IN), *dout = random_floats(CELLS * C_OUT), *dweight = new_floats(PAIR_GROUPS * C_IN * C_OUT);
+  const ast_pairs pairs = random_pairs(CELLS, CELLS, 1, 1);
+  float *x = random_floats(CELLS * C_IN), *dout = random_floats(CELLS * C_OUT), *dweight = new_floats(OFFSETS * C_IN * C_OUT);
   return FINISH(KERNEL(kernels->sparse_conv_weight(x, dout, C_IN, C_OUT, pairs, dweight)), dweight);
 }
 
@@ -189,48 +181,19 @@ static outcome attention_backward(const ast_kernels *kernels) {
   return FINISH(KERNEL(kernels->attention_backward(&s, q, k, v, out, maximum, sum, dout, dq, dk, dv)), dq, dk, dv);
 }
 
-/* Every sender sends two edges on, every second receiver gets four. */
-static ast_message message_case(void) {
-  enum { M = 6000, S = 3000, R = 3000, E = 3, HIDDEN = 16, F = 24, F2 = 20 };
-  int64_t *senders = new_ints(M), *receivers = new_ints(M), *offsets = new_ints(R + 1);
-  for (int64_t m = 0; m < M; m++) senders[m] = (7 * m) % S, receivers[m] = m / 4 * 2;
-  for (int64_t r = 0; r <= R; r++) offsets[r] = (r + 1) / 2 * 4;
-  return (ast_message){
-      .M = M,
-      .S = S,
-      .R = R,
-      .E = E,
-      .H = HIDDEN,
-      .F = F,
-      .F2 = F2,
-      .senders = senders,
-      .receivers = receivers,
-      .receiver_offsets = offsets,
-      .of_senders = random_floats(S * F),
-      .of_receivers = random_floats(R * F),
-      .edge_features = random_floats(M * E),
-      .A1 = random_floats(HIDDEN * E),
-      .a1 = random_floats(HIDDEN),
-      .A2 = random_floats(F * HIDDEN),
-      .W2 = random_floats(F2 * F),
-      .b2 = random_floats(F2),
-      .gamma = random_floats(F2),
-      .beta = random_floats(F2),
-  };
-}
+static ast_message message_case(void) { return new_message(6000, 3000, 3000, 3, 16, 24, 20, 1); }
 
 static outcome message(const ast_kernels *kernels) {
   const ast_message s = message_case();
-  float *sum = new_floats(s.R * s.F2), *messages = new_floats(s.M * s.F2);
-  return FINISH(KERNEL(kernels->message(&s, sum, messages)), sum, messages);
+  const message_results r = new_message_results(&s);
+  return FINISH(KERNEL(kernels->message(&s, r.of[SUM], r.of[MESSAGES])), r.of[SUM], r.of[MESSAGES]);
 }
 
 static outcome message_backward(const ast_kernels *kernels) {
   const ast_message s = message_case();
   const float *dsum = random_floats(s.R * s.F2), *dmessages = random_floats(s.M * s.F2);
-  const ast_message_gradients out = {new_floats(s.S * s.F), new_floats(s.R * s.F), new_floats(s.M * s.E),  new_floats(s.H * s.E),
-                                     new_floats(s.H),       new_floats(s.F * s.H), new_floats(s.F2 * s.F), new_floats(s.F2),
-                                     new_floats(s.F2),      new_floats(s.F2)};
+  const message_results r = new_message_results(&s);
+  const ast_message_gradients out = gradients_of(&r);
   const void *outputs[sizeof out / sizeof(void *)];
   memcpy(outputs, &out, sizeof out);
   return finish(KERNEL(kernels->message_backward(&s, dsum, dmessages, &out)), outputs, sizeof out / sizeof(void *));

@@ -2,109 +2,60 @@
  *
  * Accuracy: the largest error is at most twice that of the same loops in float plus 1e-6 of the largest value.
  */
-#include "check.h"
+#include "problems.h"
 
-enum { OFFSETS = 27 };
-
-typedef struct {
-  int64_t sources, destinations, offsets[OFFSETS + 1];
-  int64_t *source, *destination;
-} pair_list;
-
-/* The pairs of a list as they are handed to a kernel: in buffers of just their size. */
-static ast_pairs exact_pairs(const pair_list *p) {
-  const int64_t n = p->offsets[OFFSETS];
-  const ast_pairs pairs = {copy_ints(p->offsets, OFFSETS + 1), copy_ints(p->source, n), copy_ints(p->destination, n)};
-  READ_ONLY(pairs.offsets, pairs.source, pairs.destination);
-  return pairs;
-}
-
-/* A destination has a pair in a group with the given probability; its source is any row of the same part of the rows, of
- * which there are `parts` (the scenes of a batch). */
-static pair_list new_pairs(int64_t sources, int64_t destinations, double density, int64_t parts) {
-  pair_list p = {.sources = sources, .destinations = destinations};
-  p.source = malloc((size_t)(OFFSETS * destinations + 1) * sizeof(int64_t));
-  p.destination = malloc((size_t)(OFFSETS * destinations + 1) * sizeof(int64_t));
-  CHECK(p.source && p.destination, "no memory");
-  int64_t n = 0;
-  for (int k = 0; k < OFFSETS; k++) {
-    for (int64_t d = 0; d < destinations; d++) {
-      if (sources < parts || random_unit() >= density || k == 5) continue; /* group 5 is empty */
-      const int64_t part = d * parts / destinations, first = part * sources / parts, last = (part + 1) * sources / parts;
-      p.source[n] = first + (int64_t)(random_bits() % (uint64_t)(last - first));
-      p.destination[n++] = d;
-    }
-    p.offsets[k + 1] = n;
-  }
-  return p;
-}
-
-static float *convolve(const ast_kernels *kernels, const pair_list *p, const float *x, const float *weight, const float *bias, int64_t C_in,
-                       int64_t C_out, bool transposed) {
-  float *out = new_floats(p->destinations * C_out);
-  const ast_pairs pairs = exact_pairs(p);
-  READ_ONLY(x, weight);
-  CHECK(kernels->sparse_conv(x, weight, bias, C_in, C_out, transposed, pairs, p->destinations, out) == AST_OK, "status");
-  WRITABLE(x, weight);
-  FREE(pairs.offsets, pairs.source, pairs.destination);
+/* sparse_conv on `destinations` rows, and its weight gradient. */
+static float *convolve(const ast_kernels *kernels, const ast_pairs *p, int64_t destinations, const float *x, const float *weight,
+                       const float *bias, int64_t C_in, int64_t C_out, bool transposed) {
+  float *out = new_floats(destinations * C_out);
+  READ_ONLY(PAIR_BUFFERS(p), x, weight, bias);
+  CHECK(kernels->sparse_conv(x, weight, bias, C_in, C_out, transposed, *p, destinations, out) == AST_OK, "status");
+  WRITABLE(PAIR_BUFFERS(p), x, weight, bias);
   return out;
 }
 
-static float *weight_gradient(const ast_kernels *kernels, const pair_list *p, const float *x, const float *dout, int64_t C_in,
+static float *weight_gradient(const ast_kernels *kernels, const ast_pairs *p, const float *x, const float *dout, int64_t C_in,
                               int64_t C_out) {
   float *dweight = new_floats(OFFSETS * C_in * C_out);
-  const ast_pairs pairs = exact_pairs(p);
-  READ_ONLY(x, dout);
-  CHECK(kernels->sparse_conv_weight(x, dout, C_in, C_out, pairs, dweight) == AST_OK, "status");
-  WRITABLE(x, dout);
-  FREE(pairs.offsets, pairs.source, pairs.destination);
+  READ_ONLY(PAIR_BUFFERS(p), x, dout);
+  CHECK(kernels->sparse_conv_weight(x, dout, C_in, C_out, *p, dweight) == AST_OK, "status");
+  WRITABLE(PAIR_BUFFERS(p), x, dout);
   return dweight;
 }
 
-#define FORMULA(name, real)                                                                                                     \
-  static void name(const pair_list *p, const float *x, const float *weight, const float *bias, const float *dout, int64_t C_in, \
-                   int64_t C_out, bool transposed, real *out, real *dweight) {                                                  \
-    for (int64_t i = 0; bias && i < p->destinations * C_out; i++) out[i] = (real)bias[i % C_out];                               \
-    for (int64_t k = 0; k < OFFSETS; k++)                                                                                       \
-      for (int64_t i = p->offsets[k]; i < p->offsets[k + 1]; i++)                                                               \
-        for (int64_t a = 0; a < C_in; a++)                                                                                      \
-          for (int64_t b = 0; b < C_out; b++) {                                                                                 \
-            const real w = (real)weight[k * C_in * C_out + (transposed ? b * C_in + a : a * C_out + b)];                        \
-            const real x_pa = (real)x[p->source[i] * C_in + a];                                                                 \
-            out[p->destination[i] * C_out + b] += x_pa * w;                                                                     \
-            dweight[(k * C_in + a) * C_out + b] += x_pa * (real)dout[p->destination[i] * C_out + b];                            \
-          }                                                                                                                     \
+#define FORMULA(name, real)                                                                                                             \
+  static void name(const ast_pairs *p, int64_t destinations, const float *x, const float *weight, const float *bias, const float *dout, \
+                   int64_t C_in, int64_t C_out, bool transposed, real *out, real *dweight) {                                            \
+    for (int64_t i = 0; bias && i < destinations * C_out; i++) out[i] = (real)bias[i % C_out];                                          \
+    for (int64_t k = 0; k < OFFSETS; k++)                                                                                               \
+      for (int64_t i = p->offsets[k]; i < p->offsets[k + 1]; i++)                                                                       \
+        for (int64_t a = 0; a < C_in; a++)                                                                                              \
+          for (int64_t b = 0; b < C_out; b++) {                                                                                         \
+            const real w = (real)weight[k * C_in * C_out + (transposed ? b * C_in + a : a * C_out + b)];                                \
+            const real x_pa = (real)x[p->source[i] * C_in + a];                                                                         \
+            out[p->destination[i] * C_out + b] += x_pa * w;                                                                             \
+            dweight[(k * C_in + a) * C_out + b] += x_pa * (real)dout[p->destination[i] * C_out + b];                                    \
+          }                                                                                                                             \
   }
 FORMULA(formula, double)
 FORMULA(formula_float, float)
 
-static void compare(const char *what, const float *got, const double *exact, const float *plain, int64_t n) {
-  double error = 0, plain_error = 0, largest = 0;
-  for (int64_t i = 0; i < n; i++) {
-    CHECK(isfinite(got[i]), "%s[%lld] is %g", what, (long long)i, (double)got[i]);
-    error = fmax(error, fabs((double)got[i] - exact[i]));
-    plain_error = fmax(plain_error, fabs((double)plain[i] - exact[i]));
-    largest = fmax(largest, fabs(exact[i]));
-  }
-  CHECK(error <= 2 * plain_error + 1e-6 * largest, "%s is off by %g of %g, plain float by %g", what, error, largest, plain_error);
-}
-
 static void check_case(const ast_kernels *kernels, int64_t sources, int64_t destinations, int64_t C_in, int64_t C_out, bool transposed) {
-  pair_list p = new_pairs(sources, destinations, 0.2, 1);
+  const ast_pairs p = random_pairs(sources, destinations, 0.2, 1);
   const int64_t n = destinations * C_out, m = OFFSETS * C_in * C_out;
   float *x = random_floats(sources * C_in), *weight = random_floats(m), *dout = random_floats(n), *bias = random_floats(C_out);
   const float *used = (C_in + destinations) % 2 ? bias : NULL;
   double *exact = calloc((size_t)(n + m + 1), sizeof *exact);
   float *plain = calloc((size_t)(n + m + 1), sizeof *plain);
   CHECK(exact && plain, "no memory");
-  formula(&p, x, weight, used, dout, C_in, C_out, transposed, exact, exact + n);
-  formula_float(&p, x, weight, used, dout, C_in, C_out, transposed, plain, plain + n);
-  float *out = convolve(kernels, &p, x, weight, used, C_in, C_out, transposed);
+  formula(&p, destinations, x, weight, used, dout, C_in, C_out, transposed, exact, exact + n);
+  formula_float(&p, destinations, x, weight, used, dout, C_in, C_out, transposed, plain, plain + n);
+  float *out = convolve(kernels, &p, destinations, x, weight, used, C_in, C_out, transposed);
   float *dweight = weight_gradient(kernels, &p, x, dout, C_in, C_out);
-  compare("out", out, exact, plain, n);
-  compare("dweight", dweight, exact + n, plain + n, m);
-  free(p.source), free(p.destination), free(exact), free(plain);
-  FREE(x, weight, bias, dout, out, dweight);
+  check_accuracy("out", out, exact, plain, n);
+  check_accuracy("dweight", dweight, exact + n, plain + n, m);
+  free(exact), free(plain);
+  FREE(PAIR_BUFFERS(&p), x, weight, bias, dout, out, dweight);
 }
 
 static void test_accuracy(const ast_kernels *kernels) {
@@ -119,67 +70,59 @@ static void test_accuracy(const ast_kernels *kernels) {
 /* The transposed form is the adjoint: <conv(x), y> = <x, conv'(y)>, with the pairs of conv' sorted by the other end. */
 static void test_adjoint(const ast_kernels *kernels) {
   const int64_t C_in = 24, C_out = 40, n = 200;
-  pair_list p = new_pairs(n, n, 0, 1), q = new_pairs(n, n, 0, 1);
-  int64_t num = 0;
+  int64_t *low = new_ints(OFFSETS * n), *high = new_ints(OFFSETS * n), offsets[OFFSETS + 1] = {0}, num = 0;
   for (int k = 0; k < OFFSETS; k++) { /* destination = source + k */
-    for (int64_t i = 0; i + k < n; i++, num++) {
-      p.source[num] = q.destination[num] = i;
-      p.destination[num] = q.source[num] = i + k;
-    }
-    p.offsets[k + 1] = q.offsets[k + 1] = num;
+    for (int64_t i = 0; i + k < n; i++, num++) low[num] = i, high[num] = i + k;
+    offsets[k + 1] = num;
   }
+  const ast_pairs p = copy_pairs(offsets, low, high), q = copy_pairs(offsets, high, low);
   float *x = random_floats(n * C_in), *y = random_floats(n * C_out), *weight = random_floats(OFFSETS * C_in * C_out);
-  float *out = convolve(kernels, &p, x, weight, NULL, C_in, C_out, false);
-  float *back = convolve(kernels, &q, y, weight, NULL, C_out, C_in, true);
+  float *out = convolve(kernels, &p, n, x, weight, NULL, C_in, C_out, false);
+  float *back = convolve(kernels, &q, n, y, weight, NULL, C_out, C_in, true);
   double left = 0, right = 0, magnitude = 0;
   for (int64_t i = 0; i < n * C_out; i++) left += (double)out[i] * (double)y[i], magnitude += fabs((double)out[i] * (double)y[i]);
   for (int64_t i = 0; i < n * C_in; i++) right += (double)x[i] * (double)back[i];
   CHECK(fabs(left - right) <= 1e-6 * magnitude, "%.9g and %.9g", left, right);
-  free(p.source), free(p.destination), free(q.source), free(q.destination);
-  FREE(x, y, weight, out, back);
+  FREE(low, high, PAIR_BUFFERS(&p), PAIR_BUFFERS(&q), x, y, weight, out, back);
 }
 
 /* A scene alone gives the bits that it gives in a batch, and a NaN in another scene does not reach it. */
 static void test_batch(const ast_kernels *kernels) {
   const int64_t C_in = 20, C_out = 36, sources = 900, destinations = 16000;
-  pair_list both = new_pairs(sources, destinations, 0.1, 2), one = {.sources = sources / 2, .destinations = destinations / 2};
-  one.source = malloc((size_t)both.offsets[OFFSETS] * sizeof(int64_t)),
-  one.destination = malloc((size_t)both.offsets[OFFSETS] * sizeof(int64_t));
-  CHECK(one.source && one.destination, "no memory");
-  int64_t n = 0;
+  const ast_pairs both = random_pairs(sources, destinations, 0.1, 2);
+  int64_t *source = new_ints(both.offsets[OFFSETS]), *destination = new_ints(both.offsets[OFFSETS]), offsets[OFFSETS + 1] = {0}, n = 0;
   for (int k = 0; k < OFFSETS; k++) {
     for (int64_t i = both.offsets[k]; i < both.offsets[k + 1]; i++)
-      if (both.destination[i] >= one.destinations) {
-        one.source[n] = both.source[i] - one.sources;
-        one.destination[n++] = both.destination[i] - one.destinations;
+      if (both.destination[i] >= destinations / 2) {
+        source[n] = both.source[i] - sources / 2;
+        destination[n++] = both.destination[i] - destinations / 2;
       }
-    one.offsets[k + 1] = n;
+    offsets[k + 1] = n;
   }
+  const ast_pairs one = copy_pairs(offsets, source, destination);
   float *x = random_floats(sources * C_in), *weight = random_floats(OFFSETS * C_in * C_out);
-  for (int64_t i = 0; i < one.sources * C_in; i += 7) x[i] = NAN;
-  float *batch = convolve(kernels, &both, x, weight, NULL, C_in, C_out, false);
-  float *alone = convolve(kernels, &one, x + one.sources * C_in, weight, NULL, C_in, C_out, false);
-  for (int64_t i = 0; i < one.destinations * C_out; i++) CHECK(isfinite(alone[i]), "out[%lld]", (long long)i);
-  CHECK(!memcmp(alone, batch + one.destinations * C_out, (size_t)(one.destinations * C_out) * sizeof *alone), "not the same bits");
-  free(both.source), free(both.destination), free(one.source), free(one.destination);
-  FREE(x, weight, batch, alone);
+  for (int64_t i = 0; i < sources / 2 * C_in; i += 7) x[i] = NAN;
+  float *batch = convolve(kernels, &both, destinations, x, weight, NULL, C_in, C_out, false);
+  float *alone = convolve(kernels, &one, destinations / 2, x + sources / 2 * C_in, weight, NULL, C_in, C_out, false);
+  for (int64_t i = 0; i < destinations / 2 * C_out; i++) CHECK(isfinite(alone[i]), "out[%lld]", (long long)i);
+  CHECK(!memcmp(alone, batch + destinations / 2 * C_out, (size_t)(destinations / 2 * C_out) * sizeof *alone), "not the same bits");
+  FREE(PAIR_BUFFERS(&both), PAIR_BUFFERS(&one), source, destination, x, weight, batch, alone);
 }
 
 /* The pool that this run is on gives what the calling thread alone gives. */
 static void test_threads(const ast_kernels *kernels) {
   const int64_t C_in = 70, C_out = 32, n = 20000;
-  pair_list p = new_pairs(n, n, 0.5, 1);
+  const ast_pairs p = random_pairs(n, n, 0.5, 1);
   float *x = random_floats(n * C_in), *dout = random_floats(n * C_out), *weight = random_floats(OFFSETS * C_in * C_out), *out[2],
         *dweight[2];
   for (int i = 0; i < 2; i++) {
     if (i) ast_set_pool(NULL, NULL);
-    out[i] = convolve(kernels, &p, x, weight, NULL, C_in, C_out, false);
+    out[i] = convolve(kernels, &p, n, x, weight, NULL, C_in, C_out, false);
     dweight[i] = weight_gradient(kernels, &p, x, dout, C_in, C_out);
   }
   CHECK(!memcmp(out[0], out[1], (size_t)(n * C_out) * sizeof(float)), "threads change the result");
   CHECK(!memcmp(dweight[0], dweight[1], (size_t)(OFFSETS * C_in * C_out) * sizeof(float)), "threads change the weight gradient");
-  free(p.source), free(p.destination);
-  FREE(x, dout, weight, out[0], out[1], dweight[0], dweight[1]);
+  FREE(PAIR_BUFFERS(&p), x, dout, weight, out[0], out[1], dweight[0], dweight[1]);
 }
 
 static void test(const ast_kernels *kernels) {

@@ -1,0 +1,117 @@
+/* Problems that more than one C test poses, in buffers of just their size. */
+#ifndef AST_PROBLEMS_H
+#define AST_PROBLEMS_H
+
+#include "check.h"
+
+/* ---- the pairs of a sparse convolution ---- */
+
+enum { OFFSETS = 27 };
+
+/* Pairs in buffers of just their size. */
+static ast_pairs copy_pairs(const int64_t *offsets, const int64_t *source, const int64_t *destination) {
+  const int64_t n = offsets[OFFSETS];
+  return (ast_pairs){copy_ints(offsets, OFFSETS + 1), copy_ints(source, n), copy_ints(destination, n)};
+}
+#define PAIR_BUFFERS(p) (p)->offsets, (p)->source, (p)->destination
+
+/* A destination has a pair in a group with the given probability; its source is any row of the same part of the rows, of
+ * which there are `parts` (the scenes of a batch). */
+static ast_pairs random_pairs(int64_t sources, int64_t destinations, double density, int64_t parts) {
+  int64_t *source = malloc((size_t)(OFFSETS * destinations + 1) * sizeof *source), offsets[OFFSETS + 1] = {0}, n = 0;
+  int64_t *destination = malloc((size_t)(OFFSETS * destinations + 1) * sizeof *destination);
+  CHECK(source && destination, "no memory");
+  for (int k = 0; k < OFFSETS; k++) {
+    for (int64_t d = 0; d < destinations; d++) {
+      if (sources < parts || random_unit() >= density || k == 5) continue; /* group 5 is empty */
+      const int64_t part = d * parts / destinations, first = part * sources / parts, last = (part + 1) * sources / parts;
+      source[n] = first + (int64_t)(random_bits() % (uint64_t)(last - first));
+      destination[n++] = d;
+    }
+    offsets[k + 1] = n;
+  }
+  const ast_pairs pairs = copy_pairs(offsets, source, destination);
+  free(source), free(destination);
+  return pairs;
+}
+
+/* ---- message passing ---- */
+
+/* M edges whose ends lie in the same of `parts` parts of S senders and R receivers (the scenes of a batch), and random weights. */
+static ast_message new_message(int64_t M, int64_t S, int64_t R, int64_t E, int64_t H, int64_t F, int64_t F2, int64_t parts) {
+  int64_t *senders = new_ints(M), *receivers = new_ints(M), *offsets = new_ints(R + 1);
+  memset(offsets, 0, (size_t)(R + 1) * sizeof *offsets);
+  for (int64_t m = 0; m < M; m++) offsets[m * R / M + 1]++; /* about the same number each, */
+  for (int64_t r = 1; R > 5 && r < R; r += 5) {             /* but every fifth gives its edges to the one before */
+    offsets[r] += offsets[r + 1];
+    offsets[r + 1] = 0;
+  }
+  for (int64_t r = 0; r < R; r++) offsets[r + 1] += offsets[r];
+  for (int64_t r = 0; r < R; r++)
+    for (int64_t m = offsets[r]; m < offsets[r + 1]; m++) {
+      const int64_t part = r * parts / R, first = part * S / parts, last = (part + 1) * S / parts;
+      receivers[m] = r;
+      senders[m] = first + (int64_t)(random_bits() % (uint64_t)(last - first));
+    }
+  return (ast_message){
+      .M = M,
+      .S = S,
+      .R = R,
+      .E = E,
+      .H = H,
+      .F = F,
+      .F2 = F2,
+      .senders = senders,
+      .receivers = receivers,
+      .receiver_offsets = offsets,
+      .of_senders = random_floats(S * F),
+      .of_receivers = random_floats(R * F),
+      .edge_features = random_floats(M * E),
+      .A1 = random_floats(H * E),
+      .a1 = random_floats(H),
+      .A2 = scaled_floats(F * H, 0.3f),
+      .W2 = scaled_floats(F2 * F, 0.3f),
+      .b2 = random_floats(F2),
+      .gamma = random_floats(F2),
+      .beta = random_floats(F2),
+  };
+}
+
+#define MESSAGE_BUFFERS(s)                                                                                                                \
+  (s)->senders, (s)->receivers, (s)->receiver_offsets, (s)->of_senders, (s)->of_receivers, (s)->edge_features, (s)->A1, (s)->a1, (s)->A2, \
+      (s)->W2, (s)->b2, (s)->gamma, (s)->beta
+
+/* What message gives, and the ten gradients of message_backward. */
+enum { MESSAGE_RESULTS = 12, SUM = 0, MESSAGES, P, Q, EDGES, A1, B1, A2, W2, B2, GAMMA, BETA };
+
+typedef struct {
+  int64_t size[MESSAGE_RESULTS];
+  float *of[MESSAGE_RESULTS];
+} message_results;
+
+static message_results new_message_results(const ast_message *s) {
+  message_results r = {.size = {s->R * s->F2, s->M * s->F2, s->S * s->F, s->R * s->F, s->M * s->E, s->H * s->E, s->H, s->F * s->H,
+                                s->F2 * s->F, s->F2, s->F2, s->F2}};
+  for (int i = 0; i < MESSAGE_RESULTS; i++) r.of[i] = new_floats(r.size[i]);
+  return r;
+}
+static ast_message_gradients gradients_of(const message_results *r) {
+  float *const *of = r->of;
+  return (ast_message_gradients){of[P], of[Q], of[EDGES], of[A1], of[B1], of[A2], of[W2], of[B2], of[GAMMA], of[BETA]};
+}
+static void free_message_results(message_results r) {
+  for (int i = 0; i < MESSAGE_RESULTS; i++) FREE(r.of[i]);
+}
+
+/* Both directions. */
+static message_results solve_message(const ast_kernels *kernels, const ast_message *s, const float *dsum, const float *dmessages) {
+  const message_results r = new_message_results(s);
+  const ast_message_gradients gradients = gradients_of(&r);
+  READ_ONLY(MESSAGE_BUFFERS(s), dsum, dmessages);
+  CHECK(kernels->message(s, r.of[SUM], r.of[MESSAGES]) == AST_OK, "status");
+  CHECK(kernels->message_backward(s, dsum, dmessages, &gradients) == AST_OK, "status");
+  WRITABLE(MESSAGE_BUFFERS(s), dsum, dmessages);
+  return r;
+}
+
+#endif
