@@ -92,8 +92,7 @@ AST_INLINE void gemm_pack_columns(const float *b, int64_t row, int64_t column, i
   }
   for (int64_t k = 0; k < K; k++) {
     float *out = panel + k * GEMM_COLUMNS;
-    memcpy(out, b + k * row, (size_t)N * sizeof *out);
-    for (int64_t j = N; j < width; j++) out[j] = 0;
+    for (int64_t j = 0; j < width; j += VW) vstore(out + j, vload_upto(b + k * row + j, N - j));
   }
 }
 

@@ -17,59 +17,66 @@
 #include "gemm.h"
 #include "simd.h"
 
-/* ---- forward ---- */
+/* ---- a product of all rows ---- */
 
 typedef struct {
-  const ast_linear *s;
-  const float *x, *residual;
-  float *out, *z;
   dense_layer layer;
-  int64_t rows, panels; /* of a task */
-  int64_t groups;       /* of panels */
-} linear_job;
+  const float *a; /* [M,K], */
+  int64_t a_row, M;
+  dense_end end;                /* of all rows */
+  int64_t rows, groups, panels; /* of a task; groups of panels; panels of a group */
+} linear_product;
+
+static bool linear_is_small(const ast_linear *s) { return (double)s->M * (double)s->I * (double)s->O < 3e5; }
+
+/* Tasks of a layer that is too small to wake other threads run on this one. */
+static ast_status linear_run(const ast_linear *s, int64_t tasks, ast_task task, void *job) {
+  ast_status status = AST_OK;
+  if (!linear_is_small(s)) return ast_parallel(tasks, task, job);
+  for (int64_t i = 0; i < tasks && status == AST_OK; i++) status = task(i, job);
+  return status;
+}
+
+/* The number of tasks: enough for some threads where there are few rows, whole rows where there are many. */
+static int64_t linear_cut(linear_product *p, bool small) {
+  const int64_t M = p->M, panels = dense_panels(&p->layer);
+  p->rows = small ? M : M >= 64 * DENSE_ROWS ? 4 * DENSE_ROWS : M > DENSE_ROWS ? DENSE_ROWS : round_up((M + 1) / 2, GEMM_ROWS);
+  p->rows = max64(1, p->rows);
+  p->groups = small ? 1 : max64(1, min64(panels, 16 * p->rows / max64(1, M)));
+  p->panels = (panels + p->groups - 1) / p->groups;
+  return (M + p->rows - 1) / p->rows * p->groups;
+}
+
+static ast_status linear_product_task(int64_t index, void *context) {
+  const linear_product *p = context;
+  const dense_layer *l = &p->layer;
+  const int64_t first = index / p->groups * p->rows, last = min64(p->M, first + p->rows);
+  const int64_t first_panel = index % p->groups * p->panels, last_panel = min64(dense_panels(l), first_panel + p->panels);
+  for (int64_t i = first; i < last; i += DENSE_ROWS) {
+    dense_end end = p->end;
+    end.out += i * end.out_row;
+    if (end.residual) end.residual += i * end.residual_row;
+    if (end.z) end.z += i * (l->paired ? 2 * l->N : l->N);
+    end.next[0] = dense_rows_from(p->a, p->a_row, l->K, i + DENSE_ROWS, p->M);
+    dense_rows(l, first_panel, last_panel, min64(DENSE_ROWS, last - i), (gemm_a){p->a + i * p->a_row, p->a_row, 1}, end);
+  }
+  return AST_OK;
+}
+
+/* ---- forward ---- */
 
 static dense_layer linear_layer(const ast_linear *s, const float *weight, const float *bias, bool paired) {
   return (dense_layer){
       .weight = weight, .row = 1, .column = s->I, .bias = bias, .K = s->I, .N = paired ? s->O / 2 : s->O, .paired = paired};
 }
 
-/* Enough tasks for some threads where there are few rows, whole rows where there are many. */
-static void linear_cut(linear_job *job) {
-  const int64_t M = job->s->M, panels = dense_panels(&job->layer);
-  const bool small = (double)M * (double)job->s->I * (double)job->s->O < 3e5;
-  job->rows = small ? M : M >= 64 * DENSE_ROWS ? 4 * DENSE_ROWS : M > DENSE_ROWS ? DENSE_ROWS : round_up((M + 1) / 2, GEMM_ROWS);
-  job->rows = max64(1, job->rows);
-  job->groups = small ? 1 : max64(1, min64(panels, 16 * job->rows / max64(1, M)));
-  job->panels = (panels + job->groups - 1) / job->groups;
-}
-
-static ast_status linear_task(int64_t index, void *context) {
-  const linear_job *job = context;
-  const ast_linear *s = job->s;
-  const int64_t first = index / job->groups * job->rows, last = min64(s->M, first + job->rows);
-  const int64_t first_panel = index % job->groups * job->panels, last_panel = min64(dense_panels(&job->layer), first_panel + job->panels);
-  const int64_t N = job->layer.N;
-  for (int64_t i = first; i < last; i += DENSE_ROWS) {
-    const dense_end end = {.activation = s->activation,
-                           .out = job->out + i * N,
-                           .out_row = N,
-                           .residual = job->residual ? job->residual + i * s->residual_stride : NULL,
-                           .residual_row = s->residual_stride,
-                           .z = job->z ? job->z + i * s->O : NULL,
-                           .next = {dense_rows_from(job->x, s->x_stride, s->I, i + DENSE_ROWS, s->M)}};
-    dense_rows(&job->layer, first_panel, last_panel, min64(DENSE_ROWS, last - i), (gemm_a){job->x + i * s->x_stride, s->x_stride, 1}, end);
-  }
-  return AST_OK;
-}
-
 static ast_status linear(const ast_linear *s, const float *restrict x, const float *restrict weight, const float *restrict bias,
                          const float *restrict residual, float *restrict out, float *restrict z) {
-  linear_job job = {.s = s, .x = x, .residual = residual, .out = out, .z = z};
-  job.layer = linear_layer(s, weight, bias, s->activation == AST_GEGLU);
-  const ast_status status = dense_pack(&job.layer, 1, 6);
-  if (status != AST_OK) return status;
-  linear_cut(&job);
-  return ast_parallel((s->M + job.rows - 1) / job.rows * job.groups, linear_task, &job);
+  linear_product p = {.layer = linear_layer(s, weight, bias, s->activation == AST_GEGLU), .a = x, .a_row = s->x_stride, .M = s->M};
+  p.end = (dense_end){
+      .activation = s->activation, .out = out, .out_row = p.layer.N, .residual = residual, .residual_row = s->residual_stride, .z = z};
+  const ast_status status = dense_pack(&p.layer, 1, 6);
+  return status == AST_OK ? linear_run(s, linear_cut(&p, linear_is_small(s)), linear_product_task, &p) : status;
 }
 
 /* ---- backward ---- */
@@ -83,7 +90,10 @@ typedef struct {
   int64_t dz_row, x_row, size; /* floats of a row of the copies; of the partial sums of a chunk: dW, then dbias */
   dense_chunks chunks;
   float *partials;
-  float *all_dz, *all_x; /* by tiles: copies of all rows */
+  float *all_dz, *all_x; /* by tiles: dz of all rows if it is not dout, and x if its rows do not end with a vector */
+  gemm_a tiles_dz, tiles_x;
+  int64_t tiles, across; /* all tiles; tiles beside each other */
+  linear_product product;
 } linear_backward_job;
 
 /* dz from z, of rows of dout with their columns whole or half */
@@ -104,21 +114,27 @@ static void linear_activation(const ast_linear *s, int64_t rows, const float *z,
     }
 }
 
-/* Rows from `first` on: dz and x as padded copies, dx, and the sum of dz added to dbias. */
-static void linear_backward_rows(const linear_backward_job *job, int64_t first, int64_t rows, float *dz, float *x, float *dbias) {
+/* dz of the rows from `first` on */
+static void linear_dz(const linear_backward_job *job, int64_t first, int64_t rows, float *dz) {
   const ast_linear *s = job->s;
-  const float *dout = job->dout + first * s->dout_stride, *x_rows = job->x + first * s->x_stride;
+  const float *dout = job->dout + first * s->dout_stride, *x = job->x + first * s->x_stride;
   if (s->activation == AST_IDENTITY) {
     dense_copy_rows(dout, s->dout_stride, rows, s->O, dz, job->dz_row);
   } else if (job->z) {
     linear_activation(s, rows, job->z + first * s->O, s->O, dout, dz, job->dz_row);
   } else {
     const dense_end end = {.out = dz, .out_row = job->dz_row};
-    dense_rows(&job->layers[0], 0, dense_panels(&job->layers[0]), rows, (gemm_a){x_rows, s->x_stride, 1}, end);
+    dense_rows(&job->layers[0], 0, dense_panels(&job->layers[0]), rows, (gemm_a){x, s->x_stride, 1}, end);
     linear_activation(s, rows, dz, job->dz_row, dout, dz, job->dz_row);
   }
+}
+
+/* Rows from `first` on: dz and x as padded copies, dx, and the sum of dz added to dbias. */
+static void linear_backward_rows(const linear_backward_job *job, int64_t first, int64_t rows, float *dz, float *x, float *dbias) {
+  const ast_linear *s = job->s;
+  linear_dz(job, first, rows, dz);
   if (job->dbias) dense_add_rows(dz, job->dz_row, rows, s->O, dbias);
-  if (job->dweight) dense_copy_rows(x_rows, s->x_stride, rows, s->I, x, job->x_row);
+  if (job->dweight) dense_copy_rows(job->x + first * s->x_stride, s->x_stride, rows, s->I, x, job->x_row);
   if (!job->dx) return;
   const dense_end end = {.out = job->dx + first * s->I,
                          .out_row = s->I,
@@ -160,41 +176,61 @@ enum { LINEAR_TILE_ROWS = 48, LINEAR_TILE_COLUMNS = 8 * GEMM_COLUMNS, LINEAR_TIL
 
 static ast_status linear_block_task(int64_t index, void *context) {
   const linear_backward_job *job = context;
-  const int64_t first = index * DENSE_ROWS, rows = min64(DENSE_ROWS, job->s->M - first), width = round_up(job->s->O, VW);
-  float *dbias = job->partials + index * width;
-  memset(dbias, 0, (size_t)width * sizeof *dbias);
-  linear_backward_rows(job, first, rows, job->all_dz + first * job->dz_row, job->all_x + first * job->x_row, dbias);
+  const ast_linear *s = job->s;
+  const int64_t first = index * DENSE_ROWS, rows = min64(DENSE_ROWS, s->M - first);
+  if (job->all_dz) linear_dz(job, first, rows, job->all_dz + first * job->dz_row);
+  if (job->all_x) dense_copy_rows(job->x + first * s->x_stride, s->x_stride, rows, s->I, job->all_x + first * job->x_row, job->x_row);
   return AST_OK;
 }
 
+/* A tile of dW, beside the first ones their part of dbias, or a part of dx. */
 static ast_status linear_tile_task(int64_t index, void *context) {
-  const linear_backward_job *job = context;
+  linear_backward_job *job = context;
   const ast_linear *s = job->s;
-  const int64_t across = (s->I + LINEAR_TILE_COLUMNS - 1) / LINEAR_TILE_COLUMNS;
-  const int64_t o = index / across * LINEAR_TILE_ROWS, k = index % across * LINEAR_TILE_COLUMNS;
+  if (index >= job->tiles) return linear_product_task(index - job->tiles, &job->product);
+  const int64_t o = index / job->across * LINEAR_TILE_ROWS, k = index % job->across * LINEAR_TILE_COLUMNS;
   const int64_t rows = min64(LINEAR_TILE_ROWS, s->O - o), columns = min64(LINEAR_TILE_COLUMNS, s->I - k), width = round_up(columns, VW);
+  const gemm_a dz = job->tiles_dz, x = job->tiles_x;
   float *tile = ast_scratch(5, LINEAR_TILE_ROWS * LINEAR_TILE_COLUMNS * (int64_t)sizeof *tile);
   if (!tile) return AST_NO_MEMORY;
-  for (int64_t i = 0; i < s->M; i += LINEAR_TILE_DEPTH)
-    gemm(rows, width, min64(LINEAR_TILE_DEPTH, s->M - i), (gemm_a){job->all_dz + i * job->dz_row + o, 1, job->dz_row},
-         gemm_rows(job->all_x + i * job->x_row + k, job->x_row), tile, width, i > 0);
-  for (int64_t i = 0; i < rows; i++) memcpy(job->dweight + (o + i) * s->I + k, tile + i * width, (size_t)columns * sizeof *tile);
+  if (job->dweight) {
+    float *to = width == columns ? job->dweight + o * s->I + k : tile;
+    const int64_t to_row = width == columns ? s->I : width;
+    for (int64_t i = 0; i < s->M; i += LINEAR_TILE_DEPTH)
+      gemm(rows, width, min64(LINEAR_TILE_DEPTH, s->M - i), (gemm_a){dz.data + i * dz.row + o, 1, dz.row},
+           gemm_rows(x.data + i * x.row + k, x.row), to, to_row, i > 0);
+    for (int64_t i = 0; to == tile && i < rows; i++)
+      memcpy(job->dweight + (o + i) * s->I + k, tile + i * width, (size_t)columns * sizeof *tile);
+  }
+  if (job->dbias && k == 0) {
+    float *sums = tile;
+    memset(sums, 0, (size_t)round_up(rows, VW) * sizeof *sums);
+    for (int64_t i = 0; i < s->M; i += DENSE_ROWS)
+      dense_add_rows(dz.data + i * dz.row + o, dz.row, min64(DENSE_ROWS, s->M - i), rows, sums);
+    memcpy(job->dbias + o, sums, (size_t)rows * sizeof *sums);
+  }
   return AST_OK;
 }
 
 static ast_status linear_by_tiles(linear_backward_job *job) {
   const ast_linear *s = job->s;
-  const int64_t blocks = (s->M + DENSE_ROWS - 1) / DENSE_ROWS, width = round_up(s->O, VW);
-  float *scratch = ast_scratch(7, (blocks * width + s->M * (job->dz_row + job->x_row)) * (int64_t)sizeof *scratch);
-  if (!scratch) return AST_NO_MEMORY;
-  job->partials = scratch;
-  job->all_dz = scratch + blocks * width;
-  job->all_x = job->all_dz + s->M * job->dz_row;
-  ast_status status = ast_parallel(blocks, linear_block_task, job);
-  const int64_t down = (s->O + LINEAR_TILE_ROWS - 1) / LINEAR_TILE_ROWS, across = (s->I + LINEAR_TILE_COLUMNS - 1) / LINEAR_TILE_COLUMNS;
-  if (status == AST_OK && job->dweight) status = ast_parallel(down * across, linear_tile_task, job);
-  const dense_sum sum = {job->dbias, 0, 1, s->O, width};
-  return status == AST_OK && job->dbias ? dense_add_partials((dense_sum_job){scratch, width, blocks, &sum, 1}) : status;
+  const bool new_dz = s->activation != AST_IDENTITY || s->O % VW, new_x = s->I % VW;
+  job->tiles_dz = (gemm_a){job->dout, s->dout_stride, 1};
+  job->tiles_x = (gemm_a){job->x, s->x_stride, 1};
+  if (new_dz || new_x) {
+    float *scratch = ast_scratch(7, s->M * (job->dz_row + job->x_row) * (int64_t)sizeof *scratch);
+    if (!scratch) return AST_NO_MEMORY;
+    if (new_dz) job->all_dz = scratch, job->tiles_dz = (gemm_a){scratch, job->dz_row, 1};
+    scratch += s->M * job->dz_row;
+    if (new_x) job->all_x = scratch, job->tiles_x = (gemm_a){scratch, job->x_row, 1};
+    const ast_status status = linear_run(s, (s->M + DENSE_ROWS - 1) / DENSE_ROWS, linear_block_task, job);
+    if (status != AST_OK) return status;
+  }
+  job->across = (s->I + LINEAR_TILE_COLUMNS - 1) / LINEAR_TILE_COLUMNS;
+  if (job->dweight || job->dbias) job->tiles = (s->O + LINEAR_TILE_ROWS - 1) / LINEAR_TILE_ROWS * job->across;
+  job->product = (linear_product){.layer = job->layers[1], .a = job->tiles_dz.data, .a_row = job->tiles_dz.row, .M = s->M};
+  job->product.end = (dense_end){.out = job->dx, .out_row = s->I};
+  return linear_run(s, job->tiles + (job->dx ? linear_cut(&job->product, linear_is_small(s)) : 0), linear_tile_task, job);
 }
 
 static ast_status linear_backward(const ast_linear *s, const float *restrict dout, const float *restrict x, const float *restrict weight,
