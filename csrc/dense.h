@@ -167,12 +167,7 @@ AST_INLINE void dense_tile(const int rows, const int vectors, const dense_layer 
   const int64_t j = p * dense_panel_width(l);
   const float *panel = l->panels + p * l->K * GEMM_COLUMNS, *bias = l->panels_bias + p * GEMM_COLUMNS;
   float sums[GEMM_ROWS * GEMM_COLUMNS] __attribute__((aligned(64)));
-#pragma GCC unroll 12
-  for (int i = 0; i < rows; i++) {
-    const float *line = e->out + (i0 + i) * e->out_row + j;
-    __builtin_prefetch(line, 1);
-    if (vectors == 2) __builtin_prefetch(line + VW, 1);
-  }
+  DENSE_EACH(i, v) __builtin_prefetch(e->out + (i0 + i) * e->out_row + j + v * VW, 1);
   vf sum[GEMM_ROWS][2];
   for (int64_t k = 0;;) { /* once without inputs, too: the sums are then 0 */
     DENSE_EACH(i, v) sum[i][v] = (vf){0};
@@ -215,6 +210,11 @@ AST_INLINE void dense_strip(const int vectors, const dense_layer *l, int64_t p, 
 #undef DENSE_STEP
 }
 
+/* M rows are cut evenly between register tiles: where task `index` of `tasks` begins. */
+AST_INLINE int64_t dense_begin(int64_t M, int64_t tasks, int64_t index) {
+  return min64(M, (M + GEMM_ROWS - 1) / GEMM_ROWS * index / tasks * GEMM_ROWS);
+}
+
 /* Panels first <= p < last of the layer on `rows` rows of A. */
 static void dense_rows(const dense_layer *l, int64_t first, int64_t last, int64_t rows, gemm_a a, dense_end e) {
   for (int64_t p = first; p < last; p++) {
@@ -251,7 +251,8 @@ typedef struct {
 
 static dense_chunks dense_cut(int64_t M, int64_t floats) {
   const int64_t most = min64(32, max64(2, DENSE_PARTIALS / max64(1, floats)));
-  const int64_t num = max64(1, min64(max64(M / 192, min64(2, M / 16)), most)), rows = (M + num - 1) / num;
+  const int64_t parts = M / 192 > 2 ? round_up(M / 192, 4) : min64(2, M / 16); /* even shares for 2 and for 4 threads */
+  const int64_t num = max64(1, min64(parts, most)), rows = (M + num - 1) / num;
   const int64_t blocks = (rows + DENSE_ROWS - 1) / DENSE_ROWS;
   return (dense_chunks){num, rows, blocks ? round_up((rows + blocks - 1) / blocks, GEMM_ROWS) : DENSE_ROWS};
 }

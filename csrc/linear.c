@@ -23,8 +23,8 @@ typedef struct {
   dense_layer layer;
   const float *a; /* [M,K], */
   int64_t a_row, M;
-  dense_end end;                /* of all rows */
-  int64_t rows, groups, panels; /* of a task; groups of panels; panels of a group */
+  dense_end end;          /* of all rows */
+  int64_t blocks, groups; /* of rows and of panels: a task each pair */
 } linear_product;
 
 static bool linear_is_small(const ast_linear *s) { return (double)s->M * (double)s->I * (double)s->O < 3e5; }
@@ -39,26 +39,25 @@ static ast_status linear_run(const ast_linear *s, int64_t tasks, ast_task task, 
 
 /* The number of tasks: enough for some threads where there are few rows, whole rows where there are many. */
 static int64_t linear_cut(linear_product *p, bool small) {
-  const int64_t M = p->M, panels = dense_panels(&p->layer);
-  p->rows = small ? M : M >= 64 * DENSE_ROWS ? 4 * DENSE_ROWS : M > DENSE_ROWS ? DENSE_ROWS : round_up((M + 1) / 2, GEMM_ROWS);
-  p->rows = max64(1, p->rows);
-  p->groups = small ? 1 : max64(1, min64(panels, 16 * p->rows / max64(1, M)));
-  p->panels = (panels + p->groups - 1) / p->groups;
-  return (M + p->rows - 1) / p->rows * p->groups;
+  const int64_t rows = p->M < 64 * DENSE_ROWS ? DENSE_ROWS : 4 * DENSE_ROWS, tiles = (p->M + GEMM_ROWS - 1) / GEMM_ROWS;
+  p->blocks = small ? min64(1, tiles) : min64(tiles, round_up((p->M + rows - 1) / rows, 2));
+  p->groups = small ? 1 : max64(1, min64(dense_panels(&p->layer), 24 / max64(1, p->blocks)));
+  return p->blocks * p->groups;
 }
 
 static ast_status linear_product_task(int64_t index, void *context) {
   const linear_product *p = context;
   const dense_layer *l = &p->layer;
-  const int64_t first = index / p->groups * p->rows, last = min64(p->M, first + p->rows);
-  const int64_t first_panel = index % p->groups * p->panels, last_panel = min64(dense_panels(l), first_panel + p->panels);
+  const int64_t block = index / p->groups, first = dense_begin(p->M, p->blocks, block), last = dense_begin(p->M, p->blocks, block + 1);
+  const int64_t group = index % p->groups, panels = dense_panels(l);
   for (int64_t i = first; i < last; i += DENSE_ROWS) {
     dense_end end = p->end;
     end.out += i * end.out_row;
     if (end.residual) end.residual += i * end.residual_row;
     if (end.z) end.z += i * (l->paired ? 2 * l->N : l->N);
     end.next[0] = dense_rows_from(p->a, p->a_row, l->K, i + DENSE_ROWS, p->M);
-    dense_rows(l, first_panel, last_panel, min64(DENSE_ROWS, last - i), (gemm_a){p->a + i * p->a_row, p->a_row, 1}, end);
+    dense_rows(l, panels * group / p->groups, panels * (group + 1) / p->groups, min64(DENSE_ROWS, last - i),
+               (gemm_a){p->a + i * p->a_row, p->a_row, 1}, end);
   }
   return AST_OK;
 }

@@ -57,7 +57,7 @@ typedef struct {
   float *out;
   ast_mlp_kept kept;
   dense_layer layers[2];
-  int64_t rows, input_row, hidden_row, y_row; /* rows of a task; floats from row to row of its blocks */
+  int64_t tasks, input_row, hidden_row, y_row; /* tasks; floats from row to row of a task's blocks */
 } mlp_job;
 
 /* out from y; `whole`, a constant, says that O is a multiple of VW, so that no vector asks for its tail */
@@ -83,11 +83,11 @@ AST_INLINE void mlp_norm_rows(const mlp_job *job, int64_t first, int64_t rows, f
 static ast_status mlp_task(int64_t index, void *context) {
   const mlp_job *job = context;
   const ast_mlp *s = job->s;
-  const int64_t last = min64(s->M, (index + 1) * job->rows);
+  const int64_t first_row = dense_begin(s->M, job->tasks, index), last = dense_begin(s->M, job->tasks, index + 1);
   float *input = ast_scratch(5, DENSE_ROWS * (job->input_row + job->hidden_row + job->y_row) * (int64_t)sizeof *input);
   float *block = input + DENSE_ROWS * job->input_row, *y = block + DENSE_ROWS * job->hidden_row;
   if (!input) return AST_NO_MEMORY;
-  for (int64_t i = index * job->rows; i < last; i += DENSE_ROWS) {
+  for (int64_t i = first_row; i < last; i += DENSE_ROWS) {
     const int64_t rows = min64(DENSE_ROWS, last - i), hidden_row = job->kept.hidden ? s->H : job->hidden_row;
     float *hidden = job->kept.hidden ? job->kept.hidden + i * s->H : block;
     gemm_a a = {s->x + i * s->x_stride, s->x_stride, 1};
@@ -121,12 +121,13 @@ static ast_status mlp(const ast_mlp *s, const float *restrict residual, float *r
   mlp_job job = {.s = s, .residual = residual, .out = out, .kept = kept};
   job.layers[0] = mlp_layer(s->weight1, s->bias1, s->I + s->I2, s->H);
   job.layers[1] = mlp_layer(s->weight2, s->bias2, s->H, s->O);
-  job.rows = s->M >= 64 * DENSE_ROWS ? 4 * DENSE_ROWS : min64(DENSE_ROWS, round_up(max64(s->M / 8, 2 * GEMM_ROWS), GEMM_ROWS));
+  const int64_t rows = s->M >= 64 * DENSE_ROWS ? 4 * DENSE_ROWS : min64(DENSE_ROWS, max64(s->M / 8, 2 * GEMM_ROWS));
+  job.tasks = min64((s->M + GEMM_ROWS - 1) / GEMM_ROWS, round_up((s->M + rows - 1) / rows, 2));
   job.input_row = s->beside ? round_up(s->I + s->I2, VW) + DENSE_APART : 0;
   job.hidden_row = round_up(s->H, VW) + DENSE_APART;
   job.y_row = round_up(s->O, VW) + DENSE_APART;
   const ast_status status = dense_pack(job.layers, 2, 6);
-  return status == AST_OK ? ast_parallel((s->M + job.rows - 1) / job.rows, mlp_task, &job) : status;
+  return status == AST_OK ? ast_parallel(job.tasks, mlp_task, &job) : status;
 }
 
 /* ---- backward ---- */
