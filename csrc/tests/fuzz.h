@@ -31,9 +31,8 @@ static uint64_t take_word(int bytes) {
 /* 0..most: any small number, or one at the edge of a block */
 static int64_t take_size(int64_t most) {
   static const int64_t edges[] = {15, 16, 17, 31, 32, 33, 63, 64, 65, 95, 96, 97, 127, 128, 129, 255, 256, 257, 300, 511, 512, 513, 600};
-  enum { EDGES = sizeof edges / sizeof *edges };
-  const uint8_t byte = take_byte();
-  const int64_t size = byte < 256 - EDGES ? byte % 40 : edges[byte - (256 - EDGES)];
+  const int num = sizeof edges / sizeof *edges, byte = take_byte();
+  const int64_t size = byte < 256 - num ? byte % 40 : edges[byte - (256 - num)];
   return size <= most ? size : size % (most + 1);
 }
 
@@ -83,6 +82,13 @@ static float *take_floats(int64_t n) {
   float *x = new_floats(n);
   take_values(x, n);
   return x;
+}
+
+/* The same rows of n floats, `stride` apart, with NaN between them. */
+static float *apart(const float *x, int64_t rows, int64_t n, int64_t stride) {
+  float *to = new_floats(rows ? (rows - 1) * stride + n : 0);
+  for (int64_t i = 0; i < rows * n; i++) to[i / n * stride + i % n] = x[i];
+  return to;
 }
 
 static bool all_finite(const float *x, int64_t n) {

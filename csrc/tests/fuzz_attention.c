@@ -1,4 +1,5 @@
-/* Fuzzes attention and its gradients: a scene alone gives the bits that it gives in its batch, and where the scores are moderate,
+/* Fuzzes attention and its gradients: a scene alone gives the bits that it gives in its batch, rows apart those of
+ * dense ones, and where the scores are moderate,
  * results are those of the formula in double within the rounding of the scores, and not finite where those are not. */
 #define main tests_of_attention
 #include "test_attention.c"
@@ -18,6 +19,31 @@ static void check_alone(const ast_kernels *kernels, const problem *a, const answ
             same_floats(alone.sum, batch->sum + q0 * a->H, one.Tq * a->H),
         "scene %lld differs alone and in a batch", (long long)b);
   free_answer(alone);
+}
+
+/* Whether rows of n floats, `stride` apart, are those of x, with NaN as in new buffers between them. */
+static bool same_apart(const float *got, const float *x, int64_t rows, int64_t n, int64_t stride) {
+  float *expected = apart(x, rows, n, stride);
+  const bool same = same_floats(got, expected, rows ? (rows - 1) * stride + n : 0);
+  FREE(expected);
+  return same;
+}
+
+/* Rows of q, k and v, and of their gradients, `gap` floats more apart. */
+static void check_strides(const ast_kernels *kernels, const problem *a, const answer *dense, int64_t gap) {
+  const int64_t row = a->H * a->D, stride = row + gap;
+  ast_attention s = sizes_of(a);
+  s.q_stride = s.k_stride = s.v_stride = s.dq_stride = s.dk_stride = s.dv_stride = stride;
+  float *q = apart(a->q, a->Tq, row, stride), *k = apart(a->k, a->Tk, row, stride), *v = apart(a->v, a->Tk, row, stride);
+  problem wide = *a; /* with room for gradients of such rows */
+  wide.Tq += a->Tq * gap / row + 1, wide.Tk += a->Tk * gap / row + 1;
+  answer r = solve_rows(kernels, &wide, s, q, k, v);
+  CHECK(same_floats(r.out, dense->out, a->Tq * row) && same_floats(r.maximum, dense->maximum, a->Tq * a->H) &&
+            same_floats(r.sum, dense->sum, a->Tq * a->H) && same_apart(r.dq, dense->dq, a->Tq, row, stride) &&
+            same_apart(r.dk, dense->dk, a->Tk, row, stride) && same_apart(r.dv, dense->dv, a->Tk, row, stride),
+        "rows %lld floats apart differ", (long long)gap);
+  FREE(q, k, v);
+  free_answer(r);
 }
 
 static void compare_values(const char *what, const float *got, const double *exact, int64_t n, double bound) {
@@ -75,6 +101,8 @@ static void fuzz(const ast_kernels *kernels) {
   answer r = solve(kernels, &a);
   const int64_t b = a.B ? (a.p > 0 ? 0 : take_index(a.B)) : 0; /* with dropout a scene alone has index 0 */
   if (a.B) check_alone(kernels, &a, &r, b);
+  const int gap = take_byte();
+  if (gap % 2) check_strides(kernels, &a, &r, gap / 2);
   check_values(&a, &r);
   free_answer(r), free_problem(a);
 }

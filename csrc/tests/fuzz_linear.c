@@ -1,5 +1,6 @@
-/* Fuzzes linear and its gradients: rows alone give the bits that they give among others, gradients do not depend on which others are
- * wanted, and where all sums are moderate the results are those of the formula in double within the rounding of their terms. */
+/* Fuzzes linear and its gradients: rows alone give the bits that they give among others, nothing depends on the rows' strides
+ * or on which gradients are wanted, and where all sums are moderate the results are those of the formula in double within the rounding of
+ * their terms. */
 #define main tests_of_linear
 #include "test_linear.c"
 #undef main
@@ -18,15 +19,20 @@ static void check_rows(const ast_kernels *kernels, const problem *a, const answe
   free_answer(r);
 }
 
-/* Only the gradients in the set `wanted`, z recomputed. */
-static void check_wanted(const ast_kernels *kernels, const problem *a, const answer *all, int wanted) {
-  float *g[RESULTS] = {0};
-  for (int i = 1; i < RESULTS; i++)
-    if (wanted >> (i - 1) & 1) g[i] = new_floats(a->sizes[i]);
-  CHECK(kernels->linear_backward(&a->s, a->dout, a->x, a->weight, a->bias, NULL, g[1], g[2], g[3]) == AST_OK, "status");
-  for (int i = 1; i < RESULTS; i++)
-    CHECK(!g[i] || same_floats(g[i], all->of[i], a->sizes[i]), "%s differs among the gradients %#x", names[i], wanted);
-  FREE(g[1], g[2], g[3]);
+/* Rows `gap` floats more apart, and only the gradients in the set `wanted`, z recomputed. */
+static void check_strides(const ast_kernels *kernels, const problem *a, const answer *all, int64_t gap, int wanted) {
+  ast_linear s = a->s;
+  s.x_stride += gap, s.residual_stride += gap, s.dout_stride += gap;
+  float *x = apart(a->x, s.M, s.I, s.x_stride), *residual = apart(a->residual, s.M, a->columns, s.residual_stride);
+  float *dout = apart(a->dout, s.M, a->columns, s.dout_stride), *r[RESULTS] = {0};
+  for (int i = 0; i < RESULTS; i++)
+    if (i == 0 || wanted >> (i - 1) & 1) r[i] = new_floats(a->sizes[i]);
+  READ_ONLY(x, residual, dout);
+  CHECK(kernels->linear(&s, x, a->weight, a->bias, residual, r[0], NULL) == AST_OK, "status");
+  CHECK(kernels->linear_backward(&s, dout, x, a->weight, a->bias, NULL, r[1], r[2], r[3]) == AST_OK, "status");
+  for (int i = 0; i < RESULTS; i++)
+    CHECK(!r[i] || same_floats(r[i], all->of[i], a->sizes[i]), "%s differs with strides and the gradients %#x", names[i], wanted);
+  FREE(x, residual, dout, r[0], r[1], r[2], r[3]);
 }
 
 /* GEGLU multiplies a value by another; its slope is below 1.2. */
@@ -67,7 +73,7 @@ static void fuzz(const ast_kernels *kernels) {
   a.residual = take_floats(sizes[0]), a.dout = take_floats(sizes[0]);
   answer r = solve(kernels, &a, byte % 2);
   if (M) check_rows(kernels, &a, &r);
-  check_wanted(kernels, &a, &r, byte / 2);
+  check_strides(kernels, &a, &r, byte / 16, byte / 2 % 8);
   check_values(&a, &r);
   free_answer(r), free_problem(a);
 }

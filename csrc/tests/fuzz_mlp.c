@@ -1,5 +1,6 @@
-/* Fuzzes mlp and its gradients: rows alone give the bits that they give among others, absent arrays count as zeros, gradients do not
- * depend on which others are wanted, and results are those of the formula in double within a bound that is computed along with it. */
+/* Fuzzes mlp and its gradients: rows alone give the bits that they give among others, absent arrays count as zeros, nothing
+ * depends on the rows' strides or on which gradients are wanted, and results are those of the formula in double within a bound that is
+ * computed along with it. */
 #define main tests_of_mlp
 #include "test_mlp.c"
 #undef main
@@ -140,16 +141,24 @@ static void check_rows(const ast_kernels *kernels, const problem *a, const answe
   free_answer(r);
 }
 
-/* Only the gradients in the set `wanted`. */
-static void check_wanted(const ast_kernels *kernels, const problem *a, const answer *all, int wanted) {
-  float *g[RESULTS] = {0};
-  for (int i = 1; i < RESULTS; i++)
-    if (wanted >> (i - 1) & 1 && !(i == 2 && !a->s.beside) && !(i >= 7 && !a->s.gamma)) g[i] = new_floats(a->sizes[i]);
-  const ast_mlp_gradients to = {g[1], g[2], g[3], g[4], g[5], g[6], g[7], g[8]};
-  CHECK(kernels->mlp_backward(&a->s, a->arrays[9], (ast_mlp_kept){0}, to) == AST_OK, "status");
-  for (int i = 1; i < RESULTS; i++)
-    CHECK(!g[i] || same_floats(g[i], all->of[i], a->sizes[i]), "%s differs among the gradients %#x", names[i], wanted);
-  for (int i = 1; i < RESULTS; i++) FREE(g[i]);
+/* Rows `gap` floats more apart, and only the gradients in the set `wanted`. */
+static void check_strides(const ast_kernels *kernels, const problem *a, const answer *all, int64_t gap, int wanted) {
+  ast_mlp s = a->s;
+  s.x_stride += gap, s.beside_stride += gap, s.residual_stride += gap, s.dout_stride += gap;
+  float *x = apart(s.x, s.M, s.I, s.x_stride), *beside = s.beside ? apart(s.beside, s.M, s.I2, s.beside_stride) : NULL;
+  float *residual = apart(a->arrays[8], s.M, s.O, s.residual_stride), *dout = apart(a->arrays[9], s.M, s.O, s.dout_stride);
+  float *r[RESULTS] = {0};
+  for (int i = 0; i < RESULTS; i++)
+    if (i == 0 || (wanted >> (i - 1) & 1 && !(i == 2 && !s.beside) && !(i >= 7 && !s.gamma))) r[i] = new_floats(a->sizes[i]);
+  s.x = x, s.beside = beside;
+  READ_ONLY(x, beside, residual, dout);
+  CHECK(kernels->mlp(&s, residual, r[0], (ast_mlp_kept){0}) == AST_OK, "status");
+  const ast_mlp_gradients to = {r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8]};
+  CHECK(kernels->mlp_backward(&s, dout, (ast_mlp_kept){0}, to) == AST_OK, "status");
+  for (int i = 0; i < RESULTS; i++)
+    CHECK(!r[i] || same_floats(r[i], all->of[i], a->sizes[i]), "%s differs with strides and the gradients %#x", names[i], wanted);
+  FREE(x, beside, residual, dout);
+  for (int i = 0; i < RESULTS; i++) FREE(r[i]);
 }
 
 /* Without arrays that are zero. */
@@ -177,7 +186,7 @@ static void fuzz(const ast_kernels *kernels) {
   for (int i = 3; bare && i < 10; i += i == 5 ? 3 : 2) memset(a.arrays[i], 0, (size_t)sizes[i] * sizeof(float)); /* biases, residual */
   answer r = solve(kernels, &a, keep);
   if (M) check_rows(kernels, &a, &r, options / 16 % 2);
-  check_wanted(kernels, &a, &r, wanted);
+  check_strides(kernels, &a, &r, options / 32, wanted);
   if (bare) check_absent(kernels, &a, &r);
   check_values(&a, &r);
   free_answer(r), free_problem(a);
