@@ -60,11 +60,17 @@ typedef struct {
   int64_t tasks, input_row, hidden_row, y_row; /* tasks; floats from row to row of a task's blocks */
 } mlp_job;
 
+enum { MLP_AHEAD = 6 }; /* rows */
+
 /* out from y; `whole`, a constant, says that O is a multiple of VW, so that no vector asks for its tail */
 AST_INLINE void mlp_norm_rows(const mlp_job *job, int64_t first, int64_t rows, float *y, const bool whole) {
   const ast_mlp *s = job->s;
   const int64_t O = s->O;
   for (int64_t i = first; i < first + rows; i++, y += job->y_row) {
+    for (int64_t j = 0, later = min64(i + MLP_AHEAD, s->M - 1) * O; j < O; j += 16) { /* before a store has to wait for its line */
+      __builtin_prefetch(job->out + later + j, 1);
+      if (job->kept.normalized) __builtin_prefetch(job->kept.normalized + later + j, 1);
+    }
     const float scale = mlp_centre(y, O, whole);
     const float *residual = job->residual ? job->residual + i * s->residual_stride : NULL;
     float *out = job->out + i * O, *normalized = job->kept.normalized ? job->kept.normalized + i * O : NULL;
@@ -176,14 +182,17 @@ AST_INLINE void mlp_norm_gradient(const mlp_backward_job *job, int64_t first, in
   }
 }
 
-/* One block: its dx and dbeside, and its part of all sums, added to those of the chunk. */
+/* One block: its dx and dbeside, and its part of all sums, added to those of the chunk. Rows that do not end with a vector are copied. */
 static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_t rows, float *input, float *hidden, float *y,
                               float *partials, bool add) {
   const ast_mlp *s = job->s;
   const dense_sum *sums = job->sums;
-  const gemm_a inputs = {input, job->input_row, 1}, units = {hidden, job->hidden_row, 1};
-  mlp_copy_inputs(s, first, rows, input, job->input_row);
-  if (job->kept.hidden) {
+  gemm_a inputs = {input, job->input_row, 1}, units = {hidden, job->hidden_row, 1};
+  if (s->beside || s->I % VW) mlp_copy_inputs(s, first, rows, input, job->input_row);
+  else inputs = (gemm_a){s->x + first * s->x_stride, s->x_stride, 1};
+  if (job->kept.hidden && s->H % VW == 0) {
+    units = (gemm_a){job->kept.hidden + first * s->H, s->H, 1};
+  } else if (job->kept.hidden) {
     dense_copy_rows(job->kept.hidden + first * s->H, s->H, rows, s->H, hidden, job->hidden_row);
   } else {
     const dense_end end = {.activation = AST_RELU, .out = hidden, .out_row = job->hidden_row};
@@ -202,30 +211,31 @@ static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_
     dense_add_rows(of_block + sums[4].row, 0, 1, sums[5].row, partials + sums[5].at);
   }
   if (sums[2].to)
-    gemm(s->O, sums[2].row, rows, (gemm_a){y, 1, job->y_row}, gemm_rows(hidden, job->hidden_row), partials + sums[2].at, sums[2].row, add);
+    gemm(s->O, sums[2].row, rows, (gemm_a){y, 1, job->y_row}, gemm_rows(units.data, units.row), partials + sums[2].at, sums[2].row, add);
   if (sums[3].to) dense_add_rows(y, job->y_row, rows, s->O, partials + sums[3].at);
   if (!job->into_hidden) return;
   const dense_end masked = {.out = hidden,
                             .out_row = job->hidden_row,
-                            .hidden = hidden,
-                            .hidden_row = job->hidden_row,
+                            .hidden = units.data,
+                            .hidden_row = units.row,
                             .next = {dense_rows_from(s->x, s->x_stride, s->I, first + rows, s->M),
                                      dense_rows_from(job->dout, s->dout_stride, s->O, first + rows, s->M)}};
   dense_rows(&job->layers[2], 0, dense_panels(&job->layers[2]), rows, (gemm_a){y, job->y_row, 1}, masked);
   if (sums[0].to)
-    gemm(s->H, sums[0].row, rows, (gemm_a){hidden, 1, job->hidden_row}, gemm_rows(input, job->input_row), partials + sums[0].at,
+    gemm(s->H, sums[0].row, rows, (gemm_a){hidden, 1, job->hidden_row}, gemm_rows(inputs.data, inputs.row), partials + sums[0].at,
          sums[0].row, add);
   if (sums[1].to) dense_add_rows(hidden, job->hidden_row, rows, s->H, partials + sums[1].at);
+  const gemm_a dz = {hidden, job->hidden_row, 1};
   if (job->g.x) {
     const dense_end end = {.out = job->g.x + first * s->I,
                            .out_row = s->I,
                            .next = {dense_rows_from(job->kept.hidden, s->H, s->H, first + rows, s->M),
                                     dense_rows_from(job->kept.normalized, s->O, s->O, first + rows, s->M)}};
-    dense_rows(&job->layers[3], 0, dense_panels(&job->layers[3]), rows, units, end);
+    dense_rows(&job->layers[3], 0, dense_panels(&job->layers[3]), rows, dz, end);
   }
   if (job->g.beside) {
     const dense_end end = {.out = job->g.beside + first * s->I2, .out_row = s->I2};
-    dense_rows(&job->layers[4], 0, dense_panels(&job->layers[4]), rows, units, end);
+    dense_rows(&job->layers[4], 0, dense_panels(&job->layers[4]), rows, dz, end);
   }
 }
 
