@@ -19,7 +19,9 @@
 enum {
   DENSE_ROWS = 96,         /* rows of a block: a multiple of GEMM_ROWS */
   DENSE_APART = 16,        /* floats added to the rows of copied blocks: a power of two would crowd few cache sets */
-  DENSE_DEPTH = 192,       /* terms of one chain at most: its rounding errors grow with their number */
+  DENSE_DEPTH = 192,       /* terms of one chain at most: its rounding errors grow with their number, */
+  DENSE_SHALLOW = 32,      /* and with few outputs, where lanes lie idle anyway, short chains cost little */
+  DENSE_FEW = 8,           /* outputs */
   DENSE_PACK = 1 << 16,    /* floats of weights from which several threads pack them */
   DENSE_PARTIALS = 1 << 24 /* floats at most of partial sums */
 };
@@ -73,7 +75,7 @@ static ast_status dense_pack(dense_layer *layers, int64_t num, int slot) {
   int64_t size = 0, panels = 0;
   for (int64_t i = 0; i < num; i++) {
     if (!layers[i].weight) layers[i].N = 0;
-    const int64_t chains = max64(1, (layers[i].K + DENSE_DEPTH - 1) / DENSE_DEPTH);
+    const int64_t most = layers[i].N > DENSE_FEW ? DENSE_DEPTH : DENSE_SHALLOW, chains = max64(1, (layers[i].K + most - 1) / most);
     layers[i].depth = (layers[i].K + chains - 1) / chains;
     size += dense_packed_size(&layers[i]);
     panels += dense_panels(&layers[i]);
