@@ -98,7 +98,7 @@ static void forward_panel(forward_scratch *t, const forward_state *state, int64_
     vstore(m + c * VW, now);
   }
   if (d->threshold) {
-    for (int64_t c = 0; c < 2; c++) dropout_draw(d, query + c * VW, k0, n, t->words[c]);
+    for (int64_t c = 0; c < 2; c++) dropout_draw_queries(d, query + c * VW, k0, n, t->words[c]);
     dropped_weights(t->scores, n, base, shift, d, t->words, sum);
   } else {
     weights(t->scores, n, base, shift, sum);

@@ -6,8 +6,10 @@
  * others vanish, dS is exactly 0: both terms are rounded alike.
  *
  * A task takes a chunk of queries against all blocks of keys, then the next chunk: each score is computed once and dQ, dK and dV
- * grow in the second cache. A scene of few tasks is cut over its longer side; each part but the first leaves its share of the
- * gradient of the shorter side, added in the order of the parts. All sizes depend on the scene's own, as in the forward pass.
+ * grow in the second cache. Scores have keys across the lanes: no row is summed here, and so panels are needed of a block of keys
+ * only, not of the chunk, whose arrays would not fit with them. A scene of few tasks is cut over its longer side; each part but the first
+ * leaves its share of the gradient of the shorter side, added in the order of the parts. All sizes depend on the scene's own, as in the
+ * forward pass.
  *
  * Cost: 10 Tq Tk D flops a head in five products. Memory: at most 2 BACKWARD_TASKS D floats for each row of the shorter side.
  */
@@ -16,12 +18,13 @@
 #include "dropout.h"
 
 enum {
-  CHUNK = 512,         /* queries whose panels, rows and gradients are kept in the second cache */
-  SQUARE = 128,        /* of these, against a block of keys: */
+  CHUNK = 512,         /* queries whose rows and gradients are kept in the second cache */
+  SQUARE = 128,        /* of these, against a block of keys; */
+  GROUP = 24,          /* of these, whose scores stay in the first cache: whole tiles */
   BACKWARD_TASKS = 16, /* a scene with fewer tasks is cut */
   BACKWARD_PART = 512, /* into parts of at least so many keys or queries */
 };
-_Static_assert(CHUNK % SQUARE == 0 && SQUARE % (int)LANES == 0, "chunks hold whole squares, squares whole panels");
+_Static_assert(CHUNK % SQUARE == 0 && GROUP % (int)GEMM_ROWS == 0 && KEYS % (int)LANES == 0, "chunks hold whole squares, groups tiles");
 
 typedef struct {
   int64_t parts, part_rows;          /* rows of a part: queries if there are more of them than keys, else keys */
@@ -37,12 +40,11 @@ typedef struct {
 } backward_job;
 
 typedef struct {
-  float keys[KEYS * ROW], values[KEYS * ROW]; /* K, gain V */
+  float keys[KEYS * ROW], key_panels[KEYS * MAX_D], value_panels[KEYS * MAX_D]; /* K by rows and in panels, gain V in panels */
   float dk[KEYS * ROW], dv[KEYS * ROW];
-  float weights[KEYS * ROW], dscores[KEYS * ROW];                /* P . keep and dS as [key][query] of a square */
-  float query_panels[CHUNK * MAX_D], dout_panels[CHUNK * MAX_D]; /* scale Q and y */
-  float queries[CHUNK * ROW], dout[CHUNK * ROW], dq[CHUNK * ROW];
-  dropout_words words;
+  float weights[SQUARE * ROW], dscores[SQUARE * ROW];             /* P . keep and dS as [query][key] */
+  float queries[CHUNK * ROW], dout[CHUNK * ROW], dq[CHUNK * ROW]; /* scale Q, y and dQ / scale */
+  dropout_row words[GROUP];
   float maximum[CHUNK], share[CHUNK], delta[CHUNK]; /* m, 1 / l, rowsum(y . out) */
 } backward_scratch;
 
@@ -62,55 +64,60 @@ AST_INLINE void gradient(float *x, float *dx, vf maximum, vf share, vf delta, co
   vstore(dx, p * ((words ? dropout_keep(words, slot, threshold, dp) : dp) - delta));
 }
 
-/* Weights and their gradients of the panel of queries from i on, of those in the scratch; k0 the first of n keys of the scene. */
-static void backward_panel(backward_scratch *t, int64_t i, int64_t query, int64_t k0, int64_t n, int64_t D, const dropout *d) {
-  float *x = t->weights + i % SQUARE, *dx = t->dscores + i % SQUARE;
-  EACH_TILE(round_up(n, ROW_STEP), scores_tile, D, t->keys, t->query_panels + i * D, x, NULL)
-  EACH_TILE(round_up(n, ROW_STEP), scores_tile, D, t->values, t->dout_panels + i * D, dx, NULL)
+/* Weights and their gradients of the queries i..i+rows of those in the scratch; k0 the first of n keys of the scene. */
+static void backward_group(backward_scratch *t, int64_t i, int64_t rows, int64_t query, int64_t k0, int64_t n, int64_t D,
+                           const dropout *d) {
+  float *x = t->weights + i % SQUARE * ROW, *dx = t->dscores + i % SQUARE * ROW;
+  const int64_t whole = round_up(rows, ROW_STEP);
+  for (int64_t c = 0; c < n; c += LANES) {
+    EACH_TILE(whole, scores_tile, D, t->queries + i * ROW, t->key_panels + c * D, x + c, NULL)
+    EACH_TILE(whole, scores_tile, D, t->dout + i * ROW, t->value_panels + c * D, dx + c, NULL)
+  }
   const vu threshold = (vu){0} + (d->threshold << 16);
-  for (int64_t c = 0; c < LANES; c += VW) {
-    const vf maximum = vload(t->maximum + i + c), share = vload(t->share + i + c), delta = vload(t->delta + i + c);
+  if (d->threshold)
+    for (int64_t r = 0; r < rows; r++) dropout_draw_keys(d, query + r, k0, t->words[r]);
+  for (int64_t r = 0; r < rows; r++) {
+    const vf maximum = vsplat(t->maximum[i + r]), share = vsplat(t->share[i + r]), delta = vsplat(t->delta[i + r]);
+    float *x_r = x + r * ROW, *dx_r = dx + r * ROW;
     if (!d->threshold) {
-      for (int64_t j = 0; j < n; j++) gradient(x + j * ROW + c, dx + j * ROW + c, maximum, share, delta, NULL, 0, threshold);
+      for (int64_t c = 0; c < n; c += VW) gradient(x_r + c, dx_r + c, maximum, share, delta, NULL, 0, threshold);
       continue;
     }
-    dropout_draw(d, query + c, k0, n, t->words);
 #pragma GCC unroll 8
-    for (int slot = 0; slot < DROPOUT_SLOTS; slot++)
-      for (int64_t lane = 0; lane < min64(n - slot * DROPOUT_LANES, DROPOUT_LANES); lane++) {
-        const int64_t j = slot * DROPOUT_LANES + lane;
-        gradient(x + j * ROW + c, dx + j * ROW + c, maximum, share, delta, t->words[lane], slot, threshold);
+    for (int slot = 0; slot < DROPOUT_SLOTS; slot++) {
+      if (slot * DROPOUT_LANES >= n) break;
+#pragma GCC unroll 4
+      for (int part = 0; part < DROPOUT_PARTS; part++) {
+        const int64_t c = slot * DROPOUT_LANES + part * VW;
+        gradient(x_r + c, dx_r + c, maximum, share, delta, t->words[r][part], slot, threshold);
       }
+    }
   }
 }
 
 /* ---- tasks ---- */
 
-/* The queries q0..q0+rows of the scene of `range`: panels, rows, m, 1 / l and delta. */
+/* The queries first..first+rows of the scene of `range`: rows, m, 1 / l and delta. */
 static void load_queries(const backward_job *job, const backward_range *range, int64_t first, int64_t rows, backward_scratch *t) {
   const ast_attention *s = job->s;
   const int64_t H = s->H, D = s->D, h = range->h, q0 = s->q_offsets[range->b] + first;
   const float *q = job->q + q0 * s->q_stride + h * D, *dout = job->dout + (q0 * H + h) * D, *out = job->out + (q0 * H + h) * D;
   copy_rows(q, s->q_stride, rows, D, s->scale, t->queries);
   copy_rows(dout, H * D, rows, D, 1, t->dout);
-  for (int64_t i = 0; i < rows; i += LANES) {
-    float *panel = t->dout_panels + i * D;
-    pack_panel(t->queries + i * ROW, ROW, rows - i, D, 1, t->query_panels + i * D);
-    pack_panel(t->dout + i * ROW, ROW, rows - i, D, 1, panel);
-    for (int64_t c = 0; c < LANES; c += VW) {
-      vf sum = {0}; /* in the order of the products, so that a weight of 1 leaves dS = 0 */
-      for (int64_t e = 0; e < D; e += VW) {
-        vf x[VW];
-        load_transposed(out + (i + c) * H * D + e, H * D, rows - i - c, x);
+  for (int64_t i = 0; i < rows; i += VW) {
+    vf sum = {0}; /* in the order of the products, so that a weight of 1 leaves dS = 0 */
+    for (int64_t e = 0; e < D; e += VW) {
+      vf x[VW], y[VW];
+      load_transposed(t->dout + i * ROW + e, ROW, rows - i, y);
+      load_transposed(out + i * H * D + e, H * D, rows - i, x);
 #pragma GCC unroll 16
-        for (int j = 0; j < VW; j++) sum += vload(panel + (e + j) * LANES + c) * x[j];
-      }
-      vstore(t->delta + i + c, sum);
+      for (int j = 0; j < VW; j++) sum += y[j] * x[j];
     }
-    for (int64_t j = i; j < i + LANES; j++) {
-      t->maximum[j] = j < rows ? job->maximum[(q0 + j) * H + h] : 0;
-      t->share[j] = j < rows ? 1 / job->sum[(q0 + j) * H + h] : 0;
-    }
+    vstore(t->delta + i, sum);
+  }
+  for (int64_t i = 0; i < rows; i++) {
+    t->maximum[i] = job->maximum[(q0 + i) * H + h];
+    t->share[i] = 1 / job->sum[(q0 + i) * H + h];
   }
 }
 
@@ -130,23 +137,26 @@ static void backward_block(const backward_job *job, const backward_range *range,
   const int64_t D = s->D, row = s->k_offsets[range->b] + k0, whole = round_up(n, ROW_STEP);
   const float *k = job->k + row * s->k_stride + range->h * D, *v = job->v + row * s->v_stride + range->h * D;
   copy_rows(k, s->k_stride, n, D, 1, t->keys);
-  copy_rows(v, s->v_stride, n, D, d->gain, t->values);
+  for (int64_t c = 0; c < n; c += LANES) {
+    pack_panel(t->keys + c * ROW, ROW, n - c, D, 1, t->key_panels + c * D);
+    pack_panel(v + c * s->v_stride, s->v_stride, n - c, D, d->gain, t->value_panels + c * D);
+  }
   float *dk = range->dk + (k0 - range->first_key) * range->dk_stride, *dv = range->dv + (k0 - range->first_key) * range->dv_stride;
   const int64_t left = range->first_key + range->keys - k0 - KEYS;
-  const int64_t panels = (rows + LANES - 1) / LANES, share = (KEYS + panels - 1) / panels;
+  const int64_t groups = (rows + GROUP - 1) / GROUP, share = (KEYS + groups - 1) / groups;
   for (int64_t i0 = 0; i0 < rows; i0 += SQUARE) {
     const int64_t width = min64(SQUARE, rows - i0);
-    for (int64_t i = i0; i < i0 + width; i += LANES) {
-      const int64_t at = i / LANES * share;
+    for (int64_t i = i0; i < i0 + width; i += GROUP) {
+      const int64_t at = i / GROUP * share;
       prefetch_rows(k + (KEYS + at) * s->k_stride, s->k_stride, min64(share, left - at), D, 0);
       prefetch_rows(v + (KEYS + at) * s->v_stride, s->v_stride, min64(share, left - at), D, 0);
       prefetch_rows(dk + at * range->dk_stride, range->dk_stride, min64(share, n - at), D, 1);
       prefetch_rows(dv + at * range->dv_stride, range->dv_stride, min64(share, n - at), D, 1);
-      backward_panel(t, i, first + i, k0, n, D, d);
+      backward_group(t, i, min64(GROUP, i0 + width - i), first + i, k0, n, D, d);
     }
-    rows_product(whole, D, width, t->weights, t->dout + i0 * ROW, t->dv, (update){.set = i0 == 0});
-    rows_product(whole, D, width, t->dscores, t->queries + i0 * ROW, t->dk, (update){.set = i0 == 0});
-    columns_product(round_up(width, ROW_STEP), D, n, t->dscores, t->keys, t->dq + i0 * ROW, (update){.set = k0 == range->first_key});
+    columns_product(whole, D, width, t->weights, t->dout + i0 * ROW, t->dv, (update){.set = i0 == 0});
+    columns_product(whole, D, width, t->dscores, t->queries + i0 * ROW, t->dk, (update){.set = i0 == 0});
+    rows_product(round_up(width, ROW_STEP), D, n, t->dscores, t->keys, t->dq + i0 * ROW, (update){.set = k0 == range->first_key});
   }
   put_rows(t->dk, n, D, 1, first > range->first_query, dk, range->dk_stride);
   put_rows(t->dv, n, D, d->gain, first > range->first_query, dv, range->dv_stride);

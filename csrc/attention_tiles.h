@@ -1,9 +1,10 @@
-/* What attention and its gradient are built of: scores with queries across the lanes, and products on register tiles.
+/* What attention and its gradient are built of: scores of panels, and products on register tiles.
  *
- * A panel is LANES queries; its scores are held transposed, x[key][query], so that maximum, sum and dropout of a row of the
- * softmax are operations between vectors, never within one. Every array that a product reads row by row has rows ROW floats
- * apart: a constant, so that a tile needs one pointer for each operand, and no power of two, which would crowd few cache sets.
- * Products add in rising order of the summed index, in every tile alike: a score has the same bits forward and backward.
+ * A panel is LANES rows across the lanes: of queries in the forward pass, whose scores are held transposed, x[key][query], so that
+ * maximum and sum of a row of the softmax are operations between vectors, never within one; of keys in the backward pass, x[query][key].
+ * Every array that a product reads row by row has rows ROW floats apart: a constant, so that a tile needs one pointer for each operand, and
+ * no power of two, which would crowd few cache sets. Products add in rising order of the summed index, in every tile alike: a score has the
+ * same bits forward and backward.
  *
  * Legend: n keys of a block, D channels of a head; A read by broadcast, B in vectors, C in GEMM_ROWS x 2 vectors of registers.
  */
@@ -15,8 +16,8 @@
 #include "gemm.h"
 
 enum {
-  LANES = GEMM_COLUMNS, /* queries of a panel */
-  KEYS = 128,           /* keys of a block: the scores of a panel stay in the first cache */
+  LANES = GEMM_COLUMNS, /* rows of a panel */
+  KEYS = 128,           /* keys of a block: its scores against a panel of queries stay in the first cache */
   MAX_D = 128,          /* channels of a head */
   ROW = MAX_D + 16,     /* floats from row to row */
   ROW_STEP = 4,         /* products compute rows in multiples of this: 90 keys cost 92 */
@@ -56,7 +57,7 @@ AST_INLINE void tile_product(const int rows, const int vectors, int64_t K, gemm_
   gemm_sums(rows, vectors, K, a, b, b_row, sum);
 }
 
-/* x[key][query] = a[key] . b[query] over the channels for a tile of keys; raises largest[2], unless NULL, to the scores' maximum. */
+/* x[row][lane] = a[row] . b[lane] over the channels for a tile of rows; raises largest[2], unless NULL, to the scores' maximum. */
 AST_INLINE void scores_tile(const int rows, int64_t i, int64_t D, const float *a, const float *b, float *x, vf *largest) {
   vf sum[GEMM_ROWS][2];
   tile_product(rows, 2, D, (gemm_a){a + i * ROW, ROW, 1}, b, LANES, sum);
@@ -169,7 +170,7 @@ AST_INLINE void load_transposed(const float *from, int64_t stride, int64_t rows,
   vtranspose(x);
 }
 
-/* panel[d][query] = factor from[query][d] for at most LANES rows; the panel's other queries are 0 */
+/* panel[d][lane] = factor from[lane][d] for at most LANES rows; the panel's other lanes are 0 */
 static void pack_panel(const float *from, int64_t stride, int64_t rows, int64_t D, float factor, float *panel) {
   for (int64_t j = 0; j < LANES; j += VW)
     for (int64_t d = 0; d < D; d += VW) {

@@ -3,7 +3,7 @@
  * Threefry-4x32 of 12 rounds (Salmon et al., Parallel random numbers: as easy as 1, 2, 3, 2011) under the key
  * (seed, scene, head) turns the counter (16 g + lane, query) into four words, one half word for each of the 8 keys
  * 128 g + 16 slot + lane: half slot % 2 of word slot / 2. A weight is dropped if its half word is below round(65536 p);
- * the share kept is within 1e-5 of 1 - p. VW queries at once: some 11 operations a vector of decisions.
+ * the share kept is within 1e-5 of 1 - p. VW counters at once: some 11 operations a vector of decisions.
  */
 #ifndef AST_DROPOUT_H
 #define AST_DROPOUT_H
@@ -47,22 +47,33 @@ AST_INLINE void threefry(const uint32_t key[5], vu x[4]) {
   }
 }
 
-/* The words of VW queries and DROPOUT_KEYS keys, as [lane][word]. */
+/* The words of a vector of counters. */
+AST_INLINE void dropout_draw(const dropout *d, vu counter, vu query, vu words[4]) {
+  vu x[4] = {counter, query, {0}, {0}};
+  threefry(d->key, x);
+#pragma GCC unroll 4
+  for (int i = 0; i < 4; i++) words[i] = x[i];
+}
+
+/* Words are drawn ahead of their use: a loop of nothing else keeps several counters in flight, each of which is a long chain of
+ * dependent operations. With queries across the lanes: the words of VW queries and DROPOUT_KEYS keys, as [lane][word]. */
 typedef vu dropout_words[DROPOUT_LANES][4];
 
-/* Those of the queries from `query` and the keys from `group` on, a multiple of DROPOUT_KEYS; lanes up to n only. Drawn ahead of
- * their use: a loop of nothing else keeps several counters in flight, each of which is a long chain of dependent operations. */
-AST_INLINE void dropout_draw(const dropout *d, int64_t query, int64_t group, int64_t n, dropout_words words) {
-  vu queries;
-#pragma GCC unroll 16
-  for (int i = 0; i < VW; i++) queries[i] = (uint32_t)i;
-  queries += (uint32_t)query;
-  for (int64_t lane = 0; lane < min64(n, DROPOUT_LANES); lane++) {
-    vu x[4] = {(vu){0} + (uint32_t)(group / DROPOUT_SLOTS + lane), queries, {0}, {0}};
-    threefry(d->key, x);
+/* Those of the queries from `query` and the keys from `group` on, a multiple of DROPOUT_KEYS; lanes up to n only. */
+AST_INLINE void dropout_draw_queries(const dropout *d, int64_t query, int64_t group, int64_t n, dropout_words words) {
+  const vu queries = (vu)LANE_INDICES + (uint32_t)query;
+  for (int64_t lane = 0; lane < min64(n, DROPOUT_LANES); lane++)
+    dropout_draw(d, (vu){0} + (uint32_t)(group / DROPOUT_SLOTS + lane), queries, words[lane]);
+}
+
+/* With keys across the lanes: the words of one query and DROPOUT_KEYS keys; a slot fills DROPOUT_PARTS vectors. */
+enum { DROPOUT_PARTS = DROPOUT_LANES / VW };
+typedef vu dropout_row[DROPOUT_PARTS][4];
+
+AST_INLINE void dropout_draw_keys(const dropout *d, int64_t query, int64_t group, dropout_row words) {
 #pragma GCC unroll 4
-    for (int i = 0; i < 4; i++) words[lane][i] = x[i];
-  }
+  for (int part = 0; part < DROPOUT_PARTS; part++)
+    dropout_draw(d, (vu)LANE_INDICES + (uint32_t)(group / DROPOUT_SLOTS + part * VW), (vu){0} + (uint32_t)query, words[part]);
 }
 
 /* x where the weight of slot is kept, 0 where it is dropped; threshold in the upper half of the word. */
