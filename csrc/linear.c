@@ -7,10 +7,11 @@
  *
  * Forward, a task owns a block of rows and some panels of columns. The gradient of W is a sum over rows, cut by the shapes alone,
  * in one of two ways. By rows: a task owns a chunk of rows, and while a block of them lies in the cache takes dz, dx and its part
- * of dW from it; the parts are added in order. By tiles, where those parts would be larger than x and dz: first dz and dx by
- * blocks of rows, then dW by blocks of W, each over all rows.
+ * of dW from it; the parts are added in order. By tiles, where those parts would be larger than x and dz: dz by blocks of rows,
+ * unless it is dout itself, then side by side dW by tiles of W, each over all rows, and dx as a product like the forward one.
  *
- * Cost: 2 M I O operations for z, for dx and for dW each. Memory: the packed weights, and either the parts or copies of x and dz.
+ * Cost: 2 M I O operations for z, for dx and for dW each. Memory: the packed weights, and either the parts or, where they are not
+ * dout and x themselves, dz and x.
  */
 #include "ast.h"
 #include "dense.h"
