@@ -57,9 +57,10 @@ typedef struct {
 
 /* ---- a square of queries against a block of keys ---- */
 
-/* Score x and gain y V^T become P . keep and dS; words NULL: all are kept. */
+/* Score x and gain y V^T become P . keep and dS. Words NULL: all are kept; so are those of a row that is NaN, as 0 NaN is NaN. */
 AST_INLINE void gradient(float *x, float *dx, vf maximum, vf share, vf delta, const vu *words, int slot, vu threshold) {
   const vf p = share * vexp(vload(x) - maximum, 0), dp = vload(dx);
+  threshold &= (vu)(maximum == maximum);
   vstore(x, words ? dropout_keep(words, slot, threshold, p) : p);
   vstore(dx, p * ((words ? dropout_keep(words, slot, threshold, dp) : dp) - delta));
 }

@@ -261,10 +261,10 @@ static void test_not_finite(const ast_kernels *kernels) {
   static const float values[3] = {NAN, INFINITY, -INFINITY};
   const int64_t queries = 70, keys = 300;
   for (int place = 0; place < 3; place++)
-    for (int i = 0; i < 3; i++) {
-      problem a = new_problem(1, &queries, &keys, 2, 16, 1, 0);
+    for (int i = 0; i < 6; i++) {
+      problem a = new_problem(1, &queries, &keys, 2, 16, 1, i < 3 ? 0 : 0.3);
       float *const array[3] = {a.q, a.k, a.v};
-      array[place][37 * 32 + 5] = values[i];
+      array[place][37 * 32 + 5] = values[i % 3];
       answer r = solve(kernels, &a);
       check_against_formula(&a, &r, 2);
       free_answer(r), free_problem(a);
