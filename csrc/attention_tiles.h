@@ -137,32 +137,6 @@ static void columns_product(int64_t M, int64_t N, int64_t K, const float *a, con
 
 /* ---- rows and panels ---- */
 
-#if AST_VECTOR_BYTES == 64
-#define INTERLEAVE_LOW(a, b)  __builtin_shufflevector(a, b, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23)
-#define INTERLEAVE_HIGH(a, b) __builtin_shufflevector(a, b, 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31)
-#elif AST_VECTOR_BYTES == 32
-#define INTERLEAVE_LOW(a, b)  __builtin_shufflevector(a, b, 0, 8, 1, 9, 2, 10, 3, 11)
-#define INTERLEAVE_HIGH(a, b) __builtin_shufflevector(a, b, 4, 12, 5, 13, 6, 14, 7, 15)
-#else
-#define INTERLEAVE_LOW(a, b)  __builtin_shufflevector(a, b, 0, 4, 1, 5)
-#define INTERLEAVE_HIGH(a, b) __builtin_shufflevector(a, b, 2, 6, 3, 7)
-#endif
-
-/* x_ij <-> x_ji: each pass rotates the bits of the index (i, j) by one, log2(VW) passes exchange i and j. */
-AST_INLINE void vtranspose(vf x[VW]) {
-#pragma GCC unroll 4
-  for (int pass = 1; pass < VW; pass *= 2) {
-    vf y[VW];
-#pragma GCC unroll 8
-    for (int i = 0; i < VW / 2; i++) {
-      y[2 * i] = INTERLEAVE_LOW(x[i], x[i + VW / 2]);
-      y[2 * i + 1] = INTERLEAVE_HIGH(x[i], x[i + VW / 2]);
-    }
-#pragma GCC unroll 16
-    for (int i = 0; i < VW; i++) x[i] = y[i];
-  }
-}
-
 /* x_dj = from[j][d] for VW rows and VW channels; rows from `rows` on are 0 and not read */
 AST_INLINE void load_transposed(const float *from, int64_t stride, int64_t rows, vf x[VW]) {
 #pragma GCC unroll 16

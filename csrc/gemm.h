@@ -33,39 +33,12 @@ AST_INLINE gemm_b gemm_rows(const float *b, int64_t stride) { return (gemm_b){b,
 AST_INLINE gemm_b gemm_packed(const float *b, int64_t K) { return (gemm_b){b, GEMM_COLUMNS, K * GEMM_COLUMNS}; }
 AST_INLINE int64_t gemm_packed_size(int64_t K, int64_t N) { return K * round_up(N, GEMM_COLUMNS); }
 
-/* lanes 0 to VW - 1 of a, and VW on of b */
-AST_INLINE vf gemm_shuffle(vf a, vf b, const vi lanes) {
-#ifdef __clang__
-  vf x;
-  for (int i = 0; i < VW; i++) x[i] = lanes[i] < VW ? a[lanes[i]] : b[lanes[i] - VW];
-  return x;
-#else
-  return __builtin_shuffle(a, b, lanes);
-#endif
-}
-
-/* Of the 2 x 2 blocks of `distance` lanes in rows x_i and x_(i + distance), those off the diagonal change places. */
-AST_INLINE void gemm_exchange(vf x[VW], const int distance) {
-  const vi swapped = (LANE_INDICES & distance) != 0;
-  const vi upper = LANE_INDICES + (swapped & (VW - distance)), lower = LANE_INDICES + (swapped & VW) + (~swapped & distance);
-#pragma GCC unroll 16
-  for (int i = 0; i < VW; i++)
-    if (!(i & distance)) {
-      const vf a = x[i], b = x[i + distance];
-      x[i] = gemm_shuffle(a, b, upper);
-      x[i + distance] = gemm_shuffle(a, b, lower);
-    }
-}
-
 /* out[k][j] = in[j][k] for n rows j of m columns k, both at most VW; out has VW columns within a panel, 0 from n on. */
 AST_INLINE void gemm_transpose(const float *in, int64_t in_row, const int64_t n, const int64_t m, float *out) {
   vf x[VW];
 #pragma GCC unroll 16
   for (int j = 0; j < VW; j++) x[j] = j < n ? vload_upto(in + j * in_row, m) : (vf){0};
-  if (VW >= 16) gemm_exchange(x, 8);
-  if (VW >= 8) gemm_exchange(x, 4);
-  gemm_exchange(x, 2);
-  gemm_exchange(x, 1);
+  vtranspose(x);
 #pragma GCC unroll 16
   for (int k = 0; k < VW; k++)
     if (k < m) vstore(out + k * GEMM_COLUMNS, x[k]);

@@ -137,4 +137,30 @@ AST_INLINE int64_t min64(int64_t a, int64_t b) { return a < b ? a : b; }
 AST_INLINE int64_t max64(int64_t a, int64_t b) { return a > b ? a : b; }
 AST_INLINE int64_t round_up(int64_t n, int64_t to) { return (n + to - 1) / to * to; }
 
+#if AST_VECTOR_BYTES == 64
+#define INTERLEAVE_LOW(a, b)  __builtin_shufflevector(a, b, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23)
+#define INTERLEAVE_HIGH(a, b) __builtin_shufflevector(a, b, 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31)
+#elif AST_VECTOR_BYTES == 32
+#define INTERLEAVE_LOW(a, b)  __builtin_shufflevector(a, b, 0, 8, 1, 9, 2, 10, 3, 11)
+#define INTERLEAVE_HIGH(a, b) __builtin_shufflevector(a, b, 4, 12, 5, 13, 6, 14, 7, 15)
+#else
+#define INTERLEAVE_LOW(a, b)  __builtin_shufflevector(a, b, 0, 4, 1, 5)
+#define INTERLEAVE_HIGH(a, b) __builtin_shufflevector(a, b, 2, 6, 3, 7)
+#endif
+
+/* x_ij <-> x_ji: each pass rotates the bits of the index (i, j) by one, log2(VW) passes exchange i and j. */
+AST_INLINE void vtranspose(vf x[VW]) {
+#pragma GCC unroll 4
+  for (int pass = 1; pass < VW; pass *= 2) {
+    vf y[VW];
+#pragma GCC unroll 8
+    for (int i = 0; i < VW / 2; i++) {
+      y[2 * i] = INTERLEAVE_LOW(x[i], x[i + VW / 2]);
+      y[2 * i + 1] = INTERLEAVE_HIGH(x[i], x[i + VW / 2]);
+    }
+#pragma GCC unroll 16
+    for (int i = 0; i < VW; i++) x[i] = y[i];
+  }
+}
+
 #endif
