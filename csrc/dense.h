@@ -6,8 +6,8 @@
  * while a block of some 100 rows of A stays in the cache, and what follows the product happens in its registers, so that every
  * output is written once. For GEGLU a panel holds VW outputs of the first half of W beside the same ones of the second half.
  *
- * An element is a sum of chains of multiply-adds over rising k, cut by K alone, then the bias, whatever tile it falls into: a row's result
- * depends on neither its place, the batch nor the threads.
+ * An element is a sum of chains of multiply-adds over rising k, cut by K and N alone, then the bias, whatever tile it falls into: a row's
+ * result depends on neither its place, the batch nor the threads.
  */
 #ifndef AST_DENSE_H
 #define AST_DENSE_H
@@ -75,7 +75,8 @@ static ast_status dense_pack(dense_layer *layers, int64_t num, int slot) {
   int64_t size = 0, panels = 0;
   for (int64_t i = 0; i < num; i++) {
     if (!layers[i].weight) layers[i].N = 0;
-    const int64_t most = layers[i].N > DENSE_FEW ? DENSE_DEPTH : DENSE_SHALLOW, chains = max64(1, (layers[i].K + most - 1) / most);
+    const int64_t outputs = layers[i].paired ? 2 * layers[i].N : layers[i].N; /* as for both halves in one: z has the same bits */
+    const int64_t most = outputs > DENSE_FEW ? DENSE_DEPTH : DENSE_SHALLOW, chains = max64(1, (layers[i].K + most - 1) / most);
     layers[i].depth = (layers[i].K + chains - 1) / chains;
     size += dense_packed_size(&layers[i]);
     panels += dense_panels(&layers[i]);
