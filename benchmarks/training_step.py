@@ -88,6 +88,8 @@ def measure(case: scenes.Case, threads: int, repeats: int, limit: float | None, 
         records = [
             _record(case, what, threads, _samples(workers, what, case.steps, repeats)) for what in ("step", "rollout")
         ]
+        # Before anything is watched: what the profiler writes down lies in memory, too.
+        records[0]["peak_resident_bytes"] = {name: worker.ask("resident") for name, worker in workers.items()}
         for record, profile in zip(records, ("profile", "profile_rollout"), strict=True):
             shares = workers["ours"].ask(profile, max(case.steps, 5))
             record["shares"] = shares
@@ -97,7 +99,6 @@ def measure(case: scenes.Case, threads: int, repeats: int, limit: float | None, 
         flops = workers["ours"].ask("flops")
         records[0]["gflops"] = flops / records[0]["samples"]["ours"]["min"] / 1e9
         records[0]["share_of_peak"] = records[0]["gflops"] / limit if limit else None
-        records[0]["peak_resident_bytes"] = {name: worker.ask("resident") for name, worker in workers.items()}
     return records
 
 
