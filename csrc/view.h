@@ -76,10 +76,18 @@ static const dlpack_exchange *exchange_of(PyTypeObject *type) {
   Py_XDECREF(capsule);
   PyErr_Clear();
   if (!found || found->major != 1 || !found->look) return NULL;
-  Py_INCREF(type);
-  Py_XDECREF(known);
+  Py_INCREF((PyObject *)type);
+  Py_XDECREF((PyObject *)known);
   known = type;
   return exchange = found;
+}
+
+static int type_of_tensor(const dlpack_tensor *t) {
+  if (t->lanes != 1) return OTHER_TYPE;
+  if (t->code == DLPACK_FLOAT && t->bits == 32) return FLOATS;
+  if (t->code == DLPACK_INT && t->bits == 64) return INTS;
+  if (t->code == DLPACK_INT && t->bits == 32) return SMALL_INTS;
+  return OTHER_TYPE;
 }
 
 /* Whether the object is a dense tensor in this machine's memory. */
@@ -89,13 +97,10 @@ static bool view_of_tensor(PyObject *object, view *v) {
   if (!exchange) return false;
   if (exchange->look(object, &t) != 0) return PyErr_Clear(), false;
   if (t.device_type != DLPACK_CPU) return false;
-  const bool single = t.lanes == 1, real = t.code == DLPACK_FLOAT, integer = t.code == DLPACK_INT;
-  const int type = single && real && t.bits == 32 ? FLOATS : single && integer && t.bits == 64 ? INTS : SMALL_INTS;
-  const bool known = single && ((real && t.bits == 32) || (integer && (t.bits == 64 || t.bits == 32)));
   const int64_t item = (t.bits * t.lanes + 7) / 8;
   char *data = t.data ? (char *)t.data + t.byte_offset : nothing;
   *v = (view){.data = data,
-              .type = known ? type : OTHER_TYPE,
+              .type = type_of_tensor(&t),
               .ndim = t.ndim,
               .item = item,
               .native = item && (uintptr_t)data % (uintptr_t)item == 0,
