@@ -55,6 +55,11 @@ def _describe_split(dataset: Dataset, split: str) -> dict[str, Any]:
         fields["position"] = _field(trajectory.position)
         if trajectory.stress is not None:
             fields["stress"] = _field(trajectory.stress)
+        for frame in range(trajectory.num_frames):  # one at a time: it is six numbers an element
+            tensor = dataset.cauchy_stress(split, index, frame, frame + 1)
+            if tensor is None:
+                break
+            fields["cauchy_stress"] = _field(tensor)
     return {
         "trajectories": len(nodes),
         "nodes": [min(nodes), max(nodes)],

@@ -80,8 +80,8 @@ class DatasetWriter:
         self._kind = kind
         with self._writing():
             group = self._file.create_group(name)
-            scene = {key: getattr(trajectory.scene, key) for key in ARRAYS if key not in FRAMED}
-            for key, array in {**scene, "position": trajectory.position, "stress": trajectory.stress}.items():
+            for key in ARRAYS:
+                array = getattr(trajectory if key in FRAMED else trajectory.scene, key)
                 if array is not None:
                     chunks = (1, *array.shape[1:]) if key in FRAMED else array.shape
                     group.create_dataset(key, data=array, chunks=chunks, fletcher32=True)
@@ -206,21 +206,35 @@ class Dataset:
 
     def frames(self, split: str, index: int, start: int, stop: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Frames start to stop - 1: position [stop - start, N, 3] and stress [stop - start, N or E, 1] or None."""
-        count = self.num_frames(split, index)
-        if not 0 <= start <= stop <= count:
-            raise DatasetError(f"{self._name(split, index)}: frames {start} to {stop} of {count} do not exist")
+        self._require_frames(split, index, start, stop)
         if not self._keeps(split):
             return self._read_frames(split, index, start, stop)
         key = (split, index)
         if key not in self._frames:
-            self._frames[key] = self._read_frames(split, index, 0, count)
+            self._frames[key] = self._read_frames(split, index, 0, self.num_frames(split, index))
         position, stress = self._frames[key]
         return position[start:stop], None if stress is None else stress[start:stop]
 
     def load(self, split: str, index: int) -> Trajectory:
-        """A whole trajectory."""
+        """A whole trajectory, without its `cauchy_stress`, which is large and has a method of its own."""
         position, stress = self.frames(split, index, 0, self.num_frames(split, index))
         return Trajectory(self.scene(split, index), position, stress, self.attributes(split, index))
+
+    def cauchy_stress(self, split: str, index: int, start: int = 0, stop: int | None = None) -> np.ndarray | None:
+        """Cauchy stress [stop - start, E, 6] of frames start to stop - 1; None if the trajectory has none."""
+        group, name, count = self._group(split, index), self._name(split, index), self.num_frames(split, index)
+        stop = count if stop is None else stop
+        self._require_frames(split, index, start, stop)
+        with self._file.reading(f"{split}/{index:06d}/cauchy_stress"):
+            if "cauchy_stress" not in group:
+                return None
+            array = self._file.array(group, "cauchy_stress")
+        self._require_shape(name, array, (count, self.scene(split, index).num_elements, 6))
+        with self._file.reading(f"{split}/{index:06d}/cauchy_stress"):
+            found = array[start:stop]
+        require_finite_frames(name, "cauchy_stress", "element", found, start)
+        found.flags.writeable = False
+        return found
 
     def attributes(self, split: str, index: int) -> dict[str, AttributeValue]:
         """The status and the solver's records of a trajectory."""
@@ -303,11 +317,19 @@ class Dataset:
             with self._file.reading(f"sample {split}/{index:06d}"):
                 arrays = {array: self._file.array(group, array) for array in shapes}
             for array, shape in shapes.items():
-                if arrays[array].shape != shape:
-                    found = list(arrays[array].shape)
-                    raise DatasetError(f"{name}: {array} has the shape {found}, must be {list(shape)}")
+                self._require_shape(name, arrays[array], shape)
             self._open[key] = arrays
         return self._open[key]
+
+    def _require_shape(self, name: str, array: h5py.Dataset, shape: tuple[int, ...]) -> None:
+        if array.shape != shape:
+            key = array.name.rpartition("/")[2]
+            raise DatasetError(f"{name}: {key} has the shape {list(array.shape)}, must be {list(shape)}")
+
+    def _require_frames(self, split: str, index: int, start: int, stop: int) -> None:
+        count = self.num_frames(split, index)
+        if not 0 <= start <= stop <= count:
+            raise DatasetError(f"{self._name(split, index)}: frames {start} to {stop} of {count} do not exist")
 
     def _read_frames(self, split: str, index: int, start: int, stop: int) -> tuple[np.ndarray, np.ndarray | None]:
         found: dict[str, np.ndarray] = {}
@@ -321,7 +343,7 @@ class Dataset:
 
     def _keeps(self, split: str) -> bool:
         if split not in self._kept:
-            keys = ("position",) if self.info.stress_location == "none" else FRAMED
+            keys = ("position",) if self.info.stress_location == "none" else ("position", "stress")
             sizes = (4 * math.prod(self._shape(split, i, key)) for i in range(self.splits[split]) for key in keys)
             self._kept[split] = sum(sizes) <= min(CACHE_BYTES, self._file.size)
         return self._kept[split]

@@ -25,9 +25,10 @@ ARRAYS: dict[str, tuple[type, int]] = {
     "material": (np.float32, 2),
     "position": (np.float32, 3),
     "stress": (np.float32, 3),
+    "cauchy_stress": (np.float32, 3),
 }
-OPTIONAL = ("material", "stress")
-FRAMED = ("position", "stress")
+OPTIONAL = ("material", "stress", "cauchy_stress")
+FRAMED = ("position", "stress", "cauchy_stress")
 _INTEGRATIONS = ("quasi_static", "dynamic")
 _LOCATIONS = ("none", "node", "element")
 

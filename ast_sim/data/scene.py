@@ -125,13 +125,16 @@ class Trajectory:
         position: [S, N, 3] float32.
         stress: [S, N, 1] (nodal) or [S, E, 1] (per element) float32, von Mises stress, or None.
         attributes: `status` ("complete" or "truncated") and the records of the solver, such as `seed`, `index`,
-            `solve_seconds` (a list with one entry per frame), `newton_iterations`, `min_gap`, `min_jacobian`.
+            `newton_iterations`, `min_gap`, `min_jacobian`; and `solve_seconds` (a list with one entry per frame),
+            which a generated dataset keeps in a file of its own (`ast_sim.data.seconds`).
+        cauchy_stress: [S, E, 6] float32, Cauchy stress of each element (xx, yy, zz, xy, yz, zx), or None.
     """
 
     scene: Scene
     position: np.ndarray
     stress: np.ndarray | None = None
     attributes: dict[str, AttributeValue] = field(default_factory=dict)
+    cauchy_stress: np.ndarray | None = None
 
     @property
     def num_frames(self) -> int:
@@ -152,6 +155,9 @@ class Trajectory:
         if (self.stress is None) != (stress_location == "none") and stress_location is not None:
             found = "no stress" if self.stress is None else "stress"
             raise DatasetError(f"{name}: has {found}, but stress_location is {stress_location!r}")
+        if self.cauchy_stress is not None:
+            require_array(name, "cauchy_stress", self.cauchy_stress, np.float32, (self.num_frames, e, 6))
+            require_finite_frames(name, "cauchy_stress", "element", self.cauchy_stress)
         if self.stress is None:
             return
         rows = {"node": (n,), "element": (e,), None: (n, e)}[stress_location]

@@ -31,8 +31,10 @@ def block(nx: int, ny: int, nz: int, material: np.ndarray | None = None) -> Scen
     )
 
 
-def trajectory(scene: Scene, frames: int, seed: int = 0, stress: str = "none", **attributes) -> Trajectory:
-    """A random walk of the nodes, and random stress at the location."""
+def trajectory(
+    scene: Scene, frames: int, seed: int = 0, stress: str = "none", tensor: bool = False, **attributes
+) -> Trajectory:
+    """A random walk of the nodes, and random stress at the location; with `tensor` also random Cauchy stress."""
     generator = np.random.default_rng(seed)
     steps = 0.01 * generator.standard_normal((frames, scene.num_nodes, 3))
     rows = {"none": 0, "node": scene.num_nodes, "element": scene.num_elements}[stress]
@@ -41,6 +43,7 @@ def trajectory(scene: Scene, frames: int, seed: int = 0, stress: str = "none", *
         position=(scene.rest_position + np.cumsum(steps, axis=0)).astype(np.float32),
         stress=generator.random((frames, rows, 1), np.float32) if rows else None,
         attributes={"seed": seed, **attributes},
+        cauchy_stress=generator.random((frames, scene.num_elements, 6), np.float32) if tensor else None,
     )
 
 

@@ -73,6 +73,60 @@ def test_frames_are_slices_from_memory_or_from_disk(tmp_path, monkeypatch, cache
         assert np.shares_memory(again, dataset.frames("train", 0, 0, 4)[0]) == (cache_bytes > 0)
 
 
+def tensors(tmp_path):
+    """A file whose first trajectory has the Cauchy stress of its elements and whose second has none."""
+    members = [trajectory(block(2, 1, 1), 4, 1, tensor=True), trajectory(block(2, 1, 1), 3, 2)]
+    return write(tmp_path / "d.h5", {"train": members}), members[0].cauchy_stress
+
+
+def test_cauchy_stress_is_read_by_frames_and_only_when_asked(tmp_path):
+    path, wanted = tensors(tmp_path)
+    with h5py.File(path) as file:
+        stored = file["train/000000/cauchy_stress"]
+        assert (stored.dtype.str, stored.shape, stored.chunks) == ("<f4", (4, 12, 6), (1, 12, 6))
+        assert stored.fletcher32
+    data = path.read_bytes()
+    with Dataset(path) as dataset:
+        assert np.array_equal(dataset.cauchy_stress("train", 0), wanted)
+        assert np.array_equal(dataset.cauchy_stress("train", 0, 1, 3), wanted[1:3])
+        assert not dataset.cauchy_stress("train", 0).flags.writeable
+        assert dataset.cauchy_stress("train", 1) is None
+        with pytest.raises(DatasetError, match="train/000000: frames 2 to 5 of 4 do not exist"):
+            dataset.cauchy_stress("train", 0, 2, 5)
+    start = data.index(wanted[2].tobytes())
+    path.write_bytes(data[:start] + bytes([data[start] ^ 1]) + data[start + 1 :])
+    with Dataset(path) as dataset:  # nothing else touches the damaged frame
+        assert dataset.load("train", 0).cauchy_stress is None
+        assert np.array_equal(dataset.cauchy_stress("train", 0, 0, 2), wanted[:2])
+        with pytest.raises(DatasetError, match="train/000000/cauchy_stress cannot be read; the file is damaged"):
+            dataset.cauchy_stress("train", 0)
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda a: a[1:], r"train/000000: cauchy_stress has the shape \[3, 12, 6\], must be \[4, 12, 6\]"),
+        (lambda a: a[:, :, :5], r"cauchy_stress has the shape \[4, 12, 5\]"),
+        (lambda a: a.astype(float), "cauchy_stress is float64 with 3 axes; must be float32 with 3"),
+        (lambda a: np.where(a == a[3, 7, 2], np.nan, a), "cauchy_stress in frame 3 at element 7 is not finite"),
+    ],
+)
+def test_a_hostile_cauchy_stress_is_refused_by_name(tmp_path, edit, message):
+    path, _ = tensors(tmp_path)
+    with h5py.File(path, "r+") as file:
+        replace(file["train/000000"], "cauchy_stress", edit(file["train/000000/cauchy_stress"][()]))
+    with Dataset(path) as dataset, pytest.raises(DatasetError, match=f"{path}: .*{message}"):
+        dataset.cauchy_stress("train", 0)
+
+
+def test_the_memory_of_a_hostile_cauchy_stress_is_bounded(tmp_path):
+    path, _ = tensors(tmp_path)
+    with h5py.File(path, "r+") as file:
+        declare(file, "cauchy_stress", (1 << 40, 12, 6), "f4")
+    with Dataset(path) as dataset, pytest.raises(DatasetError, match="cauchy_stress declares the shape"):
+        dataset.cauchy_stress("train", 0)
+
+
 def test_the_layout_is_the_documented_one(tmp_path):
     path = write(tmp_path / "d.h5", some("element"), stress_location="element")
     with h5py.File(path) as file:

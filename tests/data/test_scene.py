@@ -1,5 +1,7 @@
 """Scenes and trajectories: geometry by hand, and checks that name what is wrong."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from data_samples import block, trajectory
@@ -93,6 +95,8 @@ def test_a_wrong_trajectory_is_named():
     good = trajectory(block(1, 1, 1), 4, stress="node")
     position = good.position.copy()
     position[2, 5, 1] = np.inf
+    tensor = trajectory(good.scene, 4, tensor=True)
+    tensor.check("x", "none")
     cases = [
         (Trajectory(good.scene, position), "none", "position in frame 2 at node 5 is not finite"),
         (Trajectory(good.scene, good.position[:0]), "none", "at least one frame"),
@@ -106,6 +110,8 @@ def test_a_wrong_trajectory_is_named():
             "node",
             "stress in frame 0 at node 0",
         ),
+        (replace(tensor, cauchy_stress=tensor.cauchy_stress[:, :5]), "none", r"cauchy_stress has .* \[4, 5, 6\], must"),
+        (replace(tensor, cauchy_stress=tensor.cauchy_stress * np.float32(np.nan)), "none", "cauchy_stress in frame 0 at el"),
     ]
     for value, location, message in cases:
         with pytest.raises(DatasetError, match="x: .*" + message):
