@@ -26,6 +26,7 @@ import torch
 from ast_sim.data.file import Dataset
 from ast_sim.data.graph import Graph
 from ast_sim.data.scene import NodeType, Scene, Trajectory
+from ast_sim.data.seconds import processor, read_seconds
 from ast_sim.errors import DatasetError
 from ast_sim.measures import SquaredError, rmse_pooled, rmse_sequence
 from ast_sim.model.simulator import Simulator
@@ -49,7 +50,8 @@ def evaluate(
     Returns:
         `samples`: for each scene its name, nodes, frames, errors (root mean square, in `displacement` and `stress`
         by predictor, horizon and nodes) and seconds per step of model and solver; `summary`: for each predictor
-        `rmse_sequence` and `rmse_pooled` of the same; `speedup`: the solver's time over the model's; units; threads.
+        `rmse_sequence` and `rmse_pooled` of the same; `speedup`: the solver's time over the model's, None where the
+        solver's is not known; units; threads.
 
     Raises:
         DatasetError: the split is empty.
@@ -60,6 +62,7 @@ def evaluate(
     model.eval()
     constant = _training_stress(dataset) if model.config.stress != "none" else None
     samples, displacement, stress = [], [], []
+    seconds = read_seconds(dataset)
     for index in range(count):
         name = f"{split}/{index:06d}"
         truth = dataset.load(split, index)
@@ -68,7 +71,8 @@ def evaluate(
         displacement.append(displacement_errors(truth, one_step[0], result))
         if constant is not None:
             stress.append(stress_errors(truth, one_step[1], result, constant, model.config.stress))
-        samples.append(_sample(name, truth, result, displacement[-1], stress[-1] if stress else None))
+        solver = seconds.get(name, truth.attributes.get("solve_seconds"))
+        samples.append(_sample(name, truth, result, displacement[-1], stress[-1] if stress else None, solver))
         if progress is not None:
             progress(name)
     summary = summarize(displacement, "displacement")
@@ -210,8 +214,15 @@ def _number(value: float) -> float | None:
 
 
 def _sample(
-    name: str, truth: Trajectory, result: Rollout, displacement: Errors, stress: Errors | None
+    name: str,
+    truth: Trajectory,
+    result: Rollout,
+    displacement: Errors,
+    stress: Errors | None,
+    solver: list[float] | None,
 ) -> dict[str, Any]:
+    """What is told of one scene; `solver`: the solver's seconds a frame, None where they are not known."""
+
     def values(errors: Errors) -> dict[str, Any]:
         return {
             predictor: {
@@ -221,7 +232,6 @@ def _sample(
         }
 
     steps = truth.num_frames - result.given
-    solver = truth.attributes.get("solve_seconds")
     return {
         "name": name,
         "nodes": truth.scene.num_nodes,
@@ -270,7 +280,9 @@ def table(found: dict[str, Any]) -> str:
             lines.append(f"  {predictor:18}" + "".join(f"{cell:>24}" for cell in shown))
         lines.append("")
     lines.append(f"{len(found['samples'])} scenes, {found['failures']} failed, on {found['threads']} threads")
-    if found["speedup"] is not None:
+    if all(sample["solver_seconds_per_step"] is None for sample in found["samples"]):
+        lines.append("speed against the solver: unknown, there are no seconds of it on these scenes")
+    elif found["speedup"] is not None:
         lines.append(f"{found['speedup']:.3g} times as fast as the solver on the same scenes")
     return "\n".join(lines)
 
@@ -290,7 +302,7 @@ def provenance(command: str) -> dict[str, Any]:
     return {
         "command": command,
         "commit": _commit(),
-        "processor": _processor(),
+        "processor": processor(),
         "cores": os.cpu_count(),
         "versions": versions,
     }
@@ -308,12 +320,3 @@ def _commit() -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return found.stdout.strip()
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()

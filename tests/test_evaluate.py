@@ -11,6 +11,7 @@ from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim.data.file import Dataset, DatasetWriter
 from ast_sim.data.scene import NodeType, Scene, Trajectory
+from ast_sim.data.seconds import write_seconds
 from ast_sim.errors import DatasetError
 from ast_sim.evaluate import (
     displacement_errors,
@@ -197,6 +198,29 @@ def test_the_figures_are_json_and_a_readable_table(evaluated):
     row = next(line for line in lines if line.startswith("  hold_still"))
     assert row.endswith(f"{hold['rmse_sequence']:.4g} / {hold['rmse_pooled']:.4g}")
     assert sum(line.startswith("  ast") for line in lines) == 3
+
+
+def test_the_solvers_seconds_beside_the_dataset_count_and_without_them_the_speed_is_unknown(tmp_path):
+    def speed(path):
+        with Dataset(path) as dataset:
+            model = toy.LinearSimulator(toy.config(dataset.info))
+            model.motion_normalizer.scale.fill_(1e-3)
+            return evaluate(model, dataset, "test")
+
+    path = tmp_path / "toy.h5"
+    plate = toy.plate()
+    del plate.attributes["solve_seconds"]
+    with DatasetWriter(path, toy.info()) as writer:
+        writer.add("train", plate)
+        writer.add("test", plate)
+    unknown = speed(path)
+    assert unknown["speedup"] is None and unknown["samples"][0]["solver_seconds_per_step"] is None
+    assert table(unknown).endswith("speed against the solver: unknown, there are no seconds of it on these scenes")
+    write_seconds(path, toy.info().generator, {"test/000000": {"solve_seconds": [0.0] + [3.0] * 6}})
+    known = speed(path)
+    (sample,) = known["samples"]
+    assert sample["solver_seconds_per_step"] == 3.0
+    assert known["speedup"] == pytest.approx(3.0 / sample["model_seconds_per_step"])
 
 
 def test_an_empty_split_is_an_error(tmp_path):
