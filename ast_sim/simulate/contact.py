@@ -8,6 +8,8 @@ the next, hence the pinned version and this module alone.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from ast_sim.errors import MissingExtra, SimulationError, require
@@ -15,6 +17,36 @@ from ast_sim.errors import MissingExtra, SimulationError, require
 IPCTK_VERSION = "1.5"
 # Candidate pairs stay valid while no vertex has moved further than this share of dhat from where they were collected.
 SKIN = 1.0
+# Slip per load step, in units of dhat, from which Coulomb friction is fully mobilised; below it a contact sticks.
+STICKING_SLIP = 0.1
+
+
+@dataclass(frozen=True)
+class ContactSettings:
+    """How surfaces act on each other; fixed for a dataset and stored with it.
+
+    Attributes:
+        dhat: distance in metres below which surfaces repel each other.
+        stiffness: barrier stiffness in pascal, about Young's modulus.
+        friction: Coulomb's coefficient; without friction none of its terms are computed.
+        self_contact: whether a body is held apart from itself. Nodes that do not share an element must then be
+            further apart than dhat at rest, in obstacles too.
+
+    Raises:
+        SimulationError: values that cannot be.
+    """
+
+    dhat: float
+    stiffness: float
+    friction: float = 0.0
+    self_contact: bool = False
+
+    def __post_init__(self) -> None:
+        if not (self.dhat > 0 and self.stiffness > 0 and self.friction >= 0):
+            raise SimulationError(
+                "contact needs a distance dhat and a stiffness above 0 and a friction of at least 0:"
+                f" got {self.dhat}, {self.stiffness}, {self.friction}"
+            )
 
 
 def load_ipctk():
@@ -43,7 +75,7 @@ def self_test() -> None:
     tetrahedron = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.3, 1]])
     position = np.concatenate([tetrahedron, [0.05, 0.1, 1.05] + tetrahedron @ np.diag([1, 1, 0.5])])
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
-    contact = Contact(position, np.concatenate([faces, faces + 4]), np.repeat([0, 1], 4), dhat=0.1, stiffness=3.0)
+    contact = Contact(position, np.concatenate([faces, faces + 4]), np.repeat([0, 1], 4), ContactSettings(0.1, 3.0))
 
     def state(shift: np.ndarray) -> ContactState:
         contact.collision_free_fraction(position, position + shift)
@@ -59,40 +91,47 @@ def self_test() -> None:
 
 
 class Contact:
-    """Frictionless contact between bodies whose surfaces are triangles.
+    """Contact between bodies whose surfaces are triangles, with friction and with themselves if the settings say so.
 
-    Pairs of the same body are left out: a body that touches itself is not held apart, but `intersects` finds it.
+    Without self-contact, pairs of the same body are left out: a body that touches itself is not held apart, but
+    `intersects` finds it.
 
     Args:
         rest: rest positions [N,3] in metres.
         faces: surface triangles [F,3], normals pointing out.
         body: body of each node [N].
-        dhat: distance in metres below which surfaces repel each other.
-        stiffness: barrier stiffness in pascal, about Young's modulus.
+        settings: distance, stiffness and friction.
     """
 
-    def __init__(self, rest: np.ndarray, faces: np.ndarray, body: np.ndarray, dhat: float, stiffness: float) -> None:
+    def __init__(self, rest: np.ndarray, faces: np.ndarray, body: np.ndarray, settings: ContactSettings) -> None:
         self._ipctk = ipctk = load_ipctk()
-        self.dhat, self.stiffness = dhat, stiffness
+        self.settings = settings
         self.num_nodes = len(rest)
         self.nodes, local_faces = np.unique(faces, return_inverse=True)
         local_faces = np.asfortranarray(local_faces.reshape(-1, 3), dtype=np.int32)
         vertices, edges = self._vertices(rest), ipctk.edges(local_faces)
         self._mesh = ipctk.CollisionMesh(vertices, edges, local_faces)
-        self._mesh.can_collide = ipctk.VertexPatchesCanCollide(body[self.nodes].astype(np.int32))
+        if not settings.self_contact:
+            self._mesh.can_collide = ipctk.VertexPatchesCanCollide(body[self.nodes].astype(np.int32))
         self._whole_mesh = ipctk.CollisionMesh(vertices, edges, local_faces)
-        self._potential = ipctk.BarrierPotential(dhat, True)
+        self._barrier = ipctk.BarrierPotential(settings.dhat, True)
         self._broad_phase, self._ccd = ipctk.LBVH(), ipctk.AdditiveCCD()
-        self._candidates = ipctk.Candidates()
-        self._reference = np.full_like(vertices, np.inf)
         self._dofs = (3 * self.nodes[:, None] + np.arange(3)).ravel()
+        self._friction = ipctk.FrictionPotential(STICKING_SLIP * settings.dhat)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget candidate pairs and friction: what follows depends on positions alone, not on the way to them."""
+        self._candidates = self._ipctk.Candidates()
+        self._reference = np.full((len(self.nodes), 3), np.inf)
+        self._sliding: tuple[object, np.ndarray] | None = None
 
     def _vertices(self, position: np.ndarray) -> np.ndarray:
         return np.asfortranarray(position[self.nodes])
 
     def _is_near_reference(self, vertices: np.ndarray) -> bool:
         difference = vertices - self._reference
-        return np.einsum("ij,ij->i", difference, difference).max() <= (SKIN * self.dhat) ** 2
+        return np.einsum("ij,ij->i", difference, difference).max() <= (SKIN * self.settings.dhat) ** 2
 
     def _collect(self, start: np.ndarray, end: np.ndarray) -> None:
         """Make the candidate pairs hold all that can come closer than dhat on the straight way from start to end.
@@ -102,7 +141,7 @@ class Contact:
         """
         if self._is_near_reference(start) and self._is_near_reference(end):
             return
-        self._candidates.build(self._mesh, start, end, (0.5 + SKIN) * self.dhat, self._broad_phase)
+        self._candidates.build(self._mesh, start, end, (0.5 + SKIN) * self.settings.dhat, self._broad_phase)
         self._reference = end
 
     def collision_free_fraction(self, start: np.ndarray, end: np.ndarray) -> float:
@@ -115,8 +154,19 @@ class Contact:
         """Pairs closer than dhat at positions [N,3] on the step last given to `collision_free_fraction`."""
         vertices = self._vertices(position)
         collisions = self._new_collisions()
-        collisions.build(self._candidates, self._mesh, vertices, self.dhat)
+        collisions.build(self._candidates, self._mesh, vertices, self.settings.dhat)
         return ContactState(self, collisions, vertices)
+
+    def lag_friction(self, state: ContactState, start: np.ndarray) -> None:
+        """Let friction act from now on, with the normal forces and tangents of `state`, against motion from `start`.
+
+        Normal forces that change with the unknown positions would have no potential; lagged ones have (Li et al. 2020,
+        section 5). The states that follow hold the friction, those before do not.
+        """
+        pairs = self._ipctk.TangentialCollisions()
+        stiffness, friction = self.settings.stiffness, self.settings.friction
+        pairs.build(self._mesh, state.vertices, state.collisions, self._barrier, stiffness, friction)
+        self._sliding = pairs, self._vertices(start)
 
     def _new_collisions(self):
         collisions = self._ipctk.NormalCollisions()
@@ -129,39 +179,77 @@ class Contact:
         return self._ipctk.has_intersections(self._whole_mesh, self._vertices(position), self._broad_phase)
 
     def gap(self, position: np.ndarray) -> float:
-        """Distance between the closest two bodies, in metres; infinite for a single body."""
+        """Distance in metres between the closest two surfaces that are held apart; infinite if there are none."""
         vertices = self._vertices(position)
-        radius, extent = self.dhat, np.linalg.norm(np.ptp(vertices, axis=0))
+        radius, extent = self.settings.dhat, np.linalg.norm(np.ptp(vertices, axis=0))
         collisions = self._new_collisions()
         while collisions.empty() and radius < 8 * extent:
             collisions.build(self._mesh, vertices, radius, 0.0, self._broad_phase)
             radius *= 4
         return float(np.sqrt(collisions.compute_minimum_distance(self._mesh, vertices)))  # ipctk gives its square
 
+    def area(self, state: ContactState) -> float:
+        """Rest area in square metres around the surface nodes that a barrier acts on, the mean of both sides."""
+        touched = np.abs(state.barrier_gradient()).max(axis=1) > 0
+        return 0.5 * float(np.asarray(self._mesh.vertex_areas)[touched].sum())
+
 
 class ContactState:
-    """The pairs in contact at one position and the derivatives of their barrier potential."""
+    """The pairs in contact at one position, and the derivatives of their barrier and of friction if it acts.
+
+    Args:
+        contact: what holds surfaces apart.
+        collisions: ipctk's pairs closer than dhat.
+        vertices: [V,3] positions of the surface nodes.
+    """
 
     def __init__(self, contact: Contact, collisions, vertices: np.ndarray) -> None:
-        self._contact, self._collisions, self._vertices = contact, collisions, vertices
+        self._contact, self.collisions, self.vertices = contact, collisions, vertices
+        self._sliding = contact._sliding
 
     @property
     def is_empty(self) -> bool:
-        """Whether no pair is closer than dhat."""
-        return self._collisions.empty()
+        """Whether no pair is closer than dhat and no friction acts."""
+        return self.collisions.empty() and self._sliding is None
 
     def energy(self) -> float:
+        """Barrier energy and the lagged potential of friction, in joule."""
+        if self._sliding is None:
+            return self.barrier_energy()
+        contact, (pairs, start) = self._contact, self._sliding
+        return self.barrier_energy() + contact._friction(pairs, contact._mesh, self.vertices - start)
+
+    def barrier_energy(self) -> float:
         """Barrier energy in joule."""
         contact = self._contact
-        return contact.stiffness * contact._potential(self._collisions, contact._mesh, self._vertices)
+        return contact.settings.stiffness * contact._barrier(self.collisions, contact._mesh, self.vertices)
+
+    def dissipation(self) -> float:
+        """Work in joule that friction has taken since the positions from which it acts."""
+        if self._sliding is None:
+            return 0.0
+        return float(np.vdot(self.friction_gradient(), self.vertices - self._sliding[1]))
+
+    def barrier_gradient(self) -> np.ndarray:
+        """Derivative of the barrier energy by the positions of the surface nodes [V,3], in newton."""
+        if self.collisions.empty():
+            return np.zeros(self.vertices.shape)
+        contact = self._contact
+        gradient = contact._barrier.gradient(self.collisions, contact._mesh, self.vertices)
+        return contact.settings.stiffness * gradient.reshape(-1, 3)
+
+    def friction_gradient(self) -> np.ndarray:
+        """Derivative of the potential of friction by the positions of the surface nodes [V,3], in newton."""
+        if self._sliding is None:
+            return np.zeros(self.vertices.shape)
+        contact, (pairs, start) = self._contact, self._sliding
+        return contact._friction.gradient(pairs, contact._mesh, self.vertices - start).reshape(-1, 3)
 
     def gradient(self) -> np.ndarray:
         """Derivative of the energy by the positions [N,3], in newton: minus the contact force on each node."""
-        contact = self._contact
-        result = np.zeros((contact.num_nodes, 3))
+        result = np.zeros((self._contact.num_nodes, 3))
         if not self.is_empty:
-            local = contact._potential.gradient(self._collisions, contact._mesh, self._vertices)
-            result[contact.nodes] = contact.stiffness * local.reshape(-1, 3)
+            result[self._contact.nodes] = self.barrier_gradient() + self.friction_gradient()
         return result
 
     def hessian(self, project: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -171,10 +259,19 @@ class ContactState:
             project: make each pair's block positive semi-definite.
         """
         contact = self._contact
-        if self.is_empty:
-            return np.zeros(0, int), np.zeros(0, int), np.zeros(0)
         method = contact._ipctk.PSDProjectionMethod
-        local = contact._potential.hessian(
-            self._collisions, contact._mesh, self._vertices, method.CLAMP if project else method.NONE
-        ).tocoo()
-        return contact._dofs[local.row], contact._dofs[local.col], contact.stiffness * local.data
+        method = method.CLAMP if project else method.NONE
+        parts = []
+        if not self.collisions.empty():
+            barrier = contact._barrier.hessian(self.collisions, contact._mesh, self.vertices, method)
+            parts.append((barrier, contact.settings.stiffness))
+        if self._sliding is not None:
+            pairs, start = self._sliding
+            parts.append((contact._friction.hessian(pairs, contact._mesh, self.vertices - start, method), 1.0))
+        if not parts:
+            return np.zeros(0, int), np.zeros(0, int), np.zeros(0)
+        local = [(matrix.tocoo(), scale) for matrix, scale in parts]
+        rows = np.concatenate([matrix.row for matrix, _ in local])
+        columns = np.concatenate([matrix.col for matrix, _ in local])
+        values = np.concatenate([scale * matrix.data for matrix, scale in local])
+        return contact._dofs[rows], contact._dofs[columns], values

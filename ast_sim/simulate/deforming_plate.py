@@ -7,22 +7,24 @@ Every draw comes from the generator that is passed in, in a fixed order.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ast_sim.data.file import DatasetInfo
 from ast_sim.data.scene import NodeType, Scene, Trajectory
 from ast_sim.simulate import mesh
+from ast_sim.simulate.case import SolidCase
+from ast_sim.simulate.checkpoint import Checkpoint
+from ast_sim.simulate.contact import ContactSettings
 from ast_sim.simulate.material import NeoHookean
-from ast_sim.simulate.solver import SolverSettings
 from ast_sim.simulate.trajectory import quasi_static
 
 FRAMES = 41
 DEFAULT_NODES = 400
 MINIMUM_NODES = 80
 MATERIAL = NeoHookean(young=1e6, poisson=0.4)
-DHAT = 1e-3
+CONTACT = ContactSettings(dhat=1e-3, stiffness=MATERIAL.young)
 CLAMP_MARGIN = 0.05  # metres that the obstacle stays away from the clamps, seen from above
 SHAPES = ("ball", "cylinder", "block")
 INFO = DatasetInfo(
@@ -36,21 +38,19 @@ INFO = DatasetInfo(
 )
 
 
-def simulate(
-    rng: np.random.Generator, nodes: int = DEFAULT_NODES, settings: SolverSettings | None = None
-) -> Trajectory:
+def simulate(rng: np.random.Generator, nodes: int = DEFAULT_NODES, checkpoint: Checkpoint | None = None) -> Trajectory:
     """Draw a scene and solve it.
 
     Args:
         rng: where all draws come from.
         nodes: about how many nodes the scene has, obstacle included.
-        settings: tolerances of the solver.
+        checkpoint: where unfinished frames are kept.
     """
     case = draw(rng, nodes)
     obstacle = (case.scene.body == 1)[:, None]
     targets = np.where(obstacle, case.scene.rest_position + case.travel[:, None, :], case.scene.rest_position)
-    trajectory = quasi_static(case.scene, targets, MATERIAL, DHAT, settings)
-    return replace(trajectory, attributes={**trajectory.attributes, "obstacle": case.shape})
+    solid = SolidCase(case.scene, targets, MATERIAL, CONTACT, INFO.stress_location, {"obstacle": case.shape})
+    return quasi_static(solid, checkpoint=checkpoint)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ast_sim.errors import SimulationError
-from ast_sim.simulate.material import NeoHookean, cofactor, determinant, von_mises
+from ast_sim.simulate.material import NeoHookean, cofactor, determinant
 
 # The 78 entries (p, q), p <= q, of an element's symmetric 12 x 12 stiffness; p = 3 a + i for component i of node a.
 _ROW, _COLUMN = np.triu_indices(12)
@@ -22,13 +22,17 @@ _ENTRY[_ROW, _COLUMN] = _ENTRY[_COLUMN, _ROW] = np.arange(len(_ROW))
 _SWAPPED = _ENTRY[3 * (_COLUMN // 3) + _ROW % 3, 3 * (_ROW // 3) + _COLUMN % 3]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Deformation:
-    """Deformation gradients F [3,3,E], their determinants J [E] and cofactors J F^-T [3,3,E]."""
+    """Deformation gradients F [3,3,E], their determinants J [E], cofactors J F^-T [3,3,E] and the energy in joule.
+
+    The energy is infinite if an element is inverted.
+    """
 
     F: np.ndarray
     J: np.ndarray
     cofactor: np.ndarray
+    energy: float
 
 
 class Elasticity:
@@ -58,35 +62,41 @@ class Elasticity:
         self._constant = material.mu * self.volume * dot[_ROW // 3, _COLUMN // 3] * same_component[:, None]  # [78, E]
 
     @property
-    def force_per_stress(self) -> float:
-        """Mean nodal force of an element under a stress of one pascal, in m^2: a scale for residuals."""
-        return float(np.mean(self.volume * np.abs(self.gradients)))
+    def unit_force(self) -> float:
+        """Mean nodal force of an element under a stress of Young's modulus, in newton: a scale for residuals."""
+        return float(np.mean(self.material.young * self.volume * np.abs(self.gradients)))
 
-    def deformation(self, position: np.ndarray) -> Deformation:
-        """F, J and cofactors at positions [N,3]."""
+    @property
+    def unit_energy(self) -> float:
+        """Energy in joule at an energy density of Young's modulus: a scale for rounding."""
+        return float(np.sum(self.material.young * self.volume))
+
+    def lumped_volume(self) -> np.ndarray:
+        """[N] volume around each node in m^3: a quarter of each of its elements."""
+        return np.bincount(self._nodes.ravel(), np.tile(self.volume / 4, 4), minlength=self.num_nodes)
+
+    def evaluate(self, position: np.ndarray) -> Deformation:
+        """F, J, cofactors and energy at positions [N,3]."""
         x = position.T[:, self._nodes]  # [3, 4, E]
         F = np.einsum("iae,aje->ije", x, self.gradients)
         cofactors = cofactor(F)
-        return Deformation(F, determinant(F, cofactors), cofactors)
-
-    def energy(self, deformation: Deformation) -> float:
-        """Elastic energy in joule; infinite if an element is inverted."""
-        if deformation.J.min() <= 0:
-            return np.inf
-        return float(self.volume @ self.material.energy_density(deformation.F, deformation.J))
+        J = determinant(F, cofactors)
+        energy = np.inf if J.min() <= 0 else float(self.volume @ self.material.energy_density(F, J))
+        return Deformation(F, J, cofactors, energy)
 
     def element_forces(self, deformation: Deformation) -> np.ndarray:
         """Derivative of each element's energy by its nodes [12,E], V P grad N_a, in newton."""
         P = self.material.first_piola(deformation.F, deformation.J, deformation.cofactor / deformation.J)
         return np.einsum("ije,aje->aie", P * self.volume, self.gradients).reshape(12, -1)
 
-    def assemble(self, element_forces: np.ndarray) -> np.ndarray:
-        """Sum of element forces [12,E] at the nodes [N,3]: the gradient of the energy."""
-        total = np.bincount(self._dofs.ravel(), element_forces.ravel(), minlength=3 * self.num_nodes)
-        return total.reshape(-1, 3)
+    def gradient(self, deformation: Deformation) -> tuple[np.ndarray, float]:
+        """Derivative of the energy by the positions [N,3], in newton, and the mean magnitude of an element's forces."""
+        forces = self.element_forces(deformation)
+        total = np.bincount(self._dofs.ravel(), forces.ravel(), minlength=3 * self.num_nodes)
+        return total.reshape(-1, 3), float(np.abs(forces).mean())
 
-    def stiffness(self, deformation: Deformation, project: bool = False) -> np.ndarray:
-        """Second derivative of each element's energy as its 78 upper entries [78,E].
+    def hessian(self, deformation: Deformation, project: bool = False) -> np.ndarray:
+        """Second derivative of each element's energy as its 78 upper entries [78 E], entry by entry.
 
         With g_a = F^-T grad N_a the block of nodes a, b is
 
@@ -107,15 +117,35 @@ class Elasticity:
         products *= self.volume * self.material.lam * J * J
         entries += products
         entries += self._constant
-        return _project(entries) if project else entries
+        if project:
+            indefinite = self._may_be_indefinite(deformation)
+            entries[:, indefinite] = _project(entries[:, indefinite])
+        return entries.ravel()
 
     def entry_dofs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Global degrees of freedom (3 node + component) of the rows and columns of `stiffness`, [78,E] each."""
-        return self._dofs[_ROW], self._dofs[_COLUMN]
+        """Global degrees of freedom (3 node + component) of the rows and columns of `hessian`, [78 E] each."""
+        return self._dofs[_ROW].ravel(), self._dofs[_COLUMN].ravel()
 
-    def von_mises(self, deformation: Deformation) -> np.ndarray:
-        """Von Mises stress of each element [E] in pascal."""
-        return von_mises(self.material.cauchy(deformation.F, deformation.J))
+    def _may_be_indefinite(self, deformation: Deformation) -> np.ndarray:
+        """[E] bool: whether d2 psi / dF2 has a negative eigenvalue.
+
+        For an isotropic psi of the singular values s_i of F these are mu -+ c s_k / J (flips and twists of the two
+        others) and those of A_ij = d2 psi / ds_i ds_j (Smith et al. 2019), here with c = `pressure_factor`:
+
+            A_ij = delta_ij (mu - c / s_i^2) + lambda J^2 / (s_i s_j)
+        """
+        material, J = self.material, deformation.J
+        c = material.pressure_factor(J)
+        squares = np.linalg.eigvalsh(np.einsum("kie,kje->eij", deformation.F, deformation.F))  # ascending, [E, 3]
+        inverse = 1 / np.sqrt(squares)
+        A = (material.lam * J * J)[:, None, None] * inverse[:, :, None] * inverse[:, None, :]
+        A[:, range(3), range(3)] += np.reshape(material.mu, (-1, 1)) - c[:, None] / squares
+        flip = material.mu - np.abs(c) * np.sqrt(squares[:, 2]) / J
+        return np.minimum(flip, np.linalg.eigvalsh(A)[:, 0]) < 0
+
+    def cauchy(self, deformation: Deformation) -> np.ndarray:
+        """True stress of each element [3,3,E] in pascal."""
+        return self.material.cauchy(deformation.F, deformation.J)
 
     def nodal_mean(self, element_values: np.ndarray) -> np.ndarray:
         """Volume-weighted mean [N] of the values [E] of the elements around each node; 0 for nodes without elements."""

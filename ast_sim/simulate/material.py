@@ -35,30 +35,41 @@ def determinant(F: np.ndarray, cofactors: np.ndarray) -> np.ndarray:
     return F[0, 0] * cofactors[0, 0] + F[0, 1] * cofactors[0, 1] + F[0, 2] * cofactors[0, 2]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class NeoHookean:
-    """Ciarlet's material with Young's modulus `young` in pascal and Poisson's ratio `poisson`.
+    """Ciarlet's material with Young's modulus `young` in pascal and Poisson's ratio `poisson`: numbers or [E] arrays.
 
     Raises:
         SimulationError: constants outside 0 < young, 0 <= poisson < 1/2.
     """
 
-    young: float
-    poisson: float
+    young: float | np.ndarray
+    poisson: float | np.ndarray
 
     def __post_init__(self) -> None:
-        if not (self.young > 0 and 0 <= self.poisson < 0.5):
+        young, poisson = np.broadcast_arrays(self.young, self.poisson)
+        wrong = ~((young > 0) & (poisson >= 0) & (poisson < 0.5))
+        if wrong.any():
             raise SimulationError(
-                f"Young's modulus must be positive and Poisson's ratio in [0, 0.5): got {self.young}, {self.poisson}"
+                "Young's modulus must be positive and Poisson's ratio in [0, 0.5):"
+                f" got {young[wrong].flat[0]}, {poisson[wrong].flat[0]}"
             )
 
+    def of(self, elements: np.ndarray) -> NeoHookean:
+        """The material of some of the elements, given by a mask or by their numbers."""
+        if np.ndim(self.young) == np.ndim(self.poisson) == 0:
+            return self
+        count = max(np.size(self.young), np.size(self.poisson))
+        young, poisson = (np.broadcast_to(value, count)[elements] for value in (self.young, self.poisson))
+        return NeoHookean(young, poisson)
+
     @property
-    def mu(self) -> float:
+    def mu(self) -> float | np.ndarray:
         """Shear modulus, the second Lame constant."""
         return self.young / (2 * (1 + self.poisson))
 
     @property
-    def lam(self) -> float:
+    def lam(self) -> float | np.ndarray:
         """First Lame constant."""
         return self.young * self.poisson / ((1 + self.poisson) * (1 - 2 * self.poisson))
 

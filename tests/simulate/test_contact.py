@@ -6,7 +6,7 @@ import pytest
 from ast_sim.errors import MissingExtra, SimulationError
 from ast_sim.simulate import contact as contact_module
 from ast_sim.simulate import mesh
-from ast_sim.simulate.contact import Contact
+from ast_sim.simulate.contact import Contact, ContactSettings
 
 DHAT = 1e-3
 
@@ -40,7 +40,7 @@ CASES = {
 def test_derivatives_match_central_differences(name):
     gap, make = CASES[name]
     rest, faces, body = two_bodies(gap, make and make())
-    contact = Contact(rest, faces, body, DHAT, 1e6)
+    contact = Contact(rest, faces, body, ContactSettings(DHAT, 1e6))
     state = state_at(contact, rest)
     assert state.energy() > 0
     gradient = state.gradient()
@@ -63,7 +63,7 @@ def test_derivatives_match_central_differences(name):
 
 def test_contact_forces_are_opposite_and_push_apart():
     rest, faces, body = two_bodies(0.4e-3)
-    gradient = state_at(Contact(rest, faces, body, DHAT, 1e6), rest).gradient()
+    gradient = state_at(Contact(rest, faces, body, ContactSettings(DHAT, 1e6)), rest).gradient()
     on_plate, on_ball = (-gradient[body == b].sum(axis=0) for b in (0, 1))
     np.testing.assert_allclose(on_plate, -on_ball, atol=1e-9 * np.abs(on_ball).max())
     assert on_ball[2] > 0
@@ -71,7 +71,7 @@ def test_contact_forces_are_opposite_and_push_apart():
 
 def test_projected_hessian_is_positive_semi_definite():
     rest, faces, body = two_bodies(0.4e-3)
-    rows, columns, values = state_at(Contact(rest, faces, body, DHAT, 1e6), rest).hessian(project=True)
+    rows, columns, values = state_at(Contact(rest, faces, body, ContactSettings(DHAT, 1e6)), rest).hessian(project=True)
     touched, numbers = np.unique([rows, columns], return_inverse=True)
     hessian = np.zeros((len(touched), len(touched)))
     np.add.at(hessian, tuple(numbers.reshape(2, -1)), values)
@@ -81,7 +81,7 @@ def test_projected_hessian_is_positive_semi_definite():
 
 def test_steps_stop_before_surfaces_meet():
     rest, faces, body = two_bodies(5e-3)
-    contact = Contact(rest, faces, body, DHAT, 1e6)
+    contact = Contact(rest, faces, body, ContactSettings(DHAT, 1e6))
     end = rest - np.where(body == 1, 0.02, 0)[:, None] * [0, 0, 1]
     fraction = contact.collision_free_fraction(rest, end)
     assert 0.6 * 0.25 < fraction < 0.25  # surfaces would meet after 5 of 20 mm
@@ -92,7 +92,7 @@ def test_steps_stop_before_surfaces_meet():
 
 def test_kept_candidates_find_the_same_pairs_as_a_new_search():
     rest, faces, body = two_bodies(0.8e-3)
-    kept = Contact(rest, faces, body, DHAT, 1e6)
+    kept = Contact(rest, faces, body, ContactSettings(DHAT, 1e6))
     kept.collision_free_fraction(rest, rest)
     generator = np.random.default_rng(0)
     for _ in range(20):
@@ -100,7 +100,7 @@ def test_kept_candidates_find_the_same_pairs_as_a_new_search():
         shift *= 0.99 * DHAT / np.linalg.norm(shift, axis=1, keepdims=True)
         position = rest + 0.3 * shift - np.where(body == 1, 0.3e-3, 0)[:, None] * [0, 0, 1]
         kept.collision_free_fraction(rest, position)
-        fresh = Contact(rest, faces, body, DHAT, 1e6)
+        fresh = Contact(rest, faces, body, ContactSettings(DHAT, 1e6))
         expected = state_at(fresh, position)
         assert kept.at(position).energy() == pytest.approx(expected.energy(), rel=1e-12)
         assert expected.energy() > 0
@@ -109,12 +109,12 @@ def test_kept_candidates_find_the_same_pairs_as_a_new_search():
 def test_gap_is_a_distance():
     for gap in (0.3e-3, 4e-3, 0.08):
         rest, faces, body = two_bodies(gap)
-        assert Contact(rest, faces, body, DHAT, 1e6).gap(rest) == pytest.approx(gap, rel=1e-9)
+        assert Contact(rest, faces, body, ContactSettings(DHAT, 1e6)).gap(rest) == pytest.approx(gap, rel=1e-9)
 
 
 def test_intersections_are_found_between_bodies_and_within_one():
     rest, faces, body = two_bodies(1e-4)
-    contact = Contact(rest, faces, body, DHAT, 1e6)
+    contact = Contact(rest, faces, body, ContactSettings(DHAT, 1e6))
     assert not contact.intersects(rest)
     assert contact.intersects(rest - np.where(body == 1, 2e-4, 0)[:, None] * [0, 0, 1])
     folded = rest.copy()

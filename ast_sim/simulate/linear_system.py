@@ -1,0 +1,196 @@
+"""The sparse system of a Newton step: assembled into a pattern that is kept, factorised by Cholesky.
+
+Elements couple the same unknowns at all times; contact couples more as it spreads. The pattern holds the entries of
+the elements and of every contact since the last `restart`: while no new ones come the symbolic factorization serves
+again. PARDISO (of MKL) factorises where it is installed, CHOLMOD (of cholespy) elsewhere; both with one thread, and
+both report a matrix that is not positive definite.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import weakref
+from typing import Protocol
+
+import numpy as np
+import scipy.sparse
+
+from ast_sim.errors import MissingExtra, SimulationError, require
+
+
+class Factorization(Protocol):
+    """Cholesky factorization of symmetric matrices that are given by their upper triangles."""
+
+    name: str
+
+    def factorise(self, upper: scipy.sparse.csr_array, is_new_pattern: bool) -> bool:
+        """Factorise; False if the matrix is not positive definite."""
+
+    def solve(self, right_side: np.ndarray) -> np.ndarray:
+        """Solution for the matrix last factorised."""
+
+
+class Pardiso:
+    """PARDISO in Intel's MKL; the symbolic factorization is made for new patterns only."""
+
+    _NOT_POSITIVE_DEFINITE = -4
+
+    def __init__(self) -> None:
+        # One thread, and no OpenMP runtime beside that of another library; the same bits wherever arrays lie.
+        for name, value in (("MKL_THREADING_LAYER", "SEQUENTIAL"), ("MKL_CBWR", "AVX2")):
+            os.environ.setdefault(name, value)
+        (pypardiso,) = require("simulate", "pypardiso")
+        self._error = pypardiso.pardiso_wrapper.PyPardisoError
+        self._solver = pypardiso.PyPardisoSolver(mtype=2)  # real, symmetric, positive definite
+        weakref.finalize(self, self._solver.free_memory, everything=True)  # MKL keeps the factor until it is told
+        self.name = f"PARDISO of MKL {importlib.metadata.version('mkl')}"
+
+    def factorise(self, upper: scipy.sparse.csr_array, is_new_pattern: bool) -> bool:
+        self._matrix, nothing = upper, np.zeros(upper.shape[0])
+        try:
+            for phase in (11, 22) if is_new_pattern else (22,):
+                self._solver.set_phase(phase)
+                self._solver._call_pardiso(upper, nothing)
+        except self._error as error:
+            if error.value == self._NOT_POSITIVE_DEFINITE:
+                return False
+            raise SimulationError(f"PARDISO failed with error {error.value} ({upper.shape[0]} unknowns)") from error
+        return True
+
+    def solve(self, right_side: np.ndarray) -> np.ndarray:
+        self._solver.set_phase(33)
+        return self._solver._call_pardiso(self._matrix, right_side)
+
+
+class Cholmod:
+    """CHOLMOD through cholespy, which factorises symbolically each time."""
+
+    name = "CHOLMOD (cholespy)"
+
+    def __init__(self) -> None:
+        (self._cholespy,) = require("simulate", "cholespy")
+
+    def factorise(self, upper: scipy.sparse.csr_array, is_new_pattern: bool) -> bool:
+        whole = (upper + scipy.sparse.triu(upper, 1).T).tocsc()
+        try:
+            self._solver = self._cholespy.CholeskySolverD(
+                whole.shape[0],
+                whole.indptr.astype(np.int32),
+                whole.indices.astype(np.int32),
+                whole.data,
+                self._cholespy.MatrixType.CSC,
+            )
+        except ValueError:
+            return False
+        return True
+
+    def solve(self, right_side: np.ndarray) -> np.ndarray:
+        solution = np.zeros_like(right_side)
+        self._solver.solve(right_side, solution)
+        return solution
+
+
+def factorization() -> Factorization:
+    """The fastest that is installed.
+
+    Raises:
+        MissingExtra: none is.
+    """
+    try:
+        return Pardiso()
+    except MissingExtra:
+        return Cholmod()
+
+
+class LinearSystem:
+    """Symmetric system for the free degrees of freedom; a dof is 3 node + component.
+
+    Args:
+        rows, columns: [P] dofs of the entries that elements add, each pair of dofs (r, c) standing for (c, r) too.
+        prescribed: [N] nodes whose rows and columns are left out.
+    """
+
+    def __init__(self, rows: np.ndarray, columns: np.ndarray, prescribed: np.ndarray) -> None:
+        free = np.repeat(~prescribed, 3)
+        self._free = np.flatnonzero(free)
+        self._count = len(self._free)
+        self._number = np.where(free, np.cumsum(free) - 1, -1)
+        inside, keys = self._keys(rows, columns)
+        diagonal = np.arange(self._count) * (self._count + 1)
+        self._own, slots = np.unique(np.concatenate([keys, diagonal]), return_inverse=True)
+        self._slot = np.full(len(rows), len(self._own), np.int32)  # one spare for what is left out
+        self._slot[inside] = slots[: len(keys)]
+        mixed = np.flatnonzero(free[rows] != free[columns])
+        self._mixed = mixed, rows[mixed], columns[mixed]
+        self._factorization = factorization()
+        self.factorizations = 0
+        self._set_pattern(self._own)
+
+    @property
+    def solver_name(self) -> str:
+        """What factorises, with its version."""
+        return self._factorization.name
+
+    def restart(self) -> None:
+        """Forget the contacts so far: what follows does not depend on them."""
+        if self._pattern is not self._own:
+            self._set_pattern(self._own)
+
+    def _keys(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Which entries lie between free dofs, and the position row * count + column of these in the upper triangle."""
+        rows, columns = self._number[rows], self._number[columns]
+        inside = (rows >= 0) & (columns >= 0)
+        rows, columns = rows[inside].astype(np.int64), columns[inside].astype(np.int64)
+        return inside, np.minimum(rows, columns) * self._count + np.maximum(rows, columns)
+
+    def _set_pattern(self, pattern: np.ndarray) -> None:
+        self._pattern, self._is_new = pattern, True
+        self._position = None if len(pattern) == len(self._own) else np.searchsorted(pattern, self._own)
+        rows, self._columns = np.divmod(pattern, self._count)
+        self._columns = self._columns.astype(np.int32)
+        self._starts = np.searchsorted(rows, np.arange(self._count + 1)).astype(np.int32)
+
+    def factorise(self, values: np.ndarray, contact: tuple[np.ndarray, np.ndarray, np.ndarray]) -> bool:
+        """Factorise the sum of the elements' values [P] and the contact's rows, columns and values (all entries).
+
+        Returns:
+            False if the sum is not positive definite.
+        """
+        rows, columns, contact_values = contact
+        upper = rows <= columns
+        inside, keys = self._keys(rows[upper], columns[upper])
+        place = np.searchsorted(self._pattern, keys)
+        if (self._pattern[np.minimum(place, len(self._pattern) - 1)] != keys).any():
+            self._set_pattern(np.union1d(self._pattern, keys))
+            place = np.searchsorted(self._pattern, keys)
+        data = np.bincount(self._slot, values, minlength=len(self._own) + 1)[:-1]
+        if self._position is not None:
+            spread = np.zeros(len(self._pattern))
+            spread[self._position] = data
+            data = spread
+        if len(keys):
+            data += np.bincount(place, contact_values[upper][inside], minlength=len(data))
+        matrix = scipy.sparse.csr_array((data, self._columns, self._starts), shape=(self._count, self._count))
+        self.factorizations += 1
+        done = self._factorization.factorise(matrix, self._is_new)
+        self._is_new = False
+        return done
+
+    def coupling(
+        self, values: np.ndarray, contact: tuple[np.ndarray, np.ndarray, np.ndarray], increment: np.ndarray
+    ) -> np.ndarray:
+        """What increments [N,3] of prescribed nodes change in the forces on free ones [N,3], to first order."""
+        mixed, rows, columns = self._mixed
+        increment, values = increment.ravel(), values[mixed]
+        total = np.zeros(len(increment))
+        total += np.bincount(contact[0], contact[2] * increment[contact[1]], minlength=len(increment))
+        total += np.bincount(rows, values * increment[columns], minlength=len(increment))
+        total += np.bincount(columns, values * increment[rows], minlength=len(increment))
+        return total.reshape(-1, 3)
+
+    def solve(self, right_side: np.ndarray) -> np.ndarray:
+        """Solution [N,3] for the free rows of the right side [N,3]; zero at prescribed nodes."""
+        solution = np.zeros(right_side.size)
+        solution[self._free] = self._factorization.solve(right_side.ravel()[self._free])
+        return solution.reshape(-1, 3)
