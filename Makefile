@@ -71,16 +71,18 @@ $(VENV)/installed: $(VENV)/torch pyproject.toml setup.py MANIFEST.in $(C_SOURCES
 	touch $@
 
 $(VENV)/tested: $(VENV)/installed | tools
-	$(PIP) --editable '.[simulate,view,test]'
+	$(PIP) --editable '.[simulate,cad,cluster,view,test]'
 	touch $@
 
 $(VENV)/benched: $(VENV)/installed
-	$(PIP) --editable '.[simulate,view,bench]'
+	$(PIP) --editable '.[simulate,cad,view,bench]'
 	touch $@
 
 # System programs that the tests use; installed where this is allowed, otherwise the tests say what is missing.
 tools:
 	@missing=; for tool in chromium valgrind clang; do command -v $$tool >/dev/null || missing="$$missing $$tool"; done; \
+	command -v ccx >/dev/null || missing="$$missing calculix-ccx"; \
+	ldconfig -p | grep -q libGLU.so.1 || missing="$$missing libglu1-mesa libxft2 libxcursor1 libxinerama1 libxrender1 libxfixes3"; \
 	ls $$(clang -print-resource-dir 2>/dev/null)/lib/linux/*fuzzer* >/dev/null 2>&1 || missing="$$missing libclang-rt-14-dev"; \
 	if [ -n "$$missing" ]; then \
 	  echo "installing$$missing"; \

@@ -161,13 +161,13 @@ class Newton:
         """Newton direction [N,3]; prescribed nodes take `increment` [N,3] (zero if None)."""
         for project in (False, True):
             values, contact = self.potential.hessian(state.potential, project), state.contact.hessian(project)
-            if self.system.factorise(values, contact):
-                break
-        else:
-            raise NotConverged("the projected Hessian is singular")
-        if increment is None:
-            return self.system.solve(-gradient)
-        return self.system.solve(-gradient - self.system.coupling(values, contact, increment)) + increment
+            right_side = -gradient
+            if increment is not None:
+                right_side = right_side - self.system.coupling(values, contact, increment)
+            solution = self.system.solve(values, contact, right_side)
+            if solution is not None:
+                return solution if increment is None else solution + increment
+        raise NotConverged("the projected Hessian is singular")
 
     def _move(self, target: np.ndarray) -> None:
         """Bring the prescribed nodes to `target`, the free nodes along the tangent."""
