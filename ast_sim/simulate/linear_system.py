@@ -12,6 +12,7 @@ both report a matrix that is not positive definite.
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import os
 import weakref
@@ -51,10 +52,15 @@ class Pardiso:
         for name, value in (("MKL_THREADING_LAYER", "SEQUENTIAL"), ("MKL_CBWR", "AVX2")):
             os.environ.setdefault(name, value)
         (pypardiso,) = require("simulate", "pypardiso")
+        # Left to itself, pypardiso looks for the library in the whole Python installation each time.
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            for file in importlib.metadata.files("mkl") or ():
+                if "mkl_rt" in file.name:
+                    os.environ.setdefault("PYPARDISO_MKL_RT", str(file.locate()))
         self._error = pypardiso.pardiso_wrapper.PyPardisoError
         self._solver = pypardiso.PyPardisoSolver(mtype=2)  # real, symmetric, positive definite
         weakref.finalize(self, self._solver.free_memory, everything=True)  # MKL keeps the factor until it is told
-        self.name = f"PARDISO of MKL {importlib.metadata.version('mkl')}"
+        self.name = f"PARDISO (pypardiso {importlib.metadata.version('pypardiso')})"
 
     def factorise(self, upper: scipy.sparse.csr_array, is_new_pattern: bool) -> bool:
         self._matrix, nothing = upper, np.zeros(upper.shape[0])
