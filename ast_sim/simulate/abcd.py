@@ -1,0 +1,105 @@
+"""Scene family `abcd`: two CAD-like parts of two materials, squeezed together.
+
+One part lies above the other, nearly touching; the lower end of the lower one and the upper end of the upper one are
+clamped (HANDLE), and the upper clamp moves down in 20 increments by 10 to 25 % of the free height. Lengths are scaled:
+the longest side of a pair is 1.8 units, so that the parts stay within [-1,1]^3; the mechanics without gravity knows no
+length, and a unit counts as a metre. Every draw comes from the generator that is passed in, in a fixed order.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ast_sim.data.file import DatasetInfo
+from ast_sim.data.scene import NodeType, Scene, Trajectory
+from ast_sim.errors import SimulationError
+from ast_sim.simulate.cad import MeshingFailed
+from ast_sim.simulate.case import SolidCase
+from ast_sim.simulate.checkpoint import Checkpoint
+from ast_sim.simulate.contact import ContactSettings
+from ast_sim.simulate.material import NeoHookean
+from ast_sim.simulate.mesh_check import BadMesh
+from ast_sim.simulate.pairing import Pair, Unsuitable, put_together
+from ast_sim.simulate.part_source import PartSource, part_source
+from ast_sim.simulate.parts import Part
+from ast_sim.simulate.trajectory import quasi_static
+
+INCREMENTS = 20
+DEFAULT_NODES = 4000
+MINIMUM_NODES = 200
+DRAWS = 50  # of parts and placements before a sample is given up
+CONTACT = ContactSettings(dhat=1e-3, stiffness=1e6)
+YOUNG = (5e5, 2e6)  # pascal, drawn evenly in its logarithm
+POISSON = (0.25, 0.4)
+CRUSH = (0.1, 0.25)
+INFO = DatasetInfo(
+    family="abcd",
+    integration="quasi_static",
+    stress_location="element",
+    domain_center=(0.0, 0.0, 0.0),
+    domain_half_width=1.0,
+    contact_radius=0.003,
+    time_step=0.0,
+)
+
+
+def draw(rng: np.random.Generator, nodes: int = DEFAULT_NODES, parts: PartSource | None = None) -> SolidCase:
+    """Draw a pair, its materials and how far it is squeezed.
+
+    Args:
+        rng: where all draws come from.
+        nodes: about how many nodes both parts have together.
+        parts: where they come from; `part_source()` if None.
+
+    Raises:
+        SimulationError: no pair that can be used in `DRAWS` draws; the text says why the last could not.
+    """
+    parts = part_source() if parts is None else parts
+    for _ in range(DRAWS):
+        try:
+            lower, upper = parts.draw(rng, nodes)
+            pair = put_together(rng, lower, upper, 2 * CONTACT.dhat)
+        except (BadMesh, MeshingFailed, Unsuitable) as error:
+            reason = error
+            continue
+        return _case(rng, pair, lower, upper)
+    raise SimulationError(f"none of {DRAWS} draws gave two parts that can be squeezed; the last: {reason}") from reason
+
+
+def solve(case: SolidCase, checkpoint: Checkpoint | None = None) -> Trajectory:
+    """Squeeze the pair."""
+    return quasi_static(case, checkpoint=checkpoint)
+
+
+def _case(rng: np.random.Generator, pair: Pair, lower: Part, upper: Part) -> SolidCase:
+    young = np.exp(rng.uniform(*np.log(YOUNG), 2))
+    poisson, crush = rng.uniform(*POISSON, 2), rng.uniform(*CRUSH)
+    body = pair.body[pair.elements[:, 0]]
+    # Constants and positions are those that a reader of the file finds there.
+    material = np.stack([young, poisson], axis=1).astype(np.float32)[body]
+    scene = Scene(
+        rest_position=pair.position.astype(np.float32),
+        elements=pair.elements.astype(np.int32),
+        node_type=np.where(pair.clamped, NodeType.HANDLE, NodeType.NORMAL).astype(np.uint8),
+        body=pair.body.astype(np.int32),
+        material=material,
+    )
+    # The gap is closed beside the free height's share.
+    travel = crush * pair.height + 2 * CONTACT.dhat
+    down = np.linspace(0, travel, INCREMENTS + 1)[:, None] * (pair.clamped & (pair.body == 1))
+    targets = np.repeat(scene.rest_position.astype(np.float64)[None], INCREMENTS + 1, axis=0)
+    targets[:, :, 2] -= down
+    return SolidCase(
+        scene=scene,
+        targets=targets,
+        material=NeoHookean(*material.astype(np.float64).T),
+        contact=CONTACT,
+        stress_location="element",
+        attributes={
+            "parts": f"{lower.name}, {upper.name}",
+            "crush": float(crush),
+            "free_height": pair.height,
+            "overlap": pair.overlap,
+            "scale": pair.scale,
+        },
+    )

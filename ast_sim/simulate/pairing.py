@@ -1,0 +1,175 @@
+"""Two parts put together: turned, one above the other until they almost touch, and clamped where they end.
+
+Legend: N nodes, E tetrahedra, F triangles of a surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ast_sim.errors import SimulationError
+from ast_sim.simulate.contact import Contact, ContactSettings
+from ast_sim.simulate.mesh_check import boundary
+from ast_sim.simulate.parts import Part
+
+HALF_EXTENT = 0.9  # of a pair along its longest side; bulging parts then stay within [-1,1]
+LEAST_OVERLAP = 0.3  # of the smaller of the two shadows
+RASTER = 64  # cells of the raster on which shadows are measured, along the longer side
+START = 0.1  # height above the lower part from which the upper one is let down
+PLACEMENTS = 30  # tries to place one part above the other
+LEAST_CLAMP = 0.1  # area of a clamped face, relative to the shadow of its part
+CLAMP_BANDS = (0.02, 0.05, 0.1)  # how deep a clamped face may reach, relative to the height of its part
+CLAMP_COSINE = 0.5  # of the angle between the normals of a clamped face and the vertical, at least
+
+
+class Unsuitable(SimulationError):
+    """Two parts that cannot be put together this way; other draws may."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Two parts as they stand: the upper one above the lower, both within [-1,1].
+
+    Attributes:
+        position: [N,3] float64, those of the lower part first.
+        elements: [E,4].
+        body: [N] 0 lower, 1 upper.
+        clamped: [N] bool, nodes of the lower part's lower end and the upper part's upper end.
+        height: distance between the two ends without the gap between the parts.
+        overlap: of the shadows, relative to the smaller one.
+        scale: what lengths of the parts were multiplied by.
+    """
+
+    position: np.ndarray
+    elements: np.ndarray
+    body: np.ndarray
+    clamped: np.ndarray
+    height: float
+    overlap: float
+    scale: float
+
+
+def put_together(rng: np.random.Generator, lower: Part, upper: Part, gap: float) -> Pair:
+    """Turn both parts, put one above the other and clamp their far ends.
+
+    Args:
+        rng: where the orientations and the offset come from.
+        lower: with any position.
+        upper: likewise.
+        gap: distance between the parts once the pair has its size.
+
+    Raises:
+        Unsuitable: no placement with enough overlap, parts that do not meet, an end without a face to clamp.
+    """
+    count = len(lower.position)
+    elements = np.concatenate([lower.elements, upper.elements + count])
+    body = np.repeat([0, 1], [count, len(upper.position)])
+    faces = boundary(elements)
+    low, high = turned(rng, lower.position), turned(rng, upper.position)
+    low_clamp, high_clamp = _end_face(low, lower.elements, -1), _end_face(high, upper.elements, 1)
+    high, overlap = _place(rng, low, lower.elements, high, upper.elements)
+    position = _lowered(np.concatenate([low, high]), faces, body)
+    scale = 2 * HALF_EXTENT / np.ptp(position, axis=0).max()
+    position = _spaced(position * scale, faces, body, gap)
+    position -= (position.max(axis=0) + position.min(axis=0)) / 2
+    clamped = np.concatenate([low_clamp, high_clamp])
+    if min(clamped[:count].sum(), clamped[count:].sum()) < 3:
+        raise Unsuitable("an end of a part has no three nodes to clamp")
+    height = float(np.ptp(position[clamped, 2])) - gap
+    return Pair(position, elements, body, clamped, height, overlap, float(scale))
+
+
+def turned(rng: np.random.Generator, position: np.ndarray) -> np.ndarray:
+    """Positions [N,3] with one of the six sides of their box down, turned about the vertical, centred over the origin
+    with the lowest at z = 0."""
+    axis, sign, yaw = int(rng.integers(3)), int(rng.choice([-1, 1])), rng.uniform(0, 2 * np.pi)
+    result = sign * np.roll(position, 2 - axis, axis=1)  # a cyclic change of axes is a rotation
+    result[:, 0] *= sign  # and so is turning two of them round
+    c, s = np.cos(yaw), np.sin(yaw)
+    result[:, :2] = result[:, :2] @ np.array([[c, s], [-s, c]])
+    result[:, :2] -= (result[:, :2].max(axis=0) + result[:, :2].min(axis=0)) / 2
+    result[:, 2] -= result[:, 2].min()
+    return result
+
+
+def _end_face(position: np.ndarray, elements: np.ndarray, side: int) -> np.ndarray:
+    """[N] bool: the nodes of the surface that faces down (side -1) or up (1) within a band at that end.
+
+    The band is as thin as it can be with at least `LEAST_CLAMP` of the part's shadow in it.
+    """
+    faces = boundary(elements)
+    a, b, c = np.moveaxis(position[faces], 1, 0)
+    normal = np.cross(b - a, c - a) / 2  # its length is the area
+    shadow = np.maximum(normal[:, 2], 0).sum()
+    facing = side * normal[:, 2] >= CLAMP_COSINE * np.linalg.norm(normal, axis=1)
+    depth = np.abs(position[:, 2] - (position[:, 2].max() if side > 0 else position[:, 2].min()))
+    for band in CLAMP_BANDS:
+        inside = facing & (depth[faces].max(axis=1) <= band * np.ptp(position[:, 2]))
+        if np.abs(normal[inside, 2]).sum() >= LEAST_CLAMP * shadow:
+            nodes = np.zeros(len(position), bool)
+            nodes[faces[inside]] = True
+            return nodes
+    raise Unsuitable("an end of a part is too pointed to clamp")
+
+
+def _place(
+    rng: np.random.Generator, low: np.ndarray, low_elements: np.ndarray, high: np.ndarray, high_elements: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """The upper part moved above the lower one with enough overlap of their shadows, and that overlap."""
+    extent = np.minimum(np.ptp(low[:, :2], axis=0), np.ptp(high[:, :2], axis=0))
+    cell = max(np.ptp(low[:, :2]), np.ptp(high[:, :2])) / RASTER
+    low_shadow = shadow_cells(low[:, :2], boundary(low_elements), cell)
+    for _ in range(PLACEMENTS):
+        moved = high + [*(rng.uniform(-0.5, 0.5, 2) * extent), low[:, 2].max() + START]
+        high_shadow = shadow_cells(moved[:, :2], boundary(high_elements), cell)
+        common = len(np.intersect1d(low_shadow, high_shadow, assume_unique=True))
+        overlap = common / min(len(low_shadow), len(high_shadow))
+        if overlap >= LEAST_OVERLAP:
+            return moved, overlap
+    raise Unsuitable(f"no placement of {PLACEMENTS} with an overlap of {LEAST_OVERLAP:.0%}")
+
+
+def shadow_cells(points: np.ndarray, faces: np.ndarray, cell: float) -> np.ndarray:
+    """The cells of a square raster that the triangles [F,3] over points [N,2] cover, as ascending numbers.
+
+    Each triangle is sampled more finely than the raster; of the numbers, x counts in steps of 2^20.
+    """
+    corners = points[faces]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    level = np.ceil(np.log2(np.maximum(2 * longest / cell, 1))).astype(int)
+    found = []
+    for power in np.unique(level):
+        parts = 2**power
+        i, j = np.array([(i, j) for i in range(parts + 1) for j in range(parts + 1 - i)]).T / parts
+        weights = np.stack([1 - i - j, i, j])
+        samples = np.einsum("ks,fkd->fsd", weights, corners[level == power]).reshape(-1, 2)
+        index = np.floor(samples / cell).astype(np.int64)
+        found.append(np.unique(index[:, 0] * 2**20 + index[:, 1]))
+    return np.unique(np.concatenate(found))
+
+
+def _lowered(position: np.ndarray, faces: np.ndarray, body: np.ndarray) -> np.ndarray:
+    """Positions with the upper part let down until it is about to touch the lower one."""
+    contact = Contact(position, faces, body, ContactSettings(dhat=1e-3, stiffness=1.0))
+    down = np.where(body == 1, -np.ptp(position[:, 2]), 0.0)[:, None] * [0.0, 0.0, 1.0]
+    fraction = 1.0
+    while fraction * np.abs(down).max() > 1e-5:  # each goes most of the way that is left
+        fraction = contact.collision_free_fraction(position, position + down)
+        if fraction >= 1:
+            raise Unsuitable("the upper part passes the lower one without touching it")
+        position = position + fraction * down
+    return position
+
+
+def _spaced(position: np.ndarray, faces: np.ndarray, body: np.ndarray, gap: float) -> np.ndarray:
+    """Positions with the upper part lifted until the parts are `gap` apart."""
+    contact = Contact(position, faces, body, ContactSettings(dhat=gap, stiffness=1.0))
+    upper = body == 1
+    for _ in range(100):
+        distance = contact.gap(position)
+        if distance >= gap:
+            return position
+        position = position + np.where(upper, gap - distance + 0.01 * gap, 0.0)[:, None] * [0.0, 0.0, 1.0]
+    raise Unsuitable("the parts are too close to each other side by side")
