@@ -122,8 +122,8 @@ def _build_parser() -> argparse.ArgumentParser:
     rollout.add_argument("--index", type=_at_least(0), required=True, metavar="I", help="which trajectory")
     rollout.add_argument("--out", type=Path, required=True, metavar="FILE", help="ends in .h5, .pvd or .vtkhdf")
 
-    report = command("report", _report, "write one page with moving scenes, error curves and tables")
-    report.add_argument("run_folders", type=Path, nargs="+", metavar="RUN")
+    report = command("report", _report, "write one page that shows runs (moving scenes, errors) or a dataset")
+    report.add_argument("shown", type=Path, nargs="+", metavar="RUN_OR_DATA", help="run folders, or one dataset (.h5)")
     report.add_argument("--out", type=Path, required=True, metavar="FILE.html")
     report.add_argument("--data", type=Path, metavar="DATA", help="dataset (the one that each run was trained on)")
     return parser
@@ -268,16 +268,35 @@ def _rollout(args: argparse.Namespace) -> None:
 
 
 def _report(args: argparse.Namespace) -> None:
+    datasets = [path for path in args.shown if path.is_file() or (path.suffix == ".h5" and not path.is_dir())]
+    if len(datasets) < len(args.shown) and datasets:
+        raise ConfigError(
+            f"{datasets[0]} is a dataset, the others are runs: a page shows runs or one dataset;"
+            " name the dataset of runs with --data"
+        )
+    if len(datasets) > 1:
+        raise ConfigError(f"a page shows one dataset, not {len(datasets)}: write one page for each")
+    if datasets and args.data is not None:
+        raise ConfigError(f"--data names the dataset of runs, but {datasets[0]} is a dataset itself: leave --data out")
+    if datasets:
+        from ast_sim.view import gallery
+
+        gallery.write(args.out, datasets[0])
+    else:
+        _report_runs(args)
+    print(f"report: {args.out}")
+
+
+def _report_runs(args: argparse.Namespace) -> None:
     from ast_sim import keep_memory
     from ast_sim.results import evaluate_run, open_run, report_run, write_report
 
     keep_memory()
     shown = []
-    for folder in args.run_folders:
+    for folder in args.shown:
         with open_run(folder, args.data) as run:
             shown.append(report_run(run, evaluate_run(run, "test", args.command_line)))
     write_report(args.out, shown, "Learned simulation: predictions and errors")
-    print(f"report: {args.out}")
 
 
 if __name__ == "__main__":

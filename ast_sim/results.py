@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +19,7 @@ from ast_sim.monitor import Progress
 from ast_sim.rollout import Rollout, rollouts
 from ast_sim.run import Metrics, RunConfig, load_model
 from ast_sim.view import export, report
+from ast_sim.view.files import make_folder
 
 SUFFIXES = (".h5", ".pvd", ".vtkhdf")
 
@@ -160,8 +160,5 @@ def _facts(run: TrainedRun) -> dict[str, str]:
 
 def write_report(path: Path, runs: Sequence[report.ReportRun], title: str) -> None:
     """Write the page; its folder is made if it is not there."""
-    try:
-        os.makedirs(path.parent, exist_ok=True)
-    except OSError as error:
-        raise AstSimError(f"{path} cannot be written: {error.strerror or error}") from error
+    make_folder(path.parent)
     report.write(path, runs, title)

@@ -1,11 +1,13 @@
 // What all parts of the page share: numbers with units, packed arrays, the theme, a way to make elements.
 
 const PREFIXES = [[1e9, "G"], [1e6, "M"], [1e3, "k"], [1, ""], [1e-3, "m"], [1e-6, "µ"], [1e-9, "n"]];
+const AREA_PREFIXES = [[1, ""], [1e-4, "c"], [1e-6, "m"], [1e-12, "µ"]];
 
-// The factor and the name of the unit in which `largest` reads well: {scale, name}.
+// The factor and the name of the unit in which `largest` reads well: {scale, name}. Seconds have no kiloseconds.
 function niceUnit(largest, unit) {
   if (!unit || !(largest > 0)) return { scale: 1, name: unit || "" };
-  const [scale, prefix] = PREFIXES.find(([size]) => largest >= 0.9995 * size) || PREFIXES[PREFIXES.length - 1];
+  const prefixes = unit.endsWith("²") ? AREA_PREFIXES : unit === "s" ? PREFIXES.slice(3) : PREFIXES;
+  const [scale, prefix] = prefixes.find(([size]) => largest >= 0.9995 * size) || prefixes[prefixes.length - 1];
   return { scale, name: prefix + unit };
 }
 

@@ -73,13 +73,12 @@ class Surface:
         return encoded
 
 
-def encode_scene(truth: Trajectory, predictions: Sequence[Trajectory | None], stride: int) -> Json:
-    """One scene: its surface, every `stride`-th frame of the truth and of each run's prediction, and error curves."""
+def encode_scene(truth: Trajectory, frames: np.ndarray, predictions: Sequence[Trajectory | None] = ()) -> Json:
+    """One scene: its surface, and those of `frames` that the truth and each run's prediction have."""
     for prediction in predictions:
         if prediction is not None:
             require_same_scene(truth, prediction)
     surface = Surface(truth.scene)
-    frames = np.arange(0, truth.num_frames, stride)
     low, high = _bounds(truth)
     ranges = {"displacement": _displacement_range(truth, surface)}
     if truth.stress is not None and len(surface.groups["body"][1]):
@@ -95,7 +94,6 @@ def encode_scene(truth: Trajectory, predictions: Sequence[Trajectory | None], st
         "ranges": ranges,
         "truth": surface.motion(truth, frames),
         "predictions": [None if p is None else surface.motion(p, frames) for p in predictions],
-        "curves": encode_curves(truth, predictions),
     }
 
 

@@ -1,4 +1,4 @@
-"""Errors of writing as one line that says what to do."""
+"""Places to write to, and errors of writing as one line that says what to do."""
 
 from __future__ import annotations
 
@@ -19,3 +19,15 @@ def explained(path: Path) -> Iterator[None]:
         raise AstSimError(
             f"{path} cannot be written ({reason}); nothing half-written was left: make room or choose another place"
         ) from error
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder if it is not there.
+
+    Raises:
+        AstSimError: it cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise AstSimError(f"{path} cannot be made ({error.strerror or error}): choose another place") from error

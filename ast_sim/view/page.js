@@ -26,10 +26,12 @@ function measureTable({ title, unit, columns, rows, runs }) {
 }
 
 function tiles(data) {
-  byId("tiles").append(...data.tiles.map(({ label, value, unit, suffix, detail }) => {
+  byId("tiles").append(...data.tiles.map(({ label, value, unit, suffix, detail, upTo }) => {
+    const most = upTo === undefined ? null : withUnit(upTo, unit);
+    const text = most ? `median; up to ${most.text} ${most.unit}` : detail;
     const read = typeof value === "number" || value === null ? withUnit(value, unit) : { text: value, unit: "" };
     const number = element("dd", { class: "value" }, read.text + (suffix || ""), ...(read.unit ? [" ", element("small", {}, read.unit)] : []));
-    return element("div", { class: "tile" }, element("dt", {}, label), number, detail ? element("dd", { class: "detail" }, detail) : null);
+    return element("div", { class: "tile" }, element("dt", {}, label), number, text ? element("dd", { class: "detail" }, text) : null);
   }));
   byId("tiles").hidden = !data.tiles.length;
 }
@@ -51,17 +53,17 @@ function swatch(run) {
   return mark;
 }
 
-function samplesTable({ names, order, table: columns }, scenes) {
-  const labels = Object.fromEntries(scenes.map((scene) => [scene.name, scene.label]));
+function samplesTable({ names, order, table: columns }, scenes, summary) {
+  const labels = Object.fromEntries(scenes.map((scene) => [scene.name, scene.label === scene.name ? "" : `: ${scene.label.toLowerCase()}`]));
   const units = columns.map(({ values, unit }) => niceUnit(Math.max(...values.filter(Number.isFinite), 0), unit));
   const rows = order.map((index) => element("tr", {},
-    element("th", { scope: "row" }, names[index], ...(labels[names[index]] ? [" ", element("small", {}, `shown above: ${labels[names[index]].toLowerCase()}`)] : [])),
+    element("th", { scope: "row" }, names[index], ...(names[index] in labels ? [" ", element("small", {}, `shown above${labels[names[index]]}`)] : [])),
     ...columns.map(({ values, unit }, column) => {
       const value = values[index];
       return element("td", {}, unit ? digits(value === null ? null : value / units[column].scale) : (value === null ? "–" : String(value)));
     })));
   const heads = columns.map(({ label, unit }, column) => (unit ? `${label} (${units[column].name})` : label));
-  return element("details", {}, element("summary", {}, `The figures of all ${names.length} scenes`), table(["Scene", ...heads], rows, { className: "dense" }));
+  return element("details", {}, element("summary", {}, summary), table(["Scene", ...heads], rows, { className: "dense" }));
 }
 
 function factTables(runs) {
@@ -91,7 +93,7 @@ function showSamples(data) {
   if (!data.samples) return;
   byId("all-scenes-note").textContent = "RMSE of the displacement over the full rollout, NORMAL nodes, in ascending order.";
   samplesChart(data);
-  byId("all-scenes-tables").append(samplesTable(data.samples, data.scenes));
+  byId("all-scenes-tables").append(samplesTable(data.samples, data.scenes, `The figures of all ${data.samples.names.length} scenes`));
 }
 
 function showScenes(data) {
@@ -113,15 +115,22 @@ function showScenes(data) {
   }, { threshold: 0.15 }).observe(byId("viewer"));
 }
 
+function showRuns(data) {
+  if (data.comparison) byId("comparison").append(comparisonTable(data.comparison));
+  showScenes(data);
+  showAccuracy(data);
+  showSamples(data);
+  showTraining(data);
+}
+
 const data = JSON.parse(byId("report-data").textContent);
 byId("lead").textContent = data.lead;
 byId("footer").textContent = data.footer;
 tiles(data);
-if (data.comparison) byId("comparison").append(comparisonTable(data.comparison));
-showScenes(data);
-showAccuracy(data);
-showSamples(data);
-showTraining(data);
-byId("facts").hidden = !data.runs.some((run) => run.facts.length);
-byId("facts-tables").append(factTables(data.runs));
+// The page of runs and that of a dataset share the template; what is of the other kind goes when it has been filled.
+const facts = data.kind === "dataset" ? [{ facts: data.facts }] : data.runs;
+(data.kind === "dataset" ? showDataset : showRuns)(data);
+document.querySelectorAll("[data-kind]").forEach((part) => { if (part.dataset.kind !== data.kind) part.remove(); });
+byId("facts").hidden = !facts.some((run) => run.facts.length);
+byId("facts-tables").append(factTables(facts));
 document.documentElement.dataset.ready = "true";

@@ -15,6 +15,33 @@ const FRAMES_PER_SECOND = 12;
 const VIEW = { eye: { x: -0.62, y: -1.32, z: 0.78 }, up: { x: 0, y: 0, z: 1 }, center: { x: 0, y: 0, z: -0.07 } };
 const PLANAR_VIEW = { eye: { x: 0, y: 0, z: 1.6 }, up: { x: 0, y: 1, z: 0 }, center: { x: 0, y: 0, z: 0 } };
 
+const TAN_HALF_ANGLE = Math.tan(Math.PI / 8); // of plotly's camera, upwards; sideways it is `aspect` times as much
+
+// Rows of a camera's axes: right, up, and from what it looks at to the eye.
+function viewAxes({ eye, up, center }) {
+  const unit = (v) => v.map((x) => x / Math.hypot(...v));
+  const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+  const back = unit(["x", "y", "z"].map((axis) => eye[axis] - center[axis]));
+  const right = unit(cross([up.x, up.y, up.z], back));
+  return [right, cross(back, right), back];
+}
+
+// The camera that a scene is first seen by, moved away as far as its box needs to be whole in a panel width / height = `aspect`.
+function fittingView(scene, aspect) {
+  const view = structuredClone(scene.planar ? PLANAR_VIEW : VIEW);
+  const { eye, center } = view;
+  const axes = viewAxes(view);
+  let distance = Math.hypot(eye.x - center.x, eye.y - center.y, eye.z - center.z);
+  for (let corner = 0; corner < 8; corner++) {
+    const place = ["x", "y", "z"].map((axis, which) => // in plotly's units, see Panel.layout
+      ((corner >> which) & 1 ? 1 : -1) * (scene.high[which] - scene.low[which]) / scene.size - center[axis]);
+    const [across, up, towards] = axes.map((axis) => axis.reduce((sum, part, which) => sum + part * place[which], 0));
+    distance = Math.max(distance, towards + Math.max(Math.abs(across) / aspect, Math.abs(up)) / TAN_HALF_ANGLE);
+  }
+  ["x", "y", "z"].forEach((axis, which) => { eye[axis] = center[axis] + distance * axes[2][which]; });
+  return view;
+}
+
 // The arrays that do not change of one group of triangles (the deforming bodies, or the obstacle).
 function decodeGroup(group) {
   if (!group) return null;
@@ -173,7 +200,7 @@ class Panel {
       ? `ended after frame ${scene.frames[motion.frames - 1]}` : `${this.subject} has no stress`;
     const error = which === 0 ? null : scene.curves[color]?.runs[which - 1]?.[scene.frames[shown]];
     const read = error === null || error === undefined ? null : withUnit(error, COLORS[color].unit);
-    this.note.textContent = read ? `RMSE ${read.text} ${read.unit}` : "";
+    this.note.textContent = read ? `RMSE ${read.text} ${read.unit}` : (which === 0 && scene.note) || "";
     this.stage.setAttribute("aria-label", `${this.title}, ${scene.name}, frame ${scene.frames[shown]}, coloured by ${COLORS[color].label}`);
     this.drawn = true;
     return Plotly.react(this.stage, this.traces(scene, motion, frame, color, lines), this.layout(scene, camera), PLOT_CONFIG);

@@ -1,32 +1,22 @@
-"""The report: one self-contained HTML page with moving scenes, error curves, tables and the facts of the run.
+"""The report of runs: moving scenes, error curves, tables and the facts of the run, on one page (`page`).
 
-The page needs no network: styles, scripts, plotly and all data are inside, and its content security policy lets a
-browser run these scripts only and load nothing. The data are packed arrays (`encode`), drawn by the scripts beside
-this file.
+The data are packed arrays (`encode`), drawn by the scripts beside this file.
 """
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import html
-import json
 import os
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import resources
-from pathlib import Path
 from typing import Any
 
-from ast_sim.data.disk import replacing
-from ast_sim.data.scene import Trajectory
-from ast_sim.errors import AstSimError, require
-from ast_sim.view import tables
-from ast_sim.view.encode import encode_scene, finite_json, motion_bytes
-from ast_sim.view.files import explained
+import numpy as np
 
-SCRIPTS = ("common.js", "panel.js", "viewer.js", "charts.js", "page.js")
+from ast_sim.data.scene import Trajectory
+from ast_sim.errors import AstSimError
+from ast_sim.view import page, tables
+from ast_sim.view.encode import encode_curves, encode_scene, finite_json, motion_bytes
+
 MOTION_BYTES = 3_600_000  # of all scenes together; longer ones show every n-th frame
 MIN_FRAMES = 12  # which a scene keeps however large it is
 MAX_RUNS = 6  # a page draws one panel a run, and browsers allow 16 at most
@@ -81,32 +71,9 @@ def write(path: str | os.PathLike[str], runs: Sequence[ReportRun], title: str) -
         AstSimError: no run, too many, a prediction of another scene than its truth, or the file cannot be written.
         MissingExtra: plotly is not installed.
     """
-    path = Path(path)
     if not 1 <= len(runs) <= MAX_RUNS:
         raise AstSimError(f"a report shows 1 to {MAX_RUNS} runs, not {len(runs)}")
-    page = render(runs, title)
-    with explained(path), replacing(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
-
-
-def render(runs: Sequence[ReportRun], title: str) -> str:
-    """The text of the page."""
-    (offline,) = require("view", "plotly.offline")
-    plotly = offline.get_plotlyjs()
-    script = '"use strict";\n(() => {\n' + "\n".join(_template(name) for name in SCRIPTS) + "})();\n"
-    policy = (
-        "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
-        f"script-src {_digest(plotly)} {_digest(script)}; base-uri 'none'; form-action 'none'"
-    )
-    parts = {
-        "title": html.escape(title),
-        "policy": policy,
-        "style": _template("page.css"),
-        "data": _json(page_data(runs)),
-        "plotly": plotly,
-        "script": script,
-    }
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _template("page.html"))
+    page.write(path, page_data(runs), title)
 
 
 def page_data(runs: Sequence[ReportRun]) -> dict[str, Any]:
@@ -119,6 +86,7 @@ def page_data(runs: Sequence[ReportRun]) -> dict[str, Any]:
         scene["error"] = errors.get(scene["name"])
     return finite_json(
         {
+            "kind": "runs",
             "lead": _lead(runs, names),
             "tiles": tables.tiles(evaluations[0]) if len(runs) == 1 else [],
             "comparison": tables.comparison(names, evaluations),
@@ -128,7 +96,7 @@ def page_data(runs: Sequence[ReportRun]) -> dict[str, Any]:
             "tables": tables.measure_tables(names if len(runs) > 1 else ["AST"], evaluations),
             "samples": samples,
             "runs": [_run(run, name) for run, name in zip(runs, names, strict=True)],
-            "footer": "Made by ast_sim. This page is one file and loads nothing from anywhere.",
+            "footer": page.FOOTER,
         }
     )
 
@@ -157,7 +125,9 @@ def _scenes(runs: Sequence[ReportRun]) -> list[dict[str, Any]]:
         frames = scene.truth.num_frames
         stride = max(1, min(-(-total // MOTION_BYTES), (frames - 1) // (MIN_FRAMES - 1)))
         predictions = [predictions.get(name) for predictions in by_run]
-        encoded.append({"name": name, "label": scene.label, **encode_scene(scene.truth, predictions, stride)})
+        shown = encode_scene(scene.truth, np.arange(0, frames, stride), predictions)
+        curves = encode_curves(scene.truth, predictions)
+        encoded.append({"name": name, "label": scene.label, **shown, "curves": curves})
     return encoded
 
 
@@ -187,18 +157,3 @@ def _distinct(names: Sequence[str]) -> list[str]:
         counts[name] = counts.get(name, 0) + 1
         result.append(name if counts[name] == 1 else f"{name} ({counts[name]})")
     return result
-
-
-def _template(name: str) -> str:
-    return resources.files("ast_sim.view").joinpath(name).read_text(encoding="utf-8")
-
-
-def _digest(script: str) -> str:
-    """The source expression of a content security policy that allows this very script."""
-    return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'"
-
-
-def _json(data: Any) -> str:
-    """JSON that may stand in a script element: no "<", so nothing inside can end the element or open another."""
-    text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")

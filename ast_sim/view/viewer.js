@@ -1,18 +1,33 @@
 // The moving scenes: one panel for the truth and one for every run, which share camera, frame, colours and scale.
 
+const medianScene = ({ scenes }) => Math.max(0, scenes.findIndex((scene) => scene.label === "Median"));
+
+// The colours of a quantity and its numbers in the unit that reads well.
+function drawScale(label, bar, color, { max, clipped }) {
+  const unit = niceUnit(max, COLORS[color].unit);
+  label.textContent = `${COLORS[color].label} (${unit.name})`;
+  const ticks = [0, 0.25, 0.5, 0.75, 1].map((part) => {
+    const tick = element("b", {}, `${part === 1 && clipped ? "≥ " : ""}${digits((part * max) / unit.scale)}`);
+    tick.style.left = `${100 * part}%`;
+    return tick;
+  });
+  const ramp = element("i");
+  ramp.style.background = `linear-gradient(90deg, ${COLORS[color].stops.join(", ")})`;
+  bar.replaceChildren(ramp, ...ticks);
+}
+
 class Viewer {
-  constructor(data, onChange) {
+  constructor(data, onChange, first = medianScene(data), color = "displacement") {
     this.data = data;
     this.onChange = onChange;
     this.decoded = new Map();
-    this.state = { scene: 0, frame: 0, color: "displacement", lines: true, playing: false };
-    this.panels = [new Panel("Truth", "the truth"), ...data.runs.map((run) =>
+    this.state = { scene: 0, frame: 0, color, lines: true, playing: false };
+    this.panels = [new Panel(data.runs.length ? "Truth" : "Simulation", "the truth"), ...data.runs.map((run) =>
       new Panel(data.runs.length > 1 ? `Prediction of ${run.name}` : "Prediction", "the prediction"))];
     byId("panels").append(...this.panels.map((panel) => panel.figure));
     this.panels.forEach((panel, index) => this.follow(panel, index));
     COLORS.displacement.unit = data.units.displacement;
     COLORS.stress.unit = data.units.stress;
-    const first = Math.max(0, data.scenes.findIndex((scene) => scene.label === "Median"));
     this.controls(first);
     onThemeChange.push(() => this.draw());
     this.choose(first);
@@ -29,13 +44,25 @@ class Viewer {
     const scene = this.scene;
     if (!scene.ranges[this.state.color]) this.state.color = "displacement";
     this.tracked = null;
-    this.camera = structuredClone(scene.planar ? PLANAR_VIEW : VIEW);
+    this.camera = this.startView();
     this.state.frame = Math.min(this.state.frame, scene.frames.length - 1);
     byId("frame").max = scene.frames.length - 1;
     for (const control of [byId("frame"), byId("play")]) control.disabled = scene.frames.length < 2;
     byId("obstacle-key").hidden = !scene.groups.obstacle;
     this.colorChoice();
     this.draw();
+  }
+
+  startView() {
+    const { clientWidth, clientHeight } = this.panels[0].stage;
+    return fittingView(this.scene, clientWidth && clientHeight ? clientWidth / clientHeight : 1);
+  }
+
+  // As if the user had chosen the scene and the colour.
+  select(index, color) {
+    byId("scene-choice").querySelectorAll("input")[index].checked = true;
+    Object.assign(this.state, { color, frame: 0 });
+    this.choose(index);
   }
 
   // Draws all panels; while a drawing is under way the last request waits.
@@ -66,19 +93,7 @@ class Viewer {
   }
 
   scale() {
-    const { color } = this.state;
-    const { max, clipped } = this.scene.ranges[color];
-    const unit = niceUnit(max, COLORS[color].unit);
-    byId("scale-label").textContent = `${COLORS[color].label} (${unit.name})`;
-    const ticks = [0, 0.25, 0.5, 0.75, 1].map((part) => {
-      const text = `${part === 1 && clipped ? "≥ " : ""}${digits((part * max) / unit.scale)}`;
-      const tick = element("b", {}, text);
-      tick.style.left = `${100 * part}%`;
-      return tick;
-    });
-    const ramp = element("i");
-    ramp.style.background = `linear-gradient(90deg, ${COLORS[color].stops.join(", ")})`;
-    byId("scale-bar").replaceChildren(ramp, ...ticks);
+    drawScale(byId("scale-label"), byId("scale-bar"), this.state.color, this.scene.ranges[this.state.color]);
   }
 
   // The camera of one panel moves all the others.
@@ -133,7 +148,7 @@ class Viewer {
   }
 
   resetView() {
-    this.setCamera(this.scene.planar ? PLANAR_VIEW : VIEW);
+    this.setCamera(this.startView());
   }
 
   turn(right, up) {
@@ -200,7 +215,7 @@ class Viewer {
     };
     document.addEventListener("keydown", (event) => {
       if (event.ctrlKey || event.metaKey || event.altKey || !keys[event.key]) return;
-      if (event.target.closest("button, input, select, summary, a")) return;
+      if (event.target.closest("button, input, select, summary, a") || !byId("viewer").getClientRects().length) return;
       event.preventDefault();
       keys[event.key]();
     });

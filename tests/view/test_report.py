@@ -14,7 +14,7 @@ from view_scenes import plate, strip
 
 from ast_sim.data.scene import NodeType, Trajectory
 from ast_sim.errors import AstSimError, MissingExtra
-from ast_sim.view import encode, report, tables
+from ast_sim.view import encode, page, report, tables
 from ast_sim.view.fields import surface_owners
 
 
@@ -30,7 +30,7 @@ def one_run(name="run", **scenes):
 
 def test_encoded_motion_is_the_surface_to_one_in_65534():
     truth, prediction = plate(5), plate(5, seed=1)
-    encoded = encode.encode_scene(truth, [prediction], stride=1)
+    encoded = encode.encode_scene(truth, np.arange(5), [prediction])
     for name in ("body", "obstacle"):
         triangles, nodes, _ = encode.Surface(truth.scene).groups[name]
         group = encoded["groups"][name]
@@ -61,7 +61,7 @@ def test_element_stress_stands_on_the_faces():
     truth = plate(3, stress="element")
     surface = encode.Surface(truth.scene)
     owners = surface.groups["body"][2]
-    found = unpack(encode.encode_scene(truth, [None], stride=1)["truth"]["stress"]).reshape(3, -1)
+    found = unpack(encode.encode_scene(truth, np.arange(3))["truth"]["stress"]).reshape(3, -1)
     np.testing.assert_allclose(found, truth.stress[:, owners, 0], atol=truth.stress.max() / 65000)
 
 
@@ -86,9 +86,9 @@ def test_curves_are_the_errors_frame_by_frame():
 def test_a_prediction_ends_at_its_first_frame_that_is_not_finite():
     truth, prediction = plate(5), plate(5, seed=1)
     prediction.position[3, 7] = np.nan
-    encoded = encode.encode_scene(truth, [prediction], stride=1)
+    encoded = encode.encode_scene(truth, np.arange(5), [prediction])
     assert encoded["predictions"][0]["frames"] == 3
-    assert len(encoded["curves"]["displacement"]["runs"][0]) == 3
+    assert len(encode.encode_curves(truth, [prediction])["displacement"]["runs"][0]) == 3
 
 
 def test_large_scenes_show_fewer_frames_but_all_errors(monkeypatch):
@@ -166,10 +166,11 @@ def test_the_page_is_one_small_file(tmp_path):
 
 
 def test_data_cannot_end_its_element():
-    page = report.render([one_run(**{"</script><script>x": (strip(2), strip(2))})], "<title>")
-    inside = page.split('id="report-data">', 1)[1].split("</script>", 1)[0]
+    data = report.page_data([one_run(**{"</script><script>x": (strip(2), strip(2))})])
+    text = page.render(data, "<title>")
+    inside = text.split('id="report-data">', 1)[1].split("</script>", 1)[0]
     assert json.loads(inside)["scenes"][0]["name"] == "</script><script>x"
-    assert "<title>&lt;title&gt;</title>" in page
+    assert "<title>&lt;title&gt;</title>" in text
 
 
 def test_no_number_that_json_does_not_know():

@@ -1,0 +1,71 @@
+"""One self-contained HTML page: the template with its styles, scripts, plotly and data all inside.
+
+The page needs no network: its content security policy lets a browser run these scripts only and load nothing.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+import os
+import re
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from ast_sim.data.disk import replacing
+from ast_sim.errors import require
+from ast_sim.view.files import explained
+
+SCRIPTS = ("common.js", "panel.js", "viewer.js", "charts.js", "gallery.js", "dataset.js", "page.js")
+FOOTER = "Made by ast_sim. This page is one file and loads nothing from anywhere."
+
+
+def write(path: str | os.PathLike[str], data: dict[str, Any], title: str) -> None:
+    """Write the page that shows `data`; nothing half-written is ever left under the name.
+
+    Raises:
+        AstSimError: the file cannot be written.
+        MissingExtra: plotly is not installed.
+    """
+    path = Path(path)
+    text = render(data, title)
+    with explained(path), replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def render(data: dict[str, Any], title: str) -> str:
+    """The text of the page; its scripts show what `data`, JSON without NaN, has and hide what it lacks."""
+    (offline,) = require("view", "plotly.offline")
+    plotly = offline.get_plotlyjs()
+    script = '"use strict";\n(() => {\n' + "\n".join(_template(name) for name in SCRIPTS) + "})();\n"
+    policy = (
+        "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
+        f"script-src {_digest(plotly)} {_digest(script)}; base-uri 'none'; form-action 'none'"
+    )
+    parts = {
+        "title": html.escape(title),
+        "policy": policy,
+        "style": _template("page.css"),
+        "data": _json(data),
+        "plotly": plotly,
+        "script": script,
+    }
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _template("page.html"))
+
+
+def _template(name: str) -> str:
+    return resources.files("ast_sim.view").joinpath(name).read_text(encoding="utf-8")
+
+
+def _digest(script: str) -> str:
+    """The source expression of a content security policy that allows this very script."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'"
+
+
+def _json(data: Any) -> str:
+    """JSON that may stand in a script element: no "<", so nothing inside can end the element or open another."""
+    text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
