@@ -1,8 +1,8 @@
 """Scene family `deforming_plate`: a clamped plate that a rigid obstacle presses in and lets go.
 
-The plate lies in the plane z = 0 around the origin, both short ends clamped (HANDLE); the obstacle (OBSTACLE, all of
-its nodes) stands above it, moves down along a straight slanted way and returns to its start within 41 frames.
-Every draw comes from the generator that is passed in, in a fixed order.
+The plate lies in the plane z = 0 around the origin, both ends clamped (HANDLE); in half of the scenes the clamps drift.
+The obstacle (OBSTACLE, all of its nodes) stands above it, moves down along a straight slanted way, returns to its
+start, and follows the drift meanwhile. Every draw comes from the generator that is passed in, in a fixed order.
 """
 
 from __future__ import annotations
@@ -13,20 +13,24 @@ import numpy as np
 
 from ast_sim.data.file import DatasetInfo
 from ast_sim.data.scene import NodeType, Scene, Trajectory
-from ast_sim.simulate import mesh
+from ast_sim.simulate import plate_mesh
 from ast_sim.simulate.case import SolidCase
 from ast_sim.simulate.checkpoint import Checkpoint
 from ast_sim.simulate.contact import ContactSettings
 from ast_sim.simulate.material import NeoHookean
+from ast_sim.simulate.obstacles import draw_obstacle
+from ast_sim.simulate.plate_outline import Outline, distance_to, draw_outline
 from ast_sim.simulate.trajectory import quasi_static
 
-FRAMES = 41
-DEFAULT_NODES = 400
+FRAMES = 400
+DEFAULT_NODES = 1300
 MINIMUM_NODES = 80
 MATERIAL = NeoHookean(young=1e6, poisson=0.4)
 CONTACT = ContactSettings(dhat=1e-3, stiffness=MATERIAL.young)
+LAYERS = 2  # of elements through the thickness
+OBSTACLE_SHARE = 0.16  # of the nodes
+SMALLEST_ANGLE = np.radians(22)  # of the triangles of the middle plane
 CLAMP_MARGIN = 0.05  # metres that the obstacle stays away from the clamps, seen from above
-SHAPES = ("ball", "cylinder", "block")
 INFO = DatasetInfo(
     family="deforming_plate",
     integration="quasi_static",
@@ -38,121 +42,162 @@ INFO = DatasetInfo(
 )
 
 
-def simulate(rng: np.random.Generator, nodes: int = DEFAULT_NODES, checkpoint: Checkpoint | None = None) -> Trajectory:
-    """Draw a scene and solve it.
-
-    Args:
-        rng: where all draws come from.
-        nodes: about how many nodes the scene has, obstacle included.
-        checkpoint: where unfinished frames are kept.
-    """
-    case = draw(rng, nodes)
-    obstacle = (case.scene.body == 1)[:, None]
-    targets = np.where(obstacle, case.scene.rest_position + case.travel[:, None, :], case.scene.rest_position)
-    solid = SolidCase(case.scene, targets, MATERIAL, CONTACT, INFO.stress_location, {"obstacle": case.shape})
-    return quasi_static(solid, checkpoint=checkpoint)
+def solve(case: SolidCase, checkpoint: Checkpoint | None = None) -> Trajectory:
+    """All frames of a drawn scene, or those up to the first that cannot be solved."""
+    return quasi_static(case, checkpoint=checkpoint)
 
 
 @dataclass(frozen=True)
-class PlateCase:
-    """One drawn scene.
+class _Plate:
+    """A meshed plate.
 
     Attributes:
-        scene: plate (body 0, its nodes ordered along its length) and obstacle (body 1).
-        travel: [S,3] displacement of the obstacle in each frame, in metres.
-        shape: shape of the obstacle.
+        outline: what was meshed.
+        spacing: length of its edges.
+        position, elements: [N,3] and [E,4].
+        clamps: nodes [N] of the left (1) and of the right clamp (2), 0 elsewhere.
     """
 
-    scene: Scene
-    travel: np.ndarray
-    shape: str
+    outline: Outline
+    spacing: float
+    position: np.ndarray
+    elements: np.ndarray
+    clamps: np.ndarray
 
 
-def draw(rng: np.random.Generator, nodes: int = DEFAULT_NODES) -> PlateCase:
-    """Draw a scene of 0.75 to 1.5 times `nodes` nodes, obstacle included."""
+def draw(rng: np.random.Generator, nodes: int = DEFAULT_NODES, frames: int = FRAMES) -> SolidCase:
+    """Draw a scene.
+
+    Args:
+        rng: where all draws come from.
+        nodes: about how many nodes a scene of the dataset has, obstacle included; this one has 0.5 to 1.7 times that.
+        frames: how many frames the press and the release take.
+    """
     while True:
-        case = _try_draw(rng, nodes)
-        if case is not None and 0.75 * nodes <= case.scene.num_nodes <= 1.5 * nodes:
+        case = _try_draw(rng, nodes, frames)
+        if case is not None and 0.5 * nodes <= case.scene.num_nodes <= 1.7 * nodes:
             return case
 
 
-def _try_draw(rng: np.random.Generator, nodes: int) -> PlateCase | None:
-    """One draw; None if its holes overlap, or if the obstacle does not fit or would come down on a hole."""
-    refinement = np.sqrt(DEFAULT_NODES / nodes)  # two layers of elements: nodes grow with the area
-    spacing = rng.uniform(0.036, 0.044) * refinement
-    size = rng.uniform([0.42, 0.24, 0.025], [0.54, 0.40, 0.045])
-    cells = np.maximum(np.rint(size / spacing).astype(int), (4, 2, 2))
-    holes = _draw_holes(rng, size, spacing)
-    if len(holes) == 2 and np.hypot(*(holes[0] - holes[1])[:2]) < holes[:, 2].sum() + 2.4 * spacing:
+def _try_draw(rng: np.random.Generator, nodes: int, frames: int) -> SolidCase | None:
+    """One draw; None if the plate cannot be meshed well, or if the obstacle does not fit or comes down on a hole."""
+    wanted = nodes * rng.triangular(0.53, 0.95, 1.6)
+    cells = max(2, round((OBSTACLE_SHARE * wanted) ** (1 / 3)) - 1)
+    plate = _draw_plate(rng, wanted - (cells + 1) ** 3)
+    if plate is None:
         return None
-    position, elements = mesh.plate(tuple(size), tuple(cells), holes)
-    shape, obstacle, obstacle_elements = _draw_obstacle(rng, max(2, round(3 / refinement)))
-    travel = _draw_travel(rng)
-    lowest = obstacle[np.argmin(obstacle[:, 2])]
-    # `aim`: where the lowest point of the obstacle meets the plate. It is solid, and the obstacle stays well between
-    # the clamps: nothing gives way where it would press on a clamped node.
-    first, last = obstacle[:, 0].min() + travel[:, 0].min(), obstacle[:, 0].max() + travel[:, 0].max()
-    left, right = CLAMP_MARGIN - size[0] / 2 - first, size[0] / 2 - CLAMP_MARGIN - last
-    if left > right:
-        return None
-    along = (left + right) / 2 + 0.35 * rng.uniform(-1, 1) * (right - left)
-    aim = np.array([along + lowest[0], 0.35 * rng.uniform(-1, 1) * size[1]])
-    if not all(np.hypot(*(aim - hole[:2])) >= hole[2] + spacing / 2 for hole in holes):
+    shape, obstacle, obstacle_elements = draw_obstacle(rng, cells)
+    way = draw_way(rng, frames)
+    depth = rng.uniform(0.02, 0.065)
+    direction = np.array([*rng.uniform(-0.25, 0.25, 2), -1.0])
+    touch = _draw_touch(rng, plate, obstacle, depth * direction)
+    if touch is None:
         return None
     gap = rng.uniform(0.004, 0.015)
-    direction = travel[np.argmin(travel[:, 2])]
-    start = np.array([*aim, size[2] / 2 + gap]) - [*(direction[:2] * gap / -direction[2]), 0]
-    travel = travel * (1 + gap / -direction[2])
+    drift = draw_drift(rng, way)
+    lowest = obstacle[np.argmin(obstacle[:, 2])]
+    start = np.array([*touch, plate.position[:, 2].max()]) - gap * direction
     obstacle = obstacle + start - lowest
-    node_type = np.full(len(position) + len(obstacle), NodeType.NORMAL, np.uint8)
-    node_type[: len(position)][np.isclose(np.abs(position[:, 0]), size[0] / 2)] = NodeType.HANDLE
-    node_type[len(position) :] = NodeType.OBSTACLE
-    scene = Scene(
-        rest_position=np.concatenate([position, obstacle]).astype(np.float32),
-        elements=np.concatenate([elements, obstacle_elements + len(position)]).astype(np.int32),
+    travel = (depth + gap) * way[:, None] * direction + _follow(plate, touch, drift)
+    n = len(plate.position)
+    scene = _assemble(plate, obstacle, obstacle_elements)
+    targets = np.repeat(scene.rest_position.astype(np.float64)[None], frames, axis=0)
+    targets[:, n:] += travel[:, None]
+    for clamp, moves in enumerate(drift, 1):
+        targets[:, :n][:, plate.clamps == clamp] += moves[:, None]
+    attributes = {
+        "obstacle": shape,
+        "outline": plate.outline.kind,
+        "holes": " ".join(plate.outline.hole_kinds),
+        "thickness": float(np.ptp(plate.position[:, 2])),
+        "depth": depth,
+        "drift": [float(np.linalg.norm(moves, axis=1).max()) for moves in drift],
+    }
+    return SolidCase(scene, targets, MATERIAL, CONTACT, INFO.stress_location, attributes)
+
+
+def _draw_plate(rng: np.random.Generator, nodes: float) -> _Plate | None:
+    """A plate of about so many nodes; None if it has an element of poor shape."""
+    length, width, thickness = rng.uniform([0.42, 0.24, 0.025], [0.54, 0.40, 0.045])
+    columns = nodes / (LAYERS + 1)
+    outline = draw_outline(rng, length, width, plate_mesh.spacing_for(columns, length * width, 2 * (length + width)))
+    loops = [np.concatenate(outline.pieces), *outline.holes]
+    area = sum(abs(plate_mesh.area(loop)) * (1 if loop is loops[0] else -1) for loop in loops)
+    perimeter = sum(map(plate_mesh.length, loops))
+    spacing = plate_mesh.spacing_for(columns, area, perimeter)
+    mesh = plate_mesh.triangulate(outline.pieces, outline.holes, spacing)
+    if mesh is None or plate_mesh.smallest_angle(mesh) < SMALLEST_ANGLE:
+        return None
+    taper = rng.uniform(-0.3, 0.3) if rng.random() < 0.4 else 0.0
+    position, elements = plate_mesh.extrude(mesh, thickness * (1 + taper * mesh.points[:, 0] / length), LAYERS)
+    clamps = np.zeros(len(mesh.points), int)
+    for clamp, piece in enumerate(outline.ends, 1):
+        clamps[mesh.pieces[piece]] = clamp
+    return _Plate(outline, spacing, position, elements, np.repeat(clamps, LAYERS + 1))
+
+
+def _draw_touch(rng: np.random.Generator, plate: _Plate, obstacle: np.ndarray, press: np.ndarray) -> np.ndarray | None:
+    """Where [2] the lowest point of the obstacle meets the plate; None if it does not fit, or over a hole.
+
+    The plate is solid there, and the obstacle stays well between the clamps on all of its way: nothing gives way where
+    it would press on a clamped node.
+    """
+    x, y = obstacle[:, :2].T - obstacle[np.argmin(obstacle[:, 2]), :2][:, None]
+    ends = [plate.position[plate.clamps == clamp, 0] for clamp in (1, 2)]
+    left = ends[0].max() + CLAMP_MARGIN - min(x.min(), (x + press[0]).min())
+    right = ends[1].min() - CLAMP_MARGIN - max(x.max(), (x + press[0]).max())
+    if left > right:
+        return None
+    along, across = rng.uniform(-1, 1, 2)
+    side = np.abs(plate.position[:, 1]).max()
+    touch = np.array([(left + right) / 2 + 0.35 * along * (right - left), 0.7 * across * side])
+    sides, holes = np.concatenate(plate.outline.pieces), plate.outline.holes
+    solid = distance_to(sides, touch) < -0.2 * side
+    return touch if solid and all(distance_to(hole, touch) >= plate.spacing / 2 for hole in holes) else None
+
+
+def draw_way(rng: np.random.Generator, frames: int) -> np.ndarray:
+    """Share of the press in each frame [S]: from 0 to 1, held in some, and back to 0, linearly or by a cosine."""
+    last = frames - 1
+    peak = round(rng.triangular(0.7, 0.9, 0.93) * last)
+    hold = round(rng.uniform(0.02, 0.06) * last) if rng.random() < 0.3 else 0
+    way = np.interp(np.arange(frames), [0, peak - hold, peak, last], [0, 1, 1, 0])
+    return (1 - np.cos(np.pi * way)) / 2 if rng.random() < 0.5 else way
+
+
+def draw_drift(rng: np.random.Generator, way: np.ndarray) -> np.ndarray:
+    """Displacements [2,S,3] of the left and the right clamp in metres: none, or one or both by 0.02 to 0.06.
+
+    They go outwards, not inwards (a plate that is pushed together buckles), sideways, up and down; smoothly until the
+    last frame, or with the press and back.
+    """
+    drift = np.zeros((2, len(way), 3))
+    moving = rng.choice(4, p=[0.5, 0.15, 0.15, 0.2])  # none, left, right, both
+    for clamp, outwards in ((0, -1), (1, 1)):
+        direction = np.array([outwards * rng.uniform(0, 0.7), *rng.uniform(-1, 1, 2)])
+        size = rng.uniform(0.02, 0.06)
+        if moving in (clamp + 1, 3):
+            drift[clamp] = size * direction / np.linalg.norm(direction)
+    returns = rng.random() < 0.5
+    share = way if returns else (1 - np.cos(np.pi * np.linspace(0, 1, len(way)))) / 2
+    return drift * share[:, None]
+
+
+def _follow(plate: _Plate, touch: np.ndarray, drift: np.ndarray) -> np.ndarray:
+    """Displacement [S,3] of a clamped beam under the drift of its ends, where the obstacle touches it."""
+    left, right = (plate.position[plate.clamps == clamp, 0].mean() for clamp in (1, 2))
+    s = (touch[0] - left) / (right - left)
+    share = s * s * (3 - 2 * s)
+    return (1 - share) * drift[0] + share * drift[1]
+
+
+def _assemble(plate: _Plate, obstacle: np.ndarray, obstacle_elements: np.ndarray) -> Scene:
+    n = len(plate.position)
+    node_type = np.full(n + len(obstacle), NodeType.OBSTACLE, np.uint8)
+    node_type[:n] = np.where(plate.clamps > 0, NodeType.HANDLE, NodeType.NORMAL)
+    return Scene(
+        rest_position=np.concatenate([plate.position, obstacle]).astype(np.float32),
+        elements=np.concatenate([plate.elements, obstacle_elements + n]).astype(np.int32),
         node_type=node_type,
-        body=np.repeat([0, 1], [len(position), len(obstacle)]).astype(np.int32),
+        body=np.repeat([0, 1], [n, len(obstacle)]).astype(np.int32),
     )
-    return PlateCase(scene, travel, shape)
-
-
-def _draw_holes(rng: np.random.Generator, size: np.ndarray, spacing: float) -> np.ndarray:
-    """No hole in half of the plates, else one or two, more than a cell from the sides: [H,3] centre x, y, radius."""
-    count = rng.choice([0, 1, 2], p=[0.5, 0.4, 0.1])
-    margin = 1.2 * spacing
-    radius = np.minimum(rng.uniform(0.035, 0.07, count), size[1] / 2 - margin)
-    centre = rng.uniform(-1, 1, (count, 2)) * (size[:2] / 2 - radius[:, None] - margin)
-    return np.column_stack([centre, radius])
-
-
-def _draw_obstacle(rng: np.random.Generator, cells: int) -> tuple[str, np.ndarray, np.ndarray]:
-    """Shape, positions [N,3] around the origin and tetrahedra of an obstacle, turned by a yaw and a small tilt."""
-    shape = SHAPES[rng.integers(len(SHAPES))]
-    size = rng.uniform(0.035, 0.075, 3)
-    if shape == "ball":
-        position, elements = mesh.ball(size[0], cells)
-    elif shape == "cylinder":
-        position, elements = mesh.cylinder(size[0], size[1], cells)
-    else:
-        position, elements = mesh.block(tuple(size), cells)
-    yaw, tilt, about = rng.uniform(0, np.pi), rng.uniform(0, 0.2), rng.uniform(0, 2 * np.pi)
-    axis = np.array([np.cos(about), np.sin(about), 0])
-    return shape, position @ _rotation(np.array([0, 0, 1]), yaw).T @ _rotation(axis, tilt).T, elements
-
-
-def _rotation(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Rotation matrix about a unit axis (Rodrigues)."""
-    cross = np.cross(np.eye(3), -axis)
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-
-
-def _draw_travel(rng: np.random.Generator) -> np.ndarray:
-    """Displacements [S,3] of the obstacle below its first touch: pressed in, then released, ending where it began."""
-    depth = rng.uniform(0.02, 0.06)
-    direction = np.array([*rng.uniform(-0.25, 0.25, 2), -1.0])
-    press = int(rng.integers(22, 30))
-    frame = np.arange(FRAMES)
-    way = np.where(frame <= press, frame / press, (FRAMES - 1 - frame) / (FRAMES - 1 - press))
-    if rng.random() < 0.5:
-        way = (1 - np.cos(np.pi * way)) / 2
-    return depth * way[:, None] * direction

@@ -73,11 +73,22 @@ def plate(
 
 
 def _cube(cells: int) -> tuple[np.ndarray, np.ndarray]:
-    coordinates, elements = hexahedral_grid((cells, cells, cells))
-    return 2 * coordinates / cells - 1, elements
+    """The cube [-1,1]^3, cells mirrored about its middle so that their diagonals run outwards.
+
+    No tetrahedron then has two faces on the surface, which would become flat where the cube's edges are rounded.
+    """
+    index = np.argwhere(np.ones((cells,) * 3, bool))
+    outwards = kuhn_tetrahedra() ^ np.array([0, 1, 1])  # from (0,0,0) to (1,1,1)
+    upper = (index >= cells // 2)[:, None, None, :]
+    corners = index[:, None, None, :] + np.where(upper, outwards, 1 - outwards)
+    elements = np.ravel_multi_index(np.moveaxis(corners, -1, 0), (cells + 1,) * 3).reshape(-1, 4)
+    x = 2 * np.argwhere(np.ones((cells + 1,) * 3, bool)) / cells - 1
+    inverted = np.linalg.det(x[elements[:, 1:]] - x[elements[:, :1]]) < 0
+    elements[inverted] = elements[inverted][:, [1, 0, 2, 3]]
+    return x, elements
 
 
-def _round(x: np.ndarray) -> np.ndarray:
+def rounded(x: np.ndarray) -> np.ndarray:
     """Map the square or cube [-1,1]^d onto the unit disc or ball, keeping directions: x |x|_max / |x|_2."""
     length = np.linalg.norm(x, axis=1, keepdims=True)
     return x * np.divide(np.abs(x).max(1, keepdims=True), length, out=np.zeros_like(length), where=length > 0)
@@ -92,10 +103,10 @@ def block(half_size: tuple[float, float, float], cells: int) -> tuple[np.ndarray
 def ball(radius: float, cells: int) -> tuple[np.ndarray, np.ndarray]:
     """Ball centred at the origin: positions [N,3], tetrahedra [E,4]; cells across the diameter."""
     x, elements = _cube(cells)
-    return _round(x) * radius, elements
+    return rounded(x) * radius, elements
 
 
 def cylinder(radius: float, half_length: float, cells: int) -> tuple[np.ndarray, np.ndarray]:
     """Cylinder along x centred at the origin: positions [N,3], tetrahedra [E,4]; cells along each direction."""
     x, elements = _cube(cells)
-    return np.concatenate([x[:, :1] * half_length, _round(x[:, 1:]) * radius], axis=1), elements
+    return np.concatenate([x[:, :1] * half_length, rounded(x[:, 1:]) * radius], axis=1), elements

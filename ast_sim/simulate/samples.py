@@ -18,7 +18,7 @@ from ast_sim.data.scene import Scene, Trajectory
 from ast_sim.errors import SimulationError
 from ast_sim.simulate import deforming_plate
 
-# A family is a module with INFO, DEFAULT_NODES and simulate(rng, nodes) -> Trajectory.
+# A family is a module with INFO, DEFAULT_NODES, draw(rng, nodes) -> case and solve(case) -> Trajectory.
 FAMILIES: dict[str, ModuleType] = {"deforming_plate": deforming_plate}
 
 Sample = tuple[str, int]  # split and index in it
@@ -40,7 +40,8 @@ def family_module(family: str) -> ModuleType:
 def make_sample(family: str, seed: int, split: str, index: int, nodes: int) -> Trajectory:
     """Draw and solve one sample; the same arguments give the same arrays, whoever else is drawn."""
     sequence = np.random.SeedSequence(seed, spawn_key=(SPLITS.index(split), index))
-    trajectory = family_module(family).simulate(np.random.default_rng(sequence), nodes)
+    module = family_module(family)
+    trajectory = module.solve(module.draw(np.random.default_rng(sequence), nodes))
     trajectory.attributes.update(seed=seed, index=index)
     return trajectory
 
