@@ -49,7 +49,7 @@ def make(name: str, folder: Path) -> Case:
         _write_plates(data, side)
         return _case("abcd_xl", data, 1, steps=1, most_repeats=20 if side == 55 else 3, every_thread=False)
     nodes, batch = (400, 4) if name == "tiny" else (1300, 8)
-    generate("deforming_plate", data, {"train": batch, "valid": 0, "test": 1}, seed=0, nodes=nodes)
+    generate("deforming_plate", data, {"train": batch, "valid": 0, "test": 1}, seed=0, nodes=nodes, frames=41)
     steps = 10 if name == "tiny" else 1
     return _case(name, data, batch, steps=steps, most_repeats=20, every_thread=name == "tiny")
 

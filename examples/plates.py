@@ -16,10 +16,11 @@ from ast_sim.simulate.generate import generate
 from ast_sim.train import configure, train
 
 
-def main(folder: Path, scenes: int = 24, nodes: int | None = None, steps: int = 1500) -> dict[str, float]:
+def main(folder: Path, scenes: int = 24, nodes: int = 400, steps: int = 1500) -> dict[str, float]:
     """Generate, train and predict; root mean square errors in metres over the free nodes of the test plate."""
     data, run = folder / "plates.h5", folder / "run"
-    generate("deforming_plate", data, {"train": scenes, "valid": 2, "test": 1}, seed=0, nodes=nodes, workers=2)
+    counts = {"train": scenes, "valid": 2, "test": 1}
+    generate("deforming_plate", data, counts, seed=0, nodes=nodes, frames=41, workers=2)
     train(run, configure(data, "tiny", [f"train.steps={steps}"]))
     with open_run(run, data) as trained:
         truth, prediction = predict(trained, "test", 0)
