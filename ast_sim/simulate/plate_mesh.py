@@ -75,12 +75,12 @@ def triangulate(outline: list[np.ndarray], holes: list[np.ndarray], spacing: flo
     Args:
         outline: polylines [K,2] that follow each other, counter-clockwise, and close; a node stands where they meet.
         holes: closed polylines [K,2].
-        spacing: length of the edges; on a hole they are shorter where it would have fewer than eight.
+        spacing: length of the edges; on a hole they are shorter where it would have fewer than ten.
 
     Returns:
         The mesh, or None where curves come so close that their edges are not those of a Delaunay triangulation.
     """
-    loops = [[resample(piece, spacing) for piece in outline], *([resample(hole, spacing, 8)] for hole in holes)]
+    loops = [[resample(piece, spacing) for piece in outline], *([resample(hole, spacing, 10)] for hole in holes)]
     rims = [np.concatenate(loop) for loop in loops]
     rim = np.concatenate(rims)
     first = np.cumsum([0, *map(len, rims)])[:-1]
