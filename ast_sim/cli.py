@@ -40,6 +40,19 @@ class _TrainParser(_Parser):
         return "\n".join(lines) + "\n"
 
 
+class _GenerateParser(_Parser):
+    """Its help ends with a line for every family."""
+
+    def format_help(self) -> str:
+        from ast_sim.simulate.families import FAMILIES
+
+        lines = [super().format_help(), "families:"]
+        for name, family in FAMILIES.items():
+            options = "".join(f" --{option}" for option in family.options)
+            lines.append(f"  {name:17}{family.about}{f' ({options.strip()})' if options else ''}")
+        return "\n".join(lines) + "\n"
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     args = _build_parser().parse_args(argv)
@@ -83,15 +96,21 @@ def _build_parser() -> argparse.ArgumentParser:
     demo.add_argument("--quick", action="store_true", help="fewer scenes and steps: 90 seconds on 2 cores")
     demo.add_argument("--seed", type=_at_least(0), default=0, help="of scenes and training (0)")
 
-    generate = command("generate", _generate, "simulate scenes with the bundled contact FEM; restarts where it stopped")
-    generate.add_argument("family", metavar="FAMILY", help="kind of scenes: deforming_plate")
+    about = "simulate scenes with the bundled contact FEM; restarts where it stopped"
+    generate = command("generate", _generate, about, _GenerateParser)
+    generate.add_argument("family", metavar="FAMILY", help="kind of scenes, see below")
     generate.add_argument("--out", type=Path, required=True, metavar="FILE", help="dataset to write (.h5)")
     generate.add_argument("--count", type=_at_least(1), required=True, metavar="N", help="training scenes")
     generate.add_argument("--valid", type=_at_least(0), metavar="N", help="validation scenes (a tenth of N)")
     generate.add_argument("--test", type=_at_least(0), metavar="N", help="test scenes (a tenth of N)")
     generate.add_argument("--nodes", type=_at_least(1), metavar="N", help="nodes of a scene, about")
+    generate.add_argument("--frames", type=_at_least(2), metavar="N", help="frames of a scene")
     generate.add_argument("--seed", type=_at_least(0), default=0, help="the scenes follow from it (0)")
-    generate.add_argument("--workers", type=_at_least(1), metavar="W", help="processes (one a core)")
+    generate.add_argument("--solver", choices=("own", "calculix"), help="CalculiX in place of the bundled FEM")
+    generate.add_argument("--parts", type=Path, metavar="PATH", help="own parts: a STEP, STL or mesh file, or a folder")
+    where = generate.add_mutually_exclusive_group()
+    where.add_argument("--workers", type=_at_least(1), metavar="W", help="processes (one a core)")
+    where.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler whose workers solve, as tcp://host:8786")
 
     _add_convert(command("convert", _convert, "import simulations of other programs (PVD collections, VTU series)"))
 
@@ -182,7 +201,18 @@ def _generate(args: argparse.Namespace) -> None:
         "valid": tenth if args.valid is None else args.valid,
         "test": tenth if args.test is None else args.test,
     }
-    made = generate(args.family, args.out, counts, args.seed, args.nodes, args.workers)
+    made = generate(
+        args.family,
+        args.out,
+        counts,
+        seed=args.seed,
+        nodes=args.nodes,
+        frames=args.frames,
+        workers=args.workers,
+        solver=args.solver,
+        parts=args.parts,
+        scheduler=args.scheduler,
+    )
     print(f"{made.path}: {', '.join(f'{count} {split}' for split, count in made.counts.items())}")
     if made.truncated:
         print(f"stopped before their last frame: {', '.join(made.truncated)}")

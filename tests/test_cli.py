@@ -66,6 +66,30 @@ def test_train_help_explains_every_setting(capsys):
     assert "deforming_plate" in shown
 
 
+def test_generate_help_tells_of_every_family_and_imports_no_solver():
+    code = (
+        "import sys; from ast_sim.cli import main\n"
+        "try: main(['generate', '--help'])\n"
+        "except SystemExit: pass\n"
+        "assert not {'torch', 'numpy', 'h5py', 'ipctk'} & set(sys.modules), sorted(sys.modules)"
+    )
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    for name in ("deforming_plate", "sphere_simple", "abcd", "abcd_xl"):
+        assert f"\n  {name} " in shown
+    for option in ("nodes", "frames", "solver", "parts", "workers", "scheduler"):
+        assert f"--{option}" in shown
+
+
+def test_generate_makes_a_dataset_of_the_settings_given(tmp_path, capsys):
+    out = tmp_path / "plates.h5"
+    options = ["--count", "1", "--valid", "0", "--test", "0", "--seed", "3", "--nodes", "80", "--frames", "3"]
+    assert main(["generate", "deforming_plate", "--out", str(out), *options, "--workers", "1"]) == 0
+    assert f"{out}: 1 train, 0 valid, 0 test" in capsys.readouterr().out
+    with Dataset(out) as dataset:
+        assert dataset.num_frames("train", 0) == 3
+        assert dataset.info.generator["command"] == "ast-sim generate deforming_plate --seed 3 --nodes 80 --frames 3"
+
+
 def test_info_of_a_dataset(trained, capsys):
     data, _ = trained
     assert main(["info", str(data), "--json"]) == 0
@@ -258,6 +282,13 @@ def test_a_folder_that_is_no_run_and_a_dataset_of_another_kind(trained, tmp_path
 def test_arguments_out_of_range(tmp_path, capsys):
     assert "0 is below 1" in fails(capsys, "generate", "deforming_plate", "--out", tmp_path / "a.h5", "--count", 0)
     assert "ball" in fails(capsys, "generate", "ball", "--out", tmp_path / "a.h5", "--count", 1)
+    plates = ("generate", "deforming_plate", "--out", tmp_path / "a.h5", "--count", 1)
+    assert "1 is below 2" in fails(capsys, *plates, "--frames", 1)
+    assert "invalid choice: 'abaqus'" in fails(capsys, *plates, "--solver", "abaqus")
+    assert "not allowed with" in fails(capsys, *plates, "--workers", 2, "--scheduler", "tcp://host:8786")
+    error = fails(capsys, *plates, "--parts", tmp_path)
+    assert "deforming_plate has no option parts: it is one of abcd, abcd_xl" in error
+    assert os.listdir(tmp_path) == []
 
 
 def test_a_folder_that_cannot_be_made_is_one_line(trained, tmp_path, capsys):

@@ -1,15 +1,16 @@
-"""Generate a dataset with several worker processes, in a way that survives a kill.
+"""Generate a dataset with many processes, on one machine or a cluster, in a way that survives a kill.
 
-Every finished sample lies in `OUT.parts/`; a run with the same settings goes on from there, and when all are present
-they are merged in order into the dataset file and the folder is removed. The result does not depend on the number of
-workers or on interruptions, except for the recorded seconds.
+Every finished sample lies in `OUT.parts/`, and the frames so far of long ones that are not; a run with the same
+settings goes on from there, and when all are present they are merged in order into the dataset file and the folder is
+removed. The bytes of the dataset follow from the settings: not from the number of workers, nor from interruptions. The
+seconds that the solver took lie beside it (`ast_sim.data.seconds`).
 """
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
-import importlib.metadata
+import glob
 import json
 import os
 import shutil
@@ -19,14 +20,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import ast_sim
 from ast_sim.data.disk import replacing
 from ast_sim.data.file import SPLITS, Dataset, DatasetInfo, DatasetWriter
+from ast_sim.data.seconds import Seconds, write_seconds
 from ast_sim.errors import SimulationError
+from ast_sim.simulate import cluster, pool
 from ast_sim.simulate.contact import self_test
-from ast_sim.simulate.pool import run_all
+from ast_sim.simulate.families import family_module
+from ast_sim.simulate.manifest import Manifest, Watch
 from ast_sim.simulate.progress import Progress
-from ast_sim.simulate.samples import Sample, family_module, load_sample, sample_name, sample_path
+from ast_sim.simulate.samples import Recipe, Sample, load_sample, sample_name, sample_path
+from ast_sim.simulate.settings import checked_recipe, difference, recorded
 
 COUNTS = {"train": 100, "valid": 8, "test": 10}
 
@@ -52,7 +56,11 @@ def generate(
     counts: dict[str, int] | None = None,
     seed: int = 0,
     nodes: int | None = None,
+    frames: int | None = None,
     workers: int | None = None,
+    solver: str | None = None,
+    parts: str | os.PathLike[str] | None = None,
+    scheduler: str | None = None,
     progress: bool = True,
 ) -> Generated:
     """Generate a dataset file of simulated scenes.
@@ -61,43 +69,63 @@ def generate(
         family: scene family, such as "deforming_plate".
         out: the dataset file. If it exists and was made with the same settings, nothing is done.
         counts: samples of each split; `COUNTS` if None.
-        seed: a sample depends on it, its split, its index and `nodes` alone.
+        seed: a sample depends on it, its split, its index and the family's settings alone.
         nodes: about how many nodes a scene has; the family's default if None.
+        frames: frames of a scene, for families that leave the choice; the family's default if None.
         workers: number of processes; one per available core if None.
+        solver: "own" or "calculix", for families of solids; "own" if None.
+        parts: a file or folder of parts (STEP, STL, meshes), for families that squeeze parts; own shapes if None.
+        scheduler: address of a Dask scheduler whose workers make the samples, in place of processes here.
         progress: show a bar on a terminal, lines elsewhere.
 
     Raises:
         SimulationError: settings that cannot be, an `out` or parts folder of other settings or in use, failed samples.
             The finished samples are kept: the same call goes on from them.
-        MissingExtra: ipctk is not installed.
+        MissingExtra: what the family, solver or scheduler needs is not installed.
     """
     module = family_module(family)
     self_test()
     counts = _checked_counts(COUNTS if counts is None else counts)
-    nodes = module.DEFAULT_NODES if nodes is None else nodes
+    recipe = checked_recipe(module, family, seed, nodes, frames, solver, parts)
+    if workers is not None and scheduler is not None:
+        raise SimulationError("workers are processes on this machine, a scheduler has its own: give one of them")
     workers = _available_cores() if workers is None else workers
-    for name, value, least in (("seed", seed, 0), ("nodes", nodes, module.MINIMUM_NODES), ("workers", workers, 1)):
-        if value < least:
-            raise SimulationError(f"{name} is {value}; must be at least {least}")
-    out = Path(out)
-    settings = _settings(family, seed, nodes)
+    if workers < 1:
+        raise SimulationError(f"workers is {workers}; must be at least 1")
+    out, settings = Path(out), recorded(recipe)
+    folder = out.with_name(out.name + ".parts")
     if out.exists():
-        return _existing(out, settings, counts)
-    parts = out.with_name(out.name + ".parts")
+        return _existing(out, folder, settings, counts)
     samples = [(split, index) for split in SPLITS for index in range(counts[split])]
-    with _locked(parts, settings):
-        missing = [sample for sample in samples if not _is_readable(sample_path(parts, *sample))]
-        with Progress(len(samples), len(samples) - len(missing), "scenes", progress) as bar:
-            failures = run_all(missing, parts, (family, str(seed), str(nodes)), workers, bar)
-        if failures:
-            listing = "; ".join(f"{sample_name(*sample)}: {text}" for sample, text in list(failures.items())[:3])
-            raise SimulationError(
-                f"{len(failures)} of {len(samples)} samples failed ({listing}). The others are kept in {parts}:"
-                " the same command goes on from there"
-            )
-        truncated = _merge(out, parts, samples, replace(module.INFO, generator={**settings, "counts": counts}))
-        shutil.rmtree(parts)
+    with _locked(folder, settings):
+        _make(samples, folder, recipe, workers, scheduler, progress)
+        info = replace(module.INFO, generator={**settings, "counts": counts})
+        truncated = _merge(out, folder, samples, info)
+        _remove(folder)
     return Generated(out, counts, truncated)
+
+
+def _make(
+    samples: list[Sample], folder: Path, recipe: Recipe, workers: int, scheduler: str | None, progress: bool
+) -> None:
+    """Make the samples that are not in the folder."""
+    present = {sample for sample in samples if _is_readable(sample_path(folder, *sample))}
+    missing = [sample for sample in samples if sample not in present]
+    manifest = Manifest(folder, samples, present)
+    with contextlib.closing(manifest), Progress(len(samples), len(present), "scenes", progress) as bar:
+        for name, reason in manifest.failures.items():
+            bar.note(f"{name} failed before: {reason}")
+        watch = Watch(manifest, bar)
+        if missing and scheduler is None:
+            pool.run_all(missing, folder, recipe, workers, watch)
+        elif missing:
+            cluster.run_all(missing, folder, recipe, scheduler, watch)
+    if watch.failures:
+        listing = "; ".join(f"{sample_name(*sample)}: {text}" for sample, text in list(watch.failures.items())[:3])
+        raise SimulationError(
+            f"{len(watch.failures)} of {len(samples)} samples failed ({listing}). The others are kept in {folder}:"
+            " the same command goes on from there"
+        )
 
 
 def _available_cores() -> int:
@@ -116,57 +144,39 @@ def _checked_counts(counts: dict[str, int]) -> dict[str, int]:
     return counts
 
 
-def _settings(family: str, seed: int, nodes: int) -> dict[str, Any]:
-    """All that the arrays of a sample depend on, beside its split and index."""
-    versions = {name: importlib.metadata.version(name) for name in ("numpy", "scipy", "ipctk")}
-    return {
-        "program": f"ast_sim {ast_sim.__version__}",
-        "versions": versions,
-        "family": family,
-        "seed": seed,
-        "nodes": nodes,
-        "command": f"ast-sim generate {family} --seed {seed} --nodes {nodes}",
-        "licence": "CC0-1.0",
-    }
-
-
-def _difference(found: dict[str, Any], wanted: dict[str, Any]) -> str:
-    """The first setting that differs, in words; empty if none does."""
-    for key, value in wanted.items():
-        if found.get(key) != value:
-            return f"{key} {found.get(key)} there, {value} here"
-    return ""
-
-
-def _existing(out: Path, settings: dict[str, Any], counts: dict[str, int]) -> Generated:
+def _existing(out: Path, folder: Path, settings: dict[str, Any], counts: dict[str, int]) -> Generated:
     with Dataset(out) as dataset:
-        difference = _difference(dataset.info.generator, {**settings, "counts": counts})
-        if difference:
-            raise SimulationError(f"{out} exists and holds other data ({difference}): remove it or choose another name")
+        differs = difference(dataset.info.generator, {**settings, "counts": counts})
+        if differs:
+            raise SimulationError(f"{out} exists and holds other data ({differs}): remove it or choose another name")
         names = [(split, index) for split in SPLITS for index in range(dataset.count(split))]
         truncated = [sample_name(*sample) for sample in names if dataset.attributes(*sample)["status"] == "truncated"]
+    if folder.exists():  # a kill came between the dataset and the end of its parts
+        with _locked(folder, settings):
+            _remove(folder)
+    _remove(folder)
     return Generated(out, counts, truncated)
 
 
 @contextlib.contextmanager
-def _locked(parts: Path, settings: dict[str, Any]) -> Iterator[None]:
+def _locked(folder: Path, settings: dict[str, Any]) -> Iterator[None]:
     """Hold the parts folder, made for these settings or found with them; one process at a time."""
     try:
-        parts.mkdir(parents=True, exist_ok=True)
-        lock = open(parts / "lock", "w")  # noqa: SIM115 (closed below, also on an error)
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = open(folder / "lock", "w")  # noqa: SIM115 (closed below, also on an error)
     except OSError as error:
-        raise SimulationError(f"{parts} cannot be written: {error}") from error
+        raise SimulationError(f"{folder} cannot be written: {error}") from error
     with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise SimulationError(f"{parts} is in use by another process that generates the same file") from None
-        path = parts / "settings.json"
+            raise SimulationError(f"{folder} is in use by another process that generates the same file") from None
+        path = folder / "settings.json"
         if path.exists():
-            difference = _difference(_read_settings(path), settings)
-            if difference:
+            differs = difference(_read_settings(path), settings)
+            if differs:
                 raise SimulationError(
-                    f"{parts} holds samples of other settings ({difference}): give those, or remove the folder"
+                    f"{folder} holds samples of other settings ({differs}): give those, or remove the folder"
                 )
         else:
             try:
@@ -174,6 +184,8 @@ def _locked(parts: Path, settings: dict[str, Any]) -> Iterator[None]:
                     temporary.write_text(json.dumps(settings))
             except OSError as error:
                 raise SimulationError(f"{path} cannot be written: {error}") from error
+        for leftover in folder.glob(".*"):  # what a killed process was about to write
+            leftover.unlink(missing_ok=True)
         yield
 
 
@@ -184,6 +196,15 @@ def _read_settings(path: Path) -> dict[str, Any]:
         raise SimulationError(f"{path} is damaged ({error}): remove the folder") from error
 
 
+def _remove(folder: Path) -> None:
+    """Remove the parts folder at one instant: never are there samples without the settings that they are of."""
+    removed = folder.with_name(f".{folder.name}.removed")
+    shutil.rmtree(removed, ignore_errors=True)
+    with contextlib.suppress(FileNotFoundError):
+        os.replace(folder, removed)
+        shutil.rmtree(removed)
+
+
 def _is_readable(path: Path) -> bool:
     try:
         load_sample(path)
@@ -192,12 +213,18 @@ def _is_readable(path: Path) -> bool:
     return True
 
 
-def _merge(out: Path, parts: Path, samples: list[Sample], info: DatasetInfo) -> list[str]:
+def _merge(out: Path, folder: Path, samples: list[Sample], info: DatasetInfo) -> list[str]:
+    """Write the dataset, and its seconds before it; returns the truncated samples."""
     truncated = []
+    seconds: dict[str, Seconds] = {}
+    for end in ("*.tmp", "seconds.json.*"):
+        for leftover in out.parent.glob(f".{glob.escape(out.name)}.{end}"):  # of a merge that was killed
+            leftover.unlink(missing_ok=True)
     with DatasetWriter(out, info) as writer:
         for sample in samples:
-            trajectory = load_sample(sample_path(parts, *sample))
+            trajectory, seconds[sample_name(*sample)] = load_sample(sample_path(folder, *sample))
             writer.add(sample[0], trajectory)
             if trajectory.attributes["status"] == "truncated":
                 truncated.append(sample_name(*sample))
+        write_seconds(out, info.generator, seconds)
     return truncated

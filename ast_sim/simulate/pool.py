@@ -9,109 +9,139 @@ import selectors
 import signal
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import ast_sim
 from ast_sim.errors import SimulationError
-from ast_sim.simulate.progress import Progress
-from ast_sim.simulate.samples import Sample, sample_name
+from ast_sim.simulate.manifest import Watch
+from ast_sim.simulate.samples import Recipe, Sample, sample_name
 
-SINGLE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+# One thread, and the same bits whatever the memory's alignment: without MKL_CBWR, MKL sums in another order where an
+# array happens to begin elsewhere; a named branch is also the same on processors that have more than it.
+ENVIRONMENT = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "MKL_THREADING_LAYER": "SEQUENTIAL",
+    "MKL_CBWR": "AVX2",
+}
 
 
 class Worker:
-    """One worker process and the sample that it is at."""
+    """One worker process and the sample that it is at.
 
-    def __init__(self, parts: Path, arguments: tuple[str, ...]) -> None:
+    Args:
+        folder: where it stores samples.
+        recipe: of all its samples.
+        checkpoints: where it keeps unfinished ones; the same folder if None.
+    """
+
+    def __init__(self, folder: Path, recipe: Recipe, checkpoints: Path | None = None) -> None:
         # Not multiprocessing: its spawned children import the script of the parent again, and torch with it.
         root = str(Path(ast_sim.__file__).parent.parent)
         path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+        arguments = [str(folder), str(checkpoints or folder), json.dumps(asdict(recipe)), str(os.getpid())]
         self.process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "ast_sim.simulate.worker", str(parts), *arguments],
+            [sys.executable, "-P", "-m", "ast_sim.simulate.worker", *arguments],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            env={**os.environ, **dict.fromkeys(SINGLE_THREAD, "1"), "PYTHONPATH": path},
-            text=True,
-            bufsize=1,
+            env={**os.environ, **ENVIRONMENT, "PYTHONPATH": path},
+            bufsize=0,
             start_new_session=True,  # an interrupt from the terminal goes to the parent alone
         )
         self.sample: Sample | None = None
+        self._unfinished = b""  # the beginning of a line whose end has not come yet
 
-    @property
-    def answers(self) -> TextIO:
-        return self.process.stdout
+    def fileno(self) -> int:
+        """What there is to read when the worker has said something."""
+        return self.process.stdout.fileno()
 
     def give(self, sample: Sample) -> None:
         self.sample = sample
         with contextlib.suppress(BrokenPipeError):  # a dead worker is noticed by the end of its answers
-            self.process.stdin.write(f"{sample[0]} {sample[1]}\n")
+            self.process.stdin.write(f"{sample[0]} {sample[1]}\n".encode())
 
-    def receive(self) -> dict[str, Any]:
-        """The answer to the sample given; how the process ended, as an error, if there is none."""
-        line = self.answers.readline()
-        if line.endswith("\n"):
-            return json.loads(line)
-        code = self.process.wait()
-        ended = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-        return {"error": f"its worker process {ended}", "fatal": False, "dead": True}
+    def receive(self) -> list[dict[str, Any]]:
+        """What it has said since; waits for something. How the process ended, as an error, if it has."""
+        data = os.read(self.fileno(), 1 << 16)
+        if not data:
+            code = self.process.wait()
+            ended = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+            return [{"error": f"its worker process {ended}", "dead": True}]
+        *lines, self._unfinished = (self._unfinished + data).split(b"\n")
+        return [json.loads(line) for line in lines]
 
     def stop(self) -> None:
-        self.process.kill()
+        """End the process and the programs that it started."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.process.pid, signal.SIGKILL)  # it leads a session, and a group, of its own
         self.process.wait()
         self.process.stdout.close()
         with contextlib.suppress(BrokenPipeError):
             self.process.stdin.close()
 
 
-def run_all(
-    samples: list[Sample], parts: Path, arguments: tuple[str, ...], workers: int, bar: Progress
-) -> dict[Sample, str]:
-    """Make the samples; returns those that failed, with the reason.
+class Pool:
+    """Workers that share a list of samples; one that dies costs the sample that it was at and is replaced."""
 
-    A worker that dies costs the sample that it was at and is replaced.
+    def __init__(self, samples: list[Sample], parts: Path, recipe: Recipe, watch: Watch) -> None:
+        self.waiting = list(reversed(samples))
+        self.parts, self.recipe, self.watch = parts, recipe, watch
+        self.active: list[Worker] = []
+        self.selector = selectors.DefaultSelector()
+
+    def start_worker(self) -> None:
+        worker = Worker(self.parts, self.recipe)
+        self.active.append(worker)
+        self.selector.register(worker, selectors.EVENT_READ)
+        self.give(worker)
+
+    def give(self, worker: Worker) -> None:
+        worker.give(self.waiting.pop())
+        self.watch.started(worker.sample, worker.process.pid)
+
+    def end_worker(self, worker: Worker) -> None:
+        self.selector.unregister(worker)
+        self.active.remove(worker)
+        worker.stop()
+
+    def hear(self, worker: Worker, message: dict[str, Any]) -> None:
+        """Act on what a worker said: its sample goes on, is done or has failed; then the next is for it."""
+        if "progress" in message:
+            self.watch.progress(worker.sample, *message["progress"])
+            return
+        if message.get("fatal"):
+            raise SimulationError(f"{sample_name(*worker.sample)} cannot be written: {message['error']}")
+        if "error" in message:
+            self.watch.failed(worker.sample, message["error"], message.get("traceback", ""))
+        else:
+            self.watch.done(worker.sample)
+        if self.waiting and not message.get("dead"):
+            self.give(worker)
+            return
+        self.end_worker(worker)
+        if self.waiting:
+            self.start_worker()
+
+
+def run_all(samples: list[Sample], parts: Path, recipe: Recipe, workers: int, watch: Watch) -> None:
+    """Make the samples and store them in `parts`; `watch` is told of each.
 
     Raises:
         SimulationError: an error that all samples would meet, such as a full disk.
     """
-    waiting, failures = list(reversed(samples)), {}
-    selector = selectors.DefaultSelector()
-    active: list[Worker] = []
-
-    def start_worker() -> None:
-        worker = Worker(parts, arguments)
-        active.append(worker)
-        selector.register(worker.answers, selectors.EVENT_READ, worker)
-        worker.give(waiting.pop())
-
-    def end_worker(worker: Worker) -> None:
-        selector.unregister(worker.answers)
-        active.remove(worker)
-        worker.stop()
-
+    pool = Pool(samples, parts, recipe, watch)
     try:
-        while waiting and len(active) < workers:
-            start_worker()
-        while active:
-            for key, _ in selector.select():
-                worker = key.data
-                answer = worker.receive()
-                if answer.get("fatal"):
-                    raise SimulationError(f"{sample_name(*worker.sample)} cannot be written: {answer['error']}")
-                if "error" in answer:
-                    failures[worker.sample] = answer["error"]
-                    trace = answer.get("traceback", "")
-                    bar.note(f"{sample_name(*worker.sample)} failed: {answer['error']}\n{trace}".strip())
-                else:
-                    bar.advance()
-                if waiting and not answer.get("dead"):
-                    worker.give(waiting.pop())
-                    continue
-                end_worker(worker)
-                if waiting:
-                    start_worker()
+        while pool.waiting and len(pool.active) < workers:
+            pool.start_worker()
+        while pool.active:
+            for key, _ in pool.selector.select(timeout=1.0):
+                for message in key.fileobj.receive():
+                    pool.hear(key.fileobj, message)
+            watch.tick()
     finally:
-        for worker in list(active):
-            end_worker(worker)
-        selector.close()
-    return failures
+        for worker in list(pool.active):
+            pool.end_worker(worker)
+        pool.selector.close()

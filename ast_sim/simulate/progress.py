@@ -1,14 +1,40 @@
-"""Progress of a long count: a tqdm bar on a terminal, plain lines elsewhere."""
+"""Progress of a long count whose units take long themselves: a tqdm bar on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
 import sys
 import time
+from dataclasses import dataclass
 from typing import Self
 
 from tqdm import tqdm
 
+from ast_sim.monitor import duration
+
 SECONDS_BETWEEN_LINES = 10.0
+SECONDS_OF_SILENCE = 30.0  # after which units that are not done yet say how far they are
+MOST_INSIDE = 8  # units that say so at once
+
+
+@dataclass
+class Inside:
+    """How far one unit is; the first frames may be those of an earlier run, which took no time in this one."""
+
+    started: float
+    first: int | None = None
+    frame: int = 0
+    frames: int = 0
+    iterations: int = 0
+
+    def text(self, now: float) -> str:
+        """Frames, Newton iterations, time so far and to go, as the mean of its frames so far lets expect."""
+        elapsed = now - self.started
+        if self.first is None:
+            return f"{duration(elapsed)} so far"
+        text = f"frame {self.frame} of {self.frames}, {self.iterations} iterations, {duration(elapsed)} so far"
+        if self.frame > self.first:
+            text += f", about {duration(elapsed * (self.frames - self.frame) / (self.frame - self.first))} to go"
+        return text
 
 
 class Progress:
@@ -18,6 +44,7 @@ class Progress:
         self.total, self.done, self.unit = total, done, unit
         self._before, self._started = done, time.monotonic()
         self._last_line = self._started
+        self._inside: dict[str, Inside] = {}
         self._lines = shown and not sys.stderr.isatty()
         self._bar = tqdm(total=total, initial=done, unit=f" {unit}", disable=not shown or self._lines, smoothing=0)
         if self._lines and done:
@@ -31,8 +58,35 @@ class Progress:
         if self._lines and (now - self._last_line >= SECONDS_BETWEEN_LINES or self.done == self.total):
             self._last_line = now
             rate = (self.done - self._before) / max(now - self._started, 1e-9)
-            left = (self.total - self.done) / rate
-            self._print(f"{self.done} of {self.total} {self.unit}, {rate:.2f}/s, {left:.0f} s to go")
+            left = duration((self.total - self.done) / rate)
+            self._print(f"{self.done} of {self.total} {self.unit}, {rate:.3g}/s, {left} to go")
+
+    def begin(self, name: str) -> None:
+        """A unit begins."""
+        self._inside[name] = Inside(time.monotonic())
+
+    def inside(self, name: str, frame: int, frames: int, iterations: int) -> None:
+        """A unit has `frame` of `frames` frames, after so many iterations."""
+        unit = self._inside.setdefault(name, Inside(time.monotonic()))
+        unit.first = frame if unit.first is None else unit.first
+        unit.frame, unit.frames, unit.iterations = frame, frames, iterations
+
+    def end(self, name: str) -> None:
+        """A unit is done, or has failed."""
+        self._inside.pop(name, None)
+
+    def tick(self) -> None:
+        """To be called about once a second: tells how far the units are, on a terminal that of the longest run."""
+        now = time.monotonic()
+        longest = sorted(self._inside.items(), key=lambda item: item[1].started)[:MOST_INSIDE]
+        if self._lines and longest and now - self._last_line >= SECONDS_OF_SILENCE:
+            self._last_line = now
+            for name, unit in longest:
+                self._print(f"{name}: {unit.text(now)}")
+        elif longest and now - longest[0][1].started >= SECONDS_BETWEEN_LINES:
+            self._bar.set_postfix_str(f"{longest[0][0]}: {longest[0][1].text(now)}")
+        else:
+            self._bar.set_postfix_str("")
 
     def note(self, text: str) -> None:
         """Show a line of text without disturbing the bar."""

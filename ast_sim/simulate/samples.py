@@ -1,48 +1,74 @@
-"""One generated sample as a pure function of (family, seed, split, index), and its file.
+"""One generated sample as a pure function of its recipe, split and index, and its file.
 
 A sample lies in a small file of its own until the dataset is whole; the file appears under its name complete or not
-at all.
+at all. The seconds that it took lie in it apart from its attributes: they alone differ when it is made again.
 """
 
 from __future__ import annotations
 
+import io
 import json
+from dataclasses import dataclass, replace
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 
 from ast_sim.data.disk import replacing
 from ast_sim.data.file import SPLITS
 from ast_sim.data.scene import Scene, Trajectory
-from ast_sim.errors import SimulationError
-from ast_sim.simulate import deforming_plate
-
-# A family is a module with INFO, DEFAULT_NODES, draw(rng, nodes) -> case and solve(case) -> Trajectory.
-FAMILIES: dict[str, ModuleType] = {"deforming_plate": deforming_plate}
+from ast_sim.data.seconds import Seconds, processor, split_seconds
+from ast_sim.simulate.checkpoint import Checkpoint
+from ast_sim.simulate.families import family_module
 
 Sample = tuple[str, int]  # split and index in it
 
 _SCENE = ("rest_position", "elements", "node_type", "body", "material")
+_FRAMED = ("position", "stress", "cauchy_stress")
 
 
-def family_module(family: str) -> ModuleType:
-    """The module of a scene family.
+@dataclass(frozen=True)
+class Recipe:
+    """What the samples of a dataset depend on, beside split and index.
 
-    Raises:
-        SimulationError: an unknown family.
+    Attributes:
+        family: scene family.
+        seed: where all draws come from.
+        nodes: about how many nodes a scene has.
+        frames: frames of a scene, for families that have this option.
+        solver: "own" or "calculix".
+        parts: a file or folder of the user's parts, for families that have this option.
     """
-    if family not in FAMILIES:
-        raise SimulationError(f"there is no scene family {family!r}; use one of {', '.join(FAMILIES)}")
-    return FAMILIES[family]
+
+    family: str
+    seed: int
+    nodes: int
+    frames: int | None = None
+    solver: str = "own"
+    parts: str | None = None
 
 
-def make_sample(family: str, seed: int, split: str, index: int, nodes: int) -> Trajectory:
-    """Draw and solve one sample; the same arguments give the same arrays, whoever else is drawn."""
-    sequence = np.random.SeedSequence(seed, spawn_key=(SPLITS.index(split), index))
-    module = family_module(family)
-    trajectory = module.solve(module.draw(np.random.default_rng(sequence), nodes))
-    trajectory.attributes.update(seed=seed, index=index)
+def make_sample(recipe: Recipe, split: str, index: int, checkpoint: Checkpoint | None = None) -> Trajectory:
+    """Draw and solve one sample; the same arguments give the same arrays, whoever else is drawn.
+
+    Args:
+        recipe: what all samples depend on.
+        split: "train", "valid" or "test".
+        index: which sample of the split.
+        checkpoint: where an unfinished solve is kept; one that is found there goes on.
+    """
+    module = family_module(recipe.family)
+    sequence = np.random.SeedSequence(recipe.seed, spawn_key=(SPLITS.index(split), index))
+    options = {} if recipe.frames is None else {"frames": recipe.frames}
+    if recipe.parts is not None:
+        options["source"] = Path(recipe.parts)
+    case = module.draw(np.random.default_rng(sequence), recipe.nodes, **options)
+    if recipe.solver == "calculix":
+        from ast_sim.simulate import calculix
+
+        trajectory = calculix.quasi_static(case)
+    else:
+        trajectory = module.solve(case, checkpoint)
+    trajectory.attributes.update(seed=recipe.seed, index=index)
     return trajectory
 
 
@@ -56,18 +82,41 @@ def sample_path(folder: Path, split: str, index: int) -> Path:
     return folder / f"{split}-{index:06d}.npz"
 
 
+def checkpoint_path(folder: Path, split: str, index: int) -> Path:
+    """Where an unfinished sample lies in its folder."""
+    return folder / f"{split}-{index:06d}.checkpoint"
+
+
 def save_sample(path: Path, trajectory: Trajectory) -> None:
     """Write a sample: there is a whole file or none."""
-    scene = {key: getattr(trajectory.scene, key) for key in _SCENE if getattr(trajectory.scene, key) is not None}
-    arrays = {**scene, "position": trajectory.position, "attributes": np.array(json.dumps(trajectory.attributes))}
-    if trajectory.stress is not None:
-        arrays["stress"] = trajectory.stress
-    with replacing(path) as temporary, open(temporary, "wb") as file:
-        np.savez(file, **arrays)
+    store_sample(path, pack_sample(trajectory))
 
 
-def load_sample(path: Path) -> Trajectory:
-    """Read what `save_sample` wrote."""
+def store_sample(path: Path, data: bytes) -> None:
+    """Write the bytes of a sample: there is a whole file or none."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def pack_sample(trajectory: Trajectory) -> bytes:
+    """A sample as the bytes of its file."""
+    kept, seconds = split_seconds(trajectory.attributes)
+    arrays = {key: getattr(trajectory.scene, key) for key in _SCENE}
+    arrays |= {key: getattr(trajectory, key) for key in _FRAMED}
+    texts = {"attributes": kept, "seconds": {**seconds, "processor": processor()}}
+    file = io.BytesIO()
+    np.savez(
+        file,
+        **{key: array for key, array in arrays.items() if array is not None},
+        **{key: np.array(json.dumps(value)) for key, value in texts.items()},
+    )
+    return file.getvalue()
+
+
+def load_sample(path: Path) -> tuple[Trajectory, Seconds]:
+    """Read a sample and, apart from it, the seconds that it took."""
     with np.load(path, allow_pickle=False) as file:
         scene = Scene(**{key: file[key] for key in _SCENE if key in file})
-        return Trajectory(scene, file["position"], file.get("stress"), json.loads(str(file["attributes"])))
+        framed = {key: file[key] for key in _FRAMED if key in file}
+        attributes, seconds = (json.loads(str(file[key])) for key in ("attributes", "seconds"))
+    return replace(Trajectory(scene, framed.pop("position"), attributes=attributes), **framed), seconds

@@ -1,41 +1,81 @@
 """A worker process: makes the samples that it is told to, one at a time.
 
-`python -m ast_sim.simulate.worker FOLDER FAMILY SEED NODES` reads lines "split index" from its standard input and
-answers each with a line of JSON when the sample is in its file, until the input ends. It is started afresh by
-`generate`, with one thread for all libraries, and never imports torch: two OpenMP runtimes in one process hang or slow
-each other down.
+`python -m ast_sim.simulate.worker FOLDER CHECKPOINTS RECIPE PARENT` reads lines "split index" from its standard input
+and answers each with lines of JSON: `progress` from time to time, and one with `status` or `error` when the sample is
+in its file in FOLDER or has failed; until the input ends. RECIPE is JSON, PARENT the process whose end is its own.
+It is started afresh, with one thread for all libraries, and never imports torch: two OpenMP runtimes in one process
+hang or slow each other down.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
+import time
 import traceback
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-from ast_sim.simulate.samples import make_sample, sample_path, save_sample
+from ast_sim.simulate.checkpoint import Checkpoint
+from ast_sim.simulate.samples import Recipe, checkpoint_path, make_sample, sample_path, save_sample
+
+SECONDS_BETWEEN_REPORTS = 1.0
 
 
 def main() -> None:
-    """Serve until the standard input ends."""
-    folder, family, seed, nodes = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
-    parent = os.getppid()
+    """Serve until the standard input ends, or the parent process is gone."""
+    folder, checkpoints, recipe, parent = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], int(sys.argv[4])
+    _end_with(parent)
     # Answers go to the real standard output, which nothing else may write to.
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
+
+    def answer(values: dict[str, Any]) -> None:
+        print(json.dumps(values), file=answers)
+
     for line in sys.stdin:
         split, index = line.split()
+        checkpoint = Checkpoint(checkpoint_path(checkpoints, split, int(index)), _reporter(answer))
         try:
-            trajectory = make_sample(family, seed, split, int(index), nodes)
-            if os.getppid() != parent:
-                return  # the parent was killed: its folder may belong to another run by now
+            trajectory = make_sample(Recipe(**json.loads(recipe)), split, int(index), checkpoint)
+            _stop_without(parent)  # its folder may belong to another run by now
             save_sample(sample_path(folder, split, int(index)), trajectory)
-            answer = {"status": trajectory.attributes["status"]}
+            checkpoint.remove()
+            answer({"status": trajectory.attributes["status"]})
         except Exception as error:
             fatal = isinstance(error, OSError)  # a full or unwritable disk fails all samples alike
-            answer = {"error": f"{type(error).__name__}: {error}", "fatal": fatal, "traceback": traceback.format_exc()}
-        print(json.dumps(answer), file=answers)
+            text = f"{type(error).__name__}: {error}"
+            answer({"error": text, "fatal": fatal, "traceback": traceback.format_exc()})
+
+
+def _reporter(answer: Callable[[dict[str, Any]], None]) -> Callable[[int, int, int], None]:
+    """What a solve calls with (frames done, frames of all, Newton iterations so far), however often it likes."""
+    last = time.monotonic()
+
+    def report(frame: int, frames: int, iterations: int) -> None:
+        nonlocal last
+        if time.monotonic() - last >= SECONDS_BETWEEN_REPORTS:
+            last = time.monotonic()
+            answer({"progress": [frame, frames, iterations]})
+
+    return report
+
+
+def _end_with(parent: int) -> None:
+    """Look once a second whether the parent lives: one that was killed could not end this process, and hours of
+    solving would go on for nobody. A timer, not a thread: there is to be one only.
+    """
+    signal.signal(signal.SIGALRM, lambda *_: _stop_without(parent))
+    signal.setitimer(signal.ITIMER_REAL, 1.0, 1.0)
+
+
+def _stop_without(parent: int) -> None:
+    """End this process and the programs that it started, if the parent is gone."""
+    if os.getppid() != parent:
+        os.killpg(0, signal.SIGKILL)
 
 
 if __name__ == "__main__":

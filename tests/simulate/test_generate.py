@@ -1,4 +1,4 @@
-"""Generation by worker processes: determinism, resuming after a kill, failures, settings."""
+"""Generation by worker processes: the same bytes whatever the workers, failures, settings, what is shown."""
 
 import json
 import os
@@ -6,54 +6,49 @@ import pathlib
 import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
 
 import ast_sim
 from ast_sim.data.file import Dataset
+from ast_sim.data.seconds import read_seconds, seconds_path
 from ast_sim.errors import MissingExtra, SimulationError
 from ast_sim.simulate import generate as generate_module
 from ast_sim.simulate import pool
 from ast_sim.simulate.generate import generate
+from ast_sim.simulate.manifest import Manifest
 from ast_sim.simulate.progress import Progress
-from ast_sim.simulate.samples import load_sample, make_sample, sample_path, save_sample
+from ast_sim.simulate.samples import Recipe, load_sample, make_sample, sample_path, save_sample
+from ast_sim.simulate.settings import recorded
 
-NODES = 80
-COUNTS = {"train": 3, "valid": 1, "test": 1}
+NODES, FRAMES = 80, 9
+RECIPE = Recipe("deforming_plate", 5, NODES, FRAMES)
+COUNTS = {"train": 2, "valid": 1, "test": 1}
 ROOT = pathlib.Path(ast_sim.__file__).parent.parent
 
 
-def arrays(path) -> dict[str, np.ndarray]:
-    """Everything in a dataset file that must be reproducible."""
-    found = {}
-    with Dataset(path) as dataset:
-        for split in ("train", "valid", "test"):
-            for index in range(dataset.count(split)):
-                sample, name = dataset.load(split, index), f"{split}/{index}"
-                for key in ("rest_position", "elements", "node_type", "body"):
-                    found[f"{name}/{key}"] = getattr(sample.scene, key)
-                found[f"{name}/position"], found[f"{name}/stress"] = sample.position, sample.stress
-                for key, value in sample.attributes.items():
-                    if key != "solve_seconds":
-                        found[f"{name}/{key}"] = np.asarray(value)
+def plates(out, counts=COUNTS, **changes):
+    """The dataset of these tests; changes are settings of `generate`."""
+    settings = {"seed": 5, "nodes": NODES, "frames": FRAMES, "progress": False, **changes}
+    return generate("deforming_plate", out, counts, **settings)
+
+
+def states(folder) -> dict[str, list[dict]]:
+    """The lines of a manifest, by sample."""
+    found: dict[str, list[dict]] = {}
+    for line in (folder / "manifest.jsonl").read_text().splitlines():
+        values = json.loads(line)
+        found.setdefault(values["sample"], []).append(values)
     return found
-
-
-def assert_same(a, b) -> None:
-    a, b = arrays(a), arrays(b)
-    assert a.keys() == b.keys()
-    for key in a:
-        np.testing.assert_array_equal(a[key], b[key], err_msg=key)
 
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
     out = tmp_path_factory.mktemp("undisturbed") / "plates.h5"
-    generated = generate("deforming_plate", out, COUNTS, seed=5, nodes=NODES, workers=2, progress=False)
+    generated = plates(out, workers=2)
     assert generated.path == out and generated.counts == COUNTS and generated.truncated == []
-    assert not out.with_name("plates.h5.parts").exists()
+    assert sorted(path.name for path in out.parent.iterdir()) == ["plates.h5", "plates.h5.seconds.json"]
     return out
 
 
@@ -63,59 +58,48 @@ def test_the_dataset_is_whole_and_says_where_it_is_from(undisturbed):
         info = dataset.info
         assert (info.family, info.integration, info.stress_location) == ("deforming_plate", "quasi_static", "node")
         assert (info.domain_half_width, info.contact_radius) == (1.0, 0.03)
-        assert (info.generator["seed"], info.generator["nodes"], info.generator["counts"]) == (5, NODES, COUNTS)
-        assert info.generator["versions"]["ipctk"].startswith("1.5.")
+        made = info.generator
+        assert (made["seed"], made["nodes"], made["frames"], made["counts"]) == (5, NODES, FRAMES, COUNTS)
+        assert (made["solver"], made["command"]) == (
+            "own", f"ast-sim generate deforming_plate --seed 5 --nodes {NODES} --frames {FRAMES}"
+        )  # fmt: skip
+        assert made["versions"]["ipctk"].startswith("1.5.")
         for split, count in COUNTS.items():
             for index in range(count):
                 attributes = dataset.attributes(split, index)
                 assert (attributes["status"], attributes["seed"], attributes["index"]) == ("complete", 5, index)
                 assert 0 < attributes["min_gap"] < attributes["dhat"] and attributes["min_jacobian"] > 0
-                assert len(attributes["solve_seconds"]) == 41 and attributes["max_residual"] <= 1
+                assert not [key for key in attributes if key.endswith("_seconds")]
+                assert dataset.num_frames(split, index) == FRAMES
         scenes = [dataset.scene(split, 0).num_nodes for split in COUNTS]
         positions = [dataset.load(split, 0).position[-1, :3] for split in COUNTS]
         assert not np.array_equal(positions[0], positions[1]) and len(scenes) == 3  # splits differ at equal index
 
 
-def test_one_worker_gives_the_same_arrays_as_two(undisturbed, tmp_path):
-    out = tmp_path / "plates.h5"
-    generate("deforming_plate", out, COUNTS, seed=5, nodes=NODES, workers=1, progress=False)
-    assert_same(out, undisturbed)
+def test_the_seconds_of_every_sample_lie_beside_the_dataset(undisturbed):
+    with Dataset(undisturbed) as dataset:
+        seconds = read_seconds(dataset)
+    assert sorted(seconds) == ["test/000000", "train/000000", "train/000001", "valid/000000"]
+    assert all(len(frames) == FRAMES and min(frames) > 0 for frames in seconds.values())
+    facts = json.loads(seconds_path(undisturbed).read_text())["samples"]["valid/000000"]
+    assert facts["processor"]
+
+
+def test_one_worker_gives_the_same_bytes_as_two(undisturbed, tmp_path):
+    plates(tmp_path / "plates.h5", workers=1)
+    assert (tmp_path / "plates.h5").read_bytes() == undisturbed.read_bytes()
 
 
 def test_a_sample_does_not_depend_on_the_others(undisturbed):
-    sample = make_sample("deforming_plate", 5, "train", 2, NODES)
+    sample = make_sample(RECIPE, "train", 1)
     with Dataset(undisturbed) as dataset:
-        stored = dataset.load("train", 2)
+        stored = dataset.load("train", 1)
     np.testing.assert_array_equal(sample.position, stored.position)
     np.testing.assert_array_equal(sample.stress, stored.stress)
 
 
-def test_a_killed_run_goes_on_to_the_same_dataset(undisturbed, tmp_path, monkeypatch):
-    out = tmp_path / "plates.h5"
-    script = (
-        "from ast_sim.simulate.generate import generate;"
-        f"generate('deforming_plate', {str(out)!r}, {COUNTS!r}, seed=5, nodes={NODES}, workers=1)"
-    )
-    parts = out.with_name("plates.h5.parts")
-    with subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, stderr=subprocess.PIPE) as process:
-        while not list(parts.glob("*.npz")) and process.poll() is None:
-            time.sleep(0.01)
-        process.kill()
-    assert process.returncode == -signal.SIGKILL
-    assert not out.exists()
-    there = {path.name for path in parts.glob("*.npz")}
-    assert "train-000000.npz" in there and len(there) < 5
-    sample_path(parts, "test", 0).write_bytes(b"PK\x03\x04 not a sample")  # made anew, not trusted
-    asked, run = [], pool.run_all
-    monkeypatch.setattr(generate_module, "run_all", lambda samples, *rest: asked.extend(samples) or run(samples, *rest))
-    generate("deforming_plate", out, COUNTS, seed=5, nodes=NODES, workers=2, progress=False)
-    assert_same(out, undisturbed)
-    assert ("train", 0) not in asked and ("test", 0) in asked  # finished samples are not made again
-    assert not parts.exists()
-
-
-def test_a_worker_that_is_killed_costs_its_sample_only(tmp_path, monkeypatch, capfd):
-    out = tmp_path / "plates.h5"
+def test_a_worker_that_is_killed_costs_its_sample_only(undisturbed, tmp_path, monkeypatch, capfd):
+    out, folder = tmp_path / "plates.h5", tmp_path / "plates.h5.parts"
     give = pool.Worker.give
 
     def kill_at_second(worker, sample):
@@ -123,12 +107,27 @@ def test_a_worker_that_is_killed_costs_its_sample_only(tmp_path, monkeypatch, ca
         if sample == ("train", 1):
             os.kill(worker.process.pid, signal.SIGKILL)
 
-    monkeypatch.setattr(pool.Worker, "give", kill_at_second)
-    with pytest.raises(SimulationError, match=r"1 of 5 samples failed \(train/000001: .* killed by SIGKILL\)"):
-        generate("deforming_plate", out, COUNTS, seed=5, nodes=NODES, workers=1)
+    with monkeypatch.context() as patched:
+        patched.setattr(pool.Worker, "give", kill_at_second)
+        with pytest.raises(SimulationError, match=r"1 of 4 samples failed \(train/000001: .* killed by SIGKILL\)"):
+            plates(out, workers=1, progress=True)
     assert "train/000001 failed" in capfd.readouterr().err
-    assert len(list((tmp_path / "plates.h5.parts").glob("*.npz"))) == 4
-    assert not out.exists()
+    assert len(list(folder.glob("*.npz"))) == 3 and not out.exists()
+    last = {name: lines[-1] for name, lines in states(folder).items()}
+    assert [name for name, values in last.items() if values["state"] == "done"] == [
+        "train/000000", "valid/000000", "test/000000"
+    ]  # fmt: skip
+    assert last["train/000001"]["state"] == "failed" and "SIGKILL" in last["train/000001"]["reason"]
+    assert last["valid/000000"]["bytes"] == sample_path(folder, "valid", 0).stat().st_size
+    assert [values["state"] for values in states(folder)["valid/000000"]] == ["pending", "running", "done"]
+    sample_path(folder, "test", 0).write_bytes(b"PK\x03\x04 not a sample")  # made anew, not trusted
+    asked, run = [], pool.run_all
+    monkeypatch.setattr(pool, "run_all", lambda samples, *rest: asked.extend(samples) or run(samples, *rest))
+    plates(out, progress=True)
+    shown = capfd.readouterr().err
+    assert "2 of 4 scenes are there already" in shown and "train/000001 failed before: its worker process was" in shown
+    assert asked == [("train", 1), ("test", 0)]  # finished samples are not made again
+    assert out.read_bytes() == undisturbed.read_bytes()
 
 
 def test_an_exception_in_a_worker_is_reported_and_the_others_go_on(tmp_path, monkeypatch, capfd):
@@ -140,7 +139,7 @@ def test_an_exception_in_a_worker_is_reported_and_the_others_go_on(tmp_path, mon
 
     monkeypatch.setattr(pool.Worker, "give", unreadable)
     with pytest.raises(SimulationError, match=r"1 of 2 samples failed \(train/000000: ValueError"):
-        generate("deforming_plate", tmp_path / "a.h5", {"train": 2}, nodes=NODES, workers=1)
+        plates(tmp_path / "a.h5", {"train": 2}, workers=1, progress=True)
     assert "Traceback" in capfd.readouterr().err
     assert sample_path(tmp_path / "a.h5.parts", "train", 1).exists()
 
@@ -156,51 +155,78 @@ def test_a_disk_that_cannot_be_written_stops_the_run(tmp_path, monkeypatch):
 
     monkeypatch.setattr(pool.Worker, "give", remove_folder)
     with pytest.raises(SimulationError, match="train/000000 cannot be written: FileNotFoundError"):
-        generate("deforming_plate", tmp_path / "a.h5", {"train": 2}, nodes=NODES, workers=1, progress=False)
+        plates(tmp_path / "a.h5", {"train": 2}, workers=1)
 
 
 def test_parts_of_other_settings_are_refused(tmp_path):
-    out, parts = tmp_path / "plates.h5", tmp_path / "plates.h5.parts"
-    parts.mkdir()
-    settings = generate_module._settings("deforming_plate", 1, NODES)
-    (parts / "settings.json").write_text(json.dumps(settings))
-    with pytest.raises(SimulationError, match=r"other settings \(seed 1 there, 2 here\)"):
-        generate("deforming_plate", out, {"train": 1}, seed=2, nodes=NODES, progress=False)
-    (parts / "settings.json").write_text("{")
+    out, folder = tmp_path / "plates.h5", tmp_path / "plates.h5.parts"
+    folder.mkdir()
+    (folder / "settings.json").write_text(json.dumps(recorded(RECIPE)))
+    with pytest.raises(SimulationError, match=r"other settings \(seed 5 there, 2 here\)"):
+        plates(out, {"train": 1}, seed=2)
+    older = {**recorded(RECIPE), "versions": {"numpy": "1.0"}}
+    (folder / "settings.json").write_text(json.dumps(older))
+    with pytest.raises(SimulationError, match=r"other settings \(versions: numpy 1.0 there, [2-9].* here\)"):
+        plates(out, {"train": 1})
+    (folder / "settings.json").write_text("{")
     with pytest.raises(SimulationError, match="settings.json is damaged"):
-        generate("deforming_plate", out, {"train": 1}, seed=1, nodes=NODES, progress=False)
+        plates(out, {"train": 1})
 
 
 def test_an_existing_dataset_is_kept(undisturbed):
     before = undisturbed.stat().st_mtime_ns
-    assert generate("deforming_plate", undisturbed, COUNTS, seed=5, nodes=NODES).counts == COUNTS
+    assert plates(undisturbed).counts == COUNTS
     with pytest.raises(SimulationError, match="exists and holds other data"):
-        generate("deforming_plate", undisturbed, COUNTS, seed=6, nodes=NODES)
+        plates(undisturbed, seed=6)
     assert undisturbed.stat().st_mtime_ns == before
 
 
 def test_two_runs_on_one_file_exclude_each_other(tmp_path):
-    out, parts = tmp_path / "plates.h5", tmp_path / "plates.h5.parts"
-    settings = generate_module._settings("deforming_plate", 0, NODES)
-    with generate_module._locked(parts, settings), pytest.raises(SimulationError, match="in use by another process"):
-        generate("deforming_plate", out, {"train": 1}, nodes=NODES, progress=False)
+    out = tmp_path / "plates.h5"
+    locked = generate_module._locked(tmp_path / "plates.h5.parts", recorded(RECIPE))
+    with locked, pytest.raises(SimulationError, match="in use by another process"):
+        plates(out, {"train": 1})
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"family": "deforming_plates"}, "no scene family 'deforming_plates'; use one of deforming_plate"),
+        (
+            {"family": "deforming_plates"},
+            "no scene family 'deforming_plates'; use one of deforming_plate, sphere_simple, abcd, abcd_xl",
+        ),
         ({"counts": {"training": 1}}, "no split 'training'"),
         ({"counts": {"train": 0}}, "not all 0"),
         ({"seed": -1}, "seed is -1; must be at least 0"),
         ({"nodes": 20}, "nodes is 20; must be at least 80"),
+        ({"frames": 1}, "frames is 1; must be at least 2"),
         ({"workers": 0}, "workers is 0; must be at least 1"),
+        ({"workers": 2, "scheduler": "tcp://localhost:1"}, "give one of them"),
+        ({"solver": "abaqus"}, "no solver 'abaqus'; use one of own, calculix"),
+        ({"parts": "folder"}, "deforming_plate has no option parts: it is one of abcd, abcd_xl"),
     ],
 )
 def test_settings_that_cannot_be(tmp_path, arguments, message):
     with pytest.raises(SimulationError, match=message):
         generate(**{"family": "deforming_plate", "out": tmp_path / "a.h5", **arguments})
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_parts_of_the_user_are_recorded_by_their_content(tmp_path):
+    folder = tmp_path / "parts"
+    folder.mkdir()
+    (folder / "a.step").write_text("one")
+    recipe = Recipe("abcd", 0, 100, parts=str(folder))
+    before = recorded(recipe)
+    assert before["parts"]["name"] == "parts" and before["command"].endswith(" --parts parts")
+    (folder / ".hidden").write_text("of a file browser")
+    assert recorded(recipe) == before
+    (folder / "a.step").write_text("two")
+    assert recorded(recipe)["parts"]["sha256"] != before["parts"]["sha256"]
+    moved = folder.rename(tmp_path / "elsewhere")
+    (moved / "a.step").write_text("one")
+    moved = recorded(Recipe("abcd", 0, 100, parts=str(moved)))
+    assert moved["parts"]["sha256"] == before["parts"]["sha256"]
 
 
 def test_a_missing_ipctk_is_named_before_anything_starts(tmp_path, monkeypatch):
@@ -211,11 +237,12 @@ def test_a_missing_ipctk_is_named_before_anything_starts(tmp_path, monkeypatch):
 
 
 def test_samples_survive_their_file(tmp_path):
-    sample = make_sample("deforming_plate", 5, "valid", 0, NODES)
+    sample = make_sample(RECIPE, "valid", 0)
     save_sample(tmp_path / "a.npz", sample)
-    loaded = load_sample(tmp_path / "a.npz")
-    assert loaded.attributes == sample.attributes
+    loaded, seconds = load_sample(tmp_path / "a.npz")
+    assert {**loaded.attributes, "solve_seconds": seconds["solve_seconds"]} == sample.attributes
     np.testing.assert_array_equal(loaded.position, sample.position)
+    np.testing.assert_array_equal(loaded.stress, sample.stress)
     np.testing.assert_array_equal(loaded.scene.elements, sample.scene.elements)
     assert loaded.scene.material is None and loaded.position.dtype == np.float32
     assert [path.name for path in tmp_path.iterdir()] == ["a.npz"]
@@ -224,22 +251,41 @@ def test_samples_survive_their_file(tmp_path):
 def test_the_solver_and_its_workers_need_no_torch():
     script = (
         "import sys, ast_sim.simulate.worker, ast_sim.simulate.generate;"
-        "ast_sim.simulate.samples.make_sample('deforming_plate', 0, 'train', 0, 80);"
+        "from ast_sim.simulate.samples import Recipe, make_sample;"
+        "make_sample(Recipe('deforming_plate', 0, 80, 2), 'train', 0);"
         "print('torch' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"
 
 
-def test_workers_have_one_thread_each(tmp_path):
-    worker = pool.Worker(tmp_path, ("deforming_plate", "0", "80"))
+def test_workers_have_one_thread_each_and_reproducible_products(tmp_path):
+    worker = pool.Worker(tmp_path, RECIPE)
     worker.give(("train", 0))
-    assert worker.receive() == {"status": "complete"}
-    environment = pathlib.Path(f"/proc/{worker.process.pid}/environ").read_bytes().split(b"\0")
+    messages = worker.receive()
+    while "progress" in messages[-1]:
+        messages += worker.receive()
+    assert messages[-1] == {"status": "complete"}
+    environment = pathlib.Path(f"/proc/{worker.process.pid}/environ").read_bytes().decode().split("\0")
     threads = len(list(pathlib.Path(f"/proc/{worker.process.pid}/task").iterdir()))
     worker.stop()
-    assert {b"OMP_NUM_THREADS=1", b"OPENBLAS_NUM_THREADS=1", b"MKL_NUM_THREADS=1"} <= set(environment)
+    assert {"OMP_NUM_THREADS=1", "OPENBLAS_NUM_THREADS=1", "MKL_NUM_THREADS=1"} <= set(environment)
+    assert {"MKL_THREADING_LAYER=SEQUENTIAL", "MKL_CBWR=AVX2"} <= set(environment)
     assert threads == 1
+
+
+def test_a_torn_manifest_is_only_what_a_person_reads(tmp_path):
+    save_sample(sample_path(tmp_path, "train", 0), make_sample(RECIPE, "train", 0))
+    (tmp_path / "manifest.jsonl").write_text(
+        '{"sample": "train/000000", "state": "failed", "reason": "an old one"}\n{"sample": "train/000000", "state": "pe'
+        '\n[]\n{"sample": "train/000001", "state": "done", "bytes": 1}\n\xff\n{"sample": "train/0000'
+    )
+    manifest = Manifest(tmp_path, [("train", 0), ("train", 1)], {("train", 0)})
+    manifest.close()
+    assert manifest.failures == {"train/000000": "an old one"}
+    assert {name: lines[-1]["state"] for name, lines in states(tmp_path).items()} == {
+        "train/000000": "done", "train/000001": "pending"
+    }  # fmt: skip
 
 
 def test_progress_prints_lines_where_there_is_no_terminal(capsys, monkeypatch):
@@ -254,3 +300,28 @@ def test_progress_prints_lines_where_there_is_no_terminal(capsys, monkeypatch):
     with Progress(2, 0, "scenes", False) as bar:
         bar.advance()
     assert capsys.readouterr().err == ""
+
+
+def test_long_scenes_tell_how_far_they_are(capsys, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("ast_sim.simulate.progress.time.monotonic", lambda: now[0])
+    with Progress(2, 0, "scenes", True) as bar:
+        bar.begin("train/000000")
+        bar.inside("train/000000", 4, 21, 120)  # an earlier run left four frames
+        bar.begin("train/000001")
+        now[0] = 29.0
+        bar.tick()
+        assert capsys.readouterr().err == ""
+        now[0] = 600.0
+        bar.inside("train/000000", 8, 21, 300)
+        bar.tick()
+        now[0] = 610.0
+        bar.tick()
+        bar.end("train/000000")
+        now[0] = 640.0
+        bar.tick()
+    assert capsys.readouterr().err.splitlines() == [
+        "train/000000: frame 8 of 21, 300 iterations, 10 min 00 s so far, about 32 min 30 s to go",
+        "train/000001: 10 min 00 s so far",
+        "train/000001: 10 min 40 s so far",
+    ]

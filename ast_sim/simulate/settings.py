@@ -1,0 +1,124 @@
+"""What a dataset is made from, as it is recorded: with the same settings its bytes are the same."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import shlex
+from dataclasses import asdict
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import ast_sim
+from ast_sim.errors import SimulationError
+from ast_sim.simulate.families import FAMILIES
+from ast_sim.simulate.samples import Recipe
+
+# Linear solvers are there or not; another one gives other last bits, so its absence is recorded, too.
+PACKAGES = ("numpy", "scipy", "ipctk", "pypardiso", "mkl", "cholespy")
+SOLVERS = ("own", "calculix")
+
+
+def checked_recipe(
+    module: ModuleType,
+    family: str,
+    seed: int,
+    nodes: int | None,
+    frames: int | None,
+    solver: str | None,
+    parts: str | Path | None,
+) -> Recipe:
+    """The recipe of these settings, those left out (None) at the family's defaults.
+
+    Raises:
+        SimulationError: a value that cannot be, or an option that the family does not have.
+    """
+    for name, value in (("frames", frames), ("solver", solver), ("parts", parts)):
+        if value is not None and name not in FAMILIES[family].options:
+            having = ", ".join(key for key, known in FAMILIES.items() if name in known.options)
+            raise SimulationError(f"{family} has no option {name}: it is one of {having}")
+    nodes = module.DEFAULT_NODES if nodes is None else nodes
+    if "frames" in FAMILIES[family].options:
+        frames = module.FRAMES if frames is None else frames
+    least = {"seed": (seed, 0), "nodes": (nodes, module.MINIMUM_NODES), "frames": (frames, 2)}
+    for name, (value, minimum) in least.items():
+        if value is not None and value < minimum:
+            raise SimulationError(f"{name} is {value}; must be at least {minimum}")
+    solver = solver or "own"
+    if solver not in SOLVERS:
+        raise SimulationError(f"there is no solver {solver!r}; use one of {', '.join(SOLVERS)}")
+    if parts is not None and not Path(parts).exists():
+        raise SimulationError(f"{parts}: there is no such file or folder of parts")
+    return Recipe(family, seed, nodes, frames, solver, None if parts is None else str(Path(parts).resolve()))
+
+
+def recorded(recipe: Recipe) -> dict[str, Any]:
+    """All that the arrays of a sample depend on, beside its split and index, for the dataset to keep.
+
+    Raises:
+        SimulationError: parts or a solver that are not there.
+    """
+    used = {key: value for key, value in asdict(recipe).items() if value is not None}
+    if recipe.parts is not None:
+        used["parts"] = {"name": Path(recipe.parts).name, "sha256": _digest(Path(recipe.parts))}
+    return {
+        "program": f"ast_sim {ast_sim.__version__}",
+        "versions": _versions(recipe),
+        **used,
+        "command": _command(recipe),
+        "licence": "CC0-1.0",
+    }
+
+
+def difference(found: dict[str, Any], wanted: dict[str, Any], there: str = "there", here: str = "here") -> str:
+    """The first setting that differs, in words; empty if none does."""
+    for key, value in wanted.items():
+        other = found.get(key)
+        if isinstance(value, dict) and isinstance(other, dict):
+            inner = difference(other, value, there, here) or next((f"{k} {there}" for k in other.keys() - value), "")
+            if inner:
+                return f"{key}: {inner}"
+        elif other != value:
+            return f"{key} {other} {there}, {value} {here}"
+    return ""
+
+
+def _versions(recipe: Recipe) -> dict[str, str | None]:
+    versions: dict[str, str | None] = {}
+    for name in (*PACKAGES, *FAMILIES[recipe.family].packages):
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            versions[name] = None
+    if recipe.solver == "calculix":
+        from ast_sim.simulate.calculix import find_ccx, version
+
+        versions["calculix"] = version(find_ccx())
+    return versions
+
+
+def _command(recipe: Recipe) -> str:
+    words = ["ast-sim", "generate", recipe.family, "--seed", str(recipe.seed), "--nodes", str(recipe.nodes)]
+    if recipe.frames is not None:
+        words += ["--frames", str(recipe.frames)]
+    if recipe.solver != "own":
+        words += ["--solver", recipe.solver]
+    if recipe.parts is not None:
+        words += ["--parts", Path(recipe.parts).name]
+    return shlex.join(words)
+
+
+def _digest(parts: Path) -> str:
+    """SHA-256 of the names and contents of a file or of all files in a folder."""
+    folder = parts if parts.is_dir() else parts.parent
+    files = [path for path in parts.rglob("*") if path.is_file()] if parts.is_dir() else [parts]
+    total = hashlib.sha256()
+    try:
+        for path in sorted(path for path in files if not path.name.startswith(".")):
+            with open(path, "rb") as file:
+                content = hashlib.file_digest(file, "sha256").hexdigest()
+            total.update(f"{path.relative_to(folder).as_posix()} {content}\n".encode())
+    except OSError as error:
+        raise SimulationError(f"{parts}: the parts cannot be read: {error}") from error
+    return total.hexdigest()
