@@ -30,7 +30,7 @@ from ast_sim.simulate.families import family_module
 from ast_sim.simulate.manifest import Manifest, Watch
 from ast_sim.simulate.progress import Progress
 from ast_sim.simulate.samples import Recipe, Sample, load_sample, sample_name, sample_path
-from ast_sim.simulate.settings import checked_recipe, difference, recorded
+from ast_sim.simulate.settings import check_parts, checked_recipe, difference, recorded
 
 COUNTS = {"train": 100, "valid": 8, "test": 10}
 
@@ -96,6 +96,8 @@ def generate(
     folder = out.with_name(out.name + ".parts")
     if out.exists():
         return _existing(out, folder, settings, counts)
+    if not folder.exists():
+        check_parts(recipe)
     samples = [(split, index) for split in SPLITS for index in range(counts[split])]
     with _locked(folder, settings):
         _make(samples, folder, recipe, workers, scheduler, progress)

@@ -60,7 +60,9 @@ def make_sample(recipe: Recipe, split: str, index: int, checkpoint: Checkpoint |
     sequence = np.random.SeedSequence(recipe.seed, spawn_key=(SPLITS.index(split), index))
     options = {} if recipe.frames is None else {"frames": recipe.frames}
     if recipe.parts is not None:
-        options["source"] = Path(recipe.parts)
+        from ast_sim.simulate.part_source import part_source
+
+        options["parts"] = part_source(Path(recipe.parts))
     case = module.draw(np.random.default_rng(sequence), recipe.nodes, **options)
     if recipe.solver == "calculix":
         from ast_sim.simulate import calculix

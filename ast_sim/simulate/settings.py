@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib.metadata
 import shlex
 from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import ast_sim
 from ast_sim.errors import SimulationError
 from ast_sim.simulate.families import FAMILIES
 from ast_sim.simulate.samples import Recipe
+
+if TYPE_CHECKING:
+    from ast_sim.simulate.part_source import PartSource
 
 # Linear solvers are there or not; another one gives other last bits, so its absence is recorded, too.
 PACKAGES = ("numpy", "scipy", "ipctk", "pypardiso", "mkl", "cholespy")
@@ -48,8 +50,8 @@ def checked_recipe(
     solver = solver or "own"
     if solver not in SOLVERS:
         raise SimulationError(f"there is no solver {solver!r}; use one of {', '.join(SOLVERS)}")
-    if parts is not None and not Path(parts).exists():
-        raise SimulationError(f"{parts}: there is no such file or folder of parts")
+    if parts is not None:
+        _source(parts)
     return Recipe(family, seed, nodes, frames, solver, None if parts is None else str(Path(parts).resolve()))
 
 
@@ -58,10 +60,11 @@ def recorded(recipe: Recipe) -> dict[str, Any]:
 
     Raises:
         SimulationError: parts or a solver that are not there.
+        MissingExtra: what the solver or the parts need is not installed.
     """
     used = {key: value for key, value in asdict(recipe).items() if value is not None}
-    if recipe.parts is not None:
-        used["parts"] = {"name": Path(recipe.parts).name, "sha256": _digest(Path(recipe.parts))}
+    if "parts" in FAMILIES[recipe.family].options:
+        used |= _source(recipe.parts).describe()
     return {
         "program": f"ast_sim {ast_sim.__version__}",
         "versions": _versions(recipe),
@@ -82,6 +85,18 @@ def difference(found: dict[str, Any], wanted: dict[str, Any], there: str = "ther
         elif other != value:
             return f"{key} {other} {there}, {value} {here}"
     return ""
+
+
+def check_parts(recipe: Recipe) -> None:
+    """Raise SimulationError if a part of the user is broken."""
+    if recipe.parts is not None:
+        _source(recipe.parts).check()
+
+
+def _source(parts: str | Path | None) -> PartSource:
+    from ast_sim.simulate.part_source import part_source
+
+    return part_source(None if parts is None else Path(parts))
 
 
 def _versions(recipe: Recipe) -> dict[str, str | None]:
@@ -107,18 +122,3 @@ def _command(recipe: Recipe) -> str:
     if recipe.parts is not None:
         words += ["--parts", Path(recipe.parts).name]
     return shlex.join(words)
-
-
-def _digest(parts: Path) -> str:
-    """SHA-256 of the names and contents of a file or of all files in a folder."""
-    folder = parts if parts.is_dir() else parts.parent
-    files = [path for path in parts.rglob("*") if path.is_file()] if parts.is_dir() else [parts]
-    total = hashlib.sha256()
-    try:
-        for path in sorted(path for path in files if not path.name.startswith(".")):
-            with open(path, "rb") as file:
-                content = hashlib.file_digest(file, "sha256").hexdigest()
-            total.update(f"{path.relative_to(folder).as_posix()} {content}\n".encode())
-    except OSError as error:
-        raise SimulationError(f"{parts}: the parts cannot be read: {error}") from error
-    return total.hexdigest()

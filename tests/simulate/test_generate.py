@@ -1,5 +1,6 @@
 """Generation by worker processes: the same bytes whatever the workers, failures, settings, what is shown."""
 
+import hashlib
 import json
 import os
 import pathlib
@@ -7,8 +8,10 @@ import signal
 import subprocess
 import sys
 
+import meshio
 import numpy as np
 import pytest
+from meshes import box
 
 import ast_sim
 from ast_sim.data.file import Dataset
@@ -212,21 +215,25 @@ def test_settings_that_cannot_be(tmp_path, arguments, message):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_parts_of_the_user_are_recorded_by_their_content(tmp_path):
+def test_parts_of_the_user_make_scenes_that_say_which_parts_they_are_of(tmp_path):
+    position, elements = box((2, 2, 3), (0.4, 0.4, 0.6))
     folder = tmp_path / "parts"
     folder.mkdir()
-    (folder / "a.step").write_text("one")
-    recipe = Recipe("abcd", 0, 100, parts=str(folder))
-    before = recorded(recipe)
-    assert before["parts"]["name"] == "parts" and before["command"].endswith(" --parts parts")
-    (folder / ".hidden").write_text("of a file browser")
-    assert recorded(recipe) == before
-    (folder / "a.step").write_text("two")
-    assert recorded(recipe)["parts"]["sha256"] != before["parts"]["sha256"]
+    meshio.write(folder / "block.vtu", meshio.Mesh(position, [("tetra", elements)]))
+    made = generate("abcd", tmp_path / "a.h5", {"train": 1}, nodes=200, parts=folder, workers=1, progress=False)
+    with Dataset(made.path) as dataset:
+        used = dataset.info.generator
+        assert used["parts"] == {"block.vtu": hashlib.sha256((folder / "block.vtu").read_bytes()).hexdigest()}
+        assert used["command"] == "ast-sim generate abcd --seed 0 --nodes 200 --parts parts"
+        count, trajectory = dataset.num_frames("train", 0), dataset.load("train", 0)
+        assert trajectory.stress.shape == (count, trajectory.scene.num_elements, 1)
+        assert dataset.cauchy_stress("train", 0).shape == (count, trajectory.scene.num_elements, 6)
     moved = folder.rename(tmp_path / "elsewhere")
-    (moved / "a.step").write_text("one")
-    moved = recorded(Recipe("abcd", 0, 100, parts=str(moved)))
-    assert moved["parts"]["sha256"] == before["parts"]["sha256"]
+    assert recorded(Recipe("abcd", 0, 200, parts=str(moved)))["parts"] == used["parts"]
+    meshio.write(moved / "broken.vtu", meshio.Mesh(position * (1, 1, 0), [("tetra", elements)]))
+    with pytest.raises(SimulationError, match="broken.vtu"):
+        generate("abcd", tmp_path / "b.h5", {"train": 1}, nodes=200, parts=moved)
+    assert not (tmp_path / "b.h5.parts").exists()
 
 
 def test_a_missing_ipctk_is_named_before_anything_starts(tmp_path, monkeypatch):
