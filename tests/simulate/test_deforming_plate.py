@@ -18,6 +18,7 @@ from ast_sim.simulate.deforming_plate import (
     solve,
 )
 from ast_sim.simulate.obstacles import SHAPES
+from ast_sim.simulate.plate_mesh import PlaneMesh, smallest_angle
 from ast_sim.simulate.plate_outline import OUTLINES
 
 NODES, SHORT = 150, 41
@@ -62,6 +63,11 @@ def test_scenes_have_the_size_asked_for_and_are_valid(nodes, count):
         for clamp in (clamps[clamps[:, 0] < 0], clamps[clamps[:, 0] > 0]):  # each is a plane end, all of it
             values = np.linalg.svd(clamp[:, :2] - clamp[:, :2].mean(axis=0), compute_uv=False)
             assert values[1] < 1e-5 and values[0] > 0.1 and np.ptp(clamp[:, 2]) > 0.016
+        surface = scene.surface()
+        level = plate[surface[:, 0]] & (np.ptp(rest[surface, 2], axis=1) < 0.2 * length[2])  # top and bottom
+        upwards = rest[surface[:, 0], 2] > 0
+        top = PlaneMesh(rest[:, :2].astype(float), surface[level & upwards], [])
+        assert np.degrees(smallest_angle(top)) > 21.9
         if nodes == DEFAULT_NODES:
             corners = rest[scene.elements[plate[scene.elements[:, 0]]]].astype(float)
             assert smallest_angle_between_faces(corners) > 10
