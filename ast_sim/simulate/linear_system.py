@@ -1,8 +1,9 @@
-"""The sparse system of a Newton step: conjugate gradients, preconditioned by a Cholesky factor that is kept.
+"""The sparse system of a Newton step: Cholesky, or for large ones conjugate gradients with a factor that is kept.
 
 From one Newton step to the next a matrix changes little but for a few pairs in contact, so a factor of one before
-brings conjugate gradients home in about ten iterations, and a solution with it costs a small part of a factorization
-(a thirtieth at 4,000 nodes, a hundredth at 100,000). Where that is not enough the matrix itself is factorised.
+brings conjugate gradients home in about ten iterations. A solution with it costs a hundredth of a factorization at
+100,000 nodes, where iterating is the faster way by far, and a fifteenth at 4,000, where it is not. Where the
+iterations do not suffice the matrix itself is factorised.
 
 Elements couple the same unknowns at all times; contact couples more as it spreads. The pattern holds the entries of
 the elements and of every contact since the last `restart`: while no new ones come the symbolic factorization serves
@@ -24,6 +25,8 @@ import scipy.sparse
 
 from ast_sim.errors import MissingExtra, SimulationError, require
 
+# From so many unknowns on a factor is kept and iterated with.
+ITERATE_FROM = 50_000
 # Conjugate gradients end at this residual relative to the right side: Newton's error falls by as much in a step.
 RELATIVE_RESIDUAL = 1e-3
 # After so many iterations a new factor is the cheaper way.
@@ -210,7 +213,7 @@ class LinearSystem:
         """
         matrix, right = self._assemble(values, contact), right_side.ravel()[self._free]
         free = None
-        if self._has_factor:
+        if self._has_factor and self._count >= ITERATE_FROM:
             free, is_indefinite = conjugate_gradients(matrix, right, self._factorization.solve)
             if is_indefinite:
                 return None
@@ -233,8 +236,10 @@ class LinearSystem:
         upper = rows <= columns
         inside, keys = self._keys(rows[upper], columns[upper])
         place = np.searchsorted(self._pattern, keys)
-        if (self._pattern[np.minimum(place, len(self._pattern) - 1)] != keys).any():
-            self._set_pattern(np.union1d(self._pattern, keys))
+        missing = keys[self._pattern[np.minimum(place, len(self._pattern) - 1)] != keys]
+        if len(missing):
+            # A stable sort merges two sorted runs in linear time.
+            self._set_pattern(np.sort(np.concatenate([self._pattern, np.unique(missing)]), kind="stable"))
             place = np.searchsorted(self._pattern, keys)
         data = np.bincount(self._slot, values, minlength=len(self._own) + 1)[:-1]
         if self._position is not None:

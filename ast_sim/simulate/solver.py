@@ -44,7 +44,7 @@ class SolverSettings:
     max_moves: int = 8
     max_iterations: int = 60
     max_halvings: int = 5
-    friction_passes: int = 2
+    friction_passes: int = 1
 
 
 @dataclass(frozen=True, eq=False)
