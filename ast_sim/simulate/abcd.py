@@ -28,7 +28,8 @@ INCREMENTS = 20
 DEFAULT_NODES = 4000
 MINIMUM_NODES = 200
 DRAWS = 50  # of parts and placements before a sample is given up
-CONTACT = ContactSettings(dhat=1e-3, stiffness=1e6)
+# Without friction parts slide off each other and buckle, which costs most iterations and many samples.
+CONTACT = ContactSettings(dhat=1e-3, stiffness=1e6, friction=0.15)
 YOUNG = (5e5, 2e6)  # pascal, drawn evenly in its logarithm
 POISSON = (0.25, 0.4)
 CRUSH = (0.1, 0.25)

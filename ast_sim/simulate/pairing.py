@@ -15,6 +15,8 @@ from ast_sim.simulate.mesh_check import boundary
 from ast_sim.simulate.parts import Part
 
 HALF_EXTENT = 0.9  # of a pair along its longest side; bulging parts then stay within [-1,1]
+SLENDEREST = 1.25  # height of a part as it stands, relative to the shorter side below it
+FARTHEST = 0.3  # offset of the parts along each axis, relative to the smaller of their extents
 LEAST_OVERLAP = 0.3  # of the smaller of the two shadows
 RASTER = 64  # cells of the raster on which shadows are measured, along the longer side
 START = 0.1  # height above the lower part from which the upper one is let down
@@ -82,9 +84,11 @@ def put_together(rng: np.random.Generator, lower: Part, upper: Part, gap: float)
 
 
 def turned(rng: np.random.Generator, position: np.ndarray) -> np.ndarray:
-    """Positions [N,3] with one of the six sides of their box down, turned about the vertical, centred over the origin
-    with the lowest at z = 0."""
-    axis, sign, yaw = int(rng.integers(3)), int(rng.choice([-1, 1])), rng.uniform(0, 2 * np.pi)
+    """Positions [N,3] with a side of their box down, turned about the vertical, centred over the origin, the lowest at
+    z = 0. Sides on which the part would stand too slender to be squeezed are left out."""
+    extent = np.ptp(position, axis=0)
+    upright = [axis for axis in range(3) if extent[axis] <= SLENDEREST * np.delete(extent, axis).min()]
+    axis, sign, yaw = int(rng.choice(upright)), int(rng.choice([-1, 1])), rng.uniform(0, 2 * np.pi)
     result = sign * np.roll(position, 2 - axis, axis=1)  # a cyclic change of axes is a rotation
     result[:, 0] *= sign  # and so is turning two of them round
     c, s = np.cos(yaw), np.sin(yaw)
@@ -122,7 +126,7 @@ def _place(
     cell = max(np.ptp(low[:, :2]), np.ptp(high[:, :2])) / RASTER
     low_shadow = shadow_cells(low[:, :2], boundary(low_elements), cell)
     for _ in range(PLACEMENTS):
-        moved = high + [*(rng.uniform(-0.5, 0.5, 2) * extent), low[:, 2].max() + START]
+        moved = high + [*(rng.uniform(-FARTHEST, FARTHEST, 2) * extent), low[:, 2].max() + START]
         high_shadow = shadow_cells(moved[:, :2], boundary(high_elements), cell)
         common = len(np.intersect1d(low_shadow, high_shadow, assume_unique=True))
         overlap = common / min(len(low_shadow), len(high_shadow))

@@ -99,14 +99,16 @@ def test_two_blocks_meet_face_to_face():
 
 
 def test_a_part_is_turned_without_a_change_of_shape():
-    part, seen = block((1, 0.7, 0.4)), set()
+    part, seen = block((1, 0.9, 0.8)), set()
     for seed in range(30):
         position = turned(np.random.default_rng(seed), part.position)
         assert np.allclose(volumes(position, part.elements), volumes(part.position, part.elements))
         assert position[:, 2].min() == pytest.approx(0, abs=1e-12)
         assert np.allclose(position[:, :2].max(axis=0) + position[:, :2].min(axis=0), 0)
         seen.add(round(float(np.ptp(position[:, 2])), 3))
-    assert seen == {1.0, 0.7, 0.4}
+    assert seen == {1.0, 0.9, 0.8}
+    slender = [turned(np.random.default_rng(seed), block((2, 0.7, 0.6)).position) for seed in range(20)]
+    assert {round(float(np.ptp(position[:, 2])), 3) for position in slender} == {0.7, 0.6}
 
 
 def test_shadows_have_their_area():
