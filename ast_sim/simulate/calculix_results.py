@@ -71,22 +71,22 @@ def read_increments(path: Path) -> tuple[list[int], list[int]]:
     """Iterations and cutbacks of each frame that was reached, from the .sta file.
 
     A line holds step, increment, attempt ("U" behind it if it diverged), iterations, total time, step time, increment.
-    Increments are summed up from one frame to the next: total times have six digits only.
+    A frame is a step of one unit of time.
     """
     iterations, cutbacks = [], []
-    spent, cut, time = 0, 0, 0.0
+    spent, cut = 0, 0
     for line in _text(path).splitlines()[2:]:
         words = line.replace("U", " U ").split()
         diverged = "U" in words
         try:
-            tried, increment = int(words[3 + diverged]), float(words[6 + diverged])
+            tried, time = int(words[3 + diverged]), float(words[5 + diverged])
         except (IndexError, ValueError) as error:
             raise SimulationError(f"{path}: not a line of increments: {line.strip()!r}") from error
-        spent, cut, time = spent + tried, cut + diverged, time + increment * (not diverged)
-        if time >= 1 - TIME_TOLERANCE:
+        spent, cut = spent + tried, cut + diverged
+        if not diverged and time == 1:
             iterations.append(spent)
             cutbacks.append(cut)
-            spent, cut, time = 0, 0, 0.0
+            spent, cut = 0, 0
     return iterations, cutbacks
 
 
