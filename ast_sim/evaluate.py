@@ -62,7 +62,7 @@ def evaluate(
     model.eval()
     constant = _training_stress(dataset) if model.config.stress != "none" else None
     samples, displacement, stress = [], [], []
-    seconds = read_seconds(dataset)
+    seconds = read_seconds(dataset).samples
     for index in range(count):
         name = f"{split}/{index:06d}"
         truth = dataset.load(split, index)

@@ -12,6 +12,7 @@ import math
 import os
 import platform
 import warnings
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -46,27 +47,41 @@ def write_seconds(dataset: str | os.PathLike[str], generator: dict[str, Any], sa
         temporary.write_text(json.dumps({"generator": generator, "samples": samples}) + "\n", encoding="utf-8")
 
 
-def read_seconds(dataset: Dataset) -> dict[str, list[float]]:
-    """Seconds a frame by the name of the sample, "train/000000"; empty where they are not known.
+@dataclass(frozen=True)
+class SolverSeconds:
+    """What is known of a solver's time.
+
+    Attributes:
+        samples: seconds a frame by the name of the sample, "train/000000".
+        processors: on which they were measured.
+    """
+
+    samples: dict[str, list[float]] = field(default_factory=dict)
+    processors: tuple[str, ...] = ()
+
+
+def read_seconds(dataset: Dataset) -> SolverSeconds:
+    """The seconds beside a dataset, without samples where they are not known.
 
     Warns where a file lies beside the dataset that is damaged or belongs to another one.
     """
     path = seconds_path(dataset.path)
     if not path.exists():
-        return {}
+        return SolverSeconds()
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
         own = found["generator"] == dataset.info.generator
         samples = {name: list(map(float, sample["solve_seconds"])) for name, sample in found["samples"].items()}
-        if not all(map(math.isfinite, sum(samples.values(), []))):
+        processors = sorted({str(sample.get("processor", "unknown")) for sample in found["samples"].values()})
+        if not all(math.isfinite(number) for frames in samples.values() for number in frames):
             raise ValueError("a number is not finite")
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         warnings.warn(f"{path} is damaged ({error!r}): the solver's seconds are not known", stacklevel=2)
-        return {}
+        return SolverSeconds()
     if not own:
         warnings.warn(f"{path} belongs to another dataset: the solver's seconds are not known", stacklevel=2)
-        return {}
-    return samples
+        return SolverSeconds()
+    return SolverSeconds(samples, tuple(processors))
 
 
 def processor() -> str:

@@ -59,7 +59,8 @@ class Progress:
             self._last_line = now
             rate = (self.done - self._before) / max(now - self._started, 1e-9)
             left = duration((self.total - self.done) / rate)
-            self._print(f"{self.done} of {self.total} {self.unit}, {rate:.3g}/s, {left} to go")
+            speed = f"{rate:.3g}/s" if rate >= 1 else f"{duration(1 / rate)} each"
+            self._print(f"{self.done} of {self.total} {self.unit}, {speed}, {left} to go")
 
     def begin(self, name: str) -> None:
         """A unit begins."""

@@ -34,7 +34,10 @@ def main() -> None:
     os.dup2(2, 1)
 
     def answer(values: dict[str, Any]) -> None:
-        print(json.dumps(values), file=answers)
+        try:
+            print(json.dumps(values), file=answers)
+        except BrokenPipeError:  # nobody listens any more
+            os.killpg(0, signal.SIGKILL)
 
     for line in sys.stdin:
         split, index = line.split()

@@ -7,7 +7,8 @@ from typing import Any
 
 from ast_sim.data.file import Dataset
 from ast_sim.data.layout import FORMAT, VERSION
-from ast_sim.view.survey import Sample, Seconds
+from ast_sim.data.seconds import SolverSeconds
+from ast_sim.view.survey import Sample
 
 # Records of the samples that are settings rather than results: attribute -> (name, unit); "" stands for none and
 # "length" for the dataset's own.
@@ -22,7 +23,7 @@ SETTINGS = {
 KNOWN = ("program", "versions", "family", "command", "seed", "licence")
 
 
-def dataset_facts(dataset: Dataset, samples: Sequence[Sample], seconds: Seconds | None) -> list[list[str]]:
+def dataset_facts(dataset: Dataset, samples: Sequence[Sample], seconds: SolverSeconds) -> list[list[str]]:
     """Rows of name and text: the file, its generator, its settings, its sizes; "not recorded" where it does not say."""
     info, generator = dataset.info, dataset.info.generator
     unit = info.length_unit
@@ -49,7 +50,7 @@ def dataset_facts(dataset: Dataset, samples: Sequence[Sample], seconds: Seconds 
         "Elements": element,
         "Material columns": str(dataset.material_width) if samples else None,
         "Sizes": _sizes(samples),
-        "Solved on": seconds.processor if seconds else None,
+        "Solved on": ", ".join(seconds.processors) or None,
     }
     return [[name, "not recorded" if value in (None, "") else str(value)] for name, value in rows.items()]
 

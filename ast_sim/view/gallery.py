@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ast_sim.data.file import Dataset
+from ast_sim.data.seconds import SolverSeconds, read_seconds
 from ast_sim.monitor import Progress
 from ast_sim.view import page, survey
 from ast_sim.view.bounds import verdicts
@@ -21,7 +22,7 @@ from ast_sim.view.encode import Surface, encode_scene, finite_json
 from ast_sim.view.facts import dataset_facts
 from ast_sim.view.files import make_folder
 from ast_sim.view.histogram import histogram
-from ast_sim.view.survey import Sample, Seconds
+from ast_sim.view.survey import Sample
 
 Json = dict[str, Any]
 
@@ -35,16 +36,16 @@ def write(path: str | os.PathLike[str], data: str | os.PathLike[str]) -> None:
     """Write the report of a dataset file as one HTML file; its folder is made if it is not there.
 
     Every sample is read once, and shows a bar on a terminal. The solver's seconds are taken from the file beside the
-    dataset (`survey.seconds_path`) if there is one.
+    dataset (`ast_sim.data.seconds`) if there is one.
 
     Raises:
-        DatasetError: the dataset or its seconds cannot be read.
+        DatasetError: the dataset cannot be read.
         AstSimError: the page cannot be written.
         MissingExtra: plotly is not installed.
     """
     path, data = Path(path), Path(data)
     with Dataset(data) as dataset:
-        seconds = survey.read_seconds(data)
+        seconds = read_seconds(dataset)
         make_folder(path.parent)
         with Progress(sum(dataset.splits.values()), 0, "scenes") as bar:
             samples = []
@@ -55,7 +56,7 @@ def write(path: str | os.PathLike[str], data: str | os.PathLike[str]) -> None:
     page.write(path, content, f"{dataset.info.family}: {data.name}")
 
 
-def page_data(dataset: Dataset, samples: Sequence[Sample], seconds: Seconds | None) -> Json:
+def page_data(dataset: Dataset, samples: Sequence[Sample], seconds: SolverSeconds) -> Json:
     """Everything that the page's scripts show, as JSON; `samples` and `seconds` are those of the dataset."""
     unit = dataset.info.length_unit
     ranked = sorted(samples, key=lambda sample: (sample.displacement, sample.name))

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ast_sim.data.file import Dataset
 from ast_sim.data.scene import AttributeValue, NodeType, Trajectory
-from ast_sim.errors import DatasetError
+from ast_sim.data.seconds import SolverSeconds
 from ast_sim.view.fields import deforming_rows
 
 
@@ -85,52 +83,16 @@ class Sample:
         return self.numbers(key)[1:]
 
 
-@dataclass(frozen=True)
-class Seconds:
-    """The solver's seconds, kept beside a dataset so that the file itself does not depend on the machine."""
-
-    processor: str | None
-    samples: dict[str, list[float]]
-
-
-def seconds_path(data: Path) -> Path:
-    """Where the seconds of a dataset file lie."""
-    return data.with_name(data.name + ".seconds.json")
-
-
-def read_seconds(data: Path) -> Seconds | None:
-    """The seconds that lie beside a dataset file, or None if there are none.
-
-    Raises:
-        DatasetError: the file is there but damaged.
-    """
-    path = seconds_path(data)
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        samples = {name: [float(number) for number in numbers] for name, numbers in found["samples"].items()}
-        if not all(math.isfinite(number) for numbers in samples.values() for number in numbers):
-            raise ValueError("a number that is not finite")
-        processor = found.get("processor")
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DatasetError(
-            f"{path} is damaged ({type(error).__name__}: {error}): remove it, and the report leaves the seconds out"
-        ) from error
-    return Seconds(None if processor is None else str(processor), samples)
-
-
 def names(dataset: Dataset) -> list[str]:
     """All samples in the order of the file."""
     return [f"{split}/{index:06d}" for split, count in dataset.splits.items() for index in range(count)]
 
 
-def survey(dataset: Dataset, seconds: Seconds | None) -> Iterator[Sample]:
+def survey(dataset: Dataset, seconds: SolverSeconds) -> Iterator[Sample]:
     """The figures of every sample, in the order of the file; one trajectory is looked at at a time."""
-    recorded = seconds.samples if seconds else {}
     for name in names(dataset):
         split, _, index = name.partition("/")
-        yield figures(name, dataset.load(split, int(index)), dataset.info, recorded.get(name))
+        yield figures(name, dataset.load(split, int(index)), dataset.info, seconds.samples.get(name))
 
 
 def figures(name: str, trajectory: Trajectory, info: Any, seconds: list[float] | None) -> Sample:

@@ -6,7 +6,7 @@ import pytest
 from data_samples import block, trajectory, write
 
 from ast_sim.data.file import Dataset
-from ast_sim.data.seconds import processor, read_seconds, seconds_path, split_seconds, write_seconds
+from ast_sim.data.seconds import SolverSeconds, processor, read_seconds, seconds_path, split_seconds, write_seconds
 
 GENERATOR = {"family": "test", "seed": 3, "counts": {"train": 1}}
 
@@ -27,11 +27,11 @@ def test_clocks_are_told_from_what_is_reproducible():
 
 
 def test_seconds_are_read_where_they_belong(path, recwarn):
-    assert read(path) == {}
+    assert read(path) == SolverSeconds()
     samples = {"train/000000": {"solve_seconds": [0.25, 1e-9], "processor": processor()}}
     write_seconds(path, GENERATOR, samples)
     assert sorted(member.name for member in path.parent.iterdir()) == ["d.h5", "d.h5.seconds.json"]
-    assert read(path) == {"train/000000": [0.25, 1e-9]}
+    assert read(path) == SolverSeconds({"train/000000": [0.25, 1e-9]}, (processor(),))
     assert len(recwarn) == 0 and processor()
 
 
@@ -49,4 +49,4 @@ def test_seconds_are_read_where_they_belong(path, recwarn):
 def test_seconds_that_do_not_belong_are_unknown(path, content, message):
     seconds_path(path).write_text(content)
     with pytest.warns(UserWarning, match=rf"d\.h5\.seconds\.json {message}.*: the solver's seconds are not known"):
-        assert read(path) == {}
+        assert read(path) == SolverSeconds()

@@ -81,7 +81,7 @@ def test_the_dataset_is_whole_and_says_where_it_is_from(undisturbed):
 
 def test_the_seconds_of_every_sample_lie_beside_the_dataset(undisturbed):
     with Dataset(undisturbed) as dataset:
-        seconds = read_seconds(dataset)
+        seconds = read_seconds(dataset).samples
     assert sorted(seconds) == ["test/000000", "train/000000", "train/000001", "valid/000000"]
     assert all(len(frames) == FRAMES and min(frames) > 0 for frames in seconds.values())
     facts = json.loads(seconds_path(undisturbed).read_text())["samples"]["valid/000000"]
