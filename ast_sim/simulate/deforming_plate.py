@@ -13,6 +13,7 @@ import numpy as np
 
 from ast_sim.data.file import DatasetInfo
 from ast_sim.data.scene import NodeType, Scene, Trajectory
+from ast_sim.errors import SimulationError
 from ast_sim.simulate import plate_mesh
 from ast_sim.simulate.case import SolidCase
 from ast_sim.simulate.checkpoint import Checkpoint
@@ -72,7 +73,12 @@ def draw(rng: np.random.Generator, nodes: int = DEFAULT_NODES, frames: int = FRA
         rng: where all draws come from.
         nodes: about how many nodes a scene of the dataset has, obstacle included; this one has 0.5 to 1.7 times that.
         frames: how many frames the press and the release take.
+
+    Raises:
+        SimulationError: frames that cannot hold both.
     """
+    if frames < 3:
+        raise SimulationError(f"frames is {frames}; a press and its release need at least 3")
     while True:
         case = _try_draw(rng, nodes, frames)
         if case is not None and 0.5 * nodes <= case.scene.num_nodes <= 1.7 * nodes:
@@ -159,8 +165,8 @@ def _draw_touch(rng: np.random.Generator, plate: _Plate, obstacle: np.ndarray, p
 def draw_way(rng: np.random.Generator, frames: int) -> np.ndarray:
     """Share of the press in each frame [S]: from 0 to 1, held in some, and back to 0, linearly or by a cosine."""
     last = frames - 1
-    peak = round(rng.triangular(0.7, 0.9, 0.93) * last)
-    hold = round(rng.uniform(0.02, 0.06) * last) if rng.random() < 0.3 else 0
+    peak = min(round(rng.triangular(0.7, 0.9, 0.93) * last), last - 1)
+    hold = min(round(rng.uniform(0.02, 0.06) * last), peak - 1) if rng.random() < 0.3 else 0
     way = np.interp(np.arange(frames), [0, peak - hold, peak, last], [0, 1, 1, 0])
     return (1 - np.cos(np.pi * way)) / 2 if rng.random() < 0.5 else way
 

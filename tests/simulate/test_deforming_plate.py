@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from ast_sim.data.scene import NodeType
+from ast_sim.errors import SimulationError
 from ast_sim.simulate.contact import Contact
 from ast_sim.simulate.deforming_plate import (
     CLAMP_MARGIN,
@@ -122,6 +123,15 @@ def test_the_press_ends_late_and_is_let_go():
         held += way[peak + 1] > way[peak] - 1e-12
         linear += np.abs(np.diff(way[: peak - 1], n=2)).max() < 1e-12
     assert 4 <= held <= 20 and 10 <= linear <= 30
+
+
+@pytest.mark.parametrize("frames", [3, 5, 9])
+def test_few_frames_hold_press_and_release(frames):
+    for index in range(40):
+        way = draw_way(np.random.default_rng(index), frames)
+        assert len(way) == frames and way[[0, -1]] == pytest.approx([0, 0]) and way.max() == 1
+    with pytest.raises(SimulationError, match="frames is 2; a press and its release need at least 3"):
+        draw(np.random.default_rng(0), NODES, 2)
 
 
 def test_clamps_drift_outwards_smoothly():
