@@ -7,6 +7,7 @@ function showGallery(data) {
   for (const color of ["displacement", "stress"]) COLORS[color].unit = data.units[color];
   const dialog = byId("enlarged");
   dialog.append(byId("viewer"));
+  byId("viewer").tabIndex = -1;
   const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
   let viewer = null;
   let resume = false;
@@ -16,6 +17,7 @@ function showGallery(data) {
     dialog.showModal();
     if (viewer) viewer.select(index, color);
     else window.report.viewer = viewer = new Viewer(data, () => {}, index, color);
+    byId("viewer").focus(); // rather than the button to close: the keys step and play at once
     byId("scene-choice").querySelector("input:checked").parentElement.scrollIntoView({ block: "nearest", inline: "center" });
     if (!still) viewer.play();
   });
