@@ -54,12 +54,12 @@ class Pardiso:
         # One thread, and no OpenMP runtime beside that of another library; the same bits wherever arrays lie.
         for name, value in (("MKL_THREADING_LAYER", "SEQUENTIAL"), ("MKL_CBWR", "AVX2")):
             os.environ.setdefault(name, value)
-        (pypardiso,) = require("simulate", "pypardiso")
-        # Left to itself, pypardiso looks for the library in the whole Python installation each time.
+        # Left to itself, pypardiso looks for the library in the whole Python installation each time, at its import already.
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             for file in importlib.metadata.files("mkl") or ():
                 if "mkl_rt" in file.name:
                     os.environ.setdefault("PYPARDISO_MKL_RT", str(file.locate()))
+        (pypardiso,) = require("simulate", "pypardiso")
         self._error = pypardiso.pardiso_wrapper.PyPardisoError
         self._solver = pypardiso.PyPardisoSolver(mtype=2)  # real, symmetric, positive definite
         weakref.finalize(self, self._solver.free_memory, everything=True)  # MKL keeps the factor until it is told

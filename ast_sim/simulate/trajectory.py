@@ -43,7 +43,7 @@ class FrameRecord:
         jacobian: smallest determinant of a deformation gradient.
         residual: largest force component on a free node over that of the stop test: at most 1.
         contact_area: rest area in square metres around the surface nodes on which contact acts, the mean of both sides.
-        reaction: magnitude of the force in newton that moves the prescribed nodes that move.
+        reaction: magnitude of the force in newton on the prescribed nodes of the body that is moved farthest.
         imbalance: sum of the forces on all prescribed nodes over the sum of their magnitudes; without body forces 0.
         elastic_energy, contact_energy: in joule.
         dissipation: lost to friction so far in joule.
@@ -111,7 +111,8 @@ class _Solve:
         self._elasticity = Elasticity(rest, scene.elements[self._deforming], case.material.of(self._deforming))
         self._contact = Contact(rest, scene.surface(), scene.body, case.contact)
         self._solver = QuasiStatic(self._elasticity, self._contact, scene.prescribed, rest, settings)
-        self._moving = (np.abs(case.targets - case.targets[0]).max(axis=(0, 2)) > 0) & scene.prescribed
+        travel = np.where(scene.prescribed, np.abs(case.targets - case.targets[0]).max(axis=(0, 2)), 0)
+        self._driven = scene.prescribed & (scene.body == scene.body[np.argmax(travel)])
         self._frames: dict[str, list[np.ndarray]] = {}
         self._records: list[FrameRecord] = []
         self._reactions = np.zeros_like(rest)
@@ -154,7 +155,7 @@ class _Solve:
                 jacobian,
                 solver.newton.residual(),
                 self._contact.area(state.contact),
-                float(np.linalg.norm(reactions[self._moving].sum(axis=0))),
+                float(np.linalg.norm(reactions[self._driven].sum(axis=0))),
                 self._imbalance(reactions),
                 state.potential.energy,
                 state.contact.barrier_energy(),
