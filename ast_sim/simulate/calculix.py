@@ -29,6 +29,7 @@ from ast_sim.simulate.elasticity import Elasticity
 from ast_sim.simulate.material import von_mises
 
 JOB = "case"
+BEST_GUESS = "best solution and residuals are in the frd file"
 FAILED = 201  # what ccx returns when it gives up, for whatever reason
 # What is tried one after another until all frames converge: softer contact first, then shorter increments, too.
 LADDER = (Increments(), Increments(stiffness=0.1), Increments(stiffness=0.1, largest=0.5))
@@ -249,7 +250,7 @@ def _read(path: Path) -> str:
 def _error(log: str) -> str:
     """The last message that ccx marks as an error, on one line; else its last words."""
     found = re.findall(r"\*ERROR:? *(.*(?:\n(?! *\n| *\*).*)*)", log)
-    return " ".join(found[-1].split()) if found else _last_line(log)
+    return " ".join(found[-1].split()).removesuffix(" " + BEST_GUESS) if found else _last_line(log)
 
 
 def _last_line(text: str) -> str:

@@ -27,12 +27,12 @@ class Increments:
     Attributes:
         stiffness: factor of the default contact stiffness.
         largest: longest increment.
-        smallest: shortest increment; needing a shorter one ends the solve. Well above the digits of the .sta file.
+        smallest: shortest increment; needing a shorter one ends the solve.
     """
 
     stiffness: float = 1.0
     largest: float = 1.0
-    smallest: float = 1e-3
+    smallest: float = 1e-5
 
 
 def moving_nodes(case: SolidCase) -> np.ndarray:
