@@ -16,7 +16,9 @@ from ast_sim.errors import MissingExtra, SimulationError, require
 
 IPCTK_VERSION = "1.5"
 # Candidate pairs stay valid while no vertex has moved further than this share of dhat from where they were collected.
+# A surface that may touch itself has many pairs nearby: there a thin skin costs less than the pairs that it saves.
 SKIN = 1.0
+SELF_CONTACT_SKIN = 0.3
 # Slip per load step, in units of dhat, from which Coulomb friction is fully mobilised; below it a contact sticks.
 STICKING_SLIP = 0.1
 
@@ -30,7 +32,7 @@ class ContactSettings:
         stiffness: barrier stiffness in pascal, about Young's modulus.
         friction: Coulomb's coefficient; without friction none of its terms are computed.
         self_contact: whether a body is held apart from itself. Nodes that do not share an element must then be
-            further apart than dhat at rest, in obstacles too.
+            further apart than dhat at rest.
 
     Raises:
         SimulationError: values that cannot be.
@@ -101,9 +103,17 @@ class Contact:
         faces: surface triangles [F,3], normals pointing out.
         body: body of each node [N].
         settings: distance, stiffness and friction.
+        rigid: [N] nodes of rigid bodies, which cannot touch themselves; none if None.
     """
 
-    def __init__(self, rest: np.ndarray, faces: np.ndarray, body: np.ndarray, settings: ContactSettings) -> None:
+    def __init__(
+        self,
+        rest: np.ndarray,
+        faces: np.ndarray,
+        body: np.ndarray,
+        settings: ContactSettings,
+        rigid: np.ndarray | None = None,
+    ) -> None:
         self._ipctk = ipctk = load_ipctk()
         self.settings = settings
         self.num_nodes = len(rest)
@@ -111,8 +121,12 @@ class Contact:
         local_faces = np.asfortranarray(local_faces.reshape(-1, 3), dtype=np.int32)
         vertices, edges = self._vertices(rest), ipctk.edges(local_faces)
         self._mesh = ipctk.CollisionMesh(vertices, edges, local_faces)
+        self._skin = (SELF_CONTACT_SKIN if settings.self_contact else SKIN) * settings.dhat
         if not settings.self_contact:
             self._mesh.can_collide = ipctk.VertexPatchesCanCollide(body[self.nodes].astype(np.int32))
+        elif rigid is not None:
+            patch = np.where(rigid, body, body.max() + 1 + np.arange(len(rest)))  # each other node is one of its own
+            self._mesh.can_collide = ipctk.VertexPatchesCanCollide(patch[self.nodes].astype(np.int32))
         self._whole_mesh = ipctk.CollisionMesh(vertices, edges, local_faces)
         self._barrier = ipctk.BarrierPotential(settings.dhat, True)
         self._broad_phase, self._ccd = ipctk.LBVH(), ipctk.AdditiveCCD()
@@ -131,7 +145,7 @@ class Contact:
 
     def _is_near_reference(self, vertices: np.ndarray) -> bool:
         difference = vertices - self._reference
-        return np.einsum("ij,ij->i", difference, difference).max() <= (SKIN * self.settings.dhat) ** 2
+        return np.einsum("ij,ij->i", difference, difference).max() <= self._skin**2
 
     def _collect(self, start: np.ndarray, end: np.ndarray) -> None:
         """Make the candidate pairs hold all that can come closer than dhat on the straight way from start to end.
@@ -141,7 +155,7 @@ class Contact:
         """
         if self._is_near_reference(start) and self._is_near_reference(end):
             return
-        self._candidates.build(self._mesh, start, end, (0.5 + SKIN) * self.settings.dhat, self._broad_phase)
+        self._candidates.build(self._mesh, start, end, 0.5 * self.settings.dhat + self._skin, self._broad_phase)
         self._reference = end
 
     def collision_free_fraction(self, start: np.ndarray, end: np.ndarray) -> float:

@@ -91,6 +91,7 @@ class QuasiStatic:
         extent = np.linalg.norm(np.ptp(newton.position, axis=0))
         # Inertia that resists a motion of the size of the bodies like strains of order one.
         weight = elasticity.unit_energy / volume.sum() / extent**2 * volume
+        self._damped.watch = newton.watch
         self._damped.restart(newton.position)
         for _ in range(MAX_DAMPED_STEPS):
             inertia = self._damped.potential

@@ -1,35 +1,25 @@
-"""From a drawn case to a checked trajectory.
-
-A frame is stored only if it converged and passed its checks, which are made on the float32 positions as they are
-stored: no surface intersects, bodies are apart, no element is inverted, everything is finite. At the first frame that
-fails the trajectory ends, with status "truncated".
-"""
+"""From a drawn quasi-static case to a checked trajectory."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
 
-from ast_sim.data.scene import AttributeValue, Trajectory
-from ast_sim.errors import SimulationError
+from ast_sim.data.scene import AttributeValue, NodeType, Trajectory
 from ast_sim.simulate.case import SolidCase
 from ast_sim.simulate.checkpoint import Checkpoint
 from ast_sim.simulate.contact import Contact
 from ast_sim.simulate.elasticity import Elasticity
+from ast_sim.simulate.frames import CheckFailed, Frames
 from ast_sim.simulate.load_step import QuasiStatic
 from ast_sim.simulate.material import von_mises
 from ast_sim.simulate.solver import SolverSettings
 
 # Components of a stress tensor as they are stored: xx, yy, zz, xy, yz, zx.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))
-
-
-class CheckFailed(SimulationError):
-    """A converged frame that must not be stored."""
 
 
 @dataclass(frozen=True)
@@ -82,94 +72,63 @@ def quasi_static(
     Raises:
         SimulationError: the scene at rest already fails its checks.
     """
-    checkpoint = checkpoint or Checkpoint()
-    solve = _Solve(case, settings)
-    solve.restore(checkpoint.load())
-    status: dict[str, AttributeValue] = {"status": "complete"}
-    solve.watch(checkpoint.progress)
-    while solve.num_frames < len(case.targets):
-        try:
-            solve.add_frame()
-        except SimulationError as error:
-            if solve.num_frames == 0:
-                raise
-            status = {"status": "truncated", "stopped_by": f"frame {solve.num_frames}: {error}"}
-            break
-        if checkpoint.is_due:
-            checkpoint.save(solve.arrays())
-    return solve.trajectory(status)
+    frames = SolidFrames(case, settings)
+    status = frames.run(checkpoint)
+    return Trajectory(case.scene, attributes={**status, **case.attributes, **frames.attributes()}, **frames.stacked())
 
 
-class _Solve:
-    """The solver of a case and the frames so far."""
+class SolidFrames(Frames):
+    """The frames of a quasi-static case and its solver; arguments as for `quasi_static`."""
+
+    record_type = FrameRecord
 
     def __init__(self, case: SolidCase, settings: SolverSettings | None) -> None:
-        self.case = case
-        scene = case.scene
+        super().__init__(len(case.targets))
+        self.case, scene = case, case.scene
         rest = scene.rest_position.astype(np.float64)
         self._deforming = np.flatnonzero(case.deforming)
         self._elasticity = Elasticity(rest, scene.elements[self._deforming], case.material.of(self._deforming))
-        self._contact = Contact(rest, scene.surface(), scene.body, case.contact)
-        self._solver = QuasiStatic(self._elasticity, self._contact, scene.prescribed, rest, settings)
+        rigid = scene.node_type == NodeType.OBSTACLE
+        self._contact = Contact(rest, scene.surface(), scene.body, case.contact, rigid)
+        self.solver = QuasiStatic(self._elasticity, self._contact, scene.prescribed, rest, settings)
         travel = np.where(scene.prescribed, np.abs(case.targets - case.targets[0]).max(axis=(0, 2)), 0)
         self._driven = scene.prescribed & (scene.body == scene.body[np.argmax(travel)])
-        self._frames: dict[str, list[np.ndarray]] = {}
-        self._records: list[FrameRecord] = []
         self._reactions = np.zeros_like(rest)
 
-    @property
-    def num_frames(self) -> int:
-        return len(self._records)
-
-    def watch(self, progress: Callable[[int, int, int], None]) -> None:
-        """Call `progress` after each Newton iteration with the frames so far, their final number and the iterations."""
-        solver = self._solver
-        solver.newton.watch = lambda: progress(self.num_frames, len(self.case.targets), solver.iterations)
-
-    def add_frame(self) -> None:
-        """Solve for the next frame, check it and keep it.
-
-        Raises:
-            SimulationError: no equilibrium, or a check that failed.
-        """
-        solver, index = self._solver, self.num_frames
-        started = perf_counter()
+    def next_frame(self) -> tuple[dict[str, np.ndarray], FrameRecord]:
+        """See `Frames`."""
+        solver, newton, started = self.solver, self.solver.newton, perf_counter()
         before = solver.iterations, solver.factorizations, solver.halvings, solver.dissipation
-        start = solver.newton.position
-        if index > 0:
-            solver.advance(self.case.targets[index])
+        start = newton.position
+        if self.records:
+            solver.advance(self.case.targets[len(self.records)])
         seconds = perf_counter() - started
         arrays = self._stored()
         gap, jacobian = self._check(arrays)
-        reactions = np.where(self.case.scene.prescribed[:, None], solver.newton.reactions(), 0)
-        work = 0.5 * float(np.vdot(reactions + self._reactions, solver.newton.position - start))
+        reactions = np.where(self.case.scene.prescribed[:, None], newton.reactions(), 0)
+        work = 0.5 * float(np.vdot(reactions + self._reactions, newton.position - start))
         self._reactions = reactions
-        state = solver.newton.state
-        self._records.append(
-            FrameRecord(
-                seconds,
-                solver.iterations - before[0],
-                solver.factorizations - before[1],
-                solver.halvings - before[2],
-                gap,
-                jacobian,
-                solver.newton.residual(),
-                self._contact.area(state.contact),
-                float(np.linalg.norm(reactions[self._driven].sum(axis=0))),
-                self._imbalance(reactions),
-                state.potential.energy,
-                state.contact.barrier_energy(),
-                (self._records[-1].dissipation if self._records else 0.0) + solver.dissipation - before[3],
-                (self._records[-1].work if self._records else 0.0) + work,
-            )
+        return arrays, FrameRecord(
+            solve_seconds=seconds,
+            newton_iterations=solver.iterations - before[0],
+            factorizations=solver.factorizations - before[1],
+            halvings=solver.halvings - before[2],
+            gap=gap,
+            jacobian=jacobian,
+            residual=newton.residual(),
+            contact_area=self._contact.area(newton.state.contact),
+            reaction=float(np.linalg.norm(reactions[self._driven].sum(axis=0))),
+            imbalance=self._imbalance(reactions),
+            elastic_energy=newton.state.potential.energy,
+            contact_energy=newton.state.contact.barrier_energy(),
+            dissipation=self.last("dissipation") + solver.dissipation - before[3],
+            work=self.last("work") + work,
         )
-        for name, array in arrays.items():
-            self._frames.setdefault(name, []).append(array)
 
     def _stored(self) -> dict[str, np.ndarray]:
         """The arrays of a frame as they are stored."""
-        elasticity, deformation = self._elasticity, self._solver.newton.state.potential
-        position = self._solver.newton.position.astype(np.float32)
+        elasticity, deformation = self._elasticity, self.solver.newton.state.potential
+        position = self.solver.newton.position.astype(np.float32)
         tensor = elasticity.cauchy(deformation)
         mises = von_mises(tensor)
         if self.case.stress_location == "node":
@@ -209,51 +168,37 @@ class _Solve:
             raise CheckFailed(f"an element is inverted (det F = {jacobian:.3g})")
         return gap, jacobian
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """All that `restore` needs to go on."""
-        return {
-            **{name: np.stack(frames) for name, frames in self._frames.items()},
-            "exact_position": self._solver.newton.position,
-            "reactions": self._reactions,
-            "records": np.array(json.dumps([asdict(record) for record in self._records])),
-        }
+    def exact_state(self) -> dict[str, np.ndarray]:
+        """See `Frames`."""
+        return {"position": self.solver.newton.position, "reactions": self._reactions}
 
-    def restore(self, arrays: dict[str, np.ndarray] | None) -> None:
-        """Go on from what `arrays` gave."""
-        if arrays is None:
-            return
-        self._records = [FrameRecord(**record) for record in json.loads(str(arrays.pop("records")))]
-        self._reactions = arrays.pop("reactions")
-        self._solver.newton.restart(arrays.pop("exact_position"))
-        self._frames = {name: list(array) for name, array in arrays.items()}
+    def go_on_from(self, state: dict[str, np.ndarray]) -> None:
+        """See `Frames`."""
+        self._reactions = state["reactions"]
+        self.solver.newton.restart(state["position"])
 
-    def trajectory(self, status: dict[str, AttributeValue]) -> Trajectory:
-        """The frames so far with all records."""
-        records = {name: [getattr(record, name) for record in self._records] for name in asdict(self._records[0])}
+    def watch(self, progress: Callable[[int], None]) -> None:
+        """See `Frames`."""
+        self.solver.newton.watch = lambda: progress(self.solver.iterations)
+
+    def attributes(self) -> dict[str, AttributeValue]:
+        """What the frames say together, and the constants of the solution."""
         contact, material = self.case.contact, self.case.material
-        stored = np.add(records["elastic_energy"], records["contact_energy"])
-        imbalance = records["work"] - stored + stored[0] - records["dissipation"]
-        attributes: dict[str, AttributeValue] = {
-            **status,
-            **self.case.attributes,
-            **records,
-            "min_gap": min(records["gap"]),
-            "min_jacobian": min(records["jacobian"]),
-            "max_residual": max(records["residual"]),
-            "max_imbalance": max(records["imbalance"]),
+        stored = np.add(self.recorded("elastic_energy"), self.recorded("contact_energy"))
+        imbalance = self.recorded("work") - stored + stored[0] - self.recorded("dissipation")
+        return {
+            "min_gap": min(self.recorded("gap")),
+            "min_jacobian": min(self.recorded("jacobian")),
+            "max_residual": max(self.recorded("residual")),
+            "max_imbalance": max(self.recorded("imbalance")),
             "work_balance": float(np.abs(imbalance).max() / max(stored.max(), np.finfo(float).tiny)),
             "young": _distinct(material.young),
             "poisson": _distinct(material.poisson),
             "dhat": contact.dhat,
             "kappa": contact.stiffness,
             "friction": contact.friction,
-            "solver": self._solver.newton.system.solver_name,
+            "solver": self.solver.newton.system.solver_name,
         }
-        return Trajectory(
-            scene=self.case.scene,
-            attributes=attributes,
-            **{name: np.stack(frames) for name, frames in self._frames.items()},
-        )
 
 
 def _distinct(values: float | np.ndarray) -> float | list[float]:
