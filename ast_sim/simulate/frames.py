@@ -1,4 +1,4 @@
-"""The frames of a sample, one after the other: kept with their records, saved, gone on from, ended at the first failure.
+"""The frames of a sample, one by one: kept with their records, saved, gone on from, ended at the first failure.
 
 A frame is stored only if it converged and passed its checks, which are made on the float32 positions as they are
 stored. At the first frame that fails the trajectory ends, with status "truncated" and the reason.

@@ -54,7 +54,7 @@ class Pardiso:
         # One thread, and no OpenMP runtime beside that of another library; the same bits wherever arrays lie.
         for name, value in (("MKL_THREADING_LAYER", "SEQUENTIAL"), ("MKL_CBWR", "AVX2")):
             os.environ.setdefault(name, value)
-        # Left to itself, pypardiso looks for the library in the whole Python installation each time, at its import already.
+        # Left to itself, pypardiso looks for the library in the whole Python installation, at its import already.
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             for file in importlib.metadata.files("mkl") or ():
                 if "mkl_rt" in file.name:
