@@ -2,11 +2,13 @@
 
 One part lies above the other, nearly touching; the lower end of the lower one and the upper end of the upper one are
 clamped (HANDLE), and the upper clamp moves down in 20 increments by 10 to 25 % of the free height. Lengths are scaled:
-the longest side of a pair is 1.8 units, so that the parts stay within [-1,1]^3; the mechanics without gravity knows no
+the longest side of a pair is 1.8 units, at rest it lies within [-1,1]^3; the mechanics without gravity knows no
 length, and a unit counts as a metre. Every draw comes from the generator that is passed in, in a fixed order.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,10 +18,10 @@ from ast_sim.errors import SimulationError
 from ast_sim.simulate.cad import MeshingFailed
 from ast_sim.simulate.case import SolidCase
 from ast_sim.simulate.checkpoint import Checkpoint
-from ast_sim.simulate.contact import ContactSettings
+from ast_sim.simulate.contact import Contact, ContactSettings
 from ast_sim.simulate.material import NeoHookean
-from ast_sim.simulate.mesh_check import BadMesh
-from ast_sim.simulate.pairing import Pair, Unsuitable, put_together
+from ast_sim.simulate.mesh_check import BadMesh, boundary
+from ast_sim.simulate.pairing import HALF_EXTENT, Pair, Unsuitable, put_together
 from ast_sim.simulate.part_source import PartSource, part_source
 from ast_sim.simulate.parts import Part
 from ast_sim.simulate.solver import SolverSettings
@@ -28,9 +30,9 @@ from ast_sim.simulate.trajectory import quasi_static
 INCREMENTS = 20
 DEFAULT_NODES = 4000
 MINIMUM_NODES = 200
-DRAWS = 50  # of parts and placements before a sample is given up
-# Without friction parts slide off each other and buckle, which costs most iterations and many samples.
-CONTACT = ContactSettings(dhat=1e-3, stiffness=1e6, friction=0.15)
+DRAWS = 30  # of parts and placements before a sample is given up
+# Without friction parts slide off each other, which costs most iterations; flanges that are bent touch their own webs.
+CONTACT = ContactSettings(dhat=1e-3, stiffness=1e6, friction=0.15, self_contact=True)
 # The usual stop test of codes for structures asks for 5e-3 of the mean force; buckling parts need no more than this.
 SETTINGS = SolverSettings(force_tolerance=1e-3)
 YOUNG = (5e5, 2e6)  # pascal, drawn evenly in its logarithm
@@ -41,7 +43,7 @@ INFO = DatasetInfo(
     integration="quasi_static",
     stress_location="element",
     domain_center=(0.0, 0.0, 0.0),
-    domain_half_width=1.0,
+    domain_half_width=1.25,  # parts bulge
     contact_radius=0.003,
     time_step=0.0,
 )
@@ -63,16 +65,29 @@ def draw(rng: np.random.Generator, nodes: int = DEFAULT_NODES, parts: PartSource
         try:
             lower, upper = parts.draw(rng, nodes)
             pair = put_together(rng, lower, upper, 2 * CONTACT.dhat)
+            _check_walls(pair)
         except (BadMesh, MeshingFailed, Unsuitable) as error:
             reason = error
             continue
-        return _case(rng, pair, lower, upper)
+        case = _case(rng, pair, lower, upper)
+        return replace(case, attributes={**case.attributes, "mesher": parts.mesher})
     raise SimulationError(f"none of {DRAWS} draws gave two parts that can be squeezed; the last: {reason}") from reason
 
 
 def solve(case: SolidCase, checkpoint: Checkpoint | None = None) -> Trajectory:
     """Squeeze the pair."""
     return quasi_static(case, SETTINGS, checkpoint)
+
+
+def _check_walls(pair: Pair) -> None:
+    """Raise Unsuitable where a surface comes so close to itself that contact would act at rest."""
+    contact = Contact(pair.position, boundary(pair.elements), pair.body, CONTACT)
+    contact.collision_free_fraction(pair.position, pair.position)
+    if not contact.at(pair.position).is_empty:
+        raise Unsuitable(
+            f"a wall, slit or element is thinner than {CONTACT.dhat:g}, the range of contact,"
+            f" once the longest side of the pair is {2 * HALF_EXTENT:g}"
+        )
 
 
 def _case(rng: np.random.Generator, pair: Pair, lower: Part, upper: Part) -> SolidCase:

@@ -14,7 +14,7 @@ from ast_sim.simulate.contact import Contact, ContactSettings
 from ast_sim.simulate.mesh_check import boundary
 from ast_sim.simulate.parts import Part
 
-HALF_EXTENT = 0.9  # of a pair along its longest side; bulging parts then stay within [-1,1]
+HALF_EXTENT = 0.9  # of a pair along its longest side
 SLENDEREST = 1.25  # height of a part as it stands, relative to the shorter side below it
 FARTHEST = 0.3  # offset of the parts along each axis, relative to the smaller of their extents
 LEAST_OVERLAP = 0.3  # of the smaller of the two shadows

@@ -24,7 +24,13 @@ _IGNORED = (".txt", ".md", ".json")  # notes that may lie beside the parts
 
 
 class PartSource(Protocol):
-    """Gives pairs of parts."""
+    """Gives pairs of parts.
+
+    Attributes:
+        mesher: what makes meshes, with its version.
+    """
+
+    mesher: str
 
     def describe(self) -> dict[str, Any]:
         """What the parts depend on beside the random numbers, as JSON has it."""
@@ -60,8 +66,12 @@ class GrammarParts:
 
     version: str
 
+    @property
+    def mesher(self) -> str:
+        return f"gmsh {self.version}"
+
     def describe(self) -> dict[str, Any]:
-        return {"mesher": f"gmsh {self.version}"}
+        return {"mesher": self.mesher}
 
     def check(self) -> None:
         """Nothing to check: what is drawn is checked then."""
@@ -78,8 +88,10 @@ class GrammarParts:
 class StructuredParts:
     """Shapes that need no mesh generator."""
 
+    mesher: str = "structured"
+
     def describe(self) -> dict[str, Any]:
-        return {"mesher": "structured"}
+        return {"mesher": self.mesher}
 
     def check(self) -> None:
         """Nothing to check: what is drawn is checked then."""
@@ -97,9 +109,12 @@ class FileParts:
 
     files: tuple[Path, ...]
 
+    @property
+    def mesher(self) -> str:
+        return f"gmsh {cad.gmsh_version()}" if any(map(_is_cad, self.files)) else "none"
+
     def describe(self) -> dict[str, Any]:
-        mesher = f"gmsh {cad.gmsh_version()}" if any(map(_is_cad, self.files)) else "none"
-        return {"mesher": mesher, "parts": {path.name: _sha256(path) for path in self.files}}
+        return {"mesher": self.mesher, "parts": {path.name: _sha256(path) for path in self.files}}
 
     def check(self) -> None:
         for path in self.files:
