@@ -1,0 +1,353 @@
+"""Implicit dynamics of cloth: backward Euler, each step a minimisation.
+
+With x the positions at the start of a step of length h, v their velocities and y = x + h v + h^2 g, a step finds
+
+    argmin_z  sum_i m_i |z_i - y_i|^2 / (2 h^2) + V(z) + B(z),    v' = (z - x) / h,
+
+V the energy of the cloth, B that of contact, and prescribed nodes at their targets. It ends when the Newton step, as
+an error of the acceleration (over h^2), is within a tolerance: accelerations are what a model learns from the frames.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from time import perf_counter
+
+import numpy as np
+
+from ast_sim.data.scene import AttributeValue, NodeType, Scene, Trajectory
+from ast_sim.errors import SimulationError
+from ast_sim.simulate.checkpoint import Checkpoint
+from ast_sim.simulate.cloth import Cloth, ClothMaterial
+from ast_sim.simulate.contact import Contact, ContactSettings
+from ast_sim.simulate.inertia import Inertia
+from ast_sim.simulate.solver import Newton, NotConverged, SolverSettings
+from ast_sim.simulate.trajectory import CheckFailed
+
+GRAVITY = (0.0, 0.0, -9.81)
+
+
+@dataclass(frozen=True)
+class DynamicSettings(SolverSettings):
+    """When a time step has converged and when it is given up.
+
+    Attributes:
+        acceleration_tolerance: largest component of the last Newton step of a free node over the square of the time
+            step, in m/s^2.
+        max_halvings: how often a time step is halved where it does not converge.
+    """
+
+    acceleration_tolerance: float = 0.1
+    max_halvings: int = 4
+
+
+@dataclass(frozen=True, eq=False)
+class ClothCase:
+    """A sheet of cloth, rigid obstacles with prescribed motion, and S frames.
+
+    Attributes:
+        scene: triangles; those of OBSTACLE nodes are rigid, all others are cloth, flat and at its start at rest.
+        targets: [S,N,3] float64, positions of the prescribed nodes in each frame in metres; rows of other nodes are
+            ignored, frame 0 is at rest.
+        material: of the cloth.
+        contact: between the surfaces.
+        time_step: between two frames, in seconds.
+        gravity: in m/s^2.
+        velocity: [N,3] of the free nodes in frame 0, in m/s; none move if None.
+        attributes: what the drawing wants to have recorded with the trajectory.
+    """
+
+    scene: Scene
+    targets: np.ndarray
+    material: ClothMaterial
+    contact: ContactSettings
+    time_step: float
+    gravity: tuple[float, float, float] = GRAVITY
+    velocity: np.ndarray | None = None
+    attributes: dict[str, AttributeValue] = field(default_factory=dict)
+
+    @property
+    def cloth_triangles(self) -> np.ndarray:
+        """[T,3] the triangles that are not rigid."""
+        obstacle = self.scene.node_type == NodeType.OBSTACLE
+        return self.scene.elements[~obstacle[self.scene.elements].all(axis=1)]
+
+
+class BackwardEuler(Newton):
+    """Cloth on its way through time; `advance` brings it one time step on.
+
+    What a step does depends on the positions and velocities at its start alone.
+
+    Args:
+        case: the scene, its laws and its start.
+        settings: tolerances.
+
+    Attributes:
+        cloth: the elastic potential.
+        mass: [N] in kg; 0 for prescribed nodes.
+        velocity: [N,3] of the free nodes in m/s; 0 for prescribed ones.
+        halvings: halved time steps so far.
+    """
+
+    settings: DynamicSettings
+
+    def __init__(self, case: ClothCase, settings: DynamicSettings | None = None) -> None:
+        scene, rest = case.scene, case.scene.rest_position.astype(np.float64)
+        self.cloth = Cloth(rest, case.cloth_triangles, case.material)
+        self.mass = np.where(scene.prescribed, 0, self.cloth.mass())
+        self.velocity = np.zeros_like(rest)
+        if case.velocity is not None:
+            self.velocity[~scene.prescribed] = case.velocity[~scene.prescribed]
+        self.halvings = 0
+        self._time_step, self._gravity = case.time_step, np.asarray(case.gravity, float)
+        self._inertia = Inertia(self.cloth, self.mass, case.time_step)
+        self._error = 0.0
+        contact = Contact(rest, scene.surface(), scene.body, case.contact, scene.node_type == NodeType.OBSTACLE)
+        super().__init__(self._inertia, contact, scene.prescribed, rest, settings or DynamicSettings())
+
+    def advance(self, target: np.ndarray) -> None:
+        """Go on by one time step, at whose end the prescribed nodes stand at `target` [N,3].
+
+        Raises:
+            NotConverged: also after the allowed halvings of the time step.
+        """
+        self._error = 0.0
+        self._advance(target, self._time_step, 0)
+
+    def _advance(self, target: np.ndarray, step: float, halvings: int) -> None:
+        position, velocity = self.position, self.velocity
+        try:
+            self._time_integrate(target, step)
+        except NotConverged as error:
+            if halvings == self.settings.max_halvings:
+                raise NotConverged(f"{error}, also after {halvings} halvings of the time step") from error
+            self.halvings += 1
+            self.velocity = velocity
+            self.restart(position)
+            self._advance((position + target) / 2, step / 2, halvings + 1)
+            self._advance(target, step / 2, halvings + 1)
+
+    def _time_integrate(self, target: np.ndarray, step: float) -> None:
+        start = self.position
+        inertial = start + step * self.velocity
+        self._inertia.weight = self.mass / step**2
+        self._inertia.predicted = inertial + step**2 * self._gravity
+        self.restart(start)
+        # From where nodes go by inertia few Newton steps are left; where they would collide, from halfway there.
+        end = np.where(self.prescribed[:, None], target, inertial)
+        fraction = self.contact.collision_free_fraction(start, end)
+        self.state = self._evaluate(end if fraction == 1 else start + 0.5 * fraction * (end - start))
+        self._move(target)
+        self._equilibrate(step)
+        self.velocity = np.where(self.prescribed[:, None], 0, (self.position - start) / step)
+
+    def _equilibrate(self, step: float | None = None) -> None:
+        """Newton with line search until the step is within tolerance."""
+        step = self._time_step if step is None else step
+        for _ in range(self.settings.max_iterations):
+            gradient, _ = self._gradient(self.state)
+            gradient[self.prescribed] = 0
+            self._count()
+            direction = self._direction(self.state, gradient, None)
+            self.state = self._line_search(gradient, direction)
+            error = float(np.abs(direction).max()) / (self.settings.acceleration_tolerance * step**2)
+            if error <= 1:
+                self._error = max(self._error, error)
+                return
+        raise NotConverged(f"no equilibrium after {self.settings.max_iterations} Newton iterations")
+
+    def residual(self) -> float:
+        """Last Newton step of the last time step over that of the stop test: at most 1."""
+        return self._error
+
+    def elastic_energy(self) -> float:
+        """In joule, membrane and bending."""
+        return self.state.potential.inner.energy
+
+    def kinetic_energy(self) -> float:
+        """In joule."""
+        return 0.5 * float(self.mass @ np.einsum("ij,ij->i", self.velocity, self.velocity))
+
+    def potential_energy(self) -> float:
+        """In the field of gravity, in joule, zero at the origin."""
+        return -float(self.mass @ (self.position @ self._gravity))
+
+
+@dataclass(frozen=True)
+class DynamicRecord:
+    """What the solver did for a frame and what its checks measured; every field becomes a list with one entry a frame.
+
+    Attributes:
+        solve_seconds: time of the solution.
+        newton_iterations, factorizations, halvings: what the solution took.
+        gap: smallest distance between surfaces that are held apart, in metres.
+        jacobian: smallest area of a triangle over that at rest.
+        residual: last Newton step over that of the stop test: at most 1.
+        contact_area: rest area in square metres around the surface nodes on which contact acts, the mean of both sides.
+        reaction: magnitude of the force in newton that moves the prescribed nodes that move.
+        elastic_energy, contact_energy, kinetic_energy, potential_energy: in joule.
+        work: of all prescribed nodes so far in joule, with the forces at the end of each frame.
+    """
+
+    solve_seconds: float
+    newton_iterations: int
+    factorizations: int
+    halvings: int
+    gap: float
+    jacobian: float
+    residual: float
+    contact_area: float
+    reaction: float
+    elastic_energy: float
+    contact_energy: float
+    kinetic_energy: float
+    potential_energy: float
+    work: float
+
+
+def implicit_euler(
+    case: ClothCase, settings: DynamicSettings | None = None, checkpoint: Checkpoint | None = None
+) -> Trajectory:
+    """Solve a case frame by frame.
+
+    A frame is stored only if it converged and passed its checks, which are made on the float32 positions as they are
+    stored: no surface intersects, surfaces are apart, no triangle has vanished, everything is finite. At the first
+    frame that fails the trajectory ends, with status "truncated".
+
+    Args:
+        case: what to solve.
+        settings: tolerances of the solver.
+        checkpoint: where unfinished frames are kept, and taken from if there are any.
+
+    Returns:
+        The frames up to the first that failed, with the records as attributes.
+
+    Raises:
+        SimulationError: the scene at rest already fails its checks.
+    """
+    checkpoint = checkpoint or Checkpoint()
+    solve = _Solve(case, settings)
+    solve.restore(checkpoint.load())
+    status: dict[str, AttributeValue] = {"status": "complete"}
+    solve.watch(checkpoint.progress)
+    while solve.num_frames < len(case.targets):
+        try:
+            solve.add_frame()
+        except SimulationError as error:
+            if solve.num_frames == 0:
+                raise
+            status = {"status": "truncated", "stopped_by": f"frame {solve.num_frames}: {error}"}
+            break
+        if checkpoint.is_due:
+            checkpoint.save(solve.arrays())
+    return solve.trajectory(status)
+
+
+class _Solve:
+    """The solver of a case and the frames so far."""
+
+    def __init__(self, case: ClothCase, settings: DynamicSettings | None) -> None:
+        self.case, self._solver = case, BackwardEuler(case, settings)
+        self._moving = (np.abs(case.targets - case.targets[0]).max(axis=(0, 2)) > 0) & case.scene.prescribed
+        self._frames: list[np.ndarray] = []
+        self._records: list[DynamicRecord] = []
+
+    @property
+    def num_frames(self) -> int:
+        return len(self._records)
+
+    def watch(self, progress: Callable[[int, int, int], None]) -> None:
+        """Call `progress` before each Newton step with the frames so far, their final number and the steps."""
+        solver = self._solver
+        solver.watch = lambda: progress(self.num_frames, len(self.case.targets), solver.iterations)
+
+    def add_frame(self) -> None:
+        """Solve for the next frame, check it and keep it.
+
+        Raises:
+            SimulationError: a step that did not converge, or a check that failed.
+        """
+        solver, started = self._solver, perf_counter()
+        before = solver.iterations, solver.system.factorizations, solver.halvings
+        start = solver.position
+        if self._frames:
+            solver.advance(self.case.targets[self.num_frames])
+        seconds = perf_counter() - started
+        stored = solver.position.astype(np.float32)
+        gap, jacobian = self._check(stored)
+        reactions = np.where(self.case.scene.prescribed[:, None], solver.reactions(), 0)
+        work = float(np.vdot(reactions, solver.position - start))
+        self._records.append(
+            DynamicRecord(
+                seconds,
+                solver.iterations - before[0],
+                solver.system.factorizations - before[1],
+                solver.halvings - before[2],
+                gap,
+                jacobian,
+                solver.residual(),
+                solver.contact.area(solver.state.contact),
+                float(np.linalg.norm(reactions[self._moving].sum(axis=0))),
+                solver.elastic_energy(),
+                solver.state.contact.barrier_energy(),
+                solver.kinetic_energy(),
+                solver.potential_energy(),
+                (self._records[-1].work if self._records else 0.0) + work,
+            )
+        )
+        self._frames.append(stored)
+
+    def _check(self, stored: np.ndarray) -> tuple[float, float]:
+        """Smallest gap and area ratio of a frame as it is stored.
+
+        Raises:
+            CheckFailed: naming the check and its value.
+        """
+        if not np.isfinite(stored).all():
+            raise CheckFailed("position is not finite")
+        position, solver = stored.astype(np.float64), self._solver
+        gap, jacobian = solver.contact.gap(position), float(solver.cloth.jacobian(position).min())
+        if gap <= 0 or solver.contact.intersects(position):
+            raise CheckFailed(f"surfaces intersect (gap {gap:.3g} m)")
+        if jacobian <= 0:
+            raise CheckFailed(f"a triangle has vanished (area ratio {jacobian:.3g})")
+        return gap, jacobian
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All that `restore` needs to go on."""
+        return {
+            "position": np.stack(self._frames),
+            "exact_position": self._solver.position,
+            "velocity": self._solver.velocity,
+            "records": np.array(json.dumps([asdict(record) for record in self._records])),
+        }
+
+    def restore(self, arrays: dict[str, np.ndarray] | None) -> None:
+        """Go on from what `arrays` gave."""
+        if arrays is None:
+            return
+        self._records = [DynamicRecord(**record) for record in json.loads(str(arrays["records"]))]
+        self._frames = list(arrays["position"])
+        self._solver.restart(arrays["exact_position"])
+        self._solver.velocity = arrays["velocity"]
+
+    def trajectory(self, status: dict[str, AttributeValue]) -> Trajectory:
+        """The frames so far with all records."""
+        records = {name: [getattr(record, name) for record in self._records] for name in asdict(self._records[0])}
+        contact, material = self.case.contact, self.case.material
+        attributes: dict[str, AttributeValue] = {
+            **status,
+            **self.case.attributes,
+            **records,
+            "min_gap": min(records["gap"]),
+            "min_jacobian": min(records["jacobian"]),
+            "max_residual": max(records["residual"]),
+            **asdict(material),
+            "dhat": contact.dhat,
+            "kappa": contact.stiffness,
+            "friction": contact.friction,
+            "solver": self._solver.system.solver_name,
+        }
+        return Trajectory(scene=self.case.scene, position=np.stack(self._frames), attributes=attributes)
