@@ -10,7 +10,6 @@ an error of the acceleration (over h^2), is within a tolerance: accelerations ar
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from time import process_time
@@ -18,13 +17,12 @@ from time import process_time
 import numpy as np
 
 from ast_sim.data.scene import AttributeValue, NodeType, Scene, Trajectory
-from ast_sim.errors import SimulationError
 from ast_sim.simulate.checkpoint import Checkpoint
 from ast_sim.simulate.cloth import Cloth, ClothMaterial
 from ast_sim.simulate.contact import Contact, ContactSettings
+from ast_sim.simulate.frames import CheckFailed, Frames
 from ast_sim.simulate.inertia import Inertia
 from ast_sim.simulate.solver import Newton, NotConverged, SolverSettings
-from ast_sim.simulate.trajectory import CheckFailed
 
 GRAVITY = (0.0, 0.0, -9.81)
 
@@ -135,12 +133,19 @@ class BackwardEuler(Newton):
         self._inertia.weight = self.mass / step**2
         self._inertia.predicted = inertial + step**2 * self._gravity
         self.restart(start)
+        friction_passes = 0 if self.contact.settings.friction == 0 else self.settings.friction_passes
+        if friction_passes:
+            self._lag_friction(start)
         # From where nodes go by inertia few Newton steps are left; where they would collide, from halfway there.
         end = np.where(self.prescribed[:, None], target, inertial)
         fraction = self.contact.collision_free_fraction(start, end)
         self.state = self._evaluate(end if fraction == 1 else start + 0.5 * fraction * (end - start))
         self._move(target)
         self._equilibrate(step)
+        for _ in range(friction_passes):
+            self._lag_friction(start)
+            self._equilibrate(step)
+        self.dissipation += self.state.contact.dissipation()
         self.velocity = np.where(self.prescribed[:, None], 0, (self.position - start) / step)
 
     def _equilibrate(self, step: float | None = None) -> None:
@@ -188,6 +193,7 @@ class DynamicRecord:
         contact_area: rest area in square metres around the surface nodes on which contact acts, the mean of both sides.
         reaction: magnitude of the force in newton that moves the prescribed nodes that move.
         elastic_energy, contact_energy, kinetic_energy, potential_energy: in joule.
+        dissipation: lost to friction so far in joule.
         work: of all prescribed nodes so far in joule, with the forces at the end of each frame.
     """
 
@@ -204,6 +210,7 @@ class DynamicRecord:
     contact_energy: float
     kinetic_energy: float
     potential_energy: float
+    dissipation: float
     work: float
 
 
@@ -212,92 +219,66 @@ def implicit_euler(
 ) -> Trajectory:
     """Solve a case frame by frame.
 
-    A frame is stored only if it converged and passed its checks, which are made on the float32 positions as they are
-    stored: no surface intersects, surfaces are apart, no triangle has vanished, everything is finite. At the first
-    frame that fails the trajectory ends, with status "truncated".
-
     Args:
         case: what to solve.
         settings: tolerances of the solver.
         checkpoint: where unfinished frames are kept, and taken from if there are any.
 
     Returns:
-        The frames up to the first that failed, with the records as attributes.
+        The frames up to the first that did not converge or failed a check, with the records as attributes.
 
     Raises:
         SimulationError: the scene at rest already fails its checks.
     """
-    checkpoint = checkpoint or Checkpoint()
-    solve = _Solve(case, settings)
-    solve.restore(checkpoint.load())
-    status: dict[str, AttributeValue] = {"status": "complete"}
-    solve.watch(checkpoint.progress)
-    while solve.num_frames < len(case.targets):
-        try:
-            solve.add_frame()
-        except SimulationError as error:
-            if solve.num_frames == 0:
-                raise
-            status = {"status": "truncated", "stopped_by": f"frame {solve.num_frames}: {error}"}
-            break
-        if checkpoint.is_due:
-            checkpoint.save(solve.arrays())
-    return solve.trajectory(status)
+    frames = ClothFrames(case, settings)
+    attributes = frames.run(checkpoint)
+    return Trajectory(scene=case.scene, attributes={**attributes, **frames.summary()}, **frames.stacked())
 
 
-class _Solve:
-    """The solver of a case and the frames so far."""
+class ClothFrames(Frames):
+    """The frames of a `ClothCase`: no surface intersects, surfaces are apart, no triangle has vanished."""
+
+    record_type = DynamicRecord
 
     def __init__(self, case: ClothCase, settings: DynamicSettings | None) -> None:
+        super().__init__(len(case.targets))
         self.case, self._solver = case, BackwardEuler(case, settings)
         self._moving = (np.abs(case.targets - case.targets[0]).max(axis=(0, 2)) > 0) & case.scene.prescribed
-        self._frames: list[np.ndarray] = []
-        self._records: list[DynamicRecord] = []
 
-    @property
-    def num_frames(self) -> int:
-        return len(self._records)
-
-    def watch(self, progress: Callable[[int, int, int], None]) -> None:
-        """Call `progress` before each Newton step with the frames so far, their final number and the steps."""
+    def watch(self, progress: Callable[[int], None]) -> None:
+        """See `Frames`."""
         solver = self._solver
-        solver.watch = lambda: progress(self.num_frames, len(self.case.targets), solver.iterations)
+        solver.watch = lambda: progress(solver.iterations)
 
-    def add_frame(self) -> None:
-        """Solve for the next frame, check it and keep it.
-
-        Raises:
-            SimulationError: a step that did not converge, or a check that failed.
-        """
+    def next_frame(self) -> tuple[dict[str, np.ndarray], DynamicRecord]:
+        """See `Frames`."""
         solver, started = self._solver, process_time()
-        before = solver.iterations, solver.system.factorizations, solver.halvings
+        before = solver.iterations, solver.system.factorizations, solver.halvings, solver.dissipation
         start = solver.position
-        if self._frames:
-            solver.advance(self.case.targets[self.num_frames])
+        if self.records:
+            solver.advance(self.case.targets[len(self.records)])
         seconds = process_time() - started
         stored = solver.position.astype(np.float32)
         gap, jacobian = self._check(stored)
         reactions = np.where(self.case.scene.prescribed[:, None], solver.reactions(), 0)
-        work = float(np.vdot(reactions, solver.position - start))
-        self._records.append(
-            DynamicRecord(
-                seconds,
-                solver.iterations - before[0],
-                solver.system.factorizations - before[1],
-                solver.halvings - before[2],
-                gap,
-                jacobian,
-                solver.residual(),
-                solver.contact.area(solver.state.contact),
-                float(np.linalg.norm(reactions[self._moving].sum(axis=0))),
-                solver.elastic_energy(),
-                solver.state.contact.barrier_energy(),
-                solver.kinetic_energy(),
-                solver.potential_energy(),
-                (self._records[-1].work if self._records else 0.0) + work,
-            )
+        record = DynamicRecord(
+            solve_seconds=seconds,
+            newton_iterations=solver.iterations - before[0],
+            factorizations=solver.system.factorizations - before[1],
+            halvings=solver.halvings - before[2],
+            gap=gap,
+            jacobian=jacobian,
+            residual=solver.residual(),
+            contact_area=solver.contact.area(solver.state.contact),
+            reaction=float(np.linalg.norm(reactions[self._moving].sum(axis=0))),
+            elastic_energy=solver.elastic_energy(),
+            contact_energy=solver.state.contact.barrier_energy(),
+            kinetic_energy=solver.kinetic_energy(),
+            potential_energy=solver.potential_energy(),
+            dissipation=self.last("dissipation") + solver.dissipation - before[3],
+            work=self.last("work") + float(np.vdot(reactions, solver.position - start)),
         )
-        self._frames.append(stored)
+        return {"position": stored}, record
 
     def _check(self, stored: np.ndarray) -> tuple[float, float]:
         """Smallest gap and area ratio of a frame as it is stored.
@@ -315,39 +296,26 @@ class _Solve:
             raise CheckFailed(f"a triangle has vanished (area ratio {jacobian:.3g})")
         return gap, jacobian
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """All that `restore` needs to go on."""
+    def exact_state(self) -> dict[str, np.ndarray]:
+        """See `Frames`."""
+        return {"position": self._solver.position, "velocity": self._solver.velocity}
+
+    def go_on_from(self, state: dict[str, np.ndarray]) -> None:
+        """See `Frames`."""
+        self._solver.restart(state["position"])
+        self._solver.velocity = state["velocity"]
+
+    def summary(self) -> dict[str, AttributeValue]:
+        """Attributes that do not belong to a frame."""
+        contact = self.case.contact
         return {
-            "position": np.stack(self._frames),
-            "exact_position": self._solver.position,
-            "velocity": self._solver.velocity,
-            "records": np.array(json.dumps([asdict(record) for record in self._records])),
-        }
-
-    def restore(self, arrays: dict[str, np.ndarray] | None) -> None:
-        """Go on from what `arrays` gave."""
-        if arrays is None:
-            return
-        self._records = [DynamicRecord(**record) for record in json.loads(str(arrays["records"]))]
-        self._frames = list(arrays["position"])
-        self._solver.restart(arrays["exact_position"])
-        self._solver.velocity = arrays["velocity"]
-
-    def trajectory(self, status: dict[str, AttributeValue]) -> Trajectory:
-        """The frames so far with all records."""
-        records = {name: [getattr(record, name) for record in self._records] for name in asdict(self._records[0])}
-        contact, material = self.case.contact, self.case.material
-        attributes: dict[str, AttributeValue] = {
-            **status,
             **self.case.attributes,
-            **records,
-            "min_gap": min(records["gap"]),
-            "min_jacobian": min(records["jacobian"]),
-            "max_residual": max(records["residual"]),
-            **asdict(material),
+            "min_gap": min(self.recorded("gap")),
+            "min_jacobian": min(self.recorded("jacobian")),
+            "max_residual": max(self.recorded("residual")),
+            **asdict(self.case.material),
             "dhat": contact.dhat,
             "kappa": contact.stiffness,
             "friction": contact.friction,
             "solver": self._solver.system.solver_name,
         }
-        return Trajectory(scene=self.case.scene, position=np.stack(self._frames), attributes=attributes)

@@ -156,6 +156,49 @@ def test_the_sphere_stands_where_it_is_told_and_carries_the_cloth():
     assert energy <= attributes["work"][-1]
 
 
+def on_slope(slope: float, friction: float, frames: int) -> ClothCase:
+    """A sheet on a plane, gravity leaning by the angle whose tangent is `slope`; it starts about where the barrier carries it."""
+    angle = np.arctan(slope)
+    flat = case(frames, gravity=tuple(9.81 * np.array([np.sin(angle), 0, -np.cos(angle)])))
+    corners_ = np.array([[-2, -2, -0.0185], [4, -2, -0.0185], [4, 2, -0.0185], [-2, 2, -0.0185]], np.float32)
+    scene, n = flat.scene, flat.scene.num_nodes
+    scene = Scene(
+        np.concatenate([scene.rest_position, corners_]),
+        np.concatenate([scene.elements, np.array([[0, 1, 2], [0, 2, 3]], np.int32) + n]),
+        np.append(scene.node_type, np.full(4, NodeType.OBSTACLE, np.uint8)),
+        np.append(scene.body, np.ones(4, np.int32)),
+    )
+    targets = np.repeat(scene.rest_position.astype(float)[None], frames, axis=0)
+    return replace(
+        flat, scene=scene, targets=targets, contact=ContactSettings(0.02, 300.0, friction, self_contact=True)
+    )
+
+
+def test_a_sheet_slides_down_a_slope_with_what_friction_leaves_of_gravity():
+    settings = DynamicSettings(acceleration_tolerance=1e-3)
+    slope, friction, frames = 0.5, 0.3, 60
+    trajectory = implicit_euler(on_slope(slope, friction, frames), settings)
+    travel = trajectory.position[:, :25, 0].mean(axis=1) - trajectory.position[0, :25, 0].mean()
+    speed = np.diff(travel) / STEP
+    expected = 9.81 * (slope - friction) / np.hypot(1, slope)
+    # While the sheet settles on the barrier that does not carry just its weight: the later half counts.
+    assert (speed[-1] - speed[28]) / (30 * STEP) == pytest.approx(expected, rel=0.03)
+    attributes = trajectory.attributes
+    lost = friction * 0.2 * 9.81 / np.hypot(1, slope) * (travel[-1] - travel[30])
+    assert attributes["dissipation"][-1] - attributes["dissipation"][30] == pytest.approx(lost, rel=0.05)
+
+
+def test_a_sheet_sticks_on_a_slope_below_the_friction_angle():
+    settings = DynamicSettings(acceleration_tolerance=1e-3)
+    trajectory = implicit_euler(on_slope(0.25, 0.3, 40), settings)
+    speed = np.diff(trajectory.position[:, :25, 0].mean(axis=1)) / STEP
+    # Lagged friction is mobilised by slip u in a step as 2 y - y^2, y = u / (0.1 dhat): sticking is a slow creep at
+    # which that is tan(slope) / friction. Without friction the speed would be 0.93 m/s by now.
+    creep = 0.1 * 0.02 / STEP * (1 - np.sqrt(1 - 0.25 / 0.3))
+    assert speed.max() < 1.1 * creep
+    assert speed[-10:].mean() == pytest.approx(creep, rel=0.05)
+
+
 def test_a_step_that_does_not_converge_is_halved(hanging):
     hasty = replace(EXACT, max_iterations=4)
     attributes = implicit_euler(case(25, cells=6, held=corners), hasty).attributes
