@@ -16,9 +16,8 @@ from time import perf_counter
 import numpy as np
 
 from ast_sim.data.scene import NodeType, Trajectory
-from ast_sim.simulate import calculix, trajectory
+from ast_sim.simulate import abcd, calculix
 from ast_sim.simulate.case import SolidCase
-from ast_sim.simulate.samples import family_module
 
 CRUSH = 0.2
 # What the two solvers must agree in, at the last frame.
@@ -79,10 +78,10 @@ def with_crush(case: SolidCase, crush: float) -> SolidCase:
 
 def measure(seed: int, nodes: int) -> dict:
     """Solve one seed with both solvers."""
-    case = with_crush(family_module("abcd").draw(np.random.default_rng(seed), nodes), CRUSH)
+    case = with_crush(abcd.draw(np.random.default_rng(seed), nodes), CRUSH)
     record = {"seed": seed, "nodes": case.scene.num_nodes, "tetrahedra": case.scene.num_elements}
     solutions = []
-    for name, solve in (("ours", trajectory.quasi_static), ("calculix", calculix.quasi_static)):
+    for name, solve in (("ours", abcd.solve), ("calculix", calculix.quasi_static)):
         started = perf_counter()
         solution = solve(case)
         record[name] = {
@@ -115,9 +114,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, required=True, metavar="FILE", help="write all figures here")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4], help="(0 1 2 3 4)")
-    parser.add_argument(
-        "--nodes", type=int, default=family_module("abcd").DEFAULT_NODES, help="about how many (%(default)s)"
-    )
+    parser.add_argument("--nodes", type=int, default=abcd.DEFAULT_NODES, help="about how many (%(default)s)")
     arguments = parser.parse_args()
     header = {
         **provenance(" ".join(["python -m benchmarks.calculix", *sys.argv[1:]])),

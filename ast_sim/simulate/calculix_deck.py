@@ -11,6 +11,7 @@ from itertools import combinations
 from typing import TextIO
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ast_sim.data.scene import NodeType, Scene
 from ast_sim.errors import SimulationError
@@ -18,6 +19,8 @@ from ast_sim.simulate.case import SolidCase
 
 # Node sets of the faces S1 to S4 of a C3D4.
 CALCULIX_FACES = ((0, 1, 2), (0, 1, 3), (1, 2, 3), (0, 2, 3))
+# A body counts as sharper than another if its convex edges are so by more than this, in radian.
+SHARPER = np.pi / 12
 
 
 @dataclass(frozen=True)
@@ -117,14 +120,53 @@ def _contact(case: SolidCase, increments: Increments) -> Iterator[str]:
     if case.contact.friction > 0:
         yield "*FRICTION"
         yield f"{case.contact.friction:.9e}, {stiffness / 10:.9e}"
-    edge = {body: _mean_edge(scene, scene.body[scene.elements[:, 0]] == body) for body in bodies}
     rigid = {body: bool((scene.node_type[scene.body == body] == NodeType.OBSTACLE).all()) for body in bodies}
     for pair in combinations(bodies, 2):
-        # The finer surface is the slave; of an obstacle and a body the obstacle is the master.
-        slave, master = sorted(pair, key=lambda body: (rigid[body], edge[body]))
-        if not (rigid[slave] and rigid[master]):
+        if not (rigid[pair[0]] and rigid[pair[1]]):
+            # An obstacle is the master.
+            slave, master = slave_first(scene, *pair) if not any(map(rigid.get, pair)) else sorted(pair, key=rigid.get)
             yield "*CONTACT PAIR, INTERACTION=CONTACT, TYPE=SURFACE TO SURFACE"
             yield f"BODY{slave}, BODY{master}"
+
+
+def slave_first(scene: Scene, one: int, other: int) -> tuple[int, int]:
+    """Two deforming bodies as slave and master.
+
+    Pressure acts along the normals of the master's faces. Where an edge rests on a rounded face these must be those of
+    that face, so the body that is sharper where the two are closest becomes the slave; else that of the finer mesh.
+    """
+    surface = scene.surface()
+    body_of_face = scene.body[surface[:, 0]]
+    faces = {body: surface[body_of_face == body] for body in (one, other)}
+    position = scene.rest_position.astype(np.float64)
+    mesh_size = {body: _mean_edge(scene, scene.body[scene.elements[:, 0]] == body) for body in (one, other)}
+    sharpness = {}
+    for body, opposite in ((one, other), (other, one)):
+        distance, _ = cKDTree(position[np.unique(faces[opposite])]).query(position)
+        distance[np.setdiff1d(np.arange(scene.num_nodes), faces[body])] = np.inf
+        near = distance <= distance.min() + max(mesh_size.values())
+        sharpness[body] = _convex_angle(position, faces[body], near)
+    if abs(sharpness[one] - sharpness[other]) > SHARPER:
+        slave = max((one, other), key=sharpness.get)
+    else:
+        slave = min((one, other), key=mesh_size.get)
+    return slave, other if slave == one else one
+
+
+def _convex_angle(position: np.ndarray, faces: np.ndarray, near: np.ndarray) -> float:
+    """Largest angle in radian between the normals on both sides of a convex edge with one of the nodes `near` [N]."""
+    corners = position[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    order = np.lexsort(edges.T)
+    first, second = order[:-1], order[1:]
+    shared = (edges[first] == edges[second]).all(axis=1) & near[edges[first]].any(axis=1)
+    one, other = first[shared] // 3, second[shared] // 3
+    across = corners[other].mean(axis=1) - corners[one].mean(axis=1)
+    convex = np.einsum("ij,ij->i", across, normal[one]) < 0
+    cosine = np.einsum("ij,ij->i", normal[one], normal[other])[convex]
+    return float(np.arccos(np.clip(cosine, -1, 1)).max(initial=0))
 
 
 def _surface_faces(scene: Scene) -> tuple[np.ndarray, np.ndarray]:

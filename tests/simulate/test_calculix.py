@@ -12,7 +12,7 @@ from ast_sim.data.scene import NodeType, Scene
 from ast_sim.errors import MissingExtra, SimulationError
 from ast_sim.simulate import calculix, mesh, trajectory
 from ast_sim.simulate.calculix import CalculixSettings
-from ast_sim.simulate.calculix_deck import Increments, contact_stiffness, write_deck
+from ast_sim.simulate.calculix_deck import Increments, contact_stiffness, slave_first, write_deck
 from ast_sim.simulate.calculix_results import read_increments, read_results
 from ast_sim.simulate.case import SolidCase
 from ast_sim.simulate.contact import ContactSettings
@@ -218,6 +218,17 @@ def test_the_deck_has_a_section_for_each_material_and_the_finer_body_as_slave():
     obstacle = deck_of(pressed())
     pair = next(n for n, line in enumerate(obstacle) if line.startswith("*CONTACT PAIR"))
     assert obstacle[pair + 1] == "BODY0, BODY1"  # an obstacle is the master
+
+
+def test_the_body_with_the_edge_is_the_slave_of_the_rounded_one():
+    ball, ball_elements = mesh.ball(0.3, 8)  # much finer than the block
+    block, block_elements = box([0.5, 0.5, 0.5], (1, 1, 1))
+    block = block + [0.4, 0, ball[:, 2].max() - 0.06]  # its lower edge above the slope of the ball
+    position = np.concatenate([ball, block]).astype(np.float32)
+    elements = np.concatenate([ball_elements, block_elements + len(ball)]).astype(np.int32)
+    body = np.repeat([0, 1], [len(ball), len(block)]).astype(np.int32)
+    scene = Scene(position, elements, np.zeros(len(position), np.uint8), body)
+    assert slave_first(scene, 0, 1) == slave_first(scene, 1, 0) == (1, 0)
 
 
 def deck_of(case) -> list[str]:
