@@ -104,7 +104,7 @@ def _build_parser() -> argparse.ArgumentParser:
     generate.add_argument("--valid", type=_at_least(0), metavar="N", help="validation scenes (a tenth of N)")
     generate.add_argument("--test", type=_at_least(0), metavar="N", help="test scenes (a tenth of N)")
     generate.add_argument("--nodes", type=_at_least(1), metavar="N", help="nodes of a scene, about")
-    generate.add_argument("--frames", type=_at_least(2), metavar="N", help="frames of a scene")
+    generate.add_argument("--frames", type=_at_least(1), metavar="N", help="frames of a scene")
     generate.add_argument("--seed", type=_at_least(0), default=0, help="the scenes follow from it (0)")
     generate.add_argument("--solver", choices=("own", "calculix"), help="CalculiX in place of the bundled FEM")
     generate.add_argument("--parts", type=Path, metavar="PATH", help="own parts: a STEP, STL or mesh file, or a folder")

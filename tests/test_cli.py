@@ -283,7 +283,7 @@ def test_arguments_out_of_range(tmp_path, capsys):
     assert "0 is below 1" in fails(capsys, "generate", "deforming_plate", "--out", tmp_path / "a.h5", "--count", 0)
     assert "ball" in fails(capsys, "generate", "ball", "--out", tmp_path / "a.h5", "--count", 1)
     plates = ("generate", "deforming_plate", "--out", tmp_path / "a.h5", "--count", 1)
-    assert "1 is below 2" in fails(capsys, *plates, "--frames", 1)
+    assert "frames is 2; must be at least 3" in fails(capsys, *plates, "--frames", 2)
     assert "invalid choice: 'abaqus'" in fails(capsys, *plates, "--solver", "abaqus")
     assert "not allowed with" in fails(capsys, *plates, "--workers", 2, "--scheduler", "tcp://host:8786")
     error = fails(capsys, *plates, "--parts", tmp_path)

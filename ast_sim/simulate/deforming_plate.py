@@ -26,6 +26,7 @@ from ast_sim.simulate.trajectory import quasi_static
 FRAMES = 400
 DEFAULT_NODES = 1300
 MINIMUM_NODES = 80
+MINIMUM_FRAMES = 3  # of a press and its release
 MATERIAL = NeoHookean(young=1e6, poisson=0.4)
 CONTACT = ContactSettings(dhat=1e-3, stiffness=MATERIAL.young)
 LAYERS = 2  # of elements through the thickness
@@ -77,8 +78,8 @@ def draw(rng: np.random.Generator, nodes: int = DEFAULT_NODES, frames: int = FRA
     Raises:
         SimulationError: frames that cannot hold both.
     """
-    if frames < 3:
-        raise SimulationError(f"frames is {frames}; a press and its release need at least 3")
+    if frames < MINIMUM_FRAMES:
+        raise SimulationError(f"frames is {frames}; a press and its release need at least {MINIMUM_FRAMES}")
     while True:
         case = _try_draw(rng, nodes, frames)
         if case is not None and 0.5 * nodes <= case.scene.num_nodes <= 1.7 * nodes:

@@ -43,9 +43,10 @@ def checked_recipe(
     nodes = module.DEFAULT_NODES if nodes is None else nodes
     if "frames" in FAMILIES[family].options:
         frames = module.FRAMES if frames is None else frames
-    least = {"seed": (seed, 0), "nodes": (nodes, module.MINIMUM_NODES), "frames": (frames, 2)}
-    for name, (value, minimum) in least.items():
-        if value is not None and value < minimum:
+        if frames < module.MINIMUM_FRAMES:
+            raise SimulationError(f"frames is {frames}; must be at least {module.MINIMUM_FRAMES}")
+    for name, value, minimum in (("seed", seed, 0), ("nodes", nodes, module.MINIMUM_NODES)):
+        if value < minimum:
             raise SimulationError(f"{name} is {value}; must be at least {minimum}")
     solver = solver or "own"
     if solver not in SOLVERS:

@@ -1,9 +1,10 @@
 """Runs when Python starts with this folder in PYTHONPATH: stops a generator at a chosen moment, to be killed there.
 
-AST_SIM_TEST_PAUSE names the moment and AST_SIM_TEST_MARK a file. The process that comes to the moment writes its number
-there and sleeps. Checkpoints are written at every frame, and those that are gone on from leave a file "resumed".
+AST_SIM_TEST_PAUSE names the moment and AST_SIM_TEST_MARK a file. The first process that comes to the moment writes its
+number there and sleeps. Checkpoints are written at every frame, and those that are gone on from leave a file "resumed".
 """
 
+import contextlib
 import os
 import time
 from pathlib import Path
@@ -19,8 +20,9 @@ def pausing(owner, name: str, moment: str, call: int = 1, after: bool = False) -
         calls.append(None)
         found = function(*args, **kwargs) if after else None
         if moment == PAUSE and len(calls) == call:
-            MARK.write_text(str(os.getpid()))
-            time.sleep(600)
+            with contextlib.suppress(FileExistsError), open(MARK, "x") as file:
+                print(os.getpid(), file=file, flush=True)
+                time.sleep(600)
         return found if after else function(*args, **kwargs)
 
     setattr(owner, name, paused)

@@ -2,7 +2,6 @@
 
 import json
 import os
-import pathlib
 import signal
 import socket
 import subprocess
@@ -11,9 +10,8 @@ import threading
 
 import psutil
 import pytest
-from test_generate_kills import is_running, wait_for
+from processes import environment, is_running, paused_process, wait_for
 
-import ast_sim
 from ast_sim.errors import MissingExtra, SimulationError
 from ast_sim.simulate import cluster
 from ast_sim.simulate.generate import generate
@@ -21,18 +19,12 @@ from ast_sim.simulate.settings import recorded
 
 COUNTS = {"train": 2, "test": 1}
 SETTINGS = {"seed": 5, "nodes": 80, "frames": 9, "progress": False}
-ROOT = pathlib.Path(ast_sim.__file__).parent.parent
 
 
-def environment(**changes: str) -> dict[str, str]:
-    path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
-    return {**os.environ, "PYTHONPATH": path, **changes}
-
-
-def start(program: str, *arguments: str) -> subprocess.Popen:
+def start(program: str, *arguments: str, **stop) -> subprocess.Popen:
     """`dask scheduler` or `dask worker`; its threads are not those of the solver."""
     command = [sys.executable, "-m", f"distributed.cli.dask_{program}", *arguments]
-    variables = environment(OMP_NUM_THREADS="2")
+    variables = environment(**stop, OMP_NUM_THREADS="2")
     return subprocess.Popen(command, env=variables, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
@@ -48,11 +40,11 @@ def scheduler(tmp_path_factory):
 
 
 @pytest.fixture
-def workers(scheduler, tmp_path):
-    """Two workers of one thread, without a nanny: one that is killed stays dead."""
-    folder = str(tmp_path / "dask")
-    arguments = ("--nthreads", "1", "--no-nanny", "--no-dashboard", "--local-directory", folder)
-    found = [start("worker", scheduler, *arguments) for _ in range(2)]
+def workers(scheduler, tmp_path, request):
+    """Two workers of one thread, without a nanny: one that is killed stays dead. A parameter is a moment to stop at."""
+    arguments = ("--nthreads", "1", "--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path / "dask"))
+    stop = {"pause": request.param, "mark": tmp_path / "mark"} if hasattr(request, "param") else {}
+    found = [start("worker", scheduler, *arguments, **stop) for _ in range(2)]
     yield found
     for process in found:
         process.kill()
@@ -66,37 +58,37 @@ def lines(folder) -> list[dict]:
         return []
 
 
-def running(folder, sample="train/000000") -> list[int]:
-    """Processes that were at the sample so far."""
-    found = [line for line in lines(folder) if line["sample"] == sample and line["state"] == "running"]
-    return [int(line["where"].rpartition(" ")[2]) for line in found]
+def running(folder) -> list[int]:
+    """Processes that were at a sample so far."""
+    return [int(line["where"].rpartition(" ")[2]) for line in lines(folder) if line["state"] == "running"]
 
 
+@pytest.mark.parametrize("workers", ["solving"], indirect=True)
 def test_a_killed_worker_costs_nothing_and_the_bytes_are_those_of_one_machine(scheduler, workers, tmp_path):
     out, folder = tmp_path / "plates.h5", tmp_path / "plates.h5.parts"
-    killed, manifest = [], []
+    solver, manifest = [], []
 
     def kill_a_worker():
-        wait_for(lambda: running(folder), "the sample never began")
+        solver.append(paused_process(tmp_path / "mark"))  # in the middle of a sample
+        wait_for(lambda: solver[0] in running(folder), "the sample is not in the manifest")
         manifest.append(open(folder / "manifest.jsonl"))  # noqa: SIM115 (to be read when the folder is removed)
-        (solver,) = running(folder)
-        killed.extend([psutil.Process(solver).ppid(), solver])
-        os.kill(killed[0], signal.SIGKILL)
+        dask_worker = psutil.Process(solver[0]).ppid()
+        assert dask_worker in [process.pid for process in workers]
+        os.kill(dask_worker, signal.SIGKILL)
 
     killer = threading.Thread(target=kill_a_worker)
     killer.start()
     generate("deforming_plate", out, COUNTS, scheduler=scheduler, **SETTINGS)
     killer.join()
-    assert killed[0] in [process.pid for process in workers]
-    wait_for(lambda: not is_running(killed[1]), "the solver outlived its Dask worker")
+    wait_for(lambda: not is_running(solver[0]), "the solver outlived its Dask worker")
     with manifest[0] as file:
         history = [json.loads(line) for line in file]
-    states = [line["state"] for line in history if line["sample"] == "train/000000"]
-    assert states == ["pending", "running", "running", "done"]  # begun twice, there once
-    assert sorted(line["sample"] for line in history if line["state"] == "done") == sorted(
-        f"{split}/{index:06d}" for split, count in COUNTS.items() for index in range(count)
-    )
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["dask", "plates.h5", "plates.h5.seconds.json"]
+    killed = next(line["sample"] for line in history if line.get("where", "").endswith(f" {solver[0]}"))
+    for name in ("train/000000", "train/000001", "test/000000"):
+        begun = ["running"] * (2 if name == killed else 1)
+        assert [line["state"] for line in history if line["sample"] == name] == ["pending", *begun, "done"]
+    assert (tmp_path / "resumed").exists()  # the other worker sees the folder and went on from the last frame
+    assert not folder.exists()
     generate("deforming_plate", tmp_path / "here.h5", COUNTS, **SETTINGS)
     assert out.read_bytes() == (tmp_path / "here.h5").read_bytes()
 

@@ -202,7 +202,7 @@ def test_two_runs_on_one_file_exclude_each_other(tmp_path):
         ({"counts": {"train": 0}}, "not all 0"),
         ({"seed": -1}, "seed is -1; must be at least 0"),
         ({"nodes": 20}, "nodes is 20; must be at least 80"),
-        ({"frames": 1}, "frames is 1; must be at least 2"),
+        ({"frames": 2}, "frames is 2; must be at least 3"),
         ({"workers": 0}, "workers is 0; must be at least 1"),
         ({"workers": 2, "scheduler": "tcp://localhost:1"}, "give one of them"),
         ({"solver": "abaqus"}, "no solver 'abaqus'; use one of own, calculix"),
@@ -259,7 +259,7 @@ def test_the_solver_and_its_workers_need_no_torch():
     script = (
         "import sys, ast_sim.simulate.worker, ast_sim.simulate.generate;"
         "from ast_sim.simulate.samples import Recipe, make_sample;"
-        "make_sample(Recipe('deforming_plate', 0, 80, 2), 'train', 0);"
+        "make_sample(Recipe('deforming_plate', 0, 80, 3), 'train', 0);"
         "print('torch' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)

@@ -1,13 +1,11 @@
 """Kill -9 of the generator at chosen moments, then the same command again: the same bytes as without the kill."""
 
-import os
-import pathlib
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
+from processes import environment, is_running, paused_process, wait_for
 
 from ast_sim.simulate.generate import generate
 
@@ -17,7 +15,6 @@ SCRIPT = (
     "from ast_sim.simulate.generate import generate;"
     f"generate('deforming_plate', 'plates.h5', {COUNTS!r}, workers=1, **{SETTINGS!r})"
 )
-HERE = pathlib.Path(__file__).parent
 
 
 @pytest.fixture(scope="module")
@@ -28,32 +25,15 @@ def undisturbed(tmp_path_factory) -> bytes:
 
 
 def generator(folder, pause="") -> subprocess.Popen:
-    """A process that generates in the folder and stops at the moment `pause`, see sitecustomize.py."""
-    path = os.pathsep.join([str(HERE), str(HERE.parent.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
-    environment = {"AST_SIM_TEST_PAUSE": pause, "AST_SIM_TEST_MARK": str(folder / "mark"), "PYTHONPATH": path}
-    return subprocess.Popen([sys.executable, "-c", SCRIPT], cwd=folder, env={**os.environ, **environment})
-
-
-def wait_for(condition, what: str) -> None:
-    deadline = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < deadline, what
-        time.sleep(0.01)
-
-
-def is_running(process: int) -> bool:
-    try:
-        return pathlib.Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
+    """A process that generates in the folder and stops at the moment `pause`."""
+    return subprocess.Popen([sys.executable, "-c", SCRIPT], cwd=folder, env=environment(pause, folder / "mark"))
 
 
 @pytest.mark.parametrize("moment", ["drawing", "solving", "stored", "merging", "merged", "removing"])
 def test_a_killed_run_goes_on_to_the_same_bytes(undisturbed, tmp_path, moment):
     out, folder, mark = tmp_path / "plates.h5", tmp_path / "plates.h5.parts", tmp_path / "mark"
     with generator(tmp_path, moment) as process:
-        wait_for(lambda: mark.exists() and mark.read_text(), f"the generator never came to {moment!r}")
-        paused = int(mark.read_text())
+        paused = paused_process(mark)
         process.kill()
     assert process.returncode == -signal.SIGKILL
     wait_for(lambda: not is_running(paused), "a worker outlived the generator")
