@@ -30,7 +30,7 @@ class Family:
 
 FAMILIES = {
     "deforming_plate": Family("clamped plates that a rigid obstacle presses in and lets go", ("frames", "solver")),
-    "sphere_simple": Family("a cloth and a sphere that moves into it, with inertia and self-contact"),
+    "sphere_simple": Family("a hanging cloth and a sphere that moves through it, with inertia"),
     "abcd": Family("two CAD-like parts squeezed together, 4,000 nodes", ("parts", "solver"), ("gmsh", "meshio")),
     "abcd_xl": Family("the same with 100,000 nodes: hours a scene", ("parts", "solver"), ("gmsh", "meshio")),
 }

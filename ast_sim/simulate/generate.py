@@ -100,23 +100,37 @@ def generate(
         check_parts(recipe)
     samples = [(split, index) for split in SPLITS for index in range(counts[split])]
     with _locked(folder, settings):
-        _make(samples, folder, recipe, workers, scheduler, progress)
+        _make(samples, folder, recipe, workers, scheduler, progress, _notes(settings))
         info = replace(module.INFO, generator={**settings, "counts": counts})
         truncated = _merge(out, folder, samples, info)
         _remove(folder)
     return Generated(out, counts, truncated)
 
 
+def _notes(settings: dict[str, Any]) -> list[str]:
+    """What a user should know before hours are spent."""
+    if settings.get("mesher") == "structured":
+        line = 'pip install "ast_sim[cad]"'
+        return [f"gmsh is not installed: parts are blocks, cylinders and plates; for CAD-like ones {line}"]
+    return []
+
+
 def _make(
-    samples: list[Sample], folder: Path, recipe: Recipe, workers: int, scheduler: str | None, progress: bool
+    samples: list[Sample],
+    folder: Path,
+    recipe: Recipe,
+    workers: int,
+    scheduler: str | None,
+    progress: bool,
+    notes: list[str],
 ) -> None:
     """Make the samples that are not in the folder."""
     present = {sample for sample in samples if _is_readable(sample_path(folder, *sample))}
     missing = [sample for sample in samples if sample not in present]
     manifest = Manifest(folder, samples, present)
     with contextlib.closing(manifest), Progress(len(samples), len(present), "scenes", progress) as bar:
-        for name, reason in manifest.failures.items():
-            bar.note(f"{name} failed before: {reason}")
+        for note in (*notes, *(f"{name} failed before: {why}" for name, why in manifest.failures.items())):
+            bar.note(note)
         watch = Watch(manifest, bar)
         if missing and scheduler is None:
             pool.run_all(missing, folder, recipe, workers, watch)

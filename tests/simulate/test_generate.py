@@ -236,6 +236,13 @@ def test_parts_of_the_user_make_scenes_that_say_which_parts_they_are_of(tmp_path
     assert not (tmp_path / "b.h5.parts").exists()
 
 
+def test_parts_without_gmsh_are_announced(monkeypatch):
+    monkeypatch.setattr("ast_sim.simulate.cad.gmsh_version", lambda: None)
+    (note,) = generate_module._notes(recorded(Recipe("abcd", 0, 200)))
+    assert note.startswith("gmsh is not installed") and 'pip install "ast_sim[cad]"' in note
+    assert generate_module._notes(recorded(RECIPE)) == []
+
+
 def test_a_missing_ipctk_is_named_before_anything_starts(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ipctk", None)
     with pytest.raises(MissingExtra, match=r'pip install "ast_sim\[simulate\]"'):
