@@ -67,19 +67,19 @@ function histogramCard(found, splits) {
     })),
     chartLayout(nice.name ? `${title} (${nice.name})` : title, counted === "frames" ? "Frames" : "Samples", {
       barmode: "stack", hovermode: "closest",
-      xaxis: { range: [scaled(low - shift), scaled(high - shift)], ...tailTicks(found, scaled) }, yaxis: { tickformat: ",d", dtick: tallest <= 5 ? 1 : null },
+      xaxis: { range: [scaled(low - shift), scaled(high - shift)], ...tailTicks(found, scaled, read) }, yaxis: { tickformat: ",d", dtick: tallest <= 5 ? 1 : null },
     }),
   ];
   return { card, plot, make };
 }
 
 // Where the last bin holds everything above, its tick says so.
-function tailTicks({ open, edges }, scaled) {
+function tailTicks({ open, edges }, scaled, read) {
   if (!open) return {};
   const last = edges.length - 2;
-  const every = Math.max(1, Math.round(last / 5));
+  const every = Math.max(1, Math.ceil(last / 4));
   const places = edges.slice(0, last).filter((_, bin) => bin % every === 0 && bin <= last - every / 2);
-  return { tickvals: [...places, edges[last]].map(scaled), ticktext: [...places.map((edge) => digits(scaled(edge))), `≥ ${digits(scaled(edges[last]))}`] };
+  return { tickangle: 0, tickvals: [...places, edges[last]].map(scaled), ticktext: [...places.map(read), `≥ ${read(edges[last])}`] };
 }
 
 function showHistograms({ histograms, splits, samples }) {
