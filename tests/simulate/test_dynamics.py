@@ -157,7 +157,10 @@ def test_the_sphere_stands_where_it_is_told_and_carries_the_cloth():
 
 
 def on_slope(slope: float, friction: float, frames: int) -> ClothCase:
-    """A sheet on a plane, gravity leaning by the angle whose tangent is `slope`; it starts about where the barrier carries it."""
+    """A sheet on a plane, gravity leaning by the angle whose tangent is `slope`.
+
+    It starts about where the barrier carries it.
+    """
     angle = np.arctan(slope)
     flat = case(frames, gravity=tuple(9.81 * np.array([np.sin(angle), 0, -np.cos(angle)])))
     corners_ = np.array([[-2, -2, -0.0185], [4, -2, -0.0185], [4, 2, -0.0185], [-2, 2, -0.0185]], np.float32)
