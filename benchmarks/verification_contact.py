@@ -1,0 +1,289 @@
+"""Verification of contact: a patch test across surfaces that do not match, balances and refinement of real cases."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ast_sim.data.scene import NodeType, Scene
+from ast_sim.simulate import mesh
+from ast_sim.simulate.case import SolidCase
+from ast_sim.simulate.contact import Contact, ContactSettings
+from ast_sim.simulate.elasticity import Elasticity
+from ast_sim.simulate.material import NeoHookean
+from ast_sim.simulate.solver import SolverSettings
+from ast_sim.simulate.trajectory import quasi_static
+from benchmarks.verification_bodies import Rollers, box, cauchy, newton, nodal_areas, triangles
+from benchmarks.verification_problem import (
+    Curve,
+    Outcome,
+    Picture,
+    Problem,
+    Row,
+    at_most,
+    more_than,
+    observed_order,
+    relative,
+)
+
+MATERIAL = NeoHookean(young=1e6, poisson=0.3)
+
+
+def stacked_blocks(cells: tuple[int, int], dhat: float, shortening: float = 0.2) -> list[Row]:
+    """Rows of two blocks 1 x 1 x 0.5 pressed on each other, with so many cells along a side, in uniaxial strain."""
+    size, gap = (1.0, 1.0, 0.5), 2 * dhat
+    (lower, lower_elements), (upper, upper_elements) = (
+        box(size, (n, n, max(2, n // 2)), jitter=0.25, seed=n) for n in cells
+    )
+    rest = np.concatenate([lower, upper + [0, 0, size[2] + gap]])
+    elements = np.concatenate([lower_elements, upper_elements + len(lower)])
+    body = np.repeat([0, 1], [len(lower), len(upper)])
+    sides = np.zeros(rest.shape, bool)
+    sides[:, :2] = (rest[:, :2] < 1e-9) | (rest[:, :2] > 1 - 1e-9)
+    bottom, top = rest[:, 2] < 1e-9, rest[:, 2] > 2 * size[2] + gap - 1e-9
+    elasticity = Elasticity(rest, elements, MATERIAL)
+    potential = Rollers(elasticity, sides, rest, MATERIAL.young / max(cells))
+    faces = triangles(rest, elements)
+    contact = Contact(rest, faces, body, ContactSettings(dhat, MATERIAL.young))
+    solver = newton(potential, rest, bottom | top, contact, tolerance=1e-8)
+    for share in (0.25, 0.5, 0.75, 1.0):
+        solver.step(rest - np.where(top, share * shortening, 0)[:, None] * [0, 0, 1])
+    position, forces = potential.seen(solver.position), solver.reactions()[:, 2]
+
+    below = np.abs(rest[:, 2] - size[2]) < 1e-9
+    above = np.abs(rest[:, 2] - size[2] - gap) < 1e-9
+    closed = position[above, 2].mean() - position[below, 2].mean()
+    stretch = 2 * size[2] - shortening + gap - closed
+    mu, lam = MATERIAL.mu, MATERIAL.lam
+    pressure = -(mu + lam / 2) * (stretch**2 - 1) / stretch
+    lateral = -lam / 2 * (stretch**2 - 1) / stretch
+    stress = cauchy(elasticity, position)
+    contact_force = -solver.state.contact.gradient()
+    nodal = np.abs(contact_force[:, 2]) / np.where(below | above, nodal_areas(rest, faces, below | above), np.inf)
+    inside = (below | above) & ~sides.any(axis=1)
+    least = float(contact.gap(solver.position))
+    # Where the barrier's nodal weights differ from the areas of the nodes, their gaps differ, by less than dhat in
+    # all. A surface uneven by dhat over one cell h has the strain dhat / h: of the pressure that is M dhat / (h p).
+    modulus = lam + 2 * mu
+    uneven = modulus * dhat * max(cells) / pressure
+    source = f"surface uneven by dhat over a cell: M dhat / (h p) = {uneven:.1e}"
+    name = f"{cells[0]} on {cells[1]} cells, dhat = {dhat:g}"
+    total = np.abs(contact_force[body == 1, 2].sum())
+    return [
+        relative(
+            f"{name}: pressure on the top / that of uniaxial strain",
+            pressure,
+            abs(forces[top].sum()),
+            modulus * dhat / (2 * size[2] * pressure),
+            "the mean gap is known to a share of dhat: M dhat / (height p)",
+            "Pa",
+        ),
+        at_most(
+            f"{name}: sigma_zz, largest deviation of an element / p",
+            np.abs(stress[2, 2] / -pressure - 1).max(),
+            uneven,
+            source,
+        ),
+        at_most(
+            f"{name}: sigma_xx, largest deviation of an element / p",
+            np.abs(stress[0, 0] + lateral).max() / pressure,
+            uneven,
+            source,
+        ),
+        at_most(
+            f"{name}: contact force / nodal area, largest deviation inside / p",
+            np.abs(nodal[inside] / pressure - 1).max(),
+            uneven,
+            source,
+        ),
+        at_most(
+            f"{name}: contact forces on the two blocks, sum / force",
+            np.linalg.norm(contact_force.sum(axis=0)) / total,
+            1e-12,
+            "rounding of sums over a thousand pairs",
+        ),
+        relative(
+            f"{name}: force on the bottom / force on the top",
+            1.0,
+            abs(forces[bottom].sum() / forces[top].sum()),
+            1e-6,
+            "stop test: residuals 1e-8 of an element's force, over 1e2 nodes",
+        ),
+        more_than(f"{name}: smallest gap / dhat", least / dhat, 0.0, "surfaces never touch"),
+    ]
+
+
+def contact_patch() -> Outcome:
+    """Meshes that do not match, and dhat halved."""
+    return Outcome(
+        [row for dhat in (2e-3, 1e-3, 5e-4) for row in stacked_blocks((4, 3), dhat)],
+        remarks=[
+            "The barrier transmits a uniform pressure across meshes that do not match: what deviates falls with dhat."
+        ],
+    )
+
+
+def crush_case(friction: float, frames: int) -> SolidCase:
+    """A soft ball squeezed between a stiffer block on the ground and a plate, then released.
+
+    The ball is free; block and plate are prescribed at their outer faces. The plate moves down and a little sideways.
+    """
+    ball, ball_elements = mesh.ball(0.1, 6)
+    block, block_elements = box((0.4, 0.4, 0.1), (6, 6, 2), jitter=0.2)
+    dhat = 1e-3
+    parts = [
+        (block - [0.2, 0.2, 0.1], block_elements, 2e6),
+        (ball @ _rotation() + [0.01, 0.02, 0.0], ball_elements, 1e6),
+        (block * [1, 1, 0.5] - [0.2, 0.2, 0.0], block_elements, 2e6),
+    ]
+    height, positions = 0.0, []
+    for number, (position, _, _) in enumerate(parts):
+        lift = 0.0 if number == 0 else height + 1.5 * dhat - position[:, 2].min()
+        positions.append(position + [0, 0, lift])
+        height = positions[-1][:, 2].max()
+    starts = np.cumsum([0, *(len(position) for position in positions)])
+    rest = np.concatenate(positions).astype(np.float32)
+    body = np.repeat(np.arange(3), np.diff(starts)).astype(np.int32)
+    node_type = np.full(len(rest), NodeType.NORMAL, np.uint8)
+    low, high = rest[:, 2] < -0.1 + 1e-6, rest[:, 2] > height - 1e-6
+    node_type[low | high] = NodeType.HANDLE
+    scene = Scene(
+        rest_position=rest,
+        elements=np.concatenate([part[1] + start for part, start in zip(parts, starts, strict=False)]).astype(np.int32),
+        node_type=node_type,
+        body=body,
+    )
+    young = np.concatenate([np.full(len(elements), modulus) for _, elements, modulus in parts])
+    way = np.concatenate([np.linspace(0, 1, frames + 1), np.linspace(1, 0, frames + 1)[1:]])
+    targets = np.repeat(rest[None].astype(float), len(way), axis=0)
+    targets[:, high] += way[:, None, None] * np.array([0.01, 0.0, -0.06])
+    settings = ContactSettings(dhat, 1e6, friction)
+    return SolidCase(scene, targets, NeoHookean(young, 0.4), settings, "element")
+
+
+def _rotation() -> np.ndarray:
+    rotation, _ = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))
+    return rotation * np.sign(np.linalg.det(rotation))
+
+
+def balances(frames: int = 12) -> Outcome:
+    """What must balance in every frame, with and without friction."""
+    rows, curves = [], []
+    for friction in (0.0, 0.3):
+        case = crush_case(friction, frames)
+        record = quasi_static(case).attributes
+        name = f"friction {friction:g}"
+        prescribed = int(case.scene.prescribed.sum())
+        stop = SolverSettings().force_tolerance * (case.scene.num_nodes - prescribed) / prescribed
+        rows += [
+            more_than(f"{name}: frames solved", len(record["gap"]), 2 * frames, "all of them"),
+            at_most(
+                f"{name}: sum of all reactions / sum of their magnitudes, worst frame",
+                record["max_imbalance"],
+                stop,
+                f"stop test: residuals of 1e-4 of an element's force at each free node: {stop:.0e}",
+            ),
+            at_most(
+                f"{name}: work - change of stored energy - friction, over the largest energy, worst frame",
+                record["work_balance"],
+                1 / frames**2,
+                f"trapezoidal rule over {frames} frames of a force like d^m: m (m + 1) / 12 / {frames}^2, m <= 3",
+            ),
+            at_most(f"{name}: largest residual / stop test", record["max_residual"], 1.0, "the stop test"),
+            more_than(f"{name}: smallest det F", record["min_jacobian"], 0.0, "no element is inverted"),
+            more_than(f"{name}: smallest gap / dhat", record["min_gap"] / case.contact.dhat, 0.0, "surfaces are apart"),
+        ]
+        frame = np.arange(len(record["work"]))
+        stored = np.add(record["elastic_energy"], record["contact_energy"]) + np.array(record["dissipation"])
+        curves += [
+            Curve(f"work, friction {friction:g}", frame, np.array(record["work"]), "o"),
+            Curve(f"stored + dissipated, friction {friction:g}", frame, stored, "-"),
+        ]
+    picture = Picture("A ball squeezed and released: work and energy", "frame", "joule", curves)
+    return Outcome(rows, {"energy": picture})
+
+
+def indentation_force(cells: int, dhat: float) -> float:
+    """Force in newton that presses a rigid ball 0.015 deep into an elastic block, `cells` along its sides."""
+    size, radius, depth = (0.4, 0.4, 0.2), 0.1, 0.015
+    block, elements = box(size, (cells, cells, cells // 2))
+    ball, ball_elements = mesh.ball(radius, 2 * cells)
+    ball = ball + [0.2, 0.2, size[2] + radius + 2 * dhat]
+    rest = np.concatenate([block, ball])
+    body = np.repeat([0, 1], [len(block), len(ball)])
+    faces = np.concatenate([triangles(block, elements), triangles(ball, ball_elements) + len(block)])
+    contact = Contact(rest, faces, body, ContactSettings(dhat, MATERIAL.young))
+    bottom = np.zeros(len(rest), bool)
+    bottom[: len(block)] = block[:, 2] == 0
+    solver = newton(Elasticity(rest, elements, MATERIAL), rest, bottom | (body == 1), contact, 1e-6)
+    for share in (0.25, 0.5, 0.75, 1.0):
+        solver.step(rest - np.where(body == 1, share * (depth + 2 * dhat), 0)[:, None] * [0, 0, 1])
+    return float(solver.state.contact.gradient()[body == 0, 2].sum())
+
+
+def refinement(levels: int = 3) -> Outcome:
+    """The force under h/2, with dhat fixed, and under dhat/2, with h fixed."""
+    cells, distances = [8 * 2**k for k in range(levels)], [4e-3 / 2**k for k in range(levels + 1)]
+    by_size = [indentation_force(n, distances[1]) for n in cells]
+    by_distance = [indentation_force(cells[0], dhat) for dhat in distances]
+    order_h, limit_h = observed_order([1 / n for n in cells], by_size)
+    order_d, limit_d = observed_order(distances, by_distance)
+    rows = [
+        more_than(
+            "h / 2: observed order", order_h, 0.75, "h^2 inside, h at the edge of the contact that no mesh line follows"
+        ),
+        relative(
+            "dhat / 2: observed order", 1.0, order_d, 0.25, "surfaces stand about dhat apart: the error is linear in it"
+        ),
+    ]
+    picture = Picture(
+        "Force on a ball pressed into a block",
+        "h or dhat, over the coarsest",
+        "force / limit",
+        [
+            Curve(f"h, dhat = {distances[1]:g} m", cells[0] / np.array(cells), np.array(by_size) / limit_h, "o-"),
+            Curve(
+                f"dhat, h = {0.4 / cells[0]:g} m",
+                np.array(distances) / distances[0],
+                np.array(by_distance) / limit_d,
+                "s-",
+            ),
+        ],
+    )
+    remarks = [
+        "Force with "
+        + ", ".join(f"{n} cells {force:.1f} N" for n, force in zip(cells, by_size, strict=True))
+        + f" (limit {limit_h:.1f}); with "
+        + ", ".join(f"dhat {1e3 * d:g} mm {force:.1f} N" for d, force in zip(distances, by_distance, strict=True))
+        + f" (limit {limit_d:.1f})."
+    ]
+    return Outcome(rows, {"force": picture}, remarks)
+
+
+PROBLEMS = [
+    Problem(
+        "contact_patch",
+        "Contact patch test",
+        "Two blocks with meshes that do not match, sides on rollers, pressed on each other to 80 % of their height:"
+        " uniaxial strain. With the stretch l (from the travel and the gap that is left):"
+        " sigma_zz = (mu + lambda/2) (l^2 - 1) / l, sigma_xx = lambda/2 (l^2 - 1) / l in both blocks, and a uniform"
+        " contact pressure.",
+        contact_patch,
+        quick=contact_patch,
+    ),
+    Problem(
+        "balances",
+        "Balances of a contact case",
+        "A soft ball squeezed between two stiffer blocks by a third of its height and released again, solved as a"
+        " sample of a dataset is: in every frame reactions sum to zero, work equals stored energy and friction loss,"
+        " no element is inverted, no surfaces touch.",
+        balances,
+        quick=balances,
+    ),
+    Problem(
+        "refinement",
+        "Refinement in h and dhat",
+        "A rigid ball pressed into a block: the force under refinement of the mesh and of the contact distance.",
+        refinement,
+        quick=None,
+    ),
+]
