@@ -127,8 +127,8 @@ def uniaxial() -> Outcome:
                 f"{name}: largest deviation of an element / E", spread / MATERIAL.young, STOP_TOLERANCE, STOP_SOURCE
             ),
         ]
-    l = np.linspace(0.65, 2.05, 100)
-    s, sigma = uniaxial_closed_form(l)
+    line = np.linspace(0.65, 2.05, 100)
+    s, sigma = uniaxial_closed_form(line)
     points.sort()
     x = np.array([stretch for stretch, _ in points])
     found = np.array([state for _, state in points])
@@ -137,8 +137,8 @@ def uniaxial() -> Outcome:
         "stretch",
         "stress / E",
         [
-            Curve("Cauchy, closed form", l, sigma / MATERIAL.young, "k-"),
-            Curve("nominal, closed form", l, sigma * s / MATERIAL.young, "k--"),
+            Curve("Cauchy, closed form", line, sigma / MATERIAL.young, "k-"),
+            Curve("nominal, closed form", line, sigma * s / MATERIAL.young, "k--"),
             Curve("Cauchy, computed", x, found[:, 1] / MATERIAL.young, "o"),
             Curve("nominal, computed", x, found[:, 3] / MATERIAL.young, "s"),
         ],
