@@ -1,8 +1,8 @@
 """Solves problems with known answers and writes docs/verification.md: expected, computed, error, tolerance.
 
 `python -m benchmarks.verification` solves all of them, `python -m benchmarks.verification hertz elastica` some, and
-keeps what is known of the others. The figures lie in benchmarks/results/verification.json, the pictures in docs/verification.
-The command fails if a row is not within its tolerance.
+keeps what is known of the others. Figures are kept in benchmarks/results/verification.json, pictures in
+docs/verification. The command fails if a row is not within its tolerance.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ from benchmarks import (
     verification_bending,
     verification_contact,
     verification_derivatives,
+    verification_dynamics,
     verification_elasticity,
+    verification_friction,
     verification_indentation,
 )
 from benchmarks.verification_pictures import draw
@@ -35,6 +37,8 @@ THEMES = {
     "Elasticity": verification_elasticity.PROBLEMS,
     "Bending": verification_bending.PROBLEMS,
     "Contact": verification_contact.PROBLEMS + verification_indentation.PROBLEMS,
+    "Friction": verification_friction.PROBLEMS,
+    "Dynamics": verification_dynamics.PROBLEMS,
 }
 PROBLEMS: dict[str, Problem] = {problem.name: problem for theme in THEMES.values() for problem in theme}
 

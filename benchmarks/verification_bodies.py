@@ -162,3 +162,14 @@ def nodal_areas(position: np.ndarray, faces: np.ndarray, chosen: np.ndarray) -> 
     corners = position[faces]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     return np.bincount(faces.ravel(), np.repeat(areas / 3, 3), minlength=len(position))
+
+
+def sheet(extent: float, cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """Flat square [0, extent]^2 at z = 0 whose triangles face down: nodes [M,3], triangles [F,3]."""
+    line = np.linspace(0, extent, cells + 1)
+    x, y = np.meshgrid(line, line, indexing="ij")
+    position = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    corner = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
+    right, up = corner + cells + 1, corner + 1
+    faces = np.concatenate([np.stack([corner, up, right], 1), np.stack([right, up, up + cells + 1], 1)])
+    return position, faces
