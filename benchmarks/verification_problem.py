@@ -54,8 +54,9 @@ def at_most(quantity: str, computed: float, tolerance: float, source: str, unit:
 
 
 def more_than(quantity: str, computed: float, least: float, source: str, unit: str = "") -> Row:
-    """A row whose figure must be above `least`; its error is by how much it falls short."""
-    error = max(0.0, least - float(computed)) if computed != least else np.inf
+    """A row whose figure must be above `least`; its error is by how much it falls short, infinite at `least` itself."""
+    short = np.inf if computed == least else least - float(computed)
+    error = 0.0 if computed > least else short
     return Row(f"{quantity} (> {least:g})", None, float(computed), float(error), 0.0, source, unit)
 
 
