@@ -18,6 +18,7 @@ from time import perf_counter
 from ast_sim.evaluate import provenance
 from benchmarks import (
     verification_bending,
+    verification_cloth,
     verification_contact,
     verification_derivatives,
     verification_dynamics,
@@ -38,7 +39,7 @@ THEMES = {
     "Bending": verification_bending.PROBLEMS,
     "Contact": verification_contact.PROBLEMS + verification_indentation.PROBLEMS,
     "Friction": verification_friction.PROBLEMS,
-    "Dynamics": verification_dynamics.PROBLEMS,
+    "Dynamics": verification_dynamics.PROBLEMS + verification_cloth.PROBLEMS,
 }
 PROBLEMS: dict[str, Problem] = {problem.name: problem for theme in THEMES.values() for problem in theme}
 
