@@ -26,7 +26,6 @@ from benchmarks import (
     verification_friction,
     verification_indentation,
 )
-from benchmarks.verification_pictures import draw
 from benchmarks.verification_problem import Outcome, Problem
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -131,6 +130,8 @@ def document(found: dict[str, dict]) -> str:
 
 
 def main() -> None:
+    from benchmarks.verification_pictures import draw  # needs matplotlib, which the tests of the problems do not
+
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("problems", nargs="*", choices=[[], *PROBLEMS], help=f"only these: {', '.join(PROBLEMS)}")
     names = parser.parse_args().problems or list(PROBLEMS)
