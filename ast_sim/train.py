@@ -55,6 +55,7 @@ def configure(data: Path, preset: str, assignments: Sequence[str] = ()) -> RunCo
             f"model.integration={dataset.info.integration}",
             f"model.stress={dataset.info.stress_location}",
             f"model.material_width={dataset.material_width}",
+            *(f"model.{name}={value}" for name, value in chosen.inputs(dataset.info, dataset.material_width).items()),
         ]
     return override(RunConfig(chosen.model, TrainConfig(**chosen.train), str(data)), [*kind, *assignments])
 

@@ -82,10 +82,27 @@ class ModelConfig:
 
 @dataclass(frozen=True)
 class Preset:
-    """A model with the training settings that belong to it (fields of TrainConfig)."""
+    """A model with the training settings that belong to it (fields of TrainConfig).
+
+    Attributes:
+        model: as in the paper, or for any dataset.
+        train: settings of the training.
+        adapts: whether the inputs follow the dataset: those of the paper's presets are the paper's.
+    """
 
     model: ModelConfig
     train: dict
+    adapts: bool = False
+
+    def inputs(self, info: DatasetInfo, material_width: int) -> dict[str, list[str]]:
+        """Node and element inputs that a dataset calls for: velocities if it moves in time, materials if they differ,
+        element nodes if there is a stress on elements. Empty if the preset does not adapt."""
+        if not self.adapts:
+            return {}
+        velocity = ["velocity"] if info.integration == "dynamic" else []
+        material = ["material"] if material_width else []
+        elements = ["displacement", *material] if info.stress_location == "element" else []
+        return {"node_inputs": ["displacement", *velocity, *material], "element_inputs": elements}
 
 
 _PAPER = {"batch_size": 48, "peak_rate": 1e-4 * math.sqrt(48 / 2), "noise": 0.003, "stress_weight": 0.01}
@@ -97,6 +114,7 @@ PRESETS = {
             dropout=0.0, L_cell=None, element_inputs=(), edge_strain=True,
         ),
         {"batch_size": 4, "peak_rate": 5e-4, "stress_weight": 0.1},
+        adapts=True,
     ),
     "deforming_plate": Preset(ModelConfig(), _PAPER),
     "sphere_simple": Preset(
