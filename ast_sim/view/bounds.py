@@ -56,7 +56,7 @@ def bounds(length_unit: str) -> list[Bound]:
         ),
         Bound(
             "Work balance",
-            "work done against energy stored, relative",
+            "work against stored energy, relative; a snap loses some",
             "work_balance",
             "work_balance",
             lambda values: max(values, key=abs),

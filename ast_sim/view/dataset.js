@@ -112,7 +112,7 @@ function showYield({ complete, count, splits, reasons, stopped, left_out: leftOu
   const texts = (rows) => rows.map(([name, ...rest]) => element("tr", {}, element("th", { scope: "row" }, name), ...rest.map((text) => element("td", {}, String(text)))));
   byId("yield-tables").append(table(["Reason to stop", "Samples"], texts(reasons), { className: "words" }));
   byId("yield-tables").append(element("details", {},
-    element("summary", {}, `The ${stopped.length} truncated samples${leftOut ? ` (${leftOut} more are left out)` : ""}`),
+    element("summary", {}, `${stopped.length === 1 ? "The truncated sample" : `The ${stopped.length} truncated samples`}${leftOut ? ` (${leftOut} more are left out)` : ""}`),
     table(["Sample", "Frames", "Stopped by"], texts(stopped), { className: "dense words" })));
 }
 
@@ -120,7 +120,7 @@ function showChecks(checks) {
   byId("bounds").hidden = !checks.length;
   const rows = checks.map(({ title, what, bound, range, unit, worst, recorded, failed, passed }) => {
     const nice = niceUnit(range ? Math.max(...range.map(Math.abs)) : 0, unit);
-    const read = (value) => digits(value / nice.scale);
+    const read = (value) => (!unit && Number.isInteger(value) ? String(value) : digits(value / nice.scale));
     const span = !range ? "–" : range[0] === range[1] ? read(range[0]) : `${read(range[0])} to ${read(range[1])}`;
     const [mark, words] = passed === null ? ["none", "not recorded"] : passed ? ["pass", "✓ pass"] : ["fail", `✗ fail: ${failed}`];
     return element("tr", {}, element("th", { scope: "row" }, title, " ", element("small", {}, what)),
