@@ -89,11 +89,10 @@ function showHistograms({ histograms, splits, samples }) {
   const partly = histograms.filter(({ recorded }) => recorded && recorded < samples.count)
     .map(({ title, recorded }) => `${title} for ${recorded} of ${samples.count}`);
   byId("histograms-note").textContent = partly.length ? `Recorded: ${[...new Set(partly)].join(", ")}.` : "";
-  for (const found of histograms) {
-    const { card, plot, make } = histogramCard(found, splits);
-    byId("histograms-charts").append(card);
-    if (plot) chart(plot, make);
-  }
+  // All cards stand before the first is drawn: a chart takes the width that its card has then.
+  const cards = histograms.map((found) => histogramCard(found, splits));
+  byId("histograms-charts").append(...cards.map(({ card }) => card));
+  for (const { plot, make } of cards) if (plot) chart(plot, make);
 }
 
 function showYield({ complete, count, splits, reasons, stopped, left_out: leftOut }) {

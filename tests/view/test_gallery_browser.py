@@ -145,6 +145,9 @@ def test_bars_add_up_and_axes_have_units(browser, page):
         ["Nodes", "Samples"],
         ["Elements", "Samples"],
     ]
+    width = "part => part.getBoundingClientRect().width"
+    fits = f"plot => ({width})(plot.querySelector('.main-svg')) <= ({width})(plot) + 1"
+    assert browser.evaluate(f"{charts}.every({fits})")  # none is drawn over its neighbour
     total = "trace => trace.y.reduce((sum, count) => sum + count, 0)"
     sums = browser.evaluate(f"{charts}.map(plot => plot.data.map({total}))")
     assert sums == [[2, 1], [2, 1], [2, 1], [20, 10], [2, 1], [2, 1]]
