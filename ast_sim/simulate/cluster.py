@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import logging
 import os
 import platform
 import queue
@@ -71,17 +72,32 @@ def run_all(samples: list[Sample], parts: Path, recipe: Recipe, scheduler: str, 
 @contextlib.contextmanager
 def _connected(scheduler: str) -> Iterator[Any]:
     (distributed,) = require("cluster", "distributed")
+    with _silent("distributed"):
+        try:
+            client = distributed.Client(scheduler, timeout=SECONDS_TO_CONNECT, set_as_default=False, name="ast_sim")
+        except (OSError, ValueError, TypeError) as error:
+            raise SimulationError(
+                f"the scheduler at {scheduler} cannot be reached within {SECONDS_TO_CONNECT:g} s ({error}):"
+                " is `dask scheduler` running there, and does the address read like tcp://host:8786?"
+            ) from error
+        try:
+            yield client
+        finally:
+            client.close(timeout=SECONDS_TO_CONNECT)  # which also drops what was not finished
+
+
+@contextlib.contextmanager
+def _silent(library: str) -> Iterator[None]:
+    """Keep a library from logging tracebacks: what goes wrong is told in one line."""
+    names = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == library]
+    levels = {name: logging.getLogger(name).level for name in names}
+    for name in names:
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     try:
-        client = distributed.Client(scheduler, timeout=SECONDS_TO_CONNECT, set_as_default=False, name="ast_sim")
-    except (OSError, ValueError, TypeError) as error:
-        raise SimulationError(
-            f"the scheduler at {scheduler} cannot be reached within {SECONDS_TO_CONNECT:g} s ({error}):"
-            " is `dask scheduler` running there, and does the address read like tcp://host:8786?"
-        ) from error
-    try:
-        yield client
+        yield
     finally:
-        client.close(timeout=SECONDS_TO_CONNECT)  # which also drops what was not finished
+        for name, level in levels.items():
+            logging.getLogger(name).setLevel(level)
 
 
 def _hear(event: dict[str, Any], waiting: set[Sample], watch: Watch) -> None:

@@ -15,6 +15,7 @@ from processes import environment, is_running, paused_process, wait_for
 from ast_sim.errors import MissingExtra, SimulationError
 from ast_sim.simulate import cluster
 from ast_sim.simulate.generate import generate
+from ast_sim.simulate.progress import Progress
 from ast_sim.simulate.settings import recorded
 
 COUNTS = {"train": 2, "test": 1}
@@ -28,13 +29,19 @@ def start(program: str, *arguments: str, **stop) -> subprocess.Popen:
     return subprocess.Popen(command, env=variables, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
+def start_scheduler(folder) -> tuple[subprocess.Popen, str]:
+    """A scheduler without workers, and its address."""
+    file = folder / "scheduler.json"
+    process = start("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file))
+    wait_for(lambda: file.exists() and file.read_text().strip().endswith("}"), "the scheduler did not start")
+    return process, json.loads(file.read_text())["address"]
+
+
 @pytest.fixture(scope="module")
 def scheduler(tmp_path_factory):
     """Address of a scheduler without workers."""
-    file = tmp_path_factory.mktemp("scheduler") / "scheduler.json"
-    process = start("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file))
-    wait_for(lambda: file.exists() and file.read_text().strip().endswith("}"), "the scheduler did not start")
-    yield json.loads(file.read_text())["address"]
+    process, address = start_scheduler(tmp_path_factory.mktemp("scheduler"))
+    yield address
     process.kill()
     process.wait()
 
@@ -106,6 +113,23 @@ def test_solvers_end_when_the_generator_is_killed(scheduler, workers, tmp_path):
         process.kill()
     wait_for(lambda: not is_running(solver), "the solver goes on for nobody")
     assert all(process.poll() is None for process in workers)
+
+
+def test_a_scheduler_that_goes_away_is_one_clear_error(tmp_path, monkeypatch, capfd):
+    process, address = start_scheduler(tmp_path)
+    note = Progress.note
+
+    def kill_the_scheduler(bar, text):
+        if "has no workers yet: waiting for them" in text:  # the client is connected
+            process.kill()
+            process.wait()
+        note(bar, text)
+
+    monkeypatch.setattr(Progress, "note", kill_the_scheduler)
+    with pytest.raises(SimulationError, match=f"scheduler at {address} went away. The finished samples are kept in"):
+        generate("deforming_plate", tmp_path / "plates.h5", COUNTS, scheduler=address, **SETTINGS)
+    assert process.returncode == -signal.SIGKILL
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_a_worker_that_is_set_up_differently_is_refused(scheduler, workers, tmp_path, monkeypatch):
