@@ -115,14 +115,13 @@ class BackwardEuler(Newton):
         self._advance(target, self._time_step, 0)
 
     def _advance(self, target: np.ndarray, step: float, halvings: int) -> None:
-        position, velocity = self.position, self.velocity
+        position = self.position
         try:
             self._time_integrate(target, step)
-        except NotConverged as error:
+        except NotConverged as error:  # the velocity is still that at the start
             if halvings == self.settings.max_halvings:
                 raise NotConverged(f"{error}, also after {halvings} halvings of the time step") from error
             self.halvings += 1
-            self.velocity = velocity
             self.restart(position)
             self._advance((position + target) / 2, step / 2, halvings + 1)
             self._advance(target, step / 2, halvings + 1)

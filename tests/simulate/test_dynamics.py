@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ast_sim.data.scene import NodeType, Scene
+from ast_sim.errors import SimulationError
 from ast_sim.simulate import checkpoint as checkpoint_module
 from ast_sim.simulate.checkpoint import Checkpoint
 from ast_sim.simulate.cloth import ClothMaterial
@@ -216,6 +217,11 @@ def test_frames_before_one_that_does_not_converge_are_kept():
     assert attributes["status"] == "truncated" and 1 <= trajectory.num_frames < 25
     assert attributes["stopped_by"].startswith(f"frame {trajectory.num_frames}: no equilibrium after 3 Newton")
     assert len(attributes["gap"]) == trajectory.num_frames
+
+
+def test_a_scene_that_starts_with_surfaces_through_each_other_is_refused():
+    with pytest.raises(SimulationError, match="surfaces intersect"):
+        implicit_euler(case(3, ball=(0.2, 0.05)))
 
 
 class Killed(Exception):
