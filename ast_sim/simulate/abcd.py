@@ -20,7 +20,7 @@ from ast_sim.simulate.case import SolidCase
 from ast_sim.simulate.checkpoint import Checkpoint
 from ast_sim.simulate.contact import Contact, ContactSettings
 from ast_sim.simulate.material import NeoHookean
-from ast_sim.simulate.mesh_check import BadMesh, boundary
+from ast_sim.simulate.mesh_check import BadMesh
 from ast_sim.simulate.pairing import HALF_EXTENT, Pair, Unsuitable, put_together
 from ast_sim.simulate.part_source import PartSource, part_source
 from ast_sim.simulate.parts import Part
@@ -81,7 +81,7 @@ def solve(case: SolidCase, checkpoint: Checkpoint | None = None) -> Trajectory:
 
 def _check_walls(pair: Pair) -> None:
     """Raise Unsuitable where a surface comes so close to itself that contact would act at rest."""
-    contact = Contact(pair.position, boundary(pair.elements), pair.body, CONTACT)
+    contact = Contact(pair.position, pair.faces, pair.body, CONTACT)
     contact.collision_free_fraction(pair.position, pair.position)
     if not contact.at(pair.position).is_empty:
         raise Unsuitable(

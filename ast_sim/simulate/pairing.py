@@ -37,6 +37,7 @@ class Pair:
     Attributes:
         position: [N,3] float64, those of the lower part first.
         elements: [E,4].
+        faces: [F,3], the surfaces of both parts.
         body: [N] 0 lower, 1 upper.
         clamped: [N] bool, nodes of the lower part's lower end and the upper part's upper end.
         height: distance between the two ends without the gap between the parts.
@@ -46,6 +47,7 @@ class Pair:
 
     position: np.ndarray
     elements: np.ndarray
+    faces: np.ndarray
     body: np.ndarray
     clamped: np.ndarray
     height: float
@@ -68,10 +70,11 @@ def put_together(rng: np.random.Generator, lower: Part, upper: Part, gap: float)
     count = len(lower.position)
     elements = np.concatenate([lower.elements, upper.elements + count])
     body = np.repeat([0, 1], [count, len(upper.position)])
-    faces = boundary(elements)
+    low_faces, high_faces = boundary(lower.elements), boundary(upper.elements)
+    faces = np.concatenate([low_faces, high_faces + count])
     low, high = turned(rng, lower.position), turned(rng, upper.position)
-    low_clamp, high_clamp = _end_face(low, lower.elements, -1), _end_face(high, upper.elements, 1)
-    high, overlap = _place(rng, low, lower.elements, high, upper.elements)
+    low_clamp, high_clamp = _end_face(low, low_faces, -1), _end_face(high, high_faces, 1)
+    high, overlap = _place(rng, low, low_faces, high, high_faces)
     position = _lowered(np.concatenate([low, high]), faces, body)
     scale = 2 * HALF_EXTENT / np.ptp(position, axis=0).max()
     position = _spaced(position * scale, faces, body, gap)
@@ -80,7 +83,7 @@ def put_together(rng: np.random.Generator, lower: Part, upper: Part, gap: float)
     if min(clamped[:count].sum(), clamped[count:].sum()) < 3:
         raise Unsuitable("an end of a part has no three nodes to clamp")
     height = float(np.ptp(position[clamped, 2])) - gap
-    return Pair(position, elements, body, clamped, height, overlap, float(scale))
+    return Pair(position, elements, faces, body, clamped, height, overlap, float(scale))
 
 
 def turned(rng: np.random.Generator, position: np.ndarray) -> np.ndarray:
@@ -98,12 +101,11 @@ def turned(rng: np.random.Generator, position: np.ndarray) -> np.ndarray:
     return result
 
 
-def _end_face(position: np.ndarray, elements: np.ndarray, side: int) -> np.ndarray:
+def _end_face(position: np.ndarray, faces: np.ndarray, side: int) -> np.ndarray:
     """[N] bool: the nodes of the surface that faces down (side -1) or up (1) within a band at that end.
 
     The band is as thin as it can be with at least `LEAST_CLAMP` of the part's shadow in it.
     """
-    faces = boundary(elements)
     a, b, c = np.moveaxis(position[faces], 1, 0)
     normal = np.cross(b - a, c - a) / 2  # its length is the area
     shadow = np.maximum(normal[:, 2], 0).sum()
@@ -119,15 +121,15 @@ def _end_face(position: np.ndarray, elements: np.ndarray, side: int) -> np.ndarr
 
 
 def _place(
-    rng: np.random.Generator, low: np.ndarray, low_elements: np.ndarray, high: np.ndarray, high_elements: np.ndarray
+    rng: np.random.Generator, low: np.ndarray, low_faces: np.ndarray, high: np.ndarray, high_faces: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """The upper part moved above the lower one with enough overlap of their shadows, and that overlap."""
     extent = np.minimum(np.ptp(low[:, :2], axis=0), np.ptp(high[:, :2], axis=0))
     cell = max(np.ptp(low[:, :2]), np.ptp(high[:, :2])) / RASTER
-    low_shadow = shadow_cells(low[:, :2], boundary(low_elements), cell)
+    low_shadow = shadow_cells(low[:, :2], low_faces, cell)
     for _ in range(PLACEMENTS):
         moved = high + [*(rng.uniform(-FARTHEST, FARTHEST, 2) * extent), low[:, 2].max() + START]
-        high_shadow = shadow_cells(moved[:, :2], boundary(high_elements), cell)
+        high_shadow = shadow_cells(moved[:, :2], high_faces, cell)
         common = len(np.intersect1d(low_shadow, high_shadow, assume_unique=True))
         overlap = common / min(len(low_shadow), len(high_shadow))
         if overlap >= LEAST_OVERLAP:
