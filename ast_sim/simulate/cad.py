@@ -1,7 +1,8 @@
 """CAD-like solids by a seeded grammar, and CAD files, meshed by gmsh in a process of its own.
 
-gmsh crashes and hangs on bad geometry: every call goes to `cad_worker` with a time limit. The same request gives the
-same mesh. Legend: N nodes, E tetrahedra.
+gmsh crashes and hangs on bad geometry: every call goes to `cad_worker` with a limit to its processor time, which,
+unlike the time that passes, does not depend on what else the machine does. The same request gives the same mesh, or
+the same failure. Legend: N nodes, E tetrahedra.
 """
 
 from __future__ import annotations
@@ -25,14 +26,15 @@ from ast_sim.simulate.parts import Part, oriented
 
 SINGLE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 WORKER = [sys.executable, "-P", "-m", "ast_sim.simulate.cad_worker"]
-START_SECONDS = 60.0  # allowed for gmsh to start and for the geometry
-NODES_PER_SECOND = 200.0  # and for meshing, several times over
+START_SECONDS = 60  # of processor time, allowed for gmsh to start and for the geometry
+NODES_PER_SECOND = 200  # and for meshing; both ten times what is usual
+PATIENCE = 30  # how many times as long may pass: one that sleeps is stopped then
 
 Steps = list[dict[str, Any]]
 
 
 class MeshingFailed(SimulationError):
-    """gmsh refused a part, crashed on it or took too long; the text says which."""
+    """gmsh refused a part, crashed on it or took too long, and would again; the text says which."""
 
 
 @functools.cache
@@ -53,9 +55,7 @@ def gmsh_version() -> str | None:
         ) from error
 
 
-def mesh_parts(
-    requests: list[dict[str, Any]], names: list[str], nodes: int, seconds: float | None = None
-) -> list[Part]:
+def mesh_parts(requests: list[dict[str, Any]], names: list[str], nodes: int, seconds: int | None = None) -> list[Part]:
     """Mesh parts with one element size.
 
     Args:
@@ -63,12 +63,13 @@ def mesh_parts(
             a diagonal of one.
         names: of the parts.
         nodes: wanted number of nodes of all parts together, met within about a tenth.
-        seconds: time limit; one that suits the number of nodes if None.
+        seconds: limit to the processor time, whole; one that suits the number of nodes if None.
 
     Raises:
-        MeshingFailed: a part that cannot be meshed, a crash of gmsh or no answer in time.
+        MeshingFailed: a part that cannot be meshed, on which gmsh crashes or works too long.
+        SimulationError: gmsh was killed, or sleeps: another attempt may go well.
     """
-    answer = _ask({"parts": requests, "nodes": nodes}, seconds or START_SECONDS + nodes / NODES_PER_SECOND)
+    answer = _ask({"parts": requests, "nodes": nodes}, seconds or START_SECONDS + nodes // NODES_PER_SECOND)
     result = []
     for i, name in enumerate(names):
         position, elements = answer[f"position_{i}"], answer[f"elements_{i}"]
@@ -76,20 +77,24 @@ def mesh_parts(
     return result
 
 
-def _ask(request: dict[str, Any], seconds: float) -> dict[str, np.ndarray]:
+def _ask(request: dict[str, Any], seconds: int) -> dict[str, np.ndarray]:
     root = str(Path(ast_sim.__file__).parent.parent)
     path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
     try:
         done = subprocess.run(
             WORKER,
-            input=json.dumps(request).encode(),
+            input=json.dumps({**request, "seconds": seconds}).encode(),
             capture_output=True,
-            timeout=seconds,
+            timeout=PATIENCE * seconds,
             env={**os.environ, **dict.fromkeys(SINGLE_THREAD, "1"), "PYTHONPATH": path},
         )
     except subprocess.TimeoutExpired:
-        raise MeshingFailed(f"gmsh did not finish within {seconds:.0f} s and was stopped") from None
+        raise SimulationError(f"gmsh did not answer within {PATIENCE * seconds} s and was stopped") from None
     last = (done.stderr.decode(errors="replace").strip().splitlines() or ["no message"])[-1]
+    if done.returncode == -signal.SIGXCPU:
+        raise MeshingFailed(f"gmsh did not finish within {seconds} s of processor time and was stopped")
+    if done.returncode == -signal.SIGKILL:
+        raise SimulationError("gmsh was killed by SIGKILL, as when memory runs out: use fewer workers or nodes")
     if done.returncode < 0:
         raise MeshingFailed(f"gmsh crashed ({signal.Signals(-done.returncode).name}): {last}")
     if done.returncode:

@@ -4,9 +4,9 @@
 standard output; what is wrong it says in the last line of its standard error, with exit code 3. gmsh crashes and hangs
 on bad geometry and is under the GPL: no other process of this package loads it.
 
-A request: {"parts": [...], "nodes": wanted number over all of them}, each part {"solid": steps of the grammar (see
-`ast_sim.simulate.cad`)}, {"step": path} or {"stl": path}. The answer: position_i, elements_i of each part, scale_i (the
-length by which coordinates of the file were divided), and the version of gmsh.
+A request: {"parts": [...], "nodes": wanted number over all of them, "seconds": limit to the processor time}, each part
+{"solid": steps of the grammar (see `ast_sim.simulate.cad`)}, {"step": path} or {"stl": path}. The answer: position_i,
+elements_i of each part, scale_i (the length by which coordinates of the file were divided), and the version of gmsh.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import io
 import json
 import math
 import os
+import resource
 import sys
 from dataclasses import dataclass
 from typing import Any
@@ -53,6 +54,7 @@ class Model:
 def main() -> None:
     """Answer one request."""
     request = json.loads(sys.stdin.read())
+    resource.setrlimit(resource.RLIMIT_CPU, (request["seconds"], request["seconds"] + 5))  # SIGXCPU, then SIGKILL
     answer = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what gmsh prints must not mix with the answer
     import gmsh

@@ -29,9 +29,10 @@ if sys.argv[2] == "holed":
 elif sys.argv[2] == "two":
     occ.addBox(70, 0, 0, 10, 10, 10)
 occ.synchronize()
-if sys.argv[2] == "open":
+if sys.argv[2] in ("open", "faces"):
     occ.remove(gmsh.model.getEntities(3))
-    occ.remove([gmsh.model.getEntities(2)[0]])
+    if sys.argv[2] == "open":
+        occ.remove([gmsh.model.getEntities(2)[0]])
     occ.synchronize()
 gmsh.option.setNumber("Mesh.MeshSizeMax", 8)
 if not sys.argv[1].endswith(".step"):
@@ -155,6 +156,21 @@ def test_quadratic_tetrahedra_keep_their_corners(tmp_path):
     assert len(part.position) == 27 and np.allclose(part.position * np.sqrt(3), position)
 
 
+def test_loose_faces_that_close_are_sewn_to_a_solid(tmp_path):
+    source = part_source(write(tmp_path / "faces.step", "faces"))
+    source.check()
+    part, _ = source.draw(np.random.default_rng(0), 400)
+    assert volumes(part.position, part.elements).sum() == pytest.approx(30000 / 3800**1.5, rel=1e-3)
+
+
+def test_a_binary_stl_and_one_in_metres_far_from_the_origin(tmp_path, files):
+    surface = meshio.read(files["stl"])
+    moved = meshio.Mesh(surface.points / 1000 + [0.5, 0.25, 1], surface.cells)
+    meshio.write(tmp_path / "binary.stl", moved, binary=True)
+    a, _ = part_source(tmp_path / "binary.stl").draw(np.random.default_rng(0), 800)
+    assert np.linalg.norm(np.ptp(a.position, axis=0)) == pytest.approx(1, rel=1e-3)
+
+
 def test_an_open_shell_is_refused(tmp_path, files):
     text = refusal(write(tmp_path / "open.step", "open"))
     assert "shell is open, 4 edges bound only one face, the first at (" in text
@@ -210,14 +226,20 @@ def test_without_gmsh_cad_files_name_the_extra_and_mesh_files_work(files, monkey
 
 
 def test_a_crash_and_a_hang_of_gmsh_are_told(monkeypatch):
-    def failure(code: str, seconds: float = 60) -> str:
+    def failure(code: str, seconds: int = 60, again: bool = True) -> str:
         monkeypatch.setattr(cad, "WORKER", [sys.executable, "-c", code])
-        with pytest.raises(cad.MeshingFailed) as caught:
+        with pytest.raises(SimulationError) as caught:
             cad.mesh_parts([HOLED], ["holed"], 500, seconds)
+        assert isinstance(caught.value, cad.MeshingFailed) == again  # only what would happen again is drawn anew
         return str(caught.value)
 
     assert failure("import os; os.kill(os.getpid(), 11)") == "gmsh crashed (SIGSEGV): no message"
-    assert failure("import time; time.sleep(60)", 0.5) == "gmsh did not finish within 0 s and was stopped"
+    spin = "import ast_sim.simulate.cad_worker as w; w._load = lambda *_: exec('while True: pass'); w.main()"
+    assert failure(spin, 2) == "gmsh did not finish within 2 s of processor time and was stopped"
+    killed = failure("import os; os.kill(os.getpid(), 9)", again=False)
+    assert killed == "gmsh was killed by SIGKILL, as when memory runs out: use fewer workers or nodes"
+    monkeypatch.setattr(cad, "PATIENCE", 1)
+    assert failure("import time; time.sleep(60)", 1, again=False) == "gmsh did not answer within 1 s and was stopped"
     assert failure("import sys; sys.exit('Invalid boundary mesh')") == "Invalid boundary mesh"
 
 
