@@ -59,7 +59,7 @@ def find_ccx() -> str:
     if found is None:
         where = f"CCX_BIN={wanted} is no program" if wanted else "ccx is not in PATH and CCX_BIN is not set"
         raise MissingExtra(f"CalculiX is needed here but {where}: apt install calculix-ccx")
-    return found
+    return os.path.abspath(found)  # it runs in another folder
 
 
 def version(ccx: str) -> str:
