@@ -30,7 +30,7 @@ ITERATE_FROM = 50_000
 # Conjugate gradients end at this residual relative to the right side: Newton's error falls by as much in a step.
 RELATIVE_RESIDUAL = 1e-3
 # After so many iterations a new factor is the cheaper way.
-MAX_ITERATIONS = 25
+MAX_ITERATIONS = 40
 
 
 class Factorization(Protocol):
