@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from time import process_time
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from ast_sim.data.scene import AttributeValue, NodeType, Scene, Trajectory
 from ast_sim.simulate.checkpoint import Checkpoint
 from ast_sim.simulate.cloth import Cloth, ClothMaterial
 from ast_sim.simulate.contact import Contact, ContactSettings
-from ast_sim.simulate.frames import CheckFailed, Frames
+from ast_sim.simulate.frames import CheckFailed, FrameRecord, Frames
 from ast_sim.simulate.inertia import Inertia
 from ast_sim.simulate.solver import Newton, NotConverged, SolverSettings
 
@@ -179,38 +178,17 @@ class BackwardEuler(Newton):
         return -float(self.mass @ (self.position @ self._gravity))
 
 
-@dataclass(frozen=True)
-class DynamicRecord:
-    """What the solver did for a frame and what its checks measured; every field becomes a list with one entry a frame.
+@dataclass(frozen=True, kw_only=True)
+class DynamicRecord(FrameRecord):
+    """A record with the energies of motion; the residual is the last Newton step over that of the stop test, work is
+    done by the forces at the end of each frame.
 
     Attributes:
-        solve_seconds: processor time of the solution, which takes one thread.
-        newton_iterations, factorizations, halvings: what the solution took.
-        gap: smallest distance between surfaces that are held apart, in metres.
-        jacobian: smallest area of a triangle over that at rest.
-        residual: last Newton step over that of the stop test: at most 1.
-        contact_area: rest area in square metres around the surface nodes on which contact acts, the mean of both sides.
-        reaction: magnitude of the force in newton that moves the prescribed nodes that move.
-        elastic_energy, contact_energy, kinetic_energy, potential_energy: in joule.
-        dissipation: lost to friction so far in joule.
-        work: of all prescribed nodes so far in joule, with the forces at the end of each frame.
+        kinetic_energy, potential_energy: in joule.
     """
 
-    solve_seconds: float
-    newton_iterations: int
-    factorizations: int
-    halvings: int
-    gap: float
-    jacobian: float
-    residual: float
-    contact_area: float
-    reaction: float
-    elastic_energy: float
-    contact_energy: float
     kinetic_energy: float
     potential_energy: float
-    dissipation: float
-    work: float
 
 
 def implicit_euler(
@@ -230,8 +208,8 @@ def implicit_euler(
         SimulationError: the scene at rest already fails its checks.
     """
     frames = ClothFrames(case, settings)
-    attributes = frames.run(checkpoint)
-    return Trajectory(scene=case.scene, attributes={**attributes, **frames.summary()}, **frames.stacked())
+    status = frames.run(checkpoint)
+    return Trajectory(case.scene, attributes={**status, **case.attributes, **frames.attributes()}, **frames.stacked())
 
 
 class ClothFrames(Frames):
@@ -251,20 +229,13 @@ class ClothFrames(Frames):
 
     def next_frame(self) -> tuple[dict[str, np.ndarray], DynamicRecord]:
         """See `Frames`."""
-        solver, started = self._solver, process_time()
-        before = solver.iterations, solver.system.factorizations, solver.halvings, solver.dissipation
-        start = solver.position
-        if self.records:
-            solver.advance(self.case.targets[len(self.records)])
-        seconds = process_time() - started
+        solver, start = self._solver, self._solver.position
+        cost = self.measured(solver, self._solve)
         stored = solver.position.astype(np.float32)
         gap, jacobian = self._check(stored)
         reactions = np.where(self.case.scene.prescribed[:, None], solver.reactions(), 0)
-        record = DynamicRecord(
-            solve_seconds=seconds,
-            newton_iterations=solver.iterations - before[0],
-            factorizations=solver.system.factorizations - before[1],
-            halvings=solver.halvings - before[2],
+        return {"position": stored}, DynamicRecord(
+            **cost,
             gap=gap,
             jacobian=jacobian,
             residual=solver.residual(),
@@ -274,10 +245,12 @@ class ClothFrames(Frames):
             contact_energy=solver.state.contact.barrier_energy(),
             kinetic_energy=solver.kinetic_energy(),
             potential_energy=solver.potential_energy(),
-            dissipation=self.last("dissipation") + solver.dissipation - before[3],
             work=self.last("work") + float(np.vdot(reactions, solver.position - start)),
         )
-        return {"position": stored}, record
+
+    def _solve(self) -> None:
+        if self.records:  # the first frame is the start
+            self._solver.advance(self.case.targets[len(self.records)])
 
     def _check(self, stored: np.ndarray) -> tuple[float, float]:
         """Smallest gap and area ratio of a frame as it is stored.
@@ -304,17 +277,6 @@ class ClothFrames(Frames):
         self._solver.restart(state["position"])
         self._solver.velocity = state["velocity"]
 
-    def summary(self) -> dict[str, AttributeValue]:
-        """Attributes that do not belong to a frame."""
-        contact = self.case.contact
-        return {
-            **self.case.attributes,
-            "min_gap": min(self.recorded("gap")),
-            "min_jacobian": min(self.recorded("jacobian")),
-            "max_residual": max(self.recorded("residual")),
-            **asdict(self.case.material),
-            "dhat": contact.dhat,
-            "kappa": contact.stiffness,
-            "friction": contact.friction,
-            "solver": self._solver.system.solver_name,
-        }
+    def attributes(self) -> dict[str, AttributeValue]:
+        """What the frames say together, and the constants of the solution."""
+        return {**self.summary(self.case.contact, self._solver.system.solver_name), **asdict(self.case.material)}

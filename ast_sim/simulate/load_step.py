@@ -49,7 +49,7 @@ class QuasiStatic:
     @property
     def factorizations(self) -> int:
         """Factorizations so far."""
-        return self.newton.system.factorizations + (self._damped.system.factorizations if self._damped else 0)
+        return self.newton.factorizations + (self._damped.factorizations if self._damped else 0)
 
     @property
     def dissipation(self) -> float:

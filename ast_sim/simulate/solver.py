@@ -97,6 +97,11 @@ class Newton:
         """Current positions [N,3]."""
         return self.state.position
 
+    @property
+    def factorizations(self) -> int:
+        """Factorizations so far."""
+        return self.system.factorizations
+
     def restart(self, position: np.ndarray) -> None:
         """Go on from positions [N,3], free of intersections, as if nothing had been before."""
         self.contact.restart()

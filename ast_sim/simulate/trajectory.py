@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from time import process_time
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from ast_sim.simulate.case import SolidCase
 from ast_sim.simulate.checkpoint import Checkpoint
 from ast_sim.simulate.contact import Contact
 from ast_sim.simulate.elasticity import Elasticity
-from ast_sim.simulate.frames import CheckFailed, Frames
+from ast_sim.simulate.frames import CheckFailed, FrameRecord, Frames
 from ast_sim.simulate.load_step import QuasiStatic
 from ast_sim.simulate.material import von_mises
 from ast_sim.simulate.solver import SolverSettings
@@ -22,38 +21,15 @@ from ast_sim.simulate.solver import SolverSettings
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))
 
 
-@dataclass(frozen=True)
-class FrameRecord:
-    """What the solver did for a frame and what its checks measured; every field becomes a list with one entry a frame.
+@dataclass(frozen=True, kw_only=True)
+class SolidRecord(FrameRecord):
+    """A record with the balance of forces; work is that of the trapezoidal rule over the frames.
 
     Attributes:
-        solve_seconds: processor time of the solution, which takes one thread.
-        newton_iterations, factorizations, halvings: what the solution took.
-        gap: smallest distance between surfaces that are held apart, in metres.
-        jacobian: smallest determinant of a deformation gradient.
-        residual: largest force component on a free node over that of the stop test: at most 1.
-        contact_area: rest area in square metres around the surface nodes on which contact acts, the mean of both sides.
-        reaction: magnitude of the force in newton on the prescribed nodes of the body that is moved farthest.
         imbalance: sum of the forces on all prescribed nodes over the sum of their magnitudes; without body forces 0.
-        elastic_energy, contact_energy: in joule.
-        dissipation: lost to friction so far in joule.
-        work: of all prescribed nodes so far in joule (trapezoidal rule over the frames).
     """
 
-    solve_seconds: float
-    newton_iterations: int
-    factorizations: int
-    halvings: int
-    gap: float
-    jacobian: float
-    residual: float
-    contact_area: float
-    reaction: float
     imbalance: float
-    elastic_energy: float
-    contact_energy: float
-    dissipation: float
-    work: float
 
 
 def quasi_static(
@@ -80,7 +56,7 @@ def quasi_static(
 class SolidFrames(Frames):
     """The frames of a quasi-static case and its solver; arguments as for `quasi_static`."""
 
-    record_type = FrameRecord
+    record_type = SolidRecord
 
     def __init__(self, case: SolidCase, settings: SolverSettings | None) -> None:
         super().__init__(len(case.targets))
@@ -95,24 +71,17 @@ class SolidFrames(Frames):
         self._driven = scene.prescribed & (scene.body == scene.body[np.argmax(travel)])
         self._reactions = np.zeros_like(rest)
 
-    def next_frame(self) -> tuple[dict[str, np.ndarray], FrameRecord]:
+    def next_frame(self) -> tuple[dict[str, np.ndarray], SolidRecord]:
         """See `Frames`."""
-        solver, newton, started = self.solver, self.solver.newton, process_time()
-        before = solver.iterations, solver.factorizations, solver.halvings, solver.dissipation
-        start = newton.position
-        if self.records:
-            solver.advance(self.case.targets[len(self.records)])
-        seconds = process_time() - started
+        newton, start = self.solver.newton, self.solver.newton.position
+        cost = self.measured(self.solver, self._solve)
         arrays = self._stored()
         gap, jacobian = self._check(arrays)
         reactions = np.where(self.case.scene.prescribed[:, None], newton.reactions(), 0)
         work = 0.5 * float(np.vdot(reactions + self._reactions, newton.position - start))
         self._reactions = reactions
-        return arrays, FrameRecord(
-            solve_seconds=seconds,
-            newton_iterations=solver.iterations - before[0],
-            factorizations=solver.factorizations - before[1],
-            halvings=solver.halvings - before[2],
+        return arrays, SolidRecord(
+            **cost,
             gap=gap,
             jacobian=jacobian,
             residual=newton.residual(),
@@ -121,9 +90,12 @@ class SolidFrames(Frames):
             imbalance=self._imbalance(reactions),
             elastic_energy=newton.state.potential.energy,
             contact_energy=newton.state.contact.barrier_energy(),
-            dissipation=self.last("dissipation") + solver.dissipation - before[3],
             work=self.last("work") + work,
         )
+
+    def _solve(self) -> None:
+        if self.records:  # the first frame is at rest
+            self.solver.advance(self.case.targets[len(self.records)])
 
     def _stored(self) -> dict[str, np.ndarray]:
         """The arrays of a frame as they are stored."""
@@ -183,21 +155,15 @@ class SolidFrames(Frames):
 
     def attributes(self) -> dict[str, AttributeValue]:
         """What the frames say together, and the constants of the solution."""
-        contact, material = self.case.contact, self.case.material
+        material = self.case.material
         stored = np.add(self.recorded("elastic_energy"), self.recorded("contact_energy"))
         imbalance = self.recorded("work") - stored + stored[0] - self.recorded("dissipation")
         return {
-            "min_gap": min(self.recorded("gap")),
-            "min_jacobian": min(self.recorded("jacobian")),
-            "max_residual": max(self.recorded("residual")),
+            **self.summary(self.case.contact, self.solver.newton.system.solver_name),
             "max_imbalance": max(self.recorded("imbalance")),
             "work_balance": float(np.abs(imbalance).max() / max(stored.max(), np.finfo(float).tiny)),
             "young": _distinct(material.young),
             "poisson": _distinct(material.poisson),
-            "dhat": contact.dhat,
-            "kappa": contact.stiffness,
-            "friction": contact.friction,
-            "solver": self.solver.newton.system.solver_name,
         }
 
 
