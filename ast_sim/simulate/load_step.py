@@ -1,4 +1,5 @@
-"""Quasi-static load steps: halved where they do not converge, damped where halving does not help.
+"""Quasi-static load steps: halved where they do not converge, doubled again where they do, damped where halving does
+not help.
 
 A damped step is backward Euler from rest: inertia keeps the body from leaping over the equilibrium that it cannot
 reach directly, as where it buckles. It is repeated with less and less inertia until the body rests without any, so
@@ -63,23 +64,22 @@ class QuasiStatic:
             NotConverged: after the allowed halvings and damped steps.
         """
         start = self.newton.position
-        done, part, halvings = 0.0, 1.0, 0
+        done, part, smallest = 0.0, 1.0, 0.5**self.newton.settings.max_halvings
         while done < 1:
             reached = min(1.0, done + part)
             goal = target if reached == 1 else start + reached * (target - start)
             before = self.newton.position
             try:
                 self.newton.step(goal)
-                done = reached
+                part *= 2
             except NotConverged as error:
                 self.newton.restart(before)
-                if halvings < self.newton.settings.max_halvings:
-                    halvings += 1
+                if part > smallest:
                     self.halvings += 1
                     part /= 2
                     continue
                 self._advance_damped(goal, str(error))
-                done = reached
+            done = reached
 
     def _advance_damped(self, goal: np.ndarray, reason: str) -> None:
         """Steps of backward Euler from rest, each with less inertia, until there is equilibrium without any."""
