@@ -67,7 +67,7 @@ def homogeneous_rows(name: str, F: np.ndarray, expected: dict[str, float]) -> li
 
 def shear() -> Outcome:
     """Simple shear: sigma_xy = mu gamma, sigma_xx = mu gamma^2."""
-    rows, amounts = [], (0.1, 0.5, 1.0)
+    rows, amounts = [], (0.1, 1.0)
     for gamma in amounts:
         F = np.eye(3)
         F[0, 1] = gamma
