@@ -243,7 +243,7 @@ PROBLEMS = [
         " surface goes down in the centre, so that the gap that the barrier keeps does not count. A quarter, 8 a wide"
         " and deep; on its outer faces the displacements of the point force F of the closed form (Boussinesq), in"
         " which the depth has a share of 5 %. All cells are halved from mesh to mesh.",
-        lambda: hertz([3, 6, 12]),
+        lambda: hertz([2, 4, 8]),
         quick=None,
     ),
     Problem(
