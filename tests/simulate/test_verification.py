@@ -55,11 +55,12 @@ def test_the_document_shows_a_row_that_fails():
     text = verification.document({"patch": found})
     assert "| a quantity | 1 N | 2 N | 1.0e+00 | 1.0e-01 | **NO** | a reason |" in text
     assert "0 of 1 rows hold" in text and "verification/patch_name.svg" in text and "a remark" in text
+    assert "Not solved yet at this state: `derivatives`" in text
 
 
 def test_the_document_in_the_tree_is_that_of_the_records():
     records = json.loads(verification.RECORDS.read_text())
-    assert list(records) == list(verification.PROBLEMS)
+    assert records and list(records) == [name for name in verification.PROBLEMS if name in records]
     assert verification.DOCUMENT.read_text(encoding="utf-8") == verification.document(records)
     for name, record in records.items():
         assert all((verification.PICTURES / f"{name}_{picture}.svg").exists() for picture in record["pictures"])
