@@ -33,7 +33,7 @@ def measure(family: str, workers: int) -> dict[str, Any]:
     """The records of all samples and what they say together."""
     made = generate(family, FOLDER / f"{family}.h5", {"train": COUNT}, seed=0, workers=workers)
     with Dataset(made.path) as dataset:
-        seconds = read_seconds(dataset)
+        seconds = read_seconds(dataset).samples
         samples = [
             sample(dataset.load("train", index), seconds[f"train/{index:06d}"])
             for index in range(dataset.count("train"))
