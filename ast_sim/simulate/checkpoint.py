@@ -18,7 +18,7 @@ class Checkpoint:
     """Keeps the arrays of an unfinished sample; without a path, nowhere.
 
     A solve is a pure function of the state at the start of a frame, which the arrays hold in full precision: resumed,
-    it gives the frames that it would have given. Writing takes the place of the file before, at most every few
+    it gives the frames that it would have given. Writing takes the place of the file before, and is due every few
     seconds: short samples never write.
 
     Args:
@@ -43,13 +43,11 @@ class Checkpoint:
 
     @property
     def is_due(self) -> bool:
-        """Whether `save` would write: arrays need not be gathered where it would not."""
+        """Whether the last writing is long enough ago."""
         return self.path is not None and time.monotonic() - self._written >= SECONDS_BETWEEN_WRITES
 
     def save(self, arrays: dict[str, np.ndarray]) -> None:
-        """Write the arrays, if the last writing is long enough ago."""
-        if not self.is_due:
-            return
+        """Write the arrays; there must be a path."""
         with replacing(self.path) as temporary, open(temporary, "wb") as file:
             np.savez(file, **arrays)
         self._written = time.monotonic()

@@ -19,7 +19,7 @@ from ast_sim.data.scene import AttributeValue, NodeType, Scene, Trajectory
 from ast_sim.simulate.checkpoint import Checkpoint
 from ast_sim.simulate.cloth import Cloth, ClothMaterial
 from ast_sim.simulate.contact import Contact, ContactSettings
-from ast_sim.simulate.frames import CheckFailed, FrameRecord, Frames
+from ast_sim.simulate.frames import FrameRecord, Frames
 from ast_sim.simulate.inertia import Inertia
 from ast_sim.simulate.solver import Newton, NotConverged, SolverSettings
 
@@ -194,53 +194,41 @@ class DynamicRecord(FrameRecord):
 def implicit_euler(
     case: ClothCase, settings: DynamicSettings | None = None, checkpoint: Checkpoint | None = None
 ) -> Trajectory:
-    """Solve a case frame by frame.
+    """Solve a case frame by frame, to the tolerances of `settings`; see `Frames.trajectory`.
 
-    Args:
-        case: what to solve.
-        settings: tolerances of the solver.
-        checkpoint: where unfinished frames are kept, and taken from if there are any.
-
-    Returns:
-        The frames up to the first that did not converge or failed a check, with the records as attributes.
-
-    Raises:
-        SimulationError: the scene at rest already fails its checks.
+    The checkpoint is where unfinished frames are kept, and taken from if there are any.
     """
-    frames = ClothFrames(case, settings)
-    status = frames.run(checkpoint)
-    return Trajectory(case.scene, attributes={**status, **case.attributes, **frames.attributes()}, **frames.stacked())
+    return ClothFrames(case, settings).trajectory(checkpoint)
 
 
 class ClothFrames(Frames):
-    """The frames of a `ClothCase`: no surface intersects, surfaces are apart, no triangle has vanished."""
+    """The frames of a `ClothCase` and its solver; arguments as for `implicit_euler`."""
 
+    case: ClothCase
+    solver: BackwardEuler
     record_type = DynamicRecord
 
     def __init__(self, case: ClothCase, settings: DynamicSettings | None) -> None:
-        super().__init__(len(case.targets))
-        self.case, self._solver = case, BackwardEuler(case, settings)
-        self._moving = (np.abs(case.targets - case.targets[0]).max(axis=(0, 2)) > 0) & case.scene.prescribed
+        solver = BackwardEuler(case, settings)
+        super().__init__(case, solver, solver.contact)
 
     def watch(self, progress: Callable[[int], None]) -> None:
         """See `Frames`."""
-        solver = self._solver
-        solver.watch = lambda: progress(solver.iterations)
+        self.solver.watch = lambda: progress(self.solver.iterations)
 
     def next_frame(self) -> tuple[dict[str, np.ndarray], DynamicRecord]:
         """See `Frames`."""
-        solver, start = self._solver, self._solver.position
-        cost = self.measured(solver, self._solve)
-        stored = solver.position.astype(np.float32)
-        gap, jacobian = self._check(stored)
+        solver, start = self.solver, self.solver.position
+        cost = self.advance()
+        arrays = {"position": solver.position.astype(np.float32)}
+        checked = self.check(arrays)
         reactions = np.where(self.case.scene.prescribed[:, None], solver.reactions(), 0)
-        return {"position": stored}, DynamicRecord(
+        return arrays, DynamicRecord(
             **cost,
-            gap=gap,
-            jacobian=jacobian,
+            **checked,
             residual=solver.residual(),
-            contact_area=solver.contact.area(solver.state.contact),
-            reaction=float(np.linalg.norm(reactions[self._moving].sum(axis=0))),
+            contact_area=self.contact.area(solver.state.contact),
+            reaction=float(np.linalg.norm(reactions[self.driven].sum(axis=0))),
             elastic_energy=solver.elastic_energy(),
             contact_energy=solver.state.contact.barrier_energy(),
             kinetic_energy=solver.kinetic_energy(),
@@ -248,35 +236,19 @@ class ClothFrames(Frames):
             work=self.last("work") + float(np.vdot(reactions, solver.position - start)),
         )
 
-    def _solve(self) -> None:
-        if self.records:  # the first frame is the start
-            self._solver.advance(self.case.targets[len(self.records)])
-
-    def _check(self, stored: np.ndarray) -> tuple[float, float]:
-        """Smallest gap and area ratio of a frame as it is stored.
-
-        Raises:
-            CheckFailed: naming the check and its value.
-        """
-        if not np.isfinite(stored).all():
-            raise CheckFailed("position is not finite")
-        position, solver = stored.astype(np.float64), self._solver
-        gap, jacobian = solver.contact.gap(position), float(solver.cloth.jacobian(position).min())
-        if gap <= 0 or solver.contact.intersects(position):
-            raise CheckFailed(f"surfaces intersect (gap {gap:.3g} m)")
-        if jacobian <= 0:
-            raise CheckFailed(f"a triangle has vanished (area ratio {jacobian:.3g})")
-        return gap, jacobian
+    def jacobian(self, position: np.ndarray) -> np.ndarray:
+        """See `Frames`."""
+        return self.solver.cloth.jacobian(position)
 
     def exact_state(self) -> dict[str, np.ndarray]:
         """See `Frames`."""
-        return {"position": self._solver.position, "velocity": self._solver.velocity}
+        return {"position": self.solver.position, "velocity": self.solver.velocity}
 
     def go_on_from(self, state: dict[str, np.ndarray]) -> None:
         """See `Frames`."""
-        self._solver.restart(state["position"])
-        self._solver.velocity = state["velocity"]
+        self.solver.restart(state["position"])
+        self.solver.velocity = state["velocity"]
 
     def attributes(self) -> dict[str, AttributeValue]:
-        """What the frames say together, and the constants of the solution."""
-        return {**self.summary(self.case.contact, self._solver.system.solver_name), **asdict(self.case.material)}
+        """See `Frames`."""
+        return {**self.summary(self.solver.system.solver_name), **asdict(self.case.material)}

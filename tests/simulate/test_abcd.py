@@ -72,7 +72,6 @@ def test_structured_pairs_are_sound(nodes):
 
 
 def test_pairs_of_the_grammar_are_sound():
-    pytest.importorskip("gmsh")
     source, names = part_source(), set()
     for seed in range(3):
         case = abcd.draw(np.random.default_rng(seed), 800, source)

@@ -2,6 +2,7 @@
 
 import sys
 
+import gmsh
 import meshio
 import numpy as np
 import pytest
@@ -11,8 +12,6 @@ from ast_sim.simulate import cad
 from ast_sim.simulate.mesh_check import BadMesh, check_mesh
 from ast_sim.simulate.part_source import GrammarParts, StructuredParts, part_source, read_mesh
 from ast_sim.simulate.parts import rectilinear, volumes
-
-gmsh = pytest.importorskip("gmsh")
 
 HOLED = {"solid": [
     {"do": "add", "shape": "box", "at": [0, 0, 0], "size": [1, 0.8, 0.5]},

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from browser import Browser
 from figures import evaluation, metrics
+from on_screen import HOSTILE, differ, drawn, settle, show, texts
 from view_scenes import plate, strip
 
 from ast_sim.data.scene import Trajectory
 from ast_sim.view.report import ReportRun, ReportScene, representative, write
 
-HOSTILE = "</script><script>window.pwned = 1</script><img src=x onerror='window.pwned = 1'>"
 LEFT, RIGHT = ".panel:nth-child(1) .stage", ".panel:nth-child(2) .stage"
 
 
@@ -40,23 +40,6 @@ def page(browser, tmp_path_factory):
     return path
 
 
-def show(browser, path, still=True):
-    browser.errors.clear()
-    browser.requests.clear()
-    browser.open(path)
-    browser.wait("document.documentElement.dataset.ready === 'true'")
-    if still:
-        settle(browser)
-
-
-def settle(browser):
-    """Wait until what was asked for is on the screen."""
-    browser.evaluate(
-        "(async () => { while (window.report?.viewer.drawing) await report.viewer.drawing;"
-        " for (let i = 0; i < 3; i++) await new Promise(requestAnimationFrame); })()"
-    )
-
-
 def choose(browser, group, index):
     browser.click(f"#{group}-choice label:nth-of-type({index + 1}) input")
     settle(browser)
@@ -68,20 +51,6 @@ def to_frame(browser, frame):
         " s.dispatchEvent(new Event('input', { bubbles: true })); })()"
     )
     settle(browser)
-
-
-def texts(browser, selector):
-    return browser.evaluate(f"[...document.querySelectorAll({selector!r})].map(node => node.textContent)")
-
-
-def drawn(picture):
-    """The share of the pixels that are not background."""
-    return (np.abs(picture.astype(int) - picture[-2, 2].astype(int)).max(axis=2) > 24).mean()
-
-
-def differ(one, other):
-    """The share of the pixels that differ clearly."""
-    return (np.abs(one.astype(int) - other.astype(int)).max(axis=2) > 24).mean()
 
 
 def cameras(browser):

@@ -9,15 +9,14 @@ import io
 import numpy as np
 import pytest
 from browser import Browser
+from on_screen import HOSTILE, differ, drawn, show, texts
 from PIL import Image
-from test_browser import differ, drawn, show, texts
 from view_scenes import cloth, pair
 
 from ast_sim.data.file import DatasetInfo, DatasetWriter
 from ast_sim.data.scene import Trajectory
 from ast_sim.view import gallery
 
-HOSTILE = "</script><script>window.pwned = 1</script><img src=x onerror='window.pwned = 1'>"
 BLOCKS = DatasetInfo(
     "abcd", "quasi_static", "element", (0.0, 0.0, 0.0), 1.0, 0.003, 0.0, generator={"command": HOSTILE}
 )
