@@ -11,9 +11,8 @@ _LAZY = {
     "NodeType": "ast_sim.data.scene",
     "Scene": "ast_sim.data.scene",
     "Trajectory": "ast_sim.data.scene",
-    "ModelConfig": "ast_sim.model.config",
-    "PRESETS": "ast_sim.model.config",
-    "build_model": "ast_sim.model.ast",
+    "MODELS": "ast_sim.models",
+    "build_model": "ast_sim.models",
     "keep_memory": "ast_sim.ops.library",
     "show_config": "ast_sim.ops.library",
 }

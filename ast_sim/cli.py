@@ -30,13 +30,16 @@ class _TrainParser(_Parser):
 
     def format_help(self) -> str:
         from ast_sim import config
-        from ast_sim.model.config import PRESETS
-        from ast_sim.run import RunConfig
+        from ast_sim.models import MODELS
+        from ast_sim.run import TrainConfig
 
-        lines = [super().format_help(), f"presets: {', '.join(PRESETS)}", "", "settings for --set, and their defaults:"]
-        for setting in config.settings(RunConfig):
-            if setting.help:
-                lines.append(f"  {setting.key}={setting.default}  ({setting.type})\n        {setting.help}")
+        lines = [super().format_help(), "settings for --set, and their defaults:"]
+        groups = [("training", "train.", TrainConfig), *((n, "model.", m.config) for n, m in MODELS.items())]
+        for title, prefix, settings in groups:
+            presets = f", presets {', '.join(MODELS[title].presets)}" if title in MODELS else ""
+            lines += ["", f"{title}{presets}:"]
+            for setting in config.settings(settings):
+                lines.append(f"  {prefix}{setting.key}={setting.default}  ({setting.type})\n        {setting.help}")
         return "\n".join(lines) + "\n"
 
 
@@ -121,6 +124,7 @@ def _build_parser() -> argparse.ArgumentParser:
     train = command("train", _train, "train a model", _TrainParser)
     train.add_argument("data", metavar="DATA", nargs="?", type=Path, help="dataset; not needed with --resume")
     train.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder")
+    train.add_argument("--model", metavar="M", help="which model, see below (ast)")
     train.add_argument("--preset", metavar="P", help="settings to start from (tiny)")
     train.add_argument("--set", action="append", default=[], metavar="k=v", help="change a setting; may be repeated")
     train.add_argument("--resume", action="store_true", help="go on after the last checkpoint, if there is one")
@@ -253,12 +257,12 @@ def _train(args: argparse.Namespace) -> None:
     keep_memory()
     if args.data is None and not args.resume:
         raise ConfigError("name the dataset to train on, or --resume the run in --out")
-    if args.data is None and (args.preset or args.set):
-        raise ConfigError("settings are those of the run that is resumed: leave --preset and --set out")
+    if args.data is None and (args.model or args.preset or args.set):
+        raise ConfigError("settings are those of the run that is resumed: leave --model, --preset and --set out")
     # A run that is resumed keeps its settings; given ones are compared with them.
     config = None
     if args.data is not None:
-        config = configure(args.data, args.preset or "tiny", args.set)
+        config = configure(args.data, args.preset or "tiny", args.set, args.model or "ast")
     train(args.out, config, resume=args.resume, profile_steps=args.profile or 0)
     if args.profile is None:
         print(f"run: {args.out}")

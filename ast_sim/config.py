@@ -1,7 +1,8 @@
 """Settings: nested frozen dataclasses, to and from TOML, with overrides from the command line.
 
 A field may be bool, int, float, str, a Literal of str, a tuple of these, a dataclass, and each of them or None. TOML
-has no word for None: it is written as the string "none".
+has no word for None: it is written as the string "none". A field may also be one of several dataclasses: the first
+field of each, a Literal, tells them apart.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ def override(obj: T, assignments: list[str]) -> T:
         ConfigError: an assignment without `=`, an unknown key (the nearest known one is named), a wrong type.
     """
     changes: dict[str, Any] = {}
-    kinds = {key: kind for key, _, kind in _leaves(type(obj))}
+    kinds = {key: kind for key, _, kind in _leaves(type(obj), obj=obj)}
     for assignment in assignments:
         key, equals, text = (part.strip() for part in assignment.partition("="))
         if not equals:
@@ -102,11 +103,11 @@ def _build(cls: type[T], values: Mapping[str, Any], root: type, prefix: str) -> 
     arguments = {}
     for name, item in items.items():
         key, kind = prefix + name, kinds[name]
-        if dataclasses.is_dataclass(kind):
+        if _is_group(kind):
             table = values.get(name, {})
             if not isinstance(table, dict):
                 raise ConfigError(f"{key} is {table!r}; must be a group of settings ([{key}])")
-            arguments[name] = _build(kind, table, root, f"{key}.")
+            arguments[name] = _build(_chosen(kind, table, key), table, root, f"{key}.")
         elif name in values:
             arguments[name] = _convert(values[name], kind, key)
         elif item.default is MISSING and item.default_factory is MISSING:
@@ -114,15 +115,35 @@ def _build(cls: type[T], values: Mapping[str, Any], root: type, prefix: str) -> 
     return cls(**arguments)
 
 
-def _leaves(cls: type, prefix: str = "") -> Iterator[tuple[str, dataclasses.Field, Any]]:
-    """(dotted key, field, type) of every setting that is no group."""
+def _leaves(cls: type, prefix: str = "", obj: Any = None) -> Iterator[tuple[str, dataclasses.Field, Any]]:
+    """(dotted key, field, type) of every setting that is no group; where a group is of several kinds, of that in `obj`
+    or of all."""
     kinds = get_type_hints(cls)
     for item in dataclasses.fields(cls):
         kind = kinds[item.name]
-        if dataclasses.is_dataclass(kind):
-            yield from _leaves(kind, f"{prefix}{item.name}.")
+        if _is_group(kind):
+            group = None if obj is None else getattr(obj, item.name)
+            for member in _members(kind) if group is None else (type(group),):
+                yield from _leaves(member, f"{prefix}{item.name}.", group)
         else:
             yield prefix + item.name, item, kind
+
+
+def _is_group(kind: Any) -> bool:
+    return all(dataclasses.is_dataclass(member) for member in _members(kind))
+
+
+def _chosen(kind: Any, table: Mapping[str, Any], key: str) -> type:
+    """Of the kinds of a group the one that the table names; the first if it names none."""
+    members = _members(kind)
+    if len(members) == 1:
+        return members[0]
+    tag = dataclasses.fields(members[0])[0].name
+    named = {get_args(get_type_hints(member)[tag])[0]: member for member in members}
+    name = table.get(tag, next(iter(named)))
+    if name not in named:
+        raise ConfigError(f"{key}.{tag} is {name!r}; must be one of {', '.join(named)}")
+    return named[name]
 
 
 def _unknown(cls: type, key: str) -> ConfigError:

@@ -102,9 +102,9 @@ def headlines(found: dict[str, Any]) -> list[str]:
     ):
         errors = {
             name: found["summary"].get(name, {}).get(quantity, {}).get("rollout_all", {}).get(nodes, {})
-            for name in ("ast", trivial)
+            for name in ("model", trivial)
         }
-        model, reference = (errors[name].get("rmse_sequence") for name in ("ast", trivial))
+        model, reference = (errors[name].get("rmse_sequence") for name in ("model", trivial))
         if model is not None and reference:
             lines.append(
                 f"{quantity} error over whole rollouts: {model:.3g} {unit}, {100 * model / reference:.0f} % of {words}"

@@ -92,7 +92,7 @@ def evaluate(
 def one_step_predictions(model: Simulator, truth: Trajectory, name: str) -> tuple[np.ndarray, np.ndarray | None]:
     """Every frame after the given ones, predicted from the true frame before: positions [S - given, N, 3], stress."""
     given = 2 if model.config.dynamic else 1
-    graph = Graph.from_scene(truth.scene, bool(model.config.element_inputs))
+    graph = model.graph(truth.scene)
     script = torch.tensor(truth.position)
     known = None if truth.stress is None else torch.tensor(truth.stress)
     chunk = max(1, ONE_STEP_NODES // truth.scene.num_nodes)
@@ -130,7 +130,7 @@ def displacement_errors(truth: Trajectory, one_step: np.ndarray, result: Rollout
     last = present[0] - before[0]
     frames = np.arange(1, len(target) + 1)[:, None, None]
     predictors = {
-        "ast": (one_step, result.position[given:] if result.failure is None else None),
+        "model": (one_step, result.position[given:] if result.failure is None else None),
         "hold_still": (present, np.broadcast_to(present[0], target.shape)),
         "repeat_last": (2 * present - before, present[0] + frames * last),
     }
@@ -149,7 +149,7 @@ def stress_errors(truth: Trajectory, one_step: np.ndarray, result: Rollout, cons
     rows = deforming(truth.scene, location)
     mean = target[:, rows].mean(axis=1, keepdims=True)
     predictors = {
-        "ast": (one_step, result.stress[result.given :] if result.failure is None else None),
+        "model": (one_step, result.stress[result.given :] if result.failure is None else None),
         "stress_zero": (np.zeros(1), np.zeros(1)),
         "stress_constant": (np.full(1, constant), np.full(1, constant)),
         "stress_frame_mean": (mean, mean),

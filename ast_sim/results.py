@@ -121,7 +121,7 @@ def write_prediction(run: TrainedRun, truth: Trajectory, result: Rollout, name: 
 def report_run(run: TrainedRun, evaluation: dict[str, Any]) -> report.ReportRun:
     """One run as the report shows it: the best, the median and the worst scene of an evaluation, curves and facts."""
     errors = {
-        sample["name"]: _or_infinity(sample["displacement"]["ast"]["rollout_all"]["normal"])
+        sample["name"]: _or_infinity(sample["displacement"]["model"]["rollout_all"]["normal"])
         for sample in evaluation["samples"]
     }
     scenes = []
@@ -147,7 +147,7 @@ def _facts(run: TrainedRun) -> dict[str, str]:
     scenes = training.batch_size * training.accumulate
     facts = {
         "Model": f"{type(run.model).__name__}, {sum(p.numel() for p in run.model.parameters()):,} parameters",
-        "Octree": f"level {model.L_cell}, cells of {model.cell_side:.3g} {info.length_unit}",
+        **model.facts(info.length_unit),
         "Training": f"{training.steps:,} steps of {scenes} scenes, seed {training.seed}",
         "Noise": f"{training.noise:.3g} {info.length_unit}",
         "Checkpoint": f"step {run.step:,}, the best of the validations by rollout",

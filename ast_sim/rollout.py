@@ -21,8 +21,6 @@ from ast_sim.data.scene import Trajectory
 from ast_sim.errors import RolloutError
 from ast_sim.model.simulator import Simulator
 
-MAX_LEVEL = 21  # the deepest octree that 64-bit Morton keys can hold
-
 
 @dataclass(eq=False)
 class Rollout:
@@ -103,9 +101,9 @@ class _RollingScene:
     """One scene on its way: its graph, its script and the frames so far."""
 
     def __init__(self, model: Simulator, trajectory: Trajectory, name: str, given: int, steps: int | None) -> None:
-        self.config = model.config
+        self.model, self.config = model, model.config
         self.name = name
-        self.graph = Graph.from_scene(trajectory.scene, bool(self.config.element_inputs))
+        self.graph = model.graph(trajectory.scene)
         self.script = torch.tensor(trajectory.position)
         self.end = len(self.script) if steps is None else min(len(self.script), given + steps)
         self.positions = list(self.script[:given])
@@ -146,17 +144,14 @@ class _RollingScene:
             self.seconds.append(seconds)
 
     def place(self, frame: int, position: Tensor) -> None:
-        """Find how often the domain must double around its centre to hold the positions of a frame."""
-        center = torch.tensor(self.config.domain_center, dtype=torch.float64)
-        distance = (position.double() - center).abs().amax(dim=1)
-        self.doublings = 0
-        while float(distance.max()) > self.config.domain_half_width * 2.0**self.doublings:
-            self.doublings += 1
-        if self.config.L_cell + self.doublings > MAX_LEVEL:
+        """Find the domain that holds the positions of a frame."""
+        self.domain = self.model.domain(position)
+        if self.domain is None:
+            center = torch.tensor(self.config.domain_center, dtype=torch.float64)
+            distance = (position.double() - center).abs().amax(dim=1)
             self.failure = (
                 f"{self.name}: node {int(distance.argmax())} is {float(distance.max()):.3g} from the centre of the"
-                f" domain in frame {frame}, further than an octree of {MAX_LEVEL} levels reaches;"
-                f" the {frame} frames before it are kept"
+                f" domain in frame {frame}, further than the model reaches; the {frame} frames before it are kept"
             )
 
     def result(self) -> Rollout:
@@ -165,10 +160,10 @@ class _RollingScene:
 
 
 def _same_domain(scenes: list[_RollingScene]) -> Iterator[list[_RollingScene]]:
-    """Group the scenes by how often the domain doubles for them, so that none changes another's octree."""
+    """Group the scenes by their domain, so that none changes another's."""
     groups: dict[int, list[_RollingScene]] = {}
     for scene in scenes:
-        groups.setdefault(scene.doublings, []).append(scene)
+        groups.setdefault(scene.domain, []).append(scene)
     return iter(groups.values())
 
 
@@ -207,8 +202,7 @@ def make_batch(
 ) -> Batch:
     """The model's input at one instant: states [N, 3] and, for the boundary motion, the next positions `target`."""
     motion = torch.where(graph.prescribed[:, None], target - position, 0.0)
-    inputs = "stress" in model.config.element_inputs
-    return Batch(graph, position, previous, motion, stress if inputs else None, names)
+    return Batch(graph, position, previous, motion, stress, names)
 
 
 def predict_next(model: Simulator, batch: Batch, target: Tensor) -> tuple[Tensor, Tensor | None]:

@@ -12,9 +12,8 @@ from typing import Any
 from ast_sim import checkpoint, config
 from ast_sim.data.disk import replacing
 from ast_sim.errors import CheckpointError
-from ast_sim.model.ast import build_model
-from ast_sim.model.config import ModelConfig
 from ast_sim.model.simulator import Simulator
+from ast_sim.models import AnyConfig, build_model
 
 CONFIG = "config.toml"
 METRICS = "metrics.jsonl"
@@ -52,7 +51,7 @@ class TrainConfig:
 class RunConfig:
     """All settings of a run, as kept in its `config.toml`."""
 
-    model: ModelConfig
+    model: AnyConfig
     train: TrainConfig
     data: str
 

@@ -7,7 +7,6 @@ seeding torch before each step. So weights, optimizer state and the step number 
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import errno
 import hashlib
 import math
@@ -25,8 +24,7 @@ from ast_sim.data.file import Dataset
 from ast_sim.data.sampling import PairSampler
 from ast_sim.errors import ConfigError, DatasetError, TrainingError
 from ast_sim.measures import SquaredError, rmse_sequence
-from ast_sim.model.ast import build_model
-from ast_sim.model.config import PRESETS, resolve
+from ast_sim.models import build_model, find_preset
 from ast_sim.monitor import Clock, Progress, StopSignals, duration
 from ast_sim.optimizer import Optimizer
 from ast_sim.profile import profile, table
@@ -37,25 +35,23 @@ from ast_sim.schedule import DataScales, learning_rate, measure, resolve_trainin
 CONSTANT = 1e-3  # the output is constant if its standard deviation over nodes is below this share of the targets'
 
 
-def configure(data: Path, preset: str, assignments: Sequence[str] = ()) -> RunConfig:
-    """The settings of a preset with `--set` assignments; what they leave to the data is filled in by `train`.
+def configure(data: Path, preset: str, assignments: Sequence[str] = (), model: str = "ast") -> RunConfig:
+    """The settings of a model's preset with `--set` assignments; what they leave to the data is filled in by `train`.
 
     What kind of dataset it is counts from the start, since it decides which inputs there can be.
 
     Raises:
-        ConfigError: naming the nearest preset or key that there is, or an input that the dataset does not have.
+        ConfigError: naming the nearest model, preset or key that there is, or an input that the dataset does not have.
         DatasetError: the dataset cannot be read.
     """
-    if preset not in PRESETS:
-        near = difflib.get_close_matches(preset, PRESETS, 1, 0)
-        raise ConfigError(f"there is no preset {preset!r}: did you mean {near[0]}? There are {', '.join(PRESETS)}")
-    chosen = PRESETS[preset]
+    chosen = find_preset(model, preset)
     with Dataset(data) as dataset:
+        inputs = chosen.model.inputs_for(dataset.info, dataset.material_width) if chosen.adapts else {}
         kind = [
             f"model.integration={dataset.info.integration}",
             f"model.stress={dataset.info.stress_location}",
             f"model.material_width={dataset.material_width}",
-            *(f"model.{name}={value}" for name, value in chosen.inputs(dataset.info, dataset.material_width).items()),
+            *(f"model.{name}={value}" for name, value in inputs.items()),
         ]
     return override(RunConfig(chosen.model, TrainConfig(**chosen.train), str(data)), [*kind, *assignments])
 
@@ -103,7 +99,7 @@ def train(run: Path, config: RunConfig | None = None, resume: bool = False, prof
 
 def resolve_run(config: RunConfig, dataset: Dataset, scales: DataScales) -> RunConfig:
     """The settings with everything filled in that they leave to the data."""
-    model = resolve(config.model, dataset.info, dataset.material_width, scales.spacing)
+    model = config.model.resolve(dataset.info, dataset.material_width, scales.spacing)
     training = resolve_training(config.train, scales, model.dynamic)
     return RunConfig(model=model, train=training, data=str(Path(config.data).resolve()))
 
@@ -140,7 +136,7 @@ class Training:
             batch_size=self.options.batch_size,
             seed=self.options.seed,
             noise=self.options.noise,
-            element_nodes=bool(config.model.element_inputs),
+            make_graph=self.model.graph,
             dynamic=config.model.dynamic,
             gamma=self.options.noise_gamma,
         )
@@ -160,9 +156,8 @@ class Training:
         self.ahead.__exit__(*error)
 
     def _introduce(self, scales: DataScales) -> None:
-        options, model = self.options, self.config.model
+        options = self.options
         epochs = options.steps * options.batch_size * options.accumulate / self.sampler.num_pairs
-        side = model.cell_side
         rms, spacing = max(scales.increment, 1e-300), max(scales.spacing, 1e-300)
         unit = self.dataset.info.length_unit
         print(f"parameters  {sum(p.numel() for p in self.model.parameters()):,}")
@@ -173,9 +168,11 @@ class Training:
         )
         print(
             f"noise       {options.noise:.3g} {unit} = {options.noise / rms:.2g} x rms increment"
-            f" = {options.noise / spacing:.2g} x mesh spacing"
+            f" = {options.noise / spacing:.2g} x mesh spacing",
+            flush=True,
         )
-        print(f"cell side   {side:.3g} {unit} = {side / spacing:.2g} x mesh spacing", flush=True)
+        for what, fact in self.config.model.facts(unit, spacing).items():
+            print(f"{what.lower():12}{fact}", flush=True)
 
     def prepare(self) -> None:
         """Take up the newest checkpoint; without one, the statistics of the data."""

@@ -18,7 +18,6 @@ from torch.utils.flop_counter import FlopCounterMode
 
 import ast_sim
 from ast_sim.data.file import Dataset
-from ast_sim.data.graph import Graph
 from ast_sim.monitor import StopSignals
 from ast_sim.ops import library
 from ast_sim.profile import profile
@@ -65,8 +64,7 @@ def shares(step: Callable[[], object], count: int) -> dict[str, float]:
 def rollout_step(training: Training) -> Callable[[], object]:
     """A call that predicts the second frame of the first test scene."""
     truth = training.dataset.load("test", 0)
-    config = training.config.model
-    graph = Graph.from_scene(truth.scene, bool(config.element_inputs))
+    graph = training.model.graph(truth.scene)
     first, second = torch.from_numpy(truth.position[:2].copy()).unbind(0)
     stress = None if truth.stress is None else torch.from_numpy(truth.stress[0].copy())
 

@@ -147,3 +147,35 @@ def test_settings_are_listed_with_their_help():
     assert listed["data"].default is None
     assert listed["model.center"].default == "0.0,0.0,0.0"
     assert listed["tag"] == Setting("tag", 'a text or "none"', "none", "")
+
+
+@dataclass(frozen=True)
+class Circle:
+    shape: Literal["circle"] = "circle"
+    radius: float = 1.0
+
+
+@dataclass(frozen=True)
+class Box:
+    shape: Literal["box"] = "box"
+    side: float = 2.0
+
+
+@dataclass(frozen=True)
+class Drawing:
+    figure: Circle | Box
+    title: str = ""
+
+
+def test_a_group_of_several_kinds_is_told_by_its_first_field():
+    drawing = Drawing(Box(side=3.0), "b")
+    assert from_toml(Drawing, to_toml(drawing)) == drawing
+    assert from_toml(Drawing, "") == Drawing(Circle())
+    assert override(drawing, ["figure.side=4"]) == Drawing(Box(side=4.0), "b")
+    assert [s.key for s in settings(Drawing)] == [
+        "figure.shape", "figure.radius", "figure.shape", "figure.side", "title"
+    ]  # fmt: skip
+    with pytest.raises(ConfigError, match="figure.shape is 'ring'; must be one of circle, box"):
+        from_toml(Drawing, '[figure]\nshape = "ring"')
+    with pytest.raises(ConfigError, match=r"no setting figure.radius; the nearest is figure"):
+        override(drawing, ["figure.radius=4"])

@@ -79,7 +79,7 @@ def test_headlines_are_shares_of_the_trivial_predictors():
         "length_unit": "m",
         "stress_unit": "Pa",
         "summary": {
-            "ast": {**summary("displacement", "normal", 0.002), **summary("stress", "deforming", 600.0)},
+            "model": {**summary("displacement", "normal", 0.002), **summary("stress", "deforming", 600.0)},
             "hold_still": summary("displacement", "normal", 0.01),
             "stress_frame_mean": summary("stress", "deforming", 1000.0),
         },

@@ -53,10 +53,10 @@ def test_displacement_errors_by_hand():
     one_step[:, 0, 0] = [2.0, 2.0, 3.0]
     errors = displacement_errors(truth, one_step, predicted(truth, [1.0, 1.0, 1.0], 1))
     # One coordinate of three moves, on one node of one NORMAL (3 frames x 3 numbers), or of three (27 numbers).
-    assert errors["ast"]["one_step"]["normal"].total == 2.0
-    assert errors["ast"]["one_step"]["normal"].count == 9
-    assert errors["ast"]["one_step"]["all"].count == 27
-    assert errors["ast"]["rollout_all"]["normal"].total == 8.0
+    assert errors["model"]["one_step"]["normal"].total == 2.0
+    assert errors["model"]["one_step"]["normal"].count == 9
+    assert errors["model"]["one_step"]["all"].count == 27
+    assert errors["model"]["rollout_all"]["normal"].total == 8.0
     # Hold still, one step: 0, 1, 3 for 1, 3, 3: errors 1, 2, 0. Rollout: 0 for 1, 3, 3.
     assert errors["hold_still"]["one_step"]["normal"].total == 5.0
     assert errors["hold_still"]["rollout_all"]["normal"].total == 19.0
@@ -71,14 +71,14 @@ def test_prescribed_nodes_are_at_their_places_in_every_prediction():
     errors = displacement_errors(truth, np.full((2, 3, 3), 7.0), predicted(truth, [0.0, 0.0], 1))
     assert errors["hold_still"]["rollout_all"]["all"].total == 0.0
     assert errors["hold_still"]["one_step"]["all"].total == 0.0
-    assert errors["ast"]["one_step"]["all"].total == errors["ast"]["one_step"]["normal"].total == 2 * 3 * 49
+    assert errors["model"]["one_step"]["all"].total == errors["model"]["one_step"]["normal"].total == 2 * 3 * 49
 
 
 def test_dynamic_scenes_give_two_frames_and_repeat_their_increment():
     truth = one_triangle([0.0, 1.0, 3.0, 6.0])
     one_step = truth.position[2:].copy()
     errors = displacement_errors(truth, one_step, predicted(truth, [3.0, 6.0], 2))
-    assert errors["ast"]["one_step"]["normal"].total == 0.0
+    assert errors["model"]["one_step"]["normal"].total == 0.0
     # Hold still: from frame 1 on at 1, for 3 and 6. Repeat last: 2 and 3 for 3 and 6; one step: 2 and 5.
     assert errors["hold_still"]["rollout_all"]["normal"].total == 4.0 + 25.0
     assert errors["repeat_last"]["rollout_all"]["normal"].total == 1.0 + 9.0
@@ -88,7 +88,7 @@ def test_dynamic_scenes_give_two_frames_and_repeat_their_increment():
 def test_rollout_50_ends_after_50_predicted_frames():
     truth = one_triangle([0.0] + [1.0] * 50 + [11.0] * 10)
     result = predicted(truth, [1.0] * 60, 1)
-    errors = displacement_errors(truth, truth.position[1:], result)["ast"]
+    errors = displacement_errors(truth, truth.position[1:], result)["model"]
     assert errors["rollout_50"]["normal"].total == 0.0
     assert errors["rollout_50"]["normal"].count == 150
     assert errors["rollout_all"]["normal"].total == 10 * 100.0
@@ -102,12 +102,12 @@ def test_stress_errors_by_hand():
     errors = stress_errors(truth, result.stress[1:] + np.float32(1.0), result, constant=3.0, location="node")
     by = {key: value["rollout_all"]["deforming"] for key, value in errors.items()}
     # The obstacle's node 2 does not count. Truths 2, 4 and 6, 2.
-    assert by["ast"].total == 1.0 + 4.0
-    assert by["ast"].count == 4
+    assert by["model"].total == 1.0 + 4.0
+    assert by["model"].count == 4
     assert by["stress_zero"].total == 4 + 16 + 36 + 4
     assert by["stress_constant"].total == 1 + 1 + 9 + 1
     assert by["stress_frame_mean"].total == 1 + 1 + 4 + 4  # the means are 3 and 4
-    assert errors["ast"]["one_step"]["deforming"].total == 1 + 0 + 1 + 1
+    assert errors["model"]["one_step"]["deforming"].total == 1 + 0 + 1 + 1
 
 
 def test_stress_of_elements_leaves_out_those_with_an_obstacle_node():
@@ -121,7 +121,7 @@ def test_stress_of_elements_leaves_out_those_with_an_obstacle_node():
     truth = Trajectory(scene, position, np.array([[0, 0], [5, 50]], np.float32)[:, :, None])
     result = Rollout(position, np.zeros((2, 2, 1), np.float32), 1)
     errors = stress_errors(truth, result.stress[1:], result, constant=4.0, location="element")
-    assert errors["ast"]["rollout_all"]["deforming"].total == 25.0
+    assert errors["model"]["rollout_all"]["deforming"].total == 25.0
     assert errors["stress_constant"]["rollout_all"]["deforming"].total == 1.0
 
 
@@ -129,7 +129,7 @@ def test_a_failed_rollout_has_no_error_and_no_summary():
     truth = one_triangle([0.0, 1.0, 2.0])
     failed = Rollout(truth.position[:2], None, 1, failure="node 0 in frame 2 is not finite")
     errors = displacement_errors(truth, truth.position[1:], failed)
-    summary = summarize([errors], "displacement")["ast"]["displacement"]
+    summary = summarize([errors], "displacement")["model"]["displacement"]
     assert summary["rollout_all"]["normal"] == {"rmse_sequence": None, "rmse_pooled": None}
     assert summary["one_step"]["normal"]["rmse_sequence"] == 0.0
 
@@ -173,13 +173,13 @@ def test_evaluation_of_a_dataset_agrees_with_its_formulas(evaluated):
 
 def test_every_predictor_has_every_horizon_and_the_speed_is_the_solvers_over_the_models(evaluated):
     found, truths, _ = evaluated
-    for predictor in ("ast", "hold_still", "repeat_last"):
+    for predictor in ("model", "hold_still", "repeat_last"):
         for horizon in HORIZONS:
             for nodes in ("normal", "all"):
                 values = found["summary"][predictor]["displacement"][horizon][nodes]
                 assert set(values) == {"rmse_sequence", "rmse_pooled"}
                 assert all(value >= 0 for value in values.values())
-    for predictor in ("ast", "stress_zero", "stress_constant", "stress_frame_mean"):
+    for predictor in ("model", "stress_zero", "stress_constant", "stress_frame_mean"):
         assert set(found["summary"][predictor]["stress"]) == set(HORIZONS)
     for sample, truth in zip(found["samples"], truths, strict=True):
         assert sample["nodes"] == truth.scene.num_nodes
@@ -197,7 +197,7 @@ def test_the_figures_are_json_and_a_readable_table(evaluated):
     hold = found["summary"]["hold_still"]["displacement"]["rollout_all"]["normal"]
     row = next(line for line in lines if line.startswith("  hold_still"))
     assert row.endswith(f"{hold['rmse_sequence']:.4g} / {hold['rmse_pooled']:.4g}")
-    assert sum(line.startswith("  ast") for line in lines) == 3
+    assert sum(line.startswith("  model") for line in lines) == 3
 
 
 def test_the_solvers_seconds_beside_the_dataset_count_and_without_them_the_speed_is_unknown(tmp_path):

@@ -60,9 +60,7 @@ ast_sim.show_config()
 def test_import_loads_little():
     code = "import sys, ast_sim; print([m for m in ('torch', 'scipy', 'h5py', 'meshio', 'ipctk') if m in sys.modules])"
     assert run_python(code).strip() == "[]"
-    assert (
-        run_python("import ast_sim; print(ast_sim.Scene.__name__, 'PRESETS' in dir(ast_sim))").strip() == "Scene True"
-    )
+    assert run_python("import ast_sim; print(ast_sim.Scene.__name__, 'MODELS' in dir(ast_sim))").strip() == "Scene True"
 
 
 def test_unknown_instruction_set_and_backend_are_named():

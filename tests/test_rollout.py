@@ -9,13 +9,19 @@ from toy import one_thread  # noqa: F401 (used by being imported)
 from ast_sim.data.batch import Batch
 from ast_sim.data.scene import Trajectory
 from ast_sim.errors import RolloutError
-from ast_sim.model.ast import build_model
+from ast_sim.model.ast import AST
 from ast_sim.model.simulator import Prediction, Simulator
+from ast_sim.models import build_model
 from ast_sim.rollout import rollout, rollouts
 
 
 class Constant(Simulator):
-    """Every node moves (or accelerates) by the same vector; `spoil` may change the motion of a given call."""
+    """Every node moves (or accelerates) by the same vector; `spoil` may change the motion of a given call.
+
+    Its domain is that of AST.
+    """
+
+    domain = AST.domain
 
     def __init__(self, config, motion=(0.0, 0.0, 0.0), spoil=None) -> None:
         super().__init__(config)

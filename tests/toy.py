@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from ast_sim.data.batch import Batch
 from ast_sim.data.file import DatasetInfo, DatasetWriter
 from ast_sim.data.scene import NodeType, Scene, Trajectory
-from ast_sim.model.config import ModelConfig, resolve
+from ast_sim.model.ast_config import ASTConfig
 from ast_sim.model.simulator import Prediction, Simulator
 
 
@@ -89,9 +89,9 @@ def write(path: Path, counts: tuple[int, int, int] = (3, 2, 2), **kind: bool) ->
     return path
 
 
-def config(info: DatasetInfo, mesh_spacing: float = 0.1) -> ModelConfig:
+def config(info: DatasetInfo, mesh_spacing: float = 0.1) -> ASTConfig:
     """The settings of a small AST that fits the dataset."""
-    small = ModelConfig(
+    small = ASTConfig(
         hidden=16,
         decoder_hidden=16,
         d_token=16,
@@ -104,13 +104,13 @@ def config(info: DatasetInfo, mesh_spacing: float = 0.1) -> ModelConfig:
         element_inputs=(),
         edge_strain=True,
     )
-    return resolve(small, info, 0, mesh_spacing)
+    return small.resolve(info, 0, mesh_spacing)
 
 
 class LinearSimulator(Simulator):
     """One linear map of displacement, boundary motion and their scene means; with dropout, to be of use in tests."""
 
-    def __init__(self, config: ModelConfig) -> None:
+    def __init__(self, config: ASTConfig) -> None:
         super().__init__(config)
         self.map = nn.Linear(12, 3 + (config.stress == "node"))
         self.dropout = nn.Dropout(0.1)

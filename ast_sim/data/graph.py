@@ -5,15 +5,25 @@ Legend: N nodes, E elements of k nodes, M edges, B scenes; a batch is the concat
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from ast_sim.data.scene import NodeType, Scene
 from ast_sim.ops.edges import EdgeSet
+
+
+class Concatenable(Protocol):
+    """What a model adds to the graph of a scene; like the graph, that of a batch is the concatenation of its scenes."""
+
+    @staticmethod
+    def concatenate(parts: Sequence[Any]) -> Any:
+        """Those of several scenes as one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +41,7 @@ class Graph:
         m2m: node to node, every element edge once in both directions; None with element nodes.
         e2m, m2e: element to each of its nodes, and the reverse; None without element nodes.
         rest_edges: [M, 4] float32, `edge_vectors` of e2m (elements at the mean of their nodes) or m2m at rest.
+        own: what one model alone needs, such as coarser meshes.
     """
 
     rest_position: Tensor
@@ -45,6 +56,7 @@ class Graph:
     e2m: EdgeSet | None
     m2e: EdgeSet | None
     rest_edges: Tensor
+    own: Concatenable | None = None
 
     @staticmethod
     def from_scene(scene: Scene, element_nodes: bool) -> Graph:
@@ -100,6 +112,7 @@ class Graph:
             e2m=None if graphs[0].e2m is None else EdgeSet.concatenate([g.e2m for g in graphs]),
             m2e=None if graphs[0].m2e is None else EdgeSet.concatenate([g.m2e for g in graphs]),
             rest_edges=torch.cat([g.rest_edges for g in graphs]),
+            own=None if graphs[0].own is None else graphs[0].own.concatenate([g.own for g in graphs]),
         )
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -12,6 +13,7 @@ from torch import Tensor
 from ast_sim.data.batch import Batch, Target
 from ast_sim.data.file import Dataset
 from ast_sim.data.graph import Graph
+from ast_sim.data.scene import Scene
 from ast_sim.errors import DatasetError
 
 # Separate the random numbers of the order from those of the noise.
@@ -54,12 +56,12 @@ class PairSampler:
         batch_size: int,
         seed: int,
         noise: float,
-        element_nodes: bool,
+        make_graph: Callable[[Scene], Graph],
         dynamic: bool,
         gamma: float,
     ) -> None:
         self._dataset, self._split, self._batch_size, self._seed = dataset, split, batch_size, seed
-        self._noise, self._element_nodes, self._dynamic, self._gamma = noise, element_nodes, dynamic, gamma
+        self._noise, self._make_graph, self._dynamic, self._gamma = noise, make_graph, dynamic, gamma
         self._first = 1 if dynamic else 0  # the acceleration needs a frame before t
         frames = np.array([dataset.num_frames(split, i) for i in range(dataset.count(split))], np.int64)
         self._starts = np.concatenate([[0], np.cumsum(np.maximum(frames - 1 - self._first, 0))])
@@ -124,7 +126,7 @@ class PairSampler:
             noisy = np.repeat(~scene.prescribed[:, None], 3, axis=1).astype(np.float32)
             if not scene.rest_position[:, 2].any() and not position[:, :, 2].any():
                 noisy[:, 2] = 0
-            graph = Graph.from_scene(scene, self._element_nodes)
+            graph = self._make_graph(scene)
             self._members[index] = _Member(graph, noisy, scene.prescribed[:, None])
         return self._members[index]
 

@@ -11,9 +11,11 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from ast_sim.data.batch import Batch
+from ast_sim.data.graph import Graph
+from ast_sim.data.scene import Scene
 from ast_sim.model import features as inputs
-from ast_sim.model.cells import Cells, SparseConv, build_cells
-from ast_sim.model.config import ModelConfig
+from ast_sim.model.ast_config import ASTConfig
+from ast_sim.model.cells import Cells, SparseConv, build_cells, doublings
 from ast_sim.model.linear import Linear
 from ast_sim.model.message_passing import MessagePassing
 from ast_sim.model.mlp import MLP
@@ -26,7 +28,9 @@ from ast_sim.ops.segment import segment_mean
 class AST(Simulator):
     """Only what the scene requires is built: element parts with element inputs, convolutions with l_ocnn > 0."""
 
-    def __init__(self, config: ModelConfig):
+    config: ASTConfig
+
+    def __init__(self, config: ASTConfig):
         super().__init__(config)
         c, width = config, config.hidden
         self.node_inputs = inputs.normalizer_of(c, "node")
@@ -55,6 +59,14 @@ class AST(Simulator):
 
     def _message_passing(self, name: str, edge_inputs: int = 0) -> MessagePassing:
         return MessagePassing(self.config.hidden, edge_inputs, name in self.config.residual, self.config.factorized)
+
+    def graph(self, scene: Scene) -> Graph:
+        """See `Simulator`; with element inputs elements are nodes of their own."""
+        return Graph.from_scene(scene, element_nodes=bool(self.config.element_inputs))
+
+    def domain(self, position: Tensor) -> int | None:
+        """How often the domain must double around its centre to hold the positions [N, 3]; see `Simulator`."""
+        return doublings(self.config, position)
 
     def observe(self, batch: Batch) -> None:
         """Add the batch to the statistics of the inputs."""
@@ -103,8 +115,3 @@ class AST(Simulator):
         for block in self.processor:
             tokens = block(tokens, token_offsets)
         return self.to_cells(x, level.cell_offsets, tokens, token_offsets)
-
-
-def build_model(config: ModelConfig) -> Simulator:
-    """The model of a resolved configuration."""
-    return AST(config)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ast_sim.errors import DatasetError, RolloutError
-from ast_sim.model.config import ModelConfig
+from ast_sim.model.ast_config import ASTConfig
 from ast_sim.ops.edges import EdgeSet
 from ast_sim.ops.octree import CellMap, Octree, octree
 from ast_sim.ops.sparse_conv import sparse_conv, sparse_conv_transposed
@@ -50,17 +50,17 @@ class Cells:
         return EdgeSet(o.node_cell, nodes[:-1], nodes, len(o.keys))
 
 
-def _growth(config: ModelConfig, position: Tensor) -> int:
-    """How often the domain must double around its centre to hold all positions."""
+def doublings(config: ASTConfig, position: Tensor) -> int | None:
+    """How often the domain must double around its centre to hold positions [N, 3]; None if L would pass 21."""
     center = torch.tensor(config.domain_center, dtype=torch.float64)
     reach = float((position.double() - center).abs().max()) if len(position) else 0.0
-    growth = 0
-    while reach > config.domain_half_width * 2.0**growth and config.L_cell + growth <= 21:
-        growth += 1
-    return growth
+    for growth in range(22 - config.L_cell):
+        if reach <= config.domain_half_width * 2.0**growth:
+            return growth
+    return None
 
 
-def build_cells(config: ModelConfig, position: Tensor, offsets: Tensor, may_grow: bool) -> Cells:
+def build_cells(config: ASTConfig, position: Tensor, offsets: Tensor, may_grow: bool) -> Cells:
     """The octree over positions [N, 3] of the scenes of `offsets`.
 
     With `may_grow` (a rollout) the domain doubles around its centre and L grows by one until all nodes lie inside, so
@@ -70,15 +70,15 @@ def build_cells(config: ModelConfig, position: Tensor, offsets: Tensor, may_grow
         DatasetError: a node lies outside the domain or is not finite, and the domain may not grow.
         RolloutError: the same where it may: not finite, or so far away that L would pass 21.
     """
-    growth = _growth(config, position) if may_grow and bool(torch.isfinite(position).all()) else 0
+    growth = doublings(config, position) if may_grow and bool(torch.isfinite(position).all()) else 0
     error = RolloutError if may_grow else DatasetError
-    depth = config.L_cell + growth
-    if depth > 21:
+    if growth is None:
         raise error(
             f"a node is so far from the domain centre {config.domain_center} that the octree would pass level 21"
         )
     try:
-        finest = octree(position, offsets, config.domain_center, config.domain_half_width * 2.0**growth, depth)
+        half_width, depth = config.domain_half_width * 2.0**growth, config.L_cell + growth
+        finest = octree(position, offsets, config.domain_center, half_width, depth)
     except ValueError as problem:
         advice = (
             "" if may_grow else "; give the dataset a domain_half_width that holds all frames and the training noise"

@@ -11,6 +11,7 @@ from torch import Tensor
 from ast_sim.data.batch import Batch
 from ast_sim.data.graph import edge_vectors
 from ast_sim.data.scene import NodeType
+from ast_sim.model.ast_config import ASTConfig
 from ast_sim.model.config import ModelConfig
 from ast_sim.model.normalizer import FeatureNormalizer, Kind
 
@@ -37,7 +38,7 @@ def node_features(config: ModelConfig, batch: Batch) -> Tensor:
     return torch.cat(values, dim=1)
 
 
-def element_features(config: ModelConfig, batch: Batch) -> Tensor:
+def element_features(config: ASTConfig, batch: Batch) -> Tensor:
     """[E, *]: the mean state of the nodes of each element, material and stress."""
     values = [batch.graph.element_mean(value) for value in _state(config.element_inputs, batch)]
     if "material" in config.element_inputs:
@@ -47,7 +48,7 @@ def element_features(config: ModelConfig, batch: Batch) -> Tensor:
     return torch.cat(values, dim=1)
 
 
-def edge_features(config: ModelConfig, batch: Batch) -> Tensor:
+def edge_features(config: ASTConfig, batch: Batch) -> Tensor:
     """[M, 8]: [dp0, |dp0|, dp, |dp|] with d = sender - receiver; with `edge_strain` dp and |dp| less those at rest."""
     graph, now = batch.graph, batch.position
     senders = graph.element_mean(now) if graph.e2m is not None else now
@@ -55,7 +56,7 @@ def edge_features(config: ModelConfig, batch: Batch) -> Tensor:
     return torch.cat([graph.rest_edges, vectors - graph.rest_edges if config.edge_strain else vectors], dim=1)
 
 
-def normalizer_of(config: ModelConfig, what: str) -> FeatureNormalizer:
+def normalizer_of(config: ASTConfig, what: str) -> FeatureNormalizer:
     """For the "node", "element" or "edge" features."""
     if what == "edge":
         return FeatureNormalizer([("vector", 3), ("scalar", 1), ("vector", 3), ("scalar", 1)])

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from ast_sim.data.batch import Batch, Target
+from ast_sim.data.graph import Graph
+from ast_sim.data.scene import Scene
 from ast_sim.model.config import ModelConfig
 from ast_sim.model.normalizer import FeatureNormalizer, Normalizer
 
@@ -22,7 +24,8 @@ class Prediction:
 
 
 class Simulator(nn.Module):
-    """Base of the models. A model implements `forward` (normalised outputs) and `observe` (its input statistics)."""
+    """Base of the models. A model implements `forward` (normalised outputs) and `observe` (its input statistics), and
+    `graph` and `domain` where those here do not fit."""
 
     def __init__(self, config: ModelConfig):
         super().__init__()
@@ -35,6 +38,15 @@ class Simulator(nn.Module):
 
     def observe(self, batch: Batch) -> None:
         raise NotImplementedError
+
+    def graph(self, scene: Scene) -> Graph:
+        """What the model needs of a scene at all times."""
+        return Graph.from_scene(scene, element_nodes=False)
+
+    def domain(self, position: Tensor) -> int | None:
+        """Which domain holds the positions [N, 3] of a scene, None if they are too far away for the model; scenes in
+        different domains are not predicted together."""
+        return 0
 
     def _stressed(self, batch: Batch) -> Tensor:
         """Rows whose stress counts: nodes that are no obstacle, or elements with no obstacle node."""

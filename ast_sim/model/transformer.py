@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ast_sim.model.config import ModelConfig
+from ast_sim.model.ast_config import ASTConfig
 from ast_sim.model.linear import Linear
 from ast_sim.ops.attention import cross_attention, self_attention
 
@@ -34,7 +34,7 @@ class PositionEmbedding(nn.Module):
 class FeedForward(nn.Module):
     """x + GEGLU (Shazeer 2020): W_2 (a * gelu(b)) with [a, b] = W_1 LN(x), and dropout before the sum."""
 
-    def __init__(self, config: ModelConfig):
+    def __init__(self, config: ASTConfig):
         super().__init__()
         self.norm = nn.LayerNorm(config.d_token)
         self.first = Linear(config.d_token, 2 * config.ffn_inner)
@@ -51,7 +51,7 @@ class FeedForward(nn.Module):
 class AttentionBlock(nn.Module):
     """x + attention(LN(x), LN(context)), then the feed-forward part; the context of a self-attention is x itself."""
 
-    def __init__(self, config: ModelConfig, cross: bool):
+    def __init__(self, config: ASTConfig, cross: bool):
         super().__init__()
         inner = config.heads * config.head_dim
         self.heads, self.dropout = config.heads, config.dropout

@@ -17,7 +17,7 @@ TRIVIAL = {
     "displacement": {"hold_still": "Hold still", "repeat_last": "Repeat the last increment"},
     "stress": {"stress_zero": "Zero", "stress_constant": "Constant mean", "stress_frame_mean": "Mean of the frame"},
 }
-MODEL = "ast"
+MODEL = "model"
 TRAINING_POINTS = 400  # a longer training curve is thinned to so many means
 
 

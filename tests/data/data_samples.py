@@ -7,6 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from ast_sim.data.file import DatasetWriter
+from ast_sim.data.graph import Graph
 from ast_sim.data.layout import DatasetInfo
 from ast_sim.data.scene import NodeType, Scene, Trajectory
 
@@ -67,3 +68,8 @@ def write(path, trajectories: dict[str, Iterable[Trajectory]], **changes):
             for member in members:
                 writer.add(split, member)
     return path
+
+
+def mesh_graph(scene: Scene) -> Graph:
+    """What a model without element nodes needs of a scene."""
+    return Graph.from_scene(scene, element_nodes=False)

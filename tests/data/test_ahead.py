@@ -4,7 +4,7 @@ import threading
 
 import pytest
 import torch
-from data_samples import trajectory, write
+from data_samples import mesh_graph, trajectory, write
 from meshes import two_tetrahedra
 
 from ast_sim.data.ahead import Ahead
@@ -12,7 +12,7 @@ from ast_sim.data.file import Dataset
 from ast_sim.data.sampling import PairSampler
 from ast_sim.errors import DatasetError
 
-OPTIONS = {"batch_size": 2, "seed": 3, "noise": 0.1, "element_nodes": False, "dynamic": False, "gamma": 1.0}
+OPTIONS = {"batch_size": 2, "seed": 3, "noise": 0.1, "make_graph": mesh_graph, "dynamic": False, "gamma": 1.0}
 
 
 @pytest.fixture

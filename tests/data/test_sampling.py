@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from data_samples import block, trajectory, write
+from data_samples import block, mesh_graph, trajectory, write
 from meshes import two_tetrahedra
 
 from ast_sim.data.file import Dataset
@@ -25,7 +25,7 @@ def dataset(tmp_path):
 
 
 def sampler(dataset, **changes) -> PairSampler:
-    options = {"batch_size": 4, "seed": 0, "noise": 0.0, "element_nodes": False, "dynamic": False, "gamma": 1.0}
+    options = {"batch_size": 4, "seed": 0, "noise": 0.0, "make_graph": mesh_graph, "dynamic": False, "gamma": 1.0}
     return PairSampler(dataset, "train", **{**options, **changes})
 
 

@@ -16,19 +16,19 @@ from ast_sim.data.graph import Graph
 from ast_sim.data.sampling import PairSampler
 from ast_sim.data.scene import NodeType
 from ast_sim.errors import ConfigError, DatasetError, RolloutError
-from ast_sim.model.ast import build_model
+from ast_sim.model.ast_config import PRESETS, ASTConfig
 from ast_sim.model.cells import build_cells
-from ast_sim.model.config import PRESETS, ModelConfig, resolve
 from ast_sim.model.message_passing import MessagePassing
 from ast_sim.model.mlp import FactorizedLinear
 from ast_sim.model.normalizer import Normalizer
 from ast_sim.model.transformer import AttentionBlock, PositionEmbedding
+from ast_sim.models import build_model
 from ast_sim.ops.edges import EdgeSet
 
 SMALL = {"hidden": 32, "decoder_hidden": 16, "d_token": 32, "heads": 2, "head_dim": 16, "ffn_inner": 32, "L_SA": 2}
 
 
-def small(family: str, **changes) -> ModelConfig:
+def small(family: str, **changes) -> ASTConfig:
     """The family's preset with narrow layers: the same parts, quick to run."""
     config = replace(PRESETS[family].model, **SMALL)
     if family == "deforming_plate":
@@ -36,14 +36,14 @@ def small(family: str, **changes) -> ModelConfig:
     return replace(config, **changes)
 
 
-def sampler(path, config: ModelConfig, noise: float = 1e-3) -> PairSampler:
+def sampler(path, config: ASTConfig, noise: float = 1e-3) -> PairSampler:
     return PairSampler(
-        Dataset(path), "train", batch_size=2, seed=0, noise=noise, element_nodes=bool(config.element_inputs),
+        Dataset(path), "train", batch_size=2, seed=0, noise=noise, make_graph=build_model(config).graph,
         dynamic=config.dynamic, gamma=1.0,
     )  # fmt: skip
 
 
-def batch_of(config: ModelConfig, *seeds: int, family: str = "deforming_plate") -> Batch:
+def batch_of(config: ASTConfig, *seeds: int, family: str = "deforming_plate") -> Batch:
     scenes = [trajectory(family, seed) for seed in seeds]
     graph = Graph.concatenate([Graph.from_scene(t.scene, bool(config.element_inputs)) for t in scenes])
     now, after, before = (torch.from_numpy(np.concatenate([t.position[i] for t in scenes])) for i in (2, 3, 1))
@@ -61,7 +61,7 @@ def test_every_preset_takes_a_training_step(family, tmp_path):
     path = write(tmp_path / "data.h5", family)
     with Dataset(path) as dataset:
         material = trajectory(family).scene.material
-        config = resolve(PRESETS[family].model, dataset.info, 0 if material is None else 1, 0.08)
+        config = PRESETS[family].model.resolve(dataset.info, 0 if material is None else 1, 0.08)
     assert config.stress == {"deforming_plate": "node", "abcd_xl": "element"}.get(family, "none")
     model, pairs = build_model(replace(config, dropout=0.0)), sampler(path, config)
     model.fit_statistics(pairs.batch(i) for i in range(3))
@@ -300,11 +300,11 @@ def test_mesh_and_cell_edges():
 def test_what_the_dataset_decides():
     """Level by mesh spacing, a stress on elements with the element nodes that it needs, domain and kind of dynamics."""
     info = DatasetInfo("own", "quasi_static", "element", (1.0, 2.0, 3.0), 4.0, 0.01, 0.0)
-    config = resolve(PRESETS["tiny"].model, info, 2, mesh_spacing=0.1)
+    config = PRESETS["tiny"].model.resolve(info, 2, mesh_spacing=0.1)
     assert config.element_inputs == ("displacement",) and config.stress == "element" and config.material_width == 2
     assert config.domain_center == (1.0, 2.0, 3.0) and config.domain_half_width == 4.0
     assert config.L_cell == 6 and config.cell_side == pytest.approx(0.125)  # 1 + log2(4 / 0.15) = 5.7
-    nodal = resolve(PRESETS["tiny"].model, replace(info, stress_location="node"), 0, mesh_spacing=0.1)
+    nodal = PRESETS["tiny"].model.resolve(replace(info, stress_location="node"), 0, mesh_spacing=0.1)
     assert nodal.element_inputs == () and nodal.stress == "node"
 
 
@@ -333,4 +333,4 @@ def test_integration():
 )
 def test_settings_that_do_not_fit(changes, message):
     with pytest.raises(ConfigError, match=message):
-        ModelConfig(**changes)
+        ASTConfig(**changes)

@@ -7,7 +7,7 @@ from meshes import two_tetrahedra
 
 from ast_sim.data.batch import Batch
 from ast_sim.data.graph import Graph
-from ast_sim.model.config import ModelConfig
+from ast_sim.model.ast_config import ASTConfig
 from ast_sim.model.features import edge_features, element_features, node_features, normalizer_of
 from ast_sim.model.normalizer import FeatureNormalizer
 
@@ -23,7 +23,7 @@ def batch_of(element_nodes: bool) -> Batch:
 
 def test_node_features():
     inputs = ("displacement", "velocity", "material")
-    config = ModelConfig(node_inputs=inputs, material_width=1, integration="dynamic")
+    config = ASTConfig(node_inputs=inputs, material_width=1, integration="dynamic")
     batch = batch_of(False)
     expected = []
     for node, kind in enumerate(batch.graph.node_type.tolist()):
@@ -37,7 +37,7 @@ def test_node_features():
 
 def test_element_features():
     inputs = ("displacement", "velocity", "material", "stress")
-    config = ModelConfig(element_inputs=inputs, material_width=1, integration="dynamic", stress="element")
+    config = ASTConfig(element_inputs=inputs, material_width=1, integration="dynamic", stress="element")
     batch = batch_of(True)
     expected = torch.tensor([[0.1, 0, 0, 0.05, 0, 0, 2, 5], [0.125, 0, 0, 0.0625, 0, 0, 6, 7]])
     torch.testing.assert_close(element_features(config, batch), expected, rtol=0, atol=1e-6)
@@ -47,7 +47,7 @@ def test_element_features():
 @pytest.mark.parametrize("strain", [False, True])
 @pytest.mark.parametrize("element_nodes", [False, True])
 def test_edge_features(element_nodes, strain):
-    config, batch = ModelConfig(edge_strain=strain), batch_of(element_nodes)
+    config, batch = ASTConfig(edge_strain=strain), batch_of(element_nodes)
     graph, rest, now = batch.graph, batch.graph.rest_position, batch.position
     found = edge_features(config, batch)
     assert found.shape == (len(graph.edges), 8) and normalizer_of(config, "edge").width == 8

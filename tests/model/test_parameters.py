@@ -23,8 +23,8 @@ from dataclasses import replace
 
 import pytest
 
-from ast_sim.model.ast import build_model
-from ast_sim.model.config import PRESETS
+from ast_sim.model.ast_config import PRESETS
+from ast_sim.models import build_model
 
 MESH = 18048 + 17280 + 134144 + 2 * 99840  # encoders, e2m, m2c, c2m = 369152
 

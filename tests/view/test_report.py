@@ -141,7 +141,7 @@ def test_tiles_state_ratio_speed_and_failures():
 
 def test_a_failed_rollout_has_no_figure():
     failed = evaluation({"a": None})
-    failed["summary"]["ast"]["displacement"]["rollout_all"]["normal"]["rmse_sequence"] = None
+    failed["summary"]["model"]["displacement"]["rollout_all"]["normal"]["rmse_sequence"] = None
     tile = tables.tiles(failed)[0]
     assert tile["value"] is None and tile["detail"] == "no figure, as a rollout failed"
 

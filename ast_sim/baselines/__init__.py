@@ -1,0 +1,1 @@
+"""What AST is compared with: models of other papers behind the same interface."""

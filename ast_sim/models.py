@@ -1,0 +1,49 @@
+"""All models by name: their settings, their classes, their presets."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from ast_sim.errors import ConfigError
+from ast_sim.model.ast import AST
+from ast_sim.model.ast_config import PRESETS as AST_PRESETS
+from ast_sim.model.ast_config import ASTConfig
+from ast_sim.model.config import ModelConfig, Preset
+from ast_sim.model.simulator import Simulator
+
+AnyConfig = ASTConfig
+
+
+@dataclass(frozen=True)
+class Model:
+    """A model as a user chooses it."""
+
+    config: type[ModelConfig]
+    simulator: type[Simulator]
+    presets: Mapping[str, Preset]
+
+
+MODELS = {
+    "ast": Model(ASTConfig, AST, AST_PRESETS),
+}
+
+
+def build_model(config: ModelConfig) -> Simulator:
+    """The model of resolved settings."""
+    return MODELS[config.name].simulator(config)
+
+
+def find_preset(model: str, preset: str) -> Preset:
+    """A preset of a model by name.
+
+    Raises:
+        ConfigError: there is none; the nearest is named.
+    """
+    for what, name, known in (("model", model, MODELS), (f"preset of {model}", preset, None)):
+        known = MODELS[model].presets if known is None else known
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1, 0)
+            raise ConfigError(f"there is no {what} {name!r}: did you mean {near[0]}? There are {', '.join(known)}")
+    return MODELS[model].presets[preset]
