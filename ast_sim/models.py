@@ -6,6 +6,8 @@ import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from ast_sim.baselines.mgn import MGN, MGNConfig
+from ast_sim.baselines.mgn import PRESETS as MGN_PRESETS
 from ast_sim.errors import ConfigError
 from ast_sim.model.ast import AST
 from ast_sim.model.ast_config import PRESETS as AST_PRESETS
@@ -13,7 +15,7 @@ from ast_sim.model.ast_config import ASTConfig
 from ast_sim.model.config import ModelConfig, Preset
 from ast_sim.model.simulator import Simulator
 
-AnyConfig = ASTConfig
+AnyConfig = ASTConfig | MGNConfig
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,7 @@ class Model:
 
 MODELS = {
     "ast": Model(ASTConfig, AST, AST_PRESETS),
+    "mgn": Model(MGNConfig, MGN, MGN_PRESETS),
 }
 
 

@@ -1,0 +1,126 @@
+"""What the models with world edges share: settings, inputs, the MLP of MeshGraphNets and the outputs.
+
+Legend: N nodes, E elements, M mesh edges, W world edges.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import torch
+from torch import Tensor, nn
+
+from ast_sim.baselines.world_edges import world_edges
+from ast_sim.data.batch import Batch
+from ast_sim.data.file import DatasetInfo
+from ast_sim.data.graph import edge_vectors
+from ast_sim.model.config import ModelConfig, setting
+from ast_sim.model.features import node_features, normalizer_of
+from ast_sim.model.linear import Linear
+from ast_sim.model.mlp import MLP
+from ast_sim.model.normalizer import FeatureNormalizer
+from ast_sim.model.simulator import Prediction, Simulator
+from ast_sim.ops.edges import EdgeSet
+
+_VECTOR = [("vector", 3), ("scalar", 1)]  # a difference of positions and its length
+
+
+@dataclass(frozen=True)
+class WorldEdgeConfig(ModelConfig):
+    """Settings of a model with world edges. On moving meshes nodes have a velocity, and no state elsewhere."""
+
+    node_inputs: tuple[str, ...] = setting((), "node features: displacement, velocity, material")
+    hidden: int = setting(128, "width of node and edge features")
+    world_radius: float | None = setting(None, "length of world edges at most; unset: the dataset's contact radius")
+    most_world_edges: int | None = setting(None, "world edges of a scene at most, the shortest; unset: all")
+
+    def resolve(self, info: DatasetInfo, material_width: int, mesh_spacing: float) -> Self:
+        """See `ModelConfig`."""
+        resolved = super().resolve(info, material_width, mesh_spacing)
+        radius = float(info.contact_radius) if self.world_radius is None else self.world_radius
+        return replace(resolved, world_radius=radius)
+
+    def facts(self, length_unit: str, mesh_spacing: float | None = None) -> dict[str, str]:
+        """See `ModelConfig`."""
+        share = f" = {self.world_radius / mesh_spacing:.2g} x mesh spacing" if mesh_spacing else ""
+        return {"World": f"edges up to {self.world_radius:.3g} {length_unit}{share}"}
+
+
+class WorldEdgeSimulator(Simulator):
+    """A model on mesh edges and world edges, with the inputs of MeshGraphNets (section A.1).
+
+    Nodes: type, what `node_inputs` names, motion of the boundary. Mesh edges [M, 8]: differences of the rest positions
+    and of the positions, each with its length. World edges [W, 4]: differences of the positions, with their length.
+    """
+
+    config: WorldEdgeConfig
+
+    def __init__(self, config: WorldEdgeConfig):
+        super().__init__(config)
+        self.node_inputs = normalizer_of(config, "node")
+        self.mesh_inputs = FeatureNormalizer([*_VECTOR, *_VECTOR])
+        self.world_inputs = FeatureNormalizer(_VECTOR)
+
+    def world(self, batch: Batch) -> EdgeSet:
+        """The world edges of a batch."""
+        return world_edges(batch, self.config.world_radius, self.config.most_world_edges)
+
+    def observe(self, batch: Batch) -> None:
+        """Add the batch to the statistics of the inputs."""
+        self.node_inputs.observe(node_features(self.config, batch))
+        self.mesh_inputs.observe(mesh_features(batch))
+        self.world_inputs.observe(edge_vectors(self.world(batch), batch.position, batch.position))
+
+    def nodes(self, batch: Batch) -> Tensor:
+        """Normalised inputs of the nodes, [N, *]."""
+        return self.node_inputs(node_features(self.config, batch))
+
+    def mesh_edges(self, batch: Batch) -> Tensor:
+        """Normalised inputs of the mesh edges, [M, 8]."""
+        return self.mesh_inputs(mesh_features(batch))
+
+    def world_edges(self, batch: Batch, world: EdgeSet) -> Tensor:
+        """Normalised inputs of the world edges, [W, 4]."""
+        return self.world_inputs(edge_vectors(world, batch.position, batch.position))
+
+
+def mesh_features(batch: Batch) -> Tensor:
+    """[M, 8]: [dp0, |dp0|, dp, |dp|] with d = sender - receiver."""
+    graph = batch.graph
+    return torch.cat([graph.rest_edges, edge_vectors(graph.m2m, batch.position, batch.position)], dim=1)
+
+
+class DeepMLP(nn.Module):
+    """Two hidden layers with ReLU and a linear one (MeshGraphNets, section A.1), then LayerNorm unless it decodes."""
+
+    def __init__(self, inputs: int, hidden: int, outputs: int, norm: bool = True):
+        super().__init__()
+        self.first = Linear(inputs, hidden)
+        nn.init.xavier_uniform_(self.first.weight)
+        nn.init.zeros_(self.first.bias)
+        self.rest = MLP(hidden, hidden, outputs, factorized=False)
+        self.norm = nn.LayerNorm(outputs) if norm else None
+
+    def forward(self, x: Tensor, residual: Tensor | None = None) -> Tensor:
+        """x [*, inputs] -> [*, outputs], plus the residual."""
+        return self.rest(self.first(x, "relu"), norm=self.norm, residual=residual)
+
+
+class Decoder(nn.Module):
+    """Node features [N, hidden] -> motion, and stress where the data has it: of the nodes, or of the elements from the
+    mean over their nodes."""
+
+    def __init__(self, config: WorldEdgeConfig):
+        super().__init__()
+        self.stress = config.stress
+        self.of_nodes = DeepMLP(config.hidden, config.hidden, 4 if config.stress == "node" else 3, norm=False)
+        if config.stress == "element":
+            self.of_elements = DeepMLP(config.hidden, config.hidden, 1, norm=False)
+
+    def forward(self, nodes: Tensor, batch: Batch) -> Prediction:
+        out = self.of_nodes(nodes)
+        stress = out[:, 3:] if self.stress == "node" else None
+        if self.stress == "element":
+            stress = self.of_elements(batch.graph.element_mean(nodes))
+        return Prediction(out[:, :3], stress)

@@ -1,0 +1,114 @@
+"""MeshGraphNets (Pfaff et al. 2021, arXiv 2010.03409): encode, process by message passing on two edge sets, decode.
+
+A block, with LN an MLP that ends in a LayerNorm:
+
+    e'_ij = LN_M(e_ij, v_i, v_j),    w'_ij = LN_W(w_ij, v_i, v_j),    v'_j = LN_V(v_j, sum_i e'_ij, sum_i w'_ij)
+
+and e, w and v grow by what was found. The first layer acts on its inputs separately, so that of the nodes is applied to
+nodes, not to edges.
+
+Legend: N nodes, M edges of a set.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from ast_sim.baselines.common import Decoder, DeepMLP, WorldEdgeConfig, WorldEdgeSimulator
+from ast_sim.data.batch import Batch
+from ast_sim.model.config import Preset, setting
+from ast_sim.model.simulator import Prediction
+from ast_sim.ops.edges import EdgeSet
+from ast_sim.ops.linear import linear
+from ast_sim.ops.segment import segment_sum
+
+
+@dataclass(frozen=True)
+class MGNConfig(WorldEdgeConfig):
+    """The settings of MeshGraphNets."""
+
+    name: Literal["mgn"] = setting("mgn", "MeshGraphNets")
+    blocks: int = setting(15, "message-passing blocks, none of which share weights")
+
+
+class EdgeUpdate(nn.Module):
+    """New latents of the edges of one set and their sums at the receivers."""
+
+    def __init__(self, hidden: int):
+        super().__init__()
+        self.hidden = hidden
+        self.update = DeepMLP(3 * hidden, hidden, hidden)
+
+    def forward(self, edges: EdgeSet, latents: Tensor, nodes: Tensor) -> tuple[Tensor, Tensor]:
+        """latents [M, hidden], nodes [N, hidden] -> latents with what was found, and its sums [N, hidden]."""
+        mlp = self.update
+        of_edge, of_sender, of_receiver = mlp.first.weight.split(self.hidden, dim=1)
+        of_nodes = linear(nodes, of_sender).index_select(0, edges.senders)
+        of_nodes = of_nodes + linear(nodes, of_receiver, mlp.first.bias).index_select(0, edges.receivers)
+        found = mlp.rest(torch.relu(linear(latents, of_edge, residual=of_nodes)), norm=mlp.norm)
+        order = torch.arange(len(found))
+        return latents + found, segment_sum(found, order, edges.receiver_offsets)
+
+
+class Block(nn.Module):
+    """One step on both edge sets."""
+
+    def __init__(self, hidden: int):
+        super().__init__()
+        self.mesh, self.world = EdgeUpdate(hidden), EdgeUpdate(hidden)
+        self.node = DeepMLP(3 * hidden, hidden, hidden)
+
+    def forward(
+        self, nodes: Tensor, mesh: tuple[EdgeSet, Tensor], world: tuple[EdgeSet, Tensor]
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Nodes [N, hidden] and the latents of both sets, after the step."""
+        on_mesh, mesh_sum = self.mesh(*mesh, nodes)
+        on_world, world_sum = self.world(*world, nodes)
+        return self.node(torch.cat([nodes, mesh_sum, world_sum], dim=1), residual=nodes), on_mesh, on_world
+
+
+class MGN(WorldEdgeSimulator):
+    """MeshGraphNets."""
+
+    config: MGNConfig
+
+    def __init__(self, config: MGNConfig):
+        super().__init__(config)
+        width = config.hidden
+        self.node_encoder = DeepMLP(self.node_inputs.width, width, width)
+        self.mesh_encoder = DeepMLP(self.mesh_inputs.width, width, width)
+        self.world_encoder = DeepMLP(self.world_inputs.width, width, width)
+        self.blocks = nn.ModuleList(Block(width) for _ in range(config.blocks))
+        self.decoder = Decoder(config)
+
+    def forward(self, batch: Batch) -> Prediction:
+        """Normalised outputs for the frame after `batch`."""
+        mesh, world = batch.graph.m2m, self.world(batch)
+        nodes = self.node_encoder(self.nodes(batch))
+        on_mesh = self.mesh_encoder(self.mesh_edges(batch))
+        on_world = self.world_encoder(self.world_edges(batch, world))
+        for block in self.blocks:
+            nodes, on_mesh, on_world = block(nodes, (mesh, on_mesh), (world, on_world))
+        return self.decoder(nodes, batch)
+
+
+PRESETS = {
+    # A size that two cores train in minutes.
+    "tiny": Preset(
+        MGNConfig(hidden=64, blocks=8), {"batch_size": 4, "peak_rate": 5e-4, "stress_weight": 0.1}, adapts=True
+    ),
+    # As the AST paper trains it (sections "Batch Size and Learning Rate", "Baselines").
+    "paper": Preset(
+        MGNConfig(), {"batch_size": 48, "peak_rate": 1e-4, "noise": 0.003, "stress_weight": 0.01}, adapts=True
+    ),
+    # As its authors train it, but for their schedule: 0.1^(step / 5e6) over 1e7 steps.
+    "original": Preset(
+        MGNConfig(),
+        {"steps": 10_000_000, "batch_size": 2, "peak_rate": 1e-4, "warmup": 0, "noise": 0.003, "stress_weight": 1.0},
+        adapts=True,
+    ),
+}

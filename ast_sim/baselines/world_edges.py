@@ -1,0 +1,60 @@
+"""World edges: nodes that are close in space and no neighbours on the mesh (MeshGraphNets, section 3.1)."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import torch
+from scipy.spatial import KDTree
+
+from ast_sim.data.batch import Batch
+from ast_sim.ops.edges import EdgeSet
+
+
+def world_edges(batch: Batch, radius: float, most: int | None) -> EdgeSet:
+    """All pairs of nodes of one scene at most `radius` apart that share no mesh edge, in both directions.
+
+    They are found anew for the positions of the batch, in O(N log N + pairs), and depend on the scene alone.
+
+    Args:
+        batch: positions, and the mesh edges `m2m` of its graph.
+        radius: in units of length; 0 gives no edges.
+        most: pairs of a scene at most: the shortest are kept (of equally long ones those of the lowest nodes), and a
+            warning says so once. None keeps all.
+    """
+    graph = batch.graph
+    offsets, position = graph.node_offsets.tolist(), batch.position.double().numpy()
+    mesh = _keys(graph.m2m.senders.numpy(), graph.m2m.receivers.numpy(), len(position))
+    found = [start + _pairs(position[start:end], radius) for start, end in zip(offsets[:-1], offsets[1:], strict=True)]
+    kept = [_shortest(_without(pairs, mesh, len(position)), position, most) for pairs in found]
+    first, second = torch.from_numpy(np.concatenate(kept) if kept else np.zeros((0, 2), np.int64)).unbind(1)
+    return EdgeSet.from_pairs(torch.cat([first, second]), torch.cat([second, first]), len(position), len(position))
+
+
+def _pairs(position: np.ndarray, radius: float) -> np.ndarray:
+    """[P, 2] int64: pairs (i, j), i < j, at most `radius` apart, in ascending order."""
+    if radius <= 0 or len(position) < 2:
+        return np.zeros((0, 2), np.int64)
+    pairs = KDTree(position).query_pairs(radius, output_type="ndarray").astype(np.int64)
+    return pairs[np.argsort(_keys(pairs[:, 0], pairs[:, 1], len(position)))]
+
+
+def _keys(first: np.ndarray, second: np.ndarray, num: int) -> np.ndarray:
+    return first * num + second
+
+
+def _without(pairs: np.ndarray, mesh: np.ndarray, num: int) -> np.ndarray:
+    """The pairs that are no mesh edge."""
+    return pairs[~np.isin(_keys(pairs[:, 0], pairs[:, 1], num), mesh)]
+
+
+def _shortest(pairs: np.ndarray, position: np.ndarray, most: int | None) -> np.ndarray:
+    if most is None or len(pairs) <= most:
+        return pairs
+    # The same text for all scenes: Python shows it once.
+    warnings.warn(
+        f"more world edges than model.most_world_edges = {most}: the shortest of a scene are kept", stacklevel=3
+    )
+    lengths = np.linalg.norm(position[pairs[:, 0]] - position[pairs[:, 1]], axis=1)
+    return pairs[np.sort(np.argsort(lengths, kind="stable")[:most])]

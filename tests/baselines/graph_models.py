@@ -1,0 +1,86 @@
+"""What the tests of the models with world edges share: a batch of small scenes and the formulas in plain torch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+import toy
+from torch import Tensor
+
+from ast_sim.data.batch import Batch
+from ast_sim.data.graph import Graph
+from ast_sim.model.config import ModelConfig
+from ast_sim.model.simulator import Prediction, Simulator
+from ast_sim.models import build_model
+
+Parameters = dict[str, Tensor]
+
+
+def resolved(config: ModelConfig, radius: float = 0.06, **kind: bool) -> ModelConfig:
+    """The settings on the data of tests/toy.py, with world edges between plate and block, and within the plate."""
+    return replace(config, world_radius=radius).resolve(toy.info(**kind), 0, 0.1)
+
+
+def batch_of(model: Simulator, *seeds: int) -> Batch:
+    """One batch of toy scenes in frame 3."""
+    scenes = [toy.plate(seed, dynamic=model.config.dynamic) for seed in seeds]
+    graph = Graph.concatenate([model.graph(t.scene) for t in scenes])
+    before, now, after = (torch.from_numpy(np.concatenate([t.position[i] for t in scenes])) for i in (2, 3, 4))
+    motion = torch.where(graph.prescribed[:, None], after - now, 0.0)
+    return Batch(graph, now, before if model.config.dynamic else None, motion, None, [f"scene {s}" for s in seeds])
+
+
+def made(config: ModelConfig, *seeds: int) -> tuple[Simulator, Batch]:
+    """A model with statistics of its inputs, and the batch that they are taken from."""
+    torch.manual_seed(0)
+    model = build_model(config)
+    batch = batch_of(model, *seeds)
+    model.observe(batch)
+    for module in model.modules():
+        if hasattr(module, "fix"):
+            module.fix()
+    return model, batch
+
+
+def deep_mlp(p: Parameters, name: str, x: Tensor) -> Tensor:
+    """Linear, ReLU, Linear, ReLU, Linear, and LayerNorm if it has one."""
+    x = F.relu(F.linear(x, p[f"{name}.first.weight"], p[f"{name}.first.bias"]))
+    x = F.relu(F.linear(x, p[f"{name}.rest.first.weight"], p[f"{name}.rest.first.bias"]))
+    x = F.linear(x, p[f"{name}.rest.second.weight"], p[f"{name}.rest.second.bias"])
+    if f"{name}.norm.weight" in p:
+        x = F.layer_norm(x, x.shape[-1:], p[f"{name}.norm.weight"], p[f"{name}.norm.bias"])
+    return x
+
+
+def assert_follows(model: Simulator, batch: Batch, formulas: Callable[[Parameters, torch.dtype], Prediction]) -> None:
+    """The accuracy rule for outputs and the gradients of all parameters, against the formulas in float64."""
+
+    def results(out: Prediction, parameters: list[Tensor]) -> list[Tensor]:
+        outputs = [x for x in (out.motion, out.stress) if x is not None]
+        generator = torch.Generator().manual_seed(7)
+        weights = [torch.randn(x.shape, generator=generator, dtype=torch.float64).to(x.dtype) for x in outputs]
+        total = sum((x * w).sum() for x, w in zip(outputs, weights, strict=True))
+        return [*outputs, *torch.autograd.grad(total, parameters)]
+
+    def by_formulas(dtype: torch.dtype) -> list[Tensor]:
+        p = {
+            k: v.detach().to(dtype).requires_grad_(v.requires_grad) for k, v in model.state_dict(keep_vars=True).items()
+        }
+        return results(formulas(p, dtype), [p[k] for k, _ in model.named_parameters()])
+
+    names = ["motion", *(["stress"] if model.config.stress != "none" else [])]
+    names += [name for name, _ in model.named_parameters()]
+    ours, plain, exact = (
+        results(model(batch), list(model.parameters())),
+        by_formulas(torch.float32),
+        by_formulas(torch.float64),
+    )
+    for name, *found in zip(names, ours, plain, exact, strict=True):
+        c, t, e = (x.detach() for x in found)
+        bound = 2 * float((t - e).abs().max()) + 1e-6 * float(e.abs().max())
+        assert float((c - e).abs().max()) <= bound, (name, float((c - e).abs().max()), bound)
+        assert float(e.abs().max()) > 0, name
