@@ -52,13 +52,22 @@ def from_toml(cls: type[T], text: str) -> T:
     """Read settings; keys that are left out take their defaults.
 
     Raises:
-        ConfigError: text that is not TOML, an unknown key (the nearest known one is named), a missing key without a
-            default, a value of the wrong type.
+        ConfigError: text that is not TOML, or values as `from_values` refuses them.
     """
     try:
         values = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ConfigError(f"the settings are not valid TOML: {error}") from error
+    return from_values(cls, values)
+
+
+def from_values(cls: type[T], values: Mapping[str, Any]) -> T:
+    """Settings of a TOML table that has been read.
+
+    Raises:
+        ConfigError: an unknown key (the nearest known one is named), a missing key without a default, a value of the
+            wrong type.
+    """
     return _build(cls, values, cls, "")
 
 

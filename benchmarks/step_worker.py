@@ -31,9 +31,10 @@ M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = -3, -1  # malloc.h of glibc
 
 
 class Setup(NamedTuple):
-    """What a worker trains: a dataset, a preset and its settings; `folder` is for what it writes."""
+    """What a worker trains: a dataset, a model, a preset and its settings; `folder` is for what it writes."""
 
     data: str
+    model: str
     preset: str
     settings: list[str]
     folder: str
@@ -99,13 +100,14 @@ def main() -> None:
         dataset = stack.enter_context(Dataset(Path(setup.data)))
         run = stack.enter_context(tempfile.TemporaryDirectory(dir=setup.folder))
         scales = measure(dataset)
-        config = resolve_run(configure(Path(setup.data), setup.preset, setup.settings), dataset, scales)
+        config = resolve_run(configure(Path(setup.data), setup.preset, setup.settings, setup.model), dataset, scales)
         training = stack.enter_context(Training(Path(run), config, dataset, scales, StopSignals()))
         training.prepare()
         roll = rollout_step(training)
         rolled_out = rolling_out(training)  # decorates what asks for rollout steps
         answers: dict[str, Callable[[int], object]] = {
             "step": lambda count: mean_seconds(training.advance, count),
+            "batch": lambda _: training.options.batch_size * training.options.accumulate,
             "rollout": rolled_out(lambda count: mean_seconds(roll, count)),
             "profile": lambda count: shares(training.advance, count),
             "profile_rollout": rolled_out(lambda count: shares(roll, count)),

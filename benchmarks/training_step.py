@@ -71,7 +71,7 @@ def _environment() -> dict[str, str]:
 
 def measure(case: scenes.Case, threads: int, repeats: int, limit: float | None, folder: Path) -> list[dict]:
     """The records of one preset: its training step and its rollout step."""
-    setup = Setup(str(case.data), case.preset, case.settings, str(folder))
+    setup = Setup(str(case.data), "ast", case.preset, case.settings, str(folder))
     missing: dict[str, str] = {}
     with ExitStack() as stack:
         workers: dict[str, Worker] = {}

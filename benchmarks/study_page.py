@@ -1,0 +1,216 @@
+"""docs/study.md of all studies that have a result, and their curves.
+
+`python -m benchmarks.study_page` writes it anew from benchmarks/results.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("svg")
+matplotlib.rcParams["svg.hashsalt"] = "ast_sim"
+
+from matplotlib import pyplot  # noqa: E402 (the backend has to be chosen before)
+
+INTRODUCTION = """# The models compared
+
+Made by `python -m benchmarks.study STUDY.toml`; the studies lie in `benchmarks/studies`. All runs of a study have the
+same scenes, splits, state noise and budget; each model has the learning rate of those tried with which its rollouts of
+the validation scenes are best, and the checkpoint that is evaluated is chosen by such rollouts, too. Errors are those
+of the test scenes, on nodes that the model moves: root mean squares over coordinates, by sequence (`rmse_sequence`, as
+in the AST paper) or pooled over everything (`rmse_pooled`, as in MeshGraphNets); means over the seeds, with the least
+and the largest in brackets.
+"""
+
+Run = dict[str, Any]
+
+
+def write_page(results: Path, docs: Path) -> None:
+    """Write study.md and its pictures into `docs`, from the files study_*.json in `results`."""
+    parts = [INTRODUCTION]
+    for file in sorted(results.glob("study_*.json")):
+        found = json.loads(file.read_text(encoding="utf-8"))
+        name = file.stem.removeprefix("study_")
+        draw(found, docs / "study" / f"{name}.svg")
+        parts.append(section(found, name))
+    (docs / "study.md").write_text("\n".join(parts), encoding="utf-8")
+
+
+def section(found: dict[str, Any], name: str) -> str:
+    """One study: what it is, errors, errors by phase, cost, learning rates."""
+    study, models = found["study"], found["models"]
+    budget = f"{study['minutes']:g} minutes" if study["minutes"] is not None else f"{study['samples']:,} frame pairs"
+    lines = [f"## {study['title']}", "", *([study["about"], ""] if study["about"] else [])]
+    lines += [
+        f"{scenes(found['scenes'], study['data'])}; {budget} of training on {study['threads']} thread(s), seeds"
+        f" {', '.join(map(str, study['seeds']))}; commit {(found['commit'] or '?')[:10]}, {found['processor']}.",
+        "",
+    ]
+    lines += [*table(models, ERRORS), "", *trivial(models), ""]
+    if any(measured(run).get("phases") for model in models.values() for run in model["runs"]):
+        lines += ["Error by phase of contact, full rollout, mm (`rmse_sequence`):", "", *table(models, BY_PHASE), ""]
+    lines += [*table(models, COST), "", *divergences(models, study["horizons"]), ""]
+    lines += [f"![Validation error over training time](study/{name}.svg)", ""]
+    return "\n".join(lines)
+
+
+def scenes(counts: dict[str, Any], data: dict[str, Any]) -> str:
+    """What the runs were trained and tested on."""
+    size = "".join(f", {data[key]:,} {key}" for key in ("nodes", "frames") if data[key] is not None)
+    numbers = f"{counts['train']} scenes to train on, {counts['valid']} to validate, {counts['test']} to test"
+    return f"`{counts['name']}`: {numbers}{size}"
+
+
+def measured(run: Run) -> dict[str, Any]:
+    """What was found of a run on the test scenes; nothing if it failed."""
+    return run.get("measured", {})
+
+
+def _error(predictor: str, quantity: str, horizon: str, nodes: str, key: str, scale: float) -> Callable[[Run], Any]:
+    def value(run: Run) -> float | None:
+        summary = measured(run).get("summary", {}).get(predictor, {}).get(quantity)
+        found = None if summary is None else summary[horizon][nodes][key]
+        return None if found is None else scale * found
+
+    return value
+
+
+def _displacement(horizon: str, key: str = "rmse_sequence", predictor: str = "model") -> Callable[[Run], Any]:
+    return _error(predictor, "displacement", horizon, "normal", key, 1e3)
+
+
+def _phase(name: str) -> Callable[[Run], Any]:
+    def value(run: Run) -> float | None:
+        found = measured(run).get("phases", {}).get(name)
+        return None if found is None else 1e3 * found["rmse_sequence"]
+
+    return value
+
+
+def _of_samples(run: Run, key: str) -> float | None:
+    values = [sample[key] for sample in measured(run).get("samples", [])]
+    return None if not values or None in values else 1e3 * statistics.fmean(values)
+
+
+Columns = dict[str, Callable[[Run], Any]]
+ERRORS: Columns = {
+    "1 step, mm": _displacement("one_step"),
+    "50 steps, mm": _displacement("rollout_50"),
+    "rollout, mm": _displacement("rollout_all"),
+    "pooled, mm": _displacement("rollout_all", "rmse_pooled"),
+    "stress, 1 step, kPa": _error("model", "stress", "one_step", "deforming", "rmse_sequence", 1e-3),
+    "stress, rollout, kPa": _error("model", "stress", "rollout_all", "deforming", "rmse_sequence", 1e-3),
+}
+BY_PHASE: Columns = {
+    "before contact": _phase("before"),
+    "first contact": _phase("first"),
+    "full contact": _phase("full"),
+    "release": _phase("release"),
+}
+COST: Columns = {
+    "rate": lambda run: run["rate"],
+    "parameters": lambda run: measured(run).get("parameters"),
+    "batch": lambda run: run["batch"],
+    "ms a training step": lambda run: 1e3 * run["seconds_per_step"],
+    "ms a frame pair": lambda run: 1e3 * run["seconds_per_step"] / run["batch"],
+    "steps": lambda run: run["steps"],
+    "trained, min": lambda run: run["train_seconds"] / 60,
+    "peak memory, GB": lambda run: run["peak_resident_bytes"] / 1e9,
+    "ms a rollout step": lambda run: _of_samples(run, "model_seconds_per_step"),
+}
+
+
+def table(models: dict[str, Any], columns: Columns) -> list[str]:
+    """A row a model, a column a figure; columns that no run has are left out."""
+    cells = {
+        name: {column: of_seeds(model["runs"], value) for column, value in columns.items()}
+        for name, model in models.items()
+    }
+    shown = [column for column in columns if any(row[column] for row in cells.values())]
+    if not shown:
+        return []
+    lines = [f"| model | {' | '.join(shown)} |", f"| --- |{' ---: |' * len(shown)}"]
+    return lines + [f"| {name} | {' | '.join(row[column] or '-' for column in shown)} |" for name, row in cells.items()]
+
+
+def of_seeds(runs: list[Run], value: Callable[[Run], Any]) -> str:
+    """Mean, and the least and the most in brackets where runs differ; "failed" if a run that has results has none."""
+    values = [value(run) for run in runs]
+    if all(x is None for x in values):
+        return "failed" if any("failed" in run for run in runs) else ""
+    if any(x is None for x in values):
+        return "failed"
+    mean = number(statistics.fmean(values))
+    ends = [number(end(values)) for end in (min, max)]
+    return mean if ends[0] == ends[1] else f"{mean} [{ends[0]}, {ends[1]}]"
+
+
+def number(x: float) -> str:
+    """Three significant digits, more where whole."""
+    return f"{x:,.0f}" if abs(x) >= 1000 else f"{x:.3g}"
+
+
+def trivial(models: dict[str, Any]) -> list[str]:
+    """What predictors without a model reach on the same scenes."""
+    runs = [run for model in models.values() for run in model["runs"] if measured(run)]
+    if not runs:
+        return []
+    texts = [
+        f"{what} {number(error)} mm"
+        for what, error in (
+            ("one step: hold still", _displacement("one_step", predictor="hold_still")(runs[0])),
+            ("repeat the last increment", _displacement("one_step", predictor="repeat_last")(runs[0])),
+            ("rollout: hold still", _displacement("rollout_all", predictor="hold_still")(runs[0])),
+        )
+        if error is not None
+    ]
+    return [f"Without a model: {', '.join(texts)}."]
+
+
+def divergences(models: dict[str, Any], horizons: int) -> list[str]:
+    """Which runs did not stay finite in the long rollouts, and when."""
+    lines = []
+    for name, model in models.items():
+        for run in model["runs"]:
+            if "failed" in run:
+                lines.append(f"- {name}, seed {run['seed']}: not evaluated: {run['failed']}")
+            lines += [f"- {name}, seed {run['seed']}: {text}" for text in measured(run).get("diverged", {}).values()]
+    farthest = {
+        name: max(measured(run).get("farthest", math.nan) for run in model["runs"]) for name, model in models.items()
+    }
+    reach = ", ".join(f"{name} {value:.2g}" for name, value in farthest.items() if not math.isnan(value))
+    first = f"Rolled out for {horizons} times the length of the scenes"
+    told = (
+        f"{first}, these did not stay finite:" if lines else f"{first}, every model stays finite on every test scene."
+    )
+    return [told, *lines, "", f"Farthest node from the centre, over the farthest of the truth: {reach}."]
+
+
+def draw(found: dict[str, Any], file: Path) -> None:
+    """Validation error over the seconds of training, a line a model; thin lines are its other seeds."""
+    figure, axes = pyplot.subplots(figsize=(7.2, 4.4), layout="constrained")
+    for number_, (name, model) in enumerate(found["models"].items()):
+        for i, run in enumerate(model["runs"]):
+            points = [(p["seconds"] / 60, 1e3 * p["valid_rmse"]) for p in run["curve"] if p["valid_rmse"] is not None]
+            if points:
+                width = 1.6 if i == 0 else 0.7
+                axes.plot(
+                    *zip(*points, strict=True), ".-", color=f"C{number_}", linewidth=width, label=None if i else name
+                )
+    axes.set(xlabel="training, minutes", ylabel="rollout error on validation scenes, mm", yscale="log")
+    axes.grid(alpha=0.3, which="both")
+    axes.legend(fontsize="small")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(file, metadata={"Date": None})
+    pyplot.close(figure)
+
+
+if __name__ == "__main__":
+    write_page(Path("benchmarks/results"), Path("docs"))

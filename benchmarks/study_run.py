@@ -1,0 +1,139 @@
+"""One run of a study: its speed is measured, it is trained for the budget, its best checkpoint is evaluated.
+
+Each stage leaves a file in the run's folder and is not done again: `budget.json`, the run itself, `result.json`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import statistics
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ast_sim.errors import ConfigError
+from ast_sim.results import write_json
+from ast_sim.run import Metrics, TrainConfig, read_config
+from benchmarks.step_worker import Setup
+from benchmarks.study_plan import Entry, Study
+from benchmarks.training_step import Worker
+
+WARM_UP, STEPS, REPEATS = 5, 10, 3  # training steps before the speed is measured, in a repeat, and repeats
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run: which entry, from which seed, with which rate."""
+
+    study: Study
+    name: str
+    entry: Entry
+    seed: int
+    rate: float
+    data: Path
+    folder: Path
+
+    @property
+    def settings(self) -> list[str]:
+        """What is set beyond the preset, the steps excepted."""
+        return [*self.entry.settings, f"train.seed={self.seed}", f"train.peak_rate={self.rate}"]
+
+    def environment(self) -> dict[str, str]:
+        threads = str(self.study.threads)
+        return {**os.environ, "OMP_NUM_THREADS": threads, "MKL_NUM_THREADS": threads}
+
+
+def run(job: Job) -> dict[str, Any]:
+    """The record of a run: what it took, how its validations went, its errors; `failed` says why there are none."""
+    result = job.folder / "result.json"
+    if not result.exists():
+        job.folder.mkdir(parents=True, exist_ok=True)
+        write_json(result, _made(job))
+    return json.loads(result.read_text(encoding="utf-8"))
+
+
+def _made(job: Job) -> dict[str, Any]:
+    budget = _budget(job)
+    record = {"name": job.name, "seed": job.seed, "rate": job.rate, **budget}
+    steps, every = budget["steps"], max(1, budget["steps"] // job.study.validations)
+    settings = [*job.settings, f"train.steps={steps}", f"train.validate_every={every}", f"train.log_every={every}"]
+    arguments = ["--model", job.entry.model, "--preset", job.entry.preset]
+    arguments += [word for setting in settings for word in ("--set", setting)]
+    train = ["-m", "ast_sim.cli", "train", str(job.data), "--out", str(job.folder / "run"), "--resume", *arguments]
+    code, peak = _python(job, train, "train.log")
+    record |= {"peak_resident_bytes": peak, **_training(job.folder / "run")}
+    if code != 0:
+        return {**record, "failed": _last_line(job.folder / "train.log")}
+    measured = job.folder / "measured.json"
+    words = ["-m", "benchmarks.study_measure", str(job.folder / "run"), str(job.study.horizons), str(measured)]
+    code, _ = _python(job, words, "measure.log")
+    if code != 0:
+        return {**record, "failed": _last_line(job.folder / "measure.log")}
+    return {**record, "measured": json.loads(measured.read_text(encoding="utf-8"))}
+
+
+def _budget(job: Job) -> dict[str, Any]:
+    """Steps that the budget allows; seconds a step, without validations and checkpoints, as they were measured."""
+    file = job.folder / "budget.json"
+    if file.exists():
+        return json.loads(file.read_text(encoding="utf-8"))
+    entry = job.entry
+    setup = Setup(str(job.data), entry.model, entry.preset, job.settings, str(job.folder))
+    worker = Worker("c", job.study.threads, setup, job.folder / "speed.log")
+    try:
+        worker.ask("step", WARM_UP)
+        seconds = statistics.median(worker.ask("step", STEPS) for _ in range(REPEATS))
+        batch = worker.ask("batch")
+    except RuntimeError as error:
+        raise ConfigError(f"{job.name}: {error}") from error
+    finally:
+        worker.close()
+    if job.study.minutes is not None:
+        steps = max(1, round(60 * job.study.minutes / seconds))
+    else:
+        steps = math.ceil(job.study.samples / batch)
+    budget = {"seconds_per_step": seconds, "batch": batch, "steps": steps}
+    write_json(file, budget)
+    return budget
+
+
+def _python(job: Job, words: list[str], log: str) -> tuple[int, int]:
+    """Exit code and peak resident bytes of a Python process whose output goes to a file."""
+    with open(job.folder / log, "a", encoding="utf-8") as out:
+        process = subprocess.Popen([sys.executable, *words], env=job.environment(), stdout=out, stderr=out)
+        try:
+            _, status, usage = os.wait4(process.pid, 0)
+        except BaseException:
+            process.terminate()
+            raise
+    process.returncode = os.waitstatus_to_exitcode(status)  # so that Popen does not wait for it once more
+    return process.returncode, usage.ru_maxrss * 1024
+
+
+def _training(folder: Path) -> dict[str, Any]:
+    """How the training went, from its metrics: losses and validations over the seconds spent in steps."""
+    lines = [line for line in Metrics(folder) if "loss" in line]
+    validations = {line["step"]: line for line in Metrics(folder) if "valid_rmse" in line}
+    curve, seconds, before = [], 0.0, 0
+    for line in lines:
+        seconds += line["seconds"] * (line["step"] - before)
+        before = line["step"]
+        valid = validations.get(line["step"], {})
+        curve.append({"step": before, "seconds": seconds, "loss": line["loss"], "valid_rmse": valid.get("valid_rmse")})
+    errors = [point["valid_rmse"] for point in curve if point["valid_rmse"] is not None]
+    options: TrainConfig | None = read_config(folder).train if (folder / "config.toml").exists() else None
+    return {
+        "curve": curve,
+        "train_seconds": seconds,
+        "best_valid": min(errors, default=None),
+        "noise": None if options is None else options.noise,
+    }
+
+
+def _last_line(log: Path) -> str:
+    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    return lines[-1] if lines else "it ended without a word"

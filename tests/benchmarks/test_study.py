@@ -1,0 +1,141 @@
+"""The protocol of a study: its file, the phases of contact, the choice of rates, a small one from end to end."""
+
+import json
+
+import numpy as np
+import pytest
+import toy
+from toy import one_thread  # noqa: F401
+
+from ast_sim.data.scene import Trajectory
+from ast_sim.errors import ConfigError
+from ast_sim.rollout import Rollout
+from benchmarks import study, study_page
+from benchmarks.study_measure import phase_errors, phases, repeated
+from benchmarks.study_plan import Data, Entry, Study, read
+
+TOML = """
+title = "Toy"
+samples = 16
+rates = [1e-3]
+validations = 2
+horizons = 3
+[data]
+path = "toy.h5"
+[models.ast]
+settings = ["model.hidden=16", "model.L_SA=1", "model.L_cell=3", "train.statistics_pairs=4"]
+"""
+
+
+def written(folder, text: str):
+    file = folder / "toy.toml"
+    file.write_text(text)
+    return file
+
+
+def test_the_file_says_what_is_compared(tmp_path):
+    plan, entries = read(written(tmp_path, TOML + '[models.other]\nmodel = "mgn"\nrates = [1e-4, 2e-4]'))
+    assert plan == Study("Toy", Data(path="toy.h5"), (1e-3,), samples=16, validations=2, horizons=3)
+    assert list(entries) == ["ast", "other"] and entries["other"] == Entry("mgn", rates=(1e-4, 2e-4))
+
+
+@pytest.mark.parametrize(
+    "old, new, message",
+    [
+        ("samples = 16", "", "either minutes or samples"),
+        ("samples = 16", "samples = 16\nminutes = 1", "either minutes or samples"),
+        ("rates = [1e-3]", "rates = []", "at least one of rates"),
+        ("title", "titel", "no setting titel; the nearest is title"),
+        ('path = "toy.h5"', 'path = "toy.h5"\nfamily = "abcd"', "either|family"),
+        ("[models.ast]", "[modles.ast]", "nothing to compare"),
+        ("settings = [", "setings = [", "no setting setings; the nearest is settings"),
+        ("[data]", "[data", "toy.toml: "),
+    ],
+)
+def test_a_wrong_file_is_refused_in_words(tmp_path, old, new, message):
+    with pytest.raises(ConfigError, match=message):
+        read(written(tmp_path, TOML.replace(old, new)))
+
+
+def touching(*area: float) -> Trajectory:
+    truth = toy.plate(0, frames=len(area))
+    return Trajectory(truth.scene, truth.position, truth.stress, {"contact_area": list(area)})
+
+
+def test_phases_follow_contact_and_the_deepest_frame():
+    # The block of the toy scenes is deepest in the middle, at frame 5 of 11.
+    truth = touching(0, 0, 1, 2, 2, 3, 2, 2, 1, 0, 0)
+    found = {name: np.flatnonzero(frames).tolist() for name, frames in phases(truth).items()}
+    assert found == {"before": [0, 1], "first": [2, 3, 4], "full": [5], "release": [6, 7, 8, 9, 10]}
+    never = phases(touching(0, 0, 0, 0, 0))
+    assert never["before"].all() and not any(never[name].any() for name in ("first", "full", "release"))
+    assert phases(toy.plate(0)) is None
+
+
+def test_errors_of_a_phase_are_those_of_its_frames():
+    truth = touching(0, 0, 1, 2, 2, 3, 2, 2, 1, 0, 0)
+    position = truth.position.copy()
+    position[3] += 0.5
+    found = phase_errors(truth, Rollout(position, None, 1))
+    normal = int((truth.scene.node_type == 0).sum())
+    assert found["first"].total == pytest.approx(0.25 * 3 * normal, rel=1e-5) and found["first"].count == 9 * normal
+    assert found["before"].count == 3 * normal  # frame 0 is given
+    assert found["before"].total == found["full"].total == found["release"].total == 0
+    assert phase_errors(truth, Rollout(position[:6], None, 1)) == {}
+
+
+def test_a_long_script_goes_forward_and_backward():
+    truth = toy.plate(0, frames=4)
+    assert np.array_equal(repeated(truth, 3).position, truth.position[[0, 1, 2, 3, 2, 1, 0, 1, 2, 3]])
+
+
+def test_each_model_has_the_rate_of_its_best_validation(monkeypatch, tmp_path):
+    errors = {("a", 1e-3): 2.0, ("a", 1e-4): 1.0, ("b", 1e-3): 3.0, ("b", 1e-4): None}
+
+    def record(job):
+        return {
+            "name": job.name,
+            "seed": job.seed,
+            "rate": job.rate,
+            "steps": 1,
+            "best_valid": errors[job.name, job.rate],
+        }
+
+    monkeypatch.setattr(study, "run", record)
+    plan = Study("x", Data(path="d"), (1e-3, 1e-4), seeds=(5, 6), samples=1)
+    found = study.conduct(plan, {"a": Entry(), "b": Entry()}, tmp_path, tmp_path, 2)
+    assert {name: model["rate"] for name, model in found.items()} == {"a": 1e-4, "b": 1e-3}
+    assert [run["seed"] for run in found["a"]["runs"]] == [5, 6]
+    assert found["a"]["search"] == {"0.001": 2.0, "0.0001": 1.0} and found["b"]["search"]["0.0001"] is None
+
+
+def test_a_small_study_from_end_to_end(tmp_path):
+    data = toy.write(tmp_path / "toy.h5")
+    plan, entries = read(written(tmp_path, TOML.replace("toy.h5", str(data))))
+    with pytest.raises(ConfigError, match="odd: .*no setting model.hiden"):
+        study.conduct(plan, {"odd": Entry(settings=("model.hiden=3",))}, data, tmp_path / "runs", 1)
+    found = study.conduct(plan, {"ast": entries["ast"]}, data, tmp_path / "runs", 1)
+    (made,) = found["ast"]["runs"]
+    assert made["steps"] == 4 and made["batch"] == 4 and made["seconds_per_step"] > 0
+    assert [point["step"] for point in made["curve"]] == [2, 4]
+    assert made["best_valid"] == min(point["valid_rmse"] for point in made["curve"])
+    summary = made["measured"]["summary"]["model"]["displacement"]["rollout_all"]["normal"]["rmse_sequence"]
+    assert made["measured"]["horizons"] == 3 and made["measured"]["diverged"] == {} and summary > 0
+    # Again: nothing is trained, the same record is read.
+    before = (tmp_path / "runs/ast/rate_0.001_seed_0/result.json").stat().st_mtime_ns
+    again = study.conduct(plan, {"ast": entries["ast"]}, data, tmp_path / "runs", 1)
+    assert again == found and (tmp_path / "runs/ast/rate_0.001_seed_0/result.json").stat().st_mtime_ns == before
+    page(tmp_path, found, summary)
+
+
+def page(folder, found, summary) -> None:
+    """The document has the figure, and the picture that it names."""
+    values = {"title": "Toy", "about": "", "minutes": None, "samples": 16, "threads": 1, "seeds": [0], "horizons": 3}
+    values["data"] = {"nodes": None, "frames": None}
+    scenes = {"name": "toy.h5", "train": 3, "valid": 2, "test": 2}
+    result = {"commit": None, "processor": "p", "study": values, "scenes": scenes, "models": found}
+    (folder / "study_toy.json").write_text(json.dumps(result))
+    study_page.write_page(folder, folder / "docs")
+    text = (folder / "docs/study.md").read_text()
+    assert f"{1e3 * summary:.3g}" in text and "every model stays finite" in text and "16 frame pairs" in text
+    assert (folder / "docs/study/toy.svg").read_text().startswith("<?xml")
