@@ -30,7 +30,7 @@ _VECTOR = [("vector", 3), ("scalar", 1)]  # a difference of positions and its le
 class WorldEdgeConfig(ModelConfig):
     """Settings of a model with world edges. On moving meshes nodes have a velocity, and no state elsewhere."""
 
-    node_inputs: tuple[str, ...] = setting((), "node features: displacement, velocity, material")
+    node_inputs: tuple[str, ...] = setting((), "node features: displacement, velocity, material, proximity")
     hidden: int = setting(128, "width of node and edge features")
     world_radius: float | None = setting(None, "length of world edges at most; unset: the dataset's contact radius")
     most_world_edges: int | None = setting(None, "world edges of a scene at most, the shortest; unset: all")

@@ -41,6 +41,9 @@ class Graph:
         m2m: node to node, every element edge once in both directions; None with element nodes.
         e2m, m2e: element to each of its nodes, and the reverse; None without element nodes.
         rest_edges: [M, 4] float32, `edge_vectors` of e2m (elements at the mean of their nodes) or m2m at rest.
+        body: [N] int64, or None without the surface.
+        surface: [F, 3] int64, boundary triangles, counter-clockwise seen from outside, or None where it is not needed.
+        surface_offsets: [B + 1] int64, where each scene's triangles start and end, or None.
         own: what one model alone needs, such as coarser meshes.
     """
 
@@ -56,11 +59,14 @@ class Graph:
     e2m: EdgeSet | None
     m2e: EdgeSet | None
     rest_edges: Tensor
+    body: Tensor | None = None
+    surface: Tensor | None = None
+    surface_offsets: Tensor | None = None
     own: Concatenable | None = None
 
     @staticmethod
-    def from_scene(scene: Scene, element_nodes: bool) -> Graph:
-        """The graph of one scene: e2m and m2e if elements are nodes of their own, else m2m."""
+    def from_scene(scene: Scene, element_nodes: bool, surface: bool = False) -> Graph:
+        """The graph of one scene: e2m and m2e if elements are nodes of their own, else m2m; its surface if asked."""
         n, e = scene.num_nodes, scene.num_elements
         elements = torch.from_numpy(scene.elements.astype("int64"))
         rest, node_type = torch.tensor(scene.rest_position), torch.from_numpy(scene.node_type.astype("int64"))
@@ -89,6 +95,7 @@ class Graph:
             e2m=e2m,
             m2e=m2e,
             rest_edges=rest_edges,
+            **(_surface_of(scene) if surface else {}),
         )
 
     @staticmethod
@@ -112,6 +119,7 @@ class Graph:
             e2m=None if graphs[0].e2m is None else EdgeSet.concatenate([g.e2m for g in graphs]),
             m2e=None if graphs[0].m2e is None else EdgeSet.concatenate([g.m2e for g in graphs]),
             rest_edges=torch.cat([g.rest_edges for g in graphs]),
+            **({} if graphs[0].surface is None else _join_surfaces(graphs, nodes)),
             own=None if graphs[0].own is None else graphs[0].own.concatenate([g.own for g in graphs]),
         )
 
@@ -147,6 +155,21 @@ class Graph:
     def element_mean(self, x: Tensor) -> Tensor:
         """[N, F] -> [E, F]: the mean over the nodes of each element."""
         return _element_mean(self.elements, x)
+
+
+def _surface_of(scene: Scene) -> dict[str, Tensor]:
+    triangles = torch.from_numpy(scene.surface().astype("int64"))
+    body = torch.from_numpy(scene.body.astype("int64"))
+    return {"body": body, "surface": triangles, "surface_offsets": torch.tensor([0, len(triangles)])}
+
+
+def _join_surfaces(graphs: list[Graph], nodes: list[int]) -> dict[str, Tensor]:
+    triangles = list(accumulate((len(g.surface) for g in graphs), initial=0))
+    return {
+        "body": torch.cat([g.body for g in graphs]),
+        "surface": torch.cat([g.surface + shift for g, shift in zip(graphs, nodes, strict=False)]),
+        "surface_offsets": _concatenate_offsets([g.surface_offsets for g in graphs], triangles),
+    }
 
 
 def edge_vectors(edges: EdgeSet, senders: Tensor, receivers: Tensor) -> Tensor:

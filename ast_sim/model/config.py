@@ -23,7 +23,12 @@ class ModelConfig:
     """
 
     name: str = setting("", "which model")
-    node_inputs: tuple[str, ...] = setting(("displacement",), "node features: displacement, velocity, material")
+    node_inputs: tuple[str, ...] = setting(
+        ("displacement",), "node features: displacement, velocity, material, proximity"
+    )
+    proximity_radius: float | None = setting(
+        None, "with proximity: distance from which another body is seen; unset: 1.5 mesh spacings"
+    )
     boundary_motion: bool = setting(True, "the next increment of prescribed nodes is an input")
 
     integration: Literal["quasi_static", "dynamic"] = setting("quasi_static", "p + v, or 2 p - p_previous + a")
@@ -34,7 +39,7 @@ class ModelConfig:
     contact_radius: float = setting(0.0, "distance from which other surfaces count as near")
 
     def __post_init__(self) -> None:
-        self.check_inputs("node_inputs", ("displacement", "velocity", "material"))
+        self.check_inputs("node_inputs", ("displacement", "velocity", "material", "proximity"))
 
     def check_inputs(self, key: str, known: tuple[str, ...]) -> None:
         """Raise ConfigError for inputs that there are none of, or that the dataset does not have."""
@@ -70,6 +75,7 @@ class ModelConfig:
             domain_center=tuple(float(c) for c in info.domain_center),
             domain_half_width=float(info.domain_half_width),
             contact_radius=float(info.contact_radius),
+            proximity_radius=1.5 * mesh_spacing if self.proximity_radius is None else self.proximity_radius,
         )
 
     def inputs_for(self, info: DatasetInfo, material_width: int) -> dict[str, list[str]]:

@@ -14,6 +14,8 @@ from ast_sim.data.scene import NodeType
 from ast_sim.model.ast_config import ASTConfig
 from ast_sim.model.config import ModelConfig
 from ast_sim.model.normalizer import FeatureNormalizer, Kind
+from ast_sim.model.proximity import WIDTH as PROXIMITY_WIDTH
+from ast_sim.model.proximity import proximity
 
 _STATES = ("displacement", "velocity")
 
@@ -29,10 +31,12 @@ def _state(names: tuple[str, ...], batch: Batch) -> list[Tensor]:
 
 
 def node_features(config: ModelConfig, batch: Batch) -> Tensor:
-    """[N, *]: node type (one-hot), state, material and the boundary channels of model.md."""
+    """[N, *]: node type (one-hot), state, material, proximity and the boundary channels of model.md."""
     values = [batch.graph.one_hot, *_state(config.node_inputs, batch)]
     if "material" in config.node_inputs:
         values.append(batch.graph.node_material)
+    if "proximity" in config.node_inputs:
+        values.append(proximity(batch, config.proximity_radius))
     if config.boundary_motion:
         values.append(batch.boundary_motion)
     return torch.cat(values, dim=1)
@@ -67,6 +71,8 @@ def normalizer_of(config: ASTConfig, what: str) -> FeatureNormalizer:
         kinds.append(("scalar", config.material_width))
     if "stress" in inputs:
         kinds.append(("scalar", 1))
+    if "proximity" in inputs:
+        kinds.append((None, PROXIMITY_WIDTH))
     if what == "node" and config.boundary_motion:
         kinds.append(("vector", 3))
     return FeatureNormalizer(kinds)
