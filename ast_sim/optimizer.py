@@ -23,6 +23,11 @@ class Optimizer:
             parameter.data, parameter.grad = value.view_as(parameter), gradient.view_as(parameter)
         self._adam = torch.optim.AdamW([self._vector], lr=0.0, weight_decay=0.0, fused=True)
 
+    @property
+    def gradient(self) -> Tensor:
+        """The gradients of all parameters, one after the other."""
+        return self._vector.grad
+
     def zero_gradient(self) -> None:
         self._vector.grad.zero_()
 

@@ -10,9 +10,12 @@ import dataclasses
 import errno
 import hashlib
 import math
-from collections.abc import Sequence
+import os
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,11 +25,12 @@ from ast_sim.config import override
 from ast_sim.data.ahead import Ahead
 from ast_sim.data.file import Dataset
 from ast_sim.data.sampling import PairSampler
-from ast_sim.errors import ConfigError, DatasetError, TrainingError
+from ast_sim.errors import CheckpointError, ConfigError, DatasetError, TrainingError
 from ast_sim.measures import SquaredError, rmse_sequence
 from ast_sim.models import build_model, find_preset
 from ast_sim.monitor import Clock, Progress, StopSignals, duration
 from ast_sim.optimizer import Optimizer
+from ast_sim.processes import Processes
 from ast_sim.profile import profile, table
 from ast_sim.rollout import rollouts
 from ast_sim.run import Metrics, RunConfig, TrainConfig, has_config, read_config, write_config
@@ -73,8 +77,8 @@ def train(run: Path, config: RunConfig | None = None, resume: bool = False, prof
     run = Path(run)
     try:
         run.mkdir(parents=True, exist_ok=True)
-        with checkpoint.lock(run), StopSignals() as signals:
-            saved = read_config(run) if has_config(run) else None
+        with Processes() as processes, _lock(run, processes), StopSignals() as signals, _told_by_leader(processes):
+            saved = processes.of_leader(read_config(run) if has_config(run) else None)
             if saved is not None and not resume:
                 raise TrainingError(f"{run} already holds a run: go on with --resume, or choose another folder")
             if saved is None and config is None:
@@ -82,11 +86,11 @@ def train(run: Path, config: RunConfig | None = None, resume: bool = False, prof
             with Dataset((config or saved).data) as dataset:
                 scales = measure(dataset)
                 resolved = resolve_run(config, dataset, scales) if config is not None else saved
-                if saved is None:
-                    write_config(run, resolved)
-                else:
+                if saved is not None:
                     _require_same(run, saved, resolved)
-                with Training(run, resolved, dataset, scales, signals) as training:
+                elif processes.leads:
+                    write_config(run, resolved)
+                with Training(run, resolved, dataset, scales, signals, processes) as training:
                     if profile_steps:
                         training.profile(profile_steps)
                     else:
@@ -95,6 +99,33 @@ def train(run: Path, config: RunConfig | None = None, resume: bool = False, prof
         full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
         advice = ": the last checkpoint is whole; make room, then go on with --resume" if full else ""
         raise TrainingError(f"{run}: {error}{advice}") from error
+
+
+@contextmanager
+def _lock(run: Path, processes: Processes) -> Iterator[None]:
+    """The leading process keeps others out of the run folder; the rest learn whether it could."""
+    with ExitStack() as held:
+        error = None
+        if processes.leads:
+            try:
+                held.enter_context(checkpoint.lock(run))
+            except CheckpointError as refused:
+                error = str(refused)
+        error = processes.of_leader(error)
+        if error is not None:
+            raise CheckpointError(error)
+        yield
+
+
+@contextmanager
+def _told_by_leader(processes: Processes) -> Iterator[None]:
+    """What training tells comes from the leading process."""
+    with ExitStack() as silent:
+        if not processes.leads:
+            nowhere = silent.enter_context(open(os.devnull, "w"))
+            silent.enter_context(redirect_stdout(nowhere))
+            silent.enter_context(redirect_stderr(nowhere))
+        yield
 
 
 def resolve_run(config: RunConfig, dataset: Dataset, scales: DataScales) -> RunConfig:
@@ -124,22 +155,22 @@ class Training:
     """
 
     def __init__(
-        self, run: Path, config: RunConfig, dataset: Dataset, scales: DataScales, signals: StopSignals
+        self,
+        run: Path,
+        config: RunConfig,
+        dataset: Dataset,
+        scales: DataScales,
+        signals: StopSignals,
+        processes: Processes | None = None,
     ) -> None:
         self.run, self.config, self.dataset, self.signals = run, config, dataset, signals
-        self.options = config.train
+        self.options, self.processes = config.train, processes or Processes()
+        rank, count = self.processes.rank, self.processes.count
+        if self.options.batch_size % count:
+            raise ConfigError(f"train.batch_size = {self.options.batch_size} cannot be cut for {count} processes")
         torch.manual_seed(self.options.seed)
         self.model = build_model(config.model)
-        self.sampler = PairSampler(
-            dataset,
-            "train",
-            batch_size=self.options.batch_size,
-            seed=self.options.seed,
-            noise=self.options.noise,
-            make_graph=self.model.graph,
-            dynamic=config.model.dynamic,
-            gamma=self.options.noise_gamma,
-        )
+        self.sampler = self._sampler((rank, count))
         self.ahead = Ahead(self.sampler)
         self.optimizer = Optimizer(self.model)
         self.metrics = Metrics(run)
@@ -147,6 +178,7 @@ class Training:
         self.step = 0
         self.fingerprint = self._fingerprint()
         self.sums: dict[str, float] = {}  # of the steps since the last line of metrics
+        self.stopping = 0  # the signal that asks to stop, in any process
         self._introduce(scales)
 
     def __enter__(self) -> Training:
@@ -154,6 +186,19 @@ class Training:
 
     def __exit__(self, *error: object) -> None:
         self.ahead.__exit__(*error)
+
+    def _sampler(self, part: tuple[int, int]) -> PairSampler:
+        return PairSampler(
+            self.dataset,
+            "train",
+            batch_size=self.options.batch_size,
+            seed=self.options.seed,
+            noise=self.options.noise,
+            make_graph=self.model.graph,
+            dynamic=self.config.model.dynamic,
+            gamma=self.options.noise_gamma,
+            part=part,
+        )
 
     def _introduce(self, scales: DataScales) -> None:
         options = self.options
@@ -189,7 +234,8 @@ class Training:
         options = self.options
         self.prepare()
         with Progress(options.steps, self.step, "steps") as self.progress:
-            if self.step and self._due(options.validate_every) and not self.metrics.validated(self.step):
+            validated = self.processes.of_leader(self.metrics.validated(self.step))
+            if self.step and self._due(options.validate_every) and not validated:
                 self._validate()
             self.clock = Clock()
             while self.step < options.steps:
@@ -198,7 +244,8 @@ class Training:
                 if self._due(options.log_every):
                     self._log()
                 validates = self._due(options.validate_every)
-                if validates or self._due(options.checkpoint_every) or self.signals.received:
+                self._heed_signals()
+                if validates or self._due(options.checkpoint_every) or self.stopping:
                     self._save()
                 self._stop_if_asked()
                 self.clock.step()
@@ -208,31 +255,38 @@ class Training:
     def _due(self, every: int) -> bool:
         return self.step % every == 0 or self.step == self.options.steps
 
+    def _heed_signals(self) -> None:
+        if self.processes.any(self.signals.received is not None):
+            self.stopping = self.signals.received or signal.SIGTERM
+
     def _stop_if_asked(self) -> None:
-        if self.signals.received:
+        if self.stopping:
             self.progress.line(f"stopped after step {self.step:,}: go on with --resume")
-            raise SystemExit(128 + self.signals.received)
+            raise SystemExit(128 + self.stopping)
 
     def advance(self) -> None:
         """One optimizer step, on the gradients of `accumulate` batches."""
         options = self.options
-        torch.default_generator.manual_seed(step_seed(options.seed, self.step))  # torch.manual_seed asks all devices
+        draw = self.step * self.processes.count + self.processes.rank
+        torch.default_generator.manual_seed(step_seed(options.seed, draw))  # torch.manual_seed asks all devices
         self.optimizer.zero_gradient()
         names: list[str] = []
         values: dict[str, float] = {}
         for part in range(options.accumulate):
             batch, target = self.ahead.batch(self.step * options.accumulate + part)
             try:
-                losses = self.model.loss(batch, target, options.stress_weight)
+                losses = self.model.loss(batch, target, options.stress_weight, self.processes.share)
             except DatasetError as error:
                 raise DatasetError(f"{self.dataset.path}: in one of {', '.join(batch.names)}: {error}") from error
-            loss = losses["loss"]
-            if not loss.isfinite():
-                raise self._not_finite("loss", float(loss.detach()), batch.names)
-            (loss / options.accumulate).backward()
+            found = self.processes.add(torch.stack([value.detach() for value in losses.values()]))
+            whole = dict(zip(losses, found.tolist(), strict=True))
+            if not math.isfinite(whole["loss"]):
+                raise self._not_finite("loss", whole["loss"], batch.names)
+            (losses["loss"] / options.accumulate).backward()
             names += batch.names
-            for key, value in losses.items():
-                values[key] = values.get(key, 0.0) + float(value.detach()) / options.accumulate
+            for key, value in whole.items():
+                values[key] = values.get(key, 0.0) + value / options.accumulate
+        self.processes.add(self.optimizer.gradient)
         norm = self.optimizer.clip(options.clip)
         if not math.isfinite(norm):
             raise self._not_finite("norm of the gradient", norm, names)
@@ -243,7 +297,7 @@ class Training:
             self.sums[key] = self.sums.get(key, 0.0) + value
 
     def _not_finite(self, what: str, value: float, names: list[str]) -> TrainingError:
-        last = checkpoint.latest(self.run)
+        names, last = self.processes.gathered(names), checkpoint.latest(self.run)
         kept = f"the last good checkpoint is {last}" if last else "there is no checkpoint yet"
         return TrainingError(
             f"the {what} of step {self.step + 1} is {value}, so the step was not taken: look at {', '.join(names)},"
@@ -256,7 +310,8 @@ class Training:
         self.sums = {}
         rate = learning_rate(self.options, self.step - 1)
         seconds = self.clock.seconds_per_step
-        self.metrics.append({"step": self.step, **means, "rate": rate, "seconds": seconds})
+        if self.processes.leads:
+            self.metrics.append({"step": self.step, **means, "rate": rate, "seconds": seconds})
         stress = f", stress {means['stress']:.4f}" if "stress" in means else ""
         to_go = self.clock.to_go(self.options.steps - self.step, self._validations_to_go())
         self.progress.show(
@@ -282,15 +337,17 @@ class Training:
         if count == 0:
             return
         self.ahead.wait()
-        truths = [self.dataset.load("valid", index) for index in range(count)]
-        names = [f"valid/{index:06d}" for index in range(count)]
-        results = rollouts(self.model, truths, names, progress=lambda frame: self._stop_if_asked())
+        mine = range(self.processes.rank, count, self.processes.count)
+        found = self.processes.gathered(self._rolled_out(mine))
+        if not self.processes.leads:
+            self.clock.validation()
+            return
         record: dict[str, Any] = {"step": self.step}
-        failure = next((result.failure for result in results if result.failure), None)
+        failure = next((result.failure for result in found if result.failure), None)
         if failure is None:
-            pairs = list(zip(results, truths, strict=True))
-            error = rmse_sequence([_motion_error(r.position, t, r.given) for r, t in pairs])
-            hold = rmse_sequence([_motion_error(t.position[r.given - 1], t, r.given) for r, t in pairs])
+            found.sort(key=lambda result: result.index)
+            error = rmse_sequence([result.error for result in found])
+            hold = rmse_sequence([result.hold for result in found])
             record |= {"valid_rmse": error, "valid_hold_still": hold}
             best = error < self.metrics.best()
             if best:
@@ -305,7 +362,32 @@ class Training:
         self.metrics.append({**record, "seconds": seconds})
         self.progress.line(f"validation after step {self.step:,}: {text} ({duration(seconds)})")
 
+    def _stop_at_once(self, frame: int) -> None:
+        self._heed_signals()
+        self._stop_if_asked()
+
+    def _rolled_out(self, indices: range) -> list[_Validated]:
+        """The errors of validation scenes."""
+        truths = [self.dataset.load("valid", index) for index in indices]
+        names = [f"valid/{index:06d}" for index in indices]
+        # Together they end together: none may stop on its own.
+        progress = self._stop_at_once if self.processes.count == 1 else None
+        results = rollouts(self.model, truths, names, progress=progress) if truths else []
+        return [
+            _Validated(
+                index,
+                _motion_error(result.position, truth, result.given),
+                _motion_error(truth.position[result.given - 1], truth, result.given),
+                None,
+            )
+            if result.failure is None
+            else _Validated(index, None, None, result.failure)
+            for index, truth, result in zip(indices, truths, results, strict=True)
+        ]
+
     def _save(self) -> None:
+        if not self.processes.leads:
+            return
         state = {"step": self.step, "sums": self.sums, "data": self.fingerprint}
         checkpoint.save(
             self.run,
@@ -317,11 +399,20 @@ class Training:
         )
 
     def _restore(self) -> None:
+        """The leading process finds where training stands; the others take it from there."""
+        if self.processes.leads:
+            self._restore_alone()
+        self.step, self.sums = self.processes.of_leader((self.step, self.sums))
+        self.processes.spread(self.model.state_dict().values())
+        self.optimizer.restore(self.processes.of_leader(self.optimizer.state()))
+
+    def _restore_alone(self) -> None:
         path = checkpoint.latest(self.run)
         if path is None:
             self.metrics.forget_after(0)
             batches = range(math.ceil(self.options.statistics_pairs / self.options.batch_size))
-            self.model.fit_statistics(self.sampler.batch(index) for index in batches)
+            whole = self.sampler if self.processes.count == 1 else self._sampler((0, 1))
+            self.model.fit_statistics(whole.batch(index) for index in batches)
             return
         weights, optimizer, state = checkpoint.load(path)
         if state["data"] != self.fingerprint:
@@ -342,6 +433,15 @@ class Training:
             position, _ = self.dataset.frames("train", index, 0, self.dataset.num_frames("train", index))
             digest.update(np.ascontiguousarray(position).tobytes())
         return digest.hexdigest()
+
+
+class _Validated(NamedTuple):
+    """A validation scene: the error of its rollout and that of holding still, or why there is none."""
+
+    index: int
+    error: SquaredError | None
+    hold: SquaredError | None
+    failure: str | None
 
 
 def _motion_error(position: np.ndarray, truth: Any, given: int) -> SquaredError:

@@ -44,6 +44,8 @@ class PairSampler:
 
     and gamma = 1 leads back to the true next position. Scenes whose z is 0 throughout get no noise in z.
 
+    With `part` = (i, n) a batch is the i-th of n equal parts of the one that it would be.
+
     Raises:
         DatasetError: the split has no pair, or a sample cannot be read.
     """
@@ -59,9 +61,11 @@ class PairSampler:
         make_graph: Callable[[Scene], Graph],
         dynamic: bool,
         gamma: float,
+        part: tuple[int, int] = (0, 1),
     ) -> None:
         self._dataset, self._split, self._batch_size, self._seed = dataset, split, batch_size, seed
         self._noise, self._make_graph, self._dynamic, self._gamma = noise, make_graph, dynamic, gamma
+        self._part = part
         self._first = 1 if dynamic else 0  # the acceleration needs a frame before t
         frames = np.array([dataset.num_frames(split, i) for i in range(dataset.count(split))], np.int64)
         self._starts = np.concatenate([[0], np.cumsum(np.maximum(frames - 1 - self._first, 0))])
@@ -79,8 +83,10 @@ class PairSampler:
 
     def batch(self, step: int) -> tuple[Batch, Target]:
         """The batch of a step: places step * batch_size onward in the endless sequence of epochs."""
-        first = step * self._batch_size
-        draws = [divmod(place, self.num_pairs) for place in range(first, first + self._batch_size)]
+        index, count = self._part
+        size = self._batch_size // count
+        first = step * self._batch_size + index * size
+        draws = [divmod(place, self.num_pairs) for place in range(first, first + size)]
         return self._assemble([(epoch, int(self._order(epoch)[place])) for epoch, place in draws])
 
     def _draw_order(self, epoch: int) -> np.ndarray:

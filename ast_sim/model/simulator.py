@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import torch
@@ -64,8 +64,17 @@ class Simulator(nn.Module):
             if isinstance(module, Normalizer | FeatureNormalizer):
                 module.fix()
 
-    def loss(self, batch: Batch, target: Target, stress_weight: float = 0.01) -> dict[str, Tensor]:
+    def loss(
+        self,
+        batch: Batch,
+        target: Target,
+        stress_weight: float = 0.01,
+        share: Callable[[int], float] = lambda rows: 1.0,
+    ) -> dict[str, Tensor]:
         """Mean squared errors on normalised targets: motion of NORMAL nodes, stress of everything but obstacles.
+
+        Where the batch is a part of a larger one, `share` says how much of all rows (nodes or elements) its rows are:
+        the losses of all parts then add up to that of the whole.
 
         Returns:
             "motion", "stress" (if there is one) and "loss" = motion + stress_weight * stress; "spread", the standard
@@ -75,14 +84,15 @@ class Simulator(nn.Module):
         normal = batch.graph.normal_nodes
         motion = prediction.motion.index_select(0, normal)
         error = motion - self.motion_normalizer(target.motion.index_select(0, normal))
-        losses = {"motion": error.square().mean()}
+        part = share(len(normal))
+        losses = {"motion": part * error.square().mean()}
         losses["loss"] = losses["motion"]
-        losses["spread"] = motion.detach().std(dim=0).mean() if len(motion) > 1 else motion.new_ones(())
+        losses["spread"] = part * motion.detach().std(dim=0).mean() if len(motion) > 1 else motion.new_ones(())
         if self.stress_normalizer is not None:
             rows = self._stressed(batch)
             stress = prediction.stress.index_select(0, rows)
             error = stress - self.stress_normalizer(target.stress.index_select(0, rows))
-            losses["stress"] = error.square().mean()
+            losses["stress"] = share(len(rows)) * error.square().mean()
             losses["loss"] = losses["loss"] + stress_weight * losses["stress"]
         return losses
 

@@ -1,0 +1,86 @@
+"""Training in two processes under torchrun: the same as in one with the whole batch; goes on with another number."""
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+import toy
+from safetensors.torch import load_file
+
+from ast_sim import checkpoint
+from ast_sim.run import Metrics
+
+SETTINGS = [
+    "model.hidden=16", "model.L_SA=1", "model.L_cell=3", "train.batch_size=4", "train.statistics_pairs=8",
+    "train.log_every=4", "train.validate_every=4", "train.noise=1e-4",
+]  # fmt: skip
+
+
+def command(processes: int, *words: str) -> list[str]:
+    start = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"] if processes > 1 else []
+    return [sys.executable, *start, "-m", "ast_sim.cli", "train", *words]
+
+
+def train(processes: int, data: Path, run: Path, steps: int, *words: str, check: bool = True):
+    settings = [word for setting in (*SETTINGS, f"train.steps={steps}") for word in ("--set", setting)]
+    words = (str(data), "--out", str(run), *settings, *words)
+    return subprocess.run(command(processes, *words), capture_output=True, text=True, check=check, timeout=300)
+
+
+def weights(run: Path) -> dict[str, torch.Tensor]:
+    return load_file(checkpoint.latest(run) / "model.safetensors")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    return toy.write(tmp_path_factory.mktemp("data") / "toy.h5")
+
+
+def test_two_processes_do_what_one_does(data, tmp_path):
+    told = train(2, data, tmp_path / "two", 8).stdout
+    train(1, data, tmp_path / "one", 8)
+    one, two = weights(tmp_path / "one"), weights(tmp_path / "two")
+    for name, ours in one.items():
+        # Sums over two parts round otherwise; Adam's steps of about the rate follow even the smallest gradients.
+        torch.testing.assert_close(two[name], ours, rtol=1e-4, atol=2e-5, msg=name)
+    lines, others = list(Metrics(tmp_path / "one")), list(Metrics(tmp_path / "two"))
+    assert [line["step"] for line in others] == [line["step"] for line in lines] == [4, 4, 8, 8]
+    for ours, theirs in zip(lines, others, strict=True):
+        assert theirs.keys() == ours.keys()
+        for key in {"loss", "grad_norm", "valid_rmse", "valid_hold_still"} & ours.keys():
+            assert theirs[key] == pytest.approx(ours[key], rel=1e-3), key
+    assert told.count("parameters") == 1  # one process tells
+
+    # What one began two go on with.
+    words = ["--out", str(tmp_path / "one"), "--resume"]
+    done = subprocess.run(command(2, *words), capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0 and "going on after step 8" in done.stdout
+
+
+def test_a_batch_that_cannot_be_cut_is_refused(data, tmp_path):
+    done = train(2, data, tmp_path / "run", 4, "--set", "train.batch_size=3", check=False)
+    assert done.returncode != 0 and "train.batch_size = 3 cannot be cut for 2 processes" in done.stderr
+
+
+def test_a_signal_to_one_process_stops_both_after_the_step(data, tmp_path):
+    run = tmp_path / "run"
+    settings = [word for setting in (*SETTINGS, "train.steps=100000") for word in ("--set", setting)]
+    process = subprocess.Popen(command(2, str(data), "--out", str(run), *settings), stdout=subprocess.DEVNULL)
+    try:
+        for _ in range(1200):
+            if any(line["step"] >= 4 for line in Metrics(run)):
+                break
+            time.sleep(0.1)
+        children = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True).stdout.split()
+        assert len(children) == 2
+        subprocess.run(["kill", f"-{int(signal.SIGTERM)}", children[1]], check=True)
+        assert process.wait(timeout=120) != 0
+    finally:
+        process.kill()
+    last = checkpoint.latest(run)
+    assert last is not None and int(last.name.removeprefix("step-")) >= 4
+    checkpoint.load(last)
