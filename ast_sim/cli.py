@@ -115,7 +115,7 @@ def _build_parser() -> argparse.ArgumentParser:
     where.add_argument("--workers", type=_at_least(1), metavar="W", help="processes (one a core)")
     where.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler whose workers solve, as tcp://host:8786")
 
-    _add_convert(command("convert", _convert, "import simulations of other programs (PVD collections, VTU series)"))
+    _add_convert(command("convert", _convert, "import simulations (PVD, VTU) or MeshGraphNets data (TFRecord)"))
 
     info = command("info", _info, "tell what is in a dataset or a run, and check it")
     info.add_argument("path", type=Path, metavar="FILE_OR_RUN")
@@ -154,10 +154,13 @@ def _build_parser() -> argparse.ArgumentParser:
 
 def _add_convert(convert: _Parser) -> None:
     convert.add_argument(
-        "source", type=Path, metavar="SOURCE", help="one simulation (.pvd, or a folder of .vtu), or a folder of several"
+        "source",
+        type=Path,
+        metavar="SOURCE",
+        help="a simulation (.pvd, or a folder of .vtu), a folder of several, or one of meta.json and .tfrecord files",
     )
     convert.add_argument("--out", type=Path, required=True, metavar="FILE", help="dataset to write (.h5)")
-    fields = convert.add_argument_group("names of the fields in the files")
+    fields = convert.add_argument_group("names of the fields in .vtu files")
     for name, help in (
         ("displacement", "point field, from rest; without one the points themselves move"),
         ("stress", "von Mises stress, a point or a cell field"),
@@ -168,13 +171,18 @@ def _add_convert(convert: _Parser) -> None:
     ):
         fields.add_argument(f"--{name}", metavar="NAME", help=help)
     fields.add_argument("--material", nargs="+", default=[], metavar="NAME", help="cell fields with one number each")
-    kind = convert.add_argument_group("what the dataset says of itself")
+    kind = convert.add_argument_group("what a dataset of .vtu files says of itself")
     kind.add_argument("--shares", nargs=3, type=float, default=[0.8, 0.1, 0.1], metavar=("TRAIN", "VALID", "TEST"))
     kind.add_argument("--seed", type=_at_least(0), default=0, help="of the draw for the splits (0)")
     kind.add_argument("--dynamic", action="store_true", help="inertia matters: the acceleration is predicted")
     kind.add_argument("--contact-radius", type=float, default=0.0, metavar="R")
     kind.add_argument("--time-step", type=float, default=0.0, metavar="SECONDS")
     kind.add_argument("--length-unit", default="m", metavar="UNIT")
+    records = convert.add_argument_group("what is taken of .tfrecord files (meta.json says the rest)")
+    records.add_argument("--split", nargs="+", choices=("train", "valid", "test"), help="these files only (all)")
+    records.add_argument("--limit", type=_at_least(1), metavar="N", help="the first N trajectories of each file (all)")
+    records.add_argument("--every", type=_at_least(1), default=1, metavar="K", help="every K-th frame (1)")
+    convert.set_defaults(of_series=(fields, kind), of_records=(records,))
 
 
 def _at_least(least: int) -> Any:
@@ -223,10 +231,31 @@ def _generate(args: argparse.Namespace) -> None:
 
 
 def _convert(args: argparse.Namespace) -> None:
+    from ast_sim.data.deepmind import convert_deepmind, is_deepmind
+
+    if is_deepmind(args.source):
+        _refuse(args, args.of_series, f"{args.source}: meta.json says it")
+        counts = convert_deepmind(
+            args.source, args.out, splits=args.split, limit=args.limit, every=args.every, progress=print
+        )
+    else:
+        _refuse(args, args.of_records, f"{args.source}, which holds no .tfrecord files")
+        counts = _convert_series(args)
+    print(f"{args.out}: {', '.join(f'{count} {split}' for split, count in counts.items())}")
+
+
+def _refuse(args: argparse.Namespace, groups: tuple[Any, ...], what: str) -> None:
+    """Raise ConfigError if an option of these groups was given."""
+    for action in (action for group in groups for action in group._group_actions):
+        if getattr(args, action.dest) != action.default:
+            raise ConfigError(f"{action.option_strings[0]} has no meaning for {what}")
+
+
+def _convert_series(args: argparse.Namespace) -> dict[str, int]:
     from ast_sim.data.convert import convert
     from ast_sim.data.series import FieldNames
 
-    counts = convert(
+    return convert(
         args.source,
         args.out,
         names=FieldNames(
@@ -240,7 +269,6 @@ def _convert(args: argparse.Namespace) -> None:
         length_unit=args.length_unit,
         progress=print,
     )
-    print(f"{args.out}: {', '.join(f'{count} {split}' for split, count in counts.items())}")
 
 
 def _info(args: argparse.Namespace) -> None:

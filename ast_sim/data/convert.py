@@ -9,13 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ast_sim.data.domain import Domain
 from ast_sim.data.file import DatasetWriter
 from ast_sim.data.layout import SPLITS, DatasetInfo
 from ast_sim.data.series import FieldNames, natural_order, read_series
 from ast_sim.errors import DatasetError
-
-# The cube of the octree reaches beyond the positions of the data by this share of their largest extent.
-MARGIN = 0.1
 
 SHARES = {"train": 0.8, "valid": 0.1, "test": 0.1}
 
@@ -67,21 +65,16 @@ def convert(
         length_unit=length_unit,
         generator={"program": "ast_sim convert", "source": str(source), "names": asdict(names), "seed": seed},
     )
-    lowest, highest = np.full(3, np.inf), np.full(3, -np.inf)
+    domain = Domain()
     with DatasetWriter(out, info) as writer:
         for index, (split, name) in enumerate(chosen):
             trajectory, place = read_series(found[name], names)
             if index == 0:
                 writer.info = replace(info, stress_location=place)
             writer.add(split, trajectory)
-            lowest = np.minimum(lowest, trajectory.position.min(axis=(0, 1)))
-            highest = np.maximum(highest, trajectory.position.max(axis=(0, 1)))
+            domain.add(trajectory.position)
             progress(f"{split}: {name}, {trajectory.num_frames} frames of {trajectory.scene.num_nodes} nodes")
-        writer.info = replace(
-            writer.info,
-            domain_center=tuple(float(x) for x in (lowest + highest) / 2),
-            domain_half_width=float((0.5 + MARGIN) * (highest - lowest).max()),
-        )
+        writer.info = replace(writer.info, domain_center=domain.center, domain_half_width=domain.half_width)
     return {split: sum(s == split for s, _ in chosen) for split in SPLITS}
 
 

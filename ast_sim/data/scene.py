@@ -17,6 +17,9 @@ LOCAL_EDGES = {3: ((0, 1), (0, 2), (1, 2)), 4: ((0, 1), (0, 2), (0, 3), (1, 2), 
 # The faces of a tetrahedron of positive volume, their normals pointing outward.
 LOCAL_FACES = ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
 
+# The connected parts of a mesh are found with so many elements in memory as pairs of nodes.
+_ELEMENTS_AT_ONCE = 1 << 16
+
 
 class NodeType(IntEnum):
     """What moves a node; the numbers are those of the MeshGraphNets data sets."""
@@ -79,13 +82,13 @@ class Scene:
             if self.material.shape[1] == 0:
                 raise DatasetError(f"{name}: material has no columns; leave it out (None)")
             _require_finite(name, "material", "element", self.material)
-        outside = (self.elements < 0) | (self.elements >= n)
-        if outside.any():
-            row, column = np.argwhere(outside)[0]
-            node = self.elements[row, column]
+        if self.elements.min() < 0 or self.elements.max() >= n:
+            outside = (self.elements < 0) | (self.elements >= n)
+            row = int(np.argmax(outside.any(axis=1)))
+            node = self.elements[row, np.argmax(outside[row])]
             raise DatasetError(f"{name}: element {row} refers to node {node}, but the nodes are 0 to {n - 1}")
-        ordered = np.sort(self.elements, axis=1)
-        repeated = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
+        pairs = LOCAL_EDGES[k]
+        repeated = np.logical_or.reduce([self.elements[:, a] == self.elements[:, b] for a, b in pairs])
         if repeated.any():
             row = int(np.argmax(repeated))
             raise DatasetError(f"{name}: element {row} refers to a node twice: {self.elements[row].tolist()}")
@@ -167,6 +170,21 @@ class Trajectory:
         require_finite_frames(name, "stress", stress_location or "row", self.stress)
 
 
+def connected_parts(elements: np.ndarray, num_nodes: int) -> np.ndarray:
+    """[N] int32: the number of the connected part of the mesh that each node lies in, counted by their lowest nodes."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    part = np.arange(num_nodes, dtype=np.int32)
+    for start in range(0, len(elements), _ELEMENTS_AT_ONCE):
+        corners = part[elements[start : start + _ELEMENTS_AT_ONCE]]
+        # The first corner with each of the others: that connects an element as all its edges do.
+        first, other = np.repeat(corners[:, 0], corners.shape[1] - 1), corners[:, 1:].ravel()
+        graph = coo_array((np.ones(len(first), np.int8), (first, other)), shape=(num_nodes, num_nodes))
+        part = connected_components(graph, directed=False)[1].astype(np.int32)[part]
+    return part
+
+
 def require_array(name: str, array: str, value: np.ndarray, dtype: type, shape: tuple[int | None, ...]) -> None:
     """Raise DatasetError unless `value` has the dtype and the shape; None in `shape` stands for any size."""
     if value.dtype != dtype:
@@ -179,9 +197,9 @@ def require_array(name: str, array: str, value: np.ndarray, dtype: type, shape: 
 
 def require_finite_frames(name: str, array: str, row: str, value: np.ndarray, first_frame: int = 0) -> None:
     """Raise DatasetError naming the first frame and row of `value` [S, rows, F] that is not finite."""
-    finite = np.isfinite(value).all(axis=2)
+    finite = np.isfinite(value)
     if not finite.all():
-        frame, index = np.argwhere(~finite)[0]
+        frame, index, _ = np.unravel_index(np.argmin(finite), finite.shape)
         numbers = value[frame, index].tolist()
         raise DatasetError(f"{name}: {array} in frame {first_frame + frame} at {row} {index} is not finite: {numbers}")
 

@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ast_sim.data.scene import LOCAL_EDGES, NodeType, Scene, Trajectory
+from ast_sim.data.scene import NodeType, Scene, Trajectory, connected_parts
 from ast_sim.errors import DatasetError
 
 # The cells that become elements, by what meshio calls them; cells of a lower dimension beside them are left out.
@@ -276,7 +276,7 @@ def _scene(frame: _Frame, used: np.ndarray, rest: np.ndarray, names: FieldNames)
         rest_position=rest.astype(np.float32),
         elements=elements,
         node_type=_node_type(frame, names)[used],
-        body=_parts(elements, len(used)) if body is None else body[used],
+        body=connected_parts(elements, len(used)) if body is None else body[used],
         material=np.stack(material, axis=1).astype(np.float32) if material else None,
     )
 
@@ -302,13 +302,3 @@ def _whole_numbers(frame: _Frame, name: str | None, default: str, dtype: type) -
         node = int(np.argmax(wrong))
         raise DatasetError(f"{frame.path}: {name or default} at node {node} is {value[node]:g}; must be a whole number")
     return value.astype(dtype)
-
-
-def _parts(elements: np.ndarray, num_nodes: int) -> np.ndarray:
-    """[N] int32: the number of the connected part of the mesh that each node lies in."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    pairs = np.concatenate([elements[:, list(pair)] for pair in LOCAL_EDGES[elements.shape[1]]])
-    graph = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(num_nodes, num_nodes))
-    return connected_components(graph, directed=False)[1].astype(np.int32)
