@@ -18,7 +18,7 @@ LOCAL_EDGES = {3: ((0, 1), (0, 2), (1, 2)), 4: ((0, 1), (0, 2), (0, 3), (1, 2), 
 LOCAL_FACES = ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
 
 # The connected parts of a mesh are found with so many elements in memory as pairs of nodes.
-_ELEMENTS_AT_ONCE = 1 << 16
+_ELEMENTS_AT_ONCE = 1 << 13
 
 
 class NodeType(IntEnum):
