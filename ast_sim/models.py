@@ -6,6 +6,8 @@ import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from ast_sim.baselines.bsms import BSMS, BSMSConfig
+from ast_sim.baselines.bsms import PRESETS as BSMS_PRESETS
 from ast_sim.baselines.mgn import MGN, MGNConfig
 from ast_sim.baselines.mgn import PRESETS as MGN_PRESETS
 from ast_sim.errors import ConfigError
@@ -15,7 +17,7 @@ from ast_sim.model.ast_config import ASTConfig
 from ast_sim.model.config import ModelConfig, Preset
 from ast_sim.model.simulator import Simulator
 
-AnyConfig = ASTConfig | MGNConfig
+AnyConfig = ASTConfig | MGNConfig | BSMSConfig
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,7 @@ class Model:
 MODELS = {
     "ast": Model(ASTConfig, AST, AST_PRESETS),
     "mgn": Model(MGNConfig, MGN, MGN_PRESETS),
+    "bsms": Model(BSMSConfig, BSMS, BSMS_PRESETS),
 }
 
 
