@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 from ast_sim.baselines.bsms import BSMS, BSMSConfig
 from ast_sim.baselines.bsms import PRESETS as BSMS_PRESETS
+from ast_sim.baselines.hcmt import HCMT, HCMTConfig
+from ast_sim.baselines.hcmt import PRESETS as HCMT_PRESETS
 from ast_sim.baselines.mgn import MGN, MGNConfig
 from ast_sim.baselines.mgn import PRESETS as MGN_PRESETS
 from ast_sim.errors import ConfigError
@@ -17,7 +19,7 @@ from ast_sim.model.ast_config import ASTConfig
 from ast_sim.model.config import ModelConfig, Preset
 from ast_sim.model.simulator import Simulator
 
-AnyConfig = ASTConfig | MGNConfig | BSMSConfig
+AnyConfig = ASTConfig | MGNConfig | BSMSConfig | HCMTConfig
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,7 @@ MODELS = {
     "ast": Model(ASTConfig, AST, AST_PRESETS),
     "mgn": Model(MGNConfig, MGN, MGN_PRESETS),
     "bsms": Model(BSMSConfig, BSMS, BSMS_PRESETS),
+    "hcmt": Model(HCMTConfig, HCMT, HCMT_PRESETS),
 }
 
 

@@ -1,0 +1,211 @@
+"""HCMT: its attention by hand, the model against its formulas in float64, batches, training and rollout."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+import toy
+from checks import assert_accurate
+from graph_models import assert_follows, batch_of, deep_mlp, made, resolved
+from toy import one_thread  # noqa: F401
+
+from ast_sim.baselines import channel_attention as attention_module
+from ast_sim.baselines.channel_attention import channel_attention
+from ast_sim.baselines.hcmt import HCMT, PRESETS, HCMTConfig
+from ast_sim.data.scene import NodeType
+from ast_sim.errors import ConfigError
+from ast_sim.model.features import node_features
+from ast_sim.model.simulator import Prediction
+from ast_sim.models import build_model
+from ast_sim.ops.edges import EdgeSet
+from ast_sim.run import Metrics, load_model, read_config
+from ast_sim.train import configure, train
+
+SMALL = HCMTConfig(hidden=16, levels=2, heads=2)
+
+
+def test_attention_by_hand():
+    """Edges 0 -> 2 and 1 -> 2, two channels, d = 4: weights exp(s), not divided by their sum, and s cut off at 2."""
+    edges = EdgeSet.from_pairs(torch.tensor([0, 1]), torch.tensor([2, 2]), 3, 3)
+    q = [[9, 9], [9, 9], [1, 2]]
+    k = [[2, 1], [-1, 8], [9, 9]]
+    v = [[1, 10], [3, -1], [9, 9]]
+    p, g = [[1, 0.5], [2, 1]], [[2, 1], [1, 3]]
+    out = channel_attention(
+        edges, torch.tensor([a + b + c for a, b, c in zip(q, k, v, strict=True)], dtype=torch.float32),
+        torch.tensor([a + b for a, b in zip(p, g, strict=True)], dtype=torch.float32), 4,
+    )  # fmt: skip
+    # edge 0: s = (2 * 1 * 1 / 2, 1 * 2 * 0.5 / 2) = (1, 0.5); edge 1: (-1 * 1 * 2 / 2, 8 * 2 * 1 / 2) = (-1, 8 -> 2)
+    expected = [2 * math.exp(1) + 3 * math.exp(-1), 10 * math.exp(0.5) - 3 * math.exp(2)]
+    torch.testing.assert_close(out, torch.tensor([[0, 0], [0, 0], expected]))
+
+
+def plain_attention(of_nodes, of_edges, edges, d):
+    q, k, v = of_nodes.chunk(3, dim=1)
+    p, g = of_edges.chunk(2, dim=1)
+    score = torch.clamp(k[edges.senders] * q[edges.receivers] / math.sqrt(d) * p, -2, 2)
+    return torch.zeros_like(q).index_add(0, edges.receivers, v[edges.senders] * g * torch.exp(score))
+
+
+@pytest.mark.parametrize("chunk", [1, 100, 1 << 16])
+def test_attention_and_its_gradients_are_accurate(chunk, monkeypatch):
+    """Many edges a node, nodes without, scores on both sides of the limits; whatever the size of the chunks."""
+    monkeypatch.setattr(attention_module, "CHUNK", chunk)
+    generator = torch.Generator().manual_seed(0)
+    senders, receivers = torch.randint(0, 20, (2, 150), generator=generator)
+    edges = EdgeSet.from_pairs(senders, receivers // 2, 20, 20)
+    of_nodes, of_edges = (2 * torch.randn(*shape, generator=generator) for shape in ((20, 24), (150, 16)))
+    assert_accurate(
+        lambda n, e: channel_attention(edges, n, e, 4),
+        lambda n, e: plain_attention(n, e, edges, 4),
+        [of_nodes, of_edges],
+    )
+
+
+def test_attention_without_edges_is_zero():
+    edges = EdgeSet.from_pairs(*torch.zeros(2, 0, dtype=torch.int64), 5, 5)
+    of_nodes, of_edges = torch.randn(5, 12, requires_grad=True), torch.randn(0, 8, requires_grad=True)
+    out = channel_attention(edges, of_nodes, of_edges, 4)
+    out.sum().backward()
+    assert out.tolist() == [[0.0] * 4] * 5 and not of_nodes.grad.any() and of_edges.grad.shape == (0, 8)
+
+
+def formulas(model, batch):
+    """The stack of blocks, each projection on its own, messages edge by edge; only the kept nodes are taken over."""
+    c, own = model.config, batch.graph.own
+    rest, position = batch.graph.rest_position, batch.position
+
+    def of(p, dtype):
+        def normal(name, x):
+            return (x.to(dtype) - p[f"{name}.mean"]) / p[f"{name}.scale"]
+
+        def norm(name, x):
+            return F.layer_norm(x, (c.hidden,), p[f"{name}.weight"], p[f"{name}.bias"])
+
+        def vector(x, edges):
+            d = x[edges.senders].to(dtype) - x[edges.receivers].to(dtype)
+            return torch.cat([d, torch.sqrt((d * d).sum(1, keepdim=True))], 1)
+
+        def block(name, x, *sets):
+            of_nodes, found = F.linear(norm(f"{name}.norm", x), p[f"{name}.of_nodes.weight"]), []
+            for i, (edges, e) in enumerate(sets):
+                of_edges = F.linear(norm(f"{name}.edge_norms.{i}", e), p[f"{name}.of_edges.weight"])
+                found.append(plain_attention(of_nodes, of_edges, edges, c.hidden // c.heads))
+            x = x + F.linear(torch.cat(found, 1), p[f"{name}.out.weight"])
+            y = norm(f"{name}.forward_norm", x)
+            for i in range(3):
+                y = F.linear(y if i == 0 else F.relu(y), p[f"{name}.feed_forward.{i}.weight"])
+            return x + y
+
+        nodes, meshes = torch.arange(len(position)), []  # of each mesh, in numbers of the finest
+        for i, edges in enumerate(own.edges):
+            nodes = nodes if i == 0 else nodes[own.poolings[i - 1].kept]
+            inputs = torch.cat([vector(rest[nodes], edges), vector(position[nodes], edges)], 1)
+            meshes.append((edges, deep_mlp(p, "mesh_encoder", normal("mesh_inputs", inputs))))
+        world = model.world(batch)
+        contacts = (world, deep_mlp(p, "world_encoder", normal("world_inputs", vector(position, world))))
+        x, saved = deep_mlp(p, "node_encoder", normal("node_inputs", node_features(c, batch))), []
+        for i in range(c.contact_blocks):
+            x = block(f"contact.{i}", x, meshes[0], contacts)
+        for i in range(c.levels):
+            saved.append(block(f"down.{i}", x, meshes[i]))
+            x = saved[-1][own.poolings[i].kept]
+        x = block("bottom", x, meshes[-1])
+        for i in reversed(range(c.levels)):
+            rows = list(saved[i])
+            for row, node in enumerate(own.poolings[i].kept.tolist()):
+                rows[node] = x[row]
+            x = block(f"up.{i}", torch.stack(rows), meshes[i])
+        out = deep_mlp(p, "decoder.of_nodes", x)
+        if c.stress != "element":
+            return Prediction(out[:, :3], out[:, 3:] if c.stress == "node" else None)
+        return Prediction(out[:, :3], deep_mlp(p, "decoder.of_elements", x[batch.graph.elements].mean(dim=1)))
+
+    return of
+
+
+@pytest.mark.parametrize("stress", ["none", "node", "element"])
+def test_it_follows_the_formulas(stress):
+    model, batch = made(replace(resolved(SMALL), stress=stress), 0, 1)
+    assert len(model.world(batch)) > 20 and len(batch.graph.own.edges[2]) > 10
+    assert_follows(model, batch, formulas(model, batch))
+
+
+def test_contacts_of_obstacles_join_them_with_moving_nodes_only():
+    every, batch = made(resolved(SMALL, 0.15), 0, 1)
+    model, _ = made(replace(every.config, contacts="obstacles"), 0, 1)
+    kind, found, world = batch.graph.node_type, model.world(batch), every.world(batch)
+    pairs = {frozenset((int(kind[s]), int(kind[r]))) for s, r in zip(found.senders, found.receivers, strict=True)}
+    assert pairs == {frozenset((int(NodeType.OBSTACLE), int(NodeType.NORMAL)))}
+    both = kind[world.senders] + kind[world.receivers] == NodeType.OBSTACLE + NodeType.NORMAL
+    mixed = both & (kind[world.senders] != kind[world.receivers])
+    mixed &= (kind[world.senders] == NodeType.OBSTACLE) | (kind[world.receivers] == NodeType.OBSTACLE)
+    assert len(found) == int(mixed.sum()) < len(world)
+
+
+def test_without_world_edges_it_is_the_mesh_alone():
+    model, batch = made(replace(resolved(SMALL), world_radius=0.0), 0)
+    assert len(model.world(batch)) == 0
+    out = model(batch).motion
+    exact = formulas(model, batch)({k: v.double() for k, v in model.state_dict().items()}, torch.float64).motion
+    torch.testing.assert_close(out.double(), exact, rtol=1e-4, atol=1e-5)
+    out.square().sum().backward()
+
+
+def test_a_scene_alone_equals_a_scene_in_a_batch():
+    model, both = made(resolved(SMALL), 0, 1)
+    alone = [model(batch_of(model, seed)) for seed in (0, 1)]
+    for name in ("motion", "stress"):
+        assert torch.equal(getattr(model(both), name), torch.cat([getattr(x, name) for x in alone]))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [({"levels": 0}, "model.levels is 0"), ({"heads": 3}, "model.hidden = 128 must be a multiple of model.heads = 3")],
+)
+def test_settings_out_of_range_are_refused(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        HCMTConfig(**changes)
+
+
+@pytest.mark.parametrize("dynamic", [False, True])
+def test_it_trains_and_is_found_again(tmp_path, dynamic):
+    data = toy.write(tmp_path / "toy.h5", dynamic=dynamic, stress=not dynamic)
+    settings = ["model.hidden=16", "model.levels=2", "model.world_radius=0.06", "train.batch_size=2", "train.steps=60"]
+    settings += ["train.log_every=10", "train.noise=1e-4", "train.warmup=10", "train.peak_rate=2e-3"]
+    config = configure(data, "tiny", [*settings, "train.statistics_pairs=8"], "hcmt")
+    assert config.model.node_inputs == (("velocity",) if dynamic else ())
+    train(tmp_path / "run", config)
+    losses = [record["loss"] for record in Metrics(tmp_path / "run") if "loss" in record]
+    assert losses[-1] < 0.75 * losses[0], losses
+    model, found, _ = load_model(tmp_path / "run")
+    assert isinstance(model, HCMT) and found == read_config(tmp_path / "run") and found.model.heads == 4
+    assert np.isfinite([record["valid_rmse"] for record in Metrics(tmp_path / "run") if "valid_rmse" in record]).all()
+
+
+def test_the_presets_are_those_of_the_papers():
+    original, paper = PRESETS["original"], PRESETS["paper"]
+    for preset in (original, paper):
+        c = preset.model
+        assert (c.hidden, c.heads, c.contact_blocks, c.levels) == (128, 4, 2, 6)
+        assert (preset.train["peak_rate"], preset.train["noise"]) == (1e-4, 0.003)
+    assert (original.train["batch_size"], paper.train["batch_size"]) == (1, 4)
+    assert (original.model.contacts, paper.model.contacts) == ("obstacles", "all")
+
+
+def test_the_number_of_parameters():
+    """About the 2.5 million of the source: h^2 for each of Q, K, V, P, G, O (twice with contacts) and three layers."""
+
+    def mlp(inputs, h, outputs):
+        return inputs * h + h + h * h + h + h * outputs + outputs
+
+    h = 128
+    mesh_block, contact_block = 9 * h * h + 3 * 2 * h, 10 * h * h + 4 * 2 * h
+    encoders = mlp(6, h, h) + mlp(8, h, h) + mlp(4, h, h) + 3 * 2 * h
+    total = encoders + 2 * contact_block + 13 * mesh_block + mlp(h, h, 4)
+    model = build_model(resolved(PRESETS["paper"].model))
+    assert sum(p.numel() for p in model.parameters()) == total
+    assert 2.3e6 < total < 2.6e6
