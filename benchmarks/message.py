@@ -1,7 +1,8 @@
 """Fused message passing beside the composition in torch, which holds every layer of every edge.
 
 The flops counted are those executed: the gradients recompute the layers. A layer costs 2 x its weights an edge forward;
-backward, 2 x again to recompute it and 4 x for its two gradients (2 x for the first, as raw features need none).
+backward, 2 x again to recompute it and 4 x for its two gradients (2 x for the first, as raw features need none). Latents
+of the edges cost none: their gradient is that of the first layer, and is taken.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ WIDTH = 128
 
 
 def cases() -> list[Case]:
-    graphs = [_elements_to_nodes(100_000), _mesh(1600), _nodes_to_cells(1600)]
+    graphs = [_elements_to_nodes(100_000), _mesh(1600), _nodes_to_cells(1600), _latents(1300)]
     return [_case(*graph, backward) for graph in graphs for backward in (False, True)]
 
 
@@ -42,6 +43,12 @@ def _nodes_to_cells(nodes: int) -> tuple[str, EdgeSet, int]:
     return "nodes to cells", EdgeSet.from_pairs(index, index * 2 // 9, nodes, (nodes * 2 + 8) // 9), 0
 
 
+def _latents(nodes: int) -> tuple[str, EdgeSet, int]:
+    """A mesh of the size of a plate, whose edges carry latents along: their share of the first layer is given."""
+    _, edges, _ = _mesh(nodes)
+    return "nodes to nodes, latents", edges, WIDTH
+
+
 def _case(name: str, edges: EdgeSet, raw: int, backward: bool) -> Case:
     g = torch.Generator().manual_seed(0)
     senders, receivers = edges.num_senders, edges.num_receivers
@@ -53,16 +60,17 @@ def _case(name: str, edges: EdgeSet, raw: int, backward: bool) -> Case:
     layer = [normal(WIDTH, WIDTH, scale=square), normal(WIDTH), 1 + normal(WIDTH, scale=0.1), normal(WIDTH)]
     nodes = [normal(senders, WIDTH), normal(receivers, WIDTH)]
     features = normal(len(edges), raw) if raw else None
-    encoder = [normal(WIDTH, raw), normal(WIDTH), normal(WIDTH, WIDTH, scale=square)] if raw else []
-    leaves = [x.requires_grad_(backward) for x in (*nodes, *encoder, *layer)]
+    encodes, latents = 0 < raw < WIDTH, raw == WIDTH
+    encoder = [normal(WIDTH, raw), normal(WIDTH), normal(WIDTH, WIDTH, scale=square)] if encodes else []
+    leaves = [x.requires_grad_(backward) for x in (*nodes, *([features] if latents else []), *encoder, *layer)]
     dsum = normal(receivers, WIDTH)
 
     def ours_of(P, Q, *weights):
-        encoder = weights[:3] if raw else None
+        encoder = weights[:3] if encodes else None
         return message_sum(edges, P, Q, features, encoder, *weights[-4:])
 
     def composition_of(P, Q, *weights):
-        encoder = weights[:3] if raw else None
+        encoder = weights[:3] if encodes else None
         return ops._compose(P, Q, features, encoder, *weights[-4:], edges.senders, edges.receivers)[0]
 
     def call(function):
@@ -81,7 +89,7 @@ def _case(name: str, edges: EdgeSet, raw: int, backward: bool) -> Case:
         for a, b in zip(ours(), peer(), strict=True):
             assert (a - b).abs().max() <= 1e-3 * b.abs().max()
 
-    first, others = 2 * raw * WIDTH, 2 * WIDTH * WIDTH * (2 if raw else 1)
+    first, others = (2 * raw * WIDTH, 4 * WIDTH * WIDTH) if encodes else (0, 2 * WIDTH * WIDTH)
     flops = len(edges) * ((3 * first + 4 * others) if backward else first + others)
     op = f"message passing, {'forward and backward' if backward else 'forward'}"
     shape = f"{name}: {len(edges)} edges, {senders} senders, {receivers} receivers, {WIDTH} channels"

@@ -40,13 +40,14 @@ typedef struct {
   const int64_t *source, *destination; /* [offsets[27]] */
 } ast_pairs;
 
-/* One step of message passing over M edges from S senders to R receivers (message.c). Edges are sorted by receiver. */
+/* One step of message passing over M edges from S senders to R receivers (message.c). Edges are sorted by receiver.
+ * E = 0 and H = 0: nothing of the edges. E = F and H = 0: latents, without an encoder. H = 0 allows no other E. */
 typedef struct {
   int64_t M, S, R;
-  int64_t E, H, F, F2; /* channels: raw edge features, encoder's hidden layer (0 without an encoder), first layer, messages */
+  int64_t E, H, F, F2; /* channels: edge features, encoder's hidden layer (0 without an encoder), first layer, messages */
   const int64_t *senders, *receivers, *receiver_offsets; /* [M], [M] ascending, [R+1] */
   const float *of_senders, *of_receivers;                /* [S,F], [R,F]: their shares of the first layer */
-  const float *edge_features;                            /* [M,E] */
+  const float *edge_features;                            /* [M,E]: raw, or without an encoder their share of the first layer */
   const float *A1, *a1, *A2;                             /* [H,E], [H], [F,H] */
   const float *W2, *b2, *gamma, *beta;                   /* [F2,F], [F2], [F2], [F2] */
 } ast_message;
@@ -157,7 +158,8 @@ typedef struct {
                                    const float *restrict dout, float *restrict dq, float *restrict dk, float *restrict dv);
 
   /* sum[r] = sum over the edges m into r, in stored order, of messages[m] = LN(W2 relu(z_m) + b2; gamma, beta), where
-   * z_m = of_senders[s] + of_receivers[r] + A2 relu(A1 e_m + a1); 0 without edges. sum [R,F2]; messages [M,F2] or NULL. */
+   * z_m = of_senders[s] + of_receivers[r] + A2 relu(A1 e_m + a1), or + e_m without an encoder; 0 without edges.
+   * sum [R,F2]; messages [M,F2] or NULL. */
   ast_status (*message)(const ast_message *s, float *restrict sum, float *restrict messages);
   /* Its gradients, layers recomputed. dsum [R,F2], dmessages [M,F2] or NULL. */
   ast_status (*message_backward)(const ast_message *s, const float *restrict dsum, const float *restrict dmessages,

@@ -2,6 +2,7 @@
  *
  *   h_m = relu(A1 e_m + a1)                          edge encoder, absent if H = 0
  *   x_m = relu(P_s(m) + Q_r(m) + A2 h_m)             first layer; P and Q are its products with senders and receivers
+ *   x_m = relu(P_s(m) + Q_r(m) + e_m)                the same where e_m, of F channels, is its product with latents of the edges
  *   y_m = W2 x_m + b2                                second layer
  *   out_m = gamma (y_m - mean y_m) / sqrt(var y_m + eps) + beta,     sum_r = sum of out_m over the edges m into r
  *
@@ -10,7 +11,7 @@
  * the rows of P of the next tile. The mean is subtracted before squares are summed. Sums run in stored order and a row of a
  * product does not depend on its neighbours in a tile, so neither tiles, tasks, threads nor other scenes of a batch change a bit.
  *
- * Cost per edge: 2 (E H + H F + F F2) flops, a row of P read from anywhere in memory, rows of Q and of the sum in order.
+ * Cost per edge: 2 (E H + H F + F F2) flops, a row of P read from anywhere in memory, rows of e, of Q and of the sum in order.
  * Memory: 3 tiles a thread and the packed weights.
  */
 #include <math.h>
@@ -47,6 +48,9 @@ static ast_status message_pack(const ast_message *s, bool gradients, message_wei
   return dense_pack(w->layers, gradients ? 6 : 3, 6);
 }
 
+/* Whether the edge features are a share of the first layer, added as they are. */
+AST_INLINE bool message_has_latents(const ast_message *s) { return s->E && !s->H; }
+
 /* out = a layer on n rows of A, followed by ReLU or set to 0 where `hidden` is 0 */
 static void message_layer(const message_weights *w, int layer, int64_t n, gemm_a a, dense_end end) {
   dense_rows(&w->layers[layer], 0, dense_panels(&w->layers[layer]), n, a, end);
@@ -64,7 +68,8 @@ static bool message_new_tile(const message_weights *w, message_tile *t) {
   return memory != NULL;
 }
 
-/* One register tile of x: channels of panel p of the edges from m on. P + Q comes last: large values cost the product no digits. */
+/* One register tile of x: channels of panel p of the edges from m on. P + Q comes last: large values cost the product no digits.
+ * Latents stand where the sums of the product would. */
 AST_INLINE void message_first_tile(const int rows, const int vectors, const message_weights *w, int64_t p, int64_t m, const float *h,
                                    float *x) {
   const ast_message *s = w->s;
@@ -78,6 +83,13 @@ AST_INLINE void message_first_tile(const int rows, const int vectors, const mess
       sum[i][v] = (vf){0};
       __builtin_prefetch(next + v * VW);
     }
+  }
+  if (message_has_latents(s)) {
+    const float *e = s->edge_features + m * s->F + c;
+#pragma GCC unroll 12
+    for (int i = 0; i < rows; i++)
+#pragma GCC unroll 2
+      for (int v = 0; v < vectors; v++) sum[i][v] = vload_upto(e + i * s->F + v * VW, n - v * VW);
   }
   gemm_sums(rows, vectors, s->H, (gemm_a){h, w->row, 1}, w->layers[MESSAGE_A2].panels + c * s->H, GEMM_COLUMNS, sum);
 #pragma GCC unroll 12

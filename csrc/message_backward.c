@@ -4,6 +4,7 @@
  *   dgamma = sum_m g_m u_m,   dbeta = sum_m g_m,   p_m = gamma g_m,   dy_m = (p_m - <p_m> - u_m <p_m u_m>) / sd_m
  *   dW2 = sum_m dy_m x_m^T,   db2 = sum_m dy_m,   dz_m = (z_m > 0) W2^T dy_m,         x_m = relu(z_m)
  *   dA2 = sum_m dz_m h_m^T,   dc_m = (h_m > 0) A2^T dz_m,   dA1 = sum_m dc_m e_m^T,   da1 = sum_m dc_m,   de_m = A1^T dc_m
+ *   de_m = dz_m                                                                       where e_m is added as it is
  *   dP_s = sum of dz_m over the edges from s,   dQ_r = sum of dz_m over the edges into r
  *
  * Edges come in rounds. First the tasks of a round, each a run of tiles, put dz into a buffer and add to weight gradients of
@@ -124,12 +125,13 @@ static void message_tile_backward(const message_backward_job *job, int64_t first
   message_norm_backward(job, first, n, t, sums);
   gemm(s->F2, F, n, (gemm_a){dy, 1, row}, gemm_rows(t->x, row), sums->W2, F, !fresh);
   message_layer(w, MESSAGE_W2_BACK, n, (gemm_a){dy, row, 1}, (dense_end){.out = dz, .out_row = row, .hidden = t->x, .hidden_row = row});
+  float *de = job->out->edge_features;
+  for (int64_t i = 0; de && message_has_latents(s) && i < n; i++) memcpy(de + (first + i) * E, dz + i * row, (size_t)E * sizeof *de);
   if (!H) return;
   gemm(s->F, H, n, (gemm_a){dz, 1, row}, gemm_rows(t->h, row), sums->A2, H, !fresh);
   message_layer(w, MESSAGE_A2_BACK, n, (gemm_a){dz, row, 1}, (dense_end){.out = dc, .out_row = row, .hidden = t->h, .hidden_row = row});
   dense_add_rows(dc, row, n, s->H, sums->a1);
   gemm(E, H, n, (gemm_a){s->edge_features + first * E, 1, E}, gemm_rows(dc, row), sums->A1, H, !fresh);
-  float *de = job->out->edge_features;
   if (de) message_layer(w, MESSAGE_A1_BACK, n, (gemm_a){dc, row, 1}, (dense_end){.out = de + first * E, .out_row = E});
 }
 

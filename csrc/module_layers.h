@@ -79,6 +79,13 @@ static bool check_receivers(const call *c, const argument *receivers, const argu
   return true;
 }
 
+/* Without an encoder edge features are added to of_senders and of_receivers; none at all are [M, 0]. */
+static bool check_latents(const call *c, int64_t E, int64_t H, int64_t F) {
+  if (H || !E || E == F) return true;
+  return fail(c, PyExc_ValueError, "edge_features without an encoder must have the %lld channels of of_senders, not %lld", (long long)F,
+              (long long)E);
+}
+
 static bool take_message(call *c, ast_message *s) {
   argument *P, *Q, *e, *A1, *a1, *A2, *W2, *b2, *gamma, *beta, *senders, *receivers, *offsets;
   if (!(P = IN(c, "of_senders", FLOATS, 2, FREE, FREE)) || !(Q = IN(c, "of_receivers", FLOATS, 2, FREE, P->shape[1])) ||
@@ -87,8 +94,9 @@ static bool take_message(call *c, ast_message *s) {
       !(W2 = IN(c, "W2", FLOATS, 2, FREE, P->shape[1])) || !(b2 = IN(c, "b2", FLOATS, 1, W2->shape[0])) ||
       !(gamma = IN(c, "gamma", FLOATS, 1, W2->shape[0])) || !(beta = IN(c, "beta", FLOATS, 1, W2->shape[0])) ||
       !(senders = IN(c, "senders", INTS, 1, e->shape[0])) || !(receivers = IN(c, "receivers", INTS, 1, e->shape[0])) ||
-      !(offsets = IN(c, "receiver_offsets", INTS, 1, Q->shape[0] + 1)) || !check_offsets(c, offsets, e->shape[0]) ||
-      !check_indices(c, senders, e->shape[0], P->shape[0]) || !check_receivers(c, receivers, offsets))
+      !(offsets = IN(c, "receiver_offsets", INTS, 1, Q->shape[0] + 1)) || !check_latents(c, e->shape[1], A1->shape[0], P->shape[1]) ||
+      !check_offsets(c, offsets, e->shape[0]) || !check_indices(c, senders, e->shape[0], P->shape[0]) ||
+      !check_receivers(c, receivers, offsets))
     return false;
   *s = (ast_message){
       .M = e->shape[0],

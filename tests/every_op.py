@@ -183,6 +183,19 @@ def message_results(scenes: Sequence[int]) -> Results:
     )
 
 
+def message_results_with_latents(scenes: Sequence[int]) -> Results:
+    edges, offsets = edges_of(scenes), offsets_of(scenes)
+    of_edges = edges.receiver_offsets[offsets]
+    latents = rows(scenes, 40, key=3, sizes=[6 * n for n in SIZES])
+    weights = [shared(36, 40), shared(36, key=1), shared(36), shared(36, key=2)]
+    return differentiated(
+        lambda s, r, e, *w: message_sum(edges, s, r, e, None, *w),
+        (rows(scenes, 40, key=1), rows(scenes, 40, key=2), latents, *weights),
+        [offsets, offsets, of_edges],
+        offsets,
+    )
+
+
 def segments_of(scenes: Sequence[int]) -> tuple[Octree, Tensor]:
     return octree_of(scenes, 3), offsets_of(scenes)
 
@@ -218,6 +231,7 @@ OPS: dict[str, Callable[[Sequence[int]], Results]] = {
     "attention": attention_results,
     "attention with dropout": dropout_results,
     "message_sum": message_results,
+    "message_sum with latents": message_results_with_latents,
     "segment_sum": lambda scenes: segment_results(scenes, segment_sum),
     "segment_mean": lambda scenes: segment_results(scenes, segment_mean),
     "linear": linear_results,

@@ -1,13 +1,13 @@
 """One step of message passing over a set of edges, fused: encoder, two layers, LayerNorm and the sum at the receivers.
 
-    z_m = of_senders[s] + of_receivers[r] + A2 relu(A1 e_m + a1)
+    z_m = of_senders[s] + of_receivers[r] + A2 relu(A1 e_m + a1), or + e_m where the edges carry latents
     message_m = LayerNorm(W2 relu(z_m) + b2; gamma, beta),    sum_r = sum of the messages over the edges into r
 
 The C kernel keeps no array of the width of a feature per edge, neither within a call nor for the gradients: those
 recompute the layers.
 
-Legend: M edges, S senders, R receivers, E raw edge features, H channels of the encoder's hidden layer, F channels of
-the first layer, F2 channels of a message.
+Legend: M edges, S senders, R receivers, E edge features, H channels of the encoder's hidden layer, F channels of
+the first layer, F2 channels of a message. The op itself takes H = 0 without an encoder: E = F for latents, or E = 0.
 """
 
 from __future__ import annotations
@@ -30,8 +30,15 @@ def _compose(of_senders, of_receivers, edge_features, encoder, W2, b2, gamma, be
     if encoder is not None:
         A1, a1, A2 = encoder
         z = z + F.linear(F.relu(F.linear(edge_features, A1, a1)), A2)
+    elif edge_features is not None:
+        z = z + edge_features
     messages = F.layer_norm(F.linear(F.relu(z), W2, b2), (len(b2),), gamma, beta, EPS)
     return messages.new_zeros(len(of_receivers), len(b2)).index_add(0, receivers, messages), messages
+
+
+def _are_latents(edge_features: Tensor, a1: Tensor) -> bool:
+    """Whether the edge features are added as they are."""
+    return len(a1) == 0 and edge_features.shape[1] > 0
 
 
 def _check(
@@ -59,6 +66,10 @@ def _check(
         if x.shape != shape:
             wanted = ", ".join("*" if n < 0 else str(n) for n in shape)
             raise ValueError(f"message: {name} must have shape [{wanted}], not {tuple(x.shape)}")
+    if hidden == 0 and inputs not in (0, channels):
+        raise ValueError(
+            f"message: edge_features without an encoder must have the {channels} channels of of_senders, not {inputs}"
+        )
     check_offsets("message", "receiver_offsets", offsets, edges)
     wrong = ((senders < 0) | (senders >= len(of_senders))).nonzero()
     if len(wrong):
@@ -75,7 +86,8 @@ def _reference(
 ):
     inputs = (of_senders, of_receivers, edge_features, A1, a1, A2, W2, b2, gamma, beta)
     _check(*inputs, senders, receivers, offsets)
-    total, messages = _compose(*inputs[:3], (A1, a1, A2), *inputs[6:], senders, receivers)
+    encoder = None if _are_latents(edge_features, a1) else (A1, a1, A2)
+    total, messages = _compose(*inputs[:3], encoder, *inputs[6:], senders, receivers)
     return total, messages if with_messages else messages.new_empty(0, len(b2))
 
 
@@ -98,8 +110,10 @@ def _backward_reference(
     dsum, dmessages, P, Q, e, A1, a1, A2, W2, b2, gamma, beta, senders, receivers, offsets, wants_edges
 ):
     _check(P, Q, e, A1, a1, A2, W2, b2, gamma, beta, senders, receivers, offsets)
+    latents = _are_latents(e, a1)
     h = F.relu(F.linear(e, A1, a1))
-    x = F.relu(P.index_select(0, senders) + Q.index_select(0, receivers) + F.linear(h, A2))
+    of_edges = e if latents else F.linear(h, A2)
+    x = F.relu(P.index_select(0, senders) + Q.index_select(0, receivers) + of_edges)
     y = F.linear(x, W2, b2)
     _, mean, rstd = torch.native_layer_norm(y, (len(b2),), gamma, beta, EPS)
     g = dsum.index_select(0, receivers)
@@ -113,7 +127,7 @@ def _backward_reference(
     return (
         torch.zeros_like(P).index_add_(0, senders, dz),
         torch.zeros_like(Q).index_add_(0, receivers, dz),
-        dc @ A1 if wants_edges else e.new_empty(0, e.shape[1]),
+        (dz if latents else dc @ A1) if wants_edges else e.new_empty(0, e.shape[1]),
         dc.T @ e,
         dc.sum(0),
         dz.T @ h,
@@ -174,15 +188,28 @@ def _gradient(ctx, dsum, dmessages):
 library.differentiate(_message, _save, _gradient)
 
 
+def _check_features(edges: EdgeSet, of_senders: Tensor, edge_features: Tensor | None, encoder: Encoder | None) -> None:
+    """What the op cannot see, or the composition would stretch to shapes that fit."""
+    if encoder is not None:
+        if edge_features is None:
+            raise ValueError("message: an encoder needs edge_features; give them together, or no encoder")
+        if len(encoder[1]) == 0:
+            raise ValueError("message: a1 is empty: an encoder needs hidden channels, or give none")
+    elif edge_features is not None and edge_features.shape != (len(edges), of_senders.shape[-1]):
+        wanted, shape = f"[{len(edges)}, {of_senders.shape[-1]}]", tuple(edge_features.shape)
+        raise ValueError(f"message: edge_features without an encoder must have shape {wanted}, not {shape}")
+
+
 def _call(edges: EdgeSet, of_senders, of_receivers, edge_features, encoder, W2, b2, gamma, beta, with_messages: bool):
-    if (edge_features is None) != (encoder is None):
-        raise ValueError("message: edge_features and encoder must be given together or not at all")
+    _check_features(edges, of_senders, edge_features, encoder)
     if library.BACKEND == "torch":
         inputs = (of_senders, of_receivers, edge_features, encoder, W2, b2, gamma, beta)
         return _compose(*inputs, edges.senders, edges.receivers)
-    if encoder is None:
+    if edge_features is None:
         edge_features = of_senders.new_empty(len(edges), 0)
-        encoder = (of_senders.new_empty(0, 0), of_senders.new_empty(0), of_senders.new_empty(of_senders.shape[-1], 0))
+    if encoder is None:
+        shapes = ((0, edge_features.shape[1]), (0,), (of_senders.shape[-1], 0))
+        encoder = tuple(of_senders.new_empty(shape) for shape in shapes)
     lists = (edges.senders, edges.receivers, edges.receiver_offsets)
     return _message(of_senders, of_receivers, edge_features, *encoder, W2, b2, gamma, beta, *lists, with_messages)
 
@@ -204,7 +231,8 @@ def message_sum(
         edges: M edges from S senders to R receivers.
         of_senders: [S, F], the senders' share of the first layer, W_s v_s.
         of_receivers: [R, F], the receivers' share and the constant.
-        edge_features: [M, E], or None without an encoder.
+        edge_features: [M, E] for the encoder; without one the edges' share of the first layer [M, F], such as W_e e_m
+            of the latents e_m that they carry along, or None.
         encoder: A1 [H, E], a1 [H] and A2 [F, H], or None.
         W2: [F2, F], as `torch.nn.Linear` holds it.
         b2: [F2].

@@ -36,7 +36,8 @@ static void check_values(const ast_message *s, const float *dsum, const float *d
     finite &= all_finite(inputs[i], sizes[i]);
     most[i] = largest_finite(inputs[i], sizes[i]);
   }
-  const double h = (double)s->E * most[2] * most[3] + most[4], z = most[0] + most[1] + (double)s->H * h * most[5];
+  const double h = (double)s->E * most[2] * most[3] + most[4], of_edges = s->H ? (double)s->H * h * most[5] : most[2];
+  const double z = most[0] + most[1] + of_edges;
   const double y = (double)s->F * z * most[6] + most[7], scale = most[8] + most[9] + 1;
   if (!finite || !(y < 1e4 && z < 1e4 && h < 1e4 && scale < 1e4)) return;
   const double error = 4e-7 * (double)(s->E + s->H + s->F + s->F2 + 8) * fmax(1, y) * 320 * scale;
@@ -58,6 +59,7 @@ static void fuzz(const ast_kernels *kernels) {
   const int64_t most = many ? 3 : 65;
   ast_message s = {.S = 1 + take_size(60), .R = take_size(40), .E = take_size(many ? 2 : 17)};
   s.H = take_size(most), s.F = take_size(most), s.F2 = take_size(most);
+  if (s.E && !s.H) s.E = s.F;
   const bool with_messages = take_byte() % 2;
   int64_t *offsets = take_offsets(s.R, 40);
   for (int64_t r = 0; many && r <= s.R; r++) offsets[r] += 400 * r;

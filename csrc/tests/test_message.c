@@ -23,6 +23,7 @@ static const char *const names[MESSAGE_RESULTS] = {"sum", "messages", "dof_sende
       for (int64_t i = 0; i < F; i++) {                                                                                              \
         x[i] = (real)p[i] + (real)q[i];                                                                                              \
         for (int64_t k = 0; k < H; k++) x[i] += (real)s->A2[i * H + k] * h[k];                                                       \
+        if (E && !H) x[i] += (real)e[i];                                                                                             \
         if (x[i] < 0) x[i] = 0;                                                                                                      \
       }                                                                                                                              \
       real mean = 0, variance = 0, mean_p = 0, mean_pu = 0;                                                                          \
@@ -56,6 +57,7 @@ static const char *const names[MESSAGE_RESULTS] = {"sum", "messages", "dof_sende
         out[P][s->senders[m] * F + k] += dz[k];                                                                                      \
         out[Q][s->receivers[m] * F + k] += dz[k];                                                                                    \
         for (int64_t j = 0; j < H; j++) out[A2][k * H + j] += dz[k] * h[j];                                                          \
+        if (E && !H) out[EDGES][m * E + k] = dz[k];                                                                                  \
       }                                                                                                                              \
       for (int64_t j = 0; j < H; j++) {                                                                                              \
         dc[j] = 0;                                                                                                                   \
@@ -92,19 +94,22 @@ static void check_case(const ast_kernels *kernels, const int64_t *edges, const i
 }
 
 static void test_accuracy(const ast_kernels *kernels) {
-  static const int64_t channels[][4] = {{3, 16, 16, 16}, {8, 40, 24, 40}, {1, 1, 1, 4}, {16, 7, 33, 65}, {0, 0, 20, 12}, {0, 4, 5, 6}};
+  static const int64_t channels[][4] = {{3, 16, 16, 16}, {8, 40, 24, 40}, {1, 1, 1, 4},    {16, 7, 33, 65}, {0, 0, 20, 12},
+                                        {0, 4, 5, 6},    {16, 0, 16, 16}, {33, 0, 33, 65}, {1, 0, 1, 4}};
   static const int64_t edges[][3] = {{0, 0, 0}, {0, 3, 2}, {1, 1, 1}, {2, 1, 3}, {97, 5, 7}, {600, 300, 100}, {1000, 9, 1}};
-  for (int c = 0; c < 6; c++)
+  for (int c = 0; c < 9; c++)
     for (int e = 0; e < 7; e++) {
       check_state = (uint64_t)(7 * c + e); /* no case changes the numbers of another: with one or two edges the rule is sharp */
       check_case(kernels, edges[e], channels[c], (c + e) % 2);
     }
-  if (!getenv("AST_TEST_QUICK")) check_case(kernels, (const int64_t[]){20000, 900, 700}, (const int64_t[]){2, 8, 8, 16}, false);
+  if (getenv("AST_TEST_QUICK")) return;
+  check_case(kernels, (const int64_t[]){20000, 900, 700}, (const int64_t[]){2, 8, 8, 16}, false);
+  check_case(kernels, (const int64_t[]){20000, 900, 700}, (const int64_t[]){8, 0, 8, 16}, true);
 }
 
 /* A scene alone gives the bits that it gives behind another one, and a NaN in that one does not reach it. */
-static void test_batch(const ast_kernels *kernels) {
-  const ast_message both = new_message(5000, 400, 600, 5, 24, 40, 20, 2);
+static void test_batch(const ast_kernels *kernels, int64_t E, int64_t H) {
+  const ast_message both = new_message(5000, 400, 600, E, H, 40, 20, 2);
   const int64_t M = both.M - both.receiver_offsets[300], first = both.M - M;
   ast_message one = both;
   int64_t *senders = new_ints(M), *receivers = new_ints(M), *offsets = new_ints(301);
@@ -117,6 +122,7 @@ static void test_batch(const ast_kernels *kernels) {
   for (int64_t r = 0; r <= 300; r++) offsets[r] = both.receiver_offsets[300 + r] - first;
   one.of_senders += 200 * one.F, one.of_receivers += 300 * one.F, one.edge_features += first * one.E;
   for (int64_t i = 0; i < 200 * one.F; i += 7) ((float *)(uintptr_t)both.of_senders)[i] = NAN;
+  for (int64_t i = 0; i < first * E; i += 11) ((float *)(uintptr_t)both.edge_features)[i] = i % 2 ? NAN : INFINITY;
   float *dsum = random_floats(both.R * both.F2);
   const message_results batch = solve_message(kernels, &both, dsum, NULL), alone = solve_message(kernels, &one, dsum + 300 * one.F2, NULL);
   for (int i = SUM; i <= EDGES; i++) {
@@ -130,20 +136,25 @@ static void test_batch(const ast_kernels *kernels) {
 
 /* The pool that this run is on gives what the calling thread alone gives. */
 static void test_threads(const ast_kernels *kernels) {
-  const ast_message s = new_message(18000, 700, 900, 3, 16, 24, 16, 1);
-  float *dsum = random_floats(s.R * s.F2);
-  const message_results threaded = solve_message(kernels, &s, dsum, NULL);
+  const ast_message problems[] = {new_message(18000, 700, 900, 3, 16, 24, 16, 1), new_message(18000, 700, 900, 24, 0, 24, 16, 1)};
+  float *dsum = random_floats(900 * 16);
+  message_results threaded[2];
+  for (int k = 0; k < 2; k++) threaded[k] = solve_message(kernels, &problems[k], dsum, NULL);
   ast_set_pool(NULL, NULL);
-  const message_results serial = solve_message(kernels, &s, dsum, NULL);
-  for (int i = 0; i < MESSAGE_RESULTS; i++)
-    CHECK(!memcmp(threaded.of[i], serial.of[i], (size_t)serial.size[i] * sizeof(float)), "threads change %s", names[i]);
-  free_message_results(threaded), free_message_results(serial);
-  FREE(MESSAGE_BUFFERS(&s), dsum);
+  for (int k = 0; k < 2; k++) {
+    const message_results serial = solve_message(kernels, &problems[k], dsum, NULL);
+    for (int i = 0; i < MESSAGE_RESULTS; i++)
+      CHECK(!memcmp(threaded[k].of[i], serial.of[i], (size_t)serial.size[i] * sizeof(float)), "threads change %s", names[i]);
+    free_message_results(threaded[k]), free_message_results(serial);
+    FREE(MESSAGE_BUFFERS(&problems[k]));
+  }
+  FREE(dsum);
 }
 
 static void test(const ast_kernels *kernels) {
   test_accuracy(kernels);
-  test_batch(kernels);
+  test_batch(kernels, 5, 24);
+  test_batch(kernels, 40, 0);
   test_threads(kernels); /* last: it takes the pool away */
 }
 
