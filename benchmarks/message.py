@@ -1,8 +1,8 @@
 """Fused message passing beside the composition in torch, which holds every layer of every edge.
 
 The flops counted are those executed: the gradients recompute the layers. A layer costs 2 x its weights an edge forward;
-backward, 2 x again to recompute it and 4 x for its two gradients (2 x for the first, as raw features need none). Latents
-of the edges cost none: their gradient is that of the first layer, and is taken.
+backward, 2 x again to recompute it and 4 x for its two gradients (2 x for the first, as raw features need none).
+Latents of the edges, whose gradient is taken, are added without flops that count.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
     z_m = of_senders[s] + of_receivers[r] + A2 relu(A1 e_m + a1), or + e_m where the edges carry latents
     message_m = LayerNorm(W2 relu(z_m) + b2; gamma, beta),    sum_r = sum of the messages over the edges into r
 
-The C kernel keeps no array of the width of a feature per edge, neither within a call nor for the gradients: those
-recompute the layers.
+The C kernel keeps no array of the width of a feature per edge of its own, neither within a call nor for the gradients:
+those recompute the layers.
 
 Legend: M edges, S senders, R receivers, E edge features, H channels of the encoder's hidden layer, F channels of
 the first layer, F2 channels of a message. The op itself takes H = 0 without an encoder: E = F for latents, or E = 0.
