@@ -12,6 +12,8 @@ from ast_sim.baselines.hcmt import HCMT, HCMTConfig
 from ast_sim.baselines.hcmt import PRESETS as HCMT_PRESETS
 from ast_sim.baselines.mgn import MGN, MGNConfig
 from ast_sim.baselines.mgn import PRESETS as MGN_PRESETS
+from ast_sim.baselines.transolver import PRESETS as TRANSOLVER_PRESETS
+from ast_sim.baselines.transolver import Transolver, TransolverConfig
 from ast_sim.errors import ConfigError
 from ast_sim.model.ast import AST
 from ast_sim.model.ast_config import PRESETS as AST_PRESETS
@@ -19,7 +21,7 @@ from ast_sim.model.ast_config import ASTConfig
 from ast_sim.model.config import ModelConfig, Preset
 from ast_sim.model.simulator import Simulator
 
-AnyConfig = ASTConfig | MGNConfig | BSMSConfig | HCMTConfig
+AnyConfig = ASTConfig | MGNConfig | BSMSConfig | HCMTConfig | TransolverConfig
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,7 @@ MODELS = {
     "mgn": Model(MGNConfig, MGN, MGN_PRESETS),
     "bsms": Model(BSMSConfig, BSMS, BSMS_PRESETS),
     "hcmt": Model(HCMTConfig, HCMT, HCMT_PRESETS),
+    "transolver": Model(TransolverConfig, Transolver, TRANSOLVER_PRESETS),
 }
 
 
