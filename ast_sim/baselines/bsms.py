@@ -22,7 +22,14 @@ import torch
 from torch import Tensor, nn
 
 from ast_sim.baselines.bistride import Hierarchy, build_hierarchy, subset
-from ast_sim.baselines.common import Decoder, DeepMLP, WorldEdgeConfig, WorldEdgeSimulator
+from ast_sim.baselines.common import (
+    Decoder,
+    DeepMLP,
+    WorldEdgeConfig,
+    WorldEdgeSimulator,
+    messages,
+    sum_at_receivers,
+)
 from ast_sim.data.batch import Batch
 from ast_sim.data.graph import Graph, edge_vectors
 from ast_sim.data.scene import Scene
@@ -32,8 +39,6 @@ from ast_sim.model.features import node_features
 from ast_sim.model.normalizer import FeatureNormalizer
 from ast_sim.model.simulator import Prediction
 from ast_sim.ops.edges import EdgeSet
-from ast_sim.ops.linear import linear
-from ast_sim.ops.segment import segment_sum
 
 MESH = [("vector", 3), ("scalar", 1), ("vector", 3), ("scalar", 1)]
 CONTACT = [("vector", 3), ("scalar", 1)]
@@ -82,22 +87,15 @@ class Level:
 
 
 class Messages(nn.Module):
-    """Sums of the messages along the edges of one set. The first layer acts on its inputs separately, so that of the
-    nodes is applied to nodes, not to edges."""
+    """Sums of the messages along the edges of one set."""
 
     def __init__(self, edge_inputs: int, hidden: int):
         super().__init__()
-        self.widths = [edge_inputs, hidden, hidden]
         self.mlp = plain_mlp(edge_inputs + 2 * hidden, hidden)
 
     def forward(self, edges: EdgeSet, features: Tensor, nodes: Tensor) -> Tensor:
         """features [M, edge_inputs], nodes [N, hidden] -> [N, hidden]."""
-        mlp = self.mlp
-        of_edge, of_sender, of_receiver = mlp.first.weight.split(self.widths, dim=1)
-        of_nodes = linear(nodes, of_sender).index_select(0, edges.senders)
-        of_nodes = of_nodes + linear(nodes, of_receiver, mlp.first.bias).index_select(0, edges.receivers)
-        found = mlp.rest(torch.relu(linear(features, of_edge, residual=of_nodes)), norm=mlp.norm)
-        return segment_sum(found, torch.arange(len(found)), edges.receiver_offsets)
+        return sum_at_receivers(messages(self.mlp, edges, features, nodes), edges)
 
 
 class Block(nn.Module):

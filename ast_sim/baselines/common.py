@@ -22,6 +22,8 @@ from ast_sim.model.mlp import MLP
 from ast_sim.model.normalizer import FeatureNormalizer
 from ast_sim.model.simulator import Prediction, Simulator
 from ast_sim.ops.edges import EdgeSet
+from ast_sim.ops.linear import linear
+from ast_sim.ops.segment import segment_sum
 
 _VECTOR = [("vector", 3), ("scalar", 1)]  # a difference of positions and its length
 
@@ -105,6 +107,23 @@ class DeepMLP(nn.Module):
     def forward(self, x: Tensor, residual: Tensor | None = None) -> Tensor:
         """x [*, inputs] -> [*, outputs], plus the residual."""
         return self.rest(self.first(x, "relu"), norm=self.norm, residual=residual)
+
+
+def messages(mlp: DeepMLP, edges: EdgeSet, features: Tensor, nodes: Tensor) -> Tensor:
+    """The MLP of [edge, sender, receiver] on every edge of a set: features [M, *], nodes [N, hidden] -> [M, hidden].
+
+    The first layer acts on its inputs separately, so that of the nodes is applied to nodes, not to edges.
+    """
+    width = nodes.shape[1]
+    of_edge, of_sender, of_receiver = mlp.first.weight.split([features.shape[1], width, width], dim=1)
+    of_nodes = linear(nodes, of_sender).index_select(0, edges.senders)
+    of_nodes = of_nodes + linear(nodes, of_receiver, mlp.first.bias).index_select(0, edges.receivers)
+    return mlp.rest(torch.relu(linear(features, of_edge, residual=of_nodes)), norm=mlp.norm)
+
+
+def sum_at_receivers(values: Tensor, edges: EdgeSet) -> Tensor:
+    """[M, F] on the edges of a set -> [N, F], in stored order."""
+    return segment_sum(values, torch.arange(len(values)), edges.receiver_offsets)
 
 
 class Decoder(nn.Module):

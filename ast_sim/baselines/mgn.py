@@ -4,8 +4,7 @@ A block, with LN an MLP that ends in a LayerNorm:
 
     e'_ij = LN_M(e_ij, v_i, v_j),    w'_ij = LN_W(w_ij, v_i, v_j),    v'_j = LN_V(v_j, sum_i e'_ij, sum_i w'_ij)
 
-and e, w and v grow by what was found. The first layer acts on its inputs separately, so that of the nodes is applied to
-nodes, not to edges.
+and e, w and v grow by what was found.
 
 Legend: N nodes, M edges of a set.
 """
@@ -18,13 +17,18 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from ast_sim.baselines.common import Decoder, DeepMLP, WorldEdgeConfig, WorldEdgeSimulator
+from ast_sim.baselines.common import (
+    Decoder,
+    DeepMLP,
+    WorldEdgeConfig,
+    WorldEdgeSimulator,
+    messages,
+    sum_at_receivers,
+)
 from ast_sim.data.batch import Batch
 from ast_sim.model.config import Preset, setting
 from ast_sim.model.simulator import Prediction
 from ast_sim.ops.edges import EdgeSet
-from ast_sim.ops.linear import linear
-from ast_sim.ops.segment import segment_sum
 
 
 @dataclass(frozen=True)
@@ -40,18 +44,12 @@ class EdgeUpdate(nn.Module):
 
     def __init__(self, hidden: int):
         super().__init__()
-        self.hidden = hidden
         self.update = DeepMLP(3 * hidden, hidden, hidden)
 
     def forward(self, edges: EdgeSet, latents: Tensor, nodes: Tensor) -> tuple[Tensor, Tensor]:
         """latents [M, hidden], nodes [N, hidden] -> latents with what was found, and its sums [N, hidden]."""
-        mlp = self.update
-        of_edge, of_sender, of_receiver = mlp.first.weight.split(self.hidden, dim=1)
-        of_nodes = linear(nodes, of_sender).index_select(0, edges.senders)
-        of_nodes = of_nodes + linear(nodes, of_receiver, mlp.first.bias).index_select(0, edges.receivers)
-        found = mlp.rest(torch.relu(linear(latents, of_edge, residual=of_nodes)), norm=mlp.norm)
-        order = torch.arange(len(found))
-        return latents + found, segment_sum(found, order, edges.receiver_offsets)
+        found = messages(self.update, edges, latents, nodes)
+        return latents + found, sum_at_receivers(found, edges)
 
 
 class Block(nn.Module):
