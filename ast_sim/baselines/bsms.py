@@ -22,14 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from ast_sim.baselines.bistride import Hierarchy, build_hierarchy, subset
-from ast_sim.baselines.common import (
-    Decoder,
-    DeepMLP,
-    WorldEdgeConfig,
-    WorldEdgeSimulator,
-    messages,
-    sum_at_receivers,
-)
+from ast_sim.baselines.common import Decoder, DeepMLP, WorldEdgeConfig, WorldEdgeSimulator, messages
 from ast_sim.data.batch import Batch
 from ast_sim.data.graph import Graph, edge_vectors
 from ast_sim.data.scene import Scene
@@ -69,9 +62,9 @@ class PlainNorm(nn.Module):
         self.register_buffer("bias", torch.zeros(width), persistent=False)
 
 
-def plain_mlp(inputs: int, hidden: int) -> DeepMLP:
-    """Two hidden layers, a linear one and a LayerNorm without weights."""
-    mlp = DeepMLP(inputs, hidden, hidden)
+def plain_mlp(inputs: int, hidden: int, layers: int) -> DeepMLP:
+    """Hidden layers, a linear one and a LayerNorm without weights."""
+    mlp = DeepMLP(inputs, hidden, hidden, layers)
     mlp.norm = PlainNorm(hidden)
     return mlp
 
@@ -89,22 +82,22 @@ class Level:
 class Messages(nn.Module):
     """Sums of the messages along the edges of one set."""
 
-    def __init__(self, edge_inputs: int, hidden: int):
+    def __init__(self, edge_inputs: int, hidden: int, layers: int):
         super().__init__()
-        self.mlp = plain_mlp(edge_inputs + 2 * hidden, hidden)
+        self.mlp = plain_mlp(edge_inputs + 2 * hidden, hidden, layers)
 
     def forward(self, edges: EdgeSet, features: Tensor, nodes: Tensor) -> Tensor:
         """features [M, edge_inputs], nodes [N, hidden] -> [N, hidden]."""
-        return sum_at_receivers(messages(self.mlp, edges, features, nodes), edges)
+        return messages(self.mlp, edges, features, nodes)[0]
 
 
 class Block(nn.Module):
     """One step on the mesh and the contacts of a level."""
 
-    def __init__(self, hidden: int):
+    def __init__(self, hidden: int, layers: int):
         super().__init__()
-        self.mesh, self.contact = Messages(8, hidden), Messages(4, hidden)
-        self.node = plain_mlp(3 * hidden, hidden)
+        self.mesh, self.contact = Messages(8, hidden, layers), Messages(4, hidden, layers)
+        self.node = plain_mlp(3 * hidden, hidden, layers)
 
     def forward(self, x: Tensor, level: Level) -> Tensor:
         """[N, hidden] -> [N, hidden]."""
@@ -120,13 +113,13 @@ class BSMS(WorldEdgeSimulator):
 
     def __init__(self, config: BSMSConfig):
         super().__init__(config)
-        width, levels = config.hidden, config.levels
+        width, layers, levels = config.hidden, config.hidden_layers, config.levels
         self.mesh_inputs = nn.ModuleList(FeatureNormalizer(MESH) for _ in range(levels + 1))
         self.world_inputs = nn.ModuleList(FeatureNormalizer(CONTACT) for _ in range(levels + 1))
-        self.node_encoder = plain_mlp(self.node_inputs.width, width)
-        self.down = nn.ModuleList(Block(width) for _ in range(levels))
-        self.bottom = Block(width)
-        self.up = nn.ModuleList(Block(width) for _ in range(levels))
+        self.node_encoder = plain_mlp(self.node_inputs.width, width, layers)
+        self.down = nn.ModuleList(Block(width, layers) for _ in range(levels))
+        self.bottom = Block(width, layers)
+        self.up = nn.ModuleList(Block(width, layers) for _ in range(levels))
         self.decoder = Decoder(config)
 
     def graph(self, scene: Scene) -> Graph:
@@ -187,7 +180,7 @@ class BSMS(WorldEdgeSimulator):
 PRESETS = {
     # A size that two cores train in minutes.
     "tiny": Preset(
-        BSMSConfig(hidden=64, levels=3, contacts="components"),
+        BSMSConfig(hidden=64, hidden_layers=1, levels=3, contacts="components"),
         {"batch_size": 4, "peak_rate": 5e-4, "stress_weight": 0.1},
         adapts=True,
     ),

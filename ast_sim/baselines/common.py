@@ -15,14 +15,16 @@ from ast_sim.baselines.world_edges import world_edges
 from ast_sim.data.batch import Batch
 from ast_sim.data.file import DatasetInfo
 from ast_sim.data.graph import edge_vectors
+from ast_sim.errors import ConfigError
 from ast_sim.model.config import ModelConfig, setting
 from ast_sim.model.features import node_features, normalizer_of
-from ast_sim.model.linear import Linear
-from ast_sim.model.mlp import MLP
+from ast_sim.model.mlp import MLP, layer
 from ast_sim.model.normalizer import FeatureNormalizer
 from ast_sim.model.simulator import Prediction, Simulator
 from ast_sim.ops.edges import EdgeSet
 from ast_sim.ops.linear import linear
+from ast_sim.ops.message import message_edges
+from ast_sim.ops.mlp import mlp
 from ast_sim.ops.segment import segment_sum
 
 _VECTOR = [("vector", 3), ("scalar", 1)]  # a difference of positions and its length
@@ -34,8 +36,14 @@ class WorldEdgeConfig(ModelConfig):
 
     node_inputs: tuple[str, ...] = setting((), "node features: displacement, velocity, material, proximity")
     hidden: int = setting(128, "width of node and edge features")
+    hidden_layers: int = setting(2, "hidden layers of each MLP: 2, or 1, where message passing is one fused op")
     world_radius: float | None = setting(None, "length of world edges at most; unset: the dataset's contact radius")
     most_world_edges: int | None = setting(None, "world edges of a scene at most, the shortest; unset: all")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.hidden_layers not in (1, 2):
+            raise ConfigError(f"model.hidden_layers is {self.hidden_layers}; it must be 1 or 2")
 
     def resolve(self, info: DatasetInfo, material_width: int, mesh_spacing: float) -> Self:
         """See `ModelConfig`."""
@@ -94,36 +102,46 @@ def mesh_features(batch: Batch) -> Tensor:
 
 
 class DeepMLP(nn.Module):
-    """Two hidden layers with ReLU and a linear one (MeshGraphNets, section A.1), then LayerNorm unless it decodes."""
+    """Hidden layers with ReLU and a linear one (MeshGraphNets, section A.1), then LayerNorm unless it decodes.
 
-    def __init__(self, inputs: int, hidden: int, outputs: int, norm: bool = True):
+    Args:
+        inputs, hidden, outputs: widths.
+        layers: hidden layers, 1 or 2.
+        norm: whether it ends in a LayerNorm.
+    """
+
+    def __init__(self, inputs: int, hidden: int, outputs: int, layers: int, norm: bool = True):
         super().__init__()
-        self.first = Linear(inputs, hidden)
-        nn.init.xavier_uniform_(self.first.weight)
-        nn.init.zeros_(self.first.bias)
-        self.rest = MLP(hidden, hidden, outputs, factorized=False)
+        self.first = layer(inputs, hidden, factorized=False)
+        rest = MLP(hidden, hidden, outputs, factorized=False)
+        self.rest = rest if layers == 2 else layer(hidden, outputs, factorized=False)
         self.norm = nn.LayerNorm(outputs) if norm else None
 
     def forward(self, x: Tensor, residual: Tensor | None = None) -> Tensor:
         """x [*, inputs] -> [*, outputs], plus the residual."""
-        return self.rest(self.first(x, "relu"), norm=self.norm, residual=residual)
+        weights = (self.first.weight, self.first.bias)
+        if isinstance(self.rest, MLP):
+            return self.rest(linear(x, *weights, "relu"), norm=self.norm, residual=residual)
+        norm = None if self.norm is None else (self.norm.weight, self.norm.bias)
+        return mlp(x, *weights, self.rest.weight, self.rest.bias, None, norm, residual)
 
 
-def messages(mlp: DeepMLP, edges: EdgeSet, features: Tensor, nodes: Tensor) -> Tensor:
-    """The MLP of [edge, sender, receiver] on every edge of a set: features [M, *], nodes [N, hidden] -> [M, hidden].
+def messages(edge_mlp: DeepMLP, edges: EdgeSet, features: Tensor, nodes: Tensor) -> tuple[Tensor, Tensor]:
+    """The MLP of [edge, sender, receiver] on every edge of a set: its sums at the receivers [N, hidden], in stored
+    order, and itself [M, hidden], from features [M, *] and nodes [N, hidden].
 
     The first layer acts on its inputs separately, so that of the nodes is applied to nodes, not to edges.
     """
     width = nodes.shape[1]
-    of_edge, of_sender, of_receiver = mlp.first.weight.split([features.shape[1], width, width], dim=1)
-    of_nodes = linear(nodes, of_sender).index_select(0, edges.senders)
-    of_nodes = of_nodes + linear(nodes, of_receiver, mlp.first.bias).index_select(0, edges.receivers)
-    return mlp.rest(torch.relu(linear(features, of_edge, residual=of_nodes)), norm=mlp.norm)
-
-
-def sum_at_receivers(values: Tensor, edges: EdgeSet) -> Tensor:
-    """[M, F] on the edges of a set -> [N, F], in stored order."""
-    return segment_sum(values, torch.arange(len(values)), edges.receiver_offsets)
+    of_edge, of_sender, of_receiver = edge_mlp.first.weight.split([features.shape[1], width, width], dim=1)
+    of_senders, of_receivers = linear(nodes, of_sender), linear(nodes, of_receiver, edge_mlp.first.bias)
+    rest, norm = edge_mlp.rest, edge_mlp.norm
+    if not isinstance(rest, MLP):
+        weights = (rest.weight, rest.bias, norm.weight, norm.bias)
+        return message_edges(edges, of_senders, of_receivers, linear(features, of_edge), None, *weights)
+    of_nodes = of_senders.index_select(0, edges.senders) + of_receivers.index_select(0, edges.receivers)
+    found = rest(torch.relu(linear(features, of_edge, residual=of_nodes)), norm=norm)
+    return segment_sum(found, torch.arange(len(found)), edges.receiver_offsets), found
 
 
 class Decoder(nn.Module):
@@ -133,9 +151,10 @@ class Decoder(nn.Module):
     def __init__(self, config: WorldEdgeConfig):
         super().__init__()
         self.stress = config.stress
-        self.of_nodes = DeepMLP(config.hidden, config.hidden, 4 if config.stress == "node" else 3, norm=False)
+        width, layers = config.hidden, config.hidden_layers
+        self.of_nodes = DeepMLP(width, width, 4 if config.stress == "node" else 3, layers, norm=False)
         if config.stress == "element":
-            self.of_elements = DeepMLP(config.hidden, config.hidden, 1, norm=False)
+            self.of_elements = DeepMLP(width, width, 1, layers, norm=False)
 
     def forward(self, nodes: Tensor, batch: Batch) -> Prediction:
         out = self.of_nodes(nodes)

@@ -97,10 +97,10 @@ class HCMT(WorldEdgeSimulator):
 
     def __init__(self, config: HCMTConfig):
         super().__init__(config)
-        width = config.hidden
-        self.node_encoder = DeepMLP(self.node_inputs.width, width, width)
-        self.mesh_encoder = DeepMLP(self.mesh_inputs.width, width, width)
-        self.world_encoder = DeepMLP(self.world_inputs.width, width, width)
+        width, layers = config.hidden, config.hidden_layers
+        self.node_encoder = DeepMLP(self.node_inputs.width, width, width, layers)
+        self.mesh_encoder = DeepMLP(self.mesh_inputs.width, width, width, layers)
+        self.world_encoder = DeepMLP(self.world_inputs.width, width, width, layers)
         self.contact = nn.ModuleList(Block(config, 2) for _ in range(config.contact_blocks))
         self.down = nn.ModuleList(Block(config, 1) for _ in range(config.levels))
         self.bottom = Block(config, 1)
@@ -161,7 +161,9 @@ class HCMT(WorldEdgeSimulator):
 PRESETS = {
     # A size that two cores train in minutes.
     "tiny": Preset(
-        HCMTConfig(hidden=64, levels=3), {"batch_size": 4, "peak_rate": 5e-4, "stress_weight": 0.1}, adapts=True
+        HCMTConfig(hidden=64, hidden_layers=1, levels=3),
+        {"batch_size": 4, "peak_rate": 5e-4, "stress_weight": 0.1},
+        adapts=True,
     ),
     # As the AST paper trains it, one scene on each of four GPUs (sections "Batch Size and Learning Rate", "Baselines").
     "paper": Preset(

@@ -17,14 +17,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from ast_sim.baselines.common import (
-    Decoder,
-    DeepMLP,
-    WorldEdgeConfig,
-    WorldEdgeSimulator,
-    messages,
-    sum_at_receivers,
-)
+from ast_sim.baselines.common import Decoder, DeepMLP, WorldEdgeConfig, WorldEdgeSimulator, messages
 from ast_sim.data.batch import Batch
 from ast_sim.model.config import Preset, setting
 from ast_sim.model.simulator import Prediction
@@ -42,23 +35,23 @@ class MGNConfig(WorldEdgeConfig):
 class EdgeUpdate(nn.Module):
     """New latents of the edges of one set and their sums at the receivers."""
 
-    def __init__(self, hidden: int):
+    def __init__(self, hidden: int, layers: int):
         super().__init__()
-        self.update = DeepMLP(3 * hidden, hidden, hidden)
+        self.update = DeepMLP(3 * hidden, hidden, hidden, layers)
 
     def forward(self, edges: EdgeSet, latents: Tensor, nodes: Tensor) -> tuple[Tensor, Tensor]:
         """latents [M, hidden], nodes [N, hidden] -> latents with what was found, and its sums [N, hidden]."""
-        found = messages(self.update, edges, latents, nodes)
-        return latents + found, sum_at_receivers(found, edges)
+        total, found = messages(self.update, edges, latents, nodes)
+        return latents + found, total
 
 
 class Block(nn.Module):
     """One step on both edge sets."""
 
-    def __init__(self, hidden: int):
+    def __init__(self, hidden: int, layers: int):
         super().__init__()
-        self.mesh, self.world = EdgeUpdate(hidden), EdgeUpdate(hidden)
-        self.node = DeepMLP(3 * hidden, hidden, hidden)
+        self.mesh, self.world = EdgeUpdate(hidden, layers), EdgeUpdate(hidden, layers)
+        self.node = DeepMLP(3 * hidden, hidden, hidden, layers)
 
     def forward(
         self, nodes: Tensor, mesh: tuple[EdgeSet, Tensor], world: tuple[EdgeSet, Tensor]
@@ -76,11 +69,11 @@ class MGN(WorldEdgeSimulator):
 
     def __init__(self, config: MGNConfig):
         super().__init__(config)
-        width = config.hidden
-        self.node_encoder = DeepMLP(self.node_inputs.width, width, width)
-        self.mesh_encoder = DeepMLP(self.mesh_inputs.width, width, width)
-        self.world_encoder = DeepMLP(self.world_inputs.width, width, width)
-        self.blocks = nn.ModuleList(Block(width) for _ in range(config.blocks))
+        width, layers = config.hidden, config.hidden_layers
+        self.node_encoder = DeepMLP(self.node_inputs.width, width, width, layers)
+        self.mesh_encoder = DeepMLP(self.mesh_inputs.width, width, width, layers)
+        self.world_encoder = DeepMLP(self.world_inputs.width, width, width, layers)
+        self.blocks = nn.ModuleList(Block(width, layers) for _ in range(config.blocks))
         self.decoder = Decoder(config)
 
     def forward(self, batch: Batch) -> Prediction:
@@ -97,7 +90,9 @@ class MGN(WorldEdgeSimulator):
 PRESETS = {
     # A size that two cores train in minutes.
     "tiny": Preset(
-        MGNConfig(hidden=64, blocks=8), {"batch_size": 4, "peak_rate": 5e-4, "stress_weight": 0.1}, adapts=True
+        MGNConfig(hidden=64, hidden_layers=1, blocks=8),
+        {"batch_size": 4, "peak_rate": 5e-4, "stress_weight": 0.1},
+        adapts=True,
     ),
     # As the AST paper trains it (sections "Batch Size and Learning Rate", "Baselines").
     "paper": Preset(

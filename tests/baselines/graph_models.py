@@ -47,10 +47,12 @@ def made(config: ModelConfig, *seeds: int) -> tuple[Simulator, Batch]:
 
 
 def deep_mlp(p: Parameters, name: str, x: Tensor) -> Tensor:
-    """Linear, ReLU, Linear, ReLU, Linear, and LayerNorm if it has one."""
-    x = F.relu(F.linear(x, p[f"{name}.first.weight"], p[f"{name}.first.bias"]))
-    x = F.relu(F.linear(x, p[f"{name}.rest.first.weight"], p[f"{name}.rest.first.bias"]))
-    x = F.linear(x, p[f"{name}.rest.second.weight"], p[f"{name}.rest.second.bias"])
+    """Linear, ReLU, as often as it has hidden layers, Linear, and LayerNorm if it has one."""
+    two = f"{name}.rest.first.weight" in p
+    *hidden, last = ("first", "rest.first", "rest.second") if two else ("first", "rest")
+    for layer in hidden:
+        x = F.relu(F.linear(x, p[f"{name}.{layer}.weight"], p[f"{name}.{layer}.bias"]))
+    x = F.linear(x, p[f"{name}.{last}.weight"], p[f"{name}.{last}.bias"])
     if f"{name}.norm.weight" in p:
         x = F.layer_norm(x, x.shape[-1:], p[f"{name}.norm.weight"], p[f"{name}.norm.bias"])
     return x

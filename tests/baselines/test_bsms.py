@@ -98,7 +98,7 @@ def formulas(model, batch):
     ("stress", "more"),
     [
         ("node", {}),
-        ("element", {"contacts": "components"}),
+        ("element", {"contacts": "components", "hidden_layers": 1}),
         ("none", {"repeat_ends": True, "contacts": "components", "prescribed_edges": False}),
     ],
 )

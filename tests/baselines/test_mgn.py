@@ -46,9 +46,10 @@ def formulas(model, batch):
     return of
 
 
+@pytest.mark.parametrize("layers", [1, 2])
 @pytest.mark.parametrize("stress", ["none", "node", "element"])
-def test_it_follows_the_formulas(stress):
-    model, batch = made(replace(resolved(SMALL), stress=stress), 0, 1)
+def test_it_follows_the_formulas(stress, layers):
+    model, batch = made(replace(resolved(SMALL), stress=stress, hidden_layers=layers), 0, 1)
     assert len(model.world(batch)) > 20
     assert_follows(model, batch, formulas(model, batch))
 
