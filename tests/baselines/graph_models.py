@@ -59,7 +59,8 @@ def deep_mlp(p: Parameters, name: str, x: Tensor) -> Tensor:
 
 
 def assert_follows(model: Simulator, batch: Batch, formulas: Callable[[Parameters, torch.dtype], Prediction]) -> None:
-    """The accuracy rule for outputs and the gradients of all parameters, against the formulas in float64."""
+    """Outputs and the gradients of all parameters against the formulas in float64: no worse than twice the formulas in
+    float32, relative to the largest entry of each."""
 
     def results(out: Prediction, parameters: list[Tensor]) -> list[Tensor]:
         outputs = [x for x in (out.motion, out.stress) if x is not None]
@@ -81,8 +82,12 @@ def assert_follows(model: Simulator, batch: Batch, formulas: Callable[[Parameter
         by_formulas(torch.float32),
         by_formulas(torch.float64),
     )
-    for name, *found in zip(names, ours, plain, exact, strict=True):
-        c, t, e = (x.detach() for x in found)
-        bound = 2 * float((t - e).abs().max()) + 1e-6 * float(e.abs().max())
-        assert float((c - e).abs().max()) <= bound, (name, float((c - e).abs().max()), bound)
-        assert float(e.abs().max()) > 0, name
+    triples = [[x.detach() for x in found] for found in zip(ours, plain, exact, strict=True)]
+    size = [float(e.abs().max()) for _, _, e in triples]
+    # What rounding does to one of many results is a draw: the plain form's worst of all says what to expect of each.
+    worst = max(float((t - e).abs().max()) / s for (_, t, e), s in zip(triples, size, strict=True))
+    for name, (c, _, e), s in zip(names, triples, size, strict=True):
+        assert s > 0, name
+        error = float((c - e).abs().max()) / s
+        assert error <= 2 * worst + 1e-6, (name, error, worst)
+    assert worst < 1e-4
