@@ -91,7 +91,7 @@ def find_series(source: Path) -> dict[str, Path]:
         for path in _series_in(source)
     }
     if not found:
-        raise DatasetError(f"{source}: neither it nor a folder in it holds .pvd or .vtu files")
+        raise DatasetError(f"{source}: neither it nor a folder in it holds .pvd or .vtu files, nor it .tfrecord files")
     return found
 
 

@@ -37,7 +37,7 @@ def is_deepmind(source: Path) -> bool:
     """
     if source.suffix == SUFFIX:
         raise DatasetError(f"{source}: name its folder, which must hold {META} too; one split is taken by --split")
-    return source.is_dir() and ((source / META).is_file() or any(source.glob(f"*{SUFFIX}")))
+    return source.is_dir() and any(source.glob(f"*{SUFFIX}"))
 
 
 def convert_deepmind(
@@ -210,7 +210,7 @@ class _Record:
         """[rows, columns] of what is static, or the same in all frames."""
         frames = self.frames(name)
         for frame in range(1, len(frames)):
-            if not np.array_equal(frames[frame], frames[0]):
+            if not np.array_equal(frames[frame], frames[0], equal_nan=True):
                 self._fail_changing(f"{name} in frame {frame} is not that of frame 0")
         return frames[0]
 

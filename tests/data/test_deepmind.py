@@ -161,6 +161,22 @@ def test_a_mesh_that_is_stored_for_every_frame(tmp_path):
     assert np.array_equal(found.position, wanted.position)
 
 
+def test_rest_coordinates_for_every_frame_may_be_undefined_on_the_sphere(tmp_path):
+    arrays = records("sphere_simple", "train")[0]
+    changes = features("sphere_simple", mesh_pos={"type": "dynamic", "shape": [FRAMES, -1, 2], "dtype": "float32"})
+    given = {**arrays, "mesh_pos": np.repeat(arrays["mesh_pos"], FRAMES, axis=0)}
+    found = first(written(tmp_path, "sphere_simple", given, {"features": changes}))
+    wanted = first(write(tmp_path / "static", "sphere_simple"))
+    assert np.isnan(given["mesh_pos"]).any() and np.array_equal(found.scene.rest_position, wanted.scene.rest_position)
+
+
+def test_a_folder_with_a_meta_file_of_another_kind_is_a_series(tmp_path, capsys):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "meta.json").write_text("{}")
+    assert main(["convert", str(tmp_path / "run"), "--out", str(tmp_path / "d.h5")]) == 2
+    assert "holds .pvd or .vtu files, nor it .tfrecord files" in capsys.readouterr().err
+
+
 def test_a_mesh_that_changes_is_refused(tmp_path):
     arrays = records("deforming_plate", "train")[0]
     repeated = np.repeat(arrays["cells"], FRAMES, axis=0)
