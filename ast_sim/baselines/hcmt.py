@@ -63,30 +63,26 @@ class Block(nn.Module):
         self.head_width = width // config.heads
         self.norm = nn.LayerNorm(width)
         self.edge_norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(edge_sets))
-        self.of_nodes = _layer(width, 3 * width)
-        self.of_edges = _layer(width, 2 * width)
+        self.q, self.k, self.v, self.p, self.g = (_layer(width, width) for _ in range(5))
         self.out = _layer(edge_sets * width, width)
         self.forward_norm = nn.LayerNorm(width)
         self.feed_forward = nn.ModuleList(_layer(width, width) for _ in range(3))
 
     def forward(self, x: Tensor, *edge_sets: tuple[EdgeSet, Tensor]) -> Tensor:
         """x [N, hidden] and, of each set, its edges and their features [M, hidden] -> [N, hidden]."""
-        of_nodes = self.of_nodes(self.norm(x))
-        found = [
-            channel_attention(edges, of_nodes, self.of_edges(norm(features)), self.head_width)
-            for norm, (edges, features) in zip(self.edge_norms, edge_sets, strict=True)
-        ]
+        y, found = self.norm(x), []
+        q, k, v = self.q(y), self.k(y), self.v(y)
+        for norm, (edges, features) in zip(self.edge_norms, edge_sets, strict=True):
+            e = norm(features)
+            found.append(channel_attention(edges, q, k, v, self.p(e), self.g(e), self.head_width))
         x = self.out(torch.cat(found, dim=1), residual=x)
         first, second, last = self.feed_forward
         return last(second(first(self.forward_norm(x), "relu"), "relu"), residual=x)
 
 
 def _layer(inputs: int, outputs: int) -> Linear:
-    """Without bias; each square of it Glorot uniform, as if it were a layer of its own."""
     layer = Linear(inputs, outputs, bias=False)
-    with torch.no_grad():
-        for weight in layer.weight.split(min(inputs, outputs)):
-            nn.init.xavier_uniform_(weight)
+    nn.init.xavier_uniform_(layer.weight)
     return layer
 
 

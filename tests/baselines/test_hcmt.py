@@ -34,43 +34,35 @@ def test_attention_by_hand():
     k = [[2, 1], [-1, 8], [9, 9]]
     v = [[1, 10], [3, -1], [9, 9]]
     p, g = [[1, 0.5], [2, 1]], [[2, 1], [1, 3]]
-    out = channel_attention(
-        edges, torch.tensor([a + b + c for a, b, c in zip(q, k, v, strict=True)], dtype=torch.float32),
-        torch.tensor([a + b for a, b in zip(p, g, strict=True)], dtype=torch.float32), 4,
-    )  # fmt: skip
+    out = channel_attention(edges, *(torch.tensor(x, dtype=torch.float32) for x in (q, k, v, p, g)), 4)
     # edge 0: s = (2 * 1 * 1 / 2, 1 * 2 * 0.5 / 2) = (1, 0.5); edge 1: (-1 * 1 * 2 / 2, 8 * 2 * 1 / 2) = (-1, 8 -> 2)
     expected = [2 * math.exp(1) + 3 * math.exp(-1), 10 * math.exp(0.5) - 3 * math.exp(2)]
     torch.testing.assert_close(out, torch.tensor([[0, 0], [0, 0], expected]))
 
 
-def plain_attention(of_nodes, of_edges, edges, d):
-    q, k, v = of_nodes.chunk(3, dim=1)
-    p, g = of_edges.chunk(2, dim=1)
+def plain_attention(edges, q, k, v, p, g, d):
     score = torch.clamp(k[edges.senders] * q[edges.receivers] / math.sqrt(d) * p, -2, 2)
     return torch.zeros_like(q).index_add(0, edges.receivers, v[edges.senders] * g * torch.exp(score))
 
 
-@pytest.mark.parametrize("chunk", [1, 100, 1 << 16])
+@pytest.mark.parametrize("chunk", [1, 100, 1 << 17])
 def test_attention_and_its_gradients_are_accurate(chunk, monkeypatch):
     """Many edges a node, nodes without, scores on both sides of the limits; whatever the size of the chunks."""
     monkeypatch.setattr(attention_module, "CHUNK", chunk)
     generator = torch.Generator().manual_seed(0)
     senders, receivers = torch.randint(0, 20, (2, 150), generator=generator)
     edges = EdgeSet.from_pairs(senders, receivers // 2, 20, 20)
-    of_nodes, of_edges = (2 * torch.randn(*shape, generator=generator) for shape in ((20, 24), (150, 16)))
-    assert_accurate(
-        lambda n, e: channel_attention(edges, n, e, 4),
-        lambda n, e: plain_attention(n, e, edges, 4),
-        [of_nodes, of_edges],
-    )
+    inputs = [2 * torch.randn(rows, 8, generator=generator) for rows in (20, 20, 20, 150, 150)]
+    assert_accurate(lambda *x: channel_attention(edges, *x, 4), lambda *x: plain_attention(edges, *x, 4), inputs)
 
 
 def test_attention_without_edges_is_zero():
     edges = EdgeSet.from_pairs(*torch.zeros(2, 0, dtype=torch.int64), 5, 5)
-    of_nodes, of_edges = torch.randn(5, 12, requires_grad=True), torch.randn(0, 8, requires_grad=True)
-    out = channel_attention(edges, of_nodes, of_edges, 4)
+    inputs = [torch.randn(rows, 4, requires_grad=True) for rows in (5, 5, 5, 0, 0)]
+    out = channel_attention(edges, *inputs, 4)
     out.sum().backward()
-    assert out.tolist() == [[0.0] * 4] * 5 and not of_nodes.grad.any() and of_edges.grad.shape == (0, 8)
+    assert out.tolist() == [[0.0] * 4] * 5 and not any(x.grad.any() for x in inputs[:3])
+    assert inputs[3].grad.shape == inputs[4].grad.shape == (0, 4)
 
 
 def formulas(model, batch):
@@ -90,10 +82,13 @@ def formulas(model, batch):
             return torch.cat([d, torch.sqrt((d * d).sum(1, keepdim=True))], 1)
 
         def block(name, x, *sets):
-            of_nodes, found = F.linear(norm(f"{name}.norm", x), p[f"{name}.of_nodes.weight"]), []
+            y, found = norm(f"{name}.norm", x), []
             for i, (edges, e) in enumerate(sets):
-                of_edges = F.linear(norm(f"{name}.edge_norms.{i}", e), p[f"{name}.of_edges.weight"])
-                found.append(plain_attention(of_nodes, of_edges, edges, c.hidden // c.heads))
+                e = norm(f"{name}.edge_norms.{i}", e)
+                inputs = [
+                    F.linear(z, p[f"{name}.{part}.weight"]) for part, z in zip("qkvpg", (y, y, y, e, e), strict=True)
+                ]
+                found.append(plain_attention(edges, *inputs, c.hidden // c.heads))
             x = x + F.linear(torch.cat(found, 1), p[f"{name}.out.weight"])
             y = norm(f"{name}.forward_norm", x)
             for i in range(3):
