@@ -6,7 +6,8 @@ training split); `stress_frame_mean` (the mean over the truth's frame). Prescrib
 all of them. Stress is compared on what is not part of an obstacle.
 
 Horizons: `one_step` (every frame predicted from the true frame before), `rollout_50` (the first 50 frames of the
-rollout, or all if it is shorter), `rollout_all`.
+rollout, or all if it is shorter), `rollout_all`. A time-conditioned model does not know the frame before: its one step
+is that of its rollout, and `time_conditioned` says so.
 """
 
 from __future__ import annotations
@@ -50,8 +51,8 @@ def evaluate(
     Returns:
         `samples`: for each scene its name, nodes, frames, errors (root mean square, in `displacement` and `stress`
         by predictor, horizon and nodes) and seconds per step of model and solver; `summary`: for each predictor
-        `rmse_sequence` and `rmse_pooled` of the same; `speedup`: the solver's time over the model's, None where the
-        solver's is not known; units; threads.
+        `rmse_sequence` and `rmse_pooled` of the same; `time_conditioned`: whether the model's one step is its rollout;
+        `speedup`: the solver's time over the model's, None where the solver's is not known; units; threads.
 
     Raises:
         DatasetError: the split is empty.
@@ -66,8 +67,8 @@ def evaluate(
     for index in range(count):
         name = f"{split}/{index:06d}"
         truth = dataset.load(split, index)
-        one_step = one_step_predictions(model, truth, name)
         result = rollouts(model, [truth], [name])[0]
+        one_step = _rolled(result) if model.config.time_conditioned else one_step_predictions(model, truth, name)
         displacement.append(displacement_errors(truth, one_step[0], result))
         if constant is not None:
             stress.append(stress_errors(truth, one_step[1], result, constant, model.config.stress))
@@ -82,11 +83,19 @@ def evaluate(
         "samples": samples,
         "summary": summary,
         "failures": sum(sample["failure"] is not None for sample in samples),
+        "time_conditioned": model.config.time_conditioned,
         "speedup": _speedup(samples),
         "length_unit": dataset.info.length_unit,
         "stress_unit": "Pa",
         "threads": torch.get_num_threads(),
     }
+
+
+def _rolled(result: Rollout) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """The predicted positions and stresses of a rollout; None if it failed."""
+    if result.failure is not None:
+        return None, None
+    return result.position[result.given :], None if result.stress is None else result.stress[result.given :]
 
 
 def one_step_predictions(model: Simulator, truth: Trajectory, name: str) -> tuple[np.ndarray, np.ndarray | None]:
@@ -107,6 +116,7 @@ def one_step_predictions(model: Simulator, truth: Trajectory, name: str) -> tupl
             target=script[frames].flatten(0, 1),
             stress=None if known is None else known[frames - 1].flatten(0, 1),
             names=[f"{name} frame {int(frame) - 1}" for frame in frames],
+            frame=frames.float(),
         )
         with torch.inference_mode():
             position, stress = predict_next(model, batch, script[frames].flatten(0, 1))
@@ -116,11 +126,11 @@ def one_step_predictions(model: Simulator, truth: Trajectory, name: str) -> tupl
     return np.concatenate(positions), np.concatenate(stresses) if stresses else None
 
 
-def displacement_errors(truth: Trajectory, one_step: np.ndarray, result: Rollout) -> Errors:
+def displacement_errors(truth: Trajectory, one_step: np.ndarray | None, result: Rollout) -> Errors:
     """Errors of the positions (the same as of the displacements) on NORMAL nodes and on all nodes.
 
     Args:
-        one_step: [S - given, N, 3], the model's predictions from the true frames.
+        one_step: [S - given, N, 3], the model's predictions from the true frames; None if there are none.
         result: the model's rollout.
     """
     position, given, scene = truth.position.astype(np.float64), result.given, truth.scene
@@ -143,7 +153,9 @@ def displacement_errors(truth: Trajectory, one_step: np.ndarray, result: Rollout
     return _errors_by_horizon(placed, target, rows)
 
 
-def stress_errors(truth: Trajectory, one_step: np.ndarray, result: Rollout, constant: float, location: str) -> Errors:
+def stress_errors(
+    truth: Trajectory, one_step: np.ndarray | None, result: Rollout, constant: float, location: str
+) -> Errors:
     """Errors of the stress on nodes, or elements, that are not part of an obstacle; `constant` is a predictor."""
     target = truth.stress[result.given :].astype(np.float64)
     rows = deforming(truth.scene, location)
@@ -280,6 +292,10 @@ def table(found: dict[str, Any]) -> str:
             lines.append(f"  {predictor:18}" + "".join(f"{cell:>24}" for cell in shown))
         lines.append("")
     lines.append(f"{len(found['samples'])} scenes, {found['failures']} failed, on {found['threads']} threads")
+    if found["time_conditioned"]:
+        lines.append(
+            "time-conditioned: every frame is predicted from the first, so the model's one_step is its rollout"
+        )
     if all(sample["solver_seconds_per_step"] is None for sample in found["samples"]):
         lines.append("speed against the solver: unknown, there are no seconds of it on these scenes")
     elif found["speedup"] is not None:

@@ -1,5 +1,7 @@
 """Rollouts: a model predicts a trajectory from its first frame, one increment after the other.
 
+A time-conditioned model predicts each frame from the first one: no prediction depends on another.
+
 Prescribed nodes (obstacles and handles) are put exactly where the script says; everything else is the model's.
 Scenes roll out together as one ragged batch; a scene that ends or fails leaves the batch.
 """
@@ -109,6 +111,7 @@ class _RollingScene:
         self.positions = list(self.script[:given])
         self.stresses = self._given_stress(self.config.stress, trajectory, given)
         self.given = given
+        self.source = 0 if self.config.time_conditioned else -1  # of the frames so far, where the next starts from
         self.seconds: list[float] = []
         self.failure: str | None = None
         self.place(given - 1, self.positions[-1])
@@ -144,7 +147,9 @@ class _RollingScene:
             self.seconds.append(seconds)
 
     def place(self, frame: int, position: Tensor) -> None:
-        """Find the domain that holds the positions of a frame."""
+        """Find the domain that holds the positions of a frame; time-conditioned, what the frame after starts from."""
+        if self.config.time_conditioned and frame + 1 < len(self.script):
+            position = torch.where(self.graph.prescribed[:, None], self.script[frame + 1], self.script[0])
         self.domain = self.model.domain(position)
         if self.domain is None:
             center = torch.tensor(self.config.domain_center, dtype=torch.float64)
@@ -173,11 +178,12 @@ def _step(model: Simulator, scenes: list[_RollingScene], frame: int, concatenate
     batch = make_batch(
         model,
         concatenate(*(scene.graph for scene in scenes)),
-        position=torch.cat([scene.positions[-1] for scene in scenes]),
+        position=torch.cat([scene.positions[scene.source] for scene in scenes]),
         previous=torch.cat([scene.positions[-2] for scene in scenes]) if scenes[0].given == 2 else None,
         target=torch.cat([scene.script[frame] for scene in scenes]),
-        stress=torch.cat([scene.stresses[-1] for scene in scenes]) if scenes[0].stresses else None,
+        stress=torch.cat([scene.stresses[scene.source] for scene in scenes]) if scenes[0].stresses else None,
         names=[f"{scene.name} frame {frame - 1}" for scene in scenes],
+        frame=torch.full((len(scenes),), float(frame)),
     )
     position, stress = predict_next(model, batch, torch.cat([scene.script[frame] for scene in scenes]))
     sizes = batch.graph.node_offsets.diff().tolist()
@@ -199,10 +205,12 @@ def make_batch(
     target: Tensor,
     stress: Tensor | None,
     names: list[str],
+    frame: Tensor | None = None,
 ) -> Batch:
-    """The model's input at one instant: states [N, 3] and, for the boundary motion, the next positions `target`."""
+    """The model's input at one instant: states [N, 3], for the boundary motion the positions `target` of the frame to
+    predict, and for a time-conditioned model its number in each scene."""
     motion = torch.where(graph.prescribed[:, None], target - position, 0.0)
-    return Batch(graph, position, previous, motion, stress, names)
+    return Batch(graph, position, previous, motion, stress, names, frame)
 
 
 def predict_next(model: Simulator, batch: Batch, target: Tensor) -> tuple[Tensor, Tensor | None]:

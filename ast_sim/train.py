@@ -132,6 +132,8 @@ def resolve_run(config: RunConfig, dataset: Dataset, scales: DataScales) -> RunC
     """The settings with everything filled in that they leave to the data."""
     model = config.model.resolve(dataset.info, dataset.material_width, scales.spacing)
     training = resolve_training(config.train, scales, model.dynamic)
+    if model.time_conditioned:  # starts from the true first frame each time: there is no drift to get used to
+        training = dataclasses.replace(training, noise=0.0)
     return RunConfig(model=model, train=training, data=str(Path(config.data).resolve()))
 
 
@@ -198,6 +200,7 @@ class Training:
             dynamic=self.config.model.dynamic,
             gamma=self.options.noise_gamma,
             part=part,
+            from_first=self.config.model.time_conditioned,
         )
 
     def _introduce(self, scales: DataScales) -> None:

@@ -46,6 +46,9 @@ class TransolverConfig(ModelConfig):
     heads: int = setting(8, "attention heads")
     slices: int = setting(64, "slices that each head spreads a scene over")
     mlp_ratio: int = setting(1, "hidden units of the MLP of a block over `hidden`")
+    time_conditioned: bool = setting(
+        False, "predict each frame at once from the first, the prescribed nodes and the time; no step by step"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -168,7 +171,7 @@ class Transolver(Simulator):
     def _positions(self, batch: Batch) -> Tensor:
         """[N, 6]: at rest and now, from the centre of the domain."""
         center = torch.tensor(self.config.domain_center * 2)
-        return torch.cat([batch.graph.rest_position, batch.position], dim=1) - center
+        return torch.cat([batch.graph.rest_position, features.present(self.config, batch)], dim=1) - center
 
     def observe(self, batch: Batch) -> None:
         """Add the batch to the statistics of the inputs."""

@@ -11,15 +11,17 @@ from ast_sim.data.graph import Graph
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """The state of each scene at its time t.
+    """The state of each scene at its time t; of a time-conditioned model at t = 0, whichever frame it is to predict.
 
     Attributes:
         graph: the static part.
         position: [N, 3] float32, p_t (with noise in training).
         previous_position: [N, 3], p_{t-1}; None unless the dynamics has inertia.
-        boundary_motion: [N, 3], p_{t+1} - p_t of the prescribed nodes, zero elsewhere.
+        boundary_motion: [N, 3], p_{t+1} - p_t of the prescribed nodes, zero elsewhere; time-conditioned, their whole
+            way to the frame.
         stress: [N, 1] or [E, 1] at t, or None.
         names: for messages, one per scene: "train/000012 frame 7".
+        frame: [B] float32, the number of the frame to predict, which a time-conditioned model needs.
     """
 
     graph: Graph
@@ -28,6 +30,7 @@ class Batch:
     boundary_motion: Tensor
     stress: Tensor | None
     names: list[str]
+    frame: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +39,7 @@ class Target:
 
     Attributes:
         motion: [N, 3], the increment p_{t+1} - p_t, or the acceleration p_{t+1} - 2 p_t + p_{t-1} where there is
-            inertia; corrected for the noise on p_t.
+            inertia; corrected for the noise on p_t. Time-conditioned, the whole way from the first frame.
         stress: [N, 1] or [E, 1] at t + 1, or None.
     """
 

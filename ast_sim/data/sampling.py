@@ -35,6 +35,8 @@ class _Member:
 class PairSampler:
     """Draws batches of frame pairs (t, t + 1) of a split; each epoch is a new random order of all pairs.
 
+    With `from_first` the pairs are (0, t + 1): the state is always that of frame 0, for a time-conditioned model.
+
     White Gaussian noise n of standard deviation `noise` (in units of length) is added to p_t of the NORMAL nodes. It
     depends on seed, epoch and pair alone, not on the batch that the pair is in. The target's next position is
     p_{t+1} + (1 - gamma) n (MeshGraphNets, add_noise), so that
@@ -62,11 +64,13 @@ class PairSampler:
         dynamic: bool,
         gamma: float,
         part: tuple[int, int] = (0, 1),
+        from_first: bool = False,
     ) -> None:
         self._dataset, self._split, self._batch_size, self._seed = dataset, split, batch_size, seed
         self._noise, self._make_graph, self._dynamic, self._gamma = noise, make_graph, dynamic, gamma
         self._part = part
         self._first = 1 if dynamic else 0  # the acceleration needs a frame before t
+        self._from_first = from_first
         frames = np.array([dataset.num_frames(split, i) for i in range(dataset.count(split))], np.int64)
         self._starts = np.concatenate([[0], np.cumsum(np.maximum(frames - 1 - self._first, 0))])
         if self.num_pairs == 0:
@@ -95,17 +99,18 @@ class PairSampler:
     def _assemble(self, pairs: list[tuple[int, int]]) -> tuple[Batch, Target]:
         """The batch of the pairs (epoch, number)."""
         members, names, positions, previous, boundary, motions = [], [], [], [], [], []
-        stresses, next_stresses = [], []
+        stresses, next_stresses, numbers = [], [], []
         for epoch, pair in pairs:
             index = int(np.searchsorted(self._starts, pair, side="right")) - 1
             t = pair - int(self._starts[index]) + self._first
             member = self._member(index)
-            position, stress = self._dataset.frames(self._split, index, t - self._first, t + 2)
+            position, stress = self._read(index, t)
             before, now, after = position[0], position[-2], position[-1]
             increment = after - now
             noise = self._draw_noise(epoch, pair, member)
             members.append(member)
             names.append(f"{self._split}/{index:06d} frame {t}")
+            numbers.append(t + 1.0)
             positions.append(now + noise)
             boundary.append(np.where(member.prescribed, increment, np.float32(0)))
             if self._dynamic:
@@ -117,8 +122,16 @@ class PairSampler:
                 stresses.append(stress[-2])
                 next_stresses.append(stress[-1])
         graph = Graph.concatenate([member.graph for member in members])
-        batch = Batch(graph, _join(positions), _join(previous), _join(boundary), _join(stresses), names)
-        return batch, Target(_join(motions), _join(next_stresses))
+        state = (_join(positions), _join(previous), _join(boundary), _join(stresses))
+        return Batch(graph, *state, names, torch.tensor(numbers)), Target(_join(motions), _join(next_stresses))
+
+    def _read(self, index: int, t: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """Positions and stresses of the frames that a pair needs; the last two are the state's and the target's."""
+        if not self._from_first:
+            return self._dataset.frames(self._split, index, t - self._first, t + 2)
+        frames = (self._dataset.frames(self._split, index, frame, frame + 1) for frame in (0, t + 1))
+        positions, stresses = zip(*frames, strict=True)
+        return np.concatenate(positions), None if stresses[0] is None else np.concatenate(stresses)
 
     def _draw_noise(self, epoch: int, pair: int, member: _Member) -> np.ndarray:
         generator = np.random.default_rng([self._seed, _NOISE, epoch, pair])

@@ -87,7 +87,8 @@ class AST(Simulator):
         else:
             mesh = self.m2m(edges, encoded, encoded, edge_features)
 
-        cells = build_cells(self.config, batch.position, batch.graph.node_offsets, may_grow=not self.training)
+        now = inputs.present(self.config, batch)
+        cells = build_cells(self.config, now, batch.graph.node_offsets, may_grow=not self.training)
         mesh = self.c2m(cells.to_mesh(), self._through_cells(cells, mesh), mesh)
 
         out = self.decoder(mesh, beside=encoded)

@@ -33,6 +33,9 @@ class ASTConfig(ModelConfig):
     )
     edge_strain: bool = setting(False, "edge features as differences to rest, [dp0, |dp0|, dp - dp0, |dp| - |dp0|]")
     factorized: bool = setting(True, "random weight factorization W = diag(g) V on the layers of the MLPs")
+    time_conditioned: bool = setting(
+        False, "predict each frame at once from the first, the prescribed nodes and the time; no step by step"
+    )
     residual: tuple[str, ...] = setting(("m2m",), "message passings with a residual, of m2m, e2m, m2c, c2m, m2e")
 
     def __post_init__(self) -> None:

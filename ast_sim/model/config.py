@@ -19,8 +19,11 @@ def setting(default: Any, text: str) -> Any:
 class ModelConfig:
     """Settings of any model; those of one are a subclass with a `name` of its own.
 
-    The last group is taken from the dataset when training starts.
+    The last group is taken from the dataset when training starts. A model that can predict a frame at once from the
+    first one, instead of from the one before, has a setting `time_conditioned`.
     """
+
+    time_conditioned = False  # not annotated: no field, and `name` stays the first one
 
     name: str = setting("", "which model")
     node_inputs: tuple[str, ...] = setting(
@@ -40,6 +43,11 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         self.check_inputs("node_inputs", ("displacement", "velocity", "material", "proximity"))
+        if self.time_conditioned and self.dynamic:
+            raise ConfigError(
+                "model.time_conditioned: the dataset is dynamic, and where its nodes are depends on how they moved, not"
+                " only on where the prescribed ones are: predict it step by step"
+            )
 
     def check_inputs(self, key: str, known: tuple[str, ...]) -> None:
         """Raise ConfigError for inputs that there are none of, or that the dataset does not have."""

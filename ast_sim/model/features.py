@@ -20,31 +20,40 @@ from ast_sim.model.proximity import proximity
 _STATES = ("displacement", "velocity")
 
 
-def _state(names: tuple[str, ...], batch: Batch) -> list[Tensor]:
+def present(config: ModelConfig, batch: Batch) -> Tensor:
+    """[N, 3] where a model takes the nodes to be: at p_t; time-conditioned, the prescribed ones where they will be in
+    the frame to predict, the others still in the first."""
+    return batch.position + batch.boundary_motion if config.time_conditioned else batch.position
+
+
+def _state(config: ModelConfig, names: tuple[str, ...], batch: Batch) -> list[Tensor]:
     """Displacement and velocity of the nodes, those asked for."""
     values = []
     if "displacement" in names:
-        values.append(batch.position - batch.graph.rest_position)
+        values.append(present(config, batch) - batch.graph.rest_position)
     if "velocity" in names:
         values.append(batch.position - batch.previous_position)
     return values
 
 
 def node_features(config: ModelConfig, batch: Batch) -> Tensor:
-    """[N, *]: node type (one-hot), state, material, proximity and the boundary channels of model.md."""
-    values = [batch.graph.one_hot, *_state(config.node_inputs, batch)]
+    """[N, *]: node type (one-hot), state, material, proximity and the boundary channels of model.md; time-conditioned,
+    the number of the frame."""
+    values = [batch.graph.one_hot, *_state(config, config.node_inputs, batch)]
     if "material" in config.node_inputs:
         values.append(batch.graph.node_material)
     if "proximity" in config.node_inputs:
         values.append(proximity(batch, config.proximity_radius))
     if config.boundary_motion:
         values.append(batch.boundary_motion)
+    if config.time_conditioned:
+        values.append(batch.frame.repeat_interleave(batch.graph.node_offsets.diff())[:, None])
     return torch.cat(values, dim=1)
 
 
 def element_features(config: ASTConfig, batch: Batch) -> Tensor:
     """[E, *]: the mean state of the nodes of each element, material and stress."""
-    values = [batch.graph.element_mean(value) for value in _state(config.element_inputs, batch)]
+    values = [batch.graph.element_mean(value) for value in _state(config, config.element_inputs, batch)]
     if "material" in config.element_inputs:
         values.append(batch.graph.material)
     if "stress" in config.element_inputs:
@@ -54,13 +63,13 @@ def element_features(config: ASTConfig, batch: Batch) -> Tensor:
 
 def edge_features(config: ASTConfig, batch: Batch) -> Tensor:
     """[M, 8]: [dp0, |dp0|, dp, |dp|] with d = sender - receiver; with `edge_strain` dp and |dp| less those at rest."""
-    graph, now = batch.graph, batch.position
+    graph, now = batch.graph, present(config, batch)
     senders = graph.element_mean(now) if graph.e2m is not None else now
     vectors = edge_vectors(graph.edges, senders, now)
     return torch.cat([graph.rest_edges, vectors - graph.rest_edges if config.edge_strain else vectors], dim=1)
 
 
-def normalizer_of(config: ASTConfig, what: str) -> FeatureNormalizer:
+def normalizer_of(config: ModelConfig, what: str) -> FeatureNormalizer:
     """For the "node", "element" or "edge" features."""
     if what == "edge":
         return FeatureNormalizer([("vector", 3), ("scalar", 1), ("vector", 3), ("scalar", 1)])
@@ -75,4 +84,6 @@ def normalizer_of(config: ASTConfig, what: str) -> FeatureNormalizer:
         kinds.append((None, PROXIMITY_WIDTH))
     if what == "node" and config.boundary_motion:
         kinds.append(("vector", 3))
+    if what == "node" and config.time_conditioned:
+        kinds.append(("scalar", 1))
     return FeatureNormalizer(kinds)

@@ -17,7 +17,8 @@ from ast_sim.model.normalizer import FeatureNormalizer, Normalizer
 
 @dataclass(frozen=True)
 class Prediction:
-    """motion [N, 3]: increment or acceleration; stress [N or E, 1] at the next frame, if the scene has one."""
+    """motion [N, 3]: increment (time-conditioned: from the first frame on) or acceleration; stress [N or E, 1] at the
+    next frame, if the scene has one."""
 
     motion: Tensor
     stress: Tensor | None
@@ -104,7 +105,8 @@ class Simulator(nn.Module):
         return Prediction(self.motion_normalizer.inverse(prediction.motion), stress)
 
     def integrate(self, batch: Batch, motion: Tensor) -> Tensor:
-        """[N, 3] next positions: p + v, or 2 p - p_previous + a. Prescribed nodes are the caller's."""
+        """[N, 3] next positions: p + v, or 2 p - p_previous + a; p is that of the first frame where each is predicted
+        from it. Prescribed nodes are the caller's."""
         if self.config.dynamic:
             return 2 * batch.position - batch.previous_position + motion
         return batch.position + motion
