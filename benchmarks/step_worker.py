@@ -70,7 +70,8 @@ def rollout_step(training: Training) -> Callable[[], object]:
     stress = None if truth.stress is None else torch.from_numpy(truth.stress[0].copy())
 
     def step() -> None:
-        batch = make_batch(training.model, graph, first, None, second, stress, ["test/000000 frame 0"])
+        names, frame = ["test/000000 frame 0"], torch.ones(1)
+        batch = make_batch(training.model, graph, first, None, second, stress, names, frame)
         predict_next(training.model, batch, second)
 
     return step
