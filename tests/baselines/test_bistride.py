@@ -108,16 +108,14 @@ def test_components_are_pooled_apart_and_isolated_nodes_stay():
 
 
 def test_of_the_nodes_near_the_centroid_the_one_with_least_depths_starts():
-    """A comb 0-1-2-3 with node 4 hanging on 3: 4 lies nearest to the centroid, 1 almost as near and more central."""
-    position = np.array([[-1, 0, 0], [0.1, 0.9, 0], [2, 0, 0], [-1.1, 0, 0], [0.0, 0.5, 0.7]])
-    distance = np.linalg.norm(position - position.mean(0), axis=1)
-    assert (
-        distance.argmin() == 4 and distance[1] <= 1.2 * distance[4] and (distance[[0, 2, 3]] > 1.2 * distance[4]).all()
-    )
-    edges = edge_set([(0, 1), (1, 2), (2, 3), (3, 4)], 5)
-    matrix = csr_array(dense(edges).astype(bool))
-    # from 1: depths 1 0 1 2 3, sum 7, odd {0, 2, 4}; from 4: 4 3 2 1 0, sum 10
-    assert select(matrix, position).tolist() == [1, 3]
+    """A triangle 0 1 2 with a tail 2 3 4: 0 lies nearest to the centroid, 2 almost as near and more central."""
+    position = np.array([[1, 0, 0], [0, 3, 0], [-1.1, 0, 0], [0.1, -1.5, 0], [0, -1.5, 0]])
+    matrix = csr_array(dense(edge_set([(0, 1), (1, 2), (2, 0), (2, 3), (3, 4)], 5)).astype(bool))
+    # from 2: depths 1 1 0 1 2, sum 5; from 0: 0 1 1 2 3, sum 7, which would keep 0 and 3
+    assert select(matrix, position).tolist() == [2, 4]
+    position[2, 0] = -1.3  # no longer near enough
+    position[3, 0] = 0.3
+    assert select(matrix, position).tolist() == [0, 3]
 
 
 def meshes() -> tuple[Graph, Graph]:
