@@ -25,7 +25,8 @@ def world_edges(batch: Batch, radius: float, most: int | None) -> EdgeSet:
     """
     graph = batch.graph
     offsets, position = graph.node_offsets.tolist(), batch.position.double().numpy()
-    mesh = _keys(graph.m2m.senders.numpy(), graph.m2m.receivers.numpy(), len(position))
+    # Mesh edges lie in both directions, sorted by receiver and sender.
+    mesh = _keys(graph.m2m.receivers.numpy(), graph.m2m.senders.numpy(), len(position))
     found = [start + _pairs(position[start:end], radius) for start, end in zip(offsets[:-1], offsets[1:], strict=True)]
     kept = [_shortest(_without(pairs, mesh, len(position)), position, most) for pairs in found]
     first, second = torch.from_numpy(np.concatenate(kept) if kept else np.zeros((0, 2), np.int64)).unbind(1)
@@ -45,8 +46,10 @@ def _keys(first: np.ndarray, second: np.ndarray, num: int) -> np.ndarray:
 
 
 def _without(pairs: np.ndarray, mesh: np.ndarray, num: int) -> np.ndarray:
-    """The pairs that are no mesh edge."""
-    return pairs[~np.isin(_keys(pairs[:, 0], pairs[:, 1], num), mesh)]
+    """The pairs that are no mesh edge; `mesh` are the sorted keys of these."""
+    keys = _keys(pairs[:, 0], pairs[:, 1], num)
+    place = np.minimum(np.searchsorted(mesh, keys), len(mesh) - 1)
+    return pairs[mesh[place] != keys] if len(mesh) else pairs
 
 
 def _shortest(pairs: np.ndarray, position: np.ndarray, most: int | None) -> np.ndarray:
