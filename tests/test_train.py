@@ -206,9 +206,9 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(linear, dat
 def test_a_loss_that_is_not_finite_stops_before_the_step_and_names_the_samples(linear, data, tmp_path, monkeypatch):
     real, calls = toy.LinearSimulator.loss, []
 
-    def loss(self, batch, target, stress_weight):
-        losses = real(self, batch, target, stress_weight)
-        calls.append(batch.names)
+    def loss(self, *batch_and_settings):
+        losses = real(self, *batch_and_settings)
+        calls.append(batch_and_settings[0].names)
         return losses if len(calls) < 8 else {**losses, "loss": losses["loss"] * float("nan")}
 
     monkeypatch.setattr(toy.LinearSimulator, "loss", loss)
@@ -223,8 +223,8 @@ def test_a_loss_that_is_not_finite_stops_before_the_step_and_names_the_samples(l
 def test_a_gradient_that_is_not_finite_stops_before_the_step(linear, data, tmp_path, monkeypatch):
     real = toy.LinearSimulator.loss
 
-    def loss(self, batch, target, stress_weight):
-        losses = real(self, batch, target, stress_weight)
+    def loss(self, *batch_and_settings):
+        losses = real(self, *batch_and_settings)
         # sqrt at 0: a finite value with an infinite slope
         return {**losses, "loss": losses["loss"] + (losses["loss"] - losses["loss"].detach()).sqrt()}
 
