@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 from ast_sim.baselines.bsms import BSMS, BSMSConfig
 from ast_sim.baselines.bsms import PRESETS as BSMS_PRESETS
@@ -21,6 +22,7 @@ from ast_sim.model.ast_config import ASTConfig
 from ast_sim.model.config import ModelConfig, Preset
 from ast_sim.model.simulator import Simulator
 
+T = TypeVar("T")
 AnyConfig = ASTConfig | MGNConfig | BSMSConfig | HCMTConfig | TransolverConfig
 
 
@@ -53,9 +55,11 @@ def find_preset(model: str, preset: str) -> Preset:
     Raises:
         ConfigError: there is none; the nearest is named.
     """
-    for what, name, known in (("model", model, MODELS), (f"preset of {model}", preset, None)):
-        known = MODELS[model].presets if known is None else known
-        if name not in known:
-            near = difflib.get_close_matches(name, known, 1, 0)
-            raise ConfigError(f"there is no {what} {name!r}: did you mean {near[0]}? There are {', '.join(known)}")
-    return MODELS[model].presets[preset]
+    return _named(f"preset of {model}", preset, _named("model", model, MODELS).presets)
+
+
+def _named(what: str, name: str, known: Mapping[str, T]) -> T:
+    if name not in known:
+        near = difflib.get_close_matches(name, known, 1, 0)
+        raise ConfigError(f"there is no {what} {name!r}: did you mean {near[0]}? There are {', '.join(known)}")
+    return known[name]

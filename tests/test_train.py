@@ -104,6 +104,10 @@ def test_scales_of_the_data_by_hand(data):
 def test_a_preset_that_does_not_exist_names_the_nearest():
     with pytest.raises(ConfigError, match="did you mean deforming_plate"):
         train.configure("data.h5", "deforming_plaet")
+    with pytest.raises(ConfigError, match=r"no preset of mgn 'deforming_plate'.*There are tiny, paper, original"):
+        train.configure("data.h5", "deforming_plate", model="mgn")
+    with pytest.raises(ConfigError, match="no model 'mgm': did you mean mgn"):
+        train.configure("data.h5", "tiny", model="mgm")
 
 
 def test_an_unknown_setting_names_the_nearest(data):
