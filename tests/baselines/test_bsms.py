@@ -10,14 +10,12 @@ import toy
 from graph_models import assert_follows, batch_of, deep_mlp, made, resolved
 from toy import one_thread  # noqa: F401
 
-from ast_sim.baselines.bsms import BSMS, PRESETS, BSMSConfig
+from ast_sim.baselines.bsms import PRESETS, BSMSConfig
 from ast_sim.data.scene import NodeType
 from ast_sim.errors import ConfigError
 from ast_sim.model.features import node_features
 from ast_sim.model.simulator import Prediction
 from ast_sim.models import build_model
-from ast_sim.run import Metrics, load_model, read_config
-from ast_sim.train import configure, train
 
 SMALL = BSMSConfig(hidden=16, levels=2)
 
@@ -148,21 +146,6 @@ def test_a_scene_alone_equals_a_scene_in_a_batch():
 def test_levels_below_one_are_refused():
     with pytest.raises(ConfigError, match="model.levels is 0; it must be at least 1"):
         BSMSConfig(levels=0)
-
-
-@pytest.mark.parametrize("dynamic", [False, True])
-def test_it_trains_and_is_found_again(tmp_path, dynamic):
-    data = toy.write(tmp_path / "toy.h5", dynamic=dynamic, stress=not dynamic)
-    settings = ["model.hidden=16", "model.levels=2", "model.world_radius=0.07", "train.batch_size=2", "train.steps=60"]
-    settings += ["train.log_every=10", "train.noise=1e-4", "train.warmup=10", "train.peak_rate=2e-3"]
-    config = configure(data, "tiny", [*settings, "train.statistics_pairs=8"], "bsms")
-    assert config.model.node_inputs == (("velocity",) if dynamic else ())
-    train(tmp_path / "run", config)
-    losses = [record["loss"] for record in Metrics(tmp_path / "run") if "loss" in record]
-    assert losses[-1] < 0.75 * losses[0], losses
-    model, found, _ = load_model(tmp_path / "run")
-    assert isinstance(model, BSMS) and found == read_config(tmp_path / "run") and found.model.contacts == "components"
-    assert np.isfinite([record["valid_rmse"] for record in Metrics(tmp_path / "run") if "valid_rmse" in record]).all()
 
 
 def test_the_presets_are_those_of_the_papers():

@@ -3,26 +3,22 @@
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-import toy
 from checks import assert_accurate
 from graph_models import assert_follows, batch_of, deep_mlp, made, resolved
 from toy import one_thread  # noqa: F401
 
 from ast_sim.baselines import channel_attention as attention_module
 from ast_sim.baselines.channel_attention import channel_attention
-from ast_sim.baselines.hcmt import HCMT, PRESETS, HCMTConfig
+from ast_sim.baselines.hcmt import PRESETS, HCMTConfig
 from ast_sim.data.scene import NodeType
 from ast_sim.errors import ConfigError
 from ast_sim.model.features import node_features
 from ast_sim.model.simulator import Prediction
 from ast_sim.models import build_model
 from ast_sim.ops.edges import EdgeSet
-from ast_sim.run import Metrics, load_model, read_config
-from ast_sim.train import configure, train
 
 SMALL = HCMTConfig(hidden=16, levels=2, heads=2)
 
@@ -164,21 +160,6 @@ def test_a_scene_alone_equals_a_scene_in_a_batch():
 def test_settings_out_of_range_are_refused(changes, message):
     with pytest.raises(ConfigError, match=message):
         HCMTConfig(**changes)
-
-
-@pytest.mark.parametrize("dynamic", [False, True])
-def test_it_trains_and_is_found_again(tmp_path, dynamic):
-    data = toy.write(tmp_path / "toy.h5", dynamic=dynamic, stress=not dynamic)
-    settings = ["model.hidden=16", "model.levels=2", "model.world_radius=0.06", "train.batch_size=2", "train.steps=60"]
-    settings += ["train.log_every=10", "train.noise=1e-4", "train.warmup=10", "train.peak_rate=2e-3"]
-    config = configure(data, "tiny", [*settings, "train.statistics_pairs=8"], "hcmt")
-    assert config.model.node_inputs == (("velocity",) if dynamic else ())
-    train(tmp_path / "run", config)
-    losses = [record["loss"] for record in Metrics(tmp_path / "run") if "loss" in record]
-    assert losses[-1] < 0.75 * losses[0], losses
-    model, found, _ = load_model(tmp_path / "run")
-    assert isinstance(model, HCMT) and found == read_config(tmp_path / "run") and found.model.heads == 4
-    assert np.isfinite([record["valid_rmse"] for record in Metrics(tmp_path / "run") if "valid_rmse" in record]).all()
 
 
 def test_the_presets_are_those_of_the_papers():

@@ -2,21 +2,17 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
-import toy
 from graph_models import assert_follows, batch_of, deep_mlp, made, resolved
 from toy import one_thread  # noqa: F401
 
 from ast_sim.baselines.common import mesh_features
-from ast_sim.baselines.mgn import MGN, PRESETS, MGNConfig
+from ast_sim.baselines.mgn import PRESETS, MGNConfig
 from ast_sim.data.graph import edge_vectors
 from ast_sim.model.features import node_features
 from ast_sim.model.simulator import Prediction
 from ast_sim.models import build_model
-from ast_sim.run import Metrics, load_model, read_config
-from ast_sim.train import configure, train
 
 SMALL = MGNConfig(hidden=16, blocks=2)
 
@@ -72,34 +68,13 @@ def test_both_edge_sets_count_and_have_weights_of_their_own():
         changed.load_state_dict(model.state_dict())
         with torch.no_grad():
             getattr(changed.blocks[0], part).update.norm.bias.add_(0.5)
-        assert float((changed(batch).motion - before).abs().max()) > 1e-3, part
+        assert float((changed(batch).motion - before).detach().abs().max()) > 1e-3, part
 
 
 def test_a_scene_alone_equals_a_scene_in_a_batch():
     model, both = made(resolved(SMALL), 0, 1)
     alone = torch.cat([model(batch_of(model, seed)).motion for seed in (0, 1)])
     assert torch.equal(model(both).motion, alone)
-
-
-@pytest.mark.parametrize("dynamic", [False, True])
-def test_it_trains_and_is_found_again(tmp_path, dynamic):
-    data = toy.write(tmp_path / "toy.h5", dynamic=dynamic, stress=not dynamic)
-    settings = ["model.hidden=16", "model.blocks=2", "model.world_radius=0.06", "train.batch_size=2", "train.steps=200"]
-    more = [
-        "train.log_every=20",
-        "train.noise=1e-4",
-        "train.warmup=10",
-        "train.peak_rate=2e-3",
-        "train.statistics_pairs=8",
-    ]
-    config = configure(data, "tiny", [*settings, *more], "mgn")
-    assert config.model.node_inputs == (("velocity",) if dynamic else ())
-    train(tmp_path / "run", config)
-    losses = [record["loss"] for record in Metrics(tmp_path / "run") if "loss" in record]
-    assert losses[-1] < 0.75 * losses[0], losses
-    model, found, _ = load_model(tmp_path / "run")
-    assert isinstance(model, MGN) and found == read_config(tmp_path / "run") and found.model.world_radius == 0.06
-    assert np.isfinite([record["valid_rmse"] for record in Metrics(tmp_path / "run") if "valid_rmse" in record]).all()
 
 
 def test_the_presets_are_those_of_the_papers():
