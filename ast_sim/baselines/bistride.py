@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import accumulate
 
 import numpy as np
@@ -56,25 +55,15 @@ class Pooling:
         """N of the finer mesh."""
         return self.edges.num_senders
 
-    @cached_property
-    def _by_sender(self) -> tuple[Tensor, Tensor]:
-        """The edges in order of the senders, and where each sender's start."""
-        order = torch.argsort(self.edges.senders, stable=True)
-        return order, offsets_of(self.edges.senders, self.num_nodes)
-
-    @cached_property
-    def _in_order(self) -> Tensor:
-        return torch.arange(len(self.edges))
-
     def pool(self, x: Tensor) -> Tensor:
         """[N, F] -> [C, F]: the weighted mean over the neighbours of each kept node."""
-        sent = spread(x, *self._by_sender) * self.weight.to(x.dtype)
-        return segment_sum(sent, self._in_order, self.edges.receiver_offsets)
+        sent = spread(x, *self.edges.by_sender) * self.weight.to(x.dtype)
+        return segment_sum(sent, *self.edges.by_receiver)
 
     def unpool(self, x: Tensor) -> Tensor:
         """[C, F] -> [N, F], the transpose of `pool`: sum over the kept neighbours of each node."""
-        sent = spread(x, self._in_order, self.edges.receiver_offsets) * self.weight.to(x.dtype)
-        return segment_sum(sent, *self._by_sender)
+        sent = spread(x, *self.edges.by_receiver) * self.weight.to(x.dtype)
+        return segment_sum(sent, *self.edges.by_sender)
 
     def pool_contacts(self, contacts: EdgeSet) -> EdgeSet:
         """(A + I) A_c (A + I) of the contact edges A_c among the N nodes: rows and columns of kept nodes, no diagonal.

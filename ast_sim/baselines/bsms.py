@@ -22,19 +22,22 @@ import torch
 from torch import Tensor, nn
 
 from ast_sim.baselines.bistride import Hierarchy, build_hierarchy, subset
-from ast_sim.baselines.common import Decoder, DeepMLP, WorldEdgeConfig, WorldEdgeSimulator, messages
+from ast_sim.baselines.common import (
+    Decoder,
+    DeepMLP,
+    WorldEdgeConfig,
+    WorldEdgeSimulator,
+    mesh_features,
+    messages,
+    world_normalizer,
+)
 from ast_sim.data.batch import Batch
 from ast_sim.data.graph import Graph, edge_vectors
 from ast_sim.data.scene import Scene
-from ast_sim.errors import ConfigError
 from ast_sim.model.config import Preset, setting
-from ast_sim.model.features import node_features
-from ast_sim.model.normalizer import FeatureNormalizer
+from ast_sim.model.features import node_features, normalizer_of
 from ast_sim.model.simulator import Prediction
 from ast_sim.ops.edges import EdgeSet
-
-MESH = [("vector", 3), ("scalar", 1), ("vector", 3), ("scalar", 1)]
-CONTACT = [("vector", 3), ("scalar", 1)]
 
 
 @dataclass(frozen=True)
@@ -49,8 +52,7 @@ class BSMSConfig(WorldEdgeConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.levels < 1:
-            raise ConfigError(f"model.levels is {self.levels}; it must be at least 1")
+        self.check_positive("levels")
 
 
 class PlainNorm(nn.Module):
@@ -114,8 +116,8 @@ class BSMS(WorldEdgeSimulator):
     def __init__(self, config: BSMSConfig):
         super().__init__(config)
         width, layers, levels = config.hidden, config.hidden_layers, config.levels
-        self.mesh_inputs = nn.ModuleList(FeatureNormalizer(MESH) for _ in range(levels + 1))
-        self.world_inputs = nn.ModuleList(FeatureNormalizer(CONTACT) for _ in range(levels + 1))
+        self.mesh_inputs = nn.ModuleList(normalizer_of(config, "edge") for _ in range(levels + 1))
+        self.world_inputs = nn.ModuleList(world_normalizer() for _ in range(levels + 1))
         self.node_encoder = plain_mlp(self.node_inputs.width, width, layers)
         self.down = nn.ModuleList(Block(width, layers) for _ in range(levels))
         self.bottom = Block(width, layers)
@@ -144,7 +146,7 @@ class BSMS(WorldEdgeSimulator):
             if i:
                 pooling = hierarchy.poolings[i - 1]
                 position, contacts = pooling.pool(position), pooling.pool_contacts(contacts)
-            features = torch.cat([rest, edge_vectors(mesh, position, position)], dim=1)
+            features = mesh_features(mesh, rest, position)
             found.append(Level(mesh, features, contacts, edge_vectors(contacts, position, position)))
         return found
 

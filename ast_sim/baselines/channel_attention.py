@@ -15,7 +15,7 @@ import math
 import torch
 from torch import Tensor
 
-from ast_sim.ops.edges import EdgeSet, offsets_of
+from ast_sim.ops.edges import EdgeSet
 from ast_sim.ops.segment import segment_sum
 
 LIMIT = 2.0  # of a score
@@ -44,7 +44,7 @@ class _ChannelAttention(torch.autograd.Function):
             q_e, k_e, v_e = _gather(q, k, v, edges, rows)
             weight = k_e.mul_(q_e).mul_(p[rows]).mul_(scale).clamp_(-LIMIT, LIMIT).exp_()
             torch.mul(v_e.mul_(g[rows]), weight, out=messages[rows])
-        return segment_sum(messages, torch.arange(len(edges)), edges.receiver_offsets)
+        return segment_sum(messages, *edges.by_receiver)
 
     @staticmethod
     def backward(ctx, dout: Tensor) -> tuple[Tensor | None, ...]:
@@ -63,9 +63,8 @@ class _ChannelAttention(torch.autograd.Function):
             dscore.mul_(p_e)
             torch.mul(dscore, q_e, out=dk[rows])
             torch.mul(dscore, k_e, out=dq[rows])
-        by_sender = torch.argsort(edges.senders, stable=True), offsets_of(edges.senders, edges.num_senders)
-        by_receiver = torch.arange(len(edges)), edges.receiver_offsets
-        of_nodes = segment_sum(dq, *by_receiver), segment_sum(dk, *by_sender), segment_sum(dv, *by_sender)
+        by_sender = edges.by_sender
+        of_nodes = segment_sum(dq, *edges.by_receiver), segment_sum(dk, *by_sender), segment_sum(dv, *by_sender)
         return *of_nodes, dp, dg, None, None
 
 

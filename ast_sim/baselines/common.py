@@ -27,8 +27,6 @@ from ast_sim.ops.message import message_edges
 from ast_sim.ops.mlp import mlp
 from ast_sim.ops.segment import segment_sum
 
-_VECTOR = [("vector", 3), ("scalar", 1)]  # a difference of positions and its length
-
 
 @dataclass(frozen=True)
 class WorldEdgeConfig(ModelConfig):
@@ -69,8 +67,7 @@ class WorldEdgeSimulator(Simulator):
     def __init__(self, config: WorldEdgeConfig):
         super().__init__(config)
         self.node_inputs = normalizer_of(config, "node")
-        self.mesh_inputs = FeatureNormalizer([*_VECTOR, *_VECTOR])
-        self.world_inputs = FeatureNormalizer(_VECTOR)
+        self.mesh_inputs, self.world_inputs = normalizer_of(config, "edge"), world_normalizer()
 
     def world(self, batch: Batch) -> EdgeSet:
         """The world edges of a batch."""
@@ -79,7 +76,7 @@ class WorldEdgeSimulator(Simulator):
     def observe(self, batch: Batch) -> None:
         """Add the batch to the statistics of the inputs."""
         self.node_inputs.observe(node_features(self.config, batch))
-        self.mesh_inputs.observe(mesh_features(batch))
+        self.mesh_inputs.observe(mesh_features(batch.graph.m2m, batch.graph.rest_edges, batch.position))
         self.world_inputs.observe(edge_vectors(self.world(batch), batch.position, batch.position))
 
     def nodes(self, batch: Batch) -> Tensor:
@@ -88,17 +85,21 @@ class WorldEdgeSimulator(Simulator):
 
     def mesh_edges(self, batch: Batch) -> Tensor:
         """Normalised inputs of the mesh edges, [M, 8]."""
-        return self.mesh_inputs(mesh_features(batch))
+        return self.mesh_inputs(mesh_features(batch.graph.m2m, batch.graph.rest_edges, batch.position))
 
     def world_edges(self, batch: Batch, world: EdgeSet) -> Tensor:
         """Normalised inputs of the world edges, [W, 4]."""
         return self.world_inputs(edge_vectors(world, batch.position, batch.position))
 
 
-def mesh_features(batch: Batch) -> Tensor:
-    """[M, 8]: [dp0, |dp0|, dp, |dp|] with d = sender - receiver."""
-    graph = batch.graph
-    return torch.cat([graph.rest_edges, edge_vectors(graph.m2m, batch.position, batch.position)], dim=1)
+def mesh_features(edges: EdgeSet, rest_edges: Tensor, position: Tensor) -> Tensor:
+    """[M, 8]: [dp0, |dp0|, dp, |dp|] with d = sender - receiver, of a mesh with `rest_edges` [M, 4] at `position`."""
+    return torch.cat([rest_edges, edge_vectors(edges, position, position)], dim=1)
+
+
+def world_normalizer() -> FeatureNormalizer:
+    """For a difference of positions with its length."""
+    return FeatureNormalizer([("vector", 3), ("scalar", 1)])
 
 
 class DeepMLP(nn.Module):
@@ -141,7 +142,7 @@ def messages(edge_mlp: DeepMLP, edges: EdgeSet, features: Tensor, nodes: Tensor)
         return message_edges(edges, of_senders, of_receivers, linear(features, of_edge), None, *weights)
     of_nodes = of_senders.index_select(0, edges.senders) + of_receivers.index_select(0, edges.receivers)
     found = rest(torch.relu(linear(features, of_edge, residual=of_nodes)), norm=norm)
-    return segment_sum(found, torch.arange(len(found)), edges.receiver_offsets), found
+    return segment_sum(found, *edges.by_receiver), found
 
 
 class Decoder(nn.Module):

@@ -24,11 +24,10 @@ from torch import Tensor, nn
 
 from ast_sim.baselines.bistride import Hierarchy, build_hierarchy, subset
 from ast_sim.baselines.channel_attention import channel_attention
-from ast_sim.baselines.common import Decoder, DeepMLP, WorldEdgeConfig, WorldEdgeSimulator
+from ast_sim.baselines.common import Decoder, DeepMLP, WorldEdgeConfig, WorldEdgeSimulator, mesh_features
 from ast_sim.data.batch import Batch
 from ast_sim.data.graph import Graph, edge_vectors
 from ast_sim.data.scene import NodeType, Scene
-from ast_sim.errors import ConfigError
 from ast_sim.model.config import Preset, setting
 from ast_sim.model.features import node_features
 from ast_sim.model.linear import Linear
@@ -48,10 +47,8 @@ class HCMTConfig(WorldEdgeConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.levels < 1:
-            raise ConfigError(f"model.levels is {self.levels}; it must be at least 1")
-        if self.heads < 1 or self.hidden % self.heads:
-            raise ConfigError(f"model.hidden = {self.hidden} must be a multiple of model.heads = {self.heads}")
+        self.check_positive("levels", "heads")
+        self.check_heads()
 
 
 class Block(nn.Module):
@@ -124,7 +121,7 @@ class HCMT(WorldEdgeSimulator):
         for i, (mesh, rest) in enumerate(zip(hierarchy.edges, hierarchy.rest_edges, strict=True)):
             if i:
                 position = position.index_select(0, hierarchy.poolings[i - 1].kept)
-            found.append(torch.cat([rest, edge_vectors(mesh, position, position)], dim=1))
+            found.append(mesh_features(mesh, rest, position))
         return found
 
     def observe(self, batch: Batch) -> None:

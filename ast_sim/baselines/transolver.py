@@ -26,9 +26,8 @@ from ast_sim.data.batch import Batch
 from ast_sim.data.file import DatasetInfo
 from ast_sim.data.graph import Graph
 from ast_sim.data.scene import Scene
-from ast_sim.errors import ConfigError
 from ast_sim.model import features
-from ast_sim.model.config import ModelConfig, Preset, setting
+from ast_sim.model.config import Preset, TimeConditionedConfig, setting
 from ast_sim.model.linear import Linear
 from ast_sim.model.normalizer import FeatureNormalizer
 from ast_sim.model.simulator import Prediction, Simulator
@@ -37,7 +36,7 @@ EPSILON = 1e-5  # added to the weight of a slice, so that an empty one is 0
 
 
 @dataclass(frozen=True)
-class TransolverConfig(ModelConfig):
+class TransolverConfig(TimeConditionedConfig):
     """The settings of Transolver."""
 
     name: Literal["transolver"] = setting("transolver", "Transolver: attention between learned slices")
@@ -46,17 +45,11 @@ class TransolverConfig(ModelConfig):
     heads: int = setting(8, "attention heads")
     slices: int = setting(64, "slices that each head spreads a scene over")
     mlp_ratio: int = setting(1, "hidden units of the MLP of a block over `hidden`")
-    time_conditioned: bool = setting(
-        False, "predict each frame at once from the first, the prescribed nodes and the time; no step by step"
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for key in ("hidden", "blocks", "heads", "slices", "mlp_ratio"):
-            if getattr(self, key) < 1:
-                raise ConfigError(f"model.{key} is {getattr(self, key)}; it must be at least 1")
-        if self.hidden % self.heads:
-            raise ConfigError(f"model.hidden = {self.hidden} must be a multiple of model.heads = {self.heads}")
+        self.check_positive("hidden", "blocks", "heads", "slices", "mlp_ratio")
+        self.check_heads()
 
     def inputs_for(self, info: DatasetInfo, material_width: int) -> dict[str, Any]:
         """See `ModelConfig`; the displacement always."""

@@ -62,8 +62,8 @@ class AST(Simulator):
 
     def graph(self, scene: Scene) -> Graph:
         """See `Simulator`; with element inputs elements are nodes of their own."""
-        surface = "proximity" in self.config.node_inputs
-        return Graph.from_scene(scene, element_nodes=bool(self.config.element_inputs), surface=surface)
+        element_nodes = bool(self.config.element_inputs)
+        return Graph.from_scene(scene, element_nodes, surface=self.config.sees_surfaces)
 
     def domain(self, position: Tensor) -> int | None:
         """How often the domain must double around its centre to hold the positions [N, 3]; see `Simulator`."""

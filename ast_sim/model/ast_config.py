@@ -8,11 +8,11 @@ from typing import Literal, Self
 
 from ast_sim.data.file import DatasetInfo
 from ast_sim.errors import ConfigError
-from ast_sim.model.config import ModelConfig, Preset, setting
+from ast_sim.model.config import Preset, TimeConditionedConfig, setting
 
 
 @dataclass(frozen=True)
-class ASTConfig(ModelConfig):
+class ASTConfig(TimeConditionedConfig):
     """The settings of AST."""
 
     name: Literal["ast"] = setting("ast", "Adaptive Spatial Tokenization")
@@ -33,9 +33,6 @@ class ASTConfig(ModelConfig):
     )
     edge_strain: bool = setting(False, "edge features as differences to rest, [dp0, |dp0|, dp - dp0, |dp| - |dp0|]")
     factorized: bool = setting(True, "random weight factorization W = diag(g) V on the layers of the MLPs")
-    time_conditioned: bool = setting(
-        False, "predict each frame at once from the first, the prescribed nodes and the time; no step by step"
-    )
     residual: tuple[str, ...] = setting(("m2m",), "message passings with a residual, of m2m, e2m, m2c, c2m, m2e")
 
     def __post_init__(self) -> None:

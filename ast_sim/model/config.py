@@ -19,11 +19,10 @@ def setting(default: Any, text: str) -> Any:
 class ModelConfig:
     """Settings of any model; those of one are a subclass with a `name` of its own.
 
-    The last group is taken from the dataset when training starts. A model that can predict a frame at once from the
-    first one, instead of from the one before, has a setting `time_conditioned`.
+    The last group is taken from the dataset when training starts.
     """
 
-    time_conditioned = False  # not annotated: no field, and `name` stays the first one
+    time_conditioned = False  # no setting here: see `TimeConditionedConfig`
 
     name: str = setting("", "which model")
     node_inputs: tuple[str, ...] = setting(
@@ -43,11 +42,6 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         self.check_inputs("node_inputs", ("displacement", "velocity", "material", "proximity"))
-        if self.time_conditioned and self.dynamic:
-            raise ConfigError(
-                "model.time_conditioned: the dataset is dynamic, and where its nodes are depends on how they moved, not"
-                " only on where the prescribed ones are: predict it step by step"
-            )
 
     def check_inputs(self, key: str, known: tuple[str, ...]) -> None:
         """Raise ConfigError for inputs that there are none of, or that the dataset does not have."""
@@ -60,9 +54,25 @@ class ModelConfig:
         if "velocity" in inputs and self.integration != "dynamic":
             raise ConfigError(f"model.{key}: velocity is an input of dynamic scenes only")
 
+    def check_positive(self, *keys: str) -> None:
+        """Raise ConfigError for a number below 1."""
+        for key in keys:
+            if getattr(self, key) < 1:
+                raise ConfigError(f"model.{key} is {getattr(self, key)}; it must be at least 1")
+
+    def check_heads(self) -> None:
+        """Raise ConfigError unless the width can be cut for the heads."""
+        if self.hidden % self.heads:
+            raise ConfigError(f"model.hidden = {self.hidden} must be a multiple of model.heads = {self.heads}")
+
     @property
     def dynamic(self) -> bool:
         return self.integration == "dynamic"
+
+    @property
+    def sees_surfaces(self) -> bool:
+        """Whether the inputs need the surfaces of the bodies."""
+        return "proximity" in self.node_inputs
 
     def resolve(self, info: DatasetInfo, material_width: int, mesh_spacing: float) -> Self:
         """The settings with everything filled in that the dataset decides.
@@ -95,6 +105,23 @@ class ModelConfig:
     def facts(self, length_unit: str, mesh_spacing: float | None = None) -> dict[str, str]:
         """What a report and, with the mesh spacing, a training say of these settings."""
         return {}
+
+
+@dataclass(frozen=True)
+class TimeConditionedConfig(ModelConfig):
+    """Settings of a model that can predict a frame at once from the first one, instead of from the one before."""
+
+    time_conditioned: bool = setting(
+        False, "predict each frame at once from the first, the prescribed nodes and the time; no step by step"
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.time_conditioned and self.dynamic:
+            raise ConfigError(
+                "model.time_conditioned: the dataset is dynamic, and where its nodes are depends on how they moved, not"
+                " only on where the prescribed ones are: predict it step by step"
+            )
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ class Simulator(nn.Module):
 
     def graph(self, scene: Scene) -> Graph:
         """What the model needs of a scene at all times."""
-        return Graph.from_scene(scene, element_nodes=False, surface="proximity" in self.config.node_inputs)
+        return Graph.from_scene(scene, element_nodes=False, surface=self.config.sees_surfaces)
 
     def domain(self, position: Tensor) -> int | None:
         """Which domain holds the positions [N, 3] of a scene, None if they are too far away for the model; scenes in

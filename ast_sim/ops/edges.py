@@ -6,6 +6,7 @@ Legend: M edges, S senders, R receivers.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -69,6 +70,16 @@ class EdgeSet:
     @property
     def num_receivers(self) -> int:
         return len(self.receiver_offsets) - 1
+
+    @cached_property
+    def by_receiver(self) -> tuple[Tensor, Tensor]:
+        """The edges in stored order, and where each receiver's start: as segment ops take them."""
+        return torch.arange(len(self)), self.receiver_offsets
+
+    @cached_property
+    def by_sender(self) -> tuple[Tensor, Tensor]:
+        """The edges in order of their senders, and where each sender's start."""
+        return torch.argsort(self.senders, stable=True), offsets_of(self.senders, self.num_senders)
 
     def __len__(self) -> int:
         return len(self.senders)

@@ -26,7 +26,7 @@ def formulas(model, batch):
 
         mesh, world, position = batch.graph.m2m, model.world(batch), batch.position
         v = deep_mlp(p, "node_encoder", normal("node_inputs", node_features(model.config, batch)))
-        e = deep_mlp(p, "mesh_encoder", normal("mesh_inputs", mesh_features(batch)))
+        e = deep_mlp(p, "mesh_encoder", normal("mesh_inputs", mesh_features(mesh, batch.graph.rest_edges, position)))
         w = deep_mlp(p, "world_encoder", normal("world_inputs", edge_vectors(world, position, position)))
         for i in range(model.config.blocks):
             e_new = deep_mlp(p, f"blocks.{i}.mesh.update", torch.cat([e, v[mesh.senders], v[mesh.receivers]], 1))
