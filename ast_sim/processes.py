@@ -59,7 +59,7 @@ class Processes:
 
     def any(self, flag: bool) -> bool:
         """Whether it is so in any process."""
-        return bool(self.add(torch.tensor([int(flag)])))
+        return flag if self.count == 1 else bool(self.add(torch.tensor([int(flag)])))
 
     def gathered(self, values: list[T]) -> list[T]:
         """The lists of all processes as one, in the order of their ranks."""

@@ -15,7 +15,7 @@ import signal
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,15 +26,15 @@ from ast_sim.data.ahead import Ahead
 from ast_sim.data.file import Dataset
 from ast_sim.data.sampling import PairSampler
 from ast_sim.errors import CheckpointError, ConfigError, DatasetError, TrainingError
-from ast_sim.measures import SquaredError, rmse_sequence
+from ast_sim.measures import rmse_sequence
 from ast_sim.models import build_model, find_preset
 from ast_sim.monitor import Clock, Progress, StopSignals, duration
 from ast_sim.optimizer import Optimizer
 from ast_sim.processes import Processes
 from ast_sim.profile import profile, table
-from ast_sim.rollout import rollouts
 from ast_sim.run import Metrics, RunConfig, TrainConfig, has_config, read_config, write_config
 from ast_sim.schedule import DataScales, learning_rate, measure, resolve_training, step_seed
+from ast_sim.validation import validate
 
 CONSTANT = 1e-3  # the output is constant if its standard deviation over nodes is below this share of the targets'
 
@@ -86,6 +86,7 @@ def train(run: Path, config: RunConfig | None = None, resume: bool = False, prof
             with Dataset((config or saved).data) as dataset:
                 scales = measure(dataset)
                 resolved = resolve_run(config, dataset, scales) if config is not None else saved
+                _require_equal_parts(resolved.train.batch_size, processes.count)
                 if saved is not None:
                     _require_same(run, saved, resolved)
                 elif processes.leads:
@@ -137,6 +138,11 @@ def resolve_run(config: RunConfig, dataset: Dataset, scales: DataScales) -> RunC
     return RunConfig(model=model, train=training, data=str(Path(config.data).resolve()))
 
 
+def _require_equal_parts(batch_size: int, processes: int) -> None:
+    if batch_size % processes:
+        raise ConfigError(f"train.batch_size = {batch_size} cannot be cut for {processes} processes")
+
+
 def _require_same(run: Path, saved: RunConfig, asked: RunConfig) -> None:
     """Raise ConfigError naming the first setting that differs (the place of the data may)."""
     for part in ("model", "train"):
@@ -167,12 +173,9 @@ class Training:
     ) -> None:
         self.run, self.config, self.dataset, self.signals = run, config, dataset, signals
         self.options, self.processes = config.train, processes or Processes()
-        rank, count = self.processes.rank, self.processes.count
-        if self.options.batch_size % count:
-            raise ConfigError(f"train.batch_size = {self.options.batch_size} cannot be cut for {count} processes")
         torch.manual_seed(self.options.seed)
         self.model = build_model(config.model)
-        self.sampler = self._sampler((rank, count))
+        self.sampler = self._sampler((self.processes.rank, self.processes.count))
         self.ahead = Ahead(self.sampler)
         self.optimizer = Optimizer(self.model)
         self.metrics = Metrics(run)
@@ -341,7 +344,9 @@ class Training:
             return
         self.ahead.wait()
         mine = range(self.processes.rank, count, self.processes.count)
-        found = self.processes.gathered(self._rolled_out(mine))
+        # Together processes end together: none may stop on its own.
+        progress = self._stop_at_once if self.processes.count == 1 else None
+        found = self.processes.gathered(validate(self.model, self.dataset, mine, progress))
         if not self.processes.leads:
             self.clock.validation()
             return
@@ -368,25 +373,6 @@ class Training:
     def _stop_at_once(self, frame: int) -> None:
         self._heed_signals()
         self._stop_if_asked()
-
-    def _rolled_out(self, indices: range) -> list[_Validated]:
-        """The errors of validation scenes."""
-        truths = [self.dataset.load("valid", index) for index in indices]
-        names = [f"valid/{index:06d}" for index in indices]
-        # Together they end together: none may stop on its own.
-        progress = self._stop_at_once if self.processes.count == 1 else None
-        results = rollouts(self.model, truths, names, progress=progress) if truths else []
-        return [
-            _Validated(
-                index,
-                _motion_error(result.position, truth, result.given),
-                _motion_error(truth.position[result.given - 1], truth, result.given),
-                None,
-            )
-            if result.failure is None
-            else _Validated(index, None, None, result.failure)
-            for index, truth, result in zip(indices, truths, results, strict=True)
-        ]
 
     def _save(self) -> None:
         if not self.processes.leads:
@@ -436,18 +422,3 @@ class Training:
             position, _ = self.dataset.frames("train", index, 0, self.dataset.num_frames("train", index))
             digest.update(np.ascontiguousarray(position).tobytes())
         return digest.hexdigest()
-
-
-class _Validated(NamedTuple):
-    """A validation scene: the error of its rollout and that of holding still, or why there is none."""
-
-    index: int
-    error: SquaredError | None
-    hold: SquaredError | None
-    failure: str | None
-
-
-def _motion_error(position: np.ndarray, truth: Any, given: int) -> SquaredError:
-    """Error of the frames after the given ones on NORMAL nodes; `position` [S, N, 3], or [N, 3] for one that stays."""
-    predicted = position[given:] if position.ndim == 3 else position
-    return SquaredError.between(predicted, truth.position[given:], ~truth.scene.prescribed)

@@ -12,12 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("svg")
-matplotlib.rcParams["svg.hashsalt"] = "ast_sim"
-
-from matplotlib import pyplot  # noqa: E402 (the backend has to be chosen before)
+from benchmarks.svg import axes_of_picture, save
 
 INTRODUCTION = """# The models compared
 
@@ -195,7 +190,7 @@ def divergences(models: dict[str, Any], horizons: int) -> list[str]:
 
 def draw(found: dict[str, Any], file: Path) -> None:
     """Validation error over the seconds of training, a line a model; thin lines are its other seeds."""
-    figure, axes = pyplot.subplots(figsize=(7.2, 4.4), layout="constrained")
+    figure, axes = axes_of_picture(7.2, 4.4)
     for number_, (name, model) in enumerate(found["models"].items()):
         for i, run in enumerate(model["runs"]):
             points = [(p["seconds"] / 60, 1e3 * p["valid_rmse"]) for p in run["curve"] if p["valid_rmse"] is not None]
@@ -205,11 +200,7 @@ def draw(found: dict[str, Any], file: Path) -> None:
                     *zip(*points, strict=True), ".-", color=f"C{number_}", linewidth=width, label=None if i else name
                 )
     axes.set(xlabel="training, minutes", ylabel="rollout error on validation scenes, mm", yscale="log")
-    axes.grid(alpha=0.3, which="both")
-    axes.legend(fontsize="small")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, metadata={"Date": None})
-    pyplot.close(figure)
+    save(figure, axes, file)
 
 
 if __name__ == "__main__":

@@ -1,22 +1,16 @@
-"""Draws the pictures of the verification as SVG, the same bytes for the same figures."""
+"""Draws the pictures of the verification."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("svg")
-matplotlib.rcParams["svg.hashsalt"] = "ast_sim"
-
-from matplotlib import pyplot  # noqa: E402 (the backend has to be chosen before)
-
-from benchmarks.verification_problem import Picture  # noqa: E402
+from benchmarks.svg import axes_of_picture, save
+from benchmarks.verification_problem import Picture
 
 
 def draw(picture: Picture, file: Path) -> None:
     """Write the picture to `file`, an SVG."""
-    figure, axes = pyplot.subplots(figsize=(6.4, 4.2), layout="constrained")
+    figure, axes = axes_of_picture(6.4, 4.2)
     for curve in picture.curves:
         axes.plot(curve.x, curve.y, curve.style, label=curve.label or None, markersize=4, linewidth=1.2)
     if picture.logarithmic:
@@ -25,8 +19,4 @@ def draw(picture: Picture, file: Path) -> None:
     if picture.equal:
         axes.set_aspect("equal")
     axes.set(title=picture.title, xlabel=picture.x, ylabel=picture.y)
-    axes.grid(alpha=0.3, which="both")
-    axes.legend(fontsize="small")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, metadata={"Date": None})
-    pyplot.close(figure)
+    save(figure, axes, file)

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT))
+from benchmarks import performance, targets
 
-from benchmarks import performance, targets  # noqa: E402
+ROOT = Path(__file__).parents[2]
 
 MACHINE = {
     "command": "python -m benchmarks.kernels --json F",
