@@ -1,9 +1,9 @@
 """Compares models under one protocol: equal scenes, splits, noise and budget, each with its own best learning rate.
 
 `python -m benchmarks.study STUDY.toml [--workers W]` writes benchmarks/results/study_NAME.json and docs/study.md, in
-which all studies with a result are shown. It is resumable: a run that is finished is not made again, one that was cut
-off goes on from its last checkpoint. Runs and data lie in build/study. With W workers as many runs are trained at a
-time, so their speed is measured beside each other.
+which all studies with a result are shown, anew after each run. It is resumable: a run that is finished is not made
+again, one that was cut off goes on from its last checkpoint. Runs and data lie in build/study. With W workers as many
+runs are trained at a time, so their speed is measured beside each other.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
@@ -22,7 +22,7 @@ from ast_sim.errors import AstSimError
 from ast_sim.evaluate import provenance
 from ast_sim.results import write_json
 from benchmarks.study_plan import Data, Entry, Study, read
-from benchmarks.study_run import Job, run
+from benchmarks.study_run import Job, run, train
 
 FOLDER, RESULTS = Path("build/study"), Path("benchmarks/results")
 
@@ -39,47 +39,48 @@ def dataset(data: Data, folder: Path) -> Path:
     return generate(data.family, out, counts, seed=data.seed, nodes=data.nodes, frames=data.frames).path
 
 
-def conduct(study: Study, entries: dict[str, Entry], data: Path, folder: Path, workers: int) -> dict[str, Any]:
-    """All runs, and for each entry the one of each seed with its own rate.
+def conduct(
+    study: Study, entries: dict[str, Entry], data: Path, folder: Path, workers: int
+) -> Iterator[dict[str, Any]]:
+    """What is known after each run: all entries from the first seed, then from the next one.
 
-    Returns:
-        For each entry its `rate`, `search` (the best validation error by rate) and `runs`, one a seed.
+    Yields:
+        For each entry that has a run its `rate`, `search` (the best validation error by rate) and `runs`, one a seed.
     """
-
-    def job(name: str, seed: int, rate: float) -> Job:
-        place = folder / re.sub(r"[^\w.=-]+", "_", name) / f"rate_{rate:g}_seed_{seed}"
-        return Job(study, name, entries[name], seed, rate, data, place)
-
-    def all_of(jobs: Iterable[Job]) -> list[dict[str, Any]]:
-        with ThreadPoolExecutor(workers) as pool:
-            return list(pool.map(_told, jobs))
-
-    first, *others = study.seeds
-    rates = {name: entry.rates or study.rates for name, entry in entries.items()}
-    searched = all_of(job(name, first, rate) for name, options in rates.items() for rate in options)
     found: dict[str, Any] = {}
-    for name in entries:
-        runs = [record for record in searched if record["name"] == name]
-        best = min(runs, key=lambda record: _or_infinity(record["best_valid"]))
-        search = {f"{record['rate']:g}": record["best_valid"] for record in runs}
-        found[name] = {**asdict(entries[name]), "rate": best["rate"], "search": search, "runs": [best]}
-    for record in all_of(job(name, seed, found[name]["rate"]) for seed in others for name in entries):
-        found[record["name"]]["runs"].append(record)
-    return found
+    with ThreadPoolExecutor(workers) as pool:
+        for seed in study.seeds:
+            made = pool.map(lambda name, seed=seed: _entry(study, name, entries[name], seed, data, folder), entries)
+            for name, (rate, search, record) in zip(entries, made, strict=True):
+                of_entry = found.setdefault(name, {**asdict(entries[name]), "rate": rate, "search": search, "runs": []})
+                of_entry["runs"].append(record)
+                yield found
 
 
-def _told(job: Job) -> dict[str, Any]:
-    """A run, of which a line tells when it is there."""
-    record = run(job)
+def _entry(
+    study: Study, name: str, entry: Entry, seed: int, data: Path, folder: Path
+) -> tuple[float, dict[str, Any], dict[str, Any]]:
+    """The own rate of an entry, the validation errors by which it was found, and the record of its run from a seed."""
+    place = folder / re.sub(r"[^\w.=-]+", "_", name)
+
+    def job(seed: int, rate: float, share: float) -> Job:
+        part = "" if share == 1 else "search_"
+        return Job(study, name, entry, seed, rate, share, data, place / f"{part}rate_{rate:g}_seed_{seed}")
+
+    rates = entry.rates or study.rates
+    errors = {rate: _told(train(job(study.seeds[0], rate, study.search)))["best_valid"] for rate in rates}
+    best = min(rates, key=lambda rate: float("inf") if errors[rate] is None else errors[rate])
+    search = {f"{rate:g}": error for rate, error in errors.items()}
+    return best, search, _told(run(job(seed, best, share=1)))
+
+
+def _told(record: dict[str, Any]) -> dict[str, Any]:
+    """A record, of which a line tells when it is there."""
     best = record["best_valid"]
     valid = f"validation {best:.3g}" if best is not None else "no validation"
     told = record.get("failed") or f"{record['steps']:,} steps, {valid}"
-    print(f"{job.name}, rate {job.rate:g}, seed {job.seed}: {told}", flush=True)
+    print(f"{record['name']}, rate {record['rate']:g}, seed {record['seed']}: {told}", flush=True)
     return record
-
-
-def _or_infinity(value: float | None) -> float:
-    return float("inf") if value is None else value
 
 
 def main() -> None:
@@ -89,18 +90,19 @@ def main() -> None:
     parser.add_argument("study", type=Path, metavar="STUDY.toml", help="see benchmarks/study_plan.py")
     parser.add_argument("--workers", type=int, default=1, help="runs at a time (%(default)s)")
     arguments = parser.parse_args()
+    name = arguments.study.stem
+    file = RESULTS / f"study_{name}.json"
     try:
         study, entries = read(arguments.study)
         data = dataset(study.data, FOLDER)
-        found = conduct(study, entries, data, FOLDER / arguments.study.stem, arguments.workers)
+        with Dataset(data) as opened:
+            scenes = {"name": data.name if study.data.path else study.data.family, **opened.splits}
+        made = provenance(f"python -m benchmarks.study {arguments.study}")
+        for found in conduct(study, entries, data, FOLDER / name, arguments.workers):
+            write_json(file, {**made, "study": asdict(study), "scenes": scenes, "models": found})
+            write_page(RESULTS, Path("docs"))
     except AstSimError as error:
         sys.exit(str(error))
-    made = provenance(f"python -m benchmarks.study {arguments.study}")
-    file = RESULTS / f"study_{arguments.study.stem}.json"
-    with Dataset(data) as opened:
-        scenes = {"name": data.name if study.data.path else study.data.family, **opened.splits}
-    write_json(file, {**made, "study": asdict(study), "scenes": scenes, "models": found})
-    write_page(RESULTS, Path("docs"))
     print(f"{file}, docs/study.md")
 
 

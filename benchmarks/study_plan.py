@@ -55,11 +55,12 @@ class Study:
     """What all runs have in common.
 
     Each entry is trained with each of the rates and the first seed; the rate with the lowest rollout error on the
-    validation scenes is its own, with which it is trained from the other seeds, too.
+    validation scenes is its own, with which it is trained from all seeds.
 
     Attributes:
         minutes: of training of each run, or
         samples: frame pairs that each run sees.
+        search: share of the budget with which the rates are compared; 1: the best of these runs is the first one.
         validations: rollouts of the validation scenes during a training; the checkpoint of the best is evaluated.
         horizons: test scenes are rolled out for so many times their length.
     """
@@ -70,6 +71,7 @@ class Study:
     seeds: tuple[int, ...] = (0,)
     minutes: float | None = None
     samples: int | None = None
+    search: float = 1.0
     threads: int = 1
     validations: int = 10
     horizons: int = 10
@@ -80,6 +82,8 @@ class Study:
             raise ConfigError("a study has a budget: either minutes or samples")
         if not self.rates or not self.seeds:
             raise ConfigError("a study needs at least one of rates and one of seeds")
+        if not 0 < self.search <= 1:
+            raise ConfigError(f"search = {self.search:g} is no share of the budget: above 0, at most 1")
         if (self.data.path is None) == (self.data.family is None):
             raise ConfigError("data: name either the path of a dataset or the family that is generated")
 

@@ -1,6 +1,6 @@
 """One run of a study: its speed is measured, it is trained for the budget, its best checkpoint is evaluated.
 
-Each stage leaves a file in the run's folder and is not done again: `budget.json`, the run itself, `result.json`.
+Each stage leaves a file and is not done again: `speed.json` of the model; `trained.json` and `result.json` of the run.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import os
 import statistics
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,18 +23,20 @@ from benchmarks.step_worker import Setup
 from benchmarks.study_plan import Entry, Study
 from benchmarks.training_step import Worker
 
-WARM_UP, STEPS, REPEATS = 5, 10, 3  # training steps before the speed is measured, in a repeat, and repeats
+WARM_UP, STEPS, REPEATS = 5, 10, 5  # training steps before the speed is measured, in a repeat, and repeats
+FEWEST = 3  # validations, also where rates are compared with a share of the budget
 
 
 @dataclass(frozen=True)
 class Job:
-    """A run: which entry, from which seed, with which rate."""
+    """A run: which entry, from which seed, with which rate and share of the budget."""
 
     study: Study
     name: str
     entry: Entry
     seed: int
     rate: float
+    share: float
     data: Path
     folder: Path
 
@@ -47,58 +50,66 @@ class Job:
         return {**os.environ, "OMP_NUM_THREADS": threads, "MKL_NUM_THREADS": threads}
 
 
+def train(job: Job) -> dict[str, Any]:
+    """The record of a training: what it took, how its validations went; `failed` says why it ended early."""
+    return _once(job.folder / "trained.json", lambda: _trained(job))
+
+
 def run(job: Job) -> dict[str, Any]:
-    """The record of a run: what it took, how its validations went, its errors; `failed` says why there are none."""
-    result = job.folder / "result.json"
-    if not result.exists():
-        job.folder.mkdir(parents=True, exist_ok=True)
-        write_json(result, _made(job))
-    return json.loads(result.read_text(encoding="utf-8"))
+    """The record of a training with its errors on the test scenes, `measured`; `failed` says why there are none."""
+    record = train(job)
+    return record if "failed" in record else _once(job.folder / "result.json", lambda: {**record, **_measured(job)})
 
 
-def _made(job: Job) -> dict[str, Any]:
-    budget = _budget(job)
-    record = {"name": job.name, "seed": job.seed, "rate": job.rate, **budget}
-    steps, every = budget["steps"], max(1, budget["steps"] // job.study.validations)
+def _once(file: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What a file holds; it is made if it is not there."""
+    if not file.exists():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_json(file, make())
+    return json.loads(file.read_text(encoding="utf-8"))
+
+
+def _trained(job: Job) -> dict[str, Any]:
+    speed = _once(job.folder.parent / "speed.json", lambda: _speed(job))
+    study = job.study
+    if study.minutes is not None:
+        steps = max(1, round(job.share * 60 * study.minutes / speed["seconds_per_step"]))
+    else:
+        steps = math.ceil(job.share * study.samples / speed["batch"])
+    validations = max(min(FEWEST, study.validations), round(job.share * study.validations))
+    every = max(1, steps // validations)
     settings = [*job.settings, f"train.steps={steps}", f"train.validate_every={every}", f"train.log_every={every}"]
     arguments = ["--model", job.entry.model, "--preset", job.entry.preset]
     arguments += [word for setting in settings for word in ("--set", setting)]
-    train = ["-m", "ast_sim.cli", "train", str(job.data), "--out", str(job.folder / "run"), "--resume", *arguments]
-    code, peak = _python(job, train, "train.log")
+    words = ["-m", "ast_sim.cli", "train", str(job.data), "--out", str(job.folder / "run"), "--resume", *arguments]
+    code, peak = _python(job, words, "train.log")
+    record = {"name": job.name, "seed": job.seed, "rate": job.rate, **speed, "steps": steps}
     record |= {"peak_resident_bytes": peak, **_training(job.folder / "run")}
-    if code != 0:
-        return {**record, "failed": _last_line(job.folder / "train.log")}
-    measured = job.folder / "measured.json"
-    words = ["-m", "benchmarks.study_measure", str(job.folder / "run"), str(job.study.horizons), str(measured)]
+    return record if code == 0 else {**record, "failed": _last_line(job.folder / "train.log")}
+
+
+def _measured(job: Job) -> dict[str, Any]:
+    file = job.folder / "measured.json"
+    words = ["-m", "benchmarks.study_measure", str(job.folder / "run"), str(job.study.horizons), str(file)]
     code, _ = _python(job, words, "measure.log")
     if code != 0:
-        return {**record, "failed": _last_line(job.folder / "measure.log")}
-    return {**record, "measured": json.loads(measured.read_text(encoding="utf-8"))}
+        return {"failed": _last_line(job.folder / "measure.log")}
+    return {"measured": json.loads(file.read_text(encoding="utf-8"))}
 
 
-def _budget(job: Job) -> dict[str, Any]:
-    """Steps that the budget allows; seconds a step, without validations and checkpoints, as they were measured."""
-    file = job.folder / "budget.json"
-    if file.exists():
-        return json.loads(file.read_text(encoding="utf-8"))
+def _speed(job: Job) -> dict[str, Any]:
+    """Seconds a step, without validations and checkpoints, and scenes a step."""
     entry = job.entry
-    setup = Setup(str(job.data), entry.model, entry.preset, job.settings, str(job.folder))
-    worker = Worker("c", job.study.threads, setup, job.folder / "speed.log")
+    setup = Setup(str(job.data), entry.model, entry.preset, job.settings, str(job.folder.parent))
+    worker = Worker("c", job.study.threads, setup, job.folder.parent / "speed.log")
     try:
         worker.ask("step", WARM_UP)
         seconds = statistics.median(worker.ask("step", STEPS) for _ in range(REPEATS))
-        batch = worker.ask("batch")
+        return {"seconds_per_step": seconds, "batch": worker.ask("batch")}
     except RuntimeError as error:
         raise ConfigError(f"{job.name}: {error}") from error
     finally:
         worker.close()
-    if job.study.minutes is not None:
-        steps = max(1, round(60 * job.study.minutes / seconds))
-    else:
-        steps = math.ceil(job.study.samples / batch)
-    budget = {"seconds_per_step": seconds, "batch": batch, "steps": steps}
-    write_json(file, budget)
-    return budget
 
 
 def _python(job: Job, words: list[str], log: str) -> tuple[int, int]:

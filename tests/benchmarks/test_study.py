@@ -89,42 +89,54 @@ def test_a_long_script_goes_forward_and_backward():
     assert np.array_equal(repeated(truth, 3).position, truth.position[[0, 1, 2, 3, 2, 1, 0, 1, 2, 3]])
 
 
-def test_each_model_has_the_rate_of_its_best_validation(monkeypatch, tmp_path):
+@pytest.mark.parametrize("search", [1.0, 0.2])
+def test_each_model_has_the_rate_of_its_best_validation(monkeypatch, tmp_path, search):
     errors = {("a", 1e-3): 2.0, ("a", 1e-4): 1.0, ("b", 1e-3): 3.0, ("b", 1e-4): None}
+    trained, measured = [], []
 
-    def record(job):
-        return {
-            "name": job.name,
-            "seed": job.seed,
-            "rate": job.rate,
-            "steps": 1,
-            "best_valid": errors[job.name, job.rate],
-        }
+    def record(job, done):
+        done.append((job.name, job.seed, job.rate, job.share))
+        error = errors[job.name, job.rate]
+        return {"name": job.name, "seed": job.seed, "rate": job.rate, "steps": 1, "best_valid": error}
 
-    monkeypatch.setattr(study, "run", record)
-    plan = Study("x", Data(path="d"), (1e-3, 1e-4), seeds=(5, 6), samples=1)
-    found = study.conduct(plan, {"a": Entry(), "b": Entry()}, tmp_path, tmp_path, 2)
+    monkeypatch.setattr(study, "train", lambda job: record(job, trained))
+    monkeypatch.setattr(study, "run", lambda job: record(job, measured))
+    plan = Study("x", Data(path="d"), (1e-3, 1e-4), seeds=(5, 6), samples=1, search=search)
+    counts = []
+    for found in study.conduct(plan, {"a": Entry(), "b": Entry()}, tmp_path, tmp_path, 2):
+        counts.append([len(entry["runs"]) for entry in found.values()])
+    assert counts == [[1], [1, 1], [2, 1], [2, 2]]
     assert {name: model["rate"] for name, model in found.items()} == {"a": 1e-4, "b": 1e-3}
     assert [run["seed"] for run in found["a"]["runs"]] == [5, 6]
     assert found["a"]["search"] == {"0.001": 2.0, "0.0001": 1.0} and found["b"]["search"]["0.0001"] is None
+    assert {(seed, share) for _, seed, _, share in trained} == {(5, search)}
+    assert sorted(measured) == [("a", 5, 1e-4, 1), ("a", 6, 1e-4, 1), ("b", 5, 1e-3, 1), ("b", 6, 1e-3, 1)]
 
 
 def test_a_small_study_from_end_to_end(tmp_path):
     data = toy.write(tmp_path / "toy.h5")
-    plan, entries = read(written(tmp_path, TOML.replace("toy.h5", str(data))))
+    plan, entries = read(written(tmp_path, TOML.replace("toy.h5", str(data)).replace("1e-3]", "1e-3, 1e-4]")))
+
+    def conducted(**entries: Entry) -> dict:
+        return list(study.conduct(plan, entries, data, tmp_path / "runs", 1))[-1]
+
     with pytest.raises(ConfigError, match="odd: .*no setting model.hiden"):
-        study.conduct(plan, {"odd": Entry(settings=("model.hiden=3",))}, data, tmp_path / "runs", 1)
-    found = study.conduct(plan, {"ast": entries["ast"]}, data, tmp_path / "runs", 1)
+        conducted(odd=Entry(settings=("model.hiden=3",)))
+    found = conducted(ast=entries["ast"])
     (made,) = found["ast"]["runs"]
     assert made["steps"] == 4 and made["batch"] == 4 and made["seconds_per_step"] > 0
     assert [point["step"] for point in made["curve"]] == [2, 4]
     assert made["best_valid"] == min(point["valid_rmse"] for point in made["curve"])
+    assert made["best_valid"] == min(found["ast"]["search"].values())
     summary = made["measured"]["summary"]["model"]["displacement"]["rollout_all"]["normal"]["rmse_sequence"]
     assert made["measured"]["horizons"] == 3 and made["measured"]["diverged"] == {} and summary > 0
+    # Only the run with the best rate is measured.
+    folders = tmp_path / "runs/ast"
+    assert {path.name for path in folders.glob("rate*")} == {"rate_0.001_seed_0", "rate_0.0001_seed_0"}
+    (result,) = folders.glob("*/result.json")
     # Again: nothing is trained, the same record is read.
-    before = (tmp_path / "runs/ast/rate_0.001_seed_0/result.json").stat().st_mtime_ns
-    again = study.conduct(plan, {"ast": entries["ast"]}, data, tmp_path / "runs", 1)
-    assert again == found and (tmp_path / "runs/ast/rate_0.001_seed_0/result.json").stat().st_mtime_ns == before
+    before = result.stat().st_mtime_ns
+    assert conducted(ast=entries["ast"]) == found and result.stat().st_mtime_ns == before
     page(tmp_path, found, summary)
 
 
