@@ -64,6 +64,7 @@ def test_two_processes_do_what_one_does(data, tmp_path):
 def test_a_batch_that_cannot_be_cut_is_refused(data, tmp_path):
     done = train(2, data, tmp_path / "run", 4, "--set", "train.batch_size=3", check=False)
     assert done.returncode != 0 and "train.batch_size = 3 cannot be cut for 2 processes" in done.stderr
+    assert not (tmp_path / "run/config.toml").exists()  # else the corrected command would be refused, too
 
 
 def test_a_signal_to_one_process_stops_both_after_the_step(data, tmp_path):

@@ -37,13 +37,14 @@ def lookup(tree: Any, *keys: str) -> Any:
 def measure_tables(names: Sequence[str], evaluations: Sequence[Json | None]) -> list[Json]:
     """A table of the displacement's and one of the stress's errors: every convention, runs beside trivial predictors.
 
-    The trivial predictors do not depend on the run: they are taken from the first evaluation that has them.
+    The trivial predictors do not depend on the run: they are taken from the first evaluation that has them. A
+    time-conditioned model has no row of one step: its step from frame 0 is its rollout.
     """
     unit = units(evaluations)
     summaries = [lookup(evaluation, "summary") for evaluation in evaluations]
     tables = []
     for quantity, title in (("displacement", "Displacement"), ("stress", "von Mises stress")):
-        sources = [lookup(summary, MODEL, quantity) for summary in summaries]
+        sources = [_of_model(evaluation, quantity) for evaluation in evaluations]
         for key in TRIVIAL[quantity]:
             sources.append(next((f for s in summaries if (f := lookup(s, key, quantity))), None))
         rows = _measure_rows(sources)
@@ -53,6 +54,13 @@ def measure_tables(names: Sequence[str], evaluations: Sequence[Json | None]) -> 
                 {"title": title, "unit": unit[quantity], "columns": columns, "rows": rows, "runs": len(names)}
             )
     return tables
+
+
+def _of_model(evaluation: Json | None, quantity: str) -> Json | None:
+    found = lookup(evaluation, "summary", MODEL, quantity)
+    if found is None or not evaluation.get("time_conditioned"):
+        return found
+    return {horizon: errors for horizon, errors in found.items() if horizon != "one_step"}
 
 
 def _measure_rows(sources: Sequence[Json | None]) -> list[Json]:

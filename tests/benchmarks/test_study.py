@@ -10,7 +10,8 @@ from toy import one_thread  # noqa: F401
 from ast_sim.data.scene import Trajectory
 from ast_sim.errors import ConfigError
 from ast_sim.rollout import Rollout
-from benchmarks import study, study_page
+from ast_sim.simulate.checkpoint import Checkpoint
+from benchmarks import increments, study, study_page
 from benchmarks.study_measure import phase_errors, phases, repeated
 from benchmarks.study_plan import Data, Entry, Study, read
 
@@ -142,7 +143,8 @@ def test_a_small_study_from_end_to_end(tmp_path):
 
 def page(folder, found, summary) -> None:
     """The document has the figure, and the picture that it names."""
-    values = {"title": "Toy", "about": "", "minutes": None, "samples": 16, "threads": 1, "seeds": [0], "horizons": 3}
+    values = {"title": "Toy", "about": "", "minutes": None, "samples": 16, "threads": 1, "seeds": [0, 1], "horizons": 3}
+    values |= {"search": 1.0}
     values["data"] = {"nodes": None, "frames": None}
     scenes = {"name": "toy.h5", "train": 3, "valid": 2, "test": 2}
     result = {"commit": None, "processor": "p", "study": values, "scenes": scenes, "models": found}
@@ -150,4 +152,45 @@ def page(folder, found, summary) -> None:
     study_page.write_page(folder, folder / "docs")
     text = (folder / "docs/study.md").read_text()
     assert f"{1e3 * summary:.3g}" in text and "every model stays finite" in text and "16 frame pairs" in text
+    assert "seeds 0; " in text  # not those that are still to come
+    assert "by learning rate; the best in bold:\n\n| model | 0.001 | 0.0001 |\n| --- | ---: | ---: |\n| ast |" in text
     assert (folder / "docs/study/toy.svg").read_text().startswith("<?xml")
+
+
+def run_of(rollout: float | None, milliseconds: float) -> dict:
+    summary = {"rollout_all": {"normal": {"rmse_sequence": rollout}}}
+    return {
+        "seed": 0,
+        "seconds_per_step": 4e-3 * milliseconds,
+        "batch": 4,
+        "measured": {"summary": {"model": {"displacement": summary}}},
+    }
+
+
+def test_the_verdict_names_the_best_baseline_and_who_is_better():
+    models = {
+        "AST": {"model": "ast", "runs": [run_of(1e-3, 5.0), run_of(2e-3, 5.0)]},
+        "MGN": {"model": "mgn", "runs": [run_of(4e-3, 20.0)]},
+        "BSMS": {"model": "bsms", "runs": [run_of(2.5e-3, 9.0)]},
+        "HCMT": {"model": "hcmt", "runs": [run_of(None, 9.0)]},
+        "AST, other": {"model": "ast", "runs": [run_of(1.2e-3, 5.0)]},
+    }
+    (text, _) = study_page.verdict(models)
+    assert "0.6 of that of the best baseline, BSMS" in text and "0.5, not reached" in text
+    assert "0.25 of MGN's time" in text and text.endswith("Better than AST: AST, other.")
+    models["AST"]["runs"] = [run_of(1e-3, 5.0)]
+    (text, _) = study_page.verdict(models)
+    assert "0.4 of that of" in text and "0.5, reached" in text and text.endswith("No other row has a smaller error.")
+    assert study_page.verdict({"AST": models["AST"]}) == [] and study_page.verdict({"MGN": models["MGN"]}) == []
+
+
+def test_the_cost_of_increments_is_read_from_an_unfinished_sample(tmp_path):
+    records = [{"solve_seconds": 0.0}, {"solve_seconds": 3.0, "newton_iterations": 4}, {"solve_seconds": 1.5}]
+    file = Checkpoint(tmp_path / "train-000000.checkpoint")
+    file.save(
+        {"position": np.zeros((3, 5, 3)), "stress": np.zeros((3, 7, 1)), "records": np.array(json.dumps(records))}
+    )
+    found = increments.measure(file.path)
+    assert found == {"nodes": 5, "elements": 7, "seconds": 4.5, "increments": records[1:]}
+    with pytest.raises(SystemExit, match="no frames to be read"):
+        increments.measure(tmp_path / "none")

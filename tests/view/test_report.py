@@ -119,6 +119,18 @@ def test_all_conventions_stand_beside_the_trivial_predictors():
     assert second["rows"][2]["values"] == pytest.approx([7458.0, 22770.0, 17380.0, 12430.0])
 
 
+def test_a_time_conditioned_run_has_no_figure_of_one_step():
+    runs = [evaluation({"a": 1e-3}), {**evaluation({"a": 1e-3}), "time_conditioned": True}]
+    for table in tables.measure_tables(["stepwise", "time-conditioned"], runs):
+        values, horizon = {}, None
+        for row in table["rows"]:
+            horizon = row.get("group", horizon)
+            if "values" in row:
+                values.setdefault(horizon, []).append(row["values"])
+        assert all(step is not None and none is None for step, none, *_ in values["One step"])
+        assert all(step == same for step, same, *_ in values["Full rollout"])
+
+
 def test_scenes_are_ranked_and_failures_come_last():
     found = tables.samples([evaluation({"a": 3e-3, "b": None, "c": 1e-3})], ["run"])
     assert [found["names"][i] for i in found["order"]] == ["c", "a", "b"]
