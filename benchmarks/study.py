@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import signal
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -22,7 +23,7 @@ from ast_sim.errors import AstSimError
 from ast_sim.evaluate import provenance
 from ast_sim.results import write_json
 from benchmarks.study_plan import Data, Entry, Study, read
-from benchmarks.study_run import Job, run, train
+from benchmarks.study_run import Job, run, stop, train
 
 FOLDER, RESULTS = Path("build/study"), Path("benchmarks/results")
 
@@ -49,12 +50,16 @@ def conduct(
     """
     found: dict[str, Any] = {}
     with ThreadPoolExecutor(workers) as pool:
-        for seed in study.seeds:
-            made = pool.map(lambda name, seed=seed: _entry(study, name, entries[name], seed, data, folder), entries)
-            for name, (rate, search, record) in zip(entries, made, strict=True):
-                of_entry = found.setdefault(name, {**asdict(entries[name]), "rate": rate, "search": search, "runs": []})
-                of_entry["runs"].append(record)
-                yield found
+        try:
+            for seed in study.seeds:
+                made = pool.map(lambda name, seed=seed: _entry(study, name, entries[name], seed, data, folder), entries)
+                for name, (rate, search, record) in zip(entries, made, strict=True):
+                    values = {**asdict(entries[name]), "rate": rate, "search": search, "runs": []}
+                    found.setdefault(name, values)["runs"].append(record)
+                    yield found
+        except KeyboardInterrupt:
+            stop()
+            raise
 
 
 def _entry(
@@ -90,6 +95,7 @@ def main() -> None:
     parser.add_argument("study", type=Path, metavar="STUDY.toml", help="see benchmarks/study_plan.py")
     parser.add_argument("--workers", type=int, default=1, help="runs at a time (%(default)s)")
     arguments = parser.parse_args()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
     name = arguments.study.stem
     file = RESULTS / f"study_{name}.json"
     try:
@@ -103,6 +109,8 @@ def main() -> None:
             write_page(RESULTS, Path("docs"))
     except AstSimError as error:
         sys.exit(str(error))
+    except KeyboardInterrupt:
+        sys.exit("stopped: the same command goes on from here")
     print(f"{file}, docs/study.md")
 
 

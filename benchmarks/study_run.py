@@ -1,6 +1,7 @@
 """One run of a study: its speed is measured, it is trained for the budget, its best checkpoint is evaluated.
 
 Each stage leaves a file and is not done again: `speed.json` of the model; `trained.json` and `result.json` of the run.
+What failed leaves none, so it is tried anew the next time.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import os
 import statistics
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,11 +64,14 @@ def run(job: Job) -> dict[str, Any]:
 
 
 def _once(file: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What a file holds; it is made if it is not there."""
-    if not file.exists():
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_json(file, make())
-    return json.loads(file.read_text(encoding="utf-8"))
+    """What a file holds; it is made if it is not there, and written unless it tells of a failure."""
+    if file.exists():
+        return json.loads(file.read_text(encoding="utf-8"))
+    file.parent.mkdir(parents=True, exist_ok=True)
+    made = make()
+    if "failed" not in made:
+        write_json(file, made)
+    return made
 
 
 def _trained(job: Job) -> dict[str, Any]:
@@ -112,16 +117,36 @@ def _speed(job: Job) -> dict[str, Any]:
         worker.close()
 
 
+class Stopped(Exception):
+    """The study was told to stop."""
+
+
+_stopping = threading.Event()
+_running: set[subprocess.Popen] = set()
+
+
+def stop() -> None:
+    """Stop all runs: each keeps a checkpoint, from which it goes on the next time."""
+    _stopping.set()
+    for process in tuple(_running):
+        process.terminate()
+
+
 def _python(job: Job, words: list[str], log: str) -> tuple[int, int]:
-    """Exit code and peak resident bytes of a Python process whose output goes to a file."""
+    """Exit code and peak resident bytes of a Python process whose output goes to a file; raises Stopped."""
+    if _stopping.is_set():
+        raise Stopped
     with open(job.folder / log, "a", encoding="utf-8") as out:
-        process = subprocess.Popen([sys.executable, *words], env=job.environment(), stdout=out, stderr=out)
-        try:
-            _, status, usage = os.wait4(process.pid, 0)
-        except BaseException:
-            process.terminate()
-            raise
+        # In a session of its own: a Ctrl-C reaches it through `stop` alone.
+        process = subprocess.Popen(
+            [sys.executable, *words], env=job.environment(), stdout=out, stderr=out, start_new_session=True
+        )
+        _running.add(process)
+        _, status, usage = os.wait4(process.pid, 0)
+        _running.remove(process)
     process.returncode = os.waitstatus_to_exitcode(status)  # so that Popen does not wait for it once more
+    if _stopping.is_set():
+        raise Stopped
     return process.returncode, usage.ru_maxrss * 1024
 
 

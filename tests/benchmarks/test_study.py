@@ -1,6 +1,12 @@
 """The protocol of a study: its file, the phases of contact, the choice of rates, a small one from end to end."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -139,6 +145,45 @@ def test_a_small_study_from_end_to_end(tmp_path):
     before = result.stat().st_mtime_ns
     assert conducted(ast=entries["ast"]) == found and result.stat().st_mtime_ns == before
     page(tmp_path, found, summary)
+
+
+def processes_with(word: str) -> list[str]:
+    lines = [path.read_bytes() for path in Path("/proc").glob("[0-9]*/cmdline") if path.exists()]
+    return [line.decode() for line in lines if word.encode() in line]
+
+
+def test_a_study_that_is_stopped_goes_on(tmp_path):
+    data = toy.write(tmp_path / "toy.h5")
+    written(tmp_path, TOML.replace("toy.h5", str(data)).replace("samples = 16", "samples = 800"))
+    command = [sys.executable, "-m", "benchmarks.study", str(tmp_path / "toy.toml")]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    begun = subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    folder = tmp_path / "build/study/toy/ast/rate_0.001_seed_0"
+    deadline = time.monotonic() + 120
+    while not (folder / "run/config.toml").exists():
+        assert begun.poll() is None and time.monotonic() < deadline
+        time.sleep(0.05)
+    assert processes_with(str(folder.relative_to(tmp_path)))
+    begun.send_signal(signal.SIGTERM)
+    _, told = begun.communicate(timeout=60)
+    assert begun.returncode == 1 and told.decode().endswith("stopped: the same command goes on from here\n")
+    assert not processes_with(str(folder.relative_to(tmp_path)))
+    assert not (folder / "trained.json").exists()
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0 and "200 steps" in done.stdout and (tmp_path / "docs/study.md").exists()
+    (run,) = json.loads((tmp_path / "benchmarks/results/study_toy.json").read_text())["models"]["ast"]["runs"]
+    assert run["steps"] == 200 and "measured" in run
+
+
+def test_a_failure_is_tried_anew(tmp_path, monkeypatch):
+    data = toy.write(tmp_path / "toy.h5")
+    plan, entries = read(written(tmp_path, TOML.replace("toy.h5", str(data))))
+    with monkeypatch.context() as patch:
+        patch.setenv("AST_SIM_BACKEND", "broken")
+        (found,) = study.conduct(plan, entries, data, tmp_path / "runs", 1)
+    assert "AST_SIM_BACKEND=broken is unknown" in found["ast"]["runs"][0]["failed"]
+    (found,) = study.conduct(plan, entries, data, tmp_path / "runs", 1)
+    assert "measured" in found["ast"]["runs"][0]
 
 
 def page(folder, found, summary) -> None:
