@@ -27,7 +27,6 @@ from ast_sim.baselines.common import (
     DeepMLP,
     WorldEdgeConfig,
     WorldEdgeSimulator,
-    mesh_features,
     messages,
     world_normalizer,
 )
@@ -146,7 +145,7 @@ class BSMS(WorldEdgeSimulator):
             if i:
                 pooling = hierarchy.poolings[i - 1]
                 position, contacts = pooling.pool(position), pooling.pool_contacts(contacts)
-            features = mesh_features(mesh, rest, position)
+            features = self.edge_features(mesh, rest, position)
             found.append(Level(mesh, features, contacts, edge_vectors(contacts, position, position)))
         return found
 

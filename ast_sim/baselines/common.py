@@ -17,7 +17,7 @@ from ast_sim.data.file import DatasetInfo
 from ast_sim.data.graph import edge_vectors
 from ast_sim.errors import ConfigError
 from ast_sim.model.config import ModelConfig, setting
-from ast_sim.model.features import node_features, normalizer_of
+from ast_sim.model.features import beside_rest, node_features, normalizer_of
 from ast_sim.model.mlp import MLP, layer
 from ast_sim.model.normalizer import FeatureNormalizer
 from ast_sim.model.simulator import Prediction, Simulator
@@ -35,6 +35,9 @@ class WorldEdgeConfig(ModelConfig):
     node_inputs: tuple[str, ...] = setting((), "node features: displacement, velocity, material, proximity")
     hidden: int = setting(128, "width of node and edge features")
     hidden_layers: int = setting(2, "hidden layers of each MLP: 2, or 1, where message passing is one fused op")
+    edge_strain: bool = setting(
+        False, "mesh edge features as differences to rest, [dp0, |dp0|, dp - dp0, |dp| - |dp0|]"
+    )
     world_radius: float | None = setting(None, "length of world edges at most; unset: the dataset's contact radius")
     most_world_edges: int | None = setting(None, "world edges of a scene at most, the shortest; unset: all")
 
@@ -76,8 +79,13 @@ class WorldEdgeSimulator(Simulator):
     def observe(self, batch: Batch) -> None:
         """Add the batch to the statistics of the inputs."""
         self.node_inputs.observe(node_features(self.config, batch))
-        self.mesh_inputs.observe(mesh_features(batch.graph.m2m, batch.graph.rest_edges, batch.position))
+        self.mesh_inputs.observe(self.edge_features(batch.graph.m2m, batch.graph.rest_edges, batch.position))
         self.world_inputs.observe(edge_vectors(self.world(batch), batch.position, batch.position))
+
+    def edge_features(self, edges: EdgeSet, rest_edges: Tensor, position: Tensor) -> Tensor:
+        """[M, 8]: [dp0, |dp0|, dp, |dp|] with d = sender - receiver, of a mesh with `rest_edges` [M, 4] at `position`;
+        with `edge_strain` dp and |dp| less those at rest."""
+        return beside_rest(rest_edges, edge_vectors(edges, position, position), self.config.edge_strain)
 
     def nodes(self, batch: Batch) -> Tensor:
         """Normalised inputs of the nodes, [N, *]."""
@@ -85,16 +93,11 @@ class WorldEdgeSimulator(Simulator):
 
     def mesh_edges(self, batch: Batch) -> Tensor:
         """Normalised inputs of the mesh edges, [M, 8]."""
-        return self.mesh_inputs(mesh_features(batch.graph.m2m, batch.graph.rest_edges, batch.position))
+        return self.mesh_inputs(self.edge_features(batch.graph.m2m, batch.graph.rest_edges, batch.position))
 
     def world_edges(self, batch: Batch, world: EdgeSet) -> Tensor:
         """Normalised inputs of the world edges, [W, 4]."""
         return self.world_inputs(edge_vectors(world, batch.position, batch.position))
-
-
-def mesh_features(edges: EdgeSet, rest_edges: Tensor, position: Tensor) -> Tensor:
-    """[M, 8]: [dp0, |dp0|, dp, |dp|] with d = sender - receiver, of a mesh with `rest_edges` [M, 4] at `position`."""
-    return torch.cat([rest_edges, edge_vectors(edges, position, position)], dim=1)
 
 
 def world_normalizer() -> FeatureNormalizer:

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from ast_sim.baselines.bistride import Hierarchy, build_hierarchy, subset
 from ast_sim.baselines.channel_attention import channel_attention
-from ast_sim.baselines.common import Decoder, DeepMLP, WorldEdgeConfig, WorldEdgeSimulator, mesh_features
+from ast_sim.baselines.common import Decoder, DeepMLP, WorldEdgeConfig, WorldEdgeSimulator
 from ast_sim.data.batch import Batch
 from ast_sim.data.graph import Graph, edge_vectors
 from ast_sim.data.scene import NodeType, Scene
@@ -121,7 +121,7 @@ class HCMT(WorldEdgeSimulator):
         for i, (mesh, rest) in enumerate(zip(hierarchy.edges, hierarchy.rest_edges, strict=True)):
             if i:
                 position = position.index_select(0, hierarchy.poolings[i - 1].kept)
-            found.append(mesh_features(mesh, rest, position))
+            found.append(self.edge_features(mesh, rest, position))
         return found
 
     def observe(self, batch: Batch) -> None:

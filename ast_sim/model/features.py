@@ -66,7 +66,12 @@ def edge_features(config: ASTConfig, batch: Batch) -> Tensor:
     graph, now = batch.graph, present(config, batch)
     senders = graph.element_mean(now) if graph.e2m is not None else now
     vectors = edge_vectors(graph.edges, senders, now)
-    return torch.cat([graph.rest_edges, vectors - graph.rest_edges if config.edge_strain else vectors], dim=1)
+    return beside_rest(graph.rest_edges, vectors, config.edge_strain)
+
+
+def beside_rest(rest: Tensor, vectors: Tensor, strain: bool) -> Tensor:
+    """[M, 8]: edges at rest [M, 4] and those of now [M, 4]; with `strain` their change, at the scale of strains."""
+    return torch.cat([rest, vectors - rest if strain else vectors], dim=1)
 
 
 def normalizer_of(config: ModelConfig, what: str) -> FeatureNormalizer:

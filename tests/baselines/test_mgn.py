@@ -7,7 +7,6 @@ import torch
 from graph_models import assert_follows, batch_of, deep_mlp, made, resolved
 from toy import one_thread  # noqa: F401
 
-from ast_sim.baselines.common import mesh_features
 from ast_sim.baselines.mgn import PRESETS, MGNConfig
 from ast_sim.data.graph import edge_vectors
 from ast_sim.model.features import node_features
@@ -24,9 +23,11 @@ def formulas(model, batch):
         def normal(name, x):
             return (x.to(dtype) - p[f"{name}.mean"]) / p[f"{name}.scale"]
 
-        mesh, world, position = batch.graph.m2m, model.world(batch), batch.position
+        mesh, world, position, rest = batch.graph.m2m, model.world(batch), batch.position, batch.graph.rest_edges
+        vectors = edge_vectors(mesh, position, position)
+        on_mesh = torch.cat([rest, vectors - rest if model.config.edge_strain else vectors], dim=1)
         v = deep_mlp(p, "node_encoder", normal("node_inputs", node_features(model.config, batch)))
-        e = deep_mlp(p, "mesh_encoder", normal("mesh_inputs", mesh_features(mesh, batch.graph.rest_edges, position)))
+        e = deep_mlp(p, "mesh_encoder", normal("mesh_inputs", on_mesh))
         w = deep_mlp(p, "world_encoder", normal("world_inputs", edge_vectors(world, position, position)))
         for i in range(model.config.blocks):
             e_new = deep_mlp(p, f"blocks.{i}.mesh.update", torch.cat([e, v[mesh.senders], v[mesh.receivers]], 1))
@@ -47,6 +48,11 @@ def formulas(model, batch):
 def test_it_follows_the_formulas(stress, layers):
     model, batch = made(replace(resolved(SMALL), stress=stress, hidden_layers=layers), 0, 1)
     assert len(model.world(batch)) > 20
+    assert_follows(model, batch, formulas(model, batch))
+
+
+def test_its_mesh_edges_may_hold_strains():
+    model, batch = made(replace(resolved(SMALL), edge_strain=True), 0, 1)
     assert_follows(model, batch, formulas(model, batch))
 
 
