@@ -9,7 +9,6 @@ runs are trained at a time, so their speed is measured beside each other.
 from __future__ import annotations
 
 import argparse
-import re
 import signal
 import sys
 from collections.abc import Iterator
@@ -23,7 +22,7 @@ from ast_sim.errors import AstSimError
 from ast_sim.evaluate import provenance
 from ast_sim.results import write_json
 from benchmarks.study_plan import Data, Entry, Study, read
-from benchmarks.study_run import Job, run, stop, train
+from benchmarks.study_run import Job, measure_speeds, run, stop, train
 
 FOLDER, RESULTS = Path("build/study"), Path("benchmarks/results")
 
@@ -49,6 +48,9 @@ def conduct(
         For each entry that has a run its `rate`, `search` (the best validation error by rate) and `runs`, one a seed.
     """
     found: dict[str, Any] = {}
+    measure_speeds(
+        [Job(study, name, entries[name], study.seeds[0], study.rates[0], 1, data, folder) for name in entries]
+    )
     with ThreadPoolExecutor(workers) as pool:
         try:
             for seed in study.seeds:
@@ -66,17 +68,12 @@ def _entry(
     study: Study, name: str, entry: Entry, seed: int, data: Path, folder: Path
 ) -> tuple[float, dict[str, Any], dict[str, Any]]:
     """The own rate of an entry, the validation errors by which it was found, and the record of its run from a seed."""
-    place = folder / re.sub(r"[^\w.=-]+", "_", name)
-
-    def job(seed: int, rate: float, share: float) -> Job:
-        part = "" if share == 1 else "search_"
-        return Job(study, name, entry, seed, rate, share, data, place / f"{part}rate_{rate:g}_seed_{seed}")
-
     rates = entry.rates or study.rates
-    errors = {rate: _told(train(job(study.seeds[0], rate, study.search)))["best_valid"] for rate in rates}
+    tried = [Job(study, name, entry, study.seeds[0], rate, study.search, data, folder) for rate in rates]
+    errors = {job.rate: _told(train(job))["best_valid"] for job in tried}
     best = min(rates, key=lambda rate: float("inf") if errors[rate] is None else errors[rate])
     search = {f"{rate:g}": error for rate, error in errors.items()}
-    return best, search, _told(run(job(seed, best, share=1)))
+    return best, search, _told(run(Job(study, name, entry, seed, best, 1, data, folder)))
 
 
 def _told(record: dict[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""One run of a study: its speed is measured, it is trained for the budget, its best checkpoint is evaluated.
+"""The runs of a study: their speeds are measured, each is trained for the budget, its best checkpoint is evaluated.
 
 Each stage leaves a file and is not done again: `speed.json` of the model; `trained.json` and `result.json` of the run.
 What failed leaves none, so it is tried anew the next time.
@@ -9,11 +9,12 @@ from __future__ import annotations
 import json
 import math
 import os
-import statistics
+import re
 import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,13 +26,13 @@ from benchmarks.step_worker import Setup
 from benchmarks.study_plan import Entry, Study
 from benchmarks.training_step import Worker
 
-WARM_UP, STEPS, REPEATS = 5, 10, 5  # training steps before the speed is measured, in a repeat, and repeats
+STEPS, REPEATS = 10, 5  # training steps of a turn, and turns
 FEWEST = 3  # validations, also where rates are compared with a share of the budget
 
 
 @dataclass(frozen=True)
 class Job:
-    """A run: which entry, from which seed, with which rate and share of the budget."""
+    """A run: which entry, from which seed, with which rate and share of the budget; `root` holds the study's runs."""
 
     study: Study
     name: str
@@ -40,7 +41,22 @@ class Job:
     rate: float
     share: float
     data: Path
-    folder: Path
+    root: Path
+
+    @property
+    def place(self) -> Path:
+        """The folder of all runs of the entry."""
+        return self.root / re.sub(r"[^\w.=-]+", "_", self.name)
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the run."""
+        return self.place / f"{'' if self.share == 1 else 'search_'}rate_{self.rate:g}_seed_{self.seed}"
+
+    @property
+    def speed(self) -> Path:
+        """The file with the speed of the entry."""
+        return self.place / "speed.json"
 
     @property
     def settings(self) -> list[str]:
@@ -75,7 +91,7 @@ def _once(file: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 
 
 def _trained(job: Job) -> dict[str, Any]:
-    speed = _once(job.folder.parent / "speed.json", lambda: _speed(job))
+    speed = json.loads(job.speed.read_text(encoding="utf-8"))
     study = job.study
     if study.minutes is not None:
         steps = max(1, round(job.share * 60 * study.minutes / speed["seconds_per_step"]))
@@ -102,19 +118,36 @@ def _measured(job: Job) -> dict[str, Any]:
     return {"measured": json.loads(file.read_text(encoding="utf-8"))}
 
 
-def _speed(job: Job) -> dict[str, Any]:
-    """Seconds a step, without validations and checkpoints, and scenes a step."""
-    entry = job.entry
-    setup = Setup(str(job.data), entry.model, entry.preset, job.settings, str(job.folder.parent))
-    worker = Worker("c", job.study.threads, setup, job.folder.parent / "speed.log")
+def measure_speeds(jobs: list[Job]) -> None:
+    """Measure, in turns, the seconds of a training step of each model, without validations and checkpoints.
+
+    The least of all turns counts: what else the machine does must not give one model more steps than another.
+
+    Raises:
+        ConfigError: a model does not train, with its name and the reason.
+    """
+    missing = [job for job in jobs if not job.speed.exists()]
+    with ExitStack() as stack:
+        workers = []
+        for job in missing:
+            job.place.mkdir(parents=True, exist_ok=True)
+            setup = Setup(str(job.data), job.entry.model, job.entry.preset, job.settings, str(job.place))
+            workers.append(Worker("c", job.study.threads, setup, job.place / "speed.log"))
+            stack.callback(workers[-1].close)
+        turns = []
+        for turn in range(1 + REPEATS):
+            seconds = [_asked(job, worker, "step", STEPS) for job, worker in zip(missing, workers, strict=True)]
+            turns += [seconds] if turn else []  # the first one warms up
+        for job, worker, *seconds in zip(missing, workers, *turns, strict=True):
+            batch = _asked(job, worker, "batch")
+            write_json(job.speed, {"seconds_per_step": min(seconds), "batch": batch})
+
+
+def _asked(job: Job, worker: Worker, *request: Any) -> Any:
     try:
-        worker.ask("step", WARM_UP)
-        seconds = statistics.median(worker.ask("step", STEPS) for _ in range(REPEATS))
-        return {"seconds_per_step": seconds, "batch": worker.ask("batch")}
+        return worker.ask(*request)
     except RuntimeError as error:
         raise ConfigError(f"{job.name}: {error}") from error
-    finally:
-        worker.close()
 
 
 class Stopped(Exception):

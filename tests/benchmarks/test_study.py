@@ -108,6 +108,7 @@ def test_each_model_has_the_rate_of_its_best_validation(monkeypatch, tmp_path, s
 
     monkeypatch.setattr(study, "train", lambda job: record(job, trained))
     monkeypatch.setattr(study, "run", lambda job: record(job, measured))
+    monkeypatch.setattr(study, "measure_speeds", lambda jobs: None)
     plan = Study("x", Data(path="d"), (1e-3, 1e-4), seeds=(5, 6), samples=1, search=search)
     counts = []
     for found in study.conduct(plan, {"a": Entry(), "b": Entry()}, tmp_path, tmp_path, 2):
