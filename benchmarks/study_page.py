@@ -1,4 +1,4 @@
-"""docs/study.md of all studies that have a result, and their curves.
+"""docs/study.md of all studies that have a result, their curves, and what the size of a mesh costs.
 
 `python -m benchmarks.study_page` writes it anew from benchmarks/results.
 """
@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from benchmarks import scaling_page
 from benchmarks.svg import axes_of_picture, save
 
 INTRODUCTION = """# The models compared
@@ -39,6 +40,10 @@ def write_page(results: Path, docs: Path) -> None:
         name = file.stem.removeprefix("study_")
         draw(found, docs / "study" / f"{name}.svg")
         parts.append(section(found, name))
+    if (sizes := results / "scaling.json").exists():
+        found = json.loads(sizes.read_text(encoding="utf-8"))
+        scaling_page.draw(found, docs / "study" / "scaling.svg")
+        parts.append(scaling_page.section(found))
     (docs / "study.md").write_text("\n".join(parts), encoding="utf-8")
 
 

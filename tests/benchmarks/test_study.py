@@ -203,6 +203,24 @@ def page(folder, found, summary) -> None:
     assert (folder / "docs/study/toy.svg").read_text().startswith("<?xml")
 
 
+def size_of(model: str, nodes: int, seconds: float | None) -> dict:
+    found = {"failed": "no memory"} if seconds is None else {"seconds": {"min": seconds}, "peak_resident_bytes": 2e9}
+    return {"model": model, "nodes": nodes, **found}
+
+
+def test_the_page_tells_what_the_size_of_a_mesh_costs(tmp_path):
+    records = [size_of("ast", 1000, 0.5), size_of("mgn", 1000, 2.0), size_of("ast", 2000, 0.75)]
+    records += [size_of("mgn", 2000, None), size_of("ast", 4000, 1.0)]
+    found = {"threads": 2, "memory_limit_bytes": 20e9, "commit": None, "processor": "p", "records": records}
+    (tmp_path / "scaling.json").write_text(json.dumps(found))
+    study_page.write_page(tmp_path, tmp_path / "docs")
+    text = (tmp_path / "docs/study.md").read_text()
+    for line in ("| nodes | AST | MGN |", "| 1,000 | 0.5 | 2 |", "| 2,000 | 0.75 | failed |", "| 4,000 | 1 |  |"):
+        assert line in text
+    assert "| 2,000 | 2 | failed |" in text and "- MGN at 2,000 nodes: no memory" in text
+    assert (tmp_path / "docs/study/scaling.svg").read_text().startswith("<?xml")
+
+
 def run_of(rollout: float | None, milliseconds: float) -> dict:
     summary = {"rollout_all": {"normal": {"rmse_sequence": rollout}}}
     return {
