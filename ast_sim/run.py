@@ -14,6 +14,7 @@ from ast_sim.data.disk import replacing
 from ast_sim.errors import CheckpointError
 from ast_sim.model.simulator import Simulator
 from ast_sim.models import AnyConfig, build_model
+from ast_sim.optimizer import Name as OptimizerName
 
 CONFIG = "config.toml"
 METRICS = "metrics.jsonl"
@@ -31,6 +32,9 @@ class TrainConfig:
     epochs: int = _option(100, "passes over the training pairs, where `steps` is None")
     batch_size: int = _option(48, "scenes (frame pairs) in a batch")
     accumulate: int = _option(1, "batches whose gradients are averaged for one step")
+    optimizer: OptimizerName = _option(
+        "adamw", "adamw, or muon for the matrices inside the model: slower steps of which fewer are needed"
+    )
     peak_rate: float | None = _option(None, "highest learning rate; None: 1e-4 sqrt(scenes per step / 2)")
     warmup: int | None = _option(None, "steps of linear warm-up from 1e-4 of the peak; None: 5 % of all, at most 2000")
     decay: int | None = _option(None, "step where the cosine reaches zero; None: the end, or with epochs one later")

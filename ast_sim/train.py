@@ -177,7 +177,7 @@ class Training:
         self.model = build_model(config.model)
         self.sampler = self._sampler((self.processes.rank, self.processes.count))
         self.ahead = Ahead(self.sampler)
-        self.optimizer = Optimizer(self.model)
+        self.optimizer = Optimizer(self.model, self.options.optimizer)
         self.metrics = Metrics(run)
         self.clock = Clock()
         self.step = 0

@@ -22,6 +22,7 @@ SMALL = [
     f"train.steps={STEPS}", "train.batch_size=2", "train.log_every=7", "train.checkpoint_every=3", "train.keep=2",
     "train.validate_every=30", "train.statistics_pairs=8", "model.hidden=16", "model.decoder_hidden=16",
     "model.d_token=16", "model.heads=1", "model.head_dim=16", "model.ffn_inner=16", "model.L_SA=1", "model.dropout=0.1",
+    "train.optimizer=muon",  # it keeps more than AdamW
 ]  # fmt: skip
 
 
@@ -132,7 +133,7 @@ def test_a_full_disk_is_one_line_and_nothing_is_lost(undisturbed, tmp_path):
         mounted = os.geteuid() == 0 and subprocess.run(mount, capture_output=True).returncode == 0
         if mounted:
             cleanup.callback(subprocess.run, ["umount", str(run.parent)], check=True)
-            (run.parent / "ballast").write_bytes(bytes(300_000))
+            (run.parent / "ballast").write_bytes(bytes(500_000))
             process = start(data, "--out", run, settings=SMALL)
         else:
             # No file system of our own: files may not grow beyond this, which fails likewise when they are written.
