@@ -255,6 +255,8 @@ def draw(found: dict[str, Any], file: Path) -> None:
                     *zip(*points, strict=True), ".-", color=f"C{number_}", linewidth=width, label=None if i else name
                 )
     axes.set(xlabel="training, minutes", ylabel="rollout error on validation scenes, mm", yscale="log")
+    for ticks in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
+        ticks("{x:g}")
     save(figure, axes, file)
 
 
