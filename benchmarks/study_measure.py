@@ -76,6 +76,7 @@ def measure(run: TrainedRun, horizons: int, command: str) -> dict[str, Any]:
     long rollout, by scene) and `farthest` (the largest distance in all of them from the centre of the domain over the
     largest in the truth)."""
     found = evaluate_run(run, "test", command)
+    del found["data"]  # a path of this machine
     errors: dict[str, list[SquaredError]] = {name: [] for name in PHASES}
     diverged, farthest, center = {}, 0.0, np.array(run.dataset.info.domain_center)
     for name, truth, result in long_rollouts(run, horizons):
