@@ -43,26 +43,20 @@ def wide() -> nn.Module:
     return nn.Sequential(nn.Linear(5, 16), nn.Tanh(), nn.Linear(16, 24), nn.Tanh(), nn.Linear(24, 2), nn.LayerNorm(2))
 
 
-def test_muon_is_torchs_on_the_matrices_inside_and_adamw_elsewhere():
+def test_muon_moves_the_matrices_inside_and_adamw_the_rest():
     ours, theirs = wide(), wide()
-    mine = Optimizer(ours, "muon")
-    inside = theirs[2].weight
-    muon = torch.optim.Muon([inside], lr=0.0, weight_decay=0.0, adjust_lr_fn="match_rms_adamw")
-    adam = torch.optim.AdamW([p for p in theirs.parameters() if p is not inside], lr=0.0, weight_decay=0.0)
-    start = inside.detach().clone()
-    for step in range(3):
-        mine.zero_gradient()
-        loss(ours, step).backward()
-        mine.step(1e-2)
-        theirs.zero_grad()
-        loss(theirs, step).backward()
-        for optimizer in (muon, adam):
-            optimizer.param_groups[0]["lr"] = 1e-2
-            optimizer.step()
-        if step == 0:  # later its iteration in bfloat16 makes more of what AdamW rounds otherwise
-            assert torch.equal(ours[2].weight, inside) and (inside - start).norm() > 0.01
-    for a, b in zip(ours.parameters(), theirs.parameters(), strict=True):
-        torch.testing.assert_close(a, b, rtol=0, atol=1e-3)  # three steps of at most 1e-2, to 8 bits
+    mine, adam = Optimizer(ours, "muon"), torch.optim.AdamW(theirs.parameters(), lr=1e-2, weight_decay=0.0)
+    start = ours[2].weight.detach().clone()
+    loss(ours, 0).backward()
+    mine.step(1e-2)
+    loss(theirs, 0).backward()
+    adam.step()
+    for (name, a), b in zip(ours.named_parameters(), theirs.parameters(), strict=True):
+        if name != "2.weight":
+            torch.testing.assert_close(a, b, rtol=0, atol=1e-6)
+    # Its singular values are about 1 (0.7 to 1.2 by the iteration), times the rate and 0.2 sqrt of the longer side.
+    moved = torch.linalg.svdvals((start - ours[2].weight).detach() / (1e-2 * 0.2 * 24**0.5))
+    assert 0.6 < moved[0] < 1.3 and moved[3] > 0.6
 
 
 def test_gradients_add_up_until_they_are_cleared_and_what_has_none_stays():
