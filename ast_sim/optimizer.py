@@ -6,7 +6,7 @@ matrix is its momentum with all singular values set to about 1. What is no matri
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from itertools import compress
 from typing import Literal
 
 import torch
@@ -26,8 +26,9 @@ class Optimizer:
 
     def __init__(self, model: nn.Module, name: Name = "adamw") -> None:
         parameters = list(model.parameters())
-        matrices = [p for p in parameters if name == "muon" and p.dim() == 2 and min(p.shape) >= NARROW]
-        others = [p for p in parameters if not any(p is matrix for matrix in matrices)]
+        inside = [name == "muon" and p.dim() == 2 and min(p.shape) >= NARROW for p in parameters]
+        matrices = list(compress(parameters, inside))
+        others = [p for p, is_inside in zip(parameters, inside, strict=True) if not is_inside]
         self._values, self._gradients = _in_one_array([*others, *matrices])
         rest = sum(p.numel() for p in others)
         self._rest = nn.Parameter(self._values[:rest])
@@ -78,9 +79,8 @@ class Optimizer:
         self._adam.state[self._rest] = state
 
 
-def _in_one_array(parameters: Iterable[nn.Parameter]) -> tuple[Tensor, Tensor]:
+def _in_one_array(parameters: list[nn.Parameter]) -> tuple[Tensor, Tensor]:
     """The values of all parameters, and their gradients, which are zero; the parameters become views of them."""
-    parameters = list(parameters)
     values = torch.cat([p.detach().flatten() for p in parameters])
     gradients = torch.zeros_like(values)
     sizes = [p.numel() for p in parameters]

@@ -175,6 +175,8 @@ def _python(job: Job, words: list[str], log: str) -> tuple[int, int]:
             [sys.executable, *words], env=job.environment(), stdout=out, stderr=out, start_new_session=True
         )
         _running.add(process)
+        if _stopping.is_set():  # since it was asked above: `stop` may not have seen the process
+            process.terminate()
         _, status, usage = os.wait4(process.pid, 0)
         _running.remove(process)
     process.returncode = os.waitstatus_to_exitcode(status)  # so that Popen does not wait for it once more
