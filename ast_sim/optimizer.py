@@ -1,7 +1,6 @@
 """The optimizers, on all parameters of a model as one vector: one norm and one update a step, not one per parameter.
 
-AdamW as in the paper, or Muon (Jordan et al. 2024, kellerjordan.github.io/posts/muon; torch's own): the step of a
-matrix is its momentum with all singular values set to about 1. What is no matrix, and narrow ones, are AdamW's.
+AdamW as in the paper, or Muon; what is no matrix, and narrow ones, are AdamW's then, too.
 """
 
 from __future__ import annotations
@@ -11,6 +10,8 @@ from typing import Literal
 
 import torch
 from torch import Tensor, nn
+
+from ast_sim.muon import Muon
 
 Name = Literal["adamw", "muon"]
 NARROW = 16  # rows or columns: below it a matrix takes inputs in or gives outputs, which AdamW serves better
@@ -27,18 +28,16 @@ class Optimizer:
     def __init__(self, model: nn.Module, name: Name = "adamw") -> None:
         parameters = list(model.parameters())
         inside = [name == "muon" and p.dim() == 2 and min(p.shape) >= NARROW for p in parameters]
-        matrices = list(compress(parameters, inside))
+        matrices = sorted(compress(parameters, inside), key=lambda p: p.shape)  # those of a shape side by side
         others = [p for p, is_inside in zip(parameters, inside, strict=True) if not is_inside]
         self._values, self._gradients = _in_one_array([*others, *matrices])
         rest = sum(p.numel() for p in others)
         self._rest = nn.Parameter(self._values[:rest])
         self._rest.grad = self._gradients[:rest]
         self._adam = torch.optim.AdamW([self._rest], lr=0.0, weight_decay=0.0, fused=True)
-        self._matrices = matrices
         self._muon = None
         if matrices:
-            # Scaled so that the rates of AdamW suit it, too (Liu et al. 2025, arXiv 2502.16982).
-            self._muon = torch.optim.Muon(matrices, lr=0.0, weight_decay=0.0, adjust_lr_fn="match_rms_adamw")
+            self._muon = Muon(self._values[rest:], self._gradients[rest:], [tuple(p.shape) for p in matrices])
 
     @property
     def gradient(self) -> Tensor:
@@ -57,25 +56,21 @@ class Optimizer:
 
     def step(self, rate: float) -> None:
         """Move the parameters against the gradient with this learning rate."""
-        for optimizer in (self._adam, self._muon):
-            if optimizer is not None:
-                optimizer.param_groups[0]["lr"] = rate
-                optimizer.step()
+        self._adam.param_groups[0]["lr"] = rate
+        self._adam.step()
+        if self._muon is not None:
+            self._muon.step(rate)
 
     def state(self) -> dict[str, Tensor]:
         """What a checkpoint needs beside the parameters: moments and the number of steps; empty before the first."""
         state = dict(self._adam.state[self._rest])
-        if state and self._muon is not None:
-            state["momentum"] = torch.cat([self._muon.state[p]["momentum_buffer"].flatten() for p in self._matrices])
-        return state
+        return {**state, "momentum": self._muon.momentum} if state and self._muon is not None else state
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Take up what `state` gave."""
         state = dict(state)
         if self._muon is not None and state:
-            parts = state.pop("momentum").split([p.numel() for p in self._matrices])
-            for matrix, part in zip(self._matrices, parts, strict=True):
-                self._muon.state[matrix] = {"momentum_buffer": part.view_as(matrix).clone()}
+            self._muon.momentum.copy_(state.pop("momentum"))
         self._adam.state[self._rest] = state
 
 

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from ast_sim import checkpoint, config
 from ast_sim.data.disk import replacing
@@ -41,6 +41,9 @@ class TrainConfig:
     clip: float = _option(1.0, "largest norm of the gradient")
     noise: float | None = _option(None, "std of the state noise in units of length; None: 0.45 x rms displacement")
     noise_gamma: float | None = _option(None, "share of the noise that the target undoes; None: 1, and 0.1 if dynamic")
+    mirror: tuple[Literal["x", "y", "z"], ...] = _option(
+        (), "axes along which scenes are mirrored at random: where gravity, fibres or chirality do not forbid it"
+    )
     stress_weight: float = _option(0.01, "weight of the stress in the loss; motion has 1")
     statistics_pairs: int = _option(400, "frame pairs that the input and output scales are taken from")
     seed: int = _option(0, "initial weights, order, noise and dropout follow from it")

@@ -204,6 +204,7 @@ class Training:
             gamma=self.options.noise_gamma,
             part=part,
             from_first=self.config.model.time_conditioned,
+            mirror=self.options.mirror,
         )
 
     def _introduce(self, scales: DataScales) -> None:

@@ -1,9 +1,10 @@
-"""The optimizer on one vector against torch's on a list of parameters."""
+"""The optimizers on one vector against torch's on a list of parameters."""
 
 import pytest
 import torch
 from torch import nn
 
+from ast_sim.muon import Muon, orthogonalized
 from ast_sim.optimizer import Optimizer
 
 
@@ -57,6 +58,53 @@ def test_muon_moves_the_matrices_inside_and_adamw_the_rest():
     # Its singular values are about 1 (0.7 to 1.2 by the iteration), times the rate and 0.2 sqrt of the longer side.
     moved = torch.linalg.svdvals((start - ours[2].weight).detach() / (1e-2 * 0.2 * 24**0.5))
     assert 0.6 < moved[0] < 1.3 and moved[3] > 0.6
+
+
+def steep(k: int, rows: int, columns: int, dtype=torch.float32) -> torch.Tensor:
+    """Matrices whose singular values fall from 1 to 0.01, times 10."""
+    generator = torch.Generator().manual_seed(rows)
+    u, _, v = torch.linalg.svd(
+        torch.randn(k, rows, columns, generator=generator, dtype=torch.float64), full_matrices=False
+    )
+    return (u * torch.logspace(1, -1, min(rows, columns), dtype=torch.float64) @ v).to(dtype)
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(16, 16), (16, 40), (40, 16)])
+def test_all_singular_values_become_about_one_and_directions_stay(rows, columns):
+    x = steep(3, rows, columns)
+    u, _, v = torch.linalg.svd(x.double(), full_matrices=False)
+    in_its_directions = u.mT @ orthogonalized(x).double() @ v.mT
+    singular = in_its_directions.diagonal(dim1=1, dim2=2)
+    assert singular.min() > 0.67 and singular.max() < 1.22
+    torch.testing.assert_close(in_its_directions, torch.diag_embed(singular), rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-25, 1e25])
+def test_the_size_of_a_gradient_does_not_matter_and_none_gives_none(value):
+    x = value * steep(2, 16, 24)
+    expected = orthogonalized(steep(2, 16, 24)) if value else torch.zeros(2, 16, 24)
+    torch.testing.assert_close(orthogonalized(x), expected, rtol=0, atol=1e-3)
+
+
+def test_muon_takes_the_steps_of_torch():
+    """On gradients whose singular values stand out of the rounding of bfloat16, in which torch's iterates."""
+    values, generator = torch.zeros(2 * 16 * 24 + 24 * 16), torch.Generator().manual_seed(0)
+    shapes = [(16, 24), (16, 24), (24, 16)]
+    theirs = [torch.nn.Parameter(torch.zeros(shape)) for shape in shapes]
+    gradients = torch.zeros_like(values)
+    mine, torchs = Muon(values, gradients, shapes), torch.optim.Muon(
+        theirs, lr=1e-2, weight_decay=0.0, adjust_lr_fn="match_rms_adamw"
+    )  # fmt: skip
+    for _ in range(5):
+        parts = [torch.linalg.qr(torch.randn(24, 16, generator=generator))[0] for _ in shapes]
+        parts = [part if shape == (24, 16) else part.mT for part, shape in zip(parts, shapes, strict=True)]
+        gradients.copy_(torch.cat([part.flatten() for part in parts]))
+        for parameter, part in zip(theirs, parts, strict=True):
+            parameter.grad = part.clone()
+        mine.step(1e-2)
+        torchs.step()
+    moved = torch.cat([parameter.detach().flatten() for parameter in theirs])
+    assert (values - moved).norm() < 0.02 * moved.norm()
 
 
 def test_gradients_add_up_until_they_are_cleared_and_what_has_none_stays():

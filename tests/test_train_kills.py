@@ -22,7 +22,7 @@ SMALL = [
     f"train.steps={STEPS}", "train.batch_size=2", "train.log_every=7", "train.checkpoint_every=3", "train.keep=2",
     "train.validate_every=30", "train.statistics_pairs=8", "model.hidden=16", "model.decoder_hidden=16",
     "model.d_token=16", "model.heads=1", "model.head_dim=16", "model.ffn_inner=16", "model.L_SA=1", "model.dropout=0.1",
-    "train.optimizer=muon",  # whose momenta are kept beside the moments of AdamW
+    "train.mirror=x,y", "train.optimizer=muon",  # whose momenta are kept beside the moments of AdamW
 ]  # fmt: skip
 
 

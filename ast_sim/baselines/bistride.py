@@ -19,7 +19,7 @@ Legend: N nodes of a mesh, C of them kept, M edges, P edges of a pooling, L leve
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate
 
 import numpy as np
@@ -29,6 +29,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from torch import Tensor
 
 from ast_sim.data.graph import edge_vectors
+from ast_sim.data.mirror import Mirror
 from ast_sim.ops.edges import EdgeSet, offsets_of
 from ast_sim.ops.segment import segment_sum
 
@@ -106,6 +107,12 @@ class Hierarchy:
             rest_edges=tuple(torch.cat(level) for level in zip(*(p.rest_edges for p in parts), strict=True)),
             poolings=tuple(_concatenate(level) for level in zip(*(p.poolings for p in parts), strict=True)),
             component=torch.cat([part.component + shift for part, shift in zip(parts, shifts, strict=False)]),
+        )
+
+    def mirrored(self, mirror: Mirror) -> Hierarchy:
+        """That of the mirror image, which has the same distances and so the same coarser meshes."""
+        return replace(
+            self, rest_edges=tuple(torch.from_numpy(mirror.vectors(level.numpy())) for level in self.rest_edges)
         )
 
     def between_components(self, contacts: EdgeSet) -> EdgeSet:

@@ -6,7 +6,7 @@ Legend: N nodes, E elements of k nodes, M edges, B scenes; a batch is the concat
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate
 from typing import Any, Protocol
@@ -14,16 +14,20 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from ast_sim.data.mirror import Mirror
 from ast_sim.data.scene import NodeType, Scene
 from ast_sim.ops.edges import EdgeSet
 
 
-class Concatenable(Protocol):
+class Own(Protocol):
     """What a model adds to the graph of a scene; like the graph, that of a batch is the concatenation of its scenes."""
 
     @staticmethod
     def concatenate(parts: Sequence[Any]) -> Any:
         """Those of several scenes as one."""
+
+    def mirrored(self, mirror: Mirror) -> Any:
+        """That of the mirror image of the scene."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +66,7 @@ class Graph:
     body: Tensor | None = None
     surface: Tensor | None = None
     surface_offsets: Tensor | None = None
-    own: Concatenable | None = None
+    own: Own | None = None
 
     @staticmethod
     def from_scene(scene: Scene, element_nodes: bool, surface: bool = False) -> Graph:
@@ -121,6 +125,19 @@ class Graph:
             rest_edges=torch.cat([g.rest_edges for g in graphs]),
             **({} if graphs[0].surface is None else _join_surfaces(graphs, nodes)),
             own=None if graphs[0].own is None else graphs[0].own.concatenate([g.own for g in graphs]),
+        )
+
+    def mirrored(self, mirror: Mirror) -> Graph:
+        """The graph of the mirror image of a scene: the same nodes and edges elsewhere."""
+        if mirror.is_identity:
+            return self
+        surface = self.surface
+        return replace(
+            self,
+            rest_position=torch.from_numpy(mirror.points(self.rest_position.numpy())),
+            rest_edges=torch.from_numpy(mirror.vectors(self.rest_edges.numpy())),
+            surface=None if surface is None else torch.from_numpy(mirror.triangles(surface.numpy())),
+            own=None if self.own is None else self.own.mirrored(mirror),
         )
 
     @property

@@ -13,11 +13,12 @@ from torch import Tensor
 from ast_sim.data.batch import Batch, Target
 from ast_sim.data.file import Dataset
 from ast_sim.data.graph import Graph
+from ast_sim.data.mirror import Mirror
 from ast_sim.data.scene import Scene
 from ast_sim.errors import DatasetError
 
-# Separate the random numbers of the order from those of the noise.
-_ORDER, _NOISE = 0, 1
+# Separate the random numbers of the order from those of the noise and of the mirroring.
+_ORDER, _NOISE, _MIRROR = 0, 1, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,11 +26,13 @@ class _Member:
     """A trajectory: what its pairs share.
 
     noisy: [N, 3] float32, 1 where noise acts (NORMAL nodes; not z in a plane scene), else 0.
+    center: [3] float32, the middle of the box that holds the scene at rest.
     """
 
     graph: Graph
     noisy: np.ndarray
     prescribed: np.ndarray
+    center: np.ndarray
 
 
 class PairSampler:
@@ -45,6 +48,9 @@ class PairSampler:
         acceleration  p_{t+1} - 2 p_t + p_{t-1} - (1 + gamma) n
 
     and gamma = 1 leads back to the true next position. Scenes whose z is 0 throughout get no noise in z.
+
+    Each pair is mirrored along each axis of `mirror` with probability 1/2, at planes through the middle of the scene at
+    rest: a function of seed, epoch and pair, too.
 
     With `part` = (i, n) a batch is the i-th of n equal parts of the one that it would be.
 
@@ -65,12 +71,14 @@ class PairSampler:
         gamma: float,
         part: tuple[int, int] = (0, 1),
         from_first: bool = False,
+        mirror: tuple[str, ...] = (),
     ) -> None:
         self._dataset, self._split, self._batch_size, self._seed = dataset, split, batch_size, seed
         self._noise, self._make_graph, self._dynamic, self._gamma = noise, make_graph, dynamic, gamma
         self._part = part
         self._first = 1 if dynamic else 0  # the acceleration needs a frame before t
         self._from_first = from_first
+        self._mirrored = np.array([axis in mirror for axis in "xyz"])
         frames = np.array([dataset.num_frames(split, i) for i in range(dataset.count(split))], np.int64)
         self._starts = np.concatenate([[0], np.cumsum(np.maximum(frames - 1 - self._first, 0))])
         if self.num_pairs == 0:
@@ -98,7 +106,7 @@ class PairSampler:
 
     def _assemble(self, pairs: list[tuple[int, int]]) -> tuple[Batch, Target]:
         """The batch of the pairs (epoch, number)."""
-        members, names, positions, previous, boundary, motions = [], [], [], [], [], []
+        graphs, names, positions, previous, boundary, motions = [], [], [], [], [], []
         stresses, next_stresses, numbers = [], [], []
         for epoch, pair in pairs:
             index = int(np.searchsorted(self._starts, pair, side="right")) - 1
@@ -108,20 +116,21 @@ class PairSampler:
             before, now, after = position[0], position[-2], position[-1]
             increment = after - now
             noise = self._draw_noise(epoch, pair, member)
-            members.append(member)
+            mirror = self._draw_mirror(epoch, pair, member)
+            graphs.append(member.graph.mirrored(mirror))
             names.append(f"{self._split}/{index:06d} frame {t}")
             numbers.append(t + 1.0)
-            positions.append(now + noise)
-            boundary.append(np.where(member.prescribed, increment, np.float32(0)))
+            positions.append(mirror.points(now + noise))
+            boundary.append(mirror.vectors(np.where(member.prescribed, increment, np.float32(0))))
+            motion = increment - np.float32(self._gamma) * noise
             if self._dynamic:
-                previous.append(before)
-                motions.append(increment - (now - before) - np.float32(1 + self._gamma) * noise)
-            else:
-                motions.append(increment - np.float32(self._gamma) * noise)
+                previous.append(mirror.points(before))
+                motion -= now - before + noise
+            motions.append(mirror.vectors(motion))
             if stress is not None:
                 stresses.append(stress[-2])
                 next_stresses.append(stress[-1])
-        graph = Graph.concatenate([member.graph for member in members])
+        graph = Graph.concatenate(graphs)
         state = (_join(positions), _join(previous), _join(boundary), _join(stresses))
         return Batch(graph, *state, names, torch.tensor(numbers)), Target(_join(motions), _join(next_stresses))
 
@@ -138,6 +147,10 @@ class PairSampler:
         noise = generator.standard_normal(member.noisy.shape, np.float32)
         return noise * (np.float32(self._noise) * member.noisy)
 
+    def _draw_mirror(self, epoch: int, pair: int, member: _Member) -> Mirror:
+        drawn = np.random.default_rng([self._seed, _MIRROR, epoch, pair]).integers(2, size=3, dtype=bool)
+        return Mirror(np.where(drawn & self._mirrored, np.float32(-1), np.float32(1)), member.center)
+
     def _member(self, index: int) -> _Member:
         if index not in self._members:
             scene = self._dataset.scene(self._split, index)
@@ -146,7 +159,8 @@ class PairSampler:
             if not scene.rest_position[:, 2].any() and not position[:, :, 2].any():
                 noisy[:, 2] = 0
             graph = self._make_graph(scene)
-            self._members[index] = _Member(graph, noisy, scene.prescribed[:, None])
+            center = (scene.rest_position.min(0) + scene.rest_position.max(0)) / 2
+            self._members[index] = _Member(graph, noisy, scene.prescribed[:, None], center)
         return self._members[index]
 
 

@@ -8,6 +8,7 @@ from scipy.sparse import csr_array
 
 from ast_sim.baselines.bistride import Hierarchy, build_hierarchy, select
 from ast_sim.data.graph import Graph, edge_vectors
+from ast_sim.data.mirror import Mirror
 from ast_sim.ops.edges import EdgeSet
 
 PATH = [(0, 1), (1, 2), (2, 3), (3, 4)]
@@ -211,6 +212,19 @@ def test_it_is_the_same_every_time():
         assert torch.equal(a.kept, b.kept) and torch.equal(a.weight, b.weight)
     for a, b in zip(first.edges, second.edges, strict=True):
         assert torch.equal(a.senders, b.senders) and torch.equal(a.receivers, b.receivers)
+
+
+@pytest.mark.parametrize("pooled", [True, False])
+def test_that_of_a_mirror_image_is_the_same_with_mirrored_edges(pooled):
+    graph = meshes()[0]
+    mirror = Mirror(np.float32([-1, 1, -1]), np.float32([0.25, 0, 0.5]))
+    there = torch.from_numpy(mirror.points(graph.rest_position.numpy()))
+    found = build_hierarchy(graph.m2m, graph.rest_position, 2, pooled, graph.m2m).mirrored(mirror)
+    expected = build_hierarchy(graph.m2m, there, 2, pooled, graph.m2m)
+    for level in range(3):
+        assert torch.equal(found.edges[level].senders, expected.edges[level].senders)
+        torch.testing.assert_close(found.rest_edges[level], expected.rest_edges[level], rtol=0, atol=1e-6)
+        assert not torch.allclose(found.rest_edges[level][:, 0], -expected.rest_edges[level][:, 0])
 
 
 def test_pooling_and_unpooling_are_the_gradients_of_each_other():

@@ -3,11 +3,13 @@
 import dataclasses
 
 import numpy as np
+import pytest
 import torch
 from data_samples import block
 from meshes import two_tetrahedra
 
 from ast_sim.data.graph import Graph
+from ast_sim.data.mirror import Mirror
 from ast_sim.ops.edges import EdgeSet
 
 
@@ -82,3 +84,22 @@ def test_batches_of_batches_are_batches():
             assert other is None
         else:
             assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("element_nodes", [True, False])
+@pytest.mark.parametrize("sign", [(-1, 1, 1), (-1, 1, -1), (-1, -1, -1), (1, 1, 1)])
+def test_the_graph_of_a_mirror_image(sign, element_nodes):
+    scene = block(2, 1, 1)
+    mirror = Mirror(np.float32(sign), np.float32([1, 0.5, 0.25]))
+    found = Graph.from_scene(scene, element_nodes, surface=True).mirrored(mirror)
+    # The tetrahedra of an odd reflection are inside out, which the edges do not feel.
+    rest = scene.rest_position.copy()
+    for axis in range(3):
+        if sign[axis] < 0:
+            rest[:, axis] = 2 * mirror.center[axis] - rest[:, axis]
+    expected = Graph.from_scene(dataclasses.replace(scene, rest_position=rest), element_nodes)
+    assert torch.equal(found.rest_position, expected.rest_position)
+    torch.testing.assert_close(found.rest_edges, expected.rest_edges, rtol=0, atol=1e-6)
+    corners = found.rest_position.double()[found.surface]
+    volume = torch.linalg.det(corners).sum() / 6  # by the divergence theorem, positive if seen from outside
+    torch.testing.assert_close(volume, torch.tensor(2.0, dtype=torch.float64))

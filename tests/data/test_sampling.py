@@ -201,6 +201,67 @@ def test_what_a_batch_holds_is_its_own(dataset):
     assert not (dataset.load("train", 0).position == 7).any()
 
 
+def mirror_of(dataset, name: str, nodes: slice, batch) -> np.ndarray:
+    """[3]: the signs of the mirroring of a scene, found in its rest positions."""
+    rest = dataset.load("train", frame_of(name)[0]).scene.rest_position
+    middle = (rest.min(0) + rest.max(0)) / 2
+    there = batch.graph.rest_position[nodes].numpy()
+    signs = np.where((there == rest).all(0), 1, -1)
+    assert np.allclose(there, middle + signs * (rest - middle), rtol=0, atol=1e-6)
+    return signs
+
+
+@pytest.mark.parametrize("dynamic", [False, True])
+def test_a_mirrored_pair_is_the_mirror_image_of_the_pair(dataset, dynamic):
+    options = {"noise": 0.02, "dynamic": dynamic, "gamma": 0.3, "batch_size": 5 if dynamic else 8}
+    drawn = set()
+    for step in range(8):
+        plain, aim = sampler(dataset, **options).batch(step)
+        batch, target = sampler(dataset, mirror=("x", "z"), **options).batch(step)
+        assert batch.names == plain.names
+        for name, nodes in parts(batch):
+            signs = mirror_of(dataset, name, nodes, batch)
+            rest, moved = plain.graph.rest_position[nodes], batch.graph.rest_position[nodes]
+            s = torch.from_numpy(signs).float()
+            torch.testing.assert_close(
+                batch.position[nodes] - moved, s * (plain.position[nodes] - rest), rtol=0, atol=1e-6
+            )
+            assert torch.equal(batch.boundary_motion[nodes], s * plain.boundary_motion[nodes])
+            assert torch.equal(target.motion[nodes], s * aim.motion[nodes])
+            if dynamic:
+                torch.testing.assert_close(
+                    batch.previous_position[nodes] - moved,
+                    s * (plain.previous_position[nodes] - rest), rtol=0, atol=1e-6,
+                )  # fmt: skip
+            drawn.add(tuple(signs))
+        assert torch.equal(batch.stress, plain.stress) and torch.equal(target.stress, aim.stress)
+    assert drawn == {(1, 1, 1), (-1, 1, 1), (1, 1, -1), (-1, 1, -1)}
+
+
+def test_the_mirroring_of_a_pair_does_not_depend_on_its_batch(dataset):
+    options = {"mirror": ("x", "y", "z"), "noise": 0.02}
+    one, large = sampler(dataset, batch_size=1, **options), sampler(dataset, batch_size=8, **options)
+    batch, target = large.batch(1)
+    for step, (name, nodes) in enumerate(parts(batch), start=8):
+        alone, aim = one.batch(step)
+        assert alone.names == [name]
+        assert torch.equal(alone.position, batch.position[nodes]) and torch.equal(aim.motion, target.motion[nodes])
+        assert torch.equal(alone.graph.rest_position, batch.graph.rest_position[nodes])
+
+
+def test_half_of_the_pairs_are_mirrored_along_an_axis(dataset):
+    draws = sampler(dataset, mirror=("y",), batch_size=8)
+    signs = np.array([
+        [mirror_of(dataset, name, nodes, batch) for name, nodes in parts(batch)]
+        for batch, _ in map(draws.batch, range(50))
+    ])  # fmt: skip
+    assert (signs[:, :, [0, 2]] == 1).all()
+    mirrored = signs[:, :, 1] == -1
+    assert abs(mirrored.sum() - 200) < 4 * 10  # 400 fair draws: a standard deviation of 10
+    # Eight draws agree in one of 128 batches.
+    assert sum(of_batch.all() or not of_batch.any() for of_batch in mirrored) <= 5
+
+
 def test_a_plane_scene_keeps_its_plane(tmp_path):
     scene = Scene(
         rest_position=np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32),
