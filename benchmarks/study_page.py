@@ -48,7 +48,7 @@ def write_page(results: Path, docs: Path) -> None:
 
 
 def section(found: dict[str, Any], name: str) -> str:
-    """One study: what it is, who is ahead, errors, errors by phase, cost, learning rates."""
+    """One study: what it is, who is ahead, errors, errors by phase, cost, learning rates, settings."""
     study, models = found["study"], found["models"]
     budget = f"{study['minutes']:g} minutes" if study["minutes"] is not None else f"{study['samples']:,} frame pairs"
     seeds = sorted({run["seed"] for model in models.values() for run in model["runs"]})
@@ -61,7 +61,15 @@ def section(found: dict[str, Any], name: str) -> str:
     lines += [*verdict(models), *table(models, ERRORS), "", *trivial(models), ""]
     if any(measured(run).get("phases") for model in models.values() for run in model["runs"]):
         lines += ["Error by phase of contact, full rollout, mm (`rmse_sequence`):", "", *table(models, BY_PHASE), ""]
-    lines += [*table(models, COST), "", *rates(study, models), "", *divergences(models, study["horizons"]), ""]
+    lines += [
+        *table(models, COST),
+        "",
+        *rates(study, models),
+        "",
+        *own_settings(study, models),
+        *divergences(models, study["horizons"]),
+        "",
+    ]
     lines += [f"![Validation error over training time](study/{name}.svg)", ""]
     return "\n".join(lines)
 
@@ -148,9 +156,20 @@ def verdict(models: dict[str, Any]) -> list[str]:
     if "MGN" in models:
         times = [_mean(models[name]["runs"], COST["ms a frame pair"]) for name in ("AST", "MGN")]
         text += f"; its training takes {number(times[0] / times[1])} of MGN's time per frame pair"
-    ahead = [name for name, error in errors.items() if error is not None and error < errors["AST"]]
-    text += f". Better than AST: {', '.join(ahead)}." if ahead else ". No other row has a smaller error."
+    ahead = [
+        f"{name} ({number(error / errors[best])})"
+        for name, error in errors.items()
+        if error is not None and error < errors["AST"]
+    ]
+    text += f". Better than AST: {'; '.join(ahead)}." if ahead else ". No other row has a smaller error."
     return [text, ""]
+
+
+def own_settings(study: dict[str, Any], models: dict[str, Any]) -> list[str]:
+    """What was set beyond the presets: in all runs, then in those of a row."""
+    rows = [("all", study["settings"]), *((name, model["settings"]) for name, model in models.items())]
+    told = [f"{name}: `{' '.join(settings)}`" for name, settings in rows if settings]
+    return [f"Set beyond the presets. {'; '.join(told)}.", ""] if told else []
 
 
 def _mean(runs: list[Run], value: Callable[[Run], Any]) -> float | None:

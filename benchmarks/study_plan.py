@@ -4,6 +4,7 @@ title = "Plates, 10 minutes"
 minutes = 10             # of training a run, on `threads`; or samples = 40000, as many frame pairs for every run
 rates = [2e-4, 5e-4, 1e-3]
 seeds = [0, 1]
+settings = ["train.mirror=x,y"]  # of every run
 
 [data]
 family = "deforming_plate"
@@ -41,7 +42,7 @@ class Data:
 
 @dataclass(frozen=True)
 class Entry:
-    """A row of the tables: a model with a preset and settings; `rates` in place of the study's."""
+    """A row of the tables: a model with a preset and settings beyond the study's; `rates` in place of the study's."""
 
     model: str = "ast"
     preset: str = "tiny"
@@ -61,6 +62,7 @@ class Study:
         minutes: of training of each run, or
         samples: frame pairs that each run sees.
         search: share of the budget with which the rates are compared; 1: the best of these runs is the first one.
+        settings: of every run, beyond its preset.
         validations: rollouts of the validation scenes during a training; the checkpoint of the best is evaluated.
         horizons: test scenes are rolled out for so many times their length.
     """
@@ -73,6 +75,7 @@ class Study:
     samples: int | None = None
     search: float = 1.0
     threads: int = 1
+    settings: tuple[str, ...] = ()
     validations: int = 10
     horizons: int = 10
     about: str = ""

@@ -61,7 +61,7 @@ class Job:
     @property
     def settings(self) -> list[str]:
         """What is set beyond the preset, the steps excepted."""
-        return [*self.entry.settings, f"train.seed={self.seed}", f"train.peak_rate={self.rate}"]
+        return [*self.study.settings, *self.entry.settings, f"train.seed={self.seed}", f"train.peak_rate={self.rate}"]
 
     def environment(self) -> dict[str, str]:
         threads = str(self.study.threads)

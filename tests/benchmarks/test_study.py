@@ -16,6 +16,7 @@ from toy import one_thread  # noqa: F401
 from ast_sim.data.scene import Trajectory
 from ast_sim.errors import ConfigError
 from ast_sim.rollout import Rollout
+from ast_sim.run import read_config
 from ast_sim.simulate.checkpoint import Checkpoint
 from benchmarks import increments, study, study_page
 from benchmarks.study_measure import phase_errors, phases, repeated
@@ -27,10 +28,11 @@ samples = 16
 rates = [1e-3]
 validations = 2
 horizons = 3
+settings = ["train.statistics_pairs=4"]
 [data]
 path = "toy.h5"
 [models.ast]
-settings = ["model.hidden=16", "model.L_SA=1", "model.L_cell=3", "train.statistics_pairs=4"]
+settings = ["model.hidden=16", "model.L_SA=1", "model.L_cell=3"]
 """
 
 
@@ -42,7 +44,8 @@ def written(folder, text: str):
 
 def test_the_file_says_what_is_compared(tmp_path):
     plan, entries = read(written(tmp_path, TOML + '[models.other]\nmodel = "mgn"\nrates = [1e-4, 2e-4]'))
-    assert plan == Study("Toy", Data(path="toy.h5"), (1e-3,), samples=16, validations=2, horizons=3)
+    common = ("train.statistics_pairs=4",)
+    assert plan == Study("Toy", Data(path="toy.h5"), (1e-3,), samples=16, validations=2, horizons=3, settings=common)
     assert list(entries) == ["ast", "other"] and entries["other"] == Entry("mgn", rates=(1e-4, 2e-4))
 
 
@@ -55,7 +58,7 @@ def test_the_file_says_what_is_compared(tmp_path):
         ("title", "titel", "no setting titel; the nearest is title"),
         ('path = "toy.h5"', 'path = "toy.h5"\nfamily = "abcd"', "either|family"),
         ("[models.ast]", "[modles.ast]", "nothing to compare"),
-        ("settings = [", "setings = [", "no setting setings; the nearest is settings"),
+        ('settings = ["m', 'setings = ["m', "no setting setings; the nearest is settings"),
         ("[data]", "[data", "toy.toml: "),
     ],
 )
@@ -142,6 +145,8 @@ def test_a_small_study_from_end_to_end(tmp_path):
     folders = tmp_path / "runs/ast"
     assert {path.name for path in folders.glob("rate*")} == {"rate_0.001_seed_0", "rate_0.0001_seed_0"}
     (result,) = folders.glob("*/result.json")
+    config = read_config(result.parent / "run")
+    assert config.train.statistics_pairs == 4 and config.model.hidden == 16  # the study's, and the entry's
     # Again: nothing is trained, the same record is read.
     before = result.stat().st_mtime_ns
     assert conducted(ast=entries["ast"]) == found and result.stat().st_mtime_ns == before
@@ -190,7 +195,7 @@ def test_a_failure_is_tried_anew(tmp_path, monkeypatch):
 def page(folder, found, summary) -> None:
     """The document has the figure, and the picture that it names."""
     values = {"title": "Toy", "about": "", "minutes": None, "samples": 16, "threads": 1, "seeds": [0, 1], "horizons": 3}
-    values |= {"search": 1.0}
+    values |= {"search": 1.0, "settings": ["train.statistics_pairs=4"]}
     values["data"] = {"nodes": None, "frames": None}
     scenes = {"name": "toy.h5", "train": 3, "valid": 2, "test": 2}
     result = {"commit": None, "processor": "p", "study": values, "scenes": scenes, "models": found}
@@ -198,6 +203,7 @@ def page(folder, found, summary) -> None:
     study_page.write_page(folder, folder / "docs")
     text = (folder / "docs/study.md").read_text()
     assert f"{1e3 * summary:.3g}" in text and "every model stays finite" in text and "16 frame pairs" in text
+    assert "all: `train.statistics_pairs=4`; ast: `model.hidden=16 model.L_SA=1 model.L_cell=3`." in text
     assert "seeds 0; " in text  # not those that are still to come
     assert "by learning rate; the best in bold:\n\n| model | 0.001 | 0.0001 |\n| --- | ---: | ---: |\n| ast |" in text
     assert (folder / "docs/study/toy.svg").read_text().startswith("<?xml")
@@ -241,7 +247,7 @@ def test_the_verdict_names_the_best_baseline_and_who_is_better():
     }
     (text, _) = study_page.verdict(models)
     assert "0.6 of that of the best baseline, BSMS" in text and "0.5, not reached" in text
-    assert "0.25 of MGN's time" in text and text.endswith("Better than AST: AST, other.")
+    assert "0.25 of MGN's time" in text and text.endswith("Better than AST: AST, other (0.48).")
     models["AST"]["runs"] = [run_of(1e-3, 5.0)]
     (text, _) = study_page.verdict(models)
     assert "0.4 of that of" in text and "0.5, reached" in text and text.endswith("No other row has a smaller error.")
