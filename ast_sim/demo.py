@@ -54,7 +54,8 @@ def demo(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
     generate(FAMILY, data, counts, seed=seed, nodes=NODES, frames=FRAMES)
 
     _announce(2, "training")
-    settings = [f"train.steps={size.steps}", f"train.seed={seed}"]
+    # Plates know no left and right, and none is turned over.
+    settings = [f"train.steps={size.steps}", f"train.seed={seed}", "train.mirror=x,y"]
     train(run_folder, configure(data, "tiny", settings), resume=True)
 
     with open_run(run_folder, data) as run:

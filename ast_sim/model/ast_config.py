@@ -88,9 +88,9 @@ PRESETS = {
     "tiny": Preset(
         ASTConfig(
             hidden=64, decoder_hidden=64, d_token=64, heads=4, head_dim=32, ffn_inner=128, L_SA=4, num_tokens=128,
-            dropout=0.0, L_cell=None, element_inputs=(), edge_strain=True,
+            dropout=0.0, L_cell=None, element_inputs=(), edge_strain=True, factorized=False,
         ),
-        {"batch_size": 4, "peak_rate": 5e-4, "stress_weight": 0.1},
+        {"batch_size": 4, "optimizer": "muon", "peak_rate": 1e-3, "stress_weight": 0.1},
         adapts=True,
     ),
     "deforming_plate": Preset(ASTConfig(), _PAPER),
