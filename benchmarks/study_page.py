@@ -18,12 +18,12 @@ from benchmarks.svg import axes_of_picture, save
 INTRODUCTION = """# The models compared
 
 Made by `python -m benchmarks.study STUDY.toml`; the studies lie in `benchmarks/studies`. All runs of a study have the
-same scenes, splits, state noise and budget; each model has the learning rate of those tried with which its rollouts of
-the validation scenes are best, and the checkpoint that is evaluated is chosen by such rollouts, too. Errors are those
-of the test scenes, on nodes that the model moves: root mean squares over coordinates, by sequence (`rmse_sequence`, as
-in the AST paper) or pooled over everything (`rmse_pooled`, as in MeshGraphNets); means over the seeds, with the least
-and the largest in brackets. A time-conditioned model predicts every frame from the first: it has no error of one step,
-and its first 50 frames are no easier than the others.
+same scenes, splits, state noise and budget, and the same training but for what is said to be set otherwise; each has
+the learning rate of those tried with which its rollouts of the validation scenes are best, and the checkpoint that is
+evaluated is chosen by such rollouts, too. Errors are those of the test scenes, on nodes that the model moves: root mean
+squares over coordinates, by sequence (`rmse_sequence`, as in the AST paper) or pooled over everything (`rmse_pooled`,
+as in MeshGraphNets); means over the seeds, with the least and the largest in brackets. A time-conditioned model
+predicts every frame from the first: it has no error of one step, and its first 50 frames are no easier than the others.
 """
 
 AIM = 0.5  # AST's rollout error over that of the best baseline; the paper reports 0.38 on deforming_plate
