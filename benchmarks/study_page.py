@@ -183,7 +183,7 @@ def rates(study: dict[str, Any], models: dict[str, Any]) -> list[str]:
     if all(len(model["search"]) == 1 for model in models.values()):
         return []
     share = "" if study["search"] == 1 else f" with {100 * study['search']:g} % of the budget"
-    tried = list(dict.fromkeys(rate for model in models.values() for rate in model["search"]))
+    tried = sorted({rate for model in models.values() for rate in model["search"]}, key=float)
     lines = [f"Rollout error on the validation scenes, mm, by learning rate{share}; the best in bold:", ""]
     lines += [f"| model | {' | '.join(tried)} |", f"| --- |{' ---: |' * len(tried)}"]
     for name, model in models.items():

@@ -205,7 +205,7 @@ def page(folder, found, summary) -> None:
     assert f"{1e3 * summary:.3g}" in text and "every model stays finite" in text and "16 frame pairs" in text
     assert "all: `train.statistics_pairs=4`; ast: `model.hidden=16 model.L_SA=1 model.L_cell=3`." in text
     assert "seeds 0; " in text  # not those that are still to come
-    assert "by learning rate; the best in bold:\n\n| model | 0.001 | 0.0001 |\n| --- | ---: | ---: |\n| ast |" in text
+    assert "by learning rate; the best in bold:\n\n| model | 0.0001 | 0.001 |\n| --- | ---: | ---: |\n| ast |" in text
     assert (folder / "docs/study/toy.svg").read_text().startswith("<?xml")
 
 
