@@ -42,6 +42,7 @@ class AST(Simulator):
             self.e2m = self._message_passing("e2m", self.edge_inputs.width)
         else:
             self.m2m = self._message_passing("m2m", self.edge_inputs.width)
+        self.before_cells, self.after_cells = self._mesh_steps(), self._mesh_steps()
         self.m2c = self._message_passing("m2c")
         self.c2m = self._message_passing("c2m")
         self.down = nn.ModuleList(SparseConv(width, up=False) for _ in range(c.l_ocnn))
@@ -59,6 +60,12 @@ class AST(Simulator):
 
     def _message_passing(self, name: str, edge_inputs: int = 0) -> MessagePassing:
         return MessagePassing(self.config.hidden, edge_inputs, name in self.config.residual, self.config.factorized)
+
+    def _mesh_steps(self) -> nn.ModuleList:
+        c = self.config
+        return nn.ModuleList(
+            MessagePassing(c.hidden, self.edge_inputs.width, True, c.factorized) for _ in range(c.mesh_steps)
+        )
 
     def graph(self, scene: Scene) -> Graph:
         """See `Simulator`; with element inputs elements are nodes of their own."""
@@ -86,10 +93,14 @@ class AST(Simulator):
             mesh = self.e2m(edges, elements, encoded, edge_features)
         else:
             mesh = self.m2m(edges, encoded, encoded, edge_features)
+        for step in self.before_cells:
+            mesh = step(edges, mesh, mesh, edge_features)
 
         now = inputs.present(self.config, batch)
         cells = build_cells(self.config, now, batch.graph.node_offsets, may_grow=not self.training)
         mesh = self.c2m(cells.to_mesh(), self._through_cells(cells, mesh), mesh)
+        for step in self.after_cells:
+            mesh = step(edges, mesh, mesh, edge_features)
 
         out = self.decoder(mesh, beside=encoded)
         stress = out[:, 3:] if self.config.stress == "node" else None

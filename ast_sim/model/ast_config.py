@@ -25,6 +25,7 @@ class ASTConfig(TimeConditionedConfig):
     L_SA: int = setting(12, "self-attention blocks on the tokens")
     num_tokens: int = setting(512, "tokens at most; a scene with fewer cells takes them all")
     dropout: float = setting(0.1, "dropout on attention weights and feed-forward outputs")
+    mesh_steps: int = setting(0, "more message passings on the mesh, so many before the cells and so many after them")
     L_cell: int | None = setting(5, "octree level of the cells; unset: cells of about `cell_spacings` mesh spacings")
     cell_spacings: float = setting(1.5, "cell side in mesh spacings where L_cell is unset")
     l_ocnn: int = setting(0, "levels that sparse convolutions coarsen the cells by before they become tokens")
@@ -42,6 +43,10 @@ class ASTConfig(TimeConditionedConfig):
             raise ConfigError("model.element_inputs: stress needs a dataset with stress on elements")
         if self.stress == "element" and not self.element_inputs:
             raise ConfigError("model.element_inputs: a stress on elements needs element nodes, such as displacement")
+        if self.mesh_steps < 0 or (self.mesh_steps and self.element_inputs):
+            raise ConfigError(
+                "model.mesh_steps: 0 or more; with element nodes (element_inputs) no edge joins two nodes"
+            )
         if self.head_dim % 16 or not 16 <= self.head_dim <= 128:
             raise ConfigError(f"model.head_dim must be a multiple of 16 up to 128, not {self.head_dim}")
         for name in self.residual:

@@ -145,6 +145,33 @@ def test_bodies_exchange_information_through_cells():
     assert float(difference.detach().min()) > 0
 
 
+def test_more_steps_on_the_mesh():
+    """Steps whose last norm gives zero change nothing; each of the others changes the outputs."""
+    torch.manual_seed(0)
+    config = small("deforming_plate", element_inputs=(), mesh_steps=2)
+    model, plain = build_model(config).eval(), build_model(replace(config, mesh_steps=0)).eval()
+    missing, unexpected = plain.load_state_dict(model.state_dict(), strict=False)
+    assert not missing and {name.split(".")[0] for name in unexpected} == {"before_cells", "after_cells"}
+    batch = batch_of(config, 0)
+    steps = [*model.before_cells, *model.after_cells]
+    assert len(steps) == 4
+    with torch.no_grad():
+        for step in steps:
+            torch.nn.init.zeros_(step.norm_v.weight)
+        silent = model(batch).motion
+        torch.testing.assert_close(silent, plain(batch).motion, rtol=0, atol=1e-6)
+        for step in steps:
+            torch.nn.init.ones_(step.norm_v.weight)
+            assert float((model(batch).motion - silent).abs().max()) > 1e-3
+            torch.nn.init.zeros_(step.norm_v.weight)
+
+
+@pytest.mark.parametrize("changes", [{"mesh_steps": -1, "element_inputs": ()}, {"mesh_steps": 1}])
+def test_steps_on_the_mesh_that_there_cannot_be(changes):
+    with pytest.raises(ConfigError, match="model.mesh_steps: 0 or more; with element nodes"):
+        small("deforming_plate", **changes)
+
+
 def test_message_passing_is_the_formula():
     """Split first layer and folded encoder against LN(f_e([e, v_s, v_r])) and LN(f_v([v_r, sum])) as written."""
     torch.manual_seed(0)

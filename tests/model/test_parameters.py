@@ -62,3 +62,8 @@ def test_only_what_the_scene_requires_is_built():
     assert "element_encoder" not in parts["tiny"] and "e2m" not in parts["tiny"] and "m2m" in parts["tiny"]
     assert "element_decoder" not in parts["abcd"] and "m2e" not in parts["abcd"] and "m2m" not in parts["abcd"]
     assert len(parts["tiny"]["down"]) == len(parts["abcd"]["up"]) == 0
+
+
+def test_each_step_on_the_mesh_is_one_more_m2m_before_the_cells_and_one_after():
+    config = replace(PRESETS["tiny"].model, L_cell=5, stress="node", mesh_steps=3)
+    assert sum(p.numel() for p in build_model(config).parameters()) == BY_HAND["tiny"] + 2 * 3 * 33920
