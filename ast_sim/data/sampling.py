@@ -148,6 +148,8 @@ class PairSampler:
         return noise * (np.float32(self._noise) * member.noisy)
 
     def _draw_mirror(self, epoch: int, pair: int, member: _Member) -> Mirror:
+        if not self._mirrored.any():
+            return Mirror(np.ones(3, np.float32), member.center)
         drawn = np.random.default_rng([self._seed, _MIRROR, epoch, pair]).integers(2, size=3, dtype=bool)
         return Mirror(np.where(drawn & self._mirrored, np.float32(-1), np.float32(1)), member.center)
 
