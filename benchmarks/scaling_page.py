@@ -32,8 +32,12 @@ def section(found: dict[str, Any]) -> str:
         "",
     ]
     failed = [record for record in records if "failed" in record]
-    lines += [f"- {TITLES[one['model']]} at {one['nodes']:,} nodes: {one['failed']}" for one in failed]
+    lines += [f"- {TITLES[one['model']]} at {one['nodes']:,} nodes: {_reason(one['failed'])}" for one in failed]
     return "\n".join([*lines, *([""] if failed else []), "![Time and memory by size](study/scaling.svg)", ""])
+
+
+def _reason(failed: str) -> str:
+    return "out of memory" if "can't allocate memory" in failed else failed
 
 
 def _table(records: list[Record], value: Callable[[Record], float]) -> list[str]:
