@@ -1,6 +1,6 @@
 """Checkpoints that survive a kill, a full disk and a flipped bit.
 
-A checkpoint is the folder `checkpoints/step-N` of a run: `model.safetensors`, `optimizer.safetensors`, `state.json`,
+A checkpoint is the folder `checkpoints/step-N` of a run: `model.safetensors`, `training.safetensors`, `state.json`,
 and `manifest.json` with the size and the SHA-256 of each. It is written under another name, synced to the disk and
 then renamed, so under its name it is whole or absent. Nothing is pickled.
 """
@@ -27,7 +27,7 @@ from torch import Tensor
 from ast_sim.data.disk import replacing, sync_folder, write_synced
 from ast_sim.errors import CheckpointError
 
-FILES = ("model.safetensors", "optimizer.safetensors", "state.json")
+FILES = ("model.safetensors", "training.safetensors", "state.json")
 MANIFEST = "manifest.json"
 VERSION = 1
 
@@ -46,7 +46,7 @@ def save(
     step: int,
     *,
     model: dict[str, Tensor],
-    optimizer: dict[str, Tensor],
+    training: dict[str, Tensor],
     state: dict[str, Any],
     keep: int = 3,
 ) -> Path:
@@ -69,7 +69,7 @@ def save(
         _clean(parent)
         if not _is_valid(final):
             temporary.mkdir()
-            _write_files(temporary, step, model, optimizer, state)
+            _write_files(temporary, step, model, training, state)
             _discard(final)  # a damaged one of the same name
             os.rename(temporary, final)
             sync_folder(parent)
@@ -82,7 +82,7 @@ def save(
 
 
 def load(path: str | os.PathLike[str]) -> Content:
-    """The model's arrays, the optimizer's arrays and the state of a checkpoint, verified against its manifest.
+    """The model's arrays, those that training goes on with, and the state of a checkpoint; all of it verified.
 
     Raises:
         CheckpointError: naming the file that is missing, damaged or not what the manifest says.
@@ -90,11 +90,11 @@ def load(path: str | os.PathLike[str]) -> Content:
     path = Path(path)
     data = {name: _read_verified(path, name, record) for name, record in _read_manifest(path).items()}
     try:
-        model, optimizer = (safetensors.torch.load(data.pop(name)) for name in FILES[:2])
+        model, training = (safetensors.torch.load(data.pop(name)) for name in FILES[:2])
         state = json.loads(data["state.json"])
     except (SafetensorError, ValueError, RecursionError, RuntimeError) as error:
         raise CheckpointError(f"{path}: cannot be understood: {error}") from error
-    return model, optimizer, state
+    return model, training, state
 
 
 def latest(run_dir: str | os.PathLike[str]) -> Path | None:
@@ -179,10 +179,10 @@ def lock(run_dir: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def _write_files(
-    folder: Path, step: int, model: dict[str, Tensor], optimizer: dict[str, Tensor], state: dict[str, Any]
+    folder: Path, step: int, model: dict[str, Tensor], training: dict[str, Tensor], state: dict[str, Any]
 ) -> None:
     records = {}
-    for name, content in zip(FILES, (model, optimizer, state), strict=True):
+    for name, content in zip(FILES, (model, training, state), strict=True):
         if name.endswith(".json"):
             data = json.dumps(content, allow_nan=False, indent=1).encode()
         else:

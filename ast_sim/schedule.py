@@ -75,6 +75,13 @@ def resolve_training(config: TrainConfig, scales: DataScales, dynamic: bool) -> 
     for key in ("steps", "validate_every", "checkpoint_every"):
         if getattr(config, key) is not None and getattr(config, key) < 1:
             raise ConfigError(f"train.{key} is {getattr(config, key)}; it must be at least 1")
+    if config.rollout_pool and (config.rollout_pool % config.batch_size or config.rollout_pool < 2 * config.batch_size):
+        raise ConfigError(
+            f"train.rollout_pool is {config.rollout_pool}; it must be a multiple, at least twice, of train.batch_size ="
+            f" {config.batch_size}"
+        )
+    if config.rollout_pool and config.noise == 0:
+        raise ConfigError("train.rollout_pool needs train.noise: a rollout is given up at four times that")
     scenes = config.batch_size * config.accumulate
     epoch = math.ceil(scales.pairs / scenes)
     steps = config.steps if config.steps is not None else config.epochs * epoch

@@ -19,11 +19,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ast_sim import checkpoint
 from ast_sim.config import override
 from ast_sim.data.ahead import Ahead
 from ast_sim.data.file import Dataset
+from ast_sim.data.rollout_pool import RolloutPool
 from ast_sim.data.sampling import PairSampler
 from ast_sim.errors import CheckpointError, ConfigError, DatasetError, TrainingError
 from ast_sim.measures import rmse_sequence
@@ -132,6 +134,9 @@ def _told_by_leader(processes: Processes) -> Iterator[None]:
 def resolve_run(config: RunConfig, dataset: Dataset, scales: DataScales) -> RunConfig:
     """The settings with everything filled in that they leave to the data."""
     model = config.model.resolve(dataset.info, dataset.material_width, scales.spacing)
+    if config.train.rollout_pool and (model.dynamic or model.time_conditioned):
+        why = "errors of velocity would be undone in one step" if model.dynamic else "each frame follows from the first"
+        raise ConfigError(f"train.rollout_pool is of no use here: {why}")
     training = resolve_training(config.train, scales, model.dynamic)
     if model.time_conditioned:  # starts from the true first frame each time: there is no drift to get used to
         training = dataclasses.replace(training, noise=0.0)
@@ -155,6 +160,14 @@ def _require_same(run: Path, saved: RunConfig, asked: RunConfig) -> None:
                 )
 
 
+def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {prefix + key: value for key, value in tensors.items()}
+
+
+def _without(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
+
+
 class Training:
     """The state of one training: model, optimizer, where it stands, and what it tells.
 
@@ -176,7 +189,8 @@ class Training:
         torch.manual_seed(self.options.seed)
         self.model = build_model(config.model)
         self.sampler = self._sampler((self.processes.rank, self.processes.count))
-        self.ahead = Ahead(self.sampler)
+        self.pool = self._pool() if self.options.rollout_pool else None
+        self.ahead = Ahead(self.pool or self.sampler)
         self.optimizer = Optimizer(self.model, self.options.optimizer)
         self.metrics = Metrics(run)
         self.clock = Clock()
@@ -205,6 +219,16 @@ class Training:
             part=part,
             from_first=self.config.model.time_conditioned,
             mirror=self.options.mirror,
+        )
+
+    def _pool(self) -> RolloutPool:
+        return RolloutPool(
+            self.sampler,
+            size=self.options.rollout_pool,
+            batch_size=self.options.batch_size,
+            seed=self.options.seed,
+            noise=self.options.noise,
+            part=(self.processes.rank, self.processes.count),
         )
 
     def _introduce(self, scales: DataScales) -> None:
@@ -280,16 +304,20 @@ class Training:
         names: list[str] = []
         values: dict[str, float] = {}
         for part in range(options.accumulate):
-            batch, target = self.ahead.batch(self.step * options.accumulate + part)
+            number = self.step * options.accumulate + part
+            batch, target = self.ahead.batch(number)
             try:
-                losses = self.model.loss(batch, target, options.stress_weight, self.processes.share)
+                prediction = self.model(batch)
             except DatasetError as error:
                 raise DatasetError(f"{self.dataset.path}: in one of {', '.join(batch.names)}: {error}") from error
+            losses = self.model.loss(prediction, batch, target, options.stress_weight, self.processes.share)
             found = self.processes.add(torch.stack([value.detach() for value in losses.values()]))
             whole = dict(zip(losses, found.tolist(), strict=True))
             if not math.isfinite(whole["loss"]):
                 raise self._not_finite("loss", whole["loss"], batch.names)
             (losses["loss"] / options.accumulate).backward()
+            if self.pool is not None:
+                self.pool.advance(number, self.model.residual(prediction, batch, target))
             names += batch.names
             for key, value in whole.items():
                 values[key] = values.get(key, 0.0) + value / options.accumulate
@@ -376,6 +404,7 @@ class Training:
         self._stop_if_asked()
 
     def _save(self) -> None:
+        rolling = self._rolling_scenes()
         if not self.processes.leads:
             return
         state = {"step": self.step, "sums": self.sums, "data": self.fingerprint}
@@ -383,10 +412,17 @@ class Training:
             self.run,
             self.step,
             model=self.model.state_dict(),
-            optimizer=self.optimizer.state(),
+            training={**_under("optimizer.", self.optimizer.state()), **_under("rollout_pool.", rolling)},
             state=state,
             keep=self.options.keep,
         )
+
+    def _rolling_scenes(self) -> dict[str, Tensor]:
+        """Where the scenes of the pool stand, of all processes."""
+        if self.pool is None:
+            return {}
+        self.ahead.wait()
+        return {key: value for part in self.processes.gathered([self.pool.state()]) for key, value in part.items()}
 
     def _restore(self) -> None:
         """The leading process finds where training stands; the others take it from there."""
@@ -395,6 +431,8 @@ class Training:
         self.step, self.sums = self.processes.of_leader((self.step, self.sums))
         self.processes.spread(self.model.state_dict().values())
         self.optimizer.restore(self.processes.of_leader(self.optimizer.state()))
+        if self.pool is not None:
+            self.pool.restore(self.processes.of_leader(self.pool.state()))
 
     def _restore_alone(self) -> None:
         path = checkpoint.latest(self.run)
@@ -404,14 +442,16 @@ class Training:
             whole = self.sampler if self.processes.count == 1 else self._sampler((0, 1))
             self.model.fit_statistics(whole.batch(index) for index in batches)
             return
-        weights, optimizer, state = checkpoint.load(path)
+        weights, training, state = checkpoint.load(path)
         if state["data"] != self.fingerprint:
             raise TrainingError(
                 f"{self.dataset.path} is not the dataset that {self.run} was trained on so far: bring that one back,"
                 " or train in another folder"
             )
         self.model.load_state_dict(weights)
-        self.optimizer.restore(optimizer)
+        self.optimizer.restore(_without("optimizer.", training))
+        if self.pool is not None:
+            self.pool.restore(_without("rollout_pool.", training))
         self.step, self.sums = state["step"], state["sums"]
         self.metrics.forget_after(self.step)
         print(f"going on after step {self.step:,}", flush=True)

@@ -27,7 +27,7 @@ with checkpoint.lock(sys.argv[1]):
         step += 1
         arrays = {"w": torch.full((64, 64), float(step))}
         optimizer = {"m": arrays["w"] + 0.5}
-        checkpoint.save(sys.argv[1], step, model=arrays, optimizer=optimizer, state={"step": step}, keep=2)
+        checkpoint.save(sys.argv[1], step, model=arrays, training=optimizer, state={"step": step}, keep=2)
         if step % 3 == 0:
             checkpoint.mark_best(sys.argv[1], step)
 """
@@ -48,7 +48,7 @@ def content(step: int):
 
 def save(run, step, **options):
     model, optimizer, state = content(step)
-    return checkpoint.save(run, step, model=model, optimizer=optimizer, state=state, **options)
+    return checkpoint.save(run, step, model=model, training=optimizer, state=state, **options)
 
 
 def require_content(path, step):
@@ -70,8 +70,8 @@ def test_what_was_saved_is_loaded_bit_for_bit(tmp_path):
     assert sorted(file.name for file in path.iterdir()) == [
         "manifest.json",
         "model.safetensors",
-        "optimizer.safetensors",
         "state.json",
+        "training.safetensors",
     ]
     require_content(path, 12)
 
@@ -79,7 +79,7 @@ def test_what_was_saved_is_loaded_bit_for_bit(tmp_path):
 def test_strided_and_shared_tensors_are_saved_by_value(tmp_path):
     base = torch.arange(12.0).reshape(3, 4)
     model = {"base": base, "turned": base.t(), "row": base[1], "wide": torch.ones(1).expand(5)}
-    path = checkpoint.save(tmp_path, 1, model=model, optimizer={}, state={})
+    path = checkpoint.save(tmp_path, 1, model=model, training={}, state={})
     found, optimizer, state = checkpoint.load(path)
     assert all(torch.equal(found[key], model[key]) for key in model) and optimizer == {} and state == {}
 
@@ -119,7 +119,7 @@ def test_a_damaged_best_gives_a_warning_and_none(tmp_path):
         assert checkpoint.best(tmp_path) is None
 
 
-@pytest.mark.parametrize("name", ["manifest.json", "state.json", "model.safetensors", "optimizer.safetensors"])
+@pytest.mark.parametrize("name", ["manifest.json", "state.json", "model.safetensors", "training.safetensors"])
 def test_every_flipped_bit_and_every_truncation_is_found(tmp_path, name):
     file = save(tmp_path, 3) / name
     original = file.read_bytes()
@@ -171,7 +171,7 @@ def test_damage_everywhere_is_an_error_and_not_a_new_start(tmp_path):
         lambda m: m["files"]["model.safetensors"].update(size=10**18),
         lambda m: m["files"]["model.safetensors"].update(size=-1),
         lambda m: m["files"]["model.safetensors"].update(size="1"),
-        lambda m: m["files"].pop("optimizer.safetensors"),
+        lambda m: m["files"].pop("training.safetensors"),
         lambda m: m["files"].update({"state.json": None}),
         lambda m: m.update(files=[]),
         lambda m: m.update(version=2),
@@ -255,9 +255,9 @@ from ast_sim import checkpoint
 from ast_sim.errors import CheckpointError
 if sys.argv[2] != "0":
     resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
-checkpoint.save(sys.argv[1], 1, model={"w": torch.ones(100)}, optimizer={}, state={"step": 1})
+checkpoint.save(sys.argv[1], 1, model={"w": torch.ones(100)}, training={}, state={"step": 1})
 try:
-    checkpoint.save(sys.argv[1], 2, model={"w": torch.ones(100_000)}, optimizer={}, state={"step": 2})
+    checkpoint.save(sys.argv[1], 2, model={"w": torch.ones(100_000)}, training={}, state={"step": 2})
 except CheckpointError as error:
     print(error)
 print(checkpoint.load(checkpoint.latest(sys.argv[1]))[2])
@@ -282,7 +282,7 @@ def test_a_state_that_json_cannot_hold_is_refused(tmp_path):
     save(tmp_path, 1)
     for state in ({"loss": float("nan")}, {"x": object()}):
         with pytest.raises(CheckpointError, match="step-2"):
-            checkpoint.save(tmp_path, 2, model={}, optimizer={}, state=state)
+            checkpoint.save(tmp_path, 2, model={}, training={}, state=state)
     assert steps(tmp_path) == [1]
 
 

@@ -40,9 +40,10 @@ def data(tmp_path_factory) -> Path:
     return toy.write(tmp_path_factory.mktemp("data") / "toy.h5")
 
 
-def test_two_processes_do_what_one_does(data, tmp_path):
-    told = train(2, data, tmp_path / "two", 8).stdout
-    train(1, data, tmp_path / "one", 8)
+@pytest.mark.parametrize("along", [[], ["--set", "train.rollout_pool=8"]], ids=["pairs", "rollouts"])
+def test_two_processes_do_what_one_does(data, tmp_path, along):
+    told = train(2, data, tmp_path / "two", 8, *along).stdout
+    train(1, data, tmp_path / "one", 8, *along)
     one, two = weights(tmp_path / "one"), weights(tmp_path / "two")
     for name, ours in one.items():
         # Sums over two parts round otherwise; Adam's steps of about the rate follow even the smallest gradients.

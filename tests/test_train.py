@@ -212,7 +212,7 @@ def test_a_loss_that_is_not_finite_stops_before_the_step_and_names_the_samples(l
 
     def loss(self, *batch_and_settings):
         losses = real(self, *batch_and_settings)
-        calls.append(batch_and_settings[0].names)
+        calls.append(batch_and_settings[1].names)
         return losses if len(calls) < 8 else {**losses, "loss": losses["loss"] * float("nan")}
 
     monkeypatch.setattr(toy.LinearSimulator, "loss", loss)
@@ -306,6 +306,44 @@ def test_a_damaged_newest_checkpoint_falls_back_and_ends_in_the_same_bits(linear
         train.train(tmp_path / "run", resume=True)
     a, b = weights(tmp_path / "whole"), weights(tmp_path / "run")
     assert all(torch.equal(a[key], b[key]) for key in a)
+
+
+def test_along_rollouts_a_resumed_training_ends_in_the_same_bits(linear, data, tmp_path):
+    along = settings(data, "train.rollout_pool=6", "train.noise=1e-3", "train.mirror=x,y")
+    train.train(tmp_path / "whole", along)
+    train.train(tmp_path / "run", along)
+    newest = checkpoint.latest(tmp_path / "run") / "training.safetensors"
+    newest.write_bytes(newest.read_bytes()[:-1] + b"\x7f")
+    with pytest.warns(UserWarning, match="SHA-256"):
+        train.train(tmp_path / "run", resume=True)
+    a, b = (checkpoint.load(checkpoint.latest(tmp_path / name)) for name in ("whole", "run"))
+    for ours, theirs in zip(a[:2], b[:2], strict=True):
+        assert ours.keys() == theirs.keys() and all(torch.equal(ours[key], theirs[key]) for key in ours)
+    assert {f"rollout_pool.{place}.begun" for place in range(6)} <= a[1].keys()
+    train.train(tmp_path / "without", settings(data, "train.noise=1e-3", "train.mirror=x,y"))
+    assert any(not torch.equal(a[0][key], value) for key, value in weights(tmp_path / "without").items())
+
+
+@pytest.mark.parametrize(
+    ("assignments", "match"),
+    [
+        (["train.rollout_pool=5"], r"train.rollout_pool is 5; it must be a multiple.*train.batch_size = 2"),
+        (["train.rollout_pool=2"], r"train.rollout_pool is 2; it must be a multiple, at least twice"),
+        (["train.rollout_pool=-4"], r"train.rollout_pool is -4"),
+        (["train.rollout_pool=4", "train.noise=0"], r"train.rollout_pool needs train.noise"),
+        (["train.rollout_pool=4", "model.time_conditioned=true"], r"of no use here: each frame follows from the first"),
+    ],
+)
+def test_a_pool_that_cannot_be_is_refused(linear, data, tmp_path, assignments, match):
+    with pytest.raises(ConfigError, match=match):
+        train.train(tmp_path / "run", settings(data, *assignments))
+    assert not run.has_config(tmp_path / "run")
+
+
+def test_a_pool_is_for_data_without_inertia(tmp_path):
+    data = toy.write(tmp_path / "dynamic.h5", dynamic=True, stress=False)
+    with pytest.raises(ConfigError, match=r"of no use here: errors of velocity"):
+        train.train(tmp_path / "run", train.configure(data, "tiny", ["train.rollout_pool=8"]))
 
 
 def test_a_second_writer_is_refused(linear, data, tmp_path):

@@ -35,6 +35,16 @@ class _Member:
     center: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Frames t and t + 1 of a trajectory, the error [N, 3] float32 of the state p_t, and how all of it is mirrored."""
+
+    index: int
+    t: int
+    error: np.ndarray
+    mirror: Mirror
+
+
 class PairSampler:
     """Draws batches of frame pairs (t, t + 1) of a split; each epoch is a new random order of all pairs.
 
@@ -99,26 +109,39 @@ class PairSampler:
         size = self._batch_size // count
         first = step * self._batch_size + index * size
         draws = [divmod(place, self.num_pairs) for place in range(first, first + size)]
-        return self._assemble([(epoch, int(self._order(epoch)[place])) for epoch, place in draws])
+        return self.assemble([self._pair(epoch, int(self._order(epoch)[place])) for epoch, place in draws])
+
+    def _pair(self, epoch: int, number: int) -> Pair:
+        """A pair of all, with the noise and the mirroring that it has in an epoch."""
+        index, t = self.place(number)
+        noise = self.white_noise(index, np.random.default_rng([self._seed, _NOISE, epoch, number]))
+        mirror = self.random_mirror(index, np.random.default_rng([self._seed, _MIRROR, epoch, number]))
+        return Pair(index, t, noise, mirror)
+
+    def place(self, number: int) -> tuple[int, int]:
+        """The trajectory and the first frame of pair 0, 1, ... `num_pairs` - 1."""
+        index = int(np.searchsorted(self._starts, number, side="right")) - 1
+        return index, number - int(self._starts[index]) + self._first
+
+    def last_frame(self, index: int) -> int:
+        """The number of the last frame of a trajectory."""
+        return self._dataset.num_frames(self._split, index) - 1
 
     def _draw_order(self, epoch: int) -> np.ndarray:
         return np.random.default_rng([self._seed, _ORDER, epoch]).permutation(self.num_pairs)
 
-    def _assemble(self, pairs: list[tuple[int, int]]) -> tuple[Batch, Target]:
-        """The batch of the pairs (epoch, number)."""
+    def assemble(self, pairs: list[Pair]) -> tuple[Batch, Target]:
+        """The batch of these pairs; errors count where noise acts."""
         graphs, names, positions, previous, boundary, motions = [], [], [], [], [], []
         stresses, next_stresses, numbers = [], [], []
-        for epoch, pair in pairs:
-            index = int(np.searchsorted(self._starts, pair, side="right")) - 1
-            t = pair - int(self._starts[index]) + self._first
-            member = self._member(index)
-            position, stress = self._read(index, t)
+        for pair in pairs:
+            t, mirror, member = pair.t, pair.mirror, self._member(pair.index)
+            position, stress = self._read(pair.index, t)
             before, now, after = position[0], position[-2], position[-1]
             increment = after - now
-            noise = self._draw_noise(epoch, pair, member)
-            mirror = self._draw_mirror(epoch, pair, member)
+            noise = pair.error * member.noisy
             graphs.append(member.graph.mirrored(mirror))
-            names.append(f"{self._split}/{index:06d} frame {t}")
+            names.append(f"{self._split}/{pair.index:06d} frame {t}")
             numbers.append(t + 1.0)
             positions.append(mirror.points(now + noise))
             boundary.append(mirror.vectors(np.where(member.prescribed, increment, np.float32(0))))
@@ -142,16 +165,17 @@ class PairSampler:
         positions, stresses = zip(*frames, strict=True)
         return np.concatenate(positions), None if stresses[0] is None else np.concatenate(stresses)
 
-    def _draw_noise(self, epoch: int, pair: int, member: _Member) -> np.ndarray:
-        generator = np.random.default_rng([self._seed, _NOISE, epoch, pair])
-        noise = generator.standard_normal(member.noisy.shape, np.float32)
-        return noise * (np.float32(self._noise) * member.noisy)
+    def white_noise(self, index: int, generator: np.random.Generator) -> np.ndarray:
+        """[N, 3] float32 of the standard deviation `noise`."""
+        return generator.standard_normal(self._member(index).noisy.shape, np.float32) * np.float32(self._noise)
 
-    def _draw_mirror(self, epoch: int, pair: int, member: _Member) -> Mirror:
+    def random_mirror(self, index: int, generator: np.random.Generator) -> Mirror:
+        """At the middle of a scene, along each axis of `mirror` with probability 1/2."""
+        center = self._member(index).center
         if not self._mirrored.any():
-            return Mirror(np.ones(3, np.float32), member.center)
-        drawn = np.random.default_rng([self._seed, _MIRROR, epoch, pair]).integers(2, size=3, dtype=bool)
-        return Mirror(np.where(drawn & self._mirrored, np.float32(-1), np.float32(1)), member.center)
+            return Mirror(np.ones(3, np.float32), center)
+        drawn = generator.integers(2, size=3, dtype=bool)
+        return Mirror(np.where(drawn & self._mirrored, np.float32(-1), np.float32(1)), center)
 
     def _member(self, index: int) -> _Member:
         if index not in self._members:

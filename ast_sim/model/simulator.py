@@ -67,12 +67,13 @@ class Simulator(nn.Module):
 
     def loss(
         self,
+        prediction: Prediction,
         batch: Batch,
         target: Target,
         stress_weight: float = 0.01,
         share: Callable[[int], float] = lambda rows: 1.0,
     ) -> dict[str, Tensor]:
-        """Mean squared errors on normalised targets: motion of NORMAL nodes, stress of everything but obstacles.
+        """Mean squared errors of `self(batch)`, normalised: motion of NORMAL nodes, stress of everything but obstacles.
 
         Where the batch is a part of a larger one, `share` says how much of all rows (nodes or elements) its rows are:
         the losses of all parts then add up to that of the whole.
@@ -81,7 +82,6 @@ class Simulator(nn.Module):
             "motion", "stress" (if there is one) and "loss" = motion + stress_weight * stress; "spread", the standard
             deviation of the predicted motion over the nodes: 0 means a dead decoder.
         """
-        prediction = self(batch)
         normal = batch.graph.normal_nodes
         motion = prediction.motion.index_select(0, normal)
         error = motion - self.motion_normalizer(target.motion.index_select(0, normal))
@@ -96,6 +96,12 @@ class Simulator(nn.Module):
             losses["stress"] = share(len(rows)) * error.square().mean()
             losses["loss"] = losses["loss"] + stress_weight * losses["stress"]
         return losses
+
+    @torch.no_grad()
+    def residual(self, prediction: Prediction, batch: Batch, target: Target) -> Tensor:
+        """[N, 3] how far `self(batch)` leads NORMAL nodes from the truth, in units of length; zero elsewhere."""
+        error = self.motion_normalizer.inverse(prediction.motion) - target.motion
+        return torch.zeros_like(error).index_copy_(0, batch.graph.normal_nodes, error[batch.graph.normal_nodes])
 
     @torch.inference_mode()
     def predict(self, batch: Batch) -> Prediction:

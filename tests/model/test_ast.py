@@ -70,7 +70,7 @@ def test_every_preset_takes_a_training_step(family, tmp_path):
     losses = []
     for _ in range(4):
         optimizer.zero_grad()
-        loss = model.loss(batch, target)["loss"]
+        loss = model.loss(model(batch), batch, target)["loss"]
         loss.backward()
         optimizer.step()
         losses.append(float(loss.detach()))
@@ -275,7 +275,7 @@ def test_loss_counts_the_right_nodes(tmp_path):
     model, pairs = build_model(config), sampler(path, config)
     model.fit_statistics(pairs.batch(i) for i in range(3))
     batch, target = pairs.batch(0)
-    losses = model.loss(batch, target, stress_weight=0.3)
+    losses = model.loss(model(batch), batch, target, stress_weight=0.3)
     out = model(batch)
     normal, free = batch.graph.normal_nodes, batch.graph.node_type != NodeType.OBSTACLE
     motion = (out.motion - target.motion / model.motion_normalizer.scale)[normal].square().mean()

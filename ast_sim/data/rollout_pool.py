@@ -1,0 +1,122 @@
+"""Training along rollouts: the states that a model is trained on are those to which it led itself.
+
+White noise teaches a model to undo errors that differ from node to node. What adds up in a rollout is smooth, and other
+for each model. So scenes are rolled out while the model trains: the error that a step leaves in the position is the
+error of the state of the next, and each step is trained to lead back to the truth. It takes no prediction more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ast_sim.data.batch import Batch, Target
+from ast_sim.data.mirror import Mirror
+from ast_sim.data.sampling import Pair, PairSampler
+
+SHARE = 1 / 3  # of the white noise that is added in each step
+LARGEST = 4.0  # root mean square error of a scene over the noise, above which it is given up
+_SCENE, _NOISE = 10, 11  # separate the random numbers of the scenes from those of their steps, and from the sampler's
+
+
+@dataclass(eq=False)
+class _Rolling:
+    """A scene under way; `error` [N, 3] float32 is that of its state at frame t, not mirrored."""
+
+    index: int
+    t: int
+    mirror: Mirror
+    error: np.ndarray
+
+
+class RolloutPool:
+    """So many training scenes, rolled out side by side; batch i takes the next `batch_size` of them, in turn.
+
+    A scene begins at frame 0 or, with probability 1/2, at any frame with white noise. It ends with its last
+    frame, or where its error is too large to learn from; then another one takes its place. Which one, and all noise,
+    follows from the seed, the place in the pool and the number of scenes that began there.
+
+    `batch` may run ahead of `advance`, as long as the places of the two are not the same.
+
+    Args:
+        sampler: reads, mirrors and puts together the frames of quasi-static scenes.
+        size: how many scenes; a multiple of `batch_size`.
+        noise: standard deviation of the sampler's white noise.
+        part: (i, n) takes the i-th of n equal parts of each batch.
+    """
+
+    def __init__(
+        self,
+        sampler: PairSampler,
+        *,
+        size: int,
+        batch_size: int,
+        seed: int,
+        noise: float,
+        part: tuple[int, int] = (0, 1),
+    ) -> None:
+        self._sampler, self._size, self._batch_size, self._seed = sampler, size, batch_size, seed
+        self._noise, self._part = noise, part
+        self._begun: dict[int, int] = {}
+        self._rolling: dict[int, _Rolling] = {}
+
+    def batch(self, number: int) -> tuple[Batch, Target]:
+        """The states to which the scenes of a batch have come, and what follows in the data."""
+        return self._sampler.assemble([self._pair(place) for place in self._places(number)])
+
+    def advance(self, number: int, residual: Tensor) -> None:
+        """Go on with the scenes of a batch, given what was predicted of it minus the truth [N, 3], after the step."""
+        first = 0
+        for place in self._places(number):
+            scene = self._rolling[place]
+            rows = residual[first : first + len(scene.error)].numpy()
+            first += len(rows)
+            scene.error = scene.mirror.vectors(rows)
+            scene.t += 1
+            lost = np.sqrt(np.mean(np.square(rows, dtype=np.float64))) > LARGEST * self._noise
+            if lost or scene.t == self._sampler.last_frame(scene.index):
+                del self._rolling[place]
+
+    def state(self) -> dict[str, Tensor]:
+        """Where all scenes stand, for `restore`."""
+        found = {f"{place}.begun": torch.tensor(count) for place, count in self._begun.items()}
+        for place, scene in self._rolling.items():
+            found |= {f"{place}.t": torch.tensor(scene.t), f"{place}.error": torch.from_numpy(scene.error)}
+        return found
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Go on where `state` was taken, or those of all parts together."""
+        batches = range(self._size // self._batch_size)
+        own = [place for i in batches for place in self._places(i) if f"{place}.begun" in state]
+        self._begun = {place: int(state[f"{place}.begun"]) for place in own}
+        self._rolling = {place: self._drawn(place) for place in own if f"{place}.t" in state}
+        for place, scene in self._rolling.items():
+            scene.t, scene.error = int(state[f"{place}.t"]), state[f"{place}.error"].numpy()
+
+    def _places(self, number: int) -> range:
+        """Where in the pool the scenes of this part of a batch are."""
+        index, count = self._part
+        share = self._batch_size // count
+        first = number * self._batch_size % self._size + index * share
+        return range(first, first + share)
+
+    def _pair(self, place: int) -> Pair:
+        if place not in self._rolling:
+            self._begun[place] = self._begun.get(place, 0) + 1
+            self._rolling[place] = self._drawn(place)
+        scene = self._rolling[place]
+        generator = np.random.default_rng([self._seed, _NOISE, place, self._begun[place], scene.t])
+        white = self._sampler.white_noise(scene.index, generator) * np.float32(SHARE)
+        return Pair(scene.index, scene.t, scene.error + white, scene.mirror)
+
+    def _drawn(self, place: int) -> _Rolling:
+        """The scene that began last at a place, as it began."""
+        generator = np.random.default_rng([self._seed, _SCENE, place, self._begun[place]])
+        index, t = self._sampler.place(int(generator.integers(self._sampler.num_pairs)))
+        t *= int(generator.integers(2))
+        noise = self._sampler.white_noise(index, generator)
+        error = noise if t else np.zeros_like(noise)
+        return _Rolling(index, t, self._sampler.random_mirror(index, generator), error)

@@ -1,0 +1,150 @@
+"""The pool of rollouts: states are what the model made of them, targets lead back, draws follow from the seed."""
+
+import numpy as np
+import pytest
+import torch
+from data_samples import block, mesh_graph, trajectory, write
+
+from ast_sim.data.file import Dataset
+from ast_sim.data.rollout_pool import LARGEST, SHARE, RolloutPool
+from ast_sim.data.sampling import PairSampler
+
+NOISE = 1e-3
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    """Three trajectories of different meshes with 5, 1 and 4 frames: the second has no pair."""
+    members = [trajectory(block(2 - i % 2, 1, 1), frames, seed=i) for i, frames in enumerate((5, 1, 4))]
+    with Dataset(write(tmp_path / "d.h5", {"train": members})) as dataset:
+        yield dataset
+
+
+def pool(dataset, noise: float = NOISE, size: int = 8, part=(0, 1), mirror=("x", "y"), seed: int = 0) -> RolloutPool:
+    options = {"batch_size": 4, "seed": seed, "noise": noise, "mirror": mirror}
+    pairs = PairSampler(dataset, "train", make_graph=mesh_graph, dynamic=False, gamma=1.0, **options)
+    return RolloutPool(pairs, size=size, batch_size=4, seed=seed, noise=noise, part=part)
+
+
+def residual(target, number: int, scale: float = NOISE) -> torch.Tensor:
+    return scale * torch.randn(target.motion.shape, generator=torch.Generator().manual_seed(number))
+
+
+def run(pool: RolloutPool, numbers, scale: float = NOISE) -> list:
+    found = []
+    for number in numbers:
+        batch, target = pool.batch(number)
+        found.append((batch, target))
+        pool.advance(number, residual(target, number, scale) * normal(batch)[:, None])
+    return found
+
+
+def normal(batch) -> torch.Tensor:
+    return torch.zeros(len(batch.position)).index_fill_(0, batch.graph.normal_nodes, 1.0)
+
+
+def frame(name: str) -> tuple[int, int]:
+    words = name.split()
+    return int(words[0].split("/")[1]), int(words[-1])
+
+
+def test_the_state_is_where_the_model_led_and_the_target_leads_back(dataset):
+    rolls = pool(dataset, mirror=())
+    before: dict[int, tuple] = {}
+    went_on = 0
+    for number in range(24):
+        batch, target = rolls.batch(number)
+        error = residual(target, number) * normal(batch)[:, None]
+        rows = batch.graph.node_offsets.tolist()
+        for k, name in enumerate(batch.names):
+            part = slice(rows[k], rows[k + 1])
+            index, t = frame(name)
+            truth = torch.tensor(dataset.load("train", index).position)
+            free = normal(batch)[part] > 0
+            torch.testing.assert_close((batch.position + target.motion)[part][free], truth[t + 1][free])
+            white = batch.position[part] - truth[t]
+            place = number % 2 * 4 + k
+            if place in before and before[place][0] == (index, t - 1):
+                white = white - before[place][1]
+                went_on += 1
+            assert not white[~free].any() and 0 < float(white[free].abs().max()) < 5 * NOISE * (SHARE + (t > 0))
+            before[place] = ((index, t), error[part])
+        rolls.advance(number, error)
+    assert went_on > 40
+
+
+def test_mirroring_turns_errors_back(dataset):
+    """Mirrored and not, the same scene has the same errors: those of the state are told from the truth."""
+    plain, mirrored = pool(dataset, mirror=()), pool(dataset)
+    turned = 0
+    for number in range(12):
+        (a, x), (b, y) = plain.batch(number), mirrored.batch(number)
+        assert a.names == b.names
+        sign = torch.where((x.motion * y.motion < 0) & (x.motion.abs() > 1e-9), -1.0, 1.0)
+        torch.testing.assert_close(x.motion * sign, y.motion, atol=1e-6, rtol=1e-4)
+        turned += int((sign < 0).any())
+        error = residual(x, number) * normal(a)[:, None]
+        plain.advance(number, error)
+        mirrored.advance(number, error * sign)
+    assert turned > 6
+
+
+def test_a_scene_ends_with_its_last_frame_and_half_begin_at_the_first(dataset):
+    seen: dict[int, list] = {place: [] for place in range(8)}
+    for number, (batch, _) in enumerate(run(pool(dataset), range(400), scale=0.0)):
+        for k, name in enumerate(batch.names):
+            seen[number % 2 * 4 + k].append(frame(name))
+    starts = []
+    for frames in seen.values():
+        for (index, t), (next_index, next_t) in zip(frames, frames[1:], strict=False):
+            last = {0: 3, 2: 2}[index]  # the last frame that has one after it
+            assert (next_index, next_t) == (index, t + 1) if t < last else True
+            starts += [next_t] if t == last else []
+    assert {index for frames in seen.values() for index, _ in frames} == {0, 2}
+    assert 0.5 < np.mean(np.array(starts) == 0) < 0.75  # 1/2 and of the other half the quarter or third at frame 0
+
+
+def test_a_scene_whose_error_is_too_large_is_given_up(dataset):
+    just, more = 0.99 * LARGEST * NOISE, 1.01 * LARGEST * NOISE
+    for error, goes_on in ((just, True), (more, False)):
+        rolls = pool(dataset)
+        batch, target = rolls.batch(0)
+        rolls.advance(0, torch.full(target.motion.shape, error))
+        going = {
+            f"{k}.t" in rolls.state() for k, name in enumerate(batch.names) if frame(name) in ((0, 0), (0, 1), (0, 2))
+        }
+        assert going == {goes_on}
+
+
+def test_it_goes_on_from_its_state_with_the_same_bits(dataset):
+    whole = run(pool(dataset), range(20))[11:]
+    first = pool(dataset)
+    run(first, range(11))
+    first.batch(11)  # begun ahead, as in training
+    again = pool(dataset)
+    again.restore(first.state())
+    for (a, x), (b, y) in zip(whole, run(again, range(11, 20)), strict=True):
+        assert a.names == b.names and torch.equal(a.position, b.position) and torch.equal(x.motion, y.motion)
+
+
+def test_two_parts_are_the_whole(dataset):
+    whole, parts = pool(dataset), [pool(dataset, part=(i, 2)) for i in range(2)]
+    for number in range(10):
+        batch, target = whole.batch(number)
+        halves = [part.batch(number) for part in parts]
+        assert batch.names == [name for half, _ in halves for name in half.names]
+        assert torch.equal(batch.position, torch.cat([half.position for half, _ in halves]))
+        error, rows = residual(target, number) * normal(batch)[:, None], len(halves[0][0].position)
+        whole.advance(number, error)
+        for part, rest in zip(parts, (error[:rows], error[rows:]), strict=True):
+            part.advance(number, rest)
+    states = [part.state() for part in parts]
+    assert not set(states[0]) & set(states[1]) and {**states[0], **states[1]}.keys() == whole.state().keys()
+    for part, state in zip(parts, states, strict=True):
+        part.restore({**states[0], **states[1]})
+        assert part.state().keys() == state.keys()
+
+
+def test_another_seed_draws_other_scenes(dataset):
+    draws = [[batch.names for batch, _ in run(pool(dataset, seed=seed), range(6))] for seed in (0, 0, 1)]
+    assert draws[0] == draws[1] != draws[2]
