@@ -5,16 +5,17 @@ from __future__ import annotations
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 from ast_sim.data.batch import Batch, Target
+from ast_sim.data.rollout_pool import RolloutPool
 from ast_sim.data.sampling import PairSampler
 
 
 class Ahead:
-    """The batches of a sampler, which are a function of their number alone, in rising order without waiting for them.
+    """The batches of a sampler or a pool in rising order, without waiting for them; none depends on the one before it.
 
     A context manager: its thread ends with it. An error in making a batch is raised when that batch is asked for.
     """
 
-    def __init__(self, sampler: PairSampler) -> None:
+    def __init__(self, sampler: PairSampler | RolloutPool) -> None:
         self._sampler = sampler
         self._thread = ThreadPoolExecutor(1, "sampler")
         self._next: dict[int, Future[tuple[Batch, Target]]] = {}
