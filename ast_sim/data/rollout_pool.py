@@ -115,7 +115,7 @@ class RolloutPool:
     def _drawn(self, place: int) -> _Rolling:
         """The scene that began last at a place, as it began."""
         generator = np.random.default_rng([self._seed, _SCENE, place, self._begun[place]])
-        index, t = self._sampler.place(int(generator.integers(self._sampler.num_pairs)))
+        index, t = self._sampler.locate(int(generator.integers(self._sampler.num_pairs)))
         t *= int(generator.integers(2))
         noise = self._sampler.white_noise(index, generator)
         error = noise if t else np.zeros_like(noise)

@@ -113,12 +113,12 @@ class PairSampler:
 
     def _pair(self, epoch: int, number: int) -> Pair:
         """A pair of all, with the noise and the mirroring that it has in an epoch."""
-        index, t = self.place(number)
+        index, t = self.locate(number)
         noise = self.white_noise(index, np.random.default_rng([self._seed, _NOISE, epoch, number]))
         mirror = self.random_mirror(index, np.random.default_rng([self._seed, _MIRROR, epoch, number]))
         return Pair(index, t, noise, mirror)
 
-    def place(self, number: int) -> tuple[int, int]:
+    def locate(self, number: int) -> tuple[int, int]:
         """The trajectory and the first frame of pair 0, 1, ... `num_pairs` - 1."""
         index = int(np.searchsorted(self._starts, number, side="right")) - 1
         return index, number - int(self._starts[index]) + self._first
