@@ -20,9 +20,10 @@ INTRODUCTION = """# The models compared
 Made by `python -m benchmarks.study STUDY.toml`; the studies lie in `benchmarks/studies`. All runs of a study have the
 same scenes, splits, state noise and budget, and the same training but for what is said to be set otherwise; each has
 the learning rate of those tried with which its rollouts of the validation scenes are best, and the checkpoint that is
-evaluated is chosen by such rollouts, too. Errors are those of the test scenes, on nodes that the model moves: root mean
-squares over coordinates, by sequence (`rmse_sequence`, as in the AST paper) or pooled over everything (`rmse_pooled`,
-as in MeshGraphNets); means over the seeds, with the least and the largest in brackets. A time-conditioned model
+evaluated is chosen by such rollouts, too. The budget is so many steps as fit in it at the speeds that were measured in
+turns before; what the training then took by the clock, beside other work, is told, too. Errors are those of the test
+scenes, on nodes that the model moves: root mean squares over coordinates, by sequence (`rmse_sequence`, as in the AST
+paper) or pooled over everything (`rmse_pooled`, as in MeshGraphNets); means over the seeds, with the least and the largest in brackets. A time-conditioned model
 predicts every frame from the first: it has no error of one step, and its first 50 frames are no easier than the others.
 """
 
@@ -263,11 +264,15 @@ def divergences(models: dict[str, Any], horizons: int) -> list[str]:
 
 
 def draw(found: dict[str, Any], file: Path) -> None:
-    """Validation error over the seconds of training, a line a model; thin lines are its other seeds."""
+    """Validation error over the budget spent, a line a model; thin lines are its other seeds.
+
+    A step counts as long as it took when speeds were measured in turns: the clock of a run tells what ran beside, too.
+    """
     figure, axes = axes_of_picture(7.2, 4.4)
     for number_, (name, model) in enumerate(found["models"].items()):
         for i, run in enumerate(model["runs"]):
-            points = [(p["seconds"] / 60, 1e3 * p["valid_rmse"]) for p in run["curve"] if p["valid_rmse"] is not None]
+            minutes = run["seconds_per_step"] / 60
+            points = [(minutes * p["step"], 1e3 * p["valid_rmse"]) for p in run["curve"] if p["valid_rmse"] is not None]
             if points:
                 width = 1.6 if i == 0 else 0.7
                 axes.plot(
