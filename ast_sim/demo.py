@@ -55,7 +55,7 @@ def demo(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
 
     _announce(2, "training")
     # Plates know no left and right, and none is turned over.
-    settings = [f"train.steps={size.steps}", f"train.seed={seed}", "train.mirror=x,y", "train.rollout_pool=64"]
+    settings = [f"train.steps={size.steps}", f"train.seed={seed}", "train.mirror=x,y"]
     train(run_folder, configure(data, "tiny", settings), resume=True)
 
     with open_run(run_folder, data) as run:
