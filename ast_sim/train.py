@@ -426,22 +426,22 @@ class Training:
 
     def _restore(self) -> None:
         """The leading process finds where training stands; the others take it from there."""
-        if self.processes.leads:
-            self._restore_alone()
+        rolling = self._restore_alone() if self.processes.leads else {}
         self.step, self.sums = self.processes.of_leader((self.step, self.sums))
         self.processes.spread(self.model.state_dict().values())
         self.optimizer.restore(self.processes.of_leader(self.optimizer.state()))
         if self.pool is not None:
-            self.pool.restore(self.processes.of_leader(self.pool.state()))
+            self.pool.restore(self.processes.of_leader(rolling))
 
-    def _restore_alone(self) -> None:
+    def _restore_alone(self) -> dict[str, Tensor]:
+        """Take up the newest checkpoint; returns where the scenes of the pool stood, of all processes."""
         path = checkpoint.latest(self.run)
         if path is None:
             self.metrics.forget_after(0)
             batches = range(math.ceil(self.options.statistics_pairs / self.options.batch_size))
             whole = self.sampler if self.processes.count == 1 else self._sampler((0, 1))
             self.model.fit_statistics(whole.batch(index) for index in batches)
-            return
+            return {}
         weights, training, state = checkpoint.load(path)
         if state["data"] != self.fingerprint:
             raise TrainingError(
@@ -450,11 +450,10 @@ class Training:
             )
         self.model.load_state_dict(weights)
         self.optimizer.restore(_without("optimizer.", training))
-        if self.pool is not None:
-            self.pool.restore(_without("rollout_pool.", training))
         self.step, self.sums = state["step"], state["sums"]
         self.metrics.forget_after(self.step)
         print(f"going on after step {self.step:,}", flush=True)
+        return _without("rollout_pool.", training)
 
     def _fingerprint(self) -> str:
         """Tells one dataset from another without reading it whole; recorded times and the file's place do not count."""

@@ -1,5 +1,6 @@
 """Training in two processes under torchrun: the same as in one with the whole batch; goes on with another number."""
 
+import shutil
 import signal
 import subprocess
 import sys
@@ -55,6 +56,11 @@ def test_two_processes_do_what_one_does(data, tmp_path, along):
         for key in {"loss", "grad_norm", "valid_rmse", "valid_hold_still"} & ours.keys():
             assert theirs[key] == pytest.approx(ours[key], rel=1e-3), key
     assert told.count("parameters") == 1  # one process tells
+
+    # Two that were interrupted end in the same bits.
+    shutil.rmtree(tmp_path / "two/checkpoints/step-8")
+    subprocess.run(command(2, "--out", str(tmp_path / "two"), "--resume"), check=True, timeout=300)
+    assert all(torch.equal(value, two[name]) for name, value in weights(tmp_path / "two").items())
 
     # What one began two go on with.
     words = ["--out", str(tmp_path / "one"), "--resume"]
