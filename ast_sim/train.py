@@ -189,7 +189,7 @@ class Training:
         torch.manual_seed(self.options.seed)
         self.model = build_model(config.model)
         self.sampler = self._sampler((self.processes.rank, self.processes.count))
-        self.pool = self._pool() if self.options.rollout_pool else None
+        self.pool = RolloutPool(self.sampler, self.options.rollout_pool) if self.options.rollout_pool else None
         self.ahead = Ahead(self.pool or self.sampler)
         self.optimizer = Optimizer(self.model, self.options.optimizer)
         self.metrics = Metrics(run)
@@ -219,16 +219,6 @@ class Training:
             part=part,
             from_first=self.config.model.time_conditioned,
             mirror=self.options.mirror,
-        )
-
-    def _pool(self) -> RolloutPool:
-        return RolloutPool(
-            self.sampler,
-            size=self.options.rollout_pool,
-            batch_size=self.options.batch_size,
-            seed=self.options.seed,
-            noise=self.options.noise,
-            part=(self.processes.rank, self.processes.count),
         )
 
     def _introduce(self, scales: DataScales) -> None:

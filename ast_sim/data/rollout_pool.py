@@ -33,7 +33,7 @@ class _Rolling:
 
 
 class RolloutPool:
-    """So many training scenes, rolled out side by side; batch i takes the next `batch_size` of them, in turn.
+    """So many training scenes, rolled out side by side; each batch takes the next of them, in turn.
 
     A scene begins at frame 0 or, with probability 1/2, at any frame with white noise. It ends with its last
     frame, or where its error is too large to learn from; then another one takes its place. Which one, and all noise,
@@ -42,24 +42,13 @@ class RolloutPool:
     `batch` may run ahead of `advance`, as long as the places of the two are not the same.
 
     Args:
-        sampler: reads, mirrors and puts together the frames of quasi-static scenes.
-        size: how many scenes; a multiple of `batch_size`.
-        noise: standard deviation of the sampler's white noise.
-        part: (i, n) takes the i-th of n equal parts of each batch.
+        sampler: reads, mirrors and puts together the frames of quasi-static scenes; the batch size, the seed, the
+            noise and the part of each batch are its own.
+        size: how many scenes; a multiple of the batch size.
     """
 
-    def __init__(
-        self,
-        sampler: PairSampler,
-        *,
-        size: int,
-        batch_size: int,
-        seed: int,
-        noise: float,
-        part: tuple[int, int] = (0, 1),
-    ) -> None:
-        self._sampler, self._size, self._batch_size, self._seed = sampler, size, batch_size, seed
-        self._noise, self._part = noise, part
+    def __init__(self, sampler: PairSampler, size: int) -> None:
+        self._sampler, self._size = sampler, size
         self._begun: dict[int, int] = {}
         self._rolling: dict[int, _Rolling] = {}
 
@@ -76,7 +65,7 @@ class RolloutPool:
             first += len(rows)
             scene.error = scene.mirror.vectors(rows)
             scene.t += 1
-            lost = np.sqrt(np.mean(np.square(rows, dtype=np.float64))) > LARGEST * self._noise
+            lost = np.sqrt(np.mean(np.square(rows, dtype=np.float64))) > LARGEST * self._sampler.noise
             if lost or scene.t == self._sampler.last_frame(scene.index):
                 del self._rolling[place]
 
@@ -89,7 +78,7 @@ class RolloutPool:
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Go on where `state` was taken, or those of all parts together."""
-        batches = range(self._size // self._batch_size)
+        batches = range(self._size // self._sampler.batch_size)
         own = [place for i in batches for place in self._places(i) if f"{place}.begun" in state]
         self._begun = {place: int(state[f"{place}.begun"]) for place in own}
         self._rolling = {place: self._drawn(place) for place in own if f"{place}.t" in state}
@@ -98,9 +87,9 @@ class RolloutPool:
 
     def _places(self, number: int) -> range:
         """Where in the pool the scenes of this part of a batch are."""
-        index, count = self._part
-        share = self._batch_size // count
-        first = number * self._batch_size % self._size + index * share
+        index, count = self._sampler.part
+        share = self._sampler.batch_size // count
+        first = number * self._sampler.batch_size % self._size + index * share
         return range(first, first + share)
 
     def _pair(self, place: int) -> Pair:
@@ -108,13 +97,13 @@ class RolloutPool:
             self._begun[place] = self._begun.get(place, 0) + 1
             self._rolling[place] = self._drawn(place)
         scene = self._rolling[place]
-        generator = np.random.default_rng([self._seed, _NOISE, place, self._begun[place], scene.t])
+        generator = np.random.default_rng([self._sampler.seed, _NOISE, place, self._begun[place], scene.t])
         white = self._sampler.white_noise(scene.index, generator) * np.float32(SHARE)
         return Pair(scene.index, scene.t, scene.error + white, scene.mirror)
 
     def _drawn(self, place: int) -> _Rolling:
         """The scene that began last at a place, as it began."""
-        generator = np.random.default_rng([self._seed, _SCENE, place, self._begun[place]])
+        generator = np.random.default_rng([self._sampler.seed, _SCENE, place, self._begun[place]])
         index, t = self._sampler.locate(int(generator.integers(self._sampler.num_pairs)))
         t *= int(generator.integers(2))
         noise = self._sampler.white_noise(index, generator)

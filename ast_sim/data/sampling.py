@@ -83,9 +83,9 @@ class PairSampler:
         from_first: bool = False,
         mirror: tuple[str, ...] = (),
     ) -> None:
-        self._dataset, self._split, self._batch_size, self._seed = dataset, split, batch_size, seed
-        self._noise, self._make_graph, self._dynamic, self._gamma = noise, make_graph, dynamic, gamma
-        self._part = part
+        self.batch_size, self.seed, self.noise, self.part = batch_size, seed, noise, part
+        self._dataset, self._split = dataset, split
+        self._make_graph, self._dynamic, self._gamma = make_graph, dynamic, gamma
         self._first = 1 if dynamic else 0  # the acceleration needs a frame before t
         self._from_first = from_first
         self._mirrored = np.array([axis in mirror for axis in "xyz"])
@@ -105,17 +105,17 @@ class PairSampler:
 
     def batch(self, step: int) -> tuple[Batch, Target]:
         """The batch of a step: places step * batch_size onward in the endless sequence of epochs."""
-        index, count = self._part
-        size = self._batch_size // count
-        first = step * self._batch_size + index * size
+        index, count = self.part
+        size = self.batch_size // count
+        first = step * self.batch_size + index * size
         draws = [divmod(place, self.num_pairs) for place in range(first, first + size)]
         return self.assemble([self._pair(epoch, int(self._order(epoch)[place])) for epoch, place in draws])
 
     def _pair(self, epoch: int, number: int) -> Pair:
         """A pair of all, with the noise and the mirroring that it has in an epoch."""
         index, t = self.locate(number)
-        noise = self.white_noise(index, np.random.default_rng([self._seed, _NOISE, epoch, number]))
-        mirror = self.random_mirror(index, np.random.default_rng([self._seed, _MIRROR, epoch, number]))
+        noise = self.white_noise(index, np.random.default_rng([self.seed, _NOISE, epoch, number]))
+        mirror = self.random_mirror(index, np.random.default_rng([self.seed, _MIRROR, epoch, number]))
         return Pair(index, t, noise, mirror)
 
     def locate(self, number: int) -> tuple[int, int]:
@@ -128,7 +128,7 @@ class PairSampler:
         return self._dataset.num_frames(self._split, index) - 1
 
     def _draw_order(self, epoch: int) -> np.ndarray:
-        return np.random.default_rng([self._seed, _ORDER, epoch]).permutation(self.num_pairs)
+        return np.random.default_rng([self.seed, _ORDER, epoch]).permutation(self.num_pairs)
 
     def assemble(self, pairs: list[Pair]) -> tuple[Batch, Target]:
         """The batch of these pairs; errors count where noise acts."""
@@ -167,7 +167,7 @@ class PairSampler:
 
     def white_noise(self, index: int, generator: np.random.Generator) -> np.ndarray:
         """[N, 3] float32 of the standard deviation `noise`."""
-        return generator.standard_normal(self._member(index).noisy.shape, np.float32) * np.float32(self._noise)
+        return generator.standard_normal(self._member(index).noisy.shape, np.float32) * np.float32(self.noise)
 
     def random_mirror(self, index: int, generator: np.random.Generator) -> Mirror:
         """At the middle of a scene, along each axis of `mirror` with probability 1/2."""

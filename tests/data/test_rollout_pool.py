@@ -21,9 +21,8 @@ def dataset(tmp_path):
 
 
 def pool(dataset, noise: float = NOISE, size: int = 8, part=(0, 1), mirror=("x", "y"), seed: int = 0) -> RolloutPool:
-    options = {"batch_size": 4, "seed": seed, "noise": noise, "mirror": mirror}
-    pairs = PairSampler(dataset, "train", make_graph=mesh_graph, dynamic=False, gamma=1.0, **options)
-    return RolloutPool(pairs, size=size, batch_size=4, seed=seed, noise=noise, part=part)
+    options = {"batch_size": 4, "seed": seed, "noise": noise, "mirror": mirror, "part": part}
+    return RolloutPool(PairSampler(dataset, "train", make_graph=mesh_graph, dynamic=False, gamma=1.0, **options), size)
 
 
 def residual(target, number: int, scale: float = NOISE) -> torch.Tensor:
