@@ -12,8 +12,10 @@ from ast_sim.data.file import Dataset
 from ast_sim.data.scene import NodeType
 from ast_sim.errors import ConfigError, TrainingError
 from ast_sim.measures import SquaredError, rmse_pooled
+from ast_sim.model.config import ModelConfig
 from ast_sim.run import TrainConfig
 
+ROLLOUT_BATCHES = 16  # that take turns in a pool of rollouts
 MEASURED_TRAJECTORIES = 100  # training trajectories that the scales of the data are measured on, at most
 
 
@@ -63,11 +65,11 @@ def measure(dataset: Dataset) -> DataScales:
     )
 
 
-def resolve_training(config: TrainConfig, scales: DataScales, dynamic: bool) -> TrainConfig:
-    """Fill in what the settings leave to the data.
+def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig) -> TrainConfig:
+    """Fill in what the settings leave to the data and to the model, whose settings are resolved.
 
     Raises:
-        ConfigError: naming a setting out of its range.
+        ConfigError: naming a setting out of its range, or of no use to the model.
     """
     for key, least in (("batch_size", 1), ("accumulate", 1), ("epochs", 1), ("log_every", 1), ("keep", 1), ("seed", 0)):
         if getattr(config, key) < least:
@@ -75,13 +77,9 @@ def resolve_training(config: TrainConfig, scales: DataScales, dynamic: bool) -> 
     for key in ("steps", "validate_every", "checkpoint_every"):
         if getattr(config, key) is not None and getattr(config, key) < 1:
             raise ConfigError(f"train.{key} is {getattr(config, key)}; it must be at least 1")
-    if config.rollout_pool and (config.rollout_pool % config.batch_size or config.rollout_pool < 2 * config.batch_size):
-        raise ConfigError(
-            f"train.rollout_pool is {config.rollout_pool}; it must be a multiple, at least twice, of train.batch_size ="
-            f" {config.batch_size}"
-        )
-    if config.rollout_pool and config.noise == 0:
-        raise ConfigError("train.rollout_pool needs train.noise: a rollout is given up at four times that")
+    noise = 0.45 * scales.displacement if config.noise is None else config.noise
+    if model.time_conditioned:  # starts from the true first frame each time: there is no drift to get used to
+        noise = 0.0
     scenes = config.batch_size * config.accumulate
     epoch = math.ceil(scales.pairs / scenes)
     steps = config.steps if config.steps is not None else config.epochs * epoch
@@ -91,13 +89,33 @@ def resolve_training(config: TrainConfig, scales: DataScales, dynamic: bool) -> 
         "peak_rate": 1e-4 * math.sqrt(scenes / 2),
         "warmup": min(2000, steps // 20),
         "decay": steps if config.steps is not None else steps + epoch,
-        "noise": 0.45 * scales.displacement,
-        "noise_gamma": 0.1 if dynamic else 1.0,
+        "noise_gamma": 0.1 if model.dynamic else 1.0,
         "validate_every": validate_every,
         "checkpoint_every": validate_every,
     }
     missing = {key: value for key, value in derived.items() if getattr(config, key) is None}
-    return dataclasses.replace(config, **missing)
+    return dataclasses.replace(config, **missing, noise=noise, rollout_pool=_rollout_pool(config, model, noise))
+
+
+def _rollout_pool(config: TrainConfig, model: ModelConfig, noise: float) -> int:
+    """The scenes of the pool; 0: none."""
+    useless = None
+    if model.dynamic:
+        useless = "errors of velocity would be undone in one step"
+    elif model.time_conditioned:
+        useless = "each frame follows from the first"
+    elif noise == 0:
+        useless = "without train.noise, states have no error"
+    if config.rollout_pool is None:
+        return 0 if useless else ROLLOUT_BATCHES * config.batch_size
+    if config.rollout_pool and useless:
+        raise ConfigError(f"train.rollout_pool is of no use here: {useless}")
+    if config.rollout_pool and (config.rollout_pool % config.batch_size or config.rollout_pool < 2 * config.batch_size):
+        raise ConfigError(
+            f"train.rollout_pool is {config.rollout_pool}; it must be a multiple, at least twice, of train.batch_size ="
+            f" {config.batch_size}"
+        )
+    return config.rollout_pool
 
 
 def learning_rate(config: TrainConfig, step: int) -> float:

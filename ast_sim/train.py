@@ -134,12 +134,7 @@ def _told_by_leader(processes: Processes) -> Iterator[None]:
 def resolve_run(config: RunConfig, dataset: Dataset, scales: DataScales) -> RunConfig:
     """The settings with everything filled in that they leave to the data."""
     model = config.model.resolve(dataset.info, dataset.material_width, scales.spacing)
-    if config.train.rollout_pool and (model.dynamic or model.time_conditioned):
-        why = "errors of velocity would be undone in one step" if model.dynamic else "each frame follows from the first"
-        raise ConfigError(f"train.rollout_pool is of no use here: {why}")
-    training = resolve_training(config.train, scales, model.dynamic)
-    if model.time_conditioned:  # starts from the true first frame each time: there is no drift to get used to
-        training = dataclasses.replace(training, noise=0.0)
+    training = resolve_training(config.train, scales, model)
     return RunConfig(model=model, train=training, data=str(Path(config.data).resolve()))
 
 

@@ -67,11 +67,12 @@ def conduct(
 def _entry(
     study: Study, name: str, entry: Entry, seed: int, data: Path, folder: Path
 ) -> tuple[float, dict[str, Any], dict[str, Any]]:
-    """The own rate of an entry, the validation errors by which it was found, and the record of its run from a seed."""
+    """The own rate of an entry, the validation errors by which it was found (of several), and the record of its run."""
     rates = entry.rates or study.rates
-    tried = [Job(study, name, entry, study.seeds[0], rate, study.search, data, folder) for rate in rates]
+    compared = rates if len(rates) > 1 else ()
+    tried = [Job(study, name, entry, study.seeds[0], rate, study.search, data, folder) for rate in compared]
     errors = {job.rate: _told(train(job))["best_valid"] for job in tried}
-    best = min(rates, key=lambda rate: float("inf") if errors[rate] is None else errors[rate])
+    best = min(rates, key=lambda rate: float("inf") if errors.get(rate) is None else errors[rate])
     search = {f"{rate:g}": error for rate, error in errors.items()}
     return best, search, _told(run(Job(study, name, entry, seed, best, 1, data, folder)))
 

@@ -135,6 +135,7 @@ BY_PHASE: Columns = {
 }
 COST: Columns = {
     "parameters": lambda run: measured(run).get("parameters"),
+    "learning rate": lambda run: run["rate"],
     "batch": lambda run: run["batch"],
     "ms a training step": lambda run: 1e3 * run["seconds_per_step"],
     "ms a frame pair": lambda run: 1e3 * run["seconds_per_step"] / run["batch"],
@@ -182,13 +183,14 @@ def _mean(runs: list[Run], value: Callable[[Run], Any]) -> float | None:
 
 def rates(study: dict[str, Any], models: dict[str, Any]) -> list[str]:
     """The validation errors by which each model's learning rate was chosen."""
-    if all(len(model["search"]) == 1 for model in models.values()):
+    searched = {name: model for name, model in models.items() if model["search"]}
+    if not searched:
         return []
     share = "" if study["search"] == 1 else f" with {100 * study['search']:g} % of the budget"
-    tried = sorted({rate for model in models.values() for rate in model["search"]}, key=float)
+    tried = sorted({rate for model in searched.values() for rate in model["search"]}, key=float)
     lines = [f"Rollout error on the validation scenes, mm, by learning rate{share}; the best in bold:", ""]
     lines += [f"| model | {' | '.join(tried)} |", f"| --- |{' ---: |' * len(tried)}"]
-    for name, model in models.items():
+    for name, model in searched.items():
         cells = []
         for rate in tried:
             error = model["search"].get(rate)

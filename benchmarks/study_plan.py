@@ -55,8 +55,8 @@ class Entry:
 class Study:
     """What all runs have in common.
 
-    Each entry is trained with each of the rates and the first seed; the rate with the lowest rollout error on the
-    validation scenes is its own, with which it is trained from all seeds.
+    Each entry with several rates is trained with each of them and the first seed; the rate with the lowest rollout
+    error on the validation scenes is its own, with which it is trained from all seeds.
 
     Attributes:
         minutes: of training of each run, or

@@ -15,6 +15,7 @@ from ast_sim.config import override
 from ast_sim.data.file import Dataset, DatasetWriter
 from ast_sim.data.scene import NodeType
 from ast_sim.errors import CheckpointError, ConfigError, TrainingError
+from ast_sim.model.ast_config import ASTConfig
 from ast_sim.monitor import Clock, duration
 from ast_sim.run import Metrics, RunConfig, TrainConfig
 from ast_sim.schedule import DataScales, learning_rate, measure, resolve_training, step_seed
@@ -59,19 +60,19 @@ def test_learning_rate_by_hand():
 
 
 def test_paper_defaults_follow_from_the_data():
-    resolved = resolve_training(TrainConfig(), dataclasses.replace(SCALES, pairs=480_000), dynamic=False)
+    resolved = resolve_training(TrainConfig(), dataclasses.replace(SCALES, pairs=480_000), ASTConfig())
     assert resolved.steps == 100 * 10_000
     assert resolved.peak_rate == pytest.approx(1e-4 * math.sqrt(24))
     assert resolved.warmup == 2000
     assert resolved.decay == 101 * 10_000  # the cosine ends one epoch after the last
     assert resolved.noise == pytest.approx(0.0045)
     assert resolved.noise_gamma == 1.0
-    assert resolve_training(TrainConfig(), SCALES, dynamic=True).noise_gamma == 0.1
+    assert resolve_training(TrainConfig(), SCALES, ASTConfig(integration="dynamic")).noise_gamma == 0.1
 
 
 def test_given_settings_are_kept_and_a_short_training_warms_up_for_5_percent():
     given = TrainConfig(steps=400, batch_size=4, accumulate=2, noise=0.0, peak_rate=5e-4)
-    resolved = resolve_training(given, SCALES, dynamic=False)
+    resolved = resolve_training(given, SCALES, ASTConfig())
     assert (resolved.steps, resolved.warmup, resolved.decay, resolved.noise) == (400, 20, 400, 0.0)
     assert (resolved.peak_rate, resolved.validate_every, resolved.checkpoint_every) == (5e-4, 40, 40)
 
@@ -79,7 +80,7 @@ def test_given_settings_are_kept_and_a_short_training_warms_up_for_5_percent():
 @pytest.mark.parametrize(("key", "value"), [("batch_size", 0), ("steps", 0), ("validate_every", -1), ("seed", -1)])
 def test_settings_out_of_range_are_named(key, value):
     with pytest.raises(ConfigError, match=f"train.{key} is {value}"):
-        resolve_training(dataclasses.replace(TrainConfig(), **{key: value}), SCALES, dynamic=False)
+        resolve_training(dataclasses.replace(TrainConfig(), **{key: value}), SCALES, ASTConfig())
 
 
 def test_step_seeds_differ_and_do_not_change():
@@ -122,6 +123,14 @@ def test_the_kind_of_the_dataset_decides_which_inputs_there_can_be(data, tmp_pat
     assert config.model.node_inputs == ("velocity", "displacement")
     with pytest.raises(ConfigError, match="velocity"):
         train.configure(data, "tiny", ["model.node_inputs=velocity"])
+
+
+def test_tiny_sees_other_bodies_and_learns_along_rollouts_where_that_was_measured(data, tmp_path):
+    still, moving = (train.configure(path, "tiny") for path in (data, toy.write(tmp_path / "d.h5", dynamic=True)))
+    assert still.model.node_inputs == ("displacement", "proximity") and still.train.rollout_pool is None
+    assert moving.model.node_inputs == ("displacement", "velocity")
+    paper = train.configure(data, "deforming_plate")
+    assert paper.model.node_inputs == ("displacement",) and paper.train.rollout_pool == 0
 
 
 def test_a_dynamic_dataset_is_trained_with_two_given_frames(tmp_path):
@@ -330,7 +339,7 @@ def test_along_rollouts_a_resumed_training_ends_in_the_same_bits(linear, data, t
         (["train.rollout_pool=5"], r"train.rollout_pool is 5; it must be a multiple.*train.batch_size = 2"),
         (["train.rollout_pool=2"], r"train.rollout_pool is 2; it must be a multiple, at least twice"),
         (["train.rollout_pool=-4"], r"train.rollout_pool is -4"),
-        (["train.rollout_pool=4", "train.noise=0"], r"train.rollout_pool needs train.noise"),
+        (["train.rollout_pool=4", "train.noise=0"], r"of no use here: without train.noise"),
         (["train.rollout_pool=4", "model.time_conditioned=true"], r"of no use here: each frame follows from the first"),
     ],
 )
@@ -338,6 +347,15 @@ def test_a_pool_that_cannot_be_is_refused(linear, data, tmp_path, assignments, m
     with pytest.raises(ConfigError, match=match):
         train.train(tmp_path / "run", settings(data, *assignments))
     assert not run.has_config(tmp_path / "run")
+
+
+def test_a_pool_left_to_the_data_is_of_16_batches_where_there_is_a_drift():
+    given = TrainConfig(batch_size=4, rollout_pool=None)
+    assert resolve_training(given, SCALES, ASTConfig()).rollout_pool == 64
+    for model in (ASTConfig(integration="dynamic"), ASTConfig(time_conditioned=True)):
+        assert resolve_training(given, SCALES, model).rollout_pool == 0
+    assert resolve_training(dataclasses.replace(given, noise=0.0), SCALES, ASTConfig()).rollout_pool == 0
+    assert resolve_training(TrainConfig(), SCALES, ASTConfig()).rollout_pool == 0  # the paper's
 
 
 def test_a_pool_is_for_data_without_inertia(tmp_path):

@@ -18,26 +18,30 @@ from ast_sim.data.mirror import Mirror
 from ast_sim.data.sampling import Pair, PairSampler
 
 SHARE = 1 / 3  # of the white noise that is added in each step
-LARGEST = 4.0  # root mean square error of a scene over the noise, above which it is given up
-_SCENE, _NOISE = 10, 11  # separate the random numbers of the scenes from those of their steps, and from the sampler's
+# Separate the random numbers of the order, of the scenes and of their steps; those of the sampler are others.
+_ORDER, _SCENE, _NOISE = 10, 11, 12
 
 
 @dataclass(eq=False)
 class _Rolling:
-    """A scene under way; `error` [N, 3] float32 is that of its state at frame t, not mirrored."""
+    """A scene under way.
+
+    error: [N, 3] float32, that of its state at frame t, not mirrored; None where white noise takes its place.
+    """
 
     index: int
     t: int
     mirror: Mirror
-    error: np.ndarray
+    error: np.ndarray | None
 
 
 class RolloutPool:
     """So many training scenes, rolled out side by side; each batch takes the next of them, in turn.
 
-    A scene begins at frame 0 or, with probability 1/2, at any frame with white noise. It ends with its last
-    frame, or where its error is too large to learn from; then another one takes its place. Which one, and all noise,
-    follows from the seed, the place in the pool and the number of scenes that began there.
+    A scene begins at frame 0, the first at each place at any frame, so that all frames are as frequent. After its last
+    frame another one takes its place, each about as often. Where its error exceeds the sampler's noise (root mean
+    square), it goes on from the true state with white noise: of a model that has learned little yet, the states are
+    those that it would have without a pool. All of it follows from the seed.
 
     `batch` may run ahead of `advance`, as long as the places of the two are not the same.
 
@@ -61,19 +65,22 @@ class RolloutPool:
         first = 0
         for place in self._places(number):
             scene = self._rolling[place]
-            rows = residual[first : first + len(scene.error)].numpy()
+            rows = residual[first : first + self._sampler.num_nodes(scene.index)].numpy()
             first += len(rows)
-            scene.error = scene.mirror.vectors(rows)
             scene.t += 1
-            lost = np.sqrt(np.mean(np.square(rows, dtype=np.float64))) > LARGEST * self._sampler.noise
-            if lost or scene.t == self._sampler.last_frame(scene.index):
+            if scene.t == self._sampler.last_frame(scene.index):
                 del self._rolling[place]
+            else:
+                lost = np.sqrt(np.mean(np.square(rows, dtype=np.float64))) > self._sampler.noise
+                scene.error = None if lost else scene.mirror.vectors(rows)
 
     def state(self) -> dict[str, Tensor]:
         """Where all scenes stand, for `restore`."""
         found = {f"{place}.begun": torch.tensor(count) for place, count in self._begun.items()}
         for place, scene in self._rolling.items():
-            found |= {f"{place}.t": torch.tensor(scene.t), f"{place}.error": torch.from_numpy(scene.error)}
+            found[f"{place}.t"] = torch.tensor(scene.t)
+            if scene.error is not None:
+                found[f"{place}.error"] = torch.from_numpy(scene.error)
         return found
 
     def restore(self, state: dict[str, Tensor]) -> None:
@@ -83,7 +90,8 @@ class RolloutPool:
         self._begun = {place: int(state[f"{place}.begun"]) for place in own}
         self._rolling = {place: self._drawn(place) for place in own if f"{place}.t" in state}
         for place, scene in self._rolling.items():
-            scene.t, scene.error = int(state[f"{place}.t"]), state[f"{place}.error"].numpy()
+            error = state.get(f"{place}.error")
+            scene.t, scene.error = int(state[f"{place}.t"]), None if error is None else error.numpy()
 
     def _places(self, number: int) -> range:
         """Where in the pool the scenes of this part of a batch are."""
@@ -98,14 +106,19 @@ class RolloutPool:
             self._rolling[place] = self._drawn(place)
         scene = self._rolling[place]
         generator = np.random.default_rng([self._sampler.seed, _NOISE, place, self._begun[place], scene.t])
-        white = self._sampler.white_noise(scene.index, generator) * np.float32(SHARE)
-        return Pair(scene.index, scene.t, scene.error + white, scene.mirror)
+        white = self._sampler.white_noise(scene.index, generator)
+        error = white if scene.error is None else scene.error + white * np.float32(SHARE)
+        return Pair(scene.index, scene.t, error, scene.mirror)
 
     def _drawn(self, place: int) -> _Rolling:
         """The scene that began last at a place, as it began."""
-        generator = np.random.default_rng([self._sampler.seed, _SCENE, place, self._begun[place]])
-        index, t = self._sampler.locate(int(generator.integers(self._sampler.num_pairs)))
-        t *= int(generator.integers(2))
-        noise = self._sampler.white_noise(index, generator)
-        error = noise if t else np.zeros_like(noise)
-        return _Rolling(index, t, self._sampler.random_mirror(index, generator), error)
+        seed, begun = self._sampler.seed, self._begun[place]
+        scenes = self._sampler.trajectories
+        epoch, number = divmod((begun - 1) * self._size + place, len(scenes))
+        index = int(np.random.default_rng([seed, _ORDER, epoch]).permutation(scenes)[number])
+        generator = np.random.default_rng([seed, _SCENE, place, begun])
+        t = int(generator.integers(self._sampler.last_frame(index)))
+        mirror = self._sampler.random_mirror(index, generator)
+        if begun == 1:
+            return _Rolling(index, t, mirror, None)
+        return _Rolling(index, 0, mirror, np.zeros((self._sampler.num_nodes(index), 3), np.float32))

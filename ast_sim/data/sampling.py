@@ -113,12 +113,12 @@ class PairSampler:
 
     def _pair(self, epoch: int, number: int) -> Pair:
         """A pair of all, with the noise and the mirroring that it has in an epoch."""
-        index, t = self.locate(number)
+        index, t = self._locate(number)
         noise = self.white_noise(index, np.random.default_rng([self.seed, _NOISE, epoch, number]))
         mirror = self.random_mirror(index, np.random.default_rng([self.seed, _MIRROR, epoch, number]))
         return Pair(index, t, noise, mirror)
 
-    def locate(self, number: int) -> tuple[int, int]:
+    def _locate(self, number: int) -> tuple[int, int]:
         """The trajectory and the first frame of pair 0, 1, ... `num_pairs` - 1."""
         index = int(np.searchsorted(self._starts, number, side="right")) - 1
         return index, number - int(self._starts[index]) + self._first
@@ -126,6 +126,15 @@ class PairSampler:
     def last_frame(self, index: int) -> int:
         """The number of the last frame of a trajectory."""
         return self._dataset.num_frames(self._split, index) - 1
+
+    @property
+    def trajectories(self) -> np.ndarray:
+        """Those that have a pair."""
+        return np.flatnonzero(np.diff(self._starts))
+
+    def num_nodes(self, index: int) -> int:
+        """The number of nodes of a trajectory."""
+        return len(self._member(index).noisy)
 
     def _draw_order(self, epoch: int) -> np.ndarray:
         return np.random.default_rng([self.seed, _ORDER, epoch]).permutation(self.num_pairs)

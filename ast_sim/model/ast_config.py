@@ -75,11 +75,13 @@ class ASTConfig(TimeConditionedConfig):
         return replace(resolved, L_cell=depth)
 
     def inputs_for(self, info: DatasetInfo, material_width: int) -> dict[str, list[str]]:
-        """See `ModelConfig`; the displacement always, and element nodes if there is a stress on elements."""
+        """See `ModelConfig`; the displacement always, proximity in quasi-static scenes (in dynamic ones it has not been
+        measured), and element nodes if there is a stress on elements."""
         nodes = super().inputs_for(info, material_width)["node_inputs"]
+        nearness = ["proximity"] if info.integration == "quasi_static" else []
         material = ["material"] if material_width else []
         elements = ["displacement", *material] if info.stress_location == "element" else []
-        return {"node_inputs": ["displacement", *nodes], "element_inputs": elements}
+        return {"node_inputs": ["displacement", *nearness, *nodes], "element_inputs": elements}
 
     def facts(self, length_unit: str, mesh_spacing: float | None = None) -> dict[str, str]:
         """See `ModelConfig`."""
@@ -95,7 +97,7 @@ PRESETS = {
             hidden=64, decoder_hidden=64, d_token=64, heads=4, head_dim=32, ffn_inner=128, L_SA=4, num_tokens=128,
             dropout=0.0, L_cell=None, element_inputs=(), edge_strain=True, factorized=False,
         ),
-        {"batch_size": 4, "optimizer": "muon", "peak_rate": 1e-3, "stress_weight": 0.1},
+        {"batch_size": 4, "optimizer": "muon", "peak_rate": 1e-3, "stress_weight": 0.1, "rollout_pool": None},
         adapts=True,
     ),
     "deforming_plate": Preset(ASTConfig(), _PAPER),
