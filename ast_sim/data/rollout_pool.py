@@ -17,6 +17,7 @@ from ast_sim.data.batch import Batch, Target
 from ast_sim.data.mirror import Mirror
 from ast_sim.data.sampling import Pair, PairSampler
 
+LARGEST = 4.0  # root mean square error of a state over the noise, above which there is nothing to learn from it
 SHARE = 1 / 3  # of the white noise that is added in each step
 # Separate the random numbers of the order, of the scenes and of their steps; those of the sampler are others.
 _ORDER, _SCENE, _NOISE = 10, 11, 12
@@ -39,9 +40,9 @@ class RolloutPool:
     """So many training scenes, rolled out side by side; each batch takes the next of them, in turn.
 
     A scene begins at frame 0, the first at each place at any frame, so that all frames are as frequent. After its last
-    frame another one takes its place, each about as often. Where its error exceeds the sampler's noise (root mean
-    square), it goes on from the true state with white noise: of a model that has learned little yet, the states are
-    those that it would have without a pool. All of it follows from the seed.
+    frame another one takes its place, each about as often. Where its error is too large to learn from, it goes
+    on from the true state with white noise: of a model that has learned little yet, the states are those that it would
+    have without a pool. All of it follows from the seed.
 
     `batch` may run ahead of `advance`, as long as the places of the two are not the same.
 
@@ -71,7 +72,7 @@ class RolloutPool:
             if scene.t == self._sampler.last_frame(scene.index):
                 del self._rolling[place]
             else:
-                lost = np.sqrt(np.mean(np.square(rows, dtype=np.float64))) > self._sampler.noise
+                lost = np.sqrt(np.mean(np.square(rows, dtype=np.float64))) > LARGEST * self._sampler.noise
                 scene.error = None if lost else scene.mirror.vectors(rows)
 
     def state(self) -> dict[str, Tensor]:
