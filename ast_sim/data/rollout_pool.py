@@ -41,8 +41,7 @@ class RolloutPool:
 
     A scene begins at frame 0, the first at each place at any frame, so that all frames are as frequent. After its last
     frame another one takes its place, each about as often. Where its error is too large to learn from, it goes
-    on from the true state with white noise: of a model that has learned little yet, the states are those that it would
-    have without a pool. All of it follows from the seed.
+    on from the true state with white noise, as without a pool. All of it follows from the seed.
 
     `batch` may run ahead of `advance`, as long as the places of the two are not the same.
 
@@ -53,7 +52,7 @@ class RolloutPool:
     """
 
     def __init__(self, sampler: PairSampler, size: int) -> None:
-        self._sampler, self._size = sampler, size
+        self._sampler, self._size, self._batches = sampler, size, size // sampler.batch_size
         self._begun: dict[int, int] = {}
         self._rolling: dict[int, _Rolling] = {}
 
@@ -86,8 +85,7 @@ class RolloutPool:
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Go on where `state` was taken, or those of all parts together."""
-        batches = range(self._size // self._sampler.batch_size)
-        own = [place for i in batches for place in self._places(i) if f"{place}.begun" in state]
+        own = [place for i in range(self._batches) for place in self._places(i) if f"{place}.begun" in state]
         self._begun = {place: int(state[f"{place}.begun"]) for place in own}
         self._rolling = {place: self._drawn(place) for place in own if f"{place}.t" in state}
         for place, scene in self._rolling.items():
@@ -96,10 +94,7 @@ class RolloutPool:
 
     def _places(self, number: int) -> range:
         """Where in the pool the scenes of this part of a batch are."""
-        index, count = self._sampler.part
-        share = self._sampler.batch_size // count
-        first = number * self._sampler.batch_size % self._size + index * share
-        return range(first, first + share)
+        return self._sampler.places(number % self._batches)
 
     def _pair(self, place: int) -> Pair:
         if place not in self._rolling:

@@ -83,8 +83,8 @@ class PairSampler:
         from_first: bool = False,
         mirror: tuple[str, ...] = (),
     ) -> None:
-        self.batch_size, self.seed, self.noise, self.part = batch_size, seed, noise, part
-        self._dataset, self._split = dataset, split
+        self.batch_size, self.seed, self.noise = batch_size, seed, noise
+        self._dataset, self._split, self._part = dataset, split, part
         self._make_graph, self._dynamic, self._gamma = make_graph, dynamic, gamma
         self._first = 1 if dynamic else 0  # the acceleration needs a frame before t
         self._from_first = from_first
@@ -105,11 +105,15 @@ class PairSampler:
 
     def batch(self, step: int) -> tuple[Batch, Target]:
         """The batch of a step: places step * batch_size onward in the endless sequence of epochs."""
-        index, count = self.part
+        draws = [divmod(place, self.num_pairs) for place in self.places(step)]
+        return self.assemble([self._pair(epoch, int(self._order(epoch)[place])) for epoch, place in draws])
+
+    def places(self, step: int) -> range:
+        """Which places, counted from the first batch on, are in this part of a step's batch."""
+        index, count = self._part
         size = self.batch_size // count
         first = step * self.batch_size + index * size
-        draws = [divmod(place, self.num_pairs) for place in range(first, first + size)]
-        return self.assemble([self._pair(epoch, int(self._order(epoch)[place])) for epoch, place in draws])
+        return range(first, first + size)
 
     def _pair(self, epoch: int, number: int) -> Pair:
         """A pair of all, with the noise and the mirroring that it has in an epoch."""
