@@ -2,18 +2,20 @@
 
 `python -m benchmarks.study STUDY.toml [--workers W]` writes benchmarks/results/study_NAME.json and docs/study.md, in
 which all studies with a result are shown, anew after each run. It is resumable: a run that is finished is not made
-again, one that was cut off goes on from its last checkpoint. Runs and data lie in build/study. With W workers as many
-runs are trained at a time, so their speed is measured beside each other.
+again, one that was cut off goes on from its last checkpoint. Runs and data lie in build/study; where they are gone, the
+runs in the result file stand, and those of new rows and seeds join them. With W workers as many runs are trained at a
+time, so their speed is measured beside each other.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import signal
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,7 @@ from ast_sim.errors import AstSimError
 from ast_sim.evaluate import provenance
 from ast_sim.results import write_json
 from benchmarks.study_plan import Data, Entry, Study, read
-from benchmarks.study_run import Job, measure_speeds, run, stop, train
+from benchmarks.study_run import Job, keep_speed, measure_speeds, run, stop, train
 
 FOLDER, RESULTS = Path("build/study"), Path("benchmarks/results")
 
@@ -39,42 +41,81 @@ def dataset(data: Data, folder: Path) -> Path:
     return generate(data.family, out, counts, seed=data.seed, nodes=data.nodes, frames=data.frames).path
 
 
+def finished(file: Path, study: Study, entries: dict[str, Entry]) -> dict[str, Any]:
+    """The rows of a result file that stand: entries and budget, data and settings of the study are what they were.
+
+    Runs of seeds that the study does not have, and those that failed, are left out.
+    """
+    if not file.exists():
+        return {}
+    written = json.loads(file.read_text(encoding="utf-8"))
+    free = {"title": None, "about": None, "seeds": None}
+    if {**written["study"], **free} != {**_plain(study), **free}:
+        return {}
+    rows = {}
+    for name, entry in entries.items():
+        row = written["models"].get(name, {"runs": []})
+        runs = [run for run in row["runs"] if "failed" not in run and run["seed"] in study.seeds]
+        if runs and row.items() >= _plain(entry).items():
+            rows[name] = {**row, "runs": runs}
+    return rows
+
+
+def _plain(made: Study | Entry) -> dict[str, Any]:
+    """As it is read from a result file."""
+    return json.loads(json.dumps(asdict(made)))
+
+
 def conduct(
-    study: Study, entries: dict[str, Entry], data: Path, folder: Path, workers: int
+    study: Study, entries: dict[str, Entry], data: Path, folder: Path, workers: int, known: dict[str, Any]
 ) -> Iterator[dict[str, Any]]:
     """What is known after each run: all entries from the first seed, then from the next one.
+
+    Args:
+        known: rows whose runs are not made again (see `finished`); other seeds of them have the same rate and steps.
 
     Yields:
         For each entry that has a run its `rate`, `search` (the best validation error by rate) and `runs`, one a seed.
     """
-    found: dict[str, Any] = {}
-    measure_speeds(
-        [Job(study, name, entries[name], study.seeds[0], study.rates[0], 1, data, folder) for name in entries]
-    )
+    jobs = [Job(study, name, entries[name], study.seeds[0], study.rates[0], 1, data, folder) for name in entries]
+    for job in jobs:
+        if job.name in known:
+            keep_speed(job, known[job.name]["runs"][0])
+    measure_speeds(jobs)
+    rows = dict(known)
+    if rows:
+        yield rows
     with ThreadPoolExecutor(workers) as pool:
         try:
             for seed in study.seeds:
-                made = pool.map(lambda name, seed=seed: _entry(study, name, entries[name], seed, data, folder), entries)
-                for name, (rate, search, record) in zip(entries, made, strict=True):
-                    values = {**asdict(entries[name]), "rate": rate, "search": search, "runs": []}
-                    found.setdefault(name, values)["runs"].append(record)
-                    yield found
+                missing = [replace(job, seed=seed) for job in jobs if seed not in _seeds(rows.get(job.name))]
+                for name, row in pool.map(lambda job: (job.name, _row(job, rows.get(job.name))), missing):
+                    rows[name] = row
+                    yield {name: rows[name] for name in entries if name in rows}
         except KeyboardInterrupt:
             stop()
             raise
 
 
-def _entry(
-    study: Study, name: str, entry: Entry, seed: int, data: Path, folder: Path
-) -> tuple[float, dict[str, Any], dict[str, Any]]:
-    """The own rate of an entry, the validation errors by which it was found (of several), and the record of its run."""
-    rates = entry.rates or study.rates
+def _seeds(row: dict[str, Any] | None) -> set[int]:
+    return set() if row is None else {run["seed"] for run in row["runs"]}
+
+
+def _row(job: Job, before: dict[str, Any] | None) -> dict[str, Any]:
+    """The row of an entry with one run more; before the first one, its own rate is searched for."""
+    row = before or {**asdict(job.entry), **_own_rate(job), "runs": []}
+    record = _told(run(replace(job, rate=row["rate"])))
+    return {**row, "runs": sorted([*row["runs"], record], key=lambda run: job.study.seeds.index(run["seed"]))}
+
+
+def _own_rate(job: Job) -> dict[str, Any]:
+    """The `rate` of an entry with the best validation error, and `search`, these errors by rate."""
+    rates = job.entry.rates or job.study.rates
     compared = rates if len(rates) > 1 else ()
-    tried = [Job(study, name, entry, study.seeds[0], rate, study.search, data, folder) for rate in compared]
+    tried = [replace(job, seed=job.study.seeds[0], rate=rate, share=job.study.search) for rate in compared]
     errors = {job.rate: _told(train(job))["best_valid"] for job in tried}
     best = min(rates, key=lambda rate: float("inf") if errors.get(rate) is None else errors[rate])
-    search = {f"{rate:g}": error for rate, error in errors.items()}
-    return best, search, _told(run(Job(study, name, entry, seed, best, 1, data, folder)))
+    return {"rate": best, "search": {f"{rate:g}": error for rate, error in errors.items()}}
 
 
 def _told(record: dict[str, Any]) -> dict[str, Any]:
@@ -102,7 +143,8 @@ def main() -> None:
         with Dataset(data) as opened:
             scenes = {"name": data.name if study.data.path else study.data.family, **opened.splits}
         made = provenance(f"python -m benchmarks.study {arguments.study}")
-        for found in conduct(study, entries, data, FOLDER / name, arguments.workers):
+        known = finished(file, study, entries)
+        for found in conduct(study, entries, data, FOLDER / name, arguments.workers, known):
             write_json(file, {**made, "study": asdict(study), "scenes": scenes, "models": found})
             write_page(RESULTS, Path("docs"))
     except AstSimError as error:

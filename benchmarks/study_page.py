@@ -53,11 +53,10 @@ def section(found: dict[str, Any], name: str) -> str:
     """One study: what it is, who is ahead, errors, errors by phase, cost, learning rates, settings."""
     study, models = found["study"], found["models"]
     budget = f"{study['minutes']:g} minutes" if study["minutes"] is not None else f"{study['samples']:,} frame pairs"
-    seeds = sorted({run["seed"] for model in models.values() for run in model["runs"]})
     lines = [f"## {study['title']}", "", *([study["about"], ""] if study["about"] else [])]
     lines += [
-        f"{scenes(found['scenes'], study['data'])}; {budget} of training on {study['threads']} thread(s), seeds"
-        f" {', '.join(map(str, seeds))}; commit {(found['commit'] or '?')[:10]}, {found['processor']}.",
+        f"{scenes(found['scenes'], study['data'])}; {budget} of training on {study['threads']} thread(s);"
+        f" {seeds(models)}; {', '.join(origins(models))}.",
         "",
     ]
     lines += [*verdict(models), *table(models, ERRORS), "", *trivial(models), ""]
@@ -81,6 +80,24 @@ def scenes(counts: dict[str, Any], data: dict[str, Any]) -> str:
     size = "".join(f", {data[key]:,} {key}" for key in ("nodes", "frames") if data[key] is not None)
     numbers = f"{counts['train']} scenes to train on, {counts['valid']} to validate, {counts['test']} to test"
     return f"`{counts['name']}`: {numbers}{size}"
+
+
+def seeds(models: dict[str, Any]) -> str:
+    """The seeds of the runs: of most rows, then of those that have others."""
+    rows = {name: ", ".join(str(run["seed"]) for run in model["runs"]) for name, model in models.items()}
+    common = statistics.mode(rows.values())
+    others = "".join(f", {name}: {theirs}" for name, theirs in rows.items() if theirs != common)
+    return f"seeds {common}{others}"
+
+
+def origins(models: dict[str, Any]) -> list[str]:
+    """The commits and processors of the runs, each once."""
+    made = [measured(run) for model in models.values() for run in model["runs"] if measured(run)]
+    commits = sorted({(found["commit"] or "?")[:10] for found in made})
+    return [
+        f"commit{'s' if len(commits) > 1 else ''} {', '.join(commits)}",
+        *sorted({found["processor"] for found in made}),
+    ]
 
 
 def measured(run: Run) -> dict[str, Any]:

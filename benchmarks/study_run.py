@@ -143,6 +143,12 @@ def measure_speeds(jobs: list[Job]) -> None:
             write_json(job.speed, {"seconds_per_step": min(seconds), "batch": batch})
 
 
+def keep_speed(job: Job, record: dict[str, Any]) -> None:
+    """Let further runs of the entry have as many steps as the one of a record, wherever that was made."""
+    job.place.mkdir(parents=True, exist_ok=True)
+    write_json(job.speed, {name: record[name] for name in ("seconds_per_step", "batch")})
+
+
 def _asked(job: Job, worker: Worker, *request: Any) -> Any:
     try:
         return worker.ask(*request)

@@ -2,10 +2,12 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -114,7 +116,7 @@ def test_each_model_has_the_rate_of_its_best_validation(monkeypatch, tmp_path, s
     monkeypatch.setattr(study, "measure_speeds", lambda jobs: None)
     plan = Study("x", Data(path="d"), (1e-3, 1e-4), seeds=(5, 6), samples=1, search=search)
     counts = []
-    for found in study.conduct(plan, {"a": Entry(), "b": Entry()}, tmp_path, tmp_path, 2):
+    for found in study.conduct(plan, {"a": Entry(), "b": Entry()}, tmp_path, tmp_path, 2, {}):
         counts.append([len(entry["runs"]) for entry in found.values()])
     assert counts == [[1], [1, 1], [2, 1], [2, 2]]
     assert {name: model["rate"] for name, model in found.items()} == {"a": 1e-4, "b": 1e-3}
@@ -129,7 +131,7 @@ def test_a_small_study_from_end_to_end(tmp_path):
     plan, entries = read(written(tmp_path, TOML.replace("toy.h5", str(data)).replace("1e-3]", "1e-3, 1e-4]")))
 
     def conducted(**entries: Entry) -> dict:
-        return list(study.conduct(plan, entries, data, tmp_path / "runs", 1))[-1]
+        return list(study.conduct(plan, entries, data, tmp_path / "runs", 1, {}))[-1]
 
     with pytest.raises(ConfigError, match="odd: .*no setting model.hiden"):
         conducted(odd=Entry(settings=("model.hiden=3",)))
@@ -177,8 +179,34 @@ def test_a_study_that_is_stopped_goes_on(tmp_path):
     assert not (folder / "trained.json").exists()
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=240)
     assert done.returncode == 0 and "200 steps" in done.stdout and (tmp_path / "docs/study.md").exists()
-    (run,) = json.loads((tmp_path / "benchmarks/results/study_toy.json").read_text())["models"]["ast"]["runs"]
+    result = tmp_path / "benchmarks/results/study_toy.json"
+    (run,) = json.loads(result.read_text())["models"]["ast"]["runs"]
     assert run["steps"] == 200 and "measured" in run
+    # Another seed, on a machine that has only the result: the first run stands, the new one has as many steps.
+    shutil.rmtree(tmp_path / "build")
+    text = (tmp_path / "toy.toml").read_text()
+    (tmp_path / "toy.toml").write_text("seeds = [0, 1]\n" + text)
+    subprocess.run(command, cwd=tmp_path, env=environment, check=True, timeout=240)
+    first, second = json.loads(result.read_text())["models"]["ast"]["runs"]
+    assert first == run and not folder.exists()
+    assert second["seed"] == 1 and second["curve"] != run["curve"]
+    assert [second[name] == run[name] for name in ("seconds_per_step", "batch", "steps")] == [True, True, True]
+
+
+def test_a_result_stands_for_the_same_entry_and_study(tmp_path):
+    plan, entries = read(written(tmp_path, TOML.replace("samples", "seeds = [0, 1]\nsamples")))
+    runs = [{"seed": 0}, {"seed": 1, "failed": "no memory"}, {"seed": 2}]
+    rows = {name: {**asdict(entry), "rate": 1e-3, "search": {}, "runs": runs} for name, entry in entries.items()}
+    file = tmp_path / "study_toy.json"
+    assert study.finished(file, plan, entries) == {}
+    file.write_text(json.dumps({"study": asdict(plan), "models": rows}))
+    found = study.finished(file, replace(plan, title="Other", about="it", seeds=(1, 0)), entries)
+    assert found["ast"]["runs"] == [{"seed": 0}] and found["ast"]["rate"] == 1e-3
+    assert study.finished(file, replace(plan, seeds=(1,)), entries) == {}
+    assert study.finished(file, replace(plan, samples=17), entries) == {}
+    assert study.finished(file, replace(plan, data=Data("other.h5")), entries) == {}
+    changed = {"ast": replace(entries["ast"], settings=()), "new": Entry()}
+    assert study.finished(file, plan, changed) == {}
 
 
 def test_a_failure_is_tried_anew(tmp_path, monkeypatch):
@@ -186,9 +214,9 @@ def test_a_failure_is_tried_anew(tmp_path, monkeypatch):
     plan, entries = read(written(tmp_path, TOML.replace("toy.h5", str(data))))
     with monkeypatch.context() as patch:
         patch.setenv("AST_SIM_BACKEND", "broken")
-        (found,) = study.conduct(plan, entries, data, tmp_path / "runs", 1)
+        (found,) = study.conduct(plan, entries, data, tmp_path / "runs", 1, {})
     assert "AST_SIM_BACKEND=broken is unknown" in found["ast"]["runs"][0]["failed"]
-    (found,) = study.conduct(plan, entries, data, tmp_path / "runs", 1)
+    (found,) = study.conduct(plan, entries, data, tmp_path / "runs", 1, {})
     assert "measured" in found["ast"]["runs"][0]
 
 
@@ -204,7 +232,7 @@ def page(folder, found, summary) -> None:
     text = (folder / "docs/study.md").read_text()
     assert f"{1e3 * summary:.3g}" in text and "every model stays finite" in text and "16 frame pairs" in text
     assert "all: `train.statistics_pairs=4`; ast: `model.hidden=16 model.L_SA=1 model.L_cell=3`." in text
-    assert "seeds 0; " in text  # not those that are still to come
+    assert "seeds 0; commit " in text  # not those that are still to come
     assert "by learning rate; the best in bold:\n\n| model | 0.0001 | 0.001 |\n| --- | ---: | ---: |\n| ast |" in text
     assert (folder / "docs/study/toy.svg").read_text().startswith("<?xml")
 
@@ -235,6 +263,13 @@ def run_of(rollout: float | None, milliseconds: float) -> dict:
         "batch": 4,
         "measured": {"summary": {"model": {"displacement": summary}}},
     }
+
+
+def test_the_seeds_of_most_rows_come_first():
+    of = {
+        name: {"runs": [{"seed": seed} for seed in seeds]} for name, seeds in (("a", [0, 1]), ("b", [0]), ("c", [0, 1]))
+    }
+    assert study_page.seeds(of) == "seeds 0, 1, b: 0"
 
 
 def test_the_verdict_names_the_best_baseline_and_who_is_better():
