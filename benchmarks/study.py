@@ -16,6 +16,7 @@ import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,7 @@ def dataset(data: Data, folder: Path) -> Path:
 def finished(file: Path, study: Study, entries: dict[str, Entry]) -> dict[str, Any]:
     """The rows of a result file that stand: entries and budget, data and settings of the study are what they were.
 
-    Runs of seeds that the study does not have, and those that failed, are left out.
+    Runs of other seeds than those of the entry, and those that failed, are left out.
     """
     if not file.exists():
         return {}
@@ -55,9 +56,9 @@ def finished(file: Path, study: Study, entries: dict[str, Entry]) -> dict[str, A
     rows = {}
     for name, entry in entries.items():
         row = written["models"].get(name, {"runs": []})
-        runs = [run for run in row["runs"] if "failed" not in run and run["seed"] in study.seeds]
-        if runs and row.items() >= _plain(entry).items():
-            rows[name] = {**row, "runs": runs}
+        runs = [run for run in row["runs"] if "failed" not in run and run["seed"] in (entry.seeds or study.seeds)]
+        if runs and {**row, **free}.items() >= {**_plain(entry), "seeds": None}.items():
+            rows[name] = {**row, **_plain(entry), "runs": runs}
     return rows
 
 
@@ -77,7 +78,7 @@ def conduct(
     Yields:
         For each entry that has a run its `rate`, `search` (the best validation error by rate) and `runs`, one a seed.
     """
-    jobs = [Job(study, name, entries[name], study.seeds[0], study.rates[0], 1, data, folder) for name in entries]
+    jobs = [Job(study, *entry, study.seeds[0], study.rates[0], 1, data, folder) for entry in entries.items()]
     for job in jobs:
         if job.name in known:
             keep_speed(job, known[job.name]["runs"][0])
@@ -87,8 +88,8 @@ def conduct(
         yield rows
     with ThreadPoolExecutor(workers) as pool:
         try:
-            for seed in study.seeds:
-                missing = [replace(job, seed=seed) for job in jobs if seed not in _seeds(rows.get(job.name))]
+            for turn in zip_longest(*([replace(job, seed=seed) for seed in job.seeds] for job in jobs)):
+                missing = [job for job in turn if job is not None and job.seed not in _seeds(rows.get(job.name))]
                 for name, row in pool.map(lambda job: (job.name, _row(job, rows.get(job.name))), missing):
                     rows[name] = row
                     yield {name: rows[name] for name in entries if name in rows}
@@ -105,14 +106,14 @@ def _row(job: Job, before: dict[str, Any] | None) -> dict[str, Any]:
     """The row of an entry with one run more; before the first one, its own rate is searched for."""
     row = before or {**asdict(job.entry), **_own_rate(job), "runs": []}
     record = _told(run(replace(job, rate=row["rate"])))
-    return {**row, "runs": sorted([*row["runs"], record], key=lambda run: job.study.seeds.index(run["seed"]))}
+    return {**row, "runs": sorted([*row["runs"], record], key=lambda run: job.seeds.index(run["seed"]))}
 
 
 def _own_rate(job: Job) -> dict[str, Any]:
     """The `rate` of an entry with the best validation error, and `search`, these errors by rate."""
     rates = job.entry.rates or job.study.rates
     compared = rates if len(rates) > 1 else ()
-    tried = [replace(job, seed=job.study.seeds[0], rate=rate, share=job.study.search) for rate in compared]
+    tried = [replace(job, seed=job.seeds[0], rate=rate, share=job.study.search) for rate in compared]
     errors = {job.rate: _told(train(job))["best_valid"] for job in tried}
     best = min(rates, key=lambda rate: float("inf") if errors.get(rate) is None else errors[rate])
     return {"rate": best, "search": {f"{rate:g}": error for rate, error in errors.items()}}

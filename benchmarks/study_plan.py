@@ -42,13 +42,13 @@ class Data:
 
 @dataclass(frozen=True)
 class Entry:
-    """A row of the tables: a model with a preset and settings beyond the study's; `rates` in place of the study's."""
+    """A row of the tables: a model, a preset, settings beyond the study's; own `rates` and `seeds`, or the study's."""
 
     model: str = "ast"
     preset: str = "tiny"
     settings: tuple[str, ...] = ()
     rates: tuple[float, ...] | None = None
-    about: str = ""
+    seeds: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True)

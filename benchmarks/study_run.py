@@ -44,6 +44,11 @@ class Job:
     root: Path
 
     @property
+    def seeds(self) -> tuple[int, ...]:
+        """Those of all runs of the entry."""
+        return self.entry.seeds or self.study.seeds
+
+    @property
     def place(self) -> Path:
         """The folder of all runs of the entry."""
         return self.root / re.sub(r"[^\w.=-]+", "_", self.name)

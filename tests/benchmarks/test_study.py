@@ -114,6 +114,7 @@ def test_each_model_has_the_rate_of_its_best_validation(monkeypatch, tmp_path, s
     monkeypatch.setattr(study, "train", lambda job: record(job, trained))
     monkeypatch.setattr(study, "run", lambda job: record(job, measured))
     monkeypatch.setattr(study, "measure_speeds", lambda jobs: None)
+    monkeypatch.setattr(study, "keep_speed", lambda job, record: None)
     plan = Study("x", Data(path="d"), (1e-3, 1e-4), seeds=(5, 6), samples=1, search=search)
     counts = []
     for found in study.conduct(plan, {"a": Entry(), "b": Entry()}, tmp_path, tmp_path, 2, {}):
@@ -124,6 +125,11 @@ def test_each_model_has_the_rate_of_its_best_validation(monkeypatch, tmp_path, s
     assert found["a"]["search"] == {"0.001": 2.0, "0.0001": 1.0} and found["b"]["search"]["0.0001"] is None
     assert {(seed, share) for _, seed, _, share in trained} == {(5, search)}
     assert sorted(measured) == [("a", 5, 1e-4, 1), ("a", 6, 1e-4, 1), ("b", 5, 1e-3, 1), ("b", 6, 1e-3, 1)]
+    measured.clear()
+    known = {"a": {**found["a"], "runs": found["a"]["runs"][1:]}}
+    *_, found = study.conduct(plan, {"a": Entry(), "b": Entry(seeds=(7,))}, tmp_path, tmp_path, 2, known)
+    assert sorted(measured) == [("a", 5, 1e-4, 1), ("b", 7, 1e-3, 1)]
+    assert [run["seed"] for run in found["a"]["runs"]] == [5, 6] and len(trained) == 6
 
 
 def test_a_small_study_from_end_to_end(tmp_path):
@@ -201,6 +207,9 @@ def test_a_result_stands_for_the_same_entry_and_study(tmp_path):
     assert study.finished(file, plan, entries) == {}
     file.write_text(json.dumps({"study": asdict(plan), "models": rows}))
     found = study.finished(file, replace(plan, title="Other", about="it", seeds=(1, 0)), entries)
+    assert study.finished(file, replace(plan, seeds=(3,)), {"ast": replace(entries["ast"], seeds=(1, 0))}) == {
+        "ast": {**found["ast"], "seeds": [1, 0]}
+    }
     assert found["ast"]["runs"] == [{"seed": 0}] and found["ast"]["rate"] == 1e-3
     assert study.finished(file, replace(plan, seeds=(1,)), entries) == {}
     assert study.finished(file, replace(plan, samples=17), entries) == {}
