@@ -39,13 +39,17 @@ class TrainConfig:
     warmup: int | None = _option(None, "steps of linear warm-up from 1e-4 of the peak; None: 5 % of all, at most 2000")
     decay: int | None = _option(None, "step where the cosine reaches zero; None: the end, or with epochs one later")
     clip: float = _option(1.0, "largest norm of the gradient")
-    noise: float | None = _option(None, "std of the state noise in units of length; None: 0.45 x rms displacement")
+    noise: float | None = _option(
+        None, "std of the state noise in units of length; None: 0.45 x rms displacement, if dynamic 0.6 x rms increment"
+    )
     rollout_pool: int | None = _option(
         0,
         "scenes that are rolled out while the model trains, whose states it is trained on; 0: the data's, with noise;"
-        " None: 16 batches where a model goes step by step and the data are quasi-static",
+        " None: 16 batches where a model goes step by step",
     )
-    noise_gamma: float | None = _option(None, "share of the noise that the target undoes; None: 1, and 0.1 if dynamic")
+    noise_gamma: float | None = _option(
+        None, "share of the noise that the target undoes; None: 1; 0.1 if dynamic, no pool"
+    )
     mirror: tuple[Literal["x", "y", "z"], ...] = _option(
         (), "axes along which scenes are mirrored at random: where gravity, fibres or chirality do not forbid it"
     )

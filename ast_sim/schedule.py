@@ -77,9 +77,12 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
     for key in ("steps", "validate_every", "checkpoint_every"):
         if getattr(config, key) is not None and getattr(config, key) < 1:
             raise ConfigError(f"train.{key} is {getattr(config, key)}; it must be at least 1")
-    noise = 0.45 * scales.displacement if config.noise is None else config.noise
+    # With inertia the noise is one of the velocity, too.
+    own_noise = 0.6 * scales.increment if model.dynamic else 0.45 * scales.displacement
+    noise = own_noise if config.noise is None else config.noise
     if model.time_conditioned:  # starts from the true first frame each time: there is no drift to get used to
         noise = 0.0
+    pool = _rollout_pool(config, model, noise)
     scenes = config.batch_size * config.accumulate
     epoch = math.ceil(scales.pairs / scenes)
     steps = config.steps if config.steps is not None else config.epochs * epoch
@@ -89,20 +92,18 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
         "peak_rate": 1e-4 * math.sqrt(scenes / 2),
         "warmup": min(2000, steps // 20),
         "decay": steps if config.steps is not None else steps + epoch,
-        "noise_gamma": 0.1 if model.dynamic else 1.0,
+        "noise_gamma": 0.1 if model.dynamic and not pool else 1.0,
         "validate_every": validate_every,
         "checkpoint_every": validate_every,
     }
     missing = {key: value for key, value in derived.items() if getattr(config, key) is None}
-    return dataclasses.replace(config, **missing, noise=noise, rollout_pool=_rollout_pool(config, model, noise))
+    return dataclasses.replace(config, **missing, noise=noise, rollout_pool=pool)
 
 
 def _rollout_pool(config: TrainConfig, model: ModelConfig, noise: float) -> int:
     """The scenes of the pool; 0: none."""
     useless = None
-    if model.dynamic:
-        useless = "errors of velocity would be undone in one step"
-    elif model.time_conditioned:
+    if model.time_conditioned:
         useless = "each frame follows from the first"
     elif noise == 0:
         useless = "without train.noise, states have no error"
@@ -116,6 +117,11 @@ def _rollout_pool(config: TrainConfig, model: ModelConfig, noise: float) -> int:
             f" {config.batch_size}"
         )
     return config.rollout_pool
+
+
+def largest_error(scales: DataScales, model: ModelConfig) -> float:
+    """The error of a state, in units of length, above which it does not stay in a pool: see docs/log.md."""
+    return (0.4 if model.dynamic else 1.8) * scales.displacement
 
 
 def learning_rate(config: TrainConfig, step: int) -> float:

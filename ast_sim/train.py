@@ -35,7 +35,7 @@ from ast_sim.optimizer import Optimizer
 from ast_sim.processes import Processes
 from ast_sim.profile import profile, table
 from ast_sim.run import Metrics, RunConfig, TrainConfig, has_config, read_config, write_config
-from ast_sim.schedule import DataScales, learning_rate, measure, resolve_training, step_seed
+from ast_sim.schedule import DataScales, largest_error, learning_rate, measure, resolve_training, step_seed
 from ast_sim.validation import validate
 
 CONSTANT = 1e-3  # the output is constant if its standard deviation over nodes is below this share of the targets'
@@ -184,7 +184,8 @@ class Training:
         torch.manual_seed(self.options.seed)
         self.model = build_model(config.model)
         self.sampler = self._sampler((self.processes.rank, self.processes.count))
-        self.pool = RolloutPool(self.sampler, self.options.rollout_pool) if self.options.rollout_pool else None
+        pooled, largest = self.options.rollout_pool, largest_error(scales, config.model)
+        self.pool = RolloutPool(self.sampler, pooled, largest) if pooled else None
         self.ahead = Ahead(self.pool or self.sampler)
         self.optimizer = Optimizer(self.model, self.options.optimizer)
         self.metrics = Metrics(run)

@@ -67,7 +67,8 @@ def test_paper_defaults_follow_from_the_data():
     assert resolved.decay == 101 * 10_000  # the cosine ends one epoch after the last
     assert resolved.noise == pytest.approx(0.0045)
     assert resolved.noise_gamma == 1.0
-    assert resolve_training(TrainConfig(), SCALES, ASTConfig(integration="dynamic")).noise_gamma == 0.1
+    resolved = resolve_training(TrainConfig(), SCALES, ASTConfig(integration="dynamic"))
+    assert resolved.noise_gamma == 0.1 and resolved.noise == pytest.approx(0.0012)
 
 
 def test_given_settings_are_kept_and_a_short_training_warms_up_for_5_percent():
@@ -139,7 +140,7 @@ def test_a_dynamic_dataset_is_trained_with_two_given_frames(tmp_path):
     train.train(tmp_path / "run", train.configure(dynamic, "tiny", ["model.node_inputs=velocity", *small]))
     model, resolved, _ = run.load_model(tmp_path / "run")
     assert model.config.dynamic
-    assert resolved.train.noise_gamma == 0.1
+    assert resolved.train.noise_gamma == 1.0 and resolved.train.rollout_pool == 32
     record = next(record for record in Metrics(tmp_path / "run") if "valid_rmse" in record)
     with Dataset(dynamic) as dataset:
         assert measure(dataset).pairs == 3 * 5  # 7 frames, of which 5 follow two others
@@ -352,16 +353,19 @@ def test_a_pool_that_cannot_be_is_refused(linear, data, tmp_path, assignments, m
 def test_a_pool_left_to_the_data_is_of_16_batches_where_there_is_a_drift():
     given = TrainConfig(batch_size=4, rollout_pool=None)
     assert resolve_training(given, SCALES, ASTConfig()).rollout_pool == 64
-    for model in (ASTConfig(integration="dynamic"), ASTConfig(time_conditioned=True)):
-        assert resolve_training(given, SCALES, model).rollout_pool == 0
+    dynamic = resolve_training(given, SCALES, ASTConfig(integration="dynamic"))
+    assert dynamic.rollout_pool == 64 and dynamic.noise_gamma == 1.0
+    assert resolve_training(given, SCALES, ASTConfig(time_conditioned=True)).rollout_pool == 0
     assert resolve_training(dataclasses.replace(given, noise=0.0), SCALES, ASTConfig()).rollout_pool == 0
     assert resolve_training(TrainConfig(), SCALES, ASTConfig()).rollout_pool == 0  # the paper's
 
 
-def test_a_pool_is_for_data_without_inertia(tmp_path):
-    data = toy.write(tmp_path / "dynamic.h5", dynamic=True, stress=False)
-    with pytest.raises(ConfigError, match=r"of no use here: errors of velocity"):
-        train.train(tmp_path / "run", train.configure(data, "tiny", ["train.rollout_pool=8"]))
+@pytest.mark.parametrize(
+    "setting, message", [("model.time_conditioned=true", "follows from the first"), ("train.noise=0", "have no error")]
+)
+def test_a_pool_that_is_of_no_use_is_refused(data, tmp_path, setting, message):
+    with pytest.raises(ConfigError, match=f"of no use here: .*{message}"):
+        train.train(tmp_path / "run", train.configure(data, "tiny", ["train.rollout_pool=8", setting]))
 
 
 def test_a_second_writer_is_refused(linear, data, tmp_path):

@@ -2,7 +2,8 @@
 
 White noise teaches a model to undo errors that differ from node to node. What adds up in a rollout is smooth, and other
 for each model. So scenes are rolled out while the model trains: the error that a step leaves in the position is the
-error of the state of the next, and each step is trained to lead back to the truth. It takes no prediction more.
+error of the state of the next, and each step is trained to lead back to the truth. It takes no prediction more. With
+inertia a state is two positions, and so two errors.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ from ast_sim.data.batch import Batch, Target
 from ast_sim.data.mirror import Mirror
 from ast_sim.data.sampling import Pair, PairSampler
 
-LARGEST = 4.0  # root mean square error of a state over the noise, above which there is nothing to learn from it
 SHARE = 1 / 3  # of the white noise that is added in each step
 # Separate the random numbers of the order, of the scenes and of their steps; those of the sampler are others.
 _ORDER, _SCENE, _NOISE = 10, 11, 12
@@ -25,34 +25,40 @@ _ORDER, _SCENE, _NOISE = 10, 11, 12
 
 @dataclass(eq=False)
 class _Rolling:
-    """A scene under way.
+    """A scene under way; errors are [N, 3] float32, not mirrored.
 
-    error: [N, 3] float32, that of its state at frame t, not mirrored; None where white noise takes its place.
+    error: what the last step left in p_t; None where white noise takes its place.
+    error_before: that of p_{t-1}; None where it is the true one.
+    given: that of p_t in its pair, with white noise.
     """
 
     index: int
     t: int
     mirror: Mirror
     error: np.ndarray | None
+    error_before: np.ndarray | None = None
+    given: np.ndarray | None = None
 
 
 class RolloutPool:
     """So many training scenes, rolled out side by side; each batch takes the next of them, in turn.
 
-    A scene begins at frame 0, the first at each place at any frame, so that all frames are as frequent. After its last
-    frame another one takes its place, each about as often. Where its error is too large to learn from, it goes
-    on from the true state with white noise, as without a pool. All of it follows from the seed.
+    A scene begins at its first frame, the first one at each place at any frame, so that all frames are as frequent.
+    After its last frame another one takes its place, each about as often. Where its error is too large to learn from,
+    it goes on from the true state with white noise, as without a pool. All of it follows from the seed.
 
     `batch` may run ahead of `advance`, as long as the places of the two are not the same.
 
     Args:
-        sampler: reads, mirrors and puts together the frames of quasi-static scenes; the batch size, the seed, the
-            noise and the part of each batch are its own.
+        sampler: reads, mirrors and puts together the frames of scenes; the batch size, the seed, the noise, the share
+            of errors that targets undo and the part of each batch are its own.
         size: how many scenes; a multiple of the batch size.
+        largest: root mean square error of a state, in units of length, above which there is nothing to learn from it.
     """
 
-    def __init__(self, sampler: PairSampler, size: int) -> None:
+    def __init__(self, sampler: PairSampler, size: int, largest: float) -> None:
         self._sampler, self._size, self._batches = sampler, size, size // sampler.batch_size
+        self._largest = largest
         self._begun: dict[int, int] = {}
         self._rolling: dict[int, _Rolling] = {}
 
@@ -71,16 +77,19 @@ class RolloutPool:
             if scene.t == self._sampler.last_frame(scene.index):
                 del self._rolling[place]
             else:
-                lost = np.sqrt(np.mean(np.square(rows, dtype=np.float64))) > LARGEST * self._sampler.noise
-                scene.error = None if lost else scene.mirror.vectors(rows)
+                # The target was off the truth, too, by the share of the error that it does not undo.
+                error = scene.mirror.vectors(rows) + np.float32(1 - self._sampler.gamma) * scene.given
+                lost = np.sqrt(np.mean(np.square(error, dtype=np.float64))) > self._largest
+                before = scene.given if self._sampler.dynamic else None
+                scene.error, scene.error_before = (None, None) if lost else (error, before)
 
     def state(self) -> dict[str, Tensor]:
         """Where all scenes stand, for `restore`."""
         found = {f"{place}.begun": torch.tensor(count) for place, count in self._begun.items()}
         for place, scene in self._rolling.items():
             found[f"{place}.t"] = torch.tensor(scene.t)
-            if scene.error is not None:
-                found[f"{place}.error"] = torch.from_numpy(scene.error)
+            errors = {"error": scene.error, "error_before": scene.error_before}
+            found |= {f"{place}.{key}": torch.from_numpy(value) for key, value in errors.items() if value is not None}
         return found
 
     def restore(self, state: dict[str, Tensor]) -> None:
@@ -89,8 +98,9 @@ class RolloutPool:
         self._begun = {place: int(state[f"{place}.begun"]) for place in own}
         self._rolling = {place: self._drawn(place) for place in own if f"{place}.t" in state}
         for place, scene in self._rolling.items():
-            error = state.get(f"{place}.error")
-            scene.t, scene.error = int(state[f"{place}.t"]), None if error is None else error.numpy()
+            scene.t = int(state[f"{place}.t"])
+            errors = (state.get(f"{place}.{key}") for key in ("error", "error_before"))
+            scene.error, scene.error_before = (None if error is None else error.numpy() for error in errors)
 
     def _places(self, number: int) -> range:
         """Where in the pool the scenes of this part of a batch are."""
@@ -103,8 +113,8 @@ class RolloutPool:
         scene = self._rolling[place]
         generator = np.random.default_rng([self._sampler.seed, _NOISE, place, self._begun[place], scene.t])
         white = self._sampler.white_noise(scene.index, generator)
-        error = white if scene.error is None else scene.error + white * np.float32(SHARE)
-        return Pair(scene.index, scene.t, error, scene.mirror)
+        scene.given = white if scene.error is None else scene.error + white * np.float32(SHARE)
+        return Pair(scene.index, scene.t, scene.given, scene.error_before, scene.mirror)
 
     def _drawn(self, place: int) -> _Rolling:
         """The scene that began last at a place, as it began."""
@@ -113,8 +123,9 @@ class RolloutPool:
         epoch, number = divmod((begun - 1) * self._size + place, len(scenes))
         index = int(np.random.default_rng([seed, _ORDER, epoch]).permutation(scenes)[number])
         generator = np.random.default_rng([seed, _SCENE, place, begun])
-        t = int(generator.integers(self._sampler.last_frame(index)))
+        first = self._sampler.first_frame
+        t = int(generator.integers(first, self._sampler.last_frame(index)))
         mirror = self._sampler.random_mirror(index, generator)
         if begun == 1:
             return _Rolling(index, t, mirror, None)
-        return _Rolling(index, 0, mirror, np.zeros((self._sampler.num_nodes(index), 3), np.float32))
+        return _Rolling(index, first, mirror, np.zeros((self._sampler.num_nodes(index), 3), np.float32))

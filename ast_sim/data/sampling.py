@@ -37,11 +37,13 @@ class _Member:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Frames t and t + 1 of a trajectory, the error [N, 3] float32 of the state p_t, and how all of it is mirrored."""
+    """Frames t and t + 1 of a trajectory, the errors [N, 3] float32 of p_t and, if there is inertia, of p_{t-1} (None:
+    there is none), and how all of it is mirrored."""
 
     index: int
     t: int
     error: np.ndarray
+    error_before: np.ndarray | None
     mirror: Mirror
 
 
@@ -57,7 +59,8 @@ class PairSampler:
         increment     p_{t+1} - p_t - gamma n
         acceleration  p_{t+1} - 2 p_t + p_{t-1} - (1 + gamma) n
 
-    and gamma = 1 leads back to the true next position. Scenes whose z is 0 throughout get no noise in z.
+    and gamma = 1 leads back to the true next position; an error of p_{t-1} adds to the acceleration. Scenes whose z is
+    0 throughout get no noise in z.
 
     Each pair is mirrored along each axis of `mirror` with probability 1/2, at planes through the middle of the scene at
     rest: a function of seed, epoch and pair, too.
@@ -83,17 +86,18 @@ class PairSampler:
         from_first: bool = False,
         mirror: tuple[str, ...] = (),
     ) -> None:
-        self.batch_size, self.seed, self.noise = batch_size, seed, noise
+        self.batch_size, self.seed, self.noise, self.gamma = batch_size, seed, noise, gamma
         self._dataset, self._split, self._part = dataset, split, part
-        self._make_graph, self._dynamic, self._gamma = make_graph, dynamic, gamma
-        self._first = 1 if dynamic else 0  # the acceleration needs a frame before t
+        self._make_graph, self.dynamic = make_graph, dynamic
+        self.first_frame = 1 if dynamic else 0  # of a pair: the acceleration needs a frame before
         self._from_first = from_first
         self._mirrored = np.array([axis in mirror for axis in "xyz"])
         frames = np.array([dataset.num_frames(split, i) for i in range(dataset.count(split))], np.int64)
-        self._starts = np.concatenate([[0], np.cumsum(np.maximum(frames - 1 - self._first, 0))])
+        self._starts = np.concatenate([[0], np.cumsum(np.maximum(frames - 1 - self.first_frame, 0))])
         if self.num_pairs == 0:
+            least = 2 + self.first_frame
             raise DatasetError(
-                f"{dataset.path}: {split} has no trajectory of at least {2 + self._first} frames to draw pairs from"
+                f"{dataset.path}: {split} has no trajectory of at least {least} frames to draw pairs from"
             )
         self._members: dict[int, _Member] = {}
         self._order = lru_cache(maxsize=2)(self._draw_order)
@@ -120,12 +124,12 @@ class PairSampler:
         index, t = self._locate(number)
         noise = self.white_noise(index, np.random.default_rng([self.seed, _NOISE, epoch, number]))
         mirror = self.random_mirror(index, np.random.default_rng([self.seed, _MIRROR, epoch, number]))
-        return Pair(index, t, noise, mirror)
+        return Pair(index, t, noise, None, mirror)
 
     def _locate(self, number: int) -> tuple[int, int]:
         """The trajectory and the first frame of pair 0, 1, ... `num_pairs` - 1."""
         index = int(np.searchsorted(self._starts, number, side="right")) - 1
-        return index, number - int(self._starts[index]) + self._first
+        return index, number - int(self._starts[index]) + self.first_frame
 
     def last_frame(self, index: int) -> int:
         """The number of the last frame of a trajectory."""
@@ -158,8 +162,10 @@ class PairSampler:
             numbers.append(t + 1.0)
             positions.append(mirror.points(now + noise))
             boundary.append(mirror.vectors(np.where(member.prescribed, increment, np.float32(0))))
-            motion = increment - np.float32(self._gamma) * noise
-            if self._dynamic:
+            motion = increment - np.float32(self.gamma) * noise
+            if self.dynamic:
+                if pair.error_before is not None:
+                    before = before + pair.error_before * member.noisy
                 previous.append(mirror.points(before))
                 motion -= now - before + noise
             motions.append(mirror.vectors(motion))
@@ -173,7 +179,7 @@ class PairSampler:
     def _read(self, index: int, t: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Positions and stresses of the frames that a pair needs; the last two are the state's and the target's."""
         if not self._from_first:
-            return self._dataset.frames(self._split, index, t - self._first, t + 2)
+            return self._dataset.frames(self._split, index, t - self.first_frame, t + 2)
         frames = (self._dataset.frames(self._split, index, frame, frame + 1) for frame in (0, t + 1))
         positions, stresses = zip(*frames, strict=True)
         return np.concatenate(positions), None if stresses[0] is None else np.concatenate(stresses)
