@@ -36,10 +36,12 @@ Run = dict[str, Any]
 
 def write_page(results: Path, docs: Path) -> None:
     """Write study.md and its pictures into `docs`, from the files study_*.json in `results`."""
-    parts = [INTRODUCTION]
-    for file in sorted(results.glob("study_*.json")):
-        found = json.loads(file.read_text(encoding="utf-8"))
-        name = file.stem.removeprefix("study_")
+    studies = {
+        file.stem.removeprefix("study_"): json.loads(file.read_text(encoding="utf-8"))
+        for file in sorted(results.glob("study_*.json"))
+    }
+    parts = [INTRODUCTION, *glance({found["study"]["title"]: found["models"] for found in studies.values()})]
+    for name, found in studies.items():
         draw(found, docs / "study" / f"{name}.svg")
         parts.append(section(found, name))
     if (sizes := results / "scaling.json").exists():
@@ -163,13 +165,19 @@ COST: Columns = {
 }
 
 
-def verdict(models: dict[str, Any]) -> list[str]:
-    """AST beside the best of the paper's baselines: error of the rollout and time of a frame pair."""
+def rival(models: dict[str, Any]) -> str | None:
+    """The baseline of the paper with the smallest rollout error; None if there is none, or no AST beside it."""
     errors = {name: _mean(model["runs"], ERRORS["rollout, mm"]) for name, model in models.items()}
     rivals = [name for name, model in models.items() if model["model"] in BASELINES and errors[name] is not None]
-    if errors.get("AST") is None or not rivals:
+    return min(rivals, key=errors.__getitem__) if rivals and errors.get("AST") is not None else None
+
+
+def verdict(models: dict[str, Any]) -> list[str]:
+    """AST beside the best of the paper's baselines: error of the rollout and time of a frame pair."""
+    best = rival(models)
+    if best is None:
         return []
-    best = min(rivals, key=errors.__getitem__)
+    errors = {name: _mean(model["runs"], ERRORS["rollout, mm"]) for name, model in models.items()}
     ratio = errors["AST"] / errors[best]
     text = f"**AST's rollout error is {number(ratio)} of that of the best baseline, {best}** (the aim is {AIM:g}"
     text += ", reached)" if ratio <= AIM else ", not reached)"
@@ -183,6 +191,29 @@ def verdict(models: dict[str, Any]) -> list[str]:
     ]
     text += f". Better than AST: {'; '.join(ahead)}." if ahead else ". No other row has a smaller error."
     return [text, ""]
+
+
+def glance(studies: dict[str, Any]) -> list[str]:
+    """All studies in one table: AST's errors beside those of the best baseline of each, and over them."""
+    columns = {
+        "rollout, mm": ERRORS["rollout, mm"],
+        "first contact, mm": BY_PHASE["first contact"],
+        "stress, rollout, kPa": ERRORS["stress, rollout, kPa"],
+    }
+    lines = []
+    for title, models in studies.items():
+        best = rival(models)
+        if best is None:
+            continue
+        cells = []
+        for value in columns.values():
+            ours, theirs = (_mean(models[name]["runs"], value) for name in ("AST", best))
+            cells.append(f"{number(ours)} : {number(theirs)} = **{number(ours / theirs)}**" if ours and theirs else "-")
+        lines.append(f"| {title} | {best} | {' | '.join(cells)} |")
+    if not lines:
+        return []
+    head = [f"| study | best baseline | {' | '.join(columns)} |", f"| --- | --- |{' ---: |' * len(columns)}"]
+    return ["AST beside the best of the paper's baselines, and the ratio; below 1 AST is ahead:", "", *head, *lines, ""]
 
 
 def own_settings(study: dict[str, Any], models: dict[str, Any]) -> list[str]:

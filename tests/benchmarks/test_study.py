@@ -292,6 +292,11 @@ def test_the_verdict_names_the_best_baseline_and_who_is_better():
     (text, _) = study_page.verdict(models)
     assert "0.6 of that of the best baseline, BSMS" in text and "0.5, not reached" in text
     assert "0.25 of MGN's time" in text and text.endswith("Better than AST: AST, other (0.48).")
+    head, rule, line = [line for line in study_page.glance({"Toy": models, "no AST": {}}) if line.startswith("|")]
+    assert line == "| Toy | BSMS | 1.5 : 2.5 = **0.6** | - | - |" and head.count("|") == rule.count("|") == line.count(
+        "|"
+    )
+    assert study_page.glance({"no AST": {"MGN": models["MGN"]}}) == []
     models["AST"]["runs"] = [run_of(1e-3, 5.0)]
     (text, _) = study_page.verdict(models)
     assert "0.4 of that of" in text and "0.5, reached" in text and text.endswith("No other row has a smaller error.")
