@@ -87,9 +87,9 @@ def scenes(counts: dict[str, Any], data: dict[str, Any]) -> str:
 def seeds(models: dict[str, Any]) -> str:
     """The seeds of the runs: of most rows, then of those that have others."""
     rows = {name: ", ".join(str(run["seed"]) for run in model["runs"]) for name, model in models.items()}
-    common = statistics.mode(rows.values())
-    others = "".join(f", {name}: {theirs}" for name, theirs in rows.items() if theirs != common)
-    return f"seeds {common}{others}"
+    common, *others = sorted(set(rows.values()), key=list(rows.values()).count, reverse=True)
+    told = "; ".join(f"{', '.join(name for name in rows if rows[name] == theirs)}: {theirs}" for theirs in others)
+    return f"seeds {common}" + (f" ({told})" if others else "")
 
 
 def origins(models: dict[str, Any]) -> list[str]:

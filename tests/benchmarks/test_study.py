@@ -278,7 +278,7 @@ def test_the_seeds_of_most_rows_come_first():
     of = {
         name: {"runs": [{"seed": seed} for seed in seeds]} for name, seeds in (("a", [0, 1]), ("b", [0]), ("c", [0, 1]))
     }
-    assert study_page.seeds(of) == "seeds 0, 1, b: 0"
+    assert study_page.seeds(of) == "seeds 0, 1 (b: 0)"
 
 
 def test_the_verdict_names_the_best_baseline_and_who_is_better():
