@@ -47,9 +47,7 @@ class TrainConfig:
         "scenes that are rolled out while the model trains, whose states it is trained on; 0: the data's, with noise;"
         " None: 16 batches where a model goes step by step",
     )
-    noise_gamma: float | None = _option(
-        None, "share of the noise that the target undoes; None: 1; 0.1 if dynamic, no pool"
-    )
+    noise_gamma: float | None = _option(None, "share of the noise that the target undoes; None: 1, and 0.1 if dynamic")
     mirror: tuple[Literal["x", "y", "z"], ...] = _option(
         (), "axes along which scenes are mirrored at random: where gravity, fibres or chirality do not forbid it"
     )

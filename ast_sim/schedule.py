@@ -82,7 +82,6 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
     noise = own_noise if config.noise is None else config.noise
     if model.time_conditioned:  # starts from the true first frame each time: there is no drift to get used to
         noise = 0.0
-    pool = _rollout_pool(config, model, noise)
     scenes = config.batch_size * config.accumulate
     epoch = math.ceil(scales.pairs / scenes)
     steps = config.steps if config.steps is not None else config.epochs * epoch
@@ -92,12 +91,12 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
         "peak_rate": 1e-4 * math.sqrt(scenes / 2),
         "warmup": min(2000, steps // 20),
         "decay": steps if config.steps is not None else steps + epoch,
-        "noise_gamma": 0.1 if model.dynamic and not pool else 1.0,
+        "noise_gamma": 0.1 if model.dynamic else 1.0,
         "validate_every": validate_every,
         "checkpoint_every": validate_every,
     }
     missing = {key: value for key, value in derived.items() if getattr(config, key) is None}
-    return dataclasses.replace(config, **missing, noise=noise, rollout_pool=pool)
+    return dataclasses.replace(config, **missing, noise=noise, rollout_pool=_rollout_pool(config, model, noise))
 
 
 def _rollout_pool(config: TrainConfig, model: ModelConfig, noise: float) -> int:

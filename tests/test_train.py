@@ -140,7 +140,7 @@ def test_a_dynamic_dataset_is_trained_with_two_given_frames(tmp_path):
     train.train(tmp_path / "run", train.configure(dynamic, "tiny", ["model.node_inputs=velocity", *small]))
     model, resolved, _ = run.load_model(tmp_path / "run")
     assert model.config.dynamic
-    assert resolved.train.noise_gamma == 1.0 and resolved.train.rollout_pool == 32
+    assert resolved.train.noise_gamma == 0.1 and resolved.train.rollout_pool == 32
     record = next(record for record in Metrics(tmp_path / "run") if "valid_rmse" in record)
     with Dataset(dynamic) as dataset:
         assert measure(dataset).pairs == 3 * 5  # 7 frames, of which 5 follow two others
@@ -354,7 +354,7 @@ def test_a_pool_left_to_the_data_is_of_16_batches_where_there_is_a_drift():
     given = TrainConfig(batch_size=4, rollout_pool=None)
     assert resolve_training(given, SCALES, ASTConfig()).rollout_pool == 64
     dynamic = resolve_training(given, SCALES, ASTConfig(integration="dynamic"))
-    assert dynamic.rollout_pool == 64 and dynamic.noise_gamma == 1.0
+    assert dynamic.rollout_pool == 64
     assert resolve_training(given, SCALES, ASTConfig(time_conditioned=True)).rollout_pool == 0
     assert resolve_training(dataclasses.replace(given, noise=0.0), SCALES, ASTConfig()).rollout_pool == 0
     assert resolve_training(TrainConfig(), SCALES, ASTConfig()).rollout_pool == 0  # the paper's
