@@ -56,7 +56,7 @@ def finished(file: Path, study: Study, entries: dict[str, Entry]) -> dict[str, A
     rows = {}
     for name, entry in entries.items():
         row = written["models"].get(name, {"runs": []})
-        runs = [run for run in row["runs"] if "failed" not in run and run["seed"] in (entry.seeds or study.seeds)]
+        runs = [run for run in row["runs"] if "failed" not in run and run["seed"] in study.seeds_of(entry)]
         if runs and {**row, **free}.items() >= {**_plain(entry), "seeds": None}.items():
             rows[name] = {**row, **_plain(entry), "runs": runs}
     return rows

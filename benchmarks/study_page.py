@@ -165,9 +165,14 @@ COST: Columns = {
 }
 
 
+def rollout_errors(models: dict[str, Any]) -> dict[str, float | None]:
+    """The rollout error of each row, mm."""
+    return {name: _mean(model["runs"], ERRORS["rollout, mm"]) for name, model in models.items()}
+
+
 def rival(models: dict[str, Any]) -> str | None:
     """The baseline of the paper with the smallest rollout error; None if there is none, or no AST beside it."""
-    errors = {name: _mean(model["runs"], ERRORS["rollout, mm"]) for name, model in models.items()}
+    errors = rollout_errors(models)
     rivals = [name for name, model in models.items() if model["model"] in BASELINES and errors[name] is not None]
     return min(rivals, key=errors.__getitem__) if rivals and errors.get("AST") is not None else None
 
@@ -177,7 +182,7 @@ def verdict(models: dict[str, Any]) -> list[str]:
     best = rival(models)
     if best is None:
         return []
-    errors = {name: _mean(model["runs"], ERRORS["rollout, mm"]) for name, model in models.items()}
+    errors = rollout_errors(models)
     ratio = errors["AST"] / errors[best]
     text = f"**AST's rollout error is {number(ratio)} of that of the best baseline, {best}** (the aim is {AIM:g}"
     text += ", reached)" if ratio <= AIM else ", not reached)"

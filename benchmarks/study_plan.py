@@ -90,6 +90,10 @@ class Study:
         if (self.data.path is None) == (self.data.family is None):
             raise ConfigError("data: name either the path of a dataset or the family that is generated")
 
+    def seeds_of(self, entry: Entry) -> tuple[int, ...]:
+        """Those of all runs of an entry."""
+        return entry.seeds or self.seeds
+
 
 def read(path: Path) -> tuple[Study, dict[str, Entry]]:
     """The study of a file and its entries by name.

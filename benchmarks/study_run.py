@@ -46,7 +46,7 @@ class Job:
     @property
     def seeds(self) -> tuple[int, ...]:
         """Those of all runs of the entry."""
-        return self.entry.seeds or self.study.seeds
+        return self.study.seeds_of(self.entry)
 
     @property
     def place(self) -> Path:

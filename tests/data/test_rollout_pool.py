@@ -56,35 +56,11 @@ def frame(name: str) -> tuple[int, int]:
     return int(words[0].split("/")[1]), int(words[-1])
 
 
-def test_the_state_is_where_the_model_led_and_the_target_leads_back(dataset):
-    rolls = pool(dataset, mirror=())
-    before: dict[int, tuple] = {}
-    went_on = 0
-    for number in range(24):
-        batch, target = rolls.batch(number)
-        error = residual(target, number) * normal(batch)[:, None]
-        rows = batch.graph.node_offsets.tolist()
-        for k, name in enumerate(batch.names):
-            part = slice(rows[k], rows[k + 1])
-            index, t = frame(name)
-            truth = torch.tensor(dataset.load("train", index).position)
-            free = normal(batch)[part] > 0
-            torch.testing.assert_close((batch.position + target.motion)[part][free], truth[t + 1][free])
-            white = batch.position[part] - truth[t]
-            place = number % 2 * 4 + k
-            if place in before and before[place][0] == (index, t - 1):
-                white = white - before[place][1]
-                went_on += 1
-            share = SHARE if place in before else 1
-            assert not white[~free].any() and 0 < float(white[free].abs().max()) < 5 * NOISE * share
-            before[place] = ((index, t), error[part])
-        rolls.advance(number, error)
-    assert went_on > 40
-
-
+@pytest.mark.parametrize("dynamic, least", [(False, 40), (True, 20)])
 @pytest.mark.parametrize("gamma", [1.0, 0.3])
-def test_with_inertia_both_positions_of_a_state_have_their_errors(dataset, gamma):
-    rolls = pool(dataset, mirror=(), dynamic=True, gamma=gamma)
+def test_the_state_is_where_the_model_led_and_the_target_leads_back(dataset, dynamic, least, gamma):
+    """With inertia a state is two positions, each with the error that it had when it was the newest."""
+    rolls = pool(dataset, mirror=(), dynamic=dynamic, gamma=gamma)
     before: dict[int, tuple] = {}
     went_on = 0
     for number in range(24):
@@ -94,26 +70,27 @@ def test_with_inertia_both_positions_of_a_state_have_their_errors(dataset, gamma
         for k, name in enumerate(batch.names):
             part = slice(rows[k], rows[k + 1])
             index, t = frame(name)
-            assert t > 0
             truth = torch.tensor(dataset.load("train", index).position)
-            position, previous = batch.position[part], batch.previous_position[part]
-            error, error_before = position - truth[t], previous - truth[t - 1]
-            free = normal(batch)[part] > 0
-            # What a model without fault makes of the state: the share gamma of its error is undone.
-            reached = 2 * position - previous + target.motion[part]
-            torch.testing.assert_close((reached - truth[t + 1])[free], (1 - gamma) * error[free], rtol=0, atol=1e-6)
+            position, free = batch.position[part], normal(batch)[part] > 0
+            error = position - truth[t]
             place = number % 2 * 4 + k
+            white, given = error, torch.zeros_like(error)
             if place in before and before[place][0] == (index, t - 1):
                 _, given, led = before[place]
-                torch.testing.assert_close(error_before, given, rtol=0, atol=1e-6)
                 white = error - led - (1 - gamma) * given
-                assert 0 < float(white[free].abs().max()) < 5 * NOISE * SHARE
                 went_on += 1
-            else:
-                assert not error_before.any()
+            share = SHARE if place in before else 1
+            assert not white[~free].any() and 0 < float(white[free].abs().max()) < 5 * NOISE * share
+            reached = position + target.motion[part]
+            if dynamic:
+                previous = batch.previous_position[part]
+                torch.testing.assert_close(previous - truth[t - 1], given, rtol=0, atol=1e-6)
+                reached += position - previous
+            # What a model without fault makes of the state: the share gamma of its error is undone.
+            torch.testing.assert_close((reached - truth[t + 1])[free], (1 - gamma) * error[free], rtol=0, atol=1e-6)
             before[place] = ((index, t), error, left[part])
         rolls.advance(number, left)
-    assert went_on > 20
+    assert went_on > least
 
 
 def test_mirroring_turns_errors_back(dataset):
