@@ -78,7 +78,7 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
         if getattr(config, key) is not None and getattr(config, key) < 1:
             raise ConfigError(f"train.{key} is {getattr(config, key)}; it must be at least 1")
     # With inertia the noise is one of the velocity, too.
-    own_noise = 0.6 * scales.increment if model.dynamic else 0.45 * scales.displacement
+    own_noise = 0.1 * scales.increment if model.dynamic else 0.45 * scales.displacement
     noise = own_noise if config.noise is None else config.noise
     if model.time_conditioned:  # starts from the true first frame each time: there is no drift to get used to
         noise = 0.0

@@ -68,7 +68,7 @@ def test_paper_defaults_follow_from_the_data():
     assert resolved.noise == pytest.approx(0.0045)
     assert resolved.noise_gamma == 1.0
     resolved = resolve_training(TrainConfig(), SCALES, ASTConfig(integration="dynamic"))
-    assert resolved.noise_gamma == 0.1 and resolved.noise == pytest.approx(0.0012)
+    assert resolved.noise_gamma == 0.1 and resolved.noise == pytest.approx(0.0002)
 
 
 def test_given_settings_are_kept_and_a_short_training_warms_up_for_5_percent():

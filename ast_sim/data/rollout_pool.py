@@ -2,8 +2,12 @@
 
 White noise teaches a model to undo errors that differ from node to node. What adds up in a rollout is smooth, and other
 for each model. So scenes are rolled out while the model trains: the error that a step leaves in the position is the
-error of the state of the next, and each step is trained to lead back to the truth. It takes no prediction more. With
-inertia a state is two positions, and so two errors.
+error of the state of the next, and each step is trained to lead back to the truth. It takes no prediction more.
+
+With inertia a state is two positions, and so two errors. Led back in one step, an error of the velocity would ask for
+accelerations far above those of the data. So errors are led back as by a critically damped spring:
+
+    e_{t+1} = 2 r e_t - r^2 e_{t-1},    r = 1 - gamma.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ from ast_sim.data.batch import Batch, Target
 from ast_sim.data.mirror import Mirror
 from ast_sim.data.sampling import Pair, PairSampler
 
-SHARE = 1 / 3  # of the white noise that is added in each step
+SHARE = np.float32(1 / 3)  # of the white noise that is added in each step
 # Separate the random numbers of the order, of the scenes and of their steps; those of the sampler are others.
 _ORDER, _SCENE, _NOISE = 10, 11, 12
 
@@ -29,7 +33,7 @@ class _Rolling:
 
     error: what the last step left in p_t; None where white noise takes its place.
     error_before: that of p_{t-1}; None where it is the true one.
-    given: that of p_t in its pair, with white noise.
+    pair: the one that the scene gave last.
     """
 
     index: int
@@ -37,7 +41,7 @@ class _Rolling:
     mirror: Mirror
     error: np.ndarray | None
     error_before: np.ndarray | None = None
-    given: np.ndarray | None = None
+    pair: Pair | None = None
 
 
 class RolloutPool:
@@ -77,10 +81,9 @@ class RolloutPool:
             if scene.t == self._sampler.last_frame(scene.index):
                 del self._rolling[place]
             else:
-                # The target was off the truth, too, by the share of the error that it does not undo.
-                error = scene.mirror.vectors(rows) + np.float32(1 - self._sampler.gamma) * scene.given
+                error = scene.mirror.vectors(rows) + scene.pair.error_after  # the target was off the truth, too
                 lost = np.sqrt(np.mean(np.square(error, dtype=np.float64))) > self._largest
-                before = scene.given if self._sampler.dynamic else None
+                before = scene.pair.error if self._sampler.dynamic else None
                 scene.error, scene.error_before = (None, None) if lost else (error, before)
 
     def state(self) -> dict[str, Tensor]:
@@ -113,8 +116,19 @@ class RolloutPool:
         scene = self._rolling[place]
         generator = np.random.default_rng([self._sampler.seed, _NOISE, place, self._begun[place], scene.t])
         white = self._sampler.white_noise(scene.index, generator)
-        scene.given = white if scene.error is None else scene.error + white * np.float32(SHARE)
-        return Pair(scene.index, scene.t, scene.given, scene.error_before, scene.mirror)
+        error, after = white, self._sampler.left * white
+        if scene.error is not None:
+            error, after = scene.error + white * SHARE, after * SHARE + self._led_back(scene)
+        scene.pair = Pair(scene.index, scene.t, scene.mirror, error, scene.error_before, after)
+        return scene.pair
+
+    def _led_back(self, scene: _Rolling) -> np.ndarray:
+        """What the target leaves in p_{t+1} of the error that the last step left in p_t."""
+        left = self._sampler.left
+        if not self._sampler.dynamic:
+            return left * scene.error
+        before = np.float32(0) if scene.error_before is None else scene.error_before
+        return 2 * left * scene.error - left**2 * before
 
     def _drawn(self, place: int) -> _Rolling:
         """The scene that began last at a place, as it began."""

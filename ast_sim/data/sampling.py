@@ -37,14 +37,20 @@ class _Member:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Frames t and t + 1 of a trajectory, the errors [N, 3] float32 of p_t and, if there is inertia, of p_{t-1} (None:
-    there is none), and how all of it is mirrored."""
+    """Frames t and t + 1 of a trajectory, and how they are mirrored; errors are [N, 3] float32, not mirrored.
+
+    Attributes:
+        error: that of p_t in the state.
+        error_before: if there is inertia, that of p_{t-1}; None: there is none.
+        error_after: that of p_{t+1} to which the target leads.
+    """
 
     index: int
     t: int
+    mirror: Mirror
     error: np.ndarray
     error_before: np.ndarray | None
-    mirror: Mirror
+    error_after: np.ndarray
 
 
 class PairSampler:
@@ -86,7 +92,8 @@ class PairSampler:
         from_first: bool = False,
         mirror: tuple[str, ...] = (),
     ) -> None:
-        self.batch_size, self.seed, self.noise, self.gamma = batch_size, seed, noise, gamma
+        self.batch_size, self.seed, self.noise = batch_size, seed, noise
+        self.left = np.float32(1 - gamma)  # the share of the noise that stays in the target
         self._dataset, self._split, self._part = dataset, split, part
         self._make_graph, self.dynamic = make_graph, dynamic
         self.first_frame = 1 if dynamic else 0  # of a pair: the acceleration needs a frame before
@@ -124,7 +131,7 @@ class PairSampler:
         index, t = self._locate(number)
         noise = self.white_noise(index, np.random.default_rng([self.seed, _NOISE, epoch, number]))
         mirror = self.random_mirror(index, np.random.default_rng([self.seed, _MIRROR, epoch, number]))
-        return Pair(index, t, noise, None, mirror)
+        return Pair(index, t, mirror, noise, None, self.left * noise)
 
     def _locate(self, number: int) -> tuple[int, int]:
         """The trajectory and the first frame of pair 0, 1, ... `num_pairs` - 1."""
@@ -156,18 +163,18 @@ class PairSampler:
             position, stress = self._read(pair.index, t)
             before, now, after = position[0], position[-2], position[-1]
             increment = after - now
-            noise = pair.error * member.noisy
+            error, error_after = pair.error * member.noisy, pair.error_after * member.noisy
             graphs.append(member.graph.mirrored(mirror))
             names.append(f"{self._split}/{pair.index:06d} frame {t}")
             numbers.append(t + 1.0)
-            positions.append(mirror.points(now + noise))
+            positions.append(mirror.points(now + error))
             boundary.append(mirror.vectors(np.where(member.prescribed, increment, np.float32(0))))
-            motion = increment - np.float32(self.gamma) * noise
+            motion = increment + (error_after - error)
             if self.dynamic:
                 if pair.error_before is not None:
                     before = before + pair.error_before * member.noisy
                 previous.append(mirror.points(before))
-                motion -= now - before + noise
+                motion -= now - before + error
             motions.append(mirror.vectors(motion))
             if stress is not None:
                 stresses.append(stress[-2])

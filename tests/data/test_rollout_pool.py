@@ -60,8 +60,8 @@ def frame(name: str) -> tuple[int, int]:
 @pytest.mark.parametrize("gamma", [1.0, 0.3])
 def test_the_state_is_where_the_model_led_and_the_target_leads_back(dataset, dynamic, least, gamma):
     """With inertia a state is two positions, each with the error that it had when it was the newest."""
-    rolls = pool(dataset, mirror=(), dynamic=dynamic, gamma=gamma)
-    before: dict[int, tuple] = {}
+    rolls, stays = pool(dataset, mirror=(), dynamic=dynamic, gamma=gamma), 1 - gamma
+    last: dict[int, tuple] = {}
     went_on = 0
     for number in range(24):
         batch, target = rolls.batch(number)
@@ -72,25 +72,42 @@ def test_the_state_is_where_the_model_led_and_the_target_leads_back(dataset, dyn
             index, t = frame(name)
             truth = torch.tensor(dataset.load("train", index).position)
             position, free = batch.position[part], normal(batch)[part] > 0
-            error = position - truth[t]
-            place = number % 2 * 4 + k
-            white, given = error, torch.zeros_like(error)
-            if place in before and before[place][0] == (index, t - 1):
-                _, given, led = before[place]
-                white = error - led - (1 - gamma) * given
+            place, error = number % 2 * 4 + k, position - truth[t]
+            led = before = torch.zeros_like(error)
+            if place in last and last[place][0] == (index, t - 1):
+                _, before, led = last[place]
                 went_on += 1
-            share = SHARE if place in before else 1
+            white, share = error - led, SHARE if place in last else 1
             assert not white[~free].any() and 0 < float(white[free].abs().max()) < 5 * NOISE * share
             reached = position + target.motion[part]
             if dynamic:
                 previous = batch.previous_position[part]
-                torch.testing.assert_close(previous - truth[t - 1], given, rtol=0, atol=1e-6)
+                torch.testing.assert_close(previous - truth[t - 1], before, rtol=0, atol=1e-6)
                 reached += position - previous
-            # What a model without fault makes of the state: the share gamma of its error is undone.
-            torch.testing.assert_close((reached - truth[t + 1])[free], (1 - gamma) * error[free], rtol=0, atol=1e-6)
-            before[place] = ((index, t), error, left[part])
+            # Noise is undone by the share gamma; with inertia what was there before it comes back as by a spring.
+            back = 2 * stays * led - stays**2 * before if dynamic else stays * led
+            after = (reached - truth[t + 1])[free]
+            torch.testing.assert_close(after, (stays * white + back)[free], rtol=0, atol=1e-6)
+            last[place] = ((index, t), error, (reached - truth[t + 1]) * free[:, None] + left[part])
         rolls.advance(number, left)
     assert went_on > least
+
+
+def test_with_inertia_a_faultless_model_leads_an_error_back_without_overshoot(tmp_path):
+    """Three steps after an error e of a scene at rest: 2 r e, 3 r^2 e, 4 r^3 e."""
+    with Dataset(write(tmp_path / "long.h5", {"train": [trajectory(block(1, 1, 1), 12)]})) as dataset:
+        rolls, r = pool(dataset, mirror=(), dynamic=True, gamma=0.3, noise=1e-12), 0.7
+        truth, errors, kick = torch.tensor(dataset.load("train", 0).position), [], 1e-3
+        for number in range(0, 40, 2):
+            batch, target = rolls.batch(number)
+            free, (_, t) = normal(batch)[: len(truth[0])] > 0, frame(batch.names[0])
+            errors.append(float((batch.position[: len(free)] - truth[t])[free].mean()))
+            rolls.advance(number, torch.full(target.motion.shape, kick if t == 1 else 0.0))
+            if t == 1:
+                errors = []
+            elif t == 5:
+                break
+    assert errors == pytest.approx([kick, 2 * r * kick, 3 * r**2 * kick, 4 * r**3 * kick], rel=1e-3)
 
 
 def test_mirroring_turns_errors_back(dataset):
