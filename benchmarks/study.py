@@ -15,6 +15,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import asdict, replace
 from itertools import zip_longest
 from pathlib import Path
@@ -70,7 +71,7 @@ def _plain(made: Study | Entry) -> dict[str, Any]:
 def conduct(
     study: Study, entries: dict[str, Entry], data: Path, folder: Path, workers: int, known: dict[str, Any]
 ) -> Iterator[dict[str, Any]]:
-    """What is known after each run: all entries from the first seed, then from the next one.
+    """What is known after each run: all entries from the first seed, then from the next one. Closed, it stops all runs.
 
     Args:
         known: rows whose runs are not made again (see `finished`); other seeds of them have the same rate and steps.
@@ -93,7 +94,7 @@ def conduct(
                 for name, row in pool.map(lambda job: (job.name, _row(job, rows.get(job.name))), missing):
                     rows[name] = row
                     yield {name: rows[name] for name in entries if name in rows}
-        except KeyboardInterrupt:
+        except BaseException:  # Ctrl-C here, or what made its consumer close it
             stop()
             raise
 
@@ -145,9 +146,10 @@ def main() -> None:
             scenes = {"name": data.name if study.data.path else study.data.family, **opened.splits}
         made = provenance(f"python -m benchmarks.study {arguments.study}")
         known = finished(file, study, entries)
-        for found in conduct(study, entries, data, FOLDER / name, arguments.workers, known):
-            write_json(file, {**made, "study": asdict(study), "scenes": scenes, "models": found})
-            write_page(RESULTS, Path("docs"))
+        with closing(conduct(study, entries, data, FOLDER / name, arguments.workers, known)) as rows:
+            for found in rows:
+                write_json(file, {**made, "study": asdict(study), "scenes": scenes, "models": found})
+                write_page(RESULTS, Path("docs"))
     except AstSimError as error:
         sys.exit(str(error))
     except KeyboardInterrupt:

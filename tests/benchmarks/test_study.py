@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -130,6 +131,30 @@ def test_each_model_has_the_rate_of_its_best_validation(monkeypatch, tmp_path, s
     *_, found = study.conduct(plan, {"a": Entry(), "b": Entry(seeds=(7,))}, tmp_path, tmp_path, 2, known)
     assert sorted(measured) == [("a", 5, 1e-4, 1), ("b", 7, 1e-3, 1)]
     assert [run["seed"] for run in found["a"]["runs"]] == [5, 6] and len(trained) == 6
+
+
+def test_told_to_stop_while_it_writes_it_stops_what_runs(monkeypatch, tmp_path):
+    stopped = threading.Event()
+
+    def run(job):
+        record = {"name": job.name, "seed": job.seed, "rate": job.rate, "steps": 1, "best_valid": 1.0}
+        return record if job.name == "a" or stopped.wait(5) else pytest.fail("it was waited for")
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(study, "run", run)
+    monkeypatch.setattr(study, "stop", stopped.set)
+    monkeypatch.setattr(study, "measure_speeds", lambda jobs: None)
+    monkeypatch.setattr(study_page, "write_page", interrupted)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    toy.write(tmp_path / "toy.h5")
+    written(tmp_path, TOML.replace("[models.ast]", "[models.a]\n[models.b]"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["study", "toy.toml", "--workers", "2"])
+    with pytest.raises(SystemExit, match="stopped: the same command goes on from here"):
+        study.main()
+    assert stopped.is_set()
 
 
 def test_a_small_study_from_end_to_end(tmp_path):
