@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import statistics
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from benchmarks.svg import axes_of_picture, save
 INTRODUCTION = """# The models compared
 
 Made by `python -m benchmarks.study STUDY.toml`; the studies lie in `benchmarks/studies`. All runs of a study have the
-same scenes, splits, state noise and budget, and the same training but for what is said to be set otherwise; each has
+same scenes, splits and budget, and the same state noise and training but for what is said to be set otherwise; each has
 the learning rate of those tried with which its rollouts of the validation scenes are best, and the checkpoint that is
 evaluated is chosen by such rollouts, too. The budget is so many steps as fit in it at the speeds that were measured in
 turns before; what the training then took by the clock, beside other work, is told, too. Errors are those of the test
@@ -87,8 +88,8 @@ def scenes(counts: dict[str, Any], data: dict[str, Any]) -> str:
 def seeds(models: dict[str, Any]) -> str:
     """The seeds of the runs: of most rows, then of those that have others."""
     rows = {name: ", ".join(str(run["seed"]) for run in model["runs"]) for name, model in models.items()}
-    common, *others = sorted(set(rows.values()), key=list(rows.values()).count, reverse=True)
-    told = "; ".join(f"{', '.join(name for name in rows if rows[name] == theirs)}: {theirs}" for theirs in others)
+    (common, _), *others = Counter(rows.values()).most_common()
+    told = "; ".join(f"{', '.join(name for name in rows if rows[name] == theirs)}: {theirs}" for theirs, _ in others)
     return f"seeds {common}" + (f" ({told})" if others else "")
 
 

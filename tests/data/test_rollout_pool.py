@@ -81,8 +81,10 @@ def test_the_state_is_where_the_model_led_and_the_target_leads_back(dataset, dyn
             assert not white[~free].any() and 0 < float(white[free].abs().max()) < 5 * NOISE * share
             reached = position + target.motion[part]
             if dynamic:
+                assert t > 0
                 previous = batch.previous_position[part]
                 torch.testing.assert_close(previous - truth[t - 1], before, rtol=0, atol=1e-6)
+                assert before.any() or torch.equal(previous, truth[t - 1])
                 reached += position - previous
             # Noise is undone by the share gamma; with inertia what was there before it comes back as by a spring.
             back = 2 * stays * led - stays**2 * before if dynamic else stays * led
