@@ -22,11 +22,12 @@ Made by `python -m benchmarks.study STUDY.toml`; the studies lie in `benchmarks/
 same scenes, splits and budget, and the same state noise and training but for what is said to be set otherwise; each has
 the learning rate of those tried with which its rollouts of the validation scenes are best, and the checkpoint that is
 evaluated is chosen by such rollouts, too. The budget is so many steps as fit in it at the speeds that were measured in
-turns before; what the training then took by the clock, beside other work, is told, too. Errors are those of the test
-scenes, on nodes that the model moves: root mean squares over coordinates, by sequence (`rmse_sequence`, as in the AST
-paper) or pooled over everything (`rmse_pooled`, as in MeshGraphNets); means over the seeds, with the least and the
-largest in brackets. A time-conditioned model predicts every frame from the first: it has no error of one step, and its
-first 50 frames are no easier than the others.
+turns before, those of rows that came later in turns with a row that was there and in proportion to its speed; what the
+training then took by the clock, beside other work, is told, too. Errors are those of the test scenes, on nodes that the
+model moves: root mean squares over coordinates, by sequence (`rmse_sequence`, as in the AST paper) or pooled over
+everything (`rmse_pooled`, as in MeshGraphNets); means over the seeds, with the least and the largest in brackets. A
+time-conditioned model predicts every frame from the first: it has no error of one step, and its first 50 frames are no
+easier than the others.
 """
 
 AIM = 0.5  # AST's rollout error over that of the best baseline; the paper reports 0.38 on deforming_plate

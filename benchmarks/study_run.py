@@ -96,8 +96,7 @@ def _once(file: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 
 
 def _trained(job: Job) -> dict[str, Any]:
-    speed = json.loads(job.speed.read_text(encoding="utf-8"))
-    study = job.study
+    speed, study = _speed(job), job.study
     if study.minutes is not None:
         steps = max(1, round(job.share * 60 * study.minutes / speed["seconds_per_step"]))
     else:
@@ -126,26 +125,37 @@ def _measured(job: Job) -> dict[str, Any]:
 def measure_speeds(jobs: list[Job]) -> None:
     """Measure, in turns, the seconds of a training step of each model, without validations and checkpoints.
 
-    The least of all turns counts: what else the machine does must not give one model more steps than another.
+    The least of all turns counts: what else the machine does must not give one model more steps than another. Neither
+    must the hour: where the speed of an entry is known, it is measured once more beside those that are missing, and
+    these are told as they would have been then.
 
     Raises:
         ConfigError: a model does not train, with its name and the reason.
     """
     missing = [job for job in jobs if not job.speed.exists()]
+    known = [job for job in jobs if job.speed.exists()][: bool(missing)]
+    seconds, batches = _measured_speeds([*missing, *known])
+    slower = seconds[known[0].name] / _speed(known[0])["seconds_per_step"] if known else 1
+    for job in missing:
+        write_json(job.speed, {"seconds_per_step": seconds[job.name] / slower, "batch": batches[job.name]})
+
+
+def _measured_speeds(jobs: list[Job]) -> tuple[dict[str, float], dict[str, int]]:
+    """Seconds of a training step, and frame pairs in it, by entry."""
     with ExitStack() as stack:
-        workers = []
-        for job in missing:
+        workers = {}
+        for job in jobs:
             job.place.mkdir(parents=True, exist_ok=True)
             setup = Setup(str(job.data), job.entry.model, job.entry.preset, job.settings, str(job.place))
-            workers.append(Worker("c", job.study.threads, setup, job.place / "speed.log"))
-            stack.callback(workers[-1].close)
-        turns = []
-        for turn in range(1 + REPEATS):
-            seconds = [_asked(job, worker, "step", STEPS) for job, worker in zip(missing, workers, strict=True)]
-            turns += [seconds] if turn else []  # the first one warms up
-        for job, worker, *seconds in zip(missing, workers, *turns, strict=True):
-            batch = _asked(job, worker, "batch")
-            write_json(job.speed, {"seconds_per_step": min(seconds), "batch": batch})
+            workers[job.name] = Worker("c", job.study.threads, setup, job.place / "speed.log")
+            stack.callback(workers[job.name].close)
+        turns = [{name: _asked(name, workers[name], "step", STEPS) for name in workers} for _ in range(1 + REPEATS)]
+        seconds = {name: min(turn[name] for turn in turns[1:]) for name in workers}  # the first one warms up
+        return seconds, {name: _asked(name, workers[name], "batch") for name in workers}
+
+
+def _speed(job: Job) -> dict[str, Any]:
+    return json.loads(job.speed.read_text(encoding="utf-8"))
 
 
 def keep_speed(job: Job, record: dict[str, Any]) -> None:
@@ -154,11 +164,11 @@ def keep_speed(job: Job, record: dict[str, Any]) -> None:
     write_json(job.speed, {name: record[name] for name in ("seconds_per_step", "batch")})
 
 
-def _asked(job: Job, worker: Worker, *request: Any) -> Any:
+def _asked(name: str, worker: Worker, *request: Any) -> Any:
     try:
         return worker.ask(*request)
     except RuntimeError as error:
-        raise ConfigError(f"{job.name}: {error}") from error
+        raise ConfigError(f"{name}: {error}") from error
 
 
 class Stopped(Exception):

@@ -21,7 +21,7 @@ from ast_sim.errors import ConfigError
 from ast_sim.rollout import Rollout
 from ast_sim.run import read_config
 from ast_sim.simulate.checkpoint import Checkpoint
-from benchmarks import increments, study, study_page
+from benchmarks import increments, study, study_page, study_run
 from benchmarks.study_measure import phase_errors, phases, repeated
 from benchmarks.study_plan import Data, Entry, Study, read
 
@@ -222,6 +222,31 @@ def test_a_study_that_is_stopped_goes_on(tmp_path):
     assert first == run and not folder.exists()
     assert second["seed"] == 1 and second["curve"] != run["curve"]
     assert [second[name] == run[name] for name in ("seconds_per_step", "batch", "steps")] == [True, True, True]
+
+
+def test_an_entry_that_joins_has_the_speed_of_the_hour_of_the_others(tmp_path, monkeypatch):
+    plan, _ = read(written(tmp_path, TOML))
+    now, began = {"mgn": [9.0, 3.0, 2.0, 3.0, 3.0, 3.0], "hcmt": [9.0] * 6, "bsms": [0.1] + [5.0] * 5}, []
+
+    class Clock:
+        def __init__(self, backend, threads, setup, log) -> None:
+            self.model, self.turns = setup.model, iter(now[setup.model])
+            began.append(setup.model)
+
+        def ask(self, what, count=1):
+            return next(self.turns) if what == "step" else 4
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr(study_run, "Worker", Clock)
+    first, *others = (study_run.Job(plan, m, Entry(m), 0, 1e-3, 1, tmp_path, tmp_path) for m in ("mgn", "hcmt", "bsms"))
+    study_run.keep_speed(first, {"seconds_per_step": 0.5, "batch": 2})
+    for _ in range(2):
+        study_run.measure_speeds([first, *others])
+    assert began == ["hcmt", "bsms", "mgn"]  # once: then all are known
+    kept = [json.loads(job.speed.read_text()) for job in (first, *others)]
+    assert kept == [{"seconds_per_step": s, "batch": b} for s, b in ((0.5, 2), (9 / 4, 4), (5 / 4, 4))]
 
 
 def test_a_result_stands_for_the_same_entry_and_study(tmp_path):
