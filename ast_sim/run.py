@@ -45,7 +45,7 @@ class TrainConfig:
     rollout_pool: int | None = _option(
         0,
         "scenes that are rolled out while the model trains, whose states it is trained on; 0: the data's, with noise;"
-        " None: 16 batches where a model goes step by step",
+        " None: 16 batches where a model goes step by step, of the baselines if dynamic",
     )
     noise_gamma: float | None = _option(None, "share of the noise that the target undoes; None: 1, and 0.1 if dynamic")
     mirror: tuple[Literal["x", "y", "z"], ...] = _option(

@@ -107,7 +107,7 @@ def _rollout_pool(config: TrainConfig, model: ModelConfig, noise: float) -> int:
     elif noise == 0:
         useless = "without train.noise, states have no error"
     if config.rollout_pool is None:
-        return 0 if useless else ROLLOUT_BATCHES * config.batch_size
+        return ROLLOUT_BATCHES * config.batch_size if model.gains_along_rollouts and not useless else 0
     if config.rollout_pool and useless:
         raise ConfigError(f"train.rollout_pool is of no use here: {useless}")
     if config.rollout_pool and (config.rollout_pool % config.batch_size or config.rollout_pool < 2 * config.batch_size):

@@ -16,6 +16,7 @@ from ast_sim.data.file import Dataset, DatasetWriter
 from ast_sim.data.scene import NodeType
 from ast_sim.errors import CheckpointError, ConfigError, TrainingError
 from ast_sim.model.ast_config import ASTConfig
+from ast_sim.models import MODELS
 from ast_sim.monitor import Clock, duration
 from ast_sim.run import Metrics, RunConfig, TrainConfig
 from ast_sim.schedule import DataScales, learning_rate, measure, resolve_training, step_seed
@@ -358,6 +359,16 @@ def test_a_pool_left_to_the_data_is_of_16_batches_where_there_is_a_drift():
     assert resolve_training(given, SCALES, ASTConfig(time_conditioned=True)).rollout_pool == 0
     assert resolve_training(dataclasses.replace(given, noise=0.0), SCALES, ASTConfig()).rollout_pool == 0
     assert resolve_training(TrainConfig(), SCALES, ASTConfig()).rollout_pool == 0  # the paper's
+
+
+@pytest.mark.parametrize("model", sorted(MODELS.keys() - {"ast"}))
+def test_the_pool_of_a_baseline_is_for_scenes_with_inertia(model):
+    still = MODELS[model].presets["tiny"]
+    given, moving = TrainConfig(**still.train), dataclasses.replace(still.model, integration="dynamic")
+    assert resolve_training(given, SCALES, still.model).rollout_pool == 0
+    assert resolve_training(given, SCALES, moving).rollout_pool == 64
+    for name, preset in MODELS[model].presets.items():
+        assert name == "tiny" or preset.train.get("rollout_pool", 0) == 0  # as published
 
 
 @pytest.mark.parametrize(

@@ -182,7 +182,7 @@ PRESETS = {
     # A size that two cores train in minutes.
     "tiny": Preset(
         BSMSConfig(hidden=64, hidden_layers=1, levels=3, contacts="components"),
-        {"batch_size": 4, "optimizer": "muon", "peak_rate": 1e-3, "stress_weight": 0.1},
+        {"batch_size": 4, "optimizer": "muon", "peak_rate": 1e-3, "stress_weight": 0.1, "rollout_pool": None},
         adapts=True,
     ),
     # As the AST paper trains it (sections "Batch Size and Learning Rate", "Baselines").

@@ -155,7 +155,7 @@ PRESETS = {
     # A size that two cores train in minutes.
     "tiny": Preset(
         HCMTConfig(hidden=64, hidden_layers=1, levels=3),
-        {"batch_size": 4, "optimizer": "muon", "peak_rate": 2e-3, "stress_weight": 0.1},
+        {"batch_size": 4, "optimizer": "muon", "peak_rate": 2e-3, "stress_weight": 0.1, "rollout_pool": None},
         adapts=True,
     ),
     # As the AST paper trains it, one scene on each of four GPUs (sections "Batch Size and Learning Rate", "Baselines").

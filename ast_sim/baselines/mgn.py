@@ -91,7 +91,7 @@ PRESETS = {
     # A size that two cores train in minutes.
     "tiny": Preset(
         MGNConfig(hidden=64, hidden_layers=1, blocks=8),
-        {"batch_size": 4, "optimizer": "muon", "peak_rate": 4e-3, "stress_weight": 0.1},
+        {"batch_size": 4, "optimizer": "muon", "peak_rate": 4e-3, "stress_weight": 0.1, "rollout_pool": None},
         adapts=True,
     ),
     # As the AST paper trains it (sections "Batch Size and Learning Rate", "Baselines").

@@ -188,7 +188,7 @@ class Transolver(Simulator):
 PRESETS = {
     "tiny": Preset(
         TransolverConfig(hidden=64, blocks=4, heads=4, slices=32, mlp_ratio=2),
-        {"batch_size": 4, "peak_rate": 1e-3, "stress_weight": 0.1},
+        {"batch_size": 4, "peak_rate": 1e-3, "stress_weight": 0.1, "rollout_pool": None},
         adapts=True,
     ),
     # StructBench (github.com/qilinli/StructBench), configs/deforming_plate/transolver.toml; noise of 3 mm, weights 1.

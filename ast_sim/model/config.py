@@ -70,6 +70,12 @@ class ModelConfig:
         return self.integration == "dynamic"
 
     @property
+    def gains_along_rollouts(self) -> bool:
+        """Whether there is a `train.rollout_pool` where it is left open: with inertia rollouts run away without one
+        (docs/log.md, 2026-11-23)."""
+        return self.dynamic
+
+    @property
     def sees_surfaces(self) -> bool:
         """Whether the inputs need the surfaces of the bodies."""
         return "proximity" in self.node_inputs
