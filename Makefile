@@ -19,10 +19,13 @@ demo: $(VENV)/installed
 # The op tests run once more on each instruction set that is supported but was not chosen, except those that run on all by themselves.
 OTHER_SETS = from ast_sim.ops.library import configuration as c; print(*(i for i in c()["supported"] if i != c()["instruction_set"]))
 
+# Side by side, of a file in any order; more than four processes could want more memory than there is.
+PYTEST := $(BIN)/python -m pytest --numprocesses=auto --maxprocesses=4 --dist=worksteal
+
 test: $(VENV)/tested
-	$(BIN)/python -m pytest
+	$(PYTEST)
 	@set -e; for isa in $$($(BIN)/python -c '$(OTHER_SETS)'); do \
-	  echo "AST_SIM_ISA=$$isa"; AST_SIM_ISA=$$isa $(BIN)/python -m pytest tests/ops -k "not every_instruction_set"; \
+	  echo "AST_SIM_ISA=$$isa"; AST_SIM_ISA=$$isa $(PYTEST) tests/ops -k "not every_instruction_set"; \
 	done
 
 bench: $(VENV)/benched
