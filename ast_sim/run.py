@@ -40,7 +40,9 @@ class TrainConfig:
     decay: int | None = _option(None, "step where the cosine reaches zero; None: the end, or with epochs one later")
     clip: float = _option(1.0, "largest norm of the gradient")
     noise: float | None = _option(
-        None, "std of the state noise in units of length; None: 0.45 x rms displacement, if dynamic 0.1 x rms increment"
+        None,
+        "std of the state noise in units of length; None: 0.45 x rms displacement, along rollouts 0.15 x, if dynamic"
+        " 0.1 x rms increment",
     )
     rollout_pool: int | None = _option(
         0,

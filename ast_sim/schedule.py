@@ -77,11 +77,6 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
     for key in ("steps", "validate_every", "checkpoint_every"):
         if getattr(config, key) is not None and getattr(config, key) < 1:
             raise ConfigError(f"train.{key} is {getattr(config, key)}; it must be at least 1")
-    # With inertia the noise is one of the velocity, too.
-    own_noise = 0.1 * scales.increment if model.dynamic else 0.45 * scales.displacement
-    noise = own_noise if config.noise is None else config.noise
-    if model.time_conditioned:  # starts from the true first frame each time: there is no drift to get used to
-        noise = 0.0
     scenes = config.batch_size * config.accumulate
     epoch = math.ceil(scales.pairs / scenes)
     steps = config.steps if config.steps is not None else config.epochs * epoch
@@ -96,15 +91,27 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
         "checkpoint_every": validate_every,
     }
     missing = {key: value for key, value in derived.items() if getattr(config, key) is None}
-    return dataclasses.replace(config, **missing, noise=noise, rollout_pool=_rollout_pool(config, model, noise))
+    pool = _rollout_pool(config, model)
+    return dataclasses.replace(config, **missing, noise=_noise(config, scales, model, pool > 0), rollout_pool=pool)
 
 
-def _rollout_pool(config: TrainConfig, model: ModelConfig, noise: float) -> int:
+def _noise(config: TrainConfig, scales: DataScales, model: ModelConfig, along_rollouts: bool) -> float:
+    """The standard deviation of the state noise; the shares are those found best (docs/log.md, 2026-11-23)."""
+    if model.time_conditioned:  # starts from the true first frame each time: there is no drift to get used to
+        return 0.0
+    if config.noise is not None:
+        return config.noise
+    if model.dynamic:  # it is one of the velocity, too
+        return 0.1 * scales.increment
+    return (0.15 if along_rollouts else 0.45) * scales.displacement
+
+
+def _rollout_pool(config: TrainConfig, model: ModelConfig) -> int:
     """The scenes of the pool; 0: none."""
     useless = None
     if model.time_conditioned:
         useless = "each frame follows from the first"
-    elif noise == 0:
+    elif config.noise == 0:
         useless = "without train.noise, states have no error"
     if config.rollout_pool is None:
         return ROLLOUT_BATCHES * config.batch_size if model.gains_along_rollouts and not useless else 0

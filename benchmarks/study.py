@@ -1,4 +1,4 @@
-"""Compares models under one protocol: equal scenes, splits, noise and budget, each with its own best learning rate.
+"""Compares models under one protocol: equal scenes, splits and budget, each with its own best learning rate.
 
 `python -m benchmarks.study STUDY.toml [--workers W]` writes benchmarks/results/study_NAME.json and docs/study.md, in
 which all studies with a result are shown, anew after each run. It is resumable: a run that is finished is not made

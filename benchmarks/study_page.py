@@ -19,13 +19,14 @@ from benchmarks.svg import axes_of_picture, save
 INTRODUCTION = """# The models compared
 
 Made by `python -m benchmarks.study STUDY.toml`; the studies lie in `benchmarks/studies`. All runs of a study have the
-same scenes, splits and budget, and the same state noise and training but for what is said to be set otherwise; each has
-the learning rate of those tried with which its rollouts of the validation scenes are best, and the checkpoint that is
-evaluated is chosen by such rollouts, too. The budget is so many steps as fit in it at the speeds that were measured in
-turns before, those of rows that came later in turns with a row that was there and in proportion to its speed; what the
-training then took by the clock, beside other work, is told, too. Errors are those of the test scenes, on nodes that the
-model moves: root mean squares over coordinates, by sequence (`rmse_sequence`, as in the AST paper) or pooled over
-everything (`rmse_pooled`, as in MeshGraphNets); means over the seeds, with the least and the largest in brackets. A
+same scenes, splits and budget, and the same training but for what is said to be set otherwise; the state noise, of
+which a model that is trained along its own rollouts needs less, stands in the tables. Each has the learning rate of
+those tried with which its rollouts of the validation scenes are best, and the checkpoint that is evaluated is chosen
+by such rollouts, too. The budget is so many steps as fit in it at the speeds that were measured in turns before, those
+of rows that came later in turns with a row that was there and in proportion to its speed; what the training then took
+by the clock, beside other work, is told, too. Errors are those of the test scenes, on nodes that the model moves: root
+mean squares over coordinates, by sequence (`rmse_sequence`, as in the AST paper) or pooled over everything
+(`rmse_pooled`, as in MeshGraphNets); means over the seeds, with the least and the largest in brackets. A
 time-conditioned model predicts every frame from the first: it has no error of one step, and its first 50 frames are no
 easier than the others.
 """
@@ -157,6 +158,7 @@ BY_PHASE: Columns = {
 COST: Columns = {
     "parameters": lambda run: measured(run).get("parameters"),
     "learning rate": lambda run: run["rate"],
+    "noise, mm": lambda run: None if run.get("noise") is None else 1e3 * run["noise"],
     "batch": lambda run: run["batch"],
     "ms a training step": lambda run: 1e3 * run["seconds_per_step"],
     "ms a frame pair": lambda run: 1e3 * run["seconds_per_step"] / run["batch"],

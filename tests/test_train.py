@@ -353,9 +353,10 @@ def test_a_pool_that_cannot_be_is_refused(linear, data, tmp_path, assignments, m
 
 def test_a_pool_left_to_the_data_is_of_16_batches_where_there_is_a_drift():
     given = TrainConfig(batch_size=4, rollout_pool=None)
-    assert resolve_training(given, SCALES, ASTConfig()).rollout_pool == 64
+    still = resolve_training(given, SCALES, ASTConfig())
+    assert still.rollout_pool == 64 and still.noise == pytest.approx(0.0015)  # a third of that without a pool
     dynamic = resolve_training(given, SCALES, ASTConfig(integration="dynamic"))
-    assert dynamic.rollout_pool == 64 and dynamic.noise_gamma == 0.1
+    assert dynamic.rollout_pool == 64 and dynamic.noise_gamma == 0.1 and dynamic.noise == pytest.approx(0.0002)
     assert resolve_training(given, SCALES, ASTConfig(time_conditioned=True)).rollout_pool == 0
     assert resolve_training(dataclasses.replace(given, noise=0.0), SCALES, ASTConfig()).rollout_pool == 0
     assert resolve_training(TrainConfig(), SCALES, ASTConfig()).rollout_pool == 0  # the paper's
