@@ -53,6 +53,11 @@ class TrainConfig:
     mirror: tuple[Literal["x", "y", "z"], ...] = _option(
         (), "axes along which scenes are mirrored at random: where gravity, fibres or chirality do not forbid it"
     )
+    shift: float | None = _option(
+        0.0,
+        "largest distance, along each axis and in units of length, by which scenes are moved at random; None: half the"
+        " side of the model's cells",
+    )
     stress_weight: float = _option(0.01, "weight of the stress in the loss; motion has 1")
     statistics_pairs: int = _option(400, "frame pairs that the input and output scales are taken from")
     seed: int = _option(0, "initial weights, order, noise and dropout follow from it")

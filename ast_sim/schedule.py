@@ -15,6 +15,7 @@ from ast_sim.measures import SquaredError, rmse_pooled
 from ast_sim.model.config import ModelConfig
 from ast_sim.run import TrainConfig
 
+LARGEST_SHIFT = 0.05  # of the domain's half width, where it is left open: `Domain` has more room than that
 ROLLOUT_BATCHES = 16  # that take turns in a pool of rollouts
 MEASURED_TRAJECTORIES = 100  # training trajectories that the scales of the data are measured on, at most
 
@@ -92,7 +93,8 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
     }
     missing = {key: value for key, value in derived.items() if getattr(config, key) is None}
     pool = _rollout_pool(config, model)
-    return dataclasses.replace(config, **missing, noise=_noise(config, scales, model, pool > 0), rollout_pool=pool)
+    noise = _noise(config, scales, model, pool > 0)
+    return dataclasses.replace(config, **missing, noise=noise, rollout_pool=pool, shift=_shift(config, model))
 
 
 def _noise(config: TrainConfig, scales: DataScales, model: ModelConfig, along_rollouts: bool) -> float:
@@ -123,6 +125,15 @@ def _rollout_pool(config: TrainConfig, model: ModelConfig) -> int:
             f" {config.batch_size}"
         )
     return config.rollout_pool
+
+
+def _shift(config: TrainConfig, model: ModelConfig) -> float:
+    """The largest distance by which scenes are moved: with half a cell side all places of the cells are as likely."""
+    if config.shift is None:
+        return min(model.cell_side / 2, LARGEST_SHIFT * model.domain_half_width)
+    if not 0 <= config.shift < math.inf:
+        raise ConfigError(f"train.shift is {config.shift}; it must be at least 0")
+    return config.shift
 
 
 def largest_error(scales: DataScales, model: ModelConfig) -> float:

@@ -215,6 +215,7 @@ class Training:
             part=part,
             from_first=self.config.model.time_conditioned,
             mirror=self.options.mirror,
+            shift=self.options.shift,
         )
 
     def _introduce(self, scales: DataScales) -> None:

@@ -14,7 +14,7 @@ from ast_sim import checkpoint, run, train
 from ast_sim.config import override
 from ast_sim.data.file import Dataset, DatasetWriter
 from ast_sim.data.scene import NodeType
-from ast_sim.errors import CheckpointError, ConfigError, TrainingError
+from ast_sim.errors import CheckpointError, ConfigError, DatasetError, TrainingError
 from ast_sim.model.ast_config import ASTConfig
 from ast_sim.models import MODELS
 from ast_sim.monitor import Clock, duration
@@ -79,7 +79,9 @@ def test_given_settings_are_kept_and_a_short_training_warms_up_for_5_percent():
     assert (resolved.peak_rate, resolved.validate_every, resolved.checkpoint_every) == (5e-4, 40, 40)
 
 
-@pytest.mark.parametrize(("key", "value"), [("batch_size", 0), ("steps", 0), ("validate_every", -1), ("seed", -1)])
+@pytest.mark.parametrize(
+    ("key", "value"), [("batch_size", 0), ("steps", 0), ("validate_every", -1), ("seed", -1), ("shift", -0.1)]
+)
 def test_settings_out_of_range_are_named(key, value):
     with pytest.raises(ConfigError, match=f"train.{key} is {value}"):
         resolve_training(dataclasses.replace(TrainConfig(), **{key: value}), SCALES, ASTConfig())
@@ -130,9 +132,10 @@ def test_the_kind_of_the_dataset_decides_which_inputs_there_can_be(data, tmp_pat
 def test_tiny_sees_other_bodies_and_learns_along_rollouts_where_that_was_measured(data, tmp_path):
     still, moving = (train.configure(path, "tiny") for path in (data, toy.write(tmp_path / "d.h5", dynamic=True)))
     assert still.model.node_inputs == ("displacement", "proximity") and still.train.rollout_pool is None
+    assert still.train.shift is None and moving.train.shift is None
     assert moving.model.node_inputs == ("displacement", "velocity")
     paper = train.configure(data, "deforming_plate")
-    assert paper.model.node_inputs == ("displacement",) and paper.train.rollout_pool == 0
+    assert paper.model.node_inputs == ("displacement",) and paper.train.rollout_pool == paper.train.shift == 0
 
 
 def test_a_dynamic_dataset_is_trained_with_two_given_frames(tmp_path):
@@ -370,6 +373,22 @@ def test_the_pool_of_a_baseline_is_for_scenes_with_inertia(model):
     assert resolve_training(given, SCALES, moving).rollout_pool == 64
     for name, preset in MODELS[model].presets.items():
         assert name == "tiny" or preset.train.get("rollout_pool", 0) == 0  # as published
+
+
+def test_a_shift_left_open_is_half_a_cell_as_far_as_the_domain_has_room():
+    given = TrainConfig(shift=None)
+    fine = ASTConfig(L_cell=6, domain_half_width=2.0)
+    assert fine.cell_side == 0.0625 and resolve_training(given, SCALES, fine).shift == 0.03125
+    coarse = dataclasses.replace(fine, L_cell=2)
+    assert coarse.cell_side == 1.0 and resolve_training(given, SCALES, coarse).shift == pytest.approx(0.1)
+    assert resolve_training(given, SCALES, MODELS["mgn"].presets["tiny"].model).shift == 0.0  # has no cells
+    assert resolve_training(TrainConfig(shift=0.5), SCALES, fine).shift == 0.5
+    assert resolve_training(TrainConfig(), SCALES, fine).shift == 0.0  # the paper's
+
+
+def test_scenes_that_are_moved_out_of_the_domain_are_an_error(data, tmp_path):
+    with pytest.raises(DatasetError, match=r"train.*give the dataset a domain_half_width that holds .* train.shift"):
+        train.train(tmp_path / "run", train.configure(data, "tiny", ["train.shift=1e3"]))
 
 
 @pytest.mark.parametrize(

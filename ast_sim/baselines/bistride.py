@@ -29,7 +29,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from torch import Tensor
 
 from ast_sim.data.graph import edge_vectors
-from ast_sim.data.mirror import Mirror
+from ast_sim.data.placement import Placement
 from ast_sim.ops.edges import EdgeSet, offsets_of
 from ast_sim.ops.segment import segment_sum
 
@@ -109,10 +109,10 @@ class Hierarchy:
             component=torch.cat([part.component + shift for part, shift in zip(parts, shifts, strict=False)]),
         )
 
-    def mirrored(self, mirror: Mirror) -> Hierarchy:
-        """That of the mirror image, which has the same distances and so the same coarser meshes."""
+    def placed(self, placement: Placement) -> Hierarchy:
+        """That of the scene in another place, where distances are the same and so the coarser meshes."""
         return replace(
-            self, rest_edges=tuple(torch.from_numpy(mirror.vectors(level.numpy())) for level in self.rest_edges)
+            self, rest_edges=tuple(torch.from_numpy(placement.vectors(level.numpy())) for level in self.rest_edges)
         )
 
     def between_components(self, contacts: EdgeSet) -> EdgeSet:

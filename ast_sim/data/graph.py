@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from ast_sim.data.mirror import Mirror
+from ast_sim.data.placement import Placement
 from ast_sim.data.scene import NodeType, Scene
 from ast_sim.ops.edges import EdgeSet
 
@@ -26,8 +26,8 @@ class Own(Protocol):
     def concatenate(parts: Sequence[Any]) -> Any:
         """Those of several scenes as one."""
 
-    def mirrored(self, mirror: Mirror) -> Any:
-        """That of the mirror image of the scene."""
+    def placed(self, placement: Placement) -> Any:
+        """That of the scene in another place."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,17 +127,17 @@ class Graph:
             own=None if graphs[0].own is None else graphs[0].own.concatenate([g.own for g in graphs]),
         )
 
-    def mirrored(self, mirror: Mirror) -> Graph:
-        """The graph of the mirror image of a scene: the same nodes and edges elsewhere."""
-        if mirror.is_identity:
+    def placed(self, placement: Placement) -> Graph:
+        """The graph of a scene in another place: the same nodes and edges elsewhere."""
+        if placement.is_identity:
             return self
         surface = self.surface
         return replace(
             self,
-            rest_position=torch.from_numpy(mirror.points(self.rest_position.numpy())),
-            rest_edges=torch.from_numpy(mirror.vectors(self.rest_edges.numpy())),
-            surface=None if surface is None else torch.from_numpy(mirror.triangles(surface.numpy())),
-            own=None if self.own is None else self.own.mirrored(mirror),
+            rest_position=torch.from_numpy(placement.points(self.rest_position.numpy())),
+            rest_edges=torch.from_numpy(placement.vectors(self.rest_edges.numpy())),
+            surface=None if surface is None else torch.from_numpy(placement.triangles(surface.numpy())),
+            own=None if self.own is None else self.own.placed(placement),
         )
 
     @property

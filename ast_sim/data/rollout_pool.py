@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from ast_sim.data.batch import Batch, Target
-from ast_sim.data.mirror import Mirror
+from ast_sim.data.placement import Placement
 from ast_sim.data.sampling import Pair, PairSampler
 
 SHARE = np.float32(1 / 3)  # of the white noise that is added in each step
@@ -29,7 +29,7 @@ _ORDER, _SCENE, _NOISE = 10, 11, 12
 
 @dataclass(eq=False)
 class _Rolling:
-    """A scene under way; errors are [N, 3] float32, not mirrored.
+    """A scene under way; errors are [N, 3] float32, as in the data.
 
     error: what the last step left in p_t; None where white noise takes its place.
     error_before: that of p_{t-1}; None where it is the true one.
@@ -38,7 +38,7 @@ class _Rolling:
 
     index: int
     t: int
-    mirror: Mirror
+    placement: Placement
     error: np.ndarray | None
     error_before: np.ndarray | None = None
     pair: Pair | None = None
@@ -54,7 +54,7 @@ class RolloutPool:
     `batch` may run ahead of `advance`, as long as the places of the two are not the same.
 
     Args:
-        sampler: reads, mirrors and puts together the frames of scenes; the batch size, the seed, the noise, the share
+        sampler: reads, places and puts together the frames of scenes; the batch size, the seed, the noise, the share
             of errors that targets undo and the part of each batch are its own.
         size: how many scenes; a multiple of the batch size.
         largest: root mean square error of a state, in units of length, above which there is nothing to learn from it.
@@ -81,7 +81,7 @@ class RolloutPool:
             if scene.t == self._sampler.last_frame(scene.index):
                 del self._rolling[place]
             else:
-                error = scene.mirror.vectors(rows) + scene.pair.error_after  # the target was off the truth, too
+                error = scene.placement.vectors(rows) + scene.pair.error_after  # the target was off the truth, too
                 lost = np.sqrt(np.mean(np.square(error, dtype=np.float64))) > self._largest
                 before = scene.pair.error if self._sampler.dynamic else None
                 scene.error, scene.error_before = (None, None) if lost else (error, before)
@@ -119,7 +119,7 @@ class RolloutPool:
         error, after = white, self._sampler.left * white
         if scene.error is not None:
             error, after = scene.error + white * SHARE, after * SHARE + self._led_back(scene)
-        scene.pair = Pair(scene.index, scene.t, scene.mirror, error, scene.error_before, after)
+        scene.pair = Pair(scene.index, scene.t, scene.placement, error, scene.error_before, after)
         return scene.pair
 
     def _led_back(self, scene: _Rolling) -> np.ndarray:
@@ -139,7 +139,7 @@ class RolloutPool:
         generator = np.random.default_rng([seed, _SCENE, place, begun])
         first = self._sampler.first_frame
         t = int(generator.integers(first, self._sampler.last_frame(index)))
-        mirror = self._sampler.random_mirror(index, generator)
+        placement = self._sampler.random_placement(index, generator)
         if begun == 1:
-            return _Rolling(index, t, mirror, None)
-        return _Rolling(index, first, mirror, np.zeros((self._sampler.num_nodes(index), 3), np.float32))
+            return _Rolling(index, t, placement, None)
+        return _Rolling(index, first, placement, np.zeros((self._sampler.num_nodes(index), 3), np.float32))

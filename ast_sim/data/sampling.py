@@ -13,12 +13,12 @@ from torch import Tensor
 from ast_sim.data.batch import Batch, Target
 from ast_sim.data.file import Dataset
 from ast_sim.data.graph import Graph
-from ast_sim.data.mirror import Mirror
+from ast_sim.data.placement import Placement
 from ast_sim.data.scene import Scene
 from ast_sim.errors import DatasetError
 
-# Separate the random numbers of the order from those of the noise and of the mirroring.
-_ORDER, _NOISE, _MIRROR = 0, 1, 2
+# Separate the random numbers of the order from those of the noise and of the places.
+_ORDER, _NOISE, _PLACE = 0, 1, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class _Member:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Frames t and t + 1 of a trajectory, and how they are mirrored; errors are [N, 3] float32, not mirrored.
+    """Frames t and t + 1 of a trajectory, and where they are put; errors are [N, 3] float32, as in the data.
 
     Attributes:
         error: that of p_t in the state.
@@ -47,7 +47,7 @@ class Pair:
 
     index: int
     t: int
-    mirror: Mirror
+    placement: Placement
     error: np.ndarray
     error_before: np.ndarray | None
     error_after: np.ndarray
@@ -69,7 +69,8 @@ class PairSampler:
     0 throughout get no noise in z.
 
     Each pair is mirrored along each axis of `mirror` with probability 1/2, at planes through the middle of the scene at
-    rest: a function of seed, epoch and pair, too.
+    rest, and moved along each by at most `shift` (units of length), not out of its plane if it has one: functions of
+    seed, epoch and pair, too.
 
     With `part` = (i, n) a batch is the i-th of n equal parts of the one that it would be.
 
@@ -91,6 +92,7 @@ class PairSampler:
         part: tuple[int, int] = (0, 1),
         from_first: bool = False,
         mirror: tuple[str, ...] = (),
+        shift: float = 0.0,
     ) -> None:
         self.batch_size, self.seed, self.noise = batch_size, seed, noise
         self.left = np.float32(1 - gamma)  # the share of the noise that stays in the target
@@ -98,7 +100,7 @@ class PairSampler:
         self._make_graph, self.dynamic = make_graph, dynamic
         self.first_frame = 1 if dynamic else 0  # of a pair: the acceleration needs a frame before
         self._from_first = from_first
-        self._mirrored = np.array([axis in mirror for axis in "xyz"])
+        self._mirrored, self._shift = np.array([axis in mirror for axis in "xyz"]), np.float32(shift)
         frames = np.array([dataset.num_frames(split, i) for i in range(dataset.count(split))], np.int64)
         self._starts = np.concatenate([[0], np.cumsum(np.maximum(frames - 1 - self.first_frame, 0))])
         if self.num_pairs == 0:
@@ -127,11 +129,11 @@ class PairSampler:
         return range(first, first + size)
 
     def _pair(self, epoch: int, number: int) -> Pair:
-        """A pair of all, with the noise and the mirroring that it has in an epoch."""
+        """A pair of all, with the noise and the place that it has in an epoch."""
         index, t = self._locate(number)
         noise = self.white_noise(index, np.random.default_rng([self.seed, _NOISE, epoch, number]))
-        mirror = self.random_mirror(index, np.random.default_rng([self.seed, _MIRROR, epoch, number]))
-        return Pair(index, t, mirror, noise, None, self.left * noise)
+        placement = self.random_placement(index, np.random.default_rng([self.seed, _PLACE, epoch, number]))
+        return Pair(index, t, placement, noise, None, self.left * noise)
 
     def _locate(self, number: int) -> tuple[int, int]:
         """The trajectory and the first frame of pair 0, 1, ... `num_pairs` - 1."""
@@ -159,23 +161,23 @@ class PairSampler:
         graphs, names, positions, previous, boundary, motions = [], [], [], [], [], []
         stresses, next_stresses, numbers = [], [], []
         for pair in pairs:
-            t, mirror, member = pair.t, pair.mirror, self._member(pair.index)
+            t, placement, member = pair.t, pair.placement, self._member(pair.index)
             position, stress = self._read(pair.index, t)
             before, now, after = position[0], position[-2], position[-1]
             increment = after - now
             error, error_after = pair.error * member.noisy, pair.error_after * member.noisy
-            graphs.append(member.graph.mirrored(mirror))
+            graphs.append(member.graph.placed(placement))
             names.append(f"{self._split}/{pair.index:06d} frame {t}")
             numbers.append(t + 1.0)
-            positions.append(mirror.points(now + error))
-            boundary.append(mirror.vectors(np.where(member.prescribed, increment, np.float32(0))))
+            positions.append(placement.points(now + error))
+            boundary.append(placement.vectors(np.where(member.prescribed, increment, np.float32(0))))
             motion = increment + (error_after - error)
             if self.dynamic:
                 if pair.error_before is not None:
                     before = before + pair.error_before * member.noisy
-                previous.append(mirror.points(before))
+                previous.append(placement.points(before))
                 motion -= now - before + error
-            motions.append(mirror.vectors(motion))
+            motions.append(placement.vectors(motion))
             if stress is not None:
                 stresses.append(stress[-2])
                 next_stresses.append(stress[-1])
@@ -195,13 +197,13 @@ class PairSampler:
         """[N, 3] float32 of the standard deviation `noise`."""
         return generator.standard_normal(self._member(index).noisy.shape, np.float32) * np.float32(self.noise)
 
-    def random_mirror(self, index: int, generator: np.random.Generator) -> Mirror:
-        """At the middle of a scene, along each axis of `mirror` with probability 1/2."""
-        center = self._member(index).center
-        if not self._mirrored.any():
-            return Mirror(np.ones(3, np.float32), center)
+    def random_placement(self, index: int, generator: np.random.Generator) -> Placement:
+        """Mirrored at the middle of a scene along each axis of `mirror` with probability 1/2, and moved."""
+        member = self._member(index)
         drawn = generator.integers(2, size=3, dtype=bool)
-        return Mirror(np.where(drawn & self._mirrored, np.float32(-1), np.float32(1)), center)
+        sign = np.where(drawn & self._mirrored, np.float32(-1), np.float32(1))
+        shift = generator.uniform(-1, 1, 3).astype(np.float32) * self._shift * member.noisy.max(axis=0)
+        return Placement(sign, member.center, shift)
 
     def _member(self, index: int) -> _Member:
         if index not in self._members:

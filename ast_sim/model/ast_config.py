@@ -59,7 +59,7 @@ class ASTConfig(TimeConditionedConfig):
 
     @property
     def cell_side(self) -> float:
-        """Side of a cell in the unit of length: 2^(1-L) of the half width (paper, section Sparse Convolution)."""
+        """See `ModelConfig`: 2^(1-L) of the half width (paper, section Sparse Convolution)."""
         return self.domain_half_width * 2.0 ** (1 - self.L_cell)
 
     def resolve(self, info: DatasetInfo, material_width: int, mesh_spacing: float) -> Self:
@@ -102,7 +102,10 @@ PRESETS = {
             hidden=64, decoder_hidden=64, d_token=64, heads=4, head_dim=32, ffn_inner=128, L_SA=4, num_tokens=128,
             dropout=0.0, L_cell=None, element_inputs=(), edge_strain=True, factorized=False,
         ),
-        {"batch_size": 4, "optimizer": "muon", "peak_rate": 1e-3, "stress_weight": 0.1, "rollout_pool": None},
+        {
+            "batch_size": 4, "optimizer": "muon", "peak_rate": 1e-3, "stress_weight": 0.1, "rollout_pool": None,
+            "shift": None,
+        },
         adapts=True,
     ),
     "deforming_plate": Preset(ASTConfig(), _PAPER),

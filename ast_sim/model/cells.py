@@ -81,7 +81,9 @@ def build_cells(config: ASTConfig, position: Tensor, offsets: Tensor, may_grow: 
         finest = octree(position, offsets, config.domain_center, half_width, depth)
     except ValueError as problem:
         advice = (
-            "" if may_grow else "; give the dataset a domain_half_width that holds all frames and the training noise"
+            ""
+            if may_grow
+            else "; give the dataset a domain_half_width that holds all frames with train.noise and train.shift"
         )
         raise error(f"{problem}{advice}") from problem
     return Cells(finest, finest.coarsen_all(config.l_ocnn), growth)

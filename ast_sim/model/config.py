@@ -76,6 +76,11 @@ class ModelConfig:
         return self.dynamic
 
     @property
+    def cell_side(self) -> float:
+        """Side of the cells that the model puts nodes into, in units of length; 0: it has none."""
+        return 0.0
+
+    @property
     def sees_surfaces(self) -> bool:
         """Whether the inputs need the surfaces of the bodies."""
         return "proximity" in self.node_inputs

@@ -8,7 +8,7 @@ from scipy.sparse import csr_array
 
 from ast_sim.baselines.bistride import Hierarchy, build_hierarchy, select
 from ast_sim.data.graph import Graph, edge_vectors
-from ast_sim.data.mirror import Mirror
+from ast_sim.data.placement import Placement
 from ast_sim.ops.edges import EdgeSet
 
 PATH = [(0, 1), (1, 2), (2, 3), (3, 4)]
@@ -217,9 +217,9 @@ def test_it_is_the_same_every_time():
 @pytest.mark.parametrize("pooled", [True, False])
 def test_that_of_a_mirror_image_is_the_same_with_mirrored_edges(pooled):
     graph = meshes()[0]
-    mirror = Mirror(np.float32([-1, 1, -1]), np.float32([0.25, 0, 0.5]))
+    mirror = Placement(np.float32([-1, 1, -1]), np.float32([0.25, 0, 0.5]), np.zeros(3, np.float32))
     there = torch.from_numpy(mirror.points(graph.rest_position.numpy()))
-    found = build_hierarchy(graph.m2m, graph.rest_position, 2, pooled, graph.m2m).mirrored(mirror)
+    found = build_hierarchy(graph.m2m, graph.rest_position, 2, pooled, graph.m2m).placed(mirror)
     expected = build_hierarchy(graph.m2m, there, 2, pooled, graph.m2m)
     for level in range(3):
         assert torch.equal(found.edges[level].senders, expected.edges[level].senders)

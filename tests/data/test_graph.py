@@ -9,7 +9,7 @@ from data_samples import block
 from meshes import two_tetrahedra
 
 from ast_sim.data.graph import Graph
-from ast_sim.data.mirror import Mirror
+from ast_sim.data.placement import Placement
 from ast_sim.ops.edges import EdgeSet
 
 
@@ -90,8 +90,8 @@ def test_batches_of_batches_are_batches():
 @pytest.mark.parametrize("sign", [(-1, 1, 1), (-1, 1, -1), (-1, -1, -1), (1, 1, 1)])
 def test_the_graph_of_a_mirror_image(sign, element_nodes):
     scene = block(2, 1, 1)
-    mirror = Mirror(np.float32(sign), np.float32([1, 0.5, 0.25]))
-    found = Graph.from_scene(scene, element_nodes, surface=True).mirrored(mirror)
+    mirror = Placement(np.float32(sign), np.float32([1, 0.5, 0.25]), np.zeros(3, np.float32))
+    found = Graph.from_scene(scene, element_nodes, surface=True).placed(mirror)
     # The tetrahedra of an odd reflection are inside out, which the edges do not feel.
     rest = scene.rest_position.copy()
     for axis in range(3):
@@ -103,3 +103,11 @@ def test_the_graph_of_a_mirror_image(sign, element_nodes):
     corners = found.rest_position.double()[found.surface]
     volume = torch.linalg.det(corners).sum() / 6  # by the divergence theorem, positive if seen from outside
     torch.testing.assert_close(volume, torch.tensor(2.0, dtype=torch.float64))
+
+
+def test_the_graph_of_a_scene_that_was_moved():
+    graph = Graph.from_scene(block(2, 1, 1), False, surface=True)
+    shift = np.float32([0.5, -0.25, 1])
+    found = graph.placed(Placement(np.ones(3, np.float32), np.zeros(3, np.float32), shift))
+    assert torch.equal(found.rest_position, graph.rest_position + torch.from_numpy(shift))
+    assert torch.equal(found.rest_edges, graph.rest_edges) and torch.equal(found.surface, graph.surface)

@@ -1,5 +1,7 @@
 """The sampler: every pair once an epoch, noise where and as strong as asked, targets by hand."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -262,6 +264,37 @@ def test_half_of_the_pairs_are_mirrored_along_an_axis(dataset):
     assert sum(of_batch.all() or not of_batch.any() for of_batch in mirrored) <= 5
 
 
+@pytest.mark.parametrize("dynamic", [False, True])
+def test_a_moved_pair_is_the_pair_elsewhere(dataset, dynamic):
+    options = {"noise": 0.02, "dynamic": dynamic, "gamma": 0.3, "batch_size": 5 if dynamic else 8}
+    plain, moved, shifts = sampler(dataset, **options), sampler(dataset, shift=0.25, **options), []
+    for step in range(40):
+        (batch, target), (there, aim) = plain.batch(step), moved.batch(step)
+        assert there.names == batch.names
+        for _, nodes in parts(batch):
+            way = there.graph.rest_position[nodes] - batch.graph.rest_position[nodes]
+            shifts.append(way[0])
+            states = [(there.position, batch.position)] + [(there.previous_position, batch.previous_position)] * dynamic
+            for one, other in states:
+                torch.testing.assert_close(one[nodes], other[nodes] + way[0], rtol=0, atol=1e-6)
+            torch.testing.assert_close(way, way[0].expand_as(way), rtol=0, atol=1e-6)
+        assert torch.equal(there.graph.rest_edges, batch.graph.rest_edges)
+        assert torch.equal(there.boundary_motion, batch.boundary_motion)
+        assert torch.equal(target.motion, aim.motion) and torch.equal(target.stress, aim.stress)
+    drawn = torch.stack(shifts)
+    assert drawn.abs().max() <= 0.25 + 1e-6 and (drawn.abs().amax(0) > 0.23).all()
+    # Each coordinate has a standard deviation of 0.25 / sqrt(3), and the mean of n draws one of that over sqrt(n).
+    assert (drawn.mean(0).abs() < 4 * 0.25 / math.sqrt(3 * len(drawn))).all()
+    assert torch.corrcoef(drawn.T).fill_diagonal_(0).abs().max() < 4 / math.sqrt(len(drawn))
+
+
+def test_the_place_of_a_pair_does_not_depend_on_its_batch(dataset):
+    one, large = (sampler(dataset, batch_size=size, shift=0.1) for size in (1, 8))
+    batch, _ = large.batch(1)
+    for step, (_, nodes) in enumerate(parts(batch), start=8):
+        assert torch.equal(one.batch(step)[0].graph.rest_position, batch.graph.rest_position[nodes])
+
+
 def test_a_plane_scene_keeps_its_plane(tmp_path):
     scene = Scene(
         rest_position=np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32),
@@ -277,6 +310,10 @@ def test_a_plane_scene_keeps_its_plane(tmp_path):
             noise = batch.position[nodes] - batch.graph.rest_position[nodes]
             assert (noise[:, :2] != 0).all()
             assert bool((noise[:, 2] == 0).all()) == (frame_of(name)[0] == 0)
+        batch, _ = sampler(dataset, shift=0.1, batch_size=2).batch(0)
+        for name, nodes in parts(batch):
+            place = batch.graph.rest_position[nodes]
+            assert (place[0, :2] != 0).all() and bool((place[:, 2] == 0).all()) == (frame_of(name)[0] == 0)
 
 
 def test_a_split_without_pairs_is_an_error(tmp_path):

@@ -1,4 +1,7 @@
-"""Mirror images of a scene: where they obey the same laws, one simulation stands for up to eight."""
+"""Where a training scene is put: its laws hold in mirror images of it and elsewhere in space, too.
+
+Mirrored along three axes, one simulation stands for up to eight. Moved, it meets the cells of the octree anew.
+"""
 
 from __future__ import annotations
 
@@ -8,24 +11,26 @@ import numpy as np
 
 
 @dataclass(frozen=True, eq=False)
-class Mirror:
-    """The reflection p -> c + s (p - c).
+class Placement:
+    """The reflection and translation p -> c + s (p - c) + d.
 
     Attributes:
         sign: [3] float32, s: -1 along the axes that are mirrored, else 1.
         center: [3] float32, c.
+        shift: [3] float32, d.
     """
 
     sign: np.ndarray
     center: np.ndarray
+    shift: np.ndarray
 
     @property
     def is_identity(self) -> bool:
-        return bool((self.sign > 0).all())
+        return bool((self.sign > 0).all() and not self.shift.any())
 
     def points(self, p: np.ndarray) -> np.ndarray:
-        """[N, 3] -> [N, 3]; the same bits where no axis is mirrored."""
-        return self.sign * p + (1 - self.sign) * self.center
+        """[N, 3] -> [N, 3]; the same bits where nothing is mirrored or moved."""
+        return self.sign * p + ((1 - self.sign) * self.center + self.shift)
 
     def vectors(self, v: np.ndarray) -> np.ndarray:
         """[N, 3] -> [N, 3], or [N, 4] -> [N, 4] with lengths in the last column, which stay."""
