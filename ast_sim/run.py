@@ -56,7 +56,7 @@ class TrainConfig:
     shift: float | None = _option(
         0.0,
         "largest distance, along each axis and in units of length, by which scenes are moved at random; None: half the"
-        " side of the model's cells",
+        " side of the model's cells, at most 0.05 of the domain's half width",
     )
     stress_weight: float = _option(0.01, "weight of the stress in the loss; motion has 1")
     statistics_pairs: int = _option(400, "frame pairs that the input and output scales are taken from")
