@@ -12,6 +12,10 @@ from datetime import timedelta
 from typing import Any, TypeVar
 
 import torch
+
+# Default arguments in there hold the group that stands when it is imported; torch._dynamo imports it when first needed.
+# Within a group that would keep the group alive, and a thread of it that wakes as Python ends aborts.
+import torch.distributed.nn
 from torch import Tensor, distributed
 
 PATIENCE = timedelta(hours=12)  # others may wait so long for one that writes a checkpoint or validates

@@ -65,7 +65,24 @@ def test_two_processes_do_what_one_does(data, tmp_path, along):
     # What one began two go on with.
     words = ["--out", str(tmp_path / "one"), "--resume"]
     done = subprocess.run(command(2, *words), capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0 and "going on after step 8" in done.stdout
+    assert done.returncode == 0 and "going on after step 8" in done.stdout, done.stderr
+
+
+def test_the_group_ends_with_training(data, tmp_path):
+    train(1, data, tmp_path / "run", 1)
+    script = tmp_path / "train_then_count.py"
+    script.write_text(
+        "import sys\n"
+        "from pathlib import Path\n"
+        "from ast_sim.cli import main\n"
+        "status = main()\n"
+        "threads = [name.read_text().strip() for name in Path('/proc/self/task').glob('*/comm')]\n"
+        "assert not any('gloo' in name for name in threads), threads\n"
+        "sys.exit(status)\n"
+    )
+    launch = [*command(2)[:5], str(script), "train", "--out", str(tmp_path / "run"), "--resume"]
+    done = subprocess.run(launch, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0 and "going on after step 1" in done.stdout, done.stderr
 
 
 def test_a_batch_that_cannot_be_cut_is_refused(data, tmp_path):
