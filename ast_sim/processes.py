@@ -12,10 +12,6 @@ from datetime import timedelta
 from typing import Any, TypeVar
 
 import torch
-
-# Default arguments in there hold the group that stands when it is imported; torch._dynamo imports it when first needed.
-# Within a group that would keep the group alive, and a thread of it that wakes as Python ends aborts.
-import torch.distributed.nn
 from torch import Tensor, distributed
 
 PATIENCE = timedelta(hours=12)  # others may wait so long for one that writes a checkpoint or validates
@@ -36,6 +32,10 @@ class Processes:
 
     def __enter__(self) -> Processes:
         if self.count > 1:
+            # Default arguments in there hold the group that stands when it is imported, and torch._dynamo imports it
+            # when first needed: within the group that would keep the group and its threads alive until Python ends.
+            import torch.distributed.nn  # noqa: F401
+
             distributed.init_process_group("gloo", timeout=PATIENCE)
         return self
 

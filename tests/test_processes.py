@@ -21,9 +21,9 @@ SETTINGS = [
 ]  # fmt: skip
 
 
-def command(processes: int, *words: str) -> list[str]:
+def command(processes: int, *words: str, program: tuple[str, ...] = ("-m", "ast_sim.cli")) -> list[str]:
     start = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"] if processes > 1 else []
-    return [sys.executable, *start, "-m", "ast_sim.cli", "train", *words]
+    return [sys.executable, *start, *program, "train", *words]
 
 
 def train(processes: int, data: Path, run: Path, steps: int, *words: str, check: bool = True):
@@ -80,7 +80,7 @@ def test_the_group_ends_with_training(data, tmp_path):
         "assert not any('gloo' in name for name in threads), threads\n"
         "sys.exit(status)\n"
     )
-    launch = [*command(2)[:5], str(script), "train", "--out", str(tmp_path / "run"), "--resume"]
+    launch = command(2, "--out", str(tmp_path / "run"), "--resume", program=(str(script),))
     done = subprocess.run(launch, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0 and "going on after step 1" in done.stdout, done.stderr
 
