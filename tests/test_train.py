@@ -11,6 +11,7 @@ import toy
 from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import checkpoint, run, train
+from ast_sim.baselines.transolver import TransolverConfig
 from ast_sim.config import override
 from ast_sim.data.file import Dataset, DatasetWriter
 from ast_sim.data.scene import NodeType
@@ -354,19 +355,20 @@ def test_a_pool_that_cannot_be_is_refused(linear, data, tmp_path, assignments, m
     assert not run.has_config(tmp_path / "run")
 
 
-def test_a_pool_left_to_the_data_is_of_16_batches_where_there_is_a_drift():
+@pytest.mark.parametrize("config", [ASTConfig, TransolverConfig])
+def test_a_pool_left_to_the_data_is_of_16_batches_where_there_is_a_drift(config):
     given = TrainConfig(batch_size=4, rollout_pool=None)
-    still = resolve_training(given, SCALES, ASTConfig())
+    still = resolve_training(given, SCALES, config())
     assert still.rollout_pool == 64 and still.noise == pytest.approx(0.0015)  # a third of that without a pool
-    dynamic = resolve_training(given, SCALES, ASTConfig(integration="dynamic"))
+    dynamic = resolve_training(given, SCALES, config(integration="dynamic"))
     assert dynamic.rollout_pool == 64 and dynamic.noise_gamma == 0.1 and dynamic.noise == pytest.approx(0.0002)
-    assert resolve_training(given, SCALES, ASTConfig(time_conditioned=True)).rollout_pool == 0
-    assert resolve_training(dataclasses.replace(given, noise=0.0), SCALES, ASTConfig()).rollout_pool == 0
-    assert resolve_training(TrainConfig(), SCALES, ASTConfig()).rollout_pool == 0  # the paper's
+    assert resolve_training(given, SCALES, config(time_conditioned=True)).rollout_pool == 0
+    assert resolve_training(dataclasses.replace(given, noise=0.0), SCALES, config()).rollout_pool == 0
+    assert resolve_training(TrainConfig(), SCALES, config()).rollout_pool == 0  # the papers'
 
 
-@pytest.mark.parametrize("model", sorted(MODELS.keys() - {"ast"}))
-def test_the_pool_of_a_baseline_is_for_scenes_with_inertia(model):
+@pytest.mark.parametrize("model", sorted(MODELS.keys() - {"ast", "transolver"}))
+def test_the_pool_of_a_model_with_edges_between_bodies_is_for_scenes_with_inertia(model):
     still = MODELS[model].presets["tiny"]
     given, moving = TrainConfig(**still.train), dataclasses.replace(still.model, integration="dynamic")
     assert resolve_training(given, SCALES, still.model).rollout_pool == 0

@@ -27,7 +27,7 @@ from ast_sim.data.file import DatasetInfo
 from ast_sim.data.graph import Graph
 from ast_sim.data.scene import Scene
 from ast_sim.model import features
-from ast_sim.model.config import Preset, TimeConditionedConfig, setting
+from ast_sim.model.config import Preset, TimeConditionedConfig, nearness, setting
 from ast_sim.model.linear import Linear
 from ast_sim.model.normalizer import FeatureNormalizer
 from ast_sim.model.simulator import Prediction, Simulator
@@ -51,9 +51,15 @@ class TransolverConfig(TimeConditionedConfig):
         self.check_positive("hidden", "blocks", "heads", "slices", "mlp_ratio")
         self.check_heads()
 
+    @property
+    def gains_along_rollouts(self) -> bool:
+        """See `ModelConfig`; without inertia, too."""
+        return True
+
     def inputs_for(self, info: DatasetInfo, material_width: int) -> dict[str, Any]:
-        """See `ModelConfig`; the displacement always."""
-        return {"node_inputs": ["displacement", *super().inputs_for(info, material_width)["node_inputs"]]}
+        """See `ModelConfig`; the displacement always, proximity in quasi-static scenes."""
+        nodes = super().inputs_for(info, material_width)["node_inputs"]
+        return {"node_inputs": ["displacement", *nearness(info), *nodes]}
 
 
 class MLP(nn.Module):
@@ -188,7 +194,7 @@ class Transolver(Simulator):
 PRESETS = {
     "tiny": Preset(
         TransolverConfig(hidden=64, blocks=4, heads=4, slices=32, mlp_ratio=2),
-        {"batch_size": 4, "peak_rate": 1e-3, "stress_weight": 0.1, "rollout_pool": None},
+        {"batch_size": 4, "optimizer": "muon", "peak_rate": 2e-3, "stress_weight": 0.1, "rollout_pool": None},
         adapts=True,
     ),
     # StructBench (github.com/qilinli/StructBench), configs/deforming_plate/transolver.toml; noise of 3 mm, weights 1.

@@ -8,7 +8,7 @@ from typing import Literal, Self
 
 from ast_sim.data.file import DatasetInfo
 from ast_sim.errors import ConfigError
-from ast_sim.model.config import Preset, TimeConditionedConfig, setting
+from ast_sim.model.config import Preset, TimeConditionedConfig, nearness, setting
 
 
 @dataclass(frozen=True)
@@ -80,13 +80,12 @@ class ASTConfig(TimeConditionedConfig):
         return True
 
     def inputs_for(self, info: DatasetInfo, material_width: int) -> dict[str, list[str]]:
-        """See `ModelConfig`; the displacement always, proximity in quasi-static scenes (in dynamic ones it has not been
-        measured), and element nodes if there is a stress on elements."""
+        """See `ModelConfig`; the displacement always, proximity in quasi-static scenes, and element nodes if there is a
+        stress on elements."""
         nodes = super().inputs_for(info, material_width)["node_inputs"]
-        nearness = ["proximity"] if info.integration == "quasi_static" else []
         material = ["material"] if material_width else []
         elements = ["displacement", *material] if info.stress_location == "element" else []
-        return {"node_inputs": ["displacement", *nearness, *nodes], "element_inputs": elements}
+        return {"node_inputs": ["displacement", *nearness(info), *nodes], "element_inputs": elements}
 
     def facts(self, length_unit: str, mesh_spacing: float | None = None) -> dict[str, str]:
         """See `ModelConfig`."""

@@ -15,6 +15,12 @@ def setting(default: Any, text: str) -> Any:
     return field(default=default, metadata={"help": text})
 
 
+def nearness(info: DatasetInfo) -> list[str]:
+    """What tells a model without edges between bodies that another one is near: proximity, in quasi-static scenes (in
+    dynamic ones it has not been measured)."""
+    return ["proximity"] if info.integration == "quasi_static" else []
+
+
 @dataclass(frozen=True)
 class ModelConfig:
     """Settings of any model; those of one are a subclass with a `name` of its own.
