@@ -3,10 +3,15 @@
     mesh --m2m or e2m--> mesh --M2C--> cells --OCNN--> coarse cells --CrossAttn--> tokens --L_SA x SelfAttn--> tokens
     tokens --CrossAttn--> coarse cells --OCNN transposed--> cells --C2M--> mesh --decoder--> motion (--M2E--> stress)
 
+With `exchanges`, which the paper does not have, the nodes learn from the tokens themselves; each time after the first
+    mesh --CrossAttn--> tokens --some of the SelfAttn--> tokens --CrossAttn--> mesh
+
 Legend: N nodes, E elements, C cells, T tokens.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 from torch import Tensor, nn
 
@@ -15,12 +20,12 @@ from ast_sim.data.graph import Graph
 from ast_sim.data.scene import Scene
 from ast_sim.model import features as inputs
 from ast_sim.model.ast_config import ASTConfig
-from ast_sim.model.cells import Cells, SparseConv, build_cells, doublings
+from ast_sim.model.cells import Cells, SparseConv, build_cells, doublings, places
 from ast_sim.model.linear import Linear
 from ast_sim.model.message_passing import MessagePassing
 from ast_sim.model.mlp import MLP
 from ast_sim.model.simulator import Prediction, Simulator
-from ast_sim.model.transformer import AttentionBlock, PositionEmbedding
+from ast_sim.model.transformer import AttentionBlock, PositionEmbedding, Vectors, rotations
 from ast_sim.ops.fps import farthest_point_sample
 from ast_sim.ops.segment import segment_mean
 
@@ -44,15 +49,20 @@ class AST(Simulator):
             self.m2m = self._message_passing("m2m", self.edge_inputs.width)
         self.before_cells, self.after_cells = self._mesh_steps(), self._mesh_steps()
         self.m2c = self._message_passing("m2c")
-        self.c2m = self._message_passing("c2m")
         self.down = nn.ModuleList(SparseConv(width, up=False) for _ in range(c.l_ocnn))
-        self.up = nn.ModuleList(SparseConv(width, up=True) for _ in range(c.l_ocnn))
         self.lift = Linear(width, c.d_token)
-        self.position_embedding = PositionEmbedding(c.d_token, c.L_cell - c.l_ocnn)
-        self.to_tokens = AttentionBlock(c, cross=True)
-        self.processor = nn.ModuleList(AttentionBlock(c, cross=False) for _ in range(c.L_SA))
-        self.to_cells = AttentionBlock(c, cross=True)
-        self.lower = Linear(c.d_token, width)
+        if c.places == "absolute":
+            self.position_embedding = PositionEmbedding(c.d_token, c.L_cell - c.l_ocnn)
+        self.to_tokens = AttentionBlock(c, c.d_token, c.d_token)
+        self.processor = nn.ModuleList(AttentionBlock(c, c.d_token) for _ in range(c.L_SA))
+        if c.exchanges:
+            self.to_nodes = nn.ModuleList(AttentionBlock(c, width, c.d_token) for _ in range(c.exchanges))
+            self.from_nodes = nn.ModuleList(AttentionBlock(c, c.d_token, width) for _ in range(c.exchanges - 1))
+        else:
+            self.to_cells = AttentionBlock(c, c.d_token, c.d_token)
+            self.lower = Linear(c.d_token, width)
+            self.up = nn.ModuleList(SparseConv(width, up=True) for _ in range(c.l_ocnn))
+            self.c2m = self._message_passing("c2m")
         self.decoder = MLP(2 * width, c.decoder_hidden, 4 if c.stress == "node" else 3, c.factorized)
         if c.stress == "element":
             self.m2e = self._message_passing("m2e")
@@ -98,7 +108,13 @@ class AST(Simulator):
 
         now = inputs.present(self.config, batch)
         cells = build_cells(self.config, now, batch.graph.node_offsets, may_grow=not self.training)
-        mesh = self.c2m(cells.to_mesh(), self._through_cells(cells, mesh), mesh)
+        coarse = self._to_cells(cells, mesh)
+        tokens = self._to_tokens(cells, coarse)
+        if self.config.exchanges:
+            nodes = Vectors(mesh, batch.graph.node_offsets, self._rotations(places(self.config, now)))
+            mesh = self._exchange(nodes, tokens)
+        else:
+            mesh = self._from_cells(cells, self.to_cells(coarse, self._process(tokens, self.processor)).x, mesh)
         for step in self.after_cells:
             mesh = step(edges, mesh, mesh, edge_features)
 
@@ -108,23 +124,46 @@ class AST(Simulator):
             stress = self.element_decoder(self.m2e(batch.graph.m2e, mesh, elements))
         return Prediction(out[:, :3], stress)
 
-    def _through_cells(self, cells: Cells, mesh: Tensor) -> Tensor:
-        """Mesh features [N, hidden] -> cell features [C, hidden] after the tokens have exchanged information."""
-        finest = cells.finest
+    def _to_cells(self, cells: Cells, mesh: Tensor) -> Vectors:
+        """Mesh features [N, hidden] -> the coarsest cells, which know their places."""
+        finest, coarsest = cells.finest, cells.coarsest
         mean = segment_mean(mesh, finest.node_order, finest.node_offsets)
         x = self.m2c(cells.from_mesh(), mesh, mean)
         for convolve, step in zip(self.down, cells.maps, strict=True):
             x = convolve(x, step)
-        x = self.lower(self._through_tokens(cells, self.position_embedding(self.lift(x), cells.centers())))
+        x = self.lift(x)
+        if self.config.places == "absolute":
+            return Vectors(self.position_embedding(x, cells.centers()), coarsest.cell_offsets)
+        return Vectors(x, coarsest.cell_offsets, self._rotations(cells.places()))
+
+    def _rotations(self, of: Tensor) -> Tensor:
+        return rotations(of, self.config.head_dim)
+
+    def _to_tokens(self, cells: Cells, coarse: Vectors) -> Vectors:
+        """Tokens, which begin as some of the cells and attend to all."""
+        level = cells.coarsest
+        chosen, offsets = farthest_point_sample(level.coordinates(), level.cell_offsets, self.config.num_tokens)
+        turned = None if coarse.rotations is None else coarse.rotations.index_select(0, chosen)
+        return self.to_tokens(Vectors(coarse.x.index_select(0, chosen), offsets, turned), coarse)
+
+    def _process(self, tokens: Vectors, blocks: Sequence[AttentionBlock]) -> Vectors:
+        for block in blocks:
+            tokens = block(tokens)
+        return tokens
+
+    def _exchange(self, nodes: Vectors, tokens: Vectors) -> Tensor:
+        """Nodes and tokens, which attend to each other in turn -> mesh features [N, hidden]."""
+        share = len(self.processor) // len(self.to_nodes)
+        for number, to_nodes in enumerate(self.to_nodes):
+            if number:
+                tokens = self.from_nodes[number - 1](tokens, nodes)
+            tokens = self._process(tokens, self.processor[number * share : (number + 1) * share])
+            nodes = to_nodes(nodes, tokens)
+        return nodes.x
+
+    def _from_cells(self, cells: Cells, x: Tensor, mesh: Tensor) -> Tensor:
+        """The coarsest cells [C, d_token] and mesh features [N, hidden] -> mesh features."""
+        x = self.lower(x)
         for convolve, step in zip(self.up, reversed(cells.maps), strict=True):
             x = convolve(x, step)
-        return x
-
-    def _through_tokens(self, cells: Cells, x: Tensor) -> Tensor:
-        """Embedded cells [C, d_token] -> tokens, processed -> [C, d_token]."""
-        level = cells.coarsest
-        chosen, token_offsets = farthest_point_sample(level.coordinates(), level.cell_offsets, self.config.num_tokens)
-        tokens = self.to_tokens(x.index_select(0, chosen), token_offsets, x, level.cell_offsets)
-        for block in self.processor:
-            tokens = block(tokens, token_offsets)
-        return self.to_cells(x, level.cell_offsets, tokens, token_offsets)
+        return self.c2m(cells.to_mesh(), x, mesh)

@@ -28,6 +28,12 @@ class ASTConfig(TimeConditionedConfig):
     mesh_steps: int = setting(0, "more message passings on the mesh, so many before the cells and so many after them")
     L_cell: int | None = setting(5, "octree level of the cells; unset: cells of about `cell_spacings` mesh spacings")
     cell_spacings: float = setting(1.5, "cell side in mesh spacings where L_cell is unset")
+    places: Literal["absolute", "relative"] = setting(
+        "absolute", "what attention sees of places: where a cell is, or the way between two"
+    )
+    exchanges: int = setting(
+        0, "how often nodes and tokens attend to each other, sharing the L_SA blocks; 0: nodes learn by C2M from cells"
+    )
     l_ocnn: int = setting(0, "levels that sparse convolutions coarsen the cells by before they become tokens")
     element_inputs: tuple[str, ...] = setting(
         ("displacement",), "element features: displacement, velocity, material, stress; empty: no element nodes"
@@ -47,6 +53,10 @@ class ASTConfig(TimeConditionedConfig):
             raise ConfigError(
                 "model.mesh_steps: 0 or more; with element nodes (element_inputs) no edge joins two nodes"
             )
+        if self.exchanges and self.places != "relative":
+            raise ConfigError("model.exchanges needs model.places=relative: nodes have no other place in attention")
+        if self.exchanges < 0 or (self.exchanges and self.L_SA % self.exchanges):
+            raise ConfigError(f"model.exchanges = {self.exchanges} must be 0 or divide model.L_SA = {self.L_SA}")
         if self.head_dim % 16 or not 16 <= self.head_dim <= 128:
             raise ConfigError(f"model.head_dim must be a multiple of 16 up to 128, not {self.head_dim}")
         for name in self.residual:
@@ -99,7 +109,8 @@ PRESETS = {
     "tiny": Preset(
         ASTConfig(
             hidden=64, decoder_hidden=64, d_token=64, heads=4, head_dim=32, ffn_inner=128, L_SA=4, num_tokens=128,
-            dropout=0.0, L_cell=None, element_inputs=(), edge_strain=True, factorized=False,
+            dropout=0.0, L_cell=None, places="relative", exchanges=2, element_inputs=(), edge_strain=True,
+            factorized=False,
         ),
         {
             "batch_size": 4, "optimizer": "muon", "peak_rate": 1e-3, "stress_weight": 0.1, "rollout_pool": None,

@@ -39,6 +39,10 @@ class Cells:
         """[C, 3] centres of the coarsest cells, in half widths of the domain before it grew."""
         return self.coarsest.centers() * 2.0**self.growth
 
+    def places(self) -> Tensor:
+        """[C, 3] float64: where the coarsest cells are, as `places` of their centres; exact."""
+        return self.coarsest.centers().double() * 2.0 ** (self.coarsest.depth - 1)
+
     def from_mesh(self) -> EdgeSet:
         """M2C: every node to its cell."""
         o = self.finest
@@ -58,6 +62,12 @@ def doublings(config: ASTConfig, position: Tensor) -> int | None:
         if reach <= config.domain_half_width * 2.0**growth:
             return growth
     return None
+
+
+def places(config: ASTConfig, position: Tensor) -> Tensor:
+    """[N, 3] float64: positions [N, 3] from the centre of the domain, in sides of the cells that become tokens."""
+    center = torch.tensor(config.domain_center, dtype=torch.float64)
+    return (position.double() - center) / (config.cell_side * 2.0**config.l_ocnn)
 
 
 def build_cells(config: ASTConfig, position: Tensor, offsets: Tensor, may_grow: bool) -> Cells:

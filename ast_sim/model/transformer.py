@@ -1,8 +1,13 @@
-"""Position embedding and the pre-norm attention blocks on cells and tokens (paper, section Transformer)."""
+"""Position embedding and the pre-norm attention blocks on cells, tokens and nodes (paper, section Transformer).
+
+Legend: T vectors (cells, tokens or nodes), B scenes, H heads of width D.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -31,14 +36,51 @@ class PositionEmbedding(nn.Module):
         return self.project(waves, residual=features)
 
 
+@dataclass(frozen=True)
+class Vectors:
+    """What attends and is attended to.
+
+    Attributes:
+        x: [T, width].
+        offsets: [B + 1] int64; the vectors of scene b are offsets[b]:offsets[b + 1].
+        rotations: of each by its place (see `rotations`); None: attention does not see places.
+    """
+
+    x: Tensor
+    offsets: Tensor
+    rotations: Tensor | None = None
+
+
+def rotations(places: Tensor, head_dim: int) -> Tensor:
+    """Rotary embedding (Su et al. 2021, arXiv 2104.09864) of places [T, 3] float64, in cell sides -> [T, 1, 2, D / 2],
+    the cosines and sines of the angles by which queries and keys turn, pair of components by pair.
+
+    Their product then depends on the way between two places, not on where they are. The angles are pi 2^-j times x, y
+    and z, waves of 2, 4, 8, ... cells, for as many j as there are pairs; what is left over does not turn.
+    """
+    pairs = head_dim // 2
+    angles = (places[:, :, None] * (math.pi * 0.5 ** torch.arange(pairs // 3, dtype=torch.float64))).flatten(1)
+    angles = F.pad(angles, (0, pairs - angles.shape[1]))
+    return torch.stack([angles.cos(), angles.sin()], dim=1)[:, None].float()
+
+
+def rotated(x: Tensor, by: Tensor | None) -> Tensor:
+    """x [T, H, D], its pairs (x_i, x_{i + D/2}) turned by `rotations`; by None x itself."""
+    if by is None:
+        return x
+    a, b = x.chunk(2, dim=2)
+    cos, sin = by.unbind(dim=2)
+    return torch.cat([a * cos - b * sin, a * sin + b * cos], dim=2)
+
+
 class FeedForward(nn.Module):
     """x + GEGLU (Shazeer 2020): W_2 (a * gelu(b)) with [a, b] = W_1 LN(x), and dropout before the sum."""
 
-    def __init__(self, config: ASTConfig):
+    def __init__(self, config: ASTConfig, width: int):
         super().__init__()
-        self.norm = nn.LayerNorm(config.d_token)
-        self.first = Linear(config.d_token, 2 * config.ffn_inner)
-        self.second = Linear(config.ffn_inner, config.d_token)
+        self.norm = nn.LayerNorm(width)
+        self.first = Linear(width, 2 * config.ffn_inner)
+        self.second = Linear(config.ffn_inner, width)
         self.dropout = config.dropout
 
     def forward(self, x: Tensor) -> Tensor:
@@ -49,33 +91,47 @@ class FeedForward(nn.Module):
 
 
 class AttentionBlock(nn.Module):
-    """x + attention(LN(x), LN(context)), then the feed-forward part; the context of a self-attention is x itself."""
+    """x + attention(LN(x), LN(context)), then the feed-forward part.
 
-    def __init__(self, config: ASTConfig, cross: bool):
+    Args:
+        width: of x.
+        context: width of the vectors that are attended to; None: they are x itself.
+    """
+
+    def __init__(self, config: ASTConfig, width: int, context: int | None = None):
         super().__init__()
         inner = config.heads * config.head_dim
         self.heads, self.dropout = config.heads, config.dropout
-        self.norm = nn.LayerNorm(config.d_token)
-        if cross:
-            self.norm_context = nn.LayerNorm(config.d_token)
-            self.query = Linear(config.d_token, inner, bias=False)
-            self.key_value = Linear(config.d_token, 2 * inner, bias=False)
+        self.norm = nn.LayerNorm(width)
+        if context is None:
+            self.query_key_value = Linear(width, 3 * inner, bias=False)
         else:
-            self.query_key_value = Linear(config.d_token, 3 * inner, bias=False)
-        self.out = Linear(inner, config.d_token)
-        self.feed_forward = FeedForward(config)
+            self.norm_context = nn.LayerNorm(context)
+            self.query = Linear(width, inner, bias=False)
+            self.key_value = Linear(context, 2 * inner, bias=False)
+        self.out = Linear(inner, width)
+        self.feed_forward = FeedForward(config, width)
 
-    def forward(
-        self, x: Tensor, offsets: Tensor, context: Tensor | None = None, context_offsets: Tensor | None = None
-    ) -> Tensor:
-        """x [T, d_token] in the scenes of `offsets`, context [C, d_token] in those of `context_offsets` -> as x."""
+    def forward(self, vectors: Vectors, context: Vectors | None = None) -> Vectors:
+        """The vectors after they have attended to the context or to themselves."""
         dropout = self.dropout if self.training else 0.0
         options = {"dropout_p": dropout, "seed": int(torch.randint(2**62, (1,))) if dropout else 0}
-        if context is None:
-            together = self.query_key_value(self.norm(x)).unflatten(1, (3, self.heads, -1))
-            mixed = self_attention(together, offsets, **options)
-        else:
-            query = self.query(self.norm(x)).unflatten(1, (self.heads, -1))
-            key_value = self.key_value(self.norm_context(context)).unflatten(1, (2, self.heads, -1))
-            mixed = cross_attention(query, key_value, offsets, context_offsets, **options)
-        return self.feed_forward(self.out(mixed.flatten(1), residual=x))
+        mixed = self._among(vectors, options) if context is None else self._to(context, vectors, options)
+        return replace(vectors, x=self.feed_forward(self.out(mixed.flatten(1), residual=vectors.x)))
+
+    def _among(self, vectors: Vectors, options: dict[str, Any]) -> Tensor:
+        """[T, H, D]."""
+        together = self.query_key_value(self.norm(vectors.x)).unflatten(1, (3, self.heads, -1))
+        if vectors.rotations is not None:
+            query, key, value = together.unbind(1)
+            together = torch.stack([*(rotated(x, vectors.rotations) for x in (query, key)), value], dim=1)
+        return self_attention(together, vectors.offsets, **options)
+
+    def _to(self, context: Vectors, vectors: Vectors, options: dict[str, Any]) -> Tensor:
+        """[T, H, D]."""
+        query = rotated(self.query(self.norm(vectors.x)).unflatten(1, (self.heads, -1)), vectors.rotations)
+        key_value = self.key_value(self.norm_context(context.x)).unflatten(1, (2, self.heads, -1))
+        if context.rotations is not None:
+            key, value = key_value.unbind(1)
+            key_value = torch.stack([rotated(key, context.rotations), value], dim=1)
+        return cross_attention(query, key_value, vectors.offsets, context.offsets, **options)

@@ -17,14 +17,15 @@ from ast_sim.data.sampling import PairSampler
 from ast_sim.data.scene import NodeType
 from ast_sim.errors import ConfigError, DatasetError, RolloutError
 from ast_sim.model.ast_config import PRESETS, ASTConfig
-from ast_sim.model.cells import build_cells
+from ast_sim.model.cells import build_cells, places
 from ast_sim.model.message_passing import MessagePassing
 from ast_sim.model.mlp import FactorizedLinear
 from ast_sim.model.normalizer import Normalizer
-from ast_sim.model.transformer import AttentionBlock, PositionEmbedding
+from ast_sim.model.transformer import AttentionBlock, PositionEmbedding, Vectors, rotated, rotations
 from ast_sim.models import build_model
 from ast_sim.ops.edges import EdgeSet
 
+RELATIVE, EXCHANGES = {"places": "relative"}, {"places": "relative", "exchanges": 2}
 SMALL = {"hidden": 32, "decoder_hidden": 16, "d_token": 32, "heads": 2, "head_dim": 16, "ffn_inner": 32, "L_SA": 2}
 
 
@@ -79,10 +80,11 @@ def test_every_preset_takes_a_training_step(family, tmp_path):
     assert not without, without
 
 
+@pytest.mark.parametrize("changes", [{}, RELATIVE, EXCHANGES])
 @pytest.mark.parametrize("family", ["deforming_plate", "sphere_simple", "abcd", "abcd_xl"])
-def test_c_core_and_torch_composition_agree(family, tmp_path):
-    """The same weights and batch give the same outputs and gradients on both backends."""
-    config = small(family, dropout=0.0, **({"L_cell": 7, "l_ocnn": 3} if family == "abcd_xl" else {}))
+def test_c_core_and_torch_composition_agree(family, changes, tmp_path):
+    """The same weights and batch give the same outputs and gradients on both backends, for each parameter there is."""
+    config = small(family, dropout=0.0, **changes, **({"L_cell": 7, "l_ocnn": 3} if family == "abcd_xl" else {}))
     config = replace(config, stress="element") if family == "abcd_xl" else config
     code = f"""
 import sys, torch
@@ -200,15 +202,83 @@ def test_message_passing_is_the_formula():
 def test_attention_block_is_the_formula():
     torch.manual_seed(0)
     config = small("deforming_plate", dropout=0.0)
-    block = AttentionBlock(config, cross=True)
+    block = AttentionBlock(config, 32, 32)
     x, context = torch.randn(5, 32), torch.randn(11, 32)
-    out = block(x, torch.tensor([0, 5]), context, torch.tensor([0, 11]))
+    out = block(Vectors(x, torch.tensor([0, 5])), Vectors(context, torch.tensor([0, 11]))).x
     q = block.query(block.norm(x)).view(5, 2, 16).transpose(0, 1)
     k, v = block.key_value(block.norm_context(context)).view(11, 2, 2, 16).permute(1, 2, 0, 3)
     mixed = ((q @ k.transpose(1, 2) / 4).softmax(-1) @ v).transpose(0, 1).reshape(5, 32)
     y = x + block.out(mixed)
     a, b = block.feed_forward.first(block.feed_forward.norm(y)).chunk(2, dim=1)
     torch.testing.assert_close(out, y + block.feed_forward.second(a * F.gelu(b)), rtol=1e-4, atol=1e-5)
+
+
+def test_rotations_turn_each_pair_by_its_angle():
+    """As complex numbers a + ib, times exp(i pi 2^-j x); two pairs of eight are left over."""
+    x, place = torch.randn(6, 2, 16), torch.randn(6, 3).double() * 5
+    turned = rotated(x, rotations(place, 16))
+    for axis in range(3):
+        for j in range(2):
+            pair = 2 * axis + j
+            complex_x = torch.complex(x[:, :, pair], x[:, :, pair + 8])
+            expected = complex_x * torch.exp(1j * torch.pi * 0.5**j * place[:, None, axis])
+            torch.testing.assert_close(turned[:, :, pair].double(), expected.real, rtol=0, atol=1e-5)
+            torch.testing.assert_close(turned[:, :, pair + 8].double(), expected.imag, rtol=0, atol=1e-5)
+    assert torch.equal(turned[:, :, [6, 7, 14, 15]], x[:, :, [6, 7, 14, 15]])
+
+
+def test_rotations_far_from_the_centre():
+    """2^20 cells away, the farthest that there is, the way between two places is what it is near the centre."""
+    near = torch.rand(5, 3, dtype=torch.float64)
+    far = near + 2**20
+    q, k = torch.randn(5, 1, 32), torch.randn(5, 1, 32)
+
+    def products(at):
+        return (rotated(q, rotations(at, 32)) * rotated(k, rotations(at.flip(0), 32))).sum(dim=2)
+
+    torch.testing.assert_close(products(far), products(near), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("changes, follows", [({}, False), (RELATIVE, True), (EXCHANGES, True)])
+def test_relative_places_follow_a_scene_that_is_moved_by_whole_cells(changes, follows):
+    torch.manual_seed(0)
+    config = small("deforming_plate", l_ocnn=1, **changes)
+    model, batch = build_model(config).eval(), batch_of(config, 0)
+    way = 2 * config.cell_side * torch.tensor([1.0, -2.0, 1.0])  # in whole coarse cells
+    rest = batch.graph.rest_position + way
+    moved = replace(batch, graph=replace(batch.graph, rest_position=rest), position=batch.position + way)
+    with torch.no_grad():
+        difference = model(moved).motion - model(batch).motion
+    assert (float(difference.abs().max()) < 1e-4) == follows, difference.abs().max()
+
+
+def test_places_of_nodes_and_cells_are_measured_alike():
+    """A node in the middle of a coarse cell is where the cell is, also after the domain has grown."""
+    config = small("deforming_plate", L_cell=4, l_ocnn=1, domain_center=(1.0, 2.0, 3.0), domain_half_width=2.0)
+    side = 2 * config.cell_side
+    middle = torch.tensor([[0.5, 0.5, 0.5], [-2.5, 1.5, 0.5], [5.5, -8.5, 3.5]])
+    position = middle * side + torch.tensor(config.domain_center)
+    for count, growth in ((2, 0), (3, 2)):
+        cells = build_cells(config, position[:count], torch.tensor([0, count]), may_grow=True)
+        assert cells.growth == growth
+        coarse = cells.maps[0].coarse.node_cell[cells.finest.node_cell]
+        assert torch.equal(cells.places()[coarse], middle[:count].double())
+        torch.testing.assert_close(places(config, position[:count]), middle[:count].double(), rtol=0, atol=1e-6)
+
+
+def test_nodes_of_a_cell_read_for_themselves():
+    """Nodes of one cell that only differ in where they are learn different things from the tokens, by a step as small
+    as the way between them."""
+    torch.manual_seed(0)
+    config = small("deforming_plate", **EXCHANGES)
+    model = build_model(config).eval()
+    tokens = Vectors(torch.randn(7, 32), torch.tensor([0, 7]), rotations(torch.randn(7, 3).double(), 16))
+    x = torch.randn(32).expand(3, 32)
+    place = torch.tensor([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0], [0.1001, 0.0, 0.0]]).double()
+    with torch.no_grad():
+        out = model.to_nodes[0](Vectors(x, torch.tensor([0, 3]), rotations(place, 16)), tokens).x
+    far, near = (float((out[i] - out[0]).norm()) for i in (1, 2))
+    assert far > 1e-3 and near == pytest.approx(far / 1000, rel=0.3)
 
 
 def test_random_weight_factorization():
@@ -356,6 +426,9 @@ def test_integration():
         ({"head_dim": 24}, "multiple of 16"),
         ({"residual": ("m2x",)}, "m2x"),
         ({"L_cell": 3, "l_ocnn": 4}, "l_ocnn"),
+        ({"exchanges": 1}, "model.places=relative"),
+        ({"exchanges": 5, "places": "relative"}, "model.exchanges = 5 must be 0 or divide model.L_SA = 12"),
+        ({"exchanges": -1, "places": "relative"}, "model.exchanges = -1"),
     ],
 )
 def test_settings_that_do_not_fit(changes, message):

@@ -38,12 +38,12 @@ BY_HAND = {
     # elements have material and stress (2 * 128) more; 8 convolutions; m2e; decoder 128 -> 32 -> 1: 4160 + 34
     "abcd_xl": MESH + 256 + 66048 + 26624 + 65664 + 2 * 1840128 + 12 * 1839104 + 8358 + 8 * 442496 + 99840 + 4194,
     # hidden 64, no elements, plain layers: encoder 9 -> 64 -> 64: 640 + 4160; m2m: edge encoder 576 + 4160,
-    # f_e 12352 + 4160, f_v 8256 + 4160, norms 256; m2c and c2m: f_e and f_v 8256 + 4160 each, norms 256; lift, lower
-    # 4160, embedding 33*64+64; attention, 4 heads of 32: q, k, v 24576, out 8256, norms 256, FFN 16640 + 8256 = 57984,
-    # cross 58112; decoder 128 -> 64 -> 4
-    "tiny": 4800 + 33920 + 2 * 25088 + 4160 + 2176 + 4160 + 2 * 58112 + 4 * 57984 + 8256 + 260,
+    # f_e 12352 + 4160, f_v 8256 + 4160, norms 256; m2c: f_e and f_v 8256 + 4160 each, norms 256; lift 4160; attention,
+    # 4 heads of 32: q, k, v 24576, out 8256, norms 256, FFN 16640 + 8256 = 57984, cross 58112, two to tokens, two to
+    # nodes; decoder 128 -> 64 -> 4
+    "tiny": 4800 + 33920 + 25088 + 4160 + 4 * 58112 + 4 * 57984 + 8256 + 260,
 }
-TOTALS = {"deforming_plate": 13334088, "sphere_simple": 13334054, "abcd": 26285478, "abcd_xl": 29929608, "tiny": 456068}
+TOTALS = {"deforming_plate": 13334088, "sphere_simple": 13334054, "abcd": 26285478, "abcd_xl": 29929608, "tiny": 540868}
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -61,6 +61,9 @@ def test_only_what_the_scene_requires_is_built():
     }
     assert "element_encoder" not in parts["tiny"] and "e2m" not in parts["tiny"] and "m2m" in parts["tiny"]
     assert "element_decoder" not in parts["abcd"] and "m2e" not in parts["abcd"] and "m2m" not in parts["abcd"]
+    for by_cells in ("position_embedding", "to_cells", "lower", "up", "c2m"):
+        assert by_cells not in parts["tiny"] and by_cells in parts["abcd"]
+    assert "to_nodes" in parts["tiny"] and "to_nodes" not in parts["abcd"]
     assert len(parts["tiny"]["down"]) == len(parts["abcd"]["up"]) == 0
 
 
