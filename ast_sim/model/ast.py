@@ -153,11 +153,11 @@ class AST(Simulator):
 
     def _exchange(self, nodes: Vectors, tokens: Vectors) -> Tensor:
         """Nodes and tokens, which attend to each other in turn -> mesh features [N, hidden]."""
-        share = len(self.processor) // len(self.to_nodes)
-        for number, to_nodes in enumerate(self.to_nodes):
-            if number:
-                tokens = self.from_nodes[number - 1](tokens, nodes)
-            tokens = self._process(tokens, self.processor[number * share : (number + 1) * share])
+        blocks, times = len(self.processor), len(self.to_nodes)
+        for i, to_nodes in enumerate(self.to_nodes):
+            if i:
+                tokens = self.from_nodes[i - 1](tokens, nodes)
+            tokens = self._process(tokens, self.processor[blocks * i // times : blocks * (i + 1) // times])
             nodes = to_nodes(nodes, tokens)
         return nodes.x
 

@@ -55,8 +55,8 @@ class ASTConfig(TimeConditionedConfig):
             )
         if self.exchanges and self.places != "relative":
             raise ConfigError("model.exchanges needs model.places=relative: nodes have no other place in attention")
-        if self.exchanges < 0 or (self.exchanges and self.L_SA % self.exchanges):
-            raise ConfigError(f"model.exchanges = {self.exchanges} must be 0 or divide model.L_SA = {self.L_SA}")
+        if self.exchanges < 0:
+            raise ConfigError(f"model.exchanges is {self.exchanges}; it must be at least 0")
         if self.head_dim % 16 or not 16 <= self.head_dim <= 128:
             raise ConfigError(f"model.head_dim must be a multiple of 16 up to 128, not {self.head_dim}")
         for name in self.residual:
