@@ -52,8 +52,8 @@ class Vectors:
 
 
 def rotations(places: Tensor, head_dim: int) -> Tensor:
-    """Rotary embedding (Su et al. 2021, arXiv 2104.09864) of places [T, 3] float64, in cell sides -> [T, 1, 2, D / 2],
-    the cosines and sines of the angles by which queries and keys turn, pair of components by pair.
+    """Rotary embedding (Su et al. 2021, arXiv 2104.09864) of places [T, 3] float64, in cell sides -> [T, 1, D / 2]
+    complex64 of length 1, by which queries and keys turn, pair of components by pair.
 
     Their product then depends on the way between two places, not on where they are. The angles are pi 2^-j times x, y
     and z, waves of 2, 4, 8, ... cells, for as many j as there are pairs; what is left over does not turn.
@@ -61,16 +61,14 @@ def rotations(places: Tensor, head_dim: int) -> Tensor:
     pairs = head_dim // 2
     angles = (places[:, :, None] * (math.pi * 0.5 ** torch.arange(pairs // 3, dtype=torch.float64))).flatten(1)
     angles = F.pad(angles, (0, pairs - angles.shape[1]))
-    return torch.stack([angles.cos(), angles.sin()], dim=1)[:, None].float()
+    return torch.polar(torch.ones_like(angles), angles)[:, None].to(torch.complex64)
 
 
 def rotated(x: Tensor, by: Tensor | None) -> Tensor:
-    """x [T, H, D], its pairs (x_i, x_{i + D/2}) turned by `rotations`; by None x itself."""
+    """x [..., D], each pair (x_2i, x_2i+1) turned by `rotations` [..., D / 2]; by None x itself."""
     if by is None:
         return x
-    a, b = x.chunk(2, dim=2)
-    cos, sin = by.unbind(dim=2)
-    return torch.cat([a * cos - b * sin, a * sin + b * cos], dim=2)
+    return torch.view_as_real(torch.view_as_complex(x.unflatten(-1, (-1, 2))) * by).flatten(-2)
 
 
 class FeedForward(nn.Module):
@@ -123,8 +121,8 @@ class AttentionBlock(nn.Module):
         """[T, H, D]."""
         together = self.query_key_value(self.norm(vectors.x)).unflatten(1, (3, self.heads, -1))
         if vectors.rotations is not None:
-            query, key, value = together.unbind(1)
-            together = torch.stack([*(rotated(x, vectors.rotations) for x in (query, key)), value], dim=1)
+            query_key, value = together.split((2, 1), dim=1)
+            together = torch.cat([rotated(query_key, vectors.rotations[:, None]), value], dim=1)
         return self_attention(together, vectors.offsets, **options)
 
     def _to(self, context: Vectors, vectors: Vectors, options: dict[str, Any]) -> Tensor:

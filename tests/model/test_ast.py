@@ -214,17 +214,17 @@ def test_attention_block_is_the_formula():
 
 
 def test_rotations_turn_each_pair_by_its_angle():
-    """As complex numbers a + ib, times exp(i pi 2^-j x); two pairs of eight are left over."""
+    """(a, b) as a rotation matrix turns it by pi 2^-j x; two pairs of eight are left over."""
     x, place = torch.randn(6, 2, 16), torch.randn(6, 3).double() * 5
     turned = rotated(x, rotations(place, 16))
     for axis in range(3):
         for j in range(2):
             pair = 2 * axis + j
-            complex_x = torch.complex(x[:, :, pair], x[:, :, pair + 8])
-            expected = complex_x * torch.exp(1j * torch.pi * 0.5**j * place[:, None, axis])
-            torch.testing.assert_close(turned[:, :, pair].double(), expected.real, rtol=0, atol=1e-5)
-            torch.testing.assert_close(turned[:, :, pair + 8].double(), expected.imag, rtol=0, atol=1e-5)
-    assert torch.equal(turned[:, :, [6, 7, 14, 15]], x[:, :, [6, 7, 14, 15]])
+            angle = (torch.pi * 0.5**j * place[:, None, axis]).float()
+            a, b = x[:, :, 2 * pair], x[:, :, 2 * pair + 1]
+            expected = torch.stack([a * angle.cos() - b * angle.sin(), a * angle.sin() + b * angle.cos()], dim=2)
+            torch.testing.assert_close(turned[:, :, 2 * pair : 2 * pair + 2], expected, rtol=0, atol=1e-5)
+    assert torch.equal(turned[:, :, 12:], x[:, :, 12:])
 
 
 def test_rotations_far_from_the_centre():
