@@ -108,13 +108,13 @@ class AST(Simulator):
 
         now = inputs.present(self.config, batch)
         cells = build_cells(self.config, now, batch.graph.node_offsets, may_grow=not self.training)
-        coarse = self._to_cells(cells, mesh)
-        tokens = self._to_tokens(cells, coarse)
+        coarse = self._embedded(cells, mesh)
+        tokens = self._tokens(cells, coarse)
         if self.config.exchanges:
             nodes = Vectors(mesh, batch.graph.node_offsets, self._rotations(places(self.config, now)))
             mesh = self._exchange(nodes, tokens)
         else:
-            mesh = self._from_cells(cells, self.to_cells(coarse, self._process(tokens, self.processor)).x, mesh)
+            mesh = self._back_to_mesh(cells, self.to_cells(coarse, self._process(tokens, self.processor)).x, mesh)
         for step in self.after_cells:
             mesh = step(edges, mesh, mesh, edge_features)
 
@@ -124,7 +124,7 @@ class AST(Simulator):
             stress = self.element_decoder(self.m2e(batch.graph.m2e, mesh, elements))
         return Prediction(out[:, :3], stress)
 
-    def _to_cells(self, cells: Cells, mesh: Tensor) -> Vectors:
+    def _embedded(self, cells: Cells, mesh: Tensor) -> Vectors:
         """Mesh features [N, hidden] -> the coarsest cells, which know their places."""
         finest, coarsest = cells.finest, cells.coarsest
         mean = segment_mean(mesh, finest.node_order, finest.node_offsets)
@@ -139,7 +139,7 @@ class AST(Simulator):
     def _rotations(self, of: Tensor) -> Tensor:
         return rotations(of, self.config.head_dim)
 
-    def _to_tokens(self, cells: Cells, coarse: Vectors) -> Vectors:
+    def _tokens(self, cells: Cells, coarse: Vectors) -> Vectors:
         """Tokens, which begin as some of the cells and attend to all."""
         level = cells.coarsest
         chosen, offsets = farthest_point_sample(level.coordinates(), level.cell_offsets, self.config.num_tokens)
@@ -161,7 +161,7 @@ class AST(Simulator):
             nodes = to_nodes(nodes, tokens)
         return nodes.x
 
-    def _from_cells(self, cells: Cells, x: Tensor, mesh: Tensor) -> Tensor:
+    def _back_to_mesh(self, cells: Cells, x: Tensor, mesh: Tensor) -> Tensor:
         """The coarsest cells [C, d_token] and mesh features [N, hidden] -> mesh features."""
         x = self.lower(x)
         for convolve, step in zip(self.up, reversed(cells.maps), strict=True):
