@@ -51,11 +51,6 @@ class TransolverConfig(TimeConditionedConfig):
         self.check_positive("hidden", "blocks", "heads", "slices", "mlp_ratio")
         self.check_heads()
 
-    @property
-    def gains_along_rollouts(self) -> bool:
-        """See `ModelConfig`; without inertia, too."""
-        return True
-
     def inputs_for(self, info: DatasetInfo, material_width: int) -> dict[str, Any]:
         """See `ModelConfig`; the displacement always, proximity in quasi-static scenes."""
         nodes = super().inputs_for(info, material_width)["node_inputs"]

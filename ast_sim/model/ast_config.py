@@ -84,11 +84,6 @@ class ASTConfig(TimeConditionedConfig):
         resolved = super(ASTConfig, replace(self, element_inputs=elements)).resolve(info, material_width, mesh_spacing)
         return replace(resolved, L_cell=depth)
 
-    @property
-    def gains_along_rollouts(self) -> bool:
-        """See `ModelConfig`; without inertia, too."""
-        return True
-
     def inputs_for(self, info: DatasetInfo, material_width: int) -> dict[str, list[str]]:
         """See `ModelConfig`; the displacement always, proximity in quasi-static scenes, and element nodes if there is a
         stress on elements."""

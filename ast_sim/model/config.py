@@ -140,6 +140,11 @@ class TimeConditionedConfig(ModelConfig):
                 " only on where the prescribed ones are: predict it step by step"
             )
 
+    @property
+    def gains_along_rollouts(self) -> bool:
+        """See `ModelConfig`; without inertia, too."""
+        return True
+
 
 @dataclass(frozen=True)
 class Preset:
