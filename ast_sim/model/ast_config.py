@@ -103,7 +103,7 @@ _PAPER = {"batch_size": 48, "peak_rate": 1e-4 * math.sqrt(48 / 2), "noise": 0.00
 PRESETS = {
     "tiny": Preset(
         ASTConfig(
-            hidden=64, decoder_hidden=64, d_token=64, heads=4, head_dim=32, ffn_inner=128, L_SA=4, num_tokens=128,
+            hidden=64, decoder_hidden=64, d_token=64, heads=2, head_dim=32, ffn_inner=128, L_SA=2, num_tokens=128,
             dropout=0.0, L_cell=None, places="relative", exchanges=2, element_inputs=(), edge_strain=True,
             factorized=False,
         ),
