@@ -32,7 +32,7 @@ class Size:
     steps: int
 
 
-FULL = Size(train=100, valid=8, test=10, steps=6000)  # at most 10 minutes on 2 cores
+FULL = Size(train=100, valid=8, test=10, steps=8000)  # at most 10 minutes on 2 cores
 QUICK = Size(train=16, valid=2, test=3, steps=500)  # at most 90 seconds
 
 
