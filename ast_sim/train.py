@@ -52,12 +52,12 @@ def configure(data: Path, preset: str, assignments: Sequence[str] = (), model: s
     """
     chosen = find_preset(model, preset)
     with Dataset(data) as dataset:
-        inputs = chosen.model.inputs_for(dataset.info, dataset.material_width) if chosen.adapts else {}
+        adapted = chosen.model.settings_for(dataset.info, dataset.material_width) if chosen.adapts else {}
         kind = [
             f"model.integration={dataset.info.integration}",
             f"model.stress={dataset.info.stress_location}",
             f"model.material_width={dataset.material_width}",
-            *(f"model.{name}={value}" for name, value in inputs.items()),
+            *(f"model.{name}={value}" for name, value in adapted.items()),
         ]
     return override(RunConfig(chosen.model, TrainConfig(**chosen.train), str(data)), [*kind, *assignments])
 

@@ -135,6 +135,10 @@ def test_tiny_sees_other_bodies_and_learns_along_rollouts_where_that_was_measure
     assert still.model.node_inputs == ("displacement", "proximity") and still.train.rollout_pool is None
     assert still.train.shift is None and moving.train.shift is None
     assert moving.model.node_inputs == ("displacement", "velocity")
+    assert (still.model.places, still.model.exchanges) == ("relative", 2)
+    assert (moving.model.places, moving.model.exchanges) == ("absolute", 0)
+    asked = train.configure(tmp_path / "d.h5", "tiny", ["model.places=relative", "model.exchanges=1"])
+    assert asked.model.exchanges == 1
     paper = train.configure(data, "deforming_plate")
     assert paper.model.node_inputs == ("displacement",) and paper.train.rollout_pool == paper.train.shift == 0
 

@@ -51,9 +51,9 @@ class TransolverConfig(TimeConditionedConfig):
         self.check_positive("hidden", "blocks", "heads", "slices", "mlp_ratio")
         self.check_heads()
 
-    def inputs_for(self, info: DatasetInfo, material_width: int) -> dict[str, Any]:
+    def settings_for(self, info: DatasetInfo, material_width: int) -> dict[str, Any]:
         """See `ModelConfig`; the displacement always, proximity in quasi-static scenes."""
-        nodes = super().inputs_for(info, material_width)["node_inputs"]
+        nodes = super().settings_for(info, material_width)["node_inputs"]
         return {"node_inputs": ["displacement", *nearness(info), *nodes]}
 
 

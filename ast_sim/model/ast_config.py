@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 from ast_sim.data.file import DatasetInfo
 from ast_sim.errors import ConfigError
@@ -84,13 +84,15 @@ class ASTConfig(TimeConditionedConfig):
         resolved = super(ASTConfig, replace(self, element_inputs=elements)).resolve(info, material_width, mesh_spacing)
         return replace(resolved, L_cell=depth)
 
-    def inputs_for(self, info: DatasetInfo, material_width: int) -> dict[str, list[str]]:
+    def settings_for(self, info: DatasetInfo, material_width: int) -> dict[str, Any]:
         """See `ModelConfig`; the displacement always, proximity in quasi-static scenes, and element nodes if there is a
-        stress on elements."""
-        nodes = super().inputs_for(info, material_width)["node_inputs"]
+        stress on elements. With inertia nodes learn from cells: after exchanges rollouts run away (docs/log.md,
+        2026-11-23)."""
+        nodes = super().settings_for(info, material_width)["node_inputs"]
         material = ["material"] if material_width else []
         elements = ["displacement", *material] if info.stress_location == "element" else []
-        return {"node_inputs": ["displacement", *nearness(info), *nodes], "element_inputs": elements}
+        by_cells = {"places": "absolute", "exchanges": 0} if info.integration == "dynamic" else {}
+        return {"node_inputs": ["displacement", *nearness(info), *nodes], "element_inputs": elements, **by_cells}
 
     def facts(self, length_unit: str, mesh_spacing: float | None = None) -> dict[str, str]:
         """See `ModelConfig`."""

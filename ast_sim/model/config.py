@@ -113,9 +113,9 @@ class ModelConfig:
             proximity_radius=1.5 * mesh_spacing if self.proximity_radius is None else self.proximity_radius,
         )
 
-    def inputs_for(self, info: DatasetInfo, material_width: int) -> dict[str, list[str]]:
-        """The inputs that a dataset calls for, by the name of the setting: velocities if it moves in time, materials
-        if they differ. A preset that adapts takes them."""
+    def settings_for(self, info: DatasetInfo, material_width: int) -> dict[str, Any]:
+        """The settings that a dataset calls for, by name: as inputs velocities if it moves in time, and materials if
+        they differ. A preset that adapts takes them."""
         velocity = ["velocity"] if info.integration == "dynamic" else []
         return {"node_inputs": [*velocity, *(["material"] if material_width else [])]}
 
@@ -153,7 +153,7 @@ class Preset:
     Attributes:
         model: as in a paper, or for any dataset.
         train: settings of the training.
-        adapts: whether the inputs follow the dataset: those of a paper's presets are the paper's.
+        adapts: whether it takes `settings_for` the dataset; the AST paper's presets do not.
     """
 
     model: ModelConfig
