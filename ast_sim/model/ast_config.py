@@ -86,8 +86,8 @@ class ASTConfig(TimeConditionedConfig):
 
     def settings_for(self, info: DatasetInfo, material_width: int) -> dict[str, Any]:
         """See `ModelConfig`; the displacement always, proximity in quasi-static scenes, and element nodes if there is a
-        stress on elements. With inertia nodes learn from cells: after exchanges rollouts run away (docs/log.md,
-        2026-11-23)."""
+        stress on elements. With inertia nodes learn from cells: after exchanges rollouts of cloths ran away in one
+        of two trainings (docs/log.md, 2026-11-24)."""
         nodes = super().settings_for(info, material_width)["node_inputs"]
         material = ["material"] if material_width else []
         elements = ["displacement", *material] if info.stress_location == "element" else []
