@@ -16,18 +16,17 @@ Legend: N nodes, B scenes, H heads of width D, S slices.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ast_sim.data.batch import Batch
-from ast_sim.data.file import DatasetInfo
 from ast_sim.data.graph import Graph
 from ast_sim.data.scene import Scene
 from ast_sim.model import features
-from ast_sim.model.config import Preset, TimeConditionedConfig, nearness, setting
+from ast_sim.model.config import Preset, TimeConditionedConfig, setting
 from ast_sim.model.linear import Linear
 from ast_sim.model.normalizer import FeatureNormalizer
 from ast_sim.model.simulator import Prediction, Simulator
@@ -50,11 +49,6 @@ class TransolverConfig(TimeConditionedConfig):
         super().__post_init__()
         self.check_positive("hidden", "blocks", "heads", "slices", "mlp_ratio")
         self.check_heads()
-
-    def settings_for(self, info: DatasetInfo, material_width: int) -> dict[str, Any]:
-        """See `ModelConfig`; the displacement always, proximity in quasi-static scenes."""
-        nodes = super().settings_for(info, material_width)["node_inputs"]
-        return {"node_inputs": ["displacement", *nearness(info), *nodes]}
 
 
 class MLP(nn.Module):

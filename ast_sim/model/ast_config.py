@@ -8,7 +8,7 @@ from typing import Any, Literal, Self
 
 from ast_sim.data.file import DatasetInfo
 from ast_sim.errors import ConfigError
-from ast_sim.model.config import Preset, TimeConditionedConfig, nearness, setting
+from ast_sim.model.config import Preset, TimeConditionedConfig, setting
 
 
 @dataclass(frozen=True)
@@ -85,14 +85,12 @@ class ASTConfig(TimeConditionedConfig):
         return replace(resolved, L_cell=depth)
 
     def settings_for(self, info: DatasetInfo, material_width: int) -> dict[str, Any]:
-        """See `ModelConfig`; the displacement always, proximity in quasi-static scenes, and element nodes if there is a
-        stress on elements. With inertia nodes learn from cells: after exchanges rollouts of cloths ran away in one
-        of two trainings (docs/log.md, 2026-11-24)."""
-        nodes = super().settings_for(info, material_width)["node_inputs"]
+        """See `TimeConditionedConfig`; element nodes if there is a stress on elements. With inertia nodes learn from
+        cells: after exchanges rollouts of cloths ran away in one of two trainings (docs/log.md, 2026-11-24)."""
         material = ["material"] if material_width else []
         elements = ["displacement", *material] if info.stress_location == "element" else []
         by_cells = {"places": "absolute", "exchanges": 0} if info.integration == "dynamic" else {}
-        return {"node_inputs": ["displacement", *nearness(info), *nodes], "element_inputs": elements, **by_cells}
+        return {**super().settings_for(info, material_width), "element_inputs": elements, **by_cells}
 
     def facts(self, length_unit: str, mesh_spacing: float | None = None) -> dict[str, str]:
         """See `ModelConfig`."""

@@ -15,12 +15,6 @@ def setting(default: Any, text: str) -> Any:
     return field(default=default, metadata={"help": text})
 
 
-def nearness(info: DatasetInfo) -> list[str]:
-    """What tells a model without edges between bodies that another one is near: proximity, in quasi-static scenes (in
-    dynamic ones it has not been measured)."""
-    return ["proximity"] if info.integration == "quasi_static" else []
-
-
 @dataclass(frozen=True)
 class ModelConfig:
     """Settings of any model; those of one are a subclass with a `name` of its own.
@@ -144,6 +138,13 @@ class TimeConditionedConfig(ModelConfig):
     def gains_along_rollouts(self) -> bool:
         """See `ModelConfig`; without inertia, too."""
         return True
+
+    def settings_for(self, info: DatasetInfo, material_width: int) -> dict[str, Any]:
+        """See `ModelConfig`; the displacement always, and in quasi-static scenes (in dynamic ones it has not been
+        measured) proximity: no edge between bodies tells that another one is near."""
+        nodes = super().settings_for(info, material_width)["node_inputs"]
+        proximity = ["proximity"] if info.integration == "quasi_static" else []
+        return {"node_inputs": ["displacement", *proximity, *nodes]}
 
 
 @dataclass(frozen=True)
