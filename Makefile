@@ -11,7 +11,7 @@ C_FUZZERS := $(patsubst csrc/tests/fuzz_%.c,%,$(wildcard csrc/tests/fuzz_*.c))
 C_TEST_HEADERS := $(wildcard csrc/tests/*.h)
 X86 := $(filter x86_64,$(shell uname -m))
 
-.PHONY: demo test check fuzz corpus lint bench tools clean
+.PHONY: demo test check fuzz corpus lint docs bench tools clean
 
 demo: $(VENV)/installed
 	$(BIN)/ast-sim demo
@@ -35,7 +35,12 @@ lint: $(VENV)/tested
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
+	$(BIN)/basedpyright --pythonpath $(BIN)/python
 	$(BIN)/clang-format --dry-run --Werror csrc/*.c csrc/*.h csrc/tests/*.c csrc/tests/*.h
+
+# The pages of the reference, from docstrings and the help of the commands.
+docs: $(VENV)/installed
+	$(BIN)/python docs/make_reference.py
 
 # The C tests, which need no Python: optimised, under the address and undefined behaviour sanitizers, under the thread sanitizer,
 # and under valgrind. `wide` compiles the 64-byte source for AVX2, so that its logic is tested where there is no AVX-512.
@@ -74,11 +79,11 @@ $(VENV)/installed: $(VENV)/torch pyproject.toml setup.py MANIFEST.in $(C_SOURCES
 	touch $@
 
 $(VENV)/tested: $(VENV)/installed | tools
-	$(PIP) --editable '.[simulate,cad,cluster,view,test]'
+	$(PIP) --editable '.[simulate,cad,cluster,tfrecord,view,test]'
 	touch $@
 
 $(VENV)/benched: $(VENV)/installed
-	$(PIP) --editable '.[simulate,cad,view,bench]'
+	$(PIP) --editable '.[simulate,cad,tfrecord,view,bench]'
 	touch $@
 
 # System programs that the tests use; installed where this is allowed, otherwise the tests say what is missing.

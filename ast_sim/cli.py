@@ -1,53 +1,66 @@
-"""The command line: `ast-sim COMMAND`. Errors that a user can act on are one line on stderr and exit code 2.
+"""The command line `ast-sim COMMAND`: its commands and their arguments; `commands.py` has what they do.
 
-Everything heavy is imported by the command that needs it, so that help is immediate.
+An error that a user can act on is printed as one line on stderr, and the exit code is 2.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+import io
 import os
 import shlex
 import sys
 import warnings
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ast_sim import __version__
-from ast_sim.errors import AstSimError, ConfigError, DatasetError, RolloutError
+from ast_sim import __version__, commands
+from ast_sim.support.errors import AstSimError, ConfigError, printable
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong with the arguments in one line."""
+    """A parser that reports wrong arguments in one line."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
+        self.exit(2, f"{self.prog}: {printable(message)} (see {self.prog} --help)\n")
 
 
 class _TrainParser(_Parser):
-    """Its help ends with every setting that `--set` knows; these are imported only then."""
+    """A parser whose help ends with all settings for `--set`; they are imported only when the help is printed."""
 
     def format_help(self) -> str:
-        from ast_sim import config
-        from ast_sim.models import MODELS
-        from ast_sim.run import TrainConfig
+        from ast_sim.models.registry import find_model, find_preset, model_names
+        from ast_sim.runs.train_config import TrainConfig
+        from ast_sim.support.toml_settings import settings
 
-        lines = [super().format_help(), "settings for --set, and their defaults:"]
-        groups = [("training", "train.", TrainConfig), *((n, "model.", m.config) for n, m in MODELS.items())]
-        for title, prefix, settings in groups:
-            presets = f", presets {', '.join(MODELS[title].presets)}" if title in MODELS else ""
-            lines += ["", f"{title}{presets}:"]
-            for setting in config.settings(settings):
-                lines.append(f"  {prefix}{setting.key}={setting.default}  ({setting.type})\n        {setting.help}")
+        usual = find_preset("ast", "tiny").train
+        lines = [super().format_help(), "settings for --set, and their values in the preset tiny (none: unset):"]
+        lines += ["", "training (of ast; other models list what differs):", *self._lines("train.", TrainConfig, usual)]
+        for name in model_names():
+            try:
+                model, tiny = find_model(name), find_preset(name, "tiny")
+            except ConfigError as error:
+                lines += ["", str(error)]
+                continue
+            own, common = ({s.key: s.default for s in settings(TrainConfig, train)} for train in (tiny.train, usual))
+            lines += ["", f"{name}, presets {', '.join(model.presets)}:"]
+            lines += [f"  train.{key}={value}  (in tiny)" for key, value in own.items() if value != common[key]]
+            lines += self._lines("model.", model.config, vars(tiny.model))
         return "\n".join(lines) + "\n"
+
+    @staticmethod
+    def _lines(prefix: str, kind: type, values: Mapping[str, Any]) -> list[str]:
+        from ast_sim.support.toml_settings import settings
+
+        return [f"  {prefix}{s.key}={s.default}  ({s.type})\n        {s.help}" for s in settings(kind, values)]
 
 
 class _GenerateParser(_Parser):
-    """Its help ends with a line for every family."""
+    """A parser whose help ends with a line about each family."""
 
     def format_help(self) -> str:
-        from ast_sim.simulate.families import FAMILIES
+        from ast_sim.simulate.families.names import FAMILIES
 
         lines = [super().format_help(), "families:"]
         for name, family in FAMILIES.items():
@@ -58,7 +71,12 @@ class _GenerateParser(_Parser):
 
 def main(argv: list[str] | None = None) -> int:
     """Run a command; returns the exit code."""
-    args = _build_parser().parse_args(argv)
+    if sys.stdout is None:  # closed, as by `>&-`; the next file to be opened would take its place
+        print("ast-sim: standard output is closed: send it to /dev/null instead", file=sys.stderr)
+        return 2
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # names of files may hold bytes that are no text
+    args = build_parser().parse_args(argv)
     args.command_line = shlex.join(["ast-sim", *(sys.argv[1:] if argv is None else argv)])
     warnings.showwarning = _show_warning
     try:
@@ -67,122 +85,200 @@ def main(argv: list[str] | None = None) -> int:
         return 0
     except KeyboardInterrupt:
         return 130
-    except BrokenPipeError:
-        # The reader of our output has gone; what Python flushes at exit must not complain either.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (BrokenPipeError, SystemExit) as error:
+        try:
+            sys.stdout.flush()
+        except OSError:
+            # The reader is gone. Redirect stdout, so that Python's flush at exit does not fail, too.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if isinstance(error, SystemExit):
+            raise
         return 141
     except (AstSimError, OSError) as error:
         if args.debug:
             raise
-        print(f"ast-sim {args.command}: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"ast-sim {args.command}: {printable(' '.join(str(error).split()))}", file=sys.stderr)
         return 2
 
 
 def _show_warning(message: Warning | str, *_: Any) -> None:
-    print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
+    print(f"warning: {printable(' '.join(str(message).split()))}", file=sys.stderr)
 
 
-def _build_parser() -> argparse.ArgumentParser:
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of all commands."""
     parser = _Parser(prog="ast-sim", description="Learned simulation of deforming bodies in contact.")
     parser.add_argument("--version", action="version", version=f"ast_sim {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def command(name: str, run: Any, help: str, kind: type[_Parser] = _Parser) -> _Parser:
-        commands._parser_class = kind
-        sub = commands.add_parser(name, help=help, description=help[0].upper() + help[1:] + ".")
+    def add(fill: Callable[[_Parser], None], run: Any, about: str, kind: type[_Parser] = _Parser) -> None:
+        subparsers._parser_class = kind
+        name = fill.__name__.removeprefix("_add_")
+        sub = subparsers.add_parser(name, help=about, description=about[0].upper() + about[1:] + ".")
         sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
         sub.set_defaults(run=run)
-        return sub
+        fill(sub)
 
-    demo = command("demo", _demo, "generate a small dataset, train on it, roll out its test scenes, write a report")
-    demo.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="folder for everything (demo)")
-    demo.add_argument("--quick", action="store_true", help="fewer scenes and steps: 90 seconds on 2 cores")
-    demo.add_argument("--seed", type=_at_least(0), default=0, help="of scenes and training (0)")
-
-    about = "simulate scenes with the bundled contact FEM; restarts where it stopped"
-    generate = command("generate", _generate, about, _GenerateParser)
-    generate.add_argument("family", metavar="FAMILY", help="kind of scenes, see below")
-    generate.add_argument("--out", type=Path, required=True, metavar="FILE", help="dataset to write (.h5)")
-    generate.add_argument("--count", type=_at_least(1), required=True, metavar="N", help="training scenes")
-    generate.add_argument("--valid", type=_at_least(0), metavar="N", help="validation scenes (a tenth of N)")
-    generate.add_argument("--test", type=_at_least(0), metavar="N", help="test scenes (a tenth of N)")
-    generate.add_argument("--nodes", type=_at_least(1), metavar="N", help="nodes of a scene, about")
-    generate.add_argument("--frames", type=_at_least(1), metavar="N", help="frames of a scene")
-    generate.add_argument("--seed", type=_at_least(0), default=0, help="the scenes follow from it (0)")
-    generate.add_argument("--solver", choices=("own", "calculix"), help="CalculiX in place of the bundled FEM")
-    generate.add_argument("--parts", type=Path, metavar="PATH", help="own parts: a STEP, STL or mesh file, or a folder")
-    where = generate.add_mutually_exclusive_group()
-    where.add_argument("--workers", type=_at_least(1), metavar="W", help="processes (one a core)")
-    where.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler whose workers solve, as tcp://host:8786")
-
-    _add_convert(command("convert", _convert, "import simulations (PVD, VTU) or MeshGraphNets data (TFRecord)"))
-
-    info = command("info", _info, "tell what is in a dataset or a run, and check it")
-    info.add_argument("path", type=Path, metavar="FILE_OR_RUN")
-    info.add_argument("--json", action="store_true", help="as JSON")
-
-    train = command("train", _train, "train a model", _TrainParser)
-    train.add_argument("data", metavar="DATA", nargs="?", type=Path, help="dataset; not needed with --resume")
-    train.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder")
-    train.add_argument("--model", metavar="M", help="which model, see below (ast)")
-    train.add_argument("--preset", metavar="P", help="settings to start from (tiny)")
-    train.add_argument("--set", action="append", default=[], metavar="k=v", help="change a setting; may be repeated")
-    train.add_argument("--resume", action="store_true", help="go on after the last checkpoint, if there is one")
-    train.add_argument(
-        "--profile", type=_at_least(1), metavar="N", help="print where the time of N steps goes, and end"
+    add(_add_demo, commands.demo, "simulate some plates, train on them, predict other plates, write a report")
+    about = "simulate scenes with the bundled contact solver; a second call resumes a stopped one"
+    add(_add_generate, commands.generate, about, _GenerateParser)
+    add(
+        _add_convert, commands.convert, "make a dataset from simulations of other programs (PVD, VTU, VTKHDF, TFRecord)"
     )
-
-    evaluate = command("evaluate", _evaluate, "measure a run's errors and speed on a dataset")
-    evaluate.add_argument("run_folder", type=Path, metavar="RUN")
-    evaluate.add_argument("data", type=Path, metavar="DATA")
-    evaluate.add_argument("--split", choices=("train", "valid", "test"), default="test")
-    evaluate.add_argument("--json", type=Path, metavar="FILE", help="write all figures there too")
-
-    rollout = command("rollout", _rollout, "predict a trajectory from its first frame")
-    rollout.add_argument("run_folder", type=Path, metavar="RUN")
-    rollout.add_argument("data", type=Path, metavar="DATA")
-    rollout.add_argument("--split", choices=("train", "valid", "test"), default="test")
-    rollout.add_argument("--index", type=_at_least(0), required=True, metavar="I", help="which trajectory")
-    rollout.add_argument("--out", type=Path, required=True, metavar="FILE", help="ends in .h5, .pvd or .vtkhdf")
-
-    report = command("report", _report, "write one page that shows runs (moving scenes, errors) or a dataset")
-    report.add_argument("shown", type=Path, nargs="+", metavar="RUN_OR_DATA", help="run folders, or one dataset (.h5)")
-    report.add_argument("--out", type=Path, required=True, metavar="FILE.html")
-    report.add_argument("--data", type=Path, metavar="DATA", help="dataset (the one that each run was trained on)")
+    add(_add_info, commands.info, "check a dataset or a run and show what it holds")
+    add(_add_train, commands.train, "train a model on a dataset", _TrainParser)
+    add(_add_predict, commands.predict, "predict a new scene from a mesh, or a scene of a dataset")
+    add(_add_evaluate, commands.evaluate, "measure the errors and the speed of a run on a dataset")
+    add(_add_report, commands.report, "write a page that shows runs (moving scenes, errors), or a dataset")
     return parser
 
 
+def _add_each(to: Any, options: Mapping[str, str], **shared: Any) -> None:
+    """Add options that differ only in their names and helps: a key is "--name METAVAR", its value is the help."""
+    for option, text in options.items():
+        name, metavar = option.split()
+        to.add_argument(name, metavar=metavar, help=text, **shared)
+
+
+def _add_overwrite(to: _Parser) -> None:
+    to.add_argument("--overwrite", action="store_true", help="replace the output if it exists")
+
+
+def _add_demo(demo: _Parser) -> None:
+    demo.add_argument("--out", type=_path, default=Path("demo"), metavar="DIR", help="result folder (default: demo)")
+    demo.add_argument("--quick", action="store_true", help="fewer scenes and steps: 90 seconds on 2 cores")
+    demo.add_argument("--seed", type=_at_least(0), default=0, help="seed of scenes and training (default: 0)")
+
+
+def _add_generate(generate: _Parser) -> None:
+    generate.add_argument("family", metavar="FAMILY", help="kind of scenes; the list is below")
+    _add_each(generate, {"--out FILE": "dataset to write (.h5)"}, type=_path, required=True)
+    _add_each(generate, {"--count N": "number of training scenes"}, type=_at_least(1), required=True)
+    splits = {
+        "--valid N": "number of validation scenes (default: a tenth of --count)",
+        "--test N": "number of test scenes (default: a tenth of --count)",
+    }
+    _add_each(generate, splits, type=_at_least(0))
+    sizes = {"--nodes N": "approximate number of nodes of a scene", "--frames N": "number of frames of a scene"}
+    _add_each(generate, sizes, type=_at_least(1))
+    generate.add_argument("--seed", type=_at_least(0), default=0, help="seed of the scenes (default: 0)")
+    about = "the bundled solver (own) or CalculiX (default: own)"
+    generate.add_argument("--solver", choices=("own", "calculix"), help=about)
+    _add_each(generate, {"--parts PATH": "your parts: a STEP, STL or mesh file, or a folder of them"}, type=_path)
+    about = "solve every scene to its last frame (default: give up a frame after 500 Newton iterations)"
+    generate.add_argument("--patient", action="store_true", help=about)
+    where = generate.add_mutually_exclusive_group()
+    _add_each(where, {"--workers W": "number of processes (default: one per core)"}, type=_at_least(1))
+    _add_each(where, {"--scheduler ADDRESS": "solve on the workers of a Dask scheduler, such as tcp://host:8786"})
+
+
 def _add_convert(convert: _Parser) -> None:
-    convert.add_argument(
-        "source",
-        type=Path,
-        metavar="SOURCE",
-        help="a simulation (.pvd, or a folder of .vtu), a folder of several, or one of meta.json and .tfrecord files",
+    about = (
+        "a simulation (a .pvd or .vtkhdf file or a folder of .vtu files), a folder that holds several simulations, or a"
+        " folder of meta.json and .tfrecord files"
     )
-    convert.add_argument("--out", type=Path, required=True, metavar="FILE", help="dataset to write (.h5)")
-    fields = convert.add_argument_group("names of the fields in .vtu files")
-    for name, help in (
-        ("displacement", "point field, from rest; without one the points themselves move"),
-        ("stress", "von Mises stress, a point or a cell field"),
-        ("node-type", "point field: 0 normal, 1 obstacle, 3 handle"),
-        ("obstacle", "point field, not zero at the nodes of obstacles"),
-        ("handle", "point field, not zero at nodes whose motion is prescribed"),
-        ("body", "point field that numbers the bodies"),
-    ):
-        fields.add_argument(f"--{name}", metavar="NAME", help=help)
-    fields.add_argument("--material", nargs="+", default=[], metavar="NAME", help="cell fields with one number each")
-    kind = convert.add_argument_group("what a dataset of .vtu files says of itself")
-    kind.add_argument("--shares", nargs=3, type=float, default=[0.8, 0.1, 0.1], metavar=("TRAIN", "VALID", "TEST"))
-    kind.add_argument("--seed", type=_at_least(0), default=0, help="of the draw for the splits (0)")
-    kind.add_argument("--dynamic", action="store_true", help="inertia matters: the acceleration is predicted")
-    kind.add_argument("--contact-radius", type=float, default=0.0, metavar="R")
-    kind.add_argument("--time-step", type=float, default=0.0, metavar="SECONDS")
-    kind.add_argument("--length-unit", default="m", metavar="UNIT")
-    records = convert.add_argument_group("what is taken of .tfrecord files (meta.json says the rest)")
-    records.add_argument("--split", nargs="+", choices=("train", "valid", "test"), help="these files only (all)")
-    records.add_argument("--limit", type=_at_least(1), metavar="N", help="the first N trajectories of each file (all)")
-    records.add_argument("--every", type=_at_least(1), default=1, metavar="K", help="every K-th frame (1)")
+    convert.add_argument("source", type=_path, metavar="SOURCE", help=about)
+    _add_each(convert, {"--out FILE": "dataset to write (.h5)"}, type=_path, required=True)
+    _add_overwrite(convert)
+    fields = convert.add_argument_group("names of the fields in .vtu and .vtkhdf files")
+    names = {
+        "--displacement NAME": "point field, displacement from rest; if there is none, the points themselves move",
+        "--stress NAME": "point or cell field with the von Mises stress",
+        "--node-type NAME": "point field: 0 normal, 1 obstacle, 3 handle",
+        "--obstacle NAME": "point field that is not zero at the nodes of obstacles",
+        "--handle NAME": "point field that is not zero at prescribed nodes of deforming bodies",
+        "--body NAME": "point or cell field with the numbers of the bodies",
+    }
+    _add_each(fields, names)
+    _add_each(fields, {"--material NAME": "cell fields with one number each"}, nargs="+", default=[])
+    kind = convert.add_argument_group("properties of a dataset made from .vtu files")
+    about, shares = (
+        "shares of the simulations, drawn at random (default: 0.8 0.1 0.1 of three or more)",
+        ("TRAIN", "VALID", "TEST"),
+    )
+    kind.add_argument("--shares", nargs=3, type=float, metavar=shares, help=about)
+    kind.add_argument("--seed", type=_at_least(0), default=0, help="seed of this draw (default: 0)")
+    kind.add_argument("--incomplete", action="store_true", help="convert although nothing moves or is prescribed")
+    kind.add_argument("--dynamic", action="store_true", help="inertia matters: models predict the acceleration")
+    numbers = {
+        "--contact-radius R": "distance below which surfaces are in contact (default: 0)",
+        "--time-step SECONDS": "time between two frames; 0: frames have no time (default: 0)",
+    }
+    _add_each(kind, numbers, type=float, default=0.0)
+    _add_each(kind, {"--length-unit UNIT": "unit of length: m, cm, mm, um or in (default: m)"}, default="m")
+    records = convert.add_argument_group("selection from .tfrecord files (meta.json has all other facts)")
+    records.add_argument("--split", nargs="+", choices=commands.SPLITS, help="convert only these files (default: all)")
+    _add_each(records, {"--limit N": "first N trajectories of each file (default: all)"}, type=_at_least(1))
+    _add_each(records, {"--every K": "keep every K-th frame (default: 1)"}, type=_at_least(1), default=1)
     convert.set_defaults(of_series=(fields, kind), of_records=(records,))
+
+
+def _add_info(info: _Parser) -> None:
+    info.add_argument("path", type=_path, metavar="FILE_OR_RUN", help="dataset (.h5) or run folder")
+    info.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _add_train(train: _Parser) -> None:
+    train.add_argument("data", metavar="DATA", nargs="?", type=_path, help="dataset; may be left out with --resume")
+    _add_each(train, {"--out RUN": "run folder"}, type=_path, required=True)
+    _add_each(train, {"--model M": "name of the model; the list is below (default: ast)"})
+    _add_each(train, {"--preset P": "settings to start from (default: tiny)"})
+    _add_each(train, {"--set k=v": "change a setting; may be repeated"}, action="append", default=[])
+    train.add_argument("--resume", action="store_true", help="go on after the last checkpoint, if there is one")
+    _add_each(train, {"--profile N": "only measure N steps and print how their time divides"}, type=_at_least(1))
+
+
+def _add_predict(predict: _Parser) -> None:
+    predict.add_argument("run_folder", type=_path, metavar="RUN", help="run folder")
+    about = "a mesh (.vtu, .msh, .inp, .stl, ...), or a dataset (.h5)"
+    predict.add_argument("scene", type=_path, metavar="SCENE", help=about)
+    _add_each(predict, {"--out FILE": "file to write: .h5, or .pvd or .vtkhdf for ParaView"}, type=_path, required=True)
+    _add_overwrite(predict)
+    moves = {
+        "--move BODY=MOTION": 'motion of the prescribed nodes of a body: a translation "1=0,0,-0.01", a path'
+        ' "1=0,0,-0.01 then 0.02,0,-0.01", or a rotation "1=rotate 30 about 0,0,1 at 0,0,0"; may be repeated'
+    }
+    _add_each(predict, moves, action="append", default=[])
+    about = "number of frames (default: prescribed nodes move as far in a frame as in training)"
+    _add_each(predict, {"--frames N": about}, type=_at_least(2))
+    mesh = predict.add_argument_group("if SCENE is a mesh")
+    _add_each(mesh, {"--obstacle BODY": "a rigid body; may be repeated"}, type=int, action="append", default=[])
+    marks = {
+        "--clamp BODY:PLACE": "prescribed nodes of a deforming body: 0:xmin, 0:xmin,xmax, 0:z<=0.01, 0:all,"
+        " 0:field=NAME; may be repeated",
+        "--material BODY=NUMBERS": "material of a body, such as 0=2e5,0.3; may be repeated",
+    }
+    _add_each(mesh, marks, action="append", default=[])
+    fields = {
+        "--body-field NAME": "field with the numbers of the bodies (default: body; without it, connected parts)",
+        "--type-field NAME": "point field: 0 normal, 1 obstacle, 3 handle (default: node_type)",
+    }
+    _add_each(mesh, fields)
+    data = predict.add_argument_group("if SCENE is a dataset")
+    data.add_argument("--split", choices=commands.SPLITS, default="test", help="split (default: test)")
+    _add_each(data, {"--index I": "number of the trajectory in the split"}, type=_at_least(0))
+    predict.set_defaults(of_mesh=(mesh,), of_data=(data,))
+
+
+def _add_evaluate(evaluate: _Parser) -> None:
+    evaluate.add_argument("run_folder", type=_path, metavar="RUN", help="run folder")
+    evaluate.add_argument("data", type=_path, metavar="DATA", help="dataset")
+    evaluate.add_argument("--split", choices=commands.SPLITS, default="test", help="split (default: test)")
+    _add_each(evaluate, {"--json FILE": "also write all figures to this file"}, type=_path)
+    _add_overwrite(evaluate)
+
+
+def _add_report(report: _Parser) -> None:
+    report.add_argument("shown", type=_path, nargs="+", metavar="RUN_OR_DATA", help="run folders, or one dataset (.h5)")
+    _add_each(report, {"--out FILE.html": "page to write"}, type=_path, required=True)
+    _add_each(report, {"--data DATA": "dataset for all runs (default: the training data of each run)"}, type=_path)
+    _add_overwrite(report)
+
+
+def _path(text: str) -> Path:
+    if not text or "\0" in text:
+        raise argparse.ArgumentTypeError(f"{text!r} is no name of a file or a folder")
+    return Path(text)
 
 
 def _at_least(least: int) -> Any:
@@ -190,175 +286,12 @@ def _at_least(least: int) -> Any:
         value = int(text)
         if value < least:
             raise argparse.ArgumentTypeError(f"{value} is below {least}")
+        if value >= 1 << 63:
+            raise argparse.ArgumentTypeError("a number above 2^63 - 1")
         return value
 
     number.__name__ = "whole number"
     return number
-
-
-def _demo(args: argparse.Namespace) -> None:
-    from ast_sim import keep_memory
-    from ast_sim.demo import demo
-
-    keep_memory()
-    demo(args.out, quick=args.quick, seed=args.seed)
-
-
-def _generate(args: argparse.Namespace) -> None:
-    from ast_sim.simulate.generate import generate
-
-    tenth = -(-args.count // 10)
-    counts = {
-        "train": args.count,
-        "valid": tenth if args.valid is None else args.valid,
-        "test": tenth if args.test is None else args.test,
-    }
-    made = generate(
-        args.family,
-        args.out,
-        counts,
-        seed=args.seed,
-        nodes=args.nodes,
-        frames=args.frames,
-        workers=args.workers,
-        solver=args.solver,
-        parts=args.parts,
-        scheduler=args.scheduler,
-    )
-    print(f"{made.path}: {', '.join(f'{count} {split}' for split, count in made.counts.items())}")
-    if made.truncated:
-        print(f"stopped before their last frame: {', '.join(made.truncated)}")
-
-
-def _convert(args: argparse.Namespace) -> None:
-    from ast_sim.data.deepmind import convert_deepmind, is_deepmind
-
-    if is_deepmind(args.source):
-        _refuse(args, args.of_series, f"{args.source}: meta.json says it")
-        counts = convert_deepmind(
-            args.source, args.out, splits=args.split, limit=args.limit, every=args.every, progress=print
-        )
-    else:
-        _refuse(args, args.of_records, f"{args.source}, which holds no .tfrecord files")
-        counts = _convert_series(args)
-    print(f"{args.out}: {', '.join(f'{count} {split}' for split, count in counts.items())}")
-
-
-def _refuse(args: argparse.Namespace, groups: tuple[Any, ...], what: str) -> None:
-    """Raise ConfigError if an option of these groups was given."""
-    for action in (action for group in groups for action in group._group_actions):
-        if getattr(args, action.dest) != action.default:
-            raise ConfigError(f"{action.option_strings[0]} has no meaning for {what}")
-
-
-def _convert_series(args: argparse.Namespace) -> dict[str, int]:
-    from ast_sim.data.convert import convert
-    from ast_sim.data.series import FieldNames
-
-    return convert(
-        args.source,
-        args.out,
-        names=FieldNames(
-            args.displacement, args.stress, args.node_type, args.obstacle, args.handle, args.body, tuple(args.material)
-        ),
-        splits=dict(zip(("train", "valid", "test"), args.shares, strict=True)),
-        seed=args.seed,
-        integration="dynamic" if args.dynamic else "quasi_static",
-        contact_radius=args.contact_radius,
-        time_step=args.time_step,
-        length_unit=args.length_unit,
-        progress=print,
-    )
-
-
-def _info(args: argparse.Namespace) -> None:
-    from ast_sim.info import describe, text
-
-    found = describe(args.path)
-    print(json.dumps(found, indent=1) if args.json else text(found))
-
-
-def _train(args: argparse.Namespace) -> None:
-    from ast_sim import keep_memory
-    from ast_sim.train import configure, train
-
-    keep_memory()
-    if args.data is None and not args.resume:
-        raise ConfigError("name the dataset to train on, or --resume the run in --out")
-    if args.data is None and (args.model or args.preset or args.set):
-        raise ConfigError("settings are those of the run that is resumed: leave --model, --preset and --set out")
-    # A run that is resumed keeps its settings; given ones are compared with them.
-    config = None
-    if args.data is not None:
-        config = configure(args.data, args.preset or "tiny", args.set, args.model or "ast")
-    train(args.out, config, resume=args.resume, profile_steps=args.profile or 0)
-    if args.profile is None:
-        print(f"run: {args.out}")
-
-
-def _evaluate(args: argparse.Namespace) -> None:
-    from ast_sim import keep_memory
-    from ast_sim.evaluate import table
-    from ast_sim.results import evaluate_run, open_run, write_json
-
-    keep_memory()
-    with open_run(args.run_folder, args.data) as run:
-        found = evaluate_run(run, args.split, args.command_line)
-    print(table(found))
-    if args.json is not None:
-        write_json(args.json, found)
-        print(f"all figures: {args.json}")
-
-
-def _rollout(args: argparse.Namespace) -> None:
-    from ast_sim import keep_memory
-    from ast_sim.results import SUFFIXES, open_run, predict, write_prediction
-
-    if args.out.suffix not in SUFFIXES:
-        raise ConfigError(f"--out {args.out}: a prediction is written as {', '.join(SUFFIXES)}: name it so")
-    keep_memory()
-    with open_run(args.run_folder, args.data) as run:
-        count = run.dataset.count(args.split)
-        if args.index >= count:
-            raise DatasetError(f"{args.data}: there is no {args.split}/{args.index:06d}: the split has {count}")
-        truth, result = predict(run, args.split, args.index)
-        write_prediction(run, truth, result, f"{args.split}/{args.index:06d}", args.out)
-    if result.failure is not None:
-        raise RolloutError(f"{result.failure}, in {args.out}")
-    steps = len(result.seconds)
-    print(f"{args.out}: {steps} frames predicted, {1000 * sum(result.seconds) / steps:.3g} ms each")
-
-
-def _report(args: argparse.Namespace) -> None:
-    datasets = [path for path in args.shown if path.is_file() or (path.suffix == ".h5" and not path.is_dir())]
-    if len(datasets) < len(args.shown) and datasets:
-        raise ConfigError(
-            f"{datasets[0]} is a dataset, the others are runs: a page shows runs or one dataset;"
-            " name the dataset of runs with --data"
-        )
-    if len(datasets) > 1:
-        raise ConfigError(f"a page shows one dataset, not {len(datasets)}: write one page for each")
-    if datasets and args.data is not None:
-        raise ConfigError(f"--data names the dataset of runs, but {datasets[0]} is a dataset itself: leave --data out")
-    if datasets:
-        from ast_sim.view import gallery
-
-        gallery.write(args.out, datasets[0])
-    else:
-        _report_runs(args)
-    print(f"report: {args.out}")
-
-
-def _report_runs(args: argparse.Namespace) -> None:
-    from ast_sim import keep_memory
-    from ast_sim.results import evaluate_run, open_run, report_run, write_report
-
-    keep_memory()
-    shown = []
-    for folder in args.shown:
-        with open_run(folder, args.data) as run:
-            shown.append(report_run(run, evaluate_run(run, "test", args.command_line)))
-    write_report(args.out, shown, "Learned simulation: predictions and errors")
 
 
 if __name__ == "__main__":

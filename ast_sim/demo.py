@@ -1,7 +1,8 @@
-"""The demonstration: everything from nothing to a report, in one folder.
+"""The demonstration: from simulations to a report, in one folder.
 
-Plates that an obstacle presses are simulated, a small model learns from them, and predicts plates that it has not
-seen. Run again in the same folder it goes on where it stopped; other settings are refused by the part that differs.
+It simulates plates that an obstacle presses, trains a small model on them, and predicts plates that the model has not
+seen. A second run in the same folder goes on where the first one stopped; if its settings differ, it stops with an
+error.
 """
 
 from __future__ import annotations
@@ -12,19 +13,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ast_sim.monitor import duration
-from ast_sim.results import TrainedRun, evaluate_run, open_run, report_run, write_json, write_report
-from ast_sim.simulate.generate import generate
-from ast_sim.train import configure, train
-from ast_sim.view import export, picture
+from ast_sim.inference.trained_run import Evaluation
+from ast_sim.simulate.jobs.generate import generate
+from ast_sim.support.progress import duration
+from ast_sim.training.start import train
+from ast_sim.view import export, picture, report
 
 FAMILY = "deforming_plate"
-NODES, FRAMES = 400, 41  # coarser and shorter than the family's default, so that all is done in minutes
+NODES, FRAMES = 400, 41  # fewer than the family's defaults, so that the demonstration takes minutes
 
 
 @dataclass(frozen=True)
 class Size:
-    """How much is done: scenes of each split and training steps."""
+    """The size of the demonstration: the scenes of each split and the training steps."""
 
     train: int
     valid: int
@@ -37,13 +38,13 @@ QUICK = Size(train=16, valid=2, test=3, steps=500)  # at most 90 seconds
 
 
 def demo(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
-    """Generate, train, evaluate and report in the folder `out`; the numbers follow from `quick` and `seed` alone.
+    """Generate, train, evaluate and report in the folder `out`. The results depend only on `quick` and `seed`.
 
     Returns:
-        The evaluation, as in `evaluation.json`.
+        The figures of the evaluation, as in `evaluation.json`.
 
     Raises:
-        AstSimError: `out` holds parts made with other settings, or a part fails.
+        AstSimError: `out` holds files made with other settings, or a part of the demonstration fails.
     """
     started = time.perf_counter()
     size = QUICK if quick else FULL
@@ -51,19 +52,18 @@ def demo(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
 
     _announce(1, f"simulating {size.train + size.valid + size.test} plates with the contact FEM")
     counts = {"train": size.train, "valid": size.valid, "test": size.test}
-    generate(FAMILY, data, counts, seed=seed, nodes=NODES, frames=FRAMES)
+    generate(FAMILY, data, **counts, seed=seed, nodes=NODES, frames=FRAMES)
 
     _announce(2, "training")
-    # Plates know no left and right, and none is turned over.
-    settings = [f"train.steps={size.steps}", f"train.seed={seed}", "train.mirror=x,y"]
-    train(run_folder, configure(data, "tiny", settings), resume=True)
+    # A plate mirrored along x or y is as likely as the plate itself; a plate that is turned over (z) never occurs.
+    run = train(data, run_folder, steps=size.steps, seed=seed, mirror=("x", "y"), resume=True)
 
-    with open_run(run_folder, data) as run:
-        _announce(3, f"predicting the {size.test} test scenes, which the model has not seen")
-        found = evaluate_run(run, "test", _command(out, quick, seed))
-        write_json(out / "evaluation.json", found)
-        _announce(4, "writing the report")
-        _write_pages(run, out, found)
+    _announce(3, f"predicting the {size.test} test scenes, which the model has not seen")
+    evaluation = run.evaluate(data, command=_command(out, quick, seed))
+    evaluation.save(out / "evaluation.json")
+    found = evaluation.figures
+    _announce(4, "writing the report")
+    _write_pages(evaluation, out)
 
     for line in headlines(found):
         print(line)
@@ -84,18 +84,18 @@ def _announce(number: int, text: str) -> None:
     print(f"{number}/4 {text}", flush=True)
 
 
-def _write_pages(run: TrainedRun, out: Path, found: dict[str, Any]) -> None:
-    """The report of all test scenes; the median one also as a picture and for ParaView."""
-    info = run.dataset.info
-    shown = report_run(run, found)
-    write_report(out / "report.html", [shown], "Deforming plates: predictions by AST")
+def _write_pages(evaluation: Evaluation, out: Path) -> None:
+    """Write the report of all test scenes, and the median scene as a picture and for ParaView."""
+    info = evaluation.run.info
+    shown = evaluation.shown()
+    report.write(out / "report.html", [shown], "Deforming plates: predictions by AST")
     median = shown.scenes[(len(shown.scenes) - 1) // 2]
-    picture.write(out / "picture.png", median.truth, median.prediction, info.length_unit)
+    picture.write(out / "picture.png", median.truth, median.prediction, shown.model, info.length_unit)
     export.write(out / "prediction.pvd", median.truth, median.prediction, time_step=info.time_step or 1.0)
 
 
 def headlines(found: dict[str, Any]) -> list[str]:
-    """The figures that matter, in plain words."""
+    """The most important figures as sentences."""
     lines = []
     for quantity, nodes, unit, trivial, words in (
         ("displacement", "normal", found["length_unit"], "hold_still", "that of holding still"),

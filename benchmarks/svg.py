@@ -1,4 +1,4 @@
-"""Pictures as SVG, the same bytes for the same figures."""
+"""Pictures as SVG. The same figures give the same bytes."""
 
 from __future__ import annotations
 

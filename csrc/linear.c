@@ -14,7 +14,7 @@
  * dout and x themselves, dz and x.
  */
 #include "ast.h"
-#include "dense.h"
+#include "weight_panels.h"
 #include "gemm.h"
 #include "simd.h"
 

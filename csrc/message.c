@@ -17,7 +17,7 @@
 #include <math.h>
 
 #include "ast.h"
-#include "dense.h"
+#include "weight_panels.h"
 #include "gemm.h"
 #include "simd.h"
 

@@ -17,7 +17,7 @@
  * Memory: at most SHARES sums of weight gradients and SHARES * SHARE_TILES * MESSAGE_TILE rows of dz, 11 MB at 128 channels.
  */
 #include "ast.h"
-#include "dense.h"
+#include "weight_panels.h"
 #include "gemm.h"
 #include "simd.h"
 

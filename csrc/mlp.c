@@ -9,7 +9,7 @@
  *   dn = gamma . dout,   dy = r (dn - mean(dn) - n mean(dn . n)),   dz = [h > 0] . (dy W2)
  *   dW2 = dy^T h,   dW1 = dz^T [x, beside],   d[x, beside] = dz W1,   the other gradients sums of rows of dy, dz, dout and dout . n,
  *
- * h, n and r of a block are computed again, or read if the caller kept them. Sums over rows go chunk by chunk (dense.h): they do
+ * h, n and r of a block are computed again, or read if the caller kept them. Sums over rows go chunk by chunk (weight_panels.h): they do
  * not depend on the threads, and a row's results depend on that row alone.
  *
  * Cost: 2 M H (I + I2 + O) operations forward and 4 M H (I + I2 + O) backward, 2 M H (I + I2 + O) more if nothing was kept.
@@ -17,7 +17,7 @@
 #include <math.h>
 
 #include "ast.h"
-#include "dense.h"
+#include "weight_panels.h"
 #include "gemm.h"
 #include "simd.h"
 

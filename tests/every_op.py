@@ -10,15 +10,21 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from ast_sim.ops.attention import attention
-from ast_sim.ops.edges import EdgeSet
-from ast_sim.ops.fps import farthest_point_sample
-from ast_sim.ops.linear import linear
-from ast_sim.ops.message import message_sum
-from ast_sim.ops.mlp import mlp
-from ast_sim.ops.octree import CellMap, Octree, octree
-from ast_sim.ops.segment import segment_mean, segment_sum
-from ast_sim.ops.sparse_conv import sparse_conv, sparse_conv_transposed
+from ast_sim.ops import (
+    CellMap,
+    EdgeSet,
+    Octree,
+    attention,
+    farthest_point_sample,
+    linear,
+    message_sum,
+    mlp,
+    octree,
+    segment_mean,
+    segment_sum,
+    sparse_conv,
+    sparse_conv_transposed,
+)
 
 Results = tuple[list[list[Tensor]], list[Tensor]]
 SIZES = [700, 1, 0, 2500, 130]  # rows of scene 0, 1, ...

@@ -2,6 +2,8 @@
 
 import json
 import os
+import re
+import shutil
 import subprocess
 import sys
 
@@ -9,10 +11,14 @@ import h5py
 import numpy as np
 import pytest
 import toy
+from data_samples import sign
 from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim.cli import main
-from ast_sim.data.file import Dataset
+from ast_sim.dataset.reader import Dataset
+from ast_sim.support.errors import AstSimError
+from ast_sim.support.toml_settings import settings
+from ast_sim.training.start import configure
 
 SMALL = [
     "train.steps=6", "train.batch_size=2", "train.log_every=2", "train.statistics_pairs=4", "model.hidden=16",
@@ -53,7 +59,7 @@ def test_help_lists_every_command_and_imports_no_torch():
         "assert not {'torch', 'numpy', 'h5py'} & set(sys.modules), sorted(sys.modules)"
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    for name in ("demo", "generate", "convert", "info", "train", "evaluate", "rollout", "report"):
+    for name in ("demo", "generate", "convert", "info", "train", "predict", "evaluate", "report"):
         assert f"\n    {name} " in found.stdout
 
 
@@ -61,9 +67,22 @@ def test_train_help_explains_every_setting(capsys):
     with pytest.raises(SystemExit):
         main(["train", "--help"])
     shown = capsys.readouterr().out
-    assert "train.batch_size=48" in shown
-    assert "model.L_SA=12" in shown
-    assert "deforming_plate" in shown
+    # What a training gets without --preset, not the defaults of the paper.
+    for name in ("ast", "mgn"):
+        config = configure("d.h5", "tiny", model=name)
+        section = shown[shown.index(f"\n{name}, presets") :].split("\n\n")[0]
+        for setting in settings(type(config.model), vars(config.model)):
+            assert f"  model.{setting.key}={setting.default}  (" in section
+    assert "train.batch_size=4  (" in shown and "train.optimizer=muon  (" in shown
+    assert "model.L_SA=2  (" in shown and "model.L_cell=none  (" in shown
+    assert "\n  train.peak_rate=0.002  (in tiny)" in shown
+    lines = shown.splitlines()
+    unset = [text for line, text in zip(lines, lines[1:], strict=False) if re.match(r"  (train|model)\.\w+=none", line)]
+    assert len(unset) > 10 and all("unset:" in text or "from the dataset" in text for text in unset), unset
+    assert "ast, presets tiny, deforming_plate, sphere_simple, abcd, abcd_xl:" in shown
+    for model in ("mgn", "bsms", "hcmt", "transolver"):
+        assert f"\n{model}, presets tiny, " in shown
+    assert "model.slices=32" in shown and "model.most_world_edges=none" in shown
 
 
 def test_generate_help_tells_of_every_family_and_imports_no_solver():
@@ -130,10 +149,10 @@ def test_evaluate_prints_a_table_and_writes_all_figures(trained, tmp_path, capsy
 
 
 @pytest.mark.parametrize("name", ["prediction.h5", "prediction.pvd", "prediction.vtkhdf"])
-def test_rollout_writes_the_format_that_the_name_asks_for(trained, tmp_path, capsys, name):
+def test_predict_writes_the_format_that_the_name_asks_for(trained, tmp_path, capsys, name):
     data, run = trained
     out = tmp_path / "new" / name
-    assert main(["rollout", str(run), str(data), "--index", "1", "--out", str(out)]) == 0
+    assert main(["predict", str(run), str(data), "--index", "1", "--out", str(out)]) == 0
     assert "6 frames predicted" in capsys.readouterr().out
     with Dataset(data) as dataset:
         truth = dataset.load("test", 1)
@@ -152,10 +171,10 @@ def test_rollout_writes_the_format_that_the_name_asks_for(trained, tmp_path, cap
         assert out.read_text().count("<DataSet ") == 7
 
 
-def test_a_failing_rollout_keeps_the_frames_before(trained, tmp_path, capsys, monkeypatch):
+def test_a_failing_prediction_keeps_the_frames_before(trained, tmp_path, capsys, monkeypatch):
     import torch
 
-    from ast_sim.model.simulator import Prediction, Simulator
+    from ast_sim.models.simulator import Prediction, Simulator
 
     real, calls = Simulator.predict, []
 
@@ -169,7 +188,7 @@ def test_a_failing_rollout_keeps_the_frames_before(trained, tmp_path, capsys, mo
     monkeypatch.setattr(Simulator, "predict", predict)
     data, run = trained
     out = tmp_path / "prediction.h5"
-    error = fails(capsys, "rollout", run, data, "--index", 0, "--out", out)
+    error = fails(capsys, "predict", run, data, "--index", 0, "--out", out)
     assert "in frame 3 is not finite" in error and str(out) in error
     with Dataset(out) as dataset:
         assert dataset.num_frames("test", 0) == 3
@@ -204,6 +223,92 @@ def test_resume_without_a_dataset_takes_that_of_the_run(trained, capsys):
     assert "going on after step 6" in capsys.readouterr().out
 
 
+# What an output may overwrite
+
+
+@pytest.fixture
+def commands(trained, tmp_path):
+    """Each command that writes a file, without its output; and its own copies of what it reads."""
+    from ast_sim.view import export
+
+    data, run = shutil.copy(trained[0], tmp_path / "toy.h5"), shutil.copytree(trained[1], tmp_path / "run")
+    (tmp_path / "series").mkdir()
+    export.write(tmp_path / "series" / "case.pvd", toy.plate())
+    return {
+        "convert": ("convert", tmp_path / "series" / "case.pvd", "--shares", 1, 0, 0, "--out"),
+        "predict": ("predict", run, data, "--index", 1, "--out"),
+        "report": ("report", run, "--data", data, "--out"),
+        "evaluate": ("evaluate", run, data, "--json"),
+    }
+
+
+def contents(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+OUTPUTS = {"convert": "new.h5", "predict": "new.h5", "report": "new.html", "evaluate": "new.json"}
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
+def test_an_output_that_exists_is_replaced_only_with_overwrite(commands, tmp_path, capsys, name):
+    out = tmp_path / OUTPUTS[name]
+    out.write_text("old")
+    assert "exists: name another output, or give --overwrite" in fails(capsys, *commands[name], out)
+    assert out.read_text() == "old"
+    assert main([str(word) for word in (*commands[name], out, "--overwrite")]) == 0
+    assert out.read_bytes() != b"old"
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
+def test_an_output_in_a_run_is_refused(commands, tmp_path, capsys, name):
+    before = contents(tmp_path / "run")
+    (tmp_path / "link").symlink_to(tmp_path / "run")
+    for folder in (tmp_path / "run", tmp_path / "run" / "checkpoints", tmp_path / "link", tmp_path / "run" / "new"):
+        assert "lies in the run" in fails(capsys, *commands[name], folder / OUTPUTS[name], "--overwrite")
+    assert contents(tmp_path / "run") == before
+    assert "lies in the run" in fails(capsys, *commands["evaluate"], tmp_path / "run" / "config.toml", "--overwrite")
+
+
+@pytest.mark.parametrize("link", ["no link", "symbolic link", "hard link"])
+def test_an_output_that_is_an_input_is_refused(commands, tmp_path, capsys, link):
+    before = contents(tmp_path)
+    for name, given, suffix in (
+        ("predict", "toy.h5", ".h5"),
+        ("evaluate", "toy.h5", ".h5"),
+        ("convert", "series/case.pvd", ".h5"),
+    ):
+        out = tmp_path / given
+        if link != "no link":
+            out = tmp_path / f"{name}{suffix}"
+            out.symlink_to(tmp_path / given) if link == "symbolic link" else out.hardlink_to(tmp_path / given)
+        elif name == "convert":
+            continue
+        error = fails(capsys, *commands[name], out, "--overwrite")
+        assert f"would overwrite the input {tmp_path / given}" in error
+    assert {path: data for path, data in contents(tmp_path).items() if path in before} == before
+
+
+def test_a_series_that_is_an_input_is_not_replaced(commands, tmp_path, capsys):
+    mesh = tmp_path / "series" / "case" / "frame_00000.vtu"
+    error = fails(capsys, "predict", tmp_path / "run", mesh, "--out", tmp_path / "series" / "case.pvd", "--overwrite")
+    assert "would overwrite the input" in error
+    (tmp_path / "series" / "case.pvd").unlink()
+    error = fails(capsys, *commands["predict"], tmp_path / "series" / "case.pvd")
+    assert f"{tmp_path / 'series' / 'case'} exists" in error
+
+
+def test_a_folder_that_is_converted_may_hold_the_dataset_but_not_lose_a_file(commands, tmp_path, capsys):
+    series = tmp_path / "series"
+    command = ["convert", str(series), "--shares", "1", "0", "0", "--out", str(series / "new.h5")]
+    assert main(command) == 0
+    assert "exists" in fails(capsys, *command)
+    assert main([*command, "--overwrite"]) == 0
+    (series / "link.h5").symlink_to(series / "case.pvd")
+    error = fails(capsys, "convert", series, "--out", series / "link.h5", "--overwrite")
+    assert f"would overwrite the input {series / 'case.pvd'}" in error
+    assert "must end in .h5" in fails(capsys, "convert", series, "--out", series / "case.pvd", "--overwrite")
+
+
 # What is wrong, in one line
 
 
@@ -232,6 +337,7 @@ def spoiled(data, path, array, index, value):
     path.write_bytes(data.read_bytes())
     with h5py.File(path, "r+") as file:
         file[f"train/000001/{array}"][index] = value
+        sign(file)
     return path
 
 
@@ -275,8 +381,8 @@ def test_a_folder_that_is_no_run_and_a_dataset_of_another_kind(trained, tmp_path
     other = toy.write(tmp_path / "other.h5", stress=False)
     error = fails(capsys, "evaluate", run, other)
     assert "stress_location none" in error and "other.h5" in error
-    assert "the split has 2" in fails(capsys, "rollout", run, data, "--index", 2, "--out", tmp_path / "x.h5")
-    assert ".vtkhdf" in fails(capsys, "rollout", run, data, "--index", 0, "--out", tmp_path / "x.obj")
+    assert "the split has 2" in fails(capsys, "predict", run, data, "--index", 2, "--out", tmp_path / "x.h5")
+    assert ".vtkhdf" in fails(capsys, "predict", run, data, "--index", 0, "--out", tmp_path / "x.obj")
 
 
 def test_arguments_out_of_range(tmp_path, capsys):
@@ -287,8 +393,19 @@ def test_arguments_out_of_range(tmp_path, capsys):
     assert "invalid choice: 'abaqus'" in fails(capsys, *plates, "--solver", "abaqus")
     assert "not allowed with" in fails(capsys, *plates, "--workers", 2, "--scheduler", "tcp://host:8786")
     error = fails(capsys, *plates, "--parts", tmp_path)
-    assert "deforming_plate has no option parts: it is one of abcd, abcd_xl" in error
+    assert "deforming_plate has no option parts; these families have it: abcd, abcd_xl" in error
     assert os.listdir(tmp_path) == []
+
+
+def test_a_report_is_html_and_its_name_says_so(trained, tmp_path, capsys):
+    from ast_sim.view.dataset_page import gallery
+
+    error = fails(capsys, "report", trained[0], "--out", tmp_path / "rr.pdf")
+    assert "rr.pdf: the name of a page must end in .html or .htm" in error
+    with pytest.raises(AstSimError, match="must end in"):
+        gallery.write(tmp_path / "rr", trained[0])
+    assert os.listdir(tmp_path) == []
+    assert main(["report", str(trained[0]), "--out", str(tmp_path / "RR.HTM")]) == 0
 
 
 def test_a_folder_that_cannot_be_made_is_one_line(trained, tmp_path, capsys):
@@ -297,8 +414,70 @@ def test_a_folder_that_cannot_be_made_is_one_line(trained, tmp_path, capsys):
     assert "file" in fails(capsys, "report", trained[1], "--out", tmp_path / "file" / "report.html")
 
 
+PLATES = ("generate", "deforming_plate", "--count", 1)
+
+
+@pytest.mark.parametrize("kind", ["empty", "folder"])
+def test_an_output_without_a_name_and_a_folder_as_a_file(trained, tmp_path, capsys, monkeypatch, kind):
+    data, run = trained
+    monkeypatch.chdir(tmp_path)
+    files = [
+        (*PLATES, "--out"),
+        ("convert", tmp_path, "--out"),
+        ("predict", run, data, "--index", 0, "--out"),
+        ("evaluate", run, data, "--json"),
+        ("report", run, "--out"),
+    ]
+    if kind == "empty":
+        for command in (*files, ("train", data, "--out"), ("demo", "--quick", "--out"), ("info",)):
+            assert "'' is no name of a file or a folder" in fails(capsys, *command, "")
+    else:
+        for command in files:
+            suffix = {"report": ".html", "evaluate": ".json"}.get(command[0], ".h5")
+            folder = tmp_path / f"folder{suffix}"
+            folder.mkdir(exist_ok=True)
+            assert f"{folder} is a folder: name a file" in fails(capsys, *command, folder)
+    assert all(path.is_dir() and not list(path.iterdir()) for path in tmp_path.iterdir())
+
+
+def test_more_scenes_than_a_dataset_or_the_disk_can_hold(tmp_path, capsys, monkeypatch):
+    out = tmp_path / "new" / "a.h5"
+    many = ("generate", "deforming_plate", "--out", out, "--count")
+    assert "at most 1,000,000" in fails(capsys, *many, 99999999999)
+    assert "1,000,001 scenes are too many" in fails(capsys, *many, 833_333)
+    usage = shutil.disk_usage(tmp_path)._replace(free=16 * 12 * 1000 * 100 - 1)
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: usage if folder == tmp_path else None)
+    error = fails(capsys, *many, 10, "--valid", 1, "--test", 1, "--nodes", 1000, "--frames", 100)
+    assert f"12 scenes need more than 0.019 GB, but {tmp_path} has 0.019 GB" in error
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("command", [["info"], ["--help"]])
+def test_a_closed_output_is_one_line(trained, command):
+    words = [sys.executable, "-m", "ast_sim.cli", *command, *([str(trained[0])] if command == ["info"] else [])]
+    found = subprocess.run(["sh", "-c", 'exec "$@" >&-', "sh", *words], stderr=subprocess.PIPE, text=True)
+    assert found.returncode == 2
+    assert found.stderr == "ast-sim: standard output is closed: send it to /dev/null instead\n"
+
+
+def test_what_a_file_holds_cannot_drive_the_terminal(trained, tmp_path, capsys):
+    path = tmp_path / "escapes.h5"
+    path.write_bytes(trained[0].read_bytes())
+    with h5py.File(path, "r+") as file:
+        file.attrs["family"] = "plate\x1b]0;title\x07\nkind  run"
+        file.attrs["generator"] = json.dumps({"\x1b[2J": {"\x9b1m": "\u202e"}})
+    assert main(["info", str(path)]) == 0
+    shown = capsys.readouterr().out
+    assert r"plate\x1b]0;title\x07\nkind  run" in shown
+    assert r"\x1b[2J" in shown and r"\x9b1m  \u202e" in shown
+    assert all(line.isprintable() for line in shown.split("\n"))
+    with h5py.File(path, "r+") as file:
+        file.attrs["integration"] = "\x1b[31mred"
+    assert fails(capsys, "info", path).strip().isprintable()
+
+
 def test_debug_shows_the_traceback(tmp_path):
-    from ast_sim.errors import DatasetError
+    from ast_sim.support.errors import DatasetError
 
     with pytest.raises(DatasetError):
         main(["info", str(tmp_path / "absent.h5"), "--debug"])
@@ -316,3 +495,41 @@ def test_a_reader_that_goes_away_is_no_error(trained):
 def test_the_command_needs_no_terminal_and_no_home(trained):
     environment = {key: value for key, value in os.environ.items() if key != "HOME"}
     subprocess.run([sys.executable, "-m", "ast_sim.cli", "info", str(trained[0])], check=True, env=environment)
+
+
+def test_names_that_are_not_utf_8(trained, tmp_path, capsys):
+    """They work, and messages show them escaped, or they are refused where a file cannot hold them."""
+    from ast_sim.view import export
+
+    folder = tmp_path / os.fsdecode(b"f\xff")
+    folder.mkdir()
+    data, run = folder / os.fsdecode(b"d\xe9.h5"), folder / os.fsdecode(b"r\xe9")
+    shutil.copy(trained[0], data)
+    shutil.copytree(trained[1], run)
+    export.write(tmp_path / "case.pvd", toy.plate())
+    (tmp_path / "case").rename(folder / os.fsdecode(b"c\xe9"))
+
+    def works(*words) -> str:
+        assert main([str(word) for word in words]) == 0
+        capsys.readouterr().out.encode()
+        return str(words[-1])
+
+    shown = r"f\udcff/d\udce9.h5"
+    works("info", data)
+    works("info", run)
+    prediction = works("predict", run, data, "--index", 0, "--out", folder / os.fsdecode(b"p\xe9.h5"))
+    with Dataset(prediction) as dataset:
+        assert dataset.attributes("test", 0)["source"].endswith(rf"{shown}: test/000000")
+    works("predict", run, data, "--index", 0, "--out", folder / os.fsdecode(b"p\xe9.vtkhdf"))
+    works("evaluate", run, data, "--json", folder / os.fsdecode(b"e\xe9.json"))
+    for shows in ((data,), (run, "--data", data)):
+        page = works("report", *shows, "--overwrite", "--out", folder / os.fsdecode(b"w\xe9.html"))
+        with open(page, encoding="utf-8") as file:
+            assert r"\udce9" in file.read()
+    works("convert", folder, "--shares", "1", "0", "0", "--out", folder / os.fsdecode(b"n\xe9.h5"))
+    error = fails(capsys, "train", data, "--out", tmp_path / "new", *SET)
+    assert shown in error and "a run cannot keep a path that is not UTF-8" in error and not (tmp_path / "new").exists()
+    pvd = folder / os.fsdecode(b"q\xe9.pvd")
+    assert "cannot hold a name that is not UTF-8" in fails(capsys, "predict", run, data, "--index", 0, "--out", pvd)
+    assert not pvd.exists() and not pvd.with_suffix("").exists()
+    assert r"absent\udce9.h5" in fails(capsys, "info", folder / os.fsdecode(b"absent\xe9.h5"))

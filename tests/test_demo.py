@@ -8,7 +8,7 @@ from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import demo
 from ast_sim.cli import main
-from ast_sim.data.file import Dataset
+from ast_sim.dataset.reader import Dataset
 from ast_sim.demo import FULL, QUICK, Size, headlines
 
 TINY = Size(train=1, valid=1, test=1, steps=4)

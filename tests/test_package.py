@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -36,7 +37,7 @@ def test_wheel_is_one_for_all_pythons_and_whole(wheel):
     for folder, _, files in os.walk(ROOT / "ast_sim"):
         for name in files:
             path = Path(folder, name).relative_to(ROOT).as_posix()
-            if path.endswith((".py", ".html", ".css", ".js")):
+            if path.endswith((".py", ".pyi", ".typed", ".html", ".css", ".js")):
                 assert path in names, path
     assert not [name for name in names if name.startswith(("tests", "csrc", "benchmarks"))]
 
@@ -49,7 +50,7 @@ sys.path.insert(0, {str(tmp_path)!r})
 import shutil, ast_sim, torch
 assert ast_sim.__file__.startswith({str(tmp_path)!r}), ast_sim.__file__
 assert not any(map(shutil.which, ("cc", "gcc", "clang")))
-from ast_sim.ops.segment import segment_sum
+from ast_sim.ops._segment import segment_sum
 print(segment_sum(torch.ones(3, 2), torch.arange(3), torch.tensor([0, 1, 3])).tolist())
 ast_sim.show_config()
 """
@@ -60,13 +61,43 @@ ast_sim.show_config()
 def test_import_loads_little():
     code = "import sys, ast_sim; print([m for m in ('torch', 'scipy', 'h5py', 'meshio', 'ipctk') if m in sys.modules])"
     assert run_python(code).strip() == "[]"
-    assert run_python("import ast_sim; print(ast_sim.Scene.__name__, 'MODELS' in dir(ast_sim))").strip() == "Scene True"
+    code = "import ast_sim; print(ast_sim.Scene.__name__, 'new_model' in dir(ast_sim))"
+    assert run_python(code).strip() == "Scene True"
+
+
+def test_every_extra_asks_for_what_its_code_imports():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    assert "google-crc32c" not in project["dependencies"] and extras["tfrecord"] == ["google-crc32c"]
+    assert extras["view"] == ["plotly", "matplotlib"]  # no VTK, which only tests of the files for ParaView need
+    assert "pyvista" in extras["test"]
+
+
+def test_idle_threads_soon_sleep_unless_told_otherwise():
+    """OpenMP reads its variables when torch is imported, so they must be there before."""
+    unset = {key: value for key, value in os.environ.items() if key not in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")}
+
+    def run(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-c", code]
+        return subprocess.run(command, env={**unset, **variables}, capture_output=True, text=True, check=True)
+
+    show = "; print(os.environ.get('GOMP_SPINCOUNT'))"
+    for code in ("import os, ast_sim", "import os, ast_sim.cli"):
+        found = run(code + show)
+        assert (found.stdout, found.stderr) == ("10000\n", "")
+        assert run(code + show, OMP_WAIT_POLICY="active").stdout == "None\n"
+        assert run(code + show, GOMP_SPINCOUNT="9").stdout == "9\n"
+    late = "import os, torch, ast_sim, ast_sim.ops" + show
+    found = run(late)
+    assert found.stdout == "None\n" and found.stderr.count("Warning") == 1
+    assert "Import ast_sim first, or set GOMP_SPINCOUNT=10000" in found.stderr
+    assert run(late, OMP_WAIT_POLICY="passive").stderr == ""
 
 
 def test_unknown_instruction_set_and_backend_are_named():
     for name, value in (("AST_SIM_ISA", "avx9"), ("AST_SIM_BACKEND", "cuda")):
         result = subprocess.run(
-            [sys.executable, "-c", "import ast_sim.ops.segment"],
+            [sys.executable, "-c", "import ast_sim.ops._segment"],
             env=os.environ | {name: value},
             capture_output=True,
             text=True,
@@ -75,7 +106,7 @@ def test_unknown_instruction_set_and_backend_are_named():
 
 
 def test_backend_torch_needs_no_extension():
-    code = "import sys; import ast_sim.ops.segment; print('ast_sim._C' in sys.modules)"
+    code = "import sys; import ast_sim.ops._segment; print('ast_sim._C' in sys.modules)"
     assert run_python(code, AST_SIM_BACKEND="torch").strip() == "False"
     assert run_python(code, AST_SIM_BACKEND="c").strip() == "True"
 
@@ -85,7 +116,7 @@ def test_debug_mode_notices_a_changed_input():
     code = """
 import threading, torch
 from ast_sim.ops import library
-from ast_sim.ops.segment import segment_sum
+from ast_sim.ops._segment import segment_sum
 assert library.configuration()["debug"]
 x, order, offsets = torch.ones(400_000, 16), torch.arange(400_000), torch.tensor([0, 400_000])
 stop = threading.Event()

@@ -14,11 +14,15 @@ import torch
 from meshes import box
 from torch import Tensor, nn
 
-from ast_sim.data.batch import Batch
-from ast_sim.data.file import DatasetInfo, DatasetWriter
-from ast_sim.data.scene import NodeType, Scene, Trajectory
-from ast_sim.model.ast_config import ASTConfig
-from ast_sim.model.simulator import Prediction, Simulator
+from ast_sim.batches.batch_builder import Batch
+from ast_sim.dataset.layout import DatasetInfo
+from ast_sim.dataset.writer import DatasetWriter
+from ast_sim.inference.answer import Answer
+from ast_sim.inference.rollout import Question, rollouts
+from ast_sim.models.ast.ast_config import ASTConfig
+from ast_sim.models.model_config import DataFacts
+from ast_sim.models.simulator import Prediction, Simulator
+from ast_sim.scene import NodeType, Scene, Trajectory
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -104,7 +108,17 @@ def config(info: DatasetInfo, mesh_spacing: float = 0.1) -> ASTConfig:
         element_inputs=(),
         edge_strain=True,
     )
-    return small.resolve(info, 0, mesh_spacing)
+    return small.resolve(DataFacts(info, 0, mesh_spacing))
+
+
+def answers(model: Simulator, truths: list[Trajectory], names: list[str]) -> list[Answer]:
+    """The scenes of the trajectories, predicted together."""
+    return rollouts(model, [Question.of(truth, name) for truth, name in zip(truths, names, strict=True)])
+
+
+def answer(model: Simulator, truth: Trajectory, name: str = "scene") -> Answer:
+    """The scene of the trajectory, predicted."""
+    return answers(model, [truth], [name])[0]
 
 
 class LinearSimulator(Simulator):

@@ -1,1 +1,32 @@
 """The ops of ast_sim: torch custom ops over the C core, each beside its torch composition."""
+
+from ast_sim.ops._attention import attention
+from ast_sim.ops._body_distance import WIDTH as PROXIMITY_WIDTH
+from ast_sim.ops._body_distance import proximity
+from ast_sim.ops._edges import EdgeSet
+from ast_sim.ops._fps import farthest_point_sample
+from ast_sim.ops._linear import linear
+from ast_sim.ops._message import message_edges, message_sum
+from ast_sim.ops._mlp import mlp
+from ast_sim.ops._octree import CellMap, Octree, octree
+from ast_sim.ops._segment import segment_mean, segment_sum
+from ast_sim.ops._sparse_conv import sparse_conv, sparse_conv_transposed
+
+__all__ = [
+    "PROXIMITY_WIDTH",
+    "CellMap",
+    "EdgeSet",
+    "Octree",
+    "attention",
+    "farthest_point_sample",
+    "linear",
+    "message_edges",
+    "message_sum",
+    "mlp",
+    "octree",
+    "proximity",
+    "segment_mean",
+    "segment_sum",
+    "sparse_conv",
+    "sparse_conv_transposed",
+]

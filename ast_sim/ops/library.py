@@ -1,7 +1,8 @@
 """How a kernel of the C core becomes a torch op.
 
-Every op has two bodies of the same meaning: the C kernel, for float32 on the CPU, and a composition of torch ops, which
-is its reference in the tests and runs for any other device or dtype, or everywhere with AST_SIM_BACKEND=torch.
+Every op has two bodies that compute the same: a C kernel for float32 on the CPU, and a composition of torch ops. The
+composition is the reference in the tests. It runs for every other device and dtype, and with AST_SIM_BACKEND=torch
+everywhere.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _library = torch.library.Library("ast_sim", "DEF")
 
 
 def _share_torch_threads() -> None:
-    """Hand torch's thread pool (C symbols of libtorch_cpu since torch 2.10) to the C core; else it is serial."""
+    """Hand torch's thread pool to the C core. Before torch 2.10 it has no C symbols, and the core stays serial."""
     name = {"darwin": "libtorch_cpu.dylib", "win32": "torch_cpu.dll"}.get(sys.platform, "libtorch_cpu.so")
     try:
         library = ctypes.CDLL(str(Path(torch.__file__).parent / "lib" / name))
@@ -40,12 +41,11 @@ if BACKEND == "c":
 
 
 class Op:
-    """An op as its users call it; `overload` is what torch knows of it.
+    """An op as its users call it; `overload` is the same op as torch registered it.
 
-    A call goes through torch's dispatcher only where something may stand between the caller and the kernel: tracing, a
-    dispatch mode, autocast, functorch, other devices and dtypes. For plain float32 tensors on the CPU the dispatcher
-    would cost more than a small kernel takes. With AST_SIM_BACKEND=torch an op is its composition, which torch
-    differentiates as it would any other code.
+    For plain float32 tensors on the CPU a call goes straight to the kernel: torch's dispatcher would take longer than a
+    small kernel does. The dispatcher is used for tracing, dispatch modes, autocast, functorch, other devices and other
+    dtypes. With AST_SIM_BACKEND=torch an op is its composition, and torch differentiates it like any other code.
     """
 
     def __init__(self, name: str, overload: torch._ops.OpOverload, kernel: Callable, reference: Callable) -> None:
@@ -84,16 +84,25 @@ def _is_watched() -> bool:
     )
 
 
-def define(schema: str, kernel: Callable, reference: Callable, fake: Callable) -> Op:
+def define(schema: str, reference: Callable, fake: Callable, kernel: Callable | None = None) -> Op:
     """Register the op `ast_sim::<schema>`.
 
     Args:
-        schema: name and signature in torch's schema language; functional, fresh outputs only.
-        kernel: the body over the C core; called with CPU tensors whose floating ones are all float32.
-        reference: the same as a composition of torch ops, for any device and dtype.
-        fake: the shapes of the outputs, for tracing.
+        schema: name and signature in torch's schema language. The op changes no input, and no output is a view of one.
+        reference: the body as a composition of torch ops, for any device and dtype.
+        fake: makes outputs of the right shapes without values, for tracing.
+        kernel: the body over the C core. It gets CPU tensors; those of floating point are float32. None: the function
+            of the C core with the op's name, which takes the op's arguments and then the outputs of `fake` to fill.
     """
     name = schema.split("(")[0]
+
+    def fill(*args):
+        outputs = fake(*args)
+        inputs = (dense(x) if isinstance(x, torch.Tensor) else x for x in args)
+        getattr(_C, name)(*inputs, *(outputs if isinstance(outputs, tuple) else (outputs,)))
+        return outputs
+
+    kernel = kernel or fill
 
     def on_cpu(*args):
         floats = [x for x in args if isinstance(x, torch.Tensor) and x.is_floating_point()]
@@ -113,9 +122,10 @@ def define(schema: str, kernel: Callable, reference: Callable, fake: Callable) -
 
 
 def differentiate(op: Op, setup_context: Callable, backward: Callable) -> None:
-    """Register the gradient of an op; `backward` calls ops only, so that it can be traced.
+    """Register the gradient of an op. `backward` calls ops only, so that it can be traced.
 
-    It is not called where nothing comes back, which happens if `setup_context` turned materialized zeros off.
+    `backward` is not called if all gradients of the outputs are None. That happens only where `setup_context` has
+    called `set_materialize_grads(False)`.
     """
 
     def backward_of_some(ctx, *gradients):
@@ -135,14 +145,14 @@ def differentiate(op: Op, setup_context: Callable, backward: Callable) -> None:
 
 
 def dense(x: torch.Tensor | None) -> torch.Tensor | None:
-    """The tensor as the C core takes it, contiguous and aligned; a copy only where it is not. None stays None."""
+    """The tensor contiguous and aligned, as the C core takes it: copied only if it is not. None stays None."""
     if x is None or x.is_contiguous() and not x.data_ptr() % x.element_size() and not x.is_neg():
         return x
     return x.detach().resolve_neg().clone(memory_format=torch.contiguous_format)
 
 
 def dense_rows(x: torch.Tensor | None) -> torch.Tensor | None:
-    """The same where rows may lie apart, like those of a slice of columns or of a fused projection."""
+    """Like `dense`, but the rows may lie apart in memory, as in a slice of columns or in a fused projection."""
     if x is None or x.is_contiguous() or x.dim() == 0:
         return dense(x)
     row, *inner = x.stride()
@@ -154,12 +164,23 @@ def dense_rows(x: torch.Tensor | None) -> torch.Tensor | None:
     return x if row >= length and not x.data_ptr() % x.element_size() and not x.is_neg() else dense(x)
 
 
+def check_shape(op: str, name: str, x: torch.Tensor | None, *shape: int) -> None:
+    """Raise ValueError unless x has this shape; -1 stands for any size. None passes."""
+    if x is None or x.shape == shape:
+        return
+    if x.dim() != len(shape) or any(n not in (-1, size) for n, size in zip(shape, x.shape, strict=True)):
+        wanted = ", ".join("*" if n < 0 else str(n) for n in shape)
+        raise ValueError(f"{op}: {name} must have shape [{wanted}], not {tuple(x.shape)}")
+
+
 def check_offsets(op: str, name: str, offsets: torch.Tensor, rows: int) -> None:
-    """Raise ValueError unless offsets, int64 [B + 1], start with 0, never fall and end at the number of rows."""
+    """Raise ValueError unless the offsets [B + 1] start with 0, never fall and end at the number of rows.
+
+    Raise TypeError unless they are int64.
+    """
     if offsets.dtype != torch.int64:
         raise TypeError(f"{op}: {name} must be int64, not {offsets.dtype}")
-    if offsets.dim() != 1:
-        raise ValueError(f"{op}: {name} must have shape [*], not {tuple(offsets.shape)}")
+    check_shape(op, name, offsets, -1)
     if len(offsets) < 1 or offsets[0] != 0:
         raise ValueError(f"{op}: {name} must start with 0")
     falls = (offsets.diff() < 0).nonzero()
@@ -170,8 +191,21 @@ def check_offsets(op: str, name: str, offsets: torch.Tensor, rows: int) -> None:
         raise ValueError(f"{op}: {name} must end at the number of rows {rows}, not {int(offsets[-1])}")
 
 
+def check_index(op: str, name: str, index: torch.Tensor, bound: int) -> None:
+    """Raise ValueError unless all values of an index lie in [0, bound). The message names the first that does not."""
+    wrong = ((index < 0) | (index >= bound)).nonzero()
+    if len(wrong):
+        at = int(wrong[0])
+        raise ValueError(f"{op}: {name}[{at}] = {int(index[at])} is not an index below {bound}")
+
+
+def segment_of(offsets: torch.Tensor) -> torch.Tensor:
+    """[N] int64: the segment of each row, from the offsets [C + 1] of the segments."""
+    return torch.arange(len(offsets) - 1, device=offsets.device).repeat_interleave(offsets.diff())
+
+
 def configuration() -> dict:
-    """What runs here: the backend, the instruction set, the threads and the versions."""
+    """The backend, the instruction sets, the threads and the versions in use, by name."""
     core = _C.configuration() if BACKEND == "c" else {}
     return {
         "backend": BACKEND,
@@ -187,17 +221,20 @@ def configuration() -> dict:
 
 
 def show_config() -> None:
-    """Print what runs here: the backend, the chosen instruction set, the threads and the versions."""
+    """Print the backend, the chosen instruction set, the threads and the versions in use."""
     for name, value in configuration().items():
         print(f"{name:16} {', '.join(value) if isinstance(value, list) else value}")
 
 
 def keep_memory() -> bool:
-    """Let the C library keep large freed blocks instead of giving them back to the system at every free.
+    """Let the C library keep large freed blocks of memory instead of giving them back to the system.
 
-    Fresh pages cost more than the arithmetic on them: this can double the speed of training on the CPU, at the price of
-    a process that holds its peak memory. Process-wide; returns whether it had an effect (glibc only).
-    AST_SIM_KEEP_MEMORY=0 turns it off.
+    This can double the speed of training on the CPU, because fresh pages cost more than the arithmetic on them. In
+    return the process never holds less memory than at its peak. The call acts on the whole process and has an effect
+    with glibc only; it does nothing if AST_SIM_KEEP_MEMORY=0 is set.
+
+    Returns:
+        Whether it had an effect.
     """
     if BACKEND == "torch" or os.environ.get("AST_SIM_KEEP_MEMORY") == "0":
         return False

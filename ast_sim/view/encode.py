@@ -1,7 +1,7 @@
-"""Scenes and curves as the compact JSON that the report's page reads.
+"""Scenes and curves as compact JSON for the scripts of the report.
 
-Only the surface is kept. Displacements and stresses are int16 with one scale an array, so their error is at most
-1 / 65534 of the largest value; everything is little-endian base64.
+Only the surface is kept. Displacements and stresses are int16 with one scale per array, so their error is at most 1 /
+65534 of the largest value. Everything is little-endian base64.
 """
 
 from __future__ import annotations
@@ -13,33 +13,25 @@ from typing import Any
 
 import numpy as np
 
-from ast_sim.data.scene import NodeType, Scene, Trajectory
-from ast_sim.view.fields import (
-    deforming_rows,
-    displacement_rmse,
-    is_planar,
-    require_same_scene,
-    stress_at,
-    stress_rmse,
-    surface_owners,
-)
+from ast_sim.scene import Scene, Trajectory
+from ast_sim.view.fields import displacement_rmse, is_planar, require_same_scene, stress_rmse, surface_owners
 
 Json = dict[str, Any]
 
 
 class Surface:
-    """The boundary of a scene, cut into the deforming bodies and the obstacles (all three nodes of type OBSTACLE).
+    """The boundary of a scene in two groups: the deforming bodies and the obstacles (`Scene.deforming_elements`).
 
-    For either group: `triangles` [F, 3] numbers of its own nodes, `nodes` [n] their numbers in the scene, `elements`
-    [F] the element behind each triangle.
+    Each group has `triangles` [F, 3], numbers of the group's own nodes; `nodes` [n], the numbers of these nodes in the
+    scene; and `elements` [F], the element behind each triangle.
     """
 
     def __init__(self, scene: Scene) -> None:
         surface = scene.surface()
         owners = surface_owners(scene, surface)
-        obstacle = (scene.node_type == NodeType.OBSTACLE)[surface].all(axis=1)
+        deforming = scene.deforming_elements[owners]
         self.groups = {}
-        for name, chosen in (("body", ~obstacle), ("obstacle", obstacle)):
+        for name, chosen in (("body", deforming), ("obstacle", ~deforming)):
             nodes, triangles = np.unique(surface[chosen], return_inverse=True)
             self.groups[name] = (triangles.reshape(-1, 3), nodes, owners[chosen])
 
@@ -59,10 +51,10 @@ class Surface:
     def stress(self, trajectory: Trajectory) -> np.ndarray:
         """[S, n or F]: the stress at the nodes, or on the triangles, of the deforming bodies."""
         _, nodes, elements = self.groups["body"]
-        return trajectory.stress[:, nodes if stress_at(trajectory) == "node" else elements, 0]
+        return trajectory.stress[:, nodes if trajectory.stress_at == "node" else elements, 0]
 
     def motion(self, trajectory: Trajectory, frames: np.ndarray) -> Json:
-        """The displacements and stresses of a trajectory at those of `frames` that it has and that are finite."""
+        """Displacements and stresses of a trajectory. They cover those of `frames` that it has and that are finite."""
         frames = frames[frames < finite_frames(trajectory)]
         encoded: Json = {"frames": len(frames)}
         for name, (_, nodes, _) in self.groups.items():
@@ -74,7 +66,7 @@ class Surface:
 
 
 def encode_scene(truth: Trajectory, frames: np.ndarray, predictions: Sequence[Trajectory | None] = ()) -> Json:
-    """One scene: its surface, and those of `frames` that the truth and each run's prediction have."""
+    """One scene: its surface, and the motion of the truth and of each run's prediction at `frames`."""
     for prediction in predictions:
         if prediction is not None:
             require_same_scene(truth, prediction)
@@ -90,7 +82,7 @@ def encode_scene(truth: Trajectory, frames: np.ndarray, predictions: Sequence[Tr
         "groups": surface.encode(truth.scene.rest_position),
         "low": low.tolist(),
         "high": high.tolist(),
-        "stress": stress_at(truth),
+        "stress": truth.stress_at,
         "ranges": ranges,
         "truth": surface.motion(truth, frames),
         "predictions": [None if p is None else surface.motion(p, frames) for p in predictions],
@@ -98,10 +90,11 @@ def encode_scene(truth: Trajectory, frames: np.ndarray, predictions: Sequence[Tr
 
 
 def encode_curves(truth: Trajectory, predictions: Sequence[Trajectory | None]) -> Json:
-    """Per frame, the error of each run and of the predictor that learns nothing.
+    """For each frame, the error of each run and of a predictor that learns nothing.
 
-    Displacement: NORMAL nodes, against the first frame held still. Stress: outside the obstacles, against the mean
-    of the true stress of that frame.
+    Displacement errors are those of NORMAL nodes; the predictor that learns nothing holds the first frame still. Stress
+    errors are those outside the obstacles; the predictor that learns nothing gives the mean of the true stress in the
+    frame.
     """
     frames = [0 if p is None else min(finite_frames(p), truth.num_frames) for p in predictions]
     held = np.broadcast_to(truth.position[0], truth.position.shape)
@@ -115,9 +108,9 @@ def encode_curves(truth: Trajectory, predictions: Sequence[Trajectory | None]) -
         }
     }
     if truth.stress is not None:
-        rows = deforming_rows(truth)
+        rows = truth.scene.deforming(truth.stress_at)
         mean = truth.stress[:, rows].mean(axis=1, keepdims=True, dtype=np.float64) if rows.any() else 0.0
-        comparable = [p is not None and stress_at(p) == stress_at(truth) for p in predictions]
+        comparable = [p is not None and p.stress_at == truth.stress_at for p in predictions]
         curves["stress"] = {
             "runs": [
                 stress_rmse(truth, p.stress[:n]).tolist() if known else None
@@ -153,7 +146,7 @@ def base64_of(values: np.ndarray, dtype: str) -> str:
 
 
 def finite_json(value: Any) -> Any:
-    """The same value with None for numbers that JSON does not know, and plain numbers for those of numpy."""
+    """The same value, with None for numbers that JSON does not know, and plain numbers in place of numpy's."""
     if isinstance(value, dict):
         return {str(key): finite_json(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -166,7 +159,7 @@ def finite_json(value: Any) -> Any:
 
 
 def _bounds(truth: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """The box to draw: that of the true motion, 10 % wider, and never flat."""
+    """The box to draw: the box of the true motion, made 10 % wider and never flat."""
     low, high = truth.position.min(axis=(0, 1)).astype(float), truth.position.max(axis=(0, 1)).astype(float)
     size = max(float((high - low).max()), 1e-9)
     margin = np.maximum(0.1 * (high - low), 0.02 * size)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import secrets
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,9 +12,9 @@ import h5py
 import meshio
 import numpy as np
 
-from ast_sim.data.disk import replacing
-from ast_sim.data.scene import Trajectory
-from ast_sim.errors import AstSimError
+from ast_sim.scene import Trajectory
+from ast_sim.support.disk import output_file, replacing, temporary_name
+from ast_sim.support.errors import AstSimError, is_utf8
 from ast_sim.view.fields import Fields, fields
 from ast_sim.view.files import explained
 
@@ -29,17 +28,18 @@ def write(
     prediction: Trajectory | None = None,
     time_step: float = 1.0,
 ) -> None:
-    """Write a trajectory, or with `prediction` the predicted one and its errors against it, for ParaView.
+    """Write a trajectory for ParaView; with `prediction`, write the prediction and its errors instead.
 
-    The suffix chooses the format: `.pvd` is a collection beside a folder of the same name that holds one binary VTU
-    file a frame; `.vtkhdf` is one file (VTKHDF 2.0, temporal UnstructuredGrid, the mesh stored once). Frame i stands
-    at the time i * time_step.
+    The suffix chooses the format. `.pvd` is a collection; a folder of the same name beside it holds one binary VTU file
+    a frame. `.vtkhdf` is one file (VTKHDF 2.0, temporal UnstructuredGrid, the mesh stored once). Frame i stands at the
+    time i * time_step.
 
     Point fields: displacement [m, from rest], node_type, body; von_mises [Pa] at nodes or cells, wherever the stress
-    lives. With a prediction the geometry is the predicted one, and there are error (vector), error_magnitude and
-    von_mises_error, all prediction minus truth; frames beyond the end of a shorter prediction are left out.
+    lives. With a prediction, the geometry is the predicted one, and the fields error (vector), error_magnitude and
+    von_mises_error are added. All errors are prediction minus truth. If the prediction is shorter, frames beyond its
+    end are left out.
 
-    Nothing half-written is ever left under the final name.
+    No half-written file is ever left under the final name.
 
     Raises:
         AstSimError: the suffix is not supported, the prediction is of another scene, or the file cannot be written.
@@ -50,11 +50,13 @@ def write(
         raise AstSimError(f"{path}: cannot export to {path.suffix or 'no suffix'!r}; use {' or '.join(writers)}")
     shown = fields(trajectory, prediction)
     with explained(path):
-        writers[path.suffix](path, trajectory.scene.elements, shown, time_step)
+        writers[path.suffix](output_file(path), trajectory.scene.elements, shown, time_step)
 
 
 def _write_pvd(path: Path, elements: np.ndarray, shown: Fields, time_step: float) -> None:
     folder = path.with_suffix("")
+    if not is_utf8(folder.name):
+        raise AstSimError(f"{path}: a .pvd file cannot hold a name that is not UTF-8: choose another name, or .vtkhdf")
     names = [f"frame_{frame:05d}.vtu" for frame in range(len(shown.position))]
     with _replacing_folder(folder) as temporary:
         for frame, name in enumerate(names):
@@ -83,8 +85,8 @@ def _replacing_folder(folder: Path) -> Iterator[Path]:
     """A temporary folder that takes the place of `folder`, which must be absent or hold an earlier series."""
     if folder.exists() and not (folder.is_dir() and all(f.match("frame_*.vtu") for f in folder.iterdir())):
         raise AstSimError(f"{folder} is in the way of the VTU files: it holds other files; choose another name")
-    token = secrets.token_hex(4)
-    temporary, old = (folder.with_name(f".{folder.name}.{kind}.{token}") for kind in ("new", "old"))
+    folder = Path(os.path.realpath(folder)) if folder.is_symlink() else folder
+    temporary, old = temporary_name(folder), temporary_name(folder)
     try:
         temporary.mkdir()
         yield temporary
@@ -110,7 +112,7 @@ def _write_vtkhdf(path: Path, elements: np.ndarray, shown: Fields, time_step: fl
 
 
 def _write_mesh(root: h5py.Group, elements: np.ndarray, position: np.ndarray) -> None:
-    """The one part of the mesh, whose connectivity serves every time step, and the points of all steps in a row."""
+    """Write the mesh once, because all time steps share its connectivity, and the points of all steps in a row."""
     frames, nodes = position.shape[:2]
     count, corners = elements.shape
     root["NumberOfPoints"] = np.array([nodes], dtype=np.int64)
@@ -123,7 +125,7 @@ def _write_mesh(root: h5py.Group, elements: np.ndarray, position: np.ndarray) ->
 
 
 def _write_steps(root: h5py.Group, shown: Fields, time_step: float) -> None:
-    """The times, and for every step where its points and fields start in the arrays that hold all steps in a row."""
+    """Write the times, and where the points and fields of each step start in the arrays of all steps in a row."""
     frames, nodes = shown.position.shape[:2]
     start, zero = np.arange(frames, dtype=np.int64), np.zeros(frames, dtype=np.int64)
     steps = root.create_group("Steps")

@@ -1,4 +1,4 @@
-"""What a trajectory, and the prediction of it, show: displacement, von Mises stress and the errors of both."""
+"""The fields that a trajectory and its prediction show: displacement, von Mises stress, and the errors of both."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ast_sim.data.scene import LOCAL_FACES, NodeType, Scene, Trajectory
-from ast_sim.errors import AstSimError
+from ast_sim.scene import LOCAL_FACES, NodeType, Scene, Trajectory
+from ast_sim.support.errors import AstSimError
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,10 +28,10 @@ class Fields:
 
 
 def fields(truth: Trajectory, prediction: Trajectory | None = None) -> Fields:
-    """The fields of a trajectory or, with a prediction of it, those of the prediction and its errors.
+    """The fields of a trajectory. With a prediction of it, the fields of the prediction and its errors.
 
-    Displacements are taken from the rest positions, errors are prediction minus truth. A prediction that is shorter
-    than the truth gives as many frames as it has.
+    Displacements start at the rest positions. Errors are prediction minus truth. A prediction that is shorter than the
+    truth gives as many frames as it has.
     """
     shown = truth if prediction is None else prediction
     if prediction is not None:
@@ -44,9 +44,9 @@ def fields(truth: Trajectory, prediction: Trajectory | None = None) -> Fields:
         point["error"] = position - truth.position[:frames]
         point["error_magnitude"] = np.linalg.norm(point["error"], axis=2)
     if shown.stress is not None:
-        place = point if stress_at(shown) == "node" else cell
+        place = point if shown.stress_at == "node" else cell
         place["von_mises"] = shown.stress[:frames, :, 0]
-        if prediction is not None and truth.stress is not None and truth.stress.shape[1] == shown.stress.shape[1]:
+        if prediction is not None and truth.stress_at == shown.stress_at:
             place["von_mises_error"] = place["von_mises"] - truth.stress[:frames, :, 0]
     static = {"node_type": truth.scene.node_type, "body": truth.scene.body}
     return Fields(position, static, point, cell)
@@ -61,13 +61,6 @@ def require_same_scene(truth: Trajectory, prediction: Trajectory) -> None:
             f"the prediction has {n_found} nodes and {e_found} elements, but the truth has {n} and {e}: "
             "give the prediction of this very scene"
         )
-
-
-def stress_at(trajectory: Trajectory) -> str:
-    """Where the stress lives: "none", "node" or "element" ("node" where the numbers of both are equal)."""
-    if trajectory.stress is None:
-        return "none"
-    return "node" if trajectory.stress.shape[1] == trajectory.scene.num_nodes else "element"
 
 
 def is_planar(scene: Scene) -> bool:
@@ -86,7 +79,7 @@ def surface_owners(scene: Scene, surface: np.ndarray) -> np.ndarray:
 
 
 def displacement_rmse(truth: Trajectory, position: np.ndarray) -> np.ndarray:
-    """[S] float64: per frame, the root mean square over NORMAL nodes and coordinates of `position` [S, N, 3] - truth.
+    """[S] float64: root mean square of `position` [S, N, 3] - truth over NORMAL nodes and coordinates, for each frame.
 
     A scene without NORMAL nodes gives zeros.
     """
@@ -96,17 +89,9 @@ def displacement_rmse(truth: Trajectory, position: np.ndarray) -> np.ndarray:
 
 
 def stress_rmse(truth: Trajectory, stress: np.ndarray) -> np.ndarray:
-    """[S] float64: per frame, the root mean square of `stress` [S, N or E, 1] - truth, outside the obstacles."""
-    inside = deforming_rows(truth)
+    """[S] float64: root mean square of `stress` [S, N or E, 1] - truth outside the obstacles, for each frame."""
+    inside = truth.scene.deforming(truth.stress_at)
     return _root_mean_square(stress[:, inside].astype(np.float64) - truth.stress[: len(stress), inside])
-
-
-def deforming_rows(trajectory: Trajectory) -> np.ndarray:
-    """The stress rows (bool [N] or [E]) that do not belong to an obstacle; an element does if any of its nodes does."""
-    obstacle = trajectory.scene.node_type == NodeType.OBSTACLE
-    if stress_at(trajectory) == "element":
-        obstacle = obstacle[trajectory.scene.elements].any(axis=1)
-    return ~obstacle
 
 
 def _root_mean_square(difference: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Places to write to, and errors of writing as one line that says what to do."""
+"""Make folders, and report an error of writing in one line that says what to do."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from ast_sim.errors import AstSimError
+from ast_sim.support.errors import AstSimError
 
 
 @contextlib.contextmanager

@@ -1,6 +1,6 @@
 """One self-contained HTML page: the template with its styles, scripts, plotly and data all inside.
 
-The page needs no network: its content security policy lets a browser run these scripts only and load nothing.
+The page needs no network. Its content security policy lets a browser run only these scripts and load nothing.
 """
 
 from __future__ import annotations
@@ -15,29 +15,38 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from ast_sim.data.disk import replacing
-from ast_sim.errors import require
+from ast_sim.support.disk import replacing
+from ast_sim.support.errors import AstSimError, require
 from ast_sim.view.files import explained
 
 SCRIPTS = ("common.js", "panel.js", "viewer.js", "charts.js", "gallery.js", "dataset.js", "page.js")
+SUFFIXES = (".html", ".htm")
 FOOTER = "Made by ast_sim. This page is one file and loads nothing from anywhere."
 
 
+def check_suffix(path: str | os.PathLike[str]) -> None:
+    """Raise AstSimError if the name of a page does not say that it is HTML."""
+    if Path(path).suffix.lower() not in SUFFIXES:
+        raise AstSimError(f"{path}: the name of a page must end in {' or '.join(SUFFIXES)}")
+
+
 def write(path: str | os.PathLike[str], data: dict[str, Any], title: str) -> None:
-    """Write the page that shows `data`; nothing half-written is ever left under the name.
+    """Write the page that shows `data`. No half-written file is ever left under the name.
 
     Raises:
-        AstSimError: the file cannot be written.
+        AstSimError: the suffix is neither .html nor .htm, or the file cannot be written.
         MissingExtra: plotly is not installed.
     """
     path = Path(path)
+    check_suffix(path)
     text = render(data, title)
     with explained(path), replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        # Names of files may hold bytes that are no text; their escapes are valid in JSON, too.
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def render(data: dict[str, Any], title: str) -> str:
-    """The text of the page; its scripts show what `data`, JSON without NaN, has and hide what it lacks."""
+    """The text of the page. `data` is JSON without NaN; the scripts show what it has and hide what it lacks."""
     (offline,) = require("view", "plotly.offline")
     plotly = offline.get_plotlyjs()
     script = '"use strict";\n(() => {\n' + "\n".join(_template(name) for name in SCRIPTS) + "})();\n"
@@ -57,7 +66,7 @@ def render(data: dict[str, Any], title: str) -> str:
 
 
 def _template(name: str) -> str:
-    return resources.files("ast_sim.view").joinpath(name).read_text(encoding="utf-8")
+    return resources.files("ast_sim.view").joinpath("assets", name).read_text(encoding="utf-8")
 
 
 def _digest(script: str) -> str:

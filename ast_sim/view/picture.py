@@ -1,7 +1,7 @@
 """A still picture: truth and prediction of one scene at the frame of largest displacement.
 
-Drawn by matplotlib's Agg from triangles that are projected and sorted here. A VTK window off screen would shade
-better, but its wheels need the system's EGL or Mesa libraries, which a bare server lacks; this needs none.
+This module projects and sorts triangles, and matplotlib's Agg draws them. VTK would shade better, but to draw without a
+window its wheels need the system's EGL or Mesa libraries, which a bare server lacks.
 """
 
 from __future__ import annotations
@@ -11,31 +11,37 @@ from pathlib import Path
 
 import numpy as np
 
-from ast_sim.data.disk import replacing
-from ast_sim.data.scene import NodeType, Trajectory
-from ast_sim.errors import AstSimError, require
+from ast_sim.scene import Trajectory
+from ast_sim.support.disk import replacing
+from ast_sim.support.errors import AstSimError, require
 from ast_sim.view.encode import finite_frames
-from ast_sim.view.fields import is_planar, require_same_scene, stress_at, surface_owners
+from ast_sim.view.fields import is_planar, require_same_scene, surface_owners
 from ast_sim.view.files import explained
+from ast_sim.view.tables import TITLES
 
 EYE = np.array([-0.62, -1.32, 0.78])  # from where a solid scene is seen, in units of its diagonal
 LIGHT = np.array([-0.35, -0.45, 0.82])
 OBSTACLE_COLOR = (0.47, 0.51, 0.56, 0.38)
 MESH_COLOR = (0.05, 0.08, 0.12, 0.5)
 INK = "#16202c"
-PARTS = 4  # each triangle side is cut into so many, for colours that change within it
+PARTS = 4  # each side of a triangle is cut into this many, so that colours change within it
 PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"))
+PREFIXED = {"m": PREFIXES, "Pa": PREFIXES[:4]}  # other units ("mm", "in") are shown as they are
 
 
-def write(path: str | os.PathLike[str], truth: Trajectory, prediction: Trajectory, length_unit: str = "m") -> None:
+def write(
+    path: str | os.PathLike[str], truth: Trajectory, prediction: Trajectory, model: str, length_unit: str = "m"
+) -> None:
     """Write a PNG of the truth beside the prediction, coloured by von Mises stress (Pa) or else by displacement.
 
-    The frame is the one where the truth moves farthest, among those that the prediction has. Both sides share the
-    colour scale, which ends where 1 % of the truth's triangles lie above.
+    `model` is the name under which the model is registered, such as "ast"; the picture names it.
+
+    The picture shows the frame where the truth moves farthest, among the frames that the prediction has. Both sides
+    share the colour scale. It ends where 1 % of the truth's triangles lie above it.
 
     Raises:
         AstSimError: the prediction is of another scene or has no frame, or the file cannot be written.
-        MissingExtra: matplotlib (which comes with pyvista) is not installed.
+        MissingExtra: matplotlib is not installed.
     """
     path = Path(path)
     require_same_scene(truth, prediction)
@@ -43,28 +49,30 @@ def write(path: str | os.PathLike[str], truth: Trajectory, prediction: Trajector
     if frames == 0:
         raise AstSimError("the prediction has no frame that could be drawn")
     moved = np.linalg.norm(truth.position[:frames] - truth.scene.rest_position, axis=2)
-    frame = int(moved[:, truth.scene.node_type != NodeType.OBSTACLE].max(axis=1, initial=0.0).argmax())
-    figure = _figure(truth, prediction, frame, length_unit)
+    frame = int(moved[:, truth.scene.deforming_nodes].max(axis=1, initial=0.0).argmax())
+    figure = _figure(truth, prediction, frame, model, length_unit)
     with explained(path), replacing(path) as temporary:
         figure.savefig(temporary, format="png", dpi=144)
 
 
-def _figure(truth: Trajectory, prediction: Trajectory, frame: int, length_unit: str):
+def _figure(truth: Trajectory, prediction: Trajectory, frame: int, model: str, length_unit: str):
     figures, agg, cm, colors = require(
         "view", "matplotlib.figure", "matplotlib.backends.backend_agg", "matplotlib.cm", "matplotlib.colors"
     )
     figure = figures.Figure(figsize=(10, 4), facecolor="white")
     agg.FigureCanvasAgg(figure)
-    by_stress = truth.stress is not None and stress_at(prediction) == stress_at(truth)
+    by_stress = truth.stress is not None and prediction.stress_at == truth.stress_at
     label, unit = ("von Mises stress", "Pa") if by_stress else ("Displacement", length_unit)
     values = [_corner_values(side, frame, by_stress) for side in (truth, prediction)]
-    body = ~_obstacle_triangles(truth)
-    upper = float(np.quantile(values[0][body], 0.99)) if body.any() else 0.0
-    upper = upper or float(values[0].max(initial=0.0)) or 1.0
-    scale, prefix = next(((s, p) for s, p in PREFIXES if upper >= s), PREFIXES[-1])
-    color_map = cm.ScalarMappable(colors.Normalize(0, upper / scale), "plasma" if by_stress else "viridis")
     view = _View(truth)
-    for column, (side, name) in enumerate(((truth, "Truth (finite elements)"), (prediction, "Prediction (AST)"))):
+    body = values[0][~view.obstacle]
+    upper = float(np.quantile(body, 0.99)) if body.size else 0.0
+    upper = upper or float(values[0].max(initial=0.0)) or 1.0
+    prefixes = PREFIXED.get(unit, ((1.0, ""),))
+    scale, prefix = next(((s, p) for s, p in prefixes if upper >= s), prefixes[-1])
+    color_map = cm.ScalarMappable(colors.Normalize(0, upper / scale), "plasma" if by_stress else "viridis")
+    names = ("Truth (finite elements)", f"Prediction ({TITLES.get(model, model)})")
+    for column, (side, name) in enumerate(zip((truth, prediction), names, strict=True)):
         axes = figure.add_axes((0.01 + 0.5 * column, 0.18, 0.48, 0.73))
         _draw(axes, view, side.position[frame], color_map, values[column] / scale)
         figure.text(0.25 + 0.5 * column, 0.93, name, fontsize=12.5, fontweight="bold", color=INK, ha="center")
@@ -77,7 +85,7 @@ def _figure(truth: Trajectory, prediction: Trajectory, frame: int, length_unit: 
 
 
 class _View:
-    """A perspective camera on a scene: the same for truth and prediction, fitted to the deforming bodies' box."""
+    """A perspective camera on a scene, fitted to the box of the deforming bodies. Truth and prediction share it."""
 
     def __init__(self, truth: Trajectory) -> None:
         low, high = truth.position.min(axis=(0, 1)).astype(float), truth.position.max(axis=(0, 1)).astype(float)
@@ -86,7 +94,7 @@ class _View:
         self.planar = is_planar(truth.scene)
         self.closed = truth.scene.elements.shape[1] == 4
         self.triangles = truth.scene.surface()
-        self.obstacle = _obstacle_triangles(truth)
+        self.obstacle = ~truth.scene.deforming_elements[surface_owners(truth.scene, self.triangles)]
         forward = np.array([0.0, 0.0, -1.0]) if self.planar else -EYE / np.linalg.norm(EYE)
         up = np.array([0.0, 1.0, 0.0]) if self.planar else np.array([0.0, 0.0, 1.0])
         right = np.cross(forward, up)
@@ -100,10 +108,6 @@ class _View:
         return local[..., :2] / distance[..., None], distance
 
 
-def _obstacle_triangles(trajectory: Trajectory) -> np.ndarray:
-    return (trajectory.scene.node_type == NodeType.OBSTACLE)[trajectory.scene.surface()].all(axis=1)
-
-
 def _corner_values(trajectory: Trajectory, frame: int, by_stress: bool) -> np.ndarray:
     """[F, 3]: the coloured quantity at the corners of the surface triangles."""
     scene = trajectory.scene
@@ -111,13 +115,13 @@ def _corner_values(trajectory: Trajectory, frame: int, by_stress: bool) -> np.nd
     if not by_stress:
         return np.linalg.norm(trajectory.position[frame] - scene.rest_position, axis=1)[surface]
     stress = trajectory.stress[frame, :, 0]
-    if stress_at(trajectory) == "node":
+    if trajectory.stress_at == "node":
         return stress[surface]
     return np.repeat(stress[surface_owners(scene, surface), None], 3, axis=1)
 
 
 def _draw(axes, view: _View, position: np.ndarray, color_map, values: np.ndarray) -> None:
-    """Draw the triangles that face the eye from far to near, each as small ones with its edges on top."""
+    """Draw the triangles that face the eye, from far to near; each as small triangles with its edges on top."""
     from matplotlib.collections import PolyCollection
 
     corners = position[view.triangles].astype(float)
@@ -150,7 +154,7 @@ def _draw(axes, view: _View, position: np.ndarray, color_map, values: np.ndarray
 
 
 def _shade(corners: np.ndarray) -> np.ndarray:
-    """[F]: Lambert's law with much ambient light, so that colours can still be compared with the scale."""
+    """[F]: Lambert's law with so much ambient light that colours can still be compared with the scale."""
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normal, axis=1)
     cosine = normal @ (LIGHT / np.linalg.norm(LIGHT)) / np.where(length == 0, 1, length)

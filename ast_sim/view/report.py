@@ -1,6 +1,6 @@
 """The report of runs: moving scenes, error curves, tables and the facts of the run, on one page (`page`).
 
-The data are packed arrays (`encode`), drawn by the scripts beside this file.
+`encode` packs the data into arrays, and the scripts in `assets` draw them.
 """
 
 from __future__ import annotations
@@ -12,19 +12,19 @@ from typing import Any
 
 import numpy as np
 
-from ast_sim.data.scene import Trajectory
-from ast_sim.errors import AstSimError
+from ast_sim.scene import Trajectory
+from ast_sim.support.errors import AstSimError
 from ast_sim.view import page, tables
 from ast_sim.view.encode import encode_curves, encode_scene, finite_json, motion_bytes
 
-MOTION_BYTES = 3_600_000  # of all scenes together; longer ones show every n-th frame
-MIN_FRAMES = 12  # which a scene keeps however large it is
-MAX_RUNS = 6  # a page draws one panel a run, and browsers allow 16 at most
+MOTION_BYTES = 3_600_000  # limit for all scenes together; longer scenes show every n-th frame
+MIN_FRAMES = 12  # a scene keeps at least this many, however large it is
+MAX_RUNS = 6  # a page draws one panel a run, and browsers allow at most 16
 
 
 @dataclass(frozen=True, eq=False)
 class ReportScene:
-    """A test scene to be shown: `name` as in the evaluation's samples, `label` why it was chosen ("median")."""
+    """A test scene to show: `name` as in the evaluation's samples; `label` says why it was chosen ("median")."""
 
     name: str
     label: str
@@ -37,14 +37,16 @@ class ReportRun:
     """What the report says of one run.
 
     Attributes:
-        name: as readers shall know the run.
-        scenes: predictions to be shown.
+        name: name of the run for the readers.
+        model: name under which the model is registered, such as "ast".
+        scenes: predictions to show.
         evaluation: what `ast-sim evaluate --json` writes, or None.
         metrics: the lines of `metrics.jsonl`.
-        facts: model, parameters, data, seeds, in the order to be shown; the evaluation adds its own.
+        facts: model, parameters, data, seeds, in the order to show; the evaluation adds facts of its own.
     """
 
     name: str
+    model: str
     scenes: Sequence[ReportScene]
     evaluation: Mapping[str, Any] | None = None
     metrics: Sequence[Mapping[str, Any]] = ()
@@ -52,9 +54,9 @@ class ReportRun:
 
 
 def representative(errors: Mapping[str, float]) -> list[tuple[str, str]]:
-    """The (label, name) of the best, the median and the worst of scenes by error; of fewer than three, all of them.
+    """The (label, name) of the scenes with the best, the median and the worst error; of fewer than three, all of them.
 
-    A scene whose error is not finite (a rollout that failed) is worse than any other.
+    A scene whose error is not finite (its rollout failed) counts as worse than any other.
     """
     ranked = sorted(errors, key=lambda name: (not errors[name] < float("inf"), errors[name], name))
     if len(ranked) < 3:
@@ -65,10 +67,11 @@ def representative(errors: Mapping[str, float]) -> list[tuple[str, str]]:
 def write(path: str | os.PathLike[str], runs: Sequence[ReportRun], title: str) -> None:
     """Write the report of one run, or of several side by side, as one HTML file.
 
-    Scenes of several runs are matched by name; the truth and the label are those of the first run that has it.
+    Scenes of several runs are matched by name. The truth and the label come from the first run that has the scene.
 
     Raises:
-        AstSimError: no run, too many, a prediction of another scene than its truth, or the file cannot be written.
+        AstSimError: there is no run or too many, a prediction belongs to another scene than its truth, or the file
+            cannot be written.
         MissingExtra: plotly is not installed.
     """
     if not 1 <= len(runs) <= MAX_RUNS:
@@ -79,6 +82,7 @@ def write(path: str | os.PathLike[str], runs: Sequence[ReportRun], title: str) -
 def page_data(runs: Sequence[ReportRun]) -> dict[str, Any]:
     """Everything that the page's scripts show, as JSON."""
     names = _distinct([run.name for run in runs])
+    models = [tables.TITLES.get(run.model, run.model) for run in runs]
     evaluations = [dict(run.evaluation) if run.evaluation else None for run in runs]
     scenes, samples = _scenes(runs), tables.samples(evaluations, names)
     errors = dict(zip(samples["names"], samples["runs"][0], strict=True)) if samples else {}
@@ -93,7 +97,7 @@ def page_data(runs: Sequence[ReportRun]) -> dict[str, Any]:
             "units": tables.units(evaluations),
             "scenes": scenes,
             "scenesNote": _scenes_note(scenes, evaluations[0]),
-            "tables": tables.measure_tables(names if len(runs) > 1 else ["AST"], evaluations),
+            "tables": tables.measure_tables(names if len(runs) > 1 else models, evaluations),
             "samples": samples,
             "runs": [_run(run, name) for run, name in zip(runs, names, strict=True)],
             "footer": page.FOOTER,
@@ -109,7 +113,7 @@ def _run(run: ReportRun, name: str) -> dict[str, Any]:
 
 
 def _scenes(runs: Sequence[ReportRun]) -> list[dict[str, Any]]:
-    """The scenes of all runs, in order of their first appearance, each with one prediction (or None) a run."""
+    """The scenes of all runs, in order of their first appearance. Each has one prediction (or None) for each run."""
     first: dict[str, ReportScene] = {}
     for run in runs:
         for scene in run.scenes:
@@ -146,7 +150,7 @@ def _scenes_note(scenes: Sequence[dict[str, Any]], evaluation: dict[str, Any] | 
 def _lead(runs: Sequence[ReportRun], names: Sequence[str]) -> str:
     if len(runs) > 1:
         return f"Runs compared: {', '.join(names)}."
-    return f"Run {names[0]}: scenes that the model never saw, predicted from their first frame and the obstacle’s path."
+    return f"“{names[0]}” predicts scenes that it never saw, from their first frame and the obstacle’s path."
 
 
 def _distinct(names: Sequence[str]) -> list[str]:

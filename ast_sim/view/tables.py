@@ -18,7 +18,9 @@ TRIVIAL = {
     "stress": {"stress_zero": "Zero", "stress_constant": "Constant mean", "stress_frame_mean": "Mean of the frame"},
 }
 MODEL = "model"
-TRAINING_POINTS = 400  # a longer training curve is thinned to so many means
+# The models' names as papers write them; a model that is not listed goes by its own name.
+TITLES = {"ast": "AST", "mgn": "MGN", "bsms": "BSMS", "hcmt": "HCMT", "transolver": "Transolver"}
+TRAINING_POINTS = 400  # a longer training curve is reduced to this many means
 
 
 def units(evaluations: Sequence[Json | None]) -> dict[str, str]:
@@ -28,17 +30,17 @@ def units(evaluations: Sequence[Json | None]) -> dict[str, str]:
 
 
 def lookup(tree: Any, *keys: str) -> Any:
-    """tree[key][key]..., or None as soon as one is missing."""
+    """tree[key][key]..., or None if a key is missing."""
     for key in keys:
         tree = tree.get(key) if isinstance(tree, Mapping) else None
     return tree
 
 
 def measure_tables(names: Sequence[str], evaluations: Sequence[Json | None]) -> list[Json]:
-    """A table of the displacement's and one of the stress's errors: every convention, runs beside trivial predictors.
+    """Two tables of errors: displacement and stress. Rows are measures; columns are runs and trivial predictors.
 
-    The trivial predictors do not depend on the run: they are taken from the first evaluation that has them. A
-    time-conditioned model has no row of one step: its step from frame 0 is its rollout.
+    The trivial predictors do not depend on the run, so they are taken from the first evaluation that has them. A
+    time-conditioned model has no row for one step, because its step from frame 0 is its rollout.
     """
     unit = units(evaluations)
     summaries = [lookup(evaluation, "summary") for evaluation in evaluations]
@@ -47,7 +49,7 @@ def measure_tables(names: Sequence[str], evaluations: Sequence[Json | None]) -> 
         sources = [_of_model(evaluation, quantity) for evaluation in evaluations]
         for key in TRIVIAL[quantity]:
             sources.append(next((f for s in summaries if (f := lookup(s, key, quantity))), None))
-        rows = _measure_rows(sources)
+        rows = _measure_rows(sources, _horizons(evaluations))
         if rows:
             columns = [*names, *TRIVIAL[quantity].values()]
             tables.append(
@@ -63,9 +65,16 @@ def _of_model(evaluation: Json | None, quantity: str) -> Json | None:
     return {horizon: errors for horizon, errors in found.items() if horizon != "one_step"}
 
 
-def _measure_rows(sources: Sequence[Json | None]) -> list[Json]:
+def _horizons(evaluations: Sequence[Json | None]) -> dict[str, str]:
+    """The horizons to show. The first 50 steps are the full rollout if no scene has more than these."""
+    frames = [sample.get("frames") for e in evaluations for sample in (e or {}).get("samples") or []]
+    short = bool(frames) and all(count is not None and count <= 51 for count in frames)
+    return {key: title for key, title in HORIZONS.items() if not (short and key == "rollout_50")}
+
+
+def _measure_rows(sources: Sequence[Json | None], horizons: Mapping[str, str]) -> list[Json]:
     rows: list[Json] = []
-    for horizon, title in HORIZONS.items():
+    for horizon, title in horizons.items():
         found = []
         for nodes, measure in itertools.product(NODES, MEASURES):
             values = [lookup(source, horizon, nodes, measure) for source in sources]
@@ -92,7 +101,7 @@ def tiles(evaluation: Json | None) -> list[Json]:
         reference = lookup(evaluation, "summary", trivial, *path)
         detail = "full rollout, rmse_sequence"
         if error is None:
-            detail = "no figure, as a rollout failed"
+            detail = "no figure, because a rollout failed"
         elif reference:
             detail = f"{100 * error / reference:.0f} % of “{TRIVIAL[quantity][trivial].lower()}”, full rollout"
         found.append({"label": title, "value": error, "unit": unit[quantity], "detail": detail})
@@ -114,7 +123,7 @@ def _speed_tiles(evaluation: Json) -> list[Json]:
         "label": "Speed-up over the solver",
         "value": f"{speedup:.3g}",
         "suffix": "×",
-        "detail": "same scenes, as recorded when they were solved",
+        "detail": "same scenes; the solver’s time is from their generation",
     }
     return [tile, faster]
 
@@ -138,7 +147,7 @@ def mean_of(evaluation: Json | None, key: str) -> float | None:
 
 
 def comparison(names: Sequence[str], evaluations: Sequence[Json | None]) -> Json | None:
-    """For several runs: what one chooses by, one row a run."""
+    """For several runs, the figures by which one chooses: one row a run."""
     if len(names) < 2 or not any(evaluations):
         return None
     unit = units(evaluations)
@@ -159,7 +168,7 @@ def comparison(names: Sequence[str], evaluations: Sequence[Json | None]) -> Json
 
 
 def samples(evaluations: Sequence[Json | None], names: Sequence[str]) -> Json | None:
-    """The error of every test scene over the full rollout, in ascending order of the first run's; a failed one last."""
+    """Errors of every test scene over the full rollout, in ascending order of the first run's; failed ones last."""
     lists = [{s["name"]: s for s in (e or {}).get("samples") or []} for e in evaluations]
     scenes = list(dict.fromkeys(name for samples in lists for name in samples))
     if not scenes:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import performance, targets
+from benchmarks.kernels import performance, targets
 
 ROOT = Path(__file__).parents[2]
 
@@ -94,7 +94,7 @@ def test_page(tmp_path):
         (tmp_path / f"{name}.json").write_text(json.dumps(results))
     out = tmp_path / "page.md"
     files = ["--kernels", tmp_path / "kernels.json", "--steps", tmp_path / "steps.json", "--out", out]
-    subprocess.run([sys.executable, "-m", "benchmarks.performance", *files], check=True, cwd=ROOT)
+    subprocess.run([sys.executable, "-m", "benchmarks.kernels.performance", *files], check=True, cwd=ROOT)
     text = out.read_text()
     for part in (
         "Targets reached: 1 of 2 measured.",

@@ -16,14 +16,17 @@ import pytest
 import toy
 from toy import one_thread  # noqa: F401
 
-from ast_sim.data.scene import Trajectory
-from ast_sim.errors import ConfigError
-from ast_sim.rollout import Rollout
-from ast_sim.run import read_config
-from ast_sim.simulate.checkpoint import Checkpoint
-from benchmarks import increments, study, study_page, study_run
-from benchmarks.study_measure import phase_errors, phases, repeated
-from benchmarks.study_plan import Data, Entry, Study, read
+from ast_sim.inference.answer import Answer
+from ast_sim.runs.train_config import read_config
+from ast_sim.scene import Trajectory
+from ast_sim.simulate.mechanics.unfinished import Checkpoint
+from ast_sim.support.errors import ConfigError
+from benchmarks.simulation import increments
+from benchmarks.studies import __main__ as study
+from benchmarks.studies import page as study_page
+from benchmarks.studies import run as study_run
+from benchmarks.studies.measure import phase_errors, phases, repeated
+from benchmarks.studies.plan import Data, Entry, Study, read
 
 TOML = """
 title = "Toy"
@@ -89,12 +92,12 @@ def test_errors_of_a_phase_are_those_of_its_frames():
     truth = touching(0, 0, 1, 2, 2, 3, 2, 2, 1, 0, 0)
     position = truth.position.copy()
     position[3] += 0.5
-    found = phase_errors(truth, Rollout(position, None, 1))
+    found = phase_errors(truth, Answer("scene", truth.scene, position, None, 1, []))
     normal = int((truth.scene.node_type == 0).sum())
     assert found["first"].total == pytest.approx(0.25 * 3 * normal, rel=1e-5) and found["first"].count == 9 * normal
     assert found["before"].count == 3 * normal  # frame 0 is given
     assert found["before"].total == found["full"].total == found["release"].total == 0
-    assert phase_errors(truth, Rollout(position[:6], None, 1)) == {}
+    assert phase_errors(truth, Answer("scene", truth.scene, position[:6], None, 1, [])) == {}
 
 
 def test_a_long_script_goes_forward_and_backward():
@@ -194,7 +197,7 @@ def processes_with(word: str) -> list[str]:
 def test_a_study_that_is_stopped_goes_on(tmp_path):
     data = toy.write(tmp_path / "toy.h5")
     written(tmp_path, TOML.replace("toy.h5", str(data)).replace("samples = 16", "samples = 800"))
-    command = [sys.executable, "-m", "benchmarks.study", str(tmp_path / "toy.toml")]
+    command = [sys.executable, "-m", "benchmarks.studies", str(tmp_path / "toy.toml")]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
     begun = subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     folder = tmp_path / "build/study/toy/ast/rate_0.001_seed_0"
@@ -209,7 +212,7 @@ def test_a_study_that_is_stopped_goes_on(tmp_path):
     assert not processes_with(str(folder.relative_to(tmp_path)))
     assert not (folder / "trained.json").exists()
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=240)
-    assert done.returncode == 0 and "200 steps" in done.stdout and (tmp_path / "docs/study.md").exists()
+    assert done.returncode == 0 and "200 steps" in done.stdout and (tmp_path / "docs/results/study.md").exists()
     result = tmp_path / "benchmarks/results/study_toy.json"
     (run,) = json.loads(result.read_text())["models"]["ast"]["runs"]
     assert run["steps"] == 200 and "measured" in run
@@ -287,13 +290,13 @@ def page(folder, found, summary) -> None:
     scenes = {"name": "toy.h5", "train": 3, "valid": 2, "test": 2}
     result = {"commit": None, "processor": "p", "study": values, "scenes": scenes, "models": found}
     (folder / "study_toy.json").write_text(json.dumps(result))
-    study_page.write_page(folder, folder / "docs")
-    text = (folder / "docs/study.md").read_text()
+    study_page.write_page(folder, folder / "pages")
+    text = (folder / "pages/study.md").read_text()
     assert f"{1e3 * summary:.3g}" in text and "every model stays finite" in text and "16 frame pairs" in text
     assert "all: `train.statistics_pairs=4`; ast: `model.hidden=16 model.L_SA=1 model.L_cell=3`." in text
     assert "seeds 0; commit " in text  # not those that are still to come
     assert "by learning rate; the best in bold:\n\n| model | 0.0001 | 0.001 |\n| --- | ---: | ---: |\n| ast |" in text
-    assert (folder / "docs/study/toy.svg").read_text().startswith("<?xml")
+    assert (folder / "pages/study/toy.svg").read_text().startswith("<?xml")
 
 
 def size_of(model: str, nodes: int, seconds: float | None) -> dict:
@@ -306,12 +309,12 @@ def test_the_page_tells_what_the_size_of_a_mesh_costs(tmp_path):
     records += [size_of("mgn", 2000, None), size_of("ast", 4000, 1.0)]
     found = {"threads": 2, "memory_limit_bytes": 20e9, "commit": None, "processor": "p", "records": records}
     (tmp_path / "scaling.json").write_text(json.dumps(found))
-    study_page.write_page(tmp_path, tmp_path / "docs")
-    text = (tmp_path / "docs/study.md").read_text()
+    study_page.write_page(tmp_path, tmp_path / "pages")
+    text = (tmp_path / "pages/study.md").read_text()
     for line in ("| nodes | AST | MGN |", "| 1,000 | 0.5 | 2 |", "| 2,000 | 0.75 | failed |", "| 4,000 | 1 |  |"):
         assert line in text
     assert "| 2,000 | 2 | failed |" in text and "- MGN at 2,000 nodes: no memory" in text
-    assert (tmp_path / "docs/study/scaling.svg").read_text().startswith("<?xml")
+    assert (tmp_path / "pages/study/scaling.svg").read_text().startswith("<?xml")
 
 
 def run_of(rollout: float | None, milliseconds: float) -> dict:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from ast_sim.ops.edges import EdgeSet
+from ast_sim.ops import EdgeSet
 
 
 def test_edges_are_sorted_by_receiver_then_sender():

@@ -8,9 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from ast_sim.ops import fps
-from ast_sim.ops.fps import farthest_point_sample
-from ast_sim.ops.octree import octree
+from ast_sim.ops import _fps as fps
+from ast_sim.ops import farthest_point_sample, octree
 
 
 def points(*rows: tuple[int, int, int]) -> Tensor:
@@ -120,7 +119,7 @@ def test_bitwise_equal_for_threads():
 
 CODE = """
 import hashlib, torch
-from ast_sim.ops.fps import farthest_point_sample
+from ast_sim.ops._fps import farthest_point_sample
 g = torch.Generator().manual_seed(5)
 digest = hashlib.sha256()
 for extent in (5, 4096, 2**21):

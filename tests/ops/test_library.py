@@ -5,7 +5,7 @@ import torch
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from ast_sim.ops import segment
+from ast_sim.ops import _segment as segment
 
 ORDER, OFFSETS = torch.tensor([2, 0, 1]), torch.tensor([0, 2, 3])
 

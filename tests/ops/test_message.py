@@ -7,9 +7,8 @@ import torch
 from checks import assert_accurate, assert_same_for_threads, instruction_sets, misaligned_read_only, run_python
 from torch import Tensor
 
-from ast_sim.ops import message as ops
-from ast_sim.ops.edges import EdgeSet
-from ast_sim.ops.message import message_edges, message_sum
+from ast_sim.ops import EdgeSet, message_edges, message_sum
+from ast_sim.ops import _message as ops
 
 
 def random_edges(edges: int, senders: int, receivers: int, seed: int = 0) -> EdgeSet:

@@ -6,8 +6,8 @@ from checks import assert_accurate, assert_same_for_threads, instruction_sets, m
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ast_sim.ops import mlp as ops
-from ast_sim.ops.mlp import mlp
+from ast_sim.ops import _mlp as ops
+from ast_sim.ops import mlp
 
 NAMES = ("x", "weight1", "bias1", "weight2", "bias2", "beside", "gamma", "beta", "residual")
 
@@ -281,7 +281,7 @@ def test_other_dtypes_and_autocast():
 
 MEMORY = """
 import resource, torch
-from ast_sim.ops.mlp import mlp
+from ast_sim.ops._mlp import mlp
 torch.set_num_threads(1)
 def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 def run(rows):

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from ast_sim.ops import octree as ops
-from ast_sim.ops.octree import CellMap, Octree, octree
+from ast_sim.ops import CellMap, Octree, octree
+from ast_sim.ops import _octree as ops
 
 ORIGIN = (0.0, 0.0, 0.0)
 
@@ -218,7 +218,7 @@ def test_bitwise_equal_for_threads():
 
 CODE = """
 import hashlib, torch
-from ast_sim.ops.octree import octree
+from ast_sim.ops._octree import octree
 g = torch.Generator().manual_seed(5)
 digest = hashlib.sha256()
 for depth in (4, 12, 21):

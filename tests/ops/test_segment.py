@@ -9,8 +9,8 @@ from checks import assert_accurate, assert_same_for_threads, instruction_sets, m
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ast_sim.ops import segment
-from ast_sim.ops.segment import segment_mean, segment_sum
+from ast_sim.ops import _segment as segment
+from ast_sim.ops import segment_mean, segment_sum
 
 
 def case(rows: int, segments: int, channels: int, seed: int = 0):
@@ -80,7 +80,7 @@ def test_bitwise_equal_for_threads():
 
 CODE = """
 import torch, hashlib
-from ast_sim.ops import segment
+from ast_sim.ops import _segment as segment
 g = torch.Generator().manual_seed(3)
 x, order = torch.randn(999, 37, generator=g), torch.randperm(999, generator=g)
 offsets = torch.arange(0, 1000, 27)

@@ -6,9 +6,8 @@ from checks import assert_accurate, assert_same_for_threads, instruction_sets, m
 from torch import Tensor
 from torch.nn import functional as F
 
-from ast_sim.ops import sparse_conv as ops
-from ast_sim.ops.octree import CellMap, octree
-from ast_sim.ops.sparse_conv import sparse_conv, sparse_conv_transposed
+from ast_sim.ops import CellMap, octree, sparse_conv, sparse_conv_transposed
+from ast_sim.ops import _sparse_conv as ops
 
 
 def level(*nodes: int, depth: int = 4, seed: int = 0) -> CellMap:
@@ -267,7 +266,7 @@ def test_errors_name_op_argument_and_value(dtype):
         "x must have shape": lambda: call(x=x[0]),
         r"weight (must have shape )?\[27, \*, \*\]": lambda: call(weight=weight[1:]),
         "x has 7 channels, weight takes 8": lambda: call(x=x[:, 1:]),
-        r"bias must have shape \[6\].*, not \[5\]": lambda: call(bias=x.new_zeros(5)),
+        r"bias must have shape \[6\].*, not [\[(]5": lambda: call(bias=x.new_zeros(5)),
         "pair_offsets must end at the number of rows": lambda: call(**{"0": map.pair_offsets.clamp(max=3)}),
         rf"source\[5\] = {map.num_fine} is not an index below {map.num_fine}": lambda: call(**{"1": changed}),
         rf"is not an index below {num - 1}": lambda: call(num=num - 1),

@@ -9,7 +9,7 @@ from figures import evaluation, metrics
 from on_screen import HOSTILE, differ, drawn, settle, show, texts
 from view_scenes import plate, strip
 
-from ast_sim.data.scene import Trajectory
+from ast_sim.scene import Trajectory
 from ast_sim.view.report import ReportRun, ReportScene, representative, write
 
 LEFT, RIGHT = ".panel:nth-child(1) .stage", ".panel:nth-child(2) .stage"
@@ -32,7 +32,7 @@ def page(browser, tmp_path_factory):
         for i, (label, name) in enumerate(chosen)
     ]
     path = tmp_path_factory.mktemp("report") / "report.html"
-    write(path, [ReportRun(HOSTILE, scenes, evaluation(errors), metrics(), {"Model": HOSTILE})], HOSTILE)
+    write(path, [ReportRun(HOSTILE, "ast", scenes, evaluation(errors), metrics(), {"Model": HOSTILE})], HOSTILE)
     show(browser, path)
     assert texts(browser, "#scene-choice input:checked + span") == ["Median 2.00 mm"]
     assert browser.evaluate("report.viewer.state.playing") is False  # motion is unwanted here
@@ -163,6 +163,14 @@ def test_tables_have_units_and_sensible_digits(browser, page):
 def test_training_and_facts_are_shown(browser, page):
     assert browser.evaluate("document.querySelectorAll('#training .plot .scatterlayer .trace').length") == 5
     text = browser.evaluate("document.querySelector('#facts').innerText")
+    for part in ("training", "over-time"):
+        # A card becomes narrower when one comes beside it: the chart follows.
+        wider = browser.evaluate(
+            f"[...document.querySelectorAll('#{part} .chart:not([hidden])')].map(card => {{"
+            " const drawn = card.querySelector('.plot .main-svg').getBoundingClientRect();"
+            " return drawn.width - card.clientWidth; })"
+        )
+        assert len(wider) == {"training": 2, "over-time": 3}[part] and max(wider) <= 0 and min(wider) > -40, part
     for fact in ("0123456789abcdef", "A processor, 2 threads", "python 3.11.2, torch 2.13.0", "--json <file>"):
         assert fact in text
 
@@ -209,7 +217,7 @@ def test_unusual_scenes(browser, tmp_path):
         "one frame": (plate(1, depth=0.0), plate(1, depth=0.0)),
     }
     scenes = [ReportScene(name, name, *pair) for name, pair in pairs.items()]
-    write(tmp_path / "report.html", [ReportRun("run", scenes)], "Unusual scenes")
+    write(tmp_path / "report.html", [ReportRun("run", "ast", scenes)], "Unusual scenes")
     show(browser, tmp_path / "report.html")
     colors = "(c => c.hidden ? 1 : c.querySelectorAll('input').length)(document.querySelector('#color-choice'))"
     for index, (name, (truth, _)) in enumerate(pairs.items()):
@@ -234,8 +242,8 @@ def test_several_runs_side_by_side(browser, tmp_path):
     truth = {"a": plate(5), "b": plate(5, depth=0.05)}
     both = [ReportScene(name, name, t, plate(5, seed=i)) for i, (name, t) in enumerate(truth.items())]
     runs = [
-        ReportRun("ast", both, evaluation({"a": 1e-3, "b": 2e-3}), metrics()),
-        ReportRun("ast", both[:1], evaluation({"a": 3e-3}, scale=2.0), metrics(200)),
+        ReportRun("ast", "ast", both, evaluation({"a": 1e-3, "b": 2e-3}), metrics()),
+        ReportRun("ast", "ast", both[:1], evaluation({"a": 3e-3}, scale=2.0), metrics(200)),
     ]
     write(tmp_path / "report.html", runs, "Two runs")
     show(browser, tmp_path / "report.html")
@@ -253,8 +261,28 @@ def test_several_runs_side_by_side(browser, tmp_path):
     assert browser.errors == []
 
 
+def test_only_some_units_take_a_prefix(browser, tmp_path):
+    """Millimetres, and stress so small that its prefix would be milli: "mPa" would be read as MPa."""
+    errors = {"a": 1.0, "b": 2.0}
+    chosen = [ReportScene(name, name, plate(5), plate(5, seed=1)) for name in errors]
+    found = evaluation(errors, scale=1e-5)
+    found["length_unit"] = "mm"
+    found["samples"][0]["displacement"]["model"]["rollout_all"]["normal"] = 0.268
+    write(tmp_path / "report.html", [ReportRun("run", "ast", chosen, found, metrics())], "Millimetres")
+    show(browser, tmp_path / "report.html")
+    assert texts(browser, ".tile .value")[:2] == ["1.43e−8 mm", "0.0678 Pa"]
+    assert texts(browser, "#scene-choice span small")[0] == "0.268 mm"
+    titles = texts(browser, "#over-time .ytitle, #all-scenes .ytitle, #training .ytitle")
+    assert titles and all("(mm)" in title for title in titles if "RMSE" in title), titles
+    assert not any(word in browser.evaluate("document.body.innerText") for word in ("mmm", "µmm", "mPa"))
+
+
 def test_it_plays_by_itself_unless_motion_is_unwanted(browser, tmp_path):
-    write(tmp_path / "report.html", [ReportRun("run", [ReportScene("a", "Only scene", strip(4), strip(4))])], "Strip")
+    write(
+        tmp_path / "report.html",
+        [ReportRun("run", "ast", [ReportScene("a", "Only scene", strip(4), strip(4))])],
+        "Strip",
+    )
     browser.prefer(color_scheme="light", reduced_motion="no-preference")
     show(browser, tmp_path / "report.html", still=False)
     browser.wait("report.viewer.state.playing && report.viewer.state.frame >= 2")

@@ -9,32 +9,13 @@ import numpy as np
 import pytest
 import pyvista
 from view_scenes import plate, strip
-from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
+from vtk_series import read
 
-from ast_sim.data.scene import Trajectory
-from ast_sim.errors import AstSimError
+from ast_sim.scene import Trajectory
+from ast_sim.support.errors import AstSimError
 from ast_sim.view import export
 
 CELL_TYPE = {3: pyvista.CellType.TRIANGLE, 4: pyvista.CellType.TETRA}
-
-
-def read(path):
-    """The times and the meshes of a series, with VTK's own readers, which are those of ParaView."""
-    reader = pyvista.get_reader(path)
-    meshes = []
-    if path.suffix == ".pvd":
-        for index in range(len(reader.time_values)):
-            reader.set_active_time_point(index)
-            meshes.append(reader.read()[0])
-        return list(reader.time_values), meshes
-    reader = reader.reader
-    reader.UpdateInformation()
-    # VTK announces no times for a file of one step.
-    times = reader.GetOutputInformation(0).Get(vtkStreamingDemandDrivenPipeline.TIME_STEPS()) or (0.0,)
-    for time in times:
-        reader.UpdateTimeStep(time)
-        meshes.append(pyvista.wrap(reader.GetOutputDataObject(0)).copy())
-    return list(times), meshes
 
 
 def same(found, expected):

@@ -13,9 +13,10 @@ from on_screen import HOSTILE, differ, drawn, show, texts
 from PIL import Image
 from view_scenes import cloth, pair
 
-from ast_sim.data.file import DatasetInfo, DatasetWriter
-from ast_sim.data.scene import Trajectory
-from ast_sim.view import gallery
+from ast_sim.dataset.layout import DatasetInfo
+from ast_sim.dataset.writer import DatasetWriter
+from ast_sim.scene import Trajectory
+from ast_sim.view.dataset_page import gallery
 
 BLOCKS = DatasetInfo(
     "abcd", "quasi_static", "element", (0.0, 0.0, 0.0), 1.0, 0.003, 0.0, generator={"command": HOSTILE}
@@ -46,6 +47,18 @@ def page(browser, tmp_path_factory):
     gallery.write(folder / "report.html", folder / "blocks.h5")
     show(browser, folder / "report.html", still=False)
     return folder / "report.html"
+
+
+def test_one_sample_is_no_plural(browser, page, tmp_path):
+    with DatasetWriter(tmp_path / "one.h5", BLOCKS) as writer:
+        writer.add("train", pair(FRAMES, cells=3, crush=0.05))
+    gallery.write(tmp_path / "one.html", tmp_path / "one.h5")
+    show(browser, tmp_path / "one.html", still=False)
+    text = browser.evaluate("document.querySelector('header').textContent + document.querySelector('main').textContent")
+    for words in ("1 of 1 sample", "largest displacement: 1 sample.", "The figures of 1 sample"):
+        assert words in text
+    assert "1 samples" not in text and browser.errors == []
+    show(browser, page, still=False)
 
 
 def at(browser, seconds, tiles=TILES):
@@ -164,7 +177,7 @@ def test_tables_tell_yield_bounds_and_facts(browser, page):
     rows = [texts(browser, f"#bounds-tables tbody tr:nth-child({row}) td") for row in (1, 2, 4)]
     assert rows[0] == ["✓ pass", "> 0", "400 µm", "train/000000", "3"]
     assert rows[1] == ["✗ fail: 1", "> 0", "−0.250 to 0.600", "test/000000", "3"]
-    assert rows[2] == ["✓ pass", "± 0.02", "0.00400", "train/000000", "3"]
+    assert rows[2] == ["✓ pass", "≤ 0.005", "0", "train/000000", "2"]
     assert texts(browser, "#samples-tables tbody th")[2] == "test/000000 shown above"
     assert HOSTILE in texts(browser, "#facts td")
     sections = "[...document.querySelectorAll('main section')].map(section => section.id)"

@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 from view_scenes import plate, strip
 
-from ast_sim.data.scene import Trajectory
-from ast_sim.errors import AstSimError
+from ast_sim.scene import Trajectory
+from ast_sim.support.errors import AstSimError
 from ast_sim.view import picture
 
 
@@ -35,7 +35,7 @@ def inked(image):
 )
 def test_both_sides_are_drawn(tmp_path, monkeypatch, truth, prediction):
     monkeypatch.delenv("DISPLAY", raising=False)
-    picture.write(tmp_path / "a.png", truth, prediction)
+    picture.write(tmp_path / "a.png", truth, prediction, "ast")
     left, right = sides(tmp_path / "a.png")
     for side in (left, right):
         assert 0.1 < inked(side) < 0.8
@@ -46,7 +46,7 @@ def test_both_sides_are_drawn(tmp_path, monkeypatch, truth, prediction):
 def test_errors_are_seen_and_a_perfect_prediction_is_the_truth(tmp_path):
     truth = plate(9)
     for name, prediction in (("same", truth), ("other", plate(9, seed=1))):
-        picture.write(tmp_path / f"{name}.png", truth, prediction)
+        picture.write(tmp_path / f"{name}.png", truth, prediction, "ast")
     left, right = sides(tmp_path / "same.png")
     assert (np.abs(left - right).max(axis=2) > 60).mean() < 0.02
     left, right = sides(tmp_path / "other.png")
@@ -57,16 +57,36 @@ def test_the_frame_is_that_of_the_largest_displacement(tmp_path, monkeypatch):
     frames, figure = [], picture._figure
     monkeypatch.setattr(picture, "_figure", lambda *given: frames.append(given[2]) or figure(*given))
     truth, prediction = plate(9), plate(9, seed=1)
-    picture.write(tmp_path / "a.png", truth, prediction)
-    picture.write(tmp_path / "b.png", truth, Trajectory(truth.scene, prediction.position[:3], prediction.stress[:3]))
+    picture.write(tmp_path / "a.png", truth, prediction, "ast")
+    short = Trajectory(truth.scene, prediction.position[:3], prediction.stress[:3])
+    picture.write(tmp_path / "b.png", truth, short, "ast")
     assert frames == [4, 2]
+
+
+def test_the_model_is_named():
+    for model, title in (("hcmt", "Prediction (HCMT)"), ("my-net", "Prediction (my-net)")):
+        assert title in [text.get_text() for text in picture._figure(plate(2), plate(2), 1, model, "m").texts]
+
+
+def test_only_metres_and_pascal_take_a_prefix():
+    def label(unit: str, stress: float | None = None) -> str:
+        given = plate(9, stress="none" if stress is None else "node")
+        values = None if stress is None else stress * given.stress / given.stress.max()
+        given = Trajectory(given.scene, given.position, values)
+        (bar,) = [axes for axes in picture._figure(given, given, 4, "ast", unit).axes if axes.get_xlabel()]
+        return bar.get_xlabel()
+
+    assert label("m") == "Displacement (mm), frame 4"
+    for unit in ("mm", "um", "in"):
+        assert label(unit) == f"Displacement ({unit}), frame 4"
+    assert "(Pa)" in label("mm", 0.02) and "(kPa)" in label("mm", 2e4)
 
 
 def test_nothing_is_left_where_it_cannot_be_written(tmp_path):
     with pytest.raises(AstSimError, match="cannot be written"):
-        picture.write(tmp_path / "absent" / "a.png", strip(2), strip(2))
+        picture.write(tmp_path / "absent" / "a.png", strip(2), strip(2), "ast")
     lost = strip(2)
     lost.position[0] = np.nan
     with pytest.raises(AstSimError, match="no frame"):
-        picture.write(tmp_path / "a.png", strip(2), lost)
+        picture.write(tmp_path / "a.png", strip(2), lost, "ast")
     assert list(tmp_path.iterdir()) == []

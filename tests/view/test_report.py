@@ -10,10 +10,11 @@ import sys
 import numpy as np
 import pytest
 from figures import evaluation, metrics
+from meshes import two_tetrahedra
 from view_scenes import plate, strip
 
-from ast_sim.data.scene import NodeType, Trajectory
-from ast_sim.errors import AstSimError, MissingExtra
+from ast_sim.scene import NodeType, Trajectory
+from ast_sim.support.errors import AstSimError, MissingExtra
 from ast_sim.view import encode, page, report, tables
 from ast_sim.view.fields import surface_owners
 
@@ -23,9 +24,9 @@ def unpack(packed):
     return values * packed["scale"]
 
 
-def one_run(name="run", **scenes):
+def one_run(name="run", model="ast", **scenes):
     chosen = [report.ReportScene(scene, "Only scene", *pair) for scene, pair in scenes.items()]
-    return report.ReportRun(name, chosen, evaluation({"plate": 1e-3}), metrics(), {"Parameters": "451 203"})
+    return report.ReportRun(name, model, chosen, evaluation({"plate": 1e-3}), metrics(), {"Parameters": "451 203"})
 
 
 def test_encoded_motion_is_the_surface_to_one_in_65534():
@@ -113,10 +114,37 @@ def test_all_conventions_stand_beside_the_trivial_predictors():
     first, second = tables.measure_tables(["AST"], [evaluation({"a": 1e-3})])
     assert first["columns"] == ["AST", "Hold still", "Repeat the last increment"]
     assert second["columns"] == ["AST", "Zero", "Constant mean", "Mean of the frame"]
-    assert len([row for row in first["rows"] if "values" in row]) == 12
+    assert len([row for row in first["rows"] if "values" in row]) == 8
     assert first["rows"][0] == {"group": "Full rollout"}
     assert first["rows"][1] == {"label": "rmse_sequence", "note": "NORMAL nodes", "values": [1.43e-3, 6.5e-3, 6.5e-3]}
     assert second["rows"][2]["values"] == pytest.approx([7458.0, 22770.0, 17380.0, 12430.0])
+
+
+def test_the_first_50_steps_are_shown_where_a_rollout_has_more():
+    for frames, shown in ((51, False), (52, True), (None, True)):
+        found = evaluation({"a": 1e-3, "b": 2e-3})
+        found["samples"][1]["frames"] = frames
+        for table in tables.measure_tables(["AST"], [found]):
+            assert ({"group": "First 50 steps of the rollout"} in table["rows"]) is shown
+
+
+def test_the_lead_names_the_run_once():
+    lead = report.page_data([one_run("run", "ast")])["lead"]
+    assert lead.startswith("“run” predicts scenes that it never saw") and lead.lower().count("run") == 1
+
+
+def test_the_column_of_one_run_is_headed_by_its_model():
+    for model, title in (("ast", "AST"), ("mgn", "MGN"), ("transolver", "Transolver"), ("my-net", "my-net")):
+        page_data = report.page_data([one_run("first", model)])
+        assert [table["columns"][0] for table in page_data["tables"]] == [title, title]
+    both = report.page_data([one_run("first", "mgn"), one_run("second", "mgn")])
+    assert both["tables"][0]["columns"][:2] == ["first", "second"]
+
+
+def test_an_element_that_holds_an_obstacle_node_is_shown_as_rigid():
+    groups = encode.Surface(two_tetrahedra()).groups
+    for name, element, nodes in (("body", 0, [0, 1, 2, 3]), ("obstacle", 1, [1, 2, 3, 4])):
+        assert groups[name][1].tolist() == nodes and groups[name][2].tolist() == [element] * 3
 
 
 def test_a_time_conditioned_run_has_no_figure_of_one_step():
@@ -155,7 +183,7 @@ def test_a_failed_rollout_has_no_figure():
     failed = evaluation({"a": None})
     failed["summary"]["model"]["displacement"]["rollout_all"]["normal"]["rmse_sequence"] = None
     tile = tables.tiles(failed)[0]
-    assert tile["value"] is None and tile["detail"] == "no figure, as a rollout failed"
+    assert tile["value"] is None and tile["detail"] == "no figure, because a rollout failed"
 
 
 def test_training_curves_are_thinned_to_means():
@@ -188,19 +216,19 @@ def test_data_cannot_end_its_element():
 def test_no_number_that_json_does_not_know():
     damaged = evaluation({"a": float("nan")})
     damaged["speedup"] = float("inf")
-    run = report.ReportRun("run", [], damaged, [{"step": 1, "loss": float("nan")}])
+    run = report.ReportRun("run", "ast", [], damaged, [{"step": 1, "loss": float("nan")}])
     json.dumps(report.page_data([run]), allow_nan=False)
 
 
 def test_a_run_without_anything_still_has_a_page(tmp_path):
-    report.write(tmp_path / "a.html", [report.ReportRun("empty", [])], "Nothing yet")
+    report.write(tmp_path / "a.html", [report.ReportRun("empty", "ast", [])], "Nothing yet")
     assert (tmp_path / "a.html").stat().st_size > 1_000_000
 
 
 @pytest.mark.parametrize("count", [0, 7])
 def test_number_of_runs(tmp_path, count):
     with pytest.raises(AstSimError, match=f"1 to 6 runs, not {count}"):
-        report.write(tmp_path / "a.html", [report.ReportRun("run", [])] * count, "Runs")
+        report.write(tmp_path / "a.html", [report.ReportRun("run", "ast", [])] * count, "Runs")
 
 
 def test_prediction_of_another_scene_is_refused(tmp_path):
@@ -211,13 +239,13 @@ def test_prediction_of_another_scene_is_refused(tmp_path):
 
 def test_folder_that_does_not_exist(tmp_path):
     with pytest.raises(AstSimError, match="cannot be written .No such file"):
-        report.write(tmp_path / "absent" / "a.html", [report.ReportRun("run", [])], "Runs")
+        report.write(tmp_path / "absent" / "a.html", [report.ReportRun("run", "ast", [])], "Runs")
 
 
 def test_missing_plotly_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
     with pytest.raises(MissingExtra, match=r'pip install "ast_sim\[view\]"'):
-        report.write(tmp_path / "a.html", [report.ReportRun("run", [])], "Runs")
+        report.write(tmp_path / "a.html", [report.ReportRun("run", "ast", [])], "Runs")
 
 
 def test_fewer_stress_rows_than_the_truth_has():

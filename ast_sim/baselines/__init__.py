@@ -1,1 +1,0 @@
-"""What AST is compared with: models of other papers behind the same interface."""

@@ -1,0 +1,1 @@
+"""From scenes to the batches that a model gets."""

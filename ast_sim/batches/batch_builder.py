@@ -1,0 +1,116 @@
+"""The input of a model. Training, validation, prediction and evaluation all build it here.
+
+Legend: N nodes, E elements, B scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ast_sim.batches.graph import Graph
+from ast_sim.batches.mirror_and_shift import Placement
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The state of a scene from which a model predicts.
+
+    Attributes:
+        position: [N, 3] float32, p_t, with noise in training.
+        previous: [N, 3], p_{t-1}; None in a scene without inertia.
+        stress: [N, 1] or [E, 1] at t, or None.
+    """
+
+    position: Tensor
+    previous: Tensor | None = None
+    stress: Tensor | None = None
+
+    @staticmethod
+    def concatenate(states: Sequence[State]) -> State:
+        """The states of several scenes as one."""
+        return State(*(_join(states, key) for key in ("position", "previous", "stress")))
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """The state of each scene, and the motion that is prescribed until the frame to predict.
+
+    Attributes:
+        graph: what does not change with time.
+        position, previous_position, stress: as in `State`.
+        boundary_motion: [N, 3], how far the prescribed nodes move from the state to the frame to predict; 0 elsewhere.
+        names: for messages, one for each scene: "train/000012 frame 7".
+        frame: [B] float32, the number of the frame to predict.
+    """
+
+    graph: Graph
+    position: Tensor
+    previous_position: Tensor | None
+    boundary_motion: Tensor
+    stress: Tensor | None
+    names: list[str]
+    frame: Tensor | None = None
+
+    @staticmethod
+    def build(graph: Graph, state: State, prescribed: Tensor, names: list[str], frame: Tensor) -> Batch:
+        """The batch of one scene, or of several scenes whose arrays are concatenated.
+
+        Args:
+            prescribed: [N, 3], the positions of the prescribed nodes in the frame to predict. Other rows are not read.
+        """
+        motion = torch.where(graph.prescribed[:, None], prescribed - state.position, 0.0)
+        return Batch(graph, state.position, state.previous, motion, state.stress, names, frame)
+
+    @staticmethod
+    def concatenate(batches: Sequence[Batch]) -> Batch:
+        """Several batches as one."""
+        return Batch(
+            Graph.concatenate([batch.graph for batch in batches]),
+            *(_join(batches, key) for key in ("position", "previous_position", "boundary_motion", "stress")),
+            [name for batch in batches for name in batch.names],
+            _join(batches, "frame"),
+        )
+
+    def placed(self, placement: Placement) -> Batch:
+        """The same scene, mirrored and moved."""
+        previous = self.previous_position
+        return replace(
+            self,
+            graph=self.graph.placed(placement),
+            position=placement.points(self.position),
+            previous_position=None if previous is None else placement.points(previous),
+            boundary_motion=placement.vectors(self.boundary_motion),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """What a model should predict for a batch.
+
+    Attributes:
+        motion: [N, 3], the increment from the state to the frame to predict. With inertia it is the acceleration
+            p_{t+1} - 2 p_t + p_{t-1}. Both are corrected for the noise on p_t.
+        stress: [N, 1] or [E, 1] in the frame to predict, or None.
+    """
+
+    motion: Tensor
+    stress: Tensor | None
+
+    @staticmethod
+    def concatenate(targets: Sequence[Target]) -> Target:
+        """Several targets as one."""
+        return Target(_join(targets, "motion"), _join(targets, "stress"))
+
+    def placed(self, placement: Placement) -> Target:
+        """The target of the same scene, mirrored and moved."""
+        return Target(placement.vectors(self.motion), self.stress)
+
+
+def _join(parts: Sequence[State | Batch | Target], key: str) -> Tensor | None:
+    """One attribute of all parts, concatenated; None if they do not have it."""
+    found = [getattr(part, key) for part in parts]
+    return None if found[0] is None else torch.cat(found)

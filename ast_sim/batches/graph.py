@@ -1,0 +1,198 @@
+"""What a model needs to know of a scene that does not change with time. It is computed once for each trajectory.
+
+Legend: N nodes, E elements of k nodes, M edges, B scenes; a batch is the concatenation of its scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ast_sim.batches.mirror_and_shift import Placement
+from ast_sim.ops import EdgeSet
+from ast_sim.ops._edges import join_indices, join_offsets
+from ast_sim.scene import NodeType, Scene
+
+
+class Own(Protocol):
+    """What a model adds to the graph of a scene, such as coarser meshes. It concatenates as the graph does."""
+
+    @staticmethod
+    def concatenate(parts: Sequence[Any]) -> Any:
+        """The additions to the graphs of several scenes as one."""
+
+    def placed(self, placement: Placement) -> Any:
+        """The addition to the graph of the same scene, mirrored and moved."""
+
+
+@dataclass(frozen=True, eq=False)
+class Graph:
+    """What does not change with time, of one scene or of a batch of scenes.
+
+    Attributes:
+        rest_position: [N, 3] float32.
+        node_type: [N] int64, values of `NodeType`.
+        one_hot: [N, 3] float32, 1 in the column of the node's type in the order of `NodeType`.
+        elements: [E, k] int64, node numbers within the batch.
+        deforming_nodes, deforming_elements: [N] and [E] bool, as in `Scene`.
+        material: [E, m] float32 or None.
+        node_material: [N, m] float32, the mean over the elements at each node, or None.
+        node_offsets, element_offsets: [B + 1] int64, where each scene's nodes and elements start and end.
+        m2m: node to node, every element edge in both directions; None with element nodes.
+        e2m, m2e: element to each of its nodes, and the reverse; None without element nodes.
+        rest_edges: [M, 4] float32, `edge_vectors` of `edges` at rest. An element is at the mean of its nodes.
+        body: [N] int64; None if the surface is not needed.
+        surface: [F, 3] int64, boundary triangles, counter-clockwise seen from outside; None if it is not needed.
+        surface_offsets: [B + 1] int64, where each scene's triangles start and end; None if they are not needed.
+        own: what only one model needs, such as coarser meshes, or None.
+    """
+
+    rest_position: Tensor
+    node_type: Tensor
+    one_hot: Tensor
+    elements: Tensor
+    deforming_nodes: Tensor
+    deforming_elements: Tensor
+    material: Tensor | None
+    node_material: Tensor | None
+    node_offsets: Tensor
+    element_offsets: Tensor
+    m2m: EdgeSet | None
+    e2m: EdgeSet | None
+    m2e: EdgeSet | None
+    rest_edges: Tensor
+    body: Tensor | None = None
+    surface: Tensor | None = None
+    surface_offsets: Tensor | None = None
+    own: Own | None = None
+
+    @staticmethod
+    def from_scene(scene: Scene, element_nodes: bool, surface: bool = False) -> Graph:
+        """The graph of one scene.
+
+        Args:
+            element_nodes: elements are nodes of the graph too: it has e2m and m2e, not m2m.
+            surface: the graph has the surface and the bodies.
+        """
+        n, e = scene.num_nodes, scene.num_elements
+        elements = torch.from_numpy(scene.elements.astype("int64"))
+        rest, node_type = torch.tensor(scene.rest_position), torch.from_numpy(scene.node_type.astype("int64"))
+        material = None if scene.material is None else torch.tensor(scene.material)
+        m2m = e2m = m2e = None
+        if element_nodes:
+            nodes = elements.reshape(-1)
+            owners = torch.arange(e).repeat_interleave(elements.shape[1])
+            e2m = EdgeSet.from_pairs(owners, nodes, e, n)
+            m2e = EdgeSet.from_pairs(nodes, owners, n, e)
+            rest_edges = edge_vectors(e2m, _element_mean(elements, rest), rest)
+        else:
+            m2m = both_ways(scene.edges().astype("int64"), n)
+            rest_edges = edge_vectors(m2m, rest, rest)
+        return Graph(
+            rest_position=rest,
+            node_type=node_type,
+            one_hot=torch.stack([node_type == kind for kind in NodeType], dim=1).float(),
+            elements=elements,
+            deforming_nodes=torch.from_numpy(scene.deforming_nodes),
+            deforming_elements=torch.from_numpy(scene.deforming_elements),
+            material=material,
+            node_material=None if material is None else _node_mean(elements, material, n),
+            node_offsets=torch.tensor([0, n]),
+            element_offsets=torch.tensor([0, e]),
+            m2m=m2m,
+            e2m=e2m,
+            m2e=m2e,
+            rest_edges=rest_edges,
+            **(_surface_of(scene) if surface else {}),
+        )
+
+    @staticmethod
+    def concatenate(graphs: list[Graph]) -> Graph:
+        """The graphs of several scenes as one. All have the same parts, or none of them has a part."""
+        if len(graphs) == 1:
+            return graphs[0]
+        nodes = [len(g.rest_position) for g in graphs]
+
+        def joined(key: str) -> Any:
+            parts = [getattr(g, key) for g in graphs]
+            if parts[0] is None:
+                return None
+            if key.endswith("_offsets"):
+                return join_offsets(parts)
+            if key in ("elements", "surface"):  # triangles and elements hold node numbers
+                return join_indices(parts, nodes)
+            return torch.cat(parts) if isinstance(parts[0], Tensor) else parts[0].concatenate(parts)
+
+        return Graph(**{key.name: joined(key.name) for key in fields(Graph)})
+
+    def placed(self, placement: Placement) -> Graph:
+        """The graph of the same scene, mirrored and moved."""
+        if placement.is_identity:
+            return self
+        surface = self.surface
+        return replace(
+            self,
+            rest_position=placement.points(self.rest_position),
+            rest_edges=placement.vectors(self.rest_edges),
+            surface=None if surface is None else placement.triangles(surface),
+            own=None if self.own is None else self.own.placed(placement),
+        )
+
+    @property
+    def num_scenes(self) -> int:
+        return len(self.node_offsets) - 1
+
+    @property
+    def edges(self) -> EdgeSet:
+        """The edges that have features: e2m with element nodes, else m2m."""
+        return self.m2m if self.e2m is None else self.e2m
+
+    @cached_property
+    def prescribed(self) -> Tensor:
+        """[N] bool: the nodes whose positions are given at all times (obstacles and handles)."""
+        return self.node_type != NodeType.NORMAL
+
+    @cached_property
+    def normal_nodes(self) -> Tensor:
+        """[*] int64: the nodes that a model moves."""
+        return (self.node_type == NodeType.NORMAL).nonzero()[:, 0]
+
+    def element_mean(self, x: Tensor) -> Tensor:
+        """[N, F] -> [E, F]: the mean over the nodes of each element."""
+        return _element_mean(self.elements, x)
+
+
+def _surface_of(scene: Scene) -> dict[str, Tensor]:
+    triangles = torch.from_numpy(scene.surface().astype("int64"))
+    body = torch.from_numpy(scene.body.astype("int64"))
+    return {"body": body, "surface": triangles, "surface_offsets": torch.tensor([0, len(triangles)])}
+
+
+def both_ways(pairs: np.ndarray, num_nodes: int) -> EdgeSet:
+    """The edges among the nodes that join each pair of `pairs` [P, 2] int64 in both directions."""
+    first, second = torch.from_numpy(pairs).unbind(1)
+    return EdgeSet.from_pairs(torch.cat([first, second]), torch.cat([second, first]), num_nodes, num_nodes)
+
+
+def edge_vectors(edges: EdgeSet, senders: Tensor, receivers: Tensor) -> Tensor:
+    """[M, 4]: d = sender - receiver and |d|, from the positions of senders [S, 3] and receivers [R, 3]."""
+    d = senders.index_select(0, edges.senders) - receivers.index_select(0, edges.receivers)
+    return torch.cat([d, torch.linalg.vector_norm(d, dim=1, keepdim=True)], dim=1)
+
+
+def _element_mean(elements: Tensor, x: Tensor) -> Tensor:
+    e, k = elements.shape
+    return x.index_select(0, elements.reshape(-1)).view(e, k, -1).mean(dim=1)
+
+
+def _node_mean(elements: Tensor, x: Tensor, num: int) -> Tensor:
+    """[E, F] -> [num, F]: the mean over the elements at each node; 0 where there is none."""
+    nodes, share = elements.flatten(), x.repeat_interleave(elements.shape[1], dim=0)
+    total = share.new_zeros(num, share.shape[1]).index_add_(0, nodes, share)
+    return total / torch.bincount(nodes, minlength=num).clamp(min=1)[:, None]

@@ -1,0 +1,207 @@
+"""The pairs of frames on which a model is trained. They depend only on a seed and the number of the step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+
+from ast_sim.batches.batch_builder import Batch, State, Target
+from ast_sim.batches.graph import Graph
+from ast_sim.batches.horizons import STEP_BY_STEP, Horizon
+from ast_sim.batches.mirror_and_shift import Placement
+from ast_sim.dataset.reader import CACHE_BYTES, Dataset
+from ast_sim.scene import Scene
+from ast_sim.support.byte_cache import ByteCache
+from ast_sim.support.errors import DatasetError
+
+# The order, the noise and the placements draw from separate sequences of random numbers.
+_ORDER, _NOISE, _PLACE = 0, 1, 2
+
+
+@dataclass(frozen=True, eq=False)
+class _Member:
+    """What the pairs of a trajectory share.
+
+    noisy: [N, 3] float32, 1 where noise is added, else 0: at NORMAL nodes, in a plane scene only in x and y.
+    center: [3] float32, the middle of the box around the scene at rest.
+    """
+
+    graph: Graph
+    noisy: np.ndarray
+    center: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Frames t and t + 1 of a trajectory, how they are mirrored and moved, and errors of their positions.
+
+    Errors are [N, 3] float32, before the scene is mirrored.
+
+    Attributes:
+        error: the error of p_t in the state.
+        error_before: with inertia, the error of p_{t-1} in the state; None for no error.
+        error_after: the error of the p_{t+1} to which the target leads.
+    """
+
+    index: int
+    t: int
+    placement: Placement
+    error: np.ndarray
+    error_before: np.ndarray | None
+    error_after: np.ndarray
+
+
+class PairSampler:
+    """Draws batches of frame pairs (t, t + 1) of a split. Each epoch is a new random order of all pairs.
+
+    The state of the pair (t, t + 1) is the frame from which `horizon` predicts t + 1.
+
+    White Gaussian noise n of standard deviation `noise` (in the unit of length) is added to p_t of the NORMAL nodes.
+    The next position in the target is p_{t+1} + (1 - gamma) n (MeshGraphNets, add_noise), so the target is
+
+        increment     p_{t+1} - p_t - gamma n
+        acceleration  p_{t+1} - 2 p_t + p_{t-1} - (1 + gamma) n
+
+    With gamma = 1 it leads back to the true next position. An error of p_{t-1} adds to the acceleration. A plane scene,
+    where z is 0 in all frames, gets no noise in z.
+
+    Each pair is mirrored along each axis of `mirror` with probability 1/2, at planes through the middle of the scene at
+    rest. It is moved along each axis by at most `shift` (in the unit of length), but a plane scene stays in its plane.
+
+    Noise, mirroring and shift depend on seed, epoch and pair only, not on the batch of the pair.
+
+    With `part` = (i, n), `batch` returns the i-th of n equal parts of the whole batch.
+
+    Raises:
+        DatasetError: the split has no pair, or a sample cannot be read.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        split: str,
+        *,
+        batch_size: int,
+        seed: int,
+        noise: float,
+        make_graph: Callable[[Scene], Graph],
+        dynamic: bool,
+        gamma: float,
+        part: tuple[int, int] = (0, 1),
+        horizon: Horizon = STEP_BY_STEP,
+        mirror: tuple[str, ...] = (),
+        shift: float = 0.0,
+    ) -> None:
+        self.batch_size, self.seed, self.noise = batch_size, seed, noise
+        self.left = np.float32(1 - gamma)  # share of the noise that stays in the target
+        self._dataset, self._split, self._part = dataset, split, part
+        self._make_graph, self.dynamic = make_graph, dynamic
+        self.first_frame = 1 if dynamic else 0  # the least t of a pair: the acceleration needs a frame before it
+        self._horizon = horizon
+        self._mirrored, self._shift = np.array([axis in mirror for axis in "xyz"]), np.float32(shift)
+        frames = np.array([dataset.num_frames(split, i) for i in range(dataset.count(split))], np.int64)
+        self._starts = np.concatenate([[0], np.cumsum(np.maximum(frames - 1 - self.first_frame, 0))])
+        if self.num_pairs == 0:
+            least = f"at least {2 + self.first_frame} frames"
+            raise DatasetError(f"{dataset.path}: {split} has no trajectory of {least} to draw pairs from")
+        self._members: ByteCache[_Member] = ByteCache(CACHE_BYTES)
+        self._order = lru_cache(maxsize=2)(self._draw_order)
+
+    @property
+    def num_pairs(self) -> int:
+        """The number of pairs in an epoch."""
+        return int(self._starts[-1])
+
+    def batch(self, step: int) -> tuple[Batch, Target]:
+        """The batch of a step: `batch_size` pairs from place step * batch_size on in the endless sequence of epochs."""
+        draws = [divmod(place, self.num_pairs) for place in self.places(step)]
+        return self.assemble([self._pair(epoch, int(self._order(epoch)[place])) for epoch, place in draws])
+
+    def places(self, step: int) -> range:
+        """The places of this part of a step's batch in the endless sequence of epochs."""
+        index, count = self._part
+        size = self.batch_size // count
+        first = step * self.batch_size + index * size
+        return range(first, first + size)
+
+    def _pair(self, epoch: int, number: int) -> Pair:
+        """Pair `number` of all, with its noise and its placement in an epoch."""
+        index, t = self._locate(number)
+        noise = self.white_noise(index, np.random.default_rng([self.seed, _NOISE, epoch, number]))
+        placement = self.random_placement(index, np.random.default_rng([self.seed, _PLACE, epoch, number]))
+        return Pair(index, t, placement, noise, None, self.left * noise)
+
+    def _locate(self, number: int) -> tuple[int, int]:
+        """The trajectory and the first frame of pair `number`, 0 <= number < `num_pairs`."""
+        index = int(np.searchsorted(self._starts, number, side="right")) - 1
+        return index, number - int(self._starts[index]) + self.first_frame
+
+    def last_frame(self, index: int) -> int:
+        """The number of the last frame of a trajectory."""
+        return self._dataset.num_frames(self._split, index) - 1
+
+    @property
+    def trajectories(self) -> np.ndarray:
+        """The numbers of the trajectories that have a pair."""
+        return np.flatnonzero(np.diff(self._starts))
+
+    def num_nodes(self, index: int) -> int:
+        """The number of nodes of a trajectory."""
+        return len(self._member(index).noisy)
+
+    def _draw_order(self, epoch: int) -> np.ndarray:
+        return np.random.default_rng([self.seed, _ORDER, epoch]).permutation(self.num_pairs)
+
+    def assemble(self, pairs: list[Pair]) -> tuple[Batch, Target]:
+        """The batch of these pairs. Their errors are added only where noise would be."""
+        batches, targets = zip(*(self._built(pair) for pair in pairs), strict=True)
+        return Batch.concatenate(batches), Target.concatenate(targets)
+
+    def _built(self, pair: Pair) -> tuple[Batch, Target]:
+        """The batch of one pair, mirrored and moved."""
+        member, frame = self._member(pair.index), pair.t + 1
+        source = self._horizon.source(frame)
+        position, stress = self._dataset.frames(self._split, pair.index, source - self.first_frame, source + 1)
+        (after,), next_stress = self._dataset.frames(self._split, pair.index, frame, frame + 1)
+        before, now = position[0], position[-1]
+        increment = after - now
+        error, error_after = pair.error * member.noisy, pair.error_after * member.noisy
+        motion, previous = increment + (error_after - error), None
+        if self.dynamic:
+            if pair.error_before is not None:
+                before = before + pair.error_before * member.noisy
+            motion -= now - before + error
+            previous = torch.tensor(before)
+        state = State(torch.from_numpy(now + error), previous, None if stress is None else torch.tensor(stress[-1]))
+        name = f"{self._split}/{pair.index:06d} frame {pair.t}"
+        batch = Batch.build(member.graph, state, torch.tensor(after), [name], torch.tensor([float(frame)]))
+        target = Target(torch.from_numpy(motion), None if next_stress is None else torch.tensor(next_stress[0]))
+        return batch.placed(pair.placement), target.placed(pair.placement)
+
+    def white_noise(self, index: int, generator: np.random.Generator) -> np.ndarray:
+        """[N, 3] float32: noise of the standard deviation `noise`."""
+        return generator.standard_normal(self._member(index).noisy.shape, np.float32) * np.float32(self.noise)
+
+    def random_placement(self, index: int, generator: np.random.Generator) -> Placement:
+        """Mirrored along each axis of `mirror` with probability 1/2, and moved by at most `shift`."""
+        member = self._member(index)
+        drawn = generator.integers(2, size=3, dtype=bool)
+        sign = np.where(drawn & self._mirrored, np.float32(-1), np.float32(1))
+        shift = generator.uniform(-1, 1, 3).astype(np.float32) * self._shift * member.noisy.max(axis=0)
+        return Placement(sign, member.center, shift)
+
+    def _member(self, index: int) -> _Member:
+        return self._members.get(index, lambda: self._make_member(index))
+
+    def _make_member(self, index: int) -> _Member:
+        scene = self._dataset.scene(self._split, index)
+        noisy = np.repeat(~scene.prescribed[:, None], 3, axis=1).astype(np.float32)
+        if not scene.rest_position[:, 2].any():  # only here must the whole trajectory be read
+            position, _ = self._dataset.frames(self._split, index, 0, self._dataset.num_frames(self._split, index))
+            noisy[:, 2] *= position[:, :, 2].any()
+        center = (scene.rest_position.min(0) + scene.rest_position.max(0)) / 2
+        return _Member(self._make_graph(scene), noisy, center)

@@ -1,0 +1,233 @@
+"""The commands of `ast-sim`: each calls the API and prints the result.
+
+A command imports what it needs when it runs, so that `ast-sim --help` is fast.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from ast_sim.runs.origin import CONFIG, SCOPE
+from ast_sim.support.disk import output_file
+from ast_sim.support.errors import ConfigError, DatasetError, RolloutError, printable
+
+SPLITS = ("train", "valid", "test")
+
+
+def demo(args: argparse.Namespace) -> None:
+    """`ast-sim demo`."""
+    from ast_sim import keep_memory
+    from ast_sim.demo import demo as run_demo
+
+    keep_memory()
+    run_demo(args.out, quick=args.quick, seed=args.seed)
+
+
+def generate(args: argparse.Namespace) -> None:
+    """`ast-sim generate`."""
+    from ast_sim.simulate.jobs.generate import generate as simulate
+
+    chosen = ("valid", "test", "seed", "nodes", "frames", "workers", "solver", "parts", "patient", "scheduler")
+    options = {name: getattr(args, name) for name in chosen}
+    made = simulate(args.family, args.out, train=args.count, **options)
+    print(f"{made.path}: {_counts(made.counts)}")
+    if made.truncated:
+        print(f"stopped before their last frame: {', '.join(made.truncated)}")
+
+
+def _counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{count} {split}" for split, count in counts.items())
+
+
+def convert(args: argparse.Namespace) -> None:
+    """`ast-sim convert`."""
+    from ast_sim.importers.convert import convert as import_files
+    from ast_sim.importers.deepmind import is_deepmind
+    from ast_sim.importers.vtu import FieldNames
+
+    if args.out.suffix != ".h5":
+        raise ConfigError(f"--out {args.out}: the name of a dataset must end in .h5")
+    read = args.source.rglob("*") if args.source.is_dir() else [args.source]
+    _check_output(args, args.out, (path for path in read if path.suffix != ".h5"))
+    if is_deepmind(args.source):
+        _refuse(args, args.of_series, f"{args.source}: its meta.json has the facts")
+        options = {"splits": args.split, "limit": args.limit, "every": args.every}
+    else:
+        _refuse(args, args.of_records, f"{args.source}, which holds no .tfrecord files")
+        fields = (args.displacement, args.stress, args.node_type, args.obstacle, args.handle, args.body)
+        options = {
+            "names": FieldNames(*fields, tuple(args.material)),
+            "splits": None if args.shares is None else dict(zip(SPLITS, args.shares, strict=True)),
+            "seed": args.seed,
+            "integration": "dynamic" if args.dynamic else "quasi_static",
+            "contact_radius": args.contact_radius,
+            "time_step": args.time_step,
+            "length_unit": args.length_unit,
+            "incomplete": args.incomplete,
+        }
+    counts = import_files(args.source, args.out, progress=lambda line: print(printable(line)), **options)
+    print(f"{args.out}: {_counts(counts)}")
+
+
+def _refuse(args: argparse.Namespace, groups: tuple[Any, ...], what: str) -> None:
+    """Raise ConfigError if an option of these groups was given."""
+    for action in (action for group in groups for action in group._group_actions):
+        if getattr(args, action.dest) != action.default:
+            raise ConfigError(f"{action.option_strings[0]} has no meaning for {what}")
+
+
+def _check_output(args: argparse.Namespace, out: Path, inputs: Iterable[Path]) -> None:
+    """Raise ConfigError if the output is an input, lies in a run, or exists and --overwrite was not given."""
+    output_file(out)
+    real = Path(os.path.realpath(out))
+    for folder in real.parents:
+        if (folder / CONFIG).is_file() and (folder / SCOPE).is_file():
+            raise ConfigError(f"{out} lies in the run {folder}, which it could damage: name another place")
+    # Beside NAME.pvd, a folder NAME holds the frames; a prediction replaces the whole folder.
+    outputs = [real, real.with_suffix("")] if out.suffix == ".pvd" else [real]
+    there = [path for path in outputs if path.exists()]
+    for path in inputs if there else ():
+        if any(output.samefile(place) for output in there for place in (path, path.resolve().parent) if place.exists()):
+            raise ConfigError(f"{out} would overwrite the input {path}: name another output")
+    if there and not args.overwrite:
+        raise ConfigError(f"{there[0]} exists: name another output, or give --overwrite")
+
+
+def info(args: argparse.Namespace) -> None:
+    """`ast-sim info`."""
+    from ast_sim.dataset.contents import describe_dataset, text
+
+    if args.path.is_dir():
+        from ast_sim.runs.summary import describe_run
+
+        found = describe_run(args.path)
+    else:
+        found = describe_dataset(args.path)
+    print(json.dumps(found, indent=1) if args.json else text(found))
+
+
+def train(args: argparse.Namespace) -> None:
+    """`ast-sim train`."""
+    from ast_sim import keep_memory
+    from ast_sim.training.start import configure, start_training
+
+    keep_memory()
+    if args.data is None and not args.resume:
+        raise ConfigError("name the dataset to train on, or give --resume to go on with the run in --out")
+    if args.data is None and (args.model or args.preset or args.set):
+        raise ConfigError("a resumed run keeps its settings: leave --model, --preset and --set out")
+    # A resumed run keeps its settings; with a dataset, the given settings are compared with them.
+    config = None
+    if args.data is not None:
+        config = configure(args.data, args.preset or "tiny", args.set, args.model or "ast")
+    start_training(args.out, config, resume=args.resume, profile_steps=args.profile or 0)
+    if args.profile is None:
+        print(f"run: {args.out}")
+
+
+def predict(args: argparse.Namespace) -> None:
+    """`ast-sim predict`."""
+    from ast_sim import keep_memory
+    from ast_sim.inference.answer import SUFFIXES
+    from ast_sim.inference.trained_run import Run
+    from ast_sim.prescribed_motion import parse_move
+
+    if args.out.suffix not in SUFFIXES:
+        raise ConfigError(f"--out {args.out}: the name of a prediction must end in one of {', '.join(SUFFIXES)}")
+    _check_output(args, args.out, [args.scene])
+    keep_memory()
+    moves, run = dict(map(parse_move, args.move)), Run(args.run_folder)
+    if args.scene.suffix == ".h5":
+        _refuse(args, args.of_mesh, f"{args.scene}, which is a dataset")
+        truth = _truth(run, args)
+        name = f"{args.scene}: {args.split}/{args.index:06d}"
+    else:
+        _refuse(args, args.of_data, f"{args.scene}, which is a mesh")
+        truth, name = None, str(args.scene)
+    if truth is not None and not moves:
+        answer = run.predict(truth, frames=args.frames, name=name)
+    else:
+        scene, truth = (_scene(args) if truth is None else truth.scene), None
+        answer = run.predict(scene, moves, frames=args.frames, name=name)
+    answer.save(args.out, truth)
+    if answer.failure is not None:
+        raise RolloutError(f"{answer.failure}, in {args.out}")
+    steps = len(answer.step_seconds)
+    print(f"{args.out}: {steps} frames predicted, {1000 * answer.seconds / steps:.3g} ms each")
+
+
+def _truth(run: Any, args: argparse.Namespace) -> Any:
+    """The trajectory of a dataset that the arguments select."""
+    if args.index is None:
+        raise ConfigError(f"{args.scene} is a dataset: say which trajectory with --index")
+    with run.open(args.scene) as dataset:
+        if args.index >= dataset.count(args.split):
+            count = dataset.count(args.split)
+            raise DatasetError(f"{args.scene}: there is no {args.split}/{args.index:06d}: the split has {count}")
+        return dataset[args.split][args.index]
+
+
+def _scene(args: argparse.Namespace) -> Any:
+    """The scene of a mesh; prints its description."""
+    from ast_sim.importers.scene_mesh import parse_material, read_scene
+
+    found = read_scene(
+        args.scene,
+        obstacles=args.obstacle,
+        clamps=args.clamp,
+        body_field=args.body_field,
+        type_field=args.type_field,
+        materials=dict(map(parse_material, args.material)) or None,
+    )
+    print("\n".join(map(printable, found.description)))
+    return found.scene
+
+
+def evaluate(args: argparse.Namespace) -> None:
+    """`ast-sim evaluate`."""
+    from ast_sim import keep_memory
+    from ast_sim.inference.trained_run import Run
+
+    if args.json is not None:
+        _check_output(args, args.json, [args.data])
+    keep_memory()
+    found = Run(args.run_folder).evaluate(args.data, args.split, args.command_line)
+    print(found)
+    if args.json is not None:
+        found.save(args.json)
+        print(f"all figures: {args.json}")
+
+
+def report(args: argparse.Namespace) -> None:
+    """`ast-sim report`."""
+    from ast_sim.view.page import check_suffix
+
+    check_suffix(args.out)
+    _check_output(args, args.out, [*args.shown, *filter(None, [args.data])])
+    datasets = [path for path in args.shown if path.is_file() or (path.suffix == ".h5" and not path.is_dir())]
+    if len(datasets) < len(args.shown) and datasets:
+        raise ConfigError(
+            f"{datasets[0]} is a dataset, the others are runs: a page shows runs or one dataset;"
+            " name the dataset of runs with --data"
+        )
+    if len(datasets) > 1:
+        raise ConfigError(f"a page shows one dataset, not {len(datasets)}: write one page for each")
+    if datasets and args.data is not None:
+        raise ConfigError(f"--data names the dataset of runs, but {datasets[0]} is a dataset itself: leave --data out")
+    if datasets:
+        from ast_sim.view.dataset_page import gallery
+
+        gallery.write(args.out, datasets[0])
+    else:
+        from ast_sim import keep_memory
+        from ast_sim.inference.trained_run import Run, report_evaluations
+
+        keep_memory()
+        found = [Run(folder).evaluate(args.data, command=args.command_line) for folder in args.shown]
+        report_evaluations(args.out, found, "Learned simulation: predictions and errors")
+    print(f"report: {args.out}")

@@ -1,1 +1,0 @@
-"""Scenes, trajectories, the dataset file and its sampling; `scene`, `file` and `convert` need no torch."""

@@ -1,0 +1,1 @@
+"""The dataset file: its layout, reading it, writing it, describing it."""

@@ -1,0 +1,85 @@
+"""The description of a dataset that `ast-sim info` prints. The whole dataset is read, and so it is checked as well."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ast_sim.dataset.reader import Dataset
+from ast_sim.scene import NodeType
+from ast_sim.support.errors import printable
+
+
+def describe_dataset(path: Path) -> dict[str, Any]:
+    """Counts, sizes, fields and units of a dataset; every trajectory is read and checked."""
+    with Dataset(path) as dataset:
+        splits = {split: _describe_split(dataset, split) for split, count in dataset.splits.items() if count}
+        return {
+            "kind": "dataset",
+            "path": str(path),
+            "bytes": Path(path).stat().st_size,
+            **dataclasses.asdict(dataset.info),
+            "splits": splits,
+            "checks": "every trajectory has the right shapes, finite numbers and indices in range",
+        }
+
+
+def _describe_split(dataset: Dataset, split: str) -> dict[str, Any]:
+    sizes, truncated, outside = [], [], []
+    lowest, highest, largest = np.full(3, np.inf), np.full(3, -np.inf), 0.0
+    fields: dict[str, str] = {}
+    types = dict.fromkeys((kind.name for kind in NodeType), 0)
+    for index in range(dataset.count(split)):
+        trajectory = dataset.load(split, index)
+        scene = trajectory.scene
+        sizes.append((scene.num_nodes, scene.num_elements, trajectory.num_frames))
+        for kind in NodeType:
+            types[kind.name] += int((scene.node_type == kind).sum())
+        if trajectory.attributes.get("status", "complete") != "complete":
+            truncated.append(index)
+        if (abs(trajectory.position - dataset.info.domain_center) > dataset.info.domain_half_width).any():
+            outside.append(index)
+        for position in trajectory.position:
+            lowest, highest = np.minimum(lowest, position.min(axis=0)), np.maximum(highest, position.max(axis=0))
+            moved = position.astype(np.float64) - scene.rest_position
+            largest = max(largest, float(np.linalg.norm(moved, axis=1).max()))
+        arrays = {**vars(scene), "position": trajectory.position, "stress": trajectory.stress}
+        fields |= {name: _field(array) for name, array in arrays.items() if array is not None}
+        for frame in range(trajectory.num_frames):  # one frame at a time saves memory: six numbers per element
+            tensor = dataset.cauchy_stress(split, index, frame, frame + 1)
+            if tensor is None:
+                break
+            fields["cauchy_stress"] = _field(tensor)
+    nodes, elements, frames = ([min(found), max(found)] for found in zip(*sizes, strict=True))
+    return {
+        "trajectories": len(sizes),
+        "nodes": nodes,
+        "elements": elements,
+        "frames": frames,
+        "bounding_box": [[float(f"{x:.6g}") for x in corner] for corner in (lowest, highest)],
+        "largest_displacement": float(f"{largest:.6g}"),
+        "node_types": types,
+        "fields": fields,
+        "truncated": truncated,
+        "outside_domain": outside,
+    }
+
+
+def _field(array: Any) -> str:
+    return f"{array.dtype}, {array.shape[-1] if array.ndim > 1 else 1} in a row"
+
+
+def text(facts: dict[str, Any], indent: str = "") -> str:
+    """The facts as lines of text; the facts of a nested dictionary are indented. Control characters are escaped."""
+    lines = []
+    width = max((len(key) for key, value in facts.items() if not isinstance(value, dict)), default=0)
+    for key, value in facts.items():
+        if isinstance(value, dict):
+            lines += [printable(f"{indent}{key}"), text(value, indent + "  ")] if value else []
+        else:
+            shown = ", ".join(map(str, value)) if isinstance(value, list | tuple) else value
+            lines.append(printable(f"{indent}{key:{width}}  {'none' if shown in (None, '') else shown}"))
+    return "\n".join(lines)

@@ -1,0 +1,146 @@
+"""Reading HDF5 files that are not trusted: sizes, links and filters are checked before anything is read."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from ast_sim.dataset.layout import ARRAYS, HASH, array_hash, plain_value, trajectory_hash
+from ast_sim.scene import AttributeValue
+from ast_sim.support.errors import AstSimError, DatasetError
+
+HASHED_AT_ONCE = 1 << 24
+
+# What h5py raises on a damaged file.
+_READ_ERRORS = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError, IndexError, MemoryError)
+
+
+class GuardedFile:
+    """An open HDF5 file. Every error in it is raised as a DatasetError that names the file."""
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        with self.reading("the file"):
+            if not self.path.is_file():
+                raise DatasetError(f"{self.path}: there is no such file")
+            self.size = self.path.stat().st_size
+            # Each chunk is read once, so a cache of chunks would waste 1 MiB for every open array.
+            self.root = h5py.File(self.path, "r", locking=False, rdcc_nbytes=0)
+        self._verified: set[str] = set()  # names of arrays and trajectories whose hashes have been compared
+
+    def close(self) -> None:
+        self.root.close()
+
+    @contextlib.contextmanager
+    def reading(self, what: str) -> Iterator[None]:
+        """Within the block, raise every error of h5py as a DatasetError; `what` names what is read."""
+        try:
+            yield
+        except AstSimError:
+            raise
+        except _READ_ERRORS as error:
+            text = " ".join(str(error).split()) or type(error).__name__
+            raise DatasetError(
+                f"{self.path}: {what} cannot be read; the file is damaged or no dataset of ast_sim ({text})"
+            ) from error
+
+    def attributes(self, group: h5py.Group, name: str) -> dict[str, AttributeValue]:
+        """The attributes of a group; `name` stands for the group in messages."""
+        values = {}
+        with self.reading(f"an attribute of {name}"):
+            for key in group.attrs:
+                stored = group.attrs.get_id(key)
+                if math.prod(stored.shape) * stored.dtype.itemsize > self.size or len(stored.shape) > 1:
+                    raise DatasetError(f"{name}: the attribute {key} is larger than the file, or no list")
+                values[key] = plain_value(group.attrs[key])
+        return values
+
+    def verify(self, group: h5py.Group, name: str) -> None:
+        """Compare the hash of a trajectory with the hashes of its arrays and with its attributes, at its first use."""
+        if group.name in self._verified:
+            return
+        attributes = self.attributes(group, name)
+        with self.reading(f"sample {str(group.name).strip('/')}"):
+            arrays = {key: str(plain_value(group[key].attrs[HASH])) for key in ARRAYS if key in group}
+        self._verify(str(group.name), trajectory_hash(arrays, attributes), attributes.get(HASH))
+
+    def _verify(self, name: str, found: str, stored: Any) -> None:
+        if found != (stored.decode() if isinstance(stored, bytes) else stored):
+            raise DatasetError(
+                f"{self.path}: {name.strip('/')} is not what was written: it was edited or is damaged (its SHA-256"
+                " differs); write the dataset anew with DatasetWriter"
+            )
+        self._verified.add(name)
+
+    def has(self, group: h5py.Group, key: str) -> bool:
+        """Whether a group has a member of this name."""
+        with self.reading(_path(group, key)):
+            return key in group
+
+    def child(self, group: h5py.Group, key: str, kind: type) -> Any:
+        """A member of a group. It must lie in this file; a link to another file is refused."""
+        name = f"{self.path}: {_path(group, key)}"
+        with self.reading(_path(group, key)):
+            if key not in group:
+                raise DatasetError(f"{name} is missing")
+            if not isinstance(group.get(key, getlink=True), h5py.HardLink):
+                raise DatasetError(f"{name} is a link to somewhere else, which is not followed")
+            child = group[key]
+            if not isinstance(child, kind):
+                raise DatasetError(f"{name} is no {kind.__name__.lower()}")
+            return child
+
+    def array(self, group: h5py.Group, key: str, shape: tuple[int, ...] | None = None) -> h5py.Dataset:
+        """An array of a sample. Its dtype, rank, size and (if `shape` is given) shape are checked; nothing is read."""
+        dtype, rank = ARRAYS[key]
+        array = self.child(group, key, h5py.Dataset)
+        name = f"{self.path}: {_path(group, key)}"
+        with self.reading(_path(group, key)):
+            if array.dtype != dtype or array.ndim != rank:
+                wanted = f"{np.dtype(dtype)} with {rank}"
+                raise DatasetError(f"{name} is {array.dtype} with {array.ndim} axes; must be {wanted}")
+            if array.is_virtual or array.external:
+                raise DatasetError(f"{name} keeps its numbers in another file, which is not followed")
+            properties = array.id.get_create_plist()
+            filters = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
+            if any(code != h5py.h5z.FILTER_FLETCHER32 for code in filters):
+                raise DatasetError(f"{name} is compressed; write the file without compression (h5repack -f FLET)")
+            for declared in (array.shape, array.chunks or ()):
+                size = math.prod(declared) * array.dtype.itemsize
+                if size > self.size:
+                    raise DatasetError(
+                        f"{name} declares the shape {list(declared)}, {size} bytes, but the file has {self.size}: it is"
+                        " truncated or damaged"
+                    )
+            if shape not in (None, array.shape):
+                raise DatasetError(f"{name} has the shape {list(array.shape)}, must be {list(shape)}")
+            return array
+
+    def read(self, array: h5py.Dataset, start: int = 0, stop: int | None = None) -> np.ndarray:
+        """Rows start to stop - 1 of a checked array, by default all rows; they are read-only."""
+        name = str(array.name)
+        with self.reading(name.strip("/")):
+            value = array[start:stop]
+            if name not in self._verified:
+                whole = [value] if value.shape == array.shape else _rows(array)
+                self._verify(name, array_hash(array.dtype, array.shape, whole), array.attrs.get(HASH))
+        value.flags.writeable = False
+        return value
+
+
+def _path(group: h5py.Group, key: str) -> str:
+    """The path of a member within its file, without a slash in front."""
+    return f"{group.name or ''}/{key}".strip("/")
+
+
+def _rows(array: h5py.Dataset) -> Iterator[np.ndarray]:
+    """The rows of an array, at most HASHED_AT_ONCE bytes of them at a time (at least one row)."""
+    rows = max(1, HASHED_AT_ONCE // max(1, math.prod(array.shape[1:]) * array.dtype.itemsize))
+    return (array[start : start + rows] for start in range(0, array.shape[0], rows))

@@ -1,0 +1,148 @@
+"""The layout of a dataset file: the names and dtypes of its arrays, its attributes and how they are stored."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import h5py
+import numpy as np
+
+from ast_sim.scene import AttributeValue, Scene
+from ast_sim.support.errors import DatasetError
+
+FORMAT = "ast_sim"
+VERSION = 2
+HASH = "sha256"  # attribute of every array and, over these and its attributes, of every trajectory
+SPLITS: tuple[str, ...] = ("train", "valid", "test")
+
+ARRAYS: dict[str, tuple[type, int]] = {
+    "rest_position": (np.float32, 2),
+    "elements": (np.int32, 2),
+    "node_type": (np.uint8, 1),
+    "body": (np.int32, 1),
+    "material": (np.float32, 2),
+    "position": (np.float32, 3),
+    "stress": (np.float32, 3),
+    "cauchy_stress": (np.float32, 3),
+}
+OPTIONAL = ("material", "stress", "cauchy_stress")
+FRAMED = ("position", "stress", "cauchy_stress")
+LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}  # in metres
+GIVEN_FRAMES = {"quasi_static": 1, "dynamic": 2}  # by integration: the first frames, from which a prediction starts
+_LOCATIONS = ("none", "node", "element")
+
+
+@dataclass(frozen=True)
+class DatasetInfo:
+    """What all trajectories of a dataset share. Lengths are in `length_unit`, times in seconds, stress in pascal.
+
+    Attributes:
+        family: name of the kind of scenes.
+        integration: "quasi_static" (models predict the next increment) or "dynamic" (models predict the acceleration).
+        stress_location: "none", "node" or "element".
+        domain_center, domain_half_width: the cube that holds all positions; it is the root cell of the octree.
+        contact_radius: distance below which surfaces are in contact.
+        time_step: time between two frames; 0 if frames have no time.
+        length_unit: "m", "cm", "mm", "um" or "in".
+        generator: the origin of the data, such as program, versions, command, seed and licence.
+    """
+
+    family: str
+    integration: str
+    stress_location: str
+    domain_center: tuple[float, float, float]
+    domain_half_width: float
+    contact_radius: float
+    time_step: float
+    length_unit: str = "m"
+    generator: dict[str, Any] = field(default_factory=dict)
+
+    def check(self, name: str = "dataset") -> None:
+        """Check all values.
+
+        Raises:
+            DatasetError: a value is not allowed; the text names `name` and the attribute.
+        """
+        for key, allowed in (
+            ("integration", GIVEN_FRAMES),
+            ("stress_location", _LOCATIONS),
+            ("length_unit", LENGTH_UNITS),
+        ):
+            if getattr(self, key) not in allowed:
+                raise DatasetError(f"{name}: {key} is {getattr(self, key)!r}; must be one of {', '.join(allowed)}")
+        numbers = (*self.domain_center, self.domain_half_width, self.contact_radius, self.time_step)
+        if len(self.domain_center) != 3 or not all(map(math.isfinite, numbers)):
+            raise DatasetError(f"{name}: domain_center, domain_half_width, contact_radius and time_step must be finite")
+        if self.domain_half_width <= 0 or self.contact_radius < 0 or self.time_step < 0:
+            raise DatasetError(f"{name}: domain_half_width must be above 0, contact_radius and time_step at least 0")
+
+    def attributes(self) -> dict[str, Any]:
+        """The attributes of the file's root."""
+        values = {"format": FORMAT, "version": VERSION, **asdict(self)}
+        values["domain_center"] = [float(number) for number in self.domain_center]
+        for key in ("domain_half_width", "contact_radius", "time_step"):
+            values[key] = float(values[key])
+        values["generator"] = json.dumps(self.generator, sort_keys=True)
+        return values
+
+
+def scene_kind(scene: Scene) -> tuple[int, int]:
+    """The nodes per element and the number of material columns; they are the same in all scenes of a dataset."""
+    return scene.elements.shape[1], 0 if scene.material is None else scene.material.shape[1]
+
+
+def write_attributes(group: h5py.Group | h5py.Dataset, values: dict[str, Any]) -> None:
+    """Store values of the types str, int, float and list of numbers as attributes.
+
+    Raises:
+        DatasetError: a value has another type; the text names the attribute.
+    """
+    for key, value in values.items():
+        if isinstance(value, str):
+            # A string of fixed length is stored in the object header, which has a checksum.
+            text = value.encode(errors="backslashreplace")  # names of files may hold bytes that are no text
+            group.attrs.create(key, text, dtype=h5py.string_dtype("utf-8", max(1, len(text))))
+        elif isinstance(value, (int, np.integer, np.bool_)):
+            group.attrs[key] = np.int64(value)
+        elif isinstance(value, (float, np.floating)):
+            group.attrs[key] = np.float64(value)
+        elif isinstance(value, (list, tuple, np.ndarray)) and np.asarray(value).dtype.kind in "iufb":
+            group.attrs[key] = np.asarray(value, np.float64).reshape(-1)
+        else:
+            raise DatasetError(f"the attribute {key} is {value!r}; must be a str, int, float or a list of numbers")
+
+
+def plain_value(value: Any) -> AttributeValue:
+    """Convert an attribute that h5py has read to str, int, float or list of float.
+
+    Raises:
+        TypeError: the value has another type.
+    """
+    if isinstance(value, bytes):
+        return value.decode()
+    if isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype.kind in "iuf":
+        return value.astype(float).tolist()
+    if isinstance(value, np.integer | np.floating):
+        return value.item()
+    if isinstance(value, str):
+        return value
+    raise TypeError(f"a value of the type {type(value).__name__}")
+
+
+def array_hash(dtype: np.dtype, shape: tuple[int, ...], parts: Iterable[np.ndarray]) -> str:
+    """The SHA-256 of an array, of which `parts` are consecutive rows."""
+    digest = hashlib.sha256(f"{dtype.str}{list(shape)}".encode())
+    for part in parts:
+        digest.update(np.ascontiguousarray(part).data)
+    return digest.hexdigest()
+
+
+def trajectory_hash(arrays: dict[str, str], attributes: dict[str, AttributeValue]) -> str:
+    """The SHA-256 of a trajectory, from the hashes of its arrays and its attributes."""
+    content = {"arrays": arrays, "attributes": {key: attributes[key] for key in attributes if key != HASH}}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,277 @@
+"""Reading a dataset file; its content is checked, never trusted.
+
+Layout: the root has the attributes of `DatasetInfo`, `format` and `version`. It holds the groups `train`, `valid` and
+`test`. Each of them holds one group per trajectory (`000000`, `000001`, ...) with the arrays of `Scene` and
+`Trajectory`. Each frame is a chunk. To find flipped bits, every array has the Fletcher-32 filter, and the version of
+HDF5's file format is one that adds checksums to its own structures.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, Self, overload
+
+import h5py
+import numpy as np
+
+from ast_sim.dataset.guard import GuardedFile
+from ast_sim.dataset.layout import ARRAYS, FORMAT, FRAMED, HASH, OPTIONAL, SPLITS, VERSION, DatasetInfo, scene_kind
+from ast_sim.scene import AttributeValue, Scene, Trajectory, require_finite_frames
+from ast_sim.support.byte_cache import ByteCache
+from ast_sim.support.errors import DatasetError
+
+CACHE_BYTES = 1 << 30  # limit of the cache of scenes, and the largest split whose frames are kept in memory
+
+
+class Dataset:
+    """Reads a dataset file; a context manager.
+
+    Each trajectory is checked when it is first read: dtypes, shapes, index ranges. All numbers are finite, and arrays
+    are read-only. A split of up to 1 GiB stays in memory after its first reading.
+
+    Raises:
+        DatasetError: something cannot be read; the text names the file, the sample and what is wrong.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        self._file = GuardedFile(self.path)
+        try:
+            self.info = self._read_info()
+            with self._file.reading("the list of samples"):
+                self.splits = {split: self._count(split) for split in SPLITS}
+        except BaseException:
+            self.close()
+            raise
+        self._scenes: ByteCache[Scene] = ByteCache(CACHE_BYTES)
+        self._frames: dict[tuple[str, int], tuple[np.ndarray, np.ndarray | None]] = {}
+        self._open: dict[tuple[str, int], dict[str, h5py.Dataset]] = {}
+        self._lengths: dict[tuple[str, int], int] = {}
+        self._kept: dict[str, bool] = {}  # whether the split is small enough to be kept in memory
+        self._kind: tuple[int, int] | None = None
+
+    def __getitem__(self, split: str) -> Split:
+        """The trajectories of a split: `dataset["test"][0]`."""
+        return Split(self, split, range(self.count(split)))
+
+    def __iter__(self) -> Iterator[str]:
+        """The names of the splits."""
+        return iter(self.splits)
+
+    def __len__(self) -> int:
+        """The number of splits."""
+        return len(self.splits)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._file.close()
+
+    @property
+    def material_width(self) -> int:
+        """The number of material columns that every scene has."""
+        return self._first_kind()[1]
+
+    @property
+    def element_size(self) -> int:
+        """The number of nodes per element in every scene: 3 or 4."""
+        return self._first_kind()[0]
+
+    def count(self, split: str) -> int:
+        """The number of trajectories in a split."""
+        if split not in SPLITS:
+            raise DatasetError(f"{self.path}: there is no split {split!r}; use one of {', '.join(SPLITS)}")
+        return self.splits[split]
+
+    def scene(self, split: str, index: int) -> Scene:
+        """The scene of a trajectory, checked. The last used scenes stay in memory, up to 1 GiB."""
+        return self._scenes.get((split, index), lambda: self._read_scene(split, index))
+
+    def _read_scene(self, split: str, index: int) -> Scene:
+        group, name = self._group(split, index), self._name(split, index)
+        keys = [key for key in ARRAYS if key not in FRAMED and (key not in OPTIONAL or self._file.has(group, key))]
+        scene = Scene(**{key: self._file.read(self._file.array(group, key)) for key in keys})
+        scene.check(name)
+        kind = scene_kind(scene)
+        self._kind = self._kind or kind
+        if kind != self._kind:
+            raise DatasetError(
+                f"{name}: has {kind[0]} nodes per element and {kind[1]} material columns; other samples have"
+                f" {self._kind[0]} and {self._kind[1]}"
+            )
+        return scene
+
+    def num_frames(self, split: str, index: int) -> int:
+        """The number of frames of a trajectory."""
+        key = (split, index)
+        if key not in self._lengths:
+            self._lengths[key] = self._file.array(self._group(split, index), "position").shape[0]
+        return self._lengths[key]
+
+    def frames(self, split: str, index: int, start: int, stop: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """Frames start to stop - 1: position [stop - start, N, 3] and stress [stop - start, N or E, 1] or None."""
+        self._require_frames(split, index, start, stop)
+        if not self._keeps(split):
+            return self._read_frames(split, index, start, stop)
+        key = (split, index)
+        if key not in self._frames:
+            self._frames[key] = self._read_frames(split, index, 0, self.num_frames(split, index))
+        position, stress = self._frames[key]
+        return position[start:stop], None if stress is None else stress[start:stop]
+
+    def load(self, split: str, index: int) -> Trajectory:
+        """A whole trajectory without its `cauchy_stress`: that is large, so `cauchy_stress` reads it separately."""
+        position, stress = self.frames(split, index, 0, self.num_frames(split, index))
+        scene, attributes = self.scene(split, index), self.attributes(split, index)
+        return Trajectory(scene, position, stress, attributes, stress_location=self.info.stress_location)
+
+    def fingerprint(self) -> str:
+        """The SHA-256 of what the dataset says of itself and of the hashes of all its trajectories."""
+        digest = hashlib.sha256(repr((self.info, self.splits)).encode())
+        for split, count in self.splits.items():
+            for index in range(count):
+                name = self._name(split, index)
+                digest.update(str(self._file.attributes(self._group(split, index), name)[HASH]).encode())
+        return digest.hexdigest()
+
+    def spread(self, split: str, most: int) -> Iterator[tuple[str, Trajectory]]:
+        """At most `most` trajectories of a split, evenly spread over it, and their names for messages."""
+        count = self.count(split)
+        for index in np.unique(np.linspace(0, count - 1, min(count, most)).astype(int)):
+            yield self._name(split, int(index)), self.load(split, int(index))
+
+    def cauchy_stress(self, split: str, index: int, start: int = 0, stop: int | None = None) -> np.ndarray | None:
+        """Cauchy stress [stop - start, E, 6] of frames start to stop - 1; None if the trajectory has none."""
+        group, count = self._group(split, index), self.num_frames(split, index)
+        stop = count if stop is None else stop
+        self._require_frames(split, index, start, stop)
+        if not self._file.has(group, "cauchy_stress"):
+            return None
+        shape = (count, self.scene(split, index).num_elements, 6)
+        array = self._file.array(group, "cauchy_stress", shape)
+        return self._finite(self._name(split, index), "element", array, start, stop)
+
+    def attributes(self, split: str, index: int) -> dict[str, AttributeValue]:
+        """The status and the solver's records of a trajectory."""
+        found = self._file.attributes(self._group(split, index), self._name(split, index))
+        return {key: value for key, value in found.items() if key != HASH}
+
+    def _first_kind(self) -> tuple[int, int]:
+        if self._kind is not None:
+            return self._kind
+        split = next((split for split in SPLITS if self.splits[split]), None)
+        if split is None:
+            raise DatasetError(f"{self.path}: holds no samples")
+        return scene_kind(self.scene(split, 0))
+
+    def _name(self, split: str, index: int) -> str:
+        return f"{self.path}: {split}/{index:06d}"
+
+    def _read_info(self) -> DatasetInfo:
+        values = self._file.attributes(self._file.root, str(self.path))
+        if values.get("format") != FORMAT:
+            raise DatasetError(f"{self.path}: is no dataset of ast_sim (its attribute format is not {FORMAT!r})")
+        if values.get("version") != VERSION:
+            raise DatasetError(
+                f"{self.path}: has the version {values.get('version')} of the format; this program reads {VERSION}"
+            )
+        types = {"domain_center": list, "domain_half_width": float, "contact_radius": float, "time_step": float}
+        for key in (item.name for item in fields(DatasetInfo)):
+            wanted = types.get(key, str)
+            if not isinstance(values.get(key), wanted):
+                found = repr(values[key])[:60] if key in values else "missing"
+                raise DatasetError(f"{self.path}: the attribute {key} is {found}; must be a {wanted.__name__}")
+        known: dict[str, Any] = {item.name: values[item.name] for item in fields(DatasetInfo)}
+        known["domain_center"] = tuple(known["domain_center"])
+        with self._file.reading("the attribute generator"):
+            known["generator"] = json.loads(known["generator"])
+            if not isinstance(known["generator"], dict):
+                raise DatasetError(f"{self.path}: the attribute generator must be a JSON object")
+        info = DatasetInfo(**known)
+        info.check(str(self.path))
+        return info
+
+    def _count(self, split: str) -> int:
+        if split not in self._file.root:
+            return 0
+        group = self._file.child(self._file.root, split, h5py.Group)
+        count = len(group)
+        for index, key in enumerate(sorted(group)):
+            if key != f"{index:06d}":
+                raise DatasetError(f"{self.path}: {split} holds {key!r} where {index:06d} is expected")
+        return count
+
+    def _group(self, split: str, index: int) -> h5py.Group:
+        count = self.count(split)
+        if not 0 <= index < count:
+            raise DatasetError(f"{self.path}: there is no sample {index} in {split}, which has {count}")
+        group = self._file.child(self._file.child(self._file.root, split, h5py.Group), f"{index:06d}", h5py.Group)
+        self._file.verify(group, self._name(split, index))
+        return group
+
+    def _framed(self, split: str, index: int) -> dict[str, h5py.Dataset]:
+        """The open arrays of a trajectory that have frames; their shapes fit the scene."""
+        key = (split, index)
+        if key not in self._open:
+            group, scene, count = self._group(split, index), self.scene(split, index), self.num_frames(split, index)
+            if count == 0:
+                raise DatasetError(f"{self._name(split, index)}: position has no frames")
+            shapes = {"position": (count, scene.num_nodes, 3)}
+            if self.info.stress_location != "none":
+                rows = scene.num_nodes if self.info.stress_location == "node" else scene.num_elements
+                shapes["stress"] = (count, rows, 1)
+            self._open[key] = {name: self._file.array(group, name, shape) for name, shape in shapes.items()}
+        return self._open[key]
+
+    def _require_frames(self, split: str, index: int, start: int, stop: int) -> None:
+        count = self.num_frames(split, index)
+        if not 0 <= start <= stop <= count:
+            raise DatasetError(f"{self._name(split, index)}: frames {start} to {stop} of {count} do not exist")
+
+    def _read_frames(self, split: str, index: int, start: int, stop: int) -> tuple[np.ndarray, np.ndarray | None]:
+        rows = {"position": "node", "stress": self.info.stress_location}
+        name, arrays = self._name(split, index), self._framed(split, index)
+        found = {key: self._finite(name, rows[key], array, start, stop) for key, array in arrays.items()}
+        return found["position"], found.get("stress")
+
+    def _finite(self, name: str, row: str, array: h5py.Dataset, start: int, stop: int) -> np.ndarray:
+        """Frames start to stop - 1 of an array, all finite; a `row` of it is a "node" or an "element"."""
+        found = self._file.read(array, start, stop)
+        require_finite_frames(name, str(array.name).rpartition("/")[2], row, found, start)
+        return found
+
+    def _keeps(self, split: str) -> bool:
+        if split not in self._kept:
+            keys = ("position",) if self.info.stress_location == "none" else ("position", "stress")
+            groups = [self._group(split, index) for index in range(self.splits[split])]
+            size = sum(self._file.array(group, key).nbytes for group in groups for key in keys)
+            self._kept[split] = size <= min(CACHE_BYTES, self._file.size)
+        return self._kept[split]
+
+
+class Split(Sequence[Trajectory]):
+    """The trajectories of a dataset's split, in order; each is read on access. A slice of a split is a `Split`, too."""
+
+    def __init__(self, dataset: Dataset, name: str, indices: range) -> None:
+        self._dataset, self.name, self._indices = dataset, name, indices
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    @overload
+    def __getitem__(self, index: int) -> Trajectory: ...
+    @overload
+    def __getitem__(self, index: slice) -> Split: ...
+    def __getitem__(self, index: int | slice) -> Trajectory | Split:
+        if isinstance(index, slice):
+            return Split(self._dataset, self.name, self._indices[index])
+        return self._dataset.load(self.name, self._indices[index])

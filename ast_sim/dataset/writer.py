@@ -1,0 +1,123 @@
+"""Writing a dataset file, whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Self
+
+import h5py
+
+from ast_sim.dataset.layout import (
+    ARRAYS,
+    FRAMED,
+    HASH,
+    SPLITS,
+    DatasetInfo,
+    array_hash,
+    plain_value,
+    scene_kind,
+    trajectory_hash,
+    write_attributes,
+)
+from ast_sim.scene import Trajectory
+from ast_sim.support.disk import Disk, output_file, sync_folder, temporary_name
+from ast_sim.support.errors import DatasetError
+
+
+class DatasetWriter:
+    """Writes a dataset. The complete file appears under its name when the `with` block ends without an error.
+
+    Until then a file with a temporary name in the same folder grows; on an error it is removed. `info` is written last,
+    so it may be replaced within the block, for example when the positions of all trajectories have given the domain.
+    If `path` is a link, the file to which it leads is written.
+
+    Raises:
+        AstSimError: `path` is a folder, a device, a pipe or a socket.
+        DatasetError: a trajectory does not pass its checks, the disk is full, or the folder cannot be written.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], info: DatasetInfo) -> None:
+        info.check(str(path))
+        self.path = Path(path)
+        self.info = info
+        self.counts = dict.fromkeys(SPLITS, 0)
+        self._kind: tuple[int, int] | None = None  # (nodes per element, material width) of all trajectories
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file_path = output_file(self.path)
+            self._temporary = temporary_name(self._file_path)
+            self._disk = Disk(self._temporary)
+        except OSError as error:
+            raise DatasetError(f"{self.path}: cannot be written: {error}") from error
+        # Version 1.10 of HDF5's file format has checksums on all of its structures.
+        self._file = h5py.File(self._disk, "w", libver=("v110", "v110"))
+
+    def add(self, split: str, trajectory: Trajectory) -> None:
+        """Check a trajectory and append it to the split "train", "valid" or "test"."""
+        if split not in SPLITS:
+            raise DatasetError(f"{self.path}: there is no split {split!r}; use one of {', '.join(SPLITS)}")
+        name = f"{split}/{self.counts[split]:06d}"
+        trajectory.check(f"{self.path}: {name}", self.info.stress_location)
+        kind = scene_kind(trajectory.scene)
+        if self._kind not in (None, kind):
+            raise DatasetError(
+                f"{self.path}: {name}: has {kind[0]} nodes per element and {kind[1]} material columns,"
+                f" the trajectories before it {self._kind[0]} and {self._kind[1]}"
+            )
+        self._kind = kind
+        with self._writing():
+            group = self._file.create_group(name)
+            hashes: dict[str, str] = {}
+            for key in ARRAYS:
+                array = getattr(trajectory if key in FRAMED else trajectory.scene, key)
+                if array is not None:
+                    chunks = (1, *array.shape[1:]) if key in FRAMED else array.shape
+                    stored = group.create_dataset(key, data=array, chunks=chunks, fletcher32=True)
+                    hashes[key] = array_hash(array.dtype, array.shape, [array])
+                    write_attributes(stored, {HASH: hashes[key]})
+            write_attributes(group, {"status": "complete", **trajectory.attributes})
+            attributes = {key: plain_value(value) for key, value in group.attrs.items()}
+            write_attributes(group, {HASH: trajectory_hash(hashes, attributes)})
+        self.counts[split] += 1
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Within the block, raise the first error of the disk as a DatasetError, even if HDF5 hides or changes it."""
+        failure = None
+        try:
+            yield
+        except OSError as error:
+            failure = error
+        except (RuntimeError, ValueError):
+            if self._disk.error is None:
+                raise
+        failure = self._disk.error or failure
+        if failure is not None:
+            raise DatasetError(f"{self.path}: cannot be written: {failure}") from failure
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            if kind is None:
+                self._finish()
+        finally:
+            with contextlib.suppress(Exception):
+                self._file.close()
+            self._disk.close()
+            self._temporary.unlink(missing_ok=True)
+
+    def _finish(self) -> None:
+        with self._writing():
+            self.info.check(str(self.path))
+            write_attributes(self._file, self.info.attributes())
+            self._file.close()
+            self._disk.sync()
+            self._disk.close()
+        with self._writing():
+            os.replace(self._temporary, self._file_path)
+            sync_folder(self._file_path.parent)

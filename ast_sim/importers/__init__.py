@@ -1,0 +1,1 @@
+"""Importers: datasets and scenes from the files of other programs."""

@@ -1,0 +1,83 @@
+"""What a simulation needs for a model to learn from it, and which fields of its files may hold what is missing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ast_sim.importers.mesh_file import MeshFile
+from ast_sim.importers.vtu import FieldNames, frames
+from ast_sim.scene import NodeType, Trajectory
+from ast_sim.support.errors import DatasetError
+
+# A node moves if it moves by more than this share of the size of its scene.
+_STILL = 1e-6
+
+# Words in the names of fields by which programs say what a field holds.
+_WORDS = {
+    "--obstacle": ("tool", "punch", "die", "rigid", "obstacle", "indenter"),
+    "--handle": ("fix", "clamp", "held", "hold", "handle", "bound", "bc", "encastre", "support"),
+    "--stress": ("mises", "stress", "s_eq", "seqv"),
+    "--body": ("body", "part", "instance"),
+}
+
+
+def require_complete(source: Path, trajectory: Trajectory, names: FieldNames) -> None:
+    """Check that nodes move and that some are prescribed.
+
+    Raises:
+        DatasetError: a model cannot learn from the simulation; the text names the fields that were not used, and the
+            option for each.
+    """
+    missing = _missing(trajectory)
+    if missing:
+        unused = _unused(next(iter(frames(source))), names)
+        named = ", ".join(f"{name} ({option})" for option, name in unused)
+        options = " ".join(f"{option} {name}" for option, name in unused if "|" not in option)
+        advice = f"; these fields were not used: {named}" if unused else ""
+        advice += f"; try {options}" if options else ""
+        raise DatasetError(
+            f"{source}: {' and '.join(missing)}{advice}; to predict a mesh with a trained run, use `ast-sim predict RUN"
+            " MESH --move BODY=X,Y,Z`; to convert as it is, give --incomplete"
+        )
+
+
+def _missing(trajectory: Trajectory) -> list[str]:
+    scene, position = trajectory.scene, trajectory.position
+    largest = _STILL * np.ptp(position[0], axis=0).max()
+    moves = (np.ptp(position, axis=0) > largest).any(axis=1)
+    missing = []
+    if not moves.any():
+        missing.append("nothing moves")
+    elif not moves[scene.node_type == NodeType.NORMAL].any() and trajectory.stress is None:
+        missing.append("no free node moves and there is no stress, so there is nothing to learn from")
+    if not scene.prescribed.any():
+        missing.append("nothing is prescribed")
+    return missing
+
+
+def _unused(frame: MeshFile, names: FieldNames) -> list[tuple[str, str]]:
+    """(option, name) of the fields that were not used. If only some options can be told, "|" separates them."""
+    used = {names.displacement or "displacement", names.stress or "von_mises", names.node_type or "node_type"}
+    used |= {names.obstacle, names.handle, names.body or "body", *names.material}
+    found = []
+    for place, fields in (("point", frame.point_fields), ("cell", frame.cell_fields)):
+        for name, values in fields.items():
+            if name not in used and values.dtype.kind in "iufb":
+                found.append((_option(place, name, values.reshape(len(values), -1)), name))
+    order = ["--displacement", "--stress", "--obstacle", "--handle"]
+    return sorted(found, key=lambda one: order.index(one[0]) if one[0] in order else len(order))
+
+
+def _option(place: str, name: str, values: np.ndarray) -> str:
+    """The option that may take a field of this place, name and these values."""
+    if values.shape[1] > 1:
+        return "--displacement" if place == "point" and values.shape[1] in (2, 3) else "|no option: several components"
+    for option, words in _WORDS.items():
+        if any(word in name.lower() for word in words) and (place == "point" or option in ("--stress", "--body")):
+            return option
+    if place == "cell":
+        return "--stress|--material|--body"
+    marks = np.isin(values, (0, 1)).all()
+    return "--obstacle|--handle|--node-type" if marks else "--stress|--body"

@@ -1,0 +1,190 @@
+"""Making a dataset from the simulations of another program."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ast_sim.dataset.domain import FittedWriter
+from ast_sim.dataset.layout import SPLITS
+from ast_sim.importers.completeness import require_complete
+from ast_sim.importers.deepmind import convert_deepmind, is_deepmind
+from ast_sim.importers.vtu import FieldNames, natural_order, read_series
+from ast_sim.scene import Trajectory
+from ast_sim.support.errors import DatasetError
+
+SHARES = {"train": 0.8, "valid": 0.1, "test": 0.1}
+
+Splits = Mapping[str, float] | Mapping[str, Sequence[str]]
+
+
+def convert(source: Path | str, out: Path | str, **options: Any) -> dict[str, int]:
+    """Import simulations as a dataset: PVD, VTU and VTKHDF files, or a folder of a MeshGraphNets data set.
+
+    Args:
+        options: the options of `convert_deepmind` if the source holds .tfrecord files, else those of `convert_series`.
+
+    Returns:
+        The number of trajectories in each split.
+
+    Raises:
+        DatasetError: a file is wrong or something is missing in it; the text names the file. Nothing is written then.
+    """
+    read = convert_deepmind if is_deepmind(Path(source)) else convert_series
+    return read(source, out, **options)
+
+
+def convert_series(
+    source: Path | str,
+    out: Path | str,
+    *,
+    names: FieldNames | None = None,
+    splits: Splits | None = None,
+    seed: int = 0,
+    integration: str = "quasi_static",
+    contact_radius: float = 0.0,
+    time_step: float = 0.0,
+    length_unit: str = "m",
+    incomplete: bool = False,
+    progress: Callable[[str], None] = lambda line: None,
+) -> dict[str, int]:
+    """Import simulations from PVD, VTU and VTKHDF files as a dataset.
+
+    Args:
+        source: one simulation is a `.pvd` or `.vtkhdf` file or a folder of `.vtu` files. The source is one simulation,
+            or a folder that holds several, at any depth; then the path within the source, without suffix, names a
+            simulation.
+        out: the dataset file; it is written whole or not at all.
+        names: the names of the fields in the files; see `FieldNames` for the defaults.
+        splits: for each of "train", "valid" and "test" either the names of its simulations (a simulation that is not
+            named is left out), or its share of all simulations. Shares add up to 1 and are drawn at random with `seed`.
+            A split whose share is above 0 gets at least one simulation. The default is 0.8, 0.1, 0.1; it needs three.
+        integration, contact_radius, time_step, length_unit: as in `DatasetInfo`.
+        incomplete: accept simulations in which nothing moves, nothing is prescribed or nothing can be learnt.
+        progress: called with a line of text after each simulation.
+
+    Returns:
+        The number of trajectories in each split. The dataset's positions are relative to its `generator["origin"]`, in
+        double precision, which is zero unless the first simulation lies far from zero.
+
+    Raises:
+        DatasetError: a file is wrong or something is missing in it; the text names the file. Nothing is written then.
+    """
+    source, names = Path(source), names or FieldNames()
+    found = find_series(source)
+    chosen = _assign(source, list(found), splits, seed)
+    origin = None
+    generator: dict[str, Any] = {
+        "program": "ast_sim convert",
+        "source": str(source),
+        "names": asdict(names),
+        "seed": seed,
+    }
+    facts = {"contact_radius": contact_radius, "time_step": time_step, "length_unit": length_unit}
+    facts |= {"family": source.stem, "integration": integration, "generator": generator}
+    with FittedWriter(out, stress_location="none", **facts) as writer:
+        for index, (split, name) in enumerate(chosen):
+            trajectory = read_series(found[name], names, origin)
+            if not incomplete:
+                require_complete(found[name], trajectory, names)
+            if index == 0:
+                origin = np.array(trajectory.attributes.get("origin", [0.0, 0.0, 0.0]))
+                generator["origin"] = origin.tolist()
+                writer.info = replace(writer.info, stress_location=trajectory.stress_location)
+            writer.add(split, trajectory)
+            progress(f"{split}: {name}, {_summary(trajectory)}")
+    return writer.counts
+
+
+def _summary(trajectory: Trajectory) -> str:
+    size = f"{trajectory.num_frames} frames of {trajectory.scene.num_nodes} nodes"
+    return "; ".join([size, *([str(trajectory.attributes["notes"])] if "notes" in trajectory.attributes else [])])
+
+
+def find_series(source: Path) -> dict[str, Path]:
+    """The simulations in a source by name, in natural order.
+
+    Raises:
+        DatasetError: there is no simulation.
+    """
+    if not source.is_dir():
+        return {source.stem: source}
+    found = {
+        path.relative_to(source).with_suffix("").as_posix() if path != source else source.name: path
+        for path in _series_in(source)
+    }
+    if not found:
+        raise DatasetError(f"{source}: neither the folder nor a folder in it holds .pvd, .vtkhdf or .vtu files")
+    return found
+
+
+def _series_in(folder: Path) -> Iterator[Path]:
+    """The simulations in a folder. If it holds .pvd or .vtkhdf files, only these count: .pvd files list .vtu files."""
+    entries = sorted(folder.iterdir(), key=natural_order)
+    collections = [entry for entry in entries if entry.suffix in (".pvd", ".vtkhdf")]
+    if collections:
+        yield from collections
+    elif any(entry.suffix == ".vtu" for entry in entries):
+        yield folder
+    else:
+        for entry in entries:
+            if entry.is_dir() and not entry.name.startswith("."):
+                yield from _series_in(entry)
+
+
+def _assign(source: Path, names: list[str], splits: Splits | None, seed: int) -> list[tuple[str, str]]:
+    """(split, name) of every simulation that is imported, ordered by split."""
+    if splits is None and len(names) < len(SPLITS):
+        raise DatasetError(
+            f"{source}: the splits {', '.join(SPLITS)} need three simulations, found: {len(names)}; say with --shares"
+            " where they go, for example --shares 1 0 0 to train on all or --shares 0 0 1 to test on all"
+        )
+    splits = SHARES if splits is None else splits
+    unknown = next((split for split in splits if split not in SPLITS), None)
+    if unknown is not None:
+        raise DatasetError(f"there is no split {unknown!r}; use {', '.join(SPLITS)}")
+    shares = {split: float(share) for split, share in splits.items() if isinstance(share, int | float)}
+    if len(shares) == len(splits):
+        lists = _draw(names, {split: shares.get(split, 0.0) for split in SPLITS}, seed)
+    else:
+        lists = {split: [] for split in SPLITS}
+        lists |= {split: list(members) for split, members in splits.items() if not isinstance(members, int | float)}
+        _require_known(source, names, lists)
+    return [(split, name) for split in SPLITS for name in lists[split]]
+
+
+def _draw(names: list[str], shares: dict[str, float], seed: int) -> dict[str, list[str]]:
+    """Draw the names of each split at random; within a split they keep their order. A half is rounded up for train.
+    Every share above 0 gets a simulation if there are enough."""
+    if min(shares.values()) < 0 or abs(sum(shares.values()) - 1) > 1e-6:
+        raise DatasetError(f"the shares of the splits must be at least 0 and add up to 1, not {shares}")
+    order = np.random.default_rng(seed).permutation(len(names))
+    last, total = 0, 0.0
+    ends: dict[str, int] = {}
+    least = int(len(names) >= sum(share > 0 for share in shares.values()))
+    for split in ("valid", "test"):
+        total += shares[split]
+        last = max(int(len(names) * total + 0.5 - 1e-9), last + (least if shares[split] > 0 else 0))
+        ends[split] = min(last, len(names) - (least if shares["train"] > 0 else 0))
+    valid, test = ends["valid"], ends["test"]
+    bounds = {"valid": (0, valid), "test": (valid, test), "train": (test, len(names))}
+    return {split: [names[i] for i in sorted(order[start:end])] for split, (start, end) in bounds.items()}
+
+
+def _require_known(source: Path, names: list[str], lists: dict[str, list[str]]) -> None:
+    seen: dict[str, str] = {}
+    for split, members in lists.items():
+        for name in members:
+            if name not in names:
+                nearest = difflib.get_close_matches(name, names, n=1, cutoff=0.0)[0]
+                raise DatasetError(f"{source}: there is no simulation {name!r} for {split}; the nearest is {nearest!r}")
+            if name in seen:
+                raise DatasetError(f"{source}: {name!r} is listed for {seen[name]} and again for {split}")
+            seen[name] = split
+    if not seen:
+        raise DatasetError(f"{source}: no simulation is listed for any split")

@@ -1,0 +1,250 @@
+"""A mesh of tetrahedra or triangles with its fields, from a file that meshio reads."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import string
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, overload
+
+import numpy as np
+
+from ast_sim.importers.shells import Shells, find_shells
+from ast_sim.importers.vtu_sizes import require_declared_sizes
+from ast_sim.scene import NodeType, Scene, connected_parts
+from ast_sim.support.errors import DatasetError
+
+if TYPE_CHECKING:
+    import meshio
+
+# The kinds of cells that become elements, by meshio's names, and their numbers of corners.
+_CORNERS = {"tetra": 4, "triangle": 3}
+
+
+@dataclass(frozen=True, eq=False)
+class MeshFile:
+    """Points [n, 3] float64, elements [E, 3 or 4] int64, fields by name, and notes on cells that were left out.
+
+    If there are `shells` beside the tetrahedra, their layers are among the elements and the points; see `Shells`.
+    """
+
+    path: Path
+    points: np.ndarray
+    elements: np.ndarray
+    point_fields: dict[str, np.ndarray]
+    cell_fields: dict[str, np.ndarray]
+    notes: list[str]
+    shells: Shells | None = None
+
+    @property
+    def shell_nodes(self) -> np.ndarray:
+        """[n] bool: the nodes of shells and those behind them."""
+        nodes = np.zeros(len(self.points), bool)
+        if self.shells is not None:
+            nodes[self.shells.nodes] = nodes[-len(self.shells.nodes) :] = True
+        return nodes
+
+    def field(self, place: str, name: str | None, default: str | None = None) -> np.ndarray | None:
+        """A field of a `place`, "point" or "cell", as [rows, columns] float64.
+
+        Without a `name` the field `default` is taken; if that is missing, the result is None.
+
+        Raises:
+            DatasetError: there is no field `name`, or it does not hold numbers.
+        """
+        fields = self.point_fields if place == "point" else self.cell_fields
+        wanted = name or default
+        if wanted not in fields:
+            if name is None:
+                return None
+            known = ", ".join(sorted(fields)) or "none"
+            raise DatasetError(f"{self.path}: there is no {place} field {name!r}; there are: {known}")
+        value = fields[wanted]
+        if value.dtype.kind not in "iufb":
+            raise DatasetError(f"{self.path}: the {place} field {wanted!r} does not hold numbers")
+        return np.asarray(value, np.float64).reshape(len(value), -1)
+
+    @overload
+    def numbers(self, place: str, name: str, default: str | None = None) -> np.ndarray: ...
+    @overload
+    def numbers(self, place: str, name: str | None, default: str | None = None) -> np.ndarray | None: ...
+    def numbers(self, place: str, name: str | None, default: str | None = None) -> np.ndarray | None:
+        """A field with one number in each row, as [rows]; see `field`."""
+        value = self.field(place, name, default)
+        if value is not None and value.shape[1] != 1:
+            raise DatasetError(
+                f"{self.path}: the {place} field {name or default!r} has {value.shape[1]} components; must have one"
+            )
+        return None if value is None else value[:, 0]
+
+    def whole_numbers(self, place: str, name: str | None, default: str, dtype: type) -> np.ndarray | None:
+        """A field with one whole number in each row, as [rows] of an integer type; see `field`."""
+        value = self.numbers(place, name, default)
+        if value is None:
+            return None
+        limits = np.iinfo(dtype)
+        wrong = ~((value == np.round(value)) & (value >= limits.min) & (value <= limits.max))
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            at = f"{'node' if place == 'point' else 'element'} {row}"
+            raise DatasetError(f"{self.path}: {name or default} at {at} is {value[row]:g}; must be a whole number")
+        return value.astype(dtype)
+
+    def columns(self, names: Sequence[str]) -> np.ndarray | None:
+        """Cell fields with one number in each row as the columns of [E, m] float32; None without names."""
+        return np.stack([self.numbers("cell", name) for name in names], axis=1).astype(np.float32) if names else None
+
+    def scene(self, body_field: str | None, type_field: str | None) -> tuple[Scene, np.ndarray]:
+        """The scene of the nodes that belong to an element, without material, and the numbers of these nodes; shells
+        are obstacles."""
+        used, elements = np.unique(self.elements, return_inverse=True)
+        elements = elements.reshape(self.elements.shape).astype(np.int32)
+        body = self._body(body_field)
+        types = self.whole_numbers("point", type_field, "node_type", np.uint8)
+        types = np.full(len(self.points), NodeType.NORMAL, np.uint8) if types is None else types
+        scene = Scene(
+            rest_position=self.points[used].astype(np.float32),
+            elements=elements,
+            node_type=np.where(self.shell_nodes, NodeType.OBSTACLE, types)[used].astype(np.uint8),
+            body=connected_parts(elements, len(used)) if body is None else body[used],
+        )
+        return scene, used
+
+    def _body(self, name: str | None) -> np.ndarray | None:
+        """The body of each point, [n] int32, from a point field, or from a cell field: nodes belong to the body of
+        their elements."""
+        if (name or "body") in self.point_fields or (name or "body") not in self.cell_fields:
+            return self.whole_numbers("point", name, "body", np.int32)
+        of_element = self.whole_numbers("cell", name, "body", np.int32)
+        assert of_element is not None
+        body = np.zeros(len(self.points), np.int32)
+        body[self.elements] = of_element[:, None]
+        shared = body[self.elements] != of_element[:, None]
+        if shared.any():
+            row, corner = np.argwhere(shared)[0]
+            node = self.elements[row, corner]
+            raise DatasetError(
+                f"{self.path}: the bodies {of_element[row]} and {body[node]} share node {node}; bodies must not share"
+                " nodes: give each its own, or name another body field"
+            )
+        return body
+
+
+def read_mesh(
+    source: Path | meshio.Mesh, file_format: str | None = None, curved: bool = False, path: Path = Path("mesh")
+) -> MeshFile:
+    """The tetrahedra of a file or of a meshio mesh; its triangles if it has no three-dimensional cells.
+
+    Triangles and quadrilaterals that touch no tetrahedron are shells. All other cells of a lower dimension are left
+    out. With `curved`, elements of higher order are accepted; only their corners
+    are kept. `path` names a mesh in memory in errors.
+
+    Raises:
+        DatasetError: the file is missing, damaged or of an unknown kind, or holds other elements; the text names it.
+    """
+    path = source if isinstance(source, Path) else path
+    mesh = _read(source, file_format) if isinstance(source, Path) else source
+    corners, blocks = _element_blocks(path, mesh.cells, curved)
+    elements = np.concatenate([mesh.cells[block].data[:, :corners] for block in blocks]).astype(np.int64)
+    points = np.zeros((len(mesh.points), 3))
+    points[:, : mesh.points.shape[1]] = mesh.points
+    outside = ((elements < 0) | (elements >= len(points))).any(axis=1)
+    if outside.any():
+        row = int(np.argmax(outside))
+        kind = "tetra" if corners == 4 else "triangle"
+        raise DatasetError(
+            f"{path}: {kind} {row} refers to the nodes {elements[row].tolist()}; the points are 0 to {len(points) - 1}"
+        )
+    cell_fields = {name: np.concatenate([values[b] for b in blocks]) for name, values in mesh.cell_data.items()}
+    point_fields = {name: np.asarray(values) for name, values in mesh.point_data.items()}
+    bare = MeshFile(path, points, elements, point_fields, cell_fields, _notes(mesh.cells, blocks))
+    return bare if corners == 3 else _with_shells(bare, mesh)
+
+
+def _with_shells(bare: MeshFile, mesh: meshio.Mesh) -> MeshFile:
+    """The mesh with its shells; the points and fields of each node are those of the node behind it as well."""
+    corners = {index: _shell_corners(block.type) for index, block in enumerate(mesh.cells) if len(block)}
+    flat = [index for index, count in corners.items() if count]
+    cells = [mesh.cells[index].data[:, : corners[index]].astype(np.int64) for index in flat]
+    if any(((block < 0) | (block >= len(bare.points))).any() for block in cells):
+        raise DatasetError(f"{bare.path}: a triangle or quadrilateral refers to a point that does not exist")
+    if cells and not np.isfinite(bare.points).all():
+        raise DatasetError(f"{bare.path}: point {np.argmin(np.isfinite(bare.points).all(axis=1))} is not finite")
+    shells = find_shells(bare.points, bare.elements, cells) if cells else None
+    if shells is None:
+        return bare
+    kinds = np.repeat([mesh.cells[index].type for index in flat], [len(block) for block in cells])
+    taken = Counter(kinds[np.unique(shells.cells)].tolist())
+    notes = _notes(mesh.cells, [i for i, block in enumerate(mesh.cells) if block.dim == 3], taken)
+    notes += [f"{count} cells of the kind {kind} are shells and become obstacles" for kind, count in taken.items()]
+    rows = np.repeat(shells.cells, 3)
+    points = np.concatenate([bare.points, shells.behind(bare.points)])
+    return replace(
+        bare,
+        points=points,
+        elements=np.concatenate([bare.elements, shells.tetrahedra(points)]),
+        point_fields={name: np.concatenate([v, v[shells.nodes]]) for name, v in bare.point_fields.items()},
+        cell_fields={
+            name: np.concatenate([v, np.concatenate([mesh.cell_data[name][index] for index in flat])[rows]])
+            for name, v in bare.cell_fields.items()
+        },
+        notes=notes,
+        shells=shells,
+    )
+
+
+def _shell_corners(kind: str) -> int:
+    """The corners of a cell that may belong to a shell; 0 for other cells."""
+    return {"triangle": 3, "quad": 4}.get(kind.rstrip(string.digits), 0)
+
+
+def _read(path: Path, file_format: str | None) -> meshio.Mesh:
+    """Read a file by meshio. On a damaged file meshio may raise any error, print, or raise SystemExit."""
+    import meshio
+
+    if not path.is_file():
+        raise DatasetError(f"{path}: there is no such file")
+    if path.suffix == ".vtu":
+        require_declared_sizes(path)
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+            return meshio.read(path, file_format=file_format)
+    except (Exception, SystemExit) as error:
+        kind = file_format.upper() if file_format else "a mesh"
+        told = " ".join(f"{printed.getvalue()} {error if str(error) != '1' else ''}".split())
+        raise DatasetError(f"{path}: cannot be read as {kind}: {told or type(error).__name__}") from error
+
+
+def _element_blocks(path: Path, cells: list[meshio.CellBlock], curved: bool) -> tuple[int, list[int]]:
+    """The number of corners of the elements, and the blocks of cells that hold them."""
+    dimension = max((block.dim for block in cells if len(block)), default=0)
+    blocks = [index for index, block in enumerate(cells) if block.dim == dimension and len(block)]
+    kinds = {cells[index].type for index in blocks}
+    kinds = {kind.rstrip(string.digits) for kind in kinds} if curved else kinds
+    if len(kinds) != 1 or not kinds <= set(_CORNERS):
+        found = ", ".join(dict.fromkeys(block.type for block in cells)) or "no cells"
+        linear = "" if curved else " (linear)"
+        raise DatasetError(
+            f"{path}: holds {found}; the elements must be tetra or triangle{linear}, all of one kind: mesh the bodies"
+            " with tetrahedra"
+        )
+    return _CORNERS[kinds.pop()], blocks
+
+
+def _notes(cells: list[meshio.CellBlock], blocks: list[int], shells: Counter[str] | None = None) -> list[str]:
+    """What was not taken as it is. `shells` counts the cells that became shells, by kind."""
+    left_out, reduced = Counter(), Counter()
+    for index, block in enumerate(cells):
+        if index not in blocks:
+            left_out[block.type] += len(block)
+        elif block.type not in _CORNERS:
+            reduced[block.type] += len(block)
+    notes = [
+        f"{count} cells of the kind {kind} are left out" for kind, count in (left_out - (shells or Counter())).items()
+    ]
+    return notes + [f"{count} cells of the kind {kind} keep their corners only" for kind, count in reduced.items()]

@@ -1,0 +1,114 @@
+"""Shells of triangles or quadrilaterals beside tetrahedra: the usual mesh of a rigid tool.
+
+A scene has elements of one kind, so a shell becomes a thin layer of tetrahedra: each of its nodes gets a second node
+behind it, half a mesh width along the normal, on the side that looks away from the tetrahedra. The shell itself is the
+front of the layer, so contact takes place where it took place in the file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ast_sim.scene import connected_parts
+
+# The layer is so many mean edge lengths thick.
+_THICKNESS = 0.5
+
+# The front is the side that looks at the tetrahedra, in this share of the triangles, the nearest ones.
+_NEAREST = 0.1
+
+# The edges of a rigid shell keep their lengths up to this share of the mean edge length.
+_RIGID = 0.05
+
+# The triangles that a cell with so many corners is split into.
+_TRIANGLES = {3: ((0, 1, 2),), 4: ((0, 1, 2), (0, 2, 3))}
+
+
+@dataclass(frozen=True, eq=False)
+class Shells:
+    """The shells of a mesh of n points.
+
+    Attributes:
+        triangles: [S, 3] int64, oriented alike within a shell: the normals point to the front.
+        nodes: [k] int64, the nodes of the shells in ascending order; the node behind `nodes[i]` has the number n + i.
+        thickness: [k] float64, how far behind.
+        cells: [S] int64, the cell that each triangle is made of, counted over all cells of the shells.
+    """
+
+    triangles: np.ndarray
+    nodes: np.ndarray
+    thickness: np.ndarray
+    cells: np.ndarray
+
+    def behind(self, points: np.ndarray) -> np.ndarray:
+        """[k, 3]: the points behind the nodes of the shells, for points [n, 3] of any frame."""
+        return points[self.nodes] - self.thickness[:, None] * _normals(points, self.triangles)[self.nodes]
+
+    def tetrahedra(self, points: np.ndarray) -> np.ndarray:
+        """[3 S, 4] int64: three for each triangle, of positive volume, for all points [n + k, 3]. Neighbours fit,
+        because each side of a wedge is cut from its lower node in front to its higher node behind."""
+        a, b, c = np.sort(self.triangles, axis=1).T
+        back = np.zeros(len(points), np.int64)
+        back[self.nodes] = np.arange(len(points) - len(self.nodes), len(points))
+        wedge = [(a, b, c, back[c]), (a, b, back[b], back[c]), (a, back[a], back[b], back[c])]
+        elements = np.stack([np.stack(corners, axis=1) for corners in wedge], axis=1).reshape(-1, 4)
+        negative = np.linalg.det(points[elements[:, 1:]] - points[elements[:, :1]]) < 0
+        elements[negative] = elements[negative][:, [0, 1, 3, 2]]
+        return elements
+
+    def bent(self, rest: np.ndarray, position: np.ndarray) -> tuple[int, float] | None:
+        """The first node of a shell that is not rigid in `position` [n, 3], and the change of an edge there."""
+        pairs = np.concatenate([self.triangles[:, [0, 1]], self.triangles[:, [1, 2]], self.triangles[:, [2, 0]]])
+        at_rest, now = (np.linalg.norm(at[pairs[:, 0]] - at[pairs[:, 1]], axis=1) for at in (rest, position))
+        change = np.abs(now - at_rest)
+        row = int(np.argmax(change))
+        return (int(pairs[row, 0]), float(change[row])) if change[row] > _RIGID * at_rest.mean() else None
+
+    def renumbered(self, used: np.ndarray) -> Shells:
+        """The same shells in a mesh that keeps the points `used` only, in ascending order."""
+        return replace(self, triangles=np.searchsorted(used, self.triangles), nodes=np.searchsorted(used, self.nodes))
+
+
+def find_shells(points: np.ndarray, tetrahedra: np.ndarray, cells: list[np.ndarray]) -> Shells | None:
+    """The shells among the `cells`, blocks of [c, 3] or [c, 4] corners: those that touch no tetrahedron, not even
+    through other cells. None if there are none."""
+    import igl  # takes 0.2 s
+    from scipy.spatial import KDTree
+
+    number = np.cumsum([0, *(len(block) for block in cells)])
+    split = [
+        (block[:, corners], start + np.arange(len(block)))
+        for block, start in zip(cells, number, strict=False)
+        for corners in _TRIANGLES[block.shape[1]]
+    ]
+    triangles, cell = (np.concatenate(one) for one in zip(*split, strict=True))
+    part = connected_parts(triangles, len(points))
+    free = ~np.isin(part[triangles[:, 0]], part[tetrahedra])
+    if not free.any():
+        return None
+    order = np.flatnonzero(free)[np.argsort(cell[free], kind="stable")]
+    oriented, _ = igl.bfs_orient(triangles[order])
+    triangles, cell, part_of = np.asarray(oriented, np.int64), cell[order], part[triangles[order, 0]]
+    a, b, c = (points[triangles[:, corner]] for corner in range(3))
+    centre, normal = (a + b + c) / 3, np.cross(b - a, c - a)
+    distance, nearest = KDTree(points[np.unique(tetrahedra)]).query(centre)
+    to_body = points[np.unique(tetrahedra)[nearest]] - centre
+    thickness = np.zeros(len(points))
+    for one in np.unique(part_of):
+        rows = np.flatnonzero(part_of == one)
+        near = rows[distance[rows] <= np.quantile(distance[rows], _NEAREST)]
+        if (normal[near] * to_body[near]).sum() < 0:
+            triangles[rows] = triangles[rows][:, ::-1]
+        thickness[triangles[rows]] = _THICKNESS * np.linalg.norm(b[rows] - a[rows], axis=1).mean()
+    nodes = np.unique(triangles)
+    return Shells(triangles, nodes, thickness[nodes], cell)
+
+
+def _normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """[n, 3]: unit normals at the points; that of a point is the mean of its triangles, weighted with their areas."""
+    a, b, c = (points[triangles[:, corner]] for corner in range(3))
+    normals = np.zeros_like(points)
+    np.add.at(normals, triangles.ravel(), np.repeat(np.cross(b - a, c - a), 3, axis=0))
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)

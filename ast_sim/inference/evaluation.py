@@ -1,0 +1,191 @@
+"""Evaluation on a split: errors of the model and of trivial predictors, and its speed relative to the solver."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+
+from ast_sim.batches.batch_builder import Batch, State
+from ast_sim.batches.graph import Graph
+from ast_sim.dataset.reader import Dataset
+from ast_sim.dataset.solver_seconds import read_seconds
+from ast_sim.inference.answer import Answer
+from ast_sim.inference.rollout import Question, rollouts
+from ast_sim.inference.trivial_predictors import Errors, displacement_errors, rmse_of, stress_errors, summarize
+from ast_sim.models.simulator import Simulator
+from ast_sim.scene import Trajectory
+from ast_sim.support.errors import DatasetError
+
+ONE_STEP_NODES = 8192  # frames are predicted together as long as they have at most about so many nodes
+MEAN_TRAJECTORIES = 100  # `stress_constant` is the mean of at most so many training trajectories
+
+
+def evaluate(
+    model: Simulator, dataset: Dataset, split: str = "test", progress: Callable[[str], None] | None = None
+) -> tuple[dict[str, Any], list[Answer]]:
+    """Predict all trajectories of a split and compare.
+
+    Scenes are rolled out one at a time, so that the time of a step is the time of one scene. A failed rollout has the
+    error None, and then the summary has None, too; `failures` counts failed rollouts.
+
+    Returns:
+        The predictions, and figures that hold:
+        samples: for each scene its name, nodes, frames, root mean square errors (`displacement` and `stress`, by
+        predictor, horizon and nodes), and the seconds per step of the model and of the solver;
+        summary: by predictor, quantity, horizon and nodes the errors `rmse_sequence` and `rmse_pooled` of all scenes;
+        failures: the number of failed rollouts;
+        time_conditioned: whether the model predicts each frame from the first one, so that its `one_step` errors are
+        those of its rollout;
+        speedup: the solver's time divided by the model's time, None if the solver's time is not known;
+        length_unit, stress_unit, threads.
+
+    Raises:
+        DatasetError: the split is empty.
+    """
+    count = dataset.count(split)
+    if count == 0:
+        raise DatasetError(f"{dataset.path}: the split {split} is empty, so there is nothing to evaluate on")
+    model.eval()
+    constant = _training_stress(dataset) if model.config.stress != "none" else None
+    samples, answers, displacement, stress = [], [], [], []
+    seconds = read_seconds(dataset).samples
+    for index in range(count):
+        name, truth = f"{split}/{index:06d}", dataset.load(split, index)
+        answer = rollouts(model, [Question.of(truth, name)])[0]
+        one_step = one_step_predictions(model, truth, name) if model.config.horizon.drifts else _predicted(answer)
+        displacement.append(displacement_errors(truth, one_step[0], answer))
+        if constant is not None:
+            stress.append(stress_errors(truth, one_step[1], answer, constant, model.config.stress))
+        recorded = truth.attributes.get("solve_seconds")
+        solver = seconds.get(name, recorded if isinstance(recorded, list) else None)
+        samples.append(_sample(truth, answer, displacement[-1], stress[-1] if stress else None, solver))
+        answers.append(answer)
+        if progress is not None:
+            progress(name)
+    summary = summarize(displacement, "displacement")
+    for predictor, values in summarize(stress, "stress").items():
+        summary.setdefault(predictor, {}).update(values)
+    figures = {
+        "samples": samples,
+        "summary": summary,
+        "failures": sum(sample["failure"] is not None for sample in samples),
+        "time_conditioned": not model.config.horizon.drifts,
+        "speedup": _speedup(samples),
+        "length_unit": dataset.info.length_unit,
+        "stress_unit": "Pa",
+        "threads": torch.get_num_threads(),
+    }
+    return figures, answers
+
+
+def _predicted(answer: Answer) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """The predicted positions and stresses of a rollout, without the given frames; None if the rollout failed."""
+    if answer.failure is not None:
+        return None, None
+    return answer.position[answer.given :], None if answer.stress is None else answer.stress[answer.given :]
+
+
+def one_step_predictions(model: Simulator, truth: Trajectory, name: str) -> tuple[np.ndarray, np.ndarray | None]:
+    """Each frame after the given ones, predicted from the true frame before it.
+
+    Returns:
+        Positions [S - given, N, 3] and stresses [S - given, N or E, 1] or None.
+    """
+    given = model.config.given_frames
+    graph = model.graph(truth.scene)
+    script = torch.tensor(truth.position)
+    known = None if truth.stress is None else torch.tensor(truth.stress)
+    chunk = max(1, ONE_STEP_NODES // truth.scene.num_nodes)
+    positions, stresses = [], []
+    for start in range(given, truth.num_frames, chunk):
+        frames = torch.arange(start, min(start + chunk, truth.num_frames))
+        state = State(
+            script[frames - 1].flatten(0, 1),
+            script[frames - 2].flatten(0, 1) if given == 2 else None,
+            None if known is None else known[frames - 1].flatten(0, 1),
+        )
+        prescribed = script[frames].flatten(0, 1)
+        names = [f"{name} frame {int(frame) - 1}" for frame in frames]
+        batch = Batch.build(Graph.concatenate([graph] * len(frames)), state, prescribed, names, frames.float())
+        with torch.inference_mode():
+            position, stress = model.advance(batch, prescribed)
+        positions.append(position.reshape(len(frames), -1, 3).numpy())
+        if stress is not None:
+            stresses.append(stress.reshape(len(frames), -1, 1).numpy())
+    return np.concatenate(positions), np.concatenate(stresses) if stresses else None
+
+
+def _sample(
+    truth: Trajectory,
+    answer: Answer,
+    displacement: Errors,
+    stress: Errors | None,
+    solver: list[float] | None,
+) -> dict[str, Any]:
+    """The figures of one scene; `solver`: the solver's seconds of each frame, None if they are not known."""
+    steps = truth.num_frames - answer.given
+    return {
+        "name": answer.name,
+        "nodes": truth.scene.num_nodes,
+        "frames": truth.num_frames,
+        "displacement": rmse_of(displacement),
+        "stress": rmse_of(stress) if stress is not None else None,
+        "model_seconds_per_step": answer.seconds / steps if answer.failure is None else None,
+        "solver_seconds_per_step": float(np.sum(solver)) / (truth.num_frames - 1) if solver is not None else None,
+        "failure": answer.failure,
+    }
+
+
+def _speedup(samples: list[dict[str, Any]]) -> float | None:
+    """The solver's time divided by the model's time, on the scenes where both are known."""
+    keys = ("solver_seconds_per_step", "model_seconds_per_step")
+    both = [sample for sample in samples if sample[keys[0]] is not None and sample[keys[1]] is not None]
+    solver, model = (math.fsum(sample[key] * (sample["frames"] - 1) for sample in both) for key in keys)
+    return solver / model if both and model > 0 else None
+
+
+def _training_stress(dataset: Dataset) -> float:
+    """Mean stress of the training split on the nodes or elements that deform; 0 without training data."""
+    total, number = 0.0, 0
+    for _, trajectory in dataset.spread("train", MEAN_TRAJECTORIES):
+        assert trajectory.stress is not None
+        stress = trajectory.stress[:, trajectory.scene.deforming(dataset.info.stress_location)]
+        total, number = total + float(stress.sum(dtype=np.float64)), number + stress.size
+    return total / number if number else 0.0
+
+
+def table(found: dict[str, Any]) -> str:
+    """The summary as text: for each quantity and set of nodes a table with a row for each predictor."""
+    lines = []
+    units = {"displacement": found["length_unit"], "stress": found["stress_unit"]}
+    for quantity, nodes in (("displacement", "normal"), ("displacement", "all"), ("stress", "deforming")):
+        rows = {key: values[quantity] for key, values in found["summary"].items() if quantity in values}
+        if not rows:
+            continue
+        lines.append(f"{quantity} [{units[quantity]}], {nodes} nodes: rmse_sequence / rmse_pooled")
+        horizons = next(iter(rows.values()))
+        lines.append(" " * 20 + "".join(f"{horizon:>24}" for horizon in horizons))
+        for predictor, values in rows.items():
+            cells = [values[horizon][nodes] for horizon in horizons]
+            shown = [" / ".join(_shown(cell[key]) for key in ("rmse_sequence", "rmse_pooled")) for cell in cells]
+            lines.append(f"  {predictor:18}" + "".join(f"{cell:>24}" for cell in shown))
+        lines.append("")
+    lines.append(f"scenes: {len(found['samples'])}, failed: {found['failures']}, threads: {found['threads']}")
+    if found["time_conditioned"]:
+        lines.append(
+            "time-conditioned: every frame is predicted from the first, so the model's one_step is its rollout"
+        )
+    if all(sample["solver_seconds_per_step"] is None for sample in found["samples"]):
+        lines.append("speed relative to the solver: unknown. Neither the scenes nor a file beside the dataset")
+        lines.append("(its name and .seconds.json) hold the seconds of a solver; a dataset is moved together with it")
+    elif found["speedup"] is not None:
+        lines.append(f"{found['speedup']:.3g} times as fast as the solver on the same scenes")
+    return "\n".join(lines)
+
+
+def _shown(value: float | None) -> str:
+    return "failed" if value is None else f"{value:.4g}"

@@ -1,0 +1,136 @@
+"""Predicting one scene: its motion is completed, and it is moved into the model's domain where it lies elsewhere."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Mapping
+
+import numpy as np
+
+from ast_sim.inference.answer import Answer
+from ast_sim.inference.rollout import Question, rollouts
+from ast_sim.models.model_config import ModelConfig
+from ast_sim.models.simulator import Simulator
+from ast_sim.prescribed_motion import Motion, RigidMotion, Vector, frames_for
+from ast_sim.runs.scope import Scope
+from ast_sim.scene import Scene, Trajectory
+from ast_sim.support.errors import ConfigError
+
+Motions = Motion | Mapping[int, RigidMotion | Vector] | np.ndarray
+
+
+def predict(
+    model: Simulator,
+    scope: Scope,
+    scene: Scene | Trajectory,
+    motion: Motions | None,
+    frames: int | None,
+    stress: np.ndarray | None,
+    name: str,
+) -> Answer:
+    """Predict a scene; the arguments are those of `Run.predict`, `scope` is what the model was trained on.
+
+    Raises:
+        ConfigError: the motion does not fit the scene, or the scene does not fit the model.
+    """
+    if isinstance(scene, Trajectory):
+        if not (motion is None and frames is None and stress is None):
+            raise ConfigError(
+                f"{name} has a motion, frames and a stress of its own; for others predict its scene (--move BODY=X,Y,Z)"
+            )
+        return rollouts(model, [Question.of(scene, name)])[0]
+    scene.check(name)
+    _require_material(model.config, scope, scene, name)
+    motion = _completed(model.config, scope, scene, motion, frames, name)
+    stress = _given_stress(model.config, scene, stress, name)
+    for note in scope.notes(scene, motion):
+        warnings.warn(f"{name}: {note}", stacklevel=3)
+    return _in_domain(model, Question(name, scene, motion.position, stress))
+
+
+def _completed(
+    config: ModelConfig, scope: Scope, scene: Scene, motion: Motions | None, frames: int | None, name: str
+) -> Motion:
+    """The motion of the prescribed nodes in every frame."""
+    if motion is None or (isinstance(motion, Mapping) and not motion):
+        raise ConfigError(f"{name}: say how its prescribed nodes move: {{BODY: (x, y, z)}} (--move BODY=X,Y,Z)")
+    if isinstance(motion, Mapping):
+        least = config.given_frames + 1
+        if frames is None and not scope.usual_increment:
+            raise ConfigError(f"{name}: nothing is moved in the training scenes: say how many frames (--frames)")
+        if frames is None:
+            frames = max(least, frames_for(scene, motion, scope.usual_increment))
+        if frames < least:
+            raise ConfigError(f"{name}: frames is {frames}; the run needs at least {least}")
+        return Motion.of_bodies(scene, motion, frames)
+    if frames is not None:
+        raise ConfigError(f"{name}: its motion has frames already: leave out frames={frames}")
+    if not isinstance(motion, Motion):
+        return Motion.of_positions(scene, motion)
+    motion.check(scene)
+    return motion
+
+
+def _given_stress(config: ModelConfig, scene: Scene, stress: np.ndarray | None, name: str) -> np.ndarray | None:
+    """The stress of the given frames as float32.
+
+    Raises:
+        ConfigError: its shape is not that of the model's stress.
+    """
+    if stress is None:
+        return None
+    stress = np.asarray(stress, np.float32)
+    rows = {"node": scene.num_nodes, "element": scene.num_elements}.get(config.stress)
+    wanted = (config.given_frames, rows, 1)
+    if stress.shape != wanted:
+        needs = "predicts none" if rows is None else f"needs {list(wanted)}"
+        raise ConfigError(f"{name}: the stress has the shape {list(stress.shape)}, but the run {needs}")
+    return stress
+
+
+def _require_material(config: ModelConfig, scope: Scope, scene: Scene, name: str) -> None:
+    """Raise ConfigError unless the scene has as many material columns as the training scenes."""
+    wanted, found = config.material_width, 0 if scene.material is None else scene.material.shape[1]
+    if found == wanted:
+        return
+    if not wanted:
+        raise ConfigError(f"{name} has a material, but the run was trained without one: leave it out (--material)")
+    columns = zip(scope.material_low, scope.material_high, strict=True)
+    ranges = ", ".join(f"{low:.4g} to {high:.4g}" for low, high in columns)
+    raise ConfigError(
+        f"{name} has {found or 'no'} material columns, but the run was trained with {wanted} ({ranges}): give each"
+        " body its numbers (--material BODY=NUMBER,...)"
+    )
+
+
+def _in_domain(model: Simulator, question: Question) -> Answer:
+    """Predict a scene where it lies, or in the middle of the domain if it leaves the domain."""
+    shift = _way_into_domain(model.config, question)
+    if shift is None:
+        return rollouts(model, [question])[0]
+    there = dataclasses.replace(question.scene, rest_position=_moved(question.scene.rest_position, shift))
+    moved = dataclasses.replace(question, scene=there, script=_moved(question.script, shift))
+    answer = rollouts(model, [moved])[0]
+    position, script = _moved(answer.position, -shift), question.script[: len(answer.position)]
+    # Given numbers stay what they are, to the last bit.
+    position[: answer.given] = script[: answer.given]
+    position = np.where(question.scene.prescribed[:, None], script, position)
+    return dataclasses.replace(answer, scene=question.scene, position=position)
+
+
+def _way_into_domain(config: ModelConfig, question: Question) -> np.ndarray | None:
+    """[3] float64: from the middle of the start and of all that is prescribed to the middle of the domain; None: both
+    lie inside the domain."""
+    script = question.script
+    known = np.concatenate([script[0], script[:, question.scene.prescribed].reshape(-1, 3)])
+    lowest, highest = known.min(axis=0).astype(np.float64), known.max(axis=0).astype(np.float64)
+    center = np.array(config.domain_center)
+    if max((center - lowest).max(), (highest - center).max()) <= config.domain_half_width:
+        return None
+    return center - (lowest + highest) / 2
+
+
+def _moved(points: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Points [..., 3] float32, moved by `shift` [3] float64 and rounded once."""
+    return (points.astype(np.float64) + shift).astype(np.float32)

@@ -1,0 +1,228 @@
+"""A trained run: its predictions and their evaluation."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ast_sim.dataset.layout import DatasetInfo
+from ast_sim.dataset.reader import Dataset
+from ast_sim.inference.answer import Answer
+from ast_sim.inference.evaluation import evaluate, table
+from ast_sim.inference.predict import Motions, predict
+from ast_sim.runs.folder import load_model
+from ast_sim.runs.metrics import Metrics
+from ast_sim.runs.train_config import read_scope
+from ast_sim.scene import Scene, Trajectory
+from ast_sim.support.disk import write_json
+from ast_sim.support.errors import ConfigError
+from ast_sim.support.progress import Progress
+from ast_sim.support.provenance import provenance
+from ast_sim.view import report
+from ast_sim.view.files import make_folder
+
+
+class Run:
+    """A trained run, with the model of its best checkpoint (the last one if none was validated).
+
+    Attributes:
+        path: the run folder.
+        model: the trained model, an `nn.Module`.
+        settings: the settings of the model and of the training.
+        step: the step of the checkpoint.
+        scope: the ranges of sizes, materials and motions in the training scenes.
+
+    Raises:
+        CheckpointError: the folder holds no run, or no checkpoint in it can be read.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        self.model, self.settings, self.step = load_model(self.path)
+        self.scope = read_scope(self.path)
+
+    @property
+    def info(self) -> DatasetInfo:
+        """The units and the kind of the predictions."""
+        model, scope = self.settings.model, self.scope
+        return DatasetInfo(
+            family=scope.family,
+            integration=model.integration,
+            stress_location=model.stress,
+            domain_center=model.domain_center,
+            domain_half_width=model.domain_half_width,
+            contact_radius=model.contact_radius,
+            time_step=scope.time_step,
+            length_unit=scope.length_unit,
+            generator={"program": "ast_sim predict"},
+        )
+
+    def predict(
+        self,
+        scene: Scene | Trajectory,
+        motion: Motions | None = None,
+        *,
+        frames: int | None = None,
+        stress: np.ndarray | None = None,
+        name: str = "scene",
+    ) -> Answer:
+        """Predict a scene. Its true trajectory need not be known.
+
+        The scene may lie anywhere: if it leaves the model's domain, it is moved to the middle of the domain, predicted
+        and moved back. A property outside its range in the training scenes gives a warning.
+
+        Args:
+            scene: a scene, with lengths in the run's unit. Or a `Trajectory`: its prescribed nodes give the motion, its
+                first frames the start. Then it takes no other argument, gives no warning and is not moved.
+            motion: the motion of the prescribed nodes: rigid motions by the number of the body, such as
+                {1: (0, 0, -0.01)}; or positions [S, N, 3] of all nodes or [S, P, 3] of the prescribed ones; or a
+                `Motion`.
+            frames: S, only for rigid motions; by default so many that the prescribed nodes move as far in one frame as
+                in training.
+            stress: [given, N or E, 1], the stress of the given frames in pascal; by default zero. One frame is given,
+                two where there is inertia.
+            name: name of the scene, for messages.
+
+        Raises:
+            ConfigError: the motion does not fit the scene, or the scene does not fit the run.
+        """
+        answer = predict(self.model, self.scope, scene, motion, frames, stress, name)
+        source = {"predicted_by": str(self.path), "step": self.step, "source": name}
+        return dataclasses.replace(answer, info=self.info, source=source)
+
+    def open(self, data: str | os.PathLike[str] | None = None) -> Dataset:
+        """Open a dataset, by default the one that the run was trained on. The caller closes it.
+
+        Raises:
+            DatasetError: the dataset cannot be read.
+            ConfigError: its integration, stress location or material columns differ from those of the training data.
+        """
+        dataset, model = Dataset(data or self.settings.data), self.settings.model
+        try:
+            for key, ours, theirs in (
+                ("integration", model.integration, dataset.info.integration),
+                ("stress_location", model.stress, dataset.info.stress_location),
+                ("material columns", model.material_width, dataset.material_width),
+                ("lengths in", self.scope.length_unit, dataset.info.length_unit),
+            ):
+                if ours != theirs:
+                    raise ConfigError(
+                        f"{dataset.path} has {key} {theirs}, but {self.path} was trained with {key} {ours}"
+                    )
+        except BaseException:
+            dataset.close()
+            raise
+        return dataset
+
+    def evaluate(
+        self, data: str | os.PathLike[str] | None = None, split: str = "test", command: str = "Run.evaluate"
+    ) -> Evaluation:
+        """Predict all scenes of a split and measure the errors; on a terminal a bar shows the progress.
+
+        Args:
+            data: a dataset; by default the one that the run was trained on.
+            command: the command that is recorded beside the figures.
+        """
+        with self.open(data) as dataset:
+            with Progress(dataset.count(split), 0, "scenes") as bar:
+                figures, answers = evaluate(self.model, dataset, split, lambda name: bar.advance())
+            answers = [dataclasses.replace(answer, info=self.info) for answer in answers]
+            origin = {"run": str(self.path), "step": self.step, "data": str(dataset.path), "split": split}
+            return Evaluation(self, dataset.path, {**provenance(command), **origin, **figures}, answers)
+
+    def report(self, path: str | os.PathLike[str], data: str | os.PathLike[str] | None = None) -> None:
+        """Evaluate on the test split and write a page with the results."""
+        self.evaluate(data).report(path)
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """The predictions of a run for the scenes of a split, and their errors. `str` gives a table of the errors.
+
+    Attributes:
+        run: the run.
+        data: the path of the dataset.
+        figures: errors, times and their origin, as `save` writes them; see `ast_sim.inference.evaluation.evaluate`.
+        answers: the prediction of each scene.
+    """
+
+    run: Run
+    data: Path
+    figures: dict[str, Any]
+    answers: list[Answer]
+
+    def __str__(self) -> str:
+        return table(self.figures)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write all figures as JSON."""
+        write_json(Path(path), self.figures)
+
+    def report(self, path: str | os.PathLike[str], title: str = "Learned simulation: predictions and errors") -> None:
+        """Write a page with moving scenes, errors, times and settings."""
+        report_evaluations(path, [self], title)
+
+    def shown(self) -> report.ReportRun:
+        """The content of the page: the best, the median and the worst scene, the curves of the training, facts."""
+        errors = {}
+        for sample in self.figures["samples"]:
+            error = sample["displacement"]["model"]["rollout_all"]["normal"]
+            errors[sample["name"]] = math.inf if error is None else error
+        answers = {answer.name: answer for answer in self.answers}
+        with Dataset(self.data) as dataset:
+            scenes = [
+                report.ReportScene(name, label, _truth(dataset, name), answers[name].trajectory)
+                for label, name in report.representative(errors)
+            ]
+            metrics = list(Metrics(self.run.path))
+            facts = self._facts(dataset, metrics)
+        return report.ReportRun(
+            name=self.run.path.resolve().name,
+            model=self.run.settings.model.name,
+            scenes=scenes,
+            evaluation=self.figures,
+            metrics=metrics,
+            facts=facts,
+        )
+
+    def _facts(self, dataset: Dataset, metrics: Sequence[dict[str, Any]]) -> dict[str, str]:
+        run, info = self.run, dataset.info
+        training, model = run.settings.train, run.settings.model
+        facts = {
+            "Model": f"{type(run.model).__name__}, {sum(p.numel() for p in run.model.parameters()):,} parameters",
+            **model.facts(info.length_unit),
+            "Training": f"{training.steps:,} steps of {training.batch_size * training.accumulate} scenes,"
+            f" seed {training.seed}",
+            "Noise": f"{training.noise:.3g} {info.length_unit}",
+            "Checkpoint": f"step {run.step:,}, {_choice(metrics)}",
+            "Family": info.family,
+            "Scenes": ", ".join(f"{count} {split}" for split, count in dataset.splits.items()),
+        }
+        plain = {key: value for key, value in info.generator.items() if not isinstance(value, dict)}
+        return facts | {f"Generator {key}": str(value) for key, value in plain.items()}
+
+
+def report_evaluations(path: str | os.PathLike[str], evaluations: list[Evaluation], title: str) -> None:
+    """Write one page that shows several runs side by side; a missing folder is made."""
+    make_folder(Path(path).parent)
+    report.write(path, [evaluation.shown() for evaluation in evaluations], title)
+
+
+def _truth(dataset: Dataset, name: str) -> Trajectory:
+    split, _, index = name.partition("/")
+    return dataset.load(split, int(index))
+
+
+def _choice(metrics: Sequence[dict[str, Any]]) -> str:
+    """How the checkpoint was chosen. A failed validation has the error None."""
+    errors = [record["valid_rmse"] for record in metrics if "valid_rmse" in record]
+    if not errors:
+        return "the last, none was validated"
+    return "the last, every validation failed" if set(errors) == {None} else "the best of the validations by rollout"

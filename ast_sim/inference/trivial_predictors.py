@@ -1,0 +1,119 @@
+"""Errors of the model and of trivial predictors, at several horizons.
+
+Predictors of the displacement: the model; `hold_still` (the next position equals the present one); `repeat_last` (the
+next increment equals the last one). Predictors of the stress: the model; `stress_zero`; `stress_constant` (the mean of
+the training split); `stress_frame_mean` (the mean of the true frame). All predictors have the prescribed nodes at their
+true positions. The stress is compared on the nodes or elements that deform (`Scene.deforming`).
+
+Horizons: `one_step` (each frame is predicted from the true frame before it), `rollout_50` (the first 50 frames of the
+rollout, or all frames if it is shorter), `rollout_all` (all frames).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ast_sim.inference.answer import Answer
+from ast_sim.inference.measures import SquaredError, rmse_pooled, rmse_sequence
+from ast_sim.scene import NodeType, Trajectory
+
+# The errors of one scene, by predictor, horizon and set of nodes.
+Errors = dict[str, dict[str, dict[str, SquaredError]]]
+
+
+def displacement_errors(truth: Trajectory, one_step: np.ndarray | None, answer: Answer) -> Errors:
+    """Errors of the positions on NORMAL nodes and on all nodes. Displacements have the same errors.
+
+    Args:
+        one_step: [S - given, N, 3], the model's predictions from the true frames; None if there are none.
+        answer: the model's rollout.
+    """
+    position, given, scene = truth.position.astype(np.float64), answer.given, truth.scene
+    target, present = position[given:], position[given - 1 : -1]
+    # The increment before frame 0 is zero, since the scene was at rest.
+    before = np.concatenate([position[:1], position])[given - 1 : -2]
+    last = present[0] - before[0]
+    frames = np.arange(1, len(target) + 1)[:, None, None]
+    predictors = {
+        "model": (one_step, answer.position[given:] if answer.failure is None else None),
+        "hold_still": (present, np.broadcast_to(present[0], target.shape)),
+        "repeat_last": (2 * present - before, present[0] + frames * last),
+    }
+    rows = {"normal": scene.node_type == NodeType.NORMAL, "all": np.ones(scene.num_nodes, bool)}
+    prescribed = scene.prescribed[:, None]
+    placed = {
+        key: tuple(None if value is None else np.where(prescribed, target, value) for value in values)
+        for key, values in predictors.items()
+    }
+    return _errors_by_horizon(placed, target, rows)
+
+
+def stress_errors(
+    truth: Trajectory, one_step: np.ndarray | None, answer: Answer, constant: float, location: str
+) -> Errors:
+    """Errors of the stress on the nodes or elements that deform; `constant` is the value of `stress_constant`."""
+    assert truth.stress is not None and answer.stress is not None
+    target = truth.stress[answer.given :].astype(np.float64)
+    rows = truth.scene.deforming(location)
+    mean = target[:, rows].mean(axis=1, keepdims=True)
+    predictors = {
+        "model": (one_step, answer.stress[answer.given :] if answer.failure is None else None),
+        "stress_zero": (np.zeros(1), np.zeros(1)),
+        "stress_constant": (np.full(1, constant), np.full(1, constant)),
+        "stress_frame_mean": (mean, mean),
+    }
+    full = {
+        key: tuple(None if value is None else np.broadcast_to(value, target.shape) for value in values)
+        for key, values in predictors.items()
+    }
+    return _errors_by_horizon(full, target, {"deforming": rows})
+
+
+def _errors_by_horizon(
+    predictors: dict[str, tuple[np.ndarray | None, ...]], target: np.ndarray, rows: dict[str, np.ndarray]
+) -> Errors:
+    """Compare the predictions of each predictor, a pair (one step, rollout), with the target [S - given, rows, F]."""
+    horizons = {"one_step": (0, None), "rollout_50": (1, 50), "rollout_all": (1, None)}
+    failed = SquaredError(math.inf, 1)
+    return {
+        predictor: {
+            horizon: {
+                nodes: failed
+                if predictions[which] is None
+                else SquaredError.between(predictions[which][:stop], target[:stop], mask)
+                for nodes, mask in rows.items()
+            }
+            for horizon, (which, stop) in horizons.items()
+        }
+        for predictor, predictions in predictors.items()
+    }
+
+
+def summarize(errors: list[Errors], quantity: str) -> dict[str, Any]:
+    """predictor -> quantity -> horizon -> nodes -> {rmse_sequence, rmse_pooled}, over the scenes in `errors`."""
+
+    def both(*scenes: SquaredError) -> dict[str, float | None]:
+        return {"rmse_sequence": _or_none(rmse_sequence(scenes)), "rmse_pooled": _or_none(rmse_pooled(scenes))}
+
+    return {predictor: {quantity: found} for predictor, found in _mapped(both, errors).items()} if errors else {}
+
+
+def rmse_of(errors: Errors) -> dict[str, Any]:
+    """The root mean square errors of one scene, in the same nested dictionaries."""
+    return _mapped(lambda error: _or_none(error.rmse), [errors])
+
+
+def _mapped(function: Callable[..., Any], trees: list[Any]) -> Any:
+    """Nested dictionaries whose leaves are `function` of the corresponding leaves of all `trees`, which are alike."""
+    if not isinstance(trees[0], dict):
+        return function(*trees)
+    return {key: _mapped(function, [tree[key] for tree in trees]) for key in trees[0]}
+
+
+def _or_none(value: float) -> float | None:
+    """None for infinity and NaN, which JSON does not have."""
+    return value if math.isfinite(value) else None

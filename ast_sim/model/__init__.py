@@ -1,1 +1,0 @@
-"""AST: the model of the paper, exactly as docs/model.md states it."""

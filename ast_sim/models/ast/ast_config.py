@@ -1,0 +1,102 @@
+"""The settings of AST. The defaults are those of the paper."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal, Self
+
+from ast_sim.models.model_config import NODE_INPUTS, WIDEST, DataFacts, TimeConditionedConfig, setting
+from ast_sim.support.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class ASTConfig(TimeConditionedConfig):
+    """The settings of AST."""
+
+    name: Literal["ast"] = setting("ast", "Adaptive Spatial Tokenization")
+    node_inputs: tuple[str, ...] | None = setting(("displacement",), f"{NODE_INPUTS}; unset: chosen from the data")
+    hidden: int = setting(128, "width of node, edge and cell features")
+    decoder_hidden: int = setting(32, "hidden width of the output MLPs")
+    d_token: int = setting(256, "width of a token")
+    heads: int = setting(8, "attention heads")
+    head_dim: int = setting(64, "width of a head: a multiple of 16 up to 128")
+    ffn_inner: int = setting(512, "width of the feed-forward network after gating")
+    L_SA: int = setting(12, "self-attention blocks on the tokens")
+    num_tokens: int = setting(512, "most tokens of a scene; with fewer cells, every cell becomes a token")
+    dropout: float = setting(0.1, "dropout on attention weights and feed-forward outputs")
+    mesh_steps: int = setting(0, "additional message passing steps on the mesh, before the cells and again after them")
+    L_cell: int | None = setting(5, "octree level of the cells; unset: chosen by `cell_spacings`")
+    cell_spacings: float = setting(1.5, "approximate side of a cell, in mesh spacings, if L_cell is unset")
+    places: Literal["absolute", "relative"] | None = setting(
+        "absolute",
+        "what attention knows: the position of each cell (absolute), or the offset between two (relative);"
+        " unset: relative in quasi-static scenes, absolute in dynamic ones",
+    )
+    exchanges: int | None = setting(
+        0,
+        "how often nodes and tokens attend to each other, between the L_SA blocks; 0: nodes get messages from cells"
+        " (C2M); unset: 2 with relative places in quasi-static scenes, else 0",
+    )
+    l_ocnn: int = setting(0, "levels by which sparse convolutions coarsen the cells before they become tokens")
+    element_inputs: tuple[str, ...] | None = setting(
+        ("displacement",),
+        "element features, of displacement, velocity, material and stress; empty: elements are no nodes of the graph;"
+        " unset: displacement and material if stress is predicted on elements, else empty",
+    )
+    edge_strain: bool = setting(False, "edges have dp - dp0 and |dp| - |dp0| as inputs, not dp and |dp|")
+    factorized: bool = setting(True, "random weight factorization W = diag(g) V of the MLPs' layers")
+    residual: tuple[str, ...] = setting(("m2m",), "message passing steps with a residual, of m2m, e2m, m2c, c2m, m2e")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check_inputs("element_inputs", ("displacement", "velocity", "material", "stress"))
+        self.check_inputs("residual", ("m2m", "e2m", "m2c", "c2m", "m2e"))
+        widths = ("hidden", "decoder_hidden", "d_token", "heads", "ffn_inner", "num_tokens")
+        self.check_range(1, WIDEST, *widths)
+        self.check_range(0, WIDEST, "L_SA", "mesh_steps", "exchanges")
+        self.check_range(0, 0.99, "dropout")
+        self.check_range(0.01, 1e6, "cell_spacings")
+        if self.mesh_steps and self.element_inputs:
+            raise ConfigError("model.mesh_steps must be 0 with element_inputs: then no edge joins two nodes")
+        if self.exchanges and self.places == "absolute":
+            raise ConfigError("model.exchanges needs model.places=relative: attention knows no other place of a node")
+        if self.head_dim % 16 or not 16 <= self.head_dim <= 128:
+            raise ConfigError(f"model.head_dim must be a multiple of 16 up to 128, not {self.head_dim}")
+        if self.L_cell is not None and not 0 <= self.L_cell - self.l_ocnn <= self.L_cell <= 21:
+            raise ConfigError(
+                f"model.L_cell = {self.L_cell} and l_ocnn = {self.l_ocnn} must satisfy 0 <= l_ocnn <= L_cell <= 21"
+            )
+
+    @property
+    def cell_side(self) -> float:
+        """See `ModelConfig`. The side is 2^(1-L) half widths (paper, section Sparse Convolution)."""
+        return self.domain_half_width * 2.0 ** (1 - self.L_cell)
+
+    def resolve(self, facts: DataFacts) -> Self:
+        """See `TimeConditionedConfig`. An unset L_cell follows from the mesh spacing. Dynamic scenes get no exchanges:
+        with them, rollouts of cloths diverged in one of two trainings (docs/log.md, 2026-11-24)."""
+        resolved = super().resolve(facts)
+        depth, elements, places, exchanges = self.L_cell, self.element_inputs, self.places, self.exchanges
+        if depth is None:
+            side = self.cell_spacings * facts.mesh_spacing
+            depth = min(max(round(1 + math.log2(resolved.domain_half_width / side)), self.l_ocnn + 1), 21)
+        if elements is None:
+            material = ("material",) if facts.material_width else ()
+            elements = ("displacement", *material) if resolved.stress == "element" else ()
+        if places is None:
+            places = "absolute" if resolved.dynamic else "relative"
+        if exchanges is None:
+            exchanges = 2 if places == "relative" and not resolved.dynamic else 0
+        resolved = replace(resolved, L_cell=depth, element_inputs=elements, places=places, exchanges=exchanges)
+        resolved.check_available("element_inputs")
+        if "stress" in elements and resolved.stress != "element":
+            raise ConfigError("model.element_inputs: stress needs a dataset with stress on elements")
+        if resolved.stress == "element" and not elements:
+            raise ConfigError("model.element_inputs: a stress on elements needs element nodes, such as displacement")
+        return resolved
+
+    def facts(self, length_unit: str, mesh_spacing: float | None = None) -> dict[str, str]:
+        """See `ModelConfig`."""
+        share = f" = {self.cell_side / mesh_spacing:.2g} x mesh spacing" if mesh_spacing else ""
+        return {"Cell side": f"{self.cell_side:.3g} {length_unit}{share}, octree level {self.L_cell}"}

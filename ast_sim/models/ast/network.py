@@ -1,0 +1,166 @@
+"""Adaptive Spatial Tokenization (paper, section Overall Architecture), as docs/reference/model.md states it.
+
+    mesh --m2m or e2m--> mesh --M2C--> cells --OCNN--> coarse cells --CrossAttn--> tokens --L_SA x SelfAttn--> tokens
+    tokens --CrossAttn--> coarse cells --OCNN transposed--> cells --C2M--> mesh --decoder--> motion (--M2E--> stress)
+
+With `exchanges`, which the paper does not have, nodes attend to tokens directly, not by way of cells. Each time after
+the first, the tokens attend to the nodes before:
+
+    mesh --CrossAttn--> tokens --some of the L_SA x SelfAttn--> tokens --CrossAttn--> mesh
+
+Legend: N nodes, E elements, C cells, T tokens.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import Tensor, nn
+
+from ast_sim.batches.batch_builder import Batch
+from ast_sim.batches.graph import Graph
+from ast_sim.models.ast.ast_config import ASTConfig
+from ast_sim.models.ast.cells import Cells, SparseConv, build_cells, doublings, places
+from ast_sim.models.ast.element_and_edge_inputs import edge_features, element_features
+from ast_sim.models.ast.message_passing import MessagePassing
+from ast_sim.models.ast.position_embedding import PositionEmbedding
+from ast_sim.models.ast.transformer import AttentionBlock, Vectors, rotations
+from ast_sim.models.layers import MLP, Linear
+from ast_sim.models.node_inputs import node_features, normalizer_of
+from ast_sim.models.simulator import Prediction, Simulator
+from ast_sim.ops import farthest_point_sample, segment_mean
+from ast_sim.scene import Scene
+
+
+class AST(Simulator):
+    """Adaptive Spatial Tokenization. It has only the parts that the settings ask for."""
+
+    config: ASTConfig
+
+    def __init__(self, config: ASTConfig):
+        super().__init__(config)
+        c, width = config, config.hidden
+        self.node_inputs = normalizer_of(c, "node")
+        self.edge_inputs = normalizer_of(c, "edge")
+        self.node_encoder = MLP(self.node_inputs.width, width, width, c.factorized)
+        if c.element_inputs:
+            self.element_inputs = normalizer_of(c, "element")
+            self.element_encoder = MLP(self.element_inputs.width, width, width, c.factorized)
+            self.e2m = self._message_passing("e2m", self.edge_inputs.width)
+        else:
+            self.m2m = self._message_passing("m2m", self.edge_inputs.width)
+        self.before_cells, self.after_cells = self._mesh_steps(), self._mesh_steps()
+        self.m2c = self._message_passing("m2c")
+        self.down = nn.ModuleList(SparseConv(width, up=False) for _ in range(c.l_ocnn))
+        self.lift = Linear(width, c.d_token)
+        if c.places == "absolute":
+            self.position_embedding = PositionEmbedding(c.d_token, c.L_cell - c.l_ocnn)
+        self.to_tokens = AttentionBlock(c, c.d_token, c.d_token)
+        self.processor = nn.ModuleList(AttentionBlock(c, c.d_token) for _ in range(c.L_SA))
+        if c.exchanges:
+            self.to_nodes = nn.ModuleList(AttentionBlock(c, width, c.d_token) for _ in range(c.exchanges))
+            self.from_nodes = nn.ModuleList(AttentionBlock(c, c.d_token, width) for _ in range(c.exchanges - 1))
+        else:
+            self.to_cells = AttentionBlock(c, c.d_token, c.d_token)
+            self.lower = Linear(c.d_token, width)
+            self.up = nn.ModuleList(SparseConv(width, up=True) for _ in range(c.l_ocnn))
+            self.c2m = self._message_passing("c2m")
+        self.decoder = MLP(2 * width, c.decoder_hidden, 4 if c.stress == "node" else 3, c.factorized)
+        if c.stress == "element":
+            self.m2e = self._message_passing("m2e")
+            self.element_decoder = MLP(width, c.decoder_hidden, 1, c.factorized)
+
+    def _message_passing(self, name: str, edge_inputs: int = 0) -> MessagePassing:
+        return MessagePassing(self.config.hidden, edge_inputs, name in self.config.residual, self.config.factorized)
+
+    def _mesh_steps(self) -> nn.ModuleList:
+        c = self.config
+        return nn.ModuleList(
+            MessagePassing(c.hidden, self.edge_inputs.width, True, c.factorized) for _ in range(c.mesh_steps)
+        )
+
+    def graph(self, scene: Scene) -> Graph:
+        """See `Simulator`. With element inputs, elements are nodes of the graph too."""
+        element_nodes = bool(self.config.element_inputs)
+        return Graph.from_scene(scene, element_nodes, surface=self.config.sees_surfaces)
+
+    def domain(self, position: Tensor) -> int | None:
+        """See `Simulator`: how often the domain must double around its centre to hold the positions [N, 3]."""
+        return doublings(self.config, position)
+
+    def observe(self, batch: Batch) -> None:
+        """Add the batch to the statistics of the inputs."""
+        self.node_inputs.observe(node_features(self.config, batch))
+        self.edge_inputs.observe(edge_features(self.config, batch))
+        if self.config.element_inputs:
+            self.element_inputs.observe(element_features(self.config, batch))
+
+    def forward(self, batch: Batch) -> Prediction:
+        """Normalised outputs for the frame after `batch`."""
+        encoded = self.node_encoder(self.node_inputs(node_features(self.config, batch)))
+        elements = None
+        edges, on_edges = batch.graph.edges, self.edge_inputs(edge_features(self.config, batch))
+        if self.config.element_inputs:
+            elements = self.element_encoder(self.element_inputs(element_features(self.config, batch)))
+            mesh = self.e2m(edges, elements, encoded, on_edges)
+        else:
+            mesh = self.m2m(edges, encoded, encoded, on_edges)
+        for step in self.before_cells:
+            mesh = step(edges, mesh, mesh, on_edges)
+
+        now = self.config.horizon.present(batch)
+        cells = build_cells(self.config, now, batch.graph.node_offsets, may_grow=not self.training)
+        coarse = self._embedded(cells, mesh)
+        tokens = self._tokens(cells, coarse)
+        if self.config.exchanges:
+            nodes = Vectors(mesh, batch.graph.node_offsets, rotations(places(self.config, now), self.config.head_dim))
+            mesh = self._exchange(nodes, tokens)
+        else:
+            mesh = self._back_to_mesh(cells, self.to_cells(coarse, self._process(tokens, self.processor)).x, mesh)
+        for step in self.after_cells:
+            mesh = step(edges, mesh, mesh, on_edges)
+
+        on_elements = self.config.stress == "element"
+        stress = self.element_decoder(self.m2e(batch.graph.m2e, mesh, elements)) if on_elements else None
+        return Prediction.of_nodes(self.decoder(mesh, beside=encoded), stress)
+
+    def _embedded(self, cells: Cells, mesh: Tensor) -> Vectors:
+        """Mesh features [N, hidden] -> the coarsest cells [C, d_token] with their places."""
+        finest, coarsest = cells.finest, cells.coarsest
+        mean = segment_mean(mesh, finest.node_order, finest.node_offsets)
+        x = self.m2c(cells.from_mesh(), mesh, mean)
+        for convolve, step in zip(self.down, cells.maps, strict=True):
+            x = convolve(x, step)
+        x = self.lift(x)
+        if self.config.places == "absolute":
+            return Vectors(self.position_embedding(x, cells.centers()), coarsest.cell_offsets)
+        return Vectors(x, coarsest.cell_offsets, rotations(cells.places(), self.config.head_dim))
+
+    def _tokens(self, cells: Cells, coarse: Vectors) -> Vectors:
+        """The tokens: some of the coarsest cells, after they have attended to all of them."""
+        level = cells.coarsest
+        chosen, offsets = farthest_point_sample(level.coordinates(), level.cell_offsets, self.config.num_tokens)
+        turned = None if coarse.rotations is None else coarse.rotations.index_select(0, chosen)
+        return self.to_tokens(Vectors(coarse.x.index_select(0, chosen), offsets, turned), coarse)
+
+    def _process(self, tokens: Vectors, blocks: Sequence[AttentionBlock]) -> Vectors:
+        for block in blocks:
+            tokens = block(tokens)
+        return tokens
+
+    def _exchange(self, nodes: Vectors, tokens: Vectors) -> Tensor:
+        """Nodes and tokens attend to each other in turn -> mesh features [N, hidden]."""
+        blocks, times = len(self.processor), len(self.to_nodes)
+        for i, to_nodes in enumerate(self.to_nodes):
+            if i:
+                tokens = self.from_nodes[i - 1](tokens, nodes)
+            tokens = self._process(tokens, self.processor[blocks * i // times : blocks * (i + 1) // times])
+            nodes = to_nodes(nodes, tokens)
+        return nodes.x
+
+    def _back_to_mesh(self, cells: Cells, x: Tensor, mesh: Tensor) -> Tensor:
+        """The coarsest cells [C, d_token] and mesh features [N, hidden] -> mesh features [N, hidden]."""
+        x = self.lower(x)
+        for convolve, step in zip(self.up, reversed(cells.maps), strict=True):
+            x = convolve(x, step)
+        return self.c2m(cells.to_mesh(), x, mesh)

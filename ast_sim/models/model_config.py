@@ -1,0 +1,204 @@
+"""The settings that all models share, and presets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, Self
+
+from ast_sim.batches.horizons import FROM_FIRST, STEP_BY_STEP, Horizon
+from ast_sim.dataset.layout import GIVEN_FRAMES, DatasetInfo
+from ast_sim.support.errors import ConfigError
+from ast_sim.support.toml_settings import LARGEST, require_range
+
+WIDEST = 1 << 16  # the largest width or count of a layer
+
+NODE_INPUTS = "node features, of displacement, velocity, material and proximity"
+
+
+def setting(default: Any, text: str) -> Any:
+    """A field of a settings class. `ast-sim train --help` shows its text."""
+    return field(default=default, metadata={"help": text})
+
+
+@dataclass(frozen=True)
+class DataFacts:
+    """What the settings of a model may depend on in the data.
+
+    Attributes:
+        info: facts of the dataset.
+        material_width: numbers that describe the material of an element; 0 without material.
+        mesh_spacing: mean length of a mesh edge.
+        planar: whether z is 0 in all scenes.
+    """
+
+    info: DatasetInfo
+    material_width: int
+    mesh_spacing: float
+    planar: bool = False
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Settings of any model. Each model derives a class from this one, with a `name` of its own.
+
+    When training starts, `resolve` fills in the settings that are None, and all fields from `integration` on.
+    """
+
+    time_conditioned = False  # a setting only in `TimeConditionedConfig`
+
+    name: str = setting("", "which model")
+    node_inputs: tuple[str, ...] | None = setting(None, f"{NODE_INPUTS}; unset: chosen from the data")
+    proximity_radius: float | None = setting(
+        None, "with proximity: distance within which a node sees another body; unset: 1.5 mesh spacings"
+    )
+    boundary_motion: bool = setting(True, "give each prescribed node its next increment as an input")
+
+    integration: Literal["quasi_static", "dynamic"] = setting(
+        "quasi_static", "next position: p + v if quasi_static, 2 p - p_previous + a if dynamic; from the dataset"
+    )
+    stress: Literal["none", "node", "element"] = setting("none", "where stress is predicted; from the dataset")
+    material_width: int = setting(0, "numbers that describe the material of an element; from the dataset")
+    domain_center: tuple[float, float, float] = setting((0.0, 0.0, 0.0), "centre of the domain; from the dataset")
+    domain_half_width: float = setting(1.0, "half the side of the domain, a cube; from the dataset")
+    contact_radius: float = setting(0.0, "distance within which surfaces count as near; from the dataset")
+    planar: bool = setting(False, "nodes stay at their z, as in scenes that lie in the plane z = 0; from the dataset")
+
+    def __post_init__(self) -> None:
+        self.check_inputs("node_inputs", ("displacement", "velocity", "material", "proximity"))
+        self.check_range(0, LARGEST, "proximity_radius")
+
+    def check_inputs(self, key: str, known: tuple[str, ...]) -> None:
+        """Raise ConfigError if a name in the setting `key` is not one of `known`."""
+        for name in getattr(self, key) or ():
+            if name not in known:
+                raise ConfigError(f"model.{key}: {name!r} is unknown: choose of {', '.join(known)}")
+
+    def check_available(self, key: str) -> None:
+        """Raise ConfigError if the setting `key` names an input that the dataset does not have."""
+        inputs = getattr(self, key)
+        if "material" in inputs and not self.material_width:
+            raise ConfigError(f"model.{key}: material is an input, but the dataset has no material")
+        if "velocity" in inputs and self.integration != "dynamic":
+            raise ConfigError(f"model.{key}: velocity is an input of dynamic scenes only")
+
+    def check_range(self, least: float, most: float, *keys: str) -> None:
+        """Raise ConfigError if one of these settings is set and below `least` or above `most`."""
+        for key in keys:
+            require_range(f"model.{key}", getattr(self, key), least, most)
+
+    def check_heads(self) -> None:
+        """Raise ConfigError unless the width is a multiple of the number of heads."""
+        if self.hidden % self.heads:
+            raise ConfigError(f"model.hidden = {self.hidden} must be a multiple of model.heads = {self.heads}")
+
+    @property
+    def horizon(self) -> Horizon:
+        """Which frame the model predicts from."""
+        return FROM_FIRST if self.time_conditioned else STEP_BY_STEP
+
+    @property
+    def dynamic(self) -> bool:
+        return self.integration == "dynamic"
+
+    @property
+    def given_frames(self) -> int:
+        """The number of first frames from which a prediction starts."""
+        return GIVEN_FRAMES[self.integration]
+
+    @property
+    def gains_along_rollouts(self) -> bool:
+        """Whether an unset `train.rollout_pool` becomes a pool. With inertia, rollouts diverge without one
+        (docs/log.md, 2026-11-23)."""
+        return self.dynamic
+
+    @property
+    def cell_side(self) -> float:
+        """Side of the cells into which the model sorts nodes, in the unit of length; 0 for a model without cells."""
+        return 0.0
+
+    @property
+    def sees_surfaces(self) -> bool:
+        """Whether the inputs need the surfaces of the bodies."""
+        return "proximity" in self.node_inputs
+
+    def resolve(self, facts: DataFacts) -> Self:
+        """The settings with nothing left open.
+
+        If `node_inputs` is unset, velocity becomes an input of dynamic scenes, and material of scenes that have one.
+
+        Raises:
+            ConfigError: the data lacks something that the settings ask for.
+        """
+        info = facts.info
+        velocity = ("velocity",) if info.integration == "dynamic" else ()
+        chosen = (*velocity, *(("material",) if facts.material_width else ()))
+        resolved = replace(
+            self,
+            node_inputs=chosen if self.node_inputs is None else self.node_inputs,
+            proximity_radius=1.5 * facts.mesh_spacing if self.proximity_radius is None else self.proximity_radius,
+            integration=info.integration,
+            stress=info.stress_location,
+            material_width=facts.material_width,
+            domain_center=tuple(float(c) for c in info.domain_center),
+            domain_half_width=float(info.domain_half_width),
+            contact_radius=float(info.contact_radius),
+            planar=facts.planar,
+        )
+        resolved.check_available("node_inputs")
+        return resolved
+
+    def facts(self, length_unit: str, mesh_spacing: float | None = None) -> dict[str, str]:
+        """Lines about these settings, by title, for a report. With the mesh spacing, for the start of a training."""
+        return {}
+
+
+@dataclass(frozen=True)
+class TimeConditionedConfig(ModelConfig):
+    """Settings of a model that can predict each frame at once from the first frame, not only step by step."""
+
+    time_conditioned: bool = setting(
+        False, "predict each frame at once from the first frame, the prescribed nodes and the time, not step by step"
+    )
+
+    @property
+    def gains_along_rollouts(self) -> bool:
+        """See `ModelConfig`. Such models have a pool without inertia too."""
+        return True
+
+    def resolve(self, facts: DataFacts) -> Self:
+        """See `ModelConfig`. If `node_inputs` is unset, displacement becomes an input, and proximity in quasi-static
+        scenes, because the models have no edges between bodies. Proximity has not been measured in dynamic scenes."""
+        resolved = super().resolve(facts)
+        if self.time_conditioned and resolved.dynamic:
+            raise ConfigError(
+                "model.time_conditioned: the dataset is dynamic, so the positions of its nodes depend on their motion"
+                " before, not only on the prescribed nodes: predict it step by step"
+            )
+        if self.node_inputs is not None:
+            return resolved
+        proximity = () if resolved.dynamic else ("proximity",)
+        return replace(resolved, node_inputs=("displacement", *proximity, *resolved.node_inputs))
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Settings of a model with the settings of its training.
+
+    Attributes:
+        model: settings that are None follow from the data (`ModelConfig.resolve`).
+        train: fields of TrainConfig.
+    """
+
+    model: ModelConfig
+    train: Mapping[str, Any]
+
+
+# As the AST paper trains its baselines.
+PAPER_TRAINING = {"batch_size": 48, "peak_rate": 1e-4, "noise": 0.003, "stress_weight": 0.01}
+
+
+def tiny(model: ModelConfig, peak_rate: float, **train: Any) -> Preset:
+    """The preset `tiny` of a model: for any dataset, of a size that two cores train in minutes."""
+    shared = {"batch_size": 4, "optimizer": "muon", "stress_weight": 0.1, "rollout_pool": None}
+    return Preset(model, {**shared, "peak_rate": peak_rate, **train})

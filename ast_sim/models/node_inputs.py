@@ -1,0 +1,72 @@
+"""The input features of nodes and, as far as all models share them, of edges (paper, "Input and output features").
+
+Legend: N nodes, M edges, B scenes.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ast_sim.batches.batch_builder import Batch
+from ast_sim.models.model_config import ModelConfig
+from ast_sim.models.normalizer import FeatureNormalizer, Kind
+from ast_sim.ops import PROXIMITY_WIDTH, proximity
+from ast_sim.scene import NodeType
+
+
+def states(config: ModelConfig, names: tuple[str, ...], batch: Batch) -> list[Tensor]:
+    """Displacement and velocity of the nodes, if they are among `names`."""
+    values = []
+    if "displacement" in names:
+        values.append(config.horizon.present(batch) - batch.graph.rest_position)
+    if "velocity" in names:
+        values.append(batch.position - batch.previous_position)
+    return values
+
+
+def node_features(config: ModelConfig, batch: Batch) -> Tensor:
+    """[N, *]: node type (one-hot), displacement and velocity, material, proximity, boundary motion and the number of
+    the frame, as far as they are inputs. docs/reference/model.md explains them."""
+    values = [batch.graph.one_hot, *states(config, config.node_inputs, batch)]
+    if "material" in config.node_inputs:
+        values.append(batch.graph.node_material)
+    if "proximity" in config.node_inputs:
+        values.append(_proximity(batch, config.proximity_radius))
+    if config.boundary_motion:
+        values.append(batch.boundary_motion)
+    if config.horizon.numbered:
+        values.append(batch.frame.repeat_interleave(batch.graph.node_offsets.diff())[:, None])
+    return torch.cat(values, dim=1)
+
+
+def _proximity(batch: Batch, radius: float) -> Tensor:
+    """[N, 5]: `proximity` with the prescribed nodes at their next positions and the others at their current ones. So
+    it tells whether contact begins in the next frame."""
+    graph, ahead = batch.graph, batch.position.double() + batch.boundary_motion.double()
+    return proximity(ahead, graph.node_offsets, graph.body, graph.surface, graph.surface_offsets, radius)
+
+
+def beside_rest(rest: Tensor, vectors: Tensor, strain: bool) -> Tensor:
+    """[M, 8]: edges at rest [M, 4] and now [M, 4]. With `strain`, now minus rest, which has the scale of strains."""
+    return torch.cat([rest, vectors - rest if strain else vectors], dim=1)
+
+
+def normalizer_of(config: ModelConfig, what: str) -> FeatureNormalizer:
+    """The normalizer of the "node", "element" or "edge" features."""
+    vector, scalar = ("vector", 3), ("scalar", 1)
+    if what == "edge":
+        return FeatureNormalizer([vector, scalar, vector, scalar])
+    known: dict[str, tuple[Kind | None, int]] = {  # in the order of the columns
+        "displacement": vector,
+        "velocity": vector,
+        "material": ("scalar", config.material_width),
+        "stress": scalar,
+        "proximity": (None, PROXIMITY_WIDTH),
+    }
+    inputs = config.node_inputs if what == "node" else config.element_inputs
+    kinds = [kind for name, kind in known.items() if name in inputs]
+    if what == "node":
+        kinds = [(None, len(NodeType)), *kinds]
+        kinds += [vector] * config.boundary_motion + [scalar] * config.horizon.numbered
+    return FeatureNormalizer(kinds)

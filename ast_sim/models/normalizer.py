@@ -1,0 +1,97 @@
+"""Normalisation of inputs and targets with fixed statistics. All components of a vector share one scale."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+Kind = Literal["vector", "scalar"]
+
+
+class Statistics:
+    """Mean and scale of one quantity, in float64.
+
+    The mean of a vector is 0, and its scale is the root mean square of its components. The scale of a scalar is its
+    standard deviation.
+    """
+
+    def __init__(self, kind: Kind):
+        self.kind = kind
+        self._count, self._sum, self._squares = 0, 0.0, 0.0
+
+    def observe(self, x: Tensor) -> None:
+        """Add samples."""
+        x = x.double()
+        self._count += x.numel()
+        self._sum += float(x.sum())
+        self._squares += float(x.square().sum())
+
+    def result(self) -> tuple[float, float]:
+        """Mean and scale of all samples. A quantity that never varies has the scale 1."""
+        if not self._count:
+            return 0.0, 1.0
+        mean = 0.0 if self.kind == "vector" else self._sum / self._count
+        variance = max(self._squares / self._count - mean**2, 0.0)
+        negligible = 1e-12 * self._squares / self._count
+        return mean, variance**0.5 if variance > negligible else 1.0
+
+
+class Normalizer(nn.Module):
+    """(x - mean) / scale with one mean and one scale for all components, which `fix` sets."""
+
+    def __init__(self, kind: Kind):
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(()))
+        self.register_buffer("scale", torch.ones(()))
+        self._statistics = Statistics(kind)
+
+    def observe(self, x: Tensor) -> None:
+        """Add samples."""
+        self._statistics.observe(x)
+
+    def fix(self) -> None:
+        """Set mean and scale from all samples."""
+        mean, scale = self._statistics.result()
+        self.mean.fill_(mean)
+        self.scale.fill_(scale)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return (x - self.mean) / self.scale
+
+    def inverse(self, x: Tensor) -> Tensor:
+        return x * self.scale + self.mean
+
+
+class FeatureNormalizer(nn.Module):
+    """A `Normalizer` for several quantities in the columns of one array.
+
+    Args:
+        kinds: (kind, width) of each quantity, in the order of the columns. A quantity of kind None is not changed.
+    """
+
+    def __init__(self, kinds: list[tuple[Kind | None, int]]):
+        super().__init__()
+        self.width = sum(width for _, width in kinds)
+        self.register_buffer("mean", torch.zeros(self.width))
+        self.register_buffer("scale", torch.ones(self.width))
+        self._statistics: list[tuple[slice, Statistics]] = []
+        start = 0
+        for kind, width in kinds:
+            if kind is not None:
+                self._statistics.append((slice(start, start + width), Statistics(kind)))
+            start += width
+
+    def observe(self, x: Tensor) -> None:
+        """Add rows [*, width]."""
+        for columns, statistics in self._statistics:
+            statistics.observe(x[:, columns])
+
+    def fix(self) -> None:
+        """Set mean and scale of each quantity from all rows."""
+        for columns, statistics in self._statistics:
+            self.mean[columns], self.scale[columns] = statistics.result()
+
+    def forward(self, x: Tensor) -> Tensor:
+        return (x - self.mean) / self.scale

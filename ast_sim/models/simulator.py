@@ -1,0 +1,196 @@
+"""What all learned simulators share: normalised targets, the loss, prediction in physical units, and integration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from ast_sim.batches.batch_builder import Batch, Target
+from ast_sim.batches.graph import Graph
+from ast_sim.batches.pairs import PairSampler
+from ast_sim.dataset.reader import Dataset
+from ast_sim.models.model_config import ModelConfig
+from ast_sim.models.normalizer import FeatureNormalizer, Normalizer
+from ast_sim.scene import Scene
+from ast_sim.support.errors import ConfigError
+
+_CPU_ONLY = "models run on the CPU only"
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a model predicts for a batch.
+
+    Attributes:
+        motion: [N, 3], the increment from the state to the predicted frame, or the acceleration with inertia.
+        stress: [N, 1] or [E, 1] in the predicted frame, or None.
+    """
+
+    motion: Tensor
+    stress: Tensor | None
+
+    @staticmethod
+    def of_nodes(out: Tensor, element_stress: Tensor | None = None) -> Prediction:
+        """From motion [N, 3], or motion and stress [N, 4], of the nodes, and the stress [E, 1] of elements if any."""
+        return Prediction(out[:, :3], out[:, 3:] if out.shape[1] == 4 else element_stress)
+
+
+class Simulator(nn.Module):
+    """Base class of the models. They run on the CPU and refuse any other device.
+
+    A model implements `forward`, which returns normalised outputs, and `observe`, which collects the statistics of its
+    inputs. It overrides `graph` and `domain` if they do not fit.
+    """
+
+    def __init__(self, config: ModelConfig):
+        super().__init__()
+        self.config = config
+        self.motion_normalizer = Normalizer("vector")
+        self.stress_normalizer = Normalizer("scalar") if config.stress != "none" else None
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Simulator:
+        try:
+            device = fn(torch.empty(0)).device
+        except (AssertionError, RuntimeError) as error:  # torch has no such device here
+            raise ConfigError(f"{_CPU_ONLY}: {str(error).splitlines()[0]}") from None
+        _require_cpu("the model", device)
+        return super()._apply(fn, recurse)
+
+    def __call__(self, batch: Batch) -> Prediction:
+        _require_cpu("the batch", batch.position.device)
+        return super().__call__(batch)
+
+    def forward(self, batch: Batch) -> Prediction:
+        raise NotImplementedError
+
+    def observe(self, batch: Batch) -> None:
+        raise NotImplementedError
+
+    def graph(self, scene: Scene) -> Graph:
+        """What the model needs to know of a scene that does not change with time."""
+        return Graph.from_scene(scene, element_nodes=False, surface=self.config.sees_surfaces)
+
+    def domain(self, position: Tensor) -> int | None:
+        """The number of the domain that holds the positions [N, 3] of a scene. None: they are too far away for the
+        model. Scenes in different domains are not predicted together."""
+        return 0
+
+    def pairs(
+        self,
+        dataset: Dataset,
+        split: str = "train",
+        *,
+        batch_size: int,
+        seed: int = 0,
+        noise: float = 0.0,
+        gamma: float = 1.0,
+        mirror: tuple[str, ...] = (),
+        shift: float = 0.0,
+        part: tuple[int, int] = (0, 1),
+    ) -> PairSampler:
+        """The frame pairs of a split in batches that fit this model; see `PairSampler` for the arguments.
+
+        batch, target = model.pairs(dataset, batch_size=4).batch(step)
+        """
+        return PairSampler(
+            dataset,
+            split,
+            batch_size=batch_size,
+            seed=seed,
+            noise=noise,
+            make_graph=self.graph,
+            dynamic=self.config.dynamic,
+            gamma=gamma,
+            part=part,
+            horizon=self.config.horizon,
+            mirror=mirror,
+            shift=shift,
+        )
+
+    def _stressed(self, batch: Batch) -> Tensor:
+        """[*] int64: the nodes or elements that deform. Only their stress counts."""
+        graph = batch.graph
+        deforming = graph.deforming_elements if self.config.stress == "element" else graph.deforming_nodes
+        return deforming.nonzero()[:, 0]
+
+    @torch.no_grad()
+    def fit_statistics(self, batches: Iterable[tuple[Batch, Target]]) -> None:
+        """Fix the statistics of inputs and targets, in float64, from batches like those of training, with noise."""
+        for batch, target in batches:
+            self.observe(batch)
+            self.motion_normalizer.observe(target.motion[batch.graph.normal_nodes])
+            if self.stress_normalizer is not None:
+                self.stress_normalizer.observe(target.stress[self._stressed(batch)])
+        for module in self.modules():
+            if isinstance(module, Normalizer | FeatureNormalizer):
+                module.fix()
+
+    def loss(
+        self,
+        prediction: Prediction,
+        batch: Batch,
+        target: Target,
+        stress_weight: float = 0.01,
+        share: Callable[[int], float] = lambda rows: 1.0,
+    ) -> dict[str, Tensor]:
+        """Mean squared errors of normalised outputs: motion of NORMAL nodes, and stress of what deforms.
+
+        If the batch is part of a larger one, `share` returns the share of its rows (nodes or elements) in all rows. The
+        losses of all parts then add up to the loss of the larger batch.
+
+        Args:
+            prediction: `self(batch)`.
+
+        Returns:
+            "motion", "stress" (if there is one) and "loss" = motion + stress_weight * stress. "spread" is the standard
+            deviation of the predicted motion over the nodes: if it is 0, the decoder is dead.
+        """
+        normal = batch.graph.normal_nodes
+        motion = prediction.motion.index_select(0, normal)
+        error = motion - self.motion_normalizer(target.motion.index_select(0, normal))
+        part = share(len(normal))
+        losses = {"motion": part * error.square().mean()}
+        losses["loss"] = losses["motion"]
+        losses["spread"] = part * motion.detach().std(dim=0).mean() if len(motion) > 1 else motion.new_ones(())
+        if self.stress_normalizer is not None:
+            rows = self._stressed(batch)
+            stress = prediction.stress.index_select(0, rows)
+            error = stress - self.stress_normalizer(target.stress.index_select(0, rows))
+            losses["stress"] = share(len(rows)) * error.square().mean()
+            losses["loss"] = losses["loss"] + stress_weight * losses["stress"]
+        return losses
+
+    @torch.no_grad()
+    def residual(self, prediction: Prediction, batch: Batch, target: Target) -> Tensor:
+        """[N, 3]: predicted minus target motion of NORMAL nodes, in the unit of length; 0 elsewhere."""
+        error = self.motion_normalizer.inverse(prediction.motion) - target.motion
+        return torch.zeros_like(error).index_copy_(0, batch.graph.normal_nodes, error[batch.graph.normal_nodes])
+
+    @torch.inference_mode()
+    def predict(self, batch: Batch) -> Prediction:
+        """The outputs in physical units: motion in the dataset's unit of length, stress in pascal."""
+        prediction = self(batch)
+        stress = self.stress_normalizer.inverse(prediction.stress) if self.stress_normalizer is not None else None
+        return Prediction(self.motion_normalizer.inverse(prediction.motion), stress)
+
+    def integrate(self, batch: Batch, motion: Tensor) -> Tensor:
+        """[N, 3]: positions in the predicted frame, p + v, or 2 p - p_previous + a with inertia."""
+        if self.config.planar:
+            motion = motion * motion.new_tensor([1, 1, 0])
+        if self.config.dynamic:
+            return 2 * batch.position - batch.previous_position + motion
+        return batch.position + motion
+
+    def advance(self, batch: Batch, prescribed: Tensor) -> tuple[Tensor, Tensor | None]:
+        """The positions [N, 3] and the stress in the predicted frame. Prescribed nodes are at `prescribed` [N, 3]."""
+        prediction = self.predict(batch)
+        position = self.integrate(batch, prediction.motion)
+        return torch.where(batch.graph.prescribed[:, None], prescribed, position), prediction.stress
+
+
+def _require_cpu(what: str, device: torch.device) -> None:
+    if device.type != "cpu":
+        raise ConfigError(f"{_CPU_ONLY}: {what} cannot be on {device}; leave it on the CPU")

@@ -1,0 +1,170 @@
+"""What the models with world edges share: settings, inputs, the MLP of MeshGraphNets, messages and outputs.
+
+Legend: N nodes, E elements, M mesh edges, W world edges.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import torch
+from torch import Tensor, nn
+
+from ast_sim.batches.batch_builder import Batch
+from ast_sim.batches.graph import edge_vectors
+from ast_sim.models.layers import MLP, layer
+from ast_sim.models.model_config import WIDEST, DataFacts, ModelConfig, setting
+from ast_sim.models.node_inputs import beside_rest, node_features, normalizer_of
+from ast_sim.models.normalizer import FeatureNormalizer
+from ast_sim.models.simulator import Prediction, Simulator
+from ast_sim.models.world_edges import world_edges
+from ast_sim.ops import EdgeSet, linear, message_edges, mlp, segment_sum
+from ast_sim.support.errors import ConfigError
+from ast_sim.support.toml_settings import LARGEST
+
+
+@dataclass(frozen=True)
+class WorldEdgeConfig(ModelConfig):
+    """Settings of a model with world edges."""
+
+    hidden: int = setting(128, "width of node and edge features")
+    hidden_layers: int = setting(2, "hidden layers of each MLP: 1 or 2; with 1 message passing is one fused op")
+    edge_strain: bool = setting(False, "mesh edges have dp - dp0 and |dp| - |dp0| as inputs, not dp and |dp|")
+    world_radius: float | None = setting(None, "largest length of a world edge; unset: the dataset's contact radius")
+    most_world_edges: int | None = setting(None, "join at most this many pairs of a scene, the shortest; unset: all")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check_range(1, WIDEST, "hidden")
+        self.check_range(0, LARGEST, "world_radius", "most_world_edges")
+        if self.hidden_layers not in (1, 2):
+            raise ConfigError(f"model.hidden_layers is {self.hidden_layers}; it must be 1 or 2")
+
+    def resolve(self, facts: DataFacts) -> Self:
+        """See `ModelConfig`."""
+        resolved = super().resolve(facts)
+        radius = resolved.contact_radius if self.world_radius is None else self.world_radius
+        return replace(resolved, world_radius=radius)
+
+    def facts(self, length_unit: str, mesh_spacing: float | None = None) -> dict[str, str]:
+        """See `ModelConfig`."""
+        share = f" = {self.world_radius / mesh_spacing:.2g} x mesh spacing" if mesh_spacing else ""
+        return {"World": f"edges up to {self.world_radius:.3g} {length_unit}{share}"}
+
+
+class WorldEdgeSimulator(Simulator):
+    """A model with mesh edges and world edges, and with the inputs of MeshGraphNets (section A.1).
+
+    Nodes have their type, `node_inputs` and the boundary motion. Mesh edges [M, 8] have the differences of the rest
+    positions and of the positions, each with its length. World edges [W, 4] have the difference of the positions and
+    its length.
+    """
+
+    config: WorldEdgeConfig
+
+    def __init__(self, config: WorldEdgeConfig):
+        super().__init__(config)
+        self.node_inputs = normalizer_of(config, "node")
+        self.mesh_inputs, self.world_inputs = normalizer_of(config, "edge"), world_normalizer()
+
+    def encoders(self) -> list[DeepMLP]:
+        """New encoders of the nodes, the mesh edges and the world edges."""
+        inputs = (self.node_inputs, self.mesh_inputs, self.world_inputs)
+        return [DeepMLP(self.config, normalizer.width) for normalizer in inputs]
+
+    def world(self, batch: Batch) -> EdgeSet:
+        """The world edges of a batch."""
+        return world_edges(batch, self.config.world_radius, self.config.most_world_edges)
+
+    def observe(self, batch: Batch) -> None:
+        """Add the batch to the statistics of the inputs."""
+        self.node_inputs.observe(node_features(self.config, batch))
+        self.mesh_inputs.observe(self.edge_features(batch.graph.m2m, batch.graph.rest_edges, batch.position))
+        self.world_inputs.observe(edge_vectors(self.world(batch), batch.position, batch.position))
+
+    def edge_features(self, edges: EdgeSet, rest_edges: Tensor, position: Tensor) -> Tensor:
+        """[M, 8]: [dp0, |dp0|, dp, |dp|] from `rest_edges` [M, 4] and `position` [N, 3], d = sender - receiver. With
+        `edge_strain` dp and |dp| are relative to rest."""
+        return beside_rest(rest_edges, edge_vectors(edges, position, position), self.config.edge_strain)
+
+    def nodes(self, batch: Batch) -> Tensor:
+        """Normalised inputs of the nodes, [N, *]."""
+        return self.node_inputs(node_features(self.config, batch))
+
+    def mesh_edges(self, batch: Batch) -> Tensor:
+        """Normalised inputs of the mesh edges, [M, 8]."""
+        return self.mesh_inputs(self.edge_features(batch.graph.m2m, batch.graph.rest_edges, batch.position))
+
+    def world_edges(self, batch: Batch, world: EdgeSet) -> Tensor:
+        """Normalised inputs of the world edges, [W, 4]."""
+        return self.world_inputs(edge_vectors(world, batch.position, batch.position))
+
+
+def world_normalizer() -> FeatureNormalizer:
+    """The normalizer of [dp, |dp|]."""
+    return FeatureNormalizer([("vector", 3), ("scalar", 1)])
+
+
+class DeepMLP(nn.Module):
+    """Hidden layers with ReLU and a linear layer (MeshGraphNets, section A.1), then a LayerNorm unless it decodes.
+
+    Args:
+        config: its `hidden` and `hidden_layers`.
+        inputs: width of the inputs.
+        outputs: of a decoder; None: `hidden` outputs and a LayerNorm.
+    """
+
+    def __init__(self, config: WorldEdgeConfig, inputs: int, outputs: int | None = None):
+        super().__init__()
+        hidden, width = config.hidden, outputs or config.hidden
+        self.first = layer(inputs, hidden, factorized=False)
+        rest = MLP(hidden, hidden, width, factorized=False)
+        self.rest = rest if config.hidden_layers == 2 else layer(hidden, width, factorized=False)
+        self.norm = nn.LayerNorm(width) if outputs is None else None
+
+    def forward(self, x: Tensor, residual: Tensor | None = None) -> Tensor:
+        """x [*, inputs] -> [*, outputs], plus the residual."""
+        weights = (self.first.weight, self.first.bias)
+        if isinstance(self.rest, MLP):
+            return self.rest(linear(x, *weights, "relu"), norm=self.norm, residual=residual)
+        norm = None if self.norm is None else (self.norm.weight, self.norm.bias)
+        return mlp(x, *weights, self.rest.weight, self.rest.bias, None, norm, residual)
+
+
+def messages(edge_mlp: DeepMLP, edges: EdgeSet, features: Tensor, nodes: Tensor) -> tuple[Tensor, Tensor]:
+    """Messages along the edges of a set: an MLP of [edge, sender, receiver] for each edge.
+
+    The first layer acts on the three inputs separately, so its products with nodes are computed once for each node.
+
+    Args:
+        features: [M, *], of the edges.
+        nodes: [N, hidden].
+
+    Returns:
+        The sums of the messages at the receivers [N, hidden], in stored order, and the messages [M, hidden].
+    """
+    width = nodes.shape[1]
+    of_edge, of_sender, of_receiver = edge_mlp.first.weight.split([features.shape[1], width, width], dim=1)
+    of_senders, of_receivers = linear(nodes, of_sender), linear(nodes, of_receiver, edge_mlp.first.bias)
+    rest, norm = edge_mlp.rest, edge_mlp.norm
+    if not isinstance(rest, MLP):
+        weights = (rest.weight, rest.bias, norm.weight, norm.bias)
+        return message_edges(edges, of_senders, of_receivers, linear(features, of_edge), None, *weights)
+    of_nodes = of_senders.index_select(0, edges.senders) + of_receivers.index_select(0, edges.receivers)
+    found = rest(torch.relu(linear(features, of_edge, residual=of_nodes)), norm=norm)
+    return segment_sum(found, *edges.by_receiver), found
+
+
+class Decoder(nn.Module):
+    """Node features [N, hidden] -> motion, and stress if the data has it. The stress of an element follows from the
+    mean of its nodes' features."""
+
+    def __init__(self, config: WorldEdgeConfig):
+        super().__init__()
+        self.of_nodes = DeepMLP(config, config.hidden, 4 if config.stress == "node" else 3)
+        self.of_elements = DeepMLP(config, config.hidden, 1) if config.stress == "element" else None
+
+    def forward(self, nodes: Tensor, batch: Batch) -> Prediction:
+        stress = self.of_elements(batch.graph.element_mean(nodes)) if self.of_elements is not None else None
+        return Prediction.of_nodes(self.of_nodes(nodes), stress)

@@ -1,0 +1,275 @@
+"""Attention within each scene of a batch, without a score matrix in memory.
+
+Legend: B scenes, T tokens (Tq queries, Tk keys), H heads, D channels of a head.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import torch
+from torch import Tensor
+
+from ast_sim.ops import library
+from ast_sim.ops.library import check_offsets, check_shape, dense, dense_rows
+
+# ---- dropout: the generator of the C core in torch ----
+
+_ROTATIONS = ((10, 26), (11, 21), (13, 27), (23, 5), (6, 20), (17, 11), (25, 10), (18, 20))
+_WORD = 0xFFFFFFFF
+
+
+def _rotate(x: Tensor, n: int) -> Tensor:
+    return (x << n | x >> (32 - n)) & _WORD
+
+
+def _threefry(rounds: int, key: list[Tensor], x: list[Tensor]) -> list[Tensor]:
+    """Threefry-4x32 (Salmon et al., Parallel random numbers: as easy as 1, 2, 3, 2011), in int64."""
+    key = [*key, key[0] ^ key[1] ^ key[2] ^ key[3] ^ 0x1BD11BDA]
+    x = [(word + k) & _WORD for word, k in zip(x, key, strict=False)]
+    for i in range(rounds):
+        a, b = (3, 1) if i % 2 else (1, 3)
+        x[0] = (x[0] + x[a]) & _WORD
+        x[a] = _rotate(x[a], _ROTATIONS[i % 8][0]) ^ x[0]
+        x[2] = (x[2] + x[b]) & _WORD
+        x[b] = _rotate(x[b], _ROTATIONS[i % 8][1]) ^ x[2]
+        if i % 4 == 3:
+            s = i // 4 + 1
+            x = [(x[j] + key[(j + s) % 5] + (s if j == 3 else 0)) & _WORD for j in range(4)]
+    return x
+
+
+def dropout_factors(p: float, seed: int, scene: int, shape: tuple[int, int, int], like: Tensor) -> Tensor:
+    """[H, Tq, Tk]: the factors by which dropout multiplies the weights of a scene, 0 or 1 / (share kept).
+
+    They depend on seed, scene, head, query and key alone. Each weight gets 16 random bits and is dropped if these lie
+    below round(65536 p), so the share kept is within 1e-5 of 1 - p. The bits of key 128 g + 16 slot + lane are half
+    slot % 2 of word slot // 2 of the counter (16 g + lane, query).
+    """
+    heads, queries, keys = shape
+    blocks = -(-keys // 128)
+    threshold = min(65535, int(p * 65536 + 0.5))
+    head, query, group = (torch.arange(n, device=like.device) for n in (heads, queries, 16 * blocks))
+    zero = torch.zeros_like(head)[:, None, None]
+    words = [zero + (seed & _WORD), zero + (seed >> 32 & _WORD), zero + scene, head[:, None, None]]
+    words = _threefry(12, words, [group + zero, query[:, None] + zero, zero, zero])
+    bits = torch.stack([words[slot // 2] >> slot % 2 * 16 & 0xFFFF for slot in range(8)], -2)
+    bits = (
+        bits.reshape(heads, queries, 8, blocks, 16).transpose(2, 3).reshape(heads, queries, 128 * blocks)[:, :, :keys]
+    )
+    return (bits >= threshold).to(like.dtype) * (65536 / (65536 - threshold))
+
+
+# ---- composition ----
+
+
+def _check(op: str, q: Tensor, k: Tensor, v: Tensor, q_offsets: Tensor, k_offsets: Tensor, dropout_p: float) -> None:
+    check_shape(op, "q", q, -1, -1, -1)
+    check_shape(op, "k", k, -1, *q.shape[1:])
+    check_shape(op, "v", v, *k.shape)
+    if q.shape[2] % 16 or not 16 <= q.shape[2] <= 128:
+        raise ValueError(f"{op}: the head dimension must be a multiple of 16 up to 128, not {q.shape[2]}")
+    if not 0 <= dropout_p < 1:
+        raise ValueError(f"{op}: dropout_p must lie in [0, 1)")
+    check_shape(op, "k_offsets", k_offsets, len(q_offsets))
+    check_offsets(op, "q_offsets", q_offsets, len(q))
+    check_offsets(op, "k_offsets", k_offsets, len(k))
+
+
+def _scenes(q_offsets: Tensor, k_offsets: Tensor) -> Iterator[tuple[int, slice, slice]]:
+    """The number, the query rows and the key rows of each scene that has queries and keys."""
+    q, k = q_offsets.tolist(), k_offsets.tolist()
+    for b in range(len(q) - 1):
+        if q[b] < q[b + 1] and k[b] < k[b + 1]:
+            yield b, slice(q[b], q[b + 1]), slice(k[b], k[b + 1])
+
+
+def _scores(q: Tensor, k: Tensor, scale: float) -> Tensor:
+    return torch.einsum("qhd,khd->hqk", q * scale, k)
+
+
+def _factors(scores: Tensor, dropout_p: float, seed: int, scene: int) -> Tensor | float:
+    return dropout_factors(dropout_p, seed, scene, tuple(scores.shape), scores) if dropout_p else 1.0
+
+
+def _reference(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed):
+    _check("attention", q, k, v, q_offsets, k_offsets, dropout_p)
+    out, maximum = torch.zeros_like(q), torch.full_like(q[:, :, 0], -torch.inf)
+    total = torch.zeros_like(maximum)
+    for b, i, j in _scenes(q_offsets, k_offsets):
+        x = _scores(q[i], k[j], scale)
+        m = x.detach().amax(2, keepdim=True)
+        weights = (x - m).exp()
+        sums = weights.sum(2, keepdim=True)
+        weights = weights / sums * _factors(x, dropout_p, seed, b)
+        out[i] = torch.einsum("hqk,khd->qhd", weights, v[j])
+        maximum[i], total[i] = (torch.where(sums > 0, y, torch.nan)[:, :, 0].T for y in (m, sums))
+    return out, maximum, total
+
+
+def _backward_reference(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, out, maximum, total, dout):
+    _check("attention_backward", q, k, v, q_offsets, k_offsets, dropout_p)
+    dq, dk, dv = torch.zeros_like(q), torch.zeros_like(k), torch.zeros_like(v)
+    for b, i, j in _scenes(q_offsets, k_offsets):
+        x = _scores(q[i], k[j], scale)
+        weights = (x - maximum[i].T[:, :, None]).exp() / total[i].T[:, :, None]
+        factors = _factors(x, dropout_p, seed, b)
+        dweights = factors * torch.einsum("qhd,khd->hqk", dout[i], v[j])
+        dx = scale * weights * (dweights - (dout[i] * out[i]).sum(2).T[:, :, None])
+        dq[i] = torch.einsum("hqk,khd->qhd", dx, k[j])
+        dk[j] = torch.einsum("hqk,qhd->khd", dx, q[i])
+        dv[j] = torch.einsum("hqk,qhd->khd", weights * factors, dout[i])
+    return dq, dk, dv
+
+
+# ---- C core ----
+
+
+def _fake(q, *_):
+    return q.new_empty(q.shape), q.new_empty(q.shape[:2]), q.new_empty(q.shape[:2])
+
+
+def _kernel(q, k, v, q_offsets, k_offsets, *settings):
+    outputs = _fake(q)
+    library._C.attention(*map(dense_rows, (q, k, v)), dense(q_offsets), dense(k_offsets), *settings, *outputs)
+    return outputs
+
+
+def _backward_kernel(gradients, q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, *saved):
+    """Write the gradients of q, k and v into `gradients`, whose rows may lie apart."""
+    offsets, settings = (dense(q_offsets), dense(k_offsets)), (scale, dropout_p, seed)
+    library._C.attention_backward(*map(dense_rows, (q, k, v)), *offsets, *settings, *map(dense, saved), *gradients)
+
+
+# ---- ops ----
+
+
+def _define(name: str, schema: str, split: Callable, together: Callable):
+    """Define one op and its gradient, for one way of storing q, k and v in tensors.
+
+    Args:
+        name: of the op.
+        schema: the op's tensors in torch's schema language. Their gradients have the same shapes.
+        split: returns q, k and v as views of these tensors, so that nothing is copied. It also splits gradients.
+        together: returns the gradients of the tensors, given those of q, k and v. The composition needs it, because it
+            has no views to write to.
+    """
+    num = schema.count("Tensor")
+
+    def after_split(body: Callable) -> Callable:
+        return lambda *arguments: body(*split(*arguments[:num]), *arguments[num:])
+
+    def backward_kernel(*arguments):
+        gradients = [x.new_empty(x.shape) for x in arguments[:num]]
+        _backward_kernel(split(*gradients), *split(*arguments[:num]), *arguments[num:])
+        return tuple(gradients) if num > 1 else gradients[0]
+
+    def backward_fake(*arguments):
+        gradients = tuple(x.new_empty(x.shape) for x in arguments[:num])
+        return gradients if num > 1 else gradients[0]
+
+    arguments = f"{schema}, Tensor q_offsets, Tensor k_offsets, float scale, float dropout_p, int seed"
+    outputs = ", ".join(["Tensor"] * num)
+    bodies = map(after_split, (_reference, _fake, _kernel))
+    op = library.define(f"{name}({arguments}) -> (Tensor, Tensor, Tensor)", *bodies)
+    backward = library.define(
+        f"{name}_backward({arguments}, Tensor out, Tensor maximum, Tensor total, Tensor dout) -> ({outputs})",
+        lambda *arguments: together(*after_split(_backward_reference)(*arguments)),
+        backward_fake,
+        backward_kernel,
+    )
+
+    def save(ctx, inputs, output) -> None:
+        ctx.save_for_backward(*inputs[: num + 2], *output)
+        ctx.settings = inputs[num + 2 :]
+        ctx.set_materialize_grads(False)  # the other outputs have no gradients
+        ctx.mark_non_differentiable(*output[1:])
+
+    def gradient(ctx, dout, *_):
+        *arguments, out, maximum, total = ctx.saved_tensors
+        gradients = backward(*arguments, *ctx.settings, out, maximum, total, dout)
+        return *(gradients if num > 1 else (gradients,)), *[None] * 5
+
+    library.differentiate(op, save, gradient)
+    return op, backward
+
+
+def _split_key_value(q: Tensor, key_value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    check_shape("attention_kv", "key_value", key_value, -1, 2, -1, -1)
+    return q, *key_value.unbind(1)
+
+
+def _split_qkv(qkv: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    check_shape("attention_qkv", "qkv", qkv, -1, 3, -1, -1)
+    return qkv.unbind(1)
+
+
+_attention, _attention_backward = _define(
+    "attention", "Tensor q, Tensor k, Tensor v", lambda q, k, v: (q, k, v), lambda dq, dk, dv: (dq, dk, dv)
+)
+_attention_kv, _attention_kv_backward = _define(
+    "attention_kv", "Tensor q, Tensor key_value", _split_key_value, lambda dq, dk, dv: (dq, torch.stack([dk, dv], 1))
+)
+_attention_qkv, _attention_qkv_backward = _define(
+    "attention_qkv", "Tensor qkv", _split_qkv, lambda dq, dk, dv: torch.stack([dq, dk, dv], 1)
+)
+
+
+def _settings(width: int, scale: float | None, dropout_p: float, seed: int) -> tuple[float, float, int]:
+    """The settings as the ops take them: D^-1/2 if there is no scale, and the seed as a signed number of 64 bits."""
+    return width**-0.5 if scale is None else float(scale), float(dropout_p), (seed + (1 << 63)) % (1 << 64) - (1 << 63)
+
+
+def attention(
+    q: Tensor,
+    k: Tensor,
+    v: Tensor,
+    q_offsets: Tensor,
+    k_offsets: Tensor,
+    scale: float | None = None,
+    dropout_p: float = 0.0,
+    seed: int = 0,
+) -> tuple[Tensor, Tensor]:
+    """softmax(scale q k^T) v of each scene and head, with dropout on the weights.
+
+    Memory grows with the number of tokens, not with its square, forward and backward. A scene's result has the same
+    bits for any number of threads. Without dropout it has the same bits in any batch; dropout depends on the number of
+    the scene in the batch.
+
+    Args:
+        q: [Tq, H, D]; rows may lie apart, as in a slice of a fused projection. D is a multiple of 16 up to 128.
+        k, v: [Tk, H, D], likewise.
+        q_offsets, k_offsets: [B + 1] int64; scene b has the queries q_offsets[b]:q_offsets[b + 1] and the keys
+            k_offsets[b]:k_offsets[b + 1].
+        scale: factor of the scores; D^-1/2 by default.
+        dropout_p: the probability with which a weight is dropped, 0 <= p < 1; the others are scaled up.
+        seed: of the dropout, 64 bits; the same seed drops the same weights.
+
+    Returns:
+        out [Tq, H, D] and the log sum exp of the scores [Tq, H], which carries no gradient. A scene without keys gives
+        0 and -inf. A row with a NaN or +inf score, or with only -inf, is NaN.
+
+    Raises:
+        ValueError: shapes, offsets or dropout_p are not as above.
+    """
+    settings = _settings(q.shape[-1], scale, dropout_p, seed)
+    out, maximum, total = _attention(q, k, v, q_offsets, k_offsets, *settings)
+    return out, maximum + total.log()
+
+
+def cross_attention(
+    q: Tensor, key_value: Tensor, q_offsets: Tensor, k_offsets: Tensor, dropout_p: float = 0.0, seed: int = 0
+) -> Tensor:
+    """`attention` with keys and values in one tensor [Tk, 2, H, D], and with scale D^-1/2.
+
+    Their gradient has the same layout, so nothing is copied forward or backward. Returns only out [Tq, H, D].
+    """
+    return _attention_kv(q, key_value, q_offsets, k_offsets, *_settings(q.shape[-1], None, dropout_p, seed))[0]
+
+
+def self_attention(qkv: Tensor, offsets: Tensor, dropout_p: float = 0.0, seed: int = 0) -> Tensor:
+    """`attention` among the tokens of each scene, with q, k and v in one tensor [T, 3, H, D], and with scale D^-1/2.
+
+    The gradient has the same layout, so nothing is copied forward or backward. Returns only out [T, H, D].
+    """
+    return _attention_qkv(qkv, offsets, offsets, *_settings(qkv.shape[-1], None, dropout_p, seed))[0]

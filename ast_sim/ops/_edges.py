@@ -1,0 +1,91 @@
+"""A set of directed edges. It is sorted once, and messages are passed along it many times.
+
+Legend: M edges, S senders, R receivers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import accumulate
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ast_sim.ops.library import check_index
+
+
+def offsets_of(index: Tensor, num: int) -> Tensor:
+    """[num + 1] int64: value i fills the places offsets[i]:offsets[i + 1] of a sorted index with values below num."""
+    offsets = index.new_zeros(num + 1)
+    torch.cumsum(torch.bincount(index, minlength=num), 0, out=offsets[1:])
+    return offsets
+
+
+def join_indices(parts: Sequence[Tensor], sizes: Sequence[int]) -> Tensor:
+    """The indices of several scenes as one: those of a scene are shifted by the sizes of the scenes before it."""
+    return torch.cat([index + shift for index, shift in zip(parts, accumulate(sizes, initial=0), strict=False)])
+
+
+def join_offsets(parts: Sequence[Tensor]) -> Tensor:
+    """The offsets of several scenes as one, from 0 to the sum of their last ones."""
+    return F.pad(torch.cat([offsets.diff() for offsets in parts]).cumsum(0), (1, 0))
+
+
+@dataclass(frozen=True)
+class EdgeSet:
+    """Directed edges, sorted by receiver, then by sender.
+
+    Attributes:
+        senders: [M] int64.
+        receivers: [M] int64, ascending.
+        receiver_offsets: [R + 1] int64; the edges into r are receiver_offsets[r]:receiver_offsets[r + 1].
+        num_senders: S.
+    """
+
+    senders: Tensor
+    receivers: Tensor
+    receiver_offsets: Tensor
+    num_senders: int
+
+    @staticmethod
+    def from_pairs(senders: Tensor, receivers: Tensor, num_senders: int, num_receivers: int) -> EdgeSet:
+        """Sort edges given as index pairs.
+
+        Raises:
+            ValueError: an index is out of range; the message names its place and value.
+        """
+        check_index("EdgeSet", "senders", senders, num_senders)
+        check_index("EdgeSet", "receivers", receivers, num_receivers)
+        order = torch.argsort(receivers * max(num_senders, 1) + senders, stable=True)
+        senders, receivers = senders[order], receivers[order]
+        return EdgeSet(senders, receivers, offsets_of(receivers, num_receivers), num_senders)
+
+    @staticmethod
+    def concatenate(sets: list[EdgeSet]) -> EdgeSet:
+        """The edge sets of several scenes as one, whose nodes are numbered scene after scene."""
+        if len(sets) == 1:
+            return sets[0]
+        senders = join_indices([s.senders for s in sets], [s.num_senders for s in sets])
+        receivers = join_indices([s.receivers for s in sets], [s.num_receivers for s in sets])
+        offsets = join_offsets([s.receiver_offsets for s in sets])
+        return EdgeSet(senders, receivers, offsets, sum(s.num_senders for s in sets))
+
+    @property
+    def num_receivers(self) -> int:
+        return len(self.receiver_offsets) - 1
+
+    @cached_property
+    def by_receiver(self) -> tuple[Tensor, Tensor]:
+        """The edges in stored order, and the offsets of each receiver's edges, as segment ops take them."""
+        return torch.arange(len(self)), self.receiver_offsets
+
+    @cached_property
+    def by_sender(self) -> tuple[Tensor, Tensor]:
+        """The edges sorted by sender, and the offsets of each sender's edges, as segment ops take them."""
+        return torch.argsort(self.senders, stable=True), offsets_of(self.senders, self.num_senders)
+
+    def __len__(self) -> int:
+        return len(self.senders)

@@ -1,0 +1,85 @@
+"""Farthest point sampling: it chooses a few cells such that every other cell is near one of them.
+
+Legend: B scenes, C cells, S samples.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ast_sim.ops import library
+from ast_sim.ops.library import check_offsets, check_shape, dense
+
+EXTENT = 1 << 21  # below this difference of coordinates, squared distances are exact in float64
+
+
+def _out_offsets(offsets: Tensor, num: int) -> Tensor:
+    out = torch.zeros_like(offsets)
+    torch.cumsum(offsets.diff().clamp(max=num), 0, out=out[1:])
+    return out
+
+
+def _sample_scene(points: Tensor, num: int) -> Tensor:
+    distance = torch.full_like(points[:, 0], torch.iinfo(torch.int64).max)
+    picks = [torch.zeros_like(distance[0])]
+    while len(picks) < num:
+        distance = torch.minimum(distance, (points - points[picks[-1]]).square().sum(1))
+        distance[picks[-1]] = -1
+        picks.append(distance.argmax())
+    return torch.stack(picks)
+
+
+def _sample_reference(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
+    check_shape("farthest_point_sample", "coordinates", coordinates, -1, 3)
+    if coordinates.dtype != torch.int32:
+        raise TypeError(f"farthest_point_sample: coordinates must be int32, not {coordinates.dtype}")
+    check_offsets("farthest_point_sample", "offsets", offsets, len(coordinates))
+    picks = [offsets[:0]]
+    for scene, (begin, end) in enumerate(zip(offsets.tolist(), offsets[1:].tolist(), strict=False)):
+        points = coordinates[begin:end].long()
+        if len(points) and (points.amax(0) - points.amin(0)).max() >= EXTENT:
+            raise ValueError(f"farthest_point_sample: coordinates of scene {scene} differ by 2^21 or more")
+        few = end - begin <= num
+        picks.append(begin + (torch.arange(end - begin, device=points.device) if few else _sample_scene(points, num)))
+    return torch.cat(picks), _out_offsets(offsets, num)
+
+
+def _sample_kernel(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
+    indices, out_offsets = library._C.farthest_point_sample(dense(coordinates), dense(offsets), num)
+    return torch.from_numpy(indices), torch.from_numpy(out_offsets)
+
+
+def _sample_fake(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
+    return offsets.new_empty(torch.library.get_ctx().new_dynamic_size()), torch.empty_like(offsets)
+
+
+_sample = library.define(
+    "farthest_point_sample(Tensor coordinates, Tensor offsets, int num) -> (Tensor, Tensor)",
+    _sample_reference,
+    _sample_fake,
+    _sample_kernel,
+)
+
+
+def farthest_point_sample(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
+    """Exact greedy farthest point sampling of each scene.
+
+    The first sample is the scene's first point. Each further sample is the point that is farthest from all samples so
+    far. Of equally far points the one with the lowest index is taken. If all points left coincide with samples, the
+    lowest unused index follows. A scene with at most `num` points gives all of them in order. Distances are exact.
+
+    Args:
+        coordinates: [C, 3] int32. Sampling is fast if successive points lie near each other, as in Morton order.
+        offsets: [B + 1] int64, from 0 to C; the points of scene b are offsets[b]:offsets[b + 1].
+        num: the most samples of a scene, at least 1.
+
+    Returns:
+        The rows of the samples in coordinates, [S] int64, and the offsets of each scene's samples, [B + 1] int64.
+
+    Raises:
+        ValueError: num < 1, the offsets are not as above, or the coordinates of a scene differ by 2^21 or more.
+    """
+    if num < 1:
+        raise ValueError(f"farthest_point_sample: num must be at least 1, not {num}")
+    return _sample(coordinates, offsets, num)

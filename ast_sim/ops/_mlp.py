@@ -1,0 +1,182 @@
+"""Two dense layers with a ReLU between them and a LayerNorm behind them.
+
+Legend: M rows, I and I2 inputs, H hidden units, O outputs.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ast_sim.ops import library
+from ast_sim.ops._linear import _check_weight, _given, _outputs
+from ast_sim.ops.library import check_shape, dense, dense_rows
+
+EPSILON = 1e-5
+SAVED = 1 << 25  # hidden units and outputs with more elements are not kept for the gradient, but computed again
+
+
+def _check(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual) -> None:
+    if x.dim() != 2 or (beside is not None and (beside.dim() != 2 or len(beside) != len(x))):
+        shapes = tuple(x.shape), None if beside is None else tuple(beside.shape)
+        raise ValueError(f"mlp: x and beside must be matrices of equally many rows, not {shapes[0]} and {shapes[1]}")
+    _check_weight("mlp", weight1, x.shape[1] + (0 if beside is None else beside.shape[1]))
+    _check_weight("mlp", weight2, weight1.shape[0])
+    check_shape("mlp", "bias1", bias1, weight1.shape[0])
+    for name, vector in (("bias2", bias2), ("gamma", gamma), ("beta", beta)):
+        check_shape("mlp", name, vector, weight2.shape[0])
+    check_shape("mlp", "residual", residual, len(x), weight2.shape[0])
+    if (gamma is None) != (beta is None):
+        raise ValueError("mlp: gamma and beta go together")
+
+
+def _hidden(x, beside, weight1, bias1) -> Tensor:
+    return F.relu(F.linear(x if beside is None else torch.cat([x, beside], dim=1), weight1, bias1))
+
+
+def _normalized(y: Tensor) -> tuple[Tensor, Tensor]:
+    """Each row of y normalized, and the factors [M] of the rows."""
+    centred = y - y.mean(1, keepdim=True)
+    scale = (centred.square().mean(1) + EPSILON).rsqrt()
+    return centred * scale[:, None], scale
+
+
+# ---- composition ----
+
+
+def _reference(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual, save):
+    _check(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual)
+    hidden = _hidden(x, beside, weight1, bias1)
+    out = F.linear(hidden, weight2, bias2)
+    kept = [x.new_empty(0) for _ in range(3)]
+    if save:
+        kept[0] = hidden
+    if gamma is not None:
+        if save:
+            kept[1:] = _normalized(out)
+        out = F.layer_norm(out, out.shape[1:], gamma, beta, EPSILON)
+    return out if residual is None else out + residual, *kept
+
+
+def _backward_reference(
+    dout, x, beside, weight1, bias1, weight2, bias2, gamma, beta, hidden, normalized, scale, wanted
+):
+    hidden = _hidden(x, beside, weight1, bias1) if hidden is None else hidden
+    dgamma = dbeta = dy = dout
+    if gamma is not None:
+        if normalized is None:
+            normalized, scale = _normalized(F.linear(hidden, weight2, bias2))
+        dgamma, dbeta, dn = (dout * normalized).sum(0), dout.sum(0), dout * gamma
+        dy = dn - dn.mean(1, keepdim=True) - normalized * (dn * normalized).mean(1, keepdim=True)
+        dy = dy * scale[:, None]
+    dz = (dy @ weight2).masked_fill(hidden <= 0, 0)
+    inputs = x if beside is None else torch.cat([x, beside], dim=1)
+    dinputs = dz @ weight1
+    gradients = [dinputs[:, : x.shape[1]], dinputs[:, x.shape[1] :], dz.mT @ inputs, dz.sum(0), dy.mT @ hidden]
+    gradients += [dy.sum(0), dgamma, dbeta]
+    return tuple(g.clone() if want else x.new_empty(0) for g, want in zip(gradients, wanted, strict=True))
+
+
+# ---- C core ----
+
+
+def _kept(gamma: Tensor | None, save: bool) -> list[bool]:
+    """Whether hidden, normalized and scale are kept for the gradient."""
+    norm = save and gamma is not None
+    return [save, norm, norm]
+
+
+def _kernel(x, beside, *inputs):
+    *weights, residual, save = inputs
+    _check(x, beside, *weights, residual)
+    out, *kept = _fake(x, beside, *inputs)
+    tensors = (dense_rows(x), dense_rows(beside), *map(dense, weights), dense_rows(residual))
+    library._C.mlp(*tensors, out, *_given(_kept(weights[4], save), kept))
+    return out, *kept
+
+
+def _backward_kernel(dout, x, beside, *inputs):
+    *weights, hidden, normalized, scale, wanted = inputs
+    outputs = _backward_fake(dout, x, beside, *inputs)
+    tensors = (dense_rows(x), dense_rows(beside), *map(dense, weights), dense_rows(dout))
+    library._C.mlp_backward(*tensors, *map(dense, (hidden, normalized, scale)), *_given(wanted, outputs))
+    return outputs
+
+
+def _fake(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual, save):
+    rows, hidden, columns = x.shape[0], weight1.shape[0], weight2.shape[0]
+    kept = _outputs(x, _kept(gamma, save), [(rows, hidden), (rows, columns), (rows,)])
+    return x.new_empty(rows, columns), *kept
+
+
+def _backward_fake(dout, x, beside, weight1, bias1, weight2, *kept_and_wanted):
+    vectors = [weight1.shape[:1], *[weight2.shape[:1]] * 3]
+    beside_shape = (0,) if beside is None else beside.shape
+    shapes = [x.shape, beside_shape, weight1.shape, vectors[0], weight2.shape, *vectors[1:]]
+    return tuple(_outputs(x, kept_and_wanted[-1], shapes))
+
+
+_LAYERS = "Tensor weight1, Tensor? bias1, Tensor weight2, Tensor? bias2"
+_INPUTS = f"Tensor x, Tensor? beside, {_LAYERS}, Tensor? gamma, Tensor? beta"
+_mlp = library.define(
+    f"mlp({_INPUTS}, Tensor? residual, bool save) -> (Tensor, Tensor, Tensor, Tensor)", _reference, _fake, _kernel
+)
+_mlp_backward = library.define(
+    f"mlp_backward(Tensor dout, {_INPUTS}, Tensor? hidden, Tensor? normalized, Tensor? scale, bool[8] wanted)"
+    " -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)",
+    _backward_reference,
+    _backward_fake,
+    _backward_kernel,
+)
+
+
+def _save(ctx, inputs, output) -> None:
+    *tensors, _, save = inputs
+    ctx.set_materialize_grads(False)  # what is kept has no gradient
+    ctx.mark_non_differentiable(*output[1:])
+    ctx.save_for_backward(*tensors, *_given(_kept(inputs[6], save), output[1:]))
+
+
+def _gradient(ctx, dout, *_):
+    wanted = list(ctx.needs_input_grad[:8])
+    gradients = _mlp_backward(dout, *ctx.saved_tensors, wanted) if any(wanted) else [None] * 8
+    return *_given(wanted, gradients), dout if ctx.needs_input_grad[8] else None, None
+
+
+library.differentiate(_mlp, _save, _gradient)
+
+
+def mlp(
+    x: Tensor,
+    weight1: Tensor,
+    bias1: Tensor | None,
+    weight2: Tensor,
+    bias2: Tensor | None,
+    beside: Tensor | None = None,
+    norm: tuple[Tensor, Tensor] | None = None,
+    residual: Tensor | None = None,
+) -> Tensor:
+    """LN(W2 relu(W1 [x, beside] + b1) + b2) + residual in one pass. There is no LN without `norm`.
+
+    A row of the result depends only on that row of the inputs, bit for bit. The gradients have the same bits for any
+    number of threads. Hidden units of many rows are not kept for the gradient, but computed again (`SAVED`).
+
+    Args:
+        x: [M, I]; rows may lie apart, as in a slice of columns.
+        weight1, bias1: [H, I + I2] and [H] or None.
+        weight2, bias2: [O, H] and [O] or None.
+        beside: [M, I2]: more inputs, as if they were columns of x.
+        norm: gamma and beta of the LayerNorm, [O] each (epsilon 1e-5).
+        residual: [M, O].
+
+    Returns:
+        [M, O].
+
+    Raises:
+        ValueError: shapes are not as above.
+    """
+    tensors = (x, beside, weight1, bias1, weight2, bias2, *(norm or (None, None)))
+    small = x.shape[0] * (weight1.shape[0] + weight2.shape[0]) <= SAVED
+    save = small and torch.is_grad_enabled() and any(y is not None and y.requires_grad for y in tensors)
+    return _mlp(*tensors, residual, save)[0]

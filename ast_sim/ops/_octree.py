@@ -1,0 +1,302 @@
+"""Octree cells of point clouds, and coarser levels with the pairs of cells that a stride-2 convolution connects.
+
+Legend: B scenes, N nodes, C cells, P pairs. A cell's Morton key interleaves the bits of its x, y and z, x first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ast_sim.ops import library
+from ast_sim.ops.library import check_offsets, check_shape, dense, segment_of
+
+MAX_DEPTH = 21
+
+
+@dataclass(frozen=True)
+class Octree:
+    """The occupied cells of one level, in Morton order within each scene.
+
+    Attributes:
+        keys: [C] int64, Morton keys, rising within a scene.
+        cell_offsets: [B + 1] int64; the cells of scene b are cell_offsets[b]:cell_offsets[b + 1].
+        node_cell: [N] int64, the cell of each node.
+        node_order: [N] int64, the nodes sorted by scene, cell and index.
+        node_offsets: [C + 1] int64; the nodes of cell c are node_order[node_offsets[c]:node_offsets[c + 1]].
+        depth: the domain is cut into 2^depth cells per axis.
+    """
+
+    keys: Tensor
+    cell_offsets: Tensor
+    node_cell: Tensor
+    node_order: Tensor
+    node_offsets: Tensor
+    depth: int
+
+    def coordinates(self) -> Tensor:
+        """[C, 3] int32: x, y and z of each cell, 0..2^depth - 1."""
+        return _coordinates(self.keys)
+
+    def centers(self) -> Tensor:
+        """[C, 3] float32: the middle of each cell, if the domain is scaled to [-1, 1]. Exact."""
+        return (2 * self.coordinates() + (1 - (1 << self.depth))).float() * 0.5**self.depth
+
+    def coarsen(self) -> CellMap:
+        """The next coarser level, whose nodes are the cells of this one.
+
+        Raises:
+            ValueError: at depth 0.
+        """
+        return self.coarsen_all(1)[0]
+
+    def coarsen_all(self, levels: int) -> list[CellMap]:
+        """The next coarser levels, each made from the one before it. One call is cheaper than several.
+
+        Raises:
+            ValueError: unless 0 <= levels <= depth.
+        """
+        if not 0 <= levels <= self.depth:
+            raise ValueError(f"octree: a tree of depth {self.depth} has no coarser level {levels} steps up")
+        parts, maps = _coarsen(self.keys, self.cell_offsets, levels), []
+        order = torch.arange(len(self.keys), device=self.keys.device)
+        for level in range(levels):
+            keys, cell_offsets, node_offsets, node_cell, *pairs = parts[9 * level : 9 * level + 9]
+            num_fine = node_cell.shape[0]
+            coarse = Octree(keys, cell_offsets, node_cell, order[:num_fine], node_offsets, self.depth - level - 1)
+            maps.append(CellMap(coarse, num_fine, *pairs))
+        return maps
+
+
+@dataclass(frozen=True)
+class CellMap:
+    """The pairs of a fine and a coarse cell that the 3x3x3 kernel with stride 2 connects.
+
+    Kernel offset k = 9(a+1) + 3(b+1) + (c+1) pairs the coarse cell X with the fine cell 2 X + (a, b, c), for a, b, c in
+    {-1, 0, 1}. The pairs of offset k are the rows pair_offsets[k]:pair_offsets[k + 1] of each list.
+
+    Attributes:
+        coarse: the coarser level; its nodes are the cells of the finer one.
+        num_fine: the number of cells of the finer level.
+        pair_offsets: [28] int64.
+        fine, coarse_index: [P] int64, the pairs, sorted by coarse cell within each offset.
+        fine_by_fine, coarse_by_fine: [P] int64, the same pairs, sorted by fine cell within each offset.
+    """
+
+    coarse: Octree
+    num_fine: int
+    pair_offsets: Tensor
+    fine: Tensor
+    coarse_index: Tensor
+    fine_by_fine: Tensor
+    coarse_by_fine: Tensor
+
+
+# ---- cells ----
+
+
+# Bits move apart in five steps. Step s shifts some bits by 2^(5 - s) and then keeps the bits of mask s + 1.
+_MASKS = (
+    0x1FFFFF, 0x001F00000000FFFF, 0x001F0000FF0000FF, 0x100F00F00F00F00F, 0x10C30C30C30C30C3, 0x1249249249249249,
+)  # fmt: skip
+
+
+def _spread(x: Tensor) -> Tensor:
+    """Move bit i of x < 2^21 to bit 3i."""
+    for step in range(5):
+        x = (x | x << (32 >> step)) & _MASKS[step + 1]
+    return x
+
+
+def _gather(x: Tensor) -> Tensor:
+    """The inverse of `_spread`: move bit 3i to bit i."""
+    x = x & _MASKS[5]
+    for step in reversed(range(5)):
+        x = (x | x >> (32 >> step)) & _MASKS[step]
+    return x
+
+
+def _keys_of(coordinates: Tensor) -> Tensor:
+    x, y, z = coordinates.unbind(1)
+    return _spread(x) << 2 | _spread(y) << 1 | _spread(z)
+
+
+def _check_octree(positions: Tensor, offsets: Tensor, center: Sequence[float], half_width: float, depth: int) -> None:
+    check_shape("octree", "positions", positions, -1, 3)
+    if not positions.is_floating_point():
+        raise TypeError(f"octree: positions must be float32, not {positions.dtype}")
+    check_offsets("octree", "offsets", offsets, len(positions))
+    if not 0 <= depth <= MAX_DEPTH:
+        raise ValueError(f"octree: depth must lie in 0..{MAX_DEPTH}, not {depth}")
+    if not 0 < half_width < 1e300:
+        raise ValueError("octree: half_width must be positive and finite")
+    if not all(abs(x) < 1e300 for x in center):
+        raise ValueError("octree: center must be finite")
+
+
+def _octree_reference(positions: Tensor, offsets: Tensor, center: Sequence[float], half_width: float, depth: int):
+    _check_octree(positions, offsets, center, half_width, depth)
+    unit = (positions.double() - positions.new_tensor(center, dtype=torch.float64) + half_width) / (2 * half_width)
+    finite, inside = positions.isfinite().all(1), ((unit >= -1e-6) & (unit <= 1 + 1e-6)).all(1)
+    bad = (~(finite & inside)).nonzero()
+    if len(bad):
+        node = int(bad[0])
+        position = ", ".join(f"{x:.9g}" for x in positions[node].tolist())
+        problem = f"lies outside the domain of half width {half_width:.9g}" if finite[node] else "is not finite"
+        raise ValueError(f"octree: positions[{node}] = ({position}) {problem}")
+    keys = _keys_of((unit * 2**depth).floor().long().clamp(0, 2**depth - 1))
+    scenes = segment_of(offsets)
+    order = torch.argsort(keys, stable=True)
+    if len(offsets) > 2:
+        order = order[torch.argsort(scenes[order], stable=True)]
+    return *_runs(keys[order], scenes[order], offsets, order), order
+
+
+def _runs(keys: Tensor, scenes: Tensor, offsets: Tensor, order: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The cells of rows sorted by (scene, key): keys, cell_offsets, node_offsets and node_cell.
+
+    `order` [N] are the nodes of the sorted rows.
+    """
+    head = torch.ones_like(keys, dtype=torch.bool)
+    head[1:] = (keys[1:] != keys[:-1]) | (scenes[1:] != scenes[:-1])
+    starts = head.nonzero()[:, 0]
+    node_cell = torch.empty_like(keys)
+    node_cell[order] = head.cumsum(0) - 1
+    node_offsets = torch.cat([starts, offsets[-1:]])
+    return keys[starts], torch.searchsorted(starts, offsets), node_offsets, node_cell
+
+
+def _octree_kernel(positions: Tensor, offsets: Tensor, center: Sequence[float], half_width: float, depth: int):
+    n = len(positions)
+    keys, node_cell, node_order = (offsets.new_empty(n) for _ in range(3))
+    cell_offsets, node_offsets = torch.empty_like(offsets), offsets.new_empty(n + 1)
+    outputs = (keys, cell_offsets, node_cell, node_order, node_offsets)
+    library._C.octree_build(dense(positions), dense(offsets), *center, half_width, depth, *outputs)
+    num = int(cell_offsets[-1])
+    return keys[:num], cell_offsets, node_offsets[: num + 1], node_cell, node_order
+
+
+def _octree_fake(positions: Tensor, offsets: Tensor, center: Sequence[float], half_width: float, depth: int):
+    num, n = torch.library.get_ctx().new_dynamic_size(), positions.shape[0]
+    return tuple(offsets.new_empty(size) for size in (num, offsets.shape[0], num + 1, n, n))
+
+
+def _coordinates_reference(keys: Tensor) -> Tensor:
+    return torch.stack([_gather(keys >> 2), _gather(keys >> 1), _gather(keys)], 1).int()
+
+
+def _coordinates_fake(keys: Tensor) -> Tensor:
+    return keys.new_empty(keys.shape[0], 3, dtype=torch.int32)
+
+
+# ---- the coarser level ----
+
+
+def _after_reference(keys: Tensor, scenes: Tensor) -> Tensor:
+    """[C, 8]: the cell of the same scene at +(i, j, k), in column 4i + 2j + k, or -1."""
+    if len(keys) == 0:
+        return keys.new_empty(0, 8)
+    unique, rank = keys.unique(return_inverse=True)
+    place = scenes * len(unique) + rank  # ascending like (scene, key), but without overflow
+    shift = torch.tensor([[d >> 2, d >> 1 & 1, d & 1] for d in range(8)], device=keys.device)
+    wanted = _keys_of((_coordinates_reference(keys)[:, None] + shift).reshape(-1, 3)).reshape(-1, 8)
+    rank = torch.searchsorted(unique, wanted).clamp(max=len(unique) - 1)
+    wanted_place = scenes[:, None] * len(unique) + rank
+    cell = torch.searchsorted(place, wanted_place).clamp(max=len(place) - 1)
+    return torch.where((unique[rank] == wanted) & (place[cell] == wanted_place), cell, -1)
+
+
+def _coarsen_reference(keys: Tensor, cell_offsets: Tensor, levels: int) -> list[Tensor]:
+    parts: list[Tensor] = []
+    for _ in range(levels):
+        parts += _coarsen_once(keys, cell_offsets)
+        keys, cell_offsets = parts[-9:-7]
+    return parts
+
+
+def _coarsen_once(keys: Tensor, cell_offsets: Tensor) -> tuple[Tensor, ...]:
+    check_offsets("octree_coarsen", "cell_offsets", cell_offsets, len(keys))
+    scenes = segment_of(cell_offsets)
+    wrong = keys < 0
+    wrong[1:] |= (keys[1:] <= keys[:-1]) & (scenes[1:] == scenes[:-1])
+    if wrong.any():
+        at = int(wrong.nonzero()[0])
+        raise ValueError(
+            "octree_coarsen: keys must be at least 0 and rise strictly within each scene, but"
+            f" keys[{at}] is {int(keys[at])}"
+        )
+    rows = torch.arange(len(keys), device=keys.device)
+    coarse_keys, coarse_offsets, node_offsets, node_cell = _runs(keys >> 3, scenes, cell_offsets, rows)
+    after = _after_reference(coarse_keys, segment_of(coarse_offsets))
+    groups = []
+    for k in range(27):
+        step = (k // 9 - 1, k // 3 % 3 - 1, k % 3 - 1)
+        octant = sum((a != 0) << (2 - i) for i, a in enumerate(step))
+        successor = sum((a < 0) << (2 - i) for i, a in enumerate(step))
+        fine = ((keys & 7) == octant).nonzero()[:, 0]
+        coarse = after[node_cell[fine], successor]
+        fine, coarse = fine[coarse >= 0], coarse[coarse >= 0]
+        order = coarse.argsort()
+        groups.append((fine[order], coarse[order], fine, coarse))
+    counts = torch.tensor([0] + [len(group[0]) for group in groups], device=keys.device)
+    pairs = (torch.cat(parts) for parts in zip(*groups, strict=True))
+    return coarse_keys, coarse_offsets, node_offsets, node_cell, counts.cumsum(0), *pairs
+
+
+def _coarsen_kernel(keys: Tensor, cell_offsets: Tensor, levels: int) -> list[Tensor]:
+    parts = library._C.octree_coarsen(dense(keys), dense(cell_offsets), levels)
+    return [torch.from_numpy(part) for part in parts]
+
+
+def _coarsen_fake(keys: Tensor, cell_offsets: Tensor, levels: int) -> list[Tensor]:
+    ctx, num_fine, parts = torch.library.get_ctx(), keys.shape[0], []
+    for _ in range(levels):
+        num, num_pairs = ctx.new_dynamic_size(), ctx.new_dynamic_size()
+        sizes = (num, cell_offsets.shape[0], num + 1, num_fine, 28, *[num_pairs] * 4)
+        parts += [keys.new_empty(size) for size in sizes]
+        num_fine = num
+    return parts
+
+
+_octree = library.define(
+    "octree(Tensor positions, Tensor offsets, float[] center, float half_width, int depth)"
+    " -> (Tensor, Tensor, Tensor, Tensor, Tensor)",
+    _octree_reference,
+    _octree_fake,
+    _octree_kernel,
+)
+_coordinates = library.define("octree_coordinates(Tensor keys) -> Tensor", _coordinates_reference, _coordinates_fake)
+_coarsen = library.define(
+    "octree_coarsen(Tensor keys, Tensor cell_offsets, int levels) -> Tensor[]",
+    _coarsen_reference,
+    _coarsen_fake,
+    _coarsen_kernel,
+)
+
+
+def octree(positions: Tensor, offsets: Tensor, center: Sequence[float], half_width: float, depth: int) -> Octree:
+    """The occupied cells of each scene. The cube center +- half_width is cut into 2^depth cells per axis.
+
+    The cell of a node p is floor((p - center + half_width) / (2 half_width) 2^depth) per axis, in float64, clamped to
+    0..2^depth - 1. So a node on the far face of the cube belongs to the last cell.
+
+    Args:
+        positions: [N, 3].
+        offsets: [B + 1] int64, from 0 to N; the nodes of scene b are offsets[b]:offsets[b + 1].
+        center: the middle of the domain, in the unit of positions.
+        half_width: half the side of the domain.
+        depth: 0..21.
+
+    Raises:
+        ValueError: a node is not finite or lies outside the domain by more than 1e-6 of its width (the message names
+            the first one and its position), or the offsets, the depth or the domain are not as above.
+    """
+    if len(center) != 3:
+        raise ValueError(f"octree: center must be three numbers, not {len(center)}")
+    center = [float(x) for x in center]
+    parts = _octree(positions, offsets, center, float(half_width), depth)
+    keys, cell_offsets, node_offsets, node_cell, node_order = parts
+    return Octree(keys, cell_offsets, node_cell, node_order, node_offsets, depth)

@@ -1,0 +1,104 @@
+"""Sums and means over the rows of each segment, such as the nodes of each cell.
+
+Legend: N rows, C segments, F channels.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ast_sim.ops import library
+from ast_sim.ops.library import check_offsets, check_shape, segment_of
+
+
+def _scale(node_offsets: Tensor, mean: bool, dtype: torch.dtype) -> Tensor:
+    counts = node_offsets.diff().clamp(min=1) if mean else torch.ones_like(node_offsets[1:])
+    return counts.to(dtype).reciprocal()[:, None]
+
+
+def _check(op: str, x: Tensor, node_order: Tensor, node_offsets: Tensor) -> None:
+    check_shape(op, "x", x, -1, -1)
+    check_shape(op, "node_order", node_order, len(x))
+    check_offsets(op, "node_offsets", node_offsets, len(x))
+    if not torch.equal(node_order.sort().values, torch.arange(len(x), device=x.device)):
+        raise ValueError(f"{op}: node_order must be a permutation")
+
+
+def _sum_reference(x: Tensor, node_order: Tensor, node_offsets: Tensor, mean: bool) -> Tensor:
+    _check("segment_sum", x, node_order, node_offsets)
+    out = x.new_zeros(len(node_offsets) - 1, x.shape[1])
+    out.index_add_(0, segment_of(node_offsets), x[node_order])
+    return out * _scale(node_offsets, mean, x.dtype)
+
+
+def _sum_fake(x: Tensor, node_order: Tensor, node_offsets: Tensor, mean: bool) -> Tensor:
+    return x.new_empty(torch.sym_max(node_offsets.shape[0] - 1, 0), x.shape[-1])
+
+
+def _spread_reference(dout: Tensor, node_order: Tensor, node_offsets: Tensor, mean: bool) -> Tensor:
+    dx = dout.new_empty(len(node_order), dout.shape[1])
+    dx[node_order] = (dout * _scale(node_offsets, mean, dout.dtype))[segment_of(node_offsets)]
+    return dx
+
+
+def _spread_fake(dout: Tensor, node_order: Tensor, node_offsets: Tensor, mean: bool) -> Tensor:
+    return dout.new_empty(node_order.shape[0], dout.shape[1])
+
+
+def _column_sum_reference(x: Tensor) -> Tensor:
+    check_shape("column_sum", "x", x, -1, -1)
+    return x.sum(0)
+
+
+_SEGMENTS = "Tensor node_order, Tensor node_offsets, bool mean) -> Tensor"
+_sum = library.define(f"segment_sum(Tensor x, {_SEGMENTS}", _sum_reference, _sum_fake)
+_spread = library.define(f"segment_spread(Tensor dout, {_SEGMENTS}", _spread_reference, _spread_fake)
+_column_sum = library.define(
+    "column_sum(Tensor x) -> Tensor", _column_sum_reference, lambda x: x.new_empty(x.shape[-1:])
+)
+
+
+def _save_segments(ctx, inputs, output) -> None:
+    _, node_order, node_offsets, ctx.mean = inputs
+    ctx.save_for_backward(node_order, node_offsets)
+
+
+def _gradient_by(adjoint: library.Op):
+    return lambda ctx, grad: (adjoint(grad, *ctx.saved_tensors, ctx.mean), None, None, None)
+
+
+library.differentiate(_sum, _save_segments, _gradient_by(_spread))
+library.differentiate(_spread, _save_segments, _gradient_by(_sum))
+library.differentiate(
+    _column_sum,
+    lambda ctx, inputs, output: setattr(ctx, "rows", inputs[0].shape[0]),
+    lambda ctx, grad: grad.expand(ctx.rows, -1),
+)
+
+
+def segment_sum(x: Tensor, node_order: Tensor, node_offsets: Tensor) -> Tensor:
+    """Row c is the sum of x[node_order[j]] over j in [node_offsets[c], node_offsets[c+1]), added in that order.
+
+    Args:
+        x: [N, F].
+        node_order: [N] int64, a permutation.
+        node_offsets: [C + 1] int64, from 0 to N.
+
+    Returns:
+        [C, F]; an empty segment is 0.
+
+    Raises:
+        ValueError: the offsets fall or do not end at N, or the order is no permutation.
+    """
+    return _sum(x, node_order, node_offsets, False)
+
+
+def segment_mean(x: Tensor, node_order: Tensor, node_offsets: Tensor) -> Tensor:
+    """`segment_sum` divided by the number of rows of each segment; an empty segment is 0."""
+    return _sum(x, node_order, node_offsets, True)
+
+
+def column_sum(x: Tensor) -> Tensor:
+    """[F]: the sum over the rows of x [N, F]. Its bits do not depend on the number of threads, unlike torch's sum."""
+    return _column_sum(x)

@@ -1,0 +1,152 @@
+"""Convolutions of kernel 3x3x3 and stride 2 between a level of an octree and the next coarser one.
+
+Legend: C_fine and C_coarse cells, I and O channels in and out, P pairs of cells that the kernel connects.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from ast_sim.ops import library
+from ast_sim.ops._octree import CellMap
+from ast_sim.ops._segment import column_sum
+from ast_sim.ops.library import check_index, check_offsets, check_shape, dense
+
+OFFSETS = 27
+
+
+def _check(op: str, pair_offsets: Tensor, source: Tensor, sources: int, destination: Tensor, destinations: int) -> None:
+    check_shape(op, "pair_offsets", pair_offsets, OFFSETS + 1)
+    check_shape(op, "source", source, -1)
+    check_shape(op, "destination", destination, len(source))
+    check_offsets(op, "pair_offsets", pair_offsets, len(source))
+    check_index(op, "source", source, sources)
+    check_index(op, "destination", destination, destinations)
+
+
+def _groups(pair_offsets: Tensor, source: Tensor, destination: Tensor):
+    """Kernel offset, sources and destinations of each group that has pairs."""
+    offsets = pair_offsets.tolist()
+    for k in range(OFFSETS):
+        if offsets[k] < offsets[k + 1]:
+            pairs = slice(offsets[k], offsets[k + 1])
+            yield k, source[pairs], destination[pairs]
+
+
+def _reference(x, weight, bias, transposed, pair_offsets, source, destination, back_source, back_destination, num_out):
+    check_shape("sparse_conv", "x", x, -1, -1)
+    check_shape("sparse_conv", "weight", weight, OFFSETS, -1, -1)
+    weight = weight.mT if transposed else weight
+    if x.shape[1] != weight.shape[1]:
+        raise ValueError(f"sparse_conv: x has {x.shape[1]} channels, weight takes {weight.shape[1]}")
+    check_shape("sparse_conv", "bias", bias, weight.shape[2])
+    _check("sparse_conv", pair_offsets, source, len(x), destination, num_out)
+    out = x.new_zeros(num_out, weight.shape[2])
+    for k, i, j in _groups(pair_offsets, source, destination):
+        out = out.index_add(0, j, x.index_select(0, i) @ weight[k])
+    return out if bias is None else out + bias
+
+
+def _weight_reference(x, dout, pair_offsets, source, destination):
+    _check("sparse_conv_weight", pair_offsets, source, len(x), destination, len(dout))
+    dweight = x.new_zeros(OFFSETS, x.shape[1], dout.shape[1])
+    for k, i, j in _groups(pair_offsets, source, destination):
+        dweight[k] = x.index_select(0, i).T @ dout.index_select(0, j)
+    return dweight
+
+
+def _kernel(x, weight, bias, transposed, pair_offsets, source, destination, *back_and_num):
+    out = _fake(x, weight, bias, transposed, *back_and_num)
+    inputs = (x, weight, x.new_empty(0) if bias is None else bias)
+    pairs = (pair_offsets, source, destination)
+    library._C.sparse_conv(*map(dense, inputs), transposed, *map(dense, pairs), out)
+    return out
+
+
+def _fake(x, weight, bias, transposed, *pairs_and_num):
+    return x.new_empty(pairs_and_num[-1], weight.shape[1 if transposed else -1])
+
+
+def _weight_fake(x, dout, pair_offsets, source, destination):
+    return x.new_empty(OFFSETS, x.shape[-1], dout.shape[-1])
+
+
+# The pairs come twice. (source, destination) are sorted by destination. The gradient with respect to x goes the other
+# way: (back_source, back_destination) are the destinations and sources of the same pairs, sorted by source.
+_conv = library.define(
+    "sparse_conv(Tensor x, Tensor weight, Tensor? bias, bool transposed, Tensor pair_offsets, Tensor source,"
+    " Tensor destination, Tensor back_source, Tensor back_destination, SymInt num_out) -> Tensor",
+    _reference,
+    _fake,
+    _kernel,
+)
+_conv_weight = library.define(
+    "sparse_conv_weight(Tensor x, Tensor dout, Tensor pair_offsets, Tensor source, Tensor destination) -> Tensor",
+    _weight_reference,
+    _weight_fake,
+)
+
+
+def _save(ctx, inputs, output) -> None:
+    x, weight, _, ctx.transposed, *pairs, _ = inputs
+    ctx.save_for_backward(x, weight, *pairs)
+
+
+def _gradient(ctx, dout):
+    x, weight, pair_offsets, source, destination, back_source, back_destination = ctx.saved_tensors
+    dx = dweight = dbias = None
+    if ctx.needs_input_grad[0]:
+        lists = (back_source, back_destination, source, destination)
+        dx = _conv(dout, weight, None, not ctx.transposed, pair_offsets, *lists, x.shape[0])
+    if ctx.needs_input_grad[1] and ctx.transposed:
+        dweight = _conv_weight(dout, x, pair_offsets, destination, source)
+    elif ctx.needs_input_grad[1]:
+        dweight = _conv_weight(x, dout, pair_offsets, source, destination)
+    if ctx.needs_input_grad[2]:
+        dbias = column_sum(dout)
+    return dx, dweight, dbias, *[None] * 7
+
+
+library.differentiate(_conv, _save, _gradient)
+
+
+def sparse_conv(x: Tensor, weight: Tensor, map: CellMap, bias: Tensor | None = None) -> Tensor:
+    """Convolution with stride 2: out[X] = bias + sum over (a, b, c) in {-1, 0, 1}^3 of x[2 X + (a, b, c)] W_k.
+
+    Args:
+        x: [C_fine, I], features of the cells of a level.
+        weight: [27, I, O]; W_k belongs to kernel offset k = 9(a+1) + 3(b+1) + (c+1).
+        map: `Octree.coarsen()` of that level.
+        bias: [O], or None for 0.
+
+    Returns:
+        [C_coarse, O]. A cell that does not exist contributes nothing.
+
+    Raises:
+        ValueError: shapes do not fit each other or the map.
+    """
+    if x.shape[0] != map.num_fine:
+        raise ValueError(f"sparse_conv: x has {x.shape[0]} rows for {map.num_fine} fine cells")
+    pairs = (map.fine, map.coarse_index, map.coarse_by_fine, map.fine_by_fine)
+    return _conv(x, weight, bias, False, map.pair_offsets, *pairs, len(map.coarse.keys))
+
+
+def sparse_conv_transposed(x: Tensor, weight: Tensor, map: CellMap, bias: Tensor | None = None) -> Tensor:
+    """The way back, along the same pairs: out[2 X + (a, b, c)] = bias + sum over the coarse cells X of x[X] W_k.
+
+    Args:
+        x: [C_coarse, I], features of the cells of the coarser level.
+        weight: [27, I, O].
+        map: `Octree.coarsen()` of the finer level.
+        bias: [O], or None for 0.
+
+    Returns:
+        [C_fine, O].
+
+    Raises:
+        ValueError: shapes do not fit each other or the map.
+    """
+    if x.shape[0] != len(map.coarse.keys):
+        raise ValueError(f"sparse_conv_transposed: x has {x.shape[0]} rows for {len(map.coarse.keys)} coarse cells")
+    pairs = (map.coarse_by_fine, map.fine_by_fine, map.fine, map.coarse_index)
+    return _conv(x, weight, bias, False, map.pair_offsets, *pairs, map.num_fine)

@@ -1,0 +1,256 @@
+"""Prescribed motions: positions of obstacles and handles in each frame, or rigid motions of bodies."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ast_sim.scene import Scene, nodes_of_body
+from ast_sim.support.errors import ConfigError
+
+Vector = Sequence[float]
+
+_VECTOR = r"[^\s,]+,[^\s,]+,[^\s,]+"
+_MOVE = re.compile(
+    rf"(?P<body>[0-9]+)=(?P<path>{_VECTOR}( then {_VECTOR})*)?"
+    rf" ?(rotate (?P<angle>\S+) about (?P<axis>{_VECTOR}) at (?P<point>{_VECTOR}))?"
+)
+
+
+@dataclass(frozen=True)
+class RigidMotion:
+    """How a body moves as a whole: x goes to R(s) (x - point) + point + d(s), where s runs from 0 to 1.
+
+    The angle of the rotation R grows evenly with s. The displacement d follows straight lines from one waypoint to the
+    next, at the same speed all the way. A waypoint may lie between two frames.
+
+    Attributes:
+        translation: the displacement at the end, three numbers in the scene's length unit; or a path, a list of such
+            triples. Each triple is a displacement from the start, not from the waypoint before:
+            ((0, 0, -1), (0, 0, 0)) goes down and comes back.
+        rotation: the angle at the end in degrees. It may exceed 360. A positive angle is counter-clockwise if the axis
+            points to the observer.
+        axis, point: the direction of the axis of rotation (its length does not matter) and a point on the axis, in the
+            undeformed scene. The translation moves the axis as well.
+
+    Raises:
+        ConfigError: a vector does not have three numbers, a number is not finite, or the axis is zero.
+    """
+
+    translation: Vector | Sequence[Vector] = (0.0, 0.0, 0.0)
+    rotation: float = 0.0
+    axis: Vector = (0.0, 0.0, 1.0)
+    point: Vector = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        path = np.shape(self.translation)
+        for name, wanted, fits in (
+            ("translation", "three numbers or a list of triples", path == (3,) or (len(path) == 2 and path[1] == 3)),
+            ("rotation", "one number", np.ndim(self.rotation) == 0),
+            ("axis", "three numbers, not all zero", np.shape(self.axis) == (3,) and np.any(self.axis)),
+            ("point", "three numbers", np.shape(self.point) == (3,)),
+        ):
+            value = getattr(self, name)
+            if not fits or not np.size(value) or not np.isfinite(np.asarray(value, np.float64)).all():
+                raise ConfigError(f"{name} of a motion must be {wanted}, all finite, not {value}")
+
+    def at(self, s: float, points: np.ndarray) -> np.ndarray:
+        """[n, 3] float64: the positions of the undeformed `points` [n, 3] at `s` in [0, 1]."""
+        shares, corners = self._path()
+        displacement = np.array([np.interp(s, shares, corners[:, axis]) for axis in range(3)])
+        return (points - np.asarray(self.point)) @ self._rotated(s).T + self.point + displacement
+
+    def largest_speed(self, points: np.ndarray) -> float:
+        """The largest speed of the undeformed `points` [n, 3], as a length per unit of s."""
+        angle = np.radians(abs(self.rotation))
+        axis = np.asarray(self.axis) * (np.sign(self.rotation) / np.linalg.norm(self.axis))
+        spin = angle * np.cross(axis, points - np.asarray(self.point))  # the rotation's velocity at s = 0
+        turned = np.cross(axis, spin)
+        shares, corners = self._path()
+        square = np.zeros(len(points))
+        for a, b, velocity in _segments(shares, corners):
+            # |velocity + R(s) spin|^2, where velocity . R(s) spin = along cos(angle s) + across sin(angle s):
+            along, across = spin @ velocity, turned @ velocity
+            ends = [along * np.cos(angle * s) + across * np.sin(angle * s) for s in (a, b)]
+            peak_inside = (np.arctan2(across, along) - angle * a) % (2 * np.pi) <= angle * (b - a)
+            product = np.where(peak_inside, np.hypot(along, across), np.maximum(*ends))
+            square = np.maximum(square, velocity @ velocity + (spin**2).sum(axis=1) + 2 * product)
+        return float(np.sqrt(square.max(initial=0.0)))
+
+    def _path(self) -> tuple[np.ndarray, np.ndarray]:
+        """The values of s [K] at which the path has its corners, and the corners [K, 3]; the first is the start."""
+        corners = np.concatenate([np.zeros((1, 3)), np.reshape(np.asarray(self.translation, np.float64), (-1, 3))])
+        lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+        kept = np.concatenate([[True], lengths > 0])
+        way = np.concatenate([[0.0], np.cumsum(lengths)])[kept]
+        return way / (way[-1] or 1.0), corners[kept]
+
+    def _rotated(self, s: float) -> np.ndarray:
+        """R(s) [3, 3] = I + sin(angle) K + (1 - cos(angle)) K^2, where K v = axis x v (Rodrigues)."""
+        angle = np.radians(self.rotation) * s
+        cross = np.cross(np.eye(3), np.asarray(self.axis) / np.linalg.norm(self.axis))
+        return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """The motion of the prescribed nodes of a scene (obstacles and handles) over S frames.
+
+    Attributes:
+        position: [S, N, 3] float32, in the scene's length unit. The rows of free nodes are read only in frame 0, where
+            the scene starts; in dynamic scenes also in frame 1, where equal positions mean a start without velocity.
+    """
+
+    position: np.ndarray
+
+    @classmethod
+    def of_bodies(cls, scene: Scene, motions: Mapping[int, RigidMotion | Vector], frames: int) -> Motion:
+        """Rigid motions from the first frame to the last. They move the prescribed nodes of the named bodies.
+
+        Prescribed nodes of other bodies stand still. All free nodes start at rest, undeformed.
+
+        Args:
+            motions: the motion of each body by the number of the body; three numbers are a translation.
+            frames: S, at least 2.
+
+        Raises:
+            ConfigError: `frames` is below 2, there is no such body, or the body has no prescribed node.
+        """
+        if frames < 2:
+            raise ConfigError(f"a motion needs at least 2 frames, not {frames}")
+        position = np.repeat(scene.rest_position[None], frames, axis=0)
+        for nodes, motion in _moved(scene, motions):
+            start = scene.rest_position[nodes].astype(np.float64)
+            for frame in range(1, frames):
+                position[frame, nodes] = motion.at(frame / (frames - 1), start)
+        return cls(position)
+
+    @classmethod
+    def of_positions(cls, scene: Scene, position: np.ndarray) -> Motion:
+        """A motion from positions of all nodes [S, N, 3], or of the P prescribed nodes [S, P, 3] in ascending order.
+
+        With [S, P, 3] the free nodes start at rest, undeformed.
+
+        Raises:
+            ConfigError: the shape is another one, or a number is not finite.
+        """
+        position = np.asarray(position, np.float32)
+        p = int(scene.prescribed.sum())
+        if position.ndim == 3 and position.shape[1:] == (p, 3) and p < scene.num_nodes:
+            whole = np.repeat(scene.rest_position[None], len(position), axis=0)
+            whole[:, scene.prescribed] = position
+            position = whole
+        motion = cls(position)
+        motion.check(scene)
+        return motion
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.position)
+
+    def check(self, scene: Scene) -> None:
+        """Raise ConfigError unless the shape fits `scene`, there are two or more frames, and all numbers are finite."""
+        n, p = scene.num_nodes, int(scene.prescribed.sum())
+        shape = self.position.shape
+        if len(shape) != 3 or shape[1:] != (n, 3) or shape[0] < 2:
+            raise ConfigError(
+                f"the motion has the shape {list(shape)}, must be [frames, {n} nodes, 3] or [frames, {p} prescribed"
+                " nodes, 3] with at least 2 frames"
+            )
+        finite = np.isfinite(self.position).all(axis=2)
+        if not finite.all():
+            frame, node = np.argwhere(~finite)[0]
+            numbers = self.position[frame, node].tolist()
+            raise ConfigError(f"the motion is not finite in frame {frame} at node {node}: {numbers}")
+
+    def increments(self, scene: Scene) -> list[float]:
+        """S - 1 numbers: the largest displacement of a prescribed node from one frame to the next."""
+        return [_largest(after - before) for before, after in self._steps(scene)]
+
+    def travel(self, scene: Scene) -> float:
+        """The largest distance of a prescribed node from its position in frame 0."""
+        start = self.position[0, scene.prescribed]
+        return max(_largest(after - start) for _, after in self._steps(scene))
+
+    def _steps(self, scene: Scene) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        moved = self.position[:, scene.prescribed].astype(np.float64)
+        return zip(moved[:-1], moved[1:], strict=True)
+
+
+def frames_for(scene: Scene, motions: Mapping[int, RigidMotion | Vector], increment: float) -> int:
+    """The smallest number of frames, at least 2, so that no prescribed node moves farther than `increment` per frame.
+
+    The length of a node's path counts, so a body that moves and comes back has moved.
+
+    Raises:
+        ConfigError: the increment is not above 0; or as in `Motion.of_bodies`.
+    """
+    if not (np.isfinite(increment) and increment > 0):
+        raise ConfigError(f"the increment of a frame must be above 0, not {increment}")
+    speeds = [motion.largest_speed(scene.rest_position[nodes]) for nodes, motion in _moved(scene, motions)]
+    # Positions are float32: a path that is longer only by rounding needs no further frame.
+    return 1 + max(1, int(np.ceil(max(speeds, default=0.0) / increment * (1 - 1e-6))))
+
+
+def parse_move(text: str) -> tuple[int, RigidMotion]:
+    """The body and the motion of `BODY=X,Y,Z [then X,Y,Z ...] [rotate DEGREES about X,Y,Z at X,Y,Z]`.
+
+    BODY is the number of a body. The triples before `rotate` are the translation: its end, or the waypoints of a path;
+    each is a displacement from the start. `about` gives the direction of the axis, `at` a point on the axis. The
+    translation or the rotation may be left out:
+
+        1=0,0,-0.01                             a translation
+        1=0,0,-0.01 then 0.02,0,-0.01           down, then sideways
+        1=rotate 30 about 0,0,1 at 0,0,0.1      a rotation
+        1=0,0,-0.01 rotate 30 about 0,0,1 at 0,0,0.1
+
+    Raises:
+        ConfigError: the text has another form; the error gives examples.
+    """
+    found = _MOVE.fullmatch(re.sub(r"\s*([,=])\s*", r"\1", " ".join(text.split())))
+    try:
+        if found is None or not (found["path"] or found["angle"]):
+            raise ValueError
+        motion: dict = {}
+        if found["path"]:
+            motion["translation"] = tuple(_triple(part) for part in found["path"].split(" then "))
+        if found["angle"]:
+            motion |= {"rotation": float(found["angle"])}
+            motion |= {"axis": _triple(found["axis"]), "point": _triple(found["point"])}
+    except ValueError as error:
+        raise ConfigError(
+            f"the motion {text!r} cannot be read; write it as '1=0,0,-0.01', as '1=0,0,-0.01 then 0.02,0,-0.01' or as"
+            " '1=rotate 30 about 0,0,1 at 0,0,0.1'"
+        ) from error
+    return int(found["body"]), RigidMotion(**motion)
+
+
+def _moved(scene: Scene, motions: Mapping[int, RigidMotion | Vector]) -> Iterator[tuple[np.ndarray, RigidMotion]]:
+    """The prescribed nodes [N] bool and the motion of each body in `motions`."""
+    for body, motion in motions.items():
+        nodes = nodes_of_body(scene.body, body) & scene.prescribed
+        if not nodes.any():
+            raise ConfigError(
+                f"body {body} has no prescribed node that could be moved; mark the body with --obstacle {body} or nodes"
+                f" of it with --clamp {body}:PLACE"
+            )
+        yield nodes, motion if isinstance(motion, RigidMotion) else RigidMotion(motion)
+
+
+def _segments(shares: np.ndarray, corners: np.ndarray) -> Iterator[tuple[float, float, np.ndarray]]:
+    """Start, end and velocity [3] of each straight piece of a path. A path without pieces stands still from 0 to 1."""
+    if len(shares) == 1:
+        yield 0.0, 1.0, np.zeros(3)
+    for k in range(len(shares) - 1):
+        yield shares[k], shares[k + 1], (corners[k + 1] - corners[k]) / (shares[k + 1] - shares[k])
+
+
+def _largest(vectors: np.ndarray) -> float:
+    return float(np.sqrt((vectors**2).sum(axis=1).max(initial=0.0)))
+
+
+def _triple(text: str) -> tuple[float, ...]:
+    return tuple(float(number) for number in text.split(","))

@@ -1,0 +1,306 @@
+"""Checkpoints that survive a kill, a full disk and a flipped bit.
+
+A checkpoint is the folder `checkpoints/step-N` of a run. It holds `model.safetensors`, `training.safetensors`,
+`state.json`, and `manifest.json` with the size and the SHA-256 of each of them. The folder is written under a temporary
+name, synced to the disk and then renamed, so a folder `step-N` is always complete. Nothing is pickled.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import json
+import os
+import re
+import secrets
+import shutil
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+from safetensors import SafetensorError
+from torch import Tensor
+
+from ast_sim.support.disk import sync_folder, write_synced, write_text
+from ast_sim.support.errors import CheckpointError
+from ast_sim.support.sealed_line import seal, unseal
+
+FILES = ("model.safetensors", "training.safetensors", "state.json")
+MANIFEST = "manifest.json"
+VERSION = 1
+
+_FOLDER = "checkpoints"
+_BEST = "best"
+_LOCK = ".lock"
+_TEMPORARY = ".tmp-"
+_NAME = re.compile(r"step-(0|[1-9][0-9]{0,17})")
+_MANIFEST_BYTES = 1 << 16
+_ERRORS = (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError, SafetensorError)
+
+Content = tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Any]]
+
+
+def save(
+    run_dir: str | os.PathLike[str],
+    step: int,
+    *,
+    model: dict[str, Tensor],
+    training: dict[str, Tensor],
+    state: dict[str, Any],
+    keep: int = 3,
+) -> Path:
+    """Write the checkpoint of a step. Keep the `keep` newest checkpoints and the best one; remove the others.
+
+    If a valid checkpoint of this step exists it stays, since a run always saves the same content at the same step.
+
+    Raises:
+        CheckpointError: the checkpoint cannot be written (a full disk); the earlier checkpoints are untouched.
+    """
+    if keep < 1:
+        raise CheckpointError(f"at least one checkpoint must be kept, not {keep}")
+    parent = Path(run_dir) / _FOLDER
+    final = parent / f"step-{step}"
+    temporary = parent / f"{_TEMPORARY}{secrets.token_hex(4)}"
+    try:
+        if not parent.is_dir():
+            parent.mkdir(parents=True)
+            sync_folder(run_dir)
+        _clean(parent)
+        if _damage(final) is not None:
+            temporary.mkdir()
+            _write_files(temporary, step, model, training, state)
+            _discard(final)  # a damaged checkpoint of the same step
+            os.rename(temporary, final)
+            sync_folder(parent)
+        _prune(Path(run_dir), step, keep)
+    except _ERRORS as error:
+        raise CheckpointError(f"{final}: the checkpoint cannot be written: {error}") from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    return final
+
+
+def load(path: str | os.PathLike[str], run: str | None = None) -> Content:
+    """The content of a checkpoint: the arrays of the model, the arrays of the training, and the state. All is verified.
+
+    With `run`, the SHA-256 in `run.json`, the checkpoint must have been saved by that run.
+
+    Raises:
+        CheckpointError: a file is missing or damaged, or differs from the manifest; the text names the file. Or the
+            checkpoint is of another run.
+    """
+    path = Path(path)
+    data = {name: _read_verified(path, name, record) for name, record in _read_manifest(path).items()}
+    with _explained(path, "cannot be understood"):
+        model, training = (safetensors.torch.load(data.pop(name)) for name in FILES[:2])
+        state = json.loads(data["state.json"])
+        if run is not None and state["run"] != run:
+            raise CheckpointError(f"{path} is of a run with other settings or other data: remove it from this run")
+        return model, training, state
+
+
+def latest(run_dir: str | os.PathLike[str]) -> Path | None:
+    """The newest valid checkpoint of a run; None if the run has no checkpoint. Each newer, damaged one gives a warning.
+
+    Raises:
+        CheckpointError: the run has checkpoints, but all of them are damaged.
+    """
+    damage = None
+    for path in _newest_first(Path(run_dir) / _FOLDER):
+        damage = _damage(path)
+        if damage is None:
+            return path
+        warnings.warn(f"{damage}; using the checkpoint before it", stacklevel=2)
+    if damage is not None:
+        raise CheckpointError(f"{run_dir}: no checkpoint is intact; the oldest one: {damage}")
+    return None
+
+
+def best(run_dir: str | os.PathLike[str]) -> Path | None:
+    """The checkpoint that is marked as the best; None if none is marked, or (with a warning) if it is damaged.
+
+    Raises:
+        CheckpointError: the mark itself is damaged.
+    """
+    path = _marked(Path(run_dir))
+    damage = None if path is None else _damage(path)
+    if damage is None:
+        return path
+    warnings.warn(f"the best checkpoint cannot be used: {damage}", stacklevel=2)
+    return None
+
+
+def mark_best(run_dir: str | os.PathLike[str], step: int, error: float) -> None:
+    """Mark the checkpoint of this step, with its validation error, as the best one; it is kept until another one is
+    marked.
+
+    Raises:
+        CheckpointError: there is no such checkpoint, or the mark cannot be written.
+    """
+    run_dir = Path(run_dir)
+    name = f"step-{step}"
+    if not (run_dir / _FOLDER / name).is_dir():
+        raise CheckpointError(f"{run_dir}: there is no checkpoint {name} to mark as the best")
+    with _explained(run_dir / _BEST, "cannot be written"):
+        write_text(run_dir / _BEST, seal({"step": step, "valid_rmse": error}))
+
+
+def read_best(run_dir: str | os.PathLike[str]) -> tuple[int, float] | None:
+    """The step of the checkpoint that is marked as the best, and its validation error; None if none is marked.
+
+    Raises:
+        CheckpointError: the mark is damaged.
+    """
+    path = Path(run_dir) / _BEST
+    if not os.path.lexists(path):
+        return None
+    advice = f"is damaged: remove it, then ast-sim train --resume --out {run_dir} writes it again"
+    with _explained(path, advice):
+        mark = unseal(_read_file(path, 256).decode())
+        return int(mark["step"]), float(mark["valid_rmse"])
+
+
+@contextlib.contextmanager
+def lock(run_dir: str | os.PathLike[str]) -> Iterator[None]:
+    """Within the block no other process can lock the run folder. The lock ends with the process, even with a kill.
+
+    Raises:
+        CheckpointError: another process holds the lock (the text gives its number), or the folder cannot be locked.
+    """
+    path = Path(run_dir) / _LOCK
+    with _explained(Path(run_dir), "cannot be written"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            holder = os.pread(handle, 32, 0).decode(errors="replace").strip() or "unknown"
+            raise CheckpointError(
+                f"{run_dir} is in use by process {holder}: wait until it ends, or choose another folder"
+            ) from error
+        except OSError as error:
+            raise CheckpointError(f"{path}: this file system cannot lock files: {error}") from error
+        with contextlib.suppress(OSError):  # only the message above needs the number
+            os.ftruncate(handle, 0)
+            os.pwrite(handle, str(os.getpid()).encode(), 0)
+        yield
+    finally:
+        os.close(handle)
+
+
+@contextlib.contextmanager
+def _explained(path: Path, what: str) -> Iterator[None]:
+    """Within the block, raise every error of reading or writing as a CheckpointError: `path` and `what` went wrong."""
+    try:
+        yield
+    except _ERRORS as error:
+        raise CheckpointError(f"{path}: {what}: {error}") from error
+
+
+def _write_files(
+    folder: Path, step: int, model: dict[str, Tensor], training: dict[str, Tensor], state: dict[str, Any]
+) -> None:
+    records = {}
+    for name, content in zip(FILES, (model, training, state), strict=True):
+        if name.endswith(".json"):
+            data = json.dumps(content, allow_nan=False, indent=1).encode()
+        else:
+            data = safetensors.torch.save({key: _detached(tensor) for key, tensor in content.items()})
+        records[name] = {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+        write_synced(folder / name, data)
+    manifest = {"version": VERSION, "step": step, "files": records}
+    write_synced(folder / MANIFEST, json.dumps(manifest, indent=1).encode())
+    sync_folder(folder)
+
+
+def _detached(tensor: Tensor) -> Tensor:
+    """A contiguous copy on the CPU, which shares no memory with other tensors."""
+    return tensor.detach().cpu().contiguous().clone()
+
+
+def _read_manifest(path: Path) -> dict[str, dict[str, Any]]:
+    """The size and the hash of each file; a manifest with other files is refused."""
+    with _explained(path / MANIFEST, "cannot be read"):
+        if not path.is_dir():
+            raise CheckpointError(f"{path}: there is no such checkpoint")
+        data = _read_file(path / MANIFEST, _MANIFEST_BYTES)
+        manifest = json.loads(data)
+        step = int(path.name.removeprefix("step-")) if _NAME.fullmatch(path.name) else manifest["step"]
+        if manifest != {"version": VERSION, "step": step, "files": manifest.get("files")}:
+            raise CheckpointError(f"{path / MANIFEST}: is not the manifest of version {VERSION} of this step")
+        records = manifest["files"]
+        if set(records) != set(FILES) or any(set(record) != {"size", "sha256"} for record in records.values()):
+            raise CheckpointError(f"{path / MANIFEST}: must list {', '.join(FILES)} with size and sha256")
+    return {name: records[name] for name in FILES}
+
+
+def _read_verified(path: Path, name: str, record: dict[str, Any]) -> bytes:
+    file = path / name
+    with _explained(file, "cannot be read"):
+        size = os.lstat(file).st_size
+        if size != record["size"]:
+            raise CheckpointError(f"{file}: has {size} bytes, the manifest says {record['size']}")
+        data = _read_file(file, size)
+    if hashlib.sha256(data).hexdigest() != record["sha256"]:
+        raise CheckpointError(f"{file}: is damaged: its SHA-256 is not that of the manifest")
+    return data
+
+
+def _read_file(file: Path, most: int) -> bytes:
+    """The content of a plain file with at most `most` bytes; links are not followed."""
+    handle = os.open(file, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)  # a pipe must not block
+    with open(handle, "rb") as stream:
+        data = stream.read(most + 1)
+    if len(data) > most:
+        raise CheckpointError(f"{file}: has more than {most} bytes")
+    return data
+
+
+def _damage(path: Path) -> CheckpointError | None:
+    """What is wrong with a checkpoint; None if it is valid."""
+    try:
+        for name, record in _read_manifest(path).items():
+            _read_verified(path, name, record)
+    except CheckpointError as error:
+        return error
+    return None
+
+
+def _newest_first(parent: Path) -> list[Path]:
+    paths = [path for path in parent.glob("step-*") if _NAME.fullmatch(path.name)]
+    return sorted(paths, key=lambda path: int(path.name.removeprefix("step-")), reverse=True)
+
+
+def _marked(run_dir: Path) -> Path | None:
+    """The checkpoint that the file `best` names; None if there is no such file."""
+    mark = read_best(run_dir)
+    return None if mark is None else run_dir / _FOLDER / f"step-{mark[0]}"
+
+
+def _prune(run_dir: Path, step: int, keep: int) -> None:
+    """Keep the best checkpoint and the `keep` newest up to this step; remove the others.
+
+    Checkpoints of later steps were damaged when the run was resumed.
+    """
+    paths = _newest_first(run_dir / _FOLDER)
+    first = paths.index(run_dir / _FOLDER / f"step-{step}")
+    for path in {*paths[:first], *paths[first + keep :]} - {_marked(run_dir)}:
+        _discard(path)
+
+
+def _discard(path: Path) -> None:
+    """Remove a checkpoint. It is renamed first, so that a kill never leaves a part of it under its name."""
+    if path.exists():
+        aside = path.with_name(f"{_TEMPORARY}{secrets.token_hex(4)}")
+        os.rename(path, aside)
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+def _clean(parent: Path) -> None:
+    """Remove the folders that a killed process left when it wrote or removed a checkpoint."""
+    for path in parent.glob(f"{_TEMPORARY}*"):
+        shutil.rmtree(path, ignore_errors=True)

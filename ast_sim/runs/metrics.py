@@ -1,0 +1,62 @@
+"""`metrics.jsonl` of a run: the losses and errors that training records, line by line."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from ast_sim.support.disk import write_text
+from ast_sim.support.sealed_line import seal, unseal
+
+METRICS = "metrics.jsonl"
+
+
+class Metrics:
+    """The file `metrics.jsonl`. Each line is a JSON object with a `step` and a checksum. Lines are appended; only a
+    resumed training removes some."""
+
+    def __init__(self, run: Path) -> None:
+        self.path = run / METRICS
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        """The intact lines, in order. A damaged line gives a warning; a kill may leave one at the end."""
+        if not self.path.exists():
+            return
+        with open(self.path, encoding="utf-8", errors="replace") as file:
+            for number, line in enumerate(file, 1):
+                try:
+                    yield unseal(line)
+                except ValueError as error:
+                    text = f"{self.path}: line {number} is damaged and left out: {error}"
+                    warnings.warn(text, stacklevel=2)
+
+    def append(self, record: dict[str, Any]) -> None:
+        with open(self.path, "a", encoding="utf-8") as file:
+            file.write(seal(record))
+            file.flush()
+            os.fsync(file.fileno())
+
+    def forget_after(self, step: int) -> None:
+        """Remove the lines of later steps: training is about to repeat these steps."""
+        write_text(self.path, "".join(seal(record) for record in self if record["step"] <= step))
+
+    def require(self, lines: int) -> None:
+        """Warn if fewer lines are intact than a checkpoint says were written before it."""
+        found = sum(1 for _ in self)
+        if found < lines:
+            text = f"{self.path} has lost {lines - found} of {lines} lines: its curves are not complete"
+            warnings.warn(text, stacklevel=2)
+
+    def best(self) -> tuple[int, float] | None:
+        """The step and the error of the best validation; None if no validation succeeded."""
+        errors = [(record["valid_rmse"], record["step"]) for record in self if record.get("valid_rmse") is not None]
+        if not errors:
+            return None
+        error, step = min(errors)
+        return step, error
+
+    def validated(self, step: int) -> bool:
+        return any(record["step"] == step and "valid_rmse" in record for record in self)

@@ -1,0 +1,87 @@
+"""The scope of a run: the ranges of sizes, materials and motions in its training scenes, kept in `scope.toml`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ast_sim.prescribed_motion import Motion
+from ast_sim.scene import NodeType, Scene
+
+LEEWAY = 0.05  # a value up to 5 % outside a range counts as inside
+
+
+@dataclass(frozen=True)
+class Scope:
+    """Ranges (lowest, highest) over the training scenes; lengths in `length_unit`.
+
+    Attributes:
+        family, length_unit, time_step: as in the dataset's `DatasetInfo`.
+        corners: number of nodes of an element, the same in all scenes.
+        nodes: number of nodes of a scene.
+        size: diagonal of the box around the deforming bodies at rest.
+        spacing: mean length of the mesh edges of the deforming bodies at rest.
+        travel: largest distance of a prescribed node from its place in the first frame.
+        increment: largest displacement of a prescribed node in one frame.
+        usual_increment: the median of that displacement over all frames in which one moves; 0 if none ever does.
+        material_low, material_high: the lowest and the highest number of each material column.
+    """
+
+    family: str
+    length_unit: str
+    time_step: float
+    corners: int
+    nodes: tuple[float, float]
+    size: tuple[float, float]
+    spacing: tuple[float, float]
+    travel: tuple[float, float]
+    increment: tuple[float, float]
+    usual_increment: float
+    material_low: tuple[float, ...]
+    material_high: tuple[float, ...]
+
+    def notes(self, scene: Scene, motion: Motion) -> Iterator[str]:
+        """One sentence for each property of a scene and its prescribed motion that lies outside its range."""
+        length = f" {self.length_unit}"
+        for (low, high), value, text, unit in (
+            ((self.corners, self.corners), scene.elements.shape[1], "the elements have {} nodes", ""),
+            (self.nodes, scene.num_nodes, "the scene has {} nodes", ""),
+            (self.size, size_of(scene), "the deforming bodies measure {} across", length),
+            (self.spacing, spacing_of(scene), "the mesh edges have a mean length of {}", length),
+            ((0.0, self.travel[1]), motion.travel(scene), "prescribed nodes move up to {} from their start", length),
+            ((0.0, self.increment[1]), max(motion.increments(scene)), "prescribed nodes move {} in one frame", length),
+            *self._materials(scene),
+        ):
+            if not low - LEEWAY * abs(low) <= value <= high + LEEWAY * abs(high):
+                found, *limits = (f"{number:.4g}{unit}" for number in (value, *dict.fromkeys((low, high))))
+                yield f"{text.format(found)}; in training {' to '.join(limits)}"
+
+    def _materials(self, scene: Scene) -> Iterator[tuple[tuple[float, float], float, str, str]]:
+        """The smallest and the largest number in each material column of the deforming bodies."""
+        if scene.material is None:
+            return
+        values = scene.material[scene.deforming_elements]
+        for column, limits in enumerate(zip(self.material_low, self.material_high, strict=True)):
+            for value in (values[:, column].min(initial=limits[0]), values[:, column].max(initial=limits[1])):
+                yield limits, float(value), f"material column {column} holds {{}}", ""
+
+
+def size_of(scene: Scene) -> float:
+    """The diagonal of the box around the deforming bodies at rest; 0 if there are none."""
+    points = scene.rest_position[scene.node_type != NodeType.OBSTACLE].astype(np.float64)
+    return float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0
+
+
+def spacing_of(scene: Scene) -> float:
+    """The mean length of the mesh edges of the deforming bodies at rest; 0 if there are none."""
+    lengths = edge_lengths(scene)
+    return float(lengths.mean(dtype=np.float64)) if len(lengths) else 0.0
+
+
+def edge_lengths(scene: Scene) -> np.ndarray:
+    """The lengths of the mesh edges of the deforming bodies at rest."""
+    edges = scene.edges()
+    edges = edges[(scene.node_type[edges] != NodeType.OBSTACLE).all(axis=1)]
+    return np.linalg.norm(scene.rest_position[edges[:, 0]] - scene.rest_position[edges[:, 1]], axis=1)

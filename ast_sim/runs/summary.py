@@ -1,0 +1,27 @@
+"""The description of a run folder that `ast-sim info` prints."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from ast_sim.runs import checkpoint
+from ast_sim.runs.metrics import Metrics
+from ast_sim.runs.train_config import read_config
+
+
+def describe_run(path: Path) -> dict[str, Any]:
+    """The settings, the checkpoints and the best validation of a run."""
+    settings = read_config(path)
+    latest, best = checkpoint.latest(path), checkpoint.best(path)
+    mark = checkpoint.read_best(path)
+    validation = [record for record in Metrics(path) if mark and "valid_rmse" in record and record["step"] == mark[0]]
+    return {
+        "kind": "run",
+        "path": str(path),
+        **dataclasses.asdict(settings),
+        "latest_checkpoint": latest.name if latest else None,
+        "best_checkpoint": best.name if best else None,
+        "best_validation": validation[-1] if validation else None,
+    }

@@ -1,0 +1,126 @@
+"""The settings of a run, kept in its `config.toml`; its scope is read and written the same way."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from ast_sim.models.model_config import ModelConfig, setting
+from ast_sim.models.registry import find_model
+from ast_sim.runs.origin import CONFIG, SCOPE, VERSION, verified, write_origin
+from ast_sim.runs.scope import Scope
+from ast_sim.support.disk import write_text
+from ast_sim.support.errors import ConfigError, is_utf8
+from ast_sim.support.toml_settings import from_values, to_toml, to_values
+
+OptimizerName = Literal["adamw", "muon"]
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How a model is trained. The defaults are the paper's. Where one is None, `resolve` fills in a value that follows
+    from the data."""
+
+    steps: int | None = setting(None, "optimizer steps; unset: as many as `epochs` asks for")
+    epochs: int = setting(100, "passes over the training pairs; it has no effect if `steps` is set")
+    batch_size: int = setting(48, "scenes in a batch; each scene is a pair of frames")
+    accumulate: int = setting(1, "batches in a step; the step averages their gradients")
+    optimizer: OptimizerName = setting(
+        "adamw", "adamw; or muon for the matrices inside the model: it needs fewer steps, but each step is slower"
+    )
+    peak_rate: float | None = setting(None, "highest learning rate; unset: 1e-4 sqrt(scenes per step / 2)")
+    warmup: int | None = setting(
+        None, "steps in which the learning rate grows from 1e-4 of its peak; unset: 5 % of all steps, at most 2000"
+    )
+    decay: int | None = setting(
+        None,
+        "step at which the learning rate reaches 0; unset: the last step, or one epoch later if `steps` is unset",
+    )
+    clip: float = setting(1.0, "largest norm of the gradient; a longer gradient is scaled down to it")
+    noise: float | None = setting(
+        None,
+        "standard deviation of the noise on the input state, in units of length; unset: 0.45 of the rms displacement"
+        " (0.15 with a rollout pool), in dynamic scenes 0.1 of the rms increment",
+    )
+    rollout_pool: int | None = setting(
+        0,
+        "scenes that are rolled out during training, so that the model learns from states that it predicted itself;"
+        " 0: it learns from the states of the dataset, with noise; unset: 16 batches if the scenes are dynamic or the"
+        " model is ast or transolver, else 0; always 0 for a time-conditioned model and without noise",
+    )
+    noise_gamma: float | None = setting(
+        None, "share of the noise that the target takes back; unset: 1, in dynamic scenes 0.1"
+    )
+    mirror: tuple[Literal["x", "y", "z"], ...] = setting(
+        (), "axes along which scenes are mirrored at random; name only axes that gravity, fibres or chirality allow"
+    )
+    shift: float | None = setting(
+        0.0,
+        "scenes are moved at random by at most this distance along each axis, in units of length; unset: half the side"
+        " of the model's cells, at most 0.05 of the domain's half width",
+    )
+    stress_weight: float = setting(0.01, "weight of the stress in the loss; the motion has the weight 1")
+    statistics_pairs: int = setting(400, "pairs of frames from which the scales of inputs and outputs are measured")
+    seed: int = setting(0, "seed of the initial weights, the order of the pairs, the noise and dropout")
+    validate_every: int | None = setting(
+        None, "steps from one validation (rollouts of validation scenes) to the next; unset: a tenth of all steps"
+    )
+    validate_scenes: int = setting(8, "number of validation scenes that are rolled out; these are the first ones")
+    checkpoint_every: int | None = setting(
+        None, "steps from one checkpoint to the next; unset: a checkpoint at each validation"
+    )
+    keep: int = setting(3, "number of checkpoints that are kept: the newest ones; the best one is kept as well")
+    log_every: int = setting(100, "steps whose mean is one line of metrics.jsonl")
+
+
+def _model_class(table: Mapping[str, Any]) -> type[ModelConfig]:
+    return find_model(str(table.get("name", ""))).config
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """All settings of a run: those of its model, those of its training, and the path of its dataset."""
+
+    model: ModelConfig = field(metadata={"class_of": _model_class})
+    train: TrainConfig
+    data: str
+
+    def __post_init__(self) -> None:
+        if not is_utf8(self.data):
+            raise ConfigError(f"{self.data}: a run cannot keep a path that is not UTF-8: rename the file or the folder")
+
+
+def has_config(run: Path) -> bool:
+    """Whether the folder holds a run."""
+    return (run / CONFIG).is_file()
+
+
+def read_config(run: Path) -> RunConfig:
+    """The settings of a run.
+
+    Raises:
+        CheckpointError: the folder holds no run.
+        ConfigError: the file was edited or damaged; the text names the first setting that differs.
+    """
+    return from_values(RunConfig, verified(run, CONFIG))
+
+
+def read_scope(run: Path) -> Scope:
+    """The scope of a run; errors as in `read_config`."""
+    return from_values(Scope, verified(run, SCOPE))
+
+
+def write_config(run: Path, settings: RunConfig, scope: Scope, data: str) -> None:
+    """Write the scope, `run.json` and the settings, each as a whole file; `data` is the dataset's fingerprint.
+
+    The settings come last: a folder with settings has the other two.
+    """
+    write_text(run / SCOPE, _text(scope))
+    write_origin(run, {CONFIG: to_values(settings), SCOPE: to_values(scope)}, data)
+    write_text(run / CONFIG, _text(settings))
+
+
+def _text(settings: RunConfig | Scope) -> str:
+    return f"version = {VERSION}\n{to_toml(settings)}"

@@ -1,0 +1,272 @@
+"""A scene (mesh, bodies, material) and a trajectory (the positions of its nodes over time); numpy only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+
+from ast_sim.support.errors import ConfigError, DatasetError
+
+AttributeValue = str | int | float | list[float]
+
+# The edges of a triangle and of a tetrahedron, as pairs of local node numbers.
+LOCAL_EDGES = {3: ((0, 1), (0, 2), (1, 2)), 4: ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))}
+
+# The faces of a tetrahedron with positive volume; their normals point outward.
+LOCAL_FACES = ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
+
+# The search for connected parts makes pairs of nodes from so many elements at a time, which limits its memory.
+_ELEMENTS_AT_ONCE = 1 << 13
+
+
+class NodeType(IntEnum):
+    """How a node moves. The numbers are those of the MeshGraphNets data sets."""
+
+    NORMAL = 0  # a free node: it follows the mechanics, and models predict it
+    OBSTACLE = 1  # a node of a rigid body with a prescribed motion
+    HANDLE = 3  # a node of a deforming body with a prescribed position
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The static part of a simulation with N nodes and E elements.
+
+    Attributes:
+        rest_position: [N, 3] float32, the undeformed positions; in 2-D scenes z = 0.
+        elements: [E, k] int32, the numbers of the nodes; k = 3 for triangles, k = 4 for tetrahedra.
+        node_type: [N] uint8, values of `NodeType`.
+        body: [N] int32, the number of the body that a node belongs to.
+        material: [E, m] float32, material parameters of each element, or None.
+    """
+
+    rest_position: np.ndarray
+    elements: np.ndarray
+    node_type: np.ndarray
+    body: np.ndarray
+    material: np.ndarray | None = None
+
+    @property
+    def num_nodes(self) -> int:
+        return len(self.rest_position)
+
+    @property
+    def num_elements(self) -> int:
+        return len(self.elements)
+
+    @property
+    def prescribed(self) -> np.ndarray:
+        """[N] bool: the nodes whose positions are prescribed in all frames (obstacles and handles)."""
+        return self.node_type != NodeType.NORMAL
+
+    @property
+    def deforming_nodes(self) -> np.ndarray:
+        """[N] bool: the nodes that belong to no obstacle. Obstacles are rigid and have no stress."""
+        return self.node_type != NodeType.OBSTACLE
+
+    @property
+    def deforming_elements(self) -> np.ndarray:
+        """[E] bool: the elements without a node of an obstacle."""
+        return np.all(self.deforming_nodes[self.elements], axis=1)
+
+    def deforming(self, location: str) -> np.ndarray:
+        """[N] or [E] bool, one for each row of the stress: the nodes that deform, or the elements if `location` is
+        "element"."""
+        return self.deforming_elements if location == "element" else self.deforming_nodes
+
+    def check(self, name: str = "scene") -> None:
+        """Check shapes, dtypes, finiteness, index ranges and node types.
+
+        Raises:
+            DatasetError: something is wrong; the text names `name`, the array and the first wrong node or element.
+        """
+        require_array(name, "rest_position", self.rest_position, np.float32, (None, 3))
+        require_array(name, "elements", self.elements, np.int32, (None, None))
+        n, (e, k) = self.num_nodes, self.elements.shape
+        require_array(name, "node_type", self.node_type, np.uint8, (n,))
+        require_array(name, "body", self.body, np.int32, (n,))
+        if self.material is not None:
+            require_array(name, "material", self.material, np.float32, (e, None))
+        if n == 0 or e == 0:
+            raise DatasetError(f"{name}: a scene needs nodes and elements, this one has {n} and {e}")
+        if k not in LOCAL_EDGES:
+            raise DatasetError(f"{name}: elements must have 3 nodes (triangle) or 4 (tetrahedron), not {k}")
+        _require_finite(name, "rest_position", "node", self.rest_position)
+        if self.material is not None:
+            if self.material.shape[1] == 0:
+                raise DatasetError(f"{name}: material has no columns; leave it out (None)")
+            _require_finite(name, "material", "element", self.material)
+        if self.elements.min() < 0 or self.elements.max() >= n:
+            outside = (self.elements < 0) | (self.elements >= n)
+            row = int(np.argmax(outside.any(axis=1)))
+            node = self.elements[row, np.argmax(outside[row])]
+            raise DatasetError(f"{name}: element {row} refers to node {node}, but the nodes are 0 to {n - 1}")
+        pairs = LOCAL_EDGES[k]
+        repeated = np.logical_or.reduce([self.elements[:, a] == self.elements[:, b] for a, b in pairs])
+        if repeated.any():
+            row = int(np.argmax(repeated))
+            raise DatasetError(f"{name}: element {row} refers to a node twice: {self.elements[row].tolist()}")
+        unknown = ~np.isin(self.node_type, list(NodeType))
+        if unknown.any():
+            node = int(np.argmax(unknown))
+            known = ", ".join(f"{kind.value} {kind.name}" for kind in NodeType)
+            raise DatasetError(f"{name}: node {node} has the type {self.node_type[node]}; known are {known}")
+
+    def require_predictable(self, name: str) -> None:
+        """Raise DatasetError if no node is free, or if the deforming bodies have no extent; the text names `name`."""
+        if self.prescribed.all():
+            raise DatasetError(f"{name}: all nodes are obstacles or handles, so nothing deforms: leave this scene out")
+        if not np.ptp(self.rest_position[self.deforming_nodes], axis=0).any():
+            raise DatasetError(f"{name}: all nodes that deform lie at one point at rest: give them their positions")
+
+    def edges(self) -> np.ndarray:
+        """[M, 2] int32: each edge of the mesh once, its smaller node first, in ascending order."""
+        pairs = np.concatenate([self.elements[:, list(pair)] for pair in LOCAL_EDGES[self.elements.shape[1]]])
+        pairs = np.sort(pairs.astype(np.int64), axis=1)
+        keys = np.unique(pairs[:, 0] * self.num_nodes + pairs[:, 1])
+        return np.stack([keys // self.num_nodes, keys % self.num_nodes], axis=1).astype(np.int32)
+
+    def surface(self) -> np.ndarray:
+        """[F, 3] int32: the triangles of the surface.
+
+        In a scene of triangles these are all elements. In a scene of tetrahedra they are the faces that belong to one
+        element only; their nodes run counter-clockwise, seen from outside.
+        """
+        if self.elements.shape[1] == 3:
+            return self.elements
+        corners = self.rest_position[self.elements].astype(np.float64)
+        volume = np.linalg.det(corners[:, 1:] - corners[:, :1])
+        faces = self.elements[:, np.array(LOCAL_FACES)]  # [E, 4, 3]
+        faces = np.where((volume < 0)[:, None, None], faces[:, :, ::-1], faces).reshape(-1, 3)
+        _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+        return faces[np.sort(first[count == 1])]
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A scene and its S frames.
+
+    Attributes:
+        position: [S, N, 3] float32.
+        stress: [S, N, 1] (nodal) or [S, E, 1] (per element) float32, von Mises stress, or None.
+        attributes: `status` ("complete" or "truncated"); the records of the solver, such as `seed`, `index`,
+            `newton_iterations`, `min_gap`, `min_jacobian`; and `solve_seconds`, a list with one entry per frame, which
+            a generated dataset keeps in a separate file (`ast_sim.dataset.solver_seconds`).
+        cauchy_stress: [S, E, 6] float32, Cauchy stress of each element (xx, yy, zz, xy, yz, zx), or None.
+        stress_location: "node" or "element", where the rows of `stress` are; None: the number of rows decides it.
+    """
+
+    scene: Scene
+    position: np.ndarray
+    stress: np.ndarray | None = None
+    attributes: dict[str, AttributeValue] = field(default_factory=dict)
+    cauchy_stress: np.ndarray | None = None
+    stress_location: str | None = None
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.position)
+
+    @property
+    def stress_at(self) -> str:
+        """Where the stress is: "none", "node" or "element".
+
+        Raises:
+            DatasetError: no `stress_location` is given, and the scene has as many nodes as elements.
+        """
+        if self.stress is None:
+            return "none"
+        n, e = self.scene.num_nodes, self.scene.num_elements
+        if self.stress_location is None and n == e:
+            raise DatasetError(
+                f"the stress may be at the {n} nodes or in the {e} elements: give the trajectory its stress_location"
+            )
+        return self.stress_location or ("node" if self.stress.shape[1] == n else "element")
+
+    def check(self, name: str = "trajectory", stress_location: str | None = None) -> None:
+        """Check the scene, the shapes and that every number is finite.
+
+        Raises:
+            DatasetError: something is wrong; the text names `name`, and the frame and the node if there is one.
+        """
+        self.scene.check(name)
+        n, e = self.scene.num_nodes, self.scene.num_elements
+        require_array(name, "position", self.position, np.float32, (None, n, 3))
+        if self.num_frames == 0:
+            raise DatasetError(f"{name}: a trajectory needs at least one frame")
+        require_finite_frames(name, "position", "node", self.position)
+        if (self.stress is None) != (stress_location == "none") and stress_location is not None:
+            found = "no stress" if self.stress is None else "stress"
+            raise DatasetError(f"{name}: has {found}, but stress_location is {stress_location!r}")
+        if self.cauchy_stress is not None:
+            require_array(name, "cauchy_stress", self.cauchy_stress, np.float32, (self.num_frames, e, 6))
+            require_finite_frames(name, "cauchy_stress", "element", self.cauchy_stress)
+        if self.stress is None:
+            return
+        own = self.stress_location or stress_location
+        stress_location = stress_location or own
+        if own != stress_location:
+            raise DatasetError(f"{name}: has stress at each {own}, but stress_location is {stress_location!r}")
+        rows = {"node": (n,), "element": (e,), None: (n, e)}[stress_location]
+        if self.stress.ndim == 3 and self.stress.shape[1] not in rows:
+            raise DatasetError(f"{name}: stress has {self.stress.shape[1]} rows; needs {' or '.join(map(str, rows))}")
+        require_array(name, "stress", self.stress, np.float32, (self.num_frames, None, 1))
+        require_finite_frames(name, "stress", stress_location or "row", self.stress)
+
+
+def connected_parts(elements: np.ndarray, num_nodes: int) -> np.ndarray:
+    """[N] int32: the connected part of the mesh that each node belongs to. Parts are numbered from 0 in the order of
+    their lowest nodes."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    part = np.arange(num_nodes, dtype=np.int32)
+    for start in range(0, len(elements), _ELEMENTS_AT_ONCE):
+        corners = part[elements[start : start + _ELEMENTS_AT_ONCE]]
+        # The edges from the first corner to all others connect the element, so the other edges are not needed.
+        first, other = np.repeat(corners[:, 0], corners.shape[1] - 1), corners[:, 1:].ravel()
+        graph = coo_array((np.ones(len(first), np.int8), (first, other)), shape=(num_nodes, num_nodes))
+        part = connected_components(graph, directed=False)[1].astype(np.int32)[part]
+    return part
+
+
+def nodes_of_body(body: np.ndarray, number: int) -> np.ndarray:
+    """[N] bool: the nodes of the body with this number; `body` [N] is as in `Scene`.
+
+    Raises:
+        ConfigError: there is no such body; the text names the existing bodies.
+    """
+    nodes = body == number
+    if not nodes.any():
+        numbers, counts = np.unique(body, return_counts=True)
+        known = [f"{one} ({count} nodes)" for one, count in zip(numbers[:10], counts[:10], strict=True)]
+        more = ["..."] if len(numbers) > 10 else []
+        raise ConfigError(f"there is no body {number}; there are: {', '.join(known + more)}")
+    return nodes
+
+
+def require_array(name: str, array: str, value: np.ndarray, dtype: type, shape: tuple[int | None, ...]) -> None:
+    """Raise DatasetError unless `value` has the dtype and the shape; None in `shape` allows any size."""
+    if value.dtype != dtype:
+        raise DatasetError(f"{name}: {array} must be {np.dtype(dtype)}, not {value.dtype}")
+    fits = len(value.shape) == len(shape) and all(w in (None, s) for s, w in zip(value.shape, shape, strict=True))
+    if not fits:
+        wanted = ", ".join("any" if size is None else str(size) for size in shape)
+        raise DatasetError(f"{name}: {array} has the shape {list(value.shape)}, must be [{wanted}]")
+
+
+def require_finite_frames(name: str, array: str, row: str, value: np.ndarray, first_frame: int = 0) -> None:
+    """Raise DatasetError naming the first frame and row of `value` [S, rows, F] that is not finite."""
+    finite = np.isfinite(value)
+    if not finite.all():
+        frame, index, _ = np.unravel_index(np.argmin(finite), finite.shape)
+        numbers = value[frame, index].tolist()
+        raise DatasetError(f"{name}: {array} in frame {first_frame + frame} at {row} {index} is not finite: {numbers}")
+
+
+def _require_finite(name: str, array: str, row: str, value: np.ndarray) -> None:
+    finite = np.isfinite(value).all(axis=1)
+    if not finite.all():
+        index = int(np.argmin(finite))
+        raise DatasetError(f"{name}: {array} of {row} {index} is not finite: {value[index].tolist()}")

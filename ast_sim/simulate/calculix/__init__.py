@@ -1,0 +1,1 @@
+"""CalculiX in place of the bundled solver."""

@@ -1,0 +1,260 @@
+"""CalculiX (`ccx`) as a second solver of quasi-static cases: an independent check of the bundled solver.
+
+Mesh, material (CIARLET_EL) and motion of the prescribed nodes are the same. Only contact differs: CalculiX uses a
+face-to-face penalty, so surfaces penetrate a little. The barrier of the bundled solver leaves a little air instead.
+CalculiX is licensed under the GPL and runs as a program of its own. Debian and Ubuntu have it as `calculix-ccx`. The
+environment variable CCX_BIN names another binary.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from ast_sim.scene import AttributeValue, Trajectory
+from ast_sim.simulate.calculix.ccx_results import Results, read_results
+from ast_sim.simulate.calculix.deck import Increments, contact_stiffness, write_deck
+from ast_sim.simulate.mechanics.case import SolidCase
+from ast_sim.simulate.mechanics.contact_and_friction import Contact
+from ast_sim.simulate.mechanics.elasticity import Elasticity
+from ast_sim.simulate.mechanics.material import von_mises
+from ast_sim.support.errors import MissingExtra, SimulationError
+
+JOB = "case"
+BEST_GUESS = "best solution and residuals are in the frd file"
+FAILED = 201  # what ccx returns when it gives up, for whatever reason
+# These are tried one after another until all frames converge: first softer contact, then shorter increments, too.
+LADDER = (Increments(), Increments(stiffness=0.1), Increments(stiffness=0.1, largest=0.5))
+
+
+@dataclass(frozen=True)
+class CalculixSettings:
+    """How CalculiX is run.
+
+    Attributes:
+        ladder: increments that are tried one after another until all frames converge.
+        timeout: seconds after which one attempt is killed.
+    """
+
+    ladder: tuple[Increments, ...] = LADDER
+    timeout: float = 7200.0
+
+
+def find_ccx() -> str:
+    """Path of the binary: CCX_BIN if set, else `ccx` in PATH.
+
+    Raises:
+        MissingExtra: there is no such program.
+    """
+    wanted = os.environ.get("CCX_BIN")
+    found = shutil.which(wanted or "ccx")
+    if found is None:
+        where = f"CCX_BIN={wanted} is no program" if wanted else "ccx is not in PATH and CCX_BIN is not set"
+        raise MissingExtra(f"CalculiX is needed here but {where}: apt install calculix-ccx")
+    return os.path.abspath(found)  # ccx runs in another folder
+
+
+def version(ccx: str) -> str:
+    """Version that the binary reports, such as "2.20".
+
+    Raises:
+        SimulationError: the binary does not run, or reports no version.
+    """
+    try:
+        answer = subprocess.run([ccx, "-v"], capture_output=True, text=True, timeout=60, stdin=subprocess.DEVNULL)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise SimulationError(f"{ccx} does not run: {error}") from error
+    found = re.search(r"[Vv]ersion (\d[\w.]*)", answer.stdout)
+    if not found:
+        raise SimulationError(f"{ccx} -v reports no version; is it CalculiX? {_last_line(answer.stdout)}")
+    return found[1]
+
+
+def quasi_static(case: SolidCase, settings: CalculixSettings | None = None) -> Trajectory:
+    """Solve a case with CalculiX.
+
+    Args:
+        case: what to solve. CalculiX does not hold a body apart from itself.
+        settings: the attempts and their time limit.
+
+    Returns:
+        The frames of the attempt that reached the most, up to the first in which an element is inverted or a body
+        intersects itself. `solve_seconds` is shared out among the frames in proportion to their iterations.
+
+    Raises:
+        MissingExtra: CalculiX is not installed.
+        SimulationError: CalculiX is not used for such a case, a run failed for another reason than divergence, or the
+            output cannot be read. The folder with deck and output is then kept and named.
+    """
+    settings = settings or CalculixSettings()
+    ccx = find_ccx()
+    solver = f"calculix {version(ccx)}"
+    best: Trajectory | None = None
+    for increments in settings.ladder:
+        trajectory = _attempt(case, ccx, increments, settings.timeout)
+        if best is None or trajectory.num_frames > best.num_frames:
+            best = trajectory
+        if best.attributes["status"] == "complete":
+            break
+    return replace(best, attributes={**best.attributes, "solver": solver})
+
+
+def _attempt(case: SolidCase, ccx: str, increments: Increments, timeout: float) -> Trajectory:
+    """One run in a folder of its own."""
+    folder = Path(tempfile.mkdtemp(prefix="ast_sim-calculix-"))
+    try:
+        with open(folder / f"{JOB}.inp", "w", encoding="ascii") as file:
+            write_deck(file, case, increments)
+        started = perf_counter()
+        stopped_by = _run(ccx, folder, timeout)
+        seconds = perf_counter() - started
+        scene = case.scene
+        results = read_results(folder, JOB, len(case.targets) - 1, scene.num_nodes, scene.num_elements)
+        trajectory = _trajectory(case, results, increments, stopped_by, seconds)
+    except SimulationError as error:
+        raise SimulationError(f"{error} (deck and output are kept in {folder})") from error
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    shutil.rmtree(folder)
+    return trajectory
+
+
+def _run(ccx: str, folder: Path, timeout: float) -> str:
+    """Run the deck in the folder; return why it ended early, or "".
+
+    Raises:
+        SimulationError: ccx did not end in time, or failed for another reason than missing convergence.
+    """
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "CCX_NPROC_EQUATION_SOLVER": "1", "CCX_NPROC_RESULTS": "1"}
+    log = folder / f"{JOB}.log"
+    with open(log, "w") as output:
+        try:
+            code = subprocess.run(
+                [ccx, "-i", JOB],
+                cwd=folder,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                timeout=timeout,
+            ).returncode
+        except subprocess.TimeoutExpired:
+            raise SimulationError(f"ccx did not end within {timeout:g} s") from None
+        except OSError as error:
+            raise SimulationError(f"{ccx} does not run: {error}") from error
+    if code == 0:
+        return ""
+    reason = _error(_read(log))
+    if code == FAILED and re.match(r"too many|increment size smaller", reason):
+        return f"no convergence in CalculiX: {reason}"
+    raise SimulationError(f"ccx ended with code {code}: {reason}")
+
+
+def _trajectory(
+    case: SolidCase, results: Results, increments: Increments, stopped_by: str, seconds: float
+) -> Trajectory:
+    """The converged frames up to the first that fails a check, with the records that CalculiX gives."""
+    scene = case.scene
+    rest = scene.rest_position.astype(np.float64)
+    position = np.concatenate([rest[None], rest + results.displacement])
+    position[:, scene.prescribed] = case.targets[: len(position), scene.prescribed]
+    position = position.astype(np.float32)
+    jacobian, failure = _check(case, position)
+    frames = len(jacobian)
+    status: dict[str, AttributeValue] = {"status": "complete"}
+    if frames < len(case.targets):
+        status = {"status": "truncated", "stopped_by": f"frame {frames}: {failure or stopped_by}"}
+    iterations = np.concatenate([[0], results.iterations])
+    return Trajectory(
+        scene=scene,
+        position=position[:frames],
+        **_stress_arrays(case, results.stress[: frames - 1]),
+        attributes={
+            **status,
+            **case.attributes,
+            "solve_seconds": (seconds * iterations / max(iterations.sum(), 1))[:frames].tolist(),
+            "newton_iterations": iterations[:frames].tolist(),
+            "halvings": [0, *results.cutbacks.tolist()][:frames],
+            "jacobian": jacobian,
+            "min_jacobian": min(jacobian),
+            "reaction": [0.0, *np.linalg.norm(results.reaction, axis=1).tolist()][:frames],
+            "young": np.unique(case.material.young).tolist(),
+            "poisson": np.unique(case.material.poisson).tolist(),
+            "contact_stiffness": contact_stiffness(case) * increments.stiffness,
+            "friction": case.contact.friction,
+        },
+    )
+
+
+def _check(case: SolidCase, position: np.ndarray) -> tuple[list[float], str]:
+    """Smallest determinant of a deformation gradient in each frame of [S,N,3] up to the first that fails, and why."""
+    scene = case.scene
+    at_rest = _six_volumes(scene.rest_position[scene.elements[case.deforming]])
+    surface = scene.surface()
+    bodies = [surface[scene.body[surface[:, 0]] == body] for body in np.unique(scene.body[case.scene.elements])]
+    contacts = [Contact(scene.rest_position.astype(np.float64), faces, scene.body, case.contact) for faces in bodies]
+    jacobian: list[float] = []
+    for frame in position:
+        if not np.isfinite(frame).all():
+            return jacobian, "positions are not finite"
+        smallest = float((_six_volumes(frame[scene.elements[case.deforming]]) / at_rest).min())
+        if smallest <= 0:
+            return jacobian, f"an element is inverted (det F = {smallest:.3g})"
+        for body, contact in enumerate(contacts):
+            if contact.intersects(frame.astype(np.float64)):
+                return jacobian, f"body {body} intersects itself, which CalculiX is not asked to prevent"
+        jacobian.append(smallest)
+    return jacobian, ""
+
+
+def _six_volumes(corners: np.ndarray) -> np.ndarray:
+    """Six times the volumes of tetrahedra with the corners [E,4,3]."""
+    corners = corners.astype(np.float64)
+    return np.linalg.det(corners[:, 1:] - corners[:, :1])
+
+
+def _stress_arrays(case: SolidCase, stress: np.ndarray) -> dict[str, np.ndarray]:
+    """The stress arrays of a trajectory as they are stored: stress, and Cauchy stress where stress is one of elements.
+
+    A frame at rest is put before the frames of `stress` [S-1,E,6].
+    """
+    stress = np.concatenate([np.zeros((1, *stress.shape[1:])), stress])
+    stress[:, ~case.deforming] = 0  # rigid: stress has no meaning
+    mises = _von_mises(stress)
+    if case.stress_location == "element":
+        return {"stress": mises[:, :, None].astype(np.float32), "cauchy_stress": stress.astype(np.float32)}
+    scene = case.scene
+    elasticity = Elasticity(
+        scene.rest_position.astype(np.float64), scene.elements[case.deforming], case.material.of(case.deforming)
+    )
+    nodal = np.stack([elasticity.nodal_mean(frame[case.deforming]) for frame in mises])
+    return {"stress": nodal[:, :, None].astype(np.float32)}
+
+
+def _von_mises(stress: np.ndarray) -> np.ndarray:
+    """[S,E] of the stress [S,E,6]."""
+    tensor = stress.reshape(-1, 6)[:, [[0, 3, 5], [3, 1, 4], [5, 4, 2]]]
+    return von_mises(np.moveaxis(tensor, 0, -1)).reshape(stress.shape[:2])
+
+
+def _read(path: Path) -> str:
+    return path.read_text(encoding="utf-8", errors="replace")
+
+
+def _error(log: str) -> str:
+    """The last message that ccx marks as an error, on one line; else its last words."""
+    found = re.findall(r"\*ERROR:? *(.*(?:\n(?! *\n| *\*).*)*)", log)
+    return " ".join(found[-1].split()).removesuffix(" " + BEST_GUESS) if found else _last_line(log)
+
+
+def _last_line(text: str) -> str:
+    return (text.strip().splitlines() or ["it printed nothing"])[-1].strip()

@@ -1,0 +1,215 @@
+"""Scene family `deforming_plate`: a clamped plate that a rigid obstacle presses in and lets go.
+
+The plate lies in the plane z = 0 around the origin. Both ends are clamped (HANDLE); in half of the scenes the clamps
+drift. The obstacle (all of its nodes are OBSTACLE) starts above the plate, moves down along a straight slanted way, and
+returns to its start. Meanwhile it follows the drift. Every draw comes from the generator that is passed in, in a fixed
+order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ast_sim.dataset.layout import DatasetInfo
+from ast_sim.scene import NodeType, Scene, Trajectory
+from ast_sim.simulate.mechanics.case import SolidCase
+from ast_sim.simulate.mechanics.contact_and_friction import ContactSettings
+from ast_sim.simulate.mechanics.material import NeoHookean
+from ast_sim.simulate.mechanics.quasi_static import quasi_static
+from ast_sim.simulate.mechanics.unfinished import Checkpoint
+from ast_sim.simulate.shapes import plate_mesh
+from ast_sim.simulate.shapes.obstacles import draw_obstacle
+from ast_sim.simulate.shapes.plate_outline_and_holes import Outline, distance_to, draw_outline
+from ast_sim.support.errors import SimulationError
+
+FRAMES = 400
+DEFAULT_NODES = 1300
+MINIMUM_NODES = 80
+MINIMUM_FRAMES = 3  # a press and its release need this many
+MATERIAL = NeoHookean(young=1e6, poisson=0.4)
+CONTACT = ContactSettings(dhat=1e-3, stiffness=MATERIAL.young)
+LAYERS = 2  # layers of elements through the thickness
+OBSTACLE_SHARE = 0.16  # share of the nodes that belong to the obstacle
+SMALLEST_ANGLE = np.radians(22)  # smallest angle of a triangle of the middle plane
+CLAMP_MARGIN = 0.05  # distance in metres, seen from above, between the obstacle and the clamps
+INFO = DatasetInfo(
+    family="deforming_plate",
+    integration="quasi_static",
+    stress_location="node",
+    domain_center=(0.0, 0.0, 0.0),
+    domain_half_width=1.0,
+    contact_radius=0.03,
+    time_step=0.0,
+)
+
+
+def solve(case: SolidCase, checkpoint: Checkpoint | None = None, patient: bool = False) -> Trajectory:
+    """All frames of a drawn scene, or those up to the first that cannot be solved."""
+    return quasi_static(case, checkpoint=checkpoint, patient=patient)
+
+
+@dataclass(frozen=True)
+class _Plate:
+    """A meshed plate.
+
+    Attributes:
+        outline: the outline that was meshed.
+        spacing: length of the edges of the mesh.
+        position, elements: [N,3] and [E,4].
+        clamps: [N] 1 for nodes of the left clamp, 2 for nodes of the right clamp, 0 elsewhere.
+    """
+
+    outline: Outline
+    spacing: float
+    position: np.ndarray
+    elements: np.ndarray
+    clamps: np.ndarray
+
+
+def draw(rng: np.random.Generator, nodes: int = DEFAULT_NODES, frames: int = FRAMES) -> SolidCase:
+    """Draw a scene.
+
+    Args:
+        rng: where all draws come from.
+        nodes: about how many nodes a scene of the dataset has, obstacle included. The drawn scene has 0.5 to 1.7 times
+            as many.
+        frames: how many frames the press and the release take.
+
+    Raises:
+        SimulationError: there are too few frames for a press and a release.
+    """
+    if frames < MINIMUM_FRAMES:
+        raise SimulationError(f"frames is {frames}; a press and its release need at least {MINIMUM_FRAMES}")
+    while True:
+        case = _try_draw(rng, nodes, frames)
+        if case is not None and 0.5 * nodes <= case.scene.num_nodes <= 1.7 * nodes:
+            return case
+
+
+def _try_draw(rng: np.random.Generator, nodes: int, frames: int) -> SolidCase | None:
+    """One draw; None if the plate cannot be meshed well, or if the obstacle does not fit or comes down on a hole."""
+    wanted = nodes * rng.triangular(0.53, 0.95, 1.6)
+    cells = max(2, round((OBSTACLE_SHARE * wanted) ** (1 / 3)) - 1)
+    plate = _draw_plate(rng, wanted - (cells + 1) ** 3)
+    if plate is None:
+        return None
+    shape, obstacle, obstacle_elements = draw_obstacle(rng, cells)
+    way = draw_way(rng, frames)
+    depth = rng.uniform(0.02, 0.065)
+    direction = np.array([*rng.uniform(-0.25, 0.25, 2), -1.0])
+    touch = _draw_touch(rng, plate, obstacle, depth * direction)
+    if touch is None:
+        return None
+    gap = rng.uniform(0.004, 0.015)
+    drift = draw_drift(rng, way)
+    lowest = obstacle[np.argmin(obstacle[:, 2])]
+    start = np.array([*touch, plate.position[:, 2].max()]) - gap * direction
+    obstacle = obstacle + start - lowest
+    travel = (depth + gap) * way[:, None] * direction + _follow(plate, touch, drift)
+    n = len(plate.position)
+    scene = _assemble(plate, obstacle, obstacle_elements)
+    targets = np.repeat(scene.rest_position.astype(np.float64)[None], frames, axis=0)
+    targets[:, n:] += travel[:, None]
+    for clamp, moves in enumerate(drift, 1):
+        targets[:, :n][:, plate.clamps == clamp] += moves[:, None]
+    attributes = {
+        "obstacle": shape,
+        "outline": plate.outline.kind,
+        "holes": " ".join(plate.outline.hole_kinds),
+        "thickness": float(np.ptp(plate.position[:, 2])),
+        "depth": depth,
+        "drift": [float(np.linalg.norm(moves, axis=1).max()) for moves in drift],
+    }
+    return SolidCase(scene, targets, MATERIAL, CONTACT, INFO.stress_location, attributes)
+
+
+def _draw_plate(rng: np.random.Generator, nodes: float) -> _Plate | None:
+    """A plate of about `nodes` nodes; None if it has an element of poor shape."""
+    length, width, thickness = rng.uniform([0.42, 0.24, 0.025], [0.54, 0.40, 0.045])
+    columns = nodes / (LAYERS + 1)
+    outline = draw_outline(rng, length, width, plate_mesh.spacing_for(columns, length * width, 2 * (length + width)))
+    loops = [np.concatenate(outline.pieces), *outline.holes]
+    area = sum(abs(plate_mesh.area(loop)) * (1 if loop is loops[0] else -1) for loop in loops)
+    perimeter = sum(map(plate_mesh.length, loops))
+    spacing = plate_mesh.spacing_for(columns, area, perimeter)
+    mesh = plate_mesh.triangulate(outline.pieces, outline.holes, spacing)
+    if mesh is None or plate_mesh.smallest_angle(mesh) < SMALLEST_ANGLE:
+        return None
+    taper = rng.uniform(-0.3, 0.3) if rng.random() < 0.4 else 0.0
+    position, elements = plate_mesh.extrude(mesh, thickness * (1 + taper * mesh.points[:, 0] / length), LAYERS)
+    clamps = np.zeros(len(mesh.points), int)
+    for clamp, piece in enumerate(outline.ends, 1):
+        clamps[mesh.pieces[piece]] = clamp
+    return _Plate(outline, spacing, position, elements, np.repeat(clamps, LAYERS + 1))
+
+
+def _draw_touch(rng: np.random.Generator, plate: _Plate, obstacle: np.ndarray, press: np.ndarray) -> np.ndarray | None:
+    """The point [2] where the obstacle's lowest point meets the plate. None if it does not fit, or meets a hole.
+
+    The plate is solid at this point, and the obstacle stays well between the clamps on all of its way. A clamped node
+    could not give way under it.
+    """
+    x, y = obstacle[:, :2].T - obstacle[np.argmin(obstacle[:, 2]), :2][:, None]
+    ends = [plate.position[plate.clamps == clamp, 0] for clamp in (1, 2)]
+    left = ends[0].max() + CLAMP_MARGIN - min(x.min(), (x + press[0]).min())
+    right = ends[1].min() - CLAMP_MARGIN - max(x.max(), (x + press[0]).max())
+    if left > right:
+        return None
+    along, across = rng.uniform(-1, 1, 2)
+    side = np.abs(plate.position[:, 1]).max()
+    touch = np.array([(left + right) / 2 + 0.35 * along * (right - left), 0.7 * across * side])
+    sides, holes = np.concatenate(plate.outline.pieces), plate.outline.holes
+    solid = distance_to(sides, touch) < -0.2 * side
+    return touch if solid and all(distance_to(hole, touch) >= plate.spacing / 2 for hole in holes) else None
+
+
+def draw_way(rng: np.random.Generator, frames: int) -> np.ndarray:
+    """Share of the press in each frame [S].
+
+    It rises from 0 to 1, stays there for some frames in some scenes, and falls back to 0; linearly or like a cosine.
+    """
+    last = frames - 1
+    peak = min(round(rng.triangular(0.7, 0.9, 0.93) * last), last - 1)
+    hold = min(round(rng.uniform(0.02, 0.06) * last), peak - 1) if rng.random() < 0.3 else 0
+    way = np.interp(np.arange(frames), [0, peak - hold, peak, last], [0, 1, 1, 0])
+    return (1 - np.cos(np.pi * way)) / 2 if rng.random() < 0.5 else way
+
+
+def draw_drift(rng: np.random.Generator, way: np.ndarray) -> np.ndarray:
+    """Displacements [2,S,3] of the left and the right clamp in metres. None, one or both drift, by 0.02 to 0.06.
+
+    They drift outwards, sideways, up and down, but not inwards, because a plate that is pushed together buckles. A
+    drift grows smoothly until the last frame, or comes and goes with the press.
+    """
+    drift = np.zeros((2, len(way), 3))
+    moving = rng.choice(4, p=[0.5, 0.15, 0.15, 0.2])  # none, left, right, both
+    for clamp, outwards in ((0, -1), (1, 1)):
+        direction = np.array([outwards * rng.uniform(0, 0.7), *rng.uniform(-1, 1, 2)])
+        size = rng.uniform(0.02, 0.06)
+        if moving in (clamp + 1, 3):
+            drift[clamp] = size * direction / np.linalg.norm(direction)
+    returns = rng.random() < 0.5
+    share = way if returns else (1 - np.cos(np.pi * np.linspace(0, 1, len(way)))) / 2
+    return drift * share[:, None]
+
+
+def _follow(plate: _Plate, touch: np.ndarray, drift: np.ndarray) -> np.ndarray:
+    """Displacement [S,3] of a clamped beam where the obstacle touches it, while its ends drift."""
+    left, right = (plate.position[plate.clamps == clamp, 0].mean() for clamp in (1, 2))
+    s = (touch[0] - left) / (right - left)
+    share = s * s * (3 - 2 * s)
+    return (1 - share) * drift[0] + share * drift[1]
+
+
+def _assemble(plate: _Plate, obstacle: np.ndarray, obstacle_elements: np.ndarray) -> Scene:
+    n = len(plate.position)
+    node_type = np.full(n + len(obstacle), NodeType.OBSTACLE, np.uint8)
+    node_type[:n] = np.where(plate.clamps > 0, NodeType.HANDLE, NodeType.NORMAL)
+    return Scene(
+        rest_position=np.concatenate([plate.position, obstacle]).astype(np.float32),
+        elements=np.concatenate([plate.elements, obstacle_elements + n]).astype(np.int32),
+        node_type=node_type,
+        body=np.repeat([0, 1], [n, len(obstacle)]).astype(np.int32),
+    )

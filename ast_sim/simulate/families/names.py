@@ -1,0 +1,50 @@
+"""The scene families that can be generated, by name. The module of a family is imported when it is used.
+
+Such a module has `INFO` (DatasetInfo), `DEFAULT_NODES`, `MINIMUM_NODES`, `draw(rng, nodes, ...) -> case`, which takes
+all of its draws from `rng`, and `solve(case, checkpoint) -> Trajectory`.
+"""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from types import ModuleType
+
+from ast_sim.support.errors import SimulationError
+
+
+@dataclass(frozen=True)
+class Family:
+    """What is known of a family before its module is imported.
+
+    Attributes:
+        about: one line for a user.
+        options: the options of `generate` that it has beside the number of nodes: "frames", "parts", "solver".
+        packages: packages that only its scenes depend on. The dataset records their versions.
+    """
+
+    about: str
+    options: tuple[str, ...] = ()
+    packages: tuple[str, ...] = ()
+
+
+FAMILIES = {
+    "deforming_plate": Family("clamped plates that a rigid obstacle presses in and lets go", ("frames", "solver")),
+    "sphere_simple": Family("a hanging cloth and a sphere that pushes into it, with inertia"),
+    "abcd": Family("two CAD-like parts squeezed together, 4,000 nodes", ("parts", "solver"), ("gmsh", "meshio")),
+    "abcd_xl": Family("abcd with 100,000 nodes: a scene takes hours", ("parts", "solver"), ("gmsh", "meshio")),
+}
+
+MODULES = {family: f"{__package__}.{family}" for family in FAMILIES}
+
+
+def family_module(family: str) -> ModuleType:
+    """The module of a scene family.
+
+    Raises:
+        SimulationError: the family is unknown.
+        MissingExtra: an extra that the family needs is not installed.
+    """
+    if family not in FAMILIES:
+        raise SimulationError(f"there is no scene family {family!r}; use one of {', '.join(FAMILIES)}")
+    return importlib.import_module(MODULES[family])

@@ -1,0 +1,1 @@
+"""Many scenes, solved by many processes."""

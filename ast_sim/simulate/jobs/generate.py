@@ -1,0 +1,274 @@
+"""Generate a dataset with many processes, on one machine or a cluster, in a way that survives a kill.
+
+`OUT.parts/` holds every finished sample, and the frames so far of long unfinished samples. A run with the same settings
+goes on from there. When all samples are present, they are merged in order into the dataset file, and the folder is
+removed.
+The settings alone determine the bytes of the dataset. The number of workers and interruptions do not change them. The
+solver's seconds are stored in a file beside the dataset (`ast_sim.dataset.solver_seconds`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import glob
+import json
+import os
+import shutil
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ast_sim.dataset.layout import SPLITS, DatasetInfo
+from ast_sim.dataset.reader import Dataset
+from ast_sim.dataset.solver_seconds import Seconds, write_seconds
+from ast_sim.dataset.writer import DatasetWriter
+from ast_sim.simulate.families.names import family_module
+from ast_sim.simulate.jobs import cluster, pool
+from ast_sim.simulate.jobs.display import Progress
+from ast_sim.simulate.jobs.manifest import Manifest, Watch
+from ast_sim.simulate.jobs.recipe import check_parts, checked_recipe, difference, recorded
+from ast_sim.simulate.jobs.samples import Recipe, Sample, load_sample, sample_name, sample_path
+from ast_sim.simulate.mechanics.contact_and_friction import self_test
+from ast_sim.support.disk import output_file, replacing
+from ast_sim.support.errors import SimulationError
+
+MOST_SCENES = 1_000_000  # names of samples have six digits
+
+
+@dataclass(frozen=True)
+class Generated:
+    """What `generate` did.
+
+    Attributes:
+        path: the dataset file.
+        counts: number of samples of each split.
+        truncated: names of the samples that stopped before their last frame.
+    """
+
+    path: Path
+    counts: dict[str, int]
+    truncated: list[str]
+
+
+def generate(
+    family: str,
+    out: str | os.PathLike[str],
+    *,
+    train: int = 100,
+    valid: int | None = None,
+    test: int | None = None,
+    seed: int = 0,
+    nodes: int | None = None,
+    frames: int | None = None,
+    workers: int | None = None,
+    solver: str | None = None,
+    parts: str | os.PathLike[str] | None = None,
+    patient: bool = False,
+    scheduler: str | None = None,
+    progress: bool = True,
+) -> Generated:
+    """Generate a dataset file of simulated scenes.
+
+    Args:
+        family: scene family, such as "deforming_plate".
+        out: the dataset file. If it exists and was made with the same settings, nothing is done.
+        train, valid, test: scenes of each split. `valid` and `test` are a tenth of `train` if None.
+        seed: of all random draws. A sample depends only on the seed, its split, its index and the settings.
+        nodes: about how many nodes a scene has; the family's default if None.
+        frames: frames of a scene, for families that have this option; the family's default if None.
+        workers: number of processes; one per available core if None.
+        solver: "own" or "calculix", for families of solids; "own" if None.
+        parts: a file or folder of parts (STEP, STL, meshes), for families that squeeze parts; None: drawn ones.
+        patient: solve every scene to its last frame. Else a scene ends before a frame of over 500 Newton iterations.
+        scheduler: address of a Dask scheduler. Its workers make the samples; no processes start on this machine.
+        progress: show a bar on a terminal and lines elsewhere.
+
+    Raises:
+        AstSimError: `out` is no place for a file.
+        SimulationError: a setting is invalid, the scenes cannot fit on the disk, `out` or its parts folder was made
+            with other settings, another process uses the folder, or samples failed. The finished samples are kept: the
+            same call goes on from them.
+        MissingExtra: a package that the family, the solver or the scheduler needs is not installed.
+    """
+    module = family_module(family)
+    self_test()
+    counts = _checked_counts(train, valid, test)
+    recipe = checked_recipe(module, family, seed, nodes, frames, solver, parts, patient)
+    workers = _checked_workers(workers, scheduler)
+    out, settings = Path(out), recorded(recipe)
+    output_file(out)
+    folder = out.with_name(out.name + ".parts")
+    if out.exists():
+        return _existing(out, folder, settings, counts)
+    if not folder.exists():
+        check_parts(recipe)
+        _check_room(out, sum(counts.values()), recipe.nodes, recipe.frames or getattr(module, "FRAMES", 1))
+    samples = [(split, index) for split in SPLITS for index in range(counts[split])]
+    info = replace(module.INFO, generator={**settings, "counts": counts})
+    with _locked(folder, settings):
+        _make(samples, folder, recipe, workers, scheduler, progress, _notes(settings))
+        truncated = _merge(out, folder, samples, info)
+        _remove(folder)
+    return Generated(out, counts, truncated)
+
+
+def _notes(settings: dict[str, Any]) -> list[str]:
+    """What a user should know before the run takes hours."""
+    if settings.get("mesher") == "structured":
+        line = 'pip install "ast_sim[cad]"'
+        return [f"gmsh is not installed, so parts are blocks, cylinders and plates; for CAD-like parts: {line}"]
+    return []
+
+
+def _make(
+    samples: list[Sample],
+    folder: Path,
+    recipe: Recipe,
+    workers: int,
+    scheduler: str | None,
+    progress: bool,
+    notes: list[str],
+) -> None:
+    """Make the samples that the folder lacks."""
+    present = {sample for sample in samples if _is_readable(sample_path(folder, *sample))}
+    missing = [sample for sample in samples if sample not in present]
+    manifest = Manifest(folder, samples, present)
+    with contextlib.closing(manifest), Progress(len(samples), len(present), "scenes", progress) as bar:
+        for note in (*notes, *(f"{name} failed before: {why}" for name, why in manifest.failures.items())):
+            bar.note(note)
+        watch = Watch(manifest, bar)
+        if missing and scheduler is None:
+            pool.run_all(missing, folder, recipe, workers, watch)
+        elif missing:
+            cluster.run_all(missing, folder, recipe, scheduler, watch)
+    if watch.failures:
+        listing = "; ".join(f"{sample_name(*sample)}: {text}" for sample, text in list(watch.failures.items())[:3])
+        raise SimulationError(
+            f"{len(watch.failures)} of {len(samples)} samples failed ({listing}). The others are kept in {folder}:"
+            " the same command goes on from there"
+        )
+
+
+def _checked_workers(workers: int | None, scheduler: str | None) -> int:
+    if workers is not None and scheduler is not None:
+        raise SimulationError("workers run on this machine, but a scheduler has its own workers: give one of them")
+    if workers is not None and workers < 1:
+        raise SimulationError(f"workers is {workers}; must be at least 1")
+    if workers is not None:
+        return workers
+    if hasattr(os, "sched_getaffinity"):  # not on macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _checked_counts(train: int, valid: int | None, test: int | None) -> dict[str, int]:
+    tenth = -(-train // 10)
+    counts = {
+        "train": train,
+        "valid": tenth if valid is None else valid,
+        "test": tenth if test is None else test,
+    }
+    if min(counts.values()) < 0 or sum(counts.values()) == 0:
+        raise SimulationError(f"counts must be at least 0 and not all 0, got {counts}")
+    if sum(counts.values()) > MOST_SCENES:
+        raise SimulationError(f"{sum(counts.values()):,} scenes are too many for one dataset: at most {MOST_SCENES:,}")
+    return counts
+
+
+def _check_room(out: Path, scenes: int, nodes: int, frames: int) -> None:
+    """Refuse what cannot fit on the disk: positions and stress alone take four float32 a node and frame."""
+    folder = next(parent for parent in out.absolute().parents if parent.exists())
+    least, free = 16 * scenes * nodes * frames, shutil.disk_usage(folder).free
+    if least > free:
+        raise SimulationError(
+            f"{scenes:,} scenes need more than {least / 1e9:,.3f} GB, but {folder} has {free / 1e9:,.3f} GB:"
+            " make fewer or smaller scenes, or choose another disk"
+        )
+
+
+def _existing(out: Path, folder: Path, settings: dict[str, Any], counts: dict[str, int]) -> Generated:
+    with Dataset(out) as dataset:
+        differs = difference(dataset.info.generator, {**settings, "counts": counts})
+        if differs:
+            raise SimulationError(f"{out} exists and holds other data ({differs}): remove it or choose another name")
+        names = [(split, index) for split in SPLITS for index in range(dataset.count(split))]
+        truncated = [sample_name(*sample) for sample in names if dataset.attributes(*sample)["status"] == "truncated"]
+    if folder.exists():  # a kill came after the dataset was written and before its parts were removed
+        with _locked(folder, settings):
+            _remove(folder)
+    _remove(folder)
+    return Generated(out, counts, truncated)
+
+
+@contextlib.contextmanager
+def _locked(folder: Path, settings: dict[str, Any]) -> Iterator[None]:
+    """Hold the parts folder, so that one process at a time uses it. It is new or was made with these settings."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = open(folder / "lock", "w")  # noqa: SIM115 (closed below, also on an error)
+    except OSError as error:
+        raise SimulationError(f"{folder} cannot be written: {error}") from error
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise SimulationError(f"{folder} is in use by another process that generates the same file") from None
+        path = folder / "settings.json"
+        if path.exists():
+            differs = difference(_read_settings(path), settings)
+            if differs:
+                raise SimulationError(
+                    f"{folder} holds samples of other settings ({differs}): give those settings, or remove the folder"
+                )
+        else:
+            try:
+                with replacing(path) as temporary:
+                    temporary.write_text(json.dumps(settings))
+            except OSError as error:
+                raise SimulationError(f"{path} cannot be written: {error}") from error
+        for leftover in folder.glob(".*"):  # files that a killed process had not finished
+            leftover.unlink(missing_ok=True)
+        yield
+
+
+def _read_settings(path: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError) as error:
+        raise SimulationError(f"{path} is damaged ({error}): remove the folder") from error
+
+
+def _remove(folder: Path) -> None:
+    """Remove the parts folder in one step, so that samples never lie there without their settings."""
+    removed = folder.with_name(f".{folder.name}.removed")
+    shutil.rmtree(removed, ignore_errors=True)
+    with contextlib.suppress(FileNotFoundError):
+        os.replace(folder, removed)
+        shutil.rmtree(removed)
+
+
+def _is_readable(path: Path) -> bool:
+    try:
+        load_sample(path)
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+        return False
+    return True
+
+
+def _merge(out: Path, folder: Path, samples: list[Sample], info: DatasetInfo) -> list[str]:
+    """Write the seconds and then the dataset; return the names of the truncated samples."""
+    truncated = []
+    seconds: dict[str, Seconds] = {}
+    for leftover in out.parent.glob(f".{glob.escape(out.name)}.*.tmp"):  # of a merge that was killed
+        leftover.unlink(missing_ok=True)
+    with DatasetWriter(out, info) as writer:
+        for sample in samples:
+            trajectory, seconds[sample_name(*sample)] = load_sample(sample_path(folder, *sample))
+            writer.add(sample[0], trajectory)
+            if trajectory.attributes["status"] == "truncated":
+                truncated.append(sample_name(*sample))
+        write_seconds(out, info.generator, seconds)
+    return truncated

@@ -1,0 +1,127 @@
+"""One generated sample, as a pure function of its recipe, split and index; and the file of the sample.
+
+A sample has a small file of its own until the dataset is whole. The file appears under its name complete or not at all.
+It holds the seconds of the solver apart from the other attributes: only the seconds differ when a sample is made again.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ast_sim.dataset.layout import SPLITS
+from ast_sim.dataset.solver_seconds import Seconds, split_seconds
+from ast_sim.scene import Scene, Trajectory
+from ast_sim.simulate.families.names import family_module
+from ast_sim.simulate.mechanics.unfinished import Checkpoint
+from ast_sim.support.disk import replacing
+from ast_sim.support.provenance import processor
+
+Sample = tuple[str, int]  # split and index in it
+
+_SCENE = ("rest_position", "elements", "node_type", "body", "material")
+_FRAMED = ("position", "stress", "cauchy_stress")
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """The settings that all samples of a dataset share.
+
+    Attributes:
+        family: scene family.
+        seed: the seed of all random draws.
+        nodes: about how many nodes a scene has.
+        frames: frames of a scene, for families that have this option.
+        solver: "own" or "calculix".
+        parts: a file or folder of the user's parts, for families that have this option.
+        patient: whether the own solver may take any number of Newton iterations for a frame.
+    """
+
+    family: str
+    seed: int
+    nodes: int
+    frames: int | None = None
+    solver: str = "own"
+    parts: str | None = None
+    patient: bool = False
+
+
+def make_sample(recipe: Recipe, split: str, index: int, checkpoint: Checkpoint | None = None) -> Trajectory:
+    """Draw and solve one sample. The same arguments give the same arrays, whichever other samples are made.
+
+    Args:
+        recipe: the settings that all samples share.
+        split: "train", "valid" or "test".
+        index: which sample of the split.
+        checkpoint: where an unfinished solve is kept. If there is one already, it goes on.
+    """
+    module = family_module(recipe.family)
+    sequence = np.random.SeedSequence(recipe.seed, spawn_key=(SPLITS.index(split), index))
+    options = {} if recipe.frames is None else {"frames": recipe.frames}
+    if recipe.parts is not None:
+        from ast_sim.simulate.shapes.part_source import part_source
+
+        options["parts"] = part_source(Path(recipe.parts))
+    case = module.draw(np.random.default_rng(sequence), recipe.nodes, **options)
+    if recipe.solver == "calculix":
+        from ast_sim.simulate.calculix import solve as calculix
+
+        trajectory = calculix.quasi_static(case)
+    else:
+        trajectory = module.solve(case, checkpoint, recipe.patient)
+    trajectory.attributes.update(seed=recipe.seed, index=index)
+    return trajectory
+
+
+def sample_name(split: str, index: int) -> str:
+    """The name of a sample in messages, and of its group in the dataset file."""
+    return f"{split}/{index:06d}"
+
+
+def sample_path(folder: Path, split: str, index: int) -> Path:
+    """Where a sample lies in its folder."""
+    return folder / f"{split}-{index:06d}.npz"
+
+
+def checkpoint_path(folder: Path, split: str, index: int) -> Path:
+    """Where an unfinished sample lies in its folder."""
+    return folder / f"{split}-{index:06d}.checkpoint"
+
+
+def save_sample(path: Path, trajectory: Trajectory) -> None:
+    """Write a sample. Its file is whole or absent."""
+    store_sample(path, pack_sample(trajectory))
+
+
+def store_sample(path: Path, data: bytes) -> None:
+    """Write the bytes of a sample. Its file is whole or absent."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def pack_sample(trajectory: Trajectory) -> bytes:
+    """A sample as the bytes of its file."""
+    kept, seconds = split_seconds(trajectory.attributes)
+    arrays = {key: getattr(trajectory.scene, key) for key in _SCENE}
+    arrays |= {key: getattr(trajectory, key) for key in _FRAMED}
+    texts = {"attributes": kept, "seconds": {**seconds, "processor": processor()}}
+    file = io.BytesIO()
+    np.savez(
+        file,
+        **{key: array for key, array in arrays.items() if array is not None},
+        **{key: np.array(json.dumps(value)) for key, value in texts.items()},
+    )
+    return file.getvalue()
+
+
+def load_sample(path: Path) -> tuple[Trajectory, Seconds]:
+    """Read a sample; return it and the seconds that the solver took."""
+    with np.load(path, allow_pickle=False) as file:
+        scene = Scene(**{key: file[key] for key in _SCENE if key in file})
+        framed = {key: file[key] for key in _FRAMED if key in file}
+        attributes, seconds = (json.loads(str(file[key])) for key in ("attributes", "seconds"))
+    return replace(Trajectory(scene, framed.pop("position"), attributes=attributes), **framed), seconds

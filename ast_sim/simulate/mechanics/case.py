@@ -1,0 +1,42 @@
+"""A drawn quasi-static scene, with all that its solution depends on. Any solver can solve it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ast_sim.scene import AttributeValue, Scene
+from ast_sim.simulate.mechanics.contact_and_friction import ContactSettings
+from ast_sim.simulate.mechanics.material import NeoHookean
+
+
+@dataclass(frozen=True, eq=False)
+class SolidCase:
+    """Deforming bodies of tetrahedra and rigid obstacles in S frames. The motion of clamps and obstacles is prescribed.
+
+    Attributes:
+        scene: what does not change. Elements whose nodes are all OBSTACLE nodes are rigid; all others deform.
+        targets: [S,N,3] float64, positions of the prescribed nodes in each frame in metres. Rows of other nodes are
+            ignored. Frame 0 is at rest.
+        material: material of all elements; the constants of rigid elements are ignored.
+        contact: contact between bodies.
+        stress_location: "node": von Mises stress at nodes. "element": von Mises stress and Cauchy stress of elements.
+        attributes: what the drawing wants recorded with the trajectory.
+    """
+
+    scene: Scene
+    targets: np.ndarray
+    material: NeoHookean
+    contact: ContactSettings
+    stress_location: str
+    attributes: dict[str, AttributeValue] = field(default_factory=dict)
+
+    @property
+    def deforming(self) -> np.ndarray:
+        """[E] bool: the elements that are not rigid. They have a node that is not an OBSTACLE node.
+
+        `Scene.deforming_elements` has fewer elements: those without any OBSTACLE node. The solver needs more. An
+        element with some OBSTACLE nodes is strained when its other nodes move, so it has elastic forces.
+        """
+        return self.scene.deforming_nodes[self.scene.elements].any(axis=1)

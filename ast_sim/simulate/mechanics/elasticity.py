@@ -1,0 +1,164 @@
+"""Linear tetrahedra (P1): energy, forces and stiffness of an elastic body in double precision.
+
+With N_a the shape functions and x_a the positions of a tetrahedron's four nodes, F = sum_a x_a grad N_a is constant in
+the tetrahedron. Everything that depends on the rest shape alone is computed once: gradients, volumes, and where an
+entry of an element's stiffness lands in the global matrix. Legend: N nodes, E elements; component-first arrays as in
+`material.py`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ast_sim.simulate.mechanics.material import NeoHookean, cofactor, determinant
+from ast_sim.support.errors import SimulationError
+
+# The 78 entries (p, q), p <= q, of an element's symmetric 12 x 12 stiffness; p = 3 a + i for component i of node a.
+_ROW, _COLUMN = np.triu_indices(12)
+_ENTRY = np.zeros((12, 12), int)
+_ENTRY[_ROW, _COLUMN] = _ENTRY[_COLUMN, _ROW] = np.arange(len(_ROW))
+# Entry of the pair with the two nodes exchanged and the components kept: (a i, b j) -> (b i, a j).
+_SWAPPED = _ENTRY[3 * (_COLUMN // 3) + _ROW % 3, 3 * (_ROW // 3) + _COLUMN % 3]
+
+
+@dataclass(frozen=True, eq=False)
+class Deformation:
+    """Deformation gradients F [3,3,E], their determinants J [E], cofactors J F^-T [3,3,E] and the energy in joule.
+
+    The energy is infinite if an element is inverted.
+    """
+
+    F: np.ndarray
+    J: np.ndarray
+    cofactor: np.ndarray
+    energy: float
+
+
+class Elasticity:
+    """Elastic body of tetrahedra `elements` [E,4] with rest positions [N,3]. Nodes outside all elements carry no force.
+
+    Raises:
+        SimulationError: the rest volume of an element is not positive.
+    """
+
+    def __init__(self, rest: np.ndarray, elements: np.ndarray, material: NeoHookean) -> None:
+        self.material = material
+        self.elements = elements
+        self.num_nodes = len(rest)
+        edges = np.transpose(rest[elements[:, 1:]] - rest[elements[:, :1]], (2, 1, 0))  # [3, 3, E]: component, edge
+        cofactors = cofactor(np.ascontiguousarray(edges))
+        six_volumes = determinant(edges, cofactors)
+        if (six_volumes <= 0).any():
+            worst = int(np.argmin(six_volumes))
+            raise SimulationError(f"element {worst} has the rest volume {six_volumes[worst] / 6:.3g}: must be positive")
+        self.volume = six_volumes / 6
+        gradients = np.transpose(cofactors / six_volumes, (1, 0, 2))  # of nodes 1, 2, 3: rows of the inverse
+        self.gradients = np.concatenate([-gradients.sum(0)[None], gradients])  # [4, 3, E]
+        self._nodes = np.ascontiguousarray(elements.T)
+        self._dofs = (3 * self._nodes[:, None, :] + np.arange(3)[None, :, None]).reshape(12, -1)
+        dot = np.einsum("aje,bje->abe", self.gradients, self.gradients)
+        same_component = _ROW % 3 == _COLUMN % 3
+        self._constant = material.mu * self.volume * dot[_ROW // 3, _COLUMN // 3] * same_component[:, None]  # [78, E]
+
+    @property
+    def unit_force(self) -> float:
+        """Mean nodal force of an element whose stress is Young's modulus, in newton: a scale for residuals."""
+        return float(np.mean(self.material.young * self.volume * np.abs(self.gradients)))
+
+    @property
+    def unit_energy(self) -> float:
+        """Energy in joule of a body whose energy density is Young's modulus: a scale for rounding."""
+        return float(np.sum(self.material.young * self.volume))
+
+    def lumped_volume(self) -> np.ndarray:
+        """[N] volume around each node in m^3: a quarter of the volume of each element around it."""
+        return np.bincount(self._nodes.ravel(), np.tile(self.volume / 4, 4), minlength=self.num_nodes)
+
+    def evaluate(self, position: np.ndarray) -> Deformation:
+        """F, J, cofactors and energy at positions [N,3]."""
+        x = position.T[:, self._nodes]  # [3, 4, E]
+        F = np.einsum("iae,aje->ije", x, self.gradients)
+        cofactors = cofactor(F)
+        J = determinant(F, cofactors)
+        energy = np.inf if J.min() <= 0 else float(self.volume @ self.material.energy_density(F, J))
+        return Deformation(F, J, cofactors, energy)
+
+    def element_forces(self, deformation: Deformation) -> np.ndarray:
+        """Derivative of each element's energy by its nodes [12,E], V P grad N_a, in newton."""
+        P = self.material.first_piola(deformation.F, deformation.J, deformation.cofactor / deformation.J)
+        return np.einsum("ije,aje->aie", P * self.volume, self.gradients).reshape(12, -1)
+
+    def gradient(self, deformation: Deformation) -> tuple[np.ndarray, float]:
+        """Derivative of the energy by the positions [N,3], in newton, and the mean magnitude of an element's forces."""
+        forces = self.element_forces(deformation)
+        total = np.bincount(self._dofs.ravel(), forces.ravel(), minlength=3 * self.num_nodes)
+        return total.reshape(-1, 3), float(np.abs(forces).mean())
+
+    def hessian(self, deformation: Deformation, project: bool = False) -> np.ndarray:
+        """Second derivative of each element's energy as its 78 upper entries [78 E], entry by entry.
+
+        With g_a = F^-T grad N_a the block of nodes a, b is
+
+            K_ab = V [mu (grad N_a . grad N_b) I + lambda J^2 g_a (x) g_b - c g_b (x) g_a],  c = lambda/2 (J^2 - 1) - mu
+
+        (from dP = mu dF + lambda J^2 (F^-T : dF) F^-T - c F^-T dF^T F^-T).
+
+        Args:
+            deformation: the deformation at the positions in question.
+            project: replace the negative eigenvalues of each element's matrix by zero.
+        """
+        J = deformation.J
+        g = np.einsum("ije,aje->aie", deformation.cofactor / J, self.gradients).reshape(12, -1)
+        products = g[_ROW]
+        products *= g[_COLUMN]
+        entries = products[_SWAPPED]
+        entries *= -self.volume * self.material.pressure_factor(J)
+        products *= self.volume * self.material.lam * J * J
+        entries += products
+        entries += self._constant
+        if project:
+            indefinite = self._may_be_indefinite(deformation)
+            entries[:, indefinite] = _project(entries[:, indefinite])
+        return entries.ravel()
+
+    def entry_dofs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Global degrees of freedom (3 node + component) of the rows and columns of `hessian`, [78 E] each."""
+        return self._dofs[_ROW].ravel(), self._dofs[_COLUMN].ravel()
+
+    def _may_be_indefinite(self, deformation: Deformation) -> np.ndarray:
+        """[E] bool: whether d2 psi / dF2 has a negative eigenvalue.
+
+        For an isotropic psi with singular values s_i of F, the eigenvalues of d2 psi / dF2 are of two kinds (Smith et
+        al. 2019). Flips and twists of the two axes other than k have mu -+ c s_k / J, here with c = `pressure_factor`.
+        The rest are the eigenvalues of A_ij = d2 psi / ds_i ds_j:
+
+            A_ij = delta_ij (mu - c / s_i^2) + lambda J^2 / (s_i s_j)
+        """
+        material, J = self.material, deformation.J
+        c = material.pressure_factor(J)
+        squares = np.linalg.eigvalsh(np.einsum("kie,kje->eij", deformation.F, deformation.F))  # ascending, [E, 3]
+        inverse = 1 / np.sqrt(squares)
+        A = (material.lam * J * J)[:, None, None] * inverse[:, :, None] * inverse[:, None, :]
+        A[:, range(3), range(3)] += np.reshape(material.mu, (-1, 1)) - c[:, None] / squares
+        flip = material.mu - np.abs(c) * np.sqrt(squares[:, 2]) / J
+        return np.minimum(flip, np.linalg.eigvalsh(A)[:, 0]) < 0
+
+    def cauchy(self, deformation: Deformation) -> np.ndarray:
+        """True stress of each element [3,3,E] in pascal."""
+        return self.material.cauchy(deformation.F, deformation.J)
+
+    def nodal_mean(self, element_values: np.ndarray) -> np.ndarray:
+        """Mean [N] of the values [E] of the elements around each node, weighted by volume; 0 where there are none."""
+        nodes, weight = self._nodes.ravel(), np.tile(self.volume, 4)
+        total = np.bincount(nodes, np.tile(element_values, 4) * weight, minlength=self.num_nodes)
+        volume = np.bincount(nodes, weight, minlength=self.num_nodes)
+        return np.divide(total, volume, out=np.zeros(self.num_nodes), where=volume > 0)
+
+
+def _project(entries: np.ndarray) -> np.ndarray:
+    """Nearest positive semi-definite element matrices, as upper entries [78,E]."""
+    values, vectors = np.linalg.eigh(entries[_ENTRY].transpose(2, 0, 1))
+    projected = (vectors * np.maximum(values, 0)[:, None, :]) @ vectors.transpose(0, 2, 1)
+    return np.ascontiguousarray(projected[:, _ROW, _COLUMN].T)

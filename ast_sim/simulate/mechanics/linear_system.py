@@ -1,0 +1,264 @@
+"""The sparse system of a Newton step. Small ones: Cholesky. Large ones: conjugate gradients with an earlier factor.
+
+From one Newton step to the next, a matrix changes little except for a few pairs in contact. With the factor of an
+earlier matrix, conjugate gradients therefore converge in about ten iterations. At 100,000 nodes such a solution costs a
+hundredth of a factorization, and iterating is far faster. At 4,000 nodes it costs a fifteenth, and iterating is not
+faster. If the iterations do not suffice, the matrix itself is factorised.
+
+Elements couple the same unknowns at all times; contact couples more as it spreads. The sparsity pattern holds the
+entries of the elements and of every contact since the last `restart`. As long as no new entries come, the symbolic
+factorization is used again. PARDISO (of MKL) factorises where it is installed, CHOLMOD (of cholespy) elsewhere. Both
+use one thread, and both report a matrix that is not positive definite.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import os
+import weakref
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+import scipy.sparse
+
+from ast_sim.support.errors import MissingExtra, SimulationError, require
+
+# Systems with at least this many unknowns keep a factor and iterate with it.
+ITERATE_FROM = 50_000
+# Conjugate gradients end at this residual, relative to the right side. A Newton step reduces the error by as much.
+RELATIVE_RESIDUAL = 1e-3
+# After this many iterations a new factor is cheaper.
+MAX_ITERATIONS = 40
+
+
+class Factorization(Protocol):
+    """Cholesky factorization of symmetric matrices that are given by their upper triangles."""
+
+    name: str
+
+    def factorise(self, upper: scipy.sparse.csr_array, is_new_pattern: bool) -> bool:
+        """Factorise; return False if the matrix is not positive definite."""
+
+    def solve(self, right_side: np.ndarray) -> np.ndarray:
+        """Solution for the matrix last factorised."""
+
+
+class Pardiso:
+    """PARDISO in Intel's MKL; the symbolic factorization is made for new patterns only."""
+
+    _NOT_POSITIVE_DEFINITE = -4
+
+    def __init__(self) -> None:
+        # One thread, no second OpenMP runtime in this process, and the same bits wherever arrays lie in memory.
+        for name, value in (("MKL_THREADING_LAYER", "SEQUENTIAL"), ("MKL_CBWR", "AVX2")):
+            os.environ.setdefault(name, value)
+        # Without this variable, the import of pypardiso searches the whole Python installation for the library.
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            for file in importlib.metadata.files("mkl") or ():
+                if "mkl_rt" in file.name:
+                    os.environ.setdefault("PYPARDISO_MKL_RT", str(file.locate()))
+        (pypardiso,) = require("simulate", "pypardiso")
+        self._error = pypardiso.pardiso_wrapper.PyPardisoError
+        self._solver = pypardiso.PyPardisoSolver(mtype=2)  # real, symmetric, positive definite
+        weakref.finalize(self, self._solver.free_memory, everything=True)  # MKL keeps the factor until it is told
+        self.name = f"PARDISO (pypardiso {importlib.metadata.version('pypardiso')})"
+
+    def factorise(self, upper: scipy.sparse.csr_array, is_new_pattern: bool) -> bool:
+        self._matrix, nothing = upper, np.zeros(upper.shape[0])
+        try:
+            for phase in (11, 22) if is_new_pattern else (22,):
+                self._solver.set_phase(phase)
+                self._solver._call_pardiso(upper, nothing)
+        except self._error as error:
+            if error.value == self._NOT_POSITIVE_DEFINITE:
+                return False
+            raise SimulationError(f"PARDISO failed with error {error.value} ({upper.shape[0]} unknowns)") from error
+        return True
+
+    def solve(self, right_side: np.ndarray) -> np.ndarray:
+        self._solver.set_phase(33)
+        return self._solver._call_pardiso(self._matrix, right_side)
+
+
+class Cholmod:
+    """CHOLMOD through cholespy, which factorises symbolically each time."""
+
+    name = "CHOLMOD (cholespy)"
+
+    def __init__(self) -> None:
+        (self._cholespy,) = require("simulate", "cholespy")
+
+    def factorise(self, upper: scipy.sparse.csr_array, is_new_pattern: bool) -> bool:
+        whole = (upper + scipy.sparse.triu(upper, 1).T).tocsc()
+        try:
+            self._solver = self._cholespy.CholeskySolverD(
+                whole.shape[0],
+                whole.indptr.astype(np.int32),
+                whole.indices.astype(np.int32),
+                whole.data,
+                self._cholespy.MatrixType.CSC,
+            )
+        except ValueError:
+            return False
+        return True
+
+    def solve(self, right_side: np.ndarray) -> np.ndarray:
+        solution = np.zeros_like(right_side)
+        self._solver.solve(right_side, solution)
+        return solution
+
+
+def factorization() -> Factorization:
+    """The fastest library that is installed.
+
+    Raises:
+        MissingExtra: no library is installed.
+    """
+    try:
+        return Pardiso()
+    except MissingExtra:
+        return Cholmod()
+
+
+def conjugate_gradients(
+    upper: scipy.sparse.csr_array, right_side: np.ndarray, precondition: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray | None, bool]:
+    """Preconditioned conjugate gradients for a symmetric matrix given by its upper triangle.
+
+    Returns:
+        The solution, or None if the allowed iterations do not suffice; and whether a direction of negative curvature
+        was met. A positive definite matrix has no such direction.
+    """
+    diagonal, lower = upper.diagonal(), upper.T
+    solution, residual = np.zeros_like(right_side), right_side.copy()
+    goal = RELATIVE_RESIDUAL * np.linalg.norm(right_side)
+    if goal == 0:
+        return solution, False
+    direction = preconditioned = precondition(residual)
+    product = residual @ preconditioned
+    for _ in range(MAX_ITERATIONS):
+        image = upper @ direction + lower @ direction - diagonal * direction
+        curvature = direction @ image
+        if curvature <= 0:
+            return None, True
+        solution += product / curvature * direction
+        residual -= product / curvature * image
+        if np.linalg.norm(residual) <= goal:
+            return solution, False
+        preconditioned = precondition(residual)
+        product, before = residual @ preconditioned, product
+        direction = preconditioned + product / before * direction
+    return None, False
+
+
+class LinearSystem:
+    """Symmetric system for the free degrees of freedom; a dof is 3 node + component.
+
+    Args:
+        rows, columns: [P] dofs of the entries that elements add. An entry (r, c) stands for (c, r), too.
+        prescribed: [N] nodes whose rows and columns are left out.
+    """
+
+    def __init__(self, rows: np.ndarray, columns: np.ndarray, prescribed: np.ndarray) -> None:
+        free = np.repeat(~prescribed, 3)
+        self._free = np.flatnonzero(free)
+        self._count = len(self._free)
+        self._number = np.where(free, np.cumsum(free) - 1, -1)
+        inside, keys = self._keys(rows, columns)
+        diagonal = np.arange(self._count) * (self._count + 1)
+        self._own, slots = np.unique(np.concatenate([keys, diagonal]), return_inverse=True)
+        self._slot = np.full(len(rows), len(self._own), np.int32)  # one spare slot for the entries that are left out
+        self._slot[inside] = slots[: len(keys)]
+        mixed = np.flatnonzero(free[rows] != free[columns])
+        self._mixed = mixed, rows[mixed], columns[mixed]
+        self._factorization = factorization()
+        self.factorizations, self._has_factor = 0, False
+        self._set_pattern(self._own)
+
+    @property
+    def solver_name(self) -> str:
+        """Name and version of the library that factorises."""
+        return self._factorization.name
+
+    def restart(self) -> None:
+        """Forget the factor and all contacts so far. What follows does not depend on them."""
+        self._has_factor = False
+        if self._pattern is not self._own:
+            self._set_pattern(self._own)
+
+    def _keys(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Which entries lie between free dofs, and the places row * count + column of these in the upper triangle."""
+        rows, columns = self._number[rows], self._number[columns]
+        inside = (rows >= 0) & (columns >= 0)
+        rows, columns = rows[inside].astype(np.int64), columns[inside].astype(np.int64)
+        return inside, np.minimum(rows, columns) * self._count + np.maximum(rows, columns)
+
+    def _set_pattern(self, pattern: np.ndarray) -> None:
+        self._pattern, self._is_new = pattern, True
+        self._position = None if len(pattern) == len(self._own) else np.searchsorted(pattern, self._own)
+        rows, self._columns = np.divmod(pattern, self._count)
+        self._columns = self._columns.astype(np.int32)
+        self._starts = np.searchsorted(rows, np.arange(self._count + 1)).astype(np.int32)
+
+    def solve(
+        self, values: np.ndarray, contact: tuple[np.ndarray, np.ndarray, np.ndarray], right_side: np.ndarray
+    ) -> np.ndarray | None:
+        """Solve with the sum of the elements' values [P] and the contact's rows, columns and values (all entries).
+
+        Returns:
+            [N,3]: the solution for the free rows of the right side [N,3], and zero at prescribed nodes. None if the
+            matrix is found not to be positive definite. Not every such matrix is found, but the solution is a direction
+            of descent in any case.
+        """
+        matrix, right = self._assemble(values, contact), right_side.ravel()[self._free]
+        free = None
+        if self._has_factor and self._count >= ITERATE_FROM:
+            free, is_indefinite = conjugate_gradients(matrix, right, self._factorization.solve)
+            if is_indefinite:
+                return None
+        if free is None:
+            self.factorizations += 1
+            self._has_factor = self._factorization.factorise(matrix, self._is_new)
+            self._is_new = False
+            if not self._has_factor:
+                return None
+            free = self._factorization.solve(right)
+        solution = np.zeros(right_side.size)
+        solution[self._free] = free
+        return solution.reshape(-1, 3)
+
+    def _assemble(
+        self, values: np.ndarray, contact: tuple[np.ndarray, np.ndarray, np.ndarray]
+    ) -> scipy.sparse.csr_array:
+        """The upper triangle of the sum of the elements' and the contact's matrices."""
+        rows, columns, contact_values = contact
+        upper = rows <= columns
+        inside, keys = self._keys(rows[upper], columns[upper])
+        place = np.searchsorted(self._pattern, keys)
+        missing = keys[self._pattern[np.minimum(place, len(self._pattern) - 1)] != keys]
+        if len(missing):
+            # A stable sort merges two sorted runs in linear time.
+            self._set_pattern(np.sort(np.concatenate([self._pattern, np.unique(missing)]), kind="stable"))
+            place = np.searchsorted(self._pattern, keys)
+        data = np.bincount(self._slot, values, minlength=len(self._own) + 1)[:-1]
+        if self._position is not None:
+            spread = np.zeros(len(self._pattern))
+            spread[self._position] = data
+            data = spread
+        if len(keys):
+            data += np.bincount(place, contact_values[upper][inside], minlength=len(data))
+        return scipy.sparse.csr_array((data, self._columns, self._starts), shape=(self._count, self._count))
+
+    def coupling(
+        self, values: np.ndarray, contact: tuple[np.ndarray, np.ndarray, np.ndarray], increment: np.ndarray
+    ) -> np.ndarray:
+        """Change of the forces on free nodes [N,3], to first order, when prescribed nodes move by `increment` [N,3]."""
+        mixed, rows, columns = self._mixed
+        increment, values = increment.ravel(), values[mixed]
+        total = np.zeros(len(increment))
+        total += np.bincount(contact[0], contact[2] * increment[contact[1]], minlength=len(increment))
+        total += np.bincount(rows, values * increment[columns], minlength=len(increment))
+        total += np.bincount(columns, values * increment[rows], minlength=len(increment))
+        return total.reshape(-1, 3)

@@ -1,0 +1,144 @@
+"""From a drawn quasi-static case to a checked trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ast_sim.scene import AttributeValue, Trajectory
+from ast_sim.simulate.mechanics.case import SolidCase
+from ast_sim.simulate.mechanics.contact_and_friction import Contact
+from ast_sim.simulate.mechanics.elasticity import Elasticity
+from ast_sim.simulate.mechanics.frames import FrameRecord, Frames
+from ast_sim.simulate.mechanics.load_step import QuasiStatic
+from ast_sim.simulate.mechanics.material import von_mises
+from ast_sim.simulate.mechanics.solver import SolverSettings
+from ast_sim.simulate.mechanics.unfinished import Checkpoint
+
+# Components of a stress tensor as they are stored: xx, yy, zz, xy, yz, zx.
+COMPONENTS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolidRecord(FrameRecord):
+    """A record with the balance of forces. Its work is the trapezoidal rule over the frames.
+
+    Attributes:
+        imbalance: magnitude of the sum of the forces on all prescribed nodes, divided by the sum of their magnitudes; 0
+            without body forces.
+    """
+
+    imbalance: float
+
+
+def quasi_static(
+    case: SolidCase,
+    settings: SolverSettings | None = None,
+    checkpoint: Checkpoint | None = None,
+    patient: bool = False,
+) -> Trajectory:
+    """Solve a case frame by frame, to the tolerances of `settings`; see `Frames.trajectory`.
+
+    The checkpoint keeps unfinished frames. If it holds some already, the solve goes on from them.
+    """
+    return SolidFrames(case, settings).trajectory(checkpoint, patient)
+
+
+class SolidFrames(Frames):
+    """The frames of a quasi-static case and its solver; arguments as for `quasi_static`."""
+
+    case: SolidCase
+    solver: QuasiStatic
+    record_type = SolidRecord
+
+    def __init__(self, case: SolidCase, settings: SolverSettings | None) -> None:
+        scene, rest = case.scene, case.scene.rest_position.astype(np.float64)
+        self._deforming = np.flatnonzero(case.deforming)
+        self._elasticity = Elasticity(rest, scene.elements[self._deforming], case.material.of(self._deforming))
+        contact = Contact(rest, scene.surface(), scene.body, case.contact, ~scene.deforming_nodes)
+        super().__init__(case, QuasiStatic(self._elasticity, contact, scene.prescribed, rest, settings), contact)
+        self._reactions = np.zeros_like(rest)
+
+    def next_frame(self) -> tuple[dict[str, np.ndarray], SolidRecord]:
+        """See `Frames`."""
+        newton, start = self.solver.newton, self.solver.newton.position
+        cost = self.advance()
+        arrays = self._stored()
+        checked = self.check(arrays)
+        reactions = np.where(self.case.scene.prescribed[:, None], newton.reactions(), 0)
+        work = 0.5 * float(np.vdot(reactions + self._reactions, newton.position - start))
+        self._reactions = reactions
+        return arrays, SolidRecord(
+            **cost,
+            **checked,
+            residual=newton.residual(),
+            contact_area=self.contact.area(newton.state.contact),
+            reaction=float(np.linalg.norm(reactions[self.driven].sum(axis=0))),
+            imbalance=self._imbalance(reactions),
+            elastic_energy=newton.state.potential.energy,
+            contact_energy=newton.state.contact.barrier_energy(),
+            work=self.last("work") + work,
+        )
+
+    def _stored(self) -> dict[str, np.ndarray]:
+        """The arrays of a frame as they are stored."""
+        elasticity, deformation = self._elasticity, self.solver.newton.state.potential
+        position = self.solver.newton.position.astype(np.float32)
+        tensor = elasticity.cauchy(deformation)
+        mises = von_mises(tensor)
+        if self.case.stress_location == "node":
+            return {"position": position, "stress": elasticity.nodal_mean(mises).astype(np.float32)[:, None]}
+        components = np.stack([tensor[i, j] for i, j in COMPONENTS], axis=1)
+        return {
+            "position": position,
+            "stress": self._of_all_elements(mises[:, None]),
+            "cauchy_stress": self._of_all_elements(components),
+        }
+
+    def _imbalance(self, reactions: np.ndarray) -> float:
+        """See `SolidRecord`. If there are hardly any forces, the divisor is the force of a strain of 1e-3."""
+        magnitude = max(float(np.linalg.norm(reactions, axis=1).sum()), 1e-3 * self._elasticity.unit_force)
+        return float(np.linalg.norm(reactions.sum(axis=0))) / magnitude
+
+    def _of_all_elements(self, values: np.ndarray) -> np.ndarray:
+        """Values [D, F] of the D deforming elements as [E, F] float32, with 0 for rigid elements."""
+        result = np.zeros((self.case.scene.num_elements, values.shape[1]), np.float32)
+        result[self._deforming] = values
+        return result
+
+    def jacobian(self, position: np.ndarray) -> np.ndarray:
+        """See `Frames`."""
+        return self._elasticity.evaluate(position).J
+
+    def exact_state(self) -> dict[str, np.ndarray]:
+        """See `Frames`."""
+        return {"position": self.solver.newton.position, "reactions": self._reactions}
+
+    def go_on_from(self, state: dict[str, np.ndarray]) -> None:
+        """See `Frames`."""
+        self._reactions = state["reactions"]
+        self.solver.newton.restart(state["position"])
+
+    def watch(self, progress: Callable[[int], None]) -> None:
+        """See `Frames`."""
+        self.solver.newton.watch = lambda: progress(self.solver.iterations)
+
+    def attributes(self) -> dict[str, AttributeValue]:
+        """See `Frames`."""
+        material = self.case.material
+        stored = np.add(self.recorded("elastic_energy"), self.recorded("contact_energy"))
+        imbalance = self.recorded("work") - stored + stored[0] - self.recorded("dissipation")
+        return {
+            **self.summary(self.solver.newton.system.solver_name),
+            "max_imbalance": max(self.recorded("imbalance")),
+            "work_balance": float(np.abs(imbalance).max() / max(stored.max(), np.finfo(float).tiny)),
+            "young": _distinct(material.young),
+            "poisson": _distinct(material.poisson),
+        }
+
+
+def _distinct(values: float | np.ndarray) -> float | list[float]:
+    distinct = np.unique(values).tolist()
+    return distinct[0] if len(distinct) == 1 else distinct

@@ -1,0 +1,1 @@
+"""Meshes of bodies and how they are put together."""

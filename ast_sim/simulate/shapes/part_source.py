@@ -1,0 +1,227 @@
+"""Where the parts of a scene come from: gmsh's grammar, structured shapes, or files of the user."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import meshio
+import numpy as np
+
+from ast_sim.simulate.shapes import cad
+from ast_sim.simulate.shapes.mesh_check import BadMesh, check_mesh, check_surface, merged
+from ast_sim.simulate.shapes.parts import Part, draw_structured, oriented, volumes
+from ast_sim.support.errors import MissingExtra, SimulationError
+
+STEP_ENDINGS = (".step", ".stp")
+STL_ENDING = ".stl"
+TRIAL_NODES = 1000  # nodes of the mesh that checks a CAD file
+_IGNORED = (".txt", ".md", ".json")  # notes that may lie beside the parts
+
+
+class PartSource(Protocol):
+    """Gives pairs of parts.
+
+    Attributes:
+        mesher: name and version of what makes the meshes.
+    """
+
+    mesher: str
+
+    def describe(self) -> dict[str, Any]:
+        """All that the parts depend on except the random numbers, as JSON values."""
+
+    def check(self) -> None:
+        """Raise SimulationError if a part that may be drawn is broken."""
+
+    def draw(self, rng: np.random.Generator, nodes: int) -> tuple[Part, Part]:
+        """Two parts with about `nodes` nodes together.
+
+        Raises:
+            BadMesh, MeshingFailed: these parts cannot be used. Others may be.
+        """
+
+
+def part_source(parts: Path | None = None) -> PartSource:
+    """The source of parts for a file or folder of STEP, STL or mesh files.
+
+    If `parts` is None, the source is gmsh's grammar, or structured parts where gmsh is not installed.
+
+    Raises:
+        SimulationError: the path does not exist or holds no such file.
+        MissingExtra: STEP or STL files need gmsh, which is not installed.
+    """
+    if parts is not None:
+        return FileParts(_files(Path(parts)))
+    version = cad.gmsh_version()
+    return StructuredParts() if version is None else GrammarParts(version)
+
+
+@dataclass(frozen=True)
+class GrammarParts:
+    """Solids of the grammar in `ast_sim.simulate.shapes.cad`."""
+
+    version: str
+
+    @property
+    def mesher(self) -> str:
+        return f"gmsh {self.version}"
+
+    def describe(self) -> dict[str, Any]:
+        return {"mesher": self.mesher}
+
+    def check(self) -> None:
+        """Nothing to check: each part is checked when it is drawn."""
+
+    def draw(self, rng: np.random.Generator, nodes: int) -> tuple[Part, Part]:
+        (name_a, steps_a), (name_b, steps_b) = cad.draw_solid(rng), cad.draw_solid(rng)
+        a, b = cad.mesh_parts([{"solid": steps_a}, {"solid": steps_b}], [name_a, name_b], nodes)
+        for part in (a, b):
+            check_mesh(part.position, part.elements, part.name)
+        return a, b
+
+
+@dataclass(frozen=True)
+class StructuredParts:
+    """Shapes that need no mesh generator."""
+
+    mesher: str = "structured"
+
+    def describe(self) -> dict[str, Any]:
+        return {"mesher": self.mesher}
+
+    def check(self) -> None:
+        """Nothing to check: each part is checked when it is drawn."""
+
+    def draw(self, rng: np.random.Generator, nodes: int) -> tuple[Part, Part]:
+        a, b = draw_structured(rng, nodes // 2), draw_structured(rng, nodes // 2)
+        for part in (a, b):
+            check_mesh(part.position, part.elements, part.name)
+        return a, b
+
+
+@dataclass(frozen=True)
+class FileParts:
+    """Files of the user; each part is scaled to a diagonal of one. A single file is paired with itself."""
+
+    files: tuple[Path, ...]
+
+    @property
+    def mesher(self) -> str:
+        return f"gmsh {cad.gmsh_version()}" if any(map(_is_cad, self.files)) else "none"
+
+    def describe(self) -> dict[str, Any]:
+        return {"mesher": self.mesher, "parts": {path.name: _sha256(path) for path in self.files}}
+
+    def check(self) -> None:
+        for path in self.files:
+            (part,) = _load([path], TRIAL_NODES)
+            check_mesh(part.position, part.elements, path.name)
+
+    def draw(self, rng: np.random.Generator, nodes: int) -> tuple[Part, Part]:
+        count = len(self.files)
+        chosen = [0, 0] if count == 1 else rng.choice(count, 2, replace=False)
+        a, b = _load([self.files[i] for i in chosen], nodes)
+        for part in (a, b):
+            check_mesh(part.position, part.elements, part.name)
+        return a, b
+
+
+def _files(path: Path) -> tuple[Path, ...]:
+    if not path.exists():
+        raise SimulationError(f"{path} does not exist: give a STEP, STL or mesh file, or a folder of them")
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    if path.is_dir():
+        files = [f for f in files if f.is_file() and not f.name.startswith(".") and f.suffix.lower() not in _IGNORED]
+    if not files:
+        raise SimulationError(f"{path} holds no files: give a STEP, STL or mesh file, or a folder of them")
+    readable = {*STEP_ENDINGS, STL_ENDING, *meshio.extension_to_filetypes}
+    for file in files:
+        if file.suffix.lower() not in readable:
+            raise SimulationError(f"{file} is no STEP, STL or mesh file: meshio does not know its ending")
+        if _is_cad(file) and cad.gmsh_version() is None:
+            raise MissingExtra(f'gmsh is needed to mesh {file.name} but is not installed: pip install "ast_sim[cad]"')
+    return tuple(files)
+
+
+def _is_cad(path: Path) -> bool:
+    return path.suffix.lower() in (*STEP_ENDINGS, STL_ENDING)
+
+
+def _sha256(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _load(paths: list[Path], nodes: int) -> list[Part]:
+    """The parts of files. Meshes stay as they are.
+
+    CAD files are meshed so that all parts together have about `nodes` nodes.
+
+    Raises:
+        BadMesh, MeshingFailed: the text names the file.
+    """
+    parts = {i: read_mesh(path) for i, path in enumerate(paths) if not _is_cad(path)}
+    solids = [i for i in range(len(paths)) if i not in parts]
+    if solids:
+        left = nodes - sum(len(part.position) for part in parts.values())
+        requests = [_request(paths[i]) for i in solids]
+        names = [paths[i].name for i in solids]
+        try:
+            meshed = cad.mesh_parts(requests, names, max(left, nodes // 2))
+        except cad.MeshingFailed as error:
+            raise cad.MeshingFailed(f"{' or '.join(dict.fromkeys(names))}: {error}") from error
+        parts |= dict(zip(solids, meshed, strict=True))
+    return [parts[i] for i in range(len(paths))]
+
+
+def _request(path: Path) -> dict[str, str]:
+    if path.suffix.lower() in STEP_ENDINGS:
+        return {"step": str(path.resolve())}
+    surface = _read(path)
+    triangles = surface.cells_dict.get("triangle", np.zeros((0, 3), int))
+    position, triangles = np.asarray(surface.points, float), np.asarray(triangles, int)
+    if np.isfinite(position).all() and len(triangles):
+        position, triangles = merged(position, triangles)
+    check_surface(position, triangles, path.name)
+    return {"stl": str(path.resolve())}
+
+
+def read_mesh(path: Path) -> Part:
+    """The tetrahedra of a mesh file, scaled to a diagonal of one. Only the corners of quadratic tetrahedra are used.
+
+    If all tetrahedra have negative volume, the file numbers their nodes the other way round, and they are turned.
+
+    Raises:
+        BadMesh: the file cannot be read or holds no tetrahedra.
+    """
+    mesh = _read(path)
+    blocks = [block.data[:, :4] for block in mesh.cells if block.type in ("tetra", "tetra10")]
+    if not blocks or sum(map(len, blocks)) == 0:
+        found = ", ".join(sorted({block.type for block in mesh.cells})) or "nothing"
+        raise BadMesh(f"{path.name}: it holds no tetrahedra, but {found}")
+    used, elements = np.unique(np.concatenate(blocks), return_inverse=True)
+    if used[0] < 0 or used[-1] >= len(mesh.points):
+        raise BadMesh(f"{path.name}: a tetrahedron refers to a node that is not there (there are {len(mesh.points)})")
+    position, elements = np.asarray(mesh.points, float)[used], elements.reshape(-1, 4)
+    if position.shape[1] != 3:
+        raise BadMesh(f"{path.name}: its nodes have {position.shape[1]} coordinates, not 3")
+    if (volumes(position, elements) < 0).all():
+        elements = oriented(position, elements)
+    check_mesh(position, elements, path.name)
+    return Part(position / np.linalg.norm(np.ptp(position, axis=0)), elements, path.name)
+
+
+def _read(path: Path) -> meshio.Mesh:
+    said = io.StringIO()
+    try:
+        # meshio prints what is wrong and ends the process.
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            return meshio.read(path)
+    except (Exception, SystemExit) as error:
+        text = " ".join((said.getvalue() or str(error) or type(error).__name__).split())
+        raise BadMesh(f"{path.name}: it cannot be read: {text}") from error

@@ -1,0 +1,68 @@
+"""Errors that a user can act on.
+
+The text of an error says what is wrong, where it is wrong (file, sample, frame, node, value) and what to do. The
+command line prints this text as one line on stderr and exits with code 2. In Python they are ordinary exceptions.
+"""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+
+
+class AstSimError(Exception):
+    """Base of all errors that a user can act on."""
+
+
+class ConfigError(AstSimError, ValueError):
+    """A setting that does not exist or does not fit."""
+
+
+class DatasetError(AstSimError, ValueError):
+    """A dataset or mesh file that is truncated, damaged or inconsistent."""
+
+
+class CheckpointError(AstSimError):
+    """A checkpoint or run folder that cannot be read, written or locked."""
+
+
+class TrainingError(AstSimError):
+    """Training that cannot go on, such as a loss that is not finite."""
+
+
+class RolloutError(AstSimError):
+    """A prediction that left the finite numbers or the domain."""
+
+
+class SimulationError(AstSimError):
+    """A finite-element solve that cannot be finished."""
+
+
+class MissingExtra(AstSimError, ImportError):
+    """An optional dependency that is not installed."""
+
+
+def printable(text: str) -> str:
+    """The text, with escapes for control characters, which a terminal would obey, and for bytes that are no text."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def is_utf8(path: str) -> bool:
+    """Whether the bytes of a path are UTF-8. Python has surrogates in place of other bytes."""
+    return not any("\ud800" <= c <= "\udfff" for c in path)
+
+
+def require(extra: str, *modules: str) -> list[ModuleType]:
+    """Import the modules of an optional extra.
+
+    Raises:
+        MissingExtra: a module cannot be imported; the text gives the pip command that installs the extra.
+    """
+    found = []
+    for name in modules:
+        try:
+            found.append(importlib.import_module(name))
+        except ImportError as error:
+            line = f'pip install "ast_sim[{extra}]"'
+            raise MissingExtra(f"{name} is needed here but cannot be imported ({error}): {line}") from error
+    return found

@@ -1,0 +1,51 @@
+"""How published figures were made: by which command and commit, on which processor, with which versions."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+
+def provenance(command: str) -> dict[str, Any]:
+    """The command, the commit, the processor, the number of cores and the versions: what to keep beside figures."""
+    versions: dict[str, str | None] = {"python": platform.python_version()}
+    for package in ("ast_sim", "torch", "numpy"):
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            versions[package] = None
+    return {
+        "command": command,
+        "commit": _commit(),
+        "processor": processor(),
+        "cores": os.cpu_count(),
+        "versions": versions,
+    }
+
+
+def _commit() -> str | None:
+    """The commit of the source tree that this package is imported from; None if the package is installed."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return None
+    try:
+        found = subprocess.run(
+            ["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return found.stdout.strip()
+
+
+def processor() -> str:
+    """The name of this machine's processor."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()

@@ -1,0 +1,266 @@
+"""Settings are nested frozen dataclasses. This module reads and writes them as TOML and applies `key=value` changes.
+
+The type of a field is bool, int, float, str, a Literal of str, a tuple of these, or a dataclass; any of them may be
+optional. TOML has no word for None, so None is written as the string "none". A field that holds one of several
+dataclasses has the metadata `class_of`: a function that takes the field's TOML table and returns the class.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import MISSING, dataclass
+from types import MappingProxyType, NoneType, UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from ast_sim.support.errors import ConfigError
+
+NONE = "none"
+LARGEST = 2**63 - 1  # TOML's integers have 64 bits
+NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One setting as a user sees it: its dotted name, its type, its default (None: a value must be given), its help."""
+
+    key: str
+    type: str
+    default: str | None
+    help: str
+
+
+def settings(cls: type, given: Mapping[str, Any] = NOTHING) -> Iterator[Setting]:
+    """All settings of a dataclass and of its nested dataclasses, in order. A field's metadata `help` is its help.
+
+    A value in `given`, by dotted key, takes the place of the default.
+    """
+    for key, item, kind in _leaves(cls):
+        default = (
+            given[key] if key in given else item.default if item.default_factory is MISSING else item.default_factory()
+        )
+        shown = None if default is MISSING else _show(default)
+        yield Setting(key, _describe(kind), shown, item.metadata.get("help", ""))
+
+
+def to_toml(obj: Any) -> str:
+    """The settings as TOML: every key is present, in the order of the fields."""
+    import tomli_w
+
+    return tomli_w.dumps(to_values(obj))
+
+
+def to_values(value: Any) -> Any:
+    """Settings as a TOML table: nested dictionaries, lists, texts and numbers."""
+    if dataclasses.is_dataclass(value):
+        return {item.name: to_values(getattr(value, item.name)) for item in dataclasses.fields(value)}
+    if isinstance(value, tuple):
+        return [to_values(member) for member in value]
+    return NONE if value is None else value
+
+
+def from_toml(cls: type[T], text: str) -> T:
+    """Read settings; a missing key takes its default.
+
+    Raises:
+        ConfigError: the text is not TOML; or as in `from_values`.
+    """
+    try:
+        values = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # ValueError: also an integer of thousands of digits
+        raise ConfigError(f"the settings are not valid TOML: {error}") from error
+    return from_values(cls, values)
+
+
+def from_values(cls: type[T], values: Mapping[str, Any]) -> T:
+    """Settings from a parsed TOML table.
+
+    Raises:
+        ConfigError: a key is unknown (the text names the nearest known key), a key without a default is missing, or a
+            value has the wrong type.
+    """
+    return _build(cls, values, [key for key, _, _ in _leaves(cls, values)], "")
+
+
+def require_range(key: str, value: float | None, least: float, most: float = LARGEST) -> None:
+    """Raise ConfigError if the value is set and lies below `least` or above `most`."""
+    if value is not None and not least <= value <= most:
+        limit = f"least {least}" if value < least else f"most {most}"
+        raise ConfigError(f"{key} is {value}; it must be at {limit}")
+
+
+def override(obj: T, assignments: Iterable[str]) -> T:
+    """A copy with some settings replaced. Each assignment has the form `a.b=c`; the last assignment to a key counts.
+
+    Values are TOML; the quotes of a string and the brackets of a list may be left out (`model.inputs=stress,material`).
+
+    Raises:
+        ConfigError: an assignment has no `=`; or as in `change`.
+    """
+    values = {}
+    kinds = {key: kind for key, _, kind in _leaves(type(obj), obj)}
+    for assignment in assignments:
+        key, equals, text = (part.strip() for part in assignment.partition("="))
+        if not equals:
+            raise ConfigError(f"{assignment!r} is no setting: write key=value")
+        values[key] = _parse(text, kinds[key]) if key in kinds else text
+    return change(obj, values)
+
+
+def change(obj: T, values: Mapping[str, Any]) -> T:
+    """A copy with some settings replaced; `values` gives the new values by dotted key.
+
+    Raises:
+        ConfigError: a key is unknown (the text names the nearest known key), or a value has the wrong type.
+    """
+    changes: dict[str, Any] = {}
+    kinds = {key: kind for key, _, kind in _leaves(type(obj), obj)}
+    for key, value in values.items():
+        if key not in kinds:
+            raise _unknown(kinds, key)
+        node = changes
+        *groups, last = key.split(".")
+        for group in groups:
+            node = node.setdefault(group, {})
+        node[last] = _convert(to_values(value), kinds[key], key)
+    return _replace(obj, changes)
+
+
+def _replace(obj: Any, changes: Mapping[str, Any]) -> Any:
+    values = {
+        name: _replace(getattr(obj, name), value) if isinstance(value, dict) else value
+        for name, value in changes.items()
+    }
+    return dataclasses.replace(obj, **values)
+
+
+def _build(cls: Any, values: Mapping[str, Any], known: Iterable[str], prefix: str) -> Any:
+    kinds = get_type_hints(cls)
+    items = {item.name: item for item in dataclasses.fields(cls)}
+    unknown = next((name for name in values if name not in items), None)
+    if unknown is not None:
+        raise _unknown(known, prefix + unknown)
+    arguments = {}
+    for name, item in items.items():
+        key, kind = prefix + name, kinds[name]
+        if dataclasses.is_dataclass(kind):
+            group, table = _group(item, kind, values, key)
+            arguments[name] = _build(group, table, known, f"{key}.")
+        elif name in values:
+            arguments[name] = _convert(values[name], kind, key)
+        elif item.default is MISSING and item.default_factory is MISSING:
+            raise ConfigError(f"the setting {key} is missing; must be {_describe(kind)}")
+    return cls(**arguments)
+
+
+def _leaves(cls: type, given: Any = NOTHING, prefix: str = "") -> Iterator[tuple[str, dataclasses.Field, Any]]:
+    """(dotted key, field, type) of every setting that is no group. `given` is an object of the class or a table of
+    its values; it decides the classes of the groups."""
+    kinds = get_type_hints(cls)
+    for item in dataclasses.fields(cls):
+        key, kind = prefix + item.name, kinds[item.name]
+        if dataclasses.is_dataclass(kind):
+            yield from _leaves(*_group(item, kind, given, key), f"{key}.")
+        else:
+            yield key, item, kind
+
+
+def _group(item: dataclasses.Field, kind: Any, given: Any, key: str) -> tuple[type, Any]:
+    """The class of a group, and what `given` holds for it: an object or a table."""
+    if dataclasses.is_dataclass(given):
+        group = getattr(given, item.name)
+        return type(group), group
+    table = given.get(item.name, NOTHING)
+    if not isinstance(table, Mapping):
+        raise ConfigError(f"{key} is {table!r}; must be a group of settings ([{key}])")
+    class_of = item.metadata.get("class_of")
+    return (class_of(table) if class_of else kind), table
+
+
+def _unknown(known: Iterable[str], key: str) -> ConfigError:
+    members = [name for name in known if name.startswith(f"{key}.")]
+    if members:
+        return ConfigError(f"{key} is a group of settings, such as {members[0]}")
+
+    def likeness(name: str) -> float:
+        last, wanted = name.rpartition(".")[2], key.rpartition(".")[2]
+        whole = difflib.SequenceMatcher(None, key, name).ratio()
+        return max(whole, 0.99 * difflib.SequenceMatcher(None, wanted, last).ratio() + 0.01 * whole)
+
+    return ConfigError(f"there is no setting {key}; the nearest is {max(known, key=likeness)}")
+
+
+def _parse(text: str, kind: Any) -> Any:
+    """The text after `=` as a TOML value. Text that is not TOML becomes a string, or a list where the type asks for
+    one."""
+    if str in _members(kind) and text[:1] not in ('"', "'"):
+        return text
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except (ValueError, RecursionError):
+        value = {"true": True, "false": False}.get(text.lower(), text)
+    listed = any(get_origin(member) is tuple for member in _members(kind))
+    if listed and not isinstance(value, list) and text != NONE:
+        item = next(get_args(member)[0] for member in _members(kind) if get_origin(member) is tuple)
+        return [_parse(part.strip(), item) for part in text.split(",") if part.strip()]
+    return value
+
+
+def _members(kind: Any) -> tuple[Any, ...]:
+    """The members of a union; of any other type the type itself."""
+    return get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
+
+
+def _convert(value: Any, kind: Any, key: str) -> Any:
+    """Convert a TOML value to the type.
+
+    Raises:
+        ConfigError: the value does not fit; the text names the key, the value and the type.
+    """
+    members = _members(kind)
+    if NoneType in members and value == NONE:
+        return None
+    for member in members:
+        if get_origin(member) is Literal and isinstance(value, str) and value in get_args(member):
+            return value
+        if get_origin(member) is tuple and isinstance(value, list):
+            items = get_args(member)
+            items = items[:1] * len(value) if items[-1] is Ellipsis else items
+            if len(items) == len(value):
+                return tuple(_convert(v, t, f"{key}[{i}]") for i, (v, t) in enumerate(zip(value, items, strict=True)))
+        if type(value) is int and not -LARGEST - 1 <= value <= LARGEST:
+            where = f"above {LARGEST}, the largest" if value > 0 else f"below {-LARGEST - 1}, the smallest"
+            raise ConfigError(f"{key} is {where} whole number")
+        if member in (bool, int, str) and type(value) is member:
+            return value
+        if member is float and isinstance(value, int | float) and type(value) is not bool and not math.isnan(value):
+            return float(value)
+    raise ConfigError(f"{key} is {value!r}; must be {_describe(kind)}")
+
+
+def _describe(kind: Any) -> str:
+    names = {bool: "true or false", int: "an integer", float: "a number", str: "a text", NoneType: f'"{NONE}"'}
+    texts = []
+    for member in _members(kind):
+        if get_origin(member) is Literal:
+            texts.append("one of " + ", ".join(f'"{value}"' for value in get_args(member)))
+        elif get_origin(member) is tuple:
+            items = get_args(member)
+            count = "" if items[-1] is Ellipsis else f"{len(items)} values, "
+            texts.append(f"a list ({count}each {_describe(items[0])})")
+        else:
+            texts.append(names[member])
+    return " or ".join(texts)
+
+
+def _show(value: Any) -> str:
+    if isinstance(value, tuple):
+        return ",".join(map(_show, value))
+    if isinstance(value, bool):
+        return str(value).lower()
+    return NONE if value is None else str(value)

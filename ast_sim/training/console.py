@@ -1,0 +1,119 @@
+"""The lines that a training prints: an introduction, then its progress."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import math
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+from torch import nn
+
+from ast_sim.dataset.reader import Dataset
+from ast_sim.runs.metrics import Metrics
+from ast_sim.runs.train_config import RunConfig
+from ast_sim.support.progress import Clock, Progress
+from ast_sim.support.stop_signals import StopSignals
+from ast_sim.training.data_lengths import DataScales
+from ast_sim.training.rates import learning_rate
+
+# The output counts as constant if its standard deviation over the nodes, divided by that of the targets, is below this.
+CONSTANT = 1e-3
+
+
+def introduce(model: nn.Module, config: RunConfig, dataset: Dataset, scales: DataScales, pairs: int) -> None:
+    """Print the sizes of the model and the data, the number of steps, and the noise relative to lengths of the data."""
+    options, unit = config.train, dataset.info.length_unit
+    scenes = options.batch_size * options.accumulate
+    epochs = options.steps * scenes / pairs
+    rms, spacing = max(scales.increment, 1e-300), max(scales.spacing, 1e-300)
+    print(f"parameters  {sum(p.numel() for p in model.parameters()):,}")
+    print(f"data        {scales.trajectories:,} scenes of about {scales.nodes:,} nodes, {scales.pairs:,} pairs")
+    print(f"steps       {options.steps:,} of {scenes} scenes each: {epochs:.3g} epochs")
+    print(
+        f"noise       {options.noise:.3g} {unit} = {options.noise / rms:.2g} x rms increment"
+        f" = {options.noise / spacing:.2g} x mesh spacing",
+        flush=True,
+    )
+    for what, fact in config.model.facts(unit, spacing).items():
+        print(f"{what.lower():12}{fact}", flush=True)
+
+
+class Console(Progress):
+    """The progress of a training. If nobody reads the output any more (a closed pipe, a lost terminal), the training is
+    asked to stop as by the signal SIGPIPE."""
+
+    def __init__(self, total: int, done: int, signals: StopSignals) -> None:
+        self.signals = signals
+        super().__init__(total, done, "steps")
+
+    def advance(self) -> None:
+        with self._heard():
+            super().advance()
+
+    def show(self, text: str) -> None:
+        with self._heard():
+            super().show(text)
+
+    def line(self, text: str) -> None:
+        with self._heard():
+            super().line(text)
+
+    def __exit__(self, *error: object) -> None:
+        with self._heard():
+            super().__exit__(*error)
+
+    @contextlib.contextmanager
+    def _heard(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            if error.errno not in (errno.EPIPE, errno.EIO):
+                raise
+            self.signals.received = self.signals.received or signal.SIGPIPE
+
+
+class StepLog:
+    """Averages the losses over several steps, writes the means to `metrics.jsonl` and shows them.
+
+    Attributes:
+        sums: sums of the values of all steps since the last line; a checkpoint keeps them.
+    """
+
+    def __init__(self, run: Path, config: RunConfig, dataset: Dataset, clock: Clock) -> None:
+        self.metrics, self.options, self.clock = Metrics(run), config.train, clock
+        self.validates = dataset.count("valid") > 0
+        self.sums: dict[str, float] = {}
+
+    def add(self, values: dict[str, float]) -> None:
+        """Add the values of one step."""
+        for key, value in {**values, "steps": 1}.items():
+            self.sums[key] = self.sums.get(key, 0.0) + value
+
+    def show(self, step: int, progress: Progress, writes: bool) -> None:
+        """Show the means, and write them to `metrics.jsonl` if this process writes."""
+        count = self.sums.pop("steps")
+        means = {key: value / count for key, value in self.sums.items()}
+        self.sums = {}
+        seconds = self.clock.seconds_per_step
+        if writes:
+            rate = learning_rate(self.options, step - 1)
+            self.metrics.append({"step": step, **means, "rate": rate, "seconds": seconds})
+        stress = f", stress {means['stress']:.4f}" if "stress" in means else ""
+        to_go = self.clock.to_go(self.options.steps - step, self._validations_to_go(step))
+        progress.show(
+            f"step {step:,}/{self.options.steps:,}: loss {means['loss']:.4f}, motion {means['motion']:.4f}"
+            f"{stress}, {1000 * seconds:.1f} ms a step, {to_go} to go"
+        )
+        if means["spread"] < CONSTANT:
+            # If all units of the decoder are dead, it gives every node the same output and never recovers.
+            progress.line(
+                "warning: the predicted motion is the same at all nodes: the decoder is dead. Start again with another"
+                " train.seed, a lower train.peak_rate or a higher train.noise"
+            )
+
+    def _validations_to_go(self, step: int) -> int:
+        every = self.options.validate_every
+        return math.ceil(self.options.steps / every) - (step - 1) // every if self.validates else 0

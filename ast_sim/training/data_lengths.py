@@ -1,0 +1,101 @@
+"""Measurements of the training data: the scales that settings follow from, and the ranges of the scope."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from ast_sim.dataset.layout import GIVEN_FRAMES
+from ast_sim.dataset.reader import Dataset
+from ast_sim.inference.measures import SquaredError, rmse_pooled
+from ast_sim.models.model_config import ModelConfig
+from ast_sim.prescribed_motion import Motion
+from ast_sim.runs.scope import Scope, edge_lengths, size_of, spacing_of
+from ast_sim.scene import NodeType
+from ast_sim.support.errors import TrainingError
+
+MEASURED = 100  # at most so many training trajectories are measured
+
+
+@dataclasses.dataclass(frozen=True)
+class DataScales:
+    """Scales of the training split.
+
+    Attributes:
+        displacement, increment: root mean square per coordinate, over all frames and NORMAL nodes.
+        spacing: mean length of the mesh edges of the deforming bodies at rest.
+        nodes: median number of nodes of a scene.
+        trajectories, pairs: number of trajectories, and number of frames that can be a target.
+        planar: whether z is 0 in all scenes.
+    """
+
+    displacement: float
+    increment: float
+    spacing: float
+    nodes: int
+    trajectories: int
+    pairs: int
+    planar: bool = False
+
+
+def measure(dataset: Dataset) -> DataScales:
+    """Measure the scales on at most MEASURED trajectories, evenly spread over the training split.
+
+    Raises:
+        TrainingError: the split is empty.
+        DatasetError: in one of these scenes nothing can deform.
+    """
+    count = dataset.count("train")
+    if count == 0:
+        raise TrainingError(f"{dataset.path} has no trajectories to train on: the split train is empty")
+    given = GIVEN_FRAMES[dataset.info.integration]  # these cannot be a target
+    displacement, increment, lengths, nodes, planar = [], [], [], [], True
+    for name, trajectory in dataset.spread("train", MEASURED):
+        scene, position = trajectory.scene, trajectory.position
+        scene.require_predictable(name)
+        normal = scene.node_type == NodeType.NORMAL
+        displacement.append(SquaredError.between(position, scene.rest_position, normal))
+        increment.append(SquaredError.between(position[1:], position[:-1], normal))
+        lengths.append(edge_lengths(scene))
+        nodes.append(scene.num_nodes)
+        planar = planar and not scene.rest_position[:, 2].any() and not position[:, :, 2].any()
+    return DataScales(
+        displacement=rmse_pooled(displacement),
+        increment=rmse_pooled(increment),
+        spacing=float(np.concatenate(lengths).mean(dtype=np.float64)),
+        nodes=int(np.median(nodes)),
+        trajectories=count,
+        pairs=sum(max(0, dataset.num_frames("train", index) - given) for index in range(count)),
+        planar=planar,
+    )
+
+
+def scope_of(dataset: Dataset) -> Scope:
+    """The ranges of the training split, measured on the same trajectories."""
+    rows, materials, increments = [], [], []
+    for _, trajectory in dataset.spread("train", MEASURED):
+        scene, motion = trajectory.scene, Motion(trajectory.position)
+        moves = motion.increments(scene)
+        increments += [length for length in moves if length > 0]
+        rows.append((scene.num_nodes, size_of(scene), spacing_of(scene), motion.travel(scene), max(moves)))
+        if scene.material is not None:
+            materials.append(scene.material[scene.deforming_elements])
+    found = dict(zip(("nodes", "size", "spacing", "travel", "increment"), zip(*rows, strict=True), strict=True))
+    material = np.concatenate(materials) if materials else np.zeros((1, 0))
+    info = dataset.info
+    return Scope(
+        family=info.family,
+        length_unit=info.length_unit,
+        time_step=float(info.time_step),
+        corners=dataset.element_size,
+        **{key: (float(min(values)), float(max(values))) for key, values in found.items()},
+        usual_increment=float(np.median(increments or [0.0])),
+        material_low=tuple(material.min(axis=0).tolist()),
+        material_high=tuple(material.max(axis=0).tolist()),
+    )
+
+
+def largest_error(scales: DataScales, model: ModelConfig) -> float:
+    """A pool of rollouts drops a state whose error, in units of length, is above this; see docs/log.md."""
+    return (0.4 if model.dynamic else 1.8) * scales.displacement

@@ -1,0 +1,107 @@
+"""The values of unset settings, which follow from the data and the model."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+from ast_sim.dataset.reader import Dataset
+from ast_sim.models.model_config import DataFacts, ModelConfig
+from ast_sim.runs.train_config import RunConfig, TrainConfig
+from ast_sim.support.errors import ConfigError
+from ast_sim.support.toml_settings import LARGEST, require_range
+from ast_sim.training.data_lengths import DataScales
+
+# An unset shift is at most this share of the domain's half width; the margin of `Domain` is larger.
+LARGEST_SHIFT = 0.05
+_COUNTS = ("batch_size", "accumulate", "epochs", "statistics_pairs", "steps", "decay", "log_every", "keep")
+_COUNTS += ("validate_every", "checkpoint_every")
+_RANGES = {
+    **dict.fromkeys(_COUNTS, (1, LARGEST)),
+    **dict.fromkeys(("seed", "warmup", "validate_scenes", "noise"), (0, LARGEST)),
+    "peak_rate": (1e-30, 1.0),
+    "clip": (1e-30, math.inf),
+    "stress_weight": (0, 1e6),
+    "noise_gamma": (0, 1),
+}
+ROLLOUT_BATCHES = 16  # an unset pool of rollouts holds the scenes of so many batches
+
+
+def resolve(config: RunConfig, dataset: Dataset, scales: DataScales) -> RunConfig:
+    """Fill in all unset settings: first those of the model, then those of the training.
+
+    Raises:
+        ConfigError: a setting is out of its range, or the data does not fit it; the text names the setting.
+    """
+    model = config.model.resolve(DataFacts(dataset.info, dataset.material_width, scales.spacing, scales.planar))
+    return RunConfig(model, resolve_training(config.train, scales, model), str(Path(config.data).resolve()))
+
+
+def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig) -> TrainConfig:
+    """Fill in the unset settings of the training; `model` has no unset settings.
+
+    Raises:
+        ConfigError: a setting is out of its range, or the model cannot use it; the text names the setting.
+    """
+    for key, (least, most) in _RANGES.items():
+        require_range(f"train.{key}", getattr(config, key), least, most)
+    scenes = config.batch_size * config.accumulate
+    epoch = math.ceil(scales.pairs / scenes)
+    steps = config.steps if config.steps is not None else config.epochs * epoch
+    validate_every = config.validate_every or max(1, steps // 10)
+    derived = {
+        "steps": steps,
+        "peak_rate": 1e-4 * math.sqrt(scenes / 2),
+        "warmup": min(2000, steps // 20),
+        "decay": steps if config.steps is not None else steps + epoch,
+        "noise_gamma": 0.1 if model.dynamic else 1.0,
+        "validate_every": validate_every,
+        "checkpoint_every": validate_every,
+    }
+    missing = {key: value for key, value in derived.items() if getattr(config, key) is None}
+    pool = _rollout_pool(config, model)
+    noise = _noise(config, scales, model, pool > 0)
+    resolved = dataclasses.replace(config, **missing, noise=noise, rollout_pool=pool, shift=_shift(config, model))
+    if resolved.decay <= resolved.warmup:
+        raise ConfigError(f"train.warmup is {resolved.warmup}; it must be below train.decay = {resolved.decay}")
+    return resolved
+
+
+def _noise(config: TrainConfig, scales: DataScales, model: ModelConfig, along_rollouts: bool) -> float:
+    """The standard deviation of the noise on states; measurements chose the shares (docs/log.md, 2026-11-23)."""
+    if not model.horizon.drifts:  # each prediction starts from the true first frame, so its input has no error
+        return 0.0
+    if config.noise is not None:
+        return config.noise
+    if model.dynamic:  # the noise changes the velocity as well
+        return 0.1 * scales.increment
+    return (0.15 if along_rollouts else 0.45) * scales.displacement
+
+
+def _rollout_pool(config: TrainConfig, model: ModelConfig) -> int:
+    """The number of scenes in the pool of rollouts; 0: there is no pool."""
+    useless = None
+    if not model.horizon.drifts:
+        useless = "each frame follows from the first"
+    elif config.noise == 0:
+        useless = "without train.noise, states have no error"
+    if config.rollout_pool is None:
+        return ROLLOUT_BATCHES * config.batch_size if model.gains_along_rollouts and not useless else 0
+    if config.rollout_pool and useless:
+        raise ConfigError(f"train.rollout_pool is of no use here: {useless}")
+    if config.rollout_pool and (config.rollout_pool % config.batch_size or config.rollout_pool < 2 * config.batch_size):
+        raise ConfigError(
+            f"train.rollout_pool is {config.rollout_pool}; it must be a multiple of train.batch_size ="
+            f" {config.batch_size}, at least {2 * config.batch_size}"
+        )
+    return config.rollout_pool
+
+
+def _shift(config: TrainConfig, model: ModelConfig) -> float:
+    """The largest random shift of a scene. With half a cell's side, all positions within a cell are equally likely."""
+    if config.shift is None:
+        return min(model.cell_side / 2, LARGEST_SHIFT * model.domain_half_width)
+    if not 0 <= config.shift < math.inf:
+        raise ConfigError(f"train.shift is {config.shift}; it must be at least 0")
+    return config.shift

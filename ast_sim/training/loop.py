@@ -1,0 +1,217 @@
+"""The training loop: it learns from pairs of frames, validates by rollouts and writes checkpoints.
+
+All random numbers follow from the seed and the number of the step: `PairSampler` derives the order of the pairs and
+their noise from them, and torch is seeded before each step for dropout. So a checkpoint needs only the weights, the
+state of the optimizer, the pool of rollouts and the step, and a resumed training gives the same weights bit for bit.
+"""
+
+from __future__ import annotations
+
+import math
+import signal
+from pathlib import Path
+
+import torch
+
+from ast_sim.batches.batch_builder import Batch, Target
+from ast_sim.batches.pairs import PairSampler
+from ast_sim.batches.prefetch import Ahead
+from ast_sim.batches.training_rollouts import RolloutPool
+from ast_sim.dataset.reader import Dataset
+from ast_sim.models.registry import build_model
+from ast_sim.runs import checkpoint
+from ast_sim.runs.train_config import RunConfig
+from ast_sim.support.errors import DatasetError, TrainingError
+from ast_sim.support.progress import Clock, duration
+from ast_sim.support.stop_signals import StopSignals
+from ast_sim.training.console import Console, StepLog, introduce
+from ast_sim.training.data_lengths import DataScales, largest_error
+from ast_sim.training.optimizer import Optimizer
+from ast_sim.training.processes import Processes
+from ast_sim.training.profile import profile, table
+from ast_sim.training.rates import learning_rate, step_seed
+from ast_sim.training.saving import Saver
+from ast_sim.training.validation import validate, verdict
+
+
+class Training:
+    """One training: its model, its optimizer and its step.
+
+    `go` trains to the last step. A caller that wants no records, checkpoints and validations calls `prepare`, then
+    `advance` for each step. This is a context manager, since a thread draws the batches.
+    """
+
+    def __init__(
+        self,
+        run: Path,
+        config: RunConfig,
+        dataset: Dataset,
+        scales: DataScales,
+        signals: StopSignals,
+        processes: Processes | None = None,
+    ) -> None:
+        self.run, self.config, self.dataset, self.signals = run, config, dataset, signals
+        self.options, self.processes = config.train, processes or Processes()
+        torch.manual_seed(self.options.seed)
+        self.model = build_model(config.model)
+        self.sampler = self._sampler((self.processes.rank, self.processes.count))
+        pooled, largest = self.options.rollout_pool, largest_error(scales, config.model)
+        self.pool = RolloutPool(self.sampler, pooled, largest) if pooled else None
+        self.ahead = Ahead(self.pool or self.sampler)
+        self.optimizer = Optimizer(self.model, self.options.optimizer)
+        self.clock = Clock()
+        self.log = StepLog(run, config, dataset, self.clock)
+        self.saver = Saver(run, dataset, self.model, self.optimizer, self.pool, self.processes)
+        self.step = 0
+        self.stopping = 0  # the number of a signal that some process has received; 0: no signal
+        introduce(self.model, config, dataset, scales, self.sampler.num_pairs)
+
+    def __enter__(self) -> Training:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.ahead.__exit__(*error)
+
+    def _sampler(self, part: tuple[int, int]) -> PairSampler:
+        options = self.options
+        return self.model.pairs(
+            self.dataset,
+            batch_size=options.batch_size,
+            seed=options.seed,
+            noise=options.noise,
+            gamma=options.noise_gamma,
+            part=part,
+            mirror=options.mirror,
+            shift=options.shift,
+        )
+
+    def prepare(self) -> None:
+        """Restore the newest checkpoint; if there is none, measure the statistics of the data."""
+        found = self.saver.restore()
+        if found is not None:
+            self.step, self.log.sums = found
+        elif self.processes.leads:
+            batches = range(math.ceil(self.options.statistics_pairs / self.options.batch_size))
+            whole = self.sampler if self.processes.count == 1 else self._sampler((0, 1))
+            self.model.fit_statistics(whole.batch(index) for index in batches)
+        if self.processes.leads:
+            self.log.metrics.forget_after(self.step)
+            best = self.log.metrics.best()
+            if best is not None and checkpoint.read_best(self.run) is None:
+                checkpoint.mark_best(self.run, *best)
+        self.processes.spread(self.model.state_dict().values())
+        self.model.train()
+
+    def profile(self, steps: int) -> None:
+        """Print how the time of a step divides between its parts, measured on `steps` steps."""
+        self.prepare()
+        print(table(profile(self.advance, steps)))
+
+    def go(self) -> None:
+        """Train from the newest checkpoint, or from the beginning, to the last step."""
+        options = self.options
+        self.prepare()
+        with Console(options.steps, self.step, self.signals) as self.progress:
+            validated = self.processes.of_leader(self.log.metrics.validated(self.step))
+            if self.step and self._due(options.validate_every) and not validated:
+                self._validate()
+            self.clock.restart()
+            while self.step < options.steps:
+                self.advance()
+                self.progress.advance()
+                if self._due(options.log_every):
+                    self.log.show(self.step, self.progress, self.processes.leads)
+                validates = self._due(options.validate_every)
+                self._heed_signals()
+                if validates or self._due(options.checkpoint_every) or self.stopping:
+                    self.ahead.wait()
+                    self.saver.save(self.step, self.log.sums, options.keep)
+                self._stop_if_asked()
+                self.clock.step()
+                if validates:
+                    self._validate()
+
+    def _due(self, every: int) -> bool:
+        return self.step % every == 0 or self.step == self.options.steps
+
+    def _heed_signals(self) -> None:
+        if self.processes.any(self.signals.received is not None):
+            self.stopping = self.signals.received or signal.SIGTERM
+
+    def _stop_if_asked(self) -> None:
+        if self.stopping:
+            self.progress.line(f"stopped after step {self.step:,}: go on with --resume")
+            raise SystemExit(128 + self.stopping)
+
+    def advance(self) -> None:
+        """One optimizer step with the mean gradient of `accumulate` batches."""
+        options = self.options
+        draw = self.step * self.processes.count + self.processes.rank
+        torch.default_generator.manual_seed(step_seed(options.seed, draw))  # torch.manual_seed is slow: it seeds GPUs
+        self.optimizer.zero_gradient()
+        names: list[str] = []
+        values: dict[str, float] = {}
+        for part in range(options.accumulate):
+            number = self.step * options.accumulate + part
+            batch, target = self.ahead.batch(number)
+            for key, value in self._add_gradient(number, batch, target).items():
+                values[key] = values.get(key, 0.0) + value / options.accumulate
+            names += batch.names
+        self.processes.add(self.optimizer.gradient)
+        norm = self.optimizer.clip(options.clip)
+        if not math.isfinite(norm):
+            raise self._not_finite("norm of the gradient", norm, names)
+        self.optimizer.step(learning_rate(options, self.step))
+        self.step += 1
+        self.log.add({**values, "grad_norm": norm, "clipped_share": float(norm > options.clip)})
+
+    def _add_gradient(self, number: int, batch: Batch, target: Target) -> dict[str, float]:
+        """Add the gradient of one batch; returns the losses of that batch, summed over all processes."""
+        try:
+            prediction = self.model(batch)
+        except DatasetError as error:
+            raise DatasetError(f"{self.dataset.path}: in one of {', '.join(batch.names)}: {error}") from error
+        losses = self.model.loss(prediction, batch, target, self.options.stress_weight, self.processes.share)
+        found = self.processes.add(torch.stack([value.detach() for value in losses.values()]))
+        whole = dict(zip(losses, found.tolist(), strict=True))
+        if not math.isfinite(whole["loss"]):
+            raise self._not_finite("loss", whole["loss"], batch.names)
+        (losses["loss"] / self.options.accumulate).backward()
+        if self.pool is not None:
+            self.pool.advance(number, self.model.residual(prediction, batch, target))
+        return whole
+
+    def _not_finite(self, what: str, value: float, names: list[str]) -> TrainingError:
+        names, last = self.processes.gathered(names), checkpoint.latest(self.run)
+        kept = f"the last good checkpoint is {last}" if last else "there is no checkpoint yet"
+        return TrainingError(
+            f"the {what} of step {self.step + 1} is {value}, so training stopped before this step: check the samples"
+            f" {', '.join(names)}, or start again with a train.peak_rate below {self.options.peak_rate:.3g}; {kept}"
+        )
+
+    def _validate(self) -> None:
+        """Roll out the validation scenes; if their error is the lowest so far, mark the checkpoint of this step."""
+        count = min(self.dataset.count("valid"), self.options.validate_scenes)
+        if count == 0:
+            return
+        self.ahead.wait()
+        mine = range(self.processes.rank, count, self.processes.count)
+        # Several processes must stop together, so none of them may stop within its own validation.
+        progress = self._stop_at_once if self.processes.count == 1 else None
+        found = self.processes.gathered(validate(self.model, self.dataset, mine, progress))
+        seconds = self.clock.validation()
+        if not self.processes.leads:
+            return
+        mark = checkpoint.read_best(self.run)
+        if mark is not None and mark[0] >= self.step:  # a resumed training repeats this step
+            mark = self.log.metrics.best()
+        best = math.inf if mark is None else mark[1]
+        record, text = verdict(found, best, self.dataset.info.length_unit)
+        if record["valid_rmse"] is not None and record["valid_rmse"] < best:
+            checkpoint.mark_best(self.run, self.step, record["valid_rmse"])
+        self.log.metrics.append({"step": self.step, **record, "seconds": seconds})
+        self.progress.line(f"validation after step {self.step:,}: {text} ({duration(seconds)})")
+
+    def _stop_at_once(self, frame: int) -> None:
+        self._heed_signals()
+        self._stop_if_asked()

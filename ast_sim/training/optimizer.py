@@ -1,0 +1,85 @@
+"""The optimizers: AdamW as in the paper, or Muon for large matrices with AdamW for all other parameters.
+
+All parameters of a model are stored in one vector, so that a step computes one norm and one update instead of one for
+each parameter.
+"""
+
+from __future__ import annotations
+
+from itertools import compress
+
+import torch
+from torch import Tensor, nn
+
+from ast_sim.runs.train_config import OptimizerName
+from ast_sim.training.muon import Muon
+
+# A matrix with fewer rows or columns belongs to an input or output layer; AdamW trains these better than Muon.
+NARROW = 16
+
+
+class Optimizer:
+    """AdamW or Muon, without weight decay. It moves all parameters into one array, and all gradients into another.
+
+    Args:
+        model: its parameters stay the same objects; their values and their `grad`s become views of the two arrays.
+        name: "adamw"; or "muon": Muon for matrices with at least 16 rows and columns, AdamW for all other parameters.
+    """
+
+    def __init__(self, model: nn.Module, name: OptimizerName = "adamw") -> None:
+        parameters = list(model.parameters())
+        inside = [name == "muon" and p.dim() == 2 and min(p.shape) >= NARROW for p in parameters]
+        matrices = sorted(compress(parameters, inside), key=lambda p: p.shape)  # same shapes become adjacent
+        others = [p for p, is_inside in zip(parameters, inside, strict=True) if not is_inside]
+        self._values, self._gradients = _in_one_array([*others, *matrices])
+        rest = sum(p.numel() for p in others)
+        self._rest = nn.Parameter(self._values[:rest])
+        self._rest.grad = self._gradients[:rest]
+        self._adam = torch.optim.AdamW([self._rest], lr=0.0, weight_decay=0.0, fused=True)
+        self._muon = None
+        if matrices:
+            self._muon = Muon(self._values[rest:], self._gradients[rest:], [tuple(p.shape) for p in matrices])
+
+    @property
+    def gradient(self) -> Tensor:
+        """The gradients of all parameters, one after the other."""
+        return self._gradients
+
+    def zero_gradient(self) -> None:
+        self._gradients.zero_()
+
+    def clip(self, largest: float) -> float:
+        """Scale a gradient whose norm exceeds `largest` down to it; returns the norm before."""
+        norm = float(torch.linalg.vector_norm(self._gradients))
+        if norm > largest:
+            self._gradients.mul_(largest / norm)
+        return norm
+
+    def step(self, rate: float) -> None:
+        """Move the parameters against the gradient with this learning rate."""
+        self._adam.param_groups[0]["lr"] = rate
+        self._adam.step()
+        if self._muon is not None:
+            self._muon.step(rate)
+
+    def state(self) -> dict[str, Tensor]:
+        """The moments and the number of steps, which a checkpoint keeps beside the parameters; empty before a step."""
+        state = dict(self._adam.state[self._rest])
+        return {**state, "momentum": self._muon.momentum} if state and self._muon is not None else state
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Restore a state that `state` returned."""
+        state = dict(state)
+        if self._muon is not None and state:
+            self._muon.momentum.copy_(state.pop("momentum"))
+        self._adam.state[self._rest] = state
+
+
+def _in_one_array(parameters: list[nn.Parameter]) -> tuple[Tensor, Tensor]:
+    """An array of all values and an array of all gradients (zero). The parameters become views of these arrays."""
+    values = torch.cat([p.detach().flatten() for p in parameters])
+    gradients = torch.zeros_like(values)
+    sizes = [p.numel() for p in parameters]
+    for parameter, value, gradient in zip(parameters, values.split(sizes), gradients.split(sizes), strict=True):
+        parameter.data, parameter.grad = value.view_as(parameter), gradient.view_as(parameter)
+    return values, gradients

@@ -1,0 +1,85 @@
+"""Checkpoints of a training: what they hold, and how a training is restored from them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from torch import Tensor, nn
+
+from ast_sim.batches.training_rollouts import RolloutPool
+from ast_sim.dataset.reader import Dataset
+from ast_sim.runs import checkpoint
+from ast_sim.runs.metrics import Metrics
+from ast_sim.runs.origin import read_origin
+from ast_sim.support.errors import TrainingError
+from ast_sim.training.optimizer import Optimizer
+from ast_sim.training.processes import Processes
+
+
+class Saver:
+    """Saves and restores a training. Only the leading process uses files; it sends the others what they need."""
+
+    def __init__(
+        self,
+        run: Path,
+        dataset: Dataset,
+        model: nn.Module,
+        optimizer: Optimizer,
+        pool: RolloutPool | None,
+        processes: Processes,
+    ) -> None:
+        self.run, self.dataset, self.model, self.optimizer = run, dataset, model, optimizer
+        self.pool, self.processes = pool, processes
+
+    def save(self, step: int, sums: dict[str, float], keep: int) -> None:
+        """Write the checkpoint of a step; it holds the number of lines in `metrics.jsonl`."""
+        rolling = {}
+        if self.pool is not None:
+            parts = self.processes.gathered([self.pool.state()])
+            rolling = {key: value for part in parts for key, value in part.items()}
+        if self.processes.leads:
+            lines = sum(1 for _ in Metrics(self.run))
+            run = read_origin(self.run)["sha256"]
+            checkpoint.save(
+                self.run,
+                step,
+                model=self.model.state_dict(),
+                training={**_under("optimizer.", self.optimizer.state()), **_under("rollout_pool.", rolling)},
+                state={"step": step, "sums": sums, "run": run, "lines": lines},
+                keep=keep,
+            )
+
+    def restore(self) -> tuple[int, dict[str, float]] | None:
+        """Restore the newest checkpoint; returns its step and the sums of the log, or None if there is none."""
+        found, rolling = self._restore_alone() if self.processes.leads else (None, {})
+        found = self.processes.of_leader(found)
+        if found is not None:
+            self.optimizer.restore(self.processes.of_leader(self.optimizer.state()))
+            if self.pool is not None:
+                self.pool.restore(self.processes.of_leader(rolling))
+        return found
+
+    def _restore_alone(self) -> tuple[tuple[int, dict[str, float]] | None, dict[str, Tensor]]:
+        path = checkpoint.latest(self.run)
+        if path is None:
+            return None, {}
+        origin = read_origin(self.run)
+        weights, training, state = checkpoint.load(path, origin["sha256"])
+        if origin["data"] != self.dataset.fingerprint():
+            raise TrainingError(
+                f"{self.dataset.path} is not the dataset that {self.run} was trained on so far: use that dataset, or"
+                " train in another folder"
+            )
+        Metrics(self.run).require(state["lines"])
+        self.model.load_state_dict(weights)
+        self.optimizer.restore(_without("optimizer.", training))
+        print(f"going on after step {state['step']:,}", flush=True)
+        return (state["step"], state["sums"]), _without("rollout_pool.", training)
+
+
+def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {prefix + key: value for key, value in tensors.items()}
+
+
+def _without(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}

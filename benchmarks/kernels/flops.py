@@ -1,0 +1,105 @@
+"""Useful floating point operations of our ops, for torch's FlopCounterMode: the operations of the formulas.
+
+Recomputation does not count. A multiply and an add count as two. Only products of matrices count: activations, norms
+and sums are free.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+ops = torch.ops.ast_sim
+
+
+def _product(*sizes: int) -> int:
+    count = 2
+    for size in sizes:
+        count *= size
+    return count
+
+
+def _linear(x: Tensor, weight: Tensor, *_, **__) -> int:
+    return _product(len(x), *weight.shape)
+
+
+def _linear_backward(dout: Tensor, x: Tensor, weight: Tensor, bias, z, activation, wanted, **_) -> int:
+    return _product(len(x), *weight.shape) * sum(wanted[:2])
+
+
+def _mlp(x: Tensor, beside, weight1: Tensor, bias1, weight2: Tensor, *_, **__) -> int:
+    return _product(len(x), *weight1.shape) + _product(len(x), *weight2.shape)
+
+
+def _mlp_backward(dout: Tensor, x: Tensor, beside, weight1: Tensor, bias1, weight2: Tensor, *rest, **_) -> int:
+    inputs = x.shape[1] * rest[-1][0] + (0 if beside is None else beside.shape[1]) * rest[-1][1]
+    of_weights = _mlp(x, beside, weight1, bias1, weight2)
+    return of_weights + _product(len(x), *weight2.shape) + _product(len(x), len(weight1), inputs)
+
+
+def _message(of_senders, of_receivers, edge_features, A1: Tensor, a1, A2: Tensor, W2: Tensor, *_, **__) -> int:
+    edges = len(edge_features)
+    return _product(edges, *A1.shape) + _product(edges, *A2.shape) + _product(edges, *W2.shape)
+
+
+def _message_backward(dsum, dmessages, *inputs, **_) -> int:
+    edge_features, A1, wanted = inputs[2], inputs[3], inputs[-1]
+    of_edges = 0 if wanted else _product(len(edge_features), *A1.shape)
+    return 2 * _message(*inputs) - of_edges
+
+
+def _attention(q: Tensor, k: Tensor, v: Tensor, q_offsets: Tensor, k_offsets: Tensor, *_, **__) -> int:
+    pairs = int((q_offsets.diff() * k_offsets.diff()).sum())
+    return 2 * _product(pairs, *q.shape[1:])
+
+
+def _attention_backward(*inputs, **_) -> int:
+    return _attention(*inputs) * 5 // 2
+
+
+def _cross_attention(q: Tensor, key_value: Tensor, *rest, **_) -> int:
+    return _attention(q, key_value, key_value, *rest)
+
+
+def _cross_attention_backward(*inputs, **_) -> int:
+    return _cross_attention(*inputs) * 5 // 2
+
+
+def _self_attention(qkv: Tensor, *rest, **_) -> int:
+    return _attention(qkv[:, 0], qkv, qkv, *rest)
+
+
+def _self_attention_backward(*inputs, **_) -> int:
+    return _self_attention(*inputs) * 5 // 2
+
+
+def _sparse_conv(x: Tensor, weight: Tensor, bias, transposed, pair_offsets: Tensor, *_, **__) -> int:
+    return _product(int(pair_offsets[-1]), *weight.shape[1:])
+
+
+def _sparse_conv_weight(x: Tensor, dout: Tensor, pair_offsets: Tensor, *_, **__) -> int:
+    return _product(int(pair_offsets[-1]), x.shape[1], dout.shape[1])
+
+
+def _raw(function):
+    """FlopCounterMode then hands over tensors, not their shapes."""
+    function._get_raw = True
+    return function
+
+
+FORMULAS = {
+    ops.linear: _raw(_linear),
+    ops.linear_backward: _raw(_linear_backward),
+    ops.mlp: _raw(_mlp),
+    ops.mlp_backward: _raw(_mlp_backward),
+    ops.message: _raw(_message),
+    ops.message_backward: _raw(_message_backward),
+    ops.attention: _raw(_attention),
+    ops.attention_backward: _raw(_attention_backward),
+    ops.attention_kv: _raw(_cross_attention),
+    ops.attention_kv_backward: _raw(_cross_attention_backward),
+    ops.attention_qkv: _raw(_self_attention),
+    ops.attention_qkv_backward: _raw(_self_attention_backward),
+    ops.sparse_conv: _raw(_sparse_conv),
+    ops.sparse_conv_weight: _raw(_sparse_conv_weight),
+}

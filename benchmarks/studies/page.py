@@ -1,0 +1,356 @@
+"""Writes docs/results/study.md: all studies that have a result, their curves, and the cost of the mesh size.
+
+`python -m benchmarks.studies.page` writes it from benchmarks/results.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from benchmarks.steps import scaling_page
+from benchmarks.svg import axes_of_picture, save
+
+INTRODUCTION = """# The models compared
+
+Made by `python -m benchmarks.studies STUDY.toml`; the studies lie in `benchmarks/studies`. All runs of a study have the
+same scenes, splits and budget, and the same training but for what is said to be set otherwise; the state noise, of
+which a model that is trained along its own rollouts needs less, stands in the tables. Each has the learning rate of
+those tried with which its rollouts of the validation scenes are best, and the checkpoint that is evaluated is chosen
+by such rollouts, too. The budget is so many steps as fit in it at the speeds that were measured in turns before, those
+of rows that came later in turns with a row that was there and in proportion to its speed; what the training then took
+by the clock, beside other work, is told, too. Errors are those of the test scenes, on nodes that the model moves: root
+mean squares over coordinates, by sequence (`rmse_sequence`, as in the AST paper) or pooled over everything
+(`rmse_pooled`, as in MeshGraphNets); means over the seeds, with the least and the largest in brackets. A
+time-conditioned model predicts every frame from the first: it has no error of one step, and its first 50 frames are no
+easier than the others.
+"""
+
+AIM = 0.5  # AST's rollout error over that of the best baseline; the paper reports 0.38 on deforming_plate
+BASELINES = ("mgn", "bsms", "hcmt")  # those of the paper
+
+Run = dict[str, Any]
+
+
+def write_page(results: Path, pages: Path) -> None:
+    """Write study.md and its pictures into `pages`, from the files study_*.json in `results`."""
+    studies = {
+        file.stem.removeprefix("study_"): json.loads(file.read_text(encoding="utf-8"))
+        for file in sorted(results.glob("study_*.json"))
+    }
+    parts = [INTRODUCTION, *glance({found["study"]["title"]: found["models"] for found in studies.values()})]
+    for name, found in studies.items():
+        draw(found, pages / "study" / f"{name}.svg")
+        parts.append(section(found, name))
+    if (sizes := results / "scaling.json").exists():
+        found = json.loads(sizes.read_text(encoding="utf-8"))
+        scaling_page.draw(found, pages / "study" / "scaling.svg")
+        parts.append(scaling_page.section(found))
+    (pages / "study.md").write_text("\n".join(parts), encoding="utf-8")
+
+
+def section(found: dict[str, Any], name: str) -> str:
+    """One study: what it is, who is ahead, errors, errors by phase, cost, learning rates, settings."""
+    study, models = found["study"], found["models"]
+    budget = f"{study['minutes']:g} minutes" if study["minutes"] is not None else f"{study['samples']:,} frame pairs"
+    lines = [f"## {study['title']}", "", *([study["about"], ""] if study["about"] else [])]
+    lines += [
+        f"{scenes(found['scenes'], study['data'])}; {budget} of training on {study['threads']} thread(s);"
+        f" {seeds(models)}; {', '.join(origins(models))}.",
+        "",
+    ]
+    lines += [*verdict(models), *table(models, ERRORS), "", *trivial(models), ""]
+    if any(measured(run).get("phases") for model in models.values() for run in model["runs"]):
+        lines += ["Error by phase of contact, full rollout, mm (`rmse_sequence`):", "", *table(models, BY_PHASE), ""]
+    lines += [
+        *table(models, COST),
+        "",
+        *rates(study, models),
+        "",
+        *own_settings(study, models),
+        *divergences(models, study["horizons"]),
+        "",
+    ]
+    lines += [f"![Validation error over training time](study/{name}.svg)", ""]
+    return "\n".join(lines)
+
+
+def scenes(counts: dict[str, Any], data: dict[str, Any]) -> str:
+    """What the runs were trained and tested on."""
+    size = "".join(f", {data[key]:,} {key}" for key in ("nodes", "frames") if data[key] is not None)
+    numbers = f"{counts['train']} scenes to train on, {counts['valid']} to validate, {counts['test']} to test"
+    return f"`{counts['name']}`: {numbers}{size}"
+
+
+def seeds(models: dict[str, Any]) -> str:
+    """The seeds of the runs: of most rows, then of those that have others."""
+    rows = {name: ", ".join(str(run["seed"]) for run in model["runs"]) for name, model in models.items()}
+    (common, _), *others = Counter(rows.values()).most_common()
+    told = "; ".join(f"{', '.join(name for name in rows if rows[name] == theirs)}: {theirs}" for theirs, _ in others)
+    return f"seeds {common}" + (f" ({told})" if others else "")
+
+
+def origins(models: dict[str, Any]) -> list[str]:
+    """The commits and processors of the runs, each once."""
+    made = [measured(run) for model in models.values() for run in model["runs"] if measured(run)]
+    commits = sorted({(found["commit"] or "?")[:10] for found in made})
+    return [
+        f"commit{'s' if len(commits) > 1 else ''} {', '.join(commits)}",
+        *sorted({found["processor"] for found in made}),
+    ]
+
+
+def measured(run: Run) -> dict[str, Any]:
+    """What was found of a run on the test scenes; nothing if it failed."""
+    return run.get("measured", {})
+
+
+def _error(predictor: str, quantity: str, horizon: str, nodes: str, key: str, scale: float) -> Callable[[Run], Any]:
+    def value(run: Run) -> float | None:
+        summary = measured(run).get("summary", {}).get(predictor, {}).get(quantity)
+        found = None if summary is None else summary[horizon][nodes][key]
+        return None if found is None else scale * found
+
+    return value
+
+
+def _displacement(horizon: str, key: str = "rmse_sequence", predictor: str = "model") -> Callable[[Run], Any]:
+    return _error(predictor, "displacement", horizon, "normal", key, 1e3)
+
+
+def _one_step(error: Callable[[Run], Any]) -> Callable[[Run], Any]:
+    return lambda run: None if measured(run).get("time_conditioned") else error(run)
+
+
+def _phase(name: str) -> Callable[[Run], Any]:
+    def value(run: Run) -> float | None:
+        found = measured(run).get("phases", {}).get(name)
+        return None if found is None else 1e3 * found["rmse_sequence"]
+
+    return value
+
+
+def _of_samples(run: Run, key: str) -> float | None:
+    values = [sample[key] for sample in measured(run).get("samples", [])]
+    return None if not values or None in values else 1e3 * statistics.fmean(values)
+
+
+Columns = dict[str, Callable[[Run], Any]]
+ERRORS: Columns = {
+    "1 step, mm": _one_step(_displacement("one_step")),
+    "50 steps, mm": _displacement("rollout_50"),
+    "rollout, mm": _displacement("rollout_all"),
+    "pooled, mm": _displacement("rollout_all", "rmse_pooled"),
+    "stress, 1 step, kPa": _one_step(_error("model", "stress", "one_step", "deforming", "rmse_sequence", 1e-3)),
+    "stress, rollout, kPa": _error("model", "stress", "rollout_all", "deforming", "rmse_sequence", 1e-3),
+}
+BY_PHASE: Columns = {
+    "before contact": _phase("before"),
+    "first contact": _phase("first"),
+    "full contact": _phase("full"),
+    "release": _phase("release"),
+}
+COST: Columns = {
+    "parameters": lambda run: measured(run).get("parameters"),
+    "learning rate": lambda run: run["rate"],
+    "noise, mm": lambda run: None if run.get("noise") is None else 1e3 * run["noise"],
+    "batch": lambda run: run["batch"],
+    "ms a training step": lambda run: 1e3 * run["seconds_per_step"],
+    "ms a frame pair": lambda run: 1e3 * run["seconds_per_step"] / run["batch"],
+    "steps": lambda run: run["steps"],
+    "trained, min": lambda run: run["train_seconds"] / 60,
+    "peak memory, GB": lambda run: run["peak_resident_bytes"] / 1e9,
+    "ms a rollout step": lambda run: _of_samples(run, "model_seconds_per_step"),
+}
+
+
+def rollout_errors(models: dict[str, Any]) -> dict[str, float | None]:
+    """The rollout error of each row, mm."""
+    return {name: _mean(model["runs"], ERRORS["rollout, mm"]) for name, model in models.items()}
+
+
+def opponents(models: dict[str, Any]) -> tuple[str, str] | None:
+    """The first row of AST, and the baseline of the paper with the smallest rollout error; None if one is missing."""
+    errors = rollout_errors(models)
+    known = [name for name in models if errors[name] is not None]
+    ours = next((name for name in known if models[name]["model"] == "ast"), None)
+    rivals = [name for name in known if models[name]["model"] in BASELINES]
+    return (ours, min(rivals, key=errors.__getitem__)) if ours and rivals else None
+
+
+def verdict(models: dict[str, Any]) -> list[str]:
+    """AST beside the best of the paper's baselines: error of the rollout and time of a frame pair."""
+    found = opponents(models)
+    if found is None:
+        return []
+    ours, best = found
+    errors = rollout_errors(models)
+    ratio = errors[ours] / errors[best]
+    text = (
+        f"**The rollout error of {ours} is {number(ratio)} of that of the best baseline, {best}** (the aim is {AIM:g}"
+    )
+    text += ", reached)" if ratio <= AIM else ", not reached)"
+    if "MGN" in models:
+        times = [_mean(models[name]["runs"], COST["ms a frame pair"]) for name in (ours, "MGN")]
+        text += f"; its training takes {number(times[0] / times[1])} of MGN's time per frame pair"
+    ahead = [
+        f"{name} ({number(error / errors[best])})"
+        for name, error in errors.items()
+        if error is not None and error < errors[ours]
+    ]
+    text += f". Better: {'; '.join(ahead)}." if ahead else ". No other row has a smaller error."
+    return [text, ""]
+
+
+def glance(studies: dict[str, Any]) -> list[str]:
+    """All studies in one table: AST's errors beside those of the best baseline of each, and over them."""
+    columns = {
+        "rollout, mm": ERRORS["rollout, mm"],
+        "first contact, mm": BY_PHASE["first contact"],
+        "stress, rollout, kPa": ERRORS["stress, rollout, kPa"],
+    }
+    lines = []
+    for title, models in studies.items():
+        found = opponents(models)
+        if found is None:
+            continue
+        cells = []
+        for value in columns.values():
+            ours, theirs = (_mean(models[name]["runs"], value) for name in found)
+            cells.append(f"{number(ours)} : {number(theirs)} = **{number(ours / theirs)}**" if ours and theirs else "-")
+        lines.append(f"| {title} | {' | '.join([*found, *cells])} |")
+    if not lines:
+        return []
+    head = [
+        f"| study | AST | best baseline | {' | '.join(columns)} |",
+        f"| --- | --- | --- |{' ---: |' * len(columns)}",
+    ]
+    return ["AST beside the best of the paper's baselines, and the ratio; below 1 AST is ahead:", "", *head, *lines, ""]
+
+
+def own_settings(study: dict[str, Any], models: dict[str, Any]) -> list[str]:
+    """What was set beyond the presets: in all runs, then in those of a row."""
+    rows = [("all", study["settings"]), *((name, model["settings"]) for name, model in models.items())]
+    told = [f"{name}: `{' '.join(settings)}`" for name, settings in rows if settings]
+    return [f"Set beyond the presets. {'; '.join(told)}.", ""] if told else []
+
+
+def _mean(runs: list[Run], value: Callable[[Run], Any]) -> float | None:
+    """The mean over the seeds; None if a run has no such figure."""
+    values = [value(run) for run in runs]
+    return None if None in values else statistics.fmean(values)
+
+
+def rates(study: dict[str, Any], models: dict[str, Any]) -> list[str]:
+    """The validation errors by which each model's learning rate was chosen."""
+    searched = {name: model for name, model in models.items() if model["search"]}
+    if not searched:
+        return []
+    share = "" if study["search"] == 1 else f" with {100 * study['search']:g} % of the budget"
+    tried = sorted({rate for model in searched.values() for rate in model["search"]}, key=float)
+    lines = [f"Rollout error on the validation scenes, mm, by learning rate{share}; the best in bold:", ""]
+    lines += [f"| model | {' | '.join(tried)} |", f"| --- |{' ---: |' * len(tried)}"]
+    for name, model in searched.items():
+        cells = []
+        for rate in tried:
+            error = model["search"].get(rate)
+            cell = "-" if error is None else number(1e3 * error)
+            cells.append(f"**{cell}**" if float(rate) == model["rate"] else cell)
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return lines
+
+
+def table(models: dict[str, Any], columns: Columns) -> list[str]:
+    """A row a model, a column a figure; columns that no run has are left out."""
+    cells = {
+        name: {column: of_seeds(model["runs"], value) for column, value in columns.items()}
+        for name, model in models.items()
+    }
+    shown = [column for column in columns if any(row[column] for row in cells.values())]
+    if not shown:
+        return []
+    lines = [f"| model | {' | '.join(shown)} |", f"| --- |{' ---: |' * len(shown)}"]
+    return lines + [f"| {name} | {' | '.join(row[column] or '-' for column in shown)} |" for name, row in cells.items()]
+
+
+def of_seeds(runs: list[Run], value: Callable[[Run], Any]) -> str:
+    """Mean, and the least and the most in brackets where runs differ; "failed" if a run that has results has none."""
+    values = [value(run) for run in runs]
+    if all(x is None for x in values):
+        return "failed" if any("failed" in run for run in runs) else ""
+    if any(x is None for x in values):
+        return "failed"
+    mean = number(statistics.fmean(values))
+    ends = [number(end(values)) for end in (min, max)]
+    return mean if ends[0] == ends[1] else f"{mean} [{ends[0]}, {ends[1]}]"
+
+
+def number(x: float) -> str:
+    """Three significant digits, more where whole."""
+    return f"{x:,.0f}" if abs(x) >= 1000 else f"{x:.3g}"
+
+
+def trivial(models: dict[str, Any]) -> list[str]:
+    """What predictors without a model reach on the same scenes."""
+    runs = [run for model in models.values() for run in model["runs"] if measured(run)]
+    if not runs:
+        return []
+    texts = [
+        f"{what} {number(error)} mm"
+        for what, error in (
+            ("one step: hold still", _displacement("one_step", predictor="hold_still")(runs[0])),
+            ("repeat the last increment", _displacement("one_step", predictor="repeat_last")(runs[0])),
+            ("rollout: hold still", _displacement("rollout_all", predictor="hold_still")(runs[0])),
+        )
+        if error is not None
+    ]
+    return [f"Without a model: {', '.join(texts)}."]
+
+
+def divergences(models: dict[str, Any], horizons: int) -> list[str]:
+    """Which runs did not stay finite in the long rollouts, and when."""
+    lines = []
+    for name, model in models.items():
+        for run in model["runs"]:
+            if "failed" in run:
+                lines.append(f"- {name}, seed {run['seed']}: not evaluated: {run['failed']}")
+            lines += [f"- {name}, seed {run['seed']}: {text}" for text in measured(run).get("diverged", {}).values()]
+    farthest = {
+        name: max(measured(run).get("farthest", math.nan) for run in model["runs"]) for name, model in models.items()
+    }
+    reach = ", ".join(f"{name} {value:.2g}" for name, value in farthest.items() if not math.isnan(value))
+    first = f"Rolled out for {horizons} times the length of the scenes"
+    told = (
+        f"{first}, these did not stay finite:" if lines else f"{first}, every model stays finite on every test scene."
+    )
+    return [told, *lines, "", f"Farthest node from the centre, over the farthest of the truth: {reach}."]
+
+
+def draw(found: dict[str, Any], file: Path) -> None:
+    """Validation error over the budget spent, a line a model; thin lines are its other seeds.
+
+    A step counts as long as it took when speeds were measured in turns: the clock of a run tells what ran beside, too.
+    """
+    figure, axes = axes_of_picture(7.2, 4.4)
+    for number_, (name, model) in enumerate(found["models"].items()):
+        for i, run in enumerate(model["runs"]):
+            minutes = run["seconds_per_step"] / 60
+            points = [(minutes * p["step"], 1e3 * p["valid_rmse"]) for p in run["curve"] if p["valid_rmse"] is not None]
+            if points:
+                width = 1.6 if i == 0 else 0.7
+                axes.plot(
+                    *zip(*points, strict=True), ".-", color=f"C{number_}", linewidth=width, label=None if i else name
+                )
+    axes.set(xlabel="training, minutes", ylabel="rollout error on validation scenes, mm", yscale="log")
+    for ticks in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
+        ticks("{x:g}")
+    save(figure, axes, file)
+
+
+if __name__ == "__main__":
+    write_page(Path("benchmarks/results"), Path("docs/results"))

@@ -1,0 +1,300 @@
+/* What linear.c and mlp.c are made of: a dense layer on a block of rows, and sums over blocks of rows.
+ *
+ *   out_ij = act(sum_k a_ik W_jk + bias_j) + residual_ij,   i < rows, k < K, j < N
+ *
+ * W is packed once a call into panels of GEMM_COLUMNS outputs, padded with zeros; all tasks read the same panels. Panels go by
+ * while a block of some 100 rows of A stays in the cache, and what follows the product happens in its registers, so that every
+ * output is written once. For GEGLU a panel holds VW outputs of the first half of W beside the same ones of the second half.
+ *
+ * An element is a sum of chains of multiply-adds over rising k, cut by K and N alone, then the bias, whatever tile it falls into: a row's
+ * result depends on neither its place, the batch nor the threads.
+ */
+#ifndef AST_WEIGHT_PANELS_H
+#define AST_WEIGHT_PANELS_H
+
+#include "ast.h"
+#include "gemm.h"
+#include "simd.h"
+
+enum {
+  DENSE_ROWS = 96,         /* rows of a block: a multiple of GEMM_ROWS */
+  DENSE_APART = 16,        /* floats added to the rows of copied blocks: a power of two would crowd few cache sets */
+  DENSE_DEPTH = 192,       /* terms of one chain at most: its rounding errors grow with their number, */
+  DENSE_SHALLOW = 32,      /* and with few outputs, where lanes lie idle anyway, short chains cost little */
+  DENSE_FEW = 8,           /* outputs */
+  DENSE_PACK = 1 << 16,    /* floats of weights from which several threads pack them */
+  DENSE_PARTIALS = 1 << 24 /* floats at most of partial sums */
+};
+
+typedef struct {
+  const float *weight; /* W_jk = weight[k*row + j*column] */
+  int64_t row, column;
+  const float *bias;  /* [N] or NULL; paired: [2N] */
+  int64_t K, N;       /* paired: outputs of a half */
+  bool paired;        /* N outputs beside N others */
+  int64_t depth;      /* terms of one chain of multiply-adds */
+  float *panels;      /* [panels][K][GEMM_COLUMNS], */
+  float *panels_bias; /* [panels][GEMM_COLUMNS] */
+} dense_layer;
+
+AST_INLINE int64_t dense_panel_width(const dense_layer *l) { return l->paired ? VW : GEMM_COLUMNS; }
+AST_INLINE int64_t dense_panels(const dense_layer *l) { return (l->N + dense_panel_width(l) - 1) / dense_panel_width(l); }
+AST_INLINE int64_t dense_packed_size(const dense_layer *l) { return dense_panels(l) * (l->K + 1) * GEMM_COLUMNS; }
+
+static void dense_pack_panel(const dense_layer *l, int64_t p) {
+  float *panel = l->panels + p * l->K * GEMM_COLUMNS, *bias = l->panels_bias + p * GEMM_COLUMNS;
+  const int64_t j = p * dense_panel_width(l), n = min64(dense_panel_width(l), l->N - j);
+  const float *weight = l->weight + j * l->column;
+  for (int i = 0; i < GEMM_COLUMNS; i++) bias[i] = 0;
+  if (l->paired) {
+    gemm_pack_columns(weight, l->row, l->column, l->K, n, VW, panel);
+    gemm_pack_columns(weight + l->N * l->column, l->row, l->column, l->K, n, VW, panel + VW);
+    for (int64_t i = 0; l->bias && i < n; i++) bias[i] = l->bias[j + i], bias[VW + i] = l->bias[l->N + j + i];
+  } else {
+    gemm_pack_columns(weight, l->row, l->column, l->K, n, GEMM_COLUMNS, panel);
+    for (int64_t i = 0; l->bias && i < n; i++) bias[i] = l->bias[j + i];
+  }
+}
+
+typedef struct {
+  dense_layer *layers;
+  int64_t num;
+} dense_pack_job;
+
+static ast_status dense_pack_task(int64_t index, void *context) {
+  const dense_pack_job *job = context;
+  const dense_layer *l = job->layers;
+  for (; index >= dense_panels(l); l++) index -= dense_panels(l);
+  dense_pack_panel(l, index);
+  return AST_OK;
+}
+
+/* Packs layers into scratch of the calling thread, which its tasks may read. A layer without weight is left out. */
+static ast_status dense_pack(dense_layer *layers, int64_t num, int slot) {
+  dense_pack_job job = {layers, num};
+  int64_t size = 0, panels = 0;
+  for (int64_t i = 0; i < num; i++) {
+    if (!layers[i].weight) layers[i].N = 0;
+    const int64_t outputs = layers[i].paired ? 2 * layers[i].N : layers[i].N; /* as for both halves in one: z has the same bits */
+    const int64_t most = outputs > DENSE_FEW ? DENSE_DEPTH : DENSE_SHALLOW, chains = max64(1, (layers[i].K + most - 1) / most);
+    layers[i].depth = (layers[i].K + chains - 1) / chains;
+    size += dense_packed_size(&layers[i]);
+    panels += dense_panels(&layers[i]);
+  }
+  float *packed = ast_scratch(slot, size * (int64_t)sizeof *packed);
+  if (!packed) return AST_NO_MEMORY;
+  for (int64_t i = 0; i < num; i++) {
+    layers[i].panels = packed;
+    layers[i].panels_bias = packed + dense_panels(&layers[i]) * layers[i].K * GEMM_COLUMNS;
+    packed += dense_packed_size(&layers[i]);
+  }
+  if (size >= DENSE_PACK) return ast_parallel(panels, dense_pack_task, &job);
+  for (int64_t p = 0; p < panels; p++) dense_pack_task(p, &job);
+  return AST_OK;
+}
+
+/* Rows that are needed soon; they are fetched into the second cache during the products of this one. */
+typedef struct {
+  const float *data; /* NULL: none */
+  int64_t row, rows, columns;
+} dense_next;
+
+/* The rows from `first` on of an array of M rows, as many as a block has */
+AST_INLINE dense_next dense_rows_from(const float *data, int64_t row, int64_t columns, int64_t first, int64_t M) {
+  return data && first < M ? (dense_next){data + first * row, row, min64(DENSE_ROWS, M - first), columns} : (dense_next){0};
+}
+
+enum { DENSE_NEXT = 2 };
+
+/* What happens to a product: pointers to the first row, and the floats from row to row. */
+typedef struct {
+  ast_activation activation;
+  float *out;
+  int64_t out_row;
+  const float *residual; /* added, or NULL */
+  int64_t residual_row;
+  const float *hidden; /* or NULL; out is 0 where this is not above 0: the gradient of ReLU */
+  int64_t hidden_row;
+  float *z; /* what enters the activation, or NULL: [*, N], paired [*, 2N], dense */
+  dense_next next[DENSE_NEXT];
+} dense_end;
+
+/* What follows the product of a tile in the seldom cases: halves of a panel, z, columns from j on of which not all n are real. */
+static __attribute__((noinline)) void dense_finish(const dense_layer *l, const dense_end *e, int64_t rows, int64_t vectors, int64_t i,
+                                                   int64_t j, int64_t n, const float *sums, const float *bias) {
+  for (const int64_t end = i + rows; i < end; i++, sums += GEMM_COLUMNS) {
+    if (l->paired) {
+      const vf a = vload(sums) + vload(bias), b = vload(sums + VW) + vload(bias + VW);
+      vf z = a * (b * vnormal(b));
+      if (e->z) {
+        vstore_upto(e->z + i * 2 * l->N + j, a, n);
+        vstore_upto(e->z + (i * 2 + 1) * l->N + j, b, n);
+      }
+      if (e->residual) z += vload_upto(e->residual + i * e->residual_row + j, n);
+      vstore_upto(e->out + i * e->out_row + j, z, n);
+      continue;
+    }
+    for (int64_t v = 0; v < vectors * VW; v += VW) {
+      vf z = vload(sums + v) + vload(bias + v); /* last: a large bias costs the sum no digits */
+      if (e->z) vstore_upto(e->z + i * l->N + j + v, z, n - v);
+      if (e->activation == AST_RELU) z = vmax((vf){0}, z);
+      if (e->hidden) z = (vf)((vi)z & ~(vload_upto(e->hidden + i * e->hidden_row + j + v, n - v) <= 0));
+      if (e->residual) z += vload_upto(e->residual + i * e->residual_row + j + v, n - v);
+      vstore_upto(e->out + i * e->out_row + j + v, z, n - v);
+    }
+  }
+}
+
+/* for all vectors of a register tile */
+#define DENSE_EACH(i, v) _Pragma("GCC unroll 12") for (int i = 0; i < rows; i++) _Pragma("GCC unroll 2") for (int v = 0; v < vectors; v++)
+
+/* The same in the usual cases, in the registers of the tile: rows from i on, whole vectors from column j on. */
+AST_INLINE void dense_finish_tile(const int rows, const int vectors, const dense_end *e, int64_t i0, int64_t j, const float *bias,
+                                  vf z[GEMM_ROWS][2]) {
+  DENSE_EACH(i, v) z[i][v] += vload(bias + v * VW);
+  if (e->activation == AST_RELU) DENSE_EACH(i, v) z[i][v] = vmax((vf){0}, z[i][v]);
+  if (e->hidden) {
+    const float *hidden = e->hidden + i0 * e->hidden_row + j;
+    DENSE_EACH(i, v) z[i][v] = (vf)((vi)z[i][v] & ~(vload(hidden + i * e->hidden_row + v * VW) <= 0));
+  }
+  if (e->residual) {
+    const float *residual = e->residual + i0 * e->residual_row + j;
+    DENSE_EACH(i, v) z[i][v] += vload(residual + i * e->residual_row + v * VW);
+  }
+  float *out = e->out + i0 * e->out_row + j;
+  DENSE_EACH(i, v) vstore(out + i * e->out_row + v * VW, z[i][v]);
+}
+
+/* One register tile: rows i.. of panel p. A long sum over k is one of short ones, in the stack between two of them. */
+AST_INLINE void dense_tile(const int rows, const int vectors, const dense_layer *l, int64_t p, int64_t i0, gemm_a a, const dense_end *e) {
+  const int64_t j = p * dense_panel_width(l);
+  const float *panel = l->panels + p * l->K * GEMM_COLUMNS, *bias = l->panels_bias + p * GEMM_COLUMNS;
+  float sums[GEMM_ROWS * GEMM_COLUMNS] __attribute__((aligned(64)));
+  DENSE_EACH(i, v) __builtin_prefetch(e->out + (i0 + i) * e->out_row + j + v * VW, 1);
+  vf sum[GEMM_ROWS][2];
+  for (int64_t k = 0;;) { /* once without inputs, too: the sums are then 0 */
+    DENSE_EACH(i, v) sum[i][v] = (vf){0};
+    const gemm_a part = {a.data + i0 * a.row + k * a.column, a.row, a.column};
+    gemm_sums(rows, vectors, min64(l->depth, l->K - k), part, panel + k * GEMM_COLUMNS, GEMM_COLUMNS, sum);
+    if (k) DENSE_EACH(i, v) sum[i][v] += vload(sums + i * GEMM_COLUMNS + v * VW);
+    k += l->depth;
+    if (k >= l->K) break;
+    DENSE_EACH(i, v) vstore(sums + i * GEMM_COLUMNS + v * VW, sum[i][v]);
+    __asm__("" : "+m"(sums)); /* or the compiler moves what is not yet known of them through other stack for every tile */
+  }
+  if (!l->paired && !e->z && l->N - j >= vectors * VW) {
+    dense_finish_tile(rows, vectors, e, i0, j, bias, sum);
+    return;
+  }
+  DENSE_EACH(i, v) vstore(sums + i * GEMM_COLUMNS + v * VW, sum[i][v]);
+  dense_finish(l, e, rows, vectors, i0, j, l->N - j, sums, bias);
+}
+
+/* The share of panel p, of `panels`, in rows first.. of it */
+AST_INLINE void dense_fetch(const dense_next *next, int64_t p, int64_t panels, int64_t first, int64_t rows) {
+  const int64_t lines = (next->columns + 15) / 16, begin = lines * p / panels, end = lines * (p + 1) / panels;
+  for (int64_t i = first; i < min64(first + rows, next->rows); i++)
+    for (int64_t k = begin; k < end; k++) __builtin_prefetch(next->data + i * next->row + 16 * k, 0, 2);
+}
+
+AST_INLINE void dense_strip(const int vectors, const dense_layer *l, int64_t p, int64_t rows, gemm_a a, const dense_end *e) {
+  int64_t i = 0;
+#define DENSE_STEP(num) \
+  for (; i + (num) <= rows; i += (num)) dense_tile(num, vectors, l, p, i, a, e)
+  for (; i + GEMM_ROWS <= rows; i += GEMM_ROWS) {
+    for (int n = 0; n < DENSE_NEXT; n++)
+      if (e->next[n].data) dense_fetch(&e->next[n], p, dense_panels(l), i, GEMM_ROWS);
+    dense_tile(GEMM_ROWS, vectors, l, p, i, a, e);
+  }
+  if (GEMM_ROWS > 8) DENSE_STEP(8);
+  DENSE_STEP(4);
+  DENSE_STEP(2);
+  DENSE_STEP(1);
+#undef DENSE_STEP
+}
+
+/* M rows are cut evenly between register tiles: where task `index` of `tasks` begins. */
+AST_INLINE int64_t dense_begin(int64_t M, int64_t tasks, int64_t index) {
+  return min64(M, (M + GEMM_ROWS - 1) / GEMM_ROWS * index / tasks * GEMM_ROWS);
+}
+
+/* Panels first <= p < last of the layer on `rows` rows of A. */
+static void dense_rows(const dense_layer *l, int64_t first, int64_t last, int64_t rows, gemm_a a, dense_end e) {
+  for (int64_t p = first; p < last; p++) {
+    if (l->paired || l->N - p * GEMM_COLUMNS > VW) dense_strip(2, l, p, rows, a, &e);
+    else dense_strip(1, l, p, rows, a, &e);
+  }
+}
+
+/* ---- what the gradients need ---- */
+
+/* to[i] = from[i], n floats each, padded with zeros to whole vectors */
+static void dense_copy_rows(const float *from, int64_t from_row, int64_t rows, int64_t n, float *to, int64_t to_row) {
+  for (int64_t i = 0; i < rows; i++)
+    for (int64_t j = 0; j < n; j += VW) vstore(to + i * to_row + j, vload_upto(from + i * from_row + j, n - j));
+}
+
+/* sums[j] += sum_i x_ij, n padded to whole vectors: four short chains over the rows first, so that long sums stay accurate */
+static void dense_add_rows(const float *x, int64_t row, int64_t rows, int64_t n, float *sums) {
+  for (int64_t j = 0; j < n; j += VW) {
+    vf chain[4] = {{0}};
+    int64_t i = 0;
+    for (; i + 4 <= rows; i += 4)
+#pragma GCC unroll 4
+      for (int c = 0; c < 4; c++) chain[c] += vload(x + (i + c) * row + j);
+    for (; i < rows; i++) chain[0] += vload(x + i * row + j);
+    vstore(sums + j, vload(sums + j) + ((chain[0] + chain[1]) + (chain[2] + chain[3])));
+  }
+}
+
+/* Rows are cut into chunks by their number alone; each chunk has its own partial sums, added in order at the end. */
+typedef struct {
+  int64_t num, rows, step; /* chunks, rows of a chunk, rows of a block within it */
+} dense_chunks;
+
+static dense_chunks dense_cut(int64_t M, int64_t floats) {
+  const int64_t most = min64(32, max64(2, DENSE_PARTIALS / max64(1, floats)));
+  const int64_t parts = M / 192 > 2 ? round_up(M / 192, 4) : min64(2, M / 16); /* even shares for 2 and for 4 threads */
+  const int64_t num = max64(1, min64(parts, most)), rows = (M + num - 1) / num;
+  const int64_t blocks = (rows + DENSE_ROWS - 1) / DENSE_ROWS;
+  return (dense_chunks){num, rows, blocks ? round_up((rows + blocks - 1) / blocks, GEMM_ROWS) : DENSE_ROWS};
+}
+
+/* to [rows,n] = the sum over chunks of partials[chunk][at..], rows of it `row` floats apart; `to` may be NULL */
+typedef struct {
+  float *to;
+  int64_t at, rows, n, row;
+} dense_sum;
+
+typedef struct {
+  const float *partials;
+  int64_t size, chunks;
+  const dense_sum *sums;
+  int64_t num;
+} dense_sum_job;
+
+enum { DENSE_SUM_ROWS = 16 };
+
+AST_INLINE int64_t dense_sum_tasks(const dense_sum *s) { return s->to ? (s->rows + DENSE_SUM_ROWS - 1) / DENSE_SUM_ROWS : 0; }
+
+static ast_status dense_sum_task(int64_t index, void *context) {
+  const dense_sum_job *job = context;
+  const dense_sum *s = job->sums;
+  for (; index >= dense_sum_tasks(s); s++) index -= dense_sum_tasks(s);
+  for (int64_t i = index * DENSE_SUM_ROWS; i < min64(s->rows, (index + 1) * DENSE_SUM_ROWS); i++)
+    for (int64_t j = 0; j < s->n; j += VW) {
+      const float *partial = job->partials + s->at + i * s->row + j;
+      vf sum = vload(partial);
+      for (int64_t c = 1; c < job->chunks; c++) sum += vload(partial + c * job->size);
+      vstore_upto(s->to + i * s->n + j, sum, s->n - j);
+    }
+  return AST_OK;
+}
+
+static ast_status dense_add_partials(dense_sum_job job) {
+  int64_t tasks = 0;
+  for (int64_t i = 0; i < job.num; i++) tasks += dense_sum_tasks(&job.sums[i]);
+  return ast_parallel(tasks, dense_sum_task, &job);
+}
+
+#endif

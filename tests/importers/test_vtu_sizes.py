@@ -1,0 +1,96 @@
+"""VTU files whose compressed arrays are larger than the file says."""
+
+import base64
+import lzma
+import re
+import resource
+import zlib
+
+import meshio
+import numpy as np
+import pytest
+from data_samples import block
+
+from ast_sim.importers.mesh_file import read_mesh
+from ast_sim.support.errors import DatasetError
+
+SCENE = block(2, 2, 2)
+PACKERS = {"zlib": zlib.compress, "lzma": lzma.compress}
+
+
+def compressed(data: bytes, pack, parts=1) -> tuple[bytes, bytes]:
+    """One block, as VTK stores it: the number of blocks, their size, the size of the last, the compressed sizes."""
+    packed = b"".join(pack(data) for _ in range(parts))
+    return np.array([1, len(data) * parts, len(data) * parts, len(packed)], "<u4").tobytes(), packed
+
+
+def write(path, compression, **point):
+    mesh = meshio.Mesh(SCENE.rest_position, [("tetra", SCENE.elements)], point)
+    meshio.write(path, mesh, file_format="vtu", compression=compression)
+    return path
+
+
+def with_array(path, name, head, packed):
+    text = path.read_text()
+    data = (base64.b64encode(head) + base64.b64encode(packed)).decode()
+    changed = re.sub(rf'(<DataArray[^>]*Name="{name}"[^>]*>)[^<]*', rf"\g<1>{data}", text)
+    assert changed != text
+    path.write_text(changed)
+
+
+@pytest.mark.parametrize("compression", PACKERS)
+@pytest.mark.parametrize("name", ["von_mises", "Points", "connectivity", "types"])
+def test_an_array_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(tmp_path, compression, name):
+    path = write(tmp_path / "a.vtu", compression, von_mises=np.ones(SCENE.num_nodes))
+    assert read_mesh(path, "vtu").points.shape == (SCENE.num_nodes, 3)
+    with_array(path, name, *compressed(bytes(1 << 28), PACKERS[compression]))
+    assert path.stat().st_size < 1 << 20
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(DatasetError, match=f"{path}: the array {name} unpacks to more than [0-9]+ bytes, which is all"):
+        read_mesh(path, "vtu")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # KiB; the array has 262,144
+
+
+def test_several_streams_in_one_block_are_counted_together(tmp_path):
+    path = write(tmp_path / "a.vtu", "lzma", von_mises=np.ones(SCENE.num_nodes))
+    with_array(path, "von_mises", *compressed(bytes(200), lzma.compress, parts=2))
+    with pytest.raises(DatasetError, match="the array von_mises unpacks to more than 216 bytes"):
+        read_mesh(path, "vtu")
+
+
+def appended(path, raw: bool, factor: int = 1, same: bool = False):
+    """The scene with all arrays in one appended block, as VTK itself writes them; `factor` repeats each array."""
+    arrays = {
+        "Points": ("Float32", SCENE.rest_position, 3),
+        "connectivity": ("Int64", SCENE.elements.astype(np.int64), 1),
+        "offsets": ("Int64", 4 * np.arange(1, SCENE.num_elements + 1), 1),
+        "types": ("UInt8", np.full(SCENE.num_elements, 10, np.uint8), 1),
+    }
+    tags, data = {}, b""
+    for name, (kind, values, columns) in arrays.items():
+        head, packed = compressed(values.tobytes() * factor, zlib.compress)
+        offset = 0 if same else len(data)
+        tags[name] = (
+            f'<DataArray type="{kind}" Name="{name}" NumberOfComponents="{columns}" format="appended"'
+            f' offset="{offset}"/>'
+        )
+        data += head + packed if raw else base64.b64encode(head) + base64.b64encode(packed)
+    encoding = "raw" if raw else "base64"
+    text = (
+        '<VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian" header_type="UInt32"'
+        f' compressor="vtkZLibDataCompressor">\n<UnstructuredGrid><Piece NumberOfPoints="{SCENE.num_nodes}"'
+        f' NumberOfCells="{SCENE.num_elements}">\n<Points>{tags.pop("Points")}</Points><Cells>'
+        f"{''.join(tags.values())}</Cells></Piece></UnstructuredGrid>\n"
+        f'<AppendedData encoding="{encoding}">\n_'
+    )
+    path.write_bytes(text.encode() + data + b"\n</AppendedData>\n</VTKFile>\n")
+    return path
+
+
+@pytest.mark.parametrize("raw", [True, False])
+def test_appended_arrays(tmp_path, raw):
+    assert np.array_equal(read_mesh(appended(tmp_path / "a.vtu", raw), "vtu").elements, SCENE.elements)
+    with pytest.raises(DatasetError, match="the array Points unpacks to more than 324 bytes"):
+        read_mesh(appended(tmp_path / "a.vtu", raw, factor=2), "vtu")
+    with pytest.raises(DatasetError, match="the array connectivity shares its data with another array"):
+        read_mesh(appended(tmp_path / "a.vtu", raw, same=True), "vtu")

@@ -1,0 +1,310 @@
+"""Scenes that no dataset holds: a plate and a punch from a mesh, predicted, and solved to know the truth."""
+
+import warnings
+from dataclasses import replace
+
+import meshio
+import numpy as np
+import pytest
+import toy
+from meshes import box_between, plate_and_punch
+from toy import one_thread  # noqa: F401 (used by being imported)
+from vtk_series import read
+
+from ast_sim import Dataset, DatasetWriter, Motion, Run, generate, read_scene, train
+from ast_sim.cli import main
+from ast_sim.demo import FAMILY, FRAMES, NODES
+from ast_sim.inference.rollout import Question, rollouts
+from ast_sim.scene import Scene
+from ast_sim.simulate.families import deforming_plate
+from ast_sim.simulate.mechanics.case import SolidCase
+from ast_sim.support.errors import ConfigError
+
+SIZE, CELLS, DEPTH = (0.48, 0.32, 0.03), (11, 8, 2), 0.045
+PRESCRIBED = {"obstacles": [1], "clamps": ["0:xmin,xmax"]}
+PRESS = {1: (0.0, 0.0, -DEPTH)}
+
+
+def scene_of(size=SIZE, cells=CELLS, gap=0.008) -> Scene:
+    return read_scene(plate_and_punch(size, cells, gap), **PRESCRIBED).scene
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Run:
+    """A run like the demo's, with about as much data and training as in its quick form."""
+    folder = tmp_path_factory.mktemp("new_scene")
+    generate(FAMILY, folder / "data.h5", train=16, valid=2, test=3, nodes=NODES, frames=FRAMES, workers=1)
+    return train(folder / "data.h5", folder / "run", steps=500, mirror=("x", "y"))
+
+
+@pytest.fixture(scope="module")
+def test_error(run) -> float:
+    """The displacement error in metres on the test split."""
+    return run.evaluate().figures["summary"]["model"]["displacement"]["rollout_all"]["normal"]["rmse_sequence"]
+
+
+def solved(scene: Scene, motion: Motion) -> np.ndarray:
+    """[S, N, 3]: the positions that the bundled solver finds, with all that the family's scenes have in common."""
+    targets = motion.position.astype(np.float64)
+    case = SolidCase(scene, targets, deforming_plate.MATERIAL, deforming_plate.CONTACT, "node")
+    truth = deforming_plate.solve(case)
+    assert truth.attributes["status"] == "complete"
+    return truth.position
+
+
+def rmse(difference: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(difference.astype(np.float64)))))
+
+
+def predicted_without_warning(run: Run, *arguments, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return run.predict(*arguments, **options)
+
+
+def test_a_plate_and_a_punch_are_predicted_as_well_as_the_test_scenes(run, test_error, tmp_path, capsys):
+    mesh = plate_and_punch(SIZE, CELLS, gap=0.008)
+    scene = read_scene(mesh, obstacles=[1], clamps=["0:xmin,xmax"]).scene
+    answer = predicted_without_warning(run, scene, {1: (0, 0, -DEPTH)})
+    assert answer.failure is None and answer.stress.shape == (*answer.position.shape[:2], 1)
+
+    motion = Motion.of_bodies(scene, PRESS, len(answer.position))
+    truth, free = solved(scene, motion), ~scene.prescribed
+    assert np.array_equal(answer.position[:, ~free], motion.position[:, ~free])
+    error = rmse((answer.position - truth)[1:, free])
+    hold_still = rmse((truth - truth[0])[1:, free])
+    assert error <= 2 * test_error
+    assert error < 0.75 * hold_still
+
+    # From the command line: the same numbers, in a file that VTK reads.
+    meshio.write(tmp_path / "mesh.vtu", mesh)
+    out = tmp_path / "answer.vtkhdf"
+    options = ["--obstacle", "1", "--clamp", "0:xmin,xmax", "--move", f"1=0,0,-{DEPTH}", "--out", str(out)]
+    capsys.readouterr()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert main(["predict", str(run.path), str(tmp_path / "mesh.vtu"), *options]) == 0
+    shown = capsys.readouterr().out
+    assert "body 0: 324 nodes (270 normal, 54 handle)" in shown and "body 1: 27 nodes (27 obstacle)" in shown
+    assert f"{len(answer.position) - 1} frames predicted" in shown
+    times, frames = read(out)
+    assert len(times) == len(answer.position)
+    for frame, found in enumerate(frames):
+        assert np.array_equal(found.points, answer.position[frame])
+        assert np.array_equal(found.point_data["von_mises"], answer.stress[frame, :, 0])
+        assert np.array_equal(found.cells.reshape(-1, 5)[:, 1:], scene.elements)
+    print(f"error {error:.3g} m, test split {test_error:.3g} m, holding still {hold_still:.3g} m")
+
+
+def test_the_prescribed_nodes_move_as_far_in_a_frame_as_in_training(run, monkeypatch):
+    usual = run.scope.usual_increment
+    with Dataset(run.settings.data) as data:
+        found = [
+            np.linalg.norm(np.diff(truth.position[:, truth.scene.prescribed].astype(float), axis=0), axis=2).max(axis=1)
+            for truth in data["train"]
+        ]
+    found = np.concatenate(found)
+    assert usual == pytest.approx(np.median(found[found > 0]), rel=1e-6)
+    scene = scene_of()
+    answer = run.predict(scene, PRESS)
+    assert len(answer.position) == 1 + int(np.ceil(DEPTH / usual))
+    assert len(run.predict(scene, PRESS, frames=9).position) == 9
+    monkeypatch.setattr(run, "scope", replace(run.scope, usual_increment=0.0))
+    with pytest.raises(ConfigError, match=r"nothing is moved in the training scenes: say how many frames \(--frames\)"):
+        run.predict(scene, PRESS)
+
+
+def with_positions(scene: Scene, positions: np.ndarray) -> Scene:
+    return replace(scene, rest_position=positions.astype(np.float32))
+
+
+def test_a_scene_far_away_gets_the_same_answer_there(run, tmp_path):
+    """Coordinates are multiples of 2^-12, so that float32 holds the moved ones exactly."""
+    scene = scene_of()
+    rest = np.round(scene.rest_position.astype(np.float64) * 4096) / 4096
+    press, frames = {1: (0.0, 0.0, -3 / 64)}, 17
+    known = np.concatenate([rest, rest[scene.body == 1] + press[1]])
+    rest -= (known.min(axis=0) + known.max(axis=0)) / 2
+    middle = run.predict(with_positions(scene, rest), press, frames=frames)
+    free = ~scene.prescribed
+    size = np.linalg.norm(np.ptp(rest, axis=0))
+    for shift in ((4.0, -4.0, 2.0), (64.0, -32.0, 16.0)):
+        there = with_positions(scene, rest + shift)
+        far = run.predict(there, press, frames=frames)
+        assert far.scene is there and far.failure is None
+        expected = middle.position.astype(np.float64) + shift
+        assert np.array_equal(far.position[:, free], expected.astype(np.float32)[:, free])
+        motion = Motion.of_bodies(there, press, frames)
+        assert np.array_equal(far.position[:, ~free], motion.position[:, ~free])
+        assert np.array_equal(far.stress, middle.stress)
+        if max(shift) == 4:
+            assert np.abs(far.position - expected).max() < 1e-6 * size
+    far.save(tmp_path / "far.h5")
+    with Dataset(tmp_path / "far.h5") as kept:
+        assert np.array_equal(kept["test"][0].position, far.position)
+
+
+def test_only_a_scene_that_leaves_the_domain_is_moved(run, monkeypatch):
+    asked = []
+
+    def kept(model, questions):
+        asked.extend(questions)
+        return rollouts(model, questions)
+
+    monkeypatch.setattr("ast_sim.inference.predict.rollouts", kept)
+    scene = scene_of()
+    scene = with_positions(scene, scene.rest_position + [0.7, 0.1, 0.0])  # up to x = 0.94 of 1
+    run.predict(scene, PRESS, frames=3)
+    assert asked[-1].scene is scene
+    with pytest.warns(UserWarning, match="prescribed nodes move"):  # its motion counts, too: up to x = 1.15
+        run.predict(scene, {1: (0.4, 0.0, 0.0)}, frames=3)
+    x = asked[-1].script[:, scene.prescribed, 0]
+    assert (x.min(), x.max()) == pytest.approx((-0.345, 0.345))
+    assert asked[-1].scene.rest_position[:, 0].min() == pytest.approx(-0.345)
+
+
+def test_a_trajectory_is_predicted_where_it_lies_and_nobody_warns(run):
+    with Dataset(run.settings.data) as data:
+        truth = data["test"][0]
+    scene = with_positions(truth.scene, truth.scene.rest_position + 2)
+    there = replace(truth, scene=scene, position=(2 * truth.position + 2)[:3])
+    answer = predicted_without_warning(run, there)
+    assert answer.scene is scene and np.array_equal(answer.position[0], there.position[0])
+    question = Question.of(there, "scene")
+    assert np.array_equal(answer.position, rollouts(run.model, [question])[0].position)
+
+
+@pytest.mark.parametrize(
+    ("scene", "press", "options", "words"),
+    [
+        (scene_of(), 0.12, {}, "prescribed nodes move up to 0.12 m from their start; in training 0 m to"),
+        (scene_of(), DEPTH, {"frames": 2}, "prescribed nodes move 0.045 m in one frame; in training 0 m to"),
+        (scene_of((0.66, 0.36, 0.03), (14, 8, 2)), DEPTH, {}, "the deforming bodies measure 0.7524 m across; in train"),
+        (scene_of(cells=(7, 5, 4)), DEPTH, {}, "the mesh edges have a mean length of 0.06436 m; in training"),
+        (scene_of(cells=(10, 8, 4)), DEPTH, {}, "the scene has 522 nodes; in training"),
+    ],
+    ids=["travel", "increment", "size", "spacing", "nodes"],
+)
+def test_what_lies_outside_the_training_scenes_is_told(run, scene, press, options, words):
+    with pytest.warns(UserWarning) as told:
+        run.predict(scene, {1: (0, 0, -press)}, name="plate.vtu", **options)
+    assert [str(warning.message)[: len(words) + 11] for warning in told] == [f"plate.vtu: {words}"]
+    assert told[0].filename == __file__
+
+
+def test_triangles_are_not_what_the_run_knows(run):
+    scene = scene_of()
+    with pytest.warns(UserWarning, match="the elements have 3 nodes; in training 4$"):
+        run.predict(replace(scene, elements=scene.surface()), PRESS)
+
+
+POSITIONS = np.repeat(scene_of().rest_position[None], 3, axis=0)
+
+
+@pytest.mark.parametrize(
+    ("motion", "options", "message"),
+    [
+        (None, {}, r"say how its prescribed nodes move: {BODY: \(x, y, z\)} \(--move BODY=X,Y,Z\)"),
+        ({}, {}, "say how its prescribed nodes move"),
+        ({2: (0, 0, 1)}, {}, "there is no body 2"),
+        ({1: (0, 1)}, {}, "translation of a motion must be three numbers"),
+        (PRESS, {"frames": 1}, "frames is 1; the run needs at least 2"),
+        (POSITIONS[:, :5], {}, r"the motion has the shape \[3, 5, 3\], must be \[frames, 351 nodes, 3\] or"),
+        (POSITIONS + np.nan, {}, "the motion is not finite in frame 0 at node 0"),
+        (Motion(POSITIONS[:1]), {}, "with at least 2 frames"),
+        (POSITIONS, {"frames": 3}, "its motion has frames already: leave out frames=3"),
+        (
+            POSITIONS,
+            {"stress": np.zeros((1, 5, 1))},
+            r"stress has the shape \[1, 5, 1\], but the run needs \[1, 351",
+        ),
+    ],
+)
+def test_a_motion_that_does_not_fit(run, motion, options, message):
+    with pytest.raises(ConfigError, match=message) as error:
+        run.predict(scene_of(), motion, **options)
+    assert "\n" not in str(error.value)
+
+
+def test_a_trajectory_brings_its_motion(run):
+    with Dataset(run.settings.data) as data:
+        truth = data["test"][0]
+    for options in ({"motion": PRESS}, {"frames": 3}, {"stress": truth.stress[:1]}):
+        with pytest.raises(ConfigError, match="has a motion, frames and a stress of its own"):
+            run.predict(truth, **options)
+
+
+def test_the_stress_at_the_start_is_zero_unless_given(run):
+    scene = scene_of()
+    answer = run.predict(scene, PRESS, frames=3)
+    assert not answer.stress[0].any() and answer.stress[1].any()
+    given = np.full((1, scene.num_nodes, 1), 5e4)
+    assert np.array_equal(run.predict(scene, PRESS, frames=3, stress=given).stress[:1], given.astype(np.float32))
+
+
+# A run with inertia and material
+
+
+@pytest.fixture(scope="module")
+def dynamic_run(tmp_path_factory) -> Run:
+    """A small model of the toy's plates, trained for a moment; Young's modulus 1e5 to 2e5 and a Poisson ratio."""
+    folder = tmp_path_factory.mktemp("dynamic")
+    with DatasetWriter(folder / "toy.h5", toy.info(dynamic=True)) as writer:
+        for seed, young in enumerate((1e5, 2e5)):
+            truth = toy.plate(seed, dynamic=True)
+            material = np.full((truth.scene.num_elements, 2), (young, 0.3), np.float32)
+            writer.add("train", replace(truth, scene=replace(truth.scene, material=material)))
+    settings = {"hidden": 16, "blocks": 2}
+    return train(folder / "toy.h5", folder / "run", model="mgn", model_settings=settings, steps=2, batch_size=2)
+
+
+def small_scene(materials=None) -> Scene:
+    """As the toy's, with another place of the block."""
+    plate, tets = box_between((4, 3, 1), (-0.2, -0.15, -0.02), (0.2, 0.15, 0.02))
+    block, block_tets = box_between((1, 1, 1), (-0.02, -0.05, 0.021), (0.08, 0.05, 0.121))
+    mesh = meshio.Mesh(np.concatenate([plate, block]), {"tetra": np.concatenate([tets, block_tets + len(plate)])})
+    return read_scene(mesh, **PRESCRIBED, materials=materials).scene
+
+
+def test_a_scene_with_inertia_starts_at_rest(dynamic_run):
+    scene = small_scene((1.5e5, 0.3))
+    answer = predicted_without_warning(dynamic_run, scene, {1: (0, 0, -0.02)})
+    assert answer.given == 2
+    free = ~scene.prescribed
+    assert np.array_equal(answer.position[:2, free], np.repeat(scene.rest_position[None, free], 2, axis=0))
+    assert not np.array_equal(answer.position[2, free], scene.rest_position[free])
+    assert len(answer.position) == 1 + np.ceil(0.02 / dynamic_run.scope.usual_increment)
+    # A short way takes a frame more than the two that are given.
+    assert len(dynamic_run.predict(scene, {1: (0, 0, -1e-6)}).position) == 3
+    with pytest.raises(ConfigError, match="frames is 2; the run needs at least 3"):
+        dynamic_run.predict(scene, {1: (0, 0, -0.02)}, frames=2)
+
+
+def test_a_scene_with_inertia_may_start_with_a_velocity(dynamic_run):
+    scene = small_scene((1.5e5, 0.3))
+    position = np.repeat(scene.rest_position[None], 4, axis=0)
+    position[1, ~scene.prescribed] += np.float32(0.001)
+    answer = dynamic_run.predict(scene, position)
+    assert np.array_equal(answer.position[:2], position[:2])
+
+
+def test_a_missing_material_names_the_columns(dynamic_run):
+    wanted = r"trained with 2 \(1e\+05 to 2e\+05, 0\.3 to 0\.3\): give each body its numbers"
+    for materials, has in ((None, "no"), (1e5, "1")):
+        with pytest.raises(ConfigError, match=f"scene has {has} material columns, but the run was {wanted}"):
+            dynamic_run.predict(small_scene(materials), {1: (0, 0, -0.02)})
+
+
+def test_a_material_that_the_run_has_not_seen_is_told(dynamic_run):
+    with pytest.warns(UserWarning) as told:
+        dynamic_run.predict(small_scene((3e5, 0.3)), {1: (0, 0, -0.02)})
+    assert [str(warning.message) for warning in told] == [
+        "scene: material column 0 holds 3e+05; in training 1e+05 to 2e+05"
+    ]
+
+
+def test_a_material_that_the_run_does_not_take_is_refused(run):
+    scene = scene_of()
+    scene = replace(scene, material=np.ones((scene.num_elements, 1), np.float32))
+    with pytest.raises(ConfigError, match="scene has a material, but the run was trained without one: leave it out"):
+        run.predict(scene, PRESS)

@@ -1,0 +1,33 @@
+"""The models with world edges train, are found again from their settings, and roll out the validation scenes."""
+
+import numpy as np
+import pytest
+import toy
+from toy import one_thread  # noqa: F401
+
+from ast_sim.models.registry import find_model
+from ast_sim.runs.folder import load_model
+from ast_sim.runs.metrics import Metrics
+from ast_sim.runs.train_config import read_config
+from ast_sim.training.start import configure, start_training
+
+SMALL = {"mgn": "model.blocks=2", "bsms": "model.levels=2", "hcmt": "model.levels=2"}
+
+
+@pytest.mark.parametrize("dynamic", [False, True])
+@pytest.mark.parametrize("name", SMALL)
+def test_it_trains_and_is_found_again(tmp_path, name, dynamic):
+    data = toy.write(tmp_path / "toy.h5", dynamic=dynamic, stress=not dynamic)
+    settings = [SMALL[name], "model.hidden=16", "model.world_radius=0.07", "train.statistics_pairs=8"]
+    settings += ["train.batch_size=2", "train.steps=100", "train.log_every=10", "train.warmup=10"]
+    config = configure(data, "tiny", [*settings, "train.noise=1e-4", "train.peak_rate=2e-3"], name)
+    assert config.model.node_inputs is None
+    start_training(tmp_path / "run", config)
+    lines = list(Metrics(tmp_path / "run"))
+    losses = [line["loss"] for line in lines if "loss" in line]
+    assert losses[-1] < 0.75 * losses[0], losses
+    model, found, _ = load_model(tmp_path / "run")
+    assert type(model) is find_model(name).simulator and found == read_config(tmp_path / "run")
+    assert found.model.node_inputs == (("velocity",) if dynamic else ())
+    assert (found.model.hidden, found.model.world_radius) == (16, 0.07)
+    assert np.isfinite([line["valid_rmse"] for line in lines if "valid_rmse" in line]).all()

@@ -1,0 +1,125 @@
+"""The gap to another body against closed forms and all triangles, one step ahead, and as an input of models."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import toy
+from meshes import box
+
+from ast_sim.batches.batch_builder import Batch
+from ast_sim.batches.graph import Graph
+from ast_sim.models.node_inputs import _proximity as near
+from ast_sim.models.node_inputs import node_features, normalizer_of
+from ast_sim.ops._body_distance import FINE, signed_gap
+from ast_sim.scene import Scene
+from ast_sim.training.start import configure, start_training
+
+
+def surface_of(cells, size) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes [N, 3] and boundary triangles [F, 3] of a box."""
+    nodes, elements = box(cells, size)
+    zeros = np.zeros(len(nodes))
+    scene = Scene(nodes.astype(np.float32), elements.astype(np.int32), zeros.astype(np.uint8), zeros.astype(np.int32))
+    return nodes, scene.surface()
+
+
+def gap_to_box(points: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """The signed distance from a box around the origin, in closed form."""
+    q = np.abs(points) - half
+    return np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0)
+
+
+@pytest.mark.parametrize("cells", [(1, 1, 1), (4, 2, 3)])
+def test_the_gap_to_a_box_is_that_of_the_closed_form(cells):
+    half = np.array([0.5, 0.3, 0.2])
+    points = np.random.default_rng(0).uniform(-1, 1, (4000, 3))
+    gap, normal = signed_gap(points, *surface_of(cells, 2 * half), radius=10.0)
+    np.testing.assert_allclose(gap, gap_to_box(points, half), atol=1e-12)
+    assert (gap < 0).sum() > 50
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=1e-12)
+    step = 1e-6  # the normal is the gradient of the gap
+    risen = gap_to_box(points + step * normal, half)
+    np.testing.assert_allclose((risen - gap) / step, 1, atol=1e-5)
+
+
+def test_within_the_radius_alone():
+    half = np.array([0.5, 0.3, 0.2])
+    points = np.random.default_rng(1).uniform(-1, 1, (2000, 3))
+    exact = gap_to_box(points, half)
+    gap, normal = signed_gap(points, *surface_of((3, 2, 1), 2 * half), radius=0.15)
+    near = np.abs(exact) < 0.15
+    np.testing.assert_allclose(gap[near], exact[near], atol=1e-12)
+    assert (gap[~near] == 0.15).all() and not normal[~near].any() and 100 < near.sum() < 1900
+
+
+def test_flat_triangles_of_a_surface_do_no_harm():
+    """A box whose faces are cut by nodes on an edge: triangles of no area."""
+    half = np.array([0.5, 0.3, 0.2])
+    nodes, triangles = surface_of((2, 2, 2), 2 * half)
+    a, b, c = triangles[0]
+    middle = len(nodes)
+    nodes = np.vstack([nodes, (nodes[a] + nodes[b]) / 2])
+    triangles = np.vstack([triangles, [[a, middle, b]]])
+    points = np.random.default_rng(3).uniform(-1, 1, (4000, 3))
+    gap, normal = signed_gap(points, nodes, triangles, radius=10.0)
+    np.testing.assert_allclose(gap, gap_to_box(points, half), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=1e-12)
+
+
+def test_points_on_the_surface_have_its_normal():
+    half = np.array([0.5, 0.3, 0.2])
+    nodes, triangles = surface_of((2, 2, 2), 2 * half)
+    corners = nodes[triangles]
+    gap, normal = signed_gap(corners.mean(axis=1), nodes, triangles, radius=1.0)
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    np.testing.assert_allclose(gap, 0, atol=1e-15)
+    np.testing.assert_allclose(normal, cross / np.linalg.norm(cross, axis=1, keepdims=True), atol=1e-6)
+
+
+def batch_of(*seeds: int, down: float = 0.005) -> Batch:
+    """Toy scenes at rest, whose block is about to go down."""
+    scenes = [toy.plate(seed) for seed in seeds]
+    graph = Graph.concatenate([Graph.from_scene(t.scene, element_nodes=False, surface=True) for t in scenes])
+    motion = torch.where((graph.body == 1)[:, None], torch.tensor([0.0, 0.0, -down]), 0.0)
+    return Batch(graph, graph.rest_position, None, motion, None, [""] * len(seeds))
+
+
+@pytest.mark.parametrize("down", [0.0, 0.005, 0.012, -0.01])
+def test_a_block_above_a_plate_by_hand(down):
+    """The block's lower face is the nearest of what is under it: above it after the step, or below, in the plate."""
+    batch, radius = batch_of(0, down=down), 0.1
+    found, position, body = near(batch, radius).numpy(), batch.position.numpy(), batch.graph.body.numpy()
+    block = position[body == 1]
+    gap = block[:, 2].min() - down - position[:, 2]
+    below = (np.abs(position[:, :2] - block[:, :2].mean(axis=0)) < 0.049).all(axis=1)
+    under = np.flatnonzero((body == 0) & below & (position[:, 2] > 0.019))
+    assert len(under)
+    np.testing.assert_allclose(found[under, 3], gap[under] / radius, atol=1e-6)
+    weight = 1 - np.abs(gap[under]) / radius
+    np.testing.assert_allclose(found[under, :3], weight[:, None] * [0, 0, -1], atol=1e-6)
+    np.testing.assert_allclose(found[under, 4], np.clip(gap[under] / radius / FINE, -1, 1), atol=1e-5)
+    far = np.flatnonzero((body == 0) & (np.abs(position[:, 0] - block[:, 0].mean()) > 0.05 + radius))
+    assert (found[far] == [0, 0, 0, 1, 1]).all() and len(far)
+
+
+def test_a_scene_alone_equals_a_scene_in_a_batch():
+    assert torch.equal(
+        near(batch_of(0, 1), 0.1),
+        torch.cat([near(batch_of(seed), 0.1) for seed in (0, 1)]),
+    )
+
+
+def test_it_is_an_input_of_any_model(tmp_path):
+    data = toy.write(tmp_path / "toy.h5")
+    for model in ("ast", "mgn"):
+        small = ["model.hidden=16", "train.steps=2", "train.statistics_pairs=4", "model.node_inputs=proximity"]
+        config = configure(data, "tiny", small, model)
+        assert "proximity" in config.model.node_inputs
+        start_training(tmp_path / model, config)
+    batch = batch_of(0)
+    config = replace(config.model, proximity_radius=0.1)
+    features = node_features(config, batch)
+    assert features.shape[1] == normalizer_of(config, "node").width == 3 + 5 + 3
+    assert torch.equal(features[:, 3:8], near(batch, 0.1))

@@ -1,0 +1,136 @@
+"""Linear tetrahedra: derivatives by central differences, rigid motions, the patch test."""
+
+import numpy as np
+import pytest
+
+from ast_sim.simulate.mechanics.elasticity import Elasticity
+from ast_sim.simulate.mechanics.linear_system import LinearSystem
+from ast_sim.simulate.mechanics.material import NeoHookean
+from ast_sim.simulate.shapes import mesh
+from ast_sim.support.errors import SimulationError
+
+MATERIAL = NeoHookean(young=1e6, poisson=0.4)
+
+
+def box(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """A small box whose inner nodes are moved at random."""
+    position, elements = mesh.block((1.0, 0.8, 0.6), 3)
+    inner = (np.abs(position) < np.array([1.0, 0.8, 0.6]) - 1e-9).all(axis=1)
+    shift = np.random.default_rng(seed).uniform(-0.1, 0.1, position.shape)
+    return position + np.where(inner[:, None], shift, 0), elements
+
+
+def deformed(position: np.ndarray, seed: int = 1) -> np.ndarray:
+    return position + np.random.default_rng(seed).uniform(-0.05, 0.05, position.shape)
+
+
+def gradient(elasticity: Elasticity, position: np.ndarray) -> np.ndarray:
+    return elasticity.gradient(elasticity.evaluate(position))[0]
+
+
+def dense_stiffness(elasticity: Elasticity, position: np.ndarray, project: bool = False) -> np.ndarray:
+    entries = elasticity.hessian(elasticity.evaluate(position), project)
+    rows, columns = elasticity.entry_dofs()
+    matrix = np.zeros((position.size, position.size))
+    np.add.at(matrix, (rows, columns), entries)
+    off_diagonal = rows != columns
+    np.add.at(matrix, (columns[off_diagonal], rows[off_diagonal]), entries[off_diagonal])
+    return matrix
+
+
+def test_gradient_is_the_derivative_of_the_energy():
+    rest, elements = box()
+    elasticity, position = Elasticity(rest, elements, MATERIAL), deformed(rest)
+    expected, step = gradient(elasticity, position), 1e-6
+    difference = np.empty_like(expected)
+    for index in np.ndindex(position.shape):
+        shift = np.zeros_like(position)
+        shift[index] = step
+        up, down = (elasticity.evaluate(position + s * shift).energy for s in (1, -1))
+        difference[index] = (up - down) / (2 * step)
+    np.testing.assert_allclose(difference, expected, atol=1e-6 * np.abs(expected).max())
+
+
+def test_stiffness_is_the_derivative_of_the_gradient():
+    rest, elements = box()
+    elasticity, position = Elasticity(rest, elements, MATERIAL), deformed(rest)
+    expected, step = dense_stiffness(elasticity, position), 1e-6
+    for column in range(0, position.size, 7):
+        shift = np.zeros(position.size)
+        shift[column] = step
+        shift = shift.reshape(-1, 3)
+        difference = (gradient(elasticity, position + shift) - gradient(elasticity, position - shift)) / (2 * step)
+        np.testing.assert_allclose(difference.ravel(), expected[:, column], atol=1e-6 * np.abs(expected).max())
+
+
+def test_projected_stiffness_is_positive_semi_definite_and_otherwise_the_same():
+    rest, elements = box()
+    elasticity = Elasticity(rest, elements, MATERIAL)
+    squeezed = deformed(rest) * [0.6, 1.0, 1.0]
+    exact = np.linalg.eigvalsh(dense_stiffness(elasticity, squeezed))
+    projected = np.linalg.eigvalsh(dense_stiffness(elasticity, squeezed, project=True))
+    assert exact.min() < -1e-3 * exact.max()  # the case needs the projection
+    assert projected.min() > -1e-9 * projected.max()
+    at_rest = dense_stiffness(elasticity, rest)  # nothing to project here: rotations cost nothing, all else energy
+    np.testing.assert_allclose(
+        dense_stiffness(elasticity, rest, project=True), at_rest, atol=1e-10 * np.abs(at_rest).max()
+    )
+
+
+def test_rigid_motion_gives_no_force_and_rotates_forces():
+    rest, elements = box()
+    elasticity = Elasticity(rest, elements, MATERIAL)
+    q, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
+    q *= np.sign(np.linalg.det(q))
+    scale = elasticity.unit_force
+    assert np.abs(gradient(elasticity, rest @ q.T + [1.0, -2.0, 3.0])).max() < 1e-12 * scale
+    position = deformed(rest)
+    np.testing.assert_allclose(
+        gradient(elasticity, position @ q.T + 5.0), gradient(elasticity, position) @ q.T, atol=1e-10 * scale
+    )
+
+
+def test_forces_sum_to_zero_and_have_no_moment():
+    rest, elements = box()
+    elasticity, position = Elasticity(rest, elements, MATERIAL), deformed(rest)
+    forces = gradient(elasticity, position)
+    np.testing.assert_allclose(forces.sum(axis=0), 0, atol=1e-9 * np.abs(forces).max())
+    np.testing.assert_allclose(np.cross(position, forces).sum(axis=0), 0, atol=1e-9 * np.abs(forces).max())
+
+
+def test_patch_test():
+    """With an affine motion of the boundary the equilibrium of the interior is the same affine motion."""
+    rest, elements = box()
+    elasticity = Elasticity(rest, elements, MATERIAL)
+    boundary = (np.abs(rest) > np.array([1.0, 0.8, 0.6]) - 1e-9).any(axis=1)
+    assert 0 < (~boundary).sum() < len(rest)
+    affine = np.eye(3) + np.array([[0.1, 0.05, 0.0], [-0.04, -0.08, 0.1], [0.02, 0.0, 0.06]])
+    expected = rest @ affine.T
+    position = np.where(boundary[:, None], expected, expected + 0.02 * np.sin(17 * rest))
+    system = LinearSystem(*elasticity.entry_dofs(), boundary)
+    no_contact = (np.zeros(0, int), np.zeros(0, int), np.zeros(0))
+    for _ in range(8):
+        system.restart()
+        values = elasticity.hessian(elasticity.evaluate(position))
+        position = position + system.solve(values, no_contact, -gradient(elasticity, position))
+    np.testing.assert_allclose(position, expected, atol=1e-10)
+    deformation = elasticity.evaluate(position)
+    stress = MATERIAL.cauchy(deformation.F, deformation.J)
+    np.testing.assert_allclose(stress, np.broadcast_to(stress[:, :, :1], stress.shape), atol=1e-10 * MATERIAL.young)
+
+
+def test_nodal_mean_is_weighted_by_volume():
+    rest = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, -3.0], [9, 9, 9]])
+    elements = np.array([[0, 1, 2, 3], [0, 2, 1, 4]])
+    mean = Elasticity(rest, elements, MATERIAL).nodal_mean(np.array([10.0, 2.0]))
+    np.testing.assert_allclose(mean, [4, 4, 4, 10, 2, 0])  # volumes 1/6 and 1/2
+
+
+def test_an_inverted_element_has_infinite_energy_and_no_place_at_rest():
+    rest, elements = box()
+    elasticity = Elasticity(rest, elements, MATERIAL)
+    assert elasticity.evaluate(rest * [1, 1, -1]).energy == np.inf
+    with pytest.raises(SimulationError, match="element 2 .*positive"):
+        flipped = elements.copy()
+        flipped[2, [0, 1]] = flipped[2, [1, 0]]
+        Elasticity(rest, flipped, MATERIAL)

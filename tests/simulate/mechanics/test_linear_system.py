@@ -1,0 +1,113 @@
+"""The sparse system of a Newton step: against dense algebra, with contact that comes and goes, both factorizations."""
+
+import numpy as np
+import pytest
+
+from ast_sim.simulate.mechanics import linear_system
+from ast_sim.simulate.mechanics.elasticity import Elasticity
+from ast_sim.simulate.mechanics.linear_system import Cholmod, LinearSystem, Pardiso
+from ast_sim.simulate.mechanics.material import NeoHookean
+from ast_sim.simulate.shapes import mesh
+
+NO_CONTACT = (np.zeros(0, int), np.zeros(0, int), np.zeros(0))
+
+
+@pytest.fixture(params=[Pardiso, Cholmod])
+def problem(request, monkeypatch):
+    """A plate with fixed ends: system, values of its entries, dense matrix, fixed nodes."""
+    monkeypatch.setattr(linear_system, "factorization", request.param)
+    monkeypatch.setattr(linear_system, "ITERATE_FROM", 0)
+    rest, elements = mesh.plate((0.5, 0.3, 0.03), (5, 4, 2), np.array([[0.0, 0.0, 0.06]]))
+    elasticity, fixed = Elasticity(rest, elements, NeoHookean(1e6, 0.4)), np.abs(rest[:, 0]) > 0.25 - 1e-9
+    rows, columns = elasticity.entry_dofs()
+    values = elasticity.hessian(elasticity.evaluate(rest * [1.02, 1.0, 1.01]))
+    dense = np.zeros((rest.size, rest.size))
+    np.add.at(dense, (rows, columns), values)
+    np.add.at(dense, (columns[rows != columns], rows[rows != columns]), values[rows != columns])
+    return LinearSystem(rows, columns, fixed), values, dense, fixed
+
+
+def contact_between(nodes: np.ndarray, size: int, seed: int) -> tuple:
+    """A symmetric positive definite matrix over all dofs of some nodes, as a contact's entries."""
+    dofs = (3 * nodes[:, None] + np.arange(3)).ravel()
+    root = np.random.default_rng(seed).normal(size=(len(dofs), len(dofs)))
+    return np.repeat(dofs, len(dofs)), np.tile(dofs, len(dofs)), 1e4 * (root @ root.T).ravel()
+
+
+def assert_solves(system: LinearSystem, values, contact, dense, fixed, residual: float) -> None:
+    """The solution leaves at most this residual, relative to the right side."""
+    matrix, free = dense.copy(), np.flatnonzero(np.repeat(~fixed, 3))
+    np.add.at(matrix, contact[:2], contact[2])
+    right = np.random.default_rng(5).normal(size=(len(fixed), 3))
+    solution = system.solve(values, contact, right)
+    assert (solution[fixed] == 0).all()
+    left = matrix[np.ix_(free, free)] @ solution.ravel()[free] - right.ravel()[free]
+    assert np.linalg.norm(left) <= residual * np.linalg.norm(right.ravel()[free])
+
+
+def test_it_solves_what_the_dense_matrix_does_with_contact_that_changes(problem):
+    system, values, dense, fixed = problem
+    free, held = np.flatnonzero(~fixed), np.flatnonzero(fixed)
+    far = contact_between(free[[0, len(free) // 2, -1]], len(fixed), 1)
+    mixed = contact_between(np.array([free[3], held[0]]), len(fixed), 2)  # half of it belongs to a fixed node
+    assert_solves(system, values, NO_CONTACT, dense, fixed, 1e-11)
+    for contact in (far, NO_CONTACT, mixed, far):  # by iteration
+        assert_solves(system, values, contact, dense, fixed, 1.01e-3)
+    assert system.factorizations == 1
+    for contact in (far, NO_CONTACT, mixed):
+        system.restart()
+        assert_solves(system, values, contact, dense, fixed, 1e-11)
+    assert system.factorizations == 4
+
+
+def test_a_factor_that_serves_no_more_is_replaced(problem):
+    system, values, dense, fixed = problem
+    assert_solves(system, values, NO_CONTACT, dense, fixed, 1e-11)
+    everywhere = contact_between(np.flatnonzero(~fixed), len(fixed), 1)  # far from what was factorised
+    assert_solves(system, values, everywhere, dense, fixed, 1e-9)
+    assert system.factorizations == 2
+
+
+def test_a_matrix_that_is_not_positive_definite_is_told_and_does_no_harm(problem):
+    system, values, dense, fixed = problem
+    right = np.ones((len(fixed), 3))
+    assert system.solve(-values, NO_CONTACT, right) is None  # by the factorization
+    assert_solves(system, values, NO_CONTACT, dense, fixed, 1e-11)
+    assert system.solve(-values, NO_CONTACT, right) is None  # by the iteration
+    assert system.factorizations == 2
+    assert_solves(system, values, NO_CONTACT, dense, fixed, 1.01e-3)
+
+
+def test_nothing_comes_of_nothing(problem):
+    system, values, _, fixed = problem
+    for _ in range(2):
+        assert (system.solve(values, NO_CONTACT, np.zeros((len(fixed), 3))) == 0).all()
+
+
+def test_increments_of_fixed_nodes_couple_as_in_the_dense_matrix(problem):
+    system, values, dense, fixed = problem
+    increment = np.where(fixed[:, None], np.random.default_rng(3).normal(size=(len(fixed), 3)), 0)
+    contact = contact_between(np.array([np.flatnonzero(~fixed)[0], np.flatnonzero(fixed)[0]]), len(fixed), 4)
+    matrix = dense.copy()
+    np.add.at(matrix, contact[:2], contact[2])
+    free = np.repeat(~fixed, 3)
+    expected = (matrix @ increment.ravel())[free]
+    found = system.coupling(values, contact, increment).ravel()[free]
+    np.testing.assert_allclose(found, expected, atol=1e-10 * np.abs(expected).max())
+
+
+def test_the_pattern_is_analysed_anew_only_when_contact_adds_to_it(problem, monkeypatch):
+    system, values, _, fixed = problem
+    news, factorise = [], system._factorization.factorise
+    monkeypatch.setattr(
+        system._factorization, "factorise", lambda matrix, is_new: news.append(is_new) or factorise(matrix, is_new)
+    )
+    monkeypatch.setattr(linear_system, "ITERATE_FROM", 1_000_000)  # factorise each time
+    free, right = np.flatnonzero(~fixed), np.ones((len(fixed), 3))
+    far, near = contact_between(free[[0, -1]], len(fixed), 1), contact_between(free[[0, 1]], len(fixed), 1)
+    for contact in (NO_CONTACT, near, far, NO_CONTACT, near, far):
+        system.solve(values, contact, right)
+    assert news == [True, False, True, False, False, False]
+    system.restart()
+    system.solve(values, NO_CONTACT, right)
+    assert news[-1]

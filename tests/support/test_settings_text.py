@@ -1,0 +1,190 @@
+"""Settings to and from TOML, overrides, and errors that name the key."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ast_sim.support.errors import ConfigError
+from ast_sim.support.toml_settings import Setting, from_toml, override, settings, to_toml
+
+
+@dataclass(frozen=True)
+class Model:
+    hidden: int = field(default=128, metadata={"help": "channels"})
+    inputs: tuple[str, ...] = ()
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    stress: Literal["none", "node", "element"] = "none"
+    noise: float | None = None
+    residual: bool = True
+
+
+@dataclass(frozen=True)
+class Run:
+    model: Model
+    data: str
+    rate: float = 1e-4
+    tag: str | None = None
+
+
+RUN = Run(Model(), "data.h5")
+
+
+def test_every_key_is_written_and_read_back():
+    run = Run(Model(64, ("stress", "u"), (1.0, -2.5, 1e-30), "element", 0.003, False), 'C:\\a "b"\n.h5', float("inf"))
+    text = to_toml(run)
+    assert from_toml(Run, text) == run
+    assert 'tag = "none"' in text and "[model]" in text and "hidden = 64" in text
+
+
+@given(
+    rate=st.floats(allow_nan=False),
+    hidden=st.integers(-(2**63), 2**63 - 1),
+    data=st.text(st.characters(exclude_categories=["Cs"])),
+    inputs=st.lists(st.text(st.characters(exclude_categories=["Cs"]))),
+)
+def test_any_value_survives_the_round_trip(rate, hidden, data, inputs):
+    run = Run(Model(hidden=hidden, inputs=tuple(inputs)), data, rate)
+    assert from_toml(Run, to_toml(run)) == run
+
+
+def test_missing_keys_take_their_defaults():
+    assert from_toml(Run, 'data = "x"\n[model]\nhidden = 3') == Run(Model(hidden=3), "x")
+
+
+@pytest.mark.parametrize(
+    ("assignment", "path", "value"),
+    [
+        ("model.hidden=32", "model.hidden", 32),
+        (" model.hidden = 32 ", "model.hidden", 32),
+        ("model.inputs=stress,material", "model.inputs", ("stress", "material")),
+        ('model.inputs=["stress"]', "model.inputs", ("stress",)),
+        ("model.inputs=", "model.inputs", ()),
+        ("model.center=1,2.5,-3", "model.center", (1.0, 2.5, -3.0)),
+        ("model.stress=node", "model.stress", "node"),
+        ("model.stress=none", "model.stress", "none"),
+        ("model.noise=3e-3", "model.noise", 0.003),
+        ("model.noise=none", "model.noise", None),
+        ("model.residual=False", "model.residual", False),
+        ("rate=1", "rate", 1.0),
+        ("data=a=b 3.h5", "data", "a=b 3.h5"),
+        ("data=12", "data", "12"),
+        ('data=" 12"', "data", " 12"),
+        ("tag=none", "tag", None),
+    ],
+)
+def test_an_override_sets_one_value_and_nothing_else(assignment, path, value):
+    changed = override(RUN, [assignment])
+    holder = changed.model if path.startswith("model.") else changed
+    name = path.rpartition(".")[2]
+    assert getattr(holder, name) == value and type(getattr(holder, name)) is type(value)
+    original = RUN.model if path.startswith("model.") else RUN
+    back = override(changed, [f"{path}={_as_text(getattr(original, name))}"])
+    assert back == RUN
+
+
+def _as_text(value):
+    if isinstance(value, tuple):
+        return "[" + ",".join(map(str, value)) + "]"
+    return "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def test_the_last_override_of_a_key_holds():
+    assert override(RUN, ["rate=1", "model.hidden=2", "rate=3"]) == Run(Model(hidden=2), "data.h5", 3.0)
+
+
+@pytest.mark.parametrize(
+    ("assignment", "message"),
+    [
+        ("model.hiden=3", "there is no setting model.hiden; the nearest is model.hidden"),
+        ("hidden=3", "there is no setting hidden; the nearest is model.hidden"),
+        ("modle.residual=true", "there is no setting modle.residual; the nearest is model.residual"),
+        ("model=3", "model is a group of settings, such as model.hidden"),
+        ("rate.x=3", "there is no setting rate.x; the nearest is rate"),
+        ("model.hidden", "'model.hidden' is no setting: write key=value"),
+        ("model.hidden=1.5", "model.hidden is 1.5; must be an integer"),
+        ("model.hidden=true", "model.hidden is True; must be an integer"),
+        ("model.hidden=", "model.hidden is ''; must be an integer"),
+        ("model.residual=1", "model.residual is 1; must be true or false"),
+        ("model.noise=much", "model.noise is 'much'; must be a number or \"none\""),
+        ("rate=none", "rate is 'none'; must be a number"),
+        ("rate=nan", "rate is nan; must be a number"),
+        ("model.stress=nodes", 'model.stress is \'nodes\'; must be one of "none", "node", "element"'),
+        ("model.center=1,2", "model.center is [1, 2]; must be a list (3 values, each a number)"),
+        ("model.center=1,2,x", "model.center[2] is 'x'; must be a number"),
+    ],
+)
+def test_a_wrong_override_names_the_key_and_what_would_fit(assignment, message):
+    with pytest.raises(ConfigError) as error:
+        override(RUN, [assignment])
+    assert str(error.value) == message
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("data = ", "the settings are not valid TOML"),
+        ("", "the setting data is missing; must be a text"),
+        ('data = "x"\nmodel = 3', "model is 3; must be a group of settings ([model])"),
+        ('data = "x"\n[model]\nhiden = 3', "there is no setting model.hiden; the nearest is model.hidden"),
+        ('data = "x"\n[model]\nhidden = "3"', "model.hidden is '3'; must be an integer"),
+        ('data = "x"\n[model]\ninputs = "stress"', "model.inputs is 'stress'; must be a list (each a text)"),
+        ('data = "x"\n[model]\ninputs = ["u", 3]', "model.inputs[1] is 3; must be a text"),
+    ],
+)
+def test_wrong_toml_names_the_key_and_what_would_fit(text, message):
+    with pytest.raises(ConfigError) as error:
+        from_toml(Run, text)
+    assert message in str(error.value)
+
+
+def test_settings_are_listed_with_their_help():
+    listed = {setting.key: setting for setting in settings(Run)}
+    assert list(listed)[:2] == ["model.hidden", "model.inputs"] and len(listed) == 9
+    assert listed["model.hidden"] == Setting("model.hidden", "an integer", "128", "channels")
+    assert listed["data"].default is None
+    assert listed["model.center"].default == "0.0,0.0,0.0"
+    assert listed["tag"] == Setting("tag", 'a text or "none"', "none", "")
+
+
+@dataclass(frozen=True)
+class Shape:
+    shape: str = ""
+
+
+@dataclass(frozen=True)
+class Circle(Shape):
+    shape: Literal["circle"] = "circle"
+    radius: float = 1.0
+
+
+@dataclass(frozen=True)
+class Box(Shape):
+    shape: Literal["box"] = "box"
+    side: float = 2.0
+
+
+def class_of(table):
+    return {"circle": Circle, "box": Box}[table.get("shape", "circle")]
+
+
+@dataclass(frozen=True)
+class Drawing:
+    figure: Shape = field(metadata={"class_of": class_of})
+    title: str = ""
+
+
+def test_the_class_of_a_group_follows_from_its_table():
+    drawing = Drawing(Box(side=3.0), "b")
+    assert from_toml(Drawing, to_toml(drawing)) == drawing
+    assert from_toml(Drawing, "") == Drawing(Circle())
+    assert override(drawing, ["figure.side=4"]) == Drawing(Box(side=4.0), "b")
+    assert [s.key for s in settings(Drawing)] == ["figure.shape", "figure.radius", "title"]
+    with pytest.raises(ConfigError, match=r"no setting figure.sied; the nearest is figure.side"):
+        from_toml(Drawing, '[figure]\nshape = "box"\nsied = 3')
+    with pytest.raises(ConfigError, match=r"no setting figure.radius; the nearest is figure.s"):
+        override(drawing, ["figure.radius=4"])
+    with pytest.raises(ConfigError, match="figure.shape is 'box'; must be one of \"circle\""):
+        override(Drawing(Circle()), ["figure.shape=box"])

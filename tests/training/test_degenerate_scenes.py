@@ -1,0 +1,85 @@
+"""Scenes in which nothing can deform: one clear line at training and at prediction, and never a NaN."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import toy
+from toy import one_thread  # noqa: F401 (used by being imported)
+
+from ast_sim.cli import main
+from ast_sim.dataset.writer import DatasetWriter
+from ast_sim.inference.trained_run import Run
+from ast_sim.scene import NodeType, Trajectory
+from ast_sim.support.errors import DatasetError
+from ast_sim.training import start
+
+SMALL = ["train.steps=2", "train.batch_size=2", "train.statistics_pairs=4", "train.rollout_pool=0", "model.hidden=16"]
+MORE = {"ast": ["model.d_token=16", "model.L_SA=1"], "mgn": ["model.blocks=1"]}
+NOTHING, POINT = "all nodes are obstacles or handles, so nothing deforms", "all nodes that deform lie at one point"
+
+
+def plate(which: np.ndarray | None = None, node_type: NodeType | None = None, place: int | None = None) -> Trajectory:
+    """A plate; the chosen nodes have this type, or lie where the node `place` lies."""
+    truth = toy.plate(0)
+    kinds, rest, position = truth.scene.node_type.copy(), truth.scene.rest_position.copy(), truth.position.copy()
+    if node_type is not None:
+        kinds[which] = node_type
+    if place is not None:
+        rest[which], position[:, which] = rest[place], position[:, [place]]
+    scene = dataclasses.replace(truth.scene, node_type=kinds, rest_position=rest)
+    return dataclasses.replace(truth, scene=scene, position=position)
+
+
+ALL, DEFORMING = slice(None), toy.plate(0).scene.deforming_nodes
+BAD = {
+    "obstacles only": (plate(ALL, NodeType.OBSTACLE), NOTHING),
+    "handles only": (plate(ALL, NodeType.HANDLE), NOTHING),
+    "zero size": (plate(ALL, place=0), POINT),
+    "a body of zero size": (plate(DEFORMING, place=0), POINT),
+}
+
+
+def write(path, truth: Trajectory):
+    with DatasetWriter(path, toy.info()) as writer:
+        for split in ("train", "train", "valid", "test"):
+            writer.add(split, truth)
+    return path
+
+
+@pytest.fixture(scope="module", params=["ast", "mgn"])
+def trained(request, tmp_path_factory):
+    """The name of a model, and a run of it."""
+    folder = tmp_path_factory.mktemp("trained")
+    data = toy.write(folder / "toy.h5")
+    start.start_training(folder / "run", start.configure(data, "tiny", SMALL + MORE[request.param], request.param))
+    return request.param, folder / "run"
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_a_scene_in_which_nothing_can_deform_is_one_line(trained, tmp_path, kind, capsys):
+    (model, run), (truth, message) = trained, BAD[kind]
+    data = write(tmp_path / "bad.h5", truth)
+    sets = [part for setting in SMALL + MORE[model] for part in ("--set", setting)]
+    for command in (
+        ["train", str(data), "--out", str(tmp_path / "new"), "--model", model, *sets],
+        ["predict", str(run), str(data), "--index", "0", "--out", str(tmp_path / "answer.h5")],
+        ["evaluate", str(run), str(data)],
+    ):
+        assert main(command) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1 and message in error and "/000000" in error
+    with pytest.raises(DatasetError, match=message):
+        Run(run).predict(truth.scene, truth.position)
+    assert not (tmp_path / "new" / "config.toml").exists() and not (tmp_path / "answer.h5").exists()
+
+
+def test_coincident_nodes_of_an_element_are_trained_and_predicted_without_nan(trained, tmp_path):
+    model, run = trained
+    first, second = toy.plate(0).scene.elements[0, :2]
+    truth = plate(np.array([second]), place=first)
+    data = write(tmp_path / "twin.h5", truth)
+    start.start_training(tmp_path / "new", start.configure(data, "tiny", SMALL + MORE[model], model))
+    for folder in (run, tmp_path / "new"):
+        answer = Run(folder).predict(truth)
+        assert answer.failure is None and np.isfinite(answer.position).all()

@@ -1,0 +1,604 @@
+"""The training loop: its schedule by hand, its records, and what stops it. Kills have their own file."""
+
+import dataclasses
+import math
+import random
+import warnings
+
+import numpy as np
+import pytest
+import torch
+import toy
+from toy import one_thread  # noqa: F401 (used by being imported)
+
+from ast_sim.dataset.reader import Dataset
+from ast_sim.dataset.writer import DatasetWriter
+from ast_sim.models.ast.ast_config import ASTConfig
+from ast_sim.models.registry import find_model, find_preset
+from ast_sim.models.transolver import TransolverConfig
+from ast_sim.runs import checkpoint, folder
+from ast_sim.runs.metrics import Metrics
+from ast_sim.runs.train_config import RunConfig, TrainConfig, has_config, read_config
+from ast_sim.scene import NodeType
+from ast_sim.support.errors import CheckpointError, ConfigError, DatasetError, TrainingError
+from ast_sim.support.progress import Clock, duration
+from ast_sim.support.toml_settings import override
+from ast_sim.training import loop, start
+from ast_sim.training.data_lengths import DataScales, measure
+from ast_sim.training.defaults_from_data import resolve, resolve_training
+from ast_sim.training.rates import learning_rate, step_seed
+
+SCALES = DataScales(displacement=0.01, increment=0.002, spacing=0.1, nodes=40, trajectories=3, pairs=100)
+
+
+@pytest.fixture
+def linear(monkeypatch):
+    """The linear model in the place of AST."""
+    monkeypatch.setattr(loop, "build_model", toy.LinearSimulator)
+    monkeypatch.setattr(folder, "build_model", toy.LinearSimulator)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return toy.write(tmp_path_factory.mktemp("data") / "toy.h5")
+
+
+def settings(data, *assignments: str) -> RunConfig:
+    options = TrainConfig(steps=20, batch_size=2, peak_rate=1e-2, validate_every=10, checkpoint_every=5, log_every=4)
+    with Dataset(data) as dataset:
+        config = RunConfig(toy.config(dataset.info), options, str(data))
+    return override(config, list(assignments))
+
+
+def weights(folder) -> dict[str, torch.Tensor]:
+    return checkpoint.load(checkpoint.latest(folder))[0]
+
+
+# Schedule and settings
+
+
+def test_learning_rate_by_hand():
+    config = TrainConfig(steps=100, warmup=10, decay=110, peak_rate=2.0)
+    assert learning_rate(config, 0) == 2.0 * 1e-4
+    assert learning_rate(config, 5) == pytest.approx(2.0 * (1e-4 + (1 - 1e-4) / 2))
+    assert learning_rate(config, 10) == 2.0
+    assert learning_rate(config, 60) == pytest.approx(1.0)  # half the cosine
+    assert learning_rate(config, 35) == pytest.approx(1 + math.cos(math.pi / 4))
+    assert learning_rate(config, 110) == 0.0
+
+
+def test_paper_defaults_follow_from_the_data():
+    resolved = resolve_training(TrainConfig(), dataclasses.replace(SCALES, pairs=480_000), ASTConfig())
+    assert resolved.steps == 100 * 10_000
+    assert resolved.peak_rate == pytest.approx(1e-4 * math.sqrt(24))
+    assert resolved.warmup == 2000
+    assert resolved.decay == 101 * 10_000  # the cosine ends one epoch after the last
+    assert resolved.noise == pytest.approx(0.0045)
+    assert resolved.noise_gamma == 1.0
+    resolved = resolve_training(TrainConfig(), SCALES, ASTConfig(integration="dynamic"))
+    assert resolved.noise_gamma == 0.1 and resolved.noise == pytest.approx(0.0002)
+
+
+def test_given_settings_are_kept_and_a_short_training_warms_up_for_5_percent():
+    given = TrainConfig(steps=400, batch_size=4, accumulate=2, noise=0.0, peak_rate=5e-4)
+    resolved = resolve_training(given, SCALES, ASTConfig())
+    assert (resolved.steps, resolved.warmup, resolved.decay, resolved.noise) == (400, 20, 400, 0.0)
+    assert (resolved.peak_rate, resolved.validate_every, resolved.checkpoint_every) == (5e-4, 40, 40)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("batch_size", 0), ("steps", 0), ("validate_every", -1), ("seed", -1), ("shift", -0.1), ("noise", math.inf),
+        ("noise", -1.0), ("clip", 0.0), ("clip", -1.0), ("warmup", -1), ("statistics_pairs", 0), ("peak_rate", 0.0),
+        ("peak_rate", -1e-3), ("peak_rate", math.inf), ("peak_rate", 2.0), ("stress_weight", -1.0),
+        ("stress_weight", math.inf), ("noise_gamma", 1.5), ("noise_gamma", -0.5), ("decay", 0), ("validate_scenes", -1),
+    ],
+)  # fmt: skip
+def test_settings_out_of_range_are_named(key, value):
+    with pytest.raises(ConfigError, match=f"train.{key} is {value}"):
+        resolve_training(dataclasses.replace(TrainConfig(), **{key: value}), SCALES, ASTConfig())
+
+
+def test_a_warmup_that_never_reaches_the_peak_is_refused():
+    with pytest.raises(ConfigError, match=r"train.warmup is 20; it must be below train.decay = 10"):
+        resolve_training(TrainConfig(steps=10, warmup=20), SCALES, ASTConfig())
+
+
+def test_a_seed_of_20_digits_is_refused():
+    largest = start.configure("d.h5", "tiny", [f"train.seed={2**63 - 1}"])
+    assert largest.train.seed == 2**63 - 1
+    with pytest.raises(ConfigError, match=r"train.seed is above 9223372036854775807, the largest whole number"):
+        start.configure("d.h5", "tiny", ["train.seed=12345678901234567890"])
+    with pytest.raises(ConfigError, match=r"train.noise is above 9223372036854775807"):
+        start.configure("d.h5", "tiny", [f"train.noise={'9' * 400}"])
+    with pytest.raises(ConfigError, match=r"train.seed is '99.*; must be an integer"):
+        start.configure("d.h5", "tiny", [f"train.seed={'9' * 5000}"])
+
+
+@pytest.mark.parametrize(
+    ("model", "key", "values"),
+    [
+        *(("ast", key, (0, -3, 10**9)) for key in ("hidden", "decoder_hidden", "d_token", "heads", "ffn_inner")),
+        ("ast", "num_tokens", (0, -3, 10**9)), ("ast", "L_SA", (-1,)), ("ast", "dropout", (-0.1, 1.0)),
+        ("ast", "cell_spacings", (0.0, -1.0)), ("ast", "proximity_radius", (-1.0, math.inf)),
+        *((model, "hidden", (0, -3, 10**9)) for model in ("mgn", "bsms", "hcmt", "transolver")),
+        ("mgn", "blocks", (0,)), ("mgn", "world_radius", (-1.0,)), ("mgn", "most_world_edges", (-1,)),
+        ("bsms", "levels", (0,)), ("hcmt", "heads", (0,)), ("hcmt", "contact_blocks", (-1,)),
+        ("transolver", "heads", (0,)), ("transolver", "slices", (0,)),
+    ],
+)  # fmt: skip
+def test_a_model_that_cannot_be_is_refused_with_its_setting(model, key, values):
+    for value in values:
+        with pytest.raises(ConfigError, match=rf"^model.{key} is {value}; it must be at (least|most) [\d.]+$"):
+            start.configure("d.h5", "tiny", [f"model.{key}={value}"], model)
+
+
+def test_step_seeds_differ_and_do_not_change():
+    assert len({step_seed(seed, step) for seed in range(30) for step in range(30)}) == 900
+
+
+def test_scales_of_the_data_by_hand(data):
+    with Dataset(data) as dataset:
+        found = measure(dataset)
+        truths = [dataset.load("train", index) for index in range(3)]
+    normal = [t.scene.node_type == NodeType.NORMAL for t in truths]
+    moved = [t.position[:, n].astype(float) - t.scene.rest_position[n] for t, n in zip(truths, normal, strict=True)]
+    steps = [np.diff(t.position[:, n].astype(float), axis=0) for t, n in zip(truths, normal, strict=True)]
+    assert found.displacement == pytest.approx(math.sqrt(np.concatenate([m.ravel() ** 2 for m in moved]).mean()))
+    assert found.increment == pytest.approx(math.sqrt(np.concatenate([m.ravel() ** 2 for m in steps]).mean()))
+    assert found.trajectories == 3
+    assert found.pairs == 18
+    # Edges of the plate are 0.1 (or 0.075) m, 0.04 m, and diagonals of these; the block's do not count.
+    assert 0.04 < found.spacing < math.sqrt(0.1**2 + 0.1**2 + 0.04**2)
+
+
+def test_a_preset_that_does_not_exist_names_the_nearest():
+    with pytest.raises(ConfigError, match="did you mean deforming_plate"):
+        start.configure("data.h5", "deforming_plaet")
+    with pytest.raises(ConfigError, match=r"no preset of mgn 'deforming_plate'.*There are tiny, paper, original"):
+        start.configure("data.h5", "deforming_plate", model="mgn")
+    with pytest.raises(ConfigError, match="no model 'mgm': did you mean mgn"):
+        start.configure("data.h5", "tiny", model="mgm")
+
+
+def test_an_unknown_setting_names_the_nearest():
+    with pytest.raises(ConfigError, match=r"the nearest is train\.batch_size"):
+        start.configure("data.h5", "tiny", ["train.batchsize=3"])
+    with pytest.raises(ConfigError, match=r"there is no setting model\.L_sa; the nearest is model\.L_SA"):
+        start.configure("data.h5", "tiny", ["model.L_sa=3"])
+
+
+def resolved(data, *settings: str, preset: str = "tiny", model: str = "ast") -> RunConfig:
+    """What a run on the dataset would be trained with."""
+    with Dataset(data) as dataset:
+        return resolve(start.configure(data, preset, settings, model), dataset, measure(dataset))
+
+
+def test_configure_opens_no_dataset():
+    config = start.configure("absent.h5", "tiny", ["model.hidden=16", "train.steps=3"], "mgn")
+    assert config.data == "absent.h5" and (config.model.hidden, config.train.steps) == (16, 3)
+    assert config.model.node_inputs is None and config.train.noise is None
+
+
+def test_the_kind_of_the_dataset_decides_which_inputs_there_can_be(data, tmp_path):
+    dynamic = toy.write(tmp_path / "dynamic.h5", dynamic=True)
+    config = resolved(dynamic, "model.node_inputs=velocity,displacement")
+    assert config.model.integration == "dynamic"
+    assert config.model.node_inputs == ("velocity", "displacement")
+    with pytest.raises(ConfigError, match="model.node_inputs: velocity is an input of dynamic scenes only"):
+        start.start_training(tmp_path / "run", start.configure(data, "tiny", ["model.node_inputs=velocity"]))
+    assert not has_config(tmp_path / "run")
+
+
+def test_tiny_sees_other_bodies_and_learns_along_rollouts_where_that_was_measured(data, tmp_path):
+    toy.write(tmp_path / "d.h5", dynamic=True)
+    still, moving = resolved(data), resolved(tmp_path / "d.h5")
+    assert still.model.node_inputs == ("displacement", "proximity") and still.train.rollout_pool == 64
+    assert still.train.shift == moving.train.shift == 0.025  # 0.05 of the half width
+    assert moving.model.node_inputs == ("displacement", "velocity") and moving.train.rollout_pool == 64
+    assert (still.model.places, still.model.exchanges) == ("relative", 2)
+    assert (moving.model.places, moving.model.exchanges) == ("absolute", 0)
+    assert resolved(tmp_path / "d.h5", "model.places=relative", "model.exchanges=1").model.exchanges == 1
+    paper = resolved(data, preset="deforming_plate")
+    assert paper.model.node_inputs == ("displacement",) and paper.train.rollout_pool == paper.train.shift == 0
+    assert resolved(data, model="mgn").model.node_inputs == ()
+    assert resolved(tmp_path / "d.h5", model="mgn").model.node_inputs == ("velocity",)
+    assert resolved(data, preset="original", model="transolver").model.node_inputs == ()
+
+
+def test_a_resolved_run_is_not_changed_by_resolving_it_again(data):
+    config = resolved(data)
+    with Dataset(data) as dataset:
+        assert resolve(config, dataset, measure(dataset)) == config
+
+
+def test_a_dynamic_dataset_is_trained_with_two_given_frames(tmp_path):
+    dynamic = toy.write(tmp_path / "dynamic.h5", dynamic=True)
+    small = ["model.hidden=16", "model.d_token=16", "model.L_SA=1", "train.steps=3", "train.batch_size=2"]
+    start.start_training(tmp_path / "run", start.configure(dynamic, "tiny", ["model.node_inputs=velocity", *small]))
+    model, resolved, _ = folder.load_model(tmp_path / "run")
+    assert model.config.dynamic
+    assert resolved.train.noise_gamma == 0.1 and resolved.train.rollout_pool == 32
+    record = next(record for record in Metrics(tmp_path / "run") if "valid_rmse" in record)
+    with Dataset(dynamic) as dataset:
+        assert measure(dataset).pairs == 3 * 5  # 7 frames, of which 5 follow two others
+        truths = [dataset.load("valid", index) for index in range(2)]
+    moved = [t.position[2:, ~t.scene.prescribed].astype(float) - t.position[1, ~t.scene.prescribed] for t in truths]
+    assert record["valid_hold_still"] == pytest.approx(np.mean([math.sqrt((m**2).mean()) for m in moved]))
+
+
+# The loop
+
+
+def test_training_writes_settings_metrics_and_checkpoints(linear, data, tmp_path, capsys):
+    start.start_training(tmp_path / "run", settings(data))
+    records = list(Metrics(tmp_path / "run"))
+    steps = [record for record in records if "loss" in record]
+    validations = [record for record in records if "valid_rmse" in record]
+    assert [record["step"] for record in steps] == [4, 8, 12, 16, 20]
+    assert [record["step"] for record in validations] == [10, 20]
+    for record in steps:
+        assert {"loss", "motion", "stress", "rate", "grad_norm", "clipped_share", "seconds"} <= set(record)
+        assert record["loss"] == pytest.approx(record["motion"] + 0.01 * record["stress"])
+    assert steps[-1]["loss"] < steps[0]["loss"]
+    assert 0 <= steps[0]["clipped_share"] <= 1
+    model, resolved, step = folder.load_model(tmp_path / "run")
+    best = min(validations, key=lambda record: record["valid_rmse"])
+    assert step == best["step"]
+    assert not model.training
+    assert resolved.train.decay == 20
+    assert read_config(tmp_path / "run") == resolved
+    shown = capsys.readouterr().out
+    assert "x rms increment" in shown and "x mesh spacing" in shown and "parameters  " in shown and "cell side" in shown
+    assert "to go" in shown
+
+
+def test_validation_error_is_that_of_the_rollouts(linear, data, tmp_path):
+    start.start_training(tmp_path / "run", settings(data, "train.keep=10"))
+    record = next(r for r in Metrics(tmp_path / "run") if "valid_rmse" in r and r["step"] == 20)
+    model, resolved, _ = folder.load_model(tmp_path / "run")
+    model.load_state_dict(weights(tmp_path / "run"))
+    roots, holds = [], []
+    with Dataset(data) as dataset:
+        for index in range(2):
+            truth = dataset.load("valid", index)
+            normal = ~truth.scene.prescribed
+            wrong = toy.answer(model, truth).position[1:, normal].astype(float) - truth.position[1:, normal]
+            still = truth.position[1:, normal].astype(float) - truth.position[0, normal]
+            roots.append(math.sqrt((wrong**2).mean()))
+            holds.append(math.sqrt((still**2).mean()))
+    assert record["valid_rmse"] == pytest.approx(sum(roots) / 2, rel=1e-5)
+    assert record["valid_hold_still"] == pytest.approx(sum(holds) / 2, rel=1e-9)
+
+
+def test_accumulated_gradients_are_the_mean_over_the_batches(linear, data, tmp_path):
+    # Without dropout, 2 batches of 2 scenes and 1 batch of 4 are the same pairs; sizes differ a little per scene.
+    def norm(name, *assignments):
+        config = settings(data, "train.steps=1", "train.log_every=1", "train.statistics_pairs=4", *assignments)
+        torch.manual_seed(0)
+        start.start_training(tmp_path / name, config)
+        return next(iter(Metrics(tmp_path / name)))
+
+    whole = norm("whole", "train.batch_size=4")
+    parts = norm("parts", "train.batch_size=2", "train.accumulate=2")
+    assert parts["loss"] == pytest.approx(whole["loss"], rel=0.2)
+    assert parts["grad_norm"] == pytest.approx(whole["grad_norm"], rel=0.3)
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(linear, data, tmp_path):
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        start.start_training(tmp_path / name, settings(data, f"train.seed={seed}"))
+    a, b, c = (weights(tmp_path / name) for name in "abc")
+    assert all(torch.equal(a[key], b[key]) for key in a)
+    assert not torch.equal(a["map.weight"], c["map.weight"])
+
+
+def test_a_loss_that_is_not_finite_stops_before_the_step_and_names_the_samples(linear, data, tmp_path, monkeypatch):
+    real, calls = toy.LinearSimulator.loss, []
+
+    def loss(self, *batch_and_settings):
+        losses = real(self, *batch_and_settings)
+        calls.append(batch_and_settings[1].names)
+        return losses if len(calls) < 8 else {**losses, "loss": losses["loss"] * float("nan")}
+
+    monkeypatch.setattr(toy.LinearSimulator, "loss", loss)
+    with pytest.raises(TrainingError, match=r"the loss of step 8 is nan") as error:
+        start.start_training(tmp_path / "run", settings(data))
+    assert all(name in str(error.value) for name in calls[-1])
+    assert checkpoint.latest(tmp_path / "run").name == "step-5"
+    assert "step-5" in str(error.value)
+    assert all(value.isfinite().all() for value in weights(tmp_path / "run").values())
+
+
+def test_a_gradient_that_is_not_finite_stops_before_the_step(linear, data, tmp_path, monkeypatch):
+    real = toy.LinearSimulator.loss
+
+    def loss(self, *batch_and_settings):
+        losses = real(self, *batch_and_settings)
+        # sqrt at 0: a finite value with an infinite slope
+        return {**losses, "loss": losses["loss"] + (losses["loss"] - losses["loss"].detach()).sqrt()}
+
+    monkeypatch.setattr(toy.LinearSimulator, "loss", loss)
+    with pytest.raises(TrainingError, match=r"norm of the gradient of step 1 is (nan|inf).*train/00000\d frame \d"):
+        start.start_training(tmp_path / "run", settings(data))
+    assert checkpoint.latest(tmp_path / "run") is None
+
+
+def test_a_dead_decoder_is_reported(linear, data, tmp_path, monkeypatch, capsys):
+    def forward(self, batch):
+        out = self.map.bias.expand(len(batch.position), -1)
+        return toy.Prediction(out[:, :3], out[:, 3:])
+
+    monkeypatch.setattr(toy.LinearSimulator, "forward", forward)
+    start.start_training(tmp_path / "run", settings(data, "train.steps=4"))
+    assert "warning: the predicted motion is the same at all nodes" in capsys.readouterr().out
+
+
+def test_a_failing_validation_rollout_is_recorded_and_training_goes_on(linear, data, tmp_path, monkeypatch, capsys):
+    def predict(self, batch):
+        return toy.Prediction(torch.full_like(batch.position, torch.nan), torch.zeros(len(batch.position), 1))
+
+    monkeypatch.setattr(toy.LinearSimulator, "predict", predict)
+    start.start_training(tmp_path / "run", settings(data))
+    records = [record for record in Metrics(tmp_path / "run") if "valid_rmse" in record]
+    assert [record["valid_rmse"] for record in records] == [None, None]
+    assert "valid/000000" in records[0]["failure"]
+    assert checkpoint.best(tmp_path / "run") is None
+    assert folder.load_model(tmp_path / "run")[2] == 20
+
+
+# Resuming and refusing
+
+
+def test_a_run_is_not_overwritten(linear, data, tmp_path):
+    start.start_training(tmp_path / "run", settings(data, "train.steps=2"))
+    with pytest.raises(TrainingError, match="already holds a run: go on with --resume"):
+        start.start_training(tmp_path / "run", settings(data))
+
+
+def test_resuming_with_other_settings_is_refused_naming_the_first(linear, data, tmp_path):
+    start.start_training(tmp_path / "run", settings(data, "train.steps=2"))
+    with pytest.raises(ConfigError, match=r"train.steps = 2, not 3"):
+        start.start_training(tmp_path / "run", settings(data, "train.steps=3"), resume=True)
+
+
+def test_resuming_a_finished_run_changes_nothing(linear, data, tmp_path):
+    start.start_training(tmp_path / "run", settings(data))
+    before = (tmp_path / "run" / "metrics.jsonl").read_bytes()
+    start.start_training(tmp_path / "run", resume=True)
+    assert (tmp_path / "run" / "metrics.jsonl").read_bytes() == before
+
+
+def test_resuming_on_another_dataset_is_refused(linear, data, tmp_path):
+    other = toy.write(tmp_path / "other.h5", counts=(3, 1, 1))
+    start.start_training(tmp_path / "run", settings(data, "train.steps=2"))
+    with pytest.raises(TrainingError, match="other.h5 is not the dataset"):
+        start.start_training(tmp_path / "run", settings(other, "train.steps=2"), resume=True)
+
+
+def test_resuming_nothing_needs_a_dataset_and_with_one_starts(linear, data, tmp_path):
+    with pytest.raises(TrainingError, match="holds no run to resume"):
+        start.start_training(tmp_path / "run", resume=True)
+    start.start_training(tmp_path / "run", settings(data, "train.steps=2"), resume=True)
+    assert folder.load_model(tmp_path / "run")[2] == 2
+
+
+def test_a_damaged_newest_checkpoint_falls_back_and_ends_in_the_same_bits(linear, data, tmp_path):
+    start.start_training(tmp_path / "whole", settings(data))
+    start.start_training(tmp_path / "run", settings(data))
+    newest = checkpoint.latest(tmp_path / "run") / "model.safetensors"
+    newest.write_bytes(newest.read_bytes()[:-1] + b"\x7f")
+    with pytest.warns(UserWarning, match="SHA-256"):
+        start.start_training(tmp_path / "run", resume=True)
+    a, b = weights(tmp_path / "whole"), weights(tmp_path / "run")
+    assert all(torch.equal(a[key], b[key]) for key in a)
+
+
+def test_along_rollouts_a_resumed_training_ends_in_the_same_bits(linear, data, tmp_path):
+    along = settings(data, "train.rollout_pool=6", "train.noise=1e-3", "train.mirror=x,y")
+    start.start_training(tmp_path / "whole", along)
+    start.start_training(tmp_path / "run", along)
+    newest = checkpoint.latest(tmp_path / "run") / "training.safetensors"
+    newest.write_bytes(newest.read_bytes()[:-1] + b"\x7f")
+    with pytest.warns(UserWarning, match="SHA-256"):
+        start.start_training(tmp_path / "run", resume=True)
+    a, b = (checkpoint.load(checkpoint.latest(tmp_path / name)) for name in ("whole", "run"))
+    for ours, theirs in zip(a[:2], b[:2], strict=True):
+        assert ours.keys() == theirs.keys() and all(torch.equal(ours[key], theirs[key]) for key in ours)
+    assert {f"rollout_pool.{place}.begun" for place in range(6)} <= a[1].keys()
+    start.start_training(tmp_path / "without", settings(data, "train.noise=1e-3", "train.mirror=x,y"))
+    assert any(not torch.equal(a[0][key], value) for key, value in weights(tmp_path / "without").items())
+
+
+@pytest.mark.parametrize(
+    ("assignments", "match"),
+    [
+        (["train.rollout_pool=5"], r"train.rollout_pool is 5; it must be a multiple.*train.batch_size = 2"),
+        (
+            ["train.rollout_pool=2"],
+            r"train.rollout_pool is 2; it must be a multiple of train.batch_size = 2, at least 4",
+        ),
+        (["train.rollout_pool=-4"], r"train.rollout_pool is -4"),
+        (["train.rollout_pool=4", "train.noise=0"], r"of no use here: without train.noise"),
+        (["train.rollout_pool=4", "model.time_conditioned=true"], r"of no use here: each frame follows from the first"),
+    ],
+)
+def test_a_pool_that_cannot_be_is_refused(linear, data, tmp_path, assignments, match):
+    with pytest.raises(ConfigError, match=match):
+        start.start_training(tmp_path / "run", settings(data, *assignments))
+    assert not has_config(tmp_path / "run")
+
+
+@pytest.mark.parametrize("config", [ASTConfig, TransolverConfig])
+def test_a_pool_left_to_the_data_is_of_16_batches_where_there_is_a_drift(config):
+    given = TrainConfig(batch_size=4, rollout_pool=None)
+    still = resolve_training(given, SCALES, config())
+    assert still.rollout_pool == 64 and still.noise == pytest.approx(0.0015)  # a third of that without a pool
+    dynamic = resolve_training(given, SCALES, config(integration="dynamic"))
+    assert dynamic.rollout_pool == 64 and dynamic.noise_gamma == 0.1 and dynamic.noise == pytest.approx(0.0002)
+    assert resolve_training(given, SCALES, config(time_conditioned=True)).rollout_pool == 0
+    assert resolve_training(dataclasses.replace(given, noise=0.0), SCALES, config()).rollout_pool == 0
+    assert resolve_training(TrainConfig(), SCALES, config()).rollout_pool == 0  # the papers'
+
+
+@pytest.mark.parametrize("model", ["bsms", "hcmt", "mgn"])
+def test_the_pool_of_a_model_with_edges_between_bodies_is_for_scenes_with_inertia(model):
+    still = find_preset(model, "tiny")
+    given, moving = TrainConfig(**still.train), dataclasses.replace(still.model, integration="dynamic")
+    assert resolve_training(given, SCALES, still.model).rollout_pool == 0
+    assert resolve_training(given, SCALES, moving).rollout_pool == 64
+    for name, preset in find_model(model).presets.items():
+        assert name == "tiny" or preset.train.get("rollout_pool", 0) == 0  # as published
+
+
+def test_a_shift_left_open_is_half_a_cell_as_far_as_the_domain_has_room():
+    given = TrainConfig(shift=None)
+    fine = ASTConfig(L_cell=6, domain_half_width=2.0)
+    assert fine.cell_side == 0.0625 and resolve_training(given, SCALES, fine).shift == 0.03125
+    coarse = dataclasses.replace(fine, L_cell=2)
+    assert coarse.cell_side == 1.0 and resolve_training(given, SCALES, coarse).shift == pytest.approx(0.1)
+    assert resolve_training(given, SCALES, find_preset("mgn", "tiny").model).shift == 0.0  # has no cells
+    assert resolve_training(TrainConfig(shift=0.5), SCALES, fine).shift == 0.5
+    assert resolve_training(TrainConfig(), SCALES, fine).shift == 0.0  # the paper's
+
+
+def test_scenes_that_are_moved_out_of_the_domain_are_an_error(data, tmp_path):
+    with pytest.raises(DatasetError, match=r"train.*give the dataset a domain_half_width that holds .* train.shift"):
+        start.start_training(tmp_path / "run", start.configure(data, "tiny", ["train.shift=1e3"]))
+
+
+@pytest.mark.parametrize(
+    "setting, message", [("model.time_conditioned=true", "follows from the first"), ("train.noise=0", "have no error")]
+)
+def test_a_pool_that_is_of_no_use_is_refused(data, tmp_path, setting, message):
+    with pytest.raises(ConfigError, match=f"of no use here: .*{message}"):
+        start.start_training(tmp_path / "run", start.configure(data, "tiny", ["train.rollout_pool=8", setting]))
+
+
+def test_a_second_writer_is_refused(linear, data, tmp_path):
+    (tmp_path / "run").mkdir()
+    with checkpoint.lock(tmp_path / "run"), pytest.raises(CheckpointError, match="in use by process"):
+        start.start_training(tmp_path / "run", settings(data))
+
+
+def test_training_needs_training_data(linear, tmp_path):
+    with DatasetWriter(tmp_path / "empty.h5", toy.info()) as writer:
+        writer.add("test", toy.plate())
+    with pytest.raises(TrainingError, match="the split train is empty"):
+        start.start_training(
+            tmp_path / "run", RunConfig(toy.config(toy.info()), TrainConfig(), str(tmp_path / "empty.h5"))
+        )
+
+
+def test_without_validation_scenes_the_latest_checkpoint_is_the_model(linear, tmp_path):
+    path = toy.write(tmp_path / "toy.h5", counts=(2, 0, 0))
+    start.start_training(tmp_path / "run", settings(path))
+    assert folder.load_model(tmp_path / "run")[2] == 20
+    assert not any("valid_rmse" in record for record in Metrics(tmp_path / "run"))
+
+
+# Records and the clock
+
+
+def test_metrics_survive_a_line_that_was_cut_off(tmp_path):
+    metrics = Metrics(tmp_path)
+    for step in (1, 2, 3):
+        metrics.append({"step": step, "loss": 1.0 / step})
+    metrics.append({"step": 3, "valid_rmse": 0.5})
+    with open(metrics.path, "a") as file:
+        file.write('{"step": 4, "lo')
+    with pytest.warns(UserWarning, match=r"metrics.jsonl: line 5 is damaged and left out"):
+        assert [record["step"] for record in metrics] == [1, 2, 3, 3]
+    with pytest.warns(UserWarning, match="line 5"):
+        metrics.forget_after(2)
+    assert list(metrics) == [{"step": 1, "loss": 1.0}, {"step": 2, "loss": 0.5}] and metrics.best() is None
+
+
+def test_no_damage_of_the_metrics_changes_a_record_or_the_best_in_silence(linear, data, tmp_path):
+    run, draw = tmp_path / "run", random.Random(1)
+    start.start_training(run, settings(data))
+    intact, step, content = list(Metrics(run)), folder.load_model(run)[2], (run / "metrics.jsonl").read_bytes()
+    damages = [content[: draw.randrange(len(content) - 1)] for _ in range(30)]
+    for _ in range(100):
+        place = draw.randrange(len(content))
+        damages.append(content[:place] + bytes([content[place] ^ 1 << draw.randrange(8)]) + content[place + 1 :])
+    for damaged in damages:
+        (run / "metrics.jsonl").write_bytes(damaged)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            records = list(Metrics(run))
+            assert folder.load_model(run)[2] == step
+        assert records == intact or any("metrics.jsonl" in str(warning.message) for warning in told)
+        assert all(record in intact for record in records)
+
+
+def test_metrics_without_their_last_lines_give_a_warning(linear, data, tmp_path):
+    run = tmp_path / "run"
+    start.start_training(run, settings(data))
+    lines = (run / "metrics.jsonl").read_text().splitlines(keepends=True)
+    (run / "metrics.jsonl").write_text("".join(lines[:3]))
+    with pytest.warns(UserWarning, match=r"metrics.jsonl has lost 3 of 6 lines"):
+        folder.load_model(run)
+
+
+def test_a_missing_or_damaged_best_is_refused_until_a_resume_writes_it_again(linear, data, tmp_path):
+    run = tmp_path / "run"
+    start.start_training(run, settings(data))
+    mark, step = (run / "best").read_text(), folder.load_model(run)[2]
+    (run / "best").write_text(mark.replace(f'"step": {step}', f'"step": {30 - step}'))
+    with pytest.raises(CheckpointError, match=r"best: is damaged: remove it, then ast-sim train --resume --out"):
+        folder.load_model(run)
+    (run / "best").unlink()
+    with pytest.raises(CheckpointError, match=r"best is missing, but validations were recorded: ast-sim train --resu"):
+        folder.load_model(run)
+    start.start_training(run, resume=True)
+    assert (run / "best").read_text() == mark and folder.load_model(run)[2] == step
+
+
+def test_time_to_go_counts_recent_steps_and_validations(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("time.perf_counter", lambda: now[0])
+    clock = Clock()
+    for _ in range(10):
+        now[0] += 0.5
+        clock.step()
+    assert clock.to_go(100, 0) == "50 s"
+    assert clock.to_go(100, 2) == "at least 50 s"
+    now[0] += 20.0
+    assert clock.validation() == 20.0
+    assert clock.to_go(100, 2) == "1 min 30 s"
+    for _ in range(Clock.WINDOW):
+        now[0] += 0.25
+        clock.step()
+    assert clock.to_go(4, 0) == "1 s"  # the earlier, slower steps are forgotten
+
+
+def test_durations():
+    assert [duration(s) for s in (0.4, 59.6, 185, 7800)] == ["0 s", "1 min 00 s", "3 min 05 s", "2 h 10 min"]
+
+
+@pytest.mark.parametrize("part", ["stress", "valid", "node_type"])
+def test_a_changed_dataset_is_not_gone_on_with(linear, tmp_path, part):
+    """One number of a trajectory in the middle, of the validation scenes, or one node's type."""
+
+    def changed(split, trajectory):
+        if part == "stress" and split == "train":
+            trajectory.stress[3, 10] += 1
+        elif part == "valid" and split == "valid":
+            trajectory.position[3, 10, 2] += 0.001
+        elif part == "node_type" and split == "train":
+            trajectory.scene.node_type[0] = NodeType.NORMAL
+        return trajectory
+
+    path = toy.write(tmp_path / "toy.h5")
+    start.start_training(tmp_path / "run", settings(path, "train.steps=5"))
+    with DatasetWriter(path, toy.info()) as writer:
+        for split, seeds in (("train", range(3)), ("valid", range(3, 5)), ("test", range(5, 7))):
+            for seed in seeds:
+                trajectory = toy.plate(seed)
+                writer.add(split, changed(split, trajectory) if seed in (1, 3) else trajectory)
+    with pytest.raises(TrainingError, match="is not the dataset that"):
+        start.start_training(tmp_path / "run", resume=True)
+    toy.write(path)
+    start.start_training(tmp_path / "run", resume=True)
