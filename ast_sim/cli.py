@@ -161,6 +161,8 @@ def _add_generate(generate: _Parser) -> None:
     _add_each(generate, splits, type=_at_least(0))
     sizes = {"--nodes N": "approximate number of nodes of a scene", "--frames N": "number of frames of a scene"}
     _add_each(generate, sizes, type=_at_least(1))
+    about = "solve and store only frame 0 and these, such as 1,5,20, each straight from the one before (default: all)"
+    generate.add_argument("--keep", type=_frame_numbers, metavar="K,K,...", help=about)
     generate.add_argument("--seed", type=_at_least(0), default=0, help="seed of the scenes (default: 0)")
     about = "the bundled solver (own) or CalculiX (default: own)"
     generate.add_argument("--solver", choices=("own", "calculix"), help=about)
@@ -279,6 +281,13 @@ def _path(text: str) -> Path:
     if not text or "\0" in text:
         raise argparse.ArgumentTypeError(f"{text!r} is no name of a file or a folder")
     return Path(text)
+
+
+def _frame_numbers(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(map(int, text.split(",")))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no list of whole numbers, such as 1,5,20") from None
 
 
 def _at_least(least: int) -> Any:

@@ -32,7 +32,7 @@ def generate(args: argparse.Namespace) -> None:
     """`ast-sim generate`."""
     from ast_sim.simulate.jobs.generate import generate as simulate
 
-    chosen = ("valid", "test", "seed", "nodes", "frames", "workers", "solver", "parts", "patient", "scheduler")
+    chosen = ("valid", "test", "seed", "nodes", "frames", "keep", "workers", "solver", "parts", "patient", "scheduler")
     options = {name: getattr(args, name) for name in chosen}
     made = simulate(args.family, args.out, train=args.count, **options)
     print(f"{made.path}: {_counts(made.counts)}")

@@ -95,7 +95,7 @@ def test_generate_help_tells_of_every_family_and_imports_no_solver():
     shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     for name in ("deforming_plate", "sphere_simple", "abcd", "abcd_xl"):
         assert f"\n  {name} " in shown
-    for option in ("nodes", "frames", "solver", "parts", "workers", "scheduler"):
+    for option in ("nodes", "frames", "keep", "solver", "parts", "workers", "scheduler"):
         assert f"--{option}" in shown
 
 
@@ -107,6 +107,31 @@ def test_generate_makes_a_dataset_of_the_settings_given(tmp_path, capsys):
     with Dataset(out) as dataset:
         assert dataset.num_frames("train", 0) == 3
         assert dataset.info.generator["command"] == "ast-sim generate deforming_plate --seed 3 --nodes 80 --frames 3"
+
+
+def test_generate_keeps_the_frames_asked_for(tmp_path, capsys):
+    out = tmp_path / "plates.h5"
+    plates = (
+        "generate",
+        "deforming_plate",
+        "--out",
+        str(out),
+        "--count",
+        "1",
+        "--valid",
+        "0",
+        "--test",
+        "0",
+        "--nodes",
+        "80",
+    )
+    assert main([*plates, "--frames", "9", "--keep", "2,6", "--workers", "1"]) == 0
+    with Dataset(out) as dataset:
+        assert dataset.num_frames("train", 0) == 3
+        assert dataset.info.generator["command"].endswith("--nodes 80 --frames 9 --keep 2,6")
+    assert "'2;6' is no list of whole numbers" in fails(capsys, *plates, "--keep", "2;6")
+    error = fails(capsys, *plates, "--frames", "9", "--keep", "2,9")
+    assert "keep is [2, 9]; must be numbers of frames from 1 to 8, beside frame 0" in error
 
 
 def test_info_of_a_dataset(trained, capsys):

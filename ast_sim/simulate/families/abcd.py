@@ -29,6 +29,7 @@ from ast_sim.simulate.shapes.parts import Part
 from ast_sim.support.errors import SimulationError
 
 INCREMENTS = 20
+FRAMES = INCREMENTS + 1
 DEFAULT_NODES = 4000
 MINIMUM_NODES = 200
 DRAWS = 30  # draws of parts and placements before a sample is given up
@@ -107,8 +108,8 @@ def _case(rng: np.random.Generator, pair: Pair, lower: Part, upper: Part) -> Sol
     )
     # The clamp closes the gap and then squeezes by its share of the free height.
     travel = crush * pair.height + 2 * CONTACT.dhat
-    down = np.linspace(0, travel, INCREMENTS + 1)[:, None] * (pair.clamped & (pair.body == 1))
-    targets = np.repeat(scene.rest_position.astype(np.float64)[None], INCREMENTS + 1, axis=0)
+    down = np.linspace(0, travel, FRAMES)[:, None] * (pair.clamped & (pair.body == 1))
+    targets = np.repeat(scene.rest_position.astype(np.float64)[None], FRAMES, axis=0)
     targets[:, :, 2] -= down
     return SolidCase(
         scene=scene,

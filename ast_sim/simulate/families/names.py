@@ -1,7 +1,8 @@
 """The scene families that can be generated, by name. The module of a family is imported when it is used.
 
-Such a module has `INFO` (DatasetInfo), `DEFAULT_NODES`, `MINIMUM_NODES`, `draw(rng, nodes, ...) -> case`, which takes
-all of its draws from `rng`, and `solve(case, checkpoint) -> Trajectory`.
+Such a module has `INFO` (DatasetInfo), `DEFAULT_NODES`, `MINIMUM_NODES`, `FRAMES` (frames of a scene, unless it is an
+option), `draw(rng, nodes, ...) -> case`, which takes all of its draws from `rng`, and
+`solve(case, checkpoint) -> Trajectory`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ class Family:
 
     Attributes:
         about: one line for a user.
-        options: the options of `generate` that it has beside the number of nodes: "frames", "parts", "solver".
+        options: the options of `generate` that it has beside the number of nodes: "frames", "keep", "parts", "solver".
         packages: packages that only its scenes depend on. The dataset records their versions.
     """
 
@@ -28,11 +29,14 @@ class Family:
     packages: tuple[str, ...] = ()
 
 
+_PARTS = ("gmsh", "meshio")
 FAMILIES = {
-    "deforming_plate": Family("clamped plates that a rigid obstacle presses in and lets go", ("frames", "solver")),
+    "deforming_plate": Family(
+        "clamped plates that a rigid obstacle presses in and lets go", ("frames", "keep", "solver")
+    ),
     "sphere_simple": Family("a hanging cloth and a sphere that pushes into it, with inertia"),
-    "abcd": Family("two CAD-like parts squeezed together, 4,000 nodes", ("parts", "solver"), ("gmsh", "meshio")),
-    "abcd_xl": Family("abcd with 100,000 nodes: a scene takes hours", ("parts", "solver"), ("gmsh", "meshio")),
+    "abcd": Family("two CAD-like parts squeezed together, 4,000 nodes", ("keep", "parts", "solver"), _PARTS),
+    "abcd_xl": Family("abcd with 100,000 nodes: a scene takes hours", ("keep", "parts", "solver"), _PARTS),
 }
 
 MODULES = {family: f"{__package__}.{family}" for family in FAMILIES}

@@ -16,9 +16,10 @@ import json
 import os
 import shutil
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from ast_sim.dataset.layout import SPLITS, DatasetInfo
@@ -63,6 +64,7 @@ def generate(
     seed: int = 0,
     nodes: int | None = None,
     frames: int | None = None,
+    keep: Sequence[int] | None = None,
     workers: int | None = None,
     solver: str | None = None,
     parts: str | os.PathLike[str] | None = None,
@@ -79,6 +81,8 @@ def generate(
         seed: of all random draws. A sample depends only on the seed, its split, its index and the settings.
         nodes: about how many nodes a scene has; the family's default if None.
         frames: frames of a scene, for families that have this option; the family's default if None.
+        keep: numbers of the frames to solve and store beside frame 0, ascending, for families without inertia; all if
+            None. The solver goes straight from one to the next.
         workers: number of processes; one per available core if None.
         solver: "own" or "calculix", for families of solids; "own" if None.
         parts: a file or folder of parts (STEP, STL, meshes), for families that squeeze parts; None: drawn ones.
@@ -96,7 +100,7 @@ def generate(
     module = family_module(family)
     self_test()
     counts = _checked_counts(train, valid, test)
-    recipe = checked_recipe(module, family, seed, nodes, frames, solver, parts, patient)
+    recipe = checked_recipe(module, family, seed, nodes, frames, solver, parts, patient, keep)
     workers = _checked_workers(workers, scheduler)
     out, settings = Path(out), recorded(recipe)
     output_file(out)
@@ -105,7 +109,7 @@ def generate(
         return _existing(out, folder, settings, counts)
     if not folder.exists():
         check_parts(recipe)
-        _check_room(out, sum(counts.values()), recipe.nodes, recipe.frames or getattr(module, "FRAMES", 1))
+        _check_room(out, sum(counts.values()), recipe.nodes, _frames(recipe, module))
     samples = [(split, index) for split in SPLITS for index in range(counts[split])]
     info = replace(module.INFO, generator={**settings, "counts": counts})
     with _locked(folder, settings):
@@ -113,6 +117,11 @@ def generate(
         truncated = _merge(out, folder, samples, info)
         _remove(folder)
     return Generated(out, counts, truncated)
+
+
+def _frames(recipe: Recipe, module: ModuleType) -> int:
+    """How many frames of a scene are stored."""
+    return (recipe.frames or module.FRAMES) if recipe.keep is None else 1 + len(recipe.keep)
 
 
 def _notes(settings: dict[str, Any]) -> list[str]:

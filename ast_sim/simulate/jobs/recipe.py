@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import importlib.metadata
 import shlex
+from collections.abc import Sequence
 from dataclasses import asdict
+from itertools import pairwise
+from operator import index
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -31,13 +34,14 @@ def checked_recipe(
     solver: str | None,
     parts: str | Path | None,
     patient: bool = False,
+    keep: Sequence[int] | None = None,
 ) -> Recipe:
     """The recipe with these settings, after a check. A setting that is None takes the family's default.
 
     Raises:
         SimulationError: a value is invalid, or the family does not have an option.
     """
-    for name, value in (("frames", frames), ("solver", solver), ("parts", parts)):
+    for name, value in (("frames", frames), ("keep", keep), ("solver", solver), ("parts", parts)):
         if value is not None and name not in FAMILIES[family].options:
             having = ", ".join(key for key, known in FAMILIES.items() if name in known.options)
             raise SimulationError(f"{family} has no option {name}; these families have it: {having}")
@@ -56,7 +60,20 @@ def checked_recipe(
         raise SimulationError(f"patient is for the own solver; {solver} has limits of its own")
     if parts is not None:
         _source(parts)
-    return Recipe(family, seed, nodes, frames, solver, None if parts is None else str(Path(parts).resolve()), patient)
+    if keep is not None:
+        keep = _checked_keep(keep, (frames or module.FRAMES) - 1)
+    parts = None if parts is None else str(Path(parts).resolve())
+    return Recipe(family, seed, nodes, frames, solver, parts, patient, keep)
+
+
+def _checked_keep(keep: Sequence[int], last: int) -> tuple[int, ...]:
+    """The numbers of the frames to keep, after a check; `last` is the number of the last frame."""
+    kept = tuple(map(index, keep))
+    if not kept or not all(1 <= frame <= last for frame in kept):
+        raise SimulationError(f"keep is {list(kept)}; must be numbers of frames from 1 to {last}, beside frame 0")
+    if any(later <= earlier for earlier, later in pairwise(kept)):
+        raise SimulationError(f"keep is {list(kept)}; the numbers of frames must ascend")
+    return kept
 
 
 def recorded(recipe: Recipe) -> dict[str, Any]:
@@ -67,6 +84,8 @@ def recorded(recipe: Recipe) -> dict[str, Any]:
         MissingExtra: a package that the solver or the parts need is not installed.
     """
     used = {key: value for key, value in asdict(recipe).items() if value is not None and value is not False}
+    if recipe.keep is not None:
+        used["keep"] = list(recipe.keep)  # as the file gives it back
     if "parts" in FAMILIES[recipe.family].options:
         used |= _source(recipe.parts).describe()
     return {
@@ -127,4 +146,6 @@ def _command(recipe: Recipe) -> str:
         words += ["--parts", Path(recipe.parts).name]
     if recipe.patient:
         words += ["--patient"]
+    if recipe.keep is not None:
+        words += ["--keep", ",".join(map(str, recipe.keep))]
     return shlex.join(words)

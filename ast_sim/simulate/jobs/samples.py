@@ -39,6 +39,7 @@ class Recipe:
         solver: "own" or "calculix".
         parts: a file or folder of the user's parts, for families that have this option.
         patient: whether the own solver may take any number of Newton iterations for a frame.
+        keep: the frames that are solved and stored after frame 0, by their numbers in the whole motion; None: all.
     """
 
     family: str
@@ -48,6 +49,7 @@ class Recipe:
     solver: str = "own"
     parts: str | None = None
     patient: bool = False
+    keep: tuple[int, ...] | None = None
 
 
 def make_sample(recipe: Recipe, split: str, index: int, checkpoint: Checkpoint | None = None) -> Trajectory:
@@ -67,6 +69,8 @@ def make_sample(recipe: Recipe, split: str, index: int, checkpoint: Checkpoint |
 
         options["parts"] = part_source(Path(recipe.parts))
     case = module.draw(np.random.default_rng(sequence), recipe.nodes, **options)
+    if recipe.keep is not None:
+        case = replace(case, targets=case.targets[[0, *recipe.keep]])
     if recipe.solver == "calculix":
         from ast_sim.simulate.calculix import solve as calculix
 

@@ -194,6 +194,43 @@ def test_a_patient_solve_is_recorded_and_reaches_every_frame(tmp_path, monkeypat
     assert make_sample(patient, "train", 0).num_frames == FRAMES
 
 
+def test_kept_frames_are_those_of_the_whole_motion_and_recorded(undisturbed, tmp_path):
+    kept = (3, 7)
+    out = plates(tmp_path / "kept.h5", keep=kept, workers=1).path
+    with Dataset(undisturbed) as whole, Dataset(out) as some:
+        made = some.info.generator
+        assert made["keep"] == [3, 7] and "keep" not in whole.info.generator
+        assert (
+            made["command"] == f"ast-sim generate deforming_plate --seed 5 --nodes {NODES} --frames {FRAMES} --keep 3,7"
+        )
+        for split, count in COUNTS.items():
+            for index in range(count):
+                full, part = whole.load(split, index), some.load(split, index)
+                np.testing.assert_array_equal(part.scene.rest_position, full.scene.rest_position)
+                fixed, wanted = full.scene.prescribed, full.position[[0, *kept]]
+                np.testing.assert_array_equal(part.position[:, fixed], wanted[:, fixed])
+                # Without friction the equilibrium does not depend on the way: both solves stop close to it.
+                assert part.attributes["status"] == "complete" and max(part.attributes["residual"]) <= 1
+                moved = np.linalg.norm(wanted[:, ~fixed] - wanted[0, ~fixed], axis=2).max()
+                assert np.abs(part.position - wanted).max() <= 1e-3 * moved
+                assert sum(part.attributes["newton_iterations"]) < sum(full.attributes["newton_iterations"])
+    before = out.read_bytes()
+    assert plates(out, keep=[3, 7]).counts == COUNTS and out.read_bytes() == before
+    for other in ({"keep": (3, 6)}, {}):
+        with pytest.raises(SimulationError, match="holds other data"):
+            plates(out, **other)
+    with pytest.raises(SimulationError, match=r"holds other data \(keep None there, \[3, 7\] here\)"):
+        plates(undisturbed, keep=kept)
+
+
+def test_calculix_keeps_frames_too():
+    recipe = Recipe("deforming_plate", 5, 150, FRAMES, keep=(3, 7))
+    own, other = (make_sample(replace(recipe, solver=solver), "train", 2) for solver in ("own", "calculix"))
+    assert other.attributes["status"] == "complete" and other.num_frames == 3
+    moved = np.linalg.norm(own.position - own.position[0], axis=(1, 2))
+    assert (np.linalg.norm(other.position - own.position, axis=(1, 2)) <= 0.1 * moved).all()  # contact differs a little
+
+
 def test_two_runs_on_one_file_exclude_each_other(tmp_path):
     out = tmp_path / "plates.h5"
     locked = generate_module._locked(tmp_path / "plates.h5.parts", recorded(RECIPE))
@@ -217,6 +254,16 @@ def test_two_runs_on_one_file_exclude_each_other(tmp_path):
         ({"solver": "abaqus"}, "no solver 'abaqus'; use one of own, calculix"),
         ({"family": "abcd", "solver": "calculix", "patient": True}, "patient is for the own solver"),
         ({"parts": "folder"}, "deforming_plate has no option parts; these families have it: abcd, abcd_xl"),
+        ({"keep": []}, r"keep is \[\]; must be numbers of frames from 1 to 399, beside frame 0"),
+        ({"keep": [0, 3]}, r"keep is \[0, 3\]; must be numbers of frames from 1 to 399"),
+        ({"frames": 9, "keep": [3, 9]}, r"keep is \[3, 9\]; must be numbers of frames from 1 to 8"),
+        ({"family": "abcd", "keep": [21]}, r"keep is \[21\]; must be numbers of frames from 1 to 20"),
+        ({"keep": [3, 2]}, r"keep is \[3, 2\]; the numbers of frames must ascend"),
+        ({"keep": [3, 3]}, "must ascend"),
+        (  # it has inertia: every frame follows from the one before
+            {"family": "sphere_simple", "keep": [3]},
+            "sphere_simple has no option keep; these families have it: deforming_plate, abcd, abcd_xl",
+        ),
     ],
 )
 def test_settings_that_cannot_be(tmp_path, arguments, message):
