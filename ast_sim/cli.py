@@ -162,7 +162,7 @@ def _add_generate(generate: _Parser) -> None:
     sizes = {"--nodes N": "approximate number of nodes of a scene", "--frames N": "number of frames of a scene"}
     _add_each(generate, sizes, type=_at_least(1))
     about = "solve and store only frame 0 and these, such as 1,5,20, each straight from the one before (default: all)"
-    generate.add_argument("--keep", type=_frame_numbers, metavar="K,K,...", help=about)
+    generate.add_argument("--keep", type=_whole_numbers, metavar="K,K,...", help=about)
     generate.add_argument("--seed", type=_at_least(0), default=0, help="seed of the scenes (default: 0)")
     about = "the bundled solver (own) or CalculiX (default: own)"
     generate.add_argument("--solver", choices=("own", "calculix"), help=about)
@@ -194,11 +194,8 @@ def _add_convert(convert: _Parser) -> None:
     _add_each(fields, names)
     _add_each(fields, {"--material NAME": "cell fields with one number each"}, nargs="+", default=[])
     kind = convert.add_argument_group("properties of a dataset made from .vtu files")
-    about, shares = (
-        "shares of the simulations, drawn at random (default: 0.8 0.1 0.1 of three or more)",
-        ("TRAIN", "VALID", "TEST"),
-    )
-    kind.add_argument("--shares", nargs=3, type=float, metavar=shares, help=about)
+    about = "shares of the simulations, drawn at random (default: 0.8 0.1 0.1 of three or more)"
+    kind.add_argument("--shares", nargs=3, type=float, metavar=("TRAIN", "VALID", "TEST"), help=about)
     kind.add_argument("--seed", type=_at_least(0), default=0, help="seed of this draw (default: 0)")
     kind.add_argument("--incomplete", action="store_true", help="convert although nothing moves or is prescribed")
     kind.add_argument("--dynamic", action="store_true", help="inertia matters: models predict the acceleration")
@@ -283,11 +280,8 @@ def _path(text: str) -> Path:
     return Path(text)
 
 
-def _frame_numbers(text: str) -> tuple[int, ...]:
-    try:
-        return tuple(map(int, text.split(",")))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no list of whole numbers, such as 1,5,20") from None
+def _whole_numbers(text: str) -> tuple[int, ...]:
+    return tuple(map(int, text.split(",")))
 
 
 def _at_least(least: int) -> Any:

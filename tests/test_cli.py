@@ -129,7 +129,7 @@ def test_generate_keeps_the_frames_asked_for(tmp_path, capsys):
     with Dataset(out) as dataset:
         assert dataset.num_frames("train", 0) == 3
         assert dataset.info.generator["command"].endswith("--nodes 80 --frames 9 --keep 2,6")
-    assert "'2;6' is no list of whole numbers" in fails(capsys, *plates, "--keep", "2;6")
+    assert "invalid _whole_numbers value: '2;6'" in fails(capsys, *plates, "--keep", "2;6")
     error = fails(capsys, *plates, "--frames", "9", "--keep", "2,9")
     assert "keep is [2, 9]; must be numbers of frames from 1 to 8, beside frame 0" in error
 

@@ -81,8 +81,7 @@ def generate(
         seed: of all random draws. A sample depends only on the seed, its split, its index and the settings.
         nodes: about how many nodes a scene has; the family's default if None.
         frames: frames of a scene, for families that have this option; the family's default if None.
-        keep: numbers of the frames to solve and store beside frame 0, ascending, for families without inertia; all if
-            None. The solver goes straight from one to the next.
+        keep: ascending numbers of the frames to solve, straight from one to the next, and store; all frames if None.
         workers: number of processes; one per available core if None.
         solver: "own" or "calculix", for families of solids; "own" if None.
         parts: a file or folder of parts (STEP, STL, meshes), for families that squeeze parts; None: drawn ones.
@@ -93,8 +92,7 @@ def generate(
     Raises:
         AstSimError: `out` is no place for a file.
         SimulationError: a setting is invalid, the scenes cannot fit on the disk, `out` or its parts folder was made
-            with other settings, another process uses the folder, or samples failed. The finished samples are kept: the
-            same call goes on from them.
+            with other settings, another process uses the folder, or samples failed: the same call goes on from there.
         MissingExtra: a package that the family, the solver or the scheduler needs is not installed.
     """
     module = family_module(family)
@@ -111,10 +109,9 @@ def generate(
         check_parts(recipe)
         _check_room(out, sum(counts.values()), recipe.nodes, _frames(recipe, module))
     samples = [(split, index) for split in SPLITS for index in range(counts[split])]
-    info = replace(module.INFO, generator={**settings, "counts": counts})
     with _locked(folder, settings):
         _make(samples, folder, recipe, workers, scheduler, progress, _notes(settings))
-        truncated = _merge(out, folder, samples, info)
+        truncated = _merge(out, folder, samples, replace(module.INFO, generator={**settings, "counts": counts}))
         _remove(folder)
     return Generated(out, counts, truncated)
 
