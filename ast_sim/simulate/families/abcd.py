@@ -9,13 +9,14 @@ passed in, in a fixed order.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from ast_sim.dataset.layout import DatasetInfo
-from ast_sim.scene import NodeType, Scene, Trajectory
-from ast_sim.simulate.mechanics.case import SolidCase
+from ast_sim.scene import AttributeValue, NodeType, Scene, Trajectory
+from ast_sim.simulate.mechanics.case import Drawn, SolidCase
 from ast_sim.simulate.mechanics.contact_and_friction import Contact, ContactSettings
 from ast_sim.simulate.mechanics.material import NeoHookean
 from ast_sim.simulate.mechanics.quasi_static import quasi_static
@@ -23,8 +24,8 @@ from ast_sim.simulate.mechanics.solver import SolverSettings
 from ast_sim.simulate.mechanics.unfinished import Checkpoint
 from ast_sim.simulate.shapes.cad import MeshingFailed
 from ast_sim.simulate.shapes.mesh_check import BadMesh
-from ast_sim.simulate.shapes.pairing import HALF_EXTENT, Pair, Unsuitable, put_together
-from ast_sim.simulate.shapes.part_source import PartSource, part_source
+from ast_sim.simulate.shapes.pairing import HALF_EXTENT, Pair, Unsuitable, put_likewise, put_together
+from ast_sim.simulate.shapes.part_source import Mesher, PartSource, part_source
 from ast_sim.simulate.shapes.parts import Part
 from ast_sim.support.errors import SimulationError
 
@@ -52,7 +53,28 @@ INFO = DatasetInfo(
 )
 
 
+@dataclass(frozen=True)
+class _Squeeze:
+    """What the parts are made of, and how far they are squeezed.
+
+    Attributes:
+        young, poisson: [2] constants of the lower and of the upper part; Young's moduli in pascal.
+        travel: how far the upper clamp moves down.
+        attributes: what is recorded of the drawing.
+    """
+
+    young: np.ndarray
+    poisson: np.ndarray
+    travel: float
+    attributes: dict[str, AttributeValue]
+
+
 def draw(rng: np.random.Generator, nodes: int = DEFAULT_NODES, parts: PartSource | None = None) -> SolidCase:
+    """The case of `draw_geometry`."""
+    return draw_geometry(rng, nodes, parts).case
+
+
+def draw_geometry(rng: np.random.Generator, nodes: int = DEFAULT_NODES, parts: PartSource | None = None) -> Drawn:
     """Draw a pair, its materials and how far it is squeezed.
 
     Args:
@@ -66,15 +88,32 @@ def draw(rng: np.random.Generator, nodes: int = DEFAULT_NODES, parts: PartSource
     parts = part_source() if parts is None else parts
     for _ in range(DRAWS):
         try:
-            lower, upper = parts.draw(rng, nodes)
-            pair = put_together(rng, lower, upper, 2 * CONTACT.dhat)
+            mesh = parts.draw(rng)
+            drawn = mesh(nodes)
+            pair = put_together(rng, *drawn, 2 * CONTACT.dhat)
             _check_walls(pair)
         except (BadMesh, MeshingFailed, Unsuitable) as error:
             reason = error
             continue
-        case = _case(rng, pair, lower, upper)
-        return replace(case, attributes={**case.attributes, "mesher": parts.mesher})
+        squeeze = _draw_squeeze(rng, pair, drawn, parts.mesher)
+        return Drawn(_case(pair, squeeze), partial(_remeshed, mesh, nodes, drawn, pair, squeeze))
     raise SimulationError(f"none of {DRAWS} draws gave two parts that can be squeezed; the last: {reason}") from reason
+
+
+def _remeshed(
+    mesh: Mesher, nodes: int, drawn: tuple[Part, Part], pair: Pair, squeeze: _Squeeze, share: float
+) -> SolidCase:
+    """The case on a mesh with that share of the nodes. Its clamps end where those of the drawn pair end.
+
+    Raises:
+        BadMesh, MeshingFailed, Unsuitable: there is no such mesh.
+    """
+    parts = mesh(round(share * nodes))
+    if sum(len(part.position) for part in parts) == len(pair.position) and share != 1:
+        raise Unsuitable("there is no other mesh of these parts with that few nodes")
+    other, raised = put_likewise(pair, drawn, parts, 2 * CONTACT.dhat)
+    _check_walls(other)
+    return _case(other, replace(squeeze, travel=squeeze.travel + raised))
 
 
 def solve(case: SolidCase, checkpoint: Checkpoint | None = None, patient: bool = False) -> Trajectory:
@@ -93,12 +132,25 @@ def _check_walls(pair: Pair) -> None:
         )
 
 
-def _case(rng: np.random.Generator, pair: Pair, lower: Part, upper: Part) -> SolidCase:
+def _draw_squeeze(rng: np.random.Generator, pair: Pair, parts: tuple[Part, Part], mesher: str) -> _Squeeze:
     young = np.exp(rng.uniform(*np.log(YOUNG), 2))
     poisson, crush = rng.uniform(*POISSON, 2), rng.uniform(*CRUSH)
+    attributes: dict[str, AttributeValue] = {
+        "parts": f"{parts[0].name}, {parts[1].name}",
+        "crush": float(crush),
+        "free_height": pair.height,
+        "overlap": pair.overlap,
+        "scale": pair.scale,
+        "mesher": mesher,
+    }
+    # The clamp closes the gap and then squeezes by its share of the free height.
+    return _Squeeze(young, poisson, crush * pair.height + 2 * CONTACT.dhat, attributes)
+
+
+def _case(pair: Pair, squeeze: _Squeeze) -> SolidCase:
     body = pair.body[pair.elements[:, 0]]
     # The solver uses constants and positions as the file stores them, in float32.
-    material = np.stack([young, poisson], axis=1).astype(np.float32)[body]
+    material = np.stack([squeeze.young, squeeze.poisson], axis=1).astype(np.float32)[body]
     scene = Scene(
         rest_position=pair.position.astype(np.float32),
         elements=pair.elements.astype(np.int32),
@@ -106,9 +158,7 @@ def _case(rng: np.random.Generator, pair: Pair, lower: Part, upper: Part) -> Sol
         body=pair.body.astype(np.int32),
         material=material,
     )
-    # The clamp closes the gap and then squeezes by its share of the free height.
-    travel = crush * pair.height + 2 * CONTACT.dhat
-    down = np.linspace(0, travel, FRAMES)[:, None] * (pair.clamped & (pair.body == 1))
+    down = np.linspace(0, squeeze.travel, FRAMES)[:, None] * (pair.clamped & (pair.body == 1))
     targets = np.repeat(scene.rest_position.astype(np.float64)[None], FRAMES, axis=0)
     targets[:, :, 2] -= down
     return SolidCase(
@@ -117,11 +167,5 @@ def _case(rng: np.random.Generator, pair: Pair, lower: Part, upper: Part) -> Sol
         material=NeoHookean(*material.astype(np.float64).T),
         contact=CONTACT,
         stress_location="element",
-        attributes={
-            "parts": f"{lower.name}, {upper.name}",
-            "crush": float(crush),
-            "free_height": pair.height,
-            "overlap": pair.overlap,
-            "scale": pair.scale,
-        },
+        attributes=squeeze.attributes,
     )

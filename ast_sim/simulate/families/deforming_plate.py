@@ -8,18 +8,20 @@ order.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ast_sim.dataset.layout import DatasetInfo
-from ast_sim.scene import NodeType, Scene, Trajectory
-from ast_sim.simulate.mechanics.case import SolidCase
+from ast_sim.scene import AttributeValue, NodeType, Scene, Trajectory
+from ast_sim.simulate.mechanics.case import Drawn, SolidCase
 from ast_sim.simulate.mechanics.contact_and_friction import ContactSettings
 from ast_sim.simulate.mechanics.material import NeoHookean
 from ast_sim.simulate.mechanics.quasi_static import quasi_static
+from ast_sim.simulate.mechanics.solver import SolverSettings
 from ast_sim.simulate.mechanics.unfinished import Checkpoint
 from ast_sim.simulate.shapes import plate_mesh
+from ast_sim.simulate.shapes.mesh_check import BadMesh
 from ast_sim.simulate.shapes.obstacles import draw_obstacle
 from ast_sim.simulate.shapes.plate_outline_and_holes import Outline, distance_to, draw_outline
 from ast_sim.support.errors import SimulationError
@@ -30,9 +32,12 @@ MINIMUM_NODES = 80
 MINIMUM_FRAMES = 3  # a press and its release need this many
 MATERIAL = NeoHookean(young=1e6, poisson=0.4)
 CONTACT = ContactSettings(dhat=1e-3, stiffness=MATERIAL.young)
+SETTINGS = SolverSettings()
 LAYERS = 2  # layers of elements through the thickness
 OBSTACLE_SHARE = 0.16  # share of the nodes that belong to the obstacle
 SMALLEST_ANGLE = np.radians(22)  # smallest angle of a triangle of the middle plane
+COARSE_ANGLE = np.radians(10)  # the same where the plate is meshed anew: the mesh need not be that good, but must exist
+NEARBY = (1.0, 0.95, 1.05, 0.9, 1.1)  # numbers of nodes that are tried, relative to the wanted one
 CLAMP_MARGIN = 0.05  # distance in metres, seen from above, between the obstacle and the clamps
 INFO = DatasetInfo(
     family="deforming_plate",
@@ -47,7 +52,38 @@ INFO = DatasetInfo(
 
 def solve(case: SolidCase, checkpoint: Checkpoint | None = None, patient: bool = False) -> Trajectory:
     """All frames of a drawn scene, or those up to the first that cannot be solved."""
-    return quasi_static(case, checkpoint=checkpoint, patient=patient)
+    return quasi_static(case, SETTINGS, checkpoint, patient)
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """The geometry of a plate, without a mesh.
+
+    Attributes:
+        outline: the middle plane.
+        columns: about how many nodes the mesh of the middle plane has.
+        area, perimeter: of the middle plane.
+        length: distance between the clamps of the unsheared plate.
+        thickness: where x = 0.
+        taper: by which share the thickness grows from there to x = length.
+    """
+
+    outline: Outline
+    columns: float
+    area: float
+    perimeter: float
+    length: float
+    thickness: float
+    taper: float = 0.0
+
+    def spacing(self, share: float = 1.0) -> float:
+        """Length of the edges of a mesh with that share of the columns."""
+        return plate_mesh.spacing_for(share * self.columns, self.area, self.perimeter)
+
+    def flat_mesh(self, share: float, smallest_angle: float) -> plate_mesh.PlaneMesh | None:
+        """The mesh of the middle plane with that share of the columns; None if it has a triangle of poor shape."""
+        mesh = plate_mesh.triangulate(self.outline.pieces, self.outline.holes, self.spacing(share))
+        return None if mesh is None or plate_mesh.smallest_angle(mesh) < smallest_angle else mesh
 
 
 @dataclass(frozen=True)
@@ -55,20 +91,41 @@ class _Plate:
     """A meshed plate.
 
     Attributes:
-        outline: the outline that was meshed.
-        spacing: length of the edges of the mesh.
+        shape: what was meshed.
         position, elements: [N,3] and [E,4].
         clamps: [N] 1 for nodes of the left clamp, 2 for nodes of the right clamp, 0 elsewhere.
     """
 
-    outline: Outline
-    spacing: float
+    shape: _Shape
     position: np.ndarray
     elements: np.ndarray
     clamps: np.ndarray
 
 
+@dataclass(frozen=True)
+class _Press:
+    """What presses the plate, and how everything moves.
+
+    Attributes:
+        obstacle, elements: [N,3] at the start and [E,4].
+        travel: displacement [S,3] of the obstacle.
+        drift: displacements [2,S,3] of the clamps.
+        attributes: what is recorded of the drawing.
+    """
+
+    obstacle: np.ndarray
+    elements: np.ndarray
+    travel: np.ndarray
+    drift: np.ndarray
+    attributes: dict[str, AttributeValue]
+
+
 def draw(rng: np.random.Generator, nodes: int = DEFAULT_NODES, frames: int = FRAMES) -> SolidCase:
+    """The case of `draw_geometry`."""
+    return draw_geometry(rng, nodes, frames).case
+
+
+def draw_geometry(rng: np.random.Generator, nodes: int = DEFAULT_NODES, frames: int = FRAMES) -> Drawn:
     """Draw a scene.
 
     Args:
@@ -83,12 +140,12 @@ def draw(rng: np.random.Generator, nodes: int = DEFAULT_NODES, frames: int = FRA
     if frames < MINIMUM_FRAMES:
         raise SimulationError(f"frames is {frames}; a press and its release need at least {MINIMUM_FRAMES}")
     while True:
-        case = _try_draw(rng, nodes, frames)
-        if case is not None and 0.5 * nodes <= case.scene.num_nodes <= 1.7 * nodes:
-            return case
+        drawn = _try_draw(rng, nodes, frames)
+        if drawn is not None and 0.5 * nodes <= drawn.case.scene.num_nodes <= 1.7 * nodes:
+            return drawn
 
 
-def _try_draw(rng: np.random.Generator, nodes: int, frames: int) -> SolidCase | None:
+def _try_draw(rng: np.random.Generator, nodes: int, frames: int) -> Drawn | None:
     """One draw; None if the plate cannot be meshed well, or if the obstacle does not fit or comes down on a hole."""
     wanted = nodes * rng.triangular(0.53, 0.95, 1.6)
     cells = max(2, round((OBSTACLE_SHARE * wanted) ** (1 / 3)) - 1)
@@ -108,21 +165,26 @@ def _try_draw(rng: np.random.Generator, nodes: int, frames: int) -> SolidCase | 
     start = np.array([*touch, plate.position[:, 2].max()]) - gap * direction
     obstacle = obstacle + start - lowest
     travel = (depth + gap) * way[:, None] * direction + _follow(plate, touch, drift)
-    n = len(plate.position)
-    scene = _assemble(plate, obstacle, obstacle_elements)
-    targets = np.repeat(scene.rest_position.astype(np.float64)[None], frames, axis=0)
-    targets[:, n:] += travel[:, None]
-    for clamp, moves in enumerate(drift, 1):
-        targets[:, :n][:, plate.clamps == clamp] += moves[:, None]
-    attributes = {
+    attributes: dict[str, AttributeValue] = {
         "obstacle": shape,
-        "outline": plate.outline.kind,
-        "holes": " ".join(plate.outline.hole_kinds),
+        "outline": plate.shape.outline.kind,
+        "holes": " ".join(plate.shape.outline.hole_kinds),
         "thickness": float(np.ptp(plate.position[:, 2])),
         "depth": depth,
         "drift": [float(np.linalg.norm(moves, axis=1).max()) for moves in drift],
     }
-    return SolidCase(scene, targets, MATERIAL, CONTACT, INFO.stress_location, attributes)
+    press = _Press(obstacle, obstacle_elements, travel, drift, attributes)
+    return Drawn(_case(plate, press), lambda share: _case(_remeshed(plate.shape, share), press))
+
+
+def _case(plate: _Plate, press: _Press) -> SolidCase:
+    n, frames = len(plate.position), len(press.travel)
+    scene = _assemble(plate, press.obstacle, press.elements)
+    targets = np.repeat(scene.rest_position.astype(np.float64)[None], frames, axis=0)
+    targets[:, n:] += press.travel[:, None]
+    for clamp, moves in enumerate(press.drift, 1):
+        targets[:, :n][:, plate.clamps == clamp] += moves[:, None]
+    return SolidCase(scene, targets, MATERIAL, CONTACT, INFO.stress_location, press.attributes)
 
 
 def _draw_plate(rng: np.random.Generator, nodes: float) -> _Plate | None:
@@ -132,17 +194,34 @@ def _draw_plate(rng: np.random.Generator, nodes: float) -> _Plate | None:
     outline = draw_outline(rng, length, width, plate_mesh.spacing_for(columns, length * width, 2 * (length + width)))
     loops = [np.concatenate(outline.pieces), *outline.holes]
     area = sum(abs(plate_mesh.area(loop)) * (1 if loop is loops[0] else -1) for loop in loops)
-    perimeter = sum(map(plate_mesh.length, loops))
-    spacing = plate_mesh.spacing_for(columns, area, perimeter)
-    mesh = plate_mesh.triangulate(outline.pieces, outline.holes, spacing)
-    if mesh is None or plate_mesh.smallest_angle(mesh) < SMALLEST_ANGLE:
+    shape = _Shape(outline, columns, area, sum(map(plate_mesh.length, loops)), length, thickness)
+    mesh = shape.flat_mesh(1.0, SMALLEST_ANGLE)
+    if mesh is None:
         return None
-    taper = rng.uniform(-0.3, 0.3) if rng.random() < 0.4 else 0.0
-    position, elements = plate_mesh.extrude(mesh, thickness * (1 + taper * mesh.points[:, 0] / length), LAYERS)
+    shape = replace(shape, taper=rng.uniform(-0.3, 0.3) if rng.random() < 0.4 else 0.0)
+    return _extruded(shape, mesh)
+
+
+def _extruded(shape: _Shape, mesh: plate_mesh.PlaneMesh) -> _Plate:
+    thickness = shape.thickness * (1 + shape.taper * mesh.points[:, 0] / shape.length)
+    position, elements = plate_mesh.extrude(mesh, thickness, LAYERS)
     clamps = np.zeros(len(mesh.points), int)
-    for clamp, piece in enumerate(outline.ends, 1):
+    for clamp, piece in enumerate(shape.outline.ends, 1):
         clamps[mesh.pieces[piece]] = clamp
-    return _Plate(outline, spacing, position, elements, np.repeat(clamps, LAYERS + 1))
+    return _Plate(shape, position, elements, np.repeat(clamps, LAYERS + 1))
+
+
+def _remeshed(shape: _Shape, share: float) -> _Plate:
+    """The plate with about that share of its nodes, in as many layers; with fewer, it could not bend.
+
+    Raises:
+        BadMesh: the curves of the plate come too close to each other for edges that long.
+    """
+    for nearby in NEARBY:
+        mesh = shape.flat_mesh(share * nearby, COARSE_ANGLE)
+        if mesh is not None:
+            return _extruded(shape, mesh)
+    raise BadMesh(f"no mesh with {share:g} of the nodes has triangles of good shape: holes and sides are too close")
 
 
 def _draw_touch(rng: np.random.Generator, plate: _Plate, obstacle: np.ndarray, press: np.ndarray) -> np.ndarray | None:
@@ -160,9 +239,9 @@ def _draw_touch(rng: np.random.Generator, plate: _Plate, obstacle: np.ndarray, p
     along, across = rng.uniform(-1, 1, 2)
     side = np.abs(plate.position[:, 1]).max()
     touch = np.array([(left + right) / 2 + 0.35 * along * (right - left), 0.7 * across * side])
-    sides, holes = np.concatenate(plate.outline.pieces), plate.outline.holes
+    sides, holes = np.concatenate(plate.shape.outline.pieces), plate.shape.outline.holes
     solid = distance_to(sides, touch) < -0.2 * side
-    return touch if solid and all(distance_to(hole, touch) >= plate.spacing / 2 for hole in holes) else None
+    return touch if solid and all(distance_to(hole, touch) >= plate.shape.spacing() / 2 for hole in holes) else None
 
 
 def draw_way(rng: np.random.Generator, frames: int) -> np.ndarray:

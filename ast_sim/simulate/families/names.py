@@ -2,7 +2,8 @@
 
 Such a module has `INFO` (DatasetInfo), `DEFAULT_NODES`, `MINIMUM_NODES`, `FRAMES` (frames of a scene, unless it is an
 option), `draw(rng, nodes, ...) -> case`, which takes all of its draws from `rng`, and
-`solve(case, checkpoint) -> Trajectory`.
+`solve(case, checkpoint) -> Trajectory`. One without inertia also has `SETTINGS` (SolverSettings) and
+`draw_geometry(rng, nodes, ...) -> Drawn`, which draws the same and can be meshed anew.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""A drawn quasi-static scene, with all that its solution depends on. Any solver can solve it."""
+"""A drawn quasi-static scene, with all that its solution depends on, and its other meshes. Any solver can solve it."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -40,3 +41,18 @@ class SolidCase:
         element with some OBSTACLE nodes is strained when its other nodes move, so it has elastic forces.
         """
         return self.scene.deforming_nodes[self.scene.elements].any(axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A drawn scene and the way to its other meshes.
+
+    Attributes:
+        case: the scene as the generator meshes it.
+        remesh: a function of a share above 0. It returns the same geometry, materials and motion on a mesh that has
+            about that share of the nodes of the deforming bodies. It raises SimulationError if there is no such mesh;
+            the text says why.
+    """
+
+    case: SolidCase
+    remesh: Callable[[float], SolidCase]

@@ -5,7 +5,7 @@ Legend: N nodes, E tetrahedra, F triangles of a surface.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -84,6 +84,50 @@ def put_together(rng: np.random.Generator, lower: Part, upper: Part, gap: float)
         raise Unsuitable("an end of a part has no three nodes to clamp")
     height = float(np.ptp(position[clamped, 2])) - gap
     return Pair(position, elements, faces, body, clamped, height, overlap, float(scale))
+
+
+def put_likewise(pair: Pair, drawn: tuple[Part, Part], parts: tuple[Part, Part], gap: float) -> tuple[Pair, float]:
+    """Put other meshes of the same two parts where these parts stand.
+
+    Args:
+        pair: how the parts stand.
+        drawn: the meshes that it was put together from.
+        parts: the other meshes.
+        gap: smallest distance between the parts. A coarse surface may lie outside the fine one, so the upper part is
+            raised where it would be closer.
+
+    Returns:
+        The pair of the other meshes, and how far its upper part was raised.
+
+    Raises:
+        Unsuitable: an end has no face to clamp, or the parts stay too close.
+    """
+    positions, clamps, faces = [], [], []
+    for body, (old, new) in enumerate(zip(drawn, parts, strict=True)):
+        positions.append(_carried(old.position, pair.position[pair.body == body], new.position))
+        faces.append(boundary(new.elements))
+        clamps.append(_end_face(positions[-1], faces[-1], 2 * body - 1))
+        if clamps[-1].sum() < 3:
+            raise Unsuitable("an end of a part has no three nodes to clamp")
+    count = len(positions[0])
+    body = np.repeat([0, 1], [count, len(positions[1])])
+    surface = np.concatenate([faces[0], faces[1] + count])
+    position = _spaced(np.concatenate(positions), surface, body, gap)
+    other = replace(
+        pair,
+        position=position,
+        elements=np.concatenate([parts[0].elements, parts[1].elements + count]),
+        faces=surface,
+        body=body,
+        clamped=np.concatenate(clamps),
+    )
+    return other, float(position[-1, 2] - positions[1][-1, 2])
+
+
+def _carried(start: np.ndarray, end: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points [n,3] after the affine map that takes the positions `start` to the positions `end` [N,3]."""
+    extended = np.column_stack([start, np.ones(len(start))])
+    return np.column_stack([points, np.ones(len(points))]) @ np.linalg.lstsq(extended, end)[0]
 
 
 def turned(rng: np.random.Generator, position: np.ndarray) -> np.ndarray:

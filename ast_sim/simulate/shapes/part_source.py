@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -23,6 +24,9 @@ TRIAL_NODES = 1000  # nodes of the mesh that checks a CAD file
 _IGNORED = (".txt", ".md", ".json")  # notes that may lie beside the parts
 
 
+Mesher = Callable[[int], tuple[Part, Part]]
+
+
 class PartSource(Protocol):
     """Gives pairs of parts.
 
@@ -38,11 +42,10 @@ class PartSource(Protocol):
     def check(self) -> None:
         """Raise SimulationError if a part that may be drawn is broken."""
 
-    def draw(self, rng: np.random.Generator, nodes: int) -> tuple[Part, Part]:
-        """Two parts with about `nodes` nodes together.
+    def draw(self, rng: np.random.Generator) -> Mesher:
+        """Two parts: a function that meshes both, with about a given number of nodes together, any number of times.
 
-        Raises:
-            BadMesh, MeshingFailed: these parts cannot be used. Others may be.
+        It raises BadMesh or MeshingFailed if these parts cannot be used. Others may be.
         """
 
 
@@ -77,12 +80,10 @@ class GrammarParts:
     def check(self) -> None:
         """Nothing to check: each part is checked when it is drawn."""
 
-    def draw(self, rng: np.random.Generator, nodes: int) -> tuple[Part, Part]:
+    def draw(self, rng: np.random.Generator) -> Mesher:
         (name_a, steps_a), (name_b, steps_b) = cad.draw_solid(rng), cad.draw_solid(rng)
-        a, b = cad.mesh_parts([{"solid": steps_a}, {"solid": steps_b}], [name_a, name_b], nodes)
-        for part in (a, b):
-            check_mesh(part.position, part.elements, part.name)
-        return a, b
+        requests, names = [{"solid": steps_a}, {"solid": steps_b}], [name_a, name_b]
+        return lambda nodes: _checked(cad.mesh_parts(requests, names, nodes))
 
 
 @dataclass(frozen=True)
@@ -97,11 +98,9 @@ class StructuredParts:
     def check(self) -> None:
         """Nothing to check: each part is checked when it is drawn."""
 
-    def draw(self, rng: np.random.Generator, nodes: int) -> tuple[Part, Part]:
-        a, b = draw_structured(rng, nodes // 2), draw_structured(rng, nodes // 2)
-        for part in (a, b):
-            check_mesh(part.position, part.elements, part.name)
-        return a, b
+    def draw(self, rng: np.random.Generator) -> Mesher:
+        shapes = [draw_structured(rng), draw_structured(rng)]
+        return lambda nodes: _checked([shape(nodes // 2) for shape in shapes])
 
 
 @dataclass(frozen=True)
@@ -122,13 +121,18 @@ class FileParts:
             (part,) = _load([path], TRIAL_NODES)
             check_mesh(part.position, part.elements, path.name)
 
-    def draw(self, rng: np.random.Generator, nodes: int) -> tuple[Part, Part]:
+    def draw(self, rng: np.random.Generator) -> Mesher:
         count = len(self.files)
         chosen = [0, 0] if count == 1 else rng.choice(count, 2, replace=False)
-        a, b = _load([self.files[i] for i in chosen], nodes)
-        for part in (a, b):
-            check_mesh(part.position, part.elements, part.name)
-        return a, b
+        files = [self.files[i] for i in chosen]
+        return lambda nodes: _checked(_load(files, nodes))
+
+
+def _checked(parts: list[Part]) -> tuple[Part, Part]:
+    for part in parts:
+        check_mesh(part.position, part.elements, part.name)
+    first, second = parts
+    return first, second
 
 
 def _files(path: Path) -> tuple[Path, ...]:

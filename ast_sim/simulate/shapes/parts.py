@@ -41,10 +41,14 @@ def oriented(position: np.ndarray, elements: np.ndarray) -> np.ndarray:
     return np.where((volumes(position, elements) < 0)[:, None], swapped, elements)
 
 
-def draw_structured(rng: np.random.Generator, nodes: int) -> Part:
-    """Draw one of the structured shapes with about `nodes` nodes. Its largest extent is 0.8 to 1.2."""
+def draw_structured(rng: np.random.Generator) -> Callable[[int], Part]:
+    """Draw one of the structured shapes: a function that meshes it with about a given number of nodes.
+
+    The largest extent of the part is 0.8 to 1.2.
+    """
     name, draw_shape = list(_SHAPES.items())[rng.integers(len(_SHAPES))]
-    return Part(*_of_size(draw_shape(rng), nodes), name)
+    build = draw_shape(rng)
+    return lambda nodes: Part(*_of_size(build, nodes), name)
 
 
 Build = Callable[[float], tuple[np.ndarray, np.ndarray]]  # size of the cells -> positions and elements of a part

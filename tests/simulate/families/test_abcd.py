@@ -129,12 +129,12 @@ def test_walls_thinner_than_the_range_of_contact_are_refused():
     class Sheets:
         mesher = "none"
 
-        def draw(self, rng, nodes):
+        def draw(self, rng):
             fork = rectilinear(
                 [np.array([0, 0.3, 1.0]), np.linspace(0, 1, 5), np.array([0, 0.3, 0.3004, 0.6])],
                 np.array([[[True, True, True]] * 4, [[True, False, True]] * 4]),
             )
-            return Part(*fork, "fork"), block((1, 1, 1))
+            return lambda nodes: (Part(*fork, "fork"), block((1, 1, 1)))
 
     with pytest.raises(SimulationError, match="a wall, slit or element is thinner than 0.001, the range of contact"):
         abcd.draw(np.random.default_rng(0), 300, Sheets())
@@ -144,11 +144,11 @@ def test_parts_that_cannot_be_squeezed_are_drawn_again_and_then_given_up(monkeyp
     class Flaky:
         calls, mesher = 0, "flaky"
 
-        def draw(self, rng, nodes):
+        def draw(self, rng):
             self.calls += 1
             if self.calls < 4:
                 raise MeshingFailed("gmsh crashed (SIGSEGV): no message")
-            return SOURCE.draw(rng, nodes)
+            return SOURCE.draw(rng)
 
     source = Flaky()
     check_pair(abcd.draw(np.random.default_rng(0), 300, source))
@@ -164,6 +164,46 @@ def test_the_large_family_draws_the_same_at_another_size():
     assert np.array_equal(small.scene.rest_position, large.scene.rest_position)
     case = abcd_xl.draw(np.random.default_rng(1), 10_000, SOURCE)
     assert case.scene.num_nodes == pytest.approx(10_000, rel=0.2)
+
+
+@pytest.mark.parametrize(("source", "nodes"), [(SOURCE, 800), (None, 1600)], ids=["structured", "gmsh"])
+def test_the_same_pair_on_coarser_meshes(source, nodes):
+    """Volume, materials, place and motion stay; curved surfaces are met less well."""
+    for seed in range(3):
+        drawn = abcd.draw_geometry(np.random.default_rng(seed), nodes, source)
+        case, coarse = drawn.case, drawn.remesh(0.4)
+        check_pair(case)
+        coarse.scene.check()
+        assert 0.25 <= coarse.scene.num_nodes / case.scene.num_nodes <= 0.6
+        for body in (0, 1):
+            fine_body, coarse_body = (c.scene.rest_position[c.scene.body == body] for c in (case, coarse))
+            np.testing.assert_allclose(np.ptp(coarse_body, axis=0), np.ptp(fine_body, axis=0), rtol=0.05)
+            assert np.array_equal(*(np.unique(c.scene.material[c.scene.body[c.scene.elements[:, 0]] == body], axis=0)
+                                    for c in (case, coarse)))  # fmt: skip
+            sizes = [
+                volumes(
+                    c.scene.rest_position.astype(float), c.scene.elements[c.scene.body[c.scene.elements[:, 0]] == body]
+                ).sum()
+                for c in (case, coarse)
+            ]
+            assert sizes[1] == pytest.approx(sizes[0], rel=0.06)
+        # The clamps end at the same heights, although the upper part may start a little higher.
+        tops = [c.targets[-1, c.scene.prescribed & (c.scene.body == 1), 2].max() for c in (case, coarse)]
+        assert tops[1] == pytest.approx(tops[0], abs=2e-3)
+        contact = Contact(*(coarse.targets[0], coarse.scene.surface(), coarse.scene.body, coarse.contact))
+        assert contact.gap(coarse.targets[0]) >= 1.9 * coarse.contact.dhat and not contact.intersects(coarse.targets[0])
+
+
+def test_parts_that_are_meshes_have_no_other_mesh():
+    class Given:
+        mesher = "none"
+
+        def draw(self, rng):
+            return lambda nodes: (block((1, 1, 1)), block((1, 1, 1)))
+
+    drawn = abcd.draw_geometry(np.random.default_rng(0), 300, Given())
+    with pytest.raises(Unsuitable, match="no other mesh"):
+        drawn.remesh(0.5)
 
 
 def test_a_pair_is_squeezed():

@@ -13,10 +13,12 @@ from ast_sim.simulate.families.deforming_plate import (
     MINIMUM_NODES,
     draw,
     draw_drift,
+    draw_geometry,
     draw_way,
     solve,
 )
 from ast_sim.simulate.mechanics.contact_and_friction import Contact
+from ast_sim.simulate.shapes.mesh_check import BadMesh
 from ast_sim.simulate.shapes.obstacles import SHAPES
 from ast_sim.simulate.shapes.plate_mesh import PlaneMesh, smallest_angle
 from ast_sim.simulate.shapes.plate_outline_and_holes import OUTLINES
@@ -91,6 +93,37 @@ def test_the_same_generator_draws_the_same_scene():
     np.testing.assert_array_equal(one.scene.elements, two.scene.elements)
     np.testing.assert_array_equal(one.targets, two.targets)
     assert one.targets.shape != other.targets.shape or not np.array_equal(one.targets, other.targets)
+
+
+def test_the_same_plate_on_coarser_meshes():
+    for seed in range(8):
+        drawn = draw_geometry(np.random.default_rng(seed), 400, 9)
+        case = drawn.case
+        again = drawn.remesh(1.0)
+        np.testing.assert_array_equal(again.scene.rest_position, case.scene.rest_position)
+        np.testing.assert_array_equal(again.targets, case.targets)
+        for share in (0.5, 0.25):
+            coarse = drawn.remesh(share)
+            coarse.scene.check()
+            plates = [c.scene.rest_position[c.scene.body == 0] for c in (case, coarse)]
+            assert 0.7 * share <= len(plates[1]) / len(plates[0]) <= 1.5 * share
+            np.testing.assert_allclose(np.ptp(plates[1], axis=0), np.ptp(plates[0], axis=0), rtol=0.06)
+            obstacles = [c.targets[:, c.scene.body == 1] for c in (case, coarse)]
+            np.testing.assert_array_equal(obstacles[1], obstacles[0])  # it keeps its mesh and its way
+            for end in (np.argmin, np.argmax):  # each clamp drifts as before
+                moves = [c.targets[:, k] - c.targets[0, k] for c in (case, coarse) for k in [_held(c, end)]]
+                np.testing.assert_allclose(moves[1], moves[0], atol=1e-12)
+
+
+def _held(case, end) -> int:
+    """The number of the clamped node at the left end (argmin) or the right end (argmax)."""
+    held = np.flatnonzero(case.scene.node_type == NodeType.HANDLE)
+    return int(held[end(case.scene.rest_position[held, 0])])
+
+
+def test_a_plate_that_cannot_be_meshed_with_so_few_nodes_says_so():
+    with pytest.raises(BadMesh, match="no mesh with 0.001 of the nodes"):
+        draw_geometry(np.random.default_rng(1), 400, 9).remesh(0.001)
 
 
 def test_the_obstacle_comes_down_and_returns():

@@ -97,21 +97,21 @@ def test_the_grammar_draws_the_same_from_the_same_seed():
 def test_pairs_come_from_the_grammar_if_gmsh_is_there_and_from_structured_parts_if_not(monkeypatch):
     source = part_source()
     assert isinstance(source, GrammarParts) and source.describe() == {"mesher": f"gmsh {gmsh.__version__}"}
-    pair = source.draw(np.random.default_rng(0), 600)
-    again = source.draw(np.random.default_rng(0), 600)
+    pair = source.draw(np.random.default_rng(0))(600)
+    again = source.draw(np.random.default_rng(0))(600)
     assert sum(len(part.position) for part in pair) == pytest.approx(600, rel=0.2)
     assert all(np.array_equal(x.position, y.position) for x, y in zip(pair, again, strict=True))
     monkeypatch.setattr(cad, "gmsh_version", lambda: None)
     source = part_source()
     assert isinstance(source, StructuredParts) and source.describe() == {"mesher": "structured"}
-    assert all(part.name.startswith("structured") for part in source.draw(np.random.default_rng(0), 600))
+    assert all(part.name.startswith("structured") for part in source.draw(np.random.default_rng(0))(600))
 
 
 @pytest.mark.parametrize("ending", ["step", "stl", "msh"])
 def test_a_file_of_the_user_becomes_a_pair(files, ending):
     source = part_source(files[ending])
     source.check()
-    a, b = source.draw(np.random.default_rng(0), 800)
+    a, b = source.draw(np.random.default_rng(0))(800)
     assert a.name == b.name == f"holed.{ending}"
     assert np.linalg.norm(np.ptp(a.position, axis=0)) == pytest.approx(1, rel=1e-3)
     diagonal = np.sqrt(50**2 + 30**2 + 20**2)
@@ -129,7 +129,7 @@ def test_a_folder_gives_pairs_of_different_files(files, tmp_path):
         (tmp_path / files[ending].name).symlink_to(files[ending])
     (tmp_path / "notes.txt").write_text("where they are from")
     source = part_source(tmp_path)
-    names = {tuple(part.name for part in source.draw(np.random.default_rng(seed), 1200)) for seed in range(4)}
+    names = {tuple(part.name for part in source.draw(np.random.default_rng(seed))(1200)) for seed in range(4)}
     assert names == {("holed.msh", "holed.step"), ("holed.step", "holed.msh")}
 
 
@@ -158,7 +158,7 @@ def test_quadratic_tetrahedra_keep_their_corners(tmp_path):
 def test_loose_faces_that_close_are_sewn_to_a_solid(tmp_path):
     source = part_source(write(tmp_path / "faces.step", "faces"))
     source.check()
-    part, _ = source.draw(np.random.default_rng(0), 400)
+    part, _ = source.draw(np.random.default_rng(0))(400)
     assert volumes(part.position, part.elements).sum() == pytest.approx(30000 / 3800**1.5, rel=1e-3)
 
 
@@ -166,7 +166,7 @@ def test_a_binary_stl_and_one_in_metres_far_from_the_origin(tmp_path, files):
     surface = meshio.read(files["stl"])
     moved = meshio.Mesh(surface.points / 1000 + [0.5, 0.25, 1], surface.cells)
     meshio.write(tmp_path / "binary.stl", moved, binary=True)
-    a, _ = part_source(tmp_path / "binary.stl").draw(np.random.default_rng(0), 800)
+    a, _ = part_source(tmp_path / "binary.stl").draw(np.random.default_rng(0))(800)
     assert np.linalg.norm(np.ptp(a.position, axis=0)) == pytest.approx(1, rel=1e-3)
 
 
@@ -264,4 +264,4 @@ def test_what_is_checked_when_a_part_is_drawn(monkeypatch):
     elements[3] = elements[3, [1, 0, 2, 3]]
     monkeypatch.setattr(cad, "mesh_parts", lambda *_: [cad.Part(position, elements, "bad")] * 2)
     with pytest.raises(BadMesh, match="bad: 1 inverted tetrahedron: element 3"):
-        part_source().draw(np.random.default_rng(0), 100)
+        part_source().draw(np.random.default_rng(0))(100)

@@ -11,7 +11,7 @@ from ast_sim.simulate.shapes.parts import draw_structured, extruded, oriented, r
 def test_structured_parts_are_sound_and_of_the_wanted_size(nodes):
     names = set()
     for seed in range(24):
-        part = draw_structured(np.random.default_rng(seed), nodes)
+        part = draw_structured(np.random.default_rng(seed))(nodes)
         names.add(part.name)
         check_mesh(part.position, part.elements, part.name)
         assert volumes(part.position, part.elements).min() > 0
@@ -22,14 +22,14 @@ def test_structured_parts_are_sound_and_of_the_wanted_size(nodes):
 
 
 def test_the_same_seed_gives_the_same_part():
-    first, second = (draw_structured(np.random.default_rng(7), 800) for _ in range(2))
+    first, second = (draw_structured(np.random.default_rng(7))(800) for _ in range(2))
     assert np.array_equal(first.position, second.position) and np.array_equal(first.elements, second.elements)
-    assert not np.array_equal(first.position, draw_structured(np.random.default_rng(8), 800).position)
+    assert not np.array_equal(first.position, draw_structured(np.random.default_rng(8))(800).position)
 
 
 def test_parts_enclose_their_volume():
     for seed in range(12):
-        part = draw_structured(np.random.default_rng(seed), 600)
+        part = draw_structured(np.random.default_rng(seed))(600)
         a, b, c = part.position[boundary(part.elements)].transpose(1, 0, 2)
         enclosed = np.einsum("fi,fi->", np.cross(b - a, c - a), a) / 6  # divergence theorem: needs outward normals
         assert enclosed == pytest.approx(volumes(part.position, part.elements).sum(), rel=1e-9)
