@@ -12,6 +12,7 @@ import pytest
 
 from ast_sim.simulate.families.names import FAMILIES, MODULES
 from ast_sim.simulate.jobs.pool import WORKER_MODULE
+from ast_sim.simulate.jobs.rival import RIVAL_MODULE
 from ast_sim.simulate.shapes.cad import MESHING_MODULE
 
 ROOT = Path(__file__).parent.parent / "ast_sim"
@@ -84,7 +85,7 @@ def test_a_name_means_one_thing():
     assert not [name for name, count in names.items() if count > 1]
 
 
-@pytest.mark.parametrize("module", [WORKER_MODULE, MESHING_MODULE, *MODULES.values()])
+@pytest.mark.parametrize("module", [WORKER_MODULE, RIVAL_MODULE, MESHING_MODULE, *MODULES.values()])
 def test_modules_named_by_strings_are_there(module):
     """The check of imports does not see them."""
     assert find_spec(module) is not None

@@ -37,7 +37,6 @@ LAYERS = 2  # layers of elements through the thickness
 OBSTACLE_SHARE = 0.16  # share of the nodes that belong to the obstacle
 SMALLEST_ANGLE = np.radians(22)  # smallest angle of a triangle of the middle plane
 COARSE_ANGLE = np.radians(10)  # the same where the plate is meshed anew: the mesh need not be that good, but must exist
-NEARBY = (1.0, 0.95, 1.05, 0.9, 1.1)  # numbers of nodes that are tried, relative to the wanted one
 CLAMP_MARGIN = 0.05  # distance in metres, seen from above, between the obstacle and the clamps
 INFO = DatasetInfo(
     family="deforming_plate",
@@ -217,11 +216,10 @@ def _remeshed(shape: _Shape, share: float) -> _Plate:
     Raises:
         BadMesh: the curves of the plate come too close to each other for edges that long.
     """
-    for nearby in NEARBY:
-        mesh = shape.flat_mesh(share * nearby, COARSE_ANGLE)
-        if mesh is not None:
-            return _extruded(shape, mesh)
-    raise BadMesh(f"no mesh with {share:g} of the nodes has triangles of good shape: holes and sides are too close")
+    mesh = shape.flat_mesh(share, COARSE_ANGLE)
+    if mesh is None:
+        raise BadMesh(f"a mesh with {share:g} of the nodes has triangles of poor shape: holes and sides are too close")
+    return _extruded(shape, mesh)
 
 
 def _draw_touch(rng: np.random.Generator, plate: _Plate, obstacle: np.ndarray, press: np.ndarray) -> np.ndarray | None:

@@ -31,39 +31,36 @@ ENVIRONMENT = {
 }
 
 
-class Worker:
-    """One worker process and the sample that it makes.
+class Process:
+    """A module that runs in a process of its own and answers in lines of JSON.
 
     Args:
-        folder: where it stores finished samples.
-        recipe: the recipe of all its samples.
-        checkpoints: where it stores unfinished samples; `folder` if None.
+        module: its name.
+        arguments: its arguments. The number of this process is added to them.
     """
 
-    def __init__(self, folder: Path, recipe: Recipe, checkpoints: Path | None = None) -> None:
+    def __init__(self, module: str, *arguments: str) -> None:
         # Not multiprocessing: its spawned children import the parent's script again, and torch with it.
         root = str(Path(ast_sim.__file__).parent.parent)
         path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
-        arguments = [str(folder), str(checkpoints or folder), json.dumps(asdict(recipe)), str(os.getpid())]
         self.process = subprocess.Popen(
-            [sys.executable, "-P", "-m", WORKER_MODULE, *arguments],
+            [sys.executable, "-P", "-m", module, *arguments, str(os.getpid())],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env={**os.environ, **ENVIRONMENT, "PYTHONPATH": path},
             bufsize=0,
             start_new_session=True,  # an interrupt from the terminal reaches only the parent
         )
-        self.sample: Sample | None = None
         self._unfinished = b""  # the beginning of a line whose end has not come yet
 
     def fileno(self) -> int:
         """The file descriptor that becomes readable when the worker has said something."""
         return self.process.stdout.fileno()
 
-    def give(self, sample: Sample) -> None:
-        self.sample = sample
+    def say(self, line: str) -> None:
+        """Write a line to its standard input."""
         with contextlib.suppress(BrokenPipeError):  # `receive` reports a dead worker
-            self.process.stdin.write(f"{sample[0]} {sample[1]}\n".encode())
+            self.process.stdin.write(f"{line}\n".encode())
 
     def receive(self) -> list[dict[str, Any]]:
         """Wait until the worker says something; return its messages. If it has ended, the message is an error that says
@@ -85,6 +82,24 @@ class Worker:
         self.process.stdout.close()
         with contextlib.suppress(BrokenPipeError):
             self.process.stdin.close()
+
+
+class Worker(Process):
+    """One worker process and the sample that it makes.
+
+    Args:
+        folder: where it stores finished samples.
+        recipe: the recipe of all its samples.
+        checkpoints: where it stores unfinished samples; `folder` if None.
+    """
+
+    def __init__(self, folder: Path, recipe: Recipe, checkpoints: Path | None = None) -> None:
+        super().__init__(WORKER_MODULE, str(folder), str(checkpoints or folder), json.dumps(asdict(recipe)))
+        self.sample: Sample | None = None
+
+    def give(self, sample: Sample) -> None:
+        self.sample = sample
+        self.say(f"{sample[0]} {sample[1]}")
 
 
 class Pool:

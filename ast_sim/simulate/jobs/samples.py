@@ -10,6 +10,7 @@ import io
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from ast_sim.dataset.layout import SPLITS
 from ast_sim.dataset.solver_seconds import Seconds, split_seconds
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.families.names import family_module
+from ast_sim.simulate.mechanics.case import Drawn
 from ast_sim.simulate.mechanics.unfinished import Checkpoint
 from ast_sim.support.disk import replacing
 from ast_sim.support.provenance import processor
@@ -62,13 +64,7 @@ def make_sample(recipe: Recipe, split: str, index: int, checkpoint: Checkpoint |
         checkpoint: where an unfinished solve is kept. If there is one already, it goes on.
     """
     module = family_module(recipe.family)
-    sequence = np.random.SeedSequence(recipe.seed, spawn_key=(SPLITS.index(split), index))
-    options = {} if recipe.frames is None else {"frames": recipe.frames}
-    if recipe.parts is not None:
-        from ast_sim.simulate.shapes.part_source import part_source
-
-        options["parts"] = part_source(Path(recipe.parts))
-    case = module.draw(np.random.default_rng(sequence), recipe.nodes, **options)
+    case = module.draw(_random(recipe, split, index), recipe.nodes, **_options(recipe))
     if recipe.keep is not None:
         case = replace(case, targets=case.targets[[0, *recipe.keep]])
     if recipe.solver == "calculix":
@@ -79,6 +75,26 @@ def make_sample(recipe: Recipe, split: str, index: int, checkpoint: Checkpoint |
         trajectory = module.solve(case, checkpoint, recipe.patient)
     trajectory.attributes.update(seed=recipe.seed, index=index)
     return trajectory
+
+
+def draw_sample(recipe: Recipe, split: str, index: int) -> Drawn:
+    """The scene of a sample of a family without inertia, with all frames of its motion, and its other meshes."""
+    module = family_module(recipe.family)
+    return module.draw_geometry(_random(recipe, split, index), recipe.nodes, **_options(recipe))
+
+
+def _random(recipe: Recipe, split: str, index: int) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence(recipe.seed, spawn_key=(SPLITS.index(split), index)))
+
+
+def _options(recipe: Recipe) -> dict[str, Any]:
+    """The arguments of the drawing beside the number of nodes."""
+    options: dict[str, Any] = {} if recipe.frames is None else {"frames": recipe.frames}
+    if recipe.parts is not None:
+        from ast_sim.simulate.shapes.part_source import part_source
+
+        options["parts"] = part_source(Path(recipe.parts))
+    return options
 
 
 def sample_name(split: str, index: int) -> str:

@@ -32,21 +32,13 @@ from ast_sim.simulate.mechanics.unfinished import Checkpoint
 
 SECONDS_BETWEEN_REPORTS = 1.0
 
+Answer = Callable[[dict[str, Any]], None]
+
 
 def main() -> None:
     """Serve until the standard input ends, or the parent process is gone."""
     folder, checkpoints, recipe, parent = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], int(sys.argv[4])
-    _end_with(parent)
-    # Answers go to the real standard output, which nothing else may write to.
-    answers = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)
-
-    def answer(values: dict[str, Any]) -> None:
-        try:
-            print(json.dumps(values), file=answers)
-        except BrokenPipeError:  # nobody listens any more
-            os.killpg(0, signal.SIGKILL)
-
+    answer = answers_for(parent)
     for line in sys.stdin:
         split, index = line.split()
         checkpoint = Checkpoint(checkpoint_path(checkpoints, split, int(index)), _reporter(answer))
@@ -62,7 +54,23 @@ def main() -> None:
             answer({"error": text, "fatal": fatal, "traceback": traceback.format_exc()})
 
 
-def _reporter(answer: Callable[[dict[str, Any]], None]) -> Callable[[int, int, int], None]:
+def answers_for(parent: int) -> Answer:
+    """A function that answers the parent process with a line of JSON. This process ends when the parent has ended."""
+    _end_with(parent)
+    # Answers go to the real standard output, which nothing else may write to.
+    answers = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+
+    def answer(values: dict[str, Any]) -> None:
+        try:
+            print(json.dumps(values), file=answers)
+        except BrokenPipeError:  # nobody listens any more
+            os.killpg(0, signal.SIGKILL)
+
+    return answer
+
+
+def _reporter(answer: Answer) -> Callable[[int, int, int], None]:
     """The function that a solve calls with (frames done, frames in all, Newton iterations so far), at any rate."""
     last = time.monotonic()
 

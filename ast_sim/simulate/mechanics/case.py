@@ -10,6 +10,9 @@ import numpy as np
 from ast_sim.scene import AttributeValue, Scene
 from ast_sim.simulate.mechanics.contact_and_friction import ContactSettings
 from ast_sim.simulate.mechanics.material import NeoHookean
+from ast_sim.support.errors import SimulationError
+
+NEARBY = (1.0, 0.95, 1.05, 0.9, 1.1)  # sizes of meshes that are tried, relative to the wanted one
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,3 +59,18 @@ class Drawn:
 
     case: SolidCase
     remesh: Callable[[float], SolidCase]
+
+    def remesh_nearly(self, share: float) -> SolidCase:
+        """As `remesh`. If that mesh fails, others of nearly that size are tried, as a user would do.
+
+        Raises:
+            SimulationError: all of them failed. The text says why the first did.
+        """
+        first: SimulationError | None = None
+        for nearby in NEARBY:
+            try:
+                return self.remesh(nearby * share)
+            except SimulationError as error:
+                first = first or error
+        assert first is not None
+        raise first

@@ -42,6 +42,7 @@ class QuasiStatic:
         self.newton = Newton(elasticity, contact, prescribed, position, settings)
         self._damped: Newton | None = None
         self.halvings = 0
+        self.load_steps = 0  # those that converged
 
     @property
     def iterations(self) -> int:
@@ -58,14 +59,16 @@ class QuasiStatic:
         """Work in joule lost to friction so far."""
         return self.newton.dissipation + (self._damped.dissipation if self._damped else 0.0)
 
-    def advance(self, target: np.ndarray) -> None:
+    def advance(self, target: np.ndarray, first: float = 1.0) -> None:
         """Bring the prescribed nodes to `target` [N,3] (rows of free nodes are ignored) and the others to equilibrium.
+
+        The first load step goes that share of the way; at 1 the whole way is tried in one step.
 
         Raises:
             NotConverged: there is no equilibrium after the allowed halvings and damped steps.
         """
         start = self.newton.position
-        done, part, smallest = 0.0, 1.0, 0.5**self.newton.settings.max_halvings
+        done, part, smallest = 0.0, first, 0.5**self.newton.settings.max_halvings
         while done < 1:
             reached = min(1.0, done + part)
             goal = target if reached == 1 else start + reached * (target - start)
@@ -81,6 +84,7 @@ class QuasiStatic:
                     continue
                 self._advance_damped(goal, str(error))
             done = reached
+            self.load_steps += 1
 
     def _advance_damped(self, goal: np.ndarray, reason: str) -> None:
         """Take steps of backward Euler from rest, each with less inertia, until there is equilibrium without any."""

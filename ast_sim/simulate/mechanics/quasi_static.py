@@ -1,9 +1,11 @@
-"""From a drawn quasi-static case to a checked trajectory."""
+"""From a drawn quasi-static case to a checked trajectory, or straight to one frame of it."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from time import process_time
 
 import numpy as np
 
@@ -11,11 +13,12 @@ from ast_sim.scene import AttributeValue, Trajectory
 from ast_sim.simulate.mechanics.case import SolidCase
 from ast_sim.simulate.mechanics.contact_and_friction import Contact
 from ast_sim.simulate.mechanics.elasticity import Elasticity
-from ast_sim.simulate.mechanics.frames import FrameRecord, Frames
+from ast_sim.simulate.mechanics.frames import MAX_FRAME_ITERATIONS, FrameRecord, Frames, GivenUp
 from ast_sim.simulate.mechanics.load_step import QuasiStatic
 from ast_sim.simulate.mechanics.material import von_mises
 from ast_sim.simulate.mechanics.solver import SolverSettings
 from ast_sim.simulate.mechanics.unfinished import Checkpoint
+from ast_sim.support.errors import SimulationError
 
 # Components of a stress tensor as they are stored: xx, yy, zz, xy, yz, zx.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))
@@ -44,6 +47,71 @@ def quasi_static(
     The checkpoint keeps unfinished frames. If it holds some already, the solve goes on from them.
     """
     return SolidFrames(case, settings).trajectory(checkpoint, patient)
+
+
+@dataclass(frozen=True, eq=False)
+class OneFrame:
+    """A frame that was solved straight from rest, or why it was not.
+
+    Attributes:
+        position: [N,3] float64; None if there is no solution.
+        failure: why there is none; empty if there is one.
+        seconds: processor time of the solution on one thread, with that of steps that did not converge.
+        setup_seconds: processor time in which the solver was set up for the mesh.
+        load_steps, newton_iterations, halvings: how many of them the solution took.
+    """
+
+    position: np.ndarray | None
+    failure: str
+    seconds: float
+    setup_seconds: float
+    load_steps: int
+    newton_iterations: int
+    halvings: int
+
+
+def solve_frame(
+    case: SolidCase,
+    frame: int,
+    settings: SolverSettings | None = None,
+    first: float = 1.0,
+    most_iterations: int = MAX_FRAME_ITERATIONS,
+    most_seconds: float = math.inf,
+) -> OneFrame:
+    """Solve a case from rest straight to one of its frames. What was found is checked like a frame that is stored.
+
+    Args:
+        case: what to solve.
+        frame: number of the frame.
+        settings: tolerances.
+        first: share of the way that the first load step goes. A step that does not converge is halved.
+        most_iterations, most_seconds: Newton iterations and processor time after which the solution is given up.
+    """
+    started = process_time()
+    frames = SolidFrames(case, settings)
+    solver, began = frames.solver, process_time()
+
+    def watch(iterations: int) -> None:
+        if iterations > most_iterations:
+            raise GivenUp(f"more than {most_iterations} Newton iterations")
+        if process_time() - began > most_seconds:
+            raise GivenUp(f"more than {most_seconds:.3g} s of processor time")
+
+    frames.watch(watch)
+    position, failure = None, ""
+    try:
+        solver.advance(case.targets[frame], first)
+    except SimulationError as error:
+        failure = str(error)
+    seconds = process_time() - began
+    if not failure:
+        try:
+            frames.check({"position": solver.newton.position.astype(np.float32)})
+            position = solver.newton.position
+        except SimulationError as error:
+            failure = str(error)
+    effort = solver.load_steps, solver.iterations, solver.halvings
+    return OneFrame(position, failure, seconds, began - started, *effort)
 
 
 class SolidFrames(Frames):

@@ -103,7 +103,7 @@ def test_the_same_plate_on_coarser_meshes():
         np.testing.assert_array_equal(again.scene.rest_position, case.scene.rest_position)
         np.testing.assert_array_equal(again.targets, case.targets)
         for share in (0.5, 0.25):
-            coarse = drawn.remesh(share)
+            coarse = drawn.remesh_nearly(share)
             coarse.scene.check()
             plates = [c.scene.rest_position[c.scene.body == 0] for c in (case, coarse)]
             assert 0.7 * share <= len(plates[1]) / len(plates[0]) <= 1.5 * share
@@ -122,8 +122,8 @@ def _held(case, end) -> int:
 
 
 def test_a_plate_that_cannot_be_meshed_with_so_few_nodes_says_so():
-    with pytest.raises(BadMesh, match="no mesh with 0.001 of the nodes"):
-        draw_geometry(np.random.default_rng(1), 400, 9).remesh(0.001)
+    with pytest.raises(BadMesh, match="a mesh with 0.001 of the nodes has triangles of poor shape"):
+        draw_geometry(np.random.default_rng(1), 400, 9).remesh_nearly(0.001)
 
 
 def test_the_obstacle_comes_down_and_returns():

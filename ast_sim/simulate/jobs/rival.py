@@ -1,0 +1,236 @@
+"""What the solver takes for one frame: the rival of a learned model whose user wants the answer at one frame.
+
+Such a user would not solve all frames before. The solver goes straight from rest to the wanted frame, in the fewest
+load steps that converge, and is run in several ways that trade accuracy for time: looser stop tests, a longer range of
+contact, coarser meshes. `cheapest` finds the fastest way that is as accurate as the model.
+Each scene is solved in a process of its own, on one thread and without torch.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import selectors
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ast_sim.dataset.reader import Dataset
+from ast_sim.scene import Trajectory
+from ast_sim.simulate.jobs.display import Progress
+from ast_sim.simulate.jobs.pool import Process
+from ast_sim.simulate.jobs.recipe import recipe_of
+from ast_sim.simulate.jobs.samples import sample_name
+from ast_sim.support.errors import SimulationError
+
+RIVAL_MODULE = "ast_sim.simulate.jobs.rival_worker"
+OUTCOMES, POSITIONS = "outcomes.json", "positions.npz"
+MOST_ITERATIONS = 1000
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way to run the solver, relative to how it made the dataset.
+
+    Attributes:
+        name: what it is called.
+        nodes: share of the nodes of the deforming bodies.
+        dhat: factor of the range of contact.
+        tolerance: factor of the stop test, `SolverSettings.force_tolerance`.
+    """
+
+    name: str
+    nodes: float = 1.0
+    dhat: float = 1.0
+    tolerance: float = 1.0
+
+
+WAYS = (
+    Way("own stop test"),
+    Way("10x looser", tolerance=10),
+    Way("100x looser", tolerance=100),
+    Way("2x dhat", dhat=2),
+    Way("4x dhat", dhat=4),
+    Way("1/2 nodes", nodes=0.5),
+    Way("1/4 nodes", nodes=0.25),
+    Way("1/2 nodes, 10x looser", nodes=0.5, tolerance=10),
+    Way("1/4 nodes, 10x looser", nodes=0.25, tolerance=10),
+)
+STARTS = (1, 2, 4)
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What one way gave in one scene, of its cheapest start.
+
+    Attributes:
+        way: how the solver was run.
+        failure: why there is no solution, such as "could not be meshed: ..."; empty if there is one.
+        nodes: nodes of the scene, obstacles included.
+        start: the load steps that were planned. A step that did not converge was halved, and steps then grew again.
+        seconds: processor time of the solution on one thread, with that of the steps that did not converge, but
+            without meshing and setting up. The smallest of all repeats; infinite without a mesh.
+        setup_seconds: processor time in which the solver was set up for the mesh.
+        mesh_seconds: processor time of the meshing; 0 for the mesh of the dataset.
+        load_steps, newton_iterations, halvings: how many of them the solution took.
+        position: [N,3] float64, the nodes of the dataset's mesh in metres; None without a solution. A coarser mesh
+            gives the displacement of free nodes by linear interpolation; prescribed nodes are where they should be.
+        error: root of the mean square of the distances in metres to the dataset's frame, over the free nodes.
+        relative_error: `error` over the same root of the displacement of the dataset's frame. It says little where
+            hardly anything has moved.
+    """
+
+    way: Way
+    failure: str = ""
+    nodes: int = 0
+    start: int = 0
+    seconds: float = math.inf
+    setup_seconds: float = 0.0
+    mesh_seconds: float = 0.0
+    load_steps: int = 0
+    newton_iterations: int = 0
+    halvings: int = 0
+    position: np.ndarray | None = None
+    error: float = math.inf
+    relative_error: float = math.inf
+
+    @property
+    def converged(self) -> bool:
+        """Whether there is a solution."""
+        return not self.failure
+
+
+@dataclass(frozen=True, eq=False)
+class Rivals:
+    """All outcomes of one scene.
+
+    Attributes:
+        split, index: which trajectory of the dataset.
+        frame: which of its frames.
+        displacement: root of the mean square of the displacement in this frame in metres, over the free nodes.
+        draw_seconds: processor time in which the scene was drawn and meshed as in the dataset.
+        processor: where the times were measured.
+        outcomes: one for each way, in their order.
+    """
+
+    split: str
+    index: int
+    frame: int
+    displacement: float
+    draw_seconds: float
+    processor: str
+    outcomes: tuple[Outcome, ...]
+
+
+def cheapest(outcomes: Iterable[Outcome], error: float) -> Outcome | None:
+    """The fastest outcome whose relative error is at most `error`; None if there is none."""
+    fit = [outcome for outcome in outcomes if outcome.converged and outcome.relative_error <= error]
+    return min(fit, key=lambda outcome: outcome.seconds, default=None)
+
+
+def deepest_frame(trajectory: Trajectory) -> int:
+    """The number of the frame in which the free nodes are displaced most, in the mean square."""
+    moved = trajectory.position - trajectory.position[0]
+    free = ~trajectory.scene.prescribed
+    return int(np.square(moved[:, free], dtype=np.float64).sum(axis=(1, 2)).argmax())
+
+
+def rivals(
+    dataset: str | os.PathLike[str],
+    split: str,
+    indices: Sequence[int],
+    frame_of: Callable[[Trajectory], int] | Sequence[int] = deepest_frame,
+    *,
+    ways: Sequence[Way] = WAYS,
+    starts: Sequence[int] = STARTS,
+    repeats: int = 1,
+    parts: str | os.PathLike[str] | None = None,
+    most_iterations: int = MOST_ITERATIONS,
+    progress: bool = True,
+) -> Iterator[Rivals]:
+    """Solve one frame of each scene in every way; one scene after another, each in a process of its own.
+
+    Args:
+        dataset: a dataset that `generate` made with the bundled solver.
+        split, indices: which trajectories.
+        frame_of: the number of the frame of each trajectory, from 1: a function of it, or one number for each index.
+        ways: how the solver is run.
+        starts: in how many load steps each way is tried. The cheapest that converges counts.
+        repeats: how often each is timed. The smallest time counts.
+        parts: where the parts lie, if the dataset was made of the user's own.
+        most_iterations: Newton iterations after which a try is given up.
+        progress: show a bar on a terminal and lines elsewhere.
+
+    Raises:
+        SimulationError: the dataset was not made by the bundled solver or from a family with inertia; there is no such
+            frame; drawing the scene again gives another one; or a process ended before its time.
+        DatasetError: the dataset cannot be read, or there is no such trajectory.
+    """
+    if not starts or min(starts) < 1 or repeats < 1:
+        raise SimulationError(f"starts {list(starts)} and repeats {repeats} must be at least 1")
+    with Dataset(dataset) as data:
+        recipe = recipe_of(str(dataset), data.info, None if parts is None else Path(parts))
+        frames = [_frame(data, split, index, which, frame_of) for which, index in enumerate(indices)]
+    request = {
+        "dataset": str(Path(dataset).resolve()),
+        "recipe": asdict(recipe),
+        "ways": [asdict(way) for way in ways],
+        "starts": list(starts),
+        "repeats": repeats,
+        "most_iterations": most_iterations,
+    }
+    tasks = [{**request, "split": split, "index": int(i), "frame": k} for i, k in zip(indices, frames, strict=True)]
+    return _all(tasks, progress)
+
+
+def _frame(
+    data: Dataset, split: str, index: int, which: int, frame_of: Callable[[Trajectory], int] | Sequence[int]
+) -> int:
+    """The wanted frame of a trajectory, after a check; `which` is the place of its index among the indices."""
+    if not callable(frame_of) and which >= len(frame_of):
+        raise SimulationError(f"{len(frame_of)} frames are too few: give one for each index")
+    frame = frame_of(data.load(split, index)) if callable(frame_of) else frame_of[which]
+    count = data.num_frames(split, index)
+    if not 1 <= frame < count:
+        raise SimulationError(f"{data.path}: {sample_name(split, index)} has no frame {frame}: 1 to {count - 1}")
+    return int(frame)
+
+
+def _all(tasks: list[dict[str, Any]], progress: bool) -> Iterator[Rivals]:
+    with Progress(len(tasks), 0, "scenes", progress) as bar:
+        for task in tasks:
+            name = sample_name(task["split"], task["index"])
+            bar.begin(name)
+            found = _one(task, name, bar)
+            bar.end(name)
+            bar.advance()
+            yield found
+
+
+def _one(task: dict[str, Any], name: str, bar: Progress) -> Rivals:
+    """Have a process solve a scene; read what it leaves in a folder."""
+    with tempfile.TemporaryDirectory(prefix="ast_sim-") as folder, selectors.DefaultSelector() as selector:
+        process = Process(RIVAL_MODULE, folder)
+        try:
+            process.say(json.dumps(task))
+            selector.register(process, selectors.EVENT_READ)
+            while not selector.select(timeout=1.0):
+                bar.tick()
+            (answer, *_) = process.receive()
+        finally:
+            process.stop()
+        if "error" in answer:
+            raise SimulationError(f"{name}: {answer['error']}")
+        facts = json.loads((Path(folder) / OUTCOMES).read_text(encoding="utf-8"))
+        with np.load(Path(folder) / POSITIONS, allow_pickle=False) as file:
+            positions = {int(key): file[key] for key in file.files}
+    outcomes = (
+        Outcome(**{**values, "way": Way(**values["way"]), "position": positions.get(place)})
+        for place, values in enumerate(facts.pop("outcomes"))
+    )
+    return Rivals(task["split"], task["index"], task["frame"], **facts, outcomes=tuple(outcomes))

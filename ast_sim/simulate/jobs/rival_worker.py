@@ -1,0 +1,187 @@
+"""A process that solves one frame of one scene in several ways, and times each.
+
+    python -m ast_sim.simulate.jobs.rival_worker FOLDER PARENT
+
+It reads one line from its standard input, a task as JSON: `dataset`, `recipe`, `split`, `index`, `frame`, `ways`,
+`starts`, `repeats`, `most_iterations` (see `rival`). It writes the outcomes to FOLDER and answers with a line of JSON:
+`done`, or `error`. Like every worker it has one thread, never imports torch, and ends when its parent has ended.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ast_sim.dataset.reader import Dataset
+from ast_sim.scene import Scene
+from ast_sim.simulate.families.names import family_module
+from ast_sim.simulate.jobs.rival import OUTCOMES, POSITIONS, Outcome, Way
+from ast_sim.simulate.jobs.samples import Recipe, draw_sample
+from ast_sim.simulate.jobs.worker import answers_for
+from ast_sim.simulate.mechanics.case import Drawn, SolidCase
+from ast_sim.simulate.mechanics.quasi_static import OneFrame, solve_frame
+from ast_sim.simulate.mechanics.solver import SolverSettings
+from ast_sim.simulate.shapes.mesh_transfer import transferred
+from ast_sim.support.errors import SimulationError
+from ast_sim.support.provenance import processor
+
+SAME_PLACE = 1e-6  # largest distance of a node from its place in the dataset, relative to the size of the scene
+
+
+def main() -> None:
+    """Answer one task."""
+    folder, parent = Path(sys.argv[1]), int(sys.argv[2])
+    answer = answers_for(parent)
+    try:
+        facts, positions = outcomes_of(json.loads(sys.stdin.readline()))
+        np.savez(folder / POSITIONS, **positions)
+        (folder / OUTCOMES).write_text(json.dumps(facts), encoding="utf-8")
+        answer({"done": True})
+    except SimulationError as error:
+        answer({"error": str(error)})
+    except Exception as error:
+        answer({"error": f"{type(error).__name__}: {error}"})
+
+
+def outcomes_of(task: dict[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Solve a task: the facts as JSON values, and the positions of outcome i by the name "i"."""
+    recipe = Recipe(**task["recipe"])
+    with Dataset(task["dataset"]) as dataset:
+        scene = dataset.scene(task["split"], task["index"])
+        truth = dataset.frames(task["split"], task["index"], task["frame"], task["frame"] + 1)[0][0].astype(np.float64)
+    frame = task["frame"] if recipe.keep is None else recipe.keep[task["frame"] - 1]
+    started = _seconds()
+    drawn = draw_sample(recipe, task["split"], task["index"])
+    draw_seconds = _seconds() - started
+    _require_same(drawn.case.scene, scene)
+    solver = WaySolver(drawn, frame, truth, family_module(recipe.family).SETTINGS, task)
+    found = [solver.outcome(Way(**way)) for way in task["ways"]]
+    facts = {
+        "displacement": solver.displacement,
+        "draw_seconds": draw_seconds,
+        "processor": processor(),
+        "outcomes": [asdict(replace(outcome, position=None)) for outcome in found],
+    }
+    return facts, {str(i): outcome.position for i, outcome in enumerate(found) if outcome.position is not None}
+
+
+def _seconds() -> float:
+    """Processor time of this process and of those that it has started, such as gmsh."""
+    return sum(os.times()[:4])
+
+
+def _require_same(drawn: Scene, stored: Scene) -> None:
+    """Raise SimulationError if the scene drawn again is not the one of the dataset."""
+    same = drawn.num_nodes == stored.num_nodes and np.array_equal(drawn.elements, stored.elements)
+    if same:
+        extent = np.ptp(stored.rest_position, axis=0).max()
+        same = np.abs(drawn.rest_position - stored.rest_position).max() <= SAME_PLACE * extent
+    if not same:
+        raise SimulationError(
+            "drawing the scene again gives another one than the dataset holds: use the versions of the packages that"
+            " the dataset names (`ast-sim info`)"
+        )
+
+
+class WaySolver:
+    """Solves one frame of a drawn scene in one way after another.
+
+    Args:
+        drawn: the scene.
+        frame: number of the frame in the motion of the scene.
+        truth: [N,3] float64, the dataset's positions in this frame.
+        settings: the tolerances with which the dataset was made.
+        effort: `starts`, `repeats` and `most_iterations`.
+    """
+
+    def __init__(
+        self, drawn: Drawn, frame: int, truth: np.ndarray, settings: SolverSettings, effort: dict[str, Any]
+    ) -> None:
+        self.drawn, self.frame, self.truth, self.settings, self.effort = drawn, frame, truth, settings, effort
+        self.free = ~drawn.case.scene.prescribed
+        self.rest = drawn.case.scene.rest_position.astype(np.float64)
+        self.displacement = _root_mean_square((truth - self.rest)[self.free])
+        self._meshes: dict[float, tuple[SolidCase | str, float]] = {1.0: (drawn.case, 0.0)}
+        # The libraries are loaded in the first solution; nobody's time should hold that.
+        solve_frame(drawn.case, frame, settings, most_iterations=1)
+
+    def outcome(self, way: Way) -> Outcome:
+        """Mesh and solve in this way; the cheapest of all starts that converge."""
+        if way.nodes not in self._meshes:
+            self._meshes[way.nodes] = self._meshed(way.nodes)
+        case, mesh_seconds = self._meshes[way.nodes]
+        if not isinstance(case, SolidCase):
+            return Outcome(way, f"could not be meshed: {case}", mesh_seconds=mesh_seconds)
+        case = replace(case, contact=replace(case.contact, dhat=way.dhat * case.contact.dhat))
+        settings = replace(self.settings, force_tolerance=way.tolerance * self.settings.force_tolerance)
+        start, found = self._fastest(case, settings)
+        position, error = None, np.inf
+        if found.position is not None:
+            position = found.position if way.nodes == 1 else self._on_own_mesh(case, found.position)
+            error = _root_mean_square((position - self.truth)[self.free])
+        return Outcome(
+            way,
+            found.failure,
+            case.scene.num_nodes,
+            start,
+            found.seconds,
+            found.setup_seconds,
+            mesh_seconds,
+            found.load_steps,
+            found.newton_iterations,
+            found.halvings,
+            position,
+            error,
+            error / max(self.displacement, np.finfo(float).tiny),
+        )
+
+    def _meshed(self, share: float) -> tuple[SolidCase | str, float]:
+        """The scene with that share of the nodes, or why there is none; and the processor time of all tries."""
+        started = _seconds()
+        try:
+            found: SolidCase | str = self.drawn.remesh_nearly(share)
+        except SimulationError as error:
+            found = str(error)
+        return found, _seconds() - started
+
+    def _fastest(self, case: SolidCase, settings: SolverSettings) -> tuple[int, OneFrame]:
+        """The start with the fastest solution, and the solution; without any, the start that failed fastest."""
+        best: tuple[int, OneFrame] | None = None
+        for start in self.effort["starts"]:
+            for _ in range(self.effort["repeats"]):
+                # Whoever takes longer than the best so far cannot be the fastest.
+                most = best[1].seconds if best is not None and not best[1].failure else np.inf
+                found = solve_frame(
+                    case, self.frame, settings, 1 / start, self.effort["most_iterations"], most_seconds=most
+                )
+                if best is None or (bool(found.failure), found.seconds) < (bool(best[1].failure), best[1].seconds):
+                    best = start, found
+        assert best is not None
+        return best
+
+    def _on_own_mesh(self, case: SolidCase, position: np.ndarray) -> np.ndarray:
+        """Positions of the nodes of the dataset's mesh, from those of another mesh of the same bodies."""
+        scene = case.scene
+        rest = scene.rest_position.astype(np.float64)
+        result = self.drawn.case.targets[self.frame].copy()
+        body = scene.body[scene.elements[:, 0]]
+        for number in np.unique(self.drawn.case.scene.body[self.free]):
+            nodes = self.free & (self.drawn.case.scene.body == number)
+            elements = scene.elements[body == number]
+            result[nodes] = self.rest[nodes] + transferred(rest, elements, position - rest, self.rest[nodes])
+        return result
+
+
+def _root_mean_square(vectors: np.ndarray) -> float:
+    """Root of the mean of the squared lengths of vectors [n,3]."""
+    return float(np.sqrt(np.square(vectors).sum(axis=1).mean()))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,163 @@
+"""The solver at one frame, as the rival of a model: real solves of tiny scenes in real worker processes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ast_sim.dataset.reader import Dataset
+from ast_sim.dataset.writer import DatasetWriter
+from ast_sim.simulate.jobs.generate import generate
+from ast_sim.simulate.jobs.recipe import recipe_of
+from ast_sim.simulate.jobs.rival import WAYS, Outcome, Way, cheapest, deepest_frame, rivals
+from ast_sim.simulate.jobs.rival_worker import WaySolver
+from ast_sim.simulate.jobs.samples import Recipe, draw_sample
+from ast_sim.simulate.mechanics.solver import SolverSettings
+from ast_sim.simulate.shapes.mesh_check import BadMesh
+from ast_sim.support.errors import DatasetError, SimulationError
+
+OWN, LOOSER = Way("own stop test"), Way("10x looser", tolerance=10)
+SETTINGS = {"seed": 5, "nodes": 150, "frames": 9, "workers": 1, "progress": False}
+
+
+@pytest.fixture(scope="module")
+def plates(tmp_path_factory):
+    return generate(
+        "deforming_plate", tmp_path_factory.mktemp("rival") / "a.h5", train=2, valid=0, test=0, **SETTINGS
+    ).path
+
+
+@pytest.fixture
+def no_torch(tmp_path, monkeypatch):
+    """A process that imports torch fails."""
+    folder = tmp_path / "no_torch"
+    folder.mkdir()
+    (folder / "torch.py").write_text("raise AssertionError('torch was imported')")
+    monkeypatch.setenv("PYTHONPATH", str(folder))
+
+
+def changed(plates, path, generator=None, **changes):
+    """The dataset with other facts about itself."""
+    with Dataset(plates) as data:
+        info = replace(data.info, generator=data.info.generator if generator is None else generator, **changes)
+        with DatasetWriter(path, info) as writer:
+            for trajectory in data["train"]:
+                writer.add("train", trajectory)
+    return path
+
+
+def test_every_way_is_solved_and_compared_with_the_dataset(plates, no_torch, capsys):
+    found = list(rivals(plates, "train", [0, 1], repeats=2))
+    assert "2 of 2 scenes" in capsys.readouterr().err
+    assert [(scene.split, scene.index) for scene in found] == [("train", 0), ("train", 1)]
+    with Dataset(plates) as data:
+        for scene in found:
+            truth = data.load("train", scene.index)
+            frame, free = truth.position[scene.frame].astype(float), ~truth.scene.prescribed
+            assert scene.frame == deepest_frame(truth) and scene.draw_seconds > 0 and scene.processor
+            moved = frame - truth.position[0]
+            assert scene.displacement == pytest.approx(np.sqrt((moved[free] ** 2).sum(axis=1).mean()), rel=1e-6)
+            assert [outcome.way for outcome in scene.outcomes] == list(WAYS)
+            for outcome in scene.outcomes:
+                assert outcome.converged and outcome.position.dtype == np.float64
+                # Prescribed nodes are exact, up to the float32 of the dataset.
+                np.testing.assert_allclose(outcome.position[~free], frame[~free], atol=1e-7)
+                error = np.sqrt(((outcome.position - frame)[free] ** 2).sum(axis=1).mean())
+                assert outcome.error == pytest.approx(error) and outcome.relative_error == error / scene.displacement
+                assert 0 < outcome.seconds < 30 and outcome.setup_seconds > 0 and outcome.newton_iterations > 0
+                assert outcome.start in (1, 2, 4) and outcome.load_steps >= (1, 2, 3)[(1, 2, 4).index(outcome.start)]
+                assert (outcome.nodes < truth.scene.num_nodes) == (outcome.way.nodes < 1)
+
+
+def test_the_own_stop_test_gives_the_frame_of_the_dataset(plates):
+    """Without friction there is one equilibrium here. Both solves leave forces of at most 1e-4 of the mean force of an
+    element, so their positions differ by about that share of the displacement; looser tests by as much more.
+    """
+    for scene in rivals(plates, "train", [0, 1], lambda _: 5, ways=WAYS[:3], progress=False):
+        assert scene.frame == 5
+        for outcome, most in zip(scene.outcomes, (1e-4, 1e-3, 1e-2), strict=True):
+            assert outcome.relative_error <= 3 * most, outcome.way
+
+
+def test_coarser_meshes_and_a_longer_range_of_contact_differ_but_resemble_it(plates):
+    (scene,) = rivals(plates, "train", [0], ways=WAYS[3:7], starts=[1], progress=False)
+    doubled, fourfold, half, quarter = (outcome.relative_error for outcome in scene.outcomes)
+    assert 1e-3 < doubled < fourfold < 0.3
+    assert 1e-3 < half < quarter < 0.6
+
+
+def test_what_fails_is_said_and_not_raised(plates):
+    (scene,) = rivals(plates, "train", [0], [5], ways=[OWN, LOOSER], most_iterations=2, progress=False)
+    for outcome in scene.outcomes:
+        assert outcome.failure == "more than 2 Newton iterations" and outcome.position is None and outcome.seconds > 0
+    assert cheapest(scene.outcomes, 1.0) is None
+
+    def refuse(share):
+        asked.append(share)
+        raise BadMesh(f"no mesh with {share:g} of the nodes")
+
+    asked, drawn = [], draw_sample(Recipe("deforming_plate", 5, 150, 9), "train", 0)
+    effort = {"starts": [1], "repeats": 1, "most_iterations": 9}
+    solver = WaySolver(replace(drawn, remesh=refuse), 5, drawn.case.targets[5], SolverSettings(), effort)
+    outcomes = [solver.outcome(way) for way in WAYS[5:]]
+    assert outcomes[0].failure == "could not be meshed: no mesh with 0.5 of the nodes"
+    assert outcomes[3].failure == "could not be meshed: no mesh with 0.25 of the nodes"
+    assert not outcomes[0].converged and outcomes[0].relative_error == outcomes[0].seconds == np.inf
+    assert asked[:2] == [0.5, 0.475] and len(asked) == 10  # each share is meshed once, with sizes near it
+
+
+def test_the_cheapest_is_the_fastest_that_is_as_accurate():
+    fast, slow = (Outcome(OWN, seconds=s, relative_error=e) for s, e in ((1.0, 0.05), (2.0, 0.01)))
+    failed = Outcome(LOOSER, "no equilibrium", seconds=0.1)
+    assert cheapest([failed, slow, fast], 0.05) is fast
+    assert cheapest([failed, slow, fast], 0.04) is slow
+    assert cheapest([failed, slow, fast], 0.001) is None
+
+
+def test_kept_frames_are_frames_of_the_whole_motion(plates, tmp_path):
+    kept = generate("deforming_plate", tmp_path / "b.h5", train=1, valid=0, test=0, keep=(3, 6), **SETTINGS).path
+    (scene,) = rivals(kept, "train", [0], [2], ways=[OWN], starts=[1], progress=False)
+    (whole,) = rivals(plates, "train", [0], [6], ways=[OWN], starts=[1], progress=False)
+    assert scene.outcomes[0].relative_error <= 3e-4
+    np.testing.assert_array_equal(scene.outcomes[0].position, whole.outcomes[0].position)
+
+
+def test_only_datasets_of_the_bundled_solver_have_a_rival(plates, tmp_path):
+    with Dataset(plates) as data:
+        generator = data.info.generator
+        assert recipe_of("a.h5", data.info).nodes == 150
+    cases = {
+        "converted": {"generator": {"program": "another"}},
+        "calculix": {"generator": {**generator, "solver": "calculix"}},
+        "cloth": {"family": "sphere_simple", "integration": "dynamic"},
+    }
+    for name, changes in cases.items():
+        path = changed(plates, tmp_path / f"{name}.h5", **changes)
+        with pytest.raises(SimulationError, match="was not generated by the bundled solver"):
+            rivals(path, "train", [0])
+    broken = changed(plates, tmp_path / "broken.h5", {**generator, "nodes": "many"})
+    with pytest.raises(SimulationError, match="its settings cannot be read"):
+        rivals(broken, "train", [0])
+    other = changed(plates, tmp_path / "other.h5", {**generator, "seed": 6})
+    with pytest.raises(SimulationError, match="train/000000: drawing the scene again gives another one"):
+        list(rivals(other, "train", [0], progress=False))
+    with pytest.raises(SimulationError, match="not made of parts of your own"):
+        rivals(plates, "train", [0], parts=tmp_path)
+
+
+def test_frames_and_trajectories_that_are_not_there(plates):
+    for frames in ([0], [9], lambda _: 9):
+        with pytest.raises(SimulationError, match="train/000000 has no frame [09]: 1 to 8"):
+            rivals(plates, "train", [0], frames)
+    with pytest.raises(SimulationError, match="1 frames are too few"):
+        rivals(plates, "train", [0, 1], [3])
+    with pytest.raises(DatasetError, match="no sample 2 in train"):
+        rivals(plates, "train", [2])
+    with pytest.raises(SimulationError, match="must be at least 1"):
+        rivals(plates, "train", [0], starts=[0])
+
+
+def test_a_process_that_ends_before_its_time_is_named(plates, monkeypatch):
+    monkeypatch.setattr("ast_sim.simulate.jobs.rival.RIVAL_MODULE", "ast_sim.no_such_module")
+    with pytest.raises(SimulationError, match="train/000000: its worker process"):
+        list(rivals(plates, "train", [0], progress=False))
