@@ -33,6 +33,7 @@ INCREMENTS = 20
 FRAMES = INCREMENTS + 1
 DEFAULT_NODES = 4000
 MINIMUM_NODES = 200
+COARSE_ANGLE = 1.0  # smallest dihedral angle in degrees of pairs that are meshed anew: enough for the solver
 DRAWS = 30  # draws of parts and placements before a sample is given up
 # Without friction, parts slide off each other, and that costs most iterations. Bent flanges touch their own webs.
 CONTACT = ContactSettings(dhat=1e-3, stiffness=1e6, friction=0.15, self_contact=True)
@@ -108,7 +109,7 @@ def _remeshed(
     Raises:
         BadMesh, MeshingFailed, Unsuitable: there is no such mesh.
     """
-    parts = mesh(round(share * nodes))
+    parts = mesh(round(share * nodes), COARSE_ANGLE)
     if sum(len(part.position) for part in parts) == len(pair.position) and share != 1:
         raise Unsuitable("there is no other mesh of these parts with that few nodes")
     other, raised = put_likewise(pair, drawn, parts, 2 * CONTACT.dhat)

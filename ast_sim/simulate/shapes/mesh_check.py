@@ -27,13 +27,13 @@ class BadMesh(SimulationError):
     """A mesh or surface that cannot be a part of a scene."""
 
 
-def check_mesh(position: np.ndarray, elements: np.ndarray, name: str) -> None:
+def check_mesh(position: np.ndarray, elements: np.ndarray, name: str, smallest_angle: float = SMALLEST_ANGLE) -> None:
     """Check a solid body, positions [N,3] and tetrahedra [E,4].
 
     Raises:
         BadMesh: the text names the part, what is wrong and where: no tetrahedra, too many nodes, numbers that are not
             finite, two nodes at one place, elements that are inverted, flat or with a dihedral angle below
-            `SMALLEST_ANGLE`, no volume, several pieces, or a surface that cuts itself.
+            `smallest_angle` degrees, no volume, several pieces, or a surface that cuts itself.
     """
     if len(elements) == 0:
         raise BadMesh(f"{name}: it holds no tetrahedra")
@@ -57,11 +57,11 @@ def check_mesh(position: np.ndarray, elements: np.ndarray, name: str) -> None:
     _check_volume(volume.sum(), diagonal, name)
     _check_pieces(_element_pieces(elements), centre, name, "not joined by a common face")
     angle = smallest_dihedral(position, elements)
-    sharp = angle < SMALLEST_ANGLE
+    sharp = angle < smallest_angle
     if sharp.any():
         first = int(np.argmin(angle))
         raise BadMesh(
-            f"{name}: {_count(sharp, 'tetrahedron', 'tetrahedra')} with a dihedral angle below {SMALLEST_ANGLE:g}"
+            f"{name}: {_count(sharp, 'tetrahedron', 'tetrahedra')} with a dihedral angle below {smallest_angle:g}"
             f" degrees, the sharpest with {angle[first]:.2g}: {_at(first, elements, centre)}; mesh it anew"
         )
     check_no_intersections(position, boundary(elements), name)

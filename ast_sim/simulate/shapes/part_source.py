@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -14,7 +13,7 @@ import meshio
 import numpy as np
 
 from ast_sim.simulate.shapes import cad
-from ast_sim.simulate.shapes.mesh_check import BadMesh, check_mesh, check_surface, merged
+from ast_sim.simulate.shapes.mesh_check import SMALLEST_ANGLE, BadMesh, check_mesh, check_surface, merged
 from ast_sim.simulate.shapes.parts import Part, draw_structured, oriented, volumes
 from ast_sim.support.errors import MissingExtra, SimulationError
 
@@ -24,7 +23,15 @@ TRIAL_NODES = 1000  # nodes of the mesh that checks a CAD file
 _IGNORED = (".txt", ".md", ".json")  # notes that may lie beside the parts
 
 
-Mesher = Callable[[int], tuple[Part, Part]]
+class Mesher(Protocol):
+    """Meshes two parts, any number of times."""
+
+    def __call__(self, nodes: int, smallest_angle: float = SMALLEST_ANGLE) -> tuple[Part, Part]:
+        """Meshes with about `nodes` nodes together and no dihedral angle below that one, in degrees.
+
+        Raises:
+            BadMesh, MeshingFailed: these parts cannot be used. Others may be.
+        """
 
 
 class PartSource(Protocol):
@@ -43,10 +50,7 @@ class PartSource(Protocol):
         """Raise SimulationError if a part that may be drawn is broken."""
 
     def draw(self, rng: np.random.Generator) -> Mesher:
-        """Two parts: a function that meshes both, with about a given number of nodes together, any number of times.
-
-        It raises BadMesh or MeshingFailed if these parts cannot be used. Others may be.
-        """
+        """Two parts, ready to be meshed."""
 
 
 def part_source(parts: Path | None = None) -> PartSource:
@@ -83,7 +87,9 @@ class GrammarParts:
     def draw(self, rng: np.random.Generator) -> Mesher:
         (name_a, steps_a), (name_b, steps_b) = cad.draw_solid(rng), cad.draw_solid(rng)
         requests, names = [{"solid": steps_a}, {"solid": steps_b}], [name_a, name_b]
-        return lambda nodes: _checked(cad.mesh_parts(requests, names, nodes))
+        return lambda nodes, smallest_angle=SMALLEST_ANGLE: _checked(
+            cad.mesh_parts(requests, names, nodes), smallest_angle
+        )
 
 
 @dataclass(frozen=True)
@@ -100,7 +106,7 @@ class StructuredParts:
 
     def draw(self, rng: np.random.Generator) -> Mesher:
         shapes = [draw_structured(rng), draw_structured(rng)]
-        return lambda nodes: _checked([shape(nodes // 2) for shape in shapes])
+        return lambda nodes, smallest_angle=SMALLEST_ANGLE: _checked([s(nodes // 2) for s in shapes], smallest_angle)
 
 
 @dataclass(frozen=True)
@@ -125,12 +131,12 @@ class FileParts:
         count = len(self.files)
         chosen = [0, 0] if count == 1 else rng.choice(count, 2, replace=False)
         files = [self.files[i] for i in chosen]
-        return lambda nodes: _checked(_load(files, nodes))
+        return lambda nodes, smallest_angle=SMALLEST_ANGLE: _checked(_load(files, nodes), smallest_angle)
 
 
-def _checked(parts: list[Part]) -> tuple[Part, Part]:
+def _checked(parts: list[Part], smallest_angle: float) -> tuple[Part, Part]:
     for part in parts:
-        check_mesh(part.position, part.elements, part.name)
+        check_mesh(part.position, part.elements, part.name, smallest_angle)
     first, second = parts
     return first, second
 

@@ -199,7 +199,7 @@ def test_parts_that_are_meshes_have_no_other_mesh():
         mesher = "none"
 
         def draw(self, rng):
-            return lambda nodes: (block((1, 1, 1)), block((1, 1, 1)))
+            return lambda nodes, smallest_angle=5.0: (block((1, 1, 1)), block((1, 1, 1)))
 
     drawn = abcd.draw_geometry(np.random.default_rng(0), 300, Given())
     with pytest.raises(Unsuitable, match="no other mesh"):
