@@ -35,53 +35,68 @@ typedef float corner __attribute__((vector_size(16), aligned(4), may_alias));
 typedef struct {
   const ast_elastic *s;
   const float *position, *rest, *direction; /* copies that may be read one float past the end; direction is NULL for the forces */
-  float *forces;                            /* [E,CORNERS] */
+  float *forces;                            /* [E up to a multiple of VW,CORNERS] */
   float *out;                               /* [N,3] */
 } elastic_job;
 
 /* ---- corners of VW elements <-> one vector per coordinate ---- */
 
+/* Of vectors in blocks of four: a0 b0 a1 b1, a2 b2 a3 b3, a0 a1 b0 b1, a2 a3 b2 b3 of each block; then those at even and odd places. */
 #if AST_VECTOR_BYTES == 64
-typedef float half __attribute__((vector_size(32)));
-AST_INLINE half elastic_pair(const float *x, const int64_t *nodes) {
-  const corner a = *(const corner *)(x + 3 * nodes[0]), b = *(const corner *)(x + 3 * nodes[1]);
-  return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7);
-}
-AST_INLINE vf elastic_corners(const float *x, const int64_t *nodes) {
-  return __builtin_shufflevector(elastic_pair(x, nodes), elastic_pair(x, nodes + 2), 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-}
+#define BLOCKS(a, b, i, j, k, l) \
+  __builtin_shufflevector(a, b, i, j, k, l, i + 4, j + 4, k + 4, l + 4, i + 8, j + 8, k + 8, l + 8, i + 12, j + 12, k + 12, l + 12)
 #define EVEN(a, b) __builtin_shufflevector(a, b, 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30)
 #define ODD(a, b)  __builtin_shufflevector(a, b, 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31)
 #elif AST_VECTOR_BYTES == 32
-AST_INLINE vf elastic_corners(const float *x, const int64_t *nodes) {
-  const corner a = *(const corner *)(x + 3 * nodes[0]), b = *(const corner *)(x + 3 * nodes[1]);
-  return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7);
-}
-#define EVEN(a, b) __builtin_shufflevector(a, b, 0, 2, 4, 6, 8, 10, 12, 14)
-#define ODD(a, b)  __builtin_shufflevector(a, b, 1, 3, 5, 7, 9, 11, 13, 15)
+#define BLOCKS(a, b, i, j, k, l) __builtin_shufflevector(a, b, i, j, k, l, i + 4, j + 4, k + 4, l + 4)
+#define EVEN(a, b)               __builtin_shufflevector(a, b, 0, 2, 4, 6, 8, 10, 12, 14)
+#define ODD(a, b)                __builtin_shufflevector(a, b, 1, 3, 5, 7, 9, 11, 13, 15)
 #else
-AST_INLINE vf elastic_corners(const float *x, const int64_t *nodes) { return vload(x + 3 * nodes[0]); }
-#define EVEN(a, b) __builtin_shufflevector(a, b, 0, 2, 4, 6)
-#define ODD(a, b)  __builtin_shufflevector(a, b, 1, 3, 5, 7)
+#define BLOCKS(a, b, i, j, k, l) __builtin_shufflevector(a, b, i, j, k, l)
+#define EVEN(a, b)               __builtin_shufflevector(a, b, 0, 2, 4, 6)
+#define ODD(a, b)                __builtin_shufflevector(a, b, 1, 3, 5, 7)
 #endif
+#define BLOCKS_LOW(a, b)   BLOCKS(a, b, 0, VW, 1, VW + 1)
+#define BLOCKS_HIGH(a, b)  BLOCKS(a, b, 2, VW + 2, 3, VW + 3)
+#define BLOCKS_FIRST(a, b) BLOCKS(a, b, 0, 1, VW, VW + 1)
+#define BLOCKS_LAST(a, b)  BLOCKS(a, b, 2, 3, VW + 2, VW + 3)
 
-/* edges[i][j]: coordinate i of x_(j+1) - x_0, of the first n elements; the lanes beyond hold the last of them. */
-AST_INLINE void elastic_edges(const float *x, const int64_t *elements, int64_t n, vf edges[3][3]) {
-  vf row[CORNERS];
+/* Four floats from node nodes[16 b] on in each block b: the same corner of every fourth element. */
+AST_INLINE vf elastic_load(const float *x, const int64_t *nodes) {
+  const corner a = *(const corner *)(x + 3 * nodes[0]);
+#if AST_VECTOR_BYTES == 16
+  return a;
+#else
+  typedef float pair __attribute__((vector_size(32)));
+  const pair ab = __builtin_shufflevector(a, *(const corner *)(x + 3 * nodes[16]), 0, 1, 2, 3, 4, 5, 6, 7);
+#if AST_VECTOR_BYTES == 32
+  return ab;
+#else
+  const corner c = *(const corner *)(x + 3 * nodes[32]), d = *(const corner *)(x + 3 * nodes[48]);
+  return __builtin_shufflevector(ab, (pair)__builtin_shufflevector(c, d, 0, 1, 2, 3, 4, 5, 6, 7), 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12,
+                                 13, 14, 15);
+#endif
+#endif
+}
+
+/* edges[i][j]: coordinate i of x_(j+1) - x_0 of VW elements. */
+AST_INLINE void elastic_edges(const float *x, const int64_t *elements, vf edges[3][3]) {
+  vf origin[3];
 #pragma GCC unroll 4
-  for (int part = 0; part < CORNERS; part += VW) {
-#pragma GCC unroll 16
-    for (int i = 0; i < VW; i++) row[part + i] = elastic_corners(x, elements + 4 * min64(i, n - 1) + part / 4);
-    vtranspose(row + part);
+  for (int j = 0; j < 4; j++) {
+    const vf a = elastic_load(x, elements + j), b = elastic_load(x, elements + 4 + j);
+    const vf c = elastic_load(x, elements + 8 + j), d = elastic_load(x, elements + 12 + j);
+    const vf low[2] = {BLOCKS_LOW(a, b), BLOCKS_LOW(c, d)}, high[2] = {BLOCKS_HIGH(a, b), BLOCKS_HIGH(c, d)};
+    const vf at[3] = {BLOCKS_FIRST(low[0], low[1]), BLOCKS_LAST(low[0], low[1]), BLOCKS_FIRST(high[0], high[1])};
+#pragma GCC unroll 3
+    for (int i = 0; i < 3; i++)
+      if (j == 0) origin[i] = at[i];
+      else edges[i][j - 1] = at[i] - origin[i];
   }
-#pragma GCC unroll 3
-  for (int i = 0; i < 3; i++)
-#pragma GCC unroll 3
-    for (int j = 0; j < 3; j++) edges[i][j] = row[4 * (j + 1) + i] - row[i];
 }
 
 /* Writes H, the forces on nodes 1 to 3 as columns, and the force on node 0; 0 where the mask is not set. */
-AST_INLINE void elastic_write(vf H[3][3], vi used, int64_t n, float *forces) {
+AST_INLINE void elastic_write(vf H[3][3], vi used, float *forces) {
   vf row[CORNERS];
 #pragma GCC unroll 3
   for (int i = 0; i < 3; i++) {
@@ -95,8 +110,7 @@ AST_INLINE void elastic_write(vf H[3][3], vi used, int64_t n, float *forces) {
   for (int part = 0; part < CORNERS; part += VW) {
     vtranspose(row + part);
 #pragma GCC unroll 16
-    for (int i = 0; i < VW; i++)
-      if (i < n) vstore(forces + i * CORNERS + part, row[part + i]);
+    for (int i = 0; i < VW; i++) vstore(forces + i * CORNERS + part, row[part + i]);
   }
 }
 
@@ -134,10 +148,10 @@ typedef struct {
   vf D[3][3], inverse[3][3], area[3][3];
 } elastic_rest;
 
-AST_INLINE elastic_rest elastic_measure(const float *rest, const int64_t *elements, int64_t n) {
+AST_INLINE elastic_rest elastic_measure(const float *rest, const int64_t *elements) {
   elastic_rest r;
   vd D[3][3], cofactor[3][3], size = {0};
-  elastic_edges(rest, elements, n, r.D);
+  elastic_edges(rest, elements, r.D);
 #pragma GCC unroll 9
   for (int k = 0; k < 9; k++) D[k / 3][k % 3] = __builtin_convertvector(r.D[k / 3][k % 3], vd);
 #pragma GCC unroll 3
@@ -160,19 +174,24 @@ AST_INLINE elastic_rest elastic_measure(const float *rest, const int64_t *elemen
       r.area[i][j] = __builtin_convertvector(cofactor[i][j] * sixth, vf);
       zero += r.inverse[j][i] * 0.0f;
     }
-  r.counts = __builtin_convertvector(ABS(det) > ELASTIC_FLAT * size, vi) & (zero == 0);
+  r.counts = (__builtin_convertvector(ELASTIC_FLAT * size * ABS(per_det), vf) < 1) & (zero == 0);
   return r;
 }
 
 /* The corners of up to VW elements from `first` on. */
 AST_INLINE void elastic_block(const bool directed, const elastic_job *job, int64_t first, int64_t n) {
   const int64_t *elements = job->s->elements + 4 * first;
+  int64_t some[4 * VW];
+  if (n < VW) { /* the last one stands in for those beyond, whose forces are not read */
+    for (int64_t k = 0; k < 4 * VW; k++) some[k] = elements[4 * min64(k / 4, n - 1) + k % 4];
+    elements = some;
+  }
   const float *lame = job->s->lame + 2 * first;
   const vf even = vload_upto(lame, 2 * n), odd = vload_upto(lame + VW, 2 * n - VW), lambda = EVEN(even, odd), mu = ODD(even, odd);
-  elastic_rest r = elastic_measure(job->rest, elements, n);
+  elastic_rest r = elastic_measure(job->rest, elements);
   const vi used = r.counts & ((lambda != 0) | (mu != 0));
   vf d[3][3], F[3][3], A[3][3], M[3][3], S[3][3], T[3][3], H[3][3];
-  elastic_edges(job->position, elements, n, d);
+  elastic_edges(job->position, elements, d);
 #pragma GCC unroll 9
   for (int k = 0; k < 9; k++) r.D[k / 3][k % 3] = d[k / 3][k % 3] - r.D[k / 3][k % 3];
   elastic_product(false, d, r.inverse, F);
@@ -183,7 +202,7 @@ AST_INLINE void elastic_block(const bool directed, const elastic_job *job, int64
   elastic_stress(lambda, mu, M, S);
   if (directed) { /* T = dF S + F dS, H = T area */
     vf dF[3][3], M2[3][3], dS[3][3];
-    elastic_edges(job->direction, elements, n, d);
+    elastic_edges(job->direction, elements, d);
     elastic_product(false, d, r.inverse, dF);
     elastic_product(true, F, dF, M);
 #pragma GCC unroll 9
@@ -198,7 +217,7 @@ AST_INLINE void elastic_block(const bool directed, const elastic_job *job, int64
     elastic_product(false, S, r.area, T);
     elastic_product(false, F, T, H);
   }
-  elastic_write(H, used, n, job->forces + first * CORNERS);
+  elastic_write(H, used, job->forces + first * CORNERS);
 }
 
 /* ---- tasks ---- */
@@ -231,7 +250,7 @@ static ast_status elastic_sum_task(int64_t index, void *context) {
 static ast_status elastic_run(const ast_elastic *s, const float *direction, float *out) {
   const int64_t fields = direction ? 3 : 2, length = 3 * s->N + 4;
   float *copies = ast_scratch(6, fields * length * (int64_t)sizeof *copies);
-  elastic_job job = {.s = s, .forces = ast_scratch(7, s->E * CORNERS * (int64_t)sizeof *copies), .out = out};
+  elastic_job job = {.s = s, .forces = ast_scratch(7, round_up(s->E, VW) * CORNERS * (int64_t)sizeof *copies), .out = out};
   if (!copies || !job.forces) return AST_NO_MEMORY;
   const float *from[3] = {s->position, s->rest_position, direction};
   const float **to[3] = {&job.position, &job.rest, &job.direction};

@@ -60,17 +60,20 @@ static PyObject *column_sum(PyObject *self, PyObject *const *objects, Py_ssize_t
 /* ---- elastic forces ---- */
 
 /* Each corner stands once, at its node, and the corners of a node rise: so the elements hold indices of nodes. Where they do not, that is
- * what the message says. */
+ * what the message says. Without branches: this takes place in every call. */
 static bool check_corners(const call *c, const argument *elements, const argument *order, const argument *offsets) {
   const int64_t *node = elements->data, *corner = order->data, *offset = offsets->data, corners = order->shape[0];
   if (!check_offsets(c, offsets, corners)) return false;
   for (int64_t n = 0; n + 1 < offsets->shape[0]; n++) {
-    int64_t before = -1;
-    for (int64_t j = offset[n]; j < offset[n + 1]; before = corner[j++])
-      if (corner[j] <= before || corner[j] >= corners || node[corner[j]] != n)
-        return check_indices(c, elements, corners, offsets->shape[0] - 1) &&
-               fail(c, PyExc_ValueError, "node_order[%lld] = %lld is not the next corner of an element at node %lld", (long long)j,
-                    (long long)corner[j], (long long)n);
+    bool wrong = false;
+    for (int64_t j = offset[n]; j < offset[n + 1]; j++) {
+      const bool inside = (uint64_t)corner[j] < (uint64_t)corners, rises = j == offset[n] || corner[j] > corner[j - 1];
+      wrong |= !inside | !rises | (node[inside ? corner[j] : 0] != n);
+    }
+    if (wrong)
+      return check_indices(c, elements, corners, offsets->shape[0] - 1) &&
+             fail(c, PyExc_ValueError, "node_order[%lld:%lld] must be the corners of elements at node %lld, ascending",
+                  (long long)offset[n], (long long)offset[n + 1], (long long)n);
   }
   return true;
 }
@@ -107,12 +110,13 @@ static PyObject *elastic_forces_backward(PyObject *self, PyObject *const *object
   argument *dforce, *dposition;
   ast_status status;
   if (!start(&c, "elastic_forces_backward", objects, num, 8) || !(dforce = IN(&c, "dforce", FLOATS, 2, FREE, (int64_t)3)) ||
-      !take_elastic(&c, &s) || !(dposition = OUT(&c, "dposition", FLOATS, 2, s.N, (int64_t)3)))
+      !take_elastic(&c, &s))
     return NULL;
   if (dforce->shape[0] != s.N) {
-    fail(&c, PyExc_ValueError, "dforce must have the %lld rows of position, not %lld", (long long)s.N, (long long)dforce->shape[0]);
+    fail(&c, PyExc_ValueError, "dforce must have shape [%lld, 3], not [%lld, 3]", (long long)s.N, (long long)dforce->shape[0]);
     return NULL;
   }
+  if (!(dposition = OUT(&c, "dposition", FLOATS, 2, s.N, (int64_t)3))) return NULL;
   KERNEL(c, status, kernels->elastic_forces_backward(&s, dforce->data, dposition->data));
   Py_RETURN_NONE;
 }
