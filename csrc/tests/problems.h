@@ -116,8 +116,8 @@ static message_results solve_message(const ast_kernels *kernels, const ast_messa
 
 /* ---- elastic forces ---- */
 
-/* E elements in cubes of a grid of about E / 5 nodes, whose nodes are moved by up to a fifth of a cube: none is flat. Every ninth node or
- * so has no element. */
+/* E elements in cubes of a grid of about E / 5 nodes, whose nodes are moved by up to a fifth of a cube: none is flat. Some nodes have no
+ * element. */
 static ast_elastic new_elastic(int64_t E, float scale) {
   static const int steps[6][2] = {{1, 2}, {1, 4}, {2, 1}, {2, 4}, {4, 1}, {4, 2}}; /* from a corner of a cube to the opposite one */
   int64_t side = 2;
