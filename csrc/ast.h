@@ -6,7 +6,7 @@
  * index ranges (module.c does it for Python); a kernel checks only what it alone can see, such as a point outside the cube.
  *
  * Legend: B scenes, N nodes, C cells, T tokens, F channels, C_in and C_out channels of a convolution, H heads, D channels of a head,
- * M rows of a linear layer, I and O its inputs and outputs, H hidden units.
+ * M rows of a linear layer, I and O its inputs and outputs, H hidden units; E elements.
  */
 #ifndef AST_H
 #define AST_H
@@ -84,6 +84,14 @@ typedef struct {
 typedef struct {
   float *x, *beside, *weight1, *bias1, *weight2, *bias2, *gamma, *beta;
 } ast_mlp_gradients;
+/* Tetrahedra of a St. Venant-Kirchhoff material. node_order holds the numbers 4 e + corner, by the node at that corner, then ascending. */
+typedef struct {
+  int64_t N, E;                                        /* nodes, elements */
+  const int64_t *elements, *node_order, *node_offsets; /* [E,4], [4E], [N+1]: the corners at node n */
+  const float *position, *rest_position;               /* [N,3] */
+  const float *lame;                                   /* [E,2]: lambda and mu */
+} ast_elastic;
+
 /* A level of an octree and how it follows from the next finer one. It lies in scratch memory of the calling thread, and is valid until the
  * next call of an octree kernel or of farthest_point_sample there. */
 typedef struct {
@@ -172,6 +180,12 @@ typedef struct {
   ast_status (*linear_backward)(const ast_linear *s, const float *restrict dout, const float *restrict x, const float *restrict weight,
                                 const float *restrict bias, const float *restrict z, float *restrict dx, float *restrict dweight,
                                 float *restrict dbias);
+  /* force [N,3] = -dE/dposition of the energy E = sum_e V (lambda/2 tr(G)^2 + mu G:G), G = (F^T F - I) / 2, added at each node in the
+   * order of node_order. An element contributes exactly nothing, whatever its positions, if its Lame constants are both 0, a rest
+   * position is not finite, or its rest volume is no more than rounding. */
+  ast_status (*elastic_forces)(const ast_elastic *s, float *restrict force);
+  /* dposition [N,3] = (dforce/dposition) dforce, whose matrix is symmetric: the gradient. */
+  ast_status (*elastic_forces_backward)(const ast_elastic *s, const float *restrict dforce, float *restrict dposition);
   /* out[f] = sum of x[n,f] over n, rows in blocks whose sums are added in order: the gradient of a bias. x [N,F], out [F]. */
   ast_status (*column_sum)(const float *restrict x, int64_t N, int64_t F, float *restrict out);
   /* out [M,O] = y, or LayerNorm(y), + residual, which may be NULL. */

@@ -6,6 +6,7 @@
 
 #include "attention.c"
 #include "attention_backward.c"
+#include "elastic_forces.c"
 #include "fps.c"
 #include "linear.c"
 #include "message.c"
@@ -43,6 +44,8 @@ const ast_kernels AST_TABLE(AST_ISA) = {
     .message_backward = message_backward,
     .linear = linear,
     .linear_backward = linear_backward,
+    .elastic_forces = elastic_forces,
+    .elastic_forces_backward = elastic_forces_backward,
     .column_sum = column_sum,
     .mlp = mlp,
     .mlp_backward = mlp_backward,

@@ -42,6 +42,9 @@ static PyObject *configuration(PyObject *self, PyObject *unused) {
 static PyMethodDef methods[] = {
     FAST(segment_sum, "segment_sum(x, node_order, node_offsets, mean, out)"),
     FAST(segment_spread, "segment_spread(dout, node_order, node_offsets, mean, dx)"),
+    FAST(elastic_forces, "elastic_forces(position, rest_position, lame, elements, node_order, node_offsets, force)"),
+    FAST(elastic_forces_backward,
+         "elastic_forces_backward(dforce, position, rest_position, lame, elements, node_order, node_offsets, dposition)"),
     FAST(octree_build,
          "octree_build(positions, offsets, cx, cy, cz, half_width, depth, keys, cell_offsets, node_cell, node_order, "
          "node_offsets)"),

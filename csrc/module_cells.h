@@ -1,4 +1,5 @@
-/* The module's functions of points and cells: segment sums, octree, sampling, sparse convolution. Included by module.c alone. */
+/* The module's functions of points and cells: segment sums, elastic forces, octree, sampling, sparse convolution. Included by module.c
+ * alone.*/
 #ifndef AST_MODULE_CELLS_H
 #define AST_MODULE_CELLS_H
 
@@ -53,6 +54,70 @@ static PyObject *column_sum(PyObject *self, PyObject *const *objects, Py_ssize_t
       !(out = OUT(&c, "out", FLOATS, 1, x->shape[1])))
     return NULL;
   KERNEL(c, status, kernels->column_sum(x->data, x->shape[0], x->shape[1], out->data));
+  Py_RETURN_NONE;
+}
+
+/* ---- elastic forces ---- */
+
+/* Each corner stands once, at its node, and the corners of a node rise: so the elements hold indices of nodes. Where they do not, that is
+ * what the message says. Without branches: this takes place in every call. */
+static bool check_corners(const call *c, const argument *elements, const argument *order, const argument *offsets) {
+  const int64_t *node = elements->data, *corner = order->data, *offset = offsets->data, corners = order->shape[0];
+  if (!check_offsets(c, offsets, corners)) return false;
+  for (int64_t n = 0; n + 1 < offsets->shape[0]; n++) {
+    bool wrong = false;
+    for (int64_t j = offset[n]; j < offset[n + 1]; j++) {
+      const bool inside = (uint64_t)corner[j] < (uint64_t)corners, rises = j == offset[n] || corner[j] > corner[j - 1];
+      wrong |= !inside | !rises | (node[inside ? corner[j] : 0] != n);
+    }
+    if (wrong)
+      return check_indices(c, elements, corners, offsets->shape[0] - 1) &&
+             fail(c, PyExc_ValueError, "node_order[%lld:%lld] must be the corners of elements at node %lld, ascending",
+                  (long long)offset[n], (long long)offset[n + 1], (long long)n);
+  }
+  return true;
+}
+
+static bool take_elastic(call *c, ast_elastic *s) {
+  argument *position, *rest, *lame, *elements, *order, *offsets;
+  if (!(position = IN(c, "position", FLOATS, 2, FREE, (int64_t)3)) ||
+      !(rest = IN(c, "rest_position", FLOATS, 2, position->shape[0], (int64_t)3)) || !(lame = IN(c, "lame", FLOATS, 2, FREE, (int64_t)2)) ||
+      !(elements = IN(c, "elements", INTS, 2, lame->shape[0], (int64_t)4)) || !(order = IN(c, "node_order", INTS, 1, 4 * lame->shape[0])) ||
+      !(offsets = IN(c, "node_offsets", INTS, 1, position->shape[0] + 1)) || !check_corners(c, elements, order, offsets))
+    return false;
+  *s = (ast_elastic){
+      position->shape[0], lame->shape[0], elements->data, order->data, offsets->data, position->data, rest->data, lame->data,
+  };
+  return true;
+}
+
+static PyObject *elastic_forces(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  call c;
+  ast_elastic s;
+  argument *force;
+  ast_status status;
+  if (!start(&c, "elastic_forces", objects, num, 7) || !take_elastic(&c, &s) || !(force = OUT(&c, "force", FLOATS, 2, s.N, (int64_t)3)))
+    return NULL;
+  KERNEL(c, status, kernels->elastic_forces(&s, force->data));
+  Py_RETURN_NONE;
+}
+
+static PyObject *elastic_forces_backward(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  call c;
+  ast_elastic s;
+  argument *dforce, *dposition;
+  ast_status status;
+  if (!start(&c, "elastic_forces_backward", objects, num, 8) || !(dforce = IN(&c, "dforce", FLOATS, 2, FREE, (int64_t)3)) ||
+      !take_elastic(&c, &s))
+    return NULL;
+  if (dforce->shape[0] != s.N) {
+    fail(&c, PyExc_ValueError, "dforce must have shape [%lld, 3], not [%lld, 3]", (long long)s.N, (long long)dforce->shape[0]);
+    return NULL;
+  }
+  if (!(dposition = OUT(&c, "dposition", FLOATS, 2, s.N, (int64_t)3))) return NULL;
+  KERNEL(c, status, kernels->elastic_forces_backward(&s, dforce->data, dposition->data));
   Py_RETURN_NONE;
 }
 

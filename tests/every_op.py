@@ -14,7 +14,9 @@ from ast_sim.ops import (
     CellMap,
     EdgeSet,
     Octree,
+    TetrahedronSet,
     attention,
+    elastic_forces,
     farthest_point_sample,
     linear,
     message_sum,
@@ -213,6 +215,23 @@ def segment_results(scenes: Sequence[int], op: Callable) -> Results:
     )
 
 
+def tets_of(scenes: Sequence[int]) -> TetrahedronSet:
+    """About three random elements a node within each scene; a scene of fewer than four nodes has none."""
+    sets = []
+    for s in scenes:
+        g = torch.Generator().manual_seed(s)
+        num = 3 * SIZES[s] if SIZES[s] > 3 else 0
+        elements = torch.randint(0, max(SIZES[s], 1), (num, 4), generator=g)
+        sets.append(TetrahedronSet.from_elements(elements, SIZES[s]))
+    return TetrahedronSet.concatenate(sets)
+
+
+def elastic_results(scenes: Sequence[int]) -> Results:
+    tets, offsets = tets_of(scenes), offsets_of(scenes)
+    rest, lame = rows(scenes, 3, key=1), rows(scenes, 2, key=2, sizes=[3 * n if n > 3 else 0 for n in SIZES])
+    return by_rows(lambda x: elastic_forces(x, rest, lame, tets), (rows(scenes, 3),), 1, offsets)
+
+
 def linear_results(scenes: Sequence[int]) -> Results:
     inputs = (rows(scenes, 48, key=1), rows(scenes, 35, key=2), shared(70, 48), shared(70))
     return by_rows(lambda x, residual, w, b: linear(x, w, b, "geglu", residual), inputs, 2, offsets_of(scenes))
@@ -240,6 +259,7 @@ OPS: dict[str, Callable[[Sequence[int]], Results]] = {
     "message_sum with latents": message_results_with_latents,
     "segment_sum": lambda scenes: segment_results(scenes, segment_sum),
     "segment_mean": lambda scenes: segment_results(scenes, segment_mean),
+    "elastic_forces": elastic_results,
     "linear": linear_results,
     "mlp": mlp_results,
 }

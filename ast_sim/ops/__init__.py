@@ -4,6 +4,7 @@ from ast_sim.ops._attention import attention
 from ast_sim.ops._body_distance import WIDTH as PROXIMITY_WIDTH
 from ast_sim.ops._body_distance import proximity
 from ast_sim.ops._edges import EdgeSet
+from ast_sim.ops._elastic_forces import TetrahedronSet, elastic_forces
 from ast_sim.ops._fps import farthest_point_sample
 from ast_sim.ops._linear import linear
 from ast_sim.ops._message import message_edges, message_sum
@@ -17,7 +18,9 @@ __all__ = [
     "CellMap",
     "EdgeSet",
     "Octree",
+    "TetrahedronSet",
     "attention",
+    "elastic_forces",
     "farthest_point_sample",
     "linear",
     "message_edges",

@@ -195,8 +195,9 @@ def check_index(op: str, name: str, index: torch.Tensor, bound: int) -> None:
     """Raise ValueError unless all values of an index lie in [0, bound). The message names the first that does not."""
     wrong = ((index < 0) | (index >= bound)).nonzero()
     if len(wrong):
-        at = int(wrong[0])
-        raise ValueError(f"{op}: {name}[{at}] = {int(index[at])} is not an index below {bound}")
+        at = wrong[0].tolist()
+        place, value = ", ".join(map(str, at)), int(index[tuple(at)])
+        raise ValueError(f"{op}: {name}[{place}] = {value} is not an index below {bound}")
 
 
 def segment_of(offsets: torch.Tensor) -> torch.Tensor:

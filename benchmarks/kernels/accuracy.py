@@ -12,14 +12,16 @@ from pathlib import Path
 
 import torch
 
-from ast_sim.ops import EdgeSet, octree
+from ast_sim.ops import EdgeSet, TetrahedronSet, octree
 from ast_sim.ops import _attention as attention
+from ast_sim.ops import _elastic_forces as elastic
 from ast_sim.ops import _linear as linear
 from ast_sim.ops import _message as message
 from ast_sim.ops import _mlp as mlp
 from ast_sim.ops import _segment as segment
 from ast_sim.ops import _sparse_conv as sparse_conv
 from ast_sim.ops.library import configuration
+from benchmarks.kernels.elastic_forces import box
 from tests.checks import errors
 
 SEEDS = 12
@@ -46,6 +48,25 @@ def segments(seed: int) -> Iterator[tuple[str, Case]]:
                 ["out", "dx"],
             ),
         )
+
+
+def elastic_forces(seed: int) -> Iterator[tuple[str, Case]]:
+    g = torch.Generator().manual_seed(seed)
+    nodes, elements = box(tuple(int(n) for n in torch.randint(1, 9, (3,), generator=g)))
+    scale, shift = 10.0 ** (seed % 7 - 3), 10.0 * (seed % 2)
+    rest = scale * (nodes + 0.15 * torch.rand(nodes.shape, generator=g) + shift)
+    lame = torch.rand(len(elements), 2, generator=g) + 0.5
+    tets = TetrahedronSet.from_elements(elements, len(nodes))
+
+    def composition(x):
+        stiff = (rest.to(x.dtype), lame.to(x.dtype))
+        return elastic._reference(x, *stiff, tets.elements, tets.node_order, tets.node_offsets)
+
+    position = rest + scale * (0.01, 0.1, 0.5)[seed % 3] * torch.randn(nodes.shape, generator=g)
+    yield (
+        "elastic_forces",
+        (lambda x: elastic.elastic_forces(x, rest, lame, tets), composition, [position], ["force", "dposition"]),
+    )
 
 
 def attentions(seed: int) -> Iterator[tuple[str, Case]]:
@@ -160,7 +181,7 @@ def layers(seed: int) -> Iterator[tuple[str, Case]]:
 def main() -> None:
     worst: dict[tuple[str, str], tuple[float, float, float]] = {}
     for seed in range(SEEDS):
-        for family in (segments, attentions, convolutions, messages, layers):
+        for family in (segments, elastic_forces, attentions, convolutions, messages, layers):
             for name, (op, reference, inputs, results) in family(seed):
                 for result, (c, t, magnitude) in zip(results, errors(op, reference, inputs), strict=True):
                     c, t = c / max(magnitude, 1e-300), t / max(magnitude, 1e-300)

@@ -22,6 +22,7 @@ FAMILIES = {
     "Farthest point sampling": ("farthest_point_sample",),
     "Octree": ("octree",),
     "Sums over segments": ("segment", "column_sum"),
+    "Elastic forces": ("elastic_forces",),
 }
 INTRODUCTION = """# How fast it is
 

@@ -114,4 +114,41 @@ static message_results solve_message(const ast_kernels *kernels, const ast_messa
   return r;
 }
 
+/* ---- elastic forces ---- */
+
+/* E elements in cubes of a grid of about E / 5 nodes, whose nodes are moved by up to a fifth of a cube: none is flat. Some nodes have no
+ * element. */
+static ast_elastic new_elastic(int64_t E, float scale) {
+  static const int steps[6][2] = {{1, 2}, {1, 4}, {2, 1}, {2, 4}, {4, 1}, {4, 2}}; /* from a corner of a cube to the opposite one */
+  int64_t side = 2;
+  while (side * side * side * 5 < E) side++;
+  const int64_t N = side * side * side;
+  int64_t *elements = new_ints(4 * E), *order = new_ints(4 * E), *offsets = new_ints(N + 1);
+  float *rest = new_floats(3 * N), *position = random_floats(3 * N), *lame = new_floats(2 * E);
+  for (int64_t i = 0; i < 3 * N; i++) {
+    const int64_t at = i / 3 / (i % 3 == 0 ? 1 : i % 3 == 1 ? side : side * side) % side;
+    rest[i] = scale * ((float)at + 0.2f * random_float());
+    position[i] = rest[i] + 0.2f * scale * position[i];
+  }
+  for (int64_t e = 0; e < E; e++) {
+    const int *step = steps[random_bits() % 6];
+    int64_t cube = 0;
+    for (int64_t a = 0, width = 1; a < 3; a++, width *= side) cube += (int64_t)(random_bits() % (uint64_t)(side - 1)) * width;
+    for (int corner = 0; corner < 4; corner++) {
+      const int bits = corner == 3 ? 7 : corner == 2 ? step[0] + step[1] : corner == 1 ? step[0] : 0;
+      elements[4 * e + corner] = cube + (bits & 1) + (bits >> 1 & 1) * side + (bits >> 2) * side * side;
+    }
+    lame[2 * e] = 1 + random_float(), lame[2 * e + 1] = 1.5f + random_float();
+  }
+  memset(offsets, 0, (size_t)(N + 1) * sizeof *offsets);
+  for (int64_t k = 0; k < 4 * E; k++) offsets[elements[k] + 1]++;
+  for (int64_t n = 0; n < N; n++) offsets[n + 1] += offsets[n];
+  for (int64_t k = 0; k < 4 * E; k++) order[offsets[elements[k]]++] = k; /* each offset moves to the end of its node, */
+  for (int64_t n = N; n > 0; n--) offsets[n] = offsets[n - 1];           /* which is where the next one begins */
+  offsets[0] = 0;
+  return (ast_elastic){N, E, elements, order, offsets, position, rest, lame};
+}
+
+#define ELASTIC_BUFFERS(s) (s)->elements, (s)->node_order, (s)->node_offsets, (s)->position, (s)->rest_position, (s)->lame
+
 #endif

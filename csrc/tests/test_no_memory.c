@@ -262,6 +262,18 @@ static outcome mlp_backward(const ast_kernels *kernels) {
   return finish(KERNEL(kernels->mlp_backward(&s, dout, (ast_mlp_kept){0}, out)), outputs, sizeof out / sizeof(void *));
 }
 
+static outcome elastic_forces(const ast_kernels *kernels) {
+  const ast_elastic s = new_elastic(3000, 1);
+  float *force = new_floats(3 * s.N);
+  return FINISH(KERNEL(kernels->elastic_forces(&s, force)), force);
+}
+
+static outcome elastic_forces_backward(const ast_kernels *kernels) {
+  const ast_elastic s = new_elastic(3000, 1);
+  float *dforce = random_floats(3 * s.N), *dposition = new_floats(3 * s.N);
+  return FINISH(KERNEL(kernels->elastic_forces_backward(&s, dforce, dposition)), dposition);
+}
+
 static outcome column_sum(const ast_kernels *kernels) {
   enum { N = 9000, F = 70 };
   float *x = random_floats(N * F), *out = new_floats(F);
@@ -289,6 +301,8 @@ static const struct {
     {"linear_backward", linear_backward},
     {"mlp", mlp},
     {"mlp_backward", mlp_backward},
+    {"elastic_forces", elastic_forces},
+    {"elastic_forces_backward", elastic_forces_backward},
     {"column_sum", column_sum},
 };
 
