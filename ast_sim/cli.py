@@ -238,8 +238,12 @@ def _add_predict(predict: _Parser) -> None:
         ' "1=0,0,-0.01 then 0.02,0,-0.01", or a rotation "1=rotate 30 about 0,0,1 at 0,0,0"; may be repeated'
     }
     _add_each(predict, moves, action="append", default=[])
-    about = "number of frames (default: prescribed nodes move as far in a frame as in training)"
-    _add_each(predict, {"--frames N": about}, type=_at_least(2))
+    about = "frames that are wanted, such as --frames=-1 for the last one or --frames 5,10,20 (default: all)"
+    _add_each(predict, {"--frames I,...": about}, type=_whole_numbers)
+    about = "calls that correct the first one, if the run jumps to a frame (default: the best of its validations)"
+    _add_each(predict, {"--corrections N": about}, type=_at_least(0))
+    about = "number of frames of the motion (default: prescribed nodes move as far in a frame as in training)"
+    _add_each(predict, {"--num-frames N": about}, type=_at_least(2))
     mesh = predict.add_argument_group("if SCENE is a mesh")
     _add_each(mesh, {"--obstacle BODY": "a rigid body; may be repeated"}, type=int, action="append", default=[])
     marks = {
@@ -263,6 +267,8 @@ def _add_evaluate(evaluate: _Parser) -> None:
     evaluate.add_argument("run_folder", type=_path, metavar="RUN", help="run folder")
     evaluate.add_argument("data", type=_path, metavar="DATA", help="dataset")
     evaluate.add_argument("--split", choices=commands.SPLITS, default="test", help="split (default: test)")
+    about = "scenes in which the solver goes straight to the deepest frame, to compare (default: 3; 0: none)"
+    _add_each(evaluate, {"--rivals N": about}, type=_at_least(0), default=3)
     _add_each(evaluate, {"--json FILE": "also write all figures to this file"}, type=_path)
     _add_overwrite(evaluate)
 
@@ -281,7 +287,13 @@ def _path(text: str) -> Path:
 
 
 def _whole_numbers(text: str) -> tuple[int, ...]:
-    return tuple(map(int, text.split(",")))
+    try:
+        numbers = tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no list of whole numbers, such as 5,10,-1") from None
+    if any(abs(number) >= 1 << 63 for number in numbers):
+        raise argparse.ArgumentTypeError("a number above 2^63 - 1")
+    return numbers
 
 
 def _at_least(least: int) -> Any:

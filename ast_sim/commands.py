@@ -149,16 +149,18 @@ def predict(args: argparse.Namespace) -> None:
     else:
         _refuse(args, args.of_data, f"{args.scene}, which is a mesh")
         truth, name = None, str(args.scene)
+    effort = {"frames": args.frames, "corrections": args.corrections}
     if truth is not None and not moves:
-        answer = run.predict(truth, frames=args.frames, name=name)
+        answer = run.predict(truth, num_frames=args.num_frames, name=name, **effort)
     else:
         scene, truth = (_scene(args) if truth is None else truth.scene), None
-        answer = run.predict(scene, moves, frames=args.frames, name=name)
+        answer = run.predict(scene, moves, num_frames=args.num_frames, name=name, **effort)
     answer.save(args.out, truth)
     if answer.failure is not None:
         raise RolloutError(f"{answer.failure}, in {args.out}")
     steps = len(answer.step_seconds)
-    print(f"{args.out}: {steps} frames predicted, {1000 * answer.seconds / steps:.3g} ms each")
+    each = f", {1000 * answer.seconds / steps:.3g} ms each" if steps else ""
+    print(f"{args.out}: {steps} frames predicted{each}")
 
 
 def _truth(run: Any, args: argparse.Namespace) -> Any:
@@ -196,7 +198,7 @@ def evaluate(args: argparse.Namespace) -> None:
     if args.json is not None:
         _check_output(args, args.json, [args.data])
     keep_memory()
-    found = Run(args.run_folder).evaluate(args.data, args.split, args.command_line)
+    found = Run(args.run_folder).evaluate(args.data, args.split, args.command_line, args.rivals)
     print(found)
     if args.json is not None:
         found.save(args.json)

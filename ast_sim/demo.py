@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ast_sim.inference import asked_frame
 from ast_sim.inference.trained_run import Evaluation
 from ast_sim.simulate.jobs.generate import generate
 from ast_sim.support.progress import duration
@@ -21,6 +22,7 @@ from ast_sim.view import export, picture, report
 
 FAMILY = "deforming_plate"
 NODES, FRAMES = 400, 41  # fewer than the family's defaults, so that the demonstration takes minutes
+RIVALS = 3  # in so many test scenes the solver goes straight to the deepest frame
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ def demo(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
     run = train(data, run_folder, steps=size.steps, seed=seed, mirror=("x", "y"), resume=True)
 
     _announce(3, f"predicting the {size.test} test scenes, which the model has not seen")
-    evaluation = run.evaluate(data, command=_command(out, quick, seed))
+    evaluation = run.evaluate(data, command=_command(out, quick, seed), rival_scenes=RIVALS)
     evaluation.save(out / "evaluation.json")
     found = evaluation.figures
     _announce(4, "writing the report")
@@ -113,5 +115,5 @@ def headlines(found: dict[str, Any]) -> list[str]:
     if found["failures"]:
         lines.append(f"{found['failures']} of {len(found['samples'])} rollouts failed")
     if found["speedup"] is not None:
-        lines.append(f"speed: {found['speedup']:.3g} times as fast as the solver on the same scenes")
-    return lines
+        lines.append(f"all frames: {found['speedup']:.3g} times as fast as the solver was when it made them")
+    return lines + asked_frame.lines(found["asked"])

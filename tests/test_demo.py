@@ -86,12 +86,32 @@ def test_headlines_are_shares_of_the_trivial_predictors():
         "failures": 1,
         "samples": [{}, {}],
         "speedup": 12.345,
+        "asked": {
+            "relative_error": 0.0712,
+            "seconds": 0.0251,
+            "by_calls": [0.16, 0.0712],
+            "stress_share": 0.5,
+            "largest_stress": 0.08,
+            "solver": {
+                "scenes": 3,
+                "seconds": 0.06,
+                "ratio": 2.4,
+                "cheapest_scenes": 2,
+                "cheapest_seconds": 0.03,
+                "cheapest_ratio": 1.2,
+            },
+        },
     }
     assert headlines(found) == [
         "displacement error over whole rollouts: 0.002 m, 20 % of that of holding still",
         "stress error over whole rollouts: 600 Pa, 60 % of that of each frame's true mean",
         "1 of 2 rollouts failed",
-        "speed: 12.3 times as fast as the solver on the same scenes",
+        "all frames: 12.3 times as fast as the solver was when it made them",
+        "the deepest frame at once: error 7.12 % of the displacement, 25.1 ms on one thread",
+        "  after each call: 16, 7.12 %",
+        "  stress: 0.50 of the error of the frame's true mean; the largest is 8 % off",
+        "  the solver, straight to this frame: 60 ms, 2.4 times as long (mean of 3 scenes, one thread)",
+        "  its cheapest way with at most the model's error: 30 ms, 1.2 times as long (2 scenes)",
     ]
 
 

@@ -17,10 +17,10 @@ from ast_sim.batches.mirror_and_shift import Placement
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """The state of a scene from which a model predicts.
+    """The state of a scene from which a model predicts: the frame before, or the guess that a jump starts from.
 
     Attributes:
-        position: [N, 3] float32, p_t, with noise in training.
+        position: [N, 3] float32, p_t, with noise in training. In a jump the prescribed nodes are where they will be.
         previous: [N, 3], p_{t-1}; None in a scene without inertia.
         stress: [N, 1] or [E, 1] at t, or None.
     """
@@ -44,7 +44,7 @@ class Batch:
         position, previous_position, stress: as in `State`.
         boundary_motion: [N, 3], how far the prescribed nodes move from the state to the frame to predict; 0 elsewhere.
         names: for messages, one for each scene: "train/000012 frame 7".
-        frame: [B] float32, the number of the frame to predict.
+        wants_stress: False: a model may leave out the stress on elements.
     """
 
     graph: Graph
@@ -53,17 +53,17 @@ class Batch:
     boundary_motion: Tensor
     stress: Tensor | None
     names: list[str]
-    frame: Tensor | None = None
+    wants_stress: bool = True
 
     @staticmethod
-    def build(graph: Graph, state: State, prescribed: Tensor, names: list[str], frame: Tensor) -> Batch:
+    def build(graph: Graph, state: State, prescribed: Tensor, names: list[str]) -> Batch:
         """The batch of one scene, or of several scenes whose arrays are concatenated.
 
         Args:
             prescribed: [N, 3], the positions of the prescribed nodes in the frame to predict. Other rows are not read.
         """
         motion = torch.where(graph.prescribed[:, None], prescribed - state.position, 0.0)
-        return Batch(graph, state.position, state.previous, motion, state.stress, names, frame)
+        return Batch(graph, state.position, state.previous, motion, state.stress, names)
 
     @staticmethod
     def concatenate(batches: Sequence[Batch]) -> Batch:
@@ -72,7 +72,6 @@ class Batch:
             Graph.concatenate([batch.graph for batch in batches]),
             *(_join(batches, key) for key in ("position", "previous_position", "boundary_motion", "stress")),
             [name for batch in batches for name in batch.names],
-            _join(batches, "frame"),
         )
 
     def placed(self, placement: Placement) -> Batch:

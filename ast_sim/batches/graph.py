@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ast_sim.batches.mirror_and_shift import Placement
+from ast_sim.batches.out_of_balance import Elasticity
 from ast_sim.ops import EdgeSet
 from ast_sim.ops._edges import join_indices, join_offsets
 from ast_sim.scene import NodeType, Scene
@@ -50,6 +51,7 @@ class Graph:
         body: [N] int64; None if the surface is not needed.
         surface: [F, 3] int64, boundary triangles, counter-clockwise seen from outside; None if it is not needed.
         surface_offsets: [B + 1] int64, where each scene's triangles start and end; None if they are not needed.
+        elasticity: what elastic forces need; None if they are not needed.
         own: what only one model needs, such as coarser meshes, or None.
     """
 
@@ -70,15 +72,17 @@ class Graph:
     body: Tensor | None = None
     surface: Tensor | None = None
     surface_offsets: Tensor | None = None
+    elasticity: Elasticity | None = None
     own: Own | None = None
 
     @staticmethod
-    def from_scene(scene: Scene, element_nodes: bool, surface: bool = False) -> Graph:
+    def from_scene(scene: Scene, element_nodes: bool, surface: bool = False, elasticity: bool = False) -> Graph:
         """The graph of one scene.
 
         Args:
             element_nodes: elements are nodes of the graph too: it has e2m and m2e, not m2m.
             surface: the graph has the surface and the bodies.
+            elasticity: the graph has the elasticity of its tetrahedra.
         """
         n, e = scene.num_nodes, scene.num_elements
         elements = torch.from_numpy(scene.elements.astype("int64"))
@@ -110,6 +114,7 @@ class Graph:
             m2e=m2e,
             rest_edges=rest_edges,
             **(_surface_of(scene) if surface else {}),
+            elasticity=Elasticity.of(scene) if elasticity else None,
         )
 
     @staticmethod

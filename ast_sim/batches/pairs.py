@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from ast_sim.batches.batch_builder import Batch, State, Target
+from ast_sim.batches.carry import Carrier
 from ast_sim.batches.graph import Graph
-from ast_sim.batches.horizons import STEP_BY_STEP, Horizon
 from ast_sim.batches.mirror_and_shift import Placement
 from ast_sim.dataset.reader import CACHE_BYTES, Dataset
 from ast_sim.scene import Scene
@@ -28,11 +28,13 @@ class _Member:
 
     noisy: [N, 3] float32, 1 where noise is added, else 0: at NORMAL nodes, in a plane scene only in x and y.
     center: [3] float32, the middle of the box around the scene at rest.
+    carry: moves a state along with the prescribed nodes; None if frames are predicted step by step.
     """
 
     graph: Graph
     noisy: np.ndarray
     center: np.ndarray
+    carry: Carrier | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,10 +57,30 @@ class Pair:
     error_after: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
+class Jump:
+    """Two frames of a trajectory, the later of which is predicted at once, and how they are mirrored and moved.
+
+    Attributes:
+        source, frame: the frame that is carried along, and the frame to predict.
+        error: [N, 3] float32, the error of a guess of the frame to predict, which is to be corrected, before the scene
+            is mirrored; None: there is no guess yet, and the jump starts from the source.
+        share: without a guess, the state has this share of the error of the source, carried along.
+    """
+
+    index: int
+    source: int
+    frame: int
+    placement: Placement
+    error: np.ndarray | None = None
+    share: float = 1.0
+
+
 class PairSampler:
     """Draws batches of frame pairs (t, t + 1) of a split. Each epoch is a new random order of all pairs.
 
-    The state of the pair (t, t + 1) is the frame from which `horizon` predicts t + 1.
+    With `jumps`, t + 1 is predicted from the first frame, carried along. There is no noise; instead, half of the pairs
+    start from a guess that has a random share of the error of this start, as a correction does.
 
     White Gaussian noise n of standard deviation `noise` (in the unit of length) is added to p_t of the NORMAL nodes.
     The next position in the target is p_{t+1} + (1 - gamma) n (MeshGraphNets, add_noise), so the target is
@@ -92,16 +114,16 @@ class PairSampler:
         dynamic: bool,
         gamma: float,
         part: tuple[int, int] = (0, 1),
-        horizon: Horizon = STEP_BY_STEP,
+        jumps: bool = False,
         mirror: tuple[str, ...] = (),
         shift: float = 0.0,
     ) -> None:
         self.batch_size, self.seed, self.noise = batch_size, seed, noise
         self.left = np.float32(1 - gamma)  # share of the noise that stays in the target
-        self._dataset, self._split, self._part = dataset, split, part
+        self._dataset, self._split, self.part = dataset, split, part
         self._make_graph, self.dynamic = make_graph, dynamic
         self.first_frame = 1 if dynamic else 0  # the least t of a pair: the acceleration needs a frame before it
-        self._horizon = horizon
+        self._jumps = jumps
         self._mirrored, self._shift = np.array([axis in mirror for axis in "xyz"]), np.float32(shift)
         frames = np.array([dataset.num_frames(split, i) for i in range(dataset.count(split))], np.int64)
         self._starts = np.concatenate([[0], np.cumsum(np.maximum(frames - 1 - self.first_frame, 0))])
@@ -123,16 +145,19 @@ class PairSampler:
 
     def places(self, step: int) -> range:
         """The places of this part of a step's batch in the endless sequence of epochs."""
-        index, count = self._part
+        index, count = self.part
         size = self.batch_size // count
         first = step * self.batch_size + index * size
         return range(first, first + size)
 
-    def _pair(self, epoch: int, number: int) -> Pair:
+    def _pair(self, epoch: int, number: int) -> Pair | Jump:
         """Pair `number` of all, with its noise and its placement in an epoch."""
         index, t = self._locate(number)
-        noise = self.white_noise(index, np.random.default_rng([self.seed, _NOISE, epoch, number]))
         placement = self.random_placement(index, np.random.default_rng([self.seed, _PLACE, epoch, number]))
+        if self._jumps:
+            draw = np.random.default_rng([self.seed, _NOISE, epoch, number]).random()
+            return Jump(index, self.first_frame, t + 1, placement, share=min(2 * draw, 1.0))
+        noise = self.white_noise(index, np.random.default_rng([self.seed, _NOISE, epoch, number]))
         return Pair(index, t, placement, noise, None, self.left * noise)
 
     def _locate(self, number: int) -> tuple[int, int]:
@@ -153,19 +178,44 @@ class PairSampler:
         """The number of nodes of a trajectory."""
         return len(self._member(index).noisy)
 
+    def free(self, index: int) -> np.ndarray:
+        """[N] bool: the nodes of a trajectory that a model moves."""
+        return self._member(index).noisy[:, 0] > 0
+
     def _draw_order(self, epoch: int) -> np.ndarray:
         return np.random.default_rng([self.seed, _ORDER, epoch]).permutation(self.num_pairs)
 
-    def assemble(self, pairs: list[Pair]) -> tuple[Batch, Target]:
+    def assemble(self, pairs: Sequence[Pair | Jump]) -> tuple[Batch, Target]:
         """The batch of these pairs. Their errors are added only where noise would be."""
-        batches, targets = zip(*(self._built(pair) for pair in pairs), strict=True)
+        built = (self._jump(pair) if isinstance(pair, Jump) else self._step(pair) for pair in pairs)
+        batches, targets = zip(*built, strict=True)
         return Batch.concatenate(batches), Target.concatenate(targets)
 
-    def _built(self, pair: Pair) -> tuple[Batch, Target]:
+    def _jump(self, jump: Jump) -> tuple[Batch, Target]:
+        """The batch of one jump, mirrored and moved."""
+        member = self._member(jump.index)
+        (before,), stress = self._dataset.frames(self._split, jump.index, jump.source, jump.source + 1)
+        (after,), next_stress = self._dataset.frames(self._split, jump.index, jump.frame, jump.frame + 1)
+        if jump.error is not None:
+            guess = after + jump.error * member.noisy
+        else:
+            start = member.carry(before, after)
+            guess = start if jump.share == 1 else after + np.float32(jump.share) * (start - after)
+        state = State(torch.from_numpy(guess), None, None if stress is None else torch.tensor(stress[-1]))
+        target = Target(torch.from_numpy(after - guess), None if next_stress is None else torch.tensor(next_stress[0]))
+        name = f"{self._split}/{jump.index:06d} frame {jump.frame}"
+        return self._placed(jump, state, after, target, name)
+
+    def _placed(
+        self, pair: Pair | Jump, state: State, after: np.ndarray, target: Target, name: str
+    ) -> tuple[Batch, Target]:
+        batch = Batch.build(self._member(pair.index).graph, state, torch.tensor(after), [name])
+        return batch.placed(pair.placement), target.placed(pair.placement)
+
+    def _step(self, pair: Pair) -> tuple[Batch, Target]:
         """The batch of one pair, mirrored and moved."""
         member, frame = self._member(pair.index), pair.t + 1
-        source = self._horizon.source(frame)
-        position, stress = self._dataset.frames(self._split, pair.index, source - self.first_frame, source + 1)
+        position, stress = self._dataset.frames(self._split, pair.index, pair.t - self.first_frame, frame)
         (after,), next_stress = self._dataset.frames(self._split, pair.index, frame, frame + 1)
         before, now = position[0], position[-1]
         increment = after - now
@@ -177,10 +227,8 @@ class PairSampler:
             motion -= now - before + error
             previous = torch.tensor(before)
         state = State(torch.from_numpy(now + error), previous, None if stress is None else torch.tensor(stress[-1]))
-        name = f"{self._split}/{pair.index:06d} frame {pair.t}"
-        batch = Batch.build(member.graph, state, torch.tensor(after), [name], torch.tensor([float(frame)]))
         target = Target(torch.from_numpy(motion), None if next_stress is None else torch.tensor(next_stress[0]))
-        return batch.placed(pair.placement), target.placed(pair.placement)
+        return self._placed(pair, state, after, target, f"{self._split}/{pair.index:06d} frame {pair.t}")
 
     def white_noise(self, index: int, generator: np.random.Generator) -> np.ndarray:
         """[N, 3] float32: noise of the standard deviation `noise`."""
@@ -204,4 +252,4 @@ class PairSampler:
             position, _ = self._dataset.frames(self._split, index, 0, self._dataset.num_frames(self._split, index))
             noisy[:, 2] *= position[:, :, 2].any()
         center = (scene.rest_position.min(0) + scene.rest_position.max(0)) / 2
-        return _Member(self._make_graph(scene), noisy, center)
+        return _Member(self._make_graph(scene), noisy, center, Carrier(scene) if self._jumps else None)

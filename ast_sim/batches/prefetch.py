@@ -6,6 +6,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 from ast_sim.batches.batch_builder import Batch, Target
 from ast_sim.batches.pairs import PairSampler
+from ast_sim.batches.training_jumps import JumpPool
 from ast_sim.batches.training_rollouts import RolloutPool
 
 
@@ -16,7 +17,7 @@ class Ahead:
     manager. An error in making a batch is raised when that batch is asked for.
     """
 
-    def __init__(self, sampler: PairSampler | RolloutPool) -> None:
+    def __init__(self, sampler: PairSampler | RolloutPool | JumpPool) -> None:
         self._sampler = sampler
         self._thread = ThreadPoolExecutor(1, "sampler")
         self._next: dict[int, Future[tuple[Batch, Target]]] = {}

@@ -71,6 +71,13 @@ class RolloutPool:
         """The current states of the scenes of a batch, and the next frames in the data."""
         return self._sampler.assemble([self._pair(place) for place in self._places(number)])
 
+    def errors(self, number: int, target: Target) -> list[tuple[int, float]]:
+        """None are needed: every scene counts as much; see `JumpPool`."""
+        return []
+
+    def weights(self, number: int, errors: list[tuple[int, float]]) -> None:
+        """None: every scene counts as much."""
+
     def advance(self, number: int, residual: Tensor) -> None:
         """Move the scenes of a batch one frame on.
 

@@ -20,19 +20,20 @@ SUFFIXES = (".h5", ".pvd", ".vtkhdf")
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """A predicted trajectory of S frames. The first `given` frames were given; after a failure S is smaller than asked.
+    """The S wanted frames of a prediction. The first `given` of them were given; after a failure some are missing.
 
     Attributes:
         name: name of the scene, for messages.
         scene: the scene that was predicted.
         position: [S, N, 3] float32, in the run's unit of length.
         stress: [S, N or E, 1] float32 in pascal, or None. A given frame holds the given stress, or zero without one.
-        given: number of given frames: 1, or 2 in dynamic scenes.
-        step_seconds: wall seconds of each predicted frame; scenes of one batch share a frame's time equally.
+        given: number of given frames among them: of all frames 1, or 2 in dynamic scenes.
+        step_seconds: wall seconds of each frame that was computed; the frames of one batch share its time equally.
         failure: why the prediction ended early, naming the frame and the node; None if it did not.
         info: the units and the kind of the data; it is written into files of the answer.
         source: the origin of the answer: attributes that `trajectory` gets.
         stress_location: where the rows of the stress are: "node" or "element".
+        frames: the numbers of the S frames in the motion that was asked.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Answer:
     info: DatasetInfo | None = None
     source: dict[str, AttributeValue] = field(default_factory=dict)
     stress_location: str | None = None
+    frames: tuple[int, ...] = ()
 
     @property
     def seconds(self) -> float:
@@ -58,6 +60,7 @@ class Answer:
             "status": "complete" if self.failure is None else "truncated",
             **self.source,
             "given_frames": self.given,
+            "frames": list(self.frames),
             "model_seconds": list(self.step_seconds),
         }
         location = None if self.stress is None else self.stress_location

@@ -13,8 +13,10 @@ from ast_sim.batches.batch_builder import Batch, State
 from ast_sim.batches.graph import Graph
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import read_seconds
+from ast_sim.inference import asked_frame
 from ast_sim.inference.answer import Answer
-from ast_sim.inference.rollout import Question, rollouts
+from ast_sim.inference.predict import answers as predictions
+from ast_sim.inference.question import Question
 from ast_sim.inference.trivial_predictors import Errors, displacement_errors, rmse_of, stress_errors, summarize
 from ast_sim.models.simulator import Simulator
 from ast_sim.scene import Trajectory
@@ -25,22 +27,27 @@ MEAN_TRAJECTORIES = 100  # `stress_constant` is the mean of at most so many trai
 
 
 def evaluate(
-    model: Simulator, dataset: Dataset, split: str = "test", progress: Callable[[str], None] | None = None
+    model: Simulator,
+    dataset: Dataset,
+    split: str = "test",
+    progress: Callable[[str], None] | None = None,
+    corrections: int = 0,
+    rival_scenes: int = 0,
 ) -> tuple[dict[str, Any], list[Answer]]:
     """Predict all trajectories of a split and compare.
 
-    Scenes are rolled out one at a time, so that the time of a step is the time of one scene. A failed rollout has the
-    error None, and then the summary has None, too; `failures` counts failed rollouts.
+    Scenes are predicted one at a time. A failed prediction has the error None, and then the summary has None, too.
 
     Returns:
         The predictions, and figures that hold:
         samples: for each scene its name, nodes, frames, root mean square errors (`displacement` and `stress`, by
         predictor, horizon and nodes), and the seconds per step of the model and of the solver;
         summary: by predictor, quantity, horizon and nodes the errors `rmse_sequence` and `rmse_pooled` of all scenes;
-        failures: the number of failed rollouts;
-        time_conditioned: whether the model predicts each frame from the first one, so that its `one_step` errors are
-        those of its rollout;
-        speedup: the solver's time divided by the model's time, None if the solver's time is not known;
+        failures: the number of failed predictions;
+        jumps: whether the model predicts each frame from the first one, so that its `one_step` errors are those of its
+        rollout; corrections: how many calls correct the first call of such a model;
+        asked: the deepest frame of each scene, see `asked_frames`; the solver is run in `rival_scenes` scenes;
+        speedup: the solver's recorded time for all frames, divided by the model's; None if it was not recorded;
         length_unit, stress_unit, threads.
 
     Raises:
@@ -55,8 +62,8 @@ def evaluate(
     seconds = read_seconds(dataset).samples
     for index in range(count):
         name, truth = f"{split}/{index:06d}", dataset.load(split, index)
-        answer = rollouts(model, [Question.of(truth, name)])[0]
-        one_step = one_step_predictions(model, truth, name) if model.config.horizon.drifts else _predicted(answer)
+        answer = predictions(model, [Question.of(truth, name)], corrections)[0]
+        one_step = _predicted(answer) if model.config.jumps else one_step_predictions(model, truth, name)
         displacement.append(displacement_errors(truth, one_step[0], answer))
         if constant is not None:
             stress.append(stress_errors(truth, one_step[1], answer, constant, model.config.stress))
@@ -66,20 +73,26 @@ def evaluate(
         answers.append(answer)
         if progress is not None:
             progress(name)
-    summary = summarize(displacement, "displacement")
-    for predictor, values in summarize(stress, "stress").items():
-        summary.setdefault(predictor, {}).update(values)
     figures = {
         "samples": samples,
-        "summary": summary,
+        "summary": _summary(displacement, stress),
         "failures": sum(sample["failure"] is not None for sample in samples),
-        "time_conditioned": not model.config.horizon.drifts,
+        "jumps": model.config.jumps,
+        "corrections": corrections,
+        "asked": asked_frame.asked_frames(model, dataset, split, corrections, rival_scenes, progress),
         "speedup": _speedup(samples),
         "length_unit": dataset.info.length_unit,
         "stress_unit": "Pa",
         "threads": torch.get_num_threads(),
     }
     return figures, answers
+
+
+def _summary(displacement: list[Errors], stress: list[Errors]) -> dict[str, Any]:
+    summary = summarize(displacement, "displacement")
+    for predictor, values in summarize(stress, "stress").items():
+        summary.setdefault(predictor, {}).update(values)
+    return summary
 
 
 def _predicted(answer: Answer) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -110,7 +123,7 @@ def one_step_predictions(model: Simulator, truth: Trajectory, name: str) -> tupl
         )
         prescribed = script[frames].flatten(0, 1)
         names = [f"{name} frame {int(frame) - 1}" for frame in frames]
-        batch = Batch.build(Graph.concatenate([graph] * len(frames)), state, prescribed, names, frames.float())
+        batch = Batch.build(Graph.concatenate([graph] * len(frames)), state, prescribed, names)
         with torch.inference_mode():
             position, stress = model.advance(batch, prescribed)
         positions.append(position.reshape(len(frames), -1, 3).numpy())
@@ -175,15 +188,15 @@ def table(found: dict[str, Any]) -> str:
             lines.append(f"  {predictor:18}" + "".join(f"{cell:>24}" for cell in shown))
         lines.append("")
     lines.append(f"scenes: {len(found['samples'])}, failed: {found['failures']}, threads: {found['threads']}")
-    if found["time_conditioned"]:
-        lines.append(
-            "time-conditioned: every frame is predicted from the first, so the model's one_step is its rollout"
-        )
+    if found["jumps"]:
+        calls = f"{found['corrections']} correction{'' if found['corrections'] == 1 else 's'}"
+        lines.append(f"every frame is one jump from the first and {calls}, so the model's one_step is its rollout")
     if all(sample["solver_seconds_per_step"] is None for sample in found["samples"]):
         lines.append("speed relative to the solver: unknown. Neither the scenes nor a file beside the dataset")
         lines.append("(its name and .seconds.json) hold the seconds of a solver; a dataset is moved together with it")
     elif found["speedup"] is not None:
-        lines.append(f"{found['speedup']:.3g} times as fast as the solver on the same scenes")
+        lines.append(f"all frames: {found['speedup']:.3g} times as fast as the solver was when it made them (recorded)")
+    lines += asked_frame.lines(found["asked"])
     return "\n".join(lines)
 
 

@@ -1,15 +1,19 @@
-"""Predicting one scene: its motion is completed, and it is moved into the model's domain where it lies elsewhere."""
+"""Predicting scenes, by jumps or step by step. The motion of a new scene is completed, and it is moved into the model's
+domain where it lies elsewhere.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from ast_sim.inference.answer import Answer
-from ast_sim.inference.rollout import Question, rollouts
+from ast_sim.inference.jump import jumps
+from ast_sim.inference.question import Question
+from ast_sim.inference.rollout import rollouts
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.models.simulator import Simulator
 from ast_sim.prescribed_motion import Motion, RigidMotion, Vector, frames_for
@@ -20,14 +24,41 @@ from ast_sim.support.errors import ConfigError
 Motions = Motion | Mapping[int, RigidMotion | Vector] | np.ndarray
 
 
+@dataclasses.dataclass(frozen=True)
+class Effort:
+    """What is computed.
+
+    Attributes:
+        frames: the numbers of the wanted frames; negative ones count from the end; None: all.
+        corrections: how many calls correct the first, in a model that jumps.
+    """
+
+    frames: Sequence[int] | None = None
+    corrections: int = 0
+
+
+def answers(
+    model: Simulator,
+    questions: Sequence[Question],
+    corrections: int = 0,
+    progress: Callable[[int], None] | None = None,
+) -> list[Answer]:
+    """Predict the wanted frames of several scenes, by jumps or step by step as the model does; see `jumps` and
+    `rollouts` for the arguments and errors."""
+    if model.config.jumps:
+        return jumps(model, questions, corrections, progress)
+    return rollouts(model, questions, progress)
+
+
 def predict(
     model: Simulator,
     scope: Scope,
     scene: Scene | Trajectory,
     motion: Motions | None,
-    frames: int | None,
+    num_frames: int | None,
     stress: np.ndarray | None,
     name: str,
+    effort: Effort,
 ) -> Answer:
     """Predict a scene; the arguments are those of `Run.predict`, `scope` is what the model was trained on.
 
@@ -35,18 +66,19 @@ def predict(
         ConfigError: the motion does not fit the scene, or the scene does not fit the model.
     """
     if isinstance(scene, Trajectory):
-        if not (motion is None and frames is None and stress is None):
+        if not (motion is None and num_frames is None and stress is None):
             raise ConfigError(
                 f"{name} has a motion, frames and a stress of its own; for others predict its scene (--move BODY=X,Y,Z)"
             )
-        return rollouts(model, [Question.of(scene, name)])[0]
+        return answers(model, [Question.of(scene, name, effort.frames)], effort.corrections)[0]
     scene.check(name)
     _require_material(model.config, scope, scene, name)
-    motion = _completed(model.config, scope, scene, motion, frames, name)
+    motion = _completed(model.config, scope, scene, motion, num_frames, name)
     stress = _given_stress(model.config, scene, stress, name)
-    for note in scope.notes(scene, motion):
+    for note in scope.notes(scene, motion, bool(model.config.jumps)):
         warnings.warn(f"{name}: {note}", stacklevel=3)
-    return _in_domain(model, Question(name, scene, motion.position, stress))
+    question = Question(name, scene, motion.position, stress).asking(effort.frames)
+    return _in_domain(model, question, effort.corrections)
 
 
 def _completed(
@@ -58,14 +90,14 @@ def _completed(
     if isinstance(motion, Mapping):
         least = config.given_frames + 1
         if frames is None and not scope.usual_increment:
-            raise ConfigError(f"{name}: nothing is moved in the training scenes: say how many frames (--frames)")
+            raise ConfigError(f"{name}: nothing is moved in the training scenes: say how many frames (--num-frames)")
         if frames is None:
             frames = max(least, frames_for(scene, motion, scope.usual_increment))
         if frames < least:
-            raise ConfigError(f"{name}: frames is {frames}; the run needs at least {least}")
+            raise ConfigError(f"{name}: num_frames is {frames}; the run needs at least {least}")
         return Motion.of_bodies(scene, motion, frames)
     if frames is not None:
-        raise ConfigError(f"{name}: its motion has frames already: leave out frames={frames}")
+        raise ConfigError(f"{name}: its motion has frames already: leave out num_frames={frames}")
     if not isinstance(motion, Motion):
         return Motion.of_positions(scene, motion)
     motion.check(scene)
@@ -104,15 +136,15 @@ def _require_material(config: ModelConfig, scope: Scope, scene: Scene, name: str
     )
 
 
-def _in_domain(model: Simulator, question: Question) -> Answer:
+def _in_domain(model: Simulator, question: Question, corrections: int) -> Answer:
     """Predict a scene where it lies, or in the middle of the domain if it leaves the domain."""
     shift = _way_into_domain(model.config, question)
     if shift is None:
-        return rollouts(model, [question])[0]
+        return answers(model, [question], corrections)[0]
     there = dataclasses.replace(question.scene, rest_position=_moved(question.scene.rest_position, shift))
     moved = dataclasses.replace(question, scene=there, script=_moved(question.script, shift))
-    answer = rollouts(model, [moved])[0]
-    position, script = _moved(answer.position, -shift), question.script[: len(answer.position)]
+    answer = answers(model, [moved], corrections)[0]
+    position, script = _moved(answer.position, -shift), question.script[list(answer.frames)]
     # Given numbers stay what they are, to the last bit.
     position[: answer.given] = script[: answer.given]
     position = np.where(question.scene.prescribed[:, None], script, position)

@@ -16,7 +16,7 @@ from ast_sim.dataset.layout import DatasetInfo
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.evaluation import evaluate, table
-from ast_sim.inference.predict import Motions, predict
+from ast_sim.inference.predict import Effort, Motions, predict
 from ast_sim.runs.folder import load_model
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.train_config import read_scope
@@ -37,6 +37,8 @@ class Run:
         model: the trained model, an `nn.Module`.
         settings: the settings of the model and of the training.
         step: the step of the checkpoint.
+        corrections: the number of corrections with which a model that jumps had the least error in validation; 0 for
+            a model that predicts step by step.
         scope: the ranges of sizes, materials and motions in the training scenes.
 
     Raises:
@@ -46,6 +48,7 @@ class Run:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         self.model, self.settings, self.step = load_model(self.path)
+        self.corrections = Metrics(self.path).corrections(self.step, (self.settings.train.calls or 1) - 1)
         self.scope = read_scope(self.path)
 
     @property
@@ -69,7 +72,9 @@ class Run:
         scene: Scene | Trajectory,
         motion: Motions | None = None,
         *,
-        frames: int | None = None,
+        frames: Sequence[int] | None = None,
+        corrections: int | None = None,
+        num_frames: int | None = None,
         stress: np.ndarray | None = None,
         name: str = "scene",
     ) -> Answer:
@@ -84,18 +89,36 @@ class Run:
             motion: the motion of the prescribed nodes: rigid motions by the number of the body, such as
                 {1: (0, 0, -0.01)}; or positions [S, N, 3] of all nodes or [S, P, 3] of the prescribed ones; or a
                 `Motion`.
-            frames: S, only for rigid motions; by default so many that the prescribed nodes move as far in one frame as
-                in training.
+            frames: the numbers of the frames that are wanted, such as [-1] for the last one; by default all. A model
+                that jumps computes no other frame.
+            corrections: how many calls correct the first call of a model that jumps; by default `self.corrections`.
+            num_frames: S, only for rigid motions; by default so many that the prescribed nodes move as far in one frame
+                as in training.
             stress: [given, N or E, 1], the stress of the given frames in pascal; by default zero. One frame is given,
                 two where there is inertia.
             name: name of the scene, for messages.
 
         Raises:
             ConfigError: the motion does not fit the scene, or the scene does not fit the run.
+            RolloutError: there is no such frame.
         """
-        answer = predict(self.model, self.scope, scene, motion, frames, stress, name)
+        effort = Effort(frames, self.calls_after_first(corrections))
+        answer = predict(self.model, self.scope, scene, motion, num_frames, stress, name, effort)
         source = {"predicted_by": str(self.path), "step": self.step, "source": name}
         return dataclasses.replace(answer, info=self.info, source=source)
+
+    def calls_after_first(self, corrections: int | None) -> int:
+        """The given number of corrections, or that of the run.
+
+        Raises:
+            ConfigError: the number is negative, or the model does not jump.
+        """
+        if corrections is None:
+            return self.corrections
+        if corrections < 0 or (corrections and not self.settings.model.jumps):
+            why = "must be at least 0" if corrections < 0 else f"needs a run that jumps, and {self.path} does not"
+            raise ConfigError(f"corrections is {corrections}; it {why}")
+        return corrections
 
     def open(self, data: str | os.PathLike[str] | None = None) -> Dataset:
         """Open a dataset, by default the one that the run was trained on. The caller closes it.
@@ -122,17 +145,24 @@ class Run:
         return dataset
 
     def evaluate(
-        self, data: str | os.PathLike[str] | None = None, split: str = "test", command: str = "Run.evaluate"
+        self,
+        data: str | os.PathLike[str] | None = None,
+        split: str = "test",
+        command: str = "Run.evaluate",
+        rival_scenes: int = 0,
     ) -> Evaluation:
         """Predict all scenes of a split and measure the errors; on a terminal a bar shows the progress.
 
         Args:
             data: a dataset; by default the one that the run was trained on.
             command: the command that is recorded beside the figures.
+            rival_scenes: in so many scenes the solver goes straight to the deepest frame, in several ways, to compare.
         """
         with self.open(data) as dataset:
-            with Progress(dataset.count(split), 0, "scenes") as bar:
-                figures, answers = evaluate(self.model, dataset, split, lambda name: bar.advance())
+            with Progress(dataset.count(split) + rival_scenes, 0, "scenes") as bar:
+                figures, answers = evaluate(
+                    self.model, dataset, split, lambda name: bar.advance(), self.corrections, rival_scenes
+                )
             answers = [dataclasses.replace(answer, info=self.info) for answer in answers]
             origin = {"run": str(self.path), "step": self.step, "data": str(dataset.path), "split": split}
             return Evaluation(self, dataset.path, {**provenance(command), **origin, **figures}, answers)

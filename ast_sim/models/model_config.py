@@ -6,14 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Self
 
-from ast_sim.batches.horizons import FROM_FIRST, STEP_BY_STEP, Horizon
 from ast_sim.dataset.layout import GIVEN_FRAMES, DatasetInfo
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.toml_settings import LARGEST, require_range
 
 WIDEST = 1 << 16  # the largest width or count of a layer
 
-NODE_INPUTS = "node features, of displacement, velocity, material and proximity"
+NODE_INPUTS = "node features, of displacement, velocity, material, proximity and out_of_balance (elastic forces)"
 
 
 def setting(default: Any, text: str) -> Any:
@@ -30,12 +29,14 @@ class DataFacts:
         material_width: numbers that describe the material of an element; 0 without material.
         mesh_spacing: mean length of a mesh edge.
         planar: whether z is 0 in all scenes.
+        tetrahedra: whether the elements are tetrahedra.
     """
 
     info: DatasetInfo
     material_width: int
     mesh_spacing: float
     planar: bool = False
+    tetrahedra: bool = True
 
 
 @dataclass(frozen=True)
@@ -45,14 +46,17 @@ class ModelConfig:
     When training starts, `resolve` fills in the settings that are None, and all fields from `integration` on.
     """
 
-    time_conditioned = False  # a setting only in `TimeConditionedConfig`
-
     name: str = setting("", "which model")
     node_inputs: tuple[str, ...] | None = setting(None, f"{NODE_INPUTS}; unset: chosen from the data")
     proximity_radius: float | None = setting(
         None, "with proximity: distance within which a node sees another body; unset: 1.5 mesh spacings"
     )
-    boundary_motion: bool = setting(True, "give each prescribed node its next increment as an input")
+    boundary_motion: bool = setting(True, "give each prescribed node its next increment as an input; off with jumps")
+    jumps: bool | None = setting(
+        False,
+        "predict any frame at once from the first frame, carried along by the prescribed nodes, not step by step;"
+        " unset: yes in quasi-static scenes",
+    )
 
     integration: Literal["quasi_static", "dynamic"] = setting(
         "quasi_static", "next position: p + v if quasi_static, 2 p - p_previous + a if dynamic; from the dataset"
@@ -65,7 +69,7 @@ class ModelConfig:
     planar: bool = setting(False, "nodes stay at their z, as in scenes that lie in the plane z = 0; from the dataset")
 
     def __post_init__(self) -> None:
-        self.check_inputs("node_inputs", ("displacement", "velocity", "material", "proximity"))
+        self.check_inputs("node_inputs", ("displacement", "velocity", "material", "proximity", "out_of_balance"))
         self.check_range(0, LARGEST, "proximity_radius")
 
     def check_inputs(self, key: str, known: tuple[str, ...]) -> None:
@@ -93,11 +97,6 @@ class ModelConfig:
             raise ConfigError(f"model.hidden = {self.hidden} must be a multiple of model.heads = {self.heads}")
 
     @property
-    def horizon(self) -> Horizon:
-        """Which frame the model predicts from."""
-        return FROM_FIRST if self.time_conditioned else STEP_BY_STEP
-
-    @property
     def dynamic(self) -> bool:
         return self.integration == "dynamic"
 
@@ -118,21 +117,31 @@ class ModelConfig:
         return 0.0
 
     @property
-    def sees_surfaces(self) -> bool:
-        """Whether the inputs need the surfaces of the bodies."""
-        return "proximity" in self.node_inputs
+    def graph_parts(self) -> dict[str, bool]:
+        """The parts of the graph that the inputs need: arguments of `Graph.from_scene`."""
+        return {"surface": "proximity" in self.node_inputs, "elasticity": "out_of_balance" in self.node_inputs}
 
     def resolve(self, facts: DataFacts) -> Self:
         """The settings with nothing left open.
 
-        If `node_inputs` is unset, velocity becomes an input of dynamic scenes, and material of scenes that have one.
+        If `node_inputs` is unset, velocity becomes an input of dynamic scenes, material of scenes that have one, and
+        with jumps the elastic forces of tetrahedra.
 
         Raises:
             ConfigError: the data lacks something that the settings ask for.
         """
         info = facts.info
+        jumps = info.integration == "quasi_static" if self.jumps is None else self.jumps
+        if jumps and info.integration == "dynamic":
+            raise ConfigError(
+                "model.jumps: the dataset is dynamic, so the positions of its nodes depend on their motion before, not"
+                " only on the prescribed nodes: predict it step by step"
+            )
         velocity = ("velocity",) if info.integration == "dynamic" else ()
-        chosen = (*velocity, *(("material",) if facts.material_width else ()))
+        forces = ("out_of_balance",) if jumps and facts.tetrahedra else ()
+        chosen = (*velocity, *(("material",) if facts.material_width else ()), *forces)
+        if "out_of_balance" in (self.node_inputs or ()) and not facts.tetrahedra:
+            raise ConfigError("model.node_inputs: out_of_balance needs tetrahedra, but the elements are triangles")
         resolved = replace(
             self,
             node_inputs=chosen if self.node_inputs is None else self.node_inputs,
@@ -144,6 +153,8 @@ class ModelConfig:
             domain_half_width=float(info.domain_half_width),
             contact_radius=float(info.contact_radius),
             planar=facts.planar,
+            jumps=jumps,
+            boundary_motion=self.boundary_motion and not jumps,
         )
         resolved.check_available("node_inputs")
         return resolved
@@ -154,12 +165,8 @@ class ModelConfig:
 
 
 @dataclass(frozen=True)
-class TimeConditionedConfig(ModelConfig):
-    """Settings of a model that can predict each frame at once from the first frame, not only step by step."""
-
-    time_conditioned: bool = setting(
-        False, "predict each frame at once from the first frame, the prescribed nodes and the time, not step by step"
-    )
+class ProximityConfig(ModelConfig):
+    """Settings of a model that has no edges between bodies; it sees other bodies by proximity."""
 
     @property
     def gains_along_rollouts(self) -> bool:
@@ -168,13 +175,8 @@ class TimeConditionedConfig(ModelConfig):
 
     def resolve(self, facts: DataFacts) -> Self:
         """See `ModelConfig`. If `node_inputs` is unset, displacement becomes an input, and proximity in quasi-static
-        scenes, because the models have no edges between bodies. Proximity has not been measured in dynamic scenes."""
+        scenes. Proximity has not been measured in dynamic scenes."""
         resolved = super().resolve(facts)
-        if self.time_conditioned and resolved.dynamic:
-            raise ConfigError(
-                "model.time_conditioned: the dataset is dynamic, so the positions of its nodes depend on their motion"
-                " before, not only on the prescribed nodes: predict it step by step"
-            )
         if self.node_inputs is not None:
             return resolved
         proximity = () if resolved.dynamic else ("proximity",)
@@ -201,4 +203,4 @@ PAPER_TRAINING = {"batch_size": 48, "peak_rate": 1e-4, "noise": 0.003, "stress_w
 def tiny(model: ModelConfig, peak_rate: float, **train: Any) -> Preset:
     """The preset `tiny` of a model: for any dataset, of a size that two cores train in minutes."""
     shared = {"batch_size": 4, "optimizer": "muon", "stress_weight": 0.1, "rollout_pool": None}
-    return Preset(model, {**shared, "peak_rate": peak_rate, **train})
+    return Preset(replace(model, jumps=None), {**shared, "peak_rate": peak_rate, **train})

@@ -19,24 +19,24 @@ def states(config: ModelConfig, names: tuple[str, ...], batch: Batch) -> list[Te
     """Displacement and velocity of the nodes, if they are among `names`."""
     values = []
     if "displacement" in names:
-        values.append(config.horizon.present(batch) - batch.graph.rest_position)
+        values.append(batch.position - batch.graph.rest_position)
     if "velocity" in names:
         values.append(batch.position - batch.previous_position)
     return values
 
 
 def node_features(config: ModelConfig, batch: Batch) -> Tensor:
-    """[N, *]: node type (one-hot), displacement and velocity, material, proximity, boundary motion and the number of
-    the frame, as far as they are inputs. docs/reference/model.md explains them."""
+    """[N, *]: node type (one-hot), displacement and velocity, material, proximity, forces out of balance and boundary
+    motion, as far as they are inputs. docs/reference/model.md explains them."""
     values = [batch.graph.one_hot, *states(config, config.node_inputs, batch)]
     if "material" in config.node_inputs:
         values.append(batch.graph.node_material)
     if "proximity" in config.node_inputs:
         values.append(_proximity(batch, config.proximity_radius))
+    if "out_of_balance" in config.node_inputs:
+        values.append(batch.graph.elasticity.out_of_balance(batch.position, batch.graph.rest_position))
     if config.boundary_motion:
         values.append(batch.boundary_motion)
-    if config.horizon.numbered:
-        values.append(batch.frame.repeat_interleave(batch.graph.node_offsets.diff())[:, None])
     return torch.cat(values, dim=1)
 
 
@@ -63,10 +63,11 @@ def normalizer_of(config: ModelConfig, what: str) -> FeatureNormalizer:
         "material": ("scalar", config.material_width),
         "stress": scalar,
         "proximity": (None, PROXIMITY_WIDTH),
+        "out_of_balance": (None, 3),
     }
     inputs = config.node_inputs if what == "node" else config.element_inputs
     kinds = [kind for name, kind in known.items() if name in inputs]
     if what == "node":
         kinds = [(None, len(NodeType)), *kinds]
-        kinds += [vector] * config.boundary_motion + [scalar] * config.horizon.numbered
+        kinds += [vector] * config.boundary_motion
     return FeatureNormalizer(kinds)

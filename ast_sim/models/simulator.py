@@ -71,7 +71,7 @@ class Simulator(nn.Module):
 
     def graph(self, scene: Scene) -> Graph:
         """What the model needs to know of a scene that does not change with time."""
-        return Graph.from_scene(scene, element_nodes=False, surface=self.config.sees_surfaces)
+        return Graph.from_scene(scene, element_nodes=False, **self.config.graph_parts)
 
     def domain(self, position: Tensor) -> int | None:
         """The number of the domain that holds the positions [N, 3] of a scene. None: they are too far away for the
@@ -105,7 +105,7 @@ class Simulator(nn.Module):
             dynamic=self.config.dynamic,
             gamma=gamma,
             part=part,
-            horizon=self.config.horizon,
+            jumps=self.config.jumps,
             mirror=mirror,
             shift=shift,
         )
@@ -135,6 +135,7 @@ class Simulator(nn.Module):
         target: Target,
         stress_weight: float = 0.01,
         share: Callable[[int], float] = lambda rows: 1.0,
+        weights: Tensor | None = None,
     ) -> dict[str, Tensor]:
         """Mean squared errors of normalised outputs: motion of NORMAL nodes, and stress of what deforms.
 
@@ -143,6 +144,7 @@ class Simulator(nn.Module):
 
         Args:
             prediction: `self(batch)`.
+            weights: [B], how much the squared error of the motion of each scene counts; None: 1.
 
         Returns:
             "motion", "stress" (if there is one) and "loss" = motion + stress_weight * stress. "spread" is the standard
@@ -151,6 +153,9 @@ class Simulator(nn.Module):
         normal = batch.graph.normal_nodes
         motion = prediction.motion.index_select(0, normal)
         error = motion - self.motion_normalizer(target.motion.index_select(0, normal))
+        if weights is not None:
+            of_nodes = weights.sqrt().repeat_interleave(batch.graph.node_offsets.diff())
+            error = error * of_nodes.index_select(0, normal)[:, None]
         part = share(len(normal))
         losses = {"motion": part * error.square().mean()}
         losses["loss"] = losses["motion"]
@@ -173,7 +178,8 @@ class Simulator(nn.Module):
     def predict(self, batch: Batch) -> Prediction:
         """The outputs in physical units: motion in the dataset's unit of length, stress in pascal."""
         prediction = self(batch)
-        stress = self.stress_normalizer.inverse(prediction.stress) if self.stress_normalizer is not None else None
+        known = self.stress_normalizer is not None and prediction.stress is not None
+        stress = self.stress_normalizer.inverse(prediction.stress) if known else None
         return Prediction(self.motion_normalizer.inverse(prediction.motion), stress)
 
     def integrate(self, batch: Batch, motion: Tensor) -> Tensor:

@@ -26,7 +26,7 @@ from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import Graph
 from ast_sim.models import node_inputs
 from ast_sim.models.layers import Linear
-from ast_sim.models.model_config import WIDEST, Preset, TimeConditionedConfig, setting, tiny
+from ast_sim.models.model_config import WIDEST, Preset, ProximityConfig, setting, tiny
 from ast_sim.models.normalizer import FeatureNormalizer
 from ast_sim.models.registry import Model
 from ast_sim.models.simulator import Prediction, Simulator
@@ -36,7 +36,7 @@ EPSILON = 1e-5  # added to the weight of a slice, so that an empty one is 0
 
 
 @dataclass(frozen=True)
-class TransolverConfig(TimeConditionedConfig):
+class TransolverConfig(ProximityConfig):
     """The settings of Transolver."""
 
     name: Literal["transolver"] = setting("transolver", "Transolver: attention between learned slices")
@@ -161,7 +161,7 @@ class Transolver(Simulator):
     def _positions(self, batch: Batch) -> Tensor:
         """[N, 6]: positions at rest and now, relative to the centre of the domain."""
         center = torch.tensor(self.config.domain_center * 2)
-        return torch.cat([batch.graph.rest_position, self.config.horizon.present(batch)], dim=1) - center
+        return torch.cat([batch.graph.rest_position, batch.position], dim=1) - center
 
     def observe(self, batch: Batch) -> None:
         """Add the batch to the statistics of the inputs."""
@@ -175,7 +175,7 @@ class Transolver(Simulator):
         for block in self.blocks:
             x = block(x, batch.graph.node_offsets)
         x = self.norm(x)
-        on_elements = self.config.stress == "element"
+        on_elements = self.config.stress == "element" and batch.wants_stress
         stress = self.element_decoder(batch.graph.element_mean(x)) if on_elements else None
         return Prediction.of_nodes(self.decoder(x), stress)
 

@@ -166,5 +166,6 @@ class Decoder(nn.Module):
         self.of_elements = DeepMLP(config, config.hidden, 1) if config.stress == "element" else None
 
     def forward(self, nodes: Tensor, batch: Batch) -> Prediction:
-        stress = self.of_elements(batch.graph.element_mean(nodes)) if self.of_elements is not None else None
+        on_elements = self.of_elements is not None and batch.wants_stress
+        stress = self.of_elements(batch.graph.element_mean(nodes)) if on_elements else None
         return Prediction.of_nodes(self.of_nodes(nodes), stress)

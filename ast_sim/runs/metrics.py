@@ -58,5 +58,10 @@ class Metrics:
         error, step = min(errors)
         return step, error
 
+    def corrections(self, step: int, unset: int) -> int:
+        """The best number of corrections in the validation after a step; `unset` if it was not recorded."""
+        found = [record["corrections"] for record in self if record["step"] == step and "corrections" in record]
+        return int(found[-1]) if found else unset
+
     def validated(self, step: int) -> bool:
         return any(record["step"] == step and "valid_rmse" in record for record in self)

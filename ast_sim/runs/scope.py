@@ -42,16 +42,18 @@ class Scope:
     material_low: tuple[float, ...]
     material_high: tuple[float, ...]
 
-    def notes(self, scene: Scene, motion: Motion) -> Iterator[str]:
-        """One sentence for each property of a scene and its prescribed motion that lies outside its range."""
+    def notes(self, scene: Scene, motion: Motion, jumps: bool) -> Iterator[str]:
+        """One sentence for each property of a scene and its prescribed motion that lies outside its range. For a model
+        that jumps, it does not matter how far prescribed nodes move in one frame."""
         length = f" {self.length_unit}"
+        increment = 0.0 if jumps else max(motion.increments(scene))
         for (low, high), value, text, unit in (
             ((self.corners, self.corners), scene.elements.shape[1], "the elements have {} nodes", ""),
             (self.nodes, scene.num_nodes, "the scene has {} nodes", ""),
             (self.size, size_of(scene), "the deforming bodies measure {} across", length),
             (self.spacing, spacing_of(scene), "the mesh edges have a mean length of {}", length),
             ((0.0, self.travel[1]), motion.travel(scene), "prescribed nodes move up to {} from their start", length),
-            ((0.0, self.increment[1]), max(motion.increments(scene)), "prescribed nodes move {} in one frame", length),
+            ((0.0, self.increment[1]), increment, "prescribed nodes move {} in one frame", length),
             *self._materials(scene),
         ):
             if not low - LEEWAY * abs(low) <= value <= high + LEEWAY * abs(high):

@@ -48,7 +48,10 @@ class TrainConfig:
         0,
         "scenes that are rolled out during training, so that the model learns from states that it predicted itself;"
         " 0: it learns from the states of the dataset, with noise; unset: 16 batches if the scenes are dynamic or the"
-        " model is ast or transolver, else 0; always 0 for a time-conditioned model and without noise",
+        " model is ast or transolver, else 0; always 0 with model.jumps and without noise",
+    )
+    calls: int | None = setting(
+        None, "with model.jumps: so many calls correct one another in training; unset: 6 with jumps, else 1"
     )
     noise_gamma: float | None = setting(
         None, "share of the noise that the target takes back; unset: 1, in dynamic scenes 0.1"
@@ -67,7 +70,7 @@ class TrainConfig:
     validate_every: int | None = setting(
         None, "steps from one validation (rollouts of validation scenes) to the next; unset: a tenth of all steps"
     )
-    validate_scenes: int = setting(8, "number of validation scenes that are rolled out; these are the first ones")
+    validate_scenes: int = setting(8, "number of validation scenes that are predicted; these are the first ones")
     checkpoint_every: int | None = setting(
         None, "steps from one checkpoint to the next; unset: a checkpoint at each validation"
     )

@@ -16,7 +16,7 @@ from ast_sim.training.data_lengths import DataScales
 # An unset shift is at most this share of the domain's half width; the margin of `Domain` is larger.
 LARGEST_SHIFT = 0.05
 _COUNTS = ("batch_size", "accumulate", "epochs", "statistics_pairs", "steps", "decay", "log_every", "keep")
-_COUNTS += ("validate_every", "checkpoint_every")
+_COUNTS += ("validate_every", "checkpoint_every", "calls")
 _RANGES = {
     **dict.fromkeys(_COUNTS, (1, LARGEST)),
     **dict.fromkeys(("seed", "warmup", "validate_scenes", "noise"), (0, LARGEST)),
@@ -25,6 +25,7 @@ _RANGES = {
     "stress_weight": (0, 1e6),
     "noise_gamma": (0, 1),
 }
+CALLS = 6  # (docs/log.md, 2026-11-24)
 ROLLOUT_BATCHES = 16  # an unset pool of rollouts holds the scenes of so many batches
 
 
@@ -34,7 +35,11 @@ def resolve(config: RunConfig, dataset: Dataset, scales: DataScales) -> RunConfi
     Raises:
         ConfigError: a setting is out of its range, or the data does not fit it; the text names the setting.
     """
-    model = config.model.resolve(DataFacts(dataset.info, dataset.material_width, scales.spacing, scales.planar))
+    model = config.model.resolve(
+        DataFacts(
+            dataset.info, dataset.material_width, scales.spacing, scales.planar, tetrahedra=dataset.element_size == 4
+        )
+    )
     return RunConfig(model, resolve_training(config.train, scales, model), str(Path(config.data).resolve()))
 
 
@@ -56,6 +61,7 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
         "warmup": min(2000, steps // 20),
         "decay": steps if config.steps is not None else steps + epoch,
         "noise_gamma": 0.1 if model.dynamic else 1.0,
+        "calls": CALLS if model.jumps else 1,
         "validate_every": validate_every,
         "checkpoint_every": validate_every,
     }
@@ -63,6 +69,8 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
     pool = _rollout_pool(config, model)
     noise = _noise(config, scales, model, pool > 0)
     resolved = dataclasses.replace(config, **missing, noise=noise, rollout_pool=pool, shift=_shift(config, model))
+    if resolved.calls > 1 and not model.jumps:
+        raise ConfigError(f"train.calls is {resolved.calls}; without model.jumps it must be 1")
     if resolved.decay <= resolved.warmup:
         raise ConfigError(f"train.warmup is {resolved.warmup}; it must be below train.decay = {resolved.decay}")
     return resolved
@@ -70,7 +78,7 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
 
 def _noise(config: TrainConfig, scales: DataScales, model: ModelConfig, along_rollouts: bool) -> float:
     """The standard deviation of the noise on states; measurements chose the shares (docs/log.md, 2026-11-23)."""
-    if not model.horizon.drifts:  # each prediction starts from the true first frame, so its input has no error
+    if model.jumps:  # a guess has errors of the model's own
         return 0.0
     if config.noise is not None:
         return config.noise
@@ -82,8 +90,8 @@ def _noise(config: TrainConfig, scales: DataScales, model: ModelConfig, along_ro
 def _rollout_pool(config: TrainConfig, model: ModelConfig) -> int:
     """The number of scenes in the pool of rollouts; 0: there is no pool."""
     useless = None
-    if not model.horizon.drifts:
-        useless = "each frame follows from the first"
+    if model.jumps:
+        useless = "with model.jumps, each frame follows from the first"
     elif config.noise == 0:
         useless = "without train.noise, states have no error"
     if config.rollout_pool is None:

@@ -16,6 +16,7 @@ import torch
 from ast_sim.batches.batch_builder import Batch, Target
 from ast_sim.batches.pairs import PairSampler
 from ast_sim.batches.prefetch import Ahead
+from ast_sim.batches.training_jumps import JumpPool
 from ast_sim.batches.training_rollouts import RolloutPool
 from ast_sim.dataset.reader import Dataset
 from ast_sim.models.registry import build_model
@@ -32,6 +33,8 @@ from ast_sim.training.profile import profile, table
 from ast_sim.training.rates import learning_rate, step_seed
 from ast_sim.training.saving import Saver
 from ast_sim.training.validation import validate, verdict
+
+JUMP_BATCHES = 64  # the pool of jumps holds so many batches; with 8, steps learn less: the calls of a jump are alike
 
 
 class Training:
@@ -55,8 +58,7 @@ class Training:
         torch.manual_seed(self.options.seed)
         self.model = build_model(config.model)
         self.sampler = self._sampler((self.processes.rank, self.processes.count))
-        pooled, largest = self.options.rollout_pool, largest_error(scales, config.model)
-        self.pool = RolloutPool(self.sampler, pooled, largest) if pooled else None
+        self.pool = self._pool(largest_error(scales, config.model))
         self.ahead = Ahead(self.pool or self.sampler)
         self.optimizer = Optimizer(self.model, self.options.optimizer)
         self.clock = Clock()
@@ -71,6 +73,13 @@ class Training:
 
     def __exit__(self, *error: object) -> None:
         self.ahead.__exit__(*error)
+
+    def _pool(self, largest: float) -> RolloutPool | JumpPool | None:
+        """The pool of scenes that go on from the model's own answers; None: each batch is drawn anew."""
+        options = self.options
+        if self.config.model.jumps:
+            return JumpPool(self.sampler, JUMP_BATCHES * options.batch_size, options.calls, largest)
+        return RolloutPool(self.sampler, options.rollout_pool, largest) if options.rollout_pool else None
 
     def _sampler(self, part: tuple[int, int]) -> PairSampler:
         options = self.options
@@ -171,7 +180,10 @@ class Training:
             prediction = self.model(batch)
         except DatasetError as error:
             raise DatasetError(f"{self.dataset.path}: in one of {', '.join(batch.names)}: {error}") from error
-        losses = self.model.loss(prediction, batch, target, self.options.stress_weight, self.processes.share)
+        weights = None
+        if self.pool is not None:
+            weights = self.pool.weights(number, self.processes.gathered(self.pool.errors(number, target)))
+        losses = self.model.loss(prediction, batch, target, self.options.stress_weight, self.processes.share, weights)
         found = self.processes.add(torch.stack([value.detach() for value in losses.values()]))
         whole = dict(zip(losses, found.tolist(), strict=True))
         if not math.isfinite(whole["loss"]):
@@ -198,7 +210,7 @@ class Training:
         mine = range(self.processes.rank, count, self.processes.count)
         # Several processes must stop together, so none of them may stop within its own validation.
         progress = self._stop_at_once if self.processes.count == 1 else None
-        found = self.processes.gathered(validate(self.model, self.dataset, mine, progress))
+        found = self.processes.gathered(validate(self.model, self.dataset, mine, self.options.calls, progress))
         seconds = self.clock.validation()
         if not self.processes.leads:
             return

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from torch import Tensor, nn
 
+from ast_sim.batches.training_jumps import JumpPool
 from ast_sim.batches.training_rollouts import RolloutPool
 from ast_sim.dataset.reader import Dataset
 from ast_sim.runs import checkpoint
@@ -25,7 +26,7 @@ class Saver:
         dataset: Dataset,
         model: nn.Module,
         optimizer: Optimizer,
-        pool: RolloutPool | None,
+        pool: RolloutPool | JumpPool | None,
         processes: Processes,
     ) -> None:
         self.run, self.dataset, self.model, self.optimizer = run, dataset, model, optimizer
@@ -44,7 +45,7 @@ class Saver:
                 self.run,
                 step,
                 model=self.model.state_dict(),
-                training={**_under("optimizer.", self.optimizer.state()), **_under("rollout_pool.", rolling)},
+                training={**_under("optimizer.", self.optimizer.state()), **_under("pool.", rolling)},
                 state={"step": step, "sums": sums, "run": run, "lines": lines},
                 keep=keep,
             )
@@ -74,7 +75,7 @@ class Saver:
         self.model.load_state_dict(weights)
         self.optimizer.restore(_without("optimizer.", training))
         print(f"going on after step {state['step']:,}", flush=True)
-        return (state["step"], state["sums"]), _without("rollout_pool.", training)
+        return (state["step"], state["sums"]), _without("pool.", training)
 
 
 def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:

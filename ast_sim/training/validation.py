@@ -8,10 +8,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ast_sim.dataset.reader import Dataset
+from ast_sim.inference.jump import calls
 from ast_sim.inference.measures import SquaredError, rmse_sequence
-from ast_sim.inference.rollout import Question, rollouts
+from ast_sim.inference.question import Question
+from ast_sim.inference.rollout import rollouts
 from ast_sim.models.simulator import Simulator
 from ast_sim.scene import Trajectory
+
+MORE_CALLS = 2  # a model that jumps is validated with so many more calls than it is trained with
+ENOUGH = 0.01  # a further call must lower the error by this share
+JUMPS = 4  # a model that jumps is validated at so many frames of a scene, evenly spread, the last one included
 
 
 class Validated(NamedTuple):
@@ -19,30 +25,55 @@ class Validated(NamedTuple):
 
     Attributes:
         index: number of the scene in its split.
-        error: error of the rollout; None if the rollout failed.
+        errors: error of the prediction, for a model that jumps after each call; empty if the prediction failed.
         hold: error of the prediction that nothing moves.
-        failure: why the rollout failed; None if it did not.
+        failure: why the prediction failed; None if it did not.
     """
 
     index: int
-    error: SquaredError | None
+    errors: list[SquaredError]
     hold: SquaredError
     failure: str | None
 
 
 def validate(
-    model: Simulator, dataset: Dataset, indices: Iterable[int], progress: Callable[[int], None] | None = None
+    model: Simulator,
+    dataset: Dataset,
+    indices: Iterable[int],
+    most_calls: int = 1,
+    progress: Callable[[int], None] | None = None,
 ) -> list[Validated]:
-    """Roll out validation scenes together; `progress` is called after each step and may raise to stop."""
+    """Predict validation scenes together; `progress` is called after each step and may raise to stop.
+
+    Args:
+        most_calls: so many calls correct one another in training.
+    """
     truths = {index: dataset.load("valid", index) for index in indices}
     if not truths:
         return []
-    questions = [Question.of(truth, f"valid/{index:06d}") for index, truth in truths.items()]
+    if model.config.jumps:
+        return _validate_jumps(model, truths, most_calls + MORE_CALLS if most_calls > 1 else 1)
+    questions = [Question.of(truth, _name(index)) for index, truth in truths.items()]
     found = []
     for (index, truth), answer in zip(truths.items(), rollouts(model, questions, progress), strict=True):
-        error = None if answer.failure else _motion_error(answer.position[answer.given :], truth, answer.given)
-        hold = _motion_error(truth.position[answer.given - 1], truth, answer.given)
-        found.append(Validated(index, error, hold, answer.failure))
+        after = slice(answer.given, None)
+        errors = [] if answer.failure else [_motion_error(answer.position[after], truth, after)]
+        hold = _motion_error(truth.position[answer.given - 1], truth, after)
+        found.append(Validated(index, errors, hold, answer.failure))
+    return found
+
+
+def _validate_jumps(model: Simulator, truths: dict[int, Trajectory], most_calls: int) -> list[Validated]:
+    frames = {
+        index: np.unique(np.linspace(0, truth.num_frames - 1, JUMPS + 1).round().astype(int)[1:])
+        for index, truth in truths.items()
+    }
+    questions = [Question.of(truth, _name(index), frames[index].tolist()) for index, truth in truths.items()]
+    found = []
+    for (index, truth), after in zip(truths.items(), calls(model, questions, most_calls - 1), strict=True):
+        failure = after if isinstance(after, str) else None
+        errors = [_motion_error(position, truth, frames[index]) for position in after] if failure is None else []
+        found.append(Validated(index, errors, _motion_error(truth.position[0], truth, frames[index]), failure))
     return found
 
 
@@ -50,14 +81,30 @@ def verdict(found: list[Validated], best: float, unit: str) -> tuple[dict[str, A
     """The record of a validation for `metrics.jsonl`, and its text; `best` is the lowest error before."""
     failure = next((scene.failure for scene in found if scene.failure), None)
     if failure is not None:
-        return {"valid_rmse": None, "failure": failure}, f"rollout failed: {failure}"
+        return {"valid_rmse": None, "failure": failure}, f"prediction failed: {failure}"
     found = sorted(found, key=lambda scene: scene.index)
-    error, hold = (rmse_sequence([getattr(scene, key) for scene in found]) for key in ("error", "hold"))
+    by_calls = [rmse_sequence(errors) for errors in zip(*(scene.errors for scene in found), strict=True)]
+    hold = rmse_sequence([scene.hold for scene in found])
+    corrections = _corrections(by_calls)
+    error = by_calls[corrections]
     share = f" = {error / hold:.2f} of the error of hold still" if hold else ""
-    text = f"rollout error {error:.3g} {unit}{share}{', the best so far' if error < best else ''}"
-    return {"valid_rmse": error, "valid_hold_still": hold}, text
+    after = f" after {corrections} corrections" if len(by_calls) > 1 else ""
+    text = f"error {error:.3g} {unit}{share}{after}{', the best so far' if error < best else ''}"
+    record = {"valid_rmse": error, "valid_hold_still": hold}
+    if len(by_calls) > 1:
+        record |= {"valid_by_calls": by_calls, "corrections": corrections}
+    return record, text
 
 
-def _motion_error(position: np.ndarray, truth: Trajectory, given: int) -> SquaredError:
-    """Error on NORMAL nodes of `position` [S - given, N, 3], the frames after the given ones; or [N, 3] for all."""
-    return SquaredError.between(position, truth.position[given:], ~truth.scene.prescribed)
+def _corrections(by_calls: list[float]) -> int:
+    """The number of corrections after which no further call lowers the error by more than `ENOUGH`."""
+    return next(i for i, error in enumerate(by_calls) if min(by_calls[i:]) >= (1 - ENOUGH) * error)
+
+
+def _name(index: int) -> str:
+    return f"valid/{index:06d}"
+
+
+def _motion_error(position: np.ndarray, truth: Trajectory, frames: slice | np.ndarray) -> SquaredError:
+    """Error on NORMAL nodes of `position` [S, N, 3] in these S frames of the truth; or [N, 3] for all."""
+    return SquaredError.between(position, truth.position[frames], ~truth.scene.prescribed)

@@ -60,7 +60,7 @@ def measure_tables(names: Sequence[str], evaluations: Sequence[Json | None]) -> 
 
 def _of_model(evaluation: Json | None, quantity: str) -> Json | None:
     found = lookup(evaluation, "summary", MODEL, quantity)
-    if found is None or not evaluation.get("time_conditioned"):
+    if found is None or not evaluation.get("jumps"):
         return found
     return {horizon: errors for horizon, errors in found.items() if horizon != "one_step"}
 

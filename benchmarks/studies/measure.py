@@ -26,7 +26,8 @@ from ast_sim import keep_memory
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.measures import SquaredError, rmse_pooled, rmse_sequence
-from ast_sim.inference.rollout import Question, rollouts
+from ast_sim.inference.predict import answers
+from ast_sim.inference.question import Question
 from ast_sim.inference.trained_run import Run
 from ast_sim.scene import NodeType, Trajectory
 from ast_sim.support.disk import write_json
@@ -74,7 +75,8 @@ def phase_errors(truth: Trajectory, result: Answer) -> dict[str, SquaredError]:
 def long_rollouts(run: Run, dataset: Dataset, horizons: int) -> Iterator[tuple[Trajectory, Answer]]:
     """Every test scene and its rollout over all horizons."""
     for index, truth in enumerate(dataset["test"]):
-        yield truth, rollouts(run.model, [Question.of(repeated(truth, horizons), f"test/{index:06d}")])[0]
+        question = Question.of(repeated(truth, horizons), f"test/{index:06d}")
+        yield truth, answers(run.model, [question], run.corrections)[0]
 
 
 def measure(run: Run, horizons: int, command: str) -> dict[str, Any]:

@@ -14,11 +14,12 @@ from vtk_series import read
 from ast_sim import Dataset, DatasetWriter, Motion, Run, generate, read_scene, train
 from ast_sim.cli import main
 from ast_sim.demo import FAMILY, FRAMES, NODES
-from ast_sim.inference.rollout import Question, rollouts
+from ast_sim.inference import predict
+from ast_sim.inference.question import Question
 from ast_sim.scene import Scene
 from ast_sim.simulate.families import deforming_plate
 from ast_sim.simulate.mechanics.case import SolidCase
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import ConfigError, DatasetError
 
 SIZE, CELLS, DEPTH = (0.48, 0.32, 0.03), (11, 8, 2), 0.045
 PRESCRIBED = {"obstacles": [1], "clamps": ["0:xmin,xmax"]}
@@ -108,9 +109,11 @@ def test_the_prescribed_nodes_move_as_far_in_a_frame_as_in_training(run, monkeyp
     scene = scene_of()
     answer = run.predict(scene, PRESS)
     assert len(answer.position) == 1 + int(np.ceil(DEPTH / usual))
-    assert len(run.predict(scene, PRESS, frames=9).position) == 9
+    assert len(run.predict(scene, PRESS, num_frames=9).position) == 9
     monkeypatch.setattr(run, "scope", replace(run.scope, usual_increment=0.0))
-    with pytest.raises(ConfigError, match=r"nothing is moved in the training scenes: say how many frames \(--frames\)"):
+    with pytest.raises(
+        ConfigError, match=r"nothing is moved in the training scenes: say how many frames \(--num-frames\)"
+    ):
         run.predict(scene, PRESS)
 
 
@@ -125,12 +128,12 @@ def test_a_scene_far_away_gets_the_same_answer_there(run, tmp_path):
     press, frames = {1: (0.0, 0.0, -3 / 64)}, 17
     known = np.concatenate([rest, rest[scene.body == 1] + press[1]])
     rest -= (known.min(axis=0) + known.max(axis=0)) / 2
-    middle = run.predict(with_positions(scene, rest), press, frames=frames)
+    middle = run.predict(with_positions(scene, rest), press, num_frames=frames)
     free = ~scene.prescribed
     size = np.linalg.norm(np.ptp(rest, axis=0))
     for shift in ((4.0, -4.0, 2.0), (64.0, -32.0, 16.0)):
         there = with_positions(scene, rest + shift)
-        far = run.predict(there, press, frames=frames)
+        far = run.predict(there, press, num_frames=frames)
         assert far.scene is there and far.failure is None
         expected = middle.position.astype(np.float64) + shift
         assert np.array_equal(far.position[:, free], expected.astype(np.float32)[:, free])
@@ -147,17 +150,19 @@ def test_a_scene_far_away_gets_the_same_answer_there(run, tmp_path):
 def test_only_a_scene_that_leaves_the_domain_is_moved(run, monkeypatch):
     asked = []
 
-    def kept(model, questions):
-        asked.extend(questions)
-        return rollouts(model, questions)
+    answers = predict.answers
 
-    monkeypatch.setattr("ast_sim.inference.predict.rollouts", kept)
+    def kept(model, questions, corrections):
+        asked.extend(questions)
+        return answers(model, questions, corrections)
+
+    monkeypatch.setattr(predict, "answers", kept)
     scene = scene_of()
     scene = with_positions(scene, scene.rest_position + [0.7, 0.1, 0.0])  # up to x = 0.94 of 1
-    run.predict(scene, PRESS, frames=3)
+    run.predict(scene, PRESS, num_frames=3)
     assert asked[-1].scene is scene
     with pytest.warns(UserWarning, match="prescribed nodes move"):  # its motion counts, too: up to x = 1.15
-        run.predict(scene, {1: (0.4, 0.0, 0.0)}, frames=3)
+        run.predict(scene, {1: (0.4, 0.0, 0.0)}, num_frames=3)
     x = asked[-1].script[:, scene.prescribed, 0]
     assert (x.min(), x.max()) == pytest.approx((-0.345, 0.345))
     assert asked[-1].scene.rest_position[:, 0].min() == pytest.approx(-0.345)
@@ -171,19 +176,18 @@ def test_a_trajectory_is_predicted_where_it_lies_and_nobody_warns(run):
     answer = predicted_without_warning(run, there)
     assert answer.scene is scene and np.array_equal(answer.position[0], there.position[0])
     question = Question.of(there, "scene")
-    assert np.array_equal(answer.position, rollouts(run.model, [question])[0].position)
+    assert np.array_equal(answer.position, predict.answers(run.model, [question], run.corrections)[0].position)
 
 
 @pytest.mark.parametrize(
     ("scene", "press", "options", "words"),
     [
         (scene_of(), 0.12, {}, "prescribed nodes move up to 0.12 m from their start; in training 0 m to"),
-        (scene_of(), DEPTH, {"frames": 2}, "prescribed nodes move 0.045 m in one frame; in training 0 m to"),
         (scene_of((0.66, 0.36, 0.03), (14, 8, 2)), DEPTH, {}, "the deforming bodies measure 0.7524 m across; in train"),
         (scene_of(cells=(7, 5, 4)), DEPTH, {}, "the mesh edges have a mean length of 0.06436 m; in training"),
         (scene_of(cells=(10, 8, 4)), DEPTH, {}, "the scene has 522 nodes; in training"),
     ],
-    ids=["travel", "increment", "size", "spacing", "nodes"],
+    ids=["travel", "size", "spacing", "nodes"],
 )
 def test_what_lies_outside_the_training_scenes_is_told(run, scene, press, options, words):
     with pytest.warns(UserWarning) as told:
@@ -194,7 +198,10 @@ def test_what_lies_outside_the_training_scenes_is_told(run, scene, press, option
 
 def test_triangles_are_not_what_the_run_knows(run):
     scene = scene_of()
-    with pytest.warns(UserWarning, match="the elements have 3 nodes; in training 4$"):
+    with (
+        pytest.warns(UserWarning, match="the elements have 3 nodes; in training 4$"),
+        pytest.raises(DatasetError, match="the elements are triangles, but the model takes elastic forces"),
+    ):
         run.predict(replace(scene, elements=scene.surface()), PRESS)
 
 
@@ -208,11 +215,11 @@ POSITIONS = np.repeat(scene_of().rest_position[None], 3, axis=0)
         ({}, {}, "say how its prescribed nodes move"),
         ({2: (0, 0, 1)}, {}, "there is no body 2"),
         ({1: (0, 1)}, {}, "translation of a motion must be three numbers"),
-        (PRESS, {"frames": 1}, "frames is 1; the run needs at least 2"),
+        (PRESS, {"num_frames": 1}, "num_frames is 1; the run needs at least 2"),
         (POSITIONS[:, :5], {}, r"the motion has the shape \[3, 5, 3\], must be \[frames, 351 nodes, 3\] or"),
         (POSITIONS + np.nan, {}, "the motion is not finite in frame 0 at node 0"),
         (Motion(POSITIONS[:1]), {}, "with at least 2 frames"),
-        (POSITIONS, {"frames": 3}, "its motion has frames already: leave out frames=3"),
+        (POSITIONS, {"num_frames": 3}, "its motion has frames already: leave out num_frames=3"),
         (
             POSITIONS,
             {"stress": np.zeros((1, 5, 1))},
@@ -229,17 +236,17 @@ def test_a_motion_that_does_not_fit(run, motion, options, message):
 def test_a_trajectory_brings_its_motion(run):
     with Dataset(run.settings.data) as data:
         truth = data["test"][0]
-    for options in ({"motion": PRESS}, {"frames": 3}, {"stress": truth.stress[:1]}):
+    for options in ({"motion": PRESS}, {"num_frames": 3}, {"stress": truth.stress[:1]}):
         with pytest.raises(ConfigError, match="has a motion, frames and a stress of its own"):
             run.predict(truth, **options)
 
 
 def test_the_stress_at_the_start_is_zero_unless_given(run):
     scene = scene_of()
-    answer = run.predict(scene, PRESS, frames=3)
+    answer = run.predict(scene, PRESS, num_frames=3)
     assert not answer.stress[0].any() and answer.stress[1].any()
     given = np.full((1, scene.num_nodes, 1), 5e4)
-    assert np.array_equal(run.predict(scene, PRESS, frames=3, stress=given).stress[:1], given.astype(np.float32))
+    assert np.array_equal(run.predict(scene, PRESS, num_frames=3, stress=given).stress[:1], given.astype(np.float32))
 
 
 # A run with inertia and material
@@ -276,8 +283,8 @@ def test_a_scene_with_inertia_starts_at_rest(dynamic_run):
     assert len(answer.position) == 1 + np.ceil(0.02 / dynamic_run.scope.usual_increment)
     # A short way takes a frame more than the two that are given.
     assert len(dynamic_run.predict(scene, {1: (0, 0, -1e-6)}).position) == 3
-    with pytest.raises(ConfigError, match="frames is 2; the run needs at least 3"):
-        dynamic_run.predict(scene, {1: (0, 0, -0.02)}, frames=2)
+    with pytest.raises(ConfigError, match="num_frames is 2; the run needs at least 3"):
+        dynamic_run.predict(scene, {1: (0, 0, -0.02)}, num_frames=2)
 
 
 def test_a_scene_with_inertia_may_start_with_a_velocity(dynamic_run):

@@ -424,7 +424,8 @@ def test_what_the_dataset_decides():
     tiny = PRESETS["tiny"].model
     config = tiny.resolve(DataFacts(info, 2, mesh_spacing=0.1))
     assert config.element_inputs == ("displacement", "material") and config.stress == "element"
-    assert config.node_inputs == ("displacement", "proximity", "material") and config.material_width == 2
+    assert config.node_inputs == ("displacement", "proximity", "material", "out_of_balance")
+    assert config.material_width == 2
     assert (config.places, config.exchanges) == ("relative", 2)
     assert config.domain_center == (1.0, 2.0, 3.0) and config.domain_half_width == 4.0
     assert config.L_cell == 6 and config.cell_side == pytest.approx(0.125)  # 1 + log2(4 / 0.15) = 5.7

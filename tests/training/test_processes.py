@@ -17,7 +17,7 @@ from ast_sim.runs.metrics import Metrics
 
 SETTINGS = [
     "model.hidden=16", "model.L_SA=1", "model.L_cell=3", "train.batch_size=4", "train.statistics_pairs=8",
-    "train.log_every=4", "train.validate_every=4", "train.noise=1e-4",
+    "train.log_every=4", "train.validate_every=4", "train.noise=1e-4", "model.jumps=false",
 ]  # fmt: skip
 
 
@@ -41,7 +41,11 @@ def data(tmp_path_factory) -> Path:
     return toy.write(tmp_path_factory.mktemp("data") / "toy.h5")
 
 
-@pytest.mark.parametrize("along", [[], ["--set", "train.rollout_pool=8"]], ids=["pairs", "rollouts"])
+@pytest.mark.parametrize(
+    "along",
+    [[], ["--set", "train.rollout_pool=8"], ["--set", "model.jumps=true", "--set", "train.calls=3"]],
+    ids=["pairs", "rollouts", "jumps"],
+)
 def test_two_processes_do_what_one_does(data, tmp_path, along):
     told = train(2, data, tmp_path / "two", 8, *along).stdout
     train(1, data, tmp_path / "one", 8, *along)

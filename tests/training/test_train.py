@@ -194,15 +194,18 @@ def test_the_kind_of_the_dataset_decides_which_inputs_there_can_be(data, tmp_pat
 def test_tiny_sees_other_bodies_and_learns_along_rollouts_where_that_was_measured(data, tmp_path):
     toy.write(tmp_path / "d.h5", dynamic=True)
     still, moving = resolved(data), resolved(tmp_path / "d.h5")
-    assert still.model.node_inputs == ("displacement", "proximity") and still.train.rollout_pool == 64
+    assert still.model.node_inputs == ("displacement", "proximity", "out_of_balance")
+    assert still.model.jumps and still.train.calls == 6 and still.train.rollout_pool == 0
+    assert resolved(data, "model.jumps=false").train.rollout_pool == 64
     assert still.train.shift == moving.train.shift == 0.025  # 0.05 of the half width
     assert moving.model.node_inputs == ("displacement", "velocity") and moving.train.rollout_pool == 64
+    assert not moving.model.jumps and moving.train.calls == 1
     assert (still.model.places, still.model.exchanges) == ("relative", 2)
     assert (moving.model.places, moving.model.exchanges) == ("absolute", 0)
     assert resolved(tmp_path / "d.h5", "model.places=relative", "model.exchanges=1").model.exchanges == 1
     paper = resolved(data, preset="deforming_plate")
     assert paper.model.node_inputs == ("displacement",) and paper.train.rollout_pool == paper.train.shift == 0
-    assert resolved(data, model="mgn").model.node_inputs == ()
+    assert resolved(data, model="mgn").model.node_inputs == ("out_of_balance",)
     assert resolved(tmp_path / "d.h5", model="mgn").model.node_inputs == ("velocity",)
     assert resolved(data, preset="original", model="transolver").model.node_inputs == ()
 
@@ -406,14 +409,33 @@ def test_along_rollouts_a_resumed_training_ends_in_the_same_bits(linear, data, t
     a, b = (checkpoint.load(checkpoint.latest(tmp_path / name)) for name in ("whole", "run"))
     for ours, theirs in zip(a[:2], b[:2], strict=True):
         assert ours.keys() == theirs.keys() and all(torch.equal(ours[key], theirs[key]) for key in ours)
-    assert {f"rollout_pool.{place}.begun" for place in range(6)} <= a[1].keys()
+    assert {f"pool.{place}.begun" for place in range(6)} <= a[1].keys()
     start.start_training(tmp_path / "without", settings(data, "train.noise=1e-3", "train.mirror=x,y"))
     assert any(not torch.equal(a[0][key], value) for key, value in weights(tmp_path / "without").items())
+
+
+def test_jumps_that_are_resumed_end_in_the_same_bits(linear, data, tmp_path, monkeypatch):
+    """As along rollouts; the guesses of the pool and the running errors of the calls are in the checkpoint."""
+    monkeypatch.setattr(loop, "JUMP_BATCHES", 3)  # so that 20 steps make all calls
+    jumps = settings(data, "model.jumps=true", "train.calls=3", "train.mirror=x,y")
+    start.start_training(tmp_path / "whole", jumps)
+    start.start_training(tmp_path / "run", jumps)
+    newest = checkpoint.latest(tmp_path / "run") / "training.safetensors"
+    newest.write_bytes(newest.read_bytes()[:-1] + b"\x7f")
+    with pytest.warns(UserWarning, match="SHA-256"):
+        start.start_training(tmp_path / "run", resume=True)
+    a, b = (checkpoint.load(checkpoint.latest(tmp_path / name)) for name in ("whole", "run"))
+    for ours, theirs in zip(a[:2], b[:2], strict=True):
+        assert ours.keys() == theirs.keys() and all(torch.equal(ours[key], theirs[key]) for key in ours)
+    assert a[1]["pool.squares"].isfinite().all() and any(key.endswith(".error") for key in a[1])
+    record = [line for line in Metrics(tmp_path / "run") if "corrections" in line][-1]
+    assert len(record["valid_by_calls"]) == 5 and 0 <= record["corrections"] < 5
 
 
 @pytest.mark.parametrize(
     ("assignments", "match"),
     [
+        (["train.calls=2"], r"train.calls is 2; without model.jumps it must be 1"),
         (["train.rollout_pool=5"], r"train.rollout_pool is 5; it must be a multiple.*train.batch_size = 2"),
         (
             ["train.rollout_pool=2"],
@@ -421,7 +443,7 @@ def test_along_rollouts_a_resumed_training_ends_in_the_same_bits(linear, data, t
         ),
         (["train.rollout_pool=-4"], r"train.rollout_pool is -4"),
         (["train.rollout_pool=4", "train.noise=0"], r"of no use here: without train.noise"),
-        (["train.rollout_pool=4", "model.time_conditioned=true"], r"of no use here: each frame follows from the first"),
+        (["train.rollout_pool=4", "model.jumps=true"], r"of no use here: with model.jumps, each frame follows"),
     ],
 )
 def test_a_pool_that_cannot_be_is_refused(linear, data, tmp_path, assignments, match):
@@ -437,7 +459,7 @@ def test_a_pool_left_to_the_data_is_of_16_batches_where_there_is_a_drift(config)
     assert still.rollout_pool == 64 and still.noise == pytest.approx(0.0015)  # a third of that without a pool
     dynamic = resolve_training(given, SCALES, config(integration="dynamic"))
     assert dynamic.rollout_pool == 64 and dynamic.noise_gamma == 0.1 and dynamic.noise == pytest.approx(0.0002)
-    assert resolve_training(given, SCALES, config(time_conditioned=True)).rollout_pool == 0
+    assert resolve_training(given, SCALES, config(jumps=True)).rollout_pool == 0
     assert resolve_training(dataclasses.replace(given, noise=0.0), SCALES, config()).rollout_pool == 0
     assert resolve_training(TrainConfig(), SCALES, config()).rollout_pool == 0  # the papers'
 
@@ -469,11 +491,12 @@ def test_scenes_that_are_moved_out_of_the_domain_are_an_error(data, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "setting, message", [("model.time_conditioned=true", "follows from the first"), ("train.noise=0", "have no error")]
+    "setting, message", [("model.jumps=true", "follows from the first"), ("train.noise=0", "have no error")]
 )
 def test_a_pool_that_is_of_no_use_is_refused(data, tmp_path, setting, message):
     with pytest.raises(ConfigError, match=f"of no use here: .*{message}"):
-        start.start_training(tmp_path / "run", start.configure(data, "tiny", ["train.rollout_pool=8", setting]))
+        asked = ["model.jumps=false", "train.rollout_pool=8", setting]
+        start.start_training(tmp_path / "run", start.configure(data, "tiny", asked))
 
 
 def test_a_second_writer_is_refused(linear, data, tmp_path):

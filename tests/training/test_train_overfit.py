@@ -13,7 +13,7 @@ from ast_sim.training.start import configure, start_training
 def test_overfitting_one_trajectory_brings_the_one_step_error_below_2_percent_of_the_mean_increment(tmp_path):
     data = toy.write(tmp_path / "one.h5", counts=(1, 0, 0))
     settings = [
-        "train.steps=500", "train.batch_size=6", "train.peak_rate=1e-3", "train.noise=0.0",
+        "train.steps=500", "train.batch_size=6", "train.peak_rate=1e-3", "train.noise=0.0", "model.jumps=false",
         "model.hidden=32", "model.d_token=32", "model.L_SA=2",
     ]  # fmt: skip
     start_training(tmp_path / "run", configure(data, "tiny", settings))

@@ -147,9 +147,9 @@ def test_an_element_that_holds_an_obstacle_node_is_shown_as_rigid():
         assert groups[name][1].tolist() == nodes and groups[name][2].tolist() == [element] * 3
 
 
-def test_a_time_conditioned_run_has_no_figure_of_one_step():
-    runs = [evaluation({"a": 1e-3}), {**evaluation({"a": 1e-3}), "time_conditioned": True}]
-    for table in tables.measure_tables(["stepwise", "time-conditioned"], runs):
+def test_a_run_that_jumps_has_no_figure_of_one_step():
+    runs = [evaluation({"a": 1e-3}), {**evaluation({"a": 1e-3}), "jumps": True}]
+    for table in tables.measure_tables(["stepwise", "jumps"], runs):
         values, horizon = {}, None
         for row in table["rows"]:
             horizon = row.get("group", horizon)

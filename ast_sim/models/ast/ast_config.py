@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal, Self
 
-from ast_sim.models.model_config import NODE_INPUTS, WIDEST, DataFacts, TimeConditionedConfig, setting
+from ast_sim.models.model_config import NODE_INPUTS, WIDEST, DataFacts, ProximityConfig, setting
 from ast_sim.support.errors import ConfigError
 
 
 @dataclass(frozen=True)
-class ASTConfig(TimeConditionedConfig):
+class ASTConfig(ProximityConfig):
     """The settings of AST."""
 
     name: Literal["ast"] = setting("ast", "Adaptive Spatial Tokenization")
@@ -74,7 +74,7 @@ class ASTConfig(TimeConditionedConfig):
         return self.domain_half_width * 2.0 ** (1 - self.L_cell)
 
     def resolve(self, facts: DataFacts) -> Self:
-        """See `TimeConditionedConfig`. An unset L_cell follows from the mesh spacing. Dynamic scenes get no exchanges:
+        """See `ProximityConfig`. An unset L_cell follows from the mesh spacing. Dynamic scenes get no exchanges:
         with them, rollouts of cloths diverged in one of two trainings (docs/log.md, 2026-11-24)."""
         resolved = super().resolve(facts)
         depth, elements, places, exchanges = self.L_cell, self.element_inputs, self.places, self.exchanges

@@ -26,7 +26,7 @@ def element_features(config: ASTConfig, batch: Batch) -> Tensor:
 
 def edge_features(config: ASTConfig, batch: Batch) -> Tensor:
     """[M, 8]: [dp0, |dp0|, dp, |dp|], d = sender - receiver. With `edge_strain` dp and |dp| are relative to rest."""
-    graph, now = batch.graph, config.horizon.present(batch)
+    graph, now = batch.graph, batch.position
     senders = graph.element_mean(now) if graph.e2m is not None else now
     vectors = edge_vectors(graph.edges, senders, now)
     return beside_rest(graph.rest_edges, vectors, config.edge_strain)

@@ -82,7 +82,7 @@ class AST(Simulator):
     def graph(self, scene: Scene) -> Graph:
         """See `Simulator`. With element inputs, elements are nodes of the graph too."""
         element_nodes = bool(self.config.element_inputs)
-        return Graph.from_scene(scene, element_nodes, surface=self.config.sees_surfaces)
+        return Graph.from_scene(scene, element_nodes, **self.config.graph_parts)
 
     def domain(self, position: Tensor) -> int | None:
         """See `Simulator`: how often the domain must double around its centre to hold the positions [N, 3]."""
@@ -108,7 +108,7 @@ class AST(Simulator):
         for step in self.before_cells:
             mesh = step(edges, mesh, mesh, on_edges)
 
-        now = self.config.horizon.present(batch)
+        now = batch.position
         cells = build_cells(self.config, now, batch.graph.node_offsets, may_grow=not self.training)
         coarse = self._embedded(cells, mesh)
         tokens = self._tokens(cells, coarse)
@@ -120,7 +120,7 @@ class AST(Simulator):
         for step in self.after_cells:
             mesh = step(edges, mesh, mesh, on_edges)
 
-        on_elements = self.config.stress == "element"
+        on_elements = self.config.stress == "element" and batch.wants_stress
         stress = self.element_decoder(self.m2e(batch.graph.m2e, mesh, elements)) if on_elements else None
         return Prediction.of_nodes(self.decoder(mesh, beside=encoded), stress)
 

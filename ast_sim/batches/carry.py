@@ -1,0 +1,105 @@
+"""Carrying along: the free nodes of a body follow the motion that is prescribed for its other nodes.
+
+A jump starts from here. The bodies then stand where their handles bring them, they meet or overlap, and a model sees
+where; it predicts what is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.sparse.linalg import splu
+
+from ast_sim.scene import Scene, connected_parts
+
+RIGID = 1e-3  # prescribed nodes move as a rigid body if no node is farther off, as a share of the largest displacement
+PLANAR = 1e-6  # points lie on a line if their second extent, as a share of the first, is below this
+
+
+class Carrier:
+    """Carries the free nodes of a scene along; made once for each scene.
+
+    Where the prescribed nodes of a body move rigidly, its free nodes move with them. Otherwise their displacement is
+    the harmonic extension over the mesh at rest, by linear finite elements. Nodes that no element joins to a prescribed
+    node stay.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._prescribed = scene.prescribed
+        self._bodies = [
+            (np.flatnonzero(body & scene.prescribed), np.flatnonzero(body & ~scene.prescribed))
+            for body in (scene.body == number for number in np.unique(scene.body))
+            if (body & scene.prescribed).any() and (body & ~scene.prescribed).any()
+        ]
+        self._scene = scene
+        self._extensions: dict[int, Callable[[np.ndarray], np.ndarray]] = {}
+
+    def __call__(self, position: np.ndarray, prescribed: np.ndarray) -> np.ndarray:
+        """Move a state to where the prescribed nodes will be.
+
+        Args:
+            position: [N, 3], the state.
+            prescribed: [N, 3], the positions of the prescribed nodes. Other rows are not read.
+
+        Returns:
+            [N, 3] float32.
+        """
+        there = np.where(self._prescribed[:, None], prescribed, position).astype(np.float32)
+        for number, (held, free) in enumerate(self._bodies):
+            before, after = position[held].astype(np.float64), prescribed[held].astype(np.float64)
+            if np.array_equal(before, after):
+                continue
+            move = rigid_motion(before, after)
+            if move is not None:
+                rotation, shift = move
+                there[free] = position[free].astype(np.float64) @ rotation.T + shift
+            else:
+                there[free] = position[free] + self._extension(number)(after - before)
+        return there
+
+    def _extension(self, number: int) -> Callable[[np.ndarray], np.ndarray]:
+        if number not in self._extensions:
+            self._extensions[number] = harmonic_extension(self._scene, *self._bodies[number])
+        return self._extensions[number]
+
+
+def rigid_motion(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """The rotation [3, 3] and shift [3] with after = before R^T + shift; None if the points [P, 3] do not move rigidly,
+    or if they lie on a line and turn, since then any rotation about the line would do.
+
+    The rotation is the best one in the sense of least squares (Kabsch 1976).
+    """
+    way = after - before
+    allowed = RIGID * np.abs(way).max()
+    if np.abs(way - way.mean(axis=0)).max() <= allowed:
+        return np.eye(3), way.mean(axis=0)
+    center, center_after = before.mean(axis=0), after.mean(axis=0)
+    left, extents, right = np.linalg.svd((before - center).T @ (after - center_after))
+    if extents[1] <= PLANAR * extents[0]:
+        return None
+    turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    rotation = (left @ turn @ right).T
+    shift = center_after - rotation @ center
+    return (rotation, shift) if np.abs(before @ rotation.T + shift - after).max() <= allowed else None
+
+
+def harmonic_extension(scene: Scene, held: np.ndarray, free: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """A function from the displacements [H, 3] of the held nodes of a body to those [F, 3] of its free nodes."""
+    import igl  # after torch, whose libraries it must not load first
+
+    laplacian = -igl.cotmatrix(scene.rest_position.astype(np.float64), scene.elements.astype(np.int64)).tocsr()
+    part = connected_parts(scene.elements, scene.num_nodes)
+    rows = np.flatnonzero(np.isin(part[free], part[held]))
+    if not len(rows):
+        return lambda way: np.zeros((len(free), 3))
+    reached = free[rows]
+    solve = splu(laplacian[reached][:, reached].tocsc())
+    pull = -laplacian[reached][:, held]
+
+    def extend(way: np.ndarray) -> np.ndarray:
+        moved = np.zeros((len(free), 3))
+        moved[rows] = solve.solve(pull @ way)
+        return moved
+
+    return extend

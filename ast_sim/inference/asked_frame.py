@@ -1,0 +1,204 @@
+"""One frame of every scene, as a user asks for it: its errors, its time, and what the solver takes for the same answer.
+
+The asked frame is the deepest: the free nodes are displaced most in it. The relative error is the root mean square of
+the error over that of the displacement, over the free nodes in this frame. Times are of one thread.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+
+from ast_sim.dataset.reader import Dataset
+from ast_sim.inference.answer import Answer
+from ast_sim.inference.jump import calls
+from ast_sim.inference.predict import answers
+from ast_sim.inference.question import Question
+from ast_sim.models.simulator import Simulator
+from ast_sim.scene import Trajectory
+from ast_sim.simulate.jobs.rival import Rivals, cheapest, deepest_frame, rivals
+from ast_sim.support.errors import SimulationError
+
+STARTS = (1, 2)  # in so many load steps the solver is tried
+
+
+def asked_frames(
+    model: Simulator,
+    dataset: Dataset,
+    split: str,
+    corrections: int,
+    rival_scenes: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> dict[str, Any]:
+    """Predict the deepest frame of each scene of a split, alone and on one thread.
+
+    Args:
+        corrections: how many calls follow the first, in a model that jumps.
+        rival_scenes: in so many scenes the solver goes to the same frame, in several ways; see `simulate.jobs.rival`.
+
+    Returns:
+        scenes: for each its name, frame, nodes, displacement, relative_error, by_calls (the relative error after each
+        call of a model that jumps), seconds, stress_share (the stress error over that of the frame's true mean),
+        largest_stress (relative error of the largest stress), and `solver` where the solver was run;
+        their means (`relative_error`, `by_calls`, `stress_share`, `largest_stress`), the median of seconds;
+        solver: sums over the scenes where it was run, None if there are none, and `no_solver` says why.
+    """
+    with _one_thread():
+        scenes = [_scene(model, dataset, split, index, corrections) for index in range(dataset.count(split))]
+    why = None
+    try:
+        indices = list(range(min(rival_scenes, len(scenes))))
+        frames = [scenes[index]["frame"] for index in indices]
+        found = rivals(dataset.path, split, indices, frames, starts=STARTS, progress=False) if indices else iter(())
+        for scene, rival in zip(scenes, found, strict=False):
+            scene["solver"] = _solver(rival, scene["relative_error"])
+            if progress is not None:
+                progress(scene["name"])
+    except SimulationError as error:
+        why = str(error)
+    known = [scene for scene in scenes if scene["relative_error"] is not None]
+    return {
+        "scenes": scenes,
+        **{key: _mean([scene[key] for scene in known]) for key in ("relative_error", "stress_share", "largest_stress")},
+        "by_calls": np.mean([scene["by_calls"] for scene in known], axis=0).tolist() if known else [],
+        "seconds": float(np.median([scene["seconds"] for scene in known])) if known else None,
+        "solver": _sums([scene for scene in known if "solver" in scene]),
+        "no_solver": why,
+    }
+
+
+def lines(found: dict[str, Any]) -> list[str]:
+    """The most important figures as sentences."""
+    if found["relative_error"] is None:
+        return ["the deepest frame: every prediction failed"]
+    after = [f"{100 * error:.3g}" for error in found["by_calls"]]
+    told = [
+        f"the deepest frame at once: error {100 * found['relative_error']:.3g} % of the displacement,"
+        f" {1000 * found['seconds']:.3g} ms on one thread"
+    ]
+    if len(after) > 1:
+        told.append(f"  after each call: {', '.join(after)} %")
+    if found["stress_share"] is not None:
+        told.append(
+            f"  stress: {found['stress_share']:.2f} of the error of the frame's true mean; the largest is"
+            f" {100 * found['largest_stress']:.3g} % off"
+        )
+    if found["solver"] is not None:
+        told += _solver_lines(found["solver"])
+    elif found["no_solver"] is not None:
+        told.append(f"  the solver was not run: {found['no_solver']}")
+    return told
+
+
+def _solver_lines(solver: dict[str, Any]) -> list[str]:
+    told = [
+        f"  the solver, straight to this frame: {1000 * solver['seconds']:.3g} ms, {solver['ratio']:.3g} times as long"
+        f" (mean of {solver['scenes']} scenes, one thread)"
+    ]
+    if solver["cheapest_scenes"]:
+        told.append(
+            f"  its cheapest way with at most the model's error: {1000 * solver['cheapest_seconds']:.3g} ms,"
+            f" {solver['cheapest_ratio']:.3g} times as long ({solver['cheapest_scenes']} scenes)"
+        )
+    return told
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _scene(model: Simulator, dataset: Dataset, split: str, index: int, corrections: int) -> dict[str, Any]:
+    name, truth = f"{split}/{index:06d}", dataset.load(split, index)
+    frame = max(deepest_frame(truth), model.config.given_frames)
+    question = Question.of(truth, name, [frame])
+    began = time.perf_counter()
+    (answer,) = answers(model, [question], corrections)
+    seconds = time.perf_counter() - began
+    free = ~truth.scene.prescribed
+    size = _rms(truth.position[frame] - truth.position[0], free)
+    failed = answer.failure is not None or not size  # where nothing moves, there is no relative error
+    by_calls = []
+    if model.config.jumps and not failed:
+        (after,) = calls(model, [question], corrections)
+        by_calls = [_rms(position[0] - truth.position[frame], free) / size for position in after]
+    return {
+        "name": name,
+        "frame": frame,
+        "nodes": truth.scene.num_nodes,
+        "displacement": size,
+        "relative_error": None if failed else _rms(answer.position[0] - truth.position[frame], free) / size,
+        "by_calls": by_calls,
+        "seconds": seconds,
+        **_stress(truth, answer, frame, model.config.stress),
+    }
+
+
+def _rms(difference: np.ndarray, rows: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(difference[rows], dtype=np.float64))))
+
+
+def _stress(truth: Trajectory, answer: Answer, frame: int, location: str) -> dict[str, float | None]:
+    """The errors of the stress on what deforms; None where there is no stress."""
+    if answer.stress is None or truth.stress is None or answer.failure is not None:
+        return {"stress_share": None, "largest_stress": None}
+    rows = truth.scene.deforming(location)
+    there, found = truth.stress[frame].astype(np.float64), answer.stress[0].astype(np.float64)
+    spread, largest = float(there[rows].std()), float(there[rows].max())
+    return {
+        "stress_share": _rms(found - there, rows) / spread if spread else None,
+        "largest_stress": abs(float(found[rows].max()) - largest) / largest if largest else None,
+    }
+
+
+def _solver(rival: Rivals, error: float | None) -> dict[str, Any]:
+    """What the solver took: at its own stop test, and in each way; the cheapest has at most the model's error."""
+    ways = {
+        outcome.way.name: {
+            "seconds": outcome.seconds,
+            "relative_error": outcome.relative_error,
+            "load_steps": outcome.load_steps,
+            "newton_iterations": outcome.newton_iterations,
+        }
+        if outcome.converged
+        else {"failure": outcome.failure}
+        for outcome in rival.outcomes
+    }
+    best = None if error is None else cheapest(rival.outcomes, error)
+    own = rival.outcomes[0]
+    return {
+        "seconds": own.seconds if own.converged else None,
+        "cheapest": None if best is None else best.way.name,
+        "cheapest_seconds": None if best is None else best.seconds,
+        "ways": ways,
+    }
+
+
+def _sums(scenes: list[dict[str, Any]]) -> dict[str, Any] | None:
+    """Means over the scenes in which the solver converged, and its time over the model's in these scenes."""
+    own = [scene for scene in scenes if scene["solver"]["seconds"] is not None]
+    best = [scene for scene in scenes if scene["solver"]["cheapest_seconds"] is not None]
+    if not own:
+        return None
+    found: dict[str, Any] = {"scenes": len(own), "cheapest_scenes": len(best)}
+    for key, chosen in (("seconds", own), ("cheapest_seconds", best)):
+        ratio = key.replace("seconds", "ratio")
+        took = [scene["solver"][key] for scene in chosen]
+        found[key] = _mean(took)
+        found[ratio] = sum(took) / sum(scene["seconds"] for scene in chosen) if chosen else None
+    return found
+
+
+def _mean(values: list[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None

@@ -1,0 +1,183 @@
+"""Jumps: each wanted frame is predicted at once from the first frame, then corrected; no other frame is computed.
+
+The start is the first frame, carried along by the prescribed nodes. Each call of the model gets the answer of the call
+before and predicts what is missing. The frames of all scenes are predicted side by side, in ragged batches.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ast_sim.batches.batch_builder import Batch, State
+from ast_sim.batches.carry import Carrier
+from ast_sim.batches.graph import Graph
+from ast_sim.inference.answer import Answer
+from ast_sim.inference.question import Question, not_finite, too_far
+from ast_sim.models.simulator import Simulator
+from ast_sim.support.errors import RolloutError
+
+BATCH_NODES = 4096  # frames are predicted together as long as they have at most about so many nodes
+
+
+def jumps(
+    model: Simulator,
+    questions: Sequence[Question],
+    corrections: int,
+    progress: Callable[[int], None] | None = None,
+) -> list[Answer]:
+    """Predict the wanted frames of several scenes; the other frames of a batch do not change a frame.
+
+    If a frame fails, the answer of its scene says why in `failure` and keeps the frames before. `progress` is called
+    with the number of each batch and may raise to stop.
+
+    Args:
+        corrections: how many calls follow the first.
+
+    Raises:
+        RolloutError: a scene has no frame to predict.
+        DatasetError: in a scene nothing can deform.
+    """
+    return [scene.answer() for scene in _predicted(model, questions, corrections, progress)]
+
+
+def calls(model: Simulator, questions: Sequence[Question], corrections: int) -> list[np.ndarray | str]:
+    """For each scene the positions [calls, S, N, 3] float32 of the wanted frames after each call, the first one and its
+    corrections; a text that says why where a frame failed. Arguments and errors as for `jumps`."""
+    found: list[np.ndarray | str] = []
+    for scene in _predicted(model, questions, corrections, None):
+        failure = next((frame.failure for frame in scene.frames if frame.failure), None)
+        after = [torch.stack(frame.positions).numpy() for frame in scene.frames if failure is None]
+        found.append(np.stack(after, axis=1) if failure is None else failure)
+    return found
+
+
+def _predicted(
+    model: Simulator, questions: Sequence[Question], corrections: int, progress: Callable[[int], None] | None
+) -> list[_JumpingScene]:
+    scenes = [_JumpingScene(model, question) for question in questions]
+    training = model.training
+    model.eval()
+    try:
+        with torch.inference_mode():
+            for number, group in enumerate(_groups(model, scenes)):
+                _predict(model, group, corrections)
+                if progress is not None:
+                    progress(number)
+    finally:
+        model.train(training)
+    return scenes
+
+
+def corrected(model: Simulator, batch: Batch, prescribed: Tensor, calls: int) -> Iterator[tuple[Tensor, Tensor | None]]:
+    """The positions [N, 3] and the stress after each of `calls` calls; each call corrects the answer of the one
+    before. Stress on elements is predicted by the last call only."""
+    for call in range(1, calls + 1):
+        position, stress = model.advance(replace(batch, wants_stress=call == calls), prescribed)
+        yield position, stress
+        batch = replace(batch, position=position)
+
+
+@dataclass(eq=False)
+class _Frame:
+    """A frame to predict: its start, and the positions after each call."""
+
+    scene: _JumpingScene
+    number: int
+    start: Tensor
+    positions: list[Tensor] = field(default_factory=list)
+    stress: Tensor | None = None
+    seconds: float = 0.0
+    failure: str | None = None
+
+
+@dataclass(eq=False)
+class _JumpingScene:
+    """A scene and the frames of it that are wanted."""
+
+    model: Simulator
+    question: Question
+    frames: list[_Frame] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        question, self.given = self.question, self.model.config.given_frames
+        question.check(self.given)
+        self.graph, self.script = self.model.graph(question.scene), torch.tensor(question.script)
+        self.stress = question.given_stress(self.model.config, self.given)
+        carry = Carrier(question.scene)
+        for number in question.wanted():
+            if number >= self.given:
+                start = torch.from_numpy(carry(question.script[0], question.script[number]))
+                self.frames.append(_Frame(self, number, start))
+
+    def answer(self) -> Answer:
+        """The frames before the first that failed."""
+        failure = next((frame for frame in self.frames if frame.failure), None)
+        predicted = self.frames if failure is None else self.frames[: self.frames.index(failure)]
+        kept = [number for number in self.question.wanted() if number < self.given]
+        positions = [self.script[0] for _ in kept] + [frame.positions[-1] for frame in predicted]
+        stresses = [self.stress[0] for _ in kept if self.stress] + [f.stress for f in predicted if f.stress is not None]
+        asked, numbers = self.question, [*kept, *(frame.number for frame in predicted)]
+        return Answer(
+            asked.name,
+            asked.scene,
+            torch.stack(positions).numpy() if positions else np.zeros((0, asked.scene.num_nodes, 3), np.float32),
+            torch.stack(stresses).numpy() if stresses else None,
+            len(kept),
+            [frame.seconds for frame in predicted],
+            failure=None if failure is None else f"{failure.failure}; the frames before it are kept",
+            stress_location=self.model.config.stress,
+            frames=tuple(numbers),
+        )
+
+
+def _groups(model: Simulator, scenes: Sequence[_JumpingScene]) -> Iterator[list[_Frame]]:
+    """The frames of all scenes in batches. Only frames in the same domain are predicted together."""
+    of_domain: dict[int, list[_Frame]] = {}
+    for frame in (frame for scene in scenes for frame in scene.frames):
+        domain = model.domain(frame.start)
+        if domain is None:
+            frame.failure = too_far(model.config, frame.scene.question.name, frame.number, frame.start)
+        else:
+            of_domain.setdefault(domain, []).append(frame)
+    for frames in of_domain.values():
+        group: list[_Frame] = []
+        for frame in frames:
+            if group and sum(len(other.start) for other in group) + len(frame.start) > BATCH_NODES:
+                yield group
+                group = []
+            group.append(frame)
+        yield group
+
+
+def _predict(model: Simulator, group: list[_Frame], corrections: int) -> None:
+    """Predict the frames of a batch."""
+    began = time.perf_counter()
+    prescribed = torch.cat([frame.scene.script[frame.number] for frame in group])
+    states = [State(f.start, None, f.scene.stress[0] if f.scene.stress else None) for f in group]
+    names = [f"{frame.scene.question.name} frame {frame.number}" for frame in group]
+    graph = Graph.concatenate([frame.scene.graph for frame in group])
+    batch = Batch.build(graph, State.concatenate(states), prescribed, names)
+    try:
+        answers = list(corrected(model, batch, prescribed, corrections + 1))
+    except RolloutError as error:
+        if len(group) > 1:  # one frame must not spoil the others
+            for frame in group:
+                _predict(model, [frame], corrections)
+        else:
+            group[0].failure = f"{names[0]}: {error}"
+        return
+    seconds = (time.perf_counter() - began) / len(group)
+    sizes, stress = graph.node_offsets.diff().tolist(), answers[-1][1]
+    positions = zip(*(position.split(sizes) for position, _ in answers), strict=True)
+    stresses: Sequence[Tensor | None] = [None] * len(group)
+    if stress is not None:
+        stresses = stress.split([len(frame.scene.stress[0]) for frame in group])
+    for frame, found, mises in zip(group, positions, stresses, strict=True):
+        frame.failure = not_finite(model.config, frame.scene.question.name, frame.number, found[-1], mises)
+        frame.positions, frame.stress, frame.seconds = list(found), mises, seconds

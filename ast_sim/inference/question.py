@@ -1,0 +1,95 @@
+"""What is asked of a model: a scene, the motion of its prescribed nodes, and the frames that are wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ast_sim.models.model_config import ModelConfig
+from ast_sim.scene import Scene, Trajectory
+from ast_sim.support.errors import RolloutError
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """A scene to be predicted.
+
+    Attributes:
+        name: name of the scene, for messages.
+        scene: the scene.
+        script: [S, N, 3] float32, the positions of the prescribed nodes in each frame; in the given frames, of all
+            nodes. Other entries are not read.
+        stress: [frames, N or E, 1] float32, the stress of at least the given frames; None: zero.
+        frames: the numbers of the frames that are wanted, ascending; None: all of them, the given ones too.
+    """
+
+    name: str
+    scene: Scene
+    script: np.ndarray
+    stress: np.ndarray | None = None
+    frames: tuple[int, ...] | None = None
+
+    @classmethod
+    def of(cls, truth: Trajectory, name: str, frames: Sequence[int] | None = None) -> Question:
+        """The question whose true answer is a known trajectory; negative numbers of frames count from the end."""
+        return cls(name, truth.scene, truth.position, truth.stress).asking(frames)
+
+    def asking(self, frames: Sequence[int] | None) -> Question:
+        """The same question for these frames only; negative numbers count from the end.
+
+        Raises:
+            RolloutError: there is no such frame, or none is named.
+        """
+        if frames is None:
+            return self
+        count = len(self.script)
+        for frame in frames:
+            if not -count <= frame < count:
+                raise RolloutError(f"{self.name} has the frames 0 to {count - 1}; there is no frame {frame}")
+        if not frames:
+            raise RolloutError(f"{self.name}: name at least one frame")
+        wanted = tuple(sorted({frame % count for frame in frames}))
+        return Question(self.name, self.scene, self.script, self.stress, wanted)
+
+    def check(self, given: int) -> None:
+        """Raise RolloutError or DatasetError unless there is a frame to predict and something that can deform."""
+        self.scene.require_predictable(self.name)
+        if len(self.script) <= given:
+            raise RolloutError(f"{self.name} has {len(self.script)} frames; a rollout needs at least {given + 1}")
+
+    def wanted(self) -> tuple[int, ...]:
+        """The numbers of the frames that are wanted."""
+        return tuple(range(len(self.script))) if self.frames is None else self.frames
+
+    def given_stress(self, config: ModelConfig, given: int) -> list[Tensor]:
+        """The stress of each given frame, [N or E, 1]; an empty list if the model predicts no stress."""
+        if config.stress == "none":
+            return []
+        rows = self.scene.num_nodes if config.stress == "node" else self.scene.num_elements
+        if self.stress is None or self.stress.shape[1] != rows:
+            return list(torch.zeros(given, rows, 1))
+        return list(torch.tensor(self.stress[:given]))
+
+
+def not_finite(config: ModelConfig, name: str, frame: int, position: Tensor, stress: Tensor | None) -> str | None:
+    """Where a predicted frame is not finite; None if it is finite everywhere."""
+    for what, value in (("position", position), ("stress", stress)):
+        if value is not None and not value.isfinite().all():
+            row = int(torch.nonzero(~value.isfinite().all(dim=1))[0])
+            kind = "element" if what == "stress" and config.stress == "element" else "node"
+            return f"{name}: the predicted {what} of {kind} {row} in frame {frame} is not finite: {value[row].tolist()}"
+    return None
+
+
+def too_far(config: ModelConfig, name: str, frame: int, position: Tensor) -> str:
+    """The message that a state lies too far from the domain."""
+    center = torch.tensor(config.domain_center, dtype=torch.float64)
+    distance = (position.double() - center).abs().amax(dim=1)
+    return (
+        f"{name}: in frame {frame} node {int(distance.argmax())} is {float(distance.max()):.3g}"
+        " from the centre of the domain, too far for the model"
+    )

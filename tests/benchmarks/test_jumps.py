@@ -1,0 +1,49 @@
+"""The study of jumps, from end to end on scenes of 100 nodes."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from benchmarks.studies import jumps
+
+
+@pytest.fixture
+def small(monkeypatch, tmp_path):
+    """One row of two training scenes and four steps, and the same row step by step; results in a folder of its own."""
+    row = replace(
+        jumps.ROWS["plates400"], data="small", nodes=100, frames=5, train=2, valid=1, test=2, steps=4, rivals=1,
+        settings={"mirror": ("x", "y"), "calls": 2, "batch_size": 2, "statistics_pairs": 4},
+    )  # fmt: skip
+    walk = replace(row, model={"jumps": False}, settings={"batch_size": 2, "statistics_pairs": 4}, rivals=0)
+    monkeypatch.setattr(jumps, "ROWS", {"small": row, "walk": walk})
+    monkeypatch.setattr(jumps, "RESULTS", tmp_path / "results" / "jumps.json")
+    monkeypatch.setattr(jumps, "PAGE", tmp_path / "jumps.md")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    threads = torch.get_num_threads()
+    yield tmp_path
+    torch.set_num_threads(threads)
+
+
+def test_a_row_is_trained_measured_and_shown_and_found_again(small):
+    (small / "results").mkdir()
+    jumps.main(["--folder", str(small / "data")])
+    found = json.loads(jumps.RESULTS.read_text())
+    row, walk = found["small"], found["walk"]
+    assert len(row["scenes"]) == 2 and row["solver"]["scenes"] == 1 and walk["solver"] is None
+    assert len(row["by_calls"]) == 1 + row["corrections"] and len(row["more_calls"]) == 4 + row["corrections"]
+    assert row["by_calls"] == pytest.approx(row["more_calls"][: len(row["by_calls"])], rel=1e-3)
+    assert row["relative_error"] == pytest.approx(row["by_calls"][-1], rel=1e-6)
+    assert walk["corrections"] == 0 and walk["by_calls"] == []
+    text = jumps.PAGE.read_text()
+    assert f"{100 * row['relative_error']:.1f} ±" in text and "times as long" in text
+    assert text.count("\n## ") == 2 and "Worst: test/" in text
+    jumps.main(["walk", "--folder", str(small / "data")])  # nothing is trained anew
+    assert json.loads(jumps.RESULTS.read_text())["walk"]["relative_error"] == walk["relative_error"]
+
+
+def test_an_unknown_row_is_named(capsys):
+    with pytest.raises(SystemExit):
+        jumps.main(["plates401"])
+    assert "there is no row plates401" in capsys.readouterr().err
