@@ -60,7 +60,13 @@ def calls(model: Simulator, questions: Sequence[Question], corrections: int) -> 
 def _predicted(
     model: Simulator, questions: Sequence[Question], corrections: int, progress: Callable[[int], None] | None
 ) -> list[_JumpingScene]:
-    scenes = [_JumpingScene(model, question) for question in questions]
+    for question in questions:
+        question.check(model.config.given_frames)
+    parts: dict[int, tuple[Graph, Carrier]] = {}  # of each scene, which several questions may share
+    for scene in (question.scene for question in questions):
+        if id(scene) not in parts:
+            parts[id(scene)] = model.graph(scene), Carrier(scene)
+    scenes = [_JumpingScene(model, question, *parts[id(question.scene)]) for question in questions]
     training = model.training
     model.eval()
     try:
@@ -102,17 +108,17 @@ class _JumpingScene:
 
     model: Simulator
     question: Question
+    graph: Graph
+    carry: Carrier
     frames: list[_Frame] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         question, self.given = self.question, self.model.config.given_frames
-        question.check(self.given)
-        self.graph, self.script = self.model.graph(question.scene), torch.tensor(question.script)
+        self.script = torch.tensor(question.script)
         self.stress = question.given_stress(self.model.config, self.given)
-        carry = Carrier(question.scene)
         for number in question.wanted():
             if number >= self.given:
-                start = torch.from_numpy(carry(question.script[0], question.script[number]))
+                start = torch.from_numpy(self.carry(question.script[0], question.script[number]))
                 self.frames.append(_Frame(self, number, start))
 
     def answer(self) -> Answer:

@@ -71,14 +71,44 @@ def predict(
                 f"{name} has a motion, frames and a stress of its own; for others predict its scene (--move BODY=X,Y,Z)"
             )
         return answers(model, [Question.of(scene, name, effort.frames)], effort.corrections)[0]
+    question = _question(model.config, scope, scene, motion, num_frames, name, effort, stress)
+    return _in_domain(model, [question], effort.corrections)[0]
+
+
+def predict_motions(
+    model: Simulator,
+    scope: Scope,
+    scene: Scene,
+    motions: Sequence[Motions],
+    num_frames: int | None,
+    name: str,
+    effort: Effort,
+) -> list[Answer]:
+    """Predict a scene under several motions as one batch; arguments and errors as for `predict`."""
+    questions = [
+        _question(model.config, scope, scene, motion, num_frames, f"{name}, motion {number}", effort, None)
+        for number, motion in enumerate(motions)
+    ]
+    return _in_domain(model, questions, effort.corrections)
+
+
+def _question(
+    config: ModelConfig,
+    scope: Scope,
+    scene: Scene,
+    motion: Motions | None,
+    num_frames: int | None,
+    name: str,
+    effort: Effort,
+    stress: np.ndarray | None,
+) -> Question:
     scene.check(name)
-    _require_material(model.config, scope, scene, name)
-    motion = _completed(model.config, scope, scene, motion, num_frames, name)
-    stress = _given_stress(model.config, scene, stress, name)
-    for note in scope.notes(scene, motion, bool(model.config.jumps)):
-        warnings.warn(f"{name}: {note}", stacklevel=3)
-    question = Question(name, scene, motion.position, stress).asking(effort.frames)
-    return _in_domain(model, question, effort.corrections)
+    _require_material(config, scope, scene, name)
+    motion = _completed(config, scope, scene, motion, num_frames, name)
+    stress = _given_stress(config, scene, stress, name)
+    for note in scope.notes(scene, motion, bool(config.jumps)):
+        warnings.warn(f"{name}: {note}", stacklevel=4)
+    return Question(name, scene, motion.position, stress).asking(effort.frames)
 
 
 def _completed(
@@ -136,14 +166,20 @@ def _require_material(config: ModelConfig, scope: Scope, scene: Scene, name: str
     )
 
 
-def _in_domain(model: Simulator, question: Question, corrections: int) -> Answer:
-    """Predict a scene where it lies, or in the middle of the domain if it leaves the domain."""
-    shift = _way_into_domain(model.config, question)
-    if shift is None:
-        return answers(model, [question], corrections)[0]
-    there = dataclasses.replace(question.scene, rest_position=_moved(question.scene.rest_position, shift))
-    moved = dataclasses.replace(question, scene=there, script=_moved(question.script, shift))
-    answer = answers(model, [moved], corrections)[0]
+def _in_domain(model: Simulator, questions: Sequence[Question], corrections: int) -> list[Answer]:
+    """Predict scenes where they lie; those that leave the domain in the middle of the domain."""
+    shifts = [_way_into_domain(model.config, question) for question in questions]
+    there = [q if shift is None else _moved_question(q, shift) for q, shift in zip(questions, shifts, strict=True)]
+    found = zip(questions, shifts, answers(model, there, corrections), strict=True)
+    return [answer if shift is None else _moved_back(question, answer, shift) for question, shift, answer in found]
+
+
+def _moved_question(question: Question, shift: np.ndarray) -> Question:
+    scene = dataclasses.replace(question.scene, rest_position=_moved(question.scene.rest_position, shift))
+    return dataclasses.replace(question, scene=scene, script=_moved(question.script, shift))
+
+
+def _moved_back(question: Question, answer: Answer, shift: np.ndarray) -> Answer:
     position, script = _moved(answer.position, -shift), question.script[list(answer.frames)]
     # Given numbers stay what they are, to the last bit.
     position[: answer.given] = script[: answer.given]

@@ -16,7 +16,7 @@ from ast_sim.dataset.layout import DatasetInfo
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.evaluation import evaluate, table
-from ast_sim.inference.predict import Effort, Motions, predict
+from ast_sim.inference.predict import Effort, Motions, predict, predict_motions
 from ast_sim.runs.folder import load_model
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.train_config import read_scope
@@ -106,6 +106,25 @@ class Run:
         answer = predict(self.model, self.scope, scene, motion, num_frames, stress, name, effort)
         source = {"predicted_by": str(self.path), "step": self.step, "source": name}
         return dataclasses.replace(answer, info=self.info, source=source)
+
+    def predict_motions(
+        self,
+        scene: Scene,
+        motions: Sequence[Motions],
+        *,
+        frames: Sequence[int] | None = None,
+        corrections: int | None = None,
+        num_frames: int | None = None,
+        name: str = "scene",
+    ) -> list[Answer]:
+        """Predict one scene under several motions, as one batch; the answers have the order of the motions.
+
+        Arguments and errors are those of `predict`.
+        """
+        effort = Effort(frames, self.calls_after_first(corrections))
+        answers = predict_motions(self.model, self.scope, scene, motions, num_frames, name, effort)
+        source = {"predicted_by": str(self.path), "step": self.step, "source": name}
+        return [dataclasses.replace(answer, info=self.info, source=source) for answer in answers]
 
     def calls_after_first(self, corrections: int | None) -> int:
         """The given number of corrections, or that of the run.

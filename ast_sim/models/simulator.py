@@ -73,6 +73,10 @@ class Simulator(nn.Module):
         """What the model needs to know of a scene that does not change with time."""
         return Graph.from_scene(scene, element_nodes=False, **self.config.graph_parts)
 
+    def remarks(self) -> list[str]:
+        """What a user should know of the batches that were observed, as lines."""
+        return []
+
     def domain(self, position: Tensor) -> int | None:
         """The number of the domain that holds the positions [N, 3] of a scene. None: they are too far away for the
         model. Scenes in different domains are not predicted together."""

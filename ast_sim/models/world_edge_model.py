@@ -23,6 +23,8 @@ from ast_sim.ops import EdgeSet, linear, message_edges, mlp, segment_sum
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.toml_settings import LARGEST
 
+SEEN = 0.5  # a contact radius below this share of the mesh spacing joins hardly any nodes
+
 
 @dataclass(frozen=True)
 class WorldEdgeConfig(ModelConfig):
@@ -31,7 +33,11 @@ class WorldEdgeConfig(ModelConfig):
     hidden: int = setting(128, "width of node and edge features")
     hidden_layers: int = setting(2, "hidden layers of each MLP: 1 or 2; with 1 message passing is one fused op")
     edge_strain: bool = setting(False, "mesh edges have dp - dp0 and |dp| - |dp0| as inputs, not dp and |dp|")
-    world_radius: float | None = setting(None, "largest length of a world edge; unset: the dataset's contact radius")
+    world_radius: float | None = setting(
+        None,
+        "largest length of a world edge; unset: the dataset's contact radius, or the mesh spacing if that radius is"
+        " below half of it, since edges so short would join no nodes",
+    )
     most_world_edges: int | None = setting(None, "join at most this many pairs of a scene, the shortest; unset: all")
 
     def __post_init__(self) -> None:
@@ -44,8 +50,10 @@ class WorldEdgeConfig(ModelConfig):
     def resolve(self, facts: DataFacts) -> Self:
         """See `ModelConfig`."""
         resolved = super().resolve(facts)
-        radius = resolved.contact_radius if self.world_radius is None else self.world_radius
-        return replace(resolved, world_radius=radius)
+        if self.world_radius is not None:
+            return resolved
+        seen = resolved.contact_radius >= SEEN * facts.mesh_spacing
+        return replace(resolved, world_radius=resolved.contact_radius if seen else facts.mesh_spacing)
 
     def facts(self, length_unit: str, mesh_spacing: float | None = None) -> dict[str, str]:
         """See `ModelConfig`."""
@@ -67,6 +75,7 @@ class WorldEdgeSimulator(Simulator):
         super().__init__(config)
         self.node_inputs = normalizer_of(config, "node")
         self.mesh_inputs, self.world_inputs = normalizer_of(config, "edge"), world_normalizer()
+        self._seen: list[tuple[int, int]] = []  # of the observed batches: scenes, world edges
 
     def encoders(self) -> list[DeepMLP]:
         """New encoders of the nodes, the mesh edges and the world edges."""
@@ -81,7 +90,21 @@ class WorldEdgeSimulator(Simulator):
         """Add the batch to the statistics of the inputs."""
         self.node_inputs.observe(node_features(self.config, batch))
         self.mesh_inputs.observe(self.edge_features(batch.graph.m2m, batch.graph.rest_edges, batch.position))
-        self.world_inputs.observe(edge_vectors(self.world(batch), batch.position, batch.position))
+        world = self.world(batch)
+        self.world_inputs.observe(edge_vectors(world, batch.position, batch.position))
+        self._seen.append((batch.graph.num_scenes, len(world)))
+
+    def remarks(self) -> list[str]:
+        """See `Simulator`: how many world edges a scene has."""
+        scenes, edges = (sum(counts) for counts in zip(*self._seen, strict=True)) if self._seen else (0, 0)
+        if not scenes:
+            return []
+        if not edges:
+            return [
+                f"warning: no node has a world edge of at most {self.config.world_radius:.3g} in {scenes} scenes, so"
+                " the model sees no contact: give it a larger model.world_radius"
+            ]
+        return [f"world edges {edges / scenes:.3g} a scene, on average over {scenes} scenes"]
 
     def edge_features(self, edges: EdgeSet, rest_edges: Tensor, position: Tensor) -> Tensor:
         """[M, 8]: [dp0, |dp0|, dp, |dp|] from `rest_edges` [M, 4] and `position` [N, 3], d = sender - receiver. With

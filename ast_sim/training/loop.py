@@ -103,6 +103,8 @@ class Training:
             batches = range(math.ceil(self.options.statistics_pairs / self.options.batch_size))
             whole = self.sampler if self.processes.count == 1 else self._sampler((0, 1))
             self.model.fit_statistics(whole.batch(index) for index in batches)
+            for line in self.model.remarks():
+                print(line, flush=True)
         if self.processes.leads:
             self.log.metrics.forget_after(self.step)
             best = self.log.metrics.best()

@@ -168,6 +168,20 @@ def test_only_a_scene_that_leaves_the_domain_is_moved(run, monkeypatch):
     assert asked[-1].scene.rest_position[:, 0].min() == pytest.approx(-0.345)
 
 
+def test_several_motions_of_a_scene_are_answered_together(run):
+    scene = scene_of()
+    motions = [{1: (0, 0, -depth)} for depth in (0.01, 0.03, DEPTH)]
+    together = run.predict_motions(scene, motions, frames=[-1])
+    assert len(together) == 3
+    for motion, answer in zip(motions, together, strict=True):
+        alone = run.predict(scene, motion, frames=[-1])
+        np.testing.assert_allclose(answer.position, alone.position, rtol=0, atol=2e-6)
+        assert answer.frames == alone.frames and answer.scene is scene and answer.position.shape[0] == 1
+    assert not np.allclose(together[0].position, together[2].position, atol=1e-3)
+    with pytest.raises(ConfigError, match="scene, motion 1: there is no body 2|there is no body 2"):
+        run.predict_motions(scene, [PRESS, {2: (0, 0, 1)}])
+
+
 def test_a_trajectory_is_predicted_where_it_lies_and_nobody_warns(run):
     with Dataset(run.settings.data) as data:
         truth = data["test"][0]

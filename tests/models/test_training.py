@@ -1,11 +1,14 @@
 """The models with world edges train, are found again from their settings, and roll out the validation scenes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import toy
 from toy import one_thread  # noqa: F401
 
-from ast_sim.models.registry import find_model
+from ast_sim.models.model_config import DataFacts
+from ast_sim.models.registry import find_model, find_preset
 from ast_sim.runs.folder import load_model
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.train_config import read_config
@@ -31,3 +34,18 @@ def test_it_trains_and_is_found_again(tmp_path, name, dynamic):
     assert found.model.node_inputs == (("velocity",) if dynamic else ("out_of_balance",))
     assert (found.model.hidden, found.model.world_radius) == (16, 0.07)
     assert np.isfinite([line["valid_rmse"] for line in lines if "valid_rmse" in line]).all()
+
+
+def test_the_world_radius_is_the_mesh_spacing_where_the_contact_radius_joins_no_nodes(tmp_path, capsys):
+    """The contact of parts acts within 0.003, a thirtieth of the distance between two nodes."""
+    tiny = find_preset("mgn", "tiny").model
+    for contact, expected in ((0.003, 0.1), (0.05, 0.05), (0.3, 0.3), (0.0, 0.1)):
+        info = replace(toy.info(), contact_radius=contact)
+        assert tiny.resolve(DataFacts(info, 0, 0.1)).world_radius == expected
+    asked = replace(tiny, world_radius=0.003)
+    assert asked.resolve(DataFacts(toy.info(), 0, 0.1)).world_radius == 0.003
+    data, few = toy.write(tmp_path / "toy.h5"), [SMALL["mgn"], "train.steps=1", "train.statistics_pairs=4"]
+    start_training(tmp_path / "blind", configure(data, "tiny", [*few, "model.world_radius=1e-6"], "mgn"))
+    assert "warning: no node has a world edge of at most 1e-06 in 4 scenes" in capsys.readouterr().out
+    start_training(tmp_path / "seeing", configure(data, "tiny", [*few, "model.world_radius=0.1"], "mgn"))
+    assert "a scene, on average over 4 scenes" in capsys.readouterr().out
