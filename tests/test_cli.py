@@ -75,7 +75,7 @@ def test_train_help_explains_every_setting(capsys):
             assert f"  model.{setting.key}={setting.default}  (" in section
     assert "train.batch_size=4  (" in shown and "train.optimizer=muon  (" in shown
     assert "model.L_SA=2  (" in shown and "model.L_cell=none  (" in shown
-    assert "\n  train.peak_rate=0.002  (in tiny)" in shown
+    assert "\n  train.peak_rate=0.004  (in tiny)" in shown
     lines = shown.splitlines()
     unset = [text for line, text in zip(lines, lines[1:], strict=False) if re.match(r"  (train|model)\.\w+=none", line)]
     assert len(unset) > 10 and all("unset:" in text or "from the dataset" in text for text in unset), unset
