@@ -40,7 +40,7 @@ def measure_tables(names: Sequence[str], evaluations: Sequence[Json | None]) -> 
     """Two tables of errors: displacement and stress. Rows are measures; columns are runs and trivial predictors.
 
     The trivial predictors do not depend on the run, so they are taken from the first evaluation that has them. A
-    time-conditioned model has no row for one step, because its step from frame 0 is its rollout.
+    model that jumps has no row for one step, because each of its frames is one step from the first.
     """
     unit = units(evaluations)
     summaries = [lookup(evaluation, "summary") for evaluation in evaluations]
@@ -105,7 +105,19 @@ def tiles(evaluation: Json | None) -> list[Json]:
         elif reference:
             detail = f"{100 * error / reference:.0f} % of “{TRIVIAL[quantity][trivial].lower()}”, full rollout"
         found.append({"label": title, "value": error, "unit": unit[quantity], "detail": detail})
-    return found + _speed_tiles(evaluation) + _scope_tiles(evaluation)
+    return found + _asked_tiles(evaluation) + _speed_tiles(evaluation) + _scope_tiles(evaluation)
+
+
+def _asked_tiles(evaluation: Json) -> list[Json]:
+    """The deepest frame, asked for alone, beside the solver that goes straight there."""
+    error, seconds = lookup(evaluation, "asked", "relative_error"), lookup(evaluation, "asked", "seconds")
+    if error is None or seconds is None:
+        return []
+    detail = f"of the displacement, {1000 * seconds:.3g} ms on one thread"
+    solver = lookup(evaluation, "asked", "solver", "seconds")
+    if solver is not None:
+        detail += f"; the solver, straight there: {1000 * solver:.3g} ms"
+    return [{"label": "Deepest frame alone", "value": f"{100 * error:.3g}", "suffix": "%", "detail": detail}]
 
 
 def _speed_tiles(evaluation: Json) -> list[Json]:
@@ -123,7 +135,7 @@ def _speed_tiles(evaluation: Json) -> list[Json]:
         "label": "Speed-up over the solver",
         "value": f"{speedup:.3g}",
         "suffix": "×",
-        "detail": "same scenes; the solver’s time is from their generation",
+        "detail": "all frames of the same scenes; the solver’s time was recorded when it made them",
     }
     return [tile, faster]
 

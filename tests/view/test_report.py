@@ -179,6 +179,17 @@ def test_tiles_state_ratio_speed_and_failures():
     assert found["Test scenes"]["value"] == "2" and found["Test scenes"]["detail"] == "1 rollout failed"
 
 
+def test_a_tile_states_the_deepest_frame_beside_the_solver():
+    asked = {"relative_error": 0.0577, "seconds": 0.025, "solver": {"seconds": 0.0612}}
+    found = {tile["label"]: tile for tile in tables.tiles({**evaluation({"a": 3e-3}), "asked": asked})}
+    tile = found["Deepest frame alone"]
+    assert (tile["value"], tile["suffix"]) == ("5.77", "%")
+    assert tile["detail"] == "of the displacement, 25 ms on one thread; the solver, straight there: 61.2 ms"
+    for missing in ({**asked, "solver": None}, {**asked, "relative_error": None}):
+        tiles = {tile["label"]: tile for tile in tables.tiles({**evaluation({"a": 3e-3}), "asked": missing})}
+        assert "solver" not in tiles.get("Deepest frame alone", {"detail": ""})["detail"]
+
+
 def test_a_failed_rollout_has_no_figure():
     failed = evaluation({"a": None})
     failed["summary"]["model"]["displacement"]["rollout_all"]["normal"]["rmse_sequence"] = None
