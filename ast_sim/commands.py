@@ -149,7 +149,7 @@ def predict(args: argparse.Namespace) -> None:
     else:
         _refuse(args, args.of_data, f"{args.scene}, which is a mesh")
         truth, name = None, str(args.scene)
-    effort = {"frames": args.frames, "corrections": args.corrections}
+    effort = {"frames": args.frames, "corrections": args.corrections, "newton_steps": args.newton_steps}
     if truth is not None and not moves:
         answer = run.predict(truth, num_frames=args.num_frames, name=name, **effort)
     else:

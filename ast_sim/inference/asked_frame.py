@@ -16,6 +16,7 @@ import torch
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.answer import Answer
+from ast_sim.inference.effort import Effort
 from ast_sim.inference.jump import calls
 from ast_sim.inference.predict import answers
 from ast_sim.inference.question import Question
@@ -31,25 +32,25 @@ def asked_frames(
     model: Simulator,
     dataset: Dataset,
     split: str,
-    corrections: int,
+    effort: Effort,
     rival_scenes: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> dict[str, Any]:
     """Predict the deepest frame of each scene of a split, alone and on one thread.
 
     Args:
-        corrections: how many calls follow the first, in a model that jumps.
+        effort: what follows the first call of a model that jumps.
         rival_scenes: in so many scenes the solver goes to the same frame, in several ways; see `simulate.jobs.rival`.
 
     Returns:
         scenes: for each its name, frame, nodes, displacement, relative_error, by_calls (the relative error after each
-        call of a model that jumps), seconds, stress_share (the stress error over that of the frame's true mean),
-        largest_stress (relative error of the largest stress), and `solver` where the solver was run;
+        call of a model that jumps, and after each Newton step), seconds, stress_share (the stress error over that of
+        the frame's true mean), largest_stress (relative error of the largest stress), and `solver` where it was run;
         their means (`relative_error`, `by_calls`, `stress_share`, `largest_stress`), the median of seconds;
         solver: sums over the scenes where it was run, None if there are none, and `no_solver` says why.
     """
     with _one_thread():
-        scenes = [_scene(model, dataset, split, index, corrections) for index in range(dataset.count(split))]
+        scenes = [_scene(model, dataset, split, index, effort) for index in range(dataset.count(split))]
     why = None
     try:
         indices = list(range(min(rival_scenes, len(scenes))))
@@ -72,6 +73,19 @@ def asked_frames(
     }
 
 
+def errors_by_effort(model: Simulator, truth: Trajectory, most: Effort) -> np.ndarray:
+    """[C, K]: the relative errors at the deepest frame after c corrections and k Newton steps, up to `most` of them.
+    NaN where the prediction failed."""
+    frame, free = max(deepest_frame(truth), model.config.given_frames), ~truth.scene.prescribed
+    size, found = _rms(truth.position[frame] - truth.position[0], free), np.full((most[0] + 1, most[1] + 1), np.nan)
+    for corrections in range(len(found)):
+        effort = Effort(corrections, most.newton_steps)
+        (after,) = calls(model, [Question.of(truth, "validation", [frame])], effort)
+        if not isinstance(after, str) and size:
+            found[corrections] = [_rms(x[0] - truth.position[frame], free) / size for x in after[corrections:]]
+    return found
+
+
 def lines(found: dict[str, Any]) -> list[str]:
     """The most important figures as sentences."""
     if found["relative_error"] is None:
@@ -82,7 +96,7 @@ def lines(found: dict[str, Any]) -> list[str]:
         f" {1000 * found['seconds']:.3g} ms on one thread"
     ]
     if len(after) > 1:
-        told.append(f"  after each call: {', '.join(after)} %")
+        told.append(f"  after each call, and each Newton step: {', '.join(after)} %")
     if found["stress_share"] is not None:
         told.append(
             f"  stress: {found['stress_share']:.2f} of the error of the frame's true mean; the largest is"
@@ -118,19 +132,19 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def _scene(model: Simulator, dataset: Dataset, split: str, index: int, corrections: int) -> dict[str, Any]:
+def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: Effort) -> dict[str, Any]:
     name, truth = f"{split}/{index:06d}", dataset.load(split, index)
     frame = max(deepest_frame(truth), model.config.given_frames)
     question = Question.of(truth, name, [frame])
     began = time.perf_counter()
-    (answer,) = answers(model, [question], corrections)
+    (answer,) = answers(model, [question], effort)
     seconds = time.perf_counter() - began
     free = ~truth.scene.prescribed
     size = _rms(truth.position[frame] - truth.position[0], free)
     failed = answer.failure is not None or not size  # where nothing moves, there is no relative error
     by_calls = []
     if model.config.jumps and not failed:
-        (after,) = calls(model, [question], corrections)
+        (after,) = calls(model, [question], effort)
         by_calls = [_rms(position[0] - truth.position[frame], free) / size for position in after]
     return {
         "name": name,

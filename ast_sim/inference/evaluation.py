@@ -15,6 +15,7 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.inference import asked_frame
 from ast_sim.inference.answer import Answer
+from ast_sim.inference.effort import FIRST_CALL, Effort
 from ast_sim.inference.predict import answers as predictions
 from ast_sim.inference.question import Question
 from ast_sim.inference.trivial_predictors import Errors, displacement_errors, rmse_of, stress_errors, summarize
@@ -31,7 +32,7 @@ def evaluate(
     dataset: Dataset,
     split: str = "test",
     progress: Callable[[str], None] | None = None,
-    corrections: int = 0,
+    effort: Effort = FIRST_CALL,
     rival_scenes: int = 0,
 ) -> tuple[dict[str, Any], list[Answer]]:
     """Predict all trajectories of a split and compare.
@@ -45,7 +46,7 @@ def evaluate(
         summary: by predictor, quantity, horizon and nodes the errors `rmse_sequence` and `rmse_pooled` of all scenes;
         failures: the number of failed predictions;
         jumps: whether the model predicts each frame from the first one, so that its `one_step` errors are those of its
-        rollout; corrections: how many calls correct the first call of such a model;
+        rollout; corrections, newton_steps: what follows the first call of such a model;
         asked: the deepest frame of each scene, see `asked_frames`; the solver is run in `rival_scenes` scenes;
         speedup: the solver's recorded time for all frames, divided by the model's; None if it was not recorded;
         length_unit, stress_unit, threads.
@@ -62,7 +63,7 @@ def evaluate(
     seconds = read_seconds(dataset).samples
     for index in range(count):
         name, truth = f"{split}/{index:06d}", dataset.load(split, index)
-        answer = predictions(model, [Question.of(truth, name)], corrections)[0]
+        answer = predictions(model, [Question.of(truth, name)], effort)[0]
         one_step = _predicted(answer) if model.config.jumps else one_step_predictions(model, truth, name)
         displacement.append(displacement_errors(truth, one_step[0], answer))
         if constant is not None:
@@ -78,8 +79,8 @@ def evaluate(
         "summary": _summary(displacement, stress),
         "failures": sum(sample["failure"] is not None for sample in samples),
         "jumps": model.config.jumps,
-        "corrections": corrections,
-        "asked": asked_frame.asked_frames(model, dataset, split, corrections, rival_scenes, progress),
+        **effort._asdict(),
+        "asked": asked_frame.asked_frames(model, dataset, split, effort, rival_scenes, progress),
         "speedup": _speedup(samples),
         "length_unit": dataset.info.length_unit,
         "stress_unit": "Pa",
@@ -189,8 +190,8 @@ def table(found: dict[str, Any]) -> str:
         lines.append("")
     lines.append(f"scenes: {len(found['samples'])}, failed: {found['failures']}, threads: {found['threads']}")
     if found["jumps"]:
-        calls = f"{found['corrections']} correction{'' if found['corrections'] == 1 else 's'}"
-        lines.append(f"every frame is one jump from the first and {calls}, so the model's one_step is its rollout")
+        after = Effort(found["corrections"], found["newton_steps"])
+        lines.append(f"every frame is one jump from the first and {after.text}, so the model's one_step is its rollout")
     if all(sample["solver_seconds_per_step"] is None for sample in found["samples"]):
         lines.append("speed relative to the solver: unknown. Neither the scenes nor a file beside the dataset")
         lines.append("(its name and .seconds.json) hold the seconds of a solver; a dataset is moved together with it")

@@ -1,7 +1,8 @@
 """Jumps: each wanted frame is predicted at once from the first frame, then corrected; no other frame is computed.
 
 The start is the first frame, carried along by the prescribed nodes. Each call of the model gets the answer of the call
-before and predicts what is missing. The frames of all scenes are predicted side by side, in ragged batches.
+before and predicts what is missing. Newton steps of the solver may follow. The model predicts the frames of all scenes
+side by side, in ragged batches.
 """
 
 from __future__ import annotations
@@ -18,9 +19,12 @@ from ast_sim.batches.batch_builder import Batch, State
 from ast_sim.batches.carry import Carrier
 from ast_sim.batches.graph import Graph
 from ast_sim.inference.answer import Answer
+from ast_sim.inference.effort import Effort, newton_steps
 from ast_sim.inference.question import Question, not_finite, too_far
+from ast_sim.models.model_config import ModelConfig
 from ast_sim.models.simulator import Simulator
-from ast_sim.support.errors import RolloutError
+from ast_sim.simulate.mechanics.linearised_contact import NewtonSteps
+from ast_sim.support.errors import RolloutError, SimulationError
 
 BATCH_NODES = 4096  # frames are predicted together as long as they have at most about so many nodes
 
@@ -28,7 +32,7 @@ BATCH_NODES = 4096  # frames are predicted together as long as they have at most
 def jumps(
     model: Simulator,
     questions: Sequence[Question],
-    corrections: int,
+    effort: Effort,
     progress: Callable[[int], None] | None = None,
 ) -> list[Answer]:
     """Predict the wanted frames of several scenes; the other frames of a batch do not change a frame.
@@ -37,20 +41,22 @@ def jumps(
     with the number of each batch and may raise to stop.
 
     Args:
-        corrections: how many calls follow the first.
+        effort: what follows the first call.
 
     Raises:
         RolloutError: a scene has no frame to predict.
         DatasetError: in a scene nothing can deform.
+        ConfigError: the model cannot make this effort.
     """
-    return [scene.answer() for scene in _predicted(model, questions, corrections, progress)]
+    return [scene.answer() for scene in _predicted(model, questions, effort, progress)]
 
 
-def calls(model: Simulator, questions: Sequence[Question], corrections: int) -> list[np.ndarray | str]:
+def calls(model: Simulator, questions: Sequence[Question], effort: Effort) -> list[np.ndarray | str]:
     """For each scene the positions [calls, S, N, 3] float32 of the wanted frames after each call, the first one and its
-    corrections; a text that says why where a frame failed. Arguments and errors as for `jumps`."""
+    corrections, and after each Newton step; a text that says why where a frame failed. Arguments and errors as for
+    `jumps`."""
     found: list[np.ndarray | str] = []
-    for scene in _predicted(model, questions, corrections, None):
+    for scene in _predicted(model, questions, effort, None):
         failure = next((frame.failure for frame in scene.frames if frame.failure), None)
         after = [torch.stack(frame.positions).numpy() for frame in scene.frames if failure is None]
         found.append(np.stack(after, axis=1) if failure is None else failure)
@@ -58,8 +64,9 @@ def calls(model: Simulator, questions: Sequence[Question], corrections: int) -> 
 
 
 def _predicted(
-    model: Simulator, questions: Sequence[Question], corrections: int, progress: Callable[[int], None] | None
+    model: Simulator, questions: Sequence[Question], effort: Effort, progress: Callable[[int], None] | None
 ) -> list[_JumpingScene]:
+    effort.check(model.config)
     for question in questions:
         question.check(model.config.given_frames)
     parts: dict[int, tuple[Graph, Carrier]] = {}  # of each scene, which several questions may share
@@ -67,12 +74,15 @@ def _predicted(
         if id(scene) not in parts:
             parts[id(scene)] = model.graph(scene), Carrier(scene)
     scenes = [_JumpingScene(model, question, *parts[id(question.scene)]) for question in questions]
+    solvers: dict[int, NewtonSteps] = {}
     training = model.training
     model.eval()
     try:
         with torch.inference_mode():
             for number, group in enumerate(_groups(model, scenes)):
-                _predict(model, group, corrections)
+                _predict(model, group, effort.corrections)
+                for frame in group if effort.newton_steps else ():
+                    frame.refine(model.config, solvers, effort.newton_steps)
                 if progress is not None:
                     progress(number)
     finally:
@@ -91,7 +101,7 @@ def corrected(model: Simulator, batch: Batch, prescribed: Tensor, calls: int) ->
 
 @dataclass(eq=False)
 class _Frame:
-    """A frame to predict: its start, and the positions after each call."""
+    """A frame to predict: its start, and the positions after each call and each Newton step."""
 
     scene: _JumpingScene
     number: int
@@ -100,6 +110,27 @@ class _Frame:
     stress: Tensor | None = None
     seconds: float = 0.0
     failure: str | None = None
+
+    def refine(self, config: ModelConfig, solvers: dict[int, NewtonSteps], steps: int) -> None:
+        """Make Newton steps from the answer of the model; the stress then is that of the material.
+
+        `solvers` holds those of the scenes so far, by their `id`.
+        """
+        if self.failure is not None:
+            return
+        began, scene = time.perf_counter(), self.scene.question.scene
+        try:
+            if id(scene) not in solvers:
+                solvers[id(scene)] = newton_steps(config, scene)
+            position = self.positions[-1].numpy().astype(np.float64)
+            for _ in range(steps):
+                position = solvers[id(scene)].step(position)
+                self.positions.append(torch.from_numpy(position.astype(np.float32)))
+            if config.stress != "none":
+                self.stress = torch.from_numpy(solvers[id(scene)].von_mises(position, config.stress))
+        except SimulationError as error:
+            self.failure = f"{self.scene.question.name} frame {self.number}: a Newton step failed: {error}"
+        self.seconds += time.perf_counter() - began
 
 
 @dataclass(eq=False)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from ast_sim.inference.answer import Answer
+from ast_sim.inference.effort import FIRST_CALL, Effort
 from ast_sim.inference.jump import jumps
 from ast_sim.inference.question import Question
 from ast_sim.inference.rollout import rollouts
@@ -24,29 +25,17 @@ from ast_sim.support.errors import ConfigError
 Motions = Motion | Mapping[int, RigidMotion | Vector] | np.ndarray
 
 
-@dataclasses.dataclass(frozen=True)
-class Effort:
-    """What is computed.
-
-    Attributes:
-        frames: the numbers of the wanted frames; negative ones count from the end; None: all.
-        corrections: how many calls correct the first, in a model that jumps.
-    """
-
-    frames: Sequence[int] | None = None
-    corrections: int = 0
-
-
 def answers(
     model: Simulator,
     questions: Sequence[Question],
-    corrections: int = 0,
+    effort: Effort = FIRST_CALL,
     progress: Callable[[int], None] | None = None,
 ) -> list[Answer]:
     """Predict the wanted frames of several scenes, by jumps or step by step as the model does; see `jumps` and
     `rollouts` for the arguments and errors."""
     if model.config.jumps:
-        return jumps(model, questions, corrections, progress)
+        return jumps(model, questions, effort, progress)
+    effort.check(model.config)
     return rollouts(model, questions, progress)
 
 
@@ -58,6 +47,7 @@ def predict(
     num_frames: int | None,
     stress: np.ndarray | None,
     name: str,
+    frames: Sequence[int] | None,
     effort: Effort,
 ) -> Answer:
     """Predict a scene; the arguments are those of `Run.predict`, `scope` is what the model was trained on.
@@ -70,9 +60,9 @@ def predict(
             raise ConfigError(
                 f"{name} has a motion, frames and a stress of its own; for others predict its scene (--move BODY=X,Y,Z)"
             )
-        return answers(model, [Question.of(scene, name, effort.frames)], effort.corrections)[0]
-    question = _question(model.config, scope, scene, motion, num_frames, name, effort, stress)
-    return _in_domain(model, [question], effort.corrections)[0]
+        return answers(model, [Question.of(scene, name, frames)], effort)[0]
+    question = _question(model.config, scope, scene, motion, num_frames, name, frames, stress)
+    return _in_domain(model, [question], effort)[0]
 
 
 def predict_motions(
@@ -82,14 +72,15 @@ def predict_motions(
     motions: Sequence[Motions],
     num_frames: int | None,
     name: str,
+    frames: Sequence[int] | None,
     effort: Effort,
 ) -> list[Answer]:
     """Predict a scene under several motions as one batch; arguments and errors as for `predict`."""
     questions = [
-        _question(model.config, scope, scene, motion, num_frames, f"{name}, motion {number}", effort, None)
+        _question(model.config, scope, scene, motion, num_frames, f"{name}, motion {number}", frames, None)
         for number, motion in enumerate(motions)
     ]
-    return _in_domain(model, questions, effort.corrections)
+    return _in_domain(model, questions, effort)
 
 
 def _question(
@@ -99,7 +90,7 @@ def _question(
     motion: Motions | None,
     num_frames: int | None,
     name: str,
-    effort: Effort,
+    wanted: Sequence[int] | None,
     stress: np.ndarray | None,
 ) -> Question:
     scene.check(name)
@@ -108,7 +99,7 @@ def _question(
     stress = _given_stress(config, scene, stress, name)
     for note in scope.notes(scene, motion, bool(config.jumps)):
         warnings.warn(f"{name}: {note}", stacklevel=4)
-    return Question(name, scene, motion.position, stress).asking(effort.frames)
+    return Question(name, scene, motion.position, stress).asking(wanted)
 
 
 def _completed(
@@ -166,11 +157,11 @@ def _require_material(config: ModelConfig, scope: Scope, scene: Scene, name: str
     )
 
 
-def _in_domain(model: Simulator, questions: Sequence[Question], corrections: int) -> list[Answer]:
+def _in_domain(model: Simulator, questions: Sequence[Question], effort: Effort) -> list[Answer]:
     """Predict scenes where they lie; those that leave the domain in the middle of the domain."""
     shifts = [_way_into_domain(model.config, question) for question in questions]
     there = [q if shift is None else _moved_question(q, shift) for q, shift in zip(questions, shifts, strict=True)]
-    found = zip(questions, shifts, answers(model, there, corrections), strict=True)
+    found = zip(questions, shifts, answers(model, there, effort), strict=True)
     return [answer if shift is None else _moved_back(question, answer, shift) for question, shift, answer in found]
 
 

@@ -15,8 +15,9 @@ import numpy as np
 from ast_sim.dataset.layout import DatasetInfo
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.answer import Answer
+from ast_sim.inference.effort import Effort
 from ast_sim.inference.evaluation import evaluate, table
-from ast_sim.inference.predict import Effort, Motions, predict, predict_motions
+from ast_sim.inference.predict import Motions, predict, predict_motions
 from ast_sim.runs.folder import load_model
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.train_config import read_scope
@@ -37,8 +38,8 @@ class Run:
         model: the trained model, an `nn.Module`.
         settings: the settings of the model and of the training.
         step: the step of the checkpoint.
-        corrections: the number of corrections with which a model that jumps had the least error in validation; 0 for
-            a model that predicts step by step.
+        effort: how many corrections and Newton steps follow the first call by default, as validation has decided; 0
+            for a model that predicts step by step.
         scope: the ranges of sizes, materials and motions in the training scenes.
 
     Raises:
@@ -48,7 +49,7 @@ class Run:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         self.model, self.settings, self.step = load_model(self.path)
-        self.corrections = Metrics(self.path).corrections(self.step, (self.settings.train.calls or 1) - 1)
+        self.effort = Effort(*Metrics(self.path).effort(self.step, (self.settings.train.calls or 1) - 1))
         self.scope = read_scope(self.path)
 
     @property
@@ -74,6 +75,7 @@ class Run:
         *,
         frames: Sequence[int] | None = None,
         corrections: int | None = None,
+        newton_steps: int | None = None,
         num_frames: int | None = None,
         stress: np.ndarray | None = None,
         name: str = "scene",
@@ -91,7 +93,10 @@ class Run:
                 `Motion`.
             frames: the numbers of the frames that are wanted, such as [-1] for the last one; by default all. A model
                 that jumps computes no other frame.
-            corrections: how many calls correct the first call of a model that jumps; by default `self.corrections`.
+            corrections: how many calls correct the first call of a model that jumps; by default as in `self.effort`.
+            newton_steps: how many Newton steps of the solver follow, each about a tenth of its time; by default as in
+                `self.effort`, and 0 if `corrections` is given. They need tetrahedra and their material. The stress then
+                follows from the material.
             num_frames: S, only for rigid motions; by default so many that the prescribed nodes move as far in one frame
                 as in training.
             stress: [given, N or E, 1], the stress of the given frames in pascal; by default zero. One frame is given,
@@ -102,8 +107,8 @@ class Run:
             ConfigError: the motion does not fit the scene, or the scene does not fit the run.
             RolloutError: there is no such frame.
         """
-        effort = Effort(frames, self.calls_after_first(corrections))
-        answer = predict(self.model, self.scope, scene, motion, num_frames, stress, name, effort)
+        effort = self._effort(corrections, newton_steps)
+        answer = predict(self.model, self.scope, scene, motion, num_frames, stress, name, frames, effort)
         source = {"predicted_by": str(self.path), "step": self.step, "source": name}
         return dataclasses.replace(answer, info=self.info, source=source)
 
@@ -114,6 +119,7 @@ class Run:
         *,
         frames: Sequence[int] | None = None,
         corrections: int | None = None,
+        newton_steps: int | None = None,
         num_frames: int | None = None,
         name: str = "scene",
     ) -> list[Answer]:
@@ -121,23 +127,16 @@ class Run:
 
         Arguments and errors are those of `predict`.
         """
-        effort = Effort(frames, self.calls_after_first(corrections))
-        answers = predict_motions(self.model, self.scope, scene, motions, num_frames, name, effort)
+        effort = self._effort(corrections, newton_steps)
+        answers = predict_motions(self.model, self.scope, scene, motions, num_frames, name, frames, effort)
         source = {"predicted_by": str(self.path), "step": self.step, "source": name}
         return [dataclasses.replace(answer, info=self.info, source=source) for answer in answers]
 
-    def calls_after_first(self, corrections: int | None) -> int:
-        """The given number of corrections, or that of the run.
-
-        Raises:
-            ConfigError: the number is negative, or the model does not jump.
-        """
+    def _effort(self, corrections: int | None, newton_steps: int | None) -> Effort:
+        """What is asked for; where nothing is, the default."""
         if corrections is None:
-            return self.corrections
-        if corrections < 0 or (corrections and not self.settings.model.jumps):
-            why = "must be at least 0" if corrections < 0 else f"needs a run that jumps, and {self.path} does not"
-            raise ConfigError(f"corrections is {corrections}; it {why}")
-        return corrections
+            return self.effort if newton_steps is None else Effort(self.effort.corrections, newton_steps)
+        return Effort(corrections, newton_steps or 0)
 
     def open(self, data: str | os.PathLike[str] | None = None) -> Dataset:
         """Open a dataset, by default the one that the run was trained on. The caller closes it.
@@ -180,7 +179,7 @@ class Run:
         with self.open(data) as dataset:
             with Progress(dataset.count(split) + rival_scenes, 0, "scenes") as bar:
                 figures, answers = evaluate(
-                    self.model, dataset, split, lambda name: bar.advance(), self.corrections, rival_scenes
+                    self.model, dataset, split, lambda name: bar.advance(), self.effort, rival_scenes
                 )
             answers = [dataclasses.replace(answer, info=self.info) for answer in answers]
             origin = {"run": str(self.path), "step": self.step, "data": str(dataset.path), "split": split}

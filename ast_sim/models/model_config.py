@@ -30,6 +30,7 @@ class DataFacts:
         mesh_spacing: mean length of a mesh edge.
         planar: whether z is 0 in all scenes.
         tetrahedra: whether the elements are tetrahedra.
+        recorded: what the solver recorded and is the same in all scenes: young, poisson, contact_range, friction.
     """
 
     info: DatasetInfo
@@ -37,6 +38,7 @@ class DataFacts:
     mesh_spacing: float
     planar: bool = False
     tetrahedra: bool = True
+    recorded: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,11 @@ class ModelConfig:
     domain_center: tuple[float, float, float] = setting((0.0, 0.0, 0.0), "centre of the domain; from the dataset")
     domain_half_width: float = setting(1.0, "half the side of the domain, a cube; from the dataset")
     contact_radius: float = setting(0.0, "distance within which surfaces count as near; from the dataset")
+    tetrahedra: bool = setting(False, "the elements are tetrahedra; from the dataset")
+    young: float = setting(0.0, "Young's modulus of all elements, if the solver recorded one; from the dataset")
+    poisson: float = setting(0.0, "Poisson's ratio of all elements, likewise; from the dataset")
+    contact_range: float = setting(0.0, "distance below which the solver's surfaces repel, likewise; from the dataset")
+    friction: float = setting(0.0, "coefficient of friction, likewise; from the dataset")
     planar: bool = setting(False, "nodes stay at their z, as in scenes that lie in the plane z = 0; from the dataset")
 
     def __post_init__(self) -> None:
@@ -152,6 +159,8 @@ class ModelConfig:
             domain_center=tuple(float(c) for c in info.domain_center),
             domain_half_width=float(info.domain_half_width),
             contact_radius=float(info.contact_radius),
+            tetrahedra=facts.tetrahedra,
+            **facts.recorded,
             planar=facts.planar,
             jumps=jumps,
             boundary_motion=self.boundary_motion and not jumps,

@@ -58,10 +58,11 @@ class Metrics:
         error, step = min(errors)
         return step, error
 
-    def corrections(self, step: int, unset: int) -> int:
-        """The best number of corrections in the validation after a step; `unset` if it was not recorded."""
-        found = [record["corrections"] for record in self if record["step"] == step and "corrections" in record]
-        return int(found[-1]) if found else unset
+    def effort(self, step: int, unset: int) -> tuple[int, int]:
+        """The numbers of corrections and of Newton steps that the validation after a step chose; if it recorded none,
+        `unset` corrections and no Newton step."""
+        found = [record for record in self if record["step"] == step and "corrections" in record]
+        return (int(found[-1]["corrections"]), int(found[-1].get("newton_steps", 0))) if found else (unset, 0)
 
     def validated(self, step: int) -> bool:
         return any(record["step"] == step and "valid_rmse" in record for record in self)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -12,9 +13,11 @@ from ast_sim.inference.measures import SquaredError, rmse_pooled
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.prescribed_motion import Motion
 from ast_sim.runs.scope import Scope, edge_lengths, size_of, spacing_of
-from ast_sim.scene import NodeType
+from ast_sim.scene import AttributeValue, NodeType
 from ast_sim.support.errors import TrainingError
 
+# Settings of the model, and the attributes of trajectories that hold them.
+RECORDED = {"young": "young", "poisson": "poisson", "contact_range": "dhat", "friction": "friction"}
 MEASURED = 100  # at most so many training trajectories are measured
 
 
@@ -28,6 +31,7 @@ class DataScales:
         nodes: median number of nodes of a scene.
         trajectories, pairs: number of trajectories, and number of frames that can be a target.
         planar: whether z is 0 in all scenes.
+        recorded: numbers that the solver recorded with all scenes alike, by the setting of the model; see RECORDED.
     """
 
     displacement: float
@@ -37,6 +41,7 @@ class DataScales:
     trajectories: int
     pairs: int
     planar: bool = False
+    recorded: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
 def measure(dataset: Dataset) -> DataScales:
@@ -50,7 +55,7 @@ def measure(dataset: Dataset) -> DataScales:
     if count == 0:
         raise TrainingError(f"{dataset.path} has no trajectories to train on: the split train is empty")
     given = GIVEN_FRAMES[dataset.info.integration]  # these cannot be a target
-    displacement, increment, lengths, nodes, planar = [], [], [], [], True
+    displacement, increment, lengths, nodes, constants, planar = [], [], [], [], [], True
     for name, trajectory in dataset.spread("train", MEASURED):
         scene, position = trajectory.scene, trajectory.position
         scene.require_predictable(name)
@@ -59,6 +64,7 @@ def measure(dataset: Dataset) -> DataScales:
         increment.append(SquaredError.between(position[1:], position[:-1], normal))
         lengths.append(edge_lengths(scene))
         nodes.append(scene.num_nodes)
+        constants.append({key: trajectory.attributes.get(name) for key, name in RECORDED.items()})
         planar = planar and not scene.rest_position[:, 2].any() and not position[:, :, 2].any()
     return DataScales(
         displacement=rmse_pooled(displacement),
@@ -68,7 +74,15 @@ def measure(dataset: Dataset) -> DataScales:
         trajectories=count,
         pairs=sum(max(0, dataset.num_frames("train", index) - given) for index in range(count)),
         planar=planar,
+        recorded=_alike(constants),
     )
+
+
+def _alike(constants: list[dict[str, AttributeValue | None]]) -> dict[str, float]:
+    """The numbers that are the same in all scenes."""
+    first = constants[0]
+    alike = (key for key in first if all(constant[key] == first[key] for constant in constants))
+    return {key: float(first[key]) for key in alike if isinstance(first[key], float | int)}
 
 
 def scope_of(dataset: Dataset) -> Scope:

@@ -37,7 +37,12 @@ def resolve(config: RunConfig, dataset: Dataset, scales: DataScales) -> RunConfi
     """
     model = config.model.resolve(
         DataFacts(
-            dataset.info, dataset.material_width, scales.spacing, scales.planar, tetrahedra=dataset.element_size == 4
+            dataset.info,
+            dataset.material_width,
+            scales.spacing,
+            scales.planar,
+            tetrahedra=dataset.element_size == 4,
+            recorded=scales.recorded,
         )
     )
     return RunConfig(model, resolve_training(config.train, scales, model), str(Path(config.data).resolve()))

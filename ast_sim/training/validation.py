@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ast_sim.dataset.reader import Dataset
+from ast_sim.inference.asked_frame import errors_by_effort
+from ast_sim.inference.effort import Effort, cheapest_good, knows_material
 from ast_sim.inference.jump import calls
 from ast_sim.inference.measures import SquaredError, rmse_sequence
 from ast_sim.inference.question import Question
@@ -17,6 +19,8 @@ from ast_sim.scene import Trajectory
 
 MORE_CALLS = 2  # a model that jumps is validated with so many more calls than it is trained with
 ENOUGH = 0.01  # a further call must lower the error by this share
+EFFORT_SCENES = 10  # the default effort is chosen on at most so many validation scenes, at the deepest frame
+MOST_NEWTON_STEPS = 3
 JUMPS = 4  # a model that jumps is validated at so many frames of a scene, evenly spread, the last one included
 
 
@@ -28,12 +32,14 @@ class Validated(NamedTuple):
         errors: error of the prediction, for a model that jumps after each call; empty if the prediction failed.
         hold: error of the prediction that nothing moves.
         failure: why the prediction failed; None if it did not.
+        efforts: [calls, Newton steps + 1], the relative errors at the deepest frame; None if they were not measured.
     """
 
     index: int
     errors: list[SquaredError]
     hold: SquaredError
     failure: str | None
+    efforts: np.ndarray | None = None
 
 
 def validate(
@@ -70,10 +76,14 @@ def _validate_jumps(model: Simulator, truths: dict[int, Trajectory], most_calls:
     }
     questions = [Question.of(truth, _name(index), frames[index].tolist()) for index, truth in truths.items()]
     found = []
-    for (index, truth), after in zip(truths.items(), calls(model, questions, most_calls - 1), strict=True):
+    for (index, truth), after in zip(truths.items(), calls(model, questions, Effort(most_calls - 1)), strict=True):
         failure = after if isinstance(after, str) else None
         errors = [_motion_error(position, truth, frames[index]) for position in after] if failure is None else []
-        found.append(Validated(index, errors, _motion_error(truth.position[0], truth, frames[index]), failure))
+        hold = _motion_error(truth.position[0], truth, frames[index])
+        efforts = None
+        if failure is None and index < EFFORT_SCENES and knows_material(model.config):
+            efforts = errors_by_effort(model, truth, Effort(max(0, most_calls - MORE_CALLS - 1), MOST_NEWTON_STEPS))
+        found.append(Validated(index, errors, hold, failure, efforts))
     return found
 
 
@@ -85,14 +95,20 @@ def verdict(found: list[Validated], best: float, unit: str) -> tuple[dict[str, A
     found = sorted(found, key=lambda scene: scene.index)
     by_calls = [rmse_sequence(errors) for errors in zip(*(scene.errors for scene in found), strict=True)]
     hold = rmse_sequence([scene.hold for scene in found])
-    corrections = _corrections(by_calls)
-    error = by_calls[corrections]
+    effort = Effort(_corrections(by_calls))
+    error = by_calls[effort.corrections]
     share = f" = {error / hold:.2f} of the error of hold still" if hold else ""
-    after = f" after {corrections} corrections" if len(by_calls) > 1 else ""
+    after = f" after {effort.text}" if len(by_calls) > 1 else ""
     text = f"error {error:.3g} {unit}{share}{after}{', the best so far' if error < best else ''}"
-    record = {"valid_rmse": error, "valid_hold_still": hold}
-    if len(by_calls) > 1:
-        record |= {"valid_by_calls": by_calls, "corrections": corrections}
+    record: dict[str, Any] = {"valid_rmse": error, "valid_hold_still": hold}
+    measured = [scene.efforts for scene in found if scene.efforts is not None]
+    if measured:
+        by_effort = np.mean(measured, axis=0)
+        effort = cheapest_good(by_effort)
+        record["valid_by_effort"] = by_effort.tolist()
+        text += f"; at the deepest frame {100 * by_effort[effort]:.2g} % of the displacement after {effort.text}"
+    if len(by_calls) > 1 or measured:
+        record |= {"valid_by_calls": by_calls, **effort._asdict()}
     return record, text
 
 

@@ -76,7 +76,7 @@ def long_rollouts(run: Run, dataset: Dataset, horizons: int) -> Iterator[tuple[T
     """Every test scene and its rollout over all horizons."""
     for index, truth in enumerate(dataset["test"]):
         question = Question.of(repeated(truth, horizons), f"test/{index:06d}")
-        yield truth, answers(run.model, [question], run.corrections)[0]
+        yield truth, answers(run.model, [question], run.effort)[0]
 
 
 def measure(run: Run, horizons: int, command: str) -> dict[str, Any]:

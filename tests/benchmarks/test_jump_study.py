@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -32,12 +33,17 @@ def test_a_row_is_trained_measured_and_shown_and_found_again(small):
     found = json.loads(jumps.RESULTS.read_text())
     row, walk = found["small"], found["walk"]
     assert len(row["scenes"]) == 2 and row["solver"]["scenes"] == 1 and walk["solver"] is None
-    assert len(row["by_calls"]) == 1 + row["corrections"] and len(row["more_calls"]) == 4 + row["corrections"]
-    assert row["by_calls"] == pytest.approx(row["more_calls"][: len(row["by_calls"])], rel=1e-3)
+    assert len(row["by_calls"]) == 1 + sum(row["effort"].values())
+    dial = {(turned["corrections"], turned["newton_steps"]): turned for turned in row["dial"]}
+    assert (
+        (0, 0) in dial
+        and (4, 3) in dial
+        and np.mean(dial[2, 2]["relative_error"]) < np.mean(dial[2, 0]["relative_error"])
+    )
     assert row["relative_error"] == pytest.approx(row["by_calls"][-1], rel=1e-6)
-    assert walk["corrections"] == 0 and walk["by_calls"] == []
+    assert walk["effort"] == {"corrections": 0, "newton_steps": 0} and walk["by_calls"] == walk["dial"] == []
     text = jumps.PAGE.read_text()
-    assert f"{100 * row['relative_error']:.1f} ±" in text and "times as long" in text
+    assert f"{100 * row['relative_error']:.1f} ±" in text and "times as long" in text and "every frame" in text
     assert text.count("\n## ") == 2 and "Worst: test/" in text
     jumps.main(["walk", "--folder", str(small / "data")])  # nothing is trained anew
     assert json.loads(jumps.RESULTS.read_text())["walk"]["relative_error"] == walk["relative_error"]

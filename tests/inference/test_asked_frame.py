@@ -10,9 +10,16 @@ import toy
 from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import Dataset, generate
-from ast_sim.inference.asked_frame import asked_frames, lines
+from ast_sim.inference.asked_frame import asked_frames, errors_by_effort, lines
+from ast_sim.inference.effort import Effort, cheapest_good
+from ast_sim.inference.predict import answers
+from ast_sim.inference.question import Question
+from ast_sim.models.model_config import DataFacts
+from ast_sim.models.registry import find_preset
 from ast_sim.models.simulator import Prediction, Simulator
 from ast_sim.simulate.jobs.rival import deepest_frame
+from ast_sim.support.errors import ConfigError
+from ast_sim.training.data_lengths import measure
 
 
 class Share(Simulator):
@@ -38,7 +45,7 @@ def test_errors_are_shares_of_the_displacement(one):
     frame = deepest_frame(truth)
     assert 0 < frame < 6
     model = Share(replace(toy.config(toy.info()), jumps=True), truth, frame, 0.75)
-    scene, *_ = asked_frames(model, one, "test", 2)["scenes"]
+    scene, *_ = asked_frames(model, one, "test", Effort(2))["scenes"]
     free = ~truth.scene.prescribed
     size = np.sqrt(np.mean(np.square((truth.position[frame] - truth.position[0])[free].astype(float))))
     assert (scene["name"], scene["frame"], scene["displacement"]) == ("test/000000", frame, pytest.approx(size))
@@ -52,12 +59,73 @@ def test_errors_are_shares_of_the_displacement(one):
 def test_a_failure_and_a_dataset_without_a_solver_are_told(one):
     truth = one.load("test", 0)
     model = Share(replace(toy.config(toy.info()), jumps=True), truth, 3, float("nan"))
-    found = asked_frames(model, one, "test", 1, rival_scenes=1)
+    found = asked_frames(model, one, "test", Effort(1), rival_scenes=1)
     assert found["relative_error"] is None and lines(found) == ["the deepest frame: every prediction failed"]
     model.share = 0.5
-    found = asked_frames(model, one, "test", 1, rival_scenes=1)
+    found = asked_frames(model, one, "test", Effort(1), rival_scenes=1)
     assert found["solver"] is None and "the solver was not run:" in lines(found)[-1]
     json.dumps(found, allow_nan=False)
+
+
+@pytest.fixture(scope="module")
+def pressed(tmp_path_factory):
+    """A dataset with one plate that the solver has pressed."""
+    path = tmp_path_factory.mktemp("pressed") / "d.h5"
+    generate("deforming_plate", path, train=1, valid=0, test=1, nodes=100, frames=5, workers=1)
+    with Dataset(path) as dataset:
+        yield dataset
+
+
+def pressing(dataset, share):
+    """A model that goes a share of the way to the solver's frame, with the settings that its data gives."""
+    truth, scales = dataset.load("test", 0), measure(dataset)
+    facts = DataFacts(dataset.info, 0, scales.spacing, recorded=scales.recorded)
+    settings = replace(find_preset("ast", "tiny").model, jumps=True).resolve(facts)
+    return truth, Share(settings, truth, deepest_frame(truth), share)
+
+
+def test_newton_steps_lead_from_the_answer_to_equilibrium(pressed):
+    truth, model = pressing(pressed, 0.7)
+    frame = deepest_frame(truth)
+    assert (
+        (model.config.young, model.config.poisson)
+        == (1e6, 0.4)
+        == tuple(truth.attributes[key] for key in ("young", "poisson"))
+    )
+    found = asked_frames(model, pressed, "test", Effort(1, 3))["scenes"][0]
+    errors = found["by_calls"]
+    assert errors[:2] == pytest.approx([0.3, 0.09], rel=1e-3)
+    assert errors[2] < 0.4 * errors[1] and errors[-1] < 0.015 and found["relative_error"] == errors[-1]
+    assert found["stress_share"] < 0.05 and found["largest_stress"] < 0.05
+    (answer,) = answers(model, [Question.of(truth, "plate", [frame])], Effort(1, 3))
+    held = truth.scene.prescribed
+    assert np.array_equal(answer.position[0][held], truth.position[frame][held])
+    table = errors_by_effort(model, truth, Effort(1, 3))
+    assert table.shape == (2, 4) and table[1].tolist() == errors[1:] and table[0, 0] == errors[0]
+
+
+def test_newton_steps_need_a_material(one, pressed):
+    truth, model = pressing(pressed, 0.7)
+    question = [Question.of(truth, "plate", [-1])]
+    model.config = replace(model.config, young=0.0)
+    with pytest.raises(ConfigError, match="newton_steps is 1; they need tetrahedra and their material"):
+        answers(model, question, Effort(0, 1))
+    model.config = replace(model.config, jumps=False)
+    with pytest.raises(ConfigError, match="corrections is 2; it needs a run that jumps"):
+        answers(model, question, Effort(2))
+    with pytest.raises(ConfigError, match="newton_steps is -1; it must be at least 0"):
+        Effort(0, -1).check(model.config)
+    assert measure(one).recorded == {}
+
+
+def test_the_default_effort_is_the_cheapest_that_is_good():
+    errors = np.array([[0.2, 0.1, 0.05, 0.03], [0.1, 0.05, 0.018, 0.01], [0.08, 0.04, 0.012, 0.009]])
+    assert cheapest_good(errors) == Effort(1, 2)  # three together; no two are good
+    errors[2, 1] = 0.015
+    assert cheapest_good(errors) == Effort(2, 1)  # as cheap, and more accurate
+    assert cheapest_good(errors + 0.1) == Effort(2, 3)  # none is good: the most accurate
+    errors[2] = np.nan
+    assert cheapest_good(errors) == Effort(1, 2)
 
 
 def test_beside_the_solver(tmp_path):
@@ -67,7 +135,7 @@ def test_beside_the_solver(tmp_path):
         truth = dataset.load("test", 0)
         frame = deepest_frame(truth)
         config = replace(toy.config(dataset.info), jumps=True, stress="node")
-        found = asked_frames(Share(config, truth, frame, 0.99), dataset, "test", 0, rival_scenes=1)
+        found = asked_frames(Share(config, truth, frame, 0.99), dataset, "test", Effort(), rival_scenes=1)
     solver = found["scenes"][0]["solver"]
     assert found["relative_error"] == pytest.approx(0.01, rel=1e-3)
     assert solver["ways"]["own stop test"]["relative_error"] < 1e-3

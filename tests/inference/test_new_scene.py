@@ -152,9 +152,9 @@ def test_only_a_scene_that_leaves_the_domain_is_moved(run, monkeypatch):
 
     answers = predict.answers
 
-    def kept(model, questions, corrections):
+    def kept(model, questions, effort):
         asked.extend(questions)
-        return answers(model, questions, corrections)
+        return answers(model, questions, effort)
 
     monkeypatch.setattr(predict, "answers", kept)
     scene = scene_of()
@@ -190,7 +190,7 @@ def test_a_trajectory_is_predicted_where_it_lies_and_nobody_warns(run):
     answer = predicted_without_warning(run, there)
     assert answer.scene is scene and np.array_equal(answer.position[0], there.position[0])
     question = Question.of(there, "scene")
-    assert np.array_equal(answer.position, predict.answers(run.model, [question], run.corrections)[0].position)
+    assert np.array_equal(answer.position, predict.answers(run.model, [question], run.effort)[0].position)
 
 
 @pytest.mark.parametrize(

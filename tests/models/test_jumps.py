@@ -12,6 +12,7 @@ from toy import one_thread  # noqa: F401 (used by being imported)
 from ast_sim.batches.carry import Carrier
 from ast_sim.batches.pairs import PairSampler
 from ast_sim.dataset.reader import Dataset
+from ast_sim.inference.effort import Effort
 from ast_sim.inference.evaluation import evaluate, table
 from ast_sim.inference.jump import calls
 from ast_sim.inference.predict import answers
@@ -89,14 +90,14 @@ def test_each_call_corrects_the_answer_of_the_call_before():
     truth, model = toy.plate(1), Halving(config("ast"))
     free = ~truth.scene.prescribed
     question = Question.of(truth, "scene", [2, -1])
-    (found,) = calls(model, [question], 3)
+    (found,) = calls(model, [question], Effort(3))
     assert found.shape == (4, 2, truth.scene.num_nodes, 3)
     start = truth.position[0, free]
     for call in range(4):
         way = (found[call, :, free] - start[:, None])[..., 0]
         np.testing.assert_allclose(way, 0.01 * (1 - 0.5 ** (call + 1)), rtol=0, atol=1e-7)
         assert np.array_equal(found[call][:, ~free], truth.position[[2, 6]][:, ~free])
-    (answer,) = answers(model, [question], 3)
+    (answer,) = answers(model, [question], Effort(3))
     assert np.array_equal(answer.position, found[3]) and answer.frames == (2, 6) and answer.given == 0
     assert len(answer.stress) == 2 == len(answer.step_seconds)
 
@@ -105,9 +106,9 @@ def test_only_the_wanted_frames_are_computed(monkeypatch):
     truth, model, seen = toy.plate(0), model_of("ast"), []
     forward = model.forward
     monkeypatch.setattr(model, "forward", lambda batch: seen.append(batch.names) or forward(batch))
-    (last,) = answers(model, [Question.of(truth, "scene", [-1])], 2)
+    (last,) = answers(model, [Question.of(truth, "scene", [-1])], Effort(2))
     assert seen == [["scene frame 6"]] * 3
-    (every,) = answers(model, [Question.of(truth, "scene")], 2)
+    (every,) = answers(model, [Question.of(truth, "scene")], Effort(2))
     assert every.frames == tuple(range(7)) and every.given == 1
     np.testing.assert_allclose(last.position[0], every.position[6], rtol=0, atol=2e-6)
     for wrong, message in (([7], "has the frames 0 to 6; there is no frame 7"), ([], "name at least one frame")):
@@ -121,7 +122,9 @@ def test_frames_that_are_spaced_anew_have_the_same_answers(model):
     truth, built = toy.plate(0), model_of(model)
     order = [0, 0, 1, 3, 3, 6]
     other = Trajectory(truth.scene, truth.position[order], truth.stress[order])
-    (plain,), (spaced,) = (answers(built, [Question.of(t, "scene", [f])], 2) for t, f in ((truth, 3), (other, 4)))
+    (plain,), (spaced,) = (
+        answers(built, [Question.of(t, "scene", [f])], Effort(2)) for t, f in ((truth, 3), (other, 4))
+    )
     assert np.array_equal(plain.position, spaced.position) and np.array_equal(plain.stress, spaced.stress)
 
 
@@ -161,7 +164,7 @@ def test_a_frame_that_fails_keeps_the_others_before_it():
 
 def test_the_evaluation_says_that_one_step_is_the_rollout(data):
     with Dataset(data) as dataset:
-        found, _ = evaluate(model_of("transolver"), dataset, corrections=1)
+        found, _ = evaluate(model_of("transolver"), dataset, effort=Effort(1))
         stepwise, _ = evaluate(model_of("transolver", jumps=False), dataset)
     for quantity in ("displacement", "stress"):
         errors = found["summary"]["model"][quantity]
@@ -223,6 +226,6 @@ def test_training_brings_the_error_below_holding_still(model, data, tmp_path):
     assert made.train.noise == 0.0 and made.model.jumps  # a guess has errors of the model's own
     trained, _, _ = load_model(tmp_path / "run")
     with Dataset(data) as dataset:
-        errors = evaluate(trained, dataset, corrections=1)[0]["summary"]
+        errors = evaluate(trained, dataset, effort=Effort(1))[0]["summary"]
     reached, still = (errors[key]["displacement"]["rollout_all"]["normal"] for key in ("model", "hold_still"))
     assert reached["rmse_sequence"] < 0.7 * still["rmse_sequence"]

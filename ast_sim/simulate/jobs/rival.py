@@ -2,7 +2,8 @@
 
 Such a user would not solve all frames before. The solver goes straight from rest to the wanted frame, in the fewest
 load steps that converge, and is run in several ways that trade accuracy for time: looser stop tests, a longer range of
-contact, coarser meshes. `cheapest` finds the fastest way that is as accurate as the model.
+contact, coarser meshes, Newton steps with linearised contact. `cheapest` finds the fastest way that is as accurate as
+the model.
 Each scene is solved in a process of its own, on one thread and without torch.
 """
 
@@ -42,12 +43,15 @@ class Way:
         nodes: share of the nodes of the deforming bodies.
         dhat: factor of the range of contact.
         tolerance: factor of the stop test, `SolverSettings.force_tolerance`.
+        linearised: so many load steps, each of one Newton step with linearised contact, and one more step at the end.
+            0: the bundled solver, with barriers and to its stop test.
     """
 
     name: str
     nodes: float = 1.0
     dhat: float = 1.0
     tolerance: float = 1.0
+    linearised: int = 0
 
 
 WAYS = (
@@ -60,6 +64,10 @@ WAYS = (
     Way("1/4 nodes", nodes=0.25),
     Way("1/2 nodes, 10x looser", nodes=0.5, tolerance=10),
     Way("1/4 nodes, 10x looser", nodes=0.25, tolerance=10),
+    Way("6 linearised steps", linearised=6),
+    Way("12 linearised steps", linearised=12),
+    Way("1/2 nodes, 6 linearised steps", nodes=0.5, linearised=6),
+    Way("1/2 nodes, 12 linearised steps", nodes=0.5, linearised=12),
 )
 STARTS = (1, 2, 4)
 

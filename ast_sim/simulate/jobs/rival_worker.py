@@ -14,6 +14,7 @@ import os
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
+from time import process_time
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from ast_sim.simulate.jobs.rival import OUTCOMES, POSITIONS, Outcome, Way
 from ast_sim.simulate.jobs.samples import Recipe, draw_sample
 from ast_sim.simulate.jobs.worker import answers_for
 from ast_sim.simulate.mechanics.case import Drawn, SolidCase
+from ast_sim.simulate.mechanics.linearised_contact import CLEARANCE, NewtonSteps
 from ast_sim.simulate.mechanics.quasi_static import OneFrame, solve_frame
 from ast_sim.simulate.mechanics.solver import SolverSettings
 from ast_sim.simulate.shapes.mesh_transfer import transferred
@@ -110,6 +112,7 @@ class WaySolver:
         self._meshes: dict[float, tuple[SolidCase | str, float]] = {1.0: (drawn.case, 0.0)}
         # The libraries are loaded in the first solution; nobody's time should hold that.
         solve_frame(drawn.case, frame, settings, most_iterations=1)
+        self._linearised(drawn.case, 1)
 
     def outcome(self, way: Way) -> Outcome:
         """Mesh and solve in this way; the cheapest of all starts that converge."""
@@ -120,7 +123,10 @@ class WaySolver:
             return Outcome(way, f"could not be meshed: {case}", mesh_seconds=mesh_seconds)
         case = replace(case, contact=replace(case.contact, dhat=way.dhat * case.contact.dhat))
         settings = replace(self.settings, force_tolerance=way.tolerance * self.settings.force_tolerance)
-        start, found = self._fastest(case, settings)
+        if way.linearised:
+            start, found = way.linearised, self._linearised(case, way.linearised)
+        else:
+            start, found = self._fastest(case, settings)
         position, error = None, np.inf
         if found.position is not None:
             position = found.position if way.nodes == 1 else self._on_own_mesh(case, found.position)
@@ -164,6 +170,21 @@ class WaySolver:
                     best = start, found
         assert best is not None
         return best
+
+    def _linearised(self, case: SolidCase, steps: int) -> OneFrame:
+        """So many load steps of one Newton step with linearised contact, and one Newton step more."""
+        held, began = case.scene.prescribed[:, None], process_time()
+        position, failure = case.targets[0], ""
+        contact = case.contact
+        try:
+            newton = NewtonSteps(case.scene, case.material, CLEARANCE * contact.dhat, contact.friction)
+            setup = process_time() - began
+            for share in [*np.linspace(0, 1, steps + 1)[1:], 1.0]:
+                target = case.targets[0] + share * (case.targets[self.frame] - case.targets[0])
+                position = newton.step(np.where(held, target, position))
+        except SimulationError as error:
+            position, failure, setup = None, str(error), 0.0
+        return OneFrame(position, failure, process_time() - began - setup, setup, steps, steps + 1, 0)
 
     def _on_own_mesh(self, case: SolidCase, position: np.ndarray) -> np.ndarray:
         """Positions of the nodes of the dataset's mesh, from those of another mesh of the same bodies."""

@@ -42,7 +42,7 @@ class Factorization(Protocol):
         """Factorise; return False if the matrix is not positive definite."""
 
     def solve(self, right_side: np.ndarray) -> np.ndarray:
-        """Solution for the matrix last factorised."""
+        """Solution for the matrix last factorised; right side [F], or several [F, K] in Fortran's order."""
 
 
 class Pardiso:
@@ -105,6 +105,8 @@ class Cholmod:
         return True
 
     def solve(self, right_side: np.ndarray) -> np.ndarray:
+        if right_side.ndim == 2:  # cholespy takes at most 128 right sides, in C's order
+            return np.stack([self.solve(np.ascontiguousarray(column)) for column in right_side.T], axis=1)
         solution = np.zeros_like(right_side)
         self._solver.solve(right_side, solution)
         return solution
@@ -159,12 +161,15 @@ class LinearSystem:
     Args:
         rows, columns: [P] dofs of the entries that elements add. An entry (r, c) stands for (c, r), too.
         prescribed: [N] nodes whose rows and columns are left out.
+
+    Attributes:
+        free: [F] the dofs that are not left out.
     """
 
     def __init__(self, rows: np.ndarray, columns: np.ndarray, prescribed: np.ndarray) -> None:
         free = np.repeat(~prescribed, 3)
-        self._free = np.flatnonzero(free)
-        self._count = len(self._free)
+        self.free = np.flatnonzero(free)
+        self._count = len(self.free)
         self._number = np.where(free, np.cumsum(free) - 1, -1)
         inside, keys = self._keys(rows, columns)
         diagonal = np.arange(self._count) * (self._count + 1)
@@ -212,7 +217,7 @@ class LinearSystem:
             matrix is found not to be positive definite. Not every such matrix is found, but the solution is a direction
             of descent in any case.
         """
-        matrix, right = self._assemble(values, contact), right_side.ravel()[self._free]
+        matrix, right = self._assemble(values, contact), right_side.ravel()[self.free]
         free = None
         if self._has_factor and self._count >= ITERATE_FROM:
             free, is_indefinite = conjugate_gradients(matrix, right, self._factorization.solve)
@@ -226,8 +231,24 @@ class LinearSystem:
                 return None
             free = self._factorization.solve(right)
         solution = np.zeros(right_side.size)
-        solution[self._free] = free
+        solution[self.free] = free
         return solution.reshape(-1, 3)
+
+    def factorise(self, values: np.ndarray) -> Callable[[np.ndarray], np.ndarray] | None:
+        """Factorise the sum of the elements' values [P] alone, without contact.
+
+        Returns:
+            A function from right sides [F] or [F, K] to solutions, F the number of free dofs in the order of `free`.
+            None if the matrix is not positive definite.
+        """
+        matrix = self._assemble(values, (np.zeros(0, int), np.zeros(0, int), np.zeros(0)))
+        self.factorizations += 1
+        self._has_factor = self._factorization.factorise(matrix, self._is_new)
+        self._is_new = False
+        return self._solutions if self._has_factor else None
+
+    def _solutions(self, right_sides: np.ndarray) -> np.ndarray:
+        return self._factorization.solve(np.asfortranarray(right_sides)) if right_sides.size else right_sides
 
     def _assemble(
         self, values: np.ndarray, contact: tuple[np.ndarray, np.ndarray, np.ndarray]

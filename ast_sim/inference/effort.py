@@ -1,0 +1,85 @@
+"""How much is computed for an answer: one dial from the fastest answer to an exact one."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ast_sim.models.model_config import ModelConfig
+from ast_sim.scene import Scene
+from ast_sim.simulate.mechanics.linearised_contact import CLEARANCE, NewtonSteps
+from ast_sim.simulate.mechanics.material import NeoHookean
+from ast_sim.support.errors import ConfigError
+
+GOOD = 0.02  # a relative error that most users call exact
+
+
+class Effort(NamedTuple):
+    """What follows the first call of a model that jumps.
+
+    Attributes:
+        corrections: so many further calls of the model correct its answer.
+        newton_steps: so many Newton steps of the solver then lead towards equilibrium.
+    """
+
+    corrections: int = 0
+    newton_steps: int = 0
+
+    @property
+    def text(self) -> str:
+        """Such as "2 corrections, 1 Newton step"."""
+        found = [(self.corrections, "correction"), (self.newton_steps, "Newton step")]
+        return ", ".join(f"{n} {what}{'' if n == 1 else 's'}" for n, what in found if n or what == "correction")
+
+    def check(self, config: ModelConfig) -> None:
+        """Raise ConfigError if a number is negative or the model cannot do so."""
+        for key, count in self._asdict().items():
+            if count < 0:
+                raise ConfigError(f"{key} is {count}; it must be at least 0")
+            if count and not config.jumps:
+                raise ConfigError(f"{key} is {count}; it needs a run that jumps, and this one does not")
+        if self.newton_steps and not knows_material(config):
+            raise ConfigError(
+                f"newton_steps is {self.newton_steps}; they need tetrahedra and their material: the training"
+                " scenes have no columns of Young's modulus and Poisson's ratio, and no solver recorded them"
+            )
+
+
+FIRST_CALL = Effort()
+
+
+def knows_material(config: ModelConfig) -> bool:
+    """Whether Young's modulus and Poisson's ratio are known for the scenes of a model that jumps."""
+    return bool(config.jumps and config.tetrahedra and (config.material_width == 2 or config.young > 0))
+
+
+def newton_steps(config: ModelConfig, scene: Scene) -> NewtonSteps:
+    """The Newton steps of a scene, in the material and with the contact of the training scenes.
+
+    Raises:
+        SimulationError: the constants of the material are not allowed, or an element has no volume.
+    """
+    material = NeoHookean(config.young, config.poisson)
+    if scene.material is not None and scene.material.shape[1] == 2:
+        young, poisson = scene.material.astype(np.float64).T
+        rigid = ~scene.deforming_nodes[scene.elements].any(axis=1)
+        material = NeoHookean(np.where(rigid, 1.0, young), np.where(rigid, 0.0, poisson))
+    return NewtonSteps(scene, material, CLEARANCE * config.contact_range, config.friction)
+
+
+def cheapest_good(errors: np.ndarray) -> Effort:
+    """The default effort of a run.
+
+    Args:
+        errors: [C, K], the relative errors in validation after c corrections and k Newton steps.
+
+    Returns:
+        The effort with the fewest corrections and Newton steps together whose error is at most `GOOD`; of several, the
+        most accurate one. If there is none, the most accurate one of all.
+    """
+    total = np.add.outer(*(np.arange(size) for size in errors.shape))
+    good = np.where(errors <= GOOD, total, np.inf)
+    chosen = np.where(good == good.min(), errors, np.inf) if np.isfinite(good.min()) else errors
+    corrections, steps = np.unravel_index(np.nanargmin(chosen), errors.shape)
+    return Effort(int(corrections), int(steps))

@@ -1,0 +1,250 @@
+"""Newton steps with linearised contact: from nearly right positions to equilibrium in a few steps.
+
+At positions x, with K the stiffness, f the derivative of the elastic energy, and each near pair of a surface node and
+a triangle of another body with its gap g and its outward normal n, a step finds the displacement u of the free nodes:
+
+    minimise  1/2 u K u + f u   subject to   C u + g >= clearance,
+
+where a row of C is the normal velocity of the node relative to the nearest point of the triangle. This is one step of
+sequential quadratic programming. Its dual has one unknown a pair, the force of contact l >= 0:
+
+    minimise  1/2 l B l + b l,   B = C K^-1 C^T,   b = g - clearance - C K^-1 f,   then   u = K^-1 (C^T l - f).
+
+With Coulomb friction each pair has tangential forces, too, at most the coefficient times the normal force; they resist
+slip from x. So x is taken for the place where surfaces stick. Bodies may overlap at x, and elements may be turned over:
+these get the forces and the stiffness of the nearest upright shape (Irving, Teran and Fedkiw 2004). Pairs of edges are
+left out, so edges may cross by a little. A node is on the side of a surface where it is nearest: the start must be
+nearly right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse
+from scipy.optimize import nnls
+
+from ast_sim.scene import Scene
+from ast_sim.simulate.mechanics.elasticity import Deformation, Elasticity
+from ast_sim.simulate.mechanics.linear_system import LinearSystem
+from ast_sim.simulate.mechanics.material import NeoHookean, cofactor, determinant, von_mises
+from ast_sim.support.errors import SimulationError
+
+CLEARANCE = (
+    0.8  # bodies that barriers keep apart stand off by this share of the barriers' range (docs/log.md, 2026-11-24)
+)
+NEAR = 0.5  # pairs with a gap below this may touch, in mean edge lengths of the surfaces
+DEEP = 2.0  # a node deeper inside another body than this is not taken for one in contact with it, in the same
+ROUNDING = 1e-10  # is added to the diagonal of B, relative to its mean: equal pairs make B singular
+SWEEPS, CHANGE = 100, 1e-3  # forces of friction are found when a sweep over the pairs changes them by less
+FLATTEST = 0.2  # the least stretch of an element that forces and stiffness follow
+TINY = 1e-300  # instead of zero in a denominator
+SMALLEST = 1 / 64  # a step is shortened at most so far where it turns an element over
+
+
+@dataclass(frozen=True, eq=False)
+class NearPairs:
+    """Surface nodes near triangles of other bodies.
+
+    Attributes:
+        directions: [3 P, F] sparse, the derivatives by the free dofs of each pair's gap, then of its slip along one
+            tangent, then along the other.
+        gap: [P], negative where the node lies inside the other body.
+    """
+
+    directions: scipy.sparse.csr_array
+    gap: np.ndarray
+
+
+class NewtonSteps:
+    """Newton steps of the elastic bodies of a scene; made once for each scene.
+
+    Args:
+        scene: tetrahedra. Its prescribed nodes stay where they are in a step.
+        material: of all elements; the constants of rigid ones are ignored.
+        clearance: in the unit of length, the gap that bodies in contact keep.
+        friction: Coulomb's coefficient.
+
+    Raises:
+        SimulationError: the rest volume of an element is not positive.
+        MissingExtra: no library for the linear system is installed.
+    """
+
+    def __init__(self, scene: Scene, material: NeoHookean, clearance: float, friction: float = 0.0) -> None:
+        self._scene, self._clearance, self._friction = scene, clearance, friction
+        self._rest = scene.rest_position.astype(np.float64)
+        self._deforming = np.flatnonzero(scene.deforming_nodes[scene.elements].any(axis=1))
+        elements = scene.elements[self._deforming].astype(np.int64)
+        self._elasticity = Elasticity(self._rest, elements, material.of(self._deforming))
+        held = scene.prescribed | ~np.isin(np.arange(scene.num_nodes), elements)
+        self._system = LinearSystem(*self._elasticity.entry_dofs(), held)
+        self._number = np.full(3 * scene.num_nodes, -1)
+        self._number[self._system.free] = np.arange(len(self._system.free))
+        faces = scene.surface().astype(np.int64)
+        owner, edge = scene.body[faces[:, 0]], self._rest[faces[:, 0]] - self._rest[faces[:, 1]]
+        self._length = float(np.linalg.norm(edge, axis=1).mean())
+        nodes = np.unique(faces)
+        self._surfaces = [(faces[owner == body], nodes[scene.body[nodes] != body]) for body in np.unique(owner)]
+
+    def step(self, position: np.ndarray) -> np.ndarray:
+        """The positions [N, 3] after one step from `position` [N, 3], float64.
+
+        Raises:
+            SimulationError: the stiffness is singular, or the forces of contact were not found.
+        """
+        deformation = _upright(self._elasticity.evaluate(position))
+        force = self._elasticity.gradient(deformation)[0].ravel()[self._system.free]
+        for project in (False, True):
+            solve = self._system.factorise(self._elasticity.hessian(deformation, project))
+            if solve is not None:
+                break
+        else:
+            raise SimulationError("the stiffness is singular: nothing holds a body, or an element has collapsed")
+        return self._shortened(position, self._constrained(solve, force, self.near_pairs(position)))
+
+    def _constrained(
+        self, solve: Callable[[np.ndarray], np.ndarray], force: np.ndarray, pairs: NearPairs
+    ) -> np.ndarray:
+        """The displacement [F] of the free dofs; see the head of this file."""
+        unconstrained, count = solve(-force), len(pairs.gap)
+        if not count:
+            return unconstrained
+        normals = pairs.directions[:count]
+        responses = solve(normals.toarray().T)  # K^-1 C^T
+        offset = normals @ unconstrained + pairs.gap - self._clearance
+        forces = _pressed(_compliance(normals, responses), offset)
+        active = np.flatnonzero(forces)
+        if not self._friction or not len(active):
+            return unconstrained + responses @ forces
+        tangents = pairs.directions[np.concatenate([active + count, active + 2 * count])]
+        directions = scipy.sparse.vstack([normals[active], tangents], format="csr")
+        responses = np.concatenate([responses[:, active], solve(tangents.toarray().T)], axis=1)
+        offset = np.concatenate([offset[active], tangents @ unconstrained])
+        return unconstrained + responses @ _rubbed(
+            _compliance(directions, responses), offset, forces[active], self._friction
+        )
+
+    def von_mises(self, position: np.ndarray, location: str) -> np.ndarray:
+        """[N, 1] or [E, 1] float32: the stress in pascal at `location`, "node" or "element"; 0 in rigid bodies."""
+        stress = von_mises(self._elasticity.cauchy(self._elasticity.evaluate(position)))
+        if location == "node":
+            return self._elasticity.nodal_mean(stress).astype(np.float32)[:, None]
+        found = np.zeros((self._scene.num_elements, 1), np.float32)
+        found[self._deforming, 0] = stress
+        return found
+
+    def near_pairs(self, position: np.ndarray) -> NearPairs:
+        """The pairs that may touch at `position` [N, 3]: a surface node and its nearest point of another body."""
+        import igl  # takes 0.2 s
+
+        nodes, corners, normals, shares, gaps = [], [], [], [], []
+        for faces, others in self._surfaces:
+            if not len(others):
+                continue
+            kind, near, deep = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL, NEAR * self._length, DEEP * self._length
+            gap, face, nearest, outward = igl.signed_distance(position[others], position, faces, kind, -deep, near)
+            chosen = (gap < near) & (gap > -deep)  # NaN where the surface is farther away
+            point, there = others[chosen], faces[face[chosen]]
+            away = np.sign(gap[chosen])[:, None] * (position[point] - nearest[chosen])
+            size = np.linalg.norm(away, axis=1, keepdims=True)
+            touching = size <= 1e-9 * self._length
+            nodes.append(point)
+            corners.append(there)
+            normals.append(np.where(touching, outward[chosen], away / np.where(touching, 1, size)))
+            shares.append(igl.barycentric_coordinates(nearest[chosen], *(position[there[:, i]] for i in range(3))))
+            gaps.append(gap[chosen])
+        if not gaps:
+            return NearPairs(scipy.sparse.csr_array((0, len(self._system.free))), np.zeros(0))
+        joined = (np.concatenate(parts) for parts in (nodes, corners, normals, shares, gaps))
+        return self._pairs(*joined)
+
+    def _pairs(
+        self, nodes: np.ndarray, corners: np.ndarray, normals: np.ndarray, shares: np.ndarray, gaps: np.ndarray
+    ) -> NearPairs:
+        """Pairs of nodes [P] and triangles [P, 3] with their normals, barycentric coordinates [P, 3] and gaps [P]."""
+        of_pair = np.concatenate([nodes[:, None], corners], axis=1)  # [P, 4]
+        weight = np.concatenate([np.ones((len(nodes), 1)), -shares], axis=1)
+        columns = self._number[3 * of_pair[:, :, None] + np.arange(3)]  # [P, 4, 3]
+        movable = (columns >= 0).any(axis=(1, 2))
+        columns, weight, normals = columns[movable], weight[movable], normals[movable]
+        free, rows = columns >= 0, np.broadcast_to(np.arange(len(columns))[:, None, None], columns.shape)
+        shape = (len(columns), len(self._system.free))
+        parts = []
+        for axis in (normals, *_tangents(normals)):
+            values = weight[:, :, None] * axis[:, None, :]
+            parts.append(scipy.sparse.csr_array((values[free], (rows[free], columns[free])), shape=shape))
+        return NearPairs(scipy.sparse.vstack(parts, format="csr"), gaps[movable])
+
+    def _shortened(self, position: np.ndarray, way: np.ndarray) -> np.ndarray:
+        """`position` [N, 3] moved by the largest of 1, 1/2, 1/4, ... of the way [F] that turns no element over."""
+        share = 1.0
+        while True:
+            moved = position.ravel().copy()
+            moved[self._system.free] += share * way
+            moved = moved.reshape(-1, 3)
+            if share <= SMALLEST or self._elasticity.evaluate(moved).J.min() > 0:
+                return moved
+            share /= 2
+
+
+def _upright(deformation: Deformation) -> Deformation:
+    """The deformation with no element flatter than `FLATTEST`: F = U S V^T with U and V rotations, S raised to it."""
+    bad = np.flatnonzero((deformation.J < FLATTEST) | ~np.isfinite(deformation.J))
+    if not len(bad):
+        return deformation
+    left, stretch, right = np.linalg.svd(np.moveaxis(deformation.F[:, :, bad], 2, 0))
+    for rotation, axis in ((left, (slice(None), slice(None), 2)), (right, (slice(None), 2))):
+        mirrored = np.linalg.det(rotation) < 0
+        rotation[axis] *= np.where(mirrored, -1, 1)[:, None]
+    F = deformation.F.copy()
+    F[:, :, bad] = np.moveaxis((left * np.maximum(stretch, FLATTEST)[:, None, :]) @ right, 0, 2)
+    cofactors = cofactor(F)
+    return replace(deformation, F=F, J=determinant(F, cofactors), cofactor=cofactors)
+
+
+def _tangents(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors [P, 3] that are perpendicular to each of the normals [P, 3] and to each other."""
+    across = np.eye(3)[np.abs(normals).argmin(axis=1)]
+    first = np.cross(normals, across)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return first, np.cross(normals, first)
+
+
+def _compliance(directions: scipy.sparse.csr_array, responses: np.ndarray) -> np.ndarray:
+    """C K^-1 C^T of the directions C [D, F] and their responses K^-1 C^T [F, D], made regular."""
+    found = directions @ responses
+    return (found + found.T) / 2 + ROUNDING * np.trace(found) / len(found) * np.eye(len(found))
+
+
+def _pressed(compliance: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """The forces [P] >= 0 of contact without friction: with B = L L^T they minimise |L^T l + L^-1 b|."""
+    try:
+        lower = np.linalg.cholesky(compliance)
+        return nnls(lower.T, -np.linalg.solve(lower, offset), maxiter=30 * len(offset))[0]
+    except (np.linalg.LinAlgError, RuntimeError) as error:
+        raise SimulationError(f"the forces of contact were not found: {error}") from error
+
+
+def _rubbed(compliance: np.ndarray, offset: np.ndarray, forces: np.ndarray, friction: float) -> np.ndarray:
+    """The forces [3, P] of contact with Coulomb friction, from those [P] without, by nonlinear block Gauss-Seidel
+    (Jourdan, Alart and Jean 1998): each pair in turn gets the force that is right if the others stay.
+
+    Args:
+        compliance: B [3 P, 3 P], normals first, then the first and the second tangents.
+        offset: b [3 P].
+    """
+    count, found = len(forces), np.concatenate([forces, np.zeros(2 * len(forces))])
+    for _ in range(SWEEPS):
+        before = found.copy()
+        for pair in range(count):
+            normal, tangents = pair, [pair + count, pair + 2 * count]
+            distance = compliance[normal] @ found + offset[normal]
+            found[normal] = max(0.0, found[normal] - distance / compliance[normal, normal])
+            slip, stiffest = compliance[tangents] @ found + offset[tangents], compliance[tangents, tangents].max()
+            sticking, most = found[tangents] - slip / stiffest, friction * found[normal]
+            found[tangents] = sticking * min(1.0, most / max(np.linalg.norm(sticking), TINY))
+        if np.abs(found - before).max() <= CHANGE * np.abs(found).max():
+            break
+    return found

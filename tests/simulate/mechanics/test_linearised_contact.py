@@ -1,0 +1,104 @@
+"""Newton steps with linearised contact, beside the bundled solver, which resolves contact by barriers."""
+
+import numpy as np
+import pytest
+from meshes import box
+from solids import blocks, pressed, scene_of
+
+from ast_sim.scene import NodeType
+from ast_sim.simulate.mechanics.elasticity import Elasticity
+from ast_sim.simulate.mechanics.linearised_contact import NewtonSteps
+from ast_sim.simulate.mechanics.material import NeoHookean
+from ast_sim.simulate.mechanics.quasi_static import quasi_static, solve_frame
+from ast_sim.support.errors import SimulationError
+
+DHAT = 1e-3  # of `pressed`
+RUBBER = NeoHookean(1e6, 0.4)
+
+
+def rms(difference: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(difference))))
+
+
+@pytest.fixture(scope="module")
+def squeezed():
+    """Two blocks that are pressed together by 8 mm: the case, the solver's positions, and how far free nodes went."""
+    case = pressed(*blocks(), depth=0.01)
+    frame = len(case.targets) - 1
+    found = solve_frame(case, frame)
+    assert found.failure == ""
+    free = ~case.scene.prescribed
+    return case, found.position, free, rms((found.position - case.targets[0])[free])
+
+
+def nearly(truth: np.ndarray, free: np.ndarray, size: float) -> np.ndarray:
+    """Positions that are off by smooth waves of this size at the free nodes."""
+    waves = np.sin(40 * truth @ np.array([[1.0, 0.4, 0.2], [0.3, 1, 0.5], [0.6, 0.1, 1]]) + [0, 1, 2])
+    return truth + np.where(free[:, None], size / rms(waves[free]) * waves, 0)
+
+
+def test_steps_lead_to_the_solution_of_the_solver(squeezed):
+    """One step leaves a sixth of the error. What stays is contact: the solver's gap is not the same everywhere."""
+    case, truth, free, size = squeezed
+    start, left = nearly(truth, free, 0.1 * size), {}
+    for clearance in (0.0, 0.92):  # the solver's gaps are 0.90 to 0.95 of the range of contact
+        solver = NewtonSteps(case.scene, case.material, clearance * DHAT)
+        position = start
+        for _ in range(3):
+            position = solver.step(position)
+            left.setdefault(clearance, []).append(rms((position - truth)[free]) / size)
+        assert solver.near_pairs(position).gap.min() == pytest.approx(clearance * DHAT, abs=1e-5)
+    assert np.array_equal(position[~free], truth[~free])
+    assert left[0.92][0] < 0.017 and left[0.92][-1] < 0.016 and left[0.0][-1] > 0.05
+
+
+def test_the_stress_is_that_of_the_solver(squeezed):
+    case, truth, *_ = squeezed
+    stored = quasi_static(case).stress[-1]
+    stress = NewtonSteps(case.scene, case.material, 0.8 * DHAT).von_mises(truth, "element")
+    assert stress.shape == stored.shape and rms(stress - stored) < 2e-3 * stored.max()
+
+
+def test_without_contact_a_body_comes_to_rest():
+    """A bar is bent by a fifth of its length; the forces on its free nodes vanish to rounding."""
+    nodes, elements = box((10, 2, 2), (0.5, 0.1, 0.1))
+    ends = np.isclose(abs(nodes[:, 0]), 0.25)
+    scene = scene_of(nodes, elements, np.zeros(len(nodes)), np.where(ends, NodeType.HANDLE, NodeType.NORMAL))
+    position = scene.rest_position.astype(float)
+    position[np.isclose(position[:, 0], 0.25), 2] += 0.1
+    solver = NewtonSteps(scene, RUBBER, 0.0)
+    for _ in range(10):
+        position = solver.step(position)
+    elasticity = Elasticity(scene.rest_position.astype(float), elements, RUBBER)
+    forces, _ = elasticity.gradient(elasticity.evaluate(position))
+    assert abs(forces[~ends]).max() < 1e-9 * abs(forces).max()
+    assert np.array_equal(solver.step(position)[ends], position[ends])
+
+
+def test_a_step_turns_no_element_over(squeezed):
+    """From noise that leaves elements upright the whole step would turn some over."""
+    case, truth, free, size = squeezed
+    deforming = Elasticity(case.scene.rest_position.astype(float), case.scene.elements.astype(int), case.material)
+    noise = np.random.default_rng(0).normal(size=truth.shape) * free[:, None]
+    position, share = truth, 1.0
+    while deforming.evaluate(position := truth + share * size * noise).J.min() <= 0.02:
+        share *= 0.9
+    moved = NewtonSteps(case.scene, case.material, 0.8 * DHAT).step(position)
+    assert deforming.evaluate(moved).J.min() > 0
+    assert rms((moved - truth)[free]) < rms((position - truth)[free])
+
+
+def test_a_body_deep_inside_another_is_no_pair(squeezed):
+    case, truth, *_ = squeezed
+    solver = NewtonSteps(case.scene, case.material, 0.0)
+    touching = len(solver.near_pairs(truth).gap)
+    apart = truth + np.where(case.scene.body == 1, 1.0, 0)[:, None]
+    assert touching > 10 and len(solver.near_pairs(apart).gap) == 0
+
+
+def test_a_body_that_nothing_holds_is_refused():
+    nodes, elements = box((2, 2, 2), (0.1, 0.1, 0.1))
+    scene = scene_of(nodes, elements, np.zeros(len(nodes)), np.full(len(nodes), NodeType.NORMAL))
+    solver = NewtonSteps(scene, RUBBER, 0.0)
+    with pytest.raises(SimulationError, match="stiffness is singular"):
+        solver.step(scene.rest_position.astype(float))
