@@ -139,8 +139,10 @@ class Scene:
         volume = np.linalg.det(corners[:, 1:] - corners[:, :1])
         faces = self.elements[:, np.array(LOCAL_FACES)]  # [E, 4, 3]
         faces = np.where((volume < 0)[:, None, None], faces[:, :, ::-1], faces).reshape(-1, 3)
-        _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-        return faces[np.sort(first[count == 1])]
+        nodes = np.sort(faces, axis=1)
+        order = np.lexsort(nodes.T)  # a face of two elements stands beside its like
+        like_next = np.append((nodes[order[1:]] == nodes[order[:-1]]).all(axis=1), False)
+        return faces[np.sort(order[~(like_next | np.roll(like_next, 1))])]
 
 
 @dataclass(frozen=True, eq=False)

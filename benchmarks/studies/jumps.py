@@ -60,7 +60,7 @@ class Row:
 
 
 _PLATES = {"family": "deforming_plate", "frames": 41, "train": 200, "valid": 20, "test": 50}
-_PARTS = {"family": "abcd", "data": "parts400", "nodes": 400, "train": 1500, "valid": 60, "test": 60}
+_PARTS = {"family": "abcd", "data": "parts400", "nodes": 400, "train": 1200, "valid": 60, "test": 60}
 _SHORT = {"mirror": ("x", "y"), "peak_rate": 2e-3, "validate_scenes": 20}
 _MIRRORED = {**_SHORT, "validate_every": 1500, "checkpoint_every": 1500}
 _TURNED = {**_MIRRORED, "mirror": ("x", "y", "z"), "validate_scenes": 60, "validate_every": 2000}

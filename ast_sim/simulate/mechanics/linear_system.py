@@ -55,10 +55,11 @@ class Pardiso:
         for name, value in (("MKL_THREADING_LAYER", "SEQUENTIAL"), ("MKL_CBWR", "AVX2")):
             os.environ.setdefault(name, value)
         # Without this variable, the import of pypardiso searches the whole Python installation for the library.
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            for file in importlib.metadata.files("mkl") or ():
-                if "mkl_rt" in file.name:
-                    os.environ.setdefault("PYPARDISO_MKL_RT", str(file.locate()))
+        if "PYPARDISO_MKL_RT" not in os.environ:
+            with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+                for file in importlib.metadata.files("mkl") or ():
+                    if "mkl_rt" in file.name:
+                        os.environ["PYPARDISO_MKL_RT"] = str(file.locate())
         (pypardiso,) = require("simulate", "pypardiso")
         self._error = pypardiso.pardiso_wrapper.PyPardisoError
         self._solver = pypardiso.PyPardisoSolver(mtype=2)  # real, symmetric, positive definite
