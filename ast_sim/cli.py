@@ -222,6 +222,11 @@ def _add_train(train: _Parser) -> None:
     _add_each(train, {"--out RUN": "run folder"}, type=_path, required=True)
     _add_each(train, {"--model M": "name of the model; the list is below (default: ast)"})
     _add_each(train, {"--preset P": "settings to start from (default: tiny)"})
+    files = {
+        "--config FILE": "settings from a TOML file, such as config.toml of a run; --set and options win over it",
+        "--from RUN": "start with the weights and the settings of another run, to train it longer or on other data",
+    }
+    _add_each(train, files, type=_path)
     _add_each(train, {"--set k=v": "change a setting; may be repeated"}, action="append", default=[])
     train.add_argument("--resume", action="store_true", help="go on after the last checkpoint, if there is one")
     _add_each(train, {"--profile N": "only measure N steps and print how their time divides"}, type=_at_least(1))

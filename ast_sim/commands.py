@@ -119,13 +119,15 @@ def train(args: argparse.Namespace) -> None:
     keep_memory()
     if args.data is None and not args.resume:
         raise ConfigError("name the dataset to train on, or give --resume to go on with the run in --out")
-    if args.data is None and (args.model or args.preset or args.set):
-        raise ConfigError("a resumed run keeps its settings: leave --model, --preset and --set out")
+    files = {"config": args.config, "from_run": getattr(args, "from")}
+    if args.data is None and (args.model or args.preset or args.set or any(files.values())):
+        raise ConfigError("a resumed run keeps its settings: leave --model, --preset, --config, --from and --set out")
     # A resumed run keeps its settings; with a dataset, the given settings are compared with them.
     config = None
     if args.data is not None:
-        config = configure(args.data, args.preset or "tiny", args.set, args.model or "ast")
-    start_training(args.out, config, resume=args.resume, profile_steps=args.profile or 0)
+        config = configure(args.data, args.preset, args.set, args.model, **files)
+    steps = args.profile or 0
+    start_training(args.out, config, resume=args.resume, profile_steps=steps, from_run=files["from_run"])
     if args.profile is None:
         print(f"run: {args.out}")
 

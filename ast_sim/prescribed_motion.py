@@ -13,6 +13,9 @@ from ast_sim.support.errors import ConfigError
 
 Vector = Sequence[float]
 
+LARGEST = 1e15  # of the numbers of a rigid motion: squares and float32 hold what follows from it
+MOST_BYTES = 1 << 30  # of the positions of a motion
+
 _VECTOR = r"[^\s,]+,[^\s,]+,[^\s,]+"
 _MOVE = re.compile(
     rf"(?P<body>[0-9]+)=(?P<path>{_VECTOR}( then {_VECTOR})*)?"
@@ -37,7 +40,8 @@ class RigidMotion:
             undeformed scene. The translation moves the axis as well.
 
     Raises:
-        ConfigError: a vector does not have three numbers, a number is not finite, or the axis is zero.
+        ConfigError: a vector does not have three numbers, a number is not finite or above `LARGEST`, or the axis is
+            zero.
     """
 
     translation: Vector | Sequence[Vector] = (0.0, 0.0, 0.0)
@@ -50,12 +54,18 @@ class RigidMotion:
         for name, wanted, fits in (
             ("translation", "three numbers or a list of triples", path == (3,) or (len(path) == 2 and path[1] == 3)),
             ("rotation", "one number", np.ndim(self.rotation) == 0),
-            ("axis", "three numbers, not all zero", np.shape(self.axis) == (3,) and np.any(self.axis)),
+            (
+                "axis",
+                "three numbers, not all zero",
+                np.shape(self.axis) == (3,) and np.any(np.abs(self.axis) > 1 / LARGEST),
+            ),
             ("point", "three numbers", np.shape(self.point) == (3,)),
         ):
             value = getattr(self, name)
-            if not fits or not np.size(value) or not np.isfinite(np.asarray(value, np.float64)).all():
-                raise ConfigError(f"{name} of a motion must be {wanted}, all finite, not {value}")
+            if not fits or not np.size(value) or not (np.abs(np.asarray(value, np.float64)) <= LARGEST).all():
+                raise ConfigError(
+                    f"{name} of a motion must be {wanted}, all finite and at most {LARGEST:g}, not {value}"
+                )
 
     def at(self, s: float, points: np.ndarray) -> np.ndarray:
         """[n, 3] float64: the positions of the undeformed `points` [n, 3] at `s` in [0, 1]."""
@@ -117,10 +127,17 @@ class Motion:
             frames: S, at least 2.
 
         Raises:
-            ConfigError: `frames` is below 2, there is no such body, or the body has no prescribed node.
+            ConfigError: `frames` is below 2, or the positions would take more than `MOST_BYTES`; there is no such body,
+                or the body has no prescribed node.
         """
         if frames < 2:
             raise ConfigError(f"a motion needs at least 2 frames, not {frames}")
+        needed = frames * scene.rest_position.nbytes
+        if needed > MOST_BYTES:
+            raise ConfigError(
+                f"a motion of {frames:,} frames would take {needed / 1e9:,.3g} GB: give a shorter motion, or fewer"
+                " frames with num_frames"
+            )
         position = np.repeat(scene.rest_position[None], frames, axis=0)
         for nodes, motion in _moved(scene, motions):
             start = scene.rest_position[nodes].astype(np.float64)

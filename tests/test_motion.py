@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import toy
 from meshes import two_tetrahedra
 from scipy.spatial.transform import Rotation
 
@@ -140,7 +141,10 @@ def test_a_move_that_cannot_be_read(text):
         (lambda: RigidMotion((0, 0)), r"translation of a motion must be three numbers or a list of triples.*\(0, 0\)"),
         (lambda: RigidMotion([]), "translation of a motion must be three numbers or a list of triples"),
         (lambda: RigidMotion((0, 0, np.nan)), "translation of a motion must be .*all finite"),
-        (lambda: RigidMotion(rotation=np.inf), "rotation of a motion must be one number, all finite, not inf"),
+        (
+            lambda: RigidMotion(rotation=np.inf),
+            "rotation of a motion must be one number, all finite and at most 1e\+15, not inf",
+        ),
         (lambda: RigidMotion(rotation=9, axis=(0, 0, 0)), "axis of a motion must be three numbers, not all zero"),
         (lambda: RigidMotion(rotation=9, point=(0, 0)), "point of a motion must be three numbers"),
         (lambda: parse_move("1=0,0,nan"), "translation of a motion must be .*all finite"),
@@ -173,3 +177,15 @@ def test_a_body_without_prescribed_nodes_and_positions_that_are_not_finite_are_n
     position[2, 1, 0] = np.inf
     with pytest.raises(ConfigError, match=r"not finite in frame 2 at node 4: \[inf, 0.0, 0.0\]"):
         Motion.of_positions(SCENE, position)
+
+
+def test_motions_that_are_too_far_or_too_long_are_refused():
+    scene = toy.plate().scene
+    for wrong in ({"translation": (1e300, 0, 0)}, {"rotation": 1e300}, {"rotation": 30, "axis": (1e-300, 0, 0)}):
+        with pytest.raises(ConfigError, match=f"^{list(wrong)[-1]} of a motion must be"):
+            RigidMotion(**wrong)
+    frames = frames_for(scene, {1: (1e15, 0, 0)}, 1e-6)
+    assert frames == pytest.approx(1e21, rel=1e-5)
+    for count in (frames, 2**63 - 1, 2_000_000):
+        with pytest.raises(ConfigError, match=f"a motion of {count:,} frames would take .* GB: give a shorter"):
+            Motion.of_bodies(scene, {1: (0, 0, -0.01)}, count)

@@ -18,7 +18,7 @@ from ast_sim.inference.answer import Answer
 from ast_sim.inference.effort import Effort
 from ast_sim.inference.evaluation import evaluate, table
 from ast_sim.inference.predict import Motions, predict, predict_motions
-from ast_sim.runs.folder import load_model
+from ast_sim.runs.folder import load_model, require_fit
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.train_config import read_scope
 from ast_sim.scene import Scene, Trajectory
@@ -143,20 +143,12 @@ class Run:
 
         Raises:
             DatasetError: the dataset cannot be read.
-            ConfigError: its integration, stress location or material columns differ from those of the training data.
+            ConfigError: its integration, stress location, material columns, elements or unit of length differ from
+                those of the training data.
         """
-        dataset, model = Dataset(data or self.settings.data), self.settings.model
+        dataset = Dataset(data or self.settings.data)
         try:
-            for key, ours, theirs in (
-                ("integration", model.integration, dataset.info.integration),
-                ("stress_location", model.stress, dataset.info.stress_location),
-                ("material columns", model.material_width, dataset.material_width),
-                ("lengths in", self.scope.length_unit, dataset.info.length_unit),
-            ):
-                if ours != theirs:
-                    raise ConfigError(
-                        f"{dataset.path} has {key} {theirs}, but {self.path} was trained with {key} {ours}"
-                    )
+            require_fit(self.path, self.settings.model, self.scope, dataset)
         except BaseException:
             dataset.close()
             raise

@@ -102,6 +102,20 @@ def load(path: str | os.PathLike[str], run: str | None = None) -> Content:
         return model, training, state
 
 
+def at_step(run_dir: str | os.PathLike[str], step: int) -> Path:
+    """The folder of the checkpoint of a step; there may be none."""
+    return Path(run_dir) / _FOLDER / f"step-{step}"
+
+
+def weights_hash(path: str | os.PathLike[str]) -> str:
+    """The SHA-256 of the arrays of the model in a checkpoint, as its manifest says.
+
+    Raises:
+        CheckpointError: there is no such checkpoint, or its manifest is damaged.
+    """
+    return _read_manifest(Path(path))[FILES[0]]["sha256"]
+
+
 def latest(run_dir: str | os.PathLike[str]) -> Path | None:
     """The newest valid checkpoint of a run; None if the run has no checkpoint. Each newer, damaged one gives a warning.
 

@@ -8,11 +8,12 @@ from typing import Any
 
 from ast_sim.runs import checkpoint
 from ast_sim.runs.metrics import Metrics
+from ast_sim.runs.origin import read_origin
 from ast_sim.runs.train_config import read_config
 
 
 def describe_run(path: Path) -> dict[str, Any]:
-    """The settings, the checkpoints and the best validation of a run."""
+    """The settings, the checkpoint that it starts from, its checkpoints and the best validation of a run."""
     settings = read_config(path)
     latest, best = checkpoint.latest(path), checkpoint.best(path)
     mark = checkpoint.read_best(path)
@@ -21,6 +22,7 @@ def describe_run(path: Path) -> dict[str, Any]:
         "kind": "run",
         "path": str(path),
         **dataclasses.asdict(settings),
+        "start": read_origin(path).get("start"),
         "latest_checkpoint": latest.name if latest else None,
         "best_checkpoint": best.name if best else None,
         "best_validation": validation[-1] if validation else None,

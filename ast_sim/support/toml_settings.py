@@ -95,12 +95,21 @@ def require_range(key: str, value: float | None, least: float, most: float = LAR
 
 
 def override(obj: T, assignments: Iterable[str]) -> T:
-    """A copy with some settings replaced. Each assignment has the form `a.b=c`; the last assignment to a key counts.
+    """A copy with some settings replaced; see `assigned`.
+
+    Raises:
+        ConfigError: as in `assigned` and `change`.
+    """
+    return change(obj, assigned(obj, assignments))
+
+
+def assigned(obj: Any, assignments: Iterable[str]) -> dict[str, Any]:
+    """New values of settings by dotted key. Each assignment has the form `a.b=c`; the last one to a key counts.
 
     Values are TOML; the quotes of a string and the brackets of a list may be left out (`model.inputs=stress,material`).
 
     Raises:
-        ConfigError: an assignment has no `=`; or as in `change`.
+        ConfigError: an assignment has no `=`.
     """
     values = {}
     kinds = {key: kind for key, _, kind in _leaves(type(obj), obj)}
@@ -109,7 +118,16 @@ def override(obj: T, assignments: Iterable[str]) -> T:
         if not equals:
             raise ConfigError(f"{assignment!r} is no setting: write key=value")
         values[key] = _parse(text, kinds[key]) if key in kinds else text
-    return change(obj, values)
+    return values
+
+
+def leaves(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """(dotted key, value) of every value of a TOML table that is no table."""
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            yield from leaves(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
 
 
 def change(obj: T, values: Mapping[str, Any]) -> T:

@@ -31,7 +31,8 @@ class DataScales:
         nodes: median number of nodes of a scene.
         trajectories, pairs: number of trajectories, and number of frames that can be a target.
         planar: whether z is 0 in all scenes.
-        recorded: numbers that the solver recorded with all scenes alike, by the setting of the model; see RECORDED.
+        recorded: numbers that the solver recorded with all scenes alike, by the setting of the model; see RECORDED. 0:
+            it recorded none, or several.
     """
 
     displacement: float
@@ -79,10 +80,10 @@ def measure(dataset: Dataset) -> DataScales:
 
 
 def _alike(constants: list[dict[str, AttributeValue | None]]) -> dict[str, float]:
-    """The numbers that are the same in all scenes."""
+    """The numbers that are the same in all scenes; 0 for the others."""
     first = constants[0]
-    alike = (key for key in first if all(constant[key] == first[key] for constant in constants))
-    return {key: float(first[key]) for key in alike if isinstance(first[key], float | int)}
+    alike = {key: value for key, value in first.items() if all(constant[key] == value for constant in constants)}
+    return {key: float(value) if isinstance(value := alike.get(key), float | int) else 0.0 for key in first}
 
 
 def scope_of(dataset: Dataset) -> Scope:

@@ -29,22 +29,22 @@ CALLS = 6  # (docs/log.md, 2026-11-24)
 ROLLOUT_BATCHES = 16  # an unset pool of rollouts holds the scenes of so many batches
 
 
-def resolve(config: RunConfig, dataset: Dataset, scales: DataScales) -> RunConfig:
-    """Fill in all unset settings: first those of the model, then those of the training.
+def resolve(config: RunConfig, dataset: Dataset, scales: DataScales, keep_model: bool = False) -> RunConfig:
+    """Fill in all unset settings: first those of the model, then those of the training. With `keep_model`, the model
+    has none, and stays as it is.
 
     Raises:
         ConfigError: a setting is out of its range, or the data does not fit it; the text names the setting.
     """
-    model = config.model.resolve(
-        DataFacts(
-            dataset.info,
-            dataset.material_width,
-            scales.spacing,
-            scales.planar,
-            tetrahedra=dataset.element_size == 4,
-            recorded=scales.recorded,
-        )
+    facts = DataFacts(
+        dataset.info,
+        dataset.material_width,
+        scales.spacing,
+        scales.planar,
+        tetrahedra=dataset.element_size == 4,
+        recorded=scales.recorded,
     )
+    model = dataclasses.replace(config.model, **facts.recorded) if keep_model else config.model.resolve(facts)
     return RunConfig(model, resolve_training(config.train, scales, model), str(Path(config.data).resolve()))
 
 

@@ -95,11 +95,12 @@ class Training:
         )
 
     def prepare(self) -> None:
-        """Restore the newest checkpoint; if there is none, measure the statistics of the data."""
+        """Restore the newest checkpoint. If there is none, take the weights of the run that this one starts from, or
+        measure the statistics of the data."""
         found = self.saver.restore()
         if found is not None:
             self.step, self.log.sums = found
-        elif self.processes.leads:
+        elif self.processes.leads and not self.saver.start():
             batches = range(math.ceil(self.options.statistics_pairs / self.options.batch_size))
             whole = self.sampler if self.processes.count == 1 else self._sampler((0, 1))
             self.model.fit_statistics(whole.batch(index) for index in batches)

@@ -10,6 +10,7 @@ from ast_sim.batches.training_jumps import JumpPool
 from ast_sim.batches.training_rollouts import RolloutPool
 from ast_sim.dataset.reader import Dataset
 from ast_sim.runs import checkpoint
+from ast_sim.runs.folder import first_weights
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.origin import read_origin
 from ast_sim.support.errors import TrainingError
@@ -59,6 +60,16 @@ class Saver:
             if self.pool is not None:
                 self.pool.restore(self.processes.of_leader(rolling))
         return found
+
+    def start(self) -> bool:
+        """Load the weights of the run that this one starts from; returns whether there is such a run."""
+        weights = first_weights(self.run)
+        if weights is None:
+            return False
+        self.model.load_state_dict(weights)
+        start = read_origin(self.run)["start"]
+        print(f"starts from {start['run']}, step {start['step']:,}", flush=True)
+        return True
 
     def _restore_alone(self) -> tuple[tuple[int, dict[str, float]] | None, dict[str, Tensor]]:
         path = checkpoint.latest(self.run)

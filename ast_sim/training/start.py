@@ -15,32 +15,95 @@ from ast_sim.inference.trained_run import Run
 from ast_sim.models.registry import build_model, find_preset
 from ast_sim.models.simulator import Simulator
 from ast_sim.runs import checkpoint
-from ast_sim.runs.train_config import RunConfig, TrainConfig, has_config, read_config, write_config
+from ast_sim.runs.folder import require_fit, start_at
+from ast_sim.runs.origin import read_origin
+from ast_sim.runs.train_config import (
+    RunConfig,
+    TrainConfig,
+    has_config,
+    read_changes,
+    read_config,
+    read_scope,
+    write_config,
+)
 from ast_sim.support.errors import CheckpointError, ConfigError, TrainingError
 from ast_sim.support.stop_signals import StopSignals
-from ast_sim.support.toml_settings import change, override
-from ast_sim.training.data_lengths import measure, scope_of
+from ast_sim.support.toml_settings import NONE, NOTHING, assigned, change
+from ast_sim.training.data_lengths import DataScales, measure, scope_of
 from ast_sim.training.defaults_from_data import resolve
 from ast_sim.training.loop import Training
 from ast_sim.training.processes import Processes
 
+_FOLLOW_FROM_STEPS = ("train.warmup", "train.decay", "train.validate_every", "train.checkpoint_every")
 
-def configure(data: Path, preset: str, assignments: Sequence[str] = (), model: str = "ast") -> RunConfig:
-    """The settings of a preset, changed by assignments `key=value`. Unset settings are filled in when training starts.
 
-    Raises:
-        ConfigError: there is no such model, preset or key (the text names the nearest one), or a value does not fit.
+def configure(
+    data: str | os.PathLike[str],
+    preset: str | None = None,
+    assignments: Sequence[str] = (),
+    model: str | None = None,
+    *,
+    config: str | os.PathLike[str] | None = None,
+    from_run: str | os.PathLike[str] | None = None,
+    changes: Mapping[str, Any] = NOTHING,
+) -> RunConfig:
+    """The settings of a preset or of a run, changed by a file, then by assignments `key=value` and by `changes`, values
+    by dotted key. Unset settings are filled in when training starts.
+
+    Arguments and errors are those of `train`.
     """
-    chosen = find_preset(model, preset)
-    return override(RunConfig(chosen.model, TrainConfig(**chosen.train), str(data)), assignments)
+    file = None if config is None else Path(config)
+    given = {} if file is None else read_changes(file)
+    if from_run is None:
+        with _naming(file):
+            named = given.pop("model.name", "ast")
+            chosen = find_preset(model or str(named), preset or "tiny")
+        found = RunConfig(chosen.model, TrainConfig(**chosen.train), str(data))
+    elif model or preset:
+        raise ConfigError("a run that starts from another one has its model and settings: leave model and preset out")
+    else:
+        found = dataclasses.replace(read_config(Path(from_run)), data=str(data))
+    before = found
+    with _naming(file):
+        found = _changed(found, given, reschedule=from_run is not None)
+    if assignments or changes:
+        later = {**assigned(found, assignments), **changes}
+        found = _changed(found, later, reschedule=from_run is not None or "train.steps" in given)
+    if from_run is not None:
+        key, old, new = next(_differences(before, found, ("model",)), ("", 0, 0))
+        if key:
+            raise ConfigError(
+                f"{key} is {new!r}, but {from_run} has {old!r}: a run that starts from it keeps its model"
+            )
+    return found
+
+
+def _changed(config: RunConfig, values: Mapping[str, Any], reschedule: bool) -> RunConfig:
+    """Settings with new values. With `reschedule`, another number of steps leaves open what follows from it."""
+    if reschedule and values.get("train.steps", config.train.steps) != config.train.steps:
+        values = {**dict.fromkeys(_FOLLOW_FROM_STEPS, NONE), **values}
+    return change(config, values)
+
+
+@contextmanager
+def _naming(file: Path | None) -> Iterator[None]:
+    """Within the block, a ConfigError names the file, if there is one."""
+    try:
+        yield
+    except ConfigError as error:
+        if file is None:
+            raise
+        raise ConfigError(f"{file}: {error}") from error
 
 
 def train(
     data: str | os.PathLike[str],
     out: str | os.PathLike[str],
     *,
-    model: str = "ast",
-    preset: str = "tiny",
+    model: str | None = None,
+    preset: str | None = None,
+    config: str | os.PathLike[str] | None = None,
+    from_run: str | os.PathLike[str] | None = None,
     model_settings: Mapping[str, Any] | None = None,
     resume: bool = False,
     **settings: Any,
@@ -50,19 +113,25 @@ def train(
     Args:
         data: the dataset file.
         out: the run folder. After a kill the same call with `resume=True` continues, and gives the same weights.
-        model: a registered model, such as "ast", "mgn", "bsms", "hcmt" or "transolver".
-        preset: the settings to start from.
+        model: a registered model: "ast" (the default), "mgn", "bsms", "hcmt" or "transolver".
+        preset: the settings to start from; by default "tiny".
+        config: a TOML file with settings, such as `config.toml` of a run. It may leave settings out. It does not
+            name the dataset. Other arguments win over it.
+        from_run: a run. The new run starts with the weights and scales of its best checkpoint, and with its settings;
+            those of the model stay. If `steps` differs, warm-up, decay, validations and checkpoints are chosen anew.
         model_settings: changes of the model's settings, such as {"hidden": 32}.
         resume: continue after the newest checkpoint, if there is one.
         settings: changes of the training's settings (fields of `TrainConfig`), such as steps=4000, mirror=("x", "y").
 
     Raises:
         ConfigError: there is no such model, preset or setting (the text names the nearest one), or a value does not
-            fit.
+            fit; a text about `config` names the file. Or the data does not fit the model of `from_run`.
         DatasetError: the dataset cannot be read.
         TrainingError, CheckpointError: as in `start_training`.
     """
-    start_training(Path(out), _chosen(data, model, preset, model_settings, settings), resume=resume)
+    changes = _changes(model_settings, settings)
+    chosen = configure(data, preset, (), model, config=config, from_run=from_run, changes=changes)
+    start_training(Path(out), chosen, resume=resume, from_run=from_run)
     return Run(out)
 
 
@@ -74,33 +143,34 @@ def new_model(
     Raises:
         ConfigError: there is no such model, preset or setting, or the data does not fit.
     """
-    config = _chosen(data.path, model, preset, model_settings, {})
+    config = configure(data.path, preset, (), model, changes=_changes(model_settings, {}))
     return build_model(resolve(config, data, measure(data)).model)
 
 
-def _chosen(
-    data: str | os.PathLike[str],
-    model: str,
-    preset: str,
-    model_settings: Mapping[str, Any] | None,
-    settings: Mapping[str, Any],
-) -> RunConfig:
+def _changes(model_settings: Mapping[str, Any] | None, settings: Mapping[str, Any]) -> dict[str, Any]:
     changes = {f"model.{key}": value for key, value in (model_settings or {}).items()}
-    changes |= {f"train.{key}": value for key, value in settings.items()}
-    return change(configure(Path(data), preset, model=model), changes)
+    return changes | {f"train.{key}": value for key, value in settings.items()}
 
 
-def start_training(run: Path, config: RunConfig | None = None, resume: bool = False, profile_steps: int = 0) -> None:
+def start_training(
+    run: Path,
+    config: RunConfig | None = None,
+    resume: bool = False,
+    profile_steps: int = 0,
+    from_run: str | os.PathLike[str] | None = None,
+) -> None:
     """Train a model in the run folder `run`, or resume the training of the run in it.
 
     Args:
         config: the settings; with `resume` they must equal those of the run, and None takes those of the run.
         resume: continue after the newest checkpoint, if there is one.
         profile_steps: if above 0, print how the time of so many steps divides, instead of training.
+        from_run: the run whose best checkpoint gives the first weights; `config` has its model.
 
     Raises:
         TrainingError: a loss or a gradient is not finite, the disk is full, or the folder already holds a run.
-        ConfigError: settings are out of range, or differ from those of the run that is resumed.
+        ConfigError: settings are out of range, or differ from those of the run that is resumed, or the data does not
+            fit the model of `from_run`.
         CheckpointError: another process trains in this folder, or no checkpoint in it can be read.
         SystemExit: SIGINT (code 130), SIGTERM (143) or SIGHUP (129) was received, or nobody reads the output (141);
             a checkpoint of the finished step was written.
@@ -115,16 +185,20 @@ def start_training(run: Path, config: RunConfig | None = None, resume: bool = Fa
             asked = config or saved
             if asked is None:
                 raise TrainingError(f"{run} holds no run to resume: name the dataset to start one")
+            source = None if from_run is None else Path(from_run)
             with Dataset(asked.data) as dataset:
                 scales = measure(dataset)
-                resolved = asked if config is None else resolve(asked, dataset, scales)
+                resolved = asked if config is None else resolve(asked, dataset, scales, keep_model=source is not None)
                 batch_size = resolved.train.batch_size
                 if batch_size % processes.count:
                     raise ConfigError(f"train.batch_size = {batch_size} cannot be cut for {processes.count} processes")
+                if source is not None:
+                    _require_fit(source, resolved, dataset, scales)
                 if saved is not None:
-                    _require_same(run, saved, resolved)
+                    _require_same(run, saved, resolved, source)
                 elif processes.leads:
-                    write_config(run, resolved, scope_of(dataset), dataset.fingerprint())
+                    start = None if source is None else start_at(source)
+                    write_config(run, resolved, scope_of(dataset), dataset.fingerprint(), start)
                 with Training(run, resolved, dataset, scales, signals, processes) as training:
                     if profile_steps:
                         training.profile(profile_steps)
@@ -165,13 +239,32 @@ def _told_by_leader(processes: Processes) -> Iterator[None]:
         yield
 
 
-def _require_same(run: Path, saved: RunConfig, asked: RunConfig) -> None:
-    """Raise ConfigError if a setting differs, naming the first one; only the path of the dataset may differ."""
-    for part in ("model", "train"):
-        old, new = getattr(saved, part), getattr(asked, part)
-        for key in (field.name for field in dataclasses.fields(old)):
-            if getattr(old, key) != getattr(new, key):
-                raise ConfigError(
-                    f"{run} was started with {part}.{key} = {getattr(old, key)!r}, not {getattr(new, key)!r}:"
-                    " resume without settings, or train in another folder"
-                )
+def _require_fit(source: Path, config: RunConfig, dataset: Dataset, scales: DataScales) -> None:
+    """Raise ConfigError if the model of the run `source` cannot learn from the dataset."""
+    require_fit(source, config.model, read_scope(source), dataset)
+    if config.model.planar and not scales.planar:
+        raise ConfigError(f"{dataset.path} leaves the plane z = 0, in which {source} keeps all nodes")
+
+
+def _require_same(run: Path, saved: RunConfig, asked: RunConfig, source: Path | None) -> None:
+    """Raise ConfigError if a setting or the run to start from differs, naming the first one; only the path of the
+    dataset may differ."""
+    for key, old, new in _differences(saved, asked, ("model", "train")):
+        raise ConfigError(
+            f"{run} was started with {key} = {old!r}, not {new!r}: resume without settings, or train in another folder"
+        )
+    start = read_origin(run).get("start")
+    if source is not None and (start is None or Path(start["run"]) != source.resolve()):
+        begun = "without another run" if start is None else f"from {start['run']}"
+        raise ConfigError(
+            f"{run} was started {begun}, not from {source}: resume without it, or train in another folder"
+        )
+
+
+def _differences(old: RunConfig, new: RunConfig, parts: Sequence[str]) -> Iterator[tuple[str, Any, Any]]:
+    """The settings that differ: dotted key, old value, new value."""
+    for part in parts:
+        before, after = getattr(old, part), getattr(new, part)
+        for key in (field.name for field in dataclasses.fields(before)):
+            if getattr(before, key) != getattr(after, key):
+                yield f"{part}.{key}", getattr(before, key), getattr(after, key)

@@ -94,6 +94,30 @@ def test_kill_at_random_moments_and_resume_ends_in_the_same_bits(undisturbed, tm
     assert outcome(run) == expected
 
 
+def test_a_run_that_starts_from_another_one_is_killed_and_resumes_to_the_same_bits(undisturbed, tmp_path):
+    data, _ = undisturbed
+    finish(start(data, "--out", tmp_path / "source", settings=[*SMALL, "train.steps=30"]))
+    words, settings = (
+        (data, "--from", tmp_path / "source", "--out"),
+        [f"train.steps={STEPS}", "train.checkpoint_every=3"],
+    )
+    finish(start(*words, tmp_path / "whole", settings=settings))
+    run = tmp_path / "run"
+    process = start(*words, run, settings=settings)
+    while not (run / "config.toml").exists():  # killed before its first checkpoint
+        time.sleep(0.005)
+    process.kill()
+    finish(process, -signal.SIGKILL)
+    assert newest(run) == -1
+    process = start(*words, run, "--resume", settings=settings)
+    wait_for_progress(process, run, -1)
+    process.kill()
+    finish(process, -signal.SIGKILL)
+    assert 0 < newest(run) < STEPS
+    finish(start("--out", run, "--resume"))
+    assert outcome(run) == outcome(tmp_path / "whole")
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_signals_finish_the_step_write_a_checkpoint_and_exit(undisturbed, tmp_path, number, code):
     data, expected = undisturbed

@@ -89,6 +89,7 @@ def build_cells(config: ASTConfig, position: Tensor, offsets: Tensor, may_grow: 
         finest = octree(position, offsets, config.domain_center, half_width, depth)
     except ValueError as problem:
         advice = "; give the dataset a domain_half_width that holds all frames with train.noise and train.shift"
+        advice += " (a run that starts from another one keeps the domain of that one)"
         raise error(f"{problem}{'' if may_grow else advice}") from problem
     return Cells(finest, finest.coarsen_all(config.l_ocnn), growth)
 
