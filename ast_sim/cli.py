@@ -64,7 +64,7 @@ class _GenerateParser(_Parser):
 
         lines = [super().format_help(), "families:"]
         for name, family in FAMILIES.items():
-            options = "".join(f" --{option}" for option in family.options)
+            options = "".join(" SPEC" if option == "spec" else f" --{option}" for option in family.options)
             lines.append(f"  {name:17}{family.about}{f' ({options.strip()})' if options else ''}")
         return "\n".join(lines) + "\n"
 
@@ -152,6 +152,8 @@ def _add_demo(demo: _Parser) -> None:
 
 def _add_generate(generate: _Parser) -> None:
     generate.add_argument("family", metavar="FAMILY", help="kind of scenes; the list is below")
+    about = "specification of an assembly (.toml), for the family assembly"
+    generate.add_argument("spec", type=_path, nargs="?", metavar="SPEC", help=about)
     _add_each(generate, {"--out FILE": "dataset to write (.h5)"}, type=_path, required=True)
     _add_each(generate, {"--count N": "number of training scenes"}, type=_at_least(1), required=True)
     splits = {

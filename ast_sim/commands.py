@@ -32,8 +32,8 @@ def generate(args: argparse.Namespace) -> None:
     """`ast-sim generate`."""
     from ast_sim.simulate.jobs.generate import generate as simulate
 
-    chosen = ("valid", "test", "seed", "nodes", "frames", "keep", "workers", "solver", "parts", "patient", "scheduler")
-    options = {name: getattr(args, name) for name in chosen}
+    chosen = ("valid", "test", "seed", "nodes", "frames", "keep", "workers", "solver", "parts", "spec", "patient")
+    options = {name: getattr(args, name) for name in (*chosen, "scheduler")}
     made = simulate(args.family, args.out, train=args.count, **options)
     print(f"{made.path}: {_counts(made.counts)}")
     if made.truncated:
