@@ -154,8 +154,10 @@ def _add_generate(generate: _Parser) -> None:
     generate.add_argument("family", metavar="FAMILY", help="kind of scenes; the list is below")
     about = "specification of an assembly (.toml), for the family assembly"
     generate.add_argument("spec", type=_path, nargs="?", metavar="SPEC", help=about)
-    _add_each(generate, {"--out FILE": "dataset to write (.h5)"}, type=_path, required=True)
-    _add_each(generate, {"--count N": "number of training scenes"}, type=_at_least(1), required=True)
+    _add_each(generate, {"--out FILE": "dataset to write (.h5)"}, type=_path)
+    _add_each(generate, {"--count N": "number of training scenes"}, type=_at_least(1))
+    about = "draw the first scenes of an assembly as a picture and say what --count will cost; make no dataset"
+    generate.add_argument("--look", action="store_true", help=about)
     splits = {
         "--valid N": "number of validation scenes (default: a tenth of --count)",
         "--test N": "number of test scenes (default: a tenth of --count)",

@@ -32,12 +32,41 @@ def generate(args: argparse.Namespace) -> None:
     """`ast-sim generate`."""
     from ast_sim.simulate.jobs.generate import generate as simulate
 
+    if args.look:
+        _look(args)
+        return
+    for option, value in (("--out FILE", args.out), ("--count N", args.count)):
+        if value is None:
+            raise ConfigError(f"give {option}" + (", or --look" if args.spec is not None else ""))
     chosen = ("valid", "test", "seed", "nodes", "frames", "keep", "workers", "solver", "parts", "spec", "patient")
     options = {name: getattr(args, name) for name in (*chosen, "scheduler")}
     made = simulate(args.family, args.out, train=args.count, **options)
     print(f"{made.path}: {_counts(made.counts)}")
     if made.truncated:
         print(f"stopped before their last frame: {', '.join(made.truncated)}")
+
+
+def _look(args: argparse.Namespace) -> None:
+    """`ast-sim generate assembly SPEC --look`."""
+    from ast_sim.simulate.jobs.generate import checked_counts, checked_workers
+    from ast_sim.simulate.jobs.look import look
+    from ast_sim.support.progress import duration
+    from ast_sim.view import scene_picture
+
+    if args.family != "assembly" or args.spec is None:
+        raise ConfigError("--look is for a specification: ast-sim generate assembly SPEC.toml --look")
+    found = look(args.spec, seed=args.seed, nodes=args.nodes, frames=args.frames)
+    picture = (args.out or args.spec).with_suffix(".look.png")
+    shown = [(case.scene, case.targets[-1]) for case in found.cases]
+    scene_picture.write(picture, shown, found.titles, found.unit)
+    print("\n".join(map(printable, found.lines)))
+    each = found.mesh_seconds + found.solve_seconds
+    print(f"one scene: {each:.3g} s ({found.mesh_seconds:.2g} s to mesh), {printable(found.status)}")
+    scenes = sum(checked_counts(args.count or 100, args.valid, args.test).values())
+    workers = checked_workers(args.workers, None)
+    cost = duration(each * scenes / workers)
+    print(f"--count {args.count or 100}: {scenes} scenes, about {cost} with {workers} processes")
+    print(f"picture: {picture}")
 
 
 def _counts(counts: dict[str, int]) -> str:

@@ -101,7 +101,7 @@ def generate(
     """
     module = family_module(family)
     self_test()
-    counts, workers = _checked_counts(train, valid, test), _checked_workers(workers, scheduler)
+    counts, workers = checked_counts(train, valid, test), checked_workers(workers, scheduler)
     recipe = checked_recipe(module, family, seed, nodes, frames, solver, parts, patient, keep, spec)
     out, settings = Path(out), recorded(recipe)
     output_file(out)
@@ -169,7 +169,8 @@ def _make(
         )
 
 
-def _checked_workers(workers: int | None, scheduler: str | None) -> int:
+def checked_workers(workers: int | None, scheduler: str | None) -> int:
+    """The number of processes; one per available core if None."""
     if workers is not None and scheduler is not None:
         raise SimulationError("workers run on this machine, but a scheduler has its own workers: give one of them")
     if workers is not None and workers < 1:
@@ -181,7 +182,8 @@ def _checked_workers(workers: int | None, scheduler: str | None) -> int:
     return os.cpu_count() or 1
 
 
-def _checked_counts(train: int, valid: int | None, test: int | None) -> dict[str, int]:
+def checked_counts(train: int, valid: int | None, test: int | None) -> dict[str, int]:
+    """The number of scenes of each split; a tenth of `train` where None."""
     tenth = -(-train // 10)
     counts = {
         "train": train,

@@ -162,4 +162,4 @@ def completed(parameters: Mapping[str, Parameter], given: Mapping[str, Any]) -> 
 def told(parameters: Mapping[str, Parameter], values: Values) -> str:
     """The drawn values as a text for messages."""
     shown = [name for name, one in parameters.items() if one.is_drawn]
-    return ", ".join(f"{n}={v:.6g}" if isinstance(v := values[n], float) else f"{n}={v}" for n in shown) or "its values"
+    return ", ".join(f"{n}={v:.4g}" if isinstance(v := values[n], float) else f"{n}={v}" for n in shown) or "its values"

@@ -74,12 +74,12 @@ def _check_apart(
     spec: AssemblySpec, case: SolidCase, rest: np.ndarray, pair: tuple[int, int], shared: Reference
 ) -> None:
     """Raise BadAssembly if two parts overlap, or if contact would act between them at rest."""
-    scene, (first, second) = case.scene, pair
+    first, second = pair
     if spec.parts[first].rigid and spec.parts[second].rigid:
         return
     faces = [surface_of(case, number) for number in pair]
     names = f"{spec.parts[first].name} and {spec.parts[second].name}"
-    contact = Contact(rest, np.concatenate(faces), scene.body, ContactSettings(shared.contact_distance, 1.0))
+    contact = _contact_of(case, pair)
     depth, where = deepest(rest, *faces)
     crossing = contact.intersects(rest)
     if crossing or depth > 0:
@@ -106,6 +106,17 @@ def _check_self_contact(spec: AssemblySpec, case: SolidCase, rest: np.ndarray) -
                 f"{spec.parts[number].name}: a wall, slit or element is thinner than the contact distance"
                 f" {case.contact.dhat:g} {spec.unit}: give a smaller contact_distance, or no self_contact"
             )
+
+
+def gap_between(case: SolidCase, pair: tuple[int, int]) -> float:
+    """The smallest distance between two bodies at rest."""
+    return _contact_of(case, pair).gap(case.scene.rest_position.astype(np.float64))
+
+
+def _contact_of(case: SolidCase, pair: tuple[int, int]) -> Contact:
+    faces = np.concatenate([surface_of(case, number) for number in pair])
+    rest = case.scene.rest_position.astype(np.float64)
+    return Contact(rest, faces, case.scene.body, ContactSettings(case.contact.dhat, 1.0))
 
 
 def surface_of(case: SolidCase, body: int) -> np.ndarray:
