@@ -26,6 +26,8 @@ from ast_sim.simulate.own_assembly.spec_table import Table, Vector
 from ast_sim.support.errors import ConfigError
 
 DEFAULT_FRAMES = 6
+# Names of arguments of `Run.predict` and `Run.sweep`, which a parameter cannot have.
+RESERVED = ("scene", "motion", "spec", "table", "nodes", "frames", "corrections", "num_frames", "stress", "name")
 
 
 def read_spec(path: str | os.PathLike[str]) -> AssemblySpec:
@@ -58,8 +60,8 @@ def _spec(path: Path, text: str, table: Table) -> AssemblySpec:
     named = Table(table.take("parameters", {}), "parameters")
     parameters: dict[str, Parameter] = {}
     for name in named.values:
-        if not name.isidentifier() or name in FUNCTIONS:
-            raise ConfigError(f"the parameter {name!r} needs a name of letters, digits and _, and no function's")
+        if not name.isidentifier() or name in (*FUNCTIONS, *RESERVED):
+            raise ConfigError(f"the parameter {name!r} needs another name, of letters, digits and _")
         parameters[name] = parameter(name, named.take(name))
     if "friction" in parameters and "friction" in table.values:
         raise ConfigError("friction stands beside the parameters and among them: leave one out")
