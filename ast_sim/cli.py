@@ -64,7 +64,7 @@ class _GenerateParser(_Parser):
 
         lines = [super().format_help(), "families:"]
         for name, family in FAMILIES.items():
-            options = "".join(f" --{option}" for option in family.options)
+            options = "".join(" SPEC" if option == "spec" else f" --{option}" for option in family.options)
             lines.append(f"  {name:17}{family.about}{f' ({options.strip()})' if options else ''}")
         return "\n".join(lines) + "\n"
 
@@ -127,7 +127,8 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add(_add_info, commands.info, "check a dataset or a run and show what it holds")
     add(_add_train, commands.train, "train a model on a dataset", _TrainParser)
-    add(_add_predict, commands.predict, "predict a new scene from a mesh, or a scene of a dataset")
+    add(_add_predict, commands.predict, "predict a new scene from a mesh or a specification, or a scene of a dataset")
+    add(_add_sweep, commands.sweep, "predict an assembly for many values of its parameters: a table and a picture")
     add(_add_evaluate, commands.evaluate, "measure the errors and the speed of a run on a dataset")
     add(_add_report, commands.report, "write a page that shows runs (moving scenes, errors), or a dataset")
     return parser
@@ -152,8 +153,12 @@ def _add_demo(demo: _Parser) -> None:
 
 def _add_generate(generate: _Parser) -> None:
     generate.add_argument("family", metavar="FAMILY", help="kind of scenes; the list is below")
-    _add_each(generate, {"--out FILE": "dataset to write (.h5)"}, type=_path, required=True)
-    _add_each(generate, {"--count N": "number of training scenes"}, type=_at_least(1), required=True)
+    about = "specification of an assembly (.toml), for the family assembly"
+    generate.add_argument("spec", type=_path, nargs="?", metavar="SPEC", help=about)
+    _add_each(generate, {"--out FILE": "dataset to write (.h5)"}, type=_path)
+    _add_each(generate, {"--count N": "number of training scenes"}, type=_at_least(1))
+    about = "draw the first scenes of an assembly as a picture and say what --count will cost; make no dataset"
+    generate.add_argument("--look", action="store_true", help=about)
     splits = {
         "--valid N": "number of validation scenes (default: a tenth of --count)",
         "--test N": "number of test scenes (default: a tenth of --count)",
@@ -234,9 +239,11 @@ def _add_train(train: _Parser) -> None:
 
 def _add_predict(predict: _Parser) -> None:
     predict.add_argument("run_folder", type=_path, metavar="RUN", help="run folder")
-    about = "a mesh (.vtu, .msh, .inp, .stl, ...), or a dataset (.h5)"
+    about = "a mesh (.vtu, .msh, .inp, .stl, ...), a dataset (.h5), or the specification of an assembly (.toml)"
     predict.add_argument("scene", type=_path, metavar="SCENE", help=about)
-    _add_each(predict, {"--out FILE": "file to write: .h5, or .pvd or .vtkhdf for ParaView"}, type=_path, required=True)
+    _add_each(
+        predict, {"--out FILE": "file to write: .h5, .pvd or .vtkhdf for ParaView, or .csv"}, type=_path, required=True
+    )
     _add_overwrite(predict)
     moves = {
         "--move BODY=MOTION": 'motion of the prescribed nodes of a body: a translation "1=0,0,-0.01", a path'
@@ -267,7 +274,26 @@ def _add_predict(predict: _Parser) -> None:
     data = predict.add_argument_group("if SCENE is a dataset")
     data.add_argument("--split", choices=commands.SPLITS, default="test", help="split (default: test)")
     _add_each(data, {"--index I": "number of the trajectory in the split"}, type=_at_least(0))
-    predict.set_defaults(of_mesh=(mesh,), of_data=(data,))
+    spec = predict.add_argument_group("if SCENE is the specification of an assembly")
+    about = "value of a parameter, such as travel=4.2 or bumper.young=1.5e6; may be repeated"
+    _add_each(spec, {"--set NAME=VALUE": about}, action="append", default=[])
+    _add_each(spec, {"--nodes N": "approximate number of nodes (default: by the sizes)"}, type=_at_least(1))
+    predict.set_defaults(of_mesh=(mesh,), of_data=(data,), of_spec=(spec,))
+
+
+def _add_sweep(sweep: _Parser) -> None:
+    sweep.add_argument("run_folder", type=_path, metavar="RUN", help="run folder")
+    sweep.add_argument("spec", type=_path, metavar="SPEC", help="specification of the assembly (.toml)")
+    about = "table to write (.csv); a picture with the same name is written beside it (.png)"
+    _add_each(sweep, {"--out FILE": about}, type=_path, required=True)
+    _add_overwrite(sweep)
+    about = "values of a parameter: travel=1:7:13 (from, to, how many), young=1e6,2e6; may be repeated: a grid"
+    _add_each(sweep, {"--set NAME=VALUES": about}, action="append", default=[])
+    _add_each(sweep, {"--table FILE": "instead of --set, a CSV file whose first line names parameters"}, type=_path)
+    about = "what the picture shows (default: reaction)"
+    sweep.add_argument("--quantity", choices=("reaction", "largest_stress"), default="reaction", help=about)
+    _add_each(sweep, {"--corrections N": "as for predict", "--newton-steps N": "as for predict"}, type=_at_least(0))
+    _add_each(sweep, {"--nodes N": "approximate number of nodes (default: by the sizes)"}, type=_at_least(1))
 
 
 def _add_evaluate(evaluate: _Parser) -> None:

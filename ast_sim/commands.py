@@ -32,12 +32,41 @@ def generate(args: argparse.Namespace) -> None:
     """`ast-sim generate`."""
     from ast_sim.simulate.jobs.generate import generate as simulate
 
-    chosen = ("valid", "test", "seed", "nodes", "frames", "keep", "workers", "solver", "parts", "patient", "scheduler")
-    options = {name: getattr(args, name) for name in chosen}
+    if args.look:
+        _look(args)
+        return
+    for option, value in (("--out FILE", args.out), ("--count N", args.count)):
+        if value is None:
+            raise ConfigError(f"give {option}" + (", or --look" if args.spec is not None else ""))
+    chosen = ("valid", "test", "seed", "nodes", "frames", "keep", "workers", "solver", "parts", "spec", "patient")
+    options = {name: getattr(args, name) for name in (*chosen, "scheduler")}
     made = simulate(args.family, args.out, train=args.count, **options)
     print(f"{made.path}: {_counts(made.counts)}")
     if made.truncated:
         print(f"stopped before their last frame: {', '.join(made.truncated)}")
+
+
+def _look(args: argparse.Namespace) -> None:
+    """`ast-sim generate assembly SPEC --look`."""
+    from ast_sim.simulate.jobs.generate import checked_counts, checked_workers
+    from ast_sim.simulate.jobs.look import look
+    from ast_sim.support.progress import duration
+    from ast_sim.view import scene_picture
+
+    if args.family != "assembly" or args.spec is None:
+        raise ConfigError("--look is for a specification: ast-sim generate assembly SPEC.toml --look")
+    found = look(args.spec, seed=args.seed, nodes=args.nodes, frames=args.frames)
+    picture = (args.out or args.spec).with_suffix(".look.png")
+    shown = [(case.scene, case.targets[-1]) for case in found.cases]
+    scene_picture.write(picture, shown, found.titles, found.unit)
+    print("\n".join(map(printable, found.lines)))
+    each = found.mesh_seconds + found.solve_seconds
+    print(f"one scene: {each:.3g} s ({found.mesh_seconds:.2g} s to mesh), {printable(found.status)}")
+    scenes = sum(checked_counts(args.count or 100, args.valid, args.test).values())
+    workers = checked_workers(args.workers, None)
+    cost = duration(each * scenes / workers)
+    print(f"--count {args.count or 100}: {scenes} scenes, about {cost} with {workers} processes")
+    print(f"picture: {picture}")
 
 
 def _counts(counts: dict[str, int]) -> str:
@@ -144,6 +173,10 @@ def predict(args: argparse.Namespace) -> None:
     _check_output(args, args.out, [args.scene])
     keep_memory()
     moves, run = dict(map(parse_move, args.move)), Run(args.run_folder)
+    if args.scene.suffix == ".toml":
+        _predict_spec(run, args)
+        return
+    _refuse(args, args.of_spec, f"{args.scene}, which is no specification")
     if args.scene.suffix == ".h5":
         _refuse(args, args.of_mesh, f"{args.scene}, which is a dataset")
         truth = _truth(run, args)
@@ -157,6 +190,56 @@ def predict(args: argparse.Namespace) -> None:
     else:
         scene, truth = (_scene(args) if truth is None else truth.scene), None
         answer = run.predict(scene, moves, num_frames=args.num_frames, name=name, **effort)
+    _save(answer, args, truth)
+
+
+def _predict_spec(run: Any, args: argparse.Namespace) -> None:
+    """`ast-sim predict RUN SPEC.toml`."""
+    from ast_sim.simulate.own_assembly.grid import grid, parse_setting
+
+    for group in (args.of_mesh, args.of_data):
+        _refuse(args, group, f"{args.scene}, which is a specification")
+    if args.move:
+        raise ConfigError(f"{args.scene} says what moves: change its parameters with --set, or leave --move out")
+    rows = grid(dict(map(parse_setting, args.set)))
+    if len(rows) > 1:
+        raise ConfigError("--set gives several values: ast-sim sweep predicts them all")
+    effort = {"frames": args.frames, "corrections": args.corrections, "num_frames": args.num_frames}
+    answer = run.predict(spec=args.scene, nodes=args.nodes, name=str(args.scene), **effort, **rows[0])
+    _save(answer, args, None)
+    for frame, row in zip(answer.frames, answer.figures(answer.source["origin"]), strict=True):
+        parts = [f"{name} {row[name]:.4g} {unit}" for name, unit in _units(run) if name in row]
+        print(f"frame {frame}: {', '.join(parts)}")
+
+
+def _units(run: Any) -> tuple[tuple[str, str], ...]:
+    return (("travel_of_nodes", run.scope.length_unit), ("reaction", "N"), ("largest_stress", "Pa"))
+
+
+def sweep(args: argparse.Namespace) -> None:
+    """`ast-sim sweep`."""
+    from ast_sim import keep_memory
+    from ast_sim.inference.trained_run import Run
+    from ast_sim.simulate.own_assembly.grid import parse_setting
+
+    if args.out.suffix != ".csv":
+        raise ConfigError(f"--out {args.out}: the name of a table must end in .csv")
+    picture = args.out.with_suffix(".png")
+    for out in (args.out, picture):
+        _check_output(args, out, [args.spec, *filter(None, [args.table])])
+    keep_memory()
+    run, values = Run(args.run_folder), dict(map(parse_setting, args.set))
+    effort = {"corrections": args.corrections, "newton_steps": args.newton_steps}
+    found = run.sweep(args.spec, table=args.table, nodes=args.nodes, **effort, **values)
+    found.save(args.out)
+    print(f"{args.out}: {len(found.rows)} rows, {1000 * found.seconds / len(found.rows):.3g} ms each")
+    if found.varied:
+        found.picture(picture, args.quantity)
+        print(f"picture: {picture}")
+
+
+def _save(answer: Any, args: argparse.Namespace, truth: Any) -> None:
+    """Write an answer; say how long it took, or why it ended early."""
     answer.save(args.out, truth)
     if answer.failure is not None:
         raise RolloutError(f"{answer.failure}, in {args.out}")

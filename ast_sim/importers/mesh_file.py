@@ -7,12 +7,13 @@ import io
 import string
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, overload
 
 import numpy as np
 
+from ast_sim.importers.places import Mask
 from ast_sim.importers.shells import Shells, find_shells
 from ast_sim.importers.vtu_sizes import require_declared_sizes
 from ast_sim.scene import NodeType, Scene, connected_parts
@@ -27,7 +28,8 @@ _CORNERS = {"tetra": 4, "triangle": 3}
 
 @dataclass(frozen=True, eq=False)
 class MeshFile:
-    """Points [n, 3] float64, elements [E, 3 or 4] int64, fields by name, and notes on cells that were left out.
+    """Points [n, 3] float64, elements [E, 3 or 4] int64, fields by name, and notes on cells that were left out; the
+    numbers of the nodes of each named group.
 
     If there are `shells` beside the tetrahedra, their layers are among the elements and the points; see `Shells`.
     """
@@ -39,6 +41,7 @@ class MeshFile:
     cell_fields: dict[str, np.ndarray]
     notes: list[str]
     shells: Shells | None = None
+    groups: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def shell_nodes(self) -> np.ndarray:
@@ -80,6 +83,22 @@ class MeshFile:
                 f"{self.path}: the {place} field {name or default!r} has {value.shape[1]} components; must have one"
             )
         return None if value is None else value[:, 0]
+
+    def masks(self, nodes: np.ndarray) -> tuple[Mask, Mask]:
+        """For `Place.inside`: functions of a name that say at which of the nodes [k] a point field is not zero, and
+        which of them belong to a group.
+
+        Raises:
+            DatasetError: when they are called, there is no such field or group.
+        """
+
+        def group(name: str) -> np.ndarray:
+            if name not in self.groups:
+                known = ", ".join(sorted(self.groups)) or "none"
+                raise DatasetError(f"{self.path}: there is no group of nodes {name!r}; there are: {known}")
+            return np.isin(nodes, self.groups[name])
+
+        return lambda name: self.numbers("point", name)[nodes] != 0, group
 
     def whole_numbers(self, place: str, name: str | None, default: str, dtype: type) -> np.ndarray | None:
         """A field with one whole number in each row, as [rows] of an integer type; see `field`."""
@@ -161,8 +180,21 @@ def read_mesh(
         )
     cell_fields = {name: np.concatenate([values[b] for b in blocks]) for name, values in mesh.cell_data.items()}
     point_fields = {name: np.asarray(values) for name, values in mesh.point_data.items()}
-    bare = MeshFile(path, points, elements, point_fields, cell_fields, _notes(mesh.cells, blocks))
+    bare = MeshFile(
+        path, points, elements, point_fields, cell_fields, _notes(mesh.cells, blocks), groups=node_groups(mesh)
+    )
     return bare if corners == 3 else _with_shells(bare, mesh)
+
+
+def node_groups(mesh: meshio.Mesh) -> dict[str, np.ndarray]:
+    """The numbers of the nodes of each named set of points or cells of the mesh."""
+    groups = {name: np.asarray(nodes, np.int64).ravel() for name, nodes in mesh.point_sets.items()}
+    for name, rows in mesh.cell_sets.items():
+        if not name.startswith("gmsh:"):  # what meshio keeps for itself
+            pairs = zip(mesh.cells, rows, strict=True)
+            nodes = [block.data[np.asarray(chosen, int)].ravel() for block, chosen in pairs if chosen is not None]
+            groups[name] = np.unique(np.concatenate(nodes)) if nodes else np.zeros(0, np.int64)
+    return groups
 
 
 def _with_shells(bare: MeshFile, mesh: meshio.Mesh) -> MeshFile:

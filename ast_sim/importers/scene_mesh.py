@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ast_sim.importers.mesh_file import MeshFile, read_mesh
+from ast_sim.importers.places import Place, parse_places
 from ast_sim.scene import NodeType, Scene, nodes_of_body
 from ast_sim.support.errors import ConfigError, DatasetError
 
 if TYPE_CHECKING:
     import meshio
 
-# Two coordinates count as equal if they differ by less than this share of the size of their body.
-_SAME = 1e-6
-
 # A tetrahedron (triangle) is flat if its volume (area) is below this share of its longest edge to the power of 3 (2).
 _FLAT = 1e-6
-
-_PLACE = re.compile(r"(?P<all>all)|field=(?P<field>.+)|(?P<axis>[xyz])(?P<rule>min|max|(<=|>=|<|>)(?P<limit>.+))")
 
 Numbers = float | Sequence[float]
 
@@ -39,16 +34,6 @@ class SceneMesh:
     def description(self) -> list[str]:
         """Lines of text, with which a person can check the scene: the scene, each body, the notes."""
         return describe(self.scene) + self.notes
-
-
-class Place(NamedTuple):
-    """A part of a body: the whole body, its nodes on one side of `limit`, or its nodes where a point field is not 0."""
-
-    text: str
-    field: str | None = None
-    axis: int | None = None
-    rule: str = "all"
-    limit: float = 0.0
 
 
 def read_scene(
@@ -120,22 +105,19 @@ def describe(scene: Scene) -> list[str]:
 def parse_clamp(text: str) -> tuple[int, list[Place]]:
     """The body and the places of `BODY:PLACE[,PLACE...]`; the nodes of the body in any of these places are clamped.
 
-    PLACE is one of
-        all                        all nodes
-        xmin, xmax, ymin, ...      the nodes at this end of the body
-        x>0.3, z<=0.01, ...        the nodes for which this holds
-        field=NAME                 the nodes at which this point field is not zero
+    PLACE is `all`, `xmin`, `z<=0.01`, `0<x<2 and 0<y<1`, `field=NAME`, `group=NAME` and the like: see
+    `ast_sim.importers.places`.
 
     Raises:
         ConfigError: the text has another form; the error gives examples.
     """
     try:
         body, places = _body_and_rest(text, ":")
-        return body, [_place(place.strip()) for place in places.split(",")]
+        return body, parse_places(places)
     except ValueError as error:
         raise ConfigError(
-            f"the clamp {text!r} cannot be read; write BODY:PLACE, for example 0:xmin, 0:xmin,xmax, 0:z<=0.01, 0:all or"
-            " 0:field=NAME"
+            f"the clamp {text!r} cannot be read; write BODY:PLACE, for example 0:xmin, 0:xmin,xmax, 0:z<=0.01, 0:all,"
+            " 0:0<x<2 and 0<y<1, 0:field=NAME or 0:group=NAME"
         ) from error
 
 
@@ -157,21 +139,6 @@ def _body_and_rest(text: str, separator: str) -> tuple[int, str]:
     if not found:
         raise ValueError(text)
     return int(body), rest
-
-
-def _place(text: str) -> Place:
-    found = _PLACE.fullmatch(text)
-    if found is None:
-        raise ValueError(text)
-    if found["axis"] is None:
-        return Place(text, found["field"])
-    axis = "xyz".index(found["axis"])
-    if found["limit"] is None:
-        return Place(text, axis=axis, rule=found["rule"])
-    limit = float(found["limit"])
-    if not np.isfinite(limit):
-        raise ValueError(text)
-    return Place(text, axis=axis, rule=found["rule"].removesuffix(found["limit"]), limit=limit)
 
 
 def _turned_over(scene: Scene, path: Path) -> tuple[Scene, int]:
@@ -203,7 +170,7 @@ def _node_type(
         body, places = parse_clamp(clamp)
         nodes = np.flatnonzero(nodes_of_body(scene.body, body))
         for place in places:
-            inside = _inside(mesh, place, mesh.points[used[nodes]], used[nodes])
+            inside = place.inside(mesh.points[used[nodes]], *mesh.masks(used[nodes]))
             if not inside.any():
                 low, high = (scene.rest_position[nodes].min(axis=0), scene.rest_position[nodes].max(axis=0))
                 raise ConfigError(
@@ -213,23 +180,6 @@ def _node_type(
     for body in obstacles:
         types[nodes_of_body(scene.body, body)] = NodeType.OBSTACLE
     return types
-
-
-def _inside(mesh: MeshFile, place: Place, points: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """[k] bool: which nodes of a body lie in the place. The body has the nodes [k] at the points [k, 3]."""
-    if place.field is not None:
-        return mesh.numbers("point", place.field)[nodes] != 0
-    if place.axis is None:
-        return np.ones(len(nodes), bool)
-    x, tolerance = points[:, place.axis], _SAME * np.ptp(points, axis=0).max()
-    return {
-        "min": x <= x.min() + tolerance,
-        "max": x >= x.max() - tolerance,
-        "<=": x <= place.limit + tolerance,
-        ">=": x >= place.limit - tolerance,
-        "<": x < place.limit - tolerance,
-        ">": x > place.limit + tolerance,
-    }[place.rule]
 
 
 def _material(

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from ast_sim.dataset.layout import DatasetInfo
+from ast_sim.dataset.layout import LENGTH_UNITS, DatasetInfo
 from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.scene import AttributeValue, Scene, Trajectory
 from ast_sim.support.errors import AstSimError
-from ast_sim.view import export
+from ast_sim.view import export, sweep_files
 from ast_sim.view.files import make_folder
 
-SUFFIXES = (".h5", ".pvd", ".vtkhdf")
+SUFFIXES = (".h5", ".pvd", ".vtkhdf", ".csv")
+ELASTIC = ("assembly", "abcd", "abcd_xl")  # families whose material is Young's modulus and Poisson's ratio
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +68,46 @@ class Answer:
         location = None if self.stress is None else self.stress_location
         return Trajectory(self.scene, self.position, self.stress, attributes, stress_location=location)
 
+    def reaction(self) -> np.ndarray | None:
+        """[S, 3] the force in newton that moves the prescribed nodes of the body that moves farthest.
+
+        It follows from the strains of the predicted positions, by the solver's own law of the material. None where the
+        scene has no Young's modulus and Poisson's ratio.
+        """
+        if self.info is None or self.info.family not in ELASTIC or self.scene.material is None:
+            return None
+        from ast_sim.simulate.own_assembly.reaction import Reaction
+
+        scale, force = LENGTH_UNITS[self.info.length_unit] ** 2, Reaction(self.scene)
+        return scale * np.array([force.of(position) for position in self.position]).reshape(-1, 3)
+
+    def figures(self, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> list[dict[str, float]]:
+        """What an engineer asks of each frame: the travel of the prescribed nodes, the reaction and its components (if
+        there is a material), the largest stress and where it is (if the model predicts one).
+
+        Args:
+            origin: [3] the point that positions are relative to.
+        """
+        scene, rows = self.scene, []
+        forces = self.reaction()
+        for frame, position in enumerate(self.position):
+            way = np.linalg.norm((position - scene.rest_position)[scene.prescribed], axis=1)
+            row = {"travel_of_nodes": float(way.max(initial=0.0))}
+            if forces is not None:
+                row |= {"reaction": float(np.linalg.norm(forces[frame]))}
+                row |= {f"reaction_{axis}": float(force) for axis, force in zip("xyz", forces[frame], strict=True)}
+            if self.stress is not None:
+                stress = self.stress[frame, :, 0]
+                worst = int(np.where(scene.deforming(self.stress_location or "node"), stress, -np.inf).argmax())
+                nodes = scene.elements[worst] if self.stress_location == "element" else [worst]
+                place = position[nodes].mean(axis=0) + origin
+                row |= {"largest_stress": float(stress[worst])}
+                row |= {f"stress_at_{axis}": float(x) for axis, x in zip("xyz", place, strict=True)}
+            rows.append(row)
+        return rows
+
     def save(self, path: str | os.PathLike[str], truth: Trajectory | None = None) -> None:
-        """Write the answer as a dataset (.h5) or as a file for ParaView (.pvd, .vtkhdf).
+        """Write the answer as a dataset (.h5), as a file for ParaView (.pvd, .vtkhdf), or its `figures` (.csv).
 
         Args:
             truth: the true trajectory, if it is known; a file for ParaView then holds the errors, too.
@@ -84,6 +124,11 @@ class Answer:
         if path.suffix == ".h5":
             with DatasetWriter(path, self.info) as writer:
                 writer.add("test", self.trajectory)
+        elif path.suffix == ".csv":
+            origin = self.source.get("origin", [0.0, 0.0, 0.0])
+            figures = self.figures(origin if isinstance(origin, list) else [0.0, 0.0, 0.0])
+            rows = [{"frame": frame, **row} for frame, row in zip(self.frames, figures, strict=True)]
+            sweep_files.write_table(path, rows)
         else:
             shown = (self.trajectory, None) if truth is None else (truth, self.trajectory)
             export.write(path, *shown, time_step=self.info.time_step or 1.0)

@@ -76,9 +76,23 @@ def predict_motions(
     effort: Effort,
 ) -> list[Answer]:
     """Predict a scene under several motions as one batch; arguments and errors as for `predict`."""
+    names = [f"{name}, motion {number}" for number in range(len(motions))]
+    return predict_scenes(model, scope, [(scene, motion) for motion in motions], num_frames, names, frames, effort)
+
+
+def predict_scenes(
+    model: Simulator,
+    scope: Scope,
+    asked: Sequence[tuple[Scene, Motions]],
+    num_frames: int | None,
+    names: Sequence[str],
+    frames: Sequence[int] | None,
+    effort: Effort,
+) -> list[Answer]:
+    """Predict several scenes, each under a motion, as one batch; arguments and errors as for `predict`."""
     questions = [
-        _question(model.config, scope, scene, motion, num_frames, f"{name}, motion {number}", frames, None)
-        for number, motion in enumerate(motions)
+        _question(model.config, scope, scene, motion, num_frames, name, frames, None)
+        for (scene, motion), name in zip(asked, names, strict=True)
     ]
     return _in_domain(model, questions, effort)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,13 +15,17 @@ import numpy as np
 from ast_sim.dataset.layout import DatasetInfo
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.answer import Answer
+from ast_sim.inference.assembly_questions import ask
 from ast_sim.inference.effort import Effort
 from ast_sim.inference.evaluation import evaluate, table
-from ast_sim.inference.predict import Motions, predict, predict_motions
+from ast_sim.inference.predict import Motions, predict, predict_motions, predict_scenes
+from ast_sim.inference.sweep import Sweep, sweep
+from ast_sim.prescribed_motion import Motion
 from ast_sim.runs.folder import load_model, require_fit
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.train_config import read_scope
 from ast_sim.scene import Scene, Trajectory
+from ast_sim.simulate.own_assembly.grid import grid, read_table
 from ast_sim.support.disk import write_json
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.progress import Progress
@@ -53,6 +57,11 @@ class Run:
         self.scope = read_scope(self.path)
 
     @property
+    def jumps(self) -> bool:
+        """Whether the model predicts each frame at once from the first."""
+        return bool(self.settings.model.jumps)
+
+    @property
     def info(self) -> DatasetInfo:
         """The units and the kind of the predictions."""
         model, scope = self.settings.model, self.scope
@@ -70,15 +79,18 @@ class Run:
 
     def predict(
         self,
-        scene: Scene | Trajectory,
+        scene: Scene | Trajectory | None = None,
         motion: Motions | None = None,
         *,
+        spec: str | os.PathLike[str] | None = None,
+        nodes: int | None = None,
         frames: Sequence[int] | None = None,
         corrections: int | None = None,
         newton_steps: int | None = None,
         num_frames: int | None = None,
         stress: np.ndarray | None = None,
         name: str = "scene",
+        **parameters: Any,
     ) -> Answer:
         """Predict a scene. Its true trajectory need not be known.
 
@@ -91,6 +103,9 @@ class Run:
             motion: the motion of the prescribed nodes: rigid motions by the number of the body, such as
                 {1: (0, 0, -0.01)}; or positions [S, N, 3] of all nodes or [S, P, 3] of the prescribed ones; or a
                 `Motion`.
+            spec, nodes, parameters: instead of a scene and a motion, the specification of an assembly, about how many
+                nodes (None: by its sizes), and values of its parameters: spec="SPEC.toml", travel=4.2,
+                young={"bumper": 1.5e6}. Others are in the middle of their ranges.
             frames: the numbers of the frames that are wanted, such as [-1] for the last one; by default all. A model
                 that jumps computes no other frame.
             corrections: how many calls correct the first call of a model that jumps; by default as in `self.effort`.
@@ -104,13 +119,71 @@ class Run:
             name: name of the scene, for messages.
 
         Raises:
-            ConfigError: the motion does not fit the scene, or the scene does not fit the run.
+            ConfigError: the motion does not fit the scene, the scene does not fit the run, or a specification has a
+                mistake.
             RolloutError: there is no such frame.
         """
         effort = self._effort(corrections, newton_steps)
+        source: dict[str, Any] = {"predicted_by": str(self.path), "step": self.step, "source": name}
+        if spec is not None:
+            scene, motion, values = self._of_spec(spec, parameters, num_frames, nodes, (scene, motion, stress))
+            num_frames, source = None, source | values
+        elif parameters or nodes is not None or scene is None:
+            unknown = next(iter(parameters), "nodes")
+            raise ConfigError("give a scene" if scene is None else f"{unknown} belongs to a specification: give spec")
         answer = predict(self.model, self.scope, scene, motion, num_frames, stress, name, frames, effort)
-        source = {"predicted_by": str(self.path), "step": self.step, "source": name}
         return dataclasses.replace(answer, info=self.info, source=source)
+
+    def _of_spec(
+        self, spec: str | os.PathLike[str], given: dict[str, Any], frames: int | None, nodes: int | None, others: tuple
+    ) -> tuple[Scene, Motion, dict[str, Any]]:
+        """Scene, motion and origin of an assembly."""
+        if any(other is not None for other in others):
+            raise ConfigError("a specification gives the scene and the motion: leave scene, motion and stress out")
+        (asked,) = ask(spec, [given], self.scope, frames, nodes)
+        values = {f"parameter {name}": value for name, value in asked.values.items()}
+        return asked.scene, asked.motion, {**values, "origin": asked.origin}
+
+    def sweep(
+        self,
+        spec: str | os.PathLike[str],
+        *,
+        table: str | os.PathLike[str] | Sequence[Mapping[str, Any]] | None = None,
+        corrections: int | None = None,
+        newton_steps: int | None = None,
+        nodes: int | None = None,
+        **parameters: Any,
+    ) -> Sweep:
+        """Predict the last frame of an assembly for many values of its parameters, in batches.
+
+        Args:
+            spec: the specification of the assembly.
+            table: a CSV file whose first line names parameters, or a list of mappings from names to values.
+            corrections, newton_steps, nodes: as for `predict`.
+            parameters: instead of a table, values of the parameters: one, or a list. The sweep takes every combination.
+
+        Raises:
+            ConfigError: as for `predict`; or values and a table are both given.
+            SimulationError: a scene cannot be made.
+        """
+        if table is not None and parameters:
+            raise ConfigError("a table has the values of all parameters: leave the others out, or leave the table out")
+        rows = table if table is not None else grid(parameters)
+        rows = rows if isinstance(rows, Sequence) and not isinstance(rows, str) else read_table(rows)
+        return sweep(self, spec, rows, corrections, newton_steps, nodes)
+
+    def predict_scenes(
+        self,
+        asked: Sequence[tuple[Scene, Motions]],
+        names: Sequence[str],
+        frames: Sequence[int] | None = None,
+        corrections: int | None = None,
+        newton_steps: int | None = None,
+    ) -> list[Answer]:
+        """Predict several scenes, each under a motion, as one batch; arguments and errors are those of `predict`."""
+        effort = self._effort(corrections, newton_steps)
+        answers = predict_scenes(self.model, self.scope, asked, None, names, frames, effort)
+        return [dataclasses.replace(answer, info=self.info) for answer in answers]
 
     def predict_motions(
         self,

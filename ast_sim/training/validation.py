@@ -70,10 +70,7 @@ def validate(
 
 
 def _validate_jumps(model: Simulator, truths: dict[int, Trajectory], most_calls: int) -> list[Validated]:
-    frames = {
-        index: np.unique(np.linspace(0, truth.num_frames - 1, JUMPS + 1).round().astype(int)[1:])
-        for index, truth in truths.items()
-    }
+    frames = {index: frames_asked(truth.num_frames) for index, truth in truths.items()}
     questions = [Question.of(truth, _name(index), frames[index].tolist()) for index, truth in truths.items()]
     found = []
     for (index, truth), after in zip(truths.items(), calls(model, questions, Effort(most_calls - 1)), strict=True):
@@ -85,6 +82,12 @@ def _validate_jumps(model: Simulator, truths: dict[int, Trajectory], most_calls:
             efforts = errors_by_effort(model, truth, Effort(max(0, most_calls - MORE_CALLS - 1), MOST_NEWTON_STEPS))
         found.append(Validated(index, errors, hold, failure, efforts))
     return found
+
+
+def frames_asked(count: int) -> np.ndarray:
+    """The numbers of up to `JUMPS` frames that are evenly spread over so many; never the first, which is given."""
+    spread = np.unique(np.linspace(0, count - 1, JUMPS + 1).round().astype(int)[1:])
+    return spread[spread > 0]
 
 
 def verdict(found: list[Validated], best: float, unit: str) -> tuple[dict[str, Any], str]:

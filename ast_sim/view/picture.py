@@ -64,7 +64,7 @@ def _figure(truth: Trajectory, prediction: Trajectory, frame: int, model: str, l
     by_stress = truth.stress is not None and prediction.stress_at == truth.stress_at
     label, unit = ("von Mises stress", "Pa") if by_stress else ("Displacement", length_unit)
     values = [_corner_values(side, frame, by_stress) for side in (truth, prediction)]
-    view = _View(truth)
+    view = View(truth)
     body = values[0][~view.obstacle]
     upper = float(np.quantile(body, 0.99)) if body.size else 0.0
     upper = upper or float(values[0].max(initial=0.0)) or 1.0
@@ -84,7 +84,7 @@ def _figure(truth: Trajectory, prediction: Trajectory, frame: int, model: str, l
     return figure
 
 
-class _View:
+class View:
     """A perspective camera on a scene, fitted to the box of the deforming bodies. Truth and prediction share it."""
 
     def __init__(self, truth: Trajectory) -> None:
@@ -120,7 +120,7 @@ def _corner_values(trajectory: Trajectory, frame: int, by_stress: bool) -> np.nd
     return np.repeat(stress[surface_owners(scene, surface), None], 3, axis=1)
 
 
-def _draw(axes, view: _View, position: np.ndarray, color_map, values: np.ndarray) -> None:
+def _draw(axes, view: View, position: np.ndarray, color_map, values: np.ndarray) -> None:
     """Draw the triangles that face the eye, from far to near; each as small triangles with its edges on top."""
     from matplotlib.collections import PolyCollection
 
@@ -129,7 +129,7 @@ def _draw(axes, view: _View, position: np.ndarray, color_map, values: np.ndarray
     side = flat[:, 1:] - flat[:, :1]
     facing = side[:, 0, 0] * side[:, 1, 1] - side[:, 0, 1] * side[:, 1, 0] > 0
     shown = facing if view.closed else np.ones(len(facing), dtype=bool)
-    shade = _shade(corners)
+    shading = shade(corners)
     weights = _subdivision()
     polygons, faces, edges = [], [], []
     for triangle in sorted(np.flatnonzero(shown), key=lambda t: -distance[t].mean()):
@@ -139,7 +139,7 @@ def _draw(axes, view: _View, position: np.ndarray, color_map, values: np.ndarray
             edges.append((0, 0, 0, 0))
             continue
         color = color_map.to_rgba((weights @ values[triangle]).mean(axis=1))
-        color[:, :3] *= shade[triangle]
+        color[:, :3] *= shading[triangle]
         polygons += [*(weights @ flat[triangle]), flat[triangle]]
         faces += [*color, (0, 0, 0, 0)]
         edges += [*color, MESH_COLOR]
@@ -153,7 +153,7 @@ def _draw(axes, view: _View, position: np.ndarray, color_map, values: np.ndarray
     axes.axis("off")
 
 
-def _shade(corners: np.ndarray) -> np.ndarray:
+def shade(corners: np.ndarray) -> np.ndarray:
     """[F]: Lambert's law with so much ambient light that colours can still be compared with the scale."""
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normal, axis=1)

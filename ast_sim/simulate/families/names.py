@@ -3,7 +3,8 @@
 Such a module has `INFO` (DatasetInfo), `DEFAULT_NODES`, `MINIMUM_NODES`, `FRAMES` (frames of a scene, unless it is an
 option), `draw(rng, nodes, ...) -> case`, which takes all of its draws from `rng`, and
 `solve(case, checkpoint) -> Trajectory`. One without inertia also has `SETTINGS` (SolverSettings) and
-`draw_geometry(rng, nodes, ...) -> Drawn`, which draws the same and can be meshed anew.
+`draw_geometry(rng, nodes, ...) -> Drawn`, which draws the same and can be meshed anew. The family `assembly` has
+`info`, `check_spec` and `draw_scene` instead of `INFO` and the two: they depend on a specification.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ class Family:
 
     Attributes:
         about: one line for a user.
-        options: the options of `generate` that it has beside the number of nodes: "frames", "keep", "parts", "solver".
+        options: the options of `generate` that it has beside the number of nodes: "frames", "keep", "parts", "solver",
+            "spec" (which is an argument).
         packages: packages that only its scenes depend on. The dataset records their versions.
     """
 
@@ -38,6 +40,9 @@ FAMILIES = {
     "sphere_simple": Family("a hanging cloth and a sphere that pushes into it, with inertia"),
     "abcd": Family("two CAD-like parts squeezed together, 4,000 nodes", ("keep", "parts", "solver"), _PARTS),
     "abcd_xl": Family("abcd with 100,000 nodes: a scene takes hours", ("keep", "parts", "solver"), _PARTS),
+    "assembly": Family(
+        "your own parts with your own motion and ranges, from SPEC.toml", ("spec", "frames", "keep"), _PARTS
+    ),
 }
 
 MODULES = {family: f"{__package__}.{family}" for family in FAMILIES}

@@ -22,7 +22,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from ast_sim.dataset.layout import SPLITS, DatasetInfo
+from ast_sim.dataset.domain import FittedWriter
+from ast_sim.dataset.layout import SPLITS
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import Seconds, write_seconds
 from ast_sim.dataset.writer import DatasetWriter
@@ -33,6 +34,7 @@ from ast_sim.simulate.jobs.manifest import Manifest, Watch
 from ast_sim.simulate.jobs.recipe import check_parts, checked_recipe, difference, recorded
 from ast_sim.simulate.jobs.samples import Recipe, Sample, load_sample, sample_name, sample_path
 from ast_sim.simulate.mechanics.contact_and_friction import self_test
+from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.support.disk import output_file, replacing
 from ast_sim.support.errors import SimulationError
 
@@ -68,6 +70,7 @@ def generate(
     workers: int | None = None,
     solver: str | None = None,
     parts: str | os.PathLike[str] | None = None,
+    spec: str | os.PathLike[str] | None = None,
     patient: bool = False,
     scheduler: str | None = None,
     progress: bool = True,
@@ -79,12 +82,13 @@ def generate(
         out: the dataset file. If it exists and was made with the same settings, nothing is done.
         train, valid, test: scenes of each split. `valid` and `test` are a tenth of `train` if None.
         seed: of all random draws. A sample depends only on the seed, its split, its index and the settings.
-        nodes: about how many nodes a scene has; the family's default if None.
-        frames: frames of a scene, for families that have this option; the family's default if None.
+        nodes: about how many nodes a scene has; None: the family's default, or by the sizes of a specification.
+        frames: frames of a scene, for families that have this option; None: the default of family or specification.
         keep: ascending numbers of the frames to solve, straight from one to the next, and store; all frames if None.
         workers: number of processes; one per available core if None.
         solver: "own" or "calculix", for families of solids; "own" if None.
         parts: a file or folder of parts (STEP, STL, meshes), for families that squeeze parts; None: drawn ones.
+        spec: the specification of an assembly (TOML), for the family "assembly".
         patient: solve every scene to its last frame. Else a scene ends before a frame of over 500 Newton iterations.
         scheduler: address of a Dask scheduler. Its workers make the samples; no processes start on this machine.
         progress: show a bar on a terminal and lines elsewhere.
@@ -97,23 +101,30 @@ def generate(
     """
     module = family_module(family)
     self_test()
-    counts = _checked_counts(train, valid, test)
-    recipe = checked_recipe(module, family, seed, nodes, frames, solver, parts, patient, keep)
-    workers = _checked_workers(workers, scheduler)
+    counts, workers = checked_counts(train, valid, test), checked_workers(workers, scheduler)
+    recipe = checked_recipe(module, family, seed, nodes, frames, solver, parts, patient, keep, spec)
     out, settings = Path(out), recorded(recipe)
     output_file(out)
     folder = out.with_name(out.name + ".parts")
     if out.exists():
         return _existing(out, folder, settings, counts)
     if not folder.exists():
-        check_parts(recipe)
-        _check_room(out, sum(counts.values()), recipe.nodes, _frames(recipe, module))
+        _check_start(out, sum(counts.values()), recipe, module)
     samples = [(split, index) for split in SPLITS for index in range(counts[split])]
     with _locked(folder, settings):
         _make(samples, folder, recipe, workers, scheduler, progress, _notes(settings))
-        truncated = _merge(out, folder, samples, replace(module.INFO, generator={**settings, "counts": counts}))
+        truncated = _merge(out, folder, samples, _writer(out, recipe, module, {**settings, "counts": counts}))
         _remove(folder)
     return Generated(out, counts, truncated)
+
+
+def _writer(out: Path, recipe: Recipe, module: ModuleType, generator: dict[str, Any]) -> DatasetWriter:
+    """A writer for the dataset; the domain of an assembly follows from its positions."""
+    for leftover in out.parent.glob(f".{glob.escape(out.name)}.*.tmp"):  # of a merge that was killed
+        leftover.unlink(missing_ok=True)
+    if recipe.spec is None:
+        return DatasetWriter(out, replace(module.INFO, generator=generator))
+    return FittedWriter(out, **module.info(read_spec(recipe.spec)), generator=generator)
 
 
 def _frames(recipe: Recipe, module: ModuleType) -> int:
@@ -158,7 +169,8 @@ def _make(
         )
 
 
-def _checked_workers(workers: int | None, scheduler: str | None) -> int:
+def checked_workers(workers: int | None, scheduler: str | None) -> int:
+    """The number of processes; one per available core if None."""
     if workers is not None and scheduler is not None:
         raise SimulationError("workers run on this machine, but a scheduler has its own workers: give one of them")
     if workers is not None and workers < 1:
@@ -170,7 +182,8 @@ def _checked_workers(workers: int | None, scheduler: str | None) -> int:
     return os.cpu_count() or 1
 
 
-def _checked_counts(train: int, valid: int | None, test: int | None) -> dict[str, int]:
+def checked_counts(train: int, valid: int | None, test: int | None) -> dict[str, int]:
+    """The number of scenes of each split; a tenth of `train` where None."""
     tenth = -(-train // 10)
     counts = {
         "train": train,
@@ -184,8 +197,10 @@ def _checked_counts(train: int, valid: int | None, test: int | None) -> dict[str
     return counts
 
 
-def _check_room(out: Path, scenes: int, nodes: int, frames: int) -> None:
-    """Refuse what cannot fit on the disk: positions and stress alone take four float32 a node and frame."""
+def _check_start(out: Path, scenes: int, recipe: Recipe, module: ModuleType) -> None:
+    """Refuse broken parts, and what cannot fit on the disk: positions and stress take four float32 a node and frame."""
+    check_parts(recipe)
+    nodes, frames = recipe.nodes or 1, _frames(recipe, module)
     folder = next(parent for parent in out.absolute().parents if parent.exists())
     least, free = 16 * scenes * nodes * frames, shutil.disk_usage(folder).free
     if least > free:
@@ -264,17 +279,15 @@ def _is_readable(path: Path) -> bool:
     return True
 
 
-def _merge(out: Path, folder: Path, samples: list[Sample], info: DatasetInfo) -> list[str]:
+def _merge(out: Path, folder: Path, samples: list[Sample], opened: DatasetWriter) -> list[str]:
     """Write the seconds and then the dataset; return the names of the truncated samples."""
     truncated = []
     seconds: dict[str, Seconds] = {}
-    for leftover in out.parent.glob(f".{glob.escape(out.name)}.*.tmp"):  # of a merge that was killed
-        leftover.unlink(missing_ok=True)
-    with DatasetWriter(out, info) as writer:
+    with opened as writer:
         for sample in samples:
             trajectory, seconds[sample_name(*sample)] = load_sample(sample_path(folder, *sample))
             writer.add(sample[0], trajectory)
             if trajectory.attributes["status"] == "truncated":
                 truncated.append(sample_name(*sample))
-        write_seconds(out, info.generator, seconds)
+        write_seconds(out, writer.info.generator, seconds)
     return truncated

@@ -16,6 +16,7 @@ import ast_sim
 from ast_sim.dataset.layout import DatasetInfo
 from ast_sim.simulate.families.names import FAMILIES, family_module
 from ast_sim.simulate.jobs.samples import Recipe
+from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.support.errors import SimulationError
 
 if TYPE_CHECKING:
@@ -36,23 +37,28 @@ def checked_recipe(
     parts: str | Path | None,
     patient: bool = False,
     keep: Sequence[int] | None = None,
+    spec: str | Path | None = None,
 ) -> Recipe:
     """The recipe with these settings, after a check. A setting that is None takes the family's default.
 
     Raises:
         SimulationError: a value is invalid, or the family does not have an option.
     """
-    for name, value in (("frames", frames), ("keep", keep), ("solver", solver), ("parts", parts)):
+    for name, value in (("frames", frames), ("keep", keep), ("solver", solver), ("parts", parts), ("spec", spec)):
         if value is not None and name not in FAMILIES[family].options:
             having = ", ".join(key for key, known in FAMILIES.items() if name in known.options)
             raise SimulationError(f"{family} has no option {name}; these families have it: {having}")
     nodes = module.DEFAULT_NODES if nodes is None else nodes
+    if "spec" in FAMILIES[family].options:
+        if spec is None:
+            raise SimulationError(f"{family} needs a specification: ast-sim generate {family} SPEC.toml --out FILE")
+        frames = read_spec(spec).frames if frames is None else frames
     if "frames" in FAMILIES[family].options:
         frames = module.FRAMES if frames is None else frames
         if frames < module.MINIMUM_FRAMES:
             raise SimulationError(f"frames is {frames}; must be at least {module.MINIMUM_FRAMES}")
     for name, value, minimum in (("seed", seed, 0), ("nodes", nodes, module.MINIMUM_NODES)):
-        if value < minimum:
+        if value is not None and value < minimum:
             raise SimulationError(f"{name} is {value}; must be at least {minimum}")
     solver = solver or "own"
     if solver not in SOLVERS:
@@ -64,16 +70,18 @@ def checked_recipe(
     if keep is not None:
         keep = _checked_keep(keep, (frames or module.FRAMES) - 1)
     parts = None if parts is None else str(Path(parts).resolve())
-    return Recipe(family, seed, nodes, frames, solver, parts, patient, keep)
+    spec = None if spec is None else str(Path(spec).resolve())
+    return Recipe(family, seed, nodes, frames, solver, parts, spec, patient, keep)
 
 
-def recipe_of(name: str, info: DatasetInfo, parts: str | Path | None = None) -> Recipe:
+def recipe_of(name: str, info: DatasetInfo, parts: str | Path | None = None, spec: str | Path | None = None) -> Recipe:
     """The recipe by which the bundled solver made a dataset of a family without inertia.
 
     Args:
         name: the dataset's name in messages.
         info: what the dataset says of itself.
-        parts: where the user's parts lie, if it was made of such: a dataset records their content, not their place.
+        parts, spec: where the user's parts or the specification lie, if it was made of such: a dataset records their
+            content, not their place.
 
     Raises:
         SimulationError: it was made otherwise, its settings cannot be read, or its parts are others.
@@ -87,13 +95,18 @@ def recipe_of(name: str, info: DatasetInfo, parts: str | Path | None = None) -> 
         raise SimulationError(f"{name} was made of parts of your own: say where they lie")
     if "parts" not in made and parts is not None:
         raise SimulationError(f"{name} was not made of parts of your own: leave them out")
+    if ("spec" in made) != (spec is not None):
+        told = "was made of a specification: say where it lies" if spec is None else "was made without a specification"
+        raise SimulationError(f"{name} {told}")
     try:
-        seed, nodes, frames, keep = made["seed"], made["nodes"], made.get("frames"), made.get("keep")
-        recipe = checked_recipe(family_module(family), family, seed, nodes, frames, None, parts, keep=keep)
+        seed, nodes, frames, keep = made["seed"], made.get("nodes"), made.get("frames"), made.get("keep")
+        recipe = checked_recipe(family_module(family), family, seed, nodes, frames, None, parts, False, keep, spec)
     except (KeyError, TypeError) as error:
         raise SimulationError(f"{name}: its settings cannot be read ({error!r})") from error
     if parts is not None and _source(parts).describe().get("parts") != made["parts"]:
         raise SimulationError(f"{parts} holds other parts than those that {name} was made of")
+    if spec is not None and read_spec(spec).describe() != made["spec"]:
+        raise SimulationError(f"{spec} or a file that it names differs from what {name} was made of")
     return recipe
 
 
@@ -119,6 +132,8 @@ def recorded(recipe: Recipe) -> dict[str, Any]:
         used["keep"] = list(recipe.keep)  # as the file gives it back
     if "parts" in FAMILIES[recipe.family].options:
         used |= _source(recipe.parts).describe()
+    if recipe.spec is not None:
+        used["spec"] = read_spec(recipe.spec).describe()
     return {
         "program": f"ast_sim {ast_sim.__version__}",
         "versions": _versions(recipe),
@@ -142,7 +157,11 @@ def difference(found: dict[str, Any], wanted: dict[str, Any], there: str = "ther
 
 
 def check_parts(recipe: Recipe) -> None:
-    """Raise SimulationError if one of the user's parts is broken."""
+    """Raise an error if one of the user's parts is broken, or a specification gives scenes that cannot be made."""
+    if recipe.spec is not None:
+        from ast_sim.simulate.families import assembly
+
+        assembly.check_spec(read_spec(recipe.spec), recipe.nodes, recipe.frames)
     if recipe.parts is not None:
         _source(recipe.parts).check()
 
@@ -168,7 +187,10 @@ def _versions(recipe: Recipe) -> dict[str, str | None]:
 
 
 def _command(recipe: Recipe) -> str:
-    words = ["ast-sim", "generate", recipe.family, "--seed", str(recipe.seed), "--nodes", str(recipe.nodes)]
+    words = ["ast-sim", "generate", recipe.family, *([] if recipe.spec is None else [Path(recipe.spec).name])]
+    words += ["--seed", str(recipe.seed)]
+    if recipe.nodes is not None:
+        words += ["--nodes", str(recipe.nodes)]
     if recipe.frames is not None:
         words += ["--frames", str(recipe.frames)]
     if recipe.solver != "own":

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.families.names import family_module
 from ast_sim.simulate.mechanics.case import Drawn
 from ast_sim.simulate.mechanics.unfinished import Checkpoint
+from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.support.disk import replacing
 from ast_sim.support.provenance import processor
 
@@ -36,20 +38,22 @@ class Recipe:
     Attributes:
         family: scene family.
         seed: the seed of all random draws.
-        nodes: about how many nodes a scene has.
+        nodes: about how many nodes a scene has; None: as the specification of an assembly says.
         frames: frames of a scene, for families that have this option.
         solver: "own" or "calculix".
         parts: a file or folder of the user's parts, for families that have this option.
         patient: whether the own solver may take any number of Newton iterations for a frame.
+        spec: the specification of an assembly, for the family `assembly`.
         keep: the frames that are solved and stored after frame 0, by their numbers in the whole motion; None: all.
     """
 
     family: str
     seed: int
-    nodes: int
+    nodes: int | None
     frames: int | None = None
     solver: str = "own"
     parts: str | None = None
+    spec: str | None = None
     patient: bool = False
     keep: tuple[int, ...] | None = None
 
@@ -64,7 +68,7 @@ def make_sample(recipe: Recipe, split: str, index: int, checkpoint: Checkpoint |
         checkpoint: where an unfinished solve is kept. If there is one already, it goes on.
     """
     module = family_module(recipe.family)
-    case = module.draw(_random(recipe, split, index), recipe.nodes, **_options(recipe))
+    case = _drawn_assembly(recipe, split, index).case if recipe.spec else _draw(module.draw, recipe, split, index)
     if recipe.keep is not None:
         case = replace(case, targets=case.targets[[0, *recipe.keep]])
     if recipe.solver == "calculix":
@@ -73,18 +77,31 @@ def make_sample(recipe: Recipe, split: str, index: int, checkpoint: Checkpoint |
         trajectory = calculix.quasi_static(case)
     else:
         trajectory = module.solve(case, checkpoint, recipe.patient)
+    if recipe.spec is not None:
+        trajectory = module.in_newton(trajectory, read_spec(recipe.spec).unit)
     trajectory.attributes.update(seed=recipe.seed, index=index)
     return trajectory
 
 
 def draw_sample(recipe: Recipe, split: str, index: int) -> Drawn:
     """The scene of a sample of a family without inertia, with all frames of its motion, and its other meshes."""
-    module = family_module(recipe.family)
-    return module.draw_geometry(_random(recipe, split, index), recipe.nodes, **_options(recipe))
+    if recipe.spec is not None:
+        return _drawn_assembly(recipe, split, index)
+    return _draw(family_module(recipe.family).draw_geometry, recipe, split, index)
 
 
-def _random(recipe: Recipe, split: str, index: int) -> np.random.Generator:
-    return np.random.default_rng(np.random.SeedSequence(recipe.seed, spawn_key=(SPLITS.index(split), index)))
+def _draw(draw: Callable[..., Any], recipe: Recipe, split: str, index: int) -> Any:
+    """What `draw` or `draw_geometry` of a family gives."""
+    seeds = np.random.SeedSequence(recipe.seed, spawn_key=(SPLITS.index(split), index))
+    return draw(np.random.default_rng(seeds), recipe.nodes, **_options(recipe))
+
+
+def _drawn_assembly(recipe: Recipe, split: str, index: int) -> Drawn:
+    from ast_sim.simulate.families import assembly
+
+    assert recipe.spec is not None and recipe.frames is not None
+    sample = (recipe.seed, SPLITS.index(split), index)
+    return assembly.draw_scene(read_spec(recipe.spec), sample, recipe.nodes, recipe.frames)
 
 
 def _options(recipe: Recipe) -> dict[str, Any]:

@@ -9,6 +9,7 @@ one place only (`load_ipctk`).
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,8 +33,9 @@ class ContactSettings:
         dhat: distance in metres below which surfaces repel each other.
         stiffness: barrier stiffness in pascal, about Young's modulus.
         friction: Coulomb's coefficient of friction. At 0 no term of friction is computed.
-        self_contact: whether a body is kept from touching itself. At rest, nodes that do not share an element must then
-            be further apart than dhat.
+        self_contact: whether bodies are kept from passing through themselves, or the numbers of those that are. At
+            rest, nodes of them that do not share an element must be further apart than dhat.
+        pair_friction: other coefficients of friction between two bodies: (body, body, coefficient).
 
     Raises:
         SimulationError: a value is not allowed.
@@ -42,14 +44,26 @@ class ContactSettings:
     dhat: float
     stiffness: float
     friction: float = 0.0
-    self_contact: bool = False
+    self_contact: bool | tuple[int, ...] = False
+    pair_friction: tuple[tuple[int, int, float], ...] = ()
 
     def __post_init__(self) -> None:
-        if not (self.dhat > 0 and self.stiffness > 0 and self.friction >= 0):
+        least = min([self.friction, *(coefficient for _, _, coefficient in self.pair_friction)])
+        if not (self.dhat > 0 and self.stiffness > 0 and least >= 0):
             raise SimulationError(
                 "contact needs a distance dhat and a stiffness above 0 and a friction of at least 0:"
-                f" got {self.dhat}, {self.stiffness}, {self.friction}"
+                f" got {self.dhat}, {self.stiffness}, {least}"
             )
+
+    @property
+    def has_friction(self) -> bool:
+        """Whether a term of friction is computed."""
+        return self.friction > 0 or any(coefficient > 0 for _, _, coefficient in self.pair_friction)
+
+    def friction_between(self, first: int, second: int) -> float:
+        """The coefficient of friction between two bodies."""
+        pairs = (coefficient for a, b, coefficient in self.pair_friction if {a, b} == {first, second})
+        return next(pairs, self.friction)
 
 
 def load_ipctk():
@@ -120,13 +134,17 @@ class Contact:
         self.num_nodes = len(rest)
         self.nodes, local_faces = np.unique(faces, return_inverse=True)
         local_faces = np.asfortranarray(local_faces.reshape(-1, 3), dtype=np.int32)
+        self._body = body[self.nodes].astype(float)
         vertices, edges = self._vertices(rest), ipctk.edges(local_faces)
         self._mesh = ipctk.CollisionMesh(vertices, edges, local_faces)
         self._skin = (SELF_CONTACT_SKIN if settings.self_contact else SKIN) * settings.dhat
         if not settings.self_contact:
             self._mesh.can_collide = ipctk.VertexPatchesCanCollide(body[self.nodes].astype(np.int32))
-        elif rigid is not None:
-            patch = np.where(rigid, body, body.max() + 1 + np.arange(len(rest)))  # other nodes: a patch each
+        elif rigid is not None or settings.self_contact is not True:
+            alone = np.zeros(len(rest), bool) if rigid is None else rigid
+            if settings.self_contact is not True:
+                alone = alone | ~np.isin(body, settings.self_contact)
+            patch = np.where(alone, body, body.max() + 1 + np.arange(len(rest)))  # other nodes: a patch each
             self._mesh.can_collide = ipctk.VertexPatchesCanCollide(patch[self.nodes].astype(np.int32))
         self._whole_mesh = ipctk.CollisionMesh(vertices, edges, local_faces)
         self._barrier = ipctk.BarrierPotential(settings.dhat, True)
@@ -180,7 +198,13 @@ class Contact:
         """
         pairs = self._ipctk.TangentialCollisions()
         stiffness, friction = self.settings.stiffness, self.settings.friction
-        pairs.build(self._mesh, state.vertices, state.collisions, self._barrier, stiffness, friction)
+        arguments = self._mesh, state.vertices, state.collisions, self._barrier, stiffness
+        if self.settings.pair_friction:
+            between = functools.cache(self.settings.friction_between)
+            # ipctk blends the coefficients of two vertices; here they are numbers of bodies.
+            pairs.build(*arguments, self._body, self._body, lambda a, b: between(round(a), round(b)))
+        else:
+            pairs.build(*arguments, friction)
         self._sliding = pairs, self._vertices(start)
 
     def _new_collisions(self):

@@ -132,7 +132,7 @@ class BackwardEuler(Newton):
         self._inertia.weight = self.mass / step**2
         self._inertia.predicted = inertial + step**2 * self._gravity
         self.restart(start)
-        friction_passes = 0 if self.contact.settings.friction == 0 else self.settings.friction_passes
+        friction_passes = self.settings.friction_passes if self.contact.settings.has_friction else 0
         if friction_passes:
             self._lag_friction(start)
         # Start where inertia takes the nodes: few Newton steps are left from there. If nodes collide on the way, start

@@ -152,7 +152,7 @@ class Newton:
         """
         self.restart(self.position)
         start = self.position
-        if self.contact.settings.friction == 0:
+        if not self.contact.settings.has_friction:
             self._move(target)
             self._equilibrate()
             return

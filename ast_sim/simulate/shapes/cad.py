@@ -29,6 +29,7 @@ MESHING_MODULE = "ast_sim.simulate.shapes.cad_worker"
 WORKER = [sys.executable, "-P", "-m", MESHING_MODULE]
 START_SECONDS = 60  # limit on the processor time in which gmsh starts and builds the geometry
 NODES_PER_SECOND = 200  # slowest meshing allowed; both limits are ten times the usual time
+OWN_SECONDS = 600  # limit where the size of the elements, and so the number of nodes, is the user's
 PATIENCE = 30  # on the clock this many times the limit may pass: then gmsh sleeps and is stopped
 
 Steps = list[dict[str, Any]]
@@ -76,6 +77,34 @@ def mesh_parts(requests: list[dict[str, Any]], names: list[str], nodes: int, sec
         position, elements = answer[f"position_{i}"], answer[f"elements_{i}"]
         result.append(Part(position, oriented(position, elements), name))
     return result
+
+
+def mesh_own_scale(requests: list[dict[str, Any]]) -> list[dict[str, np.ndarray]]:
+    """Mesh parts in the coordinates of their files, each with its own element size.
+
+    Args:
+        requests: one for each part, as `ast_sim.simulate.shapes.own_scale` describes them.
+
+    Returns:
+        For each part `position` [N,3], `elements` [E,4] or [F,3], and `group NAME`: the numbers of the nodes of each
+        named group.
+
+    Raises:
+        MeshingFailed, SimulationError: as `mesh_parts`; the text names the part or the parts.
+    """
+    names = " or ".join(dict.fromkeys(part["name"] for part in requests))
+    try:
+        answer = _ask({"parts": [], "nodes": 0, "own": requests}, OWN_SECONDS)
+    except MeshingFailed as error:
+        named = any(str(error).startswith(part["name"]) for part in requests)
+        raise error if named else MeshingFailed(f"{names}: {error}") from error
+    found: list[dict[str, np.ndarray]] = [{} for _ in requests]
+    for key, array in answer.items():
+        kind, _, rest = key.removeprefix("own_").partition("_")
+        number, _, name = rest.partition("_")
+        if key.startswith("own_"):
+            found[int(number)][f"group {name}" if kind == "group" else kind] = array
+    return found
 
 
 def _ask(request: dict[str, Any], seconds: int) -> dict[str, np.ndarray]:

@@ -7,7 +7,7 @@ crashes and hangs on bad geometry and is under the GPL, so no other process of t
 A request: {"parts": [...], "nodes": wanted number of nodes of all parts, "seconds": limit on the processor time}. Each
 part is {"solid": steps of the grammar (see `cad.py`)}, {"step": path} or {"stl": path}.
 The answer: position_i and elements_i of each part, scale_i (the length by which the coordinates of the file were
-divided), and the version of gmsh.
+divided), and the version of gmsh. Parts that keep their own scale are asked for under "own": see `own_scale`.
 """
 
 from __future__ import annotations
@@ -23,13 +23,19 @@ from typing import Any
 
 import numpy as np
 
-CREASE_ANGLE = math.radians(40)  # edges of an STL surface sharper than this are edges of the part
+from ast_sim.simulate.shapes import own_scale
+from ast_sim.simulate.shapes.cad_import import (
+    BadPart,
+    import_step,
+    is_top,
+    one_solid,
+    solid_of_surface,
+    surface_triangles,
+    tetrahedra,
+)
+
 MESHES = 5  # at most this many meshes are made to find the element size
 NODE_TOLERANCE = 0.1  # a mesh whose number of nodes is this near to the wanted one is good enough
-
-
-class BadPart(Exception):
-    """What is wrong with a part, in words."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +80,7 @@ def main() -> None:
         gmsh.option.setNumber(name, value)
     arrays = {"version": np.array(gmsh.option.getString("General.Version"))}
     try:
+        arrays |= own_scale.answer(gmsh, request.get("own", []))
         models = [_load(gmsh, f"part {i}", part) for i, part in enumerate(request["parts"])]
         meshes = _mesh_all(gmsh, models, request["nodes"]) if models else []
     except BadPart as error:
@@ -99,39 +106,17 @@ def _load(gmsh, name: str, part: dict[str, Any]) -> Model:
         return _load_stl(gmsh, name, part)
     occ, scale = gmsh.model.occ, 1.0
     if "step" in part:
-        _import_step(gmsh, part["step"])
+        import_step(gmsh, part["step"])
         scale = _to_unit_diagonal(gmsh)
     else:
         _build(occ, part["solid"])
     occ.synchronize()
-    volumes = gmsh.model.getEntities(3)
-    if not volumes:
-        raise BadPart(f"it holds no closed solid{_open_edge(gmsh, scale)}")
-    if len(volumes) > 1:
-        boxes = [[scale * x for x in occ.getCenterOfMass(*volume)] for volume in volumes[:2]]
-        raise BadPart(
-            f"it holds {len(volumes)} separate solids (the first two around {_point(boxes[0])} and"
-            f" {_point(boxes[1])}); a part is one solid: export each to a file of its own"
-        )
-    volume = occ.getMass(*volumes[0])
+    one_solid(gmsh, scale)
+    volume = occ.getMass(*gmsh.model.getEntities(3)[0])
     area = sum(occ.getMass(*surface) for surface in gmsh.model.getEntities(2))
     if not volume > 1e-6:
         raise BadPart(f"its volume is {volume * scale**3:.3g}, as good as zero for its size")
     return Model(name, part, volume, area, scale)
-
-
-def _import_step(gmsh, path: str) -> None:
-    """Import all shapes. If there is no solid among them, sew their faces together and make one solid of them."""
-    for heal in (0, 1):
-        gmsh.option.setNumber("Geometry.OCCSewFaces", heal)
-        gmsh.option.setNumber("Geometry.OCCMakeSolids", heal)
-        gmsh.model.occ.importShapes(path, highestDimOnly=False)
-        gmsh.model.occ.synchronize()
-        if gmsh.model.getEntities(3):
-            return
-        if not heal:
-            gmsh.model.occ.remove(gmsh.model.occ.getEntities(), recursive=True)
-            gmsh.model.occ.synchronize()
 
 
 def _to_unit_diagonal(gmsh) -> float:
@@ -143,31 +128,8 @@ def _to_unit_diagonal(gmsh) -> float:
         raise BadPart("it holds no surface at all")
     if not (math.isfinite(diagonal) and diagonal > 0):
         raise BadPart(f"its size is {diagonal}")
-    occ.dilate([entity for entity in occ.getEntities() if _is_top(gmsh, entity)], 0, 0, 0, *[1 / diagonal] * 3)
+    occ.dilate([entity for entity in occ.getEntities() if is_top(gmsh, entity)], 0, 0, 0, *[1 / diagonal] * 3)
     return diagonal
-
-
-def _is_top(gmsh, entity: tuple[int, int]) -> bool:
-    """Whether this shape is not the boundary of another. Scaling a shape scales its boundary, too."""
-    return entity[0] == 3 or not len(gmsh.model.getAdjacencies(*entity)[0])
-
-
-def _open_edge(gmsh, scale: float) -> str:
-    """Where a shell is open: a point of an edge that bounds only one face. (A seam bounds its face twice.)"""
-    uses: dict[int, int] = {}
-    for surface in gmsh.model.getEntities(2):
-        for _, curve in gmsh.model.getBoundary([surface], combined=False, oriented=False):
-            uses[abs(curve)] = uses.get(abs(curve), 0) + 1
-    single = [curve for curve, count in uses.items() if count == 1]
-    if not single:
-        return ""
-    low, high = gmsh.model.getParametrizationBounds(1, single[0])
-    where = [scale * x for x in gmsh.model.getValue(1, single[0], [(low[0] + high[0]) / 2])]
-    return f": its shell is open, {len(single)} edges bound only one face, the first at {_point(where)}"
-
-
-def _point(x) -> str:
-    return "(" + ", ".join(f"{value:.6g}" for value in x) + ")"
 
 
 def _build(occ, steps: list[dict[str, Any]]) -> None:
@@ -203,29 +165,16 @@ def _slab(occ, at: list[float], size: list[float], corner: float) -> int:
 def _load_stl(gmsh, name: str, part: dict[str, Any]) -> Model:
     """A closed surface of triangles, cut along its creases into faces. gmsh meshes these faces anew."""
     gmsh.merge(part["stl"])
-    mesh = gmsh.model.mesh
-    triangles = _triangles(gmsh)
+    triangles = surface_triangles(gmsh)
     if not len(triangles):
         raise BadPart("it holds no triangles")
     scale = float(np.linalg.norm(np.ptp(triangles.reshape(-1, 3), axis=0)))
-    mesh.classifySurfaces(CREASE_ANGLE, True, True, math.pi)
-    mesh.createGeometry()
-    loop = gmsh.model.geo.addSurfaceLoop([tag for _, tag in gmsh.model.getEntities(2)])
-    gmsh.model.geo.addVolume([loop])
-    gmsh.model.geo.synchronize()
+    solid_of_surface(gmsh)
     a, b, c = np.moveaxis(triangles / scale, 1, 0)
     normal = np.cross(b - a, c - a)
     volume = float(np.einsum("ij,ij->", a, normal)) / 6
     area = float(np.linalg.norm(normal, axis=1).sum()) / 2
     return Model(name, part, abs(volume), area, scale, unit=scale)
-
-
-def _triangles(gmsh) -> np.ndarray:
-    tags, coordinates, _ = gmsh.model.mesh.getNodes()
-    index = np.zeros(int(tags.max(initial=0)) + 1, int)
-    index[tags] = np.arange(len(tags))
-    _, nodes = gmsh.model.mesh.getElementsByType(2)
-    return coordinates.reshape(-1, 3)[index[nodes]].reshape(-1, 3, 3)
 
 
 def _mesh_all(gmsh, models: list[Model], nodes: int) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -266,14 +215,8 @@ def _mesh(gmsh, model: Model, size: float) -> tuple[np.ndarray, np.ndarray]:
     gmsh.option.setNumber("Mesh.MeshSizeMin", size * model.unit)
     gmsh.option.setNumber("Mesh.MeshSizeMax", size * model.unit)
     gmsh.model.mesh.generate(3)
-    tags, coordinates, _ = gmsh.model.mesh.getNodes()
-    _, elements = gmsh.model.mesh.getElementsByType(4)
-    if not len(elements):
-        raise BadPart("no tetrahedra came out: its surface does not enclose a volume")
-    used, elements = np.unique(elements, return_inverse=True)
-    index = np.zeros(int(tags.max()) + 1, int)
-    index[tags] = np.arange(len(tags))
-    return coordinates.reshape(-1, 3)[index[used]] / model.unit, elements.reshape(-1, 4)
+    position, elements, _ = tetrahedra(gmsh)
+    return position / model.unit, elements
 
 
 if __name__ == "__main__":

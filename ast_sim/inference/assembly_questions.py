@@ -1,0 +1,71 @@
+"""Questions about an assembly: its scene and its motion, from a specification and values of its parameters."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ast_sim.prescribed_motion import Motion
+from ast_sim.runs.scope import Scope
+from ast_sim.scene import Scene
+from ast_sim.simulate.families.assembly import scene_of
+from ast_sim.simulate.own_assembly.parameters import Values, completed
+from ast_sim.simulate.own_assembly.spec_reader import read_spec
+from ast_sim.simulate.own_assembly.standing import reference
+from ast_sim.support.errors import ConfigError
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """A scene of an assembly that is to be predicted.
+
+    Attributes:
+        scene, motion: as `Run.predict` takes them.
+        values: the values of all parameters.
+        origin: [3] the point that positions are relative to.
+    """
+
+    scene: Scene
+    motion: Motion
+    values: Values
+    origin: list[float]
+
+
+def ask(
+    spec: str | os.PathLike[str],
+    rows: Sequence[Mapping[str, Any]],
+    scope: Scope,
+    frames: int | None = None,
+    nodes: int | None = None,
+) -> list[Asked]:
+    """The scenes with these values of the parameters; equal scenes are one object, which is prepared once.
+
+    Args:
+        spec: the file of the specification.
+        rows: values by name; parameters that a row leaves out are in the middle of their ranges.
+        scope: what the model was trained on.
+        frames: frames of the motion; None: those of the specification.
+        nodes: about how many nodes a scene has; None: by the sizes of the specification.
+
+    Raises:
+        ConfigError: the specification has a mistake, there is no such parameter, or its unit is not that of the run.
+        SimulationError: a scene cannot be made; the text names the values.
+    """
+    read = read_spec(spec)
+    if read.unit != scope.length_unit:
+        raise ConfigError(
+            f"{Path(spec).name} has lengths in {read.unit}, but the run was trained in {scope.length_unit}"
+        )
+    shared, found, known = reference(read), [], {}
+    for row in rows:
+        values = completed(read.parameters, row)
+        case = scene_of(read, values, nodes, frames or read.frames, shared).case
+        arrays = (case.scene.rest_position, case.scene.elements, case.scene.node_type, case.scene.material)
+        scene = known.setdefault(tuple(np.asarray(array).tobytes() for array in arrays), case.scene)
+        found.append(Asked(scene, Motion(case.targets.astype(np.float32)), values, list(shared.origin)))
+    return found

@@ -1,0 +1,126 @@
+"""A sweep: one quantity or more over many values of the parameters of an assembly, predicted in batches."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from ast_sim.inference.answer import Answer
+from ast_sim.inference.assembly_questions import ask
+from ast_sim.inference.predict import Motions
+from ast_sim.runs.scope import Scope
+from ast_sim.scene import Scene
+from ast_sim.support.errors import ConfigError
+from ast_sim.view import sweep_files
+from ast_sim.view.files import make_folder
+
+TOGETHER = 64  # so many scenes are prepared and predicted at a time
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """What a sweep has found.
+
+    Attributes:
+        rows: one for each set of values: the parameters by name, then `travel_of_nodes` (the largest way of a
+            prescribed node), `reaction` (newton) with its components, `largest_stress` (pascal) and where it is
+            (`stress_at_x`, ...).
+        varied: the names of the parameters that differ between rows.
+        length_unit: unit of all lengths.
+        seconds: wall seconds of the model alone, for all rows.
+    """
+
+    rows: list[dict[str, Any]]
+    varied: tuple[str, ...]
+    length_unit: str
+    seconds: float
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write all rows as CSV; a missing folder is made.
+
+        Raises:
+            AstSimError: the file cannot be written.
+        """
+        make_folder(Path(path).parent)
+        sweep_files.write_table(path, self.rows)
+
+    def picture(self, path: str | os.PathLike[str], quantity: str = "reaction") -> None:
+        """Draw a quantity over the varied parameters (PNG): as curves over one or two, in colours over more.
+
+        Raises:
+            ConfigError: there is no such quantity, or nothing varies.
+            AstSimError: the file cannot be written.
+        """
+        make_folder(Path(path).parent)
+        sweep_files.write_picture(path, self.rows, self.varied, quantity, self.length_unit)
+
+
+class Predictor(Protocol):
+    """What a sweep needs of a `Run`."""
+
+    scope: Scope
+
+    @property
+    def jumps(self) -> bool: ...
+
+    def predict_scenes(
+        self,
+        asked: Sequence[tuple[Scene, Motions]],
+        names: Sequence[str],
+        frames: Sequence[int] | None = None,
+        corrections: int | None = None,
+        newton_steps: int | None = None,
+    ) -> list[Answer]: ...
+
+
+def sweep(
+    run: Predictor,
+    spec: str | os.PathLike[str],
+    rows: Sequence[Mapping[str, Any]],
+    corrections: int | None,
+    newton_steps: int | None,
+    nodes: int | None,
+) -> Sweep:
+    """Predict the last frame for each row of values; the arguments are those of `Run.sweep`."""
+    if not rows:
+        raise ConfigError("a sweep needs at least one row of values")
+    frames = 2 if run.jumps else None  # a model that jumps needs no frame between
+    table, seconds, notes = [], 0.0, []
+    for start in range(0, len(rows), TOGETHER):
+        asked = ask(spec, rows[start : start + TOGETHER], run.scope, frames, nodes)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            names = [f"row {start + number}" for number in range(len(asked))]
+            scenes = [(one.scene, one.motion) for one in asked]
+            answers = run.predict_scenes(scenes, names, [-1], corrections, newton_steps)
+        notes += [str(note.message) for note in caught]
+        table += [_row(one.values, answer, one.origin) for one, answer in zip(asked, answers, strict=True)]
+        seconds += sum(answer.seconds for answer in answers)
+    outside = {note.partition(":")[0] for note in notes}
+    if outside:
+        warnings.warn(
+            f"{len(outside)} of {len(rows)} rows lie outside the training scenes; the first: {notes[0]}", stacklevel=3
+        )
+    return Sweep(table, _varied(rows, table), run.scope.length_unit, seconds)
+
+
+def _row(values: Mapping[str, Any], answer: Answer, origin: Sequence[float]) -> dict[str, Any]:
+    if answer.failure is not None or not len(answer.position):
+        return {**values, "failure": answer.failure or "no frame was predicted"}
+    return {**values, **answer.figures(origin)[-1]}
+
+
+def _varied(rows: Sequence[Mapping[str, Any]], table: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+    """The names, in the order in which the user gave them."""
+    first = table[0]
+    given = {
+        part: None
+        for row in rows
+        for name, value in row.items()
+        for part in ([f"{one}.{name}" for one in value] if isinstance(value, Mapping) else [name])
+    }
+    return tuple(name for name in given if any(row[name] != first[name] for row in table))

@@ -1,0 +1,162 @@
+"""Scene family `assembly`: the parts of one product, from a specification of the user; see `simulate.own_assembly`.
+
+Lengths are in the unit of the specification. Forces and energies of a trajectory are in newton and joule all the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ast_sim.dataset.layout import LENGTH_UNITS
+from ast_sim.scene import Trajectory
+from ast_sim.simulate.mechanics.case import Drawn, SolidCase
+from ast_sim.simulate.mechanics.quasi_static import quasi_static
+from ast_sim.simulate.mechanics.solver import SolverSettings
+from ast_sim.simulate.mechanics.unfinished import Checkpoint
+from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
+from ast_sim.simulate.own_assembly.parameters import Values, completed, drawn, told
+from ast_sim.simulate.own_assembly.rest_check import BadAssembly, check
+from ast_sim.simulate.own_assembly.standing import PlacedPart, Reference, case, placed, reference
+from ast_sim.simulate.shapes.cad import MeshingFailed
+from ast_sim.simulate.shapes.mesh_check import BadMesh
+from ast_sim.support.errors import ConfigError, SimulationError
+
+DRAWS = 10  # draws of the parameters before a sample is given up
+MESHES, NODE_TOLERANCE = 4, 0.1  # so many meshes are made to come this near to a wanted number of nodes
+LEAST_SHARE = 0.97  # a coarser mesh has at most this share of the nodes, or there is none
+SETTINGS = SolverSettings(force_tolerance=1e-3, max_iterations=200)
+DEFAULT_NODES = None
+MINIMUM_NODES = 20
+MINIMUM_FRAMES = 2
+# Units of the solver, pascal and the unit of length, in newton and joule: so many lengths are in a product.
+_POWERS = {"reaction": 2, "elastic_energy": 3, "contact_energy": 3, "dissipation": 3, "work": 3}
+
+
+def info(spec: AssemblySpec) -> dict[str, Any]:
+    """The fields of `DatasetInfo` but the domain and the generator."""
+    shared = reference(spec)
+    return {
+        "family": "assembly",
+        "integration": "quasi_static",
+        "stress_location": "node",
+        "contact_radius": 3 * shared.contact_distance,
+        "time_step": 0.0,
+        "length_unit": spec.unit,
+    }
+
+
+def draw_scene(spec: AssemblySpec, sample: tuple[int, int, int], nodes: int | None, frames: int) -> Drawn:
+    """The scene of a sample.
+
+    Args:
+        sample: the seed, the number of the split, and the number of the sample in it.
+        nodes: about how many nodes it has; None: as the sizes of the specification give.
+        frames: frames of the motion.
+
+    Raises:
+        SimulationError: none of `DRAWS` draws gave a scene. The text says why the first did not.
+    """
+    first: SimulationError | None = None
+    shared = reference(spec)
+    for attempt in range(DRAWS):
+        values = drawn(spec.parameters, *sample, attempt)
+        try:
+            found = scene_of(spec, values, nodes, frames, shared)
+        except (BadMesh, MeshingFailed, BadAssembly) as error:
+            first = first or error
+            continue
+        case = replace(found.case, attributes={**found.case.attributes, "redrawn": attempt})
+        return replace(found, case=case)
+    raise SimulationError(f"none of {DRAWS} draws gave a scene; the first: {first}") from first
+
+
+def scene_of(
+    spec: AssemblySpec, values: Values, nodes: int | None, frames: int, shared: Reference | None = None
+) -> Drawn:
+    """The scene with these values of the parameters, checked, and its other meshes.
+
+    Raises:
+        BadMesh, MeshingFailed, BadAssembly: the text names the part, what is wrong, where, and the values.
+        ConfigError: a region holds no node, or a number is not allowed.
+    """
+    shared = shared or reference(spec)
+    try:
+        factor, parts = _sized(spec, values, nodes)
+        made = _checked(spec, values, frames, parts, shared)
+    except (BadMesh, MeshingFailed, BadAssembly) as error:
+        raise type(error)(f"with {told(spec.parameters, values)}: {error}") from error
+    except ConfigError as error:
+        raise ConfigError(f"{spec.path.name}, with {told(spec.parameters, values)}: {error}") from error
+    return Drawn(made, partial(_remeshed, spec, values, frames, shared, factor, made.scene.num_nodes))
+
+
+def check_spec(spec: AssemblySpec, nodes: int | None, frames: int) -> None:
+    """Make, but do not solve, the scene in the middle of all ranges and those at the ends of each range.
+
+    Raises:
+        SimulationError, ConfigError: as `scene_of`.
+    """
+    shared = reference(spec)
+    for values in ends_of_ranges(spec):
+        scene_of(spec, values, nodes, frames, shared)
+
+
+def ends_of_ranges(spec: AssemblySpec) -> Iterator[Values]:
+    """Values in the middle of all ranges, then those with one parameter at an end of its range."""
+    yield completed(spec.parameters, {})
+    for name, one in spec.parameters.items():
+        for end in one.ends if one.is_drawn else ():
+            yield completed(spec.parameters, {name: end})
+
+
+def solve(case: SolidCase, checkpoint: Checkpoint | None = None, patient: bool = False) -> Trajectory:
+    """Solve a drawn scene."""
+    return quasi_static(case, SETTINGS, checkpoint, patient)
+
+
+def in_newton(trajectory: Trajectory, unit: str) -> Trajectory:
+    """The trajectory with forces in newton and energies in joule; lengths and areas stay in the unit of length."""
+    attributes = dict(trajectory.attributes)
+    for name, power in _POWERS.items():
+        attributes[name] = (LENGTH_UNITS[unit] ** power * np.asarray(attributes[name])).tolist()
+    return replace(trajectory, attributes=attributes)
+
+
+def _sized(spec: AssemblySpec, values: Values, nodes: int | None) -> tuple[float, list[PlacedPart]]:
+    """The factor of all element sizes with which the scene has about that many nodes, and the parts."""
+    factor, parts = 1.0, placed(spec, values)
+    best = factor, parts
+    for _ in range(MESHES if nodes else 0):
+        count = sum(len(part.position) for part in parts)
+        if abs(count - nodes) < abs(sum(len(part.position) for part in best[1]) - nodes):
+            best = factor, parts
+        if abs(count - nodes) <= NODE_TOLERANCE * nodes:
+            break
+        factor *= (count / nodes) ** 0.4  # between the powers of surfaces and of volumes
+        parts = placed(spec, values, factor)
+    return best
+
+
+def _checked(spec: AssemblySpec, values: Values, frames: int, parts: list[PlacedPart], shared: Reference) -> SolidCase:
+    made = case(spec, values, frames, parts, shared)
+    check(spec, made, shared)
+    return made
+
+
+def _remeshed(
+    spec: AssemblySpec, values: Values, frames: int, shared: Reference, factor: float, nodes: int, share: float
+) -> SolidCase:
+    """The same scene on a mesh with that share of the nodes.
+
+    Raises:
+        BadMesh, MeshingFailed, BadAssembly: there is no such mesh.
+    """
+    made = _checked(spec, values, frames, placed(spec, values, factor * share**-0.4), shared)
+    if share < 1 and made.scene.num_nodes > LEAST_SHARE * nodes:
+        raise BadMesh("there is no coarser mesh of these parts")
+    return made

@@ -1,0 +1,110 @@
+"""A look at the scenes of an assembly before they are solved, and what a dataset of them will cost."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from ast_sim.scene import NodeType
+from ast_sim.simulate.families import assembly
+from ast_sim.simulate.jobs.pool import Worker
+from ast_sim.simulate.jobs.recipe import checked_recipe
+from ast_sim.simulate.jobs.samples import Recipe, draw_sample, load_sample, sample_path
+from ast_sim.simulate.mechanics.case import SolidCase
+from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
+from ast_sim.simulate.own_assembly.parameters import told
+from ast_sim.simulate.own_assembly.rest_check import gap_between
+from ast_sim.simulate.own_assembly.spec_reader import read_spec
+from ast_sim.support.errors import SimulationError
+
+SCENES = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """The first scenes of a dataset that is not made yet.
+
+    Attributes:
+        unit: unit of length.
+        cases: the scenes.
+        titles: the drawn values of each scene.
+        lines: what a person should check in the first scene.
+        mesh_seconds, solve_seconds: processor time that one scene takes.
+        status: whether the scene that was solved is complete, or why it is not.
+    """
+
+    unit: str
+    cases: list[SolidCase]
+    titles: list[str]
+    lines: list[str]
+    mesh_seconds: float
+    solve_seconds: float
+    status: str
+
+
+def look(spec: str | os.PathLike[str], *, seed: int = 0, nodes: int | None = None, frames: int | None = None) -> Look:
+    """Draw the first scenes of a specification, and solve one of them to see what it takes.
+
+    Args:
+        spec: the specification of an assembly.
+        seed, nodes, frames: as for `generate`.
+
+    Raises:
+        AstSimError: the specification has a mistake, a scene cannot be made, or the first one cannot be solved.
+    """
+    recipe = checked_recipe(assembly, "assembly", seed, nodes, frames, None, None, spec=Path(spec))
+    read = read_spec(spec)
+    assert recipe.frames is not None
+    assembly.check_spec(read, recipe.nodes, recipe.frames)
+    began = time.perf_counter()
+    cases = [draw_sample(recipe, "train", index).case for index in range(SCENES)]
+    mesh_seconds = (time.perf_counter() - began) / SCENES
+    titles = [told(read.parameters, _values(case)) for case in cases]
+    solve_seconds, status = _solved(recipe)
+    return Look(read.unit, cases, titles, list(_lines(read, cases[0])), mesh_seconds, solve_seconds, status)
+
+
+def _values(case: SolidCase) -> dict[str, float | str]:
+    return {key.removeprefix("parameter "): value for key, value in case.attributes.items() if "parameter " in key}
+
+
+def _lines(spec: AssemblySpec, case: SolidCase) -> Iterator[str]:
+    """What a person should check: the nodes of each part, what stands still and what moves, the gaps."""
+    scene, unit = case.scene, spec.unit
+    way = np.linalg.norm(case.targets - case.targets[0], axis=2).max(axis=0)
+    for number, part in enumerate(spec.parts):
+        nodes = scene.body == number
+        held = nodes & scene.prescribed
+        moved = held & (way > 0)
+        kind = "rigid" if part.rigid else f"{(nodes & (scene.node_type == NodeType.NORMAL)).sum()} free"
+        still = f", {(held & ~moved).sum()} stand still" if (held & ~moved).any() else ""
+        moves = f", {moved.sum()} move up to {way[moved].max():.4g} {unit}" if moved.any() else ""
+        yield f"{part.name}: {nodes.sum()} nodes ({kind}{still}{moves})"
+    for pair in combinations(range(len(spec.parts)), 2):
+        names = " and ".join(spec.parts[number].name for number in pair)
+        yield f"{names}: {gap_between(case, pair):.4g} {unit} apart"
+
+
+def _solved(recipe: Recipe) -> tuple[float, str]:
+    """The processor time in which a worker solves the first scene, and how that ended."""
+    with tempfile.TemporaryDirectory(prefix="ast_sim-") as folder:
+        worker = Worker(Path(folder), recipe)
+        try:
+            worker.give(("train", 0))
+            message = {"progress": 0}
+            while "progress" in message:
+                message = worker.receive()[-1]
+        finally:
+            worker.stop()
+        if "error" in message:
+            raise SimulationError(f"the first scene cannot be solved: {message['error']}")
+        trajectory, seconds = load_sample(sample_path(Path(folder), "train", 0))
+    stopped = trajectory.attributes.get("stopped_by", "complete")
+    return float(np.sum(seconds["solve_seconds"])), str(stopped)

@@ -1,0 +1,148 @@
+"""Arithmetic over the drawn parameters, such as "-travel * cos(skew)". Angles are in degrees, as everywhere."""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import math
+import operator
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ast_sim.support.errors import ConfigError
+
+_OPERATORS: dict[type, Callable[..., float]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: operator.pow,
+    ast.USub: operator.neg,
+    ast.UAdd: operator.pos,
+}
+FUNCTIONS: dict[str, Callable[..., float]] = {
+    "sin": lambda angle: math.sin(math.radians(angle)),
+    "cos": lambda angle: math.cos(math.radians(angle)),
+    "tan": lambda angle: math.tan(math.radians(angle)),
+    "sqrt": math.sqrt,
+    "abs": abs,
+    "min": min,
+    "max": max,
+}
+_MOST_LETTERS = 200
+
+
+@dataclass(frozen=True)
+class Expression:
+    """A number, or an arithmetic expression over parameters.
+
+    Attributes:
+        key: where it stands in the specification, for messages.
+        text: the expression.
+    """
+
+    key: str
+    text: str
+
+    @property
+    def names(self) -> set[str]:
+        """The parameters that it depends on."""
+        found = {node.id for node in ast.walk(self._tree) if isinstance(node, ast.Name)}
+        return found - FUNCTIONS.keys()
+
+    def __call__(self, values: Mapping[str, Any]) -> float:
+        """Its value for these values of the parameters.
+
+        Raises:
+            ConfigError: it cannot be computed, or the result is not finite.
+        """
+        try:
+            result = float(_value(self._tree, values))
+        except (ArithmeticError, ValueError, TypeError) as error:
+            raise ConfigError(f"{self.key} = {self.text!r} cannot be computed: {error}") from error
+        if not math.isfinite(result):
+            raise ConfigError(f"{self.key} = {self.text!r} is {result}; must be finite")
+        return result
+
+    @property
+    def _tree(self) -> ast.expr:
+        return ast.parse(self.text, mode="eval").body
+
+
+def expression(key: str, value: Any, known: Iterable[str]) -> Expression:
+    """The expression that a number or a text of the specification stands for.
+
+    Args:
+        key: where it stands.
+        value: what stands there.
+        known: the names of the parameters.
+
+    Raises:
+        ConfigError: it is neither, uses anything but arithmetic, or names an unknown parameter (the text gives the
+            nearest one).
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        raise ConfigError(f"{key} is {value!r}; must be a number or an expression such as '-travel'")
+    if not isinstance(value, str):
+        return _finite(Expression(key, repr(float(value))))
+    try:
+        if len(value) > _MOST_LETTERS:
+            raise ValueError("it is too long")
+        tree = ast.parse(value.strip(), mode="eval").body
+        _check(tree)
+    except (SyntaxError, ValueError, RecursionError) as error:
+        reason = error.msg if isinstance(error, SyntaxError) else error
+        raise ConfigError(f"{key} = {value!r} is no arithmetic of numbers and parameters: {reason}") from error
+    found = Expression(key, value.strip())
+    known = list(known)
+    for name in sorted(found.names - set(known)):
+        raise ConfigError(f"{key} = {value!r}: there is no parameter {name!r}{nearest(name, known)}")
+    return _finite(found) if not found.names else found
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """An ending for a message about an unknown name: the nearest known one, or all that there are."""
+    known = list(known)
+    close = difflib.get_close_matches(name, known, 1, 0.5)
+    if close:
+        return f"; did you mean {close[0]!r}?"
+    return f"; there are: {', '.join(known)}" if known else "; there are none"
+
+
+def _finite(found: Expression) -> Expression:
+    found({})
+    return found
+
+
+def _check(node: ast.expr) -> None:
+    if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load):
+        return
+    if isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool):
+        return
+    if isinstance(node, ast.BinOp) and type(node.op) in _OPERATORS:
+        _check(node.left)
+        _check(node.right)
+    elif isinstance(node, ast.UnaryOp) and type(node.op) in _OPERATORS:
+        _check(node.operand)
+    elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in FUNCTIONS:
+        if node.keywords or not node.args:
+            raise ValueError(f"{node.func.id} takes numbers")
+        for argument in node.args:
+            _check(argument)
+    else:
+        raise ValueError(f"{ast.unparse(node)!r} is not allowed; functions are {', '.join(FUNCTIONS)}")
+
+
+def _value(node: ast.expr, values: Mapping[str, Any]) -> float:
+    if isinstance(node, ast.Name):
+        return values[node.id]
+    if isinstance(node, ast.BinOp):
+        return _OPERATORS[type(node.op)](_value(node.left, values), _value(node.right, values))
+    if isinstance(node, ast.UnaryOp):
+        return _OPERATORS[type(node.op)](_value(node.operand, values))
+    if isinstance(node, ast.Call):
+        assert isinstance(node.func, ast.Name)
+        return FUNCTIONS[node.func.id](*(_value(argument, values) for argument in node.args))
+    assert isinstance(node, ast.Constant)
+    return node.value  # pyright: ignore[reportReturnType]

@@ -1,0 +1,89 @@
+"""Many values of the parameters: a grid over some of them, or the rows of a table."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+from collections.abc import Mapping, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ast_sim.support.errors import ConfigError
+
+MOST_ROWS = 100_000
+
+
+def parse_setting(text: str) -> tuple[str, list[Any]]:
+    """The parameter and the values of `NAME=VALUE[,VALUE...]` or `NAME=FIRST:LAST:COUNT`.
+
+    Raises:
+        ConfigError: the text has another form; the error gives examples.
+    """
+    name, found, values = (part.strip() for part in text.partition("="))
+    ends = values.split(":")
+    try:
+        if not (found and name and values):
+            raise ValueError(text)
+        if len(ends) == 3 and int(ends[2]) >= 1:
+            return name, np.linspace(float(ends[0]), float(ends[1]), int(ends[2])).tolist()
+        if len(ends) == 3:
+            raise ValueError(text)
+    except ValueError as error:
+        raise ConfigError(
+            f"{text!r} cannot be read; write travel=4.2, travel=1,2,3, travel=1:7:13 (from, to, how many) or"
+            " hook.file=long.step"
+        ) from error
+    return name, [_number_or_text(value.strip()) for value in values.split(",")]
+
+
+def grid(values: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """One row for each combination of the values; a number or a text stands for itself, a mapping for several
+    parameters as in `completed`.
+
+    Raises:
+        ConfigError: a parameter has no value, or there are too many rows.
+    """
+    flat: dict[str, Sequence[Any]] = {}
+    for name, value in values.items():
+        inner = {f"{part}.{name}": v for part, v in value.items()} if isinstance(value, Mapping) else {name: value}
+        for key, v in inner.items():
+            flat[key] = [v] if isinstance(v, str) or np.ndim(v) == 0 else list(v)
+            if not len(flat[key]):
+                raise ConfigError(f"{key} has no value")
+    count = math.prod(len(v) for v in flat.values())
+    if count > MOST_ROWS:
+        raise ConfigError(f"the grid has {count:,} rows; at most {MOST_ROWS:,}: take fewer values")
+    return [dict(zip(flat, row, strict=True)) for row in product(*flat.values())]
+
+
+def read_table(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
+    """The rows of a CSV file, whose first line names the parameters.
+
+    Raises:
+        ConfigError: it cannot be read, has no rows, or a row has another number of values.
+    """
+    try:
+        with open(Path(path), newline="", encoding="utf-8-sig") as file:
+            lines = [line for line in csv.reader(file) if line]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ConfigError(f"{path}: the table cannot be read: {error}") from error
+    if len(lines) < 2:
+        raise ConfigError(f"{path}: the table needs a line with the names of the parameters, and a row or more")
+    names = [name.strip() for name in lines[0]]
+    for number, line in enumerate(lines[1:], 2):
+        if len(line) != len(names):
+            raise ConfigError(f"{path}: row {number} has {len(line)} values, but there are {len(names)} names")
+    if len(lines) - 1 > MOST_ROWS:
+        raise ConfigError(f"{path}: the table has {len(lines) - 1:,} rows; at most {MOST_ROWS:,}")
+    return [{n: _number_or_text(v.strip()) for n, v in zip(names, line, strict=True)} for line in lines[1:]]
+
+
+def _number_or_text(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text

@@ -1,0 +1,186 @@
+"""The meshes of the parts in the coordinates of their files, times their scale."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ast_sim.importers.mesh_file import read_mesh
+from ast_sim.importers.places import Place
+from ast_sim.simulate.own_assembly.assembly_spec import (
+    CAD_ENDINGS,
+    SCRIPT_ENDINGS,
+    STL_ENDING,
+    AssemblySpec,
+    PartSpec,
+    script_and_function,
+)
+from ast_sim.simulate.own_assembly.expressions import nearest
+from ast_sim.simulate.own_assembly.parameters import Values
+from ast_sim.simulate.shapes.cad import gmsh_version, mesh_own_scale
+from ast_sim.simulate.shapes.mesh_check import BadMesh, check_mesh, check_no_intersections, check_surface, merged
+from ast_sim.simulate.shapes.parts import oriented, volumes
+from ast_sim.support.errors import ConfigError, MissingExtra
+
+SMALLEST_ANGLE = 1.0  # degrees between two faces of a tetrahedron: enough for the solver
+MESHES_KEPT = 64
+UNITS = {"m": "M", "cm": "CM", "mm": "MM", "um": "UM", "in": "INCH"}  # gmsh's names
+
+_kept: dict[str, PartMesh] = {}
+
+
+@dataclass(frozen=True, eq=False)
+class PartMesh:
+    """The mesh of a part.
+
+    Attributes:
+        name: the name of the part and of its file, for messages.
+        position: [N,3] float64 in the unit of the specification.
+        cells: [E,4] tetrahedra of positive volume; [F,3] triangles of a rigid surface.
+        groups: numbers of the nodes of each named group.
+        fields: [N] values of each point field.
+    """
+
+    name: str
+    position: np.ndarray
+    cells: np.ndarray
+    groups: dict[str, np.ndarray] = field(default_factory=dict)
+    fields: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def nodes_in(self, places: tuple[Place, ...], key: str) -> np.ndarray:
+        """[N] bool: the nodes in any of the places.
+
+        Raises:
+            ConfigError: a place holds no node, or there is no such field or group; the text begins with `key`.
+        """
+        nodes = np.zeros(len(self.position), bool)
+        for place in places:
+            inside = place.inside(self.position, lambda name: self._known("field", name, key) != 0, self._group(key))
+            if not inside.any():
+                ends = zip("xyz", self.position.min(axis=0), self.position.max(axis=0), strict=True)
+                box = ", ".join(f"{axis} from {low:.6g} to {high:.6g}" for axis, low, high in ends)
+                raise ConfigError(f"{key}: no node of {self.name} lies in {place.text!r}; it reaches in {box}")
+            nodes |= inside
+        return nodes
+
+    def _group(self, key: str) -> Any:
+        return lambda name: np.isin(np.arange(len(self.position)), self._known("group", name, key))
+
+    def _known(self, kind: str, name: str, key: str) -> np.ndarray:
+        known = self.fields if kind == "field" else self.groups
+        if name not in known:
+            raise ConfigError(f"{key}: {self.name} has no {kind} {name!r}{nearest(name, known)}")
+        return known[name]
+
+
+def part_meshes(spec: AssemblySpec, values: Values, factor: float = 1.0) -> list[PartMesh]:
+    """The meshes of all parts for these values of the parameters.
+
+    Args:
+        factor: all element sizes are multiplied by this.
+
+    Raises:
+        BadMesh, MeshingFailed: a part cannot be meshed, or its mesh cannot be used; the text names it.
+        DatasetError, ConfigError: a mesh file cannot be read, or a size is not above 0.
+        MissingExtra: a part needs gmsh, which is not installed.
+    """
+    requests = [_request(spec, part, values, factor) for part in spec.parts]
+    keys = [json.dumps(request, sort_keys=True) for request in requests]
+    new = {key: place for place, key in enumerate(keys) if key not in _kept}
+    cad = [place for place in new.values() if "size" in requests[place]]
+    if cad and gmsh_version() is None:
+        name = requests[cad[0]]["name"]
+        raise MissingExtra(f'gmsh is needed to mesh {name} but is not installed: pip install "ast_sim[cad]"')
+    sent = [{key: v for key, v in requests[place].items() if key not in ("scale", "stamp")} for place in cad]
+    meshed = dict(zip(cad, mesh_own_scale(sent) if sent else [], strict=True))
+    found = {key: _kept[key] for key in keys if key in _kept}
+    for key, place in new.items():
+        arrays, part = meshed.get(place), spec.parts[place]
+        found[key] = _from_file(part, requests[place]) if arrays is None else _meshed(part, requests[place], arrays)
+    _kept.update(found)
+    while len(_kept) > MESHES_KEPT:
+        del _kept[next(iter(_kept))]
+    return [found[key] for key in keys]
+
+
+def _request(spec: AssemblySpec, part: PartSpec, values: Values, factor: float) -> dict[str, Any]:
+    """All that the mesh of a part depends on; with "size", it is a request to gmsh."""
+    file = str(values[f"{part.name}.file"]) if len(part.files) > 1 else part.files[0]
+    path = spec.file(file)
+    changed = path.stat()
+    kind = path.suffix.lower()
+    request: dict[str, Any] = {"name": f"{part.name} ({file})", "scale": part.scale, "surface": part.rigid}
+    request["stamp"] = [str(path), changed.st_mtime_ns, changed.st_size]
+    if part.size is None:
+        return request
+    size = factor * part.size(values) / part.scale
+    finer = []
+    for one in part.finer:
+        box = [corner(values) / part.scale for corner in (*one.low, *one.high)]
+        finer.append({"box": box, "size": factor * one.size(values) / part.scale})
+    if min([size, *(one["size"] for one in finer)]) <= 0:
+        raise ConfigError(f"parts.{part.name}.size: the length of an element must be above 0")
+    request |= {"size": size, "finer": finer}
+    if kind in CAD_ENDINGS:
+        return request | {"step": str(path), "unit": UNITS[spec.unit]}
+    if kind == STL_ENDING:
+        _check_stl(path, request["name"])
+        return request | {"stl": str(path)}
+    assert kind in SCRIPT_ENDINGS
+    request["arguments"] = {name: one(values) for name, one in part.arguments.items()}
+    if kind == ".py":
+        return request | {"script": str(path), "function": script_and_function(file)[1]}
+    return request | {"geo": str(path)}
+
+
+def _check_stl(path: Path, name: str) -> None:
+    surface = read_mesh(path)
+    check_surface(*merged(surface.points, surface.elements), name)
+
+
+def _meshed(part: PartSpec, request: dict[str, Any], arrays: dict[str, np.ndarray]) -> PartMesh:
+    """What gmsh has meshed."""
+    groups = {key.removeprefix("group "): nodes for key, nodes in arrays.items() if key.startswith("group ")}
+    position, cells = part.scale * arrays["position"], arrays["elements"]
+    return _checked(PartMesh(request["name"], position, cells, groups), part.rigid)
+
+
+def _from_file(part: PartSpec, request: dict[str, Any]) -> PartMesh:
+    """A mesh, or a rigid surface, as it stands in its file."""
+    mesh = read_mesh(Path(request["stamp"][0]), curved=True)
+    used, elements = np.unique(mesh.elements, return_inverse=True)
+    elements, position = elements.reshape(-1, mesh.elements.shape[1]), part.scale * mesh.points[used]
+    fields = {
+        n: np.asarray(v)[used] for n, v in mesh.point_fields.items() if np.ndim(v) == 1 and v.dtype.kind in "iufb"
+    }
+    groups = {name: np.flatnonzero(np.isin(used, nodes)) for name, nodes in mesh.groups.items()}
+    if elements.shape[1] == 3:
+        if not np.isfinite(position).all():
+            raise BadMesh(f"{request['name']}: a corner is not finite")
+        position, elements = merged(position, elements)
+        fields, groups = {}, {}
+    return _checked(PartMesh(request["name"], position, elements, groups, fields), part.rigid)
+
+
+def _checked(mesh: PartMesh, rigid: bool) -> PartMesh:
+    """The mesh after all checks, its tetrahedra of positive volume.
+
+    Raises:
+        BadMesh: it cannot be used.
+    """
+    position, cells = mesh.position, mesh.cells
+    if cells.shape[1] == 3:
+        if not rigid:
+            raise BadMesh(
+                f"{mesh.name}: it holds triangles; a part that deforms needs tetrahedra, or a size to mesh it"
+            )
+        check_no_intersections(position, cells, mesh.name)
+        return mesh
+    if np.isfinite(position).all() and (volumes(position, cells) < 0).all():
+        cells = oriented(position, cells)
+    check_mesh(position, cells, mesh.name, SMALLEST_ANGLE)
+    return PartMesh(mesh.name, position, cells, mesh.groups, mesh.fields)

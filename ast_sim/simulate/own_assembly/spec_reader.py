@@ -1,0 +1,240 @@
+"""Reading the specification of an assembly from a TOML file; docs/reference/assembly.md explains every key."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import meshio
+
+from ast_sim.dataset.layout import LENGTH_UNITS
+from ast_sim.importers.places import Place, parse_places
+from ast_sim.simulate.own_assembly.assembly_spec import (
+    CAD_ENDINGS,
+    SCRIPT_ENDINGS,
+    STL_ENDING,
+    AssemblySpec,
+    Finer,
+    Move,
+    PartSpec,
+)
+from ast_sim.simulate.own_assembly.expressions import FUNCTIONS, Expression, nearest
+from ast_sim.simulate.own_assembly.parameters import Parameter, parameter, plain
+from ast_sim.simulate.own_assembly.spec_table import Table, Vector
+from ast_sim.support.errors import ConfigError
+
+DEFAULT_FRAMES = 6
+# Names of arguments of `Run.predict` and `Run.sweep`, which a parameter cannot have.
+RESERVED = ("scene", "motion", "spec", "table", "nodes", "frames", "corrections", "num_frames", "stress", "name")
+
+
+def read_spec(path: str | os.PathLike[str]) -> AssemblySpec:
+    """Read and check a specification. No part is read yet.
+
+    Raises:
+        ConfigError: the file is missing or no TOML, a key is unknown or missing, a value does not fit, or a file is
+            missing that it names.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+        values = tomllib.loads(text)
+    except (OSError, ValueError, RecursionError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ConfigError(f"{path}: the specification cannot be read: {reason}") from error
+    try:
+        return _spec(path.resolve(), text, Table(values, ""))
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def _spec(path: Path, text: str, table: Table) -> AssemblySpec:
+    unit, frames = table.text("unit"), table.take("frames", DEFAULT_FRAMES)
+    if unit not in LENGTH_UNITS:
+        told = "is missing" if unit is None else f"is {unit!r}"
+        raise ConfigError(f"unit {told}; say in which unit lengths are: {', '.join(LENGTH_UNITS)}")
+    if not isinstance(frames, int) or isinstance(frames, bool) or frames < 2:
+        raise ConfigError(f"frames is {frames!r}; must be a whole number of at least 2")
+    named = Table(table.take("parameters", {}), "parameters")
+    parameters: dict[str, Parameter] = {}
+    for name in named.values:
+        if not name.isidentifier() or name in (*FUNCTIONS, *RESERVED):
+            raise ConfigError(f"the parameter {name!r} needs another name, of letters, digits and _")
+        parameters[name] = parameter(name, named.take(name))
+    if "friction" in parameters and "friction" in table.values:
+        raise ConfigError("friction stands beside the parameters and among them: leave one out")
+    free = dict(parameters)
+    if "friction" not in parameters:
+        parameters["friction"] = parameter("friction", table.take("friction", 0.0), free)
+    parts = tuple(_part(name, value, free, parameters) for name, value in _parts(table).items())
+    distance = table.take("contact_distance")
+    if distance is not None and not (_is_number(distance) and distance > 0):
+        raise ConfigError(f"contact_distance is {distance!r}; must be a number above 0")
+    table.known = plain(free)
+    pairs = dict(_pair(row, [part.name for part in parts]) for row in table.tables("contact"))
+    table.done()
+    spec = AssemblySpec(path, text, unit, frames, distance, pairs, parameters, parts)
+    _check_used(spec, free)
+    _check_files(spec)
+    return spec
+
+
+def _parts(table: Table) -> dict[str, Any]:
+    parts = Table(table.take("parts", {}), "parts").values
+    if len(parts) < 2:
+        raise ConfigError(f"an assembly has two parts or more, [parts.NAME]; here {len(parts)}")
+    for name in parts:
+        if not name.isidentifier():
+            raise ConfigError(f"the part {name!r} needs a name of letters, digits and _")
+    return parts
+
+
+def _part(name: str, values: Any, free: dict[str, Parameter], parameters: dict[str, Parameter]) -> PartSpec:
+    """A part; its quantities are added to the parameters."""
+    table = Table(values, f"parts.{name}", plain(free))
+    rigid, files = table.flag("rigid"), table.take("file")
+    files = [files] if isinstance(files, str) else files
+    if not isinstance(files, list) or not files or not all(isinstance(file, str) for file in files):
+        raise ConfigError(f"{table.key('file')} is {files!r}; must be the name of a file, or of each variant")
+    if len(files) > 1:
+        parameters[f"{name}.file"] = Parameter(f"{name}.file", choices=tuple(files))
+    for quantity in ("young", "poisson"):
+        given = table.take(quantity)
+        if rigid and given is not None:
+            raise ConfigError(
+                f"{table.key(quantity)}: a rigid part has no {quantity}: leave it out, or leave out rigid"
+            )
+        if not rigid:
+            if given is None:
+                raise ConfigError(f"{table.key(quantity)} is missing; say what {name} is made of, or that it is rigid")
+            _add_material(parameters, f"{name}.{quantity}", given, free)
+    arguments = Table(table.take("arguments", {}), table.key("arguments"), plain(free))
+    scale = table.take("scale", 1.0)
+    if not (_is_number(scale) and scale > 0):
+        raise ConfigError(f"{table.key('scale')} is {scale!r}; must be a number above 0")
+    part = PartSpec(
+        name,
+        tuple(files),
+        {key: expression for key in arguments.values if (expression := arguments.number(key)) is not None},
+        float(scale),
+        table.number("size"),
+        tuple(_finer(row) for row in table.tables("finer")),
+        rigid,
+        table.flag("self_contact"),
+        _places(table, "fixed"),
+        tuple(_move(row, rigid) for row in table.tables("move")),
+        _placement(table),
+    )
+    table.done()
+    return part
+
+
+def _add_material(parameters: dict[str, Parameter], name: str, given: Any, free: dict[str, Parameter]) -> None:
+    found = parameter(name, given, free)
+    limit = 0.5 if name.endswith("poisson") else float("inf")
+    if found.formula is None and not (found.low >= 0 and found.high < limit and (limit == 0.5 or found.low > 0)):
+        wanted = "at least 0 and below 0.5" if limit == 0.5 else "above 0 (pascal)"
+        raise ConfigError(f"{name} is {found.low:g} to {found.high:g}; must be {wanted}")
+    parameters[name] = found
+
+
+def _move(table: Table, rigid: bool) -> Move:
+    where = _places(table, "where")
+    if rigid and where:
+        raise ConfigError(f"{table.key('where')}: a rigid part moves as a whole: leave it out")
+    if not rigid and not where:
+        raise ConfigError(f"{table.key('where')} is missing; say which nodes move, for example where = 'zmax'")
+    path, rotation = table.path("translation"), table.number("rotation")
+    if path is None and rotation is None:
+        raise ConfigError(f"{table.place} needs a translation, a rotation or both")
+    return _rigid_motion(table, where, path)
+
+
+def _rigid_motion(table: Table, places: tuple[Place, ...], path: tuple[Vector, ...] | None) -> Move:
+    axis, point = table.vector("axis", [0, 0, 1]), table.vector("point", [0, 0, 0])
+    rotation, still = table.number("rotation", 0), Table({"still": [0, 0, 0]}, table.place).path("still")
+    table.done()
+    assert axis is not None and point is not None and rotation is not None and still is not None
+    return Move(table.place, places, path or still, rotation, axis, point)
+
+
+def _placement(table: Table) -> Move:
+    """How a part stands: turned by `tilt`, then moved by `offset`."""
+    offset = table.vector("offset", [0, 0, 0])
+    tilt = Table(table.take("tilt", {}), table.key("tilt"), table.known)
+    assert offset is not None
+    return _rigid_motion(tilt, (), (offset,))
+
+
+def _finer(table: Table) -> Finer:
+    low, high, size = table.vector("low"), table.vector("high"), table.number("size")
+    table.done()
+    if low is None or high is None or size is None:
+        raise ConfigError(f"{table.place} needs low and high, two corners of a box, and size")
+    return Finer(low, high, size)
+
+
+def _places(table: Table, name: str) -> tuple[Place, ...]:
+    text = table.text(name)
+    try:
+        return () if text is None else tuple(parse_places(text))
+    except ValueError as error:
+        raise ConfigError(
+            f"{table.key(name)} = {text!r} cannot be read at {str(error)!r}; write for example 'zmin', 'xmin,xmax',"
+            " 'z<=2', '0<x<5 and y>1', 'field=NAME' or 'group=NAME'"
+        ) from error
+
+
+def _pair(table: Table, names: list[str]) -> tuple[tuple[int, int], Expression]:
+    pair, friction = table.take("parts"), table.number("friction")
+    if not isinstance(pair, list) or len(pair) != 2:
+        raise ConfigError(f"{table.key('parts')} is {pair!r}; must name two parts")
+    for name in pair:
+        if name not in names:
+            raise ConfigError(f"{table.key('parts')}: there is no part {name!r}{nearest(str(name), names)}")
+    if friction is None:
+        raise ConfigError(f"{table.key('friction')} is missing")
+    table.done()
+    first, second = sorted(names.index(name) for name in pair)
+    return (first, second), friction
+
+
+def _check_used(spec: AssemblySpec, free: dict[str, Parameter]) -> None:
+    """Refuse a parameter that nothing depends on: it is a slip of the pen."""
+    used: set[str] = set()
+    for part in spec.parts:
+        numbers = [*part.arguments.values(), *filter(None, [part.size])]
+        numbers += [one for finer in part.finer for one in (*finer.low, *finer.high, finer.size)]
+        for move in (*part.moves, part.placement):
+            numbers += [*(one for corner in move.path for one in corner), move.rotation, *move.axis, *move.point]
+        used |= {name for one in numbers for name in one.names}
+    formulas = [one.formula for one in spec.parameters.values() if one.formula is not None]
+    used |= {name for one in (*formulas, *spec.pair_friction.values()) for name in one.names} | {"friction"}
+    idle = [name for name in free if name not in used]
+    if idle:
+        raise ConfigError(f"nothing depends on the parameter {idle[0]!r}: use it, or leave it out")
+
+
+def _check_files(spec: AssemblySpec) -> None:
+    known = {*CAD_ENDINGS, *SCRIPT_ENDINGS, STL_ENDING, *meshio.extension_to_filetypes}
+    for part in spec.parts:
+        for name in part.files:
+            path = spec.file(name)
+            suffix = path.suffix.lower()
+            if suffix not in known:
+                raise ConfigError(f"parts.{part.name}.file: {name} is no STEP, STL, mesh, .geo or .py file")
+            if not path.is_file():
+                raise ConfigError(f"parts.{part.name}.file: there is no file {path}")
+            meshed = suffix in (*CAD_ENDINGS, *SCRIPT_ENDINGS, STL_ENDING)
+            if meshed and part.size is None and not (part.rigid and suffix == STL_ENDING):
+                raise ConfigError(f"parts.{part.name}.size is missing; {name} must be meshed: give the element length")
+            if not meshed and part.size is not None:
+                raise ConfigError(f"parts.{part.name}.size: {name} is a mesh already, and stays as it is: leave it out")
+            if part.arguments and suffix not in SCRIPT_ENDINGS:
+                raise ConfigError(f"parts.{part.name}.arguments: {name} is no script (.py, .geo) that takes any")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

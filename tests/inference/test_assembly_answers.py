@@ -1,0 +1,156 @@
+"""Questions about an assembly: a run that learned from one predicts it for other values, alone and in sweeps."""
+
+import csv
+import inspect
+import warnings
+
+import numpy as np
+import pytest
+from simulate.own_assembly.assemblies import SPEC, write_assembly
+
+import ast_sim
+from ast_sim.cli import main
+from ast_sim.inference.trained_run import Run
+from ast_sim.simulate.own_assembly.spec_reader import RESERVED
+from ast_sim.support.errors import ConfigError
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A specification and a run of a few steps; what it predicts is poor, but it is a prediction."""
+    folder = tmp_path_factory.mktemp("assembly")
+    spec = write_assembly(folder)
+    data = folder / "study.h5"
+    ast_sim.generate("assembly", data, spec=spec, train=4, valid=1, test=1, workers=1, progress=False)
+    return spec, ast_sim.train(data, folder / "run", steps=20, validate_every=20, checkpoint_every=20)
+
+
+def test_a_specification_with_values_is_a_scene(trained):
+    spec, run = trained
+    answer = run.predict(spec=spec, travel=1.2, young={"block": 1.5e6})
+    scene = answer.scene
+    assert answer.frames == (0, 1, 2) and answer.position.shape == (3, scene.num_nodes, 3) and answer.failure is None
+    assert np.unique(scene.material[:, 0]).tolist() == [0, 1.5e6]
+    punch = scene.body == 1
+    for frame in (0, 1, 2):
+        expected = scene.rest_position[punch] - np.float32([0, 0, 0.6 * frame])
+        np.testing.assert_allclose(answer.position[frame, punch], expected, atol=1e-6)
+    assert answer.source["parameter travel"] == 1.2 and answer.info.length_unit == "mm"
+    deepest = run.predict(spec=spec, travel=1.2, young={"block": 1.5e6}, frames=[-1])
+    assert np.array_equal(deepest.position[0], answer.position[2])
+
+
+def test_figures_of_an_answer(trained, tmp_path):
+    spec, run = trained
+    answer = run.predict(spec=spec, travel=1.2)
+    forces, figures = answer.reaction(), answer.figures()
+    assert forces.shape == (3, 3) and np.abs(forces[0]).max() < 1e-9
+    stress, deforming = answer.stress[2, :, 0], answer.scene.deforming_nodes
+    worst = int(np.argmax(np.where(deforming, stress, -1)))
+    assert figures[2]["travel_of_nodes"] == pytest.approx(1.2, abs=1e-5)
+    assert figures[2]["reaction"] == pytest.approx(np.linalg.norm(forces[2]))
+    assert figures[2]["largest_stress"] == stress[worst]
+    assert [figures[2][f"stress_at_{axis}"] for axis in "xyz"] == pytest.approx(answer.position[2, worst].tolist())
+    answer.save(tmp_path / "answer.csv")
+    rows = list(csv.DictReader((tmp_path / "answer.csv").open()))
+    assert [row["frame"] for row in rows] == ["0", "1", "2"]
+    assert float(rows[2]["reaction_z"]) == pytest.approx(forces[2, 2])
+
+
+def test_the_true_frames_have_the_forces_of_the_solver(trained):
+    """What `reaction` makes of the solver's own positions, in newton, is what the solver recorded."""
+    from dataclasses import replace
+
+    _, run = trained
+    with run.open() as data:
+        for index in range(3):
+            truth = data["train"][index]
+            answer = replace(run.predict(truth), position=truth.position)
+            found = np.linalg.norm(answer.reaction(), axis=1)
+            np.testing.assert_allclose(found, truth.attributes["reaction"], rtol=1e-3, atol=1e-6)
+
+
+def test_a_sweep_is_many_predictions(trained, tmp_path):
+    spec, run = trained
+    found = run.sweep(spec, travel=[0.6, 0.9, 1.2], young={"block": [1.2e6, 1.8e6]})
+    assert len(found.rows) == 6 and found.varied == ("travel", "block.young") and found.seconds > 0
+    for row in found.rows[1::3]:
+        alone = run.predict(spec=spec, travel=row["travel"], young={"block": row["block.young"]}).figures()[-1]
+        for key in ("reaction", "largest_stress", "stress_at_z", "travel_of_nodes"):
+            assert row[key] == pytest.approx(alone[key], rel=1e-3), key
+    found.save(tmp_path / "sweep.csv")
+    rows = list(csv.DictReader((tmp_path / "sweep.csv").open()))
+    assert [float(row["reaction"]) for row in rows] == [row["reaction"] for row in found.rows]
+    for quantity in ("reaction", "largest_stress"):
+        found.picture(tmp_path / "out" / f"{quantity}.png", quantity)
+        assert (tmp_path / "out" / f"{quantity}.png").stat().st_size > 10_000
+    with pytest.raises(ConfigError, match="no row has 'heat'"):
+        found.picture(tmp_path / "heat.png", "heat")
+    table = [{"travel": 0.6, "block.young": 1.2e6}, {"travel": 1.2, "block.young": 1.8e6}]
+    listed = run.sweep(spec, table=table).rows
+    for row, same in zip(listed, (found.rows[0], found.rows[5]), strict=True):
+        assert row["reaction"] == pytest.approx(same["reaction"], rel=1e-3)
+
+
+def test_rows_outside_the_training_are_told_once(trained):
+    spec, run = trained
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        run.sweep(spec, travel=[1.0, 2.4, 2.6])
+    (note,) = [str(one.message) for one in caught if "training scenes" in str(one.message)]
+    assert note.startswith(
+        "2 of 3 rows lie outside the training scenes; the first: row 1: prescribed nodes move up to 2.4"
+    )
+
+
+def test_wrong_questions(trained, tmp_path):
+    spec, run = trained
+    scene = run.predict(spec=spec).scene
+    metres = tmp_path / "metres"
+    metres.mkdir()
+    for call, line in (
+        (lambda: run.predict(spec=spec, travl=1), "there is no parameter 'travl'; did you mean 'travel'"),
+        (lambda: run.predict(scene, {1: (0, 0, -1)}, travel=1), "travel belongs to a specification: give spec"),
+        (lambda: run.predict(scene, spec=spec), "leave scene, motion and stress out"),
+        (lambda: run.predict(), "give a scene"),
+        (lambda: run.sweep(spec, table=[{"travel": 1}], travel=2), "a table has the values of all parameters"),
+        (lambda: run.sweep(spec, table=[]), "a sweep needs at least one row of values"),
+        (
+            lambda: run.predict(spec=write_assembly(metres, SPEC.replace('"mm"', '"m"'))),
+            "SPEC.toml has lengths in m, but the run was trained in mm",
+        ),
+    ):
+        with pytest.raises(ConfigError, match=line):
+            call()
+
+
+def test_names_that_parameters_cannot_have():
+    for method in (Run.predict, Run.sweep):
+        arguments = [p.name for p in inspect.signature(method).parameters.values() if p.kind != p.VAR_KEYWORD]
+        assert set(arguments) - {"self"} <= set(RESERVED)
+
+
+def test_the_command_line(trained, tmp_path, capsys):
+    spec, run = trained
+    out = tmp_path / "answer.csv"
+    words = ["predict", str(run.path), str(spec)]
+    assert main([*words, "--set", "travel=1.2", "--frames=-1", "--out", str(out)]) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert told[-1].startswith("frame 2: travel_of_nodes 1.2 mm, reaction ") and "largest_stress" in told[-1]
+    (row,) = csv.DictReader(out.open())
+    expected = run.predict(spec=spec, travel=1.2, frames=[-1]).figures()[0]
+    assert float(row["reaction"]) == pytest.approx(expected["reaction"], rel=1e-3)
+    assert main(["sweep", str(run.path), str(spec), "--set", "travel=0.6:1.2:3", "--out", str(tmp_path / "s.csv")]) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert told[0].startswith(f"{tmp_path / 's.csv'}: 3 rows, ") and told[1] == f"picture: {tmp_path / 's.png'}"
+    assert len(list(csv.DictReader((tmp_path / "s.csv").open()))) == 3 and (tmp_path / "s.png").exists()
+    for wrong, line in (
+        ([*words, "--set", "travel=1,2", "--out", str(tmp_path / "b.csv")], "ast-sim sweep predicts them all"),
+        ([*words, "--clamp", "0:zmin", "--out", str(tmp_path / "b.csv")], "--clamp has no meaning for"),
+        ([*words, "--move", "1=0,0,-1", "--out", str(tmp_path / "b.csv")], "says what moves: change its parameters"),
+        (["sweep", *words[1:], "--set", "travel=1", "--out", str(tmp_path / "b.txt")], "must end in .csv"),
+        (["sweep", *words[1:], "--set", "travel=1", "--out", str(tmp_path / "s.csv")], "exists: name another output"),
+    ):
+        assert main(wrong) == 2
+        (told_line,) = capsys.readouterr().err.strip().splitlines()
+        assert line in told_line
