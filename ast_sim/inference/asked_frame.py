@@ -78,11 +78,14 @@ def errors_by_effort(model: Simulator, truth: Trajectory, most: Effort) -> np.nd
     NaN where the prediction failed."""
     frame, free = max(deepest_frame(truth), model.config.given_frames), ~truth.scene.prescribed
     size, found = _rms(truth.position[frame] - truth.position[0], free), np.full((most[0] + 1, most[1] + 1), np.nan)
-    for corrections in range(len(found)):
-        effort = Effort(corrections, most.newton_steps)
-        (after,) = calls(model, [Question.of(truth, "validation", [frame])], effort)
-        if not isinstance(after, str) and size:
-            found[corrections] = [_rms(x[0] - truth.position[frame], free) / size for x in after[corrections:]]
+    for corrections in range(len(found)) if size else ():
+        for steps in (most.newton_steps, 0):  # where a Newton step fails, the calls before it still count
+            (after,) = calls(model, [Question.of(truth, "validation", [frame])], Effort(corrections, steps))
+            if not isinstance(after, str):
+                found[corrections, : steps + 1] = [
+                    _rms(x[0] - truth.position[frame], free) / size for x in after[corrections:]
+                ]
+                break
     return found
 
 

@@ -60,8 +60,9 @@ def newton_steps(config: ModelConfig, scene: Scene) -> NewtonSteps:
     Raises:
         SimulationError: the constants of the material are not allowed, or an element has no volume.
     """
-    material = NeoHookean(config.young, config.poisson)
-    if scene.material is not None and scene.material.shape[1] == 2:
+    if scene.material is None or scene.material.shape[1] != 2:
+        material = NeoHookean(config.young, config.poisson)
+    else:
         young, poisson = scene.material.astype(np.float64).T
         rigid = ~scene.deforming_nodes[scene.elements].any(axis=1)
         material = NeoHookean(np.where(rigid, 1.0, young), np.where(rigid, 0.0, poisson))
@@ -76,8 +77,10 @@ def cheapest_good(errors: np.ndarray) -> Effort:
 
     Returns:
         The effort with the fewest corrections and Newton steps together whose error is at most `GOOD`; of several, the
-        most accurate one. If there is none, the most accurate one of all.
+        most accurate one. If there is none, the most accurate one of all; the first call alone if no error is known.
     """
+    if np.isnan(errors).all():
+        return FIRST_CALL
     total = np.add.outer(*(np.arange(size) for size in errors.shape))
     good = np.where(errors <= GOOD, total, np.inf)
     chosen = np.where(good == good.min(), errors, np.inf) if np.isfinite(good.min()) else errors

@@ -79,7 +79,7 @@ ROWS = {
         settings={**_MIRRORED, "peak_rate": 1e-3}, rivals=0, **_PLATES,
     ),
     "plates1300": Row("Plates, 1,300 nodes", data="plates1300", nodes=1300, steps=9_000, settings=_MIRRORED, **_PLATES),
-    "parts400": Row("Pairs of parts, 400 nodes", steps=14_000, settings=_TURNED, rivals=5, **_PARTS),
+    "parts400": Row("Pairs of parts, 400 nodes", steps=9_000, settings=_TURNED, rivals=5, **_PARTS),
 }  # fmt: skip
 
 

@@ -18,7 +18,8 @@ from ast_sim.models.model_config import DataFacts
 from ast_sim.models.registry import find_preset
 from ast_sim.models.simulator import Prediction, Simulator
 from ast_sim.simulate.jobs.rival import deepest_frame
-from ast_sim.support.errors import ConfigError
+from ast_sim.simulate.mechanics.linearised_contact import NewtonSteps
+from ast_sim.support.errors import ConfigError, SimulationError
 from ast_sim.training.data_lengths import measure
 
 
@@ -84,7 +85,11 @@ def pressing(dataset, share):
     return truth, Share(settings, truth, deepest_frame(truth), share)
 
 
-def test_newton_steps_lead_from_the_answer_to_equilibrium(pressed):
+def collapse(self, position):
+    raise SimulationError("collapsed")
+
+
+def test_newton_steps_lead_from_the_answer_to_equilibrium(pressed, monkeypatch):
     truth, model = pressing(pressed, 0.7)
     frame = deepest_frame(truth)
     assert (
@@ -101,6 +106,9 @@ def test_newton_steps_lead_from_the_answer_to_equilibrium(pressed):
     held = truth.scene.prescribed
     assert np.array_equal(answer.position[0][held], truth.position[frame][held])
     table = errors_by_effort(model, truth, Effort(1, 3))
+    monkeypatch.setattr(NewtonSteps, "step", collapse)
+    assert np.isnan(errors_by_effort(model, truth, Effort(1, 3))[:, 1:]).all()
+    assert errors_by_effort(model, truth, Effort(1, 3))[:, 0].tolist() == table[:, 0].tolist()
     assert table.shape == (2, 4) and table[1].tolist() == errors[1:] and table[0, 0] == errors[0]
 
 
@@ -126,6 +134,7 @@ def test_the_default_effort_is_the_cheapest_that_is_good():
     assert cheapest_good(errors + 0.1) == Effort(2, 3)  # none is good: the most accurate
     errors[2] = np.nan
     assert cheapest_good(errors) == Effort(1, 2)
+    assert cheapest_good(np.full((3, 4), np.nan)) == Effort()
 
 
 def test_beside_the_solver(tmp_path):

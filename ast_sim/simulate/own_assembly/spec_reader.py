@@ -27,7 +27,19 @@ from ast_sim.support.errors import ConfigError
 
 DEFAULT_FRAMES = 6
 # Names of arguments of `Run.predict` and `Run.sweep`, which a parameter cannot have.
-RESERVED = ("scene", "motion", "spec", "table", "nodes", "frames", "corrections", "num_frames", "stress", "name")
+RESERVED = (
+    "scene",
+    "motion",
+    "spec",
+    "table",
+    "nodes",
+    "frames",
+    "corrections",
+    "newton_steps",
+    "num_frames",
+    "stress",
+    "name",
+)
 
 
 def read_spec(path: str | os.PathLike[str]) -> AssemblySpec:
