@@ -78,7 +78,10 @@ ROWS = {
         "Plates, 400 nodes, step by step, 12,000", data="plates400", nodes=400, steps=12_000, model={"jumps": False},
         settings={**_MIRRORED, "peak_rate": 1e-3}, rivals=0, **_PLATES,
     ),
-    "plates1300": Row("Plates, 1,300 nodes", data="plates1300", nodes=1300, steps=9_000, settings=_MIRRORED, **_PLATES),
+    "plates1300": Row(
+        "Plates, 1,300 nodes", data="plates1300", nodes=1300, steps=3_000, settings={**_SHORT, "validate_scenes": 10},
+        **{**_PLATES, "train": 60, "valid": 10, "test": 30},
+    ),
     "parts400": Row("Pairs of parts, 400 nodes", steps=9_000, settings=_TURNED, rivals=5, **_PARTS),
 }  # fmt: skip
 
