@@ -47,8 +47,7 @@ def evaluate(
         jumps: whether the model predicts each frame from the first one, so that its `one_step` errors are those of its
         rollout; corrections: how many calls correct the first call of such a model;
         asked: the deepest frame of each scene, see `asked_frames`; the solver is run in `rival_scenes` scenes;
-        speedup: the solver's recorded time for all frames, divided by the model's; None if it was not recorded, or if
-        the model has more than one thread, since the solver had one;
+        speedup: the solver's recorded time for all frames over the model's, both on one thread; else None;
         length_unit, stress_unit, threads.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The figures of an evaluation (`ast-sim evaluate --json`) and of a training, arranged for the report's page."""
+"""The figures of an evaluation (`ast-sim evaluate --out`) and of a training, arranged for the report's page."""
 
 from __future__ import annotations
 
