@@ -280,14 +280,16 @@ def evaluate(args: argparse.Namespace) -> None:
     from ast_sim import keep_memory
     from ast_sim.inference.trained_run import Run
 
-    if args.json is not None:
-        _check_output(args, args.json, [args.data])
+    if args.out is not None:
+        _check_output(args, args.out, [args.data])
+        if args.out.suffix != ".json":
+            raise ConfigError(f"--out {args.out}: the name of a file of figures must end in .json")
     keep_memory()
     found = Run(args.run_folder).evaluate(args.data, args.split, args.command_line, args.rivals)
     print(found)
-    if args.json is not None:
-        found.save(args.json)
-        print(f"all figures: {args.json}")
+    if args.out is not None:
+        found.save(args.out)
+        print(f"all figures: {args.out}")
 
 
 def report(args: argparse.Namespace) -> None:

@@ -114,6 +114,4 @@ def headlines(found: dict[str, Any]) -> list[str]:
             )
     if found["failures"]:
         lines.append(f"{found['failures']} of {len(found['samples'])} rollouts failed")
-    if found["speedup"] is not None:
-        lines.append(f"all frames: {found['speedup']:.3g} times as fast as the solver was when it made them")
     return lines + asked_frame.lines(found["asked"])

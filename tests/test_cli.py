@@ -164,7 +164,7 @@ def test_info_of_a_run(trained, capsys):
 
 def test_evaluate_prints_a_table_and_writes_all_figures(trained, tmp_path, capsys):
     data, run = trained
-    assert main(["evaluate", str(run), str(data), "--json", str(tmp_path / "evaluation.json")]) == 0
+    assert main(["evaluate", str(run), str(data), "--out", str(tmp_path / "evaluation.json")]) == 0
     shown = capsys.readouterr().out
     assert "hold_still" in shown and "stress_frame_mean" in shown
     found = json.loads((tmp_path / "evaluation.json").read_text())
@@ -262,7 +262,7 @@ def commands(trained, tmp_path):
         "convert": ("convert", tmp_path / "series" / "case.pvd", "--shares", 1, 0, 0, "--out"),
         "predict": ("predict", run, data, "--index", 1, "--out"),
         "report": ("report", run, "--data", data, "--out"),
-        "evaluate": ("evaluate", run, data, "--json"),
+        "evaluate": ("evaluate", run, data, "--out"),
     }
 
 
@@ -407,6 +407,7 @@ def test_a_folder_that_is_no_run_and_a_dataset_of_another_kind(trained, tmp_path
     assert "stress_location none" in error and "other.h5" in error
     assert "the split has 2" in fails(capsys, "predict", run, data, "--index", 2, "--out", tmp_path / "x.h5")
     assert ".vtkhdf" in fails(capsys, "predict", run, data, "--index", 0, "--out", tmp_path / "x.obj")
+    assert "must end in .json" in fails(capsys, "evaluate", run, data, "--out", tmp_path / "x.html")
 
 
 def test_arguments_out_of_range(tmp_path, capsys):
@@ -449,7 +450,7 @@ def test_an_output_without_a_name_and_a_folder_as_a_file(trained, tmp_path, caps
         (*PLATES, "--out"),
         ("convert", tmp_path, "--out"),
         ("predict", run, data, "--index", 0, "--out"),
-        ("evaluate", run, data, "--json"),
+        ("evaluate", run, data, "--out"),
         ("report", run, "--out"),
     ]
     if kind == "empty":
@@ -545,7 +546,7 @@ def test_names_that_are_not_utf_8(trained, tmp_path, capsys):
     with Dataset(prediction) as dataset:
         assert dataset.attributes("test", 0)["source"].endswith(rf"{shown}: test/000000")
     works("predict", run, data, "--index", 0, "--out", folder / os.fsdecode(b"p\xe9.vtkhdf"))
-    works("evaluate", run, data, "--json", folder / os.fsdecode(b"e\xe9.json"))
+    works("evaluate", run, data, "--out", folder / os.fsdecode(b"e\xe9.json"))
     for shows in ((data,), (run, "--data", data)):
         page = works("report", *shows, "--overwrite", "--out", folder / os.fsdecode(b"w\xe9.html"))
         with open(page, encoding="utf-8") as file:

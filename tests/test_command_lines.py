@@ -52,6 +52,7 @@ PATH = st.sampled_from(
 FIELD = st.sampled_from(["displacement", "von_mises", "node_type", "body", "material", "absent", ""])
 OUT = {
     "convert": ["new.h5"],
+    "evaluate": ["new.json"],
     "generate": ["new.h5"],
     "report": ["new.html"],
     "predict": ["new.h5", "new.pvd", "new.vtkhdf"],
@@ -59,7 +60,7 @@ OUT = {
 USUAL = {  # what a user may well give, by the name that the parser has for it
     "run_folder": ["run"], "from": ["run"], "data": ["toy.h5", "toy.h5", "dynamic.h5"], "path": ["toy.h5", "run"],
     "scene": ["toy.h5", "cases/a/frame_00000.vtu"], "source": ["cases", "cases/a.pvd", "mesh.vtkhdf"],
-    "shown": ["run", "toy.h5"], "json": ["new.json"], "config": ["my.toml", "run/config.toml"], "count": ["1", "3"],
+    "shown": ["run", "toy.h5"], "config": ["my.toml", "run/config.toml"], "count": ["1", "3"],
     "index": ["0", "1"], "rivals": ["0"], "nodes": ["80", "400"], "frames": ["5", "9", "-1", "1,2,3", "0"],
     "shares": ["1", "0", "0.5"], "obstacle": ["0", "1"], "corrections": ["0", "2"], "num_frames": ["2", "4"],
     "move": ["1=0,0,-0.01", "1=0,0,-0.01 then 0.02,0,-0.01", "1=rotate 30 about 0,0,1 at 0,0,0", "0=0,0,0", "9=1,1,1",

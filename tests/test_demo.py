@@ -41,7 +41,7 @@ def test_everything_is_made(made):
         assert dataset.splits == {"train": 1, "valid": 1, "test": 1}
     found = json.loads((made / "evaluation.json").read_text())
     assert found["command"] == f"ast-sim demo --out {made} --quick --seed 0"
-    assert found["speedup"] > 0
+    assert (found["speedup"] is None) == (found["threads"] > 1)
     assert found["step"] in (1, 2, 3, 4)
 
 
@@ -85,7 +85,6 @@ def test_headlines_are_shares_of_the_trivial_predictors():
         },
         "failures": 1,
         "samples": [{}, {}],
-        "speedup": 12.345,
         "asked": {
             "relative_error": 0.0712,
             "seconds": 0.0251,
@@ -106,7 +105,6 @@ def test_headlines_are_shares_of_the_trivial_predictors():
         "displacement error over whole rollouts: 0.002 m, 20 % of that of holding still",
         "stress error over whole rollouts: 600 Pa, 60 % of that of each frame's true mean",
         "1 of 2 rollouts failed",
-        "all frames: 12.3 times as fast as the solver was when it made them",
         "the deepest frame at once: error 7.12 % of the displacement, 25.1 ms on one thread",
         "  after each call: 16, 7.12 %",
         "  stress: 0.50 of the error of the frame's true mean; the largest is 8 % off",

@@ -48,7 +48,7 @@ def evaluate(
         jumps: whether the model predicts each frame from the first one, so that its `one_step` errors are those of its
         rollout; corrections, newton_steps: what follows the first call of such a model;
         asked: the deepest frame of each scene, see `asked_frames`; the solver is run in `rival_scenes` scenes;
-        speedup: the solver's recorded time for all frames, divided by the model's; None if it was not recorded;
+        speedup: the solver's recorded time for all frames over the model's, both on one thread; else None;
         length_unit, stress_unit, threads.
 
     Raises:
@@ -155,7 +155,9 @@ def _sample(
 
 
 def _speedup(samples: list[dict[str, Any]]) -> float | None:
-    """The solver's time divided by the model's time, on the scenes where both are known."""
+    """The solver's time divided by the model's time, on the scenes where both are known, both on one thread."""
+    if torch.get_num_threads() != 1:
+        return None
     keys = ("solver_seconds_per_step", "model_seconds_per_step")
     both = [sample for sample in samples if sample[keys[0]] is not None and sample[keys[1]] is not None]
     solver, model = (math.fsum(sample[key] * (sample["frames"] - 1) for sample in both) for key in keys)
@@ -195,10 +197,25 @@ def table(found: dict[str, Any]) -> str:
     if all(sample["solver_seconds_per_step"] is None for sample in found["samples"]):
         lines.append("speed relative to the solver: unknown. Neither the scenes nor a file beside the dataset")
         lines.append("(its name and .seconds.json) hold the seconds of a solver; a dataset is moved together with it")
-    elif found["speedup"] is not None:
-        lines.append(f"all frames: {found['speedup']:.3g} times as fast as the solver was when it made them (recorded)")
+    else:
+        lines.append(_all_frames(found))
     lines += asked_frame.lines(found["asked"])
     return "\n".join(lines)
+
+
+def _all_frames(found: dict[str, Any]) -> str:
+    """A line on the time of all frames, the model's beside the solver's; a ratio only if both had one thread."""
+    if found["speedup"] is not None:
+        return f"all frames: {found['speedup']:.3g} times as fast as the solver was when it made them (one thread each)"
+    known = [sample for sample in found["samples"] if sample["solver_seconds_per_step"] is not None]
+    times = {}
+    for who in ("model", "solver"):
+        seconds = [sample[f"{who}_seconds_per_step"] for sample in known]
+        times[who] = "unknown" if None in seconds else f"{1000 * math.fsum(seconds) / len(seconds):.3g} ms"
+    return (
+        f"a frame of all: the model {times['model']} on {found['threads']} threads, the solver {times['solver']} on one"
+        " thread when it made them"
+    )
 
 
 def _shown(value: float | None) -> str:

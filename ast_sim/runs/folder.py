@@ -15,7 +15,7 @@ from ast_sim.runs import checkpoint
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.origin import read_origin
 from ast_sim.runs.scope import Scope
-from ast_sim.runs.train_config import RunConfig, read_config
+from ast_sim.runs.train_config import RunConfig, has_config, read_config
 from ast_sim.support.errors import CheckpointError, ConfigError
 
 
@@ -62,7 +62,7 @@ def first_weights(run: Path) -> dict[str, Tensor] | None:
     Raises:
         CheckpointError: the checkpoint is gone, damaged, or not the one that the run recorded.
     """
-    start = read_origin(run).get("start")
+    start = read_origin(run).get("start") if has_config(run) else None  # a loop of one's own may have no settings
     if start is None:
         return None
     path = checkpoint.at_step(start["run"], start["step"])

@@ -40,7 +40,7 @@ class ReportRun:
         name: name of the run for the readers.
         model: name under which the model is registered, such as "ast".
         scenes: predictions to show.
-        evaluation: what `ast-sim evaluate --json` writes, or None.
+        evaluation: what `ast-sim evaluate --out` writes, or None.
         metrics: the lines of `metrics.jsonl`.
         facts: model, parameters, data, seeds, in the order to show; the evaluation adds facts of its own.
     """

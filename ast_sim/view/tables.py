@@ -1,4 +1,4 @@
-"""The figures of an evaluation (`ast-sim evaluate --json`) and of a training, arranged for the report's page."""
+"""The figures of an evaluation (`ast-sim evaluate --out`) and of a training, arranged for the report's page."""
 
 from __future__ import annotations
 
@@ -127,15 +127,16 @@ def _speed_tiles(evaluation: Json) -> list[Json]:
     threads = evaluation.get("threads")
     where = f" on {threads} thread{'s' if threads != 1 else ''}" if threads else ""
     tile = {"label": "Time per step", "value": model, "unit": "s", "detail": f"mean over the scenes{where}"}
+    if solver:
+        tile["detail"] = f"solver: {1000 * solver:.3g} ms on 1 thread" + (f"; model{where}" if where else "")
     speedup = evaluation.get("speedup")
     if speedup is None:
         return [tile]
-    tile["detail"] = f"solver: {1000 * solver:.3g} ms" + (f"; model{where}" if where else "") if solver else ""
     faster = {
         "label": "Speed-up over the solver",
         "value": f"{speedup:.3g}",
         "suffix": "×",
-        "detail": "all frames of the same scenes; the solver’s time was recorded when it made them",
+        "detail": "all frames of the same scenes, one thread each; the solver’s time was recorded when it made them",
     }
     return [tile, faster]
 

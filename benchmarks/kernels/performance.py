@@ -31,8 +31,8 @@ Made by `python -m benchmarks.kernels.performance` from `benchmarks/results/`; d
 Every case runs ours and its peers in turns on the same input, after their results were compared. Times are the shortest
 of all samples. "Best peer" is the fastest of them, "ratio" its time over ours: 2 means that ours takes half the time.
 "Peak" is what the processor reaches with multiply-adds on registers alone, measured in the same run; "of peak" is the
-share of it that useful arithmetic has. "Target" is what was aimed at; where it is not reached, [the log](../log.md)
-has the reason.
+share of it that useful arithmetic has. Ratios hold for the processor that is named, and for no other; the share of peak
+depends on it much less. "Target" is what was aimed at; where it is not reached, [the log](../log.md) has the reason.
 """
 NUMBERS = {
     "share_of_peak": ("{:.2f} of peak", "at least"),

@@ -50,7 +50,7 @@ def test_the_page_leads_to_a_model(installed, tmp_path):
     toy.write(tmp_path / "plates.h5")
     commands = [line for block in blocks("sh") for line in block.splitlines() if line.startswith("ast-sim")]
     assert [shlex.split(command)[1] for command in commands] == ["train", "evaluate", "report"]
-    more = {"train": [word for setting in FEW for word in ("--set", setting)], "evaluate": ["--json", "errors.json"]}
+    more = {"train": [word for setting in FEW for word in ("--set", setting)], "evaluate": ["--out", "errors.json"]}
     for command in commands:
         words = shlex.split(command)[1:]
         done = run("ast_sim.cli", *words, *more.get(words[0], []), folder=tmp_path, packages=installed)

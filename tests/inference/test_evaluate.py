@@ -226,6 +226,15 @@ def test_the_solvers_seconds_beside_the_dataset_count_and_without_them_the_speed
     (sample,) = known["samples"]
     assert sample["solver_seconds_per_step"] == 3.0
     assert known["speedup"] == pytest.approx(3.0 / sample["model_seconds_per_step"])
+    assert "times as fast as the solver was when it made them (one thread each)" in table(known)
+    torch.set_num_threads(2)
+    try:
+        unequal = speed(path)
+    finally:
+        torch.set_num_threads(1)
+    assert unequal["speedup"] is None and "times as fast" not in table(unequal)
+    took = 1000 * unequal["samples"][0]["model_seconds_per_step"]
+    assert f"the model {took:.3g} ms on 2 threads, the solver 3e+03 ms on one thread" in table(unequal)
 
 
 def test_an_empty_split_is_an_error(tmp_path):

@@ -32,7 +32,7 @@ def evaluation(errors: dict[str, float | None], scale: float = 1.0) -> dict[str,
         for name, error in errors.items()
     ]
     return {
-        "command": "ast-sim evaluate run data.h5 --json <file>",
+        "command": "ast-sim evaluate run data.h5 --out <file>",
         "commit": "0123456789abcdef",
         "processor": "A processor",
         "versions": {"python": "3.11.2", "torch": "2.13.0", "ast_sim": None},

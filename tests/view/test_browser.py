@@ -171,7 +171,7 @@ def test_training_and_facts_are_shown(browser, page):
             " return drawn.width - card.clientWidth; })"
         )
         assert len(wider) == {"training": 2, "over-time": 3}[part] and max(wider) <= 0 and min(wider) > -40, part
-    for fact in ("0123456789abcdef", "A processor, 2 threads", "python 3.11.2, torch 2.13.0", "--json <file>"):
+    for fact in ("0123456789abcdef", "A processor, 2 threads", "python 3.11.2, torch 2.13.0", "--out <file>"):
         assert fact in text
 
 

@@ -24,7 +24,7 @@ from ast_sim.simulate.jobs.generate import generate
 from ast_sim.simulate.jobs.manifest import Manifest
 from ast_sim.simulate.jobs.recipe import recorded
 from ast_sim.simulate.jobs.samples import Recipe, load_sample, make_sample, sample_path, save_sample
-from ast_sim.support.errors import MissingExtra, SimulationError
+from ast_sim.support.errors import MissingExtra, SimulationError, require
 
 NODES, FRAMES = 80, 9
 RECIPE = Recipe("deforming_plate", 5, NODES, FRAMES)
@@ -307,6 +307,18 @@ def test_a_missing_ipctk_is_named_before_anything_starts(tmp_path, monkeypatch):
     with pytest.raises(MissingExtra, match=r'pip install "ast_sim\[simulate\]"'):
         generate("deforming_plate", tmp_path / "a.h5")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_while_a_compiled_module_is_imported_is_no_missing_extra(tmp_path, monkeypatch):
+    lines = ["try:", "    raise KeyboardInterrupt", "except KeyboardInterrupt as error:"]
+    (tmp_path / "stopped.py").write_text(
+        "\n".join([*lines, "    raise ImportError('initialization failed') from error"])
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        require("simulate", "stopped")
+    with pytest.raises(MissingExtra, match="no_such_module is needed here"):
+        require("simulate", "no_such_module")
 
 
 def test_samples_survive_their_file(tmp_path):
