@@ -14,6 +14,14 @@ SCRIPT = """
 def broken(gmsh, height):
     raise ValueError(f"no height {height:g}")
 
+def tangled(gmsh):
+    gmsh.model.occ.addBox(0, 0, 0, 1, 1, 1)
+
+    def generate(dimension):
+        raise Exception("tangled")
+
+    gmsh.model.mesh.generate = generate
+
 def two(gmsh):
     gmsh.model.occ.addBox(0, 0, 0, 1, 1, 1)
     gmsh.model.occ.addBox(5, 0, 0, 1, 1, 1)
@@ -75,6 +83,7 @@ WRONG = {
     "script fails": (*scripted("broken"), "TypeError: broken.. missing 1 required positional argument: 'height'"),
     "script has no such function": (*scripted("brokn"), "block .made.py:brokn.: the script has no function brokn"),
     "two solids": (*scripted("two"), "it holds 2 separate solids"),
+    "no mesh": (*scripted("tangled"), "with elements of the size 2: tangled; another size may do"),
     "two pieces": ('"block.vtu"', '"pieces.vtu"', "block .pieces.vtu.: it has 2 pieces not joined by a common face"),
     "triangles": ('"block.vtu"', '"tool.stl"', "parts.block.size is missing; tool.stl must be meshed"),
     "scale": ("poisson", "scale = 0\npoisson", "parts.block.scale is 0; must be a number above 0"),
