@@ -2,8 +2,8 @@
 
 `python -m benchmarks.studies.assembly [ROW ...]` generates the scenes of each product of `examples`, trains a run and
 measures it on test scenes, which no training has seen. It writes benchmarks/results/assembly.json and
-docs/results/assembly.md. Data and runs lie in `--folder`; a second call goes on with what is there. Everything runs on
-one thread.
+the page of this name in docs/results. Data and runs lie in `--folder`; a second call goes on with what is there.
+Everything runs on one thread.
 """
 
 from __future__ import annotations
