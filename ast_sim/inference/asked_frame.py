@@ -6,6 +6,7 @@ the error over that of the displacement, over the free nodes in this frame. Time
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -35,12 +36,14 @@ def asked_frames(
     effort: Effort,
     rival_scenes: int = 0,
     progress: Callable[[str], None] | None = None,
+    spec: str | os.PathLike[str] | None = None,
 ) -> dict[str, Any]:
     """Predict the deepest frame of each scene of a split, alone and on one thread.
 
     Args:
         effort: what follows the first call of a model that jumps.
         rival_scenes: in so many scenes the solver goes to the same frame, in several ways; see `simulate.jobs.rival`.
+        spec: where the specification lies, if the dataset is of an assembly; the solver needs it.
 
     Returns:
         scenes: for each its name, frame, nodes, displacement, relative_error, by_calls (the relative error after each
@@ -55,7 +58,8 @@ def asked_frames(
     try:
         indices = list(range(min(rival_scenes, len(scenes))))
         frames = [scenes[index]["frame"] for index in indices]
-        found = rivals(dataset.path, split, indices, frames, starts=STARTS, progress=False) if indices else iter(())
+        effort = {"starts": STARTS, "spec": spec, "progress": False}
+        found = rivals(dataset.path, split, indices, frames, **effort) if indices else iter(())
         for scene, rival in zip(scenes, found, strict=False):
             scene["solver"] = _solver(rival, scene["relative_error"])
             if progress is not None:

@@ -158,6 +158,7 @@ def rivals(
     starts: Sequence[int] = STARTS,
     repeats: int = 1,
     parts: str | os.PathLike[str] | None = None,
+    spec: str | os.PathLike[str] | None = None,
     most_iterations: int = MOST_ITERATIONS,
     progress: bool = True,
 ) -> Iterator[Rivals]:
@@ -170,7 +171,7 @@ def rivals(
         ways: how the solver is run.
         starts: in how many load steps each way is tried. The cheapest that converges counts.
         repeats: how often each is timed. The smallest time counts.
-        parts: where the parts lie, if the dataset was made of the user's own.
+        parts, spec: where the parts or the specification lie, if the dataset was made of the user's own.
         most_iterations: Newton iterations after which a try is given up.
         progress: show a bar on a terminal and lines elsewhere.
 
@@ -182,7 +183,7 @@ def rivals(
     if not starts or min(starts) < 1 or repeats < 1:
         raise SimulationError(f"starts {list(starts)} and repeats {repeats} must be at least 1")
     with Dataset(dataset) as data:
-        recipe = recipe_of(str(dataset), data.info, None if parts is None else Path(parts))
+        recipe = recipe_of(str(dataset), data.info, *(None if path is None else Path(path) for path in (parts, spec)))
         frames = [_frame(data, split, index, which, frame_of) for which, index in enumerate(indices)]
     request = {
         "dataset": str(Path(dataset).resolve()),

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+MENDED = ("Degenerated", "SmallEdges", "SmallFaces")
 CREASE_ANGLE = math.radians(40)  # edges of an STL surface sharper than this are edges of the part
 
 
@@ -13,8 +14,14 @@ class BadPart(Exception):
     """What is wrong with a part, in words."""
 
 
-def import_step(gmsh, path: str) -> None:
-    """Import all shapes. If there is no solid among them, sew their faces together and make one solid of them."""
+def import_step(gmsh, path: str, mend: bool = True) -> None:
+    """Import all shapes. If there is no solid among them, sew their faces together and make one solid of them.
+
+    To mend is to remove degenerate edges and those that are very small. The pole of a sphere is such an edge: without
+    it, gmsh cannot mesh the sphere.
+    """
+    for name in MENDED:
+        gmsh.option.setNumber(f"Geometry.OCCFix{name}", int(mend))
     for heal in (0, 1):
         gmsh.option.setNumber("Geometry.OCCSewFaces", heal)
         gmsh.option.setNumber("Geometry.OCCMakeSolids", heal)

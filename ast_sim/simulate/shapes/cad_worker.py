@@ -73,9 +73,6 @@ def main() -> None:
         ("Mesh.RandomSeed", 1),
         ("Mesh.MeshSizeFromPoints", 0),
         ("Mesh.MeshSizeExtendFromBoundary", 0),
-        ("Geometry.OCCFixDegenerated", 1),
-        ("Geometry.OCCFixSmallEdges", 1),
-        ("Geometry.OCCFixSmallFaces", 1),
     ):
         gmsh.option.setNumber(name, value)
     arrays = {"version": np.array(gmsh.option.getString("General.Version"))}

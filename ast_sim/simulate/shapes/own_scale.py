@@ -41,10 +41,8 @@ def answer(gmsh, parts: list[dict[str, Any]]) -> dict[str, np.ndarray]:
     """
     arrays = {}
     for i, part in enumerate(parts):
-        gmsh.model.add(f"own {i}")
         try:
-            solid = _make(gmsh, part)
-            gmsh.model.mesh.generate(3 if solid else 2)
+            solid = _mesh(gmsh, part)
             position, elements, tags = tetrahedra(gmsh) if solid else triangles(gmsh)
         except Exception as error:  # gmsh raises Exception itself
             raise BadPart(f"{part['name']}: {str(error).strip() or 'gmsh stopped without a message'}") from error
@@ -57,7 +55,23 @@ def answer(gmsh, parts: list[dict[str, Any]]) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _make(gmsh, part: dict[str, Any]) -> bool:
+def _mesh(gmsh, part: dict[str, Any]) -> bool:
+    """Make and mesh a part, a STEP file first as it is and then mended; return whether it is a solid."""
+    failures: list[Exception] = []
+    for mend in (False, True) if "step" in part else (False,):
+        gmsh.model.add("own")
+        solid = _make(gmsh, part, mend)
+        try:
+            gmsh.model.mesh.generate(3 if solid else 2)
+            return solid
+        except Exception as error:  # gmsh raises Exception itself
+            failures.append(error)
+            gmsh.model.remove()
+    text = str(failures[0]).strip() or "gmsh stopped without a message"
+    raise BadPart(f"with elements of the size {part['size']:.4g}: {text}; another size may do") from failures[0]
+
+
+def _make(gmsh, part: dict[str, Any], mend: bool) -> bool:
     """Make the shape and set the sizes; return whether it is a solid."""
     if "stl" in part:
         gmsh.merge(part["stl"])
@@ -66,7 +80,7 @@ def _make(gmsh, part: dict[str, Any]) -> bool:
         solid_of_surface(gmsh)
     elif "step" in part:
         gmsh.option.setString("Geometry.OCCTargetUnit", part["unit"])
-        import_step(gmsh, part["step"])
+        import_step(gmsh, part["step"], mend)
     elif "geo" in part:
         for name, value in part["arguments"].items():
             gmsh.parser.setNumber(name, [value])

@@ -13,6 +13,7 @@ from ast_sim.scene import NodeType
 from ast_sim.simulate.families import assembly
 from ast_sim.simulate.jobs.generate import generate
 from ast_sim.simulate.jobs.recipe import recipe_of
+from ast_sim.simulate.jobs.rival import WAYS, Way, rivals
 from ast_sim.simulate.jobs.samples import draw_sample
 from ast_sim.simulate.own_assembly.parameters import completed
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
@@ -226,6 +227,15 @@ def test_other_contents_are_another_dataset(tmp_path):
         recipe_of("a.h5", info)
 
 
+def test_a_part_that_was_changed_is_read_again(tmp_path):
+    path = write_assembly(tmp_path)
+    before = scene_of(path).case.scene
+    write_box(tmp_path / "punch.vtu", (3, 3, 5.5), (7, 7, 8), (2, 2, 2))
+    after = scene_of(path).case.scene
+    lowest = [scene.rest_position[scene.body == 1, 2].min() for scene in (before, after)]
+    assert lowest == pytest.approx([5.2, 5.5])
+
+
 def test_the_same_scene_on_a_coarser_mesh(tmp_path):
     path = write_assembly(tmp_path, SPEC.replace('"block.vtu"', '"made.py"\nsize = 1.5'))
     (tmp_path / "made.py").write_text("def make(gmsh):\n    gmsh.model.occ.addBox(0, 0, 0, 10, 10, 5)\n")
@@ -236,6 +246,22 @@ def test_the_same_scene_on_a_coarser_mesh(tmp_path):
     assert np.array_equal(coarse.targets[-1, -1], drawn.case.targets[-1, -1])
     with pytest.raises(SimulationError, match="there is no coarser mesh"):
         scene_of(write_assembly(tmp_path)).remesh(0.5)
+
+
+def test_the_solver_goes_straight_to_a_frame(tmp_path):
+    """In the dataset's own way and on a coarser mesh, from the specification that the dataset was made of."""
+    path = write_assembly(tmp_path, SPEC.replace('"block.vtu"', '"made.py"\nsize = 1.8'))
+    (tmp_path / "made.py").write_text("def make(gmsh):\n    gmsh.model.occ.addBox(0, 0, 0, 10, 10, 5)\n")
+    out = tmp_path / "study.h5"
+    generate("assembly", out, spec=path, train=0, valid=0, test=1, workers=1, progress=False)
+    ways = (WAYS[0], Way("half", nodes=0.5))
+    (found,) = rivals(out, "test", [0], ways=ways, starts=(1,), spec=path, progress=False)
+    own, coarse = found.outcomes
+    assert found.frame == 2 and own.converged and coarse.converged, (own.failure, coarse.failure)
+    assert own.relative_error < 0.02 and own.relative_error < coarse.relative_error < 0.8
+    assert coarse.nodes < 0.75 * own.nodes
+    with pytest.raises(SimulationError, match="was made of a specification: say where it lies"):
+        rivals(out, "test", [0], progress=False)
 
 
 def test_a_draw_that_cannot_stand_is_drawn_again(tmp_path):

@@ -14,6 +14,14 @@ SCRIPT = """
 def broken(gmsh, height):
     raise ValueError(f"no height {height:g}")
 
+def tangled(gmsh):
+    gmsh.model.occ.addBox(0, 0, 0, 1, 1, 1)
+
+    def generate(dimension):
+        raise Exception("tangled")
+
+    gmsh.model.mesh.generate = generate
+
 def two(gmsh):
     gmsh.model.occ.addBox(0, 0, 0, 1, 1, 1)
     gmsh.model.occ.addBox(5, 0, 0, 1, 1, 1)
@@ -60,6 +68,7 @@ WRONG = {
     "fixed and moved": ('fixed = "zmin"', "fixed = 'zmin'\nmove = {where = 'xmin', translation = [0, 0, 1]}",
                         r"parts.block.move: 5 of its nodes are also in parts.block.fixed, the first at \(0, 0, 0\)"),
     "overlap": ("rigid", "offset = [0, 0, -1.2]\nrigid", r"block and punch overlap at rest by 1 mm at \(.*, 4\)"),
+    "crossing": ('"punch.vtu"', '"bar.vtu"', r"block and punch cut each other at rest near \(.*\): move one of them"),
     "swallowed": ("rigid", "offset = [0, 0, -2]\nscale=0.5\nrigid", "block and punch overlap at rest by 2 mm"),
     "touching": ("rigid", "offset = [0, 0, -0.2]\nrigid", "block and punch cut each other|are 0 mm apart at rest"),
     "too close": ("rigid", "offset = [0, 0, -0.16]\nrigid", "are 0.04 mm apart at rest, near .* distance 0.05"),
@@ -75,6 +84,7 @@ WRONG = {
     "script fails": (*scripted("broken"), "TypeError: broken.. missing 1 required positional argument: 'height'"),
     "script has no such function": (*scripted("brokn"), "block .made.py:brokn.: the script has no function brokn"),
     "two solids": (*scripted("two"), "it holds 2 separate solids"),
+    "no mesh": (*scripted("tangled"), "with elements of the size 2: tangled; another size may do"),
     "two pieces": ('"block.vtu"', '"pieces.vtu"', "block .pieces.vtu.: it has 2 pieces not joined by a common face"),
     "triangles": ('"block.vtu"', '"tool.stl"', "parts.block.size is missing; tool.stl must be meshed"),
     "scale": ("poisson", "scale = 0\npoisson", "parts.block.scale is 0; must be a number above 0"),
@@ -93,6 +103,7 @@ def test_a_mistake_gives_one_clear_line(mistake, tmp_path, capsys):
     (tmp_path / "made.py").write_text(SCRIPT)
     write_pieces(tmp_path / "pieces.vtu")
     write_box(tmp_path / "block.doc.vtu", (0, 0, 0), (1, 1, 1), (1, 1, 1))
+    write_box(tmp_path / "bar.vtu", (-5, 4.2, 3), (15, 4.8, 3.5), (1, 1, 1))  # no node of either lies in the other
     position, _ = box((0, 0, 0), (1, 1, 1), (1, 1, 1))
     meshio.Mesh(position, {"triangle": np.array([[0, 1, 2]])}).write(tmp_path / "tool.stl")
     capsys.readouterr()

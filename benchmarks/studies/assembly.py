@@ -1,0 +1,157 @@
+"""Own assemblies: errors of displacement and reaction, the time of an answer, and after how many questions it pays.
+
+`python -m benchmarks.studies.assembly [ROW ...]` generates the scenes of each product of `examples`, trains a run and
+measures it on test scenes, which no training has seen. It writes benchmarks/results/assembly.json and
+the page of this name in docs/results. Data and runs lie in `--folder`; a second call goes on with what is there.
+Everything runs on one thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import ast_sim
+from ast_sim.dataset.solver_seconds import read_seconds
+from ast_sim.inference.asked_frame import asked_frames
+from ast_sim.runs.metrics import Metrics
+from ast_sim.support.disk import write_json, write_text
+from ast_sim.support.provenance import provenance
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "benchmarks" / "results" / "assembly.json"
+PAGE = ROOT / "docs" / "results" / "assembly.md"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A product, its scenes and a training on them.
+
+    Attributes:
+        title: what the page calls it.
+        spec: its specification.
+        nodes, train, valid, test: of the dataset.
+        steps, settings: of the training.
+        rivals: in so many test scenes the solver is run.
+    """
+
+    title: str
+    spec: Path
+    nodes: int
+    train: int
+    steps: int
+    valid: int = 10
+    test: int = 50
+    settings: dict[str, Any] = field(default_factory=dict)
+    rivals: int = 10
+
+
+_SETTINGS = {"peak_rate": 2e-3, "validate_scenes": 10, "validate_every": 500, "checkpoint_every": 500}
+_BUMPER, _HOOK = (ROOT / "examples" / name / "SPEC.toml" for name in ("bumper", "snap_hook"))
+ROWS = {
+    "bumper": Row("Bumper, 1,600 nodes", _BUMPER, nodes=1600, train=100, steps=1700, settings=_SETTINGS),
+    "snap_hook": Row("Snap hook, 1,600 nodes", _HOOK, nodes=1600, train=200, steps=2500, settings=_SETTINGS),
+}
+
+
+def measured(name: str, row: Row, folder: Path) -> dict[str, Any]:
+    """Generate, train and measure a row; what is there already is not made again."""
+    data = ast_sim.generate(
+        "assembly", folder / f"{name}.h5", spec=row.spec, train=row.train, valid=row.valid, test=row.test,
+        nodes=row.nodes, workers=1,
+    ).path  # fmt: skip
+    run = ast_sim.train(data, folder / f"run_{name}_{row.steps}", steps=row.steps, resume=True, **row.settings)
+    with run.open(data) as dataset:
+        found = asked_frames(run.model, dataset, "test", run.corrections, row.rivals, spec=row.spec)
+        forces = [_forces(run, dataset, index) for index in range(row.test)]
+        solver_seconds = read_seconds(dataset).samples.values()
+    steps = [record["seconds"] for record in Metrics(run.path) if "loss" in record]
+    return {
+        **provenance(f"python -m benchmarks.studies.assembly {name}"),
+        "row": {**asdict(row), "spec": f"{row.spec.parent.name}/{row.spec.name}"},
+        "generation_minutes": float(sum(map(sum, solver_seconds))) / 60,
+        "minutes": float(np.median(steps)) * row.steps / 60,
+        "corrections": run.corrections,
+        "reaction": float(np.mean([abs(p - t) / t for p, t in forces if t > 0])),
+        "forces": forces,
+        **found,
+    }
+
+
+def _forces(run: ast_sim.Run, dataset: ast_sim.Dataset, index: int) -> tuple[float, float]:
+    """The predicted and the true reaction in newton in the last frame of a test scene."""
+    truth = dataset.load("test", index)
+    answer = replace(run.predict(truth, frames=[-1]), info=run.info)
+    return answer.figures()[-1]["reaction"], truth.attributes["reaction"][-1]
+
+
+def page(results: dict[str, Any]) -> str:
+    """The page of all rows that have a result."""
+    shown = [results[name] for name in ROWS if name in results]
+    head = ["product", "trained", "minutes", "error", "reaction", "largest stress", "answer", "solver", "pays after"]
+    lines = [_INTRODUCTION, "| " + " | ".join(head) + " |", "| --- | --- |" + " ---: |" * (len(head) - 2)]
+    return "\n".join([*lines, *map(_line, shown)])
+
+
+_INTRODUCTION = """# Own assemblies
+
+Made by `python -m benchmarks.studies.assembly` from `benchmarks/results/assembly.json`; do not edit.
+
+Each product of `examples` was generated, trained and asked for frames of test scenes, on one thread, beside other
+work. "Error" is that of the displacement on the free nodes at the deepest frame, relative to it (mean and standard
+error); "reaction" the error of the force that moves the tool, in the last frame; "largest stress" that of the largest
+von Mises stress. The solver goes straight to the same frame at its own stop test. "Pays after" is the number of
+questions whose time in the solver is that of the simulations and the training.
+"""
+
+
+def _line(found: dict[str, Any]) -> str:
+    row, solver = found["row"], found["solver"]
+    errors = [scene["relative_error"] for scene in found["scenes"] if scene["relative_error"] is not None]
+    spent = 60 * (found["generation_minutes"] + found["minutes"])
+    saved = 0.0 if solver is None else solver["seconds"] - found["seconds"]
+    return "| " + " | ".join([
+        row["title"],
+        f"{row['train']} scenes ({found['generation_minutes']:.1f} min), {row['steps']:,} steps",
+        f"{found['minutes']:.0f}",
+        f"{100 * np.mean(errors):.1f} ± {100 * np.std(errors) / len(errors) ** 0.5:.1f} %",
+        f"{100 * found['reaction']:.1f} %",
+        "-" if found["largest_stress"] is None else f"{100 * found['largest_stress']:.0f} %",
+        f"{1000 * found['seconds']:.0f} ms",
+        "-" if solver is None else f"{1000 * solver['seconds']:.0f} ms",
+        f"{spent / saved:,.0f} questions" if saved > 0 else "never: the solver is faster" if solver else "-",
+    ]) + " |"  # fmt: skip
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("rows", nargs="*", metavar="ROW", help=f"of {', '.join(ROWS)} (default: all)")
+    default = Path("build/assembly")
+    parser.add_argument("--folder", type=Path, default=default, help=f"data and runs (default: {default})")
+    asked = parser.parse_args(arguments)
+    unknown = set(asked.rows) - set(ROWS)
+    if unknown:
+        parser.error(f"there is no row {', '.join(sorted(unknown))}")
+    import torch  # after ast_sim, which says how its threads wait
+
+    torch.set_num_threads(1)
+    os.environ["OMP_NUM_THREADS"] = "1"  # of the generator's and the solver's processes
+    ast_sim.keep_memory()
+    results = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
+    for name in asked.rows or ROWS:
+        results[name] = measured(name, ROWS[name], asked.folder)
+        write_json(RESULTS, results)
+        write_text(PAGE, page(results) + "\n")
+        found = results[name]
+        print(f"{name}: {100 * found['relative_error']:.3g} %, reaction {100 * found['reaction']:.3g} %", flush=True)
+
+
+if __name__ == "__main__":
+    main()

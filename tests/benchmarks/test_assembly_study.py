@@ -1,0 +1,49 @@
+"""The study of own assemblies, from end to end on a block that a punch presses."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from simulate.own_assembly.assemblies import write_assembly
+
+from benchmarks.studies import assembly
+
+
+@pytest.fixture
+def small(monkeypatch, tmp_path):
+    """A row of three training scenes and four steps; results in a folder of its own."""
+    row = replace(
+        assembly.ROWS["bumper"], spec=write_assembly(tmp_path), nodes=100, train=3, valid=1, test=2, steps=4, rivals=1,
+        settings={"calls": 2, "batch_size": 2, "statistics_pairs": 4},
+    )  # fmt: skip
+    monkeypatch.setattr(assembly, "ROWS", {"small": row})
+    monkeypatch.setattr(assembly, "RESULTS", tmp_path / "results" / "assembly.json")
+    monkeypatch.setattr(assembly, "PAGE", tmp_path / "assembly.md")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    threads = torch.get_num_threads()
+    yield tmp_path
+    torch.set_num_threads(threads)
+
+
+def test_a_product_is_simulated_learned_and_measured(small):
+    (small / "results").mkdir()
+    assembly.main(["--folder", str(small / "data")])
+    found = json.loads(assembly.RESULTS.read_text())["small"]
+    assert len(found["scenes"]) == len(found["forces"]) == 2 and found["solver"]["scenes"] == 1
+    assert found["no_solver"] is None and found["generation_minutes"] > 0
+    errors = [abs(predicted - true) / true for predicted, true in found["forces"]]
+    assert found["reaction"] == pytest.approx(sum(errors) / 2) and min(true for _, true in found["forces"]) > 0.1
+    (line,) = [line for line in assembly.PAGE.read_text().splitlines() if line.startswith("| Bumper")]
+    assert f"{100 * found['reaction']:.1f} %" in line and ("questions" in line or "never" in line)
+
+
+def test_an_unknown_row_is_named(capsys):
+    with pytest.raises(SystemExit):
+        assembly.main(["bumpr"])
+    assert "there is no row bumpr" in capsys.readouterr().err
+
+
+def test_the_rows_name_specifications_that_are_there():
+    for row in assembly.ROWS.values():
+        assert row.spec.is_file()
