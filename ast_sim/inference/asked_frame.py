@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -58,8 +58,9 @@ def asked_frames(
     try:
         indices = list(range(min(rival_scenes, len(scenes))))
         frames = [scenes[index]["frame"] for index in indices]
-        effort = {"starts": STARTS, "spec": spec, "progress": False}
-        found = rivals(dataset.path, split, indices, frames, **effort) if indices else iter(())
+        found: Iterable[Rivals] = ()
+        if indices:
+            found = rivals(dataset.path, split, indices, frames, starts=STARTS, spec=spec, progress=False)
         for scene, rival in zip(scenes, found, strict=False):
             scene["solver"] = _solver(rival, scene["relative_error"])
             if progress is not None:

@@ -69,7 +69,7 @@ def measured(name: str, row: Row, folder: Path) -> dict[str, Any]:
     ).path  # fmt: skip
     run = ast_sim.train(data, folder / f"run_{name}_{row.steps}", steps=row.steps, resume=True, **row.settings)
     with run.open(data) as dataset:
-        found = asked_frames(run.model, dataset, "test", run.corrections, row.rivals, spec=row.spec)
+        found = asked_frames(run.model, dataset, "test", run.effort, row.rivals, spec=row.spec)
         forces = [_forces(run, dataset, index) for index in range(row.test)]
         solver_seconds = read_seconds(dataset).samples.values()
     steps = [record["seconds"] for record in Metrics(run.path) if "loss" in record]
@@ -78,7 +78,7 @@ def measured(name: str, row: Row, folder: Path) -> dict[str, Any]:
         "row": {**asdict(row), "spec": f"{row.spec.parent.name}/{row.spec.name}"},
         "generation_minutes": float(sum(map(sum, solver_seconds))) / 60,
         "minutes": float(np.median(steps)) * row.steps / 60,
-        "corrections": run.corrections,
+        "effort": run.effort._asdict(),
         "reaction": float(np.mean([abs(p - t) / t for p, t in forces if t > 0])),
         "forces": forces,
         **found,
