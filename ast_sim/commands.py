@@ -245,7 +245,10 @@ def _save(answer: Any, args: argparse.Namespace, truth: Any) -> None:
         raise RolloutError(f"{answer.failure}, in {args.out}")
     steps = len(answer.step_seconds)
     each = f", {1000 * answer.seconds / steps:.3g} ms each" if steps else ""
-    print(f"{args.out}: {steps} frames predicted{each}")
+    print(f"{args.out}: {steps} frame{'' if steps == 1 else 's'} predicted{each}")
+    if answer.expected_error is not None:
+        percent = f"{100 * answer.expected_error:.2g} % of the displacement"
+        print(f"expected error: {percent}, as in the validation scenes at their deepest frame")
 
 
 def _truth(run: Any, args: argparse.Namespace) -> Any:

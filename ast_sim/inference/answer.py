@@ -36,6 +36,9 @@ class Answer:
         source: the origin of the answer: attributes that `trajectory` gets.
         stress_location: where the rows of the stress are: "node" or "element".
         frames: the numbers of the S frames in the motion that was asked.
+        expected_error: how far validation scenes were off with the same corrections and Newton steps: the mean over the
+            scenes of the root mean square error at the deepest frame, over that of the displacement. It is no bound for
+            this scene. None: the run did not measure it.
     """
 
     name: str
@@ -49,6 +52,7 @@ class Answer:
     source: dict[str, AttributeValue] = field(default_factory=dict)
     stress_location: str | None = None
     frames: tuple[int, ...] = ()
+    expected_error: float | None = None
 
     @property
     def seconds(self) -> float:

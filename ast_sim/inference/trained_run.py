@@ -54,6 +54,7 @@ class Run:
         self.path = Path(path)
         self.model, self.settings, self.step = load_model(self.path)
         self.effort = Effort(*Metrics(self.path).effort(self.step, (self.settings.train.calls or 1) - 1))
+        self._errors = Metrics(self.path).errors_by_effort(self.step)
         self.scope = read_scope(self.path)
 
     @property
@@ -132,7 +133,7 @@ class Run:
             unknown = next(iter(parameters), "nodes")
             raise ConfigError("give a scene" if scene is None else f"{unknown} belongs to a specification: give spec")
         answer = predict(self.model, self.scope, scene, motion, num_frames, stress, name, frames, effort)
-        return dataclasses.replace(answer, info=self.info, source=source)
+        return self._signed(answer, effort, source)
 
     def _of_spec(
         self, spec: str | os.PathLike[str], given: dict[str, Any], frames: int | None, nodes: int | None, others: tuple
@@ -183,7 +184,7 @@ class Run:
         """Predict several scenes, each under a motion, as one batch; arguments and errors are those of `predict`."""
         effort = self._effort(corrections, newton_steps)
         answers = predict_scenes(self.model, self.scope, asked, None, names, frames, effort)
-        return [dataclasses.replace(answer, info=self.info) for answer in answers]
+        return [self._signed(answer, effort, {}) for answer in answers]
 
     def predict_motions(
         self,
@@ -203,7 +204,15 @@ class Run:
         effort = self._effort(corrections, newton_steps)
         answers = predict_motions(self.model, self.scope, scene, motions, num_frames, name, frames, effort)
         source = {"predicted_by": str(self.path), "step": self.step, "source": name}
-        return [dataclasses.replace(answer, info=self.info, source=source) for answer in answers]
+        return [self._signed(answer, effort, source) for answer in answers]
+
+    def _signed(self, answer: Answer, effort: Effort, source: dict[str, Any]) -> Answer:
+        """The answer with its units, its origin and the error that is to be expected."""
+        known = effort.corrections < len(self._errors) and effort.newton_steps < len(self._errors[0])
+        expected = self._errors[effort.corrections][effort.newton_steps] if known else None
+        if expected is not None:
+            source = {**source, "expected_error": expected}
+        return dataclasses.replace(answer, info=self.info, source=source, expected_error=expected)
 
     def _effort(self, corrections: int | None, newton_steps: int | None) -> Effort:
         """What is asked for; where nothing is, the default."""

@@ -64,5 +64,11 @@ class Metrics:
         found = [record for record in self if record["step"] == step and "corrections" in record]
         return (int(found[-1]["corrections"]), int(found[-1].get("newton_steps", 0))) if found else (unset, 0)
 
+    def errors_by_effort(self, step: int) -> list[list[float | None]]:
+        """[corrections][Newton steps]: the mean relative errors at the deepest frame that the validation after a step
+        found; empty if it found none."""
+        found = [record["valid_by_effort"] for record in self if record["step"] == step and "valid_by_effort" in record]
+        return found[-1] if found else []
+
     def validated(self, step: int) -> bool:
         return any(record["step"] == step and "valid_rmse" in record for record in self)

@@ -78,8 +78,9 @@ def _validate_jumps(model: Simulator, truths: dict[int, Trajectory], most_calls:
         errors = [_motion_error(position, truth, frames[index]) for position in after] if failure is None else []
         hold = _motion_error(truth.position[0], truth, frames[index])
         efforts = None
-        if failure is None and index < EFFORT_SCENES and knows_material(model.config):
-            efforts = errors_by_effort(model, truth, Effort(max(0, most_calls - MORE_CALLS - 1), MOST_NEWTON_STEPS))
+        if failure is None and index < EFFORT_SCENES:
+            steps = MOST_NEWTON_STEPS if knows_material(model.config) else 0
+            efforts = errors_by_effort(model, truth, Effort(max(0, most_calls - MORE_CALLS - 1), steps))
         found.append(Validated(index, errors, hold, failure, efforts))
     return found
 
@@ -107,9 +108,11 @@ def verdict(found: list[Validated], best: float, unit: str) -> tuple[dict[str, A
     measured = [scene.efforts for scene in found if scene.efforts is not None]
     if measured:
         by_effort = np.mean(measured, axis=0)
-        effort = cheapest_good(by_effort)
-        record["valid_by_effort"] = by_effort.tolist()
-        text += f"; at the deepest frame {100 * by_effort[effort]:.2g} % of the displacement after {effort.text}"
+        if by_effort.shape[1] > 1:
+            effort = cheapest_good(by_effort)
+        record["valid_by_effort"] = [[None if np.isnan(e) else float(e) for e in errors] for errors in by_effort]
+        if effort.corrections < len(by_effort) and not np.isnan(by_effort[effort]):
+            text += f"; at the deepest frame {100 * by_effort[effort]:.2g} % of the displacement after {effort.text}"
     if len(by_calls) > 1 or measured:
         record |= {"valid_by_calls": by_calls, **effort._asdict()}
     return record, text

@@ -13,6 +13,8 @@ from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.writer import DatasetWriter
+from ast_sim.inference.effort import Effort
+from ast_sim.inference.trained_run import Run
 from ast_sim.models.ast.ast_config import ASTConfig
 from ast_sim.models.registry import find_model, find_preset
 from ast_sim.models.transolver import TransolverConfig
@@ -430,6 +432,14 @@ def test_jumps_that_are_resumed_end_in_the_same_bits(linear, data, tmp_path, mon
     assert a[1]["pool.squares"].isfinite().all() and any(key.endswith(".error") for key in a[1])
     record = [line for line in Metrics(tmp_path / "run") if "corrections" in line][-1]
     assert len(record["valid_by_calls"]) == 5 and 0 <= record["corrections"] < 5
+    run = Run(tmp_path / "run")
+    assert run.effort == Effort(Metrics(run.path).effort(run.step, 0)[0])
+    errors = [row for (row,) in Metrics(run.path).errors_by_effort(run.step)]
+    with run.open() as dataset:
+        truth = dataset["valid"][0]
+    answers = [run.predict(truth, frames=[-1], corrections=corrections) for corrections in (0, 2, 3)]
+    assert [answer.expected_error for answer in answers] == [errors[0], errors[2], None] and len(errors) == 3
+    assert answers[0].trajectory.attributes["expected_error"] == errors[0]
 
 
 @pytest.mark.parametrize(
