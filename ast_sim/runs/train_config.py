@@ -123,6 +123,8 @@ def read_changes(path: Path) -> dict[str, Any]:
     Raises:
         ConfigError: the file cannot be read, is no TOML, or is of another version; the text names the file.
     """
+    if path.exists() and not path.is_file():  # a pipe without a writer would block for ever
+        raise ConfigError(f"{path} cannot be read: it is no regular file")
     try:
         found = dict(leaves(tomllib.loads(path.read_text(encoding="utf-8"))))
     except OSError as error:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import shutil
 
 import numpy as np
@@ -18,7 +19,7 @@ from ast_sim.runs import checkpoint
 from ast_sim.runs.folder import load_model
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.origin import read_origin
-from ast_sim.runs.train_config import read_config
+from ast_sim.runs.train_config import read_changes, read_config
 from ast_sim.support.errors import CheckpointError, ConfigError
 from ast_sim.training.rates import step_seed
 from ast_sim.training.start import configure, start_training
@@ -238,3 +239,10 @@ def test_a_resumed_run_takes_neither(folder, capsys):
     for option in ("--config", "--from"):
         assert main(["train", "--out", str(folder / "source"), "--resume", option, str(folder / "source")]) == 2
         assert "a resumed run keeps its settings: leave --model, --preset, --config, --from" in capsys.readouterr().err
+
+
+def test_a_settings_file_that_is_a_pipe_is_refused_at_once(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", tmp_path):
+        with pytest.raises(ConfigError, match="it is no regular file"):
+            read_changes(path)
