@@ -50,6 +50,8 @@ def read_spec(path: str | os.PathLike[str]) -> AssemblySpec:
             missing that it names.
     """
     path = Path(path)
+    if path.exists() and not path.is_file():  # a pipe without a writer would block for ever
+        raise ConfigError(f"{path}: the specification cannot be read: it is no regular file")
     try:
         text = path.read_text(encoding="utf-8")
         values = tomllib.loads(text)
