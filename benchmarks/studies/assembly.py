@@ -40,6 +40,7 @@ class Row:
         nodes, train, valid, test: of the dataset.
         steps, settings: of the training.
         rivals: in so many test scenes the solver is run.
+        after: the row whose run this training starts from.
     """
 
     title: str
@@ -51,6 +52,11 @@ class Row:
     test: int = 50
     settings: dict[str, Any] = field(default_factory=dict)
     rivals: int = 10
+    after: str | None = None
+
+    def run_folder(self, name: str, folder: Path) -> Path:
+        """Where the run of the row of that name lies."""
+        return folder / f"run_{name}_{self.steps}"
 
 
 _SETTINGS = {"peak_rate": 2e-3, "validate_scenes": 10, "validate_every": 500, "checkpoint_every": 500}
@@ -58,6 +64,18 @@ _BUMPER, _HOOK = (ROOT / "examples" / name / "SPEC.toml" for name in ("bumper", 
 ROWS = {
     "bumper": Row("Bumper, 1,600 nodes", _BUMPER, nodes=1600, train=100, steps=1700, settings=_SETTINGS),
     "snap_hook": Row("Snap hook, 1,600 nodes", _HOOK, nodes=1600, train=200, steps=2500, settings=_SETTINGS),
+    "bumper_6000": Row(
+        "Bumper, 6,000 nodes, after the small ones",
+        _BUMPER,
+        nodes=6000,
+        train=60,
+        valid=5,
+        test=20,
+        steps=500,
+        settings={"validate_scenes": 5, "validate_every": 250, "checkpoint_every": 100},
+        rivals=5,
+        after="bumper",
+    ),
 }
 
 
@@ -67,7 +85,10 @@ def measured(name: str, row: Row, folder: Path) -> dict[str, Any]:
         "assembly", folder / f"{name}.h5", spec=row.spec, train=row.train, valid=row.valid, test=row.test,
         nodes=row.nodes, workers=1,
     ).path  # fmt: skip
-    run = ast_sim.train(data, folder / f"run_{name}_{row.steps}", steps=row.steps, resume=True, **row.settings)
+    start = None if row.after is None else ROWS[row.after].run_folder(row.after, folder)
+    run = ast_sim.train(
+        data, row.run_folder(name, folder), from_run=start, steps=row.steps, resume=True, **row.settings
+    )
     with run.open(data) as dataset:
         found = asked_frames(run.model, dataset, "test", run.effort, row.rivals, spec=row.spec)
         forces = [_forces(run, dataset, index) for index in range(row.test)]
