@@ -221,14 +221,15 @@ class Run:
         return Effort(corrections, newton_steps or 0)
 
     def open(self, data: str | os.PathLike[str] | None = None) -> Dataset:
-        """Open a dataset, by default the one that the run was trained on. The caller closes it.
+        """Open a dataset, by default the one that the run was trained on, with lengths in the run's unit. The caller
+        closes it.
 
         Raises:
             DatasetError: the dataset cannot be read.
-            ConfigError: its integration, stress location, material columns, elements or unit of length differ from
-                those of the training data.
+            ConfigError: its integration, stress location, material columns or elements differ from those of the
+                training data.
         """
-        dataset = Dataset(data or self.settings.data)
+        dataset = Dataset(data or self.settings.data, self.scope.length_unit)
         try:
             require_fit(self.path, self.settings.model, self.scope, dataset)
         except BaseException:
@@ -298,7 +299,7 @@ class Evaluation:
             error = sample["displacement"]["model"]["rollout_all"]["normal"]
             errors[sample["name"]] = math.inf if error is None else error
         answers = {answer.name: answer for answer in self.answers}
-        with Dataset(self.data) as dataset:
+        with self.run.open(self.data) as dataset:
             scenes = [
                 report.ReportScene(name, label, _truth(dataset, name), answers[name].trajectory)
                 for label, name in report.representative(errors)
