@@ -21,13 +21,16 @@ import numpy as np
 import ast_sim
 from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.inference.asked_frame import asked_frames
+from ast_sim.inference.effort import Effort
 from ast_sim.runs.metrics import Metrics
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
+from benchmarks.studies.validation_curve import curve_line, validation_curve
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "benchmarks" / "results" / "assembly.json"
 PAGE = ROOT / "docs" / "results" / "assembly.md"
+SHOWN_WORST = 5
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,7 @@ def measured(name: str, row: Row, folder: Path) -> dict[str, Any]:
         "generation_minutes": float(sum(map(sum, solver_seconds))) / 60,
         "minutes": float(np.median(steps)) * row.steps / 60,
         "effort": run.effort._asdict(),
+        "curve": validation_curve(run),
         "reaction": float(np.mean([abs(p - t) / t for p, t in forces if t > 0])),
         "forces": forces,
         **found,
@@ -118,7 +122,23 @@ def page(results: dict[str, Any]) -> str:
     shown = [results[name] for name in ROWS if name in results]
     head = ["product", "trained", "minutes", "error", "reaction", "largest stress", "answer", "solver", "pays after"]
     lines = [_INTRODUCTION, "| " + " | ".join(head) + " |", "| --- | --- |" + " ---: |" * (len(head) - 2)]
-    return "\n".join([*lines, *map(_line, shown)])
+    return "\n".join([*lines, *map(_line, shown), *(line for found in shown for line in _section(found))])
+
+
+def _section(found: dict[str, Any]) -> list[str]:
+    """The worst scenes of a row, and how its errors fell."""
+    ranked = sorted((s for s in found["scenes"] if s["relative_error"] is not None), key=lambda s: -s["relative_error"])
+    errors = [100 * scene["relative_error"] for scene in ranked]
+    worst = ", ".join(f"{scene['name']} {100 * scene['relative_error']:.0f} %" for scene in ranked[:SHOWN_WORST])
+    spread = f"a tenth below {np.quantile(errors, 0.1):.1f} %, the median {np.median(errors):.1f} %"
+    return [
+        "",
+        f"## {found['row']['title']}",
+        "",
+        f"{Effort(**found['effort']).text}. Over the scenes: {spread}, a tenth above {np.quantile(errors, 0.9):.1f} %."
+        f" Worst: {worst}.",
+        *([curve_line(found["curve"])] if found["curve"] else []),
+    ]
 
 
 _INTRODUCTION = """# Own assemblies
