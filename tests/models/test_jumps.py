@@ -21,8 +21,9 @@ from ast_sim.models.model_config import DataFacts
 from ast_sim.models.registry import build_model, find_preset, model_names
 from ast_sim.models.simulator import Prediction, Simulator
 from ast_sim.models.transolver import TransolverConfig
+from ast_sim.runs.config_toml import read_config
 from ast_sim.runs.folder import load_model
-from ast_sim.runs.train_config import RunConfig, TrainConfig, read_config
+from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.scene import Trajectory
 from ast_sim.support.errors import ConfigError, RolloutError
 from ast_sim.support.toml_settings import from_toml, to_toml
