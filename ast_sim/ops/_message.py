@@ -112,8 +112,8 @@ def _backward_reference(
     dz = (dy @ W2) * (x > 0)
     dc = (dz @ A2) * (h > 0)
     return (
-        torch.zeros_like(P).index_add_(0, senders, dz),
-        torch.zeros_like(Q).index_add_(0, receivers, dz),
+        torch.zeros_like(P).index_add(0, senders, dz),
+        torch.zeros_like(Q).index_add(0, receivers, dz),
         (dz if latents else dc @ A1) if wants_edges else e.new_empty(0, e.shape[1]),
         dc.T @ e,
         dc.sum(0),
@@ -173,6 +173,7 @@ def _gradient(ctx, dsum, dmessages):
 
 
 library.differentiate(_message, _save, _gradient)
+library.differentiate_by_composition(_message_backward)
 
 
 def _check_features(edges: EdgeSet, of_senders: Tensor, edge_features: Tensor | None, encoder: Encoder | None) -> None:

@@ -145,6 +145,7 @@ def _gradient(ctx, dout, *_):
 
 
 library.differentiate(_mlp, _save, _gradient)
+library.differentiate_by_composition(_mlp_backward, (9, 10, 11))
 
 
 def mlp(

@@ -3,6 +3,10 @@
 Every op has two bodies that compute the same: a C kernel for float32 on the CPU, and a composition of torch ops. The
 composition is the reference in the tests. It runs for every other device and dtype, and with AST_SIM_BACKEND=torch
 everywhere.
+
+Kernels know first derivatives backwards, and no others. All others are those of the composition: second derivatives
+(`create_graph=True`), tangents (`torch.autograd.forward_ad`) and everything in `torch.func`. Under `vmap` the indices
+of an op must be those of every sample.
 """
 
 from __future__ import annotations
@@ -15,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch.autograd import forward_ad
 
 BACKEND = os.environ.get("AST_SIM_BACKEND", "c")
 if BACKEND not in ("c", "torch"):
@@ -46,17 +51,21 @@ class Op:
     For plain float32 tensors on the CPU a call goes straight to the kernel: torch's dispatcher would take longer than a
     small kernel does. The dispatcher is used for tracing, dispatch modes, autocast, functorch, other devices and other
     dtypes. With AST_SIM_BACKEND=torch an op is its composition, and torch differentiates it like any other code.
+    Tangents and functorch take the composition, too.
     """
 
     def __init__(self, name: str, overload: torch._ops.OpOverload, kernel: Callable, reference: Callable) -> None:
         self.name, self.overload, self.kernel, self.reference = name, overload, kernel, reference
         self.function: type[torch.autograd.Function] | None = None  # set by `differentiate`
+        self.kept: tuple[int, ...] = ()  # set by `differentiate_by_composition`
 
     def __call__(self, *args):
         if BACKEND == "torch":
             return self.reference(*args)
         if torch.compiler.is_compiling():
             return self.overload(*args)
+        if forward_ad._current_level >= 0 and self.function and any(map(_has_tangent, args)):
+            return self.compose(*args)
         wants_gradient = False
         for x in args:
             if isinstance(x, torch.Tensor):
@@ -69,9 +78,38 @@ class Op:
             return self.function.apply(*args)
         return self.kernel(*args)
 
+    def compose(self, *args):
+        """The composition, as a function that torch can differentiate and transform in every way."""
+        for x in args:
+            if _is_batched(x) and not (self.function and x.is_floating_point()):
+                raise ValueError(
+                    f"{self.name}: vmap takes indices, offsets and what is no function of real numbers only where they"
+                    " are those of every sample; call the op for each sample, or for all of them as scenes of one batch"
+                )
+        args = [None if i in self.kept else x for i, x in enumerate(args)]
+        if not torch.is_autocast_enabled("cpu"):
+            return self.reference(*args)
+        with torch.autocast("cpu", enabled=False):
+            return self.reference(*(x.float() if getattr(x, "dtype", None) in _LOW_DTYPES else x for x in args))
+
 
 _PLAIN_TYPES = (torch.Tensor, torch.nn.Parameter)
 _PLAIN_DTYPES = (torch.float32, torch.int64, torch.int32)
+_LOW_DTYPES = (torch.float16, torch.bfloat16)
+
+
+def _has_tangent(x) -> bool:
+    return isinstance(x, torch.Tensor) and forward_ad.unpack_dual(x).tangent is not None
+
+
+def _is_batched(x) -> bool:
+    """Whether x is another tensor for each sample of a vmap."""
+    functorch = torch._C._functorch
+    while isinstance(x, torch.Tensor) and functorch.is_functorch_wrapped_tensor(x):
+        if functorch.is_batchedtensor(x):
+            return True
+        x = functorch.get_unwrapped(x)
+    return False
 
 
 def _is_watched() -> bool:
@@ -118,7 +156,9 @@ def define(schema: str, reference: Callable, fake: Callable, kernel: Callable | 
     _library.impl(name, reference, "CompositeExplicitAutograd")
     torch.library.register_fake(f"ast_sim::{name}", fake, lib=_library)
     torch.library.register_autocast(f"ast_sim::{name}", "cpu", torch.float32, lib=_library)
-    return Op(name, getattr(torch.ops.ast_sim, name).default, kernel, reference)
+    op = Op(name, getattr(torch.ops.ast_sim, name).default, kernel, reference)
+    _library.impl(name, op.compose, "FuncTorchDynamicLayerFrontMode")  # comes first under each transform of torch.func
+    return op
 
 
 def differentiate(op: Op, setup_context: Callable, backward: Callable) -> None:
@@ -142,6 +182,44 @@ def differentiate(op: Op, setup_context: Callable, backward: Callable) -> None:
 
     body = {"forward": staticmethod(forward), "backward": staticmethod(backward_of_some)}
     op.function = type(f"ast_sim_{op.name}", (torch.autograd.Function,), body)
+
+
+def differentiate_by_composition(op: Op, kept: tuple[int, ...] = ()) -> None:
+    """Register the derivatives of the composition as those of an op, such as the gradient of another op.
+
+    Args:
+        op: the op.
+        kept: the numbers of the arguments that another op has kept for this one. They are functions of the other
+            arguments. The composition computes them again where it gets None, and so their derivatives are not lost.
+    """
+    op.kept = kept
+
+    def save(ctx, inputs, output) -> None:
+        ctx.set_materialize_grads(False)
+        ctx.others = [None if isinstance(x, torch.Tensor) else x for x in inputs]
+        ctx.save_for_backward(
+            *(x if isinstance(x, torch.Tensor) and i not in kept else None for i, x in enumerate(inputs))
+        )
+
+    def gradient(ctx, *gradients):
+        wanted = [i for i, needed in enumerate(ctx.needs_input_grad) if needed and i not in kept]
+        args = [y if x is None else x for x, y in zip(ctx.saved_tensors, ctx.others, strict=True)]
+        with torch.enable_grad():
+            for i in wanted:
+                args[i] = args[i].view_as(args[i])  # where an argument is computed from another, the two stay apart
+            outputs = op.compose(*args)
+        outputs = outputs if isinstance(outputs, tuple) else (outputs,)
+        pairs = [(y, dy) for y, dy in zip(outputs, gradients, strict=True) if y.requires_grad and dy is not None]
+        found = [None] * len(args)
+        if wanted and pairs:
+            variables, again = [args[i] for i in wanted], torch.is_grad_enabled()
+            ys, dys = zip(*pairs, strict=True)
+            derivatives = torch.autograd.grad(ys, variables, dys, create_graph=again, allow_unused=True)
+            for i, derivative in zip(wanted, derivatives, strict=True):
+                found[i] = derivative
+        return tuple(found)
+
+    differentiate(op, save, gradient)
 
 
 def dense(x: torch.Tensor | None) -> torch.Tensor | None:
