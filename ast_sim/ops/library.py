@@ -64,7 +64,7 @@ class Op:
             return self.reference(*args)
         if torch.compiler.is_compiling():
             return self.overload(*args)
-        if forward_ad._current_level >= 0 and self.function and any(map(_has_tangent, args)):
+        if forward_ad._current_level >= 0 and any(map(_has_tangent, args)):
             return self.compose(*args)
         wants_gradient = False
         for x in args:
@@ -102,6 +102,11 @@ def _has_tangent(x) -> bool:
     return isinstance(x, torch.Tensor) and forward_ad.unpack_dual(x).tangent is not None
 
 
+def is_differentiated(x: torch.Tensor) -> bool:
+    """Whether x has a gradient or a tangent, or belongs to a transform of torch.func."""
+    return x.requires_grad or _has_tangent(x) or torch._C._functorch.is_functorch_wrapped_tensor(x)
+
+
 def _is_batched(x) -> bool:
     """Whether x is another tensor for each sample of a vmap."""
     functorch = torch._C._functorch
@@ -118,7 +123,7 @@ def _is_watched() -> bool:
         torch._C._len_torch_dispatch_stack() > 0
         or torch._C._are_functorch_transforms_active()
         or torch.is_autocast_enabled("cpu")
-        or torch.jit.is_tracing()
+        or torch._C._is_tracing()
     )
 
 
@@ -171,6 +176,8 @@ def differentiate(op: Op, setup_context: Callable, backward: Callable) -> None:
     def backward_of_some(ctx, *gradients):
         if all(gradient is None for gradient in gradients):
             return (None,) * len(ctx.needs_input_grad)
+        if any(map(_is_old_batch, gradients)):
+            return _backward_of_each(backward, ctx, gradients)
         return backward(ctx, *gradients)
 
     torch.library.register_autograd(op.overload.name(), backward_of_some, setup_context=setup_context, lib=_library)
@@ -182,6 +189,22 @@ def differentiate(op: Op, setup_context: Callable, backward: Callable) -> None:
 
     body = {"forward": staticmethod(forward), "backward": staticmethod(backward_of_some)}
     op.function = type(f"ast_sim_{op.name}", (torch.autograd.Function,), body)
+
+
+def _is_old_batch(x: torch.Tensor | None) -> bool:
+    """Whether x is batched by `is_grads_batched=True`, whose vmap is older than torch.func and knows few ops."""
+    return x is not None and torch._C._functorch.is_legacy_batchedtensor(x)
+
+
+def _backward_of_each(backward: Callable, ctx, gradients: tuple) -> tuple:
+    """`backward`, one sample after the other."""
+    level = torch._C._vmapmode_increment_nesting() - 1
+    torch._C._vmapmode_decrement_nesting()
+    batches = [torch._remove_batch_dim(x, level, 0, 0) if _is_old_batch(x) else x for x in gradients]
+    num = next(len(x) for x, y in zip(batches, gradients, strict=True) if _is_old_batch(y))
+    samples = [[x[i] if _is_old_batch(y) else x for x, y in zip(batches, gradients, strict=True)] for i in range(num)]
+    found = zip(*(backward(ctx, *sample) for sample in samples), strict=True)
+    return tuple(None if x[0] is None else torch._add_batch_dim(torch.stack(x), 0, level) for x in found)
 
 
 def differentiate_by_composition(op: Op, kept: tuple[int, ...] = ()) -> None:
