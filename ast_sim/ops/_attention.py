@@ -244,7 +244,8 @@ def attention(
 ) -> tuple[Tensor, Tensor]:
     """softmax(scale q k^T) v of each scene and head, with dropout on the weights.
 
-    Memory grows with the number of tokens, not with its square, forward and backward. A scene's result has the same
+    Memory grows with the number of tokens, not with its square, forward and backward; second derivatives and tangents
+    do store the scores. A scene's result has the same
     bits for any number of threads. Without dropout it has the same bits in any batch; dropout depends on the number of
     the scene in the batch.
 

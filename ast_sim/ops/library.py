@@ -4,9 +4,9 @@ Every op has two bodies that compute the same: a C kernel for float32 on the CPU
 composition is the reference in the tests. It runs for every other device and dtype, and with AST_SIM_BACKEND=torch
 everywhere.
 
-Kernels know first derivatives backwards, and no others. All others are those of the composition: second derivatives
-(`create_graph=True`), tangents (`torch.autograd.forward_ad`) and everything in `torch.func`. Under `vmap` the indices
-of an op must be those of every sample.
+Kernels know the first derivative, backwards. All others are those of the composition: higher ones
+(`create_graph=True`), tangents (`torch.autograd.forward_ad`) and everything in `torch.func`. With `vmap` the indices of
+an op must be the same for every sample.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ class Op:
 
     For plain float32 tensors on the CPU a call goes straight to the kernel: torch's dispatcher would take longer than a
     small kernel does. The dispatcher is used for tracing, dispatch modes, autocast, functorch, other devices and other
-    dtypes. With AST_SIM_BACKEND=torch an op is its composition, and torch differentiates it like any other code.
-    Tangents and functorch take the composition, too.
+    dtypes. Tangents and functorch take the composition. With AST_SIM_BACKEND=torch an op is its composition, and torch
+    differentiates it like any other code.
     """
 
     def __init__(self, name: str, overload: torch._ops.OpOverload, kernel: Callable, reference: Callable) -> None:
@@ -80,11 +80,11 @@ class Op:
 
     def compose(self, *args):
         """The composition, as a function that torch can differentiate and transform in every way."""
-        for x in args:
+        for argument, x in zip(self.overload._schema.arguments, args, strict=True):
             if _is_batched(x) and not (self.function and x.is_floating_point()):
                 raise ValueError(
-                    f"{self.name}: vmap takes indices, offsets and what is no function of real numbers only where they"
-                    " are those of every sample; call the op for each sample, or for all of them as scenes of one batch"
+                    f"{self.name}: vmap over {argument.name} is not possible: give every sample the same, call the op"
+                    " for each, or join the samples as scenes of one batch"
                 )
         args = [None if i in self.kept else x for i, x in enumerate(args)]
         if not torch.is_autocast_enabled("cpu"):
@@ -212,35 +212,32 @@ def differentiate_by_composition(op: Op, kept: tuple[int, ...] = ()) -> None:
 
     Args:
         op: the op.
-        kept: the numbers of the arguments that another op has kept for this one. They are functions of the other
-            arguments. The composition computes them again where it gets None, and so their derivatives are not lost.
+        kept: the numbers of the arguments that follow from the others and were kept from the forward op. Where the
+            composition is differentiated it gets None and computes them again; their derivatives would be lost.
     """
     op.kept = kept
 
     def save(ctx, inputs, output) -> None:
         ctx.set_materialize_grads(False)
         ctx.others = [None if isinstance(x, torch.Tensor) else x for x in inputs]
-        ctx.save_for_backward(
-            *(x if isinstance(x, torch.Tensor) and i not in kept else None for i, x in enumerate(inputs))
-        )
+        tensors = (x if isinstance(x, torch.Tensor) and i not in kept else None for i, x in enumerate(inputs))
+        ctx.save_for_backward(*tensors)
 
     def gradient(ctx, *gradients):
         wanted = [i for i, needed in enumerate(ctx.needs_input_grad) if needed and i not in kept]
         args = [y if x is None else x for x, y in zip(ctx.saved_tensors, ctx.others, strict=True)]
         with torch.enable_grad():
-            for i in wanted:
-                args[i] = args[i].view_as(args[i])  # where an argument is computed from another, the two stay apart
+            for i in wanted:  # by a view of its own: an argument may be a function of another, such as dout of x
+                args[i] = args[i].view_as(args[i])
             outputs = op.compose(*args)
         outputs = outputs if isinstance(outputs, tuple) else (outputs,)
         pairs = [(y, dy) for y, dy in zip(outputs, gradients, strict=True) if y.requires_grad and dy is not None]
-        found = [None] * len(args)
-        if wanted and pairs:
-            variables, again = [args[i] for i in wanted], torch.is_grad_enabled()
-            ys, dys = zip(*pairs, strict=True)
-            derivatives = torch.autograd.grad(ys, variables, dys, create_graph=again, allow_unused=True)
-            for i, derivative in zip(wanted, derivatives, strict=True):
-                found[i] = derivative
-        return tuple(found)
+        if not pairs:
+            return (None,) * len(args)
+        ys, dys = zip(*pairs, strict=True)
+        again, variables = torch.is_grad_enabled(), [args[i] for i in wanted]
+        found = iter(torch.autograd.grad(ys, variables, dys, create_graph=again, allow_unused=True))
+        return tuple(next(found) if i in wanted else None for i in range(len(args)))
 
     differentiate(op, save, gradient)
 

@@ -75,7 +75,10 @@ OPS: dict[str, tuple[Callable, list[tuple[int, ...]]]] = {
         lambda s, r, e, a, b, c, *w: message_sum(EDGES, s, r, e, (a, b, c), *w),
         [(4, 5), (5, 5), (7, 3), (8, 3), (8,), (5, 8), *LAYERS],
     ),
-    "message_sum latents": (lambda s, r, e, *w: message_sum(EDGES, s, r, e, None, *w), [(4, 5), (5, 5), (7, 5), *LAYERS]),
+    "message_sum latents": (
+        lambda s, r, e, *w: message_sum(EDGES, s, r, e, None, *w),
+        [(4, 5), (5, 5), (7, 5), *LAYERS],
+    ),
     "message_sum bare": (lambda s, r, *w: message_sum(EDGES, s, r, None, None, *w), [(4, 5), (5, 5), *LAYERS]),
     "message_edges": (
         lambda s, r, e, *w: torch.cat(message_edges(EDGES, s, r, e, None, *w)),
@@ -214,14 +217,17 @@ def test_tangents(name, monkeypatch):
     """Of all inputs at once, and of each input alone."""
     function, inputs, directions = case(name)
     for i in (None, *range(len(inputs))):
-        only = lambda d: tuple(x if i in (None, j) else torch.zeros_like(x) for j, x in enumerate(d))  # noqa: B023, E731
-        wanted = exact(monkeypatch, lambda f, x, d: F.jvp(f, x, only(d))[1], name)
-        assert_right(torch.func.jvp(function, inputs, only(directions))[1], wanted)
+        moves = [i in (None, j) for j in range(len(inputs))]
+
+        def jvp(function, inputs, directions, moves=moves):
+            return F.jvp(function, inputs, tuple(d * m for d, m in zip(directions, moves, strict=True)))[1]
+
+        wanted = exact(monkeypatch, jvp, name)
+        some = [d * m for d, m in zip(directions, moves, strict=True)]
+        assert_right(torch.func.jvp(function, inputs, tuple(some))[1], wanted)
         with forward_ad.dual_level(), torch.no_grad():
-            duals = [
-                forward_ad.make_dual(x, d) if i in (None, j) else x
-                for j, (x, d) in enumerate(zip(inputs, directions, strict=True))
-            ]
+            moved = zip(inputs, directions, moves, strict=True)
+            duals = [forward_ad.make_dual(x, d) if m else x for x, d, m in moved]
             assert_right(forward_ad.unpack_dual(function(*duals)).tangent, wanted)
 
 
@@ -263,9 +269,7 @@ def test_vmap(name):
     function, inputs, directions = case(name)
     for i in (None, *range(len(inputs))):
         chosen = [i in (None, j) for j in range(len(inputs))]
-        stacks = [
-            torch.stack([x, d, x - d], 1) if c else x for x, d, c in zip(inputs, directions, chosen, strict=True)
-        ]
+        stacks = [torch.stack([x, d, x - d], 1) if c else x for x, d, c in zip(inputs, directions, chosen, strict=True)]
         found = torch.func.vmap(function, tuple(1 if c else None for c in chosen))(*stacks)
         wanted = [function(*(s[:, b] if c else s for s, c in zip(stacks, chosen, strict=True))) for b in range(3)]
         torch.testing.assert_close(found, torch.stack(wanted), rtol=1e-4, atol=1e-4)
@@ -289,7 +293,8 @@ def test_composition_against_differences(name):
 def test_the_first_gradient_keeps_its_bits(name):
     """Whether or not it is differentiated again."""
     function, inputs, _ = case(name)
-    out, inputs = function(*(inputs := leaves(inputs))), inputs
+    inputs = leaves(inputs)
+    out = function(*inputs)
     plain = torch.autograd.grad(out.sum(), inputs, retain_graph=True)
     for x, y in zip(plain, torch.autograd.grad(out.sum(), inputs, create_graph=True), strict=True):
         assert torch.equal(x, y) and y.requires_grad
@@ -329,19 +334,34 @@ def test_compiled_transforms(transform):
 @pytest.mark.parametrize(
     "name, call, inputs",
     [
-        ("segment_sum", lambda o: segment_sum(torch.ones(5, 3), o, SEGMENTS[1]), SEGMENTS[0]),
-        ("attention", lambda o: attention(*[torch.ones(5, 1, 16)] * 3, o, o)[0], torch.tensor([0, 2, 5])),
-        ("octree", lambda x: octree(x, torch.tensor([0, 4]), (0.0, 0.0, 0.0), 1.0, 3).keys, torch.zeros(4, 3)),
+        ("segment_sum: vmap over node_order", lambda o: segment_sum(torch.ones(5, 3), o, SEGMENTS[1]), SEGMENTS[0]),
         (
-            "farthest_point_sample",
+            "attention: vmap over q_offsets",
+            lambda o: attention(*[torch.ones(5, 1, 16)] * 3, o, o)[0],
+            torch.tensor([0, 2, 5]),
+        ),
+        (
+            "octree: vmap over positions",
+            lambda x: octree(x, torch.tensor([0, 4]), (0.0, 0.0, 0.0), 1.0, 3).keys,
+            torch.zeros(4, 3),
+        ),
+        (
+            "farthest_point_sample: vmap over coordinates",
             lambda x: farthest_point_sample(x, torch.tensor([0, 4]), 2)[0],
             torch.zeros(4, 3, dtype=torch.int32),
         ),
     ],
 )
 def test_vmap_over_indices_is_refused(name, call, inputs):
-    with pytest.raises(ValueError, match=f"{name}: vmap takes indices"):
+    with pytest.raises(ValueError, match=f"{name} is not possible: give every sample the same"):
         torch.func.vmap(call)(torch.stack([inputs, inputs]))
+
+
+def test_the_log_sum_exp_has_no_derivative_in_any_direction():
+    q = normal(5, 2, 16).float()
+    lse = lambda q: attention(q, q, q, SCENES[0], SCENES[0])[1]  # noqa: E731
+    assert not lse(q.clone().requires_grad_()).requires_grad
+    assert not torch.func.jvp(lse, (q,), (q,))[1].any()
 
 
 def test_octree_has_no_tangent():
