@@ -88,38 +88,49 @@ def _scores(q: Tensor, k: Tensor, scale: float) -> Tensor:
     return torch.einsum("qhd,khd->hqk", q * scale, k)
 
 
+def _join(like: Tensor, fill: float, parts: list[tuple[slice, Tensor]]) -> Tensor:
+    """The rows of all scenes; the rows between these parts hold `fill`. Nothing is written to: vmap could not do it."""
+    rows, end = [], 0
+    for where, x in (*parts, (slice(len(like), len(like)), like[:0])):
+        rows += [like.new_full((where.start - end, *like.shape[1:]), fill), x]
+        end = where.stop
+    return torch.cat(rows)
+
+
 def _factors(scores: Tensor, dropout_p: float, seed: int, scene: int) -> Tensor | float:
     return dropout_factors(dropout_p, seed, scene, tuple(scores.shape), scores) if dropout_p else 1.0
 
 
 def _reference(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed):
     _check("attention", q, k, v, q_offsets, k_offsets, dropout_p)
-    out, maximum = torch.zeros_like(q), torch.full_like(q[:, :, 0], -torch.inf)
-    total = torch.zeros_like(maximum)
+    out, maximum, total = [], [], []
     for b, i, j in _scenes(q_offsets, k_offsets):
         x = _scores(q[i], k[j], scale)
         m = x.detach().amax(2, keepdim=True)
         weights = (x - m).exp()
         sums = weights.sum(2, keepdim=True)
         weights = weights / sums * _factors(x, dropout_p, seed, b)
-        out[i] = torch.einsum("hqk,khd->qhd", weights, v[j])
-        maximum[i], total[i] = (torch.where(sums > 0, y, torch.nan)[:, :, 0].T for y in (m, sums))
-    return out, maximum, total
+        out.append((i, torch.einsum("hqk,khd->qhd", weights, v[j])))
+        for parts, y in ((maximum, m), (total, sums.detach())):
+            parts.append((i, torch.where(sums > 0, y, torch.nan)[:, :, 0].T))
+    return _join(q, 0, out), _join(q[:, :, 0], -torch.inf, maximum), _join(q[:, :, 0], 0, total)
 
 
 def _backward_reference(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, out, maximum, total, dout):
     _check("attention_backward", q, k, v, q_offsets, k_offsets, dropout_p)
-    dq, dk, dv = torch.zeros_like(q), torch.zeros_like(k), torch.zeros_like(v)
+    dq, dk, dv = [], [], []
     for b, i, j in _scenes(q_offsets, k_offsets):
         x = _scores(q[i], k[j], scale)
-        weights = (x - maximum[i].T[:, :, None]).exp() / total[i].T[:, :, None]
+        kept = out is not None  # `out`, `maximum` and `total` are None where second derivatives are wanted
+        weights = (x - maximum[i].T[:, :, None]).exp() / total[i].T[:, :, None] if kept else x.softmax(2)
         factors = _factors(x, dropout_p, seed, b)
         dweights = factors * torch.einsum("qhd,khd->hqk", dout[i], v[j])
-        dx = scale * weights * (dweights - (dout[i] * out[i]).sum(2).T[:, :, None])
-        dq[i] = torch.einsum("hqk,khd->qhd", dx, k[j])
-        dk[j] = torch.einsum("hqk,qhd->khd", dx, q[i])
-        dv[j] = torch.einsum("hqk,qhd->khd", weights * factors, dout[i])
-    return dq, dk, dv
+        mean = (dout[i] * out[i]).sum(2).T[:, :, None] if kept else (weights * dweights).sum(2, keepdim=True)
+        dx = scale * weights * (dweights - mean)
+        dq.append((i, torch.einsum("hqk,khd->qhd", dx, k[j])))
+        dk.append((j, torch.einsum("hqk,qhd->khd", dx, q[i])))
+        dv.append((j, torch.einsum("hqk,qhd->khd", weights * factors, dout[i])))
+    return _join(q, 0, dq), _join(k, 0, dk), _join(v, 0, dv)
 
 
 # ---- C core ----
@@ -191,6 +202,7 @@ def _define(name: str, schema: str, split: Callable, together: Callable):
         return *(gradients if num > 1 else (gradients,)), *[None] * 5
 
     library.differentiate(op, save, gradient)
+    library.differentiate_by_composition(backward, (num + 5, num + 6, num + 7))
     return op, backward
 
 
@@ -232,7 +244,8 @@ def attention(
 ) -> tuple[Tensor, Tensor]:
     """softmax(scale q k^T) v of each scene and head, with dropout on the weights.
 
-    Memory grows with the number of tokens, not with its square, forward and backward. A scene's result has the same
+    Memory grows with the number of tokens, not with its square, forward and backward; second derivatives and tangents
+    do store the scores. A scene's result has the same
     bits for any number of threads. Without dropout it has the same bits in any batch; dropout depends on the number of
     the scene in the batch.
 

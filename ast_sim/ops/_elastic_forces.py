@@ -174,6 +174,7 @@ library.differentiate(
     lambda ctx, inputs, output: ctx.save_for_backward(*inputs),
     lambda ctx, grad: (_forces_backward(grad, *ctx.saved_tensors), *[None] * 5),
 )
+library.differentiate_by_composition(_forces_backward)
 
 
 def elastic_forces(position: Tensor, rest_position: Tensor, lame: Tensor, tets: TetrahedronSet) -> Tensor:

@@ -134,6 +134,7 @@ def _linear_gradient(ctx, dout, _):
 
 
 library.differentiate(_linear, _save_linear, _linear_gradient)
+library.differentiate_by_composition(_linear_backward, (4,))
 
 
 def linear(

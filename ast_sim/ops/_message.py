@@ -17,9 +17,9 @@ from torch import Tensor
 
 from ast_sim.ops import library
 from ast_sim.ops._edges import EdgeSet
+from ast_sim.ops._mlp import layer_norm, layer_norm_backward, normalize
 from ast_sim.ops.library import check_index, check_offsets, check_shape, dense, segment_of
 
-EPS = 1e-5
 Encoder = tuple[Tensor, Tensor, Tensor]
 
 
@@ -31,7 +31,7 @@ def _compose(of_senders, of_receivers, edge_features, encoder, W2, b2, gamma, be
         z = z + F.linear(F.relu(F.linear(edge_features, A1, a1)), A2)
     elif edge_features is not None:
         z = z + edge_features
-    messages = F.layer_norm(F.linear(F.relu(z), W2, b2), (len(b2),), gamma, beta, EPS)
+    messages = layer_norm(F.linear(F.relu(z), W2, b2), gamma, beta)
     return messages.new_zeros(len(of_receivers), len(b2)).index_add(0, receivers, messages), messages
 
 
@@ -102,18 +102,15 @@ def _backward_reference(
     of_edges = e if latents else F.linear(h, A2)
     x = F.relu(P.index_select(0, senders) + Q.index_select(0, receivers) + of_edges)
     y = F.linear(x, W2, b2)
-    _, mean, rstd = torch.native_layer_norm(y, (len(b2),), gamma, beta, EPS)
     g = dsum.index_select(0, receivers)
     if len(dmessages):
         g = g + dmessages
-    dy, dgamma, dbeta = torch.ops.aten.native_layer_norm_backward(
-        g, y, (len(b2),), mean, rstd, gamma, beta, (True, True, True)
-    )
+    dy, dgamma, dbeta = layer_norm_backward(g, gamma, *normalize(y))
     dz = (dy @ W2) * (x > 0)
     dc = (dz @ A2) * (h > 0)
     return (
-        torch.zeros_like(P).index_add_(0, senders, dz),
-        torch.zeros_like(Q).index_add_(0, receivers, dz),
+        torch.zeros_like(P).index_add(0, senders, dz),
+        torch.zeros_like(Q).index_add(0, receivers, dz),
         (dz if latents else dc @ A1) if wants_edges else e.new_empty(0, e.shape[1]),
         dc.T @ e,
         dc.sum(0),
@@ -173,6 +170,7 @@ def _gradient(ctx, dsum, dmessages):
 
 
 library.differentiate(_message, _save, _gradient)
+library.differentiate_by_composition(_message_backward)
 
 
 def _check_features(edges: EdgeSet, of_senders: Tensor, edge_features: Tensor | None, encoder: Encoder | None) -> None:

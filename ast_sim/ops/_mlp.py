@@ -8,6 +8,7 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from ast_sim.ops import library
 from ast_sim.ops._linear import _check_weight, _given, _outputs
@@ -35,11 +36,25 @@ def _hidden(x, beside, weight1, bias1) -> Tensor:
     return F.relu(F.linear(x if beside is None else torch.cat([x, beside], dim=1), weight1, bias1))
 
 
-def _normalized(y: Tensor) -> tuple[Tensor, Tensor]:
+def normalize(y: Tensor) -> tuple[Tensor, Tensor]:
     """Each row of y normalized, and the factors [M] of the rows."""
     centred = y - y.mean(1, keepdim=True)
     scale = (centred.square().mean(1) + EPSILON).rsqrt()
     return centred * scale[:, None], scale
+
+
+def layer_norm(y: Tensor, gamma: Tensor, beta: Tensor) -> Tensor:
+    """torch's own, or the formula: torch loses terms in the tangent of its tangent."""
+    if torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
+        return normalize(y)[0] * gamma + beta
+    return F.layer_norm(y, y.shape[1:], gamma, beta, EPSILON)
+
+
+def layer_norm_backward(dout: Tensor, gamma: Tensor, normalized: Tensor, scale: Tensor) -> tuple:
+    """The gradients of y, gamma and beta. torch's own loses terms in third derivatives."""
+    dn = dout * gamma
+    dy = dn - dn.mean(1, keepdim=True) - normalized * (dn * normalized).mean(1, keepdim=True)
+    return dy * scale[:, None], (dout * normalized).sum(0), dout.sum(0)
 
 
 # ---- composition ----
@@ -54,8 +69,8 @@ def _reference(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual,
         kept[0] = hidden
     if gamma is not None:
         if save:
-            kept[1:] = _normalized(out)
-        out = F.layer_norm(out, out.shape[1:], gamma, beta, EPSILON)
+            kept[1:] = normalize(out)
+        out = layer_norm(out, gamma, beta)
     return out if residual is None else out + residual, *kept
 
 
@@ -66,10 +81,8 @@ def _backward_reference(
     dgamma = dbeta = dy = dout
     if gamma is not None:
         if normalized is None:
-            normalized, scale = _normalized(F.linear(hidden, weight2, bias2))
-        dgamma, dbeta, dn = (dout * normalized).sum(0), dout.sum(0), dout * gamma
-        dy = dn - dn.mean(1, keepdim=True) - normalized * (dn * normalized).mean(1, keepdim=True)
-        dy = dy * scale[:, None]
+            normalized, scale = normalize(F.linear(hidden, weight2, bias2))
+        dy, dgamma, dbeta = layer_norm_backward(dout, gamma, normalized, scale)
     dz = (dy @ weight2).masked_fill(hidden <= 0, 0)
     inputs = x if beside is None else torch.cat([x, beside], dim=1)
     dinputs = dz @ weight1
@@ -145,6 +158,7 @@ def _gradient(ctx, dout, *_):
 
 
 library.differentiate(_mlp, _save, _gradient)
+library.differentiate_by_composition(_mlp_backward, (9, 10, 11))
 
 
 def mlp(

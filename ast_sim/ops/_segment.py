@@ -73,7 +73,7 @@ library.differentiate(_spread, _save_segments, _gradient_by(_sum))
 library.differentiate(
     _column_sum,
     lambda ctx, inputs, output: setattr(ctx, "rows", inputs[0].shape[0]),
-    lambda ctx, grad: grad.expand(ctx.rows, -1),
+    lambda ctx, grad: (grad.expand(ctx.rows, -1),),
 )
 
 

@@ -5,6 +5,7 @@ Legend: C_fine and C_coarse cells, I and O channels in and out, P pairs of cells
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from ast_sim.ops import library
@@ -49,10 +50,9 @@ def _reference(x, weight, bias, transposed, pair_offsets, source, destination, b
 
 def _weight_reference(x, dout, pair_offsets, source, destination):
     _check("sparse_conv_weight", pair_offsets, source, len(x), destination, len(dout))
-    dweight = x.new_zeros(OFFSETS, x.shape[1], dout.shape[1])
-    for k, i, j in _groups(pair_offsets, source, destination):
-        dweight[k] = x.index_select(0, i).T @ dout.index_select(0, j)
-    return dweight
+    groups = _groups(pair_offsets, source, destination)
+    found = {k: x.index_select(0, i).T @ dout.index_select(0, j) for k, i, j in groups}
+    return torch.stack([found.get(k, x.new_zeros(x.shape[1], dout.shape[1])) for k in range(OFFSETS)])
 
 
 def _kernel(x, weight, bias, transposed, pair_offsets, source, destination, *back_and_num):
@@ -108,6 +108,7 @@ def _gradient(ctx, dout):
 
 
 library.differentiate(_conv, _save, _gradient)
+library.differentiate_by_composition(_conv_weight)
 
 
 def sparse_conv(x: Tensor, weight: Tensor, map: CellMap, bias: Tensor | None = None) -> Tensor:

@@ -3,6 +3,10 @@
 Every op has two bodies that compute the same: a C kernel for float32 on the CPU, and a composition of torch ops. The
 composition is the reference in the tests. It runs for every other device and dtype, and with AST_SIM_BACKEND=torch
 everywhere.
+
+Kernels know the first derivative, backwards. All others are those of the composition: higher ones
+(`create_graph=True`), tangents (`torch.autograd.forward_ad`) and everything in `torch.func`. With `vmap` the indices of
+an op must be the same for every sample.
 """
 
 from __future__ import annotations
@@ -15,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch.autograd import forward_ad
 
 BACKEND = os.environ.get("AST_SIM_BACKEND", "c")
 if BACKEND not in ("c", "torch"):
@@ -45,18 +50,22 @@ class Op:
 
     For plain float32 tensors on the CPU a call goes straight to the kernel: torch's dispatcher would take longer than a
     small kernel does. The dispatcher is used for tracing, dispatch modes, autocast, functorch, other devices and other
-    dtypes. With AST_SIM_BACKEND=torch an op is its composition, and torch differentiates it like any other code.
+    dtypes. Tangents and functorch take the composition. With AST_SIM_BACKEND=torch an op is its composition, and torch
+    differentiates it like any other code.
     """
 
     def __init__(self, name: str, overload: torch._ops.OpOverload, kernel: Callable, reference: Callable) -> None:
         self.name, self.overload, self.kernel, self.reference = name, overload, kernel, reference
         self.function: type[torch.autograd.Function] | None = None  # set by `differentiate`
+        self.kept: tuple[int, ...] = ()  # set by `differentiate_by_composition`
 
     def __call__(self, *args):
         if BACKEND == "torch":
             return self.reference(*args)
         if torch.compiler.is_compiling():
             return self.overload(*args)
+        if forward_ad._current_level >= 0 and any(map(_has_tangent, args)):
+            return self.compose(*args)
         wants_gradient = False
         for x in args:
             if isinstance(x, torch.Tensor):
@@ -69,9 +78,43 @@ class Op:
             return self.function.apply(*args)
         return self.kernel(*args)
 
+    def compose(self, *args):
+        """The composition, as a function that torch can differentiate and transform in every way."""
+        for argument, x in zip(self.overload._schema.arguments, args, strict=True):
+            if _is_batched(x) and not (self.function and x.is_floating_point()):
+                raise ValueError(
+                    f"{self.name}: vmap over {argument.name} is not possible: give every sample the same, call the op"
+                    " for each, or join the samples as scenes of one batch"
+                )
+        args = [None if i in self.kept else x for i, x in enumerate(args)]
+        if not torch.is_autocast_enabled("cpu"):
+            return self.reference(*args)
+        with torch.autocast("cpu", enabled=False):
+            return self.reference(*(x.float() if getattr(x, "dtype", None) in _LOW_DTYPES else x for x in args))
+
 
 _PLAIN_TYPES = (torch.Tensor, torch.nn.Parameter)
 _PLAIN_DTYPES = (torch.float32, torch.int64, torch.int32)
+_LOW_DTYPES = (torch.float16, torch.bfloat16)
+
+
+def _has_tangent(x) -> bool:
+    return isinstance(x, torch.Tensor) and forward_ad.unpack_dual(x).tangent is not None
+
+
+def is_differentiated(x: torch.Tensor) -> bool:
+    """Whether x has a gradient or a tangent, or belongs to a transform of torch.func."""
+    return x.requires_grad or _has_tangent(x) or torch._C._functorch.is_functorch_wrapped_tensor(x)
+
+
+def _is_batched(x) -> bool:
+    """Whether x is another tensor for each sample of a vmap."""
+    functorch = torch._C._functorch
+    while isinstance(x, torch.Tensor) and functorch.is_functorch_wrapped_tensor(x):
+        if functorch.is_batchedtensor(x):
+            return True
+        x = functorch.get_unwrapped(x)
+    return False
 
 
 def _is_watched() -> bool:
@@ -80,7 +123,7 @@ def _is_watched() -> bool:
         torch._C._len_torch_dispatch_stack() > 0
         or torch._C._are_functorch_transforms_active()
         or torch.is_autocast_enabled("cpu")
-        or torch.jit.is_tracing()
+        or torch._C._is_tracing()
     )
 
 
@@ -118,7 +161,9 @@ def define(schema: str, reference: Callable, fake: Callable, kernel: Callable | 
     _library.impl(name, reference, "CompositeExplicitAutograd")
     torch.library.register_fake(f"ast_sim::{name}", fake, lib=_library)
     torch.library.register_autocast(f"ast_sim::{name}", "cpu", torch.float32, lib=_library)
-    return Op(name, getattr(torch.ops.ast_sim, name).default, kernel, reference)
+    op = Op(name, getattr(torch.ops.ast_sim, name).default, kernel, reference)
+    _library.impl(name, op.compose, "FuncTorchDynamicLayerFrontMode")  # comes first under each transform of torch.func
+    return op
 
 
 def differentiate(op: Op, setup_context: Callable, backward: Callable) -> None:
@@ -131,6 +176,8 @@ def differentiate(op: Op, setup_context: Callable, backward: Callable) -> None:
     def backward_of_some(ctx, *gradients):
         if all(gradient is None for gradient in gradients):
             return (None,) * len(ctx.needs_input_grad)
+        if any(map(_is_old_batch, gradients)):
+            return _backward_of_each(backward, ctx, gradients)
         return backward(ctx, *gradients)
 
     torch.library.register_autograd(op.overload.name(), backward_of_some, setup_context=setup_context, lib=_library)
@@ -142,6 +189,57 @@ def differentiate(op: Op, setup_context: Callable, backward: Callable) -> None:
 
     body = {"forward": staticmethod(forward), "backward": staticmethod(backward_of_some)}
     op.function = type(f"ast_sim_{op.name}", (torch.autograd.Function,), body)
+
+
+def _is_old_batch(x: torch.Tensor | None) -> bool:
+    """Whether x is batched by `is_grads_batched=True`, whose vmap is older than torch.func and knows few ops."""
+    return x is not None and torch._C._functorch.is_legacy_batchedtensor(x)
+
+
+def _backward_of_each(backward: Callable, ctx, gradients: tuple) -> tuple:
+    """`backward`, one sample after the other."""
+    level = torch._C._vmapmode_increment_nesting() - 1
+    torch._C._vmapmode_decrement_nesting()
+    batches = [torch._remove_batch_dim(x, level, 0, 0) if _is_old_batch(x) else x for x in gradients]
+    num = next(len(x) for x, y in zip(batches, gradients, strict=True) if _is_old_batch(y))
+    samples = [[x[i] if _is_old_batch(y) else x for x, y in zip(batches, gradients, strict=True)] for i in range(num)]
+    found = zip(*(backward(ctx, *sample) for sample in samples), strict=True)
+    return tuple(None if x[0] is None else torch._add_batch_dim(torch.stack(x), 0, level) for x in found)
+
+
+def differentiate_by_composition(op: Op, kept: tuple[int, ...] = ()) -> None:
+    """Register the derivatives of the composition as those of an op, such as the gradient of another op.
+
+    Args:
+        op: the op.
+        kept: the numbers of the arguments that follow from the others and were kept from the forward op. Where the
+            composition is differentiated it gets None and computes them again; their derivatives would be lost.
+    """
+    op.kept = kept
+
+    def save(ctx, inputs, output) -> None:
+        ctx.set_materialize_grads(False)
+        ctx.others = [None if isinstance(x, torch.Tensor) else x for x in inputs]
+        tensors = (x if isinstance(x, torch.Tensor) and i not in kept else None for i, x in enumerate(inputs))
+        ctx.save_for_backward(*tensors)
+
+    def gradient(ctx, *gradients):
+        wanted = [i for i, needed in enumerate(ctx.needs_input_grad) if needed and i not in kept]
+        args = [y if x is None else x for x, y in zip(ctx.saved_tensors, ctx.others, strict=True)]
+        with torch.enable_grad():
+            for i in wanted:  # by a view of its own: an argument may be a function of another, such as dout of x
+                args[i] = args[i].view_as(args[i])
+            outputs = op.compose(*args)
+        outputs = outputs if isinstance(outputs, tuple) else (outputs,)
+        pairs = [(y, dy) for y, dy in zip(outputs, gradients, strict=True) if y.requires_grad and dy is not None]
+        if not pairs:
+            return (None,) * len(args)
+        ys, dys = zip(*pairs, strict=True)
+        again, variables = torch.is_grad_enabled(), [args[i] for i in wanted]
+        found = iter(torch.autograd.grad(ys, variables, dys, create_graph=again, allow_unused=True))
+        return tuple(next(found) if i in wanted else None for i in range(len(args)))
+
+    differentiate(op, save, gradient)
 
 
 def dense(x: torch.Tensor | None) -> torch.Tensor | None:
