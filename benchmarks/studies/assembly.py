@@ -66,7 +66,7 @@ _SETTINGS = {"peak_rate": 2e-3, "validate_scenes": 10, "validate_every": 500, "c
 _BUMPER, _HOOK = (ROOT / "examples" / name / "SPEC.toml" for name in ("bumper", "snap_hook"))
 ROWS = {
     "bumper": Row("Bumper, 1,600 nodes", _BUMPER, nodes=1600, train=100, steps=1700, settings=_SETTINGS),
-    "snap_hook": Row("Snap hook, 1,600 nodes", _HOOK, nodes=1600, train=200, steps=2500, settings=_SETTINGS),
+    "snap_hook": Row("Snap hook, 1,600 nodes", _HOOK, nodes=1600, train=200, steps=1000, settings=_SETTINGS),
     "bumper_6000": Row(
         "Bumper, 6,000 nodes, after the small ones",
         _BUMPER,
