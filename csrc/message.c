@@ -8,17 +8,16 @@
  *
  * Edges are sorted by receiver. A task owns a range of receivers with about the same number of edges as any other and goes
  * through them in tiles of MESSAGE_TILE edges, whose h, x and y stay in the second-level cache; while it multiplies, it fetches
- * the rows of P of the next tile. The mean is subtracted before squares are summed. Sums run in stored order and a row of a
+ * the rows of P of the next tile. Sums run in stored order and a row of a
  * product does not depend on its neighbours in a tile, so neither tiles, tasks, threads nor other scenes of a batch change a bit.
  *
  * Cost per edge: 2 (E H + H F + F F2) flops, a row of P read from anywhere in memory, rows of e, of Q and of the sum in order.
  * Memory: 3 tiles a thread and the packed weights.
  */
-#include <math.h>
-
 #include "ast.h"
 #include "weight_panels.h"
 #include "gemm.h"
+#include "norm.h"
 #include "simd.h"
 
 enum {
@@ -27,7 +26,6 @@ enum {
   LEAST_EDGES = 2 * MESSAGE_TILE, /* of a task, even if that makes fewer of them, */
   MOST_EDGES = 16 * MESSAGE_TILE  /* or more */
 };
-static const float MESSAGE_EPS = 1e-5f;
 
 typedef struct {
   const ast_message *s;
@@ -58,13 +56,13 @@ static void message_layer(const message_weights *w, int layer, int64_t n, gemm_a
 
 typedef struct {
   float *h, *x, *y; /* [MESSAGE_TILE, row], their padding undefined */
-  float *columns;   /* [4, row] */
+  norm_columns columns;
 } message_tile;
 
 static bool message_new_tile(const message_weights *w, message_tile *t) {
   const int64_t size = MESSAGE_TILE * w->row;
-  float *memory = ast_scratch(5, (3 * size + 4 * w->row) * (int64_t)sizeof *memory);
-  *t = (message_tile){memory, memory + size, memory + 2 * size, memory + 3 * size};
+  float *memory = ast_scratch(5, 3 * (size + w->row) * (int64_t)sizeof *memory), *columns = memory + 3 * size;
+  *t = (message_tile){memory, memory + size, memory + 2 * size, {columns, columns + w->row, columns + 2 * w->row}};
   return memory != NULL;
 }
 
@@ -128,20 +126,6 @@ static void message_layers(const message_weights *w, int64_t first, int64_t n, c
   message_layer(w, MESSAGE_W2, n, (gemm_a){t->x, w->row, 1}, (dense_end){.out = t->y, .out_row = w->row});
 }
 
-/* Subtracts the mean from y, padded with zeros then; returns 1 / sqrt(variance + eps). */
-AST_INLINE float message_center(int64_t F2, float *y) {
-  vf total = {0}, squares = {0};
-  for (int64_t c = 0; c < F2; c += VW) total += vload_upto(y + c, F2 - c);
-  const float mean = vsum(total) / (float)F2;
-  for (int64_t c = 0; c < F2; c += VW) {
-    vf x = vload(y + c) - mean;
-    if (c + VW > F2) x = (vf)((vi)x & (LANE_INDICES < (int32_t)(F2 - c)));
-    vstore(y + c, x);
-    squares += x * x;
-  }
-  return 1 / sqrtf(vsum(squares) / (float)F2 + MESSAGE_EPS);
-}
-
 /* ---- forward ---- */
 
 typedef struct {
@@ -161,16 +145,19 @@ static int64_t first_receiver(const ast_message *s, int64_t edge) {
   return begin;
 }
 
-static void message_out(const message_job *job, int64_t m, float *y) {
+/* The messages of edges first.., from y, and the sums of their receivers. */
+AST_INLINE void message_out(const message_job *job, int64_t first, int64_t n, float *y, const bool whole) {
   const ast_message *s = job->w.s;
   const int64_t F2 = s->F2;
-  const float inverse = message_center(F2, y);
-  float *sum = job->sum + s->receivers[m] * F2;
-  for (int64_t c = 0; c < F2; c += VW) {
-    const int64_t n = F2 - c;
-    const vf out = vload(y + c) * inverse * vload_upto(s->gamma + c, n) + vload_upto(s->beta + c, n);
-    vstore_upto(sum + c, vload_upto(sum + c, n) + out, n);
-    if (job->messages) vstore_upto(job->messages + m * F2 + c, out, n);
+  for (int64_t m = first; m < first + n; m++, y += job->w.row) {
+    const float scale = norm_centre(y, F2, whole);
+    float *sum = job->sum + s->receivers[m] * F2;
+    for (int64_t c = 0; c < F2; c += VW) {
+      const int64_t lanes = whole ? VW : F2 - c;
+      const vf out = norm_out(scale * vload(y + c), s->gamma, s->beta, c, lanes);
+      vstore_upto(sum + c, vload_upto(sum + c, lanes) + out, lanes);
+      if (job->messages) vstore_upto(job->messages + m * F2 + c, out, lanes);
+    }
   }
 }
 
@@ -186,7 +173,8 @@ static ast_status message_task(int64_t index, void *context) {
   for (int64_t m = s->receiver_offsets[begin]; m < last; m += MESSAGE_TILE) {
     const int64_t n = min64(MESSAGE_TILE, last - m);
     message_layers(&job->w, m, n, &t);
-    for (int64_t i = 0; i < n; i++) message_out(job, m + i, t.y + i * job->w.row);
+    if (s->F2 % VW) message_out(job, m, n, t.y, false);
+    else message_out(job, m, n, t.y, true);
   }
   return AST_OK;
 }

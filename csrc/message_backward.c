@@ -79,39 +79,21 @@ static void message_sort_by_part(const message_backward_job *job, int64_t begin,
 }
 
 /* y becomes dy. Sums over the tile are added to those of the share at its end: shorter sums are more exact. */
-static void message_norm_backward(const message_backward_job *job, int64_t first, int64_t n, const message_tile *t,
-                                  const message_sums *sums) {
+AST_INLINE void message_norm_backward(const message_backward_job *job, int64_t first, int64_t n, const message_tile *t,
+                                      const message_sums *sums, const bool whole) {
   const ast_message *s = job->w.s;
   const int64_t F2 = s->F2, row = job->w.row;
-  float *dgamma = t->columns, *dbeta = dgamma + row, *db2 = dbeta + row, *p_i = db2 + row;
-  memset(dgamma, 0, (size_t)(3 * row) * sizeof *dgamma);
+  memset(t->columns.dgamma, 0, (size_t)row * sizeof(float));
+  memset(t->columns.dbeta, 0, (size_t)row * sizeof(float));
   for (int64_t i = 0; i < n; i++) {
     float *y = t->y + i * row;
-    const float *dsum = job->dsum + s->receivers[first + i] * F2;
     const float *dmessage = job->dmessages ? job->dmessages + (first + i) * F2 : NULL;
-    const float inverse = message_center(F2, y);
-    vf total = {0}, along = {0};
-    for (int64_t c = 0; c < F2; c += VW) {
-      vf g = vload_upto(dsum + c, F2 - c);
-      if (dmessage) g += vload_upto(dmessage + c, F2 - c);
-      const vf u = vload(y + c) * inverse, p = g * vload_upto(s->gamma + c, F2 - c);
-      vstore(y + c, u);
-      vstore(p_i + c, p); /* not computed twice: fused into the difference below it would not cancel */
-      total += p;
-      along += p * u;
-      vstore(dbeta + c, vload(dbeta + c) + g);
-      vstore(dgamma + c, vload(dgamma + c) + g * u);
-    }
-    const float mean_p = vsum(total) / (float)F2, mean_pu = vsum(along) / (float)F2;
-    for (int64_t c = 0; c < F2; c += VW) {
-      const vf dy = (vload(p_i + c) - mean_p - vload(y + c) * mean_pu) * inverse;
-      vstore(y + c, dy);
-      vstore(db2 + c, vload(db2 + c) + dy);
-    }
+    const float scale = norm_centre(y, F2, whole);
+    norm_backward(F2, whole, s->gamma, job->dsum + s->receivers[first + i] * F2, dmessage, scale, NULL, y, &t->columns);
   }
-  dense_add_rows(dgamma, row, 1, F2, sums->gamma);
-  dense_add_rows(dbeta, row, 1, F2, sums->beta);
-  dense_add_rows(db2, row, 1, F2, sums->b2);
+  dense_add_rows(t->columns.dgamma, 0, 1, F2, sums->gamma);
+  dense_add_rows(t->columns.dbeta, 0, 1, F2, sums->beta);
+  dense_add_rows(t->y, row, n, F2, sums->b2);
 }
 
 /* dz of the tile into the buffer, and the weight gradients added to `sums`, or put there if they are `fresh`. */
@@ -122,7 +104,8 @@ static void message_tile_backward(const message_backward_job *job, int64_t first
   const int64_t H = round_up(s->H, VW), F = round_up(s->F, VW), E = s->E, row = w->row;
   float *dz = job->dz + (first - job->begin) * row, *dy = t->y, *dc = t->y;
   message_layers(w, first, n, t);
-  message_norm_backward(job, first, n, t, sums);
+  if (s->F2 % VW) message_norm_backward(job, first, n, t, sums, false);
+  else message_norm_backward(job, first, n, t, sums, true);
   gemm(s->F2, F, n, (gemm_a){dy, 1, row}, gemm_rows(t->x, row), sums->W2, F, !fresh);
   message_layer(w, MESSAGE_W2_BACK, n, (gemm_a){dy, row, 1}, (dense_end){.out = dz, .out_row = row, .hidden = t->x, .hidden_row = row});
   float *de = job->out->edge_features;

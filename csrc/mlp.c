@@ -3,8 +3,7 @@
  *   h = max(0, [x, beside] W1^T + bias1),   y = h W2^T + bias2,   n = (y - mean(y)) / sqrt(var(y) + eps)
  *   out = gamma . n + beta + residual       (without norm: y + residual)
  *
- * Rows are taken in blocks that stay in the cache with all their intermediate values. The variance is the mean of squared
- * differences to the mean, in a second pass over a row in the cache. Backward, with r = 1 / sqrt(var + eps),
+ * Rows are taken in blocks that stay in the cache with all their intermediate values. Backward, with r = 1 / sqrt(var + eps),
  *
  *   dn = gamma . dout,   dy = r (dn - mean(dn) - n mean(dn . n)),   dz = [h > 0] . (dy W2)
  *   dW2 = dy^T h,   dW1 = dz^T [x, beside],   d[x, beside] = dz W1,   the other gradients sums of rows of dy, dz, dout and dout . n,
@@ -14,14 +13,11 @@
  *
  * Cost: 2 M H (I + I2 + O) operations forward and 4 M H (I + I2 + O) backward, 2 M H (I + I2 + O) more if nothing was kept.
  */
-#include <math.h>
-
 #include "ast.h"
 #include "weight_panels.h"
 #include "gemm.h"
+#include "norm.h"
 #include "simd.h"
-
-static const float MLP_EPSILON = 1e-5f;
 
 static dense_layer mlp_layer(const float *weight, const float *bias, int64_t K, int64_t N) {
   return (dense_layer){.weight = weight, .row = 1, .column = K, .bias = bias, .K = K, .N = N};
@@ -31,22 +27,6 @@ static dense_layer mlp_layer(const float *weight, const float *bias, int64_t K, 
 static void mlp_copy_inputs(const ast_mlp *s, int64_t first, int64_t rows, float *to, int64_t row) {
   dense_copy_rows(s->x + first * s->x_stride, s->x_stride, rows, s->I, to, row);
   if (s->beside) dense_copy_rows(s->beside + first * s->beside_stride, s->beside_stride, rows, s->I2, to + s->I, row);
-}
-
-/* the first n lanes of x, 0 in the others */
-AST_INLINE vf mlp_lanes(vf x, int64_t n) { return n >= VW ? x : (vf)((vi)x & (LANE_INDICES < (int32_t)n)); }
-
-/* y becomes y - mean(y), 0 behind its O columns; returns 1 / sqrt(var + eps), the factor that makes n of it. */
-AST_INLINE float mlp_centre(float *y, int64_t O, const bool whole) {
-  vf sum = {0}, squares = {0};
-  for (int64_t j = 0; j < O; j += VW) sum += whole ? vload(y + j) : mlp_lanes(vload(y + j), O - j);
-  const float mean = vsum(sum) / (float)O;
-  for (int64_t j = 0; j < O; j += VW) {
-    const vf d = whole ? vload(y + j) - mean : mlp_lanes(vload(y + j) - mean, O - j);
-    squares += d * d;
-    vstore(y + j, d);
-  }
-  return 1 / sqrtf(vsum(squares) / (float)O + MLP_EPSILON);
 }
 
 /* ---- forward ---- */
@@ -71,14 +51,14 @@ AST_INLINE void mlp_norm_rows(const mlp_job *job, int64_t first, int64_t rows, f
       __builtin_prefetch(job->out + later + j, 1);
       if (job->kept.normalized) __builtin_prefetch(job->kept.normalized + later + j, 1);
     }
-    const float scale = mlp_centre(y, O, whole);
+    const float scale = norm_centre(y, O, whole);
     const float *residual = job->residual ? job->residual + i * s->residual_stride : NULL;
     float *out = job->out + i * O, *normalized = job->kept.normalized ? job->kept.normalized + i * O : NULL;
     if (job->kept.scale) job->kept.scale[i] = scale;
     for (int64_t j = 0; j < O; j += VW) {
       const int64_t lanes = whole ? VW : O - j;
       const vf n = scale * vload(y + j);
-      vf value = vload_upto(s->gamma + j, lanes) * n + vload_upto(s->beta + j, lanes);
+      vf value = norm_out(n, s->gamma, s->beta, j, lanes);
       if (residual) value += vload_upto(residual + j, lanes);
       vstore_upto(out + j, value, lanes);
       if (normalized) vstore_upto(normalized + j, n, lanes);
@@ -155,30 +135,13 @@ typedef struct {
 } mlp_backward_job;
 
 /* dy of the rows from `first` on, in the place of y, or of n, which is read if it was kept; dgamma and dbeta are added to */
-AST_INLINE void mlp_norm_gradient(const mlp_backward_job *job, int64_t first, int64_t rows, float *y, float *dgamma, float *dbeta,
+AST_INLINE void mlp_norm_backward(const mlp_backward_job *job, int64_t first, int64_t rows, float *y, const norm_columns *columns,
                                   const bool whole) {
   const ast_mlp *s = job->s;
-  const int64_t O = s->O;
   for (int64_t i = first; i < first + rows; i++, y += job->y_row) {
-    const float *dout = job->dout + i * s->dout_stride, *kept = job->kept.normalized ? job->kept.normalized + i * O : NULL;
-    const float scale = kept ? job->kept.scale[i] : mlp_centre(y, O, whole);
-    vf sum = {0}, products = {0};
-    for (int64_t j = 0; j < O; j += VW) {
-      const int64_t lanes = whole ? VW : O - j;
-      const vf n = kept ? vload_upto(kept + j, lanes) : scale * vload(y + j);
-      const vf d = vload_upto(dout + j, lanes), dn = vload_upto(s->gamma + j, lanes) * d;
-      sum += dn;
-      products += dn * n;
-      vstore(y + j, n);
-      vstore(dgamma + j, vload(dgamma + j) + d * n);
-      vstore(dbeta + j, vload(dbeta + j) + d);
-    }
-    const float mean = vsum(sum) / (float)O, product = vsum(products) / (float)O;
-    for (int64_t j = 0; j < O; j += VW) {
-      const int64_t lanes = whole ? VW : O - j;
-      const vf dn = vload_upto(s->gamma + j, lanes) * vload_upto(dout + j, lanes);
-      vstore(y + j, scale * ((dn - mean) - vload(y + j) * product));
-    }
+    const float *kept = job->kept.normalized ? job->kept.normalized + i * s->O : NULL;
+    const float scale = kept ? job->kept.scale[i] : norm_centre(y, s->O, whole);
+    norm_backward(s->O, whole, s->gamma, job->dout + i * s->dout_stride, NULL, scale, kept, y, columns);
   }
 }
 
@@ -204,11 +167,12 @@ static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_
     const dense_end end = {.out = y, .out_row = job->y_row};
     if (!job->kept.normalized) dense_rows(&job->layers[1], 0, dense_panels(&job->layers[1]), rows, units, end);
     float *of_block = y + DENSE_ROWS * job->y_row; /* sums of the block first, so that long sums stay accurate */
+    const norm_columns columns = {of_block, of_block + sums[4].row, of_block + 2 * sums[4].row};
     memset(of_block, 0, 2 * (size_t)sums[4].row * sizeof *of_block);
-    if (s->O % VW) mlp_norm_gradient(job, first, rows, y, of_block, of_block + sums[4].row, false);
-    else mlp_norm_gradient(job, first, rows, y, of_block, of_block + sums[4].row, true);
-    dense_add_rows(of_block, 0, 1, sums[4].row, partials + sums[4].at);
-    dense_add_rows(of_block + sums[4].row, 0, 1, sums[5].row, partials + sums[5].at);
+    if (s->O % VW) mlp_norm_backward(job, first, rows, y, &columns, false);
+    else mlp_norm_backward(job, first, rows, y, &columns, true);
+    dense_add_rows(columns.dgamma, 0, 1, sums[4].row, partials + sums[4].at);
+    dense_add_rows(columns.dbeta, 0, 1, sums[5].row, partials + sums[5].at);
   }
   if (sums[2].to)
     gemm(s->O, sums[2].row, rows, (gemm_a){y, 1, job->y_row}, gemm_rows(units.data, units.row), partials + sums[2].at, sums[2].row, add);
@@ -242,7 +206,7 @@ static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_
 static ast_status mlp_backward_task(int64_t index, void *context) {
   const mlp_backward_job *job = context;
   const int64_t first = index * job->chunks.rows, last = min64(job->s->M, first + job->chunks.rows);
-  const int64_t floats = DENSE_ROWS * (job->input_row + job->hidden_row + job->y_row) + 2 * job->sums[4].row;
+  const int64_t floats = DENSE_ROWS * (job->input_row + job->hidden_row + job->y_row) + 3 * job->sums[4].row;
   float *input = ast_scratch(5, floats * (int64_t)sizeof *input);
   if (!input) return AST_NO_MEMORY;
   float *hidden = input + DENSE_ROWS * job->input_row, *y = hidden + DENSE_ROWS * job->hidden_row;
