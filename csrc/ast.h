@@ -30,7 +30,7 @@ typedef struct {
   float scale;
   double dropout_p;                        /* weights are dropped with this probability, 0 <= p < 1 */
   uint64_t seed;                           /* of the counter-based generator: key (seed), counter (scene, head, query, key) */
-  int64_t dq_stride, dk_stride, dv_stride; /* floats from one row of the gradients to the next; 0: H*D */
+  int64_t dq_stride, dk_stride, dv_stride; /* the same of the gradients */
 } ast_attention;
 
 /* The pairs of a sparse convolution, grouped by kernel offset: group k is [offsets[k], offsets[k+1]) for k < 27.

@@ -257,11 +257,7 @@ static ast_status attention_backward(const ast_attention *s, const float *restri
   }
   float *partials = ast_scratch(7, next.first_partial * (int64_t)sizeof *partials);
   if (!partials) return AST_NO_MEMORY;
-  ast_attention sizes = *s;
-  if (!sizes.dq_stride) sizes.dq_stride = s->H * s->D;
-  if (!sizes.dk_stride) sizes.dk_stride = s->H * s->D;
-  if (!sizes.dv_stride) sizes.dv_stride = s->H * s->D;
-  backward_job job = {&sizes, q, k, v, out, maximum, sum, dout, dq, dk, dv, cuts, partials};
+  backward_job job = {s, q, k, v, out, maximum, sum, dout, dq, dk, dv, cuts, partials};
   const ast_status status = ast_parallel(next.first_task, backward_task, &job);
   return status == AST_OK && next.first_partial ? ast_parallel(s->B * s->H, add_partials_task, &job) : status;
 }

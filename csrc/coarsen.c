@@ -18,10 +18,6 @@
 #include "ast.h"
 #include "simd.h"
 
-#ifndef OCTREE_MAX_CELLS
-#define OCTREE_MAX_CELLS INT32_MAX /* neighbours are held as int32 */
-#endif
-
 enum { OCTREE_LEVELS = 22, OCTREE_GROUPS = 27 }; /* the given level and at most 21 above it: a key has 63 bits */
 
 AST_INLINE unsigned octree_octants(int64_t family) { return (unsigned)family & 255; }
@@ -51,7 +47,7 @@ AST_INLINE int octree_starts(const octree_cells_job *s, int64_t i, int64_t b) {
 static ast_status octree_count_cells_task(int64_t chunk, void *context) {
   const octree_cells_job *s = context;
   octree_chunk count = {.next = {0}};
-  int64_t b = octree_scene_of(s->offsets, s->B, chunk * OCTREE_CHUNK);
+  int64_t b = scene_at(s->offsets, s->B, chunk * OCTREE_CHUNK);
   for (int64_t i = chunk * OCTREE_CHUNK; i < min64(s->C, (chunk + 1) * OCTREE_CHUNK); i++) {
     while (s->offsets[b + 1] <= i) b++;
     count.next[octree_starts(s, i, b)]++;
@@ -63,7 +59,7 @@ static ast_status octree_count_cells_task(int64_t chunk, void *context) {
 static ast_status octree_write_cells_task(int64_t chunk, void *context) {
   const octree_cells_job *s = context;
   octree_chunk own = s->chunks[chunk];
-  int64_t begin[OCTREE_LEVELS], *families[OCTREE_LEVELS], b = octree_scene_of(s->offsets, s->B, chunk * OCTREE_CHUNK);
+  int64_t begin[OCTREE_LEVELS], *families[OCTREE_LEVELS], b = scene_at(s->offsets, s->B, chunk * OCTREE_CHUNK);
   memcpy(begin, own.next, sizeof begin);
   for (int j = 1; j <= s->root; j++) families[j] = s->level[j].families;
   for (int64_t i = chunk * OCTREE_CHUNK; i < min64(s->C, (chunk + 1) * OCTREE_CHUNK); i++) {
@@ -109,14 +105,7 @@ static void octree_places(octree_chunk *chunks, int64_t num, int root, int64_t C
 
 /* The first cell of each scene: of the cells above those of the finer level. */
 static void octree_scene_offsets(const ast_octree_level *s, const int64_t *fine_offsets) {
-  for (int64_t b = 0, low = 0; b <= s->B; b++) {
-    for (int64_t high = s->C; low < high;) {
-      const int64_t middle = (low + high) / 2;
-      if (octree_first(s->families[middle]) < fine_offsets[b]) low = middle + 1;
-      else high = middle;
-    }
-    s->offsets[b] = low;
-  }
+  for (int64_t b = 0, cell = 0; b <= s->B; b++) s->offsets[b] = cell = lower_bound(s->families, cell, s->C, fine_offsets[b] << 8);
 }
 
 /* ---- neighbours ---- */
@@ -252,7 +241,7 @@ static char *octree_place_level(ast_octree_level *s, int64_t C, int64_t B, int64
 /* The cells of all levels up to the root, of which `level` gets all, [root + 1]. */
 static ast_status octree_all_cells(octree_cells_job *s, ast_octree_level *level) {
   const int64_t chunks = octree_chunks(s->C);
-  if (s->C > OCTREE_MAX_CELLS) return AST_TOO_LARGE;
+  if (s->C > INT32_MAX) return AST_TOO_LARGE; /* neighbours are held as int32 */
   s->chunks = ast_scratch(2, chunks * (int64_t)sizeof *s->chunks);
   if (!s->chunks) return AST_NO_MEMORY;
   ast_parallel(chunks, octree_count_cells_task, s);

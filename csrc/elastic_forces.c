@@ -259,9 +259,8 @@ static ast_status elastic_run(const ast_elastic *s, const float *direction, floa
     *to[i] = memcpy(copies + i * length, from[i], (size_t)(3 * s->N) * sizeof *copies);
     copies[i * length + 3 * s->N] = 0;
   }
-  const ast_status status =
-      ast_parallel((s->E + ELASTIC_ELEMENTS - 1) / ELASTIC_ELEMENTS, direction ? elastic_direction_task : elastic_force_task, &job);
-  return status == AST_OK ? ast_parallel((s->N + ELASTIC_NODES - 1) / ELASTIC_NODES, elastic_sum_task, &job) : status;
+  const ast_status status = ast_parallel(divide_up(s->E, ELASTIC_ELEMENTS), direction ? elastic_direction_task : elastic_force_task, &job);
+  return status == AST_OK ? ast_parallel(divide_up(s->N, ELASTIC_NODES), elastic_sum_task, &job) : status;
 }
 
 static ast_status elastic_forces(const ast_elastic *s, float *restrict force) { return elastic_run(s, NULL, force); }

@@ -45,7 +45,7 @@ AST_INLINE void fps_replay(fps_tournament t, int64_t key) {
 /* Points of a block: few blocks for small scenes, and never more than FPS_BLOCKS. */
 static int64_t fps_block_size(int64_t n) {
   const int64_t size = n <= 512 ? n : n < 20000 ? 128 : 192;
-  return round_up(max64(size, (n + FPS_BLOCKS - 1) / FPS_BLOCKS), FPS_TILE);
+  return round_up(max64(size, divide_up(n, FPS_BLOCKS)), FPS_TILE);
 }
 
 /* 2^l, for loops over l that no instruction set has a shift for. */

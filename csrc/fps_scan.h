@@ -14,7 +14,7 @@ typedef struct {
 
 /* Room for the blocks and the samples of a scene; no points in it yet. */
 static bool FPS(reserve)(FPS(scene) * s, int64_t n, int64_t num, int64_t size) {
-  const int64_t blocks = (n + size - 1) / size, samples = num + FPS_TILE;
+  const int64_t blocks = divide_up(n, size), samples = num + FPS_TILE;
   int64_t leaves = 1;
   while (leaves < blocks) leaves *= 2;
   const int64_t large = 2 * leaves + blocks, middle = blocks * size, small = blocks * (3 * size + 6) + 3 * samples;

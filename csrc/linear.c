@@ -40,8 +40,8 @@ static ast_status linear_run(const ast_linear *s, int64_t tasks, ast_task task, 
 
 /* The number of tasks: enough for some threads where there are few rows, whole rows where there are many. */
 static int64_t linear_cut(linear_product *p, bool small) {
-  const int64_t rows = p->M < 64 * DENSE_ROWS ? DENSE_ROWS : 4 * DENSE_ROWS, tiles = (p->M + GEMM_ROWS - 1) / GEMM_ROWS;
-  p->blocks = small ? min64(1, tiles) : min64(tiles, round_up((p->M + rows - 1) / rows, 2));
+  const int64_t rows = p->M < 64 * DENSE_ROWS ? DENSE_ROWS : 4 * DENSE_ROWS, tiles = divide_up(p->M, GEMM_ROWS);
+  p->blocks = small ? min64(1, tiles) : min64(tiles, round_up(divide_up(p->M, rows), 2));
   p->groups = small ? 1 : max64(1, min64(dense_panels(&p->layer), 24 / max64(1, p->blocks)));
   return p->blocks * p->groups;
 }
@@ -156,7 +156,7 @@ static ast_status linear_chunk_task(int64_t index, void *context) {
   for (int64_t i = first; i < last; i += job->chunks.step) {
     const int64_t rows = min64(job->chunks.step, last - i);
     linear_backward_rows(job, i, rows, dz, x, dbias);
-    if (job->dweight) gemm(s->O, width, rows, (gemm_a){dz, 1, job->dz_row}, gemm_rows(x, job->x_row), dweight, width, i > first);
+    if (job->dweight) gemm(s->O, width, rows, (gemm_a){dz, 1, job->dz_row}, x, job->x_row, dweight, width, i > first);
   }
   return AST_OK;
 }
@@ -197,8 +197,8 @@ static ast_status linear_tile_task(int64_t index, void *context) {
     float *to = width == columns ? job->dweight + o * s->I + k : tile;
     const int64_t to_row = width == columns ? s->I : width;
     for (int64_t i = 0; i < s->M; i += LINEAR_TILE_DEPTH)
-      gemm(rows, width, min64(LINEAR_TILE_DEPTH, s->M - i), (gemm_a){dz.data + i * dz.row + o, 1, dz.row},
-           gemm_rows(x.data + i * x.row + k, x.row), to, to_row, i > 0);
+      gemm(rows, width, min64(LINEAR_TILE_DEPTH, s->M - i), (gemm_a){dz.data + i * dz.row + o, 1, dz.row}, x.data + i * x.row + k, x.row,
+           to, to_row, i > 0);
     for (int64_t i = 0; to == tile && i < rows; i++)
       memcpy(job->dweight + (o + i) * s->I + k, tile + i * width, (size_t)columns * sizeof *tile);
   }
@@ -223,11 +223,11 @@ static ast_status linear_by_tiles(linear_backward_job *job) {
     if (new_dz) job->all_dz = scratch, job->tiles_dz = (gemm_a){scratch, job->dz_row, 1};
     scratch += s->M * job->dz_row;
     if (new_x) job->all_x = scratch, job->tiles_x = (gemm_a){scratch, job->x_row, 1};
-    const ast_status status = linear_run(s, (s->M + DENSE_ROWS - 1) / DENSE_ROWS, linear_block_task, job);
+    const ast_status status = linear_run(s, divide_up(s->M, DENSE_ROWS), linear_block_task, job);
     if (status != AST_OK) return status;
   }
-  job->across = (s->I + LINEAR_TILE_COLUMNS - 1) / LINEAR_TILE_COLUMNS;
-  if (job->dweight || job->dbias) job->tiles = (s->O + LINEAR_TILE_ROWS - 1) / LINEAR_TILE_ROWS * job->across;
+  job->across = divide_up(s->I, LINEAR_TILE_COLUMNS);
+  if (job->dweight || job->dbias) job->tiles = divide_up(s->O, LINEAR_TILE_ROWS) * job->across;
   job->product = (linear_product){.layer = job->layers[1], .a = job->tiles_dz.data, .a_row = job->tiles_dz.row, .M = s->M};
   job->product.end = (dense_end){.out = job->dx, .out_row = s->I};
   return linear_run(s, job->tiles + (job->dx ? linear_cut(&job->product, linear_is_small(s)) : 0), linear_tile_task, job);

@@ -7,9 +7,9 @@
  *   out_m = gamma (y_m - mean y_m) / sqrt(var y_m + eps) + beta,     sum_r = sum of out_m over the edges m into r
  *
  * Edges are sorted by receiver. A task owns a range of receivers with about the same number of edges as any other and goes
- * through them in tiles of MESSAGE_TILE edges, whose h, x and y stay in the second-level cache; while it multiplies, it fetches
- * the rows of P of the next tile. Sums run in stored order and a row of a
- * product does not depend on its neighbours in a tile, so neither tiles, tasks, threads nor other scenes of a batch change a bit.
+ * through them in tiles of MESSAGE_TILE edges, whose h, x and y stay in the second-level cache; while it multiplies, it
+ * fetches the rows of P of the next tile. Sums run in stored order and a row of a product does not depend on its neighbours
+ * in a tile, so neither tiles, tasks, threads nor other scenes of a batch change a bit.
  *
  * Cost per edge: 2 (E H + H F + F F2) flops, a row of P read from anywhere in memory, rows of e, of Q and of the sum in order.
  * Memory: 3 tiles a thread and the packed weights.
@@ -134,17 +134,6 @@ typedef struct {
   float *sum, *messages;
 } message_job;
 
-/* The first receiver whose edges start at `edge` or later. */
-static int64_t first_receiver(const ast_message *s, int64_t edge) {
-  int64_t begin = 0, end = s->R;
-  while (begin < end) {
-    const int64_t middle = begin + (end - begin) / 2;
-    if (s->receiver_offsets[middle] < edge) begin = middle + 1;
-    else end = middle;
-  }
-  return begin;
-}
-
 /* The messages of edges first.., from y, and the sums of their receivers. */
 AST_INLINE void message_out(const message_job *job, int64_t first, int64_t n, float *y, const bool whole) {
   const ast_message *s = job->w.s;
@@ -164,8 +153,8 @@ AST_INLINE void message_out(const message_job *job, int64_t first, int64_t n, fl
 static ast_status message_task(int64_t index, void *context) {
   const message_job *job = context;
   const ast_message *s = job->w.s;
-  const int64_t begin = first_receiver(s, index * s->M / job->tasks);
-  const int64_t end = index + 1 < job->tasks ? first_receiver(s, (index + 1) * s->M / job->tasks) : s->R;
+  const int64_t begin = lower_bound(s->receiver_offsets, 0, s->R, index * s->M / job->tasks);
+  const int64_t end = index + 1 < job->tasks ? lower_bound(s->receiver_offsets, begin, s->R, (index + 1) * s->M / job->tasks) : s->R;
   const int64_t last = s->receiver_offsets[end];
   message_tile t;
   if (!message_new_tile(&job->w, &t)) return AST_NO_MEMORY;
@@ -184,6 +173,6 @@ static ast_status message(const ast_message *s, float *restrict sum, float *rest
   const ast_status status = message_pack(s, false, &job.w);
   if (status != AST_OK) return status;
   const int64_t edges = min64(MOST_EDGES, max64(LEAST_EDGES, s->M / MESSAGE_TASKS));
-  job.tasks = max64(1, (s->M + edges - 1) / edges);
+  job.tasks = max64(1, divide_up(s->M, edges));
   return ast_parallel(job.tasks, message_task, &job);
 }

@@ -106,15 +106,15 @@ static void message_tile_backward(const message_backward_job *job, int64_t first
   message_layers(w, first, n, t);
   if (s->F2 % VW) message_norm_backward(job, first, n, t, sums, false);
   else message_norm_backward(job, first, n, t, sums, true);
-  gemm(s->F2, F, n, (gemm_a){dy, 1, row}, gemm_rows(t->x, row), sums->W2, F, !fresh);
+  gemm(s->F2, F, n, (gemm_a){dy, 1, row}, t->x, row, sums->W2, F, !fresh);
   message_layer(w, MESSAGE_W2_BACK, n, (gemm_a){dy, row, 1}, (dense_end){.out = dz, .out_row = row, .hidden = t->x, .hidden_row = row});
   float *de = job->out->edge_features;
   for (int64_t i = 0; de && message_has_latents(s) && i < n; i++) memcpy(de + (first + i) * E, dz + i * row, (size_t)E * sizeof *de);
   if (!H) return;
-  gemm(s->F, H, n, (gemm_a){dz, 1, row}, gemm_rows(t->h, row), sums->A2, H, !fresh);
+  gemm(s->F, H, n, (gemm_a){dz, 1, row}, t->h, row, sums->A2, H, !fresh);
   message_layer(w, MESSAGE_A2_BACK, n, (gemm_a){dz, row, 1}, (dense_end){.out = dc, .out_row = row, .hidden = t->h, .hidden_row = row});
   dense_add_rows(dc, row, n, s->H, sums->a1);
-  gemm(E, H, n, (gemm_a){s->edge_features + first * E, 1, E}, gemm_rows(dc, row), sums->A1, H, !fresh);
+  gemm(E, H, n, (gemm_a){s->edge_features + first * E, 1, E}, dc, row, sums->A1, H, !fresh);
   if (de) message_layer(w, MESSAGE_A1_BACK, n, (gemm_a){dc, row, 1}, (dense_end){.out = de + first * E, .out_row = E});
 }
 
@@ -191,7 +191,7 @@ static ast_status message_rounds(message_backward_job *job) {
   ast_status status = AST_OK;
   do { /* once even without edges, to clear dP and dQ */
     job->end = min64(s->M, job->begin + job->tasks * job->edges);
-    const int64_t tasks = (job->end - job->begin + job->edges - 1) / job->edges;
+    const int64_t tasks = divide_up(job->end - job->begin, job->edges);
     status = ast_parallel(tasks, message_backward_task, job);
     if (status == AST_OK) status = ast_parallel(2 * PARTS, message_rows_task, job);
     job->begin = job->end;
@@ -222,10 +222,10 @@ static ast_status message_backward(const ast_message *s, const float *restrict d
   message_backward_job job = {.dsum = dsum, .dmessages = dmessages, .out = out, .share_size = message_sums_size(s)};
   ast_status status = message_pack(s, true, &job.w);
   if (status != AST_OK) return status;
-  const int64_t tiles = max64(1, (s->M + MESSAGE_TILE - 1) / MESSAGE_TILE), most = SHARES * SHARE_TILES, rounds = (tiles + most - 1) / most;
-  const int64_t of_round = (tiles + rounds - 1) / rounds, of_task = (of_round + SHARES - 1) / SHARES;
+  const int64_t tiles = max64(1, divide_up(s->M, MESSAGE_TILE)), most = SHARES * SHARE_TILES, rounds = divide_up(tiles, most);
+  const int64_t of_round = divide_up(tiles, rounds), of_task = divide_up(of_round, SHARES);
   job.edges = MESSAGE_TILE * of_task;
-  job.tasks = (of_round + of_task - 1) / of_task;
+  job.tasks = divide_up(of_round, of_task);
 
   const int64_t round = job.tasks * job.edges, shares = job.tasks * job.share_size, dz = round * job.w.row, dA1 = s->E * s->H;
   const int64_t offsets = round_up(job.tasks * (PARTS + 1), 8);

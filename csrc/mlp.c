@@ -108,7 +108,7 @@ static ast_status mlp(const ast_mlp *s, const float *restrict residual, float *r
   job.layers[0] = mlp_layer(s->weight1, s->bias1, s->I + s->I2, s->H);
   job.layers[1] = mlp_layer(s->weight2, s->bias2, s->H, s->O);
   const int64_t rows = s->M >= 64 * DENSE_ROWS ? 4 * DENSE_ROWS : min64(DENSE_ROWS, max64(s->M / 8, 2 * GEMM_ROWS));
-  job.tasks = min64((s->M + GEMM_ROWS - 1) / GEMM_ROWS, round_up((s->M + rows - 1) / rows, 2));
+  job.tasks = min64(divide_up(s->M, GEMM_ROWS), round_up(divide_up(s->M, rows), 2));
   job.input_row = s->beside ? round_up(s->I + s->I2, VW) + DENSE_APART : 0;
   job.hidden_row = round_up(s->H, VW) + DENSE_APART;
   job.y_row = round_up(s->O, VW) + DENSE_APART;
@@ -174,8 +174,7 @@ static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_
     dense_add_rows(columns.dgamma, 0, 1, sums[4].row, partials + sums[4].at);
     dense_add_rows(columns.dbeta, 0, 1, sums[5].row, partials + sums[5].at);
   }
-  if (sums[2].to)
-    gemm(s->O, sums[2].row, rows, (gemm_a){y, 1, job->y_row}, gemm_rows(units.data, units.row), partials + sums[2].at, sums[2].row, add);
+  if (sums[2].to) gemm(s->O, sums[2].row, rows, (gemm_a){y, 1, job->y_row}, units.data, units.row, partials + sums[2].at, sums[2].row, add);
   if (sums[3].to) dense_add_rows(y, job->y_row, rows, s->O, partials + sums[3].at);
   if (!job->into_hidden) return;
   const dense_end masked = {.out = hidden,
@@ -186,8 +185,7 @@ static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_
                                      dense_rows_from(job->dout, s->dout_stride, s->O, first + rows, s->M)}};
   dense_rows(&job->layers[2], 0, dense_panels(&job->layers[2]), rows, (gemm_a){y, job->y_row, 1}, masked);
   if (sums[0].to)
-    gemm(s->H, sums[0].row, rows, (gemm_a){hidden, 1, job->hidden_row}, gemm_rows(inputs.data, inputs.row), partials + sums[0].at,
-         sums[0].row, add);
+    gemm(s->H, sums[0].row, rows, (gemm_a){hidden, 1, job->hidden_row}, inputs.data, inputs.row, partials + sums[0].at, sums[0].row, add);
   if (sums[1].to) dense_add_rows(hidden, job->hidden_row, rows, s->H, partials + sums[1].at);
   const gemm_a dz = {hidden, job->hidden_row, 1};
   if (job->g.x) {

@@ -14,18 +14,7 @@
 
 enum { OCTREE_CHUNK = 1 << 13, OCTREE_TILE = 64 };
 
-static int64_t octree_chunks(int64_t n) { return (n + OCTREE_CHUNK - 1) / OCTREE_CHUNK; }
-
-/* The scene of row i: the last b with offsets[b] <= i. */
-static int64_t octree_scene_of(const int64_t *offsets, int64_t B, int64_t i) {
-  int64_t low = 0, high = B;
-  while (high - low > 1) {
-    const int64_t middle = (low + high) / 2;
-    if (offsets[middle] <= i) low = middle;
-    else high = middle;
-  }
-  return low;
-}
+static int64_t octree_chunks(int64_t n) { return divide_up(n, OCTREE_CHUNK); }
 
 /* The number of bits of n. */
 static int octree_bits(uint64_t n) {
@@ -156,9 +145,9 @@ AST_INLINE void octree_scatter(const uint64_t *keys, const uint64_t *nodes, uint
 AST_INLINE ast_status octree_radix_sort(uint64_t *keys, uint64_t *nodes, uint64_t *keys_other, uint64_t *nodes_other, int64_t n, int low,
                                         int high, const bool packed) {
   const int max_digit = n < 1 << 12 ? 8 : n < 1 << 20 ? OCTREE_MAX_DIGIT : 9;
-  const int passes = (high - low + max_digit - 1) / max_digit;
+  const int passes = (int)divide_up(high - low, max_digit);
   if (!passes) return AST_OK;
-  const int digit = (high - low + passes - 1) / passes;
+  const int digit = (int)divide_up(high - low, passes);
   const uint64_t mask = (1ull << digit) - 1;
   int64_t *count = ast_scratch(3, OCTREE_HISTOGRAM * (int64_t)sizeof *count);
   if (!count) return AST_NO_MEMORY;
@@ -231,7 +220,7 @@ AST_INLINE int octree_heads(const octree_run_job *s, int64_t begin, int64_t end,
 
 AST_INLINE void octree_runs_of_chunk(const octree_run_job *s, int64_t chunk, const bool write) {
   const int64_t end = min64(s->N, (chunk + 1) * OCTREE_CHUNK);
-  int64_t b = octree_scene_of(s->offsets, s->B, chunk * OCTREE_CHUNK), run = write ? s->chunk_runs[chunk] : 0;
+  int64_t b = scene_at(s->offsets, s->B, chunk * OCTREE_CHUNK), run = write ? s->chunk_runs[chunk] : 0;
   int32_t heads[OCTREE_TILE];
   for (int64_t i = chunk * OCTREE_CHUNK, next; i < end; i = next) {
     while (s->offsets[b + 1] <= i) b++;
@@ -271,14 +260,7 @@ static ast_status octree_runs(const uint64_t *sorted, int shift, const int64_t *
   }
   ast_parallel(chunks, octree_write_runs_task, &job);
   starts[runs] = N;
-  for (int64_t b = 0, low = 0; b <= B; b++) {
-    for (int64_t high = runs; low < high;) {
-      const int64_t middle = (low + high) / 2;
-      if (starts[middle] < offsets[b]) low = middle + 1;
-      else high = middle;
-    }
-    run_offsets[b] = low;
-  }
+  for (int64_t b = 0, run = 0; b <= B; b++) run_offsets[b] = run = lower_bound(starts, run, runs, offsets[b]);
   return AST_OK;
 }
 
@@ -297,7 +279,7 @@ static ast_status octree_node_task(int64_t chunk, void *context) {
   const uint64_t *index = sort->packed ? sort->keys : sort->keys + sort->N;
   const uint64_t mask = sort->packed ? (1ull << sort->index_bits) - 1 : UINT64_MAX;
   const int64_t end = min64(s->C, (chunk + 1) * OCTREE_CHUNK);
-  int64_t b = octree_scene_of(s->cell_offsets, s->B, chunk * OCTREE_CHUNK);
+  int64_t b = scene_at(s->cell_offsets, s->B, chunk * OCTREE_CHUNK);
   for (int64_t c = chunk * OCTREE_CHUNK; c < end; c++) {
     while (s->cell_offsets[b + 1] <= c) b++;
     for (int64_t i = s->node_offsets[c]; i < s->node_offsets[c + 1]; i++) {

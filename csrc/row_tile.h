@@ -17,7 +17,7 @@ enum { LINE = 16 }; /* floats in a cache line */
 _Static_assert(GEMM_ROWS <= 12 && GEMM_COLUMNS == 2 * VW, "a tile has at most 12 rows of 2 vectors");
 
 /* How many strips n rows are cut into, evenly. */
-AST_INLINE int64_t row_strips(int64_t n) { return (n + GEMM_ROWS - 1) / GEMM_ROWS; }
+AST_INLINE int64_t row_strips(int64_t n) { return divide_up(n, GEMM_ROWS); }
 
 #define ROW_CASES(call) \
   switch (rows) {       \

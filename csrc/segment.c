@@ -83,13 +83,13 @@ static ast_status segment_spread_task(int64_t index, void *context) {
 static ast_status segment_sum(const float *restrict x, int64_t F, const int64_t *restrict node_order, const int64_t *restrict node_offsets,
                               int64_t C, bool mean, float *restrict out) {
   segment_job job = segment_plan(x, F, node_order, node_offsets, C, mean, out);
-  return ast_parallel((C + job.rows - 1) / job.rows, segment_sum_task, &job);
+  return ast_parallel(divide_up(C, job.rows), segment_sum_task, &job);
 }
 
 static ast_status segment_spread(const float *restrict dout, int64_t F, const int64_t *restrict node_order,
                                  const int64_t *restrict node_offsets, int64_t C, bool mean, float *restrict dx) {
   segment_job job = segment_plan(dout, F, node_order, node_offsets, C, mean, dx);
-  return ast_parallel((C + job.rows - 1) / job.rows, segment_spread_task, &job);
+  return ast_parallel(divide_up(C, job.rows), segment_spread_task, &job);
 }
 
 /* ---- the sum over all rows ---- */
@@ -116,7 +116,7 @@ static ast_status column_sum_task(int64_t index, void *context) {
 }
 
 static ast_status column_sum(const float *restrict x, int64_t N, int64_t F, float *restrict out) {
-  const int64_t blocks = (N + COLUMN_ROWS - 1) / COLUMN_ROWS;
+  const int64_t blocks = divide_up(N, COLUMN_ROWS);
   column_job job = {x, N, F, ast_scratch(6, blocks * F * (int64_t)sizeof *job.sums)};
   if (!job.sums) return AST_NO_MEMORY;
   const ast_status status = ast_parallel(blocks, column_sum_task, &job);

@@ -46,7 +46,7 @@ static void conv_weight_point(const conv_weight_job *job, int64_t block, int64_t
 /* sum [rows,C_out] (+)= x^T dout over the pairs of a tile. */
 static void conv_weight_add_tile(const conv_weight_tile *tile, const conv_weight_tile *next, int64_t rows, int64_t C_out, bool add,
                                  float *sum) {
-  const int64_t strips = row_strips(rows), x_lines = (rows + LINE - 1) / LINE, lines = x_lines + (C_out + LINE - 1) / LINE;
+  const int64_t strips = row_strips(rows), x_lines = divide_up(rows, LINE), lines = x_lines + divide_up(C_out, LINE);
   float tail[WEIGHT_TILE][GEMM_COLUMNS];
   const float *tail_rows[WEIGHT_TILE];
   for (int64_t c = 0, line = 0; c < C_out; c += GEMM_COLUMNS) {
@@ -106,7 +106,7 @@ static ast_status sparse_conv_weight(const float *restrict x, const float *restr
                                      float *restrict dweight) {
   if (C_in == 0 || C_out == 0) return AST_OK;
   conv_weight_job job = {.x = x, .dout = dout, .C_in = C_in, .C_out = C_out, .pairs = pairs, .dweight = dweight};
-  job.blocks = (C_in + CHANNEL_BLOCK - 1) / CHANNEL_BLOCK;
+  job.blocks = divide_up(C_in, CHANNEL_BLOCK);
   const int64_t part_pairs = max64(PART_PAIRS, pairs.offsets[OFFSETS] / MOST_PARTS);
   for (int64_t k = 0; k < OFFSETS; k++)
     job.first_part[k + 1] = job.first_part[k] + max64(1, (pairs.offsets[k + 1] - pairs.offsets[k]) / part_pairs);

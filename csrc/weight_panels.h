@@ -38,7 +38,7 @@ typedef struct {
 } dense_layer;
 
 AST_INLINE int64_t dense_panel_width(const dense_layer *l) { return l->paired ? VW : GEMM_COLUMNS; }
-AST_INLINE int64_t dense_panels(const dense_layer *l) { return (l->N + dense_panel_width(l) - 1) / dense_panel_width(l); }
+AST_INLINE int64_t dense_panels(const dense_layer *l) { return divide_up(l->N, dense_panel_width(l)); }
 AST_INLINE int64_t dense_packed_size(const dense_layer *l) { return dense_panels(l) * (l->K + 1) * GEMM_COLUMNS; }
 
 static void dense_pack_panel(const dense_layer *l, int64_t p) {
@@ -76,8 +76,8 @@ static ast_status dense_pack(dense_layer *layers, int64_t num, int slot) {
   for (int64_t i = 0; i < num; i++) {
     if (!layers[i].weight) layers[i].N = 0;
     const int64_t outputs = layers[i].paired ? 2 * layers[i].N : layers[i].N; /* as for both halves in one: z has the same bits */
-    const int64_t most = outputs > DENSE_FEW ? DENSE_DEPTH : DENSE_SHALLOW, chains = max64(1, (layers[i].K + most - 1) / most);
-    layers[i].depth = (layers[i].K + chains - 1) / chains;
+    const int64_t most = outputs > DENSE_FEW ? DENSE_DEPTH : DENSE_SHALLOW, chains = max64(1, divide_up(layers[i].K, most));
+    layers[i].depth = divide_up(layers[i].K, chains);
     size += dense_packed_size(&layers[i]);
     panels += dense_panels(&layers[i]);
   }
@@ -215,7 +215,7 @@ AST_INLINE void dense_strip(const int vectors, const dense_layer *l, int64_t p, 
 
 /* M rows are cut evenly between register tiles: where task `index` of `tasks` begins. */
 AST_INLINE int64_t dense_begin(int64_t M, int64_t tasks, int64_t index) {
-  return min64(M, (M + GEMM_ROWS - 1) / GEMM_ROWS * index / tasks * GEMM_ROWS);
+  return min64(M, divide_up(M, GEMM_ROWS) * index / tasks * GEMM_ROWS);
 }
 
 /* Panels first <= p < last of the layer on `rows` rows of A. */
@@ -255,9 +255,9 @@ typedef struct {
 static dense_chunks dense_cut(int64_t M, int64_t floats) {
   const int64_t most = min64(32, max64(2, DENSE_PARTIALS / max64(1, floats)));
   const int64_t parts = M / 192 > 2 ? round_up(M / 192, 4) : min64(2, M / 16); /* even shares for 2 and for 4 threads */
-  const int64_t num = max64(1, min64(parts, most)), rows = (M + num - 1) / num;
-  const int64_t blocks = (rows + DENSE_ROWS - 1) / DENSE_ROWS;
-  return (dense_chunks){num, rows, blocks ? round_up((rows + blocks - 1) / blocks, GEMM_ROWS) : DENSE_ROWS};
+  const int64_t num = max64(1, min64(parts, most)), rows = divide_up(M, num);
+  const int64_t blocks = divide_up(rows, DENSE_ROWS);
+  return (dense_chunks){num, rows, blocks ? round_up(divide_up(rows, blocks), GEMM_ROWS) : DENSE_ROWS};
 }
 
 /* to [rows,n] = the sum over chunks of partials[chunk][at..], rows of it `row` floats apart; `to` may be NULL */
@@ -275,7 +275,7 @@ typedef struct {
 
 enum { DENSE_SUM_ROWS = 16 };
 
-AST_INLINE int64_t dense_sum_tasks(const dense_sum *s) { return s->to ? (s->rows + DENSE_SUM_ROWS - 1) / DENSE_SUM_ROWS : 0; }
+AST_INLINE int64_t dense_sum_tasks(const dense_sum *s) { return s->to ? divide_up(s->rows, DENSE_SUM_ROWS) : 0; }
 
 static ast_status dense_sum_task(int64_t index, void *context) {
   const dense_sum_job *job = context;

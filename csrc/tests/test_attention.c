@@ -41,6 +41,9 @@ static ast_attention sizes_of(const problem *a) {
                          .q_stride = row,
                          .k_stride = row,
                          .v_stride = row,
+                         .dq_stride = row,
+                         .dk_stride = row,
+                         .dv_stride = row,
                          .scale = 1 / sqrtf((float)a->D),
                          .dropout_p = a->p,
                          .seed = 0x123456789abcdefu};

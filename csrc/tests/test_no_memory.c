@@ -159,6 +159,9 @@ static ast_attention attention_sizes(void) {
                          .q_stride = ROW,
                          .k_stride = ROW,
                          .v_stride = ROW,
+                         .dq_stride = ROW,
+                         .dk_stride = ROW,
+                         .dv_stride = ROW,
                          .scale = 0.25f,
                          .dropout_p = 0.1,
                          .seed = 5};
