@@ -92,8 +92,8 @@ typedef struct {
   const float *lame;                                   /* [E,2]: lambda and mu */
 } ast_elastic;
 
-/* A level of an octree and how it follows from the next finer one. It lies in scratch memory of the calling thread, and is valid until the
- * next call of an octree kernel or of farthest_point_sample there. */
+/* A level of an octree and how it follows from the next finer one. It lies in scratch memory of the calling thread: the
+ * caller of octree_coarsen sets a mark before, and releases it when the levels are written out. */
 typedef struct {
   int64_t C, C_fine, B;     /* cells of this level and of the finer one, scenes */
   int64_t *keys, *offsets;  /* [C], [B+1] as in octree_build */
@@ -208,9 +208,16 @@ typedef int32_t (*ast_num_threads)(uint32_t *num);
 void ast_set_pool(ast_parallel_for parallel_for, ast_num_threads num_threads);
 int64_t ast_threads(void);
 
-/* memory.c: scratch of the calling thread, 64-byte aligned and kept between calls; one per slot. NULL if memory is out. */
-enum { AST_SLOTS = 8 };
-void *ast_scratch(int slot, int64_t bytes);
+/* memory.c: scratch memory of the calling thread, 64-byte aligned, kept between calls; NULL if memory is out. It is good until a
+ * mark from before it is released: marks nest. ast_parallel releases what a task took. */
+void *ast_scratch(int64_t bytes);
+void *ast_scratch_mark(void);
+void ast_scratch_release(void *mark);
+/* What a block of C takes from here on is released where the block is left. */
+#define AST_SCRATCH_SCOPE          AST_SCRATCH_SCOPE_AT(__LINE__)
+#define AST_SCRATCH_SCOPE_AT(line) AST_SCRATCH_SCOPE_OF(line)
+#define AST_SCRATCH_SCOPE_OF(line) __attribute__((cleanup(ast_scratch_leave), unused)) void *const scratch_mark_##line = ast_scratch_mark()
+static inline void ast_scratch_leave(void *const *mark) { ast_scratch_release(*mark); }
 /* Lets the C library keep large freed blocks (glibc): fresh pages cost more than the arithmetic. True if it had an effect. */
 bool ast_keep_memory(void);
 

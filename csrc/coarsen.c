@@ -13,7 +13,6 @@
  * passed over: the lone child of a cell without neighbours has none.
  *
  * Cost: a few ns for each cell of each level up to the root. Work is cut into chunks as in octree.c, which holds what the two share.
- * Scratch of the calling thread: slot 1 holds the levels, slot 2 the counts of the chunks of cells, slot 4 those of the chunks of pairs.
  */
 #include "ast.h"
 #include "simd.h"
@@ -242,13 +241,13 @@ static char *octree_place_level(ast_octree_level *s, int64_t C, int64_t B, int64
 static ast_status octree_all_cells(octree_cells_job *s, ast_octree_level *level) {
   const int64_t chunks = octree_chunks(s->C);
   if (s->C > INT32_MAX) return AST_TOO_LARGE; /* neighbours are held as int32 */
-  s->chunks = ast_scratch(2, chunks * (int64_t)sizeof *s->chunks);
+  s->chunks = ast_scratch(chunks * (int64_t)sizeof *s->chunks);
   if (!s->chunks) return AST_NO_MEMORY;
   ast_parallel(chunks, octree_count_cells_task, s);
   int64_t C[OCTREE_LEVELS], bytes = 0;
   octree_places(s->chunks, chunks, s->root, C);
   for (int j = 1; j <= s->root; j++) bytes += octree_level_bytes(C[j], s->B);
-  char *memory = ast_scratch(1, bytes);
+  char *memory = ast_scratch(bytes);
   if (!memory) return AST_NO_MEMORY;
   C[0] = s->C;
   for (int j = 1; j <= s->root; j++) memory = octree_place_level(&level[j], C[j], s->B, C[j - 1], memory);
@@ -283,7 +282,7 @@ static ast_status octree_coarsen(const int64_t *restrict keys, const int64_t *re
   if (status != AST_OK) return status;
   int64_t counts = 0;
   for (int j = 1; j <= levels; j++) counts += OCTREE_GROUPS * octree_chunks(level[j].C);
-  int64_t *memory = ast_scratch(4, counts * (int64_t)sizeof *memory);
+  int64_t *memory = ast_scratch(counts * (int64_t)sizeof *memory);
   if (!memory) return AST_NO_MEMORY;
   for (int j = 1; j <= levels; memory += OCTREE_GROUPS * octree_chunks(level[j++].C)) level[j].pairs = memory;
   memset(level[cells.root].near, 0, (size_t)level[cells.root].C);

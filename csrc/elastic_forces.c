@@ -249,9 +249,10 @@ static ast_status elastic_sum_task(int64_t index, void *context) {
 }
 
 static ast_status elastic_run(const ast_elastic *s, const float *direction, float *out) {
+  AST_SCRATCH_SCOPE;
   const int64_t fields = direction ? 3 : 2, length = 3 * s->N + 4;
-  float *copies = ast_scratch(6, fields * length * (int64_t)sizeof *copies);
-  elastic_job job = {.s = s, .forces = ast_scratch(7, round_up(s->E, VW) * CORNERS * (int64_t)sizeof *copies), .out = out};
+  float *copies = ast_scratch(fields * length * (int64_t)sizeof *copies);
+  elastic_job job = {.s = s, .forces = ast_scratch(round_up(s->E, VW) * CORNERS * (int64_t)sizeof *copies), .out = out};
   if (!copies || !job.forces) return AST_NO_MEMORY;
   const float *from[3] = {s->position, s->rest_position, direction};
   const float **to[3] = {&job.position, &job.rest, &job.direction};

@@ -12,7 +12,6 @@
  * Cost: at most n distances a sample, as without blocks; in Morton order few blocks are looked at between two samples.
  *
  * Squared distances are integers, below 2^44; they fit in int32 unless the scene is wide.
- * Scratch: slot 1 of the thread holds the blocks, slot 2 which points are taken.
  */
 #include "ast.h"
 #include "simd.h"
@@ -103,7 +102,7 @@ static int64_t fps_extent(const int32_t *coordinates, int64_t n, int32_t middle[
 /* Once all distances are 0: the lowest points not among the `taken` samples, until there are num. */
 static ast_status fps_fill_up(int64_t begin, int64_t n, int64_t taken, int64_t num, int64_t *indices) {
   if (taken == num) return AST_OK;
-  uint8_t *used = ast_scratch(2, n);
+  uint8_t *used = ast_scratch(n);
   if (!used) return AST_NO_MEMORY;
   memset(used, 0, (size_t)n);
   for (int64_t i = 0; i < taken; i++) used[indices[i] - begin] = 1;

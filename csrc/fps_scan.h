@@ -18,7 +18,7 @@ static bool FPS(reserve)(FPS(scene) * s, int64_t n, int64_t num, int64_t size) {
   int64_t leaves = 1;
   while (leaves < blocks) leaves *= 2;
   const int64_t large = 2 * leaves + blocks, middle = blocks * size, small = blocks * (3 * size + 6) + 3 * samples;
-  int64_t *memory = ast_scratch(1, large * 8 + middle * (int64_t)sizeof(T) + small * (int64_t)sizeof(COORDINATE));
+  int64_t *memory = ast_scratch(large * 8 + middle * (int64_t)sizeof(T) + small * (int64_t)sizeof(COORDINATE));
   if (!memory) return false;
   *s = (FPS(scene)){.size = size, .blocks = blocks, .seen = memory + 2 * leaves, .tournament = {leaves, memory}};
   s->distances = (T *)(memory + large);

@@ -34,7 +34,10 @@ static bool linear_is_small(const ast_linear *s) { return (double)s->M * (double
 static ast_status linear_run(const ast_linear *s, int64_t tasks, ast_task task, void *job) {
   ast_status status = AST_OK;
   if (!linear_is_small(s)) return ast_parallel(tasks, task, job);
-  for (int64_t i = 0; i < tasks && status == AST_OK; i++) status = task(i, job);
+  for (int64_t i = 0; i < tasks && status == AST_OK; i++) {
+    AST_SCRATCH_SCOPE;
+    status = task(i, job);
+  }
   return status;
 }
 
@@ -72,10 +75,11 @@ static dense_layer linear_layer(const ast_linear *s, const float *weight, const 
 
 static ast_status linear(const ast_linear *s, const float *restrict x, const float *restrict weight, const float *restrict bias,
                          const float *restrict residual, float *restrict out, float *restrict z) {
+  AST_SCRATCH_SCOPE;
   linear_product p = {.layer = linear_layer(s, weight, bias, s->activation == AST_GEGLU), .a = x, .a_row = s->x_stride, .M = s->M};
   p.end = (dense_end){
       .activation = s->activation, .out = out, .out_row = p.layer.N, .residual = residual, .residual_row = s->residual_stride, .z = z};
-  const ast_status status = dense_pack(&p.layer, 1, 6);
+  const ast_status status = dense_pack(&p.layer, 1);
   return status == AST_OK ? linear_run(s, linear_cut(&p, linear_is_small(s)), linear_product_task, &p) : status;
 }
 
@@ -148,7 +152,7 @@ static ast_status linear_chunk_task(int64_t index, void *context) {
   const linear_backward_job *job = context;
   const ast_linear *s = job->s;
   const int64_t first = index * job->chunks.rows, last = min64(s->M, first + job->chunks.rows), width = round_up(s->I, VW);
-  float *dz = ast_scratch(5, DENSE_ROWS * (job->dz_row + job->x_row) * (int64_t)sizeof *dz), *x = dz + DENSE_ROWS * job->dz_row;
+  float *dz = ast_scratch(DENSE_ROWS * (job->dz_row + job->x_row) * (int64_t)sizeof *dz), *x = dz + DENSE_ROWS * job->dz_row;
   if (!dz) return AST_NO_MEMORY;
   float *dweight = job->partials + index * job->size, *dbias = dweight + s->O * width;
   memset(dbias, 0, (size_t)round_up(s->O, VW) * sizeof *dbias);
@@ -164,7 +168,7 @@ static ast_status linear_chunk_task(int64_t index, void *context) {
 static ast_status linear_by_rows(linear_backward_job *job) {
   const ast_linear *s = job->s;
   const int64_t width = round_up(s->I, VW);
-  job->partials = ast_scratch(7, job->chunks.num * job->size * (int64_t)sizeof(float));
+  job->partials = ast_scratch(job->chunks.num * job->size * (int64_t)sizeof(float));
   if (!job->partials) return AST_NO_MEMORY;
   const ast_status status = ast_parallel(job->chunks.num, linear_chunk_task, job);
   if (status != AST_OK) return status;
@@ -191,7 +195,7 @@ static ast_status linear_tile_task(int64_t index, void *context) {
   const int64_t o = index / job->across * LINEAR_TILE_ROWS, k = index % job->across * LINEAR_TILE_COLUMNS;
   const int64_t rows = min64(LINEAR_TILE_ROWS, s->O - o), columns = min64(LINEAR_TILE_COLUMNS, s->I - k), width = round_up(columns, VW);
   const gemm_a dz = job->tiles_dz, x = job->tiles_x;
-  float *tile = ast_scratch(5, LINEAR_TILE_ROWS * LINEAR_TILE_COLUMNS * (int64_t)sizeof *tile);
+  float *tile = ast_scratch(LINEAR_TILE_ROWS * LINEAR_TILE_COLUMNS * (int64_t)sizeof *tile);
   if (!tile) return AST_NO_MEMORY;
   if (job->dweight) {
     float *to = width == columns ? job->dweight + o * s->I + k : tile;
@@ -218,7 +222,7 @@ static ast_status linear_by_tiles(linear_backward_job *job) {
   job->tiles_dz = (gemm_a){job->dout, s->dout_stride, 1};
   job->tiles_x = (gemm_a){job->x, s->x_stride, 1};
   if (new_dz || new_x) {
-    float *scratch = ast_scratch(7, s->M * (job->dz_row + job->x_row) * (int64_t)sizeof *scratch);
+    float *scratch = ast_scratch(s->M * (job->dz_row + job->x_row) * (int64_t)sizeof *scratch);
     if (!scratch) return AST_NO_MEMORY;
     if (new_dz) job->all_dz = scratch, job->tiles_dz = (gemm_a){scratch, job->dz_row, 1};
     scratch += s->M * job->dz_row;
@@ -236,11 +240,12 @@ static ast_status linear_by_tiles(linear_backward_job *job) {
 static ast_status linear_backward(const ast_linear *s, const float *restrict dout, const float *restrict x, const float *restrict weight,
                                   const float *restrict bias, const float *restrict z, float *restrict dx, float *restrict dweight,
                                   float *restrict dbias) {
+  AST_SCRATCH_SCOPE;
   const bool recompute = s->activation != AST_IDENTITY && !z;
   linear_backward_job job = {.s = s, .dout = dout, .x = x, .z = z, .dx = dx, .dweight = dweight, .dbias = dbias};
   job.layers[0] = linear_layer(s, recompute ? weight : NULL, bias, false);
   job.layers[1] = (dense_layer){.weight = dx ? weight : NULL, .row = s->I, .column = 1, .K = s->O, .N = s->I};
-  const ast_status status = dense_pack(job.layers, 2, 6);
+  const ast_status status = dense_pack(job.layers, 2);
   if (status != AST_OK) return status;
   job.columns = s->activation == AST_GEGLU ? s->O / 2 : s->O;
   job.dz_row = round_up(s->O, VW) + DENSE_APART;

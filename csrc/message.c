@@ -43,7 +43,7 @@ static ast_status message_pack(const ast_message *s, bool gradients, message_wei
   w->layers[MESSAGE_W2_BACK] = (dense_layer){.weight = s->W2, .row = s->F, .column = 1, .K = s->F2, .N = s->F};
   w->layers[MESSAGE_A2_BACK] = (dense_layer){.weight = s->A2, .row = s->H, .column = 1, .K = s->F, .N = s->H};
   w->layers[MESSAGE_A1_BACK] = (dense_layer){.weight = s->A1, .row = s->E, .column = 1, .K = s->H, .N = s->E};
-  return dense_pack(w->layers, gradients ? 6 : 3, 6);
+  return dense_pack(w->layers, gradients ? 6 : 3);
 }
 
 /* Whether the edge features are a share of the first layer, added as they are. */
@@ -61,7 +61,7 @@ typedef struct {
 
 static bool message_new_tile(const message_weights *w, message_tile *t) {
   const int64_t size = MESSAGE_TILE * w->row;
-  float *memory = ast_scratch(5, 3 * (size + w->row) * (int64_t)sizeof *memory), *columns = memory + 3 * size;
+  float *memory = ast_scratch(3 * (size + w->row) * (int64_t)sizeof *memory), *columns = memory + 3 * size;
   *t = (message_tile){memory, memory + size, memory + 2 * size, {columns, columns + w->row, columns + 2 * w->row}};
   return memory != NULL;
 }
@@ -169,6 +169,7 @@ static ast_status message_task(int64_t index, void *context) {
 }
 
 static ast_status message(const ast_message *s, float *restrict sum, float *restrict messages) {
+  AST_SCRATCH_SCOPE;
   message_job job = {.sum = sum, .messages = messages};
   const ast_status status = message_pack(s, false, &job.w);
   if (status != AST_OK) return status;

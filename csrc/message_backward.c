@@ -219,6 +219,7 @@ static ast_status message_add_shares(const message_backward_job *job, float *dA1
 
 static ast_status message_backward(const ast_message *s, const float *restrict dsum, const float *restrict dmessages,
                                    const ast_message_gradients *out) {
+  AST_SCRATCH_SCOPE;
   message_backward_job job = {.dsum = dsum, .dmessages = dmessages, .out = out, .share_size = message_sums_size(s)};
   ast_status status = message_pack(s, true, &job.w);
   if (status != AST_OK) return status;
@@ -230,7 +231,7 @@ static ast_status message_backward(const ast_message *s, const float *restrict d
   const int64_t round = job.tasks * job.edges, shares = job.tasks * job.share_size, dz = round * job.w.row, dA1 = s->E * s->H;
   const int64_t offsets = round_up(job.tasks * (PARTS + 1), 8);
   job.part_offsets =
-      ast_scratch(7, offsets * (int64_t)sizeof(int64_t) + (shares + dz + dA1) * (int64_t)sizeof(float) + round * (int64_t)sizeof(int32_t));
+      ast_scratch(offsets * (int64_t)sizeof(int64_t) + (shares + dz + dA1) * (int64_t)sizeof(float) + round * (int64_t)sizeof(int32_t));
   if (!job.part_offsets) return AST_NO_MEMORY;
   job.shares = (float *)(job.part_offsets + offsets);
   job.dz = job.shares + shares;

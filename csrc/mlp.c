@@ -70,7 +70,7 @@ static ast_status mlp_task(int64_t index, void *context) {
   const mlp_job *job = context;
   const ast_mlp *s = job->s;
   const int64_t first_row = dense_begin(s->M, job->tasks, index), last = dense_begin(s->M, job->tasks, index + 1);
-  float *input = ast_scratch(5, DENSE_ROWS * (job->input_row + job->hidden_row + job->y_row) * (int64_t)sizeof *input);
+  float *input = ast_scratch(DENSE_ROWS * (job->input_row + job->hidden_row + job->y_row) * (int64_t)sizeof *input);
   float *block = input + DENSE_ROWS * job->input_row, *y = block + DENSE_ROWS * job->hidden_row;
   if (!input) return AST_NO_MEMORY;
   for (int64_t i = first_row; i < last; i += DENSE_ROWS) {
@@ -104,6 +104,7 @@ static ast_status mlp_task(int64_t index, void *context) {
 }
 
 static ast_status mlp(const ast_mlp *s, const float *restrict residual, float *restrict out, ast_mlp_kept kept) {
+  AST_SCRATCH_SCOPE;
   mlp_job job = {.s = s, .residual = residual, .out = out, .kept = kept};
   job.layers[0] = mlp_layer(s->weight1, s->bias1, s->I + s->I2, s->H);
   job.layers[1] = mlp_layer(s->weight2, s->bias2, s->H, s->O);
@@ -112,7 +113,7 @@ static ast_status mlp(const ast_mlp *s, const float *restrict residual, float *r
   job.input_row = s->beside ? round_up(s->I + s->I2, VW) + DENSE_APART : 0;
   job.hidden_row = round_up(s->H, VW) + DENSE_APART;
   job.y_row = round_up(s->O, VW) + DENSE_APART;
-  const ast_status status = dense_pack(job.layers, 2, 6);
+  const ast_status status = dense_pack(job.layers, 2);
   return status == AST_OK ? ast_parallel(job.tasks, mlp_task, &job) : status;
 }
 
@@ -205,7 +206,7 @@ static ast_status mlp_backward_task(int64_t index, void *context) {
   const mlp_backward_job *job = context;
   const int64_t first = index * job->chunks.rows, last = min64(job->s->M, first + job->chunks.rows);
   const int64_t floats = DENSE_ROWS * (job->input_row + job->hidden_row + job->y_row) + 3 * job->sums[4].row;
-  float *input = ast_scratch(5, floats * (int64_t)sizeof *input);
+  float *input = ast_scratch(floats * (int64_t)sizeof *input);
   if (!input) return AST_NO_MEMORY;
   float *hidden = input + DENSE_ROWS * job->input_row, *y = hidden + DENSE_ROWS * job->hidden_row;
   float *partials = job->partials + index * job->size;
@@ -236,6 +237,7 @@ static void mlp_place_sums(mlp_backward_job *job) {
 }
 
 static ast_status mlp_backward(const ast_mlp *s, const float *restrict dout, ast_mlp_kept kept, ast_mlp_gradients g) {
+  AST_SCRATCH_SCOPE;
   mlp_backward_job job = {.s = s, .dout = dout, .kept = kept, .g = g};
   const int64_t K = s->I + s->I2;
   job.into_hidden = g.x || g.beside || g.weight1 || g.bias1;
@@ -244,14 +246,14 @@ static ast_status mlp_backward(const ast_mlp *s, const float *restrict dout, ast
   job.layers[2] = (dense_layer){.weight = job.into_hidden ? s->weight2 : NULL, .row = s->H, .column = 1, .K = s->O, .N = s->H};
   job.layers[3] = (dense_layer){.weight = g.x ? s->weight1 : NULL, .row = K, .column = 1, .K = s->H, .N = s->I};
   job.layers[4] = (dense_layer){.weight = g.beside ? s->weight1 + s->I : NULL, .row = K, .column = 1, .K = s->H, .N = s->I2};
-  ast_status status = dense_pack(job.layers, 5, 6);
+  ast_status status = dense_pack(job.layers, 5);
   if (status != AST_OK) return status;
   job.input_row = round_up(s->I, VW) + round_up(s->I2, VW) + DENSE_APART;
   job.hidden_row = round_up(s->H, VW) + DENSE_APART;
   job.y_row = round_up(s->O, VW) + DENSE_APART;
   mlp_place_sums(&job);
   job.chunks = dense_cut(s->M, job.size);
-  job.partials = ast_scratch(7, job.chunks.num * job.size * (int64_t)sizeof(float));
+  job.partials = ast_scratch(job.chunks.num * job.size * (int64_t)sizeof(float));
   if (!job.partials) return AST_NO_MEMORY;
   status = ast_parallel(job.chunks.num, mlp_backward_task, &job);
   if (status != AST_OK) return status;

@@ -4,8 +4,7 @@
  * cells of any aligned cube of 2^m cells a side are a contiguous run of the sorted keys.
  *
  * Work is cut into fixed chunks of the flat arrays, whatever the scenes, and every result is an integer that does not depend on the
- * chunks. Scratch: slots 1 and 2 of the calling thread hold the keys being sorted and the other half of the sort, then the counts of
- * the chunks; slot 3 of each thread holds the histograms of its sort.
+ * chunks.
  */
 #include <math.h>
 
@@ -149,7 +148,7 @@ AST_INLINE ast_status octree_radix_sort(uint64_t *keys, uint64_t *nodes, uint64_
   if (!passes) return AST_OK;
   const int digit = (int)divide_up(high - low, passes);
   const uint64_t mask = (1ull << digit) - 1;
-  int64_t *count = ast_scratch(3, OCTREE_HISTOGRAM * (int64_t)sizeof *count);
+  int64_t *count = ast_scratch(OCTREE_HISTOGRAM * (int64_t)sizeof *count);
   if (!count) return AST_NO_MEMORY;
   memset(count, 0, sizeof *count * (size_t)passes << digit);
   for (int64_t i = 0; i < n; i++)
@@ -249,7 +248,7 @@ static ast_status octree_write_runs_task(int64_t chunk, void *context) {
 static ast_status octree_runs(const uint64_t *sorted, int shift, const int64_t *offsets, int64_t B, int64_t *keys, int64_t *starts,
                               int64_t *run_offsets) {
   const int64_t N = offsets[B], chunks = octree_chunks(N);
-  octree_run_job job = {sorted, shift, offsets, B, N, ast_scratch(2, (chunks + 1) * (int64_t)sizeof(int64_t)), keys, starts};
+  octree_run_job job = {sorted, shift, offsets, B, N, ast_scratch((chunks + 1) * (int64_t)sizeof(int64_t)), keys, starts};
   if (!job.chunk_runs) return AST_NO_MEMORY;
   ast_parallel(chunks, octree_count_runs_task, &job);
   int64_t runs = 0;
@@ -295,6 +294,7 @@ static ast_status octree_build(const float *restrict positions, const int64_t *r
                                double half_width, int depth, int64_t *restrict keys, int64_t *restrict cell_offsets,
                                int64_t *restrict node_cell, int64_t *restrict node_order, int64_t *restrict node_offsets,
                                int64_t *bad_node) {
+  AST_SCRATCH_SCOPE;
   const int64_t N = offsets[B];
   memset(cell_offsets, 0, sizeof *cell_offsets * (size_t)(B + 1));
   node_offsets[0] = 0;
@@ -304,7 +304,7 @@ static ast_status octree_build(const float *restrict positions, const int64_t *r
   const int index_bits = octree_bits((uint64_t)(largest - 1));
   const bool packed = 3 * depth + index_bits <= 64;
   const int64_t bytes = (packed ? 1 : 2) * N * (int64_t)sizeof(uint64_t);
-  octree_sort_job sort = {offsets, N, index_bits, packed, ast_scratch(1, bytes), ast_scratch(2, bytes)};
+  octree_sort_job sort = {offsets, N, index_bits, packed, ast_scratch(bytes), ast_scratch(bytes)};
   if (!sort.keys || !sort.other) return AST_NO_MEMORY;
 
   octree_key_job key = {positions, N, center, half_width, depth, sort.keys};

@@ -6,7 +6,7 @@
  *
  * The pairs of a group are written with P rising, by chunks of P whose places coarsen.c has counted. With d = 0 the fine cell is a child of
  * P and rises too, so the other order is the same. With d > 0 the fine cells of a group are marked in a bit map and read out of it in
- * order. Scratch: slot 3 of each thread holds the bit map and the place of each fine cell.
+ * order.
  */
 #include "ast.h"
 #include "simd.h"
@@ -48,7 +48,7 @@ static ast_status octree_sort_pairs_task(int64_t k, void *context) {
   const int64_t begin = s->pair_offsets[k], end = s->pair_offsets[k + 1], words = s->C_fine / 64 + 1;
   const bool sorted = k / 9 > 0 && k / 3 % 3 > 0 && k % 3 > 0; /* a, b and c are not -1: d = 0 */
   if (sorted || begin == end) return AST_OK;
-  uint64_t *marked = ast_scratch(3, 8 * words + 4 * s->C_fine);
+  uint64_t *marked = ast_scratch(8 * words + 4 * s->C_fine);
   if (!marked) return AST_NO_MEMORY;
   int32_t *place = (int32_t *)(marked + words);
   memset(marked, 0, 8 * (size_t)words);

@@ -116,8 +116,9 @@ static ast_status column_sum_task(int64_t index, void *context) {
 }
 
 static ast_status column_sum(const float *restrict x, int64_t N, int64_t F, float *restrict out) {
+  AST_SCRATCH_SCOPE;
   const int64_t blocks = divide_up(N, COLUMN_ROWS);
-  column_job job = {x, N, F, ast_scratch(6, blocks * F * (int64_t)sizeof *job.sums)};
+  column_job job = {x, N, F, ast_scratch(blocks * F * (int64_t)sizeof *job.sums)};
   if (!job.sums) return AST_NO_MEMORY;
   const ast_status status = ast_parallel(blocks, column_sum_task, &job);
   if (status == AST_OK) add_rows(job.sums, blocks, F, out);

@@ -108,7 +108,7 @@ static ast_status conv_task(int64_t index, void *context) {
   const int64_t C_out = job->C_out;
   const int64_t first = index / job->column_tasks * job->rows, last = min64(job->num_out, first + job->rows);
   const int64_t column = index % job->column_tasks * job->columns, columns = min64(job->columns, C_out - column);
-  float *bias = ast_scratch(5, C_out * (int64_t)sizeof *bias + job->rows);
+  float *bias = ast_scratch(C_out * (int64_t)sizeof *bias + job->rows);
   if (!bias) return AST_NO_MEMORY;
   uint8_t *seen = (uint8_t *)(bias + C_out);
   if (job->bias) memcpy(bias, job->bias, (size_t)C_out * sizeof *bias);
@@ -147,8 +147,9 @@ static void conv_cut(conv_job *job) {
 
 static ast_status sparse_conv(const float *restrict x, const float *restrict weight, const float *restrict bias, int64_t C_in,
                               int64_t C_out, bool transposed, ast_pairs pairs, int64_t num_out, float *restrict out) {
+  AST_SCRATCH_SCOPE;
   if (num_out == 0 || C_out == 0) return AST_OK;
-  float *packed = ast_scratch(6, OFFSETS * gemm_packed_size(C_in, C_out) * (int64_t)sizeof *packed);
+  float *packed = ast_scratch(OFFSETS * gemm_packed_size(C_in, C_out) * (int64_t)sizeof *packed);
   if (!packed) return AST_NO_MEMORY;
   conv_job job = {.x = x,
                   .weight = weight,

@@ -104,6 +104,7 @@ static ast_status conv_weight_join_task(int64_t index, void *context) {
 
 static ast_status sparse_conv_weight(const float *restrict x, const float *restrict dout, int64_t C_in, int64_t C_out, ast_pairs pairs,
                                      float *restrict dweight) {
+  AST_SCRATCH_SCOPE;
   if (C_in == 0 || C_out == 0) return AST_OK;
   conv_weight_job job = {.x = x, .dout = dout, .C_in = C_in, .C_out = C_out, .pairs = pairs, .dweight = dweight};
   job.blocks = divide_up(C_in, CHANNEL_BLOCK);
@@ -111,7 +112,7 @@ static ast_status sparse_conv_weight(const float *restrict x, const float *restr
   for (int64_t k = 0; k < OFFSETS; k++)
     job.first_part[k + 1] = job.first_part[k] + max64(1, (pairs.offsets[k + 1] - pairs.offsets[k]) / part_pairs);
   const int64_t parts = job.first_part[OFFSETS];
-  job.parts = ast_scratch(6, (parts - OFFSETS) * C_in * C_out * (int64_t)sizeof *job.parts);
+  job.parts = ast_scratch((parts - OFFSETS) * C_in * C_out * (int64_t)sizeof *job.parts);
   if (!job.parts) return AST_NO_MEMORY;
   const ast_status status = ast_parallel(parts * job.blocks, conv_weight_task, &job);
   return status == AST_OK && parts > OFFSETS ? ast_parallel(OFFSETS * job.blocks, conv_weight_join_task, &job) : status;

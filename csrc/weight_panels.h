@@ -70,7 +70,7 @@ static ast_status dense_pack_task(int64_t index, void *context) {
 }
 
 /* Packs layers into scratch of the calling thread, which its tasks may read. A layer without weight is left out. */
-static ast_status dense_pack(dense_layer *layers, int64_t num, int slot) {
+static ast_status dense_pack(dense_layer *layers, int64_t num) {
   dense_pack_job job = {layers, num};
   int64_t size = 0, panels = 0;
   for (int64_t i = 0; i < num; i++) {
@@ -81,7 +81,7 @@ static ast_status dense_pack(dense_layer *layers, int64_t num, int slot) {
     size += dense_packed_size(&layers[i]);
     panels += dense_panels(&layers[i]);
   }
-  float *packed = ast_scratch(slot, size * (int64_t)sizeof *packed);
+  float *packed = ast_scratch(size * (int64_t)sizeof *packed);
   if (!packed) return AST_NO_MEMORY;
   for (int64_t i = 0; i < num; i++) {
     layers[i].panels = packed;
