@@ -5,8 +5,9 @@
  * the number of rows. Inputs are never changed and outputs are written in full. The caller has checked shapes, offsets and
  * index ranges (module.c does it for Python); a kernel checks only what it alone can see, such as a point outside the cube.
  *
- * Legend: B scenes, N nodes, C cells, T tokens, F channels, C_in and C_out channels of a convolution, H heads, D channels of a head,
- * M rows of a linear layer, I and O its inputs and outputs, H hidden units; E elements.
+ * Legend: B scenes, N nodes, C cells, T tokens, F channels, C_in and C_out channels of a convolution, D channels of a head of
+ * attention, M rows of a dense layer (or edges, of S senders and R receivers), I and O its inputs and outputs. H is the size of
+ * what lies between: the hidden units of two layers, the heads of attention. E elements, or channels of an edge.
  */
 #ifndef AST_H
 #define AST_H
@@ -46,8 +47,8 @@ typedef struct {
   int64_t M, S, R;
   int64_t E, H, F, F2; /* channels: edge features, encoder's hidden layer (0 without an encoder), first layer, messages */
   const int64_t *senders, *receivers, *receiver_offsets; /* [M], [M] ascending, [R+1] */
-  const float *of_senders, *of_receivers;                /* [S,F], [R,F]: their shares of the first layer */
-  const float *edge_features;                            /* [M,E]: raw, or without an encoder their share of the first layer */
+  const float *of_senders, *of_receivers;                /* [S,F], [R,F]: their products with the first layer */
+  const float *edge_features;                            /* [M,E]: raw, or without an encoder such products, too */
   const float *A1, *a1, *A2;                             /* [H,E], [H], [F,H] */
   const float *W2, *b2, *gamma, *beta;                   /* [F2,F], [F2], [F2], [F2] */
 } ast_message;

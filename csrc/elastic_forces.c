@@ -34,7 +34,7 @@ static const double ELASTIC_FLAT = 0x1p-21;
 typedef float corner __attribute__((vector_size(16), aligned(4), may_alias));
 
 typedef struct {
-  const ast_elastic *s;
+  const ast_elastic *mesh;
   const float *position, *rest, *direction; /* copies that may be read one float past the end; direction is NULL for the forces */
   float *forces;                            /* [E up to a multiple of VW,CORNERS] */
   float *out;                               /* [N,3] */
@@ -181,13 +181,13 @@ AST_INLINE elastic_rest elastic_measure(const float *rest, const int64_t *elemen
 
 /* The corners of up to VW elements from `first` on. */
 AST_INLINE void elastic_block(const bool directed, const elastic_job *job, int64_t first, int64_t n) {
-  const int64_t *elements = job->s->elements + 4 * first;
+  const int64_t *elements = job->mesh->elements + 4 * first;
   int64_t some[4 * VW];
   if (n < VW) { /* the last one stands in for those beyond, whose forces are not read */
     for (int64_t k = 0; k < 4 * VW; k++) some[k] = elements[4 * min64(k / 4, n - 1) + k % 4];
     elements = some;
   }
-  const float *lame = job->s->lame + 2 * first;
+  const float *lame = job->mesh->lame + 2 * first;
   const vf even = vload_upto(lame, 2 * n), odd = vload_upto(lame + VW, 2 * n - VW), lambda = EVEN(even, odd), mu = ODD(even, odd);
   elastic_rest r = elastic_measure(job->rest, elements);
   const vi used = r.counts & ((lambda != 0) | (mu != 0));
@@ -225,47 +225,49 @@ AST_INLINE void elastic_block(const bool directed, const elastic_job *job, int64
 
 static ast_status elastic_force_task(int64_t index, void *context) {
   const elastic_job *job = context;
-  const int64_t end = min64(job->s->E, (index + 1) * ELASTIC_ELEMENTS);
+  const int64_t end = min64(job->mesh->E, (index + 1) * ELASTIC_ELEMENTS);
   for (int64_t e = index * ELASTIC_ELEMENTS; e < end; e += VW) elastic_block(false, job, e, min64(VW, end - e));
   return AST_OK;
 }
 
 static ast_status elastic_direction_task(int64_t index, void *context) {
   const elastic_job *job = context;
-  const int64_t end = min64(job->s->E, (index + 1) * ELASTIC_ELEMENTS);
+  const int64_t end = min64(job->mesh->E, (index + 1) * ELASTIC_ELEMENTS);
   for (int64_t e = index * ELASTIC_ELEMENTS; e < end; e += VW) elastic_block(true, job, e, min64(VW, end - e));
   return AST_OK;
 }
 
 static ast_status elastic_sum_task(int64_t index, void *context) {
   const elastic_job *job = context;
-  const ast_elastic *s = job->s;
-  for (int64_t n = index * ELASTIC_NODES; n < min64(s->N, (index + 1) * ELASTIC_NODES); n++) {
+  const ast_elastic *mesh = job->mesh;
+  for (int64_t n = index * ELASTIC_NODES; n < min64(mesh->N, (index + 1) * ELASTIC_NODES); n++) {
     corner sum = {0};
-    for (int64_t j = s->node_offsets[n]; j < s->node_offsets[n + 1]; j++) sum += *(const corner *)(job->forces + 4 * s->node_order[j]);
+    for (int64_t j = mesh->node_offsets[n]; j < mesh->node_offsets[n + 1]; j++)
+      sum += *(const corner *)(job->forces + 4 * mesh->node_order[j]);
     for (int i = 0; i < 3; i++) job->out[3 * n + i] = sum[i];
   }
   return AST_OK;
 }
 
-static ast_status elastic_run(const ast_elastic *s, const float *direction, float *out) {
+static ast_status elastic_run(const ast_elastic *mesh, const float *direction, float *out) {
   AST_SCRATCH_SCOPE;
-  const int64_t fields = direction ? 3 : 2, length = 3 * s->N + 4;
+  const int64_t fields = direction ? 3 : 2, length = 3 * mesh->N + 4;
   float *copies = ast_scratch(fields * length * (int64_t)sizeof *copies);
-  elastic_job job = {.s = s, .forces = ast_scratch(round_up(s->E, VW) * CORNERS * (int64_t)sizeof *copies), .out = out};
+  elastic_job job = {.mesh = mesh, .forces = ast_scratch(round_up(mesh->E, VW) * CORNERS * (int64_t)sizeof *copies), .out = out};
   if (!copies || !job.forces) return AST_NO_MEMORY;
-  const float *from[3] = {s->position, s->rest_position, direction};
+  const float *from[3] = {mesh->position, mesh->rest_position, direction};
   const float **to[3] = {&job.position, &job.rest, &job.direction};
   for (int64_t i = 0; i < fields; i++) {
-    *to[i] = memcpy(copies + i * length, from[i], (size_t)(3 * s->N) * sizeof *copies);
-    copies[i * length + 3 * s->N] = 0;
+    *to[i] = memcpy(copies + i * length, from[i], (size_t)(3 * mesh->N) * sizeof *copies);
+    copies[i * length + 3 * mesh->N] = 0;
   }
-  const ast_status status = ast_parallel(divide_up(s->E, ELASTIC_ELEMENTS), direction ? elastic_direction_task : elastic_force_task, &job);
-  return status == AST_OK ? ast_parallel(divide_up(s->N, ELASTIC_NODES), elastic_sum_task, &job) : status;
+  const ast_status status =
+      ast_parallel(divide_up(mesh->E, ELASTIC_ELEMENTS), direction ? elastic_direction_task : elastic_force_task, &job);
+  return status == AST_OK ? ast_parallel(divide_up(mesh->N, ELASTIC_NODES), elastic_sum_task, &job) : status;
 }
 
-static ast_status elastic_forces(const ast_elastic *s, float *restrict force) { return elastic_run(s, NULL, force); }
+static ast_status elastic_forces(const ast_elastic *mesh, float *restrict force) { return elastic_run(mesh, NULL, force); }
 
-static ast_status elastic_forces_backward(const ast_elastic *s, const float *restrict dforce, float *restrict dposition) {
-  return elastic_run(s, dforce, dposition);
+static ast_status elastic_forces_backward(const ast_elastic *mesh, const float *restrict dforce, float *restrict dposition) {
+  return elastic_run(mesh, dforce, dposition);
 }

@@ -112,22 +112,22 @@ static ast_status fps_fill_up(int64_t begin, int64_t n, int64_t taken, int64_t n
 }
 
 static ast_status fps_task(int64_t scene, void *context) {
-  const fps_job *s = context;
-  const int64_t begin = s->offsets[scene], n = s->offsets[scene + 1] - begin;
-  const int32_t *coordinates = s->coordinates + 3 * begin;
-  int64_t *indices = s->indices + s->out_offsets[scene];
+  const fps_job *job = context;
+  const int64_t begin = job->offsets[scene], n = job->offsets[scene + 1] - begin;
+  const int32_t *coordinates = job->coordinates + 3 * begin;
+  int64_t *indices = job->indices + job->out_offsets[scene];
   int32_t middle[3];
   if (n == 0) return AST_OK;
   const int64_t square = fps_extent(coordinates, n, middle);
   if (square < 0) return AST_OUTSIDE;
-  if (n <= s->num) {
+  if (n <= job->num) {
     for (int64_t i = 0; i < n; i++) indices[i] = begin + i;
     return AST_OK;
   }
   /* Differences of at most sqrt(INT32_MAX) = 46340: relative to the middle they fit in int16. */
-  const int64_t taken = square <= INT32_MAX ? fps_narrow_sample(coordinates, n, middle, begin, s->num, indices)
-                                            : fps_wide_sample(coordinates, n, middle, begin, s->num, indices);
-  return taken ? fps_fill_up(begin, n, taken, s->num, indices) : AST_NO_MEMORY;
+  const int64_t taken = square <= INT32_MAX ? fps_narrow_sample(coordinates, n, middle, begin, job->num, indices)
+                                            : fps_wide_sample(coordinates, n, middle, begin, job->num, indices);
+  return taken ? fps_fill_up(begin, n, taken, job->num, indices) : AST_NO_MEMORY;
 }
 
 static ast_status farthest_point_sample(const int32_t *restrict coordinates, const int64_t *restrict offsets, int64_t B, int64_t num,

@@ -51,7 +51,7 @@ AST_INLINE void norm_backward(int64_t n, const bool whole, const float *gamma, c
     const vf u = u_kept ? vload_upto(u_kept + c, lanes) : scale * vload(y + c);
     vf d = vload_upto(dout + c, lanes);
     if (also) d += vload_upto(also + c, lanes);
-    const vf p_c = vload_upto(gamma + c, lanes) * d;
+    const vf p_c = vload_upto(gamma + c, lanes) * d; /* forward: out = gamma u + beta */
     vstore(y + c, u);
     vstore(p + c, p_c); /* not computed twice: fused into the difference below it would not cancel */
     sum += p_c;
@@ -60,6 +60,7 @@ AST_INLINE void norm_backward(int64_t n, const bool whole, const float *gamma, c
     vstore(dbeta + c, vload(dbeta + c) + d);
   }
   const float mean = vsum(sum) / (float)n, mean_along = vsum(along) / (float)n;
+  /* forward: u = (y - mean(y)) / sd, both of which depend on y */
   for (int64_t c = 0; c < n; c += VW) vstore(y + c, scale * ((vload(p + c) - mean) - vload(y + c) * mean_along));
 }
 

@@ -53,11 +53,11 @@ typedef struct {
 } octree_key_job;
 
 /* u = (p - center + half_width) / (2 half_width), which is in [0, 1] inside the cube. */
-static ast_status octree_check_node(const octree_key_job *s, int64_t n) {
+static ast_status octree_check_node(const octree_key_job *job, int64_t n) {
   ast_status status = AST_OK;
   for (int a = 0; a < 3; a++) {
-    const float p = s->positions[3 * n + a];
-    const double u = (p - s->center[a] + s->half_width) / (2 * s->half_width);
+    const float p = job->positions[3 * n + a];
+    const double u = (p - job->center[a] + job->half_width) / (2 * job->half_width);
     if (!isfinite(p)) return AST_NOT_FINITE;
     if (!(u >= -1e-6 && u <= 1 + 1e-6)) status = AST_OUTSIDE;
   }
@@ -67,17 +67,17 @@ static ast_status octree_check_node(const octree_key_job *s, int64_t n) {
 /* min(floor(u 2^depth), 2^depth - 1) = floor(min(u 2^depth, 2^depth - 1)), and truncation is floor above 0: so the clamp comes
  * first, in double, and no value overflows the conversion, not even NaN. */
 static ast_status octree_key_task(int64_t index, void *context) {
-  const octree_key_job *s = context;
-  const int64_t end = min64(s->N, (index + 1) * OCTREE_CHUNK);
-  const double cells = (double)(1 << s->depth), last = cells - 1, h = s->half_width, width = 2 * h;
+  const octree_key_job *job = context;
+  const int64_t end = min64(job->N, (index + 1) * OCTREE_CHUNK);
+  const double cells = (double)(1 << job->depth), last = cells - 1, h = job->half_width, width = 2 * h;
   double center[3 * OCTREE_TILE];
   int32_t cell[3 * OCTREE_TILE];
   uint64_t x[OCTREE_TILE], y[OCTREE_TILE], z[OCTREE_TILE];
   int64_t inside = -1;
-  for (int i = 0; i < 3 * OCTREE_TILE; i++) center[i] = s->center[i % 3];
+  for (int i = 0; i < 3 * OCTREE_TILE; i++) center[i] = job->center[i % 3];
   for (int64_t begin = index * OCTREE_CHUNK; begin < end; begin += OCTREE_TILE) {
     const int num = (int)min64(OCTREE_TILE, end - begin);
-    const float *p = s->positions + 3 * begin;
+    const float *p = job->positions + 3 * begin;
     for (int i = 0; i < 3 * num; i++) {
       const double u = (p[i] - center[i] + h) / width;
       inside &= (u >= -1e-6) & (u <= 1 + 1e-6) ? -1 : 0;
@@ -91,7 +91,7 @@ static ast_status octree_key_task(int64_t index, void *context) {
       y[i] = (uint64_t)cell[3 * i + 1];
       z[i] = (uint64_t)cell[3 * i + 2];
     }
-    uint64_t *key = s->keys + begin;
+    uint64_t *key = job->keys + begin;
     for (int i = 0; i < num; i++) key[i] = octree_spread(x[i]) << 2 | octree_spread(y[i]) << 1 | octree_spread(z[i]);
   }
   return inside ? AST_OK : AST_OUTSIDE;
@@ -104,10 +104,10 @@ typedef struct {
 } octree_coordinates_job;
 
 static ast_status octree_coordinates_task(int64_t index, void *context) {
-  const octree_coordinates_job *s = context;
-  for (int64_t c = index * OCTREE_CHUNK; c < min64(s->C, (index + 1) * OCTREE_CHUNK); c++) {
-    const uint64_t key = (uint64_t)s->keys[c];
-    for (int a = 0; a < 3; a++) s->coordinates[3 * c + a] = (int32_t)octree_gather(key >> (2 - a));
+  const octree_coordinates_job *job = context;
+  for (int64_t c = index * OCTREE_CHUNK; c < min64(job->C, (index + 1) * OCTREE_CHUNK); c++) {
+    const uint64_t key = (uint64_t)job->keys[c];
+    for (int a = 0; a < 3; a++) job->coordinates[3 * c + a] = (int32_t)octree_gather(key >> (2 - a));
   }
   return AST_OK;
 }
@@ -179,20 +179,20 @@ AST_INLINE ast_status octree_radix_sort(uint64_t *keys, uint64_t *nodes, uint64_
 }
 
 static ast_status octree_sort_task(int64_t b, void *context) {
-  const octree_sort_job *s = context;
-  const int64_t begin = s->offsets[b], n = s->offsets[b + 1] - begin;
+  const octree_sort_job *job = context;
+  const int64_t begin = job->offsets[b], n = job->offsets[b + 1] - begin;
   if (n == 0) return AST_OK;
-  uint64_t *keys = s->keys + begin, *other = s->other + begin, differ = 0;
+  uint64_t *keys = job->keys + begin, *other = job->other + begin, differ = 0;
   for (int64_t i = 0; i < n; i++) differ |= keys[i] ^ keys[0];
   int low = 0;
   while (differ && !(differ >> low & 1)) low++;
   const int high = octree_bits(differ);
-  if (s->packed) {
-    for (int64_t i = 0; i < n; i++) keys[i] = keys[i] << s->index_bits | (uint64_t)i;
-    return octree_radix_sort(keys, NULL, other, NULL, n, low + s->index_bits, high + s->index_bits, true);
+  if (job->packed) {
+    for (int64_t i = 0; i < n; i++) keys[i] = keys[i] << job->index_bits | (uint64_t)i;
+    return octree_radix_sort(keys, NULL, other, NULL, n, low + job->index_bits, high + job->index_bits, true);
   }
-  for (int64_t i = 0; i < n; i++) keys[s->N + i] = (uint64_t)i;
-  return octree_radix_sort(keys, keys + s->N, other, other + s->N, n, low, high, false);
+  for (int64_t i = 0; i < n; i++) keys[job->N + i] = (uint64_t)i;
+  return octree_radix_sort(keys, keys + job->N, other, other + job->N, n, low, high, false);
 }
 
 /* ---- runs of equal keys ---- */
@@ -208,30 +208,30 @@ typedef struct {
 } octree_run_job;
 
 /* Of the rows begin..end-1, in one scene, those that start a run; the scene starts at `first`. */
-AST_INLINE int octree_heads(const octree_run_job *s, int64_t begin, int64_t end, int64_t first, int32_t *heads) {
+AST_INLINE int octree_heads(const octree_run_job *job, int64_t begin, int64_t end, int64_t first, int32_t *heads) {
   int num = 0;
   for (int64_t i = begin; i < end; i++) {
     heads[num] = (int32_t)(i - begin);
-    num += i == first || s->sorted[i] >> s->shift != s->sorted[i - 1] >> s->shift;
+    num += i == first || job->sorted[i] >> job->shift != job->sorted[i - 1] >> job->shift;
   }
   return num;
 }
 
-AST_INLINE void octree_runs_of_chunk(const octree_run_job *s, int64_t chunk, const bool write) {
-  const int64_t end = min64(s->N, (chunk + 1) * OCTREE_CHUNK);
-  int64_t b = scene_at(s->offsets, s->B, chunk * OCTREE_CHUNK), run = write ? s->chunk_runs[chunk] : 0;
+AST_INLINE void octree_runs_of_chunk(const octree_run_job *job, int64_t chunk, const bool write) {
+  const int64_t end = min64(job->N, (chunk + 1) * OCTREE_CHUNK);
+  int64_t b = scene_at(job->offsets, job->B, chunk * OCTREE_CHUNK), run = write ? job->chunk_runs[chunk] : 0;
   int32_t heads[OCTREE_TILE];
   for (int64_t i = chunk * OCTREE_CHUNK, next; i < end; i = next) {
-    while (s->offsets[b + 1] <= i) b++;
-    next = min64(min64(end, s->offsets[b + 1]), i + OCTREE_TILE);
-    const int num = octree_heads(s, i, next, s->offsets[b], heads);
+    while (job->offsets[b + 1] <= i) b++;
+    next = min64(min64(end, job->offsets[b + 1]), i + OCTREE_TILE);
+    const int num = octree_heads(job, i, next, job->offsets[b], heads);
     for (int j = 0; write && j < num; j++) {
-      s->keys[run + j] = (int64_t)(s->sorted[i + heads[j]] >> s->shift);
-      s->starts[run + j] = i + heads[j];
+      job->keys[run + j] = (int64_t)(job->sorted[i + heads[j]] >> job->shift);
+      job->starts[run + j] = i + heads[j];
     }
     run += num;
   }
-  if (!write) s->chunk_runs[chunk] = run;
+  if (!write) job->chunk_runs[chunk] = run;
 }
 
 static ast_status octree_count_runs_task(int64_t chunk, void *context) {
@@ -273,18 +273,18 @@ typedef struct {
 } octree_node_job;
 
 static ast_status octree_node_task(int64_t chunk, void *context) {
-  const octree_node_job *s = context;
-  const octree_sort_job *sort = s->sort;
+  const octree_node_job *job = context;
+  const octree_sort_job *sort = job->sort;
   const uint64_t *index = sort->packed ? sort->keys : sort->keys + sort->N;
   const uint64_t mask = sort->packed ? (1ull << sort->index_bits) - 1 : UINT64_MAX;
-  const int64_t end = min64(s->C, (chunk + 1) * OCTREE_CHUNK);
-  int64_t b = scene_at(s->cell_offsets, s->B, chunk * OCTREE_CHUNK);
+  const int64_t end = min64(job->C, (chunk + 1) * OCTREE_CHUNK);
+  int64_t b = scene_at(job->cell_offsets, job->B, chunk * OCTREE_CHUNK);
   for (int64_t c = chunk * OCTREE_CHUNK; c < end; c++) {
-    while (s->cell_offsets[b + 1] <= c) b++;
-    for (int64_t i = s->node_offsets[c]; i < s->node_offsets[c + 1]; i++) {
-      const int64_t node = s->offsets[b] + (int64_t)(index[i] & mask);
-      s->node_order[i] = node;
-      s->node_cell[node] = c;
+    while (job->cell_offsets[b + 1] <= c) b++;
+    for (int64_t i = job->node_offsets[c]; i < job->node_offsets[c + 1]; i++) {
+      const int64_t node = job->offsets[b] + (int64_t)(index[i] & mask);
+      job->node_order[i] = node;
+      job->node_cell[node] = c;
     }
   }
   return AST_OK;

@@ -95,11 +95,11 @@ static void conv_tile(const conv_job *job, const conv_walk *tile, const conv_row
   const float *weight = job->packed + tile->k * gemm_packed_size(C_in, C_out);
   const int64_t strips = row_strips(n), parts = strips * (divide_up(columns, GEMM_COLUMNS));
   for (int64_t c = column, part = 0; c < column + columns; c += GEMM_COLUMNS)
-    for (int64_t s = 0; s < strips; s++, part++) {
-      const int64_t i = n * s / strips, f = next->n * part / parts, f_end = next->n * (part + 1) / parts;
+    for (int64_t strip = 0; strip < strips; strip++, part++) {
+      const int64_t i = n * strip / strips, f = next->n * part / parts, f_end = next->n * (part + 1) / parts;
       const row_pointers pointers = {rows->x + i, rows->base + i, rows->out + i};
       const row_fetch fetch = {next_rows->x + f, next_rows->out + f, f_end - f};
-      row_panel(n * (s + 1) / strips - i, min64(GEMM_COLUMNS, C_out - c), C_in, pointers, fetch, weight + c * C_in, c);
+      row_panel(n * (strip + 1) / strips - i, min64(GEMM_COLUMNS, C_out - c), C_in, pointers, fetch, weight + c * C_in, c);
     }
 }
 

@@ -58,12 +58,12 @@ static void conv_weight_add_tile(const conv_weight_tile *tile, const conv_weight
       tail_rows[i] = tail[i];
     }
     if (width % VW) p.b = tail_rows, p.b_column = 0;
-    for (int64_t s = 0; s < strips; s++, line++) {
-      p.a_column = rows * s / strips;
+    for (int64_t strip = 0; strip < strips; strip++, line++) {
+      p.a_column = rows * strip / strips;
       p.next = next->n < tile->n || line >= lines ? p.b : line < x_lines ? next->x : next->dout;
       p.next_column = p.next == p.b ? p.b_column : LINE * (line < x_lines ? line : line - x_lines);
       float *out = sum + p.a_column * C_out + c;
-      column_panel(rows * (s + 1) / strips - p.a_column, width, tile->n, p, add ? out : NULL, out, C_out);
+      column_panel(rows * (strip + 1) / strips - p.a_column, width, tile->n, p, add ? out : NULL, out, C_out);
     }
   }
 }

@@ -190,7 +190,7 @@ AST_INLINE void dense_tile(const int rows, const int vectors, const dense_layer 
   dense_finish(l, e, rows, vectors, i0, j, l->N - j, sums, bias);
 }
 
-/* The share of panel p, of `panels`, in rows first.. of it */
+/* Of the rows first.. those parts that panel p of `panels` fetches. */
 AST_INLINE void dense_fetch(const dense_next *next, int64_t p, int64_t panels, int64_t first, int64_t rows) {
   const int64_t lines = (next->columns + 15) / 16, begin = lines * p / panels, end = lines * (p + 1) / panels;
   for (int64_t i = first; i < min64(first + rows, next->rows); i++)
@@ -254,7 +254,7 @@ typedef struct {
 
 static dense_chunks dense_cut(int64_t M, int64_t floats) {
   const int64_t most = min64(32, max64(2, DENSE_PARTIALS / max64(1, floats)));
-  const int64_t parts = M / 192 > 2 ? round_up(M / 192, 4) : min64(2, M / 16); /* even shares for 2 and for 4 threads */
+  const int64_t parts = M / 192 > 2 ? round_up(M / 192, 4) : min64(2, M / 16); /* even for 2 and for 4 threads */
   const int64_t num = max64(1, min64(parts, most)), rows = divide_up(M, num);
   const int64_t blocks = divide_up(rows, DENSE_ROWS);
   return (dense_chunks){num, rows, blocks ? round_up(divide_up(rows, blocks), GEMM_ROWS) : DENSE_ROWS};
@@ -275,18 +275,18 @@ typedef struct {
 
 enum { DENSE_SUM_ROWS = 16 };
 
-AST_INLINE int64_t dense_sum_tasks(const dense_sum *s) { return s->to ? divide_up(s->rows, DENSE_SUM_ROWS) : 0; }
+AST_INLINE int64_t dense_sum_tasks(const dense_sum *target) { return target->to ? divide_up(target->rows, DENSE_SUM_ROWS) : 0; }
 
 static ast_status dense_sum_task(int64_t index, void *context) {
   const dense_sum_job *job = context;
-  const dense_sum *s = job->sums;
-  for (; index >= dense_sum_tasks(s); s++) index -= dense_sum_tasks(s);
-  for (int64_t i = index * DENSE_SUM_ROWS; i < min64(s->rows, (index + 1) * DENSE_SUM_ROWS); i++)
-    for (int64_t j = 0; j < s->n; j += VW) {
-      const float *partial = job->partials + s->at + i * s->row + j;
+  const dense_sum *target = job->sums;
+  for (; index >= dense_sum_tasks(target); target++) index -= dense_sum_tasks(target);
+  for (int64_t i = index * DENSE_SUM_ROWS; i < min64(target->rows, (index + 1) * DENSE_SUM_ROWS); i++)
+    for (int64_t j = 0; j < target->n; j += VW) {
+      const float *partial = job->partials + target->at + i * target->row + j;
       vf sum = vload(partial);
       for (int64_t c = 1; c < job->chunks; c++) sum += vload(partial + c * job->size);
-      vstore_upto(s->to + i * s->n + j, sum, s->n - j);
+      vstore_upto(target->to + i * target->n + j, sum, target->n - j);
     }
   return AST_OK;
 }
