@@ -82,36 +82,39 @@ AST_INLINE void gemm_sums(const int rows, const int vectors, int64_t K, gemm_a a
   }
 }
 
+/* for all vectors of a register tile */
+#define TILE_EACH(i, v) _Pragma("GCC unroll 12") for (int i = 0; i < rows; i++) _Pragma("GCC unroll 2") for (int v = 0; v < vectors; v++)
+
+/* Cuts n rows into register tiles: calls tile(rows) for the rows i, i + 1, ... with a constant number of them. */
+#define EACH_TILE_OF_ROWS(i, n, tile)                \
+  do {                                               \
+    int64_t i = 0;                                   \
+    TILES_OF_ROWS(i, n, GEMM_ROWS, tile);            \
+    if (GEMM_ROWS > 8) TILES_OF_ROWS(i, n, 8, tile); \
+    TILES_OF_ROWS(i, n, 4, tile);                    \
+    TILES_OF_ROWS(i, n, 2, tile);                    \
+    TILES_OF_ROWS(i, n, 1, tile);                    \
+  } while (0)
+#define TILES_OF_ROWS(i, n, rows, tile) \
+  for (; i + (rows) <= (n); i += (rows)) tile(rows)
+
 /* One register tile. */
 AST_INLINE void gemm_tile(const int rows, const int vectors, int64_t K, gemm_a a, const float *b, int64_t b_row, float *c, int64_t c_row,
                           bool add) {
   vf sum[GEMM_ROWS][2];
-#pragma GCC unroll 12
-  for (int i = 0; i < rows; i++)
-#pragma GCC unroll 2
-    for (int j = 0; j < vectors; j++) sum[i][j] = (vf){0};
+  TILE_EACH(i, v) sum[i][v] = (vf){0};
   gemm_sums(rows, vectors, K, a, b, b_row, sum);
-#pragma GCC unroll 12
-  for (int i = 0; i < rows; i++)
-#pragma GCC unroll 2
-    for (int j = 0; j < vectors; j++) {
-      float *c_ij = c + i * c_row + j * VW;
-      vstore(c_ij, add ? vload(c_ij) + sum[i][j] : sum[i][j]);
-    }
+  TILE_EACH(i, v) {
+    float *c_iv = c + i * c_row + v * VW;
+    vstore(c_iv, add ? vload(c_iv) + sum[i][v] : sum[i][v]);
+  }
 }
 
 AST_INLINE void gemm_strip(const int vectors, int64_t M, int64_t K, gemm_a a, const float *b, int64_t b_row, float *c, int64_t c_row,
                            bool add) {
-  int64_t i = 0;
-#define GEMM_STEP(rows)                \
-  for (; i + (rows) <= M; i += (rows)) \
-  gemm_tile(rows, vectors, K, (gemm_a){a.data + i * a.row, a.row, a.column}, b, b_row, c + i * c_row, c_row, add)
-  GEMM_STEP(GEMM_ROWS);
-  if (GEMM_ROWS > 8) GEMM_STEP(8);
-  GEMM_STEP(4);
-  GEMM_STEP(2);
-  GEMM_STEP(1);
-#undef GEMM_STEP
+#define GEMM_TILE(rows) gemm_tile(rows, vectors, K, (gemm_a){a.data + i * a.row, a.row, a.column}, b, b_row, c + i * c_row, c_row, add)
+  EACH_TILE_OF_ROWS(i, M, GEMM_TILE);
+#undef GEMM_TILE
 }
 
 /* C [M,N] (+)= A [M,K] B [K,N], N a multiple of VW, rows of B and C b_row and c_row floats apart. */

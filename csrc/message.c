@@ -103,15 +103,9 @@ AST_INLINE void message_first_tile(const int rows, const int vectors, const mess
 
 AST_INLINE void message_first_strip(const int vectors, const message_weights *w, int64_t p, int64_t first, int64_t n,
                                     const message_tile *t) {
-  int64_t i = 0;
-#define MESSAGE_STEP(rows) \
-  for (; i + (rows) <= n; i += (rows)) message_first_tile(rows, vectors, w, p, first + i, t->h + i * w->row, t->x + i * w->row)
-  MESSAGE_STEP(GEMM_ROWS);
-  if (GEMM_ROWS > 8) MESSAGE_STEP(8);
-  MESSAGE_STEP(4);
-  MESSAGE_STEP(2);
-  MESSAGE_STEP(1);
-#undef MESSAGE_STEP
+#define FIRST_TILE(rows) message_first_tile(rows, vectors, w, p, first + i, t->h + i * w->row, t->x + i * w->row)
+  EACH_TILE_OF_ROWS(i, n, FIRST_TILE);
+#undef FIRST_TILE
 }
 
 /* h, x and y of edges first to first + n */

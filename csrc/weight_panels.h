@@ -145,24 +145,21 @@ static __attribute__((noinline)) void dense_finish(const dense_layer *l, const d
   }
 }
 
-/* for all vectors of a register tile */
-#define DENSE_EACH(i, v) _Pragma("GCC unroll 12") for (int i = 0; i < rows; i++) _Pragma("GCC unroll 2") for (int v = 0; v < vectors; v++)
-
 /* The same in the usual cases, in the registers of the tile: rows from i on, whole vectors from column j on. */
 AST_INLINE void dense_finish_tile(const int rows, const int vectors, const dense_end *e, int64_t i0, int64_t j, const float *bias,
                                   vf z[GEMM_ROWS][2]) {
-  DENSE_EACH(i, v) z[i][v] += vload(bias + v * VW);
-  if (e->activation == AST_RELU) DENSE_EACH(i, v) z[i][v] = vmax((vf){0}, z[i][v]);
+  TILE_EACH(i, v) z[i][v] += vload(bias + v * VW);
+  if (e->activation == AST_RELU) TILE_EACH(i, v) z[i][v] = vmax((vf){0}, z[i][v]);
   if (e->hidden) {
     const float *hidden = e->hidden + i0 * e->hidden_row + j;
-    DENSE_EACH(i, v) z[i][v] = (vf)((vi)z[i][v] & ~(vload(hidden + i * e->hidden_row + v * VW) <= 0));
+    TILE_EACH(i, v) z[i][v] = (vf)((vi)z[i][v] & ~(vload(hidden + i * e->hidden_row + v * VW) <= 0));
   }
   if (e->residual) {
     const float *residual = e->residual + i0 * e->residual_row + j;
-    DENSE_EACH(i, v) z[i][v] += vload(residual + i * e->residual_row + v * VW);
+    TILE_EACH(i, v) z[i][v] += vload(residual + i * e->residual_row + v * VW);
   }
   float *out = e->out + i0 * e->out_row + j;
-  DENSE_EACH(i, v) vstore(out + i * e->out_row + v * VW, z[i][v]);
+  TILE_EACH(i, v) vstore(out + i * e->out_row + v * VW, z[i][v]);
 }
 
 /* One register tile: rows i.. of panel p. A long sum over k is one of short ones, in the stack between two of them. */
@@ -170,23 +167,23 @@ AST_INLINE void dense_tile(const int rows, const int vectors, const dense_layer 
   const int64_t j = p * dense_panel_width(l);
   const float *panel = l->panels + p * l->K * GEMM_COLUMNS, *bias = l->panels_bias + p * GEMM_COLUMNS;
   float sums[GEMM_ROWS * GEMM_COLUMNS] __attribute__((aligned(64)));
-  DENSE_EACH(i, v) __builtin_prefetch(e->out + (i0 + i) * e->out_row + j + v * VW, 1);
+  TILE_EACH(i, v) __builtin_prefetch(e->out + (i0 + i) * e->out_row + j + v * VW, 1);
   vf sum[GEMM_ROWS][2];
   for (int64_t k = 0;;) { /* once without inputs, too: the sums are then 0 */
-    DENSE_EACH(i, v) sum[i][v] = (vf){0};
+    TILE_EACH(i, v) sum[i][v] = (vf){0};
     const gemm_a part = {a.data + i0 * a.row + k * a.column, a.row, a.column};
     gemm_sums(rows, vectors, min64(l->depth, l->K - k), part, panel + k * GEMM_COLUMNS, GEMM_COLUMNS, sum);
-    if (k) DENSE_EACH(i, v) sum[i][v] += vload(sums + i * GEMM_COLUMNS + v * VW);
+    if (k) TILE_EACH(i, v) sum[i][v] += vload(sums + i * GEMM_COLUMNS + v * VW);
     k += l->depth;
     if (k >= l->K) break;
-    DENSE_EACH(i, v) vstore(sums + i * GEMM_COLUMNS + v * VW, sum[i][v]);
+    TILE_EACH(i, v) vstore(sums + i * GEMM_COLUMNS + v * VW, sum[i][v]);
     __asm__("" : "+m"(sums)); /* or the compiler moves what is not yet known of them through other stack for every tile */
   }
   if (!l->paired && !e->z && l->N - j >= vectors * VW) {
     dense_finish_tile(rows, vectors, e, i0, j, bias, sum);
     return;
   }
-  DENSE_EACH(i, v) vstore(sums + i * GEMM_COLUMNS + v * VW, sum[i][v]);
+  TILE_EACH(i, v) vstore(sums + i * GEMM_COLUMNS + v * VW, sum[i][v]);
   dense_finish(l, e, rows, vectors, i0, j, l->N - j, sums, bias);
 }
 
@@ -198,19 +195,14 @@ AST_INLINE void dense_fetch(const dense_next *next, int64_t p, int64_t panels, i
 }
 
 AST_INLINE void dense_strip(const int vectors, const dense_layer *l, int64_t p, int64_t rows, gemm_a a, const dense_end *e) {
-  int64_t i = 0;
-#define DENSE_STEP(num) \
-  for (; i + (num) <= rows; i += (num)) dense_tile(num, vectors, l, p, i, a, e)
-  for (; i + GEMM_ROWS <= rows; i += GEMM_ROWS) {
-    for (int n = 0; n < DENSE_NEXT; n++)
-      if (e->next[n].data) dense_fetch(&e->next[n], p, dense_panels(l), i, GEMM_ROWS);
-    dense_tile(GEMM_ROWS, vectors, l, p, i, a, e);
-  }
-  if (GEMM_ROWS > 8) DENSE_STEP(8);
-  DENSE_STEP(4);
-  DENSE_STEP(2);
-  DENSE_STEP(1);
-#undef DENSE_STEP
+#define DENSE_TILE(rows)                                                               \
+  do {                                                                                 \
+    for (int n = 0; n < DENSE_NEXT && (rows) == GEMM_ROWS; n++)                        \
+      if (e->next[n].data) dense_fetch(&e->next[n], p, dense_panels(l), i, GEMM_ROWS); \
+    dense_tile(rows, vectors, l, p, i, a, e);                                          \
+  } while (0)
+  EACH_TILE_OF_ROWS(i, rows, DENSE_TILE);
+#undef DENSE_TILE
 }
 
 /* M rows are cut evenly between register tiles: where task `index` of `tasks` begins. */
