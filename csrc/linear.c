@@ -69,8 +69,9 @@ static ast_status linear_product_task(int64_t index, void *context) {
 /* ---- forward ---- */
 
 static dense_layer linear_layer(const ast_linear *sizes, const float *weight, const float *bias, bool paired) {
-  return (dense_layer){
-      .weight = weight, .row = 1, .column = sizes->I, .bias = bias, .K = sizes->I, .N = paired ? sizes->O / 2 : sizes->O, .paired = paired};
+  dense_layer layer = dense_forward(weight, bias, sizes->I, paired ? sizes->O / 2 : sizes->O);
+  layer.paired = paired;
+  return layer;
 }
 
 static ast_status linear(const ast_linear *sizes, const float *restrict x, const float *restrict weight, const float *restrict bias,
@@ -134,7 +135,7 @@ static void linear_dz(const linear_backward_job *job, int64_t first, int64_t row
     linear_activation(sizes, rows, job->z + first * sizes->O, sizes->O, dout, dz, job->dz_row);
   } else {
     const dense_end end = {.out = dz, .out_row = job->dz_row};
-    dense_rows(&job->layers[0], 0, dense_panels(&job->layers[0]), rows, (gemm_a){x, sizes->x_stride, 1}, end);
+    dense_all(&job->layers[0], rows, (gemm_a){x, sizes->x_stride, 1}, end);
     linear_activation(sizes, rows, dz, job->dz_row, dout, dz, job->dz_row);
   }
 }
@@ -151,7 +152,7 @@ static void linear_backward_rows(const linear_backward_job *job, int64_t first, 
                          .out_row = sizes->I,
                          .next = {dense_rows_from(job->dout, sizes->dout_stride, job->columns, first + rows, sizes->M),
                                   dense_rows_from(job->x, sizes->x_stride, sizes->I, first + rows, sizes->M)}};
-  dense_rows(&job->layers[1], 0, dense_panels(&job->layers[1]), rows, (gemm_a){dz, job->dz_row, 1}, end);
+  dense_all(&job->layers[1], rows, (gemm_a){dz, job->dz_row, 1}, end);
 }
 
 /* By rows: a chunk, its part of dW and dbias. */
@@ -253,7 +254,7 @@ static ast_status linear_backward(const ast_linear *sizes, const float *restrict
   const bool recompute = sizes->activation != AST_IDENTITY && !z;
   linear_backward_job job = {.sizes = sizes, .dout = dout, .x = x, .z = z, .dx = dx, .dweight = dweight, .dbias = dbias};
   job.layers[0] = linear_layer(sizes, recompute ? weight : NULL, bias, false);
-  job.layers[1] = (dense_layer){.weight = dx ? weight : NULL, .row = sizes->I, .column = 1, .K = sizes->O, .N = sizes->I};
+  job.layers[1] = dense_backward(dx ? weight : NULL, sizes->I, sizes->O, sizes->I);
   const ast_status status = dense_pack(job.layers, 2);
   if (status != AST_OK) return status;
   job.columns = sizes->activation == AST_GEGLU ? sizes->O / 2 : sizes->O;

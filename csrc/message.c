@@ -37,22 +37,17 @@ enum { MESSAGE_A1, MESSAGE_A2, MESSAGE_W2, MESSAGE_W2_BACK, MESSAGE_A2_BACK, MES
 
 static ast_status message_pack(const ast_message *step, bool gradients, message_weights *w) {
   *w = (message_weights){.step = step, .row = round_up(max64(step->H, max64(step->F, step->F2)), VW) + DENSE_APART};
-  w->layers[MESSAGE_A1] = (dense_layer){.weight = step->A1, .row = 1, .column = step->E, .bias = step->a1, .K = step->E, .N = step->H};
-  w->layers[MESSAGE_A2] = (dense_layer){.weight = step->A2, .row = 1, .column = step->H, .K = step->H, .N = step->F};
-  w->layers[MESSAGE_W2] = (dense_layer){.weight = step->W2, .row = 1, .column = step->F, .bias = step->b2, .K = step->F, .N = step->F2};
-  w->layers[MESSAGE_W2_BACK] = (dense_layer){.weight = step->W2, .row = step->F, .column = 1, .K = step->F2, .N = step->F};
-  w->layers[MESSAGE_A2_BACK] = (dense_layer){.weight = step->A2, .row = step->H, .column = 1, .K = step->F, .N = step->H};
-  w->layers[MESSAGE_A1_BACK] = (dense_layer){.weight = step->A1, .row = step->E, .column = 1, .K = step->H, .N = step->E};
+  w->layers[MESSAGE_A1] = dense_forward(step->A1, step->a1, step->E, step->H);
+  w->layers[MESSAGE_A2] = dense_forward(step->A2, NULL, step->H, step->F);
+  w->layers[MESSAGE_W2] = dense_forward(step->W2, step->b2, step->F, step->F2);
+  w->layers[MESSAGE_W2_BACK] = dense_backward(step->W2, step->F, step->F2, step->F);
+  w->layers[MESSAGE_A2_BACK] = dense_backward(step->A2, step->H, step->F, step->H);
+  w->layers[MESSAGE_A1_BACK] = dense_backward(step->A1, step->E, step->H, step->E);
   return dense_pack(w->layers, gradients ? 6 : 3);
 }
 
 /* Whether the edge features are products with the first layer already, added as they are. */
 AST_INLINE bool message_has_latents(const ast_message *step) { return step->E && !step->H; }
-
-/* out = a layer on n rows of A, followed by ReLU or set to 0 where `hidden` is 0 */
-static void message_layer(const message_weights *w, int layer, int64_t n, gemm_a a, dense_end end) {
-  dense_rows(&w->layers[layer], 0, dense_panels(&w->layers[layer]), n, a, end);
-}
 
 typedef struct {
   float *h, *x, *y; /* [MESSAGE_TILE, row], their padding undefined */
@@ -112,12 +107,12 @@ AST_INLINE void message_first_strip(const int vectors, const message_weights *w,
 static void message_layers(const message_weights *w, int64_t first, int64_t n, const message_tile *t) {
   const ast_message *step = w->step;
   const gemm_a e = {step->edge_features + first * step->E, step->E, 1};
-  message_layer(w, MESSAGE_A1, n, e, (dense_end){.activation = AST_RELU, .out = t->h, .out_row = w->row});
+  dense_all(&w->layers[MESSAGE_A1], n, e, (dense_end){.activation = AST_RELU, .out = t->h, .out_row = w->row});
   for (int64_t p = 0; p * GEMM_COLUMNS < step->F; p++) {
     if (step->F - p * GEMM_COLUMNS > VW) message_first_strip(2, w, p, first, n, t);
     else message_first_strip(1, w, p, first, n, t);
   }
-  message_layer(w, MESSAGE_W2, n, (gemm_a){t->x, w->row, 1}, (dense_end){.out = t->y, .out_row = w->row});
+  dense_all(&w->layers[MESSAGE_W2], n, (gemm_a){t->x, w->row, 1}, (dense_end){.out = t->y, .out_row = w->row});
 }
 
 /* ---- forward ---- */

@@ -38,7 +38,6 @@ typedef struct {
   message_weights w;
   const float *dsum, *dmessages;
   const ast_message_gradients *out;
-  float *W2, *A2, *A1;        /* in panels, as the products with dy, dz and dc read them */
   float *dz;                  /* of the edges of this round, rows w.row apart */
   float *partials;            /* the sums of each task of a round */
   int64_t *part_offsets;      /* [tasks, PARTS + 1] places in by_part */
@@ -108,18 +107,20 @@ static void message_tile_backward(const message_backward_job *job, int64_t first
   else message_norm_backward(job, first, n, t, sums, true);
   /* forward: y = W2 x + b2, so dW2 = dy x^T and dx = W2^T dy */
   gemm(step->F2, F, n, (gemm_a){dy, 1, row}, t->x, row, sums->W2, F, !fresh);
-  message_layer(w, MESSAGE_W2_BACK, n, (gemm_a){dy, row, 1}, (dense_end){.out = dz, .out_row = row, .hidden = t->x, .hidden_row = row});
+  dense_all(&w->layers[MESSAGE_W2_BACK], n, (gemm_a){dy, row, 1},
+            (dense_end){.out = dz, .out_row = row, .hidden = t->x, .hidden_row = row});
   /* forward: x = relu(P + Q + e), so de = dz */
   float *de = job->out->edge_features;
   for (int64_t i = 0; de && message_has_latents(step) && i < n; i++) memcpy(de + (first + i) * E, dz + i * row, (size_t)E * sizeof *de);
   if (!H) return;
   /* forward: x = relu(P + Q + A2 h), so dA2 = dz h^T and dh = A2^T dz */
   gemm(step->F, H, n, (gemm_a){dz, 1, row}, t->h, row, sums->A2, H, !fresh);
-  message_layer(w, MESSAGE_A2_BACK, n, (gemm_a){dz, row, 1}, (dense_end){.out = dc, .out_row = row, .hidden = t->h, .hidden_row = row});
+  dense_all(&w->layers[MESSAGE_A2_BACK], n, (gemm_a){dz, row, 1},
+            (dense_end){.out = dc, .out_row = row, .hidden = t->h, .hidden_row = row});
   /* forward: h = relu(A1 e + a1), so da1 = dc, dA1 = dc e^T and de = A1^T dc */
   dense_add_rows(dc, row, n, step->H, sums->a1);
   gemm(E, H, n, (gemm_a){step->edge_features + first * E, 1, E}, dc, row, sums->A1, H, !fresh);
-  if (de) message_layer(w, MESSAGE_A1_BACK, n, (gemm_a){dc, row, 1}, (dense_end){.out = de + first * E, .out_row = E});
+  if (de) dense_all(&w->layers[MESSAGE_A1_BACK], n, (gemm_a){dc, row, 1}, (dense_end){.out = de + first * E, .out_row = E});
 }
 
 static ast_status message_backward_task(int64_t index, void *context) {

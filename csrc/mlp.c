@@ -22,10 +22,6 @@
 /* Both layers, and for the gradients W2^T and W1^T, to x and to beside. */
 enum { MLP_FIRST, MLP_SECOND, MLP_SECOND_BACK, MLP_FIRST_BACK, MLP_BESIDE_BACK, MLP_LAYERS };
 
-static dense_layer mlp_layer(const float *weight, const float *bias, int64_t K, int64_t N) {
-  return (dense_layer){.weight = weight, .row = 1, .column = K, .bias = bias, .K = K, .N = N};
-}
-
 /* [x, beside] of rows from `first` on, copied side by side; rows of the copy are padded with zeros to whole vectors */
 static void mlp_copy_inputs(const ast_mlp *mlp, int64_t first, int64_t rows, float *to, int64_t row) {
   dense_copy_rows(mlp->x + first * mlp->x_stride, mlp->x_stride, rows, mlp->I, to, row);
@@ -89,11 +85,10 @@ static ast_status mlp_task(int64_t index, void *context) {
                              .out_row = hidden_row,
                              .next = {dense_rows_from(mlp->x, mlp->x_stride, mlp->I, i + DENSE_ROWS, mlp->M),
                                       dense_rows_from(mlp->beside, mlp->beside_stride, mlp->I2, i + DENSE_ROWS, mlp->M)}};
-    dense_rows(&job->layers[MLP_FIRST], 0, dense_panels(&job->layers[MLP_FIRST]), rows, a, first);
+    dense_all(&job->layers[MLP_FIRST], rows, a, first);
     a = (gemm_a){hidden, hidden_row, 1};
     if (mlp->gamma) {
-      dense_rows(&job->layers[MLP_SECOND], 0, dense_panels(&job->layers[MLP_SECOND]), rows, a,
-                 (dense_end){.out = y, .out_row = job->y_row});
+      dense_all(&job->layers[MLP_SECOND], rows, a, (dense_end){.out = y, .out_row = job->y_row});
       if (mlp->O % VW) mlp_norm_rows(job, i, rows, y, false);
       else mlp_norm_rows(job, i, rows, y, true);
     } else {
@@ -101,7 +96,7 @@ static ast_status mlp_task(int64_t index, void *context) {
                                 .out_row = mlp->O,
                                 .residual = job->residual ? job->residual + i * mlp->residual_stride : NULL,
                                 .residual_row = mlp->residual_stride};
-      dense_rows(&job->layers[MLP_SECOND], 0, dense_panels(&job->layers[MLP_SECOND]), rows, a, second);
+      dense_all(&job->layers[MLP_SECOND], rows, a, second);
     }
   }
   return AST_OK;
@@ -110,8 +105,8 @@ static ast_status mlp_task(int64_t index, void *context) {
 static ast_status mlp(const ast_mlp *mlp, const float *restrict residual, float *restrict out, ast_mlp_kept kept) {
   AST_SCRATCH_SCOPE;
   mlp_job job = {.mlp = mlp, .residual = residual, .out = out, .kept = kept};
-  job.layers[MLP_FIRST] = mlp_layer(mlp->weight1, mlp->bias1, mlp->I + mlp->I2, mlp->H);
-  job.layers[MLP_SECOND] = mlp_layer(mlp->weight2, mlp->bias2, mlp->H, mlp->O);
+  job.layers[MLP_FIRST] = dense_forward(mlp->weight1, mlp->bias1, mlp->I + mlp->I2, mlp->H);
+  job.layers[MLP_SECOND] = dense_forward(mlp->weight2, mlp->bias2, mlp->H, mlp->O);
   const int64_t rows = mlp->M >= 64 * DENSE_ROWS ? 4 * DENSE_ROWS : min64(DENSE_ROWS, max64(mlp->M / 8, 2 * GEMM_ROWS));
   job.tasks = min64(divide_up(mlp->M, GEMM_ROWS), round_up(divide_up(mlp->M, rows), 2));
   job.input_row = mlp->beside ? round_up(mlp->I + mlp->I2, VW) + DENSE_APART : 0;
@@ -164,13 +159,13 @@ static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_
     dense_copy_rows(job->kept.hidden + first * mlp->H, mlp->H, rows, mlp->H, hidden, job->hidden_row);
   } else {
     const dense_end end = {.activation = AST_RELU, .out = hidden, .out_row = job->hidden_row};
-    dense_rows(&job->layers[MLP_FIRST], 0, dense_panels(&job->layers[MLP_FIRST]), rows, inputs, end);
+    dense_all(&job->layers[MLP_FIRST], rows, inputs, end);
   }
   if (!mlp->gamma) {
     dense_copy_rows(job->dout + first * mlp->dout_stride, mlp->dout_stride, rows, mlp->O, y, job->y_row);
   } else {
     const dense_end end = {.out = y, .out_row = job->y_row};
-    if (!job->kept.normalized) dense_rows(&job->layers[MLP_SECOND], 0, dense_panels(&job->layers[MLP_SECOND]), rows, units, end);
+    if (!job->kept.normalized) dense_all(&job->layers[MLP_SECOND], rows, units, end);
     float *of_block = y + DENSE_ROWS * job->y_row; /* sums of the block first, so that long sums stay accurate */
     const norm_columns columns = {of_block, of_block + sums[MLP_DGAMMA].row, of_block + 2 * sums[MLP_DGAMMA].row};
     memset(of_block, 0, 2 * (size_t)sums[MLP_DGAMMA].row * sizeof *of_block);
@@ -191,7 +186,7 @@ static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_
                             .hidden_row = units.row,
                             .next = {dense_rows_from(mlp->x, mlp->x_stride, mlp->I, first + rows, mlp->M),
                                      dense_rows_from(job->dout, mlp->dout_stride, mlp->O, first + rows, mlp->M)}};
-  dense_rows(&job->layers[MLP_SECOND_BACK], 0, dense_panels(&job->layers[MLP_SECOND_BACK]), rows, (gemm_a){y, job->y_row, 1}, masked);
+  dense_all(&job->layers[MLP_SECOND_BACK], rows, (gemm_a){y, job->y_row, 1}, masked);
   /* forward: h = max(0, [x, beside] W1^T + bias1), so dW1 = dz^T [x, beside], dbias1 = dz and d[x, beside] = dz W1 */
   if (sums[MLP_DWEIGHT1].to)
     gemm(mlp->H, sums[MLP_DWEIGHT1].row, rows, (gemm_a){hidden, 1, job->hidden_row}, inputs.data, inputs.row,
@@ -203,11 +198,11 @@ static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_
                            .out_row = mlp->I,
                            .next = {dense_rows_from(job->kept.hidden, mlp->H, mlp->H, first + rows, mlp->M),
                                     dense_rows_from(job->kept.normalized, mlp->O, mlp->O, first + rows, mlp->M)}};
-    dense_rows(&job->layers[MLP_FIRST_BACK], 0, dense_panels(&job->layers[MLP_FIRST_BACK]), rows, dz, end);
+    dense_all(&job->layers[MLP_FIRST_BACK], rows, dz, end);
   }
   if (job->g.beside) {
     const dense_end end = {.out = job->g.beside + first * mlp->I2, .out_row = mlp->I2};
-    dense_rows(&job->layers[MLP_BESIDE_BACK], 0, dense_panels(&job->layers[MLP_BESIDE_BACK]), rows, dz, end);
+    dense_all(&job->layers[MLP_BESIDE_BACK], rows, dz, end);
   }
 }
 
@@ -250,13 +245,11 @@ static ast_status mlp_backward(const ast_mlp *mlp, const float *restrict dout, a
   mlp_backward_job job = {.mlp = mlp, .dout = dout, .kept = kept, .g = g};
   const int64_t K = mlp->I + mlp->I2;
   job.into_hidden = g.x || g.beside || g.weight1 || g.bias1;
-  job.layers[MLP_FIRST] = mlp_layer(kept.hidden ? NULL : mlp->weight1, mlp->bias1, K, mlp->H);
-  job.layers[MLP_SECOND] = mlp_layer(kept.normalized || !mlp->gamma ? NULL : mlp->weight2, mlp->bias2, mlp->H, mlp->O);
-  job.layers[MLP_SECOND_BACK] =
-      (dense_layer){.weight = job.into_hidden ? mlp->weight2 : NULL, .row = mlp->H, .column = 1, .K = mlp->O, .N = mlp->H};
-  job.layers[MLP_FIRST_BACK] = (dense_layer){.weight = g.x ? mlp->weight1 : NULL, .row = K, .column = 1, .K = mlp->H, .N = mlp->I};
-  job.layers[MLP_BESIDE_BACK] =
-      (dense_layer){.weight = g.beside ? mlp->weight1 + mlp->I : NULL, .row = K, .column = 1, .K = mlp->H, .N = mlp->I2};
+  job.layers[MLP_FIRST] = dense_forward(kept.hidden ? NULL : mlp->weight1, mlp->bias1, K, mlp->H);
+  job.layers[MLP_SECOND] = dense_forward(kept.normalized || !mlp->gamma ? NULL : mlp->weight2, mlp->bias2, mlp->H, mlp->O);
+  job.layers[MLP_SECOND_BACK] = dense_backward(job.into_hidden ? mlp->weight2 : NULL, mlp->H, mlp->O, mlp->H);
+  job.layers[MLP_FIRST_BACK] = dense_backward(g.x ? mlp->weight1 : NULL, K, mlp->H, mlp->I);
+  job.layers[MLP_BESIDE_BACK] = dense_backward(g.beside ? mlp->weight1 + mlp->I : NULL, K, mlp->H, mlp->I2);
   ast_status status = dense_pack(job.layers, MLP_LAYERS);
   if (status != AST_OK) return status;
   job.input_row = round_up(mlp->I, VW) + round_up(mlp->I2, VW) + DENSE_APART;

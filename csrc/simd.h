@@ -26,6 +26,8 @@ typedef uint32_t vu __attribute__((vector_size(AST_VECTOR_BYTES)));
 typedef float vf_unaligned __attribute__((vector_size(AST_VECTOR_BYTES), aligned(4), may_alias));
 
 #define AST_INLINE static inline __attribute__((always_inline))
+/* A loop over i < n, a constant up to 16, written out. */
+#define EACH(n, i) _Pragma("GCC unroll 16") for (int i = 0; i < (n); i++)
 
 AST_INLINE vf vload(const float *p) { return *(const vf_unaligned *)p; }
 AST_INLINE void vstore(float *p, vf x) { *(vf_unaligned *)p = x; }

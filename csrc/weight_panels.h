@@ -37,6 +37,14 @@ typedef struct {
   float *panels_bias; /* [panels][GEMM_COLUMNS] */
 } dense_layer;
 
+/* y = x W^T + bias with W [N,K], and dx = dy W of N of its columns, with W [K,row]; a NULL weight leaves the layer out. */
+AST_INLINE dense_layer dense_forward(const float *weight, const float *bias, int64_t K, int64_t N) {
+  return (dense_layer){.weight = weight, .row = 1, .column = K, .bias = bias, .K = K, .N = N};
+}
+AST_INLINE dense_layer dense_backward(const float *weight, int64_t row, int64_t K, int64_t N) {
+  return (dense_layer){.weight = weight, .row = row, .column = 1, .K = K, .N = N};
+}
+
 AST_INLINE int64_t dense_panel_width(const dense_layer *l) { return l->paired ? VW : GEMM_COLUMNS; }
 AST_INLINE int64_t dense_panels(const dense_layer *l) { return divide_up(l->N, dense_panel_width(l)); }
 AST_INLINE int64_t dense_packed_size(const dense_layer *l) { return dense_panels(l) * (l->K + 1) * GEMM_COLUMNS; }
@@ -217,6 +225,9 @@ static void dense_rows(const dense_layer *l, int64_t first, int64_t last, int64_
     else dense_strip(1, l, p, rows, a, &e);
   }
 }
+
+/* All of the layer. */
+static void dense_all(const dense_layer *l, int64_t rows, gemm_a a, dense_end e) { dense_rows(l, 0, dense_panels(l), rows, a, e); }
 
 /* ---- what the gradients need ---- */
 
