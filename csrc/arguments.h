@@ -203,7 +203,8 @@ static bool check_indices(const call *c, const argument *a, int64_t length, int6
 static bool check_permutation(const call *c, const argument *a, int64_t n) {
   if (!check_indices(c, a, n, n)) return false;
   const int64_t *index = a->data;
-  uint8_t *seen = ast_scratch(0, n / 8 + 1);
+  AST_SCRATCH_SCOPE;
+  uint8_t *seen = ast_scratch(n / 8 + 1);
   if (!seen) return PyErr_NoMemory(), false;
   memset(seen, 0, (size_t)(n / 8 + 1));
   for (int64_t i = 0; i < n; i++) {

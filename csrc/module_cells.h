@@ -212,8 +212,9 @@ static bool append_level(PyObject *list, const ast_octree_level *level, Py_ssize
 }
 
 /* The list, filled, or NULL. It exists before the first kernel runs, and arrays are no objects of the garbage collector: so no Python
- * code can use the thread's scratch memory while the levels lie there. */
+ * code runs in between. */
 static PyObject *fill_levels(call *c, const argument *keys, const argument *offsets, int levels, PyObject *list) {
+  AST_SCRATCH_SCOPE; /* of the levels */
   ast_octree_level level[21];
   ast_status status;
   KERNEL(*c, status, kernels->octree_coarsen(keys->data, offsets->data, offsets->shape[0] - 1, levels, level));
