@@ -52,7 +52,7 @@ static bool fail(const call *c, PyObject *type, const char *format, ...) {
 static int64_t value_of(const call *c, const dimension *d) {
   int64_t value = d->constant;
   for (int i = 0; i < 2; i++) {
-    const int64_t size = c->size[(int)d->letter[i]];
+    const int64_t size = c->size[d->letter[i]];
     if (size != UNBOUND) value += d->factor[i] * size;
   }
   return value;
@@ -60,7 +60,7 @@ static int64_t value_of(const call *c, const dimension *d) {
 
 /* Whether an axis may be as long as this. A letter that stands alone binds at first sight; in a sum an absent one is 0. */
 static bool fits(call *c, const dimension *d, int64_t length) {
-  int64_t *size = &c->size[(int)d->letter[0]];
+  int64_t *size = &c->size[d->letter[0]];
   if (*size == UNBOUND && !d->letter[1]) {
     const int64_t rest = length - d->constant;
     if (rest < 0 || rest % d->factor[0]) return false;
@@ -71,8 +71,8 @@ static bool fits(call *c, const dimension *d, int64_t length) {
 
 /* The dimension as a message shows it: its size, or the spec's text where that is not known. */
 static int show_dimension(const call *c, const dimension *d, char *text, size_t room) {
-  if (c->size[(int)d->letter[0]] != UNBOUND || d->letter[1]) return snprintf(text, room, "%lld", (long long)value_of(c, d));
-  return snprintf(text, room, "%.*s", d->text_length, d->text);
+  if (c->size[d->letter[0]] != UNBOUND || d->letter[1]) return snprintf(text, room, "%lld", (long long)value_of(c, d));
+  return snprintf(text, room, "%s", d->text);
 }
 
 /* ---- arrays ---- */
@@ -163,8 +163,7 @@ static bool take_number(call *c, const parameter *p, PyObject *object, argument 
   else a->integer = PyLong_AsLongLong(object);
   if ((a->number == -1 || a->integer == -1) && PyErr_Occurred()) return fail_number(c, p, object);
   if (p->kind == INTEGER && (a->integer < p->low || a->integer > p->high))
-    return fail(c, PyExc_ValueError, "%s must lie in %lld..%lld, not %lld", p->name, (long long)p->low, (long long)p->high,
-                (long long)a->integer);
+    return fail(c, PyExc_ValueError, "%s must lie in %lld..%lld, not %lld", p->name, p->low, p->high, (long long)a->integer);
   return true;
 }
 

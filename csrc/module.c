@@ -38,16 +38,15 @@ static bool names_match(const spec *s, const char *parameters) {
 
 /* declare(name, spec) adds the function of a kernel to the module. */
 static PyObject *declare(PyObject *module, PyObject *arguments) {
-  const char *name, *text;
-  if (!PyArg_ParseTuple(arguments, "ss", &name, &text)) return NULL;
+  const char *name;
+  PyObject *parameters;
+  if (!PyArg_ParseTuple(arguments, "sO", &name, &parameters)) return NULL;
   binding *b = find_binding(name);
   if (!b) return PyErr_Format(PyExc_ValueError, "declare: there is no kernel %s", name);
-  char *kept = malloc(strlen(text) + 1); /* for ever, like the kernel */
-  if (!kept) return PyErr_NoMemory();
-  const char *wrong = read_spec(strcpy(kept, text), value_checks, &b->spec);
-  if (wrong) return PyErr_Format(PyExc_ValueError, "declare: the spec of %s cannot be read at '%s'", name, wrong);
-  if (!names_match(&b->spec, b->parameters))
-    return PyErr_Format(PyExc_ValueError, "declare: %s takes %s, and not what its spec says", name, b->parameters);
+  if (!read_spec(parameters, value_checks, &b->spec) || !names_match(&b->spec, b->parameters)) {
+    PyErr_Clear();
+    return PyErr_Format(PyExc_ValueError, "declare: %s takes (%s), its spec says something else", name, b->parameters);
+  }
   PyMethodDef *method = &kernel_methods[b - bindings];
   *method = (PyMethodDef){b->name, (PyCFunction)(void (*)(void))call_kernel, METH_FASTCALL, b->parameters};
   PyObject *self = PyCapsule_New(b, NULL, NULL), *function = self ? PyCFunction_NewEx(method, self, NULL) : NULL;

@@ -55,7 +55,8 @@ class Kernel:
         self._layouts = [(i, dense_rows if "rows" in p.words else dense) for i, p in inputs]
         self._floats = [i for i, p in inputs if p.dtype.is_floating_point]
         if BACKEND == "c":
-            _C.declare(name, spec)
+            places = {p.name: i for i, p in enumerate(self.parameters)}
+            _C.declare(name, tuple(p.numbers(places) for p in self.parameters))
 
     def __call__(self, *arguments):
         """Call the C core. Inputs are copied if they do not lie in memory as the kernel needs them.

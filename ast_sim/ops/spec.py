@@ -9,18 +9,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 Sizes = dict[str, int]
 Given = dict[str, Any]
 
-_PARAMETER = re.compile(r"(\w+)(\?)?(?:\[([^]]*)\])?((?:\s+\w+(?:\([^)]*\))?)*)\s*(?:,|->|$)")
+_PARAMETER = re.compile(r"\s*(\w+)(\??)(?:\[([^]]*)\])?((?:\s+\w+(?:\([^)]*\))?)*)\s*(?:,|$)")
 _WORD = re.compile(r"(\w+)(?:\(([^)]*)\))?")
-_TERM = re.compile(r"(\d*)([A-Z]?)$")
+_TERM = re.compile(r"(\d*)([A-Z]?)")
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Dimension:
 
     @staticmethod
     def of(text: str) -> Dimension:
-        terms = [_TERM.match(term.strip()) for term in text.split("+")]
+        terms = [_TERM.fullmatch(term.strip()) for term in text.split("+")]
         parts = [(int(term[1] or 1), term[2]) for term in terms if term]
         constant = sum(n for n, letter in parts if not letter)
         return Dimension(text.strip(), constant, {letter: n for n, letter in parts if letter})
@@ -54,6 +55,11 @@ class Dimension:
     def show(self, sizes: Sizes) -> str:
         return str(self.size(sizes)) if len(self.factors) != 1 or [*self.factors][0] in sizes else self.text
 
+    def numbers(self) -> tuple:
+        """As csrc/spec.h takes it."""
+        terms = [(n, letter) for letter, n in self.factors.items()] + [(0, "\0")] * 2
+        return self.text, self.constant, *terms[0], *terms[1]
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -62,8 +68,8 @@ class Parameter:
     name: str
     optional: bool
     output: bool
-    shape: list[Dimension] | None
-    words: dict[str, str] = field(default_factory=dict)  # each with what stands in its parentheses
+    shape: tuple[Dimension, ...] | None
+    words: dict[str, str]  # each with what stands in its parentheses
 
     @property
     def dtype(self) -> torch.dtype:
@@ -71,20 +77,41 @@ class Parameter:
             return torch.int32
         return torch.int64 if "int64" in self.words or self.words.keys() & CHECKS.keys() else torch.float32
 
+    def numbers(self, places: dict[str, int]) -> tuple:
+        """As csrc/spec.h takes it, given the place of each parameter."""
+        kind = next((i for i, word in enumerate(("integer", "number", "bits"), 1) if word in self.words), 0)
+        low, high = map(int, self.words.get("integer", "0,0").split(","))
+        others = (places[self.words[word]] if word in self.words else -1 for word in ("with", "needs"))
+        flags = (self.optional, self.output, "rows" in self.words, "filled" in self.words)
+        checks = []
+        for word in (word for word in self.words if word in CHECKS):
+            bound, arrays = _inside(self.words[word])
+            checks.append((word, bound.numbers(), *([places[name] for name in arrays] + [-1, -1])[:2]))
+        shape = tuple(d.numbers() for d in self.shape or ())
+        return self.name, kind, _TYPES[self.dtype], *flags, low, high, *others, shape, tuple(checks)
+
+
+_WORDS = ("int64", "int32", "rows", "filled", "integer", "number", "bits", "with", "needs")
+_TYPES = {dtype: np.dtype(str(dtype)[6:]).num for dtype in (torch.float32, torch.int64, torch.int32)}
+
+
+def _inside(text: str) -> tuple[Dimension, list[str]]:
+    """The dimension, or the names of arrays, in the parentheses of a check."""
+    names = [name.strip() for name in text.split(",")] if text[:1].islower() else []
+    return Dimension.of("0" if names else text or "0"), names
+
 
 def parameters_of(spec: str) -> list[Parameter]:
     inputs, _, outputs = spec.partition("->")
-    return [
-        Parameter(
-            name, bool(optional), part is outputs, _shape(shape) if shape else None, dict(_WORD.findall(words or ""))
-        )
-        for part in (inputs, outputs)
-        for name, optional, shape, words in _PARAMETER.findall(part)
-    ]
-
-
-def _shape(text: str) -> list[Dimension]:
-    return [Dimension.of(d) for d in text.split(",")]
+    parameters = []
+    for part in (inputs, outputs):
+        for name, optional, shape, words in _PARAMETER.findall(part):
+            dimensions = tuple(map(Dimension.of, shape.split(","))) if shape else None
+            known = dict(_WORD.findall(words))
+            if not known.keys() <= {*_WORDS, *CHECKS}:
+                raise ValueError(f"{name} in a spec has words that nobody knows: {words}")
+            parameters.append(Parameter(name, bool(optional), part is outputs, dimensions, known))
+    return parameters
 
 
 def check(kernel: str, parameters: list[Parameter], given: Given) -> None:
@@ -102,10 +129,8 @@ def check(kernel: str, parameters: list[Parameter], given: Given) -> None:
     for p in known:
         for word, inside in p.words.items():
             if word in CHECKS and given[p.name] is not None:
-                if inside[:1].islower():
-                    others = [given[name.strip()] for name in inside.split(",")]
-                else:
-                    others = [Dimension.of(inside).size(sizes)] if inside else []
+                bound, arrays = _inside(inside)
+                others = [given[name] for name in arrays] or ([bound.size(sizes)] if inside else [])
                 CHECKS[word](kernel, p.name, given[p.name], *others)
 
 
@@ -132,7 +157,7 @@ def _is_present(kernel: str, p: Parameter, given: Given) -> bool:
 def _check_array(kernel: str, p: Parameter, x: Tensor, sizes: Sizes) -> None:
     if x.dtype != p.dtype and not (p.dtype.is_floating_point and x.dtype.is_floating_point):
         raise TypeError(f"{kernel}: {p.name} must be {str(p.dtype)[6:]}, not {x.dtype}")
-    shape, before = p.shape or [], dict(sizes)
+    shape, before = p.shape or (), dict(sizes)
     if x.dim() != len(shape) or not all(d.fits(n, sizes) for d, n in zip(shape, x.shape, strict=True)):
         wanted = ", ".join(d.show(before) for d in shape)
         raise ValueError(f"{kernel}: {p.name} must have shape [{wanted}], not {tuple(x.shape)}")
