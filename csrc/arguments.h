@@ -7,7 +7,7 @@
 #ifndef AST_ARGUMENTS_H
 #define AST_ARGUMENTS_H
 
-#include "spec.h"
+#include "frozen.h"
 
 #include <stdarg.h>
 
@@ -25,12 +25,15 @@ typedef struct argument {
   double number;
   int64_t bytes, row_bytes; /* of all elements, and from row to row */
   bool dense;
-  void *copy; /* debug: what an input held before the call */
+  frozen *frozen; /* whose hidden copy `data` is, held during the call, or NULL */
+  void *secured;  /* or a copy made for this call */
+  void *copy;     /* debug: what an input held before the call */
 } argument;
 
 typedef struct call {
   const char *name;
   const spec *spec;
+  int taken;             /* arguments */
   int64_t size[LETTERS]; /* by letter; UNBOUND before first sight */
   argument arguments[MAX_PARAMETERS];
 } call;
@@ -277,12 +280,40 @@ static const named_check value_checks[] = {
     {"scenes", check_scenes},   {"segments", check_segments}, {"corners", check_corners},         {NULL, NULL},
 };
 
+/* Puts integers where no other thread can change them (frozen.h): all checks and the kernel read them there. */
+static bool secure(argument *a) {
+  if (!a->bytes) return true;
+  if ((a->frozen = find_frozen(a->data, a->bytes))) {
+    Py_INCREF(a->frozen->owner);
+    a->data = a->frozen->hidden;
+    return true;
+  }
+  if (!(a->secured = malloc((size_t)a->bytes))) return PyErr_NoMemory(), false;
+  a->data = memcpy(a->secured, a->data, (size_t)a->bytes);
+  return true;
+}
+
+static void release(call *c) {
+  for (int i = 0; i < c->taken; i++) {
+    if (c->arguments[i].frozen) Py_DECREF(c->arguments[i].frozen->owner);
+    free(c->arguments[i].secured);
+  }
+}
+
 static bool check_values(const call *c, const parameter *p, const argument *a) {
   for (int i = 0; i < p->num_checks; i++) {
     const value_check *check = &p->checks[i];
     const argument *others[2];
-    for (int j = 0; j < 2; j++) others[j] = check->others[j] == NO_PARAMETER ? NULL : &c->arguments[check->others[j]];
-    if (!check->function(c, a, value_of(c, &check->bound), others)) return false;
+    fact found = {check->function, value_of(c, &check->bound), {0, 0}};
+    bool lasts = a->frozen;
+    for (int j = 0; j < 2; j++) {
+      others[j] = check->others[j] == NO_PARAMETER ? NULL : &c->arguments[check->others[j]];
+      if (others[j] && others[j]->frozen) found.others[j] = others[j]->frozen->number;
+      else if (others[j]) lasts = false;
+    }
+    if (lasts && is_known(a->frozen, &found)) continue;
+    if (!check->function(c, a, found.bound, others)) return false;
+    if (lasts) remember(a->frozen, &found);
   }
   return true;
 }
@@ -313,6 +344,7 @@ static bool take(call *c, PyObject *const *objects, Py_ssize_t num) {
   for (int i = 0; i < num; i++) {
     const parameter *p = &s->parameters[i];
     c->arguments[i] = (argument){.name = p->name};
+    c->taken = i + 1;
     if (p->output && (i == 0 || !s->parameters[i - 1].output)) bind_absent(c, true);
     if (p->kind != ARRAY) {
       if (!take_number(c, p, objects[i], &c->arguments[i])) return false;
@@ -320,6 +352,7 @@ static bool take(call *c, PyObject *const *objects, Py_ssize_t num) {
     }
     const bool given = objects[i] != Py_None;
     if (!check_presence(c, p, given) || (given && !take_array(c, p, objects[i], &c->arguments[i]))) return false;
+    if (given && !p->output && p->type != FLOATS && !secure(&c->arguments[i])) return false;
   }
   bind_absent(c, false);
   for (int i = 0; i < num; i++)

@@ -9,11 +9,39 @@ static PyObject *call_kernel(PyObject *self, PyObject *const *objects, Py_ssize_
   call c;
   c.name = b->name;
   c.spec = &b->spec;
-  if (!take(&c, objects, num) || (b->check && !b->check(&c))) return NULL;
-  if (b->result) return b->result(&c);
+  c.taken = 0;
+  PyObject *result = NULL;
   ast_status status;
-  if (!run(&c, b->run, NULL, &status)) return NULL;
-  Py_RETURN_NONE;
+  if (take(&c, objects, num) && (!b->check || b->check(&c))) {
+    if (b->result) result = b->result(&c);
+    else if (run(&c, b->run, NULL, &status)) Py_INCREF(result = Py_None);
+  }
+  release(&c);
+  return result;
+}
+
+/* A new array with the values of this one, which kernels trust from now on (frozen.h). Or the same object if there is nothing to do: it is
+ * such a one already, has no values, or is nothing that a kernel reads as indices in place. */
+static PyObject *freeze_one(PyObject *object) {
+  view v;
+  if (!view_of(object, &v) || v.type != INTS || v.ndim < 1 || v.ndim > MAX_SHAPE || !is_dense(&v)) return Py_INCREF(object), object;
+  const int64_t bytes = view_size(&v) * v.item;
+  if (!bytes || find_frozen(v.data, bytes)) return Py_INCREF(object), object;
+  frozen *f = new_frozen(bytes);
+  if (!f) return NULL;
+  memcpy(f->hidden, v.data, (size_t)bytes);
+  show(f);
+  return array_of(f, v.ndim, v.shape);
+}
+
+static PyObject *freeze(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  PyObject *tuple = PyTuple_New(num);
+  for (Py_ssize_t i = 0; tuple && i < num; i++) {
+    PyObject *array = freeze_one(objects[i]);
+    if (!array || PyTuple_SetItem(tuple, i, array)) Py_CLEAR(tuple);
+  }
+  return tuple;
 }
 
 static PyMethodDef kernel_methods[sizeof bindings / sizeof *bindings];
@@ -88,6 +116,7 @@ static PyObject *configuration(PyObject *self, PyObject *unused) {
 
 static PyMethodDef methods[] = {
     {"declare", declare, METH_VARARGS, "declare(name, spec): adds the kernel of this name, which takes what the spec says."},
+    {"freeze", (PyCFunction)(void (*)(void))freeze, METH_FASTCALL, "freeze(*indices): copies that kernels trust, or those that are such."},
     {"set_pool", set_pool, METH_VARARGS, "set_pool(parallel_for, num_threads): addresses of torch's thread pool, 0 for serial."},
     {"keep_memory", keep_memory, METH_NOARGS, "Let the C library keep freed blocks; whether it had an effect."},
     {"configuration", configuration, METH_NOARGS, "The chosen instruction set, the supported ones, the threads, the debug mode."},

@@ -98,16 +98,6 @@ KERNEL(octree_coarsen, keys, cell_offsets, levels) {
   return kernels->octree_coarsen(a->keys.data, a->cell_offsets.data, n['B'], (int)a->levels.integer, result);
 }
 
-/* A new array, filled with -1 in debug mode: for outputs whose sizes follow from the values of the inputs. */
-static PyObject *new_ints(int64_t length, int64_t **data) {
-  npy_intp shape[1] = {(npy_intp)length};
-  PyObject *array = PyArray_SimpleNew(1, shape, INTS);
-  if (!array) return NULL;
-  *data = PyArray_DATA((PyArrayObject *)array);
-  if (debug) memset(*data, 0xff, (size_t)length * sizeof(int64_t));
-  return array;
-}
-
 /* Of a level: keys, cell_offsets, first_child, node_cell, pair_offsets, fine, coarse, fine_by_fine, coarse_by_fine. Their sizes are known
  * only half-way, so they are made here. */
 enum { LEVEL_ARRAYS = 9 };
@@ -116,15 +106,19 @@ enum { LEVEL_ARRAYS = 9 };
 static bool append_level(PyObject *list, const ast_octree_level *level, Py_ssize_t at) {
   const int64_t pairs = level->pair_offsets[27];
   const int64_t lengths[LEVEL_ARRAYS] = {level->C, level->B + 1, level->C + 1, level->C_fine, 28, pairs, pairs, pairs, pairs};
+  frozen *made[LEVEL_ARRAYS];
   int64_t *data[LEVEL_ARRAYS];
   for (int i = 0; i < LEVEL_ARRAYS; i++) {
-    PyObject *array = new_ints(lengths[i], &data[i]);
+    PyObject *array = (made[i] = new_frozen(lengths[i] * (int64_t)sizeof *data[i])) ? array_of(made[i], 1, &lengths[i]) : NULL;
     if (!array || PyList_SetItem(list, at + i, array)) return false;
+    data[i] = made[i]->hidden;
+    if (debug) memset(data[i], 0xff, (size_t)made[i]->bytes);
   }
   memcpy(data[4], level->pair_offsets, sizeof level->pair_offsets);
   ast_status status;
   Py_BEGIN_ALLOW_THREADS;
   status = kernels->octree_write_level(level, data[0], data[1], data[2], data[3], data[5], data[6], data[7], data[8]);
+  for (int i = 0; i < LEVEL_ARRAYS; i++) show(made[i]);
   Py_END_ALLOW_THREADS;
   return status == AST_OK || (PyErr_NoMemory(), false);
 }

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ast_sim.ops import library
 from ast_sim.ops._edges import join_indices, join_offsets, offsets_of
-from ast_sim.ops.library import check_index
+from ast_sim.ops.library import check_index, freeze
 
 FLAT = 2.0**-21  # a rest volume below this share of the magnitudes that it is the sum of may be rounding alone
 
@@ -36,6 +36,9 @@ class TetrahedronSet:
     elements: Tensor
     node_order: Tensor
     node_offsets: Tensor
+
+    def __post_init__(self) -> None:
+        freeze(self, "elements", "node_order", "node_offsets")
 
     @staticmethod
     def from_elements(elements: Tensor, num_nodes: int) -> TetrahedronSet:

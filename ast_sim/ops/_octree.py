@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ast_sim.ops import library
-from ast_sim.ops.library import segment_of
+from ast_sim.ops.library import freeze, segment_of
 
 MAX_DEPTH = 21
 
@@ -36,6 +36,9 @@ class Octree:
     node_order: Tensor
     node_offsets: Tensor
     depth: int
+
+    def __post_init__(self) -> None:
+        freeze(self, "keys", "cell_offsets", "node_cell", "node_order", "node_offsets")
 
     def coordinates(self) -> Tensor:
         """[C, 3] int32: x, y and z of each cell, 0..2^depth - 1."""
@@ -93,6 +96,9 @@ class CellMap:
     coarse_index: Tensor
     fine_by_fine: Tensor
     coarse_by_fine: Tensor
+
+    def __post_init__(self) -> None:
+        freeze(self, "pair_offsets", "fine", "coarse_index", "fine_by_fine", "coarse_by_fine")
 
 
 # ---- cells ----

@@ -222,6 +222,22 @@ def check_shape(op: str, name: str, x: torch.Tensor | None, *shape: int) -> None
         raise ValueError(f"{op}: {name} must have shape [{wanted}], not {tuple(x.shape)}")
 
 
+def frozen(*indices: Tensor) -> tuple[Tensor, ...]:
+    """Copies of int64 tensors that the C core trusts: it keeps the values in memory of its own and checks them once.
+
+    So nobody should write to the copies: kernels would not see it. Other tensors are copied and checked in every call.
+    """
+    if BACKEND == "torch" or torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack() > 0:
+        return indices
+    return tuple([x if y is x else torch.from_numpy(y) for x, y in zip(indices, _C.freeze(*indices), strict=True)])
+
+
+def freeze(record: object, *names: str) -> None:
+    """Make these attributes of a frozen dataclass `frozen`, when it is built."""
+    values = record.__dict__
+    values.update(zip(names, frozen(*[values[name] for name in names]), strict=True))
+
+
 def configuration() -> dict:
     """The backend, the instruction sets, the threads and the versions in use, by name."""
     core = _C.configuration() if BACKEND == "c" else {}
