@@ -195,9 +195,34 @@ typedef struct {
   ast_status (*mlp_backward)(const ast_mlp *s, const float *restrict dout, ast_mlp_kept kept, ast_mlp_gradients gradients);
 } ast_kernels;
 
+/* Every kernel of the table. */
+#define AST_KERNELS(KERNEL)       \
+  KERNEL(segment_sum)             \
+  KERNEL(segment_spread)          \
+  KERNEL(octree_build)            \
+  KERNEL(octree_coordinates)      \
+  KERNEL(octree_coarsen)          \
+  KERNEL(octree_write_level)      \
+  KERNEL(farthest_point_sample)   \
+  KERNEL(sparse_conv)             \
+  KERNEL(sparse_conv_weight)      \
+  KERNEL(attention)               \
+  KERNEL(attention_backward)      \
+  KERNEL(message)                 \
+  KERNEL(message_backward)        \
+  KERNEL(linear)                  \
+  KERNEL(linear_backward)         \
+  KERNEL(elastic_forces)          \
+  KERNEL(elastic_forces_backward) \
+  KERNEL(column_sum)              \
+  KERNEL(mlp)                     \
+  KERNEL(mlp_backward)
+
 /* dispatch.c: the table of an instruction set by name ("base", "avx2", "avx512"), or of the best one if name is NULL.
  * NULL if it was not compiled in or the processor and system do not support it. */
 const ast_kernels *ast_select(const char *name);
+/* The table of the i-th of the instruction sets that are supported, the best one first; NULL beyond the last. */
+const ast_kernels *ast_supported(int i);
 
 /* parallel.c: runs task(i, context) for 0 <= i < tasks, on the threads of the pool if one was set, and returns the first
  * status by index that is not AST_OK. Tasks are handed out dynamically: a task must depend on its index alone. */

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from ast_sim.ops import library
-from ast_sim.ops.library import check_offsets, check_shape, dense, dense_rows
 
 # ---- dropout: the generator of the C core in torch ----
 
@@ -63,17 +62,23 @@ def dropout_factors(p: float, seed: int, scene: int, shape: tuple[int, int, int]
 # ---- composition ----
 
 
-def _check(op: str, q: Tensor, k: Tensor, v: Tensor, q_offsets: Tensor, k_offsets: Tensor, dropout_p: float) -> None:
-    check_shape(op, "q", q, -1, -1, -1)
-    check_shape(op, "k", k, -1, *q.shape[1:])
-    check_shape(op, "v", v, *k.shape)
+_SPEC = (
+    "q[Q,H,D] rows, k[K,H,D] rows, v[K,H,D] rows, q_offsets[B+1] offsets(Q), k_offsets[B+1] offsets(K), scale number,"
+    " dropout_p number, seed bits"
+)
+_kernel = library.Kernel("attention", f"{_SPEC} -> out[Q,H,D], maximum[Q,H], sum[Q,H]")
+_backward_kernel = library.Kernel(
+    "attention_backward",
+    f"{_SPEC}, out[Q,H,D], maximum[Q,H], sum[Q,H], dout[Q,H,D] -> dq[Q,H,D] rows, dk[K,H,D] rows, dv[K,H,D] rows",
+)
+
+
+def _check(kernel: library.Kernel, q, k, v, q_offsets, k_offsets, dropout_p: float) -> None:
+    kernel.check(q, k, v, q_offsets, k_offsets)
     if q.shape[2] % 16 or not 16 <= q.shape[2] <= 128:
-        raise ValueError(f"{op}: the head dimension must be a multiple of 16 up to 128, not {q.shape[2]}")
+        raise ValueError(f"{kernel.name}: the head dimension must be a multiple of 16 up to 128, not {q.shape[2]}")
     if not 0 <= dropout_p < 1:
-        raise ValueError(f"{op}: dropout_p must lie in [0, 1)")
-    check_shape(op, "k_offsets", k_offsets, len(q_offsets))
-    check_offsets(op, "q_offsets", q_offsets, len(q))
-    check_offsets(op, "k_offsets", k_offsets, len(k))
+        raise ValueError(f"{kernel.name}: dropout_p must lie in [0, 1)")
 
 
 def _scenes(q_offsets: Tensor, k_offsets: Tensor) -> Iterator[tuple[int, slice, slice]]:
@@ -102,7 +107,7 @@ def _factors(scores: Tensor, dropout_p: float, seed: int, scene: int) -> Tensor 
 
 
 def _reference(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed):
-    _check("attention", q, k, v, q_offsets, k_offsets, dropout_p)
+    _check(_kernel, q, k, v, q_offsets, k_offsets, dropout_p)
     out, maximum, total = [], [], []
     for b, i, j in _scenes(q_offsets, k_offsets):
         x = _scores(q[i], k[j], scale)
@@ -117,7 +122,7 @@ def _reference(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed):
 
 
 def _backward_reference(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, out, maximum, total, dout):
-    _check("attention_backward", q, k, v, q_offsets, k_offsets, dropout_p)
+    _check(_backward_kernel, q, k, v, q_offsets, k_offsets, dropout_p)
     dq, dk, dv = [], [], []
     for b, i, j in _scenes(q_offsets, k_offsets):
         x = _scores(q[i], k[j], scale)
@@ -136,20 +141,8 @@ def _backward_reference(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, o
 # ---- C core ----
 
 
-def _fake(q, *_):
+def _new(q, *_):
     return q.new_empty(q.shape), q.new_empty(q.shape[:2]), q.new_empty(q.shape[:2])
-
-
-def _kernel(q, k, v, q_offsets, k_offsets, *settings):
-    outputs = _fake(q)
-    library._C.attention(*map(dense_rows, (q, k, v)), dense(q_offsets), dense(k_offsets), *settings, *outputs)
-    return outputs
-
-
-def _backward_kernel(gradients, q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, *saved):
-    """Write the gradients of q, k and v into `gradients`, whose rows may lie apart."""
-    offsets, settings = (dense(q_offsets), dense(k_offsets)), (scale, dropout_p, seed)
-    library._C.attention_backward(*map(dense_rows, (q, k, v)), *offsets, *settings, *map(dense, saved), *gradients)
 
 
 # ---- ops ----
@@ -170,24 +163,26 @@ def _define(name: str, schema: str, split: Callable, together: Callable):
     def after_split(body: Callable) -> Callable:
         return lambda *arguments: body(*split(*arguments[:num]), *arguments[num:])
 
-    def backward_kernel(*arguments):
-        gradients = [x.new_empty(x.shape) for x in arguments[:num]]
-        _backward_kernel(split(*gradients), *split(*arguments[:num]), *arguments[num:])
-        return tuple(gradients) if num > 1 else gradients[0]
+    def call(outputs, *arguments) -> None:
+        _kernel(*split(*arguments[:num]), *arguments[num:], *outputs)
 
-    def backward_fake(*arguments):
+    def new_gradients(*arguments):
         gradients = tuple(x.new_empty(x.shape) for x in arguments[:num])
         return gradients if num > 1 else gradients[0]
 
+    def call_backward(gradients, *arguments) -> None:
+        gradients = gradients if num > 1 else (gradients,)
+        _backward_kernel(*split(*arguments[:num]), *arguments[num:], *split(*gradients))
+
     arguments = f"{schema}, Tensor q_offsets, Tensor k_offsets, float scale, float dropout_p, int seed"
     outputs = ", ".join(["Tensor"] * num)
-    bodies = map(after_split, (_reference, _fake, _kernel))
-    op = library.define(f"{name}({arguments}) -> (Tensor, Tensor, Tensor)", *bodies)
+    schema = f"{name}({arguments}) -> (Tensor, Tensor, Tensor)"
+    op = library.define(schema, after_split(_reference), after_split(_new), call)
     backward = library.define(
         f"{name}_backward({arguments}, Tensor out, Tensor maximum, Tensor total, Tensor dout) -> ({outputs})",
         lambda *arguments: together(*after_split(_backward_reference)(*arguments)),
-        backward_fake,
-        backward_kernel,
+        new_gradients,
+        call_backward,
     )
 
     def save(ctx, inputs, output) -> None:
@@ -207,12 +202,14 @@ def _define(name: str, schema: str, split: Callable, together: Callable):
 
 
 def _split_key_value(q: Tensor, key_value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    check_shape("attention_kv", "key_value", key_value, -1, 2, -1, -1)
+    if key_value.dim() != 4 or key_value.shape[1] != 2:
+        raise ValueError(f"attention_kv: key_value must have shape [K, 2, H, D], not {tuple(key_value.shape)}")
     return q, *key_value.unbind(1)
 
 
 def _split_qkv(qkv: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    check_shape("attention_qkv", "qkv", qkv, -1, 3, -1, -1)
+    if qkv.dim() != 4 or qkv.shape[1] != 3:
+        raise ValueError(f"attention_qkv: qkv must have shape [T, 3, H, D], not {tuple(qkv.shape)}")
     return qkv.unbind(1)
 
 

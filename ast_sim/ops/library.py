@@ -19,7 +19,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 from torch.autograd import forward_ad
+
+from ast_sim.ops import spec as specs
+from ast_sim.ops.spec import check_index, segment_of
+
+__all__ = ["check_index", "segment_of"]
 
 BACKEND = os.environ.get("AST_SIM_BACKEND", "c")
 if BACKEND not in ("c", "torch"):
@@ -43,6 +49,46 @@ if BACKEND == "c":
     from ast_sim import _C
 
     _share_torch_threads()
+
+
+class Kernel:
+    """A function of the C core and what it takes."""
+
+    def __init__(self, name: str, spec: str) -> None:
+        self.name, self.parameters = name, specs.parameters_of(spec)
+        inputs = [(i, p) for i, p in enumerate(self.parameters) if p.shape is not None and not p.output]
+        self._layouts = [(i, dense_rows if "rows" in p.words else dense) for i, p in inputs]
+        self._floats = [i for i, p in inputs if p.dtype.is_floating_point]
+        if BACKEND == "c":
+            places = {p.name: i for i, p in enumerate(self.parameters)}
+            _C.declare(name, tuple(p.numbers(places) for p in self.parameters))
+
+    def __call__(self, *arguments):
+        """Call the C core. Inputs are copied if they do not lie in memory as the kernel needs them.
+
+        Nearly all of them do. The core notices where one does not, and says so before it does anything. What it cannot
+        see is whether a tensor is the negative of its memory.
+        """
+        function, failure = getattr(_C, self.name), None
+        for i in self._floats:
+            if (x := arguments[i]) is not None and x.is_neg():
+                break
+        else:
+            try:
+                return function(*arguments)
+            except ValueError as error:
+                failure = error
+        copies = list(arguments)
+        for i, layout in self._layouts:
+            copies[i] = layout(arguments[i])
+        if failure and all(x is y for x, y in zip(arguments, copies, strict=True)):
+            raise failure
+        return function(*copies)
+
+    def check(self, *first: Tensor | float | None, **given: Tensor | float | None) -> None:
+        """Raise what the C core would raise for the first arguments and for those by name, for the composition."""
+        names = (p.name for p in self.parameters)
+        specs.check(self.name, self.parameters, dict(zip(names, first, strict=False)) | given)
 
 
 class Op:
@@ -127,25 +173,28 @@ def _is_watched() -> bool:
     )
 
 
-def define(schema: str, reference: Callable, fake: Callable, kernel: Callable | None = None) -> Op:
+def define(
+    schema: str, reference: Callable, outputs: Callable, call: Kernel | Callable, fake: Callable | None = None
+) -> Op:
     """Register the op `ast_sim::<schema>`.
 
     Args:
         schema: name and signature in torch's schema language. The op changes no input, and no output is a view of one.
         reference: the body as a composition of torch ops, for any device and dtype.
-        fake: makes outputs of the right shapes without values, for tracing.
-        kernel: the body over the C core. It gets CPU tensors; those of floating point are float32. None: the function
-            of the C core with the op's name, which takes the op's arguments and then the outputs of `fake` to fill.
+        outputs: makes the outputs without values, a tensor or a tuple, from the op's arguments.
+        call: fills them through the C core: call(outputs, *arguments). It gets CPU tensors; those of floating point are
+            float32. What it returns stands for the outputs, unless it is None. A kernel takes the op's arguments and
+            then the outputs.
+        fake: makes outputs of the right shapes for tracing, where `outputs` does not because they depend on values.
     """
     name = schema.split("(")[0]
 
-    def fill(*args):
-        outputs = fake(*args)
-        inputs = (dense(x) if isinstance(x, torch.Tensor) else x for x in args)
-        getattr(_C, name)(*inputs, *(outputs if isinstance(outputs, tuple) else (outputs,)))
-        return outputs
+    def kernel(*args):
+        out = outputs(*args)
+        result = call(*args, *(out if isinstance(out, tuple) else (out,))) if is_kernel else call(out, *args)
+        return out if result is None else result
 
-    kernel = kernel or fill
+    is_kernel = isinstance(call, Kernel)
 
     def on_cpu(*args):
         floats = [x for x in args if isinstance(x, torch.Tensor) and x.is_floating_point()]
@@ -159,7 +208,7 @@ def define(schema: str, reference: Callable, fake: Callable, kernel: Callable | 
     _library.define(schema)
     _library.impl(name, on_cpu, "CPU")
     _library.impl(name, reference, "CompositeExplicitAutograd")
-    torch.library.register_fake(f"ast_sim::{name}", fake, lib=_library)
+    torch.library.register_fake(f"ast_sim::{name}", fake or outputs, lib=_library)
     torch.library.register_autocast(f"ast_sim::{name}", "cpu", torch.float32, lib=_library)
     op = Op(name, getattr(torch.ops.ast_sim, name).default, kernel, reference)
     _library.impl(name, op.compose, "FuncTorchDynamicLayerFrontMode")  # comes first under each transform of torch.func
@@ -271,36 +320,20 @@ def check_shape(op: str, name: str, x: torch.Tensor | None, *shape: int) -> None
         raise ValueError(f"{op}: {name} must have shape [{wanted}], not {tuple(x.shape)}")
 
 
-def check_offsets(op: str, name: str, offsets: torch.Tensor, rows: int) -> None:
-    """Raise ValueError unless the offsets [B + 1] start with 0, never fall and end at the number of rows.
+def frozen(*indices: Tensor) -> tuple[Tensor, ...]:
+    """Copies of int64 tensors that the C core trusts: it keeps the values in memory of its own and checks them once.
 
-    Raise TypeError unless they are int64.
+    So nobody should write to the copies: kernels would not see it. Other tensors are copied and checked in every call.
     """
-    if offsets.dtype != torch.int64:
-        raise TypeError(f"{op}: {name} must be int64, not {offsets.dtype}")
-    check_shape(op, name, offsets, -1)
-    if len(offsets) < 1 or offsets[0] != 0:
-        raise ValueError(f"{op}: {name} must start with 0")
-    falls = (offsets.diff() < 0).nonzero()
-    if len(falls):
-        at = int(falls[0]) + 1
-        raise ValueError(f"{op}: {name} must never fall, but falls to {int(offsets[at])} at {at}")
-    if offsets[-1] != rows:
-        raise ValueError(f"{op}: {name} must end at the number of rows {rows}, not {int(offsets[-1])}")
+    if BACKEND == "torch" or torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack() > 0:
+        return indices
+    return tuple([x if y is x else torch.from_numpy(y) for x, y in zip(indices, _C.freeze(*indices), strict=True)])
 
 
-def check_index(op: str, name: str, index: torch.Tensor, bound: int) -> None:
-    """Raise ValueError unless all values of an index lie in [0, bound). The message names the first that does not."""
-    wrong = ((index < 0) | (index >= bound)).nonzero()
-    if len(wrong):
-        at = wrong[0].tolist()
-        place, value = ", ".join(map(str, at)), int(index[tuple(at)])
-        raise ValueError(f"{op}: {name}[{place}] = {value} is not an index below {bound}")
-
-
-def segment_of(offsets: torch.Tensor) -> torch.Tensor:
-    """[N] int64: the segment of each row, from the offsets [C + 1] of the segments."""
-    return torch.arange(len(offsets) - 1, device=offsets.device).repeat_interleave(offsets.diff())
+def freeze(record: object, *names: str) -> None:
+    """Make these attributes of a frozen dataclass `frozen`, when it is built."""
+    values = record.__dict__
+    values.update(zip(names, frozen(*[values[name] for name in names]), strict=True))
 
 
 def configuration() -> dict:
