@@ -1,4 +1,4 @@
-"""Indices that another thread overwrites while ops run: no kernel reads beyond its arrays, and what was checked stays."""
+"""Indices that another thread overwrites while ops run: no kernel reads beyond its arrays; what was checked stays."""
 
 import pytest
 import torch
