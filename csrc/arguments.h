@@ -1,8 +1,10 @@
-/* How the module takes its arguments apart: every array is checked for type, shape, layout and index range before a kernel sees it.
+/* How the module takes its arguments apart: every array is checked for type, shape, layout and index range before a
+ * kernel sees it.
  *
- * What a kernel takes stands in its spec (spec.h). Arrays are NumPy arrays or tensors (view.h) of exact dtype, aligned and row major;
- * outputs are allocated by the caller. A message names the kernel, the argument and the offending value. In debug mode outputs are
- * filled with NaN (integers: -1) before the kernel runs, and inputs are compared with copies afterwards. Included by module.c alone.
+ * What a kernel takes stands in its spec (spec.h). Arrays are NumPy arrays or tensors (view.h) of exact dtype, aligned
+ * and row major; outputs are allocated by the caller. A message names the kernel, the argument and the offending value.
+ * In debug mode outputs are filled with NaN (integers: -1) before the kernel runs, and inputs are compared with copies
+ * afterwards. Included by module.c alone.
  */
 #ifndef AST_ARGUMENTS_H
 #define AST_ARGUMENTS_H
@@ -61,7 +63,8 @@ static int64_t value_of(const call *c, const dimension *d) {
   return value;
 }
 
-/* Whether an axis may be as long as this. A letter that stands alone binds at first sight; in a sum an absent one is 0. */
+/* Whether an axis may be as long as this. A letter that stands alone binds at first sight; in a sum an absent one is 0.
+ */
 static bool fits(call *c, const dimension *d, int64_t length) {
   int64_t *size = &c->size[d->letter[0]];
   if (*size == UNBOUND && !d->letter[1]) {
@@ -255,8 +258,8 @@ static bool check_segments(const call *c, const argument *a, int64_t bound, cons
   return true;
 }
 
-/* The others are elements and the order of their corners. Each corner stands once, at its node, and the corners of a node rise: so the
- * elements hold indices of nodes. Where they do not, that is what the message says. */
+/* The others are elements and the order of their corners. Each corner stands once, at its node, and the corners of a
+ * node rise: so the elements hold indices of nodes. Where they do not, that is what the message says. */
 static bool check_corners(const call *c, const argument *a, int64_t bound, const argument *const others[2]) {
   (void)bound;
   const argument *const none[2] = {NULL, NULL};

@@ -1,11 +1,12 @@
 /* Index arrays that nobody can change, so that a check holds for ever.
  *
- * A kernel reads wherever an index points, and another thread may write to a tensor between the check and the kernel. So a kernel reads
- * integers only from memory that Python cannot reach. freeze() makes a block of two copies: the tensor that Python gets lies over the
- * one that is shown, kernels read the hidden one. torch's ops take tensors and nothing else: the address of the shown copy says which block
- * a tensor belongs to, through autograd and views alike. The block lives as long as its storage, so no other tensor has that address
- * meanwhile. Checks that the hidden copy passed are kept in the block. Integers that are not frozen are copied in every call
- * (arguments.h). All of it happens under the interpreter's lock. Included by arguments.h alone.
+ * A kernel reads wherever an index points, and another thread may write to a tensor between the check and the kernel.
+ * So a kernel reads integers only from memory that Python cannot reach. freeze() makes a block of two copies: the
+ * tensor that Python gets lies over the one that is shown, kernels read the hidden one. torch's ops take tensors and
+ * nothing else: the address of the shown copy says which block a tensor belongs to, through autograd and views alike.
+ * The block lives as long as its storage, so no other tensor has that address meanwhile. Checks that the hidden copy
+ * passed are kept in the block. Integers that are not frozen are copied in every call (arguments.h). All of it happens
+ * under the interpreter's lock. Included by arguments.h alone.
  */
 #ifndef AST_FROZEN_H
 #define AST_FROZEN_H

@@ -1,5 +1,5 @@
-/* All kernels of one instruction set as one translation unit: isa_*.c names the set and includes this file. Everything is
- * static, so that code for a newer processor can never be picked by the linker for an older one. */
+/* All kernels of one instruction set as one translation unit: isa_*.c names the set and includes this file. Everything
+ * is static, so that code for a newer processor can never be picked by the linker for an older one. */
 #include "ast.h"
 #include "simd.h"
 #include "gemm.h"

@@ -1,4 +1,5 @@
-/* The Python module ast_sim._C: every function checks its arguments (arguments.h), then calls a kernel with the GIL released. */
+/* The Python module ast_sim._C: every function checks its arguments (arguments.h), then calls a kernel with the GIL
+ * released. */
 #include "module_kernels.h"
 
 /* ---- kernels ---- */
@@ -20,8 +21,8 @@ static PyObject *call_kernel(PyObject *self, PyObject *const *objects, Py_ssize_
   return result;
 }
 
-/* A new array with the values of this one, which kernels trust from now on (frozen.h). Or the same object if there is nothing to do: it is
- * such a one already, has no values, or is nothing that a kernel reads as indices in place. */
+/* A new array with the values of this one, which kernels trust from now on (frozen.h). Or the same object if there is
+ * nothing to do: it is such a one already, has no values, or is nothing that a kernel reads as indices in place. */
 static PyObject *freeze_one(PyObject *object) {
   view v;
   if (!view_of(object, &v) || v.type != INTS || v.ndim < 1 || v.ndim > MAX_SHAPE || !is_dense(&v)) return Py_INCREF(object), object;

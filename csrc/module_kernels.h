@@ -1,7 +1,9 @@
-/* How each kernel is called with the arguments that its spec in ast_sim/ops has taken apart. Included by module.c alone.
+/* How each kernel is called with the arguments that its spec in ast_sim/ops has taken apart. Included by module.c
+ * alone.
  *
- * KERNEL(name, parameters...) { body } names the parameters in the order of the spec, which is compared with them at import. In the body
- * `a` are the arguments by name, `n` the sizes by letter of the spec, and `result` is what takes more than a status.
+ * KERNEL(name, parameters...) { body } names the parameters in the order of the spec, which is compared with them at
+ * import. In the body `a` are the arguments by name, `n` the sizes by letter of the spec, and `result` is what takes
+ * more than a status.
  */
 #ifndef AST_MODULE_KERNELS_H
 #define AST_MODULE_KERNELS_H
@@ -98,8 +100,8 @@ KERNEL(octree_coarsen, keys, cell_offsets, levels) {
   return kernels->octree_coarsen(a->keys.data, a->cell_offsets.data, n['B'], (int)a->levels.integer, result);
 }
 
-/* Of a level: keys, cell_offsets, first_child, node_cell, pair_offsets, fine, coarse, fine_by_fine, coarse_by_fine. Their sizes are known
- * only half-way, so they are made here. */
+/* Of a level: keys, cell_offsets, first_child, node_cell, pair_offsets, fine, coarse, fine_by_fine, coarse_by_fine.
+ * Their sizes are known only half-way, so they are made here. */
 enum { LEVEL_ARRAYS = 9 };
 
 /* Puts the arrays of a level into the list, from `at` on; false with an exception set if there is no memory. */
@@ -123,8 +125,8 @@ static bool append_level(PyObject *list, const ast_octree_level *level, Py_ssize
   return status == AST_OK || (PyErr_NoMemory(), false);
 }
 
-/* The list of all levels' arrays. It exists before the kernel runs, and arrays are no objects of the garbage collector: so no Python code
- * can use the thread's scratch memory while the levels lie there. */
+/* The list of all levels' arrays. It exists before the kernel runs, and arrays are no objects of the garbage collector:
+ * so no Python code can use the thread's scratch memory while the levels lie there. */
 static PyObject *octree_coarsen_result(call *c) {
   const octree_coarsen_arguments *a = (const void *)c->arguments;
   const int levels = (int)a->levels.integer;

@@ -311,9 +311,9 @@ static ast_status octree_build(const float *restrict positions, const int64_t *r
   ast_status status = ast_parallel(octree_chunks(N), octree_key_task, &key);
   if (status != AST_OK) {
     int64_t n = 0;
-    while ((status = octree_check_node(&key, n)) == AST_OK) n++;
+    while ((status = octree_check_node(&key, n)) == AST_OK && n + 1 < N) n++;
     *bad_node = n;
-    return status;
+    return status == AST_OK ? AST_OUTSIDE : status; /* another thread has moved the node since */
   }
   status = ast_parallel(B, octree_sort_task, &sort);
   if (status == AST_OK) status = octree_runs(sort.keys, packed ? index_bits : 0, offsets, B, keys, node_offsets, cell_offsets);

@@ -2,9 +2,9 @@
  *
  *   x[M,I] rows, weight[O,I] filled, bias?[O], source[P] index(M), depth integer(0,21) -> out[M,O]
  *
- * An array has a dimension for each axis: a number, a letter, or a sum such as 4E, C+1, I+J. A letter binds at first sight; the same
- * letter is the same size ever after. `?` allows None. Behind the arrow stand outputs. README.md lists the words. Included by arguments.h
- * alone.
+ * An array has a dimension for each axis: a number, a letter, or a sum such as 4E, C+1, I+J. A letter binds at first
+ * sight; the same letter is the same size ever after. `?` allows None. Behind the arrow stand outputs. README.md lists
+ * the words. Included by arguments.h alone.
  */
 #ifndef AST_SPEC_H
 #define AST_SPEC_H
@@ -26,7 +26,8 @@ typedef struct {
 struct call;
 struct argument;
 
-/* Looks at the values of an index array: `bound` is the dimension that the spec names, `others` are the arrays that it names. */
+/* Looks at the values of an index array: `bound` is the dimension that the spec names, `others` are the arrays that it
+ * names. */
 typedef bool (*check_function)(const struct call *c, const struct argument *a, int64_t bound, const struct argument *const others[2]);
 
 typedef struct {

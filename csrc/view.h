@@ -1,8 +1,10 @@
-/* What the module reads of an array that Python holds: a NumPy array, or a tensor of a library that offers DLPack's exchange in C.
+/* What the module reads of an array that Python holds: a NumPy array, or a tensor of a library that offers DLPack's
+ * exchange in C.
  *
- * A torch tensor is looked at where it lies, by one C call and without a Python object beside it; torch has offered this since 2.10
- * (`__dlpack_c_exchange_api__`, DLPack 1.3). Nothing is owned: a view is good while the caller holds the object. Included by
- * arguments.h alone.
+ * A torch tensor is looked at where it lies, by one C call and without a Python object beside it; torch has offered
+ * this since 2.10
+ * (`__dlpack_c_exchange_api__`, DLPack 1.3). Nothing is owned: a view is good while the caller holds the object.
+ * Included by arguments.h alone.
  */
 #ifndef AST_VIEW_H
 #define AST_VIEW_H
