@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ast_sim.ops import library
+from ast_sim.ops.derivatives import differentiate, differentiate_by_composition
 
 # ---- dropout: the generator of the C core in torch ----
 
@@ -196,8 +197,8 @@ def _define(name: str, schema: str, split: Callable, together: Callable):
         gradients = backward(*arguments, *ctx.settings, out, maximum, total, dout)
         return *(gradients if num > 1 else (gradients,)), *[None] * 5
 
-    library.differentiate(op, save, gradient)
-    library.differentiate_by_composition(backward, (num + 5, num + 6, num + 7))
+    differentiate(op, save, gradient)
+    differentiate_by_composition(backward, (num + 5, num + 6, num + 7))
     return op, backward
 
 

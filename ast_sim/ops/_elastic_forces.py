@@ -18,6 +18,7 @@ from torch import Tensor
 
 from ast_sim.ops import library
 from ast_sim.ops._edges import join_indices, join_offsets, offsets_of
+from ast_sim.ops.derivatives import differentiate, differentiate_by_composition
 from ast_sim.ops.library import check_index, freeze
 
 FLAT = 2.0**-21  # a rest volume below this share of the magnitudes that it is the sum of may be rounding alone
@@ -174,12 +175,12 @@ _forces_backward = library.define(
     f"elastic_forces_backward(Tensor dforce, {_INPUTS}", _backward_reference, _new_backward, _call_backward
 )
 
-library.differentiate(
+differentiate(
     _forces,
     lambda ctx, inputs, output: ctx.save_for_backward(*inputs),
     lambda ctx, grad: (_forces_backward(grad, *ctx.saved_tensors), *[None] * 5),
 )
-library.differentiate_by_composition(_forces_backward)
+differentiate_by_composition(_forces_backward)
 
 
 def elastic_forces(position: Tensor, rest_position: Tensor, lame: Tensor, tets: TetrahedronSet) -> Tensor:

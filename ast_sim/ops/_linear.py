@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ast_sim.ops import library
+from ast_sim.ops.derivatives import differentiate, differentiate_by_composition
 
 ACTIVATIONS = ("none", "relu", "geglu")
 GEGLU = ACTIVATIONS.index("geglu")
@@ -133,8 +134,8 @@ def _linear_gradient(ctx, dout, _):
     return *_given(wanted, gradients), dout if ctx.needs_input_grad[3] else None, None, None
 
 
-library.differentiate(_linear, _save_linear, _linear_gradient)
-library.differentiate_by_composition(_linear_backward, (4,))
+differentiate(_linear, _save_linear, _linear_gradient)
+differentiate_by_composition(_linear_backward, (4,))
 
 
 def linear(

@@ -18,6 +18,7 @@ from torch import Tensor
 from ast_sim.ops import library
 from ast_sim.ops._edges import EdgeSet
 from ast_sim.ops._mlp import layer_norm, layer_norm_backward, normalize
+from ast_sim.ops.derivatives import differentiate, differentiate_by_composition
 
 Encoder = tuple[Tensor, Tensor, Tensor]
 
@@ -154,8 +155,8 @@ def _gradient(ctx, dsum, dmessages):
     return *gradients, *[None] * 4
 
 
-library.differentiate(_message, _save, _gradient)
-library.differentiate_by_composition(_message_backward)
+differentiate(_message, _save, _gradient)
+differentiate_by_composition(_message_backward)
 
 
 def _check_features(edges: EdgeSet, of_senders: Tensor, edge_features: Tensor | None, encoder: Encoder | None) -> None:

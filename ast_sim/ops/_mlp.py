@@ -12,6 +12,7 @@ from torch.autograd import forward_ad
 
 from ast_sim.ops import library
 from ast_sim.ops._linear import _given, _outputs
+from ast_sim.ops.derivatives import differentiate, differentiate_by_composition
 
 EPSILON = 1e-5
 SAVED = 1 << 25  # hidden units and outputs with more elements are not kept for the gradient, but computed again
@@ -149,8 +150,8 @@ def _gradient(ctx, dout, *_):
     return *_given(wanted, gradients), dout if ctx.needs_input_grad[8] else None, None
 
 
-library.differentiate(_mlp, _save, _gradient)
-library.differentiate_by_composition(_mlp_backward, (9, 10, 11))
+differentiate(_mlp, _save, _gradient)
+differentiate_by_composition(_mlp_backward, (9, 10, 11))
 
 
 def mlp(

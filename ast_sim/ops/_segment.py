@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ast_sim.ops import library
+from ast_sim.ops.derivatives import differentiate
 from ast_sim.ops.library import segment_of
 
 
@@ -72,9 +73,9 @@ def _gradient_by(adjoint: library.Op):
     return lambda ctx, grad: (adjoint(grad, *ctx.saved_tensors, ctx.mean), None, None, None)
 
 
-library.differentiate(_sum, _save_segments, _gradient_by(_spread))
-library.differentiate(_spread, _save_segments, _gradient_by(_sum))
-library.differentiate(
+differentiate(_sum, _save_segments, _gradient_by(_spread))
+differentiate(_spread, _save_segments, _gradient_by(_sum))
+differentiate(
     _column_sum,
     lambda ctx, inputs, output: setattr(ctx, "rows", inputs[0].shape[0]),
     lambda ctx, grad: (grad.expand(ctx.rows, -1),),

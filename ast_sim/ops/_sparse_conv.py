@@ -11,6 +11,7 @@ from torch import Tensor
 from ast_sim.ops import library
 from ast_sim.ops._octree import CellMap
 from ast_sim.ops._segment import column_sum
+from ast_sim.ops.derivatives import differentiate, differentiate_by_composition
 
 OFFSETS = 27
 
@@ -104,8 +105,8 @@ def _gradient(ctx, dout):
     return dx, dweight, dbias, *[None] * 7
 
 
-library.differentiate(_conv, _save, _gradient)
-library.differentiate_by_composition(_conv_weight)
+differentiate(_conv, _save, _gradient)
+differentiate_by_composition(_conv_weight)
 
 
 def sparse_conv(x: Tensor, weight: Tensor, map: CellMap, bias: Tensor | None = None) -> Tensor:
