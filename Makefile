@@ -31,12 +31,17 @@ test: $(VENV)/tested
 bench: $(VENV)/benched
 	$(BIN)/python -m benchmarks.kernels --json benchmarks/results/kernels.json
 
+# `make check` compiles all of the core but its Python module, which needs the headers of Python and numpy.
+INCLUDE := import numpy, sysconfig; print('-isystem', numpy.get_include(), '-isystem', sysconfig.get_path('include'))
 lint: $(VENV)/tested
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/basedpyright --pythonpath $(BIN)/python
 	$(BIN)/clang-format --dry-run --Werror csrc/*.c csrc/*.h csrc/tests/*.c csrc/tests/*.h
+	@set -e; include=$$($(BIN)/python -c "$(INCLUDE)"); for compiler in gcc-11 clang; do \
+	  echo "$$compiler: csrc/module.c"; $$compiler -std=gnu11 -fsyntax-only $(WARNINGS) $$include csrc/module.c; \
+	done
 
 # The pages of the reference, from docstrings and the help of the commands.
 docs: $(VENV)/installed

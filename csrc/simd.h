@@ -6,6 +6,10 @@
 #include <stdint.h>
 #include <string.h>
 
+#if __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
+#error "the kernels need a little-endian machine" /* coarsen.c takes eight bytes for a word */
+#endif
+
 #ifndef AST_VECTOR_BYTES
 #if defined(__AVX512F__)
 #define AST_VECTOR_BYTES 64
@@ -59,8 +63,8 @@ AST_INLINE void vstore_upto(float *p, vf x, int64_t n) {
 
 /* a where the mask is set (-1), b where it is not (0) */
 AST_INLINE vf vselect(vi mask, vf a, vf b) { return (vf)((mask & (vi)a) | (~mask & (vi)b)); }
-/* b where either is NaN. Compilers turn it into the instruction of that meaning: clang from a selection, GCC only from a loop over the
- * elements that stays one. */
+/* b where either is NaN. Compilers turn it into the instruction of that meaning: clang from a selection, GCC only
+ * from a loop over the elements that stays one. */
 AST_INLINE vf vmax(vf a, vf b) {
 #ifdef __clang__
   return vselect(a > b, a, b);
