@@ -5,8 +5,9 @@
  * the number of rows. Inputs are never changed and outputs are written in full. The caller has checked shapes, offsets and
  * index ranges (module.c does it for Python); a kernel checks only what it alone can see, such as a point outside the cube.
  *
- * Legend: B scenes, N nodes, C cells, T tokens, F channels, C_in and C_out channels of a convolution, H heads, D channels of a head,
- * M rows of a linear layer, I and O its inputs and outputs, H hidden units; E elements.
+ * Legend: B scenes, N nodes, C cells, T tokens, F channels, C_in and C_out channels of a convolution, D channels of a head of
+ * attention, M rows of a dense layer (or edges, of S senders and R receivers), I and O its inputs and outputs. H is the size of
+ * what lies between: the hidden units of two layers, the heads of attention. E elements, or channels of an edge.
  */
 #ifndef AST_H
 #define AST_H
@@ -30,7 +31,7 @@ typedef struct {
   float scale;
   double dropout_p;                        /* weights are dropped with this probability, 0 <= p < 1 */
   uint64_t seed;                           /* of the counter-based generator: key (seed), counter (scene, head, query, key) */
-  int64_t dq_stride, dk_stride, dv_stride; /* floats from one row of the gradients to the next; 0: H*D */
+  int64_t dq_stride, dk_stride, dv_stride; /* the same of the gradients */
 } ast_attention;
 
 /* The pairs of a sparse convolution, grouped by kernel offset: group k is [offsets[k], offsets[k+1]) for k < 27.
@@ -46,8 +47,8 @@ typedef struct {
   int64_t M, S, R;
   int64_t E, H, F, F2; /* channels: edge features, encoder's hidden layer (0 without an encoder), first layer, messages */
   const int64_t *senders, *receivers, *receiver_offsets; /* [M], [M] ascending, [R+1] */
-  const float *of_senders, *of_receivers;                /* [S,F], [R,F]: their shares of the first layer */
-  const float *edge_features;                            /* [M,E]: raw, or without an encoder their share of the first layer */
+  const float *of_senders, *of_receivers;                /* [S,F], [R,F]: their products with the first layer */
+  const float *edge_features;                            /* [M,E]: raw, or without an encoder such products, too */
   const float *A1, *a1, *A2;                             /* [H,E], [H], [F,H] */
   const float *W2, *b2, *gamma, *beta;                   /* [F2,F], [F2], [F2], [F2] */
 } ast_message;
@@ -92,8 +93,8 @@ typedef struct {
   const float *lame;                                   /* [E,2]: lambda and mu */
 } ast_elastic;
 
-/* A level of an octree and how it follows from the next finer one. It lies in scratch memory of the calling thread, and is valid until the
- * next call of an octree kernel or of farthest_point_sample there. */
+/* A level of an octree and how it follows from the next finer one. It lies in scratch memory of the calling thread: the
+ * caller of octree_coarsen sets a mark before, and releases it when the levels are written out. */
 typedef struct {
   int64_t C, C_fine, B;     /* cells of this level and of the finer one, scenes */
   int64_t *keys, *offsets;  /* [C], [B+1] as in octree_build */
@@ -194,9 +195,34 @@ typedef struct {
   ast_status (*mlp_backward)(const ast_mlp *s, const float *restrict dout, ast_mlp_kept kept, ast_mlp_gradients gradients);
 } ast_kernels;
 
+/* Every kernel of the table. */
+#define AST_KERNELS(KERNEL)       \
+  KERNEL(segment_sum)             \
+  KERNEL(segment_spread)          \
+  KERNEL(octree_build)            \
+  KERNEL(octree_coordinates)      \
+  KERNEL(octree_coarsen)          \
+  KERNEL(octree_write_level)      \
+  KERNEL(farthest_point_sample)   \
+  KERNEL(sparse_conv)             \
+  KERNEL(sparse_conv_weight)      \
+  KERNEL(attention)               \
+  KERNEL(attention_backward)      \
+  KERNEL(message)                 \
+  KERNEL(message_backward)        \
+  KERNEL(linear)                  \
+  KERNEL(linear_backward)         \
+  KERNEL(elastic_forces)          \
+  KERNEL(elastic_forces_backward) \
+  KERNEL(column_sum)              \
+  KERNEL(mlp)                     \
+  KERNEL(mlp_backward)
+
 /* dispatch.c: the table of an instruction set by name ("base", "avx2", "avx512"), or of the best one if name is NULL.
  * NULL if it was not compiled in or the processor and system do not support it. */
 const ast_kernels *ast_select(const char *name);
+/* The table of the i-th of the instruction sets that are supported, the best one first; NULL beyond the last. */
+const ast_kernels *ast_supported(int i);
 
 /* parallel.c: runs task(i, context) for 0 <= i < tasks, on the threads of the pool if one was set, and returns the first
  * status by index that is not AST_OK. Tasks are handed out dynamically: a task must depend on its index alone. */
@@ -208,9 +234,16 @@ typedef int32_t (*ast_num_threads)(uint32_t *num);
 void ast_set_pool(ast_parallel_for parallel_for, ast_num_threads num_threads);
 int64_t ast_threads(void);
 
-/* memory.c: scratch of the calling thread, 64-byte aligned and kept between calls; one per slot. NULL if memory is out. */
-enum { AST_SLOTS = 8 };
-void *ast_scratch(int slot, int64_t bytes);
+/* memory.c: scratch memory of the calling thread, 64-byte aligned, kept between calls; NULL if memory is out. It is good until a
+ * mark from before it is released: marks nest. ast_parallel releases what a task took. */
+void *ast_scratch(int64_t bytes);
+void *ast_scratch_mark(void);
+void ast_scratch_release(void *mark);
+/* What a block of C takes from here on is released where the block is left. */
+#define AST_SCRATCH_SCOPE          AST_SCRATCH_SCOPE_AT(__LINE__)
+#define AST_SCRATCH_SCOPE_AT(line) AST_SCRATCH_SCOPE_OF(line)
+#define AST_SCRATCH_SCOPE_OF(line) __attribute__((cleanup(ast_scratch_leave), unused)) void *const scratch_mark_##line = ast_scratch_mark()
+static inline void ast_scratch_leave(void *const *mark) { ast_scratch_release(*mark); }
 /* Lets the C library keep large freed blocks (glibc): fresh pages cost more than the arithmetic. True if it had an effect. */
 bool ast_keep_memory(void);
 

@@ -174,7 +174,7 @@ static ast_status forward_task(int64_t index, void *context) {
     fill_rows(0, H, rows, 1, job->sum + q0 * H + h);
     return AST_OK;
   }
-  forward_scratch *t = ast_scratch(5, sizeof *t);
+  forward_scratch *t = ast_scratch(sizeof *t);
   if (!t) return AST_NO_MEMORY;
   const bool whole = job->cuts[task.b].parts == 1;
   const forward_state state = whole ? (forward_state){t->out, t->maximum, t->sum} : partial_of(job, &task, task.part);
@@ -230,7 +230,8 @@ static ast_status merge_task(int64_t index, void *context) {
 
 static ast_status attention(const ast_attention *s, const float *restrict q, const float *restrict k, const float *restrict v,
                             float *restrict out, float *restrict maximum, float *restrict sum) {
-  forward_cut *cuts = ast_scratch(6, (s->B + 1) * (int64_t)sizeof *cuts), next = {0};
+  AST_SCRATCH_SCOPE;
+  forward_cut *cuts = ast_scratch((s->B + 1) * (int64_t)sizeof *cuts), next = {0};
   if (!cuts) return AST_NO_MEMORY;
   for (int64_t b = 0; b < s->B; b++) {
     forward_cut *cut = cuts + b;
@@ -242,7 +243,7 @@ static ast_status attention(const ast_attention *s, const float *restrict q, con
     next.first_partial += s->H * cut->chunks * cut->parts * cut->partial_rows * (ROW + 2);
   }
   cuts[s->B] = next;
-  float *partials = ast_scratch(7, next.first_partial * (int64_t)sizeof *partials);
+  float *partials = ast_scratch(next.first_partial * (int64_t)sizeof *partials);
   if (!partials) return AST_NO_MEMORY;
   forward_job job = {s, q, k, v, out, maximum, sum, cuts, partials};
   const ast_status status = ast_parallel(next.first_task, forward_task, &job);

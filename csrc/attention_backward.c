@@ -214,7 +214,7 @@ static ast_status backward_task(int64_t index, void *context) {
   if (r.keys == 0) fill_rows(0, r.dq_stride, r.queries, D, r.dq);
   if (r.queries == 0) fill_rows(0, r.dk_stride, r.keys, D, r.dk), fill_rows(0, r.dv_stride, r.keys, D, r.dv);
   if (r.keys == 0 || r.queries == 0) return AST_OK;
-  backward_scratch *t = ast_scratch(5, sizeof *t);
+  backward_scratch *t = ast_scratch(sizeof *t);
   if (!t) return AST_NO_MEMORY;
   const dropout d = dropout_of(job->s, r.b, r.h);
   for (int64_t i = 0; i < r.queries; i += CHUNK) {
@@ -247,7 +247,8 @@ static ast_status add_partials_task(int64_t index, void *context) {
 static ast_status attention_backward(const ast_attention *s, const float *restrict q, const float *restrict k, const float *restrict v,
                                      const float *restrict out, const float *restrict maximum, const float *restrict sum,
                                      const float *restrict dout, float *restrict dq, float *restrict dk, float *restrict dv) {
-  backward_cut *cuts = ast_scratch(6, (s->B + 1) * (int64_t)sizeof *cuts), next = {0};
+  AST_SCRATCH_SCOPE;
+  backward_cut *cuts = ast_scratch((s->B + 1) * (int64_t)sizeof *cuts), next = {0};
   if (!cuts) return AST_NO_MEMORY;
   for (int64_t b = 0; b < s->B; b++) {
     cuts[b] = cut_backward(s, b);
@@ -255,13 +256,9 @@ static ast_status attention_backward(const ast_attention *s, const float *restri
     next.first_task += s->H * cuts[b].parts;
     next.first_partial += s->H * (cuts[b].parts - 1) * partial_size(s, b);
   }
-  float *partials = ast_scratch(7, next.first_partial * (int64_t)sizeof *partials);
+  float *partials = ast_scratch(next.first_partial * (int64_t)sizeof *partials);
   if (!partials) return AST_NO_MEMORY;
-  ast_attention sizes = *s;
-  if (!sizes.dq_stride) sizes.dq_stride = s->H * s->D;
-  if (!sizes.dk_stride) sizes.dk_stride = s->H * s->D;
-  if (!sizes.dv_stride) sizes.dv_stride = s->H * s->D;
-  backward_job job = {&sizes, q, k, v, out, maximum, sum, dout, dq, dk, dv, cuts, partials};
+  backward_job job = {s, q, k, v, out, maximum, sum, dout, dq, dk, dv, cuts, partials};
   const ast_status status = ast_parallel(next.first_task, backward_task, &job);
   return status == AST_OK && next.first_partial ? ast_parallel(s->B * s->H, add_partials_task, &job) : status;
 }

@@ -13,14 +13,9 @@
  * passed over: the lone child of a cell without neighbours has none.
  *
  * Cost: a few ns for each cell of each level up to the root. Work is cut into chunks as in octree.c, which holds what the two share.
- * Scratch of the calling thread: slot 1 holds the levels, slot 2 the counts of the chunks of cells, slot 4 those of the chunks of pairs.
  */
 #include "ast.h"
 #include "simd.h"
-
-#ifndef OCTREE_MAX_CELLS
-#define OCTREE_MAX_CELLS INT32_MAX /* neighbours are held as int32 */
-#endif
 
 enum { OCTREE_LEVELS = 22, OCTREE_GROUPS = 27 }; /* the given level and at most 21 above it: a key has 63 bits */
 
@@ -43,46 +38,46 @@ typedef struct {
 } octree_cells_job;
 
 /* The levels above the given one at which cell i starts a cell; b is its scene. */
-AST_INLINE int octree_starts(const octree_cells_job *s, int64_t i, int64_t b) {
-  if (i == s->offsets[b]) return s->root;
-  return (63 - __builtin_clzll((uint64_t)(s->keys[i] ^ s->keys[i - 1]))) / 3;
+AST_INLINE int octree_starts(const octree_cells_job *job, int64_t i, int64_t b) {
+  if (i == job->offsets[b]) return job->root;
+  return (63 - __builtin_clzll((uint64_t)(job->keys[i] ^ job->keys[i - 1]))) / 3;
 }
 
 static ast_status octree_count_cells_task(int64_t chunk, void *context) {
-  const octree_cells_job *s = context;
+  const octree_cells_job *job = context;
   octree_chunk count = {.next = {0}};
-  int64_t b = octree_scene_of(s->offsets, s->B, chunk * OCTREE_CHUNK);
-  for (int64_t i = chunk * OCTREE_CHUNK; i < min64(s->C, (chunk + 1) * OCTREE_CHUNK); i++) {
-    while (s->offsets[b + 1] <= i) b++;
-    count.next[octree_starts(s, i, b)]++;
+  int64_t b = scene_at(job->offsets, job->B, chunk * OCTREE_CHUNK);
+  for (int64_t i = chunk * OCTREE_CHUNK; i < min64(job->C, (chunk + 1) * OCTREE_CHUNK); i++) {
+    while (job->offsets[b + 1] <= i) b++;
+    count.next[octree_starts(job, i, b)]++;
   }
-  s->chunks[chunk] = count;
+  job->chunks[chunk] = count;
   return AST_OK;
 }
 
 static ast_status octree_write_cells_task(int64_t chunk, void *context) {
-  const octree_cells_job *s = context;
-  octree_chunk own = s->chunks[chunk];
-  int64_t begin[OCTREE_LEVELS], *families[OCTREE_LEVELS], b = octree_scene_of(s->offsets, s->B, chunk * OCTREE_CHUNK);
+  const octree_cells_job *job = context;
+  octree_chunk own = job->chunks[chunk];
+  int64_t begin[OCTREE_LEVELS], *families[OCTREE_LEVELS], b = scene_at(job->offsets, job->B, chunk * OCTREE_CHUNK);
   memcpy(begin, own.next, sizeof begin);
-  for (int j = 1; j <= s->root; j++) families[j] = s->level[j].families;
-  for (int64_t i = chunk * OCTREE_CHUNK; i < min64(s->C, (chunk + 1) * OCTREE_CHUNK); i++) {
-    while (s->offsets[b + 1] <= i) b++;
-    const int starts = octree_starts(s, i, b);
-    int64_t key = s->keys[i], child = i;
+  for (int j = 1; j <= job->root; j++) families[j] = job->level[j].families;
+  for (int64_t i = chunk * OCTREE_CHUNK; i < min64(job->C, (chunk + 1) * OCTREE_CHUNK); i++) {
+    while (job->offsets[b + 1] <= i) b++;
+    const int starts = octree_starts(job, i, b);
+    int64_t key = job->keys[i], child = i;
     for (int j = 1; j <= starts; j++) {
       const int64_t P = own.next[j]++;
       families[j][P] = child << 8 | 1 << (key & 7);
       key >>= 3;
-      if (j <= s->levels) s->level[j].keys[P] = key;
+      if (j <= job->levels) job->level[j].keys[P] = key;
       child = P;
     }
-    if (starts == s->root) continue;
+    if (starts == job->root) continue;
     const int64_t parent = own.next[starts + 1] - 1;
     if (parent >= begin[starts + 1]) families[starts + 1][parent] |= 1 << (key & 7);
     else own.before[starts + 1] |= (uint8_t)(1 << (key & 7));
   }
-  memcpy(s->chunks[chunk].before, own.before, sizeof own.before);
+  memcpy(job->chunks[chunk].before, own.before, sizeof own.before);
   return AST_OK;
 }
 
@@ -108,15 +103,9 @@ static void octree_places(octree_chunk *chunks, int64_t num, int root, int64_t C
 }
 
 /* The first cell of each scene: of the cells above those of the finer level. */
-static void octree_scene_offsets(const ast_octree_level *s, const int64_t *fine_offsets) {
-  for (int64_t b = 0, low = 0; b <= s->B; b++) {
-    for (int64_t high = s->C; low < high;) {
-      const int64_t middle = (low + high) / 2;
-      if (octree_first(s->families[middle]) < fine_offsets[b]) low = middle + 1;
-      else high = middle;
-    }
-    s->offsets[b] = low;
-  }
+static void octree_scene_offsets(const ast_octree_level *level, const int64_t *fine_offsets) {
+  for (int64_t b = 0, cell = 0; b <= level->B; b++)
+    level->offsets[b] = cell = lower_bound(level->families, cell, level->C, fine_offsets[b] << 8);
 }
 
 /* ---- neighbours ---- */
@@ -153,10 +142,10 @@ AST_INLINE uint64_t octree_bits_of_bytes(uint64_t x) {
 }
 
 /* The octants of the children, 0 if there are none, and the first child: of a cell (byte and item 0) and of the cells before it (d). */
-AST_INLINE uint64_t octree_families_of(const ast_octree_level *s, int64_t P, octree_cells *first) {
-  octree_families families = {s->families[P]};
-  if (s->near[P])
-    for (int d = 1; d < 8; d++) families[d] = s->families[s->before[P][d]];
+AST_INLINE uint64_t octree_families_of(const ast_octree_level *level, int64_t P, octree_cells *first) {
+  octree_families families = {level->families[P]};
+  if (level->near[P])
+    for (int d = 1; d < 8; d++) families[d] = level->families[level->before[P][d]];
   *first = __builtin_convertvector(families >> 8, octree_cells);
   return (uint64_t)__builtin_convertvector(families, octree_bytes);
 }
@@ -199,24 +188,24 @@ AST_INLINE void octree_settle(const octree_neighbour_job *job, uint64_t families
 
 /* Counts the pairs of a chunk by place, if `count`, and finds the cells before its children, if `settle`. */
 AST_INLINE void octree_neighbours(const octree_neighbour_job *job, int64_t chunk, int64_t places[64], const bool count, const bool settle) {
-  const ast_octree_level *s = job->level;
-  for (int64_t P = chunk * OCTREE_CHUNK; P < min64(s->C, (chunk + 1) * OCTREE_CHUNK); P++) {
-    unsigned octants = octree_octants(s->families[P]);
-    int64_t f = octree_first(s->families[P]);
-    if (!s->near[P] && !(octants & (octants - 1))) {
+  const ast_octree_level *level = job->level;
+  for (int64_t P = chunk * OCTREE_CHUNK; P < min64(level->C, (chunk + 1) * OCTREE_CHUNK); P++) {
+    unsigned octants = octree_octants(level->families[P]);
+    int64_t f = octree_first(level->families[P]);
+    if (!level->near[P] && !(octants & (octants - 1))) {
       if (count) places[__builtin_ctz(octants)]++;
-      if (count) s->others[P] = 0;
+      if (count) level->others[P] = 0;
       if (settle) job->finer->near[f] = 0;
       continue;
     }
     octree_cells first;
-    const uint64_t families = octree_families_of(s, P, &first);
+    const uint64_t families = octree_families_of(level, P, &first);
     for (; octants; octants &= octants - 1, f++) {
       if (count) places[__builtin_ctz(octants)]++;
       if (settle) octree_settle(job, families, first, __builtin_ctz(octants), f);
     }
     if (!count) continue;
-    uint64_t others = s->others[P] = families & octree_pair_places;
+    uint64_t others = level->others[P] = families & octree_pair_places;
     for (; others; others &= others - 1) places[__builtin_ctzll(others)]++;
   }
 }
@@ -237,51 +226,51 @@ static ast_status octree_neighbour_task(int64_t chunk, void *context) {
 static int64_t octree_level_bytes(int64_t C, int64_t B) { return 8 * (3 * C + B + 3) + 32 * C + round_up(C, 8); }
 
 /* Takes room for C cells out of `memory`; returns what is left. */
-static char *octree_place_level(ast_octree_level *s, int64_t C, int64_t B, int64_t C_fine, char *memory) {
-  *s = (ast_octree_level){.C = C, .C_fine = C_fine, .B = B, .keys = (int64_t *)memory};
-  s->offsets = s->keys + C;
-  s->families = s->offsets + B + 2;
-  s->families[-1] = 0; /* of the cell that is not there */
-  s->families[C] = C_fine << 8;
-  s->others = (uint64_t *)(s->families + C + 1);
-  s->before = (int32_t (*)[8])(s->others + C);
-  s->near = (uint8_t *)(s->before + C);
+static char *octree_place_level(ast_octree_level *level, int64_t C, int64_t B, int64_t C_fine, char *memory) {
+  *level = (ast_octree_level){.C = C, .C_fine = C_fine, .B = B, .keys = (int64_t *)memory};
+  level->offsets = level->keys + C;
+  level->families = level->offsets + B + 2;
+  level->families[-1] = 0; /* of the cell that is not there */
+  level->families[C] = C_fine << 8;
+  level->others = (uint64_t *)(level->families + C + 1);
+  level->before = (int32_t (*)[8])(level->others + C);
+  level->near = (uint8_t *)(level->before + C);
   return memory + octree_level_bytes(C, B);
 }
 
 /* The cells of all levels up to the root, of which `level` gets all, [root + 1]. */
-static ast_status octree_all_cells(octree_cells_job *s, ast_octree_level *level) {
-  const int64_t chunks = octree_chunks(s->C);
-  if (s->C > OCTREE_MAX_CELLS) return AST_TOO_LARGE;
-  s->chunks = ast_scratch(2, chunks * (int64_t)sizeof *s->chunks);
-  if (!s->chunks) return AST_NO_MEMORY;
-  ast_parallel(chunks, octree_count_cells_task, s);
+static ast_status octree_all_cells(octree_cells_job *job, ast_octree_level *level) {
+  const int64_t chunks = octree_chunks(job->C);
+  if (job->C > INT32_MAX) return AST_TOO_LARGE; /* neighbours are held as int32 */
+  job->chunks = ast_scratch(chunks * (int64_t)sizeof *job->chunks);
+  if (!job->chunks) return AST_NO_MEMORY;
+  ast_parallel(chunks, octree_count_cells_task, job);
   int64_t C[OCTREE_LEVELS], bytes = 0;
-  octree_places(s->chunks, chunks, s->root, C);
-  for (int j = 1; j <= s->root; j++) bytes += octree_level_bytes(C[j], s->B);
-  char *memory = ast_scratch(1, bytes);
+  octree_places(job->chunks, chunks, job->root, C);
+  for (int j = 1; j <= job->root; j++) bytes += octree_level_bytes(C[j], job->B);
+  char *memory = ast_scratch(bytes);
   if (!memory) return AST_NO_MEMORY;
-  C[0] = s->C;
-  for (int j = 1; j <= s->root; j++) memory = octree_place_level(&level[j], C[j], s->B, C[j - 1], memory);
-  ast_parallel(chunks, octree_write_cells_task, s);
+  C[0] = job->C;
+  for (int j = 1; j <= job->root; j++) memory = octree_place_level(&level[j], C[j], job->B, C[j - 1], memory);
+  ast_parallel(chunks, octree_write_cells_task, job);
   for (int64_t chunk = 1; chunk < chunks; chunk++)
-    for (int j = 1; j <= s->root; j++)
-      if (s->chunks[chunk].before[j]) level[j].families[s->chunks[chunk].next[j] - 1] |= s->chunks[chunk].before[j];
-  for (int j = 1; j <= s->levels; j++) octree_scene_offsets(&level[j], j == 1 ? s->offsets : level[j - 1].offsets);
+    for (int j = 1; j <= job->root; j++)
+      if (job->chunks[chunk].before[j]) level[j].families[job->chunks[chunk].next[j] - 1] |= job->chunks[chunk].before[j];
+  for (int j = 1; j <= job->levels; j++) octree_scene_offsets(&level[j], j == 1 ? job->offsets : level[j - 1].offsets);
   return AST_OK;
 }
 
 /* The place of each chunk's pairs in each group, from their numbers, and the offsets of the groups. */
-static void octree_pair_offsets(ast_octree_level *s) {
-  s->pair_offsets[0] = 0;
+static void octree_pair_offsets(ast_octree_level *level) {
+  level->pair_offsets[0] = 0;
   for (int k = 0; k < OCTREE_GROUPS; k++) {
-    int64_t next = s->pair_offsets[k];
-    for (int64_t chunk = 0; chunk < octree_chunks(s->C); chunk++) {
-      const int64_t here = s->pairs[OCTREE_GROUPS * chunk + k];
-      s->pairs[OCTREE_GROUPS * chunk + k] = next;
+    int64_t next = level->pair_offsets[k];
+    for (int64_t chunk = 0; chunk < octree_chunks(level->C); chunk++) {
+      const int64_t here = level->pairs[OCTREE_GROUPS * chunk + k];
+      level->pairs[OCTREE_GROUPS * chunk + k] = next;
       next += here;
     }
-    s->pair_offsets[k + 1] = next;
+    level->pair_offsets[k + 1] = next;
   }
 }
 
@@ -294,7 +283,7 @@ static ast_status octree_coarsen(const int64_t *restrict keys, const int64_t *re
   if (status != AST_OK) return status;
   int64_t counts = 0;
   for (int j = 1; j <= levels; j++) counts += OCTREE_GROUPS * octree_chunks(level[j].C);
-  int64_t *memory = ast_scratch(4, counts * (int64_t)sizeof *memory);
+  int64_t *memory = ast_scratch(counts * (int64_t)sizeof *memory);
   if (!memory) return AST_NO_MEMORY;
   for (int j = 1; j <= levels; memory += OCTREE_GROUPS * octree_chunks(level[j++].C)) level[j].pairs = memory;
   memset(level[cells.root].near, 0, (size_t)level[cells.root].C);

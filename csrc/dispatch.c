@@ -4,23 +4,39 @@
 
 #include "ast.h"
 
-extern const ast_kernels ast_kernels_base, ast_kernels_avx2, ast_kernels_avx512;
-
 /* __builtin_cpu_supports also asks the operating system (XGETBV) whether it saves the wide registers. */
-const ast_kernels *ast_select(const char *name) {
-  const ast_kernels *tables[3];
-  int num = 0;
+#define HAS        __builtin_cpu_supports
+#define HAS_base   true
+#define HAS_avx2   (HAS("avx2") && HAS("fma"))
+#define HAS_avx512 (HAS("avx512f") && HAS("avx512bw") && HAS("avx512dq") && HAS("avx512vl") && HAS("fma"))
+
+/* The instruction sets that were compiled, the best one first. */
 #ifdef AST_HAVE_AVX512
-  if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512dq") &&
-      __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("fma"))
-    tables[num++] = &ast_kernels_avx512;
+#define IF_AVX512(set) set
+#else
+#define IF_AVX512(set)
 #endif
 #ifdef AST_HAVE_AVX2
-  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) tables[num++] = &ast_kernels_avx2;
+#define IF_AVX2(set) set
+#else
+#define IF_AVX2(set)
 #endif
-  tables[num++] = &ast_kernels_base;
-  if (!name) return tables[0];
-  for (int i = 0; i < num; i++)
-    if (!strcmp(tables[i]->isa, name)) return tables[i];
+#define SETS(SET) IF_AVX512(SET(avx512)) IF_AVX2(SET(avx2)) SET(base)
+
+#define DECLARE(isa) extern const ast_kernels ast_kernels_##isa;
+SETS(DECLARE)
+
+const ast_kernels *ast_supported(int i) {
+#define COUNT(isa) \
+  if (HAS_##isa && i-- == 0) return &ast_kernels_##isa;
+  SETS(COUNT)
   return NULL;
+}
+
+const ast_kernels *ast_select(const char *name) {
+  if (!name) return ast_supported(0);
+  const ast_kernels *table = NULL;
+  for (int i = 0; (table = ast_supported(i)) && strcmp(table->isa, name) != 0; i++) {
+  }
+  return table;
 }

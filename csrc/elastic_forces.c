@@ -34,7 +34,7 @@ static const double ELASTIC_FLAT = 0x1p-21;
 typedef float corner __attribute__((vector_size(16), aligned(4), may_alias));
 
 typedef struct {
-  const ast_elastic *s;
+  const ast_elastic *mesh;
   const float *position, *rest, *direction; /* copies that may be read one float past the end; direction is NULL for the forces */
   float *forces;                            /* [E up to a multiple of VW,CORNERS] */
   float *out;                               /* [N,3] */
@@ -88,35 +88,30 @@ AST_INLINE vf elastic_load(const float *x, const int64_t *nodes) {
 /* edges[i][j]: coordinate i of x_(j+1) - x_0 of VW elements. */
 AST_INLINE void elastic_edges(const float *x, const int64_t *elements, vf edges[3][3]) {
   vf origin[3];
-#pragma GCC unroll 4
-  for (int j = 0; j < 4; j++) {
+  EACH(4, j) {
     const vf a = elastic_load(x, elements + j), b = elastic_load(x, elements + 4 + j);
     const vf c = elastic_load(x, elements + 8 + j), d = elastic_load(x, elements + 12 + j);
     const vf low[2] = {BLOCKS_LOW(a, b), BLOCKS_LOW(c, d)}, high[2] = {BLOCKS_HIGH(a, b), BLOCKS_HIGH(c, d)};
     const vf at[3] = {BLOCKS_FIRST(low[0], low[1]), BLOCKS_LAST(low[0], low[1]), BLOCKS_FIRST(high[0], high[1])};
-#pragma GCC unroll 3
-    for (int i = 0; i < 3; i++)
+    EACH(3, i) {
       if (j == 0) origin[i] = at[i];
       else edges[i][j - 1] = at[i] - origin[i];
+    }
   }
 }
 
 /* Writes H, the forces on nodes 1 to 3 as columns, and the force on node 0; 0 where the mask is not set. */
 AST_INLINE void elastic_write(vf H[3][3], vi used, float *forces) {
   vf row[CORNERS];
-#pragma GCC unroll 3
-  for (int i = 0; i < 3; i++) {
+  EACH(3, i) {
     row[i] = vselect(used, -(H[i][0] + H[i][1] + H[i][2]), (vf){0});
-#pragma GCC unroll 3
-    for (int j = 0; j < 3; j++) row[4 * (j + 1) + i] = vselect(used, H[i][j], (vf){0});
+    EACH(3, j) row[4 * (j + 1) + i] = vselect(used, H[i][j], (vf){0});
   }
-#pragma GCC unroll 4
-  for (int j = 0; j < 4; j++) row[4 * j + 3] = (vf){0};
+  EACH(4, j) row[4 * j + 3] = (vf){0};
 #pragma GCC unroll 4
   for (int part = 0; part < CORNERS; part += VW) {
     vtranspose(row + part);
-#pragma GCC unroll 16
-    for (int i = 0; i < VW; i++) vstore(forces + i * CORNERS + part, row[part + i]);
+    EACH(VW, i) vstore(forces + i * CORNERS + part, row[part + i]);
   }
 }
 
@@ -124,22 +119,16 @@ AST_INLINE void elastic_write(vf H[3][3], vi used, float *forces) {
 
 /* C = A B, or A^T B */
 AST_INLINE void elastic_product(const bool transposed, vf A[3][3], vf B[3][3], vf C[3][3]) {
-#pragma GCC unroll 3
-  for (int i = 0; i < 3; i++)
-#pragma GCC unroll 3
-    for (int j = 0; j < 3; j++) {
-      const vf a = transposed ? A[0][i] : A[i][0], b = transposed ? A[1][i] : A[i][1], c = transposed ? A[2][i] : A[i][2];
-      C[i][j] = a * B[0][j] + b * B[1][j] + c * B[2][j];
-    }
+  EACH(3, i) EACH(3, j) {
+    const vf a = transposed ? A[0][i] : A[i][0], b = transposed ? A[1][i] : A[i][1], c = transposed ? A[2][i] : A[i][2];
+    C[i][j] = a * B[0][j] + b * B[1][j] + c * B[2][j];
+  }
 }
 
 /* S = lambda/2 tr(M) I + mu M of a symmetric M = 2 G */
 AST_INLINE void elastic_stress(vf lambda, vf mu, vf M[3][3], vf S[3][3]) {
   const vf pressure = 0.5f * lambda * (M[0][0] + M[1][1] + M[2][2]);
-#pragma GCC unroll 3
-  for (int i = 0; i < 3; i++)
-#pragma GCC unroll 3
-    for (int j = 0; j < 3; j++) S[i][j] = i == j ? mu * M[i][j] + pressure : mu * M[i][j];
+  EACH(3, i) EACH(3, j) S[i][j] = i == j ? mu * M[i][j] + pressure : mu * M[i][j];
 }
 
 /* D in double: the products of two edges are exact, so that D^-1 is rounded but once, however flat the element. Edges of any float are
@@ -158,66 +147,55 @@ AST_INLINE elastic_rest elastic_measure(const float *rest, const int64_t *elemen
   elastic_rest r;
   vd D[3][3], cofactor[3][3], size = {0};
   elastic_edges(rest, elements, r.D);
-#pragma GCC unroll 9
-  for (int k = 0; k < 9; k++) D[k / 3][k % 3] = __builtin_convertvector(r.D[k / 3][k % 3], vd);
-#pragma GCC unroll 3
-  for (int i = 0; i < 3; i++)
-#pragma GCC unroll 3
-    for (int j = 0; j < 3; j++) {
-      const int i1 = (i + 1) % 3, i2 = (i + 2) % 3, j1 = (j + 1) % 3, j2 = (j + 2) % 3;
-      const vd plus = D[i1][j1] * D[i2][j2], minus = D[i2][j1] * D[i1][j2];
-      cofactor[i][j] = plus - minus;
-      if (j == 0) size += ABS(D[i][0]) * (ABS(plus) + ABS(minus));
-    }
+  EACH(9, k) D[k / 3][k % 3] = __builtin_convertvector(r.D[k / 3][k % 3], vd);
+  EACH(3, i) EACH(3, j) {
+    const int i1 = (i + 1) % 3, i2 = (i + 2) % 3, j1 = (j + 1) % 3, j2 = (j + 2) % 3;
+    const vd plus = D[i1][j1] * D[i2][j2], minus = D[i2][j1] * D[i1][j2];
+    cofactor[i][j] = plus - minus;
+    if (j == 0) size += ABS(D[i][0]) * (ABS(plus) + ABS(minus));
+  }
   const vd det = D[0][0] * cofactor[0][0] + D[1][0] * cofactor[1][0] + D[2][0] * cofactor[2][0];
   const vd per_det = 1.0 / det, sixth = ABS(det) * per_det * (-1.0 / 6);
   vf zero = {0}; /* NaN where an entry of the inverse is not finite */
-#pragma GCC unroll 3
-  for (int i = 0; i < 3; i++)
-#pragma GCC unroll 3
-    for (int j = 0; j < 3; j++) {
-      r.inverse[j][i] = __builtin_convertvector(cofactor[i][j] * per_det, vf);
-      r.area[i][j] = __builtin_convertvector(cofactor[i][j] * sixth, vf);
-      zero += r.inverse[j][i] * 0.0f;
-    }
+  EACH(3, i) EACH(3, j) {
+    r.inverse[j][i] = __builtin_convertvector(cofactor[i][j] * per_det, vf);
+    r.area[i][j] = __builtin_convertvector(cofactor[i][j] * sixth, vf);
+    zero += r.inverse[j][i] * 0.0f;
+  }
   r.counts = (__builtin_convertvector(ELASTIC_FLAT * size * ABS(per_det), vf) < 1) & (zero == 0);
   return r;
 }
 
 /* The corners of up to VW elements from `first` on. */
 AST_INLINE void elastic_block(const bool directed, const elastic_job *job, int64_t first, int64_t n) {
-  const int64_t *elements = job->s->elements + 4 * first;
+  const int64_t *elements = job->mesh->elements + 4 * first;
   int64_t some[4 * VW];
   if (n < VW) { /* the last one stands in for those beyond, whose forces are not read */
     for (int64_t k = 0; k < 4 * VW; k++) some[k] = elements[4 * min64(k / 4, n - 1) + k % 4];
     elements = some;
   }
-  const float *lame = job->s->lame + 2 * first;
+  const float *lame = job->mesh->lame + 2 * first;
   const vf even = vload_upto(lame, 2 * n), odd = vload_upto(lame + VW, 2 * n - VW), lambda = EVEN(even, odd), mu = ODD(even, odd);
   elastic_rest r = elastic_measure(job->rest, elements);
   const vi used = r.counts & ((lambda != 0) | (mu != 0));
   vf d[3][3], F[3][3], A[3][3], M[3][3], S[3][3], T[3][3], H[3][3];
   elastic_edges(job->position, elements, d);
-#pragma GCC unroll 9
-  for (int k = 0; k < 9; k++) r.D[k / 3][k % 3] = d[k / 3][k % 3] - r.D[k / 3][k % 3];
+  EACH(9, k) r.D[k / 3][k % 3] = d[k / 3][k % 3] - r.D[k / 3][k % 3];
   elastic_product(false, d, r.inverse, F);
   elastic_product(false, r.D, r.inverse, A);
   elastic_product(true, A, A, M);
-#pragma GCC unroll 9
-  for (int k = 0; k < 9; k++) M[k / 3][k % 3] += A[k / 3][k % 3] + A[k % 3][k / 3];
+  EACH(9, k) M[k / 3][k % 3] += A[k / 3][k % 3] + A[k % 3][k / 3];
   elastic_stress(lambda, mu, M, S);
   if (directed) { /* T = dF S + F dS, H = T area */
     vf dF[3][3], M2[3][3], dS[3][3];
     elastic_edges(job->direction, elements, d);
     elastic_product(false, d, r.inverse, dF);
     elastic_product(true, F, dF, M);
-#pragma GCC unroll 9
-    for (int k = 0; k < 9; k++) M2[k / 3][k % 3] = M[k / 3][k % 3] + M[k % 3][k / 3];
+    EACH(9, k) M2[k / 3][k % 3] = M[k / 3][k % 3] + M[k % 3][k / 3];
     elastic_stress(lambda, mu, M2, dS);
     elastic_product(false, dF, S, T);
     elastic_product(false, F, dS, A);
-#pragma GCC unroll 9
-    for (int k = 0; k < 9; k++) T[k / 3][k % 3] += A[k / 3][k % 3];
+    EACH(9, k) T[k / 3][k % 3] += A[k / 3][k % 3];
     elastic_product(false, T, r.area, H);
   } else { /* F (S area): the product of the areas first, which are small where F is large */
     elastic_product(false, S, r.area, T);
@@ -230,47 +208,49 @@ AST_INLINE void elastic_block(const bool directed, const elastic_job *job, int64
 
 static ast_status elastic_force_task(int64_t index, void *context) {
   const elastic_job *job = context;
-  const int64_t end = min64(job->s->E, (index + 1) * ELASTIC_ELEMENTS);
+  const int64_t end = min64(job->mesh->E, (index + 1) * ELASTIC_ELEMENTS);
   for (int64_t e = index * ELASTIC_ELEMENTS; e < end; e += VW) elastic_block(false, job, e, min64(VW, end - e));
   return AST_OK;
 }
 
 static ast_status elastic_direction_task(int64_t index, void *context) {
   const elastic_job *job = context;
-  const int64_t end = min64(job->s->E, (index + 1) * ELASTIC_ELEMENTS);
+  const int64_t end = min64(job->mesh->E, (index + 1) * ELASTIC_ELEMENTS);
   for (int64_t e = index * ELASTIC_ELEMENTS; e < end; e += VW) elastic_block(true, job, e, min64(VW, end - e));
   return AST_OK;
 }
 
 static ast_status elastic_sum_task(int64_t index, void *context) {
   const elastic_job *job = context;
-  const ast_elastic *s = job->s;
-  for (int64_t n = index * ELASTIC_NODES; n < min64(s->N, (index + 1) * ELASTIC_NODES); n++) {
+  const ast_elastic *mesh = job->mesh;
+  for (int64_t n = index * ELASTIC_NODES; n < min64(mesh->N, (index + 1) * ELASTIC_NODES); n++) {
     corner sum = {0};
-    for (int64_t j = s->node_offsets[n]; j < s->node_offsets[n + 1]; j++) sum += *(const corner *)(job->forces + 4 * s->node_order[j]);
+    for (int64_t j = mesh->node_offsets[n]; j < mesh->node_offsets[n + 1]; j++)
+      sum += *(const corner *)(job->forces + 4 * mesh->node_order[j]);
     for (int i = 0; i < 3; i++) job->out[3 * n + i] = sum[i];
   }
   return AST_OK;
 }
 
-static ast_status elastic_run(const ast_elastic *s, const float *direction, float *out) {
-  const int64_t fields = direction ? 3 : 2, length = 3 * s->N + 4;
-  float *copies = ast_scratch(6, fields * length * (int64_t)sizeof *copies);
-  elastic_job job = {.s = s, .forces = ast_scratch(7, round_up(s->E, VW) * CORNERS * (int64_t)sizeof *copies), .out = out};
+static ast_status elastic_run(const ast_elastic *mesh, const float *direction, float *out) {
+  AST_SCRATCH_SCOPE;
+  const int64_t fields = direction ? 3 : 2, length = 3 * mesh->N + 4;
+  float *copies = ast_scratch(fields * length * (int64_t)sizeof *copies);
+  elastic_job job = {.mesh = mesh, .forces = ast_scratch(round_up(mesh->E, VW) * CORNERS * (int64_t)sizeof *copies), .out = out};
   if (!copies || !job.forces) return AST_NO_MEMORY;
-  const float *from[3] = {s->position, s->rest_position, direction};
+  const float *from[3] = {mesh->position, mesh->rest_position, direction};
   const float **to[3] = {&job.position, &job.rest, &job.direction};
   for (int64_t i = 0; i < fields; i++) {
-    *to[i] = memcpy(copies + i * length, from[i], (size_t)(3 * s->N) * sizeof *copies);
-    copies[i * length + 3 * s->N] = 0;
+    *to[i] = memcpy(copies + i * length, from[i], (size_t)(3 * mesh->N) * sizeof *copies);
+    copies[i * length + 3 * mesh->N] = 0;
   }
   const ast_status status =
-      ast_parallel((s->E + ELASTIC_ELEMENTS - 1) / ELASTIC_ELEMENTS, direction ? elastic_direction_task : elastic_force_task, &job);
-  return status == AST_OK ? ast_parallel((s->N + ELASTIC_NODES - 1) / ELASTIC_NODES, elastic_sum_task, &job) : status;
+      ast_parallel(divide_up(mesh->E, ELASTIC_ELEMENTS), direction ? elastic_direction_task : elastic_force_task, &job);
+  return status == AST_OK ? ast_parallel(divide_up(mesh->N, ELASTIC_NODES), elastic_sum_task, &job) : status;
 }
 
-static ast_status elastic_forces(const ast_elastic *s, float *restrict force) { return elastic_run(s, NULL, force); }
+static ast_status elastic_forces(const ast_elastic *mesh, float *restrict force) { return elastic_run(mesh, NULL, force); }
 
-static ast_status elastic_forces_backward(const ast_elastic *s, const float *restrict dforce, float *restrict dposition) {
-  return elastic_run(s, dforce, dposition);
+static ast_status elastic_forces_backward(const ast_elastic *mesh, const float *restrict dforce, float *restrict dposition) {
+  return elastic_run(mesh, dforce, dposition);
 }

@@ -12,7 +12,6 @@
  * Cost: at most n distances a sample, as without blocks; in Morton order few blocks are looked at between two samples.
  *
  * Squared distances are integers, below 2^44; they fit in int32 unless the scene is wide.
- * Scratch: slot 1 of the thread holds the blocks, slot 2 which points are taken.
  */
 #include "ast.h"
 #include "simd.h"
@@ -45,7 +44,7 @@ AST_INLINE void fps_replay(fps_tournament t, int64_t key) {
 /* Points of a block: few blocks for small scenes, and never more than FPS_BLOCKS. */
 static int64_t fps_block_size(int64_t n) {
   const int64_t size = n <= 512 ? n : n < 20000 ? 128 : 192;
-  return round_up(max64(size, (n + FPS_BLOCKS - 1) / FPS_BLOCKS), FPS_TILE);
+  return round_up(max64(size, divide_up(n, FPS_BLOCKS)), FPS_TILE);
 }
 
 /* 2^l, for loops over l that no instruction set has a shift for. */
@@ -103,7 +102,7 @@ static int64_t fps_extent(const int32_t *coordinates, int64_t n, int32_t middle[
 /* Once all distances are 0: the lowest points not among the `taken` samples, until there are num. */
 static ast_status fps_fill_up(int64_t begin, int64_t n, int64_t taken, int64_t num, int64_t *indices) {
   if (taken == num) return AST_OK;
-  uint8_t *used = ast_scratch(2, n);
+  uint8_t *used = ast_scratch(n);
   if (!used) return AST_NO_MEMORY;
   memset(used, 0, (size_t)n);
   for (int64_t i = 0; i < taken; i++) used[indices[i] - begin] = 1;
@@ -113,22 +112,22 @@ static ast_status fps_fill_up(int64_t begin, int64_t n, int64_t taken, int64_t n
 }
 
 static ast_status fps_task(int64_t scene, void *context) {
-  const fps_job *s = context;
-  const int64_t begin = s->offsets[scene], n = s->offsets[scene + 1] - begin;
-  const int32_t *coordinates = s->coordinates + 3 * begin;
-  int64_t *indices = s->indices + s->out_offsets[scene];
+  const fps_job *job = context;
+  const int64_t begin = job->offsets[scene], n = job->offsets[scene + 1] - begin;
+  const int32_t *coordinates = job->coordinates + 3 * begin;
+  int64_t *indices = job->indices + job->out_offsets[scene];
   int32_t middle[3];
   if (n == 0) return AST_OK;
   const int64_t square = fps_extent(coordinates, n, middle);
   if (square < 0) return AST_OUTSIDE;
-  if (n <= s->num) {
+  if (n <= job->num) {
     for (int64_t i = 0; i < n; i++) indices[i] = begin + i;
     return AST_OK;
   }
   /* Differences of at most sqrt(INT32_MAX) = 46340: relative to the middle they fit in int16. */
-  const int64_t taken = square <= INT32_MAX ? fps_narrow_sample(coordinates, n, middle, begin, s->num, indices)
-                                            : fps_wide_sample(coordinates, n, middle, begin, s->num, indices);
-  return taken ? fps_fill_up(begin, n, taken, s->num, indices) : AST_NO_MEMORY;
+  const int64_t taken = square <= INT32_MAX ? fps_narrow_sample(coordinates, n, middle, begin, job->num, indices)
+                                            : fps_wide_sample(coordinates, n, middle, begin, job->num, indices);
+  return taken ? fps_fill_up(begin, n, taken, job->num, indices) : AST_NO_MEMORY;
 }
 
 static ast_status farthest_point_sample(const int32_t *restrict coordinates, const int64_t *restrict offsets, int64_t B, int64_t num,

@@ -1,8 +1,8 @@
 /* The register-blocked product that every dense kernel is built on.
  *
  * C_ij (+)= sum_k A_ik B_kj. A has any strides (so A^T needs no copy) and is read by broadcast; B is read in whole vectors,
- * either packed into panels of GEMM_COLUMNS columns or as rows of a row-major matrix whose width is a multiple of VW. A tile of
- * GEMM_ROWS x 2 vectors of C stays in registers over the whole k loop; K is never blocked (all K here are at most some hundred).
+ * from a panel of GEMM_COLUMNS columns or from rows of a matrix. A tile of GEMM_ROWS x 2 vectors of C stays in registers over
+ * the whole k loop.
  */
 #ifndef AST_GEMM_H
 #define AST_GEMM_H
@@ -23,14 +23,6 @@ typedef struct {
   int64_t row, column; /* strides in floats */
 } gemm_a;
 
-typedef struct {
-  const float *data;
-  int64_t row;   /* from one k to the next: GEMM_COLUMNS if packed */
-  int64_t panel; /* from one panel of GEMM_COLUMNS columns to the next: K * GEMM_COLUMNS if packed, GEMM_COLUMNS if not */
-} gemm_b;
-
-AST_INLINE gemm_b gemm_rows(const float *b, int64_t stride) { return (gemm_b){b, stride, GEMM_COLUMNS}; }
-AST_INLINE gemm_b gemm_packed(const float *b, int64_t K) { return (gemm_b){b, GEMM_COLUMNS, K * GEMM_COLUMNS}; }
 AST_INLINE int64_t gemm_packed_size(int64_t K, int64_t N) { return K * round_up(N, GEMM_COLUMNS); }
 
 /* out[k][j] = in[j][k] for n rows j of m columns k, both at most VW; out has VW columns within a panel, 0 from n on. */
@@ -90,44 +82,46 @@ AST_INLINE void gemm_sums(const int rows, const int vectors, int64_t K, gemm_a a
   }
 }
 
+/* for all vectors of a register tile */
+#define TILE_EACH(i, v) _Pragma("GCC unroll 12") for (int i = 0; i < rows; i++) _Pragma("GCC unroll 2") for (int v = 0; v < vectors; v++)
+
+/* Cuts n rows into register tiles: calls tile(rows) for the rows i, i + 1, ... with a constant number of them. */
+#define EACH_TILE_OF_ROWS(i, n, tile)                \
+  do {                                               \
+    int64_t i = 0;                                   \
+    TILES_OF_ROWS(i, n, GEMM_ROWS, tile);            \
+    if (GEMM_ROWS > 8) TILES_OF_ROWS(i, n, 8, tile); \
+    TILES_OF_ROWS(i, n, 4, tile);                    \
+    TILES_OF_ROWS(i, n, 2, tile);                    \
+    TILES_OF_ROWS(i, n, 1, tile);                    \
+  } while (0)
+#define TILES_OF_ROWS(i, n, rows, tile) \
+  for (; i + (rows) <= (n); i += (rows)) tile(rows)
+
 /* One register tile. */
 AST_INLINE void gemm_tile(const int rows, const int vectors, int64_t K, gemm_a a, const float *b, int64_t b_row, float *c, int64_t c_row,
                           bool add) {
   vf sum[GEMM_ROWS][2];
-#pragma GCC unroll 12
-  for (int i = 0; i < rows; i++)
-#pragma GCC unroll 2
-    for (int j = 0; j < vectors; j++) sum[i][j] = (vf){0};
+  TILE_EACH(i, v) sum[i][v] = (vf){0};
   gemm_sums(rows, vectors, K, a, b, b_row, sum);
-#pragma GCC unroll 12
-  for (int i = 0; i < rows; i++)
-#pragma GCC unroll 2
-    for (int j = 0; j < vectors; j++) {
-      float *c_ij = c + i * c_row + j * VW;
-      vstore(c_ij, add ? vload(c_ij) + sum[i][j] : sum[i][j]);
-    }
+  TILE_EACH(i, v) {
+    float *c_iv = c + i * c_row + v * VW;
+    vstore(c_iv, add ? vload(c_iv) + sum[i][v] : sum[i][v]);
+  }
 }
 
 AST_INLINE void gemm_strip(const int vectors, int64_t M, int64_t K, gemm_a a, const float *b, int64_t b_row, float *c, int64_t c_row,
                            bool add) {
-  int64_t i = 0;
-#define GEMM_STEP(rows)                \
-  for (; i + (rows) <= M; i += (rows)) \
-  gemm_tile(rows, vectors, K, (gemm_a){a.data + i * a.row, a.row, a.column}, b, b_row, c + i * c_row, c_row, add)
-  GEMM_STEP(GEMM_ROWS);
-  if (GEMM_ROWS > 8) GEMM_STEP(8);
-  GEMM_STEP(4);
-  GEMM_STEP(2);
-  GEMM_STEP(1);
-#undef GEMM_STEP
+#define GEMM_TILE(rows) gemm_tile(rows, vectors, K, (gemm_a){a.data + i * a.row, a.row, a.column}, b, b_row, c + i * c_row, c_row, add)
+  EACH_TILE_OF_ROWS(i, M, GEMM_TILE);
+#undef GEMM_TILE
 }
 
-/* C [M,N] (+)= A [M,K] B [K,N], N a multiple of VW, rows of C c_row floats apart. */
-static void gemm(int64_t M, int64_t N, int64_t K, gemm_a a, gemm_b b, float *c, int64_t c_row, bool add) {
+/* C [M,N] (+)= A [M,K] B [K,N], N a multiple of VW, rows of B and C b_row and c_row floats apart. */
+static void gemm(int64_t M, int64_t N, int64_t K, gemm_a a, const float *b, int64_t b_row, float *c, int64_t c_row, bool add) {
   for (int64_t j = 0; j < N; j += GEMM_COLUMNS) {
-    const float *panel = b.data + j / GEMM_COLUMNS * b.panel;
-    if (N - j >= GEMM_COLUMNS) gemm_strip(2, M, K, a, panel, b.row, c + j, c_row, add);
-    else gemm_strip(1, M, K, a, panel, b.row, c + j, c_row, add);
+    if (N - j >= GEMM_COLUMNS) gemm_strip(2, M, K, a, b + j, b_row, c + j, c_row, add);
+    else gemm_strip(1, M, K, a, b + j, b_row, c + j, c_row, add);
   }
 }
 

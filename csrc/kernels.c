@@ -24,29 +24,8 @@
 #define AST_STRING_OF(isa) #isa
 #define AST_STRING(isa)    AST_STRING_OF(isa)
 
+#define AST_ENTRY(name) .name = name,
+
 extern const ast_kernels AST_TABLE(AST_ISA);
 
-const ast_kernels AST_TABLE(AST_ISA) = {
-    .isa = AST_STRING(AST_ISA),
-    .vector_bytes = AST_VECTOR_BYTES,
-    .segment_sum = segment_sum,
-    .segment_spread = segment_spread,
-    .octree_build = octree_build,
-    .octree_coordinates = octree_coordinates,
-    .octree_coarsen = octree_coarsen,
-    .octree_write_level = octree_write_level,
-    .farthest_point_sample = farthest_point_sample,
-    .sparse_conv = sparse_conv,
-    .sparse_conv_weight = sparse_conv_weight,
-    .attention = attention,
-    .attention_backward = attention_backward,
-    .message = message,
-    .message_backward = message_backward,
-    .linear = linear,
-    .linear_backward = linear_backward,
-    .elastic_forces = elastic_forces,
-    .elastic_forces_backward = elastic_forces_backward,
-    .column_sum = column_sum,
-    .mlp = mlp,
-    .mlp_backward = mlp_backward,
-};
+const ast_kernels AST_TABLE(AST_ISA) = {.isa = AST_STRING(AST_ISA), .vector_bytes = AST_VECTOR_BYTES, AST_KERNELS(AST_ENTRY)};

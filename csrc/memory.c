@@ -1,4 +1,9 @@
-/* Scratch memory of each thread, kept between calls, and the C library's thresholds for giving memory back. */
+/* Scratch memory of each thread, a stack in a few blocks, and the C library's thresholds for giving memory back.
+ *
+ * A request that finds no room in the newest block gets a new one. When the stack is empty again one block stays if it was enough;
+ * else the next request gets one for all that was ever in use at once: so a kernel that is called again and again allocates
+ * nothing from its third call on, and its arrays lie side by side. More than SCRATCH_KEPT bytes are given back instead.
+ */
 #include <limits.h>
 #include <pthread.h>
 #include <stdlib.h>
@@ -9,43 +14,105 @@
 
 #include "ast.h"
 
+enum { ALIGNMENT = 64, SCRATCH_KEPT = 1 << 26 };
+
+/* With the address sanitizer every request is a block of its own, freed when it is released: no access beyond it, or after, escapes. */
+#ifndef __has_feature
+#define __has_feature(name) 0
+#endif
+#if defined(__SANITIZE_ADDRESS__) || __has_feature(address_sanitizer)
+enum { APART = true };
+#else
+enum { APART = false };
+#endif
+
+typedef struct block {
+  struct block *below;
+  char *next, *end; /* the room that is left */
+} block;
+
+_Static_assert(sizeof(block) <= ALIGNMENT, "the memory of a block begins at the first aligned byte behind its head");
+
 typedef struct {
-  void *data[AST_SLOTS];
-  int64_t size[AST_SLOTS];
-} scratch;
+  block *newest;
+  int64_t used, most; /* bytes now, and at most since `most` was forgotten */
+} stack;
 
 static pthread_key_t key;
 static pthread_once_t once = PTHREAD_ONCE_INIT;
 static int key_status;
 
-static void release(void *p) {
-  scratch *s = p;
-  for (int i = 0; i < AST_SLOTS; i++) free(s->data[i]);
+static char *begin_of(block *b) { return (char *)b + ALIGNMENT; }
+
+static void pop(stack *s) {
+  block *b = s->newest;
+  s->used -= b->next - begin_of(b);
+  s->newest = b->below;
+  free(b);
+}
+
+static void free_stack(void *p) {
+  stack *s = p;
+  while (s->newest) pop(s);
   free(s);
 }
 
-static void create_key(void) { key_status = pthread_key_create(&key, release); }
+static void create_key(void) { key_status = pthread_key_create(&key, free_stack); }
 
-void *ast_scratch(int slot, int64_t bytes) {
+/* That of the calling thread; NULL if it has none yet. */
+static stack *own_stack(void) {
   pthread_once(&once, create_key);
-  if (key_status) return NULL;
-  scratch *s = pthread_getspecific(key);
-  if (!s) {
-    s = calloc(1, sizeof *s);
-    if (!s || pthread_setspecific(key, s)) {
-      free(s);
-      return NULL;
-    }
+  return key_status ? NULL : pthread_getspecific(key);
+}
+
+static stack *new_stack(void) {
+  stack *s = key_status ? NULL : calloc(1, sizeof *s);
+  if (s && !pthread_setspecific(key, s)) return s;
+  free(s);
+  return NULL;
+}
+
+static bool push(stack *s, int64_t bytes) {
+  if (!s->used && s->newest) pop(s);
+  const int64_t room = s->newest || APART || s->most < bytes ? bytes : s->most;
+  block *b = aligned_alloc(ALIGNMENT, (size_t)(ALIGNMENT + room));
+  if (!b) return false;
+  *b = (block){.below = s->newest, .next = begin_of(b), .end = begin_of(b) + room};
+  s->newest = b;
+  return true;
+}
+
+void *ast_scratch(int64_t bytes) {
+  stack *s = own_stack();
+  if (!s && !(s = new_stack())) return NULL;
+  const int64_t size = (bytes / ALIGNMENT + 1) * ALIGNMENT; /* never 0, so that no two requests give the same mark */
+  if ((!s->newest || APART || s->newest->end - s->newest->next < size) && !push(s, size)) return NULL;
+  void *const data = s->newest->next;
+  s->newest->next += size;
+  s->used += size;
+  if (s->most < s->used) s->most = s->used;
+  return data;
+}
+
+void *ast_scratch_mark(void) {
+  const stack *s = own_stack();
+  return s && s->used ? s->newest->next : NULL;
+}
+
+void ast_scratch_release(void *mark) {
+  stack *s = own_stack();
+  if (!s || !s->used) return;
+  if (mark) { /* the end of a request: no block but its own reaches there */
+    while (s->newest->next < (char *)mark || (char *)mark <= begin_of(s->newest)) pop(s);
+    s->used -= s->newest->next - (char *)mark;
+    s->newest->next = mark;
+    return;
   }
-  if (s->size[slot] <= bytes) { /* never NULL, not even for 0 bytes */
-    const size_t size = ((size_t)bytes + 4096) & ~(size_t)4095;
-    void *data = aligned_alloc(64, size);
-    if (!data) return NULL;
-    free(s->data[slot]);
-    s->data[slot] = data;
-    s->size[slot] = (int64_t)size;
-  }
-  return s->data[slot];
+  while (s->newest->below) pop(s);
+  s->used = 0;
+  s->newest->next = begin_of(s->newest);
+  if (APART || s->most > SCRATCH_KEPT) s->most = 0, pop(s);
+  else if (s->newest->end - s->newest->next < s->most) pop(s);
 }
 
 bool ast_keep_memory(void) {

@@ -5,16 +5,16 @@
  *   dW2 = sum_m dy_m x_m^T,   db2 = sum_m dy_m,   dz_m = (z_m > 0) W2^T dy_m,         x_m = relu(z_m)
  *   dA2 = sum_m dz_m h_m^T,   dc_m = (h_m > 0) A2^T dz_m,   dA1 = sum_m dc_m e_m^T,   da1 = sum_m dc_m,   de_m = A1^T dc_m
  *   de_m = dz_m                                                                       where e_m is added as it is
- *   dP_s = sum of dz_m over the edges from s,   dQ_r = sum of dz_m over the edges into r
+ *   dP_s = sum of dz_m over the edges from step,   dQ_r = sum of dz_m over the edges into r
  *
  * Edges come in rounds. First the tasks of a round, each a run of tiles, put dz into a buffer and add to weight gradients of
- * their own, of which there are at most SHARES. Then other tasks add the rows of the buffer to dQ, each for a run of receivers,
+ * their own, of which there are at most ROUND_TASKS. Then other tasks add the rows of the buffer to dQ, each for a run of receivers,
  * and to dP, each for the senders with the same index modulo PARTS. All go through their edges in stored order, so that each
- * sum runs in stored order whatever the rounds, tasks, threads and other scenes. At the end the weight gradients of the shares
+ * sum runs in stored order whatever the rounds, tasks, threads and other scenes. At the end the weight gradients of the tasks
  * are added up in order.
  *
  * Cost per edge: the forward flops again, and twice as many for the two products per layer (but E H once, unless de is wanted).
- * Memory: at most SHARES sums of weight gradients and SHARES * SHARE_TILES * MESSAGE_TILE rows of dz, 11 MB at 128 channels.
+ * Memory: at most ROUND_TASKS sums of weight gradients and ROUND_TASKS * TASK_TILES * MESSAGE_TILE rows of dz, 11 MB at 128 channels.
  */
 #include "ast.h"
 #include "weight_panels.h"
@@ -22,8 +22,8 @@
 #include "simd.h"
 
 enum {
-  SHARES = 16,
-  SHARE_TILES = 10, /* of a task of a round */
+  ROUND_TASKS = 16,
+  TASK_TILES = 10, /* of a task of a round */
   PARTS = 8,
   ROWS_AHEAD = 6 /* edges by which prefetching runs ahead */
 };
@@ -38,26 +38,25 @@ typedef struct {
   message_weights w;
   const float *dsum, *dmessages;
   const ast_message_gradients *out;
-  float *W2, *A2, *A1;              /* in panels, as the products with dy, dz and dc read them */
-  float *dz;                        /* of the edges of this round, rows w.row apart */
-  float *shares;                    /* [SHARES] */
-  int64_t *part_offsets;            /* [tasks, PARTS + 1] places in by_part */
-  int32_t *by_part;                 /* the edges of each task, less `begin`, by the part of their sender */
-  int64_t share_size, tasks, edges; /* floats of a share; tasks of a round; edges of a task */
-  int64_t begin, end;               /* the edges of this round */
+  float *dz;                  /* of the edges of this round, rows w.row apart */
+  float *partials;            /* the sums of each task of a round */
+  int64_t *part_offsets;      /* [tasks, PARTS + 1] places in by_part */
+  int32_t *by_part;           /* the edges of each task, less `begin`, by the part of their sender */
+  int64_t size, tasks, edges; /* floats of the sums of a task; tasks of a round; edges of a task */
+  int64_t begin, end;         /* the edges of this round */
 } message_backward_job;
 
-static int64_t message_sums_size(const ast_message *s) {
-  const int64_t H = round_up(s->H, VW), F = round_up(s->F, VW), F2 = round_up(s->F2, VW);
-  return round_up(s->F2 * F + s->F * H + s->E * H + 3 * F2 + H, 16);
+static int64_t message_sums_size(const ast_message *step) {
+  const int64_t H = round_up(step->H, VW), F = round_up(step->F, VW), F2 = round_up(step->F2, VW);
+  return round_up(step->F2 * F + step->F * H + step->E * H + 3 * F2 + H, 16);
 }
 
-static message_sums message_sums_at(const ast_message *s, float *memory) {
-  const int64_t H = round_up(s->H, VW), F = round_up(s->F, VW), F2 = round_up(s->F2, VW);
+static message_sums message_sums_at(const ast_message *step, float *memory) {
+  const int64_t H = round_up(step->H, VW), F = round_up(step->F, VW), F2 = round_up(step->F2, VW);
   message_sums sums = {.W2 = memory};
-  sums.A2 = sums.W2 + s->F2 * F;
-  sums.A1 = sums.A2 + s->F * H;
-  sums.b2 = sums.A1 + s->E * H;
+  sums.A2 = sums.W2 + step->F2 * F;
+  sums.A1 = sums.A2 + step->F * H;
+  sums.b2 = sums.A1 + step->E * H;
   sums.gamma = sums.b2 + F2;
   sums.beta = sums.gamma + F2;
   sums.a1 = sums.beta + F2;
@@ -67,7 +66,7 @@ static message_sums message_sums_at(const ast_message *s, float *memory) {
 
 /* Sorts the edges of a task by the part of their sender, in stored order within each. */
 static void message_sort_by_part(const message_backward_job *job, int64_t begin, int64_t end, int64_t *part_offsets) {
-  const int64_t *senders = job->w.s->senders;
+  const int64_t *senders = job->w.step->senders;
   int64_t next[PARTS] = {0};
   for (int64_t m = begin; m < end; m++) next[senders[m] % PARTS]++;
   part_offsets[0] = begin - job->begin;
@@ -78,67 +77,56 @@ static void message_sort_by_part(const message_backward_job *job, int64_t begin,
   for (int64_t m = begin; m < end; m++) job->by_part[next[senders[m] % PARTS]++] = (int32_t)(m - job->begin);
 }
 
-/* y becomes dy. Sums over the tile are added to those of the share at its end: shorter sums are more exact. */
-static void message_norm_backward(const message_backward_job *job, int64_t first, int64_t n, const message_tile *t,
-                                  const message_sums *sums) {
-  const ast_message *s = job->w.s;
-  const int64_t F2 = s->F2, row = job->w.row;
-  float *dgamma = t->columns, *dbeta = dgamma + row, *db2 = dbeta + row, *p_i = db2 + row;
-  memset(dgamma, 0, (size_t)(3 * row) * sizeof *dgamma);
+/* y becomes dy. Sums over the tile are added to those of the task at its end: shorter sums are more exact. */
+AST_INLINE void message_norm_backward(const message_backward_job *job, int64_t first, int64_t n, const message_tile *t,
+                                      const message_sums *sums, const bool whole) {
+  const ast_message *step = job->w.step;
+  const int64_t F2 = step->F2, row = job->w.row;
+  memset(t->columns.dgamma, 0, (size_t)row * sizeof(float));
+  memset(t->columns.dbeta, 0, (size_t)row * sizeof(float));
   for (int64_t i = 0; i < n; i++) {
     float *y = t->y + i * row;
-    const float *dsum = job->dsum + s->receivers[first + i] * F2;
     const float *dmessage = job->dmessages ? job->dmessages + (first + i) * F2 : NULL;
-    const float inverse = message_center(F2, y);
-    vf total = {0}, along = {0};
-    for (int64_t c = 0; c < F2; c += VW) {
-      vf g = vload_upto(dsum + c, F2 - c);
-      if (dmessage) g += vload_upto(dmessage + c, F2 - c);
-      const vf u = vload(y + c) * inverse, p = g * vload_upto(s->gamma + c, F2 - c);
-      vstore(y + c, u);
-      vstore(p_i + c, p); /* not computed twice: fused into the difference below it would not cancel */
-      total += p;
-      along += p * u;
-      vstore(dbeta + c, vload(dbeta + c) + g);
-      vstore(dgamma + c, vload(dgamma + c) + g * u);
-    }
-    const float mean_p = vsum(total) / (float)F2, mean_pu = vsum(along) / (float)F2;
-    for (int64_t c = 0; c < F2; c += VW) {
-      const vf dy = (vload(p_i + c) - mean_p - vload(y + c) * mean_pu) * inverse;
-      vstore(y + c, dy);
-      vstore(db2 + c, vload(db2 + c) + dy);
-    }
+    const float scale = norm_centre(y, F2, whole);
+    norm_backward(F2, whole, step->gamma, job->dsum + step->receivers[first + i] * F2, dmessage, scale, NULL, y, &t->columns);
   }
-  dense_add_rows(dgamma, row, 1, F2, sums->gamma);
-  dense_add_rows(dbeta, row, 1, F2, sums->beta);
-  dense_add_rows(db2, row, 1, F2, sums->b2);
+  dense_add_rows(t->columns.dgamma, 0, 1, F2, sums->gamma);
+  dense_add_rows(t->columns.dbeta, 0, 1, F2, sums->beta);
+  dense_add_rows(t->y, row, n, F2, sums->b2);
 }
 
 /* dz of the tile into the buffer, and the weight gradients added to `sums`, or put there if they are `fresh`. */
 static void message_tile_backward(const message_backward_job *job, int64_t first, int64_t n, bool fresh, const message_tile *t,
                                   const message_sums *sums) {
   const message_weights *w = &job->w;
-  const ast_message *s = w->s;
-  const int64_t H = round_up(s->H, VW), F = round_up(s->F, VW), E = s->E, row = w->row;
+  const ast_message *step = w->step;
+  const int64_t H = round_up(step->H, VW), F = round_up(step->F, VW), E = step->E, row = w->row;
   float *dz = job->dz + (first - job->begin) * row, *dy = t->y, *dc = t->y;
   message_layers(w, first, n, t);
-  message_norm_backward(job, first, n, t, sums);
-  gemm(s->F2, F, n, (gemm_a){dy, 1, row}, gemm_rows(t->x, row), sums->W2, F, !fresh);
-  message_layer(w, MESSAGE_W2_BACK, n, (gemm_a){dy, row, 1}, (dense_end){.out = dz, .out_row = row, .hidden = t->x, .hidden_row = row});
+  if (step->F2 % VW) message_norm_backward(job, first, n, t, sums, false);
+  else message_norm_backward(job, first, n, t, sums, true);
+  /* forward: y = W2 x + b2, so dW2 = dy x^T and dx = W2^T dy */
+  gemm(step->F2, F, n, (gemm_a){dy, 1, row}, t->x, row, sums->W2, F, !fresh);
+  dense_all(&w->layers[MESSAGE_W2_BACK], n, (gemm_a){dy, row, 1},
+            (dense_end){.out = dz, .out_row = row, .hidden = t->x, .hidden_row = row});
+  /* forward: x = relu(P + Q + e), so de = dz */
   float *de = job->out->edge_features;
-  for (int64_t i = 0; de && message_has_latents(s) && i < n; i++) memcpy(de + (first + i) * E, dz + i * row, (size_t)E * sizeof *de);
+  for (int64_t i = 0; de && message_has_latents(step) && i < n; i++) memcpy(de + (first + i) * E, dz + i * row, (size_t)E * sizeof *de);
   if (!H) return;
-  gemm(s->F, H, n, (gemm_a){dz, 1, row}, gemm_rows(t->h, row), sums->A2, H, !fresh);
-  message_layer(w, MESSAGE_A2_BACK, n, (gemm_a){dz, row, 1}, (dense_end){.out = dc, .out_row = row, .hidden = t->h, .hidden_row = row});
-  dense_add_rows(dc, row, n, s->H, sums->a1);
-  gemm(E, H, n, (gemm_a){s->edge_features + first * E, 1, E}, gemm_rows(dc, row), sums->A1, H, !fresh);
-  if (de) message_layer(w, MESSAGE_A1_BACK, n, (gemm_a){dc, row, 1}, (dense_end){.out = de + first * E, .out_row = E});
+  /* forward: x = relu(P + Q + A2 h), so dA2 = dz h^T and dh = A2^T dz */
+  gemm(step->F, H, n, (gemm_a){dz, 1, row}, t->h, row, sums->A2, H, !fresh);
+  dense_all(&w->layers[MESSAGE_A2_BACK], n, (gemm_a){dz, row, 1},
+            (dense_end){.out = dc, .out_row = row, .hidden = t->h, .hidden_row = row});
+  /* forward: h = relu(A1 e + a1), so da1 = dc, dA1 = dc e^T and de = A1^T dc */
+  dense_add_rows(dc, row, n, step->H, sums->a1);
+  gemm(E, H, n, (gemm_a){step->edge_features + first * E, 1, E}, dc, row, sums->A1, H, !fresh);
+  if (de) dense_all(&w->layers[MESSAGE_A1_BACK], n, (gemm_a){dc, row, 1}, (dense_end){.out = de + first * E, .out_row = E});
 }
 
 static ast_status message_backward_task(int64_t index, void *context) {
   const message_backward_job *job = context;
   const int64_t begin = job->begin + index * job->edges, end = min64(job->end, begin + job->edges);
-  const message_sums sums = message_sums_at(job->w.s, job->shares + index * job->share_size);
+  const message_sums sums = message_sums_at(job->w.step, job->partials + index * job->size);
   message_tile t;
   if (!message_new_tile(&job->w, &t)) return AST_NO_MEMORY;
   if (!job->begin) memset(sums.b2, 0, (size_t)(sums.end - sums.b2) * sizeof *sums.b2);
@@ -150,9 +138,9 @@ static ast_status message_backward_task(int64_t index, void *context) {
 
 /* dP of the senders of a part; the first round clears them before. */
 static void message_add_to_senders(const message_backward_job *job, int64_t part) {
-  const ast_message *s = job->w.s;
-  const int64_t F = s->F, *senders = s->senders + job->begin;
-  for (int64_t r = part; !job->begin && r < s->S; r += PARTS) memset(job->out->of_senders + r * F, 0, (size_t)F * sizeof(float));
+  const ast_message *step = job->w.step;
+  const int64_t F = step->F, *senders = step->senders + job->begin;
+  for (int64_t r = part; !job->begin && r < step->S; r += PARTS) memset(job->out->of_senders + r * F, 0, (size_t)F * sizeof(float));
   for (int64_t task = 0; task * job->edges < job->end - job->begin; task++) {
     const int64_t *offsets = job->part_offsets + task * (PARTS + 1), last = offsets[part + 1];
     for (int64_t i = offsets[part]; i < last; i++) {
@@ -163,35 +151,39 @@ static void message_add_to_senders(const message_backward_job *job, int64_t part
       }
       const float *dz = job->dz + job->by_part[i] * job->w.row;
       float *dP = job->out->of_senders + senders[job->by_part[i]] * F;
+      /* forward: z += P[sender] */
       for (int64_t c = 0; c < F; c += VW) vstore_upto(dP + c, vload_upto(dP + c, F - c) + vload(dz + c), F - c);
     }
   }
 }
 
 /* The first edge from m on that is not of the same receiver as the one before it. */
-static int64_t message_next_receiver(const ast_message *s, int64_t m) { return m == 0 ? 0 : s->receiver_offsets[s->receivers[m - 1] + 1]; }
+static int64_t message_next_receiver(const ast_message *step, int64_t m) {
+  return m == 0 ? 0 : step->receiver_offsets[step->receivers[m - 1] + 1];
+}
 
 /* dQ of the receivers whose first edge in this round is in a part of it. A row is cleared before its first edge of all, together
  * with those between it and the row before. */
 static void message_add_to_receivers(const message_backward_job *job, int64_t part) {
-  const ast_message *s = job->w.s;
-  const int64_t F = s->F, edges = job->end - job->begin;
+  const ast_message *step = job->w.step;
+  const int64_t F = step->F, edges = job->end - job->begin;
   int64_t begin = job->begin + part * edges / PARTS, end = job->begin + (part + 1) * edges / PARTS;
-  if (part) begin = message_next_receiver(s, begin);
-  if (part + 1 < PARTS) end = message_next_receiver(s, end);
+  if (part) begin = message_next_receiver(step, begin);
+  if (part + 1 < PARTS) end = message_next_receiver(step, end);
   for (int64_t m = begin; m < min64(end, job->end); m++) {
-    const int64_t r = s->receivers[m];
+    const int64_t r = step->receivers[m];
     const float *dz = job->dz + (m - job->begin) * job->w.row;
     float *dQ = job->out->of_receivers + r * F;
-    if (m == s->receiver_offsets[r]) {
-      const int64_t before = m ? s->receivers[m - 1] + 1 : 0;
+    if (m == step->receiver_offsets[r]) {
+      const int64_t before = m ? step->receivers[m - 1] + 1 : 0;
       memset(job->out->of_receivers + before * F, 0, (size_t)((r + 1 - before) * F) * sizeof *dQ);
     }
+    /* forward: z += Q[receiver] */
     for (int64_t c = 0; c < F; c += VW) vstore_upto(dQ + c, vload_upto(dQ + c, F - c) + vload(dz + c), F - c);
   }
-  if (end == s->M && part + 1 == PARTS) { /* receivers behind the last edge */
-    const int64_t before = s->M ? s->receivers[s->M - 1] + 1 : 0;
-    memset(job->out->of_receivers + before * F, 0, (size_t)((s->R - before) * F) * sizeof(float));
+  if (end == step->M && part + 1 == PARTS) { /* receivers behind the last edge */
+    const int64_t before = step->M ? step->receivers[step->M - 1] + 1 : 0;
+    memset(job->out->of_receivers + before * F, 0, (size_t)((step->R - before) * F) * sizeof(float));
   }
 }
 
@@ -204,55 +196,56 @@ static ast_status message_rows_task(int64_t index, void *context) {
 /* ---- all rounds ---- */
 
 static ast_status message_rounds(message_backward_job *job) {
-  const ast_message *s = job->w.s;
+  const ast_message *step = job->w.step;
   ast_status status = AST_OK;
   do { /* once even without edges, to clear dP and dQ */
-    job->end = min64(s->M, job->begin + job->tasks * job->edges);
-    const int64_t tasks = (job->end - job->begin + job->edges - 1) / job->edges;
+    job->end = min64(step->M, job->begin + job->tasks * job->edges);
+    const int64_t tasks = divide_up(job->end - job->begin, job->edges);
     status = ast_parallel(tasks, message_backward_task, job);
     if (status == AST_OK) status = ast_parallel(2 * PARTS, message_rows_task, job);
     job->begin = job->end;
-  } while (status == AST_OK && job->begin < s->M);
+  } while (status == AST_OK && job->begin < step->M);
   return status;
 }
 
-/* The sum of the shares, dA1 by way of its transpose. */
-static ast_status message_add_shares(const message_backward_job *job, float *dA1) {
-  const ast_message *s = job->w.s;
+/* The sum over the tasks, dA1 by way of its transpose. */
+static ast_status message_add_partials(const message_backward_job *job, float *dA1) {
+  const ast_message *step = job->w.step;
   const ast_message_gradients *out = job->out;
-  const message_sums at = message_sums_at(s, job->shares);
-  const int64_t H = round_up(s->H, VW), F = round_up(s->F, VW);
+  const message_sums at = message_sums_at(step, job->partials);
+  const int64_t H = round_up(step->H, VW), F = round_up(step->F, VW);
   const dense_sum sums[] = {
-      {out->W2, at.W2 - job->shares, s->F2, s->F, F},    {out->A2, at.A2 - job->shares, s->F, s->H, H},
-      {dA1, at.A1 - job->shares, s->E, s->H, H},         {out->b2, at.b2 - job->shares, 1, s->F2, 0},
-      {out->gamma, at.gamma - job->shares, 1, s->F2, 0}, {out->beta, at.beta - job->shares, 1, s->F2, 0},
-      {out->a1, at.a1 - job->shares, 1, s->H, 0},
+      {out->W2, at.W2 - job->partials, step->F2, step->F, F}, {out->A2, at.A2 - job->partials, step->F, step->H, H},
+      {dA1, at.A1 - job->partials, step->E, step->H, H},      {out->b2, at.b2 - job->partials, 1, step->F2, 0},
+      {out->gamma, at.gamma - job->partials, 1, step->F2, 0}, {out->beta, at.beta - job->partials, 1, step->F2, 0},
+      {out->a1, at.a1 - job->partials, 1, step->H, 0},
   };
-  const ast_status status = dense_add_partials((dense_sum_job){job->shares, job->share_size, job->tasks, sums, 7});
-  for (int64_t h = 0; status == AST_OK && h < s->H; h++)
-    for (int64_t i = 0; i < s->E; i++) out->A1[h * s->E + i] = dA1[i * s->H + h];
+  const ast_status status = dense_add_partials((dense_sum_job){job->partials, job->size, job->tasks, sums, 7});
+  for (int64_t h = 0; status == AST_OK && h < step->H; h++)
+    for (int64_t i = 0; i < step->E; i++) out->A1[h * step->E + i] = dA1[i * step->H + h];
   return status;
 }
 
-static ast_status message_backward(const ast_message *s, const float *restrict dsum, const float *restrict dmessages,
+static ast_status message_backward(const ast_message *step, const float *restrict dsum, const float *restrict dmessages,
                                    const ast_message_gradients *out) {
-  message_backward_job job = {.dsum = dsum, .dmessages = dmessages, .out = out, .share_size = message_sums_size(s)};
-  ast_status status = message_pack(s, true, &job.w);
+  AST_SCRATCH_SCOPE;
+  message_backward_job job = {.dsum = dsum, .dmessages = dmessages, .out = out, .size = message_sums_size(step)};
+  ast_status status = message_pack(step, true, &job.w);
   if (status != AST_OK) return status;
-  const int64_t tiles = max64(1, (s->M + MESSAGE_TILE - 1) / MESSAGE_TILE), most = SHARES * SHARE_TILES, rounds = (tiles + most - 1) / most;
-  const int64_t of_round = (tiles + rounds - 1) / rounds, of_task = (of_round + SHARES - 1) / SHARES;
+  const int64_t tiles = max64(1, divide_up(step->M, MESSAGE_TILE)), most = ROUND_TASKS * TASK_TILES, rounds = divide_up(tiles, most);
+  const int64_t of_round = divide_up(tiles, rounds), of_task = divide_up(of_round, ROUND_TASKS);
   job.edges = MESSAGE_TILE * of_task;
-  job.tasks = (of_round + of_task - 1) / of_task;
+  job.tasks = divide_up(of_round, of_task);
 
-  const int64_t round = job.tasks * job.edges, shares = job.tasks * job.share_size, dz = round * job.w.row, dA1 = s->E * s->H;
+  const int64_t round = job.tasks * job.edges, partials = job.tasks * job.size, dz = round * job.w.row, dA1 = step->E * step->H;
   const int64_t offsets = round_up(job.tasks * (PARTS + 1), 8);
   job.part_offsets =
-      ast_scratch(7, offsets * (int64_t)sizeof(int64_t) + (shares + dz + dA1) * (int64_t)sizeof(float) + round * (int64_t)sizeof(int32_t));
+      ast_scratch(offsets * (int64_t)sizeof(int64_t) + (partials + dz + dA1) * (int64_t)sizeof(float) + round * (int64_t)sizeof(int32_t));
   if (!job.part_offsets) return AST_NO_MEMORY;
-  job.shares = (float *)(job.part_offsets + offsets);
-  job.dz = job.shares + shares;
+  job.partials = (float *)(job.part_offsets + offsets);
+  job.dz = job.partials + partials;
   job.by_part = (int32_t *)(job.dz + dz + dA1);
-  if (!s->M) memset(job.shares, 0, (size_t)shares * sizeof *job.shares);
+  if (!step->M) memset(job.partials, 0, (size_t)partials * sizeof *job.partials);
   status = message_rounds(&job);
-  return status == AST_OK ? message_add_shares(&job, job.dz + dz) : status;
+  return status == AST_OK ? message_add_partials(&job, job.dz + dz) : status;
 }

@@ -1,19 +1,98 @@
 /* The Python module ast_sim._C: every function checks its arguments (arguments.h), then calls a kernel with the GIL released. */
-#include "arguments.h"
-#include "module_cells.h"
-#include "module_layers.h"
+#include "module_kernels.h"
+
+/* ---- kernels ---- */
+
+static PyObject *call_kernel(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  const binding *b = PyCapsule_GetPointer(self, NULL);
+  if (!b) return NULL;
+  call c;
+  c.name = b->name;
+  c.spec = &b->spec;
+  c.taken = 0;
+  PyObject *result = NULL;
+  ast_status status;
+  if (take(&c, objects, num) && (!b->check || b->check(&c))) {
+    if (b->result) result = b->result(&c);
+    else if (run(&c, b->run, NULL, &status)) Py_INCREF(result = Py_None);
+  }
+  release(&c);
+  return result;
+}
+
+/* A new array with the values of this one, which kernels trust from now on (frozen.h). Or the same object if there is nothing to do: it is
+ * such a one already, has no values, or is nothing that a kernel reads as indices in place. */
+static PyObject *freeze_one(PyObject *object) {
+  view v;
+  if (!view_of(object, &v) || v.type != INTS || v.ndim < 1 || v.ndim > MAX_SHAPE || !is_dense(&v)) return Py_INCREF(object), object;
+  const int64_t bytes = view_size(&v) * v.item;
+  if (!bytes || find_frozen(v.data, bytes)) return Py_INCREF(object), object;
+  frozen *f = new_frozen(bytes);
+  if (!f) return NULL;
+  memcpy(f->hidden, v.data, (size_t)bytes);
+  show(f);
+  return array_of(f, v.ndim, v.shape);
+}
+
+static PyObject *freeze(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  PyObject *tuple = PyTuple_New(num);
+  for (Py_ssize_t i = 0; tuple && i < num; i++) {
+    PyObject *array = freeze_one(objects[i]);
+    if (!array || PyTuple_SetItem(tuple, i, array)) Py_CLEAR(tuple);
+  }
+  return tuple;
+}
+
+static PyMethodDef kernel_methods[sizeof bindings / sizeof *bindings];
+
+static binding *find_binding(const char *name) {
+  for (size_t i = 0; i < sizeof bindings / sizeof *bindings; i++)
+    if (!strcmp(bindings[i].name, name)) return &bindings[i];
+  return NULL;
+}
+
+/* Whether the spec names the parameters that the call of the kernel reads, in this order: "x, weight, out". */
+static bool names_match(const spec *s, const char *parameters) {
+  for (int i = 0; i < s->num; i++) {
+    const size_t length = strlen(s->parameters[i].name);
+    if (i && strncmp(parameters, ", ", 2) != 0) return false;
+    parameters += i ? 2 : 0;
+    if (strncmp(parameters, s->parameters[i].name, length) != 0) return false;
+    parameters += length;
+  }
+  return !*parameters;
+}
+
+/* declare(name, spec) adds the function of a kernel to the module. */
+static PyObject *declare(PyObject *module, PyObject *arguments) {
+  const char *name;
+  PyObject *parameters;
+  if (!PyArg_ParseTuple(arguments, "sO", &name, &parameters)) return NULL;
+  binding *b = find_binding(name);
+  if (!b) return PyErr_Format(PyExc_ValueError, "declare: there is no kernel %s", name);
+  if (!read_spec(parameters, value_checks, &b->spec) || !names_match(&b->spec, b->parameters)) {
+    PyErr_Clear();
+    return PyErr_Format(PyExc_ValueError, "declare: %s takes (%s), its spec says something else", name, b->parameters);
+  }
+  PyMethodDef *method = &kernel_methods[b - bindings];
+  *method = (PyMethodDef){b->name, (PyCFunction)(void (*)(void))call_kernel, METH_FASTCALL, b->parameters};
+  PyObject *self = PyCapsule_New(b, NULL, NULL), *function = self ? PyCFunction_NewEx(method, self, NULL) : NULL;
+  const bool added = function && PyObject_SetAttrString(module, name, function) == 0;
+  Py_XDECREF(self);
+  Py_XDECREF(function);
+  if (!added) return NULL;
+  Py_RETURN_NONE;
+}
 
 /* ---- the process ---- */
 
 /* The addresses of torch_parallel_for and torch_get_num_threads. */
-static PyObject *set_pool(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+static PyObject *set_pool(PyObject *self, PyObject *arguments) {
   (void)self;
-  call c;
-  if (!start(&c, "set_pool", objects, num, 2)) return NULL;
-  const uintptr_t parallel_for = (uintptr_t)PyLong_AsUnsignedLongLong(objects[0]);
-  const uintptr_t num_threads = (uintptr_t)PyLong_AsUnsignedLongLong(objects[1]);
-  if (PyErr_Occurred()) return NULL;
-  ast_set_pool((ast_parallel_for)parallel_for, (ast_num_threads)num_threads);
+  unsigned long long parallel_for, num_threads;
+  if (!PyArg_ParseTuple(arguments, "KK", &parallel_for, &num_threads)) return NULL;
+  ast_set_pool((ast_parallel_for)(uintptr_t)parallel_for, (ast_num_threads)(uintptr_t)num_threads);
   Py_RETURN_NONE;
 }
 
@@ -24,12 +103,10 @@ static PyObject *keep_memory(PyObject *self, PyObject *unused) {
 
 static PyObject *configuration(PyObject *self, PyObject *unused) {
   (void)self, (void)unused;
-  static const char *const names[] = {"base", "avx2", "avx512"};
   PyObject *supported = PyList_New(0);
-  for (int i = 0; supported && i < 3; i++) {
-    if (!ast_select(names[i])) continue;
-    PyObject *name = PyUnicode_FromString(names[i]);
-    if (!name || PyList_Append(supported, name)) Py_CLEAR(supported);
+  for (int i = 0; supported && ast_supported(i); i++) {
+    PyObject *name = PyUnicode_FromString(ast_supported(i)->isa);
+    if (!name || PyList_Insert(supported, 0, name)) Py_CLEAR(supported);
     Py_XDECREF(name);
   }
   if (!supported) return NULL;
@@ -37,44 +114,10 @@ static PyObject *configuration(PyObject *self, PyObject *unused) {
                        debug ? Py_True : Py_False);
 }
 
-#define FAST(name, text) {#name, (PyCFunction)(void (*)(void))name, METH_FASTCALL, text}
-
 static PyMethodDef methods[] = {
-    FAST(segment_sum, "segment_sum(x, node_order, node_offsets, mean, out)"),
-    FAST(segment_spread, "segment_spread(dout, node_order, node_offsets, mean, dx)"),
-    FAST(elastic_forces, "elastic_forces(position, rest_position, lame, elements, node_order, node_offsets, force)"),
-    FAST(elastic_forces_backward,
-         "elastic_forces_backward(dforce, position, rest_position, lame, elements, node_order, node_offsets, dposition)"),
-    FAST(octree_build,
-         "octree_build(positions, offsets, cx, cy, cz, half_width, depth, keys, cell_offsets, node_cell, node_order, "
-         "node_offsets)"),
-    FAST(octree_coordinates, "octree_coordinates(keys, coordinates)"),
-    FAST(octree_coarsen, "octree_coarsen(keys, cell_offsets, levels) -> list of nine arrays a level"),
-    FAST(farthest_point_sample, "farthest_point_sample(coordinates, offsets, num) -> (indices, out_offsets)"),
-    FAST(sparse_conv, "sparse_conv(x, weight, bias, transposed, pair_offsets, source, destination, out)"),
-    FAST(sparse_conv_weight, "sparse_conv_weight(x, dout, pair_offsets, source, destination, dweight)"),
-    FAST(attention, "attention(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, out, maximum, sum)"),
-    FAST(attention_backward,
-         "attention_backward(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, out, maximum, sum, dout, dq, "
-         "dk, dv)"),
-    FAST(message,
-         "message(of_senders, of_receivers, edge_features, A1, a1, A2, W2, b2, gamma, beta, senders, receivers, receiver_offsets, "
-         "sum, messages)"),
-    FAST(message_backward,
-         "message_backward(of_senders, of_receivers, edge_features, A1, a1, A2, W2, b2, gamma, beta, senders, receivers, "
-         "receiver_offsets, dsum, dmessages, then the gradients in the order of the inputs)"),
-    FAST(linear, "linear(x, weight, bias, residual, activation, out, z); bias, residual and z may be None"),
-    FAST(linear_backward,
-         "linear_backward(x, weight, bias, z, activation, dout, dx, dweight, dbias); bias, z and the gradients that are not wanted may be "
-         "None"),
-    FAST(column_sum, "column_sum(x, out)"),
-    FAST(mlp,
-         "mlp(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual, out, hidden, normalized, scale); all but x, the weights "
-         "and out may be None"),
-    FAST(mlp_backward,
-         "mlp_backward(x, beside, weight1, bias1, weight2, bias2, gamma, beta, dout, hidden, normalized, scale, dx, dbeside, dweight1, "
-         "dbias1, dweight2, dbias2, dgamma, dbeta); all but x, the weights and dout may be None"),
-    FAST(set_pool, "set_pool(parallel_for, num_threads): addresses of torch's thread pool, 0 for serial"),
+    {"declare", declare, METH_VARARGS, "declare(name, spec): adds the kernel of this name, which takes what the spec says."},
+    {"freeze", (PyCFunction)(void (*)(void))freeze, METH_FASTCALL, "freeze(*indices): copies that kernels trust, or those that are such."},
+    {"set_pool", set_pool, METH_VARARGS, "set_pool(parallel_for, num_threads): addresses of torch's thread pool, 0 for serial."},
     {"keep_memory", keep_memory, METH_NOARGS, "Let the C library keep freed blocks; whether it had an effect."},
     {"configuration", configuration, METH_NOARGS, "The chosen instruction set, the supported ones, the threads, the debug mode."},
     {NULL, NULL, 0, NULL},

@@ -4,8 +4,7 @@
  * cells of any aligned cube of 2^m cells a side are a contiguous run of the sorted keys.
  *
  * Work is cut into fixed chunks of the flat arrays, whatever the scenes, and every result is an integer that does not depend on the
- * chunks. Scratch: slots 1 and 2 of the calling thread hold the keys being sorted and the other half of the sort, then the counts of
- * the chunks; slot 3 of each thread holds the histograms of its sort.
+ * chunks.
  */
 #include <math.h>
 
@@ -14,18 +13,7 @@
 
 enum { OCTREE_CHUNK = 1 << 13, OCTREE_TILE = 64 };
 
-static int64_t octree_chunks(int64_t n) { return (n + OCTREE_CHUNK - 1) / OCTREE_CHUNK; }
-
-/* The scene of row i: the last b with offsets[b] <= i. */
-static int64_t octree_scene_of(const int64_t *offsets, int64_t B, int64_t i) {
-  int64_t low = 0, high = B;
-  while (high - low > 1) {
-    const int64_t middle = (low + high) / 2;
-    if (offsets[middle] <= i) low = middle;
-    else high = middle;
-  }
-  return low;
-}
+static int64_t octree_chunks(int64_t n) { return divide_up(n, OCTREE_CHUNK); }
 
 /* The number of bits of n. */
 static int octree_bits(uint64_t n) {
@@ -65,11 +53,11 @@ typedef struct {
 } octree_key_job;
 
 /* u = (p - center + half_width) / (2 half_width), which is in [0, 1] inside the cube. */
-static ast_status octree_check_node(const octree_key_job *s, int64_t n) {
+static ast_status octree_check_node(const octree_key_job *job, int64_t n) {
   ast_status status = AST_OK;
   for (int a = 0; a < 3; a++) {
-    const float p = s->positions[3 * n + a];
-    const double u = (p - s->center[a] + s->half_width) / (2 * s->half_width);
+    const float p = job->positions[3 * n + a];
+    const double u = (p - job->center[a] + job->half_width) / (2 * job->half_width);
     if (!isfinite(p)) return AST_NOT_FINITE;
     if (!(u >= -1e-6 && u <= 1 + 1e-6)) status = AST_OUTSIDE;
   }
@@ -79,17 +67,17 @@ static ast_status octree_check_node(const octree_key_job *s, int64_t n) {
 /* min(floor(u 2^depth), 2^depth - 1) = floor(min(u 2^depth, 2^depth - 1)), and truncation is floor above 0: so the clamp comes
  * first, in double, and no value overflows the conversion, not even NaN. */
 static ast_status octree_key_task(int64_t index, void *context) {
-  const octree_key_job *s = context;
-  const int64_t end = min64(s->N, (index + 1) * OCTREE_CHUNK);
-  const double cells = (double)(1 << s->depth), last = cells - 1, h = s->half_width, width = 2 * h;
+  const octree_key_job *job = context;
+  const int64_t end = min64(job->N, (index + 1) * OCTREE_CHUNK);
+  const double cells = (double)(1 << job->depth), last = cells - 1, h = job->half_width, width = 2 * h;
   double center[3 * OCTREE_TILE];
   int32_t cell[3 * OCTREE_TILE];
   uint64_t x[OCTREE_TILE], y[OCTREE_TILE], z[OCTREE_TILE];
   int64_t inside = -1;
-  for (int i = 0; i < 3 * OCTREE_TILE; i++) center[i] = s->center[i % 3];
+  for (int i = 0; i < 3 * OCTREE_TILE; i++) center[i] = job->center[i % 3];
   for (int64_t begin = index * OCTREE_CHUNK; begin < end; begin += OCTREE_TILE) {
     const int num = (int)min64(OCTREE_TILE, end - begin);
-    const float *p = s->positions + 3 * begin;
+    const float *p = job->positions + 3 * begin;
     for (int i = 0; i < 3 * num; i++) {
       const double u = (p[i] - center[i] + h) / width;
       inside &= u >= -1e-6 && u <= 1 + 1e-6 ? -1 : 0;
@@ -103,7 +91,7 @@ static ast_status octree_key_task(int64_t index, void *context) {
       y[i] = (uint64_t)cell[3 * i + 1];
       z[i] = (uint64_t)cell[3 * i + 2];
     }
-    uint64_t *key = s->keys + begin;
+    uint64_t *key = job->keys + begin;
     for (int i = 0; i < num; i++) key[i] = octree_spread(x[i]) << 2 | octree_spread(y[i]) << 1 | octree_spread(z[i]);
   }
   return inside ? AST_OK : AST_OUTSIDE;
@@ -116,10 +104,10 @@ typedef struct {
 } octree_coordinates_job;
 
 static ast_status octree_coordinates_task(int64_t index, void *context) {
-  const octree_coordinates_job *s = context;
-  for (int64_t c = index * OCTREE_CHUNK; c < min64(s->C, (index + 1) * OCTREE_CHUNK); c++) {
-    const uint64_t key = (uint64_t)s->keys[c];
-    for (int a = 0; a < 3; a++) s->coordinates[3 * c + a] = (int32_t)octree_gather(key >> (2 - a));
+  const octree_coordinates_job *job = context;
+  for (int64_t c = index * OCTREE_CHUNK; c < min64(job->C, (index + 1) * OCTREE_CHUNK); c++) {
+    const uint64_t key = (uint64_t)job->keys[c];
+    for (int a = 0; a < 3; a++) job->coordinates[3 * c + a] = (int32_t)octree_gather(key >> (2 - a));
   }
   return AST_OK;
 }
@@ -156,11 +144,11 @@ AST_INLINE void octree_scatter(const uint64_t *keys, const uint64_t *nodes, uint
 AST_INLINE ast_status octree_radix_sort(uint64_t *keys, uint64_t *nodes, uint64_t *keys_other, uint64_t *nodes_other, int64_t n, int low,
                                         int high, const bool packed) {
   const int max_digit = n < 1 << 12 ? 8 : n < 1 << 20 ? OCTREE_MAX_DIGIT : 9;
-  const int passes = (high - low + max_digit - 1) / max_digit;
+  const int passes = (int)divide_up(high - low, max_digit);
   if (!passes) return AST_OK;
-  const int digit = (high - low + passes - 1) / passes;
+  const int digit = (int)divide_up(high - low, passes);
   const uint64_t mask = (1ull << digit) - 1;
-  int64_t *count = ast_scratch(3, OCTREE_HISTOGRAM * (int64_t)sizeof *count);
+  int64_t *count = ast_scratch(OCTREE_HISTOGRAM * (int64_t)sizeof *count);
   if (!count) return AST_NO_MEMORY;
   memset(count, 0, sizeof *count * (size_t)passes << digit);
   for (int64_t i = 0; i < n; i++)
@@ -191,20 +179,20 @@ AST_INLINE ast_status octree_radix_sort(uint64_t *keys, uint64_t *nodes, uint64_
 }
 
 static ast_status octree_sort_task(int64_t b, void *context) {
-  const octree_sort_job *s = context;
-  const int64_t begin = s->offsets[b], n = s->offsets[b + 1] - begin;
+  const octree_sort_job *job = context;
+  const int64_t begin = job->offsets[b], n = job->offsets[b + 1] - begin;
   if (n == 0) return AST_OK;
-  uint64_t *keys = s->keys + begin, *other = s->other + begin, differ = 0;
+  uint64_t *keys = job->keys + begin, *other = job->other + begin, differ = 0;
   for (int64_t i = 0; i < n; i++) differ |= keys[i] ^ keys[0];
   int low = 0;
   while (differ && !(differ >> low & 1)) low++;
   const int high = octree_bits(differ);
-  if (s->packed) {
-    for (int64_t i = 0; i < n; i++) keys[i] = keys[i] << s->index_bits | (uint64_t)i;
-    return octree_radix_sort(keys, NULL, other, NULL, n, low + s->index_bits, high + s->index_bits, true);
+  if (job->packed) {
+    for (int64_t i = 0; i < n; i++) keys[i] = keys[i] << job->index_bits | (uint64_t)i;
+    return octree_radix_sort(keys, NULL, other, NULL, n, low + job->index_bits, high + job->index_bits, true);
   }
-  for (int64_t i = 0; i < n; i++) keys[s->N + i] = (uint64_t)i;
-  return octree_radix_sort(keys, keys + s->N, other, other + s->N, n, low, high, false);
+  for (int64_t i = 0; i < n; i++) keys[job->N + i] = (uint64_t)i;
+  return octree_radix_sort(keys, keys + job->N, other, other + job->N, n, low, high, false);
 }
 
 /* ---- runs of equal keys ---- */
@@ -220,30 +208,30 @@ typedef struct {
 } octree_run_job;
 
 /* Of the rows begin..end-1, in one scene, those that start a run; the scene starts at `first`. */
-AST_INLINE int octree_heads(const octree_run_job *s, int64_t begin, int64_t end, int64_t first, int32_t *heads) {
+AST_INLINE int octree_heads(const octree_run_job *job, int64_t begin, int64_t end, int64_t first, int32_t *heads) {
   int num = 0;
   for (int64_t i = begin; i < end; i++) {
     heads[num] = (int32_t)(i - begin);
-    num += i == first || s->sorted[i] >> s->shift != s->sorted[i - 1] >> s->shift;
+    num += i == first || job->sorted[i] >> job->shift != job->sorted[i - 1] >> job->shift;
   }
   return num;
 }
 
-AST_INLINE void octree_runs_of_chunk(const octree_run_job *s, int64_t chunk, const bool write) {
-  const int64_t end = min64(s->N, (chunk + 1) * OCTREE_CHUNK);
-  int64_t b = octree_scene_of(s->offsets, s->B, chunk * OCTREE_CHUNK), run = write ? s->chunk_runs[chunk] : 0;
+AST_INLINE void octree_runs_of_chunk(const octree_run_job *job, int64_t chunk, const bool write) {
+  const int64_t end = min64(job->N, (chunk + 1) * OCTREE_CHUNK);
+  int64_t b = scene_at(job->offsets, job->B, chunk * OCTREE_CHUNK), run = write ? job->chunk_runs[chunk] : 0;
   int32_t heads[OCTREE_TILE];
   for (int64_t i = chunk * OCTREE_CHUNK, next; i < end; i = next) {
-    while (s->offsets[b + 1] <= i) b++;
-    next = min64(min64(end, s->offsets[b + 1]), i + OCTREE_TILE);
-    const int num = octree_heads(s, i, next, s->offsets[b], heads);
+    while (job->offsets[b + 1] <= i) b++;
+    next = min64(min64(end, job->offsets[b + 1]), i + OCTREE_TILE);
+    const int num = octree_heads(job, i, next, job->offsets[b], heads);
     for (int j = 0; write && j < num; j++) {
-      s->keys[run + j] = (int64_t)(s->sorted[i + heads[j]] >> s->shift);
-      s->starts[run + j] = i + heads[j];
+      job->keys[run + j] = (int64_t)(job->sorted[i + heads[j]] >> job->shift);
+      job->starts[run + j] = i + heads[j];
     }
     run += num;
   }
-  if (!write) s->chunk_runs[chunk] = run;
+  if (!write) job->chunk_runs[chunk] = run;
 }
 
 static ast_status octree_count_runs_task(int64_t chunk, void *context) {
@@ -260,7 +248,7 @@ static ast_status octree_write_runs_task(int64_t chunk, void *context) {
 static ast_status octree_runs(const uint64_t *sorted, int shift, const int64_t *offsets, int64_t B, int64_t *keys, int64_t *starts,
                               int64_t *run_offsets) {
   const int64_t N = offsets[B], chunks = octree_chunks(N);
-  octree_run_job job = {sorted, shift, offsets, B, N, ast_scratch(2, (chunks + 1) * (int64_t)sizeof(int64_t)), keys, starts};
+  octree_run_job job = {sorted, shift, offsets, B, N, ast_scratch((chunks + 1) * (int64_t)sizeof(int64_t)), keys, starts};
   if (!job.chunk_runs) return AST_NO_MEMORY;
   ast_parallel(chunks, octree_count_runs_task, &job);
   int64_t runs = 0;
@@ -271,14 +259,7 @@ static ast_status octree_runs(const uint64_t *sorted, int shift, const int64_t *
   }
   ast_parallel(chunks, octree_write_runs_task, &job);
   starts[runs] = N;
-  for (int64_t b = 0, low = 0; b <= B; b++) {
-    for (int64_t high = runs; low < high;) {
-      const int64_t middle = (low + high) / 2;
-      if (starts[middle] < offsets[b]) low = middle + 1;
-      else high = middle;
-    }
-    run_offsets[b] = low;
-  }
+  for (int64_t b = 0, run = 0; b <= B; b++) run_offsets[b] = run = lower_bound(starts, run, runs, offsets[b]);
   return AST_OK;
 }
 
@@ -292,18 +273,18 @@ typedef struct {
 } octree_node_job;
 
 static ast_status octree_node_task(int64_t chunk, void *context) {
-  const octree_node_job *s = context;
-  const octree_sort_job *sort = s->sort;
+  const octree_node_job *job = context;
+  const octree_sort_job *sort = job->sort;
   const uint64_t *index = sort->packed ? sort->keys : sort->keys + sort->N;
   const uint64_t mask = sort->packed ? (1ull << sort->index_bits) - 1 : UINT64_MAX;
-  const int64_t end = min64(s->C, (chunk + 1) * OCTREE_CHUNK);
-  int64_t b = octree_scene_of(s->cell_offsets, s->B, chunk * OCTREE_CHUNK);
+  const int64_t end = min64(job->C, (chunk + 1) * OCTREE_CHUNK);
+  int64_t b = scene_at(job->cell_offsets, job->B, chunk * OCTREE_CHUNK);
   for (int64_t c = chunk * OCTREE_CHUNK; c < end; c++) {
-    while (s->cell_offsets[b + 1] <= c) b++;
-    for (int64_t i = s->node_offsets[c]; i < s->node_offsets[c + 1]; i++) {
-      const int64_t node = s->offsets[b] + (int64_t)(index[i] & mask);
-      s->node_order[i] = node;
-      s->node_cell[node] = c;
+    while (job->cell_offsets[b + 1] <= c) b++;
+    for (int64_t i = job->node_offsets[c]; i < job->node_offsets[c + 1]; i++) {
+      const int64_t node = job->offsets[b] + (int64_t)(index[i] & mask);
+      job->node_order[i] = node;
+      job->node_cell[node] = c;
     }
   }
   return AST_OK;
@@ -313,6 +294,7 @@ static ast_status octree_build(const float *restrict positions, const int64_t *r
                                double half_width, int depth, int64_t *restrict keys, int64_t *restrict cell_offsets,
                                int64_t *restrict node_cell, int64_t *restrict node_order, int64_t *restrict node_offsets,
                                int64_t *bad_node) {
+  AST_SCRATCH_SCOPE;
   const int64_t N = offsets[B];
   memset(cell_offsets, 0, sizeof *cell_offsets * (size_t)(B + 1));
   node_offsets[0] = 0;
@@ -322,7 +304,7 @@ static ast_status octree_build(const float *restrict positions, const int64_t *r
   const int index_bits = octree_bits((uint64_t)(largest - 1));
   const bool packed = 3 * depth + index_bits <= 64;
   const int64_t bytes = (packed ? 1 : 2) * N * (int64_t)sizeof(uint64_t);
-  octree_sort_job sort = {offsets, N, index_bits, packed, ast_scratch(1, bytes), ast_scratch(2, bytes)};
+  octree_sort_job sort = {offsets, N, index_bits, packed, ast_scratch(bytes), ast_scratch(bytes)};
   if (!sort.keys || !sort.other) return AST_NO_MEMORY;
 
   octree_key_job key = {positions, N, center, half_width, depth, sort.keys};

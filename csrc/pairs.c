@@ -6,7 +6,7 @@
  *
  * The pairs of a group are written with P rising, by chunks of P whose places coarsen.c has counted. With d = 0 the fine cell is a child of
  * P and rises too, so the other order is the same. With d > 0 the fine cells of a group are marked in a bit map and read out of it in
- * order. Scratch: slot 3 of each thread holds the bit map and the place of each fine cell.
+ * order.
  */
 #include "ast.h"
 #include "simd.h"
@@ -19,21 +19,21 @@ typedef struct {
 
 static ast_status octree_write_pairs_task(int64_t chunk, void *context) {
   const octree_pair_job *job = context;
-  const ast_octree_level *s = job->level;
-  const int64_t begin = chunk * OCTREE_CHUNK, end = min64(s->C, begin + OCTREE_CHUNK);
+  const ast_octree_level *level = job->level;
+  const int64_t begin = chunk * OCTREE_CHUNK, end = min64(level->C, begin + OCTREE_CHUNK);
   int64_t next[OCTREE_GROUPS];
-  memcpy(next, s->pairs + OCTREE_GROUPS * chunk, sizeof next);
-  memcpy(job->keys + begin, s->keys + begin, (size_t)(end - begin) * sizeof *s->keys);
+  memcpy(next, level->pairs + OCTREE_GROUPS * chunk, sizeof next);
+  memcpy(job->keys + begin, level->keys + begin, (size_t)(end - begin) * sizeof *level->keys);
   for (int64_t P = begin; P < end; P++) {
-    int64_t f = job->first_child[P] = octree_first(s->families[P]);
-    for (unsigned octants = octree_octants(s->families[P]); octants; octants &= octants - 1, f++) {
+    int64_t f = job->first_child[P] = octree_first(level->families[P]);
+    for (unsigned octants = octree_octants(level->families[P]); octants; octants &= octants - 1, f++) {
       const int64_t to = next[octree_group(__builtin_ctz(octants))]++;
       job->fine[to] = job->fine_by_fine[to] = f;
       job->coarse[to] = job->coarse_by_fine[to] = job->node_cell[f] = P;
     }
-    for (uint64_t others = s->others[P]; others; others &= others - 1) {
+    for (uint64_t others = level->others[P]; others; others &= others - 1) {
       const int place = __builtin_ctzll(others);
-      const int64_t to = next[octree_group(place)]++, family = s->families[s->before[P][place >> 3]];
+      const int64_t to = next[octree_group(place)]++, family = level->families[level->before[P][place >> 3]];
       job->fine[to] = octree_first(family) + __builtin_popcount(octree_octants(family) & ((1u << (place & 7)) - 1));
       job->coarse[to] = P;
     }
@@ -44,11 +44,11 @@ static ast_status octree_write_pairs_task(int64_t chunk, void *context) {
 /* Sorts the pairs of group k, whose fine cells differ, by the fine cell. */
 static ast_status octree_sort_pairs_task(int64_t k, void *context) {
   const octree_pair_job *job = context;
-  const ast_octree_level *s = job->level;
-  const int64_t begin = s->pair_offsets[k], end = s->pair_offsets[k + 1], words = s->C_fine / 64 + 1;
+  const ast_octree_level *level = job->level;
+  const int64_t begin = level->pair_offsets[k], end = level->pair_offsets[k + 1], words = level->C_fine / 64 + 1;
   const bool sorted = k / 9 > 0 && k / 3 % 3 > 0 && k % 3 > 0; /* a, b and c are not -1: d = 0 */
   if (sorted || begin == end) return AST_OK;
-  uint64_t *marked = ast_scratch(3, 8 * words + 4 * s->C_fine);
+  uint64_t *marked = ast_scratch(8 * words + 4 * level->C_fine);
   if (!marked) return AST_NO_MEMORY;
   int32_t *place = (int32_t *)(marked + words);
   memset(marked, 0, 8 * (size_t)words);
@@ -65,12 +65,12 @@ static ast_status octree_sort_pairs_task(int64_t k, void *context) {
   return AST_OK;
 }
 
-static ast_status octree_write_level(const ast_octree_level *s, int64_t *restrict keys, int64_t *restrict offsets,
+static ast_status octree_write_level(const ast_octree_level *level, int64_t *restrict keys, int64_t *restrict offsets,
                                      int64_t *restrict first_child, int64_t *restrict node_cell, int64_t *restrict fine,
                                      int64_t *restrict coarse, int64_t *restrict fine_by_fine, int64_t *restrict coarse_by_fine) {
-  octree_pair_job job = {s, keys, first_child, node_cell, fine, coarse, fine_by_fine, coarse_by_fine};
-  memcpy(offsets, s->offsets, (size_t)(s->B + 1) * sizeof *offsets);
-  first_child[s->C] = s->C_fine;
-  ast_parallel(octree_chunks(s->C), octree_write_pairs_task, &job);
+  octree_pair_job job = {level, keys, first_child, node_cell, fine, coarse, fine_by_fine, coarse_by_fine};
+  memcpy(offsets, level->offsets, (size_t)(level->B + 1) * sizeof *offsets);
+  first_child[level->C] = level->C_fine;
+  ast_parallel(octree_chunks(level->C), octree_write_pairs_task, &job);
   return ast_parallel(OCTREE_GROUPS, octree_sort_pairs_task, &job);
 }

@@ -29,10 +29,12 @@ typedef struct {
 static void run(int64_t begin, int64_t end, void *context) {
   (void)begin, (void)end;
   job *j = context;
+  void *const mark = ast_scratch_mark();
   for (;;) {
     const int64_t i = atomic_fetch_add(&j->next, 1);
     if (i >= j->tasks) return;
     const ast_status status = j->task(i, j->context);
+    ast_scratch_release(mark);
     if (status == AST_OK) continue;
     const int64_t failure = i << 8 | (int64_t)status;
     int64_t known = atomic_load(&j->failed);

@@ -3,7 +3,8 @@
  *   row_panel:     out_i = base_i + sum_k A_ik B_kj     rows i of A and out by pointer, a panel of B packed (gemm.h)
  *   column_panel:  out_ij = base_ij + sum_k A_ki B_kj   rows k of A and B by pointer, out dense
  *
- * A strip has any number of rows i up to GEMM_ROWS, a panel up to GEMM_COLUMNS columns j. `base` is out itself or what it starts from (a
+ * A strip has any number of rows i up to GEMM_ROWS: tiles are cut evenly, since the cut of gemm.h costs 6 to 19 % where 48 pairs come
+ * at a time. A panel has up to GEMM_COLUMNS columns j. `base` is out itself or what it starts from (a
  * bias, nothing): so nothing is cleared beforehand, and no product is stored only to be added. The sum over k runs in order for each
  * element alone: its bits do not depend on the strip. Rows that are needed later are fetched a line at a time between the steps of the
  * sum: all at once they would fill the queue of cache misses, and the processor would wait for it.
@@ -17,7 +18,7 @@ enum { LINE = 16 }; /* floats in a cache line */
 _Static_assert(GEMM_ROWS <= 12 && GEMM_COLUMNS == 2 * VW, "a tile has at most 12 rows of 2 vectors");
 
 /* How many strips n rows are cut into, evenly. */
-AST_INLINE int64_t row_strips(int64_t n) { return (n + GEMM_ROWS - 1) / GEMM_ROWS; }
+AST_INLINE int64_t row_strips(int64_t n) { return divide_up(n, GEMM_ROWS); }
 
 #define ROW_CASES(call) \
   switch (rows) {       \

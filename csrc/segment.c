@@ -29,12 +29,12 @@ static segment_job segment_plan(const float *x, int64_t F, const int64_t *order,
 }
 
 /* `vectors` vectors of one segment from channel f on: all of a row is read at once, and rows that come later are fetched. */
-AST_INLINE void segment_columns(const int vectors, const segment_job *s, int64_t begin, int64_t end, int64_t f, float scale, float *out) {
+AST_INLINE void segment_columns(const int vectors, const segment_job *job, int64_t begin, int64_t end, int64_t f, float scale, float *out) {
   vf sum[SEGMENT_VECTORS];
 #pragma GCC unroll 8
   for (int v = 0; v < vectors; v++) sum[v] = (vf){0};
   for (int64_t j = begin; j < end; j++) {
-    const float *row = s->x + s->order[j] * s->F + f, *later = s->x + s->order[min64(j + SEGMENT_AHEAD, s->last)] * s->F + f;
+    const float *row = job->x + job->order[j] * job->F + f, *later = job->x + job->order[min64(j + SEGMENT_AHEAD, job->last)] * job->F + f;
 #pragma GCC unroll 8
     for (int v = 0; v < vectors; v++) {
       if (v * VW % 16 == 0) __builtin_prefetch(later + v * VW);
@@ -46,19 +46,19 @@ AST_INLINE void segment_columns(const int vectors, const segment_job *s, int64_t
 }
 
 static ast_status segment_sum_task(int64_t index, void *context) {
-  const segment_job *s = context;
-  const int64_t F = s->F;
-  for (int64_t c = index * s->rows; c < min64(s->C, (index + 1) * s->rows); c++) {
-    const int64_t begin = s->offsets[c], end = s->offsets[c + 1];
-    const float scale = s->mean && end > begin ? 1.0f / (float)(end - begin) : 1.0f;
-    float *out = s->out + c * F;
+  const segment_job *job = context;
+  const int64_t F = job->F;
+  for (int64_t c = index * job->rows; c < min64(job->C, (index + 1) * job->rows); c++) {
+    const int64_t begin = job->offsets[c], end = job->offsets[c + 1];
+    const float scale = job->mean && end > begin ? 1.0f / (float)(end - begin) : 1.0f;
+    float *out = job->out + c * F;
     int64_t f = 0;
-    for (; f + SEGMENT_VECTORS * VW <= F; f += SEGMENT_VECTORS * VW) segment_columns(SEGMENT_VECTORS, s, begin, end, f, scale, out);
-    for (; f + 4 * VW <= F; f += 4 * VW) segment_columns(4, s, begin, end, f, scale, out);
-    for (; f + VW <= F; f += VW) segment_columns(1, s, begin, end, f, scale, out);
+    for (; f + SEGMENT_VECTORS * VW <= F; f += SEGMENT_VECTORS * VW) segment_columns(SEGMENT_VECTORS, job, begin, end, f, scale, out);
+    for (; f + 4 * VW <= F; f += 4 * VW) segment_columns(4, job, begin, end, f, scale, out);
+    for (; f + VW <= F; f += VW) segment_columns(1, job, begin, end, f, scale, out);
     for (; f < F; f++) {
       float sum = 0;
-      for (int64_t j = begin; j < end; j++) sum += s->x[s->order[j] * F + f];
+      for (int64_t j = begin; j < end; j++) sum += job->x[job->order[j] * F + f];
       out[f] = sum * scale;
     }
   }
@@ -66,15 +66,15 @@ static ast_status segment_sum_task(int64_t index, void *context) {
 }
 
 static ast_status segment_spread_task(int64_t index, void *context) {
-  const segment_job *s = context;
-  const int64_t F = s->F;
-  for (int64_t c = index * s->rows; c < min64(s->C, (index + 1) * s->rows); c++) {
-    const int64_t begin = s->offsets[c], end = s->offsets[c + 1];
-    const float scale = s->mean && end > begin ? 1.0f / (float)(end - begin) : 1.0f;
+  const segment_job *job = context;
+  const int64_t F = job->F;
+  for (int64_t c = index * job->rows; c < min64(job->C, (index + 1) * job->rows); c++) {
+    const int64_t begin = job->offsets[c], end = job->offsets[c + 1];
+    const float scale = job->mean && end > begin ? 1.0f / (float)(end - begin) : 1.0f;
     for (int64_t j = begin; j < end; j++) {
-      const float *in = s->x + c * F;
-      float *out = s->out + s->order[j] * F;
-      for (int64_t f = 0; f < F; f++) out[f] = in[f] * scale;
+      const float *in = job->x + c * F;
+      float *out = job->out + job->order[j] * F;
+      for (int64_t f = 0; f < F; f++) out[f] = in[f] * scale; /* forward: out += scale x */
     }
   }
   return AST_OK;
@@ -83,13 +83,13 @@ static ast_status segment_spread_task(int64_t index, void *context) {
 static ast_status segment_sum(const float *restrict x, int64_t F, const int64_t *restrict node_order, const int64_t *restrict node_offsets,
                               int64_t C, bool mean, float *restrict out) {
   segment_job job = segment_plan(x, F, node_order, node_offsets, C, mean, out);
-  return ast_parallel((C + job.rows - 1) / job.rows, segment_sum_task, &job);
+  return ast_parallel(divide_up(C, job.rows), segment_sum_task, &job);
 }
 
 static ast_status segment_spread(const float *restrict dout, int64_t F, const int64_t *restrict node_order,
                                  const int64_t *restrict node_offsets, int64_t C, bool mean, float *restrict dx) {
   segment_job job = segment_plan(dout, F, node_order, node_offsets, C, mean, dx);
-  return ast_parallel((C + job.rows - 1) / job.rows, segment_spread_task, &job);
+  return ast_parallel(divide_up(C, job.rows), segment_spread_task, &job);
 }
 
 /* ---- the sum over all rows ---- */
@@ -109,15 +109,16 @@ static void add_rows(const float *restrict x, int64_t rows, int64_t F, float *re
 }
 
 static ast_status column_sum_task(int64_t index, void *context) {
-  const column_job *s = context;
+  const column_job *job = context;
   const int64_t first = index * COLUMN_ROWS;
-  add_rows(s->x + first * s->F, min64(COLUMN_ROWS, s->N - first), s->F, s->sums + index * s->F);
+  add_rows(job->x + first * job->F, min64(COLUMN_ROWS, job->N - first), job->F, job->sums + index * job->F);
   return AST_OK;
 }
 
 static ast_status column_sum(const float *restrict x, int64_t N, int64_t F, float *restrict out) {
-  const int64_t blocks = (N + COLUMN_ROWS - 1) / COLUMN_ROWS;
-  column_job job = {x, N, F, ast_scratch(6, blocks * F * (int64_t)sizeof *job.sums)};
+  AST_SCRATCH_SCOPE;
+  const int64_t blocks = divide_up(N, COLUMN_ROWS);
+  column_job job = {x, N, F, ast_scratch(blocks * F * (int64_t)sizeof *job.sums)};
   if (!job.sums) return AST_NO_MEMORY;
   const ast_status status = ast_parallel(blocks, column_sum_task, &job);
   if (status == AST_OK) add_rows(job.sums, blocks, F, out);

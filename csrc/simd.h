@@ -6,6 +6,8 @@
 #include <stdint.h>
 #include <string.h>
 
+#include "integers.h"
+
 #if __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
 #error "the kernels need a little-endian machine" /* coarsen.c takes eight bytes for a word */
 #endif
@@ -28,6 +30,8 @@ typedef uint32_t vu __attribute__((vector_size(AST_VECTOR_BYTES)));
 typedef float vf_unaligned __attribute__((vector_size(AST_VECTOR_BYTES), aligned(4), may_alias));
 
 #define AST_INLINE static inline __attribute__((always_inline))
+/* A loop over i < n, a constant up to 16, written out. */
+#define EACH(n, i) _Pragma("GCC unroll 16") for (int i = 0; i < (n); i++)
 
 AST_INLINE vf vload(const float *p) { return *(const vf_unaligned *)p; }
 AST_INLINE void vstore(float *p, vf x) { *(vf_unaligned *)p = x; }
@@ -148,10 +152,6 @@ AST_INLINE vf vnormal(vf x) {
   return vselect(t > 475.0f / 512, vselect(z < 0, tail, 1 - tail), 0.5f * near + 0.5f);
 }
 AST_INLINE vf vnormal_density(vf x) { return 0x1.988454p-2f * vexp2(x * x * -0x1.715476p-1f, 0); }
-
-AST_INLINE int64_t min64(int64_t a, int64_t b) { return a < b ? a : b; }
-AST_INLINE int64_t max64(int64_t a, int64_t b) { return a > b ? a : b; }
-AST_INLINE int64_t round_up(int64_t n, int64_t to) { return (n + to - 1) / to * to; }
 
 #if AST_VECTOR_BYTES == 64
 #define INTERLEAVE_LOW(a, b)  VSHUFFLE(a, b, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23)

@@ -25,16 +25,6 @@ enum {
   LEAST_TASKS = 8    /* however few pairs there are */
 };
 
-/* the first i in [begin, end) with values[i] >= bound, or end */
-static int64_t lower_bound(const int64_t *values, int64_t begin, int64_t end, int64_t bound) {
-  while (begin < end) {
-    const int64_t middle = begin + (end - begin) / 2;
-    if (values[middle] < bound) begin = middle + 1;
-    else end = middle;
-  }
-  return begin;
-}
-
 typedef struct {
   const float *x, *weight, *bias;
   float *packed; /* W_k in panels, [27] */
@@ -49,7 +39,7 @@ typedef struct {
 /* Packs one panel of one W_k. */
 static ast_status conv_pack_task(int64_t index, void *context) {
   const conv_job *job = context;
-  const int64_t C_in = job->C_in, C_out = job->C_out, panels = round_up(C_out, GEMM_COLUMNS) / GEMM_COLUMNS;
+  const int64_t C_in = job->C_in, C_out = job->C_out, panels = divide_up(C_out, GEMM_COLUMNS);
   const int64_t k = index / panels, column = index % panels * GEMM_COLUMNS;
   if (job->pairs.offsets[k] == job->pairs.offsets[k + 1]) return AST_OK;
   const float *weight = job->weight + k * C_in * C_out + column * (job->transposed ? C_in : 1);
@@ -103,13 +93,13 @@ static void conv_tile(const conv_job *job, const conv_walk *tile, const conv_row
                       int64_t column, int64_t columns) {
   const int64_t C_in = job->C_in, C_out = job->C_out, n = tile->n;
   const float *weight = job->packed + tile->k * gemm_packed_size(C_in, C_out);
-  const int64_t strips = row_strips(n), parts = strips * ((columns + GEMM_COLUMNS - 1) / GEMM_COLUMNS);
+  const int64_t strips = row_strips(n), parts = strips * (divide_up(columns, GEMM_COLUMNS));
   for (int64_t c = column, part = 0; c < column + columns; c += GEMM_COLUMNS)
-    for (int64_t s = 0; s < strips; s++, part++) {
-      const int64_t i = n * s / strips, f = next->n * part / parts, f_end = next->n * (part + 1) / parts;
+    for (int64_t strip = 0; strip < strips; strip++, part++) {
+      const int64_t i = n * strip / strips, f = next->n * part / parts, f_end = next->n * (part + 1) / parts;
       const row_pointers pointers = {rows->x + i, rows->base + i, rows->out + i};
       const row_fetch fetch = {next_rows->x + f, next_rows->out + f, f_end - f};
-      row_panel(n * (s + 1) / strips - i, min64(GEMM_COLUMNS, C_out - c), C_in, pointers, fetch, weight + c * C_in, c);
+      row_panel(n * (strip + 1) / strips - i, min64(GEMM_COLUMNS, C_out - c), C_in, pointers, fetch, weight + c * C_in, c);
     }
 }
 
@@ -118,7 +108,7 @@ static ast_status conv_task(int64_t index, void *context) {
   const int64_t C_out = job->C_out;
   const int64_t first = index / job->column_tasks * job->rows, last = min64(job->num_out, first + job->rows);
   const int64_t column = index % job->column_tasks * job->columns, columns = min64(job->columns, C_out - column);
-  float *bias = ast_scratch(5, C_out * (int64_t)sizeof *bias + job->rows);
+  float *bias = ast_scratch(C_out * (int64_t)sizeof *bias + job->rows);
   if (!bias) return AST_NO_MEMORY;
   uint8_t *seen = (uint8_t *)(bias + C_out);
   if (job->bias) memcpy(bias, job->bias, (size_t)C_out * sizeof *bias);
@@ -142,7 +132,7 @@ static ast_status conv_task(int64_t index, void *context) {
 /* Sizes of the tasks. Where there are few pairs, ranges of rows (each reads all weights) and of columns (each reads all pairs) make
  * up LEAST_TASKS so that the least is read. */
 static void conv_cut(conv_job *job) {
-  const int64_t num_pairs = job->pairs.offsets[OFFSETS], panels = round_up(job->C_out, GEMM_COLUMNS) / GEMM_COLUMNS;
+  const int64_t num_pairs = job->pairs.offsets[OFFSETS], panels = divide_up(job->C_out, GEMM_COLUMNS);
   int64_t row_tasks = num_pairs / TASK_PAIRS, column_tasks = 1;
   if (row_tasks < LEAST_TASKS) {
     while (column_tasks < min64(panels, LEAST_TASKS) && column_tasks * num_pairs < LEAST_TASKS / 2 / column_tasks * OFFSETS * job->C_out)
@@ -150,15 +140,16 @@ static void conv_cut(conv_job *job) {
     row_tasks = LEAST_TASKS / column_tasks;
   }
   row_tasks = min64(row_tasks, job->num_out);
-  job->rows = (job->num_out + row_tasks - 1) / row_tasks;
-  job->columns = (panels + column_tasks - 1) / column_tasks * GEMM_COLUMNS;
-  job->column_tasks = (job->C_out + job->columns - 1) / job->columns;
+  job->rows = divide_up(job->num_out, row_tasks);
+  job->columns = divide_up(panels, column_tasks) * GEMM_COLUMNS;
+  job->column_tasks = divide_up(job->C_out, job->columns);
 }
 
 static ast_status sparse_conv(const float *restrict x, const float *restrict weight, const float *restrict bias, int64_t C_in,
                               int64_t C_out, bool transposed, ast_pairs pairs, int64_t num_out, float *restrict out) {
+  AST_SCRATCH_SCOPE;
   if (num_out == 0 || C_out == 0) return AST_OK;
-  float *packed = ast_scratch(6, OFFSETS * gemm_packed_size(C_in, C_out) * (int64_t)sizeof *packed);
+  float *packed = ast_scratch(OFFSETS * gemm_packed_size(C_in, C_out) * (int64_t)sizeof *packed);
   if (!packed) return AST_NO_MEMORY;
   conv_job job = {.x = x,
                   .weight = weight,
@@ -171,6 +162,6 @@ static ast_status sparse_conv(const float *restrict x, const float *restrict wei
                   .pairs = pairs,
                   .out = out};
   conv_cut(&job);
-  const ast_status status = ast_parallel(OFFSETS * (round_up(C_out, GEMM_COLUMNS) / GEMM_COLUMNS), conv_pack_task, &job);
-  return status == AST_OK ? ast_parallel((num_out + job.rows - 1) / job.rows * job.column_tasks, conv_task, &job) : status;
+  const ast_status status = ast_parallel(OFFSETS * divide_up(C_out, GEMM_COLUMNS), conv_pack_task, &job);
+  return status == AST_OK ? ast_parallel(divide_up(num_out, job.rows) * job.column_tasks, conv_task, &job) : status;
 }

@@ -46,7 +46,7 @@ static void conv_weight_point(const conv_weight_job *job, int64_t block, int64_t
 /* sum [rows,C_out] (+)= x^T dout over the pairs of a tile. */
 static void conv_weight_add_tile(const conv_weight_tile *tile, const conv_weight_tile *next, int64_t rows, int64_t C_out, bool add,
                                  float *sum) {
-  const int64_t strips = row_strips(rows), x_lines = (rows + LINE - 1) / LINE, lines = x_lines + (C_out + LINE - 1) / LINE;
+  const int64_t strips = row_strips(rows), x_lines = divide_up(rows, LINE), lines = x_lines + divide_up(C_out, LINE);
   float tail[WEIGHT_TILE][GEMM_COLUMNS];
   const float *tail_rows[WEIGHT_TILE];
   for (int64_t c = 0, line = 0; c < C_out; c += GEMM_COLUMNS) {
@@ -58,12 +58,12 @@ static void conv_weight_add_tile(const conv_weight_tile *tile, const conv_weight
       tail_rows[i] = tail[i];
     }
     if (width % VW) p.b = tail_rows, p.b_column = 0;
-    for (int64_t s = 0; s < strips; s++, line++) {
-      p.a_column = rows * s / strips;
+    for (int64_t strip = 0; strip < strips; strip++, line++) {
+      p.a_column = rows * strip / strips;
       p.next = next->n < tile->n || line >= lines ? p.b : line < x_lines ? next->x : next->dout;
       p.next_column = p.next == p.b ? p.b_column : LINE * (line < x_lines ? line : line - x_lines);
       float *out = sum + p.a_column * C_out + c;
-      column_panel(rows * (s + 1) / strips - p.a_column, width, tile->n, p, add ? out : NULL, out, C_out);
+      column_panel(rows * (strip + 1) / strips - p.a_column, width, tile->n, p, add ? out : NULL, out, C_out);
     }
   }
 }
@@ -104,14 +104,15 @@ static ast_status conv_weight_join_task(int64_t index, void *context) {
 
 static ast_status sparse_conv_weight(const float *restrict x, const float *restrict dout, int64_t C_in, int64_t C_out, ast_pairs pairs,
                                      float *restrict dweight) {
+  AST_SCRATCH_SCOPE;
   if (C_in == 0 || C_out == 0) return AST_OK;
   conv_weight_job job = {.x = x, .dout = dout, .C_in = C_in, .C_out = C_out, .pairs = pairs, .dweight = dweight};
-  job.blocks = (C_in + CHANNEL_BLOCK - 1) / CHANNEL_BLOCK;
+  job.blocks = divide_up(C_in, CHANNEL_BLOCK);
   const int64_t part_pairs = max64(PART_PAIRS, pairs.offsets[OFFSETS] / MOST_PARTS);
   for (int64_t k = 0; k < OFFSETS; k++)
     job.first_part[k + 1] = job.first_part[k] + max64(1, (pairs.offsets[k + 1] - pairs.offsets[k]) / part_pairs);
   const int64_t parts = job.first_part[OFFSETS];
-  job.parts = ast_scratch(6, (parts - OFFSETS) * C_in * C_out * (int64_t)sizeof *job.parts);
+  job.parts = ast_scratch((parts - OFFSETS) * C_in * C_out * (int64_t)sizeof *job.parts);
   if (!job.parts) return AST_NO_MEMORY;
   const ast_status status = ast_parallel(parts * job.blocks, conv_weight_task, &job);
   return status == AST_OK && parts > OFFSETS ? ast_parallel(OFFSETS * job.blocks, conv_weight_join_task, &job) : status;

@@ -37,8 +37,16 @@ typedef struct {
   float *panels_bias; /* [panels][GEMM_COLUMNS] */
 } dense_layer;
 
+/* y = x W^T + bias with W [N,K], and dx = dy W of N of its columns, with W [K,row]; a NULL weight leaves the layer out. */
+AST_INLINE dense_layer dense_forward(const float *weight, const float *bias, int64_t K, int64_t N) {
+  return (dense_layer){.weight = weight, .row = 1, .column = K, .bias = bias, .K = K, .N = N};
+}
+AST_INLINE dense_layer dense_backward(const float *weight, int64_t row, int64_t K, int64_t N) {
+  return (dense_layer){.weight = weight, .row = row, .column = 1, .K = K, .N = N};
+}
+
 AST_INLINE int64_t dense_panel_width(const dense_layer *l) { return l->paired ? VW : GEMM_COLUMNS; }
-AST_INLINE int64_t dense_panels(const dense_layer *l) { return (l->N + dense_panel_width(l) - 1) / dense_panel_width(l); }
+AST_INLINE int64_t dense_panels(const dense_layer *l) { return divide_up(l->N, dense_panel_width(l)); }
 AST_INLINE int64_t dense_packed_size(const dense_layer *l) { return dense_panels(l) * (l->K + 1) * GEMM_COLUMNS; }
 
 static void dense_pack_panel(const dense_layer *l, int64_t p) {
@@ -70,18 +78,18 @@ static ast_status dense_pack_task(int64_t index, void *context) {
 }
 
 /* Packs layers into scratch of the calling thread, which its tasks may read. A layer without weight is left out. */
-static ast_status dense_pack(dense_layer *layers, int64_t num, int slot) {
+static ast_status dense_pack(dense_layer *layers, int64_t num) {
   dense_pack_job job = {layers, num};
   int64_t size = 0, panels = 0;
   for (int64_t i = 0; i < num; i++) {
     if (!layers[i].weight) layers[i].N = 0;
     const int64_t outputs = layers[i].paired ? 2 * layers[i].N : layers[i].N; /* as for both halves in one: z has the same bits */
-    const int64_t most = outputs > DENSE_FEW ? DENSE_DEPTH : DENSE_SHALLOW, chains = max64(1, (layers[i].K + most - 1) / most);
-    layers[i].depth = (layers[i].K + chains - 1) / chains;
+    const int64_t most = outputs > DENSE_FEW ? DENSE_DEPTH : DENSE_SHALLOW, chains = max64(1, divide_up(layers[i].K, most));
+    layers[i].depth = divide_up(layers[i].K, chains);
     size += dense_packed_size(&layers[i]);
     panels += dense_panels(&layers[i]);
   }
-  float *packed = ast_scratch(slot, size * (int64_t)sizeof *packed);
+  float *packed = ast_scratch(size * (int64_t)sizeof *packed);
   if (!packed) return AST_NO_MEMORY;
   for (int64_t i = 0; i < num; i++) {
     layers[i].panels = packed;
@@ -145,24 +153,21 @@ static __attribute__((noinline)) void dense_finish(const dense_layer *l, const d
   }
 }
 
-/* for all vectors of a register tile */
-#define DENSE_EACH(i, v) _Pragma("GCC unroll 12") for (int i = 0; i < rows; i++) _Pragma("GCC unroll 2") for (int v = 0; v < vectors; v++)
-
 /* The same in the usual cases, in the registers of the tile: rows from i on, whole vectors from column j on. */
 AST_INLINE void dense_finish_tile(const int rows, const int vectors, const dense_end *e, int64_t i0, int64_t j, const float *bias,
                                   vf z[GEMM_ROWS][2]) {
-  DENSE_EACH(i, v) z[i][v] += vload(bias + v * VW);
-  if (e->activation == AST_RELU) DENSE_EACH(i, v) z[i][v] = vmax((vf){0}, z[i][v]);
+  TILE_EACH(i, v) z[i][v] += vload(bias + v * VW);
+  if (e->activation == AST_RELU) TILE_EACH(i, v) z[i][v] = vmax((vf){0}, z[i][v]);
   if (e->hidden) {
     const float *hidden = e->hidden + i0 * e->hidden_row + j;
-    DENSE_EACH(i, v) z[i][v] = (vf)((vi)z[i][v] & ~(vload(hidden + i * e->hidden_row + v * VW) <= 0));
+    TILE_EACH(i, v) z[i][v] = (vf)((vi)z[i][v] & ~(vload(hidden + i * e->hidden_row + v * VW) <= 0));
   }
   if (e->residual) {
     const float *residual = e->residual + i0 * e->residual_row + j;
-    DENSE_EACH(i, v) z[i][v] += vload(residual + i * e->residual_row + v * VW);
+    TILE_EACH(i, v) z[i][v] += vload(residual + i * e->residual_row + v * VW);
   }
   float *out = e->out + i0 * e->out_row + j;
-  DENSE_EACH(i, v) vstore(out + i * e->out_row + v * VW, z[i][v]);
+  TILE_EACH(i, v) vstore(out + i * e->out_row + v * VW, z[i][v]);
 }
 
 /* One register tile: rows i.. of panel p. A long sum over k is one of short ones, in the stack between two of them. */
@@ -170,27 +175,27 @@ AST_INLINE void dense_tile(const int rows, const int vectors, const dense_layer 
   const int64_t j = p * dense_panel_width(l);
   const float *panel = l->panels + p * l->K * GEMM_COLUMNS, *bias = l->panels_bias + p * GEMM_COLUMNS;
   float sums[GEMM_ROWS * GEMM_COLUMNS] __attribute__((aligned(64)));
-  DENSE_EACH(i, v) __builtin_prefetch(e->out + (i0 + i) * e->out_row + j + v * VW, 1);
+  TILE_EACH(i, v) __builtin_prefetch(e->out + (i0 + i) * e->out_row + j + v * VW, 1);
   vf sum[GEMM_ROWS][2];
   for (int64_t k = 0;;) { /* once without inputs, too: the sums are then 0 */
-    DENSE_EACH(i, v) sum[i][v] = (vf){0};
+    TILE_EACH(i, v) sum[i][v] = (vf){0};
     const gemm_a part = {a.data + i0 * a.row + k * a.column, a.row, a.column};
     gemm_sums(rows, vectors, min64(l->depth, l->K - k), part, panel + k * GEMM_COLUMNS, GEMM_COLUMNS, sum);
-    if (k) DENSE_EACH(i, v) sum[i][v] += vload(sums + i * GEMM_COLUMNS + v * VW);
+    if (k) TILE_EACH(i, v) sum[i][v] += vload(sums + i * GEMM_COLUMNS + v * VW);
     k += l->depth;
     if (k >= l->K) break;
-    DENSE_EACH(i, v) vstore(sums + i * GEMM_COLUMNS + v * VW, sum[i][v]);
+    TILE_EACH(i, v) vstore(sums + i * GEMM_COLUMNS + v * VW, sum[i][v]);
     __asm__("" : "+m"(sums)); /* or the compiler moves what is not yet known of them through other stack for every tile */
   }
   if (!l->paired && !e->z && l->N - j >= vectors * VW) {
     dense_finish_tile(rows, vectors, e, i0, j, bias, sum);
     return;
   }
-  DENSE_EACH(i, v) vstore(sums + i * GEMM_COLUMNS + v * VW, sum[i][v]);
+  TILE_EACH(i, v) vstore(sums + i * GEMM_COLUMNS + v * VW, sum[i][v]);
   dense_finish(l, e, rows, vectors, i0, j, l->N - j, sums, bias);
 }
 
-/* The share of panel p, of `panels`, in rows first.. of it */
+/* Of the rows first.. those parts that panel p of `panels` fetches. */
 AST_INLINE void dense_fetch(const dense_next *next, int64_t p, int64_t panels, int64_t first, int64_t rows) {
   const int64_t lines = (next->columns + 15) / 16, begin = lines * p / panels, end = lines * (p + 1) / panels;
   for (int64_t i = first; i < min64(first + rows, next->rows); i++)
@@ -198,24 +203,19 @@ AST_INLINE void dense_fetch(const dense_next *next, int64_t p, int64_t panels, i
 }
 
 AST_INLINE void dense_strip(const int vectors, const dense_layer *l, int64_t p, int64_t rows, gemm_a a, const dense_end *e) {
-  int64_t i = 0;
-#define DENSE_STEP(num) \
-  for (; i + (num) <= rows; i += (num)) dense_tile(num, vectors, l, p, i, a, e)
-  for (; i + GEMM_ROWS <= rows; i += GEMM_ROWS) {
-    for (int n = 0; n < DENSE_NEXT; n++)
-      if (e->next[n].data) dense_fetch(&e->next[n], p, dense_panels(l), i, GEMM_ROWS);
-    dense_tile(GEMM_ROWS, vectors, l, p, i, a, e);
-  }
-  if (GEMM_ROWS > 8) DENSE_STEP(8);
-  DENSE_STEP(4);
-  DENSE_STEP(2);
-  DENSE_STEP(1);
-#undef DENSE_STEP
+#define DENSE_TILE(rows)                                                               \
+  do {                                                                                 \
+    for (int n = 0; n < DENSE_NEXT && (rows) == GEMM_ROWS; n++)                        \
+      if (e->next[n].data) dense_fetch(&e->next[n], p, dense_panels(l), i, GEMM_ROWS); \
+    dense_tile(rows, vectors, l, p, i, a, e);                                          \
+  } while (0)
+  EACH_TILE_OF_ROWS(i, rows, DENSE_TILE);
+#undef DENSE_TILE
 }
 
 /* M rows are cut evenly between register tiles: where task `index` of `tasks` begins. */
 AST_INLINE int64_t dense_begin(int64_t M, int64_t tasks, int64_t index) {
-  return min64(M, (M + GEMM_ROWS - 1) / GEMM_ROWS * index / tasks * GEMM_ROWS);
+  return min64(M, divide_up(M, GEMM_ROWS) * index / tasks * GEMM_ROWS);
 }
 
 /* Panels first <= p < last of the layer on `rows` rows of A. */
@@ -225,6 +225,9 @@ static void dense_rows(const dense_layer *l, int64_t first, int64_t last, int64_
     else dense_strip(1, l, p, rows, a, &e);
   }
 }
+
+/* All of the layer. */
+static void dense_all(const dense_layer *l, int64_t rows, gemm_a a, dense_end e) { dense_rows(l, 0, dense_panels(l), rows, a, e); }
 
 /* ---- what the gradients need ---- */
 
@@ -254,10 +257,10 @@ typedef struct {
 
 static dense_chunks dense_cut(int64_t M, int64_t floats) {
   const int64_t most = min64(32, max64(2, DENSE_PARTIALS / max64(1, floats)));
-  const int64_t parts = M / 192 > 2 ? round_up(M / 192, 4) : min64(2, M / 16); /* even shares for 2 and for 4 threads */
-  const int64_t num = max64(1, min64(parts, most)), rows = (M + num - 1) / num;
-  const int64_t blocks = (rows + DENSE_ROWS - 1) / DENSE_ROWS;
-  return (dense_chunks){num, rows, blocks ? round_up((rows + blocks - 1) / blocks, GEMM_ROWS) : DENSE_ROWS};
+  const int64_t parts = M / 192 > 2 ? round_up(M / 192, 4) : min64(2, M / 16); /* even for 2 and for 4 threads */
+  const int64_t num = max64(1, min64(parts, most)), rows = divide_up(M, num);
+  const int64_t blocks = divide_up(rows, DENSE_ROWS);
+  return (dense_chunks){num, rows, blocks ? round_up(divide_up(rows, blocks), GEMM_ROWS) : DENSE_ROWS};
 }
 
 /* to [rows,n] = the sum over chunks of partials[chunk][at..], rows of it `row` floats apart; `to` may be NULL */
@@ -275,18 +278,18 @@ typedef struct {
 
 enum { DENSE_SUM_ROWS = 16 };
 
-AST_INLINE int64_t dense_sum_tasks(const dense_sum *s) { return s->to ? (s->rows + DENSE_SUM_ROWS - 1) / DENSE_SUM_ROWS : 0; }
+AST_INLINE int64_t dense_sum_tasks(const dense_sum *target) { return target->to ? divide_up(target->rows, DENSE_SUM_ROWS) : 0; }
 
 static ast_status dense_sum_task(int64_t index, void *context) {
   const dense_sum_job *job = context;
-  const dense_sum *s = job->sums;
-  for (; index >= dense_sum_tasks(s); s++) index -= dense_sum_tasks(s);
-  for (int64_t i = index * DENSE_SUM_ROWS; i < min64(s->rows, (index + 1) * DENSE_SUM_ROWS); i++)
-    for (int64_t j = 0; j < s->n; j += VW) {
-      const float *partial = job->partials + s->at + i * s->row + j;
+  const dense_sum *target = job->sums;
+  for (; index >= dense_sum_tasks(target); target++) index -= dense_sum_tasks(target);
+  for (int64_t i = index * DENSE_SUM_ROWS; i < min64(target->rows, (index + 1) * DENSE_SUM_ROWS); i++)
+    for (int64_t j = 0; j < target->n; j += VW) {
+      const float *partial = job->partials + target->at + i * target->row + j;
       vf sum = vload(partial);
       for (int64_t c = 1; c < job->chunks; c++) sum += vload(partial + c * job->size);
-      vstore_upto(s->to + i * s->n + j, sum, s->n - j);
+      vstore_upto(target->to + i * target->n + j, sum, target->n - j);
     }
   return AST_OK;
 }

@@ -12,7 +12,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Self, overload
 
@@ -20,7 +20,18 @@ import h5py
 import numpy as np
 
 from ast_sim.dataset.guard import GuardedFile
-from ast_sim.dataset.layout import ARRAYS, FORMAT, FRAMED, HASH, OPTIONAL, SPLITS, VERSION, DatasetInfo, scene_kind
+from ast_sim.dataset.layout import (
+    ARRAYS,
+    FORMAT,
+    FRAMED,
+    HASH,
+    LENGTH_UNITS,
+    OPTIONAL,
+    SPLITS,
+    VERSION,
+    DatasetInfo,
+    scene_kind,
+)
 from ast_sim.scene import AttributeValue, Scene, Trajectory, require_finite_frames
 from ast_sim.support.byte_cache import ByteCache
 from ast_sim.support.errors import DatasetError
@@ -34,15 +45,20 @@ class Dataset:
     Each trajectory is checked when it is first read: dtypes, shapes, index ranges. All numbers are finite, and arrays
     are read-only. A split of up to 1 GiB stays in memory after its first reading.
 
+    Args:
+        path: the file.
+        length_unit: the unit in which positions, origins and what `info` says of lengths are given; by default the one
+            of the file. The solver's records stay as they are.
+
     Raises:
         DatasetError: something cannot be read; the text names the file, the sample and what is wrong.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = Path(path)
+    def __init__(self, path: str | os.PathLike[str], length_unit: str | None = None) -> None:
+        self.path, self._scale = Path(path), 1.0
         self._file = GuardedFile(self.path)
         try:
-            self.info = self._read_info()
+            self.info = self._in_unit(self._read_info(), length_unit)
             with self._file.reading("the list of samples"):
                 self.splits = {split: self._count(split) for split in SPLITS}
         except BaseException:
@@ -99,7 +115,8 @@ class Dataset:
     def _read_scene(self, split: str, index: int) -> Scene:
         group, name = self._group(split, index), self._name(split, index)
         keys = [key for key in ARRAYS if key not in FRAMED and (key not in OPTIONAL or self._file.has(group, key))]
-        scene = Scene(**{key: self._file.read(self._file.array(group, key)) for key in keys})
+        arrays = {key: self._file.read(self._file.array(group, key)) for key in keys}
+        scene = Scene(**{**arrays, "rest_position": self._scaled(arrays["rest_position"])})
         scene.check(name)
         kind = scene_kind(scene)
         self._kind = self._kind or kind
@@ -163,6 +180,8 @@ class Dataset:
     def attributes(self, split: str, index: int) -> dict[str, AttributeValue]:
         """The status and the solver's records of a trajectory."""
         found = self._file.attributes(self._group(split, index), self._name(split, index))
+        if "origin" in found:
+            found["origin"] = (self._scale * np.asarray(found["origin"])).tolist()
         return {key: value for key, value in found.items() if key != HASH}
 
     def _first_kind(self) -> tuple[int, int]:
@@ -241,7 +260,28 @@ class Dataset:
         rows = {"position": "node", "stress": self.info.stress_location}
         name, arrays = self._name(split, index), self._framed(split, index)
         found = {key: self._finite(name, rows[key], array, start, stop) for key, array in arrays.items()}
-        return found["position"], found.get("stress")
+        return self._scaled(found["position"]), found.get("stress")
+
+    def _scaled(self, position: np.ndarray) -> np.ndarray:
+        """Positions in the unit of `info`."""
+        if self._scale == 1:
+            return position
+        found = (self._scale * position.astype(np.float64)).astype(np.float32)
+        found.flags.writeable = False
+        return found
+
+    def _in_unit(self, info: DatasetInfo, unit: str | None) -> DatasetInfo:
+        """The facts in another unit of length."""
+        if unit is None or unit == info.length_unit:
+            return info
+        self._scale = LENGTH_UNITS[info.length_unit] / LENGTH_UNITS[unit]
+        return replace(
+            info,
+            length_unit=unit,
+            domain_center=tuple(self._scale * value for value in info.domain_center),
+            domain_half_width=self._scale * info.domain_half_width,
+            contact_radius=self._scale * info.contact_radius,
+        )
 
     def _finite(self, name: str, row: str, array: h5py.Dataset, start: int, stop: int) -> np.ndarray:
         """Frames start to stop - 1 of an array, all finite; a `row` of it is a "node" or an "element"."""

@@ -79,17 +79,20 @@ def asked_frames(
 
 
 def errors_by_effort(model: Simulator, truth: Trajectory, most: Effort) -> np.ndarray:
-    """[C, K]: the relative errors at the deepest frame after c corrections and k Newton steps, up to `most` of them.
-    NaN where the prediction failed."""
+    """[2, C, K]: the errors at the deepest frame after c corrections and k Newton steps, up to `most` of them: that of
+    the displacement, relative to it, and that of the stress, relative to that of the frame's true mean. NaN where the
+    prediction failed, or where there is no stress."""
     frame, free = max(deepest_frame(truth), model.config.given_frames), ~truth.scene.prescribed
-    size, found = _rms(truth.position[frame] - truth.position[0], free), np.full((most[0] + 1, most[1] + 1), np.nan)
-    for corrections in range(len(found)) if size else ():
+    size, found = _rms(truth.position[frame] - truth.position[0], free), np.full((2, most[0] + 1, most[1] + 1), np.nan)
+    for corrections in range(most.corrections + 1) if size else ():
         for steps in (most.newton_steps, 0):  # where a Newton step fails, the calls before it still count
             (after,) = calls(model, [Question.of(truth, "validation", [frame])], Effort(corrections, steps))
             if not isinstance(after, str):
-                found[corrections, : steps + 1] = [
-                    _rms(x[0] - truth.position[frame], free) / size for x in after[corrections:]
-                ]
+                moved = [_rms(x[0] - truth.position[frame], free) / size for x in after.position[corrections:]]
+                found[0, corrections, : steps + 1] = moved
+                for step, stress in enumerate(() if after.stress is None else after.stress):
+                    share, _ = _stress_errors(truth, stress[0], frame, model.config.stress)
+                    found[1, corrections, step] = np.nan if share is None else share
                 break
     return found
 
@@ -153,7 +156,8 @@ def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: E
     by_calls = []
     if model.config.jumps and not failed:
         (after,) = calls(model, [question], effort)
-        by_calls = [_rms(position[0] - truth.position[frame], free) / size for position in after]
+        positions = () if isinstance(after, str) else after.position
+        by_calls = [_rms(position[0] - truth.position[frame], free) / size for position in positions]
     return {
         "name": name,
         "frame": frame,
@@ -162,7 +166,7 @@ def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: E
         "relative_error": None if failed else _rms(answer.position[0] - truth.position[frame], free) / size,
         "by_calls": by_calls,
         "seconds": seconds,
-        **_stress(truth, answer, frame, model.config.stress),
+        **dict(zip(("stress_share", "largest_stress"), _stress_of(truth, answer, frame, model), strict=True)),
     }
 
 
@@ -170,17 +174,27 @@ def _rms(difference: np.ndarray, rows: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(difference[rows], dtype=np.float64))))
 
 
-def _stress(truth: Trajectory, answer: Answer, frame: int, location: str) -> dict[str, float | None]:
-    """The errors of the stress on what deforms; None where there is no stress."""
-    if answer.stress is None or truth.stress is None or answer.failure is not None:
-        return {"stress_share": None, "largest_stress": None}
+def _stress_of(truth: Trajectory, answer: Answer, frame: int, model: Simulator) -> tuple[float | None, float | None]:
+    """See `_stress_errors`; None where there is no stress."""
+    if answer.stress is None or answer.failure is not None:
+        return None, None
+    return _stress_errors(truth, answer.stress[0], frame, model.config.stress)
+
+
+def _stress_errors(
+    truth: Trajectory, stress: np.ndarray, frame: int, location: str
+) -> tuple[float | None, float | None]:
+    """The error of the stress on what deforms, relative to that of the frame's true mean; and by how much the largest
+    is off. None where they say nothing."""
+    if truth.stress is None:
+        return None, None
     rows = truth.scene.deforming(location)
-    there, found = truth.stress[frame].astype(np.float64), answer.stress[0].astype(np.float64)
+    there, found = truth.stress[frame].astype(np.float64), stress.astype(np.float64)
     spread, largest = float(there[rows].std()), float(there[rows].max())
-    return {
-        "stress_share": _rms(found - there, rows) / spread if spread else None,
-        "largest_stress": abs(float(found[rows].max()) - largest) / largest if largest else None,
-    }
+    return (
+        _rms(found - there, rows) / spread if spread else None,
+        abs(float(found[rows].max()) - largest) / largest if largest else None,
+    )
 
 
 def _solver(rival: Rivals, error: float | None) -> dict[str, Any]:

@@ -13,6 +13,8 @@ from ast_sim.simulate.mechanics.material import NeoHookean
 from ast_sim.support.errors import ConfigError
 
 GOOD = 0.02  # a relative error that most users call exact
+GOOD_STRESS = 0.1  # the same of the stress, relative to the error of its mean
+WORTH = 0.05  # a correction or a Newton step must lower an error that is not good by this share
 
 
 class Effort(NamedTuple):
@@ -69,20 +71,28 @@ def newton_steps(config: ModelConfig, scene: Scene) -> NewtonSteps:
     return NewtonSteps(scene, material, CLEARANCE * config.contact_range, config.friction)
 
 
-def cheapest_good(errors: np.ndarray) -> Effort:
+def cheapest_good(errors: np.ndarray, stress: np.ndarray) -> Effort:
     """The default effort of a run.
 
+    Stress tells more than the displacement: it follows from strains, and a step that leaves single elements distorted
+    hardly moves their nodes.
+
     Args:
-        errors: [C, K], the relative errors in validation after c corrections and k Newton steps.
+        errors: [C, K], the relative errors of the displacement in validation after c corrections and k Newton steps.
+        stress: [C, K], those of the stress; NaN where there is none.
 
     Returns:
-        The effort with the fewest corrections and Newton steps together whose error is at most `GOOD`; of several, the
-        most accurate one. If there is none, the most accurate one of all; the first call alone if no error is known.
+        Of the efforts whose errors are good, or nearly the smallest of all, the one with the fewest corrections and
+        Newton steps together; of several, the most accurate one. If no effort has both errors so, that of the
+        displacement decides. The first call alone if no error is known.
     """
     if np.isnan(errors).all():
         return FIRST_CALL
+    accurate = errors <= max(GOOD, (1 + WORTH) * np.nanmin(errors))
+    least = np.inf if np.isnan(stress).all() else max(GOOD_STRESS, (1 + WORTH) * np.nanmin(stress))
+    both = accurate & ~(stress > least)
     total = np.add.outer(*(np.arange(size) for size in errors.shape))
-    good = np.where(errors <= GOOD, total, np.inf)
-    chosen = np.where(good == good.min(), errors, np.inf) if np.isfinite(good.min()) else errors
-    corrections, steps = np.unravel_index(np.nanargmin(chosen), errors.shape)
+    allowed = np.where(both if both.any() else accurate, total, np.inf)
+    chosen = np.where(allowed == allowed.min(), errors, np.inf)
+    corrections, steps = np.unravel_index(chosen.argmin(), errors.shape)
     return Effort(int(corrections), int(steps))

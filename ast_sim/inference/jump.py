@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -51,20 +52,39 @@ def jumps(
     return [scene.answer() for scene in _predicted(model, questions, effort, progress)]
 
 
-def calls(model: Simulator, questions: Sequence[Question], effort: Effort) -> list[np.ndarray | str]:
-    """For each scene the positions [calls, S, N, 3] float32 of the wanted frames after each call, the first one and its
-    corrections, and after each Newton step; a text that says why where a frame failed. Arguments and errors as for
+class Way(NamedTuple):
+    """The wanted frames of a scene on the way to the answer.
+
+    Attributes:
+        position: [calls, S, N, 3] float32, after each call, the first one and its corrections, and each Newton step.
+        stress: [1 + Newton steps, S, N or E, 1] float32, after the last call and each Newton step; None without stress.
+    """
+
+    position: np.ndarray
+    stress: np.ndarray | None
+
+
+def calls(model: Simulator, questions: Sequence[Question], effort: Effort) -> list[Way | str]:
+    """For each scene the way to its answer, or a text that says why a frame failed. Arguments and errors as for
     `jumps`."""
-    found: list[np.ndarray | str] = []
-    for scene in _predicted(model, questions, effort, None):
+    found: list[Way | str] = []
+    for scene in _predicted(model, questions, effort, None, every_stress=True):
         failure = next((frame.failure for frame in scene.frames if frame.failure), None)
-        after = [torch.stack(frame.positions).numpy() for frame in scene.frames if failure is None]
-        found.append(np.stack(after, axis=1) if failure is None else failure)
+        if failure is not None:
+            found.append(failure)
+            continue
+        position = np.stack([torch.stack(frame.positions).numpy() for frame in scene.frames], axis=1)
+        stress = [torch.stack(frame.stresses).numpy() for frame in scene.frames if frame.stresses]
+        found.append(Way(position, np.stack(stress, axis=1) if stress else None))
     return found
 
 
 def _predicted(
-    model: Simulator, questions: Sequence[Question], effort: Effort, progress: Callable[[int], None] | None
+    model: Simulator,
+    questions: Sequence[Question],
+    effort: Effort,
+    progress: Callable[[int], None] | None,
+    every_stress: bool = False,
 ) -> list[_JumpingScene]:
     effort.check(model.config)
     for question in questions:
@@ -82,7 +102,7 @@ def _predicted(
             for number, group in enumerate(_groups(model, scenes)):
                 _predict(model, group, effort.corrections)
                 for frame in group if effort.newton_steps else ():
-                    frame.refine(model.config, solvers, effort.newton_steps)
+                    frame.refine(model.config, solvers, effort.newton_steps, every_stress)
                 if progress is not None:
                     progress(number)
     finally:
@@ -101,20 +121,21 @@ def corrected(model: Simulator, batch: Batch, prescribed: Tensor, calls: int) ->
 
 @dataclass(eq=False)
 class _Frame:
-    """A frame to predict: its start, and the positions after each call and each Newton step."""
+    """A frame to predict: its start, the positions after each call and each Newton step, and the stress after the last
+    call and after Newton steps."""
 
     scene: _JumpingScene
     number: int
     start: Tensor
     positions: list[Tensor] = field(default_factory=list)
-    stress: Tensor | None = None
+    stresses: list[Tensor] = field(default_factory=list)
     seconds: float = 0.0
     failure: str | None = None
 
-    def refine(self, config: ModelConfig, solvers: dict[int, NewtonSteps], steps: int) -> None:
+    def refine(self, config: ModelConfig, solvers: dict[int, NewtonSteps], steps: int, every_stress: bool) -> None:
         """Make Newton steps from the answer of the model; the stress then is that of the material.
 
-        `solvers` holds those of the scenes so far, by their `id`.
+        `solvers` holds those of the scenes so far, by their `id`. The stress is that of the last step, or of every one.
         """
         if self.failure is not None:
             return
@@ -123,11 +144,11 @@ class _Frame:
             if id(scene) not in solvers:
                 solvers[id(scene)] = newton_steps(config, scene)
             position = self.positions[-1].numpy().astype(np.float64)
-            for _ in range(steps):
+            for step in range(1, steps + 1):
                 position = solvers[id(scene)].step(position)
                 self.positions.append(torch.from_numpy(position.astype(np.float32)))
-            if config.stress != "none":
-                self.stress = torch.from_numpy(solvers[id(scene)].von_mises(position, config.stress))
+                if config.stress != "none" and (every_stress or step == steps):
+                    self.stresses.append(torch.from_numpy(solvers[id(scene)].von_mises(position, config.stress)))
         except SimulationError as error:
             self.failure = f"{self.scene.question.name} frame {self.number}: a Newton step failed: {error}"
         self.seconds += time.perf_counter() - began
@@ -158,7 +179,7 @@ class _JumpingScene:
         predicted = self.frames if failure is None else self.frames[: self.frames.index(failure)]
         kept = [number for number in self.question.wanted() if number < self.given]
         positions = [self.script[0] for _ in kept] + [frame.positions[-1] for frame in predicted]
-        stresses = [self.stress[0] for _ in kept if self.stress] + [f.stress for f in predicted if f.stress is not None]
+        stresses = [self.stress[0] for _ in kept if self.stress] + [f.stresses[-1] for f in predicted if f.stresses]
         asked, numbers = self.question, [*kept, *(frame.number for frame in predicted)]
         return Answer(
             asked.name,
@@ -217,4 +238,5 @@ def _predict(model: Simulator, group: list[_Frame], corrections: int) -> None:
         stresses = stress.split([len(frame.scene.stress[0]) for frame in group])
     for frame, found, mises in zip(group, positions, stresses, strict=True):
         frame.failure = not_finite(model.config, frame.scene.question.name, frame.number, found[-1], mises)
-        frame.positions, frame.stress, frame.seconds = list(found), mises, seconds
+        frame.positions, frame.seconds = list(found), seconds
+        frame.stresses = [] if mises is None else [mises]

@@ -21,9 +21,9 @@ from ast_sim.inference.evaluation import evaluate, table
 from ast_sim.inference.predict import Motions, predict, predict_motions, predict_scenes
 from ast_sim.inference.sweep import Sweep, sweep
 from ast_sim.prescribed_motion import Motion
+from ast_sim.runs.config_toml import read_scope
 from ast_sim.runs.folder import load_model, require_fit
 from ast_sim.runs.metrics import Metrics
-from ast_sim.runs.train_config import read_scope
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.own_assembly.grid import grid, read_table
 from ast_sim.support.disk import write_json
@@ -221,14 +221,14 @@ class Run:
         return Effort(corrections, newton_steps or 0)
 
     def open(self, data: str | os.PathLike[str] | None = None) -> Dataset:
-        """Open a dataset, by default the one that the run was trained on. The caller closes it.
+        """Open a dataset, by default the training data, with lengths in the run's unit. The caller closes it.
 
         Raises:
             DatasetError: the dataset cannot be read.
-            ConfigError: its integration, stress location, material columns, elements or unit of length differ from
-                those of the training data.
+            ConfigError: its integration, stress location, material columns or elements differ from those of the
+                training data.
         """
-        dataset = Dataset(data or self.settings.data)
+        dataset = Dataset(data or self.settings.data, self.scope.length_unit)
         try:
             require_fit(self.path, self.settings.model, self.scope, dataset)
         except BaseException:
@@ -298,7 +298,7 @@ class Evaluation:
             error = sample["displacement"]["model"]["rollout_all"]["normal"]
             errors[sample["name"]] = math.inf if error is None else error
         answers = {answer.name: answer for answer in self.answers}
-        with Dataset(self.data) as dataset:
+        with self.run.open(self.data) as dataset:
             scenes = [
                 report.ReportScene(name, label, _truth(dataset, name), answers[name].trajectory)
                 for label, name in report.representative(errors)

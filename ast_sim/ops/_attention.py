@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from ast_sim.ops import library
-from ast_sim.ops.library import check_offsets, check_shape, dense, dense_rows
 
 # ---- dropout: the generator of the C core in torch ----
 
@@ -63,17 +62,23 @@ def dropout_factors(p: float, seed: int, scene: int, shape: tuple[int, int, int]
 # ---- composition ----
 
 
-def _check(op: str, q: Tensor, k: Tensor, v: Tensor, q_offsets: Tensor, k_offsets: Tensor, dropout_p: float) -> None:
-    check_shape(op, "q", q, -1, -1, -1)
-    check_shape(op, "k", k, -1, *q.shape[1:])
-    check_shape(op, "v", v, *k.shape)
+_SPEC = (
+    "q[Q,H,D] rows, k[K,H,D] rows, v[K,H,D] rows, q_offsets[B+1] offsets(Q), k_offsets[B+1] offsets(K), scale number,"
+    " dropout_p number, seed bits"
+)
+_kernel = library.Kernel("attention", f"{_SPEC} -> out[Q,H,D], maximum[Q,H], sum[Q,H]")
+_backward_kernel = library.Kernel(
+    "attention_backward",
+    f"{_SPEC}, out[Q,H,D], maximum[Q,H], sum[Q,H], dout[Q,H,D] -> dq[Q,H,D] rows, dk[K,H,D] rows, dv[K,H,D] rows",
+)
+
+
+def _check(kernel: library.Kernel, q, k, v, q_offsets, k_offsets, dropout_p: float) -> None:
+    kernel.check(q, k, v, q_offsets, k_offsets)
     if q.shape[2] % 16 or not 16 <= q.shape[2] <= 128:
-        raise ValueError(f"{op}: the head dimension must be a multiple of 16 up to 128, not {q.shape[2]}")
+        raise ValueError(f"{kernel.name}: the head dimension must be a multiple of 16 up to 128, not {q.shape[2]}")
     if not 0 <= dropout_p < 1:
-        raise ValueError(f"{op}: dropout_p must lie in [0, 1)")
-    check_shape(op, "k_offsets", k_offsets, len(q_offsets))
-    check_offsets(op, "q_offsets", q_offsets, len(q))
-    check_offsets(op, "k_offsets", k_offsets, len(k))
+        raise ValueError(f"{kernel.name}: dropout_p must lie in [0, 1)")
 
 
 def _scenes(q_offsets: Tensor, k_offsets: Tensor) -> Iterator[tuple[int, slice, slice]]:
@@ -88,57 +93,56 @@ def _scores(q: Tensor, k: Tensor, scale: float) -> Tensor:
     return torch.einsum("qhd,khd->hqk", q * scale, k)
 
 
+def _join(like: Tensor, fill: float, parts: list[tuple[slice, Tensor]]) -> Tensor:
+    """The rows of all scenes; the rows between these parts hold `fill`. Nothing is written to: vmap could not do it."""
+    rows, end = [], 0
+    for where, x in (*parts, (slice(len(like), len(like)), like[:0])):
+        rows += [like.new_full((where.start - end, *like.shape[1:]), fill), x]
+        end = where.stop
+    return torch.cat(rows)
+
+
 def _factors(scores: Tensor, dropout_p: float, seed: int, scene: int) -> Tensor | float:
     return dropout_factors(dropout_p, seed, scene, tuple(scores.shape), scores) if dropout_p else 1.0
 
 
 def _reference(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed):
-    _check("attention", q, k, v, q_offsets, k_offsets, dropout_p)
-    out, maximum = torch.zeros_like(q), torch.full_like(q[:, :, 0], -torch.inf)
-    total = torch.zeros_like(maximum)
+    _check(_kernel, q, k, v, q_offsets, k_offsets, dropout_p)
+    out, maximum, total = [], [], []
     for b, i, j in _scenes(q_offsets, k_offsets):
         x = _scores(q[i], k[j], scale)
         m = x.detach().amax(2, keepdim=True)
         weights = (x - m).exp()
         sums = weights.sum(2, keepdim=True)
         weights = weights / sums * _factors(x, dropout_p, seed, b)
-        out[i] = torch.einsum("hqk,khd->qhd", weights, v[j])
-        maximum[i], total[i] = (torch.where(sums > 0, y, torch.nan)[:, :, 0].T for y in (m, sums))
-    return out, maximum, total
+        out.append((i, torch.einsum("hqk,khd->qhd", weights, v[j])))
+        for parts, y in ((maximum, m), (total, sums.detach())):
+            parts.append((i, torch.where(sums > 0, y, torch.nan)[:, :, 0].T))
+    return _join(q, 0, out), _join(q[:, :, 0], -torch.inf, maximum), _join(q[:, :, 0], 0, total)
 
 
 def _backward_reference(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, out, maximum, total, dout):
-    _check("attention_backward", q, k, v, q_offsets, k_offsets, dropout_p)
-    dq, dk, dv = torch.zeros_like(q), torch.zeros_like(k), torch.zeros_like(v)
+    _check(_backward_kernel, q, k, v, q_offsets, k_offsets, dropout_p)
+    dq, dk, dv = [], [], []
     for b, i, j in _scenes(q_offsets, k_offsets):
         x = _scores(q[i], k[j], scale)
-        weights = (x - maximum[i].T[:, :, None]).exp() / total[i].T[:, :, None]
+        kept = out is not None  # `out`, `maximum` and `total` are None where second derivatives are wanted
+        weights = (x - maximum[i].T[:, :, None]).exp() / total[i].T[:, :, None] if kept else x.softmax(2)
         factors = _factors(x, dropout_p, seed, b)
         dweights = factors * torch.einsum("qhd,khd->hqk", dout[i], v[j])
-        dx = scale * weights * (dweights - (dout[i] * out[i]).sum(2).T[:, :, None])
-        dq[i] = torch.einsum("hqk,khd->qhd", dx, k[j])
-        dk[j] = torch.einsum("hqk,qhd->khd", dx, q[i])
-        dv[j] = torch.einsum("hqk,qhd->khd", weights * factors, dout[i])
-    return dq, dk, dv
+        mean = (dout[i] * out[i]).sum(2).T[:, :, None] if kept else (weights * dweights).sum(2, keepdim=True)
+        dx = scale * weights * (dweights - mean)
+        dq.append((i, torch.einsum("hqk,khd->qhd", dx, k[j])))
+        dk.append((j, torch.einsum("hqk,qhd->khd", dx, q[i])))
+        dv.append((j, torch.einsum("hqk,qhd->khd", weights * factors, dout[i])))
+    return _join(q, 0, dq), _join(k, 0, dk), _join(v, 0, dv)
 
 
 # ---- C core ----
 
 
-def _fake(q, *_):
+def _new(q, *_):
     return q.new_empty(q.shape), q.new_empty(q.shape[:2]), q.new_empty(q.shape[:2])
-
-
-def _kernel(q, k, v, q_offsets, k_offsets, *settings):
-    outputs = _fake(q)
-    library._C.attention(*map(dense_rows, (q, k, v)), dense(q_offsets), dense(k_offsets), *settings, *outputs)
-    return outputs
-
-
-def _backward_kernel(gradients, q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, *saved):
-    """Write the gradients of q, k and v into `gradients`, whose rows may lie apart."""
-    offsets, settings = (dense(q_offsets), dense(k_offsets)), (scale, dropout_p, seed)
-    library._C.attention_backward(*map(dense_rows, (q, k, v)), *offsets, *settings, *map(dense, saved), *gradients)
 
 
 # ---- ops ----
@@ -159,24 +163,26 @@ def _define(name: str, schema: str, split: Callable, together: Callable):
     def after_split(body: Callable) -> Callable:
         return lambda *arguments: body(*split(*arguments[:num]), *arguments[num:])
 
-    def backward_kernel(*arguments):
-        gradients = [x.new_empty(x.shape) for x in arguments[:num]]
-        _backward_kernel(split(*gradients), *split(*arguments[:num]), *arguments[num:])
-        return tuple(gradients) if num > 1 else gradients[0]
+    def call(outputs, *arguments) -> None:
+        _kernel(*split(*arguments[:num]), *arguments[num:], *outputs)
 
-    def backward_fake(*arguments):
+    def new_gradients(*arguments):
         gradients = tuple(x.new_empty(x.shape) for x in arguments[:num])
         return gradients if num > 1 else gradients[0]
 
+    def call_backward(gradients, *arguments) -> None:
+        gradients = gradients if num > 1 else (gradients,)
+        _backward_kernel(*split(*arguments[:num]), *arguments[num:], *split(*gradients))
+
     arguments = f"{schema}, Tensor q_offsets, Tensor k_offsets, float scale, float dropout_p, int seed"
     outputs = ", ".join(["Tensor"] * num)
-    bodies = map(after_split, (_reference, _fake, _kernel))
-    op = library.define(f"{name}({arguments}) -> (Tensor, Tensor, Tensor)", *bodies)
+    schema = f"{name}({arguments}) -> (Tensor, Tensor, Tensor)"
+    op = library.define(schema, after_split(_reference), after_split(_new), call)
     backward = library.define(
         f"{name}_backward({arguments}, Tensor out, Tensor maximum, Tensor total, Tensor dout) -> ({outputs})",
         lambda *arguments: together(*after_split(_backward_reference)(*arguments)),
-        backward_fake,
-        backward_kernel,
+        new_gradients,
+        call_backward,
     )
 
     def save(ctx, inputs, output) -> None:
@@ -191,16 +197,19 @@ def _define(name: str, schema: str, split: Callable, together: Callable):
         return *(gradients if num > 1 else (gradients,)), *[None] * 5
 
     library.differentiate(op, save, gradient)
+    library.differentiate_by_composition(backward, (num + 5, num + 6, num + 7))
     return op, backward
 
 
 def _split_key_value(q: Tensor, key_value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    check_shape("attention_kv", "key_value", key_value, -1, 2, -1, -1)
+    if key_value.dim() != 4 or key_value.shape[1] != 2:
+        raise ValueError(f"attention_kv: key_value must have shape [K, 2, H, D], not {tuple(key_value.shape)}")
     return q, *key_value.unbind(1)
 
 
 def _split_qkv(qkv: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    check_shape("attention_qkv", "qkv", qkv, -1, 3, -1, -1)
+    if qkv.dim() != 4 or qkv.shape[1] != 3:
+        raise ValueError(f"attention_qkv: qkv must have shape [T, 3, H, D], not {tuple(qkv.shape)}")
     return qkv.unbind(1)
 
 
@@ -232,7 +241,8 @@ def attention(
 ) -> tuple[Tensor, Tensor]:
     """softmax(scale q k^T) v of each scene and head, with dropout on the weights.
 
-    Memory grows with the number of tokens, not with its square, forward and backward. A scene's result has the same
+    Memory grows with the number of tokens, not with its square, forward and backward; second derivatives and tangents
+    do store the scores. A scene's result has the same
     bits for any number of threads. Without dropout it has the same bits in any batch; dropout depends on the number of
     the scene in the batch.
 

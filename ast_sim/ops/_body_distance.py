@@ -11,6 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ast_sim.ops.library import is_differentiated
+
 FINE = 0.1  # the second channel of the gap saturates at this share of the radius
 WIDTH = 5
 
@@ -29,7 +31,12 @@ def proximity(
         body: [N] int64, the body of each node.
         surface: [F, 3] int64, boundary triangles, counter-clockwise seen from outside.
         radius: in the unit of position.
+
+    Raises:
+        ValueError: a derivative or a transform of torch.func is asked for.
     """
+    if any(map(is_differentiated, (position, offsets, body, surface, surface_offsets))):
+        raise ValueError("proximity: it has no derivatives: detach the position, and call it outside of torch.func")
     ahead, body, surface = position.numpy(), body.numpy(), surface.numpy()
     gap, normal = np.full(len(ahead), radius), np.zeros((len(ahead), 3))
     nodes, faces = offsets.tolist(), surface_offsets.tolist()

@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ast_sim.ops.library import check_index
+from ast_sim.ops.library import check_index, freeze, frozen
 
 
 def offsets_of(index: Tensor, num: int) -> Tensor:
@@ -50,6 +50,9 @@ class EdgeSet:
     receiver_offsets: Tensor
     num_senders: int
 
+    def __post_init__(self) -> None:
+        freeze(self, "senders", "receivers", "receiver_offsets")
+
     @staticmethod
     def from_pairs(senders: Tensor, receivers: Tensor, num_senders: int, num_receivers: int) -> EdgeSet:
         """Sort edges given as index pairs.
@@ -80,12 +83,12 @@ class EdgeSet:
     @cached_property
     def by_receiver(self) -> tuple[Tensor, Tensor]:
         """The edges in stored order, and the offsets of each receiver's edges, as segment ops take them."""
-        return torch.arange(len(self)), self.receiver_offsets
+        return *frozen(torch.arange(len(self))), self.receiver_offsets
 
     @cached_property
-    def by_sender(self) -> tuple[Tensor, Tensor]:
+    def by_sender(self) -> tuple[Tensor, ...]:
         """The edges sorted by sender, and the offsets of each sender's edges, as segment ops take them."""
-        return torch.argsort(self.senders, stable=True), offsets_of(self.senders, self.num_senders)
+        return frozen(torch.argsort(self.senders, stable=True), offsets_of(self.senders, self.num_senders))
 
     def __len__(self) -> int:
         return len(self.senders)

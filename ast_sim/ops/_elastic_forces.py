@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ast_sim.ops import library
 from ast_sim.ops._edges import join_indices, join_offsets, offsets_of
-from ast_sim.ops.library import check_index, check_offsets, check_shape, segment_of
+from ast_sim.ops.library import check_index, freeze
 
 FLAT = 2.0**-21  # a rest volume below this share of the magnitudes that it is the sum of may be rounding alone
 
@@ -37,6 +37,9 @@ class TetrahedronSet:
     node_order: Tensor
     node_offsets: Tensor
 
+    def __post_init__(self) -> None:
+        freeze(self, "elements", "node_order", "node_offsets")
+
     @staticmethod
     def from_elements(elements: Tensor, num_nodes: int) -> TetrahedronSet:
         """Sort the corners of the elements [E, 4] by node.
@@ -47,7 +50,8 @@ class TetrahedronSet:
         """
         if elements.dtype != torch.int64:
             raise TypeError(f"TetrahedronSet: elements must be int64, not {elements.dtype}")
-        check_shape("TetrahedronSet", "elements", elements, -1, 4)
+        if elements.dim() != 2 or elements.shape[1] != 4:
+            raise ValueError(f"TetrahedronSet: elements must have shape [E, 4], not {tuple(elements.shape)}")
         check_index("TetrahedronSet", "elements", elements, num_nodes)
         corners = elements.flatten()
         return TetrahedronSet(elements, torch.argsort(corners, stable=True), offsets_of(corners, num_nodes))
@@ -72,20 +76,12 @@ class TetrahedronSet:
 # ---- the composition ----
 
 
-def _check(op: str, position, rest_position, lame, elements, node_order, node_offsets) -> None:
-    """The checks of the C module."""
-    check_shape(op, "position", position, -1, 3)
-    check_shape(op, "rest_position", rest_position, len(position), 3)
-    check_shape(op, "lame", lame, -1, 2)
-    check_shape(op, "elements", elements, len(lame), 4)
-    check_shape(op, "node_order", node_order, 4 * len(lame))
-    check_shape(op, "node_offsets", node_offsets, len(position) + 1)
-    check_offsets(op, "node_offsets", node_offsets, 4 * len(lame))
-    check_index(op, "elements", elements, len(position))
-    if not torch.equal(node_order, torch.argsort(elements.flatten(), stable=True)) or not torch.equal(
-        elements.flatten()[node_order], segment_of(node_offsets)
-    ):
-        raise ValueError(f"{op}: node_order and node_offsets are not those of the elements")
+_SPEC = (
+    "position[N,3], rest_position[N,3], lame[E,2], elements[E,4] int64, node_order[4E] int64,"
+    " node_offsets[N+1] offsets(4E) corners(elements, node_order)"
+)
+_kernel = library.Kernel("elastic_forces", f"{_SPEC} -> force[N,3]")
+_backward_kernel = library.Kernel("elastic_forces_backward", f"{_SPEC}, dforce[N,3] -> dposition[N,3]")
 
 
 def _edges(x: Tensor, elements: Tensor) -> Tensor:
@@ -139,15 +135,14 @@ def _strain(F: Tensor) -> Tensor:
 
 
 def _reference(position, rest_position, lame, elements, node_order, node_offsets):
-    _check("elastic_forces", position, rest_position, lame, elements, node_order, node_offsets)
+    _kernel.check(position, rest_position, lame, elements, node_order, node_offsets)
     rest = _Rest.of(rest_position, lame, elements)
     F = rest.gradient(position, elements)
     return rest.add(F @ rest.stress(_strain(F)), elements, len(position))
 
 
 def _backward_reference(dforce, position, rest_position, lame, elements, node_order, node_offsets):
-    _check("elastic_forces_backward", position, rest_position, lame, elements, node_order, node_offsets)
-    check_shape("elastic_forces_backward", "dforce", dforce, len(position), 3)
+    _backward_kernel.check(position, rest_position, lame, elements, node_order, node_offsets, dforce)
     rest = _Rest.of(rest_position, lame, elements)
     F, dF = (rest.gradient(x, elements) for x in (position, dforce))
     FdF = F.mT @ dF
@@ -158,22 +153,33 @@ def _backward_reference(dforce, position, rest_position, lame, elements, node_or
 # ---- the ops ----
 
 
-def _fake(position, *_):
+def _new(position, *_):
     return position.new_empty(position.shape[0], 3)
+
+
+def _new_backward(dforce, position, *_):
+    return _new(position)
+
+
+def _call_backward(out, dforce, *inputs):
+    _backward_kernel(*inputs, dforce, out)
 
 
 _INPUTS = (
     "Tensor position, Tensor rest_position, Tensor lame, Tensor elements, Tensor node_order, Tensor node_offsets)"
     " -> Tensor"
 )
-_forces = library.define(f"elastic_forces({_INPUTS}", _reference, _fake)
-_forces_backward = library.define(f"elastic_forces_backward(Tensor dforce, {_INPUTS}", _backward_reference, _fake)
+_forces = library.define(f"elastic_forces({_INPUTS}", _reference, _new, _kernel)
+_forces_backward = library.define(
+    f"elastic_forces_backward(Tensor dforce, {_INPUTS}", _backward_reference, _new_backward, _call_backward
+)
 
 library.differentiate(
     _forces,
     lambda ctx, inputs, output: ctx.save_for_backward(*inputs),
     lambda ctx, grad: (_forces_backward(grad, *ctx.saved_tensors), *[None] * 5),
 )
+library.differentiate_by_composition(_forces_backward)
 
 
 def elastic_forces(position: Tensor, rest_position: Tensor, lame: Tensor, tets: TetrahedronSet) -> Tensor:

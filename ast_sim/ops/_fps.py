@@ -9,9 +9,15 @@ import torch
 from torch import Tensor
 
 from ast_sim.ops import library
-from ast_sim.ops.library import check_offsets, check_shape, dense
 
 EXTENT = 1 << 21  # below this difference of coordinates, squared distances are exact in float64
+
+
+_kernel = library.Kernel(
+    "farthest_point_sample",
+    "coordinates[C,3] int32, offsets[B+1] offsets(C), num integer(1,9223372036854775807)"
+    " -> out_offsets[B+1] int64, indices[S] int64",
+)
 
 
 def _out_offsets(offsets: Tensor, num: int) -> Tensor:
@@ -31,10 +37,7 @@ def _sample_scene(points: Tensor, num: int) -> Tensor:
 
 
 def _sample_reference(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
-    check_shape("farthest_point_sample", "coordinates", coordinates, -1, 3)
-    if coordinates.dtype != torch.int32:
-        raise TypeError(f"farthest_point_sample: coordinates must be int32, not {coordinates.dtype}")
-    check_offsets("farthest_point_sample", "offsets", offsets, len(coordinates))
+    _kernel.check(coordinates, offsets, num)
     picks = [offsets[:0]]
     for scene, (begin, end) in enumerate(zip(offsets.tolist(), offsets[1:].tolist(), strict=False)):
         points = coordinates[begin:end].long()
@@ -45,9 +48,16 @@ def _sample_reference(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[T
     return torch.cat(picks), _out_offsets(offsets, num)
 
 
-def _sample_kernel(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
-    indices, out_offsets = library._C.farthest_point_sample(dense(coordinates), dense(offsets), num)
-    return torch.from_numpy(indices), torch.from_numpy(out_offsets)
+def _new_samples(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
+    """There is room for as many as there may be."""
+    room = min(coordinates.shape[0], max(offsets.shape[0] - 1, 0) * num)
+    return offsets.new_empty(room), offsets.new_empty(offsets.shape)
+
+
+def _call(outputs, coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
+    indices, out_offsets = outputs
+    samples = _kernel(coordinates, offsets, num, out_offsets, indices)
+    return (indices if samples == indices.shape[0] else indices[:samples].clone()), out_offsets
 
 
 def _sample_fake(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
@@ -57,8 +67,9 @@ def _sample_fake(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor
 _sample = library.define(
     "farthest_point_sample(Tensor coordinates, Tensor offsets, int num) -> (Tensor, Tensor)",
     _sample_reference,
+    _new_samples,
+    _call,
     _sample_fake,
-    _sample_kernel,
 )
 
 

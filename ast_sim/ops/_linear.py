@@ -10,9 +10,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ast_sim.ops import library
-from ast_sim.ops.library import check_shape, dense, dense_rows
 
 ACTIVATIONS = ("none", "relu", "geglu")
+GEGLU = ACTIVATIONS.index("geglu")
 SAVED = 1 << 24  # an activation's input with more elements is not kept for the gradient, but computed again
 
 
@@ -25,19 +25,25 @@ def _given(wanted: list[bool], outputs: list[Tensor]) -> list[Tensor | None]:
     return [x if want else None for want, x in zip(wanted, outputs, strict=True)]
 
 
-def _check_weight(op: str, weight: Tensor, inputs: int) -> None:
-    if weight.dim() != 2 or weight.shape[1] != inputs or not weight.numel():
-        raise ValueError(f"{op}: weight must have shape [O, {inputs}], not {tuple(weight.shape)}")
+_SPECS = (
+    "x[M,I] rows, weight[O,I] filled, bias?[O], residual?[M,P] rows, activation integer(0,1) -> out[M,P], z?[M,O]",
+    "x[M,I] rows, weight[O,I] filled, bias?[O], z?[M,O], activation integer(0,1), dout[M,P] rows"
+    " -> dx?[M,I], dweight?[O,I], dbias?[O]",
+)
+# By whether the outputs are pairs.
+_linear_kernels, _backward_kernels = (
+    (
+        library.Kernel(name, spec.replace("P", "O")),
+        library.Kernel(f"linear_geglu{name[6:]}", spec.replace("O", "2P").replace("(0,1)", "(2,2)")),
+    )
+    for name, spec in zip(("linear", "linear_backward"), _SPECS, strict=True)
+)
 
 
-def _check_linear(x: Tensor, weight: Tensor, bias: Tensor | None, activation: str) -> None:
+def _number_of(activation: str) -> int:
     if activation not in ACTIVATIONS:
         raise ValueError(f"linear: activation {activation!r} is unknown: choose of {', '.join(ACTIVATIONS)}")
-    check_shape("linear", "x", x, -1, -1)
-    _check_weight("linear", weight, x.shape[1])
-    check_shape("linear", "bias", bias, weight.shape[0])
-    if activation == "geglu" and weight.shape[0] % 2:
-        raise ValueError(f"linear: geglu takes an even number of outputs, not {weight.shape[0]}")
+    return ACTIVATIONS.index(activation)
 
 
 def _activated(z: Tensor, activation: str) -> Tensor:
@@ -48,10 +54,10 @@ def _activated(z: Tensor, activation: str) -> Tensor:
 
 
 def _linear_reference(x, weight, bias, residual, activation, save):
-    _check_linear(x, weight, bias, activation)
+    kernel = _linear_kernels[_number_of(activation) == GEGLU]
+    kernel.check(x, weight, bias, residual)
     z = F.linear(x, weight, bias)
     out = _activated(z, activation)
-    check_shape("linear", "residual", residual, *out.shape)
     out = out if residual is None else out + residual
     return out, (z.clone() if out is z else z) if save else x.new_empty(0)
 
@@ -76,43 +82,37 @@ def _linear_backward_reference(dout, x, weight, bias, z, activation, wanted):
     )
 
 
-def _linear_kernel(x, weight, bias, residual, activation, save):
-    _check_linear(x, weight, bias, activation)
-    out, z = _linear_fake(x, weight, bias, residual, activation, save)
-    check_shape("linear", "residual", residual, *out.shape)
-    inputs = (dense_rows(x), dense(weight), dense(bias), dense_rows(residual), ACTIVATIONS.index(activation))
-    library._C.linear(*inputs, out, z if save else None)
-    return out, z
+def _call_linear(outputs, x, weight, bias, residual, activation, save):
+    number, (out, z) = _number_of(activation), outputs
+    _linear_kernels[number == GEGLU](x, weight, bias, residual, number, out, z if save else None)
 
 
-def _linear_backward_kernel(dout, x, weight, bias, z, activation, wanted):
-    outputs = _linear_backward_fake(dout, x, weight, bias, z, activation, wanted)
-    inputs = (dense_rows(x), dense(weight), dense(bias), dense(z), ACTIVATIONS.index(activation), dense_rows(dout))
-    library._C.linear_backward(*inputs, *_given(wanted, outputs))
-    return outputs
+def _call_linear_backward(outputs, dout, x, weight, bias, z, activation, wanted):
+    number = _number_of(activation)
+    _backward_kernels[number == GEGLU](x, weight, bias, z, number, dout, *_given(wanted, outputs))
 
 
-def _linear_fake(x, weight, bias, residual, activation, save):
+def _new_linear(x, weight, bias, residual, activation, save):
     out = x.new_empty(x.shape[0], weight.shape[0] // (2 if activation == "geglu" else 1))
     return out, x.new_empty((x.shape[0], weight.shape[0]) if save else (0,))
 
 
-def _linear_backward_fake(dout, x, weight, bias, z, activation, wanted):
+def _new_linear_backward(dout, x, weight, bias, z, activation, wanted):
     return tuple(_outputs(x, wanted, [x.shape, weight.shape, weight.shape[:1]]))
 
 
 _linear = library.define(
     "linear(Tensor x, Tensor weight, Tensor? bias, Tensor? residual, str activation, bool save) -> (Tensor, Tensor)",
     _linear_reference,
-    _linear_fake,
-    _linear_kernel,
+    _new_linear,
+    _call_linear,
 )
 _linear_backward = library.define(
     "linear_backward(Tensor dout, Tensor x, Tensor weight, Tensor? bias, Tensor? z, str activation, bool[3] wanted)"
     " -> (Tensor, Tensor, Tensor)",
     _linear_backward_reference,
-    _linear_backward_fake,
-    _linear_backward_kernel,
+    _new_linear_backward,
+    _call_linear_backward,
 )
 
 
@@ -134,6 +134,7 @@ def _linear_gradient(ctx, dout, _):
 
 
 library.differentiate(_linear, _save_linear, _linear_gradient)
+library.differentiate_by_composition(_linear_backward, (4,))
 
 
 def linear(

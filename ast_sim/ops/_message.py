@@ -17,9 +17,8 @@ from torch import Tensor
 
 from ast_sim.ops import library
 from ast_sim.ops._edges import EdgeSet
-from ast_sim.ops.library import check_index, check_offsets, check_shape, dense, segment_of
+from ast_sim.ops._mlp import layer_norm, layer_norm_backward, normalize
 
-EPS = 1e-5
 Encoder = tuple[Tensor, Tensor, Tensor]
 
 
@@ -31,7 +30,7 @@ def _compose(of_senders, of_receivers, edge_features, encoder, W2, b2, gamma, be
         z = z + F.linear(F.relu(F.linear(edge_features, A1, a1)), A2)
     elif edge_features is not None:
         z = z + edge_features
-    messages = F.layer_norm(F.linear(F.relu(z), W2, b2), (len(b2),), gamma, beta, EPS)
+    messages = layer_norm(F.linear(F.relu(z), W2, b2), gamma, beta)
     return messages.new_zeros(len(of_receivers), len(b2)).index_add(0, receivers, messages), messages
 
 
@@ -40,55 +39,42 @@ def _are_latents(edge_features: Tensor, a1: Tensor) -> bool:
     return len(a1) == 0 and edge_features.shape[1] > 0
 
 
-def _check(
-    of_senders, of_receivers, edge_features, A1, a1, A2, W2, b2, gamma, beta, senders, receivers, offsets
-) -> None:
-    """The checks of the C module, for the composition."""
-    check_shape("message", "of_senders", of_senders, -1, -1)
-    check_shape("message", "edge_features", edge_features, -1, -1)
-    (edges, inputs), channels = edge_features.shape, of_senders.shape[1]
-    hidden, out = len(a1), len(b2)
-    for name, x, shape in (
-        ("of_receivers", of_receivers, (-1, channels)),
-        ("A1", A1, (hidden, inputs)),
-        ("a1", a1, (hidden,)),
-        ("A2", A2, (channels, hidden)),
-        ("W2", W2, (out, channels)),
-        ("b2", b2, (out,)),
-        ("gamma", gamma, (out,)),
-        ("beta", beta, (out,)),
-        ("senders", senders, (edges,)),
-        ("receivers", receivers, (edges,)),
-        ("receiver_offsets", offsets, (len(of_receivers) + 1,)),
-    ):
-        check_shape("message", name, x, *shape)
-    if hidden == 0 and inputs not in (0, channels):
+_SPEC = (
+    "of_senders[S,F], of_receivers[R,F], edge_features?[M,E], A1?[H,E] needs(edge_features), a1?[H] with(A1),"
+    " A2?[F,H] with(A1), W2[G,F], b2[G], gamma[G], beta[G], senders[M] index(S), receivers[M] int64,"
+    " receiver_offsets[R+1] offsets(M) segments(receivers)"
+)
+_kernel = library.Kernel("message", f"{_SPEC} -> sum[R,G], messages?[M,G]")
+_backward_kernel = library.Kernel(
+    "message_backward",
+    f"{_SPEC}, dsum[R,G], dmessages?[M,G] -> dof_senders[S,F], dof_receivers[R,F], dedge_features?[M,E], dA1[H,E],"
+    " da1[H], dA2[F,H], dW2[G,F], db2[G], dgamma[G], dbeta[G]",
+)
+
+
+def _check(kernel: library.Kernel, *tensors: Tensor) -> None:
+    kernel.check(*tensors)
+    inputs, channels = tensors[2].shape[1], tensors[0].shape[1]
+    if len(tensors[4]) == 0 and inputs not in (0, channels):
         raise ValueError(
             f"message: edge_features without an encoder must have the {channels} channels of of_senders, not {inputs}"
         )
-    check_offsets("message", "receiver_offsets", offsets, edges)
-    check_index("message", "senders", senders, len(of_senders))
-    wrong = (receivers != segment_of(offsets)).nonzero()
-    if len(wrong):
-        at = int(wrong[0])
-        raise ValueError(f"message: receivers[{at}] is {int(receivers[at])}, but receiver_offsets say otherwise")
 
 
 def _reference(*inputs):
     *tensors, with_messages = inputs
-    _check(*tensors)
+    _check(_kernel, *tensors)
     encoder = tensors[3:6]
     total, messages = _compose(*tensors[:3], None if _are_latents(tensors[2], encoder[1]) else encoder, *tensors[6:12])
     return total, messages if with_messages else messages.new_empty(0, messages.shape[1])
 
 
-def _kernel(*inputs):
-    total, messages = _fake(*inputs)
-    library._C.message(*(dense(x) for x in inputs[:-1]), total, messages)
-    return total, messages
+def _call_kernel(outputs, *inputs):
+    *tensors, with_messages = inputs
+    _kernel(*tensors, outputs[0], outputs[1] if with_messages else None)
 
 
-def _fake(of_senders, of_receivers, edge_features, A1, a1, A2, W2, b2, *edges):
+def _new(of_senders, of_receivers, edge_features, A1, a1, A2, W2, b2, *edges):
     total = of_receivers.new_empty(of_receivers.shape[0], b2.shape[0])
     return total, of_receivers.new_empty(edge_features.shape[0] if edges[-1] else 0, b2.shape[0])
 
@@ -96,24 +82,21 @@ def _fake(of_senders, of_receivers, edge_features, A1, a1, A2, W2, b2, *edges):
 def _backward_reference(
     dsum, dmessages, P, Q, e, A1, a1, A2, W2, b2, gamma, beta, senders, receivers, offsets, wants_edges
 ):
-    _check(P, Q, e, A1, a1, A2, W2, b2, gamma, beta, senders, receivers, offsets)
+    _check(_backward_kernel, P, Q, e, A1, a1, A2, W2, b2, gamma, beta, senders, receivers, offsets)
     latents = _are_latents(e, a1)
     h = F.relu(F.linear(e, A1, a1))
     of_edges = e if latents else F.linear(h, A2)
     x = F.relu(P.index_select(0, senders) + Q.index_select(0, receivers) + of_edges)
     y = F.linear(x, W2, b2)
-    _, mean, rstd = torch.native_layer_norm(y, (len(b2),), gamma, beta, EPS)
     g = dsum.index_select(0, receivers)
     if len(dmessages):
         g = g + dmessages
-    dy, dgamma, dbeta = torch.ops.aten.native_layer_norm_backward(
-        g, y, (len(b2),), mean, rstd, gamma, beta, (True, True, True)
-    )
+    dy, dgamma, dbeta = layer_norm_backward(g, gamma, *normalize(y))
     dz = (dy @ W2) * (x > 0)
     dc = (dz @ A2) * (h > 0)
     return (
-        torch.zeros_like(P).index_add_(0, senders, dz),
-        torch.zeros_like(Q).index_add_(0, receivers, dz),
+        torch.zeros_like(P).index_add(0, senders, dz),
+        torch.zeros_like(Q).index_add(0, receivers, dz),
         (dz if latents else dc @ A1) if wants_edges else e.new_empty(0, e.shape[1]),
         dc.T @ e,
         dc.sum(0),
@@ -133,14 +116,13 @@ def _outputs(inputs, wants_edges: bool) -> list[Tensor]:
     return [x.new_empty(shape) for x, shape in zip(inputs, shapes, strict=True)]
 
 
-def _backward_kernel(dsum, dmessages, *inputs):
-    *inputs, wants_edges = inputs
-    out = _outputs(inputs[:10], wants_edges)
-    library._C.message_backward(*(dense(x) for x in (*inputs, dsum, dmessages)), *out)
-    return tuple(out)
+def _call_backward(outputs, dsum, dmessages, *inputs):
+    *tensors, wants_edges = inputs
+    P, Q, e, *rest = outputs
+    _backward_kernel(*tensors, dsum, dmessages if len(dmessages) else None, P, Q, e if wants_edges else None, *rest)
 
 
-def _backward_fake(dsum, dmessages, *inputs):
+def _new_backward(dsum, dmessages, *inputs):
     return tuple(_outputs(inputs[:10], inputs[-1]))
 
 
@@ -148,12 +130,12 @@ _INPUTS = (
     "Tensor of_senders, Tensor of_receivers, Tensor edge_features, Tensor A1, Tensor a1, Tensor A2,"
     " Tensor W2, Tensor b2, Tensor gamma, Tensor beta, Tensor senders, Tensor receivers, Tensor receiver_offsets"
 )
-_message = library.define(f"message({_INPUTS}, bool with_messages) -> (Tensor, Tensor)", _reference, _fake, _kernel)
+_message = library.define(f"message({_INPUTS}, bool with_messages) -> (Tensor, Tensor)", _reference, _new, _call_kernel)
 _message_backward = library.define(
     f"message_backward(Tensor dsum, Tensor dmessages, {_INPUTS}, bool wants_edges) -> ({', '.join(['Tensor'] * 10)})",
     _backward_reference,
-    _backward_fake,
-    _backward_kernel,
+    _new_backward,
+    _call_backward,
 )
 
 
@@ -173,6 +155,7 @@ def _gradient(ctx, dsum, dmessages):
 
 
 library.differentiate(_message, _save, _gradient)
+library.differentiate_by_composition(_message_backward)
 
 
 def _check_features(edges: EdgeSet, of_senders: Tensor, edge_features: Tensor | None, encoder: Encoder | None) -> None:

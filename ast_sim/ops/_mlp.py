@@ -8,45 +8,58 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from ast_sim.ops import library
-from ast_sim.ops._linear import _check_weight, _given, _outputs
-from ast_sim.ops.library import check_shape, dense, dense_rows
+from ast_sim.ops._linear import _given, _outputs
 
 EPSILON = 1e-5
 SAVED = 1 << 25  # hidden units and outputs with more elements are not kept for the gradient, but computed again
 
 
-def _check(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual) -> None:
-    if x.dim() != 2 or (beside is not None and (beside.dim() != 2 or len(beside) != len(x))):
-        shapes = tuple(x.shape), None if beside is None else tuple(beside.shape)
-        raise ValueError(f"mlp: x and beside must be matrices of equally many rows, not {shapes[0]} and {shapes[1]}")
-    _check_weight("mlp", weight1, x.shape[1] + (0 if beside is None else beside.shape[1]))
-    _check_weight("mlp", weight2, weight1.shape[0])
-    check_shape("mlp", "bias1", bias1, weight1.shape[0])
-    for name, vector in (("bias2", bias2), ("gamma", gamma), ("beta", beta)):
-        check_shape("mlp", name, vector, weight2.shape[0])
-    check_shape("mlp", "residual", residual, len(x), weight2.shape[0])
-    if (gamma is None) != (beta is None):
-        raise ValueError("mlp: gamma and beta go together")
+_TENSORS = (
+    "x[M,I] rows, beside?[M,J] rows, weight1[H,I+J] filled, bias1?[H], weight2[O,H] filled, bias2?[O],"
+    " gamma?[O], beta?[O] with(gamma)"
+)
+_KEPT = "hidden?[M,H], normalized?[M,O], scale?[M] with(normalized)"
+_mlp_kernel = library.Kernel("mlp", f"{_TENSORS}, residual?[M,O] rows -> out[M,O], {_KEPT}")
+_backward_kernel = library.Kernel(
+    "mlp_backward",
+    f"{_TENSORS}, dout[M,O] rows, {_KEPT} -> dx?[M,I], dbeside?[M,J], dweight1?[H,I+J], dbias1?[H], dweight2?[O,H],"
+    " dbias2?[O], dgamma?[O], dbeta?[O]",
+)
 
 
 def _hidden(x, beside, weight1, bias1) -> Tensor:
     return F.relu(F.linear(x if beside is None else torch.cat([x, beside], dim=1), weight1, bias1))
 
 
-def _normalized(y: Tensor) -> tuple[Tensor, Tensor]:
+def normalize(y: Tensor) -> tuple[Tensor, Tensor]:
     """Each row of y normalized, and the factors [M] of the rows."""
     centred = y - y.mean(1, keepdim=True)
     scale = (centred.square().mean(1) + EPSILON).rsqrt()
     return centred * scale[:, None], scale
 
 
+def layer_norm(y: Tensor, gamma: Tensor, beta: Tensor) -> Tensor:
+    """torch's own, or the formula: torch loses terms in the tangent of its tangent."""
+    if torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
+        return normalize(y)[0] * gamma + beta
+    return F.layer_norm(y, y.shape[1:], gamma, beta, EPSILON)
+
+
+def layer_norm_backward(dout: Tensor, gamma: Tensor, normalized: Tensor, scale: Tensor) -> tuple:
+    """The gradients of y, gamma and beta. torch's own loses terms in third derivatives."""
+    dn = dout * gamma
+    dy = dn - dn.mean(1, keepdim=True) - normalized * (dn * normalized).mean(1, keepdim=True)
+    return dy * scale[:, None], (dout * normalized).sum(0), dout.sum(0)
+
+
 # ---- composition ----
 
 
 def _reference(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual, save):
-    _check(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual)
+    _mlp_kernel.check(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual)
     hidden = _hidden(x, beside, weight1, bias1)
     out = F.linear(hidden, weight2, bias2)
     kept = [x.new_empty(0) for _ in range(3)]
@@ -54,8 +67,8 @@ def _reference(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual,
         kept[0] = hidden
     if gamma is not None:
         if save:
-            kept[1:] = _normalized(out)
-        out = F.layer_norm(out, out.shape[1:], gamma, beta, EPSILON)
+            kept[1:] = normalize(out)
+        out = layer_norm(out, gamma, beta)
     return out if residual is None else out + residual, *kept
 
 
@@ -66,10 +79,8 @@ def _backward_reference(
     dgamma = dbeta = dy = dout
     if gamma is not None:
         if normalized is None:
-            normalized, scale = _normalized(F.linear(hidden, weight2, bias2))
-        dgamma, dbeta, dn = (dout * normalized).sum(0), dout.sum(0), dout * gamma
-        dy = dn - dn.mean(1, keepdim=True) - normalized * (dn * normalized).mean(1, keepdim=True)
-        dy = dy * scale[:, None]
+            normalized, scale = normalize(F.linear(hidden, weight2, bias2))
+        dy, dgamma, dbeta = layer_norm_backward(dout, gamma, normalized, scale)
     dz = (dy @ weight2).masked_fill(hidden <= 0, 0)
     inputs = x if beside is None else torch.cat([x, beside], dim=1)
     dinputs = dz @ weight1
@@ -87,30 +98,24 @@ def _kept(gamma: Tensor | None, save: bool) -> list[bool]:
     return [save, norm, norm]
 
 
-def _kernel(x, beside, *inputs):
-    *weights, residual, save = inputs
-    _check(x, beside, *weights, residual)
-    out, *kept = _fake(x, beside, *inputs)
-    tensors = (dense_rows(x), dense_rows(beside), *map(dense, weights), dense_rows(residual))
-    library._C.mlp(*tensors, out, *_given(_kept(weights[4], save), kept))
-    return out, *kept
+def _call(outputs, *inputs):
+    *tensors, save = inputs
+    out, *kept = outputs
+    _mlp_kernel(*tensors, out, *_given(_kept(tensors[6], save), kept))
 
 
-def _backward_kernel(dout, x, beside, *inputs):
-    *weights, hidden, normalized, scale, wanted = inputs
-    outputs = _backward_fake(dout, x, beside, *inputs)
-    tensors = (dense_rows(x), dense_rows(beside), *map(dense, weights), dense_rows(dout))
-    library._C.mlp_backward(*tensors, *map(dense, (hidden, normalized, scale)), *_given(wanted, outputs))
-    return outputs
+def _call_backward(outputs, dout, *inputs):
+    *tensors, hidden, normalized, scale, wanted = inputs
+    _backward_kernel(*tensors, dout, hidden, normalized, scale, *_given(wanted, outputs))
 
 
-def _fake(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual, save):
+def _new(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual, save):
     rows, hidden, columns = x.shape[0], weight1.shape[0], weight2.shape[0]
     kept = _outputs(x, _kept(gamma, save), [(rows, hidden), (rows, columns), (rows,)])
     return x.new_empty(rows, columns), *kept
 
 
-def _backward_fake(dout, x, beside, weight1, bias1, weight2, *kept_and_wanted):
+def _new_backward(dout, x, beside, weight1, bias1, weight2, *kept_and_wanted):
     vectors = [weight1.shape[:1], *[weight2.shape[:1]] * 3]
     beside_shape = (0,) if beside is None else beside.shape
     shapes = [x.shape, beside_shape, weight1.shape, vectors[0], weight2.shape, *vectors[1:]]
@@ -120,14 +125,14 @@ def _backward_fake(dout, x, beside, weight1, bias1, weight2, *kept_and_wanted):
 _LAYERS = "Tensor weight1, Tensor? bias1, Tensor weight2, Tensor? bias2"
 _INPUTS = f"Tensor x, Tensor? beside, {_LAYERS}, Tensor? gamma, Tensor? beta"
 _mlp = library.define(
-    f"mlp({_INPUTS}, Tensor? residual, bool save) -> (Tensor, Tensor, Tensor, Tensor)", _reference, _fake, _kernel
+    f"mlp({_INPUTS}, Tensor? residual, bool save) -> (Tensor, Tensor, Tensor, Tensor)", _reference, _new, _call
 )
 _mlp_backward = library.define(
     f"mlp_backward(Tensor dout, {_INPUTS}, Tensor? hidden, Tensor? normalized, Tensor? scale, bool[8] wanted)"
     " -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)",
     _backward_reference,
-    _backward_fake,
-    _backward_kernel,
+    _new_backward,
+    _call_backward,
 )
 
 
@@ -145,6 +150,7 @@ def _gradient(ctx, dout, *_):
 
 
 library.differentiate(_mlp, _save, _gradient)
+library.differentiate_by_composition(_mlp_backward, (9, 10, 11))
 
 
 def mlp(

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ast_sim.ops import library
-from ast_sim.ops.library import check_offsets, check_shape, dense, segment_of
+from ast_sim.ops.library import freeze, segment_of
 
 MAX_DEPTH = 21
 
@@ -36,6 +36,9 @@ class Octree:
     node_order: Tensor
     node_offsets: Tensor
     depth: int
+
+    def __post_init__(self) -> None:
+        freeze(self, "keys", "cell_offsets", "node_cell", "node_order", "node_offsets")
 
     def coordinates(self) -> Tensor:
         """[C, 3] int32: x, y and z of each cell, 0..2^depth - 1."""
@@ -94,6 +97,9 @@ class CellMap:
     fine_by_fine: Tensor
     coarse_by_fine: Tensor
 
+    def __post_init__(self) -> None:
+        freeze(self, "pair_offsets", "fine", "coarse_index", "fine_by_fine", "coarse_by_fine")
+
 
 # ---- cells ----
 
@@ -124,21 +130,23 @@ def _keys_of(coordinates: Tensor) -> Tensor:
     return _spread(x) << 2 | _spread(y) << 1 | _spread(z)
 
 
-def _check_octree(positions: Tensor, offsets: Tensor, center: Sequence[float], half_width: float, depth: int) -> None:
-    check_shape("octree", "positions", positions, -1, 3)
-    if not positions.is_floating_point():
-        raise TypeError(f"octree: positions must be float32, not {positions.dtype}")
-    check_offsets("octree", "offsets", offsets, len(positions))
-    if not 0 <= depth <= MAX_DEPTH:
-        raise ValueError(f"octree: depth must lie in 0..{MAX_DEPTH}, not {depth}")
+_octree_kernel = library.Kernel(
+    "octree",
+    "positions[N,3], offsets[B+1] offsets(N), x number, y number, z number, half_width number, depth integer(0,21)"
+    " -> keys[N] int64, cell_offsets[B+1] int64, node_cell[N] int64, node_order[N] int64, node_offsets[N+1] int64",
+)
+_coordinates_kernel = library.Kernel("octree_coordinates", "keys[C] int64 -> coordinates[C,3] int32")
+_coarsen_kernel = library.Kernel(
+    "octree_coarsen", "keys[C] int64, cell_offsets[B+1] offsets(C) scenes(keys), levels integer(0,21)"
+)
+
+
+def _octree_reference(positions: Tensor, offsets: Tensor, center: Sequence[float], half_width: float, depth: int):
+    _octree_kernel.check(positions, offsets, depth=depth)
     if not 0 < half_width < 1e300:
         raise ValueError("octree: half_width must be positive and finite")
     if not all(abs(x) < 1e300 for x in center):
         raise ValueError("octree: center must be finite")
-
-
-def _octree_reference(positions: Tensor, offsets: Tensor, center: Sequence[float], half_width: float, depth: int):
-    _check_octree(positions, offsets, center, half_width, depth)
     unit = (positions.double() - positions.new_tensor(center, dtype=torch.float64) + half_width) / (2 * half_width)
     finite, inside = positions.isfinite().all(1), ((unit >= -1e-6) & (unit <= 1 + 1e-6)).all(1)
     bad = (~(finite & inside)).nonzero()
@@ -169,13 +177,17 @@ def _runs(keys: Tensor, scenes: Tensor, offsets: Tensor, order: Tensor) -> tuple
     return keys[starts], torch.searchsorted(starts, offsets), node_offsets, node_cell
 
 
-def _octree_kernel(positions: Tensor, offsets: Tensor, center: Sequence[float], half_width: float, depth: int):
-    n = len(positions)
+def _new_octree(positions: Tensor, offsets: Tensor, *domain):
+    """There is room for a cell a node."""
+    n = positions.shape[0]
     keys, node_cell, node_order = (offsets.new_empty(n) for _ in range(3))
-    cell_offsets, node_offsets = torch.empty_like(offsets), offsets.new_empty(n + 1)
+    return keys, torch.empty_like(offsets), offsets.new_empty(n + 1), node_cell, node_order
+
+
+def _call_octree(outputs, positions: Tensor, offsets: Tensor, center: Sequence[float], half_width: float, depth: int):
+    keys, cell_offsets, node_offsets, node_cell, node_order = outputs
     outputs = (keys, cell_offsets, node_cell, node_order, node_offsets)
-    library._C.octree_build(dense(positions), dense(offsets), *center, half_width, depth, *outputs)
-    num = int(cell_offsets[-1])
+    num = _octree_kernel(positions, offsets, *center, half_width, depth, *outputs)
     return keys[:num], cell_offsets, node_offsets[: num + 1], node_cell, node_order
 
 
@@ -188,7 +200,7 @@ def _coordinates_reference(keys: Tensor) -> Tensor:
     return torch.stack([_gather(keys >> 2), _gather(keys >> 1), _gather(keys)], 1).int()
 
 
-def _coordinates_fake(keys: Tensor) -> Tensor:
+def _new_coordinates(keys: Tensor) -> Tensor:
     return keys.new_empty(keys.shape[0], 3, dtype=torch.int32)
 
 
@@ -218,16 +230,8 @@ def _coarsen_reference(keys: Tensor, cell_offsets: Tensor, levels: int) -> list[
 
 
 def _coarsen_once(keys: Tensor, cell_offsets: Tensor) -> tuple[Tensor, ...]:
-    check_offsets("octree_coarsen", "cell_offsets", cell_offsets, len(keys))
+    _coarsen_kernel.check(keys, cell_offsets)
     scenes = segment_of(cell_offsets)
-    wrong = keys < 0
-    wrong[1:] |= (keys[1:] <= keys[:-1]) & (scenes[1:] == scenes[:-1])
-    if wrong.any():
-        at = int(wrong.nonzero()[0])
-        raise ValueError(
-            "octree_coarsen: keys must be at least 0 and rise strictly within each scene, but"
-            f" keys[{at}] is {int(keys[at])}"
-        )
     rows = torch.arange(len(keys), device=keys.device)
     coarse_keys, coarse_offsets, node_offsets, node_cell = _runs(keys >> 3, scenes, cell_offsets, rows)
     after = _after_reference(coarse_keys, segment_of(coarse_offsets))
@@ -246,9 +250,9 @@ def _coarsen_once(keys: Tensor, cell_offsets: Tensor) -> tuple[Tensor, ...]:
     return coarse_keys, coarse_offsets, node_offsets, node_cell, counts.cumsum(0), *pairs
 
 
-def _coarsen_kernel(keys: Tensor, cell_offsets: Tensor, levels: int) -> list[Tensor]:
-    parts = library._C.octree_coarsen(dense(keys), dense(cell_offsets), levels)
-    return [torch.from_numpy(part) for part in parts]
+def _call_coarsen(outputs, keys: Tensor, cell_offsets: Tensor, levels: int) -> list[Tensor]:
+    """The arrays are made by the core, which alone knows their sizes."""
+    return [torch.from_numpy(part) for part in _coarsen_kernel(keys, cell_offsets, levels)]
 
 
 def _coarsen_fake(keys: Tensor, cell_offsets: Tensor, levels: int) -> list[Tensor]:
@@ -265,15 +269,19 @@ _octree = library.define(
     "octree(Tensor positions, Tensor offsets, float[] center, float half_width, int depth)"
     " -> (Tensor, Tensor, Tensor, Tensor, Tensor)",
     _octree_reference,
+    _new_octree,
+    _call_octree,
     _octree_fake,
-    _octree_kernel,
 )
-_coordinates = library.define("octree_coordinates(Tensor keys) -> Tensor", _coordinates_reference, _coordinates_fake)
+_coordinates = library.define(
+    "octree_coordinates(Tensor keys) -> Tensor", _coordinates_reference, _new_coordinates, _coordinates_kernel
+)
 _coarsen = library.define(
     "octree_coarsen(Tensor keys, Tensor cell_offsets, int levels) -> Tensor[]",
     _coarsen_reference,
+    lambda *_: (),
+    _call_coarsen,
     _coarsen_fake,
-    _coarsen_kernel,
 )
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ast_sim.ops import library
-from ast_sim.ops.library import check_offsets, check_shape, segment_of
+from ast_sim.ops.library import segment_of
 
 
 def _scale(node_offsets: Tensor, mean: bool, dtype: torch.dtype) -> Tensor:
@@ -17,45 +17,49 @@ def _scale(node_offsets: Tensor, mean: bool, dtype: torch.dtype) -> Tensor:
     return counts.to(dtype).reciprocal()[:, None]
 
 
-def _check(op: str, x: Tensor, node_order: Tensor, node_offsets: Tensor) -> None:
-    check_shape(op, "x", x, -1, -1)
-    check_shape(op, "node_order", node_order, len(x))
-    check_offsets(op, "node_offsets", node_offsets, len(x))
-    if not torch.equal(node_order.sort().values, torch.arange(len(x), device=x.device)):
-        raise ValueError(f"{op}: node_order must be a permutation")
+_sum_kernel = library.Kernel(
+    "segment_sum",
+    "x[N,F], node_order[N] permutation, node_offsets[C+1] offsets(N), mean integer(0,1) -> out[C,F]",
+)
+_spread_kernel = library.Kernel(
+    "segment_spread",
+    "dout[C,F], node_order[N] permutation, node_offsets[C+1] offsets(N), mean integer(0,1) -> dx[N,F]",
+)
+_column_sum_kernel = library.Kernel("column_sum", "x[N,F] -> out[F]")
 
 
 def _sum_reference(x: Tensor, node_order: Tensor, node_offsets: Tensor, mean: bool) -> Tensor:
-    _check("segment_sum", x, node_order, node_offsets)
+    _sum_kernel.check(x, node_order, node_offsets)
     out = x.new_zeros(len(node_offsets) - 1, x.shape[1])
     out.index_add_(0, segment_of(node_offsets), x[node_order])
     return out * _scale(node_offsets, mean, x.dtype)
 
 
-def _sum_fake(x: Tensor, node_order: Tensor, node_offsets: Tensor, mean: bool) -> Tensor:
+def _new_sum(x: Tensor, node_order: Tensor, node_offsets: Tensor, mean: bool) -> Tensor:
     return x.new_empty(torch.sym_max(node_offsets.shape[0] - 1, 0), x.shape[-1])
 
 
 def _spread_reference(dout: Tensor, node_order: Tensor, node_offsets: Tensor, mean: bool) -> Tensor:
+    _spread_kernel.check(dout, node_order, node_offsets)
     dx = dout.new_empty(len(node_order), dout.shape[1])
     dx[node_order] = (dout * _scale(node_offsets, mean, dout.dtype))[segment_of(node_offsets)]
     return dx
 
 
-def _spread_fake(dout: Tensor, node_order: Tensor, node_offsets: Tensor, mean: bool) -> Tensor:
+def _new_spread(dout: Tensor, node_order: Tensor, node_offsets: Tensor, mean: bool) -> Tensor:
     return dout.new_empty(node_order.shape[0], dout.shape[1])
 
 
 def _column_sum_reference(x: Tensor) -> Tensor:
-    check_shape("column_sum", "x", x, -1, -1)
+    _column_sum_kernel.check(x)
     return x.sum(0)
 
 
 _SEGMENTS = "Tensor node_order, Tensor node_offsets, bool mean) -> Tensor"
-_sum = library.define(f"segment_sum(Tensor x, {_SEGMENTS}", _sum_reference, _sum_fake)
-_spread = library.define(f"segment_spread(Tensor dout, {_SEGMENTS}", _spread_reference, _spread_fake)
+_sum = library.define(f"segment_sum(Tensor x, {_SEGMENTS}", _sum_reference, _new_sum, _sum_kernel)
+_spread = library.define(f"segment_spread(Tensor dout, {_SEGMENTS}", _spread_reference, _new_spread, _spread_kernel)
 _column_sum = library.define(
-    "column_sum(Tensor x) -> Tensor", _column_sum_reference, lambda x: x.new_empty(x.shape[-1:])
+    "column_sum(Tensor x) -> Tensor", _column_sum_reference, lambda x: x.new_empty(x.shape[-1:]), _column_sum_kernel
 )
 
 
@@ -73,7 +77,7 @@ library.differentiate(_spread, _save_segments, _gradient_by(_sum))
 library.differentiate(
     _column_sum,
     lambda ctx, inputs, output: setattr(ctx, "rows", inputs[0].shape[0]),
-    lambda ctx, grad: grad.expand(ctx.rows, -1),
+    lambda ctx, grad: (grad.expand(ctx.rows, -1),),
 )
 
 

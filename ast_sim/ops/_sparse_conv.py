@@ -5,23 +5,29 @@ Legend: C_fine and C_coarse cells, I and O channels in and out, P pairs of cells
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from ast_sim.ops import library
 from ast_sim.ops._octree import CellMap
 from ast_sim.ops._segment import column_sum
-from ast_sim.ops.library import check_index, check_offsets, check_shape, dense
 
 OFFSETS = 27
 
 
-def _check(op: str, pair_offsets: Tensor, source: Tensor, sources: int, destination: Tensor, destinations: int) -> None:
-    check_shape(op, "pair_offsets", pair_offsets, OFFSETS + 1)
-    check_shape(op, "source", source, -1)
-    check_shape(op, "destination", destination, len(source))
-    check_offsets(op, "pair_offsets", pair_offsets, len(source))
-    check_index(op, "source", source, sources)
-    check_index(op, "destination", destination, destinations)
+_PAIRS = "pair_offsets[28] offsets(P), source[P] index(N)"
+_SPEC = (
+    "x[N,I], weight[27,{axes}], bias?[O], transposed integer({number},{number}), " + _PAIRS + ","
+    " destination[P] index(R) rising(pair_offsets) -> out[R,O]"
+)
+# By whether the weight is transposed.
+_kernels = (
+    library.Kernel("sparse_conv", _SPEC.format(axes="I,O", number=0)),
+    library.Kernel("sparse_conv_transposed", _SPEC.format(axes="O,I", number=1)),
+)
+_weight_kernel = library.Kernel(
+    "sparse_conv_weight", f"x[N,I], dout[R,O], {_PAIRS}, destination[P] index(R) -> dweight[27,I,O]"
+)
 
 
 def _groups(pair_offsets: Tensor, source: Tensor, destination: Tensor):
@@ -34,13 +40,8 @@ def _groups(pair_offsets: Tensor, source: Tensor, destination: Tensor):
 
 
 def _reference(x, weight, bias, transposed, pair_offsets, source, destination, back_source, back_destination, num_out):
-    check_shape("sparse_conv", "x", x, -1, -1)
-    check_shape("sparse_conv", "weight", weight, OFFSETS, -1, -1)
+    _kernels[transposed].check(x, weight, bias, int(transposed), pair_offsets, source, destination, R=num_out)
     weight = weight.mT if transposed else weight
-    if x.shape[1] != weight.shape[1]:
-        raise ValueError(f"sparse_conv: x has {x.shape[1]} channels, weight takes {weight.shape[1]}")
-    check_shape("sparse_conv", "bias", bias, weight.shape[2])
-    _check("sparse_conv", pair_offsets, source, len(x), destination, num_out)
     out = x.new_zeros(num_out, weight.shape[2])
     for k, i, j in _groups(pair_offsets, source, destination):
         out = out.index_add(0, j, x.index_select(0, i) @ weight[k])
@@ -48,26 +49,21 @@ def _reference(x, weight, bias, transposed, pair_offsets, source, destination, b
 
 
 def _weight_reference(x, dout, pair_offsets, source, destination):
-    _check("sparse_conv_weight", pair_offsets, source, len(x), destination, len(dout))
-    dweight = x.new_zeros(OFFSETS, x.shape[1], dout.shape[1])
-    for k, i, j in _groups(pair_offsets, source, destination):
-        dweight[k] = x.index_select(0, i).T @ dout.index_select(0, j)
-    return dweight
+    _weight_kernel.check(x, dout, pair_offsets, source, destination)
+    groups = _groups(pair_offsets, source, destination)
+    found = {k: x.index_select(0, i).T @ dout.index_select(0, j) for k, i, j in groups}
+    return torch.stack([found.get(k, x.new_zeros(x.shape[1], dout.shape[1])) for k in range(OFFSETS)])
 
 
-def _kernel(x, weight, bias, transposed, pair_offsets, source, destination, *back_and_num):
-    out = _fake(x, weight, bias, transposed, *back_and_num)
-    inputs = (x, weight, x.new_empty(0) if bias is None else bias)
-    pairs = (pair_offsets, source, destination)
-    library._C.sparse_conv(*map(dense, inputs), transposed, *map(dense, pairs), out)
-    return out
+def _call(out, x, weight, bias, transposed, pair_offsets, source, destination, *back_and_num):
+    _kernels[transposed](x, weight, bias, transposed, pair_offsets, source, destination, out)
 
 
-def _fake(x, weight, bias, transposed, *pairs_and_num):
+def _new(x, weight, bias, transposed, *pairs_and_num):
     return x.new_empty(pairs_and_num[-1], weight.shape[1 if transposed else -1])
 
 
-def _weight_fake(x, dout, pair_offsets, source, destination):
+def _new_weight(x, dout, pair_offsets, source, destination):
     return x.new_empty(OFFSETS, x.shape[-1], dout.shape[-1])
 
 
@@ -77,13 +73,14 @@ _conv = library.define(
     "sparse_conv(Tensor x, Tensor weight, Tensor? bias, bool transposed, Tensor pair_offsets, Tensor source,"
     " Tensor destination, Tensor back_source, Tensor back_destination, SymInt num_out) -> Tensor",
     _reference,
-    _fake,
-    _kernel,
+    _new,
+    _call,
 )
 _conv_weight = library.define(
     "sparse_conv_weight(Tensor x, Tensor dout, Tensor pair_offsets, Tensor source, Tensor destination) -> Tensor",
     _weight_reference,
-    _weight_fake,
+    _new_weight,
+    _weight_kernel,
 )
 
 
@@ -108,6 +105,7 @@ def _gradient(ctx, dout):
 
 
 library.differentiate(_conv, _save, _gradient)
+library.differentiate_by_composition(_conv_weight)
 
 
 def sparse_conv(x: Tensor, weight: Tensor, map: CellMap, bias: Tensor | None = None) -> Tensor:

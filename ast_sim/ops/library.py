@@ -3,6 +3,10 @@
 Every op has two bodies that compute the same: a C kernel for float32 on the CPU, and a composition of torch ops. The
 composition is the reference in the tests. It runs for every other device and dtype, and with AST_SIM_BACKEND=torch
 everywhere.
+
+Kernels know the first derivative, backwards. All others are those of the composition: higher ones
+(`create_graph=True`), tangents (`torch.autograd.forward_ad`) and everything in `torch.func`. With `vmap` the indices of
+an op must be the same for every sample.
 """
 
 from __future__ import annotations
@@ -16,6 +20,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from ast_sim.ops import spec as specs
+from ast_sim.ops.spec import check_index, segment_of
+
+__all__ = ["check_index", "segment_of"]
 
 BACKEND = os.environ.get("AST_SIM_BACKEND", "c")
 if BACKEND not in ("c", "torch"):
@@ -46,23 +57,67 @@ if BACKEND == "c":
     _share_torch_threads()
 
 
+class Kernel:
+    """A function of the C core and what it takes."""
+
+    def __init__(self, name: str, spec: str) -> None:
+        self.name, self.parameters = name, specs.parameters_of(spec)
+        inputs = [(i, p) for i, p in enumerate(self.parameters) if p.shape is not None and not p.output]
+        self._layouts = [(i, dense_rows if "rows" in p.words else dense) for i, p in inputs]
+        self._floats = [i for i, p in inputs if p.dtype.is_floating_point]
+        if BACKEND == "c":
+            places = {p.name: i for i, p in enumerate(self.parameters)}
+            _C.declare(name, tuple(p.numbers(places) for p in self.parameters))
+
+    def __call__(self, *arguments):
+        """Call the C core. Inputs are copied if they do not lie in memory as the kernel needs them.
+
+        Nearly all of them do. The core notices where one does not, and says so before it does anything. What it cannot
+        see is whether a tensor is the negative of its memory.
+        """
+        function, failure = getattr(_C, self.name), None
+        for i in self._floats:
+            if (x := arguments[i]) is not None and x.is_neg():
+                break
+        else:
+            try:
+                return function(*arguments)
+            except ValueError as error:
+                failure = error
+        copies = list(arguments)
+        for i, layout in self._layouts:
+            copies[i] = layout(arguments[i])
+        if failure and all(x is y for x, y in zip(arguments, copies, strict=True)):
+            raise failure
+        return function(*copies)
+
+    def check(self, *first: Tensor | float | None, **given: Tensor | float | None) -> None:
+        """Raise what the C core would raise for the first arguments and for those by name, for the composition."""
+        names = (p.name for p in self.parameters)
+        specs.check(self.name, self.parameters, dict(zip(names, first, strict=False)) | given)
+
+
 class Op:
     """An op as its users call it; `overload` is the same op as torch registered it.
 
     For plain float32 tensors on the CPU a call goes straight to the kernel: torch's dispatcher would take longer than a
     small kernel does. The dispatcher is used for tracing, dispatch modes, autocast, functorch, other devices and other
-    dtypes. With AST_SIM_BACKEND=torch an op is its composition, and torch differentiates it like any other code.
+    dtypes. Tangents and functorch take the composition. With AST_SIM_BACKEND=torch an op is its composition, and torch
+    differentiates it like any other code.
     """
 
     def __init__(self, name: str, overload: torch._ops.OpOverload, kernel: Callable, reference: Callable) -> None:
         self.name, self.overload, self.kernel, self.reference = name, overload, kernel, reference
         self.function: type[torch.autograd.Function] | None = None  # set by `differentiate`
+        self.kept: tuple[int, ...] = ()  # set by `differentiate_by_composition`
 
     def __call__(self, *args):
         if BACKEND == "torch":
             return self.reference(*args)
         if torch.compiler.is_compiling():
             return self.overload(*args)
+        if forward_ad._current_level >= 0 and any(map(_has_tangent, args)):
+            return self.compose(*args)
         wants_gradient = False
         for x in args:
             if isinstance(x, torch.Tensor):
@@ -75,9 +130,43 @@ class Op:
             return self.function.apply(*args)
         return self.kernel(*args)
 
+    def compose(self, *args):
+        """The composition, as a function that torch can differentiate and transform in every way."""
+        for argument, x in zip(self.overload._schema.arguments, args, strict=True):
+            if _is_batched(x) and not (self.function and x.is_floating_point()):
+                raise ValueError(
+                    f"{self.name}: vmap over {argument.name} is not possible: give every sample the same, call the op"
+                    " for each, or join the samples as scenes of one batch"
+                )
+        args = [None if i in self.kept else x for i, x in enumerate(args)]
+        if not torch.is_autocast_enabled("cpu"):
+            return self.reference(*args)
+        with torch.autocast("cpu", enabled=False):
+            return self.reference(*(x.float() if getattr(x, "dtype", None) in _LOW_DTYPES else x for x in args))
+
 
 _PLAIN_TYPES = (torch.Tensor, torch.nn.Parameter)
 _PLAIN_DTYPES = (torch.float32, torch.int64, torch.int32)
+_LOW_DTYPES = (torch.float16, torch.bfloat16)
+
+
+def _has_tangent(x) -> bool:
+    return isinstance(x, torch.Tensor) and forward_ad.unpack_dual(x).tangent is not None
+
+
+def is_differentiated(x: torch.Tensor) -> bool:
+    """Whether x has a gradient or a tangent, or belongs to a transform of torch.func."""
+    return x.requires_grad or _has_tangent(x) or torch._C._functorch.is_functorch_wrapped_tensor(x)
+
+
+def _is_batched(x) -> bool:
+    """Whether x is another tensor for each sample of a vmap."""
+    functorch = torch._C._functorch
+    while isinstance(x, torch.Tensor) and functorch.is_functorch_wrapped_tensor(x):
+        if functorch.is_batchedtensor(x):
+            return True
+        x = functorch.get_unwrapped(x)
+    return False
 
 
 def _is_watched() -> bool:
@@ -86,29 +175,32 @@ def _is_watched() -> bool:
         torch._C._len_torch_dispatch_stack() > 0
         or torch._C._are_functorch_transforms_active()
         or torch.is_autocast_enabled("cpu")
-        or torch.jit.is_tracing()
+        or torch._C._is_tracing()
     )
 
 
-def define(schema: str, reference: Callable, fake: Callable, kernel: Callable | None = None) -> Op:
+def define(
+    schema: str, reference: Callable, outputs: Callable, call: Kernel | Callable, fake: Callable | None = None
+) -> Op:
     """Register the op `ast_sim::<schema>`.
 
     Args:
         schema: name and signature in torch's schema language. The op changes no input, and no output is a view of one.
         reference: the body as a composition of torch ops, for any device and dtype.
-        fake: makes outputs of the right shapes without values, for tracing.
-        kernel: the body over the C core. It gets CPU tensors; those of floating point are float32. None: the function
-            of the C core with the op's name, which takes the op's arguments and then the outputs of `fake` to fill.
+        outputs: makes the outputs without values, a tensor or a tuple, from the op's arguments.
+        call: fills them through the C core: call(outputs, *arguments). It gets CPU tensors; those of floating point are
+            float32. What it returns stands for the outputs, unless it is None. A kernel takes the op's arguments and
+            then the outputs.
+        fake: makes outputs of the right shapes for tracing, where `outputs` does not because they depend on values.
     """
     name = schema.split("(")[0]
 
-    def fill(*args):
-        outputs = fake(*args)
-        inputs = (dense(x) if isinstance(x, torch.Tensor) else x for x in args)
-        getattr(_C, name)(*inputs, *(outputs if isinstance(outputs, tuple) else (outputs,)))
-        return outputs
+    def kernel(*args):
+        out = outputs(*args)
+        result = call(*args, *(out if isinstance(out, tuple) else (out,))) if is_kernel else call(out, *args)
+        return out if result is None else result
 
-    kernel = kernel or fill
+    is_kernel = isinstance(call, Kernel)
 
     def on_cpu(*args):
         floats = [x for x in args if isinstance(x, torch.Tensor) and x.is_floating_point()]
@@ -122,9 +214,11 @@ def define(schema: str, reference: Callable, fake: Callable, kernel: Callable | 
     _library.define(schema)
     _library.impl(name, on_cpu, "CPU")
     _library.impl(name, reference, "CompositeExplicitAutograd")
-    torch.library.register_fake(f"ast_sim::{name}", fake, lib=_library)
+    torch.library.register_fake(f"ast_sim::{name}", fake or outputs, lib=_library)
     torch.library.register_autocast(f"ast_sim::{name}", "cpu", torch.float32, lib=_library)
-    return Op(name, getattr(torch.ops.ast_sim, name).default, kernel, reference)
+    op = Op(name, getattr(torch.ops.ast_sim, name).default, kernel, reference)
+    _library.impl(name, op.compose, "FuncTorchDynamicLayerFrontMode")  # comes first under each transform of torch.func
+    return op
 
 
 def differentiate(op: Op, setup_context: Callable, backward: Callable) -> None:
@@ -137,6 +231,8 @@ def differentiate(op: Op, setup_context: Callable, backward: Callable) -> None:
     def backward_of_some(ctx, *gradients):
         if all(gradient is None for gradient in gradients):
             return (None,) * len(ctx.needs_input_grad)
+        if any(map(_is_old_batch, gradients)):
+            return _backward_of_each(backward, ctx, gradients)
         return backward(ctx, *gradients)
 
     torch.library.register_autograd(op.overload.name(), backward_of_some, setup_context=setup_context, lib=_library)
@@ -148,6 +244,57 @@ def differentiate(op: Op, setup_context: Callable, backward: Callable) -> None:
 
     body = {"forward": staticmethod(forward), "backward": staticmethod(backward_of_some)}
     op.function = type(f"ast_sim_{op.name}", (torch.autograd.Function,), body)
+
+
+def _is_old_batch(x: torch.Tensor | None) -> bool:
+    """Whether x is batched by `is_grads_batched=True`, whose vmap is older than torch.func and knows few ops."""
+    return x is not None and torch._C._functorch.is_legacy_batchedtensor(x)
+
+
+def _backward_of_each(backward: Callable, ctx, gradients: tuple) -> tuple:
+    """`backward`, one sample after the other."""
+    level = torch._C._vmapmode_increment_nesting() - 1
+    torch._C._vmapmode_decrement_nesting()
+    batches = [torch._remove_batch_dim(x, level, 0, 0) if _is_old_batch(x) else x for x in gradients]
+    num = next(len(x) for x, y in zip(batches, gradients, strict=True) if _is_old_batch(y))
+    samples = [[x[i] if _is_old_batch(y) else x for x, y in zip(batches, gradients, strict=True)] for i in range(num)]
+    found = zip(*(backward(ctx, *sample) for sample in samples), strict=True)
+    return tuple(None if x[0] is None else torch._add_batch_dim(torch.stack(x), 0, level) for x in found)
+
+
+def differentiate_by_composition(op: Op, kept: tuple[int, ...] = ()) -> None:
+    """Register the derivatives of the composition as those of an op, such as the gradient of another op.
+
+    Args:
+        op: the op.
+        kept: the numbers of the arguments that follow from the others and were kept from the forward op. Where the
+            composition is differentiated it gets None and computes them again; their derivatives would be lost.
+    """
+    op.kept = kept
+
+    def save(ctx, inputs, output) -> None:
+        ctx.set_materialize_grads(False)
+        ctx.others = [None if isinstance(x, torch.Tensor) else x for x in inputs]
+        tensors = (x if isinstance(x, torch.Tensor) and i not in kept else None for i, x in enumerate(inputs))
+        ctx.save_for_backward(*tensors)
+
+    def gradient(ctx, *gradients):
+        wanted = [i for i, needed in enumerate(ctx.needs_input_grad) if needed and i not in kept]
+        args = [y if x is None else x for x, y in zip(ctx.saved_tensors, ctx.others, strict=True)]
+        with torch.enable_grad():
+            for i in wanted:  # by a view of its own: an argument may be a function of another, such as dout of x
+                args[i] = args[i].view_as(args[i])
+            outputs = op.compose(*args)
+        outputs = outputs if isinstance(outputs, tuple) else (outputs,)
+        pairs = [(y, dy) for y, dy in zip(outputs, gradients, strict=True) if y.requires_grad and dy is not None]
+        if not pairs:
+            return (None,) * len(args)
+        ys, dys = zip(*pairs, strict=True)
+        again, variables = torch.is_grad_enabled(), [args[i] for i in wanted]
+        found = iter(torch.autograd.grad(ys, variables, dys, create_graph=again, allow_unused=True))
+        return tuple(next(found) if i in wanted else None for i in range(len(args)))
+
+    differentiate(op, save, gradient)
 
 
 def dense(x: torch.Tensor | None) -> torch.Tensor | None:
@@ -179,36 +326,20 @@ def check_shape(op: str, name: str, x: torch.Tensor | None, *shape: int) -> None
         raise ValueError(f"{op}: {name} must have shape [{wanted}], not {tuple(x.shape)}")
 
 
-def check_offsets(op: str, name: str, offsets: torch.Tensor, rows: int) -> None:
-    """Raise ValueError unless the offsets [B + 1] start with 0, never fall and end at the number of rows.
+def frozen(*indices: Tensor) -> tuple[Tensor, ...]:
+    """Copies of int64 tensors that the C core trusts: it keeps the values in memory of its own and checks them once.
 
-    Raise TypeError unless they are int64.
+    So nobody should write to the copies: kernels would not see it. Other tensors are copied and checked in every call.
     """
-    if offsets.dtype != torch.int64:
-        raise TypeError(f"{op}: {name} must be int64, not {offsets.dtype}")
-    check_shape(op, name, offsets, -1)
-    if len(offsets) < 1 or offsets[0] != 0:
-        raise ValueError(f"{op}: {name} must start with 0")
-    falls = (offsets.diff() < 0).nonzero()
-    if len(falls):
-        at = int(falls[0]) + 1
-        raise ValueError(f"{op}: {name} must never fall, but falls to {int(offsets[at])} at {at}")
-    if offsets[-1] != rows:
-        raise ValueError(f"{op}: {name} must end at the number of rows {rows}, not {int(offsets[-1])}")
+    if BACKEND == "torch" or torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack() > 0:
+        return indices
+    return tuple([x if y is x else torch.from_numpy(y) for x, y in zip(indices, _C.freeze(*indices), strict=True)])
 
 
-def check_index(op: str, name: str, index: torch.Tensor, bound: int) -> None:
-    """Raise ValueError unless all values of an index lie in [0, bound). The message names the first that does not."""
-    wrong = ((index < 0) | (index >= bound)).nonzero()
-    if len(wrong):
-        at = wrong[0].tolist()
-        place, value = ", ".join(map(str, at)), int(index[tuple(at)])
-        raise ValueError(f"{op}: {name}[{place}] = {value} is not an index below {bound}")
-
-
-def segment_of(offsets: torch.Tensor) -> torch.Tensor:
-    """[N] int64: the segment of each row, from the offsets [C + 1] of the segments."""
-    return torch.arange(len(offsets) - 1, device=offsets.device).repeat_interleave(offsets.diff())
+def freeze(record: object, *names: str) -> None:
+    """Make these attributes of a frozen dataclass `frozen`, when it is built."""
+    values = record.__dict__
+    values.update(zip(names, frozen(*[values[name] for name in names]), strict=True))
 
 
 def configuration() -> dict:

@@ -12,10 +12,11 @@ from ast_sim.models.model_config import ModelConfig
 from ast_sim.models.registry import build_model
 from ast_sim.models.simulator import Simulator
 from ast_sim.runs import checkpoint
+from ast_sim.runs.config_toml import has_config, read_config
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.origin import read_origin
 from ast_sim.runs.scope import Scope
-from ast_sim.runs.train_config import RunConfig, has_config, read_config
+from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.errors import CheckpointError, ConfigError
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from ast_sim.runs import checkpoint
+from ast_sim.runs.config_toml import read_config
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.origin import read_origin
-from ast_sim.runs.train_config import read_config
 
 
 def describe_run(path: Path) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from ast_sim.scene import Trajectory
 MORE_CALLS = 2  # a model that jumps is validated with so many more calls than it is trained with
 ENOUGH = 0.01  # a further call must lower the error by this share
 EFFORT_SCENES = 10  # the default effort is chosen on at most so many validation scenes, at the deepest frame
-MOST_NEWTON_STEPS = 3
+MOST_NEWTON_STEPS = 5
 JUMPS = 4  # a model that jumps is validated at so many frames of a scene, evenly spread, the last one included
 
 
@@ -32,7 +32,8 @@ class Validated(NamedTuple):
         errors: error of the prediction, for a model that jumps after each call; empty if the prediction failed.
         hold: error of the prediction that nothing moves.
         failure: why the prediction failed; None if it did not.
-        efforts: [calls, Newton steps + 1], the relative errors at the deepest frame; None if they were not measured.
+        efforts: [2, calls, Newton steps + 1], the errors of displacement and stress at the deepest frame, as
+            `errors_by_effort` gives them; None if they were not measured.
     """
 
     index: int
@@ -75,7 +76,8 @@ def _validate_jumps(model: Simulator, truths: dict[int, Trajectory], most_calls:
     found = []
     for (index, truth), after in zip(truths.items(), calls(model, questions, Effort(most_calls - 1)), strict=True):
         failure = after if isinstance(after, str) else None
-        errors = [_motion_error(position, truth, frames[index]) for position in after] if failure is None else []
+        positions = () if isinstance(after, str) else after.position
+        errors = [_motion_error(position, truth, frames[index]) for position in positions]
         hold = _motion_error(truth.position[0], truth, frames[index])
         efforts = None
         if failure is None and index < EFFORT_SCENES:
@@ -107,15 +109,20 @@ def verdict(found: list[Validated], best: float, unit: str) -> tuple[dict[str, A
     record: dict[str, Any] = {"valid_rmse": error, "valid_hold_still": hold}
     measured = [scene.efforts for scene in found if scene.efforts is not None]
     if measured:
-        by_effort = np.mean(measured, axis=0)
+        by_effort, stress_by_effort = np.mean(measured, axis=0)
         if by_effort.shape[1] > 1:
-            effort = cheapest_good(by_effort)
-        record["valid_by_effort"] = [[None if np.isnan(e) else float(e) for e in errors] for errors in by_effort]
+            effort = cheapest_good(by_effort, stress_by_effort)
+        record["valid_by_effort"], record["valid_stress_by_effort"] = _as_lists(by_effort), _as_lists(stress_by_effort)
         if effort.corrections < len(by_effort) and not np.isnan(by_effort[effort]):
             text += f"; at the deepest frame {100 * by_effort[effort]:.2g} % of the displacement after {effort.text}"
     if len(by_calls) > 1 or measured:
         record |= {"valid_by_calls": by_calls, **effort._asdict()}
     return record, text
+
+
+def _as_lists(errors: np.ndarray) -> list[list[float | None]]:
+    """For JSON, which has no NaN."""
+    return [[None if np.isnan(error) else float(error) for error in row] for row in errors]
 
 
 def _corrections(by_calls: list[float]) -> int:

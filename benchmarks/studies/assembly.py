@@ -21,13 +21,16 @@ import numpy as np
 import ast_sim
 from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.inference.asked_frame import asked_frames
+from ast_sim.inference.effort import Effort
 from ast_sim.runs.metrics import Metrics
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
+from benchmarks.studies.validation_curve import curve_line, validation_curve
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "benchmarks" / "results" / "assembly.json"
 PAGE = ROOT / "docs" / "results" / "assembly.md"
+SHOWN_WORST = 5
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,7 @@ class Row:
         nodes, train, valid, test: of the dataset.
         steps, settings: of the training.
         rivals: in so many test scenes the solver is run.
+        after: the row whose run this training starts from.
     """
 
     title: str
@@ -51,13 +55,30 @@ class Row:
     test: int = 50
     settings: dict[str, Any] = field(default_factory=dict)
     rivals: int = 10
+    after: str | None = None
+
+    def run_folder(self, name: str, folder: Path) -> Path:
+        """Where the run of the row of that name lies."""
+        return folder / f"run_{name}_{self.steps}"
 
 
 _SETTINGS = {"peak_rate": 2e-3, "validate_scenes": 10, "validate_every": 500, "checkpoint_every": 500}
 _BUMPER, _HOOK = (ROOT / "examples" / name / "SPEC.toml" for name in ("bumper", "snap_hook"))
 ROWS = {
     "bumper": Row("Bumper, 1,600 nodes", _BUMPER, nodes=1600, train=100, steps=1700, settings=_SETTINGS),
-    "snap_hook": Row("Snap hook, 1,600 nodes", _HOOK, nodes=1600, train=200, steps=2500, settings=_SETTINGS),
+    "snap_hook": Row("Snap hook, 1,600 nodes", _HOOK, nodes=1600, train=200, steps=1000, settings=_SETTINGS),
+    "bumper_6000": Row(
+        "Bumper, 6,000 nodes, after the small ones",
+        _BUMPER,
+        nodes=6000,
+        train=20,
+        valid=3,
+        test=10,
+        steps=300,
+        settings={"validate_scenes": 3, "validate_every": 150, "checkpoint_every": 100},
+        rivals=5,
+        after="bumper",
+    ),
 }
 
 
@@ -67,7 +88,10 @@ def measured(name: str, row: Row, folder: Path) -> dict[str, Any]:
         "assembly", folder / f"{name}.h5", spec=row.spec, train=row.train, valid=row.valid, test=row.test,
         nodes=row.nodes, workers=1,
     ).path  # fmt: skip
-    run = ast_sim.train(data, folder / f"run_{name}_{row.steps}", steps=row.steps, resume=True, **row.settings)
+    start = None if row.after is None else ROWS[row.after].run_folder(row.after, folder)
+    run = ast_sim.train(
+        data, row.run_folder(name, folder), from_run=start, steps=row.steps, resume=True, **row.settings
+    )
     with run.open(data) as dataset:
         found = asked_frames(run.model, dataset, "test", run.effort, row.rivals, spec=row.spec)
         forces = [_forces(run, dataset, index) for index in range(row.test)]
@@ -79,6 +103,7 @@ def measured(name: str, row: Row, folder: Path) -> dict[str, Any]:
         "generation_minutes": float(sum(map(sum, solver_seconds))) / 60,
         "minutes": float(np.median(steps)) * row.steps / 60,
         "effort": run.effort._asdict(),
+        "curve": validation_curve(run),
         "reaction": float(np.mean([abs(p - t) / t for p, t in forces if t > 0])),
         "forces": forces,
         **found,
@@ -97,7 +122,23 @@ def page(results: dict[str, Any]) -> str:
     shown = [results[name] for name in ROWS if name in results]
     head = ["product", "trained", "minutes", "error", "reaction", "largest stress", "answer", "solver", "pays after"]
     lines = [_INTRODUCTION, "| " + " | ".join(head) + " |", "| --- | --- |" + " ---: |" * (len(head) - 2)]
-    return "\n".join([*lines, *map(_line, shown)])
+    return "\n".join([*lines, *map(_line, shown), *(line for found in shown for line in _section(found))])
+
+
+def _section(found: dict[str, Any]) -> list[str]:
+    """The worst scenes of a row, and how its errors fell."""
+    ranked = sorted((s for s in found["scenes"] if s["relative_error"] is not None), key=lambda s: -s["relative_error"])
+    errors = [100 * scene["relative_error"] for scene in ranked]
+    worst = ", ".join(f"{scene['name']} {100 * scene['relative_error']:.0f} %" for scene in ranked[:SHOWN_WORST])
+    spread = f"a tenth below {np.quantile(errors, 0.1):.1f} %, the median {np.median(errors):.1f} %"
+    return [
+        "",
+        f"## {found['row']['title']}",
+        "",
+        f"{Effort(**found['effort']).text}. Over the scenes: {spread}, a tenth above {np.quantile(errors, 0.9):.1f} %."
+        f" Worst: {worst}.",
+        *([curve_line(found["curve"])] if found["curve"] else []),
+    ]
 
 
 _INTRODUCTION = """# Own assemblies

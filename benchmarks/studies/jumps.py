@@ -23,6 +23,7 @@ from ast_sim.inference.effort import Effort, knows_material
 from ast_sim.runs.metrics import Metrics
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
+from benchmarks.studies.validation_curve import curve_line, validation_curve
 
 RESULTS = Path(__file__).parents[1] / "results" / "jumps.json"
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "jumps.md"
@@ -106,6 +107,7 @@ def measured(row: Row, folder: Path) -> dict[str, Any]:
         "row": asdict(row),
         "minutes": float(np.median(seconds)) * row.steps / 60,
         "effort": run.effort._asdict(),
+        "curve": validation_curve(run),
         "dial": dial,
         "training_scenes": known,
         **found,
@@ -215,6 +217,8 @@ def _section(found: dict[str, Any]) -> list[str]:
             f"Stress: {found['stress_share']:.2f} of the error of the frame's true mean; the largest stress is"
             f" {100 * found['largest_stress']:.0f} % off."
         )
+    if found.get("curve"):
+        lines.append(curve_line(found["curve"]))
     if found["dial"]:
         head = ["corrections", "Newton steps", "error", "stress", "answer", "cheapest"]
         lines += ["", "| " + " | ".join(head) + " |", "|" + " ---: |" * len(head)]

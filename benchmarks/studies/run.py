@@ -19,8 +19,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ast_sim.runs.config_toml import read_config
 from ast_sim.runs.metrics import Metrics
-from ast_sim.runs.train_config import TrainConfig, read_config
+from ast_sim.runs.train_config import TrainConfig
 from ast_sim.support.disk import write_json
 from ast_sim.support.errors import ConfigError
 from benchmarks.steps.step_worker import Setup

@@ -41,6 +41,9 @@ static ast_attention sizes_of(const problem *a) {
                          .q_stride = row,
                          .k_stride = row,
                          .v_stride = row,
+                         .dq_stride = row,
+                         .dk_stride = row,
+                         .dv_stride = row,
                          .scale = 1 / sqrtf((float)a->D),
                          .dropout_p = a->p,
                          .seed = 0x123456789abcdefu};
@@ -98,50 +101,12 @@ static double dropout_factor(const ast_attention *s, int64_t scene, int64_t head
   return bits < threshold ? 0 : 65536.0 / (65536 - threshold);
 }
 
-/* out, lse and gradients in the type `real`, every array laid out as the kernel's */
-#define FORMULA(name, real, EXP, LOG)                                                                                  \
-  static void name(const problem *a, real *out, real *lse, real *dq, real *dk, real *dv) {                             \
-    const ast_attention s = sizes_of(a);                                                                               \
-    const int64_t D = a->D, row = a->H * D;                                                                            \
-    real *w = calloc((size_t)(a->Tk + 1) * 2, sizeof *w), *z = w + a->Tk + 1;                                          \
-    for (int64_t i = 0; i < a->Tq * row; i++) dq[i] = out[i] = 0;                                                      \
-    for (int64_t i = 0; i < a->Tk * row; i++) dk[i] = dv[i] = 0;                                                       \
-    for (int64_t b = 0; b < a->B; b++)                                                                                 \
-      for (int64_t i = a->q_offsets[b]; i < a->q_offsets[b + 1]; i++)                                                  \
-        for (int64_t h = 0; h < a->H; h++) {                                                                           \
-          const float *q = a->q + i * row + h * D, *y = a->dout + i * row + h * D;                                     \
-          const int64_t k0 = a->k_offsets[b], k1 = a->k_offsets[b + 1];                                                \
-          real m = -INFINITY, l = 0, delta = 0;                                                                        \
-          for (int64_t j = k0; j < k1; j++) {                                                                          \
-            real x = 0;                                                                                                \
-            for (int64_t d = 0; d < D; d++) x += (real)q[d] * (real)a->k[j * row + h * D + d];                         \
-            w[j] = x * (real)s.scale;                                                                                  \
-            if (!(w[j] <= m)) m = w[j];                                                                                \
-          }                                                                                                            \
-          for (int64_t j = k0; j < k1; j++) l += w[j] = EXP(w[j] - m);                                                 \
-          lse[i * a->H + h] = k1 > k0 ? m + LOG(l) : -INFINITY;                                                        \
-          for (int64_t j = k0; j < k1; j++) {                                                                          \
-            w[j] /= l;                                                                                                 \
-            z[j] = s.dropout_p > 0 ? (real)dropout_factor(&s, b, h, i - a->q_offsets[b], j - k0) : 1;                  \
-            for (int64_t d = 0; d < D; d++) out[i * row + h * D + d] += w[j] * z[j] * (real)a->v[j * row + h * D + d]; \
-          }                                                                                                            \
-          for (int64_t d = 0; d < D; d++) delta += (real)y[d] * out[i * row + h * D + d];                              \
-          for (int64_t j = k0; j < k1; j++) {                                                                          \
-            real dp = 0;                                                                                               \
-            for (int64_t d = 0; d < D; d++) dp += (real)y[d] * (real)a->v[j * row + h * D + d];                        \
-            const real ds = w[j] * (z[j] * dp - delta) * (real)s.scale;                                                \
-            for (int64_t d = 0; d < D; d++) {                                                                          \
-              const int64_t at = j * row + h * D + d;                                                                  \
-              dq[i * row + h * D + d] += ds * (real)a->k[at];                                                          \
-              dk[at] += ds * (real)q[d];                                                                               \
-              dv[at] += w[j] * z[j] * (real)y[d];                                                                      \
-            }                                                                                                          \
-          }                                                                                                            \
-        }                                                                                                              \
-    free(w);                                                                                                           \
-  }
-FORMULA(formula, double, exp, log)
-FORMULA(formula_float, float, expf, logf)
+#define real    double
+#define FORMULA formula
+#include "formula_attention.h"
+#define real    float
+#define FORMULA formula_float
+#include "formula_attention.h"
 
 static void compare(const char *what, const float *got, const double *exact, const float *plain, int64_t n, double factor) {
   double error = 0, plain_error = 0, largest = 0;

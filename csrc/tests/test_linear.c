@@ -49,47 +49,12 @@ static void free_answer(answer r) {
   FREE(r.z);
 }
 
-/* The results in the type `real`. */
-#define FORMULA(name, real, ERF, EXP)                                                               \
-  static void name(const problem *a, real *out, real *dx, real *dweight, real *dbias) {             \
-    const int64_t I = a->s.I, O = a->s.O, N = a->columns;                                           \
-    real *z = calloc((size_t)O * 2 + 1, sizeof *z), *dz = z + O;                                    \
-    for (int64_t j = 0; j < a->s.M * I; j++) dx[j] = 0;                                             \
-    for (int64_t j = 0; j < O * I; j++) dweight[j] = 0;                                             \
-    for (int64_t j = 0; j < O; j++) dbias[j] = 0;                                                   \
-    for (int64_t i = 0; i < a->s.M; i++) {                                                          \
-      for (int64_t o = 0; o < O; o++) {                                                             \
-        z[o] = (real)a->bias[o];                                                                    \
-        for (int64_t k = 0; k < I; k++) z[o] += (real)a->x[i * I + k] * (real)a->weight[o * I + k]; \
-      }                                                                                             \
-      for (int64_t j = 0; j < N; j++) {                                                             \
-        const real y = (real)a->dout[i * N + j];                                                    \
-        real act = z[j];                                                                            \
-        if (a->s.activation == AST_GEGLU) {                                                         \
-          const real b = z[N + j], phi = (real)0.5 * (1 + ERF(b * (real)0.70710678118654752));      \
-          act = z[j] * b * phi;                                                                     \
-          dz[j] = y * b * phi;                                                                      \
-          dz[N + j] = y * z[j] * (phi + b * EXP(-b * b / 2) * (real)0.3989422804014327);            \
-        } else if (a->s.activation == AST_RELU) {                                                   \
-          act = z[j] <= 0 ? 0 : z[j];                                                               \
-          dz[j] = z[j] <= 0 ? 0 : y;                                                                \
-        } else {                                                                                    \
-          dz[j] = y;                                                                                \
-        }                                                                                           \
-        out[i * N + j] = act + (real)a->residual[i * N + j];                                        \
-      }                                                                                             \
-      for (int64_t o = 0; o < O; o++) {                                                             \
-        dbias[o] += dz[o];                                                                          \
-        for (int64_t k = 0; k < I; k++) {                                                           \
-          dx[i * I + k] += dz[o] * (real)a->weight[o * I + k];                                      \
-          dweight[o * I + k] += dz[o] * (real)a->x[i * I + k];                                      \
-        }                                                                                           \
-      }                                                                                             \
-    }                                                                                               \
-    free(z);                                                                                        \
-  }
-FORMULA(formula, double, erf, exp)
-FORMULA(formula_float, float, erff, expf)
+#define real    double
+#define FORMULA formula
+#include "formula_linear.h"
+#define real    float
+#define FORMULA formula_float
+#include "formula_linear.h"
 
 static void check_against_formula(const problem *a, const answer *r) {
   double *exact[RESULTS];

@@ -1,5 +1,5 @@
 /* Every allocation of a kernel fails in turn: the kernel says AST_NO_MEMORY, leaks nothing, and gives its usual result when it is
- * called again.
+ * called again. Called a third time it allocates nothing.
  *
  * The linker sends the allocations of the whole program through the functions below (--wrap, see the Makefile). Each attempt is made
  * by fresh threads, which have no scratch memory yet. A new kernel is one function here and one line of `cases`.
@@ -9,6 +9,12 @@
 #include <stdatomic.h>
 
 #include "problems.h"
+
+#ifdef __SANITIZE_ADDRESS__
+enum { APART = true }; /* scratch memory: each request is an allocation then */
+#else
+enum { APART = false };
+#endif
 
 /* ---- allocations that fail ---- */
 
@@ -113,6 +119,7 @@ static outcome octree_coarsen(const ast_kernels *kernels) {
   enum { B = 2, C = 34000 };
   int64_t *keys = new_ints(C), *offsets = even_offsets(B, C / B);
   for (int64_t i = 0; i < C; i++) keys[i] = 4 * (i % (C / B));
+  AST_SCRATCH_SCOPE; /* of the level */
   ast_octree_level level;
   const ast_status status = KERNEL(kernels->octree_coarsen(keys, offsets, B, 1, &level));
   if (status != AST_OK) return finish(status, NULL, 0);
@@ -159,6 +166,9 @@ static ast_attention attention_sizes(void) {
                          .q_stride = ROW,
                          .k_stride = ROW,
                          .v_stride = ROW,
+                         .dq_stride = ROW,
+                         .dk_stride = ROW,
+                         .dv_stride = ROW,
                          .scale = 0.25f,
                          .dropout_p = 0.1,
                          .seed = 5};
@@ -313,7 +323,7 @@ typedef struct {
   outcome (*run)(const ast_kernels *);
   bool threaded;
   outcome first, again; /* with the allocation that fails, and without */
-  long failures;
+  long failures, third; /* allocations of a third call */
 } attempt;
 
 /* From a thread of its own: the case with the allocation that fails, then once more on the same threads. */
@@ -327,6 +337,10 @@ static void *make_attempt(void *p) {
   atomic_store(&failing, LONG_MAX);
   check_state = 1;
   a->again = a->run(a->kernels);
+  check_state = 1;
+  atomic_store(&allocations, 0);
+  a->run(a->kernels);
+  a->third = atomic_load(&allocations);
   if (a->threaded) pool_stop();
   return NULL;
 }
@@ -348,6 +362,7 @@ static void test(const ast_kernels *kernels) {
     const attempt usual = attempt_in_thread(kernels, cases[i].run, threaded, LONG_MAX);
     const uint64_t digest = usual.first.digest;
     CHECK(usual.first.status == AST_OK && usual.again.status == AST_OK && usual.again.digest == digest, "%s", cases[i].name);
+    CHECK(threaded || APART || usual.third == 0, "%s: %ld allocations when it is called again", cases[i].name, usual.third);
     for (int mode = quick && threaded ? 1 : 0; mode < (quick && !threaded ? 1 : 2); mode++) {
       atomic_store(&all_after, mode == 1);
       for (long n = 0;; n++) {
@@ -363,7 +378,33 @@ static void test(const ast_kernels *kernels) {
   if (threaded) pool_start(CHECK_THREADS);
 }
 
+/* Requests keep apart, marks nest, and what is released is used again; a large stack is given back as a whole. */
+static void *test_scratch(void *unused) {
+  const long before = atomic_load(&living);
+  for (int round = 0; round < 3; round++) {
+    AST_SCRATCH_SCOPE;
+    char *all[8], *again = NULL;
+    for (int i = 0; i < 8; i++) all[i] = memset(ast_scratch(1 << 2 * i), i, 1 << 2 * i);
+    for (int i = 0; i < 8; i++) {
+      AST_SCRATCH_SCOPE;
+      char *inner = ast_scratch(100000);
+      CHECK(inner && (uintptr_t)inner % 64 == 0 && (APART || i == 0 || inner == again), "released memory is not used again");
+      again = memset(inner, 99, 100000);
+    }
+    for (int i = 0; i < 8; i++)
+      for (int j = 0; j < 1 << 2 * i; j++) CHECK(all[i][j] == i, "a later request writes into request %d", i);
+  }
+  CHECK(atomic_load(&living) <= before + 2, "%ld blocks are kept", atomic_load(&living) - before);
+  void *const mark = ast_scratch_mark();
+  CHECK(ast_scratch(1 << 27) && ast_scratch(1 << 20), "no memory");
+  ast_scratch_release(mark);
+  CHECK(atomic_load(&living) == before + 1, "%ld blocks are kept", atomic_load(&living) - before);
+  return unused;
+}
+
 int main(void) {
+  pthread_t thread;
+  CHECK(!pthread_create(&thread, NULL, test_scratch, NULL) && !pthread_join(thread, NULL), "no thread");
   on_every_table(test);
   return 0;
 }

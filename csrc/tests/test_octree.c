@@ -170,6 +170,7 @@ static void check_pairs(const ast_octree_level *s, const int64_t *keys, const in
 
 /* Level by level from the cells of t, whose other arrays are not read; frees it. */
 static void check_levels_of(const ast_kernels *kernels, tree t, int64_t B, int levels, const char *what) {
+  AST_SCRATCH_SCOPE; /* of the levels */
   ast_octree_level level[21];
   READ_ONLY(t.keys, t.cell_offsets);
   CHECK(kernels->octree_coarsen(t.keys, t.cell_offsets, B, levels, level) == AST_OK, "%s", what);

@@ -12,12 +12,13 @@ from benchmarks.studies import assembly
 
 @pytest.fixture
 def small(monkeypatch, tmp_path):
-    """A row of three training scenes and four steps; results in a folder of its own."""
+    """A row of three training scenes and four steps, and one that goes on from its run; results in a folder apart."""
     row = replace(
         assembly.ROWS["bumper"], spec=write_assembly(tmp_path), nodes=100, train=3, valid=1, test=2, steps=4, rivals=1,
         settings={"calls": 2, "batch_size": 2, "statistics_pairs": 4},
     )  # fmt: skip
-    monkeypatch.setattr(assembly, "ROWS", {"small": row})
+    later = replace(row, title="Later", steps=2, settings={"batch_size": 2}, after="small", rivals=0)
+    monkeypatch.setattr(assembly, "ROWS", {"small": row, "later": later})
     monkeypatch.setattr(assembly, "RESULTS", tmp_path / "results" / "assembly.json")
     monkeypatch.setattr(assembly, "PAGE", tmp_path / "assembly.md")
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
@@ -35,6 +36,7 @@ def test_a_product_is_simulated_learned_and_measured(small):
     errors = [abs(predicted - true) / true for predicted, true in found["forces"]]
     assert found["reaction"] == pytest.approx(sum(errors) / 2) and min(true for _, true in found["forces"]) > 0.1
     (line,) = [line for line in assembly.PAGE.read_text().splitlines() if line.startswith("| Bumper")]
+    assert json.loads((small / "data" / "run_later_2" / "run.json").read_text())["start"]["step"] in (2, 4)
     assert f"{100 * found['reaction']:.1f} %" in line and ("questions" in line or "never" in line)
 
 

@@ -105,11 +105,12 @@ def test_newton_steps_lead_from_the_answer_to_equilibrium(pressed, monkeypatch):
     (answer,) = answers(model, [Question.of(truth, "plate", [frame])], Effort(1, 3))
     held = truth.scene.prescribed
     assert np.array_equal(answer.position[0][held], truth.position[frame][held])
-    table = errors_by_effort(model, truth, Effort(1, 3))
+    table, stress = errors_by_effort(model, truth, Effort(1, 3))
+    assert stress[1, 3] == pytest.approx(found["stress_share"]) and stress[1, 1] > 1.1 * stress[1, 3]
     monkeypatch.setattr(NewtonSteps, "step", collapse)
-    assert np.isnan(errors_by_effort(model, truth, Effort(1, 3))[:, 1:]).all()
-    assert errors_by_effort(model, truth, Effort(1, 3))[:, 0].tolist() == table[:, 0].tolist()
-    assert table.shape == (2, 4) and table[1].tolist() == errors[1:] and table[0, 0] == errors[0]
+    assert np.isnan(errors_by_effort(model, truth, Effort(1, 3))[:, :, 1:]).all()
+    assert errors_by_effort(model, truth, Effort(1, 3))[0, :, 0].tolist() == table[:, 0].tolist()
+    assert table.shape == stress.shape == (2, 4) and table[1].tolist() == errors[1:] and table[0, 0] == errors[0]
 
 
 def test_newton_steps_need_a_material(one, pressed):
@@ -128,13 +129,23 @@ def test_newton_steps_need_a_material(one, pressed):
 
 def test_the_default_effort_is_the_cheapest_that_is_good():
     errors = np.array([[0.2, 0.1, 0.05, 0.03], [0.1, 0.05, 0.018, 0.01], [0.08, 0.04, 0.012, 0.009]])
-    assert cheapest_good(errors) == Effort(1, 2)  # three together; no two are good
+    unknown = np.full((3, 4), np.nan)
+    assert cheapest_good(errors, unknown) == Effort(1, 2)  # three together; no two are good
     errors[2, 1] = 0.015
-    assert cheapest_good(errors) == Effort(2, 1)  # as cheap, and more accurate
-    assert cheapest_good(errors + 0.1) == Effort(2, 3)  # none is good: the most accurate
+    assert cheapest_good(errors, unknown) == Effort(2, 1)  # as cheap, and more accurate
+    assert cheapest_good(errors + 0.1, unknown) == Effort(1, 3)  # none is good: the cheapest of those nearly the best
+    assert cheapest_good(10 * errors, unknown) == Effort(2, 3)
     errors[2] = np.nan
-    assert cheapest_good(errors) == Effort(1, 2)
-    assert cheapest_good(np.full((3, 4), np.nan)) == Effort()
+    assert cheapest_good(errors, unknown) == Effort(1, 2)
+    assert cheapest_good(unknown, unknown) == Effort()
+
+
+def test_stress_decides_the_default_effort_too():
+    errors = np.array([[0.2, 0.015, 0.002, 0.001], [0.1, 0.012, 0.001, 0.001]])
+    stress = np.array([[0.8, 3.0, 0.5, 0.2], [0.6, 2.0, 0.09, 0.05]])  # one step distorts single elements
+    assert cheapest_good(errors, stress) == Effort(1, 2)
+    assert cheapest_good(errors, 10 * stress) == Effort(1, 3)  # none is good: the best
+    assert cheapest_good(errors, np.array([[0.05, 9.0, 9.0, 9.0], [9.0, 9.0, 9.0, 9.0]])) == Effort(0, 1)  # never both
 
 
 def test_beside_the_solver(tmp_path):

@@ -10,7 +10,6 @@ from toy import one_thread  # noqa: F401 (used by being imported)
 from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.inference.trained_run import Run
 from ast_sim.scene import NodeType, Scene, Trajectory
-from ast_sim.support.errors import ConfigError
 from ast_sim.support.sealed_line import seal
 from ast_sim.training.start import configure, start_training
 
@@ -35,13 +34,21 @@ def test_how_the_checkpoint_was_chosen_is_said(tmp_path, validated, choice):
         assert evaluation.shown().facts["Checkpoint"].endswith("the last, every validation failed")
 
 
-def test_data_in_another_unit_are_refused(tmp_path):
-    data = toy.write(tmp_path / "toy.h5")
+def test_data_in_another_unit_are_converted(tmp_path):
+    """The same plate in millimetres has the same errors, in metres, as it has in metres."""
+    data, plate = toy.write(tmp_path / "toy.h5"), toy.plate(0)
     start_training(tmp_path / "run", configure(data, "tiny", SETTINGS, model="mgn"))
-    with DatasetWriter(tmp_path / "mm.h5", replace(toy.info(), length_unit="mm")) as writer:
-        writer.add("test", toy.plate(0))
-    with pytest.raises(ConfigError, match=r"mm.h5 has lengths in mm, but .*run was trained with lengths in m"):
-        Run(tmp_path / "run").evaluate(tmp_path / "mm.h5")
+    run, found = Run(tmp_path / "run"), []
+    for unit, scale in (("m", 1), ("mm", 1000)):
+        info = toy.info()
+        facts = {"domain_half_width": scale * info.domain_half_width, "contact_radius": scale * info.contact_radius}
+        scene = replace(plate.scene, rest_position=(scale * plate.scene.rest_position).astype(np.float32))
+        with DatasetWriter(tmp_path / f"{unit}.h5", replace(info, length_unit=unit, **facts)) as writer:
+            writer.add("test", replace(plate, scene=scene, position=(scale * plate.position).astype(np.float32)))
+        figures = run.evaluate(tmp_path / f"{unit}.h5").figures
+        assert figures["length_unit"] == "m"
+        found.append(figures["samples"][0]["displacement"]["model"]["rollout_all"]["normal"])
+    assert found[1] == pytest.approx(found[0], rel=1e-4) and found[0] > 0
 
 
 def test_planar_scenes_stay_in_their_plane(tmp_path):

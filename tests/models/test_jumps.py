@@ -21,8 +21,9 @@ from ast_sim.models.model_config import DataFacts
 from ast_sim.models.registry import build_model, find_preset, model_names
 from ast_sim.models.simulator import Prediction, Simulator
 from ast_sim.models.transolver import TransolverConfig
+from ast_sim.runs.config_toml import read_config
 from ast_sim.runs.folder import load_model
-from ast_sim.runs.train_config import RunConfig, TrainConfig, read_config
+from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.scene import Trajectory
 from ast_sim.support.errors import ConfigError, RolloutError
 from ast_sim.support.toml_settings import from_toml, to_toml
@@ -90,7 +91,7 @@ def test_each_call_corrects_the_answer_of_the_call_before():
     truth, model = toy.plate(1), Halving(config("ast"))
     free = ~truth.scene.prescribed
     question = Question.of(truth, "scene", [2, -1])
-    (found,) = calls(model, [question], Effort(3))
+    ((found, stress),) = calls(model, [question], Effort(3))
     assert found.shape == (4, 2, truth.scene.num_nodes, 3)
     start = truth.position[0, free]
     for call in range(4):
@@ -99,7 +100,7 @@ def test_each_call_corrects_the_answer_of_the_call_before():
         assert np.array_equal(found[call][:, ~free], truth.position[[2, 6]][:, ~free])
     (answer,) = answers(model, [question], Effort(3))
     assert np.array_equal(answer.position, found[3]) and answer.frames == (2, 6) and answer.given == 0
-    assert len(answer.stress) == 2 == len(answer.step_seconds)
+    assert len(answer.stress) == 2 == len(answer.step_seconds) and np.array_equal(stress[0], answer.stress)
 
 
 def test_only_the_wanted_frames_are_computed(monkeypatch):

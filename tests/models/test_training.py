@@ -9,9 +9,9 @@ from toy import one_thread  # noqa: F401
 
 from ast_sim.models.model_config import DataFacts
 from ast_sim.models.registry import find_model, find_preset
+from ast_sim.runs.config_toml import read_config
 from ast_sim.runs.folder import load_model
 from ast_sim.runs.metrics import Metrics
-from ast_sim.runs.train_config import read_config
 from ast_sim.training.start import configure, start_training
 
 SMALL = {"mgn": "model.blocks=2", "bsms": "model.levels=2", "hcmt": "model.levels=2"}

@@ -340,9 +340,9 @@ def test_gradients_of_fused_projections_in_float64():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_fused_projections_must_hold_what_their_name_says(dtype):
     q, k, _, *offsets = case([3, 2], [4, 3], 2, 16)
-    with pytest.raises(ValueError, match=r"key_value must have shape \[\*, 2, \*, \*\], not \(7, 2, 16\)"):
+    with pytest.raises(ValueError, match=r"key_value must have shape \[K, 2, H, D\], not \(7, 2, 16\)"):
         cross_attention(q.to(dtype), k.to(dtype), *offsets)
-    with pytest.raises(ValueError, match=r"qkv must have shape \[\*, 3, \*, \*\], not \(5, 2, 2, 16\)"):
+    with pytest.raises(ValueError, match=r"qkv must have shape \[T, 3, H, D\], not \(5, 2, 2, 16\)"):
         self_attention(q.to(dtype)[:, None].expand(5, 2, 2, 16), offsets[0])
 
 

@@ -15,10 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from ast_sim.ops import library
+from ast_sim.ops import library, linear
 
 ALLOWED = (TypeError, ValueError, MemoryError)
-NO_KERNEL = {"set_pool", "keep_memory", "configuration"}
+NO_KERNEL = {"declare", "set_pool", "keep_memory", "configuration"}
 FUNCTIONS = sorted(
     n for n in dir(library._C) if callable(getattr(library._C, n)) and n[0] != "_" and n not in NO_KERNEL
 )
@@ -50,6 +50,9 @@ def calls() -> dict[str, list[tuple]]:
         patch.setattr(library, "_C", recorder)
         for op in every_op.OPS.values():
             op([1, 4, 2])
+        for _ in range(2):
+            x, weight = torch.randn(5, 3, requires_grad=True), torch.randn(4, 3)
+            linear(x, weight, torch.randn(4), "relu", torch.randn(5, 4)).sum().backward()
     return recorder.calls
 
 
@@ -228,8 +231,8 @@ def test_tensors_and_arrays_of_all_kinds_are_read(change):
         (lambda x: x.bfloat16(), "must be float32, not torch.bfloat16"),
         (lambda x: x.to(torch.complex64), "must be float32, not torch.complex64"),
         (lambda x: x.double().numpy(), r"must be float32, not dtype\('float64'\)"),
-        (lambda x: x[0], r"must have shape \[\*, \*\], not \(3,\)"),
-        (lambda x: x.view(1, 1, 1, 5, 3), r"must have shape \[\*, \*\], not \(1, 1, 1, 5, 3\)"),
+        (lambda x: x[0], r"must have shape \[N, F\], not \(3,\)"),
+        (lambda x: x.view(1, 1, 1, 5, 3), r"must have shape \[N, F\], not \(1, 1, 1, 5, 3\)"),
         (lambda x: x.T, "must be contiguous"),
         (lambda x: x[:, :1].expand(5, 3), "must be contiguous"),
         (lambda x: torch.from_numpy(misaligned(x.numpy())), "must be aligned"),
@@ -243,7 +246,7 @@ def test_tensors_that_do_not_fit_are_refused(change, message):
 NO_MEMORY = """
 import resource
 import numpy as np
-from ast_sim.ops import library
+from ast_sim.ops import library, linear
 
 N = 2_000_000
 inputs = (np.zeros((N, 3), np.float32), np.array([0, N]), 0.0, 0.0, 0.0, 1.0, 12)
@@ -252,11 +255,11 @@ mapped = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize(
 most = resource.getrlimit(resource.RLIMIT_AS)
 resource.setrlimit(resource.RLIMIT_AS, (mapped + (8 << 20), most[1]))
 try:
-    library._C.octree_build(*inputs, *out)
+    library._C.octree(*inputs, *out)
 except MemoryError:
     print("MemoryError")
 resource.setrlimit(resource.RLIMIT_AS, most)
-library._C.octree_build(*inputs, *out)
+library._C.octree(*inputs, *out)
 print(*out[1])
 """
 

@@ -280,7 +280,7 @@ def test_wrong_elements_are_named():
         TetrahedronSet.from_elements(torch.tensor([[0, 1, 2, 3], [4, 5, 9, 7]]), 9)
     with pytest.raises(ValueError, match=r"elements\[0, 0\] = -1 is not an index"):
         TetrahedronSet.from_elements(torch.tensor([[-1, 1, 2, 3]]), 9)
-    with pytest.raises(ValueError, match=r"elements must have shape \[\*, 4\]"):
+    with pytest.raises(ValueError, match=r"elements must have shape \[E, 4\]"):
         TetrahedronSet.from_elements(torch.zeros(2, 8, dtype=torch.int64), 9)
     with pytest.raises(TypeError, match="elements must be int64"):
         TetrahedronSet.from_elements(torch.zeros(2, 4, dtype=torch.int32), 9)
@@ -344,9 +344,9 @@ def test_unusual_layouts_and_unchanged_inputs():
 
 
 CHANGES = [
-    (lambda x, X, m, e, o, f: (x[:, :2], X, m, e, o, f), r"position must have shape \[\*, 3\]"),
+    (lambda x, X, m, e, o, f: (x[:, :2], X, m, e, o, f), r"position must have shape \[N, 3\]"),
     (lambda x, X, m, e, o, f: (x, X[:-1], m, e, o, f), "rest_position must have shape"),
-    (lambda x, X, m, e, o, f: (x, X, m[:, :1], e, o, f), r"lame must have shape \[\*, 2\]"),
+    (lambda x, X, m, e, o, f: (x, X, m[:, :1], e, o, f), r"lame must have shape \[E, 2\]"),
     (lambda x, X, m, e, o, f: (x, X, m, e[:-1], o, f), "elements must have shape"),
     (lambda x, X, m, e, o, f: (x, X, m, e, o[:-1], f), "node_order must have shape"),
     (lambda x, X, m, e, o, f: (x, X, m, e, o, f[1:]), "node_offsets must have shape"),

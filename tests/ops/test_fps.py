@@ -159,10 +159,10 @@ OFFSETS = torch.tensor([0, 10, 30])
     [
         ((POINTS, OFFSETS, 0), "num must be at least 1, not 0"),
         ((POINTS, OFFSETS, -5), "num must be at least 1, not -5"),
-        ((POINTS[:, :2], OFFSETS, 4), r"coordinates must have shape \[\*, 3\], not \(30, 2\)"),
+        ((POINTS[:, :2], OFFSETS, 4), r"coordinates must have shape \[C, 3\], not \(30, 2\)"),
         ((POINTS.long(), OFFSETS, 4), "coordinates must be int32"),
         ((POINTS, OFFSETS.int(), 4), "offsets must be int64"),
-        ((POINTS, OFFSETS[:0], 4), "offsets must start with 0"),
+        ((POINTS, OFFSETS[:0], 4), r"offsets must have shape \[B\+1\], not \(0,\)"),
         ((POINTS, torch.tensor([0, 20, 10, 30]), 4), "offsets must never fall, but falls to 10 at 2"),
         ((POINTS, torch.tensor([0, 10, 31]), 4), "offsets must end at the number of rows 30, not 31"),
         (

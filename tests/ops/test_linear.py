@@ -270,14 +270,14 @@ def test_other_dtypes_and_autocast():
 @pytest.mark.parametrize(
     "change, message",
     [
-        (lambda x, w, b, r: (x[0], w, b, "none", r), r"x must have shape \[\*, \*\], not \(5,\)"),
+        (lambda x, w, b, r: (x[0], w, b, "none", r), r"x must have shape \[M, I\], not \(5,\)"),
         (lambda x, w, b, r: (x, w[:, :2], b, "none", r), r"weight must have shape \[O, 5\], not \(6, 2\)"),
-        (lambda x, w, b, r: (x, w[:0], b[:0], "none", r[:, :0]), r"weight must have shape \[O, 5\], not \(0, 5\)"),
-        (lambda x, w, b, r: (x[:, :0], w[:, :0], b, "none", r), r"weight must have shape \[O, 0\], not \(6, 0\)"),
+        (lambda x, w, b, r: (x, w[:0], b[:0], "none", r[:, :0]), r"weight must have a shape without 0, not \(0, 5\)"),
+        (lambda x, w, b, r: (x[:, :0], w[:, :0], b, "none", r), r"weight must have a shape without 0, not \(6, 0\)"),
         (lambda x, w, b, r: (x, w, b[:3], "none", r), r"bias must have shape \[6\], not \(3,\)"),
         (lambda x, w, b, r: (x, w, b, "none", r[:3]), r"residual must have shape \[9, 6\], not \(3, 6\)"),
         (lambda x, w, b, r: (x, w, b, "geglu", r), r"residual must have shape \[9, 3\], not \(9, 6\)"),
-        (lambda x, w, b, r: (x, w[:5], b[:5], "geglu", None), "geglu takes an even number of outputs, not 5"),
+        (lambda x, w, b, r: (x, w[:5], b[:5], "geglu", None), r"weight must have shape \[2P, 5\], not \(5, 5\)"),
         (lambda x, w, b, r: (x, w, b, "tanh", r), "activation 'tanh' is unknown"),
     ],
 )

@@ -303,14 +303,14 @@ def test_hidden_units_of_many_rows_are_never_stored():
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"x": lambda y: y[0]}, r"x and beside must be matrices of equally many rows, not \(5,\) and \(9, 3\)"),
-        ({"weight1": lambda y: y[:, 1:]}, r"weight must have shape \[O, 8\], not \(10, 7\)"),
-        ({"weight2": lambda y: y[:, 1:]}, r"weight must have shape \[O, 10\], not \(6, 9\)"),
+        ({"x": lambda y: y[0]}, r"x must have shape \[M, I\], not \(5,\)"),
+        ({"weight1": lambda y: y[:, 1:]}, r"weight1 must have shape \[H, 8\], not \(10, 7\)"),
+        ({"weight2": lambda y: y[:, 1:]}, r"weight2 must have shape \[O, 10\], not \(6, 9\)"),
         ({"bias1": lambda y: y[1:]}, r"bias1 must have shape \[10\], not \(9,\)"),
         ({"bias2": lambda y: y[1:]}, r"bias2 must have shape \[6\], not \(5,\)"),
         ({"gamma": lambda y: y[1:]}, r"gamma must have shape \[6\], not \(5,\)"),
         ({"beta": lambda y: None}, "gamma and beta go together"),
-        ({"beside": lambda y: y[1:]}, r"x and beside must be matrices .* not \(9, 5\) and \(8, 3\)"),
+        ({"beside": lambda y: y[1:]}, r"beside must have shape \[9, J\], not \(8, 3\)"),
         ({"residual": lambda y: y[:, 1:]}, r"residual must have shape \[9, 6\], not \(9, 5\)"),
     ],
 )

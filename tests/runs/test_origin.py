@@ -9,8 +9,8 @@ from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim.cli import main
 from ast_sim.runs import checkpoint
+from ast_sim.runs.config_toml import read_config, read_scope
 from ast_sim.runs.folder import load_model
-from ast_sim.runs.train_config import read_config, read_scope
 from ast_sim.support.errors import CheckpointError, ConfigError
 from ast_sim.training import start
 

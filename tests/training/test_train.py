@@ -19,8 +19,9 @@ from ast_sim.models.ast.ast_config import ASTConfig
 from ast_sim.models.registry import find_model, find_preset
 from ast_sim.models.transolver import TransolverConfig
 from ast_sim.runs import checkpoint, folder
+from ast_sim.runs.config_toml import has_config, read_config
 from ast_sim.runs.metrics import Metrics
-from ast_sim.runs.train_config import RunConfig, TrainConfig, has_config, read_config
+from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.scene import NodeType
 from ast_sim.support.errors import CheckpointError, ConfigError, DatasetError, TrainingError
 from ast_sim.support.progress import Clock, duration

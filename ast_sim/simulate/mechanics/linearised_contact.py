@@ -19,6 +19,7 @@ nearly right.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -37,6 +38,8 @@ CLEARANCE = (
 )
 NEAR = 0.5  # pairs with a gap below this may touch, in mean edge lengths of the surfaces
 DEEP = 2.0  # a node deeper inside another body than this is not taken for one in contact with it, in the same
+FEW, SHARE = 8, 4  # a round takes so many of the pairs that would overlap, or this part of them if that is more
+OVERLAP = 1e-6  # pairs may overlap by this much at the end of a step, in the same
 ROUNDING = 1e-10  # is added to the diagonal of B, relative to its mean: equal pairs make B singular
 SWEEPS, CHANGE = 100, 1e-3  # forces of friction are found when a sweep over the pairs changes them by less
 FLATTEST = 0.2  # the least stretch of an element that forces and stiffness follow
@@ -108,23 +111,40 @@ class NewtonSteps:
         self, solve: Callable[[np.ndarray], np.ndarray], force: np.ndarray, pairs: NearPairs
     ) -> np.ndarray:
         """The displacement [F] of the free dofs; see the head of this file."""
-        unconstrained, count = solve(-force), len(pairs.gap)
-        if not count:
-            return unconstrained
+        unconstrained, count = solve(-force[:, None])[:, 0], len(pairs.gap)
         normals = pairs.directions[:count]
-        responses = solve(normals.toarray().T)  # K^-1 C^T
         offset = normals @ unconstrained + pairs.gap - self._clearance
-        forces = _pressed(_compliance(normals, responses), offset)
-        active = np.flatnonzero(forces)
+        active, responses, forces = self._pressed_pairs(solve, normals, offset)
         if not self._friction or not len(active):
             return unconstrained + responses @ forces
         tangents = pairs.directions[np.concatenate([active + count, active + 2 * count])]
         directions = scipy.sparse.vstack([normals[active], tangents], format="csr")
-        responses = np.concatenate([responses[:, active], solve(tangents.toarray().T)], axis=1)
+        responses = np.concatenate([responses, solve(tangents.toarray().T)], axis=1)
         offset = np.concatenate([offset[active], tangents @ unconstrained])
-        return unconstrained + responses @ _rubbed(
-            _compliance(directions, responses), offset, forces[active], self._friction
-        )
+        return unconstrained + responses @ _rubbed(_compliance(directions, responses), offset, forces, self._friction)
+
+    def _pressed_pairs(
+        self, solve: Callable[[np.ndarray], np.ndarray], normals: scipy.sparse.csr_array, offset: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The pairs [A] that press on each other, their responses K^-1 C^T [F, A] and forces [A], without friction.
+
+        A response costs a solution with the stiffness. So pairs get one in rounds, those first that would overlap most
+        with the forces so far. At the end no pair overlaps: these are the forces of all pairs.
+        """
+        chosen, responses, forces = np.zeros(0, int), np.zeros((normals.shape[1], 0)), np.zeros(0)
+        while True:
+            gap = offset + normals @ (responses @ forces)
+            gap[chosen] = 0
+            missing = np.flatnonzero(gap < -OVERLAP * self._length)
+            if not len(missing):
+                break
+            deepest = missing[np.argsort(gap[missing], kind="stable")][: max(FEW, len(missing) // SHARE)]
+            chosen = np.concatenate([chosen, deepest])
+            responses = np.concatenate([responses, solve(normals[deepest].toarray().T)], axis=1)
+            forces = _pressed(_compliance(normals[chosen], responses), offset[chosen])
+        order = np.argsort(chosen)
+        active = order[forces[order] > 0]
+        return chosen[active], responses[:, active], forces[active]
 
     def von_mises(self, position: np.ndarray, location: str) -> np.ndarray:
         """[N, 1] or [E, 1] float32: the stress in pascal at `location`, "node" or "element"; 0 in rigid bodies."""
@@ -141,9 +161,11 @@ class NewtonSteps:
 
         nodes, corners, normals, shares, gaps = [], [], [], [], []
         for faces, others in self._surfaces:
-            if not len(others):
-                continue
             kind, near, deep = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL, NEAR * self._length, DEEP * self._length
+            others = others[_beside(position[others], position[faces], deep)]
+            faces = faces[_beside(position[faces], position[others], deep)]
+            if not len(faces):
+                continue
             gap, face, nearest, outward = igl.signed_distance(position[others], position, faces, kind, -deep, near)
             chosen = (gap < near) & (gap > -deep)  # NaN where the surface is farther away
             point, there = others[chosen], faces[face[chosen]]
@@ -204,6 +226,15 @@ def _upright(deformation: Deformation) -> Deformation:
     return replace(deformation, F=F, J=determinant(F, cofactors), cofactor=cofactors)
 
 
+def _beside(things: np.ndarray, others: np.ndarray, distance: float) -> np.ndarray:
+    """[n] bool: which points [n, 3] or triangles [n, 3, 3] come as near as `distance` to the box around the others."""
+    if not len(others):
+        return np.zeros(len(things), bool)
+    box = others.reshape(-1, 3).min(axis=0) - distance, others.reshape(-1, 3).max(axis=0) + distance
+    low, high = (things, things) if things.ndim == 2 else (things.min(axis=1), things.max(axis=1))
+    return ((high >= box[0]) & (low <= box[1])).all(axis=1)
+
+
 def _tangents(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two unit vectors [P, 3] that are perpendicular to each of the normals [P, 3] and to each other."""
     across = np.eye(3)[np.abs(normals).argmin(axis=1)]
@@ -236,15 +267,18 @@ def _rubbed(compliance: np.ndarray, offset: np.ndarray, forces: np.ndarray, fric
         offset: b [3 P].
     """
     count, found = len(forces), np.concatenate([forces, np.zeros(2 * len(forces))])
+    diagonal = compliance.diagonal()
+    stiffest = np.maximum(diagonal[count : 2 * count], diagonal[2 * count :])
+    tangents = [slice(pair + count, None, count) for pair in range(count)]
+    along = [compliance[rows] for rows in tangents]  # [2, 3 P] of each pair
     for _ in range(SWEEPS):
         before = found.copy()
-        for pair in range(count):
-            normal, tangents = pair, [pair + count, pair + 2 * count]
-            distance = compliance[normal] @ found + offset[normal]
-            found[normal] = max(0.0, found[normal] - distance / compliance[normal, normal])
-            slip, stiffest = compliance[tangents] @ found + offset[tangents], compliance[tangents, tangents].max()
-            sticking, most = found[tangents] - slip / stiffest, friction * found[normal]
-            found[tangents] = sticking * min(1.0, most / max(np.linalg.norm(sticking), TINY))
+        for pair, rows in enumerate(tangents):
+            distance = compliance[pair] @ found + offset[pair]
+            found[pair] = max(0.0, found[pair] - distance / diagonal[pair])
+            sticking = found[rows] - (along[pair] @ found + offset[rows]) / stiffest[pair]
+            size, most = math.hypot(*sticking), friction * found[pair]
+            found[rows] = sticking * min(1.0, most / max(size, TINY))
         if np.abs(found - before).max() <= CHANGE * np.abs(found).max():
             break
     return found

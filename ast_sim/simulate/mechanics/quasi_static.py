@@ -14,7 +14,7 @@ from ast_sim.simulate.mechanics.case import SolidCase
 from ast_sim.simulate.mechanics.contact_and_friction import Contact
 from ast_sim.simulate.mechanics.elasticity import Elasticity
 from ast_sim.simulate.mechanics.frames import MAX_FRAME_ITERATIONS, FrameRecord, Frames, GivenUp
-from ast_sim.simulate.mechanics.load_step import QuasiStatic
+from ast_sim.simulate.mechanics.load_halving import QuasiStatic
 from ast_sim.simulate.mechanics.material import von_mises
 from ast_sim.simulate.mechanics.solver import SolverSettings
 from ast_sim.simulate.mechanics.unfinished import Checkpoint

@@ -6,6 +6,7 @@ from meshes import box
 from solids import blocks, pressed, scene_of
 
 from ast_sim.scene import NodeType
+from ast_sim.simulate.mechanics import linearised_contact
 from ast_sim.simulate.mechanics.elasticity import Elasticity
 from ast_sim.simulate.mechanics.linearised_contact import NewtonSteps
 from ast_sim.simulate.mechanics.material import NeoHookean
@@ -102,3 +103,26 @@ def test_a_body_that_nothing_holds_is_refused():
     solver = NewtonSteps(scene, RUBBER, 0.0)
     with pytest.raises(SimulationError, match="stiffness is singular"):
         solver.step(scene.rest_position.astype(float))
+
+
+def test_forces_found_in_rounds_are_those_of_all_pairs_at_once(squeezed, monkeypatch):
+    case, truth, free, size = squeezed
+    start, found = nearly(truth, free, 0.1 * size), []
+    for few in (2, 1000):
+        monkeypatch.setattr(linearised_contact, "FEW", few)
+        for friction in (0.0, 0.3):
+            found.append(NewtonSteps(case.scene, case.material, 0.8 * DHAT, friction).step(start))
+    assert rms(found[0] - found[2]) < 1e-6 * size and rms(found[1] - found[3]) < 1e-6 * size
+    assert rms(found[0] - found[1]) > 1e-4 * size  # friction is felt
+
+
+def test_what_is_not_looked_at_is_not_near(squeezed, monkeypatch):
+    """Only what comes near the box around the other body is compared; the pairs are those of whole surfaces."""
+    case, truth, *_ = squeezed
+    solver = NewtonSteps(case.scene, case.material, 0.0)
+    pairs = solver.near_pairs(truth)
+    kept = linearised_contact._beside(truth, truth[case.scene.body == 1], 0.0)
+    assert 0 < kept.sum() < len(truth)
+    monkeypatch.setattr(linearised_contact, "_beside", lambda things, *_: np.ones(len(things), bool))
+    whole = solver.near_pairs(truth)
+    assert np.array_equal(pairs.gap, whole.gap) and abs(pairs.directions - whole.directions).max() < 1e-12

@@ -10,7 +10,7 @@ from solids import blocks, pressed
 from ast_sim.simulate.mechanics.case import SolidCase
 from ast_sim.simulate.mechanics.contact_and_friction import Contact, ContactSettings
 from ast_sim.simulate.mechanics.elasticity import Elasticity
-from ast_sim.simulate.mechanics.load_step import QuasiStatic
+from ast_sim.simulate.mechanics.load_halving import QuasiStatic
 from ast_sim.simulate.mechanics.material import NeoHookean
 from ast_sim.simulate.mechanics.quasi_static import quasi_static
 from ast_sim.simulate.mechanics.solver import Newton, NotConverged, SolverSettings

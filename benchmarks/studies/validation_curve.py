@@ -1,0 +1,34 @@
+"""How the errors of a run fell while it was trained: those of its validations, at the deepest frame."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ast_sim import Run
+from ast_sim.runs.metrics import Metrics
+
+
+def validation_curve(run: Run) -> list[dict[str, float]]:
+    """For each validation the `step`, the `minutes` (steps times the median time of a step), and the smallest relative
+    errors over all numbers of corrections: of the `model` alone, and with `newton` steps after it."""
+    records = list(Metrics(run.path))
+    minutes = float(np.median([record["seconds"] for record in records if "loss" in record])) / 60
+    found = []
+    for record in records:
+        errors = np.array(record.get("valid_by_effort") or np.zeros((0, 0)), dtype=float)
+        if np.isfinite(errors).any():
+            model, newton = float(np.nanmin(errors[:, 0])), float(np.nanmin(errors))
+            found.append(
+                {"step": record["step"], "minutes": minutes * record["step"], "model": model, "newton": newton}
+            )
+    return found
+
+
+def curve_line(curve: list[dict[str, float]]) -> str:
+    """The curve as a sentence."""
+    told = [
+        f"{point['step']:,} steps ({point['minutes']:.0f} min)"
+        f" {100 * point['model']:.1f} and {100 * point['newton']:.1f} %"
+        for point in curve
+    ]
+    return f"Validation scenes, the model alone and with Newton steps, each at its best: {', '.join(told)}."

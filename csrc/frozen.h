@@ -1,0 +1,92 @@
+/* Index arrays that nobody can change, so that a check holds for ever.
+ *
+ * A kernel reads wherever an index points, and another thread may write to a tensor between the check and the kernel. So a kernel reads
+ * integers only from memory that Python cannot reach. freeze() makes a block of two copies: the tensor that Python gets lies over the
+ * one that is shown, kernels read the hidden one. torch's ops take tensors and nothing else: the address of the shown copy says which block
+ * a tensor belongs to, through autograd and views alike. The block lives as long as its storage, so no other tensor has that address
+ * meanwhile. Checks that the hidden copy passed are kept in the block. Integers that are not frozen are copied in every call
+ * (arguments.h). All of it happens under the interpreter's lock. Included by arguments.h alone.
+ */
+#ifndef AST_FROZEN_H
+#define AST_FROZEN_H
+
+#include "spec.h"
+
+enum { MAX_FACTS = 8, BUCKETS = 4096, ALIGNMENT = 64 };
+
+/* A check that the array passed. The other arrays are frozen, too; no two blocks ever have the same number. */
+typedef struct {
+  check_function function;
+  int64_t bound, others[2];
+} fact;
+
+typedef struct frozen {
+  struct frozen *next; /* in its bucket */
+  PyObject *owner;     /* the capsule that frees this block */
+  void *hidden, *shown;
+  int64_t bytes, number;
+  fact facts[MAX_FACTS];
+  int num_facts; /* the newest MAX_FACTS are kept */
+} frozen;
+
+static frozen *buckets[BUCKETS];
+
+static frozen **bucket_of(const void *shown) { return &buckets[(uintptr_t)shown / ALIGNMENT % BUCKETS]; }
+
+/* The block of an array that is shown from this address on, or NULL. A part of one is not frozen. */
+static frozen *find_frozen(const void *shown, int64_t bytes) {
+  for (frozen *f = *bucket_of(shown); f; f = f->next)
+    if (f->shown == shown) return f->bytes == bytes ? f : NULL;
+  return NULL;
+}
+
+static void forget(PyObject *capsule) {
+  frozen *f = PyCapsule_GetPointer(capsule, NULL), **link = bucket_of(f->shown);
+  while (*link != f) link = &(*link)->next;
+  *link = f->next;
+  free(f);
+}
+
+/* Never 0, so that every copy has an address of its own. */
+static int64_t aligned(int64_t bytes) { return bytes / ALIGNMENT * ALIGNMENT + ALIGNMENT; }
+
+/* A new block; its values are unset. */
+static frozen *new_frozen(int64_t bytes) {
+  static int64_t number;
+  const int64_t head = aligned(sizeof(frozen));
+  char *memory = aligned_alloc(ALIGNMENT, (size_t)(head + 2 * aligned(bytes)));
+  if (!memory) return (void)PyErr_NoMemory(), NULL;
+  frozen *f = (frozen *)memory, **bucket;
+  *f = (frozen){.hidden = memory + head, .shown = memory + head + aligned(bytes), .bytes = bytes, .number = ++number};
+  bucket = bucket_of(f->shown);
+  if (!(f->owner = PyCapsule_New(f, NULL, forget))) return free(f), NULL;
+  f->next = *bucket;
+  *bucket = f;
+  return f;
+}
+
+/* The array over what is shown, which from now on owns the block. */
+static PyObject *array_of(frozen *f, int ndim, const int64_t *shape) {
+  npy_intp lengths[MAX_SHAPE];
+  for (int d = 0; d < ndim; d++) lengths[d] = (npy_intp)shape[d];
+  PyObject *array = PyArray_SimpleNewFromData(ndim, lengths, INTS, f->shown);
+  if (!array) Py_DECREF(f->owner);
+  else if (PyArray_SetBaseObject((PyArrayObject *)array, f->owner)) Py_CLEAR(array); /* took the reference all the same */
+  return array;
+}
+
+static void show(frozen *f) { memcpy(f->shown, f->hidden, (size_t)f->bytes); }
+
+static bool is_known(const frozen *f, const fact *wanted) {
+  for (int i = 0; i < f->num_facts && i < MAX_FACTS; i++) {
+    const fact *known = &f->facts[i];
+    if (known->function == wanted->function && known->bound == wanted->bound && known->others[0] == wanted->others[0] &&
+        known->others[1] == wanted->others[1])
+      return true;
+  }
+  return false;
+}
+
+static void remember(frozen *f, const fact *found) { f->facts[f->num_facts++ % MAX_FACTS] = *found; }
+
+#endif

@@ -1,0 +1,67 @@
+/* LayerNorm of rows y of n channels, in both directions, for mlp.c and message.c.
+ *
+ *   u = (y - mean(y)) / sd,   out = gamma . u + beta,                         sd = sqrt(var(y) + eps)
+ *   p = gamma . dout,         dy = (p - mean(p) - u mean(p . u)) / sd,        dgamma = sum of dout . u,   dbeta = sum of dout
+ *
+ * The variance is the mean of squared differences to the mean, in a second pass over a row in the cache. Rows are readable and
+ * writable up to whole vectors; `whole`, a constant, says that n is a multiple of VW, so that no vector asks for its tail.
+ */
+#ifndef AST_NORM_H
+#define AST_NORM_H
+
+#include <math.h>
+
+#include "simd.h"
+
+static const float NORM_EPSILON = 1e-5f;
+
+/* the first n lanes of x, 0 in the others */
+AST_INLINE vf norm_lanes(vf x, int64_t n) { return n >= VW ? x : (vf)((vi)x & (LANE_INDICES < (int32_t)n)); }
+
+/* y becomes y - mean(y), 0 behind its n channels; returns 1 / sd, the factor that makes u of it. */
+AST_INLINE float norm_centre(float *y, int64_t n, const bool whole) {
+  vf sum = {0}, squares = {0};
+  for (int64_t c = 0; c < n; c += VW) sum += whole ? vload(y + c) : norm_lanes(vload(y + c), n - c);
+  const float mean = vsum(sum) / (float)n;
+  for (int64_t c = 0; c < n; c += VW) {
+    const vf d = whole ? vload(y + c) - mean : norm_lanes(vload(y + c) - mean, n - c);
+    squares += d * d;
+    vstore(y + c, d);
+  }
+  return 1 / sqrtf(vsum(squares) / (float)n + NORM_EPSILON);
+}
+
+/* gamma . u + beta of the lanes from channel c on, u = scale (y - mean(y)) */
+AST_INLINE vf norm_out(vf u, const float *gamma, const float *beta, int64_t c, int64_t lanes) {
+  return vload_upto(gamma + c, lanes) * u + vload_upto(beta + c, lanes);
+}
+
+/* Of some rows: what dgamma and dbeta are so far, and room for p of one. */
+typedef struct {
+  float *dgamma, *dbeta, *p;
+} norm_columns;
+
+/* One row: y, from norm_centre, becomes dy. dout and `also`, unless NULL, are added; u is read if it was kept, and y is not then. */
+AST_INLINE void norm_backward(int64_t n, const bool whole, const float *gamma, const float *dout, const float *also, float scale,
+                              const float *u_kept, float *y, const norm_columns *columns) {
+  float *dgamma = columns->dgamma, *dbeta = columns->dbeta, *p = columns->p;
+  vf sum = {0}, along = {0};
+  for (int64_t c = 0; c < n; c += VW) {
+    const int64_t lanes = whole ? VW : n - c;
+    const vf u = u_kept ? vload_upto(u_kept + c, lanes) : scale * vload(y + c);
+    vf d = vload_upto(dout + c, lanes);
+    if (also) d += vload_upto(also + c, lanes);
+    const vf p_c = vload_upto(gamma + c, lanes) * d; /* forward: out = gamma u + beta */
+    vstore(y + c, u);
+    vstore(p + c, p_c); /* not computed twice: fused into the difference below it would not cancel */
+    sum += p_c;
+    along += p_c * u;
+    vstore(dgamma + c, vload(dgamma + c) + d * u);
+    vstore(dbeta + c, vload(dbeta + c) + d);
+  }
+  const float mean = vsum(sum) / (float)n, mean_along = vsum(along) / (float)n;
+  /* forward: u = (y - mean(y)) / sd, both of which depend on y */
+  for (int64_t c = 0; c < n; c += VW) vstore(y + c, scale * ((vload(p + c) - mean) - vload(y + c) * mean_along));
+}
+
+#endif
