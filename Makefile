@@ -31,20 +31,25 @@ test: $(VENV)/tested
 bench: $(VENV)/benched
 	$(BIN)/python -m benchmarks.kernels --json benchmarks/results/kernels.json
 
+# `make check` compiles all of the core but its Python module, which needs the headers of Python and numpy.
+INCLUDE := import numpy, sysconfig; print('-isystem', numpy.get_include(), '-isystem', sysconfig.get_path('include'))
 lint: $(VENV)/tested
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/basedpyright --pythonpath $(BIN)/python
 	$(BIN)/clang-format --dry-run --Werror csrc/*.c csrc/*.h csrc/tests/*.c csrc/tests/*.h
+	@set -e; include=$$($(BIN)/python -c "$(INCLUDE)"); for compiler in gcc-11 clang; do \
+	  echo "$$compiler: csrc/module.c"; $$compiler -std=gnu11 -fsyntax-only $(WARNINGS) $$include csrc/module.c; \
+	done
 
 # The pages of the reference, from docstrings and the help of the commands.
 docs: $(VENV)/installed
 	$(BIN)/python docs/make_reference.py
 
 # The C tests, which need no Python: optimised, under the address and undefined behaviour sanitizers, under the thread sanitizer,
-# and under valgrind. `wide` compiles the 64-byte source for AVX2, so that its logic is tested where there is no AVX-512.
-# The kept inputs of the fuzz targets run once more.
+# under valgrind, and as GCC 11, clang and GCC for aarch64 (on an emulator) compile them. `wide` compiles the 64-byte source for AVX2, so
+# that its logic is tested where there is no AVX-512. The kept inputs of the fuzz targets run once more.
 check: $(addprefix build/check/,$(addsuffix .passed,$(C_TESTS))) $(addprefix build/check/fuzz_,$(addsuffix .passed,$(C_FUZZERS)))
 
 # New inputs for each fuzz target for FUZZ_SECONDS; what it finds lies in build/fuzz. FUZZ names fewer targets.
@@ -86,23 +91,28 @@ $(VENV)/benched: $(VENV)/installed
 	$(PIP) --editable '.[simulate,cad,tfrecord,view,bench]'
 	touch $@
 
-# System programs that the tests use; installed where this is allowed, otherwise the tests say what is missing.
+# System programs that the tests use; installed where this is allowed, otherwise the tests say what is missing. One at a time if not all
+# together: a system that does not know one of them still gets the others.
+COMMANDS := chromium valgrind clang gcc-11 $(if $(X86),aarch64-linux-gnu-gcc:gcc-aarch64-linux-gnu qemu-aarch64:qemu-user) ccx:calculix-ccx
 tools:
-	@missing=; for tool in chromium valgrind clang; do command -v $$tool >/dev/null || missing="$$missing $$tool"; done; \
-	command -v ccx >/dev/null || missing="$$missing calculix-ccx"; \
+	@missing=; for tool in $(COMMANDS); do command -v $${tool%:*} >/dev/null || missing="$$missing $${tool#*:}"; done; \
 	ldconfig -p | grep -q libGLU.so.1 || missing="$$missing libglu1-mesa libxft2 libxcursor1 libxinerama1 libxrender1 libxfixes3"; \
 	ls $$(clang -print-resource-dir 2>/dev/null)/lib/linux/*fuzzer* >/dev/null 2>&1 || missing="$$missing libclang-rt-14-dev"; \
+	ls /usr/aarch64-linux-gnu/lib/libc.so.6 >/dev/null 2>&1 || missing="$$missing $(if $(X86),libc6-dev-arm64-cross)"; \
 	if [ -n "$$missing" ]; then \
-	  echo "installing$$missing"; \
-	  (apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -qq -y $$missing >/dev/null) \
-	    || echo "cannot install$$missing: the tests that need them will fail"; \
+	  echo "installing$$missing"; export DEBIAN_FRONTEND=noninteractive; install="apt-get install -qq -y"; \
+	  apt-get update -qq; $$install $$missing >/dev/null 2>&1 || for package in $$missing; do \
+	    $$install $$package >/dev/null || echo "cannot install $$package: the tests that need it will fail"; \
+	  done; \
 	fi
 
 # ---- the builds of the C tests ----
 
 C_FLAGS := -std=gnu11 -fno-math-errno -fno-trapping-math -pthread
 SANITIZE := address,undefined,float-cast-overflow
-GCC := $(CC) $(C_FLAGS) -Wall -Wextra -Wconversion -Wshadow -Wno-maybe-uninitialized -Wno-psabi -Werror
+WARNINGS := -Wall -Wextra -Wconversion -Wshadow -Wno-psabi -Werror
+GCC_WARNINGS := $(WARNINGS) -Wno-maybe-uninitialized
+GCC := $(CC) $(C_FLAGS) $(GCC_WARNINGS)
 CLANG := clang $(C_FLAGS) -w
 COMPILE_plain := $(GCC) -O3
 COMPILE_sanitized := $(GCC) -O1 -g -fsanitize=$(SANITIZE) -fno-sanitize-recover=all
@@ -112,13 +122,16 @@ COMPILE_valgrind := $(GCC) -O1 -g
 # targets themselves: the sizes that a kernel compares do not stand in an input, and the tracing took most of the time.
 COMPILE_fuzz := $(CLANG) -O0 -g -fsanitize=fuzzer-no-link,$(SANITIZE) -fno-sanitize-coverage=trace-cmp -fno-sanitize-recover=all
 COMPILE_target := $(CLANG) -O1 -g -fsanitize=$(SANITIZE) -fno-sanitize-recover=all
-COMPILE_wide := $(GCC) -O2 -Wno-psabi -mavx2 -mfma -DAST_VECTOR_BYTES=64
+COMPILE_wide := $(GCC) -O2 -mavx2 -mfma -DAST_VECTOR_BYTES=64
+COMPILE_gcc11 := gcc-11 $(C_FLAGS) $(GCC_WARNINGS) -O2
+COMPILE_clang := clang $(C_FLAGS) $(WARNINGS) -O2
+COMPILE_aarch64 := aarch64-linux-gnu-gcc $(C_FLAGS) $(GCC_WARNINGS) -O2
 
 CORE := isa_base dispatch parallel memory
-BUILDS := plain sanitized races valgrind
+BUILDS := plain sanitized races valgrind gcc11 clang
 ifneq ($(X86),)
 CORE_X86 := isa_avx2 isa_avx512
-BUILDS += wide
+BUILDS += wide aarch64
 FLAGS_isa_avx2 := -mavx2 -mfma
 FLAGS_isa_avx512 := -mavx512f -mavx512bw -mavx512dq -mavx512vl -mfma -mprefer-vector-width=512
 FLAGS_dispatch := -DAST_HAVE_AVX2 -DAST_HAVE_AVX512
@@ -131,13 +144,13 @@ define BUILD
 build/check/$(1)/%.o: csrc/%.c $(C_SOURCES) | tools
 	@mkdir -p $$(@D)
 	@$(COMPILE_$(1)) $$(FLAGS_$$*) -c $$< -o $$@
-build/check/$(1)/core.a: $(patsubst %,build/check/$(1)/%.o,$(CORE) $(if $(filter wide,$(1)),,$(CORE_X86)))
+build/check/$(1)/core.a: $(patsubst %,build/check/$(1)/%.o,$(CORE) $(if $(filter wide aarch64,$(1)),,$(CORE_X86)))
 	@ar rcs $$@ $$^
 $(patsubst %,build/check/$(1)/test_%,$(C_TESTS)): build/check/$(1)/test_%: csrc/tests/test_%.c $(C_TEST_HEADERS) build/check/$(1)/core.a
 	@$(COMPILE_$(1)) $$< build/check/$(1)/core.a -lm $$(LINK_test_$$*) -o $$@
 endef
 $(foreach build,$(BUILDS) fuzz,$(eval $(call BUILD,$(build))))
-build/check/wide/%.o: FLAGS_dispatch :=
+build/check/wide/%.o build/check/aarch64/%.o: FLAGS_dispatch :=
 
 $(addprefix build/check/fuzz/fuzz_,$(C_FUZZERS)): build/check/fuzz/fuzz_%: csrc/tests/fuzz_%.c csrc/tests/test_%.c $(C_TEST_HEADERS) build/check/fuzz/core.a
 	@$(COMPILE_target) -c $< -o $@.o
@@ -156,7 +169,10 @@ build/check/%.passed: $(addsuffix /test_%,$(addprefix build/check/,$(BUILDS)))
 	run "address and undefined behaviour sanitizers" env ASAN_OPTIONS=detect_leaks=1 build/check/sanitized/test_$*; \
 	run "thread sanitizer" env AST_TEST_QUICK=1 $$(setarch -R true 2>/dev/null && echo setarch -R) build/check/races/test_$*; \
 	run valgrind env AST_TEST_QUICK=1 valgrind --quiet --error-exitcode=1 --leak-check=full build/check/valgrind/test_$*; \
-	$(if $(X86),run "64 byte vectors on AVX2" build/check/wide/test_$*)
+	run "GCC 11" env AST_TEST_QUICK=1 build/check/gcc11/test_$*; \
+	run clang env AST_TEST_QUICK=1 build/check/clang/test_$*; \
+	$(if $(X86),run "64 byte vectors on AVX2" build/check/wide/test_$*; \
+	run aarch64 env AST_TEST_QUICK=1 qemu-aarch64 -L /usr/aarch64-linux-gnu build/check/aarch64/test_$*)
 	@touch $@
 
 clean:

@@ -19,6 +19,7 @@ FLAGS = [
     "-Wall",
     "-Wextra",
     "-Wno-unknown-pragmas",
+    "-Wno-psabi",
 ]
 INSTRUCTION_SETS = {
     "base": [],

@@ -166,7 +166,7 @@ typedef struct {
 
 /* x[from[i]] in lane i */
 #ifdef __clang__
-static octree_cells octree_pick(octree_cells x, octree_cells from) {
+AST_INLINE octree_cells octree_pick(octree_cells x, octree_cells from) {
   octree_cells y;
   for (int i = 0; i < 8; i++) y[i] = x[from[i]];
   return y;

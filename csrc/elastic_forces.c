@@ -45,17 +45,17 @@ typedef struct {
 /* Of vectors in blocks of four: a0 b0 a1 b1, a2 b2 a3 b3, a0 a1 b0 b1, a2 a3 b2 b3 of each block; then those at even and odd places. */
 #if AST_VECTOR_BYTES == 64
 #define BLOCKS(a, b, i, j, k, l) \
-  __builtin_shufflevector(a, b, i, j, k, l, i + 4, j + 4, k + 4, l + 4, i + 8, j + 8, k + 8, l + 8, i + 12, j + 12, k + 12, l + 12)
-#define EVEN(a, b) __builtin_shufflevector(a, b, 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30)
-#define ODD(a, b)  __builtin_shufflevector(a, b, 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31)
+  VSHUFFLE(a, b, i, j, k, l, i + 4, j + 4, k + 4, l + 4, i + 8, j + 8, k + 8, l + 8, i + 12, j + 12, k + 12, l + 12)
+#define EVEN(a, b) VSHUFFLE(a, b, 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30)
+#define ODD(a, b)  VSHUFFLE(a, b, 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31)
 #elif AST_VECTOR_BYTES == 32
-#define BLOCKS(a, b, i, j, k, l) __builtin_shufflevector(a, b, i, j, k, l, i + 4, j + 4, k + 4, l + 4)
-#define EVEN(a, b)               __builtin_shufflevector(a, b, 0, 2, 4, 6, 8, 10, 12, 14)
-#define ODD(a, b)                __builtin_shufflevector(a, b, 1, 3, 5, 7, 9, 11, 13, 15)
+#define BLOCKS(a, b, i, j, k, l) VSHUFFLE(a, b, i, j, k, l, i + 4, j + 4, k + 4, l + 4)
+#define EVEN(a, b)               VSHUFFLE(a, b, 0, 2, 4, 6, 8, 10, 12, 14)
+#define ODD(a, b)                VSHUFFLE(a, b, 1, 3, 5, 7, 9, 11, 13, 15)
 #else
-#define BLOCKS(a, b, i, j, k, l) __builtin_shufflevector(a, b, i, j, k, l)
-#define EVEN(a, b)               __builtin_shufflevector(a, b, 0, 2, 4, 6)
-#define ODD(a, b)                __builtin_shufflevector(a, b, 1, 3, 5, 7)
+#define BLOCKS(a, b, i, j, k, l) VSHUFFLE(a, b, i, j, k, l)
+#define EVEN(a, b)               VSHUFFLE(a, b, 0, 2, 4, 6)
+#define ODD(a, b)                VSHUFFLE(a, b, 1, 3, 5, 7)
 #endif
 #define BLOCKS_LOW(a, b)   BLOCKS(a, b, 0, VW, 1, VW + 1)
 #define BLOCKS_HIGH(a, b)  BLOCKS(a, b, 2, VW + 2, 3, VW + 3)
@@ -64,12 +64,17 @@ typedef struct {
 
 /* Four floats from node nodes[16 b] on in each block b: the same corner of every fourth element. */
 AST_INLINE vf elastic_load(const float *x, const int64_t *nodes) {
-  const corner a = *(const corner *)(x + 3 * nodes[0]);
 #if AST_VECTOR_BYTES == 16
-  return a;
+  return *(const corner *)(x + 3 * nodes[0]);
+#elif !__has_builtin(__builtin_shufflevector) /* GCC 11, which cannot join vectors otherwise */
+  float corners[VW];
+#pragma GCC unroll 4
+  for (int block = 0; block < VW / 4; block++) memcpy(corners + 4 * block, x + 3 * nodes[16 * block], 4 * sizeof *x);
+  return vload(corners);
 #else
   typedef float pair __attribute__((vector_size(32)));
-  const pair ab = __builtin_shufflevector(a, *(const corner *)(x + 3 * nodes[16]), 0, 1, 2, 3, 4, 5, 6, 7);
+  const corner a = *(const corner *)(x + 3 * nodes[0]), b = *(const corner *)(x + 3 * nodes[16]);
+  const pair ab = __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7);
 #if AST_VECTOR_BYTES == 32
   return ab;
 #else

@@ -80,7 +80,7 @@ static ast_status octree_key_task(int64_t index, void *context) {
     const float *p = job->positions + 3 * begin;
     for (int i = 0; i < 3 * num; i++) {
       const double u = (p[i] - center[i] + h) / width;
-      inside &= (u >= -1e-6) & (u <= 1 + 1e-6) ? -1 : 0;
+      inside &= u >= -1e-6 && u <= 1 + 1e-6 ? -1 : 0;
       double v = u * cells;
       v = v < last ? v : last;
       v = v > 0 ? v : 0;

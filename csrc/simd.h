@@ -8,6 +8,10 @@
 
 #include "integers.h"
 
+#if __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
+#error "the kernels need a little-endian machine" /* coarsen.c takes eight bytes for a word */
+#endif
+
 #ifndef AST_VECTOR_BYTES
 #if defined(__AVX512F__)
 #define AST_VECTOR_BYTES 64
@@ -63,13 +67,25 @@ AST_INLINE void vstore_upto(float *p, vf x, int64_t n) {
 
 /* a where the mask is set (-1), b where it is not (0) */
 AST_INLINE vf vselect(vi mask, vf a, vf b) { return (vf)((mask & (vi)a) | (~mask & (vi)b)); }
-/* b where either is NaN; by elements in a loop that stays one, which compilers turn into the instruction of that meaning */
+/* b where either is NaN. Compilers turn it into the instruction of that meaning: clang from a selection, GCC only
+ * from a loop over the elements that stays one. */
 AST_INLINE vf vmax(vf a, vf b) {
+#ifdef __clang__
+  return vselect(a > b, a, b);
+#else
   vf x;
 #pragma GCC unroll 1
   for (int i = 0; i < VW; i++) x[i] = a[i] > b[i] ? a[i] : b[i];
   return x;
+#endif
 }
+
+/* The lanes with these numbers, VW constants: 0 to VW - 1 are those of a, VW to 2 VW - 1 those of b. */
+#ifdef __clang__
+#define VSHUFFLE(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
+#else /* GCC 11 has only this one */
+#define VSHUFFLE(a, b, ...) __builtin_shuffle(a, b, (vi){__VA_ARGS__})
+#endif
 
 #if AST_VECTOR_BYTES == 64
 static const vi LANE_INDICES = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
@@ -138,14 +154,14 @@ AST_INLINE vf vnormal(vf x) {
 AST_INLINE vf vnormal_density(vf x) { return 0x1.988454p-2f * vexp2(x * x * -0x1.715476p-1f, 0); }
 
 #if AST_VECTOR_BYTES == 64
-#define INTERLEAVE_LOW(a, b)  __builtin_shufflevector(a, b, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23)
-#define INTERLEAVE_HIGH(a, b) __builtin_shufflevector(a, b, 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31)
+#define INTERLEAVE_LOW(a, b)  VSHUFFLE(a, b, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23)
+#define INTERLEAVE_HIGH(a, b) VSHUFFLE(a, b, 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31)
 #elif AST_VECTOR_BYTES == 32
-#define INTERLEAVE_LOW(a, b)  __builtin_shufflevector(a, b, 0, 8, 1, 9, 2, 10, 3, 11)
-#define INTERLEAVE_HIGH(a, b) __builtin_shufflevector(a, b, 4, 12, 5, 13, 6, 14, 7, 15)
+#define INTERLEAVE_LOW(a, b)  VSHUFFLE(a, b, 0, 8, 1, 9, 2, 10, 3, 11)
+#define INTERLEAVE_HIGH(a, b) VSHUFFLE(a, b, 4, 12, 5, 13, 6, 14, 7, 15)
 #else
-#define INTERLEAVE_LOW(a, b)  __builtin_shufflevector(a, b, 0, 4, 1, 5)
-#define INTERLEAVE_HIGH(a, b) __builtin_shufflevector(a, b, 2, 6, 3, 7)
+#define INTERLEAVE_LOW(a, b)  VSHUFFLE(a, b, 0, 4, 1, 5)
+#define INTERLEAVE_HIGH(a, b) VSHUFFLE(a, b, 2, 6, 3, 7)
 #endif
 
 /* x_ij <-> x_ji: each pass rotates the bits of the index (i, j) by one, log2(VW) passes exchange i and j. */

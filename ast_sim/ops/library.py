@@ -14,6 +14,7 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -35,12 +36,17 @@ LIBRARY = torch.library.Library("ast_sim", "DEF")
 
 
 def _share_torch_threads() -> None:
-    """Hand torch's thread pool to the C core. Before torch 2.10 it has no C symbols, and the core stays serial."""
+    """Hand torch's thread pool to the C core. Without it (torch before 2.10) the core runs on one thread, and warns."""
     name = {"darwin": "libtorch_cpu.dylib", "win32": "torch_cpu.dll"}.get(sys.platform, "libtorch_cpu.so")
     try:
         library = ctypes.CDLL(str(Path(torch.__file__).parent / "lib" / name))
         pool = [library.torch_parallel_for, library.torch_get_num_threads]
-    except (OSError, AttributeError):
+    except (OSError, AttributeError) as error:
+        warnings.warn(
+            f"ast_sim's kernels run on one thread, as torch {torch.__version__} does not offer its own ({error}): "
+            "install torch 2.10 or later, or set AST_SIM_BACKEND=torch to run torch's ops instead",
+            stacklevel=2,
+        )
         return
     _C.set_pool(*(ctypes.cast(function, ctypes.c_void_p).value for function in pool))
 

@@ -1,5 +1,9 @@
 """An op gives the same whether it is called directly or through torch's dispatcher, and whoever must see it does."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 import torch
 from torch.fx.experimental.proxy_tensor import make_fx
@@ -66,3 +70,25 @@ def test_modes_and_tracers_see_the_op():
     assert seen.names == ["ast_sim.segment_sum.default"]
     traced = make_fx(lambda x: segment.segment_sum(x, ORDER, OFFSETS))(x)
     assert torch.ops.ast_sim.segment_sum.default in [node.target for node in traced.graph.nodes]
+
+
+WITHOUT_SYMBOLS = "ctypes.CDLL = lambda path: object()"
+WITHOUT_LIBRARY = "torch.__file__ = '/nowhere/torch/__init__.py'"
+
+
+@pytest.mark.parametrize("missing", [WITHOUT_SYMBOLS, WITHOUT_LIBRARY])
+def test_one_thread_for_want_of_torchs_is_a_warning(missing):
+    code = f"""
+import ctypes, torch
+{missing}
+import ast_sim, ast_sim.ops
+from ast_sim.ops import library
+assert torch.get_num_threads() == 2 and library.configuration()["core_threads"] == 1
+order, offsets = torch.arange(4), torch.tensor([0, 3, 4])
+assert ast_sim.ops.segment_sum(torch.ones(4, 5), order, offsets)[:, 0].tolist() == [3, 1]
+"""
+    environment = {**os.environ, "AST_SIM_BACKEND": "c", "OMP_NUM_THREADS": "2"}
+    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=300)
+    assert run.returncode == 0, run.stderr
+    (warning,) = [line for line in run.stderr.splitlines() if "Warning: " in line]
+    assert "run on one thread" in warning and "install torch 2.10 or later" in warning
