@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 TORCH := $(shell sed -n 's/^torch==/torch==/p' constraints.txt)
 PIP := $(BIN)/pip install --quiet --constraint constraints.txt
-C_SOURCES := $(wildcard csrc/*.c csrc/*.h)
+C_SOURCES := $(wildcard csrc/*.c csrc/*.h csrc/tests/simd_*.h)
 C_TESTS := $(patsubst csrc/tests/test_%.c,%,$(wildcard csrc/tests/test_*.c))
 C_FUZZERS := $(patsubst csrc/tests/fuzz_%.c,%,$(wildcard csrc/tests/fuzz_*.c))
 C_TEST_HEADERS := $(wildcard csrc/tests/*.h)
@@ -114,13 +114,16 @@ COMPILE_fuzz := $(CLANG) -O0 -g -fsanitize=fuzzer-no-link,$(SANITIZE) -fno-sanit
 COMPILE_target := $(CLANG) -O1 -g -fsanitize=$(SANITIZE) -fno-sanitize-recover=all
 COMPILE_wide := $(GCC) -O2 -Wno-psabi -mavx2 -mfma -DAST_VECTOR_BYTES=64
 
-CORE := isa_base dispatch parallel memory
+CORE := isa_base dispatch parallel memory tests/simd_base
 BUILDS := plain sanitized races valgrind
 ifneq ($(X86),)
 CORE_X86 := isa_avx2 isa_avx512
+CORE += tests/simd_avx2 tests/simd_avx512
 BUILDS += wide
 FLAGS_isa_avx2 := -mavx2 -mfma
 FLAGS_isa_avx512 := -mavx512f -mavx512bw -mavx512dq -mavx512vl -mfma -mprefer-vector-width=512
+FLAGS_tests/simd_avx2 := $(FLAGS_isa_avx2)
+FLAGS_tests/simd_avx512 := $(FLAGS_isa_avx512)
 FLAGS_dispatch := -DAST_HAVE_AVX2 -DAST_HAVE_AVX512
 endif
 # Every allocation of this test passes through functions of its own.
