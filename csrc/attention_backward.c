@@ -71,8 +71,8 @@ static void backward_group(backward_scratch *t, int64_t i, int64_t rows, int64_t
   float *x = t->weights + i % SQUARE * ROW, *dx = t->dscores + i % SQUARE * ROW;
   const int64_t whole = round_up(rows, ROW_STEP);
   for (int64_t c = 0; c < n; c += LANES) {
-    EACH_TILE(whole, scores_tile, D, t->queries + i * ROW, t->key_panels + c * D, x + c, NULL)
-    EACH_TILE(whole, scores_tile, D, t->dout + i * ROW, t->value_panels + c * D, dx + c, NULL)
+    scores_product(whole, D, t->queries + i * ROW, t->key_panels + c * D, x + c, NULL);
+    scores_product(whole, D, t->dout + i * ROW, t->value_panels + c * D, dx + c, NULL);
   }
   const vu threshold = (vu){0} + (d->threshold << 16);
   if (d->threshold)
@@ -106,13 +106,15 @@ static void load_queries(const backward_job *job, const backward_range *range, i
   copy_rows(q, s->q_stride, rows, D, s->scale, t->queries);
   copy_rows(dout, H * D, rows, D, 1, t->dout);
   for (int64_t i = 0; i < rows; i += VW) {
-    vf sum = {0}; /* in the order of the products, so that a weight of 1 leaves dS = 0 */
+    vf sum = {0}, chain = {0}; /* in the order of the products, so that a weight of 1 leaves dS = 0 */
     for (int64_t e = 0; e < D; e += VW) {
       vf x[VW], y[VW];
       load_transposed(t->dout + i * ROW + e, ROW, rows - i, y);
       load_transposed(out + i * H * D + e, H * D, rows - i, x);
 #pragma GCC unroll 16
-      for (int j = 0; j < VW; j++) sum += y[j] * x[j];
+      for (int j = 0; j < VW; j++) chain += y[j] * x[j];
+      if ((e + VW) % SCORE_DEPTH && e + VW < D) continue;
+      sum = chain + sum, chain = (vf){0};
     }
     vstore(t->delta + i, sum);
   }
