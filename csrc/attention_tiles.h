@@ -80,10 +80,10 @@ AST_INLINE void chain_tile(const int rows, const bool add, int64_t i, int64_t D,
     largest[j] = m;
   }
 }
-#define CHAIN_TILE(name, add)                                                                                            \
-  AST_INLINE void name(const int rows, int64_t i, int64_t D, const float *a, const float *b, float *x, vf *largest) {    \
-    chain_tile(rows, add, i, D, a, b, x, largest);                                                                       \
-  }                                                                                                                      \
+#define CHAIN_TILE(name, add)                                                                                         \
+  AST_INLINE void name(const int rows, int64_t i, int64_t D, const float *a, const float *b, float *x, vf *largest) { \
+    chain_tile(rows, add, i, D, a, b, x, largest);                                                                    \
+  }                                                                                                                   \
   TILE_FUNCTIONS(name, (int64_t i, int64_t D, const float *a, const float *b, float *x, vf *largest), i, D, a, b, x, largest)
 CHAIN_TILE(first_chain, false)
 CHAIN_TILE(next_chain, true)
