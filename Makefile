@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 TORCH := $(shell sed -n 's/^torch==/torch==/p' constraints.txt)
 PIP := $(BIN)/pip install --quiet --constraint constraints.txt
-C_SOURCES := $(wildcard csrc/*.c csrc/*.h)
+C_SOURCES := $(wildcard csrc/*.c csrc/*.h csrc/tests/simd_*.h)
 C_TESTS := $(patsubst csrc/tests/test_%.c,%,$(wildcard csrc/tests/test_*.c))
 C_FUZZERS := $(patsubst csrc/tests/fuzz_%.c,%,$(wildcard csrc/tests/fuzz_*.c))
 C_TEST_HEADERS := $(wildcard csrc/tests/*.h)
@@ -127,13 +127,16 @@ COMPILE_gcc11 := gcc-11 $(C_FLAGS) $(GCC_WARNINGS) -O2
 COMPILE_clang := clang $(C_FLAGS) $(WARNINGS) -O2
 COMPILE_aarch64 := aarch64-linux-gnu-gcc $(C_FLAGS) $(GCC_WARNINGS) -O2
 
-CORE := isa_base dispatch parallel memory
+CORE := isa_base dispatch parallel memory tests/simd_base
 BUILDS := plain sanitized races valgrind gcc11 clang
 ifneq ($(X86),)
 CORE_X86 := isa_avx2 isa_avx512
+SIMD_X86 := tests/simd_avx2 tests/simd_avx512
 BUILDS += wide aarch64
 FLAGS_isa_avx2 := -mavx2 -mfma
 FLAGS_isa_avx512 := -mavx512f -mavx512bw -mavx512dq -mavx512vl -mfma -mprefer-vector-width=512
+FLAGS_tests/simd_avx2 := $(FLAGS_isa_avx2)
+FLAGS_tests/simd_avx512 := $(FLAGS_isa_avx512)
 FLAGS_dispatch := -DAST_HAVE_AVX2 -DAST_HAVE_AVX512
 endif
 # Every allocation of this test passes through functions of its own.
@@ -144,7 +147,7 @@ define BUILD
 build/check/$(1)/%.o: csrc/%.c $(C_SOURCES) | tools
 	@mkdir -p $$(@D)
 	@$(COMPILE_$(1)) $$(FLAGS_$$*) -c $$< -o $$@
-build/check/$(1)/core.a: $(patsubst %,build/check/$(1)/%.o,$(CORE) $(if $(filter wide aarch64,$(1)),,$(CORE_X86)))
+build/check/$(1)/core.a: $(patsubst %,build/check/$(1)/%.o,$(CORE) $(if $(filter wide aarch64,$(1)),,$(CORE_X86)) $(if $(filter aarch64,$(1)),,$(SIMD_X86)))
 	@ar rcs $$@ $$^
 $(patsubst %,build/check/$(1)/test_%,$(C_TESTS)): build/check/$(1)/test_%: csrc/tests/test_%.c $(C_TEST_HEADERS) build/check/$(1)/core.a
 	@$(COMPILE_$(1)) $$< build/check/$(1)/core.a -lm $$(LINK_test_$$*) -o $$@

@@ -89,7 +89,7 @@ static void forward_panel(forward_scratch *t, const forward_state *state, int64_
   float *m = state->maximum + i0, *l = state->sum + i0, fade[LANES];
   const float *queries = t->queries + i0 * D;
   vf largest[2] = {vsplat(-INFINITY), vsplat(-INFINITY)}, base[2], sum[2] = {{0}};
-  EACH_TILE(round_up(n, ROW_STEP), scores_tile, D, t->keys, queries, t->scores, largest)
+  scores_product(round_up(n, ROW_STEP), D, t->keys, queries, t->scores, largest);
 #pragma GCC unroll 2
   for (int c = 0; c < 2; c++) {
     const vf before = vload(m + c * VW), now = vmax(largest[c], before);

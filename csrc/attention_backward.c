@@ -3,7 +3,8 @@
  * With y = dout, P the weights, Z the dropout factors (0 or 1/keep) and . the product by elements,
  *   dV = (P . Z)^T y,   dS = P . (Z . (y V^T) - rowsum(y . out)),   dQ = scale dS K,   dK = scale dS^T Q.
  * P is recomputed as exp(x - m) / l; the log sum exp in one float would be off by 5e-4 where it is 1e4. Where one weight is 1 and the
- * others vanish, dS is exactly 0: both terms are rounded alike.
+ * others vanish, dS is exactly 0: both terms are rounded alike. Where one key takes nearly all the weight of a query, its dS is a small
+ * difference of large terms; but a row of dS sums to 0. So that key is noted, and what its row sums to is at the end taken off its dS.
  *
  * A task takes a chunk of queries against all blocks of keys, then the next chunk: each score is computed once and dQ, dK and dV
  * grow in the second cache. Scores have keys across the lanes: no row is summed here, and so panels are needed of a block of keys
@@ -11,7 +12,8 @@
  * leaves its share of the gradient of the shorter side, added in the order of the parts. All sizes depend on the scene's own, as in the
  * forward pass.
  *
- * Cost: 10 Tq Tk D flops a head in five products. Memory: at most 2 BACKWARD_TASKS D floats for each row of the shorter side.
+ * Cost: 10 Tq Tk D flops a head in five products. Memory: at most 2 BACKWARD_TASKS D floats for each row of the shorter side,
+ * and a peak for each query, head and part of the keys.
  */
 #include "ast.h"
 #include "attention_tiles.h"
@@ -27,9 +29,18 @@ enum {
 _Static_assert(CHUNK % SQUARE == 0 && GROUP % (int)GEMM_ROWS == 0 && KEYS % (int)LANES == 0, "chunks hold whole squares, groups tiles");
 
 typedef struct {
-  int64_t parts, part_rows;          /* rows of a part: queries if there are more of them than keys, else keys */
-  int64_t first_task, first_partial; /* tasks, and floats of the partial gradients, before this scene */
+  int64_t parts, part_rows;                      /* rows of a part: queries if there are more of them than keys, else keys */
+  int64_t first_task, first_partial, first_peak; /* tasks, floats of the partial gradients and peaks before this scene */
 } backward_cut;
+
+/* Of a query whose weights are nearly all of one key: that key of the scene, or -1 if it is in no block so far, and the sum of dS. */
+typedef struct {
+  int64_t key;
+  float sum;
+} backward_peak;
+
+static const float PEAK = 0.875f;        /* the weight from which a key is one */
+static const float LEAST_SUM = 0x1p-46f; /* of the terms of dS: what is smaller would be 0 in double, too */
 
 typedef struct {
   const ast_attention *s;
@@ -37,6 +48,8 @@ typedef struct {
   float *dq, *dk, *dv;
   const backward_cut *cuts; /* [B+1] */
   float *partials;
+  backward_peak *peaks; /* [parts by keys, queries] of each scene and head */
+  bool any_peaks;
 } backward_job;
 
 typedef struct {
@@ -46,6 +59,7 @@ typedef struct {
   float queries[CHUNK * ROW], dout[CHUNK * ROW], dq[CHUNK * ROW]; /* scale Q, y and dQ / scale */
   dropout_row words[GROUP];
   float maximum[CHUNK], share[CHUNK], delta[CHUNK]; /* m, 1 / l, rowsum(y . out) */
+  backward_peak peaks[CHUNK];
 } backward_scratch;
 
 /* The scene, head, queries and keys of a task, and where its gradients go: rows [.][stride]. */
@@ -53,6 +67,7 @@ typedef struct {
   int64_t b, h, first_query, queries, first_key, keys;
   float *dq, *dk, *dv;
   int64_t dq_stride, dk_stride, dv_stride;
+  int64_t first_peak; /* of the scene's first query */
 } backward_range;
 
 /* ---- a square of queries against a block of keys ---- */
@@ -65,14 +80,30 @@ AST_INLINE void gradient(float *x, float *dx, vf maximum, vf share, vf delta, co
   vstore(dx, p * ((words ? dropout_keep(words, slot, threshold, dp) : dp) - delta));
 }
 
+/* The first of n scores that is the maximum, or -1. */
+static int64_t find_peak(const float *x, int64_t n, float maximum) {
+  int64_t c = 0;
+  for (; c + VW <= n; c += VW)
+    if (vsum((vf)((vload(x + c) == maximum) & (vi)vsplat(1))) > 0) break;
+  for (const int64_t end = min64(n, c + VW); c < end; c++)
+    if (x[c] == maximum) return c;
+  return -1;
+}
+
+static float sum_of(const float *x, int64_t n) {
+  vf sum = {0};
+  for (int64_t c = 0; c < n; c += VW) sum += vload_upto(x + c, n - c);
+  return vsum(sum);
+}
+
 /* Weights and their gradients of the queries i..i+rows of those in the scratch; k0 the first of n keys of the scene. */
 static void backward_group(backward_scratch *t, int64_t i, int64_t rows, int64_t query, int64_t k0, int64_t n, int64_t D,
                            const dropout *d) {
   float *x = t->weights + i % SQUARE * ROW, *dx = t->dscores + i % SQUARE * ROW;
   const int64_t whole = round_up(rows, ROW_STEP);
   for (int64_t c = 0; c < n; c += LANES) {
-    EACH_TILE(whole, scores_tile, D, t->queries + i * ROW, t->key_panels + c * D, x + c, NULL)
-    EACH_TILE(whole, scores_tile, D, t->dout + i * ROW, t->value_panels + c * D, dx + c, NULL)
+    scores_product(whole, D, t->queries + i * ROW, t->key_panels + c * D, x + c, NULL);
+    scores_product(whole, D, t->dout + i * ROW, t->value_panels + c * D, dx + c, NULL);
   }
   const vu threshold = (vu){0} + (d->threshold << 16);
   if (d->threshold)
@@ -80,19 +111,22 @@ static void backward_group(backward_scratch *t, int64_t i, int64_t rows, int64_t
   for (int64_t r = 0; r < rows; r++) {
     const vf maximum = vsplat(t->maximum[i + r]), share = vsplat(t->share[i + r]), delta = vsplat(t->delta[i + r]);
     float *x_r = x + r * ROW, *dx_r = dx + r * ROW;
-    if (!d->threshold) {
-      for (int64_t c = 0; c < n; c += VW) gradient(x_r + c, dx_r + c, maximum, share, delta, NULL, 0, threshold);
-      continue;
+    backward_peak *peak = t->share[i + r] > PEAK ? &t->peaks[i + r] : NULL;
+    if (peak && peak->key < 0) {
+      const int64_t at = find_peak(x_r, n, t->maximum[i + r]);
+      if (at >= 0) peak->key = k0 + at;
     }
+    for (int64_t c = 0; !d->threshold && c < n; c += VW) gradient(x_r + c, dx_r + c, maximum, share, delta, NULL, 0, threshold);
 #pragma GCC unroll 8
     for (int slot = 0; slot < DROPOUT_SLOTS; slot++) {
-      if (slot * DROPOUT_LANES >= n) break;
+      if (!d->threshold || slot * DROPOUT_LANES >= n) break;
 #pragma GCC unroll 4
       for (int part = 0; part < DROPOUT_PARTS; part++) {
         const int64_t c = slot * DROPOUT_LANES + part * VW;
         gradient(x_r + c, dx_r + c, maximum, share, delta, t->words[r][part], slot, threshold);
       }
     }
+    if (peak) peak->sum += sum_of(dx_r, n);
   }
 }
 
@@ -106,19 +140,22 @@ static void load_queries(const backward_job *job, const backward_range *range, i
   copy_rows(q, s->q_stride, rows, D, s->scale, t->queries);
   copy_rows(dout, H * D, rows, D, 1, t->dout);
   for (int64_t i = 0; i < rows; i += VW) {
-    vf sum = {0}; /* in the order of the products, so that a weight of 1 leaves dS = 0 */
+    vf sum = {0}, chain = {0}; /* in the order of the products, so that a weight of 1 leaves dS = 0 */
     for (int64_t e = 0; e < D; e += VW) {
       vf x[VW], y[VW];
       load_transposed(t->dout + i * ROW + e, ROW, rows - i, y);
       load_transposed(out + i * H * D + e, H * D, rows - i, x);
 #pragma GCC unroll 16
-      for (int j = 0; j < VW; j++) sum += y[j] * x[j];
+      for (int j = 0; j < VW; j++) chain += y[j] * x[j];
+      if ((e + VW) % SCORE_DEPTH && e + VW < D) continue;
+      sum = chain + sum, chain = (vf){0};
     }
     vstore(t->delta + i, sum);
   }
   for (int64_t i = 0; i < rows; i++) {
     t->maximum[i] = job->maximum[(q0 + i) * H + h];
     t->share[i] = 1 / job->sum[(q0 + i) * H + h];
+    t->peaks[i] = (backward_peak){-1, 0};
   }
 }
 
@@ -178,6 +215,47 @@ static int64_t partial_size(const ast_attention *s, int64_t b) {
   return s->D * (queries > keys ? 2 * keys : queries);
 }
 
+/* Peaks of a scene and head: of all its queries, once for each part of its keys. */
+static int64_t num_peaks(const ast_attention *s, int64_t b, int64_t parts) {
+  const int64_t queries = s->q_offsets[b + 1] - s->q_offsets[b], keys = s->k_offsets[b + 1] - s->k_offsets[b];
+  return queries > keys ? queries : parts * queries;
+}
+
+/* Leaves the peaks of the queries first..first+rows of the scene. */
+static void put_peaks(backward_job *job, const backward_range *range, int64_t first, int64_t rows, const backward_scratch *t) {
+  backward_peak *to = job->peaks + range->first_peak + first;
+  bool any = false;
+  for (int64_t i = 0; i < rows; i++) {
+    to[i] = t->peaks[i];
+    if (fabsf(to[i].sum) <= LEAST_SUM * fabsf(t->delta[i])) to[i].sum = 0;
+    any |= to[i].sum != 0;
+  }
+  if (any) __atomic_store_n(&job->any_peaks, true, __ATOMIC_RELAXED);
+}
+
+/* Takes off the dS of each peak what its row sums to. */
+static void settle_peaks(const backward_job *job, int64_t b, int64_t h) {
+  const ast_attention *s = job->s;
+  const int64_t D = s->D, q0 = s->q_offsets[b], queries = s->q_offsets[b + 1] - q0, k0 = s->k_offsets[b];
+  const int64_t num = s->k_offsets[b + 1] == k0 ? 0 : num_peaks(s, b, job->cuts[b].parts);
+  const backward_peak *peaks = job->peaks + job->cuts[b].first_peak + h * num;
+  for (int64_t i = 0; i < min64(queries, num); i++) {
+    backward_peak all = {-1, 0};
+    for (int64_t at = i; at < num; at += queries) {
+      all.sum += peaks[at].sum;
+      if (all.key < 0) all.key = peaks[at].key;
+    }
+    if (all.key < 0 || all.sum == 0 || !isfinite(all.sum)) continue;
+    const float *q = job->q + (q0 + i) * s->q_stride + h * D, *k = job->k + (k0 + all.key) * s->k_stride + h * D;
+    float *dq = job->dq + (q0 + i) * s->dq_stride + h * D, *dk = job->dk + (k0 + all.key) * s->dk_stride + h * D;
+    const float factor = s->scale * all.sum;
+    for (int64_t e = 0; e < D; e += VW) {
+      vstore(dq + e, vload(dq + e) - factor * vload(k + e));
+      vstore(dk + e, vload(dk + e) - factor * vload(q + e));
+    }
+  }
+}
+
 static int64_t scene_of(const backward_job *job, int64_t task) {
   int64_t b = 0, last = job->s->B - 1; /* the last scene that has at most `task` tasks before it */
   while (b < last) {
@@ -199,6 +277,7 @@ static backward_range find_range(const backward_job *job, int64_t index) {
   float *partial = job->partials + cut->first_partial + (h * (cut->parts - 1) + part - 1) * partial_size(s, b);
   if (by_queries) r.first_query = before, r.queries = min64(cut->part_rows, r.queries - before);
   else r.first_key = before, r.keys = min64(cut->part_rows, r.keys - before);
+  r.first_peak = cut->first_peak + h * num_peaks(s, b, cut->parts) + (by_queries ? 0 : part * r.queries);
   r.dq = job->dq + (q0 + r.first_query) * s->dq_stride + h * D, r.dq_stride = s->dq_stride;
   r.dk = job->dk + (k0 + r.first_key) * s->dk_stride + h * D, r.dk_stride = s->dk_stride;
   r.dv = job->dv + (k0 + r.first_key) * s->dv_stride + h * D, r.dv_stride = s->dv_stride;
@@ -208,7 +287,7 @@ static backward_range find_range(const backward_job *job, int64_t index) {
 }
 
 static ast_status backward_task(int64_t index, void *context) {
-  const backward_job *job = context;
+  backward_job *job = context;
   const backward_range r = find_range(job, index);
   const int64_t D = job->s->D;
   if (r.keys == 0) fill_rows(0, r.dq_stride, r.queries, D, r.dq);
@@ -222,12 +301,13 @@ static ast_status backward_task(int64_t index, void *context) {
     load_queries(job, &r, first, rows, t);
     for (int64_t k0 = 0; k0 < r.keys; k0 += KEYS) backward_block(job, &r, first, rows, r.first_key + k0, min64(KEYS, r.keys - k0), &d, t);
     put_rows(t->dq, rows, D, job->s->scale, false, r.dq + i * r.dq_stride, r.dq_stride);
+    put_peaks(job, &r, first, rows, t);
   }
   return AST_OK;
 }
 
-/* Adds the partial gradients of scene index / H and head index % H to what the first part left. */
-static ast_status add_partials_task(int64_t index, void *context) {
+/* Scene index / H and head index % H: adds the partial gradients to what the first part left, and settles the peaks. */
+static ast_status finish_task(int64_t index, void *context) {
   const backward_job *job = context;
   const ast_attention *s = job->s;
   const int64_t H = s->H, D = s->D, b = index / H, h = index % H, size = partial_size(s, b), parts = job->cuts[b].parts;
@@ -241,6 +321,7 @@ static ast_status add_partials_task(int64_t index, void *context) {
       for (int64_t e = h * D; e < h * D + D; e += VW) vstore(to + e, vload(to + e) + vload(partial + i * D + e - h * D));
     }
   }
+  if (job->any_peaks) settle_peaks(job, b, h);
   return AST_OK;
 }
 
@@ -252,13 +333,15 @@ static ast_status attention_backward(const ast_attention *s, const float *restri
   if (!cuts) return AST_NO_MEMORY;
   for (int64_t b = 0; b < s->B; b++) {
     cuts[b] = cut_backward(s, b);
-    cuts[b].first_task = next.first_task, cuts[b].first_partial = next.first_partial;
+    cuts[b].first_task = next.first_task, cuts[b].first_partial = next.first_partial, cuts[b].first_peak = next.first_peak;
     next.first_task += s->H * cuts[b].parts;
     next.first_partial += s->H * (cuts[b].parts - 1) * partial_size(s, b);
+    next.first_peak += s->H * num_peaks(s, b, cuts[b].parts);
   }
+  backward_peak *peaks = ast_scratch(next.first_peak * (int64_t)sizeof *peaks);
   float *partials = ast_scratch(next.first_partial * (int64_t)sizeof *partials);
-  if (!partials) return AST_NO_MEMORY;
-  backward_job job = {s, q, k, v, out, maximum, sum, dout, dq, dk, dv, cuts, partials};
+  if (!peaks || !partials) return AST_NO_MEMORY;
+  backward_job job = {s, q, k, v, out, maximum, sum, dout, dq, dk, dv, cuts, partials, peaks, false};
   const ast_status status = ast_parallel(next.first_task, backward_task, &job);
-  return status == AST_OK && next.first_partial ? ast_parallel(s->B * s->H, add_partials_task, &job) : status;
+  return status == AST_OK && (next.first_partial || job.any_peaks) ? ast_parallel(s->B * s->H, finish_task, &job) : status;
 }

@@ -4,7 +4,7 @@
  * maximum and sum of a row of the softmax are operations between vectors, never within one; of keys in the backward pass, x[query][key].
  * Every array that a product reads row by row has rows ROW floats apart: a constant, so that a tile needs one pointer for each operand, and
  * no power of two, which would crowd few cache sets. Products add in rising order of the summed index, in every tile alike: a score has the
- * same bits forward and backward.
+ * same bits forward and backward. A score is a sum of chains of SCORE_DEPTH products: its error, times its own size, is that of a weight.
  *
  * Legend: n keys of a block, D channels of a head; A read by broadcast, B in vectors, C in GEMM_ROWS x 2 vectors of registers.
  */
@@ -20,6 +20,7 @@ enum {
   KEYS = 128,           /* keys of a block: its scores against a panel of queries stay in the first cache */
   MAX_D = 128,          /* channels of a head */
   ROW = MAX_D + 16,     /* floats from row to row */
+  SCORE_DEPTH = 32,     /* products of one chain of a score at most: their rounding errors grow with their number */
   ROW_STEP = 4,         /* products compute rows in multiples of this: 90 keys cost 92 */
 };
 
@@ -57,14 +58,19 @@ AST_INLINE void tile_product(const int rows, const int vectors, int64_t K, gemm_
   gemm_sums(rows, vectors, K, a, b, b_row, sum);
 }
 
-/* x[row][lane] = a[row] . b[lane] over the channels for a tile of rows; raises largest[2], unless NULL, to the scores' maximum. */
-AST_INLINE void scores_tile(const int rows, int64_t i, int64_t D, const float *a, const float *b, float *x, vf *largest) {
+/* x[row][lane] = (x[row][lane] +) a[row] . b[lane] over D channels for a tile of rows; raises largest[2], unless NULL, to the maximum
+ * of x. */
+AST_INLINE void chain_tile(const int rows, const bool add, int64_t i, int64_t D, const float *a, const float *b, float *x, vf *largest) {
   vf sum[GEMM_ROWS][2];
   tile_product(rows, 2, D, (gemm_a){a + i * ROW, ROW, 1}, b, LANES, sum);
 #pragma GCC unroll 12
   for (int r = 0; r < rows; r++)
 #pragma GCC unroll 2
-    for (int j = 0; j < 2; j++) vstore(x + (i + r) * ROW + j * VW, sum[r][j]);
+    for (int j = 0; j < 2; j++) {
+      float *to = x + (i + r) * ROW + j * VW;
+      if (add) sum[r][j] += vload(to);
+      vstore(to, sum[r][j]);
+    }
   if (!largest) return;
 #pragma GCC unroll 2
   for (int j = 0; j < 2; j++) {
@@ -74,7 +80,21 @@ AST_INLINE void scores_tile(const int rows, int64_t i, int64_t D, const float *a
     largest[j] = m;
   }
 }
-TILE_FUNCTIONS(scores_tile, (int64_t i, int64_t D, const float *a, const float *b, float *x, vf *largest), i, D, a, b, x, largest)
+#define CHAIN_TILE(name, add)                                                                                         \
+  AST_INLINE void name(const int rows, int64_t i, int64_t D, const float *a, const float *b, float *x, vf *largest) { \
+    chain_tile(rows, add, i, D, a, b, x, largest);                                                                    \
+  }                                                                                                                   \
+  TILE_FUNCTIONS(name, (int64_t i, int64_t D, const float *a, const float *b, float *x, vf *largest), i, D, a, b, x, largest)
+CHAIN_TILE(first_chain, false)
+CHAIN_TILE(next_chain, true)
+#undef CHAIN_TILE
+
+/* x[row][lane] = a[row] . b[lane] for n rows, chain after chain; raises largest[2], unless NULL, to the maximum of x. */
+static void scores_product(int64_t n, int64_t D, const float *a, const float *b, float *x, vf *largest) {
+  EACH_TILE(n, first_chain, min64(D, SCORE_DEPTH), a, b, x, D > SCORE_DEPTH ? NULL : largest)
+  for (int64_t d = SCORE_DEPTH; d < D; d += SCORE_DEPTH)
+    EACH_TILE(n, next_chain, min64(D - d, SCORE_DEPTH), a + d, b + d * LANES, x, D > d + SCORE_DEPTH ? NULL : largest)
+}
 
 /* What becomes of c as a product comes to it: c = product, c += product, or row i of c = factor[i] c + product. */
 typedef struct {

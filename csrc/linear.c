@@ -119,9 +119,9 @@ static void linear_activation(const ast_linear *sizes, int64_t rows, const float
         vstore_upto(dz + j, (vf)((vi)y & ~(a <= 0)), n);
         continue;
       }
-      const vf b = vload_upto(z + half + j, n), phi = vnormal(b);
+      const vf b = vload_upto(z + half + j, n), gauss = vgauss(b), phi = vnormal(b, gauss);
       vstore_upto(dz + j, y * (b * phi), n);
-      vstore_upto(dz + half + j, y * a * (b * vnormal_density(b) + phi), n);
+      vstore_upto(dz + half + j, y * a * (b * vnormal_density(gauss) + phi), n);
     }
 }
 

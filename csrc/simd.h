@@ -115,43 +115,71 @@ AST_INLINE float vsum(vf x) {
   return x[0];
 }
 
-/* 2^(y - shift) with y = factor x, within 1 ULP for y < 127: 0 where x < least, NaN for NaN. */
-AST_INLINE vf vpower(vf x, const float factor, int32_t shift, float least) {
-  const float magic = 0x1.8p23f + (float)(127 - shift);
-  const vf rounded = x * factor + magic; /* its low bits: n + 127 - shift, the exponent of 2^(n - shift), n the integer nearest to y */
-  const vf f = x * factor - (rounded - magic);
-  vf p = 0x1.41fbbcp-13f * f + 0x1.5f3e52p-10f; /* 2^f on [-1/2, 1/2], minimax with p(0) = 1 */
-  p = p * f + 0x1.3b2d4cp-7f;
-  p = p * f + 0x1.c6aee8p-5f;
-  p = p * f + 0x1.ebfbdcp-3f;
-  p = p * f + 0x1.62e430p-1f;
-  p = p * f + 1.0f;
-  const vf power = (vf)((vu)rounded << 23);
-  return (vf)((vi)(p * power) & ~(x < least));
-}
-/* 2^(x - shift) and e^x 2^-shift: 0 where the result would be below 2^-125 (also for -inf). */
-AST_INLINE vf vexp2(vf x, int32_t shift) { return vpower(x, 1, shift, (float)(shift - 125)); }
-AST_INLINE vf vexp(vf x, int32_t shift) { return vpower(x, 0x1.715476p+0f, shift, (float)(shift - 125) * 0x1.62e430p-1f); }
+/* ---- functions, whose bounds in units in the last place are the table of tests/test_simd.c ---- */
 
-/* The distribution function of the normal distribution, (1 + erf(x / sqrt 2)) / 2, and its density. */
-AST_INLINE vf vnormal(vf x) {
-  const vf z = x * 0x1.6a09e6p-1f, t = vselect(z < 0, -z, z), s = z * z;
-  vf near = -0x1.38e000p-11f * s + 0x1.471a58p-8f; /* erf(z) = z + z p(z^2) where |z| is below 475/512, */
-  near = near * s - 0x1.b691b2p-6f;
-  near = near * s + 0x1.ce1c44p-4f;
-  near = near * s - 0x1.812700p-2f;
-  near = near * s + 0x1.06eba8p-3f;
-  near = near * z + z;
-  vf far = -0x1.220000p-16f * t + 0x1.91cfb2p-12f; /* log(1 - erf(t)) = -t + t q(t) elsewhere, minimax */
-  far = far * s + (-0x1.fd1438p-9f * t + 0x1.8d6342p-6f);
-  far = far * t - 0x1.b55cb8p-4f;
-  far = far * t - 0x1.450aa0p-1f;
-  far = far * t - 0x1.079d0cp-3f;
-  far = far * t - t;
-  const vf tail = vexp2(far * 0x1.715476p+0f, 1);
-  return vselect(t > 475.0f / 512, vselect(z < 0, tail, 1 - tail), 0.5f * near + 0.5f);
+/* ln 2 = LN2 + LN2_REST; LN2 has 17 bits, so that n LN2 is exact for |n| <= 127, with or without FMA (Cody and Waite) */
+#if defined(__FMA__) || defined(__ARM_FEATURE_FMA)
+enum { FUSED = 1 }; /* whether a product and a sum are rounded once */
+#else
+enum { FUSED = 0 };
+#endif
+static const float LN2 = 0x1.62e4p-1f, LN2_REST = 0x1.7f7d1cp-20f, LOG2_E = 0x1.715476p+0f;
+
+/* e^r for |r| up to ln(2) / 2 and a little more: minimax with e^r = 1 + r + O(r^2) */
+AST_INLINE vf vexp_near(vf r) {
+  vf p = 0x1.6a511ap-10f * r + 0x1.12397cp-7f;
+  p = p * r + 0x1.5558acp-5f;
+  p = p * r + 0x1.555492p-3f;
+  p = p * r + 0x1.fffffcp-2f;
+  return FUSED ? (p * r + 1) * r + 1 : p * (r * r) + r + 1; /* what rounds least */
 }
-AST_INLINE vf vnormal_density(vf x) { return 0x1.988454p-2f * vexp2(x * x * -0x1.715476p-1f, 0); }
+
+/* n, the integer nearest to x log2(e), and 2^(n - shift) */
+AST_INLINE vf vexp_power(vf x, int32_t shift, vf *n) {
+  const float magic = 0x1.8p23f + (float)(127 - shift);
+  const vf rounded = x * LOG2_E + magic; /* its low bits are n + 127 - shift, the exponent of 2^(n - shift) */
+  *n = rounded - magic;
+  return (vf)((vu)rounded << 23);
+}
+
+/* e^x 2^-shift for x < 88: 0 where it would be below 2^-125 (also for -inf), NaN for NaN. */
+AST_INLINE vf vexp(vf x, int32_t shift) {
+  vf n;
+  const vf power = vexp_power(x, shift, &n);
+  const vf r = (x - n * LN2) - n * LN2_REST;
+  return (vf)((vi)(vexp_near(r) * power) & ~(x < (float)(shift - 125) * 0x1.62e430p-1f));
+}
+
+/* e^(-x^2/2): the square in two parts, as that of the upper half of x is exact; rounded, it would cost 40 ULP. */
+AST_INLINE vf vgauss(vf x) {
+  const vf high = (vf)((vi)x & ~0xfff), half = -0.5f * high, s = half * high, rest = (half - 0.5f * x) * (x - high);
+  vf n;
+  const vf power = vexp_power(s + rest, 0, &n);
+  const vf r = (s - n * LN2) + (rest - n * LN2_REST);
+  return (vf)((vi)(vexp_near(r) * power) & ~(s < -126 * 0x1.62e430p-1f));
+}
+
+/* The density of the normal distribution and its distribution function Phi, given e^(-x^2/2). */
+AST_INLINE vf vnormal_density(vf gauss) { return 0x1.988454p-2f * gauss; }
+AST_INLINE vf vnormal(vf x, vf gauss) {
+  const vf t = (vf)((vi)x & INT32_MAX), s = x * x;
+  vf near = -0x1.c4628ap-18f * s + 0x1.d02a46p-14f; /* Phi(x) = 1/2 + x p(x^2) where |x| is at most 1.2, */
+  near = near * s - 0x1.36267ap-10f;
+  near = near * s + 0x1.46c0dcp-7f;
+  near = near * s - 0x1.1057dap-4f;
+  near = near * s + 0x1.988452p-2f;
+  near = near * x + 0.5f;
+  const vf v = 1.0f / (0.5f * t + 1.0f);
+  vf far = -0x1.19a4p-3f * v + 0x1.989f4ep-2f; /* Phi(-t) = e^(-t^2/2) v q(v) elsewhere, minimax */
+  far = far * v - 0x1.782fccp-2f;
+  far = far * v + 0x1.4e8616p-6f;
+  far = far * v + 0x1.162892p-5f;
+  far = far * v + 0x1.360a72p-3f;
+  far = far * v + 0x1.984ceep-3f;
+  far = far * v + 0x1.9885ap-3f;
+  const vf tail = far * v * gauss;
+  return vselect(t > 1.2f, vselect(x < 0, tail, 1 - tail), near);
+}
 
 #if AST_VECTOR_BYTES == 64
 #define INTERLEAVE_LOW(a, b)  VSHUFFLE(a, b, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23)

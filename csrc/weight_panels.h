@@ -133,7 +133,7 @@ static __attribute__((noinline)) void dense_finish(const dense_layer *l, const d
   for (const int64_t end = i + rows; i < end; i++, sums += GEMM_COLUMNS) {
     if (l->paired) {
       const vf a = vload(sums) + vload(bias), b = vload(sums + VW) + vload(bias + VW);
-      vf z = a * (b * vnormal(b));
+      vf z = a * (b * vnormal(b, vgauss(b)));
       if (e->z) {
         vstore_upto(e->z + i * 2 * l->N + j, a, n);
         vstore_upto(e->z + (i * 2 + 1) * l->N + j, b, n);

@@ -1,0 +1,2 @@
+#define AST_ISA avx512
+#include "simd_table.h"

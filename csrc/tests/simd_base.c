@@ -1,0 +1,2 @@
+#define AST_ISA base
+#include "simd_table.h"
