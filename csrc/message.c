@@ -91,7 +91,8 @@ AST_INLINE void message_first_tile(const int rows, const int vectors, const mess
 #pragma GCC unroll 2
       for (int v = 0; v < vectors; v++) sum[i][v] = vload_upto(e + i * s->F + v * VW, n - v * VW);
   }
-  gemm_sums(rows, vectors, s->H, (gemm_a){h, w->row, 1}, w->layers[MESSAGE_A2].panels + c * s->H, GEMM_COLUMNS, sum);
+  const dense_layer *l = &w->layers[MESSAGE_A2];
+  if (s->H) dense_sums(rows, vectors, l, (gemm_a){h, w->row, 1}, l->panels + c * s->H, sum);
 #pragma GCC unroll 12
   for (int i = 0; i < rows; i++) {
     const float *P = s->of_senders + s->senders[m + i] * s->F + c, *Q = s->of_receivers + s->receivers[m + i] * s->F + c;

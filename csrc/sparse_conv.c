@@ -8,7 +8,7 @@
  * W_k is packed into panels once a call. A task owns a range of destinations (and, where there are few, some of the columns). In each
  * group its pairs are a contiguous run, since destinations rise. It takes them tile by tile: rows of x are multiplied where they lie,
  * and the products added to the rows of out, or to the bias at a row's first contribution, while the rows of the next tile are fetched.
- * Groups follow in ascending order and a sum over I is never split: the bits of a row depend on neither the ranges, the threads nor the
+ * Groups follow in ascending order and a sum over I is cut by I alone: the bits of a row depend on neither the ranges, the threads nor the
  * other scenes.
  *
  * The gradient with respect to x is the same kernel with the lists exchanged and W_k^T.
@@ -20,9 +20,10 @@
 
 enum {
   OFFSETS = 27,
-  PAIR_TILE = 48,    /* pairs at a time: 24 KB at 128 channels, beside 16 KB of a panel of weights in L1 */
-  TASK_PAIRS = 4096, /* pairs a task, about: fewer would read the weights too often */
-  LEAST_TASKS = 8    /* however few pairs there are */
+  PAIR_TILE = 48,      /* pairs at a time: 24 KB at 128 channels, beside 16 KB of a panel of weights in L1 */
+  TASK_PAIRS = 4096,   /* pairs a task, about: fewer would read the weights too often */
+  LEAST_TASKS = 8,     /* however few pairs there are */
+  CHAIN_CHANNELS = 512 /* products of one chain at most: their rounding errors grow with their number */
 };
 
 /* the first i in [begin, end) with values[i] >= bound, or end */
@@ -98,19 +99,30 @@ static void conv_point(const conv_job *job, const conv_walk *tile, int64_t first
   }
 }
 
-/* Multiplies the rows of a tile strip by strip and panel by panel, while those of the next are fetched. */
-static void conv_tile(const conv_job *job, const conv_walk *tile, const conv_rows *rows, const conv_walk *next, const conv_rows *next_rows,
-                      int64_t column, int64_t columns) {
-  const int64_t C_in = job->C_in, C_out = job->C_out, n = tile->n;
-  const float *weight = job->packed + tile->k * gemm_packed_size(C_in, C_out);
+/* The products of channels first.. of the rows of a tile, strip by strip and panel by panel, while the rows of the next are fetched. */
+static void conv_chain(const conv_job *job, const conv_walk *tile, const conv_rows *rows, const conv_walk *next, const conv_rows *next_rows,
+                       int64_t first, int64_t column, int64_t columns) {
+  const int64_t C_in = job->C_in, C_out = job->C_out, n = tile->n, K = min64(C_in - first, CHAIN_CHANNELS);
+  const float *weight = job->packed + tile->k * gemm_packed_size(C_in, C_out) + first * GEMM_COLUMNS;
   const int64_t strips = row_strips(n), parts = strips * ((columns + GEMM_COLUMNS - 1) / GEMM_COLUMNS);
   for (int64_t c = column, part = 0; c < column + columns; c += GEMM_COLUMNS)
     for (int64_t s = 0; s < strips; s++, part++) {
       const int64_t i = n * s / strips, f = next->n * part / parts, f_end = next->n * (part + 1) / parts;
       const row_pointers pointers = {rows->x + i, rows->base + i, rows->out + i};
       const row_fetch fetch = {next_rows->x + f, next_rows->out + f, f_end - f};
-      row_panel(n * (s + 1) / strips - i, min64(GEMM_COLUMNS, C_out - c), C_in, pointers, fetch, weight + c * C_in, c);
+      row_panel(n * (s + 1) / strips - i, min64(GEMM_COLUMNS, C_out - c), K, pointers, fetch, weight + c * C_in, c);
     }
+}
+
+/* All channels of a tile, as chains of products: out holds their sum so far, so that each but the first starts from there. */
+static void conv_tile(const conv_job *job, const conv_walk *tile, conv_rows *rows, const conv_walk *next, const conv_rows *next_rows,
+                      int64_t column, int64_t columns) {
+  conv_chain(job, tile, rows, next, next_rows, 0, column, columns);
+  const conv_walk none = {0};
+  for (int64_t first = CHAIN_CHANNELS; first < job->C_in; first += CHAIN_CHANNELS) {
+    for (int64_t i = 0; i < tile->n; i++) rows->x[i] += CHAIN_CHANNELS, rows->base[i] = rows->out[i];
+    conv_chain(job, tile, rows, &none, next_rows, first, column, columns);
+  }
 }
 
 static ast_status conv_task(int64_t index, void *context) {

@@ -165,23 +165,29 @@ AST_INLINE void dense_finish_tile(const int rows, const int vectors, const dense
   DENSE_EACH(i, v) vstore(out + i * e->out_row + v * VW, z[i][v]);
 }
 
-/* One register tile: rows i.. of panel p. A long sum over k is one of short ones, in the stack between two of them. */
-AST_INLINE void dense_tile(const int rows, const int vectors, const dense_layer *l, int64_t p, int64_t i0, gemm_a a, const dense_end *e) {
-  const int64_t j = p * dense_panel_width(l);
-  const float *panel = l->panels + p * l->K * GEMM_COLUMNS, *bias = l->panels_bias + p * GEMM_COLUMNS;
+/* sum_ij = sum_k a_ik W_jk for a register tile, chain after chain, their sum in the stack between two of them. */
+AST_INLINE void dense_sums(const int rows, const int vectors, const dense_layer *l, gemm_a a, const float *panel, vf sum[GEMM_ROWS][2]) {
   float sums[GEMM_ROWS * GEMM_COLUMNS] __attribute__((aligned(64)));
-  DENSE_EACH(i, v) __builtin_prefetch(e->out + (i0 + i) * e->out_row + j + v * VW, 1);
-  vf sum[GEMM_ROWS][2];
   for (int64_t k = 0;;) { /* once without inputs, too: the sums are then 0 */
     DENSE_EACH(i, v) sum[i][v] = (vf){0};
-    const gemm_a part = {a.data + i0 * a.row + k * a.column, a.row, a.column};
-    gemm_sums(rows, vectors, min64(l->depth, l->K - k), part, panel + k * GEMM_COLUMNS, GEMM_COLUMNS, sum);
+    gemm_sums(rows, vectors, min64(l->depth, l->K - k), (gemm_a){a.data + k * a.column, a.row, a.column}, panel + k * GEMM_COLUMNS,
+              GEMM_COLUMNS, sum);
     if (k) DENSE_EACH(i, v) sum[i][v] += vload(sums + i * GEMM_COLUMNS + v * VW);
     k += l->depth;
     if (k >= l->K) break;
     DENSE_EACH(i, v) vstore(sums + i * GEMM_COLUMNS + v * VW, sum[i][v]);
     __asm__("" : "+m"(sums)); /* or the compiler moves what is not yet known of them through other stack for every tile */
   }
+}
+
+/* One register tile: rows i.. of panel p. */
+AST_INLINE void dense_tile(const int rows, const int vectors, const dense_layer *l, int64_t p, int64_t i0, gemm_a a, const dense_end *e) {
+  const int64_t j = p * dense_panel_width(l);
+  const float *panel = l->panels + p * l->K * GEMM_COLUMNS, *bias = l->panels_bias + p * GEMM_COLUMNS;
+  float sums[GEMM_ROWS * GEMM_COLUMNS] __attribute__((aligned(64)));
+  DENSE_EACH(i, v) __builtin_prefetch(e->out + (i0 + i) * e->out_row + j + v * VW, 1);
+  vf sum[GEMM_ROWS][2];
+  dense_sums(rows, vectors, l, (gemm_a){a.data + i0 * a.row, a.row, a.column}, panel, sum);
   if (!l->paired && !e->z && l->N - j >= vectors * VW) {
     dense_finish_tile(rows, vectors, e, i0, j, bias, sum);
     return;
