@@ -84,7 +84,8 @@ static int show_dimension(const call *c, const dimension *d, char *text, size_t 
 /* ---- arrays ---- */
 
 /* The message of an argument that is `wanted`, and not as this attribute of it says. */
-static bool fail_attribute(const call *c, PyObject *type, const char *name, const char *wanted, PyObject *object, const char *attribute) {
+static bool fail_attribute(const call *c, PyObject *type, const char *name, const char *wanted, PyObject *object,
+                           const char *attribute) {
   PyObject *value = PyObject_GetAttrString(object, attribute);
   PyObject *shown = value && strcmp(attribute, "shape") == 0 ? PySequence_Tuple(value) : value;
   if (shown) fail(c, type, "%s must %s, not %R", name, wanted, shown);
@@ -117,7 +118,8 @@ static bool check_layout(const call *c, const parameter *p, const view *v, argum
   for (int d = v->ndim - 1; d >= 0; d--) {
     const int64_t stride = v->stride[d];
     if (size && v->shape[d] > 1 && stride != expected) {
-      if (!p->rows || d > 0 || stride < expected || stride % v->item) return fail(c, PyExc_ValueError, "%s must be contiguous", p->name);
+      if (!p->rows || d > 0 || stride < expected || stride % v->item)
+        return fail(c, PyExc_ValueError, "%s must be contiguous", p->name);
       a->dense = false;
     }
     if (d == 0) a->row_bytes = v->shape[0] > 1 ? stride : expected;
@@ -145,10 +147,12 @@ static bool take_shape(call *c, const parameter *p, const view *v) {
 static bool take_array(call *c, const parameter *p, PyObject *object, argument *a) {
   view v;
   if (!view_of(object, &v))
-    return fail(c, PyExc_TypeError, "%s must be a NumPy array or a dense tensor on the CPU, not %R", p->name, (PyObject *)Py_TYPE(object));
+    return fail(c, PyExc_TypeError, "%s must be a NumPy array or a dense tensor on the CPU, not %R", p->name,
+                (PyObject *)Py_TYPE(object));
   if (v.type != p->type) return fail_type(c, p, object);
   if (!take_shape(c, p, &v)) return fail_shape(c, p, object);
-  if (p->filled && view_size(&v) == 0) return fail_attribute(c, PyExc_ValueError, p->name, "have a shape without 0", object, "shape");
+  if (p->filled && view_size(&v) == 0)
+    return fail_attribute(c, PyExc_ValueError, p->name, "have a shape without 0", object, "shape");
   if (p->output && !v.writeable) return fail(c, PyExc_ValueError, "%s must be writeable", p->name);
   a->data = v.data;
   return check_layout(c, p, &v, a);
@@ -169,7 +173,8 @@ static bool take_number(call *c, const parameter *p, PyObject *object, argument 
   else a->integer = PyLong_AsLongLong(object);
   if ((a->number == -1 || a->integer == -1) && PyErr_Occurred()) return fail_number(c, p, object);
   if (p->kind == INTEGER && (a->integer < p->low || a->integer > p->high))
-    return fail(c, PyExc_ValueError, "%s must lie in %lld..%lld, not %lld", p->name, p->low, p->high, (long long)a->integer);
+    return fail(c, PyExc_ValueError, "%s must lie in %lld..%lld, not %lld", p->name, p->low, p->high,
+                (long long)a->integer);
   return true;
 }
 
@@ -178,10 +183,12 @@ static bool take_number(call *c, const parameter *p, PyObject *object, argument 
 /* A failure of one element, named as Python would name it. */
 static bool fail_element(const call *c, const argument *a, int64_t at, const char *problem, int64_t bound) {
   char place[60];
-  if (a->row_stride > 1) snprintf(place, sizeof place, "%lld, %lld", (long long)(at / a->row_stride), (long long)(at % a->row_stride));
+  if (a->row_stride > 1)
+    snprintf(place, sizeof place, "%lld, %lld", (long long)(at / a->row_stride), (long long)(at % a->row_stride));
   else snprintf(place, sizeof place, "%lld", (long long)at);
   const int64_t value = ((const int64_t *)a->data)[at];
-  return fail(c, PyExc_ValueError, "%s[%s] = %lld is %s %lld", a->name, place, (long long)value, problem, (long long)bound);
+  return fail(c, PyExc_ValueError, "%s[%s] = %lld is %s %lld", a->name, place, (long long)value, problem,
+              (long long)bound);
 }
 
 /* They start with 0, never fall and end at the bound. */
@@ -191,7 +198,8 @@ static bool check_offsets(const call *c, const argument *a, int64_t bound, const
   if (n < 1 || offsets[0] != 0) return fail(c, PyExc_ValueError, "%s must start with 0", a->name);
   for (int64_t i = 1; i < n; i++)
     if (offsets[i] < offsets[i - 1])
-      return fail(c, PyExc_ValueError, "%s must never fall, but falls to %lld at %lld", a->name, (long long)offsets[i], (long long)i);
+      return fail(c, PyExc_ValueError, "%s must never fall, but falls to %lld at %lld", a->name, (long long)offsets[i],
+                  (long long)i);
   if (offsets[n - 1] != bound)
     return fail(c, PyExc_ValueError, "%s must end at the number of rows %lld, not %lld", a->name, (long long)bound,
                 (long long)offsets[n - 1]);
@@ -219,7 +227,8 @@ static bool check_permutation(const call *c, const argument *a, int64_t bound, c
     seen[index[i] >> 3] |= bit;
   }
   free(seen);
-  return twice < 0 || fail(c, PyExc_ValueError, "%s must be a permutation, but holds %lld twice", a->name, (long long)twice);
+  return twice < 0 ||
+         fail(c, PyExc_ValueError, "%s must be a permutation, but holds %lld twice", a->name, (long long)twice);
 }
 
 /* Strictly within each group of pairs; the other array are the offsets of the groups. */
@@ -229,7 +238,8 @@ static bool check_rising(const call *c, const argument *a, int64_t bound, const 
   for (int64_t k = 0; k + 1 < others[0]->length; k++)
     for (int64_t i = offset[k] + 1; i < offset[k + 1]; i++)
       if (index[i] <= index[i - 1])
-        return fail(c, PyExc_ValueError, "%s must rise strictly within each kernel offset, but does not at %lld", a->name, (long long)i);
+        return fail(c, PyExc_ValueError, "%s must rise strictly within each kernel offset, but does not at %lld",
+                    a->name, (long long)i);
   return true;
 }
 
@@ -241,7 +251,8 @@ static bool check_scenes(const call *c, const argument *a, int64_t bound, const 
   for (int64_t b = 0; b + 1 < a->length; b++)
     for (int64_t i = offset[b]; i < offset[b + 1]; i++)
       if (key[i] < 0 || (i > offset[b] && key[i] <= key[i - 1]))
-        return fail(c, PyExc_ValueError, "%s must be at least 0 and rise strictly within each scene, but %s[%lld] is %lld", name, name,
+        return fail(c, PyExc_ValueError,
+                    "%s must be at least 0 and rise strictly within each scene, but %s[%lld] is %lld", name, name,
                     (long long)i, (long long)key[i]);
   return true;
 }
@@ -253,8 +264,8 @@ static bool check_segments(const call *c, const argument *a, int64_t bound, cons
   for (int64_t r = 0; r + 1 < a->length; r++)
     for (int64_t m = offset[r]; m < offset[r + 1]; m++)
       if (segment[m] != r)
-        return fail(c, PyExc_ValueError, "%s[%lld] is %lld, but %s say %lld", others[0]->name, (long long)m, (long long)segment[m], a->name,
-                    (long long)r);
+        return fail(c, PyExc_ValueError, "%s[%lld] is %lld, but %s say %lld", others[0]->name, (long long)m,
+                    (long long)segment[m], a->name, (long long)r);
   return true;
 }
 
@@ -272,15 +283,17 @@ static bool check_corners(const call *c, const argument *a, int64_t bound, const
     }
     if (wrong)
       return check_index(c, others[0], a->length - 1, none) &&
-             fail(c, PyExc_ValueError, "%s[%lld:%lld] must be the corners of elements at node %lld, ascending", others[1]->name,
-                  (long long)offset[n], (long long)offset[n + 1], (long long)n);
+             fail(c, PyExc_ValueError, "%s[%lld:%lld] must be the corners of elements at node %lld, ascending",
+                  others[1]->name, (long long)offset[n], (long long)offset[n + 1], (long long)n);
   }
   return true;
 }
 
 static const named_check value_checks[] = {
-    {"offsets", check_offsets}, {"index", check_index},       {"permutation", check_permutation}, {"rising", check_rising},
-    {"scenes", check_scenes},   {"segments", check_segments}, {"corners", check_corners},         {NULL, NULL},
+    {"offsets", check_offsets},         {"index", check_index},
+    {"permutation", check_permutation}, {"rising", check_rising},
+    {"scenes", check_scenes},           {"segments", check_segments},
+    {"corners", check_corners},         {NULL, NULL},
 };
 
 /* Puts integers where no other thread can change them (frozen.h): all checks and the kernel read them there. */
@@ -341,7 +354,8 @@ static void bind_absent(call *c, bool of_inputs) {
 
 static bool take(call *c, PyObject *const *objects, Py_ssize_t num) {
   const spec *s = c->spec;
-  if (num != s->num) return PyErr_Format(PyExc_TypeError, "%s takes %d arguments, not %zd", c->name, s->num, num), false;
+  if (num != s->num)
+    return PyErr_Format(PyExc_TypeError, "%s takes %d arguments, not %zd", c->name, s->num, num), false;
   for (int letter = 'A'; letter < LETTERS; letter++) c->size[letter] = UNBOUND;
   c->size[0] = 0;
   for (int i = 0; i < num; i++) {
@@ -359,7 +373,8 @@ static bool take(call *c, PyObject *const *objects, Py_ssize_t num) {
   }
   bind_absent(c, false);
   for (int i = 0; i < num; i++)
-    if (s->parameters[i].num_checks && c->arguments[i].data && !check_values(c, &s->parameters[i], &c->arguments[i])) return false;
+    if (s->parameters[i].num_checks && c->arguments[i].data && !check_values(c, &s->parameters[i], &c->arguments[i]))
+      return false;
   return true;
 }
 
@@ -385,7 +400,8 @@ static bool end(call *c, ast_status status) {
   for (int i = 0; debug && i < c->spec->num; i++) {
     argument *a = &c->arguments[i];
     if (!a->copy) continue;
-    if (ok && memcmp(a->copy, a->data, (size_t)a->bytes)) ok = fail(c, PyExc_AssertionError, "the kernel changed its input %s", a->name);
+    if (ok && memcmp(a->copy, a->data, (size_t)a->bytes))
+      ok = fail(c, PyExc_AssertionError, "the kernel changed its input %s", a->name);
     free(a->copy);
   }
   return ok && (status != AST_NO_MEMORY || (PyErr_NoMemory(), false));

@@ -1,13 +1,15 @@
 /* The public C interface of the ast_sim core: status codes, types and one contract per kernel.
  *
- * Nothing here knows Python, torch or OpenMP. Sizes and indices are int64_t. Float arrays are float32, row major and dense
- * unless a row stride is an argument. Ragged batches are concatenated; `offsets` [B+1] starts at 0, never falls and ends at
- * the number of rows. Inputs are never changed and outputs are written in full. The caller has checked shapes, offsets and
- * index ranges (module.c does it for Python); a kernel checks only what it alone can see, such as a point outside the cube.
+ * Nothing here knows Python, torch or OpenMP. Sizes and indices are int64_t. Float arrays are float32, row major and
+ * dense unless a row stride is an argument. Ragged batches are concatenated; `offsets` [B+1] starts at 0, never falls
+ * and ends at the number of rows. Inputs are never changed and outputs are written in full. The caller has checked
+ * shapes, offsets and index ranges (module.c does it for Python); a kernel checks only what it alone can see, such as a
+ * point outside the cube.
  *
- * Legend: B scenes, N nodes, C cells, T tokens, F channels, C_in and C_out channels of a convolution, D channels of a head of
- * attention, M rows of a dense layer (or edges, of S senders and R receivers), I and O its inputs and outputs. H is the size of
- * what lies between: the hidden units of two layers, the heads of attention. E elements, or channels of an edge.
+ * Legend: B scenes, N nodes, C cells, T tokens, F channels, C_in and C_out channels of a convolution, D channels of a
+ * head of attention, M rows of a dense layer (or edges, of S senders and R receivers), I and O its inputs and outputs.
+ * H is the size of what lies between: the hidden units of two layers, the heads of attention. E elements, or channels
+ * of an edge.
  */
 #ifndef AST_H
 #define AST_H
@@ -29,8 +31,8 @@ typedef struct {
   const int64_t *q_offsets, *k_offsets; /* [B+1] */
   int64_t q_stride, k_stride, v_stride; /* floats from one row of q, k, v to the next, at least H*D */
   float scale;
-  double dropout_p;                        /* weights are dropped with this probability, 0 <= p < 1 */
-  uint64_t seed;                           /* of the counter-based generator: key (seed), counter (scene, head, query, key) */
+  double dropout_p; /* weights are dropped with this probability, 0 <= p < 1 */
+  uint64_t seed;    /* of the counter-based generator: key (seed), counter (scene, head, query, key) */
   int64_t dq_stride, dk_stride, dv_stride; /* the same of the gradients */
 } ast_attention;
 
@@ -45,7 +47,8 @@ typedef struct {
  * E = 0 and H = 0: nothing of the edges. E = F and H = 0: latents, without an encoder. H = 0 allows no other E. */
 typedef struct {
   int64_t M, S, R;
-  int64_t E, H, F, F2; /* channels: edge features, encoder's hidden layer (0 without an encoder), first layer, messages */
+  int64_t E, H, F,
+      F2; /* channels: edge features, encoder's hidden layer (0 without an encoder), first layer, messages */
   const int64_t *senders, *receivers, *receiver_offsets; /* [M], [M] ascending, [R+1] */
   const float *of_senders, *of_receivers;                /* [S,F], [R,F]: their products with the first layer */
   const float *edge_features;                            /* [M,E]: raw, or without an encoder such products, too */
@@ -57,17 +60,20 @@ typedef struct {
 typedef struct {
   float *of_senders, *of_receivers, *edge_features, *A1, *a1, *A2, *W2, *b2, *gamma, *beta;
 } ast_message_gradients;
-/* What follows the product of a linear layer: nothing, max(0, z), or a . gelu(b) for z = [a, b], a and b of half the columns. */
+/* What follows the product of a linear layer: nothing, max(0, z), or a . gelu(b) for z = [a, b], a and b of half the
+ * columns. */
 typedef enum { AST_IDENTITY = 0, AST_RELU, AST_GEGLU } ast_activation;
 
-/* The sizes of a linear layer on x [M,I] with weight [O,I]: z = x W^T + bias is [M,O], the output has O columns, or O/2 for GEGLU. */
+/* The sizes of a linear layer on x [M,I] with weight [O,I]: z = x W^T + bias is [M,O], the output has O columns, or O/2
+ * for GEGLU. */
 typedef struct {
   int64_t M, I, O;
   int64_t x_stride, residual_stride, dout_stride; /* floats from row to row */
   ast_activation activation;
 } ast_linear;
 
-/* Two dense layers: h = max(0, [x, beside] weight1^T + bias1), y = h weight2^T + bias2, then LayerNorm if there is a gamma. */
+/* Two dense layers: h = max(0, [x, beside] weight1^T + bias1), y = h weight2^T + bias2, then LayerNorm if there is a
+ * gamma. */
 typedef struct {
   int64_t M, I, I2, H, O;                                        /* beside [M,I2] may be NULL, with I2 = 0 */
   int64_t x_stride, beside_stride, residual_stride, dout_stride; /* floats from row to row */
@@ -76,7 +82,8 @@ typedef struct {
   const float *gamma, *beta;                      /* [O], both or none NULL */
 } ast_mlp;
 
-/* What the forward pass may keep for the backward pass: h [M,H], y normalized [M,O] and its factors [M], each NULL if it is not. */
+/* What the forward pass may keep for the backward pass: h [M,H], y normalized [M,O] and its factors [M], each NULL if
+ * it is not. */
 typedef struct {
   float *hidden, *normalized, *scale;
 } ast_mlp_kept;
@@ -85,7 +92,8 @@ typedef struct {
 typedef struct {
   float *x, *beside, *weight1, *bias1, *weight2, *bias2, *gamma, *beta;
 } ast_mlp_gradients;
-/* Tetrahedra of a St. Venant-Kirchhoff material. node_order holds the numbers 4 e + corner, by the node at that corner, then ascending. */
+/* Tetrahedra of a St. Venant-Kirchhoff material. node_order holds the numbers 4 e + corner, by the node at that corner,
+ * then ascending. */
 typedef struct {
   int64_t N, E;                                        /* nodes, elements */
   const int64_t *elements, *node_order, *node_offsets; /* [E,4], [4E], [N+1]: the corners at node n */
@@ -96,13 +104,13 @@ typedef struct {
 /* A level of an octree and how it follows from the next finer one. It lies in scratch memory of the calling thread: the
  * caller of octree_coarsen sets a mark before, and releases it when the levels are written out. */
 typedef struct {
-  int64_t C, C_fine, B;     /* cells of this level and of the finer one, scenes */
-  int64_t *keys, *offsets;  /* [C], [B+1] as in octree_build */
-  int64_t *families;        /* [C+1]: first child << 8 | set of the octants 4x+2y+z of all children */
-  uint8_t *near;            /* [C]: whether the scene has a cell at P - (i,j,k) for any (i,j,k) of 0 and 1 but (0,0,0) */
-  int32_t (*before)[8];     /* [C,8]: where it has, those cells by 4i+2j+k, or -1 */
-  uint64_t *others;         /* [C]: the fine cells that pair with P and are no children of it, as bits 8 (4i+2j+k) + octant */
-  int64_t *pairs;           /* where the pairs of each chunk go; of octree_write_level alone */
+  int64_t C, C_fine, B;    /* cells of this level and of the finer one, scenes */
+  int64_t *keys, *offsets; /* [C], [B+1] as in octree_build */
+  int64_t *families;       /* [C+1]: first child << 8 | set of the octants 4x+2y+z of all children */
+  uint8_t *near;           /* [C]: whether the scene has a cell at P - (i,j,k) for any (i,j,k) of 0 and 1 but (0,0,0) */
+  int32_t (*before)[8];    /* [C,8]: where it has, those cells by 4i+2j+k, or -1 */
+  uint64_t *others; /* [C]: the fine cells that pair with P and are no children of it, as bits 8 (4i+2j+k) + octant */
+  int64_t *pairs;   /* where the pairs of each chunk go; of octree_write_level alone */
   int64_t pair_offsets[28]; /* of the pairs with the finer level, by kernel offset */
 } ast_octree_level;
 
@@ -113,58 +121,64 @@ typedef struct {
 
   /* out[c] = sum (or mean) of x[node_order[j]] for node_offsets[c] <= j < node_offsets[c+1], in that order; 0 if empty.
    * x [N,F], node_order [node_offsets[C]], out [C,F]. */
-  ast_status (*segment_sum)(const float *restrict x, int64_t F, const int64_t *restrict node_order, const int64_t *restrict node_offsets,
-                            int64_t C, bool mean, float *restrict out);
-  /* The adjoint: dx[node_order[j]] = dout[c] (over the number of rows of c if mean). node_order is a permutation of 0..N-1. */
+  ast_status (*segment_sum)(const float *restrict x, int64_t F, const int64_t *restrict node_order,
+                            const int64_t *restrict node_offsets, int64_t C, bool mean, float *restrict out);
+  /* The adjoint: dx[node_order[j]] = dout[c] (over the number of rows of c if mean). node_order is a permutation of
+   * 0..N-1. */
   ast_status (*segment_spread)(const float *restrict dout, int64_t F, const int64_t *restrict node_order,
                                const int64_t *restrict node_offsets, int64_t C, bool mean, float *restrict dx);
 
   /* Cells of `positions` [N,3] in the cube center +- half_width cut into 2^depth parts per axis, 0 <= depth <= 21.
    * Index per axis: floor((p - center + half_width) / (2 half_width) * 2^depth) in double, clamped to [0, 2^depth - 1];
-   * Morton key with x as the most significant axis. Capacity: keys [N], node_offsets [N+1]; cells in use: cell_offsets[B].
-   * node_order is stable: by scene, key, node. On AST_NOT_FINITE and AST_OUTSIDE (beyond 1e-6 of the width of the cube)
-   * *bad_node is the first such node. */
-  ast_status (*octree_build)(const float *restrict positions, const int64_t *restrict offsets, int64_t B, const double center[3],
-                             double half_width, int depth, int64_t *restrict keys, int64_t *restrict cell_offsets,
-                             int64_t *restrict node_cell, int64_t *restrict node_order, int64_t *restrict node_offsets, int64_t *bad_node);
+   * Morton key with x as the most significant axis. Capacity: keys [N], node_offsets [N+1]; cells in use:
+   * cell_offsets[B]. node_order is stable: by scene, key, node. On AST_NOT_FINITE and AST_OUTSIDE (beyond 1e-6 of the
+   * width of the cube) *bad_node is the first such node. */
+  ast_status (*octree_build)(const float *restrict positions, const int64_t *restrict offsets, int64_t B,
+                             const double center[3], double half_width, int depth, int64_t *restrict keys,
+                             int64_t *restrict cell_offsets, int64_t *restrict node_cell, int64_t *restrict node_order,
+                             int64_t *restrict node_offsets, int64_t *bad_node);
   /* coordinates [C,3]: x, y and z of each cell, 0..2^21 - 1. */
   ast_status (*octree_coordinates)(const int64_t *restrict keys, int64_t C, int32_t *restrict coordinates);
-  /* The next `levels` <= 21 coarser levels of cells keys [C] (ascending within a scene), finest first, and the number of pairs
-   * (fine, coarse) with fine = 2 P + (a,b,c) of each, grouped by kernel offset 9(a+1) + 3(b+1) + (c+1). */
+  /* The next `levels` <= 21 coarser levels of cells keys [C] (ascending within a scene), finest first, and the number
+   * of pairs (fine, coarse) with fine = 2 P + (a,b,c) of each, grouped by kernel offset 9(a+1) + 3(b+1) + (c+1). */
   ast_status (*octree_coarsen)(const int64_t *restrict keys, const int64_t *restrict offsets, int64_t B, int levels,
                                ast_octree_level *restrict level);
-  /* Writes a level out: keys [C], offsets [B+1], first_child [C+1], node_cell [C_fine] (the parent of each finer cell), and the pairs
-   * twice: (fine, coarse) with coarse rising within each group, and (fine_by_fine, coarse_by_fine) with fine rising within each group,
-   * each array [pair_offsets[27]]. */
+  /* Writes a level out: keys [C], offsets [B+1], first_child [C+1], node_cell [C_fine] (the parent of each finer cell),
+   * and the pairs twice: (fine, coarse) with coarse rising within each group, and (fine_by_fine, coarse_by_fine) with
+   * fine rising within each group, each array [pair_offsets[27]]. */
   ast_status (*octree_write_level)(const ast_octree_level *level, int64_t *restrict keys, int64_t *restrict offsets,
                                    int64_t *restrict first_child, int64_t *restrict node_cell, int64_t *restrict fine,
-                                   int64_t *restrict coarse, int64_t *restrict fine_by_fine, int64_t *restrict coarse_by_fine);
+                                   int64_t *restrict coarse, int64_t *restrict fine_by_fine,
+                                   int64_t *restrict coarse_by_fine);
 
   /* Exact greedy farthest point sampling of coordinates [C,3], per scene min(num, C_b) indices (into the
-   * whole array) from out_offsets[b] on: the first is the scene's first point, ties go to the lowest index, and once all
-   * distances are 0 the lowest unused index follows. A scene with at most `num` points gives all of them, ascending.
-   * AST_OUTSIDE if two coordinates of a scene differ by 2^21 or more. */
-  ast_status (*farthest_point_sample)(const int32_t *restrict coordinates, const int64_t *restrict offsets, int64_t B, int64_t num,
-                                      const int64_t *restrict out_offsets, int64_t *restrict indices);
+   * whole array) from out_offsets[b] on: the first is the scene's first point, ties go to the lowest index, and once
+   * all distances are 0 the lowest unused index follows. A scene with at most `num` points gives all of them,
+   * ascending. AST_OUTSIDE if two coordinates of a scene differ by 2^21 or more. */
+  ast_status (*farthest_point_sample)(const int32_t *restrict coordinates, const int64_t *restrict offsets, int64_t B,
+                                      int64_t num, const int64_t *restrict out_offsets, int64_t *restrict indices);
 
-  /* out = bias, then out[destination] += x[source] W_k over all pairs of group k, groups in ascending order. weight [27,C_in,C_out];
-   * with `transposed` weight [27,C_out,C_in] is used as W_k^T. x [*,C_in], bias [C_out] or NULL for 0, out [num_out,C_out]. */
-  ast_status (*sparse_conv)(const float *restrict x, const float *restrict weight, const float *restrict bias, int64_t C_in, int64_t C_out,
-                            bool transposed, ast_pairs pairs, int64_t num_out, float *restrict out);
+  /* out = bias, then out[destination] += x[source] W_k over all pairs of group k, groups in ascending order. weight
+   * [27,C_in,C_out]; with `transposed` weight [27,C_out,C_in] is used as W_k^T. x [*,C_in], bias [C_out] or NULL for 0,
+   * out [num_out,C_out]. */
+  ast_status (*sparse_conv)(const float *restrict x, const float *restrict weight, const float *restrict bias,
+                            int64_t C_in, int64_t C_out, bool transposed, ast_pairs pairs, int64_t num_out,
+                            float *restrict out);
   /* dweight[k] = sum over the pairs of group k of x[source]^T dout[destination]. dweight [27,C_in,C_out]. */
-  ast_status (*sparse_conv_weight)(const float *restrict x, const float *restrict dout, int64_t C_in, int64_t C_out, ast_pairs pairs,
-                                   float *restrict dweight);
+  ast_status (*sparse_conv_weight)(const float *restrict x, const float *restrict dout, int64_t C_in, int64_t C_out,
+                                   ast_pairs pairs, float *restrict dweight);
 
-  /* out[q,h] = sum_k P[q,h,k] v[k,h], P = dropout(softmax_k(x)) of the scores x = scale q[q,h] . k[k,h]; maximum = max_k x and
-   * sum = sum_k exp(x - maximum), so that log sum exp is maximum + log(sum). q [Tq,H,D], k and v [Tk,H,D], out [Tq,H,D] dense,
-   * maximum and sum [Tq,H]; D is a multiple of 16, at most 128. Without keys: out 0, maximum -inf, sum 0. A row with a NaN or
-   * +inf score, or with only -inf, is NaN in all outputs. */
-  ast_status (*attention)(const ast_attention *s, const float *restrict q, const float *restrict k, const float *restrict v,
-                          float *restrict out, float *restrict maximum, float *restrict sum);
+  /* out[q,h] = sum_k P[q,h,k] v[k,h], P = dropout(softmax_k(x)) of the scores x = scale q[q,h] . k[k,h]; maximum =
+   * max_k x and sum = sum_k exp(x - maximum), so that log sum exp is maximum + log(sum). q [Tq,H,D], k and v [Tk,H,D],
+   * out [Tq,H,D] dense, maximum and sum [Tq,H]; D is a multiple of 16, at most 128. Without keys: out 0, maximum -inf,
+   * sum 0. A row with a NaN or +inf score, or with only -inf, is NaN in all outputs. */
+  ast_status (*attention)(const ast_attention *s, const float *restrict q, const float *restrict k,
+                          const float *restrict v, float *restrict out, float *restrict maximum, float *restrict sum);
   /* Its gradients, P recomputed from maximum and sum. dq [Tq,H,D], dk and dv [Tk,H,D]. */
-  ast_status (*attention_backward)(const ast_attention *s, const float *restrict q, const float *restrict k, const float *restrict v,
-                                   const float *restrict out, const float *restrict maximum, const float *restrict sum,
-                                   const float *restrict dout, float *restrict dq, float *restrict dk, float *restrict dv);
+  ast_status (*attention_backward)(const ast_attention *s, const float *restrict q, const float *restrict k,
+                                   const float *restrict v, const float *restrict out, const float *restrict maximum,
+                                   const float *restrict sum, const float *restrict dout, float *restrict dq,
+                                   float *restrict dk, float *restrict dv);
 
   /* sum[r] = sum over the edges m into r, in stored order, of messages[m] = LN(W2 relu(z_m) + b2; gamma, beta), where
    * z_m = of_senders[s] + of_receivers[r] + A2 relu(A1 e_m + a1), or + e_m without an encoder; 0 without edges.
@@ -173,26 +187,30 @@ typedef struct {
   /* Its gradients, layers recomputed. dsum [R,F2], dmessages [M,F2] or NULL. */
   ast_status (*message_backward)(const ast_message *s, const float *restrict dsum, const float *restrict dmessages,
                                  const ast_message_gradients *out);
-  /* out = act(z) + residual with z = x W^T + bias; bias [O] and residual may be NULL, and so z [M,O], if it is not wanted. */
-  ast_status (*linear)(const ast_linear *s, const float *restrict x, const float *restrict weight, const float *restrict bias,
-                       const float *restrict residual, float *restrict out, float *restrict z);
-  /* Its gradients dx [M,I], dweight [O,I] and dbias [O], each NULL if it is not wanted. z is recomputed if it is NULL; for ReLU
-   * max(0, z) will do. */
-  ast_status (*linear_backward)(const ast_linear *s, const float *restrict dout, const float *restrict x, const float *restrict weight,
-                                const float *restrict bias, const float *restrict z, float *restrict dx, float *restrict dweight,
-                                float *restrict dbias);
-  /* force [N,3] = -dE/dposition of the energy E = sum_e V (lambda/2 tr(G)^2 + mu G:G), G = (F^T F - I) / 2, added at each node in the
-   * order of node_order. An element contributes exactly nothing, whatever its positions, if its Lame constants are both 0, a rest
-   * position is not finite, or its rest volume is no more than rounding. */
+  /* out = act(z) + residual with z = x W^T + bias; bias [O] and residual may be NULL, and so z [M,O], if it is not
+   * wanted. */
+  ast_status (*linear)(const ast_linear *s, const float *restrict x, const float *restrict weight,
+                       const float *restrict bias, const float *restrict residual, float *restrict out,
+                       float *restrict z);
+  /* Its gradients dx [M,I], dweight [O,I] and dbias [O], each NULL if it is not wanted. z is recomputed if it is NULL;
+   * for ReLU max(0, z) will do. */
+  ast_status (*linear_backward)(const ast_linear *s, const float *restrict dout, const float *restrict x,
+                                const float *restrict weight, const float *restrict bias, const float *restrict z,
+                                float *restrict dx, float *restrict dweight, float *restrict dbias);
+  /* force [N,3] = -dE/dposition of the energy E = sum_e V (lambda/2 tr(G)^2 + mu G:G), G = (F^T F - I) / 2, added at
+   * each node in the order of node_order. An element contributes exactly nothing, whatever its positions, if its Lame
+   * constants are both 0, a rest position is not finite, or its rest volume is no more than rounding. */
   ast_status (*elastic_forces)(const ast_elastic *s, float *restrict force);
   /* dposition [N,3] = (dforce/dposition) dforce, whose matrix is symmetric: the gradient. */
   ast_status (*elastic_forces_backward)(const ast_elastic *s, const float *restrict dforce, float *restrict dposition);
-  /* out[f] = sum of x[n,f] over n, rows in blocks whose sums are added in order: the gradient of a bias. x [N,F], out [F]. */
+  /* out[f] = sum of x[n,f] over n, rows in blocks whose sums are added in order: the gradient of a bias. x [N,F], out
+   * [F]. */
   ast_status (*column_sum)(const float *restrict x, int64_t N, int64_t F, float *restrict out);
   /* out [M,O] = y, or LayerNorm(y), + residual, which may be NULL. */
   ast_status (*mlp)(const ast_mlp *s, const float *restrict residual, float *restrict out, ast_mlp_kept kept);
   /* Its gradients; what was not kept is computed again. */
-  ast_status (*mlp_backward)(const ast_mlp *s, const float *restrict dout, ast_mlp_kept kept, ast_mlp_gradients gradients);
+  ast_status (*mlp_backward)(const ast_mlp *s, const float *restrict dout, ast_mlp_kept kept,
+                             ast_mlp_gradients gradients);
 } ast_kernels;
 
 /* Every kernel of the table. */
@@ -224,27 +242,30 @@ const ast_kernels *ast_select(const char *name);
 /* The table of the i-th of the instruction sets that are supported, the best one first; NULL beyond the last. */
 const ast_kernels *ast_supported(int i);
 
-/* parallel.c: runs task(i, context) for 0 <= i < tasks, on the threads of the pool if one was set, and returns the first
- * status by index that is not AST_OK. Tasks are handed out dynamically: a task must depend on its index alone. */
+/* parallel.c: runs task(i, context) for 0 <= i < tasks, on the threads of the pool if one was set, and returns the
+ * first status by index that is not AST_OK. Tasks are handed out dynamically: a task must depend on its index alone. */
 typedef ast_status (*ast_task)(int64_t index, void *context);
 ast_status ast_parallel(int64_t tasks, ast_task task, void *context);
 /* The pool: torch's own (torch_parallel_for, torch_get_num_threads), handed over as pointers; NULL means serial. */
-typedef int32_t (*ast_parallel_for)(int64_t begin, int64_t end, int64_t grain, void (*body)(int64_t, int64_t, void *), void *context);
+typedef int32_t (*ast_parallel_for)(int64_t begin, int64_t end, int64_t grain, void (*body)(int64_t, int64_t, void *),
+                                    void *context);
 typedef int32_t (*ast_num_threads)(uint32_t *num);
 void ast_set_pool(ast_parallel_for parallel_for, ast_num_threads num_threads);
 int64_t ast_threads(void);
 
-/* memory.c: scratch memory of the calling thread, 64-byte aligned, kept between calls; NULL if memory is out. It is good until a
- * mark from before it is released: marks nest. ast_parallel releases what a task took. */
+/* memory.c: scratch memory of the calling thread, 64-byte aligned, kept between calls; NULL if memory is out. It is
+ * good until a mark from before it is released: marks nest. ast_parallel releases what a task took. */
 void *ast_scratch(int64_t bytes);
 void *ast_scratch_mark(void);
 void ast_scratch_release(void *mark);
 /* What a block of C takes from here on is released where the block is left. */
 #define AST_SCRATCH_SCOPE          AST_SCRATCH_SCOPE_AT(__LINE__)
 #define AST_SCRATCH_SCOPE_AT(line) AST_SCRATCH_SCOPE_OF(line)
-#define AST_SCRATCH_SCOPE_OF(line) __attribute__((cleanup(ast_scratch_leave), unused)) void *const scratch_mark_##line = ast_scratch_mark()
+#define AST_SCRATCH_SCOPE_OF(line) \
+  __attribute__((cleanup(ast_scratch_leave), unused)) void *const scratch_mark_##line = ast_scratch_mark()
 static inline void ast_scratch_leave(void *const *mark) { ast_scratch_release(*mark); }
-/* Lets the C library keep large freed blocks (glibc): fresh pages cost more than the arithmetic. True if it had an effect. */
+/* Lets the C library keep large freed blocks (glibc): fresh pages cost more than the arithmetic. True if it had an
+ * effect. */
 bool ast_keep_memory(void);
 
 #endif

@@ -1,15 +1,17 @@
 /* Attention: out = dropout(softmax(scale Q K^T)) V for each scene and head, without a Tq x Tk array.
  *
- * Keys come in blocks. With x_j the scores of one query against a block, m their running maximum and l their running sum,
- *   m' = max(m, max_j x_j),  p_j = exp(x_j - m'),  l' = l exp(m - m') + sum_j p_j,  o' = o exp(m - m') + sum_j p_j v_j,
- * and out = o / l at the end. The weights carry a factor 2^-shift with 2^shift >= Tk, so l <= 1 and |o| <= max |v|: nothing
- * overflows that the result would not. A row with a NaN or +inf score, or with nothing but -inf, is NaN, as x - max says.
+ * Keys come in blocks. With x_j the scores of one query against a block, m their running maximum and l their running
+ * sum, m' = max(m, max_j x_j),  p_j = exp(x_j - m'),  l' = l exp(m - m') + sum_j p_j,  o' = o exp(m - m') + sum_j p_j
+ * v_j, and out = o / l at the end. The weights carry a factor 2^-shift with 2^shift >= Tk, so l <= 1 and |o| <= max
+ * |v|: nothing overflows that the result would not. A row with a NaN or +inf score, or with nothing but -inf, is NaN,
+ * as x - max says.
  *
- * A task is one scene and head, QUERIES queries and one part of the keys. Only a scene of few tasks and many keys has more than
- * one part; its parts leave (m, l, o), merged in their order by the same formula. All sizes depend on the scene's own numbers of
- * queries, keys and heads, so a result depends on neither threads nor batch.
+ * A task is one scene and head, QUERIES queries and one part of the keys. Only a scene of few tasks and many keys has
+ * more than one part; its parts leave (m, l, o), merged in their order by the same formula. All sizes depend on the
+ * scene's own numbers of queries, keys and heads, so a result depends on neither threads nor batch.
  *
- * Cost: 4 Tq Tk D flops a head in two products, and some 15 vector operations (26 with dropout) a vector of scores between them.
+ * Cost: 4 Tq Tk D flops a head in two products, and some 15 vector operations (26 with dropout) a vector of scores
+ * between them.
  */
 #include "ast.h"
 #include "attention_tiles.h"
@@ -20,7 +22,8 @@ enum {
   PARTED_TASKS = 16, /* a scene with fewer tasks is cut over its keys as well, */
   PART_KEYS = 1024,  /* into parts of at least so many */
 };
-_Static_assert(QUERIES % LANES == 0 && (int)KEYS == DROPOUT_KEYS, "tasks hold whole panels, blocks one group of the dropout");
+_Static_assert(QUERIES % LANES == 0 && (int)KEYS == DROPOUT_KEYS,
+               "tasks hold whole panels, blocks one group of the dropout");
 
 typedef struct {
   int64_t chunks, parts, part_keys;               /* of queries; of keys; keys of a part */
@@ -69,7 +72,8 @@ AST_INLINE void weights(float *x, int64_t n, const vf base[2], int32_t shift, vf
 }
 
 /* The same, with those weights that are dropped 0; the sums are of all. */
-AST_INLINE void dropped_weights(float *x, int64_t n, const vf base[2], int32_t shift, const dropout *d, dropout_words words[2], vf sum[2]) {
+AST_INLINE void dropped_weights(float *x, int64_t n, const vf base[2], int32_t shift, const dropout *d,
+                                dropout_words words[2], vf sum[2]) {
   const vu threshold = (vu){0} + (d->threshold << 16);
 #pragma GCC unroll 8
   for (int slot = 0; slot < DROPOUT_SLOTS; slot++)
@@ -84,8 +88,8 @@ AST_INLINE void dropped_weights(float *x, int64_t n, const vf base[2], int32_t s
 }
 
 /* Takes n keys, k0 the first of them in the scene, into the state of a panel, the queries i0..i0+rows of the task. */
-static void forward_panel(forward_scratch *t, const forward_state *state, int64_t i0, int64_t rows, int64_t query, int64_t k0, int64_t n,
-                          int64_t D, int32_t shift, bool first, const dropout *d) {
+static void forward_panel(forward_scratch *t, const forward_state *state, int64_t i0, int64_t rows, int64_t query,
+                          int64_t k0, int64_t n, int64_t D, int32_t shift, bool first, const dropout *d) {
   float *m = state->maximum + i0, *l = state->sum + i0, fade[LANES];
   const float *queries = t->queries + i0 * D;
   vf largest[2] = {vsplat(-INFINITY), vsplat(-INFINITY)}, base[2], sum[2] = {{0}};
@@ -181,7 +185,8 @@ static ast_status forward_task(int64_t index, void *context) {
   const dropout d = dropout_of(s, task.b, h);
   const int64_t panels = (rows + LANES - 1) / LANES, share = (KEYS + panels - 1) / panels;
   for (int64_t p = 0; p < panels; p++)
-    pack_panel(job->q + (q0 + p * LANES) * s->q_stride + h * D, s->q_stride, rows - p * LANES, D, s->scale, t->queries + p * LANES * D);
+    pack_panel(job->q + (q0 + p * LANES) * s->q_stride + h * D, s->q_stride, rows - p * LANES, D, s->scale,
+               t->queries + p * LANES * D);
   fill_rows(0, 0, 1, panels * LANES, state.sum);
   fill_rows(-INFINITY, 0, 1, panels * LANES, state.maximum);
   for (int64_t k0 = 0; k0 < task.keys; k0 += KEYS) {
@@ -193,8 +198,8 @@ static ast_status forward_task(int64_t index, void *context) {
       const int64_t next = KEYS + p * share, ahead = min64(share, task.keys - k0 - next);
       prefetch_rows(k + next * s->k_stride, s->k_stride, ahead, D, 0);
       prefetch_rows(v + next * s->v_stride, s->v_stride, ahead, D, 0);
-      forward_panel(t, &state, p * LANES, min64(LANES, rows - p * LANES), task.first_query + p * LANES, task.first_key + k0, n, D,
-                    task.shift, k0 == 0, &d);
+      forward_panel(t, &state, p * LANES, min64(LANES, rows - p * LANES), task.first_query + p * LANES,
+                    task.first_key + k0, n, D, task.shift, k0 == 0, &d);
     }
   }
   if (whole) finish(job, &task, &state);
@@ -228,8 +233,9 @@ static ast_status merge_task(int64_t index, void *context) {
   return AST_OK;
 }
 
-static ast_status attention(const ast_attention *s, const float *restrict q, const float *restrict k, const float *restrict v,
-                            float *restrict out, float *restrict maximum, float *restrict sum) {
+static ast_status attention(const ast_attention *s, const float *restrict q, const float *restrict k,
+                            const float *restrict v, float *restrict out, float *restrict maximum,
+                            float *restrict sum) {
   AST_SCRATCH_SCOPE;
   forward_cut *cuts = ast_scratch((s->B + 1) * (int64_t)sizeof *cuts), next = {0};
   if (!cuts) return AST_NO_MEMORY;

@@ -2,18 +2,19 @@
  *
  * With y = dout, P the weights, Z the dropout factors (0 or 1/keep) and . the product by elements,
  *   dV = (P . Z)^T y,   dS = P . (Z . (y V^T) - rowsum(y . out)),   dQ = scale dS K,   dK = scale dS^T Q.
- * P is recomputed as exp(x - m) / l; the log sum exp in one float would be off by 5e-4 where it is 1e4. Where one weight is 1 and the
- * others vanish, dS is exactly 0: both terms are rounded alike. Where one key takes nearly all the weight of a query, its dS is a small
- * difference of large terms; but a row of dS sums to 0. So that key is noted, and what its row sums to is at the end taken off its dS.
+ * P is recomputed as exp(x - m) / l; the log sum exp in one float would be off by 5e-4 where it is 1e4. Where one
+ * weight is 1 and the others vanish, dS is exactly 0: both terms are rounded alike. Where one key takes nearly all the
+ * weight of a query, its dS is a small difference of large terms; but a row of dS sums to 0. So that key is noted, and
+ * what its row sums to is at the end taken off its dS.
  *
- * A task takes a chunk of queries against all blocks of keys, then the next chunk: each score is computed once and dQ, dK and dV
- * grow in the second cache. Scores have keys across the lanes: no row is summed here, and so panels are needed of a block of keys
- * only, not of the chunk, whose arrays would not fit with them. A scene of few tasks is cut over its longer side; each part but the first
- * leaves its share of the gradient of the shorter side, added in the order of the parts. All sizes depend on the scene's own, as in the
- * forward pass.
+ * A task takes a chunk of queries against all blocks of keys, then the next chunk: each score is computed once and dQ,
+ * dK and dV grow in the second cache. Scores have keys across the lanes: no row is summed here, and so panels are
+ * needed of a block of keys only, not of the chunk, whose arrays would not fit with them. A scene of few tasks is cut
+ * over its longer side; each part but the first leaves its share of the gradient of the shorter side, added in the
+ * order of the parts. All sizes depend on the scene's own, as in the forward pass.
  *
- * Cost: 10 Tq Tk D flops a head in five products. Memory: at most 2 BACKWARD_TASKS D floats for each row of the shorter side,
- * and a peak for each query, head and part of the keys.
+ * Cost: 10 Tq Tk D flops a head in five products. Memory: at most 2 BACKWARD_TASKS D floats for each row of the shorter
+ * side, and a peak for each query, head and part of the keys.
  */
 #include "ast.h"
 #include "attention_tiles.h"
@@ -26,14 +27,17 @@ enum {
   BACKWARD_TASKS = 16, /* a scene with fewer tasks is cut */
   BACKWARD_PART = 512, /* into parts of at least so many keys or queries */
 };
-_Static_assert(CHUNK % SQUARE == 0 && GROUP % (int)GEMM_ROWS == 0 && KEYS % (int)LANES == 0, "chunks hold whole squares, groups tiles");
+_Static_assert(CHUNK % SQUARE == 0 && GROUP % (int)GEMM_ROWS == 0 && KEYS % (int)LANES == 0,
+               "chunks hold whole squares, groups tiles");
 
 typedef struct {
-  int64_t parts, part_rows;                      /* rows of a part: queries if there are more of them than keys, else keys */
-  int64_t first_task, first_partial, first_peak; /* tasks, floats of the partial gradients and peaks before this scene */
+  int64_t parts, part_rows; /* rows of a part: queries if there are more of them than keys, else keys */
+  int64_t first_task, first_partial,
+      first_peak; /* tasks, floats of the partial gradients and peaks before this scene */
 } backward_cut;
 
-/* Of a query whose weights are nearly all of one key: that key of the scene, or -1 if it is in no block so far, and the sum of dS. */
+/* Of a query whose weights are nearly all of one key: that key of the scene, or -1 if it is in no block so far, and the
+ * sum of dS. */
 typedef struct {
   int64_t key;
   float sum;
@@ -53,7 +57,8 @@ typedef struct {
 } backward_job;
 
 typedef struct {
-  float keys[KEYS * ROW], key_panels[KEYS * MAX_D], value_panels[KEYS * MAX_D]; /* K by rows and in panels, gain V in panels */
+  float keys[KEYS * ROW], key_panels[KEYS * MAX_D],
+      value_panels[KEYS * MAX_D]; /* K by rows and in panels, gain V in panels */
   float dk[KEYS * ROW], dv[KEYS * ROW];
   float weights[SQUARE * ROW], dscores[SQUARE * ROW];             /* P . keep and dS as [query][key] */
   float queries[CHUNK * ROW], dout[CHUNK * ROW], dq[CHUNK * ROW]; /* scale Q, y and dQ / scale */
@@ -72,7 +77,8 @@ typedef struct {
 
 /* ---- a square of queries against a block of keys ---- */
 
-/* Score x and gain y V^T become P . keep and dS. Words NULL: all are kept; so are those of a row that is NaN, as 0 NaN is NaN. */
+/* Score x and gain y V^T become P . keep and dS. Words NULL: all are kept; so are those of a row that is NaN, as 0 NaN
+ * is NaN. */
 AST_INLINE void gradient(float *x, float *dx, vf maximum, vf share, vf delta, const vu *words, int slot, vu threshold) {
   const vf p = share * vexp(vload(x) - maximum, 0), dp = vload(dx);
   threshold &= (vu)(maximum == maximum);
@@ -97,8 +103,8 @@ static float sum_of(const float *x, int64_t n) {
 }
 
 /* Weights and their gradients of the queries i..i+rows of those in the scratch; k0 the first of n keys of the scene. */
-static void backward_group(backward_scratch *t, int64_t i, int64_t rows, int64_t query, int64_t k0, int64_t n, int64_t D,
-                           const dropout *d) {
+static void backward_group(backward_scratch *t, int64_t i, int64_t rows, int64_t query, int64_t k0, int64_t n,
+                           int64_t D, const dropout *d) {
   float *x = t->weights + i % SQUARE * ROW, *dx = t->dscores + i % SQUARE * ROW;
   const int64_t whole = round_up(rows, ROW_STEP);
   for (int64_t c = 0; c < n; c += LANES) {
@@ -116,7 +122,8 @@ static void backward_group(backward_scratch *t, int64_t i, int64_t rows, int64_t
       const int64_t at = find_peak(x_r, n, t->maximum[i + r]);
       if (at >= 0) peak->key = k0 + at;
     }
-    for (int64_t c = 0; !d->threshold && c < n; c += VW) gradient(x_r + c, dx_r + c, maximum, share, delta, NULL, 0, threshold);
+    for (int64_t c = 0; !d->threshold && c < n; c += VW)
+      gradient(x_r + c, dx_r + c, maximum, share, delta, NULL, 0, threshold);
 #pragma GCC unroll 8
     for (int slot = 0; slot < DROPOUT_SLOTS; slot++) {
       if (!d->threshold || slot * DROPOUT_LANES >= n) break;
@@ -133,10 +140,12 @@ static void backward_group(backward_scratch *t, int64_t i, int64_t rows, int64_t
 /* ---- tasks ---- */
 
 /* The queries first..first+rows of the scene of `range`: rows, m, 1 / l and delta. */
-static void load_queries(const backward_job *job, const backward_range *range, int64_t first, int64_t rows, backward_scratch *t) {
+static void load_queries(const backward_job *job, const backward_range *range, int64_t first, int64_t rows,
+                         backward_scratch *t) {
   const ast_attention *s = job->s;
   const int64_t H = s->H, D = s->D, h = range->h, q0 = s->q_offsets[range->b] + first;
-  const float *q = job->q + q0 * s->q_stride + h * D, *dout = job->dout + (q0 * H + h) * D, *out = job->out + (q0 * H + h) * D;
+  const float *q = job->q + q0 * s->q_stride + h * D, *dout = job->dout + (q0 * H + h) * D,
+              *out = job->out + (q0 * H + h) * D;
   copy_rows(q, s->q_stride, rows, D, s->scale, t->queries);
   copy_rows(dout, H * D, rows, D, 1, t->dout);
   for (int64_t i = 0; i < rows; i += VW) {
@@ -168,9 +177,10 @@ static void put_rows(const float *from, int64_t rows, int64_t D, float factor, b
     }
 }
 
-/* The queries first..first+rows, which the scratch holds, against the block of n keys from k0 on, all counted from the scene's first. */
-static void backward_block(const backward_job *job, const backward_range *range, int64_t first, int64_t rows, int64_t k0, int64_t n,
-                           const dropout *d, backward_scratch *t) {
+/* The queries first..first+rows, which the scratch holds, against the block of n keys from k0 on, all counted from the
+ * scene's first. */
+static void backward_block(const backward_job *job, const backward_range *range, int64_t first, int64_t rows,
+                           int64_t k0, int64_t n, const dropout *d, backward_scratch *t) {
   const ast_attention *s = job->s;
   const int64_t D = s->D, row = s->k_offsets[range->b] + k0, whole = round_up(n, ROW_STEP);
   const float *k = job->k + row * s->k_stride + range->h * D, *v = job->v + row * s->v_stride + range->h * D;
@@ -179,7 +189,8 @@ static void backward_block(const backward_job *job, const backward_range *range,
     pack_panel(t->keys + c * ROW, ROW, n - c, D, 1, t->key_panels + c * D);
     pack_panel(v + c * s->v_stride, s->v_stride, n - c, D, d->gain, t->value_panels + c * D);
   }
-  float *dk = range->dk + (k0 - range->first_key) * range->dk_stride, *dv = range->dv + (k0 - range->first_key) * range->dv_stride;
+  float *dk = range->dk + (k0 - range->first_key) * range->dk_stride,
+        *dv = range->dv + (k0 - range->first_key) * range->dv_stride;
   const int64_t left = range->first_key + range->keys - k0 - KEYS;
   const int64_t groups = (rows + GROUP - 1) / GROUP, share = (KEYS + groups - 1) / groups;
   for (int64_t i0 = 0; i0 < rows; i0 += SQUARE) {
@@ -194,7 +205,8 @@ static void backward_block(const backward_job *job, const backward_range *range,
     }
     columns_product(whole, D, width, t->weights, t->dout + i0 * ROW, t->dv, (update){.set = i0 == 0});
     columns_product(whole, D, width, t->dscores, t->queries + i0 * ROW, t->dk, (update){.set = i0 == 0});
-    rows_product(round_up(width, ROW_STEP), D, n, t->dscores, t->keys, t->dq + i0 * ROW, (update){.set = k0 == range->first_key});
+    rows_product(round_up(width, ROW_STEP), D, n, t->dscores, t->keys, t->dq + i0 * ROW,
+                 (update){.set = k0 == range->first_key});
   }
   put_rows(t->dk, n, D, 1, first > range->first_query, dk, range->dk_stride);
   put_rows(t->dv, n, D, d->gain, first > range->first_query, dv, range->dv_stride);
@@ -222,7 +234,8 @@ static int64_t num_peaks(const ast_attention *s, int64_t b, int64_t parts) {
 }
 
 /* Leaves the peaks of the queries first..first+rows of the scene. */
-static void put_peaks(backward_job *job, const backward_range *range, int64_t first, int64_t rows, const backward_scratch *t) {
+static void put_peaks(backward_job *job, const backward_range *range, int64_t first, int64_t rows,
+                      const backward_scratch *t) {
   backward_peak *to = job->peaks + range->first_peak + first;
   bool any = false;
   for (int64_t i = 0; i < rows; i++) {
@@ -299,7 +312,8 @@ static ast_status backward_task(int64_t index, void *context) {
   for (int64_t i = 0; i < r.queries; i += CHUNK) {
     const int64_t rows = min64(CHUNK, r.queries - i), first = r.first_query + i;
     load_queries(job, &r, first, rows, t);
-    for (int64_t k0 = 0; k0 < r.keys; k0 += KEYS) backward_block(job, &r, first, rows, r.first_key + k0, min64(KEYS, r.keys - k0), &d, t);
+    for (int64_t k0 = 0; k0 < r.keys; k0 += KEYS)
+      backward_block(job, &r, first, rows, r.first_key + k0, min64(KEYS, r.keys - k0), &d, t);
     put_rows(t->dq, rows, D, job->s->scale, false, r.dq + i * r.dq_stride, r.dq_stride);
     put_peaks(job, &r, first, rows, t);
   }
@@ -311,29 +325,33 @@ static ast_status finish_task(int64_t index, void *context) {
   const backward_job *job = context;
   const ast_attention *s = job->s;
   const int64_t H = s->H, D = s->D, b = index / H, h = index % H, size = partial_size(s, b), parts = job->cuts[b].parts;
-  const int64_t q0 = s->q_offsets[b], queries = s->q_offsets[b + 1] - q0, k0 = s->k_offsets[b], keys = s->k_offsets[b + 1] - k0;
+  const int64_t q0 = s->q_offsets[b], queries = s->q_offsets[b + 1] - q0, k0 = s->k_offsets[b],
+                keys = s->k_offsets[b + 1] - k0;
   for (int64_t part = 1; part < parts; part++) {
     const float *partial = job->partials + job->cuts[b].first_partial + (h * (parts - 1) + part - 1) * size;
     for (int64_t i = 0; i < size / D; i++) {
       float *to = queries <= keys ? job->dq + (q0 + i) * s->dq_stride
                   : i < keys      ? job->dk + (k0 + i) * s->dk_stride
                                   : job->dv + (k0 + i - keys) * s->dv_stride;
-      for (int64_t e = h * D; e < h * D + D; e += VW) vstore(to + e, vload(to + e) + vload(partial + i * D + e - h * D));
+      for (int64_t e = h * D; e < h * D + D; e += VW)
+        vstore(to + e, vload(to + e) + vload(partial + i * D + e - h * D));
     }
   }
   if (job->any_peaks) settle_peaks(job, b, h);
   return AST_OK;
 }
 
-static ast_status attention_backward(const ast_attention *s, const float *restrict q, const float *restrict k, const float *restrict v,
-                                     const float *restrict out, const float *restrict maximum, const float *restrict sum,
-                                     const float *restrict dout, float *restrict dq, float *restrict dk, float *restrict dv) {
+static ast_status attention_backward(const ast_attention *s, const float *restrict q, const float *restrict k,
+                                     const float *restrict v, const float *restrict out, const float *restrict maximum,
+                                     const float *restrict sum, const float *restrict dout, float *restrict dq,
+                                     float *restrict dk, float *restrict dv) {
   AST_SCRATCH_SCOPE;
   backward_cut *cuts = ast_scratch((s->B + 1) * (int64_t)sizeof *cuts), next = {0};
   if (!cuts) return AST_NO_MEMORY;
   for (int64_t b = 0; b < s->B; b++) {
     cuts[b] = cut_backward(s, b);
-    cuts[b].first_task = next.first_task, cuts[b].first_partial = next.first_partial, cuts[b].first_peak = next.first_peak;
+    cuts[b].first_task = next.first_task, cuts[b].first_partial = next.first_partial,
+    cuts[b].first_peak = next.first_peak;
     next.first_task += s->H * cuts[b].parts;
     next.first_partial += s->H * (cuts[b].parts - 1) * partial_size(s, b);
     next.first_peak += s->H * num_peaks(s, b, cuts[b].parts);
@@ -343,5 +361,6 @@ static ast_status attention_backward(const ast_attention *s, const float *restri
   if (!peaks || !partials) return AST_NO_MEMORY;
   backward_job job = {s, q, k, v, out, maximum, sum, dout, dq, dk, dv, cuts, partials, peaks, false};
   const ast_status status = ast_parallel(next.first_task, backward_task, &job);
-  return status == AST_OK && (next.first_partial || job.any_peaks) ? ast_parallel(s->B * s->H, finish_task, &job) : status;
+  return status == AST_OK && (next.first_partial || job.any_peaks) ? ast_parallel(s->B * s->H, finish_task, &job)
+                                                                   : status;
 }

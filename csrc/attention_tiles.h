@@ -1,12 +1,14 @@
 /* What attention and its gradient are built of: scores of panels, and products on register tiles.
  *
- * A panel is LANES rows across the lanes: of queries in the forward pass, whose scores are held transposed, x[key][query], so that
- * maximum and sum of a row of the softmax are operations between vectors, never within one; of keys in the backward pass, x[query][key].
- * Every array that a product reads row by row has rows ROW floats apart: a constant, so that a tile needs one pointer for each operand, and
- * no power of two, which would crowd few cache sets. Products add in rising order of the summed index, in every tile alike: a score has the
- * same bits forward and backward. A score is a sum of chains of SCORE_DEPTH products: its error, times its own size, is that of a weight.
+ * A panel is LANES rows across the lanes: of queries in the forward pass, whose scores are held transposed,
+ * x[key][query], so that maximum and sum of a row of the softmax are operations between vectors, never within one; of
+ * keys in the backward pass, x[query][key]. Every array that a product reads row by row has rows ROW floats apart: a
+ * constant, so that a tile needs one pointer for each operand, and no power of two, which would crowd few cache sets.
+ * Products add in rising order of the summed index, in every tile alike: a score has the same bits forward and
+ * backward. A score is a sum of chains of SCORE_DEPTH products: its error, times its own size, is that of a weight.
  *
- * Legend: n keys of a block, D channels of a head; A read by broadcast, B in vectors, C in GEMM_ROWS x 2 vectors of registers.
+ * Legend: n keys of a block, D channels of a head; A read by broadcast, B in vectors, C in GEMM_ROWS x 2 vectors of
+ * registers.
  */
 #ifndef AST_ATTENTION_TILES_H
 #define AST_ATTENTION_TILES_H
@@ -20,7 +22,7 @@ enum {
   KEYS = 128,           /* keys of a block: its scores against a panel of queries stay in the first cache */
   MAX_D = 128,          /* channels of a head */
   ROW = MAX_D + 16,     /* floats from row to row */
-  SCORE_DEPTH = 32,     /* products of one chain of a score at most: their rounding errors grow with their number */
+  SCORE_DEPTH = 64,     /* products of one chain of a score at most: their rounding errors grow with their number */
   ROW_STEP = 4,         /* products compute rows in multiples of this: 90 keys cost 92 */
 };
 
@@ -33,7 +35,8 @@ AST_INLINE int64_t next_tile(int64_t rest) {
   return 4;
 }
 
-/* Functions of their own for the tiles of GEMM_ROWS, 8 and 4 rows of `f`: inlined, their loops would compete for registers. */
+/* Functions of their own for the tiles of GEMM_ROWS, 8 and 4 rows of `f`: inlined, their loops would compete for
+ * registers. */
 #define TILE_FUNCTIONS(f, parameters, ...)                                                          \
   static __attribute__((noinline)) void f##_whole parameters { f(GEMM_ROWS, __VA_ARGS__); }         \
   static __attribute__((noinline)) void f##_8 parameters { f(GEMM_ROWS < 8 ? 4 : 8, __VA_ARGS__); } \
@@ -49,8 +52,8 @@ AST_INLINE int64_t next_tile(int64_t rest) {
   }
 
 /* sum_ij = sum_k A_ik b[k b_row + j], j over `vectors` vectors */
-AST_INLINE void tile_product(const int rows, const int vectors, int64_t K, gemm_a a, const float *b, const int64_t b_row,
-                             vf sum[GEMM_ROWS][2]) {
+AST_INLINE void tile_product(const int rows, const int vectors, int64_t K, gemm_a a, const float *b,
+                             const int64_t b_row, vf sum[GEMM_ROWS][2]) {
 #pragma GCC unroll 12
   for (int i = 0; i < rows; i++)
 #pragma GCC unroll 2
@@ -58,9 +61,10 @@ AST_INLINE void tile_product(const int rows, const int vectors, int64_t K, gemm_
   gemm_sums(rows, vectors, K, a, b, b_row, sum);
 }
 
-/* x[row][lane] = (x[row][lane] +) a[row] . b[lane] over D channels for a tile of rows; raises largest[2], unless NULL, to the maximum
- * of x. */
-AST_INLINE void chain_tile(const int rows, const bool add, int64_t i, int64_t D, const float *a, const float *b, float *x, vf *largest) {
+/* x[row][lane] = (x[row][lane] +) a[row] . b[lane] over D channels for a tile of rows; raises largest[2], unless NULL,
+ * to the maximum of x. */
+AST_INLINE void chain_tile(const int rows, const bool add, int64_t i, int64_t D, const float *a, const float *b,
+                           float *x, vf *largest) {
   vf sum[GEMM_ROWS][2];
   tile_product(rows, 2, D, (gemm_a){a + i * ROW, ROW, 1}, b, LANES, sum);
 #pragma GCC unroll 12
@@ -84,12 +88,14 @@ AST_INLINE void chain_tile(const int rows, const bool add, int64_t i, int64_t D,
   AST_INLINE void name(const int rows, int64_t i, int64_t D, const float *a, const float *b, float *x, vf *largest) { \
     chain_tile(rows, add, i, D, a, b, x, largest);                                                                    \
   }                                                                                                                   \
-  TILE_FUNCTIONS(name, (int64_t i, int64_t D, const float *a, const float *b, float *x, vf *largest), i, D, a, b, x, largest)
+  TILE_FUNCTIONS(name, (int64_t i, int64_t D, const float *a, const float *b, float *x, vf *largest), i, D, a, b, x,  \
+                 largest)
 CHAIN_TILE(first_chain, false)
 CHAIN_TILE(next_chain, true)
 #undef CHAIN_TILE
 
-/* x[row][lane] = a[row] . b[lane] for n rows, chain after chain; raises largest[2], unless NULL, to the maximum of x. */
+/* x[row][lane] = a[row] . b[lane] for n rows, chain after chain; raises largest[2], unless NULL, to the maximum of x.
+ */
 static void scores_product(int64_t n, int64_t D, const float *a, const float *b, float *x, vf *largest) {
   EACH_TILE(n, first_chain, min64(D, SCORE_DEPTH), a, b, x, D > SCORE_DEPTH ? NULL : largest)
   for (int64_t d = SCORE_DEPTH; d < D; d += SCORE_DEPTH)
@@ -103,8 +109,8 @@ typedef struct {
 } update;
 
 /* c[i][j] is updated by sum_k a_ik b[k][j], rows of b and c ROW apart */
-AST_INLINE void product_tile(const int rows, int64_t i, const int vectors, int64_t K, const float *a, const int64_t a_row,
-                             const int64_t a_column, const float *b, float *c, update how) {
+AST_INLINE void product_tile(const int rows, int64_t i, const int vectors, int64_t K, const float *a,
+                             const int64_t a_row, const int64_t a_column, const float *b, float *c, update how) {
   vf sum[GEMM_ROWS][2];
   tile_product(rows, vectors, K, (gemm_a){a + i * a_row, a_row, a_column}, b, ROW, sum);
   c += i * ROW;
@@ -143,7 +149,8 @@ PRODUCT_TILE(columns_tile, 2, 1, ROW)
 PRODUCT_TILE(columns_tile_narrow, 1, 1, ROW)
 #undef PRODUCT_TILE
 
-/* C [M,N] is updated by A B with A row by row, and with A given as its transpose; M a multiple of ROW_STEP, N one of VW. */
+/* C [M,N] is updated by A B with A row by row, and with A given as its transpose; M a multiple of ROW_STEP, N one of
+ * VW. */
 static void rows_product(int64_t M, int64_t N, int64_t K, const float *a, const float *b, float *c, update how) {
   int64_t j = 0;
   for (; j + 2 * VW <= N; j += 2 * VW) EACH_TILE(M, rows_tile, K, a, b + j, c + j, how)
@@ -175,11 +182,12 @@ static void pack_panel(const float *from, int64_t stride, int64_t rows, int64_t 
     }
 }
 
-/* to[i] = factor from[i], rows ROW apart, and once more the last of them up to a whole ROW_STEP: a key that comes twice changes
- * no maximum */
+/* to[i] = factor from[i], rows ROW apart, and once more the last of them up to a whole ROW_STEP: a key that comes twice
+ * changes no maximum */
 static void copy_rows(const float *from, int64_t stride, int64_t rows, int64_t D, float factor, float *to) {
   for (int64_t i = 0; i < round_up(rows, ROW_STEP); i++)
-    for (int64_t d = 0; d < D; d += VW) vstore(to + i * ROW + d, factor * vload(from + min64(i, rows - 1) * stride + d));
+    for (int64_t d = 0; d < D; d += VW)
+      vstore(to + i * ROW + d, factor * vload(from + min64(i, rows - 1) * stride + d));
 }
 
 static void fill_rows(float value, int64_t stride, int64_t rows, int64_t D, float *to) {

@@ -1,18 +1,21 @@
 /* The coarser levels of an octree, all at once, and which of their cells are neighbours.
  *
- * Level 0 holds the given cells, level j+1 the parents of those of level j, the root R one cell a scene. Legend: P a cell, o = 4x+2y+z
- * its octant (the low three bits of its key), d = 4i+2j+k a step of 0 or 1 along each axis.
+ * Level 0 holds the given cells, level j+1 the parents of those of level j, the root R one cell a scene. Legend: P a
+ * cell, o = 4x+2y+z its octant (the low three bits of its key), d = 4i+2j+k a step of 0 or 1 along each axis.
  *
- * Cells. Cell i of level 0 starts new cells at levels 1..q, where q is the highest octal digit in which its key differs from the one
- * before it; q = R where a scene starts. Counting each q by chunks tells where the cells of every level go, and one more pass writes them:
- * of its parents cell i is the first child up to level q, and a further child at level q+1.
+ * Cells. Cell i of level 0 starts new cells at levels 1..q, where q is the highest octal digit in which its key differs
+ * from the one before it; q = R where a scene starts. Counting each q by chunks tells where the cells of every level
+ * go, and one more pass writes them: of its parents cell i is the first child up to level q, and a further child at
+ * level q+1.
  *
- * Neighbours, from the root down. Octant o of P, moved by -d, is octant o^d of the cell at -(d & ~o) from P (the axes that borrow). So
- * children find the cells before them among the children of P and of the cells before P, without a search. The children of these eight
- * cells are 64 bits, byte d for the cell at -d; one child's eight neighbours are found in them at once. In a sparse level most cells are
- * passed over: the lone child of a cell without neighbours has none.
+ * Neighbours, from the root down. Octant o of P, moved by -d, is octant o^d of the cell at -(d & ~o) from P (the axes
+ * that borrow). So children find the cells before them among the children of P and of the cells before P, without a
+ * search. The children of these eight cells are 64 bits, byte d for the cell at -d; one child's eight neighbours are
+ * found in them at once. In a sparse level most cells are passed over: the lone child of a cell without neighbours has
+ * none.
  *
- * Cost: a few ns for each cell of each level up to the root. Work is cut into chunks as in octree.c, which holds what the two share.
+ * Cost: a few ns for each cell of each level up to the root. Work is cut into chunks as in octree.c, which holds what
+ * the two share.
  */
 #include "ast.h"
 #include "simd.h"
@@ -89,7 +92,8 @@ static int octree_root(const int64_t *keys, const int64_t *offsets, int64_t B, i
   return root;
 }
 
-/* Turns the counts of the chunks into places: a cell with q starts cells of the levels 1..q. C[j] becomes the cells of level j. */
+/* Turns the counts of the chunks into places: a cell with q starts cells of the levels 1..q. C[j] becomes the cells of
+ * level j. */
 static void octree_places(octree_chunk *chunks, int64_t num, int root, int64_t C[OCTREE_LEVELS]) {
   memset(C, 0, OCTREE_LEVELS * sizeof *C);
   for (int64_t chunk = 0; chunk < num; chunk++) {
@@ -141,7 +145,8 @@ AST_INLINE uint64_t octree_bits_of_bytes(uint64_t x) {
   return (x + (x >> 4)) & 0x0f0f0f0f0f0f0f0f;
 }
 
-/* The octants of the children, 0 if there are none, and the first child: of a cell (byte and item 0) and of the cells before it (d). */
+/* The octants of the children, 0 if there are none, and the first child: of a cell (byte and item 0) and of the cells
+ * before it (d). */
 AST_INLINE uint64_t octree_families_of(const ast_octree_level *level, int64_t P, octree_cells *first) {
   octree_families families = {level->families[P]};
   if (level->near[P])
@@ -150,17 +155,20 @@ AST_INLINE uint64_t octree_families_of(const ast_octree_level *level, int64_t P,
   return (uint64_t)__builtin_convertvector(families, octree_bytes);
 }
 
-/* Places 8d + octant of the pairs of a coarse cell with the children of the cells before it: d is not 0, and the octant has its bits. */
+/* Places 8d + octant of the pairs of a coarse cell with the children of the cells before it: d is not 0, and the octant
+ * has its bits. */
 static const uint64_t octree_pair_places = 0x80c0a0f088ccaa00;
 
 /* The kernel offset of a pair (pairs.c) at place 8d + octant. */
 AST_INLINE int octree_group(int place) {
   const int octant = place & 7, d = place >> 3;
-  return 9 * ((octant >> 2) - 2 * (d >> 2) + 1) + 3 * ((octant >> 1 & 1) - 2 * (d >> 1 & 1) + 1) + (octant & 1) - 2 * (d & 1) + 1;
+  return 9 * ((octant >> 2) - 2 * (d >> 2) + 1) + 3 * ((octant >> 1 & 1) - 2 * (d >> 1 & 1) + 1) + (octant & 1) -
+         2 * (d & 1) + 1;
 }
 
 typedef struct {
-  const ast_octree_level *level, *finer; /* the neighbours at `finer` follow from those at `level`; NULL: no need of them */
+  const ast_octree_level *level,
+      *finer; /* the neighbours at `finer` follow from those at `level`; NULL: no need of them */
   const octree_moves *moves;
 } octree_neighbour_job;
 
@@ -176,7 +184,8 @@ AST_INLINE octree_cells octree_pick(octree_cells x, octree_cells from) {
 #endif
 
 /* The cells before child f of P, whose octant this is. */
-AST_INLINE void octree_settle(const octree_neighbour_job *job, uint64_t families, octree_cells first, int octant, int64_t f) {
+AST_INLINE void octree_settle(const octree_neighbour_job *job, uint64_t families, octree_cells first, int octant,
+                              int64_t f) {
   const octree_moves *m = job->moves;
   const uint64_t moved = (families & m->keep[octant]) * m->copies[octant], found = moved & m->at[octant];
   const octree_bytes earlier = (octree_bytes)octree_bits_of_bytes(moved & m->below[octant]);
@@ -187,7 +196,8 @@ AST_INLINE void octree_settle(const octree_neighbour_job *job, uint64_t families
 }
 
 /* Counts the pairs of a chunk by place, if `count`, and finds the cells before its children, if `settle`. */
-AST_INLINE void octree_neighbours(const octree_neighbour_job *job, int64_t chunk, int64_t places[64], const bool count, const bool settle) {
+AST_INLINE void octree_neighbours(const octree_neighbour_job *job, int64_t chunk, int64_t places[64], const bool count,
+                                  const bool settle) {
   const ast_octree_level *level = job->level;
   for (int64_t P = chunk * OCTREE_CHUNK; P < min64(level->C, (chunk + 1) * OCTREE_CHUNK); P++) {
     unsigned octants = octree_octants(level->families[P]);
@@ -255,7 +265,8 @@ static ast_status octree_all_cells(octree_cells_job *job, ast_octree_level *leve
   ast_parallel(chunks, octree_write_cells_task, job);
   for (int64_t chunk = 1; chunk < chunks; chunk++)
     for (int j = 1; j <= job->root; j++)
-      if (job->chunks[chunk].before[j]) level[j].families[job->chunks[chunk].next[j] - 1] |= job->chunks[chunk].before[j];
+      if (job->chunks[chunk].before[j])
+        level[j].families[job->chunks[chunk].next[j] - 1] |= job->chunks[chunk].before[j];
   for (int j = 1; j <= job->levels; j++) octree_scene_offsets(&level[j], j == 1 ? job->offsets : level[j - 1].offsets);
   return AST_OK;
 }

@@ -1,4 +1,5 @@
-/* Dropout that depends on (seed, scene, head, query, key) alone, so that any cutting of the work drops the same weights.
+/* Dropout that depends on (seed, scene, head, query, key) alone, so that any cutting of the work drops the same
+ * weights.
  *
  * Threefry-4x32 of 12 rounds (Salmon et al., Parallel random numbers: as easy as 1, 2, 3, 2011) under the key
  * (seed, scene, head) turns the counter (16 g + lane, query) into four words, one half word for each of the 8 keys
@@ -55,8 +56,9 @@ AST_INLINE void dropout_draw(const dropout *d, vu counter, vu query, vu words[4]
   for (int i = 0; i < 4; i++) words[i] = x[i];
 }
 
-/* Words are drawn ahead of their use: a loop of nothing else keeps several counters in flight, each of which is a long chain of
- * dependent operations. With queries across the lanes: the words of VW queries and DROPOUT_KEYS keys, as [lane][word]. */
+/* Words are drawn ahead of their use: a loop of nothing else keeps several counters in flight, each of which is a long
+ * chain of dependent operations. With queries across the lanes: the words of VW queries and DROPOUT_KEYS keys, as
+ * [lane][word]. */
 typedef vu dropout_words[DROPOUT_LANES][4];
 
 /* Those of the queries from `query` and the keys from `group` on, a multiple of DROPOUT_KEYS; lanes up to n only. */
@@ -73,12 +75,14 @@ typedef vu dropout_row[DROPOUT_PARTS][4];
 AST_INLINE void dropout_draw_keys(const dropout *d, int64_t query, int64_t group, dropout_row words) {
 #pragma GCC unroll 4
   for (int part = 0; part < DROPOUT_PARTS; part++)
-    dropout_draw(d, (vu)LANE_INDICES + (uint32_t)(group / DROPOUT_SLOTS + part * VW), (vu){0} + (uint32_t)query, words[part]);
+    dropout_draw(d, (vu)LANE_INDICES + (uint32_t)(group / DROPOUT_SLOTS + part * VW), (vu){0} + (uint32_t)query,
+                 words[part]);
 }
 
 /* x where the weight of slot is kept, 0 where it is dropped; threshold in the upper half of the word. */
 AST_INLINE vf dropout_keep(const vu words[4], int slot, vu threshold, vf x) {
-  const vu bits = slot % 2 ? words[slot / 2] : words[slot / 2] << 16; /* the half word on top: what is below it decides nothing */
+  const vu bits =
+      slot % 2 ? words[slot / 2] : words[slot / 2] << 16; /* the half word on top: what is below it decides nothing */
   return (vf)((vi)x & (vi)(bits >= threshold));
 }
 

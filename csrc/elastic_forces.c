@@ -1,6 +1,7 @@
 /* The elastic forces of St. Venant-Kirchhoff tetrahedra, and the product of their Jacobian with a direction.
  *
- * Element e with nodes 0..3 has the rest edges D = [X1 - X0, X2 - X0, X3 - X0] and the edges d = [x1 - x0, x2 - x0, x3 - x0]:
+ * Element e with nodes 0..3 has the rest edges D = [X1 - X0, X2 - X0, X3 - X0] and the edges d = [x1 - x0, x2 - x0, x3
+ * - x0]:
  *
  *   F = d D^-1,  A = (d - D) D^-1 = F - I,  2 G = A + A^T + A^T A = F^T F - I,  S = lambda tr(G) I + 2 mu G
  *   [f1, f2, f3] = -V F S D^-T = -sign(det D) / 6  F S cof(D),  f0 = -(f1 + f2 + f3)          V = |det D| / 6
@@ -9,15 +10,15 @@
  *
  *   2 dG = F^T dF + dF^T F,  dS = lambda tr(dG) I + 2 mu dG,  [df1, df2, df3] = -sign(det D) / 6 (dF S + F dS) cof(D)
  *
- * The energy V (lambda/2 tr(G)^2 + mu G:G) is a polynomial of the positions: forces are finite for any guess, also for one turned inside
- * out. f = -dE/dx, so its Jacobian is symmetric: the product with dforce is the gradient dposition.
+ * The energy V (lambda/2 tr(G)^2 + mu G:G) is a polynomial of the positions: forces are finite for any guess, also for
+ * one turned inside out. f = -dE/dx, so its Jacobian is symmetric: the product with dforce is the gradient dposition.
  *
  * A instead of F - I: at rest the forces are exactly 0, and near it they do not drown in the rounding of 1.
  *
- * N nodes, E elements. About 350 operations an element forward, 80 of them in double, and 530 in a direction, on 4 x 24 bytes of
- * coordinates: arithmetic is the limit. VW elements are computed at once: their corners are transposed into one vector per coordinate, and
- * the forces back into 16 floats per element. Then each node adds those of its corners in stored order, so that the result depends on
- * neither threads nor batch.
+ * N nodes, E elements. About 350 operations an element forward, 80 of them in double, and 530 in a direction, on 4 x 24
+ * bytes of coordinates: arithmetic is the limit. VW elements are computed at once: their corners are transposed into
+ * one vector per coordinate, and the forces back into 16 floats per element. Then each node adds those of its corners
+ * in stored order, so that the result depends on neither threads nor batch.
  */
 #include "ast.h"
 #include "simd.h"
@@ -28,21 +29,24 @@ enum {
   CORNERS = 16             /* floats of the corners of an element: 4 x (x, y, z, unused) */
 };
 
-/* A rest volume below this share of the sum of the magnitudes of its products may be rounding alone: 8 roundings of 2^-24. */
+/* A rest volume below this share of the sum of the magnitudes of its products may be rounding alone: 8 roundings of
+ * 2^-24. */
 static const double ELASTIC_FLAT = 0x1p-21;
 
 typedef float corner __attribute__((vector_size(16), aligned(4), may_alias));
 
 typedef struct {
   const ast_elastic *mesh;
-  const float *position, *rest, *direction; /* copies that may be read one float past the end; direction is NULL for the forces */
-  float *forces;                            /* [E up to a multiple of VW,CORNERS] */
-  float *out;                               /* [N,3] */
+  const float *position, *rest,
+      *direction; /* copies that may be read one float past the end; direction is NULL for the forces */
+  float *forces;  /* [E up to a multiple of VW,CORNERS] */
+  float *out;     /* [N,3] */
 } elastic_job;
 
 /* ---- corners of VW elements <-> one vector per coordinate ---- */
 
-/* Of vectors in blocks of four: a0 b0 a1 b1, a2 b2 a3 b3, a0 a1 b0 b1, a2 a3 b2 b3 of each block; then those at even and odd places. */
+/* Of vectors in blocks of four: a0 b0 a1 b1, a2 b2 a3 b3, a0 a1 b0 b1, a2 a3 b2 b3 of each block; then those at even
+ * and odd places. */
 #if AST_VECTOR_BYTES == 64
 #define BLOCKS(a, b, i, j, k, l) \
   VSHUFFLE(a, b, i, j, k, l, i + 4, j + 4, k + 4, l + 4, i + 8, j + 8, k + 8, l + 8, i + 12, j + 12, k + 12, l + 12)
@@ -79,8 +83,8 @@ AST_INLINE vf elastic_load(const float *x, const int64_t *nodes) {
   return ab;
 #else
   const corner c = *(const corner *)(x + 3 * nodes[32]), d = *(const corner *)(x + 3 * nodes[48]);
-  return __builtin_shufflevector(ab, (pair)__builtin_shufflevector(c, d, 0, 1, 2, 3, 4, 5, 6, 7), 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12,
-                                 13, 14, 15);
+  return __builtin_shufflevector(ab, (pair)__builtin_shufflevector(c, d, 0, 1, 2, 3, 4, 5, 6, 7), 0, 1, 2, 3, 4, 5, 6,
+                                 7, 8, 9, 10, 11, 12, 13, 14, 15);
 #endif
 #endif
 }
@@ -131,8 +135,8 @@ AST_INLINE void elastic_stress(vf lambda, vf mu, vf M[3][3], vf S[3][3]) {
   EACH(3, i) EACH(3, j) S[i][j] = i == j ? mu * M[i][j] + pressure : mu * M[i][j];
 }
 
-/* D in double: the products of two edges are exact, so that D^-1 is rounded but once, however flat the element. Edges of any float are
- * in the range of their volumes, whatever the unit of length. */
+/* D in double: the products of two edges are exact, so that D^-1 is rounded but once, however flat the element. Edges
+ * of any float are in the range of their volumes, whatever the unit of length. */
 typedef double vd __attribute__((vector_size(2 * AST_VECTOR_BYTES)));
 typedef int64_t vl __attribute__((vector_size(2 * AST_VECTOR_BYTES)));
 #define ABS(x) ((vd)((vl)(x) & INT64_MAX))
@@ -175,7 +179,8 @@ AST_INLINE void elastic_block(const bool directed, const elastic_job *job, int64
     elements = some;
   }
   const float *lame = job->mesh->lame + 2 * first;
-  const vf even = vload_upto(lame, 2 * n), odd = vload_upto(lame + VW, 2 * n - VW), lambda = EVEN(even, odd), mu = ODD(even, odd);
+  const vf even = vload_upto(lame, 2 * n), odd = vload_upto(lame + VW, 2 * n - VW), lambda = EVEN(even, odd),
+           mu = ODD(even, odd);
   elastic_rest r = elastic_measure(job->rest, elements);
   const vi used = r.counts & ((lambda != 0) | (mu != 0));
   vf d[3][3], F[3][3], A[3][3], M[3][3], S[3][3], T[3][3], H[3][3];
@@ -236,7 +241,8 @@ static ast_status elastic_run(const ast_elastic *mesh, const float *direction, f
   AST_SCRATCH_SCOPE;
   const int64_t fields = direction ? 3 : 2, length = 3 * mesh->N + 4;
   float *copies = ast_scratch(fields * length * (int64_t)sizeof *copies);
-  elastic_job job = {.mesh = mesh, .forces = ast_scratch(round_up(mesh->E, VW) * CORNERS * (int64_t)sizeof *copies), .out = out};
+  elastic_job job = {
+      .mesh = mesh, .forces = ast_scratch(round_up(mesh->E, VW) * CORNERS * (int64_t)sizeof *copies), .out = out};
   if (!copies || !job.forces) return AST_NO_MEMORY;
   const float *from[3] = {mesh->position, mesh->rest_position, direction};
   const float **to[3] = {&job.position, &job.rest, &job.direction};
@@ -249,8 +255,11 @@ static ast_status elastic_run(const ast_elastic *mesh, const float *direction, f
   return status == AST_OK ? ast_parallel(divide_up(mesh->N, ELASTIC_NODES), elastic_sum_task, &job) : status;
 }
 
-static ast_status elastic_forces(const ast_elastic *mesh, float *restrict force) { return elastic_run(mesh, NULL, force); }
+static ast_status elastic_forces(const ast_elastic *mesh, float *restrict force) {
+  return elastic_run(mesh, NULL, force);
+}
 
-static ast_status elastic_forces_backward(const ast_elastic *mesh, const float *restrict dforce, float *restrict dposition) {
+static ast_status elastic_forces_backward(const ast_elastic *mesh, const float *restrict dforce,
+                                          float *restrict dposition) {
   return elastic_run(mesh, dforce, dposition);
 }

@@ -1,15 +1,18 @@
 /* Exact greedy farthest point sampling, with lazy distances.
  *
- * t_0 = 0, t_{j+1} = argmax_i d_i with d_i = min_{k <= j} |x_i - x_{t_k}|^2, the lowest i of several. Legend: n points, samples t.
+ * t_0 = 0, t_{j+1} = argmax_i d_i with d_i = min_{k <= j} |x_i - x_{t_k}|^2, the lowest i of several. Legend: n points,
+ * samples t.
  *
- * Distances only fall as samples come. So a block of consecutive points may stop looking at new samples: the largest distance that it
- * had then stays an upper bound. The next sample lies in the block with the largest bound, once that block has seen all samples; until
- * then it looks at those it missed, its bound falls, and another block may lead. Of the missed samples only those matter whose distance
- * from the bounding box of the block is less than the bound. (Bounding boxes and deferred samples: Han et al., "QuickFPS", IEEE TCAD
- * 2023; there the blocks are the leaves of a KD tree, here the points come in Morton order and any cut gives small blocks.)
+ * Distances only fall as samples come. So a block of consecutive points may stop looking at new samples: the largest
+ * distance that it had then stays an upper bound. The next sample lies in the block with the largest bound, once that
+ * block has seen all samples; until then it looks at those it missed, its bound falls, and another block may lead. Of
+ * the missed samples only those matter whose distance from the bounding box of the block is less than the bound.
+ * (Bounding boxes and deferred samples: Han et al., "QuickFPS", IEEE TCAD 2023; there the blocks are the leaves of a KD
+ * tree, here the points come in Morton order and any cut gives small blocks.)
  *
- * Exact for any order of points: a block whose bound is reached has seen everything, and among equal bounds the first block leads.
- * Cost: at most n distances a sample, as without blocks; in Morton order few blocks are looked at between two samples.
+ * Exact for any order of points: a block whose bound is reached has seen everything, and among equal bounds the first
+ * block leads. Cost: at most n distances a sample, as without blocks; in Morton order few blocks are looked at between
+ * two samples.
  *
  * Squared distances are integers, below 2^44; they fit in int32 unless the scene is wide.
  */
@@ -18,9 +21,9 @@
 
 enum { FPS_EXTENT = 1 << 21, FPS_TILE = 64 };
 
-/* A tournament of blocks. The leaves, nodes leaves..2 leaves - 1, hold a key for each block; node i holds the larger of nodes 2i and
- * 2i + 1, node 1 the largest of all. A key is the bound, below 2^44, and the block counted from the last one possible: so the first
- * block wins among equals. Leaves beyond the last block hold -1. */
+/* A tournament of blocks. The leaves, nodes leaves..2 leaves - 1, hold a key for each block; node i holds the larger of
+ * nodes 2i and 2i + 1, node 1 the largest of all. A key is the bound, below 2^44, and the block counted from the last
+ * one possible: so the first block wins among equals. Leaves beyond the last block hold -1. */
 enum { FPS_BLOCK_BITS = 19, FPS_BLOCKS = 1 << FPS_BLOCK_BITS };
 
 typedef struct {
@@ -48,10 +51,11 @@ static int64_t fps_block_size(int64_t n) {
 }
 
 /* 2^l, for loops over l that no instruction set has a shift for. */
-static const uint32_t fps_bits[32] = {0x1,       0x2,       0x4,       0x8,       0x10,       0x20,       0x40,       0x80,
-                                      0x100,     0x200,     0x400,     0x800,     0x1000,     0x2000,     0x4000,     0x8000,
-                                      0x10000,   0x20000,   0x40000,   0x80000,   0x100000,   0x200000,   0x400000,   0x800000,
-                                      0x1000000, 0x2000000, 0x4000000, 0x8000000, 0x10000000, 0x20000000, 0x40000000, 0x80000000};
+static const uint32_t fps_bits[32] = {0x1,        0x2,        0x4,        0x8,       0x10,      0x20,      0x40,
+                                      0x80,       0x100,      0x200,      0x400,     0x800,     0x1000,    0x2000,
+                                      0x4000,     0x8000,     0x10000,    0x20000,   0x40000,   0x80000,   0x100000,
+                                      0x200000,   0x400000,   0x800000,   0x1000000, 0x2000000, 0x4000000, 0x8000000,
+                                      0x10000000, 0x20000000, 0x40000000, 0x80000000};
 
 #define T          int32_t
 #define COORDINATE int16_t
@@ -130,8 +134,8 @@ static ast_status fps_task(int64_t scene, void *context) {
   return taken ? fps_fill_up(begin, n, taken, job->num, indices) : AST_NO_MEMORY;
 }
 
-static ast_status farthest_point_sample(const int32_t *restrict coordinates, const int64_t *restrict offsets, int64_t B, int64_t num,
-                                        const int64_t *restrict out_offsets, int64_t *restrict indices) {
+static ast_status farthest_point_sample(const int32_t *restrict coordinates, const int64_t *restrict offsets, int64_t B,
+                                        int64_t num, const int64_t *restrict out_offsets, int64_t *restrict indices) {
   fps_job job = {coordinates, offsets, out_offsets, num, indices};
   return ast_parallel(B, fps_task, &job);
 }

@@ -1,14 +1,17 @@
-/* Farthest point sampling of one scene, included by fps.c once per type T of squared distances and type COORDINATE of coordinates relative
- * to the middle of the scene; FPS(name) makes the names of that type. The loops over points are written for the compiler to vectorise. */
+/* Farthest point sampling of one scene, included by fps.c once per type T of squared distances and type COORDINATE of
+ * coordinates relative to the middle of the scene; FPS(name) makes the names of that type. The loops over points are
+ * written for the compiler to vectorise. */
 
-/* Points in blocks of consecutive ones, the last block padded with copies of the last point, which comes first of them. */
+/* Points in blocks of consecutive ones, the last block padded with copies of the last point, which comes first of them.
+ */
 typedef struct {
-  int64_t size, blocks;   /* points of a block, a multiple of FPS_TILE */
-  int64_t *seen;          /* [blocks] the number of samples that the block has seen */
-  T *distances;           /* [blocks,size] from those */
-  COORDINATE *points;     /* [blocks,3,size] */
-  COORDINATE *boxes;      /* [blocks,6]: lowest x, y, z, highest x, y, z */
-  COORDINATE *samples[3]; /* x, y, z of all samples so far; followed by FPS_TILE items that are read but do not matter */
+  int64_t size, blocks; /* points of a block, a multiple of FPS_TILE */
+  int64_t *seen;        /* [blocks] the number of samples that the block has seen */
+  T *distances;         /* [blocks,size] from those */
+  COORDINATE *points;   /* [blocks,3,size] */
+  COORDINATE *boxes;    /* [blocks,6]: lowest x, y, z, highest x, y, z */
+  COORDINATE
+      *samples[3]; /* x, y, z of all samples so far; followed by FPS_TILE items that are read but do not matter */
   fps_tournament tournament;
 } FPS(scene);
 
@@ -37,7 +40,8 @@ AST_INLINE T FPS(pass)(const FPS(scene) * scene, int64_t b, const int64_t *list,
   const COORDINATE *restrict x = scene->points + 3 * size * b, *restrict y = x + size, *restrict z = y + size;
   T *restrict distances = scene->distances + size * b, farthest = 0;
   COORDINATE p[4], q[4], r[4];
-  for (int k = 0; k < num; k++) p[k] = scene->samples[0][list[k]], q[k] = scene->samples[1][list[k]], r[k] = scene->samples[2][list[k]];
+  for (int k = 0; k < num; k++)
+    p[k] = scene->samples[0][list[k]], q[k] = scene->samples[1][list[k]], r[k] = scene->samples[2][list[k]];
   for (int64_t i = 0; i < size; i++) {
     T least = distances[i];
 #pragma GCC unroll 4
@@ -82,7 +86,8 @@ AST_INLINE uint32_t FPS(near)(const FPS(scene) * scene, const COORDINATE *box, T
   return bits;
 }
 
-/* Shows block b, whose bound is `bound`, the samples that it has not seen of the first `taken`; returns its new bound. */
+/* Shows block b, whose bound is `bound`, the samples that it has not seen of the first `taken`; returns its new bound.
+ */
 static T FPS(update)(const FPS(scene) * scene, int64_t b, T bound, int64_t taken) {
   const COORDINATE *box = scene->boxes + 6 * b;
   int64_t list[128];
@@ -105,7 +110,8 @@ static T FPS(update)(const FPS(scene) * scene, int64_t b, T bound, int64_t taken
 }
 
 /* The points of block b, its bounding box, and the distances from the first sample; returns the largest. */
-static T FPS(fill)(const FPS(scene) * scene, const int32_t *coordinates, int64_t n, const int32_t origin[3], int64_t b) {
+static T FPS(fill)(const FPS(scene) * scene, const int32_t *coordinates, int64_t n, const int32_t origin[3],
+                   int64_t b) {
   const int64_t size = scene->size, begin = b * size, points = min64(n - begin, size);
   const int32_t *restrict in = coordinates + 3 * begin;
   COORDINATE *restrict x = scene->points + 3 * size * b, *restrict y = x + size, *restrict z = y + size;
@@ -146,9 +152,11 @@ static int64_t FPS(find)(const FPS(scene) * scene, int64_t b, T distance) {
   return first;
 }
 
-/* Writes the indices of the samples, from `begin` on, until there are num or all distances are 0. Returns their number, 0 without memory.
+/* Writes the indices of the samples, from `begin` on, until there are num or all distances are 0. Returns their number,
+ * 0 without memory.
  */
-static int64_t FPS(sample)(const int32_t *coordinates, int64_t n, const int32_t origin[3], int64_t begin, int64_t num, int64_t *indices) {
+static int64_t FPS(sample)(const int32_t *coordinates, int64_t n, const int32_t origin[3], int64_t begin, int64_t num,
+                           int64_t *indices) {
   FPS(scene) scene;
   if (!FPS(reserve)(&scene, n, num, fps_block_size(n))) return 0;
   const fps_tournament t = scene.tournament;

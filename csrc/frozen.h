@@ -72,7 +72,8 @@ static PyObject *array_of(frozen *f, int ndim, const int64_t *shape) {
   for (int d = 0; d < ndim; d++) lengths[d] = (npy_intp)shape[d];
   PyObject *array = PyArray_SimpleNewFromData(ndim, lengths, INTS, f->shown);
   if (!array) Py_DECREF(f->owner);
-  else if (PyArray_SetBaseObject((PyArrayObject *)array, f->owner)) Py_CLEAR(array); /* took the reference all the same */
+  else if (PyArray_SetBaseObject((PyArrayObject *)array, f->owner))
+    Py_CLEAR(array); /* took the reference all the same */
   return array;
 }
 

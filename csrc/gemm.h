@@ -1,8 +1,8 @@
 /* The register-blocked product that every dense kernel is built on.
  *
- * C_ij (+)= sum_k A_ik B_kj. A has any strides (so A^T needs no copy) and is read by broadcast; B is read in whole vectors,
- * from a panel of GEMM_COLUMNS columns or from rows of a matrix. A tile of GEMM_ROWS x 2 vectors of C stays in registers over
- * the whole k loop.
+ * C_ij (+)= sum_k A_ik B_kj. A has any strides (so A^T needs no copy) and is read by broadcast; B is read in whole
+ * vectors, from a panel of GEMM_COLUMNS columns or from rows of a matrix. A tile of GEMM_ROWS x 2 vectors of C stays in
+ * registers over the whole k loop.
  */
 #ifndef AST_GEMM_H
 #define AST_GEMM_H
@@ -37,17 +37,20 @@ AST_INLINE void gemm_transpose(const float *in, int64_t in_row, const int64_t n,
 }
 
 /* The same for blocks at the end; out of line, as it is long. */
-static __attribute__((noinline)) void gemm_transpose_part(const float *in, int64_t in_row, int64_t n, int64_t m, float *out) {
+static __attribute__((noinline)) void gemm_transpose_part(const float *in, int64_t in_row, int64_t n, int64_t m,
+                                                          float *out) {
   gemm_transpose(in, in_row, n, m, out);
 }
 
-/* One panel of B_kj = b[k*row + j*column], row or column 1, j < N <= `width`: that many of the GEMM_COLUMNS columns of a panel, padded
- * with zeros. */
-AST_INLINE void gemm_pack_columns(const float *b, int64_t row, int64_t column, int64_t K, int64_t N, const int64_t width, float *panel) {
+/* One panel of B_kj = b[k*row + j*column], row or column 1, j < N <= `width`: that many of the GEMM_COLUMNS columns of
+ * a panel, padded with zeros. */
+AST_INLINE void gemm_pack_columns(const float *b, int64_t row, int64_t column, int64_t K, int64_t N,
+                                  const int64_t width, float *panel) {
   if (row == 1) {
     for (int64_t j = 0; j < width; j += VW)
       for (int64_t k0 = 0; k0 < K; k0 += VW) {
-        const int64_t k = max64(0, min64(k0, K - VW)); /* the last block overlaps the one before rather than end within it */
+        const int64_t k =
+            max64(0, min64(k0, K - VW)); /* the last block overlaps the one before rather than end within it */
         const float *in = b + k + j * column;
         float *out = panel + k * GEMM_COLUMNS + j;
         if (N - j >= VW && K >= VW) gemm_transpose(in, column, VW, VW, out);
@@ -67,8 +70,10 @@ static void gemm_pack(const float *b, int64_t row, int64_t column, int64_t K, in
     gemm_pack_columns(b + j * column, row, column, K, min64(GEMM_COLUMNS, N - j), GEMM_COLUMNS, panels + j * K);
 }
 
-/* sum_ij += sum_k A_ik B_kj in registers: `rows` and `vectors` are constants at every call, so that the loops over them unroll. */
-AST_INLINE void gemm_sums(const int rows, const int vectors, int64_t K, gemm_a a, const float *b, int64_t b_row, vf sum[GEMM_ROWS][2]) {
+/* sum_ij += sum_k A_ik B_kj in registers: `rows` and `vectors` are constants at every call, so that the loops over them
+ * unroll. */
+AST_INLINE void gemm_sums(const int rows, const int vectors, int64_t K, gemm_a a, const float *b, int64_t b_row,
+                          vf sum[GEMM_ROWS][2]) {
   for (int64_t k = 0; k < K; k++) {
     vf b_k[2];
 #pragma GCC unroll 2
@@ -83,7 +88,8 @@ AST_INLINE void gemm_sums(const int rows, const int vectors, int64_t K, gemm_a a
 }
 
 /* for all vectors of a register tile */
-#define TILE_EACH(i, v) _Pragma("GCC unroll 12") for (int i = 0; i < rows; i++) _Pragma("GCC unroll 2") for (int v = 0; v < vectors; v++)
+#define TILE_EACH(i, v) \
+  _Pragma("GCC unroll 12") for (int i = 0; i < rows; i++) _Pragma("GCC unroll 2") for (int v = 0; v < vectors; v++)
 
 /* Cuts n rows into register tiles: calls tile(rows) for the rows i, i + 1, ... with a constant number of them. */
 #define EACH_TILE_OF_ROWS(i, n, tile)                \
@@ -99,8 +105,8 @@ AST_INLINE void gemm_sums(const int rows, const int vectors, int64_t K, gemm_a a
   for (; i + (rows) <= (n); i += (rows)) tile(rows)
 
 /* One register tile. */
-AST_INLINE void gemm_tile(const int rows, const int vectors, int64_t K, gemm_a a, const float *b, int64_t b_row, float *c, int64_t c_row,
-                          bool add) {
+AST_INLINE void gemm_tile(const int rows, const int vectors, int64_t K, gemm_a a, const float *b, int64_t b_row,
+                          float *c, int64_t c_row, bool add) {
   vf sum[GEMM_ROWS][2];
   TILE_EACH(i, v) sum[i][v] = (vf){0};
   gemm_sums(rows, vectors, K, a, b, b_row, sum);
@@ -110,15 +116,17 @@ AST_INLINE void gemm_tile(const int rows, const int vectors, int64_t K, gemm_a a
   }
 }
 
-AST_INLINE void gemm_strip(const int vectors, int64_t M, int64_t K, gemm_a a, const float *b, int64_t b_row, float *c, int64_t c_row,
-                           bool add) {
-#define GEMM_TILE(rows) gemm_tile(rows, vectors, K, (gemm_a){a.data + i * a.row, a.row, a.column}, b, b_row, c + i * c_row, c_row, add)
+AST_INLINE void gemm_strip(const int vectors, int64_t M, int64_t K, gemm_a a, const float *b, int64_t b_row, float *c,
+                           int64_t c_row, bool add) {
+#define GEMM_TILE(rows) \
+  gemm_tile(rows, vectors, K, (gemm_a){a.data + i * a.row, a.row, a.column}, b, b_row, c + i * c_row, c_row, add)
   EACH_TILE_OF_ROWS(i, M, GEMM_TILE);
 #undef GEMM_TILE
 }
 
 /* C [M,N] (+)= A [M,K] B [K,N], N a multiple of VW, rows of B and C b_row and c_row floats apart. */
-static void gemm(int64_t M, int64_t N, int64_t K, gemm_a a, const float *b, int64_t b_row, float *c, int64_t c_row, bool add) {
+static void gemm(int64_t M, int64_t N, int64_t K, gemm_a a, const float *b, int64_t b_row, float *c, int64_t c_row,
+                 bool add) {
   for (int64_t j = 0; j < N; j += GEMM_COLUMNS) {
     if (N - j >= GEMM_COLUMNS) gemm_strip(2, M, K, a, b + j, b_row, c + j, c_row, add);
     else gemm_strip(1, M, K, a, b + j, b_row, c + j, c_row, add);

@@ -22,6 +22,8 @@ static inline int64_t lower_bound(const int64_t *values, int64_t begin, int64_t 
 }
 
 /* The scene of row i: the last b with offsets[b] <= i, for offsets [B+1] from 0 on and 0 <= i < offsets[B]. */
-static inline int64_t scene_at(const int64_t *offsets, int64_t B, int64_t i) { return lower_bound(offsets, 0, B, i + 1) - 1; }
+static inline int64_t scene_at(const int64_t *offsets, int64_t B, int64_t i) {
+  return lower_bound(offsets, 0, B, i + 1) - 1;
+}
 
 #endif

@@ -28,4 +28,5 @@
 
 extern const ast_kernels AST_TABLE(AST_ISA);
 
-const ast_kernels AST_TABLE(AST_ISA) = {.isa = AST_STRING(AST_ISA), .vector_bytes = AST_VECTOR_BYTES, AST_KERNELS(AST_ENTRY)};
+const ast_kernels AST_TABLE(AST_ISA) = {
+    .isa = AST_STRING(AST_ISA), .vector_bytes = AST_VECTOR_BYTES, AST_KERNELS(AST_ENTRY)};

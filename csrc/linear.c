@@ -3,15 +3,17 @@
  *   z = x W^T + bias,   out = act(z) + residual
  *   dz = act'(z) . dout,   dx = dz W,   dW = dz^T x,   dbias = the sum of the rows of dz
  *
- * with act(z) = z, max(0, z), or a . gelu(b) for z = [a, b] (Shazeer, GLU variants improve transformer, 2020), gelu(b) = b Phi(b).
+ * with act(z) = z, max(0, z), or a . gelu(b) for z = [a, b] (Shazeer, GLU variants improve transformer, 2020), gelu(b)
+ * = b Phi(b).
  *
- * Forward, a task owns a block of rows and some panels of columns. The gradient of W is a sum over rows, cut by the shapes alone,
- * in one of two ways. By rows: a task owns a chunk of rows, and while a block of them lies in the cache takes dz, dx and its part
- * of dW from it; the parts are added in order. By tiles, where those parts would be larger than x and dz: dz by blocks of rows,
- * unless it is dout itself, then side by side dW by tiles of W, each over all rows, and dx as a product like the forward one.
+ * Forward, a task owns a block of rows and some panels of columns. The gradient of W is a sum over rows, cut by the
+ * shapes alone, in one of two ways. By rows: a task owns a chunk of rows, and while a block of them lies in the cache
+ * takes dz, dx and its part of dW from it; the parts are added in order. By tiles, where those parts would be larger
+ * than x and dz: dz by blocks of rows, unless it is dout itself, then side by side dW by tiles of W, each over all
+ * rows, and dx as a product like the forward one.
  *
- * Cost: 2 M I O operations for z, for dx and for dW each. Memory: the packed weights, and either the parts or, where they are not
- * dout and x themselves, dz and x.
+ * Cost: 2 M I O operations for z, for dx and for dW each. Memory: the packed weights, and either the parts or, where
+ * they are not dout and x themselves, dz and x.
  */
 #include "ast.h"
 #include "weight_panels.h"
@@ -28,7 +30,9 @@ typedef struct {
   int64_t blocks, groups; /* of rows and of panels: a task each pair */
 } linear_product;
 
-static bool linear_is_small(const ast_linear *sizes) { return (double)sizes->M * (double)sizes->I * (double)sizes->O < 3e5; }
+static bool linear_is_small(const ast_linear *sizes) {
+  return (double)sizes->M * (double)sizes->I * (double)sizes->O < 3e5;
+}
 
 /* Tasks of a layer that is too small to wake other threads run on this one. */
 static ast_status linear_run(const ast_linear *sizes, int64_t tasks, ast_task task, void *job) {
@@ -52,7 +56,8 @@ static int64_t linear_cut(linear_product *p, bool small) {
 static ast_status linear_product_task(int64_t index, void *context) {
   const linear_product *p = context;
   const dense_layer *l = &p->layer;
-  const int64_t block = index / p->groups, first = dense_begin(p->M, p->blocks, block), last = dense_begin(p->M, p->blocks, block + 1);
+  const int64_t block = index / p->groups, first = dense_begin(p->M, p->blocks, block),
+                last = dense_begin(p->M, p->blocks, block + 1);
   const int64_t group = index % p->groups, panels = dense_panels(l);
   for (int64_t i = first; i < last; i += DENSE_ROWS) {
     dense_end end = p->end;
@@ -74,11 +79,14 @@ static dense_layer linear_layer(const ast_linear *sizes, const float *weight, co
   return layer;
 }
 
-static ast_status linear(const ast_linear *sizes, const float *restrict x, const float *restrict weight, const float *restrict bias,
-                         const float *restrict residual, float *restrict out, float *restrict z) {
+static ast_status linear(const ast_linear *sizes, const float *restrict x, const float *restrict weight,
+                         const float *restrict bias, const float *restrict residual, float *restrict out,
+                         float *restrict z) {
   AST_SCRATCH_SCOPE;
-  linear_product p = {
-      .layer = linear_layer(sizes, weight, bias, sizes->activation == AST_GEGLU), .a = x, .a_row = sizes->x_stride, .M = sizes->M};
+  linear_product p = {.layer = linear_layer(sizes, weight, bias, sizes->activation == AST_GEGLU),
+                      .a = x,
+                      .a_row = sizes->x_stride,
+                      .M = sizes->M};
   p.end = (dense_end){.activation = sizes->activation,
                       .out = out,
                       .out_row = p.layer.N,
@@ -107,8 +115,8 @@ typedef struct {
 } linear_backward_job;
 
 /* dz from z, of rows of dout with their columns whole or half */
-static void linear_activation(const ast_linear *sizes, int64_t rows, const float *z, int64_t z_row, const float *dout, float *dz,
-                              int64_t dz_row) {
+static void linear_activation(const ast_linear *sizes, int64_t rows, const float *z, int64_t z_row, const float *dout,
+                              float *dz, int64_t dz_row) {
   const int64_t half = sizes->O / 2, N = sizes->activation == AST_GEGLU ? half : sizes->O;
   for (int64_t i = 0; i < rows; i++, z += z_row, dout += sizes->dout_stride, dz += dz_row)
     for (int64_t j = 0; j < N; j += VW) {
@@ -141,7 +149,8 @@ static void linear_dz(const linear_backward_job *job, int64_t first, int64_t row
 }
 
 /* Rows from `first` on: dz and x as padded copies, dx, and the sum of dz added to dbias. */
-static void linear_backward_rows(const linear_backward_job *job, int64_t first, int64_t rows, float *dz, float *x, float *dbias) {
+static void linear_backward_rows(const linear_backward_job *job, int64_t first, int64_t rows, float *dz, float *x,
+                                 float *dbias) {
   const ast_linear *sizes = job->sizes;
   linear_dz(job, first, rows, dz);
   /* forward: z = x W^T + bias, so dbias = dz, dx = dz W and dW = dz^T x */
@@ -159,8 +168,10 @@ static void linear_backward_rows(const linear_backward_job *job, int64_t first, 
 static ast_status linear_chunk_task(int64_t index, void *context) {
   const linear_backward_job *job = context;
   const ast_linear *sizes = job->sizes;
-  const int64_t first = index * job->chunks.rows, last = min64(sizes->M, first + job->chunks.rows), width = round_up(sizes->I, VW);
-  float *dz = ast_scratch(DENSE_ROWS * (job->dz_row + job->x_row) * (int64_t)sizeof *dz), *x = dz + DENSE_ROWS * job->dz_row;
+  const int64_t first = index * job->chunks.rows, last = min64(sizes->M, first + job->chunks.rows),
+                width = round_up(sizes->I, VW);
+  float *dz = ast_scratch(DENSE_ROWS * (job->dz_row + job->x_row) * (int64_t)sizeof *dz),
+        *x = dz + DENSE_ROWS * job->dz_row;
   if (!dz) return AST_NO_MEMORY;
   float *dweight = job->partials + index * job->size, *dbias = dweight + sizes->O * width;
   memset(dbias, 0, (size_t)round_up(sizes->O, VW) * sizeof *dbias);
@@ -168,7 +179,8 @@ static ast_status linear_chunk_task(int64_t index, void *context) {
   for (int64_t i = first; i < last; i += job->chunks.step) {
     const int64_t rows = min64(job->chunks.step, last - i);
     linear_backward_rows(job, i, rows, dz, x, dbias);
-    if (job->dweight) gemm(sizes->O, width, rows, (gemm_a){dz, 1, job->dz_row}, x, job->x_row, dweight, width, i > first);
+    if (job->dweight)
+      gemm(sizes->O, width, rows, (gemm_a){dz, 1, job->dz_row}, x, job->x_row, dweight, width, i > first);
   }
   return AST_OK;
 }
@@ -180,7 +192,8 @@ static ast_status linear_by_rows(linear_backward_job *job) {
   if (!job->partials) return AST_NO_MEMORY;
   const ast_status status = ast_parallel(job->chunks.num, linear_chunk_task, job);
   if (status != AST_OK) return status;
-  const dense_sum sums[2] = {{job->dweight, 0, sizes->O, sizes->I, width}, {job->dbias, sizes->O * width, 1, sizes->O, width}};
+  const dense_sum sums[2] = {{job->dweight, 0, sizes->O, sizes->I, width},
+                             {job->dbias, sizes->O * width, 1, sizes->O, width}};
   return dense_add_partials((dense_sum_job){job->partials, job->size, job->chunks.num, sums, 2});
 }
 
@@ -192,7 +205,8 @@ static ast_status linear_block_task(int64_t index, void *context) {
   const int64_t first = index * DENSE_ROWS, rows = min64(DENSE_ROWS, sizes->M - first);
   if (job->all_dz) linear_dz(job, first, rows, job->all_dz + first * job->dz_row);
   if (job->all_x)
-    dense_copy_rows(job->x + first * sizes->x_stride, sizes->x_stride, rows, sizes->I, job->all_x + first * job->x_row, job->x_row);
+    dense_copy_rows(job->x + first * sizes->x_stride, sizes->x_stride, rows, sizes->I, job->all_x + first * job->x_row,
+                    job->x_row);
   return AST_OK;
 }
 
@@ -211,8 +225,8 @@ static ast_status linear_tile_task(int64_t index, void *context) {
     float *to = width == columns ? job->dweight + o * sizes->I + k : tile;
     const int64_t to_row = width == columns ? sizes->I : width;
     for (int64_t i = 0; i < sizes->M; i += LINEAR_TILE_DEPTH)
-      gemm(rows, width, min64(LINEAR_TILE_DEPTH, sizes->M - i), (gemm_a){dz.data + i * dz.row + o, 1, dz.row}, x.data + i * x.row + k,
-           x.row, to, to_row, i > 0);
+      gemm(rows, width, min64(LINEAR_TILE_DEPTH, sizes->M - i), (gemm_a){dz.data + i * dz.row + o, 1, dz.row},
+           x.data + i * x.row + k, x.row, to, to_row, i > 0);
     for (int64_t i = 0; to == tile && i < rows; i++)
       memcpy(job->dweight + (o + i) * sizes->I + k, tile + i * width, (size_t)columns * sizeof *tile);
   }
@@ -242,17 +256,20 @@ static ast_status linear_by_tiles(linear_backward_job *job) {
   }
   job->across = divide_up(sizes->I, LINEAR_TILE_COLUMNS);
   if (job->dweight || job->dbias) job->tiles = divide_up(sizes->O, LINEAR_TILE_ROWS) * job->across;
-  job->product = (linear_product){.layer = job->layers[1], .a = job->tiles_dz.data, .a_row = job->tiles_dz.row, .M = sizes->M};
+  job->product =
+      (linear_product){.layer = job->layers[1], .a = job->tiles_dz.data, .a_row = job->tiles_dz.row, .M = sizes->M};
   job->product.end = (dense_end){.out = job->dx, .out_row = sizes->I};
-  return linear_run(sizes, job->tiles + (job->dx ? linear_cut(&job->product, linear_is_small(sizes)) : 0), linear_tile_task, job);
+  return linear_run(sizes, job->tiles + (job->dx ? linear_cut(&job->product, linear_is_small(sizes)) : 0),
+                    linear_tile_task, job);
 }
 
 static ast_status linear_backward(const ast_linear *sizes, const float *restrict dout, const float *restrict x,
-                                  const float *restrict weight, const float *restrict bias, const float *restrict z, float *restrict dx,
-                                  float *restrict dweight, float *restrict dbias) {
+                                  const float *restrict weight, const float *restrict bias, const float *restrict z,
+                                  float *restrict dx, float *restrict dweight, float *restrict dbias) {
   AST_SCRATCH_SCOPE;
   const bool recompute = sizes->activation != AST_IDENTITY && !z;
-  linear_backward_job job = {.sizes = sizes, .dout = dout, .x = x, .z = z, .dx = dx, .dweight = dweight, .dbias = dbias};
+  linear_backward_job job = {
+      .sizes = sizes, .dout = dout, .x = x, .z = z, .dx = dx, .dweight = dweight, .dbias = dbias};
   job.layers[0] = linear_layer(sizes, recompute ? weight : NULL, bias, false);
   job.layers[1] = dense_backward(dx ? weight : NULL, sizes->I, sizes->O, sizes->I);
   const ast_status status = dense_pack(job.layers, 2);
@@ -262,5 +279,6 @@ static ast_status linear_backward(const ast_linear *sizes, const float *restrict
   job.x_row = round_up(sizes->I, VW) + DENSE_APART;
   job.size = sizes->O * round_up(sizes->I, VW) + round_up(sizes->O, VW);
   job.chunks = dense_cut(sizes->M, job.size);
-  return sizes->M * (job.dz_row + job.x_row) < job.chunks.num * job.size && sizes->M > 0 ? linear_by_tiles(&job) : linear_by_rows(&job);
+  return sizes->M * (job.dz_row + job.x_row) < job.chunks.num * job.size && sizes->M > 0 ? linear_by_tiles(&job)
+                                                                                         : linear_by_rows(&job);
 }

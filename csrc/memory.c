@@ -1,8 +1,9 @@
 /* Scratch memory of each thread, a stack in a few blocks, and the C library's thresholds for giving memory back.
  *
- * A request that finds no room in the newest block gets a new one. When the stack is empty again one block stays if it was enough;
- * else the next request gets one for all that was ever in use at once: so a kernel that is called again and again allocates
- * nothing from its third call on, and its arrays lie side by side. More than SCRATCH_KEPT bytes are given back instead.
+ * A request that finds no room in the newest block gets a new one. When the stack is empty again one block stays if it
+ * was enough; else the next request gets one for all that was ever in use at once: so a kernel that is called again and
+ * again allocates nothing from its third call on, and its arrays lie side by side. More than SCRATCH_KEPT bytes are
+ * given back instead.
  */
 #include <limits.h>
 #include <pthread.h>
@@ -16,7 +17,8 @@
 
 enum { ALIGNMENT = 64, SCRATCH_KEPT = 1 << 26 };
 
-/* With the address sanitizer every request is a block of its own, freed when it is released: no access beyond it, or after, escapes. */
+/* With the address sanitizer every request is a block of its own, freed when it is released: no access beyond it, or
+ * after, escapes. */
 #ifndef __has_feature
 #define __has_feature(name) 0
 #endif

@@ -2,17 +2,17 @@
  *
  *   h_m = relu(A1 e_m + a1)                          edge encoder, absent if H = 0
  *   x_m = relu(P_s(m) + Q_r(m) + A2 h_m)             first layer; P and Q are its products with senders and receivers
- *   x_m = relu(P_s(m) + Q_r(m) + e_m)                the same where e_m, of F channels, is its product with latents of the edges
- *   y_m = W2 x_m + b2                                second layer
- *   out_m = gamma (y_m - mean y_m) / sqrt(var y_m + eps) + beta,     sum_r = sum of out_m over the edges m into r
+ *   x_m = relu(P_s(m) + Q_r(m) + e_m)                the same where e_m, of F channels, is its product with latents of
+ * the edges y_m = W2 x_m + b2                                second layer out_m = gamma (y_m - mean y_m) / sqrt(var y_m
+ * + eps) + beta,     sum_r = sum of out_m over the edges m into r
  *
- * Edges are sorted by receiver. A task owns a range of receivers with about the same number of edges as any other and goes
- * through them in tiles of MESSAGE_TILE edges, whose h, x and y stay in the second-level cache; while it multiplies, it
- * fetches the rows of P of the next tile. Sums run in stored order and a row of a product does not depend on its neighbours
- * in a tile, so neither tiles, tasks, threads nor other scenes of a batch change a bit.
+ * Edges are sorted by receiver. A task owns a range of receivers with about the same number of edges as any other and
+ * goes through them in tiles of MESSAGE_TILE edges, whose h, x and y stay in the second-level cache; while it
+ * multiplies, it fetches the rows of P of the next tile. Sums run in stored order and a row of a product does not
+ * depend on its neighbours in a tile, so neither tiles, tasks, threads nor other scenes of a batch change a bit.
  *
- * Cost per edge: 2 (E H + H F + F F2) flops, a row of P read from anywhere in memory, rows of e, of Q and of the sum in order.
- * Memory: 3 tiles a thread and the packed weights.
+ * Cost per edge: 2 (E H + H F + F F2) flops, a row of P read from anywhere in memory, rows of e, of Q and of the sum in
+ * order. Memory: 3 tiles a thread and the packed weights.
  */
 #include "ast.h"
 #include "weight_panels.h"
@@ -61,10 +61,10 @@ static bool message_new_tile(const message_weights *w, message_tile *t) {
   return memory != NULL;
 }
 
-/* One register tile of x: channels of panel p of the edges from m on. P + Q comes last: large values cost the product no digits.
- * Latents stand where the sums of the product would. */
-AST_INLINE void message_first_tile(const int rows, const int vectors, const message_weights *w, int64_t p, int64_t m, const float *h,
-                                   float *x) {
+/* One register tile of x: channels of panel p of the edges from m on. P + Q comes last: large values cost the product
+ * no digits. Latents stand where the sums of the product would. */
+AST_INLINE void message_first_tile(const int rows, const int vectors, const message_weights *w, int64_t p, int64_t m,
+                                   const float *h, float *x) {
   const ast_message *s = w->step;
   const int64_t c = p * GEMM_COLUMNS, n = s->F - c;
   vf sum[GEMM_ROWS][2];
@@ -84,10 +84,12 @@ AST_INLINE void message_first_tile(const int rows, const int vectors, const mess
 #pragma GCC unroll 2
       for (int v = 0; v < vectors; v++) sum[i][v] = vload_upto(e + i * s->F + v * VW, n - v * VW);
   }
-  gemm_sums(rows, vectors, s->H, (gemm_a){h, w->row, 1}, w->layers[MESSAGE_A2].panels + c * s->H, GEMM_COLUMNS, sum);
+  const dense_layer *l = &w->layers[MESSAGE_A2];
+  if (s->H) dense_sums(rows, vectors, l, (gemm_a){h, w->row, 1}, l->panels + c * s->H, sum);
 #pragma GCC unroll 12
   for (int i = 0; i < rows; i++) {
-    const float *P = s->of_senders + s->senders[m + i] * s->F + c, *Q = s->of_receivers + s->receivers[m + i] * s->F + c;
+    const float *P = s->of_senders + s->senders[m + i] * s->F + c,
+                *Q = s->of_receivers + s->receivers[m + i] * s->F + c;
 #pragma GCC unroll 2
     for (int v = 0; v < vectors; v++) {
       const vf z = vload_upto(P + v * VW, n - v * VW) + vload_upto(Q + v * VW, n - v * VW) + sum[i][v];
@@ -143,8 +145,9 @@ static ast_status message_task(int64_t index, void *context) {
   const message_job *job = context;
   const ast_message *step = job->w.step;
   const int64_t begin = lower_bound(step->receiver_offsets, 0, step->R, index * step->M / job->tasks);
-  const int64_t end =
-      index + 1 < job->tasks ? lower_bound(step->receiver_offsets, begin, step->R, (index + 1) * step->M / job->tasks) : step->R;
+  const int64_t end = index + 1 < job->tasks
+                          ? lower_bound(step->receiver_offsets, begin, step->R, (index + 1) * step->M / job->tasks)
+                          : step->R;
   const int64_t last = step->receiver_offsets[end];
   message_tile t;
   if (!message_new_tile(&job->w, &t)) return AST_NO_MEMORY;

@@ -3,18 +3,19 @@
  *
  *   dgamma = sum_m g_m u_m,   dbeta = sum_m g_m,   p_m = gamma g_m,   dy_m = (p_m - <p_m> - u_m <p_m u_m>) / sd_m
  *   dW2 = sum_m dy_m x_m^T,   db2 = sum_m dy_m,   dz_m = (z_m > 0) W2^T dy_m,         x_m = relu(z_m)
- *   dA2 = sum_m dz_m h_m^T,   dc_m = (h_m > 0) A2^T dz_m,   dA1 = sum_m dc_m e_m^T,   da1 = sum_m dc_m,   de_m = A1^T dc_m
- *   de_m = dz_m                                                                       where e_m is added as it is
+ *   dA2 = sum_m dz_m h_m^T,   dc_m = (h_m > 0) A2^T dz_m,   dA1 = sum_m dc_m e_m^T,   da1 = sum_m dc_m,   de_m = A1^T
+ * dc_m de_m = dz_m                                                                       where e_m is added as it is
  *   dP_s = sum of dz_m over the edges from step,   dQ_r = sum of dz_m over the edges into r
  *
- * Edges come in rounds. First the tasks of a round, each a run of tiles, put dz into a buffer and add to weight gradients of
- * their own, of which there are at most ROUND_TASKS. Then other tasks add the rows of the buffer to dQ, each for a run of receivers,
- * and to dP, each for the senders with the same index modulo PARTS. All go through their edges in stored order, so that each
- * sum runs in stored order whatever the rounds, tasks, threads and other scenes. At the end the weight gradients of the tasks
- * are added up in order.
+ * Edges come in rounds. First the tasks of a round, each a run of tiles, put dz into a buffer and add to weight
+ * gradients of their own, of which there are at most ROUND_TASKS. Then other tasks add the rows of the buffer to dQ,
+ * each for a run of receivers, and to dP, each for the senders with the same index modulo PARTS. All go through their
+ * edges in stored order, so that each sum runs in stored order whatever the rounds, tasks, threads and other scenes. At
+ * the end the weight gradients of the tasks are added up in order.
  *
- * Cost per edge: the forward flops again, and twice as many for the two products per layer (but E H once, unless de is wanted).
- * Memory: at most ROUND_TASKS sums of weight gradients and ROUND_TASKS * TASK_TILES * MESSAGE_TILE rows of dz, 11 MB at 128 channels.
+ * Cost per edge: the forward flops again, and twice as many for the two products per layer (but E H once, unless de is
+ * wanted). Memory: at most ROUND_TASKS sums of weight gradients and ROUND_TASKS * TASK_TILES * MESSAGE_TILE rows of dz,
+ * 11 MB at 128 channels.
  */
 #include "ast.h"
 #include "weight_panels.h"
@@ -88,7 +89,8 @@ AST_INLINE void message_norm_backward(const message_backward_job *job, int64_t f
     float *y = t->y + i * row;
     const float *dmessage = job->dmessages ? job->dmessages + (first + i) * F2 : NULL;
     const float scale = norm_centre(y, F2, whole);
-    norm_backward(F2, whole, step->gamma, job->dsum + step->receivers[first + i] * F2, dmessage, scale, NULL, y, &t->columns);
+    norm_backward(F2, whole, step->gamma, job->dsum + step->receivers[first + i] * F2, dmessage, scale, NULL, y,
+                  &t->columns);
   }
   dense_add_rows(t->columns.dgamma, 0, 1, F2, sums->gamma);
   dense_add_rows(t->columns.dbeta, 0, 1, F2, sums->beta);
@@ -96,8 +98,8 @@ AST_INLINE void message_norm_backward(const message_backward_job *job, int64_t f
 }
 
 /* dz of the tile into the buffer, and the weight gradients added to `sums`, or put there if they are `fresh`. */
-static void message_tile_backward(const message_backward_job *job, int64_t first, int64_t n, bool fresh, const message_tile *t,
-                                  const message_sums *sums) {
+static void message_tile_backward(const message_backward_job *job, int64_t first, int64_t n, bool fresh,
+                                  const message_tile *t, const message_sums *sums) {
   const message_weights *w = &job->w;
   const ast_message *step = w->step;
   const int64_t H = round_up(step->H, VW), F = round_up(step->F, VW), E = step->E, row = w->row;
@@ -111,7 +113,8 @@ static void message_tile_backward(const message_backward_job *job, int64_t first
             (dense_end){.out = dz, .out_row = row, .hidden = t->x, .hidden_row = row});
   /* forward: x = relu(P + Q + e), so de = dz */
   float *de = job->out->edge_features;
-  for (int64_t i = 0; de && message_has_latents(step) && i < n; i++) memcpy(de + (first + i) * E, dz + i * row, (size_t)E * sizeof *de);
+  for (int64_t i = 0; de && message_has_latents(step) && i < n; i++)
+    memcpy(de + (first + i) * E, dz + i * row, (size_t)E * sizeof *de);
   if (!H) return;
   /* forward: x = relu(P + Q + A2 h), so dA2 = dz h^T and dh = A2^T dz */
   gemm(step->F, H, n, (gemm_a){dz, 1, row}, t->h, row, sums->A2, H, !fresh);
@@ -120,7 +123,8 @@ static void message_tile_backward(const message_backward_job *job, int64_t first
   /* forward: h = relu(A1 e + a1), so da1 = dc, dA1 = dc e^T and de = A1^T dc */
   dense_add_rows(dc, row, n, step->H, sums->a1);
   gemm(E, H, n, (gemm_a){step->edge_features + first * E, 1, E}, dc, row, sums->A1, H, !fresh);
-  if (de) dense_all(&w->layers[MESSAGE_A1_BACK], n, (gemm_a){dc, row, 1}, (dense_end){.out = de + first * E, .out_row = E});
+  if (de)
+    dense_all(&w->layers[MESSAGE_A1_BACK], n, (gemm_a){dc, row, 1}, (dense_end){.out = de + first * E, .out_row = E});
 }
 
 static ast_status message_backward_task(int64_t index, void *context) {
@@ -140,7 +144,8 @@ static ast_status message_backward_task(int64_t index, void *context) {
 static void message_add_to_senders(const message_backward_job *job, int64_t part) {
   const ast_message *step = job->w.step;
   const int64_t F = step->F, *senders = step->senders + job->begin;
-  for (int64_t r = part; !job->begin && r < step->S; r += PARTS) memset(job->out->of_senders + r * F, 0, (size_t)F * sizeof(float));
+  for (int64_t r = part; !job->begin && r < step->S; r += PARTS)
+    memset(job->out->of_senders + r * F, 0, (size_t)F * sizeof(float));
   for (int64_t task = 0; task * job->edges < job->end - job->begin; task++) {
     const int64_t *offsets = job->part_offsets + task * (PARTS + 1), last = offsets[part + 1];
     for (int64_t i = offsets[part]; i < last; i++) {
@@ -162,8 +167,8 @@ static int64_t message_next_receiver(const ast_message *step, int64_t m) {
   return m == 0 ? 0 : step->receiver_offsets[step->receivers[m - 1] + 1];
 }
 
-/* dQ of the receivers whose first edge in this round is in a part of it. A row is cleared before its first edge of all, together
- * with those between it and the row before. */
+/* dQ of the receivers whose first edge in this round is in a part of it. A row is cleared before its first edge of all,
+ * together with those between it and the row before. */
 static void message_add_to_receivers(const message_backward_job *job, int64_t part) {
   const ast_message *step = job->w.step;
   const int64_t F = step->F, edges = job->end - job->begin;
@@ -232,15 +237,17 @@ static ast_status message_backward(const ast_message *step, const float *restric
   message_backward_job job = {.dsum = dsum, .dmessages = dmessages, .out = out, .size = message_sums_size(step)};
   ast_status status = message_pack(step, true, &job.w);
   if (status != AST_OK) return status;
-  const int64_t tiles = max64(1, divide_up(step->M, MESSAGE_TILE)), most = ROUND_TASKS * TASK_TILES, rounds = divide_up(tiles, most);
+  const int64_t tiles = max64(1, divide_up(step->M, MESSAGE_TILE)), most = ROUND_TASKS * TASK_TILES,
+                rounds = divide_up(tiles, most);
   const int64_t of_round = divide_up(tiles, rounds), of_task = divide_up(of_round, ROUND_TASKS);
   job.edges = MESSAGE_TILE * of_task;
   job.tasks = divide_up(of_round, of_task);
 
-  const int64_t round = job.tasks * job.edges, partials = job.tasks * job.size, dz = round * job.w.row, dA1 = step->E * step->H;
+  const int64_t round = job.tasks * job.edges, partials = job.tasks * job.size, dz = round * job.w.row,
+                dA1 = step->E * step->H;
   const int64_t offsets = round_up(job.tasks * (PARTS + 1), 8);
-  job.part_offsets =
-      ast_scratch(offsets * (int64_t)sizeof(int64_t) + (partials + dz + dA1) * (int64_t)sizeof(float) + round * (int64_t)sizeof(int32_t));
+  job.part_offsets = ast_scratch(offsets * (int64_t)sizeof(int64_t) + (partials + dz + dA1) * (int64_t)sizeof(float) +
+                                 round * (int64_t)sizeof(int32_t));
   if (!job.part_offsets) return AST_NO_MEMORY;
   job.partials = (float *)(job.part_offsets + offsets);
   job.dz = job.partials + partials;

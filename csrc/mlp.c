@@ -1,17 +1,21 @@
-/* Two dense layers with a LayerNorm behind them, and their gradients; hidden units live between the two only if the caller keeps them.
+/* Two dense layers with a LayerNorm behind them, and their gradients; hidden units live between the two only if the
+ * caller keeps them.
  *
  *   h = max(0, [x, beside] W1^T + bias1),   y = h W2^T + bias2,   n = (y - mean(y)) / sqrt(var(y) + eps)
  *   out = gamma . n + beta + residual       (without norm: y + residual)
  *
- * Rows are taken in blocks that stay in the cache with all their intermediate values. Backward, with r = 1 / sqrt(var + eps),
+ * Rows are taken in blocks that stay in the cache with all their intermediate values. Backward, with r = 1 / sqrt(var +
+ * eps),
  *
  *   dn = gamma . dout,   dy = r (dn - mean(dn) - n mean(dn . n)),   dz = [h > 0] . (dy W2)
- *   dW2 = dy^T h,   dW1 = dz^T [x, beside],   d[x, beside] = dz W1,   the other gradients sums of rows of dy, dz, dout and dout . n,
+ *   dW2 = dy^T h,   dW1 = dz^T [x, beside],   d[x, beside] = dz W1,   the other gradients sums of rows of dy, dz, dout
+ * and dout . n,
  *
- * h, n and r of a block are computed again, or read if the caller kept them. Sums over rows go chunk by chunk (weight_panels.h): they do
- * not depend on the threads, and a row's results depend on that row alone.
+ * h, n and r of a block are computed again, or read if the caller kept them. Sums over rows go chunk by chunk
+ * (weight_panels.h): they do not depend on the threads, and a row's results depend on that row alone.
  *
- * Cost: 2 M H (I + I2 + O) operations forward and 4 M H (I + I2 + O) backward, 2 M H (I + I2 + O) more if nothing was kept.
+ * Cost: 2 M H (I + I2 + O) operations forward and 4 M H (I + I2 + O) backward, 2 M H (I + I2 + O) more if nothing was
+ * kept.
  */
 #include "ast.h"
 #include "weight_panels.h"
@@ -25,7 +29,8 @@ enum { MLP_FIRST, MLP_SECOND, MLP_SECOND_BACK, MLP_FIRST_BACK, MLP_BESIDE_BACK, 
 /* [x, beside] of rows from `first` on, copied side by side; rows of the copy are padded with zeros to whole vectors */
 static void mlp_copy_inputs(const ast_mlp *mlp, int64_t first, int64_t rows, float *to, int64_t row) {
   dense_copy_rows(mlp->x + first * mlp->x_stride, mlp->x_stride, rows, mlp->I, to, row);
-  if (mlp->beside) dense_copy_rows(mlp->beside + first * mlp->beside_stride, mlp->beside_stride, rows, mlp->I2, to + mlp->I, row);
+  if (mlp->beside)
+    dense_copy_rows(mlp->beside + first * mlp->beside_stride, mlp->beside_stride, rows, mlp->I2, to + mlp->I, row);
 }
 
 /* ---- forward ---- */
@@ -46,7 +51,8 @@ AST_INLINE void mlp_norm_rows(const mlp_job *job, int64_t first, int64_t rows, f
   const ast_mlp *mlp = job->mlp;
   const int64_t O = mlp->O;
   for (int64_t i = first; i < first + rows; i++, y += job->y_row) {
-    for (int64_t j = 0, later = min64(i + MLP_AHEAD, mlp->M - 1) * O; j < O; j += 16) { /* before a store has to wait for its line */
+    for (int64_t j = 0, later = min64(i + MLP_AHEAD, mlp->M - 1) * O; j < O;
+         j += 16) { /* before a store has to wait for its line */
       __builtin_prefetch(job->out + later + j, 1);
       if (job->kept.normalized) __builtin_prefetch(job->kept.normalized + later + j, 1);
     }
@@ -80,11 +86,12 @@ static ast_status mlp_task(int64_t index, void *context) {
       mlp_copy_inputs(mlp, i, rows, input, job->input_row);
       a = (gemm_a){input, job->input_row, 1};
     }
-    const dense_end first = {.activation = AST_RELU,
-                             .out = hidden,
-                             .out_row = hidden_row,
-                             .next = {dense_rows_from(mlp->x, mlp->x_stride, mlp->I, i + DENSE_ROWS, mlp->M),
-                                      dense_rows_from(mlp->beside, mlp->beside_stride, mlp->I2, i + DENSE_ROWS, mlp->M)}};
+    const dense_end first = {
+        .activation = AST_RELU,
+        .out = hidden,
+        .out_row = hidden_row,
+        .next = {dense_rows_from(mlp->x, mlp->x_stride, mlp->I, i + DENSE_ROWS, mlp->M),
+                 dense_rows_from(mlp->beside, mlp->beside_stride, mlp->I2, i + DENSE_ROWS, mlp->M)}};
     dense_all(&job->layers[MLP_FIRST], rows, a, first);
     a = (gemm_a){hidden, hidden_row, 1};
     if (mlp->gamma) {
@@ -134,9 +141,10 @@ typedef struct {
   int64_t size;
 } mlp_backward_job;
 
-/* dy of the rows from `first` on, in the place of y, or of n, which is read if it was kept; dgamma and dbeta are added to */
-AST_INLINE void mlp_norm_backward(const mlp_backward_job *job, int64_t first, int64_t rows, float *y, const norm_columns *columns,
-                                  const bool whole) {
+/* dy of the rows from `first` on, in the place of y, or of n, which is read if it was kept; dgamma and dbeta are added
+ * to */
+AST_INLINE void mlp_norm_backward(const mlp_backward_job *job, int64_t first, int64_t rows, float *y,
+                                  const norm_columns *columns, const bool whole) {
   const ast_mlp *mlp = job->mlp;
   for (int64_t i = first; i < first + rows; i++, y += job->y_row) {
     const float *kept = job->kept.normalized ? job->kept.normalized + i * mlp->O : NULL;
@@ -145,9 +153,10 @@ AST_INLINE void mlp_norm_backward(const mlp_backward_job *job, int64_t first, in
   }
 }
 
-/* One block: its dx and dbeside, and its part of all sums, added to those of the chunk. Rows that do not end with a vector are copied. */
-static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_t rows, float *input, float *hidden, float *y,
-                              float *partials, bool add) {
+/* One block: its dx and dbeside, and its part of all sums, added to those of the chunk. Rows that do not end with a
+ * vector are copied. */
+static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_t rows, float *input, float *hidden,
+                              float *y, float *partials, bool add) {
   const ast_mlp *mlp = job->mlp;
   const dense_sum *sums = job->sums;
   gemm_a inputs = {input, job->input_row, 1}, units = {hidden, job->hidden_row, 1};
@@ -176,8 +185,8 @@ static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_
   }
   /* forward: y = h W2^T + bias2, so dW2 = dy^T h, dbias2 = dy and dh = dy W2 */
   if (sums[MLP_DWEIGHT2].to)
-    gemm(mlp->O, sums[MLP_DWEIGHT2].row, rows, (gemm_a){y, 1, job->y_row}, units.data, units.row, partials + sums[MLP_DWEIGHT2].at,
-         sums[MLP_DWEIGHT2].row, add);
+    gemm(mlp->O, sums[MLP_DWEIGHT2].row, rows, (gemm_a){y, 1, job->y_row}, units.data, units.row,
+         partials + sums[MLP_DWEIGHT2].at, sums[MLP_DWEIGHT2].row, add);
   if (sums[MLP_DBIAS2].to) dense_add_rows(y, job->y_row, rows, mlp->O, partials + sums[MLP_DBIAS2].at);
   if (!job->into_hidden) return;
   const dense_end masked = {.out = hidden,
@@ -246,7 +255,8 @@ static ast_status mlp_backward(const ast_mlp *mlp, const float *restrict dout, a
   const int64_t K = mlp->I + mlp->I2;
   job.into_hidden = g.x || g.beside || g.weight1 || g.bias1;
   job.layers[MLP_FIRST] = dense_forward(kept.hidden ? NULL : mlp->weight1, mlp->bias1, K, mlp->H);
-  job.layers[MLP_SECOND] = dense_forward(kept.normalized || !mlp->gamma ? NULL : mlp->weight2, mlp->bias2, mlp->H, mlp->O);
+  job.layers[MLP_SECOND] =
+      dense_forward(kept.normalized || !mlp->gamma ? NULL : mlp->weight2, mlp->bias2, mlp->H, mlp->O);
   job.layers[MLP_SECOND_BACK] = dense_backward(job.into_hidden ? mlp->weight2 : NULL, mlp->H, mlp->O, mlp->H);
   job.layers[MLP_FIRST_BACK] = dense_backward(g.x ? mlp->weight1 : NULL, K, mlp->H, mlp->I);
   job.layers[MLP_BESIDE_BACK] = dense_backward(g.beside ? mlp->weight1 + mlp->I : NULL, K, mlp->H, mlp->I2);

@@ -25,7 +25,8 @@ static PyObject *call_kernel(PyObject *self, PyObject *const *objects, Py_ssize_
  * nothing to do: it is such a one already, has no values, or is nothing that a kernel reads as indices in place. */
 static PyObject *freeze_one(PyObject *object) {
   view v;
-  if (!view_of(object, &v) || v.type != INTS || v.ndim < 1 || v.ndim > MAX_SHAPE || !is_dense(&v)) return Py_INCREF(object), object;
+  if (!view_of(object, &v) || v.type != INTS || v.ndim < 1 || v.ndim > MAX_SHAPE || !is_dense(&v))
+    return Py_INCREF(object), object;
   const int64_t bytes = view_size(&v) * v.item;
   if (!bytes || find_frozen(v.data, bytes)) return Py_INCREF(object), object;
   frozen *f = new_frozen(bytes);
@@ -111,16 +112,20 @@ static PyObject *configuration(PyObject *self, PyObject *unused) {
     Py_XDECREF(name);
   }
   if (!supported) return NULL;
-  return Py_BuildValue("{s:s,s:N,s:L,s:O}", "isa", kernels->isa, "supported", supported, "threads", (long long)ast_threads(), "debug",
-                       debug ? Py_True : Py_False);
+  return Py_BuildValue("{s:s,s:N,s:L,s:O}", "isa", kernels->isa, "supported", supported, "threads",
+                       (long long)ast_threads(), "debug", debug ? Py_True : Py_False);
 }
 
 static PyMethodDef methods[] = {
-    {"declare", declare, METH_VARARGS, "declare(name, spec): adds the kernel of this name, which takes what the spec says."},
-    {"freeze", (PyCFunction)(void (*)(void))freeze, METH_FASTCALL, "freeze(*indices): copies that kernels trust, or those that are such."},
-    {"set_pool", set_pool, METH_VARARGS, "set_pool(parallel_for, num_threads): addresses of torch's thread pool, 0 for serial."},
+    {"declare", declare, METH_VARARGS,
+     "declare(name, spec): adds the kernel of this name, which takes what the spec says."},
+    {"freeze", (PyCFunction)(void (*)(void))freeze, METH_FASTCALL,
+     "freeze(*indices): copies that kernels trust, or those that are such."},
+    {"set_pool", set_pool, METH_VARARGS,
+     "set_pool(parallel_for, num_threads): addresses of torch's thread pool, 0 for serial."},
     {"keep_memory", keep_memory, METH_NOARGS, "Let the C library keep freed blocks; whether it had an effect."},
-    {"configuration", configuration, METH_NOARGS, "The chosen instruction set, the supported ones, the threads, the debug mode."},
+    {"configuration", configuration, METH_NOARGS,
+     "The chosen instruction set, the supported ones, the threads, the debug mode."},
     {NULL, NULL, 0, NULL},
 };
 
@@ -131,7 +136,8 @@ static int execute(PyObject *module) {
   debug = check && !strcmp(check, "1");
   kernels = ast_select(wanted && *wanted ? wanted : NULL);
   if (kernels) return 0;
-  PyErr_Format(PyExc_ImportError, "AST_SIM_ISA=%s is not supported by this processor and build; unset it or choose base, avx2 or avx512",
+  PyErr_Format(PyExc_ImportError,
+               "AST_SIM_ISA=%s is not supported by this processor and build; unset it or choose base, avx2 or avx512",
                wanted);
   return -1;
 }

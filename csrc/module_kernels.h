@@ -17,10 +17,12 @@
   } name##_arguments;         \
   static const char name##_parameters[] = NAMES_OF(__VA_ARGS__)
 
-#define KERNEL(name, ...)                                                                                                             \
-  PARAMETERS(name, __VA_ARGS__);                                                                                                      \
-  static ast_status name##_body(const name##_arguments *, const int64_t *, void *);                                                   \
-  static ast_status name##_run(const argument *a, const int64_t *n, void *result) { return name##_body((const void *)a, n, result); } \
+#define KERNEL(name, ...)                                                           \
+  PARAMETERS(name, __VA_ARGS__);                                                    \
+  static ast_status name##_body(const name##_arguments *, const int64_t *, void *); \
+  static ast_status name##_run(const argument *a, const int64_t *n, void *result) { \
+    return name##_body((const void *)a, n, result);                                 \
+  }                                                                                 \
   static ast_status name##_body(const name##_arguments *a, const int64_t *n, NOT_ALWAYS result)
 #define NOT_ALWAYS __attribute__((unused)) void *
 
@@ -40,11 +42,13 @@ static bool run(call *c, run_function function, void *result, ast_status *status
 /* ---- sums of rows ---- */
 
 KERNEL(segment_sum, x, node_order, node_offsets, mean, out) {
-  return kernels->segment_sum(a->x.data, n['F'], a->node_order.data, a->node_offsets.data, n['C'], a->mean.integer, a->out.data);
+  return kernels->segment_sum(a->x.data, n['F'], a->node_order.data, a->node_offsets.data, n['C'], a->mean.integer,
+                              a->out.data);
 }
 
 KERNEL(segment_spread, dout, node_order, node_offsets, mean, dx) {
-  return kernels->segment_spread(a->dout.data, n['F'], a->node_order.data, a->node_offsets.data, n['C'], a->mean.integer, a->dx.data);
+  return kernels->segment_spread(a->dout.data, n['F'], a->node_order.data, a->node_offsets.data, n['C'],
+                                 a->mean.integer, a->dx.data);
 }
 
 KERNEL(column_sum, x, out) { return kernels->column_sum(a->x.data, n['N'], n['F'], a->out.data); }
@@ -52,23 +56,37 @@ KERNEL(column_sum, x, out) { return kernels->column_sum(a->x.data, n['N'], n['F'
 /* ---- elastic forces ---- */
 
 KERNEL(elastic_forces, position, rest_position, lame, elements, node_order, node_offsets, force) {
-  const ast_elastic s = {
-      n['N'], n['E'], a->elements.data, a->node_order.data, a->node_offsets.data, a->position.data, a->rest_position.data, a->lame.data};
+  const ast_elastic s = {n['N'],
+                         n['E'],
+                         a->elements.data,
+                         a->node_order.data,
+                         a->node_offsets.data,
+                         a->position.data,
+                         a->rest_position.data,
+                         a->lame.data};
   return kernels->elastic_forces(&s, a->force.data);
 }
 
 KERNEL(elastic_forces_backward, position, rest_position, lame, elements, node_order, node_offsets, dforce, dposition) {
-  const ast_elastic s = {
-      n['N'], n['E'], a->elements.data, a->node_order.data, a->node_offsets.data, a->position.data, a->rest_position.data, a->lame.data};
+  const ast_elastic s = {n['N'],
+                         n['E'],
+                         a->elements.data,
+                         a->node_order.data,
+                         a->node_offsets.data,
+                         a->position.data,
+                         a->rest_position.data,
+                         a->lame.data};
   return kernels->elastic_forces_backward(&s, a->dforce.data, a->dposition.data);
 }
 
 /* ---- octree ---- */
 
-KERNEL(octree, positions, offsets, x, y, z, half_width, depth, keys, cell_offsets, node_cell, node_order, node_offsets) {
+KERNEL(octree, positions, offsets, x, y, z, half_width, depth, keys, cell_offsets, node_cell, node_order,
+       node_offsets) {
   const double center[3] = {a->x.number, a->y.number, a->z.number};
-  return kernels->octree_build(a->positions.data, a->offsets.data, n['B'], center, a->half_width.number, (int)a->depth.integer,
-                               a->keys.data, a->cell_offsets.data, a->node_cell.data, a->node_order.data, a->node_offsets.data, result);
+  return kernels->octree_build(a->positions.data, a->offsets.data, n['B'], center, a->half_width.number,
+                               (int)a->depth.integer, a->keys.data, a->cell_offsets.data, a->node_cell.data,
+                               a->node_order.data, a->node_offsets.data, result);
 }
 
 static bool octree_check(const call *c) {
@@ -90,11 +108,14 @@ static PyObject *octree_result(call *c) {
   const float *p = (const float *)a->positions.data + 3 * bad;
   char place[120], problem[80] = "is not finite";
   snprintf(place, sizeof place, "(%.9g, %.9g, %.9g)", (double)p[0], (double)p[1], (double)p[2]);
-  if (status == AST_OUTSIDE) snprintf(problem, sizeof problem, "lies outside the domain of half width %.9g", a->half_width.number);
+  if (status == AST_OUTSIDE)
+    snprintf(problem, sizeof problem, "lies outside the domain of half width %.9g", a->half_width.number);
   return fail(c, PyExc_ValueError, "positions[%lld] = %s %s", (long long)bad, place, problem), NULL;
 }
 
-KERNEL(octree_coordinates, keys, coordinates) { return kernels->octree_coordinates(a->keys.data, n['C'], a->coordinates.data); }
+KERNEL(octree_coordinates, keys, coordinates) {
+  return kernels->octree_coordinates(a->keys.data, n['C'], a->coordinates.data);
+}
 
 KERNEL(octree_coarsen, keys, cell_offsets, levels) {
   return kernels->octree_coarsen(a->keys.data, a->cell_offsets.data, n['B'], (int)a->levels.integer, result);
@@ -107,11 +128,13 @@ enum { LEVEL_ARRAYS = 9 };
 /* Puts the arrays of a level into the list, from `at` on; false with an exception set if there is no memory. */
 static bool append_level(PyObject *list, const ast_octree_level *level, Py_ssize_t at) {
   const int64_t pairs = level->pair_offsets[27];
-  const int64_t lengths[LEVEL_ARRAYS] = {level->C, level->B + 1, level->C + 1, level->C_fine, 28, pairs, pairs, pairs, pairs};
+  const int64_t lengths[LEVEL_ARRAYS] = {level->C, level->B + 1, level->C + 1, level->C_fine, 28,
+                                         pairs,    pairs,        pairs,        pairs};
   frozen *made[LEVEL_ARRAYS];
   int64_t *data[LEVEL_ARRAYS];
   for (int i = 0; i < LEVEL_ARRAYS; i++) {
-    PyObject *array = (made[i] = new_frozen(lengths[i] * (int64_t)sizeof *data[i])) ? array_of(made[i], 1, &lengths[i]) : NULL;
+    PyObject *array =
+        (made[i] = new_frozen(lengths[i] * (int64_t)sizeof *data[i])) ? array_of(made[i], 1, &lengths[i]) : NULL;
     if (!array || PyList_SetItem(list, at + i, array)) return false;
     data[i] = made[i]->hidden;
     if (debug) memset(data[i], 0xff, (size_t)made[i]->bytes);
@@ -136,7 +159,8 @@ static PyObject *octree_coarsen_result(call *c) {
   PyObject *list = PyList_New((Py_ssize_t)levels * LEVEL_ARRAYS);
   if (!list) return NULL;
   bool ok = run(c, octree_coarsen_run, level, &status);
-  if (ok && status == AST_TOO_LARGE) ok = fail(c, PyExc_ValueError, "keys must be fewer than 2^31, not %lld", (long long)c->size['C']);
+  if (ok && status == AST_TOO_LARGE)
+    ok = fail(c, PyExc_ValueError, "keys must be fewer than 2^31, not %lld", (long long)c->size['C']);
   for (int j = 0; ok && j < levels; j++) ok = append_level(list, &level[j], (Py_ssize_t)j * LEVEL_ARRAYS);
   if (!ok) Py_CLEAR(list);
   return list;
@@ -161,7 +185,8 @@ static bool farthest_point_sample_check(const call *c) {
   const int64_t points = c->size['C'], scenes = c->size['B'], num = a->num.integer, room = c->size['S'];
   const int64_t most = scenes && num <= (points - 1) / scenes ? scenes * num : points;
   if (room >= most) return true;
-  return fail(c, PyExc_ValueError, "indices must have room for %lld samples, not %lld", (long long)most, (long long)room);
+  return fail(c, PyExc_ValueError, "indices must have room for %lld samples, not %lld", (long long)most,
+              (long long)room);
 }
 
 /* The first scene with two coordinates on one axis that differ by 2^21 or more, or -1. */
@@ -194,7 +219,8 @@ static PyObject *farthest_point_sample_result(call *c) {
 /* Transposed, the spec gives the axes of the weight the other way round. */
 KERNEL(sparse_conv, x, weight, bias, transposed, pair_offsets, source, destination, out) {
   const ast_pairs pairs = {a->pair_offsets.data, a->source.data, a->destination.data};
-  return kernels->sparse_conv(a->x.data, a->weight.data, a->bias.data, n['I'], n['O'], a->transposed.integer, pairs, n['R'], a->out.data);
+  return kernels->sparse_conv(a->x.data, a->weight.data, a->bias.data, n['I'], n['O'], a->transposed.integer, pairs,
+                              n['R'], a->out.data);
 }
 
 KERNEL(sparse_conv_weight, x, dout, pair_offsets, source, destination, dweight) {
@@ -227,7 +253,8 @@ static bool attention_check(const call *c) {
   const int64_t D = c->size['D'];
   if (D % 16 || D < 16 || D > 128)
     return fail(c, PyExc_ValueError, "the head dimension must be a multiple of 16 up to 128, not %lld", (long long)D);
-  if (!(a->dropout_p.number >= 0 && a->dropout_p.number < 1)) return fail(c, PyExc_ValueError, "dropout_p must lie in [0, 1)");
+  if (!(a->dropout_p.number >= 0 && a->dropout_p.number < 1))
+    return fail(c, PyExc_ValueError, "dropout_p must lie in [0, 1)");
   return true;
 }
 
@@ -241,13 +268,14 @@ KERNEL(attention_backward, ATTENTION, out, maximum, sum, dout, dq, dk, dv) {
   s.dq_stride = a->dq.row_stride;
   s.dk_stride = a->dk.row_stride;
   s.dv_stride = a->dv.row_stride;
-  return kernels->attention_backward(&s, a->q.data, a->k.data, a->v.data, a->out.data, a->maximum.data, a->sum.data, a->dout.data,
-                                     a->dq.data, a->dk.data, a->dv.data);
+  return kernels->attention_backward(&s, a->q.data, a->k.data, a->v.data, a->out.data, a->maximum.data, a->sum.data,
+                                     a->dout.data, a->dq.data, a->dk.data, a->dv.data);
 }
 
 /* ---- message passing ---- */
 
-#define MESSAGE of_senders, of_receivers, edge_features, A1, a1, A2, W2, b2, gamma, beta, senders, receivers, receiver_offsets
+#define MESSAGE \
+  of_senders, of_receivers, edge_features, A1, a1, A2, W2, b2, gamma, beta, senders, receivers, receiver_offsets
 PARAMETERS(message_inputs, MESSAGE);
 
 static ast_message message_of(const void *arguments, const int64_t *n) {
@@ -278,7 +306,8 @@ static ast_message message_of(const void *arguments, const int64_t *n) {
 static bool message_check(const call *c) {
   const int64_t E = c->size['E'], F = c->size['F'];
   if (c->size['H'] || !E || E == F) return true;
-  return fail(c, PyExc_ValueError, "edge_features without an encoder must have the %lld channels of of_senders, not %lld", (long long)F,
+  return fail(c, PyExc_ValueError,
+              "edge_features without an encoder must have the %lld channels of of_senders, not %lld", (long long)F,
               (long long)E);
 }
 
@@ -287,7 +316,8 @@ KERNEL(message, MESSAGE, sum, messages) {
   return kernels->message(&s, a->sum.data, a->messages.data);
 }
 
-KERNEL(message_backward, MESSAGE, dsum, dmessages, dof_senders, dof_receivers, dedge_features, dA1, da1, dA2, dW2, db2, dgamma, dbeta) {
+KERNEL(message_backward, MESSAGE, dsum, dmessages, dof_senders, dof_receivers, dedge_features, dA1, da1, dA2, dW2, db2,
+       dgamma, dbeta) {
   const ast_message s = message_of(a, n);
   const ast_message_gradients out = {
       a->dof_senders.data, a->dof_receivers.data, a->dedge_features.data, a->dA1.data,  a->da1.data, a->dA2.data,
@@ -300,7 +330,8 @@ KERNEL(message_backward, MESSAGE, dsum, dmessages, dof_senders, dof_receivers, d
 /* O outputs, or P pairs of them. */
 static ast_linear linear_of(const argument *x, const int64_t *n, int64_t activation) {
   const int64_t O = activation == AST_GEGLU ? 2 * n['P'] : n['O'];
-  return (ast_linear){.M = n['M'], .I = n['I'], .O = O, .x_stride = x->row_stride, .activation = (ast_activation)activation};
+  return (ast_linear){
+      .M = n['M'], .I = n['I'], .O = O, .x_stride = x->row_stride, .activation = (ast_activation)activation};
 }
 
 KERNEL(linear, x, weight, bias, residual, activation, out, z) {
@@ -312,8 +343,8 @@ KERNEL(linear, x, weight, bias, residual, activation, out, z) {
 KERNEL(linear_backward, x, weight, bias, z, activation, dout, dx, dweight, dbias) {
   ast_linear s = linear_of(&a->x, n, a->activation.integer);
   s.dout_stride = a->dout.row_stride;
-  return kernels->linear_backward(&s, a->dout.data, a->x.data, a->weight.data, a->bias.data, a->z.data, a->dx.data, a->dweight.data,
-                                  a->dbias.data);
+  return kernels->linear_backward(&s, a->dout.data, a->x.data, a->weight.data, a->bias.data, a->z.data, a->dx.data,
+                                  a->dweight.data, a->dbias.data);
 }
 
 #define MLP x, beside, weight1, bias1, weight2, bias2, gamma, beta
@@ -341,10 +372,12 @@ static ast_mlp mlp_of(const void *arguments, const int64_t *n) {
 KERNEL(mlp, MLP, residual, out, hidden, normalized, scale) {
   ast_mlp s = mlp_of(a, n);
   s.residual_stride = a->residual.row_stride;
-  return kernels->mlp(&s, a->residual.data, a->out.data, (ast_mlp_kept){a->hidden.data, a->normalized.data, a->scale.data});
+  return kernels->mlp(&s, a->residual.data, a->out.data,
+                      (ast_mlp_kept){a->hidden.data, a->normalized.data, a->scale.data});
 }
 
-KERNEL(mlp_backward, MLP, dout, hidden, normalized, scale, dx, dbeside, dweight1, dbias1, dweight2, dbias2, dgamma, dbeta) {
+KERNEL(mlp_backward, MLP, dout, hidden, normalized, scale, dx, dbeside, dweight1, dbias1, dweight2, dbias2, dgamma,
+       dbeta) {
   ast_mlp s = mlp_of(a, n);
   s.dout_stride = a->dout.row_stride;
   const ast_mlp_kept kept = {a->hidden.data, a->normalized.data, a->scale.data};
@@ -363,8 +396,9 @@ typedef struct {
   spec spec;
 } binding;
 
-#define BINDING(name, ...)            BINDING_AS(#name, name, __VA_ARGS__)
-#define BINDING_AS(text, kernel, ...) {.name = text, .parameters = kernel##_parameters, .run = kernel##_run, __VA_ARGS__}
+#define BINDING(name, ...) BINDING_AS(#name, name, __VA_ARGS__)
+#define BINDING_AS(text, kernel, ...) \
+  {.name = text, .parameters = kernel##_parameters, .run = kernel##_run, __VA_ARGS__}
 
 static binding bindings[] = {
     BINDING(attention, .check = attention_check),

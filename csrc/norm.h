@@ -1,10 +1,12 @@
 /* LayerNorm of rows y of n channels, in both directions, for mlp.c and message.c.
  *
  *   u = (y - mean(y)) / sd,   out = gamma . u + beta,                         sd = sqrt(var(y) + eps)
- *   p = gamma . dout,         dy = (p - mean(p) - u mean(p . u)) / sd,        dgamma = sum of dout . u,   dbeta = sum of dout
+ *   p = gamma . dout,         dy = (p - mean(p) - u mean(p . u)) / sd,        dgamma = sum of dout . u,   dbeta = sum
+ * of dout
  *
- * The variance is the mean of squared differences to the mean, in a second pass over a row in the cache. Rows are readable and
- * writable up to whole vectors; `whole`, a constant, says that n is a multiple of VW, so that no vector asks for its tail.
+ * The variance is the mean of squared differences to the mean, in a second pass over a row in the cache. Rows are
+ * readable and writable up to whole vectors; `whole`, a constant, says that n is a multiple of VW, so that no vector
+ * asks for its tail.
  */
 #ifndef AST_NORM_H
 #define AST_NORM_H
@@ -41,9 +43,10 @@ typedef struct {
   float *dgamma, *dbeta, *p;
 } norm_columns;
 
-/* One row: y, from norm_centre, becomes dy. dout and `also`, unless NULL, are added; u is read if it was kept, and y is not then. */
-AST_INLINE void norm_backward(int64_t n, const bool whole, const float *gamma, const float *dout, const float *also, float scale,
-                              const float *u_kept, float *y, const norm_columns *columns) {
+/* One row: y, from norm_centre, becomes dy. dout and `also`, unless NULL, are added; u is read if it was kept, and y is
+ * not then. */
+AST_INLINE void norm_backward(int64_t n, const bool whole, const float *gamma, const float *dout, const float *also,
+                              float scale, const float *u_kept, float *y, const norm_columns *columns) {
   float *dgamma = columns->dgamma, *dbeta = columns->dbeta, *p = columns->p;
   vf sum = {0}, along = {0};
   for (int64_t c = 0; c < n; c += VW) {

@@ -1,10 +1,10 @@
 /* Linear octrees: the cells of points by Morton key.
  *
- * The Morton key of cell (x, y, z) interleaves the bits, x first: ... x1 y1 z1 x0 y0 z0. A shift by 3 is the parent's key, and the
- * cells of any aligned cube of 2^m cells a side are a contiguous run of the sorted keys.
+ * The Morton key of cell (x, y, z) interleaves the bits, x first: ... x1 y1 z1 x0 y0 z0. A shift by 3 is the parent's
+ * key, and the cells of any aligned cube of 2^m cells a side are a contiguous run of the sorted keys.
  *
- * Work is cut into fixed chunks of the flat arrays, whatever the scenes, and every result is an integer that does not depend on the
- * chunks.
+ * Work is cut into fixed chunks of the flat arrays, whatever the scenes, and every result is an integer that does not
+ * depend on the chunks.
  */
 #include <math.h>
 
@@ -64,8 +64,8 @@ static ast_status octree_check_node(const octree_key_job *job, int64_t n) {
   return status;
 }
 
-/* min(floor(u 2^depth), 2^depth - 1) = floor(min(u 2^depth, 2^depth - 1)), and truncation is floor above 0: so the clamp comes
- * first, in double, and no value overflows the conversion, not even NaN. */
+/* min(floor(u 2^depth), 2^depth - 1) = floor(min(u 2^depth, 2^depth - 1)), and truncation is floor above 0: so the
+ * clamp comes first, in double, and no value overflows the conversion, not even NaN. */
 static ast_status octree_key_task(int64_t index, void *context) {
   const octree_key_job *job = context;
   const int64_t end = min64(job->N, (index + 1) * OCTREE_CHUNK);
@@ -119,7 +119,8 @@ static ast_status octree_coordinates(const int64_t *restrict keys, int64_t C, in
 
 /* ---- sort ---- */
 
-/* Rows to sort by key, stably: one word key << index_bits | index where that fits in 64 bits, else a key and an index. */
+/* Rows to sort by key, stably: one word key << index_bits | index where that fits in 64 bits, else a key and an index.
+ */
 typedef struct {
   const int64_t *offsets;
   int64_t N;
@@ -131,8 +132,8 @@ typedef struct {
 enum { OCTREE_MAX_DIGIT = 11, OCTREE_HISTOGRAM = 6 << OCTREE_MAX_DIGIT }; /* 63 bits in 6 digits of 11, or 8 of 8 */
 
 /* One pass of the LSD radix sort, by the digit (key >> shift) & mask; count[d] is where digit d starts. */
-AST_INLINE void octree_scatter(const uint64_t *keys, const uint64_t *nodes, uint64_t *keys_out, uint64_t *nodes_out, int64_t n, int shift,
-                               uint64_t mask, int64_t *count, const bool packed) {
+AST_INLINE void octree_scatter(const uint64_t *keys, const uint64_t *nodes, uint64_t *keys_out, uint64_t *nodes_out,
+                               int64_t n, int shift, uint64_t mask, int64_t *count, const bool packed) {
   for (int64_t i = 0; i < n; i++) {
     const int64_t to = count[keys[i] >> shift & mask]++;
     keys_out[to] = keys[i];
@@ -140,9 +141,10 @@ AST_INLINE void octree_scatter(const uint64_t *keys, const uint64_t *nodes, uint
   }
 }
 
-/* Sorts n rows by the bits low..high-1 of their keys, the only ones that differ. The result is in `keys` (and `nodes`). */
-AST_INLINE ast_status octree_radix_sort(uint64_t *keys, uint64_t *nodes, uint64_t *keys_other, uint64_t *nodes_other, int64_t n, int low,
-                                        int high, const bool packed) {
+/* Sorts n rows by the bits low..high-1 of their keys, the only ones that differ. The result is in `keys` (and `nodes`).
+ */
+AST_INLINE ast_status octree_radix_sort(uint64_t *keys, uint64_t *nodes, uint64_t *keys_other, uint64_t *nodes_other,
+                                        int64_t n, int low, int high, const bool packed) {
   const int max_digit = n < 1 << 12 ? 8 : n < 1 << 20 ? OCTREE_MAX_DIGIT : 9;
   const int passes = (int)divide_up(high - low, max_digit);
   if (!passes) return AST_OK;
@@ -152,7 +154,8 @@ AST_INLINE ast_status octree_radix_sort(uint64_t *keys, uint64_t *nodes, uint64_
   if (!count) return AST_NO_MEMORY;
   memset(count, 0, sizeof *count * (size_t)passes << digit);
   for (int64_t i = 0; i < n; i++)
-    for (int pass = 0; pass < passes; pass++) count[(uint64_t)pass << digit | (keys[i] >> (low + pass * digit) & mask)]++;
+    for (int pass = 0; pass < passes; pass++)
+      count[(uint64_t)pass << digit | (keys[i] >> (low + pass * digit) & mask)]++;
   const uint64_t *const home = keys;
   for (int pass = 0; pass < passes; pass++) {
     const int shift = low + pass * digit;
@@ -245,10 +248,11 @@ static ast_status octree_write_runs_task(int64_t chunk, void *context) {
 }
 
 /* The keys and starts of all runs, starts closed by N, and the first run of each scene. */
-static ast_status octree_runs(const uint64_t *sorted, int shift, const int64_t *offsets, int64_t B, int64_t *keys, int64_t *starts,
-                              int64_t *run_offsets) {
+static ast_status octree_runs(const uint64_t *sorted, int shift, const int64_t *offsets, int64_t B, int64_t *keys,
+                              int64_t *starts, int64_t *run_offsets) {
   const int64_t N = offsets[B], chunks = octree_chunks(N);
-  octree_run_job job = {sorted, shift, offsets, B, N, ast_scratch((chunks + 1) * (int64_t)sizeof(int64_t)), keys, starts};
+  octree_run_job job = {sorted, shift, offsets, B, N, ast_scratch((chunks + 1) * (int64_t)sizeof(int64_t)),
+                        keys,   starts};
   if (!job.chunk_runs) return AST_NO_MEMORY;
   ast_parallel(chunks, octree_count_runs_task, &job);
   int64_t runs = 0;
@@ -290,10 +294,10 @@ static ast_status octree_node_task(int64_t chunk, void *context) {
   return AST_OK;
 }
 
-static ast_status octree_build(const float *restrict positions, const int64_t *restrict offsets, int64_t B, const double center[3],
-                               double half_width, int depth, int64_t *restrict keys, int64_t *restrict cell_offsets,
-                               int64_t *restrict node_cell, int64_t *restrict node_order, int64_t *restrict node_offsets,
-                               int64_t *bad_node) {
+static ast_status octree_build(const float *restrict positions, const int64_t *restrict offsets, int64_t B,
+                               const double center[3], double half_width, int depth, int64_t *restrict keys,
+                               int64_t *restrict cell_offsets, int64_t *restrict node_cell,
+                               int64_t *restrict node_order, int64_t *restrict node_offsets, int64_t *bad_node) {
   AST_SCRATCH_SCOPE;
   const int64_t N = offsets[B];
   memset(cell_offsets, 0, sizeof *cell_offsets * (size_t)(B + 1));
@@ -316,7 +320,8 @@ static ast_status octree_build(const float *restrict positions, const int64_t *r
     return status == AST_OK ? AST_OUTSIDE : status; /* another thread has moved the node since */
   }
   status = ast_parallel(B, octree_sort_task, &sort);
-  if (status == AST_OK) status = octree_runs(sort.keys, packed ? index_bits : 0, offsets, B, keys, node_offsets, cell_offsets);
+  if (status == AST_OK)
+    status = octree_runs(sort.keys, packed ? index_bits : 0, offsets, B, keys, node_offsets, cell_offsets);
   if (status != AST_OK) return status;
   octree_node_job node = {&sort, offsets, cell_offsets, node_offsets, B, cell_offsets[B], node_cell, node_order};
   return ast_parallel(octree_chunks(node.C), octree_node_task, &node);

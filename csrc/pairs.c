@@ -1,12 +1,13 @@
 /* The pairs of the stride-2 convolution between a level of an octree and the next coarser one.
  *
- * Kernel offset k = 9(a+1) + 3(b+1) + (c+1) pairs the coarse cell P with the fine cell 2P + (a,b,c). Along one axis a = 0 if the fine
- * cell is even, and a = +1 (P its parent) or -1 (P the parent's successor) if it is odd. So P pairs with child `octant` of the cell Q at
- * P - (i,j,k) if the octant has the bits d = 4i+2j+k, at (a,b,c) = octant - 2 (i,j,k): a kernel offset is such a pair (octant, d).
+ * Kernel offset k = 9(a+1) + 3(b+1) + (c+1) pairs the coarse cell P with the fine cell 2P + (a,b,c). Along one axis a =
+ * 0 if the fine cell is even, and a = +1 (P its parent) or -1 (P the parent's successor) if it is odd. So P pairs with
+ * child `octant` of the cell Q at P - (i,j,k) if the octant has the bits d = 4i+2j+k, at (a,b,c) = octant - 2 (i,j,k):
+ * a kernel offset is such a pair (octant, d).
  *
- * The pairs of a group are written with P rising, by chunks of P whose places coarsen.c has counted. With d = 0 the fine cell is a child of
- * P and rises too, so the other order is the same. With d > 0 the fine cells of a group are marked in a bit map and read out of it in
- * order.
+ * The pairs of a group are written with P rising, by chunks of P whose places coarsen.c has counted. With d = 0 the
+ * fine cell is a child of P and rises too, so the other order is the same. With d > 0 the fine cells of a group are
+ * marked in a bit map and read out of it in order.
  */
 #include "ast.h"
 #include "simd.h"
@@ -67,7 +68,8 @@ static ast_status octree_sort_pairs_task(int64_t k, void *context) {
 
 static ast_status octree_write_level(const ast_octree_level *level, int64_t *restrict keys, int64_t *restrict offsets,
                                      int64_t *restrict first_child, int64_t *restrict node_cell, int64_t *restrict fine,
-                                     int64_t *restrict coarse, int64_t *restrict fine_by_fine, int64_t *restrict coarse_by_fine) {
+                                     int64_t *restrict coarse, int64_t *restrict fine_by_fine,
+                                     int64_t *restrict coarse_by_fine) {
   octree_pair_job job = {level, keys, first_child, node_cell, fine, coarse, fine_by_fine, coarse_by_fine};
   memcpy(offsets, level->offsets, (size_t)(level->B + 1) * sizeof *offsets);
   first_child[level->C] = level->C_fine;

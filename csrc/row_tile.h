@@ -3,11 +3,12 @@
  *   row_panel:     out_i = base_i + sum_k A_ik B_kj     rows i of A and out by pointer, a panel of B packed (gemm.h)
  *   column_panel:  out_ij = base_ij + sum_k A_ki B_kj   rows k of A and B by pointer, out dense
  *
- * A strip has any number of rows i up to GEMM_ROWS: tiles are cut evenly, since the cut of gemm.h costs 6 to 19 % where 48 pairs come
- * at a time. A panel has up to GEMM_COLUMNS columns j. `base` is out itself or what it starts from (a
- * bias, nothing): so nothing is cleared beforehand, and no product is stored only to be added. The sum over k runs in order for each
- * element alone: its bits do not depend on the strip. Rows that are needed later are fetched a line at a time between the steps of the
- * sum: all at once they would fill the queue of cache misses, and the processor would wait for it.
+ * A strip has any number of rows i up to GEMM_ROWS: tiles are cut evenly, since the cut of gemm.h costs 6 to 19 % where
+ * 48 pairs come at a time. A panel has up to GEMM_COLUMNS columns j. `base` is out itself or what it starts from (a
+ * bias, nothing): so nothing is cleared beforehand, and no product is stored only to be added. The sum over k runs in
+ * order for each element alone: its bits do not depend on the strip. Rows that are needed later are fetched a line at a
+ * time between the steps of the sum: all at once they would fill the queue of cache misses, and the processor would
+ * wait for it.
  */
 #ifndef AST_ROW_TILE_H
 #define AST_ROW_TILE_H
@@ -50,7 +51,8 @@ typedef struct {
   int64_t n;
 } row_fetch;
 
-AST_INLINE void row_tile(const int rows, const int vectors, int64_t K, row_pointers p, row_fetch next, const float *b, int64_t column) {
+AST_INLINE void row_tile(const int rows, const int vectors, int64_t K, row_pointers p, row_fetch next, const float *b,
+                         int64_t column) {
   const float *a[GEMM_ROWS];
   vf sum[GEMM_ROWS][2];
 #pragma GCC unroll 12
@@ -80,10 +82,12 @@ AST_INLINE void row_tile(const int rows, const int vectors, int64_t K, row_point
 #pragma GCC unroll 12
   for (int i = 0; i < rows; i++)
 #pragma GCC unroll 2
-    for (int j = 0; j < vectors; j++) vstore(p.out[i] + column + j * VW, vload(p.base[i] + column + j * VW) + sum[i][j]);
+    for (int j = 0; j < vectors; j++)
+      vstore(p.out[i] + column + j * VW, vload(p.base[i] + column + j * VW) + sum[i][j]);
 }
 
-AST_INLINE void row_strip(const int vectors, int64_t rows, int64_t K, row_pointers p, row_fetch next, const float *b, int64_t column) {
+AST_INLINE void row_strip(const int vectors, int64_t rows, int64_t K, row_pointers p, row_fetch next, const float *b,
+                          int64_t column) {
 #define ROW_CASE(n)                                                      \
   case n:                                                                \
     if ((n) <= GEMM_ROWS) row_tile((n), vectors, K, p, next, b, column); \
@@ -93,7 +97,8 @@ AST_INLINE void row_strip(const int vectors, int64_t rows, int64_t K, row_pointe
 }
 
 /* Columns [column, column + width) of out. */
-static void row_panel(int64_t rows, int64_t width, int64_t K, row_pointers p, row_fetch next, const float *b, int64_t column) {
+static void row_panel(int64_t rows, int64_t width, int64_t K, row_pointers p, row_fetch next, const float *b,
+                      int64_t column) {
   if (width == GEMM_COLUMNS) row_strip(2, rows, K, p, next, b, column);
   else if (width == VW) row_strip(1, rows, K, p, next, b, column);
   if (width % VW == 0) return;
@@ -114,7 +119,8 @@ typedef struct {
   int64_t a_column, b_column, next_column;
 } column_pointers;
 
-AST_INLINE void column_tile(const int rows, const int vectors, int64_t K, column_pointers p, const float *base, float *out, int64_t row) {
+AST_INLINE void column_tile(const int rows, const int vectors, int64_t K, column_pointers p, const float *base,
+                            float *out, int64_t row) {
   vf sum[GEMM_ROWS][2];
 #pragma GCC unroll 12
   for (int i = 0; i < rows; i++)
@@ -143,7 +149,8 @@ AST_INLINE void column_tile(const int rows, const int vectors, int64_t K, column
     }
 }
 
-AST_INLINE void column_strip(const int vectors, int64_t rows, int64_t K, column_pointers p, const float *base, float *out, int64_t row) {
+AST_INLINE void column_strip(const int vectors, int64_t rows, int64_t K, column_pointers p, const float *base,
+                             float *out, int64_t row) {
 #define ROW_CASE(n)                                                        \
   case n:                                                                  \
     if ((n) <= GEMM_ROWS) column_tile((n), vectors, K, p, base, out, row); \
@@ -152,13 +159,16 @@ AST_INLINE void column_strip(const int vectors, int64_t rows, int64_t K, column_
 #undef ROW_CASE
 }
 
-/* `width` columns of out, whose rows are `row` floats apart; rows of B are readable in whole vectors. base is out, or NULL for 0. */
-static void column_panel(int64_t rows, int64_t width, int64_t K, column_pointers p, const float *base, float *out, int64_t row) {
+/* `width` columns of out, whose rows are `row` floats apart; rows of B are readable in whole vectors. base is out, or
+ * NULL for 0. */
+static void column_panel(int64_t rows, int64_t width, int64_t K, column_pointers p, const float *base, float *out,
+                         int64_t row) {
   if (width == GEMM_COLUMNS) column_strip(2, rows, K, p, base, out, row);
   else if (width == VW) column_strip(1, rows, K, p, base, out, row);
   if (width % VW == 0) return;
   float part[GEMM_ROWS * GEMM_COLUMNS] = {0};
-  for (int64_t i = 0; base && i < rows; i++) memcpy(part + i * GEMM_COLUMNS, base + i * row, (size_t)width * sizeof(float));
+  for (int64_t i = 0; base && i < rows; i++)
+    memcpy(part + i * GEMM_COLUMNS, base + i * row, (size_t)width * sizeof(float));
   column_strip(2, rows, K, p, part, part, GEMM_COLUMNS);
   for (int64_t i = 0; i < rows; i++) memcpy(out + i * row, part + i * GEMM_COLUMNS, (size_t)width * sizeof(float));
 }

@@ -3,9 +3,9 @@
  *   segment_sum: out_c = s_c sum_{j in segment c} x_{order(j)}       segment_spread: dx_{order(j)} = s_c dout_c
  *   column_sum:  out = sum_n x_n
  *
- * N rows n, C segments c, F channels; s_c is 1, or 1 over the rows of c. N F operations on 4 (N + C) F bytes: memory is the limit. A
- * segment is summed in the stored order, so the result depends on neither threads nor batch. The sum over all rows goes by blocks of
- * COLUMN_ROWS, whose sums are then added in order.
+ * N rows n, C segments c, F channels; s_c is 1, or 1 over the rows of c. N F operations on 4 (N + C) F bytes: memory is
+ * the limit. A segment is summed in the stored order, so the result depends on neither threads nor batch. The sum over
+ * all rows goes by blocks of COLUMN_ROWS, whose sums are then added in order.
  */
 #include "ast.h"
 #include "simd.h"
@@ -24,17 +24,21 @@ typedef struct {
   float *out;
 } segment_job;
 
-static segment_job segment_plan(const float *x, int64_t F, const int64_t *order, const int64_t *offsets, int64_t C, bool mean, float *out) {
+static segment_job segment_plan(const float *x, int64_t F, const int64_t *order, const int64_t *offsets, int64_t C,
+                                bool mean, float *out) {
   return (segment_job){x, F, C, max64(1, SEGMENT_FLOATS / max64(1, F)), offsets[C] - 1, order, offsets, mean, out};
 }
 
-/* `vectors` vectors of one segment from channel f on: all of a row is read at once, and rows that come later are fetched. */
-AST_INLINE void segment_columns(const int vectors, const segment_job *job, int64_t begin, int64_t end, int64_t f, float scale, float *out) {
+/* `vectors` vectors of one segment from channel f on: all of a row is read at once, and rows that come later are
+ * fetched. */
+AST_INLINE void segment_columns(const int vectors, const segment_job *job, int64_t begin, int64_t end, int64_t f,
+                                float scale, float *out) {
   vf sum[SEGMENT_VECTORS];
 #pragma GCC unroll 8
   for (int v = 0; v < vectors; v++) sum[v] = (vf){0};
   for (int64_t j = begin; j < end; j++) {
-    const float *row = job->x + job->order[j] * job->F + f, *later = job->x + job->order[min64(j + SEGMENT_AHEAD, job->last)] * job->F + f;
+    const float *row = job->x + job->order[j] * job->F + f,
+                *later = job->x + job->order[min64(j + SEGMENT_AHEAD, job->last)] * job->F + f;
 #pragma GCC unroll 8
     for (int v = 0; v < vectors; v++) {
       if (v * VW % 16 == 0) __builtin_prefetch(later + v * VW);
@@ -53,7 +57,8 @@ static ast_status segment_sum_task(int64_t index, void *context) {
     const float scale = job->mean && end > begin ? 1.0f / (float)(end - begin) : 1.0f;
     float *out = job->out + c * F;
     int64_t f = 0;
-    for (; f + SEGMENT_VECTORS * VW <= F; f += SEGMENT_VECTORS * VW) segment_columns(SEGMENT_VECTORS, job, begin, end, f, scale, out);
+    for (; f + SEGMENT_VECTORS * VW <= F; f += SEGMENT_VECTORS * VW)
+      segment_columns(SEGMENT_VECTORS, job, begin, end, f, scale, out);
     for (; f + 4 * VW <= F; f += 4 * VW) segment_columns(4, job, begin, end, f, scale, out);
     for (; f + VW <= F; f += VW) segment_columns(1, job, begin, end, f, scale, out);
     for (; f < F; f++) {
@@ -80,8 +85,8 @@ static ast_status segment_spread_task(int64_t index, void *context) {
   return AST_OK;
 }
 
-static ast_status segment_sum(const float *restrict x, int64_t F, const int64_t *restrict node_order, const int64_t *restrict node_offsets,
-                              int64_t C, bool mean, float *restrict out) {
+static ast_status segment_sum(const float *restrict x, int64_t F, const int64_t *restrict node_order,
+                              const int64_t *restrict node_offsets, int64_t C, bool mean, float *restrict out) {
   segment_job job = segment_plan(x, F, node_order, node_offsets, C, mean, out);
   return ast_parallel(divide_up(C, job.rows), segment_sum_task, &job);
 }

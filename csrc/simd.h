@@ -37,7 +37,8 @@ AST_INLINE vf vload(const float *p) { return *(const vf_unaligned *)p; }
 AST_INLINE void vstore(float *p, vf x) { *(vf_unaligned *)p = x; }
 AST_INLINE vf vsplat(float x) { return x - (vf){0}; } /* x - 0 keeps -0 */
 
-/* The first n < VW floats; the others are 0 and are not read. In pieces of fixed size: a copy of variable size is a call. */
+/* The first n < VW floats; the others are 0 and are not read. In pieces of fixed size: a copy of variable size is a
+ * call. */
 AST_INLINE vf vload_part(const float *p, int64_t n) {
   vf x = {0};
   float *to = (float *)&x;
@@ -117,7 +118,8 @@ AST_INLINE float vsum(vf x) {
 
 /* ---- functions, whose bounds in units in the last place are the table of tests/test_simd.c ---- */
 
-/* ln 2 = LN2 + LN2_REST; LN2 has 17 bits, so that n LN2 is exact for |n| <= 127, with or without FMA (Cody and Waite) */
+/* ln 2 = LN2 + LN2_REST; LN2 has 17 bits, so that n LN2 is exact for |n| <= 127, with or without FMA (Cody and Waite)
+ */
 #if defined(__FMA__) || defined(__ARM_FEATURE_FMA)
 enum { FUSED = 1 }; /* whether a product and a sum are rounded once */
 #else

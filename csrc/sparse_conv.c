@@ -2,14 +2,15 @@
  *
  *   out_q = bias + sum_k sum_{(p,q) in group k} x_p W_k
  *
- * k < 27 kernel offsets, p source and q destination cells, P pairs, I = C_in and O = C_out channels. 2 P I O operations on at most
- * 4 P (I + 2 O) bytes: arithmetic is the limit if rows come in time. Only pairs that exist are touched; a row without pairs is the bias.
+ * k < 27 kernel offsets, p source and q destination cells, P pairs, I = C_in and O = C_out channels. 2 P I O operations
+ * on at most 4 P (I + 2 O) bytes: arithmetic is the limit if rows come in time. Only pairs that exist are touched; a
+ * row without pairs is the bias.
  *
- * W_k is packed into panels once a call. A task owns a range of destinations (and, where there are few, some of the columns). In each
- * group its pairs are a contiguous run, since destinations rise. It takes them tile by tile: rows of x are multiplied where they lie,
- * and the products added to the rows of out, or to the bias at a row's first contribution, while the rows of the next tile are fetched.
- * Groups follow in ascending order and a sum over I is never split: the bits of a row depend on neither the ranges, the threads nor the
- * other scenes.
+ * W_k is packed into panels once a call. A task owns a range of destinations (and, where there are few, some of the
+ * columns). In each group its pairs are a contiguous run, since destinations rise. It takes them tile by tile: rows of
+ * x are multiplied where they lie, and the products added to the rows of out, or to the bias at a row's first
+ * contribution, while the rows of the next tile are fetched. Groups follow in ascending order and a sum over I is cut
+ * by I alone: the bits of a row depend on neither the ranges, the threads nor the other scenes.
  *
  * The gradient with respect to x is the same kernel with the lists exchanged and W_k^T.
  */
@@ -20,9 +21,10 @@
 
 enum {
   OFFSETS = 27,
-  PAIR_TILE = 48,    /* pairs at a time: 24 KB at 128 channels, beside 16 KB of a panel of weights in L1 */
-  TASK_PAIRS = 4096, /* pairs a task, about: fewer would read the weights too often */
-  LEAST_TASKS = 8    /* however few pairs there are */
+  PAIR_TILE = 48,      /* pairs at a time: 24 KB at 128 channels, beside 16 KB of a panel of weights in L1 */
+  TASK_PAIRS = 4096,   /* pairs a task, about: fewer would read the weights too often */
+  LEAST_TASKS = 8,     /* however few pairs there are */
+  CHAIN_CHANNELS = 512 /* products of one chain at most: their rounding errors grow with their number */
 };
 
 typedef struct {
@@ -72,13 +74,15 @@ static conv_walk conv_start(const ast_pairs *pairs, int64_t first, int64_t last)
   return w;
 }
 
-/* Rows of a tile, in memory that need not hold them yet; base is the bias where out has no contribution before this one, else out. */
+/* Rows of a tile, in memory that need not hold them yet; base is the bias where out has no contribution before this
+ * one, else out. */
 typedef struct {
   const float *x[PAIR_TILE], *base[PAIR_TILE];
   float *out[PAIR_TILE];
 } conv_rows;
 
-static void conv_point(const conv_job *job, const conv_walk *tile, int64_t first_row, const float *bias, uint8_t *seen, conv_rows *r) {
+static void conv_point(const conv_job *job, const conv_walk *tile, int64_t first_row, const float *bias, uint8_t *seen,
+                       conv_rows *r) {
   for (int64_t i = 0; i < tile->n; i++) {
     const int64_t q = job->pairs.destination[tile->first + i];
     r->x[i] = job->x + job->pairs.source[tile->first + i] * job->C_in;
@@ -88,19 +92,32 @@ static void conv_point(const conv_job *job, const conv_walk *tile, int64_t first
   }
 }
 
-/* Multiplies the rows of a tile strip by strip and panel by panel, while those of the next are fetched. */
-static void conv_tile(const conv_job *job, const conv_walk *tile, const conv_rows *rows, const conv_walk *next, const conv_rows *next_rows,
-                      int64_t column, int64_t columns) {
-  const int64_t C_in = job->C_in, C_out = job->C_out, n = tile->n;
-  const float *weight = job->packed + tile->k * gemm_packed_size(C_in, C_out);
-  const int64_t strips = row_strips(n), parts = strips * (divide_up(columns, GEMM_COLUMNS));
+/* The products of channels first.. of the rows of a tile, strip by strip and panel by panel, while the rows of the next
+ * are fetched. */
+static void conv_chain(const conv_job *job, const conv_walk *tile, const conv_rows *rows, const conv_walk *next,
+                       const conv_rows *next_rows, int64_t first, int64_t column, int64_t columns) {
+  const int64_t C_in = job->C_in, C_out = job->C_out, n = tile->n, K = min64(C_in - first, CHAIN_CHANNELS);
+  const float *weight = job->packed + tile->k * gemm_packed_size(C_in, C_out) + first * GEMM_COLUMNS;
+  const int64_t strips = row_strips(n), parts = strips * divide_up(columns, GEMM_COLUMNS);
   for (int64_t c = column, part = 0; c < column + columns; c += GEMM_COLUMNS)
     for (int64_t strip = 0; strip < strips; strip++, part++) {
       const int64_t i = n * strip / strips, f = next->n * part / parts, f_end = next->n * (part + 1) / parts;
       const row_pointers pointers = {rows->x + i, rows->base + i, rows->out + i};
       const row_fetch fetch = {next_rows->x + f, next_rows->out + f, f_end - f};
-      row_panel(n * (strip + 1) / strips - i, min64(GEMM_COLUMNS, C_out - c), C_in, pointers, fetch, weight + c * C_in, c);
+      row_panel(n * (strip + 1) / strips - i, min64(GEMM_COLUMNS, C_out - c), K, pointers, fetch, weight + c * C_in, c);
     }
+}
+
+/* All channels of a tile, as chains of products: out holds their sum so far, so that each but the first starts from
+ * there. */
+static void conv_tile(const conv_job *job, const conv_walk *tile, conv_rows *rows, const conv_walk *next,
+                      const conv_rows *next_rows, int64_t column, int64_t columns) {
+  conv_chain(job, tile, rows, next, next_rows, 0, column, columns);
+  const conv_walk none = {0};
+  for (int64_t first = CHAIN_CHANNELS; first < job->C_in; first += CHAIN_CHANNELS) {
+    for (int64_t i = 0; i < tile->n; i++) rows->x[i] += CHAIN_CHANNELS, rows->base[i] = rows->out[i];
+    conv_chain(job, tile, rows, &none, next_rows, first, column, columns);
+  }
 }
 
 static ast_status conv_task(int64_t index, void *context) {
@@ -129,13 +146,14 @@ static ast_status conv_task(int64_t index, void *context) {
   return AST_OK;
 }
 
-/* Sizes of the tasks. Where there are few pairs, ranges of rows (each reads all weights) and of columns (each reads all pairs) make
- * up LEAST_TASKS so that the least is read. */
+/* Sizes of the tasks. Where there are few pairs, ranges of rows (each reads all weights) and of columns (each reads all
+ * pairs) make up LEAST_TASKS so that the least is read. */
 static void conv_cut(conv_job *job) {
   const int64_t num_pairs = job->pairs.offsets[OFFSETS], panels = divide_up(job->C_out, GEMM_COLUMNS);
   int64_t row_tasks = num_pairs / TASK_PAIRS, column_tasks = 1;
   if (row_tasks < LEAST_TASKS) {
-    while (column_tasks < min64(panels, LEAST_TASKS) && column_tasks * num_pairs < LEAST_TASKS / 2 / column_tasks * OFFSETS * job->C_out)
+    while (column_tasks < min64(panels, LEAST_TASKS) &&
+           column_tasks * num_pairs < LEAST_TASKS / 2 / column_tasks * OFFSETS * job->C_out)
       column_tasks *= 2;
     row_tasks = LEAST_TASKS / column_tasks;
   }
@@ -145,8 +163,9 @@ static void conv_cut(conv_job *job) {
   job->column_tasks = divide_up(job->C_out, job->columns);
 }
 
-static ast_status sparse_conv(const float *restrict x, const float *restrict weight, const float *restrict bias, int64_t C_in,
-                              int64_t C_out, bool transposed, ast_pairs pairs, int64_t num_out, float *restrict out) {
+static ast_status sparse_conv(const float *restrict x, const float *restrict weight, const float *restrict bias,
+                              int64_t C_in, int64_t C_out, bool transposed, ast_pairs pairs, int64_t num_out,
+                              float *restrict out) {
   AST_SCRATCH_SCOPE;
   if (num_out == 0 || C_out == 0) return AST_OK;
   float *packed = ast_scratch(OFFSETS * gemm_packed_size(C_in, C_out) * (int64_t)sizeof *packed);

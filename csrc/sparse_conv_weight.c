@@ -2,12 +2,12 @@
  *
  *   dW_k = sum_{(p,q) in group k} x_p^T dout_q
  *
- * k < 27 kernel offsets, p source and q destination cells, P pairs, I = C_in and O = C_out channels. 2 P I O operations on
- * 4 P (I + O) bytes, O again for each further CHANNEL_BLOCK of I.
+ * k < 27 kernel offsets, p source and q destination cells, P pairs, I = C_in and O = C_out channels. 2 P I O operations
+ * on 4 P (I + O) bytes, O again for each further CHANNEL_BLOCK of I.
  *
- * A group is cut evenly into parts by its size alone. A task owns a part, and a block of rows of its dW_k: it adds tile after
- * tile of pairs to sums that stay in the cache, while the rows of the next tile are fetched. The parts of a group are then added in order:
- * the bits depend on the pairs, not on the threads.
+ * A group is cut evenly into parts by its size alone. A task owns a part, and a block of rows of its dW_k: it adds tile
+ * after tile of pairs to sums that stay in the cache, while the rows of the next tile are fetched. The parts of a group
+ * are then added in order: the bits depend on the pairs, not on the threads.
  */
 #include "ast.h"
 #include "row_tile.h"
@@ -35,7 +35,8 @@ typedef struct {
   int64_t n;
 } conv_weight_tile;
 
-static void conv_weight_point(const conv_weight_job *job, int64_t block, int64_t first, int64_t end, conv_weight_tile *tile) {
+static void conv_weight_point(const conv_weight_job *job, int64_t block, int64_t first, int64_t end,
+                              conv_weight_tile *tile) {
   tile->n = max64(0, min64(WEIGHT_TILE, end - first));
   for (int64_t i = 0; i < tile->n; i++) {
     tile->x[i] = job->x + job->pairs.source[first + i] * job->C_in + block;
@@ -44,8 +45,8 @@ static void conv_weight_point(const conv_weight_job *job, int64_t block, int64_t
 }
 
 /* sum [rows,C_out] (+)= x^T dout over the pairs of a tile. */
-static void conv_weight_add_tile(const conv_weight_tile *tile, const conv_weight_tile *next, int64_t rows, int64_t C_out, bool add,
-                                 float *sum) {
+static void conv_weight_add_tile(const conv_weight_tile *tile, const conv_weight_tile *next, int64_t rows,
+                                 int64_t C_out, bool add, float *sum) {
   const int64_t strips = row_strips(rows), x_lines = divide_up(rows, LINE), lines = x_lines + divide_up(C_out, LINE);
   float tail[WEIGHT_TILE][GEMM_COLUMNS];
   const float *tail_rows[WEIGHT_TILE];
@@ -102,8 +103,8 @@ static ast_status conv_weight_join_task(int64_t index, void *context) {
   return AST_OK;
 }
 
-static ast_status sparse_conv_weight(const float *restrict x, const float *restrict dout, int64_t C_in, int64_t C_out, ast_pairs pairs,
-                                     float *restrict dweight) {
+static ast_status sparse_conv_weight(const float *restrict x, const float *restrict dout, int64_t C_in, int64_t C_out,
+                                     ast_pairs pairs, float *restrict dweight) {
   AST_SCRATCH_SCOPE;
   if (C_in == 0 || C_out == 0) return AST_OK;
   conv_weight_job job = {.x = x, .dout = dout, .C_in = C_in, .C_out = C_out, .pairs = pairs, .dweight = dweight};

@@ -28,7 +28,8 @@ struct argument;
 
 /* Looks at the values of an index array: `bound` is the dimension that the spec names, `others` are the arrays that it
  * names. */
-typedef bool (*check_function)(const struct call *c, const struct argument *a, int64_t bound, const struct argument *const others[2]);
+typedef bool (*check_function)(const struct call *c, const struct argument *a, int64_t bound,
+                               const struct argument *const others[2]);
 
 typedef struct {
   check_function function;
@@ -61,7 +62,8 @@ typedef struct {
 } named_check;
 
 static bool read_dimension(PyObject *tuple, dimension *d) {
-  return PyArg_ParseTuple(tuple, "sLLCLC", &d->text, &d->constant, &d->factor[0], &d->letter[0], &d->factor[1], &d->letter[1]) &&
+  return PyArg_ParseTuple(tuple, "sLLCLC", &d->text, &d->constant, &d->factor[0], &d->letter[0], &d->factor[1],
+                          &d->letter[1]) &&
          d->letter[0] < LETTERS && d->letter[1] < LETTERS;
 }
 
@@ -76,8 +78,8 @@ static bool read_check(PyObject *tuple, const named_check *known, value_check *c
 
 static bool read_parameter(PyObject *tuple, const named_check *known, parameter *p) {
   PyObject *shape, *checks;
-  if (!PyArg_ParseTuple(tuple, "siippppLLiiOO", &p->name, &p->kind, &p->type, &p->optional, &p->output, &p->rows, &p->filled, &p->low,
-                        &p->high, &p->with, &p->needs, &shape, &checks))
+  if (!PyArg_ParseTuple(tuple, "siippppLLiiOO", &p->name, &p->kind, &p->type, &p->optional, &p->output, &p->rows,
+                        &p->filled, &p->low, &p->high, &p->with, &p->needs, &shape, &checks))
     return false;
   p->ndim = (int)PyTuple_Size(shape), p->num_checks = (int)PyTuple_Size(checks);
   bool ok = p->ndim <= MAX_SHAPE && p->num_checks <= MAX_CHECKS;

@@ -53,7 +53,8 @@ static void view_of_array(PyArrayObject *array, view *v) {
               .item = PyArray_ITEMSIZE(array),
               .native = PyArray_ISBEHAVED_RO(array),
               .writeable = PyArray_ISWRITEABLE(array)};
-  for (int d = 0; d < v->ndim && d < MAX_SHAPE; d++) v->shape[d] = PyArray_DIM(array, d), v->stride[d] = PyArray_STRIDE(array, d);
+  for (int d = 0; d < v->ndim && d < MAX_SHAPE; d++)
+    v->shape[d] = PyArray_DIM(array, d), v->stride[d] = PyArray_STRIDE(array, d);
 }
 
 /* ---- the part of DLPack's interface (dlpack.h, version 1) that takes a look at a tensor ---- */

@@ -2,12 +2,13 @@
  *
  *   out_ij = act(sum_k a_ik W_jk + bias_j) + residual_ij,   i < rows, k < K, j < N
  *
- * W is packed once a call into panels of GEMM_COLUMNS outputs, padded with zeros; all tasks read the same panels. Panels go by
- * while a block of some 100 rows of A stays in the cache, and what follows the product happens in its registers, so that every
- * output is written once. For GEGLU a panel holds VW outputs of the first half of W beside the same ones of the second half.
+ * W is packed once a call into panels of GEMM_COLUMNS outputs, padded with zeros; all tasks read the same panels.
+ * Panels go by while a block of some 100 rows of A stays in the cache, and what follows the product happens in its
+ * registers, so that every output is written once. For GEGLU a panel holds VW outputs of the first half of W beside the
+ * same ones of the second half.
  *
- * An element is a sum of chains of multiply-adds over rising k, cut by K and N alone, then the bias, whatever tile it falls into: a row's
- * result depends on neither its place, the batch nor the threads.
+ * An element is a sum of chains of multiply-adds over rising k, cut by K and N alone, then the bias, whatever tile it
+ * falls into: a row's result depends on neither its place, the batch nor the threads.
  */
 #ifndef AST_WEIGHT_PANELS_H
 #define AST_WEIGHT_PANELS_H
@@ -37,7 +38,8 @@ typedef struct {
   float *panels_bias; /* [panels][GEMM_COLUMNS] */
 } dense_layer;
 
-/* y = x W^T + bias with W [N,K], and dx = dy W of N of its columns, with W [K,row]; a NULL weight leaves the layer out. */
+/* y = x W^T + bias with W [N,K], and dx = dy W of N of its columns, with W [K,row]; a NULL weight leaves the layer out.
+ */
 AST_INLINE dense_layer dense_forward(const float *weight, const float *bias, int64_t K, int64_t N) {
   return (dense_layer){.weight = weight, .row = 1, .column = K, .bias = bias, .K = K, .N = N};
 }
@@ -83,8 +85,10 @@ static ast_status dense_pack(dense_layer *layers, int64_t num) {
   int64_t size = 0, panels = 0;
   for (int64_t i = 0; i < num; i++) {
     if (!layers[i].weight) layers[i].N = 0;
-    const int64_t outputs = layers[i].paired ? 2 * layers[i].N : layers[i].N; /* as for both halves in one: z has the same bits */
-    const int64_t most = outputs > DENSE_FEW ? DENSE_DEPTH : DENSE_SHALLOW, chains = max64(1, divide_up(layers[i].K, most));
+    const int64_t outputs =
+        layers[i].paired ? 2 * layers[i].N : layers[i].N; /* as for both halves in one: z has the same bits */
+    const int64_t most = outputs > DENSE_FEW ? DENSE_DEPTH : DENSE_SHALLOW,
+                  chains = max64(1, divide_up(layers[i].K, most));
     layers[i].depth = divide_up(layers[i].K, chains);
     size += dense_packed_size(&layers[i]);
     panels += dense_panels(&layers[i]);
@@ -109,7 +113,8 @@ typedef struct {
 
 /* The rows from `first` on of an array of M rows, as many as a block has */
 AST_INLINE dense_next dense_rows_from(const float *data, int64_t row, int64_t columns, int64_t first, int64_t M) {
-  return data && first < M ? (dense_next){data + first * row, row, min64(DENSE_ROWS, M - first), columns} : (dense_next){0};
+  return data && first < M ? (dense_next){data + first * row, row, min64(DENSE_ROWS, M - first), columns}
+                           : (dense_next){0};
 }
 
 enum { DENSE_NEXT = 2 };
@@ -127,9 +132,11 @@ typedef struct {
   dense_next next[DENSE_NEXT];
 } dense_end;
 
-/* What follows the product of a tile in the seldom cases: halves of a panel, z, columns from j on of which not all n are real. */
-static __attribute__((noinline)) void dense_finish(const dense_layer *l, const dense_end *e, int64_t rows, int64_t vectors, int64_t i,
-                                                   int64_t j, int64_t n, const float *sums, const float *bias) {
+/* What follows the product of a tile in the seldom cases: halves of a panel, z, columns from j on of which not all n
+ * are real. */
+static __attribute__((noinline)) void dense_finish(const dense_layer *l, const dense_end *e, int64_t rows,
+                                                   int64_t vectors, int64_t i, int64_t j, int64_t n, const float *sums,
+                                                   const float *bias) {
   for (const int64_t end = i + rows; i < end; i++, sums += GEMM_COLUMNS) {
     if (l->paired) {
       const vf a = vload(sums) + vload(bias), b = vload(sums + VW) + vload(bias + VW);
@@ -154,8 +161,8 @@ static __attribute__((noinline)) void dense_finish(const dense_layer *l, const d
 }
 
 /* The same in the usual cases, in the registers of the tile: rows from i on, whole vectors from column j on. */
-AST_INLINE void dense_finish_tile(const int rows, const int vectors, const dense_end *e, int64_t i0, int64_t j, const float *bias,
-                                  vf z[GEMM_ROWS][2]) {
+AST_INLINE void dense_finish_tile(const int rows, const int vectors, const dense_end *e, int64_t i0, int64_t j,
+                                  const float *bias, vf z[GEMM_ROWS][2]) {
   TILE_EACH(i, v) z[i][v] += vload(bias + v * VW);
   if (e->activation == AST_RELU) TILE_EACH(i, v) z[i][v] = vmax((vf){0}, z[i][v]);
   if (e->hidden) {
@@ -170,23 +177,32 @@ AST_INLINE void dense_finish_tile(const int rows, const int vectors, const dense
   TILE_EACH(i, v) vstore(out + i * e->out_row + v * VW, z[i][v]);
 }
 
-/* One register tile: rows i.. of panel p. A long sum over k is one of short ones, in the stack between two of them. */
-AST_INLINE void dense_tile(const int rows, const int vectors, const dense_layer *l, int64_t p, int64_t i0, gemm_a a, const dense_end *e) {
+/* sum_ij = sum_k a_ik W_jk for a register tile, chain after chain, their sum in the stack between two of them. */
+AST_INLINE void dense_sums(const int rows, const int vectors, const dense_layer *l, gemm_a a, const float *panel,
+                           vf sum[GEMM_ROWS][2]) {
+  float sums[GEMM_ROWS * GEMM_COLUMNS] __attribute__((aligned(64)));
+  for (int64_t k = 0;;) { /* once without inputs, too: the sums are then 0 */
+    TILE_EACH(i, v) sum[i][v] = (vf){0};
+    gemm_sums(rows, vectors, min64(l->depth, l->K - k), (gemm_a){a.data + k * a.column, a.row, a.column},
+              panel + k * GEMM_COLUMNS, GEMM_COLUMNS, sum);
+    if (k) TILE_EACH(i, v) sum[i][v] += vload(sums + i * GEMM_COLUMNS + v * VW);
+    k += l->depth;
+    if (k >= l->K) break;
+    TILE_EACH(i, v) vstore(sums + i * GEMM_COLUMNS + v * VW, sum[i][v]);
+    __asm__(""
+            : "+m"(sums)); /* or the compiler moves what is not yet known of them through other stack for every tile */
+  }
+}
+
+/* One register tile: rows i.. of panel p. */
+AST_INLINE void dense_tile(const int rows, const int vectors, const dense_layer *l, int64_t p, int64_t i0, gemm_a a,
+                           const dense_end *e) {
   const int64_t j = p * dense_panel_width(l);
   const float *panel = l->panels + p * l->K * GEMM_COLUMNS, *bias = l->panels_bias + p * GEMM_COLUMNS;
   float sums[GEMM_ROWS * GEMM_COLUMNS] __attribute__((aligned(64)));
   TILE_EACH(i, v) __builtin_prefetch(e->out + (i0 + i) * e->out_row + j + v * VW, 1);
   vf sum[GEMM_ROWS][2];
-  for (int64_t k = 0;;) { /* once without inputs, too: the sums are then 0 */
-    TILE_EACH(i, v) sum[i][v] = (vf){0};
-    const gemm_a part = {a.data + i0 * a.row + k * a.column, a.row, a.column};
-    gemm_sums(rows, vectors, min64(l->depth, l->K - k), part, panel + k * GEMM_COLUMNS, GEMM_COLUMNS, sum);
-    if (k) TILE_EACH(i, v) sum[i][v] += vload(sums + i * GEMM_COLUMNS + v * VW);
-    k += l->depth;
-    if (k >= l->K) break;
-    TILE_EACH(i, v) vstore(sums + i * GEMM_COLUMNS + v * VW, sum[i][v]);
-    __asm__("" : "+m"(sums)); /* or the compiler moves what is not yet known of them through other stack for every tile */
-  }
+  dense_sums(rows, vectors, l, (gemm_a){a.data + i0 * a.row, a.row, a.column}, panel, sum);
   if (!l->paired && !e->z && l->N - j >= vectors * VW) {
     dense_finish_tile(rows, vectors, e, i0, j, bias, sum);
     return;
@@ -202,7 +218,8 @@ AST_INLINE void dense_fetch(const dense_next *next, int64_t p, int64_t panels, i
     for (int64_t k = begin; k < end; k++) __builtin_prefetch(next->data + i * next->row + 16 * k, 0, 2);
 }
 
-AST_INLINE void dense_strip(const int vectors, const dense_layer *l, int64_t p, int64_t rows, gemm_a a, const dense_end *e) {
+AST_INLINE void dense_strip(const int vectors, const dense_layer *l, int64_t p, int64_t rows, gemm_a a,
+                            const dense_end *e) {
 #define DENSE_TILE(rows)                                                               \
   do {                                                                                 \
     for (int n = 0; n < DENSE_NEXT && (rows) == GEMM_ROWS; n++)                        \
@@ -227,7 +244,9 @@ static void dense_rows(const dense_layer *l, int64_t first, int64_t last, int64_
 }
 
 /* All of the layer. */
-static void dense_all(const dense_layer *l, int64_t rows, gemm_a a, dense_end e) { dense_rows(l, 0, dense_panels(l), rows, a, e); }
+static void dense_all(const dense_layer *l, int64_t rows, gemm_a a, dense_end e) {
+  dense_rows(l, 0, dense_panels(l), rows, a, e);
+}
 
 /* ---- what the gradients need ---- */
 
@@ -237,7 +256,8 @@ static void dense_copy_rows(const float *from, int64_t from_row, int64_t rows, i
     for (int64_t j = 0; j < n; j += VW) vstore(to + i * to_row + j, vload_upto(from + i * from_row + j, n - j));
 }
 
-/* sums[j] += sum_i x_ij, n padded to whole vectors: four short chains over the rows first, so that long sums stay accurate */
+/* sums[j] += sum_i x_ij, n padded to whole vectors: four short chains over the rows first, so that long sums stay
+ * accurate */
 static void dense_add_rows(const float *x, int64_t row, int64_t rows, int64_t n, float *sums) {
   for (int64_t j = 0; j < n; j += VW) {
     vf chain[4] = {{0}};
@@ -278,7 +298,9 @@ typedef struct {
 
 enum { DENSE_SUM_ROWS = 16 };
 
-AST_INLINE int64_t dense_sum_tasks(const dense_sum *target) { return target->to ? divide_up(target->rows, DENSE_SUM_ROWS) : 0; }
+AST_INLINE int64_t dense_sum_tasks(const dense_sum *target) {
+  return target->to ? divide_up(target->rows, DENSE_SUM_ROWS) : 0;
+}
 
 static ast_status dense_sum_task(int64_t index, void *context) {
   const dense_sum_job *job = context;

@@ -1,10 +1,10 @@
 /* Buffers beside pages that must not be touched: a read or write past an end stops the program.
  *
- *   slack | data | guard     as a rule: the last byte lies before a guard page, whatever the alignment of the data is then
- *   guard | data | slack     with buffers_at_start: aligned to a page, and an index of -1 faults
+ *   slack | data | guard     as a rule: the last byte lies before a guard page, whatever the alignment of the data is
+ * then guard | data | slack     with buffers_at_start: aligned to a page, and an index of -1 faults
  *
- * The slack up to a whole page holds a pattern that is checked when the buffer is freed. READ_ONLY makes the pages of inputs
- * read-only for a call, so that a write to an input stops the program, too.
+ * The slack up to a whole page holds a pattern that is checked when the buffer is freed. READ_ONLY makes the pages of
+ * inputs read-only for a call, so that a write to an input stops the program, too.
  */
 #ifndef AST_BUFFERS_H
 #define AST_BUFFERS_H
@@ -65,8 +65,8 @@ static void free_buffers(const void *const *data, size_t num) {
     if (!data[i]) continue;
     buffer *b = buffer_of(data[i]);
     for (const char *c = b->pages; c < b->pages + b->pages_size; c++)
-      CHECK((c >= b->data && c < b->data + b->size) || *(const unsigned char *)c == SLACK_PATTERN, "written %td bytes from a buffer of %zu",
-            c - b->data, b->size);
+      CHECK((c >= b->data && c < b->data + b->size) || *(const unsigned char *)c == SLACK_PATTERN,
+            "written %td bytes from a buffer of %zu", c - b->data, b->size);
     CHECK(!munmap(b->map, b->map_size), "munmap");
     *b = buffers[--num_buffers];
   }
@@ -92,6 +92,8 @@ static float *scaled_floats(int64_t n, float amplitude) {
   for (int64_t i = 0; i < n; i++) x[i] *= amplitude;
   return x;
 }
-static int64_t *copy_ints(const int64_t *values, int64_t n) { return memcpy(new_ints(n), values, (size_t)n * sizeof *values); }
+static int64_t *copy_ints(const int64_t *values, int64_t n) {
+  return memcpy(new_ints(n), values, (size_t)n * sizeof *values);
+}
 
 #endif

@@ -46,13 +46,14 @@ static void check_accuracy(const char *what, const float *got, const double *exa
     plain_error = fmax(plain_error, fabs((double)plain[i] - exact[i]));
     largest = fmax(largest, fabs(exact[i]));
   }
-  CHECK(error <= 2 * plain_error + 1e-6 * largest, "%s is off by %g of %g, plain float by %g", what, error, largest, plain_error);
+  CHECK(error <= 2 * plain_error + 1e-6 * largest, "%s is off by %g of %g, plain float by %g", what, error, largest,
+        plain_error);
 }
 
 enum { CHECK_THREADS = 4 };
 
-/* Runs `test` on every table of kernels that this processor supports: on the calling thread, with buffers that end at a page,
- * and on a pool, with buffers that start at one. */
+/* Runs `test` on every table of kernels that this processor supports: on the calling thread, with buffers that end at a
+ * page, and on a pool, with buffers that start at one. */
 static void on_every_table(void (*test)(const ast_kernels *)) {
   static const char *const names[] = {"base", "avx2", "avx512"};
   for (int i = 0; i < 3; i++) {

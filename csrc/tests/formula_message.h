@@ -5,11 +5,13 @@
 
 static void FORMULA(const ast_message *s, const float *dsum, const float *dmessages, real *const *out) {
   const int64_t E = s->E, H = s->H, F = s->F, F2 = s->F2;
-  real *h = calloc((size_t)(2 * H + 2 * F + 2 * F2 + 1), sizeof *h), *x = h + H, *u = x + F, *dy = u + F2, *dz = dy + F2;
+  real *h = calloc((size_t)(2 * H + 2 * F + 2 * F2 + 1), sizeof *h), *x = h + H, *u = x + F, *dy = u + F2,
+       *dz = dy + F2;
   real *dc = dz + F;
   CHECK(h, "no memory");
   for (int64_t m = 0; m < s->M; m++) {
-    const float *e = s->edge_features + m * E, *p = s->of_senders + s->senders[m] * F, *q = s->of_receivers + s->receivers[m] * F;
+    const float *e = s->edge_features + m * E, *p = s->of_senders + s->senders[m] * F,
+                *q = s->of_receivers + s->receivers[m] * F;
     for (int64_t i = 0; i < H; i++) {
       h[i] = (real)s->a1[i];
       for (int64_t k = 0; k < E; k++) h[i] += (real)s->A1[i * E + k] * (real)e[k];

@@ -1,8 +1,9 @@
 /* What the fuzz targets share: the bytes of an input become a table of kernels, sizes, offsets and numbers.
  *
- * Arrays are random numbers of a seed that the input holds, with single elements replaced by what follows. Inputs are short: one that
- * has ended goes on as its first byte says, so that no part of a problem waits for inputs to grow. A target includes the test of its
- * kernel for the exact results, defines fuzz(kernels), and keeps its seeds in corpus/<kernel>. `make fuzz` runs all of them.
+ * Arrays are random numbers of a seed that the input holds, with single elements replaced by what follows. Inputs are
+ * short: one that has ended goes on as its first byte says, so that no part of a problem waits for inputs to grow. A
+ * target includes the test of its kernel for the exact results, defines fuzz(kernels), and keeps its seeds in
+ * corpus/<kernel>. `make fuzz` runs all of them.
  */
 #ifndef AST_FUZZ_H
 #define AST_FUZZ_H
@@ -14,8 +15,12 @@
 static void fuzz(const ast_kernels *kernels);
 
 static const uint8_t *fuzz_next, *fuzz_end;
-static enum { ZEROS, BYTES, MODERATE } fuzz_rest; /* after the end: zeros, random bytes, or these with arrays of moderate numbers alone */
-static uint64_t fuzz_state;                       /* of the random bytes: at first a hash of the input */
+static enum {
+  ZEROS,
+  BYTES,
+  MODERATE
+} fuzz_rest;                /* after the end: zeros, random bytes, or these with arrays of moderate numbers alone */
+static uint64_t fuzz_state; /* of the random bytes: at first a hash of the input */
 
 static uint8_t take_byte(void) {
   if (fuzz_next < fuzz_end) return *fuzz_next++;
@@ -30,7 +35,8 @@ static uint64_t take_word(int bytes) {
 
 /* 0..most: any small number, or one at the edge of a block */
 static int64_t take_size(int64_t most) {
-  static const int64_t edges[] = {15, 16, 17, 31, 32, 33, 63, 64, 65, 95, 96, 97, 127, 128, 129, 255, 256, 257, 300, 511, 512, 513, 600};
+  static const int64_t edges[] = {15,  16,  17,  31,  32,  33,  63,  64,  65,  95,  96, 97,
+                                  127, 128, 129, 255, 256, 257, 300, 511, 512, 513, 600};
   const int num = sizeof edges / sizeof *edges, byte = take_byte();
   const int64_t size = byte < 256 - num ? byte % 40 : edges[byte - (256 - num)];
   return size <= most ? size : size % (most + 1);
@@ -40,7 +46,9 @@ static int64_t take_size(int64_t most) {
 static bool take_chance(void) { return take_byte() % 16 == 15; }
 
 /* n, or fewer if they would cost more than `budget` at `cost` each */
-static int64_t within(int64_t budget, int64_t cost, int64_t n) { return cost > 0 && n > budget / cost ? budget / cost : n; }
+static int64_t within(int64_t budget, int64_t cost, int64_t n) {
+  return cost > 0 && n > budget / cost ? budget / cost : n;
+}
 
 static int64_t take_index(int64_t n) { return (int64_t)(take_word(2) % (uint64_t)n); }
 
@@ -53,8 +61,9 @@ static int64_t *take_offsets(int64_t B, int64_t most) {
 }
 
 static float take_float(void) {
-  static const float values[] = {0.0f,     -0.0f,       1.0f,   -1.0f,   NAN,   INFINITY, -INFINITY, FLT_MAX, -FLT_MAX, FLT_MIN,
-                                 -FLT_MIN, 1.4013e-45f, 1e-40f, -1e-40f, 1e30f, -1e30f,   1e-30f,    0.5f,    1e19f,    -1e19f};
+  static const float values[] = {0.0f,    -0.0f,    1.0f,    -1.0f,    NAN,         INFINITY, -INFINITY,
+                                 FLT_MAX, -FLT_MAX, FLT_MIN, -FLT_MIN, 1.4013e-45f, 1e-40f,   -1e-40f,
+                                 1e30f,   -1e30f,   1e-30f,  0.5f,     1e19f,       -1e19f};
   enum { VALUES = sizeof values / sizeof *values };
   const uint8_t byte = take_byte();
   if (byte < VALUES) return values[byte];

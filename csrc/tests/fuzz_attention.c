@@ -9,12 +9,15 @@
 
 static void check_alone(const ast_kernels *kernels, const problem *a, const answer *batch, int64_t b) {
   const int64_t row = a->H * a->D, q0 = a->q_offsets[b], k0 = a->k_offsets[b];
-  problem one = {.B = 1, .H = a->H, .D = a->D, .Tq = a->q_offsets[b + 1] - q0, .Tk = a->k_offsets[b + 1] - k0, .p = a->p};
+  problem one = {
+      .B = 1, .H = a->H, .D = a->D, .Tq = a->q_offsets[b + 1] - q0, .Tk = a->k_offsets[b + 1] - k0, .p = a->p};
   one.q_offsets[1] = one.Tq, one.k_offsets[1] = one.Tk;
   one.q = a->q + q0 * row, one.k = a->k + k0 * row, one.v = a->v + k0 * row, one.dout = a->dout + q0 * row;
   answer alone = solve(kernels, &one);
-  CHECK(same_floats(alone.out, batch->out + q0 * row, one.Tq * row) && same_floats(alone.dq, batch->dq + q0 * row, one.Tq * row) &&
-            same_floats(alone.dk, batch->dk + k0 * row, one.Tk * row) && same_floats(alone.dv, batch->dv + k0 * row, one.Tk * row) &&
+  CHECK(same_floats(alone.out, batch->out + q0 * row, one.Tq * row) &&
+            same_floats(alone.dq, batch->dq + q0 * row, one.Tq * row) &&
+            same_floats(alone.dk, batch->dk + k0 * row, one.Tk * row) &&
+            same_floats(alone.dv, batch->dv + k0 * row, one.Tk * row) &&
             same_floats(alone.maximum, batch->maximum + q0 * a->H, one.Tq * a->H) &&
             same_floats(alone.sum, batch->sum + q0 * a->H, one.Tq * a->H),
         "scene %lld differs alone and in a batch", (long long)b);
@@ -34,7 +37,8 @@ static void check_strides(const ast_kernels *kernels, const problem *a, const an
   const int64_t row = a->H * a->D, stride = row + gap;
   ast_attention s = sizes_of(a);
   s.q_stride = s.k_stride = s.v_stride = s.dq_stride = s.dk_stride = s.dv_stride = stride;
-  float *q = apart(a->q, a->Tq, row, stride), *k = apart(a->k, a->Tk, row, stride), *v = apart(a->v, a->Tk, row, stride);
+  float *q = apart(a->q, a->Tq, row, stride), *k = apart(a->k, a->Tk, row, stride),
+        *v = apart(a->v, a->Tk, row, stride);
   problem wide = *a; /* with room for gradients of such rows */
   wide.Tq += a->Tq * gap / row + 1, wide.Tk += a->Tk * gap / row + 1;
   answer r = solve_rows(kernels, &wide, s, q, k, v);
@@ -48,8 +52,8 @@ static void check_strides(const ast_kernels *kernels, const problem *a, const an
 
 static void compare_values(const char *what, const float *got, const double *exact, int64_t n, double bound) {
   for (int64_t i = 0; i < n; i++)
-    CHECK(isfinite(exact[i]) ? fabs((double)got[i] - exact[i]) <= bound : !isfinite(got[i]), "%s[%lld] is %g, not %g within %g", what,
-          (long long)i, (double)got[i], exact[i], bound);
+    CHECK(isfinite(exact[i]) ? fabs((double)got[i] - exact[i]) <= bound : !isfinite(got[i]),
+          "%s[%lld] is %g, not %g within %g", what, (long long)i, (double)got[i], exact[i], bound);
 }
 
 /* error: that of a weight, relative, from the rounding of its score */
@@ -60,7 +64,8 @@ static void check_values(const problem *a, const answer *r) {
   const double error = 2e-7 * (D + 8) * score + 1e-7 * (double)(a->Tk + a->Tq + 16), gain = 1 / (1 - fmin(a->p, 0.99));
   const double slope = 4 * gain * D * y * v * scale; /* of dS */
   if (!(score < 40 && v < 1e10 && y < 1e10 && q < 1e10 && k < 1e10)) return;
-  double *out = calloc((size_t)(2 * queries + 2 * keys + a->Tq * a->H + 1), sizeof *out), *dq = out + queries, *dk = dq + queries;
+  double *out = calloc((size_t)(2 * queries + 2 * keys + a->Tq * a->H + 1), sizeof *out), *dq = out + queries,
+         *dk = dq + queries;
   double *dv = dk + keys, *lse = dv + keys;
   CHECK(out, "no memory");
   formula(a, out, lse, dq, dk, dv);
@@ -73,11 +78,12 @@ static void check_values(const problem *a, const answer *r) {
 
 enum { COST = 1 << 19 }; /* pairs of a query and a key, times channels, about */
 
-/* Scenes of any sizes, or, first, one so long in queries or in keys that it is cut over them. What their pairs cost is saved on heads,
- * then on channels. */
+/* Scenes of any sizes, or, first, one so long in queries or in keys that it is cut over them. What their pairs cost is
+ * saved on heads, then on channels. */
 static problem take_problem(void) {
   static const double rates[] = {0, 0, 0.1, 0.9, 1e-9, 0.999999, 0.5, 0};
-  problem a = {.B = take_size(5), .H = 1 + take_byte() % 3, .D = 16 * (1 + take_byte() % 8), .p = rates[take_byte() % 8]};
+  problem a = {
+      .B = take_size(5), .H = 1 + take_byte() % 3, .D = 16 * (1 + take_byte() % 8), .p = rates[take_byte() % 8]};
   const int shape = take_byte() % 16;
   int64_t pairs = 0;
   for (int64_t b = 0; b < a.B; b++) {
@@ -92,7 +98,8 @@ static problem take_problem(void) {
   while (pairs * a.H * a.D > COST && a.H > 1) a.H--;
   while (pairs * a.H * a.D > COST && a.D > 16) a.D -= 16;
   const int64_t row = a.H * a.D;
-  a.q = take_floats(a.Tq * row), a.k = take_floats(a.Tk * row), a.v = take_floats(a.Tk * row), a.dout = take_floats(a.Tq * row);
+  a.q = take_floats(a.Tq * row), a.k = take_floats(a.Tk * row), a.v = take_floats(a.Tk * row),
+  a.dout = take_floats(a.Tq * row);
   return a;
 }
 

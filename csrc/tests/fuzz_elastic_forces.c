@@ -1,5 +1,5 @@
-/* Fuzzes elastic_forces and its gradient: any numbers and any corners. Elements in another order, each alone at its nodes, give the same
- * bits; without stiffness they give exactly nothing. */
+/* Fuzzes elastic_forces and its gradient: any numbers and any corners. Elements in another order, each alone at its
+ * nodes, give the same bits; without stiffness they give exactly nothing. */
 #include "fuzz.h"
 
 /* The corners by node, ascending. */
@@ -15,7 +15,8 @@ static void sort_corners(ast_elastic *s) {
 }
 
 /* Forces and changes [4E,3] at corners that have a node each. */
-static void scatter(const ast_kernels *kernels, const ast_elastic *s, const float *direction, float *force, float *change) {
+static void scatter(const ast_kernels *kernels, const ast_elastic *s, const float *direction, float *force,
+                    float *change) {
   ast_elastic apart = {.N = 4 * s->E, .E = s->E, .lame = s->lame};
   int64_t *elements = new_ints(4 * s->E);
   float *of[3];
@@ -44,7 +45,8 @@ static void fuzz(const ast_kernels *kernels) {
   float *lame = take_floats(2 * s.E), *direction = take_floats(3 * s.N);
   for (int64_t i = 0; !stiff && i < 2 * s.E; i++) lame[i] = 0;
   s.lame = lame, s.position = take_floats(3 * s.N), s.rest_position = take_floats(3 * s.N);
-  float *force = new_floats(3 * s.N), *change = new_floats(3 * s.N), *at_corners = new_floats(12 * s.E), *changes = new_floats(12 * s.E);
+  float *force = new_floats(3 * s.N), *change = new_floats(3 * s.N), *at_corners = new_floats(12 * s.E),
+        *changes = new_floats(12 * s.E);
   READ_ONLY(s.elements, s.node_order, s.node_offsets, s.lame, s.position, s.rest_position, direction);
   CHECK(kernels->elastic_forces(&s, force) == AST_OK, "status");
   CHECK(kernels->elastic_forces_backward(&s, direction, change) == AST_OK, "status");
@@ -59,5 +61,6 @@ static void fuzz(const ast_kernels *kernels) {
     CHECK(same_floats(&sum_of_changes, change + i, 1), "change %lld is %g", (long long)i, (double)change[i]);
     CHECK(stiff || (force[i] == 0 && change[i] == 0), "without stiffness %lld is %g", (long long)i, (double)force[i]);
   }
-  FREE(s.elements, s.node_order, s.node_offsets, s.lame, s.position, s.rest_position, direction, force, change, at_corners, changes);
+  FREE(s.elements, s.node_order, s.node_offsets, s.lame, s.position, s.rest_position, direction, force, change,
+       at_corners, changes);
 }

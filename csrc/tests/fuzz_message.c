@@ -1,5 +1,6 @@
-/* Fuzzes message and its gradients: the gradients that are not sums over edges, and the messages, of a scene alone are those in a
- * batch to the bit; where all values are moderate, sum and messages are those of the formula in double within a loose bound. */
+/* Fuzzes message and its gradients: the gradients that are not sums over edges, and the messages, of a scene alone are
+ * those in a batch to the bit; where all values are moderate, sum and messages are those of the formula in double
+ * within a loose bound. */
 #define main tests_of_message
 #include "test_message.c"
 #undef main
@@ -17,19 +18,25 @@ static void check_part(const ast_kernels *kernels, const ast_message *s, const f
   for (int64_t r = 0; r <= part.R; r++) part_offsets[r] = offsets[first + r] - edge;
   part.senders += edge, part.edge_features += edge * s->E, part.of_receivers += first * s->F;
   part.receivers = receivers, part.receiver_offsets = part_offsets;
-  const message_results r = solve_message(kernels, &part, dsum + first * s->F2, dmessages ? dmessages + edge * s->F2 : NULL);
-  CHECK(same_floats(r.of[SUM], all->of[SUM] + first * s->F2, part.R * s->F2), "sum of receivers from %lld on", (long long)first);
-  CHECK(same_floats(r.of[MESSAGES], all->of[MESSAGES] + edge * s->F2, part.M * s->F2), "messages from %lld on", (long long)edge);
+  const message_results r =
+      solve_message(kernels, &part, dsum + first * s->F2, dmessages ? dmessages + edge * s->F2 : NULL);
+  CHECK(same_floats(r.of[SUM], all->of[SUM] + first * s->F2, part.R * s->F2), "sum of receivers from %lld on",
+        (long long)first);
+  CHECK(same_floats(r.of[MESSAGES], all->of[MESSAGES] + edge * s->F2, part.M * s->F2), "messages from %lld on",
+        (long long)edge);
   CHECK(same_floats(r.of[Q], all->of[Q] + first * s->F, part.R * s->F), "dof_receivers from %lld on", (long long)first);
-  CHECK(same_floats(r.of[EDGES], all->of[EDGES] + edge * s->E, part.M * s->E), "dedge_features from %lld on", (long long)edge);
+  CHECK(same_floats(r.of[EDGES], all->of[EDGES] + edge * s->E, part.M * s->E), "dedge_features from %lld on",
+        (long long)edge);
   free_message_results(r);
   FREE(receivers, part_offsets);
 }
 
 /* A LayerNorm magnifies errors by at most 1 / sqrt(eps) < 320. */
 static void check_values(const ast_message *s, const float *dsum, const float *dmessages, const message_results *r) {
-  const int64_t sizes[] = {s->S * s->F, s->R * s->F, s->M * s->E, s->H * s->E, s->H, s->F * s->H, s->F2 * s->F, s->F2, s->F2, s->F2};
-  const float *const inputs[] = {s->of_senders, s->of_receivers, s->edge_features, s->A1, s->a1, s->A2, s->W2, s->b2, s->gamma, s->beta};
+  const int64_t sizes[] = {s->S * s->F, s->R * s->F,  s->M * s->E, s->H * s->E, s->H,
+                           s->F * s->H, s->F2 * s->F, s->F2,       s->F2,       s->F2};
+  const float *const inputs[] = {s->of_senders, s->of_receivers, s->edge_features, s->A1,  s->a1, s->A2,
+                                 s->W2,         s->b2,           s->gamma,         s->beta};
   double most[10];
   bool finite = all_finite(dsum, s->R * s->F2) && (!dmessages || all_finite(dmessages, s->M * s->F2));
   for (int i = 0; i < 10; i++) {
@@ -49,8 +56,8 @@ static void check_values(const ast_message *s, const float *dsum, const float *d
   formula(s, dsum, dmessages, exact);
   for (int i = SUM; i <= MESSAGES; i++)
     for (int64_t j = 0; j < r->size[i]; j++)
-      CHECK(fabs((double)r->of[i][j] - exact[i][j]) <= error * (i == SUM ? (double)s->M + 1 : 1), "%s[%lld] is %g, not %g", names[i],
-            (long long)j, (double)r->of[i][j], exact[i][j]);
+      CHECK(fabs((double)r->of[i][j] - exact[i][j]) <= error * (i == SUM ? (double)s->M + 1 : 1),
+            "%s[%lld] is %g, not %g", names[i], (long long)j, (double)r->of[i][j], exact[i][j]);
   for (int i = 0; i < MESSAGE_RESULTS; i++) free(exact[i]);
 }
 
@@ -72,7 +79,8 @@ static void fuzz(const ast_kernels *kernels) {
     senders[m] = (int64_t)(random_bits() % (uint64_t)s.S);
   }
   s.senders = senders, s.receivers = receivers, s.receiver_offsets = offsets;
-  s.of_senders = take_floats(s.S * s.F), s.of_receivers = take_floats(s.R * s.F), s.edge_features = take_floats(s.M * s.E);
+  s.of_senders = take_floats(s.S * s.F), s.of_receivers = take_floats(s.R * s.F),
+  s.edge_features = take_floats(s.M * s.E);
   s.A1 = take_floats(s.H * s.E), s.a1 = take_floats(s.H), s.A2 = take_floats(s.F * s.H), s.W2 = take_floats(s.F2 * s.F);
   s.b2 = take_floats(s.F2), s.gamma = take_floats(s.F2), s.beta = take_floats(s.F2);
   const float *dsum = take_floats(s.R * s.F2), *dmessages = with_messages ? take_floats(s.M * s.F2) : NULL;

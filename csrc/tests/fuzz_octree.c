@@ -17,7 +17,8 @@ static int64_t first_bad(cloud s, const double center[3], double half_width) {
 
 static void fuzz_build(const ast_kernels *kernels) {
   const int64_t B = take_size(6);
-  const bool many = take_chance(); /* nodes, so that they are cut into chunks; few levels of them, as each is checked cell by cell */
+  const bool many =
+      take_chance(); /* nodes, so that they are cut into chunks; few levels of them, as each is checked cell by cell */
   const int depth = take_byte() % (many ? 7 : 22), shape = take_byte() % SHAPES;
   double center[3], half_width = 1;
   cloud s = {0, B, take_offsets(B, 300), NULL};
@@ -42,10 +43,10 @@ static void fuzz_build(const ast_kernels *kernels) {
     tree t = new_tree(s.N, B);
     int64_t node = -1;
     READ_ONLY(s.positions, s.offsets);
-    const ast_status status = kernels->octree_build(s.positions, s.offsets, B, center, half_width, depth, t.keys, t.cell_offsets,
-                                                    t.node_cell, t.node_order, t.node_offsets, &node);
-    CHECK(status == (finite ? AST_OUTSIDE : AST_NOT_FINITE) && node == bad, "status %d at %lld, not %lld", (int)status, (long long)node,
-          (long long)bad);
+    const ast_status status = kernels->octree_build(s.positions, s.offsets, B, center, half_width, depth, t.keys,
+                                                    t.cell_offsets, t.node_cell, t.node_order, t.node_offsets, &node);
+    CHECK(status == (finite ? AST_OUTSIDE : AST_NOT_FINITE) && node == bad, "status %d at %lld, not %lld", (int)status,
+          (long long)node, (long long)bad);
     free_tree(t);
   }
   free_cloud(s);

@@ -1,5 +1,5 @@
-/* Fuzzes segment_sum and segment_spread: sums in stored order are exact in float arithmetic, whatever the values. And column_sum: a column
- * alone gives the bits that it gives among others, within the rounding of its terms. */
+/* Fuzzes segment_sum and segment_spread: sums in stored order are exact in float arithmetic, whatever the values. And
+ * column_sum: a column alone gives the bits that it gives among others, within the rounding of its terms. */
 #include "fuzz.h"
 
 static void fuzz_segments(const ast_kernels *kernels) {
@@ -25,7 +25,8 @@ static void fuzz_segments(const ast_kernels *kernels) {
       float sum = 0;
       for (int64_t j = offsets[c]; j < offsets[c + 1]; j++) sum += x[order[j] * F + f];
       sum *= scale;
-      CHECK(same_floats(&sum, out + c * F + f, 1), "segment %lld: %g, not %g", (long long)c, (double)out[c * F + f], (double)sum);
+      CHECK(same_floats(&sum, out + c * F + f, 1), "segment %lld: %g, not %g", (long long)c, (double)out[c * F + f],
+            (double)sum);
       sum *= scale;
       for (int64_t j = offsets[c]; j < offsets[c + 1]; j++)
         CHECK(same_floats(&sum, back + order[j] * F + f, 1), "row %lld", (long long)order[j]);
@@ -45,7 +46,8 @@ static void fuzz_columns(const ast_kernels *kernels) {
     for (int64_t n = 0; n < N; n++) sum += (double)x[n * F + f], magnitude += fabs((double)x[n * F + f]);
     if (magnitude <= (double)FLT_MAX) {
       const double bound = 6e-8 * (double)(N + 2) * magnitude;
-      CHECK(fabs((double)out[f] - sum) <= bound, "column %lld: %g, not %g within %g", (long long)f, (double)out[f], sum, bound);
+      CHECK(fabs((double)out[f] - sum) <= bound, "column %lld: %g, not %g within %g", (long long)f, (double)out[f], sum,
+            bound);
     } else if (!isfinite(sum)) {
       CHECK(!isfinite(out[f]), "column %lld is %g, not %g", (long long)f, (double)out[f], sum);
     }

@@ -31,9 +31,11 @@ static void *pool_work(void *index) {
   }
 }
 
-static int32_t pool_for(int64_t begin, int64_t end, int64_t grain, void (*body)(int64_t, int64_t, void *), void *context) {
+static int32_t pool_for(int64_t begin, int64_t end, int64_t grain, void (*body)(int64_t, int64_t, void *),
+                        void *context) {
   (void)grain;
-  CHECK(begin < end && end - begin <= the_pool.threads, "%lld tasks for %u threads", (long long)(end - begin), the_pool.threads);
+  CHECK(begin < end && end - begin <= the_pool.threads, "%lld tasks for %u threads", (long long)(end - begin),
+        the_pool.threads);
   the_pool.begin = begin, the_pool.end = end, the_pool.body = body, the_pool.context = context;
   pthread_barrier_wait(&the_pool.start);
   body(begin, begin + 1, context);
@@ -50,8 +52,10 @@ static int32_t pool_threads(uint32_t *num) {
 static void pool_start(uint32_t threads) {
   CHECK(threads >= 1 && threads <= MOST_THREADS, "%u threads", threads);
   the_pool.threads = threads, the_pool.stopped = false;
-  CHECK(!pthread_barrier_init(&the_pool.start, NULL, threads) && !pthread_barrier_init(&the_pool.finish, NULL, threads), "no barrier");
-  for (uint32_t i = 1; i < threads; i++) CHECK(!pthread_create(&the_pool.thread[i], NULL, pool_work, (void *)(intptr_t)i), "no thread");
+  CHECK(!pthread_barrier_init(&the_pool.start, NULL, threads) && !pthread_barrier_init(&the_pool.finish, NULL, threads),
+        "no barrier");
+  for (uint32_t i = 1; i < threads; i++)
+    CHECK(!pthread_create(&the_pool.thread[i], NULL, pool_work, (void *)(intptr_t)i), "no thread");
   ast_set_pool(pool_for, pool_threads);
 }
 

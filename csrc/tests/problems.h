@@ -15,8 +15,8 @@ static ast_pairs copy_pairs(const int64_t *offsets, const int64_t *source, const
 }
 #define PAIR_BUFFERS(p) (p)->offsets, (p)->source, (p)->destination
 
-/* A destination has a pair in a group with the given probability; its source is any row of the same part of the rows, of
- * which there are `parts` (the scenes of a batch). */
+/* A destination has a pair in a group with the given probability; its source is any row of the same part of the rows,
+ * of which there are `parts` (the scenes of a batch). */
 static ast_pairs random_pairs(int64_t sources, int64_t destinations, double density, int64_t parts) {
   int64_t *source = malloc((size_t)(OFFSETS * destinations + 1) * sizeof *source), offsets[OFFSETS + 1] = {0}, n = 0;
   int64_t *destination = malloc((size_t)(OFFSETS * destinations + 1) * sizeof *destination);
@@ -24,7 +24,8 @@ static ast_pairs random_pairs(int64_t sources, int64_t destinations, double dens
   for (int k = 0; k < OFFSETS; k++) {
     for (int64_t d = 0; d < destinations; d++) {
       if (sources < parts || random_unit() >= density || k == 5) continue; /* group 5 is empty */
-      const int64_t part = d * parts / destinations, first = part * sources / parts, last = (part + 1) * sources / parts;
+      const int64_t part = d * parts / destinations, first = part * sources / parts,
+                    last = (part + 1) * sources / parts;
       source[n] = first + (int64_t)(random_bits() % (uint64_t)(last - first));
       destination[n++] = d;
     }
@@ -37,8 +38,10 @@ static ast_pairs random_pairs(int64_t sources, int64_t destinations, double dens
 
 /* ---- message passing ---- */
 
-/* M edges whose ends lie in the same of `parts` parts of S senders and R receivers (the scenes of a batch), and random weights. */
-static ast_message new_message(int64_t M, int64_t S, int64_t R, int64_t E, int64_t H, int64_t F, int64_t F2, int64_t parts) {
+/* M edges whose ends lie in the same of `parts` parts of S senders and R receivers (the scenes of a batch), and random
+ * weights. */
+static ast_message new_message(int64_t M, int64_t S, int64_t R, int64_t E, int64_t H, int64_t F, int64_t F2,
+                               int64_t parts) {
   int64_t *senders = new_ints(M), *receivers = new_ints(M), *offsets = new_ints(R + 1);
   memset(offsets, 0, (size_t)(R + 1) * sizeof *offsets);
   for (int64_t m = 0; m < M; m++) offsets[m * R / M + 1]++; /* about the same number each, */
@@ -77,9 +80,9 @@ static ast_message new_message(int64_t M, int64_t S, int64_t R, int64_t E, int64
   };
 }
 
-#define MESSAGE_BUFFERS(s)                                                                                                                \
-  (s)->senders, (s)->receivers, (s)->receiver_offsets, (s)->of_senders, (s)->of_receivers, (s)->edge_features, (s)->A1, (s)->a1, (s)->A2, \
-      (s)->W2, (s)->b2, (s)->gamma, (s)->beta
+#define MESSAGE_BUFFERS(s)                                                                                     \
+  (s)->senders, (s)->receivers, (s)->receiver_offsets, (s)->of_senders, (s)->of_receivers, (s)->edge_features, \
+      (s)->A1, (s)->a1, (s)->A2, (s)->W2, (s)->b2, (s)->gamma, (s)->beta
 
 /* What message gives, and the ten gradients of message_backward. */
 enum { MESSAGE_RESULTS = 12, SUM = 0, MESSAGES, P, Q, EDGES, A1, B1, A2, W2, B2, GAMMA, BETA };
@@ -90,8 +93,8 @@ typedef struct {
 } message_results;
 
 static message_results new_message_results(const ast_message *s) {
-  message_results r = {.size = {s->R * s->F2, s->M * s->F2, s->S * s->F, s->R * s->F, s->M * s->E, s->H * s->E, s->H, s->F * s->H,
-                                s->F2 * s->F, s->F2, s->F2, s->F2}};
+  message_results r = {.size = {s->R * s->F2, s->M * s->F2, s->S * s->F, s->R * s->F, s->M * s->E, s->H * s->E, s->H,
+                                s->F * s->H, s->F2 * s->F, s->F2, s->F2, s->F2}};
   for (int i = 0; i < MESSAGE_RESULTS; i++) r.of[i] = new_floats(r.size[i]);
   return r;
 }
@@ -104,7 +107,8 @@ static void free_message_results(message_results r) {
 }
 
 /* Both directions. */
-static message_results solve_message(const ast_kernels *kernels, const ast_message *s, const float *dsum, const float *dmessages) {
+static message_results solve_message(const ast_kernels *kernels, const ast_message *s, const float *dsum,
+                                     const float *dmessages) {
   const message_results r = new_message_results(s);
   const ast_message_gradients gradients = gradients_of(&r);
   READ_ONLY(MESSAGE_BUFFERS(s), dsum, dmessages);
@@ -116,10 +120,11 @@ static message_results solve_message(const ast_kernels *kernels, const ast_messa
 
 /* ---- elastic forces ---- */
 
-/* E elements in cubes of a grid of about E / 5 nodes, whose nodes are moved by up to a fifth of a cube: none is flat. Some nodes have no
- * element. */
+/* E elements in cubes of a grid of about E / 5 nodes, whose nodes are moved by up to a fifth of a cube: none is flat.
+ * Some nodes have no element. */
 static ast_elastic new_elastic(int64_t E, float scale) {
-  static const int steps[6][2] = {{1, 2}, {1, 4}, {2, 1}, {2, 4}, {4, 1}, {4, 2}}; /* from a corner of a cube to the opposite one */
+  static const int steps[6][2] = {{1, 2}, {1, 4}, {2, 1},
+                                  {2, 4}, {4, 1}, {4, 2}}; /* from a corner of a cube to the opposite one */
   int64_t side = 2;
   while (side * side * side * 5 < E) side++;
   const int64_t N = side * side * side;
@@ -133,7 +138,8 @@ static ast_elastic new_elastic(int64_t E, float scale) {
   for (int64_t e = 0; e < E; e++) {
     const int *step = steps[random_bits() % 6];
     int64_t cube = 0;
-    for (int64_t a = 0, width = 1; a < 3; a++, width *= side) cube += (int64_t)(random_bits() % (uint64_t)(side - 1)) * width;
+    for (int64_t a = 0, width = 1; a < 3; a++, width *= side)
+      cube += (int64_t)(random_bits() % (uint64_t)(side - 1)) * width;
     for (int corner = 0; corner < 4; corner++) {
       const int bits = corner == 3 ? 7 : corner == 2 ? step[0] + step[1] : corner == 1 ? step[0] : 0;
       elements[4 * e + corner] = cube + (bits & 1) + (bits >> 1 & 1) * side + (bits >> 2) * side * side;
@@ -149,6 +155,7 @@ static ast_elastic new_elastic(int64_t E, float scale) {
   return (ast_elastic){N, E, elements, order, offsets, position, rest, lame};
 }
 
-#define ELASTIC_BUFFERS(s) (s)->elements, (s)->node_order, (s)->node_offsets, (s)->position, (s)->rest_position, (s)->lame
+#define ELASTIC_BUFFERS(s) \
+  (s)->elements, (s)->node_order, (s)->node_offsets, (s)->position, (s)->rest_position, (s)->lame
 
 #endif

@@ -1,11 +1,13 @@
 /* attention and attention_backward against the formula in double, on every instruction set, serial and on a pool.
  *
- * Accuracy: the largest error is at most twice that of the same formula in plain float plus 1e-6 of the largest value; four
- * times for scores of 1e4, where the rounding of a few scores is all that counts.
+ * Accuracy: the largest error is at most twice that of the same formula in plain float plus 1e-6 of the largest value;
+ * four times for scores of 1e4, where the rounding of a few scores is all that counts.
  */
 #include "check.h"
 
-static bool same_bits(const void *a, const void *b, int64_t floats) { return memcmp(a, b, (size_t)floats * sizeof(float)) == 0; }
+static bool same_bits(const void *a, const void *b, int64_t floats) {
+  return memcmp(a, b, (size_t)floats * sizeof(float)) == 0;
+}
 
 typedef struct {
   int64_t B, H, D, Tq, Tk;
@@ -18,7 +20,8 @@ typedef struct {
   float *out, *maximum, *sum, *dq, *dk, *dv;
 } answer;
 
-static problem new_problem(int64_t B, const int64_t *queries, const int64_t *keys, int64_t H, int64_t D, float amplitude, double p) {
+static problem new_problem(int64_t B, const int64_t *queries, const int64_t *keys, int64_t H, int64_t D,
+                           float amplitude, double p) {
   problem a = {.B = B, .H = H, .D = D, .p = p};
   for (int64_t b = 0; b < B; b++) {
     a.q_offsets[b + 1] = a.Tq += queries[b];
@@ -56,18 +59,22 @@ static answer new_answer(const problem *a) {
 }
 
 /* Both directions, on q, k and v with rows of their own strides. */
-static answer solve_rows(const ast_kernels *kernels, const problem *a, ast_attention s, const float *q, const float *k, const float *v) {
+static answer solve_rows(const ast_kernels *kernels, const problem *a, ast_attention s, const float *q, const float *k,
+                         const float *v) {
   const answer r = new_answer(a);
   s.q_offsets = copy_ints(a->q_offsets, a->B + 1), s.k_offsets = copy_ints(a->k_offsets, a->B + 1);
   READ_ONLY(q, k, v, a->dout, s.q_offsets, s.k_offsets);
   CHECK(kernels->attention(&s, q, k, v, r.out, r.maximum, r.sum) == AST_OK, "status");
   READ_ONLY(r.out, r.maximum, r.sum);
-  CHECK(kernels->attention_backward(&s, q, k, v, r.out, r.maximum, r.sum, a->dout, r.dq, r.dk, r.dv) == AST_OK, "status");
+  CHECK(kernels->attention_backward(&s, q, k, v, r.out, r.maximum, r.sum, a->dout, r.dq, r.dk, r.dv) == AST_OK,
+        "status");
   WRITABLE(q, k, v, a->dout);
   FREE(s.q_offsets, s.k_offsets);
   return r;
 }
-static answer solve(const ast_kernels *kernels, const problem *a) { return solve_rows(kernels, a, sizes_of(a), a->q, a->k, a->v); }
+static answer solve(const ast_kernels *kernels, const problem *a) {
+  return solve_rows(kernels, a, sizes_of(a), a->q, a->k, a->v);
+}
 
 static void free_problem(problem a) { FREE(a.q, a.k, a.v, a.dout); }
 static void free_answer(answer r) { FREE(r.out, r.maximum, r.sum, r.dq, r.dk, r.dv); }
@@ -108,12 +115,14 @@ static double dropout_factor(const ast_attention *s, int64_t scene, int64_t head
 #define FORMULA formula_float
 #include "formula_attention.h"
 
-static void compare(const char *what, const float *got, const double *exact, const float *plain, int64_t n, double factor) {
+static void compare(const char *what, const float *got, const double *exact, const float *plain, int64_t n,
+                    double factor) {
   double error = 0, plain_error = 0, largest = 0;
   for (int64_t i = 0; i < n; i++) {
     if (!isfinite(exact[i])) {
       const float expected = (float)exact[i];
-      CHECK(isnan(expected) ? isnan(got[i]) : got[i] == expected, "%s[%lld] is %g, not %g", what, (long long)i, (double)got[i], exact[i]);
+      CHECK(isnan(expected) ? isnan(got[i]) : got[i] == expected, "%s[%lld] is %g, not %g", what, (long long)i,
+            (double)got[i], exact[i]);
       continue;
     }
     CHECK(isfinite(got[i]), "%s[%lld] is %g, not %g", what, (long long)i, (double)got[i], exact[i]);
@@ -121,11 +130,13 @@ static void compare(const char *what, const float *got, const double *exact, con
     plain_error = fmax(plain_error, fabs((double)plain[i] - exact[i]));
     largest = fmax(largest, fabs(exact[i]));
   }
-  CHECK(error <= factor * plain_error + 1e-6 * largest, "%s is off by %g of %g, plain float by %g", what, error, largest, plain_error);
+  CHECK(error <= factor * plain_error + 1e-6 * largest, "%s is off by %g of %g, plain float by %g", what, error,
+        largest, plain_error);
 }
 
 static void check_against_formula(const problem *a, const answer *r, double factor) {
-  const int64_t sizes[5] = {a->Tq * a->H * a->D, a->Tq * a->H, a->Tq * a->H * a->D, a->Tk * a->H * a->D, a->Tk * a->H * a->D};
+  const int64_t sizes[5] = {a->Tq * a->H * a->D, a->Tq * a->H, a->Tq * a->H * a->D, a->Tk * a->H * a->D,
+                            a->Tk * a->H * a->D};
   static const char *const names[5] = {"out", "lse", "dq", "dk", "dv"};
   float *lse = new_floats(sizes[1]);
   const float *got[5] = {r->out, lse, r->dq, r->dk, r->dv};
@@ -149,10 +160,10 @@ static void check_against_formula(const problem *a, const answer *r, double fact
 /* ---- tests ---- */
 
 static void test_accuracy(const ast_kernels *kernels) {
-  static const int64_t sizes[][2] = {
-      {0, 0},    {0, 3},    {3, 0},     {1, 1},    {2, 1},    {1, 2},     {7, 5},    {33, 17},
-      {65, 127}, {64, 129}, {257, 129}, {31, 513}, {530, 40}, {1100, 20}, {20, 2100}}; /* chunks of queries; scenes cut over queries and
-                                                                                          over keys */
+  static const int64_t sizes[][2] = {{0, 0},    {0, 3},     {3, 0},    {1, 1},    {2, 1},     {1, 2},
+                                     {7, 5},    {33, 17},   {65, 127}, {64, 129}, {257, 129}, {31, 513},
+                                     {530, 40}, {1100, 20}, {20, 2100}}; /* chunks of queries; scenes cut over queries
+                                                                            and over keys */
   static const int64_t widths[] = {16, 32, 48, 64, 128};
   const bool quick = getenv("AST_TEST_QUICK") != NULL; /* under valgrind */
   for (size_t i = 0; i < sizeof sizes / sizeof *sizes; i++)
@@ -175,7 +186,8 @@ static void test_dropout_rate(const ast_kernels *kernels) {
     answer r = solve(kernels, &a);
     double kept = 0;
     for (int64_t j = 0; j < queries; j++) kept += (double)r.out[j * 16] / (double)queries;
-    const double p = fmin(rates[i], 65535.0 / 65536), deviation = sqrt(p / (1 - p) / (double)(queries * keys)); /* of the mean, about 1 */
+    const double p = fmin(rates[i], 65535.0 / 65536),
+                 deviation = sqrt(p / (1 - p) / (double)(queries * keys)); /* of the mean, about 1 */
     CHECK(fabs(kept - 1) <= 5 * deviation + 1e-5, "p = %g: mean of the dropout factors is %g", rates[i], kept);
     free_answer(r), free_problem(a);
   }
@@ -214,7 +226,8 @@ static void test_same_bits_on_threads(const ast_kernels *kernels) {
   answer serial = solve(kernels, &a);
   const answer *const others[2] = {&again, &serial};
   for (int i = 0; i < 2; i++)
-    CHECK(same_bits(first.out, others[i]->out, a.Tq * row) && same_bits(first.maximum, others[i]->maximum, a.Tq * a.H) &&
+    CHECK(same_bits(first.out, others[i]->out, a.Tq * row) &&
+              same_bits(first.maximum, others[i]->maximum, a.Tq * a.H) &&
               same_bits(first.dq, others[i]->dq, a.Tq * row) && same_bits(first.dk, others[i]->dk, a.Tk * row) &&
               same_bits(first.dv, others[i]->dv, a.Tk * row),
           "%s changes the result", i ? "a pool of threads" : "a second run");
@@ -234,7 +247,8 @@ static void test_not_finite(const ast_kernels *kernels) {
       check_against_formula(&a, &r, 2);
       free_answer(r), free_problem(a);
     }
-  problem a = new_problem(1, &queries, &keys, 1, 16, 1, 0); /* every score of row 3 is -inf; the first keys of row 4 are */
+  problem a =
+      new_problem(1, &queries, &keys, 1, 16, 1, 0); /* every score of row 3 is -inf; the first keys of row 4 are */
   for (int64_t j = 0; j < keys; j++) {
     a.k[j * 16] = 1, a.k[j * 16 + 1] = j < 280 ? 1 : 0;
     for (int64_t i = 0; i < queries; i++) a.q[i * 16 + 1] = 0;
@@ -258,7 +272,8 @@ static void test_large_values(const ast_kernels *kernels) {
   problem a = new_problem(1, &queries, &keys, 1, 16, 0, 0);
   for (int64_t j = 0; j < keys * 16; j++) a.v[j] = 3e38f;
   answer r = solve(kernels, &a);
-  for (int64_t i = 0; i < queries * 16; i++) CHECK(fabs((double)r.out[i] / 3e38 - 1) < 1e-5, "out is %g", (double)r.out[i]);
+  for (int64_t i = 0; i < queries * 16; i++)
+    CHECK(fabs((double)r.out[i] / 3e38 - 1) < 1e-5, "out is %g", (double)r.out[i]);
   free_answer(r), free_problem(a);
 }
 
@@ -276,9 +291,10 @@ static void test_row_strides(const ast_kernels *kernels) {
   float *gradient = new_floats(tokens * 3 * row);
   ast_attention s = sizes_of(&a);
   s.q_stride = s.k_stride = s.v_stride = s.dq_stride = s.dk_stride = s.dv_stride = 3 * row;
-  CHECK(kernels->attention(&s, fused, fused + row, fused + 2 * row, sliced.out, sliced.maximum, sliced.sum) == AST_OK, "status");
-  CHECK(kernels->attention_backward(&s, fused, fused + row, fused + 2 * row, sliced.out, sliced.maximum, sliced.sum, a.dout, gradient,
-                                    gradient + row, gradient + 2 * row) == AST_OK,
+  CHECK(kernels->attention(&s, fused, fused + row, fused + 2 * row, sliced.out, sliced.maximum, sliced.sum) == AST_OK,
+        "status");
+  CHECK(kernels->attention_backward(&s, fused, fused + row, fused + 2 * row, sliced.out, sliced.maximum, sliced.sum,
+                                    a.dout, gradient, gradient + row, gradient + 2 * row) == AST_OK,
         "status");
   CHECK(same_bits(dense.out, sliced.out, tokens * row), "strides change the result");
   for (int64_t i = 0; i < tokens; i++) {
@@ -304,7 +320,8 @@ static void test(const ast_kernels *kernels) {
 int main(void) {
   uint32_t x[4] = {0};
   threefry(20, (const uint32_t[4]){0}, x);
-  CHECK(x[0] == 0x9c6ca96au && x[1] == 0xe17eae66u && x[2] == 0xfc10ecd4u && x[3] == 0x5256a7d8u, "not Threefry: %08x", x[0]);
+  CHECK(x[0] == 0x9c6ca96au && x[1] == 0xe17eae66u && x[2] == 0xfc10ecd4u && x[3] == 0x5256a7d8u, "not Threefry: %08x",
+        x[0]);
   on_every_table(test);
   return 0;
 }

@@ -1,4 +1,5 @@
-/* elastic_forces and its gradient against the formulas in double, at sizes around every block; elements that contribute nothing. */
+/* elastic_forces and its gradient against the formulas in double, at sizes around every block; elements that contribute
+ * nothing. */
 #include "problems.h"
 
 /* C = A B, or A^T B */
@@ -66,8 +67,8 @@ static void check(const char *what, const float *got, const double *exact, int64
   double largest = 0;
   for (int64_t i = 0; i < n; i++) largest = fmax(largest, fabs(exact[i]));
   for (int64_t i = 0; i < n; i++)
-    CHECK(fabs((double)got[i] - exact[i]) <= 4e-6 * largest, "%s[%lld] is %g, not %g of %g", what, (long long)i, (double)got[i], exact[i],
-          largest);
+    CHECK(fabs((double)got[i] - exact[i]) <= 4e-6 * largest, "%s[%lld] is %g, not %g of %g", what, (long long)i,
+          (double)got[i], exact[i], largest);
 }
 
 static void compare(const ast_kernels *kernels, int64_t E, float scale) {

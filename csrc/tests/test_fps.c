@@ -29,8 +29,8 @@ static int by_value(const void *a, const void *b) {
   return x < y ? -1 : x > y;
 }
 
-static void check_sample(const ast_kernels *kernels, const int32_t *points, const int64_t *scene_offsets, int64_t B, int64_t num,
-                         const char *what) {
+static void check_sample(const ast_kernels *kernels, const int32_t *points, const int64_t *scene_offsets, int64_t B,
+                         int64_t num, const char *what) {
   int64_t *offsets = copy_ints(scene_offsets, B + 1), *out_offsets = new_ints(B + 1);
   out_offsets[0] = 0;
   for (int64_t b = 0; b < B; b++) {
@@ -48,16 +48,19 @@ static void check_sample(const ast_kernels *kernels, const int32_t *points, cons
       for (int64_t i = 0; i < n; i++) expected[at + i] = offsets[b] + i;
     else greedy(points, offsets[b], offsets[b + 1], num, expected + at);
     for (int64_t i = at; i < at + rows; i++)
-      CHECK(indices[i] == expected[i], "%s, %lld of %lld: sample %lld of scene %lld is %lld, not %lld", what, (long long)num, (long long)n,
-            (long long)(i - at), (long long)b, (long long)indices[i], (long long)expected[i]);
+      CHECK(indices[i] == expected[i], "%s, %lld of %lld: sample %lld of scene %lld is %lld, not %lld", what,
+            (long long)num, (long long)n, (long long)(i - at), (long long)b, (long long)indices[i],
+            (long long)expected[i]);
     qsort(indices + at, (size_t)rows, sizeof *indices, by_value);
-    for (int64_t i = at + 1; i < at + rows; i++) CHECK(indices[i] > indices[i - 1], "%s: %lld twice", what, (long long)indices[i]);
+    for (int64_t i = at + 1; i < at + rows; i++)
+      CHECK(indices[i] > indices[i - 1], "%s: %lld twice", what, (long long)indices[i]);
   }
   FREE(offsets, out_offsets, indices, expected);
 }
 
 enum { RANDOM, SORTED, LATTICE, COINCIDENT, TWINS, COLLINEAR, PLANAR, CORNERS, SHAPES };
-static const char *const shapes[] = {"random", "sorted", "lattice", "coincident", "twins", "collinear", "planar", "corners"};
+static const char *const shapes[] = {"random", "sorted",    "lattice", "coincident",
+                                     "twins",  "collinear", "planar",  "corners"};
 
 static void fill(int32_t *points, int64_t n, int shape, int64_t extent, int32_t origin) {
   int64_t side = 1;
@@ -125,15 +128,18 @@ static void test_exhausted(const ast_kernels *kernels) {
 }
 
 static void test_too_wide(const ast_kernels *kernels) {
-  int64_t *offsets = copy_ints((const int64_t[]){0, 2, 102}, 3), *out_offsets = copy_ints((const int64_t[]){0, 1, 2}, 3);
+  int64_t *offsets = copy_ints((const int64_t[]){0, 2, 102}, 3),
+          *out_offsets = copy_ints((const int64_t[]){0, 1, 2}, 3);
   int64_t *indices = new_ints(2);
   int32_t *points = new_small_ints(306);
   memset(points, 0, 306 * sizeof *points);
   for (int i = 6; i < 306; i++) {
     points[i] = i % 2 ? INT32_MIN : INT32_MAX;
-    CHECK(kernels->farthest_point_sample(points, offsets, 2, 1, out_offsets, indices) == AST_OUTSIDE, "coordinate %d", i);
+    CHECK(kernels->farthest_point_sample(points, offsets, 2, 1, out_offsets, indices) == AST_OUTSIDE, "coordinate %d",
+          i);
     points[i] = 1 << 21;
-    CHECK(kernels->farthest_point_sample(points, offsets, 2, 1, out_offsets, indices) == AST_OUTSIDE, "coordinate %d", i);
+    CHECK(kernels->farthest_point_sample(points, offsets, 2, 1, out_offsets, indices) == AST_OUTSIDE, "coordinate %d",
+          i);
     points[i] = (1 << 21) - 1;
     CHECK(kernels->farthest_point_sample(points, offsets, 2, 1, out_offsets, indices) == AST_OK, "coordinate %d", i);
     points[i] = 0;

@@ -4,7 +4,9 @@
  */
 #include "check.h"
 
-static bool same_bits(const void *a, const void *b, int64_t floats) { return memcmp(a, b, (size_t)floats * sizeof(float)) == 0; }
+static bool same_bits(const void *a, const void *b, int64_t floats) {
+  return memcmp(a, b, (size_t)floats * sizeof(float)) == 0;
+}
 
 enum { RESULTS = 4 }; /* out, dx, dweight, dbias */
 static const char *const names[RESULTS] = {"out", "dx", "dweight", "dbias"};
@@ -38,7 +40,8 @@ static answer solve(const ast_kernels *kernels, const problem *a, bool save) {
   READ_ONLY(a->x, a->weight, a->bias, a->residual, a->dout);
   CHECK(kernels->linear(&a->s, a->x, a->weight, a->bias, a->residual, r.of[0], save ? r.z : NULL) == AST_OK, "status");
   READ_ONLY(r.z);
-  CHECK(kernels->linear_backward(&a->s, a->dout, a->x, a->weight, a->bias, save ? r.z : NULL, r.of[1], r.of[2], r.of[3]) == AST_OK,
+  CHECK(kernels->linear_backward(&a->s, a->dout, a->x, a->weight, a->bias, save ? r.z : NULL, r.of[1], r.of[2],
+                                 r.of[3]) == AST_OK,
         "status");
   WRITABLE(a->x, a->weight, a->bias, a->residual, a->dout);
   return r;
@@ -95,7 +98,8 @@ static void test_same_bits(const ast_kernels *kernels) {
   for (int i = 0; i < 6; i++) {
     problem a = new_problem(700, sizes[i / 3][0], sizes[i / 3][1], (ast_activation)(i % 3), 1);
     answer all = solve(kernels, &a, false), again = solve(kernels, &a, true);
-    for (int j = 0; j < RESULTS; j++) CHECK(same_bits(all.of[j], again.of[j], a.sizes[j]), "%s differs if z is kept", names[j]);
+    for (int j = 0; j < RESULTS; j++)
+      CHECK(same_bits(all.of[j], again.of[j], a.sizes[j]), "%s differs if z is kept", names[j]);
     for (int64_t first = 0; first < 700; first += 233) {
       problem one = a;
       one.s.M = 1 + first / 17;
@@ -103,7 +107,8 @@ static void test_same_bits(const ast_kernels *kernels) {
       one.x += first * one.s.I, one.residual += first * one.columns, one.dout += first * one.columns;
       one.sizes[0] = one.s.M * one.columns, one.sizes[1] = one.s.M * one.s.I;
       answer r = solve(kernels, &one, false);
-      CHECK(same_bits(r.of[0], all.of[0] + first * one.columns, one.sizes[0]), "out of %lld rows alone", (long long)one.s.M);
+      CHECK(same_bits(r.of[0], all.of[0] + first * one.columns, one.sizes[0]), "out of %lld rows alone",
+            (long long)one.s.M);
       CHECK(same_bits(r.of[1], all.of[1] + first * one.s.I, one.sizes[1]), "dx of %lld rows alone", (long long)one.s.M);
       free_answer(r);
     }

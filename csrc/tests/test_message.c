@@ -4,8 +4,9 @@
  */
 #include "problems.h"
 
-static const char *const names[MESSAGE_RESULTS] = {"sum", "messages", "dof_senders", "dof_receivers", "dedge_features", "dA1",
-                                                   "da1", "dA2",      "dW2",         "db2",           "dgamma",         "dbeta"};
+static const char *const names[MESSAGE_RESULTS] = {
+    "sum", "messages", "dof_senders", "dof_receivers", "dedge_features", "dA1",
+    "da1", "dA2",      "dW2",         "db2",           "dgamma",         "dbeta"};
 
 #define real    double
 #define FORMULA formula
@@ -15,7 +16,8 @@ static const char *const names[MESSAGE_RESULTS] = {"sum", "messages", "dof_sende
 #include "formula_message.h"
 
 static void check_case(const ast_kernels *kernels, const int64_t *edges, const int64_t *channels, bool with_messages) {
-  const ast_message s = new_message(edges[0], edges[1], edges[2], channels[0], channels[1], channels[2], channels[3], 1);
+  const ast_message s =
+      new_message(edges[0], edges[1], edges[2], channels[0], channels[1], channels[2], channels[3], 1);
   float *dsum = random_floats(s.R * s.F2), *dmessages = with_messages ? random_floats(s.M * s.F2) : NULL;
   const message_results r = solve_message(kernels, &s, dsum, dmessages);
   double *exact[MESSAGE_RESULTS];
@@ -36,12 +38,15 @@ static void check_case(const ast_kernels *kernels, const int64_t *edges, const i
 }
 
 static void test_accuracy(const ast_kernels *kernels) {
-  static const int64_t channels[][4] = {{3, 16, 16, 16}, {8, 40, 24, 40}, {1, 1, 1, 4},    {16, 7, 33, 65}, {0, 0, 20, 12},
-                                        {0, 4, 5, 6},    {16, 0, 16, 16}, {33, 0, 33, 65}, {1, 0, 1, 4}};
-  static const int64_t edges[][3] = {{0, 0, 0}, {0, 3, 2}, {1, 1, 1}, {2, 1, 3}, {97, 5, 7}, {600, 300, 100}, {1000, 9, 1}};
+  static const int64_t channels[][4] = {{3, 16, 16, 16}, {8, 40, 24, 40}, {1, 1, 1, 4},
+                                        {16, 7, 33, 65}, {0, 0, 20, 12},  {0, 4, 5, 6},
+                                        {16, 0, 16, 16}, {33, 0, 33, 65}, {1, 0, 1, 4}};
+  static const int64_t edges[][3] = {{0, 0, 0},  {0, 3, 2},       {1, 1, 1},   {2, 1, 3},
+                                     {97, 5, 7}, {600, 300, 100}, {1000, 9, 1}};
   for (int c = 0; c < 9; c++)
     for (int e = 0; e < 7; e++) {
-      check_state = (uint64_t)(7 * c + e); /* no case changes the numbers of another: with one or two edges the rule is sharp */
+      check_state =
+          (uint64_t)(7 * c + e); /* no case changes the numbers of another: with one or two edges the rule is sharp */
       check_case(kernels, edges[e], channels[c], (c + e) % 2);
     }
   if (getenv("AST_TEST_QUICK")) return;
@@ -66,11 +71,13 @@ static void test_batch(const ast_kernels *kernels, int64_t E, int64_t H) {
   for (int64_t i = 0; i < 200 * one.F; i += 7) ((float *)(uintptr_t)both.of_senders)[i] = NAN;
   for (int64_t i = 0; i < first * E; i += 11) ((float *)(uintptr_t)both.edge_features)[i] = i % 2 ? NAN : INFINITY;
   float *dsum = random_floats(both.R * both.F2);
-  const message_results batch = solve_message(kernels, &both, dsum, NULL), alone = solve_message(kernels, &one, dsum + 300 * one.F2, NULL);
+  const message_results batch = solve_message(kernels, &both, dsum, NULL),
+                        alone = solve_message(kernels, &one, dsum + 300 * one.F2, NULL);
   for (int i = SUM; i <= EDGES; i++) {
     const int64_t n = alone.size[i];
     for (int64_t j = 0; j < n; j++) CHECK(isfinite(alone.of[i][j]), "%s[%lld]", names[i], (long long)j);
-    CHECK(!memcmp(alone.of[i], batch.of[i] + batch.size[i] - n, (size_t)n * sizeof(float)), "%s: not the same bits", names[i]);
+    CHECK(!memcmp(alone.of[i], batch.of[i] + batch.size[i] - n, (size_t)n * sizeof(float)), "%s: not the same bits",
+          names[i]);
   }
   free_message_results(batch), free_message_results(alone);
   FREE(MESSAGE_BUFFERS(&both), senders, receivers, offsets, dsum);
@@ -78,7 +85,8 @@ static void test_batch(const ast_kernels *kernels, int64_t E, int64_t H) {
 
 /* The pool that this run is on gives what the calling thread alone gives. */
 static void test_threads(const ast_kernels *kernels) {
-  const ast_message problems[] = {new_message(18000, 700, 900, 3, 16, 24, 16, 1), new_message(18000, 700, 900, 24, 0, 24, 16, 1)};
+  const ast_message problems[] = {new_message(18000, 700, 900, 3, 16, 24, 16, 1),
+                                  new_message(18000, 700, 900, 24, 0, 24, 16, 1)};
   float *dsum = random_floats(900 * 16);
   message_results threaded[2];
   for (int k = 0; k < 2; k++) threaded[k] = solve_message(kernels, &problems[k], dsum, NULL);
@@ -86,7 +94,8 @@ static void test_threads(const ast_kernels *kernels) {
   for (int k = 0; k < 2; k++) {
     const message_results serial = solve_message(kernels, &problems[k], dsum, NULL);
     for (int i = 0; i < MESSAGE_RESULTS; i++)
-      CHECK(!memcmp(threaded[k].of[i], serial.of[i], (size_t)serial.size[i] * sizeof(float)), "threads change %s", names[i]);
+      CHECK(!memcmp(threaded[k].of[i], serial.of[i], (size_t)serial.size[i] * sizeof(float)), "threads change %s",
+            names[i]);
     free_message_results(threaded[k]), free_message_results(serial);
     FREE(MESSAGE_BUFFERS(&problems[k]));
   }

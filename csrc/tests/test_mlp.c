@@ -4,10 +4,13 @@
  */
 #include "check.h"
 
-static bool same_bits(const void *a, const void *b, int64_t floats) { return memcmp(a, b, (size_t)floats * sizeof(float)) == 0; }
+static bool same_bits(const void *a, const void *b, int64_t floats) {
+  return memcmp(a, b, (size_t)floats * sizeof(float)) == 0;
+}
 
 enum { RESULTS = 9 };
-static const char *const names[RESULTS] = {"out", "dx", "dbeside", "dweight1", "dbias1", "dweight2", "dbias2", "dgamma", "dbeta"};
+static const char *const names[RESULTS] = {"out",      "dx",     "dbeside", "dweight1", "dbias1",
+                                           "dweight2", "dbias2", "dgamma",  "dbeta"};
 
 typedef struct {
   ast_mlp s;
@@ -97,14 +100,16 @@ static void check_against_formula(const problem *a, const answer *r) {
       plain_error = fmax(plain_error, fabs((double)plain[i][j] - exact[i][j]));
       largest = fmax(largest, fabs(exact[i][j]));
     }
-    CHECK(error <= 2 * plain_error + 1e-6 * largest, "%s is off by %g of %g, plain float by %g", names[i], error, largest, plain_error);
+    CHECK(error <= 2 * plain_error + 1e-6 * largest, "%s is off by %g of %g, plain float by %g", names[i], error,
+          largest, plain_error);
     free(exact[i]), free(plain[i]);
   }
 }
 
 static void test_accuracy(const ast_kernels *kernels) {
-  static const int64_t sizes[][5] = {{0, 3, 2, 4, 5},     {1, 1, 0, 1, 2},    {2, 3, 0, 17, 3},   {7, 5, 4, 6, 33},    {12, 16, 16, 16, 16},
-                                     {13, 33, 5, 64, 31}, {95, 3, 0, 30, 16}, {97, 60, 7, 20, 2}, {193, 17, 0, 40, 48}};
+  static const int64_t sizes[][5] = {{0, 3, 2, 4, 5},    {1, 1, 0, 1, 2},      {2, 3, 0, 17, 3},
+                                     {7, 5, 4, 6, 33},   {12, 16, 16, 16, 16}, {13, 33, 5, 64, 31},
+                                     {95, 3, 0, 30, 16}, {97, 60, 7, 20, 2},   {193, 17, 0, 40, 48}};
   for (size_t i = 0; i < sizeof sizes / sizeof *sizes; i++)
     for (int norm = 0; norm < 2; norm++) {
       problem a = new_problem(sizes[i][0], sizes[i][1], sizes[i][2], sizes[i][3], sizes[i][4], norm);

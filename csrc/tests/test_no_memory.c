@@ -1,8 +1,9 @@
-/* Every allocation of a kernel fails in turn: the kernel says AST_NO_MEMORY, leaks nothing, and gives its usual result when it is
- * called again. Called a third time it allocates nothing.
+/* Every allocation of a kernel fails in turn: the kernel says AST_NO_MEMORY, leaks nothing, and gives its usual result
+ * when it is called again. Called a third time it allocates nothing.
  *
- * The linker sends the allocations of the whole program through the functions below (--wrap, see the Makefile). Each attempt is made
- * by fresh threads, which have no scratch memory yet. A new kernel is one function here and one line of `cases`.
+ * The linker sends the allocations of the whole program through the functions below (--wrap, see the Makefile). Each
+ * attempt is made by fresh threads, which have no scratch memory yet. A new kernel is one function here and one line of
+ * `cases`.
  */
 #include <errno.h>
 #include <limits.h>
@@ -34,16 +35,20 @@ static void *counted(void *p) {
   return p;
 }
 
-void *__real_malloc(size_t), *__real_calloc(size_t, size_t), *__real_realloc(void *, size_t), *__real_aligned_alloc(size_t, size_t);
+void *__real_malloc(size_t), *__real_calloc(size_t, size_t), *__real_realloc(void *, size_t),
+    *__real_aligned_alloc(size_t, size_t);
 int __real_posix_memalign(void **, size_t, size_t);
 void __real_free(void *);
-void *__wrap_malloc(size_t), *__wrap_calloc(size_t, size_t), *__wrap_realloc(void *, size_t), *__wrap_aligned_alloc(size_t, size_t);
+void *__wrap_malloc(size_t), *__wrap_calloc(size_t, size_t), *__wrap_realloc(void *, size_t),
+    *__wrap_aligned_alloc(size_t, size_t);
 int __wrap_posix_memalign(void **, size_t, size_t);
 void __wrap_free(void *);
 
 void *__wrap_malloc(size_t size) { return fails() ? NULL : counted(__real_malloc(size)); }
 void *__wrap_calloc(size_t num, size_t size) { return fails() ? NULL : counted(__real_calloc(num, size)); }
-void *__wrap_aligned_alloc(size_t alignment, size_t size) { return fails() ? NULL : counted(__real_aligned_alloc(alignment, size)); }
+void *__wrap_aligned_alloc(size_t alignment, size_t size) {
+  return fails() ? NULL : counted(__real_aligned_alloc(alignment, size));
+}
 void *__wrap_realloc(void *p, size_t size) {
   if (fails()) return NULL;
   return p ? __real_realloc(p, size) : counted(__real_realloc(p, size));
@@ -96,7 +101,8 @@ static outcome segment(const ast_kernels *kernels, bool spread) {
   enum { F = 131, C = 300, N = 3 * C };
   int64_t *offsets = even_offsets(C, 3), *order = even_offsets(N - 1, 1);
   float *x = random_floats((spread ? C : N) * F), *out = new_floats((spread ? N : C) * F);
-  return FINISH(KERNEL((spread ? kernels->segment_spread : kernels->segment_sum)(x, F, order, offsets, C, true, out)), out);
+  return FINISH(KERNEL((spread ? kernels->segment_spread : kernels->segment_sum)(x, F, order, offsets, C, true, out)),
+                out);
 }
 static outcome segment_sum(const ast_kernels *kernels) { return segment(kernels, false); }
 static outcome segment_spread(const ast_kernels *kernels) { return segment(kernels, true); }
@@ -105,11 +111,12 @@ static outcome octree_build(const ast_kernels *kernels, int depth) {
   enum { B = 3, N = 9000 };
   const double center[3] = {0, 0, 0};
   float *positions = random_floats(3 * N);
-  int64_t *offsets = even_offsets(B, N / B), *keys = new_ints(N), *cell_offsets = new_ints(B + 1), *node_cell = new_ints(N);
+  int64_t *offsets = even_offsets(B, N / B), *keys = new_ints(N), *cell_offsets = new_ints(B + 1),
+          *node_cell = new_ints(N);
   int64_t *node_order = new_ints(N), *node_offsets = new_ints(N + 1), bad = -1;
-  return FINISH(
-      KERNEL(kernels->octree_build(positions, offsets, B, center, 1, depth, keys, cell_offsets, node_cell, node_order, node_offsets, &bad)),
-      keys, cell_offsets, node_cell, node_order, node_offsets);
+  return FINISH(KERNEL(kernels->octree_build(positions, offsets, B, center, 1, depth, keys, cell_offsets, node_cell,
+                                             node_order, node_offsets, &bad)),
+                keys, cell_offsets, node_cell, node_order, node_offsets);
 }
 static outcome octree_build_packed(const ast_kernels *kernels) { return octree_build(kernels, 12); }
 static outcome octree_build_wide(const ast_kernels *kernels) { return octree_build(kernels, 21); }
@@ -123,12 +130,13 @@ static outcome octree_coarsen(const ast_kernels *kernels) {
   ast_octree_level level;
   const ast_status status = KERNEL(kernels->octree_coarsen(keys, offsets, B, 1, &level));
   if (status != AST_OK) return finish(status, NULL, 0);
-  int64_t *coarse_keys = new_ints(level.C), *coarse_offsets = new_ints(B + 1), *first_child = new_ints(level.C + 1), *parent = new_ints(C);
+  int64_t *coarse_keys = new_ints(level.C), *coarse_offsets = new_ints(B + 1), *first_child = new_ints(level.C + 1),
+          *parent = new_ints(C);
   int64_t *pairs[4];
   for (int i = 0; i < 4; i++) pairs[i] = new_ints(level.pair_offsets[27]);
-  return FINISH(
-      kernels->octree_write_level(&level, coarse_keys, coarse_offsets, first_child, parent, pairs[0], pairs[1], pairs[2], pairs[3]),
-      coarse_keys, coarse_offsets, first_child, parent, pairs[0], pairs[1], pairs[2], pairs[3]);
+  return FINISH(kernels->octree_write_level(&level, coarse_keys, coarse_offsets, first_child, parent, pairs[0],
+                                            pairs[1], pairs[2], pairs[3]),
+                coarse_keys, coarse_offsets, first_child, parent, pairs[0], pairs[1], pairs[2], pairs[3]);
 }
 
 static outcome sample(const ast_kernels *kernels, int64_t extent) {
@@ -145,13 +153,15 @@ enum { CELLS = 300, C_IN = 70, C_OUT = 20 };
 
 static outcome sparse_conv(const ast_kernels *kernels) {
   const ast_pairs pairs = random_pairs(CELLS, CELLS, 1, 1);
-  float *x = random_floats(CELLS * C_IN), *weight = random_floats(OFFSETS * C_IN * C_OUT), *out = new_floats(CELLS * C_OUT);
+  float *x = random_floats(CELLS * C_IN), *weight = random_floats(OFFSETS * C_IN * C_OUT),
+        *out = new_floats(CELLS * C_OUT);
   return FINISH(KERNEL(kernels->sparse_conv(x, weight, NULL, C_IN, C_OUT, false, pairs, CELLS, out)), out);
 }
 
 static outcome sparse_conv_weight(const ast_kernels *kernels) {
   const ast_pairs pairs = random_pairs(CELLS, CELLS, 1, 1);
-  float *x = random_floats(CELLS * C_IN), *dout = random_floats(CELLS * C_OUT), *dweight = new_floats(OFFSETS * C_IN * C_OUT);
+  float *x = random_floats(CELLS * C_IN), *dout = random_floats(CELLS * C_OUT),
+        *dweight = new_floats(OFFSETS * C_IN * C_OUT);
   return FINISH(KERNEL(kernels->sparse_conv_weight(x, dout, C_IN, C_OUT, pairs, dweight)), dweight);
 }
 
@@ -176,15 +186,19 @@ static ast_attention attention_sizes(void) {
 
 static outcome attention(const ast_kernels *kernels) {
   const ast_attention s = attention_sizes();
-  float *q = random_floats(SCENES * QUERIES * ROW), *k = random_floats(SCENES * KEYS * ROW), *v = random_floats(SCENES * KEYS * ROW);
-  float *out = new_floats(SCENES * QUERIES * ROW), *maximum = new_floats(SCENES * QUERIES * H), *sum = new_floats(SCENES * QUERIES * H);
+  float *q = random_floats(SCENES * QUERIES * ROW), *k = random_floats(SCENES * KEYS * ROW),
+        *v = random_floats(SCENES * KEYS * ROW);
+  float *out = new_floats(SCENES * QUERIES * ROW), *maximum = new_floats(SCENES * QUERIES * H),
+        *sum = new_floats(SCENES * QUERIES * H);
   return FINISH(KERNEL(kernels->attention(&s, q, k, v, out, maximum, sum)), out, maximum, sum);
 }
 
 static outcome attention_backward(const ast_kernels *kernels) {
   const ast_attention s = attention_sizes();
-  float *q = random_floats(SCENES * QUERIES * ROW), *k = random_floats(SCENES * KEYS * ROW), *v = random_floats(SCENES * KEYS * ROW);
-  float *out = random_floats(SCENES * QUERIES * ROW), *maximum = new_floats(SCENES * QUERIES * H), *sum = new_floats(SCENES * QUERIES * H);
+  float *q = random_floats(SCENES * QUERIES * ROW), *k = random_floats(SCENES * KEYS * ROW),
+        *v = random_floats(SCENES * KEYS * ROW);
+  float *out = random_floats(SCENES * QUERIES * ROW), *maximum = new_floats(SCENES * QUERIES * H),
+        *sum = new_floats(SCENES * QUERIES * H);
   float *dout = random_floats(SCENES * QUERIES * ROW), *dq = new_floats(SCENES * QUERIES * ROW);
   float *dk = new_floats(SCENES * KEYS * ROW), *dv = new_floats(SCENES * KEYS * ROW);
   for (int64_t i = 0; i < SCENES * QUERIES * H; i++) maximum[i] = 4, sum[i] = KEYS;
@@ -213,17 +227,20 @@ enum { LINEAR_ROWS = 700, INPUTS = 40, OUTPUTS = 70 };
 
 static outcome linear(const ast_kernels *kernels) {
   const ast_linear s = {LINEAR_ROWS, INPUTS, OUTPUTS, INPUTS, OUTPUTS / 2, OUTPUTS / 2, AST_GEGLU};
-  float *x = random_floats(LINEAR_ROWS * INPUTS), *weight = random_floats(OUTPUTS * INPUTS), *bias = random_floats(OUTPUTS);
+  float *x = random_floats(LINEAR_ROWS * INPUTS), *weight = random_floats(OUTPUTS * INPUTS),
+        *bias = random_floats(OUTPUTS);
   float *residual = random_floats(LINEAR_ROWS * OUTPUTS / 2), *out = new_floats(LINEAR_ROWS * OUTPUTS / 2);
   return FINISH(KERNEL(kernels->linear(&s, x, weight, bias, residual, out, NULL)), out);
 }
 
 static outcome linear_backward(const ast_kernels *kernels) {
   const ast_linear s = {LINEAR_ROWS, INPUTS, OUTPUTS, INPUTS, OUTPUTS / 2, OUTPUTS / 2, AST_GEGLU};
-  float *x = random_floats(LINEAR_ROWS * INPUTS), *weight = random_floats(OUTPUTS * INPUTS), *bias = random_floats(OUTPUTS);
+  float *x = random_floats(LINEAR_ROWS * INPUTS), *weight = random_floats(OUTPUTS * INPUTS),
+        *bias = random_floats(OUTPUTS);
   float *dout = random_floats(LINEAR_ROWS * OUTPUTS / 2), *dx = new_floats(LINEAR_ROWS * INPUTS);
   float *dweight = new_floats(OUTPUTS * INPUTS), *dbias = new_floats(OUTPUTS);
-  return FINISH(KERNEL(kernels->linear_backward(&s, dout, x, weight, bias, NULL, dx, dweight, dbias)), dx, dweight, dbias);
+  return FINISH(KERNEL(kernels->linear_backward(&s, dout, x, weight, bias, NULL, dx, dweight, dbias)), dx, dweight,
+                dbias);
 }
 
 enum { MLP_ROWS = 700, MLP_IN = 20, MLP_BESIDE = 9, MLP_HIDDEN = 40, MLP_OUT = 33 };
@@ -345,7 +362,8 @@ static void *make_attempt(void *p) {
   return NULL;
 }
 
-static attempt attempt_in_thread(const ast_kernels *kernels, outcome (*run)(const ast_kernels *), bool threaded, long n) {
+static attempt attempt_in_thread(const ast_kernels *kernels, outcome (*run)(const ast_kernels *), bool threaded,
+                                 long n) {
   attempt a = {.kernels = kernels, .run = run, .threaded = threaded};
   pthread_t thread;
   const long before = atomic_load(&living);
@@ -361,14 +379,16 @@ static void test(const ast_kernels *kernels) {
   for (size_t i = 0; i < sizeof cases / sizeof *cases; i++) {
     const attempt usual = attempt_in_thread(kernels, cases[i].run, threaded, LONG_MAX);
     const uint64_t digest = usual.first.digest;
-    CHECK(usual.first.status == AST_OK && usual.again.status == AST_OK && usual.again.digest == digest, "%s", cases[i].name);
-    CHECK(threaded || APART || usual.third == 0, "%s: %ld allocations when it is called again", cases[i].name, usual.third);
+    CHECK(usual.first.status == AST_OK && usual.again.status == AST_OK && usual.again.digest == digest, "%s",
+          cases[i].name);
+    CHECK(threaded || APART || usual.third == 0, "%s: %ld allocations when it is called again", cases[i].name,
+          usual.third);
     for (int mode = quick && threaded ? 1 : 0; mode < (quick && !threaded ? 1 : 2); mode++) {
       atomic_store(&all_after, mode == 1);
       for (long n = 0;; n++) {
         const attempt a = attempt_in_thread(kernels, cases[i].run, threaded, n);
-        CHECK(a.first.status == (a.failures ? AST_NO_MEMORY : AST_OK), "%s, allocation %ld: status %d", cases[i].name, n,
-              (int)a.first.status);
+        CHECK(a.first.status == (a.failures ? AST_NO_MEMORY : AST_OK), "%s, allocation %ld: status %d", cases[i].name,
+              n, (int)a.first.status);
         CHECK(a.again.status == AST_OK && a.again.digest == digest && (a.failures || a.first.digest == digest),
               "%s, allocation %ld: another result", cases[i].name, n);
         if (!a.failures) break;
@@ -388,7 +408,8 @@ static void *test_scratch(void *unused) {
     for (int i = 0; i < 8; i++) {
       AST_SCRATCH_SCOPE;
       char *inner = ast_scratch(100000);
-      CHECK(inner && (uintptr_t)inner % 64 == 0 && (APART || i == 0 || inner == again), "released memory is not used again");
+      CHECK(inner && (uintptr_t)inner % 64 == 0 && (APART || i == 0 || inner == again),
+            "released memory is not used again");
       again = memset(inner, 99, 100000);
     }
     for (int i = 0; i < 8; i++)

@@ -1,4 +1,5 @@
-/* The octree against brute force: one floor and one bit loop a node, qsort for the order, and bsearch over all 27 offsets. */
+/* The octree against brute force: one floor and one bit loop a node, qsort for the order, and bsearch over all 27
+ * offsets. */
 #include <float.h>
 
 #include "check.h"
@@ -14,7 +15,9 @@ typedef struct {
   int64_t *keys, *cell_offsets, *node_cell, *node_order, *node_offsets;
 } tree;
 
-static tree new_tree(int64_t N, int64_t B) { return (tree){new_ints(N), new_ints(B + 1), new_ints(N), new_ints(N), new_ints(N + 1)}; }
+static tree new_tree(int64_t N, int64_t B) {
+  return (tree){new_ints(N), new_ints(B + 1), new_ints(N), new_ints(N), new_ints(N + 1)};
+}
 
 static void free_tree(tree t) { FREE(t.keys, t.cell_offsets, t.node_cell, t.node_order, t.node_offsets); }
 
@@ -54,12 +57,13 @@ static int by_scene_key_node(const void *a, const void *b) {
   return x->node < y->node ? -1 : x->node > y->node;
 }
 
-static void check_build(const ast_kernels *kernels, cloud s, const double center[3], double half_width, int depth, const char *what) {
+static void check_build(const ast_kernels *kernels, cloud s, const double center[3], double half_width, int depth,
+                        const char *what) {
   tree t = new_tree(s.N, s.B);
   int64_t bad = -1, c = -1;
   READ_ONLY(s.positions, s.offsets);
-  CHECK(kernels->octree_build(s.positions, s.offsets, s.B, center, half_width, depth, t.keys, t.cell_offsets, t.node_cell, t.node_order,
-                              t.node_offsets, &bad) == AST_OK,
+  CHECK(kernels->octree_build(s.positions, s.offsets, s.B, center, half_width, depth, t.keys, t.cell_offsets,
+                              t.node_cell, t.node_order, t.node_offsets, &bad) == AST_OK,
         "%s", what);
   WRITABLE(s.positions, s.offsets);
   entry *sorted = malloc((size_t)(s.N + 1) * sizeof *sorted);
@@ -68,7 +72,8 @@ static void check_build(const ast_kernels *kernels, cloud s, const double center
       sorted[i] = (entry){b, key_of(s.positions + 3 * i, center, half_width, depth), i};
   qsort(sorted, (size_t)s.N, sizeof *sorted, by_scene_key_node);
   for (int64_t i = 0, b = 0; i <= s.N; i++) {
-    const bool head = i == s.N || i == 0 || sorted[i].scene != sorted[i - 1].scene || sorted[i].key != sorted[i - 1].key;
+    const bool head =
+        i == s.N || i == 0 || sorted[i].scene != sorted[i - 1].scene || sorted[i].key != sorted[i - 1].key;
     c += head;
     for (; b <= s.B && s.offsets[b] <= i; b++)
       CHECK(t.cell_offsets[b] == (s.offsets[b] == s.N ? t.cell_offsets[s.B] : c), "%s: scene %lld", what, (long long)b);
@@ -104,12 +109,14 @@ static int64_t find(const int64_t *keys, const int64_t *offsets, int64_t scene, 
   for (int a = 0; a < 3; a++)
     if (cell[a] < 0 || cell[a] >= 1 << 21) return -1;
   const int64_t key = interleave(cell);
-  const int64_t *at = bsearch(&key, keys + offsets[scene], (size_t)(offsets[scene + 1] - offsets[scene]), sizeof key, by_value);
+  const int64_t *at =
+      bsearch(&key, keys + offsets[scene], (size_t)(offsets[scene + 1] - offsets[scene]), sizeof key, by_value);
   return at ? at - keys : -1;
 }
 
 /* The cells of a level, its cells before each cell, and node_cell, from the keys of the finer level. */
-static void check_cells(const ast_octree_level *s, const int64_t *keys, const int64_t *offsets, tree t, const char *what) {
+static void check_cells(const ast_octree_level *s, const int64_t *keys, const int64_t *offsets, tree t,
+                        const char *what) {
   int64_t C = 0, cell[3], other[3];
   for (int64_t b = 0; b < s->B; b++) {
     CHECK(t.cell_offsets[b] == C, "%s: scene %lld", what, (long long)b);
@@ -137,8 +144,8 @@ static void check_cells(const ast_octree_level *s, const int64_t *keys, const in
 }
 
 /* The pairs of a level, by coarse and by fine cell. */
-static void check_pairs(const ast_octree_level *s, const int64_t *keys, const int64_t *offsets, tree t, int64_t *const pair[4],
-                        const char *what) {
+static void check_pairs(const ast_octree_level *s, const int64_t *keys, const int64_t *offsets, tree t,
+                        int64_t *const pair[4], const char *what) {
   int64_t cell[3], other[3], pairs = 0;
   for (int64_t k = 0, by_fine = 0; k < 27; k++) {
     const int64_t step[3] = {k / 9 - 1, k / 3 % 3 - 1, k % 3 - 1};
@@ -148,7 +155,8 @@ static void check_pairs(const ast_octree_level *s, const int64_t *keys, const in
         for (int a = 0; a < 3; a++) other[a] = 2 * cell[a] + step[a];
         const int64_t f = find(keys, offsets, b, other);
         if (f < 0) continue;
-        CHECK(pair[0][pairs] == f && pair[1][pairs] == P, "%s: offset %lld, coarse cell %lld", what, (long long)k, (long long)P);
+        CHECK(pair[0][pairs] == f && pair[1][pairs] == P, "%s: offset %lld, coarse cell %lld", what, (long long)k,
+              (long long)P);
         pairs++;
       }
       for (int64_t f = offsets[b]; f < offsets[b + 1]; f++) {
@@ -160,11 +168,13 @@ static void check_pairs(const ast_octree_level *s, const int64_t *keys, const in
         }
         const int64_t P = whole ? find(t.keys, t.cell_offsets, b, other) : -1;
         if (P < 0) continue;
-        CHECK(pair[2][by_fine] == f && pair[3][by_fine] == P, "%s: offset %lld, fine cell %lld", what, (long long)k, (long long)f);
+        CHECK(pair[2][by_fine] == f && pair[3][by_fine] == P, "%s: offset %lld, fine cell %lld", what, (long long)k,
+              (long long)f);
         by_fine++;
       }
     }
-    CHECK(s->pair_offsets[k + 1] == pairs && pairs == by_fine, "%s: offset %lld has %lld pairs", what, (long long)k, (long long)pairs);
+    CHECK(s->pair_offsets[k + 1] == pairs && pairs == by_fine, "%s: offset %lld has %lld pairs", what, (long long)k,
+          (long long)pairs);
   }
 }
 
@@ -176,11 +186,12 @@ static void check_levels_of(const ast_kernels *kernels, tree t, int64_t B, int l
   CHECK(kernels->octree_coarsen(t.keys, t.cell_offsets, B, levels, level) == AST_OK, "%s", what);
   WRITABLE(t.keys, t.cell_offsets);
   for (int j = 0; j < levels; j++) {
-    tree coarser = {new_ints(level[j].C), new_ints(B + 1), new_ints(level[j].C_fine), new_ints(0), new_ints(level[j].C + 1)};
+    tree coarser = {new_ints(level[j].C), new_ints(B + 1), new_ints(level[j].C_fine), new_ints(0),
+                    new_ints(level[j].C + 1)};
     int64_t *pair[4];
     for (int i = 0; i < 4; i++) pair[i] = new_ints(level[j].pair_offsets[27]);
-    CHECK(kernels->octree_write_level(&level[j], coarser.keys, coarser.cell_offsets, coarser.node_offsets, coarser.node_cell, pair[0],
-                                      pair[1], pair[2], pair[3]) == AST_OK,
+    CHECK(kernels->octree_write_level(&level[j], coarser.keys, coarser.cell_offsets, coarser.node_offsets,
+                                      coarser.node_cell, pair[0], pair[1], pair[2], pair[3]) == AST_OK,
           "%s", what);
     check_cells(&level[j], t.keys, t.cell_offsets, coarser, what);
     check_pairs(&level[j], t.keys, t.cell_offsets, coarser, pair, what);
@@ -191,13 +202,13 @@ static void check_levels_of(const ast_kernels *kernels, tree t, int64_t B, int l
   free_tree(t);
 }
 
-static void check_levels(const ast_kernels *kernels, cloud s, const double center[3], double half_width, int depth, int levels,
-                         const char *what) {
+static void check_levels(const ast_kernels *kernels, cloud s, const double center[3], double half_width, int depth,
+                         int levels, const char *what) {
   tree t = new_tree(s.N, s.B);
   int64_t bad;
   READ_ONLY(s.positions, s.offsets);
-  CHECK(kernels->octree_build(s.positions, s.offsets, s.B, center, half_width, depth, t.keys, t.cell_offsets, t.node_cell, t.node_order,
-                              t.node_offsets, &bad) == AST_OK,
+  CHECK(kernels->octree_build(s.positions, s.offsets, s.B, center, half_width, depth, t.keys, t.cell_offsets,
+                              t.node_cell, t.node_order, t.node_offsets, &bad) == AST_OK,
         "%s", what);
   WRITABLE(s.positions, s.offsets);
   int64_t *all_keys = t.keys;
@@ -253,7 +264,8 @@ static void test_shapes(const ast_kernels *kernels) {
         cloud s = new_cloud(sizes[n], scenes[(n + d + shape) % 3]);
         fill(s, shape, depths[d]);
         check_build(kernels, s, origin, 1, depths[d], shapes[shape]);
-        if (sizes[n] < 1000) check_levels(kernels, s, origin, 1, depths[d], depths[d] < 21 ? depths[d] + 1 : 21, shapes[shape]);
+        if (sizes[n] < 1000)
+          check_levels(kernels, s, origin, 1, depths[d], depths[d] < 21 ? depths[d] + 1 : 21, shapes[shape]);
         free_cloud(s);
       }
 }
@@ -271,8 +283,9 @@ static void test_chunks(const ast_kernels *kernels) {
 }
 
 static void test_values(const ast_kernels *kernels) {
-  static const float values[] = {0.0f,           -0.0f,           1.0f,          -1.0f,          1e-40f, -1e-40f, FLT_MIN, -FLT_MIN,
-                                 0x1.fffffep-1f, -0x1.fffffep-1f, 1.0000019073f, -1.0000019073f, 0.5f,   1.0f / 3};
+  static const float values[] = {0.0f,          -0.0f,          1.0f,     -1.0f,          1e-40f,
+                                 -1e-40f,       FLT_MIN,        -FLT_MIN, 0x1.fffffep-1f, -0x1.fffffep-1f,
+                                 1.0000019073f, -1.0000019073f, 0.5f,     1.0f / 3};
   enum { NUM = sizeof values / sizeof *values };
   const double origin[3] = {0, 0, 0}, center[3] = {0.1, -2, 1e-3};
   cloud s = new_cloud(NUM * NUM, 4);
@@ -300,10 +313,11 @@ static void test_errors(const ast_kernels *kernels) {
       if (first % 32 == 0) fill(s, RANDOM, 5);
       s.positions[3 * first + i % 3] = wrong[i];
       if (first + 1 < N) s.positions[3 * first + 3] = wrong[(i + 3) % 6];
-      const ast_status status = kernels->octree_build(s.positions, s.offsets, s.B, origin, 1, 9, t.keys, t.cell_offsets, t.node_cell,
-                                                      t.node_order, t.node_offsets, &bad);
-      CHECK(status == (isfinite(wrong[i]) ? AST_OUTSIDE : AST_NOT_FINITE) && bad == first, "value %g at node %lld: status %d at %lld",
-            (double)wrong[i], (long long)first, (int)status, (long long)bad);
+      const ast_status status = kernels->octree_build(s.positions, s.offsets, s.B, origin, 1, 9, t.keys, t.cell_offsets,
+                                                      t.node_cell, t.node_order, t.node_offsets, &bad);
+      CHECK(status == (isfinite(wrong[i]) ? AST_OUTSIDE : AST_NOT_FINITE) && bad == first,
+            "value %g at node %lld: status %d at %lld", (double)wrong[i], (long long)first, (int)status,
+            (long long)bad);
       memset(s.positions + 3 * first, 0, (first + 1 < N ? 6 : 3) * sizeof(float));
     }
   free_tree(t), free_cloud(s);

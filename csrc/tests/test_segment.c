@@ -29,7 +29,8 @@ static void compare(const ast_kernels *kernels, int64_t N, int64_t C, int64_t F,
         const float expected = out[c * F + f] * (float)(1 / (float)count);
         CHECK(back[order[j] * F + f] == expected, "row %lld", (long long)order[j]);
       }
-      CHECK(fabs((double)out[c * F + f] - sum / count) <= 1e-7 * (double)(offsets[c + 1] - offsets[c] + 2) * magnitude / count + 0.0,
+      CHECK(fabs((double)out[c * F + f] - sum / count) <=
+                1e-7 * (double)(offsets[c + 1] - offsets[c] + 2) * magnitude / count + 0.0,
             "N %lld C %lld F %lld: %g", (long long)N, (long long)C, (long long)F, (double)out[c * F + f]);
     }
   FREE(x, out, back, order, offsets);
@@ -43,7 +44,8 @@ static void sum_columns(const ast_kernels *kernels, int64_t N, int64_t F) {
   for (int64_t f = 0; f < F; f++) {
     double sum = 0, magnitude = 0;
     for (int64_t n = 0; n < N; n++) sum += (double)x[n * F + f], magnitude += fabs((double)x[n * F + f]);
-    CHECK(fabs((double)out[f] - sum) <= 1e-6 * magnitude, "N %lld F %lld: %g", (long long)N, (long long)F, (double)out[f]);
+    CHECK(fabs((double)out[f] - sum) <= 1e-6 * magnitude, "N %lld F %lld: %g", (long long)N, (long long)F,
+          (double)out[f]);
   }
   FREE(x, out);
 }

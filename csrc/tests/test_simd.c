@@ -1,7 +1,8 @@
-/* The functions of simd.h against long double, on every instruction set: the worst error of each in units in the last place.
+/* The functions of simd.h against long double, on every instruction set: the worst error of each in units in the last
+ * place.
  *
- * Floats are drawn evenly from all bit patterns of a domain, and evenly by value. One unit in the last place (ULP) is the distance
- * of neighbouring floats at the exact result.
+ * Floats are drawn evenly from all bit patterns of a domain, and evenly by value. One unit in the last place (ULP) is
+ * the distance of neighbouring floats at the exact result.
  */
 #include <float.h>
 #include <stddef.h>
@@ -26,8 +27,8 @@ typedef struct {
 
 #define AT(name) offsetof(simd_table, name)
 /* Errors of the density count twice where the product with the constant has a smaller exponent. Phi to 1 ULP in its
- * tail would take q and v in two floats each; what uses it adds b Phi(b) to sums, where an error of 6 ULP at -1 is below
- * 1 ULP of b. */
+ * tail would take q and v in two floats each; what uses it adds b Phi(b) to sums, where an error of 6 ULP at -1 is
+ * below 1 ULP of b. */
 static const row rows[] = {
     {"e^x", AT(exp), exact_exp, -86.6f, 88.0f, 1},
     {"e^x 2^-9", AT(exp_shifted), exact_exp_shifted, -80.4f, 88.0f, 1},
@@ -71,7 +72,8 @@ static void check_row(const simd_table *table, const row *r, int64_t num) {
   const int64_t first = rank_of(r->least), ranks = rank_of(r->most) - first + 1;
   for (int64_t done = 0; done < num; done += BLOCK) {
     for (int i = 0; i < BLOCK; i++)
-      x[i] = i % 2 ? r->least + (r->most - r->least) * (float)random_unit() : of_rank(first + (int64_t)(random_bits() % (uint64_t)ranks));
+      x[i] = i % 2 ? r->least + (r->most - r->least) * (float)random_unit()
+                   : of_rank(first + (int64_t)(random_bits() % (uint64_t)ranks));
     x[0] = r->least, x[1] = r->most;
     function_of(table, r)(x, y, BLOCK);
     for (int i = 0; i < BLOCK; i++) {
@@ -89,7 +91,9 @@ static void check_specials(const simd_table *table) {
                               FLT_MAX, 1e-40f,    -1e-40f,  -88,  -14,   14,   5.9f, -1e4f};
   float y[SIMD_MOST_LANES];
   table->exp(x, y, SIMD_MOST_LANES);
-  CHECK(isnan(y[0]) && y[1] == 0 && y[3] == 1 && y[4] == 1 && y[5] == 0 && y[7] == 0 && y[9] == 1 && y[11] == 0 && y[15] == 0, "e^x");
+  CHECK(isnan(y[0]) && y[1] == 0 && y[3] == 1 && y[4] == 1 && y[5] == 0 && y[7] == 0 && y[9] == 1 && y[11] == 0 &&
+            y[15] == 0,
+        "e^x");
   table->gauss(x, y, SIMD_MOST_LANES);
   CHECK(isnan(y[0]) && y[3] == 1 && y[4] == 1 && y[9] == 1 && y[12] == 0 && y[13] == 0, "e^(-x^2/2)");
   CHECK(y[1] == 0 && y[2] == 0 && y[5] == 0 && y[6] == 0 && y[7] == 0 && y[8] == 0 && y[15] == 0, "e^(-x^2/2) far out");

@@ -5,8 +5,8 @@
 #include "problems.h"
 
 /* sparse_conv on `destinations` rows, and its weight gradient. */
-static float *convolve(const ast_kernels *kernels, const ast_pairs *p, int64_t destinations, const float *x, const float *weight,
-                       const float *bias, int64_t C_in, int64_t C_out, bool transposed) {
+static float *convolve(const ast_kernels *kernels, const ast_pairs *p, int64_t destinations, const float *x,
+                       const float *weight, const float *bias, int64_t C_in, int64_t C_out, bool transposed) {
   float *out = new_floats(destinations * C_out);
   READ_ONLY(PAIR_BUFFERS(p), x, weight, bias);
   CHECK(kernels->sparse_conv(x, weight, bias, C_in, C_out, transposed, *p, destinations, out) == AST_OK, "status");
@@ -14,8 +14,8 @@ static float *convolve(const ast_kernels *kernels, const ast_pairs *p, int64_t d
   return out;
 }
 
-static float *weight_gradient(const ast_kernels *kernels, const ast_pairs *p, const float *x, const float *dout, int64_t C_in,
-                              int64_t C_out) {
+static float *weight_gradient(const ast_kernels *kernels, const ast_pairs *p, const float *x, const float *dout,
+                              int64_t C_in, int64_t C_out) {
   float *dweight = new_floats(OFFSETS * C_in * C_out);
   READ_ONLY(PAIR_BUFFERS(p), x, dout);
   CHECK(kernels->sparse_conv_weight(x, dout, C_in, C_out, *p, dweight) == AST_OK, "status");
@@ -30,10 +30,12 @@ static float *weight_gradient(const ast_kernels *kernels, const ast_pairs *p, co
 #define FORMULA formula_float
 #include "formula_sparse_conv.h"
 
-static void check_case(const ast_kernels *kernels, int64_t sources, int64_t destinations, int64_t C_in, int64_t C_out, bool transposed) {
+static void check_case(const ast_kernels *kernels, int64_t sources, int64_t destinations, int64_t C_in, int64_t C_out,
+                       bool transposed) {
   const ast_pairs p = random_pairs(sources, destinations, 0.2, 1);
   const int64_t n = destinations * C_out, m = OFFSETS * C_in * C_out;
-  float *x = random_floats(sources * C_in), *weight = random_floats(m), *dout = random_floats(n), *bias = random_floats(C_out);
+  float *x = random_floats(sources * C_in), *weight = random_floats(m), *dout = random_floats(n),
+        *bias = random_floats(C_out);
   const float *used = (C_in + destinations) % 2 ? bias : NULL;
   double *exact = calloc((size_t)(n + m + 1), sizeof *exact);
   float *plain = calloc((size_t)(n + m + 1), sizeof *plain);
@@ -49,10 +51,12 @@ static void check_case(const ast_kernels *kernels, int64_t sources, int64_t dest
 }
 
 static void test_accuracy(const ast_kernels *kernels) {
-  static const int64_t channels[][2] = {{0, 3}, {3, 0}, {1, 1}, {1, 16}, {3, 5}, {16, 8}, {17, 33}, {64, 64}, {65, 130}};
+  static const int64_t channels[][2] = {{0, 3},  {3, 0},   {1, 1},   {1, 16},  {3, 5},
+                                        {16, 8}, {17, 33}, {64, 64}, {65, 130}};
   static const int64_t rows[][2] = {{0, 0}, {0, 3}, {4, 0}, {1, 1}, {2, 2}, {9, 300}, {700, 129}};
   for (int c = 0; c < 9; c++)
-    for (int r = 0; r < 7; r++) check_case(kernels, rows[r][0], rows[r][1], channels[c][0], channels[c][1], (c + r) % 2);
+    for (int r = 0; r < 7; r++)
+      check_case(kernels, rows[r][0], rows[r][1], channels[c][0], channels[c][1], (c + r) % 2);
   check_case(kernels, 900, 50000, 3, 5, false); /* ranges of rows, and groups in parts */
   check_case(kernels, 50, 3, 3, 150, true);     /* ranges of columns */
 }
@@ -70,7 +74,8 @@ static void test_adjoint(const ast_kernels *kernels) {
   float *out = convolve(kernels, &p, n, x, weight, NULL, C_in, C_out, false);
   float *back = convolve(kernels, &q, n, y, weight, NULL, C_out, C_in, true);
   double left = 0, right = 0, magnitude = 0;
-  for (int64_t i = 0; i < n * C_out; i++) left += (double)out[i] * (double)y[i], magnitude += fabs((double)out[i] * (double)y[i]);
+  for (int64_t i = 0; i < n * C_out; i++)
+    left += (double)out[i] * (double)y[i], magnitude += fabs((double)out[i] * (double)y[i]);
   for (int64_t i = 0; i < n * C_in; i++) right += (double)x[i] * (double)back[i];
   CHECK(fabs(left - right) <= 1e-6 * magnitude, "%.9g and %.9g", left, right);
   FREE(low, high, PAIR_BUFFERS(&p), PAIR_BUFFERS(&q), x, y, weight, out, back);
@@ -80,7 +85,8 @@ static void test_adjoint(const ast_kernels *kernels) {
 static void test_batch(const ast_kernels *kernels) {
   const int64_t C_in = 20, C_out = 36, sources = 900, destinations = 16000;
   const ast_pairs both = random_pairs(sources, destinations, 0.1, 2);
-  int64_t *source = new_ints(both.offsets[OFFSETS]), *destination = new_ints(both.offsets[OFFSETS]), offsets[OFFSETS + 1] = {0}, n = 0;
+  int64_t *source = new_ints(both.offsets[OFFSETS]), *destination = new_ints(both.offsets[OFFSETS]),
+          offsets[OFFSETS + 1] = {0}, n = 0;
   for (int k = 0; k < OFFSETS; k++) {
     for (int64_t i = both.offsets[k]; i < both.offsets[k + 1]; i++)
       if (both.destination[i] >= destinations / 2) {
@@ -95,7 +101,8 @@ static void test_batch(const ast_kernels *kernels) {
   float *batch = convolve(kernels, &both, destinations, x, weight, NULL, C_in, C_out, false);
   float *alone = convolve(kernels, &one, destinations / 2, x + sources / 2 * C_in, weight, NULL, C_in, C_out, false);
   for (int64_t i = 0; i < destinations / 2 * C_out; i++) CHECK(isfinite(alone[i]), "out[%lld]", (long long)i);
-  CHECK(!memcmp(alone, batch + destinations / 2 * C_out, (size_t)(destinations / 2 * C_out) * sizeof *alone), "not the same bits");
+  CHECK(!memcmp(alone, batch + destinations / 2 * C_out, (size_t)(destinations / 2 * C_out) * sizeof *alone),
+        "not the same bits");
   FREE(PAIR_BUFFERS(&both), PAIR_BUFFERS(&one), source, destination, x, weight, batch, alone);
 }
 
@@ -103,15 +110,16 @@ static void test_batch(const ast_kernels *kernels) {
 static void test_threads(const ast_kernels *kernels) {
   const int64_t C_in = 70, C_out = 32, n = getenv("AST_TEST_QUICK") ? 3000 : 20000;
   const ast_pairs p = random_pairs(n, n, 0.5, 1);
-  float *x = random_floats(n * C_in), *dout = random_floats(n * C_out), *weight = random_floats(OFFSETS * C_in * C_out), *out[2],
-        *dweight[2];
+  float *x = random_floats(n * C_in), *dout = random_floats(n * C_out), *weight = random_floats(OFFSETS * C_in * C_out),
+        *out[2], *dweight[2];
   for (int i = 0; i < 2; i++) {
     if (i) ast_set_pool(NULL, NULL);
     out[i] = convolve(kernels, &p, n, x, weight, NULL, C_in, C_out, false);
     dweight[i] = weight_gradient(kernels, &p, x, dout, C_in, C_out);
   }
   CHECK(!memcmp(out[0], out[1], (size_t)(n * C_out) * sizeof(float)), "threads change the result");
-  CHECK(!memcmp(dweight[0], dweight[1], (size_t)(OFFSETS * C_in * C_out) * sizeof(float)), "threads change the weight gradient");
+  CHECK(!memcmp(dweight[0], dweight[1], (size_t)(OFFSETS * C_in * C_out) * sizeof(float)),
+        "threads change the weight gradient");
   FREE(PAIR_BUFFERS(&p), x, dout, weight, out[0], out[1], dweight[0], dweight[1]);
 }
 
