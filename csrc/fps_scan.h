@@ -2,16 +2,14 @@
  * coordinates relative to the middle of the scene; FPS(name) makes the names of that type. The loops over points are
  * written for the compiler to vectorise. */
 
-/* Points in blocks of consecutive ones, the last block padded with copies of the last point, which comes first of them.
- */
+/* Points in blocks of consecutive ones. Copies of the last point pad the last block; it comes before them. */
 typedef struct {
-  int64_t size, blocks; /* points of a block, a multiple of FPS_TILE */
-  int64_t *seen;        /* [blocks] the number of samples that the block has seen */
-  T *distances;         /* [blocks,size] from those */
-  COORDINATE *points;   /* [blocks,3,size] */
-  COORDINATE *boxes;    /* [blocks,6]: lowest x, y, z, highest x, y, z */
-  COORDINATE
-      *samples[3]; /* x, y, z of all samples so far; followed by FPS_TILE items that are read but do not matter */
+  int64_t size, blocks;   /* points of a block, a multiple of FPS_TILE */
+  int64_t *seen;          /* [blocks] the number of samples that the block has seen */
+  T *distances;           /* [blocks,size] from those */
+  COORDINATE *points;     /* [blocks,3,size] */
+  COORDINATE *boxes;      /* [blocks,6]: lowest x, y, z, highest x, y, z */
+  COORDINATE *samples[3]; /* x, y, z of all samples so far, then FPS_TILE items that are read but do not matter */
   fps_tournament tournament;
 } FPS(scene);
 
