@@ -167,7 +167,7 @@ static void test_accuracy(const ast_kernels *kernels) {
   static const int64_t widths[] = {16, 32, 48, 64, 128};
   const bool quick = getenv("AST_TEST_QUICK") != NULL; /* under valgrind */
   for (size_t i = 0; i < sizeof sizes / sizeof *sizes; i++)
-    for (int kind = 0; kind < (quick && sizes[i][0] + sizes[i][1] > 600 ? 1 : 4); kind++) {
+    for (int kind = 0; kind < (quick && sizes[i][0] + sizes[i][1] > 300 ? 1 : 4); kind++) {
       const int64_t D = widths[(i + (size_t)kind) % 5], H = 1 + (int64_t)(i % 3);
       static const float amplitudes[4] = {1, 0, 60, 1e15f}; /* usual; all scores equal; scores of 1e4; of 1e30 */
       problem a = new_problem(1, &sizes[i][0], &sizes[i][1], H, D, amplitudes[kind], kind % 2 ? 0.1 : 0);

@@ -348,16 +348,19 @@ static void *make_attempt(void *p) {
   attempt *a = p;
   if (a->threaded) pool_start(CHECK_THREADS);
   atomic_store(&allocations, 0), atomic_store(&failures, 0);
+  const bool none_fails = atomic_load(&failing) == LONG_MAX;
   check_state = 1;
   a->first = a->run(a->kernels);
   a->failures = atomic_load(&failures);
   atomic_store(&failing, LONG_MAX);
   check_state = 1;
   a->again = a->run(a->kernels);
-  check_state = 1;
-  atomic_store(&allocations, 0);
-  a->run(a->kernels);
-  a->third = atomic_load(&allocations);
+  if (none_fails) {
+    check_state = 1;
+    atomic_store(&allocations, 0);
+    a->run(a->kernels);
+    a->third = atomic_load(&allocations);
+  }
   if (a->threaded) pool_stop();
   return NULL;
 }
@@ -398,7 +401,8 @@ static void test(const ast_kernels *kernels) {
   if (threaded) pool_start(CHECK_THREADS);
 }
 
-/* Requests keep apart, marks nest, and what is released is used again; a large stack is given back as a whole. */
+/* Requests keep apart, marks nest, and what is released is used again, from the second round on: only then one block is
+ * large enough for all. A large stack is given back as a whole. */
 static void *test_scratch(void *unused) {
   const long before = atomic_load(&living);
   for (int round = 0; round < 3; round++) {
@@ -408,8 +412,13 @@ static void *test_scratch(void *unused) {
     for (int i = 0; i < 8; i++) {
       AST_SCRATCH_SCOPE;
       char *inner = ast_scratch(100000);
+<<<<<<< HEAD
       CHECK(inner && (uintptr_t)inner % 64 == 0 && (APART || i == 0 || inner == again),
             "released memory is not used again");
+=======
+      CHECK(inner && (uintptr_t)inner % 64 == 0, "no memory, or not aligned");
+      CHECK(APART || round == 0 || i == 0 || inner == again, "released memory is not used again");
+>>>>>>> h_portable
       again = memset(inner, 99, 100000);
     }
     for (int i = 0; i < 8; i++)
