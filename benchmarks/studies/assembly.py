@@ -163,12 +163,16 @@ def _line(found: dict[str, Any]) -> str:
         f"{row['train']} scenes ({found['generation_minutes']:.1f} min), {row['steps']:,} steps",
         f"{found['minutes']:.0f}",
         f"{100 * np.mean(errors):.1f} ± {100 * np.std(errors) / len(errors) ** 0.5:.1f} %",
-        f"{100 * found['reaction']:.1f} %",
+        f"{100 * found['reaction']:.1f} %, median {100 * _median_reaction(found['forces']):.1f} %",
         "-" if found["largest_stress"] is None else f"{100 * found['largest_stress']:.0f} %",
         f"{1000 * found['seconds']:.0f} ms",
         "-" if solver is None else f"{1000 * solver['seconds']:.0f} ms",
         f"{spent / saved:,.0f} questions" if saved > 0 else "never: the solver is faster" if solver else "-",
     ]) + " |"  # fmt: skip
+
+
+def _median_reaction(forces: list[tuple[float, float]]) -> float:
+    return float(np.median([abs(predicted - true) / true for predicted, true in forces if true > 0]))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -13,15 +13,14 @@ def validation_curve(run: Run) -> list[dict[str, float]]:
     errors over all numbers of corrections: of the `model` alone, and with `newton` steps after it."""
     records = list(Metrics(run.path))
     minutes = float(np.median([record["seconds"] for record in records if "loss" in record])) / 60
-    found = []
+    found: dict[int, dict[str, float]] = {}
     for record in records:
         errors = np.array(record.get("valid_by_effort") or np.zeros((0, 0)), dtype=float)
         if np.isfinite(errors).any():
             model, newton = float(np.nanmin(errors[:, 0])), float(np.nanmin(errors))
-            found.append(
-                {"step": record["step"], "minutes": minutes * record["step"], "model": model, "newton": newton}
-            )
-    return found
+            step = record["step"]  # a later validation of a step replaces an earlier one
+            found[step] = {"step": step, "minutes": minutes * step, "model": model, "newton": newton}
+    return list(found.values())
 
 
 def curve_line(curve: list[dict[str, float]]) -> str:
