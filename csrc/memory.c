@@ -1,9 +1,9 @@
-/* Scratch memory of each thread, a stack in a few blocks, and the C library's thresholds for giving memory back.
+/* Scratch memory of each thread, a stack in blocks, and the C library's thresholds for giving memory back.
  *
- * A request that finds no room in the newest block gets a new one. When the stack is empty again one block stays if it
- * was enough; else the next request gets one for all that was ever in use at once: so a kernel that is called again and
- * again allocates nothing from its third call on, and its arrays lie side by side. More than SCRATCH_KEPT bytes are
- * given back instead.
+ * A request that finds no room in the newest block gets a new one. Of the blocks that are released the largest stays as
+ * a spare for the next request. When the stack is empty the spare goes, too, if it could not have held all that was in
+ * use at once: the next block then can. So a kernel that is called again and again allocates nothing from its third
+ * call on, and its arrays lie side by side. Where more than SCRATCH_KEPT bytes were in use, all are given back.
  */
 #include <limits.h>
 #include <pthread.h>
@@ -36,8 +36,8 @@ typedef struct block {
 _Static_assert(sizeof(block) <= ALIGNMENT, "the memory of a block begins at the first aligned byte behind its head");
 
 typedef struct {
-  block *newest;
-  int64_t used, most; /* bytes now, and at most since `most` was forgotten */
+  block *newest, *spare;
+  int64_t used, most; /* bytes now, and at most since memory was given back */
 } stack;
 
 static pthread_key_t key;
@@ -45,17 +45,40 @@ static pthread_once_t once = PTHREAD_ONCE_INIT;
 static int key_status;
 
 static char *begin_of(block *b) { return (char *)b + ALIGNMENT; }
+static int64_t room_of(block *b) { return b ? b->end - begin_of(b) : -1; }
 
 static void pop(stack *s) {
   block *b = s->newest;
   s->used -= b->next - begin_of(b);
   s->newest = b->below;
-  free(b);
+  if (!APART && room_of(b) > room_of(s->spare)) {
+    free(s->spare);
+    s->spare = b;
+  } else {
+    free(b);
+  }
+}
+
+static bool push(stack *s, int64_t bytes) {
+  block *b = s->spare;
+  if (room_of(b) >= bytes) {
+    s->spare = NULL;
+  } else {
+    const int64_t room = s->newest || APART || s->most < bytes ? bytes : s->most;
+    b = aligned_alloc(ALIGNMENT, (size_t)(ALIGNMENT + room));
+    if (!b) return false;
+    b->end = begin_of(b) + room;
+  }
+  b->below = s->newest;
+  b->next = begin_of(b);
+  s->newest = b;
+  return true;
 }
 
 static void free_stack(void *p) {
   stack *s = p;
   while (s->newest) pop(s);
+  free(s->spare);
   free(s);
 }
 
@@ -74,16 +97,6 @@ static stack *new_stack(void) {
   return NULL;
 }
 
-static bool push(stack *s, int64_t bytes) {
-  if (!s->used && s->newest) pop(s);
-  const int64_t room = s->newest || APART || s->most < bytes ? bytes : s->most;
-  block *b = aligned_alloc(ALIGNMENT, (size_t)(ALIGNMENT + room));
-  if (!b) return false;
-  *b = (block){.below = s->newest, .next = begin_of(b), .end = begin_of(b) + room};
-  s->newest = b;
-  return true;
-}
-
 void *ast_scratch(int64_t bytes) {
   stack *s = own_stack();
   if (!s && !(s = new_stack())) return NULL;
@@ -98,23 +111,22 @@ void *ast_scratch(int64_t bytes) {
 
 void *ast_scratch_mark(void) {
   const stack *s = own_stack();
-  return s && s->used ? s->newest->next : NULL;
+  return s && s->newest ? s->newest->next : NULL;
 }
 
+/* A mark is the end of a request, where no block but its own reaches, or NULL for the empty stack. */
 void ast_scratch_release(void *mark) {
   stack *s = own_stack();
-  if (!s || !s->used) return;
-  if (mark) { /* the end of a request: no block but its own reaches there */
-    while (s->newest->next < (char *)mark || (char *)mark <= begin_of(s->newest)) pop(s);
+  if (!s || !s->newest) return;
+  while (s->newest && (s->newest->next < (char *)mark || (char *)mark <= begin_of(s->newest))) pop(s);
+  if (s->newest) {
     s->used -= s->newest->next - (char *)mark;
     s->newest->next = mark;
-    return;
+  } else if (s->most > SCRATCH_KEPT || room_of(s->spare) < s->most) {
+    free(s->spare);
+    s->spare = NULL;
+    if (s->most > SCRATCH_KEPT) s->most = 0;
   }
-  while (s->newest->below) pop(s);
-  s->used = 0;
-  s->newest->next = begin_of(s->newest);
-  if (APART || s->most > SCRATCH_KEPT) s->most = 0, pop(s);
-  else if (s->newest->end - s->newest->next < s->most) pop(s);
 }
 
 bool ast_keep_memory(void) {

@@ -146,9 +146,10 @@ AST_INLINE void octree_scatter(const uint64_t *keys, const uint64_t *nodes, uint
 AST_INLINE ast_status octree_radix_sort(uint64_t *keys, uint64_t *nodes, uint64_t *keys_other, uint64_t *nodes_other,
                                         int64_t n, int low, int high, const bool packed) {
   const int max_digit = n < 1 << 12 ? 8 : n < 1 << 20 ? OCTREE_MAX_DIGIT : 9;
-  const int passes = (int)divide_up(high - low, max_digit);
+  const int passes =
+      (high - low + max_digit - 1) / max_digit; /* in int: the loops below come out slower from int64_t */
   if (!passes) return AST_OK;
-  const int digit = (int)divide_up(high - low, passes);
+  const int digit = (high - low + passes - 1) / passes;
   const uint64_t mask = (1ull << digit) - 1;
   int64_t *count = ast_scratch(OCTREE_HISTOGRAM * (int64_t)sizeof *count);
   if (!count) return AST_NO_MEMORY;
