@@ -115,16 +115,17 @@ GCC_WARNINGS := $(WARNINGS) -Wno-maybe-uninitialized
 GCC := $(CC) $(C_FLAGS) $(GCC_WARNINGS)
 CLANG := clang $(C_FLAGS) -w
 COMPILE_plain := $(GCC) -O3
-COMPILE_sanitized := $(GCC) -O1 -g -fsanitize=$(SANITIZE) -fno-sanitize-recover=all
-COMPILE_races := $(CLANG) -O1 -g -fsanitize=thread
-COMPILE_valgrind := $(GCC) -O1 -g
+# GCC fuses products and sums into one operation from -O2 on; AST_UNFUSED tells the test of rounding errors where it does not.
+COMPILE_sanitized := $(GCC) -O1 -g -DAST_UNFUSED -fsanitize=$(SANITIZE) -fno-sanitize-recover=all
+COMPILE_races := $(CLANG) -O1 -g -DAST_UNFUSED -fsanitize=thread
+COMPILE_valgrind := $(GCC) -O1 -g -DAST_UNFUSED
 # -O0: the optimiser takes minutes over unrolled products with all these checks in them. Comparisons are not traced, nor branches of the
 # targets themselves: the sizes that a kernel compares do not stand in an input, and the tracing took most of the time.
 COMPILE_fuzz := $(CLANG) -O0 -g -fsanitize=fuzzer-no-link,$(SANITIZE) -fno-sanitize-coverage=trace-cmp -fno-sanitize-recover=all
 COMPILE_target := $(CLANG) -O1 -g -fsanitize=$(SANITIZE) -fno-sanitize-recover=all
 COMPILE_wide := $(GCC) -O2 -mavx2 -mfma -DAST_VECTOR_BYTES=64
 COMPILE_gcc11 := gcc-11 $(C_FLAGS) $(GCC_WARNINGS) -O2
-COMPILE_clang := clang $(C_FLAGS) $(WARNINGS) -O2
+COMPILE_clang := clang $(C_FLAGS) $(WARNINGS) -O2 -DAST_UNFUSED
 COMPILE_aarch64 := aarch64-linux-gnu-gcc $(C_FLAGS) $(GCC_WARNINGS) -O2
 
 CORE := isa_base dispatch parallel memory tests/simd_base

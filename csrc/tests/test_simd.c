@@ -82,7 +82,12 @@ static void check_row(const simd_table *table, const row *r, int64_t num) {
     }
   }
   printf("    %-16s [%6.1f, %5.1f]  %.2f ULP at %.9g\n", r->name, (double)r->least, (double)r->most, worst, (double)at);
-  CHECK(worst <= r->bound, "%s is off by %g ULP, not %g, at %.9g", r->name, worst, r->bound, (double)at);
+#ifdef AST_UNFUSED
+  const double bound = 1.5 * r->bound; /* products are rounded, too, where the kernels count on fused ones */
+#else
+  const double bound = r->bound;
+#endif
+  CHECK(worst <= bound, "%s is off by %g ULP, not %g, at %.9g", r->name, worst, bound, (double)at);
 }
 
 /* What lies outside of the domains. */
