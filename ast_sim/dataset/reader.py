@@ -274,6 +274,8 @@ class Dataset:
         """The facts in another unit of length."""
         if unit is None or unit == info.length_unit:
             return info
+        if unit not in LENGTH_UNITS:
+            raise DatasetError(f"{self.path}: length_unit {unit!r} is unknown: use one of {', '.join(LENGTH_UNITS)}")
         self._scale = LENGTH_UNITS[info.length_unit] / LENGTH_UNITS[unit]
         return replace(
             info,

@@ -16,7 +16,6 @@ import numpy as np
 import torch
 
 from ast_sim.dataset.reader import Dataset
-from ast_sim.inference.answer import Answer
 from ast_sim.inference.effort import Effort
 from ast_sim.inference.jump import calls
 from ast_sim.inference.predict import answers
@@ -91,7 +90,7 @@ def errors_by_effort(model: Simulator, truth: Trajectory, most: Effort) -> np.nd
                 moved = [_rms(x[0] - truth.position[frame], free) / size for x in after.position[corrections:]]
                 found[0, corrections, : steps + 1] = moved
                 for step, stress in enumerate(() if after.stress is None else after.stress):
-                    share, _ = _stress_errors(truth, stress[0], frame, model.config.stress)
+                    share = _stress_errors(truth, stress[0], frame, model.config.stress)["stress_share"]
                     found[1, corrections, step] = np.nan if share is None else share
                 break
     return found
@@ -153,6 +152,7 @@ def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: E
     free = ~truth.scene.prescribed
     size = _rms(truth.position[frame] - truth.position[0], free)
     failed = answer.failure is not None or not size  # where nothing moves, there is no relative error
+    stress = None if answer.stress is None or answer.failure is not None else answer.stress[0]
     by_calls = []
     if model.config.jumps and not failed:
         (after,) = calls(model, [question], effort)
@@ -166,7 +166,7 @@ def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: E
         "relative_error": None if failed else _rms(answer.position[0] - truth.position[frame], free) / size,
         "by_calls": by_calls,
         "seconds": seconds,
-        **dict(zip(("stress_share", "largest_stress"), _stress_of(truth, answer, frame, model), strict=True)),
+        **_stress_errors(truth, stress, frame, model.config.stress),
     }
 
 
@@ -174,27 +174,18 @@ def _rms(difference: np.ndarray, rows: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(difference[rows], dtype=np.float64))))
 
 
-def _stress_of(truth: Trajectory, answer: Answer, frame: int, model: Simulator) -> tuple[float | None, float | None]:
-    """See `_stress_errors`; None where there is no stress."""
-    if answer.stress is None or answer.failure is not None:
-        return None, None
-    return _stress_errors(truth, answer.stress[0], frame, model.config.stress)
-
-
-def _stress_errors(
-    truth: Trajectory, stress: np.ndarray, frame: int, location: str
-) -> tuple[float | None, float | None]:
+def _stress_errors(truth: Trajectory, stress: np.ndarray | None, frame: int, location: str) -> dict[str, float | None]:
     """The error of the stress on what deforms, relative to that of the frame's true mean; and by how much the largest
     is off. None where they say nothing."""
-    if truth.stress is None:
-        return None, None
+    if stress is None or truth.stress is None:
+        return {"stress_share": None, "largest_stress": None}
     rows = truth.scene.deforming(location)
     there, found = truth.stress[frame].astype(np.float64), stress.astype(np.float64)
     spread, largest = float(there[rows].std()), float(there[rows].max())
-    return (
-        _rms(found - there, rows) / spread if spread else None,
-        abs(float(found[rows].max()) - largest) / largest if largest else None,
-    )
+    return {
+        "stress_share": _rms(found - there, rows) / spread if spread else None,
+        "largest_stress": abs(float(found[rows].max()) - largest) / largest if largest else None,
+    }
 
 
 def _solver(rival: Rivals, error: float | None) -> dict[str, Any]:

@@ -243,9 +243,8 @@ def attention(
     """softmax(scale q k^T) v of each scene and head, with dropout on the weights.
 
     Memory grows with the number of tokens, not with its square, forward and backward; second derivatives and tangents
-    do store the scores. A scene's result has the same
-    bits for any number of threads. Without dropout it has the same bits in any batch; dropout depends on the number of
-    the scene in the batch.
+    do store the scores. A scene's result has the same bits for any number of threads. Without dropout it has the same
+    bits in any batch; dropout depends on the number of the scene in the batch.
 
     Args:
         q: [Tq, H, D]; rows may lie apart, as in a slice of a fused projection. D is a multiple of 16 up to 128.

@@ -14,7 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ast_sim.ops.library import check_index, freeze, frozen
+from ast_sim.ops.library import freeze, frozen
+from ast_sim.ops.spec import check_index
 
 
 def offsets_of(index: Tensor, num: int) -> Tensor:

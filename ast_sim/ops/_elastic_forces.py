@@ -19,7 +19,8 @@ from torch import Tensor
 from ast_sim.ops import library
 from ast_sim.ops._edges import join_indices, join_offsets, offsets_of
 from ast_sim.ops.derivatives import differentiate, differentiate_by_composition
-from ast_sim.ops.library import check_index, freeze
+from ast_sim.ops.library import freeze
+from ast_sim.ops.spec import check_index
 
 FLAT = 2.0**-21  # a rest volume below this share of the magnitudes that it is the sum of may be rounding alone
 

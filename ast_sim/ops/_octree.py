@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from ast_sim.ops import library
-from ast_sim.ops.library import freeze, segment_of
+from ast_sim.ops.library import freeze
+from ast_sim.ops.spec import segment_of
 
 MAX_DEPTH = 21
 

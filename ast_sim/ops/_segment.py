@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ast_sim.ops import library
 from ast_sim.ops.derivatives import differentiate
-from ast_sim.ops.library import segment_of
+from ast_sim.ops.spec import segment_of
 
 
 def _scale(node_offsets: Tensor, mean: bool, dtype: torch.dtype) -> Tensor:

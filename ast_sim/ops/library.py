@@ -24,9 +24,6 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from ast_sim.ops import spec as specs
-from ast_sim.ops.spec import check_index, segment_of
-
-__all__ = ["check_index", "segment_of"]
 
 BACKEND = os.environ.get("AST_SIM_BACKEND", "c")
 if BACKEND not in ("c", "torch"):
@@ -239,15 +236,6 @@ def dense_rows(x: torch.Tensor | None) -> torch.Tensor | None:
             return dense(x)
         length *= n
     return x if row >= length and not x.data_ptr() % x.element_size() and not x.is_neg() else dense(x)
-
-
-def check_shape(op: str, name: str, x: torch.Tensor | None, *shape: int) -> None:
-    """Raise ValueError unless x has this shape; -1 stands for any size. None passes."""
-    if x is None or x.shape == shape:
-        return
-    if x.dim() != len(shape) or any(n not in (-1, size) for n, size in zip(shape, x.shape, strict=True)):
-        wanted = ", ".join("*" if n < 0 else str(n) for n in shape)
-        raise ValueError(f"{op}: {name} must have shape [{wanted}], not {tuple(x.shape)}")
 
 
 def frozen(*indices: Tensor) -> tuple[Tensor, ...]:

@@ -22,10 +22,9 @@ import ast_sim
 from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.inference.asked_frame import asked_frames
 from ast_sim.inference.effort import Effort
-from ast_sim.runs.metrics import Metrics
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
-from benchmarks.studies.validation_curve import curve_line, validation_curve
+from benchmarks.studies.validation_curve import curve_line, minutes_per_step, validation_curve
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "benchmarks" / "results" / "assembly.json"
@@ -96,12 +95,11 @@ def measured(name: str, row: Row, folder: Path) -> dict[str, Any]:
         found = asked_frames(run.model, dataset, "test", run.effort, row.rivals, spec=row.spec)
         forces = [_forces(run, dataset, index) for index in range(row.test)]
         solver_seconds = read_seconds(dataset).samples.values()
-    steps = [record["seconds"] for record in Metrics(run.path) if "loss" in record]
     return {
         **provenance(f"python -m benchmarks.studies.assembly {name}"),
         "row": {**asdict(row), "spec": f"{row.spec.parent.name}/{row.spec.name}"},
         "generation_minutes": float(sum(map(sum, solver_seconds))) / 60,
-        "minutes": float(np.median(steps)) * row.steps / 60,
+        "minutes": minutes_per_step(run) * row.steps,
         "effort": run.effort._asdict(),
         "curve": validation_curve(run),
         "reaction": float(np.mean([abs(p - t) / t for p, t in forces if t > 0])),

@@ -20,10 +20,9 @@ import numpy as np
 import ast_sim
 from ast_sim.inference.asked_frame import asked_frames
 from ast_sim.inference.effort import Effort, knows_material
-from ast_sim.runs.metrics import Metrics
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
-from benchmarks.studies.validation_curve import curve_line, validation_curve
+from benchmarks.studies.validation_curve import curve_line, minutes_per_step, validation_curve
 
 RESULTS = Path(__file__).parents[1] / "results" / "jumps.json"
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "jumps.md"
@@ -101,11 +100,10 @@ def measured(row: Row, folder: Path) -> dict[str, Any]:
         found = asked_frames(run.model, dataset, "test", run.effort, row.rivals)
         known = asked_frames(run.model, dataset, "train", run.effort)["relative_error"]
         dial = [_turned(run, dataset, effort) for effort in _efforts(run)]
-    seconds = [record["seconds"] for record in Metrics(run.path) if "loss" in record]
     return {
         **provenance(f"python -m benchmarks.studies.jumps {row.data}"),
         "row": asdict(row),
-        "minutes": float(np.median(seconds)) * row.steps / 60,
+        "minutes": minutes_per_step(run) * row.steps,
         "effort": run.effort._asdict(),
         "curve": validation_curve(run),
         "dial": dial,

@@ -8,13 +8,17 @@ from ast_sim import Run
 from ast_sim.runs.metrics import Metrics
 
 
+def minutes_per_step(run: Run) -> float:
+    """The median time of a training step, in minutes."""
+    return float(np.median([record["seconds"] for record in Metrics(run.path) if "loss" in record])) / 60
+
+
 def validation_curve(run: Run) -> list[dict[str, float]]:
-    """For each validation the `step`, the `minutes` (steps times the median time of a step), and the smallest relative
-    errors over all numbers of corrections: of the `model` alone, and with `newton` steps after it."""
-    records = list(Metrics(run.path))
-    minutes = float(np.median([record["seconds"] for record in records if "loss" in record])) / 60
+    """For each validation the `step`, the `minutes` until then, and the smallest relative errors over all numbers of
+    corrections: of the `model` alone, and with `newton` steps after it."""
+    minutes = minutes_per_step(run)
     found: dict[int, dict[str, float]] = {}
-    for record in records:
+    for record in Metrics(run.path):
         errors = np.array(record.get("valid_by_effort") or np.zeros((0, 0)), dtype=float)
         if np.isfinite(errors).any():
             model, newton = float(np.nanmin(errors[:, 0])), float(np.nanmin(errors))

@@ -7,9 +7,11 @@ import pytest
 import toy
 from toy import one_thread  # noqa: F401 (used by being imported)
 
+from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.inference.trained_run import Run
 from ast_sim.scene import NodeType, Scene, Trajectory
+from ast_sim.support.errors import DatasetError
 from ast_sim.support.sealed_line import seal
 from ast_sim.training.start import configure, start_training
 
@@ -49,6 +51,8 @@ def test_data_in_another_unit_are_converted(tmp_path):
         assert figures["length_unit"] == "m"
         found.append(figures["samples"][0]["displacement"]["model"]["rollout_all"]["normal"])
     assert found[1] == pytest.approx(found[0], rel=1e-4) and found[0] > 0
+    with pytest.raises(DatasetError, match="length_unit 'parsec' is unknown: use one of m, cm, mm, um, in"):
+        Dataset(tmp_path / "mm.h5", "parsec")
 
 
 def test_planar_scenes_stay_in_their_plane(tmp_path):

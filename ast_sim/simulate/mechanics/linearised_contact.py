@@ -38,8 +38,8 @@ CLEARANCE = (
 )
 NEAR = 0.5  # pairs with a gap below this may touch, in mean edge lengths of the surfaces
 DEEP = 2.0  # a node deeper inside another body than this is not taken for one in contact with it, in the same
-FEW, SHARE = 8, 4  # a round takes so many of the pairs that would overlap, or this part of them if that is more
 OVERLAP = 1e-6  # pairs may overlap by this much at the end of a step, in the same
+FEW, SHARE = 8, 4  # a round takes so many of the pairs that would overlap, or this part of them if that is more
 ROUNDING = 1e-10  # is added to the diagonal of B, relative to its mean: equal pairs make B singular
 SWEEPS, CHANGE = 100, 1e-3  # forces of friction are found when a sweep over the pairs changes them by less
 FLATTEST = 0.2  # the least stretch of an element that forces and stiffness follow
