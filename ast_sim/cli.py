@@ -254,7 +254,10 @@ def _add_predict(predict: _Parser) -> None:
     _add_each(predict, {"--frames I,...": about}, type=_whole_numbers)
     about = "calls that correct the first one, if the run jumps to a frame (default: as its validation has decided)"
     _add_each(predict, {"--corrections N": about}, type=_at_least(0))
-    about = "Newton steps of the solver after them, towards the exact answer (default: likewise; 0 with --corrections)"
+    about = (
+        "at most so many Newton steps of the solver after them, until one is small (default: likewise; 0 with"
+        " --corrections)"
+    )
     _add_each(predict, {"--newton-steps N": about}, type=_at_least(0))
     about = "number of frames of the motion (default: prescribed nodes move as far in a frame as in training)"
     _add_each(predict, {"--num-frames N": about}, type=_at_least(2))

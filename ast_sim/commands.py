@@ -204,8 +204,9 @@ def _predict_spec(run: Any, args: argparse.Namespace) -> None:
     rows = grid(dict(map(parse_setting, args.set)))
     if len(rows) > 1:
         raise ConfigError("--set gives several values: ast-sim sweep predicts them all")
-    effort = {"frames": args.frames, "corrections": args.corrections, "num_frames": args.num_frames}
-    answer = run.predict(spec=args.scene, nodes=args.nodes, name=str(args.scene), **effort, **rows[0])
+    effort = {"frames": args.frames, "corrections": args.corrections, "newton_steps": args.newton_steps}
+    asked = {"nodes": args.nodes, "num_frames": args.num_frames, "name": str(args.scene)}
+    answer = run.predict(spec=args.scene, **asked, **effort, **rows[0])
     _save(answer, args, None)
     for frame, row in zip(answer.frames, answer.figures(answer.source["origin"]), strict=True):
         parts = [f"{name} {row[name]:.4g} {unit}" for name, unit in _units(run) if name in row]
@@ -233,6 +234,8 @@ def sweep(args: argparse.Namespace) -> None:
     found = run.sweep(args.spec, table=args.table, nodes=args.nodes, **effort, **values)
     found.save(args.out)
     print(f"{args.out}: {len(found.rows)} rows, {1000 * found.seconds / len(found.rows):.3g} ms each")
+    if found.unsettled:
+        print(f"not converged: {found.unsettled} rows, in which last_newton_step is above 0.1")
     if found.varied:
         found.picture(picture, args.quantity)
         print(f"picture: {picture}")
@@ -249,6 +252,9 @@ def _save(answer: Any, args: argparse.Namespace, truth: Any) -> None:
     if answer.expected_error is not None:
         percent = f"{100 * answer.expected_error:.2g} % of the displacement"
         print(f"expected error: {percent}, as in the validation scenes at their deepest frame")
+    if answer.converged is False:
+        size = f"{max(answer.last_steps):.2g}, and should be at most 0.1"
+        print(f"not converged: the size of a last Newton step is {size}")
 
 
 def _truth(run: Any, args: argparse.Namespace) -> Any:

@@ -12,6 +12,7 @@ import numpy as np
 from ast_sim.dataset.layout import LENGTH_UNITS, DatasetInfo
 from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.scene import AttributeValue, Scene, Trajectory
+from ast_sim.simulate.mechanics.linearised_contact import STILL
 from ast_sim.support.errors import AstSimError
 from ast_sim.view import export, sweep_files
 from ast_sim.view.files import make_folder
@@ -39,6 +40,9 @@ class Answer:
         expected_error: how far validation scenes were off with the same corrections and Newton steps: the mean over the
             scenes of the root mean square error at the deepest frame, over that of the displacement. It is no bound for
             this scene. None: the run did not measure it.
+        last_steps: of each computed frame the size of its last Newton step: the largest component of a node's move, in
+            mean edge lengths of the surfaces, or the root mean square of the moves over that of the displacements, if
+            that is larger. Newton's method is quadratic: about its square is missing. Empty without Newton steps.
     """
 
     name: str
@@ -53,11 +57,17 @@ class Answer:
     stress_location: str | None = None
     frames: tuple[int, ...] = ()
     expected_error: float | None = None
+    last_steps: tuple[float, ...] = ()
 
     @property
     def seconds(self) -> float:
         """Wall seconds of the whole prediction."""
         return sum(self.step_seconds)
+
+    @property
+    def converged(self) -> bool | None:
+        """Whether the Newton steps of every frame ended because the last one was small, at most 0.1; None without."""
+        return max(self.last_steps) <= STILL if self.last_steps else None
 
     @property
     def trajectory(self) -> Trajectory:
@@ -68,6 +78,7 @@ class Answer:
             "given_frames": self.given,
             "frames": list(self.frames),
             "model_seconds": list(self.step_seconds),
+            **({"last_newton_steps": list(self.last_steps)} if self.last_steps else {}),
         }
         location = None if self.stress is None else self.stress_location
         return Trajectory(self.scene, self.position, self.stress, attributes, stress_location=location)
@@ -87,7 +98,8 @@ class Answer:
 
     def figures(self, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> list[dict[str, float]]:
         """What an engineer asks of each frame: the travel of the prescribed nodes, the reaction and its components (if
-        there is a material), the largest stress and where it is (if the model predicts one).
+        there is a material), the largest stress and where it is (if the model predicts one), the size of the last
+        Newton step (if any was made).
 
         Args:
             origin: [3] the point that positions are relative to.
@@ -107,6 +119,8 @@ class Answer:
                 place = position[nodes].mean(axis=0) + origin
                 row |= {"largest_stress": float(stress[worst])}
                 row |= {f"stress_at_{axis}": float(x) for axis, x in zip("xyz", place, strict=True)}
+            if self.last_steps and frame >= self.given:
+                row |= {"last_newton_step": self.last_steps[frame - self.given]}
             rows.append(row)
         return rows
 

@@ -23,6 +23,7 @@ from ast_sim.inference.question import Question
 from ast_sim.models.simulator import Simulator
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.jobs.rival import Rivals, cheapest, deepest_frame, rivals
+from ast_sim.simulate.mechanics.linearised_contact import STILL
 from ast_sim.support.errors import SimulationError
 
 STARTS = (1, 2)  # in so many load steps the solver is tried
@@ -46,9 +47,10 @@ def asked_frames(
 
     Returns:
         scenes: for each its name, frame, nodes, displacement, relative_error, by_calls (the relative error after each
-        call of a model that jumps, and after each Newton step), seconds, stress_share (the stress error over that of
-        the frame's true mean), largest_stress (relative error of the largest stress), and `solver` where it was run;
-        their means (`relative_error`, `by_calls`, `stress_share`, `largest_stress`), the median of seconds;
+        call of a model that jumps, and after each Newton step), seconds, last_step (the size of the last Newton step,
+        None without one), stress_share (the stress error over that of the frame's true mean), largest_stress (relative
+        error of the largest stress), and `solver` where it was run; their means (`relative_error`, `by_calls`,
+        `stress_share`, `largest_stress`), the median of seconds; unsettled: the scenes whose Newton steps did not end;
         solver: sums over the scenes where it was run, None if there are none, and `no_solver` says why.
     """
     with _one_thread():
@@ -72,23 +74,25 @@ def asked_frames(
         **{key: _mean([scene[key] for scene in known]) for key in ("relative_error", "stress_share", "largest_stress")},
         "by_calls": np.mean([scene["by_calls"] for scene in known], axis=0).tolist() if known else [],
         "seconds": float(np.median([scene["seconds"] for scene in known])) if known else None,
+        "unsettled": sum((scene["last_step"] or 0) > STILL for scene in known),
         "solver": _sums([scene for scene in known if "solver" in scene]),
         "no_solver": why,
     }
 
 
 def errors_by_effort(model: Simulator, truth: Trajectory, most: Effort) -> np.ndarray:
-    """[2, C, K]: the errors at the deepest frame after c corrections and k Newton steps, up to `most` of them: that of
-    the displacement, relative to it, and that of the stress, relative to that of the frame's true mean. NaN where the
-    prediction failed, or where there is no stress."""
+    """[3, C, K]: the errors at the deepest frame after c corrections and up to k Newton steps, up to `most` of them:
+    that of the displacement, relative to it, and that of the stress, relative to that of the frame's true mean; and how
+    many Newton steps were made. NaN where the prediction failed, or where there is no stress."""
     frame, free = max(deepest_frame(truth), model.config.given_frames), ~truth.scene.prescribed
-    size, found = _rms(truth.position[frame] - truth.position[0], free), np.full((2, most[0] + 1, most[1] + 1), np.nan)
+    size, found = _rms(truth.position[frame] - truth.position[0], free), np.full((3, most[0] + 1, most[1] + 1), np.nan)
     for corrections in range(most.corrections + 1) if size else ():
         for steps in (most.newton_steps, 0):  # where a Newton step fails, the calls before it still count
             (after,) = calls(model, [Question.of(truth, "validation", [frame])], Effort(corrections, steps))
             if not isinstance(after, str):
                 moved = [_rms(x[0] - truth.position[frame], free) / size for x in after.position[corrections:]]
                 found[0, corrections, : steps + 1] = moved
+                found[2, corrections, : steps + 1] = np.minimum(np.arange(steps + 1), after.steps[0])
                 for step, stress in enumerate(() if after.stress is None else after.stress):
                     share = _stress_errors(truth, stress[0], frame, model.config.stress)["stress_share"]
                     found[1, corrections, step] = np.nan if share is None else share
@@ -107,6 +111,8 @@ def lines(found: dict[str, Any]) -> list[str]:
     ]
     if len(after) > 1:
         told.append(f"  after each call, and each Newton step: {', '.join(after)} %")
+    if found["unsettled"]:
+        told.append(f"  in {found['unsettled']} of {len(found['scenes'])} scenes the Newton steps did not end")
     if found["stress_share"] is not None:
         told.append(
             f"  stress: {found['stress_share']:.2f} of the error of the frame's true mean; the largest is"
@@ -166,6 +172,7 @@ def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: E
         "relative_error": None if failed else _rms(answer.position[0] - truth.position[frame], free) / size,
         "by_calls": by_calls,
         "seconds": seconds,
+        "last_step": answer.last_steps[-1] if answer.last_steps else None,
         **_stress_errors(truth, stress, frame, model.config.stress),
     }
 

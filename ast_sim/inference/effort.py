@@ -22,7 +22,8 @@ class Effort(NamedTuple):
 
     Attributes:
         corrections: so many further calls of the model correct its answer.
-        newton_steps: so many Newton steps of the solver then lead towards equilibrium.
+        newton_steps: at most so many Newton steps of the solver then lead towards equilibrium. They end when a step is
+            at most `STILL`.
     """
 
     corrections: int = 0
@@ -30,9 +31,10 @@ class Effort(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Such as "2 corrections, 1 Newton step"."""
+        """Such as "2 corrections, up to 1 Newton step"."""
         found = [(self.corrections, "correction"), (self.newton_steps, "Newton step")]
-        return ", ".join(f"{n} {what}{'' if n == 1 else 's'}" for n, what in found if n or what == "correction")
+        told = [f"{n} {what}{'' if n == 1 else 's'}" for n, what in found if n or what == "correction"]
+        return ", up to ".join(told)
 
     def check(self, config: ModelConfig) -> None:
         """Raise ConfigError if a number is negative or the model cannot do so."""
@@ -71,28 +73,31 @@ def newton_steps(config: ModelConfig, scene: Scene) -> NewtonSteps:
     return NewtonSteps(scene, material, CLEARANCE * config.contact_range, config.friction)
 
 
-def cheapest_good(errors: np.ndarray, stress: np.ndarray) -> Effort:
-    """The default effort of a run.
+def cheapest_good(errors: np.ndarray, stress: np.ndarray, steps: np.ndarray) -> Effort:
+    """The default effort of a run: Newton steps until one is small, or none, since scenes differ in how many they need.
 
     Stress tells more than the displacement: it follows from strains, and a step that leaves single elements distorted
     hardly moves their nodes.
 
     Args:
-        errors: [C, K], the relative errors of the displacement in validation after c corrections and k Newton steps.
+        errors: [C, K], the relative errors of the displacement in validation after c corrections and up to k Newton
+            steps.
         stress: [C, K], those of the stress; NaN where there is none.
+        steps: [C, K], how many Newton steps were made.
 
     Returns:
         Of the efforts whose errors are good, or nearly the smallest of all, the one with the fewest corrections and
-        Newton steps together; of several, the most accurate one. If no effort has both errors so, that of the
-        displacement decides. The first call alone if no error is known.
+        Newton steps together. If no effort has both errors so, that of the displacement decides. The first call alone
+        if no error is known.
     """
     if np.isnan(errors).all():
         return FIRST_CALL
+    ends = sorted({0, errors.shape[1] - 1})
+    errors, stress, steps = errors[:, ends], stress[:, ends], steps[:, ends]
     accurate = errors <= max(GOOD, (1 + WORTH) * np.nanmin(errors))
     least = np.inf if np.isnan(stress).all() else max(GOOD_STRESS, (1 + WORTH) * np.nanmin(stress))
     both = accurate & ~(stress > least)
-    total = np.add.outer(*(np.arange(size) for size in errors.shape))
+    total = np.arange(len(errors))[:, None] + steps
     allowed = np.where(both if both.any() else accurate, total, np.inf)
-    chosen = np.where(allowed == allowed.min(), errors, np.inf)
-    corrections, steps = np.unravel_index(chosen.argmin(), errors.shape)
-    return Effort(int(corrections), int(steps))
+    corrections, column = np.unravel_index(allowed.argmin(), allowed.shape)
+    return Effort(int(corrections), ends[column])

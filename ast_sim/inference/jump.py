@@ -24,7 +24,7 @@ from ast_sim.inference.effort import Effort, newton_steps
 from ast_sim.inference.question import Question, not_finite, too_far
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.models.simulator import Simulator
-from ast_sim.simulate.mechanics.linearised_contact import NewtonSteps
+from ast_sim.simulate.mechanics.linearised_contact import STILL, NewtonSteps
 from ast_sim.support.errors import RolloutError, SimulationError
 
 BATCH_NODES = 4096  # frames are predicted together as long as they have at most about so many nodes
@@ -56,12 +56,17 @@ class Way(NamedTuple):
     """The wanted frames of a scene on the way to the answer.
 
     Attributes:
-        position: [calls, S, N, 3] float32, after each call, the first one and its corrections, and each Newton step.
+        position: [1 + corrections + Newton steps, S, N, 3] float32, after the first call, each correction, and each
+            Newton step. Where a frame needed fewer Newton steps, its last positions are repeated; stress likewise.
         stress: [1 + Newton steps, S, N or E, 1] float32, after the last call and each Newton step; None without stress.
+        steps: [S], the Newton steps that were made.
+        last_step: [S], the size of the last one, NaN where none was made.
     """
 
     position: np.ndarray
     stress: np.ndarray | None
+    steps: np.ndarray
+    last_step: np.ndarray
 
 
 def calls(model: Simulator, questions: Sequence[Question], effort: Effort) -> list[Way | str]:
@@ -73,10 +78,17 @@ def calls(model: Simulator, questions: Sequence[Question], effort: Effort) -> li
         if failure is not None:
             found.append(failure)
             continue
-        position = np.stack([torch.stack(frame.positions).numpy() for frame in scene.frames], axis=1)
-        stress = [torch.stack(frame.stresses).numpy() for frame in scene.frames if frame.stresses]
-        found.append(Way(position, np.stack(stress, axis=1) if stress else None))
+        position = [_stacked(frame.positions, 1 + sum(effort)) for frame in scene.frames]
+        stress = [_stacked(frame.stresses, 1 + effort.newton_steps) for frame in scene.frames if frame.stresses]
+        steps = np.array([len(frame.positions) - 1 - effort.corrections for frame in scene.frames])
+        last = np.array([np.nan if frame.last_step is None else frame.last_step for frame in scene.frames])
+        found.append(Way(np.stack(position, axis=1), np.stack(stress, axis=1) if stress else None, steps, last))
     return found
+
+
+def _stacked(rows: Sequence[Tensor], count: int) -> np.ndarray:
+    """The rows, and the last one again until they are so many."""
+    return torch.stack([*rows, *[rows[-1]] * (count - len(rows))]).numpy()
 
 
 def _predicted(
@@ -121,19 +133,20 @@ def corrected(model: Simulator, batch: Batch, prescribed: Tensor, calls: int) ->
 
 @dataclass(eq=False)
 class _Frame:
-    """A frame to predict: its start, the positions after each call and each Newton step, and the stress after the last
-    call and after Newton steps."""
+    """A frame to predict: its start, the positions after each call and each Newton step, the stress after the last call
+    and after Newton steps, and the size of the last Newton step."""
 
     scene: _JumpingScene
     number: int
     start: Tensor
     positions: list[Tensor] = field(default_factory=list)
     stresses: list[Tensor] = field(default_factory=list)
+    last_step: float | None = None
     seconds: float = 0.0
     failure: str | None = None
 
-    def refine(self, config: ModelConfig, solvers: dict[int, NewtonSteps], steps: int, every_stress: bool) -> None:
-        """Make Newton steps from the answer of the model; the stress then is that of the material.
+    def refine(self, config: ModelConfig, solvers: dict[int, NewtonSteps], most: int, every_stress: bool) -> None:
+        """Make Newton steps from the answer of the model until one is `STILL`; the stress then is that of the material.
 
         `solvers` holds those of the scenes so far, by their `id`. The stress is that of the last step, or of every one.
         """
@@ -143,12 +156,16 @@ class _Frame:
         try:
             if id(scene) not in solvers:
                 solvers[id(scene)] = newton_steps(config, scene)
-            position = self.positions[-1].numpy().astype(np.float64)
-            for step in range(1, steps + 1):
-                position = solvers[id(scene)].step(position)
+            solver, position = solvers[id(scene)], self.positions[-1].numpy().astype(np.float64)
+            for step in range(1, most + 1):
+                before, position = position, solver.step(position)
                 self.positions.append(torch.from_numpy(position.astype(np.float32)))
-                if config.stress != "none" and (every_stress or step == steps):
-                    self.stresses.append(torch.from_numpy(solvers[id(scene)].von_mises(position, config.stress)))
+                self.last_step = solver.size(before, position)
+                ends = step == most or self.last_step <= STILL
+                if config.stress != "none" and (every_stress or ends):
+                    self.stresses.append(torch.from_numpy(solver.von_mises(position, config.stress)))
+                if ends:
+                    break
         except SimulationError as error:
             self.failure = f"{self.scene.question.name} frame {self.number}: a Newton step failed: {error}"
         self.seconds += time.perf_counter() - began
@@ -191,6 +208,7 @@ class _JumpingScene:
             failure=None if failure is None else f"{failure.failure}; the frames before it are kept",
             stress_location=self.model.config.stress,
             frames=tuple(numbers),
+            last_steps=tuple(frame.last_step for frame in predicted if frame.last_step is not None),
         )
 
 

@@ -14,6 +14,7 @@ from ast_sim.inference.assembly_questions import ask
 from ast_sim.inference.predict import Motions
 from ast_sim.runs.scope import Scope
 from ast_sim.scene import Scene
+from ast_sim.simulate.mechanics.linearised_contact import STILL
 from ast_sim.support.errors import ConfigError
 from ast_sim.view import sweep_files
 from ast_sim.view.files import make_folder
@@ -28,7 +29,7 @@ class Sweep:
     Attributes:
         rows: one for each set of values: the parameters by name, then `travel_of_nodes` (the largest way of a
             prescribed node), `reaction` (newton) with its components, `largest_stress` (pascal) and where it is
-            (`stress_at_x`, ...).
+            (`stress_at_x`, ...), and `last_newton_step` (see `Answer.last_steps`).
         varied: the names of the parameters that differ between rows.
         length_unit: unit of all lengths.
         seconds: wall seconds of the model alone, for all rows.
@@ -38,6 +39,11 @@ class Sweep:
     varied: tuple[str, ...]
     length_unit: str
     seconds: float
+
+    @property
+    def unsettled(self) -> int:
+        """The number of rows whose Newton steps have not converged."""
+        return sum(row.get("last_newton_step", 0.0) > STILL for row in self.rows)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all rows as CSV; a missing folder is made.

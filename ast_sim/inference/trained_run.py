@@ -110,9 +110,9 @@ class Run:
             frames: the numbers of the frames that are wanted, such as [-1] for the last one; by default all. A model
                 that jumps computes no other frame.
             corrections: how many calls correct the first call of a model that jumps; by default as in `self.effort`.
-            newton_steps: how many Newton steps of the solver follow, each about a tenth of its time; by default as in
-                `self.effort`, and 0 if `corrections` is given. They need tetrahedra and their material. The stress then
-                follows from the material.
+            newton_steps: at most so many Newton steps of the solver follow, each about a tenth of its time, until one
+                is small (`Answer.last_steps`); by default as in `self.effort`, and 0 if `corrections` is given. They
+                need tetrahedra and their material. The stress then follows from the material.
             num_frames: S, only for rigid motions; by default so many that the prescribed nodes move as far in one frame
                 as in training.
             stress: [given, N or E, 1], the stress of the given frames in pascal; by default zero. One frame is given,
@@ -208,8 +208,8 @@ class Run:
 
     def _signed(self, answer: Answer, effort: Effort, source: dict[str, Any]) -> Answer:
         """The answer with its units, its origin and the error that is to be expected."""
-        known = effort.corrections < len(self._errors) and effort.newton_steps < len(self._errors[0])
-        expected = self._errors[effort.corrections][effort.newton_steps] if known else None
+        known = self._errors[effort.corrections] if effort.corrections < len(self._errors) else [None]
+        expected = known[min(effort.newton_steps, len(known) - 1)]
         if expected is not None:
             source = {**source, "expected_error": expected}
         return dataclasses.replace(answer, info=self.info, source=source, expected_error=expected)

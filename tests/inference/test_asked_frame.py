@@ -10,8 +10,10 @@ import toy
 from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import Dataset, generate
+from ast_sim.inference import jump
 from ast_sim.inference.asked_frame import asked_frames, errors_by_effort, lines
-from ast_sim.inference.effort import Effort, cheapest_good
+from ast_sim.inference.effort import Effort, cheapest_good, newton_steps
+from ast_sim.inference.jump import calls
 from ast_sim.inference.predict import answers
 from ast_sim.inference.question import Question
 from ast_sim.models.model_config import DataFacts
@@ -97,6 +99,7 @@ def test_newton_steps_lead_from_the_answer_to_equilibrium(pressed, monkeypatch):
         == (1e6, 0.4)
         == tuple(truth.attributes[key] for key in ("young", "poisson"))
     )
+    monkeypatch.setattr(jump, "STILL", 0.0)
     found = asked_frames(model, pressed, "test", Effort(1, 3))["scenes"][0]
     errors = found["by_calls"]
     assert errors[:2] == pytest.approx([0.3, 0.09], rel=1e-3)
@@ -105,8 +108,12 @@ def test_newton_steps_lead_from_the_answer_to_equilibrium(pressed, monkeypatch):
     (answer,) = answers(model, [Question.of(truth, "plate", [frame])], Effort(1, 3))
     held = truth.scene.prescribed
     assert np.array_equal(answer.position[0][held], truth.position[frame][held])
-    table, stress = errors_by_effort(model, truth, Effort(1, 3))
-    assert stress[1, 3] == pytest.approx(found["stress_share"]) and stress[1, 1] > 1.1 * stress[1, 3]
+    table, stress, steps = errors_by_effort(model, truth, Effort(1, 3))
+    assert (
+        steps.tolist() == [[0, 1, 2, 3]] * 2
+        and stress[1, 3] == pytest.approx(found["stress_share"])
+        and stress[1, 1] > 1.1 * stress[1, 3]
+    )
     monkeypatch.setattr(NewtonSteps, "step", collapse)
     assert np.isnan(errors_by_effort(model, truth, Effort(1, 3))[:, :, 1:]).all()
     assert errors_by_effort(model, truth, Effort(1, 3))[0, :, 0].tolist() == table[:, 0].tolist()
@@ -127,25 +134,61 @@ def test_newton_steps_need_a_material(one, pressed):
     assert not any(measure(one).recorded.values())
 
 
+def test_newton_steps_end_when_one_is_small(pressed, monkeypatch):
+    truth, model = pressing(pressed, 0.6)
+    question = [Question.of(truth, "plate", [deepest_frame(truth)])]
+    monkeypatch.setattr(jump, "STILL", 0.0)
+    (all_steps,) = calls(model, question, Effort(1, 6))
+    sizes = [
+        newton_steps(model.config, truth.scene).size(*(all_steps.position[i, 0].astype(float) for i in (k, k + 1)))
+        for k in range(1, 7)
+    ]
+    assert sizes == sorted(sizes, reverse=True) and sizes[0] > 0.1 > sizes[-1]
+    assert all_steps.steps == [6] and all_steps.last_step[0] == pytest.approx(sizes[-1], abs=1e-5)
+    monkeypatch.undo()
+    needed = next(k for k, size in enumerate(sizes, 1) if size <= 0.1)
+    (ended,) = calls(model, question, Effort(1, 6))
+    assert ended.steps == [needed] and ended.last_step[0] == pytest.approx(sizes[needed - 1], rel=1e-3)
+    assert np.array_equal(ended.position[: 2 + needed], all_steps.position[: 2 + needed])
+    assert np.array_equal(ended.position[2 + needed :], np.repeat(ended.position[1 + needed][None], 6 - needed, axis=0))
+    assert np.array_equal(ended.stress[1:needed], all_steps.stress[1:needed]) and len(ended.stress) == 7
+    (answer,) = answers(model, question, Effort(1, 6))
+    assert answer.converged and answer.last_steps == (ended.last_step[0],)
+    assert np.array_equal(answer.position[0], ended.position[-1, 0]) and np.array_equal(
+        answer.stress[0], ended.stress[-1, 0]
+    )
+    assert answer.trajectory.attributes["last_newton_steps"] == list(answer.last_steps)
+    (short,) = answers(model, question, Effort(1, 1))
+    assert short.converged is False and short.last_steps == (pytest.approx(sizes[0], rel=1e-3),)
+    assert answers(model, question, Effort(1))[0].converged is None
+    found = asked_frames(model, pressed, "test", Effort(1, 1))
+    assert found["unsettled"] == 1 and "in 1 of 1 scenes the Newton steps did not end" in "\n".join(lines(found))
+    assert asked_frames(model, pressed, "test", Effort(1, 6))["unsettled"] == 0
+
+
 def test_the_default_effort_is_the_cheapest_that_is_good():
     errors = np.array([[0.2, 0.1, 0.05, 0.03], [0.1, 0.05, 0.018, 0.01], [0.08, 0.04, 0.012, 0.009]])
+    steps = np.array([[0, 1, 2, 3], [0, 1, 1.9, 2.8], [0, 1, 1.7, 1.7]])
     unknown = np.full((3, 4), np.nan)
-    assert cheapest_good(errors, unknown) == Effort(1, 2)  # three together; no two are good
-    errors[2, 1] = 0.015
-    assert cheapest_good(errors, unknown) == Effort(2, 1)  # as cheap, and more accurate
-    assert cheapest_good(errors + 0.1, unknown) == Effort(1, 3)  # none is good: the cheapest of those nearly the best
-    assert cheapest_good(10 * errors, unknown) == Effort(2, 3)
+    assert cheapest_good(errors, unknown, steps) == Effort(2, 3)  # 3.7 together; 3.8 after one correction
+    steps[1, 3] = 2.6
+    assert cheapest_good(errors, unknown, steps) == Effort(1, 3)
+    assert cheapest_good(errors / 4.5, unknown, steps) == Effort(2)  # good without Newton steps
+    assert cheapest_good(10 * errors, unknown, steps) == Effort(2, 3)  # none is good: of those nearly the best
     errors[2] = np.nan
-    assert cheapest_good(errors, unknown) == Effort(1, 2)
-    assert cheapest_good(unknown, unknown) == Effort()
+    assert cheapest_good(errors, unknown, steps) == Effort(1, 3)
+    assert cheapest_good(unknown, unknown, unknown) == Effort()
+    assert cheapest_good(errors[:, :1], unknown[:, :1], steps[:, :1]) == Effort(1)
 
 
 def test_stress_decides_the_default_effort_too():
-    errors = np.array([[0.2, 0.015, 0.002, 0.001], [0.1, 0.012, 0.001, 0.001]])
-    stress = np.array([[0.8, 3.0, 0.5, 0.2], [0.6, 2.0, 0.09, 0.05]])  # one step distorts single elements
-    assert cheapest_good(errors, stress) == Effort(1, 2)
-    assert cheapest_good(errors, 10 * stress) == Effort(1, 3)  # none is good: the best
-    assert cheapest_good(errors, np.array([[0.05, 9.0, 9.0, 9.0], [9.0, 9.0, 9.0, 9.0]])) == Effort(0, 1)  # never both
+    errors, steps = np.array([[0.015, 0.002], [0.012, 0.001]]), np.array([[0.0, 2.5], [0.0, 2.0]])
+    stress = np.array([[0.8, 0.3], [0.6, 0.05]])
+    assert cheapest_good(errors, stress, steps) == Effort(1, 1)
+    assert cheapest_good(errors, 10 * stress, steps) == Effort(1, 1)  # none is good: the best
+    assert cheapest_good(errors, np.array([[0.05, 9.0], [9.0, 9.0]]), steps) == Effort()
+    errors[0, 0] = 0.1
+    assert cheapest_good(errors, np.array([[0.05, 9.0], [9.0, 9.0]]), steps) == Effort(1)  # never both
 
 
 def test_beside_the_solver(tmp_path):

@@ -44,6 +44,7 @@ ROUNDING = 1e-10  # is added to the diagonal of B, relative to its mean: equal p
 SWEEPS, CHANGE = 100, 1e-3  # forces of friction are found when a sweep over the pairs changes them by less
 FLATTEST = 0.2  # the least stretch of an element that forces and stiffness follow
 TINY = 1e-300  # instead of zero in a denominator
+STILL = 0.1  # after a step of this size (`NewtonSteps.size`) about its square is missing: Newton's method is quadratic
 SMALLEST = 1 / 64  # a step is shortened at most so far where it turns an element over
 
 
@@ -106,6 +107,14 @@ class NewtonSteps:
         else:
             raise SimulationError("the stiffness is singular: nothing holds a body, or an element has collapsed")
         return self._shortened(position, self._constrained(solve, force, self.near_pairs(position)))
+
+    def size(self, before: np.ndarray, after: np.ndarray) -> float:
+        """The size of a step between positions [N, 3]: the largest component of a move, in mean edge lengths of the
+        surfaces, or the root mean square of the moves over that of the displacements from rest, if that is larger."""
+        free = self._system.free
+        move, displacement = ((after - start).ravel()[free] for start in (before, self._rest))
+        share = np.linalg.norm(move) / max(np.linalg.norm(displacement), TINY)
+        return float(max(np.abs(move).max() / self._length, share))
 
     def _constrained(
         self, solve: Callable[[np.ndarray], np.ndarray], force: np.ndarray, pairs: NearPairs
