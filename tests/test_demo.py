@@ -89,6 +89,7 @@ def test_headlines_are_shares_of_the_trivial_predictors():
             "relative_error": 0.0712,
             "seconds": 0.0251,
             "by_calls": [0.16, 0.0712],
+            "unsettled": 0,
             "stress_share": 0.5,
             "largest_stress": 0.08,
             "solver": {
