@@ -1,7 +1,8 @@
 """One frame of every scene, as a user asks for it: its errors, its time, and what the solver takes for the same answer.
 
 The asked frame is the deepest: the free nodes are displaced most in it. The relative error is the root mean square of
-the error over that of the displacement, over the free nodes in this frame. Times are of one thread.
+the error over that of the displacement, over the free nodes in this frame. Times are of one thread, and count what is
+prepared for a mesh, for the model and for the solver.
 """
 
 from __future__ import annotations
@@ -199,7 +200,8 @@ def _solver(rival: Rivals, error: float | None) -> dict[str, Any]:
     """What the solver took: at its own stop test, and in each way; the cheapest has at most the model's error."""
     ways = {
         outcome.way.name: {
-            "seconds": outcome.seconds,
+            "seconds": outcome.whole_seconds,
+            "setup_seconds": outcome.setup_seconds,
             "relative_error": outcome.relative_error,
             "load_steps": outcome.load_steps,
             "newton_iterations": outcome.newton_iterations,
@@ -211,9 +213,9 @@ def _solver(rival: Rivals, error: float | None) -> dict[str, Any]:
     best = None if error is None else cheapest(rival.outcomes, error)
     own = rival.outcomes[0]
     return {
-        "seconds": own.seconds if own.converged else None,
+        "seconds": own.whole_seconds if own.converged else None,
         "cheapest": None if best is None else best.way.name,
-        "cheapest_seconds": None if best is None else best.seconds,
+        "cheapest_seconds": None if best is None else best.whole_seconds,
         "ways": ways,
     }
 

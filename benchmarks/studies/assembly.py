@@ -146,7 +146,8 @@ Made by `python -m benchmarks.studies.assembly` from `benchmarks/results/assembl
 Each product of `examples` was generated, trained and asked for frames of test scenes, on one thread, beside other
 work. "Error" is that of the displacement on the free nodes at the deepest frame, relative to it (mean and standard
 error); "reaction" the error of the force that moves the tool, in the last frame; "largest stress" that of the largest
-von Mises stress. The solver goes straight to the same frame at its own stop test. "Pays after" is the number of
+von Mises stress. The solver goes straight to the same frame at its own stop test. Both times count what is prepared
+for a mesh. "Pays after" is the number of
 questions whose time in the solver is that of the simulations and the training.
 """
 

@@ -153,7 +153,8 @@ alone, with all that is prepared for its mesh. Validation has chosen how many co
 first call of the model in the first table; `predict(corrections=, newton_steps=)` chooses them for an answer. Newton
 steps end when one is small; where they do not end, the page says so.
 
-The solver goes straight from rest to the same frame, on one thread. What it prepares for a mesh is not counted.
+The solver goes straight from rest to the same frame, on one thread. What it prepares for a mesh is counted, too; the
+meshing is not.
 "Solver" is its own stop test, in the number of load steps (1 or 2) that takes least. "Cheapest" is, scene by scene, the
 fastest of 13 ways whose error is at most that of the answer: the own stop test and looser ones, a longer range of
 contact, meshes of a half and a quarter of the nodes, and 6 or 12 load steps of one Newton step with linearised contact.

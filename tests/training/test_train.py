@@ -21,6 +21,7 @@ from ast_sim.models.transolver import TransolverConfig
 from ast_sim.runs import checkpoint, folder
 from ast_sim.runs.config_toml import has_config, read_config
 from ast_sim.runs.metrics import Metrics
+from ast_sim.runs.summary import describe_run
 from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.scene import NodeType
 from ast_sim.support.errors import CheckpointError, ConfigError, DatasetError, TrainingError
@@ -570,10 +571,13 @@ def test_no_damage_of_the_metrics_changes_a_record_or_the_best_in_silence(linear
 def test_metrics_without_their_last_lines_give_a_warning(linear, data, tmp_path):
     run = tmp_path / "run"
     start.start_training(run, settings(data))
+    assert describe_run(run)["best_validation"]["step"] == 20
     lines = (run / "metrics.jsonl").read_text().splitlines(keepends=True)
     (run / "metrics.jsonl").write_text("".join(lines[:3]))
     with pytest.warns(UserWarning, match=r"metrics.jsonl has lost 3 of 6 lines"):
         folder.load_model(run)
+    with pytest.warns(UserWarning, match="metrics.jsonl has lost the validation after step 20, the best one"):
+        assert describe_run(run)["best_validation"] is None
 
 
 def test_a_missing_or_damaged_best_is_refused_until_a_resume_writes_it_again(linear, data, tmp_path):

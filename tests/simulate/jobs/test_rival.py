@@ -117,6 +117,7 @@ def test_the_cheapest_is_the_fastest_that_is_as_accurate():
     assert cheapest([failed, slow, fast], 0.05) is fast
     assert cheapest([failed, slow, fast], 0.04) is slow
     assert cheapest([failed, slow, fast], 0.001) is None
+    assert cheapest([replace(fast, setup_seconds=1.5), slow], 0.05) is slow  # what is set up for the mesh counts
 
 
 def test_kept_frames_are_frames_of_the_whole_motion(plates, tmp_path):
