@@ -235,7 +235,7 @@ def sweep(args: argparse.Namespace) -> None:
     found.save(args.out)
     print(f"{args.out}: {len(found.rows)} rows, {1000 * found.seconds / len(found.rows):.3g} ms each")
     if found.unsettled:
-        print(f"not converged: {found.unsettled} rows, in which last_newton_step is above 0.1")
+        print(f"not converged: {found.unsettled} rows, whose last_newton_step is too large")
     if found.varied:
         found.picture(picture, args.quantity)
         print(f"picture: {picture}")
@@ -253,8 +253,7 @@ def _save(answer: Any, args: argparse.Namespace, truth: Any) -> None:
         percent = f"{100 * answer.expected_error:.2g} % of the displacement"
         print(f"expected error: {percent}, as in the validation scenes at their deepest frame")
     if answer.converged is False:
-        size = f"{max(answer.last_steps):.2g}, and should be at most 0.1"
-        print(f"not converged: the size of a last Newton step is {size}")
+        print(f"not converged: the last Newton step is too large, with a size of {max(answer.last_steps):.2g}")
 
 
 def _truth(run: Any, args: argparse.Namespace) -> Any:

@@ -42,7 +42,8 @@ class Answer:
             this scene. None: the run did not measure it.
         last_steps: of each computed frame the size of its last Newton step: the largest component of a node's move, in
             mean edge lengths of the surfaces, or the root mean square of the moves over that of the displacements, if
-            that is larger. Newton's method is quadratic: about its square is missing. Empty without Newton steps.
+            that is larger. As long as the contact does not change, a next step would be about its square. Empty without
+            Newton steps.
     """
 
     name: str
@@ -66,7 +67,7 @@ class Answer:
 
     @property
     def converged(self) -> bool | None:
-        """Whether the Newton steps of every frame ended because the last one was small, at most 0.1; None without."""
+        """Whether the Newton steps of every frame ended because the last one was at most 0.05; None without."""
         return max(self.last_steps) <= STILL if self.last_steps else None
 
     @property

@@ -20,7 +20,7 @@ from ast_sim.models.model_config import DataFacts
 from ast_sim.models.registry import find_preset
 from ast_sim.models.simulator import Prediction, Simulator
 from ast_sim.simulate.jobs.rival import deepest_frame
-from ast_sim.simulate.mechanics.linearised_contact import NewtonSteps
+from ast_sim.simulate.mechanics.linearised_contact import STILL, NewtonSteps
 from ast_sim.support.errors import ConfigError, SimulationError
 from ast_sim.training.data_lengths import measure
 
@@ -143,10 +143,10 @@ def test_newton_steps_end_when_one_is_small(pressed, monkeypatch):
         newton_steps(model.config, truth.scene).size(*(all_steps.position[i, 0].astype(float) for i in (k, k + 1)))
         for k in range(1, 7)
     ]
-    assert sizes == sorted(sizes, reverse=True) and sizes[0] > 0.1 > sizes[-1]
+    assert sizes == sorted(sizes, reverse=True) and sizes[0] > STILL > sizes[-1]
     assert all_steps.steps == [6] and all_steps.last_step[0] == pytest.approx(sizes[-1], abs=1e-5)
     monkeypatch.undo()
-    needed = next(k for k, size in enumerate(sizes, 1) if size <= 0.1)
+    needed = next(k for k, size in enumerate(sizes, 1) if size <= STILL)
     (ended,) = calls(model, question, Effort(1, 6))
     assert ended.steps == [needed] and ended.last_step[0] == pytest.approx(sizes[needed - 1], rel=1e-3)
     assert np.array_equal(ended.position[: 2 + needed], all_steps.position[: 2 + needed])

@@ -44,7 +44,7 @@ ROUNDING = 1e-10  # is added to the diagonal of B, relative to its mean: equal p
 SWEEPS, CHANGE = 100, 1e-3  # forces of friction are found when a sweep over the pairs changes them by less
 FLATTEST = 0.2  # the least stretch of an element that forces and stiffness follow
 TINY = 1e-300  # instead of zero in a denominator
-STILL = 0.1  # after a step of this size (`NewtonSteps.size`) about its square is missing: Newton's method is quadratic
+STILL = 0.05  # a step of this size (`NewtonSteps.size`) or less is the last one (docs/log.md, 2026-11-25)
 SMALLEST = 1 / 64  # a step is shortened at most so far where it turns an element over
 
 
