@@ -10,7 +10,7 @@ from typing import Any
 from ast_sim.runs.origin import CONFIG, SCOPE, VERSION, verified, write_origin
 from ast_sim.runs.scope import Scope
 from ast_sim.runs.train_config import RunConfig
-from ast_sim.support.disk import write_text
+from ast_sim.support.disk import read_text, write_text
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.toml_settings import from_values, leaves, to_toml, to_values
 
@@ -42,10 +42,8 @@ def read_changes(path: Path) -> dict[str, Any]:
     Raises:
         ConfigError: the file cannot be read, is no TOML, or is of another version; the text names the file.
     """
-    if path.exists() and not path.is_file():  # a pipe without a writer would block for ever
-        raise ConfigError(f"{path} cannot be read: it is no regular file")
     try:
-        found = dict(leaves(tomllib.loads(path.read_text(encoding="utf-8"))))
+        found = dict(leaves(tomllib.loads(read_text(path))))
     except OSError as error:
         raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import io
 import json
@@ -40,6 +41,18 @@ def write_synced(path: str | os.PathLike[str], data: bytes) -> None:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
+
+
+def read_text(path: Path, encoding: str = "utf-8") -> str:
+    """The text of a file that a user names.
+
+    Raises:
+        OSError: it cannot be read, or is no regular file: a pipe without a writer would block for ever.
+        ValueError: it has another encoding.
+    """
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "it is no regular file", str(path))
+    return path.read_text(encoding=encoding)
 
 
 def output_file(path: Path) -> Path:

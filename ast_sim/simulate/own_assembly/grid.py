@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -12,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ast_sim.support.disk import read_text
 from ast_sim.support.errors import ConfigError
 
 MOST_ROWS = 100_000
@@ -67,10 +69,10 @@ def read_table(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
         ConfigError: it cannot be read, has no rows, or a row has another number of values.
     """
     try:
-        with open(Path(path), newline="", encoding="utf-8-sig") as file:
-            lines = [line for line in csv.reader(file) if line]
+        lines = [line for line in csv.reader(io.StringIO(read_text(Path(path), "utf-8-sig"))) if line]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ConfigError(f"{path}: the table cannot be read: {error}") from error
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ConfigError(f"{path}: the table cannot be read: {reason}") from error
     if len(lines) < 2:
         raise ConfigError(f"{path}: the table needs a line with the names of the parameters, and a row or more")
     names = [name.strip() for name in lines[0]]

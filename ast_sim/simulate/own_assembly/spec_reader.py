@@ -23,6 +23,7 @@ from ast_sim.simulate.own_assembly.assembly_spec import (
 from ast_sim.simulate.own_assembly.expressions import FUNCTIONS, Expression, nearest
 from ast_sim.simulate.own_assembly.parameters import Parameter, parameter, plain
 from ast_sim.simulate.own_assembly.spec_table import Table, Vector
+from ast_sim.support.disk import read_text
 from ast_sim.support.errors import ConfigError
 
 DEFAULT_FRAMES = 6
@@ -50,10 +51,8 @@ def read_spec(path: str | os.PathLike[str]) -> AssemblySpec:
             missing that it names.
     """
     path = Path(path)
-    if path.exists() and not path.is_file():  # a pipe without a writer would block for ever
-        raise ConfigError(f"{path}: the specification cannot be read: it is no regular file")
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
         values = tomllib.loads(text)
     except (OSError, ValueError, RecursionError) as error:
         reason = error.strerror if isinstance(error, OSError) else error

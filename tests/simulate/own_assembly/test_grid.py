@@ -1,5 +1,7 @@
 """Grids and tables of parameters, as texts and as mappings."""
 
+import os
+
 import numpy as np
 import pytest
 
@@ -45,3 +47,6 @@ def test_tables(tmp_path):
             read_table(path)
     with pytest.raises(ConfigError, match="the table cannot be read"):
         read_table(tmp_path / "none.csv")
+    os.mkfifo(tmp_path / "pipe.csv")
+    with pytest.raises(ConfigError, match="the table cannot be read: it is no regular file"):  # and does not block
+        read_table(tmp_path / "pipe.csv")
