@@ -82,18 +82,24 @@ def asked_frames(
 
 
 def errors_by_effort(model: Simulator, truth: Trajectory, most: Effort) -> np.ndarray:
-    """[3, C, K]: the errors at the deepest frame after c corrections and up to k Newton steps, up to `most` of them:
-    that of the displacement, relative to it, and that of the stress, relative to that of the frame's true mean; and how
-    many Newton steps were made. NaN where the prediction failed, or where there is no stress."""
+    """The errors at the deepest frame after c corrections and up to k Newton steps, up to `most` of them.
+
+    Returns:
+        [4, C, K]: the error of the displacement, relative to it; that of the stress, relative to that of the frame's
+        true mean; how many Newton steps were made; 1 where these did not end, else 0. NaN where the prediction failed,
+        or where there is no stress.
+    """
     frame, free = max(deepest_frame(truth), model.config.given_frames), ~truth.scene.prescribed
-    size, found = _rms(truth.position[frame] - truth.position[0], free), np.full((3, most[0] + 1, most[1] + 1), np.nan)
+    size, found = _rms(truth.position[frame] - truth.position[0], free), np.full((4, most[0] + 1, most[1] + 1), np.nan)
     for corrections in range(most.corrections + 1) if size else ():
         for steps in (most.newton_steps, 0):  # where a Newton step fails, the calls before it still count
             (after,) = calls(model, [Question.of(truth, "validation", [frame])], Effort(corrections, steps))
             if not isinstance(after, str):
                 moved = [_rms(x[0] - truth.position[frame], free) / size for x in after.position[corrections:]]
                 found[0, corrections, : steps + 1] = moved
-                found[2, corrections, : steps + 1] = np.minimum(np.arange(steps + 1), after.steps[0])
+                allowed, made = np.arange(steps + 1), after.steps[0] + (after.last_step[0] > STILL)
+                found[2, corrections, : steps + 1] = np.minimum(allowed, made)
+                found[3, corrections, : steps + 1] = (allowed > 0) & (allowed < made)
                 for step, stress in enumerate(() if after.stress is None else after.stress):
                     share = _stress_errors(truth, stress[0], frame, model.config.stress)["stress_share"]
                     found[1, corrections, step] = np.nan if share is None else share

@@ -73,31 +73,31 @@ def newton_steps(config: ModelConfig, scene: Scene) -> NewtonSteps:
     return NewtonSteps(scene, material, CLEARANCE * config.contact_range, config.friction)
 
 
-def cheapest_good(errors: np.ndarray, stress: np.ndarray, steps: np.ndarray) -> Effort:
+def cheapest_good(found: np.ndarray) -> Effort:
     """The default effort of a run: Newton steps until one is small, or none, since scenes differ in how many they need.
 
     Stress tells more than the displacement: it follows from strains, and a step that leaves single elements distorted
     hardly moves their nodes.
 
     Args:
-        errors: [C, K], the relative errors of the displacement in validation after c corrections and up to k Newton
-            steps.
-        stress: [C, K], those of the stress; NaN where there is none.
-        steps: [C, K], how many Newton steps were made.
+        found: [4, C, K], means over validation scenes after c corrections and up to k Newton steps: the relative errors
+            of the displacement and of the stress (NaN where there is none), how many Newton steps were made, and the
+            share of the scenes in which they did not end.
 
     Returns:
-        Of the efforts whose errors are good, or nearly the smallest of all, the one with the fewest corrections and
-        Newton steps together. If no effort has both errors so, that of the displacement decides. The first call alone
-        if no error is known.
+        Of the efforts whose errors are good, or nearly the smallest of all, those whose Newton steps did not end in the
+        fewest scenes; of these the one with the fewest corrections and Newton steps together. If no effort has both
+        errors so, that of the displacement decides. The first call alone if no error is known.
     """
-    if np.isnan(errors).all():
+    if np.isnan(found[0]).all():
         return FIRST_CALL
-    ends = sorted({0, errors.shape[1] - 1})
-    errors, stress, steps = errors[:, ends], stress[:, ends], steps[:, ends]
+    ends = sorted({0, found.shape[2] - 1})
+    errors, stress, steps, unsettled = found[:, :, ends]
     accurate = errors <= max(GOOD, (1 + WORTH) * np.nanmin(errors))
     least = np.inf if np.isnan(stress).all() else max(GOOD_STRESS, (1 + WORTH) * np.nanmin(stress))
     both = accurate & ~(stress > least)
-    total = np.arange(len(errors))[:, None] + steps
-    allowed = np.where(both if both.any() else accurate, total, np.inf)
-    corrections, column = np.unravel_index(allowed.argmin(), allowed.shape)
+    good = both if both.any() else accurate
+    settled = good & (unsettled <= unsettled[good].min())
+    total = np.where(settled, np.arange(len(errors))[:, None] + steps, np.inf)
+    corrections, column = np.unravel_index(total.argmin(), total.shape)
     return Effort(int(corrections), ends[column])

@@ -32,8 +32,8 @@ class Validated(NamedTuple):
         errors: error of the prediction, for a model that jumps after each call; empty if the prediction failed.
         hold: error of the prediction that nothing moves.
         failure: why the prediction failed; None if it did not.
-        efforts: [3, calls, Newton steps + 1], the errors of displacement and stress at the deepest frame and the Newton
-            steps made, as `errors_by_effort` gives them; None if they were not measured.
+        efforts: [4, calls, Newton steps + 1], the errors of displacement and stress at the deepest frame, the Newton
+            steps made and whether they did not end, as `errors_by_effort` gives them; None if they were not measured.
     """
 
     index: int
@@ -109,11 +109,11 @@ def verdict(found: list[Validated], best: float, unit: str) -> tuple[dict[str, A
     record: dict[str, Any] = {"valid_rmse": error, "valid_hold_still": hold}
     measured = [scene.efforts for scene in found if scene.efforts is not None]
     if measured:
-        by_effort, stress_by_effort, steps = np.mean(measured, axis=0)
+        by_effort, stress_by_effort, steps, unsettled = means = np.mean(measured, axis=0)
         if by_effort.shape[1] > 1:
-            effort = cheapest_good(by_effort, stress_by_effort, steps)
+            effort = cheapest_good(means)
         record["valid_by_effort"], record["valid_stress_by_effort"] = _as_lists(by_effort), _as_lists(stress_by_effort)
-        record["valid_newton_steps"] = _as_lists(steps)
+        record["valid_newton_steps"], record["valid_unsettled"] = _as_lists(steps), _as_lists(unsettled)
         if effort.corrections < len(by_effort) and not np.isnan(by_effort[effort]):
             text += f"; at the deepest frame {100 * by_effort[effort]:.2g} % of the displacement after {effort.text}"
     if len(by_calls) > 1 or measured:

@@ -108,7 +108,8 @@ def test_newton_steps_lead_from_the_answer_to_equilibrium(pressed, monkeypatch):
     (answer,) = answers(model, [Question.of(truth, "plate", [frame])], Effort(1, 3))
     held = truth.scene.prescribed
     assert np.array_equal(answer.position[0][held], truth.position[frame][held])
-    table, stress, steps = errors_by_effort(model, truth, Effort(1, 3))
+    table, stress, steps, unsettled = errors_by_effort(model, truth, Effort(1, 3))
+    assert unsettled.tolist() == [[0, 1, 1, 0]] * 2
     assert (
         steps.tolist() == [[0, 1, 2, 3]] * 2
         and stress[1, 3] == pytest.approx(found["stress_share"])
@@ -169,26 +170,31 @@ def test_newton_steps_end_when_one_is_small(pressed, monkeypatch):
 def test_the_default_effort_is_the_cheapest_that_is_good():
     errors = np.array([[0.2, 0.1, 0.05, 0.03], [0.1, 0.05, 0.018, 0.01], [0.08, 0.04, 0.012, 0.009]])
     steps = np.array([[0, 1, 2, 3], [0, 1, 1.9, 2.8], [0, 1, 1.7, 1.7]])
-    unknown = np.full((3, 4), np.nan)
-    assert cheapest_good(errors, unknown, steps) == Effort(2, 3)  # 3.7 together; 3.8 after one correction
+    unknown, ended = np.full((3, 4), np.nan), np.zeros((3, 4))
+    assert cheapest_good(np.stack([errors, unknown, steps, ended])) == Effort(2, 3)  # 3.7 together; 3.8 after one
     steps[1, 3] = 2.6
-    assert cheapest_good(errors, unknown, steps) == Effort(1, 3)
-    assert cheapest_good(errors / 4.5, unknown, steps) == Effort(2)  # good without Newton steps
-    assert cheapest_good(10 * errors, unknown, steps) == Effort(2, 3)  # none is good: of those nearly the best
+    assert cheapest_good(np.stack([errors, unknown, steps, ended])) == Effort(1, 3)
+    ended[1, 3] = 0.1  # in one scene of ten the steps did not end
+    assert cheapest_good(np.stack([errors, unknown, steps, ended])) == Effort(2, 3)
+    ended[2, 3] = 0.1
+    assert cheapest_good(np.stack([errors, unknown, steps, ended])) == Effort(1, 3)
+    assert cheapest_good(np.stack([errors / 4.5, unknown, steps, ended])) == Effort(2)  # good without Newton steps
+    assert cheapest_good(np.stack([10 * errors, unknown, steps, ended])) == Effort(2, 3)  # the only one nearly the best
     errors[2] = np.nan
-    assert cheapest_good(errors, unknown, steps) == Effort(1, 3)
-    assert cheapest_good(unknown, unknown, unknown) == Effort()
-    assert cheapest_good(errors[:, :1], unknown[:, :1], steps[:, :1]) == Effort(1)
+    assert cheapest_good(np.stack([errors, unknown, steps, ended])) == Effort(1, 3)
+    assert cheapest_good(np.full((4, 3, 4), np.nan)) == Effort()
+    assert cheapest_good(np.stack([errors, unknown, steps, ended])[:, :, :1]) == Effort(1)
 
 
 def test_stress_decides_the_default_effort_too():
     errors, steps = np.array([[0.015, 0.002], [0.012, 0.001]]), np.array([[0.0, 2.5], [0.0, 2.0]])
-    stress = np.array([[0.8, 0.3], [0.6, 0.05]])
-    assert cheapest_good(errors, stress, steps) == Effort(1, 1)
-    assert cheapest_good(errors, 10 * stress, steps) == Effort(1, 1)  # none is good: the best
-    assert cheapest_good(errors, np.array([[0.05, 9.0], [9.0, 9.0]]), steps) == Effort()
+    stress, ended = np.array([[0.8, 0.3], [0.6, 0.05]]), np.zeros((2, 2))
+    assert cheapest_good(np.stack([errors, stress, steps, ended])) == Effort(1, 1)
+    assert cheapest_good(np.stack([errors, 10 * stress, steps, ended])) == Effort(1, 1)  # none is good: the best
+    stress = np.array([[0.05, 9.0], [9.0, 9.0]])
+    assert cheapest_good(np.stack([errors, stress, steps, ended])) == Effort()
     errors[0, 0] = 0.1
-    assert cheapest_good(errors, np.array([[0.05, 9.0], [9.0, 9.0]]), steps) == Effort(1)  # never both
+    assert cheapest_good(np.stack([errors, stress, steps, ended])) == Effort(1)  # never both
 
 
 def test_beside_the_solver(tmp_path):
