@@ -14,6 +14,8 @@ from ast_sim.support.errors import ConfigError
 
 GOOD = 0.02  # a relative error that most users call exact
 GOOD_STRESS = 0.1  # the same of the stress, relative to the error of its mean
+MOST_NEWTON_STEPS = 10  # by default; they end earlier where one is small
+AGAIN = 2  # a frame in which so many Newton steps did not end is begun anew with so many more corrections
 WORTH = 0.05  # a correction or a Newton step must lower an error that is not good by this share
 
 
@@ -23,7 +25,7 @@ class Effort(NamedTuple):
     Attributes:
         corrections: so many further calls of the model correct its answer.
         newton_steps: at most so many Newton steps of the solver then lead towards equilibrium. They end when a step is
-            at most `STILL`.
+            at most `STILL`. Where `MOST_NEWTON_STEPS` or more do not end, they begin anew after more corrections.
     """
 
     corrections: int = 0

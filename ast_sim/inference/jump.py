@@ -20,7 +20,7 @@ from ast_sim.batches.batch_builder import Batch, State
 from ast_sim.batches.carry import Carrier
 from ast_sim.batches.graph import Graph
 from ast_sim.inference.answer import Answer
-from ast_sim.inference.effort import Effort, newton_steps
+from ast_sim.inference.effort import AGAIN, MOST_NEWTON_STEPS, Effort, newton_steps
 from ast_sim.inference.question import Question, not_finite, too_far
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.models.simulator import Simulator
@@ -73,7 +73,7 @@ def calls(model: Simulator, questions: Sequence[Question], effort: Effort) -> li
     """For each scene the way to its answer, or a text that says why a frame failed. Arguments and errors as for
     `jumps`."""
     found: list[Way | str] = []
-    for scene in _predicted(model, questions, effort, None, every_stress=True):
+    for scene in _predicted(model, questions, effort, None, whole_way=True):
         failure = next((frame.failure for frame in scene.frames if frame.failure), None)
         if failure is not None:
             found.append(failure)
@@ -96,8 +96,9 @@ def _predicted(
     questions: Sequence[Question],
     effort: Effort,
     progress: Callable[[int], None] | None,
-    every_stress: bool = False,
+    whole_way: bool = False,
 ) -> list[_JumpingScene]:
+    """The scenes with their predicted frames. `whole_way`: the stress after each Newton step, and no second start."""
     effort.check(model.config)
     for question in questions:
         question.check(model.config.given_frames)
@@ -114,12 +115,24 @@ def _predicted(
             for number, group in enumerate(_groups(model, scenes)):
                 _predict(model, group, effort.corrections)
                 for frame in group if effort.newton_steps else ():
-                    frame.refine(model.config, solvers, effort.newton_steps, every_stress)
+                    frame.refine(model.config, solvers, effort.newton_steps, whole_way)
+                    if not whole_way and effort.newton_steps >= MOST_NEWTON_STEPS and frame.unsettled:
+                        _start_again(model, frame, effort, solvers)
                 if progress is not None:
                     progress(number)
     finally:
         model.train(training)
     return scenes
+
+
+def _start_again(model: Simulator, frame: _Frame, effort: Effort, solvers: dict[int, NewtonSteps]) -> None:
+    """Newton steps need a nearly right start: more corrections give a better one."""
+    first, spent = (frame.positions, frame.stresses, frame.last_step), frame.seconds
+    _predict(model, [frame], effort.corrections + AGAIN)
+    frame.refine(model.config, solvers, effort.newton_steps, every_stress=False)
+    frame.seconds += spent
+    if frame.failure is not None:  # the first answer at least says that it has not converged
+        frame.failure, (frame.positions, frame.stresses, frame.last_step) = None, first
 
 
 def corrected(model: Simulator, batch: Batch, prescribed: Tensor, calls: int) -> Iterator[tuple[Tensor, Tensor | None]]:
@@ -144,6 +157,11 @@ class _Frame:
     last_step: float | None = None
     seconds: float = 0.0
     failure: str | None = None
+
+    @property
+    def unsettled(self) -> bool:
+        """Whether the Newton steps did not end."""
+        return self.failure is None and self.last_step is not None and self.last_step > STILL
 
     def refine(self, config: ModelConfig, solvers: dict[int, NewtonSteps], most: int, every_stress: bool) -> None:
         """Make Newton steps from the answer of the model until one is `STILL`; the stress then is that of the material.

@@ -9,7 +9,7 @@ import numpy as np
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.asked_frame import errors_by_effort
-from ast_sim.inference.effort import Effort, cheapest_good, knows_material
+from ast_sim.inference.effort import MOST_NEWTON_STEPS, Effort, cheapest_good, knows_material
 from ast_sim.inference.jump import calls
 from ast_sim.inference.measures import SquaredError, rmse_sequence
 from ast_sim.inference.question import Question
@@ -20,7 +20,6 @@ from ast_sim.scene import Trajectory
 MORE_CALLS = 2  # a model that jumps is validated with so many more calls than it is trained with
 ENOUGH = 0.01  # a further call must lower the error by this share
 EFFORT_SCENES = 10  # the default effort is chosen on at most so many validation scenes, at the deepest frame
-MOST_NEWTON_STEPS = 10  # they end earlier where they are still
 JUMPS = 4  # a model that jumps is validated at so many frames of a scene, evenly spread, the last one included
 
 

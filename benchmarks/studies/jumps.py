@@ -19,11 +19,10 @@ import numpy as np
 
 import ast_sim
 from ast_sim.inference.asked_frame import asked_frames
-from ast_sim.inference.effort import Effort, knows_material
+from ast_sim.inference.effort import MOST_NEWTON_STEPS, Effort, knows_material
 from ast_sim.simulate.mechanics.linearised_contact import STILL
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
-from ast_sim.training.validation import MOST_NEWTON_STEPS
 from benchmarks.studies.validation_curve import curve_line, minutes_per_step, validation_curve
 
 RESULTS = Path(__file__).parents[1] / "results" / "jumps.json"

@@ -121,6 +121,32 @@ def test_newton_steps_lead_from_the_answer_to_equilibrium(pressed, monkeypatch):
     assert table.shape == stress.shape == (2, 4) and table[1].tolist() == errors[1:] and table[0, 0] == errors[0]
 
 
+def test_newton_steps_that_do_not_end_begin_anew_after_more_corrections(pressed, monkeypatch):
+    truth, model = pressing(pressed, 0.4)
+    frame = deepest_frame(truth)
+    question, free = [Question.of(truth, "plate", [frame])], ~truth.scene.prescribed
+    (first,) = calls(model, question, Effort(1, 10))
+    assert first.steps == [10] and first.last_step[0] > STILL  # with 0.36 of the way missing
+    (again,) = calls(model, question, Effort(3, 10))  # with 0.13 missing
+    (answer,) = answers(model, question, Effort(1, 10))
+    assert answer.converged and np.array_equal(answer.position[0], again.position[-1, 0])
+    assert np.array_equal(answer.stress[0], again.stress[-1, 0]) and answer.seconds > 0
+    size = np.linalg.norm((truth.position[frame] - truth.position[0])[free])
+    assert np.linalg.norm((answer.position[0] - truth.position[frame])[free]) < 0.02 * size
+    (nine,) = answers(model, question, Effort(1, 9))
+    assert nine.converged is False  # who asks for fewer steps gets no second start
+    step, made = NewtonSteps.step, []
+
+    def fail_later(self, position):
+        made.append(1)
+        return step(self, position) if len(made) <= 10 else collapse(self, position)
+
+    monkeypatch.setattr(NewtonSteps, "step", fail_later)
+    (kept,) = answers(model, question, Effort(1, 10))
+    assert len(made) == 11 and kept.failure is None and kept.converged is False
+    assert np.array_equal(kept.position[0], first.position[-1, 0])
+
+
 def test_newton_steps_need_a_material(one, pressed):
     truth, model = pressing(pressed, 0.7)
     question = [Question.of(truth, "plate", [-1])]
