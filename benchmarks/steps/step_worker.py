@@ -72,7 +72,7 @@ def rollout_step(training: Training) -> Callable[[], object]:
     stress = None if truth.stress is None else torch.from_numpy(truth.stress[0].copy())
 
     def step() -> None:
-        batch = Batch.build(graph, State(first, None, stress), second, ["test/000000 frame 0"], torch.ones(1))
+        batch = Batch.build(graph, State(first, None, stress), second, ["test/000000 frame 0"])
         training.model.advance(batch, second)
 
     return step
