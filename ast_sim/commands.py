@@ -235,7 +235,7 @@ def sweep(args: argparse.Namespace) -> None:
     found.save(args.out)
     print(f"{args.out}: {len(found.rows)} rows, {1000 * found.seconds / len(found.rows):.3g} ms each")
     if found.unsettled:
-        print(f"not converged: {found.unsettled} rows, whose last_newton_step is too large")
+        print(f"not converged: {found.unsettled} of {len(found.rows)} rows, where last_newton_step is too large")
     if found.varied:
         found.picture(picture, args.quantity)
         print(f"picture: {picture}")

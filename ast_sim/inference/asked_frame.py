@@ -48,10 +48,11 @@ def asked_frames(
 
     Returns:
         scenes: for each its name, frame, nodes, displacement, relative_error, by_calls (the relative error after each
-        call of a model that jumps, and after each Newton step), seconds, last_step (the size of the last Newton step,
-        None without one), stress_share (the stress error over that of the frame's true mean), largest_stress (relative
-        error of the largest stress), and `solver` where it was run; their means (`relative_error`, `by_calls`,
-        `stress_share`, `largest_stress`), the median of seconds; unsettled: the scenes whose Newton steps did not end;
+        call of a model that jumps, and after each Newton step, of the first start), seconds, last_step (the size of the
+        last Newton step, None without one), stress_share (the stress error over that of the frame's true mean),
+        largest_stress (relative error of the largest stress), and `solver` where it was run; their means
+        (`relative_error`, `by_calls`, `stress_share`, `largest_stress`), the median of seconds; unsettled: the scenes
+        whose Newton steps did not end;
         solver: sums over the scenes where it was run, None if there are none, and `no_solver` says why.
     """
     with _one_thread():

@@ -134,7 +134,7 @@ def _section(found: dict[str, Any]) -> list[str]:
         f"## {found['row']['title']}",
         "",
         f"{Effort(**found['effort']).text}. Over the scenes: {spread}, a tenth above {np.quantile(errors, 0.9):.1f} %."
-        f" Worst: {worst}. The Newton steps of {found['unsettled']} scenes did not end.",
+        f" Worst: {worst}. The Newton steps did not end in {found['unsettled']} of {len(found['scenes'])} scenes.",
         *([curve_line(found["curve"])] if found["curve"] else []),
     ]
 

@@ -215,7 +215,9 @@ def _section(found: dict[str, Any]) -> list[str]:
     )
     unsettled = [scene["name"] for scene in ranked if (scene["last_step"] or 0) > STILL]
     if unsettled:
-        lines.append(f"The Newton steps of {len(unsettled)} scenes did not end: {', '.join(unsettled)}.")
+        lines.append(
+            f"The Newton steps did not end in {len(unsettled)} of {len(ranked)} scenes: {', '.join(unsettled)}."
+        )
     if found["stress_share"] is not None:
         lines.append(
             f"Stress: {found['stress_share']:.2f} of the error of the frame's true mean; the largest stress is"

@@ -91,7 +91,8 @@ def test_each_call_corrects_the_answer_of_the_call_before():
     truth, model = toy.plate(1), Halving(config("ast"))
     free = ~truth.scene.prescribed
     question = Question.of(truth, "scene", [2, -1])
-    ((found, stress),) = calls(model, [question], Effort(3))
+    ((found, stress, steps, _),) = calls(model, [question], Effort(3))
+    assert steps.tolist() == [0, 0]
     assert found.shape == (4, 2, truth.scene.num_nodes, 3)
     start = truth.position[0, free]
     for call in range(4):
