@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 
@@ -122,9 +123,9 @@ class Scene:
 
     def edges(self) -> np.ndarray:
         """[M, 2] int32: each edge of the mesh once, its smaller node first, in ascending order."""
-        pairs = np.concatenate([self.elements[:, list(pair)] for pair in LOCAL_EDGES[self.elements.shape[1]]])
-        pairs = np.sort(pairs.astype(np.int64), axis=1)
-        keys = np.unique(pairs[:, 0] * self.num_nodes + pairs[:, 1])
+        pairs = np.array(LOCAL_EDGES[self.elements.shape[1]]).T
+        one, other = (self.elements[:, ends].ravel().astype(np.int64) for ends in pairs)
+        keys = np.unique(np.minimum(one, other) * self.num_nodes + np.maximum(one, other))
         return np.stack([keys // self.num_nodes, keys % self.num_nodes], axis=1).astype(np.int32)
 
     def surface(self) -> np.ndarray:
@@ -133,16 +134,25 @@ class Scene:
         In a scene of triangles these are all elements. In a scene of tetrahedra they are the faces that belong to one
         element only; their nodes run counter-clockwise, seen from outside.
         """
+        return self._surface
+
+    @cached_property
+    def _surface(self) -> np.ndarray:
         if self.elements.shape[1] == 3:
             return self.elements
-        corners = self.rest_position[self.elements].astype(np.float64)
-        volume = np.linalg.det(corners[:, 1:] - corners[:, :1])
-        faces = self.elements[:, np.array(LOCAL_FACES)]  # [E, 4, 3]
-        faces = np.where((volume < 0)[:, None, None], faces[:, :, ::-1], faces).reshape(-1, 3)
-        nodes = np.sort(faces, axis=1)
-        order = np.lexsort(nodes.T)  # a face of two elements stands beside its like
-        like_next = np.append((nodes[order[1:]] == nodes[order[:-1]]).all(axis=1), False)
-        return faces[np.sort(order[~(like_next | np.roll(like_next, 1))])]
+        faces = self.elements.astype(np.int64)[:, np.array(LOCAL_FACES)].reshape(-1, 3)  # [4 E, 3]
+        one, two, three = np.ascontiguousarray(faces.T)
+        low, high = np.minimum(np.minimum(one, two), three), np.maximum(np.maximum(one, two), three)
+        upper = (one + two + three - low - high) * self.num_nodes + high
+        order = np.lexsort((upper, low))  # a face of two elements stands beside its like
+        low, upper = low[order], upper[order]
+        like_next = np.append((low[1:] == low[:-1]) & (upper[1:] == upper[:-1]), False)
+        outer = np.sort(order[~(like_next | np.roll(like_next, 1))])
+        corners = self.rest_position[self.elements[outer // 4]].astype(np.float64)
+        turned = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
+        surface = np.where(turned[:, None], faces[outer, ::-1], faces[outer]).astype(np.int32)
+        surface.setflags(write=False)
+        return surface
 
 
 @dataclass(frozen=True, eq=False)

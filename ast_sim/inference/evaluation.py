@@ -57,7 +57,6 @@ def evaluate(
     count = dataset.count(split)
     if count == 0:
         raise DatasetError(f"{dataset.path}: the split {split} is empty, so there is nothing to evaluate on")
-    model.eval()
     constant = _training_stress(dataset) if model.config.stress != "none" else None
     samples, answers, displacement, stress = [], [], [], []
     seconds = read_seconds(dataset).samples
@@ -125,7 +124,7 @@ def one_step_predictions(model: Simulator, truth: Trajectory, name: str) -> tupl
         prescribed = script[frames].flatten(0, 1)
         names = [f"{name} frame {int(frame) - 1}" for frame in frames]
         batch = Batch.build(Graph.concatenate([graph] * len(frames)), state, prescribed, names)
-        with torch.inference_mode():
+        with model.predicting():
             position, stress = model.advance(batch, prescribed)
         positions.append(position.reshape(len(frames), -1, 3).numpy())
         if stress is not None:

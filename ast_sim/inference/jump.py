@@ -108,20 +108,15 @@ def _predicted(
             parts[id(scene)] = model.graph(scene), Carrier(scene)
     scenes = [_JumpingScene(model, question, *parts[id(question.scene)]) for question in questions]
     solvers: dict[int, NewtonSteps] = {}
-    training = model.training
-    model.eval()
-    try:
-        with torch.inference_mode():
-            for number, group in enumerate(_groups(model, scenes)):
-                _predict(model, group, effort.corrections)
-                for frame in group if effort.newton_steps else ():
-                    frame.refine(model.config, solvers, effort.newton_steps, whole_way)
-                    if not whole_way and effort.newton_steps >= MOST_NEWTON_STEPS and frame.unsettled:
-                        _start_again(model, frame, effort, solvers)
-                if progress is not None:
-                    progress(number)
-    finally:
-        model.train(training)
+    with model.predicting():
+        for number, group in enumerate(_groups(model, scenes)):
+            _predict(model, group, effort.corrections)
+            for frame in group if effort.newton_steps else ():
+                frame.refine(model.config, solvers, effort.newton_steps, whole_way)
+                if not whole_way and effort.newton_steps >= MOST_NEWTON_STEPS and frame.unsettled:
+                    _start_again(model, frame, effort, solvers)
+            if progress is not None:
+                progress(number)
     return scenes
 
 
@@ -176,7 +171,7 @@ class _Frame:
                 solvers[id(scene)] = newton_steps(config, scene)
             solver, position = solvers[id(scene)], self.positions[-1].numpy().astype(np.float64)
             for step in range(1, most + 1):
-                before, position = position, solver.step(position)
+                before, position = position, solver.step(position, from_afar=step == 1)
                 self.positions.append(torch.from_numpy(position.astype(np.float32)))
                 self.last_step = solver.size(before, position)
                 ends = step == most or self.last_step <= STILL

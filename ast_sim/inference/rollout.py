@@ -38,19 +38,14 @@ def rollouts(
         question.check(given)
     scenes = [_RollingScene(model, question, given) for question in questions]
     concatenate = lru_cache(maxsize=4)(lambda *graphs: Graph.concatenate(list(graphs)))
-    training = model.training
-    model.eval()
-    try:
-        with torch.inference_mode():
-            for frame in range(given, max(scene.end for scene in scenes)):
-                running = [scene for scene in scenes if scene.runs_at(frame)]
-                # Only scenes of the same domain are predicted together: none may change another's domain.
-                for domain in dict.fromkeys(scene.domain for scene in running):
-                    _step(model, [scene for scene in running if scene.domain == domain], frame, concatenate)
-                if progress is not None and running:
-                    progress(frame)
-    finally:
-        model.train(training)
+    with model.predicting():
+        for frame in range(given, max(scene.end for scene in scenes)):
+            running = [scene for scene in scenes if scene.runs_at(frame)]
+            # Only scenes of the same domain are predicted together: none may change another's domain.
+            for domain in dict.fromkeys(scene.domain for scene in running):
+                _step(model, [scene for scene in running if scene.domain == domain], frame, concatenate)
+            if progress is not None and running:
+                progress(frame)
     return [scene.answer() for scene in scenes]
 
 

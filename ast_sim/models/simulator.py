@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -177,6 +178,19 @@ class Simulator(nn.Module):
         """[N, 3]: predicted minus target motion of NORMAL nodes, in the unit of length; 0 elsewhere."""
         error = self.motion_normalizer.inverse(prediction.motion) - target.motion
         return torch.zeros_like(error).index_copy_(0, batch.graph.normal_nodes, error[batch.graph.normal_nodes])
+
+    @contextmanager
+    def predicting(self) -> Iterator[None]:
+        """Predict in here: without gradients and dropout. Afterwards the module trains again if it did."""
+        training = self.training
+        if training:
+            self.eval()
+        try:
+            with torch.inference_mode():
+                yield
+        finally:
+            if training:
+                self.train()
 
     @torch.inference_mode()
     def predict(self, batch: Batch) -> Prediction:

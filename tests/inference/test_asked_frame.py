@@ -87,7 +87,7 @@ def pressing(dataset, share):
     return truth, Share(settings, truth, deepest_frame(truth), share)
 
 
-def collapse(self, position):
+def collapse(self, position, from_afar=False):
     raise SimulationError("collapsed")
 
 
@@ -137,9 +137,9 @@ def test_newton_steps_that_do_not_end_begin_anew_after_more_corrections(pressed,
     assert nine.converged is False  # who asks for fewer steps gets no second start
     step, made = NewtonSteps.step, []
 
-    def fail_later(self, position):
+    def fail_later(self, position, from_afar=False):
         made.append(1)
-        return step(self, position) if len(made) <= 10 else collapse(self, position)
+        return step(self, position, from_afar) if len(made) <= 10 else collapse(self, position)
 
     monkeypatch.setattr(NewtonSteps, "step", fail_later)
     (kept,) = answers(model, question, Effort(1, 10))

@@ -107,7 +107,7 @@ class Elasticity:
 
         Args:
             deformation: the deformation at the positions in question.
-            project: replace the negative eigenvalues of each element's matrix by zero.
+            project: replace the negative eigenvalues of d2 psi / dF2 by zero in each element.
         """
         J = deformation.J
         g = np.einsum("ije,aje->aie", deformation.cofactor / J, self.gradients).reshape(12, -1)
@@ -119,31 +119,51 @@ class Elasticity:
         entries += products
         entries += self._constant
         if project:
-            indefinite = self._may_be_indefinite(deformation)
-            entries[:, indefinite] = _project(entries[:, indefinite])
+            self._lift(entries, deformation)
         return entries.ravel()
 
     def entry_dofs(self) -> tuple[np.ndarray, np.ndarray]:
         """Global degrees of freedom (3 node + component) of the rows and columns of `hessian`, [78 E] each."""
         return self._dofs[_ROW].ravel(), self._dofs[_COLUMN].ravel()
 
-    def _may_be_indefinite(self, deformation: Deformation) -> np.ndarray:
-        """[E] bool: whether d2 psi / dF2 has a negative eigenvalue.
+    def _lift(self, entries: np.ndarray, deformation: Deformation) -> None:
+        """Add to the entries [78,E] of each element what makes the negative eigenvalues of d2 psi / dF2 zero.
 
-        For an isotropic psi with singular values s_i of F, the eigenvalues of d2 psi / dF2 are of two kinds (Smith et
-        al. 2019). Flips and twists of the two axes other than k have mu -+ c s_k / J, here with c = `pressure_factor`.
-        The rest are the eigenvalues of A_ij = d2 psi / ds_i ds_j:
+        With F = sum_i s_i u_i v_i^T, the eigenvectors of d2 psi / dF2 are of two kinds (Smith et al. 2019). For each
+        axis k the other two, i and j, have the twist u_i v_j^T - u_j v_i^T with the eigenvalue mu + c s_k / J, and the
+        flip u_i v_j^T + u_j v_i^T with mu - c s_k / J; here c is `pressure_factor`. At most one of them is negative.
+        The other three are sum_i w_i u_i v_i^T, with w an eigenvector of
 
-            A_ij = delta_ij (mu - c / s_i^2) + lambda J^2 / (s_i s_j)
+            A_ij = delta_ij (mu - c / s_i^2) + lambda J^2 / (s_i s_j),
+
+        which has no negative eigenvalue unless c is positive.
         """
         material, J = self.material, deformation.J
-        c = material.pressure_factor(J)
-        squares = np.linalg.eigvalsh(np.einsum("kie,kje->eij", deformation.F, deformation.F))  # ascending, [E, 3]
-        inverse = 1 / np.sqrt(squares)
-        A = (material.lam * J * J)[:, None, None] * inverse[:, :, None] * inverse[:, None, :]
-        A[:, range(3), range(3)] += np.reshape(material.mu, (-1, 1)) - c[:, None] / squares
-        flip = material.mu - np.abs(c) * np.sqrt(squares[:, 2]) / J
-        return np.minimum(flip, np.linalg.eigvalsh(A)[:, 0]) < 0
+        mu, c = material.mu, material.pressure_factor(J)
+        squares, right = np.linalg.eigh(np.einsum("kie,kje->eij", deformation.F, deformation.F))
+        stretch, right = np.sqrt(squares.T), np.ascontiguousarray(right.transpose(2, 1, 0))  # [3, E], [axis, 3, E]
+        left = np.einsum("ije,kje->kie", deformation.F, right) / stretch[:, None]
+        across = np.einsum("aje,kje->kae", self.gradients, right)  # v_k . grad N_a
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            value = mu - np.abs(c) * stretch[k] / J
+            below = np.flatnonzero(value < 0)
+            one, other = (across[x][:, None, below] * left[y][None, :, below] for x, y in ((j, i), (i, j)))
+            self._raise(entries, below, one + np.sign(c[below]) * other, -value[below] / 2)
+        widened = np.flatnonzero(c > 0)
+        inverse = 1 / stretch[:, widened]
+        A = (material.lam * J * J)[widened] * inverse[:, None] * inverse[None]
+        A[range(3), range(3)] += np.broadcast_to(mu, J.shape)[widened] - c[widened] * inverse * inverse
+        values, vectors = np.linalg.eigh(A.transpose(2, 0, 1))
+        for value, weight in zip(values.T, vectors.transpose(2, 1, 0), strict=True):
+            below = np.flatnonzero(value < 0)
+            chosen = widened[below]
+            way = np.einsum("ke,kae,kie->aie", weight[:, below], across[:, :, chosen], left[:, :, chosen])
+            self._raise(entries, chosen, way, -value[below])
+
+    def _raise(self, entries: np.ndarray, elements: np.ndarray, way: np.ndarray, value: np.ndarray) -> None:
+        """Add value [n] times volume times b b^T to the entries of some elements, with b = `way` [4,3,n]."""
+        b = way.reshape(12, -1)
+        entries[:, elements] += (b * (value * self.volume[elements]))[_ROW] * b[_COLUMN]
 
     def cauchy(self, deformation: Deformation) -> np.ndarray:
         """True stress of each element [3,3,E] in pascal."""
@@ -155,10 +175,3 @@ class Elasticity:
         total = np.bincount(nodes, np.tile(element_values, 4) * weight, minlength=self.num_nodes)
         volume = np.bincount(nodes, weight, minlength=self.num_nodes)
         return np.divide(total, volume, out=np.zeros(self.num_nodes), where=volume > 0)
-
-
-def _project(entries: np.ndarray) -> np.ndarray:
-    """Nearest positive semi-definite element matrices, as upper entries [78,E]."""
-    values, vectors = np.linalg.eigh(entries[_ENTRY].transpose(2, 0, 1))
-    projected = (vectors * np.maximum(values, 0)[:, None, :]) @ vectors.transpose(0, 2, 1)
-    return np.ascontiguousarray(projected[:, _ROW, _COLUMN].T)

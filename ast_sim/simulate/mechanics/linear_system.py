@@ -14,10 +14,12 @@ use one thread, and both report a matrix that is not positive definite.
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib.metadata
 import os
 import weakref
 from collections.abc import Callable
+from types import ModuleType
 from typing import Protocol
 
 import numpy as np
@@ -45,26 +47,32 @@ class Factorization(Protocol):
         """Solution for the matrix last factorised; right side [F], or several [F, K] in Fortran's order."""
 
 
+@functools.cache
+def _pypardiso() -> tuple[ModuleType, str]:
+    """The module, ready for use, and its name and version."""
+    # One thread, no second OpenMP runtime in this process, and the same bits wherever arrays lie in memory.
+    for name, value in (("MKL_THREADING_LAYER", "SEQUENTIAL"), ("MKL_CBWR", "AVX2")):
+        os.environ.setdefault(name, value)
+    # Without this variable, the import of pypardiso searches the whole Python installation for the library.
+    if "PYPARDISO_MKL_RT" not in os.environ:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            for file in importlib.metadata.files("mkl") or ():
+                if "mkl_rt" in file.name:
+                    os.environ["PYPARDISO_MKL_RT"] = str(file.locate())
+    (pypardiso,) = require("simulate", "pypardiso")
+    return pypardiso, f"PARDISO (pypardiso {importlib.metadata.version('pypardiso')})"
+
+
 class Pardiso:
     """PARDISO in Intel's MKL; the symbolic factorization is made for new patterns only."""
 
     _NOT_POSITIVE_DEFINITE = -4
 
     def __init__(self) -> None:
-        # One thread, no second OpenMP runtime in this process, and the same bits wherever arrays lie in memory.
-        for name, value in (("MKL_THREADING_LAYER", "SEQUENTIAL"), ("MKL_CBWR", "AVX2")):
-            os.environ.setdefault(name, value)
-        # Without this variable, the import of pypardiso searches the whole Python installation for the library.
-        if "PYPARDISO_MKL_RT" not in os.environ:
-            with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-                for file in importlib.metadata.files("mkl") or ():
-                    if "mkl_rt" in file.name:
-                        os.environ["PYPARDISO_MKL_RT"] = str(file.locate())
-        (pypardiso,) = require("simulate", "pypardiso")
+        pypardiso, self.name = _pypardiso()
         self._error = pypardiso.pardiso_wrapper.PyPardisoError
         self._solver = pypardiso.PyPardisoSolver(mtype=2)  # real, symmetric, positive definite
         weakref.finalize(self, self._solver.free_memory, everything=True)  # MKL keeps the factor until it is told
-        self.name = f"PARDISO (pypardiso {importlib.metadata.version('pypardiso')})"
 
     def factorise(self, upper: scipy.sparse.csr_array, is_new_pattern: bool) -> bool:
         self._matrix, nothing = upper, np.zeros(upper.shape[0])

@@ -92,15 +92,19 @@ class NewtonSteps:
         nodes = np.unique(faces)
         self._surfaces = [(faces[owner == body], nodes[scene.body[nodes] != body]) for body in np.unique(owner)]
 
-    def step(self, position: np.ndarray) -> np.ndarray:
+    def step(self, position: np.ndarray, from_afar: bool = False) -> np.ndarray:
         """The positions [N, 3] after one step from `position` [N, 3], float64.
+
+        Args:
+            from_afar: far from equilibrium the stiffness is hardly ever positive definite, so the projected one is
+                taken at once. Otherwise it is taken where the exact one is not.
 
         Raises:
             SimulationError: the stiffness is singular, or the forces of contact were not found.
         """
         deformation = _upright(self._elasticity.evaluate(position))
         force = self._elasticity.gradient(deformation)[0].ravel()[self._system.free]
-        for project in (False, True):
+        for project in (True,) if from_afar else (False, True):
             solve = self._system.factorise(self._elasticity.hessian(deformation, project))
             if solve is not None:
                 break

@@ -5,7 +5,7 @@ import pytest
 
 from ast_sim.simulate.mechanics.elasticity import Elasticity
 from ast_sim.simulate.mechanics.linear_system import LinearSystem
-from ast_sim.simulate.mechanics.material import NeoHookean
+from ast_sim.simulate.mechanics.material import NeoHookean, cofactor, determinant
 from ast_sim.simulate.shapes import mesh
 from ast_sim.support.errors import SimulationError
 
@@ -75,6 +75,34 @@ def test_projected_stiffness_is_positive_semi_definite_and_otherwise_the_same():
     np.testing.assert_allclose(
         dense_stiffness(elasticity, rest, project=True), at_rest, atol=1e-10 * np.abs(at_rest).max()
     )
+
+
+@pytest.mark.parametrize(
+    "stretches", [(0.5, 0.9, 1.1), (0.97, 1.0, 1.02), (1.0, 1.0, 1.0), (1.4, 1.7, 2.5), (0.1, 3.0, 5.0)]
+)
+def test_the_projection_makes_the_negative_eigenvalues_of_the_second_derivative_zero(stretches):
+    """Beside the eigenvalues of the whole 9 x 9 matrix, which is made of differences of P."""
+    rng = np.random.default_rng(3)
+    left, right = (np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(2))
+    left *= np.sign(np.linalg.det(left @ right))
+    F = left @ np.diag(stretches) @ right
+    rest, material = np.array([[0.0, 0, 0], [1, 0.1, 0], [0.2, 1, 0], [0.1, 0.3, 0.8]]), NeoHookean(1e6, 0.4)
+    elasticity = Elasticity(rest, np.array([[0, 1, 2, 3]]), material)
+
+    def piola(F: np.ndarray) -> np.ndarray:
+        F = F.reshape(3, 3, 1)
+        cofactors = cofactor(F)
+        J = determinant(F, cofactors)
+        return material.first_piola(F, J, cofactors / J).ravel()
+
+    step = 1e-6
+    second = np.stack([(piola(F.ravel() + e) - piola(F.ravel() - e)) / (2 * step) for e in step * np.eye(9)])
+    values, vectors = np.linalg.eigh((second + second.T) / 2)
+    kept = (vectors * np.maximum(values, 0)) @ vectors.T
+    by_nodes = np.einsum("ik,aj->akij", np.eye(3), elasticity.gradients[:, :, 0]).reshape(12, 9)  # dF by the nodes
+    expected = elasticity.volume[0] * by_nodes @ kept @ by_nodes.T
+    found = dense_stiffness(elasticity, rest @ F.T, project=True)
+    np.testing.assert_allclose(found, expected, atol=1e-7 * np.abs(expected).max())
 
 
 def test_rigid_motion_gives_no_force_and_rotates_forces():

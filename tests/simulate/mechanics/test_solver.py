@@ -85,19 +85,19 @@ def test_a_load_step_that_fails_is_halved():
 
 
 def test_what_halving_does_not_help_is_damped():
-    """A slender column that is pressed snaps aside: with two iterations a step it needs inertia to get there."""
+    """A slender column that is pressed snaps aside in eleven iterations: with eight it needs inertia to get there."""
     column = mesh.plate((0.6, 0.03, 0.02), (24, 2, 1), np.zeros((0, 3)))
     rest, elements = column
     rest = rest + np.cos(np.pi * rest[:, :1] / 0.6) * [0, 0, 5e-4]  # an imperfection decides the side
     ends = np.isclose(np.abs(rest[:, 0]), 0.3)
-    target = rest * [0.9, 1, 1]
+    target = rest * [0.85, 1, 1]
     surface = np.array([[0, 1, 2]])
     contact = Contact(rest, surface, np.zeros(len(rest), int), ContactSettings(1e-4, 1e6))
 
     def solver(settings: SolverSettings) -> QuasiStatic:
         return QuasiStatic(Elasticity(rest, elements, NeoHookean(1e6, 0.3)), contact, ends, rest, settings)
 
-    hasty = solver(SolverSettings(max_iterations=9, max_halvings=0))
+    hasty = solver(SolverSettings(max_iterations=8, max_halvings=0))
     hasty.advance(target)
     assert hasty._damped is not None and hasty.newton.residual() <= 1
     assert np.ptp(hasty.newton.position[:, 2]) > 0.03  # it did buckle
