@@ -2,7 +2,8 @@
 
 The start is the first frame, carried along by the prescribed nodes. Each call of the model gets the answer of the call
 before and predicts what is missing. Newton steps of the solver may follow. The model predicts the frames of all scenes
-side by side, in ragged batches.
+side by side, in ragged batches. With friction, Newton steps know the way of the load as far as the frames before are
+wanted, too; in all else a frame does not depend on the others.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def jumps(
     effort: Effort,
     progress: Callable[[int], None] | None = None,
 ) -> list[Answer]:
-    """Predict the wanted frames of several scenes; the other frames of a batch do not change a frame.
+    """Predict the wanted frames of several scenes; the other scenes of a batch do not change a frame.
 
     If a frame fails, the answer of its scene says why in `failure` and keeps the frames before. `progress` is called
     with the number of each batch and may raise to stop.
@@ -161,7 +162,8 @@ class _Frame:
     def refine(self, config: ModelConfig, solvers: dict[int, NewtonSteps], most: int, every_stress: bool) -> None:
         """Make Newton steps from the answer of the model until one is `STILL`; the stress then is that of the material.
 
-        `solvers` holds those of the scenes so far, by their `id`. The stress is that of the last step, or of every one.
+        Friction resists slip from the frame before, where that is wanted, too. `solvers` holds those of the scenes so
+        far, by their `id`. The stress is that of the last step, or of every one.
         """
         if self.failure is not None:
             return
@@ -169,9 +171,13 @@ class _Frame:
         try:
             if id(scene) not in solvers:
                 solvers[id(scene)] = newton_steps(config, scene)
-            solver, position = solvers[id(scene)], self.positions[-1].numpy().astype(np.float64)
+            solver, position, stuck = (
+                solvers[id(scene)],
+                _array(self.positions[-1]),
+                self.scene.settled(self.number - 1),
+            )
             for step in range(1, most + 1):
-                before, position = position, solver.step(position, from_afar=step == 1)
+                before, position = position, solver.step(position, from_afar=step == 1, stuck=stuck)
                 self.positions.append(torch.from_numpy(position.astype(np.float32)))
                 self.last_step = solver.size(before, position)
                 ends = step == most or self.last_step <= STILL
@@ -203,6 +209,14 @@ class _JumpingScene:
                 start = torch.from_numpy(self.carry(question.script[0], question.script[number]))
                 self.frames.append(_Frame(self, number, start))
 
+    def settled(self, number: int) -> np.ndarray | None:
+        """The positions [N, 3] of a wanted frame that is given or has had its Newton steps, else None."""
+        if number < self.given:
+            return _array(self.script[number]) if number in self.question.wanted() else None
+        frame = next((frame for frame in self.frames if frame.number == number), None)
+        made = frame is not None and frame.last_step is not None and frame.failure is None
+        return _array(frame.positions[-1]) if made else None
+
     def answer(self) -> Answer:
         """The frames before the first that failed."""
         failure = next((frame for frame in self.frames if frame.failure), None)
@@ -223,6 +237,10 @@ class _JumpingScene:
             frames=tuple(numbers),
             last_steps=tuple(frame.last_step for frame in predicted if frame.last_step is not None),
         )
+
+
+def _array(positions: Tensor) -> np.ndarray:
+    return positions.numpy().astype(np.float64)
 
 
 def _groups(model: Simulator, scenes: Sequence[_JumpingScene]) -> Iterator[list[_Frame]]:

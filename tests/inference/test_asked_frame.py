@@ -87,7 +87,7 @@ def pressing(dataset, share):
     return truth, Share(settings, truth, deepest_frame(truth), share)
 
 
-def collapse(self, position, from_afar=False):
+def collapse(self, position, from_afar=False, stuck=None):
     raise SimulationError("collapsed")
 
 
@@ -137,14 +137,33 @@ def test_newton_steps_that_do_not_end_begin_anew_after_more_corrections(pressed,
     assert nine.converged is False  # who asks for fewer steps gets no second start
     step, made = NewtonSteps.step, []
 
-    def fail_later(self, position, from_afar=False):
+    def fail_later(self, position, from_afar=False, stuck=None):
         made.append(1)
-        return step(self, position, from_afar) if len(made) <= 10 else collapse(self, position)
+        return step(self, position, from_afar, stuck) if len(made) <= 10 else collapse(self, position)
 
     monkeypatch.setattr(NewtonSteps, "step", fail_later)
     (kept,) = answers(model, question, Effort(1, 10))
     assert len(made) == 11 and kept.failure is None and kept.converged is False
     assert np.array_equal(kept.position[0], first.position[-1, 0])
+
+
+def test_friction_knows_the_frame_before_if_that_is_wanted_too(pressed, monkeypatch):
+    truth, model = pressing(pressed, 0.9)
+    step, stuck_at = NewtonSteps.step, {}
+
+    def watched(self, position, from_afar=False, stuck=None):
+        stuck_at.setdefault(len(stuck_at) if from_afar else len(stuck_at) - 1, stuck)
+        return step(self, position, from_afar, stuck)
+
+    monkeypatch.setattr(NewtonSteps, "step", watched)
+    monkeypatch.setattr(jump, "BATCH_NODES", 1)  # the model takes one frame at a time
+    last = truth.num_frames - 1
+    (whole,) = answers(model, [Question.of(truth, "plate", None)], Effort(1, 2))
+    assert len(stuck_at) == last and all(np.array_equal(stuck_at[k], whole.position[k]) for k in range(last))
+    for frames, known in (([last], [False]), ([1], [False]), ([0, 1, 3], [True, False])):
+        stuck_at.clear()
+        answers(model, [Question.of(truth, "plate", frames)], Effort(1, 2))
+        assert [stuck is not None for stuck in stuck_at.values()] == known
 
 
 def test_newton_steps_need_a_material(one, pressed):

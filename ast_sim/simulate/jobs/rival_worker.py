@@ -174,14 +174,15 @@ class WaySolver:
     def _linearised(self, case: SolidCase, steps: int) -> OneFrame:
         """So many load steps of one Newton step with linearised contact, and one Newton step more."""
         held, began = case.scene.prescribed[:, None], process_time()
-        position, failure = case.targets[0], ""
-        contact = case.contact
+        position = before = case.targets[0]
+        contact, failure = case.contact, ""
         try:
             newton = NewtonSteps(case.scene, case.material, CLEARANCE * contact.dhat, contact.friction)
             setup = process_time() - began
-            for share in [*np.linspace(0, 1, steps + 1)[1:], 1.0]:
-                target = case.targets[0] + share * (case.targets[self.frame] - case.targets[0])
-                position = newton.step(np.where(held, target, position))
+            for share in np.linspace(0, 1, steps + 1)[1:]:
+                target, before = case.targets[0] + share * (case.targets[self.frame] - case.targets[0]), position
+                position = newton.step(np.where(held, target, before), stuck=before)
+            position = newton.step(position, stuck=before)
         except SimulationError as error:
             position, failure, setup = None, str(error), 0.0
         return OneFrame(position, failure, process_time() - began - setup, setup, steps, steps + 1, 0)

@@ -10,11 +10,13 @@ sequential quadratic programming. Its dual has one unknown a pair, the force of 
 
     minimise  1/2 l B l + b l,   B = C K^-1 C^T,   b = g - clearance - C K^-1 f,   then   u = K^-1 (C^T l - f).
 
-With Coulomb friction each pair has tangential forces, too, at most the coefficient times the normal force; they resist
-slip from x. So x is taken for the place where surfaces stick. Bodies may overlap at x, and elements may be turned over:
-these get the forces and the stiffness of the nearest upright shape (Irving, Teran and Fedkiw 2004). Pairs of edges are
-left out, so edges may cross by a little. A node is on the side of a surface where it is nearest: the start must be
-nearly right.
+With Coulomb friction each pair has tangential forces, too, at most the coefficient times the normal force. They resist
+slip from where the surfaces stuck to each other. A single step does not know the way of the load. If nothing else is
+given, its surfaces have slid along the last fiftieth of a straight way from rest: those that slide get the whole
+friction against their way, and those that stick hardly feel it (docs/log.md, 2026-11-25). Bodies may overlap at x, and
+elements may be turned over: these get the forces and the stiffness of the nearest upright shape (Irving, Teran and
+Fedkiw 2004). Pairs of edges are left out, so edges may cross by a little. A node is on the side of a surface where it
+is nearest: the start must be nearly right.
 """
 
 from __future__ import annotations
@@ -41,6 +43,7 @@ DEEP = 2.0  # a node deeper inside another body than this is not taken for one i
 OVERLAP = 1e-6  # pairs may overlap by this much at the end of a step, in the same
 FEW, SHARE = 8, 4  # a round takes so many of the pairs that would overlap, or this part of them if that is more
 ROUNDING = 1e-10  # is added to the diagonal of B, relative to its mean: equal pairs make B singular
+SLID = 0.02  # surfaces have slid along this last part of the way from rest to x, if nothing else is known
 SWEEPS, CHANGE = 100, 1e-3  # forces of friction are found when a sweep over the pairs changes them by less
 FLATTEST = 0.2  # the least stretch of an element that forces and stiffness follow
 TINY = 1e-300  # instead of zero in a denominator
@@ -56,10 +59,12 @@ class NearPairs:
         directions: [3 P, F] sparse, the derivatives by the free dofs of each pair's gap, then of its slip along one
             tangent, then along the other.
         gap: [P], negative where the node lies inside the other body.
+        slip: [2 P], how far the node has slid along one tangent, then along the other.
     """
 
     directions: scipy.sparse.csr_array
     gap: np.ndarray
+    slip: np.ndarray
 
 
 class NewtonSteps:
@@ -92,12 +97,13 @@ class NewtonSteps:
         nodes = np.unique(faces)
         self._surfaces = [(faces[owner == body], nodes[scene.body[nodes] != body]) for body in np.unique(owner)]
 
-    def step(self, position: np.ndarray, from_afar: bool = False) -> np.ndarray:
+    def step(self, position: np.ndarray, from_afar: bool = False, stuck: np.ndarray | None = None) -> np.ndarray:
         """The positions [N, 3] after one step from `position` [N, 3], float64.
 
         Args:
             from_afar: far from equilibrium the stiffness is hardly ever positive definite, so the projected one is
                 taken at once. Otherwise it is taken where the exact one is not.
+            stuck: [N, 3] where surfaces in contact stuck to each other; see the head of this file.
 
         Raises:
             SimulationError: the stiffness is singular, or the forces of contact were not found.
@@ -110,7 +116,7 @@ class NewtonSteps:
                 break
         else:
             raise SimulationError("the stiffness is singular: nothing holds a body, or an element has collapsed")
-        return self._shortened(position, self._constrained(solve, force, self.near_pairs(position)))
+        return self._shortened(position, self._constrained(solve, force, self.near_pairs(position, stuck)))
 
     def size(self, before: np.ndarray, after: np.ndarray) -> float:
         """The size of a step between positions [N, 3]: the largest component of a move, in mean edge lengths of the
@@ -130,10 +136,11 @@ class NewtonSteps:
         active, responses, forces = self._pressed_pairs(solve, normals, offset)
         if not self._friction or not len(active):
             return unconstrained + responses @ forces
-        tangents = pairs.directions[np.concatenate([active + count, active + 2 * count])]
+        along = np.concatenate([active, active + count])
+        tangents = pairs.directions[count + along]
         directions = scipy.sparse.vstack([normals[active], tangents], format="csr")
         responses = np.concatenate([responses, solve(tangents.toarray().T)], axis=1)
-        offset = np.concatenate([offset[active], tangents @ unconstrained])
+        offset = np.concatenate([offset[active], tangents @ unconstrained + pairs.slip[along]])
         return unconstrained + responses @ _rubbed(_compliance(directions, responses), offset, forces, self._friction)
 
     def _pressed_pairs(
@@ -168,8 +175,9 @@ class NewtonSteps:
         found[self._deforming, 0] = stress
         return found
 
-    def near_pairs(self, position: np.ndarray) -> NearPairs:
-        """The pairs that may touch at `position` [N, 3]: a surface node and its nearest point of another body."""
+    def near_pairs(self, position: np.ndarray, stuck: np.ndarray | None = None) -> NearPairs:
+        """The pairs that may touch at `position` [N, 3]: a surface node and its nearest point of another body. They
+        have slid from where they were at `stuck` [N, 3]; see `step`."""
         import igl  # takes 0.2 s
 
         nodes, corners, normals, shares, gaps = [], [], [], [], []
@@ -191,26 +199,36 @@ class NewtonSteps:
             shares.append(igl.barycentric_coordinates(nearest[chosen], *(position[there[:, i]] for i in range(3))))
             gaps.append(gap[chosen])
         if not gaps:
-            return NearPairs(scipy.sparse.csr_array((0, len(self._system.free))), np.zeros(0))
+            return NearPairs(scipy.sparse.csr_array((0, len(self._system.free))), np.zeros(0), np.zeros(0))
         joined = (np.concatenate(parts) for parts in (nodes, corners, normals, shares, gaps))
-        return self._pairs(*joined)
+        slid = SLID * (position - self._rest) if stuck is None else position - stuck
+        return self._pairs(*joined, slid)
 
     def _pairs(
-        self, nodes: np.ndarray, corners: np.ndarray, normals: np.ndarray, shares: np.ndarray, gaps: np.ndarray
+        self,
+        nodes: np.ndarray,
+        corners: np.ndarray,
+        normals: np.ndarray,
+        shares: np.ndarray,
+        gaps: np.ndarray,
+        slid: np.ndarray,
     ) -> NearPairs:
-        """Pairs of nodes [P] and triangles [P, 3] with their normals, barycentric coordinates [P, 3] and gaps [P]."""
+        """Pairs of nodes [P] and triangles [P, 3] with their normals, barycentric coordinates [P, 3] and gaps [P]; the
+        nodes have moved by `slid` [N, 3] since the pairs stuck."""
         of_pair = np.concatenate([nodes[:, None], corners], axis=1)  # [P, 4]
         weight = np.concatenate([np.ones((len(nodes), 1)), -shares], axis=1)
         columns = self._number[3 * of_pair[:, :, None] + np.arange(3)]  # [P, 4, 3]
         movable = (columns >= 0).any(axis=(1, 2))
-        columns, weight, normals = columns[movable], weight[movable], normals[movable]
+        of_pair, columns, weight, normals = of_pair[movable], columns[movable], weight[movable], normals[movable]
         free, rows = columns >= 0, np.broadcast_to(np.arange(len(columns))[:, None, None], columns.shape)
         shape = (len(columns), len(self._system.free))
-        parts = []
-        for axis in (normals, *_tangents(normals)):
+        parts, tangents = [], _tangents(normals)
+        for axis in (normals, *tangents):
             values = weight[:, :, None] * axis[:, None, :]
             parts.append(scipy.sparse.csr_array((values[free], (rows[free], columns[free])), shape=shape))
-        return NearPairs(scipy.sparse.vstack(parts, format="csr"), gaps[movable])
+        relative = np.einsum("pk,pki->pi", weight, slid[of_pair])
+        slip = np.concatenate([np.einsum("pi,pi->p", relative, tangent) for tangent in tangents])
+        return NearPairs(scipy.sparse.vstack(parts, format="csr"), gaps[movable], slip)
 
     def _shortened(self, position: np.ndarray, way: np.ndarray) -> np.ndarray:
         """`position` [N, 3] moved by the largest of 1, 1/2, 1/4, ... of the way [F] that turns no element over."""

@@ -116,6 +116,30 @@ def test_forces_found_in_rounds_are_those_of_all_pairs_at_once(squeezed, monkeyp
     assert rms(found[0] - found[1]) > 1e-4 * size  # friction is felt
 
 
+def test_what_slides_feels_friction_against_its_way(monkeypatch):
+    """A block is pressed down, then pushed aside until it slides; the steps start from nearly what the solver finds. If
+    it stuck where each step begins, any force would hold it; in truth the whole friction acts against its way."""
+    case = pressed(*blocks(), depth=0.01, shift=0.03, friction=0.2)
+    truth = quasi_static(case).position.astype(float)
+    found, free, upper = truth[-1], ~case.scene.prescribed, case.scene.body == 1
+    solver = NewtonSteps(case.scene, case.material, 0.92 * DHAT, 0.2)
+
+    def pulled(position: np.ndarray) -> float:
+        """The force along the way, of the force that presses."""
+        forces = solver._elasticity.gradient(solver._elasticity.evaluate(position))[0][upper & ~free].sum(axis=0)
+        return forces[0] / -forces[2]
+
+    left, pull = {}, {}
+    for known in ("here", "frame before", "nothing"):
+        position = nearly(found, free, 0.1 * rms((found - truth[0])[free]))
+        for _ in range(4):
+            position = solver.step(position, stuck={"here": position, "frame before": truth[-2]}.get(known))
+        left[known], pull[known] = rms((position - found)[free]), pulled(position) / pulled(found)
+    assert pull["frame before"] == pytest.approx(1, abs=0.01) and pull["nothing"] == pytest.approx(1, abs=0.01)
+    assert pull["here"] < 0.9
+    assert max(left["frame before"], left["nothing"]) < 0.55 * left["here"]
+
+
 def test_what_is_not_looked_at_is_not_near(squeezed, monkeypatch):
     """Only what comes near the box around the other body is compared; the pairs are those of whole surfaces."""
     case, truth, *_ = squeezed
