@@ -5,9 +5,8 @@ Legend: B scenes, T tokens (Tq queries, Tk keys), H heads, D channels of a head.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-
 import re
+from collections.abc import Callable, Iterator
 
 import torch
 from torch import Tensor

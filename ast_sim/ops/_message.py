@@ -11,7 +11,6 @@ the first layer, F2 channels of a message. Without an encoder the op takes H = 0
 
 from __future__ import annotations
 
-import torch
 import torch.nn.functional as F
 from torch import Tensor
 
@@ -48,8 +47,9 @@ _INPUTS = (
 )
 _SPEC = f"{_INPUTS}; with_messages switch -> sum[R,G], messages[M,G] if(with_messages)"
 _BACKWARD_SPEC = (
-    f"dsum[R,G] late, dmessages?[M,G] late, {_INPUTS}; wants_edges wants(edge_features) -> dof_senders[S,F], dof_receivers[R,F],"
-    " dedge_features[M,E] if(wants_edges), dA1[H,E], da1[H], dA2[F,H], dW2[G,F], db2[G], dgamma[G], dbeta[G]"
+    f"dsum[R,G] late, dmessages?[M,G] late, {_INPUTS}; wants_edges wants(edge_features)"
+    " -> dof_senders[S,F], dof_receivers[R,F], dedge_features[M,E] if(wants_edges), dA1[H,E], da1[H], dA2[F,H],"
+    " dW2[G,F], db2[G], dgamma[G], dbeta[G]"
 )
 
 
