@@ -259,8 +259,7 @@ static bool check_values(const call *c, int at) {
 
 /* Whether the argument may be there, or may not, beside the others. */
 static bool may_be(const call *c, const parameter *p, bool given) {
-  return (given || p->optional) && (p->with == NO_PARAMETER || given == !!c->arguments[p->with].data) &&
-         (!given || p->needs == NO_PARAMETER || c->arguments[p->needs].data);
+  return (given || p->optional) && (p->with == NO_PARAMETER || given == !!c->arguments[p->with].data);
 }
 
 /* A letter that only absent inputs have is 0. Outputs bind no letter of an input: a kernel may look there. */

@@ -32,8 +32,8 @@ typedef struct {
 typedef struct {
   int64_t kind, type;
   int64_t optional, output, rows, filled; /* rows: they may lie apart; filled: there must be elements */
-  int64_t low, high;   /* of an integer from low to high, or of a number in [low, high) if low < high */
-  int64_t with, needs; /* given exactly if that parameter is, or only if it is */
+  int64_t low, high; /* of an integer from low to high, or of a number in [low, high) if low < high */
+  int64_t with;      /* given exactly if that parameter is */
   int64_t ndim, num_checks;
   dimension shape[MAX_SHAPE];
   value_check checks[MAX_CHECKS];

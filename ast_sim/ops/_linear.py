@@ -18,7 +18,7 @@ SAVED = 1 << 24  # an activation's input with more elements is not kept for the 
 
 # What stands behind `linear` and `linear_backward` in a spec; P is O, or O/2 for "geglu".
 _INPUTS = "x[M,I] rows, weight[O,I] filled, bias?[O]"
-_ACTIVATION = "activation choice(none,relu,geglu) integer(0,1)"
+_ACTIVATION = f"activation choice({','.join(ACTIVATIONS)}) integer(0,1)"
 _SPEC = f"{_INPUTS}, residual?[M,P] rows added, {_ACTIVATION}; save switch -> out[M,P], z[M,O] if(save)"
 _BACKWARD_SPEC = (
     f"dout[M,P] rows late, {_INPUTS}, z?[M,O], {_ACTIVATION}; wanted wants(x,weight,bias)"
@@ -26,17 +26,10 @@ _BACKWARD_SPEC = (
 )
 
 
-def _either(name: str, spec: str, activation: int) -> Either:
-    """The kernels of an op whose argument with this number is the activation."""
-
-    def which(*args) -> bool:
-        if args[activation] not in ACTIVATIONS:
-            choice = ", ".join(ACTIVATIONS)
-            raise ValueError(f"linear: activation {args[activation]!r} is unknown: choose of {choice}")
-        return args[activation] == "geglu"
-
-    of_pairs = spec.replace("O", "2P").replace("(0,1)", "(2,2)")
-    return Either(which, Kernel(name, spec.replace("P", "O")), Kernel(f"linear_geglu{name[6:]}", of_pairs))
+def _either(name: str, spec: str) -> Either:
+    one = Kernel(name, spec.replace("P", "O"))
+    pairs = Kernel(f"linear_geglu{name[6:]}", spec.replace("O", "2P").replace("(0,1)", "(2,2)"))
+    return Either("activation", {"none": one, "relu": one, "geglu": pairs})
 
 
 def _linear_reference(x, weight, bias, residual, activation, save):
@@ -55,8 +48,8 @@ def _known_z(given: dict):
     return given["out"] if given["activation"] == "relu" and given["residual"] is None else given["z"]
 
 
-_linear = Op(_either("linear", _SPEC, 4), _linear_reference)
-_linear_backward = gradient_op(_linear, _either("linear_backward", _BACKWARD_SPEC, 5), {"z": _known_z})
+_linear = Op(_either("linear", _SPEC), _linear_reference)
+_linear_backward = gradient_op(_linear, _either("linear_backward", _BACKWARD_SPEC), {"z": _known_z})
 
 
 def linear(

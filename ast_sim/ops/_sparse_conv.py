@@ -50,10 +50,8 @@ def _weight_reference(x, dout, pair_offsets, source, destination):
     return torch.stack([found.get(k, x.new_zeros(x.shape[1], dout.shape[1])) for k in range(OFFSETS)])
 
 
-_conv = Op(
-    Either(lambda *args: args[3], Kernel("sparse_conv", _SPEC), Kernel("sparse_conv_transposed", _TRANSPOSED_SPEC)),
-    _reference,
-)
+_either = {False: Kernel("sparse_conv", _SPEC), True: Kernel("sparse_conv_transposed", _TRANSPOSED_SPEC)}
+_conv = Op(Either("transposed", _either), _reference)
 _conv_weight = Op(Kernel("sparse_conv_weight", _WEIGHT_SPEC), _weight_reference)
 
 

@@ -28,7 +28,8 @@ def gradient_op(op: Op, kernel: Kernel | Either, known: dict[str, Callable[[dict
     place = {p.name: i for i, p in enumerate([*inputs, *outputs])}
     numbers = {f"d{p.name}": i for i, p in enumerate(outputs)}
     cotangents = {i: numbers[p.name] for i, p in enumerate(taken) if p.name in numbers}
-    kept = [i for i, p in enumerate(taken) if place.get(p.name, 0) >= len(inputs)]
+    sources = [place.get(p.name) for p in taken]
+    kept = [i for i, source in enumerate(sources) if source is not None and source >= len(inputs)]
     wants = {i: [place[name] for name in p.names("wants")] for i, p in enumerate(taken) if "wants" in p.words}
     of_inputs = [place[p.name[1:]] for p in kernel.spec.outputs]
     added = [i for i, p in enumerate(inputs) if "added" in p.words]
@@ -48,11 +49,12 @@ def gradient_op(op: Op, kernel: Kernel | Either, known: dict[str, Callable[[dict
         ys = output if isinstance(output, tuple) else (output,)
         ctx.set_materialize_grads(len(cotangents) == len(ys))
         ctx.mark_non_differentiable(*(y for i, y in enumerate(ys) if i not in cotangents.values()))
-        given = dict(zip(place, (*inputs, *ys), strict=True))
-        given |= {name: function(given) for name, function in (known or {}).items()}
-        values = [given.get(p.name) for p in taken]
+        given = (*inputs, *ys)
+        values = [None if i is None else given[i] for i in sources]
         for i in kept:
-            values[i] = _wanted(values[i], taken[i])
+            function = (known or {}).get(taken[i].name)
+            y = function(dict(zip(place, given, strict=True))) if function else values[i]
+            values[i] = _wanted(y, taken[i])
         _keep(ctx, values)
 
     def backward(ctx, *dys):

@@ -66,7 +66,7 @@ class Kernel:
 
     def __init__(self, name: str, spec: str, more: Callable[[str, Sizes, Given], None] | None = None) -> None:
         self.name, self.spec, self.more = name, Spec(spec), more
-        taken = self.spec.taken
+        taken, self._num = self.spec.taken, len(self.spec.taken)
         self._parameters = taken + self.spec.outputs
         self._floats = [i for i, p in enumerate(taken) if p.shape is not None and p.dtype.is_floating_point]
         if BACKEND == "c":
@@ -87,9 +87,8 @@ class Kernel:
                     raise BufferError
             return function(*arguments)
         except BufferError:
-            num = len(self.spec.taken)
             try:
-                return function(*map(dense, arguments[:num], self._parameters), *arguments[num:])
+                return function(*map(dense, arguments[: self._num], self._parameters), *arguments[self._num :])
             except ValueError as error:
                 refusal = error
         except ValueError as error:
@@ -117,15 +116,16 @@ class Kernel:
             given = self.spec.arguments(*arguments)
         except Exception as error:  # no outputs for such arguments
             raise self._reason(self.spec.inputs, arguments) or error from None
-        return self(*given), given[len(self.spec.taken) :]
+        return self(*given), given[self._num :]
 
     def run(self, *arguments):
         """The op."""
-        return self.given(self.fill(*arguments)[1], arguments)
+        _, outputs = self.fill(*arguments)
+        return outputs[0] if len(outputs) == 1 else self.given(outputs, arguments)
 
     def fake(self, *arguments):
         """The outputs without values, for tracing."""
-        return self.given(self.spec.arguments(*arguments)[len(self.spec.taken) :], arguments)
+        return self.given(self.spec.arguments(*arguments)[self._num :], arguments)
 
     @staticmethod
     def given(outputs: tuple, arguments: tuple):
@@ -136,19 +136,28 @@ class Kernel:
 
 
 class Either:
-    """Kernels of one op that differ in shapes: `which` gives the number of the kernel from the arguments of the op."""
+    """Kernels of one op that differ in shapes: one for each value of an argument."""
 
-    def __init__(self, which: Callable[..., int], *kernels: Kernel) -> None:
-        self.name, self.spec, self.which, self.kernels = kernels[0].name, kernels[0].spec, which, kernels
+    def __init__(self, argument: str, kernels: dict[Any, Kernel]) -> None:
+        first = next(iter(kernels.values()))
+        self.name, self.spec, self.kernels = first.name, first.spec, kernels
+        self.argument = [p.name for p in first.spec.inputs].index(argument)
+
+    def of(self, arguments: tuple) -> Kernel:
+        value = arguments[self.argument]
+        if value in self.kernels:
+            return self.kernels[value]
+        name, choice = self.spec.inputs[self.argument].name, ", ".join(map(str, self.kernels))
+        raise ValueError(f"{self.name}: {name} {value!r} is unknown: choose of {choice}")
 
     def check(self, *arguments) -> None:
-        self.kernels[self.which(*arguments)].check(*arguments)
+        self.of(arguments).check(*arguments)
 
     def run(self, *arguments):
-        return self.kernels[self.which(*arguments)].run(*arguments)
+        return self.of(arguments).run(*arguments)
 
     def fake(self, *arguments):
-        return self.kernels[self.which(*arguments)].fake(*arguments)
+        return self.of(arguments).fake(*arguments)
 
 
 def dense(x: Any, p: Parameter) -> Any:

@@ -44,22 +44,27 @@ class Dimension:
     def size(self, sizes: Sizes) -> int:
         return self.constant + sum(n * sizes.get(letter, 0) for letter, n in self.factors.items())
 
+    @property
+    def single(self) -> str:
+        """The letter, if it stands alone."""
+        return next(iter(self.factors)) if len(self.factors) == 1 else ""
+
     def fits(self, length: int, sizes: Sizes) -> bool:
         """Whether an axis may be as long as this. A letter that stands alone binds at first sight."""
-        if len(self.factors) == 1:
-            ((letter, factor),) = self.factors.items()
-            rest = length - self.constant
-            if letter not in sizes and rest >= 0 and rest % factor == 0:
-                sizes[letter] = rest // factor
-            return letter in sizes and length == self.size(sizes)
+        if self.single and self.single not in sizes:
+            rest, factor = length - self.constant, self.factors[self.single]
+            if rest < 0 or rest % factor:
+                return False
+            sizes[self.single] = rest // factor
         return length == self.size(sizes)
 
     def show(self, sizes: Sizes) -> str:
-        return str(self.size(sizes)) if len(self.factors) != 1 or [*self.factors][0] in sizes else self.text
+        return self.text if self.single and self.single not in sizes else str(self.size(sizes))
 
-    def expression(self, sizes: dict[str, str]) -> str:
-        """The size as Python, from the expressions of the letters."""
-        terms = [f"{n} * {sizes[letter]}" if n > 1 else sizes[letter] for letter, n in self.factors.items()]
+    @property
+    def expression(self) -> str:
+        """The size as Python, where the letters are numbers."""
+        terms = [f"{n} * {letter}" if n > 1 else letter for letter, n in self.factors.items()]
         return " + ".join(terms + [str(self.constant)] * (self.constant > 0 or not terms))
 
     def numbers(self) -> list[int]:
@@ -104,28 +109,25 @@ class Parameter:
     @property
     def argument(self) -> str:
         """The Python expression of what the kernel takes for it."""
-        choices = {name: i for i, name in enumerate(self.names("choice"))}
-        return f"{choices}[{self.name}]" if choices else self.name
+        return f"{tuple(self.names('choice'))}.index({self.name})" if "choice" in self.words else self.name
 
     def numbers(self, places: dict[str, int], checks: list[str]) -> list[int]:
         """As csrc/spec.h takes it, given the place of each parameter and the names of the core's checks."""
         kind = 0 if self.shape is not None else 3 if "bits" in self.words else 2 if "number" in self.words else 1
         flags = (self.optional or "if" in self.words, self.output, "rows" in self.words, "filled" in self.words)
-        others = (places[self.words[word]] if word in self.words else -1 for word in ("with", "needs"))
+        other = places[self.words["with"]] if "with" in self.words else -1
         shape, mine = self.shape or (), [word for word in self.words if word in CHECKS]
-        numbers = [kind, _TYPES[self.dtype], *map(int, flags), *self.bounds, *others, len(shape), len(mine)]
-        for i in range(4):
-            numbers += shape[i].numbers() if i < len(shape) else [0] * 5
-        for i in range(2):
-            bound, arrays = _inside(self.words[mine[i]] if i < len(mine) else "")
-            check = checks.index(mine[i]) if i < len(mine) else 0
-            numbers += [check, *bound.numbers(), *([places[name] for name in arrays] + [-1, -1])[:2]]
-        return numbers
+        numbers = [kind, _TYPES[self.dtype], *map(int, flags), *self.bounds, other, len(shape), len(mine)]
+        rows = [d.numbers() for d in shape] + [[0] * 5] * (4 - len(shape))
+        for word in mine:
+            bound, arrays = _inside(self.words[word])
+            rows.append([checks.index(word), *bound.numbers(), *([places[name] for name in arrays] + [-1, -1])[:2]])
+        return sum([numbers, *rows, *[[0] * 8] * (2 - len(mine))], [])
 
 
 _SCHEMA = {"choice": "str", "flag": "bool", "switch": "bool", "wants": "bool", "size": "SymInt", "integer": "int"}
 _SCHEMA |= {"number": "float", "bits": "int"}
-_WORDS = {"int64", "int32", "rows", "filled", "late", "with", "needs", "added", "if", *_SCHEMA}
+_WORDS = {"int64", "int32", "rows", "filled", "late", "with", "added", "if", *_SCHEMA}
 _TYPES = {dtype: np.dtype(str(dtype)[6:]).num for dtype in (torch.float32, torch.int64, torch.int32)}
 
 
@@ -147,13 +149,7 @@ def _parameters(text: str, output: bool = False) -> list[Parameter]:
 
 
 class Spec:
-    """The text taken apart.
-
-    Attributes:
-        taken: what the kernel takes.
-        inputs: what the op takes: the same, and what stands behind the semicolon.
-        outputs: of both.
-    """
+    """The text taken apart: what the kernel takes (`taken`), what the op takes (`inputs`), and the outputs of both."""
 
     def __init__(self, text: str) -> None:
         inputs, _, outputs = text.partition("->")
@@ -174,38 +170,38 @@ class Spec:
 
         It is written out as Python, like the methods of a dataclass, for it runs in every call.
         """
-        return self._function([p.argument for p in self.taken] + [self._new(p) for p in self.outputs])
+        return self._function([p.argument for p in self.taken] + [self._new(p) for p in self.outputs], self._sizes())
 
     @cached_property
     def wanted(self) -> Callable[..., tuple[bool, ...]]:
         """Whether each output is wanted, from the arguments of the op."""
         return self._function([self._condition(p) for p in self.outputs])
 
-    def _function(self, expressions: list[str]) -> Callable[..., tuple]:
-        names = ", ".join(p.name for p in self.inputs)
-        return eval(f"lambda {names}: ({', '.join(expressions)},)", {"torch": torch})
+    def _function(self, expressions: list[str], sizes: dict[str, str] | None = None) -> Callable[..., tuple]:
+        lines = [f"def function({', '.join(p.name for p in self.inputs)}):"]
+        lines += [f"    {letter} = {size}" for letter, size in (sizes or {}).items()]
+        namespace: dict[str, Any] = {"torch": torch}
+        exec("\n".join([*lines, f"    return {', '.join(expressions)},"]), namespace)
+        return namespace["function"]
 
     def _new(self, p: Parameter) -> str:
         """The expression of an output without values."""
         tensors = [x for x in self.inputs if x.shape is not None]
         like = next((x for x in tensors if x.dtype == p.dtype), tensors[0])
-        lengths = "".join(f"{d.expression(self._sizes)}, " for d in p.shape or ())
+        lengths = "".join(f"{d.expression}, " for d in p.shape or ())
         dtype = "" if like.dtype == p.dtype else f", dtype={p.dtype}"
         return f"{like.name}.new_empty(({lengths}){dtype}) if {self._condition(p)} else None"
 
-    @cached_property
     def _sizes(self) -> dict[str, str]:
-        """The expression of each letter; from a tensor that is always there, if there is such a one."""
-        sizes = {}
-        for p in sorted(self.inputs, key=lambda p: not p.optional):
+        """The expression of each letter of the outputs; from a tensor that is always there, if there is such a one."""
+        used = {letter for p in self.outputs for d in p.shape or () for letter in d.factors}
+        sizes = {p.words["size"]: p.name for p in self.inputs if "size" in p.words}
+        for p in sorted(self.inputs, key=lambda p: p.optional):
             for axis, d in enumerate(p.shape or ()):
-                if len(d.factors) == 1:
-                    ((letter, factor),) = d.factors.items()
+                if d.single in used and d.single not in sizes:
                     size = f"{p.name}.shape[{axis}]" + f" - {d.constant}" * (d.constant > 0)
-                    size = f"({size}) // {factor}" if factor > 1 else size
-                    sizes[letter] = f"(0 if {p.name} is None else {size})" if p.optional else f"({size})"
-            if "size" in p.words:
-                sizes[p.words["size"]] = p.name
+                    size = f"({size}) // {d.factors[d.single]}" if d.factors[d.single] > 1 else size
+                    sizes[d.single] = f"0 if {p.name} is None else {size}" if p.optional else size
         return sizes
 
     def _condition(self, p: Parameter) -> str:
@@ -223,23 +219,23 @@ class Spec:
 
 
 def check(name: str, parameters: list[Parameter], given: Given, exact: bool = False) -> Sizes:
-    """Raise ValueError or TypeError if these arguments do not fit; others are not looked at.
+    """Raise ValueError or TypeError if these arguments do not fit, and return the sizes by letter.
 
-    Args:
-        name: of the op, for the message.
-        parameters: their spec.
-        given: the arguments by name.
-        exact: tensors of floating point must be float32; otherwise they may have any dtype.
-
-    Returns:
-        The sizes by letter.
+    Parameters that are not given are not looked at. Tensors of floating point may have any dtype, unless it must be
+    `exact`.
     """
     sizes: Sizes = {p.words["size"]: given[p.name] for p in parameters if "size" in p.words and p.name in given}
     known = [p for p in parameters if p.name in given]
     for p in sorted(known, key=lambda p: "late" in p.words):
         if p.shape is None:
             _check_number(name, p, given[p.name])
-        elif _is_present(name, p, given):
+            continue
+        present = given[p.name] is not None
+        if not present and not p.optional and "if" not in p.words:
+            raise TypeError(f"{name}: {p.name} must not be None")
+        if "with" in p.words and present != (given[p.words["with"]] is not None):
+            raise ValueError(f"{name}: {p.words['with']} and {p.name} go together")
+        if present:
             _check_tensor(name, p, given[p.name], sizes, exact)
     for p in known:
         for word, inside in p.words.items():
@@ -256,19 +252,6 @@ def _check_number(name: str, p: Parameter, value: float) -> None:
         raise ValueError(f"{name}: {p.name} must lie in {low}..{high}, not {value}")
     if p.words.get("number") and not low <= value < high:
         raise ValueError(f"{name}: {p.name} must lie in [{low}, {high}), not {value}")
-
-
-def _is_present(name: str, p: Parameter, given: Given) -> bool:
-    present = given[p.name] is not None
-    if not present and not p.optional and "if" not in p.words:
-        raise TypeError(f"{name}: {p.name} must not be None")
-    other = p.words.get("with")
-    if other and present != (given[other] is not None):
-        raise ValueError(f"{name}: {other} and {p.name} go together")
-    other = p.words.get("needs")
-    if other and present and given[other] is None:
-        raise ValueError(f"{name}: {p.name} needs {other}")
-    return present
 
 
 def _check_tensor(name: str, p: Parameter, x: Tensor, sizes: Sizes, exact: bool) -> None:
