@@ -118,7 +118,7 @@ class Kernel:
             raise self._reason(self.spec.inputs, arguments) or error from None
         return self(*given), given[self._num :]
 
-    def run(self, *arguments):
+    def run(self, *arguments) -> Any:
         """The op."""
         _, outputs = self.fill(*arguments)
         return outputs[0] if len(outputs) == 1 else self.given(outputs, arguments)
@@ -128,7 +128,7 @@ class Kernel:
         return self.given(self.spec.arguments(*arguments)[self._num :], arguments)
 
     @staticmethod
-    def given(outputs: tuple, arguments: tuple):
+    def given(outputs: tuple, arguments: tuple) -> Any:
         """The outputs as an op returns them: one that is not wanted is empty, because an op cannot return None."""
         if len(outputs) == 1:
             return outputs[0]
@@ -153,8 +153,8 @@ class Either:
     def check(self, *arguments) -> None:
         self.of(arguments).check(*arguments)
 
-    def run(self, *arguments):
-        return self.of(arguments).run(*arguments)
+    def run(self, *arguments) -> Any:
+        return (self.kernels.get(arguments[self.argument]) or self.of(arguments)).run(*arguments)
 
     def fake(self, *arguments):
         return self.of(arguments).fake(*arguments)
@@ -206,7 +206,7 @@ class Op:
         torch.library.register_autocast(f"ast_sim::{self.name}", "cpu", torch.float32, lib=LIBRARY)
         self.overload = getattr(torch.ops.ast_sim, self.name).default
 
-    def __call__(self, *args):
+    def __call__(self, *args) -> Any:
         if BACKEND == "torch":
             return self.reference(*args)
         if torch.compiler.is_compiling():
@@ -225,7 +225,7 @@ class Op:
             return self.function.apply(*args)
         return self.kernel(*args)
 
-    def reference(self, *args):
+    def reference(self, *args) -> Any:
         """The composition, after the checks."""
         if self._check:
             self._check(*args)
@@ -241,7 +241,7 @@ class Op:
                 raise ValueError(f"{self.name}: all tensors must lie on one device, found {x.device} beside cpu")
         return self.kernel(*args)
 
-    def compose(self, *args):
+    def compose(self, *args) -> Any:
         """The composition, as a function that torch can differentiate and transform in every way."""
         for argument, x in zip(self.overload._schema.arguments, args, strict=True):
             if _is_batched(x) and not (self.function and x.is_floating_point()):

@@ -188,9 +188,9 @@ class Spec:
         """The expression of an output without values."""
         tensors = [x for x in self.inputs if x.shape is not None]
         like = next((x for x in tensors if x.dtype == p.dtype), tensors[0])
-        lengths = "".join(f"{d.expression}, " for d in p.shape or ())
+        lengths = ", ".join(d.expression for d in p.shape or ())
         dtype = "" if like.dtype == p.dtype else f", dtype={p.dtype}"
-        return f"{like.name}.new_empty(({lengths}){dtype}) if {self._condition(p)} else None"
+        return f"{like.name}.new_empty({lengths}{dtype}) if {self._condition(p)} else None"
 
     def _sizes(self) -> dict[str, str]:
         """The expression of each letter of the outputs; from a tensor that is always there, if there is such a one."""
