@@ -101,7 +101,7 @@ class Kernel:
             raise reason
 
     def _reason(self, parameters: list[Parameter], arguments: tuple, exact: bool = False) -> Exception | None:
-        given = {p.name: x for p, x in zip(parameters, arguments, strict=True)}
+        given = {p.name: x for p, x in zip(parameters, arguments, strict=False)}
         try:
             sizes = check(self.name, parameters, given, exact)
             if self.more:
