@@ -44,12 +44,17 @@ static bool fail(const call *c, const char *problem) {
   return false;
 }
 
-static bool refuse(const call *c, int i, PyObject *type, const char *why) {
+/* The name of an argument; good until the next call. */
+static const char *name_of(const call *c, int i) {
+  static char shown[80];
   const char *name = c->spec->names;
   while (i--) name = strchr(name, ' ') + 1;
-  char shown[80];
   snprintf(shown, sizeof shown, "%.*s", (int)strcspn(name, ","), name);
-  PyErr_Format(type, "%s: %s %s", c->spec->name, shown, why);
+  return shown;
+}
+
+static bool refuse(const call *c, int i, PyObject *type, const char *why) {
+  PyErr_Format(type, "%s: %s %s", c->spec->name, name_of(c, i), why);
   return false;
 }
 
@@ -317,7 +322,7 @@ static bool end(call *c, ast_status status) {
     argument *a = &c->arguments[i];
     if (!a->copy) continue;
     if (ok && memcmp(a->copy, a->data, (size_t)a->bytes))
-      ok = refuse(c, i, PyExc_AssertionError, "is an input, and the kernel changed it");
+      ok = PyErr_Format(PyExc_AssertionError, "%s: the kernel changed its input %s", c->spec->name, name_of(c, i));
     free(a->copy);
   }
   return ok && (status != AST_NO_MEMORY || (PyErr_NoMemory(), false));

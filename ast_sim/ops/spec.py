@@ -226,7 +226,7 @@ def check(name: str, parameters: list[Parameter], given: Given, exact: bool = Fa
     """
     sizes: Sizes = {p.words["size"]: given[p.name] for p in parameters if "size" in p.words and p.name in given}
     known = [p for p in parameters if p.name in given]
-    for p in sorted(known, key=lambda p: "late" in p.words):
+    for p in sorted(known, key=lambda p: (p.output, "late" in p.words)):
         if p.shape is None:
             _check_number(name, p, given[p.name])
             continue
