@@ -2,16 +2,15 @@
  * kernel sees it.
  *
  * What a kernel takes stands in its spec (spec.h). Arrays are NumPy arrays or tensors (view.h) of exact dtype, aligned
- * and row major; outputs are allocated by the caller. A message names the kernel, the argument and the offending value.
- * In debug mode outputs are filled with NaN (integers: -1) before the kernel runs, and inputs are compared with copies
- * afterwards. Included by module.c alone.
+ * and row major; outputs are allocated by the caller. A message here names the kernel and the argument. Which value is
+ * wrong, and what would be right, ast_sim/ops/spec.py finds out, whose checks are the same. A BufferError means that a
+ * copy in row major order will do. In debug mode outputs are filled with NaN (integers: -1) before the kernel runs, and
+ * inputs are compared with copies afterwards. Included by module_kernels.h alone.
  */
 #ifndef AST_ARGUMENTS_H
 #define AST_ARGUMENTS_H
 
 #include "frozen.h"
-
-#include <stdarg.h>
 
 #undef I /* of complex.h, which NumPy includes: here it is a number of inputs */
 #include "ast.h"
@@ -19,8 +18,7 @@
 static const ast_kernels *kernels; /* of the chosen instruction set */
 static bool debug;                 /* AST_SIM_DEBUG=1 */
 
-typedef struct argument {
-  const char *name;
+typedef struct {
   void *data;                 /* NULL where None was given */
   int64_t length, row_stride; /* rows, and items from row to row */
   int64_t integer;            /* also a number's 64 bits */
@@ -32,8 +30,7 @@ typedef struct argument {
   void *copy;     /* debug: what an input held before the call */
 } argument;
 
-typedef struct call {
-  const char *name;
+typedef struct {
   const spec *spec;
   int taken;             /* arguments */
   int64_t size[LETTERS]; /* by letter; UNBOUND before first sight */
@@ -42,13 +39,22 @@ typedef struct call {
 
 enum { UNBOUND = -1 };
 
-static bool fail(const call *c, PyObject *type, const char *format, ...) {
-  va_list values;
-  va_start(values, format);
-  PyObject *text = PyUnicode_FromFormatV(format, values);
-  va_end(values);
-  if (text) PyErr_Format(type, "%s: %U", c->name, text);
-  Py_XDECREF(text);
+static bool fail(const call *c, const char *problem) {
+  PyErr_Format(PyExc_ValueError, "%s: %s", c->spec->name, problem);
+  return false;
+}
+
+/* The name of an argument; good until the next call. */
+static const char *name_of(const call *c, int i) {
+  static char shown[80];
+  const char *name = c->spec->names;
+  while (i--) name = strchr(name, ' ') + 1;
+  snprintf(shown, sizeof shown, "%.*s", (int)strcspn(name, ","), name);
+  return shown;
+}
+
+static bool refuse(const call *c, int i, PyObject *type, const char *why) {
+  PyErr_Format(type, "%s: %s %s", c->spec->name, name_of(c, i), why);
   return false;
 }
 
@@ -75,226 +81,143 @@ static bool fits(call *c, const dimension *d, int64_t length) {
   return length == value_of(c, d);
 }
 
-/* The dimension as a message shows it: its size, or the spec's text where that is not known. */
-static int show_dimension(const call *c, const dimension *d, char *text, size_t room) {
-  if (c->size[d->letter[0]] != UNBOUND || d->letter[1]) return snprintf(text, room, "%lld", (long long)value_of(c, d));
-  return snprintf(text, room, "%s", d->text);
+/* ---- arrays and numbers ---- */
+
+static bool take_shape(call *c, const parameter *p, const view *v) {
+  bool right = v->ndim == p->ndim;
+  for (int d = 0; right && d < p->ndim; d++) right = fits(c, &p->shape[d], v->shape[d]);
+  return right;
 }
 
-/* ---- arrays ---- */
-
-/* The message of an argument that is `wanted`, and not as this attribute of it says. */
-static bool fail_attribute(const call *c, PyObject *type, const char *name, const char *wanted, PyObject *object,
-                           const char *attribute) {
-  PyObject *value = PyObject_GetAttrString(object, attribute);
-  PyObject *shown = value && strcmp(attribute, "shape") == 0 ? PySequence_Tuple(value) : value;
-  if (shown) fail(c, type, "%s must %s, not %R", name, wanted, shown);
-  if (shown != value) Py_XDECREF(shown);
-  Py_XDECREF(value);
-  return false;
-}
-
-static bool fail_type(const call *c, const parameter *p, PyObject *object) {
-  const char *type = p->type == FLOATS ? "be float32" : p->type == INTS ? "be int64" : "be int32";
-  return fail_attribute(c, PyExc_TypeError, p->name, type, object, "dtype");
-}
-
-static bool fail_shape(const call *c, const parameter *p, PyObject *object) {
-  char wanted[200] = "have shape [";
-  size_t used = strlen(wanted);
-  for (int d = 0; d < p->ndim; d++) {
-    if (d) used += (size_t)snprintf(wanted + used, sizeof wanted - used, ", ");
-    used += (size_t)show_dimension(c, &p->shape[d], wanted + used, sizeof wanted - used);
-  }
-  snprintf(wanted + used, sizeof wanted - used, "]");
-  return fail_attribute(c, PyExc_ValueError, p->name, wanted, object, "shape");
-}
-
-static bool check_layout(const call *c, const parameter *p, const view *v, argument *a) {
+static bool take_layout(const parameter *p, const view *v, argument *a) {
   const int64_t size = view_size(v);
   int64_t expected = v->item;
-  if (!v->native) return fail(c, PyExc_ValueError, "%s must be aligned and in native byte order", p->name);
   a->dense = true;
   for (int d = v->ndim - 1; d >= 0; d--) {
     const int64_t stride = v->stride[d];
     if (size && v->shape[d] > 1 && stride != expected) {
-      if (!p->rows || d > 0 || stride < expected || stride % v->item)
-        return fail(c, PyExc_ValueError, "%s must be contiguous", p->name);
+      if (!p->rows || d > 0 || stride < expected || stride % v->item) return false;
       a->dense = false;
     }
     if (d == 0) a->row_bytes = v->shape[0] > 1 ? stride : expected;
     expected *= v->shape[d];
   }
+  a->data = v->data;
   a->length = v->shape[0];
   a->bytes = size * v->item;
   a->row_stride = a->row_bytes / v->item;
-  return true;
+  return v->native;
 }
 
-/* Binds letters if the whole shape fits, and none if not: so the message names those that the array was to bind. */
-static bool take_shape(call *c, const parameter *p, const view *v) {
-  int first_seen[MAX_SHAPE], num = 0;
-  bool right = v->ndim == p->ndim;
-  for (int d = 0; right && d < p->ndim; d++) {
-    const int letter = p->shape[d].letter[0];
-    if (c->size[letter] == UNBOUND) first_seen[num++] = letter;
-    right = fits(c, &p->shape[d], v->shape[d]);
-  }
-  while (!right && num) c->size[first_seen[--num]] = UNBOUND;
-  return right;
-}
-
-static bool take_array(call *c, const parameter *p, PyObject *object, argument *a) {
+static bool take_array(call *c, int i, PyObject *object) {
+  const parameter *p = &c->spec->parameters[i];
   view v;
-  if (!view_of(object, &v))
-    return fail(c, PyExc_TypeError, "%s must be a NumPy array or a dense tensor on the CPU, not %R", p->name,
-                (PyObject *)Py_TYPE(object));
-  if (v.type != p->type) return fail_type(c, p, object);
-  if (!take_shape(c, p, &v)) return fail_shape(c, p, object);
-  if (p->filled && view_size(&v) == 0)
-    return fail_attribute(c, PyExc_ValueError, p->name, "have a shape without 0", object, "shape");
-  if (p->output && !v.writeable) return fail(c, PyExc_ValueError, "%s must be writeable", p->name);
-  a->data = v.data;
-  return check_layout(c, p, &v, a);
+  if (!view_of(object, &v)) return refuse(c, i, PyExc_TypeError, "must be a NumPy array or a dense tensor on the CPU");
+  if (v.type != p->type) return refuse(c, i, PyExc_ValueError, "is of another type");
+  if (!take_shape(c, p, &v)) return refuse(c, i, PyExc_ValueError, "has another shape");
+  if (p->filled && view_size(&v) == 0) return refuse(c, i, PyExc_ValueError, "has no elements");
+  if (p->output && !v.writeable) return refuse(c, i, PyExc_ValueError, "must be writeable");
+  return take_layout(p, &v, &c->arguments[i]) || refuse(c, i, PyExc_BufferError, "must be aligned and contiguous");
 }
 
-/* ---- numbers ---- */
-
-/* An integer too large for C is out of range like any other; so is a float. */
-static bool fail_number(const call *c, const parameter *p, PyObject *object) {
-  if (!PyErr_ExceptionMatches(PyExc_OverflowError)) return false;
-  PyErr_Clear();
-  return fail(c, PyExc_ValueError, "%s must not be as large as %R", p->name, object);
-}
-
-static bool take_number(call *c, const parameter *p, PyObject *object, argument *a) {
+static bool take_number(call *c, int i, PyObject *object) {
+  const parameter *p = &c->spec->parameters[i];
+  argument *a = &c->arguments[i];
   if (p->kind == NUMBER) a->number = PyFloat_AsDouble(object);
   else if (p->kind == BITS) a->integer = (int64_t)PyLong_AsUnsignedLongLongMask(object);
   else a->integer = PyLong_AsLongLong(object);
-  if ((a->number == -1 || a->integer == -1) && PyErr_Occurred()) return fail_number(c, p, object);
-  if (p->kind == INTEGER && (a->integer < p->low || a->integer > p->high))
-    return fail(c, PyExc_ValueError, "%s must lie in %lld..%lld, not %lld", p->name, p->low, p->high,
-                (long long)a->integer);
-  return true;
+  bool inside = true;
+  if ((a->number == -1 || a->integer == -1) && PyErr_Occurred()) {
+    if (!PyErr_ExceptionMatches(PyExc_OverflowError)) return false;
+    PyErr_Clear();
+    inside = false;
+  }
+  if (p->kind == INTEGER) inside &= a->integer >= p->low && a->integer <= p->high;
+  if (p->kind == NUMBER && p->low < p->high) inside &= a->number >= (double)p->low && a->number < (double)p->high;
+  return inside || refuse(c, i, PyExc_ValueError, "is out of range");
 }
 
-/* ---- values ---- */
+/* ---- values: `a` is the array with the check, `bound` the dimension that the spec names, `others` the arrays ---- */
 
-/* A failure of one element, named as Python would name it. */
-static bool fail_element(const call *c, const argument *a, int64_t at, const char *problem, int64_t bound) {
-  char place[60];
-  if (a->row_stride > 1)
-    snprintf(place, sizeof place, "%lld, %lld", (long long)(at / a->row_stride), (long long)(at % a->row_stride));
-  else snprintf(place, sizeof place, "%lld", (long long)at);
-  const int64_t value = ((const int64_t *)a->data)[at];
-  return fail(c, PyExc_ValueError, "%s[%s] = %lld is %s %lld", a->name, place, (long long)value, problem,
-              (long long)bound);
-}
+#define UNUSED __attribute__((unused))
+#define CHECK(name) \
+  static bool check_##name(const argument *a, UNUSED int64_t bound, UNUSED const argument *const others[2])
 
 /* They start with 0, never fall and end at the bound. */
-static bool check_offsets(const call *c, const argument *a, int64_t bound, const argument *const others[2]) {
-  (void)others;
+CHECK(offsets) {
   const int64_t *offsets = a->data, n = a->length;
-  if (n < 1 || offsets[0] != 0) return fail(c, PyExc_ValueError, "%s must start with 0", a->name);
+  if (n < 1 || offsets[0] != 0) return false;
   for (int64_t i = 1; i < n; i++)
-    if (offsets[i] < offsets[i - 1])
-      return fail(c, PyExc_ValueError, "%s must never fall, but falls to %lld at %lld", a->name, (long long)offsets[i],
-                  (long long)i);
-  if (offsets[n - 1] != bound)
-    return fail(c, PyExc_ValueError, "%s must end at the number of rows %lld, not %lld", a->name, (long long)bound,
-                (long long)offsets[n - 1]);
-  return true;
+    if (offsets[i] < offsets[i - 1]) return false;
+  return offsets[n - 1] == bound;
 }
 
-static bool check_index(const call *c, const argument *a, int64_t bound, const argument *const others[2]) {
-  (void)others;
+CHECK(index) {
   const int64_t *index = a->data, n = a->bytes / (int64_t)sizeof *index;
   for (int64_t i = 0; i < n; i++)
-    if (index[i] < 0 || index[i] >= bound) return fail_element(c, a, i, "not an index below", bound);
+    if (index[i] < 0 || index[i] >= bound) return false;
   return true;
 }
 
-static bool check_permutation(const call *c, const argument *a, int64_t bound, const argument *const others[2]) {
-  (void)bound;
+CHECK(permutation) {
   const int64_t *index = a->data, n = a->length;
-  if (!check_index(c, a, n, others)) return false;
+  if (!check_index(a, n, others)) return false;
   uint8_t *seen = calloc((size_t)n / 8 + 1, 1);
   if (!seen) return PyErr_NoMemory(), false;
-  int64_t twice = -1;
+  bool once = true;
   for (int64_t i = 0; i < n; i++) {
     const uint8_t bit = (uint8_t)(1u << (index[i] & 7));
-    if (seen[index[i] >> 3] & bit) twice = index[i];
+    if (seen[index[i] >> 3] & bit) once = false;
     seen[index[i] >> 3] |= bit;
   }
   free(seen);
-  return twice < 0 ||
-         fail(c, PyExc_ValueError, "%s must be a permutation, but holds %lld twice", a->name, (long long)twice);
+  return once;
 }
 
 /* Strictly within each group of pairs; the other array are the offsets of the groups. */
-static bool check_rising(const call *c, const argument *a, int64_t bound, const argument *const others[2]) {
-  (void)bound;
+CHECK(rising) {
   const int64_t *offset = others[0]->data, *index = a->data;
   for (int64_t k = 0; k + 1 < others[0]->length; k++)
     for (int64_t i = offset[k] + 1; i < offset[k + 1]; i++)
-      if (index[i] <= index[i - 1])
-        return fail(c, PyExc_ValueError, "%s must rise strictly within each kernel offset, but does not at %lld",
-                    a->name, (long long)i);
+      if (index[i] <= index[i - 1]) return false;
   return true;
 }
 
 /* The other array are the keys of the cells: at least 0, and strictly rising within each scene. */
-static bool check_scenes(const call *c, const argument *a, int64_t bound, const argument *const others[2]) {
-  (void)bound;
+CHECK(scenes) {
   const int64_t *key = others[0]->data, *offset = a->data;
-  const char *name = others[0]->name;
   for (int64_t b = 0; b + 1 < a->length; b++)
     for (int64_t i = offset[b]; i < offset[b + 1]; i++)
-      if (key[i] < 0 || (i > offset[b] && key[i] <= key[i - 1]))
-        return fail(c, PyExc_ValueError,
-                    "%s must be at least 0 and rise strictly within each scene, but %s[%lld] is %lld", name, name,
-                    (long long)i, (long long)key[i]);
+      if (key[i] < 0 || (i > offset[b] && key[i] <= key[i - 1])) return false;
   return true;
 }
 
 /* The other array holds the number of the segment of each row. */
-static bool check_segments(const call *c, const argument *a, int64_t bound, const argument *const others[2]) {
-  (void)bound;
+CHECK(segments) {
   const int64_t *segment = others[0]->data, *offset = a->data;
   for (int64_t r = 0; r + 1 < a->length; r++)
     for (int64_t m = offset[r]; m < offset[r + 1]; m++)
-      if (segment[m] != r)
-        return fail(c, PyExc_ValueError, "%s[%lld] is %lld, but %s say %lld", others[0]->name, (long long)m,
-                    (long long)segment[m], a->name, (long long)r);
+      if (segment[m] != r) return false;
   return true;
 }
 
 /* The others are elements and the order of their corners. Each corner stands once, at its node, and the corners of a
- * node rise: so the elements hold indices of nodes. Where they do not, that is what the message says. */
-static bool check_corners(const call *c, const argument *a, int64_t bound, const argument *const others[2]) {
-  (void)bound;
-  const argument *const none[2] = {NULL, NULL};
+ * node rise: so the elements hold indices of nodes. */
+CHECK(corners) {
   const int64_t *node = others[0]->data, *corner = others[1]->data, *offset = a->data, corners = others[1]->length;
-  for (int64_t n = 0; n + 1 < a->length; n++) {
-    bool wrong = false; /* without branches */
+  bool wrong = false; /* without branches */
+  for (int64_t n = 0; n + 1 < a->length; n++)
     for (int64_t j = offset[n]; j < offset[n + 1]; j++) {
       const bool inside = (uint64_t)corner[j] < (uint64_t)corners, rises = j == offset[n] || corner[j] > corner[j - 1];
       wrong |= !inside | !rises | (node[inside ? corner[j] : 0] != n);
     }
-    if (wrong)
-      return check_index(c, others[0], a->length - 1, none) &&
-             fail(c, PyExc_ValueError, "%s[%lld:%lld] must be the corners of elements at node %lld, ascending",
-                  others[1]->name, (long long)offset[n], (long long)offset[n + 1], (long long)n);
-  }
-  return true;
+  return !wrong;
 }
 
-static const named_check value_checks[] = {
-    {"offsets", check_offsets},         {"index", check_index},
-    {"permutation", check_permutation}, {"rising", check_rising},
-    {"scenes", check_scenes},           {"segments", check_segments},
-    {"corners", check_corners},         {NULL, NULL},
-};
+/* All of them, and their names in the same order: a spec says them by number. */
+static bool (*const checks[])(const argument *, int64_t, const argument *const[2]) = {
+    check_offsets, check_index, check_permutation, check_rising, check_scenes, check_segments, check_corners};
+static const char check_names[] = "offsets index permutation rising scenes segments corners";
 
 /* Puts integers where no other thread can change them (frozen.h): all checks and the kernel read them there. */
 static bool secure(argument *a) {
@@ -316,11 +239,13 @@ static void release(call *c) {
   }
 }
 
-static bool check_values(const call *c, const parameter *p, const argument *a) {
+static bool check_values(const call *c, int at) {
+  const parameter *p = &c->spec->parameters[at];
+  const argument *a = &c->arguments[at];
   for (int i = 0; i < p->num_checks; i++) {
     const value_check *check = &p->checks[i];
     const argument *others[2];
-    fact found = {check->function, value_of(c, &check->bound), {0, 0}};
+    fact found = {check->check, value_of(c, &check->bound), {0, 0}};
     bool lasts = a->frozen;
     for (int j = 0; j < 2; j++) {
       others[j] = check->others[j] == NO_PARAMETER ? NULL : &c->arguments[check->others[j]];
@@ -328,7 +253,8 @@ static bool check_values(const call *c, const parameter *p, const argument *a) {
       else if (others[j]) lasts = false;
     }
     if (lasts && is_known(a->frozen, &found)) continue;
-    if (!check->function(c, a, found.bound, others)) return false;
+    if (!checks[check->check](a, found.bound, others))
+      return PyErr_Occurred() ? false : refuse(c, at, PyExc_ValueError, "has other values than its spec says");
     if (lasts) remember(a->frozen, &found);
   }
   return true;
@@ -337,13 +263,8 @@ static bool check_values(const call *c, const parameter *p, const argument *a) {
 /* ---- all of them ---- */
 
 /* Whether the argument may be there, or may not, beside the others. */
-static bool check_presence(const call *c, const parameter *p, bool given) {
-  if (!given && !p->optional) return fail(c, PyExc_TypeError, "%s must not be None", p->name);
-  if (p->with != NO_PARAMETER && given != !!c->arguments[p->with].data)
-    return fail(c, PyExc_ValueError, "%s and %s go together", c->spec->parameters[p->with].name, p->name);
-  if (given && p->needs != NO_PARAMETER && !c->arguments[p->needs].data)
-    return fail(c, PyExc_ValueError, "%s needs %s", p->name, c->spec->parameters[p->needs].name);
-  return true;
+static bool may_be(const call *c, const parameter *p, bool given) {
+  return (given || p->optional) && (p->with == NO_PARAMETER || given == !!c->arguments[p->with].data);
 }
 
 /* A letter that only absent inputs have is 0. Outputs bind no letter of an input: a kernel may look there. */
@@ -355,26 +276,26 @@ static void bind_absent(call *c, bool of_inputs) {
 static bool take(call *c, PyObject *const *objects, Py_ssize_t num) {
   const spec *s = c->spec;
   if (num != s->num)
-    return PyErr_Format(PyExc_TypeError, "%s takes %d arguments, not %zd", c->name, s->num, num), false;
+    return PyErr_Format(PyExc_TypeError, "%s takes %d arguments, not %zd", s->name, s->num, num), false;
   for (int letter = 'A'; letter < LETTERS; letter++) c->size[letter] = UNBOUND;
   c->size[0] = 0;
   for (int i = 0; i < num; i++) {
     const parameter *p = &s->parameters[i];
-    c->arguments[i] = (argument){.name = p->name};
+    const bool given = objects[i] != Py_None;
+    c->arguments[i] = (argument){0};
     c->taken = i + 1;
     if (p->output && (i == 0 || !s->parameters[i - 1].output)) bind_absent(c, true);
     if (p->kind != ARRAY) {
-      if (!take_number(c, p, objects[i], &c->arguments[i])) return false;
+      if (!take_number(c, i, objects[i])) return false;
       continue;
     }
-    const bool given = objects[i] != Py_None;
-    if (!check_presence(c, p, given) || (given && !take_array(c, p, objects[i], &c->arguments[i]))) return false;
+    if (!may_be(c, p, given)) return refuse(c, i, PyExc_ValueError, given ? "must be None" : "must not be None");
+    if (given && !take_array(c, i, objects[i])) return false;
     if (given && !p->output && p->type != FLOATS && !secure(&c->arguments[i])) return false;
   }
   bind_absent(c, false);
   for (int i = 0; i < num; i++)
-    if (s->parameters[i].num_checks && c->arguments[i].data && !check_values(c, &s->parameters[i], &c->arguments[i]))
-      return false;
+    if (c->arguments[i].data && !check_values(c, i)) return false;
   return true;
 }
 
@@ -401,7 +322,7 @@ static bool end(call *c, ast_status status) {
     argument *a = &c->arguments[i];
     if (!a->copy) continue;
     if (ok && memcmp(a->copy, a->data, (size_t)a->bytes))
-      ok = fail(c, PyExc_AssertionError, "the kernel changed its input %s", a->name);
+      ok = PyErr_Format(PyExc_AssertionError, "%s: the kernel changed its input %s", c->spec->name, name_of(c, i));
     free(a->copy);
   }
   return ok && (status != AST_NO_MEMORY || (PyErr_NoMemory(), false));

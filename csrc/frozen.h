@@ -17,8 +17,7 @@ enum { MAX_FACTS = 8, BUCKETS = 4096, ALIGNMENT = 64 };
 
 /* A check that the array passed. The other arrays are frozen, too; no two blocks ever have the same number. */
 typedef struct {
-  check_function function;
-  int64_t bound, others[2];
+  int64_t check, bound, others[2];
 } fact;
 
 typedef struct frozen {
@@ -80,12 +79,8 @@ static PyObject *array_of(frozen *f, int ndim, const int64_t *shape) {
 static void show(frozen *f) { memcpy(f->shown, f->hidden, (size_t)f->bytes); }
 
 static bool is_known(const frozen *f, const fact *wanted) {
-  for (int i = 0; i < f->num_facts && i < MAX_FACTS; i++) {
-    const fact *known = &f->facts[i];
-    if (known->function == wanted->function && known->bound == wanted->bound && known->others[0] == wanted->others[0] &&
-        known->others[1] == wanted->others[1])
-      return true;
-  }
+  for (int i = 0; i < f->num_facts && i < MAX_FACTS; i++)
+    if (memcmp(&f->facts[i], wanted, sizeof *wanted) == 0) return true;
   return false;
 }
 

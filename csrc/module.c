@@ -8,7 +8,6 @@ static PyObject *call_kernel(PyObject *self, PyObject *const *objects, Py_ssize_
   const binding *b = PyCapsule_GetPointer(self, NULL);
   if (!b) return NULL;
   call c;
-  c.name = b->name;
   c.spec = &b->spec;
   c.taken = 0;
   PyObject *result = NULL;
@@ -48,38 +47,21 @@ static PyObject *freeze(PyObject *self, PyObject *const *objects, Py_ssize_t num
 
 static PyMethodDef kernel_methods[sizeof bindings / sizeof *bindings];
 
-static binding *find_binding(const char *name) {
-  for (size_t i = 0; i < sizeof bindings / sizeof *bindings; i++)
-    if (!strcmp(bindings[i].name, name)) return &bindings[i];
-  return NULL;
-}
-
-/* Whether the spec names the parameters that the call of the kernel reads, in this order: "x, weight, out". */
-static bool names_match(const spec *s, const char *parameters) {
-  for (int i = 0; i < s->num; i++) {
-    const size_t length = strlen(s->parameters[i].name);
-    if (i && strncmp(parameters, ", ", 2) != 0) return false;
-    parameters += i ? 2 : 0;
-    if (strncmp(parameters, s->parameters[i].name, length) != 0) return false;
-    parameters += length;
-  }
-  return !*parameters;
-}
-
-/* declare(name, spec) adds the function of a kernel to the module. */
+/* declare(name, names, numbers) adds the function of a kernel to the module: the names of its parameters are those that
+ * the call of the kernel reads, "x, weight, out", and the numbers are its spec. */
 static PyObject *declare(PyObject *module, PyObject *arguments) {
-  const char *name;
-  PyObject *parameters;
-  if (!PyArg_ParseTuple(arguments, "sO", &name, &parameters)) return NULL;
-  binding *b = find_binding(name);
-  if (!b) return PyErr_Format(PyExc_ValueError, "declare: there is no kernel %s", name);
-  if (!read_spec(parameters, value_checks, &b->spec) || !names_match(&b->spec, b->parameters)) {
-    PyErr_Clear();
-    return PyErr_Format(PyExc_ValueError, "declare: %s takes (%s), its spec says something else", name, b->parameters);
-  }
-  PyMethodDef *method = &kernel_methods[b - bindings];
-  *method = (PyMethodDef){b->name, (PyCFunction)(void (*)(void))call_kernel, METH_FASTCALL, b->parameters};
-  PyObject *self = PyCapsule_New(b, NULL, NULL), *function = self ? PyCFunction_NewEx(method, self, NULL) : NULL;
+  const char *name, *names, *numbers;
+  Py_ssize_t bytes;
+  if (!PyArg_ParseTuple(arguments, "ssy#", &name, &names, &numbers, &bytes)) return NULL;
+  size_t i = 0, num = sizeof bindings / sizeof *bindings;
+  while (i < num && strcmp(bindings[i].spec.name, name) != 0) i++;
+  if (i == num) return PyErr_Format(PyExc_ValueError, "declare: there is no kernel %s", name);
+  spec *s = &bindings[i].spec;
+  if (!read_spec(s, names, numbers, bytes))
+    return PyErr_Format(PyExc_ValueError, "declare: %s takes (%s), its spec says something else", name, s->names);
+  kernel_methods[i] = (PyMethodDef){s->name, (PyCFunction)(void (*)(void))call_kernel, METH_FASTCALL, s->names};
+  PyObject *self = PyCapsule_New(&bindings[i], NULL, NULL);
+  PyObject *function = self ? PyCFunction_NewEx(&kernel_methods[i], self, NULL) : NULL;
   const bool added = function && PyObject_SetAttrString(module, name, function) == 0;
   Py_XDECREF(self);
   Py_XDECREF(function);
@@ -118,7 +100,7 @@ static PyObject *configuration(PyObject *self, PyObject *unused) {
 
 static PyMethodDef methods[] = {
     {"declare", declare, METH_VARARGS,
-     "declare(name, spec): adds the kernel of this name, which takes what the spec says."},
+     "declare(name, names, numbers): adds the kernel of this name, which takes what the numbers of its spec say."},
     {"freeze", (PyCFunction)(void (*)(void))freeze, METH_FASTCALL,
      "freeze(*indices): copies that kernels trust, or those that are such."},
     {"set_pool", set_pool, METH_VARARGS,
@@ -130,8 +112,8 @@ static PyMethodDef methods[] = {
 };
 
 static int execute(PyObject *module) {
-  (void)module;
   import_array1(-1);
+  if (PyModule_AddStringConstant(module, "checks", check_names)) return -1;
   const char *wanted = getenv("AST_SIM_ISA"), *check = getenv("AST_SIM_DEBUG");
   debug = check && !strcmp(check, "1");
   kernels = ast_select(wanted && *wanted ? wanted : NULL);

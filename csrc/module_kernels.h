@@ -15,7 +15,7 @@
   typedef struct {            \
     argument __VA_ARGS__;     \
   } name##_arguments;         \
-  static const char name##_parameters[] = NAMES_OF(__VA_ARGS__)
+  UNUSED static const char name##_parameters[] = NAMES_OF(__VA_ARGS__)
 
 #define KERNEL(name, ...)                                                           \
   PARAMETERS(name, __VA_ARGS__);                                                    \
@@ -23,8 +23,20 @@
   static ast_status name##_run(const argument *a, const int64_t *n, void *result) { \
     return name##_body((const void *)a, n, result);                                 \
   }                                                                                 \
-  static ast_status name##_body(const name##_arguments *a, const int64_t *n, NOT_ALWAYS result)
-#define NOT_ALWAYS __attribute__((unused)) void *
+  static ast_status name##_body(const name##_arguments *a, UNUSED const int64_t *n, UNUSED void *result)
+
+/* EACH(MACRO, x, y, ...) is MACRO(x), MACRO(y), ... for up to 16 names. */
+#define EACH(MACRO, ...)       AGAIN(EACH_OF(MACRO, __VA_ARGS__))
+#define EACH_OF(MACRO, x, ...) MACRO(x) __VA_OPT__(, NEXT_OF PARENTHESES(MACRO, __VA_ARGS__))
+#define NEXT_OF()              EACH_OF
+#define PARENTHESES            ()
+#define AGAIN(...)             AGAIN_4(AGAIN_4(AGAIN_4(AGAIN_4(__VA_ARGS__))))
+#define AGAIN_4(...)           AGAIN_1(AGAIN_1(AGAIN_1(AGAIN_1(__VA_ARGS__))))
+#define AGAIN_1(...)           __VA_ARGS__
+/* Members of a struct of the core that have the name of a size or of a parameter, or of x where that is dx. */
+#define SIZE(letter)   .letter = n[(int)*#letter]
+#define FIELD(name)    .name = a->name.data
+#define GRADIENT(name) .name = a->d##name.data
 
 typedef ast_status (*run_function)(const argument *a, const int64_t *n, void *result);
 
@@ -55,27 +67,21 @@ KERNEL(column_sum, x, out) { return kernels->column_sum(a->x.data, n['N'], n['F'
 
 /* ---- elastic forces ---- */
 
-KERNEL(elastic_forces, position, rest_position, lame, elements, node_order, node_offsets, force) {
-  const ast_elastic s = {n['N'],
-                         n['E'],
-                         a->elements.data,
-                         a->node_order.data,
-                         a->node_offsets.data,
-                         a->position.data,
-                         a->rest_position.data,
-                         a->lame.data};
+#define ELASTIC position, rest_position, lame, elements, node_order, node_offsets
+PARAMETERS(elastic_inputs, ELASTIC);
+
+static ast_elastic elastic_of(const void *arguments, const int64_t *n) {
+  const elastic_inputs_arguments *a = arguments;
+  return (ast_elastic){EACH(SIZE, N, E), EACH(FIELD, ELASTIC)};
+}
+
+KERNEL(elastic_forces, ELASTIC, force) {
+  const ast_elastic s = elastic_of(a, n);
   return kernels->elastic_forces(&s, a->force.data);
 }
 
-KERNEL(elastic_forces_backward, position, rest_position, lame, elements, node_order, node_offsets, dforce, dposition) {
-  const ast_elastic s = {n['N'],
-                         n['E'],
-                         a->elements.data,
-                         a->node_order.data,
-                         a->node_offsets.data,
-                         a->position.data,
-                         a->rest_position.data,
-                         a->lame.data};
+KERNEL(elastic_forces_backward, dforce, ELASTIC, dposition) {
+  const ast_elastic s = elastic_of(&a->position, n);
   return kernels->elastic_forces_backward(&s, a->dforce.data, a->dposition.data);
 }
 
@@ -91,11 +97,9 @@ KERNEL(octree, positions, offsets, x, y, z, half_width, depth, keys, cell_offset
 
 static bool octree_check(const call *c) {
   const octree_arguments *a = (const void *)c->arguments;
-  if (!(a->half_width.number > 0 && a->half_width.number < 1e300))
-    return fail(c, PyExc_ValueError, "half_width must be positive and finite");
-  for (const argument *x = &a->x; x <= &a->z; x++)
-    if (!(x->number > -1e300 && x->number < 1e300)) return fail(c, PyExc_ValueError, "center must be finite");
-  return true;
+  bool finite = a->half_width.number > 0 && a->half_width.number < 1e300;
+  for (const argument *x = &a->x; x <= &a->z; x++) finite &= x->number > -1e300 && x->number < 1e300;
+  return finite || fail(c, "half_width must be positive, and it and center finite");
 }
 
 /* The number of cells; the outputs have room for as many as there are nodes. */
@@ -105,12 +109,7 @@ static PyObject *octree_result(call *c) {
   int64_t bad = 0;
   if (!run(c, octree_run, &bad, &status)) return NULL;
   if (status == AST_OK) return PyLong_FromLongLong(((const int64_t *)a->cell_offsets.data)[c->size['B']]);
-  const float *p = (const float *)a->positions.data + 3 * bad;
-  char place[120], problem[80] = "is not finite";
-  snprintf(place, sizeof place, "(%.9g, %.9g, %.9g)", (double)p[0], (double)p[1], (double)p[2]);
-  if (status == AST_OUTSIDE)
-    snprintf(problem, sizeof problem, "lies outside the domain of half width %.9g", a->half_width.number);
-  return fail(c, PyExc_ValueError, "positions[%lld] = %s %s", (long long)bad, place, problem), NULL;
+  return PyErr_Format(PyExc_ValueError, "octree: positions[%lld] is not a point of the domain", (long long)bad);
 }
 
 KERNEL(octree_coordinates, keys, coordinates) {
@@ -159,8 +158,7 @@ static PyObject *octree_coarsen_result(call *c) {
   PyObject *list = PyList_New((Py_ssize_t)levels * LEVEL_ARRAYS);
   if (!list) return NULL;
   bool ok = run(c, octree_coarsen_run, level, &status);
-  if (ok && status == AST_TOO_LARGE)
-    ok = fail(c, PyExc_ValueError, "keys must be fewer than 2^31, not %lld", (long long)c->size['C']);
+  if (ok && status == AST_TOO_LARGE) ok = fail(c, "keys must be fewer than 2^31");
   for (int j = 0; ok && j < levels; j++) ok = append_level(list, &level[j], (Py_ssize_t)j * LEVEL_ARRAYS);
   if (!ok) Py_CLEAR(list);
   return list;
@@ -184,24 +182,7 @@ static bool farthest_point_sample_check(const call *c) {
   const farthest_point_sample_arguments *a = (const void *)c->arguments;
   const int64_t points = c->size['C'], scenes = c->size['B'], num = a->num.integer, room = c->size['S'];
   const int64_t most = scenes && num <= (points - 1) / scenes ? scenes * num : points;
-  if (room >= most) return true;
-  return fail(c, PyExc_ValueError, "indices must have room for %lld samples, not %lld", (long long)most,
-              (long long)room);
-}
-
-/* The first scene with two coordinates on one axis that differ by 2^21 or more, or -1. */
-static int64_t too_wide(const int32_t *coordinates, const int64_t *offsets, int64_t B) {
-  for (int64_t b = 0; b < B; b++)
-    for (int a = 0; a < 3; a++) {
-      int64_t low = INT64_MAX, high = INT64_MIN;
-      for (int64_t i = offsets[b]; i < offsets[b + 1]; i++) {
-        const int64_t x = coordinates[3 * i + a];
-        low = x < low ? x : low;
-        high = x > high ? x : high;
-      }
-      if (offsets[b] < offsets[b + 1] && high - low >= 1 << 21) return b;
-    }
-  return -1;
+  return room >= most || fail(c, "indices must have room for the samples");
 }
 
 /* The number of samples. */
@@ -210,8 +191,7 @@ static PyObject *farthest_point_sample_result(call *c) {
   ast_status status;
   if (!run(c, farthest_point_sample_run, NULL, &status)) return NULL;
   if (status == AST_OK) return PyLong_FromLongLong(((const int64_t *)a->out_offsets.data)[c->size['B']]);
-  const int64_t scene = too_wide(a->coordinates.data, a->offsets.data, c->size['B']);
-  return fail(c, PyExc_ValueError, "coordinates of scene %lld differ by 2^21 or more", (long long)scene), NULL;
+  return fail(c, "coordinates of a scene differ by 2^21 or more"), NULL;
 }
 
 /* ---- sparse convolution ---- */
@@ -230,85 +210,91 @@ KERNEL(sparse_conv_weight, x, dout, pair_offsets, source, destination, dweight) 
 
 /* ---- attention ---- */
 
-#define ATTENTION q, k, v, q_offsets, k_offsets, scale, dropout_p, seed
-PARAMETERS(attention_inputs, ATTENTION);
+#define ATTENTION q_offsets, k_offsets, scale, dropout_p, seed, out, maximum, total
+PARAMETERS(attention_rest, ATTENTION, dout);
 
-static ast_attention attention_of(const void *arguments, const int64_t *n) {
-  const attention_inputs_arguments *a = arguments;
-  return (ast_attention){.B = n['B'],
-                         .H = n['H'],
-                         .D = n['D'],
-                         .q_offsets = a->q_offsets.data,
-                         .k_offsets = a->k_offsets.data,
-                         .q_stride = a->q.row_stride,
-                         .k_stride = a->k.row_stride,
-                         .v_stride = a->v.row_stride,
+/* Queries, keys and values, which may lie beside each other in one array, or their gradients. */
+typedef struct {
+  argument q, k, v;
+} tokens;
+
+static argument part(const argument *a, int64_t i, const int64_t *n) {
+  argument x = *a;
+  x.data = (float *)a->data + i * n['H'] * n['D'];
+  return x;
+}
+
+static tokens of_kv(const argument *q, const argument *key_value, const int64_t *n) {
+  return (tokens){*q, part(key_value, 0, n), part(key_value, 1, n)};
+}
+
+static tokens of_qkv(const argument *qkv, const int64_t *n) { return (tokens){*qkv, part(qkv, 1, n), part(qkv, 2, n)}; }
+
+static bool attention_check(const call *c) {
+  const int64_t D = c->size['D'];
+  return (D % 16 == 0 && D >= 16 && D <= 128) || fail(c, "the head dimension must be a multiple of 16 up to 128");
+}
+
+static ast_attention attention_of(const tokens *x, const attention_rest_arguments *a, const int64_t *n) {
+  return (ast_attention){EACH(SIZE, B, H, D),
+                         EACH(FIELD, q_offsets, k_offsets),
+                         .q_stride = x->q.row_stride,
+                         .k_stride = x->k.row_stride,
+                         .v_stride = x->v.row_stride,
                          .scale = (float)a->scale.number,
                          .dropout_p = a->dropout_p.number,
                          .seed = (uint64_t)a->seed.integer};
 }
 
-static bool attention_check(const call *c) {
-  const attention_inputs_arguments *a = (const void *)c->arguments;
-  const int64_t D = c->size['D'];
-  if (D % 16 || D < 16 || D > 128)
-    return fail(c, PyExc_ValueError, "the head dimension must be a multiple of 16 up to 128, not %lld", (long long)D);
-  if (!(a->dropout_p.number >= 0 && a->dropout_p.number < 1))
-    return fail(c, PyExc_ValueError, "dropout_p must lie in [0, 1)");
-  return true;
+static ast_status attend(tokens x, const void *rest, const int64_t *n) {
+  const attention_rest_arguments *a = rest;
+  const ast_attention s = attention_of(&x, a, n);
+  return kernels->attention(&s, x.q.data, x.k.data, x.v.data, a->out.data, a->maximum.data, a->total.data);
 }
 
-KERNEL(attention, ATTENTION, out, maximum, sum) {
-  const ast_attention s = attention_of(a, n);
-  return kernels->attention(&s, a->q.data, a->k.data, a->v.data, a->out.data, a->maximum.data, a->sum.data);
+static ast_status attend_backward(tokens x, const void *rest, tokens d, const int64_t *n) {
+  const attention_rest_arguments *a = rest;
+  ast_attention s = attention_of(&x, a, n);
+  s.dq_stride = d.q.row_stride;
+  s.dk_stride = d.k.row_stride;
+  s.dv_stride = d.v.row_stride;
+  return kernels->attention_backward(&s, x.q.data, x.k.data, x.v.data, a->out.data, a->maximum.data, a->total.data,
+                                     a->dout.data, d.q.data, d.k.data, d.v.data);
 }
 
-KERNEL(attention_backward, ATTENTION, out, maximum, sum, dout, dq, dk, dv) {
-  ast_attention s = attention_of(a, n);
-  s.dq_stride = a->dq.row_stride;
-  s.dk_stride = a->dk.row_stride;
-  s.dv_stride = a->dv.row_stride;
-  return kernels->attention_backward(&s, a->q.data, a->k.data, a->v.data, a->out.data, a->maximum.data, a->sum.data,
-                                     a->dout.data, a->dq.data, a->dk.data, a->dv.data);
+KERNEL(attention, q, k, v, ATTENTION) { return attend((tokens){a->q, a->k, a->v}, &a->q_offsets, n); }
+
+KERNEL(attention_kv, q, key_value, ATTENTION) { return attend(of_kv(&a->q, &a->key_value, n), &a->q_offsets, n); }
+
+KERNEL(attention_qkv, qkv, ATTENTION) { return attend(of_qkv(&a->qkv, n), &a->q_offsets, n); }
+
+KERNEL(attention_backward, q, k, v, ATTENTION, dout, dq, dk, dv) {
+  return attend_backward((tokens){a->q, a->k, a->v}, &a->q_offsets, (tokens){a->dq, a->dk, a->dv}, n);
+}
+
+KERNEL(attention_kv_backward, q, key_value, ATTENTION, dout, dq, dkey_value) {
+  return attend_backward(of_kv(&a->q, &a->key_value, n), &a->q_offsets, of_kv(&a->dq, &a->dkey_value, n), n);
+}
+
+KERNEL(attention_qkv_backward, qkv, ATTENTION, dout, dqkv) {
+  return attend_backward(of_qkv(&a->qkv, n), &a->q_offsets, of_qkv(&a->dqkv, n), n);
 }
 
 /* ---- message passing ---- */
 
-#define MESSAGE \
-  of_senders, of_receivers, edge_features, A1, a1, A2, W2, b2, gamma, beta, senders, receivers, receiver_offsets
+#define MESSAGE_FLOATS of_senders, of_receivers, edge_features, A1, a1, A2, W2, b2, gamma, beta
+#define MESSAGE        MESSAGE_FLOATS, senders, receivers, receiver_offsets
 PARAMETERS(message_inputs, MESSAGE);
 
 static ast_message message_of(const void *arguments, const int64_t *n) {
   const message_inputs_arguments *a = arguments;
-  return (ast_message){.M = n['M'],
-                       .S = n['S'],
-                       .R = n['R'],
-                       .E = n['E'],
-                       .H = n['H'],
-                       .F = n['F'],
-                       .F2 = n['G'],
-                       .senders = a->senders.data,
-                       .receivers = a->receivers.data,
-                       .receiver_offsets = a->receiver_offsets.data,
-                       .of_senders = a->of_senders.data,
-                       .of_receivers = a->of_receivers.data,
-                       .edge_features = a->edge_features.data,
-                       .A1 = a->A1.data,
-                       .a1 = a->a1.data,
-                       .A2 = a->A2.data,
-                       .W2 = a->W2.data,
-                       .b2 = a->b2.data,
-                       .gamma = a->gamma.data,
-                       .beta = a->beta.data};
+  return (ast_message){EACH(SIZE, M, S, R, E, H, F), .F2 = n['G'], EACH(FIELD, MESSAGE)};
 }
 
 /* Without an encoder edge features are added to of_senders and of_receivers; none at all are [M, 0]. */
 static bool message_check(const call *c) {
-  const int64_t E = c->size['E'], F = c->size['F'];
-  if (c->size['H'] || !E || E == F) return true;
-  return fail(c, PyExc_ValueError,
-              "edge_features without an encoder must have the %lld channels of of_senders, not %lld", (long long)F,
-              (long long)E);
+  const int64_t E = c->size['E'];
+  return c->size['H'] || !E || E == c->size['F'] || fail(c, "edge_features without an encoder have other channels");
 }
 
 KERNEL(message, MESSAGE, sum, messages) {
@@ -316,13 +302,11 @@ KERNEL(message, MESSAGE, sum, messages) {
   return kernels->message(&s, a->sum.data, a->messages.data);
 }
 
-KERNEL(message_backward, MESSAGE, dsum, dmessages, dof_senders, dof_receivers, dedge_features, dA1, da1, dA2, dW2, db2,
+KERNEL(message_backward, dsum, dmessages, MESSAGE, dof_senders, dof_receivers, dedge_features, dA1, da1, dA2, dW2, db2,
        dgamma, dbeta) {
-  const ast_message s = message_of(a, n);
-  const ast_message_gradients out = {
-      a->dof_senders.data, a->dof_receivers.data, a->dedge_features.data, a->dA1.data,  a->da1.data, a->dA2.data,
-      a->dW2.data,         a->db2.data,           a->dgamma.data,         a->dbeta.data};
-  return kernels->message_backward(&s, a->dsum.data, a->dmessages.data, &out);
+  const ast_message s = message_of(&a->of_senders, n);
+  const ast_message_gradients gradients = {EACH(GRADIENT, MESSAGE_FLOATS)};
+  return kernels->message_backward(&s, a->dsum.data, a->dmessages.data, &gradients);
 }
 
 /* ---- dense layers ---- */
@@ -340,7 +324,7 @@ KERNEL(linear, x, weight, bias, residual, activation, out, z) {
   return kernels->linear(&s, a->x.data, a->weight.data, a->bias.data, a->residual.data, a->out.data, a->z.data);
 }
 
-KERNEL(linear_backward, x, weight, bias, z, activation, dout, dx, dweight, dbias) {
+KERNEL(linear_backward, dout, x, weight, bias, z, activation, dx, dweight, dbias) {
   ast_linear s = linear_of(&a->x, n, a->activation.integer);
   s.dout_stride = a->dout.row_stride;
   return kernels->linear_backward(&s, a->dout.data, a->x.data, a->weight.data, a->bias.data, a->z.data, a->dx.data,
@@ -352,57 +336,45 @@ PARAMETERS(mlp_inputs, MLP);
 
 static ast_mlp mlp_of(const void *arguments, const int64_t *n) {
   const mlp_inputs_arguments *a = arguments;
-  return (ast_mlp){.M = n['M'],
-                   .I = n['I'],
-                   .I2 = n['J'],
-                   .H = n['H'],
-                   .O = n['O'],
-                   .x_stride = a->x.row_stride,
-                   .beside_stride = a->beside.row_stride,
-                   .x = a->x.data,
-                   .beside = a->beside.data,
-                   .weight1 = a->weight1.data,
-                   .bias1 = a->bias1.data,
-                   .weight2 = a->weight2.data,
-                   .bias2 = a->bias2.data,
-                   .gamma = a->gamma.data,
-                   .beta = a->beta.data};
+  return (ast_mlp){EACH(SIZE, M, I, H, O), .I2 = n['J'], .x_stride = a->x.row_stride,
+                   .beside_stride = a->beside.row_stride, EACH(FIELD, MLP)};
 }
 
-KERNEL(mlp, MLP, residual, out, hidden, normalized, scale) {
+#define MLP_KEPT hidden, normalized, scale
+
+KERNEL(mlp, MLP, residual, out, MLP_KEPT) {
   ast_mlp s = mlp_of(a, n);
   s.residual_stride = a->residual.row_stride;
-  return kernels->mlp(&s, a->residual.data, a->out.data,
-                      (ast_mlp_kept){a->hidden.data, a->normalized.data, a->scale.data});
+  return kernels->mlp(&s, a->residual.data, a->out.data, (ast_mlp_kept){EACH(FIELD, MLP_KEPT)});
 }
 
-KERNEL(mlp_backward, MLP, dout, hidden, normalized, scale, dx, dbeside, dweight1, dbias1, dweight2, dbias2, dgamma,
-       dbeta) {
-  ast_mlp s = mlp_of(a, n);
+KERNEL(mlp_backward, dout, MLP, MLP_KEPT, dx, dbeside, dweight1, dbias1, dweight2, dbias2, dgamma, dbeta) {
+  ast_mlp s = mlp_of(&a->x, n);
   s.dout_stride = a->dout.row_stride;
-  const ast_mlp_kept kept = {a->hidden.data, a->normalized.data, a->scale.data};
-  const ast_mlp_gradients gradients = {a->dx.data,       a->dbeside.data, a->dweight1.data, a->dbias1.data,
-                                       a->dweight2.data, a->dbias2.data,  a->dgamma.data,   a->dbeta.data};
-  return kernels->mlp_backward(&s, a->dout.data, kept, gradients);
+  return kernels->mlp_backward(&s, a->dout.data, (ast_mlp_kept){EACH(FIELD, MLP_KEPT)},
+                               (ast_mlp_gradients){EACH(GRADIENT, MLP)});
 }
 
 /* ---- all kernels ---- */
 
 typedef struct {
-  const char *name, *parameters;
+  spec spec;
   run_function run;
   bool (*check)(const call *c); /* what a spec cannot say; may be NULL */
   PyObject *(*result)(call *c); /* runs the kernel where it returns more than None; may be NULL */
-  spec spec;
 } binding;
 
 #define BINDING(name, ...) BINDING_AS(#name, name, __VA_ARGS__)
 #define BINDING_AS(text, kernel, ...) \
-  {.name = text, .parameters = kernel##_parameters, .run = kernel##_run, __VA_ARGS__}
+  {.spec.name = text, .spec.names = kernel##_parameters, .run = kernel##_run, __VA_ARGS__}
 
 static binding bindings[] = {
     BINDING(attention, .check = attention_check),
     BINDING(attention_backward, .check = attention_check),
+    BINDING(attention_kv, .check = attention_check),
+    BINDING(attention_kv_backward, .check = attention_check),
+    BINDING(attention_qkv, .check = attention_check),
+    BINDING(attention_qkv_backward, .check = attention_check),
     BINDING(column_sum),
     BINDING(elastic_forces),
     BINDING(elastic_forces_backward),

@@ -5,13 +5,15 @@ Legend: B scenes, T tokens (Tq queries, Tk keys), H heads, D channels of a head.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 
 import torch
 from torch import Tensor
 
-from ast_sim.ops import library
-from ast_sim.ops.derivatives import differentiate, differentiate_by_composition
+from ast_sim.ops.derivatives import gradient_op
+from ast_sim.ops.library import Kernel, Op
+from ast_sim.ops.spec import Given, Sizes
 
 # ---- dropout: the generator of the C core in torch ----
 
@@ -63,23 +65,9 @@ def dropout_factors(p: float, seed: int, scene: int, shape: tuple[int, int, int]
 # ---- composition ----
 
 
-_SPEC = (
-    "q[Q,H,D] rows, k[K,H,D] rows, v[K,H,D] rows, q_offsets[B+1] offsets(Q), k_offsets[B+1] offsets(K), scale number,"
-    " dropout_p number, seed bits"
-)
-_kernel = library.Kernel("attention", f"{_SPEC} -> out[Q,H,D], maximum[Q,H], sum[Q,H]")
-_backward_kernel = library.Kernel(
-    "attention_backward",
-    f"{_SPEC}, out[Q,H,D], maximum[Q,H], sum[Q,H], dout[Q,H,D] -> dq[Q,H,D] rows, dk[K,H,D] rows, dv[K,H,D] rows",
-)
-
-
-def _check(kernel: library.Kernel, q, k, v, q_offsets, k_offsets, dropout_p: float) -> None:
-    kernel.check(q, k, v, q_offsets, k_offsets)
-    if q.shape[2] % 16 or not 16 <= q.shape[2] <= 128:
-        raise ValueError(f"{kernel.name}: the head dimension must be a multiple of 16 up to 128, not {q.shape[2]}")
-    if not 0 <= dropout_p < 1:
-        raise ValueError(f"{kernel.name}: dropout_p must lie in [0, 1)")
+def _check_heads(name: str, sizes: Sizes, given: Given) -> None:
+    if sizes["D"] % 16 or not 16 <= sizes["D"] <= 128:
+        raise ValueError(f"{name}: the head dimension must be a multiple of 16 up to 128, not {sizes['D']}")
 
 
 def _scenes(q_offsets: Tensor, k_offsets: Tensor) -> Iterator[tuple[int, slice, slice]]:
@@ -108,7 +96,6 @@ def _factors(scores: Tensor, dropout_p: float, seed: int, scene: int) -> Tensor 
 
 
 def _reference(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed):
-    _check(_kernel, q, k, v, q_offsets, k_offsets, dropout_p)
     out, maximum, total = [], [], []
     for b, i, j in _scenes(q_offsets, k_offsets):
         x = _scores(q[i], k[j], scale)
@@ -122,106 +109,29 @@ def _reference(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed):
     return _join(q, 0, out), _join(q[:, :, 0], -torch.inf, maximum), _join(q[:, :, 0], 0, total)
 
 
-def _backward_reference(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, out, maximum, total, dout):
-    _check(_backward_kernel, q, k, v, q_offsets, k_offsets, dropout_p)
-    dq, dk, dv = [], [], []
-    for b, i, j in _scenes(q_offsets, k_offsets):
-        x = _scores(q[i], k[j], scale)
-        kept = out is not None  # `out`, `maximum` and `total` are None where second derivatives are wanted
-        weights = (x - maximum[i].T[:, :, None]).exp() / total[i].T[:, :, None] if kept else x.softmax(2)
-        factors = _factors(x, dropout_p, seed, b)
-        dweights = factors * torch.einsum("qhd,khd->hqk", dout[i], v[j])
-        mean = (dout[i] * out[i]).sum(2).T[:, :, None] if kept else (weights * dweights).sum(2, keepdim=True)
-        dx = scale * weights * (dweights - mean)
-        dq.append((i, torch.einsum("hqk,khd->qhd", dx, k[j])))
-        dk.append((j, torch.einsum("hqk,qhd->khd", dx, q[i])))
-        dv.append((j, torch.einsum("hqk,qhd->khd", weights * factors, dout[i])))
-    return _join(q, 0, dq), _join(k, 0, dk), _join(v, 0, dv)
-
-
-# ---- C core ----
-
-
-def _new(q, *_):
-    return q.new_empty(q.shape), q.new_empty(q.shape[:2]), q.new_empty(q.shape[:2])
-
-
 # ---- ops ----
 
-
-def _define(name: str, schema: str, split: Callable, together: Callable):
-    """Define one op and its gradient, for one way of storing q, k and v in tensors.
-
-    Args:
-        name: of the op.
-        schema: the op's tensors in torch's schema language. Their gradients have the same shapes.
-        split: returns q, k and v as views of these tensors, so that nothing is copied. It also splits gradients.
-        together: returns the gradients of the tensors, given those of q, k and v. The composition needs it, because it
-            has no views to write to.
-    """
-    num = schema.count("Tensor")
-
-    def after_split(body: Callable) -> Callable:
-        return lambda *arguments: body(*split(*arguments[:num]), *arguments[num:])
-
-    def call(outputs, *arguments) -> None:
-        _kernel(*split(*arguments[:num]), *arguments[num:], *outputs)
-
-    def new_gradients(*arguments):
-        gradients = tuple(x.new_empty(x.shape) for x in arguments[:num])
-        return gradients if num > 1 else gradients[0]
-
-    def call_backward(gradients, *arguments) -> None:
-        gradients = gradients if num > 1 else (gradients,)
-        _backward_kernel(*split(*arguments[:num]), *arguments[num:], *split(*gradients))
-
-    arguments = f"{schema}, Tensor q_offsets, Tensor k_offsets, float scale, float dropout_p, int seed"
-    outputs = ", ".join(["Tensor"] * num)
-    schema = f"{name}({arguments}) -> (Tensor, Tensor, Tensor)"
-    op = library.define(schema, after_split(_reference), after_split(_new), call)
-    backward = library.define(
-        f"{name}_backward({arguments}, Tensor out, Tensor maximum, Tensor total, Tensor dout) -> ({outputs})",
-        lambda *arguments: together(*after_split(_backward_reference)(*arguments)),
-        new_gradients,
-        call_backward,
-    )
-
-    def save(ctx, inputs, output) -> None:
-        ctx.save_for_backward(*inputs[: num + 2], *output)
-        ctx.settings = inputs[num + 2 :]
-        ctx.set_materialize_grads(False)  # the other outputs have no gradients
-        ctx.mark_non_differentiable(*output[1:])
-
-    def gradient(ctx, dout, *_):
-        *arguments, out, maximum, total = ctx.saved_tensors
-        gradients = backward(*arguments, *ctx.settings, out, maximum, total, dout)
-        return *(gradients if num > 1 else (gradients,)), *[None] * 5
-
-    differentiate(op, save, gradient)
-    differentiate_by_composition(backward, (num + 5, num + 6, num + 7))
-    return op, backward
+_SETTINGS = "q_offsets[B+1] offsets(Q), k_offsets[B+1] offsets(K), scale number, dropout_p number(0,1), seed bits"
+_OUTPUTS = "out[Q,H,D], maximum[Q,H], total[Q,H]"
 
 
-def _split_key_value(q: Tensor, key_value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    if key_value.dim() != 4 or key_value.shape[1] != 2:
-        raise ValueError(f"attention_kv: key_value must have shape [K, 2, H, D], not {tuple(key_value.shape)}")
-    return q, *key_value.unbind(1)
+def _ops(name: str, tensors: str, split: Callable, rename: Callable[[str], str] = str) -> tuple[Op, Op]:
+    """Attention and its gradient for one way of storing q, k and v in tensors, and what makes q, k and v of these."""
+    num, gradients = tensors.count("["), ", ".join(f"d{x}" for x in tensors.replace(" rows", "").split(", "))
+    spec = f"{tensors}, {_SETTINGS} -> {_OUTPUTS}"
+    backward_spec = f"{tensors}, {_SETTINGS}, {_OUTPUTS}, dout[Q,H,D] -> {gradients}"
+    op = Op(Kernel(name, rename(spec), _check_heads), lambda *args: _reference(*split(*args[:num]), *args[num:]))
+    return op, gradient_op(op, Kernel(f"{name}_backward", rename(backward_spec), _check_heads))
 
 
-def _split_qkv(qkv: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    if qkv.dim() != 4 or qkv.shape[1] != 3:
-        raise ValueError(f"attention_qkv: qkv must have shape [T, 3, H, D], not {tuple(qkv.shape)}")
-    return qkv.unbind(1)
-
-
-_attention, _attention_backward = _define(
-    "attention", "Tensor q, Tensor k, Tensor v", lambda q, k, v: (q, k, v), lambda dq, dk, dv: (dq, dk, dv)
+_attention, _attention_backward = _ops(
+    "attention", "q[Q,H,D] rows, k[K,H,D] rows, v[K,H,D] rows", lambda q, k, v: (q, k, v)
 )
-_attention_kv, _attention_kv_backward = _define(
-    "attention_kv", "Tensor q, Tensor key_value", _split_key_value, lambda dq, dk, dv: (dq, torch.stack([dk, dv], 1))
+_attention_kv, _attention_kv_backward = _ops(
+    "attention_kv", "q[Q,H,D] rows, key_value[K,2,H,D] rows", lambda q, key_value: (q, *key_value.unbind(1))
 )
-_attention_qkv, _attention_qkv_backward = _define(
-    "attention_qkv", "Tensor qkv", _split_qkv, lambda dq, dk, dv: torch.stack([dq, dk, dv], 1)
+_attention_qkv, _attention_qkv_backward = _ops(
+    "attention_qkv", "qkv[T,3,H,D] rows", lambda qkv: qkv.unbind(1), lambda spec: re.sub("[QK]", "T", spec)
 )
 
 

@@ -16,10 +16,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ast_sim.ops import library
 from ast_sim.ops._edges import join_indices, join_offsets, offsets_of
-from ast_sim.ops.derivatives import differentiate, differentiate_by_composition
-from ast_sim.ops.library import freeze
+from ast_sim.ops.derivatives import gradient_op
+from ast_sim.ops.library import Kernel, Op, freeze
 from ast_sim.ops.spec import check_index
 
 FLAT = 2.0**-21  # a rest volume below this share of the magnitudes that it is the sum of may be rounding alone
@@ -82,8 +81,6 @@ _SPEC = (
     "position[N,3], rest_position[N,3], lame[E,2], elements[E,4] int64, node_order[4E] int64,"
     " node_offsets[N+1] offsets(4E) corners(elements, node_order)"
 )
-_kernel = library.Kernel("elastic_forces", f"{_SPEC} -> force[N,3]")
-_backward_kernel = library.Kernel("elastic_forces_backward", f"{_SPEC}, dforce[N,3] -> dposition[N,3]")
 
 
 def _edges(x: Tensor, elements: Tensor) -> Tensor:
@@ -137,51 +134,15 @@ def _strain(F: Tensor) -> Tensor:
 
 
 def _reference(position, rest_position, lame, elements, node_order, node_offsets):
-    _kernel.check(position, rest_position, lame, elements, node_order, node_offsets)
     rest = _Rest.of(rest_position, lame, elements)
     F = rest.gradient(position, elements)
     return rest.add(F @ rest.stress(_strain(F)), elements, len(position))
 
 
-def _backward_reference(dforce, position, rest_position, lame, elements, node_order, node_offsets):
-    _backward_kernel.check(position, rest_position, lame, elements, node_order, node_offsets, dforce)
-    rest = _Rest.of(rest_position, lame, elements)
-    F, dF = (rest.gradient(x, elements) for x in (position, dforce))
-    FdF = F.mT @ dF
-    dP = dF @ rest.stress(_strain(F)) + F @ rest.stress((FdF + FdF.mT) / 2)
-    return rest.add(dP, elements, len(position))
-
-
-# ---- the ops ----
-
-
-def _new(position, *_):
-    return position.new_empty(position.shape[0], 3)
-
-
-def _new_backward(dforce, position, *_):
-    return _new(position)
-
-
-def _call_backward(out, dforce, *inputs):
-    _backward_kernel(*inputs, dforce, out)
-
-
-_INPUTS = (
-    "Tensor position, Tensor rest_position, Tensor lame, Tensor elements, Tensor node_order, Tensor node_offsets)"
-    " -> Tensor"
+_forces = Op(Kernel("elastic_forces", f"{_SPEC} -> force[N,3]"), _reference)
+_forces_backward = gradient_op(
+    _forces, Kernel("elastic_forces_backward", f"dforce[N,3] late, {_SPEC} -> dposition[N,3]")
 )
-_forces = library.define(f"elastic_forces({_INPUTS}", _reference, _new, _kernel)
-_forces_backward = library.define(
-    f"elastic_forces_backward(Tensor dforce, {_INPUTS}", _backward_reference, _new_backward, _call_backward
-)
-
-differentiate(
-    _forces,
-    lambda ctx, inputs, output: ctx.save_for_backward(*inputs),
-    lambda ctx, grad: (_forces_backward(grad, *ctx.saved_tensors), *[None] * 5),
-)
-differentiate_by_composition(_forces_backward)
 
 
 def elastic_forces(position: Tensor, rest_position: Tensor, lame: Tensor, tets: TetrahedronSet) -> Tensor:

@@ -8,15 +8,25 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ast_sim.ops import library
+from ast_sim.ops.library import Kernel, Op
+from ast_sim.ops.spec import Given, Sizes
 
 EXTENT = 1 << 21  # below this difference of coordinates, squared distances are exact in float64
 
 
-_kernel = library.Kernel(
+def _check_extent(name: str, sizes: Sizes, given: Given) -> None:
+    offsets = given["offsets"].tolist()
+    for scene in range(len(offsets) - 1):
+        points = given["coordinates"][offsets[scene] : offsets[scene + 1]].long()
+        if len(points) and (points.amax(0) - points.amin(0)).max() >= EXTENT:
+            raise ValueError(f"{name}: coordinates of scene {scene} differ by 2^21 or more")
+
+
+_kernel = Kernel(
     "farthest_point_sample",
-    "coordinates[C,3] int32, offsets[B+1] offsets(C), num integer(1,9223372036854775807)"
+    "coordinates[C,3] int32, offsets[B+1] offsets(C), num integer(1,9223372036854775807); room size(S)"
     " -> out_offsets[B+1] int64, indices[S] int64",
+    _check_extent,
 )
 
 
@@ -37,40 +47,27 @@ def _sample_scene(points: Tensor, num: int) -> Tensor:
 
 
 def _sample_reference(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
-    _kernel.check(coordinates, offsets, num)
+    _kernel.check(coordinates, offsets, num, 0)
     picks = [offsets[:0]]
-    for scene, (begin, end) in enumerate(zip(offsets.tolist(), offsets[1:].tolist(), strict=False)):
+    for begin, end in zip(offsets.tolist(), offsets[1:].tolist(), strict=False):
         points = coordinates[begin:end].long()
-        if len(points) and (points.amax(0) - points.amin(0)).max() >= EXTENT:
-            raise ValueError(f"farthest_point_sample: coordinates of scene {scene} differ by 2^21 or more")
         few = end - begin <= num
         picks.append(begin + (torch.arange(end - begin, device=points.device) if few else _sample_scene(points, num)))
     return torch.cat(picks), _out_offsets(offsets, num)
 
 
-def _new_samples(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
-    """There is room for as many as there may be."""
-    room = min(coordinates.shape[0], max(offsets.shape[0] - 1, 0) * num)
-    return offsets.new_empty(room), offsets.new_empty(offsets.shape)
-
-
-def _call(outputs, coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
-    indices, out_offsets = outputs
-    samples = _kernel(coordinates, offsets, num, out_offsets, indices)
-    return (indices if samples == indices.shape[0] else indices[:samples].clone()), out_offsets
+def _run(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
+    room = min(coordinates.shape[0], max(offsets.shape[0] - 1, 0) * num)  # as many as there may be
+    samples, (out_offsets, indices) = _kernel.fill(coordinates, offsets, num, room)
+    return (indices if samples == room else indices[:samples].clone()), out_offsets
 
 
 def _sample_fake(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
     return offsets.new_empty(torch.library.get_ctx().new_dynamic_size()), torch.empty_like(offsets)
 
 
-_sample = library.define(
-    "farthest_point_sample(Tensor coordinates, Tensor offsets, int num) -> (Tensor, Tensor)",
-    _sample_reference,
-    _new_samples,
-    _call,
-    _sample_fake,
-)
+_SCHEMA = "(Tensor coordinates, Tensor offsets, int num) -> (Tensor, Tensor)"
+_sample = Op(_kernel, _sample_reference, _SCHEMA, _run, _sample_fake)
 
 
 def farthest_point_sample(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:

@@ -10,9 +10,8 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from ast_sim.ops import library
-from ast_sim.ops._linear import _given, _outputs
-from ast_sim.ops.derivatives import differentiate, differentiate_by_composition
+from ast_sim.ops.derivatives import gradient_op
+from ast_sim.ops.library import Kernel, Op
 
 EPSILON = 1e-5
 SAVED = 1 << 25  # hidden units and outputs with more elements are not kept for the gradient, but computed again
@@ -22,17 +21,16 @@ _TENSORS = (
     "x[M,I] rows, beside?[M,J] rows, weight1[H,I+J] filled, bias1?[H], weight2[O,H] filled, bias2?[O],"
     " gamma?[O], beta?[O] with(gamma)"
 )
-_KEPT = "hidden?[M,H], normalized?[M,O], scale?[M] with(normalized)"
-_mlp_kernel = library.Kernel("mlp", f"{_TENSORS}, residual?[M,O] rows -> out[M,O], {_KEPT}")
-_backward_kernel = library.Kernel(
-    "mlp_backward",
-    f"{_TENSORS}, dout[M,O] rows, {_KEPT} -> dx?[M,I], dbeside?[M,J], dweight1?[H,I+J], dbias1?[H], dweight2?[O,H],"
-    " dbias2?[O], dgamma?[O], dbeta?[O]",
+_SPEC = (
+    f"{_TENSORS}, residual?[M,O] rows added; save switch"
+    " -> out[M,O], hidden[M,H] if(save), normalized[M,O] if(save,gamma), scale[M] if(save,gamma)"
 )
-
-
-def _hidden(x, beside, weight1, bias1) -> Tensor:
-    return F.relu(F.linear(x if beside is None else torch.cat([x, beside], dim=1), weight1, bias1))
+_BACKWARD_SPEC = (
+    f"dout[M,O] rows late, {_TENSORS}, hidden?[M,H], normalized?[M,O], scale?[M] with(normalized);"
+    " wanted wants(x,beside,weight1,bias1,weight2,bias2,gamma,beta)"
+    " -> dx[M,I] if(wanted), dbeside[M,J] if(wanted), dweight1[H,I+J] if(wanted), dbias1[H] if(wanted),"
+    " dweight2[O,H] if(wanted), dbias2[O] if(wanted), dgamma[O] if(wanted), dbeta[O] if(wanted)"
+)
 
 
 def normalize(y: Tensor) -> tuple[Tensor, Tensor]:
@@ -49,109 +47,17 @@ def layer_norm(y: Tensor, gamma: Tensor, beta: Tensor) -> Tensor:
     return F.layer_norm(y, y.shape[1:], gamma, beta, EPSILON)
 
 
-def layer_norm_backward(dout: Tensor, gamma: Tensor, normalized: Tensor, scale: Tensor) -> tuple:
-    """The gradients of y, gamma and beta. torch's own loses terms in third derivatives."""
-    dn = dout * gamma
-    dy = dn - dn.mean(1, keepdim=True) - normalized * (dn * normalized).mean(1, keepdim=True)
-    return dy * scale[:, None], (dout * normalized).sum(0), dout.sum(0)
-
-
-# ---- composition ----
-
-
 def _reference(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual, save):
-    _mlp_kernel.check(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual)
-    hidden = _hidden(x, beside, weight1, bias1)
-    out = F.linear(hidden, weight2, bias2)
-    kept = [x.new_empty(0) for _ in range(3)]
-    if save:
-        kept[0] = hidden
+    hidden = F.relu(F.linear(x if beside is None else torch.cat([x, beside], dim=1), weight1, bias1))
+    y = out = F.linear(hidden, weight2, bias2)
     if gamma is not None:
-        if save:
-            kept[1:] = normalize(out)
-        out = layer_norm(out, gamma, beta)
+        out = layer_norm(y, gamma, beta)
+    kept = (hidden, *(normalize(y) if gamma is not None else (None, None))) if save else (None, None, None)
     return out if residual is None else out + residual, *kept
 
 
-def _backward_reference(
-    dout, x, beside, weight1, bias1, weight2, bias2, gamma, beta, hidden, normalized, scale, wanted
-):
-    hidden = _hidden(x, beside, weight1, bias1) if hidden is None else hidden
-    dgamma = dbeta = dy = dout
-    if gamma is not None:
-        if normalized is None:
-            normalized, scale = normalize(F.linear(hidden, weight2, bias2))
-        dy, dgamma, dbeta = layer_norm_backward(dout, gamma, normalized, scale)
-    dz = (dy @ weight2).masked_fill(hidden <= 0, 0)
-    inputs = x if beside is None else torch.cat([x, beside], dim=1)
-    dinputs = dz @ weight1
-    gradients = [dinputs[:, : x.shape[1]], dinputs[:, x.shape[1] :], dz.mT @ inputs, dz.sum(0), dy.mT @ hidden]
-    gradients += [dy.sum(0), dgamma, dbeta]
-    return tuple(g.clone() if want else x.new_empty(0) for g, want in zip(gradients, wanted, strict=True))
-
-
-# ---- C core ----
-
-
-def _kept(gamma: Tensor | None, save: bool) -> list[bool]:
-    """Whether hidden, normalized and scale are kept for the gradient."""
-    norm = save and gamma is not None
-    return [save, norm, norm]
-
-
-def _call(outputs, *inputs):
-    *tensors, save = inputs
-    out, *kept = outputs
-    _mlp_kernel(*tensors, out, *_given(_kept(tensors[6], save), kept))
-
-
-def _call_backward(outputs, dout, *inputs):
-    *tensors, hidden, normalized, scale, wanted = inputs
-    _backward_kernel(*tensors, dout, hidden, normalized, scale, *_given(wanted, outputs))
-
-
-def _new(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual, save):
-    rows, hidden, columns = x.shape[0], weight1.shape[0], weight2.shape[0]
-    kept = _outputs(x, _kept(gamma, save), [(rows, hidden), (rows, columns), (rows,)])
-    return x.new_empty(rows, columns), *kept
-
-
-def _new_backward(dout, x, beside, weight1, bias1, weight2, *kept_and_wanted):
-    vectors = [weight1.shape[:1], *[weight2.shape[:1]] * 3]
-    beside_shape = (0,) if beside is None else beside.shape
-    shapes = [x.shape, beside_shape, weight1.shape, vectors[0], weight2.shape, *vectors[1:]]
-    return tuple(_outputs(x, kept_and_wanted[-1], shapes))
-
-
-_LAYERS = "Tensor weight1, Tensor? bias1, Tensor weight2, Tensor? bias2"
-_INPUTS = f"Tensor x, Tensor? beside, {_LAYERS}, Tensor? gamma, Tensor? beta"
-_mlp = library.define(
-    f"mlp({_INPUTS}, Tensor? residual, bool save) -> (Tensor, Tensor, Tensor, Tensor)", _reference, _new, _call
-)
-_mlp_backward = library.define(
-    f"mlp_backward(Tensor dout, {_INPUTS}, Tensor? hidden, Tensor? normalized, Tensor? scale, bool[8] wanted)"
-    " -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)",
-    _backward_reference,
-    _new_backward,
-    _call_backward,
-)
-
-
-def _save(ctx, inputs, output) -> None:
-    *tensors, _, save = inputs
-    ctx.set_materialize_grads(False)  # what is kept has no gradient
-    ctx.mark_non_differentiable(*output[1:])
-    ctx.save_for_backward(*tensors, *_given(_kept(inputs[6], save), output[1:]))
-
-
-def _gradient(ctx, dout, *_):
-    wanted = list(ctx.needs_input_grad[:8])
-    gradients = _mlp_backward(dout, *ctx.saved_tensors, wanted) if any(wanted) else [None] * 8
-    return *_given(wanted, gradients), dout if ctx.needs_input_grad[8] else None, None
-
-
-differentiate(_mlp, _save, _gradient)
-differentiate_by_composition(_mlp_backward, (9, 10, 11))
+_mlp = Op(Kernel("mlp", _SPEC), _reference)
+_mlp_backward = gradient_op(_mlp, Kernel("mlp_backward", _BACKWARD_SPEC))
 
 
 def mlp(

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ast_sim.ops import library
-from ast_sim.ops.library import freeze
-from ast_sim.ops.spec import segment_of
+from ast_sim.ops.library import Kernel, Op, freeze
+from ast_sim.ops.spec import Given, Sizes, segment_of
 
 MAX_DEPTH = 21
 
@@ -131,31 +130,41 @@ def _keys_of(coordinates: Tensor) -> Tensor:
     return _spread(x) << 2 | _spread(y) << 1 | _spread(z)
 
 
-_octree_kernel = library.Kernel(
-    "octree",
-    "positions[N,3], offsets[B+1] offsets(N), x number, y number, z number, half_width number, depth integer(0,21)"
-    " -> keys[N] int64, cell_offsets[B+1] int64, node_cell[N] int64, node_order[N] int64, node_offsets[N+1] int64",
-)
-_coordinates_kernel = library.Kernel("octree_coordinates", "keys[C] int64 -> coordinates[C,3] int32")
-_coarsen_kernel = library.Kernel(
-    "octree_coarsen", "keys[C] int64, cell_offsets[B+1] offsets(C) scenes(keys), levels integer(0,21)"
-)
+def _unit(positions: Tensor, center: Sequence[float], half_width: float) -> Tensor:
+    """The positions where the domain is scaled to [0, 1], in float64."""
+    return (positions.double() - positions.new_tensor(center, dtype=torch.float64) + half_width) / (2 * half_width)
 
 
-def _octree_reference(positions: Tensor, offsets: Tensor, center: Sequence[float], half_width: float, depth: int):
-    _octree_kernel.check(positions, offsets, depth=depth)
+def _check_domain(name: str, sizes: Sizes, given: Given) -> None:
+    positions, half_width, center = given["positions"], given["half_width"], [given[axis] for axis in "xyz"]
     if not 0 < half_width < 1e300:
-        raise ValueError("octree: half_width must be positive and finite")
+        raise ValueError(f"{name}: half_width must be positive and finite")
     if not all(abs(x) < 1e300 for x in center):
-        raise ValueError("octree: center must be finite")
-    unit = (positions.double() - positions.new_tensor(center, dtype=torch.float64) + half_width) / (2 * half_width)
+        raise ValueError(f"{name}: center must be finite")
+    unit = _unit(positions, center, half_width)
     finite, inside = positions.isfinite().all(1), ((unit >= -1e-6) & (unit <= 1 + 1e-6)).all(1)
     bad = (~(finite & inside)).nonzero()
     if len(bad):
         node = int(bad[0])
         position = ", ".join(f"{x:.9g}" for x in positions[node].tolist())
         problem = f"lies outside the domain of half width {half_width:.9g}" if finite[node] else "is not finite"
-        raise ValueError(f"octree: positions[{node}] = ({position}) {problem}")
+        raise ValueError(f"{name}: positions[{node}] = ({position}) {problem}")
+
+
+_octree_kernel = Kernel(
+    "octree",
+    "positions[N,3], offsets[B+1] offsets(N), x number, y number, z number, half_width number, depth integer(0,21)"
+    " -> keys[N] int64, cell_offsets[B+1] int64, node_cell[N] int64, node_order[N] int64, node_offsets[N+1] int64",
+    _check_domain,
+)
+_coarsen_kernel = Kernel(
+    "octree_coarsen", "keys[C] int64, cell_offsets[B+1] offsets(C) scenes(keys), levels integer(0,21)"
+)
+
+
+def _octree_reference(positions: Tensor, offsets: Tensor, center: Sequence[float], half_width: float, depth: int):
+    _octree_kernel.check(positions, offsets, *center, half_width, depth)
+    unit = _unit(positions, center, half_width)
     keys = _keys_of((unit * 2**depth).floor().long().clamp(0, 2**depth - 1))
     scenes = segment_of(offsets)
     order = torch.argsort(keys, stable=True)
@@ -178,17 +187,9 @@ def _runs(keys: Tensor, scenes: Tensor, offsets: Tensor, order: Tensor) -> tuple
     return keys[starts], torch.searchsorted(starts, offsets), node_offsets, node_cell
 
 
-def _new_octree(positions: Tensor, offsets: Tensor, *domain):
-    """There is room for a cell a node."""
-    n = positions.shape[0]
-    keys, node_cell, node_order = (offsets.new_empty(n) for _ in range(3))
-    return keys, torch.empty_like(offsets), offsets.new_empty(n + 1), node_cell, node_order
-
-
-def _call_octree(outputs, positions: Tensor, offsets: Tensor, center: Sequence[float], half_width: float, depth: int):
-    keys, cell_offsets, node_offsets, node_cell, node_order = outputs
-    outputs = (keys, cell_offsets, node_cell, node_order, node_offsets)
-    num = _octree_kernel(positions, offsets, *center, half_width, depth, *outputs)
+def _run_octree(positions: Tensor, offsets: Tensor, center: Sequence[float], half_width: float, depth: int):
+    num, outputs = _octree_kernel.fill(positions, offsets, *center, half_width, depth)
+    keys, cell_offsets, node_cell, node_order, node_offsets = outputs  # with room for a cell a node
     return keys[:num], cell_offsets, node_offsets[: num + 1], node_cell, node_order
 
 
@@ -199,10 +200,6 @@ def _octree_fake(positions: Tensor, offsets: Tensor, center: Sequence[float], ha
 
 def _coordinates_reference(keys: Tensor) -> Tensor:
     return torch.stack([_gather(keys >> 2), _gather(keys >> 1), _gather(keys)], 1).int()
-
-
-def _new_coordinates(keys: Tensor) -> Tensor:
-    return keys.new_empty(keys.shape[0], 3, dtype=torch.int32)
 
 
 # ---- the coarser level ----
@@ -231,7 +228,7 @@ def _coarsen_reference(keys: Tensor, cell_offsets: Tensor, levels: int) -> list[
 
 
 def _coarsen_once(keys: Tensor, cell_offsets: Tensor) -> tuple[Tensor, ...]:
-    _coarsen_kernel.check(keys, cell_offsets)
+    _coarsen_kernel.check(keys, cell_offsets, 1)
     scenes = segment_of(cell_offsets)
     rows = torch.arange(len(keys), device=keys.device)
     coarse_keys, coarse_offsets, node_offsets, node_cell = _runs(keys >> 3, scenes, cell_offsets, rows)
@@ -251,9 +248,9 @@ def _coarsen_once(keys: Tensor, cell_offsets: Tensor) -> tuple[Tensor, ...]:
     return coarse_keys, coarse_offsets, node_offsets, node_cell, counts.cumsum(0), *pairs
 
 
-def _call_coarsen(outputs, keys: Tensor, cell_offsets: Tensor, levels: int) -> list[Tensor]:
+def _run_coarsen(keys: Tensor, cell_offsets: Tensor, levels: int) -> list[Tensor]:
     """The arrays are made by the core, which alone knows their sizes."""
-    return [torch.from_numpy(part) for part in _coarsen_kernel(keys, cell_offsets, levels)]
+    return [torch.from_numpy(part) for part in _coarsen_kernel.fill(keys, cell_offsets, levels)[0]]
 
 
 def _coarsen_fake(keys: Tensor, cell_offsets: Tensor, levels: int) -> list[Tensor]:
@@ -266,22 +263,20 @@ def _coarsen_fake(keys: Tensor, cell_offsets: Tensor, levels: int) -> list[Tenso
     return parts
 
 
-_octree = library.define(
-    "octree(Tensor positions, Tensor offsets, float[] center, float half_width, int depth)"
-    " -> (Tensor, Tensor, Tensor, Tensor, Tensor)",
+_octree = Op(
+    _octree_kernel,
     _octree_reference,
-    _new_octree,
-    _call_octree,
+    "(Tensor positions, Tensor offsets, float[] center, float half_width, int depth)"
+    " -> (Tensor, Tensor, Tensor, Tensor, Tensor)",
+    _run_octree,
     _octree_fake,
 )
-_coordinates = library.define(
-    "octree_coordinates(Tensor keys) -> Tensor", _coordinates_reference, _new_coordinates, _coordinates_kernel
-)
-_coarsen = library.define(
-    "octree_coarsen(Tensor keys, Tensor cell_offsets, int levels) -> Tensor[]",
+_coordinates = Op(Kernel("octree_coordinates", "keys[C] int64 -> coordinates[C,3] int32"), _coordinates_reference)
+_coarsen = Op(
+    _coarsen_kernel,
     _coarsen_reference,
-    lambda *_: (),
-    _call_coarsen,
+    "(Tensor keys, Tensor cell_offsets, int levels) -> Tensor[]",
+    _run_coarsen,
     _coarsen_fake,
 )
 

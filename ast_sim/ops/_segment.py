@@ -8,8 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ast_sim.ops import library
 from ast_sim.ops.derivatives import differentiate
+from ast_sim.ops.library import Kernel, Op
 from ast_sim.ops.spec import segment_of
 
 
@@ -18,50 +18,21 @@ def _scale(node_offsets: Tensor, mean: bool, dtype: torch.dtype) -> Tensor:
     return counts.to(dtype).reciprocal()[:, None]
 
 
-_sum_kernel = library.Kernel(
-    "segment_sum",
-    "x[N,F], node_order[N] permutation, node_offsets[C+1] offsets(N), mean integer(0,1) -> out[C,F]",
-)
-_spread_kernel = library.Kernel(
-    "segment_spread",
-    "dout[C,F], node_order[N] permutation, node_offsets[C+1] offsets(N), mean integer(0,1) -> dx[N,F]",
-)
-_column_sum_kernel = library.Kernel("column_sum", "x[N,F] -> out[F]")
-
-
 def _sum_reference(x: Tensor, node_order: Tensor, node_offsets: Tensor, mean: bool) -> Tensor:
-    _sum_kernel.check(x, node_order, node_offsets)
-    out = x.new_zeros(len(node_offsets) - 1, x.shape[1])
-    out.index_add_(0, segment_of(node_offsets), x[node_order])
+    out = x.new_zeros(len(node_offsets) - 1, x.shape[1]).index_add(0, segment_of(node_offsets), x[node_order])
     return out * _scale(node_offsets, mean, x.dtype)
 
 
-def _new_sum(x: Tensor, node_order: Tensor, node_offsets: Tensor, mean: bool) -> Tensor:
-    return x.new_empty(torch.sym_max(node_offsets.shape[0] - 1, 0), x.shape[-1])
-
-
 def _spread_reference(dout: Tensor, node_order: Tensor, node_offsets: Tensor, mean: bool) -> Tensor:
-    _spread_kernel.check(dout, node_order, node_offsets)
     dx = dout.new_empty(len(node_order), dout.shape[1])
     dx[node_order] = (dout * _scale(node_offsets, mean, dout.dtype))[segment_of(node_offsets)]
     return dx
 
 
-def _new_spread(dout: Tensor, node_order: Tensor, node_offsets: Tensor, mean: bool) -> Tensor:
-    return dout.new_empty(node_order.shape[0], dout.shape[1])
-
-
-def _column_sum_reference(x: Tensor) -> Tensor:
-    _column_sum_kernel.check(x)
-    return x.sum(0)
-
-
-_SEGMENTS = "Tensor node_order, Tensor node_offsets, bool mean) -> Tensor"
-_sum = library.define(f"segment_sum(Tensor x, {_SEGMENTS}", _sum_reference, _new_sum, _sum_kernel)
-_spread = library.define(f"segment_spread(Tensor dout, {_SEGMENTS}", _spread_reference, _new_spread, _spread_kernel)
-_column_sum = library.define(
-    "column_sum(Tensor x) -> Tensor", _column_sum_reference, lambda x: x.new_empty(x.shape[-1:]), _column_sum_kernel
-)
+_SEGMENTS = "node_order[N] permutation, node_offsets[C+1] offsets(N), mean flag"
+_sum = Op(Kernel("segment_sum", f"x[N,F], {_SEGMENTS} -> out[C,F]"), _sum_reference)
+_spread = Op(Kernel("segment_spread", f"dout[C,F], {_SEGMENTS} -> dx[N,F]"), _spread_reference)
+_column_sum = Op(Kernel("column_sum", "x[N,F] -> out[F]"), lambda x: x.sum(0))
 
 
 def _save_segments(ctx, inputs, output) -> None:
@@ -69,7 +40,7 @@ def _save_segments(ctx, inputs, output) -> None:
     ctx.save_for_backward(node_order, node_offsets)
 
 
-def _gradient_by(adjoint: library.Op):
+def _gradient_by(adjoint: Op):
     return lambda ctx, grad: (adjoint(grad, *ctx.saved_tensors, ctx.mean), None, None, None)
 
 

@@ -8,27 +8,23 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ast_sim.ops import library
 from ast_sim.ops._octree import CellMap
 from ast_sim.ops._segment import column_sum
 from ast_sim.ops.derivatives import differentiate, differentiate_by_composition
+from ast_sim.ops.library import Either, Kernel, Op
 
 OFFSETS = 27
 
 
+# The pairs come twice. (source, destination) are sorted by destination. The gradient with respect to x goes the other
+# way: (back_source, back_destination) are the destinations and sources of the same pairs, sorted by source.
 _PAIRS = "pair_offsets[28] offsets(P), source[P] index(N)"
 _SPEC = (
-    "x[N,I], weight[27,{axes}], bias?[O], transposed integer({number},{number}), " + _PAIRS + ","
-    " destination[P] index(R) rising(pair_offsets) -> out[R,O]"
+    f"x[N,I], weight[27,I,O], bias?[O], transposed flag integer(0,0), {_PAIRS}, destination[P] index(R)"
+    " rising(pair_offsets); back_source[P] int64, back_destination[P] int64, num_out size(R) -> out[R,O]"
 )
-# By whether the weight is transposed.
-_kernels = (
-    library.Kernel("sparse_conv", _SPEC.format(axes="I,O", number=0)),
-    library.Kernel("sparse_conv_transposed", _SPEC.format(axes="O,I", number=1)),
-)
-_weight_kernel = library.Kernel(
-    "sparse_conv_weight", f"x[N,I], dout[R,O], {_PAIRS}, destination[P] index(R) -> dweight[27,I,O]"
-)
+_TRANSPOSED_SPEC = _SPEC.replace("I,O", "O,I").replace("(0,0)", "(1,1)")
+_WEIGHT_SPEC = f"x[N,I], dout[R,O], {_PAIRS}, destination[P] index(R) -> dweight[27,I,O]"
 
 
 def _groups(pair_offsets: Tensor, source: Tensor, destination: Tensor):
@@ -41,7 +37,6 @@ def _groups(pair_offsets: Tensor, source: Tensor, destination: Tensor):
 
 
 def _reference(x, weight, bias, transposed, pair_offsets, source, destination, back_source, back_destination, num_out):
-    _kernels[transposed].check(x, weight, bias, int(transposed), pair_offsets, source, destination, R=num_out)
     weight = weight.mT if transposed else weight
     out = x.new_zeros(num_out, weight.shape[2])
     for k, i, j in _groups(pair_offsets, source, destination):
@@ -50,39 +45,14 @@ def _reference(x, weight, bias, transposed, pair_offsets, source, destination, b
 
 
 def _weight_reference(x, dout, pair_offsets, source, destination):
-    _weight_kernel.check(x, dout, pair_offsets, source, destination)
     groups = _groups(pair_offsets, source, destination)
     found = {k: x.index_select(0, i).T @ dout.index_select(0, j) for k, i, j in groups}
     return torch.stack([found.get(k, x.new_zeros(x.shape[1], dout.shape[1])) for k in range(OFFSETS)])
 
 
-def _call(out, x, weight, bias, transposed, pair_offsets, source, destination, *back_and_num):
-    _kernels[transposed](x, weight, bias, transposed, pair_offsets, source, destination, out)
-
-
-def _new(x, weight, bias, transposed, *pairs_and_num):
-    return x.new_empty(pairs_and_num[-1], weight.shape[1 if transposed else -1])
-
-
-def _new_weight(x, dout, pair_offsets, source, destination):
-    return x.new_empty(OFFSETS, x.shape[-1], dout.shape[-1])
-
-
-# The pairs come twice. (source, destination) are sorted by destination. The gradient with respect to x goes the other
-# way: (back_source, back_destination) are the destinations and sources of the same pairs, sorted by source.
-_conv = library.define(
-    "sparse_conv(Tensor x, Tensor weight, Tensor? bias, bool transposed, Tensor pair_offsets, Tensor source,"
-    " Tensor destination, Tensor back_source, Tensor back_destination, SymInt num_out) -> Tensor",
-    _reference,
-    _new,
-    _call,
-)
-_conv_weight = library.define(
-    "sparse_conv_weight(Tensor x, Tensor dout, Tensor pair_offsets, Tensor source, Tensor destination) -> Tensor",
-    _weight_reference,
-    _new_weight,
-    _weight_kernel,
-)
+_either = {False: Kernel("sparse_conv", _SPEC), True: Kernel("sparse_conv_transposed", _TRANSPOSED_SPEC)}
+_conv = Op(Either("transposed", _either), _reference)
+_conv_weight = Op(Kernel("sparse_conv_weight", _WEIGHT_SPEC), _weight_reference)
 
 
 def _save(ctx, inputs, output) -> None:

@@ -1,12 +1,129 @@
-"""The derivatives of an op: the gradient that has a kernel of its own, and all others by compositions."""
+"""The derivatives of an op: the gradient that has a kernel of its own, and all others by compositions.
+
+A gradient op goes by names: it takes inputs and outputs of its op, and the gradient of the output y as `dy`. It returns
+the gradient of the input x as `dx`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
+from torch import Tensor
 
-from ast_sim.ops.library import LIBRARY, Op
+from ast_sim.ops.library import LIBRARY, Either, Kernel, Op
+from ast_sim.ops.spec import Parameter
+
+
+def gradient_op(op: Op, kernel: Kernel | Either, known: dict[str, Callable[[dict], Any]] | None = None) -> Op:
+    """The gradient of an op as an op of its own. Torch derives its composition from that of the op.
+
+    Args:
+        op: gets this gradient.
+        kernel: computes it in the core.
+        known: for an output of the op which the kernel takes: what stands for it, or None, by all inputs and outputs.
+    """
+    inputs, outputs, taken = op.spec.inputs, op.spec.outputs, kernel.spec.inputs
+    place = {p.name: i for i, p in enumerate([*inputs, *outputs])}
+    numbers = {f"d{p.name}": i for i, p in enumerate(outputs)}
+    cotangents = {i: numbers[p.name] for i, p in enumerate(taken) if p.name in numbers}
+    sources = [place.get(p.name) for p in taken]
+    kept = [i for i, source in enumerate(sources) if source is not None and source >= len(inputs)]
+    wants = {i: [place[name] for name in p.names("wants")] for i, p in enumerate(taken) if "wants" in p.words}
+    of_inputs = [place[p.name[1:]] for p in kernel.spec.outputs]
+    added = [i for i, p in enumerate(inputs) if "added" in p.words]
+
+    def composition(*args) -> tuple:
+        given = {p.name: x for p, x in zip(taken, args, strict=True)}
+        dys = [given.get(f"d{p.name}") for p in outputs]
+        switches = {name for p, dy in zip(outputs, dys, strict=True) if dy is not None for name in p.names("if")}
+        xs = [p.name in switches if "switch" in p.words else given.get(p.name) for p in inputs]
+        wanted = [i for i, want in zip(of_inputs, kernel.spec.wanted(*args), strict=True) if want]
+        found = dict(zip(wanted, pull_back(op.composition, xs, wanted, dys), strict=True))
+        return tuple(found.get(i) for i in of_inputs)
+
+    gradient = Op(kernel, composition)
+
+    def save(ctx, inputs, output) -> None:
+        ys = output if isinstance(output, tuple) else (output,)
+        ctx.set_materialize_grads(len(cotangents) == len(ys))
+        ctx.mark_non_differentiable(*(y for i, y in enumerate(ys) if i not in cotangents.values()))
+        given = (*inputs, *ys)
+        values = [None if i is None else given[i] for i in sources]
+        for i in kept:
+            function = (known or {}).get(taken[i].name)
+            y = function(dict(zip(place, given, strict=True))) if function else values[i]
+            values[i] = _wanted(y, taken[i])
+        _keep(ctx, values)
+
+    def backward(ctx, *dys):
+        args, needed = _kept(ctx), ctx.needs_input_grad
+        for i, output in cotangents.items():
+            args[i] = _wanted(dys[output], taken[i])
+        for i, which in wants.items():
+            args[i] = [needed[k] for k in which] if len(which) > 1 else needed[which[0]]
+        dxs: list[Tensor | None] = [None] * len(needed)
+        if any(needed[i] for i in of_inputs):
+            found = gradient(*args)
+            for i, dx in zip(of_inputs, found if isinstance(found, tuple) else (found,), strict=True):
+                dxs[i] = dx if needed[i] else None
+        for i in added:
+            dxs[i] = dys[0] if needed[i] else None
+        return tuple(dxs)
+
+    differentiate(op, save, backward)
+    differentiate_by_composition(gradient, kept)
+    return gradient
+
+
+def _wanted(y: Tensor | None, p: Parameter) -> Tensor | None:
+    """None for the empty tensor that stands for an output which was not wanted."""
+    return None if p.optional and y is not None and y.numel() == 0 else y
+
+
+def _keep(ctx, values: Sequence) -> None:
+    ctx.save_for_backward(*(x if isinstance(x, Tensor) else None for x in values))
+    ctx.others = [None if isinstance(x, Tensor) else x for x in values]
+
+
+def _kept(ctx) -> list:
+    return [y if x is None else x for x, y in zip(ctx.saved_tensors, ctx.others, strict=True)]
+
+
+def pull_back(
+    function: Callable, xs: Sequence, wanted: Sequence[int], dys: Sequence[Tensor | None]
+) -> Sequence[Tensor]:
+    """The gradients of function(*xs) by the arguments `wanted`, given those of its outputs; None counts as 0."""
+    given = [i for i, dy in enumerate(dys) if dy is not None]
+
+    def part(*some: Tensor) -> tuple[Tensor, ...]:
+        found = dict(zip(wanted, some, strict=True))
+        ys = function(*(found.get(i, x) for i, x in enumerate(xs)))
+        return tuple((ys if isinstance(ys, tuple) else (ys,))[i] for i in given)
+
+    return torch.func.vjp(part, *(xs[i] for i in wanted))[1](tuple(dys[i] for i in given))
+
+
+def differentiate_by_composition(op: Op, kept: Sequence[int] = ()) -> None:
+    """Register the derivatives of the composition as those of an op.
+
+    Args:
+        op: the op.
+        kept: the numbers of the arguments that the composition does not read, because they follow from the others.
+    """
+
+    def save(ctx, inputs, output) -> None:
+        ctx.set_materialize_grads(False)
+        _keep(ctx, inputs)
+
+    def backward(ctx, *gradients):
+        args = _kept(ctx)
+        wanted = [i for i, needed in enumerate(ctx.needs_input_grad) if needed and i not in kept]
+        found = dict(zip(wanted, pull_back(op.compose, args, wanted, gradients), strict=True))
+        return tuple(found.get(i) for i in range(len(args)))
+
+    differentiate(op, save, backward)
 
 
 def differentiate(op: Op, setup_context: Callable, backward: Callable) -> None:
@@ -34,7 +151,7 @@ def differentiate(op: Op, setup_context: Callable, backward: Callable) -> None:
     op.function = type(f"ast_sim_{op.name}", (torch.autograd.Function,), body)
 
 
-def _is_old_batch(x: torch.Tensor | None) -> bool:
+def _is_old_batch(x: Tensor | None) -> bool:
     """Whether x is batched by `is_grads_batched=True`, whose vmap is older than torch.func and knows few ops."""
     return x is not None and torch._C._functorch.is_legacy_batchedtensor(x)
 
@@ -48,38 +165,3 @@ def _backward_of_each(backward: Callable, ctx, gradients: tuple) -> tuple:
     samples = [[x[i] if _is_old_batch(y) else x for x, y in zip(batches, gradients, strict=True)] for i in range(num)]
     found = zip(*(backward(ctx, *sample) for sample in samples), strict=True)
     return tuple(None if x[0] is None else torch._add_batch_dim(torch.stack(x), 0, level) for x in found)
-
-
-def differentiate_by_composition(op: Op, kept: tuple[int, ...] = ()) -> None:
-    """Register the derivatives of the composition as those of an op, such as the gradient of another op.
-
-    Args:
-        op: the op.
-        kept: the numbers of the arguments that follow from the others and were kept from the forward op. Where the
-            composition is differentiated it gets None and computes them again; their derivatives would be lost.
-    """
-    op.kept = kept
-
-    def save(ctx, inputs, output) -> None:
-        ctx.set_materialize_grads(False)
-        ctx.others = [None if isinstance(x, torch.Tensor) else x for x in inputs]
-        tensors = (x if isinstance(x, torch.Tensor) and i not in kept else None for i, x in enumerate(inputs))
-        ctx.save_for_backward(*tensors)
-
-    def gradient(ctx, *gradients):
-        wanted = [i for i, needed in enumerate(ctx.needs_input_grad) if needed and i not in kept]
-        args = [y if x is None else x for x, y in zip(ctx.saved_tensors, ctx.others, strict=True)]
-        with torch.enable_grad():
-            for i in wanted:  # by a view of its own: an argument may be a function of another, such as dout of x
-                args[i] = args[i].view_as(args[i])
-            outputs = op.compose(*args)
-        outputs = outputs if isinstance(outputs, tuple) else (outputs,)
-        pairs = [(y, dy) for y, dy in zip(outputs, gradients, strict=True) if y.requires_grad and dy is not None]
-        if not pairs:
-            return (None,) * len(args)
-        ys, dys = zip(*pairs, strict=True)
-        again, variables = torch.is_grad_enabled(), [args[i] for i in wanted]
-        found = iter(torch.autograd.grad(ys, variables, dys, create_graph=again, allow_unused=True))
-        return tuple(next(found) if i in wanted else None for i in range(len(args)))
-
-    differentiate(op, save, gradient)

@@ -17,13 +17,14 @@ import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from ast_sim.ops import spec as specs
+from ast_sim.ops.spec import Given, Parameter, Sizes, Spec, check
 
 BACKEND = os.environ.get("AST_SIM_BACKEND", "c")
 if BACKEND not in ("c", "torch"):
@@ -55,43 +56,118 @@ if BACKEND == "c":
 
 
 class Kernel:
-    """A function of the C core and what it takes."""
+    """A function of the C core and what it takes (`spec.py`).
 
-    def __init__(self, name: str, spec: str) -> None:
-        self.name, self.parameters = name, specs.parameters_of(spec)
-        inputs = [(i, p) for i, p in enumerate(self.parameters) if p.shape is not None and not p.output]
-        self._layouts = [(i, dense_rows if "rows" in p.words else dense) for i, p in inputs]
-        self._floats = [i for i, p in inputs if p.dtype.is_floating_point]
+    Args:
+        name: of the function.
+        spec: what it takes and gives.
+        more: raises ValueError for what no word of the spec says: more(name, sizes by letter, arguments by name).
+    """
+
+    def __init__(self, name: str, spec: str, more: Callable[[str, Sizes, Given], None] | None = None) -> None:
+        self.name, self.spec, self.more = name, Spec(spec), more
+        taken, self._num = self.spec.taken, len(self.spec.taken)
+        self._parameters = taken + self.spec.outputs
+        self._floats = [i for i, p in enumerate(taken) if p.shape is not None and p.dtype.is_floating_point]
         if BACKEND == "c":
-            places = {p.name: i for i, p in enumerate(self.parameters)}
-            _C.declare(name, tuple(p.numbers(places) for p in self.parameters))
+            places = {p.name: i for i, p in enumerate(self._parameters)}
+            numbers = [n for p in self._parameters for n in p.numbers(places, _C.checks.split())]
+            _C.declare(name, ", ".join(places), np.array(numbers, np.int64).tobytes())
 
     def __call__(self, *arguments):
-        """Call the C core. Inputs are copied if they do not lie in memory as the kernel needs them.
+        """Call the C core with what it takes and with outputs. Inputs are copied if they do not lie as it reads them.
 
-        Nearly all of them do. The core notices where one does not, and says so before it does anything. What it cannot
-        see is whether a tensor is the negative of its memory.
+        The core sees which do not, before it does anything. It cannot see whether a tensor is the negative of its
+        memory. It says what it refuses, but not why: the checks here do.
         """
-        function, failure = getattr(_C, self.name), None
-        for i in self._floats:
-            if (x := arguments[i]) is not None and x.is_neg():
-                break
-        else:
+        function = getattr(_C, self.name)
+        try:
+            for i in self._floats:
+                if (x := arguments[i]) is not None and x.is_neg():
+                    raise BufferError
+            return function(*arguments)
+        except BufferError:
             try:
-                return function(*arguments)
+                return function(*map(dense, arguments[: self._num], self._parameters), *arguments[self._num :])
             except ValueError as error:
-                failure = error
-        copies = list(arguments)
-        for i, layout in self._layouts:
-            copies[i] = layout(arguments[i])
-        if failure and all(x is y for x, y in zip(arguments, copies, strict=True)):
-            raise failure
-        return function(*copies)
+                refusal = error
+        except ValueError as error:
+            refusal = error
+        raise self._reason(self._parameters, arguments, exact=True) or refusal
 
-    def check(self, *first: Tensor | float | None, **given: Tensor | float | None) -> None:
-        """Raise what the C core would raise for the first arguments and for those by name, for the composition."""
-        names = (p.name for p in self.parameters)
-        specs.check(self.name, self.parameters, dict(zip(names, first, strict=False)) | given)
+    def check(self, *arguments) -> None:
+        """Raise ValueError or TypeError for arguments of the op that do not fit, for the composition."""
+        if reason := self._reason(self.spec.inputs, arguments):
+            raise reason
+
+    def _reason(self, parameters: list[Parameter], arguments: tuple, exact: bool = False) -> Exception | None:
+        given = {p.name: x for p, x in zip(parameters, arguments, strict=False)}
+        try:
+            sizes = check(self.name, parameters, given, exact)
+            if self.more:
+                self.more(self.name, sizes, given)
+        except (TypeError, ValueError) as error:
+            return error
+        return None
+
+    def fill(self, *arguments) -> tuple[Any, tuple]:
+        """Call the C core with the arguments of the op and with new outputs; what it returns, and the outputs."""
+        try:
+            given = self.spec.arguments(*arguments)
+        except Exception as error:  # no outputs for such arguments
+            raise self._reason(self.spec.inputs, arguments) or error from None
+        return self(*given), given[self._num :]
+
+    def run(self, *arguments) -> Any:
+        """The op."""
+        _, outputs = self.fill(*arguments)
+        return outputs[0] if len(outputs) == 1 else self.given(outputs, arguments)
+
+    def fake(self, *arguments):
+        """The outputs without values, for tracing."""
+        return self.given(self.spec.arguments(*arguments)[self._num :], arguments)
+
+    @staticmethod
+    def given(outputs: tuple, arguments: tuple) -> Any:
+        """The outputs as an op returns them: one that is not wanted is empty, because an op cannot return None."""
+        if len(outputs) == 1:
+            return outputs[0]
+        return tuple([arguments[0].new_empty(0) if x is None else x for x in outputs])
+
+
+class Either:
+    """Kernels of one op that differ in shapes: one for each value of an argument."""
+
+    def __init__(self, argument: str, kernels: dict[Any, Kernel]) -> None:
+        first = next(iter(kernels.values()))
+        self.name, self.spec, self.kernels = first.name, first.spec, kernels
+        self.argument = [p.name for p in first.spec.inputs].index(argument)
+
+    def of(self, arguments: tuple) -> Kernel:
+        value = arguments[self.argument]
+        if value in self.kernels:
+            return self.kernels[value]
+        name, choice = self.spec.inputs[self.argument].name, ", ".join(map(str, self.kernels))
+        raise ValueError(f"{self.name}: {name} {value!r} is unknown: choose of {choice}")
+
+    def check(self, *arguments) -> None:
+        self.of(arguments).check(*arguments)
+
+    def run(self, *arguments) -> Any:
+        return (self.kernels.get(arguments[self.argument]) or self.of(arguments)).run(*arguments)
+
+    def fake(self, *arguments):
+        return self.of(arguments).fake(*arguments)
+
+
+def dense(x: Any, p: Parameter) -> Any:
+    """A tensor aligned and contiguous, but for rows that may lie apart; a copy only if it is not so already."""
+    if not isinstance(x, Tensor) or p.shape is None:
+        return x
+    inside = x[0] if "rows" in p.words and x.dim() and len(x) and x.stride(0) >= x[0].numel() else x
+    if inside.is_contiguous() and not x.data_ptr() % x.element_size() and not x.is_neg():
+        return x
+    return x.detach().resolve_neg().clone(memory_format=torch.contiguous_format)
 
 
 class Op:
@@ -101,14 +177,36 @@ class Op:
     small kernel does. The dispatcher is used for tracing, dispatch modes, autocast, functorch, other devices and other
     dtypes. Tangents and functorch take the composition. With AST_SIM_BACKEND=torch an op is its composition, and torch
     differentiates it like any other code.
+
+    Args:
+        kernel: the function of the core; the op has its name. The op changes no input, and no output is a view of one.
+        composition: the body as a composition of torch ops, for any device and dtype. Instead of an output that is not
+            wanted it returns None.
+        schema: signature in torch's schema language, where it does not follow from the spec.
+        run: the body through the core, where it is more than a call of the kernel.
+        fake: makes outputs of the right shapes for tracing, where the shapes depend on values.
     """
 
-    def __init__(self, name: str, overload: torch._ops.OpOverload, kernel: Callable, reference: Callable) -> None:
-        self.name, self.overload, self.kernel, self.reference = name, overload, kernel, reference
+    def __init__(
+        self,
+        kernel: Kernel | Either,
+        composition: Callable,
+        schema: str | None = None,
+        run: Callable | None = None,
+        fake: Callable | None = None,
+    ) -> None:
+        self.name, self.spec, self.composition = kernel.name, kernel.spec, composition
+        self.kernel, self._check = run or kernel.run, kernel.check if run is None else None
         self.function: type[torch.autograd.Function] | None = None  # set by `derivatives.differentiate`
-        self.kept: tuple[int, ...] = ()  # set by `differentiate_by_composition`
+        LIBRARY.define(self.name + (schema or self.spec.schema))
+        LIBRARY.impl(self.name, self._on_cpu, "CPU")
+        LIBRARY.impl(self.name, self.reference, "CompositeExplicitAutograd")
+        LIBRARY.impl(self.name, self.compose, "FuncTorchDynamicLayerFrontMode")  # first under transforms of torch.func
+        torch.library.register_fake(f"ast_sim::{self.name}", fake or kernel.fake, lib=LIBRARY)
+        torch.library.register_autocast(f"ast_sim::{self.name}", "cpu", torch.float32, lib=LIBRARY)
+        self.overload = getattr(torch.ops.ast_sim, self.name).default
 
-    def __call__(self, *args):
+    def __call__(self, *args) -> Any:
         if BACKEND == "torch":
             return self.reference(*args)
         if torch.compiler.is_compiling():
@@ -127,7 +225,23 @@ class Op:
             return self.function.apply(*args)
         return self.kernel(*args)
 
-    def compose(self, *args):
+    def reference(self, *args) -> Any:
+        """The composition, after the checks."""
+        if self._check:
+            self._check(*args)
+        found = self.composition(*args)
+        return Kernel.given(found, args) if isinstance(found, tuple) else found
+
+    def _on_cpu(self, *args):
+        tensors = [x for x in args if isinstance(x, Tensor)]
+        if BACKEND == "torch" or any(x.is_floating_point() and x.dtype != torch.float32 for x in tensors):
+            return self.reference(*args)
+        for x in tensors:
+            if x.device.type != "cpu":
+                raise ValueError(f"{self.name}: all tensors must lie on one device, found {x.device} beside cpu")
+        return self.kernel(*args)
+
+    def compose(self, *args) -> Any:
         """The composition, as a function that torch can differentiate and transform in every way."""
         for argument, x in zip(self.overload._schema.arguments, args, strict=True):
             if _is_batched(x) and not (self.function and x.is_floating_point()):
@@ -135,7 +249,6 @@ class Op:
                     f"{self.name}: vmap over {argument.name} is not possible: give every sample the same, call the op"
                     " for each, or join the samples as scenes of one batch"
                 )
-        args = [None if i in self.kept else x for i, x in enumerate(args)]
         if not torch.is_autocast_enabled("cpu"):
             return self.reference(*args)
         with torch.autocast("cpu", enabled=False):
@@ -174,68 +287,6 @@ def _is_watched() -> bool:
         or torch.is_autocast_enabled("cpu")
         or torch._C._is_tracing()
     )
-
-
-def define(
-    schema: str, reference: Callable, outputs: Callable, call: Kernel | Callable, fake: Callable | None = None
-) -> Op:
-    """Register the op `ast_sim::<schema>`.
-
-    Args:
-        schema: name and signature in torch's schema language. The op changes no input, and no output is a view of one.
-        reference: the body as a composition of torch ops, for any device and dtype.
-        outputs: makes the outputs without values, a tensor or a tuple, from the op's arguments.
-        call: fills them through the C core: call(outputs, *arguments). It gets CPU tensors; those of floating point are
-            float32. What it returns stands for the outputs, unless it is None. A kernel takes the op's arguments and
-            then the outputs.
-        fake: makes outputs of the right shapes for tracing, where `outputs` does not because they depend on values.
-    """
-    name = schema.split("(")[0]
-
-    def kernel(*args):
-        out = outputs(*args)
-        result = call(*args, *(out if isinstance(out, tuple) else (out,))) if is_kernel else call(out, *args)
-        return out if result is None else result
-
-    is_kernel = isinstance(call, Kernel)
-
-    def on_cpu(*args):
-        floats = [x for x in args if isinstance(x, torch.Tensor) and x.is_floating_point()]
-        if BACKEND == "torch" or any(x.dtype != torch.float32 for x in floats):
-            return reference(*args)
-        for x in args:
-            if isinstance(x, torch.Tensor) and x.device.type != "cpu":
-                raise ValueError(f"{name}: all tensors must lie on one device, found {x.device} beside cpu")
-        return kernel(*args)
-
-    LIBRARY.define(schema)
-    LIBRARY.impl(name, on_cpu, "CPU")
-    LIBRARY.impl(name, reference, "CompositeExplicitAutograd")
-    torch.library.register_fake(f"ast_sim::{name}", fake or outputs, lib=LIBRARY)
-    torch.library.register_autocast(f"ast_sim::{name}", "cpu", torch.float32, lib=LIBRARY)
-    op = Op(name, getattr(torch.ops.ast_sim, name).default, kernel, reference)
-    LIBRARY.impl(name, op.compose, "FuncTorchDynamicLayerFrontMode")  # comes first under each transform of torch.func
-    return op
-
-
-def dense(x: torch.Tensor | None) -> torch.Tensor | None:
-    """The tensor contiguous and aligned, as the C core takes it: copied only if it is not. None stays None."""
-    if x is None or x.is_contiguous() and not x.data_ptr() % x.element_size() and not x.is_neg():
-        return x
-    return x.detach().resolve_neg().clone(memory_format=torch.contiguous_format)
-
-
-def dense_rows(x: torch.Tensor | None) -> torch.Tensor | None:
-    """Like `dense`, but the rows may lie apart in memory, as in a slice of columns or in a fused projection."""
-    if x is None or x.is_contiguous() or x.dim() == 0:
-        return dense(x)
-    row, *inner = x.stride()
-    length = 1
-    for n, stride in zip(reversed(x.shape[1:]), reversed(inner), strict=True):
-        if stride != length:
-            return dense(x)
-        length *= n
-    return x if row >= length and not x.data_ptr() % x.element_size() and not x.is_neg() else dense(x)
 
 
 def frozen(*indices: Tensor) -> tuple[Tensor, ...]:

@@ -1,6 +1,7 @@
-"""What a kernel takes, said once. The C core checks every call by this text, and so do the compositions.
+"""What an op takes and gives, said once: its schema, its outputs, the checks here and those of the core follow from it.
 
-    x[M,I] rows, weight[O,I] filled, bias?[O], source[P] index(M), depth integer(0,21) -> out[M,O]
+    x[M,I] rows, weight[O,I] filled, bias?[O], source[P] index(M), depth integer(0,21); save switch
+    -> out[M,O], z[M,O] if(save)
 
 `csrc/README.md` explains the words.
 """
@@ -10,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -42,28 +44,38 @@ class Dimension:
     def size(self, sizes: Sizes) -> int:
         return self.constant + sum(n * sizes.get(letter, 0) for letter, n in self.factors.items())
 
+    @property
+    def single(self) -> str:
+        """The letter, if it stands alone."""
+        return next(iter(self.factors)) if len(self.factors) == 1 else ""
+
     def fits(self, length: int, sizes: Sizes) -> bool:
         """Whether an axis may be as long as this. A letter that stands alone binds at first sight."""
-        if len(self.factors) == 1:
-            ((letter, factor),) = self.factors.items()
-            rest = length - self.constant
-            if letter not in sizes and rest >= 0 and rest % factor == 0:
-                sizes[letter] = rest // factor
-            return letter in sizes and length == self.size(sizes)
+        if self.single and self.single not in sizes:
+            rest, factor = length - self.constant, self.factors[self.single]
+            if rest < 0 or rest % factor:
+                return False
+            sizes[self.single] = rest // factor
         return length == self.size(sizes)
 
     def show(self, sizes: Sizes) -> str:
-        return str(self.size(sizes)) if len(self.factors) != 1 or [*self.factors][0] in sizes else self.text
+        return self.text if self.single and self.single not in sizes else str(self.size(sizes))
 
-    def numbers(self) -> tuple:
+    @property
+    def expression(self) -> str:
+        """The size as Python, where the letters are numbers."""
+        terms = [f"{n} * {letter}" if n > 1 else letter for letter, n in self.factors.items()]
+        return " + ".join(terms + [str(self.constant)] * (self.constant > 0 or not terms))
+
+    def numbers(self) -> list[int]:
         """As csrc/spec.h takes it."""
-        terms = [(n, letter) for letter, n in self.factors.items()] + [(0, "\0")] * 2
-        return self.text, self.constant, *terms[0], *terms[1]
+        factors, letters = [*self.factors.values(), 0, 0], [*map(ord, self.factors), 0, 0]
+        return [self.constant, *factors[:2], *letters[:2]]
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One argument of a kernel. `shape` is None for a number."""
+    """One argument of an op. `shape` is None for what is no tensor."""
 
     name: str
     optional: bool
@@ -71,27 +83,51 @@ class Parameter:
     shape: tuple[Dimension, ...] | None
     words: dict[str, str]  # each with what stands in its parentheses
 
+    def names(self, word: str) -> list[str]:
+        """What stands in the parentheses of a word, taken apart."""
+        return [name.strip() for name in self.words.get(word, "").split(",") if name]
+
     @property
     def dtype(self) -> torch.dtype:
         if "int32" in self.words:
             return torch.int32
         return torch.int64 if "int64" in self.words or self.words.keys() & CHECKS.keys() else torch.float32
 
-    def numbers(self, places: dict[str, int]) -> tuple:
-        """As csrc/spec.h takes it, given the place of each parameter."""
-        kind = next((i for i, word in enumerate(("integer", "number", "bits"), 1) if word in self.words), 0)
-        low, high = map(int, self.words.get("integer", "0,0").split(","))
-        others = (places[self.words[word]] if word in self.words else -1 for word in ("with", "needs"))
-        flags = (self.optional, self.output, "rows" in self.words, "filled" in self.words)
-        checks = []
-        for word in (word for word in self.words if word in CHECKS):
+    @property
+    def bounds(self) -> tuple[int, int]:
+        low, high = self.names("integer") or self.names("number") or (0, 1 if "flag" in self.words else 0)
+        return int(low), int(high)
+
+    @property
+    def type(self) -> str:
+        """In torch's schema language."""
+        if self.shape is not None:
+            return "Tensor?" if self.optional else "Tensor"
+        wants = len(self.names("wants"))
+        return f"bool[{wants}]" if wants > 1 else next(_SCHEMA[word] for word in self.words if word in _SCHEMA)
+
+    @property
+    def argument(self) -> str:
+        """The Python expression of what the kernel takes for it."""
+        return f"{tuple(self.names('choice'))}.index({self.name})" if "choice" in self.words else self.name
+
+    def numbers(self, places: dict[str, int], checks: list[str]) -> list[int]:
+        """As csrc/spec.h takes it, given the place of each parameter and the names of the core's checks."""
+        kind = 0 if self.shape is not None else 3 if "bits" in self.words else 2 if "number" in self.words else 1
+        flags = (self.optional or "if" in self.words, self.output, "rows" in self.words, "filled" in self.words)
+        other = places[self.words["with"]] if "with" in self.words else -1
+        shape, mine = self.shape or (), [word for word in self.words if word in CHECKS]
+        numbers = [kind, _TYPES[self.dtype], *map(int, flags), *self.bounds, other, len(shape), len(mine)]
+        rows = [d.numbers() for d in shape] + [[0] * 5] * (4 - len(shape))
+        for word in mine:
             bound, arrays = _inside(self.words[word])
-            checks.append((word, bound.numbers(), *([places[name] for name in arrays] + [-1, -1])[:2]))
-        shape = tuple(d.numbers() for d in self.shape or ())
-        return self.name, kind, _TYPES[self.dtype], *flags, low, high, *others, shape, tuple(checks)
+            rows.append([checks.index(word), *bound.numbers(), *([places[name] for name in arrays] + [-1, -1])[:2]])
+        return sum([numbers, *rows, *[[0] * 8] * (2 - len(mine))], [])
 
 
-_WORDS = ("int64", "int32", "rows", "filled", "integer", "number", "bits", "with", "needs")
+_SCHEMA = {"choice": "str", "flag": "bool", "switch": "bool", "wants": "bool", "size": "SymInt", "integer": "int"}
+_SCHEMA |= {"number": "float", "bits": "int"}
+_WORDS = {"int64", "int32", "rows", "filled", "late", "with", "added", "if", *_SCHEMA}
 _TYPES = {dtype: np.dtype(str(dtype)[6:]).num for dtype in (torch.float32, torch.int64, torch.int32)}
 
 
@@ -101,68 +137,132 @@ def _inside(text: str) -> tuple[Dimension, list[str]]:
     return Dimension.of("0" if names else text or "0"), names
 
 
-def parameters_of(spec: str) -> list[Parameter]:
-    inputs, _, outputs = spec.partition("->")
+def _parameters(text: str, output: bool = False) -> list[Parameter]:
     parameters = []
-    for part in (inputs, outputs):
-        for name, optional, shape, words in _PARAMETER.findall(part):
-            dimensions = tuple(map(Dimension.of, shape.split(","))) if shape else None
-            known = dict(_WORD.findall(words))
-            if not known.keys() <= {*_WORDS, *CHECKS}:
-                raise ValueError(f"{name} in a spec has words that nobody knows: {words}")
-            parameters.append(Parameter(name, bool(optional), part is outputs, dimensions, known))
+    for name, optional, shape, words in _PARAMETER.findall(text):
+        dimensions = tuple(map(Dimension.of, shape.split(","))) if shape else None
+        known = dict(_WORD.findall(words))
+        if not known.keys() <= {*_WORDS, *CHECKS}:
+            raise ValueError(f"{name} in a spec has words that nobody knows: {words}")
+        parameters.append(Parameter(name, bool(optional), output, dimensions, known))
     return parameters
 
 
-def check(kernel: str, parameters: list[Parameter], given: Given) -> None:
-    """Raise the ValueError or TypeError that the C core would raise for these arguments; others are not looked at.
+class Spec:
+    """The text taken apart: what the kernel takes (`taken`), what the op takes (`inputs`), and the outputs of both."""
 
-    A letter may be given, too. Tensors of floating point may have any dtype.
+    def __init__(self, text: str) -> None:
+        inputs, _, outputs = text.partition("->")
+        taken, _, others = inputs.partition(";")
+        self.taken, self.outputs = _parameters(taken), _parameters(outputs, output=True)
+        self.inputs = self.taken + _parameters(others)
+
+    @property
+    def schema(self) -> str:
+        """In torch's schema language."""
+        inputs = ", ".join(f"{p.type} {p.name}" for p in self.inputs)
+        outputs = ", ".join(["Tensor"] * len(self.outputs))
+        return f"({inputs}) -> {outputs if len(self.outputs) == 1 else f'({outputs})'}"
+
+    @cached_property
+    def arguments(self) -> Callable[..., tuple]:
+        """The kernel's arguments from those of the op: what it takes, and new outputs, None where one is not wanted.
+
+        It is written out as Python, like the methods of a dataclass, for it runs in every call.
+        """
+        return self._function([p.argument for p in self.taken] + [self._new(p) for p in self.outputs], self._sizes())
+
+    @cached_property
+    def wanted(self) -> Callable[..., tuple[bool, ...]]:
+        """Whether each output is wanted, from the arguments of the op."""
+        return self._function([self._condition(p) for p in self.outputs])
+
+    def _function(self, expressions: list[str], sizes: dict[str, str] | None = None) -> Callable[..., tuple]:
+        lines = [f"def function({', '.join(p.name for p in self.inputs)}):"]
+        lines += [f"    {letter} = {size}" for letter, size in (sizes or {}).items()]
+        namespace: dict[str, Any] = {"torch": torch}
+        exec("\n".join([*lines, f"    return {', '.join(expressions)},"]), namespace)
+        return namespace["function"]
+
+    def _new(self, p: Parameter) -> str:
+        """The expression of an output without values."""
+        tensors = [x for x in self.inputs if x.shape is not None]
+        like = next((x for x in tensors if x.dtype == p.dtype), tensors[0])
+        lengths = ", ".join(d.expression for d in p.shape or ())
+        dtype = "" if like.dtype == p.dtype else f", dtype={p.dtype}"
+        return f"{like.name}.new_empty({lengths}{dtype}) if {self._condition(p)} else None"
+
+    def _sizes(self) -> dict[str, str]:
+        """The expression of each letter of the outputs; from a tensor that is always there, if there is such a one."""
+        used = {letter for p in self.outputs for d in p.shape or () for letter in d.factors}
+        sizes = {p.words["size"]: p.name for p in self.inputs if "size" in p.words}
+        for p in sorted(self.inputs, key=lambda p: p.optional):
+            for axis, d in enumerate(p.shape or ()):
+                if d.single in used and d.single not in sizes:
+                    size = f"{p.name}.shape[{axis}]" + f" - {d.constant}" * (d.constant > 0)
+                    size = f"({size}) // {d.factors[d.single]}" if d.factors[d.single] > 1 else size
+                    sizes[d.single] = f"0 if {p.name} is None else {size}" if p.optional else size
+        return sizes
+
+    def _condition(self, p: Parameter) -> str:
+        """The expression of whether an output is wanted."""
+        conditions = []
+        for name in p.names("if"):
+            other = next(x for x in self.inputs if x.name == name)
+            wants = other.names("wants")
+            place = f"[{wants.index(p.name[1:])}]" if len(wants) > 1 else ""
+            conditions.append(f"{name}{place}" + " is not None" * (other.shape is not None))
+        return " and ".join(conditions) or "True"
+
+
+# ---- arguments that do not fit ----
+
+
+def check(name: str, parameters: list[Parameter], given: Given, exact: bool = False) -> Sizes:
+    """Raise ValueError or TypeError if these arguments do not fit, and return the sizes by letter.
+
+    Parameters that are not given are not looked at. Tensors of floating point may have any dtype, unless it must be
+    `exact`.
     """
-    sizes = {letter: n for letter, n in given.items() if len(letter) == 1 and letter.isupper()}
+    sizes: Sizes = {p.words["size"]: given[p.name] for p in parameters if "size" in p.words and p.name in given}
     known = [p for p in parameters if p.name in given]
-    for p in known:
+    for p in sorted(known, key=lambda p: (p.output, "late" in p.words)):
         if p.shape is None:
-            _check_number(kernel, p, given[p.name])
-        elif _is_present(kernel, p, given):
-            _check_array(kernel, p, given[p.name], sizes)
+            _check_number(name, p, given[p.name])
+            continue
+        present = given[p.name] is not None
+        if not present and not p.optional and "if" not in p.words:
+            raise TypeError(f"{name}: {p.name} must not be None")
+        if "with" in p.words and present != (given[p.words["with"]] is not None):
+            raise ValueError(f"{name}: {p.words['with']} and {p.name} go together")
+        if present:
+            _check_tensor(name, p, given[p.name], sizes, exact)
     for p in known:
         for word, inside in p.words.items():
             if word in CHECKS and given[p.name] is not None:
                 bound, arrays = _inside(inside)
-                others = [given[name] for name in arrays] or ([bound.size(sizes)] if inside else [])
-                CHECKS[word](kernel, p.name, given[p.name], *others)
+                others = [given[other] for other in arrays] or ([bound.size(sizes)] if inside else [])
+                CHECKS[word](name, p.name, given[p.name], *others)
+    return sizes
 
 
-def _check_number(kernel: str, p: Parameter, value: float) -> None:
-    if "integer" in p.words:
-        low, high = (int(n) for n in p.words["integer"].split(","))
-        if not low <= value <= high:
-            raise ValueError(f"{kernel}: {p.name} must lie in {low}..{high}, not {value}")
+def _check_number(name: str, p: Parameter, value: float) -> None:
+    low, high = p.bounds
+    if "integer" in p.words and "choice" not in p.words and not low <= value <= high:
+        raise ValueError(f"{name}: {p.name} must lie in {low}..{high}, not {value}")
+    if p.words.get("number") and not low <= value < high:
+        raise ValueError(f"{name}: {p.name} must lie in [{low}, {high}), not {value}")
 
 
-def _is_present(kernel: str, p: Parameter, given: Given) -> bool:
-    present = given[p.name] is not None
-    if not present and not p.optional:
-        raise TypeError(f"{kernel}: {p.name} must not be None")
-    other = p.words.get("with")
-    if other and present != (given[other] is not None):
-        raise ValueError(f"{kernel}: {other} and {p.name} go together")
-    other = p.words.get("needs")
-    if other and present and given[other] is None:
-        raise ValueError(f"{kernel}: {p.name} needs {other}")
-    return present
-
-
-def _check_array(kernel: str, p: Parameter, x: Tensor, sizes: Sizes) -> None:
-    if x.dtype != p.dtype and not (p.dtype.is_floating_point and x.dtype.is_floating_point):
-        raise TypeError(f"{kernel}: {p.name} must be {str(p.dtype)[6:]}, not {x.dtype}")
+def _check_tensor(name: str, p: Parameter, x: Tensor, sizes: Sizes, exact: bool) -> None:
+    if x.dtype != p.dtype and (exact or not (p.dtype.is_floating_point and x.dtype.is_floating_point)):
+        raise TypeError(f"{name}: {p.name} must be {str(p.dtype)[6:]}, not {x.dtype}")
     shape, before = p.shape or (), dict(sizes)
     if x.dim() != len(shape) or not all(d.fits(n, sizes) for d, n in zip(shape, x.shape, strict=True)):
         wanted = ", ".join(d.show(before) for d in shape)
-        raise ValueError(f"{kernel}: {p.name} must have shape [{wanted}], not {tuple(x.shape)}")
+        raise ValueError(f"{name}: {p.name} must have shape [{wanted}], not {tuple(x.shape)}")
     if "filled" in p.words and not x.numel():
-        raise ValueError(f"{kernel}: {p.name} must have a shape without 0, not {tuple(x.shape)}")
+        raise ValueError(f"{name}: {p.name} must have a shape without 0, not {tuple(x.shape)}")
 
 
 # ---- values of index tensors ----

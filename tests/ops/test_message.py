@@ -281,7 +281,7 @@ def test_opcheck(with_messages, hidden, raw):
     lists = (edges.senders, edges.receivers, edges.receiver_offsets)
     torch.library.opcheck(ops._message.overload, (*inputs, *lists, with_messages))
     values = [x.detach() for x in inputs]
-    dmessages = torch.randn(30 if with_messages else 0, 6)
+    dmessages = torch.randn(30, 6) if with_messages else None
     torch.library.opcheck(
         ops._message_backward.overload, (torch.randn(5, 6), dmessages, *values, *lists, with_messages)
     )
@@ -421,7 +421,7 @@ def test_errors_name_op_argument_and_value(dtype):
     inputs[3:6] = (x.to(dtype) for x in op_inputs_of(edges, 6, 0, 3)[3:6])
     with pytest.raises(ValueError, match="message: a1 is empty: an encoder needs hidden channels"):
         message_sum(edges, *inputs[:3], tuple(inputs[3:6]), *inputs[6:10])
-    gradients = (torch.zeros(5, 6, dtype=dtype), torch.zeros(0, 6, dtype=dtype))
+    gradients = (torch.zeros(5, 6, dtype=dtype), None)
     for function, arguments in ((ops._message, (*inputs, False)), (ops._message_backward, (*gradients, *inputs, True))):
         with pytest.raises(ValueError, match="edge_features without an encoder must have the 6 channels of.*, not 3"):
             function(*arguments)

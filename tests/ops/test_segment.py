@@ -112,7 +112,7 @@ def test_opcheck():
 @pytest.mark.parametrize("rows, channels", [(0, 3), (1, 1), (3, 0), (511, 17), (512, 128), (5000, 33)])
 def test_column_sum(rows, channels):
     x = torch.randn(rows, channels)
-    assert_accurate(segment.column_sum, segment._column_sum_reference, [x])
+    assert_accurate(segment.column_sum, lambda x: x.sum(0), [x])
     assert_same_for_threads(lambda: [segment.column_sum(x)])
     torch.library.opcheck(segment._column_sum.overload, (x.requires_grad_(),))
     with pytest.raises(ValueError, match="column_sum: x must have shape"):
