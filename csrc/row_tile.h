@@ -97,8 +97,8 @@ AST_INLINE void row_strip(const int vectors, int64_t rows, int64_t K, row_pointe
 }
 
 /* Columns [column, column + width) of out. */
-static void row_panel(int64_t rows, int64_t width, int64_t K, row_pointers p, row_fetch next, const float *b,
-                      int64_t column) {
+AST_INLINE void row_panel(int64_t rows, int64_t width, int64_t K, row_pointers p, row_fetch next, const float *b,
+                          int64_t column) {
   if (width == GEMM_COLUMNS) row_strip(2, rows, K, p, next, b, column);
   else if (width == VW) row_strip(1, rows, K, p, next, b, column);
   if (width % VW == 0) return;
