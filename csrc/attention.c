@@ -62,24 +62,29 @@ typedef struct {
 
 /* Scores x become exp(x - base) 2^-shift; their sums over the n keys. */
 AST_INLINE void weights(float *x, int64_t n, const vf base[2], int32_t shift, vf sum[2]) {
-  for (int64_t j = 0; j < n; j++) EACH(2, c) {
+  for (int64_t j = 0; j < n; j++) {
+    EACH(2, c) {
       const vf p = vexp(vload(x + j * ROW + c * VW) - base[c], shift);
       sum[c] += p;
       vstore(x + j * ROW + c * VW, p);
     }
+  }
 }
 
 /* The same, with those weights that are dropped 0; the sums are of all. */
 AST_INLINE void dropped_weights(float *x, int64_t n, const vf base[2], int32_t shift, const dropout *d,
                                 dropout_words words[2], vf sum[2]) {
   const vu threshold = (vu){0} + (d->threshold << 16);
-  EACH(DROPOUT_SLOTS, slot)
-  for (int64_t lane = 0; lane < min64(n - slot * DROPOUT_LANES, DROPOUT_LANES); lane++) EACH(2, c) {
-      float *to = x + (slot * DROPOUT_LANES + lane) * ROW + c * VW;
-      const vf p = vexp(vload(to) - base[c], shift);
-      sum[c] += p;
-      vstore(to, dropout_keep(words[c][lane], slot, threshold, p));
+  EACH(DROPOUT_SLOTS, slot) {
+    for (int64_t lane = 0; lane < min64(n - slot * DROPOUT_LANES, DROPOUT_LANES); lane++) {
+      EACH(2, c) {
+        float *to = x + (slot * DROPOUT_LANES + lane) * ROW + c * VW;
+        const vf p = vexp(vload(to) - base[c], shift);
+        sum[c] += p;
+        vstore(to, dropout_keep(words[c][lane], slot, threshold, p));
+      }
     }
+  }
 }
 
 /* Takes n keys, k0 the first of them in the scene, into the state of a panel, the queries i0..i0+rows of the task. */

@@ -70,9 +70,10 @@ enum { DROPOUT_PARTS = DROPOUT_LANES / VW };
 typedef vu dropout_row[DROPOUT_PARTS][4];
 
 AST_INLINE void dropout_draw_keys(const dropout *d, int64_t query, int64_t group, dropout_row words) {
-  EACH(DROPOUT_PARTS, part)
-  dropout_draw(d, (vu)LANE_INDICES + (uint32_t)(group / DROPOUT_SLOTS + part * VW), (vu){0} + (uint32_t)query,
-               words[part]);
+  EACH(DROPOUT_PARTS, part) {
+    const vu keys = (vu)LANE_INDICES + (uint32_t)(group / DROPOUT_SLOTS + part * VW);
+    dropout_draw(d, keys, (vu){0} + (uint32_t)query, words[part]);
+  }
 }
 
 /* x where the weight of slot is kept, 0 where it is dropped; threshold in the upper half of the word. */

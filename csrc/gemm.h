@@ -30,8 +30,9 @@ AST_INLINE void gemm_transpose(const float *in, int64_t in_row, const int64_t n,
   vf x[VW];
   EACH(VW, j) x[j] = j < n ? vload_upto(in + j * in_row, m) : (vf){0};
   vtranspose(x);
-  EACH(VW, k)
-  if (k < m) vstore(out + k * GEMM_COLUMNS, x[k]);
+  EACH(VW, k) {
+    if (k < m) vstore(out + k * GEMM_COLUMNS, x[k]);
+  }
 }
 
 /* The same for blocks at the end; out of line, as it is long. */

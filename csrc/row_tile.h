@@ -74,8 +74,7 @@ AST_INLINE void row_tile(const int rows, const int vectors, int64_t K, row_point
       }
     }
   }
-  TILE_EACH(i, j)
-  vstore(p.out[i] + column + j * VW, vload(p.base[i] + column + j * VW) + sum[i][j]);
+  TILE_EACH(i, j) vstore(p.out[i] + column + j * VW, vload(p.base[i] + column + j * VW) + sum[i][j]);
 }
 
 AST_INLINE void row_strip(const int vectors, int64_t rows, int64_t K, row_pointers p, row_fetch next, const float *b,
