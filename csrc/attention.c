@@ -62,29 +62,29 @@ typedef struct {
 
 /* Scores x become exp(x - base) 2^-shift; their sums over the n keys. */
 AST_INLINE void weights(float *x, int64_t n, const vf base[2], int32_t shift, vf sum[2]) {
-  for (int64_t j = 0; j < n; j++)
-#pragma GCC unroll 2
-    for (int c = 0; c < 2; c++) {
+  for (int64_t j = 0; j < n; j++) {
+    EACH(2, c) {
       const vf p = vexp(vload(x + j * ROW + c * VW) - base[c], shift);
       sum[c] += p;
       vstore(x + j * ROW + c * VW, p);
     }
+  }
 }
 
 /* The same, with those weights that are dropped 0; the sums are of all. */
 AST_INLINE void dropped_weights(float *x, int64_t n, const vf base[2], int32_t shift, const dropout *d,
                                 dropout_words words[2], vf sum[2]) {
   const vu threshold = (vu){0} + (d->threshold << 16);
-#pragma GCC unroll 8
-  for (int slot = 0; slot < DROPOUT_SLOTS; slot++)
-    for (int64_t lane = 0; lane < min64(n - slot * DROPOUT_LANES, DROPOUT_LANES); lane++)
-#pragma GCC unroll 2
-      for (int c = 0; c < 2; c++) {
+  EACH(DROPOUT_SLOTS, slot) {
+    for (int64_t lane = 0; lane < min64(n - slot * DROPOUT_LANES, DROPOUT_LANES); lane++) {
+      EACH(2, c) {
         float *to = x + (slot * DROPOUT_LANES + lane) * ROW + c * VW;
         const vf p = vexp(vload(to) - base[c], shift);
         sum[c] += p;
         vstore(to, dropout_keep(words[c][lane], slot, threshold, p));
       }
+    }
+  }
 }
 
 /* Takes n keys, k0 the first of them in the scene, into the state of a panel, the queries i0..i0+rows of the task. */
@@ -94,8 +94,7 @@ static void forward_panel(forward_scratch *t, const forward_state *state, int64_
   const float *queries = t->queries + i0 * D;
   vf largest[2] = {vsplat(-INFINITY), vsplat(-INFINITY)}, base[2], sum[2] = {{0}};
   scores_product(round_up(n, ROW_STEP), D, t->keys, queries, t->scores, largest);
-#pragma GCC unroll 2
-  for (int c = 0; c < 2; c++) {
+  EACH(2, c) {
     const vf before = vload(m + c * VW), now = vmax(largest[c], before);
     base[c] = vselect(now == -INFINITY, (vf){0}, now); /* only -inf so far: weights 0, not NaN */
     vstore(fade + c * VW, vexp(before - base[c], 0));
@@ -107,8 +106,7 @@ static void forward_panel(forward_scratch *t, const forward_state *state, int64_
   } else {
     weights(t->scores, n, base, shift, sum);
   }
-#pragma GCC unroll 2
-  for (int c = 0; c < 2; c++) vstore(l + c * VW, vload(l + c * VW) * vload(fade + c * VW) + sum[c]);
+  EACH(2, c) vstore(l + c * VW, vload(l + c * VW) * vload(fade + c * VW) + sum[c]);
   columns_product(round_up(rows, ROW_STEP), D, n, t->scores, t->values, state->out + i0 * ROW, (update){first, fade});
 }
 

@@ -124,11 +124,9 @@ static void backward_group(backward_scratch *t, int64_t i, int64_t rows, int64_t
     }
     for (int64_t c = 0; !d->threshold && c < n; c += VW)
       gradient(x_r + c, dx_r + c, maximum, share, delta, NULL, 0, threshold);
-#pragma GCC unroll 8
-    for (int slot = 0; slot < DROPOUT_SLOTS; slot++) {
+    EACH(DROPOUT_SLOTS, slot) {
       if (!d->threshold || slot * DROPOUT_LANES >= n) break;
-#pragma GCC unroll 4
-      for (int part = 0; part < DROPOUT_PARTS; part++) {
+      EACH(DROPOUT_PARTS, part) {
         const int64_t c = slot * DROPOUT_LANES + part * VW;
         gradient(x_r + c, dx_r + c, maximum, share, delta, t->words[r][part], slot, threshold);
       }
@@ -154,8 +152,7 @@ static void load_queries(const backward_job *job, const backward_range *range, i
       vf x[VW], y[VW];
       load_transposed(t->dout + i * ROW + e, ROW, rows - i, y);
       load_transposed(out + i * H * D + e, H * D, rows - i, x);
-#pragma GCC unroll 16
-      for (int j = 0; j < VW; j++) chain += y[j] * x[j];
+      EACH(VW, j) chain += y[j] * x[j];
       if ((e + VW) % SCORE_DEPTH && e + VW < D) continue;
       sum = chain + sum, chain = (vf){0};
     }

@@ -51,36 +51,21 @@ AST_INLINE int64_t next_tile(int64_t rest) {
     else f##_4(tile_, __VA_ARGS__);                             \
   }
 
-/* sum_ij = sum_k A_ik b[k b_row + j], j over `vectors` vectors */
-AST_INLINE void tile_product(const int rows, const int vectors, int64_t K, gemm_a a, const float *b,
-                             const int64_t b_row, vf sum[GEMM_ROWS][2]) {
-#pragma GCC unroll 12
-  for (int i = 0; i < rows; i++)
-#pragma GCC unroll 2
-    for (int j = 0; j < vectors; j++) sum[i][j] = (vf){0};
-  gemm_sums(rows, vectors, K, a, b, b_row, sum);
-}
-
 /* x[row][lane] = (x[row][lane] +) a[row] . b[lane] over D channels for a tile of rows; raises largest[2], unless NULL,
  * to the maximum of x. */
 AST_INLINE void chain_tile(const int rows, const bool add, int64_t i, int64_t D, const float *a, const float *b,
                            float *x, vf *largest) {
   vf sum[GEMM_ROWS][2];
-  tile_product(rows, 2, D, (gemm_a){a + i * ROW, ROW, 1}, b, LANES, sum);
-#pragma GCC unroll 12
-  for (int r = 0; r < rows; r++)
-#pragma GCC unroll 2
-    for (int j = 0; j < 2; j++) {
-      float *to = x + (i + r) * ROW + j * VW;
-      if (add) sum[r][j] += vload(to);
-      vstore(to, sum[r][j]);
-    }
+  gemm_product(rows, 2, D, (gemm_a){a + i * ROW, ROW, 1}, b, LANES, sum);
+  EACH(rows, r) EACH(2, j) {
+    float *to = x + (i + r) * ROW + j * VW;
+    if (add) sum[r][j] += vload(to);
+    vstore(to, sum[r][j]);
+  }
   if (!largest) return;
-#pragma GCC unroll 2
-  for (int j = 0; j < 2; j++) {
+  EACH(2, j) {
     vf m = largest[j];
-#pragma GCC unroll 12
-    for (int r = 0; r < rows; r++) m = vmax(sum[r][j], m);
+    EACH(rows, r) m = vmax(sum[r][j], m);
     largest[j] = m;
   }
 }
@@ -112,29 +97,20 @@ typedef struct {
 AST_INLINE void product_tile(const int rows, int64_t i, const int vectors, int64_t K, const float *a,
                              const int64_t a_row, const int64_t a_column, const float *b, float *c, update how) {
   vf sum[GEMM_ROWS][2];
-  tile_product(rows, vectors, K, (gemm_a){a + i * a_row, a_row, a_column}, b, ROW, sum);
+  gemm_product(rows, vectors, K, (gemm_a){a + i * a_row, a_row, a_column}, b, ROW, sum);
   c += i * ROW;
   if (how.set) {
-#pragma GCC unroll 12
-    for (int r = 0; r < rows; r++)
-#pragma GCC unroll 2
-      for (int j = 0; j < vectors; j++) vstore(c + r * ROW + j * VW, sum[r][j]);
+    TILE_EACH(r, j) vstore(c + r * ROW + j * VW, sum[r][j]);
   } else if (how.factor) {
-#pragma GCC unroll 12
-    for (int r = 0; r < rows; r++)
-#pragma GCC unroll 2
-      for (int j = 0; j < vectors; j++) {
-        float *to = c + r * ROW + j * VW;
-        vstore(to, how.factor[i + r] * vload(to) + sum[r][j]);
-      }
+    TILE_EACH(r, j) {
+      float *to = c + r * ROW + j * VW;
+      vstore(to, how.factor[i + r] * vload(to) + sum[r][j]);
+    }
   } else {
-#pragma GCC unroll 12
-    for (int r = 0; r < rows; r++)
-#pragma GCC unroll 2
-      for (int j = 0; j < vectors; j++) {
-        float *to = c + r * ROW + j * VW;
-        vstore(to, vload(to) + sum[r][j]);
-      }
+    TILE_EACH(r, j) {
+      float *to = c + r * ROW + j * VW;
+      vstore(to, vload(to) + sum[r][j]);
+    }
   }
 }
 
@@ -166,8 +142,7 @@ static void columns_product(int64_t M, int64_t N, int64_t K, const float *a, con
 
 /* x_dj = from[j][d] for VW rows and VW channels; rows from `rows` on are 0 and not read */
 AST_INLINE void load_transposed(const float *from, int64_t stride, int64_t rows, vf x[VW]) {
-#pragma GCC unroll 16
-  for (int j = 0; j < VW; j++) x[j] = j < rows ? vload(from + j * stride) : (vf){0};
+  EACH(VW, j) x[j] = j < rows ? vload(from + j * stride) : (vf){0};
   vtranspose(x);
 }
 
@@ -177,8 +152,7 @@ static void pack_panel(const float *from, int64_t stride, int64_t rows, int64_t 
     for (int64_t d = 0; d < D; d += VW) {
       vf x[VW];
       load_transposed(from + j * stride + d, stride, rows - j, x);
-#pragma GCC unroll 16
-      for (int i = 0; i < VW; i++) vstore(panel + (d + i) * LANES + j, factor * x[i]);
+      EACH(VW, i) vstore(panel + (d + i) * LANES + j, factor * x[i]);
     }
 }
 

@@ -30,10 +30,8 @@ static dropout dropout_of(const ast_attention *s, int64_t scene, int64_t head) {
 
 AST_INLINE void threefry(const uint32_t key[5], vu x[4]) {
   static const uint8_t rotation[8][2] = {{10, 26}, {11, 21}, {13, 27}, {23, 5}, {6, 20}, {17, 11}, {25, 10}, {18, 20}};
-#pragma GCC unroll 4
-  for (int i = 0; i < 4; i++) x[i] += key[i];
-#pragma GCC unroll 12
-  for (int round = 0; round < 12; round++) {
+  EACH(4, i) x[i] += key[i];
+  EACH(12, round) {
     const int a = round % 2 ? 3 : 1, b = round % 2 ? 1 : 3;
     const uint32_t r = rotation[round % 8][0], t = rotation[round % 8][1];
     x[0] += x[a];
@@ -52,8 +50,7 @@ AST_INLINE void threefry(const uint32_t key[5], vu x[4]) {
 AST_INLINE void dropout_draw(const dropout *d, vu counter, vu query, vu words[4]) {
   vu x[4] = {counter, query, {0}, {0}};
   threefry(d->key, x);
-#pragma GCC unroll 4
-  for (int i = 0; i < 4; i++) words[i] = x[i];
+  EACH(4, i) words[i] = x[i];
 }
 
 /* Words are drawn ahead of their use: a loop of nothing else keeps several counters in flight, each of which is a long
@@ -73,10 +70,10 @@ enum { DROPOUT_PARTS = DROPOUT_LANES / VW };
 typedef vu dropout_row[DROPOUT_PARTS][4];
 
 AST_INLINE void dropout_draw_keys(const dropout *d, int64_t query, int64_t group, dropout_row words) {
-#pragma GCC unroll 4
-  for (int part = 0; part < DROPOUT_PARTS; part++)
-    dropout_draw(d, (vu)LANE_INDICES + (uint32_t)(group / DROPOUT_SLOTS + part * VW), (vu){0} + (uint32_t)query,
-                 words[part]);
+  EACH(DROPOUT_PARTS, part) {
+    const vu keys = (vu)LANE_INDICES + (uint32_t)(group / DROPOUT_SLOTS + part * VW);
+    dropout_draw(d, keys, (vu){0} + (uint32_t)query, words[part]);
+  }
 }
 
 /* x where the weight of slot is kept, 0 where it is dropped; threshold in the upper half of the word. */

@@ -74,8 +74,7 @@ AST_INLINE uint32_t FPS(near)(const FPS(scene) * scene, const COORDINATE *box, T
   uint32_t bits = 0;
   for (int l = 0; l < 32; l++) {
     int32_t d[3] = {x[l], y[l], z[l]};
-#pragma GCC unroll 3
-    for (int a = 0; a < 3; a++) {
+    EACH(3, a) {
       const int32_t below = box[a] - d[a], above = d[a] - box[3 + a], outside = below > above ? below : above;
       d[a] = outside > 0 ? outside : 0;
     }

@@ -28,12 +28,11 @@ AST_INLINE int64_t gemm_packed_size(int64_t K, int64_t N) { return K * round_up(
 /* out[k][j] = in[j][k] for n rows j of m columns k, both at most VW; out has VW columns within a panel, 0 from n on. */
 AST_INLINE void gemm_transpose(const float *in, int64_t in_row, const int64_t n, const int64_t m, float *out) {
   vf x[VW];
-#pragma GCC unroll 16
-  for (int j = 0; j < VW; j++) x[j] = j < n ? vload_upto(in + j * in_row, m) : (vf){0};
+  EACH(VW, j) x[j] = j < n ? vload_upto(in + j * in_row, m) : (vf){0};
   vtranspose(x);
-#pragma GCC unroll 16
-  for (int k = 0; k < VW; k++)
+  EACH(VW, k) {
     if (k < m) vstore(out + k * GEMM_COLUMNS, x[k]);
+  }
 }
 
 /* The same for blocks at the end; out of line, as it is long. */
@@ -76,13 +75,10 @@ AST_INLINE void gemm_sums(const int rows, const int vectors, int64_t K, gemm_a a
                           vf sum[GEMM_ROWS][2]) {
   for (int64_t k = 0; k < K; k++) {
     vf b_k[2];
-#pragma GCC unroll 2
-    for (int j = 0; j < vectors; j++) b_k[j] = vload(b + k * b_row + j * VW);
-#pragma GCC unroll 12
-    for (int i = 0; i < rows; i++) {
+    EACH(vectors, j) b_k[j] = vload(b + k * b_row + j * VW);
+    EACH(rows, i) {
       const vf a_ik = vsplat(a.data[i * a.row + k * a.column]);
-#pragma GCC unroll 2
-      for (int j = 0; j < vectors; j++) sum[i][j] += a_ik * b_k[j];
+      EACH(vectors, j) sum[i][j] += a_ik * b_k[j];
     }
   }
 }
@@ -104,12 +100,18 @@ AST_INLINE void gemm_sums(const int rows, const int vectors, int64_t K, gemm_a a
 #define TILES_OF_ROWS(i, n, rows, tile) \
   for (; i + (rows) <= (n); i += (rows)) tile(rows)
 
-/* One register tile. */
+/* sum_ij = sum_k A_ik B_kj */
+AST_INLINE void gemm_product(const int rows, const int vectors, int64_t K, gemm_a a, const float *b, int64_t b_row,
+                             vf sum[GEMM_ROWS][2]) {
+  TILE_EACH(i, v) sum[i][v] = (vf){0};
+  gemm_sums(rows, vectors, K, a, b, b_row, sum);
+}
+
+/* One register tile of C. */
 AST_INLINE void gemm_tile(const int rows, const int vectors, int64_t K, gemm_a a, const float *b, int64_t b_row,
                           float *c, int64_t c_row, bool add) {
   vf sum[GEMM_ROWS][2];
-  TILE_EACH(i, v) sum[i][v] = (vf){0};
-  gemm_sums(rows, vectors, K, a, b, b_row, sum);
+  gemm_product(rows, vectors, K, a, b, b_row, sum);
   TILE_EACH(i, v) {
     float *c_iv = c + i * c_row + v * VW;
     vstore(c_iv, add ? vload(c_iv) + sum[i][v] : sum[i][v]);

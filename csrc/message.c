@@ -68,30 +68,23 @@ AST_INLINE void message_first_tile(const int rows, const int vectors, const mess
   const ast_message *s = w->step;
   const int64_t c = p * GEMM_COLUMNS, n = s->F - c;
   vf sum[GEMM_ROWS][2];
-#pragma GCC unroll 12
-  for (int i = 0; i < rows; i++) {
+  EACH(rows, i) {
     const float *next = s->of_senders + s->senders[min64(m + i + MESSAGE_TILE, s->M - 1)] * s->F + c;
-#pragma GCC unroll 2
-    for (int v = 0; v < vectors; v++) {
+    EACH(vectors, v) {
       sum[i][v] = (vf){0};
       __builtin_prefetch(next + v * VW);
     }
   }
   if (message_has_latents(s)) {
     const float *e = s->edge_features + m * s->F + c;
-#pragma GCC unroll 12
-    for (int i = 0; i < rows; i++)
-#pragma GCC unroll 2
-      for (int v = 0; v < vectors; v++) sum[i][v] = vload_upto(e + i * s->F + v * VW, n - v * VW);
+    TILE_EACH(i, v) sum[i][v] = vload_upto(e + i * s->F + v * VW, n - v * VW);
   }
   const dense_layer *l = &w->layers[MESSAGE_A2];
   if (s->H) dense_sums(rows, vectors, l, (gemm_a){h, w->row, 1}, l->panels + c * s->H, sum);
-#pragma GCC unroll 12
-  for (int i = 0; i < rows; i++) {
+  EACH(rows, i) {
     const float *P = s->of_senders + s->senders[m + i] * s->F + c,
                 *Q = s->of_receivers + s->receivers[m + i] * s->F + c;
-#pragma GCC unroll 2
-    for (int v = 0; v < vectors; v++) {
+    EACH(vectors, v) {
       const vf z = vload_upto(P + v * VW, n - v * VW) + vload_upto(Q + v * VW, n - v * VW) + sum[i][v];
       vstore(x + i * w->row + c + v * VW, vmax((vf){0}, z));
     }

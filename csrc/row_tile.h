@@ -55,11 +55,9 @@ AST_INLINE void row_tile(const int rows, const int vectors, int64_t K, row_point
                          int64_t column) {
   const float *a[GEMM_ROWS];
   vf sum[GEMM_ROWS][2];
-#pragma GCC unroll 12
-  for (int i = 0; i < rows; i++) {
+  EACH(rows, i) {
     a[i] = p.a[i];
-#pragma GCC unroll 2
-    for (int j = 0; j < vectors; j++) sum[i][j] = (vf){0};
+    EACH(vectors, j) sum[i][j] = (vf){0};
   }
   for (int64_t k0 = 0; k0 < K; k0 += LINE) {
     for (int64_t i = 0; i < next.n; i++) {
@@ -69,21 +67,14 @@ AST_INLINE void row_tile(const int rows, const int vectors, int64_t K, row_point
     const int64_t end = min64(K, k0 + LINE);
     for (int64_t k = k0; k < end; k++) {
       vf b_k[2];
-#pragma GCC unroll 2
-      for (int j = 0; j < vectors; j++) b_k[j] = vload(b + k * GEMM_COLUMNS + j * VW);
-#pragma GCC unroll 12
-      for (int i = 0; i < rows; i++) {
+      EACH(vectors, j) b_k[j] = vload(b + k * GEMM_COLUMNS + j * VW);
+      EACH(rows, i) {
         const vf a_ik = vsplat(a[i][k]);
-#pragma GCC unroll 2
-        for (int j = 0; j < vectors; j++) sum[i][j] += a_ik * b_k[j];
+        EACH(vectors, j) sum[i][j] += a_ik * b_k[j];
       }
     }
   }
-#pragma GCC unroll 12
-  for (int i = 0; i < rows; i++)
-#pragma GCC unroll 2
-    for (int j = 0; j < vectors; j++)
-      vstore(p.out[i] + column + j * VW, vload(p.base[i] + column + j * VW) + sum[i][j]);
+  TILE_EACH(i, j) vstore(p.out[i] + column + j * VW, vload(p.base[i] + column + j * VW) + sum[i][j]);
 }
 
 AST_INLINE void row_strip(const int vectors, int64_t rows, int64_t K, row_pointers p, row_fetch next, const float *b,
@@ -97,8 +88,8 @@ AST_INLINE void row_strip(const int vectors, int64_t rows, int64_t K, row_pointe
 }
 
 /* Columns [column, column + width) of out. */
-static void row_panel(int64_t rows, int64_t width, int64_t K, row_pointers p, row_fetch next, const float *b,
-                      int64_t column) {
+AST_INLINE void row_panel(int64_t rows, int64_t width, int64_t K, row_pointers p, row_fetch next, const float *b,
+                          int64_t column) {
   if (width == GEMM_COLUMNS) row_strip(2, rows, K, p, next, b, column);
   else if (width == VW) row_strip(1, rows, K, p, next, b, column);
   if (width % VW == 0) return;
@@ -122,31 +113,22 @@ typedef struct {
 AST_INLINE void column_tile(const int rows, const int vectors, int64_t K, column_pointers p, const float *base,
                             float *out, int64_t row) {
   vf sum[GEMM_ROWS][2];
-#pragma GCC unroll 12
-  for (int i = 0; i < rows; i++)
-#pragma GCC unroll 2
-    for (int j = 0; j < vectors; j++) sum[i][j] = (vf){0};
+  TILE_EACH(i, j) sum[i][j] = (vf){0};
   for (int64_t k = 0; k < K; k++) {
     __builtin_prefetch(p.next[k] + p.next_column, 0, 2);
     const float *a = p.a[k] + p.a_column, *b = p.b[k] + p.b_column;
     __asm__("" : "+r"(a), "+r"(b)); /* as pointers, or the compiler keeps a register for each offset */
     vf b_k[2];
-#pragma GCC unroll 2
-    for (int j = 0; j < vectors; j++) b_k[j] = vload(b + j * VW);
-#pragma GCC unroll 12
-    for (int i = 0; i < rows; i++) {
+    EACH(vectors, j) b_k[j] = vload(b + j * VW);
+    EACH(rows, i) {
       const vf a_ki = vsplat(a[i]);
-#pragma GCC unroll 2
-      for (int j = 0; j < vectors; j++) sum[i][j] += a_ki * b_k[j];
+      EACH(vectors, j) sum[i][j] += a_ki * b_k[j];
     }
   }
-#pragma GCC unroll 12
-  for (int i = 0; i < rows; i++)
-#pragma GCC unroll 2
-    for (int j = 0; j < vectors; j++) {
-      const int64_t ij = i * row + j * VW;
-      vstore(out + ij, base ? vload(base + ij) + sum[i][j] : sum[i][j]);
-    }
+  TILE_EACH(i, j) {
+    const int64_t ij = i * row + j * VW;
+    vstore(out + ij, base ? vload(base + ij) + sum[i][j] : sum[i][j]);
+  }
 }
 
 AST_INLINE void column_strip(const int vectors, int64_t rows, int64_t K, column_pointers p, const float *base,

@@ -34,19 +34,16 @@ static segment_job segment_plan(const float *x, int64_t F, const int64_t *order,
 AST_INLINE void segment_columns(const int vectors, const segment_job *job, int64_t begin, int64_t end, int64_t f,
                                 float scale, float *out) {
   vf sum[SEGMENT_VECTORS];
-#pragma GCC unroll 8
-  for (int v = 0; v < vectors; v++) sum[v] = (vf){0};
+  EACH(vectors, v) sum[v] = (vf){0};
   for (int64_t j = begin; j < end; j++) {
     const float *row = job->x + job->order[j] * job->F + f,
                 *later = job->x + job->order[min64(j + SEGMENT_AHEAD, job->last)] * job->F + f;
-#pragma GCC unroll 8
-    for (int v = 0; v < vectors; v++) {
+    EACH(vectors, v) {
       if (v * VW % 16 == 0) __builtin_prefetch(later + v * VW);
       sum[v] += vload(row + v * VW);
     }
   }
-#pragma GCC unroll 8
-  for (int v = 0; v < vectors; v++) vstore(out + f + v * VW, sum[v] * scale);
+  EACH(vectors, v) vstore(out + f + v * VW, sum[v] * scale);
 }
 
 static ast_status segment_sum_task(int64_t index, void *context) {

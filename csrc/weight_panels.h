@@ -262,9 +262,7 @@ static void dense_add_rows(const float *x, int64_t row, int64_t rows, int64_t n,
   for (int64_t j = 0; j < n; j += VW) {
     vf chain[4] = {{0}};
     int64_t i = 0;
-    for (; i + 4 <= rows; i += 4)
-#pragma GCC unroll 4
-      for (int c = 0; c < 4; c++) chain[c] += vload(x + (i + c) * row + j);
+    for (; i + 4 <= rows; i += 4) EACH(4, c) chain[c] += vload(x + (i + c) * row + j);
     for (; i < rows; i++) chain[0] += vload(x + i * row + j);
     vstore(sums + j, vload(sums + j) + ((chain[0] + chain[1]) + (chain[2] + chain[3])));
   }

@@ -2,8 +2,14 @@
 
 Legend: a case is an op, its composition and its floating inputs. `python tests/ops/test_accuracy_random.py 400` looks
 for cases that miss the rule among more draws, and prints them with the errors of op and composition.
+
+Some attentions must miss it: where scores are large, a few rows decide both largest errors, and of two computations
+rounded alike either may have the larger one. The composition with channels and keys in another order misses the rule
+beside itself in 7 of 100 draws, the kernel in 5, or in 9 without FMA (docs/log.md). So the draws that are tested are
+few and fixed, and a mean over many draws is tested as well.
 """
 
+import math
 import sys
 from collections.abc import Callable
 
@@ -69,18 +75,40 @@ class Draw:
         return torch.tensor([0, *sizes]).cumsum(0)
 
 
-def attention_case(draw: Draw) -> Case:
+def attention_problem(draw: Draw) -> tuple[list[Tensor], tuple]:
+    """Inputs, and what follows them."""
     scenes, heads, width = draw.number(1, 3), draw.number(1, 4), 16 * draw.number(1, 8)
     q_offsets, k_offsets = (draw.offsets(scenes, 400) for _ in range(2))
     while not (q_offsets.diff() * k_offsets.diff()).any():  # somebody attends to somebody
         q_offsets, k_offsets = (draw.offsets(scenes, 400) for _ in range(2))
     amplitude, p = draw.real(0.1, 1e4) ** 0.5, draw.one_of(0.0, 0.0, 0.1)
     q, k, v = (draw.normal(int(n[-1]), heads, width) for n in (q_offsets, k_offsets, k_offsets))
-    settings = (q_offsets, k_offsets, width**-0.5, p, 7)
+    return [amplitude * q, amplitude * k, v], (q_offsets, k_offsets, width**-0.5, p, 7)
+
+
+def attention_case(draw: Draw) -> Case:
+    inputs, settings = attention_problem(draw)
     return (
         lambda q, k, v: attention(q, k, v, *settings)[0],
         lambda q, k, v: _attention._reference(q, k, v, *settings)[0],
-        [amplitude * q, amplitude * k, v],
+        inputs,
+    )
+
+
+def reordered_attention_case(draw: Draw) -> Case:
+    """The composition in the kernel's place, with channels, and keys unless they are dropped, in another order."""
+    inputs, settings = attention_problem(draw)
+    _, k_offsets, _, p, _ = settings
+    channels, keys = torch.randperm(inputs[0].shape[-1], generator=draw.generator), torch.arange(len(inputs[1]))
+    if p == 0:
+        parts = [
+            part[torch.randperm(len(part), generator=draw.generator)] for part in keys.split(k_offsets.diff().tolist())
+        ]
+        keys = torch.cat(parts)
+    return (
+        lambda q, k, v: _attention._reference(q[..., channels], k[keys][..., channels], v[keys], *settings)[0],
+        lambda q, k, v: _attention._reference(q, k, v, *settings)[0],
+        inputs,
     )
 
 
@@ -199,16 +227,26 @@ def test_accuracy(family, number, request):
     assert_accurate(*family(Draw(SEED + number)))
 
 
+def test_attention_is_more_accurate_than_its_composition_in_the_mean():
+    """The geometric mean of the ratios of largest errors is 0.8, or 0.84 without FMA."""
+    ratios = []
+    for number in range(100):
+        found = errors(*attention_case(Draw(SEED + number)))
+        ratios += [math.log(c / t) for c, t, m in found if c > 0 and t > 1e-7 * m]
+    assert len(ratios) > 300
+    assert math.exp(sum(ratios) / len(ratios)) < 1
+
+
 if __name__ == "__main__":
-    total = missed = 0
-    for case in CASES:
+    for case in [*CASES, reordered_attention_case]:
+        missed = 0
         for seed in range(int(sys.argv[1])):
-            total += 1
             found = errors(*case(Draw(seed)))
+            found = [(c, t, m) for c, t, m in found if m == 0 or m > 2**-120]  # kernels take subnormal numbers for 0
             shares = [c / (2 * t + 1e-6 * m + 1e-300) for c, t, m in found]
             if max(shares, default=0) > 1:
                 missed += 1
                 worst = shares.index(max(shares))
                 c, t, m = found[worst]
                 print(f"{case.__name__} {seed}: result {worst} off by {c:.1e}, composition {t:.1e}, largest {m:.1e}")
-    print(f"{missed} of {total} cases miss the rule")
+        print(f"{case.__name__}: {missed} of {sys.argv[1]} miss the rule")

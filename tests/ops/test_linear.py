@@ -80,9 +80,11 @@ def test_accuracy_of_small_and_large_values(amplitude, activation):
 
 @pytest.mark.parametrize("inputs, outputs", [(193, 4), (4096, 8), (8, 4096)])
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_accuracy_of_wide_layers(inputs, outputs, activation):
-    """One chain of thousands of terms would lose a digit against sums in blocks."""
-    assert_accurate(fused(activation), composed(activation), case(64, inputs, outputs, activation))
+@pytest.mark.parametrize("positive", [False, True])
+def test_accuracy_of_wide_layers(inputs, outputs, activation, positive):
+    """One chain of thousands of terms would lose a digit against sums in blocks, most where all are positive."""
+    x = case(64, inputs, outputs, activation)
+    assert_accurate(fused(activation), composed(activation), [y.abs() for y in x] if positive else x)
 
 
 def test_accuracy_of_long_sums():

@@ -80,6 +80,21 @@ def test_accuracy_of_messages(size, width, hidden, raw, out):
     assert_accurate(fused(edges, message_edges), composed(edges, True), inputs_of(edges, width, hidden, raw, out))
 
 
+WIDE = [(4096, 8, 3, 8, False), (8, 4096, 3, 8, False), (8, 8, 4096, 8, False), (8, 8, 3, 4096, False)]
+WIDE += [(8, 4096, 3, 8, True), (4096, 0, 4096, 8, True)]
+
+
+@pytest.mark.parametrize("width, hidden, raw, out, positive", WIDE)
+def test_accuracy_of_wide_layers(width, hidden, raw, out, positive):
+    """Sums over features, hidden units and channels are cut into chains: one long chain loses a digit of positive
+    terms."""
+    edges = random_edges(200, 50, 30)
+    inputs = inputs_of(edges, width, hidden, raw, out)
+    if positive:
+        inputs = [None if x is None else x.abs() for x in inputs]
+    assert_accurate(fused(edges), composed(edges), inputs)
+
+
 @with_and_without_encoder
 def test_accuracy_over_several_rounds(width, hidden, raw):
     edges = random_edges(40_000, 3000, 2000)

@@ -100,6 +100,16 @@ def test_accuracy_of_a_mean_far_above_the_spread():
     assert_accurate(fused(keep), composed(keep), x)
 
 
+@pytest.mark.parametrize("inputs, hidden, outputs", [(4096, 8, 8), (8, 4096, 8), (8, 8, 4096)])
+@pytest.mark.parametrize("positive", [False, True])
+@pytest.mark.parametrize("saved", [0, ops.SAVED])
+def test_accuracy_of_wide_layers(inputs, hidden, outputs, positive, saved, monkeypatch):
+    """Sums over inputs, hidden units and outputs are cut into chains: one chain loses a digit of positive terms."""
+    monkeypatch.setattr(ops, "SAVED", saved)
+    x, keep = chosen(case(64, inputs, hidden, outputs), beside=False)
+    assert_accurate(fused(keep), composed(keep), [y.abs() for y in x] if positive else x)
+
+
 def test_accuracy_of_long_sums():
     """The gradients of weights, biases, gamma and beta are sums over all rows, here of equal terms."""
     x, keep = chosen(case(50_000, 4, 6, 3), beside=False, residual=False)

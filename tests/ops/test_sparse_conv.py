@@ -44,6 +44,15 @@ def test_accuracy(nodes, channels):
     assert_accurate(lambda x, w: sparse_conv_transposed(x, w, map), composed_transposed(map), inputs)
 
 
+@pytest.mark.parametrize("channels", [(4096, 8), (8, 4096)])
+def test_accuracy_of_many_channels(channels):
+    """A sum over channels is cut into chains, forward over those of x and backward over those of the output."""
+    map = level(60)
+    assert_accurate(lambda x, w: sparse_conv(x, w, map), composed(map), features(map.num_fine, channels))
+    inputs = features(len(map.coarse.keys), channels)
+    assert_accurate(lambda x, w: sparse_conv_transposed(x, w, map), composed_transposed(map), inputs)
+
+
 def test_dense_convolution():
     """Zeros in place of the absent cells, kernel 3, stride 2, padding 1."""
     map, depth = level(700, depth=3), 3
