@@ -7,6 +7,7 @@ TORCH := $(shell sed -n 's/^torch==/torch==/p' constraints.txt)
 PIP := $(BIN)/pip install --quiet --constraint constraints.txt
 C_SOURCES := $(wildcard csrc/*.c csrc/*.h csrc/tests/simd_*.h)
 C_TESTS := $(patsubst csrc/tests/test_%.c,%,$(wildcard csrc/tests/test_*.c))
+SLOW_FIRST := $(filter attention linear message fps,$(C_TESTS)) $(filter-out attention linear message fps,$(C_TESTS))
 C_FUZZERS := $(patsubst csrc/tests/fuzz_%.c,%,$(wildcard csrc/tests/fuzz_*.c))
 C_TEST_HEADERS := $(wildcard csrc/tests/*.h)
 X86 := $(filter x86_64,$(shell uname -m))
@@ -16,7 +17,8 @@ X86 := $(filter x86_64,$(shell uname -m))
 demo: $(VENV)/installed
 	$(BIN)/ast-sim demo
 
-# The op tests run once more on each instruction set that is supported but was not chosen, except those that run on all by themselves.
+# The op tests run once more on each instruction set that is supported but was not chosen, except those that run on all by themselves, and
+# those that no kernel has a part in: how the ops are registered (opcheck), and how the library is found and told of threads.
 OTHER_SETS = from ast_sim.ops.library import configuration as c; print(*(i for i in c()["supported"] if i != c()["instruction_set"]))
 
 # Side by side, of a file in any order; more than four processes could want more memory than there is.
@@ -25,7 +27,8 @@ PYTEST := $(BIN)/python -m pytest --numprocesses=auto --maxprocesses=4 --dist=wo
 test: $(VENV)/tested
 	$(PYTEST)
 	@set -e; for isa in $$($(BIN)/python -c '$(OTHER_SETS)'); do \
-	  echo "AST_SIM_ISA=$$isa"; AST_SIM_ISA=$$isa $(PYTEST) tests/ops -k "not every_instruction_set"; \
+	  echo "AST_SIM_ISA=$$isa"; AST_SIM_ISA=$$isa $(PYTEST) tests/ops --ignore=tests/ops/test_library.py \
+	      -k "not every_instruction_set and not opcheck"; \
 	done
 
 bench: $(VENV)/benched
@@ -47,10 +50,15 @@ lint: $(VENV)/tested
 docs: $(VENV)/installed
 	$(BIN)/python docs/make_reference.py
 
+BUILDS := sanitized valgrind races $(if $(X86),aarch64 wide) plain gcc11 clang
+CHECKS := $(foreach build,$(BUILDS),$(patsubst %,build/check/$(build)/%.passed,$(SLOW_FIRST))) \
+  $(addprefix build/check/fuzz_,$(addsuffix .passed,$(C_FUZZERS)))
+
 # The C tests, which need no Python: optimised, under the address and undefined behaviour sanitizers, under the thread sanitizer,
 # under valgrind, and as GCC 11, clang and GCC for aarch64 (on an emulator) compile them. `wide` compiles the 64-byte source for AVX2, so
 # that its logic is tested where there is no AVX-512. The kept inputs of the fuzz targets run once more.
-check: $(addprefix build/check/,$(addsuffix .passed,$(C_TESTS))) $(addprefix build/check/fuzz_,$(addsuffix .passed,$(C_FUZZERS)))
+# Each test of each build is a target of its own, those that take longest first, so that with `--jobs` no core is left idle in the end.
+check: $(CHECKS)
 
 # New inputs for each fuzz target for FUZZ_SECONDS; what it finds lies in build/fuzz. FUZZ names fewer targets.
 FUZZ_SECONDS ?= 600
@@ -83,8 +91,9 @@ $(VENV)/installed: $(VENV)/torch pyproject.toml setup.py MANIFEST.in $(C_SOURCES
 	$(PIP) --editable '.[simulate,view]'
 	touch $@
 
+# By name, the package that is there gets its extras; by path, it would be built once more, half a minute on one core.
 $(VENV)/tested: $(VENV)/installed | tools
-	$(PIP) --editable '.[simulate,cad,cluster,tfrecord,view,test]'
+	$(PIP) 'ast_sim[simulate,cad,cluster,tfrecord,view,test]'
 	touch $@
 
 $(VENV)/benched: $(VENV)/installed
@@ -116,6 +125,9 @@ GCC := $(CC) $(C_FLAGS) $(GCC_WARNINGS)
 CLANG := clang $(C_FLAGS) -w
 COMPILE_plain := $(GCC) -O3
 # GCC fuses products and sums into one operation from -O2 on; AST_UNFUSED tells the test of rounding errors where it does not.
+# GCC fuses products and sums into one operation from -O2 on; AST_UNFUSED tells the test of rounding errors where it does not.
+# The kernels are not optimised under the sanitizers: that took 73 s of compiling for 12 s of running, on one core.
+UNOPTIMISED_sanitized := -O0
 COMPILE_sanitized := $(GCC) -O1 -g -DAST_UNFUSED -fsanitize=$(SANITIZE) -fno-sanitize-recover=all
 COMPILE_races := $(CLANG) -O1 -g -DAST_UNFUSED -fsanitize=thread
 COMPILE_valgrind := $(GCC) -O1 -g -DAST_UNFUSED
@@ -123,17 +135,16 @@ COMPILE_valgrind := $(GCC) -O1 -g -DAST_UNFUSED
 # targets themselves: the sizes that a kernel compares do not stand in an input, and the tracing took most of the time.
 COMPILE_fuzz := $(CLANG) -O0 -g -fsanitize=fuzzer-no-link,$(SANITIZE) -fno-sanitize-coverage=trace-cmp -fno-sanitize-recover=all
 COMPILE_target := $(CLANG) -O1 -g -fsanitize=$(SANITIZE) -fno-sanitize-recover=all
-COMPILE_wide := $(GCC) -O2 -mavx2 -mfma -DAST_VECTOR_BYTES=64
+# -O1: 13 s, and -O2 35 s. The code that is compiled so is not the library's.
+COMPILE_wide := $(GCC) -O1 -DAST_UNFUSED -mavx2 -mfma -DAST_VECTOR_BYTES=64
 COMPILE_gcc11 := gcc-11 $(C_FLAGS) $(GCC_WARNINGS) -O2
 COMPILE_clang := clang $(C_FLAGS) $(WARNINGS) -O2 -DAST_UNFUSED
 COMPILE_aarch64 := aarch64-linux-gnu-gcc $(C_FLAGS) $(GCC_WARNINGS) -O2
 
 CORE := isa_base dispatch parallel memory tests/simd_base
-BUILDS := plain sanitized races valgrind gcc11 clang
 ifneq ($(X86),)
 CORE_X86 := isa_avx2 isa_avx512
 SIMD_X86 := tests/simd_avx2 tests/simd_avx512
-BUILDS += wide aarch64
 FLAGS_isa_avx2 := -mavx2 -mfma
 FLAGS_isa_avx512 := -mavx512f -mavx512bw -mavx512dq -mavx512vl -mfma -mprefer-vector-width=512
 FLAGS_tests/simd_avx2 := $(FLAGS_isa_avx2)
@@ -147,7 +158,7 @@ LINK_test_no_memory := -Wl,--wrap=malloc,--wrap=calloc,--wrap=realloc,--wrap=ali
 define BUILD
 build/check/$(1)/%.o: csrc/%.c $(C_SOURCES) | tools
 	@mkdir -p $$(@D)
-	@$(COMPILE_$(1)) $$(FLAGS_$$*) -c $$< -o $$@
+	@$(COMPILE_$(1)) $$(FLAGS_$$*) $(UNOPTIMISED_$(1)) -c $$< -o $$@
 build/check/$(1)/core.a: $(patsubst %,build/check/$(1)/%.o,$(CORE) $(if $(filter wide aarch64,$(1)),,$(CORE_X86)) $(if $(filter aarch64,$(1)),,$(SIMD_X86)))
 	@ar rcs $$@ $$^
 $(patsubst %,build/check/$(1)/test_%,$(C_TESTS)): build/check/$(1)/test_%: csrc/tests/test_%.c $(C_TEST_HEADERS) build/check/$(1)/core.a
@@ -167,17 +178,28 @@ build/check/fuzz_%.passed: build/check/fuzz/fuzz_% csrc/tests/corpus/%
 	@touch $@
 
 # The thread sanitizer finds no room for its shadow memory where addresses are too random.
-build/check/%.passed: $(addsuffix /test_%,$(addprefix build/check/,$(BUILDS)))
-	@run() { echo "$* ($$1)"; shift; "$$@"; }; set -e; \
-	run optimised build/check/plain/test_$*; \
-	run "address and undefined behaviour sanitizers" env ASAN_OPTIONS=detect_leaks=1 build/check/sanitized/test_$*; \
-	run "thread sanitizer" env AST_TEST_QUICK=1 $$(setarch -R true 2>/dev/null && echo setarch -R) build/check/races/test_$*; \
-	run valgrind env AST_TEST_QUICK=1 valgrind --quiet --error-exitcode=1 --leak-check=full build/check/valgrind/test_$*; \
-	run "GCC 11" env AST_TEST_QUICK=1 build/check/gcc11/test_$*; \
-	run clang env AST_TEST_QUICK=1 build/check/clang/test_$*; \
-	$(if $(X86),run "64 byte vectors on AVX2" build/check/wide/test_$*; \
-	run aarch64 env AST_TEST_QUICK=1 qemu-aarch64 -L /usr/aarch64-linux-gnu build/check/aarch64/test_$*)
-	@touch $@
+RUN_sanitized := env ASAN_OPTIONS=detect_leaks=1
+RUN_races = env AST_TEST_QUICK=1 $$(setarch -R true 2>/dev/null && echo setarch -R)
+RUN_valgrind := env AST_TEST_QUICK=1 valgrind --quiet --error-exitcode=1 --leak-check=full
+RUN_gcc11 := env AST_TEST_QUICK=1
+RUN_clang := env AST_TEST_QUICK=1
+RUN_aarch64 := env AST_TEST_QUICK=1 qemu-aarch64 -L /usr/aarch64-linux-gnu
+NAME_plain := optimised
+NAME_sanitized := address and undefined behaviour sanitizers
+NAME_races := thread sanitizer
+NAME_valgrind := valgrind
+NAME_gcc11 := GCC 11
+NAME_clang := clang
+NAME_wide := 64 byte vectors on AVX2
+NAME_aarch64 := aarch64
+
+define RUN
+$(patsubst %,build/check/$(1)/%.passed,$(C_TESTS)): build/check/$(1)/%.passed: build/check/$(1)/test_%
+	@echo "$$* ($(NAME_$(1)))"
+	@$$(RUN_$(1)) $$<
+	@touch $$@
+endef
+$(foreach build,$(BUILDS),$(eval $(call RUN,$(build))))
 
 clean:
 	rm -rf build dist *.egg-info ast_sim/*.so
