@@ -53,7 +53,6 @@ class Run:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         self.model, self.settings, self.step = load_model(self.path)
-        self.model.eval()
         self.effort = Effort(*Metrics(self.path).effort(self.step, (self.settings.train.calls or 1) - 1))
         self._errors = Metrics(self.path).errors_by_effort(self.step)
         self.scope = read_scope(self.path)
