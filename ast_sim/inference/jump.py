@@ -213,9 +213,10 @@ class _JumpingScene:
         """The positions [N, 3] of a wanted frame that is given or has had its Newton steps, else None."""
         if number < self.given:
             return _array(self.script[number]) if number in self.question.wanted() else None
-        frame = next((frame for frame in self.frames if frame.number == number), None)
-        made = frame is not None and frame.last_step is not None and frame.failure is None
-        return _array(frame.positions[-1]) if made else None
+        for frame in self.frames:
+            if frame.number == number and frame.last_step is not None and frame.failure is None:
+                return _array(frame.positions[-1])
+        return None
 
     def answer(self) -> Answer:
         """The frames before the first that failed."""
