@@ -125,7 +125,6 @@ GCC := $(CC) $(C_FLAGS) $(GCC_WARNINGS)
 CLANG := clang $(C_FLAGS) -w
 COMPILE_plain := $(GCC) -O3
 # GCC fuses products and sums into one operation from -O2 on; AST_UNFUSED tells the test of rounding errors where it does not.
-# GCC fuses products and sums into one operation from -O2 on; AST_UNFUSED tells the test of rounding errors where it does not.
 # The kernels are not optimised under the sanitizers: that took 73 s of compiling for 12 s of running, on one core.
 UNOPTIMISED_sanitized := -O0
 COMPILE_sanitized := $(GCC) -O1 -g -DAST_UNFUSED -fsanitize=$(SANITIZE) -fno-sanitize-recover=all
