@@ -72,6 +72,14 @@ ROWS = {
     "plates400": Row(
         "Plates, 400 nodes, 12,000 steps", data="plates400", nodes=400, steps=12_000, settings=_MIRRORED, **_PLATES
     ),
+    "plates400_50": Row(
+        "Plates, 400 nodes, 50 scenes", data="plates400_50", nodes=400, steps=12_000, settings=_MIRRORED, rivals=0,
+        **{**_PLATES, "train": 50},
+    ),
+    "plates400_100": Row(
+        "Plates, 400 nodes, 100 scenes", data="plates400_100", nodes=400, steps=12_000, settings=_MIRRORED, rivals=0,
+        **{**_PLATES, "train": 100},
+    ),
     "plates400_long": Row(
         "Plates, 400 nodes, 45,000 steps", data="plates400", nodes=400, steps=45_000, settings=_MIRRORED, **_PLATES
     ),
