@@ -1,12 +1,17 @@
 """Checks that the tests of all ops share: the accuracy rule, equality over threads and instruction sets."""
 
+import fcntl
+import functools
 import os
+import shutil
 import subprocess
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from torch import Tensor
 
@@ -97,8 +102,69 @@ def run_python(code: str, **environment: str) -> str:
     return result.stdout
 
 
+def made_once(tmp_path_factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """A folder that `make` fills, once for all the processes of a test run."""
+    root = tmp_path_factory.getbasetemp()
+    root = root.parent if "PYTEST_XDIST_WORKER" in os.environ else root
+    folder = root / name
+    with open(root / f"{name}.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "whole").exists():
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+            make(folder)
+            (folder / "whole").touch()
+    return folder
+
+
+SERVER = """
+import os, sys, traceback
+import torch, pytest, hypothesis
+import ast_sim, ast_sim.ops
+for line in sys.stdin:
+    child = os.fork()
+    if not child:
+        status = 1
+        try:
+            exec(compile(eval(line), "<code>", "exec"), {"__name__": "__main__"})
+            status = 0
+        except BaseException:
+            traceback.print_exc(file=sys.stdout)
+        finally:
+            sys.stdout.flush()
+            os._exit(status)
+    print(f"END {os.waitpid(child, 0)[1]}", flush=True)
+"""
+
+
+@functools.cache
+def _server(**environment: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", SERVER],
+        env=os.environ | environment,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+def run_forked(code: str, **environment: str) -> str:
+    """As run_python, in a copy of a process that has torch and the ops imported: all but a moment of a short test."""
+    server = _server(**environment)
+    assert server.stdin and server.stdout
+    server.stdin.write(repr(code) + "\n")
+    server.stdin.flush()
+    shown = []
+    for line in server.stdout:
+        if line.startswith("END "):
+            assert line == "END 0\n", f"{line}{''.join(shown)}"
+            return "".join(shown)
+        shown.append(line)
+    raise AssertionError(f"the process ended with {server.wait()}: {''.join(shown)}")
+
+
 def assert_same_everywhere(code: str) -> None:
     """Code that prints a SHA-256 of its results prints the same on every instruction set and with the compositions."""
-    prints = {isa: run_python(code, AST_SIM_ISA=isa) for isa in instruction_sets()}
-    prints["torch"] = run_python(code, AST_SIM_BACKEND="torch")
+    prints = {isa: run_forked(code, AST_SIM_ISA=isa) for isa in instruction_sets()}
+    prints["torch"] = run_forked(code, AST_SIM_BACKEND="torch")
     assert "base" in prints and len(set(prints.values())) == 1 and len(prints["base"].strip()) == 64, prints

@@ -4,13 +4,7 @@ import itertools
 
 import pytest
 import torch
-from checks import (
-    assert_accurate,
-    assert_same_for_threads,
-    instruction_sets,
-    misaligned_read_only,
-    run_python,
-)
+from checks import assert_accurate, assert_same_for_threads, instruction_sets, misaligned_read_only, run_forked
 from torch import Tensor
 
 from ast_sim.ops import TetrahedronSet, elastic_forces
@@ -319,7 +313,7 @@ print("accurate")
 
 def test_every_instruction_set():
     for isa in instruction_sets():
-        assert run_python(CODE, AST_SIM_ISA=isa).strip() == "accurate"
+        assert run_forked(CODE, AST_SIM_ISA=isa).strip() == "accurate"
 
 
 def test_opcheck():

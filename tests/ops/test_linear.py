@@ -3,7 +3,7 @@
 import pytest
 import torch
 import torch.nn.functional as F
-from checks import assert_accurate, assert_same_for_threads, instruction_sets, misaligned_read_only, run_python
+from checks import assert_accurate, assert_same_for_threads, instruction_sets, misaligned_read_only, run_forked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -202,7 +202,7 @@ print(configuration()["instruction_set"])
 
 def test_every_instruction_set():
     for isa in instruction_sets():
-        assert run_python(CODE, AST_SIM_ISA=isa).strip() == isa
+        assert run_forked(CODE, AST_SIM_ISA=isa).strip() == isa
 
 
 # ---- the op ----

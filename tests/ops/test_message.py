@@ -4,7 +4,14 @@ import re
 
 import pytest
 import torch
-from checks import assert_accurate, assert_same_for_threads, instruction_sets, misaligned_read_only, run_python
+from checks import (
+    assert_accurate,
+    assert_same_for_threads,
+    instruction_sets,
+    misaligned_read_only,
+    run_forked,
+    run_python,
+)
 from torch import Tensor
 
 from ast_sim.ops import EdgeSet, message_edges, message_sum
@@ -262,7 +269,7 @@ print(configuration()["instruction_set"])
 
 def test_every_instruction_set():
     for isa in instruction_sets():
-        assert run_python(CODE, AST_SIM_ISA=isa).strip() == isa
+        assert run_forked(CODE, AST_SIM_ISA=isa).strip() == isa
 
 
 TORCH = """

@@ -2,7 +2,14 @@
 
 import pytest
 import torch
-from checks import assert_accurate, assert_same_for_threads, instruction_sets, misaligned_read_only, run_python
+from checks import (
+    assert_accurate,
+    assert_same_for_threads,
+    instruction_sets,
+    misaligned_read_only,
+    run_forked,
+    run_python,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -231,7 +238,7 @@ print(configuration()["instruction_set"])
 
 def test_every_instruction_set():
     for isa in instruction_sets():
-        assert run_python(CODE, AST_SIM_ISA=isa).strip() == isa
+        assert run_forked(CODE, AST_SIM_ISA=isa).strip() == isa
 
 
 # ---- the op ----

@@ -5,7 +5,7 @@ import hashlib
 import numpy as np
 import pytest
 import torch
-from checks import assert_accurate, assert_same_for_threads, instruction_sets, misaligned_read_only, run_python
+from checks import assert_accurate, assert_same_for_threads, instruction_sets, misaligned_read_only, run_forked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -91,7 +91,7 @@ print(hashlib.sha256(out.numpy().tobytes()).hexdigest())
 
 
 def test_every_instruction_set():
-    prints = {isa: run_python(CODE, AST_SIM_ISA=isa).strip() for isa in instruction_sets()}
+    prints = {isa: run_forked(CODE, AST_SIM_ISA=isa).strip() for isa in instruction_sets()}
     assert "base" in prints and len(set(prints.values())) == 1, prints
     assert len(next(iter(prints.values()))) == len(hashlib.sha256().hexdigest())
 

@@ -66,14 +66,7 @@ def test_two_processes_do_what_one_does(data, tmp_path, along):
     subprocess.run(command(2, "--out", str(tmp_path / "two"), "--resume"), check=True, timeout=300)
     assert all(torch.equal(value, two[name]) for name, value in weights(tmp_path / "two").items())
 
-    # What one began two go on with.
-    words = ["--out", str(tmp_path / "one"), "--resume"]
-    done = subprocess.run(command(2, *words), capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0 and "going on after step 8" in done.stdout, done.stderr
-
-
-def test_the_group_ends_with_training(data, tmp_path):
-    train(1, data, tmp_path / "run", 1)
+    # What one began two go on with, and the group that they are ends with training.
     script = tmp_path / "train_then_count.py"
     script.write_text(
         "import sys\n"
@@ -84,9 +77,9 @@ def test_the_group_ends_with_training(data, tmp_path):
         "assert not any('gloo' in name for name in threads), threads\n"
         "sys.exit(status)\n"
     )
-    launch = command(2, "--out", str(tmp_path / "run"), "--resume", program=(str(script),))
+    launch = command(2, "--out", str(tmp_path / "one"), "--resume", program=(str(script),))
     done = subprocess.run(launch, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0 and "going on after step 1" in done.stdout, done.stderr
+    assert done.returncode == 0 and "going on after step 8" in done.stdout, done.stderr
 
 
 def test_a_batch_that_cannot_be_cut_is_refused(data, tmp_path):
