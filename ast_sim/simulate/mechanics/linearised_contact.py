@@ -94,7 +94,7 @@ class NewtonSteps:
         faces = scene.surface().astype(np.int64)
         owner, edge = scene.body[faces[:, 0]], self._rest[faces[:, 0]] - self._rest[faces[:, 1]]
         self._length = float(np.linalg.norm(edge, axis=1).mean())
-        nodes = np.unique(faces)
+        nodes, self._shortening = np.unique(faces), 1.0  # the share of the last step that was made
         self._surfaces = [(faces[owner == body], nodes[scene.body[nodes] != body]) for body in np.unique(owner)]
 
     def step(self, position: np.ndarray, from_afar: bool = False, stuck: np.ndarray | None = None) -> np.ndarray:
@@ -119,12 +119,13 @@ class NewtonSteps:
         return self._shortened(position, self._constrained(solve, force, self.near_pairs(position, stuck)))
 
     def size(self, before: np.ndarray, after: np.ndarray) -> float:
-        """The size of a step between positions [N, 3]: the largest component of a move, in mean edge lengths of the
-        surfaces, or the root mean square of the moves over that of the displacements from rest, if that is larger."""
+        """The size of the last step, between positions [N, 3]: the largest component of a move, in mean edge lengths of
+        the surfaces, or the root mean square of the moves over that of the displacements from rest, if that is larger.
+        A step that was shortened has the size of the whole one: where elements stop it, it has not converged."""
         free = self._system.free
         move, displacement = ((after - start).ravel()[free] for start in (before, self._rest))
         share = np.linalg.norm(move) / max(np.linalg.norm(displacement), TINY)
-        return float(max(np.abs(move).max() / self._length, share))
+        return float(max(np.abs(move).max() / self._length, share)) / self._shortening
 
     def _constrained(
         self, solve: Callable[[np.ndarray], np.ndarray], force: np.ndarray, pairs: NearPairs
@@ -234,6 +235,7 @@ class NewtonSteps:
         """`position` [N, 3] moved by the largest of 1, 1/2, 1/4, ... of the way [F] that turns no element over."""
         share = 1.0
         while True:
+            self._shortening = share
             moved = position.ravel().copy()
             moved[self._system.free] += share * way
             moved = moved.reshape(-1, 3)

@@ -76,17 +76,20 @@ def test_without_contact_a_body_comes_to_rest():
     assert np.array_equal(solver.step(position)[ends], position[ends])
 
 
-def test_a_step_turns_no_element_over(squeezed):
-    """From noise that leaves elements upright the whole step would turn some over."""
-    case, truth, free, size = squeezed
+def test_a_step_turns_no_element_over_and_has_the_size_of_the_whole_one(squeezed, monkeypatch):
+    """The whole way of the free nodes, towards their centre and beyond, would turn elements over."""
+    case, truth, free, _ = squeezed
+    solver = NewtonSteps(case.scene, case.material, 0.8 * DHAT)
+    way = -1.5 * (truth - truth[free].mean(axis=0))[free]
+    monkeypatch.setattr(solver, "_constrained", lambda *_: way.ravel())
+    moved = solver.step(truth)
     deforming = Elasticity(case.scene.rest_position.astype(float), case.scene.elements.astype(int), case.material)
-    noise = np.random.default_rng(0).normal(size=truth.shape) * free[:, None]
-    position, share = truth, 1.0
-    while deforming.evaluate(position := truth + share * size * noise).J.min() <= 0.02:
-        share *= 0.9
-    moved = NewtonSteps(case.scene, case.material, 0.8 * DHAT).step(position)
-    assert deforming.evaluate(moved).J.min() > 0
-    assert rms((moved - truth)[free]) < rms((position - truth)[free])
+    made = abs(moved - truth)[free].max() / abs(way).max()
+    double = truth.copy()
+    double[free] += 2 * made * way
+    assert made <= 0.5 and deforming.evaluate(moved).J.min() > 0 >= deforming.evaluate(double).J.min()
+    share = rms(way) / rms((moved - case.scene.rest_position)[free])
+    assert solver.size(truth, moved) == pytest.approx(max(abs(way).max() / solver._length, share))
 
 
 def test_a_body_deep_inside_another_is_no_pair(squeezed):
