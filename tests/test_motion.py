@@ -143,7 +143,7 @@ def test_a_move_that_cannot_be_read(text):
         (lambda: RigidMotion((0, 0, np.nan)), "translation of a motion must be .*all finite"),
         (
             lambda: RigidMotion(rotation=np.inf),
-            "rotation of a motion must be one number, all finite and at most 1e\+15, not inf",
+            r"rotation of a motion must be one number, all finite and at most 1e\+15, not inf",
         ),
         (lambda: RigidMotion(rotation=9, axis=(0, 0, 0)), "axis of a motion must be three numbers, not all zero"),
         (lambda: RigidMotion(rotation=9, point=(0, 0)), "point of a motion must be three numbers"),

@@ -15,7 +15,7 @@ import ctypes
 import os
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -93,14 +93,16 @@ class Kernel:
                 refusal = error
         except ValueError as error:
             refusal = error
-        raise self._reason(self._parameters, arguments, exact=True) or refusal
+        # Of copies: another thread may write to the indices meanwhile. If they are right by now, no reason is found.
+        seen = [x.clone() if isinstance(x, Tensor) and not x.is_floating_point() else x for x in arguments]
+        raise self._reason(self._parameters, seen, exact=True) or refusal
 
     def check(self, *arguments) -> None:
         """Raise ValueError or TypeError for arguments of the op that do not fit, for the composition."""
         if reason := self._reason(self.spec.inputs, arguments):
             raise reason
 
-    def _reason(self, parameters: list[Parameter], arguments: tuple, exact: bool = False) -> Exception | None:
+    def _reason(self, parameters: list[Parameter], arguments: Sequence, exact: bool = False) -> Exception | None:
         given = {p.name: x for p, x in zip(parameters, arguments, strict=False)}
         try:
             sizes = check(self.name, parameters, given, exact)

@@ -47,7 +47,7 @@ def scribble():
                     y[len(y) // 2 :].fill_(value)
                     y.copy_(good)
 
-writers = [threading.Thread(target=scribble) for _ in range(2)]
+writers = [threading.Thread(target=scribble, daemon=True) for _ in range(2)]
 for writer in writers:
     writer.start()
 refused = 0
