@@ -13,6 +13,7 @@ from ast_sim.inference.answer import Answer
 from ast_sim.inference.assembly_questions import ask
 from ast_sim.inference.predict import Motions
 from ast_sim.runs.scope import Scope
+from ast_sim.runs.train_config import RunConfig
 from ast_sim.scene import Scene
 from ast_sim.simulate.mechanics.linearised_contact import STILL
 from ast_sim.support.errors import ConfigError
@@ -69,9 +70,7 @@ class Predictor(Protocol):
     """What a sweep needs of a `Run`."""
 
     scope: Scope
-
-    @property
-    def jumps(self) -> bool: ...
+    settings: RunConfig
 
     def predict_scenes(
         self,
@@ -91,10 +90,15 @@ def sweep(
     newton_steps: int | None,
     nodes: int | None,
 ) -> Sweep:
-    """Predict the last frame for each row of values; the arguments are those of `Run.sweep`."""
+    """Predict the last frame for each row of values; the arguments are those of `Run.sweep`.
+
+    With friction a body may be in equilibrium in two places. Then the frame before is predicted, too: Newton steps from
+    there find the place that the way leads to. Without friction, a model that jumps needs no frame between.
+    """
     if not rows:
         raise ConfigError("a sweep needs at least one row of values")
-    frames = 2 if run.jumps else None  # a model that jumps needs no frame between
+    model = run.settings.model
+    frames = 2 if model.jumps and not model.friction else None
     table, seconds, notes = [], 0.0, []
     for start in range(0, len(rows), TOGETHER):
         asked = ask(spec, rows[start : start + TOGETHER], run.scope, frames, nodes)
@@ -102,7 +106,8 @@ def sweep(
             warnings.simplefilter("always")
             names = [f"row {start + number}" for number in range(len(asked))]
             scenes = [(one.scene, one.motion) for one in asked]
-            answers = run.predict_scenes(scenes, names, [-1], corrections, newton_steps)
+            wanted = [-2, -1] if model.friction and len(asked[0].motion.position) > 2 else [-1]
+            answers = run.predict_scenes(scenes, names, wanted, corrections, newton_steps)
         notes += [str(note.message) for note in caught]
         table += [_row(one.values, answer, one.origin) for one, answer in zip(asked, answers, strict=True)]
         seconds += sum(answer.seconds for answer in answers)

@@ -58,11 +58,6 @@ class Run:
         self.scope = read_scope(self.path)
 
     @property
-    def jumps(self) -> bool:
-        """Whether the model predicts each frame at once from the first."""
-        return bool(self.settings.model.jumps)
-
-    @property
     def info(self) -> DatasetInfo:
         """The units and the kind of the predictions."""
         model, scope = self.settings.model, self.scope
@@ -108,7 +103,8 @@ class Run:
                 nodes (None: by its sizes), and values of its parameters: spec="SPEC.toml", travel=4.2,
                 young={"bumper": 1.5e6}. Others are in the middle of their ranges.
             frames: the numbers of the frames that are wanted, such as [-1] for the last one; by default all. A model
-                that jumps computes no other frame.
+                that jumps computes no other frame. With friction ask for [-2, -1]: a body may be in equilibrium in two
+                places, and the frame before says in which.
             corrections: how many calls correct the first call of a model that jumps; by default as in `self.effort`.
             newton_steps: at most so many Newton steps of the solver follow, each about a tenth of its time, until one
                 is small (`Answer.last_steps`); by default as in `self.effort`, and 0 if `corrections` is given. They

@@ -1,9 +1,9 @@
 """Own assemblies: errors of displacement and reaction, the time of an answer, and after how many questions it pays.
 
 `python -m benchmarks.studies.assembly [ROW ...]` generates the scenes of each product of `examples`, trains a run and
-measures it on test scenes, which no training has seen. It writes benchmarks/results/assembly.json and
-the page of this name in docs/results. Data and runs lie in `--folder`; a second call goes on with what is there.
-Everything runs on one thread.
+measures it on test scenes, which no training has seen: the deepest frame asked for alone, and all frames together. It
+writes benchmarks/results/assembly.json and the page of this name in docs/results. Data and runs lie in `--folder`; a
+second call goes on with what is there. Everything runs on one thread.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import tempfile
+import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -22,6 +24,7 @@ import ast_sim
 from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.inference.asked_frame import asked_frames
 from ast_sim.inference.effort import Effort
+from ast_sim.simulate.jobs.rival import deepest_frame
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
 from benchmarks.studies.validation_curve import curve_line, minutes_per_step, validation_curve
@@ -65,7 +68,11 @@ _SETTINGS = {"peak_rate": 2e-3, "validate_scenes": 10, "validate_every": 500, "c
 _BUMPER, _HOOK = (ROOT / "examples" / name / "SPEC.toml" for name in ("bumper", "snap_hook"))
 ROWS = {
     "bumper": Row("Bumper, 1,600 nodes", _BUMPER, nodes=1600, train=100, steps=1700, settings=_SETTINGS),
+    "bumper_50": Row("Bumper, 50 scenes", _BUMPER, nodes=1600, train=50, steps=1700, settings=_SETTINGS, rivals=0),
     "snap_hook": Row("Snap hook, 1,600 nodes", _HOOK, nodes=1600, train=200, steps=1000, settings=_SETTINGS),
+    "snap_hook_100": Row(
+        "Snap hook, 100 scenes", _HOOK, nodes=1600, train=100, steps=1000, settings=_SETTINGS, rivals=0
+    ),
     "bumper_6000": Row(
         "Bumper, 6,000 nodes, after the small ones",
         _BUMPER,
@@ -93,7 +100,7 @@ def measured(name: str, row: Row, folder: Path) -> dict[str, Any]:
     )
     with run.open(data) as dataset:
         found = asked_frames(run.model, dataset, "test", run.effort, row.rivals, spec=row.spec)
-        forces = [_forces(run, dataset, index) for index in range(row.test)]
+        curves = [_curve(run, dataset, index) for index in range(row.test)]
         solver_seconds = read_seconds(dataset).samples.values()
     return {
         **provenance(f"python -m benchmarks.studies.assembly {name}"),
@@ -101,26 +108,64 @@ def measured(name: str, row: Row, folder: Path) -> dict[str, Any]:
         "generation_minutes": float(sum(map(sum, solver_seconds))) / 60,
         "minutes": minutes_per_step(run) * row.steps,
         "effort": run.effort._asdict(),
-        "curve": validation_curve(run),
-        "reaction": float(np.mean([abs(p - t) / t for p, t in forces if t > 0])),
-        "forces": forces,
+        "training": validation_curve(run),
+        "curves": curves,
+        "solver_curves": _solver_curves(row) if row.rivals else [],
         **found,
     }
 
 
-def _forces(run: ast_sim.Run, dataset: ast_sim.Dataset, index: int) -> tuple[float, float]:
-    """The predicted and the true reaction in newton in the last frame of a test scene."""
+def _curve(run: ast_sim.Run, dataset: ast_sim.Dataset, index: int) -> dict[str, float]:
+    """A test scene, all frames of which are asked for together: the relative error at the deepest frame, the seconds;
+    the reaction in newton in the last frame, the true one, and the one of the last frame alone."""
     truth = dataset.load("test", index)
-    answer = replace(run.predict(truth, frames=[-1]), info=run.info)
-    return answer.figures()[-1]["reaction"], truth.attributes["reaction"][-1]
+    began = time.perf_counter()
+    answer = run.predict(truth)
+    seconds = time.perf_counter() - began
+    deepest, free = deepest_frame(truth), ~truth.scene.prescribed
+    true, rest, found = (x[free].astype(np.float64) for x in (*truth.position[[deepest, 0]], answer.position[deepest]))
+    return {
+        "frames": len(answer.position) - answer.given,
+        "relative_error": float(np.linalg.norm(found - true) / np.linalg.norm(true - rest)),
+        "seconds": seconds,
+        "reaction": _last_reaction(run, answer),
+        "true_reaction": truth.attributes["reaction"][-1],
+        "reaction_alone": _last_reaction(run, run.predict(truth, frames=[-1])),
+    }
+
+
+def _last_reaction(run: ast_sim.Run, answer: ast_sim.Answer) -> float:
+    return replace(answer, info=run.info).figures()[-1]["reaction"]
+
+
+def _solver_curves(row: Row) -> list[float]:
+    """The seconds in which the solver finds all frames of the first test scenes, one after the other."""
+    with tempfile.TemporaryDirectory() as folder:
+        again = ast_sim.generate(
+            "assembly", Path(folder) / "again.h5", spec=row.spec, train=1, valid=1, test=row.rivals, nodes=row.nodes,
+            workers=1,
+        ).path  # fmt: skip
+        with ast_sim.Dataset(again) as dataset:
+            found = read_seconds(dataset).samples
+    return [sum(found[f"test/{index:06d}"]) for index in range(row.rivals)]
 
 
 def page(results: dict[str, Any]) -> str:
     """The page of all rows that have a result."""
     shown = [results[name] for name in ROWS if name in results]
-    head = ["product", "trained", "minutes", "error", "reaction", "largest stress", "answer", "solver", "pays after"]
-    lines = [_INTRODUCTION, "| " + " | ".join(head) + " |", "| --- | --- |" + " ---: |" * (len(head) - 2)]
-    return "\n".join([*lines, *map(_line, shown), *(line for found in shown for line in _section(found))])
+    alone = ["product", "trained", "minutes", "error", "reaction", "largest stress", "answer", "solver", "pays after"]
+    together = ["product", "frames", "error", "reaction", "answer", "solver"]
+    lines = [_INTRODUCTION, *_head(alone, texts=2), *map(_alone, shown)]
+    lines += [_TOGETHER, *_head(together, texts=1), *map(_together, shown)]
+    return "\n".join([*lines, *(line for found in shown for line in _section(found))])
+
+
+def _head(columns: list[str], texts: int) -> list[str]:
+    return [_table_line(columns), "|" + " --- |" * texts + " ---: |" * (len(columns) - texts)]
+
+
+def _table_line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
 
 
 def _section(found: dict[str, Any]) -> list[str]:
@@ -135,7 +180,7 @@ def _section(found: dict[str, Any]) -> list[str]:
         "",
         f"{Effort(**found['effort']).text}. Over the scenes: {spread}, a tenth above {np.quantile(errors, 0.9):.1f} %."
         f" Worst: {worst}. The Newton steps did not end in {found['unsettled']} of {len(found['scenes'])} scenes.",
-        *([curve_line(found["curve"])] if found["curve"] else []),
+        *([curve_line(found["training"])] if found["training"] else []),
     ]
 
 
@@ -143,35 +188,70 @@ _INTRODUCTION = """# Own assemblies
 
 Made by `python -m benchmarks.studies.assembly` from `benchmarks/results/assembly.json`; do not edit.
 
-Each product of `examples` was generated, trained and asked for frames of test scenes, on one thread, beside other
-work. "Error" is that of the displacement on the free nodes at the deepest frame, relative to it (mean and standard
-error); "reaction" the error of the force that moves the tool, in the last frame; "largest stress" that of the largest
-von Mises stress. The solver goes straight to the same frame at its own stop test. Both times count what is prepared
-for a mesh. "Pays after" is the number of
-questions whose time in the solver is that of the simulations and the training.
+Each product of `examples` was generated, trained and asked for frames of test scenes, on one thread. "Error" is that of
+the displacement on the free nodes at the deepest frame, relative to it (mean and standard error); "reaction" the error
+of the force that moves the tool, in the last frame; "largest stress" that of the largest von Mises stress. The solver
+goes straight to the same frame at its own stop test. Both times count what is prepared for a mesh. "Pays after" is the
+number of questions whose time in the solver is that of the simulations and the training.
+"""
+
+_TOGETHER = """
+## All frames of a scene at once
+
+With friction, a frame depends on the frames before. If all are asked for, Newton steps know the slip from each frame to
+the next, and find the place of equilibrium to which the way leads. So forces over the travel are more accurate than the
+same frame alone. "Error" and "reaction" are of the same frames as above. The solver finds one frame after the other.
 """
 
 
-def _line(found: dict[str, Any]) -> str:
+def _alone(found: dict[str, Any]) -> str:
     row, solver = found["row"], found["solver"]
     errors = [scene["relative_error"] for scene in found["scenes"] if scene["relative_error"] is not None]
     spent = 60 * (found["generation_minutes"] + found["minutes"])
     saved = 0.0 if solver is None else solver["seconds"] - found["seconds"]
-    return "| " + " | ".join([
+    return _table_line([
         row["title"],
         f"{row['train']} scenes ({found['generation_minutes']:.1f} min), {row['steps']:,} steps",
         f"{found['minutes']:.0f}",
-        f"{100 * np.mean(errors):.1f} ± {100 * np.std(errors) / len(errors) ** 0.5:.1f} %",
-        f"{100 * found['reaction']:.1f} %, median {100 * _median_reaction(found['forces']):.1f} %",
+        _percent(errors),
+        _reaction(found, "reaction_alone"),
         "-" if found["largest_stress"] is None else f"{100 * found['largest_stress']:.0f} %",
         f"{1000 * found['seconds']:.0f} ms",
-        "-" if solver is None else f"{1000 * solver['seconds']:.0f} ms",
+        "-" if solver is None else f"{1000 * solver['seconds']:.0f} ms, {_ratio(found)} times as long",
         f"{spent / saved:,.0f} questions" if saved > 0 else "never: the solver is faster" if solver else "-",
-    ]) + " |"  # fmt: skip
+    ])  # fmt: skip
 
 
-def _median_reaction(forces: list[tuple[float, float]]) -> float:
-    return float(np.median([abs(predicted - true) / true for predicted, true in forces if true > 0]))
+def _together(found: dict[str, Any]) -> str:
+    curves, solver = found["curves"], found["solver_curves"]
+    ratios = [theirs / ours["seconds"] for theirs, ours in zip(solver, curves, strict=False)]
+    return _table_line([
+        found["row"]["title"],
+        str(curves[0]["frames"]),
+        _percent([curve["relative_error"] for curve in curves]),
+        _reaction(found, "reaction"),
+        f"{1000 * np.median([curve['seconds'] for curve in curves]):.0f} ms",
+        f"{1000 * np.mean(solver):.0f} ms, {_mean(ratios)} times as long" if solver else "-",
+    ])  # fmt: skip
+
+
+def _ratio(found: dict[str, Any]) -> str:
+    """The solver's time over that of the answer, straight to the deepest frame."""
+    known = [scene for scene in found["scenes"] if "solver" in scene and scene["solver"]["seconds"] is not None]
+    return _mean([scene["solver"]["seconds"] / scene["seconds"] for scene in known])
+
+
+def _mean(values: Sequence[float]) -> str:
+    return f"{np.mean(values):.2g} ± {np.std(values) / len(values) ** 0.5:.1g}"
+
+
+def _percent(errors: Sequence[float]) -> str:
+    return f"{100 * np.mean(errors):.2g} ± {100 * np.std(errors) / len(errors) ** 0.5:.1g} %"
+
+
+def _reaction(found: dict[str, Any], key: str) -> str:
+    errors = [abs(c[key] / c["true_reaction"] - 1) for c in found["curves"] if c["true_reaction"] > 0]
+    return f"{100 * np.mean(errors):.2g} %, median {100 * np.median(errors):.2g} %"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -194,7 +274,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         write_json(RESULTS, results)
         write_text(PAGE, page(results) + "\n")
         found = results[name]
-        print(f"{name}: {100 * found['relative_error']:.3g} %, reaction {100 * found['reaction']:.3g} %", flush=True)
+        print(f"{name}: {100 * found['relative_error']:.3g} %, reaction {_reaction(found, 'reaction')}", flush=True)
 
 
 if __name__ == "__main__":

@@ -31,13 +31,17 @@ def test_a_product_is_simulated_learned_and_measured(small):
     (small / "results").mkdir()
     assembly.main(["--folder", str(small / "data")])
     found = json.loads(assembly.RESULTS.read_text())["small"]
-    assert len(found["scenes"]) == len(found["forces"]) == 2 and found["solver"]["scenes"] == 1
+    assert len(found["scenes"]) == len(found["curves"]) == 2 and found["solver"]["scenes"] == 1
     assert found["no_solver"] is None and found["generation_minutes"] > 0
-    errors = [abs(predicted - true) / true for predicted, true in found["forces"]]
-    assert found["reaction"] == pytest.approx(sum(errors) / 2) and min(true for _, true in found["forces"]) > 0.1
-    (line,) = [line for line in assembly.PAGE.read_text().splitlines() if line.startswith("| Bumper")]
+    assert len(found["solver_curves"]) == 1 and found["solver_curves"][0] > 0
+    for curve, scene in zip(found["curves"], found["scenes"], strict=True):
+        assert curve["frames"] == 2 and curve["true_reaction"] > 0.1 and curve["seconds"] > 0
+        assert curve["relative_error"] == pytest.approx(scene["relative_error"], rel=1e-3)  # there is no friction
+        assert curve["reaction"] == pytest.approx(curve["reaction_alone"], rel=1e-3)
+    alone, together = (line for line in assembly.PAGE.read_text().splitlines() if line.startswith("| Bumper"))
+    error = sum(abs(curve["reaction"] / curve["true_reaction"] - 1) for curve in found["curves"]) / 2
+    assert f"{100 * error:.2g} %, median" in together and ("questions" in alone or "never" in alone)
     assert json.loads((small / "data" / "run_later_2" / "run.json").read_text())["start"]["step"] in (2, 4)
-    assert f"{100 * found['reaction']:.1f} %" in line and ("questions" in line or "never" in line)
 
 
 def test_an_unknown_row_is_named(capsys):

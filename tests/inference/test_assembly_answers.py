@@ -92,6 +92,18 @@ def test_a_sweep_is_many_predictions(trained, tmp_path):
         assert row["reaction"] == pytest.approx(same["reaction"], rel=1e-3)
 
 
+def test_with_friction_a_sweep_knows_the_frame_before(tmp_path):
+    spec = write_assembly(tmp_path, SPEC.replace("[parameters]", "friction = 0.4\n\n[parameters]"))
+    ast_sim.generate("assembly", tmp_path / "study.h5", spec=spec, train=2, valid=1, test=1, workers=1, progress=False)
+    run = ast_sim.train(tmp_path / "study.h5", tmp_path / "run", steps=5)
+    (row,) = run.sweep(spec, travel=1.5, corrections=0, newton_steps=3).rows
+    alone, after_another = (
+        run.predict(spec=spec, travel=1.5, corrections=0, newton_steps=3, frames=frames).figures()[-1]["reaction"]
+        for frames in ([-1], [-2, -1])
+    )
+    assert row["reaction"] == pytest.approx(after_another, rel=1e-6) and abs(alone / after_another - 1) > 1e-4
+
+
 def test_rows_outside_the_training_are_told_once(trained):
     spec, run = trained
     with warnings.catch_warnings(record=True) as caught:
