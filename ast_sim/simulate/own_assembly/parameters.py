@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import qmc
 
 from ast_sim.simulate.own_assembly.expressions import Expression, expression, nearest
 from ast_sim.support.errors import ConfigError
@@ -125,6 +124,8 @@ def drawn(parameters: Mapping[str, Parameter], seed: int, split: int, index: int
     sequence = np.random.SeedSequence(seed, spawn_key=(split,) if attempt == 0 else (split, index, attempt))
     shares = np.zeros(0)
     if moving and attempt == 0:
+        from scipy.stats import qmc  # takes 0.3 s
+
         sobol = qmc.Sobol(len(moving), scramble=True, rng=np.random.default_rng(sequence))
         shares = (sobol.fast_forward(index) if index else sobol).random(1)[0]
     elif moving:
