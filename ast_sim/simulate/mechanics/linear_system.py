@@ -36,7 +36,7 @@ MAX_ITERATIONS = 40
 
 
 class Factorization(Protocol):
-    """Cholesky factorization of symmetric matrices that are given by their upper triangles."""
+    """Cholesky factorization K = L L^T of symmetric matrices that are given by their upper triangles."""
 
     name: str
 
@@ -44,7 +44,16 @@ class Factorization(Protocol):
         """Factorise; return False if the matrix is not positive definite."""
 
     def solve(self, right_side: np.ndarray) -> np.ndarray:
-        """Solution for the matrix last factorised; right side [F], or several [F, K] in Fortran's order."""
+        """Solution for the matrix last factorised, to the last bits."""
+
+    def responses(self, loads: np.ndarray) -> np.ndarray:
+        """What `compliance` and `displacement` need of the loads P [F, A], a column each: L^-1 P, half of K^-1 P."""
+
+    def compliance(self, responses: np.ndarray) -> np.ndarray:
+        """P^T K^-1 P [A, A]."""
+
+    def displacement(self, responses: np.ndarray, forces: np.ndarray) -> np.ndarray:
+        """K^-1 P times the forces [A]: [F]."""
 
 
 @functools.cache
@@ -87,11 +96,24 @@ class Pardiso:
         return True
 
     def solve(self, right_side: np.ndarray) -> np.ndarray:
-        self._solver.set_phase(33)
-        # PARDISO refines a solution twice, which triples its time. The solver's iterations need that, since barriers
-        # make their matrices stiff. Systems with many right sides are of elastic bodies alone.
-        self._solver.set_iparm(8, 2 if right_side.ndim == 1 else 0)
-        return self._solver._call_pardiso(self._matrix, right_side)
+        # PARDISO refines it twice, which triples the time: barriers make the matrices of the solver stiff.
+        return self._applied(33, right_side, refinements=2)
+
+    def responses(self, loads: np.ndarray) -> np.ndarray:
+        return self._applied(331, loads)  # L^-1
+
+    def compliance(self, responses: np.ndarray) -> np.ndarray:
+        return responses.T @ responses
+
+    def displacement(self, responses: np.ndarray, forces: np.ndarray) -> np.ndarray:
+        return self._applied(333, responses @ forces)  # L^-T
+
+    def _applied(self, phase: int, columns: np.ndarray, refinements: int = 0) -> np.ndarray:
+        if not columns.size:
+            return columns
+        self._solver.set_phase(phase)
+        self._solver.set_iparm(8, refinements)
+        return self._solver._call_pardiso(self._matrix, np.asfortranarray(columns))
 
 
 class Cholmod:
@@ -117,11 +139,21 @@ class Cholmod:
         return True
 
     def solve(self, right_side: np.ndarray) -> np.ndarray:
-        if right_side.ndim == 2:  # cholespy takes at most 128 right sides, in C's order
-            return np.stack([self.solve(np.ascontiguousarray(column)) for column in right_side.T], axis=1)
         solution = np.zeros_like(right_side)
         self._solver.solve(right_side, solution)
         return solution
+
+    def responses(self, loads: np.ndarray) -> np.ndarray:
+        """Loads and solutions, since cholespy does not give L: [2 F, A]."""
+        solutions = [self.solve(load) for load in np.ascontiguousarray(loads.T)]
+        return np.concatenate([loads, np.reshape(solutions, loads.T.shape).T])
+
+    def compliance(self, responses: np.ndarray) -> np.ndarray:
+        loads, solutions = np.split(responses, 2)
+        return loads.T @ solutions
+
+    def displacement(self, responses: np.ndarray, forces: np.ndarray) -> np.ndarray:
+        return np.split(responses, 2)[1] @ forces
 
 
 def factorization() -> Factorization:
@@ -274,21 +306,14 @@ class LinearSystem:
         solution[self.free] = free
         return solution.reshape(-1, 3)
 
-    def factorise(self, values: np.ndarray) -> Callable[[np.ndarray], np.ndarray] | None:
-        """Factorise the sum of the elements' values [P] alone, without contact.
-
-        Returns:
-            A function from right sides [F] or [F, K] to solutions, F the number of free dofs in the order of `free`.
-            None if the matrix is not positive definite.
-        """
+    def factorise(self, values: np.ndarray) -> Factorization | None:
+        """Factorise the sum of the elements' values [P] alone, without contact. The unknowns of the factorization are
+        those of `free`. None if the matrix is not positive definite."""
         matrix = self._assemble(values, (np.zeros(0, int), np.zeros(0, int), np.zeros(0)))
         self.factorizations += 1
         self._has_factor = self._factorization.factorise(matrix, self._is_new)
         self._is_new = False
-        return self._solutions if self._has_factor else None
-
-    def _solutions(self, right_sides: np.ndarray) -> np.ndarray:
-        return self._factorization.solve(np.asfortranarray(right_sides)) if right_sides.size else right_sides
+        return self._factorization if self._has_factor else None
 
     def _assemble(
         self, values: np.ndarray, contact: tuple[np.ndarray, np.ndarray, np.ndarray]

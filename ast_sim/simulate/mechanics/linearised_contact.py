@@ -10,6 +10,8 @@ sequential quadratic programming. Its dual has one unknown a pair, the force of 
 
     minimise  1/2 l B l + b l,   B = C K^-1 C^T,   b = g - clearance - C K^-1 f,   then   u = K^-1 (C^T l - f).
 
+With the factorization K = L L^T, B is the product of L^-1 C^T with itself.
+
 With Coulomb friction each pair has tangential forces, too, at most the coefficient times the normal force. They resist
 slip from where the surfaces stuck to each other. A single step does not know the way of the load. If nothing else is
 given, its surfaces have slid along the last fiftieth of a straight way from rest: those that slide get the whole
@@ -22,7 +24,6 @@ is nearest: the start must be nearly right.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,7 +32,7 @@ from scipy.optimize import nnls
 
 from ast_sim.scene import Scene
 from ast_sim.simulate.mechanics.elasticity import Deformation, Elasticity
-from ast_sim.simulate.mechanics.linear_system import LinearSystem
+from ast_sim.simulate.mechanics.linear_system import Factorization, LinearSystem
 from ast_sim.simulate.mechanics.material import NeoHookean, cofactor, determinant, von_mises
 from ast_sim.support.errors import SimulationError
 
@@ -111,12 +112,12 @@ class NewtonSteps:
         deformation = _upright(self._elasticity.evaluate(position))
         force = self._elasticity.gradient(deformation)[0].ravel()[self._system.free]
         for project in (True,) if from_afar else (False, True):
-            solve = self._system.factorise(self._elasticity.hessian(deformation, project))
-            if solve is not None:
+            factor = self._system.factorise(self._elasticity.hessian(deformation, project))
+            if factor is not None:
                 break
         else:
             raise SimulationError("the stiffness is singular: nothing holds a body, or an element has collapsed")
-        return self._shortened(position, self._constrained(solve, force, self.near_pairs(position, stuck)))
+        return self._shortened(position, self._constrained(factor, force, self.near_pairs(position, stuck)))
 
     def size(self, before: np.ndarray, after: np.ndarray) -> float:
         """The size of the last step, between positions [N, 3]: the largest component of a move, in mean edge lengths of
@@ -127,42 +128,42 @@ class NewtonSteps:
         share = np.linalg.norm(move) / max(np.linalg.norm(displacement), TINY)
         return float(max(np.abs(move).max() / self._length, share)) / self._shortening
 
-    def _constrained(
-        self, solve: Callable[[np.ndarray], np.ndarray], force: np.ndarray, pairs: NearPairs
-    ) -> np.ndarray:
+    def _constrained(self, factor: Factorization, force: np.ndarray, pairs: NearPairs) -> np.ndarray:
         """The displacement [F] of the free dofs; see the head of this file."""
-        unconstrained, count = solve(-force[:, None])[:, 0], len(pairs.gap)
-        normals = pairs.directions[:count]
-        offset = normals @ unconstrained + pairs.gap - self._clearance
-        active, responses, forces = self._pressed_pairs(solve, normals, offset)
-        if not self._friction or not len(active):
-            return unconstrained + responses @ forces
-        along = np.concatenate([active, active + count])
-        tangents = pairs.directions[count + along]
-        directions = scipy.sparse.vstack([normals[active], tangents], format="csr")
-        responses = np.concatenate([responses, solve(tangents.toarray().T)], axis=1)
-        offset = np.concatenate([offset[active], tangents @ unconstrained + pairs.slip[along]])
-        return unconstrained + responses @ _rubbed(_compliance(directions, responses), offset, forces, self._friction)
+        unconstrained = factor.displacement(factor.responses(-force[:, None]), np.ones(1))
+        count = len(pairs.gap)
+        offset = pairs.directions[:count] @ unconstrained + pairs.gap - self._clearance
+        active, responses, forces = self._pressed_pairs(factor, pairs.directions[:count], offset)
+        if not len(active):
+            return unconstrained
+        if self._friction:
+            along = np.concatenate([active, active + count])
+            tangents = pairs.directions[count + along]
+            responses = np.concatenate([responses, factor.responses(tangents.toarray().T)], axis=1)
+            offset = np.concatenate([offset[active], tangents @ unconstrained + pairs.slip[along]])
+            forces = _rubbed(_regular(factor.compliance(responses)), offset, forces, self._friction)
+        return unconstrained + factor.displacement(responses, forces)
 
     def _pressed_pairs(
-        self, solve: Callable[[np.ndarray], np.ndarray], normals: scipy.sparse.csr_array, offset: np.ndarray
+        self, factor: Factorization, normals: scipy.sparse.csr_array, offset: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The pairs [A] that press on each other, their responses K^-1 C^T [F, A] and forces [A], without friction.
+        """The pairs [A] that press on each other, their responses [., A] and forces [A], without friction.
 
-        A response costs a solution with the stiffness. So pairs get one in rounds, those first that would overlap most
-        with the forces so far. At the end no pair overlaps: these are the forces of all pairs.
+        A response costs half a solution with the stiffness. So pairs get one in rounds, those first that would overlap
+        most with the forces so far. At the end no pair overlaps: these are the forces of all pairs.
         """
-        chosen, responses, forces = np.zeros(0, int), np.zeros((normals.shape[1], 0)), np.zeros(0)
+        chosen, forces, gap = np.zeros(0, int), np.zeros(0), offset.copy()
+        responses = factor.responses(np.zeros((normals.shape[1], 0)))
         while True:
-            gap = offset + normals @ (responses @ forces)
-            gap[chosen] = 0
             missing = np.flatnonzero(gap < -OVERLAP * self._length)
             if not len(missing):
                 break
             deepest = missing[np.argsort(gap[missing], kind="stable")][: max(FEW, len(missing) // SHARE)]
             chosen = np.concatenate([chosen, deepest])
-            responses = np.concatenate([responses, solve(normals[deepest].toarray().T)], axis=1)
-            forces = _pressed(_compliance(normals[chosen], responses), offset[chosen])
+            responses = np.concatenate([responses, factor.responses(normals[deepest].toarray().T)], axis=1)
+            forces = _pressed(_regular(factor.compliance(responses)), offset[chosen])
+            gap = offset + normals @ factor.displacement(responses, forces)
+            gap[chosen] = 0
         order = np.argsort(chosen)
         active = order[forces[order] > 0]
         return chosen[active], responses[:, active], forces[active]
@@ -221,15 +222,15 @@ class NewtonSteps:
         columns = self._number[3 * of_pair[:, :, None] + np.arange(3)]  # [P, 4, 3]
         movable = (columns >= 0).any(axis=(1, 2))
         of_pair, columns, weight, normals = of_pair[movable], columns[movable], weight[movable], normals[movable]
-        free, rows = columns >= 0, np.broadcast_to(np.arange(len(columns))[:, None, None], columns.shape)
-        shape = (len(columns), len(self._system.free))
-        parts, tangents = [], _tangents(normals)
-        for axis in (normals, *tangents):
-            values = weight[:, :, None] * axis[:, None, :]
-            parts.append(scipy.sparse.csr_array((values[free], (rows[free], columns[free])), shape=shape))
+        tangents = _tangents(normals)
+        axes, rows = np.concatenate([normals, *tangents]), np.arange(3 * len(normals))
+        values, columns = np.tile(weight, (3, 1))[:, :, None] * axes[:, None, :], np.tile(columns, (3, 1, 1))
+        free, rows = columns >= 0, np.broadcast_to(rows[:, None, None], columns.shape)
+        entries = values[free], (rows[free], columns[free])
+        directions = scipy.sparse.csr_array(entries, shape=(len(axes), len(self._system.free)))
         relative = np.einsum("pk,pki->pi", weight, slid[of_pair])
         slip = np.concatenate([np.einsum("pi,pi->p", relative, tangent) for tangent in tangents])
-        return NearPairs(scipy.sparse.vstack(parts, format="csr"), gaps[movable], slip)
+        return NearPairs(directions, gaps[movable], slip)
 
     def _shortened(self, position: np.ndarray, way: np.ndarray) -> np.ndarray:
         """`position` [N, 3] moved by the largest of 1, 1/2, 1/4, ... of the way [F] that turns no element over."""
@@ -276,10 +277,10 @@ def _tangents(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return first, np.cross(normals, first)
 
 
-def _compliance(directions: scipy.sparse.csr_array, responses: np.ndarray) -> np.ndarray:
-    """C K^-1 C^T of the directions C [D, F] and their responses K^-1 C^T [F, D], made regular."""
-    found = directions @ responses
-    return (found + found.T) / 2 + ROUNDING * np.trace(found) / len(found) * np.eye(len(found))
+def _regular(compliance: np.ndarray) -> np.ndarray:
+    """The compliance, exactly symmetric and without zero eigenvalues."""
+    ridge = ROUNDING * np.trace(compliance) / len(compliance)
+    return (compliance + compliance.T) / 2 + ridge * np.eye(len(compliance))
 
 
 def _pressed(compliance: np.ndarray, offset: np.ndarray) -> np.ndarray:

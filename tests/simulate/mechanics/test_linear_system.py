@@ -60,6 +60,21 @@ def test_it_solves_what_the_dense_matrix_does_with_contact_that_changes(problem)
     assert system.factorizations == 4
 
 
+def test_responses_to_loads_are_those_of_the_dense_inverse(problem):
+    system, values, dense, fixed = problem
+    free, random = np.flatnonzero(np.repeat(~fixed, 3)), np.random.default_rng(7)
+    inverse = np.linalg.inv(dense[np.ix_(free, free)])
+    loads, forces, factor = random.normal(size=(len(free), 4)), random.normal(size=4), system.factorise(values)
+    responses = np.concatenate([factor.responses(loads[:, :1]), factor.responses(loads[:, 1:])], axis=1)
+    np.testing.assert_allclose(factor.compliance(responses), loads.T @ inverse @ loads, rtol=1e-8)
+    displacement = inverse @ loads @ forces
+    np.testing.assert_allclose(
+        factor.displacement(responses, forces), displacement, atol=1e-9 * abs(displacement).max()
+    )
+    assert factor.responses(loads[:, :0]).shape[1] == 0
+    assert system.factorise(-values) is None
+
+
 def test_a_factor_that_serves_no_more_is_replaced(problem):
     system, values, dense, fixed = problem
     assert_solves(system, values, NO_CONTACT, dense, fixed, 1e-11)
