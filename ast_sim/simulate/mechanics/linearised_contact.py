@@ -301,18 +301,21 @@ def _rubbed(compliance: np.ndarray, offset: np.ndarray, forces: np.ndarray, fric
         offset: b [3 P].
     """
     count, found = len(forces), np.concatenate([forces, np.zeros(2 * len(forces))])
-    diagonal = compliance.diagonal()
-    stiffest = np.maximum(diagonal[count : 2 * count], diagonal[2 * count :])
-    tangents = [slice(pair + count, None, count) for pair in range(count)]
-    along = [compliance[rows] for rows in tangents]  # [2, 3 P] of each pair
+    of_pair = np.ascontiguousarray(compliance.reshape(3, count, 3 * count).swapaxes(0, 1))  # the three rows of each
+    by_normal = of_pair[np.arange(count), :, np.arange(count)].tolist()  # what a pair's own normal force moves
+    stiffest = compliance.diagonal().reshape(3, count)[1:].max(axis=0).tolist()
+    pairs = list(zip(of_pair, offset.reshape(3, count).T, by_normal, stiffest, strict=True))
     for _ in range(SWEEPS):
         before = found.copy()
-        for pair, rows in enumerate(tangents):
-            distance = compliance[pair] @ found + offset[pair]
-            found[pair] = max(0.0, found[pair] - distance / diagonal[pair])
-            sticking = found[rows] - (along[pair] @ found + offset[rows]) / stiffest[pair]
-            size, most = math.hypot(*sticking), friction * found[pair]
-            found[rows] = sticking * min(1.0, most / max(size, TINY))
+        for pair, (rows, gap, (own, first_by_normal, second_by_normal), tangential) in enumerate(pairs):
+            components = slice(pair, None, count)
+            distance, first, second = (rows @ found + gap).tolist()
+            normal_before, one, other = found[components].tolist()
+            normal = max(0.0, normal_before - distance / own)
+            one -= (first + first_by_normal * (normal - normal_before)) / tangential
+            other -= (second + second_by_normal * (normal - normal_before)) / tangential
+            share = min(1.0, friction * normal / max(math.hypot(one, other), TINY))
+            found[components] = normal, share * one, share * other
         if np.abs(found - before).max() <= CHANGE * np.abs(found).max():
             break
     return found
