@@ -171,11 +171,8 @@ class _Frame:
         try:
             if id(scene) not in solvers:
                 solvers[id(scene)] = newton_steps(config, scene)
-            solver, position, stuck = (
-                solvers[id(scene)],
-                _array(self.positions[-1]),
-                self.scene.settled(self.number - 1),
-            )
+            solver, position = solvers[id(scene)], _array(self.positions[-1])
+            stuck = self.scene.settled(self.number - 1)
             for step in range(1, most + 1):
                 before, position = position, solver.step(position, from_afar=step == 1, stuck=stuck)
                 self.positions.append(torch.from_numpy(position.astype(np.float32)))

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ast_sim.ops.library import is_differentiated
+from ast_sim.support.boxes import beside
 
 FINE = 0.1  # the second channel of the gap saturates at this share of the radius
 WIDTH = 5
@@ -45,8 +46,6 @@ def proximity(
         for other in np.unique(body[mine]):
             of_others = nodes[scene] + np.flatnonzero(body[mine] != other)
             of_body = triangles[body[triangles[:, 0]] == other]
-            if not len(of_others) or not len(of_body):
-                continue
             found, outward = signed_gap(ahead[of_others], ahead, of_body, radius)
             nearer = np.abs(found) < np.abs(gap[of_others])
             gap[of_others[nearer]], normal[of_others[nearer]] = found[nearer], outward[nearer]
@@ -73,18 +72,14 @@ def signed_gap(
     import igl  # takes 0.2 s; only models with this input need it
 
     gap, normal = np.full(len(points), radius), np.zeros((len(points), 3))
-    used, triangles = np.unique(triangles, return_inverse=True)
-    distance, _, nearest, outward = igl.signed_distance(
-        points, position[used], triangles.reshape(-1, 3), igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL, -radius, radius
-    )
-    near = np.abs(distance) < radius  # the distance is NaN where the surface is farther away
-    gap[near] = distance[near]
-    away = np.sign(distance[near])[:, None] * (points - nearest)[near]
-    touching = np.abs(distance[near]) <= 1e-12 * radius
-    normal[near] = _unit(np.where(touching[:, None], outward[near], away))
+    # All triangles around a nearest point are kept, so the sign is that of the whole surface.
+    close = np.flatnonzero(beside(points, position[triangles], radius))
+    triangles = triangles[beside(position[triangles], points[close], radius)]
+    if len(triangles):
+        points, kind = points[close], igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
+        distance, _, nearest, outward = igl.signed_distance(points, position, triangles, kind, -radius, radius)
+        touching = np.abs(distance) <= 1e-12 * radius
+        away = (points - nearest) / np.where(touching, 1, distance)[:, None]
+        near = np.abs(distance) < radius  # the distance is NaN where the surface is farther away
+        gap[close[near]], normal[close[near]] = distance[near], np.where(touching[:, None], outward, away)[near]
     return gap, normal
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return vectors / np.where(length > 0, length, 1)

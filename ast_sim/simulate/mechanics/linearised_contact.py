@@ -34,6 +34,7 @@ from ast_sim.scene import Scene
 from ast_sim.simulate.mechanics.elasticity import Deformation, Elasticity
 from ast_sim.simulate.mechanics.linear_system import Factorization, LinearSystem
 from ast_sim.simulate.mechanics.material import NeoHookean, cofactor, determinant, von_mises
+from ast_sim.support.boxes import beside
 from ast_sim.support.errors import SimulationError
 
 CLEARANCE = (
@@ -185,8 +186,8 @@ class NewtonSteps:
         nodes, corners, normals, shares, gaps = [], [], [], [], []
         for faces, others in self._surfaces:
             kind, near, deep = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL, NEAR * self._length, DEEP * self._length
-            others = others[_beside(position[others], position[faces], deep)]
-            faces = faces[_beside(position[faces], position[others], deep)]
+            others = others[beside(position[others], position[faces], deep)]
+            faces = faces[beside(position[faces], position[others], deep)]
             if not len(faces):
                 continue
             gap, face, nearest, outward = igl.signed_distance(position[others], position, faces, kind, -deep, near)
@@ -258,15 +259,6 @@ def _upright(deformation: Deformation) -> Deformation:
     F[:, :, bad] = np.moveaxis((left * np.maximum(stretch, FLATTEST)[:, None, :]) @ right, 0, 2)
     cofactors = cofactor(F)
     return replace(deformation, F=F, J=determinant(F, cofactors), cofactor=cofactors)
-
-
-def _beside(things: np.ndarray, others: np.ndarray, distance: float) -> np.ndarray:
-    """[n] bool: which points [n, 3] or triangles [n, 3, 3] come as near as `distance` to the box around the others."""
-    if not len(others):
-        return np.zeros(len(things), bool)
-    box = others.reshape(-1, 3).min(axis=0) - distance, others.reshape(-1, 3).max(axis=0) + distance
-    low, high = (things, things) if things.ndim == 2 else (things.min(axis=1), things.max(axis=1))
-    return ((high >= box[0]) & (low <= box[1])).all(axis=1)
 
 
 def _tangents(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

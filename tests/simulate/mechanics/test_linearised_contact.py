@@ -148,8 +148,8 @@ def test_what_is_not_looked_at_is_not_near(squeezed, monkeypatch):
     case, truth, *_ = squeezed
     solver = NewtonSteps(case.scene, case.material, 0.0)
     pairs = solver.near_pairs(truth)
-    kept = linearised_contact._beside(truth, truth[case.scene.body == 1], 0.0)
+    kept = linearised_contact.beside(truth, truth[case.scene.body == 1], 0.0)
     assert 0 < kept.sum() < len(truth)
-    monkeypatch.setattr(linearised_contact, "_beside", lambda things, *_: np.ones(len(things), bool))
+    monkeypatch.setattr(linearised_contact, "beside", lambda things, *_: np.ones(len(things), bool))
     whole = solver.near_pairs(truth)
     assert np.array_equal(pairs.gap, whole.gap) and abs(pairs.directions - whole.directions).max() < 1e-12
