@@ -303,7 +303,7 @@ def _add_evaluate(evaluate: _Parser) -> None:
     evaluate.add_argument("run_folder", type=_path, metavar="RUN", help="run folder")
     evaluate.add_argument("data", type=_path, metavar="DATA", help="dataset")
     evaluate.add_argument("--split", choices=commands.SPLITS, default="test", help="split (default: test)")
-    about = "scenes in which the solver goes straight to the deepest frame, to compare (default: 3; 0: none)"
+    about = "scenes in which the solver solves the deepest frame, to compare (default: 3; 0: none)"
     _add_each(evaluate, {"--rivals N": about}, type=_at_least(0), default=3)
     _add_each(evaluate, {"--out FILE.json": "also write all figures to this file"}, type=_path)
     _add_overwrite(evaluate)

@@ -22,7 +22,7 @@ from ast_sim.view import export, picture, report
 
 FAMILY = "deforming_plate"
 NODES, FRAMES = 400, 41  # fewer than the family's defaults, so that the demonstration takes minutes
-RIVALS = 3  # in so many test scenes the solver goes straight to the deepest frame
+RIVALS = 3  # in so many test scenes the solver solves the deepest frame
 
 
 @dataclass(frozen=True)

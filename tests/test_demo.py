@@ -109,7 +109,7 @@ def test_headlines_are_shares_of_the_trivial_predictors():
         "the deepest frame at once: error 7.12 % of the displacement, 25.1 ms on one thread",
         "  after each call, and each Newton step: 16, 7.12 %",
         "  stress: 0.50 of the error of the frame's true mean; the largest is 8 % off",
-        "  the solver, straight to this frame: 60 ms, 2.4 times as long (mean of 3 scenes, one thread)",
+        "  the solver for this frame: 60 ms, 2.4 times as long (mean of 3 scenes, one thread)",
         "  its cheapest way with at most the model's error: 30 ms, 1.2 times as long (2 scenes)",
     ]
 

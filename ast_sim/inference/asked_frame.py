@@ -27,8 +27,6 @@ from ast_sim.simulate.jobs.rival import Rivals, cheapest, deepest_frame, rivals
 from ast_sim.simulate.mechanics.linearised_contact import STILL
 from ast_sim.support.errors import SimulationError
 
-STARTS = (1, 2)  # in so many load steps the solver is tried
-
 
 def asked_frames(
     model: Simulator,
@@ -63,7 +61,7 @@ def asked_frames(
         frames = [scenes[index]["frame"] for index in indices]
         found: Iterable[Rivals] = ()
         if indices:
-            found = rivals(dataset.path, split, indices, frames, starts=STARTS, spec=spec, progress=False)
+            found = rivals(dataset.path, split, indices, frames, spec=spec, progress=False)
         for scene, rival in zip(scenes, found, strict=False):
             scene["solver"] = _solver(rival, scene["relative_error"])
             if progress is not None:
@@ -135,7 +133,7 @@ def lines(found: dict[str, Any]) -> list[str]:
 
 def _solver_lines(solver: dict[str, Any]) -> list[str]:
     told = [
-        f"  the solver, straight to this frame: {1000 * solver['seconds']:.3g} ms, {solver['ratio']:.3g} times as long"
+        f"  the solver for this frame: {1000 * solver['seconds']:.3g} ms, {solver['ratio']:.3g} times as long"
         f" (mean of {solver['scenes']} scenes, one thread)"
     ]
     if solver["cheapest_scenes"]:

@@ -244,7 +244,7 @@ class Run:
         Args:
             data: a dataset; by default the one that the run was trained on.
             command: the command that is recorded beside the figures.
-            rival_scenes: in so many scenes the solver goes straight to the deepest frame, in several ways, to compare.
+            rival_scenes: in so many scenes the solver solves the deepest frame, in several ways, to compare.
         """
         with self.open(data) as dataset:
             with Progress(dataset.count(split) + rival_scenes, 0, "scenes") as bar:

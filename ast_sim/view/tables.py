@@ -109,14 +109,14 @@ def tiles(evaluation: Json | None) -> list[Json]:
 
 
 def _asked_tiles(evaluation: Json) -> list[Json]:
-    """The deepest frame, asked for alone, beside the solver that goes straight there."""
+    """The deepest frame, asked for alone, beside the solver."""
     error, seconds = lookup(evaluation, "asked", "relative_error"), lookup(evaluation, "asked", "seconds")
     if error is None or seconds is None:
         return []
     detail = f"of the displacement, {1000 * seconds:.3g} ms on one thread"
     solver = lookup(evaluation, "asked", "solver", "seconds")
     if solver is not None:
-        detail += f"; the solver, straight there: {1000 * solver:.3g} ms"
+        detail += f"; the solver: {1000 * solver:.3g} ms"
     return [{"label": "Deepest frame alone", "value": f"{100 * error:.3g}", "suffix": "%", "detail": detail}]
 
 

@@ -160,12 +160,12 @@ alone, with all that is prepared for its mesh. Validation has chosen how many co
 first call of the model in the first table; `predict(corrections=, newton_steps=)` chooses them for an answer. Newton
 steps end when one is small; where they do not end, the page says so.
 
-The solver goes straight from rest to the same frame, on one thread. What it prepares for a mesh is counted, too; the
-meshing is not. "Solver" is its time at its own stop test, in one or two load steps, whichever is faster. For "cheapest"
-13 settings are tried in each scene: the own stop test and looser ones, a longer range of contact, meshes of a half and
-a quarter of the nodes, and 6 or 12 load steps of one Newton step with linearised contact. The fastest whose error is at
-most that of the answer counts; the own stop test always may. "Times as long" is that time over the time of the answer:
-its mean over these scenes, with its standard error.
+The solver goes from rest to the same frame, on one thread: straight in one, two or four load steps and frame by frame,
+whichever is fastest. What it prepares for a mesh is counted, too; the meshing is not. "Solver" is its time at its own
+stop test. For "cheapest" 13 settings are tried in each scene: the own stop test and looser ones, a longer range of
+contact, meshes of a half and a quarter of the nodes, and 6 or 12 load steps of one Newton step with linearised contact.
+The fastest whose error is at most that of the answer counts; the own stop test always may. "Times as long" is that time
+over the time of the answer: its mean over these scenes, with its standard error.
 """
 
 

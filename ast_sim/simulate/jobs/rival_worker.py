@@ -163,8 +163,9 @@ class WaySolver:
             for _ in range(self.effort["repeats"]):
                 # Whoever takes longer than the best so far cannot be the fastest.
                 most = best[1].seconds if best is not None and not best[1].failure else np.inf
+                first = 1 / start if start else 0.0
                 found = solve_frame(
-                    case, self.frame, settings, 1 / start, self.effort["most_iterations"], most_seconds=most
+                    case, self.frame, settings, first, self.effort["most_iterations"], most_seconds=most
                 )
                 if best is None or (bool(found.failure), found.seconds) < (bool(best[1].failure), best[1].seconds):
                     best = start, found

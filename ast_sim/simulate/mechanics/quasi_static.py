@@ -78,13 +78,14 @@ def solve_frame(
     most_iterations: int = MAX_FRAME_ITERATIONS,
     most_seconds: float = math.inf,
 ) -> OneFrame:
-    """Solve a case from rest straight to one of its frames. What was found is checked like a frame that is stored.
+    """Solve a case from rest to one of its frames. What was found is checked like a frame that is stored.
 
     Args:
         case: what to solve.
         frame: number of the frame.
         settings: tolerances.
-        first: share of the way that the first load step goes. A step that does not converge is halved.
+        first: share of the way that the first load step goes; 0: each frame before is solved, too. A step that does not
+            converge is halved.
         most_iterations, most_seconds: Newton iterations and processor time after which the solution is given up.
     """
     started = process_time()
@@ -100,7 +101,8 @@ def solve_frame(
     frames.watch(watch)
     position, failure = None, ""
     try:
-        solver.advance(case.targets[frame], first)
+        for target in case.targets[frame if first else 1 : frame + 1]:
+            solver.advance(target, first or 1.0)
     except SimulationError as error:
         failure = str(error)
     seconds = process_time() - began
