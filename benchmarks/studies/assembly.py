@@ -82,7 +82,7 @@ ROWS = {
         test=10,
         steps=300,
         settings={"validate_scenes": 3, "validate_every": 150, "checkpoint_every": 100},
-        rivals=5,
+        rivals=1,
         after="bumper",
     ),
 }
