@@ -260,7 +260,8 @@ def _solver(found: dict[str, Any], key: str) -> str:
 
 
 def _mean(values: Sequence[float]) -> str:
-    return f"{np.mean(values):.2g} ± {np.std(values) / len(values) ** 0.5:.1g}"
+    spread = f" ± {np.std(values) / len(values) ** 0.5:.1g}" if len(values) > 1 else ""
+    return f"{np.mean(values):.2g}{spread}"
 
 
 def _percent(errors: Sequence[float]) -> str:
