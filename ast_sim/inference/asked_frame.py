@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -59,9 +59,7 @@ def asked_frames(
     try:
         indices = list(range(min(rival_scenes, len(scenes))))
         frames = [scenes[index]["frame"] for index in indices]
-        found: Iterable[Rivals] = ()
-        if indices:
-            found = rivals(dataset.path, split, indices, frames, spec=spec, progress=False)
+        found = rivals(dataset.path, split, indices, frames, spec=spec, progress=False) if indices else ()
         for scene, rival in zip(scenes, found, strict=False):
             scene["solver"] = _solver(rival, scene["relative_error"])
             if progress is not None:
@@ -94,7 +92,7 @@ def errors_by_effort(model: Simulator, truth: Trajectory, most: Effort) -> np.nd
         for steps in (most.newton_steps, 0):  # where a Newton step fails, the calls before it still count
             (after,) = calls(model, [Question.of(truth, "validation", [frame])], Effort(corrections, steps))
             if not isinstance(after, str):
-                moved = [_rms(x[0] - truth.position[frame], free) / size for x in after.position[corrections:]]
+                moved = [relative_error(x[0], truth, frame) for x in after.position[corrections:]]
                 found[0, corrections, : steps + 1] = moved
                 allowed, made = np.arange(steps + 1), after.steps[0] + (after.last_step[0] > STILL)
                 found[2, corrections, : steps + 1] = np.minimum(allowed, made)
@@ -161,26 +159,31 @@ def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: E
     began = time.perf_counter()
     (answer,) = answers(model, [question], effort)
     seconds = time.perf_counter() - began
-    free = ~truth.scene.prescribed
-    size = _rms(truth.position[frame] - truth.position[0], free)
+    size = _rms(truth.position[frame] - truth.position[0], ~truth.scene.prescribed)
     failed = answer.failure is not None or not size  # where nothing moves, there is no relative error
     stress = None if answer.stress is None or answer.failure is not None else answer.stress[0]
     by_calls = []
     if model.config.jumps and not failed:
         (after,) = calls(model, [question], effort)
         positions = () if isinstance(after, str) else after.position
-        by_calls = [_rms(position[0] - truth.position[frame], free) / size for position in positions]
+        by_calls = [relative_error(position[0], truth, frame) for position in positions]
     return {
         "name": name,
         "frame": frame,
         "nodes": truth.scene.num_nodes,
         "displacement": size,
-        "relative_error": None if failed else _rms(answer.position[0] - truth.position[frame], free) / size,
+        "relative_error": None if failed else relative_error(answer.position[0], truth, frame),
         "by_calls": by_calls,
         "seconds": seconds,
         "last_step": answer.last_steps[-1] if answer.last_steps else None,
         **_stress_errors(truth, stress, frame, model.config.stress),
     }
+
+
+def relative_error(position: np.ndarray, truth: Trajectory, frame: int) -> float:
+    """The error of the free nodes at positions [N, 3] in a frame, over their displacement, which must not be 0."""
+    free, true = ~truth.scene.prescribed, truth.position[frame]
+    return _rms(position - true, free) / _rms(true - truth.position[0], free)
 
 
 def _rms(difference: np.ndarray, rows: np.ndarray) -> float:

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.assembly_questions import ask
+from ast_sim.inference.effort import Effort
 from ast_sim.inference.predict import Motions
 from ast_sim.runs.scope import Scope
 from ast_sim.runs.train_config import RunConfig
@@ -86,28 +87,27 @@ def sweep(
     run: Predictor,
     spec: str | os.PathLike[str],
     rows: Sequence[Mapping[str, Any]],
-    corrections: int | None,
-    newton_steps: int | None,
+    effort: Effort,
     nodes: int | None,
 ) -> Sweep:
     """Predict the last frame for each row of values; the arguments are those of `Run.sweep`.
 
-    With friction a body may be in equilibrium in two places. Then the frame before is predicted, too: Newton steps from
-    there find the place that the way leads to. Without friction, a model that jumps needs no frame between.
+    With friction a body may be in equilibrium in two places. So the frame before is predicted, too: Newton steps from
+    there find the place that the way leads to. Otherwise a model that jumps needs no frame between.
     """
     if not rows:
         raise ConfigError("a sweep needs at least one row of values")
     model = run.settings.model
-    frames = 2 if model.jumps and not model.friction else None
+    needs_way = bool(model.friction and effort.newton_steps)
+    frames = 2 if model.jumps and not needs_way else None
     table, seconds, notes = [], 0.0, []
     for start in range(0, len(rows), TOGETHER):
         asked = ask(spec, rows[start : start + TOGETHER], run.scope, frames, nodes)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             names = [f"row {start + number}" for number in range(len(asked))]
-            scenes = [(one.scene, one.motion) for one in asked]
-            wanted = [-2, -1] if model.friction and len(asked[0].motion.position) > 2 else [-1]
-            answers = run.predict_scenes(scenes, names, wanted, corrections, newton_steps)
+            wanted = [-2, -1] if needs_way and len(asked[0].motion.position) > 2 else [-1]
+            answers = run.predict_scenes([(one.scene, one.motion) for one in asked], names, wanted, *effort)
         notes += [str(note.message) for note in caught]
         table += [_row(one.values, answer, one.origin) for one, answer in zip(asked, answers, strict=True)]
         seconds += sum(answer.seconds for answer in answers)

@@ -167,7 +167,7 @@ class Run:
             raise ConfigError("a table has the values of all parameters: leave the others out, or leave the table out")
         rows = table if table is not None else grid(parameters)
         rows = rows if isinstance(rows, Sequence) and not isinstance(rows, str) else read_table(rows)
-        return sweep(self, spec, rows, corrections, newton_steps, nodes)
+        return sweep(self, spec, rows, self._effort(corrections, newton_steps), nodes)
 
     def predict_scenes(
         self,

@@ -22,11 +22,12 @@ import numpy as np
 
 import ast_sim
 from ast_sim.dataset.solver_seconds import read_seconds
-from ast_sim.inference.asked_frame import asked_frames
+from ast_sim.inference.asked_frame import asked_frames, relative_error
 from ast_sim.inference.effort import Effort
 from ast_sim.simulate.jobs.rival import deepest_frame
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
+from benchmarks.studies.beside_solver import beside_solver, times_as_long
 from benchmarks.studies.validation_curve import curve_line, minutes_per_step, validation_curve
 
 ROOT = Path(__file__).parents[2]
@@ -122,11 +123,10 @@ def _curve(run: ast_sim.Run, dataset: ast_sim.Dataset, index: int) -> dict[str, 
     began = time.perf_counter()
     answer = run.predict(truth)
     seconds = time.perf_counter() - began
-    deepest, free = deepest_frame(truth), ~truth.scene.prescribed
-    true, rest, found = (x[free].astype(np.float64) for x in (*truth.position[[deepest, 0]], answer.position[deepest]))
+    deepest = deepest_frame(truth)
     return {
         "frames": len(answer.position) - answer.given,
-        "relative_error": float(np.linalg.norm(found - true) / np.linalg.norm(true - rest)),
+        "relative_error": relative_error(answer.position[deepest], truth, deepest),
         "seconds": seconds,
         "reaction": _last_reaction(run, answer),
         "true_reaction": truth.attributes["reaction"][-1],
@@ -221,6 +221,7 @@ def _alone(found: dict[str, Any]) -> str:
     row, solver = found["row"], found["solver"]
     errors = [scene["relative_error"] for scene in found["scenes"] if scene["relative_error"] is not None]
     spent = 60 * (found["generation_minutes"] + found["minutes"])
+    seconds = [scene["seconds"] for scene in found["scenes"]]
     saved = 0.0 if solver is None else solver["seconds"] - found["seconds"]
     return _table_line([
         row["title"],
@@ -230,8 +231,8 @@ def _alone(found: dict[str, Any]) -> str:
         _reaction(found, "reaction_alone"),
         "-" if found["largest_stress"] is None else f"{100 * found['largest_stress']:.0f} %",
         f"{1000 * found['seconds']:.0f} ms",
-        "-" if solver is None else _solver(found, "seconds"),
-        "-" if solver is None else _solver(found, "cheapest_seconds"),
+        beside_solver(found["scenes"], [0.0] * len(found["scenes"]), seconds),
+        beside_solver(found["scenes"], [scene["relative_error"] for scene in found["scenes"]], seconds),
         f"{spent / saved:,.0f} questions" if saved > 0 else "never: the solver is faster" if solver else "-",
     ])  # fmt: skip
 
@@ -245,23 +246,8 @@ def _together(found: dict[str, Any]) -> str:
         _percent([curve["relative_error"] for curve in curves]),
         _reaction(found, "reaction"),
         f"{1000 * np.median([curve['seconds'] for curve in curves]):.0f} ms",
-        f"{1000 * np.mean(solver):.0f} ms, {_mean(ratios)} times as long" if solver else "-",
+        times_as_long(solver, ratios) if solver else "-",
     ])  # fmt: skip
-
-
-def _solver(found: dict[str, Any], key: str) -> str:
-    """The solver's mean time for the deepest frame, and its times over those of the answer."""
-    known = [(scene["solver"][key], scene["seconds"]) for scene in found["scenes"] if "solver" in scene]
-    known = [pair for pair in known if pair[0] is not None]
-    if not known:
-        return "-"
-    mean, ratios = np.mean([theirs for theirs, _ in known]), [theirs / ours for theirs, ours in known]
-    return f"{1000 * mean:.0f} ms, {_mean(ratios)} times as long"
-
-
-def _mean(values: Sequence[float]) -> str:
-    spread = f" ± {np.std(values) / len(values) ** 0.5:.1g}" if len(values) > 1 else ""
-    return f"{np.mean(values):.2g}{spread}"
 
 
 def _percent(errors: Sequence[float]) -> str:

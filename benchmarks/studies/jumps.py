@@ -23,6 +23,7 @@ from ast_sim.inference.effort import MOST_NEWTON_STEPS, Effort, knows_material
 from ast_sim.simulate.mechanics.linearised_contact import STILL
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
+from benchmarks.studies.beside_solver import beside_solver
 from benchmarks.studies.validation_curve import curve_line, minutes_per_step, validation_curve
 
 RESULTS = Path(__file__).parents[1] / "results" / "jumps.json"
@@ -183,8 +184,8 @@ def _table(shown: dict[str, Any]) -> list[str]:
             _percent(errors),
             f"{100 * found['training_scenes']:.1f} %",
             f"{1000 * np.median(seconds):.0f} ms",
-            _beside(found["scenes"], [0.0] * len(errors), seconds),
-            _beside(found["scenes"], errors, seconds),
+            beside_solver(found["scenes"], [0.0] * len(errors), seconds),
+            beside_solver(found["scenes"], errors, seconds),
         ]) + " |")  # fmt: skip
     return lines
 
@@ -193,23 +194,6 @@ def _percent(errors: list[float | None]) -> str:
     known = [100 * error for error in errors if error is not None]
     failed = f", {len(errors) - len(known)} failed" if len(known) < len(errors) else ""
     return f"{np.mean(known):.1f} ± {np.std(known) / len(known) ** 0.5:.1f} %{failed}"
-
-
-def _beside(scenes: list[dict[str, Any]], errors: list[float | None], seconds: list[float]) -> str:
-    """The solver's time and its ratio to the answers', where the solver was run and the answer did not fail. In each
-    scene the fastest way counts that is as accurate as the answer; the own stop test always is."""
-    taken, ratios = [], []
-    for scene, error, answer in zip(scenes, errors, seconds, strict=True):
-        if "solver" not in scene or scene["solver"]["seconds"] is None or error is None:
-            continue
-        ways = [way for way in scene["solver"]["ways"].values() if "seconds" in way]
-        fit = [way["seconds"] for way in ways if way["relative_error"] <= error]
-        taken.append(min([*fit, scene["solver"]["seconds"]]))
-        ratios.append(taken[-1] / answer)
-    if not taken:
-        return "-"
-    spread = np.std(ratios) / len(ratios) ** 0.5
-    return f"{1000 * np.mean(taken):.0f} ms, {np.mean(ratios):.2g} ± {spread:.1g} times as long"
 
 
 def _section(found: dict[str, Any]) -> list[str]:
@@ -243,7 +227,7 @@ def _section(found: dict[str, Any]) -> list[str]:
             _percent(turned["relative_error"]),
             "-" if turned["stress_share"] is None else f"{turned['stress_share']:.2f}",
             f"{1000 * np.median(turned['seconds']):.0f} ms",
-            _beside(found["scenes"], turned["relative_error"], turned["seconds"]),
+            beside_solver(found["scenes"], turned["relative_error"], turned["seconds"]),
         ]) + " |")  # fmt: skip
     return lines
 

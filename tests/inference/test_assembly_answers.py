@@ -102,6 +102,11 @@ def test_with_friction_a_sweep_knows_the_frame_before(tmp_path):
         for frames in ([-1], [-2, -1])
     )
     assert row["reaction"] == pytest.approx(after_another, rel=1e-6) and abs(alone / after_another - 1) > 1e-4
+    asked, predict_scenes = [], run.predict_scenes
+    run.predict_scenes = lambda *given: asked.append(given[2]) or predict_scenes(*given)
+    run.sweep(spec, travel=1.5, corrections=0, newton_steps=0)
+    run.sweep(spec, travel=1.5, corrections=0, newton_steps=3)
+    assert asked == [[-1], [-2, -1]]  # without Newton steps, the frame before changes nothing
 
 
 def test_rows_outside_the_training_are_told_once(trained):
