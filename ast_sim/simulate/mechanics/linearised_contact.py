@@ -50,6 +50,7 @@ SWEEPS, CHANGE = 100, 1e-3  # forces of friction are found when a sweep over the
 FLATTEST = 0.2  # the least stretch of an element that forces and stiffness follow
 TINY = 1e-300  # instead of zero in a denominator
 STILL = 0.05  # a step of this size (`NewtonSteps.size`) or less is the last one (docs/log.md, 2026-11-25)
+SLIGHT = 1e-3  # a displacement below this, in mean edge lengths, is none: before bodies touch, only rounding is left
 SMALLEST = 1 / 64  # a step is shortened at most so far where it turns an element over
 
 
@@ -80,7 +81,6 @@ class NewtonSteps:
 
     Raises:
         SimulationError: the rest volume of an element is not positive.
-        MissingExtra: no library for the linear system is installed.
     """
 
     def __init__(self, scene: Scene, material: NeoHookean, clearance: float, friction: float = 0.0) -> None:
@@ -123,10 +123,12 @@ class NewtonSteps:
     def size(self, before: np.ndarray, after: np.ndarray) -> float:
         """The size of the last step, between positions [N, 3]: the largest component of a move, in mean edge lengths of
         the surfaces, or the root mean square of the moves over that of the displacements from rest, if that is larger.
-        A step that was shortened has the size of the whole one: where elements stop it, it has not converged."""
+        Displacements below `SLIGHT` count as `SLIGHT`. A step that was shortened has the size of the whole one: where
+        elements stop it, it has not converged."""
         free = self._system.free
         move, displacement = ((after - start).ravel()[free] for start in (before, self._rest))
-        share = np.linalg.norm(move) / max(np.linalg.norm(displacement), TINY)
+        slight = SLIGHT * self._length * math.sqrt(len(free))
+        share = np.linalg.norm(move) / max(np.linalg.norm(displacement), slight)
         return float(max(np.abs(move).max() / self._length, share)) / self._shortening
 
     def _constrained(self, factor: Factorization, force: np.ndarray, pairs: NearPairs) -> np.ndarray:

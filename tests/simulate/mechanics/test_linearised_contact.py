@@ -8,7 +8,7 @@ from solids import blocks, pressed, scene_of
 from ast_sim.scene import NodeType
 from ast_sim.simulate.mechanics import linearised_contact
 from ast_sim.simulate.mechanics.elasticity import Elasticity
-from ast_sim.simulate.mechanics.linearised_contact import NewtonSteps
+from ast_sim.simulate.mechanics.linearised_contact import STILL, NewtonSteps
 from ast_sim.simulate.mechanics.material import NeoHookean
 from ast_sim.simulate.mechanics.quasi_static import quasi_static, solve_frame
 from ast_sim.support.errors import SimulationError
@@ -90,6 +90,17 @@ def test_a_step_turns_no_element_over_and_has_the_size_of_the_whole_one(squeezed
     assert made <= 0.5 and deforming.evaluate(moved).J.min() > 0 >= deforming.evaluate(double).J.min()
     share = rms(way) / rms((moved - case.scene.rest_position)[free])
     assert solver.size(truth, moved) == pytest.approx(max(abs(way).max() / solver._length, share))
+
+
+def test_steps_end_where_nothing_is_displaced(squeezed):
+    """Before bodies touch, a frame is the rest shape: what is left of a guess after a step is all rounding."""
+    case, _, free, size = squeezed
+    rest = case.scene.rest_position.astype(np.float64)
+    solver, position, sizes = NewtonSteps(case.scene, case.material, 0.0), nearly(rest, free, 0.01 * size), []
+    for _ in range(3):
+        before, position = position, solver.step(position)
+        sizes.append(solver.size(before, position))
+    assert sizes[0] > STILL and max(sizes[1:]) < 0.1 * STILL and rms((position - rest)[free]) < 1e-6 * size
 
 
 def test_a_body_deep_inside_another_is_no_pair(squeezed):
