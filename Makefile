@@ -88,7 +88,7 @@ $(VENV)/torch: constraints.txt
 	touch $@
 
 $(VENV)/installed: $(VENV)/torch pyproject.toml setup.py MANIFEST.in $(C_SOURCES)
-	$(PIP) --editable '.[simulate,view]'
+	$(PIP) --editable '.[simulate,cad,view]'
 	touch $@
 
 # By name, the package that is there gets its extras; by path, it would be built once more, half a minute on one core.

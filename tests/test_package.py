@@ -1,6 +1,7 @@
 """The package as users get it: a wheel with everything in it, imported without a compiler; what an import loads."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -63,6 +64,30 @@ def test_import_loads_little():
     assert run_python(code).strip() == "[]"
     code = "import ast_sim; print(ast_sim.Scene.__name__, 'new_model' in dir(ast_sim))"
     assert run_python(code).strip() == "Scene True"
+
+
+def test_training_and_predicting_need_no_extra(tmp_path, monkeypatch):
+    """Newton steps of the solver belong to an answer, so what they import is installed with the package."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = (project["optional-dependencies"][name] for name in ("simulate", "cad", "cluster", "view"))
+    modules = [re.split("[<>=;]", requirement)[0] for extra in extras for requirement in extra]
+    code = f"""
+import sys
+sys.modules.update(dict.fromkeys({modules!r}))
+import toy, ast_sim
+from ast_sim.dataset.writer import DatasetWriter
+with DatasetWriter("toy.h5", toy.info()) as writer:
+    for seed, split in enumerate(("train", "valid", "test")):
+        plate = toy.plate(seed)
+        plate.attributes.update(young=1e6, poisson=0.4, dhat=0.001)
+        writer.add(split, plate)
+run = ast_sim.train("toy.h5", "run", steps=2)
+with ast_sim.Dataset("toy.h5") as data:
+    answer = run.predict(data["test"][0], frames=[-1], newton_steps=1)
+print(answer.failure, len(answer.last_steps))
+"""
+    monkeypatch.chdir(tmp_path)
+    assert run_python(code, PYTHONPATH=str(ROOT / "tests")).splitlines()[-1] == "None 1"
 
 
 def test_every_extra_asks_for_what_its_code_imports():

@@ -63,14 +63,14 @@ def require(extra: str, *modules: str) -> list[ModuleType]:
         try:
             found.append(importlib.import_module(name))
         except ImportError as error:
-            if _interrupted(error):  # Ctrl-C while a compiled module is imported
+            if interrupted(error):  # Ctrl-C while a compiled module is imported
                 raise KeyboardInterrupt from error
             line = f'pip install "ast_sim[{extra}]"'
             raise MissingExtra(f"{name} is needed here but cannot be imported ({error}): {line}") from error
     return found
 
 
-def _interrupted(error: BaseException | None) -> bool:
+def interrupted(error: BaseException | None) -> bool:
     """Whether a KeyboardInterrupt lies behind the error."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__

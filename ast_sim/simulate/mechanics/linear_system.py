@@ -7,7 +7,7 @@ faster. If the iterations do not suffice, the matrix itself is factorised.
 
 Elements couple the same unknowns at all times; contact couples more as it spreads. The sparsity pattern holds the
 entries of the elements and of every contact since the last `restart`. As long as no new entries come, the symbolic
-factorization is used again. PARDISO (of MKL) factorises where it is installed, CHOLMOD (of cholespy) elsewhere. Both
+factorization is used again. PARDISO (of MKL) factorises where there is MKL, CHOLMOD (of cholespy) elsewhere. Both
 use one thread, and both report a matrix that is not positive definite.
 """
 
@@ -25,7 +25,7 @@ from typing import Protocol
 import numpy as np
 import scipy.sparse
 
-from ast_sim.support.errors import MissingExtra, SimulationError, require
+from ast_sim.support.errors import SimulationError, interrupted
 
 # Systems with at least this many unknowns keep a factor and iterate with it.
 ITERATE_FROM = 50_000
@@ -68,7 +68,8 @@ def _pypardiso() -> tuple[ModuleType, str]:
             for file in importlib.metadata.files("mkl") or ():
                 if "mkl_rt" in file.name:
                     os.environ["PYPARDISO_MKL_RT"] = str(file.locate())
-    (pypardiso,) = require("simulate", "pypardiso")
+    import pypardiso
+
     return pypardiso, f"PARDISO (pypardiso {importlib.metadata.version('pypardiso')})"
 
 
@@ -122,7 +123,9 @@ class Cholmod:
     name = "CHOLMOD (cholespy)"
 
     def __init__(self) -> None:
-        (self._cholespy,) = require("simulate", "cholespy")
+        import cholespy
+
+        self._cholespy = cholespy
 
     def factorise(self, upper: scipy.sparse.csr_array, is_new_pattern: bool) -> bool:
         whole = (upper + scipy.sparse.triu(upper, 1).T).tocsc()
@@ -157,14 +160,12 @@ class Cholmod:
 
 
 def factorization() -> Factorization:
-    """The fastest library that is installed.
-
-    Raises:
-        MissingExtra: no library is installed.
-    """
+    """The fastest library that there is for this machine."""
     try:
         return Pardiso()
-    except MissingExtra:
+    except ImportError as error:
+        if interrupted(error):  # by Ctrl-C
+            raise KeyboardInterrupt from error
         return Cholmod()
 
 

@@ -1,5 +1,7 @@
 """The sparse system of a Newton step: against dense algebra, with contact that comes and goes, both factorizations."""
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -43,6 +45,13 @@ def assert_solves(system: LinearSystem, values, contact, dense, fixed, residual:
     assert (solution[fixed] == 0).all()
     left = matrix[np.ix_(free, free)] @ solution.ravel()[free] - right.ravel()[free]
     assert np.linalg.norm(left) <= residual * np.linalg.norm(right.ravel()[free])
+
+
+def test_where_there_is_no_mkl_cholmod_factorises(monkeypatch):
+    assert isinstance(linear_system.factorization(), Pardiso)
+    monkeypatch.setitem(sys.modules, "pypardiso", None)
+    linear_system._pypardiso.cache_clear()
+    assert isinstance(linear_system.factorization(), Cholmod)
 
 
 def test_it_solves_what_the_dense_matrix_does_with_contact_that_changes(problem):
