@@ -1,4 +1,4 @@
-"""The time of the solver beside the time of the answers, as the pages of the studies state it."""
+"""What the pages of asked frames and of own assemblies say in the same words."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+
+SHOWN_WORST = 5
 
 
 def beside_solver(scenes: Sequence[dict[str, Any]], errors: Sequence[float | None], seconds: Sequence[float]) -> str:
@@ -22,6 +24,17 @@ def beside_solver(scenes: Sequence[dict[str, Any]], errors: Sequence[float | Non
     if not taken:
         return "-"
     return times_as_long(taken, ratios)
+
+
+def over_the_scenes(scenes: Sequence[dict[str, Any]]) -> str:
+    """How the errors of the answers are spread, and which scenes are the worst."""
+    errors = {scene["name"]: 100 * scene["relative_error"] for scene in scenes if scene["relative_error"] is not None}
+    low, middle, high = np.quantile(list(errors.values()), (0.1, 0.5, 0.9))
+    worst = ", ".join(f"{name} {errors[name]:.2g} %" for name in sorted(errors, key=lambda n: -errors[n])[:SHOWN_WORST])
+    return (
+        f"Over the scenes: a tenth below {low:.2g} %, the median {middle:.2g} %, a tenth above {high:.2g} %."
+        f" Worst: {worst}."
+    )
 
 
 def times_as_long(taken: Sequence[float], ratios: Sequence[float]) -> str:
