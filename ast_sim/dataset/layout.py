@@ -97,12 +97,13 @@ def scene_kind(scene: Scene) -> tuple[int, int]:
 
 
 def write_attributes(group: h5py.Group | h5py.Dataset, values: dict[str, Any]) -> None:
-    """Store values of the types str, int, float and list of numbers as attributes.
+    """Store values of the types str, int, float and list of numbers as attributes, in the order of their names: the
+    bytes of a file depend on the order.
 
     Raises:
         DatasetError: a value has another type; the text names the attribute.
     """
-    for key, value in values.items():
+    for key, value in sorted(values.items()):
         if isinstance(value, str):
             # A string of fixed length is stored in the object header, which has a checksum.
             text = value.encode(errors="backslashreplace")  # names of files may hold bytes that are no text

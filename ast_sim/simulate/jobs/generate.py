@@ -2,7 +2,7 @@
 
 `OUT.parts/` holds every finished sample, and the frames so far of long unfinished samples. A run with the same settings
 goes on from there. When all samples are present, they are merged in order into the dataset file, and the folder is
-removed.
+removed. If a dataset shall have more scenes, its samples are laid into the folder again, and only the others are made.
 The settings alone determine the bytes of the dataset. The number of workers and interruptions do not change them. The
 solver's seconds are stored in a file beside the dataset (`ast_sim.dataset.solver_seconds`).
 """
@@ -25,14 +25,22 @@ from typing import Any
 from ast_sim.dataset.domain import FittedWriter
 from ast_sim.dataset.layout import SPLITS
 from ast_sim.dataset.reader import Dataset
-from ast_sim.dataset.solver_seconds import Seconds, write_seconds
+from ast_sim.dataset.solver_seconds import Seconds, read_seconds, seconds_path, write_seconds
 from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.simulate.families.names import family_module
 from ast_sim.simulate.jobs import cluster, pool
 from ast_sim.simulate.jobs.display import Progress
 from ast_sim.simulate.jobs.manifest import Manifest, Watch
 from ast_sim.simulate.jobs.recipe import check_parts, checked_recipe, difference, recorded
-from ast_sim.simulate.jobs.samples import Recipe, Sample, load_sample, sample_name, sample_path
+from ast_sim.simulate.jobs.samples import (
+    Recipe,
+    Sample,
+    load_sample,
+    pack_sample,
+    sample_name,
+    sample_path,
+    store_sample,
+)
 from ast_sim.simulate.mechanics.contact_and_friction import self_test
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.support.disk import output_file, replacing
@@ -79,7 +87,7 @@ def generate(
 
     Args:
         family: scene family, such as "deforming_plate".
-        out: the dataset file. If it exists and was made with the same settings, nothing is done.
+        out: the dataset file. If it exists and was made with the same settings, only scenes that it lacks are made.
         train, valid, test: scenes of each split. `valid` and `test` are a tenth of `train` if None.
         seed: of all random draws. A sample depends only on the seed, its split, its index and the settings.
         nodes: about how many nodes a scene has; None: the family's default, or by the sizes of a specification.
@@ -106,12 +114,14 @@ def generate(
     out, settings = Path(out), recorded(recipe)
     output_file(out)
     folder = out.with_name(out.name + ".parts")
-    if out.exists():
+    if out.exists() and not _grows(out, settings, counts):
         return _existing(out, folder, settings, counts)
     if not folder.exists():
         _check_start(out, sum(counts.values()), recipe, module)
-    samples = [(split, index) for split in SPLITS for index in range(counts[split])]
+    samples = _samples(counts)
     with _locked(folder, settings):
+        if out.exists():
+            _unpack(out, folder)
         _make(samples, folder, recipe, workers, scheduler, progress, _notes(settings))
         truncated = _merge(out, folder, samples, _writer(out, recipe, module, {**settings, "counts": counts}))
         _remove(folder)
@@ -210,17 +220,42 @@ def _check_start(out: Path, scenes: int, recipe: Recipe, module: ModuleType) -> 
         )
 
 
+def _grows(out: Path, settings: dict[str, Any], counts: dict[str, int]) -> bool:
+    """Whether the dataset was made with these settings and has fewer scenes in a split, and more in none."""
+    with Dataset(out) as dataset:
+        before, same = dataset.splits, not difference(dataset.info.generator, settings)
+    return same and before != counts and all(before[split] <= counts[split] for split in SPLITS)
+
+
+def _samples(counts: dict[str, int]) -> list[Sample]:
+    """The samples of a dataset, in order."""
+    return [(split, index) for split in SPLITS for index in range(counts[split])]
+
+
+def _unpack(out: Path, folder: Path) -> None:
+    """Lay the samples of the dataset into the parts folder, as they lay there before they were merged."""
+    with Dataset(out) as dataset:
+        known = read_seconds(dataset).samples
+        seconds = json.loads(seconds_path(out).read_text(encoding="utf-8"))["samples"] if known else {}
+        for sample in _samples(dataset.splits):
+            path = sample_path(folder, *sample)
+            if not _is_readable(path):
+                whole = replace(dataset.load(*sample), cauchy_stress=dataset.cauchy_stress(*sample))
+                store_sample(path, pack_sample(whole, seconds.get(sample_name(*sample), {})))
+
+
 def _existing(out: Path, folder: Path, settings: dict[str, Any], counts: dict[str, int]) -> Generated:
     with Dataset(out) as dataset:
         differs = difference(dataset.info.generator, {**settings, "counts": counts})
         if differs:
             raise SimulationError(f"{out} exists and holds other data ({differs}): remove it or choose another name")
-        names = [(split, index) for split in SPLITS for index in range(dataset.count(split))]
+        names = _samples(dataset.splits)
         truncated = [sample_name(*sample) for sample in names if dataset.attributes(*sample)["status"] == "truncated"]
-    if folder.exists():  # a kill came after the dataset was written and before its parts were removed
-        with _locked(folder, settings):
-            _remove(folder)
-    _remove(folder)
+    if set(folder.glob("*.npz")) <= {sample_path(folder, *sample) for sample in names}:  # else it is about to grow
+        if folder.exists():  # a kill came after the dataset was written and before its parts were removed
+            with _locked(folder, settings):
+                _remove(folder)
+        _remove(folder)
     return Generated(out, counts, truncated)
 
 
@@ -285,8 +320,10 @@ def _merge(out: Path, folder: Path, samples: list[Sample], opened: DatasetWriter
     seconds: dict[str, Seconds] = {}
     with opened as writer:
         for sample in samples:
-            trajectory, seconds[sample_name(*sample)] = load_sample(sample_path(folder, *sample))
+            trajectory, taken = load_sample(sample_path(folder, *sample))
             writer.add(sample[0], trajectory)
+            if taken:
+                seconds[sample_name(*sample)] = taken
             if trajectory.attributes["status"] == "truncated":
                 truncated.append(sample_name(*sample))
         write_seconds(out, writer.info.generator, seconds)

@@ -140,12 +140,12 @@ def store_sample(path: Path, data: bytes) -> None:
         temporary.write_bytes(data)
 
 
-def pack_sample(trajectory: Trajectory) -> bytes:
-    """A sample as the bytes of its file."""
-    kept, seconds = split_seconds(trajectory.attributes)
+def pack_sample(trajectory: Trajectory, seconds: Seconds | None = None) -> bytes:
+    """A sample as the bytes of its file; with the seconds of its attributes, on this processor, if none are given."""
+    kept, taken = split_seconds(trajectory.attributes)
     arrays = {key: getattr(trajectory.scene, key) for key in _SCENE}
     arrays |= {key: getattr(trajectory, key) for key in _FRAMED}
-    texts = {"attributes": kept, "seconds": {**seconds, "processor": processor()}}
+    texts = {"attributes": kept, "seconds": {**taken, "processor": processor()} if seconds is None else seconds}
     file = io.BytesIO()
     np.savez(
         file,

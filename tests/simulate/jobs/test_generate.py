@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import data_samples
 import meshio
 import numpy as np
 import pytest
@@ -183,6 +184,57 @@ def test_an_existing_dataset_is_kept(undisturbed):
     with pytest.raises(SimulationError, match="exists and holds other data"):
         plates(undisturbed, seed=6)
     assert undisturbed.stat().st_mtime_ns == before
+
+
+def test_a_dataset_grows_without_solving_a_scene_twice(undisturbed, tmp_path, monkeypatch):
+    out, folder = tmp_path / "plates.h5", tmp_path / "plates.h5.parts"
+    plates(out, {"train": 1, "valid": 1})
+    with Dataset(out) as dataset:
+        before = read_seconds(dataset).samples
+    run_all, made = pool.run_all, []
+
+    def stopped(samples, *rest):
+        made.extend(samples)
+        run_all(samples[:1], *rest)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pool, "run_all", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        plates(out)
+    assert made == [("train", 1), ("test", 0)]
+    assert plates(out, {"train": 1, "valid": 1}).counts["train"] == 1  # as it was; what is under way is not lost
+    assert (folder / "train-000001.npz").exists()
+
+    monkeypatch.setattr(pool, "run_all", lambda samples, *rest: (made.extend(samples), run_all(samples, *rest)))
+    assert plates(out).counts == COUNTS
+    assert made[2:] == [("test", 0)]
+    assert out.read_bytes() == undisturbed.read_bytes() and not folder.exists()
+    with Dataset(out) as dataset:
+        after = read_seconds(dataset).samples
+    assert len(after) == 4 and {name: after[name] for name in before} == before
+    with pytest.raises(SimulationError, match=r"holds other data \(counts: train 2 there, 1 here\)"):
+        plates(out, {"train": 1, "valid": 1, "test": 1})
+
+
+def test_a_dataset_whose_seconds_are_lost_grows_without_them(undisturbed, tmp_path):
+    out = tmp_path / "plates.h5"
+    plates(out, {"train": 1, "valid": 1})
+    (tmp_path / "plates.h5.seconds.json").unlink()
+    plates(out)
+    with Dataset(out) as dataset:
+        assert sorted(read_seconds(dataset).samples) == ["test/000000", "train/000001"]
+    assert out.read_bytes() == undisturbed.read_bytes()
+
+
+def test_a_dataset_is_unpacked_with_all_its_arrays(tmp_path):
+    member = data_samples.trajectory(data_samples.block(2, 1, 1), 3, stress="element", tensor=True, solver="own")
+    path = data_samples.write(tmp_path / "d.h5", {"train": [member]}, stress_location="element")
+    generate_module._unpack(path, tmp_path)
+    found, seconds = load_sample(sample_path(tmp_path, "train", 0))
+    for key in ("position", "stress", "cauchy_stress"):
+        assert np.array_equal(getattr(found, key), getattr(member, key))
+    assert np.array_equal(found.scene.elements, member.scene.elements) and seconds == {}
+    assert found.attributes == {"seed": 0, "solver": "own", "status": "complete"}
 
 
 def test_a_patient_solve_is_recorded_and_reaches_every_frame(tmp_path, monkeypatch):
