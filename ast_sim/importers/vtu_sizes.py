@@ -7,6 +7,7 @@ each array is known before it is unpacked.
 from __future__ import annotations
 
 import base64
+import io
 import lzma
 import zlib
 from collections.abc import Iterator
@@ -20,8 +21,10 @@ from ast_sim.support.errors import DatasetError
 # No linear or quadratic cell of VTK has more nodes.
 _MOST_NODES = 27
 
-# Unpacking goes in pieces of so many bytes. An array of facts on the whole file, such as its time, has at most one.
-_PIECE = 1 << 20
+# The most bytes of an array of facts on the whole file, such as its time.
+_FACTS = 1 << 20
+
+_DAMAGED = (ElementTree.ParseError, LookupError, ValueError, OverflowError, EOFError, zlib.error, lzma.LZMAError)
 
 
 def require_declared_sizes(path: Path) -> None:
@@ -32,27 +35,26 @@ def require_declared_sizes(path: Path) -> None:
     Raises:
         DatasetError: an array is too large, or two arrays share their data; the text names the file and the array.
     """
-    content = path.read_bytes()
     try:
-        root, raw = _tree(content)
-        if root.get("compressor") is None:
+        root, raw = _tree(path.read_bytes())
+        compressor = root.get("compressor")
+        if compressor is None:
             return
         arrays = list(_arrays(root))
-    except (ElementTree.ParseError, LookupError, ValueError):
+    except _DAMAGED:
         return
     appended = root.find("AppendedData")
     shared = b"" if appended is None else (raw or (appended.text or "").strip().removeprefix("_").encode())
-    header = np.dtype({"UInt64": "u8", "UInt32": "u4"}.get(root.get("header_type", "UInt32"), "u4"))
+    header = np.dtype("u8" if root.get("header_type") == "UInt64" else "u4")
     header = header.newbyteorder(">" if root.get("byte_order") == "BigEndian" else "<")
-    offsets: set[str] = set()
+    offsets: set[str | None] = set()
     for array, limit in arrays:
-        kind, name, offset = array.get("format"), array.get("Name", "Points"), array.get("offset", "0")
+        name, kind, offset = array.get("Name", "Points"), array.get("format"), array.get("offset")
         if kind == "appended" and offset in offsets:
             raise DatasetError(f"{path}: the array {name} shares its data with another array; the file is damaged")
-        offsets |= {offset} if kind == "appended" else set()
-        data = shared[int(offset) :] if kind == "appended" else (array.text or "").strip().encode()
+        offsets.add(offset)
         encoded = kind == "binary" or not raw
-        if kind in ("appended", "binary") and _exceeds(data, encoded, header, root.attrib["compressor"], limit):
+        if kind in ("appended", "binary") and _exceeds(array, shared, encoded, header, compressor, limit):
             raise DatasetError(
                 f"{path}: the array {name} unpacks to more than {limit} bytes, which is all that the declared numbers"
                 " of points and cells allow; the file is damaged"
@@ -81,61 +83,38 @@ def _arrays(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, in
                     columns = 1 if array.get("Name") in ("offsets", "types") else _MOST_NODES
                 yield array, rows * columns * size["".join(filter(str.isdigit, array.get("type", "")))]
     for array in root.iterfind("UnstructuredGrid/FieldData/DataArray"):
-        yield array, _PIECE
+        yield array, _FACTS
 
 
-def _exceeds(data: bytes, encoded: bool, header: np.dtype, compressor: str, limit: int) -> bool:
+def _exceeds(
+    array: ElementTree.Element, shared: bytes, encoded: bool, header: np.dtype, compressor: str, limit: int
+) -> bool:
     """Whether an array unpacks to more than `limit` bytes. Its data start with the number of blocks, the size of a
-    block, the size of the last block and the compressed sizes of all blocks."""
+    block, the size of the last block and the compressed sizes of all blocks. Where they are damaged, the reader fails.
+    """
 
     def read(start: int, count: int) -> bytes:
         """`count` bytes of the part that starts at `start`."""
-        if not encoded:
-            return data[start : start + count]
-        try:
+        if encoded:
             return base64.b64decode(data[start : start + -(-count // 3) * 4])[:count]
-        except ValueError:
-            return b""
+        return data[start : start + count]
 
-    first = np.frombuffer(read(0, header.itemsize), header)
-    if len(first) == 0:
-        return False
-    length = (3 + int(first[0])) * header.itemsize
-    sizes = np.frombuffer(read(0, min(length, len(data)) // header.itemsize * header.itemsize), header)[3:]
-    if len(sizes) < int(first[0]):
-        return False
-    packed = read(-(-length // 3) * 4 if encoded else length, int(sizes.sum(dtype=np.uint64)))
-    ends = np.cumsum(sizes.astype(np.int64))
-    total = 0
-    for start, end in zip(ends - sizes.astype(np.int64), ends, strict=True):
-        for count in _unpacked(packed[start:end], compressor):
-            total += count
-            if total > limit:
+    left = limit + 1
+    try:
+        appended = array.get("format") == "appended"
+        data = shared[int(array.get("offset", 0)) :] if appended else (array.text or "").strip().encode()
+        length = (3 + int(np.frombuffer(read(0, header.itemsize), header)[0])) * header.itemsize
+        sizes = np.frombuffer(read(0, length), header)[3:]
+        packed = io.BytesIO(read(-(-length // 3) * 4 if encoded else length, int(sizes.sum(dtype=np.uint64))))
+        for size in sizes.tolist():
+            block = packed.read(size)
+            if compressor == "vtkZLibDataCompressor":
+                left -= len(zlib.decompressobj().decompress(block, left))
+            else:
+                with lzma.LZMAFile(io.BytesIO(block)) as unpacked:
+                    left -= unpacked.seek(left)  # unpacks so many bytes, or all, and keeps none
+            if left == 0:
                 return True
+    except _DAMAGED:
+        pass
     return False
-
-
-def _unpacked(block: bytes, compressor: str) -> Iterator[int]:
-    """The sizes of the pieces of a block, as they are unpacked."""
-    if compressor == "vtkZLibDataCompressor":
-        stream = zlib.decompressobj()
-        while block and not stream.eof:
-            try:
-                piece = stream.decompress(block, _PIECE)
-            except zlib.error:
-                return
-            yield len(piece)
-            block = stream.unconsumed_tail
-        return
-    while block:  # an LZMA block may hold several streams
-        unpacker = lzma.LZMADecompressor()
-        while not unpacker.eof:
-            try:
-                piece = unpacker.decompress(block, _PIECE)
-            except (lzma.LZMAError, EOFError):
-                return
-            yield len(piece)
-            block = b""
-            if unpacker.needs_input:
-                return
-        block = unpacker.unused_data
