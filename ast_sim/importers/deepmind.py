@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from itertools import count, islice
 from pathlib import Path
 
 import numpy as np
@@ -16,16 +17,12 @@ import numpy as np
 from ast_sim.dataset.domain import FittedWriter
 from ast_sim.dataset.layout import SPLITS
 from ast_sim.importers.deepmind_meta import LENGTH, Meta, read_meta
-from ast_sim.importers.tfrecord import RecordFile, Span, find_values
-from ast_sim.scene import Scene, Trajectory, connected_parts
+from ast_sim.importers.tfrecord import find_values, read_records
+from ast_sim.scene import Scene, Trajectory, connected_parts, require_array
 from ast_sim.support.errors import DatasetError
 
 SUFFIX = ".tfrecord"
 META = "meta.json"
-
-# The arrays that a trajectory needs: the allowed numbers of columns, and the kind of the numbers.
-_NEEDED = {"cells": ((3, 4), "iu"), "node_type": ((1,), "iu"), "mesh_pos": ((2, 3), "f"), "world_pos": ((3,), "f")}
-_STRESS = {"stress": ((1,), "f")}
 
 
 def is_deepmind(source: Path) -> bool:
@@ -72,7 +69,6 @@ def convert_deepmind(
     source = Path(source)
     files = _split_files(source, splits)
     meta = read_meta(source / META)
-    _require_features(source / META, meta)
     taken = {"source": str(source), "simulator": meta.simulator, "limit": limit, "every": every}
     with FittedWriter(
         out,
@@ -101,12 +97,12 @@ def read_trajectories(path: Path, meta: Meta, limit: int | None = None, every: i
     Raises:
         DatasetError: the file is wrong; the text names the file and the record.
     """
-    with RecordFile(path) as file:
-        if file.at_end:
-            raise DatasetError(f"{path}: is empty: download it again")
-        while not file.at_end and (limit is None or file.count < limit):
-            # The record has no name here, so its memory is free before the next one is read.
-            yield _trajectory(file.read(), meta, path, file.count - 1, every)
+    # By `map` the record has no name here, so its memory is free before the next one is read.
+    yield from map(
+        lambda payload, index: _trajectory(payload, meta, path, index, every),
+        islice(read_records(path), limit),
+        count(),
+    )
 
 
 def _split_files(source: Path, splits: Sequence[str] | None) -> dict[str, Path]:
@@ -120,62 +116,27 @@ def _split_files(source: Path, splits: Sequence[str] | None) -> dict[str, Path]:
     return files
 
 
-def _require_features(path: Path, meta: Meta) -> None:
-    """Raise DatasetError unless the features describe trajectories of one moving mesh."""
-    used = _NEEDED | (_STRESS if "stress" in meta.features else {})
-    for name, (columns, kinds) in used.items():
-        if name not in meta.features:
-            raise DatasetError(
-                f"{path}: there is no feature {name}; deforming bodies have {', '.join(_NEEDED)} (as deforming_plate"
-                f" and sphere_simple), here are {', '.join(meta.features) or 'none'}"
-            )
-        feature = meta.features[name]
-        rank = 2 if feature.kind == "dynamic_varlen" else 3
-        if len(feature.shape) != rank or feature.shape[-1] not in columns:
-            widths = " or ".join(map(str, columns))
-            raise DatasetError(
-                f"{path}: the feature {name} has the shape {list(feature.shape)}; must have {rank} sizes, the last"
-                f" of them {widths}"
-            )
-        if feature.dtype.kind not in kinds:
-            raise DatasetError(f"{path}: the feature {name} is {feature.dtype.name}, which does not fit what it means")
-        if name in ("world_pos", "stress") and feature.kind == "static":
-            raise DatasetError(f"{path}: the feature {name} is static; must have a value for each frame")
-
-
-@dataclass(frozen=True)
 class _Record:
     """A trajectory as it is stored; `where` is the file and the record, for messages."""
 
-    payload: bytes
-    spans: dict[str, Span]
-    meta: Meta
-    where: str
-
-    @classmethod
-    def of(cls, payload: bytes, meta: Meta, where: str) -> _Record:
-        """Find all features in the payload, and check their sizes against `meta.json`."""
+    def __init__(self, payload: bytes, meta: Meta, where: str) -> None:
+        self.payload, self.meta, self.where = payload, meta, where
         counts = [LENGTH + name for name, feature in meta.features.items() if feature.kind == "dynamic_varlen"]
-        spans = find_values(payload, [*meta.features, *counts], where)
+        self.spans = find_values(payload, [*meta.features, *counts], where)
         for name in (*meta.features, *counts):
-            if name not in spans:
+            if name not in self.spans:
                 raise DatasetError(f"{where}: has no feature {name}, which {META} lists")
-        record = cls(payload, spans, meta, where)
-        for name, feature in meta.features.items():
-            record.array(name, feature.shape, feature.dtype)
-        return record
 
     def array(self, name: str, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-        """A feature as a view of the payload; its number of bytes gives the size -1 in the shape."""
-        begin, end = self.spans[name]
-        row = abs(math.prod(shape)) * dtype.itemsize
-        rows, rest = divmod(end - begin, row)
-        if rest or (-1 not in shape and rows != 1):
+        """A feature as a view of the payload."""
+        values = memoryview(self.payload)[slice(*self.spans[name])]
+        try:
+            return np.frombuffer(values, dtype).reshape(shape)
+        except (ValueError, OverflowError) as error:
             raise DatasetError(
-                f"{self.where}: the feature {name} has {end - begin} bytes; {META} says {dtype.name} {list(shape)},"
-                f" {'a multiple of ' if -1 in shape else ''}{row} bytes"
-            )
-        return np.ndarray(tuple(rows if size == -1 else size for size in shape), dtype, self.payload, begin)
+                f"{self.where}: the feature {name} has {len(values)} bytes; {META} says {dtype.name} {list(shape)}, a"
+                f" multiple of {abs(math.prod(shape)) * dtype.itemsize} bytes"
+            ) from error
 
     def frames(self, name: str) -> np.ndarray:
         """A feature as [T, rows, columns]; a static one as [1, rows, columns]."""
@@ -208,20 +169,13 @@ class _Record:
 
 def _trajectory(payload: bytes, meta: Meta, path: Path, index: int, every: int) -> Trajectory:
     where = f"{path}: record {index}"
-    record = _Record.of(payload, meta, where)
+    record = _Record(payload, meta, where)
     position = _floats(record.frames("world_pos")[::every])
     stress = _floats(record.frames("stress")[::every]) if "stress" in meta.features else None
-    node_type, mesh_pos = record.constant("node_type"), record.constant("mesh_pos")
-    nodes = {"node_type": len(node_type), "mesh_pos": len(mesh_pos)}
-    if stress is not None:
-        nodes["stress"] = stress.shape[1]
-    for name, count in nodes.items():
-        if count != position.shape[1]:
-            raise DatasetError(f"{where}: {name} has {count} rows and world_pos {position.shape[1]}: both are per node")
     scene = _scene(
         _integers(record.constant("cells"), np.int32, f"{where}: cells"),
-        _integers(node_type[:, 0], np.uint8, f"{where}: node_type"),
-        _floats(mesh_pos),
+        _integers(record.constant("node_type")[:, 0], np.uint8, f"{where}: node_type"),
+        _floats(record.constant("mesh_pos")),
         position[0],
         where,
     )
@@ -237,7 +191,8 @@ def _scene(elements: np.ndarray, node_type: np.ndarray, mesh_pos: np.ndarray, fi
     rest say nothing about the motion in space. A body whose nodes are all prescribed, such as the sphere of
     sphere_simple, is rigid: its rest position is its position in the first frame, and its `mesh_pos` is not read.
     """
-    nodes = len(mesh_pos)
+    nodes = len(first)
+    require_array(where, "mesh_pos", mesh_pos, np.float32, (nodes, None))
     scene = Scene(np.zeros((nodes, 3), np.float32), elements, node_type, np.zeros(nodes, np.int32))
     scene.check(where)  # before its parts are searched
     body = connected_parts(elements, nodes)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
-import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +15,20 @@ from ast_sim.support.errors import DatasetError
 LENGTH = "length_"  # prefix of the feature that holds, for each frame, the number of rows of another feature
 LARGEST = 1 << 20  # most bytes of a meta.json; real ones have about 1,000
 
-_TYPES = ("static", "dynamic", "dynamic_varlen")
-_DTYPES = ("float32", "float64", "int32", "int64", "uint8")
+_CHANGING = ("dynamic", "dynamic_varlen")
+_ANY = ("static", *_CHANGING)
+_INTEGERS = ("int32", "int64", "uint8")
+_FLOATS = ("float32", "float64")
+
+# The features that are read, all but `stress` necessary: the allowed types, numbers of columns and dtypes.
+_USED = {
+    "cells": (_ANY, (3, 4), _INTEGERS),
+    "node_type": (_ANY, (1,), _INTEGERS),
+    "mesh_pos": (_ANY, (2, 3), _FLOATS),
+    "world_pos": (_CHANGING, (3,), _FLOATS),
+    "stress": (_CHANGING, (1,), _FLOATS),
+}
+
 _KINDS = {dict: "an object", list: "a list", str: "a text", int: "a whole number", float: "a number"}
 
 
@@ -29,7 +39,7 @@ class Feature:
     Attributes:
         kind: "static" (one for all frames), "dynamic" (one for each frame), "dynamic_varlen" (the rows of all frames
             one after the other; each frame has its own number of rows).
-        shape: the sizes; one of them may be -1, it follows from the number of bytes.
+        shape: the frames (1 if static; left out if varlen), the rows (-1: as many as there are bytes for), the columns.
         dtype: type of the numbers, little-endian.
     """
 
@@ -47,7 +57,7 @@ class Meta:
         dt: time between two frames; 0 if time has no meaning.
         collision_radius: distance below which nodes of different bodies get an edge.
         trajectory_length: number of frames of every trajectory.
-        features: the arrays of a trajectory, by name.
+        features: the arrays of a trajectory that are read, by name.
     """
 
     simulator: str
@@ -58,40 +68,27 @@ class Meta:
 
 
 def read_meta(path: Path) -> Meta:
-    """Read `meta.json` and check every value.
-
-    The published files of `flag_dynamic_sizing` and `sphere_dynamic_sizing` have an error: they give `sizing_field` the
-    dtype "<dtype: 'float32'>" and 4 columns, but the data have 3 (google-deepmind/deepmind-research, issues 532 and
-    651). These files are accepted, and so are files in which the error was corrected.
+    """Read `meta.json` and check every value that is used. Features that are not read may be anything.
 
     Raises:
         DatasetError: a value is wrong; the text names the file, the key and the value.
     """
-    values = _Values(str(path), _read_json(path))
-    features = values.take("features", dict)
-    names = values.take("field_names", list)
-    length = values.take("trajectory_length", int)
-    dt, radius = values.take("dt", float), values.take("collision_radius", float)
+    values = _read_json(path)
+    told = _take(path, values, "features", dict)
+    length = _take(path, values, "trajectory_length", int)
+    dt, radius = (_take(path, values, key, float) for key in ("dt", "collision_radius"))
     if length < 1 or dt < 0 or radius < 0:
         raise DatasetError(f"{path}: trajectory_length must be at least 1, dt and collision_radius at least 0")
-    meta = Meta(
-        simulator=values.take("simulator", str),
-        dt=dt,
-        collision_radius=radius,
-        trajectory_length=length,
-        features={name: _feature(f"{path}: the feature {name}", name, value) for name, value in features.items()},
-    )
-    for name, feature in meta.features.items():
-        for field in (name, LENGTH + name) if feature.kind == "dynamic_varlen" else (name,):
-            if field not in names:
-                raise DatasetError(f"{path}: field_names does not list {field}, which the feature {name} needs")
-        first = {"static": 1, "dynamic": length}.get(feature.kind, feature.shape[0])
-        if feature.shape[0] != first:
+    features = {}
+    for name in _USED:
+        if name in told:
+            features[name] = _feature(f"{path}: the feature {name}", told[name], length, *_USED[name])
+        elif name != "stress":
             raise DatasetError(
-                f"{path}: the feature {name} is {feature.kind} and its shape {list(feature.shape)}: the first size must"
-                f" be {first}" + (", which is trajectory_length" if feature.kind == "dynamic" else "")
+                f"{path}: there is no feature {name}; deforming bodies have {', '.join(_USED)} (as deforming_plate;"
+                f" sphere_simple has no stress), here are {', '.join(told) or 'none'}"
             )
-    return meta
+    return Meta(_take(path, values, "simulator", str), dt, radius, length, features)
 
 
 def _read_json(path: Path) -> Any:
@@ -107,43 +104,34 @@ def _read_json(path: Path) -> Any:
         raise DatasetError(f"{path}: cannot be read as JSON: {error}") from error
 
 
-class _Values:
-    """A JSON object whose values are taken by key and type."""
-
-    def __init__(self, where: str, values: Any) -> None:
-        if not isinstance(values, dict):
-            raise DatasetError(f"{where}: must be a JSON object, not {_shown(values)}")
-        self._where, self._values = where, values
-
-    def take(self, key: str, kind: type) -> Any:
-        if key not in self._values:
-            raise DatasetError(f"{self._where}: {key} is missing")
-        value = self._values[key]
-        allowed = (int, float) if kind is float else kind
-        fits = isinstance(value, allowed) and not isinstance(value, bool)
-        # A whole number in JSON may have so many digits that no float can hold it.
-        if fits and kind is float:
-            fits = abs(value) <= sys.float_info.max
-        if not fits:
-            raise DatasetError(f"{self._where}: {key} is {_shown(value)}; must be {_KINDS[kind]}")
-        return float(value) if kind is float else value
+def _take(where: Path | str, values: Any, key: str, kind: type) -> Any:
+    """The value of a key of a JSON object, which must be of this type."""
+    if not isinstance(values, dict):
+        raise DatasetError(f"{where}: must be a JSON object, not {_shown(values)}")
+    if key not in values:
+        raise DatasetError(f"{where}: {key} is missing")
+    value = values[key]
+    fits = isinstance(value, (int, float) if kind is float else kind) and not isinstance(value, bool)
+    # A whole number in JSON may have so many digits that no float can hold it.
+    if not fits or (kind is float and not abs(value) <= sys.float_info.max):
+        raise DatasetError(f"{where}: {key} is {_shown(value)}; must be {_KINDS[kind]}")
+    return kind(value)
 
 
-def _feature(where: str, name: str, value: Any) -> Feature:
-    values = _Values(where, value)
-    kind, shape, spelled = values.take("type", str), values.take("shape", list), values.take("dtype", str)
-    if kind not in _TYPES:
-        raise DatasetError(f"{where}: type is {_shown(kind)}; must be one of {', '.join(_TYPES)}")
-    dtype = re.sub(r"^<dtype: '(\w+)'>$", r"\1", spelled)
-    if dtype not in _DTYPES:
-        raise DatasetError(f"{where}: dtype is {_shown(spelled)}; must be one of {', '.join(_DTYPES)}")
-    whole = all(isinstance(size, int) and not isinstance(size, bool) for size in shape)
-    if not shape or not whole or any(size < 1 and size != -1 for size in shape) or shape.count(-1) > 1:
-        raise DatasetError(f"{where}: shape is {_shown(shape)}; must be a list of sizes, one of which may be -1")
-    if abs(math.prod(shape)) > np.iinfo(np.int64).max:
-        raise DatasetError(f"{where}: shape is {_shown(shape)}, which no file can hold")
-    if name == "sizing_field" and shape == [-1, 4]:
-        shape = [-1, 3]
+def _feature(
+    where: str, value: Any, length: int, kinds: tuple[str, ...], columns: tuple[int, ...], dtypes: tuple[str, ...]
+) -> Feature:
+    kind, dtype, shape = (_take(where, value, *key) for key in (("type", str), ("dtype", str), ("shape", list)))
+    for key, found, allowed in (("type", kind, kinds), ("dtype", dtype, dtypes)):
+        if found not in allowed:
+            raise DatasetError(f"{where}: {key} is {_shown(found)}; must be one of {', '.join(allowed)}")
+    first = {"static": [1], "dynamic": [length], "dynamic_varlen": []}[kind]
+    whole = len(shape) == len(first) + 2 and all(type(size) is int for size in shape)
+    if not whole or shape[:-2] != first or not (shape[-2] == -1 or shape[-2] > 0) or shape[-1] not in columns:
+        wanted = ", ".join(map(str, [*first, -1, " or ".join(map(str, columns))]))
+        raise DatasetError(
+            f"{where} is {kind} and has the shape {_shown(shape)}; must be [{wanted}] (trajectory_length is {length})"
+        )
     return Feature(kind, tuple(shape), np.dtype(dtype).newbyteorder("<"))
 
 

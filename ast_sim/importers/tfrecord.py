@@ -15,12 +15,11 @@ refused. Each length is compared with the number of bytes left before anything i
 
 from __future__ import annotations
 
-import os
 import struct
 from collections.abc import Collection, Iterator
-from itertools import islice
+from itertools import count, islice
 from pathlib import Path
-from typing import Self
+from typing import BinaryIO
 
 from ast_sim.support.errors import DatasetError, require
 
@@ -33,65 +32,52 @@ _KINDS = {2: "a float_list", 3: "an int64_list"}
 Span = tuple[int, int]  # first byte, and the byte after the last
 
 
-class RecordFile:
-    """Reads the records of a TFRecord file, one after the other; a context manager.
+def read_records(path: Path) -> Iterator[bytes]:
+    """The payloads of the records of a TFRecord file, one after the other; all checksums are compared.
 
     Raises:
-        DatasetError: the file is truncated or damaged; the text names the file, the record and its first byte.
+        DatasetError: the file is empty, truncated or damaged; the text names the file, the record and its first byte.
     """
+    if not path.is_file():
+        raise DatasetError(f"{path}: there is no such file")
+    try:
+        size = path.stat().st_size
+        if size == 0:
+            raise DatasetError(f"{path}: is empty: download it again")
+        with open(path, "rb") as file:
+            for index in count():
+                if file.tell() == size:
+                    return
+                # The payload has no name here, so its memory is free before the next one is read.
+                yield _payload(file, size, f"{path}: record {index} at byte {file.tell()}")
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read: {error}") from error
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = Path(path)
-        if not self.path.is_file():
-            raise DatasetError(f"{self.path}: there is no such file")
-        try:
-            self._file = open(self.path, "rb")  # noqa: SIM115 (closed by close)
-        except OSError as error:
-            raise DatasetError(f"{self.path}: cannot be read: {error}") from error
-        self._left = os.fstat(self._file.fileno()).st_size
-        self._start = 0
-        self.count = 0  # records read so far
 
-    def __enter__(self) -> Self:
-        return self
+def _payload(file: BinaryIO, size: int, where: str) -> bytes:
+    """The payload of the record that starts here in a file of this size."""
 
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
-
-    @property
-    def at_end(self) -> bool:
-        return self._left == 0
-
-    def read(self) -> bytes:
-        """The payload of the next record; both checksums are compared."""
-        header = self._take(_HEADER.size, "header")
-        length, checksum = _HEADER.unpack(header)
-        if masked_crc(header[:8]) != checksum:
-            self._fail("the checksum of its length does not fit: the file is damaged or no TFRecord file")
-        if length > self._left - _CHECKSUM.size:
-            self._fail(f"it declares {length} bytes, but {self._left} are left: the file is truncated or damaged")
-        payload = self._take(length, "payload")
-        (checksum,) = _CHECKSUM.unpack(self._take(_CHECKSUM.size, "checksum"))
-        if masked_crc(payload) != checksum:
-            self._fail(f"the checksum of its {length} bytes does not fit: the file is damaged")
-        self._start += _HEADER.size + length + _CHECKSUM.size
-        self.count += 1
-        return payload
-
-    def _take(self, size: int, what: str) -> bytes:
-        if size > self._left:
-            self._fail(f"its {what} has {size} bytes, but {self._left} are left: the file is truncated")
-        try:
-            found = self._file.read(size)
-        except OSError as error:
-            raise DatasetError(f"{self.path}: cannot be read: {error}") from error
-        if len(found) < size:
-            self._fail(f"only {len(found)} of {size} bytes of its {what} could be read: the file was cut meanwhile")
-        self._left -= size
+    def take(count: int, what: str) -> bytes:
+        found = file.read(count)
+        if len(found) < count:
+            raise DatasetError(
+                f"{where}: its {what} has {count} bytes, but {len(found)} are left: the file is truncated"
+            )
         return found
 
-    def _fail(self, what: str) -> None:
-        raise DatasetError(f"{self.path}: record {self.count} at byte {self._start}: {what}")
+    header = take(_HEADER.size, "header")
+    length, checksum = _HEADER.unpack(header)
+    if masked_crc(header[:8]) != checksum:
+        raise DatasetError(f"{where}: the checksum of its length does not fit: the file is damaged or no TFRecord file")
+    left = size - file.tell()
+    if length > left - _CHECKSUM.size:
+        raise DatasetError(
+            f"{where}: it declares {length} bytes, but {left} are left: the file is truncated or damaged"
+        )
+    payload = take(length, "payload")
+    if _CHECKSUM.pack(masked_crc(payload)) != take(_CHECKSUM.size, "checksum"):
+        raise DatasetError(f"{where}: the checksum of its {length} bytes does not fit: the file is damaged")
+    return payload
 
 
 def masked_crc(data: bytes) -> int:
@@ -120,14 +106,18 @@ def find_values(payload: bytes, names: Collection[str], where: str) -> dict[str,
         DatasetError: the payload is no `Example`, or a feature to find occurs twice or is not one value of bytes. The
             text names `where` and what is wrong.
     """
-    wanted = {name.encode(): name for name in names}
-    longest = max(map(len, wanted), default=0)
+    wanted: dict[bytes | memoryview, str] = {name.encode(): name for name in names}
+    view = memoryview(payload)  # keys are looked up without a copy
     found: dict[str, Span] = {}
-    for features in _fields(payload, (0, len(payload)), "Example", (1,), where):
-        for entry in _fields(payload, features[1], "Features", (1,), where):
-            key, feature = _entry(payload, entry[1], where)
-            # A key that is longer than all names is not copied.
-            name = wanted.get(payload[slice(*key)]) if key[1] - key[0] <= longest else None
+    for _, features in _fields(payload, (0, len(payload)), "Example", (1,), where):
+        for _, entry in _fields(payload, features, "Features", (1,), where):
+            parts = list(islice(_fields(payload, entry, "an entry of Features", (1, 2), where), 3))
+            key, feature = (dict(parts).get(number, (0, 0)) for number in (1, 2))  # a missing one is empty
+            if len(dict(parts)) < len(parts):
+                raise DatasetError(
+                    f"{where}: an entry of Features at byte {entry[0]} of the record has two keys or values"
+                )
+            name = wanted.get(view[slice(*key)])
             if name is None:
                 continue
             if name in found:
@@ -136,28 +126,19 @@ def find_values(payload: bytes, names: Collection[str], where: str) -> dict[str,
     return found
 
 
-def _entry(payload: bytes, span: Span, where: str) -> tuple[Span, Span]:
-    """The key and the value of an entry of the map; a missing one is empty."""
-    found: dict[int, Span] = {}
-    for number, part in _fields(payload, span, "an entry of Features", (1, 2), where):
-        if number in found:
-            raise DatasetError(f"{where}: an entry of Features at byte {span[0]} of the record has two keys or values")
-        found[number] = part
-    return found.get(1, (0, 0)), found.get(2, (0, 0))
-
-
 def _bytes_value(payload: bytes, span: Span, where: str) -> Span:
     """The one value of a `Feature` that holds a BytesList."""
-    # There may be millions of lists; two are enough to see that there are too many.
+    # There may be millions of lists or values; two are enough to see that there are too many.
     lists = list(islice(_fields(payload, span, "Feature", (1, 2, 3), where), 2))
-    if len(lists) != 1 or lists[0][0] != 1:
-        kind = _KINDS.get(lists[0][0], "several lists") if lists else "nothing"
-        raise DatasetError(f"{where} holds {kind}; must be a bytes_list, the raw bytes of an array")
-    values = list(islice(_fields(payload, lists[0][1], "BytesList", (1,), where), 2))
-    if len(values) != 1:
-        count = "no value" if not values else "several values"
-        raise DatasetError(f"{where} holds {count}; must have one, the raw bytes of an array")
-    return values[0][1]
+    kind = lists[0][0] if lists else 0
+    if len(lists) == 1 and kind == 1:
+        values = list(islice(_fields(payload, lists[0][1], "BytesList", (1,), where), 2))
+        if len(values) == 1:
+            return values[0][1]
+        held = "several values" if values else "no value"
+    else:
+        held = _KINDS.get(kind, "several lists") if lists else "nothing"
+    raise DatasetError(f"{where} holds {held}; must be a bytes_list of one value, the raw bytes of an array")
 
 
 def _fields(payload: bytes, span: Span, message: str, known: tuple[int, ...], where: str) -> Iterator[tuple[int, Span]]:

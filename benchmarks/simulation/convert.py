@@ -30,7 +30,8 @@ from scipy.spatial import Delaunay
 
 from ast_sim.importers.deepmind import convert_deepmind, read_trajectories
 from ast_sim.importers.deepmind_meta import read_meta
-from ast_sim.importers.tfrecord import RecordFile, masked_crc
+from ast_sim.importers.tfrecord import masked_crc
+from ast_sim.importers.tfrecord import read_records as records_of
 from ast_sim.support.provenance import provenance
 
 TARGET = 200.0  # MB/s of the whole conversion
@@ -97,9 +98,8 @@ def example(arrays: dict[str, np.ndarray]) -> bytes:
 
 
 def read_records(path: Path) -> None:
-    with RecordFile(path) as file:
-        while not file.at_end:
-            file.read()
+    for record in records_of(path):
+        del record
 
 
 def read_checked(path: Path) -> None:

@@ -12,7 +12,7 @@ from deepmind_samples import FAMILIES, bytes_feature, entry, example, field, fra
 
 from ast_sim.importers.deepmind import convert_deepmind, read_trajectories
 from ast_sim.importers.deepmind_meta import read_meta
-from ast_sim.importers.tfrecord import RecordFile
+from ast_sim.importers.tfrecord import read_records
 from ast_sim.support.errors import DatasetError
 
 BY_TENSORFLOW = Path(__file__).parent / "deepmind"
@@ -185,8 +185,7 @@ def test_every_mutation_of_a_file_is_found(tmp_path, family, writer):
 def test_every_mutation_under_a_right_checksum_is_an_error_or_other_numbers(tmp_path, family, writer):
     source = source_of(tmp_path, family, writer)
     told = read_meta(source / "meta.json")
-    with RecordFile(source / "valid.tfrecord") as file:
-        payload = file.read()
+    payload = next(read_records(source / "valid.tfrecord"))
     path, dice, names = tmp_path / "valid.tfrecord", random.Random(2), list(told.features)
     assert outcome(path, told, frame(payload)) is None
     found = []

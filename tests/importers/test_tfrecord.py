@@ -7,17 +7,8 @@ import numpy as np
 import pytest
 from deepmind_samples import bytes_feature, crc32c, entry, example, field, frame, varint
 
-from ast_sim.importers.tfrecord import RecordFile, find_values, masked_crc
+from ast_sim.importers.tfrecord import find_values, masked_crc, read_records
 from ast_sim.support.errors import DatasetError, MissingExtra
-
-
-def payloads(path) -> list[bytes]:
-    with RecordFile(path) as file:
-        found = []
-        while not file.at_end:
-            found.append(file.read())
-        assert file.count == len(found)
-        return found
 
 
 def values(payload: bytes, *names: str) -> dict[str, bytes]:
@@ -42,16 +33,17 @@ def test_a_missing_checksum_package_is_named(tmp_path, monkeypatch):
     path.write_bytes(frame(b"one"))
     monkeypatch.setitem(sys.modules, "google_crc32c", None)
     with pytest.raises(MissingExtra, match=r'google_crc32c .* pip install "ast_sim\[tfrecord\]"'):
-        payloads(path)
+        list(read_records(path))
 
 
 def test_records_come_in_order(tmp_path):
     given = [b"", b"one", bytes(range(256)) * 40]
     path = tmp_path / "a.tfrecord"
     path.write_bytes(b"".join(map(frame, given)))
-    assert payloads(path) == given
+    assert list(read_records(path)) == given
     path.write_bytes(b"")
-    assert payloads(path) == []
+    with pytest.raises(DatasetError, match=f"{path}: is empty"):
+        list(read_records(path))
 
 
 LENGTH = frame(b"")[:12]  # a valid header of a record of no bytes
@@ -82,23 +74,25 @@ def test_a_damaged_file_is_named(tmp_path, case):
     path = tmp_path / "a.tfrecord"
     path.write_bytes(frame(b"one") + content)
     with pytest.raises(DatasetError, match=message) as error:
-        payloads(path)
+        list(read_records(path))
     assert str(error.value).startswith(f"{path}: record 1 at byte 19: ")
 
 
 def test_a_file_that_shrinks_while_it_is_read(tmp_path):
     path = tmp_path / "a.tfrecord"
-    path.write_bytes(frame(bytes(100_000)))
-    with RecordFile(path) as file:
-        path.write_bytes(path.read_bytes()[:50_000])
-        with pytest.raises(DatasetError, match="record 0 at byte 0: only 49988 of 100000 bytes of its payload"):
-            file.read()
+    whole = 2 * frame(bytes(100_000))
+    path.write_bytes(whole)
+    records = read_records(path)
+    next(records)
+    path.write_bytes(whole[:150_000])
+    with pytest.raises(DatasetError, match="record 1 at byte 100016: its payload has 100000 bytes, but 49972 are left"):
+        next(records)
 
 
 def test_no_file(tmp_path):
     for path in (tmp_path, tmp_path / "none.tfrecord"):
         with pytest.raises(DatasetError, match=f"{path}: there is no such file"):
-            RecordFile(path)
+            next(read_records(path))
 
 
 def test_features_are_found_by_name():
