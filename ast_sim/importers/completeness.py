@@ -62,7 +62,7 @@ def _unused(frame: MeshFile, names: FieldNames) -> list[tuple[str, str]]:
     used = {names.displacement or "displacement", names.stress or "von_mises", names.node_type or "node_type"}
     used |= {names.obstacle, names.handle, names.body or "body", *names.material}
     found = []
-    for place, fields in (("point", frame.point_fields), ("cell", frame.cell_fields)):
+    for place, fields in frame.fields.items():
         for name, values in fields.items():
             if name not in used and values.dtype.kind in "iufb":
                 found.append((_option(place, name, values.reshape(len(values), -1)), name))

@@ -7,9 +7,9 @@ import io
 import string
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,8 +28,8 @@ _CORNERS = {"tetra": 4, "triangle": 3}
 
 @dataclass(frozen=True, eq=False)
 class MeshFile:
-    """Points [n, 3] float64, elements [E, 3 or 4] int64, fields by name, and notes on cells that were left out; the
-    numbers of the nodes of each named group.
+    """Points [n, 3] float64, elements [E, 3 or 4] int64, fields by place ("point" or "cell") and name, notes on cells
+    that were left out, and the numbers of the nodes of each named group.
 
     If there are `shells` beside the tetrahedra, their layers are among the elements and the points; see `Shells`.
     """
@@ -37,11 +37,10 @@ class MeshFile:
     path: Path
     points: np.ndarray
     elements: np.ndarray
-    point_fields: dict[str, np.ndarray]
-    cell_fields: dict[str, np.ndarray]
+    fields: dict[str, dict[str, np.ndarray]]
     notes: list[str]
+    groups: dict[str, np.ndarray]
     shells: Shells | None = None
-    groups: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def shell_nodes(self) -> np.ndarray:
@@ -51,38 +50,28 @@ class MeshFile:
             nodes[self.shells.nodes] = nodes[-len(self.shells.nodes) :] = True
         return nodes
 
-    def field(self, place: str, name: str | None, default: str | None = None) -> np.ndarray | None:
+    def field(self, place: str, name: str) -> np.ndarray:
         """A field of a `place`, "point" or "cell", as [rows, columns] float64.
 
-        Without a `name` the field `default` is taken; if that is missing, the result is None.
-
         Raises:
-            DatasetError: there is no field `name`, or it does not hold numbers.
+            DatasetError: there is no such field, or it does not hold numbers.
         """
-        fields = self.point_fields if place == "point" else self.cell_fields
-        wanted = name or default
-        if wanted not in fields:
-            if name is None:
-                return None
+        fields = self.fields[place]
+        if name not in fields:
             known = ", ".join(sorted(fields)) or "none"
             raise DatasetError(f"{self.path}: there is no {place} field {name!r}; there are: {known}")
-        value = fields[wanted]
-        if value.dtype.kind not in "iufb":
-            raise DatasetError(f"{self.path}: the {place} field {wanted!r} does not hold numbers")
-        return np.asarray(value, np.float64).reshape(len(value), -1)
+        if fields[name].dtype.kind not in "iufb":
+            raise DatasetError(f"{self.path}: the {place} field {name!r} does not hold numbers")
+        return fields[name].astype(np.float64).reshape(len(fields[name]), -1)
 
-    @overload
-    def numbers(self, place: str, name: str, default: str | None = None) -> np.ndarray: ...
-    @overload
-    def numbers(self, place: str, name: str | None, default: str | None = None) -> np.ndarray | None: ...
-    def numbers(self, place: str, name: str | None, default: str | None = None) -> np.ndarray | None:
+    def numbers(self, place: str, name: str) -> np.ndarray:
         """A field with one number in each row, as [rows]; see `field`."""
-        value = self.field(place, name, default)
-        if value is not None and value.shape[1] != 1:
+        value = self.field(place, name)
+        if value.shape[1] != 1:
             raise DatasetError(
-                f"{self.path}: the {place} field {name or default!r} has {value.shape[1]} components; must have one"
+                f"{self.path}: the {place} field {name!r} has {value.shape[1]} components; must have one"
             )
-        return None if value is None else value[:, 0]
+        return value[:, 0]
 
     def masks(self, nodes: np.ndarray) -> tuple[Mask, Mask]:
         """For `Place.inside`: functions of a name that say at which of the nodes [k] a point field is not zero, and
@@ -100,17 +89,14 @@ class MeshFile:
 
         return lambda name: self.numbers("point", name)[nodes] != 0, group
 
-    def whole_numbers(self, place: str, name: str | None, default: str, dtype: type) -> np.ndarray | None:
+    def whole_numbers(self, place: str, name: str, dtype: type) -> np.ndarray:
         """A field with one whole number in each row, as [rows] of an integer type; see `field`."""
-        value = self.numbers(place, name, default)
-        if value is None:
-            return None
-        limits = np.iinfo(dtype)
+        value, limits = self.numbers(place, name), np.iinfo(dtype)
         wrong = ~((value == np.round(value)) & (value >= limits.min) & (value <= limits.max))
         if wrong.any():
             row = int(np.argmax(wrong))
             at = f"{'node' if place == 'point' else 'element'} {row}"
-            raise DatasetError(f"{self.path}: {name or default} at {at} is {value[row]:g}; must be a whole number")
+            raise DatasetError(f"{self.path}: {name} at {at} is {value[row]:g}; must be a whole number")
         return value.astype(dtype)
 
     def columns(self, names: Sequence[str]) -> np.ndarray | None:
@@ -123,12 +109,14 @@ class MeshFile:
         used, elements = np.unique(self.elements, return_inverse=True)
         elements = elements.reshape(self.elements.shape).astype(np.int32)
         body = self._body(body_field)
-        types = self.whole_numbers("point", type_field, "node_type", np.uint8)
-        types = np.full(len(self.points), NodeType.NORMAL, np.uint8) if types is None else types
+        types = np.full(len(self.points), NodeType.NORMAL, np.uint8)
+        if type_field is not None or "node_type" in self.fields["point"]:
+            types = self.whole_numbers("point", type_field or "node_type", np.uint8)
+        types[self.shell_nodes] = NodeType.OBSTACLE
         scene = Scene(
             rest_position=self.points[used].astype(np.float32),
             elements=elements,
-            node_type=np.where(self.shell_nodes, NodeType.OBSTACLE, types)[used].astype(np.uint8),
+            node_type=types[used],
             body=connected_parts(elements, len(used)) if body is None else body[used],
         )
         return scene, used
@@ -136,37 +124,38 @@ class MeshFile:
     def _body(self, name: str | None) -> np.ndarray | None:
         """The body of each point, [n] int32, from a point field, or from a cell field: nodes belong to the body of
         their elements."""
-        if (name or "body") in self.point_fields or (name or "body") not in self.cell_fields:
-            return self.whole_numbers("point", name, "body", np.int32)
-        of_element = self.whole_numbers("cell", name, "body", np.int32)
-        assert of_element is not None
+        wanted = name or "body"
+        place = "cell" if wanted in self.fields["cell"] and wanted not in self.fields["point"] else "point"
+        if name is None and wanted not in self.fields[place]:
+            return None
+        found = self.whole_numbers(place, wanted, np.int32)
+        if place == "point":
+            return found
         body = np.zeros(len(self.points), np.int32)
-        body[self.elements] = of_element[:, None]
-        shared = body[self.elements] != of_element[:, None]
+        body[self.elements] = found[:, None]
+        shared = body[self.elements] != found[:, None]
         if shared.any():
             row, corner = np.argwhere(shared)[0]
             node = self.elements[row, corner]
             raise DatasetError(
-                f"{self.path}: the bodies {of_element[row]} and {body[node]} share node {node}; bodies must not share"
+                f"{self.path}: the bodies {found[row]} and {body[node]} share node {node}; bodies must not share"
                 " nodes: give each its own, or name another body field"
             )
         return body
 
 
-def read_mesh(
-    source: Path | meshio.Mesh, file_format: str | None = None, curved: bool = False, path: Path = Path("mesh")
-) -> MeshFile:
+def read_mesh(source: Path | meshio.Mesh, curved: bool = False, path: Path = Path("mesh")) -> MeshFile:
     """The tetrahedra of a file or of a meshio mesh; its triangles if it has no three-dimensional cells.
 
     Triangles and quadrilaterals that touch no tetrahedron are shells. All other cells of a lower dimension are left
-    out. With `curved`, elements of higher order are accepted; only their corners
-    are kept. `path` names a mesh in memory in errors.
+    out. With `curved`, elements of higher order are accepted; only their corners are kept. `path` names a mesh in
+    memory in errors.
 
     Raises:
         DatasetError: the file is missing, damaged or of an unknown kind, or holds other elements; the text names it.
     """
     path = source if isinstance(source, Path) else path
-    mesh = _read(source, file_format) if isinstance(source, Path) else source
+    mesh = _read(source) if isinstance(source, Path) else source
     corners, blocks = _element_blocks(path, mesh.cells, curved)
     elements = np.concatenate([mesh.cells[block].data[:, :corners] for block in blocks]).astype(np.int64)
     points = np.zeros((len(mesh.points), 3))
@@ -178,12 +167,12 @@ def read_mesh(
         raise DatasetError(
             f"{path}: {kind} {row} refers to the nodes {elements[row].tolist()}; the points are 0 to {len(points) - 1}"
         )
-    cell_fields = {name: np.concatenate([values[b] for b in blocks]) for name, values in mesh.cell_data.items()}
-    point_fields = {name: np.asarray(values) for name, values in mesh.point_data.items()}
-    bare = MeshFile(
-        path, points, elements, point_fields, cell_fields, _notes(mesh.cells, blocks), groups=node_groups(mesh)
-    )
-    return bare if corners == 3 else _with_shells(bare, mesh)
+    fields = {
+        "point": {name: np.asarray(values) for name, values in mesh.point_data.items()},
+        "cell": {name: np.concatenate([values[b] for b in blocks]) for name, values in mesh.cell_data.items()},
+    }
+    bare = MeshFile(path, points, elements, fields, _notes(mesh.cells, blocks), node_groups(mesh))
+    return bare if corners == 3 else _with_shells(bare, mesh, blocks)
 
 
 def node_groups(mesh: meshio.Mesh) -> dict[str, np.ndarray]:
@@ -197,7 +186,7 @@ def node_groups(mesh: meshio.Mesh) -> dict[str, np.ndarray]:
     return groups
 
 
-def _with_shells(bare: MeshFile, mesh: meshio.Mesh) -> MeshFile:
+def _with_shells(bare: MeshFile, mesh: meshio.Mesh, blocks: list[int]) -> MeshFile:
     """The mesh with its shells; the points and fields of each node are those of the node behind it as well."""
     corners = {index: _shell_corners(block.type) for index, block in enumerate(mesh.cells) if len(block)}
     flat = [index for index, count in corners.items() if count]
@@ -211,22 +200,17 @@ def _with_shells(bare: MeshFile, mesh: meshio.Mesh) -> MeshFile:
         return bare
     kinds = np.repeat([mesh.cells[index].type for index in flat], [len(block) for block in cells])
     taken = Counter(kinds[np.unique(shells.cells)].tolist())
-    notes = _notes(mesh.cells, [i for i, block in enumerate(mesh.cells) if block.dim == 3], taken)
-    notes += [f"{count} cells of the kind {kind} are shells and become obstacles" for kind, count in taken.items()]
     rows = np.repeat(shells.cells, 3)
     points = np.concatenate([bare.points, shells.behind(bare.points)])
-    return replace(
-        bare,
-        points=points,
-        elements=np.concatenate([bare.elements, shells.tetrahedra(points)]),
-        point_fields={name: np.concatenate([v, v[shells.nodes]]) for name, v in bare.point_fields.items()},
-        cell_fields={
+    fields = {
+        "point": {name: np.concatenate([v, v[shells.nodes]]) for name, v in bare.fields["point"].items()},
+        "cell": {
             name: np.concatenate([v, np.concatenate([mesh.cell_data[name][index] for index in flat])[rows]])
-            for name, v in bare.cell_fields.items()
+            for name, v in bare.fields["cell"].items()
         },
-        notes=notes,
-        shells=shells,
-    )
+    }
+    elements, notes = np.concatenate([bare.elements, shells.tetrahedra(points)]), _notes(mesh.cells, blocks, taken)
+    return MeshFile(bare.path, points, elements, fields, notes, bare.groups, shells)
 
 
 def _shell_corners(kind: str) -> int:
@@ -234,7 +218,7 @@ def _shell_corners(kind: str) -> int:
     return {"triangle": 3, "quad": 4}.get(kind.rstrip(string.digits), 0)
 
 
-def _read(path: Path, file_format: str | None) -> meshio.Mesh:
+def _read(path: Path) -> meshio.Mesh:
     """Read a file by meshio. On a damaged file meshio may raise any error, print, or raise SystemExit."""
     import meshio
 
@@ -245,11 +229,10 @@ def _read(path: Path, file_format: str | None) -> meshio.Mesh:
     printed = io.StringIO()
     try:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
-            return meshio.read(path, file_format=file_format)
+            return meshio.read(path)
     except (Exception, SystemExit) as error:
-        kind = file_format.upper() if file_format else "a mesh"
         told = " ".join(f"{printed.getvalue()} {error if str(error) != '1' else ''}".split())
-        raise DatasetError(f"{path}: cannot be read as {kind}: {told or type(error).__name__}") from error
+        raise DatasetError(f"{path}: cannot be read as a mesh: {told or type(error).__name__}") from error
 
 
 def _element_blocks(path: Path, cells: list[meshio.CellBlock], curved: bool) -> tuple[int, list[int]]:
@@ -270,13 +253,12 @@ def _element_blocks(path: Path, cells: list[meshio.CellBlock], curved: bool) -> 
 
 def _notes(cells: list[meshio.CellBlock], blocks: list[int], shells: Counter[str] | None = None) -> list[str]:
     """What was not taken as it is. `shells` counts the cells that became shells, by kind."""
-    left_out, reduced = Counter(), Counter()
+    left_out, reduced, shells = Counter(), Counter(), shells or Counter()
     for index, block in enumerate(cells):
         if index not in blocks:
             left_out[block.type] += len(block)
         elif block.type not in _CORNERS:
             reduced[block.type] += len(block)
-    notes = [
-        f"{count} cells of the kind {kind} are left out" for kind, count in (left_out - (shells or Counter())).items()
-    ]
-    return notes + [f"{count} cells of the kind {kind} keep their corners only" for kind, count in reduced.items()]
+    told = {"are left out": left_out - shells, "keep their corners only": reduced}
+    told["are shells and become obstacles"] = shells
+    return [f"{n} cells of the kind {kind} {what}" for what, count in told.items() for kind, n in count.items()]

@@ -112,7 +112,7 @@ def frames(source: Path) -> Iterator[MeshFile]:
         yield from vtkhdf_frames(source)
     else:
         for path in frame_files(source):
-            yield read_mesh(path, "vtu")
+            yield read_mesh(path)
 
 
 def far_origin(points: np.ndarray) -> np.ndarray:
@@ -203,9 +203,9 @@ def _require_same_mesh(frame: MeshFile, first: MeshFile) -> None:
 
 def _displacement(frame: MeshFile, names: FieldNames, used: np.ndarray) -> np.ndarray | None:
     """The displacements [used, 3]; None if the file holds none."""
-    value = frame.field("point", names.displacement, "displacement")
-    if value is None:
+    if names.displacement is None and "displacement" not in frame.fields["point"]:
         return None
+    value = frame.field("point", names.displacement or "displacement")
     if value.shape[1] not in (2, 3):
         raise DatasetError(f"{frame.path}: the displacement has {value.shape[1]} components; must have 2 or 3")
     return np.pad(value, ((0, 0), (0, 3 - value.shape[1])))[used]
@@ -242,12 +242,12 @@ def _rest_and_position(
 def _stress_place(frame: MeshFile, names: FieldNames) -> str:
     """Where a file holds the stress: "none", "node" or "element"."""
     name = names.stress or "von_mises"
-    if name in frame.point_fields:
+    if name in frame.fields["point"]:
         return "node"
-    if name in frame.cell_fields:
+    if name in frame.fields["cell"]:
         return "element"
     if names.stress is not None:
-        known = ", ".join(sorted({*frame.point_fields, *frame.cell_fields})) or "none"
+        known = ", ".join(sorted({*frame.fields["point"], *frame.fields["cell"]})) or "none"
         raise DatasetError(f"{frame.path}: there is no field {names.stress!r}; there are: {known}")
     return "none"
 

@@ -279,9 +279,13 @@ def frame(**changes):
 
 
 WRONG = {
-    "damaged": (lambda path: path.write_bytes(b"<VTKFile type='UnstructuredGrid'"), {}, "1.vtu: cannot be read as VTU"),
-    "empty": (lambda path: path.write_bytes(b""), {}, "1.vtu: cannot be read as VTU"),
-    "another format": (lambda path: path.write_text("<a/>"), {}, "1.vtu: cannot be read as VTU: .*Expected tag"),
+    "damaged": (
+        lambda path: path.write_bytes(b"<VTKFile type='UnstructuredGrid'"),
+        {},
+        "1.vtu: cannot be read as a mesh",
+    ),
+    "empty": (lambda path: path.write_bytes(b""), {}, "1.vtu: cannot be read as a mesh"),
+    "another format": (lambda path: path.write_text("<a/>"), {}, "1.vtu: cannot be read as a mesh: .*Expected tag"),
     "fewer points": (
         frame(points=ONE.rest_position[:7]),
         {},

@@ -42,12 +42,12 @@ def with_array(path, name, head, packed):
 @pytest.mark.parametrize("name", ["von_mises", "Points", "connectivity", "types"])
 def test_an_array_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(tmp_path, compression, name):
     path = write(tmp_path / "a.vtu", compression, von_mises=np.ones(SCENE.num_nodes))
-    assert read_mesh(path, "vtu").points.shape == (SCENE.num_nodes, 3)
+    assert read_mesh(path).points.shape == (SCENE.num_nodes, 3)
     with_array(path, name, *compressed(bytes(1 << 28), PACKERS[compression]))
     assert path.stat().st_size < 1 << 20
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(DatasetError, match=f"{path}: the array {name} unpacks to more than [0-9]+ bytes, which is all"):
-        read_mesh(path, "vtu")
+        read_mesh(path)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # KiB; the array has 262,144
 
 
@@ -55,7 +55,7 @@ def test_several_streams_in_one_block_are_counted_together(tmp_path):
     path = write(tmp_path / "a.vtu", "lzma", von_mises=np.ones(SCENE.num_nodes))
     with_array(path, "von_mises", *compressed(bytes(200), lzma.compress, parts=2))
     with pytest.raises(DatasetError, match="the array von_mises unpacks to more than 216 bytes"):
-        read_mesh(path, "vtu")
+        read_mesh(path)
 
 
 def appended(path, raw: bool, factor: int = 1, same: bool = False):
@@ -89,8 +89,8 @@ def appended(path, raw: bool, factor: int = 1, same: bool = False):
 
 @pytest.mark.parametrize("raw", [True, False])
 def test_appended_arrays(tmp_path, raw):
-    assert np.array_equal(read_mesh(appended(tmp_path / "a.vtu", raw), "vtu").elements, SCENE.elements)
+    assert np.array_equal(read_mesh(appended(tmp_path / "a.vtu", raw)).elements, SCENE.elements)
     with pytest.raises(DatasetError, match="the array Points unpacks to more than 324 bytes"):
-        read_mesh(appended(tmp_path / "a.vtu", raw, factor=2), "vtu")
+        read_mesh(appended(tmp_path / "a.vtu", raw, factor=2))
     with pytest.raises(DatasetError, match="the array connectivity shares its data with another array"):
-        read_mesh(appended(tmp_path / "a.vtu", raw, same=True), "vtu")
+        read_mesh(appended(tmp_path / "a.vtu", raw, same=True))

@@ -155,7 +155,7 @@ def _from_file(part: PartSpec, request: dict[str, Any]) -> PartMesh:
     used, elements = np.unique(mesh.elements, return_inverse=True)
     elements, position = elements.reshape(-1, mesh.elements.shape[1]), part.scale * mesh.points[used]
     fields = {
-        n: np.asarray(v)[used] for n, v in mesh.point_fields.items() if np.ndim(v) == 1 and v.dtype.kind in "iufb"
+        n: np.asarray(v)[used] for n, v in mesh.fields["point"].items() if np.ndim(v) == 1 and v.dtype.kind in "iufb"
     }
     groups = {name: np.flatnonzero(np.isin(used, nodes)) for name, nodes in mesh.groups.items()}
     if elements.shape[1] == 3:
