@@ -39,16 +39,18 @@ class GuardedFile:
         self.root.close()
 
     @contextlib.contextmanager
-    def reading(self, what: str) -> Iterator[None]:
-        """Within the block, raise every error of h5py as a DatasetError; `what` names what is read."""
+    def reading(self, what: str) -> Iterator[str]:
+        """Within the block, raise every error of h5py as a DatasetError; `what` names what is read. Gives that name,
+        with the path of the file before it."""
+        name = f"{self.path}: {what}"
         try:
-            yield
+            yield name
         except AstSimError:
             raise
         except _READ_ERRORS as error:
             text = " ".join(str(error).split()) or type(error).__name__
             raise DatasetError(
-                f"{self.path}: {what} cannot be read; the file is damaged or no dataset of ast_sim ({text})"
+                f"{name} cannot be read; the file is damaged or no dataset of ast_sim ({text})"
             ) from error
 
     def attributes(self, group: h5py.Group, name: str) -> dict[str, AttributeValue]:
@@ -86,8 +88,7 @@ class GuardedFile:
 
     def child(self, group: h5py.Group, key: str, kind: type) -> Any:
         """A member of a group. It must lie in this file; a link to another file is refused."""
-        name = f"{self.path}: {_path(group, key)}"
-        with self.reading(_path(group, key)):
+        with self.reading(_path(group, key)) as name:
             if key not in group:
                 raise DatasetError(f"{name} is missing")
             if not isinstance(group.get(key, getlink=True), h5py.HardLink):
@@ -101,11 +102,10 @@ class GuardedFile:
         """An array of a sample. Its dtype, rank, size and (if `shape` is given) shape are checked; nothing is read."""
         dtype, rank = ARRAYS[key]
         array = self.child(group, key, h5py.Dataset)
-        name = f"{self.path}: {_path(group, key)}"
-        with self.reading(_path(group, key)):
+        with self.reading(_path(group, key)) as name:
             if array.dtype != dtype or array.ndim != rank:
-                wanted = f"{np.dtype(dtype)} with {rank}"
-                raise DatasetError(f"{name} is {array.dtype} with {array.ndim} axes; must be {wanted}")
+                found = f"{array.dtype} with {array.ndim} axes"
+                raise DatasetError(f"{name} is {found}; must be {np.dtype(dtype)} with {rank}")
             if array.is_virtual or array.external:
                 raise DatasetError(f"{name} keeps its numbers in another file, which is not followed")
             properties = array.id.get_create_plist()

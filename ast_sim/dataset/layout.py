@@ -84,16 +84,25 @@ class DatasetInfo:
     def attributes(self) -> dict[str, Any]:
         """The attributes of the file's root."""
         values = {"format": FORMAT, "version": VERSION, **asdict(self)}
-        values["domain_center"] = [float(number) for number in self.domain_center]
         for key in ("domain_half_width", "contact_radius", "time_step"):
             values[key] = float(values[key])
         values["generator"] = json.dumps(self.generator, sort_keys=True)
         return values
 
 
-def scene_kind(scene: Scene) -> tuple[int, int]:
-    """The nodes per element and the number of material columns; they are the same in all scenes of a dataset."""
-    return scene.elements.shape[1], 0 if scene.material is None else scene.material.shape[1]
+def require_kind(name: str, scene: Scene, known: tuple[int, int] | None) -> tuple[int, int]:
+    """The nodes per element and the number of material columns of a scene.
+
+    Raises:
+        DatasetError: they are not those of the other scenes of the dataset, where these are `known`.
+    """
+    kind = scene.elements.shape[1], 0 if scene.material is None else scene.material.shape[1]
+    if known not in (None, kind):
+        raise DatasetError(
+            f"{name}: has {kind[0]} nodes per element and {kind[1]} material columns; other samples have {known[0]}"
+            f" and {known[1]}"
+        )
+    return kind
 
 
 def write_attributes(group: h5py.Group | h5py.Dataset, values: dict[str, Any]) -> None:

@@ -13,6 +13,7 @@ import json
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, Self, overload
 
@@ -30,7 +31,7 @@ from ast_sim.dataset.layout import (
     SPLITS,
     VERSION,
     DatasetInfo,
-    scene_kind,
+    require_kind,
 )
 from ast_sim.scene import AttributeValue, Scene, Trajectory, require_finite_frames
 from ast_sim.support.byte_cache import ByteCache
@@ -67,7 +68,6 @@ class Dataset:
         self._scenes: ByteCache[Scene] = ByteCache(CACHE_BYTES)
         self._frames: dict[tuple[str, int], tuple[np.ndarray, np.ndarray | None]] = {}
         self._open: dict[tuple[str, int], dict[str, h5py.Dataset]] = {}
-        self._lengths: dict[tuple[str, int], int] = {}
         self._kept: dict[str, bool] = {}  # whether the split is small enough to be kept in memory
         self._kind: tuple[int, int] | None = None
 
@@ -118,21 +118,12 @@ class Dataset:
         arrays = {key: self._file.read(self._file.array(group, key)) for key in keys}
         scene = Scene(**{**arrays, "rest_position": self._scaled(arrays["rest_position"])})
         scene.check(name)
-        kind = scene_kind(scene)
-        self._kind = self._kind or kind
-        if kind != self._kind:
-            raise DatasetError(
-                f"{name}: has {kind[0]} nodes per element and {kind[1]} material columns; other samples have"
-                f" {self._kind[0]} and {self._kind[1]}"
-            )
+        self._kind = require_kind(name, scene, self._kind)
         return scene
 
     def num_frames(self, split: str, index: int) -> int:
         """The number of frames of a trajectory."""
-        key = (split, index)
-        if key not in self._lengths:
-            self._lengths[key] = self._file.array(self._group(split, index), "position").shape[0]
-        return self._lengths[key]
+        return len(self._framed(split, index)["position"])
 
     def frames(self, split: str, index: int, start: int, stop: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Frames start to stop - 1: position [stop - start, N, 3] and stress [stop - start, N or E, 1] or None."""
@@ -185,12 +176,10 @@ class Dataset:
         return {key: value for key, value in found.items() if key != HASH}
 
     def _first_kind(self) -> tuple[int, int]:
-        if self._kind is not None:
-            return self._kind
         split = next((split for split in SPLITS if self.splits[split]), None)
         if split is None:
             raise DatasetError(f"{self.path}: holds no samples")
-        return scene_kind(self.scene(split, 0))
+        return require_kind(self._name(split, 0), self.scene(split, 0), self._kind)
 
     def _name(self, split: str, index: int) -> str:
         return f"{self.path}: {split}/{index:06d}"
@@ -238,16 +227,17 @@ class Dataset:
         return group
 
     def _framed(self, split: str, index: int) -> dict[str, h5py.Dataset]:
-        """The open arrays of a trajectory that have frames; their shapes fit the scene."""
+        """The open arrays of a trajectory that have frames; their shapes fit the mesh."""
         key = (split, index)
         if key not in self._open:
-            group, scene, count = self._group(split, index), self.scene(split, index), self.num_frames(split, index)
+            group = self._group(split, index)
+            count = len(self._file.array(group, "position"))
             if count == 0:
                 raise DatasetError(f"{self._name(split, index)}: position has no frames")
-            shapes = {"position": (count, scene.num_nodes, 3)}
+            shapes = {"position": (count, len(self._file.array(group, "rest_position")), 3)}
             if self.info.stress_location != "none":
-                rows = scene.num_nodes if self.info.stress_location == "node" else scene.num_elements
-                shapes["stress"] = (count, rows, 1)
+                rows = "rest_position" if self.info.stress_location == "node" else "elements"
+                shapes["stress"] = (count, len(self._file.array(group, rows)), 1)
             self._open[key] = {name: self._file.array(group, name, shape) for name, shape in shapes.items()}
         return self._open[key]
 
@@ -293,9 +283,8 @@ class Dataset:
 
     def _keeps(self, split: str) -> bool:
         if split not in self._kept:
-            keys = ("position",) if self.info.stress_location == "none" else ("position", "stress")
-            groups = [self._group(split, index) for index in range(self.splits[split])]
-            size = sum(self._file.array(group, key).nbytes for group in groups for key in keys)
+            arrays = [self._framed(split, index).values() for index in range(self.splits[split])]
+            size = sum(array.nbytes for array in chain.from_iterable(arrays))
             self._kept[split] = size <= min(CACHE_BYTES, self._file.size)
         return self._kept[split]
 

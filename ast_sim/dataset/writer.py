@@ -18,7 +18,7 @@ from ast_sim.dataset.layout import (
     DatasetInfo,
     array_hash,
     plain_value,
-    scene_kind,
+    require_kind,
     trajectory_hash,
     write_attributes,
 )
@@ -61,13 +61,7 @@ class DatasetWriter:
             raise DatasetError(f"{self.path}: there is no split {split!r}; use one of {', '.join(SPLITS)}")
         name = f"{split}/{self.counts[split]:06d}"
         trajectory.check(f"{self.path}: {name}", self.info.stress_location)
-        kind = scene_kind(trajectory.scene)
-        if self._kind not in (None, kind):
-            raise DatasetError(
-                f"{self.path}: {name}: has {kind[0]} nodes per element and {kind[1]} material columns,"
-                f" the trajectories before it {self._kind[0]} and {self._kind[1]}"
-            )
-        self._kind = kind
+        self._kind = require_kind(f"{self.path}: {name}", trajectory.scene, self._kind)
         with self._writing():
             group = self._file.create_group(name)
             hashes: dict[str, str] = {}

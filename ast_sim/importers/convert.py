@@ -148,12 +148,12 @@ def _assign(source: Path, names: list[str], splits: Splits | None, seed: int) ->
     unknown = next((split for split in splits if split not in SPLITS), None)
     if unknown is not None:
         raise DatasetError(f"there is no split {unknown!r}; use {', '.join(SPLITS)}")
-    shares = {split: float(share) for split, share in splits.items() if isinstance(share, int | float)}
-    if len(shares) == len(splits):
-        lists = _draw(names, {split: shares.get(split, 0.0) for split in SPLITS}, seed)
+    given = {split: splits.get(split, 0.0) for split in SPLITS}
+    shares = {split: float(share) for split, share in given.items() if isinstance(share, int | float)}
+    if len(shares) == len(given):
+        lists = _draw(names, shares, seed)
     else:
-        lists = {split: [] for split in SPLITS}
-        lists |= {split: list(members) for split, members in splits.items() if not isinstance(members, int | float)}
+        lists = {split: [] if isinstance(members, int | float) else list(members) for split, members in given.items()}
         _require_known(source, names, lists)
     return [(split, name) for split in SPLITS for name in lists[split]]
 
@@ -164,16 +164,14 @@ def _draw(names: list[str], shares: dict[str, float], seed: int) -> dict[str, li
     if min(shares.values()) < 0 or abs(sum(shares.values()) - 1) > 1e-6:
         raise DatasetError(f"the shares of the splits must be at least 0 and add up to 1, not {shares}")
     order = np.random.default_rng(seed).permutation(len(names))
-    last, total = 0, 0.0
-    ends: dict[str, int] = {}
     least = int(len(names) >= sum(share > 0 for share in shares.values()))
+    ends, total = [0], 0.0
     for split in ("valid", "test"):
         total += shares[split]
-        last = max(int(len(names) * total + 0.5 - 1e-9), last + (least if shares[split] > 0 else 0))
-        ends[split] = min(last, len(names) - (least if shares["train"] > 0 else 0))
-    valid, test = ends["valid"], ends["test"]
-    bounds = {"valid": (0, valid), "test": (valid, test), "train": (test, len(names))}
-    return {split: [names[i] for i in sorted(order[start:end])] for split, (start, end) in bounds.items()}
+        end = max(int(len(names) * total + 0.5 - 1e-9), ends[-1] + least * (shares[split] > 0))
+        ends.append(min(end, len(names) - least * (shares["train"] > 0)))
+    bounds = zip(("valid", "test", "train"), ends, [*ends[1:], len(names)], strict=True)
+    return {split: [names[i] for i in sorted(order[start:end])] for split, start, end in bounds}
 
 
 def _require_known(source: Path, names: list[str], lists: dict[str, list[str]]) -> None:

@@ -112,8 +112,8 @@ def parse_clamp(text: str) -> tuple[int, list[Place]]:
         ConfigError: the text has another form; the error gives examples.
     """
     try:
-        body, places = _body_and_rest(text, ":")
-        return body, parse_places(places)
+        body, places = text.split(":", 1)
+        return int(body), parse_places(places)
     except ValueError as error:
         raise ConfigError(
             f"the clamp {text!r} cannot be read; write BODY:PLACE, for example 0:xmin, 0:xmin,xmax, 0:z<=0.01, 0:all,"
@@ -128,17 +128,10 @@ def parse_material(text: str) -> tuple[int, tuple[float, ...]]:
         ConfigError: the text has another form; the error gives an example.
     """
     try:
-        body, numbers = _body_and_rest(text, "=")
-        return body, tuple(float(number) for number in numbers.split(","))
+        body, numbers = text.split("=", 1)
+        return int(body), tuple(float(number) for number in numbers.split(","))
     except ValueError as error:
         raise ConfigError(f"the material {text!r} cannot be read; write BODY=NUMBERS, for example 0=2e5,0.3") from error
-
-
-def _body_and_rest(text: str, separator: str) -> tuple[int, str]:
-    body, found, rest = text.partition(separator)
-    if not found:
-        raise ValueError(text)
-    return int(body), rest
 
 
 def _turned_over(scene: Scene, path: Path) -> tuple[Scene, int]:
