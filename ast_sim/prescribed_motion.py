@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -51,14 +52,11 @@ class RigidMotion:
 
     def __post_init__(self) -> None:
         path = np.shape(self.translation)
+        turns = np.shape(self.axis) == (3,) and np.any(np.abs(self.axis) > 1 / LARGEST)
         for name, wanted, fits in (
             ("translation", "three numbers or a list of triples", path == (3,) or (len(path) == 2 and path[1] == 3)),
             ("rotation", "one number", np.ndim(self.rotation) == 0),
-            (
-                "axis",
-                "three numbers, not all zero",
-                np.shape(self.axis) == (3,) and np.any(np.abs(self.axis) > 1 / LARGEST),
-            ),
+            ("axis", "three numbers, not all zero", turns),
             ("point", "three numbers", np.shape(self.point) == (3,)),
         ):
             value = getattr(self, name)
@@ -185,16 +183,15 @@ class Motion:
 
     def increments(self, scene: Scene) -> list[float]:
         """S - 1 numbers: the largest displacement of a prescribed node from one frame to the next."""
-        return [_largest(after - before) for before, after in self._steps(scene)]
+        return [_largest(after - before) for before, after in pairwise(self._prescribed(scene))]
 
     def travel(self, scene: Scene) -> float:
         """The largest distance of a prescribed node from its position in frame 0."""
-        start = self.position[0, scene.prescribed]
-        return max(_largest(after - start) for _, after in self._steps(scene))
+        start, *moved = self._prescribed(scene)
+        return max(_largest(after - start) for after in moved)
 
-    def _steps(self, scene: Scene) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        moved = self.position[:, scene.prescribed].astype(np.float64)
-        return zip(moved[:-1], moved[1:], strict=True)
+    def _prescribed(self, scene: Scene) -> np.ndarray:
+        return self.position[:, scene.prescribed].astype(np.float64)
 
 
 def frames_for(scene: Scene, motions: Mapping[int, RigidMotion | Vector], increment: float) -> int:
@@ -235,8 +232,8 @@ def parse_move(text: str) -> tuple[int, RigidMotion]:
         if found["path"]:
             motion["translation"] = tuple(_triple(part) for part in found["path"].split(" then "))
         if found["angle"]:
-            motion |= {"rotation": float(found["angle"])}
-            motion |= {"axis": _triple(found["axis"]), "point": _triple(found["point"])}
+            motion["rotation"] = float(found["angle"])
+            motion |= {key: _triple(found[key]) for key in ("axis", "point")}
     except ValueError as error:
         raise ConfigError(
             f"the motion {text!r} cannot be read; write it as '1=0,0,-0.01', as '1=0,0,-0.01 then 0.02,0,-0.01' or as"

@@ -93,11 +93,11 @@ class Scene:
             raise DatasetError(f"{name}: a scene needs nodes and elements, this one has {n} and {e}")
         if k not in LOCAL_EDGES:
             raise DatasetError(f"{name}: elements must have 3 nodes (triangle) or 4 (tetrahedron), not {k}")
-        _require_finite(name, "rest_position", "node", self.rest_position)
+        require_finite(name, "rest_position", "node", self.rest_position)
         if self.material is not None:
             if self.material.shape[1] == 0:
                 raise DatasetError(f"{name}: material has no columns; leave it out (None)")
-            _require_finite(name, "material", "element", self.material)
+            require_finite(name, "material", "element", self.material)
         if self.elements.min() < 0 or self.elements.max() >= n:
             outside = (self.elements < 0) | (self.elements >= n)
             row = int(np.argmax(outside.any(axis=1)))
@@ -207,24 +207,25 @@ class Trajectory:
         require_array(name, "position", self.position, np.float32, (None, n, 3))
         if self.num_frames == 0:
             raise DatasetError(f"{name}: a trajectory needs at least one frame")
-        require_finite_frames(name, "position", "node", self.position)
-        if (self.stress is None) != (stress_location == "none") and stress_location is not None:
+        require_finite(name, "position", "node", self.position)
+        if stress_location is not None and (self.stress is None) != (stress_location == "none"):
             found = "no stress" if self.stress is None else "stress"
             raise DatasetError(f"{name}: has {found}, but stress_location is {stress_location!r}")
         if self.cauchy_stress is not None:
             require_array(name, "cauchy_stress", self.cauchy_stress, np.float32, (self.num_frames, e, 6))
-            require_finite_frames(name, "cauchy_stress", "element", self.cauchy_stress)
+            require_finite(name, "cauchy_stress", "element", self.cauchy_stress)
         if self.stress is None:
             return
-        own = self.stress_location or stress_location
-        stress_location = stress_location or own
-        if own != stress_location:
-            raise DatasetError(f"{name}: has stress at each {own}, but stress_location is {stress_location!r}")
-        rows = {"node": (n,), "element": (e,), None: (n, e)}[stress_location]
-        if self.stress.ndim == 3 and self.stress.shape[1] not in rows:
-            raise DatasetError(f"{name}: stress has {self.stress.shape[1]} rows; needs {' or '.join(map(str, rows))}")
+        location = stress_location or self.stress_location
+        if self.stress_location not in (None, location):
+            raise DatasetError(
+                f"{name}: has stress at each {self.stress_location}, but stress_location is {location!r}"
+            )
         require_array(name, "stress", self.stress, np.float32, (self.num_frames, None, 1))
-        require_finite_frames(name, "stress", stress_location or "row", self.stress)
+        rows = {"node": (n,), "element": (e,), None: (n, e)}[location]
+        if self.stress.shape[1] not in rows:
+            raise DatasetError(f"{name}: stress has {self.stress.shape[1]} rows; needs {' or '.join(map(str, rows))}")
+        require_finite(name, "stress", location or "row", self.stress)
 
 
 def connected_parts(elements: np.ndarray, num_nodes: int) -> np.ndarray:
@@ -268,17 +269,10 @@ def require_array(name: str, array: str, value: np.ndarray, dtype: type, shape: 
         raise DatasetError(f"{name}: {array} has the shape {list(value.shape)}, must be [{wanted}]")
 
 
-def require_finite_frames(name: str, array: str, row: str, value: np.ndarray, first_frame: int = 0) -> None:
-    """Raise DatasetError naming the first frame and row of `value` [S, rows, F] that is not finite."""
+def require_finite(name: str, array: str, row: str, value: np.ndarray, first_frame: int = 0) -> None:
+    """Raise DatasetError naming the first frame and row of `value`, [S, rows, F] or [rows, F], that is not finite."""
     finite = np.isfinite(value)
     if not finite.all():
-        frame, index, _ = np.unravel_index(np.argmin(finite), finite.shape)
-        numbers = value[frame, index].tolist()
-        raise DatasetError(f"{name}: {array} in frame {first_frame + frame} at {row} {index} is not finite: {numbers}")
-
-
-def _require_finite(name: str, array: str, row: str, value: np.ndarray) -> None:
-    finite = np.isfinite(value).all(axis=1)
-    if not finite.all():
-        index = int(np.argmin(finite))
-        raise DatasetError(f"{name}: {array} of {row} {index} is not finite: {value[index].tolist()}")
+        *frame, index, _ = np.unravel_index(np.argmin(finite), finite.shape)
+        at = f"in frame {first_frame + frame[0]} at {row} {index}" if frame else f"of {row} {index}"
+        raise DatasetError(f"{name}: {array} {at} is not finite: {value[*frame, index].tolist()}")

@@ -53,23 +53,23 @@ class GuardedFile:
                 f"{name} cannot be read; the file is damaged or no dataset of ast_sim ({text})"
             ) from error
 
-    def attributes(self, group: h5py.Group, name: str) -> dict[str, AttributeValue]:
-        """The attributes of a group; `name` stands for the group in messages."""
+    def attributes(self, group: h5py.Group) -> dict[str, AttributeValue]:
+        """The attributes of a group."""
         values = {}
-        with self.reading(f"an attribute of {name}"):
+        with self.reading(f"an attribute of {_path(group) or 'the file'}") as name:
             for key in group.attrs:
                 stored = group.attrs.get_id(key)
                 if math.prod(stored.shape) * stored.dtype.itemsize > self.size or len(stored.shape) > 1:
-                    raise DatasetError(f"{name}: the attribute {key} is larger than the file, or no list")
+                    raise DatasetError(f"{name}, {key}, is larger than the file, or no list")
                 values[key] = plain_value(group.attrs[key])
         return values
 
-    def verify(self, group: h5py.Group, name: str) -> None:
+    def verify(self, group: h5py.Group) -> None:
         """Compare the hash of a trajectory with the hashes of its arrays and with its attributes, at its first use."""
         if group.name in self._verified:
             return
-        attributes = self.attributes(group, name)
-        with self.reading(f"sample {str(group.name).strip('/')}"):
+        attributes = self.attributes(group)
+        with self.reading(f"sample {_path(group)}"):
             arrays = {key: str(plain_value(group[key].attrs[HASH])) for key in ARRAYS if key in group}
         self._verify(str(group.name), trajectory_hash(arrays, attributes), attributes.get(HASH))
 
@@ -135,8 +135,8 @@ class GuardedFile:
         return value
 
 
-def _path(group: h5py.Group, key: str) -> str:
-    """The path of a member within its file, without a slash in front."""
+def _path(group: h5py.Group, key: str = "") -> str:
+    """The path of a group or of its member within the file, without a slash in front."""
     return f"{group.name or ''}/{key}".strip("/")
 
 

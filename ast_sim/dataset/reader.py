@@ -33,7 +33,7 @@ from ast_sim.dataset.layout import (
     DatasetInfo,
     require_kind,
 )
-from ast_sim.scene import AttributeValue, Scene, Trajectory, require_finite_frames
+from ast_sim.scene import AttributeValue, Scene, Trajectory, require_finite
 from ast_sim.support.byte_cache import ByteCache
 from ast_sim.support.errors import DatasetError
 
@@ -147,8 +147,7 @@ class Dataset:
         digest = hashlib.sha256(repr((self.info, self.splits)).encode())
         for split, count in self.splits.items():
             for index in range(count):
-                name = self._name(split, index)
-                digest.update(str(self._file.attributes(self._group(split, index), name)[HASH]).encode())
+                digest.update(str(self._file.attributes(self._group(split, index))[HASH]).encode())
         return digest.hexdigest()
 
     def spread(self, split: str, most: int) -> Iterator[tuple[str, Trajectory]]:
@@ -170,7 +169,7 @@ class Dataset:
 
     def attributes(self, split: str, index: int) -> dict[str, AttributeValue]:
         """The status and the solver's records of a trajectory."""
-        found = self._file.attributes(self._group(split, index), self._name(split, index))
+        found = self._file.attributes(self._group(split, index))
         if "origin" in found:
             found["origin"] = (self._scale * np.asarray(found["origin"])).tolist()
         return {key: value for key, value in found.items() if key != HASH}
@@ -185,7 +184,7 @@ class Dataset:
         return f"{self.path}: {split}/{index:06d}"
 
     def _read_info(self) -> DatasetInfo:
-        values = self._file.attributes(self._file.root, str(self.path))
+        values = self._file.attributes(self._file.root)
         if values.get("format") != FORMAT:
             raise DatasetError(f"{self.path}: is no dataset of ast_sim (its attribute format is not {FORMAT!r})")
         if values.get("version") != VERSION:
@@ -223,7 +222,7 @@ class Dataset:
         if not 0 <= index < count:
             raise DatasetError(f"{self.path}: there is no sample {index} in {split}, which has {count}")
         group = self._file.child(self._file.child(self._file.root, split, h5py.Group), f"{index:06d}", h5py.Group)
-        self._file.verify(group, self._name(split, index))
+        self._file.verify(group)
         return group
 
     def _framed(self, split: str, index: int) -> dict[str, h5py.Dataset]:
@@ -278,7 +277,7 @@ class Dataset:
     def _finite(self, name: str, row: str, array: h5py.Dataset, start: int, stop: int) -> np.ndarray:
         """Frames start to stop - 1 of an array, all finite; a `row` of it is a "node" or an "element"."""
         found = self._file.read(array, start, stop)
-        require_finite_frames(name, str(array.name).rpartition("/")[2], row, found, start)
+        require_finite(name, str(array.name).rpartition("/")[2], row, found, start)
         return found
 
     def _keeps(self, split: str) -> bool:

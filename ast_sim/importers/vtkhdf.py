@@ -49,6 +49,9 @@ def _frame(path: Path, root: Any, steps: Any, step: int) -> MeshFile:
     def start(name: str) -> int:
         return 0 if steps is None or name not in steps else int(np.ravel(steps[name][step])[0])
 
+    def fields(place: str, count: int) -> dict[str, Any]:
+        return {n: _rows(v, start(f"{place}Offsets/{n}"), count) for n, v in root.get(place, {}).items()}
+
     if steps is None:
         parts, part = len(root["NumberOfPoints"]), 0
     else:
@@ -68,20 +71,11 @@ def _frame(path: Path, root: Any, steps: Any, step: int) -> MeshFile:
         name, corners = _KINDS[int(number)]
         taken.append(np.flatnonzero(types == number))
         blocks.append((name, connectivity[offsets[taken[-1]][:, None] + np.arange(corners)]))
-    point, cell = (
-        {
-            name: _rows(values, start(f"{place}Offsets/{name}"), count)
-            for name, values in (root[place].items() if place in root else ())
-        }
-        for place, count in (("PointData", points), ("CellData", cells))
-    )
-    mesh = meshio.Mesh(
-        _rows(root["Points"], start("PointOffsets"), points),
-        blocks,
-        dict(point),
-        {name: [values[rows] for rows in taken] for name, values in cell.items()},
-    )
-    return read_mesh(mesh, path=path)
+    cell_data: dict[str, Any] = {
+        name: [values[rows] for rows in taken] for name, values in fields("CellData", cells).items()
+    }
+    nodes = _rows(root["Points"], start("PointOffsets"), points)
+    return read_mesh(meshio.Mesh(nodes, blocks, fields("PointData", points), cell_data), path=path)
 
 
 def _rows(values: h5py.Dataset, first: int, count: int) -> np.ndarray:
