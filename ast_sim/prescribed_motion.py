@@ -77,9 +77,9 @@ class RigidMotion:
         axis = np.asarray(self.axis) * (np.sign(self.rotation) / np.linalg.norm(self.axis))
         spin = angle * np.cross(axis, points - np.asarray(self.point))  # the rotation's velocity at s = 0
         turned = np.cross(axis, spin)
-        shares, corners = self._path()
         square = np.zeros(len(points))
-        for a, b, velocity in _segments(shares, corners):
+        for (a, start), (b, end) in pairwise(zip(*self._path(), strict=True)):
+            velocity = (end - start) / (b - a)
             # |velocity + R(s) spin|^2, where velocity . R(s) spin = along cos(angle s) + across sin(angle s):
             along, across = spin @ velocity, turned @ velocity
             ends = [along * np.cos(angle * s) + across * np.sin(angle * s) for s in (a, b)]
@@ -89,12 +89,14 @@ class RigidMotion:
         return float(np.sqrt(square.max(initial=0.0)))
 
     def _path(self) -> tuple[np.ndarray, np.ndarray]:
-        """The values of s [K] at which the path has its corners, and the corners [K, 3]; the first is the start."""
+        """The values of s [K] at which the path has its corners, and the corners [K, 3], from the start to the end."""
         corners = np.concatenate([np.zeros((1, 3)), np.reshape(np.asarray(self.translation, np.float64), (-1, 3))])
         lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+        if not lengths.any():
+            return np.array([0.0, 1.0]), corners[:2]
         kept = np.concatenate([[True], lengths > 0])
         way = np.concatenate([[0.0], np.cumsum(lengths)])[kept]
-        return way / (way[-1] or 1.0), corners[kept]
+        return way / way[-1], corners[kept]
 
     def _rotated(self, s: float) -> np.ndarray:
         """R(s) [3, 3] = I + sin(angle) K + (1 - cos(angle)) K^2, where K v = axis x v (Rodrigues)."""
@@ -252,14 +254,6 @@ def _moved(scene: Scene, motions: Mapping[int, RigidMotion | Vector]) -> Iterato
                 f" of it with --clamp {body}:PLACE"
             )
         yield nodes, motion if isinstance(motion, RigidMotion) else RigidMotion(motion)
-
-
-def _segments(shares: np.ndarray, corners: np.ndarray) -> Iterator[tuple[float, float, np.ndarray]]:
-    """Start, end and velocity [3] of each straight piece of a path. A path without pieces stands still from 0 to 1."""
-    if len(shares) == 1:
-        yield 0.0, 1.0, np.zeros(3)
-    for k in range(len(shares) - 1):
-        yield shares[k], shares[k + 1], (corners[k + 1] - corners[k]) / (shares[k + 1] - shares[k])
 
 
 def _largest(vectors: np.ndarray) -> float:

@@ -192,12 +192,13 @@ class Dataset:
                 f"{self.path}: has the version {values.get('version')} of the format; this program reads {VERSION}"
             )
         types = {"domain_center": list, "domain_half_width": float, "contact_radius": float, "time_step": float}
+        known: dict[str, Any] = {}
         for key in (item.name for item in fields(DatasetInfo)):
             wanted = types.get(key, str)
             if not isinstance(values.get(key), wanted):
                 found = repr(values[key])[:60] if key in values else "missing"
                 raise DatasetError(f"{self.path}: the attribute {key} is {found}; must be a {wanted.__name__}")
-        known: dict[str, Any] = {item.name: values[item.name] for item in fields(DatasetInfo)}
+            known[key] = values[key]
         known["domain_center"] = tuple(known["domain_center"])
         with self._file.reading("the attribute generator"):
             known["generator"] = json.loads(known["generator"])

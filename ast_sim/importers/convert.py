@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ast_sim.dataset.domain import FittedWriter
 from ast_sim.dataset.layout import SPLITS
+from ast_sim.dataset.writer import FittedWriter
 from ast_sim.importers.completeness import require_complete
 from ast_sim.importers.deepmind import convert_deepmind, is_deepmind
 from ast_sim.importers.vtu import FieldNames, natural_order, read_series

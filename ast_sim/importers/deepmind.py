@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ast_sim.dataset.domain import FittedWriter
 from ast_sim.dataset.layout import SPLITS
+from ast_sim.dataset.writer import FittedWriter
 from ast_sim.importers.deepmind_meta import LENGTH, Meta, read_meta
 from ast_sim.importers.tfrecord import find_values, read_records
 from ast_sim.scene import Scene, Trajectory, connected_parts, require_array

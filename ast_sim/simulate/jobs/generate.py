@@ -22,11 +22,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from ast_sim.dataset.domain import FittedWriter
 from ast_sim.dataset.layout import SPLITS
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import Seconds, read_seconds, seconds_path, write_seconds
-from ast_sim.dataset.writer import DatasetWriter
+from ast_sim.dataset.writer import DatasetWriter, FittedWriter
 from ast_sim.simulate.families.names import family_module
 from ast_sim.simulate.jobs import cluster, pool
 from ast_sim.simulate.jobs.display import Progress
