@@ -15,7 +15,6 @@ from ast_sim.dataset.writer import FittedWriter
 from ast_sim.importers.completeness import require_complete
 from ast_sim.importers.deepmind import convert_deepmind, is_deepmind
 from ast_sim.importers.vtu import FieldNames, natural_order, read_series
-from ast_sim.scene import Trajectory
 from ast_sim.support.errors import DatasetError
 
 SHARES = {"train": 0.8, "valid": 0.1, "test": 0.1}
@@ -97,13 +96,10 @@ def convert_series(
                 generator["origin"] = origin.tolist()
                 writer.info = replace(writer.info, stress_location=trajectory.stress_location)
             writer.add(split, trajectory)
-            progress(f"{split}: {name}, {_summary(trajectory)}")
+            size = f"{trajectory.num_frames} frames of {trajectory.scene.num_nodes} nodes"
+            notes = trajectory.attributes.get("notes")
+            progress(f"{split}: {name}, {size}" + (f"; {notes}" if notes else ""))
     return writer.counts
-
-
-def _summary(trajectory: Trajectory) -> str:
-    size = f"{trajectory.num_frames} frames of {trajectory.scene.num_nodes} nodes"
-    return "; ".join([size, *([str(trajectory.attributes["notes"])] if "notes" in trajectory.attributes else [])])
 
 
 def find_series(source: Path) -> dict[str, Path]:

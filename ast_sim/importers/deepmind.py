@@ -81,10 +81,9 @@ def convert_deepmind(
     ) as writer:
         for split, path in files.items():
             for trajectory in read_trajectories(path, meta, limit, every):
-                frames, nodes = trajectory.position.shape[:2]
-                text = f"{split}: {path.name} {writer.counts[split]}, {frames} frames of {nodes} nodes"
+                size = f"{trajectory.num_frames} frames of {trajectory.scene.num_nodes} nodes"
                 writer.add(split, trajectory)
-                progress(text)
+                progress(f"{split}: {path.name} {writer.counts[split] - 1}, {size}")
                 del trajectory  # to free its memory before the next one is read
     return writer.counts
 

@@ -133,11 +133,8 @@ def far_origin(points: np.ndarray) -> np.ndarray:
 def _warn_of_rounding(source: Path, rest: np.ndarray, position: np.ndarray) -> None:
     """Warn if the displacements change when the rest points [N, 3] and the positions [S, N, 3] become float32."""
     small = rest.astype(np.float32).astype(np.float64)
-    largest = worst = 0.0
-    for one in position:
-        exact = one - rest
-        largest = max(largest, np.abs(exact).max())
-        worst = max(worst, np.abs(one.astype(np.float32) - small - exact).max())
+    largest = max(np.abs(one - rest).max() for one in position)
+    worst = max(np.abs(one.astype(np.float32) - small - (one - rest)).max() for one in position)
     if worst > _ROUNDING * largest:
         warnings.warn(
             f"{source}: the largest displacement is {largest:.3g}, and rounding to float32 changes displacements by up"
