@@ -98,11 +98,7 @@ class Scene:
             if self.material.shape[1] == 0:
                 raise DatasetError(f"{name}: material has no columns; leave it out (None)")
             require_finite(name, "material", "element", self.material)
-        if self.elements.min() < 0 or self.elements.max() >= n:
-            outside = (self.elements < 0) | (self.elements >= n)
-            row = int(np.argmax(outside.any(axis=1)))
-            node = self.elements[row, np.argmax(outside[row])]
-            raise DatasetError(f"{name}: element {row} refers to node {node}, but the nodes are 0 to {n - 1}")
+        require_nodes(name, "element", self.elements, n)
         pairs = LOCAL_EDGES[k]
         repeated = np.logical_or.reduce([self.elements[:, a] == self.elements[:, b] for a, b in pairs])
         if repeated.any():
@@ -267,6 +263,15 @@ def require_array(name: str, array: str, value: np.ndarray, dtype: type, shape: 
     if not fits:
         wanted = ", ".join("any" if size is None else str(size) for size in shape)
         raise DatasetError(f"{name}: {array} has the shape {list(value.shape)}, must be [{wanted}]")
+
+
+def require_nodes(name: str, kind: str, elements: np.ndarray, count: int) -> None:
+    """Raise DatasetError naming the first of the `elements` [E, k] that refers to a node beyond 0 to `count` - 1."""
+    outside = (elements < 0) | (elements >= count)
+    if outside.any():
+        row, corner = np.unravel_index(np.argmax(outside), outside.shape)
+        node = elements[row, corner]
+        raise DatasetError(f"{name}: {kind} {row} refers to node {node}, but the nodes are 0 to {count - 1}")
 
 
 def require_finite(name: str, array: str, row: str, value: np.ndarray, first_frame: int = 0) -> None:

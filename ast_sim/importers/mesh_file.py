@@ -16,7 +16,7 @@ import numpy as np
 from ast_sim.importers.places import Mask
 from ast_sim.importers.shells import Shells, find_shells
 from ast_sim.importers.vtu_sizes import require_declared_sizes
-from ast_sim.scene import NodeType, Scene, connected_parts
+from ast_sim.scene import NodeType, Scene, connected_parts, require_nodes
 from ast_sim.support.errors import DatasetError
 
 if TYPE_CHECKING:
@@ -160,13 +160,7 @@ def read_mesh(source: Path | meshio.Mesh, curved: bool = False, path: Path = Pat
     elements = np.concatenate([mesh.cells[block].data[:, :corners] for block in blocks]).astype(np.int64)
     points = np.zeros((len(mesh.points), 3))
     points[:, : mesh.points.shape[1]] = mesh.points
-    outside = ((elements < 0) | (elements >= len(points))).any(axis=1)
-    if outside.any():
-        row = int(np.argmax(outside))
-        kind = "tetra" if corners == 4 else "triangle"
-        raise DatasetError(
-            f"{path}: {kind} {row} refers to the nodes {elements[row].tolist()}; the points are 0 to {len(points) - 1}"
-        )
+    require_nodes(str(path), "tetra" if corners == 4 else "triangle", elements, len(points))
     fields = {
         "point": {name: np.asarray(values) for name, values in mesh.point_data.items()},
         "cell": {name: np.concatenate([values[b] for b in blocks]) for name, values in mesh.cell_data.items()},
@@ -191,8 +185,8 @@ def _with_shells(bare: MeshFile, mesh: meshio.Mesh, blocks: list[int]) -> MeshFi
     corners = {index: _shell_corners(block.type) for index, block in enumerate(mesh.cells) if len(block)}
     flat = [index for index, count in corners.items() if count]
     cells = [mesh.cells[index].data[:, : corners[index]].astype(np.int64) for index in flat]
-    if any(((block < 0) | (block >= len(bare.points))).any() for block in cells):
-        raise DatasetError(f"{bare.path}: a triangle or quadrilateral refers to a point that does not exist")
+    for index, block in zip(flat, cells, strict=True):
+        require_nodes(str(bare.path), mesh.cells[index].type, block, len(bare.points))
     if cells and not np.isfinite(bare.points).all():
         raise DatasetError(f"{bare.path}: point {np.argmin(np.isfinite(bare.points).all(axis=1))} is not finite")
     shells = find_shells(bare.points, bare.elements, cells) if cells else None

@@ -289,7 +289,7 @@ WRONG = {
     "fewer points": (
         frame(points=ONE.rest_position[:7]),
         {},
-        "1.vtu: tetra 0 refers to the nodes .*; the points are 0 to 6",
+        "1.vtu: tetra [0-9] refers to node 7, but the nodes are 0 to 6",
     ),
     "another mesh": (frame(elements=ONE.elements[::-1]), {}, "1.vtu: its elements are not those of 0.vtu"),
     "more points": (frame(points=np.ones((9, 3), np.float32)), {}, "1.vtu: has 9 points, 0.vtu 8"),

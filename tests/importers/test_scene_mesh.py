@@ -201,7 +201,7 @@ WRONG = {
     ),
     "a node twice": (with_fields(tets=TETS[:, [0, 1, 2, 2]]), {}, "element 0 refers to a node twice"),
     "not finite": (with_fields(points=NAN), {}, "rest_position of node 3 is not finite"),
-    "a missing point": (with_fields(tets=TETS + 1), {}, "tetra .* refers to the nodes .*; the points are 0 to 269"),
+    "a missing point": (with_fields(tets=TETS + 1), {}, "tetra .* refers to node 270, but the nodes are 0 to 269"),
     "hexahedra": (
         meshio.Mesh(POINTS, {"hexahedron": np.arange(8)[None], "triangle": np.arange(3)[None]}),
         {},
