@@ -78,23 +78,18 @@ def convert_series(
     found = find_series(source)
     chosen = _assign(source, list(found), splits, seed)
     origin = None
-    generator: dict[str, Any] = {
-        "program": "ast_sim convert",
-        "source": str(source),
-        "names": asdict(names),
-        "seed": seed,
-    }
+    made_by = {"program": "ast_sim convert", "source": str(source), "names": asdict(names), "seed": seed}
     facts = {"contact_radius": contact_radius, "time_step": time_step, "length_unit": length_unit}
-    facts |= {"family": source.stem, "integration": integration, "generator": generator}
+    facts |= {"family": source.stem, "integration": integration}
     with FittedWriter(out, stress_location="none", **facts) as writer:
-        for index, (split, name) in enumerate(chosen):
+        for split, name in chosen:
             trajectory = read_series(found[name], names, origin)
             if not incomplete:
                 require_complete(found[name], trajectory, names)
-            if index == 0:
+            if origin is None:
                 origin = np.array(trajectory.attributes.get("origin", [0.0, 0.0, 0.0]))
-                generator["origin"] = origin.tolist()
-                writer.info = replace(writer.info, stress_location=trajectory.stress_location)
+                place, made_by = trajectory.stress_at, {**made_by, "origin": origin.tolist()}
+                writer.info = replace(writer.info, stress_location=place, generator=made_by)
             writer.add(split, trajectory)
             size = f"{trajectory.num_frames} frames of {trajectory.scene.num_nodes} nodes"
             notes = trajectory.attributes.get("notes")
