@@ -97,7 +97,7 @@ def read_trajectories(path: Path, meta: Meta, limit: int | None = None, every: i
         DatasetError: the file is wrong; the text names the file and the record.
     """
     # By `map` the record has no name here, so its memory is free before the next one is read.
-    yield from map(
+    return map(
         lambda payload, index: _trajectory(payload, meta, path, index, every),
         islice(read_records(path), limit),
         count(),
