@@ -234,10 +234,11 @@ class Dataset:
             count = len(self._file.array(group, "position"))
             if count == 0:
                 raise DatasetError(f"{self._name(split, index)}: position has no frames")
-            shapes = {"position": (count, len(self._file.array(group, "rest_position")), 3)}
+            nodes = len(self._file.array(group, "rest_position"))
+            shapes = {"position": (count, nodes, 3)}
             if self.info.stress_location != "none":
-                rows = "rest_position" if self.info.stress_location == "node" else "elements"
-                shapes["stress"] = (count, len(self._file.array(group, rows)), 1)
+                rows = nodes if self.info.stress_location == "node" else len(self._file.array(group, "elements"))
+                shapes["stress"] = (count, rows, 1)
             self._open[key] = {name: self._file.array(group, name, shape) for name, shape in shapes.items()}
         return self._open[key]
 
