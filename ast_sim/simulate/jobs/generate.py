@@ -115,15 +115,13 @@ def generate(
     folder = out.with_name(out.name + ".parts")
     if out.exists() and not _grows(out, settings, counts):
         return _existing(out, folder, settings, counts)
-    if not folder.exists():
-        _check_start(out, sum(counts.values()), recipe, module)
     samples = _samples(counts)
+    if not folder.exists():
+        _check_start(out, len(samples), recipe, module)
     with _locked(folder, settings):
-        if out.exists():
-            _unpack(out, folder)
+        _unpack(out, folder)
         _make(samples, folder, recipe, workers, scheduler, progress, _notes(settings))
         truncated = _merge(out, folder, samples, _writer(out, recipe, module, {**settings, "counts": counts}))
-        _remove(folder)
     return Generated(out, counts, truncated)
 
 
@@ -232,7 +230,9 @@ def _samples(counts: dict[str, int]) -> list[Sample]:
 
 
 def _unpack(out: Path, folder: Path) -> None:
-    """Lay the samples of the dataset into the parts folder, as they lay there before they were merged."""
+    """Lay the samples of a dataset that is there into the parts folder, as they lay there before they were merged."""
+    if not out.exists():
+        return
     with Dataset(out) as dataset:
         known = read_seconds(dataset).samples
         seconds = json.loads(seconds_path(out).read_text(encoding="utf-8"))["samples"] if known else {}
@@ -314,7 +314,7 @@ def _is_readable(path: Path) -> bool:
 
 
 def _merge(out: Path, folder: Path, samples: list[Sample], opened: DatasetWriter) -> list[str]:
-    """Write the seconds and then the dataset; return the names of the truncated samples."""
+    """Write the seconds and then the dataset, and remove the folder; return the names of the truncated samples."""
     truncated = []
     seconds: dict[str, Seconds] = {}
     with opened as writer:
@@ -326,4 +326,5 @@ def _merge(out: Path, folder: Path, samples: list[Sample], opened: DatasetWriter
             if trajectory.attributes["status"] == "truncated":
                 truncated.append(sample_name(*sample))
         write_seconds(out, writer.info.generator, seconds)
+    _remove(folder)
     return truncated

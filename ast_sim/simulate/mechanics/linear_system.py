@@ -7,8 +7,8 @@ faster. If the iterations do not suffice, the matrix itself is factorised.
 
 Elements couple the same unknowns at all times; contact couples more as it spreads. The sparsity pattern holds the
 entries of the elements and of every contact since the last `restart`. As long as no new entries come, the symbolic
-factorization is used again. PARDISO (of MKL) factorises where there is MKL, CHOLMOD (of cholespy) elsewhere. Both
-use one thread, and both report a matrix that is not positive definite.
+factorization is used again. PARDISO factorises where there is MKL, CHOLMOD elsewhere. Both use one thread, and both
+report a matrix that is not positive definite.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ class Factorization(Protocol):
 def _pypardiso() -> tuple[ModuleType, str]:
     """The module, ready for use, and its name and version."""
     # One thread, no second OpenMP runtime in this process, and the same bits wherever arrays lie in memory.
-    for name, value in (("MKL_THREADING_LAYER", "SEQUENTIAL"), ("MKL_CBWR", "AVX2")):
-        os.environ.setdefault(name, value)
+    os.environ.setdefault("MKL_THREADING_LAYER", "SEQUENTIAL")
+    os.environ.setdefault("MKL_CBWR", "AVX2")
     # Without this variable, the import of pypardiso searches the whole Python installation for the library.
     if "PYPARDISO_MKL_RT" not in os.environ:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
@@ -122,20 +122,17 @@ class Cholmod:
 
     name = "CHOLMOD (cholespy)"
 
-    def __init__(self) -> None:
+    def factorise(self, upper: scipy.sparse.csr_array, is_new_pattern: bool) -> bool:
         import cholespy
 
-        self._cholespy = cholespy
-
-    def factorise(self, upper: scipy.sparse.csr_array, is_new_pattern: bool) -> bool:
         whole = (upper + scipy.sparse.triu(upper, 1).T).tocsc()
         try:
-            self._solver = self._cholespy.CholeskySolverD(
+            self._solver = cholespy.CholeskySolverD(
                 whole.shape[0],
                 whole.indptr.astype(np.int32),
                 whole.indices.astype(np.int32),
                 whole.data,
-                self._cholespy.MatrixType.CSC,
+                cholespy.MatrixType.CSC,
             )
         except ValueError:
             return False
