@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from itertools import accumulate
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -41,21 +42,21 @@ class Statistics:
 class Normalizer(nn.Module):
     """(x - mean) / scale with one mean and one scale for all components, which `fix` sets."""
 
-    def __init__(self, kind: Kind):
+    def __init__(self, kind: Kind | None, shape: tuple[int, ...] = ()):
         super().__init__()
-        self.register_buffer("mean", torch.zeros(()))
-        self.register_buffer("scale", torch.ones(()))
-        self._statistics = Statistics(kind)
+        self.register_buffer("mean", torch.zeros(shape))
+        self.register_buffer("scale", torch.ones(shape))
+        self._statistics: list[tuple[Any, Statistics]] = [(..., Statistics(kind))] if kind else []
 
     def observe(self, x: Tensor) -> None:
         """Add samples."""
-        self._statistics.observe(x)
+        for columns, statistics in self._statistics:
+            statistics.observe(x[:, columns])
 
     def fix(self) -> None:
         """Set mean and scale from all samples."""
-        mean, scale = self._statistics.result()
-        self.mean.fill_(mean)
-        self.scale.fill_(scale)
+        for columns, statistics in self._statistics:
+            self.mean[columns], self.scale[columns] = statistics.result()
 
     def forward(self, x: Tensor) -> Tensor:
         return (x - self.mean) / self.scale
@@ -64,7 +65,7 @@ class Normalizer(nn.Module):
         return x * self.scale + self.mean
 
 
-class FeatureNormalizer(nn.Module):
+class FeatureNormalizer(Normalizer):
     """A `Normalizer` for several quantities in the columns of one array.
 
     Args:
@@ -72,26 +73,10 @@ class FeatureNormalizer(nn.Module):
     """
 
     def __init__(self, kinds: list[tuple[Kind | None, int]]):
-        super().__init__()
-        self.width = sum(width for _, width in kinds)
-        self.register_buffer("mean", torch.zeros(self.width))
-        self.register_buffer("scale", torch.ones(self.width))
-        self._statistics: list[tuple[slice, Statistics]] = []
-        start = 0
-        for kind, width in kinds:
-            if kind is not None:
-                self._statistics.append((slice(start, start + width), Statistics(kind)))
-            start += width
-
-    def observe(self, x: Tensor) -> None:
-        """Add rows [*, width]."""
-        for columns, statistics in self._statistics:
-            statistics.observe(x[:, columns])
-
-    def fix(self) -> None:
-        """Set mean and scale of each quantity from all rows."""
-        for columns, statistics in self._statistics:
-            self.mean[columns], self.scale[columns] = statistics.result()
-
-    def forward(self, x: Tensor) -> Tensor:
-        return (x - self.mean) / self.scale
+        width = sum(width for _, width in kinds)
+        super().__init__(None, (width,))
+        self.width = width
+        ends = accumulate(width for _, width in kinds)
+        self._statistics = [
+            (slice(end - width, end), Statistics(kind)) for end, (kind, width) in zip(ends, kinds, strict=True) if kind
+        ]

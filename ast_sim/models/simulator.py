@@ -14,7 +14,7 @@ from ast_sim.batches.graph import Graph
 from ast_sim.batches.pairs import PairSampler
 from ast_sim.dataset.reader import Dataset
 from ast_sim.models.model_config import ModelConfig
-from ast_sim.models.normalizer import FeatureNormalizer, Normalizer
+from ast_sim.models.normalizer import Normalizer
 from ast_sim.scene import Scene
 from ast_sim.support.errors import ConfigError
 
@@ -130,7 +130,7 @@ class Simulator(nn.Module):
             if self.stress_normalizer is not None:
                 self.stress_normalizer.observe(target.stress[self._stressed(batch)])
         for module in self.modules():
-            if isinstance(module, Normalizer | FeatureNormalizer):
+            if isinstance(module, Normalizer):
                 module.fix()
 
     def loss(
