@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import numpy as np
 import torch
@@ -45,11 +46,17 @@ class Pooling:
         kept: [C] int64, ascending, nodes of the finer mesh.
         edges: P edges, from nodes of the finer mesh to nodes of the coarser mesh.
         weight: [P, 1] float32; the weights of the edges into a node add up to 1.
+        moves: whether the positions of kept nodes are pooled like features. Otherwise they stay in place.
     """
 
     kept: Tensor
     edges: EdgeSet
     weight: Tensor
+    moves: bool
+
+    def positions(self, finer: Tensor) -> Tensor:
+        """[N, 3] -> [C, 3]: the positions of the coarser mesh."""
+        return self.pool(finer) if self.moves else finer.index_select(0, self.kept)
 
     def pool(self, x: Tensor) -> Tensor:
         """[N, F] -> [C, F]: the weighted mean over the neighbours of each kept node."""
@@ -70,9 +77,8 @@ class Pooling:
         if not len(contacts):
             return _edge_set(csr_array((len(self.kept),) * 2, dtype=bool))
         neighbours = _matrix(self.edges)
-        itself = csr_array((np.ones(len(self.kept), bool), self.kept.numpy(), np.arange(len(self.kept) + 1)))
-        itself.resize(neighbours.shape)
-        reach = neighbours + itself
+        itself = (np.ones(len(self.kept), bool), self.kept.numpy(), np.arange(len(self.kept) + 1))
+        reach = neighbours + csr_array(itself, shape=neighbours.shape)
         return _edge_set(_without_diagonal(reach @ _matrix(contacts) @ reach.T.tocsr()))
 
 
@@ -109,6 +115,12 @@ class Hierarchy:
         """The hierarchy of the same scene, mirrored and moved. Distances stay, so the coarser meshes stay too."""
         return replace(self, rest_edges=tuple(placement.vectors(level) for level in self.rest_edges))
 
+    def meshes(self, position: Tensor) -> list[tuple[EdgeSet, Tensor, Tensor]]:
+        """The edges of each mesh, their vectors at rest, and the positions of its nodes; `position` [N, 3] is of the
+        finest."""
+        positions = accumulate(self.poolings, lambda finer, pooling: pooling.positions(finer), initial=position)
+        return list(zip(self.edges, self.rest_edges, positions, strict=True))
+
     def between_components(self, contacts: EdgeSet) -> EdgeSet:
         """The contact edges whose ends lie in different components."""
         apart = self.component[contacts.senders] != self.component[contacts.receivers]
@@ -130,9 +142,9 @@ def build_hierarchy(edges: EdgeSet, rest_position: Tensor, levels: int, pooled: 
     edge_sets, rest_edges, poolings = [edges], [edge_vectors(edges, rest_position, rest_position)], []
     for _ in range(levels):
         kept = select(adjacency, kept_position)
-        pooling, weight = _pooling(adjacency, kept, weight)
+        pooling, weight = _pooling(adjacency, kept, weight, pooled)
         adjacency, kept_position = coarsen(adjacency, kept), kept_position[kept]
-        position = pooling.pool(position) if pooled else position[pooling.kept]
+        position = pooling.positions(position)
         edge_sets.append(_edge_set(adjacency))
         poolings.append(pooling)
         rest_edges.append(edge_vectors(edge_sets[-1], position, position).float())
@@ -174,7 +186,7 @@ def coarsen(adjacency: csr_array, kept: np.ndarray) -> csr_array:
     return _without_diagonal(enhanced[kept] @ enhanced[:, kept])
 
 
-def _pooling(adjacency: csr_array, kept: np.ndarray, weight: np.ndarray) -> tuple[Pooling, np.ndarray]:
+def _pooling(adjacency: csr_array, kept: np.ndarray, weight: np.ndarray, moves: bool) -> tuple[Pooling, np.ndarray]:
     """The pooling to the kept nodes, and their weights w' [C] from the weights w [N] of all nodes."""
     degree = np.diff(adjacency.indptr)
     alone = diags_array((degree == 0), dtype=bool)
@@ -184,7 +196,7 @@ def _pooling(adjacency: csr_array, kept: np.ndarray, weight: np.ndarray) -> tupl
     neighbours.sort_indices()
     edges = _edge_set(neighbours)
     weights = share[neighbours.indices] / total.repeat(np.diff(neighbours.indptr))
-    return Pooling(torch.from_numpy(kept), edges, torch.from_numpy(weights).float()[:, None]), total
+    return Pooling(torch.from_numpy(kept), edges, torch.from_numpy(weights).float()[:, None], moves), total
 
 
 def spread(x: Tensor, order: Tensor, offsets: Tensor) -> Tensor:
@@ -206,6 +218,7 @@ def _concatenate(poolings: Sequence[Pooling]) -> Pooling:
         join_indices([pooling.kept for pooling in poolings], [pooling.edges.num_senders for pooling in poolings]),
         EdgeSet.concatenate([pooling.edges for pooling in poolings]),
         torch.cat([pooling.weight for pooling in poolings]),
+        poolings[0].moves,
     )
 
 

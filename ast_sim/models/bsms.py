@@ -16,26 +16,20 @@ Legend: N nodes, M edges of a set, L levels below the mesh.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from ast_sim.batches.batch_builder import Batch
-from ast_sim.batches.graph import Graph, edge_vectors
-from ast_sim.models.bistride import Hierarchy, build_hierarchy, subset
+from ast_sim.batches.graph import Graph
+from ast_sim.models.bistride import build_hierarchy, subset
 from ast_sim.models.model_config import PAPER_TRAINING, WIDEST, Preset, setting, tiny
-from ast_sim.models.node_inputs import node_features, normalizer_of
+from ast_sim.models.node_inputs import normalizer_of
 from ast_sim.models.registry import Model
 from ast_sim.models.simulator import Prediction
-from ast_sim.models.world_edge_model import (
-    Decoder,
-    DeepMLP,
-    WorldEdgeConfig,
-    WorldEdgeSimulator,
-    messages,
-    world_normalizer,
-)
+from ast_sim.models.world_edge_model import Decoder, DeepMLP, Edges, WorldEdgeConfig, WorldEdgeSimulator, messages
 from ast_sim.ops import EdgeSet
 from ast_sim.scene import Scene
 
@@ -64,47 +58,21 @@ class PlainNorm(nn.Module):
         self.register_buffer("bias", torch.zeros(width), persistent=False)
 
 
-def plain_mlp(config: BSMSConfig, inputs: int) -> DeepMLP:
-    """A `DeepMLP` whose LayerNorm has no parameters."""
-    mlp = DeepMLP(config, inputs)
-    mlp.norm = PlainNorm(config.hidden)
-    return mlp
-
-
-@dataclass(frozen=True, eq=False)
-class Level:
-    """The edges of one mesh and its contacts in one state, and their features [M, 8] and [M, 4]."""
-
-    mesh: EdgeSet
-    mesh_features: Tensor
-    contacts: EdgeSet
-    contact_features: Tensor
-
-
-class Messages(nn.Module):
-    """Sums of the messages along the edges of one set."""
-
-    def __init__(self, config: BSMSConfig, edge_inputs: int):
-        super().__init__()
-        self.mlp = plain_mlp(config, edge_inputs + 2 * config.hidden)
-
-    def forward(self, edges: EdgeSet, features: Tensor, nodes: Tensor) -> Tensor:
-        """features [M, edge_inputs], nodes [N, hidden] -> [N, hidden]."""
-        return messages(self.mlp, edges, features, nodes)[0]
-
-
 class Block(nn.Module):
     """One step on the mesh and the contacts of a level."""
 
     def __init__(self, config: BSMSConfig):
         super().__init__()
-        self.mesh, self.contact = Messages(config, 8), Messages(config, 4)
-        self.node = plain_mlp(config, 3 * config.hidden)
+        self.mesh, self.contact = (
+            nn.ModuleDict({"mlp": DeepMLP(config, edge_inputs + 2 * config.hidden, norm=PlainNorm)})
+            for edge_inputs in (8, 4)
+        )
+        self.node = DeepMLP(config, 3 * config.hidden, norm=PlainNorm)
 
-    def forward(self, x: Tensor, level: Level) -> Tensor:
+    def forward(self, x: Tensor, mesh: Edges, contacts: Edges) -> Tensor:
         """[N, hidden] -> [N, hidden]."""
-        on_mesh = self.mesh(level.mesh, level.mesh_features, x)
-        in_contact = self.contact(level.contacts, level.contact_features, x)
+        on_mesh, _ = messages(self.mesh["mlp"], *mesh, x)
+        in_contact, _ = messages(self.contact["mlp"], *contacts, x)
         return self.node(torch.cat([x, on_mesh, in_contact], dim=1), residual=x)
 
 
@@ -116,8 +84,8 @@ class BSMS(WorldEdgeSimulator):
     def __init__(self, config: BSMSConfig):
         super().__init__(config)
         self.mesh_inputs = nn.ModuleList(normalizer_of(config, "edge") for _ in range(config.levels + 1))
-        self.world_inputs = nn.ModuleList(world_normalizer() for _ in range(config.levels + 1))
-        self.node_encoder = plain_mlp(config, self.node_inputs.width)
+        self.world_inputs = nn.ModuleList(normalizer_of(config, "world_edge") for _ in range(config.levels + 1))
+        self.node_encoder = DeepMLP(config, self.node_inputs.width, norm=PlainNorm)
         self.down = nn.ModuleList(Block(config) for _ in range(config.levels))
         self.bottom = Block(config)
         self.up = nn.ModuleList(Block(config) for _ in range(config.levels))
@@ -137,33 +105,16 @@ class BSMS(WorldEdgeSimulator):
         found = super().world(batch)
         return batch.graph.own.between_components(found) if self.config.contacts == "components" else found
 
-    def levels(self, batch: Batch) -> list[Level]:
-        """The meshes and contacts of a batch with features that are not normalised, the finest first."""
-        hierarchy: Hierarchy = batch.graph.own
-        position, contacts, found = batch.position, self.world(batch), []
-        for i, (mesh, rest) in enumerate(zip(hierarchy.edges, hierarchy.rest_edges, strict=True)):
-            if i:
-                pooling = hierarchy.poolings[i - 1]
-                position, contacts = pooling.pool(position), pooling.pool_contacts(contacts)
-            features = self.edge_features(mesh, rest, position)
-            found.append(Level(mesh, features, contacts, edge_vectors(contacts, position, position)))
-        return found
-
-    def observe(self, batch: Batch) -> None:
-        """Add the batch to the statistics of the inputs."""
-        self.node_inputs.observe(node_features(self.config, batch))
-        for mesh, world, level in zip(self.mesh_inputs, self.world_inputs, self.levels(batch), strict=True):
-            mesh.observe(level.mesh_features)
-            world.observe(level.contact_features)
+    def contacts(self, batch: Batch) -> list[EdgeSet]:
+        """The contact edges of each mesh, the finest first."""
+        poolings = batch.graph.own.poolings
+        return list(accumulate(poolings, lambda finer, step: step.pool_contacts(finer), initial=self.world(batch)))
 
     def forward(self, batch: Batch) -> Prediction:
         """Normalised outputs for the frame after `batch`."""
-        levels = [
-            Level(level.mesh, mesh(level.mesh_features), level.contacts, world(level.contact_features))
-            for mesh, world, level in zip(self.mesh_inputs, self.world_inputs, self.levels(batch), strict=True)
-        ]
-        poolings = batch.graph.own.poolings
-        x, skipped = self.node_encoder(self.nodes(batch)), []
+        nodes, *edges = self.inputs(batch)
+        levels, poolings = list(zip(*edges, strict=True)), batch.graph.own.poolings
+        x, skipped = self.node_encoder(nodes), []
         for i, block in enumerate(self.down):
             skipped.append(self._steps(block, x, levels[i], end=i == 0))
             x = poolings[i].pool(skipped[-1])
@@ -172,9 +123,9 @@ class BSMS(WorldEdgeSimulator):
             x = skipped[i] + self._steps(block, poolings[i].unpool(x), levels[i], end=i == 0)
         return self.decoder(x, batch)
 
-    def _steps(self, block: Block, x: Tensor, level: Level, end: bool) -> Tensor:
+    def _steps(self, block: Block, x: Tensor, level: tuple[Edges, Edges], end: bool) -> Tensor:
         for _ in range(2 if end and self.config.repeat_ends else 1):
-            x = block(x, level)
+            x = block(x, *level)
         return x
 
 

@@ -25,14 +25,13 @@ import torch
 from torch import Tensor, nn
 
 from ast_sim.batches.batch_builder import Batch
-from ast_sim.batches.graph import Graph, edge_vectors
-from ast_sim.models.bistride import Hierarchy, build_hierarchy, subset
+from ast_sim.batches.graph import Graph
+from ast_sim.models.bistride import build_hierarchy, subset
 from ast_sim.models.layers import Linear
 from ast_sim.models.model_config import PAPER_TRAINING, WIDEST, Preset, setting, tiny
-from ast_sim.models.node_inputs import node_features
 from ast_sim.models.registry import Model
 from ast_sim.models.simulator import Prediction
-from ast_sim.models.world_edge_model import Decoder, WorldEdgeConfig, WorldEdgeSimulator
+from ast_sim.models.world_edge_model import Decoder, Edges, WorldEdgeConfig, WorldEdgeSimulator
 from ast_sim.ops import EdgeSet, segment_sum
 from ast_sim.scene import NodeType, Scene
 
@@ -68,7 +67,7 @@ class Block(nn.Module):
         self.forward_norm = nn.LayerNorm(width)
         self.feed_forward = nn.ModuleList(_layer(width, width) for _ in range(3))
 
-    def forward(self, x: Tensor, *edge_sets: tuple[EdgeSet, Tensor]) -> Tensor:
+    def forward(self, x: Tensor, *edge_sets: Edges) -> Tensor:
         """x [N, hidden] and the edges of each set with their features [M, hidden] -> [N, hidden]."""
         y, found = self.norm(x), []
         q, k, v = self.q(y), self.k(y), self.v(y)
@@ -87,7 +86,7 @@ def _layer(inputs: int, outputs: int) -> Linear:
 
 
 class HCMT(WorldEdgeSimulator):
-    """The Hierarchical Contact Mesh Transformer."""
+    """The Hierarchical Contact Mesh Transformer. The edges of all meshes share statistics."""
 
     config: HCMTConfig
 
@@ -114,32 +113,14 @@ class HCMT(WorldEdgeSimulator):
         ends = torch.stack([batch.graph.node_type[found.senders], batch.graph.node_type[found.receivers]])
         return subset(found, (ends == NodeType.OBSTACLE).any(0) & (ends == NodeType.NORMAL).any(0))
 
-    def mesh_levels(self, batch: Batch) -> list[Tensor]:
-        """The features [M, 8] of the edges of each mesh, not normalised, the finest first."""
-        hierarchy: Hierarchy = batch.graph.own
-        position, found = batch.position, []
-        for i, (mesh, rest) in enumerate(zip(hierarchy.edges, hierarchy.rest_edges, strict=True)):
-            if i:
-                position = position.index_select(0, hierarchy.poolings[i - 1].kept)
-            found.append(self.edge_features(mesh, rest, position))
-        return found
-
-    def observe(self, batch: Batch) -> None:
-        """Add the batch to the statistics of the inputs. The edges of all meshes share statistics."""
-        self.node_inputs.observe(node_features(self.config, batch))
-        for features in self.mesh_levels(batch):
-            self.mesh_inputs.observe(features)
-        self.world_inputs.observe(edge_vectors(self.world(batch), batch.position, batch.position))
-
     def forward(self, batch: Batch) -> Prediction:
         """Normalised outputs for the frame after `batch`."""
-        hierarchy, world = batch.graph.own, self.world(batch)
-        encoded = [self.mesh_encoder(self.mesh_inputs(features)) for features in self.mesh_levels(batch)]
-        meshes = list(zip(hierarchy.edges, encoded, strict=True))
-        kept = [pooling.kept for pooling in hierarchy.poolings]
-        contacts = (world, self.world_encoder(self.world_edges(batch, world)))
+        nodes, on_mesh, [(world, on_world)] = self.inputs(batch)
+        meshes = [(edges, self.mesh_encoder(features)) for edges, features in on_mesh]
+        kept = [pooling.kept for pooling in batch.graph.own.poolings]
+        contacts = (world, self.world_encoder(on_world))
 
-        x, saved = self.node_encoder(self.nodes(batch)), []
+        x, saved = self.node_encoder(nodes), []
         for block in self.contact:
             x = block(x, meshes[0], contacts)
         for block, mesh, chosen in zip(self.down, meshes, kept, strict=False):

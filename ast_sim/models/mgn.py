@@ -21,7 +21,7 @@ from ast_sim.batches.batch_builder import Batch
 from ast_sim.models.model_config import PAPER_TRAINING, WIDEST, Preset, setting, tiny
 from ast_sim.models.registry import Model
 from ast_sim.models.simulator import Prediction
-from ast_sim.models.world_edge_model import Decoder, DeepMLP, WorldEdgeConfig, WorldEdgeSimulator, messages
+from ast_sim.models.world_edge_model import Decoder, DeepMLP, Edges, WorldEdgeConfig, WorldEdgeSimulator, messages
 from ast_sim.ops import EdgeSet
 
 
@@ -58,10 +58,8 @@ class Block(nn.Module):
         self.mesh, self.world = EdgeUpdate(config), EdgeUpdate(config)
         self.node = DeepMLP(config, 3 * config.hidden)
 
-    def forward(
-        self, nodes: Tensor, mesh: tuple[EdgeSet, Tensor], world: tuple[EdgeSet, Tensor]
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """The nodes [N, hidden] and the latents of both sets after the step."""
+    def forward(self, nodes: Tensor, mesh: Edges, world: Edges) -> tuple[Tensor, Tensor, Tensor]:
+        """The nodes [N, hidden] and the latents [M, hidden] of both sets after the step."""
         on_mesh, mesh_sum = self.mesh(*mesh, nodes)
         on_world, world_sum = self.world(*world, nodes)
         return self.node(torch.cat([nodes, mesh_sum, world_sum], dim=1), residual=nodes), on_mesh, on_world
@@ -80,10 +78,8 @@ class MGN(WorldEdgeSimulator):
 
     def forward(self, batch: Batch) -> Prediction:
         """Normalised outputs for the frame after `batch`."""
-        mesh, world = batch.graph.m2m, self.world(batch)
-        nodes = self.node_encoder(self.nodes(batch))
-        on_mesh = self.mesh_encoder(self.mesh_edges(batch))
-        on_world = self.world_encoder(self.world_edges(batch, world))
+        nodes, [(mesh, on_mesh)], [(world, on_world)] = self.inputs(batch)
+        nodes, on_mesh, on_world = self.node_encoder(nodes), self.mesh_encoder(on_mesh), self.world_encoder(on_world)
         for block in self.blocks:
             nodes, on_mesh, on_world = block(nodes, (mesh, on_mesh), (world, on_world))
         return self.decoder(nodes, batch)

@@ -1,6 +1,6 @@
-"""The input features of nodes and, as far as all models share them, of edges (paper, "Input and output features").
+"""The input features of nodes, elements and edges (paper, table "Input and output features").
 
-Legend: N nodes, M edges, B scenes.
+Legend: N nodes, E elements, M edges.
 """
 
 from __future__ import annotations
@@ -9,13 +9,14 @@ import torch
 from torch import Tensor
 
 from ast_sim.batches.batch_builder import Batch
+from ast_sim.batches.graph import edge_vectors
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.models.normalizer import FeatureNormalizer, Kind
-from ast_sim.ops import PROXIMITY_WIDTH, proximity
+from ast_sim.ops import PROXIMITY_WIDTH, EdgeSet, proximity
 from ast_sim.scene import NodeType
 
 
-def states(config: ModelConfig, names: tuple[str, ...], batch: Batch) -> list[Tensor]:
+def _states(names: tuple[str, ...], batch: Batch) -> list[Tensor]:
     """Displacement and velocity of the nodes, if they are among `names`."""
     values = []
     if "displacement" in names:
@@ -28,7 +29,7 @@ def states(config: ModelConfig, names: tuple[str, ...], batch: Batch) -> list[Te
 def node_features(config: ModelConfig, batch: Batch) -> Tensor:
     """[N, *]: node type (one-hot), displacement and velocity, material, proximity, forces out of balance and boundary
     motion, as far as they are inputs. docs/reference/model.md explains them."""
-    values = [batch.graph.one_hot, *states(config, config.node_inputs, batch)]
+    values = [batch.graph.one_hot, *_states(config.node_inputs, batch)]
     if "material" in config.node_inputs:
         values.append(batch.graph.node_material)
     if "proximity" in config.node_inputs:
@@ -47,16 +48,28 @@ def _proximity(batch: Batch, radius: float) -> Tensor:
     return proximity(ahead, graph.node_offsets, graph.body, graph.surface, graph.surface_offsets, radius)
 
 
-def beside_rest(rest: Tensor, vectors: Tensor, strain: bool) -> Tensor:
-    """[M, 8]: edges at rest [M, 4] and now [M, 4]. With `strain`, now minus rest, which has the scale of strains."""
-    return torch.cat([rest, vectors - rest if strain else vectors], dim=1)
+def element_features(config: ModelConfig, batch: Batch) -> Tensor:
+    """[E, *]: displacement and velocity (means of the element's nodes), material and stress, if they are inputs."""
+    values = [batch.graph.element_mean(value) for value in _states(config.element_inputs, batch)]
+    if "material" in config.element_inputs:
+        values.append(batch.graph.material)
+    if "stress" in config.element_inputs:
+        values.append(batch.stress)
+    return torch.cat(values, dim=1)
+
+
+def edge_features(config: ModelConfig, edges: EdgeSet, rest: Tensor, senders: Tensor, receivers: Tensor) -> Tensor:
+    """[M, 8]: [dp0, |dp0|, dp, |dp|] from the edges at `rest` [M, 4] and the positions of senders and receivers now,
+    d = sender - receiver. With `edge_strain` dp and |dp| are relative to rest, and so have the scale of strains."""
+    now = edge_vectors(edges, senders, receivers)
+    return torch.cat([rest, now - rest if config.edge_strain else now], dim=1)
 
 
 def normalizer_of(config: ModelConfig, what: str) -> FeatureNormalizer:
-    """The normalizer of the "node", "element" or "edge" features."""
+    """The normalizer of the "node", "element", "edge" or "world_edge" features."""
     vector, scalar = ("vector", 3), ("scalar", 1)
-    if what == "edge":
-        return FeatureNormalizer([vector, scalar, vector, scalar])
+    if what in ("edge", "world_edge"):
+        return FeatureNormalizer([vector, scalar] * (2 if what == "edge" else 1))
     known: dict[str, tuple[Kind | None, int]] = {  # in the order of the columns
         "displacement": vector,
         "velocity": vector,

@@ -5,8 +5,9 @@ Legend: N nodes, E elements, M mesh edges, W world edges.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -15,13 +16,15 @@ from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import edge_vectors
 from ast_sim.models.layers import MLP, layer
 from ast_sim.models.model_config import WIDEST, DataFacts, ModelConfig, setting
-from ast_sim.models.node_inputs import beside_rest, node_features, normalizer_of
+from ast_sim.models.node_inputs import edge_features, node_features, normalizer_of
 from ast_sim.models.normalizer import FeatureNormalizer
 from ast_sim.models.simulator import Prediction, Simulator
 from ast_sim.models.world_edges import world_edges
 from ast_sim.ops import EdgeSet, linear, message_edges, mlp, segment_sum
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.toml_settings import LARGEST
+
+Edges = tuple[EdgeSet, Tensor]  # with the features of each edge
 
 SEEN = 0.5  # a contact radius below this share of the mesh spacing joins hardly any nodes
 
@@ -66,16 +69,17 @@ class WorldEdgeSimulator(Simulator):
 
     Nodes have their type, `node_inputs` and the boundary motion. Mesh edges [M, 8] have the differences of the rest
     positions and of the positions, each with its length. World edges [W, 4] have the difference of the positions and
-    its length.
+    its length. If the graph's `own` is a `Hierarchy`, all its meshes have mesh edges.
     """
 
     config: WorldEdgeConfig
 
     def __init__(self, config: WorldEdgeConfig):
         super().__init__(config)
-        self.node_inputs = normalizer_of(config, "node")
-        self.mesh_inputs, self.world_inputs = normalizer_of(config, "edge"), world_normalizer()
-        self._seen: list[tuple[int, int]] = []  # of the observed batches: scenes, world edges
+        self.node_inputs, self.mesh_inputs, self.world_inputs = (
+            normalizer_of(config, what) for what in ("node", "edge", "world_edge")
+        )
+        self._scenes = self._world_edges = 0  # in the observed batches
 
     def encoders(self) -> list[DeepMLP]:
         """New encoders of the nodes, the mesh edges and the world edges."""
@@ -86,47 +90,47 @@ class WorldEdgeSimulator(Simulator):
         """The world edges of a batch."""
         return world_edges(batch, self.config.world_radius, self.config.most_world_edges)
 
+    def contacts(self, batch: Batch) -> list[EdgeSet]:
+        """The world edges of each mesh that has some, the finest first."""
+        return [self.world(batch)]
+
+    def inputs(
+        self, batch: Batch, use: Callable[[FeatureNormalizer, Tensor], Any] = FeatureNormalizer.__call__
+    ) -> tuple[Tensor, list[Edges], list[Edges]]:
+        """The inputs of the nodes, and the mesh edges and world edges of each mesh, the finest first; all normalised,
+        or what `use` makes of them."""
+        graph, now = batch.graph, batch.position
+        meshes = [(graph.m2m, graph.rest_edges, now)] if graph.own is None else graph.own.meshes(now)
+        on_mesh, on_world = [], []
+        for level, (edges, rest, position) in enumerate(meshes):
+            features = edge_features(self.config, edges, rest, position, position)
+            on_mesh.append((edges, use(_of_level(self.mesh_inputs, level), features)))
+        for level, edges in enumerate(self.contacts(batch)):
+            position = meshes[level][2]
+            features = edge_vectors(edges, position, position)
+            on_world.append((edges, use(_of_level(self.world_inputs, level), features)))
+        return use(self.node_inputs, node_features(self.config, batch)), on_mesh, on_world
+
     def observe(self, batch: Batch) -> None:
         """Add the batch to the statistics of the inputs."""
-        self.node_inputs.observe(node_features(self.config, batch))
-        self.mesh_inputs.observe(self.edge_features(batch.graph.m2m, batch.graph.rest_edges, batch.position))
-        world = self.world(batch)
-        self.world_inputs.observe(edge_vectors(world, batch.position, batch.position))
-        self._seen.append((batch.graph.num_scenes, len(world)))
+        _, _, on_world = self.inputs(batch, FeatureNormalizer.observe)
+        self._scenes += batch.graph.num_scenes
+        self._world_edges += len(on_world[0][0])
 
     def remarks(self) -> list[str]:
         """See `Simulator`: how many world edges a scene has."""
-        scenes, edges = (sum(counts) for counts in zip(*self._seen, strict=True)) if self._seen else (0, 0)
-        if not scenes:
-            return []
-        if not edges:
-            return [
-                f"warning: no node has a world edge of at most {self.config.world_radius:.3g} in {scenes} scenes, so"
-                " the model sees no contact: give it a larger model.world_radius"
-            ]
-        return [f"world edges {edges / scenes:.3g} a scene, on average over {scenes} scenes"]
-
-    def edge_features(self, edges: EdgeSet, rest_edges: Tensor, position: Tensor) -> Tensor:
-        """[M, 8]: [dp0, |dp0|, dp, |dp|] from `rest_edges` [M, 4] and `position` [N, 3], d = sender - receiver. With
-        `edge_strain` dp and |dp| are relative to rest."""
-        return beside_rest(rest_edges, edge_vectors(edges, position, position), self.config.edge_strain)
-
-    def nodes(self, batch: Batch) -> Tensor:
-        """Normalised inputs of the nodes, [N, *]."""
-        return self.node_inputs(node_features(self.config, batch))
-
-    def mesh_edges(self, batch: Batch) -> Tensor:
-        """Normalised inputs of the mesh edges, [M, 8]."""
-        return self.mesh_inputs(self.edge_features(batch.graph.m2m, batch.graph.rest_edges, batch.position))
-
-    def world_edges(self, batch: Batch, world: EdgeSet) -> Tensor:
-        """Normalised inputs of the world edges, [W, 4]."""
-        return self.world_inputs(edge_vectors(world, batch.position, batch.position))
+        if self._world_edges:
+            mean = self._world_edges / self._scenes
+            return [f"world edges {mean:.3g} a scene, on average over {self._scenes} scenes"]
+        return [
+            f"warning: no node has a world edge of at most {self.config.world_radius:.3g} in {self._scenes} scenes, so"
+            " the model sees no contact: give it a larger model.world_radius"
+        ]
 
 
-def world_normalizer() -> FeatureNormalizer:
-    """The normalizer of [dp, |dp|]."""
-    return FeatureNormalizer([("vector", 3), ("scalar", 1)])
+def _of_level(normalizers: nn.Module, level: int) -> FeatureNormalizer:
+    """A model has a normalizer for each mesh, or one for all."""
+    return normalizers[level] if isinstance(normalizers, nn.ModuleList) else normalizers
 
 
 class DeepMLP(nn.Module):
@@ -136,15 +140,22 @@ class DeepMLP(nn.Module):
         config: its `hidden` and `hidden_layers`.
         inputs: width of the inputs.
         outputs: of a decoder; None: `hidden` outputs and a LayerNorm.
+        norm: makes the LayerNorm.
     """
 
-    def __init__(self, config: WorldEdgeConfig, inputs: int, outputs: int | None = None):
+    def __init__(
+        self,
+        config: WorldEdgeConfig,
+        inputs: int,
+        outputs: int | None = None,
+        norm: Callable[[int], nn.Module] = nn.LayerNorm,
+    ):
         super().__init__()
         hidden, width = config.hidden, outputs or config.hidden
         self.first = layer(inputs, hidden, factorized=False)
         rest = MLP(hidden, hidden, width, factorized=False)
         self.rest = rest if config.hidden_layers == 2 else layer(hidden, width, factorized=False)
-        self.norm = nn.LayerNorm(width) if outputs is None else None
+        self.norm = norm(width) if outputs is None else None
 
     def forward(self, x: Tensor, residual: Tensor | None = None) -> Tensor:
         """x [*, inputs] -> [*, outputs], plus the residual."""

@@ -102,7 +102,7 @@ def formulas(model, batch):
 )
 def test_it_follows_the_formulas(stress, more):
     model, batch = made(replace(resolved(SMALL, 0.07), stress=stress, **more), 0, 1)
-    assert all(len(level.contacts) > 4 for level in model.levels(batch))
+    assert all(len(contacts) > 4 for contacts in model.contacts(batch))
     assert_follows(model, batch, formulas(model, batch))
 
 
@@ -129,7 +129,7 @@ def test_edges_between_prescribed_nodes_can_be_left_out():
 
 def test_without_world_edges_it_is_the_mesh_alone():
     model, batch = made(replace(resolved(SMALL), world_radius=0.0), 0)
-    assert all(len(level.contacts) == 0 for level in model.levels(batch))
+    assert all(len(contacts) == 0 for contacts in model.contacts(batch))
     out = model(batch).motion
     exact = formulas(model, batch)({k: v.double() for k, v in model.state_dict().items()}, torch.float64).motion
     torch.testing.assert_close(out.double(), exact, rtol=1e-4, atol=1e-5)

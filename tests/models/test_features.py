@@ -8,8 +8,7 @@ from meshes import two_tetrahedra
 from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import Graph
 from ast_sim.models.ast.ast_config import ASTConfig
-from ast_sim.models.ast.element_and_edge_inputs import edge_features, element_features
-from ast_sim.models.node_inputs import node_features, normalizer_of
+from ast_sim.models.node_inputs import edge_features, element_features, node_features, normalizer_of
 from ast_sim.models.normalizer import FeatureNormalizer
 
 
@@ -50,7 +49,8 @@ def test_element_features():
 def test_edge_features(element_nodes, strain):
     config, batch = ASTConfig(edge_strain=strain), batch_of(element_nodes)
     graph, rest, now = batch.graph, batch.graph.rest_position, batch.position
-    found = edge_features(config, batch)
+    senders = graph.element_mean(now) if element_nodes else now
+    found = edge_features(config, graph.edges, graph.rest_edges, senders, now)
     assert found.shape == (len(graph.edges), 8) and normalizer_of(config, "edge").width == 8
     for row, s, r in zip(found, graph.edges.senders.tolist(), graph.edges.receivers.tolist(), strict=True):
         ends = [(x[graph.elements[s]].mean(dim=0) if element_nodes else x[s]) - x[r] for x in (rest, now)]

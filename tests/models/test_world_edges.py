@@ -5,10 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from graph_models import made, resolved
 from meshes import box
 
 from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import Graph
+from ast_sim.models.bsms import BSMSConfig
+from ast_sim.models.hcmt import HCMTConfig
+from ast_sim.models.mgn import MGNConfig
 from ast_sim.models.world_edges import world_edges
 from ast_sim.scene import Scene
 
@@ -93,3 +97,11 @@ def test_a_scene_has_the_same_edges_alone_and_in_a_batch():
     both = replace(one, graph=graph, position=torch.cat([other.position, one.position]))
     alone = {(i + 12, j + 12) for i, j in pairs_of(world_edges(one, 1.3, None))}
     assert {pair for pair in pairs_of(world_edges(both, 1.3, None)) if pair[0] >= 12} == alone
+
+
+@pytest.mark.parametrize("small", [MGNConfig(blocks=1), BSMSConfig(levels=1), HCMTConfig(levels=1)])
+def test_a_model_tells_how_many_a_scene_has_and_warns_of_none(small):
+    model, batch = made(resolved(replace(small, hidden=16)), 0, 1)
+    assert model.remarks() == [f"world edges {len(model.world(batch)) / 2:.3g} a scene, on average over 2 scenes"]
+    blind, _ = made(resolved(replace(small, hidden=16), 0.0), 0)
+    assert blind.remarks()[0].startswith("warning: no node has a world edge of at most 0 in 1 scenes")

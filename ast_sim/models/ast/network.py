@@ -21,12 +21,11 @@ from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import Graph
 from ast_sim.models.ast.ast_config import ASTConfig
 from ast_sim.models.ast.cells import Cells, SparseConv, build_cells, doublings, places
-from ast_sim.models.ast.element_and_edge_inputs import edge_features, element_features
 from ast_sim.models.ast.message_passing import MessagePassing
 from ast_sim.models.ast.position_embedding import PositionEmbedding
 from ast_sim.models.ast.transformer import AttentionBlock, Vectors, rotations
 from ast_sim.models.layers import MLP, Linear
-from ast_sim.models.node_inputs import node_features, normalizer_of
+from ast_sim.models.node_inputs import edge_features, element_features, node_features, normalizer_of
 from ast_sim.models.simulator import Prediction, Simulator
 from ast_sim.ops import farthest_point_sample, segment_mean
 from ast_sim.scene import Scene
@@ -88,10 +87,15 @@ class AST(Simulator):
         """See `Simulator`: how often the domain must double around its centre to hold the positions [N, 3]."""
         return doublings(self.config, position)
 
+    def _edge_features(self, batch: Batch) -> Tensor:
+        graph, now = batch.graph, batch.position
+        senders = graph.element_mean(now) if self.config.element_inputs else now
+        return edge_features(self.config, graph.edges, graph.rest_edges, senders, now)
+
     def observe(self, batch: Batch) -> None:
         """Add the batch to the statistics of the inputs."""
         self.node_inputs.observe(node_features(self.config, batch))
-        self.edge_inputs.observe(edge_features(self.config, batch))
+        self.edge_inputs.observe(self._edge_features(batch))
         if self.config.element_inputs:
             self.element_inputs.observe(element_features(self.config, batch))
 
@@ -99,7 +103,7 @@ class AST(Simulator):
         """Normalised outputs for the frame after `batch`."""
         encoded = self.node_encoder(self.node_inputs(node_features(self.config, batch)))
         elements = None
-        edges, on_edges = batch.graph.edges, self.edge_inputs(edge_features(self.config, batch))
+        edges, on_edges = batch.graph.edges, self.edge_inputs(self._edge_features(batch))
         if self.config.element_inputs:
             elements = self.element_encoder(self.element_inputs(element_features(self.config, batch)))
             mesh = self.e2m(edges, elements, encoded, on_edges)
