@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -83,37 +84,17 @@ class Simulator(nn.Module):
         model. Scenes in different domains are not predicted together."""
         return 0
 
-    def pairs(
-        self,
-        dataset: Dataset,
-        split: str = "train",
-        *,
-        batch_size: int,
-        seed: int = 0,
-        noise: float = 0.0,
-        gamma: float = 1.0,
-        mirror: tuple[str, ...] = (),
-        shift: float = 0.0,
-        part: tuple[int, int] = (0, 1),
-    ) -> PairSampler:
-        """The frame pairs of a split in batches that fit this model; see `PairSampler` for the arguments.
+    def pairs(self, dataset: Dataset, split: str = "train", *, batch_size: int, **options: Any) -> PairSampler:
+        """The frame pairs of a split in batches that fit this model.
 
         batch, target = model.pairs(dataset, batch_size=4).batch(step)
+
+        Args:
+            options: seed (0 by default), noise (0), gamma (1), mirror, shift and part, as of `PairSampler`.
         """
-        return PairSampler(
-            dataset,
-            split,
-            batch_size=batch_size,
-            seed=seed,
-            noise=noise,
-            make_graph=self.graph,
-            dynamic=self.config.dynamic,
-            gamma=gamma,
-            part=part,
-            jumps=self.config.jumps,
-            mirror=mirror,
-            shift=shift,
-        )
+        options = {"seed": 0, "noise": 0.0, "gamma": 1.0, **options, "batch_size": batch_size}
+        of_model = {"make_graph": self.graph, "dynamic": self.config.dynamic, "jumps": self.config.jumps}
+        return PairSampler(dataset, split, **of_model, **options)
 
     def _stressed(self, batch: Batch) -> Tensor:
         """[*] int64: the nodes or elements that deform. Only their stress counts."""
@@ -183,14 +164,12 @@ class Simulator(nn.Module):
     def predicting(self) -> Iterator[None]:
         """Predict in here: without gradients and dropout. Afterwards the module trains again if it did."""
         training = self.training
-        if training:
-            self.eval()
+        self.eval()
         try:
             with torch.inference_mode():
                 yield
         finally:
-            if training:
-                self.train()
+            self.train(training)
 
     @torch.inference_mode()
     def predict(self, batch: Batch) -> Prediction:

@@ -19,9 +19,8 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.models.ast.ast_config import ASTConfig
 from ast_sim.models.ast.cells import build_cells, places
 from ast_sim.models.ast.message_passing import MessagePassing
-from ast_sim.models.ast.position_embedding import PositionEmbedding
 from ast_sim.models.ast.presets import PRESETS
-from ast_sim.models.ast.transformer import AttentionBlock, Vectors, rotated, rotations
+from ast_sim.models.ast.transformer import AttentionBlock, PositionEmbedding, Vectors, rotated, rotations
 from ast_sim.models.layers import FactorizedLinear
 from ast_sim.models.model_config import DataFacts
 from ast_sim.models.normalizer import Normalizer
@@ -196,7 +195,7 @@ def test_message_passing_is_the_formula():
     edges = EdgeSet.from_pairs(senders, receivers, 9, 7)
     v_s, v_r, raw = torch.randn(9, 16).double(), torch.randn(7, 16).double(), torch.randn(40, 8).double()
     for residual in (False, True):
-        step = MessagePassing(16, 8, residual, factorized=True).double()
+        step = MessagePassing(ASTConfig(hidden=16), 8, residual).double()
         for p in step.parameters():
             torch.nn.init.normal_(p)
         e = step.edge_encoder(raw)
@@ -204,7 +203,7 @@ def test_message_passing_is_the_formula():
         total = torch.zeros(7, 16).double().index_add_(0, edges.receivers, message)
         expected = step.norm_v(step.f_v(torch.cat([v_r, total], dim=1))) + (v_r if residual else 0)
         torch.testing.assert_close(step(edges, v_s, v_r, raw), expected, rtol=1e-10, atol=1e-10)
-    free = MessagePassing(16, 0, False, factorized=False).double()
+    free = MessagePassing(ASTConfig(hidden=16, factorized=False), 0, False).double()
     message = free.norm_e(free.f_e(torch.cat([v_s[edges.senders], v_r[edges.receivers]], dim=1)))
     total = torch.zeros(7, 16).double().index_add_(0, edges.receivers, message)
     torch.testing.assert_close(free(edges, v_s, v_r), free.norm_v(free.f_v(torch.cat([v_r, total], dim=1))))

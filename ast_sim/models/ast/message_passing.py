@@ -13,6 +13,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from ast_sim.models.ast.ast_config import ASTConfig
 from ast_sim.models.layers import MLP
 from ast_sim.ops import EdgeSet, linear, message_sum
 
@@ -21,20 +22,19 @@ class MessagePassing(nn.Module):
     """Messages from senders to receivers, both of width `hidden`.
 
     Args:
-        hidden: width of the features.
+        config: its `hidden` and `factorized`.
         edge_inputs: width of the raw edge features, encoded by an MLP of their own; 0 for the edge-free form.
         residual: whether the receivers are added to the result.
-        factorized: whether the MLPs have random weight factorization.
     """
 
-    def __init__(self, hidden: int, edge_inputs: int, residual: bool, factorized: bool):
+    def __init__(self, config: ASTConfig, edge_inputs: int, residual: bool):
         super().__init__()
+        hidden, factorized = config.hidden, config.factorized
         self.hidden, self.residual = hidden, residual
         self.edge_encoder = MLP(edge_inputs, hidden, hidden, factorized) if edge_inputs else None
         self.f_e = MLP((3 if edge_inputs else 2) * hidden, hidden, hidden, factorized)
         self.f_v = MLP(2 * hidden, hidden, hidden, factorized)
-        self.norm_e = nn.LayerNorm(hidden)
-        self.norm_v = nn.LayerNorm(hidden)
+        self.norm_e, self.norm_v = nn.LayerNorm(hidden), nn.LayerNorm(hidden)
 
     def forward(
         self, edges: EdgeSet, senders: Tensor, receivers: Tensor, edge_features: Tensor | None = None

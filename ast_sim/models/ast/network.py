@@ -13,8 +13,6 @@ Legend: N nodes, E elements, C cells, T tokens.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from torch import Tensor, nn
 
 from ast_sim.batches.batch_builder import Batch
@@ -22,8 +20,7 @@ from ast_sim.batches.graph import Graph
 from ast_sim.models.ast.ast_config import ASTConfig
 from ast_sim.models.ast.cells import Cells, SparseConv, build_cells, doublings, places
 from ast_sim.models.ast.message_passing import MessagePassing
-from ast_sim.models.ast.position_embedding import PositionEmbedding
-from ast_sim.models.ast.transformer import AttentionBlock, Vectors, rotations
+from ast_sim.models.ast.transformer import AttentionBlock, PositionEmbedding, Vectors, rotations
 from ast_sim.models.layers import MLP, Linear
 from ast_sim.models.node_inputs import edge_features, element_features, node_features, normalizer_of
 from ast_sim.models.simulator import Prediction, Simulator
@@ -55,7 +52,7 @@ class AST(Simulator):
         if c.places == "absolute":
             self.position_embedding = PositionEmbedding(c.d_token, c.L_cell - c.l_ocnn)
         self.to_tokens = AttentionBlock(c, c.d_token, c.d_token)
-        self.processor = nn.ModuleList(AttentionBlock(c, c.d_token) for _ in range(c.L_SA))
+        self.processor = nn.Sequential(*(AttentionBlock(c, c.d_token) for _ in range(c.L_SA)))
         if c.exchanges:
             self.to_nodes = nn.ModuleList(AttentionBlock(c, width, c.d_token) for _ in range(c.exchanges))
             self.from_nodes = nn.ModuleList(AttentionBlock(c, c.d_token, width) for _ in range(c.exchanges - 1))
@@ -70,13 +67,11 @@ class AST(Simulator):
             self.element_decoder = MLP(width, c.decoder_hidden, 1, c.factorized)
 
     def _message_passing(self, name: str, edge_inputs: int = 0) -> MessagePassing:
-        return MessagePassing(self.config.hidden, edge_inputs, name in self.config.residual, self.config.factorized)
+        return MessagePassing(self.config, edge_inputs, name in self.config.residual)
 
     def _mesh_steps(self) -> nn.ModuleList:
-        c = self.config
-        return nn.ModuleList(
-            MessagePassing(c.hidden, self.edge_inputs.width, True, c.factorized) for _ in range(c.mesh_steps)
-        )
+        steps = (MessagePassing(self.config, self.edge_inputs.width, True) for _ in range(self.config.mesh_steps))
+        return nn.ModuleList(steps)
 
     def graph(self, scene: Scene) -> Graph:
         """See `Simulator`. With element inputs, elements are nodes of the graph too."""
@@ -120,7 +115,7 @@ class AST(Simulator):
             nodes = Vectors(mesh, batch.graph.node_offsets, rotations(places(self.config, now), self.config.head_dim))
             mesh = self._exchange(nodes, tokens)
         else:
-            mesh = self._back_to_mesh(cells, self.to_cells(coarse, self._process(tokens, self.processor)).x, mesh)
+            mesh = self._back_to_mesh(cells, self.to_cells(coarse, self.processor(tokens)).x, mesh)
         for step in self.after_cells:
             mesh = step(edges, mesh, mesh, on_edges)
 
@@ -147,18 +142,13 @@ class AST(Simulator):
         turned = None if coarse.rotations is None else coarse.rotations.index_select(0, chosen)
         return self.to_tokens(Vectors(coarse.x.index_select(0, chosen), offsets, turned), coarse)
 
-    def _process(self, tokens: Vectors, blocks: Sequence[AttentionBlock]) -> Vectors:
-        for block in blocks:
-            tokens = block(tokens)
-        return tokens
-
     def _exchange(self, nodes: Vectors, tokens: Vectors) -> Tensor:
         """Nodes and tokens attend to each other in turn -> mesh features [N, hidden]."""
         blocks, times = len(self.processor), len(self.to_nodes)
         for i, to_nodes in enumerate(self.to_nodes):
             if i:
                 tokens = self.from_nodes[i - 1](tokens, nodes)
-            tokens = self._process(tokens, self.processor[blocks * i // times : blocks * (i + 1) // times])
+            tokens = self.processor[blocks * i // times : blocks * (i + 1) // times](tokens)
             nodes = to_nodes(nodes, tokens)
         return nodes.x
 

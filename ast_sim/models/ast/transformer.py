@@ -1,6 +1,6 @@
 """Position embedding, and attention blocks on cells, tokens and nodes (paper, section Transformer).
 
-Legend: T vectors (cells, tokens or nodes), B scenes, H heads of width D.
+Legend: T vectors (cells, tokens or nodes), C cells, B scenes, H heads of width D.
 """
 
 from __future__ import annotations
@@ -31,6 +31,24 @@ class Vectors:
     x: Tensor
     offsets: Tensor
     rotations: Tensor | None = None
+
+
+class PositionEmbedding(nn.Module):
+    """c + Linear([x, sin(2^j pi x), cos(2^j pi x)]) per axis, j = 0..7 (paper, section Overall Architecture).
+
+    At the centres of cells of level L the waves with j >= L are constant, so they are left out.
+    """
+
+    def __init__(self, width: int, level: int):
+        super().__init__()
+        self.register_buffer("frequency", math.pi * 2.0 ** torch.arange(min(8, level)), persistent=False)
+        self.project = Linear(3 * (1 + 2 * min(8, level)), width)
+
+    def forward(self, features: Tensor, centers: Tensor) -> Tensor:
+        """features [C, width], centers [C, 3] in units of the half width of the domain -> [C, width]."""
+        phase = (centers[:, :, None] * self.frequency).flatten(1)
+        waves = torch.cat([centers, phase.sin(), phase.cos()], dim=1)
+        return self.project(waves, residual=features)
 
 
 def rotations(places: Tensor, head_dim: int) -> Tensor:
