@@ -5,25 +5,21 @@ from __future__ import annotations
 import os
 import platform
 import subprocess
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+
+_PACKAGES = ("ast_sim", "torch", "numpy")
 
 
 def provenance(command: str) -> dict[str, Any]:
     """The command, the commit, the processor, the number of cores and the versions: what to keep beside figures."""
-    versions: dict[str, str | None] = {"python": platform.python_version()}
-    for package in ("ast_sim", "torch", "numpy"):
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            versions[package] = None
     return {
         "command": command,
         "commit": _commit(),
         "processor": processor(),
         "cores": os.cpu_count(),
-        "versions": versions,
+        "versions": {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}},
     }
 
 

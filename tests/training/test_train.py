@@ -26,7 +26,7 @@ from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.scene import NodeType
 from ast_sim.support.errors import CheckpointError, ConfigError, DatasetError, TrainingError
 from ast_sim.support.progress import Clock, duration
-from ast_sim.support.toml_settings import override
+from ast_sim.support.toml_settings import assigned, change
 from ast_sim.training import loop, start
 from ast_sim.training.data_lengths import DataScales, measure
 from ast_sim.training.defaults_from_data import resolve, resolve_training
@@ -51,7 +51,7 @@ def settings(data, *assignments: str) -> RunConfig:
     options = TrainConfig(steps=20, batch_size=2, peak_rate=1e-2, validate_every=10, checkpoint_every=5, log_every=4)
     with Dataset(data) as dataset:
         config = RunConfig(toy.config(dataset.info), options, str(data))
-    return override(config, list(assignments))
+    return change(config, assigned(config, assignments))
 
 
 def weights(folder) -> dict[str, torch.Tensor]:
