@@ -63,7 +63,7 @@ class Block(nn.Module):
 
     def __init__(self, config: BSMSConfig):
         super().__init__()
-        self.mesh, self.contact = (
+        self.mesh, self.contact = (  # `mlp`: its name in saved runs
             nn.ModuleDict({"mlp": DeepMLP(config, edge_inputs + 2 * config.hidden, norm=PlainNorm)})
             for edge_inputs in (8, 4)
         )

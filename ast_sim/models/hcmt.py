@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import Graph
 from ast_sim.models.bistride import build_hierarchy, subset
-from ast_sim.models.layers import Linear
+from ast_sim.models.layers import layer
 from ast_sim.models.model_config import PAPER_TRAINING, WIDEST, Preset, setting, tiny
 from ast_sim.models.registry import Model
 from ast_sim.models.simulator import Prediction
@@ -62,10 +62,10 @@ class Block(nn.Module):
         self.head_width = width // config.heads
         self.norm = nn.LayerNorm(width)
         self.edge_norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(edge_sets))
-        self.q, self.k, self.v, self.p, self.g = (_layer(width, width) for _ in range(5))
-        self.out = _layer(edge_sets * width, width)
+        self.q, self.k, self.v, self.p, self.g = (layer(width, width, bias=False) for _ in range(5))
+        self.out = layer(edge_sets * width, width, bias=False)
         self.forward_norm = nn.LayerNorm(width)
-        self.feed_forward = nn.ModuleList(_layer(width, width) for _ in range(3))
+        self.feed_forward = nn.ModuleList(layer(width, width, bias=False) for _ in range(3))
 
     def forward(self, x: Tensor, *edge_sets: Edges) -> Tensor:
         """x [N, hidden] and the edges of each set with their features [M, hidden] -> [N, hidden]."""
@@ -77,12 +77,6 @@ class Block(nn.Module):
         x = self.out(torch.cat(found, dim=1), residual=x)
         first, second, last = self.feed_forward
         return last(second(first(self.forward_norm(x), "relu"), "relu"), residual=x)
-
-
-def _layer(inputs: int, outputs: int) -> Linear:
-    layer = Linear(inputs, outputs, bias=False)
-    nn.init.xavier_uniform_(layer.weight)
-    return layer
 
 
 class HCMT(WorldEdgeSimulator):

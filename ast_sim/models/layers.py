@@ -36,20 +36,21 @@ class FactorizedLinear(nn.Module):
         return self.g[:, None] * self.V
 
 
-def layer(inputs: int, outputs: int, factorized: bool) -> nn.Module:
-    """A layer of an MLP, factorized or plain. Both start with W = Glorot uniform and b = 0."""
+def layer(inputs: int, outputs: int, factorized: bool = False, bias: bool = True) -> nn.Module:
+    """A layer, factorized or plain. Both start with W = Glorot uniform and b = 0."""
     if factorized:
         return FactorizedLinear(inputs, outputs)
-    plain = nn.Linear(inputs, outputs)
+    plain = Linear(inputs, outputs, bias)
     nn.init.xavier_uniform_(plain.weight)
-    nn.init.zeros_(plain.bias)
+    if bias:
+        nn.init.zeros_(plain.bias)
     return plain
 
 
 class MLP(nn.Module):
     """Linear, ReLU, Linear."""
 
-    def __init__(self, inputs: int, hidden: int, outputs: int, factorized: bool):
+    def __init__(self, inputs: int, hidden: int, outputs: int, factorized: bool = False):
         super().__init__()
         self.first = layer(inputs, hidden, factorized)
         self.second = layer(hidden, outputs, factorized)

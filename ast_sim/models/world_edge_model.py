@@ -152,9 +152,9 @@ class DeepMLP(nn.Module):
     ):
         super().__init__()
         hidden, width = config.hidden, outputs or config.hidden
-        self.first = layer(inputs, hidden, factorized=False)
-        rest = MLP(hidden, hidden, width, factorized=False)
-        self.rest = rest if config.hidden_layers == 2 else layer(hidden, width, factorized=False)
+        self.first = layer(inputs, hidden)
+        rest = MLP(hidden, hidden, width)
+        self.rest = rest if config.hidden_layers == 2 else layer(hidden, width)
         self.norm = norm(width) if outputs is None else None
 
     def forward(self, x: Tensor, residual: Tensor | None = None) -> Tensor:
