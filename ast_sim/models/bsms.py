@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import Graph
 from ast_sim.models.bistride import build_hierarchy, subset
-from ast_sim.models.model_config import PAPER_TRAINING, WIDEST, Preset, setting, tiny
+from ast_sim.models.model_config import PAPER_TRAINING, Preset, count, setting, tiny
 from ast_sim.models.node_inputs import normalizer_of
 from ast_sim.models.registry import Model
 from ast_sim.models.simulator import Prediction
@@ -39,14 +39,10 @@ class BSMSConfig(WorldEdgeConfig):
     """The settings of BSMS-GNN."""
 
     name: Literal["bsms"] = setting("bsms", "BSMS-GNN")
-    levels: int = setting(6, "coarser meshes below the finest one")
+    levels: int = count(6, "coarser meshes below the finest one")
     repeat_ends: bool = setting(False, "apply the blocks of the finest and of the coarsest mesh twice")
     contacts: Literal["all", "components"] = setting("all", "world edges: all, or only between components of the mesh")
     prescribed_edges: bool = setting(True, "keep mesh edges between two prescribed nodes")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_range(1, WIDEST, "levels")
 
 
 class PlainNorm(nn.Module):

@@ -28,7 +28,7 @@ from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import Graph
 from ast_sim.models.bistride import build_hierarchy, subset
 from ast_sim.models.layers import layer
-from ast_sim.models.model_config import PAPER_TRAINING, WIDEST, Preset, setting, tiny
+from ast_sim.models.model_config import PAPER_TRAINING, Preset, count, setting, tiny
 from ast_sim.models.registry import Model
 from ast_sim.models.simulator import Prediction
 from ast_sim.models.world_edge_model import Decoder, Edges, WorldEdgeConfig, WorldEdgeSimulator
@@ -41,15 +41,13 @@ class HCMTConfig(WorldEdgeConfig):
     """The settings of HCMT."""
 
     name: Literal["hcmt"] = setting("hcmt", "Hierarchical Contact Mesh Transformer")
-    heads: int = setting(4, "attention heads: scores are divided by the square root of a head's width")
-    contact_blocks: int = setting(2, "blocks on the finest mesh and its contacts, before the hierarchy")
-    levels: int = setting(6, "coarser meshes below the finest one")
+    heads: int = count(4, "attention heads: scores are divided by the square root of a head's width")
+    contact_blocks: int = count(2, "blocks on the finest mesh and its contacts, before the hierarchy", least=0)
+    levels: int = count(6, "coarser meshes below the finest one")
     contacts: Literal["all", "obstacles"] = setting("all", "world edges: all, or only obstacles to moving nodes")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_range(1, WIDEST, "levels", "heads")
-        self.check_range(0, WIDEST, "contact_blocks")
         self.check_heads()
 
 

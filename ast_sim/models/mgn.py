@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from ast_sim.batches.batch_builder import Batch
-from ast_sim.models.model_config import PAPER_TRAINING, WIDEST, Preset, setting, tiny
+from ast_sim.models.model_config import PAPER_TRAINING, Preset, count, setting, tiny
 from ast_sim.models.registry import Model
 from ast_sim.models.simulator import Prediction
 from ast_sim.models.world_edge_model import Decoder, DeepMLP, Edges, WorldEdgeConfig, WorldEdgeSimulator, messages
@@ -30,11 +30,7 @@ class MGNConfig(WorldEdgeConfig):
     """The settings of MeshGraphNets."""
 
     name: Literal["mgn"] = setting("mgn", "MeshGraphNets")
-    blocks: int = setting(15, "message-passing blocks, each with its own weights")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_range(1, WIDEST, "blocks")
+    blocks: int = count(15, "message-passing blocks, each with its own weights")
 
 
 class EdgeUpdate(nn.Module):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, Self
 
 from ast_sim.dataset.layout import GIVEN_FRAMES, DatasetInfo
@@ -15,9 +15,15 @@ WIDEST = 1 << 16  # the largest width or count of a layer
 NODE_INPUTS = "node features, of displacement, velocity, material, proximity and out_of_balance (elastic forces)"
 
 
-def setting(default: Any, text: str) -> Any:
-    """A field of a settings class. `ast-sim train --help` shows its text."""
-    return field(default=default, metadata={"help": text})
+def setting(default: Any, text: str, least: float | None = None, most: float = LARGEST) -> Any:
+    """A field of a settings class. `ast-sim train --help` shows its text. With `least`, a model refuses numbers below
+    it and above `most`."""
+    return field(default=default, metadata={"help": text, "limits": None if least is None else (least, most)})
+
+
+def count(default: int | None, text: str, least: int = 1) -> Any:
+    """A `setting` that counts something, such as blocks or the width of a layer."""
+    return setting(default, text, least, WIDEST)
 
 
 @dataclass(frozen=True)
@@ -51,7 +57,7 @@ class ModelConfig:
     name: str = setting("", "which model")
     node_inputs: tuple[str, ...] | None = setting(None, f"{NODE_INPUTS}; unset: chosen from the data")
     proximity_radius: float | None = setting(
-        None, "with proximity: distance within which a node sees another body; unset: 1.5 mesh spacings"
+        None, "with proximity: distance within which a node sees another body; unset: 1.5 mesh spacings", least=0
     )
     boundary_motion: bool = setting(True, "give each prescribed node its next increment as an input; off with jumps")
     jumps: bool | None = setting(
@@ -77,7 +83,9 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         self.check_inputs("node_inputs", ("displacement", "velocity", "material", "proximity", "out_of_balance"))
-        self.check_range(0, LARGEST, "proximity_radius")
+        for item in fields(self):
+            if limits := item.metadata.get("limits"):
+                require_range(f"model.{item.name}", getattr(self, item.name), *limits)
 
     def check_inputs(self, key: str, known: tuple[str, ...]) -> None:
         """Raise ConfigError if a name in the setting `key` is not one of `known`."""
@@ -92,11 +100,6 @@ class ModelConfig:
             raise ConfigError(f"model.{key}: material is an input, but the dataset has no material")
         if "velocity" in inputs and self.integration != "dynamic":
             raise ConfigError(f"model.{key}: velocity is an input of dynamic scenes only")
-
-    def check_range(self, least: float, most: float, *keys: str) -> None:
-        """Raise ConfigError if one of these settings is set and below `least` or above `most`."""
-        for key in keys:
-            require_range(f"model.{key}", getattr(self, key), least, most)
 
     def check_heads(self) -> None:
         """Raise ConfigError unless the width is a multiple of the number of heads."""

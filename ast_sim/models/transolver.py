@@ -26,7 +26,7 @@ from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import Graph
 from ast_sim.models import node_inputs
 from ast_sim.models.layers import Linear
-from ast_sim.models.model_config import WIDEST, Preset, ProximityConfig, setting, tiny
+from ast_sim.models.model_config import Preset, ProximityConfig, count, setting, tiny
 from ast_sim.models.normalizer import FeatureNormalizer
 from ast_sim.models.registry import Model
 from ast_sim.models.simulator import Prediction, Simulator
@@ -40,15 +40,14 @@ class TransolverConfig(ProximityConfig):
     """The settings of Transolver."""
 
     name: Literal["transolver"] = setting("transolver", "Transolver: attention between learned slices")
-    hidden: int = setting(128, "width of node features, a multiple of the number of heads")
-    blocks: int = setting(8, "blocks of Physics-Attention and MLP")
-    heads: int = setting(8, "attention heads")
-    slices: int = setting(64, "slices over which each head spreads a scene")
-    mlp_ratio: int = setting(1, "hidden units of the MLP of each block, as a multiple of `hidden`")
+    hidden: int = count(128, "width of node features, a multiple of the number of heads")
+    blocks: int = count(8, "blocks of Physics-Attention and MLP")
+    heads: int = count(8, "attention heads")
+    slices: int = count(64, "slices over which each head spreads a scene")
+    mlp_ratio: int = count(1, "hidden units of the MLP of each block, as a multiple of `hidden`")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_range(1, WIDEST, "hidden", "blocks", "heads", "slices", "mlp_ratio")
         self.check_heads()
 
 

@@ -15,14 +15,12 @@ from torch import Tensor, nn
 from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import edge_vectors
 from ast_sim.models.layers import MLP, layer
-from ast_sim.models.model_config import WIDEST, DataFacts, ModelConfig, setting
+from ast_sim.models.model_config import DataFacts, ModelConfig, count, setting
 from ast_sim.models.node_inputs import edge_features, node_features, normalizer_of
 from ast_sim.models.normalizer import FeatureNormalizer
 from ast_sim.models.simulator import Prediction, Simulator
 from ast_sim.models.world_edges import world_edges
 from ast_sim.ops import EdgeSet, linear, message_edges, mlp, segment_sum
-from ast_sim.support.errors import ConfigError
-from ast_sim.support.toml_settings import LARGEST
 
 Edges = tuple[EdgeSet, Tensor]  # with the features of each edge
 
@@ -33,22 +31,16 @@ SEEN = 0.5  # a contact radius below this share of the mesh spacing joins hardly
 class WorldEdgeConfig(ModelConfig):
     """Settings of a model with world edges."""
 
-    hidden: int = setting(128, "width of node and edge features")
-    hidden_layers: int = setting(2, "hidden layers of each MLP: 1 or 2; with 1 message passing is one fused op")
+    hidden: int = count(128, "width of node and edge features")
+    hidden_layers: int = setting(2, "hidden layers of each MLP: 1 or 2; with 1 message passing is one fused op", 1, 2)
     edge_strain: bool = setting(False, "mesh edges have dp - dp0 and |dp| - |dp0| as inputs, not dp and |dp|")
     world_radius: float | None = setting(
         None,
         "largest length of a world edge; unset: the dataset's contact radius, or the mesh spacing if that radius is"
         " below half of it, since edges so short would join no nodes",
+        least=0,
     )
-    most_world_edges: int | None = setting(None, "join at most this many pairs of a scene, the shortest; unset: all")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_range(1, WIDEST, "hidden")
-        self.check_range(0, LARGEST, "world_radius", "most_world_edges")
-        if self.hidden_layers not in (1, 2):
-            raise ConfigError(f"model.hidden_layers is {self.hidden_layers}; it must be 1 or 2")
+    most_world_edges: int | None = setting(None, "join at most this many pairs of a scene, the shortest; unset: all", 0)
 
     def resolve(self, facts: DataFacts) -> Self:
         """See `ModelConfig`."""

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal, Self
 
-from ast_sim.models.model_config import NODE_INPUTS, WIDEST, DataFacts, ProximityConfig, setting
+from ast_sim.models.model_config import NODE_INPUTS, DataFacts, ProximityConfig, count, setting
 from ast_sim.support.errors import ConfigError
 
 
@@ -16,27 +16,28 @@ class ASTConfig(ProximityConfig):
 
     name: Literal["ast"] = setting("ast", "Adaptive Spatial Tokenization")
     node_inputs: tuple[str, ...] | None = setting(("displacement",), f"{NODE_INPUTS}; unset: chosen from the data")
-    hidden: int = setting(128, "width of node, edge and cell features")
-    decoder_hidden: int = setting(32, "hidden width of the output MLPs")
-    d_token: int = setting(256, "width of a token")
-    heads: int = setting(8, "attention heads")
+    hidden: int = count(128, "width of node, edge and cell features")
+    decoder_hidden: int = count(32, "hidden width of the output MLPs")
+    d_token: int = count(256, "width of a token")
+    heads: int = count(8, "attention heads")
     head_dim: int = setting(64, "width of a head: a multiple of 16 up to 128")
-    ffn_inner: int = setting(512, "width of the feed-forward network after gating")
-    L_SA: int = setting(12, "self-attention blocks on the tokens")
-    num_tokens: int = setting(512, "most tokens of a scene; with fewer cells, every cell becomes a token")
-    dropout: float = setting(0.1, "dropout on attention weights and feed-forward outputs")
-    mesh_steps: int = setting(0, "additional message passing steps on the mesh, before the cells and again after them")
+    ffn_inner: int = count(512, "width of the feed-forward network after gating")
+    L_SA: int = count(12, "self-attention blocks on the tokens", least=0)
+    num_tokens: int = count(512, "most tokens of a scene; with fewer cells, every cell becomes a token")
+    dropout: float = setting(0.1, "dropout on attention weights and feed-forward outputs", 0, 0.99)
+    mesh_steps: int = count(0, "additional message passing steps on the mesh, before the cells and again after them", 0)
     L_cell: int | None = setting(5, "octree level of the cells; unset: chosen by `cell_spacings`")
-    cell_spacings: float = setting(1.5, "approximate side of a cell, in mesh spacings, if L_cell is unset")
+    cell_spacings: float = setting(1.5, "approximate side of a cell, in mesh spacings, if L_cell is unset", 0.01, 1e6)
     places: Literal["absolute", "relative"] | None = setting(
         "absolute",
         "what attention knows: the position of each cell (absolute), or the offset between two (relative);"
         " unset: relative in quasi-static scenes, absolute in dynamic ones",
     )
-    exchanges: int | None = setting(
+    exchanges: int | None = count(
         0,
         "how often nodes and tokens attend to each other, between the L_SA blocks; 0: nodes get messages from cells"
         " (C2M); unset: 2 with relative places in quasi-static scenes, else 0",
+        least=0,
     )
     l_ocnn: int = setting(0, "levels by which sparse convolutions coarsen the cells before they become tokens")
     element_inputs: tuple[str, ...] | None = setting(
@@ -52,11 +53,6 @@ class ASTConfig(ProximityConfig):
         super().__post_init__()
         self.check_inputs("element_inputs", ("displacement", "velocity", "material", "stress"))
         self.check_inputs("residual", ("m2m", "e2m", "m2c", "c2m", "m2e"))
-        widths = ("hidden", "decoder_hidden", "d_token", "heads", "ffn_inner", "num_tokens")
-        self.check_range(1, WIDEST, *widths)
-        self.check_range(0, WIDEST, "L_SA", "mesh_steps", "exchanges")
-        self.check_range(0, 0.99, "dropout")
-        self.check_range(0.01, 1e6, "cell_spacings")
         if self.mesh_steps and self.element_inputs:
             raise ConfigError("model.mesh_steps must be 0 with element_inputs: then no edge joins two nodes")
         if self.exchanges and self.places == "absolute":
