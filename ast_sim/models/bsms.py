@@ -108,7 +108,7 @@ class BSMS(WorldEdgeSimulator):
 
     def forward(self, batch: Batch) -> Prediction:
         """Normalised outputs for the frame after `batch`."""
-        nodes, *edges = self.inputs(batch)
+        nodes, *edges = self.inputs_of(batch)
         levels, poolings = list(zip(*edges, strict=True)), batch.graph.own.poolings
         x, skipped = self.node_encoder(nodes), []
         for i, block in enumerate(self.down):

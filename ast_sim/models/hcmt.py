@@ -107,7 +107,7 @@ class HCMT(WorldEdgeSimulator):
 
     def forward(self, batch: Batch) -> Prediction:
         """Normalised outputs for the frame after `batch`."""
-        nodes, on_mesh, [(world, on_world)] = self.inputs(batch)
+        nodes, on_mesh, [(world, on_world)] = self.inputs_of(batch)
         meshes = [(edges, self.mesh_encoder(features)) for edges, features in on_mesh]
         kept = [pooling.kept for pooling in batch.graph.own.poolings]
         contacts = (world, self.world_encoder(on_world))

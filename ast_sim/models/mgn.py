@@ -74,7 +74,7 @@ class MGN(WorldEdgeSimulator):
 
     def forward(self, batch: Batch) -> Prediction:
         """Normalised outputs for the frame after `batch`."""
-        nodes, [(mesh, on_mesh)], [(world, on_world)] = self.inputs(batch)
+        nodes, [(mesh, on_mesh)], [(world, on_world)] = self.inputs_of(batch)
         nodes, on_mesh, on_world = self.node_encoder(nodes), self.mesh_encoder(on_mesh), self.world_encoder(on_world)
         for block in self.blocks:
             nodes, on_mesh, on_world = block(nodes, (mesh, on_mesh), (world, on_world))

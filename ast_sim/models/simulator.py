@@ -19,6 +19,8 @@ from ast_sim.models.normalizer import Normalizer
 from ast_sim.scene import Scene
 from ast_sim.support.errors import ConfigError
 
+Use = Callable[[Normalizer, Tensor], Any]  # what becomes of the values of an input: normalised, or observed
+
 _CPU_ONLY = "models run on the CPU only"
 
 
@@ -43,8 +45,8 @@ class Prediction:
 class Simulator(nn.Module):
     """Base class of the models. They run on the CPU and refuse any other device.
 
-    A model implements `forward`, which returns normalised outputs, and `observe`, which collects the statistics of its
-    inputs. It overrides `graph` and `domain` if they do not fit.
+    A model implements `forward`, which returns normalised outputs, and `inputs_of`, which gives the inputs of its
+    network, or overrides `observe` instead. It overrides `graph` and `domain` if they do not fit.
     """
 
     def __init__(self, config: ModelConfig):
@@ -68,8 +70,13 @@ class Simulator(nn.Module):
     def forward(self, batch: Batch) -> Prediction:
         raise NotImplementedError
 
-    def observe(self, batch: Batch) -> None:
+    def inputs_of(self, batch: Batch, use: Use = Normalizer.__call__) -> Any:
+        """All inputs of the network, normalised, or what `use` makes of a normalizer and the values that it is for."""
         raise NotImplementedError
+
+    def observe(self, batch: Batch) -> None:
+        """Add the batch to the statistics of the inputs."""
+        self.inputs_of(batch, Normalizer.observe)
 
     def graph(self, scene: Scene) -> Graph:
         """What the model needs to know of a scene that does not change with time."""

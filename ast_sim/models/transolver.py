@@ -24,12 +24,12 @@ from torch import Tensor, nn
 
 from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import Graph
-from ast_sim.models import node_inputs
 from ast_sim.models.layers import Linear
 from ast_sim.models.model_config import Preset, ProximityConfig, count, setting, tiny
-from ast_sim.models.normalizer import FeatureNormalizer
+from ast_sim.models.node_inputs import node_features, normalizer_of
+from ast_sim.models.normalizer import FeatureNormalizer, Normalizer
 from ast_sim.models.registry import Model
-from ast_sim.models.simulator import Prediction, Simulator
+from ast_sim.models.simulator import Prediction, Simulator, Use
 from ast_sim.scene import Scene
 
 EPSILON = 1e-5  # added to the weight of a slice, so that an empty one is 0
@@ -139,7 +139,7 @@ class Transolver(Simulator):
 
     def __init__(self, config: TransolverConfig):
         super().__init__(config)
-        self.node_inputs = node_inputs.normalizer_of(config, "node")
+        self.node_inputs = normalizer_of(config, "node")
         self.positions = FeatureNormalizer([("vector", 3), ("vector", 3)])
         self.encoder = MLP(self.node_inputs.width + self.positions.width, 2 * config.hidden, config.hidden)
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.blocks))
@@ -157,20 +157,15 @@ class Transolver(Simulator):
         """See `Simulator`. It has no edges."""
         return replace(super().graph(scene), m2m=None, rest_edges=torch.empty(0, 4))
 
-    def _positions(self, batch: Batch) -> Tensor:
-        """[N, 6]: positions at rest and now, relative to the centre of the domain."""
+    def inputs_of(self, batch: Batch, use: Use = Normalizer.__call__) -> tuple[Tensor, Tensor]:
+        """See `Simulator`: of the nodes, and their positions at rest and now from the centre of the domain, [N, 6]."""
         center = torch.tensor(self.config.domain_center * 2)
-        return torch.cat([batch.graph.rest_position, batch.position], dim=1) - center
-
-    def observe(self, batch: Batch) -> None:
-        """Add the batch to the statistics of the inputs."""
-        self.node_inputs.observe(node_inputs.node_features(self.config, batch))
-        self.positions.observe(self._positions(batch))
+        positions = torch.cat([batch.graph.rest_position, batch.position], dim=1) - center
+        return use(self.node_inputs, node_features(self.config, batch)), use(self.positions, positions)
 
     def forward(self, batch: Batch) -> Prediction:
         """Normalised outputs for the frame after `batch`."""
-        inputs = self.node_inputs(node_inputs.node_features(self.config, batch))
-        x = self.encoder(torch.cat([inputs, self.positions(self._positions(batch))], dim=1))
+        x = self.encoder(torch.cat(self.inputs_of(batch), dim=1))
         for block in self.blocks:
             x = block(x, batch.graph.node_offsets)
         x = self.norm(x)

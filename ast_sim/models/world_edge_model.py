@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Self
 
 import torch
 from torch import Tensor, nn
@@ -17,8 +17,8 @@ from ast_sim.batches.graph import edge_vectors
 from ast_sim.models.layers import MLP, layer
 from ast_sim.models.model_config import DataFacts, ModelConfig, count, setting
 from ast_sim.models.node_inputs import edge_features, node_features, normalizer_of
-from ast_sim.models.normalizer import FeatureNormalizer
-from ast_sim.models.simulator import Prediction, Simulator
+from ast_sim.models.normalizer import Normalizer
+from ast_sim.models.simulator import Prediction, Simulator, Use
 from ast_sim.models.world_edges import world_edges
 from ast_sim.ops import EdgeSet, linear, message_edges, mlp, segment_sum
 
@@ -86,11 +86,8 @@ class WorldEdgeSimulator(Simulator):
         """The world edges of each mesh that has some, the finest first."""
         return [self.world(batch)]
 
-    def inputs(
-        self, batch: Batch, use: Callable[[FeatureNormalizer, Tensor], Any] = FeatureNormalizer.__call__
-    ) -> tuple[Tensor, list[Edges], list[Edges]]:
-        """The inputs of the nodes, and the mesh edges and world edges of each mesh, the finest first; all normalised,
-        or what `use` makes of them."""
+    def inputs_of(self, batch: Batch, use: Use = Normalizer.__call__) -> tuple[Tensor, list[Edges], list[Edges]]:
+        """See `Simulator`: of the nodes, and the mesh edges and world edges of each mesh, the finest first."""
         graph, now = batch.graph, batch.position
         meshes = [(graph.m2m, graph.rest_edges, now)] if graph.own is None else graph.own.meshes(now)
         on_mesh, on_world = [], []
@@ -104,8 +101,8 @@ class WorldEdgeSimulator(Simulator):
         return use(self.node_inputs, node_features(self.config, batch)), on_mesh, on_world
 
     def observe(self, batch: Batch) -> None:
-        """Add the batch to the statistics of the inputs."""
-        _, _, on_world = self.inputs(batch, FeatureNormalizer.observe)
+        """See `Simulator`. Counts the world edges, too."""
+        _, _, on_world = self.inputs_of(batch, Normalizer.observe)
         self._scenes += batch.graph.num_scenes
         self._world_edges += len(on_world[0][0])
 
@@ -120,7 +117,7 @@ class WorldEdgeSimulator(Simulator):
         ]
 
 
-def _of_level(normalizers: nn.Module, level: int) -> FeatureNormalizer:
+def _of_level(normalizers: nn.Module, level: int) -> Normalizer:
     """A model has a normalizer for each mesh, or one for all."""
     return normalizers[level] if isinstance(normalizers, nn.ModuleList) else normalizers
 

@@ -29,14 +29,12 @@ class Clock:
     WINDOW = 200  # steps that count as recent
 
     def __init__(self) -> None:
-        self._steps: deque[float] = deque(maxlen=self.WINDOW)
-        self._validations: deque[float] = deque(maxlen=3)
-        self._mark = time.perf_counter()
+        self.restart()
 
     def restart(self) -> None:
         """Forget all measured times and measure from now on."""
-        self._steps.clear()
-        self._validations.clear()
+        self._steps: deque[float] = deque(maxlen=self.WINDOW)
+        self._validations: deque[float] = deque(maxlen=3)
         self._mark = time.perf_counter()
 
     def step(self) -> None:

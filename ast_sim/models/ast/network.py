@@ -23,7 +23,8 @@ from ast_sim.models.ast.message_passing import MessagePassing
 from ast_sim.models.ast.transformer import AttentionBlock, PositionEmbedding, Vectors, rotations
 from ast_sim.models.layers import MLP, Linear
 from ast_sim.models.node_inputs import edge_features, element_features, node_features, normalizer_of
-from ast_sim.models.simulator import Prediction, Simulator
+from ast_sim.models.normalizer import Normalizer
+from ast_sim.models.simulator import Prediction, Simulator, Use
 from ast_sim.ops import farthest_point_sample, segment_mean
 from ast_sim.scene import Scene
 
@@ -82,25 +83,22 @@ class AST(Simulator):
         """See `Simulator`: how often the domain must double around its centre to hold the positions [N, 3]."""
         return doublings(self.config, position)
 
-    def _edge_features(self, batch: Batch) -> Tensor:
-        graph, now = batch.graph, batch.position
-        senders = graph.element_mean(now) if self.config.element_inputs else now
-        return edge_features(self.config, graph.edges, graph.rest_edges, senders, now)
-
-    def observe(self, batch: Batch) -> None:
-        """Add the batch to the statistics of the inputs."""
-        self.node_inputs.observe(node_features(self.config, batch))
-        self.edge_inputs.observe(self._edge_features(batch))
-        if self.config.element_inputs:
-            self.element_inputs.observe(element_features(self.config, batch))
+    def inputs_of(self, batch: Batch, use: Use = Normalizer.__call__) -> tuple[Tensor, Tensor, Tensor | None]:
+        """See `Simulator`: of the nodes, the edges, and the elements, if they are nodes of the graph."""
+        config, graph, now = self.config, batch.graph, batch.position
+        elements, senders = None, now
+        if config.element_inputs:
+            elements = use(self.element_inputs, element_features(config, batch))
+            senders = graph.element_mean(now)
+        edges = edge_features(config, graph.edges, graph.rest_edges, senders, now)
+        return use(self.node_inputs, node_features(config, batch)), use(self.edge_inputs, edges), elements
 
     def forward(self, batch: Batch) -> Prediction:
         """Normalised outputs for the frame after `batch`."""
-        encoded = self.node_encoder(self.node_inputs(node_features(self.config, batch)))
-        elements = None
-        edges, on_edges = batch.graph.edges, self.edge_inputs(self._edge_features(batch))
-        if self.config.element_inputs:
-            elements = self.element_encoder(self.element_inputs(element_features(self.config, batch)))
+        nodes, on_edges, elements = self.inputs_of(batch)
+        edges, encoded = batch.graph.edges, self.node_encoder(nodes)
+        if elements is not None:
+            elements = self.element_encoder(elements)
             mesh = self.e2m(edges, elements, encoded, on_edges)
         else:
             mesh = self.m2m(edges, encoded, encoded, on_edges)
