@@ -70,7 +70,7 @@ def from_values(cls: type[T], values: Mapping[str, Any]) -> T:
         ConfigError: a key is unknown (the text names the nearest known key), a key without a default is missing, or a
             value has the wrong type.
     """
-    return _build(cls, values, [key for key, _, _ in _leaves(cls, values)], "")
+    return _with(cls, values, dict(leaves(values)))
 
 
 def require_range(key: str, value: float | None, least: float, most: float = LARGEST) -> None:
@@ -113,37 +113,29 @@ def change(obj: T, values: Mapping[str, Any]) -> T:
     Raises:
         ConfigError: a key is unknown (the text names the nearest known key), or a value has the wrong type.
     """
-    converted = {}
-    kinds = {key: kind for key, _, kind in _leaves(type(obj), obj)}
-    for key, value in values.items():
+    return _with(type(obj), obj, values)
+
+
+def _with(cls: type[T], given: Any, values: Mapping[str, Any]) -> T:
+    """Settings of a class with values by dotted key, the others from `given`; `_leaves` says what that is."""
+    kinds = {key: kind for key, _, kind in _leaves(cls, given)}
+    for key in values:
         if key not in kinds:
             raise _unknown(kinds, key)
-        converted[key] = _convert(to_values(value), kinds[key], key)
-    return _replace(obj, converted, "")
+    return _build(cls, given, {key: _convert(to_values(value), kinds[key], key) for key, value in values.items()})
 
 
-def _replace(obj: Any, values: Mapping[str, Any], prefix: str) -> Any:
-    changes = {}
-    for item in dataclasses.fields(obj):
-        key, old = prefix + item.name, getattr(obj, item.name)
-        changes[item.name] = _replace(old, values, f"{key}.") if dataclasses.is_dataclass(old) else values.get(key, old)
-    return dataclasses.replace(obj, **changes)
-
-
-def _build(cls: Any, values: Mapping[str, Any], known: Iterable[str], prefix: str) -> Any:
-    kinds = get_type_hints(cls)
-    items = {item.name: item for item in dataclasses.fields(cls)}
-    unknown = next((name for name in values if name not in items), None)
-    if unknown is not None:
-        raise _unknown(known, prefix + unknown)
+def _build(cls: Any, given: Any, values: Mapping[str, Any], prefix: str = "") -> Any:
     arguments = {}
-    for name, item in items.items():
-        key, kind = prefix + name, kinds[name]
+    kinds = get_type_hints(cls)
+    for item in dataclasses.fields(cls):
+        key, kind = prefix + item.name, kinds[item.name]
         if dataclasses.is_dataclass(kind):
-            group, table = _group(item, kind, values, key)
-            arguments[name] = _build(group, table, known, f"{key}.")
-        elif name in values:
-            arguments[name] = _convert(values[name], kind, key)
+            arguments[item.name] = _build(*_group(item, kind, given, key), values, f"{key}.")
+        elif key in values:
+            arguments[item.name] = values[key]
+        elif dataclasses.is_dataclass(given):
+            arguments[item.name] = getattr(given, item.name)
         elif item.default is MISSING:
             raise ConfigError(f"the setting {key} is missing; must be {_describe(kind)}")
     return cls(**arguments)
