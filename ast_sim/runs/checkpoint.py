@@ -13,7 +13,6 @@ import hashlib
 import json
 import os
 import re
-import secrets
 import shutil
 import warnings
 from collections.abc import Iterator
@@ -21,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import safetensors.torch
+import torch
 from safetensors import SafetensorError
 from torch import Tensor
 
@@ -59,27 +59,24 @@ def save(
     Raises:
         CheckpointError: the checkpoint cannot be written (a full disk); the earlier checkpoints are untouched.
     """
-    if keep < 1:
-        raise CheckpointError(f"at least one checkpoint must be kept, not {keep}")
-    parent = Path(run_dir) / _FOLDER
-    final = parent / f"step-{step}"
-    temporary = parent / f"{_TEMPORARY}{secrets.token_hex(4)}"
-    try:
+    final = at_step(run_dir, step)
+    parent = final.parent
+    with _explained(final, "the checkpoint cannot be written"):
         if not parent.is_dir():
             parent.mkdir(parents=True)
             sync_folder(run_dir)
-        _clean(parent)
-        if _damage(final) is not None:
-            temporary.mkdir()
-            _write_files(temporary, step, model, training, state)
-            _discard(final)  # a damaged checkpoint of the same step
-            os.rename(temporary, final)
-            sync_folder(parent)
-        _prune(Path(run_dir), step, keep)
-    except _ERRORS as error:
-        raise CheckpointError(f"{final}: the checkpoint cannot be written: {error}") from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        _remove_temporary(parent)
+        try:
+            if _damage(final) is not None:
+                temporary = parent / f"{_TEMPORARY}new"
+                temporary.mkdir()
+                _write_files(temporary, step, model, training, state)
+                _discard(final)  # a damaged checkpoint of the same step
+                os.rename(temporary, final)
+                sync_folder(parent)
+            _prune(Path(run_dir), step, keep)
+        finally:
+            _remove_temporary(parent)
     return final
 
 
@@ -93,7 +90,7 @@ def load(path: str | os.PathLike[str], run: str | None = None) -> Content:
             checkpoint is of another run.
     """
     path = Path(path)
-    data = {name: _read_verified(path, name, record) for name, record in _read_manifest(path).items()}
+    data = _read_verified(path)
     with _explained(path, "cannot be understood"):
         model, training = (safetensors.torch.load(data.pop(name)) for name in FILES[:2])
         state = json.loads(data["state.json"])
@@ -154,12 +151,11 @@ def mark_best(run_dir: str | os.PathLike[str], step: int, error: float) -> None:
     Raises:
         CheckpointError: there is no such checkpoint, or the mark cannot be written.
     """
-    run_dir = Path(run_dir)
-    name = f"step-{step}"
-    if not (run_dir / _FOLDER / name).is_dir():
-        raise CheckpointError(f"{run_dir}: there is no checkpoint {name} to mark as the best")
-    with _explained(run_dir / _BEST, "cannot be written"):
-        write_text(run_dir / _BEST, seal({"step": step, "valid_rmse": error}))
+    if not at_step(run_dir, step).is_dir():
+        raise CheckpointError(f"{run_dir}: there is no checkpoint step-{step} to mark as the best")
+    path = Path(run_dir) / _BEST
+    with _explained(path, "cannot be written"):
+        write_text(path, seal({"step": step, "valid_rmse": error}))
 
 
 def read_best(run_dir: str | os.PathLike[str]) -> tuple[int, float] | None:
@@ -186,24 +182,21 @@ def lock(run_dir: str | os.PathLike[str]) -> Iterator[None]:
     """
     path = Path(run_dir) / _LOCK
     with _explained(Path(run_dir), "cannot be written"):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    try:
+        path.touch()
+    with open(path, "r+b", buffering=0) as file:
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            holder = os.pread(handle, 32, 0).decode(errors="replace").strip() or "unknown"
+            holder = file.read(32).decode(errors="replace") or "unknown"
             raise CheckpointError(
                 f"{run_dir} is in use by process {holder}: wait until it ends, or choose another folder"
             ) from error
         except OSError as error:
             raise CheckpointError(f"{path}: this file system cannot lock files: {error}") from error
         with contextlib.suppress(OSError):  # only the message above needs the number
-            os.ftruncate(handle, 0)
-            os.pwrite(handle, str(os.getpid()).encode(), 0)
+            file.truncate(0)
+            file.write(str(os.getpid()).encode())
         yield
-    finally:
-        os.close(handle)
 
 
 @contextlib.contextmanager
@@ -218,50 +211,54 @@ def _explained(path: Path, what: str) -> Iterator[None]:
 def _write_files(
     folder: Path, step: int, model: dict[str, Tensor], training: dict[str, Tensor], state: dict[str, Any]
 ) -> None:
-    records = {}
-    for name, content in zip(FILES, (model, training, state), strict=True):
-        if name.endswith(".json"):
-            data = json.dumps(content, allow_nan=False, indent=1).encode()
-        else:
-            data = safetensors.torch.save({key: _detached(tensor) for key, tensor in content.items()})
-        records[name] = {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
-        write_synced(folder / name, data)
-    manifest = {"version": VERSION, "step": step, "files": records}
-    write_synced(folder / MANIFEST, json.dumps(manifest, indent=1).encode())
+    data = {FILES[0]: _packed(model), FILES[1]: _packed(training), FILES[2]: _json(state)}
+    records = {name: {"size": len(content), "sha256": _hash(content)} for name, content in data.items()}
+    data[MANIFEST] = _json({"version": VERSION, "step": step, "files": records})
+    for name, content in data.items():
+        write_synced(folder / name, content)
     sync_folder(folder)
 
 
-def _detached(tensor: Tensor) -> Tensor:
-    """A contiguous copy on the CPU, which shares no memory with other tensors."""
-    return tensor.detach().cpu().contiguous().clone()
+def _packed(tensors: dict[str, Tensor]) -> bytes:
+    """The bytes of contiguous copies, which share no memory with one another."""
+    return safetensors.torch.save(
+        {key: tensor.detach().clone(memory_format=torch.contiguous_format) for key, tensor in tensors.items()}
+    )
+
+
+def _json(values: dict[str, Any]) -> bytes:
+    return json.dumps(values, allow_nan=False, indent=1).encode()
+
+
+def _hash(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
 
 
 def _read_manifest(path: Path) -> dict[str, dict[str, Any]]:
-    """The size and the hash of each file; a manifest with other files is refused."""
+    """The size and the hash of each file; a manifest that says anything else is refused."""
     with _explained(path / MANIFEST, "cannot be read"):
         if not path.is_dir():
             raise CheckpointError(f"{path}: there is no such checkpoint")
-        data = _read_file(path / MANIFEST, _MANIFEST_BYTES)
-        manifest = json.loads(data)
-        step = int(path.name.removeprefix("step-")) if _NAME.fullmatch(path.name) else manifest["step"]
-        if manifest != {"version": VERSION, "step": step, "files": manifest.get("files")}:
+        manifest = json.loads(_read_file(path / MANIFEST, _MANIFEST_BYTES))
+        records = {name: {key: manifest["files"][name][key] for key in ("size", "sha256")} for name in FILES}
+        if manifest != {"version": VERSION, "step": _step(path), "files": records}:
             raise CheckpointError(f"{path / MANIFEST}: is not the manifest of version {VERSION} of this step")
-        records = manifest["files"]
-        if set(records) != set(FILES) or any(set(record) != {"size", "sha256"} for record in records.values()):
-            raise CheckpointError(f"{path / MANIFEST}: must list {', '.join(FILES)} with size and sha256")
-    return {name: records[name] for name in FILES}
+    return records
 
 
-def _read_verified(path: Path, name: str, record: dict[str, Any]) -> bytes:
-    file = path / name
-    with _explained(file, "cannot be read"):
-        size = os.lstat(file).st_size
-        if size != record["size"]:
-            raise CheckpointError(f"{file}: has {size} bytes, the manifest says {record['size']}")
-        data = _read_file(file, size)
-    if hashlib.sha256(data).hexdigest() != record["sha256"]:
-        raise CheckpointError(f"{file}: is damaged: its SHA-256 is not that of the manifest")
-    return data
+def _read_verified(path: Path) -> dict[str, bytes]:
+    """The content of each file, which is what the manifest says."""
+    found = {}
+    for name, record in _read_manifest(path).items():
+        file = path / name
+        with _explained(file, "cannot be read"):
+            size = os.lstat(file).st_size
+            if size != record["size"]:
+                raise CheckpointError(f"{file}: has {size} bytes, the manifest says {record['size']}")
+            found[name] = _read_file(file, size)
+        if _hash(found[name]) != record["sha256"]:
+            raise CheckpointError(f"{file}: is damaged: its SHA-256 is not that of the manifest")
+    return found
 
 
 def _read_file(file: Path, most: int) -> bytes:
@@ -277,22 +274,24 @@ def _read_file(file: Path, most: int) -> bytes:
 def _damage(path: Path) -> CheckpointError | None:
     """What is wrong with a checkpoint; None if it is valid."""
     try:
-        for name, record in _read_manifest(path).items():
-            _read_verified(path, name, record)
+        _read_verified(path)
     except CheckpointError as error:
         return error
     return None
 
 
+def _step(path: Path) -> int:
+    return int(path.name.removeprefix("step-"))
+
+
 def _newest_first(parent: Path) -> list[Path]:
-    paths = [path for path in parent.glob("step-*") if _NAME.fullmatch(path.name)]
-    return sorted(paths, key=lambda path: int(path.name.removeprefix("step-")), reverse=True)
+    return sorted(filter(lambda path: _NAME.fullmatch(path.name), parent.glob("step-*")), key=_step, reverse=True)
 
 
 def _marked(run_dir: Path) -> Path | None:
     """The checkpoint that the file `best` names; None if there is no such file."""
     mark = read_best(run_dir)
-    return None if mark is None else run_dir / _FOLDER / f"step-{mark[0]}"
+    return None if mark is None else at_step(run_dir, mark[0])
 
 
 def _prune(run_dir: Path, step: int, keep: int) -> None:
@@ -301,20 +300,18 @@ def _prune(run_dir: Path, step: int, keep: int) -> None:
     Checkpoints of later steps were damaged when the run was resumed.
     """
     paths = _newest_first(run_dir / _FOLDER)
-    first = paths.index(run_dir / _FOLDER / f"step-{step}")
+    first = paths.index(at_step(run_dir, step))
     for path in {*paths[:first], *paths[first + keep :]} - {_marked(run_dir)}:
         _discard(path)
 
 
 def _discard(path: Path) -> None:
-    """Remove a checkpoint. It is renamed first, so that a kill never leaves a part of it under its name."""
+    """Rename a checkpoint, so that a kill never leaves a part of it under its name; `save` removes it in the end."""
     if path.exists():
-        aside = path.with_name(f"{_TEMPORARY}{secrets.token_hex(4)}")
-        os.rename(path, aside)
-        shutil.rmtree(aside, ignore_errors=True)
+        os.rename(path, path.with_name(_TEMPORARY + path.name))
 
 
-def _clean(parent: Path) -> None:
-    """Remove the folders that a killed process left when it wrote or removed a checkpoint."""
+def _remove_temporary(parent: Path) -> None:
+    """Remove the folders of checkpoints that are not finished or no longer wanted, also those of a killed process."""
     for path in parent.glob(f"{_TEMPORARY}*"):
         shutil.rmtree(path, ignore_errors=True)
