@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from ast_sim.runs.origin import CONFIG, SCOPE
+from ast_sim.runs import CONFIG, SCOPE
 from ast_sim.support.disk import output_file
 from ast_sim.support.errors import ConfigError, DatasetError, RolloutError, printable
 
@@ -132,7 +132,7 @@ def info(args: argparse.Namespace) -> None:
     from ast_sim.dataset.contents import describe_dataset, text
 
     if args.path.is_dir():
-        from ast_sim.runs.summary import describe_run
+        from ast_sim.runs.folder import describe_run
 
         found = describe_run(args.path)
     else:

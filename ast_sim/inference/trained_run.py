@@ -53,8 +53,9 @@ class Run:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         self.model, self.settings, self.step = load_model(self.path)
-        self.effort = Effort(*Metrics(self.path).effort(self.step, (self.settings.train.calls or 1) - 1))
-        self._errors = Metrics(self.path).errors_by_effort(self.step)
+        chosen, unset = Metrics(self.path).validation(self.step) or {}, (self.settings.train.calls or 1) - 1
+        self.effort = Effort(chosen.get("corrections", unset), chosen.get("newton_steps", 0))
+        self._errors = chosen.get("valid_by_effort", [])
         self.scope = read_scope(self.path)
 
     @property

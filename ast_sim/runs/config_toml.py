@@ -1,18 +1,31 @@
-"""`config.toml` of a run, its settings as a file; its scope is read and written the same way."""
+"""The settings and the scope of a run as files: `config.toml` and `scope.toml` for people, `run.json` to compare with.
+
+`run.json` holds the settings, the scope and the dataset that the run was started with, the checkpoint that gave its
+first weights if it starts from another run, and the SHA-256 of them all. It is written once. A reader compares the
+other two files with it, so a damaged or edited file is noticed. Each checkpoint holds the SHA-256, so a checkpoint of
+another run is noticed.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ast_sim.runs.origin import CONFIG, SCOPE, VERSION, verified, write_origin
+from ast_sim.runs import CONFIG, SCOPE
 from ast_sim.runs.scope import Scope
 from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.disk import read_text, write_text
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import CheckpointError, ConfigError
 from ast_sim.support.toml_settings import from_values, leaves, to_toml, to_values
+
+ORIGIN = "run.json"
+VERSION = 1
+_KEYS = {"version", CONFIG, SCOPE, "data", "sha256"}
+_START = "start"  # only in a run that starts from another one
 
 
 def has_config(run: Path) -> bool:
@@ -20,19 +33,34 @@ def has_config(run: Path) -> bool:
     return (run / CONFIG).is_file()
 
 
+def write_config(
+    run: Path, settings: RunConfig, scope: Scope, data: str, start: Mapping[str, Any] | None = None
+) -> None:
+    """Write the three files, each whole; `data` is the dataset's fingerprint, `start` the checkpoint that gives the
+    first weights.
+
+    The settings come last: a folder with settings has the other two.
+    """
+    values = {"version": VERSION, CONFIG: to_values(settings), SCOPE: to_values(scope), "data": data}
+    values |= {_START: dict(start)} if start else {}
+    write_text(run / SCOPE, _text(scope))
+    write_text(run / ORIGIN, json.dumps({**values, "sha256": _hash(values)}, indent=1) + "\n")
+    write_text(run / CONFIG, _text(settings))
+
+
 def read_config(run: Path) -> RunConfig:
     """The settings of a run.
 
     Raises:
-        CheckpointError: the folder holds no run.
+        CheckpointError: the folder holds no run, or `run.json` cannot be read.
         ConfigError: the file was edited or damaged; the text names the first setting that differs.
     """
-    return from_values(RunConfig, verified(run, CONFIG))
+    return from_values(RunConfig, _verified(run, CONFIG))
 
 
 def read_scope(run: Path) -> Scope:
     """The scope of a run; errors as in `read_config`."""
-    return from_values(Scope, verified(run, SCOPE))
+    return from_values(Scope, _verified(run, SCOPE))
 
 
 def read_changes(path: Path) -> dict[str, Any]:
@@ -43,10 +71,10 @@ def read_changes(path: Path) -> dict[str, Any]:
         ConfigError: the file cannot be read, is no TOML, or is of another version; the text names the file.
     """
     try:
-        found = dict(leaves(tomllib.loads(read_text(path))))
+        found = _leaves(path)
     except OSError as error:
         raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise ConfigError(f"{path} is not valid TOML: {error}") from error
     found.pop("data", None)
     version = found.pop("version", VERSION)
@@ -55,18 +83,66 @@ def read_changes(path: Path) -> dict[str, Any]:
     return found
 
 
-def write_config(
-    run: Path, settings: RunConfig, scope: Scope, data: str, start: Mapping[str, Any] | None = None
-) -> None:
-    """Write the scope, `run.json` and the settings, each as a whole file; `data` is the dataset's fingerprint, `start`
-    the checkpoint that gives the first weights.
+def read_origin(run: Path) -> dict[str, Any]:
+    """The content of `run.json`: `config.toml`, `scope.toml`, `data`, `sha256`, and `start` if there is one.
 
-    The settings come last: a folder with settings has the other two.
+    Raises:
+        CheckpointError: the file is missing, damaged or of another version.
     """
-    write_text(run / SCOPE, _text(scope))
-    write_origin(run, {CONFIG: to_values(settings), SCOPE: to_values(scope)}, data, start)
-    write_text(run / CONFIG, _text(settings))
+    path = run / ORIGIN
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if found.keys() - {_START} != _KEYS or found["sha256"] != _hash(found):
+            raise ValueError
+    except OSError as error:
+        raise CheckpointError(f"{path} cannot be read ({error.strerror}): {_advice(ORIGIN)}") from error
+    except (ValueError, AttributeError, TypeError, RecursionError) as error:
+        raise CheckpointError(f"{path} is damaged: its content does not fit its SHA-256: {_advice(ORIGIN)}") from error
+    if found["version"] != VERSION:
+        raise CheckpointError(f"{path} has version {found['version']}, not {VERSION}: use the ast_sim that wrote it")
+    return found
+
+
+def _verified(run: Path, name: str) -> dict[str, Any]:
+    """The table of the file `name` of a run; the file must hold what the run was started with."""
+    path = run / name
+    try:
+        found = _leaves(path)
+    except OSError as error:
+        raise CheckpointError(f"{run} is not a run folder: {name} cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise ConfigError(f"{path} is damaged: it is not valid TOML ({error}): {_advice(name)}") from error
+    kept = read_origin(run)[name]
+    wanted = {"version": VERSION, **dict(leaves(kept))}
+    for key in (*wanted, *found):
+        if key not in found:
+            raise ConfigError(f"{path}: {key} is missing; the run was started with {wanted[key]!r}: {_advice(name)}")
+        if key not in wanted:
+            raise ConfigError(f"{path}: {key} is no setting of this run: {_advice(name)}")
+        if found[key] != wanted[key]:
+            raise ConfigError(
+                f"{path}: {key} is {found[key]!r}, but the run was started with {wanted[key]!r}: {_advice(name)}"
+            )
+    return kept
+
+
+def _leaves(path: Path) -> dict[str, Any]:
+    """The values in a TOML file by dotted key. Raises OSError or ValueError."""
+    try:
+        return dict(leaves(tomllib.loads(read_text(path))))
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+
+
+def _advice(name: str) -> str:
+    return f"restore {name} as it was, or train in another folder"
 
 
 def _text(settings: RunConfig | Scope) -> str:
     return f"version = {VERSION}\n{to_toml(settings)}"
+
+
+def _hash(values: Mapping[str, Any]) -> str:
+    """The SHA-256 of all values but that of the key `sha256`."""
+    hashed = {key: value for key, value in values.items() if key != "sha256"}
+    return hashlib.sha256(json.dumps(hashed, sort_keys=True).encode()).hexdigest()

@@ -1,7 +1,9 @@
-"""The trained model in a run folder."""
+"""The trained model in a run folder, and what the folder holds."""
 
 from __future__ import annotations
 
+import dataclasses
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +14,8 @@ from ast_sim.models.model_config import ModelConfig
 from ast_sim.models.registry import build_model
 from ast_sim.models.simulator import Simulator
 from ast_sim.runs import checkpoint
-from ast_sim.runs.config_toml import has_config, read_config
+from ast_sim.runs.config_toml import has_config, read_config, read_origin
 from ast_sim.runs.metrics import Metrics
-from ast_sim.runs.origin import read_origin
 from ast_sim.runs.scope import Scope
 from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.errors import CheckpointError, ConfigError
@@ -83,3 +84,25 @@ def require_fit(run: Path, model: ModelConfig, scope: Scope, dataset: Dataset) -
     ):
         if ours != theirs:
             raise ConfigError(f"{dataset.path} has {what} {theirs}, but {run} was trained with {what} {ours}")
+
+
+def describe_run(path: Path) -> dict[str, Any]:
+    """What `ast-sim info` says of a run: its settings, the checkpoint that it starts from, its checkpoints and the best
+    validation.
+
+    A warning tells if the record of that validation is lost.
+    """
+    settings = read_config(path)
+    latest, best, mark = checkpoint.latest(path), checkpoint.best(path), checkpoint.read_best(path)
+    validation = Metrics(path).validation(mark[0]) if mark else None
+    if mark and not validation:
+        warnings.warn(f"{Metrics(path).path} has lost the validation after step {mark[0]}, the best one", stacklevel=2)
+    return {
+        "kind": "run",
+        "path": str(path),
+        **dataclasses.asdict(settings),
+        "start": read_origin(path).get("start"),
+        "latest_checkpoint": latest.name if latest else None,
+        "best_checkpoint": best.name if best else None,
+        "best_validation": validation,
+    }

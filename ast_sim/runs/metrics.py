@@ -52,23 +52,9 @@ class Metrics:
 
     def best(self) -> tuple[int, float] | None:
         """The step and the error of the best validation; None if no validation succeeded."""
-        errors = [(record["valid_rmse"], record["step"]) for record in self if record.get("valid_rmse") is not None]
-        if not errors:
-            return None
-        error, step = min(errors)
-        return step, error
+        marks = ((record["step"], record["valid_rmse"]) for record in self if record.get("valid_rmse") is not None)
+        return min(marks, key=lambda mark: mark[1], default=None)
 
-    def effort(self, step: int, unset: int) -> tuple[int, int]:
-        """The numbers of corrections and of Newton steps that the validation after a step chose; if it recorded none,
-        `unset` corrections and no Newton step."""
-        found = [record for record in self if record["step"] == step and "corrections" in record]
-        return (int(found[-1]["corrections"]), int(found[-1].get("newton_steps", 0))) if found else (unset, 0)
-
-    def errors_by_effort(self, step: int) -> list[list[float | None]]:
-        """[corrections][Newton steps]: the mean relative errors at the deepest frame that the validation after a step
-        found; empty if it found none."""
-        found = [record["valid_by_effort"] for record in self if record["step"] == step and "valid_by_effort" in record]
-        return found[-1] if found else []
-
-    def validated(self, step: int) -> bool:
-        return any(record["step"] == step and "valid_rmse" in record for record in self)
+    def validation(self, step: int) -> dict[str, Any] | None:
+        """The record of the validation after a step; None if there is none."""
+        return next((record for record in self if record["step"] == step and "valid_rmse" in record), None)

@@ -124,7 +124,7 @@ class Training:
         options = self.options
         self.prepare()
         with Console(options.steps, self.step, self.signals) as self.progress:
-            validated = self.processes.of_leader(self.log.metrics.validated(self.step))
+            validated = self.processes.of_leader(self.log.metrics.validation(self.step) is not None)
             if self.step and self._due(options.validate_every) and not validated:
                 self._validate()
             self.clock.restart()

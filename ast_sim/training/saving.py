@@ -10,9 +10,9 @@ from ast_sim.batches.training_jumps import JumpPool
 from ast_sim.batches.training_rollouts import RolloutPool
 from ast_sim.dataset.reader import Dataset
 from ast_sim.runs import checkpoint
+from ast_sim.runs.config_toml import read_origin
 from ast_sim.runs.folder import first_weights
 from ast_sim.runs.metrics import Metrics
-from ast_sim.runs.origin import read_origin
 from ast_sim.support.errors import TrainingError
 from ast_sim.training.optimizer import Optimizer
 from ast_sim.training.processes import Processes

@@ -15,9 +15,8 @@ from ast_sim.inference.trained_run import Run
 from ast_sim.models.registry import build_model, find_preset
 from ast_sim.models.simulator import Simulator
 from ast_sim.runs import checkpoint
-from ast_sim.runs.config_toml import has_config, read_changes, read_config, read_scope, write_config
+from ast_sim.runs.config_toml import has_config, read_changes, read_config, read_origin, read_scope, write_config
 from ast_sim.runs.folder import require_fit, start_at
-from ast_sim.runs.origin import read_origin
 from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.support.errors import CheckpointError, ConfigError, TrainingError
 from ast_sim.support.stop_signals import StopSignals

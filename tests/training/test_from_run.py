@@ -16,10 +16,9 @@ from ast_sim.cli import main
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.runs import checkpoint
-from ast_sim.runs.config_toml import read_changes, read_config
+from ast_sim.runs.config_toml import read_changes, read_config, read_origin
 from ast_sim.runs.folder import load_model
 from ast_sim.runs.metrics import Metrics
-from ast_sim.runs.origin import read_origin
 from ast_sim.support.errors import CheckpointError, ConfigError
 from ast_sim.training.rates import step_seed
 from ast_sim.training.start import configure, start_training

@@ -21,7 +21,6 @@ from ast_sim.models.transolver import TransolverConfig
 from ast_sim.runs import checkpoint, folder
 from ast_sim.runs.config_toml import has_config, read_config
 from ast_sim.runs.metrics import Metrics
-from ast_sim.runs.summary import describe_run
 from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.scene import NodeType
 from ast_sim.support.errors import CheckpointError, ConfigError, DatasetError, TrainingError
@@ -435,8 +434,9 @@ def test_jumps_that_are_resumed_end_in_the_same_bits(linear, data, tmp_path, mon
     record = [line for line in Metrics(tmp_path / "run") if "corrections" in line][-1]
     assert len(record["valid_by_calls"]) == 5 and 0 <= record["corrections"] < 5
     run = Run(tmp_path / "run")
-    assert run.effort == Effort(Metrics(run.path).effort(run.step, 0)[0])
-    errors = [row for (row,) in Metrics(run.path).errors_by_effort(run.step)]
+    validation = Metrics(run.path).validation(run.step)
+    assert run.effort == Effort(validation["corrections"])
+    errors = [row for (row,) in validation["valid_by_effort"]]
     with run.open() as dataset:
         truth = dataset["valid"][0]
     answers = [run.predict(truth, frames=[-1], corrections=corrections) for corrections in (0, 2, 3)]
@@ -571,13 +571,13 @@ def test_no_damage_of_the_metrics_changes_a_record_or_the_best_in_silence(linear
 def test_metrics_without_their_last_lines_give_a_warning(linear, data, tmp_path):
     run = tmp_path / "run"
     start.start_training(run, settings(data))
-    assert describe_run(run)["best_validation"]["step"] == 20
+    assert folder.describe_run(run)["best_validation"]["step"] == 20
     lines = (run / "metrics.jsonl").read_text().splitlines(keepends=True)
     (run / "metrics.jsonl").write_text("".join(lines[:3]))
     with pytest.warns(UserWarning, match=r"metrics.jsonl has lost 3 of 6 lines"):
         folder.load_model(run)
     with pytest.warns(UserWarning, match="metrics.jsonl has lost the validation after step 20, the best one"):
-        assert describe_run(run)["best_validation"] is None
+        assert folder.describe_run(run)["best_validation"] is None
 
 
 def test_a_missing_or_damaged_best_is_refused_until_a_resume_writes_it_again(linear, data, tmp_path):
