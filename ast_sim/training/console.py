@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import math
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 from torch import nn
@@ -41,6 +40,20 @@ def introduce(model: nn.Module, config: RunConfig, dataset: Dataset, scales: Dat
         print(f"{what.lower():12}{fact}", flush=True)
 
 
+def _heard(method: Callable[..., None]) -> Callable[..., None]:
+    """A method of `Progress` for `Console`."""
+
+    def attempt(self: Console, *arguments: object) -> None:
+        try:
+            method(self, *arguments)
+        except OSError as error:
+            if error.errno not in (errno.EPIPE, errno.EIO):
+                raise
+            self.signals.received = self.signals.received or signal.SIGPIPE
+
+    return attempt
+
+
 class Console(Progress):
     """The progress of a training. If nobody reads the output any more (a closed pipe, a lost terminal), the training is
     asked to stop as by the signal SIGPIPE."""
@@ -49,30 +62,10 @@ class Console(Progress):
         self.signals = signals
         super().__init__(total, done, "steps")
 
-    def advance(self) -> None:
-        with self._heard():
-            super().advance()
-
-    def show(self, text: str) -> None:
-        with self._heard():
-            super().show(text)
-
-    def line(self, text: str) -> None:
-        with self._heard():
-            super().line(text)
-
-    def __exit__(self, *error: object) -> None:
-        with self._heard():
-            super().__exit__(*error)
-
-    @contextlib.contextmanager
-    def _heard(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            if error.errno not in (errno.EPIPE, errno.EIO):
-                raise
-            self.signals.received = self.signals.received or signal.SIGPIPE
+    advance = _heard(Progress.advance)
+    show = _heard(Progress.show)
+    line = _heard(Progress.line)
+    __exit__ = _heard(Progress.__exit__)
 
 
 class StepLog:

@@ -10,6 +10,7 @@ from itertools import compress
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from ast_sim.runs.train_config import OptimizerName
 from ast_sim.training.muon import Muon
@@ -24,6 +25,9 @@ class Optimizer:
     Args:
         model: its parameters stay the same objects; their values and their `grad`s become views of the two arrays.
         name: "adamw"; or "muon": Muon for matrices with at least 16 rows and columns, AdamW for all other parameters.
+
+    Attributes:
+        gradient: the gradients of all parameters, one after the other.
     """
 
     def __init__(self, model: nn.Module, name: OptimizerName = "adamw") -> None:
@@ -31,28 +35,23 @@ class Optimizer:
         inside = [name == "muon" and p.dim() == 2 and min(p.shape) >= NARROW for p in parameters]
         matrices = sorted(compress(parameters, inside), key=lambda p: p.shape)  # same shapes become adjacent
         others = [p for p, is_inside in zip(parameters, inside, strict=True) if not is_inside]
-        self._values, self._gradients = _in_one_array([*others, *matrices])
+        values, self.gradient = _in_one_array([*others, *matrices])
         rest = sum(p.numel() for p in others)
-        self._rest = nn.Parameter(self._values[:rest])
-        self._rest.grad = self._gradients[:rest]
+        self._rest = nn.Parameter(values[:rest])
+        self._rest.grad = self.gradient[:rest]
         self._adam = torch.optim.AdamW([self._rest], lr=0.0, weight_decay=0.0, fused=True)
         self._muon = None
         if matrices:
-            self._muon = Muon(self._values[rest:], self._gradients[rest:], [tuple(p.shape) for p in matrices])
-
-    @property
-    def gradient(self) -> Tensor:
-        """The gradients of all parameters, one after the other."""
-        return self._gradients
+            self._muon = Muon(values[rest:], self.gradient[rest:], [tuple(p.shape) for p in matrices])
 
     def zero_gradient(self) -> None:
-        self._gradients.zero_()
+        self.gradient.zero_()
 
     def clip(self, largest: float) -> float:
         """Scale a gradient whose norm exceeds `largest` down to it; returns the norm before."""
-        norm = float(torch.linalg.vector_norm(self._gradients))
+        norm = float(torch.linalg.vector_norm(self.gradient))
         if norm > largest:
-            self._gradients.mul_(largest / norm)
+            self.gradient.mul_(largest / norm)
         return norm
 
     def step(self, rate: float) -> None:
@@ -77,9 +76,9 @@ class Optimizer:
 
 def _in_one_array(parameters: list[nn.Parameter]) -> tuple[Tensor, Tensor]:
     """An array of all values and an array of all gradients (zero). The parameters become views of these arrays."""
-    values = torch.cat([p.detach().flatten() for p in parameters])
+    values = parameters_to_vector(parameters).detach()
+    vector_to_parameters(values, parameters)
     gradients = torch.zeros_like(values)
-    sizes = [p.numel() for p in parameters]
-    for parameter, value, gradient in zip(parameters, values.split(sizes), gradients.split(sizes), strict=True):
-        parameter.data, parameter.grad = value.view_as(parameter), gradient.view_as(parameter)
+    for parameter, gradient in zip(parameters, gradients.split([p.numel() for p in parameters]), strict=True):
+        parameter.grad = gradient.view_as(parameter)
     return values, gradients

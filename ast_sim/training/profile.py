@@ -56,30 +56,29 @@ class _TimedCore:
 
     def __init__(self, core: Any) -> None:
         self._core = core
-        self.nanoseconds: dict[str, int] = defaultdict(int)
-        self.calls: dict[str, int] = defaultdict(int)
+        self.seconds: dict[str, list[float]] = defaultdict(list)  # of each call
 
     def __getattr__(self, name: str) -> Callable:
         function = getattr(self._core, name)
 
         def timed(*arguments: Any) -> Any:
-            start = time.perf_counter_ns()
+            start = time.perf_counter()
             try:
                 return function(*arguments)
             finally:
-                self.nanoseconds[name] += time.perf_counter_ns() - start
-                self.calls[name] += 1
+                self.seconds[name].append(time.perf_counter() - start)
 
         setattr(self, name, timed)
         return timed
 
+    def entries(self, steps: int) -> list[Entry]:
+        """The kernels, the slowest first."""
+        return _sorted([Entry("kernel", name, len(t) / steps, sum(t) / steps) for name, t in self.seconds.items()])
+
 
 @contextmanager
 def _timed_core() -> Iterator[_TimedCore]:
-    if library.BACKEND == "torch":
-        yield _TimedCore(None)
-        return
-    core = library._C
+    core = getattr(library, "_C", None)  # none with AST_SIM_BACKEND=torch
     library._C = _TimedCore(core)
     try:
         yield library._C
@@ -93,11 +92,10 @@ def profile(step: Callable[[], object], steps: int) -> Profile:
         step()
     with _timed_core() as core:
         seconds = _seconds_of(step, steps)
-    timed = core.nanoseconds.items()
-    kernels = _sorted([Entry("kernel", name, core.calls[name] / steps, t * 1e-9 / steps) for name, t in timed])
+    kernels = core.entries(steps)
     with _timed_core() as core, torch_profile(activities=[ProfilerActivity.CPU]) as watched:
         watched_seconds = _seconds_of(step, steps)
-    within = sum(core.nanoseconds.values()) * 1e-9 / steps
+    within = sum(entry.seconds for entry in core.entries(steps))
     rest = _beside_kernels(watched, steps, watched_seconds, within)
     scale = (seconds - sum(entry.seconds for entry in kernels)) / (watched_seconds - within)
     rest = [replace(entry, seconds=entry.seconds * scale) for entry in rest]

@@ -53,13 +53,15 @@ class Saver:
 
     def restore(self) -> tuple[int, dict[str, float]] | None:
         """Restore the newest checkpoint; returns its step and the sums of the log, or None if there is none."""
-        found, rolling = self._restore_alone() if self.processes.leads else (None, {})
-        found = self.processes.of_leader(found)
-        if found is not None:
-            self.optimizer.restore(self.processes.of_leader(self.optimizer.state()))
-            if self.pool is not None:
-                self.pool.restore(self.processes.of_leader(rolling))
-        return found
+        content = self.processes.of_leader(self._newest() if self.processes.leads else None)
+        if content is None:
+            return None
+        weights, training, state = content
+        self.model.load_state_dict(weights)
+        self.optimizer.restore(_without("optimizer.", training))
+        if self.pool is not None:
+            self.pool.restore(_without("pool.", training))
+        return state["step"], state["sums"]
 
     def start(self) -> bool:
         """Load the weights of the run that this one starts from; returns whether there is such a run."""
@@ -71,22 +73,22 @@ class Saver:
         print(f"starts from {start['run']}, step {start['step']:,}", flush=True)
         return True
 
-    def _restore_alone(self) -> tuple[tuple[int, dict[str, float]] | None, dict[str, Tensor]]:
+    def _newest(self) -> checkpoint.Content | None:
+        """The content of the newest checkpoint, which must be of this run and of this dataset."""
         path = checkpoint.latest(self.run)
         if path is None:
-            return None, {}
+            return None
         origin = read_origin(self.run)
-        weights, training, state = checkpoint.load(path, origin["sha256"])
+        content = checkpoint.load(path, origin["sha256"])
         if origin["data"] != self.dataset.fingerprint():
             raise TrainingError(
                 f"{self.dataset.path} is not the dataset that {self.run} was trained on so far: use that dataset, or"
                 " train in another folder"
             )
+        state = content[2]
         Metrics(self.run).require(state["lines"])
-        self.model.load_state_dict(weights)
-        self.optimizer.restore(_without("optimizer.", training))
         print(f"going on after step {state['step']:,}", flush=True)
-        return (state["step"], state["sums"]), _without("pool.", training)
+        return content
 
 
 def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -58,15 +58,10 @@ def configure(
     before = found
     with _naming(file):
         found = _changed(found, given, reschedule=from_run is not None)
-    if assignments or changes:
-        later = {**assigned(found, assignments), **changes}
-        found = _changed(found, later, reschedule=from_run is not None or "train.steps" in given)
-    if from_run is not None:
-        key, old, new = next(_differences(before, found, ("model",)), ("", 0, 0))
-        if key:
-            raise ConfigError(
-                f"{key} is {new!r}, but {from_run} has {old!r}: a run that starts from it keeps its model"
-            )
+    later = {**assigned(found, assignments), **changes}
+    found = _changed(found, later, reschedule=from_run is not None or "train.steps" in given)
+    for key, old, new in _differences(before, found, "model") if from_run is not None else ():
+        raise ConfigError(f"{key} is {new!r}, but {from_run} has {old!r}: a run that starts from it keeps its model")
     return found
 
 
@@ -208,26 +203,25 @@ def start_training(
 def _lock(run: Path, processes: Processes) -> Iterator[None]:
     """Within the block the leading process holds the lock of the run folder. If it cannot, all processes raise."""
     with ExitStack() as held:
-        error = None
-        if processes.leads:
-            try:
+        refusal = None
+        try:
+            if processes.leads:
                 held.enter_context(checkpoint.lock(run))
-            except CheckpointError as refused:
-                error = str(refused)
-        error = processes.of_leader(error)
-        if error is not None:
-            raise CheckpointError(error)
+        except CheckpointError as error:
+            refusal = str(error)
+        refusal = processes.of_leader(refusal)
+        if refusal is not None:
+            raise CheckpointError(refusal)
         yield
 
 
 @contextmanager
 def _told_by_leader(processes: Processes) -> Iterator[None]:
     """Within the block only the leading process prints."""
-    with ExitStack() as silent:
-        if not processes.leads:
-            nowhere = silent.enter_context(open(os.devnull, "w"))
-            silent.enter_context(redirect_stdout(nowhere))
-            silent.enter_context(redirect_stderr(nowhere))
+    if processes.leads:
+        yield
+        return
+    with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
         yield
 
 
@@ -241,7 +235,7 @@ def _require_fit(source: Path, config: RunConfig, dataset: Dataset, scales: Data
 def _require_same(run: Path, saved: RunConfig, asked: RunConfig, source: Path | None) -> None:
     """Raise ConfigError if a setting or the run to start from differs, naming the first one; only the path of the
     dataset may differ."""
-    for key, old, new in _differences(saved, asked, ("model", "train")):
+    for key, old, new in _differences(saved, asked, "model", "train"):
         raise ConfigError(
             f"{run} was started with {key} = {old!r}, not {new!r}: resume without settings, or train in another folder"
         )
@@ -253,10 +247,8 @@ def _require_same(run: Path, saved: RunConfig, asked: RunConfig, source: Path | 
         )
 
 
-def _differences(old: RunConfig, new: RunConfig, parts: Sequence[str]) -> Iterator[tuple[str, Any, Any]]:
+def _differences(old: RunConfig, new: RunConfig, *parts: str) -> Iterator[tuple[str, Any, Any]]:
     """The settings that differ: dotted key, old value, new value."""
     for part in parts:
-        before, after = getattr(old, part), getattr(new, part)
-        for key in (field.name for field in dataclasses.fields(before)):
-            if getattr(before, key) != getattr(after, key):
-                yield f"{part}.{key}", getattr(before, key), getattr(after, key)
+        before, after = vars(getattr(old, part)), vars(getattr(new, part))
+        yield from ((f"{part}.{key}", before[key], after[key]) for key in before if before[key] != after[key])

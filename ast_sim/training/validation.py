@@ -54,32 +54,29 @@ def validate(
     Args:
         most_calls: so many calls correct one another in training.
     """
-    truths = {index: dataset.load("valid", index) for index in indices}
+    indices = list(indices)
+    truths = [dataset.load("valid", index) for index in indices]
     if not truths:
         return []
-    if model.config.jumps:
-        return _validate_jumps(model, truths, most_calls + MORE_CALLS if most_calls > 1 else 1)
-    questions = [Question.of(truth, _name(index)) for index, truth in truths.items()]
+    jumps, given = model.config.jumps, model.config.given_frames
+    most_calls += MORE_CALLS if most_calls > 1 else 0
+    frames = [frames_asked(truth.num_frames) if jumps else np.arange(given, truth.num_frames) for truth in truths]
+    questions = [
+        Question.of(truth, f"valid/{index:06d}", asked.tolist() if jumps else None)
+        for index, truth, asked in zip(indices, truths, frames, strict=True)
+    ]
+    if jumps:
+        ways = calls(model, questions, Effort(most_calls - 1))
+        predicted = [(way, ()) if isinstance(way, str) else (None, way.position) for way in ways]
+    else:
+        answers = rollouts(model, questions, progress)
+        predicted = [(a.failure, () if a.failure else a.position[None, given:]) for a in answers]
     found = []
-    for (index, truth), answer in zip(truths.items(), rollouts(model, questions, progress), strict=True):
-        after = slice(answer.given, None)
-        errors = [] if answer.failure else [_motion_error(answer.position[after], truth, after)]
-        hold = _motion_error(truth.position[answer.given - 1], truth, after)
-        found.append(Validated(index, errors, hold, answer.failure))
-    return found
-
-
-def _validate_jumps(model: Simulator, truths: dict[int, Trajectory], most_calls: int) -> list[Validated]:
-    frames = {index: frames_asked(truth.num_frames) for index, truth in truths.items()}
-    questions = [Question.of(truth, _name(index), frames[index].tolist()) for index, truth in truths.items()]
-    found = []
-    for (index, truth), after in zip(truths.items(), calls(model, questions, Effort(most_calls - 1)), strict=True):
-        failure = after if isinstance(after, str) else None
-        positions = () if isinstance(after, str) else after.position
-        errors = [_motion_error(position, truth, frames[index]) for position in positions]
-        hold = _motion_error(truth.position[0], truth, frames[index])
+    for index, truth, asked, (failure, positions) in zip(indices, truths, frames, predicted, strict=True):
+        errors = [_motion_error(position, truth, asked) for position in positions]
+        hold = _motion_error(truth.position[given - 1], truth, asked)
         efforts = None
-        if failure is None and index < EFFORT_SCENES:
+        if jumps and failure is None and index < EFFORT_SCENES:
             steps = MOST_NEWTON_STEPS if knows_material(model.config) else 0
             efforts = errors_by_effort(model, truth, Effort(max(0, most_calls - MORE_CALLS - 1), steps))
         found.append(Validated(index, errors, hold, failure, efforts))
@@ -108,11 +105,12 @@ def verdict(found: list[Validated], best: float, unit: str) -> tuple[dict[str, A
     record: dict[str, Any] = {"valid_rmse": error, "valid_hold_still": hold}
     measured = [scene.efforts for scene in found if scene.efforts is not None]
     if measured:
-        by_effort, stress_by_effort, steps, unsettled = means = np.mean(measured, axis=0)
+        means = np.mean(measured, axis=0)
+        by_effort = means[0]
         if by_effort.shape[1] > 1:
             effort = cheapest_good(means)
-        record["valid_by_effort"], record["valid_stress_by_effort"] = _as_lists(by_effort), _as_lists(stress_by_effort)
-        record["valid_newton_steps"], record["valid_unsettled"] = _as_lists(steps), _as_lists(unsettled)
+        keys = ("valid_by_effort", "valid_stress_by_effort", "valid_newton_steps", "valid_unsettled")
+        record |= zip(keys, np.where(np.isnan(means), None, means).tolist(), strict=True)  # JSON has no NaN
         if effort.corrections < len(by_effort) and not np.isnan(by_effort[effort]):
             text += f"; at the deepest frame {100 * by_effort[effort]:.2g} % of the displacement after {effort.text}"
     if len(by_calls) > 1 or measured:
@@ -120,20 +118,11 @@ def verdict(found: list[Validated], best: float, unit: str) -> tuple[dict[str, A
     return record, text
 
 
-def _as_lists(errors: np.ndarray) -> list[list[float | None]]:
-    """For JSON, which has no NaN."""
-    return [[None if np.isnan(error) else float(error) for error in row] for row in errors]
-
-
 def _corrections(by_calls: list[float]) -> int:
     """The number of corrections after which no further call lowers the error by more than `ENOUGH`."""
     return next(i for i, error in enumerate(by_calls) if min(by_calls[i:]) >= (1 - ENOUGH) * error)
 
 
-def _name(index: int) -> str:
-    return f"valid/{index:06d}"
-
-
-def _motion_error(position: np.ndarray, truth: Trajectory, frames: slice | np.ndarray) -> SquaredError:
+def _motion_error(position: np.ndarray, truth: Trajectory, frames: np.ndarray) -> SquaredError:
     """Error on NORMAL nodes of `position` [S, N, 3] in these S frames of the truth; or [N, 3] for all."""
     return SquaredError.between(position, truth.position[frames], ~truth.scene.prescribed)
