@@ -79,10 +79,8 @@ def convert(args: argparse.Namespace) -> None:
     from ast_sim.importers.deepmind import is_deepmind
     from ast_sim.importers.vtu import FieldNames
 
-    if args.out.suffix != ".h5":
-        raise ConfigError(f"--out {args.out}: the name of a dataset must end in .h5")
     read = args.source.rglob("*") if args.source.is_dir() else [args.source]
-    _check_output(args, args.out, (path for path in read if path.suffix != ".h5"))
+    _check_output(args, args.out, (path for path in read if path.suffix != ".h5"), "a dataset", ".h5")
     if is_deepmind(args.source):
         _refuse(args, args.of_series, f"{args.source}: its meta.json has the facts")
         options = {"splits": args.split, "limit": args.limit, "every": args.every}
@@ -110,8 +108,12 @@ def _refuse(args: argparse.Namespace, groups: tuple[Any, ...], what: str) -> Non
             raise ConfigError(f"{action.option_strings[0]} has no meaning for {what}")
 
 
-def _check_output(args: argparse.Namespace, out: Path, inputs: Iterable[Path]) -> None:
-    """Raise ConfigError if the output is an input, lies in a run, or exists and --overwrite was not given."""
+def _check_output(args: argparse.Namespace, out: Path, inputs: Iterable[Path], what: str = "", *suffixes: str) -> None:
+    """Raise ConfigError if the name of the output does not end as that of `what` must, or if the output is an input,
+    lies in a run, or exists and --overwrite was not given."""
+    if suffixes and out.suffix not in suffixes:
+        one_of = "one of " if len(suffixes) > 1 else ""
+        raise ConfigError(f"--out {out}: the name of {what} must end in {one_of}{', '.join(suffixes)}")
     output_file(out)
     real = Path(os.path.realpath(out))
     for folder in real.parents:
@@ -163,18 +165,14 @@ def train(args: argparse.Namespace) -> None:
 
 def predict(args: argparse.Namespace) -> None:
     """`ast-sim predict`."""
-    from ast_sim import keep_memory
     from ast_sim.inference.answer import SUFFIXES
-    from ast_sim.inference.trained_run import Run
     from ast_sim.prescribed_motion import parse_move
 
-    if args.out.suffix not in SUFFIXES:
-        raise ConfigError(f"--out {args.out}: the name of a prediction must end in one of {', '.join(SUFFIXES)}")
-    _check_output(args, args.out, [args.scene])
-    keep_memory()
-    moves, run = dict(map(parse_move, args.move)), Run(args.run_folder)
+    _check_output(args, args.out, [args.scene], "a prediction", *SUFFIXES)
+    moves, run = dict(map(parse_move, args.move)), _open_run(args.run_folder)
+    effort = {"frames": args.frames, "corrections": args.corrections, "newton_steps": args.newton_steps}
     if args.scene.suffix == ".toml":
-        _predict_spec(run, args)
+        _predict_spec(run, args, effort)
         return
     _refuse(args, args.of_spec, f"{args.scene}, which is no specification")
     if args.scene.suffix == ".h5":
@@ -184,7 +182,6 @@ def predict(args: argparse.Namespace) -> None:
     else:
         _refuse(args, args.of_data, f"{args.scene}, which is a mesh")
         truth, name = None, str(args.scene)
-    effort = {"frames": args.frames, "corrections": args.corrections, "newton_steps": args.newton_steps}
     if truth is not None and not moves:
         answer = run.predict(truth, num_frames=args.num_frames, name=name, **effort)
     else:
@@ -193,7 +190,7 @@ def predict(args: argparse.Namespace) -> None:
     _save(answer, args, truth)
 
 
-def _predict_spec(run: Any, args: argparse.Namespace) -> None:
+def _predict_spec(run: Any, args: argparse.Namespace, effort: dict[str, Any]) -> None:
     """`ast-sim predict RUN SPEC.toml`."""
     from ast_sim.simulate.own_assembly.grid import grid, parse_setting
 
@@ -204,32 +201,23 @@ def _predict_spec(run: Any, args: argparse.Namespace) -> None:
     rows = grid(dict(map(parse_setting, args.set)))
     if len(rows) > 1:
         raise ConfigError("--set gives several values: ast-sim sweep predicts them all")
-    effort = {"frames": args.frames, "corrections": args.corrections, "newton_steps": args.newton_steps}
     asked = {"nodes": args.nodes, "num_frames": args.num_frames, "name": str(args.scene)}
     answer = run.predict(spec=args.scene, **asked, **effort, **rows[0])
     _save(answer, args, None)
+    units = {"travel_of_nodes": run.scope.length_unit, "reaction": "N", "largest_stress": "Pa"}
     for frame, row in zip(answer.frames, answer.figures(answer.source["origin"]), strict=True):
-        parts = [f"{name} {row[name]:.4g} {unit}" for name, unit in _units(run) if name in row]
+        parts = [f"{name} {row[name]:.4g} {unit}" for name, unit in units.items() if name in row]
         print(f"frame {frame}: {', '.join(parts)}")
-
-
-def _units(run: Any) -> tuple[tuple[str, str], ...]:
-    return (("travel_of_nodes", run.scope.length_unit), ("reaction", "N"), ("largest_stress", "Pa"))
 
 
 def sweep(args: argparse.Namespace) -> None:
     """`ast-sim sweep`."""
-    from ast_sim import keep_memory
-    from ast_sim.inference.trained_run import Run
     from ast_sim.simulate.own_assembly.grid import parse_setting
 
-    if args.out.suffix != ".csv":
-        raise ConfigError(f"--out {args.out}: the name of a table must end in .csv")
     picture = args.out.with_suffix(".png")
-    for out in (args.out, picture):
-        _check_output(args, out, [args.spec, *filter(None, [args.table])])
-    keep_memory()
-    run, values = Run(args.run_folder), dict(map(parse_setting, args.set))
+    for out, what, suffix in ((args.out, "a table", ".csv"), (picture, "a picture", ".png")):
+        _check_output(args, out, [args.spec, *filter(None, [args.table])], what, suffix)
+    run, values = _open_run(args.run_folder), dict(map(parse_setting, args.set))
     effort = {"corrections": args.corrections, "newton_steps": args.newton_steps}
     found = run.sweep(args.spec, table=args.table, nodes=args.nodes, **effort, **values)
     found.save(args.out)
@@ -283,17 +271,20 @@ def _scene(args: argparse.Namespace) -> Any:
     return found.scene
 
 
+def _open_run(folder: Path) -> Any:
+    from ast_sim import Run, keep_memory
+
+    keep_memory()
+    return Run(folder)
+
+
 def evaluate(args: argparse.Namespace) -> None:
     """`ast-sim evaluate`."""
-    from ast_sim import keep_memory
-    from ast_sim.inference.trained_run import Run
-
     if args.out is not None:
         _check_output(args, args.out, [args.data])
         if args.out.suffix != ".json":
             raise ConfigError(f"--out {args.out}: the name of a file of figures must end in .json")
-    keep_memory()
-    found = Run(args.run_folder).evaluate(args.data, args.split, args.command_line, args.rivals)
+    found = _open_run(args.run_folder).evaluate(args.data, args.split, args.command_line, args.rivals)
     print(found)
     if args.out is not None:
         found.save(args.out)
@@ -321,10 +312,8 @@ def report(args: argparse.Namespace) -> None:
 
         gallery.write(args.out, datasets[0])
     else:
-        from ast_sim import keep_memory
-        from ast_sim.inference.trained_run import Run, report_evaluations
+        from ast_sim.inference.trained_run import report_evaluations
 
-        keep_memory()
-        found = [Run(folder).evaluate(args.data, command=args.command_line) for folder in args.shown]
+        found = [_open_run(folder).evaluate(args.data, command=args.command_line) for folder in args.shown]
         report_evaluations(args.out, found, "Learned simulation: predictions and errors")
     print(f"report: {args.out}")

@@ -53,15 +53,15 @@ def demo(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
     data, run_folder = out / "data.h5", out / "run"
 
     _announce(1, f"simulating {size.train + size.valid + size.test} plates with the contact FEM")
-    counts = {"train": size.train, "valid": size.valid, "test": size.test}
-    generate(FAMILY, data, **counts, seed=seed, nodes=NODES, frames=FRAMES)
+    generate(FAMILY, data, train=size.train, valid=size.valid, test=size.test, seed=seed, nodes=NODES, frames=FRAMES)
 
     _announce(2, "training")
     # A plate mirrored along x or y is as likely as the plate itself; a plate that is turned over (z) never occurs.
     run = train(data, run_folder, steps=size.steps, seed=seed, mirror=("x", "y"), resume=True)
 
     _announce(3, f"predicting the {size.test} test scenes, which the model has not seen")
-    evaluation = run.evaluate(data, command=_command(out, quick, seed), rival_scenes=RIVALS)
+    command = shlex.join(["ast-sim", "demo", "--out", str(out), *(["--quick"] if quick else []), "--seed", str(seed)])
+    evaluation = run.evaluate(data, command=command, rival_scenes=RIVALS)
     evaluation.save(out / "evaluation.json")
     found = evaluation.figures
     _announce(4, "writing the report")
@@ -76,10 +76,6 @@ def demo(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
     print(f"run         {run_folder}")
     print(f"in all {duration(time.perf_counter() - started)}", flush=True)
     return found
-
-
-def _command(out: Path, quick: bool, seed: int) -> str:
-    return shlex.join(["ast-sim", "demo", "--out", str(out), *(["--quick"] if quick else []), "--seed", str(seed)])
 
 
 def _announce(number: int, text: str) -> None:
@@ -103,11 +99,7 @@ def headlines(found: dict[str, Any]) -> list[str]:
         ("displacement", "normal", found["length_unit"], "hold_still", "that of holding still"),
         ("stress", "deforming", found["stress_unit"], "stress_frame_mean", "that of each frame's true mean"),
     ):
-        errors = {
-            name: found["summary"].get(name, {}).get(quantity, {}).get("rollout_all", {}).get(nodes, {})
-            for name in ("model", trivial)
-        }
-        model, reference = (errors[name].get("rmse_sequence") for name in ("model", trivial))
+        model, reference = (_error(found["summary"], name, quantity, nodes) for name in ("model", trivial))
         if model is not None and reference:
             lines.append(
                 f"{quantity} error over whole rollouts: {model:.3g} {unit}, {100 * model / reference:.0f} % of {words}"
@@ -115,3 +107,10 @@ def headlines(found: dict[str, Any]) -> list[str]:
     if found["failures"]:
         lines.append(f"{found['failures']} of {len(found['samples'])} rollouts failed")
     return lines + asked_frame.lines(found["asked"])
+
+
+def _error(summary: dict[str, Any], name: str, quantity: str, nodes: str) -> float | None:
+    """The error of a predictor over whole rollouts; None if it predicts no such quantity."""
+    for key in (name, quantity, "rollout_all", nodes):
+        summary = summary.get(key, {})
+    return summary.get("rmse_sequence")
