@@ -20,53 +20,55 @@ from ast_sim.support.errors import AstSimError, ConfigError, printable
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that reports wrong arguments in one line."""
+    """A parser that reports wrong arguments in one line. Its help ends with the lines that `more` makes when it is
+    printed, since what they tell of takes time to import."""
+
+    more: Callable[[], list[str]] = list
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {printable(message)} (see {self.prog} --help)\n")
 
-
-class _TrainParser(_Parser):
-    """A parser whose help ends with all settings for `--set`; they are imported only when the help is printed."""
-
     def format_help(self) -> str:
-        from ast_sim.models.registry import find_model, find_preset, model_names
-        from ast_sim.runs.train_config import TrainConfig
-        from ast_sim.support.toml_settings import settings
-
-        usual = find_preset("ast", "tiny").train
-        lines = [super().format_help(), "settings for --set, and their values in the preset tiny (none: unset):"]
-        lines += ["", "training (of ast; other models list what differs):", *self._lines("train.", TrainConfig, usual)]
-        for name in model_names():
-            try:
-                model, tiny = find_model(name), find_preset(name, "tiny")
-            except ConfigError as error:
-                lines += ["", str(error)]
-                continue
-            own, common = ({s.key: s.default for s in settings(TrainConfig, train)} for train in (tiny.train, usual))
-            lines += ["", f"{name}, presets {', '.join(model.presets)}:"]
-            lines += [f"  train.{key}={value}  (in tiny)" for key, value in own.items() if value != common[key]]
-            lines += self._lines("model.", model.config, vars(tiny.model))
-        return "\n".join(lines) + "\n"
-
-    @staticmethod
-    def _lines(prefix: str, kind: type, values: Mapping[str, Any]) -> list[str]:
-        from ast_sim.support.toml_settings import settings
-
-        return [f"  {prefix}{s.key}={s.default}  ({s.type})\n        {s.help}" for s in settings(kind, values)]
+        return super().format_help() + "".join(f"{line}\n" for line in self.more())
 
 
-class _GenerateParser(_Parser):
-    """A parser whose help ends with a line about each family."""
+def _all_settings() -> list[str]:
+    """All settings for `train --set`."""
+    from ast_sim.models.registry import find_model, find_preset, model_names
+    from ast_sim.runs.train_config import TrainConfig
+    from ast_sim.support.toml_settings import settings
 
-    def format_help(self) -> str:
-        from ast_sim.simulate.families.names import FAMILIES
+    usual = find_preset("ast", "tiny").train
+    lines = ["", "settings for --set, and their values in the preset tiny (none: unset):"]
+    lines += ["", "training (of ast; other models list what differs):", *_settings("train.", TrainConfig, usual)]
+    for name in model_names():
+        try:
+            model, tiny = find_model(name), find_preset(name, "tiny")
+        except ConfigError as error:
+            lines += ["", str(error)]
+            continue
+        own, common = ({s.key: s.default for s in settings(TrainConfig, train)} for train in (tiny.train, usual))
+        lines += ["", f"{name}, presets {', '.join(model.presets)}:"]
+        lines += [f"  train.{key}={value}  (in tiny)" for key, value in own.items() if value != common[key]]
+        lines += _settings("model.", model.config, vars(tiny.model))
+    return lines
 
-        lines = [super().format_help(), "families:"]
-        for name, family in FAMILIES.items():
-            options = "".join(" SPEC" if option == "spec" else f" --{option}" for option in family.options)
-            lines.append(f"  {name:17}{family.about}{f' ({options.strip()})' if options else ''}")
-        return "\n".join(lines) + "\n"
+
+def _settings(prefix: str, kind: type, values: Mapping[str, Any]) -> list[str]:
+    from ast_sim.support.toml_settings import settings
+
+    return [f"  {prefix}{s.key}={s.default}  ({s.type})\n        {s.help}" for s in settings(kind, values)]
+
+
+def _families() -> list[str]:
+    """A line about each family of `generate`."""
+    from ast_sim.simulate.families.names import FAMILIES
+
+    lines = ["", "families:"]
+    for name, family in FAMILIES.items():
+        options = "".join(" SPEC" if option == "spec" else f" --{option}" for option in family.options)
+        lines.append(f"  {name:17}{family.about}{f' ({options.strip()})' if options else ''}")
+    return lines
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -78,7 +80,7 @@ def main(argv: list[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="backslashreplace")  # names of files may hold bytes that are no text
     args = build_parser().parse_args(argv)
     args.command_line = shlex.join(["ast-sim", *(sys.argv[1:] if argv is None else argv)])
-    warnings.showwarning = _show_warning
+    warnings.showwarning = lambda message, *_: _tell("warning", message)
     try:
         args.run(args)
         sys.stdout.flush()
@@ -97,12 +99,12 @@ def main(argv: list[str] | None = None) -> int:
     except (AstSimError, OSError) as error:
         if args.debug:
             raise
-        print(f"ast-sim {args.command}: {printable(' '.join(str(error).split()))}", file=sys.stderr)
+        _tell(f"ast-sim {args.command}", error)
         return 2
 
 
-def _show_warning(message: Warning | str, *_: Any) -> None:
-    print(f"warning: {printable(' '.join(str(message).split()))}", file=sys.stderr)
+def _tell(what: str, message: object) -> None:
+    print(f"{what}: {printable(' '.join(str(message).split()))}", file=sys.stderr)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -111,26 +113,22 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"ast_sim {__version__}")
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def add(fill: Callable[[_Parser], None], run: Any, about: str, kind: type[_Parser] = _Parser) -> None:
-        subparsers._parser_class = kind
-        name = fill.__name__.removeprefix("_add_")
-        sub = subparsers.add_parser(name, help=about, description=about[0].upper() + about[1:] + ".")
+    def add(fill: Callable[[_Parser], None], run: Callable[[argparse.Namespace], None]) -> None:
+        about = run.__doc__ or ""
+        sub = subparsers.add_parser(run.__name__, help=about[:1].lower() + about[1:-1], description=about)
         sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
         sub.set_defaults(run=run)
         fill(sub)
 
-    add(_add_demo, commands.demo, "simulate some plates, train on them, predict other plates, write a report")
-    about = "simulate scenes with the bundled contact solver; a second call resumes a stopped one"
-    add(_add_generate, commands.generate, about, _GenerateParser)
-    add(
-        _add_convert, commands.convert, "make a dataset from simulations of other programs (PVD, VTU, VTKHDF, TFRecord)"
-    )
-    add(_add_info, commands.info, "check a dataset or a run and show what it holds")
-    add(_add_train, commands.train, "train a model on a dataset", _TrainParser)
-    add(_add_predict, commands.predict, "predict a new scene from a mesh or a specification, or a scene of a dataset")
-    add(_add_sweep, commands.sweep, "predict an assembly for many values of its parameters: a table and a picture")
-    add(_add_evaluate, commands.evaluate, "measure the errors and the speed of a run on a dataset")
-    add(_add_report, commands.report, "write a page that shows runs (moving scenes, errors), or a dataset")
+    add(_add_demo, commands.demo)
+    add(_add_generate, commands.generate)
+    add(_add_convert, commands.convert)
+    add(_add_info, commands.info)
+    add(_add_train, commands.train)
+    add(_add_predict, commands.predict)
+    add(_add_sweep, commands.sweep)
+    add(_add_evaluate, commands.evaluate)
+    add(_add_report, commands.report)
     return parser
 
 
@@ -139,6 +137,11 @@ def _add_each(to: Any, options: Mapping[str, str], **shared: Any) -> None:
     for option, text in options.items():
         name, metavar = option.split()
         to.add_argument(name, metavar=metavar, help=text, **shared)
+
+
+def _add_out(to: _Parser, metavar: str, about: str, required: bool = True) -> None:
+    to.add_argument("--out", type=_path, metavar=metavar, required=required, help=about)
+    _add_overwrite(to)
 
 
 def _add_overwrite(to: _Parser) -> None:
@@ -152,6 +155,7 @@ def _add_demo(demo: _Parser) -> None:
 
 
 def _add_generate(generate: _Parser) -> None:
+    generate.more = _families
     generate.add_argument("family", metavar="FAMILY", help="kind of scenes; the list is below")
     about = "specification of an assembly (.toml), for the family assembly"
     generate.add_argument("spec", type=_path, nargs="?", metavar="SPEC", help=about)
@@ -185,8 +189,7 @@ def _add_convert(convert: _Parser) -> None:
         " folder of meta.json and .tfrecord files"
     )
     convert.add_argument("source", type=_path, metavar="SOURCE", help=about)
-    _add_each(convert, {"--out FILE": "dataset to write (.h5)"}, type=_path, required=True)
-    _add_overwrite(convert)
+    _add_out(convert, "FILE", "dataset to write (.h5)")
     fields = convert.add_argument_group("names of the fields in .vtu and .vtkhdf files")
     names = {
         "--displacement NAME": "point field, displacement from rest; if there is none, the points themselves move",
@@ -223,6 +226,7 @@ def _add_info(info: _Parser) -> None:
 
 
 def _add_train(train: _Parser) -> None:
+    train.more = _all_settings
     train.add_argument("data", metavar="DATA", nargs="?", type=_path, help="dataset; may be left out with --resume")
     _add_each(train, {"--out RUN": "run folder"}, type=_path, required=True)
     _add_each(train, {"--model M": "name of the model; the list is below (default: ast)"})
@@ -241,10 +245,7 @@ def _add_predict(predict: _Parser) -> None:
     predict.add_argument("run_folder", type=_path, metavar="RUN", help="run folder")
     about = "a mesh (.vtu, .msh, .inp, .stl, ...), a dataset (.h5), or the specification of an assembly (.toml)"
     predict.add_argument("scene", type=_path, metavar="SCENE", help=about)
-    _add_each(
-        predict, {"--out FILE": "file to write: .h5, .pvd or .vtkhdf for ParaView, or .csv"}, type=_path, required=True
-    )
-    _add_overwrite(predict)
+    _add_out(predict, "FILE", "file to write: .h5, .pvd or .vtkhdf for ParaView, or .csv")
     moves = {
         "--move BODY=MOTION": 'motion of the prescribed nodes of a body: a translation "1=0,0,-0.01", a path'
         ' "1=0,0,-0.01 then 0.02,0,-0.01", or a rotation "1=rotate 30 about 0,0,1 at 0,0,0"; may be repeated'
@@ -252,13 +253,13 @@ def _add_predict(predict: _Parser) -> None:
     _add_each(predict, moves, action="append", default=[])
     about = "frames that are wanted, such as --frames=-1 for the last one or --frames 5,10,20 (default: all)"
     _add_each(predict, {"--frames I,...": about}, type=_whole_numbers)
-    about = "calls that correct the first one, if the run jumps to a frame (default: as its validation has decided)"
-    _add_each(predict, {"--corrections N": about}, type=_at_least(0))
-    about = (
-        "at most so many Newton steps of the solver after them, until one is small (default: likewise; 0 with"
-        " --corrections)"
-    )
-    _add_each(predict, {"--newton-steps N": about}, type=_at_least(0))
+    efforts = {
+        "--corrections N": "calls that correct the first one, if the run jumps to a frame (default: as its validation"
+        " has decided)",
+        "--newton-steps N": "at most so many Newton steps of the solver after them, until one is small (default:"
+        " likewise; 0 with --corrections)",
+    }
+    _add_each(predict, efforts, type=_at_least(0))
     about = "number of frames of the motion (default: prescribed nodes move as far in a frame as in training)"
     _add_each(predict, {"--num-frames N": about}, type=_at_least(2))
     mesh = predict.add_argument_group("if SCENE is a mesh")
@@ -287,9 +288,7 @@ def _add_predict(predict: _Parser) -> None:
 def _add_sweep(sweep: _Parser) -> None:
     sweep.add_argument("run_folder", type=_path, metavar="RUN", help="run folder")
     sweep.add_argument("spec", type=_path, metavar="SPEC", help="specification of the assembly (.toml)")
-    about = "table to write (.csv); a picture with the same name is written beside it (.png)"
-    _add_each(sweep, {"--out FILE": about}, type=_path, required=True)
-    _add_overwrite(sweep)
+    _add_out(sweep, "FILE", "table to write (.csv); a picture with the same name is written beside it (.png)")
     about = "values of a parameter: travel=1:7:13 (from, to, how many), young=1e6,2e6; may be repeated: a grid"
     _add_each(sweep, {"--set NAME=VALUES": about}, action="append", default=[])
     _add_each(sweep, {"--table FILE": "instead of --set, a CSV file whose first line names parameters"}, type=_path)
@@ -305,8 +304,7 @@ def _add_evaluate(evaluate: _Parser) -> None:
     evaluate.add_argument("--split", choices=commands.SPLITS, default="test", help="split (default: test)")
     about = "scenes in which the solver solves the deepest frame, to compare (default: 3; 0: none)"
     _add_each(evaluate, {"--rivals N": about}, type=_at_least(0), default=3)
-    _add_each(evaluate, {"--out FILE.json": "also write all figures to this file"}, type=_path)
-    _add_overwrite(evaluate)
+    _add_out(evaluate, "FILE.json", "also write all figures to this file", required=False)
 
 
 def _add_report(report: _Parser) -> None:

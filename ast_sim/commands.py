@@ -1,4 +1,4 @@
-"""The commands of `ast-sim`: each calls the API and prints the result.
+"""The commands of `ast-sim`: each calls the API and prints the result. Its help begins with its docstring.
 
 A command imports what it needs when it runs, so that `ast-sim --help` is fast.
 """
@@ -20,7 +20,7 @@ SPLITS = ("train", "valid", "test")
 
 
 def demo(args: argparse.Namespace) -> None:
-    """`ast-sim demo`."""
+    """Simulate some plates, train on them, predict other plates, write a report."""
     from ast_sim import keep_memory
     from ast_sim.demo import demo as run_demo
 
@@ -29,7 +29,7 @@ def demo(args: argparse.Namespace) -> None:
 
 
 def generate(args: argparse.Namespace) -> None:
-    """`ast-sim generate`."""
+    """Simulate scenes with the bundled contact solver; a second call resumes a stopped one."""
     from ast_sim.simulate.jobs.generate import generate as simulate
 
     if args.look:
@@ -74,7 +74,7 @@ def _counts(counts: dict[str, int]) -> str:
 
 
 def convert(args: argparse.Namespace) -> None:
-    """`ast-sim convert`."""
+    """Make a dataset from simulations of other programs (PVD, VTU, VTKHDF, TFRecord)."""
     from ast_sim.importers.convert import convert as import_files
     from ast_sim.importers.deepmind import is_deepmind
     from ast_sim.importers.vtu import FieldNames
@@ -130,7 +130,7 @@ def _check_output(args: argparse.Namespace, out: Path, inputs: Iterable[Path], w
 
 
 def info(args: argparse.Namespace) -> None:
-    """`ast-sim info`."""
+    """Check a dataset or a run and show what it holds."""
     from ast_sim.dataset.contents import describe_dataset, text
 
     if args.path.is_dir():
@@ -143,7 +143,7 @@ def info(args: argparse.Namespace) -> None:
 
 
 def train(args: argparse.Namespace) -> None:
-    """`ast-sim train`."""
+    """Train a model on a dataset."""
     from ast_sim import keep_memory
     from ast_sim.training.start import configure, start_training
 
@@ -164,7 +164,7 @@ def train(args: argparse.Namespace) -> None:
 
 
 def predict(args: argparse.Namespace) -> None:
-    """`ast-sim predict`."""
+    """Predict a new scene from a mesh or a specification, or a scene of a dataset."""
     from ast_sim.inference.answer import SUFFIXES
     from ast_sim.prescribed_motion import parse_move
 
@@ -211,7 +211,7 @@ def _predict_spec(run: Any, args: argparse.Namespace, effort: dict[str, Any]) ->
 
 
 def sweep(args: argparse.Namespace) -> None:
-    """`ast-sim sweep`."""
+    """Predict an assembly for many values of its parameters: a table and a picture."""
     from ast_sim.simulate.own_assembly.grid import parse_setting
 
     picture = args.out.with_suffix(".png")
@@ -279,7 +279,7 @@ def _open_run(folder: Path) -> Any:
 
 
 def evaluate(args: argparse.Namespace) -> None:
-    """`ast-sim evaluate`."""
+    """Measure the errors and the speed of a run on a dataset."""
     if args.out is not None:
         _check_output(args, args.out, [args.data])
         if args.out.suffix != ".json":
@@ -292,7 +292,7 @@ def evaluate(args: argparse.Namespace) -> None:
 
 
 def report(args: argparse.Namespace) -> None:
-    """`ast-sim report`."""
+    """Write a page that shows runs (moving scenes, errors), or a dataset."""
     from ast_sim.view.page import check_suffix
 
     check_suffix(args.out)
