@@ -57,7 +57,7 @@ class Pair:
     error_after: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Jump:
     """Two frames of a trajectory, the later of which is predicted at once, and how they are mirrored and moved.
 

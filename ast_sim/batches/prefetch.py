@@ -6,8 +6,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 from ast_sim.batches.batch_builder import Batch, Target
 from ast_sim.batches.pairs import PairSampler
-from ast_sim.batches.training_jumps import JumpPool
-from ast_sim.batches.training_rollouts import RolloutPool
+from ast_sim.batches.training_pool import Pool
 
 
 class Ahead:
@@ -17,7 +16,7 @@ class Ahead:
     manager. An error in making a batch is raised when that batch is asked for.
     """
 
-    def __init__(self, sampler: PairSampler | RolloutPool | JumpPool) -> None:
+    def __init__(self, sampler: PairSampler | Pool) -> None:
         self._sampler = sampler
         self._thread = ThreadPoolExecutor(1, "sampler")
         self._next: dict[int, Future[tuple[Batch, Target]]] = {}

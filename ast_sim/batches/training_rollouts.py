@@ -16,16 +16,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from ast_sim.batches.batch_builder import Batch, Target
 from ast_sim.batches.mirror_and_shift import Placement
-from ast_sim.batches.pairs import Pair, PairSampler
+from ast_sim.batches.pairs import Pair
+from ast_sim.batches.training_pool import Pool
 
 SHARE = np.float32(1 / 3)  # share of the white noise that is added in each step of a rollout
-# The order, the scenes and their steps draw from separate sequences of random numbers, apart from the sampler's.
-_ORDER, _SCENE, _NOISE = 10, 11, 12
+_NOISE = 12  # the noise draws from a sequence of random numbers of its own
 
 
 @dataclass(eq=False)
@@ -45,88 +42,27 @@ class _Rolling:
     pair: Pair | None = None
 
 
-class RolloutPool:
-    """Training scenes that are rolled out side by side. The pool has `size` places, and batches take them in turn.
+class RolloutPool(Pool):
+    """Training scenes that are rolled out side by side; see `Pool` for the arguments.
 
-    A scene starts at its first frame, and another scene follows it after its last frame, each about equally often. Only
-    the first scene at each place starts at a random frame, so that all frames occur equally often from the beginning.
-    A scene whose error is too large to learn from goes on from the true state with white noise, as without a pool. The
-    seed determines all random choices.
-
-    `batch` may be called ahead of `advance` if the two calls concern different places.
-
-    Args:
-        sampler: reads and assembles frames. Its batch size, seed, noise, gamma and part hold for the pool too.
-        size: how many scenes; a multiple of the batch size.
-        largest: a state with a root mean square error above this, in the unit of length, is too wrong to learn from.
+    A scene starts at its first frame, and another scene follows it after its last frame. Only the first scene at each
+    place starts at a random frame, so that all frames occur equally often from the beginning. A scene whose error is
+    too large to learn from goes on from the true state with white noise, as without a pool. The sampler's noise and
+    gamma hold for the pool too.
     """
 
-    def __init__(self, sampler: PairSampler, size: int, largest: float) -> None:
-        self._sampler, self._size, self._batches = sampler, size, size // sampler.batch_size
-        self._largest = largest
-        self._begun: dict[int, int] = {}
-        self._rolling: dict[int, _Rolling] = {}
+    streams = (10, 11)
+    kept = ("t", "error", "error_before")
 
-    def batch(self, number: int) -> tuple[Batch, Target]:
-        """The current states of the scenes of a batch, and the next frames in the data."""
-        return self._sampler.assemble([self._pair(place) for place in self._places(number)])
+    def _start(self, index: int, first: bool, generator: np.random.Generator) -> _Rolling:
+        earliest = self._sampler.first_frame
+        t = int(generator.integers(earliest, self._sampler.last_frame(index)))
+        placement = self._sampler.random_placement(index, generator)
+        if first:
+            return _Rolling(index, t, placement, None)
+        return _Rolling(index, earliest, placement, np.zeros((self._sampler.num_nodes(index), 3), np.float32))
 
-    def errors(self, number: int, target: Target) -> list[tuple[int, float]]:
-        """None are needed: every scene counts as much; see `JumpPool`."""
-        return []
-
-    def weights(self, number: int, errors: list[tuple[int, float]]) -> None:
-        """None: every scene counts as much."""
-
-    def advance(self, number: int, residual: Tensor) -> None:
-        """Move the scenes of a batch one frame on.
-
-        Args:
-            number: of the batch.
-            residual: [N, 3], `Simulator.residual` of the batch.
-        """
-        first = 0
-        for place in self._places(number):
-            scene = self._rolling[place]
-            rows = residual[first : first + self._sampler.num_nodes(scene.index)]
-            first += len(rows)
-            scene.t += 1
-            if scene.t == self._sampler.last_frame(scene.index):
-                del self._rolling[place]
-            else:
-                # The residual counts from the target, which has an error of its own.
-                error = scene.placement.vectors(rows).numpy() + scene.pair.error_after
-                lost = np.sqrt(np.mean(np.square(error, dtype=np.float64))) > self._largest
-                before = scene.pair.error if self._sampler.dynamic else None
-                scene.error, scene.error_before = (None, None) if lost else (error, before)
-
-    def state(self) -> dict[str, Tensor]:
-        """The state of all scenes, for `restore`."""
-        found = {f"{place}.begun": torch.tensor(count) for place, count in self._begun.items()}
-        for place, scene in self._rolling.items():
-            kept = {"t": scene.t, "error": scene.error, "error_before": scene.error_before}
-            found |= {f"{place}.{key}": torch.as_tensor(value) for key, value in kept.items() if value is not None}
-        return found
-
-    def restore(self, state: dict[str, Tensor]) -> None:
-        """Take over what `state` returned, of this part of the batches or of all parts together."""
-        own = [place for i in range(self._batches) for place in self._places(i) if f"{place}.begun" in state]
-        self._begun = {place: int(state[f"{place}.begun"]) for place in own}
-        self._rolling = {place: self._drawn(place) for place in own if f"{place}.t" in state}
-        for place, scene in self._rolling.items():
-            scene.t = int(state[f"{place}.t"])
-            errors = (state.get(f"{place}.{key}") for key in ("error", "error_before"))
-            scene.error, scene.error_before = (None if error is None else error.numpy() for error in errors)
-
-    def _places(self, number: int) -> range:
-        """The places in the pool of this part of a batch."""
-        return self._sampler.places(number % self._batches)
-
-    def _pair(self, place: int) -> Pair:
-        if place not in self._rolling:
-            self._begun[place] = self._begun.get(place, 0) + 1
-            self._rolling[place] = self._drawn(place)
-        scene = self._rolling[place]
+    def _frames(self, place: int, scene: _Rolling) -> Pair:
         generator = np.random.default_rng([self._sampler.seed, _NOISE, place, self._begun[place], scene.t])
         white = self._sampler.white_noise(scene.index, generator)
         error, after = white, self._sampler.left * white
@@ -143,16 +79,9 @@ class RolloutPool:
         before = np.float32(0) if scene.error_before is None else scene.error_before
         return 2 * left * scene.error - left**2 * before
 
-    def _drawn(self, place: int) -> _Rolling:
-        """The last scene that started at a place, as it was at the start."""
-        seed, begun = self._sampler.seed, self._begun[place]
-        scenes = self._sampler.trajectories
-        epoch, number = divmod((begun - 1) * self._size + place, len(scenes))
-        index = int(np.random.default_rng([seed, _ORDER, epoch]).permutation(scenes)[number])
-        generator = np.random.default_rng([seed, _SCENE, place, begun])
-        first = self._sampler.first_frame
-        t = int(generator.integers(first, self._sampler.last_frame(index)))
-        placement = self._sampler.random_placement(index, generator)
-        if begun == 1:
-            return _Rolling(index, t, placement, None)
-        return _Rolling(index, first, placement, np.zeros((self._sampler.num_nodes(index), 3), np.float32))
+    def _goes_on(self, scene: _Rolling, error: np.ndarray) -> bool:
+        scene.t += 1
+        error = error + scene.pair.error_after  # the residual counts from the target, which has an error of its own
+        before = scene.pair.error if self._sampler.dynamic else None
+        scene.error, scene.error_before = (None, None) if self._lost(error) else (error, before)
+        return scene.t < self._sampler.last_frame(scene.index)

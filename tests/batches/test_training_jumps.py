@@ -66,7 +66,7 @@ def test_a_jump_starts_from_a_frame_carried_along_and_then_from_the_answer_befor
             torch.testing.assert_close(position + motion, torch.tensor(truth.position[frame]), rtol=0, atol=1e-6)
             held = truth.scene.prescribed
             assert np.array_equal(position[held], truth.position[frame][held])
-            call = jumps._guesses[place].call
+            call = jumps._going[place].call
             if call:
                 assert call < CALLS and before[place][:2] == (name, call - 1)
                 torch.testing.assert_close(motion, -before[place][2], rtol=0, atol=1e-6)
@@ -114,7 +114,7 @@ def test_later_calls_count_as_much_as_the_first(dataset):
     squares = {}
     for number in range(200):
         batch, target = jumps.batch(number)
-        calls = [jumps._guesses[place].call for place in jumps._places(number)]
+        calls = [jumps._going[place].call for place in jumps._places(number)]
         for call, motion, free in zip(
             calls, scenes(batch, target.motion), scenes(batch, ~batch.graph.prescribed), strict=True
         ):

@@ -53,7 +53,7 @@ def test_from_the_file_to_the_loss(run):
         pool = JumpPool(model.pairs(dataset, "train", batch_size=4), JUMP_BATCHES * 4, run.settings.train.calls, 1.0)
         drawn, _ = pool.batch(0)
         for name, place in zip(drawn.names, range(4), strict=True):
-            jump = pool._guesses[place].jump
+            jump = pool._going[place]
             assert name == f"train/{jump.index:06d} frame {jump.frame}"
             (before,), (stress,) = dataset.frames("train", jump.index, jump.source, jump.source + 1)
             (after,), (next_stress,) = dataset.frames("train", jump.index, jump.frame, jump.frame + 1)
