@@ -35,6 +35,11 @@ class Asked:
     values: Values
     origin: list[float]
 
+    @property
+    def facts(self) -> dict[str, Any]:
+        """The attributes of an answer that tell of the assembly."""
+        return {**{f"parameter {name}": value for name, value in self.values.items()}, "origin": self.origin}
+
 
 def ask(
     spec: str | os.PathLike[str],

@@ -39,18 +39,18 @@ def answers(
     return rollouts(model, questions, progress)
 
 
-def predict(
-    model: Simulator,
+def new_question(
+    config: ModelConfig,
     scope: Scope,
     scene: Scene | Trajectory,
     motion: Motions | None,
     num_frames: int | None,
-    stress: np.ndarray | None,
     name: str,
     frames: Sequence[int] | None,
-    effort: Effort,
-) -> Answer:
-    """Predict a scene; the arguments are those of `Run.predict`, `scope` is what the model was trained on.
+    stress: np.ndarray | None = None,
+) -> Question:
+    """The question that the arguments of `Run.predict` ask, `scope` is what the model was trained on. A property of a
+    scene outside the training scenes gives a warning.
 
     Raises:
         ConfigError: the motion does not fit the scene, or the scene does not fit the model.
@@ -60,60 +60,14 @@ def predict(
             raise ConfigError(
                 f"{name} has a motion, frames and a stress of its own; for others predict its scene (--move BODY=X,Y,Z)"
             )
-        return answers(model, [Question.of(scene, name, frames)], effort)[0]
-    question = _question(model.config, scope, scene, motion, num_frames, name, frames, stress)
-    return _in_domain(model, [question], effort)[0]
-
-
-def predict_motions(
-    model: Simulator,
-    scope: Scope,
-    scene: Scene,
-    motions: Sequence[Motions],
-    num_frames: int | None,
-    name: str,
-    frames: Sequence[int] | None,
-    effort: Effort,
-) -> list[Answer]:
-    """Predict a scene under several motions as one batch; arguments and errors as for `predict`."""
-    names = [f"{name}, motion {number}" for number in range(len(motions))]
-    return predict_scenes(model, scope, [(scene, motion) for motion in motions], num_frames, names, frames, effort)
-
-
-def predict_scenes(
-    model: Simulator,
-    scope: Scope,
-    asked: Sequence[tuple[Scene, Motions]],
-    num_frames: int | None,
-    names: Sequence[str],
-    frames: Sequence[int] | None,
-    effort: Effort,
-) -> list[Answer]:
-    """Predict several scenes, each under a motion, as one batch; arguments and errors as for `predict`."""
-    questions = [
-        _question(model.config, scope, scene, motion, num_frames, name, frames, None)
-        for (scene, motion), name in zip(asked, names, strict=True)
-    ]
-    return _in_domain(model, questions, effort)
-
-
-def _question(
-    config: ModelConfig,
-    scope: Scope,
-    scene: Scene,
-    motion: Motions | None,
-    num_frames: int | None,
-    name: str,
-    wanted: Sequence[int] | None,
-    stress: np.ndarray | None,
-) -> Question:
+        return Question.of(scene, name, frames)
     scene.check(name)
     _require_material(config, scope, scene, name)
     motion = _completed(config, scope, scene, motion, num_frames, name)
     stress = _given_stress(config, scene, stress, name)
     for note in scope.notes(scene, motion, bool(config.jumps)):
-        warnings.warn(f"{name}: {note}", stacklevel=4)
-    return Question(name, scene, motion.position, stress).asking(wanted)
+        warnings.warn(f"{name}: {note}", stacklevel=3)
+    return Question(name, scene, motion.position, stress, movable=True).asking(frames)
 
 
 def _completed(
@@ -171,8 +125,8 @@ def _require_material(config: ModelConfig, scope: Scope, scene: Scene, name: str
     )
 
 
-def _in_domain(model: Simulator, questions: Sequence[Question], effort: Effort) -> list[Answer]:
-    """Predict scenes where they lie; those that leave the domain in the middle of the domain."""
+def in_domain(model: Simulator, questions: Sequence[Question], effort: Effort) -> list[Answer]:
+    """Predict scenes where they lie; those that may be moved and leave the domain in the middle of the domain."""
     shifts = [_way_into_domain(model.config, question) for question in questions]
     there = [q if shift is None else _moved_question(q, shift) for q, shift in zip(questions, shifts, strict=True)]
     found = zip(questions, shifts, answers(model, there, effort), strict=True)
@@ -194,12 +148,13 @@ def _moved_back(question: Question, answer: Answer, shift: np.ndarray) -> Answer
 
 def _way_into_domain(config: ModelConfig, question: Question) -> np.ndarray | None:
     """[3] float64: from the middle of the start and of all that is prescribed to the middle of the domain; None: both
-    lie inside the domain."""
+    lie inside the domain, or the scene stays where it is."""
     script = question.script
     known = np.concatenate([script[0], script[:, question.scene.prescribed].reshape(-1, 3)])
     lowest, highest = known.min(axis=0).astype(np.float64), known.max(axis=0).astype(np.float64)
     center = np.array(config.domain_center)
-    if max((center - lowest).max(), (highest - center).max()) <= config.domain_half_width:
+    inside = max((center - lowest).max(), (highest - center).max()) <= config.domain_half_width
+    if inside or not question.movable:
         return None
     return center - (lowest + highest) / 2
 

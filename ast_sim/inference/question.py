@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ class Question:
             nodes. Other entries are not read.
         stress: [frames, N or E, 1] float32, the stress of at least the given frames; None: zero.
         frames: the numbers of the frames that are wanted, ascending; None: all of them, the given ones too.
+        movable: the scene may be moved into the domain of the model.
     """
 
     name: str
@@ -32,6 +33,7 @@ class Question:
     script: np.ndarray
     stress: np.ndarray | None = None
     frames: tuple[int, ...] | None = None
+    movable: bool = False
 
     @classmethod
     def of(cls, truth: Trajectory, name: str, frames: Sequence[int] | None = None) -> Question:
@@ -52,8 +54,7 @@ class Question:
                 raise RolloutError(f"{self.name} has the frames 0 to {count - 1}; there is no frame {frame}")
         if not frames:
             raise RolloutError(f"{self.name}: name at least one frame")
-        wanted = tuple(sorted({frame % count for frame in frames}))
-        return Question(self.name, self.scene, self.script, self.stress, wanted)
+        return replace(self, frames=tuple(sorted({frame % count for frame in frames})))
 
     def check(self, given: int) -> None:
         """Raise RolloutError or DatasetError unless there is a frame to predict and something that can deform."""

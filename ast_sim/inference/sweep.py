@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.assembly_questions import ask
 from ast_sim.inference.effort import Effort
-from ast_sim.inference.predict import Motions
+from ast_sim.models.model_config import ModelConfig
 from ast_sim.runs.scope import Scope
-from ast_sim.runs.train_config import RunConfig
-from ast_sim.scene import Scene
 from ast_sim.simulate.mechanics.linearised_contact import STILL
 from ast_sim.support.errors import ConfigError
 from ast_sim.view import sweep_files
@@ -67,47 +65,37 @@ class Sweep:
         sweep_files.write_picture(path, self.rows, self.varied, quantity, self.length_unit)
 
 
-class Predictor(Protocol):
-    """What a sweep needs of a `Run`."""
-
-    scope: Scope
-    settings: RunConfig
-
-    def predict_scenes(
-        self,
-        asked: Sequence[tuple[Scene, Motions]],
-        names: Sequence[str],
-        frames: Sequence[int] | None = None,
-        corrections: int | None = None,
-        newton_steps: int | None = None,
-    ) -> list[Answer]: ...
-
-
 def sweep(
-    run: Predictor,
+    predict_scenes: Callable[..., list[Answer]],
+    config: ModelConfig,
+    scope: Scope,
     spec: str | os.PathLike[str],
     rows: Sequence[Mapping[str, Any]],
     effort: Effort,
     nodes: int | None,
 ) -> Sweep:
-    """Predict the last frame for each row of values; the arguments are those of `Run.sweep`.
+    """Predict the last frame for each row of values.
 
     With friction a body may be in equilibrium in two places. So the frame before is predicted, too: Newton steps from
     there find the place that the way leads to. Otherwise a model that jumps needs no frame between.
+
+    Args:
+        predict_scenes: of a `Run`.
+        config, scope: of its model, and what that was trained on.
+        spec, rows, nodes: those of `Run.sweep`.
     """
     if not rows:
         raise ConfigError("a sweep needs at least one row of values")
-    model = run.settings.model
-    needs_way = bool(model.friction and effort.newton_steps)
-    frames = 2 if model.jumps and not needs_way else None
+    needs_way = bool(config.friction and effort.newton_steps)
+    frames = 2 if config.jumps and not needs_way else None
     table, seconds, notes = [], 0.0, []
     for start in range(0, len(rows), TOGETHER):
-        asked = ask(spec, rows[start : start + TOGETHER], run.scope, frames, nodes)
+        asked = ask(spec, rows[start : start + TOGETHER], scope, frames, nodes)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             names = [f"row {start + number}" for number in range(len(asked))]
             wanted = [-2, -1] if needs_way and len(asked[0].motion.position) > 2 else [-1]
-            answers = run.predict_scenes([(one.scene, one.motion) for one in asked], names, wanted, *effort)
+            answers = predict_scenes([(one.scene, one.motion) for one in asked], names, wanted, *effort)
         notes += [str(note.message) for note in caught]
         table += [_row(one.values, answer, one.origin) for one, answer in zip(asked, answers, strict=True)]
         seconds += sum(answer.seconds for answer in answers)
@@ -116,7 +104,7 @@ def sweep(
         warnings.warn(
             f"{len(outside)} of {len(rows)} rows lie outside the training scenes; the first: {notes[0]}", stacklevel=3
         )
-    return Sweep(table, _varied(rows, table), run.scope.length_unit, seconds)
+    return Sweep(table, _varied(rows, table), scope.length_unit, seconds)
 
 
 def _row(values: Mapping[str, Any], answer: Answer, origin: Sequence[float]) -> dict[str, Any]:

@@ -18,9 +18,9 @@ from ast_sim.inference.answer import Answer
 from ast_sim.inference.assembly_questions import ask
 from ast_sim.inference.effort import Effort
 from ast_sim.inference.evaluation import evaluate, table
-from ast_sim.inference.predict import Motions, predict, predict_motions, predict_scenes
+from ast_sim.inference.predict import Motions, in_domain, new_question
+from ast_sim.inference.question import Question
 from ast_sim.inference.sweep import Sweep, sweep
-from ast_sim.prescribed_motion import Motion
 from ast_sim.runs.config_toml import read_scope
 from ast_sim.runs.folder import load_model, require_fit
 from ast_sim.runs.metrics import Metrics
@@ -121,26 +121,17 @@ class Run:
                 mistake.
             RolloutError: there is no such frame.
         """
-        effort = self._effort(corrections, newton_steps)
-        source: dict[str, Any] = {"predicted_by": str(self.path), "step": self.step, "source": name}
+        facts: dict[str, Any] = {}
         if spec is not None:
-            scene, motion, values = self._of_spec(spec, parameters, num_frames, nodes, (scene, motion, stress))
-            num_frames, source = None, source | values
+            if not (scene is None and motion is None and stress is None):
+                raise ConfigError("a specification gives the scene and the motion: leave scene, motion and stress out")
+            (asked,) = ask(spec, [parameters], self.scope, num_frames, nodes)
+            scene, motion, num_frames, facts = asked.scene, asked.motion, None, asked.facts
         elif parameters or nodes is not None or scene is None:
             unknown = next(iter(parameters), "nodes")
             raise ConfigError("give a scene" if scene is None else f"{unknown} belongs to a specification: give spec")
-        answer = predict(self.model, self.scope, scene, motion, num_frames, stress, name, frames, effort)
-        return self._signed(answer, effort, source)
-
-    def _of_spec(
-        self, spec: str | os.PathLike[str], given: dict[str, Any], frames: int | None, nodes: int | None, others: tuple
-    ) -> tuple[Scene, Motion, dict[str, Any]]:
-        """Scene, motion and origin of an assembly."""
-        if any(other is not None for other in others):
-            raise ConfigError("a specification gives the scene and the motion: leave scene, motion and stress out")
-        (asked,) = ask(spec, [given], self.scope, frames, nodes)
-        values = {f"parameter {name}": value for name, value in asked.values.items()}
-        return asked.scene, asked.motion, {**values, "origin": asked.origin}
+        question = new_question(self.settings.model, self.scope, scene, motion, num_frames, name, frames, stress)
+        return self._answers([question], corrections, newton_steps, facts)[0]
 
     def sweep(
         self,
@@ -168,7 +159,8 @@ class Run:
             raise ConfigError("a table has the values of all parameters: leave the others out, or leave the table out")
         rows = table if table is not None else grid(parameters)
         rows = rows if isinstance(rows, Sequence) and not isinstance(rows, str) else read_table(rows)
-        return sweep(self, spec, rows, self._effort(corrections, newton_steps), nodes)
+        effort = self._effort(corrections, newton_steps)
+        return sweep(self.predict_scenes, self.settings.model, self.scope, spec, rows, effort, nodes)
 
     def predict_scenes(
         self,
@@ -177,11 +169,12 @@ class Run:
         frames: Sequence[int] | None = None,
         corrections: int | None = None,
         newton_steps: int | None = None,
+        num_frames: int | None = None,
     ) -> list[Answer]:
         """Predict several scenes, each under a motion, as one batch; arguments and errors are those of `predict`."""
-        effort = self._effort(corrections, newton_steps)
-        answers = predict_scenes(self.model, self.scope, asked, None, names, frames, effort)
-        return [self._signed(answer, effort, {}) for answer in answers]
+        config, scope, named = self.settings.model, self.scope, zip(asked, names, strict=True)
+        questions = [new_question(config, scope, *pair, num_frames, name, frames) for pair, name in named]
+        return self._answers(questions, corrections, newton_steps)
 
     def predict_motions(
         self,
@@ -198,18 +191,22 @@ class Run:
 
         Arguments and errors are those of `predict`.
         """
-        effort = self._effort(corrections, newton_steps)
-        answers = predict_motions(self.model, self.scope, scene, motions, num_frames, name, frames, effort)
-        source = {"predicted_by": str(self.path), "step": self.step, "source": name}
-        return [self._signed(answer, effort, source) for answer in answers]
+        names = [f"{name}, motion {number}" for number in range(len(motions))]
+        asked = [(scene, motion) for motion in motions]
+        return self.predict_scenes(asked, names, frames, corrections, newton_steps, num_frames)
 
-    def _signed(self, answer: Answer, effort: Effort, source: dict[str, Any]) -> Answer:
-        """The answer with its units, its origin and the error that is to be expected."""
+    def _answers(
+        self, questions: list[Question], corrections: int | None, newton_steps: int | None, facts: Mapping = {}
+    ) -> list[Answer]:
+        """The answers with their units, their origin, to which `facts` belong, and the error that is to be expected."""
+        effort = self._effort(corrections, newton_steps)
         known = self._errors[effort.corrections] if effort.corrections < len(self._errors) else [None]
         expected = known[min(effort.newton_steps, len(known) - 1)]
+        origin = {"predicted_by": str(self.path), "step": self.step, **facts}
         if expected is not None:
-            source = {**source, "expected_error": expected}
-        return dataclasses.replace(answer, info=self.info, source=source, expected_error=expected)
+            origin["expected_error"] = expected
+        shared, answers = {"info": self.info, "expected_error": expected}, in_domain(self.model, questions, effort)
+        return [dataclasses.replace(answer, source={**origin, "source": answer.name}, **shared) for answer in answers]
 
     def _effort(self, corrections: int | None, newton_steps: int | None) -> Effort:
         """What is asked for; where nothing is, the default."""
