@@ -118,7 +118,7 @@ class Graph:
         )
 
     @staticmethod
-    def concatenate(graphs: list[Graph]) -> Graph:
+    def concatenate(graphs: Sequence[Graph]) -> Graph:
         """The graphs of several scenes as one. All have the same parts, or none of them has a part."""
         if len(graphs) == 1:
             return graphs[0]

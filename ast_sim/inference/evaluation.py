@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ast_sim.batches.batch_builder import Batch, State
-from ast_sim.batches.graph import Graph
+from ast_sim.batches.batch_builder import State
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.inference import asked_frame
@@ -18,6 +17,7 @@ from ast_sim.inference.answer import Answer
 from ast_sim.inference.effort import FIRST_CALL, Effort
 from ast_sim.inference.predict import answers as predictions
 from ast_sim.inference.question import Question
+from ast_sim.inference.together import Start, predict_together
 from ast_sim.inference.trivial_predictors import Errors, displacement_errors, rmse_of, stress_errors, summarize
 from ast_sim.models.simulator import Simulator
 from ast_sim.scene import Trajectory
@@ -111,25 +111,17 @@ def one_step_predictions(model: Simulator, truth: Trajectory, name: str) -> tupl
     given = model.config.given_frames
     graph = model.graph(truth.scene)
     script = torch.tensor(truth.position)
-    known = None if truth.stress is None else torch.tensor(truth.stress)
-    chunk = max(1, ONE_STEP_NODES // truth.scene.num_nodes)
-    positions, stresses = [], []
-    for start in range(given, truth.num_frames, chunk):
-        frames = torch.arange(start, min(start + chunk, truth.num_frames))
-        state = State(
-            script[frames - 1].flatten(0, 1),
-            script[frames - 2].flatten(0, 1) if given == 2 else None,
-            None if known is None else known[frames - 1].flatten(0, 1),
-        )
-        prescribed = script[frames].flatten(0, 1)
-        names = [f"{name} frame {int(frame) - 1}" for frame in frames]
-        batch = Batch.build(Graph.concatenate([graph] * len(frames)), state, prescribed, names)
-        with model.predicting():
-            position, stress = model.advance(batch, prescribed)
-        positions.append(position.reshape(len(frames), -1, 3).numpy())
-        if stress is not None:
-            stresses.append(stress.reshape(len(frames), -1, 1).numpy())
-    return np.concatenate(positions), np.concatenate(stresses) if stresses else None
+    known = [None] * len(script) if truth.stress is None else torch.tensor(truth.stress)
+    starts = []
+    for frame in range(given, truth.num_frames):
+        state = State(script[frame - 1], script[frame - 2] if given == 2 else None, known[frame - 1])
+        starts.append(Start(f"{name} frame {frame - 1}", graph, state, script[frame]))
+    chunk, found = max(1, ONE_STEP_NODES // truth.scene.num_nodes), []
+    with model.predicting():
+        for first in range(0, len(starts), chunk):
+            found += predict_together(model, starts[first : first + chunk])
+    stresses = [stress.numpy() for _, stress, _ in found if stress is not None]
+    return np.array([positions[0].numpy() for positions, *_ in found]), np.array(stresses) if stresses else None
 
 
 def _sample(

@@ -10,21 +10,24 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import cache, partial
+from itertools import takewhile
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ast_sim.batches.batch_builder import Batch, State
+from ast_sim.batches.batch_builder import State
 from ast_sim.batches.carry import Carrier
 from ast_sim.batches.graph import Graph
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.effort import AGAIN, MOST_NEWTON_STEPS, Effort, newton_steps
 from ast_sim.inference.question import Question, not_finite, too_far
-from ast_sim.models.model_config import ModelConfig
+from ast_sim.inference.together import Start, predict_together
 from ast_sim.models.simulator import Simulator
+from ast_sim.scene import Scene
 from ast_sim.simulate.mechanics.linearised_contact import STILL, NewtonSteps
 from ast_sim.support.errors import RolloutError, SimulationError
 
@@ -75,19 +78,19 @@ def calls(model: Simulator, questions: Sequence[Question], effort: Effort) -> li
     `jumps`."""
     found: list[Way | str] = []
     for scene in _predicted(model, questions, effort, None, whole_way=True):
-        failure = next((frame.failure for frame in scene.frames if frame.failure), None)
-        if failure is not None:
-            found.append(failure)
+        if scene.failure is not None:
+            found.append(scene.failure)
             continue
         position = [_stacked(frame.positions, 1 + sum(effort)) for frame in scene.frames]
-        stress = [_stacked(frame.stresses, 1 + effort.newton_steps) for frame in scene.frames if frame.stresses]
+        known = [frame for frame in scene.frames if model.config.stress != "none"]
+        stress = [_stacked(frame.stresses, 1 + effort.newton_steps) for frame in known]
         steps = np.array([len(frame.positions) - 1 - effort.corrections for frame in scene.frames])
         last = np.array([np.nan if frame.last_step is None else frame.last_step for frame in scene.frames])
         found.append(Way(np.stack(position, axis=1), np.stack(stress, axis=1) if stress else None, steps, last))
     return found
 
 
-def _stacked(rows: Sequence[Tensor], count: int) -> np.ndarray:
+def _stacked(rows: list, count: int) -> np.ndarray:
     """The rows, and the last one again until they are so many."""
     return torch.stack([*rows, *[rows[-1]] * (count - len(rows))]).numpy()
 
@@ -103,41 +106,29 @@ def _predicted(
     effort.check(model.config)
     for question in questions:
         question.check(model.config.given_frames)
-    parts: dict[int, tuple[Graph, Carrier]] = {}  # of each scene, which several questions may share
-    for scene in (question.scene for question in questions):
-        if id(scene) not in parts:
-            parts[id(scene)] = model.graph(scene), Carrier(scene)
-    scenes = [_JumpingScene(model, question, *parts[id(question.scene)]) for question in questions]
-    solvers: dict[int, NewtonSteps] = {}
+    # Several questions may share a scene.
+    graph, carrier, solver = cache(model.graph), cache(Carrier), cache(partial(newton_steps, model.config))
+    scenes = [_JumpingScene(model, q, graph(q.scene), carrier(q.scene), solver) for q in questions]
     with model.predicting():
         for number, group in enumerate(_groups(model, scenes)):
             _predict(model, group, effort.corrections)
             for frame in group if effort.newton_steps else ():
-                frame.refine(model.config, solvers, effort.newton_steps, whole_way)
+                frame.refine(effort.newton_steps, whole_way)
                 if not whole_way and effort.newton_steps >= MOST_NEWTON_STEPS and frame.unsettled:
-                    _start_again(model, frame, effort, solvers)
+                    _start_again(model, frame, effort)
             if progress is not None:
                 progress(number)
     return scenes
 
 
-def _start_again(model: Simulator, frame: _Frame, effort: Effort, solvers: dict[int, NewtonSteps]) -> None:
+def _start_again(model: Simulator, frame: _Frame, effort: Effort) -> None:
     """Newton steps need a nearly right start: more corrections give a better one."""
     first, spent = (frame.positions, frame.stresses, frame.last_step), frame.seconds
     _predict(model, [frame], effort.corrections + AGAIN)
-    frame.refine(model.config, solvers, effort.newton_steps, every_stress=False)
+    frame.refine(effort.newton_steps, every_stress=False)
     frame.seconds += spent
     if frame.failure is not None:  # the first answer at least says that it has not converged
         frame.failure, (frame.positions, frame.stresses, frame.last_step) = None, first
-
-
-def corrected(model: Simulator, batch: Batch, prescribed: Tensor, calls: int) -> Iterator[tuple[Tensor, Tensor | None]]:
-    """The positions [N, 3] and the stress after each of `calls` calls; each call corrects the answer of the one
-    before. Stress on elements is predicted by the last call only."""
-    for call in range(1, calls + 1):
-        position, stress = model.advance(replace(batch, wants_stress=call == calls), prescribed)
-        yield position, stress
-        batch = replace(batch, position=position)
 
 
 @dataclass(eq=False)
@@ -147,9 +138,9 @@ class _Frame:
 
     scene: _JumpingScene
     number: int
-    start: Tensor
+    start: Start
     positions: list[Tensor] = field(default_factory=list)
-    stresses: list[Tensor] = field(default_factory=list)
+    stresses: list[Tensor | None] = field(default_factory=list)
     last_step: float | None = None
     seconds: float = 0.0
     failure: str | None = None
@@ -159,31 +150,29 @@ class _Frame:
         """Whether the Newton steps did not end."""
         return self.failure is None and self.last_step is not None and self.last_step > STILL
 
-    def refine(self, config: ModelConfig, solvers: dict[int, NewtonSteps], most: int, every_stress: bool) -> None:
+    def refine(self, most: int, every_stress: bool) -> None:
         """Make Newton steps from the answer of the model until one is `STILL`; the stress then is that of the material.
 
-        Friction resists slip from the frame before, where that is wanted, too. `solvers` holds those of the scenes so
-        far, by their `id`. The stress is that of the last step, or of every one.
+        Friction resists slip from the frame before, where that is wanted, too. The stress is that of the last step, or
+        of every one.
         """
         if self.failure is not None:
             return
-        began, scene = time.perf_counter(), self.scene.question.scene
+        began, location = time.perf_counter(), self.scene.model.config.stress
         try:
-            if id(scene) not in solvers:
-                solvers[id(scene)] = newton_steps(config, scene)
-            solver, position = solvers[id(scene)], _array(self.positions[-1])
+            solver, position = self.scene.solver(self.scene.question.scene), _array(self.positions[-1])
             stuck = self.scene.settled(self.number - 1)
             for step in range(1, most + 1):
                 before, position = position, solver.step(position, from_afar=step == 1, stuck=stuck)
                 self.positions.append(torch.from_numpy(position.astype(np.float32)))
                 self.last_step = solver.size(before, position)
                 ends = step == most or self.last_step <= STILL
-                if config.stress != "none" and (every_stress or ends):
-                    self.stresses.append(torch.from_numpy(solver.von_mises(position, config.stress)))
+                if location != "none" and (every_stress or ends):
+                    self.stresses.append(torch.from_numpy(solver.von_mises(position, location)))
                 if ends:
                     break
         except SimulationError as error:
-            self.failure = f"{self.scene.question.name} frame {self.number}: a Newton step failed: {error}"
+            self.failure = f"{self.start.name}: a Newton step failed: {error}"
         self.seconds += time.perf_counter() - began
 
 
@@ -195,6 +184,7 @@ class _JumpingScene:
     question: Question
     graph: Graph
     carry: Carrier
+    solver: Callable[[Scene], NewtonSteps]
     frames: list[_Frame] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -203,37 +193,33 @@ class _JumpingScene:
         self.stress = question.given_stress(self.model.config, self.given)
         for number in question.wanted():
             if number >= self.given:
-                start = torch.from_numpy(self.carry(question.script[0], question.script[number]))
+                carried = torch.from_numpy(self.carry(question.script[0], question.script[number]))
+                state = State(carried, stress=self.stress[0])
+                start = Start(f"{question.name} frame {number}", self.graph, state, self.script[number])
                 self.frames.append(_Frame(self, number, start))
 
     def settled(self, number: int) -> np.ndarray | None:
         """The positions [N, 3] of a wanted frame that is given or has had its Newton steps, else None."""
         if number < self.given:
             return _array(self.script[number]) if number in self.question.wanted() else None
-        for frame in self.frames:
-            if frame.number == number and frame.last_step is not None and frame.failure is None:
-                return _array(frame.positions[-1])
-        return None
+        done = (frame for frame in self.frames if frame.last_step is not None and frame.failure is None)
+        return next((_array(frame.positions[-1]) for frame in done if frame.number == number), None)
+
+    @property
+    def failure(self) -> str | None:
+        """Why the first frame that failed did so."""
+        return next((frame.failure for frame in self.frames if frame.failure), None)
 
     def answer(self) -> Answer:
         """The frames before the first that failed."""
-        failure = next((frame for frame in self.frames if frame.failure), None)
-        predicted = self.frames if failure is None else self.frames[: self.frames.index(failure)]
-        kept = [number for number in self.question.wanted() if number < self.given]
-        positions = [self.script[0] for _ in kept] + [frame.positions[-1] for frame in predicted]
-        stresses = [self.stress[0] for _ in kept if self.stress] + [f.stresses[-1] for f in predicted if f.stresses]
-        asked, numbers = self.question, [*kept, *(frame.number for frame in predicted)]
-        return Answer(
-            asked.name,
-            asked.scene,
-            torch.stack(positions).numpy() if positions else np.zeros((0, asked.scene.num_nodes, 3), np.float32),
-            torch.stack(stresses).numpy() if stresses else None,
-            len(kept),
+        predicted = list(takewhile(lambda frame: frame.failure is None, self.frames))
+        frames = dict(enumerate(zip(self.script[: self.given], self.stress, strict=True)))
+        return self.question.answer(
+            self.model.config,
+            frames | {frame.number: (frame.positions[-1], frame.stresses[-1]) for frame in predicted},
             [frame.seconds for frame in predicted],
-            failure=None if failure is None else f"{failure.failure}; the frames before it are kept",
-            stress_location=self.model.config.stress,
-            frames=tuple(numbers),
-            last_steps=tuple(frame.last_step for frame in predicted if frame.last_step is not None),
+            self.failure and f"{self.failure}; the frames before it are kept",
+            tuple(frame.last_step for frame in predicted if frame.last_step is not None),
         )
 
 
@@ -245,15 +231,16 @@ def _groups(model: Simulator, scenes: Sequence[_JumpingScene]) -> Iterator[list[
     """The frames of all scenes in batches. Only frames in the same domain are predicted together."""
     of_domain: dict[int, list[_Frame]] = {}
     for frame in (frame for scene in scenes for frame in scene.frames):
-        domain = model.domain(frame.start)
+        position = frame.start.state.position
+        domain = model.domain(position)
         if domain is None:
-            frame.failure = too_far(model.config, frame.scene.question.name, frame.number, frame.start)
+            frame.failure = too_far(model.config, frame.scene.question.name, frame.number, position)
         else:
             of_domain.setdefault(domain, []).append(frame)
     for frames in of_domain.values():
         group: list[_Frame] = []
         for frame in frames:
-            if group and sum(len(other.start) for other in group) + len(frame.start) > BATCH_NODES:
+            if group and sum(len(other.start.prescribed) for other in [*group, frame]) > BATCH_NODES:
                 yield group
                 group = []
             group.append(frame)
@@ -262,28 +249,15 @@ def _groups(model: Simulator, scenes: Sequence[_JumpingScene]) -> Iterator[list[
 
 def _predict(model: Simulator, group: list[_Frame], corrections: int) -> None:
     """Predict the frames of a batch."""
-    began = time.perf_counter()
-    prescribed = torch.cat([frame.scene.script[frame.number] for frame in group])
-    states = [State(f.start, None, f.scene.stress[0] if f.scene.stress else None) for f in group]
-    names = [f"{frame.scene.question.name} frame {frame.number}" for frame in group]
-    graph = Graph.concatenate([frame.scene.graph for frame in group])
-    batch = Batch.build(graph, State.concatenate(states), prescribed, names)
     try:
-        answers = list(corrected(model, batch, prescribed, corrections + 1))
+        found = predict_together(model, [frame.start for frame in group], corrections + 1)
     except RolloutError as error:
         if len(group) > 1:  # one frame must not spoil the others
             for frame in group:
                 _predict(model, [frame], corrections)
         else:
-            group[0].failure = f"{names[0]}: {error}"
+            group[0].failure = f"{group[0].start.name}: {error}"
         return
-    seconds = (time.perf_counter() - began) / len(group)
-    sizes, stress = graph.node_offsets.diff().tolist(), answers[-1][1]
-    positions = zip(*(position.split(sizes) for position, _ in answers), strict=True)
-    stresses: Sequence[Tensor | None] = [None] * len(group)
-    if stress is not None:
-        stresses = stress.split([len(frame.scene.stress[0]) for frame in group])
-    for frame, found, mises in zip(group, positions, stresses, strict=True):
-        frame.failure = not_finite(model.config, frame.scene.question.name, frame.number, found[-1], mises)
-        frame.positions, frame.seconds = list(found), seconds
-        frame.stresses = [] if mises is None else [mises]
+    for frame, (positions, stress, seconds) in zip(group, found, strict=True):
+        frame.failure = not_finite(model.config, frame.scene.question.name, frame.number, positions[-1], stress)
+        frame.positions, frame.stresses, frame.seconds = positions, [stress], seconds

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ast_sim.inference.answer import Answer
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.support.errors import RolloutError
@@ -66,14 +67,40 @@ class Question:
         """The numbers of the frames that are wanted."""
         return tuple(range(len(self.script))) if self.frames is None else self.frames
 
-    def given_stress(self, config: ModelConfig, given: int) -> list[Tensor]:
-        """The stress of each given frame, [N or E, 1]; an empty list if the model predicts no stress."""
+    def given_stress(self, config: ModelConfig, given: int) -> list[Tensor] | list[None]:
+        """The stress of each given frame, [N or E, 1]; None if the model predicts no stress."""
         if config.stress == "none":
-            return []
+            return [None] * given
         rows = self.scene.num_nodes if config.stress == "node" else self.scene.num_elements
         if self.stress is None or self.stress.shape[1] != rows:
             return list(torch.zeros(given, rows, 1))
         return list(torch.tensor(self.stress[:given]))
+
+    def answer(
+        self,
+        config: ModelConfig,
+        frames: Mapping[int, tuple[Tensor, Tensor | None]],
+        seconds: list[float],
+        failure: str | None,
+        last_steps: tuple[float, ...] = (),
+    ) -> Answer:
+        """The answer with the wanted ones of these frames: positions and stress, by number of the frame. The other
+        arguments are as in `Answer`."""
+        numbers = tuple(number for number in self.wanted() if number in frames)
+        position = np.array([frames[number][0].numpy() for number in numbers], np.float32)
+        stress = [value.numpy() for value in (frames[number][1] for number in numbers) if value is not None]
+        return Answer(
+            self.name,
+            self.scene,
+            position.reshape(len(numbers), self.scene.num_nodes, 3),
+            np.array(stress) if stress else None,
+            sum(number < config.given_frames for number in numbers),
+            seconds,
+            failure,
+            stress_location=config.stress,
+            frames=numbers,
+            last_steps=last_steps,
+        )
 
 
 def not_finite(config: ModelConfig, name: str, frame: int, position: Tensor, stress: Tensor | None) -> str | None:

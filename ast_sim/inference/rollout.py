@@ -6,18 +6,17 @@ positions. Several scenes are predicted together as one ragged batch; a scene th
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from ast_sim.batches.batch_builder import Batch, State
+from ast_sim.batches.batch_builder import State
 from ast_sim.batches.graph import Graph
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.question import Question, not_finite, too_far
+from ast_sim.inference.together import Start, predict_together
 from ast_sim.models.simulator import Simulator
 
 
@@ -37,13 +36,16 @@ def rollouts(
     for question in questions:
         question.check(given)
     scenes = [_RollingScene(model, question, given) for question in questions]
-    concatenate = lru_cache(maxsize=4)(lambda *graphs: Graph.concatenate(list(graphs)))
+    concatenate = lru_cache(maxsize=4)(Graph.concatenate)
     with model.predicting():
         for frame in range(given, max(scene.end for scene in scenes)):
             running = [scene for scene in scenes if scene.runs_at(frame)]
             # Only scenes of the same domain are predicted together: none may change another's domain.
             for domain in dict.fromkeys(scene.domain for scene in running):
-                _step(model, [scene for scene in running if scene.domain == domain], frame, concatenate)
+                group = [scene for scene in running if scene.domain == domain]
+                found = predict_together(model, [scene.start(frame) for scene in group], concatenate=concatenate)
+                for scene, (positions, stress, seconds) in zip(group, found, strict=True):
+                    scene.advance(frame, positions[-1], stress, seconds)
             if progress is not None and running:
                 progress(frame)
     return [scene.answer() for scene in scenes]
@@ -53,76 +55,39 @@ class _RollingScene:
     """A scene during its rollout: its graph, its script and the frames so far."""
 
     def __init__(self, model: Simulator, question: Question, given: int) -> None:
-        self.model, self.config, self.question, self.given = model, model.config, question, given
+        self.model, self.config, self.question = model, model.config, question
         self.graph = model.graph(question.scene)
         self.script = torch.tensor(question.script)
         self.end = max(question.wanted()) + 1
-        self.positions = list(self.script[:given])
-        self.stresses = question.given_stress(model.config, given)
+        self.frames = list(zip(self.script[:given], question.given_stress(model.config, given), strict=True))
         self.seconds: list[float] = []
         self.failure: str | None = None
-        self.place(given - 1, self.positions[-1])
+        self.place(given - 1, *self.frames[-1])
 
     def runs_at(self, frame: int) -> bool:
         return frame < self.end and self.failure is None
 
-    def state(self, frame: int) -> State:
-        """The state from which a frame is predicted."""
-        previous = self.positions[frame - 2] if self.config.dynamic else None
-        return State(self.positions[frame - 1], previous, self.stresses[frame - 1] if self.stresses else None)
+    def start(self, frame: int) -> Start:
+        """What a frame is predicted from."""
+        position, stress = self.frames[frame - 1]
+        state = State(position, self.frames[frame - 2][0] if self.config.dynamic else None, stress)
+        return Start(f"{self.question.name} frame {frame - 1}", self.graph, state, self.script[frame])
 
     def advance(self, frame: int, position: Tensor, stress: Tensor | None, seconds: float) -> None:
         """Keep the predicted frame, or set `failure` if it is not finite or too far away."""
-        failure = not_finite(self.config, self.question.name, frame, position, stress)
-        if failure is not None:
-            self.failure = f"{failure}; the {frame} frames before it are kept"
-            return
-        self.place(frame, position)
+        self.place(frame, position, stress)
         if self.failure is None:
-            self.positions.append(position)
-            self.stresses += [] if stress is None else [stress]
+            self.frames.append((position, stress))
             self.seconds.append(seconds)
 
-    def place(self, frame: int, position: Tensor) -> None:
-        """Find the domain that holds the state from which the frame after `frame` is predicted."""
-        self.domain = self.model.domain(position)
-        if self.domain is None:
-            failure = too_far(self.config, self.question.name, frame, position)
-            self.failure = f"{failure}; the {frame} frames before it are kept"
+    def place(self, frame: int, position: Tensor, stress: Tensor | None) -> None:
+        """Find the domain that holds the state from which the frame after `frame` is predicted, or set `failure`."""
+        failure = not_finite(self.config, self.question.name, frame, position, stress)
+        if failure is None:
+            self.domain = self.model.domain(position)
+            failure = too_far(self.config, self.question.name, frame, position) if self.domain is None else None
+        self.failure = failure and f"{failure}; the {frame} frames before it are kept"
 
     def answer(self) -> Answer:
         """The wanted frames so far as an answer."""
-        numbers = tuple(frame for frame in self.question.wanted() if frame < len(self.positions))
-        positions, stresses = ([values[i] for i in numbers if values] for values in (self.positions, self.stresses))
-        asked, nodes = self.question, self.question.scene.num_nodes
-        return Answer(
-            asked.name,
-            asked.scene,
-            torch.stack(positions).numpy() if positions else np.zeros((0, nodes, 3), np.float32),
-            torch.stack(stresses).numpy() if stresses else None,
-            sum(number < self.given for number in numbers),
-            self.seconds,
-            failure=self.failure,
-            stress_location=self.config.stress,
-            frames=numbers,
-        )
-
-
-def _step(model: Simulator, scenes: list[_RollingScene], frame: int, concatenate: Callable[..., Graph]) -> None:
-    """Predict a frame of all scenes at once; `concatenate` joins their graphs."""
-    start = time.perf_counter()
-    prescribed = torch.cat([scene.script[frame] for scene in scenes])
-    batch = Batch.build(
-        concatenate(*(scene.graph for scene in scenes)),
-        State.concatenate([scene.state(frame) for scene in scenes]),
-        prescribed,
-        [f"{scene.question.name} frame {frame - 1}" for scene in scenes],
-    )
-    position, stress = model.advance(batch, prescribed)
-    positions = position.split(batch.graph.node_offsets.diff().tolist())
-    stresses: Sequence[Tensor | None] = [None] * len(scenes)
-    if stress is not None:
-        stresses = stress.split([len(scene.stresses[-1]) for scene in scenes])
-    seconds = (time.perf_counter() - start) / len(scenes)
-    for scene, next_position, next_stress in zip(scenes, positions, stresses, strict=True):
-        scene.advance(frame, next_position, next_stress, seconds)
+        return self.question.answer(self.config, dict(enumerate(self.frames)), self.seconds, self.failure)
