@@ -7,6 +7,7 @@ where; it predicts what is missing.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 from scipy.sparse.linalg import splu
@@ -27,13 +28,12 @@ class Carrier:
 
     def __init__(self, scene: Scene) -> None:
         self._prescribed = scene.prescribed
-        self._bodies = [
+        bodies = self._bodies = [
             (np.flatnonzero(body & scene.prescribed), np.flatnonzero(body & ~scene.prescribed))
             for body in (scene.body == number for number in np.unique(scene.body))
             if (body & scene.prescribed).any() and (body & ~scene.prescribed).any()
         ]
-        self._scene = scene
-        self._extensions: dict[int, Callable[[np.ndarray], np.ndarray]] = {}
+        self._extension = cache(lambda number: harmonic_extension(scene, *bodies[number]))
 
     def __call__(self, position: np.ndarray, prescribed: np.ndarray) -> np.ndarray:
         """Move a state to where the prescribed nodes will be.
@@ -57,11 +57,6 @@ class Carrier:
             else:
                 there[free] = position[free] + self._extension(number)(after - before)
         return there
-
-    def _extension(self, number: int) -> Callable[[np.ndarray], np.ndarray]:
-        if number not in self._extensions:
-            self._extensions[number] = harmonic_extension(self._scene, *self._bodies[number])
-        return self._extensions[number]
 
 
 def rigid_motion(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

@@ -8,6 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ast_sim.batches.batch_builder import Batch, State, Target
 from ast_sim.batches.carry import Carrier
@@ -20,6 +21,8 @@ from ast_sim.support.errors import DatasetError
 
 # The order, the noise and the placements draw from separate sequences of random numbers.
 _ORDER, _NOISE, _PLACE = 0, 1, 2
+
+_Motion = tuple[np.ndarray, Tensor | None, np.ndarray]  # the position in the state, the one before it, the target
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,18 +155,14 @@ class PairSampler:
 
     def _pair(self, epoch: int, number: int) -> Pair | Jump:
         """Pair `number` of all, with its noise and its placement in an epoch."""
-        index, t = self._locate(number)
+        index = int(np.searchsorted(self._starts, number, side="right")) - 1
+        t = number - int(self._starts[index]) + self.first_frame
         placement = self.random_placement(index, np.random.default_rng([self.seed, _PLACE, epoch, number]))
         if self._jumps:
             draw = np.random.default_rng([self.seed, _NOISE, epoch, number]).random()
             return Jump(index, self.first_frame, t + 1, placement, share=min(2 * draw, 1.0))
         noise = self.white_noise(index, np.random.default_rng([self.seed, _NOISE, epoch, number]))
         return Pair(index, t, placement, noise, None, self.left * noise)
-
-    def _locate(self, number: int) -> tuple[int, int]:
-        """The trajectory and the first frame of pair `number`, 0 <= number < `num_pairs`."""
-        index = int(np.searchsorted(self._starts, number, side="right")) - 1
-        return index, number - int(self._starts[index]) + self.first_frame
 
     def last_frame(self, index: int) -> int:
         """The number of the last frame of a trajectory."""
@@ -187,48 +186,40 @@ class PairSampler:
 
     def assemble(self, pairs: Sequence[Pair | Jump]) -> tuple[Batch, Target]:
         """The batch of these pairs. Their errors are added only where noise would be."""
-        built = (self._jump(pair) if isinstance(pair, Jump) else self._step(pair) for pair in pairs)
-        batches, targets = zip(*built, strict=True)
+        batches, targets = zip(*map(self._built, pairs), strict=True)
         return Batch.concatenate(batches), Target.concatenate(targets)
 
-    def _jump(self, jump: Jump) -> tuple[Batch, Target]:
-        """The batch of one jump, mirrored and moved."""
-        member = self._member(jump.index)
-        (before,), stress = self._dataset.frames(self._split, jump.index, jump.source, jump.source + 1)
-        (after,), next_stress = self._dataset.frames(self._split, jump.index, jump.frame, jump.frame + 1)
+    def _built(self, pair: Pair | Jump) -> tuple[Batch, Target]:
+        """The batch of one pair, mirrored and moved."""
+        member, jumps, name = self._member(pair.index), isinstance(pair, Jump), f"{self._split}/{pair.index:06d}"
+        source, frame = (pair.source, pair.frame) if jumps else (pair.t, pair.t + 1)
+        before, stress = self._dataset.frames(self._split, pair.index, source - self.first_frame, source + 1)
+        (after,), next_stress = self._dataset.frames(self._split, pair.index, frame, frame + 1)
+        position, previous, motion = (self._jump if jumps else self._step)(pair, member, before, after)
+        state = State(torch.from_numpy(position), previous, None if stress is None else torch.tensor(stress[-1]))
+        target = Target(torch.from_numpy(motion), None if next_stress is None else torch.tensor(next_stress[0]))
+        names = [f"{name} frame {frame if jumps else source}"]
+        batch = Batch.build(member.graph, state, torch.tensor(after), names)
+        return batch.placed(pair.placement), target.placed(pair.placement)
+
+    def _jump(self, jump: Jump, member: _Member, before: np.ndarray, after: np.ndarray) -> _Motion:
         if jump.error is not None:
             guess = after + jump.error * member.noisy
         else:
-            start = member.carry(before, after)
+            start = member.carry(before[-1], after)
             guess = start if jump.share == 1 else after + np.float32(jump.share) * (start - after)
-        state = State(torch.from_numpy(guess), None, None if stress is None else torch.tensor(stress[-1]))
-        target = Target(torch.from_numpy(after - guess), None if next_stress is None else torch.tensor(next_stress[0]))
-        name = f"{self._split}/{jump.index:06d} frame {jump.frame}"
-        return self._placed(jump, state, after, target, name)
+        return guess, None, after - guess
 
-    def _placed(
-        self, pair: Pair | Jump, state: State, after: np.ndarray, target: Target, name: str
-    ) -> tuple[Batch, Target]:
-        batch = Batch.build(self._member(pair.index).graph, state, torch.tensor(after), [name])
-        return batch.placed(pair.placement), target.placed(pair.placement)
-
-    def _step(self, pair: Pair) -> tuple[Batch, Target]:
-        """The batch of one pair, mirrored and moved."""
-        member, frame = self._member(pair.index), pair.t + 1
-        position, stress = self._dataset.frames(self._split, pair.index, pair.t - self.first_frame, frame)
-        (after,), next_stress = self._dataset.frames(self._split, pair.index, frame, frame + 1)
+    def _step(self, pair: Pair, member: _Member, position: np.ndarray, after: np.ndarray) -> _Motion:
         before, now = position[0], position[-1]
-        increment = after - now
         error, error_after = pair.error * member.noisy, pair.error_after * member.noisy
-        motion, previous = increment + (error_after - error), None
+        motion, previous = after - now + (error_after - error), None
         if self.dynamic:
             if pair.error_before is not None:
                 before = before + pair.error_before * member.noisy
             motion -= now - before + error
             previous = torch.tensor(before)
-        state = State(torch.from_numpy(now + error), previous, None if stress is None else torch.tensor(stress[-1]))
-        target = Target(torch.from_numpy(motion), None if next_stress is None else torch.tensor(next_stress[0]))
-        return self._placed(pair, state, after, target, f"{self._split}/{pair.index:06d} frame {pair.t}")
+        return now + error, previous, motion
 
     def white_noise(self, index: int, generator: np.random.Generator) -> np.ndarray:
         """[N, 3] float32: noise of the standard deviation `noise`."""

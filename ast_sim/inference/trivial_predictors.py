@@ -66,17 +66,14 @@ def stress_errors(
         "stress_constant": (np.full(1, constant), np.full(1, constant)),
         "stress_frame_mean": (mean, mean),
     }
-    full = {
-        key: tuple(None if value is None else np.broadcast_to(value, target.shape) for value in values)
-        for key, values in predictors.items()
-    }
-    return _errors_by_horizon(full, target, {"deforming": rows})
+    return _errors_by_horizon(predictors, target, {"deforming": rows})
 
 
 def _errors_by_horizon(
     predictors: dict[str, tuple[np.ndarray | None, ...]], target: np.ndarray, rows: dict[str, np.ndarray]
 ) -> Errors:
-    """Compare the predictions of each predictor, a pair (one step, rollout), with the target [S - given, rows, F]."""
+    """Compare the predictions of each predictor, a pair (one step, rollout) of what broadcasts to the target, with the
+    target [S - given, rows, F]."""
     horizons = {"one_step": (0, None), "rollout_50": (1, 50), "rollout_all": (1, None)}
     failed = SquaredError(math.inf, 1)
     return {
