@@ -134,7 +134,7 @@ class PairSampler:
             least = f"at least {2 + self.first_frame} frames"
             raise DatasetError(f"{dataset.path}: {split} has no trajectory of {least} to draw pairs from")
         self._members: ByteCache[_Member] = ByteCache(CACHE_BYTES)
-        self._order = lru_cache(maxsize=2)(self._draw_order)
+        self._order = lru_cache(maxsize=2)(lambda epoch: self.random(_ORDER, epoch).permutation(self.num_pairs))
 
     @property
     def num_pairs(self) -> int:
@@ -157,11 +157,11 @@ class PairSampler:
         """Pair `number` of all, with its noise and its placement in an epoch."""
         index = int(np.searchsorted(self._starts, number, side="right")) - 1
         t = number - int(self._starts[index]) + self.first_frame
-        placement = self.random_placement(index, np.random.default_rng([self.seed, _PLACE, epoch, number]))
+        placement = self.random_placement(index, self.random(_PLACE, epoch, number))
         if self._jumps:
-            draw = np.random.default_rng([self.seed, _NOISE, epoch, number]).random()
+            draw = self.random(_NOISE, epoch, number).random()
             return Jump(index, self.first_frame, t + 1, placement, share=min(2 * draw, 1.0))
-        noise = self.white_noise(index, np.random.default_rng([self.seed, _NOISE, epoch, number]))
+        noise = self.white_noise(index, self.random(_NOISE, epoch, number))
         return Pair(index, t, placement, noise, None, self.left * noise)
 
     def last_frame(self, index: int) -> int:
@@ -181,8 +181,9 @@ class PairSampler:
         """[N] bool: the nodes of a trajectory that a model moves."""
         return self._member(index).noisy[:, 0] > 0
 
-    def _draw_order(self, epoch: int) -> np.ndarray:
-        return np.random.default_rng([self.seed, _ORDER, epoch]).permutation(self.num_pairs)
+    def random(self, *stream: int) -> np.random.Generator:
+        """A sequence of random numbers, which the seed and these numbers determine."""
+        return np.random.default_rng([self.seed, *stream])
 
     def assemble(self, pairs: Sequence[Pair | Jump]) -> tuple[Batch, Target]:
         """The batch of these pairs. Their errors are added only where noise would be."""

@@ -105,11 +105,11 @@ class Pool:
 
     def _drawn(self, place: int) -> Any:
         """The last scene that started at a place, as it was at the start."""
-        seed, begun, scenes = self._sampler.seed, self._begun[place], self._sampler.trajectories
+        sampler, begun = self._sampler, self._begun[place]
         order, draws = self.streams
-        epoch, number = divmod((begun - 1) * self._size + place, len(scenes))
-        index = int(np.random.default_rng([seed, order, epoch]).permutation(scenes)[number])
-        return self._start(index, begun == 1, np.random.default_rng([seed, draws, place, begun]))
+        epoch, number = divmod((begun - 1) * self._size + place, len(sampler.trajectories))
+        index = int(sampler.random(order, epoch).permutation(sampler.trajectories)[number])
+        return self._start(index, begun == 1, sampler.random(draws, place, begun))
 
     def _lost(self, error: np.ndarray) -> bool:
         """Whether an error is too large to learn from."""

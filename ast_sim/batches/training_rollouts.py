@@ -63,7 +63,7 @@ class RolloutPool(Pool):
         return _Rolling(index, earliest, placement, np.zeros((self._sampler.num_nodes(index), 3), np.float32))
 
     def _frames(self, place: int, scene: _Rolling) -> Pair:
-        generator = np.random.default_rng([self._sampler.seed, _NOISE, place, self._begun[place], scene.t])
+        generator = self._sampler.random(_NOISE, place, self._begun[place], scene.t)
         white = self._sampler.white_noise(scene.index, generator)
         error, after = white, self._sampler.left * white
         if scene.error is not None:

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -53,8 +52,12 @@ def asked_frames(
         whose Newton steps did not end;
         solver: sums over the scenes where it was run, None if there are none, and `no_solver` says why.
     """
-    with _one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
         scenes = [_scene(model, dataset, split, index, effort) for index in range(dataset.count(split))]
+    finally:
+        torch.set_num_threads(threads)
     why = None
     try:
         indices = list(range(min(rival_scenes, len(scenes))))
@@ -142,16 +145,6 @@ def _solver_lines(solver: dict[str, Any]) -> list[str]:
     return told
 
 
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
 def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: Effort) -> dict[str, Any]:
     name, truth = f"{split}/{index:06d}", dataset.load(split, index)
     frame = max(deepest_frame(truth), model.config.given_frames)
@@ -235,11 +228,10 @@ def _sums(scenes: list[dict[str, Any]]) -> dict[str, Any] | None:
     if not own:
         return None
     found: dict[str, Any] = {"scenes": len(own), "cheapest_scenes": len(best)}
-    for key, chosen in (("seconds", own), ("cheapest_seconds", best)):
-        ratio = key.replace("seconds", "ratio")
-        took = [scene["solver"][key] for scene in chosen]
-        found[key] = _mean(took)
-        found[ratio] = sum(took) / sum(scene["seconds"] for scene in chosen) if chosen else None
+    for which, chosen in (("", own), ("cheapest_", best)):
+        took = [scene["solver"][f"{which}seconds"] for scene in chosen]
+        found[f"{which}seconds"] = _mean(took)
+        found[f"{which}ratio"] = sum(took) / sum(scene["seconds"] for scene in chosen) if chosen else None
     return found
 
 

@@ -7,13 +7,11 @@ positions. Several scenes are predicted together as one ragged batch; a scene th
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 
 import torch
 from torch import Tensor
 
 from ast_sim.batches.batch_builder import State
-from ast_sim.batches.graph import Graph
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.question import Question, not_finite, too_far
 from ast_sim.inference.together import Start, predict_together
@@ -36,14 +34,13 @@ def rollouts(
     for question in questions:
         question.check(given)
     scenes = [_RollingScene(model, question, given) for question in questions]
-    concatenate = lru_cache(maxsize=4)(Graph.concatenate)
     with model.predicting():
         for frame in range(given, max(scene.end for scene in scenes)):
             running = [scene for scene in scenes if scene.runs_at(frame)]
             # Only scenes of the same domain are predicted together: none may change another's domain.
             for domain in dict.fromkeys(scene.domain for scene in running):
                 group = [scene for scene in running if scene.domain == domain]
-                found = predict_together(model, [scene.start(frame) for scene in group], concatenate=concatenate)
+                found = predict_together(model, [scene.start(frame) for scene in group])
                 for scene, (positions, stress, seconds) in zip(group, found, strict=True):
                     scene.advance(frame, positions[-1], stress, seconds)
             if progress is not None and running:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -31,23 +31,17 @@ class Start(NamedTuple):
 
 
 def predict_together(
-    model: Simulator,
-    starts: Sequence[Start],
-    calls: int = 1,
-    concatenate: Callable[[Sequence[Graph]], Graph] = Graph.concatenate,
+    model: Simulator, starts: Sequence[Start], calls: int = 1
 ) -> list[tuple[list[Tensor], Tensor | None, float]]:
     """Predict the frames; each call corrects the answer of the one before. Stress on elements is predicted by the last
     call only.
-
-    Args:
-        concatenate: joins the graphs.
 
     Returns:
         For each frame its positions [N, 3] after each call, its stress, and its share of the wall seconds.
     """
     began = time.perf_counter()
     names, graphs, states, prescribed = zip(*starts, strict=True)
-    graph, prescribed = concatenate(graphs), torch.cat(prescribed)
+    graph, prescribed = Graph.concatenate(graphs), torch.cat(prescribed)
     batch = Batch.build(graph, State.concatenate(states), prescribed, list(names))
     sizes, positions, stress = graph.node_offsets.diff().tolist(), [], None
     for call in range(1, calls + 1):
