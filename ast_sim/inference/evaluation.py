@@ -75,7 +75,7 @@ def evaluate(
             progress(name)
     figures = {
         "samples": samples,
-        "summary": _summary(displacement, stress),
+        "summary": summarize({"displacement": displacement, "stress": stress}),
         "failures": sum(sample["failure"] is not None for sample in samples),
         "jumps": model.config.jumps,
         **effort._asdict(),
@@ -86,13 +86,6 @@ def evaluate(
         "threads": torch.get_num_threads(),
     }
     return figures, answers
-
-
-def _summary(displacement: list[Errors], stress: list[Errors]) -> dict[str, Any]:
-    summary = summarize(displacement, "displacement")
-    for predictor, values in summarize(stress, "stress").items():
-        summary.setdefault(predictor, {}).update(values)
-    return summary
 
 
 def _predicted(answer: Answer) -> tuple[np.ndarray | None, np.ndarray | None]:

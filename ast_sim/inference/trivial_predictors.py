@@ -90,13 +90,17 @@ def _errors_by_horizon(
     }
 
 
-def summarize(errors: list[Errors], quantity: str) -> dict[str, Any]:
-    """predictor -> quantity -> horizon -> nodes -> {rmse_sequence, rmse_pooled}, over the scenes in `errors`."""
+def summarize(errors: dict[str, list[Errors]]) -> dict[str, Any]:
+    """predictor -> quantity -> horizon -> nodes -> {rmse_sequence, rmse_pooled}, over the scenes of each quantity."""
 
     def both(*scenes: SquaredError) -> dict[str, float | None]:
         return {"rmse_sequence": _or_none(rmse_sequence(scenes)), "rmse_pooled": _or_none(rmse_pooled(scenes))}
 
-    return {predictor: {quantity: found} for predictor, found in _mapped(both, errors).items()} if errors else {}
+    found: dict[str, Any] = {}
+    for quantity, scenes in errors.items():
+        for predictor, values in (_mapped(both, scenes) if scenes else {}).items():
+            found.setdefault(predictor, {})[quantity] = values
+    return found
 
 
 def rmse_of(errors: Errors) -> dict[str, Any]:

@@ -132,7 +132,7 @@ def test_a_failed_rollout_has_no_error_and_no_summary():
     truth = one_triangle([0.0, 1.0, 2.0])
     failed = answer_of(truth, truth.position[:2], None, 1, "node 0 in frame 2 is not finite")
     errors = displacement_errors(truth, truth.position[1:], failed)
-    summary = summarize([errors], "displacement")["model"]["displacement"]
+    summary = summarize({"displacement": [errors]})["model"]["displacement"]
     assert summary["rollout_all"]["normal"] == {"rmse_sequence": None, "rmse_pooled": None}
     assert summary["one_step"]["normal"]["rmse_sequence"] == 0.0
 
