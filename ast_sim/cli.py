@@ -304,6 +304,8 @@ def _add_evaluate(evaluate: _Parser) -> None:
     evaluate.add_argument("--split", choices=commands.SPLITS, default="test", help="split (default: test)")
     about = "scenes in which the solver solves the deepest frame, to compare (default: 3; 0: none)"
     _add_each(evaluate, {"--rivals N": about}, type=_at_least(0), default=3)
+    about = "the specification or the parts of your own of which DATA was made; the solver needs them"
+    _add_each(evaluate, {"--made-from PATH": about}, type=_path)
     _add_out(evaluate, "FILE.json", "also write all figures to this file", required=False)
 
 

@@ -284,7 +284,8 @@ def evaluate(args: argparse.Namespace) -> None:
         _check_output(args, args.out, [args.data])
         if args.out.suffix != ".json":
             raise ConfigError(f"--out {args.out}: the name of a file of figures must end in .json")
-    found = _open_run(args.run_folder).evaluate(args.data, args.split, args.command_line, args.rivals)
+    run = _open_run(args.run_folder)
+    found = run.evaluate(args.data, args.split, args.command_line, args.rivals, args.made_from)
     print(found)
     if args.out is not None:
         found.save(args.out)

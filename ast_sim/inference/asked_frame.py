@@ -34,14 +34,14 @@ def asked_frames(
     effort: Effort,
     rival_scenes: int = 0,
     progress: Callable[[str], None] | None = None,
-    spec: str | os.PathLike[str] | None = None,
+    made_from: str | os.PathLike[str] | None = None,
 ) -> dict[str, Any]:
     """Predict the deepest frame of each scene of a split, alone and on one thread.
 
     Args:
         effort: what follows the first call of a model that jumps.
         rival_scenes: in so many scenes the solver goes to the same frame, in several ways; see `simulate.jobs.rival`.
-        spec: where the specification lies, if the dataset is of an assembly; the solver needs it.
+        made_from: the specification or the parts of which the dataset was made, if any; the solver needs them.
 
     Returns:
         scenes: for each its name, frame, nodes, displacement, relative_error, by_calls (the relative error after each
@@ -62,7 +62,7 @@ def asked_frames(
     try:
         indices = list(range(min(rival_scenes, len(scenes))))
         frames = [scenes[index]["frame"] for index in indices]
-        found = rivals(dataset.path, split, indices, frames, spec=spec, progress=False) if indices else ()
+        found = rivals(dataset.path, split, indices, frames, made_from=made_from, progress=False) if indices else ()
         for scene, rival in zip(scenes, found, strict=False):
             scene["solver"] = _solver(rival, scene["relative_error"])
             if progress is not None:

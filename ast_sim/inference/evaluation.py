@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -34,6 +35,7 @@ def evaluate(
     progress: Callable[[str], None] | None = None,
     effort: Effort = FIRST_CALL,
     rival_scenes: int = 0,
+    made_from: str | os.PathLike[str] | None = None,
 ) -> tuple[dict[str, Any], list[Answer]]:
     """Predict all trajectories of a split and compare.
 
@@ -79,7 +81,7 @@ def evaluate(
         "failures": sum(sample["failure"] is not None for sample in samples),
         "jumps": model.config.jumps,
         **effort._asdict(),
-        "asked": asked_frame.asked_frames(model, dataset, split, effort, rival_scenes, progress),
+        "asked": asked_frame.asked_frames(model, dataset, split, effort, rival_scenes, progress, made_from),
         "speedup": _speedup(samples),
         "length_unit": dataset.info.length_unit,
         "stress_unit": "Pa",

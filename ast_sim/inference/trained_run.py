@@ -107,9 +107,9 @@ class Run:
                 that jumps computes no other frame. With friction ask for [-2, -1]: a body may be in equilibrium in two
                 places, and the frame before says in which.
             corrections: how many calls correct the first call of a model that jumps; by default as in `self.effort`.
-            newton_steps: at most so many Newton steps of the solver follow, each about a tenth of its time, until one
-                is small (`Answer.last_steps`); by default as in `self.effort`, and 0 if `corrections` is given. They
-                need tetrahedra and their material. The stress then follows from the material.
+            newton_steps: at most so many Newton steps of the solver follow, until one is small (`Answer.last_steps`);
+                by default as in `self.effort`, and 0 if `corrections` is given. They need tetrahedra and their
+                material. The stress then follows from the material.
             num_frames: S, only for rigid motions; by default so many that the prescribed nodes move as far in one frame
                 as in training.
             stress: [given, N or E, 1], the stress of the given frames in pascal; by default zero. One frame is given,
@@ -236,6 +236,7 @@ class Run:
         split: str = "test",
         command: str = "Run.evaluate",
         rival_scenes: int = 0,
+        made_from: str | os.PathLike[str] | None = None,
     ) -> Evaluation:
         """Predict all scenes of a split and measure the errors; on a terminal a bar shows the progress.
 
@@ -243,11 +244,12 @@ class Run:
             data: a dataset; by default the one that the run was trained on.
             command: the command that is recorded beside the figures.
             rival_scenes: in so many scenes the solver solves the deepest frame, in several ways, to compare.
+            made_from: the specification or the parts of your own of which the dataset was made; the solver needs them.
         """
         with self.open(data) as dataset:
             with Progress(dataset.count(split) + rival_scenes, 0, "scenes") as bar:
                 figures, answers = evaluate(
-                    self.model, dataset, split, lambda name: bar.advance(), self.effort, rival_scenes
+                    self.model, dataset, split, lambda name: bar.advance(), self.effort, rival_scenes, made_from
                 )
             answers = [dataclasses.replace(answer, info=self.info) for answer in answers]
             origin = {"run": str(self.path), "step": self.step, "data": str(dataset.path), "split": split}

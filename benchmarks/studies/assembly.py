@@ -99,7 +99,7 @@ def measured(name: str, row: Row, folder: Path) -> dict[str, Any]:
         data, row.run_folder(name, folder), from_run=start, steps=row.steps, resume=True, **row.settings
     )
     with run.open(data) as dataset:
-        found = asked_frames(run.model, dataset, "test", run.effort, row.rivals, spec=row.spec)
+        found = asked_frames(run.model, dataset, "test", run.effort, row.rivals, made_from=row.spec)
         curves = [_curve(run, dataset, index) for index in range(row.test)]
         solver_seconds = read_seconds(dataset).samples.values()
     return {

@@ -163,8 +163,7 @@ def rivals(
     ways: Sequence[Way] = WAYS,
     starts: Sequence[int] = STARTS,
     repeats: int = 1,
-    parts: str | os.PathLike[str] | None = None,
-    spec: str | os.PathLike[str] | None = None,
+    made_from: str | os.PathLike[str] | None = None,
     most_iterations: int = MOST_ITERATIONS,
     progress: bool = True,
 ) -> Iterator[Rivals]:
@@ -177,7 +176,7 @@ def rivals(
         ways: how the solver is run.
         starts: in how many load steps each way is tried; 0: frame by frame. The cheapest that converges counts.
         repeats: how often each is timed. The smallest time counts.
-        parts, spec: where the parts or the specification lie, if the dataset was made of the user's own.
+        made_from: where the parts or the specification lie, if the dataset was made of the user's own.
         most_iterations: Newton iterations after which a try is given up.
         progress: show a bar on a terminal and lines elsewhere.
 
@@ -189,7 +188,7 @@ def rivals(
     if not starts or min(starts) < 0 or repeats < 1:
         raise SimulationError(f"starts {list(starts)} must be at least 0, and repeats {repeats} at least 1")
     with Dataset(dataset) as data:
-        recipe = recipe_of(str(dataset), data.info, *(None if path is None else Path(path) for path in (parts, spec)))
+        recipe = recipe_of(str(dataset), data.info, None if made_from is None else Path(made_from))
         frames = [_frame(data, split, index, which, frame_of) for which, index in enumerate(indices)]
     request = {
         "dataset": str(Path(dataset).resolve()),

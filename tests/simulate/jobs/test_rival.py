@@ -153,8 +153,8 @@ def test_only_datasets_of_the_bundled_solver_have_a_rival(plates, tmp_path):
     other = changed(plates, tmp_path / "other.h5", {**generator, "seed": 6})
     with pytest.raises(SimulationError, match="train/000000: drawing the scene again gives another one"):
         list(rivals(other, "train", [0], progress=False))
-    with pytest.raises(SimulationError, match="not made of parts of your own"):
-        rivals(plates, "train", [0], parts=tmp_path)
+    with pytest.raises(SimulationError, match="was made without parts of your own or a specification: leave .* out"):
+        rivals(plates, "train", [0], made_from=tmp_path)
 
 
 def test_frames_and_trajectories_that_are_not_there(plates):

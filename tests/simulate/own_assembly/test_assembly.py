@@ -205,7 +205,7 @@ def test_the_bytes_do_not_depend_on_workers(tmp_path):
         given = [data["train"][i].attributes["parameter travel"] for i in range(3)]
     assert info.length_unit == "mm" and info.generator["spec"]["text"] == SPEC and len(set(given)) == 3
     assert info.generator["command"] == "ast-sim generate assembly SPEC.toml --seed 0 --frames 3"
-    recipe = recipe_of("1.h5", info, spec=path)
+    recipe = recipe_of("1.h5", info, path)
     again = draw_sample(recipe, "train", 1)
     assert np.array_equal(again.case.scene.rest_position, truth.scene.rest_position)
     assert truth.position[-1, -1, 2] - truth.position[0, -1, 2] == pytest.approx(-given[1], abs=1e-6)
@@ -222,8 +222,8 @@ def test_other_contents_are_another_dataset(tmp_path):
     with Dataset(out) as data:
         info = data.info
     with pytest.raises(SimulationError, match="SPEC.toml or a file that it names differs from what a.h5 was made of"):
-        recipe_of("a.h5", info, spec=path)
-    with pytest.raises(SimulationError, match="a.h5 was made of a specification: say where it lies"):
+        recipe_of("a.h5", info, path)
+    with pytest.raises(SimulationError, match="a.h5 was made of a specification: say where to find that"):
         recipe_of("a.h5", info)
 
 
@@ -255,12 +255,12 @@ def test_the_solver_goes_straight_to_a_frame(tmp_path):
     out = tmp_path / "study.h5"
     generate("assembly", out, spec=path, train=0, valid=0, test=1, workers=1, progress=False)
     ways = (WAYS[0], Way("half", nodes=0.5))
-    (found,) = rivals(out, "test", [0], ways=ways, starts=(1,), spec=path, progress=False)
+    (found,) = rivals(out, "test", [0], ways=ways, starts=(1,), made_from=path, progress=False)
     own, coarse = found.outcomes
     assert found.frame == 2 and own.converged and coarse.converged, (own.failure, coarse.failure)
     assert own.relative_error < 0.02 and own.relative_error < coarse.relative_error < 0.8
     assert coarse.nodes < 0.75 * own.nodes
-    with pytest.raises(SimulationError, match="was made of a specification: say where it lies"):
+    with pytest.raises(SimulationError, match="was made of a specification: say where to find that"):
         rivals(out, "test", [0], progress=False)
 
 
