@@ -30,6 +30,7 @@ from ast_sim.simulate.shapes.cad_import import (
     is_top,
     one_solid,
     solid_of_surface,
+    start,
     surface_triangles,
     tetrahedra,
 )
@@ -66,15 +67,7 @@ def main() -> None:
     os.dup2(2, 1)  # what gmsh prints must not mix with the answer
     import gmsh
 
-    gmsh.initialize(interruptible=False)
-    for name, value in (
-        ("General.Terminal", 0),
-        ("General.NumThreads", 1),
-        ("Mesh.RandomSeed", 1),
-        ("Mesh.MeshSizeFromPoints", 0),
-        ("Mesh.MeshSizeExtendFromBoundary", 0),
-    ):
-        gmsh.option.setNumber(name, value)
+    start(gmsh)
     arrays = {"version": np.array(gmsh.option.getString("General.Version"))}
     try:
         arrays |= own_scale.answer(gmsh, request.get("own", []))

@@ -24,6 +24,7 @@ from ast_sim.simulate.shapes.cad_import import (
     import_step,
     one_solid,
     solid_of_surface,
+    start,
     surface_triangles,
     tetrahedra,
     triangles,
@@ -34,13 +35,14 @@ TRANSITION = 2.0  # around a finer box the elements grow to the usual size over 
 
 
 def answer(gmsh, parts: list[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """The arrays of all parts.
+    """The arrays of all parts. Each gets a gmsh of its own: a mesh must not depend on the parts before it.
 
     Raises:
         BadPart: a part cannot be meshed; the text names it.
     """
     arrays = {}
     for i, part in enumerate(parts):
+        start(gmsh)
         try:
             solid = _mesh(gmsh, part)
             position, elements, tags = tetrahedra(gmsh) if solid else triangles(gmsh)
@@ -51,7 +53,6 @@ def answer(gmsh, parts: list[dict[str, Any]]) -> dict[str, np.ndarray]:
             name = gmsh.model.getPhysicalName(dimension, group)
             nodes, _ = gmsh.model.mesh.getNodesForPhysicalGroup(dimension, group)
             arrays[f"own_group_{i}_{name}"] = np.flatnonzero(np.isin(tags, nodes))
-        gmsh.model.remove()
     return arrays
 
 

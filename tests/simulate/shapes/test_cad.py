@@ -76,6 +76,36 @@ def test_the_same_request_gives_the_same_mesh():
     assert np.array_equal(first.position, second.position) and np.array_equal(first.elements, second.elements)
 
 
+def test_a_part_does_not_depend_on_the_parts_before_it(tmp_path):
+    """Neither on the options that their scripts set nor on constants of the same name."""
+    (tmp_path / "ball.py").write_text("""
+def make(gmsh):
+    gmsh.option.setNumber("Mesh.MeshSizeFactor", 0.5)
+    gmsh.model.occ.addSphere(0, 0, 0, 1)
+""")
+    (tmp_path / "bar.geo").write_text("""
+SetFactory("OpenCASCADE");
+DefineConstant[ height = 2 ];
+Box(1) = {0, 0, 0, 1, 1, height};
+""")
+    part = {"size": 0.5, "finer": [], "arguments": {}}
+    ball = {**part, "name": "ball", "script": str(tmp_path / "ball.py"), "function": "make"}
+    bar = {**part, "name": "bar", "geo": str(tmp_path / "bar.geo")}
+    *_, after = cad.mesh_own_scale([ball, {**bar, "name": "low", "arguments": {"height": 0.7}}, bar])
+    (alone,) = cad.mesh_own_scale([bar])
+    assert np.ptp(alone["position"], axis=0) == pytest.approx([1, 1, 2])
+    assert np.array_equal(after["position"], alone["position"]) and np.array_equal(after["elements"], alone["elements"])
+
+
+def test_the_settings_of_the_user_of_gmsh_do_not_matter(tmp_path, monkeypatch):
+    """Whoever saves options in the window of Gmsh has a file of them at home."""
+    (before,) = cad.mesh_parts([HOLED], ["holed"], 300)
+    (tmp_path / ".gmsh-options").write_text("Mesh.ElementOrder = 2;\nMesh.Algorithm3D = 10;\n")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (after,) = cad.mesh_parts([HOLED], ["holed"], 300)
+    assert np.array_equal(before.position, after.position) and np.array_equal(before.elements, after.elements)
+
+
 def test_every_solid_of_the_grammar_can_be_meshed():
     rng, names, steps = np.random.default_rng(5), [], []
     while set(names) != set(cad._SOLIDS) or len(names) < 18:
