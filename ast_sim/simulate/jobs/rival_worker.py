@@ -178,7 +178,9 @@ class WaySolver:
         position = before = case.targets[0]
         contact, failure = case.contact, ""
         try:
-            newton = NewtonSteps(case.scene, case.material, CLEARANCE * contact.dhat, contact.friction)
+            # Newton steps know one coefficient; of several they get the largest.
+            friction = contact.frictions(case.scene)[-1]
+            newton = NewtonSteps(case.scene, case.material, CLEARANCE * contact.dhat, friction)
             setup = process_time() - began
             for share in np.linspace(0, 1, steps + 1)[1:]:
                 target, before = case.targets[0] + share * (case.targets[self.frame] - case.targets[0]), position

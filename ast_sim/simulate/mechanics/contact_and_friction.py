@@ -10,10 +10,12 @@ one place only (`load_ipctk`).
 from __future__ import annotations
 
 import functools
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 
+from ast_sim.scene import Scene
 from ast_sim.support.errors import MissingExtra, SimulationError, require
 
 IPCTK_VERSION = "1.5"
@@ -64,6 +66,13 @@ class ContactSettings:
         """The coefficient of friction between two bodies."""
         pairs = (coefficient for a, b, coefficient in self.pair_friction if {a, b} == {first, second})
         return next(pairs, self.friction)
+
+    def frictions(self, scene: Scene) -> list[float]:
+        """The coefficients of friction that act in a scene, ascending, each once. Rigid bodies do not rub on others."""
+        deforms = {int(body): bool(scene.deforming_nodes[scene.body == body].any()) for body in np.unique(scene.body)}
+        rubbing = [pair for pair in itertools.combinations(deforms, 2) if deforms[pair[0]] or deforms[pair[1]]]
+        found = {self.friction_between(*pair) for pair in rubbing}
+        return sorted(found | {self.friction} if self.self_contact or not found else found)
 
 
 def load_ipctk():

@@ -228,13 +228,14 @@ class Frames(ABC):
     def summary(self, solver: str) -> dict[str, AttributeValue]:
         """The worst values of the records, and what holds for all frames; `solver` is the name of the linear solver."""
         contact = self.case.contact
+        frictions = contact.frictions(self.case.scene)
         return {
             "min_gap": min(self.recorded("gap")),
             "min_jacobian": min(self.recorded("jacobian")),
             "max_residual": max(self.recorded("residual")),
             "dhat": contact.dhat,
             "kappa": contact.stiffness,
-            "friction": contact.friction,
+            "friction": frictions if len(frictions) > 1 else frictions[0],
             "solver": solver,
         }
 

@@ -98,6 +98,20 @@ offset = [0, 0, 40]""")  # fmt: skip
     assert sticky.attributes["dissipation"][-1] > 0 == smooth.attributes["dissipation"][-1]
 
 
+def test_the_friction_of_two_parts_is_recorded(tmp_path):
+    """A model knows the friction that the dataset records. Two rigid parts do not rub on each other."""
+    pair = '[[contact]]\nparts = ["block", "punch"]\nfriction = 0.4\n'
+    write_box(tmp_path / "back.vtu", (3, 3, 9), (7, 7, 10), (1, 1, 1))
+    back = '[parts.back]\nfile = "back.vtu"\nrigid = true\n' + pair.replace("punch", "back")
+    for spec in (SPEC + pair, SPEC + back + pair):
+        made, found = solved(write_assembly(tmp_path, spec), travel=0.5)
+        assert found.attributes["friction"] == 0.4 and made.case.contact.friction == 0
+    others = SPEC + back.replace("0.4", "0.1") + pair
+    contact, scene = (made := scene_of(write_assembly(tmp_path, others)).case).contact, made.scene
+    assert contact.frictions(scene) == [0.1, 0.4]
+    assert replace(contact, self_contact=(0,)).frictions(scene) == [0, 0.1, 0.4]
+
+
 def test_a_rigid_surface_is_a_tool(tmp_path):
     """A single sheet of triangles above the block: the block touches the sheet, not the layer behind it."""
     path = write_assembly(tmp_path, SPEC.replace('"punch.vtu"', '"sheet.stl"'))
