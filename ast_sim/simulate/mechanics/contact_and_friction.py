@@ -127,7 +127,8 @@ class Contact:
         faces: surface triangles [F,3], normals pointing out.
         body: number of the body of each node [N].
         settings: distance, stiffness and friction.
-        rigid: [N] bool, nodes of rigid bodies. A rigid body cannot touch itself. None: no body is rigid.
+        rigid: [N] bool, nodes of rigid bodies, which touch neither themselves nor each other, because their motion is
+            given. None: no body is rigid.
     """
 
     def __init__(
@@ -147,15 +148,19 @@ class Contact:
         vertices, edges = self._vertices(rest), ipctk.edges(local_faces)
         self._mesh = ipctk.CollisionMesh(vertices, edges, local_faces)
         self._skin = (SELF_CONTACT_SKIN if settings.self_contact else SKIN) * settings.dhat
-        if not settings.self_contact:
-            self._mesh.can_collide = ipctk.VertexPatchesCanCollide(body[self.nodes].astype(np.int32))
-        elif rigid is not None or settings.self_contact is not True:
-            alone = np.zeros(len(rest), bool) if rigid is None else rigid
-            if settings.self_contact is not True:
-                alone = alone | ~np.isin(body, settings.self_contact)
-            patch = np.where(alone, body, body.max() + 1 + np.arange(len(rest)))  # other nodes: a patch each
-            self._mesh.can_collide = ipctk.VertexPatchesCanCollide(patch[self.nodes].astype(np.int32))
         self._whole_mesh = ipctk.CollisionMesh(vertices, edges, local_faces)
+        # Nodes of one number do not touch each other: those of a body, and those of all rigid bodies.
+        fixed = np.zeros(len(rest), bool) if rigid is None else rigid
+        whole = np.zeros(len(rest), bool) if rigid is None else ~np.isin(body, body[~rigid])
+        together, alone = np.where(whole, -1, body), body.max() + 1 + np.arange(len(rest))
+        if not settings.self_contact:
+            self._mesh.can_collide = self._unless_alike(together)
+        elif rigid is not None or settings.self_contact is not True:
+            if settings.self_contact is not True:
+                fixed = fixed | ~np.isin(body, settings.self_contact)
+            self._mesh.can_collide = self._unless_alike(np.where(fixed, together, alone))
+        if len(np.unique(body[whole])) > 1:
+            self._whole_mesh.can_collide = self._unless_alike(np.where(whole, together, alone))
         self._barrier = ipctk.BarrierPotential(settings.dhat, True)
         self._broad_phase, self._ccd = ipctk.LBVH(), ipctk.AdditiveCCD()
         self._dofs = (3 * self.nodes[:, None] + np.arange(3)).ravel()
@@ -167,6 +172,10 @@ class Contact:
         self._candidates = self._ipctk.Candidates()
         self._reference = np.full((len(self.nodes), 3), np.inf)
         self._sliding: tuple[object, np.ndarray] | None = None
+
+    def _unless_alike(self, numbers: np.ndarray):
+        """What ipctk asks before it pairs two surface nodes: whether their numbers [N] differ."""
+        return self._ipctk.VertexPatchesCanCollide(numbers[self.nodes].astype(np.int32))
 
     def _vertices(self, position: np.ndarray) -> np.ndarray:
         return np.asfortranarray(position[self.nodes])
@@ -223,7 +232,7 @@ class Contact:
         return collisions
 
     def intersects(self, position: np.ndarray) -> bool:
-        """Whether any two surface triangles intersect, whether of one body or of two."""
+        """Whether any two surface triangles intersect, whether of one body or of two. Two rigid bodies may overlap."""
         return self._ipctk.has_intersections(self._whole_mesh, self._vertices(position), self._broad_phase)
 
     def gap(self, position: np.ndarray) -> float:

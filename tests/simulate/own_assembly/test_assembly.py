@@ -112,6 +112,26 @@ def test_the_friction_of_two_parts_is_recorded(tmp_path):
     assert replace(contact, self_contact=(0,)).frictions(scene) == [0, 0.1, 0.4]
 
 
+def test_rigid_parts_may_touch_and_pass_each_other(tmp_path):
+    """A tool of two parts that share a face, and a guide that it moves into: nothing gives way there."""
+    write_box(tmp_path / "back.vtu", (3, 3, 8), (7, 7, 9), (1, 1, 1))
+    write_box(tmp_path / "guide.vtu", (3, 3, 10), (7, 7, 12), (2, 2, 2))
+    parts = ["back", "guide"]
+    more = "".join(f'[parts.{name}]\nfile = "{name}.vtu"\nrigid = true\nmove = {{MOVE}}\n' for name in parts)
+    more = more.replace("{MOVE}", "{ translation = [0, 0, '-travel'] }", 1)
+    more = more.replace("{MOVE}", "{ translation = [0, 0, '-3 * travel'] }")
+    alone, together = tmp_path / "alone", tmp_path / "together"
+    for folder, spec in ((alone, SPEC), (together, SPEC + more)):
+        folder.mkdir()
+        for name in parts:
+            (folder / f"{name}.vtu").write_bytes((tmp_path / f"{name}.vtu").read_bytes())
+        write_assembly(folder, spec)
+    made, first = solved(alone / "SPEC.toml", travel=1.0)
+    _, second = solved(together / "SPEC.toml", travel=1.0)
+    count = made.case.scene.num_nodes
+    np.testing.assert_allclose(second.position[:, :count], first.position, rtol=0, atol=1e-6)
+
+
 def test_a_rigid_surface_is_a_tool(tmp_path):
     """A single sheet of triangles above the block: the block touches the sheet, not the layer behind it."""
     path = write_assembly(tmp_path, SPEC.replace('"punch.vtu"', '"sheet.stl"'))
