@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,9 @@ IPCTK_VERSION = "1.5"
 # saves searches but adds pairs. A surface that may touch itself has many pairs nearby, so its skin is thin.
 SKIN = 1.0
 SELF_CONTACT_SKIN = 0.3
+# ipctk counts squares of distances as zero below about 1e-16, so lengths are blown up by a power of two, which rounds
+# nothing, until dhat is at least ZOOMED where it is below SMALL.
+SMALL, ZOOMED = 1e-6, 1e-3
 # Slip per load step, in units of dhat, from which Coulomb friction is fully mobilised; below it a contact sticks.
 STICKING_SLIP = 0.1
 
@@ -141,13 +145,15 @@ class Contact:
     ) -> None:
         self._ipctk = ipctk = load_ipctk()
         self.settings = settings
+        self._zoom = 1.0 if settings.dhat >= SMALL else 2.0 ** math.ceil(math.log2(ZOOMED / settings.dhat))
+        self._dhat = self._zoom * settings.dhat  # in ipctk's lengths, as are all vertices and distances below
         self.num_nodes = len(rest)
         self.nodes, local_faces = np.unique(faces, return_inverse=True)
         local_faces = np.asfortranarray(local_faces.reshape(-1, 3), dtype=np.int32)
         self._body = body[self.nodes].astype(float)
         vertices, edges = self._vertices(rest), ipctk.edges(local_faces)
         self._mesh = ipctk.CollisionMesh(vertices, edges, local_faces)
-        self._skin = (SELF_CONTACT_SKIN if settings.self_contact else SKIN) * settings.dhat
+        self._skin = (SELF_CONTACT_SKIN if settings.self_contact else SKIN) * self._dhat
         self._whole_mesh = ipctk.CollisionMesh(vertices, edges, local_faces)
         # Nodes of one number do not touch each other: those of a body, and those of all rigid bodies.
         fixed = np.zeros(len(rest), bool) if rigid is None else rigid
@@ -161,10 +167,10 @@ class Contact:
             self._mesh.can_collide = self._unless_alike(np.where(fixed, together, alone))
         if len(np.unique(body[whole])) > 1:
             self._whole_mesh.can_collide = self._unless_alike(np.where(whole, together, alone))
-        self._barrier = ipctk.BarrierPotential(settings.dhat, True)
+        self._barrier = ipctk.BarrierPotential(self._dhat, True)
         self._broad_phase, self._ccd = ipctk.LBVH(), ipctk.AdditiveCCD()
         self._dofs = (3 * self.nodes[:, None] + np.arange(3)).ravel()
-        self._friction = ipctk.FrictionPotential(STICKING_SLIP * settings.dhat)
+        self._friction = ipctk.FrictionPotential(STICKING_SLIP * self._dhat)
         self.restart()
 
     def restart(self) -> None:
@@ -178,7 +184,7 @@ class Contact:
         return self._ipctk.VertexPatchesCanCollide(numbers[self.nodes].astype(np.int32))
 
     def _vertices(self, position: np.ndarray) -> np.ndarray:
-        return np.asfortranarray(position[self.nodes])
+        return np.asfortranarray(self._zoom * position[self.nodes])
 
     def _is_near_reference(self, vertices: np.ndarray) -> bool:
         difference = vertices - self._reference
@@ -192,7 +198,7 @@ class Contact:
         """
         if self._is_near_reference(start) and self._is_near_reference(end):
             return
-        self._candidates.build(self._mesh, start, end, 0.5 * self.settings.dhat + self._skin, self._broad_phase)
+        self._candidates.build(self._mesh, start, end, 0.5 * self._dhat + self._skin, self._broad_phase)
         self._reference = end
 
     def collision_free_fraction(self, start: np.ndarray, end: np.ndarray) -> float:
@@ -205,7 +211,7 @@ class Contact:
         """Pairs closer than dhat at positions [N,3]. They must lie on the last step of `collision_free_fraction`."""
         vertices = self._vertices(position)
         collisions = self._new_collisions()
-        collisions.build(self._candidates, self._mesh, vertices, self.settings.dhat)
+        collisions.build(self._candidates, self._mesh, vertices, self._dhat)
         return ContactState(self, collisions, vertices)
 
     def lag_friction(self, state: ContactState, start: np.ndarray) -> None:
@@ -238,17 +244,18 @@ class Contact:
     def gap(self, position: np.ndarray) -> float:
         """Smallest distance in metres between surfaces that are kept apart; infinite if there are none."""
         vertices = self._vertices(position)
-        radius, extent = self.settings.dhat, np.linalg.norm(np.ptp(vertices, axis=0))
+        radius, extent = self._dhat, np.linalg.norm(np.ptp(vertices, axis=0))
         collisions = self._new_collisions()
         while collisions.empty() and radius < 8 * extent:
             collisions.build(self._mesh, vertices, radius, 0.0, self._broad_phase)
             radius *= 4
-        return float(np.sqrt(collisions.compute_minimum_distance(self._mesh, vertices)))  # ipctk gives its square
+        square = collisions.compute_minimum_distance(self._mesh, vertices)  # so ipctk gives it
+        return float(np.sqrt(square)) / self._zoom
 
     def area(self, state: ContactState) -> float:
         """Rest area in square metres around the surface nodes on which a barrier acts. It is the mean of both sides."""
         touched = np.abs(state.barrier_gradient()).max(axis=1) > 0
-        return 0.5 * float(np.asarray(self._mesh.vertex_areas)[touched].sum())
+        return 0.5 * float(np.asarray(self._mesh.vertex_areas)[touched].sum()) / self._zoom**2
 
 
 class ContactState:
@@ -257,7 +264,7 @@ class ContactState:
     Args:
         contact: the contact that this state belongs to.
         collisions: ipctk's pairs closer than dhat.
-        vertices: [V,3] positions of the surface nodes.
+        vertices: [V,3] positions of the surface nodes, in ipctk's lengths.
     """
 
     def __init__(self, contact: Contact, collisions, vertices: np.ndarray) -> None:
@@ -274,18 +281,20 @@ class ContactState:
         if self._sliding is None:
             return self.barrier_energy()
         contact, (pairs, start) = self._contact, self._sliding
-        return self.barrier_energy() + contact._friction(pairs, contact._mesh, self.vertices - start)
+        energy = contact._friction(pairs, contact._mesh, self.vertices - start)
+        return self.barrier_energy() + energy / contact._zoom**3
 
     def barrier_energy(self) -> float:
         """Barrier energy in joule."""
         contact = self._contact
-        return contact.settings.stiffness * contact._barrier(self.collisions, contact._mesh, self.vertices)
+        energy = contact._barrier(self.collisions, contact._mesh, self.vertices)
+        return contact.settings.stiffness * energy / contact._zoom**3
 
     def dissipation(self) -> float:
         """Work in joule that friction has taken since the positions at which it began to act."""
         if self._sliding is None:
             return 0.0
-        return float(np.vdot(self.friction_gradient(), self.vertices - self._sliding[1]))
+        return float(np.vdot(self.friction_gradient(), self.vertices - self._sliding[1])) / self._contact._zoom
 
     def barrier_gradient(self) -> np.ndarray:
         """Derivative of the barrier energy by the positions of the surface nodes [V,3], in newton."""
@@ -293,14 +302,15 @@ class ContactState:
             return np.zeros(self.vertices.shape)
         contact = self._contact
         gradient = contact._barrier.gradient(self.collisions, contact._mesh, self.vertices)
-        return contact.settings.stiffness * gradient.reshape(-1, 3)
+        return contact.settings.stiffness * gradient.reshape(-1, 3) / contact._zoom**2
 
     def friction_gradient(self) -> np.ndarray:
         """Derivative of the potential of friction by the positions of the surface nodes [V,3], in newton."""
         if self._sliding is None:
             return np.zeros(self.vertices.shape)
         contact, (pairs, start) = self._contact, self._sliding
-        return contact._friction.gradient(pairs, contact._mesh, self.vertices - start).reshape(-1, 3)
+        gradient = contact._friction.gradient(pairs, contact._mesh, self.vertices - start)
+        return gradient.reshape(-1, 3) / contact._zoom**2
 
     def gradient(self) -> np.ndarray:
         """Derivative of the energy by the positions [N,3], in newton: minus the contact force on each node."""
@@ -330,5 +340,5 @@ class ContactState:
         local = [(matrix.tocoo(), scale) for matrix, scale in parts]
         rows = np.concatenate([matrix.row for matrix, _ in local])
         columns = np.concatenate([matrix.col for matrix, _ in local])
-        values = np.concatenate([scale * matrix.data for matrix, scale in local])
+        values = np.concatenate([scale * matrix.data for matrix, scale in local]) / contact._zoom
         return contact._dofs[rows], contact._dofs[columns], values

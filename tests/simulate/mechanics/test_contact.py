@@ -69,6 +69,26 @@ def test_contact_forces_are_opposite_and_push_apart():
     assert on_ball[2] > 0
 
 
+@pytest.mark.parametrize("size", [1e-4, 1e-7])
+def test_contact_does_not_depend_on_the_unit_of_length(size):
+    """Parts of a few micrometres in metres: squares of their gaps are below what ipctk tells from zero."""
+    rest, faces, body = two_bodies(0.4e-3)
+    slid = rest + np.where(body == 1, 2e-4, 0)[:, None] * [1, 0, 0]
+    found = []
+    for scale in (1, size):
+        contact = Contact(scale * rest, faces, body, ContactSettings(scale * DHAT, 1e6, friction=0.3))
+        contact.lag_friction(state_at(contact, scale * rest), scale * rest)
+        state = state_at(contact, scale * slid)
+        hessian = np.abs(state.hessian()[2]).max()
+        powers = {"energy": 3, "barrier_energy": 3, "dissipation": 3, "gradient": 2, "friction_gradient": 2}
+        lines = [np.max(getattr(state, name)()) / scale**power for name, power in powers.items()]
+        gap, step = contact.gap(scale * slid), -0.01 * np.where(body == 1, scale, 0)[:, None] * [0, 0, 1]
+        fraction = contact.collision_free_fraction(scale * slid, scale * slid + step)
+        found.append([*lines, hessian / scale, gap / scale, contact.area(state) / scale**2, fraction])
+    assert min(np.abs(found[0])) > 0 and found[0][-1] < 0.1
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-6)
+
+
 def test_projected_hessian_is_positive_semi_definite():
     rest, faces, body = two_bodies(0.4e-3)
     rows, columns, values = state_at(Contact(rest, faces, body, ContactSettings(DHAT, 1e6)), rest).hessian(project=True)

@@ -61,6 +61,16 @@ def test_millimetres_and_metres_give_the_same_mechanics(tmp_path):
     assert 5 < first.attributes["reaction"][-1] < 30
 
 
+def test_parts_of_micrometres_are_solved_in_metres(tmp_path):
+    spec = SPEC.replace('"mm"', '"m"').replace("0.05", "5e-8").replace("[0.5, 1.5]", "[0.5e-6, 1.5e-6]")
+    first, second = tmp_path / "mm", tmp_path / "m"
+    first.mkdir(), second.mkdir()
+    _, large = solved(write_assembly(first), travel=1.0)
+    _, small = solved(write_assembly(second, spec, scale=1e-6), travel=1e-6)
+    np.testing.assert_allclose(small.position, 1e-6 * large.position, rtol=0, atol=2e-6 * 1e-5)
+    np.testing.assert_allclose(small.attributes["reaction"], 1e-6 * np.array(large.attributes["reaction"]), rtol=1e-3)
+
+
 def test_far_from_the_origin_nothing_changes(tmp_path):
     near, far = tmp_path / "near", tmp_path / "far"
     near.mkdir(), far.mkdir()
