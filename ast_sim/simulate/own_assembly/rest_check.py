@@ -27,11 +27,13 @@ def check(spec: AssemblySpec, case: SolidCase, shared: Reference) -> None:
     """Check the assembly at rest, and its prescribed nodes in all frames.
 
     Raises:
-        BadAssembly: nothing holds a part, parts overlap or are closer than the contact distance, a part comes too close
-            to itself, or prescribed nodes turn an element over.
+        BadAssembly: nothing holds a part, no node is free, parts overlap or are closer than the contact distance, a
+            part comes too close to itself, or prescribed nodes turn an element over.
     """
     _check_held(spec, case)
     _check_turned_over(spec, case)
+    if case.scene.prescribed.all():
+        raise BadAssembly("all nodes are fixed or moved, so nothing deforms: hold fewer of them, or mesh finer")
     rest = case.scene.rest_position.astype(np.float64)
     for pair in combinations(range(len(spec.parts)), 2):
         _check_apart(spec, case, rest, pair, shared)
