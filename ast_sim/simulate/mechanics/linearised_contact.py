@@ -108,8 +108,20 @@ class NewtonSteps:
             stuck: [N, 3] where surfaces in contact stuck to each other; see the head of this file.
 
         Raises:
-            SimulationError: the stiffness is singular, or the forces of contact were not found.
+            SimulationError: the stiffness is singular, the forces of contact were not found, or the positions are too
+                far from equilibrium.
         """
+        try:
+            with np.errstate(all="ignore"):
+                found = self._stepped(position, from_afar, stuck)
+        except np.linalg.LinAlgError as error:
+            raise SimulationError(f"the positions are too far from equilibrium: {error}") from error
+        if not np.isfinite(found).all():
+            raise SimulationError("the positions are too far from equilibrium: the step is not finite")
+        return found
+
+    def _stepped(self, position: np.ndarray, from_afar: bool, stuck: np.ndarray | None) -> np.ndarray:
+        """See `step`."""
         deformation = _upright(self._elasticity.evaluate(position))
         force = self._elasticity.gradient(deformation)[0].ravel()[self._system.free]
         for project in (True,) if from_afar else (False, True):

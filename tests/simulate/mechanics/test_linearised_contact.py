@@ -119,6 +119,17 @@ def test_a_body_that_nothing_holds_is_refused():
         solver.step(scene.rest_position.astype(float))
 
 
+@pytest.mark.parametrize("size", [1e6, 1e30])
+def test_positions_that_lead_nowhere_are_refused(squeezed, size):
+    """A model that was trained badly answers with any numbers; the start of a step may be one of its answers."""
+    case, truth, free, _ = squeezed
+    position = truth + size * np.where(free[:, None], np.random.default_rng(0).standard_normal(truth.shape), 0)
+    solver = NewtonSteps(case.scene, case.material, 0.0)
+    with pytest.raises(SimulationError, match="too far from equilibrium"):
+        for _ in range(4):
+            position = solver.step(position, from_afar=True)
+
+
 def test_forces_found_in_rounds_are_those_of_all_pairs_at_once(squeezed, monkeypatch):
     case, truth, free, size = squeezed
     start, found = nearly(truth, free, 0.1 * size), []
