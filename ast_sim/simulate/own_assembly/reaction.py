@@ -3,13 +3,16 @@
 At equilibrium, the derivative f_i of the elastic energy by the position of a node is zero at free nodes that nothing
 touches; at a held node it is the force that holds the node, at a touched node the contact force on it. So the force on
 the moved nodes is the sum of w_i f_i for every field w that is 1 where these act on the deforming bodies, and 0 at all
-other nodes that are held or touched. On predicted positions, f_i is not zero elsewhere. A smooth w then averages the
-stress over all of the body, where the forces at the moved nodes alone would show the errors of one layer of elements.
+other nodes that are held or touched. Where a body touches itself, its two sides push each other: w is the same on both.
+On predicted positions, f_i is not zero elsewhere. A smooth w then averages the stress over all of the body, where the
+forces at the moved nodes alone would show the errors of one layer of elements.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import cg
 
 from ast_sim.scene import NodeType, Scene
@@ -17,6 +20,7 @@ from ast_sim.simulate.mechanics.elasticity import Elasticity
 from ast_sim.simulate.mechanics.material import NeoHookean
 
 REACH = 1.0  # a node counts as touched if another body is nearer than so many mean edge lengths
+OPPOSITE = 0.5  # cosine between opposite normals, at most; at an edge, a normal is the mean of its faces
 SMOOTH = 1e-3  # residual to which the smooth field is computed; every field is exact at equilibrium
 
 
@@ -56,7 +60,7 @@ class Reaction:
             return np.zeros(3)
         deformation = self._elasticity.evaluate(position)
         forces, _ = self._elasticity.gradient(deformation)
-        return self._field(source, sink) @ forces
+        return self._field(source, sink, self._folds(position)) @ forces
 
     def _ends(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """[N] bool twice: the deforming nodes on which the moved nodes act, and all others that are held or touched."""
@@ -91,11 +95,47 @@ class Reaction:
                 found[nodes[closer]], nearest[nodes[closer]] = body, square[closer]
         return found
 
-    def _field(self, source: np.ndarray, sink: np.ndarray) -> np.ndarray:
-        """[N] w: about harmonic between 1 at the sources and 0 at the sinks."""
-        field = source.astype(float)
-        inner = np.flatnonzero(self._deforming & ~source & ~sink)
+    def _folds(self, position: np.ndarray) -> np.ndarray:
+        """[2, P] pairs of nodes of a deforming body whose surfaces look at each other across a gap within reach, and
+        have come nearer: there the body may touch itself."""
+        from scipy.spatial import KDTree
+
+        outward, found = self._outward(position), [np.zeros((0, 2), int)]
+        for faces in self._surfaces.values():
+            nodes = np.unique(faces)
+            nodes = nodes[self._deforming[nodes]]
+            if len(nodes):
+                found.append(nodes[KDTree(position[nodes]).query_pairs(self._reach, output_type="ndarray")])
+        first, second = np.concatenate(found).T
+        way, before = position[second] - position[first], self._rest[second] - self._rest[first]
+        facing = np.einsum("pi,pi->p", outward[first] - outward[second], way) > 0
+        opposite = np.einsum("pi,pi->p", outward[first], outward[second]) < OPPOSITE
+        nearer = np.linalg.norm(way, axis=1) < np.linalg.norm(before, axis=1)
+        return np.stack([first, second])[:, facing & opposite & nearer]
+
+    def _outward(self, position: np.ndarray) -> np.ndarray:
+        """[N,3] the outward unit normals at the nodes of the surfaces; zero at all other nodes."""
+        faces, outward = np.concatenate(list(self._surfaces.values())), np.zeros_like(position)
+        a, b, c = (position[faces[:, corner]] for corner in range(3))
+        np.add.at(outward, faces.ravel(), np.repeat(np.cross(b - a, c - a), 3, axis=0))
+        return outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), np.finfo(float).tiny)
+
+    def _field(self, source: np.ndarray, sink: np.ndarray, folds: np.ndarray) -> np.ndarray:
+        """[N] w: about harmonic between 1 at the sources and 0 at the sinks, and the same on both sides of folds."""
+        count, free = len(source), self._deforming & ~source & ~sink
+        inside = folds[:, free[folds].all(axis=0)]
+        links = coo_array((np.ones(len(inside[0])), inside), shape=(count, count))
+        groups, group = connected_components(links, directed=False)
+        # A fold that a source or a sink touches is part of it, unless both do.
+        both = np.concatenate([folds, folds[::-1]], axis=1)
+        by_source, by_sink = (
+            np.bincount(group[both[0, ends[both[1]]]], minlength=groups) > 0 for ends in (source, sink)
+        )
+        field = (source | (free & (by_source & ~by_sink)[group])).astype(float)
+        inner = np.flatnonzero(free & (by_source == by_sink)[group])
         if len(inner):
-            rows = self._laplacian[inner]
-            field[inner] = cg(rows[:, inner], -rows[:, source].sum(axis=1), rtol=SMOOTH, maxiter=500)[0]
+            place = np.unique(group[inner], return_inverse=True)[1]
+            spread = coo_array((np.ones(len(inner)), (np.arange(len(inner)), place))).tocsr()
+            rows = spread.T @ self._laplacian[inner]
+            field[inner] = spread @ cg(rows[:, inner] @ spread, -rows @ field, rtol=SMOOTH, maxiter=500)[0]
         return field

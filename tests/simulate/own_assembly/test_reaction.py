@@ -1,5 +1,6 @@
 """The force that moves a body: against closed forms, against the solver, and on positions with errors."""
 
+import meshio
 import numpy as np
 import pytest
 from simulate.own_assembly.assemblies import SPEC, box, write_assembly
@@ -11,6 +12,7 @@ from ast_sim.simulate.mechanics.material import NeoHookean
 from ast_sim.simulate.own_assembly.parameters import completed
 from ast_sim.simulate.own_assembly.reaction import Reaction
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
+from ast_sim.simulate.shapes.parts import rectilinear
 
 YOUNG, POISSON = 1.5e6, 0.3
 
@@ -49,6 +51,22 @@ def test_the_force_is_that_of_the_solver(tmp_path, who_moves):
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), recorded, rtol=1e-3, atol=1e-3)
     # The punch is pushed down, the block up.
     assert recorded[-1] > 1e6 and (found[-1, 2] > 0) == (who_moves == "the block")
+
+
+def test_a_part_that_touches_itself(tmp_path):
+    """The punch closes a slit. The forces between its lips are no force on the punch, however large they are."""
+    lines = [np.linspace(0, 10, 11), np.linspace(0, 4, 5), np.array([0, 0.9, 1.8, 2.2, 3.1, 4])]
+    solid = np.ones((10, 4, 5), bool)
+    solid[:8, :, 2] = False
+    position, elements = rectilinear(lines, solid)
+    meshio.Mesh(position, {"tetra": elements}).write(tmp_path / "clip.vtu")
+    spec = SPEC.replace('"block.vtu"', '"clip.vtu"\nself_contact = true')
+    spec = spec.replace("rigid = true", "rigid = true\noffset = [-3, -3, -1]")
+    scene, truth = solved(tmp_path, spec, travel=1.4)
+    force, recorded = Reaction(scene), np.array(truth.attributes["reaction"])
+    found = [np.linalg.norm(force.of(position)) for position in truth.position]
+    np.testing.assert_allclose(found, recorded, rtol=0.02, atol=1e-3)
+    assert all(len(force._folds(position.astype(float))[0]) > 10 for position in truth.position[1:])
 
 
 def test_where_nothing_touches_no_force_is_needed(tmp_path):
