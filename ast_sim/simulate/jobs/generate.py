@@ -30,7 +30,7 @@ from ast_sim.simulate.families.names import family_module
 from ast_sim.simulate.jobs import cluster, pool
 from ast_sim.simulate.jobs.display import Progress
 from ast_sim.simulate.jobs.manifest import Manifest, Watch
-from ast_sim.simulate.jobs.recipe import check_parts, checked_recipe, difference, recorded
+from ast_sim.simulate.jobs.recipe import check_parts, checked_recipe, difference, recorded, whole
 from ast_sim.simulate.jobs.samples import (
     Recipe,
     Sample,
@@ -106,10 +106,10 @@ def generate(
             with other settings, another process uses the folder, or samples failed: the same call goes on from there.
         MissingExtra: a package that the family, the solver or the scheduler needs is not installed.
     """
-    module = family_module(family)
+    module, numbers = family_module(family), whole(seed=seed, nodes=nodes, frames=frames)
     self_test()
     counts, workers = checked_counts(train, valid, test), checked_workers(workers, scheduler)
-    recipe = checked_recipe(module, family, seed, nodes, frames, solver, parts, patient, keep, spec)
+    recipe = checked_recipe(module, family, *numbers, solver, parts, patient, keep, spec)
     out, settings = Path(out), recorded(recipe)
     output_file(out)
     folder = out.with_name(out.name + ".parts")

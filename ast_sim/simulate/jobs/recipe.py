@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 # Another linear solver gives other last bits, so it is also recorded which solvers are not installed.
 PACKAGES = ("numpy", "scipy", "ipctk", "pypardiso", "mkl", "cholespy")
 SOLVERS = ("own", "calculix")
+LARGEST_SEED = 2**63 - 1
 
 
 def checked_recipe(
@@ -60,6 +61,8 @@ def checked_recipe(
     for name, value, minimum in (("seed", seed, 0), ("nodes", nodes, module.MINIMUM_NODES)):
         if value is not None and value < minimum:
             raise SimulationError(f"{name} is {value}; must be at least {minimum}")
+    if seed > LARGEST_SEED:
+        raise SimulationError(f"seed is {seed}; must be at most 2^63 - 1, the largest number that the file can hold")
     solver = solver or "own"
     if solver not in SOLVERS:
         raise SimulationError(f"there is no solver {solver!r}; use one of {', '.join(SOLVERS)}")
@@ -108,6 +111,20 @@ def recipe_of(name: str, info: DatasetInfo, made_from: str | Path | None = None)
     if spec is not None and read_spec(spec).describe() != made["spec"]:
         raise SimulationError(f"{spec} or a file that it names differs from what {name} was made of")
     return recipe
+
+
+def whole(**numbers: Any) -> list[Any]:
+    """The numbers as plain integers, whatever integer types they have; None stays None.
+
+    Raises:
+        SimulationError: one is no whole number; the text names it.
+    """
+    for name, value in numbers.items():
+        try:
+            numbers[name] = None if value is None else index(value)
+        except TypeError as error:
+            raise SimulationError(f"{name} is {value!r}; must be a whole number") from error
+    return list(numbers.values())
 
 
 def _checked_keep(keep: Sequence[int], last: int) -> tuple[int, ...]:

@@ -23,17 +23,21 @@ def parse_setting(text: str) -> tuple[str, list[Any]]:
     """The parameter and the values of `NAME=VALUE[,VALUE...]` or `NAME=FIRST:LAST:COUNT`.
 
     Raises:
-        ConfigError: the text has another form; the error gives examples.
+        ConfigError: the text has another form (the error gives examples), or there are too many values.
     """
     name, found, values = (part.strip() for part in text.partition("="))
     ends = values.split(":")
     try:
         if not (found and name and values):
             raise ValueError(text)
+        if len(ends) == 3 and int(ends[2]) > MOST_ROWS:
+            raise ConfigError(f"{text!r} asks for {int(ends[2]):,} values; at most {MOST_ROWS:,}: take fewer")
         if len(ends) == 3 and int(ends[2]) >= 1:
             return name, np.linspace(float(ends[0]), float(ends[1]), int(ends[2])).tolist()
         if len(ends) == 3:
             raise ValueError(text)
+    except ConfigError:
+        raise
     except ValueError as error:
         raise ConfigError(
             f"{text!r} cannot be read; write travel=4.2, travel=1,2,3, travel=1:7:13 (from, to, how many) or"
@@ -47,12 +51,14 @@ def grid(values: Mapping[str, Any]) -> list[dict[str, Any]]:
     parameters as in `completed`.
 
     Raises:
-        ConfigError: a parameter has no value, or there are too many rows.
+        ConfigError: a parameter has no value or is given twice, or there are too many rows.
     """
     flat: dict[str, Sequence[Any]] = {}
     for name, value in values.items():
         inner = {f"{part}.{name}": v for part, v in value.items()} if isinstance(value, Mapping) else {name: value}
         for key, v in inner.items():
+            if key in flat:
+                raise ConfigError(f"{key} is given twice: leave one out")
             flat[key] = [v] if isinstance(v, str) or np.ndim(v) == 0 else list(v)
             if not len(flat[key]):
                 raise ConfigError(f"{key} has no value")
@@ -66,7 +72,7 @@ def read_table(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
     """The rows of a CSV file, whose first line names the parameters.
 
     Raises:
-        ConfigError: it cannot be read, has no rows, or a row has another number of values.
+        ConfigError: it cannot be read, has no rows, two columns have one name, or a row has another number of values.
     """
     try:
         lines = [line for line in csv.reader(io.StringIO(read_text(Path(path), "utf-8-sig"))) if line]
@@ -76,6 +82,9 @@ def read_table(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
     if len(lines) < 2:
         raise ConfigError(f"{path}: the table needs a line with the names of the parameters, and a row or more")
     names = [name.strip() for name in lines[0]]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise ConfigError(f"{path}: two columns have the name {twice!r}")
     for number, line in enumerate(lines[1:], 2):
         if len(line) != len(names):
             raise ConfigError(f"{path}: row {number} has {len(line)} values, but there are {len(names)} names")

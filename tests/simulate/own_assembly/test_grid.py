@@ -35,13 +35,21 @@ def test_grids_have_an_end():
         grid({"a": range(1000), "b": range(1000)})
     with pytest.raises(ConfigError, match="a has no value"):
         grid({"a": []})
+    with pytest.raises(ConfigError, match="'a=0:1:100000000000' asks for 100,000,000,000 values; at most 100,000"):
+        parse_setting("a=0:1:100000000000")
+    with pytest.raises(ConfigError, match="pad.young is given twice"):
+        grid({"young": {"pad": [1, 2]}, "pad.young": 3})
 
 
 def test_tables(tmp_path):
     path = tmp_path / "table.csv"
     path.write_text("travel, hook.file\n1.5,a.step\n\n2,b.step\n")
     assert read_table(path) == [{"travel": 1.5, "hook.file": "a.step"}, {"travel": 2.0, "hook.file": "b.step"}]
-    for text, line in (("travel\n", "a row or more"), ("a,b\n1,2\n3\n", "row 3 has 1 values, but there are 2 names")):
+    for text, line in (
+        ("travel\n", "a row or more"),
+        ("a,b\n1,2\n3\n", "row 3 has 1 values, but there are 2 names"),
+        ("a, b,a\n1,2,3\n", "two columns have the name 'a'"),
+    ):
         path.write_text(text)
         with pytest.raises(ConfigError, match=line):
             read_table(path)
