@@ -95,5 +95,5 @@ def stress_rmse(truth: Trajectory, stress: np.ndarray) -> np.ndarray:
 
 
 def _root_mean_square(difference: np.ndarray) -> np.ndarray:
-    values = difference.reshape(len(difference), -1)
-    return np.sqrt((values**2).sum(axis=1) / max(values.shape[1], 1))
+    each = tuple(range(1, difference.ndim))
+    return np.sqrt((difference**2).sum(axis=each) / max(np.prod(difference.shape[1:]), 1))

@@ -92,6 +92,13 @@ def test_a_prediction_ends_at_its_first_frame_that_is_not_finite():
     assert len(encode.encode_curves(truth, [prediction])["displacement"]["runs"][0]) == 3
 
 
+def test_a_prediction_without_a_finite_frame_has_no_errors():
+    truth, prediction = plate(5), plate(5, seed=1)
+    prediction.position[:] = np.nan
+    curves = encode.encode_curves(truth, [prediction])
+    assert curves["displacement"]["runs"] == [[]] and len(curves["displacement"]["trivial"]) == 5
+
+
 def test_large_scenes_show_fewer_frames_but_all_errors(monkeypatch):
     monkeypatch.setattr(report, "MOTION_BYTES", 200_000)
     truth = plate(61)
