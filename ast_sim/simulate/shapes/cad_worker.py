@@ -62,7 +62,7 @@ class Model:
 def main() -> None:
     """Answer one request."""
     request = json.loads(sys.stdin.read())
-    resource.setrlimit(resource.RLIMIT_CPU, (request["seconds"], request["seconds"] + 5))  # SIGXCPU, then SIGKILL
+    _limit_seconds(request["seconds"])
     answer = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what gmsh prints must not mix with the answer
     import gmsh
@@ -83,6 +83,15 @@ def main() -> None:
     np.savez(buffer, **arrays)
     answer.write(buffer.getvalue())
     answer.close()
+
+
+def _limit_seconds(seconds: int) -> None:
+    """Limit the processor time: SIGXCPU, then SIGKILL. A limit that is lower already (`ulimit -t`) stays."""
+    _, most = resource.getrlimit(resource.RLIMIT_CPU)
+    wanted = (seconds, seconds + 5)
+    if most != resource.RLIM_INFINITY:
+        wanted = (min(seconds, max(1, most - 5)), min(seconds + 5, most))
+    resource.setrlimit(resource.RLIMIT_CPU, wanted)
 
 
 def _refuse(text: str) -> int:

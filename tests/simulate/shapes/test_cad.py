@@ -272,6 +272,16 @@ def test_a_crash_and_a_hang_of_gmsh_are_told(monkeypatch):
     assert failure("import sys; sys.exit('Invalid boundary mesh')") == "Invalid boundary mesh"
 
 
+def test_a_limit_of_processor_time_that_the_user_has_is_kept():
+    """On shared machines `ulimit -t` may be below the limit of a mesh; nobody can raise it."""
+    import subprocess
+
+    code = "from ast_sim.simulate.shapes import cad; print(cad.gmsh_version())"
+    command = f"ulimit -t {cad.START_SECONDS - 5} && exec {sys.executable} -c '{code}'"
+    told = subprocess.run(["bash", "-c", command], check=True, capture_output=True, text=True).stdout
+    assert told.strip() == cad.gmsh_version()
+
+
 def test_a_gmsh_that_does_not_start_names_what_it_needs(monkeypatch):
     cad.gmsh_version.cache_clear()
     monkeypatch.setattr(cad, "WORKER", [sys.executable, "-c", "raise OSError('libGLU.so.1: not there')"])
