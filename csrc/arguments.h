@@ -25,14 +25,13 @@ typedef struct {
   double number;
   int64_t bytes, row_bytes; /* of all elements, and from row to row */
   bool dense;
-  frozen *frozen; /* whose hidden copy `data` is, held during the call, or NULL */
+  frozen *frozen; /* whose hidden copy `data` is, or where an output is made; held during the call; or NULL */
   void *secured;  /* or a copy made for this call */
   void *copy;     /* debug: what an input held before the call */
 } argument;
 
 typedef struct {
   const spec *spec;
-  int taken;             /* arguments */
   int64_t size[LETTERS]; /* by letter; UNBOUND before first sight */
   argument arguments[MAX_PARAMETERS];
 } call;
@@ -219,21 +218,21 @@ static bool (*const checks[])(const argument *, int64_t, const argument *const[2
     check_offsets, check_index, check_permutation, check_rising, check_scenes, check_segments, check_corners};
 static const char check_names[] = "offsets index permutation rising scenes segments corners";
 
-/* Puts integers where no other thread can change them (frozen.h): all checks and the kernel read them there. */
+/* Copies integers to where no other thread can change them (frozen.h): all checks and the kernel read them there. */
 static bool secure(argument *a) {
   if (!a->bytes) return true;
-  if ((a->frozen = find_frozen(a->data, a->bytes))) {
-    Py_INCREF(a->frozen->owner);
-    a->data = a->frozen->hidden;
-    return true;
+  if ((a->frozen = find_frozen(a->data, a->bytes))) Py_INCREF(a->frozen->owner);
+  void **copy = a->frozen ? &a->frozen->hidden : &a->secured;
+  if (!*copy) {
+    if (!(*copy = malloc((size_t)a->bytes))) return PyErr_NoMemory(), false;
+    memcpy(*copy, a->data, (size_t)a->bytes);
   }
-  if (!(a->secured = malloc((size_t)a->bytes))) return PyErr_NoMemory(), false;
-  a->data = memcpy(a->secured, a->data, (size_t)a->bytes);
+  a->data = *copy;
   return true;
 }
 
 static void release(call *c) {
-  for (int i = 0; i < c->taken; i++) {
+  for (int i = 0; i < c->spec->num; i++) {
     if (c->arguments[i].frozen) Py_DECREF(c->arguments[i].frozen->owner);
     free(c->arguments[i].secured);
   }
@@ -275,16 +274,15 @@ static void bind_absent(call *c, bool of_inputs) {
 
 static bool take(call *c, PyObject *const *objects, Py_ssize_t num) {
   const spec *s = c->spec;
-  if (num != s->num)
-    return PyErr_Format(PyExc_TypeError, "%s takes %d arguments, not %zd", s->name, s->num, num), false;
+  const int wanted = s->counts ? s->num_inputs : s->num;
+  if (num != wanted)
+    return PyErr_Format(PyExc_TypeError, "%s takes %d arguments, not %zd", s->name, wanted, num), false;
   for (int letter = 'A'; letter < LETTERS; letter++) c->size[letter] = UNBOUND;
   c->size[0] = 0;
   for (int i = 0; i < num; i++) {
     const parameter *p = &s->parameters[i];
     const bool given = objects[i] != Py_None;
-    c->arguments[i] = (argument){0};
-    c->taken = i + 1;
-    if (p->output && (i == 0 || !s->parameters[i - 1].output)) bind_absent(c, true);
+    if (i == s->num_inputs) bind_absent(c, true);
     if (p->kind != ARRAY) {
       if (!take_number(c, i, objects[i])) return false;
       continue;
@@ -316,6 +314,36 @@ static bool begin(call *c) {
   return true;
 }
 
+/* Makes the outputs of a kernel that counts them, by the sizes in the call; false with an exception set if there is no
+ * memory. */
+static bool make_outputs(call *c) {
+  for (int i = c->spec->num_inputs; i < c->spec->num; i++) {
+    argument *a = &c->arguments[i];
+    a->length = value_of(c, &c->spec->parameters[i].shape[0]);
+    a->row_bytes = sizeof(int64_t);
+    a->bytes = a->length * a->row_bytes;
+    if (!(a->frozen = new_frozen(a->bytes))) return false;
+    a->data = a->frozen->shown;
+  }
+  return true;
+}
+
+/* Appends them to a list, as long as the sizes in the call say by now: where a kernel counts last, there was room for
+ * more. */
+static bool append_outputs(call *c, PyObject *list) {
+  for (int i = c->spec->num_inputs; i < c->spec->num; i++) {
+    frozen *f = c->arguments[i].frozen;
+    const int64_t length = value_of(c, &c->spec->parameters[i].shape[0]);
+    f->bytes = length * (int64_t)sizeof(int64_t);
+    c->arguments[i].frozen = NULL;
+    PyObject *array = array_of(f, 1, &length);
+    const bool appended = array && PyList_Append(list, array) == 0;
+    Py_XDECREF(array);
+    if (!appended) return false;
+  }
+  return true;
+}
+
 static bool end(call *c, ast_status status) {
   bool ok = !PyErr_Occurred();
   for (int i = 0; debug && i < c->spec->num; i++) {
@@ -324,6 +352,7 @@ static bool end(call *c, ast_status status) {
     if (ok && memcmp(a->copy, a->data, (size_t)a->bytes))
       ok = PyErr_Format(PyExc_AssertionError, "%s: the kernel changed its input %s", c->spec->name, name_of(c, i));
     free(a->copy);
+    a->copy = NULL;
   }
   return ok && (status != AST_NO_MEMORY || (PyErr_NoMemory(), false));
 }

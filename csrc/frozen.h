@@ -1,12 +1,12 @@
-/* Index arrays that nobody can change, so that a check holds for ever.
+/* Index arrays whose values kernels read where nobody can change them, so that a check holds for ever.
  *
  * A kernel reads wherever an index points, and another thread may write to a tensor between the check and the kernel.
- * So a kernel reads integers only from memory that Python cannot reach. freeze() makes a block of two copies: the
- * tensor that Python gets lies over the one that is shown, kernels read the hidden one. torch's ops take tensors and
- * nothing else: the address of the shown copy says which block a tensor belongs to, through autograd and views alike.
- * The block lives as long as its storage, so no other tensor has that address meanwhile. Checks that the hidden copy
- * passed are kept in the block. Integers that are not frozen are copied in every call (arguments.h). All of it happens
- * under the interpreter's lock. Included by arguments.h alone.
+ * So a kernel reads integers only from memory that Python cannot reach. The tensor that Python gets lies over the
+ * memory that is shown; the first kernel to read it makes a hidden copy, and all kernels read that. torch's ops take
+ * tensors and nothing else: the address of the shown memory says which block a tensor belongs to, through autograd and
+ * views alike. The block lives as long as its storage, so no other tensor has that address meanwhile. Checks that the
+ * hidden copy passed are kept in the block. Integers that are not frozen are copied in every call (arguments.h). All of
+ * it happens under the interpreter's lock. Included by arguments.h alone.
  */
 #ifndef AST_FROZEN_H
 #define AST_FROZEN_H
@@ -21,9 +21,9 @@ typedef struct {
 } fact;
 
 typedef struct frozen {
-  struct frozen *next; /* in its bucket */
-  PyObject *owner;     /* the capsule that frees this block */
-  void *hidden, *shown;
+  struct frozen *next;  /* in its bucket */
+  PyObject *owner;      /* the capsule that frees this block */
+  void *shown, *hidden; /* hidden: NULL before a kernel reads it */
   int64_t bytes, number;
   fact facts[MAX_FACTS];
   int num_facts; /* the newest MAX_FACTS are kept */
@@ -44,21 +44,21 @@ static void forget(PyObject *capsule) {
   frozen *f = PyCapsule_GetPointer(capsule, NULL), **link = bucket_of(f->shown);
   while (*link != f) link = &(*link)->next;
   *link = f->next;
+  free(f->hidden);
   free(f);
 }
 
-/* Never 0, so that every copy has an address of its own. */
+/* Never 0, so that every block has an address of its own. */
 static int64_t aligned(int64_t bytes) { return bytes / ALIGNMENT * ALIGNMENT + ALIGNMENT; }
 
 /* A new block; its values are unset. */
 static frozen *new_frozen(int64_t bytes) {
   static int64_t number;
   const int64_t head = aligned(sizeof(frozen));
-  char *memory = aligned_alloc(ALIGNMENT, (size_t)(head + 2 * aligned(bytes)));
+  char *memory = aligned_alloc(ALIGNMENT, (size_t)(head + aligned(bytes)));
   if (!memory) return (void)PyErr_NoMemory(), NULL;
-  frozen *f = (frozen *)memory, **bucket;
-  *f = (frozen){.hidden = memory + head, .shown = memory + head + aligned(bytes), .bytes = bytes, .number = ++number};
-  bucket = bucket_of(f->shown);
+  frozen *f = (frozen *)memory, **bucket = bucket_of(memory + head);
+  *f = (frozen){.shown = memory + head, .bytes = bytes, .number = ++number};
   if (!(f->owner = PyCapsule_New(f, NULL, forget))) return free(f), NULL;
   f->next = *bucket;
   *bucket = f;
@@ -75,8 +75,6 @@ static PyObject *array_of(frozen *f, int ndim, const int64_t *shape) {
     Py_CLEAR(array); /* took the reference all the same */
   return array;
 }
-
-static void show(frozen *f) { memcpy(f->shown, f->hidden, (size_t)f->bytes); }
 
 static bool is_known(const frozen *f, const fact *wanted) {
   for (int i = 0; i < f->num_facts && i < MAX_FACTS; i++)

@@ -7,14 +7,13 @@
 static PyObject *call_kernel(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
   const binding *b = PyCapsule_GetPointer(self, NULL);
   if (!b) return NULL;
-  call c;
-  c.spec = &b->spec;
-  c.taken = 0;
+  call c = {.spec = &b->spec};
   PyObject *result = NULL;
   ast_status status;
   if (take(&c, objects, num) && (!b->check || b->check(&c))) {
-    if (b->result) result = b->result(&c);
-    else if (run(&c, b->run, NULL, &status)) Py_INCREF(result = Py_None);
+    if (!b->count) {
+      if (run(&c, b->run, NULL, &status)) Py_INCREF(result = Py_None);
+    } else if ((result = PyList_New(0)) && !b->count(&c, result)) Py_CLEAR(result);
   }
   release(&c);
   return result;
@@ -30,8 +29,7 @@ static PyObject *freeze_one(PyObject *object) {
   if (!bytes || find_frozen(v.data, bytes)) return Py_INCREF(object), object;
   frozen *f = new_frozen(bytes);
   if (!f) return NULL;
-  memcpy(f->hidden, v.data, (size_t)bytes);
-  show(f);
+  memcpy(f->shown, v.data, (size_t)bytes);
   return array_of(f, v.ndim, v.shape);
 }
 

@@ -102,72 +102,59 @@ static bool octree_check(const call *c) {
   return finite || fail(c, "half_width must be positive, and it and center finite");
 }
 
-/* The number of cells; the outputs have room for as many as there are nodes. */
-static PyObject *octree_result(call *c) {
+static bool octree_count(call *c, PyObject *list) {
   const octree_arguments *a = (const void *)c->arguments;
   ast_status status;
   int64_t bad = 0;
-  if (!run(c, octree_run, &bad, &status)) return NULL;
-  if (status == AST_OK) return PyLong_FromLongLong(((const int64_t *)a->cell_offsets.data)[c->size['B']]);
-  return PyErr_Format(PyExc_ValueError, "octree: positions[%lld] is not a point of the domain", (long long)bad);
+  c->size['C'] = c->size['N']; /* room for a cell a node */
+  if (!make_outputs(c) || !run(c, octree_run, &bad, &status)) return false;
+  if (status != AST_OK)
+    return PyErr_Format(PyExc_ValueError, "octree: positions[%lld] is not a point of the domain", (long long)bad),
+           false;
+  c->size['C'] = ((const int64_t *)a->cell_offsets.data)[c->size['B']];
+  return append_outputs(c, list);
 }
 
 KERNEL(octree_coordinates, keys, coordinates) {
   return kernels->octree_coordinates(a->keys.data, n['C'], a->coordinates.data);
 }
 
-KERNEL(octree_coarsen, keys, cell_offsets, levels) {
+KERNEL(octree_coarsen, keys, cell_offsets, levels, coarse_keys, coarse_offsets, first_child, node_cell, pair_offsets,
+       fine, coarse, fine_by_fine, coarse_by_fine) {
   return kernels->octree_coarsen(a->keys.data, a->cell_offsets.data, n['B'], (int)a->levels.integer, result);
 }
 
-/* Of a level: keys, cell_offsets, first_child, node_cell, pair_offsets, fine, coarse, fine_by_fine, coarse_by_fine.
- * Their sizes are known only half-way, so they are made here. */
-enum { LEVEL_ARRAYS = 9 };
-
-/* Puts the arrays of a level into the list, from `at` on; false with an exception set if there is no memory. */
-static bool append_level(PyObject *list, const ast_octree_level *level, Py_ssize_t at) {
-  const int64_t pairs = level->pair_offsets[27];
-  const int64_t lengths[LEVEL_ARRAYS] = {level->C, level->B + 1, level->C + 1, level->C_fine, 28,
-                                         pairs,    pairs,        pairs,        pairs};
-  frozen *made[LEVEL_ARRAYS];
-  int64_t *data[LEVEL_ARRAYS];
-  for (int i = 0; i < LEVEL_ARRAYS; i++) {
-    PyObject *array =
-        (made[i] = new_frozen(lengths[i] * (int64_t)sizeof *data[i])) ? array_of(made[i], 1, &lengths[i]) : NULL;
-    if (!array || PyList_SetItem(list, at + i, array)) return false;
-    data[i] = made[i]->hidden;
-    if (debug) memset(data[i], 0xff, (size_t)made[i]->bytes);
-  }
-  memcpy(data[4], level->pair_offsets, sizeof level->pair_offsets);
-  ast_status status;
-  Py_BEGIN_ALLOW_THREADS;
-  status = kernels->octree_write_level(level, data[0], data[1], data[2], data[3], data[5], data[6], data[7], data[8]);
-  for (int i = 0; i < LEVEL_ARRAYS; i++) show(made[i]);
-  Py_END_ALLOW_THREADS;
-  return status == AST_OK || (PyErr_NoMemory(), false);
+static ast_status write_level(const argument *arguments, UNUSED const int64_t *n, void *result) {
+  const octree_coarsen_arguments *a = (const void *)arguments;
+  const ast_octree_level *level = result;
+  memcpy(a->pair_offsets.data, level->pair_offsets, sizeof level->pair_offsets);
+  return kernels->octree_write_level(level, a->coarse_keys.data, a->coarse_offsets.data, a->first_child.data,
+                                     a->node_cell.data, a->fine.data, a->coarse.data, a->fine_by_fine.data,
+                                     a->coarse_by_fine.data);
 }
 
-/* The list of all levels' arrays. It exists before the kernel runs, and arrays are no objects of the garbage collector:
- * so no Python code can use the thread's scratch memory while the levels lie there. */
-static PyObject *octree_coarsen_result(call *c) {
-  const octree_coarsen_arguments *a = (const void *)c->arguments;
-  const int levels = (int)a->levels.integer;
+/* The outputs of all levels. The list exists before the kernel runs, and arrays are no objects of the garbage
+ * collector: so no Python code can use the thread's scratch memory while the levels lie there. */
+static bool octree_coarsen_count(call *c, PyObject *list) {
+  const int levels = (int)((const octree_coarsen_arguments *)(const void *)c->arguments)->levels.integer;
   AST_SCRATCH_SCOPE; /* of the levels */
   ast_octree_level level[21];
   ast_status status;
-  PyObject *list = PyList_New((Py_ssize_t)levels * LEVEL_ARRAYS);
-  if (!list) return NULL;
   bool ok = run(c, octree_coarsen_run, level, &status);
   if (ok && status == AST_TOO_LARGE) ok = fail(c, "keys must be fewer than 2^31");
-  for (int j = 0; ok && j < levels; j++) ok = append_level(list, &level[j], (Py_ssize_t)j * LEVEL_ARRAYS);
-  if (!ok) Py_CLEAR(list);
-  return list;
+  for (int j = 0; ok && j < levels; j++) {
+    c->size['N'] = level[j].C_fine;
+    c->size['C'] = level[j].C;
+    c->size['P'] = level[j].pair_offsets[27];
+    ok = make_outputs(c) && run(c, write_level, &level[j], &status) && append_outputs(c, list);
+  }
+  return ok;
 }
 
 /* ---- farthest point sampling ---- */
 
 /* out_offsets say where the samples of each scene lie: min(num, points) of each. */
-KERNEL(farthest_point_sample, coordinates, offsets, num, out_offsets, indices) {
+KERNEL(farthest_point_sample, coordinates, offsets, num, indices, out_offsets) {
   const int64_t *offsets = a->offsets.data, num = a->num.integer;
   int64_t *out = a->out_offsets.data;
   out[0] = 0;
@@ -178,20 +165,15 @@ KERNEL(farthest_point_sample, coordinates, offsets, num, out_offsets, indices) {
   return kernels->farthest_point_sample(a->coordinates.data, offsets, n['B'], num, out, a->indices.data);
 }
 
-static bool farthest_point_sample_check(const call *c) {
+static bool farthest_point_sample_count(call *c, PyObject *list) {
   const farthest_point_sample_arguments *a = (const void *)c->arguments;
-  const int64_t points = c->size['C'], scenes = c->size['B'], num = a->num.integer, room = c->size['S'];
-  const int64_t most = scenes && num <= (points - 1) / scenes ? scenes * num : points;
-  return room >= most || fail(c, "indices must have room for the samples");
-}
-
-/* The number of samples. */
-static PyObject *farthest_point_sample_result(call *c) {
-  const farthest_point_sample_arguments *a = (const void *)c->arguments;
+  const int64_t points = c->size['C'], scenes = c->size['B'], num = a->num.integer;
   ast_status status;
-  if (!run(c, farthest_point_sample_run, NULL, &status)) return NULL;
-  if (status == AST_OK) return PyLong_FromLongLong(((const int64_t *)a->out_offsets.data)[c->size['B']]);
-  return fail(c, "coordinates of a scene differ by 2^21 or more"), NULL;
+  c->size['S'] = scenes && num <= (points - 1) / scenes ? scenes * num : points; /* room */
+  if (!make_outputs(c) || !run(c, farthest_point_sample_run, NULL, &status)) return false;
+  if (status != AST_OK) return fail(c, "coordinates of a scene differ by 2^21 or more");
+  c->size['S'] = ((const int64_t *)a->out_offsets.data)[scenes];
+  return append_outputs(c, list);
 }
 
 /* ---- sparse convolution ---- */
@@ -360,13 +342,15 @@ KERNEL(mlp_backward, dout, MLP, MLP_KEPT, dx, dbeside, dweight1, dbias1, dweight
 typedef struct {
   spec spec;
   run_function run;
-  bool (*check)(const call *c); /* what a spec cannot say; may be NULL */
-  PyObject *(*result)(call *c); /* runs the kernel where it returns more than None; may be NULL */
+  bool (*check)(const call *c);           /* what a spec cannot say; may be NULL */
+  bool (*count)(call *c, PyObject *list); /* runs a kernel that counts its outputs, and lists them; may be NULL */
 } binding;
 
 #define BINDING(name, ...) BINDING_AS(#name, name, __VA_ARGS__)
 #define BINDING_AS(text, kernel, ...) \
   {.spec.name = text, .spec.names = kernel##_parameters, .run = kernel##_run, __VA_ARGS__}
+
+#define COUNTED(kernel) .spec.counts = true, .count = kernel##_count
 
 static binding bindings[] = {
     BINDING(attention, .check = attention_check),
@@ -378,7 +362,7 @@ static binding bindings[] = {
     BINDING(column_sum),
     BINDING(elastic_forces),
     BINDING(elastic_forces_backward),
-    BINDING(farthest_point_sample, .check = farthest_point_sample_check, .result = farthest_point_sample_result),
+    BINDING(farthest_point_sample, COUNTED(farthest_point_sample)),
     BINDING(linear),
     BINDING(linear_backward),
     BINDING_AS("linear_geglu", linear),
@@ -387,8 +371,8 @@ static binding bindings[] = {
     BINDING(message_backward, .check = message_check),
     BINDING(mlp),
     BINDING(mlp_backward),
-    BINDING(octree, .check = octree_check, .result = octree_result),
-    BINDING(octree_coarsen, .result = octree_coarsen_result),
+    BINDING(octree, COUNTED(octree), .check = octree_check),
+    BINDING(octree_coarsen, COUNTED(octree_coarsen)),
     BINDING(octree_coordinates),
     BINDING(segment_spread),
     BINDING(segment_sum),

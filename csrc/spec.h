@@ -41,7 +41,8 @@ typedef struct {
 
 typedef struct {
   const char *name, *names; /* of the kernel, and of its parameters: "x, weight, out" */
-  int num;
+  bool counts; /* the kernel counts its outputs, one-dimensional integers, which the core makes; others are given */
+  int num, num_inputs;
   parameter parameters[MAX_PARAMETERS];
   bool of_inputs[LETTERS]; /* the letters in shapes of inputs */
 } spec;
@@ -51,8 +52,10 @@ static bool read_spec(spec *s, const char *names, const char *numbers, Py_ssize_
   s->num = (int)(bytes / (Py_ssize_t)sizeof(parameter));
   if (strcmp(s->names, names) != 0 || s->num > MAX_PARAMETERS || bytes % (Py_ssize_t)sizeof(parameter)) return false;
   memcpy(s->parameters, numbers, (size_t)bytes);
-  for (int i = 0; i < s->num; i++)
-    for (int d = 0; !s->parameters[i].output && d < s->parameters[i].ndim; d++)
+  for (s->num_inputs = 0; s->num_inputs < s->num && !s->parameters[s->num_inputs].output; s->num_inputs++) {
+  }
+  for (int i = 0; i < s->num_inputs; i++)
+    for (int d = 0; d < s->parameters[i].ndim; d++)
       for (int term = 0; term < 2; term++) s->of_inputs[s->parameters[i].shape[d].letter[term]] = true;
   return true;
 }

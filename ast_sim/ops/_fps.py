@@ -6,6 +6,7 @@ Legend: B scenes, C cells, S samples.
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ast_sim.ops.library import Kernel, Op
@@ -22,20 +23,6 @@ def _check_extent(name: str, sizes: Sizes, given: Given) -> None:
             raise ValueError(f"{name}: coordinates of scene {scene} differ by 2^21 or more")
 
 
-_kernel = Kernel(
-    "farthest_point_sample",
-    "coordinates[C,3] int32, offsets[B+1] offsets(C), num integer(1,9223372036854775807); room size(S)"
-    " -> out_offsets[B+1] int64, indices[S] int64",
-    _check_extent,
-)
-
-
-def _out_offsets(offsets: Tensor, num: int) -> Tensor:
-    out = torch.zeros_like(offsets)
-    torch.cumsum(offsets.diff().clamp(max=num), 0, out=out[1:])
-    return out
-
-
 def _sample_scene(points: Tensor, num: int) -> Tensor:
     distance = torch.full_like(points[:, 0], torch.iinfo(torch.int64).max)
     picks = [torch.zeros_like(distance[0])]
@@ -46,28 +33,24 @@ def _sample_scene(points: Tensor, num: int) -> Tensor:
     return torch.stack(picks)
 
 
-def _sample_reference(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
-    _kernel.check(coordinates, offsets, num, 0)
+def _sample_reference(coordinates: Tensor, offsets: Tensor, num: int) -> list[Tensor]:
     picks = [offsets[:0]]
     for begin, end in zip(offsets.tolist(), offsets[1:].tolist(), strict=False):
         points = coordinates[begin:end].long()
         few = end - begin <= num
         picks.append(begin + (torch.arange(end - begin, device=points.device) if few else _sample_scene(points, num)))
-    return torch.cat(picks), _out_offsets(offsets, num)
+    return [torch.cat(picks), F.pad(offsets.diff().clamp(max=num).cumsum(0), (1, 0))]
 
 
-def _run(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
-    room = min(coordinates.shape[0], max(offsets.shape[0] - 1, 0) * num)  # as many as there may be
-    samples, (out_offsets, indices) = _kernel.fill(coordinates, offsets, num, room)
-    return (indices if samples == room else indices[:samples].clone()), out_offsets
-
-
-def _sample_fake(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
-    return offsets.new_empty(torch.library.get_ctx().new_dynamic_size()), torch.empty_like(offsets)
-
-
-_SCHEMA = "(Tensor coordinates, Tensor offsets, int num) -> (Tensor, Tensor)"
-_sample = Op(_kernel, _sample_reference, _SCHEMA, _run, _sample_fake)
+_sample = Op(
+    Kernel(
+        "farthest_point_sample",
+        "coordinates[C,3] int32, offsets[B+1] offsets(C), num integer(1,9223372036854775807)"
+        " -> indices[S] int64, out_offsets[B+1] int64",
+        _check_extent,
+    ),
+    _sample_reference,
+)
 
 
 def farthest_point_sample(coordinates: Tensor, offsets: Tensor, num: int) -> tuple[Tensor, Tensor]:
@@ -90,4 +73,5 @@ def farthest_point_sample(coordinates: Tensor, offsets: Tensor, num: int) -> tup
     """
     if num < 1:
         raise ValueError(f"farthest_point_sample: num must be at least 1, not {num}")
-    return _sample(coordinates, offsets, num)
+    indices, out_offsets = _sample(coordinates, offsets, num)
+    return indices, out_offsets

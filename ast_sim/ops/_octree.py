@@ -5,8 +5,9 @@ Legend: B scenes, N nodes, C cells, P pairs. A cell's Morton key interleaves the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -154,23 +155,26 @@ def _check_domain(name: str, sizes: Sizes, given: Given) -> None:
 _octree_kernel = Kernel(
     "octree",
     "positions[N,3], offsets[B+1] offsets(N), x number, y number, z number, half_width number, depth integer(0,21)"
-    " -> keys[N] int64, cell_offsets[B+1] int64, node_cell[N] int64, node_order[N] int64, node_offsets[N+1] int64",
+    " -> keys[C] int64, cell_offsets[B+1] int64, node_cell[N] int64, node_order[N] int64, node_offsets[C+1] int64",
     _check_domain,
 )
 _coarsen_kernel = Kernel(
-    "octree_coarsen", "keys[C] int64, cell_offsets[B+1] offsets(C) scenes(keys), levels integer(0,21)"
+    "octree_coarsen",
+    "keys[N] int64, cell_offsets[B+1] offsets(N) scenes(keys), levels integer(0,21)"
+    " -> coarse_keys[C] int64, coarse_offsets[B+1] int64, first_child[C+1] int64, node_cell[N] int64,"
+    " pair_offsets[28] int64, fine[P] int64, coarse[P] int64, fine_by_fine[P] int64, coarse_by_fine[P] int64",
 )
 
 
-def _octree_reference(positions: Tensor, offsets: Tensor, center: Sequence[float], half_width: float, depth: int):
-    _octree_kernel.check(positions, offsets, *center, half_width, depth)
-    unit = _unit(positions, center, half_width)
+def _octree_reference(positions: Tensor, offsets: Tensor, x: float, y: float, z: float, half_width: float, depth: int):
+    unit = _unit(positions, (x, y, z), half_width)
     keys = _keys_of((unit * 2**depth).floor().long().clamp(0, 2**depth - 1))
     scenes = segment_of(offsets)
     order = torch.argsort(keys, stable=True)
     if len(offsets) > 2:
         order = order[torch.argsort(scenes[order], stable=True)]
-    return *_runs(keys[order], scenes[order], offsets, order), order
+    keys, cell_offsets, node_offsets, node_cell = _runs(keys[order], scenes[order], offsets, order)
+    return [keys, cell_offsets, node_cell, order, node_offsets]
 
 
 def _runs(keys: Tensor, scenes: Tensor, offsets: Tensor, order: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -185,17 +189,6 @@ def _runs(keys: Tensor, scenes: Tensor, offsets: Tensor, order: Tensor) -> tuple
     node_cell[order] = head.cumsum(0) - 1
     node_offsets = torch.cat([starts, offsets[-1:]])
     return keys[starts], torch.searchsorted(starts, offsets), node_offsets, node_cell
-
-
-def _run_octree(positions: Tensor, offsets: Tensor, center: Sequence[float], half_width: float, depth: int):
-    num, outputs = _octree_kernel.fill(positions, offsets, *center, half_width, depth)
-    keys, cell_offsets, node_cell, node_order, node_offsets = outputs  # with room for a cell a node
-    return keys[:num], cell_offsets, node_offsets[: num + 1], node_cell, node_order
-
-
-def _octree_fake(positions: Tensor, offsets: Tensor, center: Sequence[float], half_width: float, depth: int):
-    num, n = torch.library.get_ctx().new_dynamic_size(), positions.shape[0]
-    return tuple(offsets.new_empty(size) for size in (num, offsets.shape[0], num + 1, n, n))
 
 
 def _coordinates_reference(keys: Tensor) -> Tensor:
@@ -219,16 +212,16 @@ def _after_reference(keys: Tensor, scenes: Tensor) -> Tensor:
     return torch.where((unique[rank] == wanted) & (place[cell] == wanted_place), cell, -1)
 
 
-def _coarsen_reference(keys: Tensor, cell_offsets: Tensor, levels: int) -> list[Tensor]:
+def _level_by_level(once: Callable, keys: Tensor, cell_offsets: Tensor, levels: int) -> list[Tensor]:
+    """The outputs of all levels, where `once` gives those of one."""
     parts: list[Tensor] = []
     for _ in range(levels):
-        parts += _coarsen_once(keys, cell_offsets)
+        parts += once(keys, cell_offsets, 1)
         keys, cell_offsets = parts[-9:-7]
     return parts
 
 
-def _coarsen_once(keys: Tensor, cell_offsets: Tensor) -> tuple[Tensor, ...]:
-    _coarsen_kernel.check(keys, cell_offsets, 1)
+def _coarsen_once(keys: Tensor, cell_offsets: Tensor, levels: int) -> list[Tensor]:
     scenes = segment_of(cell_offsets)
     rows = torch.arange(len(keys), device=keys.device)
     coarse_keys, coarse_offsets, node_offsets, node_cell = _runs(keys >> 3, scenes, cell_offsets, rows)
@@ -245,40 +238,12 @@ def _coarsen_once(keys: Tensor, cell_offsets: Tensor) -> tuple[Tensor, ...]:
         groups.append((fine[order], coarse[order], fine, coarse))
     counts = torch.tensor([0] + [len(group[0]) for group in groups], device=keys.device)
     pairs = (torch.cat(parts) for parts in zip(*groups, strict=True))
-    return coarse_keys, coarse_offsets, node_offsets, node_cell, counts.cumsum(0), *pairs
+    return [coarse_keys, coarse_offsets, node_offsets, node_cell, counts.cumsum(0), *pairs]
 
 
-def _run_coarsen(keys: Tensor, cell_offsets: Tensor, levels: int) -> list[Tensor]:
-    """The arrays are made by the core, which alone knows their sizes."""
-    return [torch.from_numpy(part) for part in _coarsen_kernel.fill(keys, cell_offsets, levels)[0]]
-
-
-def _coarsen_fake(keys: Tensor, cell_offsets: Tensor, levels: int) -> list[Tensor]:
-    ctx, num_fine, parts = torch.library.get_ctx(), keys.shape[0], []
-    for _ in range(levels):
-        num, num_pairs = ctx.new_dynamic_size(), ctx.new_dynamic_size()
-        sizes = (num, cell_offsets.shape[0], num + 1, num_fine, 28, *[num_pairs] * 4)
-        parts += [keys.new_empty(size) for size in sizes]
-        num_fine = num
-    return parts
-
-
-_octree = Op(
-    _octree_kernel,
-    _octree_reference,
-    "(Tensor positions, Tensor offsets, float[] center, float half_width, int depth)"
-    " -> (Tensor, Tensor, Tensor, Tensor, Tensor)",
-    _run_octree,
-    _octree_fake,
-)
+_octree = Op(_octree_kernel, _octree_reference)
 _coordinates = Op(Kernel("octree_coordinates", "keys[C] int64 -> coordinates[C,3] int32"), _coordinates_reference)
-_coarsen = Op(
-    _coarsen_kernel,
-    _coarsen_reference,
-    "(Tensor keys, Tensor cell_offsets, int levels) -> Tensor[]",
-    _run_coarsen,
-    _coarsen_fake,
-)
+_coarsen = Op(_coarsen_kernel, partial(_level_by_level, _coarsen_once), partial(_level_by_level, _coarsen_kernel.fake))
 
 
 def octree(positions: Tensor, offsets: Tensor, center: Sequence[float], half_width: float, depth: int) -> Octree:
@@ -300,7 +265,4 @@ def octree(positions: Tensor, offsets: Tensor, center: Sequence[float], half_wid
     """
     if len(center) != 3:
         raise ValueError(f"octree: center must be three numbers, not {len(center)}")
-    center = [float(x) for x in center]
-    parts = _octree(positions, offsets, center, float(half_width), depth)
-    keys, cell_offsets, node_offsets, node_cell, node_order = parts
-    return Octree(keys, cell_offsets, node_cell, node_order, node_offsets, depth)
+    return Octree(*_octree(positions, offsets, *map(float, center), float(half_width), depth), depth)

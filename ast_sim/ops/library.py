@@ -112,22 +112,21 @@ class Kernel:
             return error
         return None
 
-    def fill(self, *arguments) -> tuple[Any, tuple]:
-        """Call the C core with the arguments of the op and with new outputs; what it returns, and the outputs."""
+    def run(self, *arguments) -> Any:
+        """The op: call the C core with new outputs, unless it makes them."""
+        if self.spec.counts:
+            return [torch.from_numpy(x) for x in self(*arguments)]
         try:
             given = self.spec.arguments(*arguments)
         except Exception as error:  # no outputs for such arguments
             raise self._reason(self.spec.inputs, arguments) or error from None
-        return self(*given), given[self._num :]
-
-    def run(self, *arguments) -> Any:
-        """The op."""
-        _, outputs = self.fill(*arguments)
-        return outputs[0] if len(outputs) == 1 else self.given(outputs, arguments)
+        self(*given)
+        return self.given(given[self._num :], arguments)
 
     def fake(self, *arguments):
         """The outputs without values, for tracing."""
-        return self.given(self.spec.arguments(*arguments)[self._num :], arguments)
+        outputs = self.spec.arguments(*arguments)[self._num :]
+        return list(outputs) if self.spec.counts else self.given(outputs, arguments)
 
     @staticmethod
     def given(outputs: tuple, arguments: tuple) -> Any:
@@ -184,23 +183,14 @@ class Op:
         kernel: the function of the core; the op has its name. The op changes no input, and no output is a view of one.
         composition: the body as a composition of torch ops, for any device and dtype. Instead of an output that is not
             wanted it returns None.
-        schema: signature in torch's schema language, where it does not follow from the spec.
-        run: the body through the core, where it is more than a call of the kernel.
-        fake: makes outputs of the right shapes for tracing, where the shapes depend on values.
+        fake: makes outputs of the right shapes for tracing, where they do not follow from the spec.
     """
 
-    def __init__(
-        self,
-        kernel: Kernel | Either,
-        composition: Callable,
-        schema: str | None = None,
-        run: Callable | None = None,
-        fake: Callable | None = None,
-    ) -> None:
+    def __init__(self, kernel: Kernel | Either, composition: Callable, fake: Callable | None = None) -> None:
         self.name, self.spec, self.composition = kernel.name, kernel.spec, composition
-        self.kernel, self._check = run or kernel.run, kernel.check if run is None else None
+        self.kernel, self._check = kernel.run, kernel.check
         self.function: type[torch.autograd.Function] | None = None  # set by `derivatives.differentiate`
-        LIBRARY.define(self.name + (schema or self.spec.schema))
+        LIBRARY.define(self.name + self.spec.schema)
         LIBRARY.impl(self.name, self._on_cpu, "CPU")
         LIBRARY.impl(self.name, self.reference, "CompositeExplicitAutograd")
         LIBRARY.impl(self.name, self.compose, "FuncTorchDynamicLayerFrontMode")  # first under transforms of torch.func
@@ -229,8 +219,7 @@ class Op:
 
     def reference(self, *args) -> Any:
         """The composition, after the checks."""
-        if self._check:
-            self._check(*args)
+        self._check(*args)
         found = self.composition(*args)
         return Kernel.given(found, args) if isinstance(found, tuple) else found
 
@@ -292,7 +281,7 @@ def _is_watched() -> bool:
 
 
 def frozen(*indices: Tensor) -> tuple[Tensor, ...]:
-    """Copies of int64 tensors that the C core trusts: it keeps the values in memory of its own and checks them once.
+    """Copies of int64 tensors that the C core trusts: from the first call on it keeps the values, and checks them once.
 
     So nobody should write to the copies: kernels would not see it. Other tensors are copied and checked in every call.
     """

@@ -128,6 +128,7 @@ class Parameter:
 _SCHEMA = {"choice": "str", "flag": "bool", "switch": "bool", "wants": "bool", "size": "SymInt", "integer": "int"}
 _SCHEMA |= {"number": "float", "bits": "int"}
 _WORDS = {"int64", "int32", "rows", "filled", "late", "with", "added", "if", *_SCHEMA}
+_COUNTED = "torch.library.get_ctx().new_dynamic_size()"  # for tracing
 _TYPES = {dtype: np.dtype(str(dtype)[6:]).num for dtype in (torch.float32, torch.int64, torch.int32)}
 
 
@@ -156,13 +157,15 @@ class Spec:
         taken, _, others = inputs.partition(";")
         self.taken, self.outputs = _parameters(taken), _parameters(outputs, output=True)
         self.inputs = self.taken + _parameters(others)
+        self.counts = _COUNTED in self._sizes().values()  # then the kernel counts the outputs, and makes them all
 
     @property
     def schema(self) -> str:
         """In torch's schema language."""
         inputs = ", ".join(f"{p.type} {p.name}" for p in self.inputs)
         outputs = ", ".join(["Tensor"] * len(self.outputs))
-        return f"({inputs}) -> {outputs if len(self.outputs) == 1 else f'({outputs})'}"
+        outputs = "Tensor[]" if self.counts else outputs if len(self.outputs) == 1 else f"({outputs})"
+        return f"({inputs}) -> {outputs}"
 
     @cached_property
     def arguments(self) -> Callable[..., tuple]:
@@ -202,7 +205,7 @@ class Spec:
                     size = f"{p.name}.shape[{axis}]" + f" - {d.constant}" * (d.constant > 0)
                     size = f"({size}) // {d.factors[d.single]}" if d.factors[d.single] > 1 else size
                     sizes[d.single] = f"0 if {p.name} is None else {size}" if p.optional else size
-        return sizes
+        return dict.fromkeys(sorted(used), _COUNTED) | sizes
 
     def _condition(self, p: Parameter) -> str:
         """The expression of whether an output is wanted."""

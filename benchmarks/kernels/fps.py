@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ast_sim.ops import farthest_point_sample, octree
-from ast_sim.ops._fps import _sample_reference
+from ast_sim.ops._fps import _sample
 from benchmarks.kernels.case import Case
 
 
@@ -69,7 +69,7 @@ def cases() -> list[Case]:
             return _sample_scenes(floats, scenes, num, height)
 
         def composed(coordinates=coordinates, offsets=offsets, num=num):
-            return _sample_reference(coordinates, offsets, num)[0]
+            return _sample.reference(coordinates, offsets, num)[0]
 
         found.append(
             Case(

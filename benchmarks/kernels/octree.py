@@ -27,15 +27,15 @@ def _case(op: str, shape: str, items: int, ours, composed) -> Case:
 
 def _all_levels(positions: Tensor, offsets: Tensor, depth: int, levels: int, build, coarsen) -> list[Tensor]:
     """The cells of the nodes, and `levels` coarser levels with their pairs."""
-    cells = build(positions, offsets, ORIGIN, 1.0, depth)
+    cells = build(positions, offsets, *ORIGIN, 1.0, depth)
     return [*cells, *coarsen(*cells[:2], levels)]
 
 
 def cases() -> list[Case]:
     found = []
     for points in (10_000, 100_000, 1_000_000):
-        build = (sphere(points), torch.tensor([0, points]), ORIGIN, 1.0, DEPTH)
-        tree = octree(*build)
+        build = (sphere(points), torch.tensor([0, points]), *ORIGIN, 1.0, DEPTH)
+        tree = octree(*build[:2], ORIGIN, 1.0, DEPTH)
         shape = f"{points} points on a sphere, depth {DEPTH}"
         found.append(
             _case(
@@ -43,7 +43,7 @@ def cases() -> list[Case]:
                 shape,
                 points,
                 lambda build=build: ops._octree(*build),
-                lambda build=build: ops._octree_reference(*build),
+                lambda build=build: ops._octree.reference(*build),
             )
         )
         if points > 100_000:
@@ -55,7 +55,7 @@ def cases() -> list[Case]:
                 f"{shape} to {COARSEST}, with pairs",
                 points,
                 lambda down=down: ops._coarsen(*down),
-                lambda down=down: ops._coarsen_reference(*down),
+                lambda down=down: ops._coarsen.reference(*down),
             )
         )
     plate = torch.cat([sphere(400) * torch.tensor([1, 1, 0.02]) for _ in range(4)])
@@ -72,7 +72,7 @@ def cases() -> list[Case]:
                 shape,
                 len(positions),
                 lambda inputs=inputs: _all_levels(*inputs, ops._octree, ops._coarsen),
-                lambda inputs=inputs: _all_levels(*inputs, ops._octree_reference, ops._coarsen_reference),
+                lambda inputs=inputs: _all_levels(*inputs, ops._octree.reference, ops._coarsen.reference),
             )
         )
     return found

@@ -33,7 +33,7 @@ def greedy(rows: list[tuple[int, ...]], num: int) -> list[int]:
 
 def assert_kernel_equals_composition(coordinates: Tensor, offsets: Tensor, num: int) -> None:
     for x, y in zip(
-        farthest_point_sample(coordinates, offsets, num), fps._sample_reference(coordinates, offsets, num), strict=True
+        farthest_point_sample(coordinates, offsets, num), fps._sample.reference(coordinates, offsets, num), strict=True
     ):
         assert x.dtype == y.dtype == torch.int64 and torch.equal(x, y)
 
@@ -175,7 +175,7 @@ OFFSETS = torch.tensor([0, 10, 30])
 @pytest.mark.parametrize("reference", [False, True])
 def test_errors_name_op_argument_and_value(monkeypatch, reference, arguments, message):
     if reference:
-        monkeypatch.setattr(fps, "_sample", fps._sample_reference)
+        monkeypatch.setattr(fps, "_sample", fps._sample.reference)
     with pytest.raises((ValueError, TypeError), match=f"farthest_point_sample: .*{message}"):
         farthest_point_sample(*arguments)
 

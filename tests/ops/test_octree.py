@@ -27,14 +27,11 @@ def assert_equal(a: Octree | CellMap, b: Octree | CellMap) -> None:
 
 
 def composed(positions, offsets, center, half_width, depth) -> Octree:
-    keys, cell_offsets, node_offsets, node_cell, node_order = ops._octree_reference(
-        positions, offsets, center, half_width, depth
-    )
-    return Octree(keys, cell_offsets, node_cell, node_order, node_offsets, depth)
+    return Octree(*ops._octree.reference(positions, offsets, *center, half_width, depth), depth)
 
 
 def composed_map(tree: Octree) -> CellMap:
-    keys, cell_offsets, node_offsets, node_cell, *pairs = ops._coarsen_reference(tree.keys, tree.cell_offsets, 1)
+    keys, cell_offsets, node_offsets, node_cell, *pairs = ops._coarsen.reference(tree.keys, tree.cell_offsets, 1)
     order = torch.arange(len(tree.keys))
     return CellMap(Octree(keys, cell_offsets, node_cell, order, node_offsets, tree.depth - 1), len(tree.keys), *pairs)
 
@@ -239,7 +236,7 @@ def test_every_instruction_set_and_backend():
 def test_opcheck():
     positions, offsets = cloud("random", 40).requires_grad_(), torch.tensor([0, 15, 40])
     tree = octree(positions, offsets, ORIGIN, 1, 3)
-    torch.library.opcheck(ops._octree.overload, (positions, offsets, list(ORIGIN), 1.0, 3))
+    torch.library.opcheck(ops._octree.overload, (positions, offsets, *ORIGIN, 1.0, 3))
     torch.library.opcheck(ops._coordinates.overload, (tree.keys,))
     torch.library.opcheck(ops._coarsen.overload, (tree.keys, tree.cell_offsets, 2))
 
@@ -324,7 +321,7 @@ def test_errors_name_op_argument_and_value(build, arguments, message):
         build(*arguments)
 
 
-@pytest.mark.parametrize("coarsen", [ops._coarsen, ops._coarsen_reference])
+@pytest.mark.parametrize("coarsen", [ops._coarsen, ops._coarsen.reference])
 def test_errors_of_the_coarser_level(coarsen):
     with pytest.raises(ValueError, match="cell_offsets must end at the number of rows 2, not 1"):
         coarsen(torch.tensor([1, 2]), torch.tensor([0, 1]), 1)
