@@ -10,34 +10,36 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ast_sim.ops.derivatives import gradient_op
-from ast_sim.ops.library import Either, Kernel, Op
+from ast_sim.ops.library import Kernel, Op
 
 ACTIVATIONS = ("none", "relu", "geglu")
+RELU, GEGLU = 1, 2  # as numbers
 SAVED = 1 << 24  # an activation's input with more elements is not kept for the gradient, but computed again
 
 
 # What stands behind `linear` and `linear_backward` in a spec; P is O, or O/2 for "geglu".
 _INPUTS = "x[M,I] rows, weight[O,I] filled, bias?[O]"
-_ACTIVATION = f"activation choice({','.join(ACTIVATIONS)}) integer(0,1)"
-_SPEC = f"{_INPUTS}, residual?[M,P] rows added, {_ACTIVATION}; save switch -> out[M,P], z[M,O] if(save)"
+_SPEC = f"{_INPUTS}, residual?[M,P] rows added, activation integer(0,1); save switch -> out[M,P], z[M,O] if(save)"
 _BACKWARD_SPEC = (
-    f"dout[M,P] rows late, {_INPUTS}, z?[M,O], {_ACTIVATION}; wanted wants(x,weight,bias)"
+    f"dout[M,P] rows late, {_INPUTS}, z?[M,O], activation integer(0,1); wanted wants(x,weight,bias)"
     " -> dx[M,I] if(wanted), dweight[O,I] if(wanted), dbias[O] if(wanted)"
 )
 
 
-def _either(name: str, spec: str) -> Either:
-    one = Kernel(name, spec.replace("P", "O"))
-    pairs = Kernel(f"linear_geglu{name[6:]}", spec.replace("O", "2P").replace("(0,1)", "(2,2)"))
-    return Either("activation", {"none": one, "relu": one, "geglu": pairs})
+def _plain(name: str, spec: str) -> Kernel:
+    return Kernel(name, spec.replace("P", "O"))
+
+
+def _pairs(name: str, spec: str) -> Kernel:
+    return Kernel(name, spec.replace("O", "2P").replace("(0,1)", "(2,2)"))
 
 
 def _linear_reference(x, weight, bias, residual, activation, save):
     z = out = F.linear(x, weight, bias)
-    if activation == "geglu":
+    if activation == GEGLU:
         a, b = z.chunk(2, dim=1)
         out = a * F.gelu(b)
-    elif activation == "relu":
+    elif activation == RELU:
         out = F.relu(z)
     out = out if residual is None else out + residual
     return out, (z.clone() if out is z else z) if save else None
@@ -45,11 +47,13 @@ def _linear_reference(x, weight, bias, residual, activation, save):
 
 def _known_z(given: dict):
     """The gradient of ReLU needs only its output."""
-    return given["out"] if given["activation"] == "relu" and given["residual"] is None else given["z"]
+    return given["out"] if given["activation"] == RELU and given["residual"] is None else given["z"]
 
 
-_linear = Op(_either("linear", _SPEC), _linear_reference)
-_linear_backward = gradient_op(_linear, _either("linear_backward", _BACKWARD_SPEC), {"z": _known_z})
+_linear = Op(_plain("linear", _SPEC), _linear_reference)
+_linear_backward = gradient_op(_linear, _plain("linear_backward", _BACKWARD_SPEC), {"z": _known_z})
+_geglu = Op(_pairs("linear_geglu", _SPEC), _linear_reference)
+_geglu_backward = gradient_op(_geglu, _pairs("linear_geglu_backward", _BACKWARD_SPEC))
 
 
 def linear(
@@ -73,8 +77,11 @@ def linear(
     Raises:
         ValueError: shapes or the activation are not as above.
     """
+    if activation not in ACTIVATIONS:
+        raise ValueError(f"linear: activation {activation!r} is unknown: choose of {', '.join(ACTIVATIONS)}")
     save = False
     if activation == "geglu" or (activation == "relu" and residual is not None):
         small = x.shape[0] * weight.shape[0] <= SAVED
         save = small and torch.is_grad_enabled() and any(y is not None and y.requires_grad for y in (x, weight, bias))
-    return _linear(x, weight, bias, residual, activation, save)[0]
+    op = _geglu if activation == "geglu" else _linear
+    return op(x, weight, bias, residual, ACTIVATIONS.index(activation), save)[0]

@@ -11,7 +11,7 @@ from torch import Tensor
 from ast_sim.ops._octree import CellMap
 from ast_sim.ops._segment import column_sum
 from ast_sim.ops.derivatives import differentiate, differentiate_by_composition
-from ast_sim.ops.library import Either, Kernel, Op
+from ast_sim.ops.library import Kernel, Op
 
 OFFSETS = 27
 
@@ -50,8 +50,8 @@ def _weight_reference(x, dout, pair_offsets, source, destination):
     return torch.stack([found.get(k, x.new_zeros(x.shape[1], dout.shape[1])) for k in range(OFFSETS)])
 
 
-_either = {False: Kernel("sparse_conv", _SPEC), True: Kernel("sparse_conv_transposed", _TRANSPOSED_SPEC)}
-_conv = Op(Either("transposed", _either), _reference)
+_conv = Op(Kernel("sparse_conv", _SPEC), _reference)
+_conv_transposed = Op(Kernel("sparse_conv_transposed", _TRANSPOSED_SPEC), _reference)
 _conv_weight = Op(Kernel("sparse_conv_weight", _WEIGHT_SPEC), _weight_reference)
 
 
@@ -65,7 +65,8 @@ def _gradient(ctx, dout):
     dx = dweight = dbias = None
     if ctx.needs_input_grad[0]:
         lists = (back_source, back_destination, source, destination)
-        dx = _conv(dout, weight, None, not ctx.transposed, pair_offsets, *lists, x.shape[0])
+        adjoint = _conv if ctx.transposed else _conv_transposed
+        dx = adjoint(dout, weight, None, not ctx.transposed, pair_offsets, *lists, x.shape[0])
     if ctx.needs_input_grad[1] and ctx.transposed:
         dweight = _conv_weight(dout, x, pair_offsets, destination, source)
     elif ctx.needs_input_grad[1]:
@@ -76,6 +77,7 @@ def _gradient(ctx, dout):
 
 
 differentiate(_conv, _save, _gradient)
+differentiate(_conv_transposed, _save, _gradient)
 differentiate_by_composition(_conv_weight)
 
 

@@ -12,11 +12,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ast_sim.ops.library import LIBRARY, Either, Kernel, Op
+from ast_sim.ops.library import LIBRARY, Kernel, Op
 from ast_sim.ops.spec import Parameter
 
 
-def gradient_op(op: Op, kernel: Kernel | Either, known: dict[str, Callable[[dict], Any]] | None = None) -> Op:
+def gradient_op(op: Op, kernel: Kernel, known: dict[str, Callable[[dict], Any]] | None = None) -> Op:
     """The gradient of an op as an op of its own. Torch derives its composition from that of the op.
 
     Args:

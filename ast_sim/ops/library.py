@@ -136,31 +136,6 @@ class Kernel:
         return tuple([arguments[0].new_empty(0) if x is None else x for x in outputs])
 
 
-class Either:
-    """Kernels of one op that differ in shapes: one for each value of an argument."""
-
-    def __init__(self, argument: str, kernels: dict[Any, Kernel]) -> None:
-        first = next(iter(kernels.values()))
-        self.name, self.spec, self.kernels = first.name, first.spec, kernels
-        self.argument = [p.name for p in first.spec.inputs].index(argument)
-
-    def of(self, arguments: tuple) -> Kernel:
-        value = arguments[self.argument]
-        if value in self.kernels:
-            return self.kernels[value]
-        name, choice = self.spec.inputs[self.argument].name, ", ".join(map(str, self.kernels))
-        raise ValueError(f"{self.name}: {name} {value!r} is unknown: choose of {choice}")
-
-    def check(self, *arguments) -> None:
-        self.of(arguments).check(*arguments)
-
-    def run(self, *arguments) -> Any:
-        return (self.kernels.get(arguments[self.argument]) or self.of(arguments)).run(*arguments)
-
-    def fake(self, *arguments):
-        return self.of(arguments).fake(*arguments)
-
-
 def dense(x: Any, p: Parameter) -> Any:
     """A tensor aligned and contiguous, but for rows that may lie apart; a copy only if it is not so already."""
     if not isinstance(x, Tensor) or p.shape is None:
@@ -186,7 +161,7 @@ class Op:
         fake: makes outputs of the right shapes for tracing, where they do not follow from the spec.
     """
 
-    def __init__(self, kernel: Kernel | Either, composition: Callable, fake: Callable | None = None) -> None:
+    def __init__(self, kernel: Kernel, composition: Callable, fake: Callable | None = None) -> None:
         self.name, self.spec, self.composition = kernel.name, kernel.spec, composition
         self.kernel, self._check = kernel.run, kernel.check
         self.function: type[torch.autograd.Function] | None = None  # set by `derivatives.differentiate`

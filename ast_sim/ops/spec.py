@@ -106,11 +106,6 @@ class Parameter:
         wants = len(self.names("wants"))
         return f"bool[{wants}]" if wants > 1 else next(_SCHEMA[word] for word in self.words if word in _SCHEMA)
 
-    @property
-    def argument(self) -> str:
-        """The Python expression of what the kernel takes for it."""
-        return f"{tuple(self.names('choice'))}.index({self.name})" if "choice" in self.words else self.name
-
     def numbers(self, places: dict[str, int], checks: list[str]) -> list[int]:
         """As csrc/spec.h takes it, given the place of each parameter and the names of the core's checks."""
         kind = 0 if self.shape is not None else 3 if "bits" in self.words else 2 if "number" in self.words else 1
@@ -125,7 +120,7 @@ class Parameter:
         return sum([numbers, *rows, *[[0] * 8] * (2 - len(mine))], [])
 
 
-_SCHEMA = {"choice": "str", "flag": "bool", "switch": "bool", "wants": "bool", "size": "SymInt", "integer": "int"}
+_SCHEMA = {"flag": "bool", "switch": "bool", "wants": "bool", "size": "SymInt", "integer": "int"}
 _SCHEMA |= {"number": "float", "bits": "int"}
 _WORDS = {"int64", "int32", "rows", "filled", "late", "with", "added", "if", *_SCHEMA}
 _COUNTED = "torch.library.get_ctx().new_dynamic_size()"  # for tracing
@@ -173,7 +168,7 @@ class Spec:
 
         It is written out as Python, like the methods of a dataclass, for it runs in every call.
         """
-        return self._function([p.argument for p in self.taken] + [self._new(p) for p in self.outputs], self._sizes())
+        return self._function([p.name for p in self.taken] + [self._new(p) for p in self.outputs], self._sizes())
 
     @cached_property
     def wanted(self) -> Callable[..., tuple[bool, ...]]:
@@ -251,7 +246,7 @@ def check(name: str, parameters: list[Parameter], given: Given, exact: bool = Fa
 
 def _check_number(name: str, p: Parameter, value: float) -> None:
     low, high = p.bounds
-    if "integer" in p.words and "choice" not in p.words and not low <= value <= high:
+    if "integer" in p.words and not low <= value <= high:
         raise ValueError(f"{name}: {p.name} must lie in {low}..{high}, not {value}")
     if p.words.get("number") and not low <= value < high:
         raise ValueError(f"{name}: {p.name} must lie in [{low}, {high}), not {value}")

@@ -154,12 +154,12 @@ def layers(seed: int) -> Iterator[tuple[str, Case]]:
     x, extra, dout = (torch.randn(rows, n, generator=g) for n in (inputs, beside, outputs))
     weight, bias = torch.randn(outputs, inputs, generator=g), torch.randn(outputs, generator=g)
     results = ["out", "dx", "dweight", "dbias"]
-    for activation in linear.ACTIVATIONS:
+    for number, activation in enumerate(linear.ACTIVATIONS):
         yield (
             f"linear, {activation}",
             (
                 lambda x, w, b, a=activation: linear.linear(x, w, b, a),
-                lambda x, w, b, a=activation: linear._linear_reference(x, w, b, None, a, False)[0],
+                lambda x, w, b, a=number: linear._linear_reference(x, w, b, None, a, False)[0],
                 [x, weight, bias],
                 results,
             ),

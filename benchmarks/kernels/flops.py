@@ -90,6 +90,8 @@ def _raw(function):
 FORMULAS = {
     ops.linear: _raw(_linear),
     ops.linear_backward: _raw(_linear_backward),
+    ops.linear_geglu: _raw(_linear),
+    ops.linear_geglu_backward: _raw(_linear_backward),
     ops.mlp: _raw(_mlp),
     ops.mlp_backward: _raw(_mlp_backward),
     ops.message: _raw(_message),
@@ -101,5 +103,6 @@ FORMULAS = {
     ops.attention_qkv: _raw(_self_attention),
     ops.attention_qkv_backward: _raw(_self_attention_backward),
     ops.sparse_conv: _raw(_sparse_conv),
+    ops.sparse_conv_transposed: _raw(_sparse_conv),
     ops.sparse_conv_weight: _raw(_sparse_conv_weight),
 }

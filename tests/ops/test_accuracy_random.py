@@ -115,9 +115,10 @@ def reordered_attention_case(draw: Draw) -> Case:
 def linear_case(draw: Draw) -> Case:
     rows, inputs, outputs = draw.number(1, 600), draw.number(1, 600), 2 * draw.number(1, 300)
     activation = draw.one_of(*_linear.ACTIVATIONS)
+    number = _linear.ACTIVATIONS.index(activation)
     return (
         lambda x, w, b: linear(x, w, b, activation),
-        lambda x, w, b: _linear._linear_reference(x, w, b, None, activation, False)[0],
+        lambda x, w, b: _linear._linear_reference(x, w, b, None, number, False)[0],
         [
             draw.normal(rows, inputs, scale=draw.real(1e-3, 1e3)),
             draw.normal(outputs, inputs, scale=inputs**-0.5),

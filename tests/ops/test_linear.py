@@ -28,7 +28,7 @@ def fused(activation):
 
 def composed(activation):
     return lambda x, weight, bias=None, residual=None: ops._linear_reference(
-        x, weight, bias, residual, activation, False
+        x, weight, bias, residual, ACTIVATIONS.index(activation), False
     )[0]
 
 
@@ -211,12 +211,14 @@ def test_every_instruction_set():
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_opcheck(activation):
     x, weight, bias, residual = (y.requires_grad_() for y in case(9, 5, 6, activation))
+    number, plain = ACTIVATIONS.index(activation), activation != "geglu"
+    op, backward = (ops._linear, ops._linear_backward) if plain else (ops._geglu, ops._geglu_backward)
     for save in (False, True):
-        torch.library.opcheck(ops._linear.overload, (x, weight, bias, residual, activation, save))
-    torch.library.opcheck(ops._linear.overload, (x, weight, None, None, activation, False))
+        torch.library.opcheck(op.overload, (x, weight, bias, residual, number, save))
+    torch.library.opcheck(op.overload, (x, weight, None, None, number, False))
     dout, x, weight, bias = (y.detach() for y in (residual, x, weight, bias))
     for wanted in ([True] * 3, [True, False, False], [False, True, True]):
-        torch.library.opcheck(ops._linear_backward.overload, (dout, x, weight, bias, None, activation, wanted))
+        torch.library.opcheck(backward.overload, (dout, x, weight, bias, None, number, wanted))
 
 
 @pytest.mark.parametrize("wanted", [(0,), (1,), (2,), (3,), (0, 2), (1, 3)])

@@ -5,7 +5,7 @@ import torch
 
 from ast_sim.ops.spec import Spec, check
 
-TEXT = """x[M,I] rows, offsets[B+1] offsets(M), bias?[4O] with(scale), scale?[O], kind choice(no,yes), mean flag;
+TEXT = """x[M,I] rows, offsets[B+1] offsets(M), bias?[4O] with(scale), scale?[O], mean flag;
           num size(R), save switch, wanted wants(x,bias)
           -> y[R,I+O], index[B] int64, kept[M] if(save,bias), dbias[4O] if(wanted)"""
 SPEC = Spec(TEXT)
@@ -14,7 +14,7 @@ X, OFFSETS = torch.zeros(5, 3), torch.tensor([0, 2, 5])
 
 def test_the_schema_follows():
     assert SPEC.schema == (
-        "(Tensor x, Tensor offsets, Tensor? bias, Tensor? scale, str kind, bool mean, SymInt num, bool save,"
+        "(Tensor x, Tensor offsets, Tensor? bias, Tensor? scale, bool mean, SymInt num, bool save,"
         " bool[2] wanted) -> (Tensor, Tensor, Tensor, Tensor)"
     )
     assert Spec("x[N] -> y[N]").schema == "(Tensor x) -> Tensor"
@@ -22,15 +22,15 @@ def test_the_schema_follows():
 
 def test_the_arguments_of_the_kernel_follow():
     bias, scale = torch.zeros(8), torch.zeros(2)
-    x, offsets, b, s, kind, mean, y, index, kept, dbias = SPEC.arguments(
-        X, OFFSETS, bias, scale, "yes", True, 7, True, [False, True]
+    x, offsets, b, s, mean, y, index, kept, dbias = SPEC.arguments(
+        X, OFFSETS, bias, scale, True, 7, True, [False, True]
     )
-    assert x is X and offsets is OFFSETS and b is bias and s is scale and (kind, mean) == (1, True)
+    assert x is X and offsets is OFFSETS and b is bias and s is scale and mean is True
     assert y.shape == (7, 5) and index.shape == (2,) and index.dtype == torch.int64
     assert kept.shape == (5,) and dbias.shape == (8,)
-    *_, y, _, kept, dbias = SPEC.arguments(X, OFFSETS, None, None, "no", False, 7, True, [True, False])
+    *_, y, _, kept, dbias = SPEC.arguments(X, OFFSETS, None, None, False, 7, True, [True, False])
     assert y.shape == (7, 3) and kept is None and dbias is None
-    assert SPEC.wanted(X, OFFSETS, None, None, "no", False, 7, True, [True, False]) == (True, True, False, False)
+    assert SPEC.wanted(X, OFFSETS, None, None, False, 7, True, [True, False]) == (True, True, False, False)
 
 
 @pytest.mark.parametrize(
