@@ -22,14 +22,15 @@ static PyObject *call_kernel(PyObject *self, PyObject *const *objects, Py_ssize_
 /* A new array with the values of this one, which kernels trust from now on (frozen.h). Or the same object if there is
  * nothing to do: it is such a one already, has no values, or is nothing that a kernel reads as indices in place. */
 static PyObject *freeze_one(PyObject *object) {
+  static const parameter dense;
   view v;
-  if (!view_of(object, &v) || v.type != INTS || v.ndim < 1 || v.ndim > MAX_SHAPE || !is_dense(&v))
+  argument a;
+  if (!view_of(object, &v) || v.type != INTS || v.ndim < 1 || v.ndim > MAX_SHAPE || !take_layout(&dense, &v, &a) ||
+      !a.bytes || find_frozen(a.data, a.bytes))
     return Py_INCREF(object), object;
-  const int64_t bytes = view_size(&v) * v.item;
-  if (!bytes || find_frozen(v.data, bytes)) return Py_INCREF(object), object;
-  frozen *f = new_frozen(bytes);
+  frozen *f = new_frozen(a.bytes);
   if (!f) return NULL;
-  memcpy(f->shown, v.data, (size_t)bytes);
+  memcpy(f->shown, a.data, (size_t)a.bytes);
   return array_of(f, v.ndim, v.shape);
 }
 

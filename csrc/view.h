@@ -36,14 +36,6 @@ static int64_t view_size(const view *v) {
   return size;
 }
 
-/* Whether the items lie in memory one after the other, as C reads them. */
-static bool is_dense(const view *v) {
-  int64_t expected = v->item;
-  for (int d = v->ndim - 1; d >= 0; expected *= v->shape[d--])
-    if (v->shape[d] > 1 && v->stride[d] != expected) return false;
-  return v->native;
-}
-
 static char nothing[64]; /* where arrays without elements lie */
 
 static void view_of_array(PyArrayObject *array, view *v) {

@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ast_sim.ops.library import freeze, frozen
+from ast_sim.ops.library import IndexSet, frozen
 from ast_sim.ops.spec import check_index
 
 
@@ -36,7 +36,7 @@ def join_offsets(parts: Sequence[Tensor]) -> Tensor:
 
 
 @dataclass(frozen=True)
-class EdgeSet:
+class EdgeSet(IndexSet):
     """Directed edges, sorted by receiver, then by sender.
 
     Attributes:
@@ -50,9 +50,6 @@ class EdgeSet:
     receivers: Tensor
     receiver_offsets: Tensor
     num_senders: int
-
-    def __post_init__(self) -> None:
-        freeze(self, "senders", "receivers", "receiver_offsets")
 
     @staticmethod
     def from_pairs(senders: Tensor, receivers: Tensor, num_senders: int, num_receivers: int) -> EdgeSet:

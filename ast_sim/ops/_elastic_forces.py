@@ -18,14 +18,14 @@ from torch import Tensor
 
 from ast_sim.ops._edges import join_indices, join_offsets, offsets_of
 from ast_sim.ops.derivatives import gradient_op
-from ast_sim.ops.library import Kernel, Op, freeze
+from ast_sim.ops.library import IndexSet, Kernel, Op
 from ast_sim.ops.spec import check_index
 
 FLAT = 2.0**-21  # a rest volume below this share of the magnitudes that it is the sum of may be rounding alone
 
 
 @dataclass(frozen=True)
-class TetrahedronSet:
+class TetrahedronSet(IndexSet):
     """Tetrahedra, and at each node the corners that meet there.
 
     Attributes:
@@ -37,9 +37,6 @@ class TetrahedronSet:
     elements: Tensor
     node_order: Tensor
     node_offsets: Tensor
-
-    def __post_init__(self) -> None:
-        freeze(self, "elements", "node_order", "node_offsets")
 
     @staticmethod
     def from_elements(elements: Tensor, num_nodes: int) -> TetrahedronSet:

@@ -14,7 +14,6 @@ from __future__ import annotations
 import torch.nn.functional as F
 from torch import Tensor
 
-from ast_sim.ops import library
 from ast_sim.ops._edges import EdgeSet
 from ast_sim.ops._mlp import layer_norm
 from ast_sim.ops.derivatives import gradient_op
@@ -22,23 +21,6 @@ from ast_sim.ops.library import Kernel, Op
 from ast_sim.ops.spec import Given, Sizes
 
 Encoder = tuple[Tensor, Tensor, Tensor]
-
-
-def _compose(of_senders, of_receivers, edge_features, encoder, W2, b2, gamma, beta, senders, receivers):
-    """(sum, messages) from torch ops, which store every layer of every edge."""
-    z = of_senders.index_select(0, senders) + of_receivers.index_select(0, receivers)
-    if encoder is not None:
-        A1, a1, A2 = encoder
-        z = z + F.linear(F.relu(F.linear(edge_features, A1, a1)), A2)
-    elif edge_features is not None:
-        z = z + edge_features
-    messages = layer_norm(F.linear(F.relu(z), W2, b2), gamma, beta)
-    return messages.new_zeros(len(of_receivers), len(b2)).index_add(0, receivers, messages), messages
-
-
-def _are_latents(edge_features: Tensor, a1: Tensor) -> bool:
-    """Whether the edge features are latents, which are added without an encoder."""
-    return len(a1) == 0 and edge_features.shape[1] > 0
 
 
 _INPUTS = (
@@ -61,10 +43,17 @@ def _check_latents(name: str, sizes: Sizes, given: Given) -> None:
         )
 
 
-def _reference(*inputs):
-    *tensors, with_messages = inputs
-    encoder = tensors[3:6]
-    total, messages = _compose(*tensors[:3], None if _are_latents(tensors[2], encoder[1]) else encoder, *tensors[6:12])
+def _reference(
+    of_senders, of_receivers, edge_features, A1, a1, A2, W2, b2, gamma, beta, senders, receivers, _, with_messages
+):
+    """From torch ops, which store every layer of every edge."""
+    z = of_senders.index_select(0, senders) + of_receivers.index_select(0, receivers)
+    if len(a1):
+        z = z + F.linear(F.relu(F.linear(edge_features, A1, a1)), A2)
+    elif edge_features.shape[1]:
+        z = z + edge_features
+    messages = layer_norm(F.linear(F.relu(z), W2, b2), gamma, beta)
+    total = messages.new_zeros(len(of_receivers), len(b2)).index_add(0, receivers, messages)
     return total, messages if with_messages else None
 
 
@@ -84,18 +73,21 @@ def _check_features(edges: EdgeSet, of_senders: Tensor, edge_features: Tensor | 
         raise ValueError(f"message: edge_features without an encoder must have shape {wanted}, not {shape}")
 
 
-def _call(edges: EdgeSet, of_senders, of_receivers, edge_features, encoder, W2, b2, gamma, beta, with_messages: bool):
-    _check_features(edges, of_senders, edge_features, encoder)
-    if library.BACKEND == "torch":
-        inputs = (of_senders, of_receivers, edge_features, encoder, W2, b2, gamma, beta)
-        return _compose(*inputs, edges.senders, edges.receivers)
+def _of_edges(edges: EdgeSet, of_senders: Tensor, edge_features: Tensor | None, encoder: Encoder | None) -> tuple:
+    """The edge features and the encoder as the op takes them: empty where there are none."""
     if edge_features is None:
         edge_features = of_senders.new_empty(len(edges), 0)
     if encoder is None:
         shapes = ((0, edge_features.shape[1]), (0,), (of_senders.shape[-1], 0))
         encoder = tuple(of_senders.new_empty(shape) for shape in shapes)
+    return edge_features, *encoder
+
+
+def _call(edges: EdgeSet, of_senders, of_receivers, edge_features, encoder, W2, b2, gamma, beta, with_messages: bool):
+    _check_features(edges, of_senders, edge_features, encoder)
+    of_edges = _of_edges(edges, of_senders, edge_features, encoder)
     lists = (edges.senders, edges.receivers, edges.receiver_offsets)
-    return _message(of_senders, of_receivers, edge_features, *encoder, W2, b2, gamma, beta, *lists, with_messages)
+    return _message(of_senders, of_receivers, *of_edges, W2, b2, gamma, beta, *lists, with_messages)
 
 
 def message_sum(

@@ -12,14 +12,14 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from ast_sim.ops.library import Kernel, Op, freeze
+from ast_sim.ops.library import IndexSet, Kernel, Op
 from ast_sim.ops.spec import Given, Sizes, segment_of
 
 MAX_DEPTH = 21
 
 
 @dataclass(frozen=True)
-class Octree:
+class Octree(IndexSet):
     """The occupied cells of one level, in Morton order within each scene.
 
     Attributes:
@@ -37,9 +37,6 @@ class Octree:
     node_order: Tensor
     node_offsets: Tensor
     depth: int
-
-    def __post_init__(self) -> None:
-        freeze(self, "keys", "cell_offsets", "node_cell", "node_order", "node_offsets")
 
     def coordinates(self) -> Tensor:
         """[C, 3] int32: x, y and z of each cell, 0..2^depth - 1."""
@@ -76,7 +73,7 @@ class Octree:
 
 
 @dataclass(frozen=True)
-class CellMap:
+class CellMap(IndexSet):
     """The pairs of a fine and a coarse cell that the 3x3x3 kernel with stride 2 connects.
 
     Kernel offset k = 9(a+1) + 3(b+1) + (c+1) pairs the coarse cell X with the fine cell 2 X + (a, b, c), for a, b, c in
@@ -97,9 +94,6 @@ class CellMap:
     coarse_index: Tensor
     fine_by_fine: Tensor
     coarse_by_fine: Tensor
-
-    def __post_init__(self) -> None:
-        freeze(self, "pair_offsets", "fine", "coarse_index", "fine_by_fine", "coarse_by_fine")
 
 
 # ---- cells ----

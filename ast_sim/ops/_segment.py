@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ast_sim.ops.derivatives import differentiate
+from ast_sim.ops.derivatives import differentiate, differentiate_by_composition
 from ast_sim.ops.library import Kernel, Op
 from ast_sim.ops.spec import segment_of
 
@@ -46,11 +46,7 @@ def _gradient_by(adjoint: Op):
 
 differentiate(_sum, _save_segments, _gradient_by(_spread))
 differentiate(_spread, _save_segments, _gradient_by(_sum))
-differentiate(
-    _column_sum,
-    lambda ctx, inputs, output: setattr(ctx, "rows", inputs[0].shape[0]),
-    lambda ctx, grad: (grad.expand(ctx.rows, -1),),
-)
+differentiate_by_composition(_column_sum)
 
 
 def segment_sum(x: Tensor, node_order: Tensor, node_offsets: Tensor) -> Tensor:

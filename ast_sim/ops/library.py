@@ -265,10 +265,15 @@ def frozen(*indices: Tensor) -> tuple[Tensor, ...]:
     return tuple([x if y is x else torch.from_numpy(y) for x, y in zip(indices, _C.freeze(*indices), strict=True)])
 
 
-def freeze(record: object, *names: str) -> None:
-    """Make these attributes of a frozen dataclass `frozen`, when it is built."""
-    values = record.__dict__
-    values.update(zip(names, frozen(*[values[name] for name in names]), strict=True))
+class IndexSet:
+    """A frozen dataclass of this kind makes its tensors `frozen` when it is built."""
+
+    def __init_subclass__(cls) -> None:
+        cls._tensors = [name for name, kind in cls.__annotations__.items() if kind in ("Tensor", Tensor)]
+
+    def __post_init__(self) -> None:
+        values = self.__dict__
+        values.update(zip(self._tensors, frozen(*[values[name] for name in self._tensors]), strict=True))
 
 
 def configuration() -> dict:

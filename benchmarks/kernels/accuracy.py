@@ -125,13 +125,13 @@ def messages(seed: int) -> Iterator[tuple[str, Case]]:
     plain = [torch.randn(shape, generator=g) * (shape[0] ** -0.5 if i == 2 else 1) for i, shape in enumerate(shapes)]
     shapes = [(len(edges), 8), (width, 8), (width,), (width, width)]
     encoder = [torch.randn(shape, generator=g) * (width**-0.5 if i == 3 else 1) for i, shape in enumerate(shapes)]
-    lists = (edges.senders, edges.receivers)
+    lists, none = (edges.senders, edges.receivers, None, False), message._of_edges(edges, plain[0], None, None)
     results = ["out", "dof_senders", "dof_receivers", "dW2", "db2", "dgamma", "dbeta"]
     yield (
         "message_sum",
         (
             lambda P, Q, *layer: message.message_sum(edges, P, Q, None, None, *layer),
-            lambda P, Q, *layer: message._compose(P, Q, None, None, *layer, *lists)[0],
+            lambda P, Q, *layer: message._reference(P, Q, *(x.to(P) for x in none), *layer, *lists)[0],
             plain,
             results,
         ),
@@ -140,7 +140,7 @@ def messages(seed: int) -> Iterator[tuple[str, Case]]:
         "message_sum, encoder",
         (
             lambda P, Q, a, b, c, d, e, *x: message.message_sum(edges, P, Q, e, tuple(x), a, b, c, d),
-            lambda P, Q, a, b, c, d, e, *x: message._compose(P, Q, e, tuple(x), a, b, c, d, *lists)[0],
+            lambda P, Q, a, b, c, d, e, *x: message._reference(P, Q, e, *x, a, b, c, d, *lists)[0],
             [*plain, *encoder],
             [*results, "dedge_features", "dA1", "da1", "dA2"],
         ),

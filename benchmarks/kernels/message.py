@@ -71,7 +71,8 @@ def _case(name: str, edges: EdgeSet, raw: int, backward: bool) -> Case:
 
     def composition_of(P, Q, *weights):
         encoder = weights[:3] if encodes else None
-        return ops._compose(P, Q, features, encoder, *weights[-4:], edges.senders, edges.receivers)[0]
+        of_edges = ops._of_edges(edges, P, features, encoder)
+        return ops._reference(P, Q, *of_edges, *weights[-4:], edges.senders, edges.receivers, None, False)[0]
 
     def call(function):
         if not backward:

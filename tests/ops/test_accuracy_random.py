@@ -160,7 +160,7 @@ def message_case(draw: Draw) -> Case:
     ]
     return (
         lambda P, Q, e, A1, a1, A2, *layer: message_sum(edges, P, Q, e, (A1, a1, A2), *layer),
-        lambda P, Q, e, A1, a1, A2, *layer: _message._compose(P, Q, e, (A1, a1, A2), *layer, *lists)[0],
+        lambda P, Q, e, A1, a1, A2, *layer: _message._reference(P, Q, e, A1, a1, A2, *layer, *lists, None, False)[0],
         inputs,
     )
 

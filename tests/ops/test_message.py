@@ -61,7 +61,8 @@ def leaves_of(inputs: list) -> list:
 def composed(edges: EdgeSet, with_messages: bool = False):
     def call(P, Q, e, A1, a1, A2, *layer):
         encoder = None if A1 is None else (A1, a1, A2)
-        both = ops._compose(P, Q, e, encoder, *layer, edges.senders, edges.receivers)
+        of_edges = ops._of_edges(edges, P, e, encoder)
+        both = ops._reference(P, Q, *of_edges, *layer, edges.senders, edges.receivers, None, True)
         return both if with_messages else both[0]
 
     return call
