@@ -1,11 +1,11 @@
 /* How the module takes its arguments apart: every array is checked for type, shape, layout and index range before a
  * kernel sees it.
  *
- * What a kernel takes stands in its spec (spec.h). Arrays are NumPy arrays or tensors (view.h) of exact dtype, aligned
- * and row major; outputs are allocated by the caller. A message here names the kernel and the argument. Which value is
- * wrong, and what would be right, ast_sim/ops/spec.py finds out, whose checks are the same. A BufferError means that a
- * copy in row major order will do. In debug mode outputs are filled with NaN (integers: -1) before the kernel runs, and
- * inputs are compared with copies afterwards. Included by module_kernels.h alone.
+ * What a kernel takes stands in its spec (spec.h). Arrays are tensors (view.h) of exact dtype, aligned and row major;
+ * outputs are allocated by the caller, unless the kernel counts them. A message here names the kernel and the argument.
+ * Which value is wrong, and what would be right, ast_sim/ops/spec.py finds out, whose checks are the same. A
+ * BufferError means that a copy in row major order will do. In debug mode outputs are filled with NaN (integers: -1)
+ * before the kernel runs, and inputs are compared with copies afterwards. Included by module_kernels.h alone.
  */
 #ifndef AST_ARGUMENTS_H
 #define AST_ARGUMENTS_H
@@ -105,17 +105,16 @@ static bool take_layout(const parameter *p, const view *v, argument *a) {
   a->length = v->shape[0];
   a->bytes = size * v->item;
   a->row_stride = a->row_bytes / v->item;
-  return v->native;
+  return v->aligned;
 }
 
 static bool take_array(call *c, int i, PyObject *object) {
   const parameter *p = &c->spec->parameters[i];
   view v;
-  if (!view_of(object, &v)) return refuse(c, i, PyExc_TypeError, "must be a NumPy array or a dense tensor on the CPU");
+  if (!view_of(object, &v)) return refuse(c, i, PyExc_TypeError, "must be a dense tensor on the CPU");
   if (v.type != p->type) return refuse(c, i, PyExc_ValueError, "is of another type");
   if (!take_shape(c, p, &v)) return refuse(c, i, PyExc_ValueError, "has another shape");
   if (p->filled && view_size(&v) == 0) return refuse(c, i, PyExc_ValueError, "has no elements");
-  if (p->output && !v.writeable) return refuse(c, i, PyExc_ValueError, "must be writeable");
   return take_layout(p, &v, &c->arguments[i]) || refuse(c, i, PyExc_BufferError, "must be aligned and contiguous");
 }
 

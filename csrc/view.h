@@ -1,10 +1,8 @@
-/* What the module reads of an array that Python holds: a NumPy array, or a tensor of a library that offers DLPack's
- * exchange in C.
+/* What the module reads of a tensor that Python holds, of a library that offers DLPack's exchange in C.
  *
  * A torch tensor is looked at where it lies, by one C call and without a Python object beside it; torch has offered
- * this since 2.10
- * (`__dlpack_c_exchange_api__`, DLPack 1.3). Nothing is owned: a view is good while the caller holds the object.
- * Included by arguments.h alone.
+ * this since 2.10 (`__dlpack_c_exchange_api__`, DLPack 1.3). Nothing is owned: a view is good while the caller holds
+ * the object. Included by arguments.h alone.
  */
 #ifndef AST_VIEW_H
 #define AST_VIEW_H
@@ -27,7 +25,7 @@ typedef struct {
   int type, ndim;
   int64_t item;                                /* bytes */
   int64_t shape[MAX_SHAPE], stride[MAX_SHAPE]; /* strides in bytes; unset where ndim is larger than MAX_SHAPE */
-  bool native, writeable;                      /* native: aligned and in this machine's byte order */
+  bool aligned;
 } view;
 
 static int64_t view_size(const view *v) {
@@ -37,17 +35,6 @@ static int64_t view_size(const view *v) {
 }
 
 static char nothing[64]; /* where arrays without elements lie */
-
-static void view_of_array(PyArrayObject *array, view *v) {
-  *v = (view){.data = PyArray_DATA(array),
-              .type = PyArray_TYPE(array),
-              .ndim = PyArray_NDIM(array),
-              .item = PyArray_ITEMSIZE(array),
-              .native = PyArray_ISBEHAVED_RO(array),
-              .writeable = PyArray_ISWRITEABLE(array)};
-  for (int d = 0; d < v->ndim && d < MAX_SHAPE; d++)
-    v->shape[d] = PyArray_DIM(array, d), v->stride[d] = PyArray_STRIDE(array, d);
-}
 
 /* ---- the part of DLPack's interface (dlpack.h, version 1) that takes a look at a tensor ---- */
 
@@ -94,7 +81,7 @@ static int type_of_tensor(const dlpack_tensor *t) {
 }
 
 /* Whether the object is a dense tensor in this machine's memory. */
-static bool view_of_tensor(PyObject *object, view *v) {
+static bool view_of(PyObject *object, view *v) {
   const dlpack_exchange *exchange = exchange_of(Py_TYPE(object));
   dlpack_tensor t;
   if (!exchange) return false;
@@ -106,18 +93,11 @@ static bool view_of_tensor(PyObject *object, view *v) {
               .type = type_of_tensor(&t),
               .ndim = t.ndim,
               .item = item,
-              .native = item && (uintptr_t)data % (uintptr_t)item == 0,
-              .writeable = true};
+              .aligned = item && (uintptr_t)data % (uintptr_t)item == 0};
   bool empty = false;
   for (int d = 0; d < v->ndim; d++) empty = empty || t.shape[d] == 0;
   for (int d = 0; d < v->ndim && d < MAX_SHAPE; d++) v->shape[d] = t.shape[d], v->stride[d] = t.strides[d] * item;
   return t.data || empty;
-}
-
-static bool view_of(PyObject *object, view *v) {
-  if (!PyArray_Check(object)) return view_of_tensor(object, v);
-  view_of_array((PyArrayObject *)object, v);
-  return true;
 }
 
 #endif

@@ -177,9 +177,8 @@ def test_every_function_is_recorded():
     which=st.integers(0, 1),
     changes=st.lists(st.tuples(st.integers(0, 40), spoilers()), min_size=1, max_size=3),
     more=st.sampled_from([0] * 20 + [-1, 1]),
-    tensors=st.booleans(),
 )
-def test_arguments_that_do_not_fit(name, which, changes, more, tensors):
+def test_arguments_that_do_not_fit(name, which, changes, more):
     recorded = calls()[name][which % len(calls()[name])]
     arguments = [x.copy() if isinstance(x, np.ndarray) else x for x in recorded]
     for at, spoil in changes:
@@ -187,20 +186,16 @@ def test_arguments_that_do_not_fit(name, which, changes, more, tensors):
             arguments[at % len(arguments)] = spoil(arguments[at % len(arguments)])
     if more:
         arguments = arguments[:-1] if more < 0 else [*arguments, 0]
-    if tensors:
-        arguments = [as_tensor(x) for x in arguments]
     try:
-        getattr(library._C, name)(*arguments)
+        getattr(library._C, name)(*map(as_tensor, arguments))
     except ALLOWED as error:
         assert isinstance(error, MemoryError) or str(error)
 
 
-@pytest.mark.parametrize("tensors", [False, True])
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_recorded_calls_are_valid(name, tensors):
+def test_recorded_calls_are_valid(name):
     for recorded in calls()[name]:
-        arguments = copy.deepcopy(recorded)
-        getattr(library._C, name)(*(as_tensor(x) if tensors else x for x in arguments))
+        getattr(library._C, name)(*map(as_tensor, copy.deepcopy(recorded)))
 
 
 class Derived(torch.Tensor):
@@ -215,10 +210,9 @@ class Derived(torch.Tensor):
         lambda x: torch.nn.Parameter(x),
         lambda x: x.as_subclass(Derived),
         lambda x: torch.cat([x, x])[5:],
-        lambda x: x.numpy(),
     ],
 )
-def test_tensors_and_arrays_of_all_kinds_are_read(change):
+def test_tensors_of_all_kinds_are_read(change):
     out = torch.empty(3)
     library._C.column_sum(change(torch.arange(15.0).view(5, 3)), out)
     assert out.tolist() == [30.0, 35.0, 40.0]
@@ -227,9 +221,9 @@ def test_tensors_and_arrays_of_all_kinds_are_read(change):
 @pytest.mark.parametrize(
     "change, message",
     [
-        (lambda x: x.to_sparse(), "must be a NumPy array or a dense tensor on the CPU"),
-        (lambda x: x.to("meta"), "must be a NumPy array or a dense tensor on the CPU"),
-        (lambda x: FakeTensorMode().from_tensor(x), "must be a NumPy array or a dense tensor on the CPU"),
+        (lambda x: x.to_sparse(), "must be a dense tensor on the CPU"),
+        (lambda x: x.to("meta"), "must be a dense tensor on the CPU"),
+        (lambda x: FakeTensorMode().from_tensor(x), "must be a dense tensor on the CPU"),
         (lambda x: x.double(), "must be float32, not torch.float64"),
         (lambda x: x.bfloat16(), "must be float32, not torch.bfloat16"),
         (lambda x: x.to(torch.complex64), "must be float32, not torch.complex64"),
@@ -246,9 +240,9 @@ def test_tensors_that_do_not_fit_are_refused(change, message):
         column_sum(x, torch.empty(3))
 
 
-@pytest.mark.parametrize("change", [lambda x: x.tolist(), lambda x: x.double().numpy(), lambda x: None])
-def test_what_is_no_such_array_is_refused(change):
-    with pytest.raises((TypeError, ValueError), match="column_sum: x (must|is of another type)"):
+@pytest.mark.parametrize("change", [lambda x: x.tolist(), lambda x: x.numpy(), lambda x: None])
+def test_what_is_no_tensor_is_refused(change):
+    with pytest.raises((TypeError, ValueError), match="column_sum: x must"):
         library._C.column_sum(change(torch.arange(15.0).view(5, 3)), torch.empty(3))
 
 
@@ -270,11 +264,11 @@ def test_other_layouts_are_copied(change):
 
 NO_MEMORY = """
 import resource
-import numpy as np
+import torch
 from ast_sim.ops import library, linear
 
 N = 2_000_000
-inputs = (np.zeros((N, 3), np.float32), np.array([0, N]), 0.0, 0.0, 0.0, 1.0, 12)
+inputs = (torch.zeros(N, 3), torch.tensor([0, N]), 0.0, 0.0, 0.0, 1.0, 12)
 most = resource.getrlimit(resource.RLIMIT_AS)
 for room in 8, 80:  # too little for the outputs of 64 MB, and for what the kernel takes beside them
     mapped = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
