@@ -192,13 +192,13 @@ def predict(args: argparse.Namespace) -> None:
 
 def _predict_spec(run: Any, args: argparse.Namespace, effort: dict[str, Any]) -> None:
     """`ast-sim predict RUN SPEC.toml`."""
-    from ast_sim.simulate.own_assembly.grid import grid, parse_setting
+    from ast_sim.simulate.own_assembly.grid import grid, parse_settings
 
     for group in (args.of_mesh, args.of_data):
         _refuse(args, group, f"{args.scene}, which is a specification")
     if args.move:
         raise ConfigError(f"{args.scene} says what moves: change its parameters with --set, or leave --move out")
-    rows = grid(dict(map(parse_setting, args.set)))
+    rows = grid(parse_settings(args.set))
     if len(rows) > 1:
         raise ConfigError("--set gives several values: ast-sim sweep predicts them all")
     asked = {"nodes": args.nodes, "num_frames": args.num_frames, "name": str(args.scene)}
@@ -212,12 +212,12 @@ def _predict_spec(run: Any, args: argparse.Namespace, effort: dict[str, Any]) ->
 
 def sweep(args: argparse.Namespace) -> None:
     """Predict an assembly for many values of its parameters: a table and a picture."""
-    from ast_sim.simulate.own_assembly.grid import parse_setting
+    from ast_sim.simulate.own_assembly.grid import parse_settings
 
     picture = args.out.with_suffix(".png")
     for out, what, suffix in ((args.out, "a table", ".csv"), (picture, "a picture", ".png")):
         _check_output(args, out, [args.spec, *filter(None, [args.table])], what, suffix)
-    run, values = _open_run(args.run_folder), dict(map(parse_setting, args.set))
+    run, values = _open_run(args.run_folder), parse_settings(args.set)
     effort = {"corrections": args.corrections, "newton_steps": args.newton_steps}
     found = run.sweep(args.spec, table=args.table, nodes=args.nodes, **effort, **values)
     found.save(args.out)

@@ -150,11 +150,16 @@ class Dataset:
                 digest.update(str(self._file.attributes(self._group(split, index))[HASH]).encode())
         return digest.hexdigest()
 
+    def with_frames(self, split: str, least: int) -> list[int]:
+        """The trajectories of a split with at least so many frames. Where a solver gave up in the first, only the start
+        is there."""
+        return [index for index in range(self.count(split)) if self.num_frames(split, index) >= least]
+
     def spread(self, split: str, most: int) -> Iterator[tuple[str, Trajectory]]:
-        """At most `most` trajectories of a split, evenly spread over it, and their names for messages."""
-        count = self.count(split)
-        for index in np.unique(np.linspace(0, count - 1, min(count, most)).astype(int)):
-            yield self._name(split, int(index)), self.load(split, int(index))
+        """At most `most` trajectories of a split that move, evenly spread over it, and their names for messages."""
+        moving = self.with_frames(split, 2)
+        for place in np.unique(np.linspace(0, len(moving) - 1, min(len(moving), most)).astype(int)):
+            yield self._name(split, moving[place]), self.load(split, moving[place])
 
     def cauchy_stress(self, split: str, index: int, start: int = 0, stop: int | None = None) -> np.ndarray | None:
         """Cauchy stress [stop - start, E, 6] of frames start to stop - 1; None if the trajectory has none."""

@@ -44,6 +44,7 @@ class Answer:
             mean edge lengths of the surfaces, or the root mean square of the moves over that of the displacements, if
             that is larger. As long as the contact does not change, a next step would be about its square. Empty without
             Newton steps.
+        driven: the number of the body whose prescribed nodes move farthest in the whole motion.
     """
 
     name: str
@@ -59,6 +60,7 @@ class Answer:
     frames: tuple[int, ...] = ()
     expected_error: float | None = None
     last_steps: tuple[float, ...] = ()
+    driven: int = 0
 
     @property
     def seconds(self) -> float:
@@ -85,7 +87,7 @@ class Answer:
         return Trajectory(self.scene, self.position, self.stress, attributes, stress_location=location)
 
     def reaction(self) -> np.ndarray | None:
-        """[S, 3] the force in newton that moves the prescribed nodes of the body that moves farthest.
+        """[S, 3] the force in newton that moves the prescribed nodes of the body `driven`.
 
         It follows from the strains of the predicted positions, by the solver's own law of the material. None where the
         scene has no Young's modulus and Poisson's ratio.
@@ -94,7 +96,7 @@ class Answer:
             return None
         from ast_sim.simulate.own_assembly.reaction import Reaction
 
-        scale, force = LENGTH_UNITS[self.info.length_unit] ** 2, Reaction(self.scene)
+        scale, force = LENGTH_UNITS[self.info.length_unit] ** 2, Reaction(self.scene, self.driven)
         return scale * np.array([force.of(position) for position in self.position]).reshape(-1, 3)
 
     def figures(self, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> list[dict[str, float]]:

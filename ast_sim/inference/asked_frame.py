@@ -55,13 +55,13 @@ def asked_frames(
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        scenes = [_scene(model, dataset, split, index, effort) for index in range(dataset.count(split))]
+        indices = dataset.with_frames(split, model.config.given_frames + 1)
+        scenes = [_scene(model, dataset, split, index, effort) for index in indices]
     finally:
         torch.set_num_threads(threads)
     why = None
     try:
-        indices = list(range(min(rival_scenes, len(scenes))))
-        frames = [scenes[index]["frame"] for index in indices]
+        indices, frames = indices[:rival_scenes], [scene["frame"] for scene in scenes[:rival_scenes]]
         found = rivals(dataset.path, split, indices, frames, made_from=made_from, progress=False) if indices else ()
         for scene, rival in zip(scenes, found, strict=False):
             scene["solver"] = _solver(rival, scene["relative_error"])

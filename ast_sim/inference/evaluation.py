@@ -39,7 +39,8 @@ def evaluate(
 ) -> tuple[dict[str, Any], list[Answer]]:
     """Predict all trajectories of a split and compare.
 
-    Scenes are predicted one at a time. A failed prediction has the error None, and then the summary has None, too.
+    Scenes are predicted one at a time; those without a frame to predict are left out. A failed prediction has the error
+    None, and then the summary has None, too.
 
     Returns:
         The predictions, and figures that hold:
@@ -56,13 +57,15 @@ def evaluate(
     Raises:
         DatasetError: the split is empty.
     """
-    count = dataset.count(split)
-    if count == 0:
-        raise DatasetError(f"{dataset.path}: the split {split} is empty, so there is nothing to evaluate on")
+    indices = dataset.with_frames(split, model.config.given_frames + 1)
+    if not indices:
+        raise DatasetError(
+            f"{dataset.path}: the split {split} has no frame to predict: there is nothing to evaluate on"
+        )
     constant = _training_stress(dataset) if model.config.stress != "none" else None
     samples, answers, displacement, stress = [], [], [], []
     seconds = read_seconds(dataset).samples
-    for index in range(count):
+    for index in indices:
         name, truth = f"{split}/{index:06d}", dataset.load(split, index)
         answer = predictions(model, [Question.of(truth, name)], effort)[0]
         one_step = _predicted(answer) if model.config.jumps else one_step_predictions(model, truth, name)

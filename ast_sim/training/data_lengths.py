@@ -80,10 +80,11 @@ def measure(dataset: Dataset) -> DataScales:
 
 
 def _alike(constants: list[dict[str, AttributeValue | None]]) -> dict[str, float]:
-    """The numbers that are the same in all scenes; 0 for the others."""
+    """The numbers that are the same in all scenes, the largest of several; 0 for the others."""
     first = constants[0]
     alike = {key: value for key, value in first.items() if all(constant[key] == value for constant in constants)}
-    return {key: float(value) if isinstance(value := alike.get(key), float | int) else 0.0 for key in first}
+    known = {key: value for key, value in alike.items() if isinstance(value, float | int | list)}
+    return {key: float(np.max(known.get(key, 0.0), initial=0.0)) for key in first}
 
 
 def scope_of(dataset: Dataset) -> Scope:

@@ -206,11 +206,11 @@ class Training:
 
     def _validate(self) -> None:
         """Roll out the validation scenes; if their error is the lowest so far, mark the checkpoint of this step."""
-        count = min(self.dataset.count("valid"), self.options.validate_scenes)
-        if count == 0:
+        scenes = self.dataset.with_frames("valid", self.model.config.given_frames + 1)[: self.options.validate_scenes]
+        if not scenes:
             return
         self.ahead.wait()
-        mine = range(self.processes.rank, count, self.processes.count)
+        mine = scenes[self.processes.rank :: self.processes.count]
         # Several processes must stop together, so none of them may stop within its own validation.
         progress = self._stop_at_once if self.processes.count == 1 else None
         found = self.processes.gathered(validate(self.model, self.dataset, mine, self.options.calls, progress))

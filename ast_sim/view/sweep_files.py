@@ -38,8 +38,8 @@ def write_picture(
 ) -> None:
     """Write a PNG of a quantity over the varied parameters.
 
-    One parameter gives a curve. Two give a curve over the first for each value of the second, or points in colours if
-    these are many; more than two give the same for the first two.
+    One parameter gives a curve, or points if its values are names of files. Two give a curve over the first for each
+    value of the second, or points in colours if these are many; more than two give the same for the first two.
 
     Args:
         rows: the values of the parameters and of the quantity. Rows without the quantity are left out.
@@ -48,7 +48,7 @@ def write_picture(
         length_unit: unit of length, for the title.
 
     Raises:
-        ConfigError: no row has the quantity, or no parameter that is a number varies.
+        ConfigError: no row has the quantity, or no parameter varies.
         AstSimError: the file cannot be written.
         MissingExtra: matplotlib is not installed.
     """
@@ -56,15 +56,19 @@ def write_picture(
     numbers = [name for name in varied if all(isinstance(row[name], int | float) for row in rows)]
     if not shown:
         raise ConfigError(f"no row has {quantity!r}; the rows have: {', '.join(rows[0]) if rows else 'nothing'}")
-    if not numbers:
-        raise ConfigError("no parameter that is a number varies, so there is nothing to draw over")
+    if not varied:
+        raise ConfigError("no parameter varies, so there is nothing to draw over")
     figures, agg = require("view", "matplotlib.figure", "matplotlib.backends.backend_agg")
     figure = figures.Figure(figsize=(6.4, 4.2), facecolor="white")
     agg.FigureCanvasAgg(figure)
     axes = figure.add_subplot()
-    first = numbers[0]
+    first = (numbers or varied)[0]
     others = [name for name in varied if name != first]
-    x, y = (np.array([float(row[key]) for row in shown]) for key in (first, quantity))
+    x = np.array([row[first] for row in shown], float if numbers else str)
+    y = np.array([float(row[quantity]) for row in shown])
+    if not numbers:  # names of files stand side by side
+        names, x = np.unique(x, return_inverse=True)
+        axes.set_xticks(range(len(names)), names)
     groups = [row[others[0]] for row in shown] if others else [""] * len(shown)
     if len(set(groups)) <= MOST_CURVES:
         _curves(axes, x, y, groups, others)
@@ -83,12 +87,13 @@ def write_picture(
 
 
 def _curves(axes, x: np.ndarray, y: np.ndarray, groups: Sequence[Any], others: Sequence[str]) -> None:
-    """A curve for each group; points alone where more parameters vary than a curve can show."""
+    """A curve for each group; points alone where more parameters vary than a curve can show, or names."""
+    style = "o-" if len(others) < 2 and x.dtype.kind == "f" else "o"
     for group in dict.fromkeys(groups):
         mine = np.array([other == group for other in groups])
         order = np.argsort(x[mine], kind="stable")
         shown = group if isinstance(group, str) else f"{group:.4g}"
         label = f"{others[0]} = {shown}" if others else None
-        axes.plot(x[mine][order], y[mine][order], "o-" if len(others) < 2 else "o", markersize=3, label=label)
+        axes.plot(x[mine][order], y[mine][order], style, markersize=3, label=label)
     if others:
         axes.legend(fontsize=8, frameon=False)

@@ -92,8 +92,12 @@ def test_a_sweep_is_many_predictions(trained, tmp_path):
         assert row["reaction"] == pytest.approx(same["reaction"], rel=1e-3)
 
 
-def test_with_friction_a_sweep_knows_the_frame_before(tmp_path):
-    spec = write_assembly(tmp_path, SPEC.replace("[parameters]", "friction = 0.4\n\n[parameters]"))
+BETWEEN = '[[contact]]\nparts = ["block", "punch"]\nfriction = 0.4\n\n[parameters]'
+
+
+@pytest.mark.parametrize("rubs", ["friction = 0.4\n\n[parameters]", "friction = [0.3, 0.5]\n\n[parameters]", BETWEEN])
+def test_with_friction_a_sweep_knows_the_frame_before(tmp_path, rubs):
+    spec = write_assembly(tmp_path, SPEC.replace("[parameters]", rubs))
     ast_sim.generate("assembly", tmp_path / "study.h5", spec=spec, train=2, valid=1, test=1, workers=1, progress=False)
     run = ast_sim.train(tmp_path / "study.h5", tmp_path / "run", steps=5)
     (row,) = run.sweep(spec, travel=1.5, corrections=0, newton_steps=3).rows

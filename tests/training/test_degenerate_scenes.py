@@ -32,6 +32,27 @@ def plate(which: np.ndarray | None = None, node_type: NodeType | None = None, pl
     return dataclasses.replace(truth, scene=scene, position=position)
 
 
+@pytest.mark.parametrize("dynamic", [False, True])
+def test_where_the_solver_gave_up_at_once_there_is_nothing_to_learn_or_measure(tmp_path, dynamic):
+    start_only = toy.plate(1, dynamic=dynamic)
+    start_only = dataclasses.replace(start_only, position=start_only.position[:1], stress=start_only.stress[:1])
+    with DatasetWriter(tmp_path / "toy.h5", toy.info(dynamic=dynamic)) as writer:
+        for split in ("train", "valid", "test"):
+            for truth in (toy.plate(0, dynamic=dynamic), start_only, toy.plate(2, dynamic=dynamic)):
+                writer.add(split, truth)
+    settings = start.configure(tmp_path / "toy.h5", "tiny", ["train.steps=2"])
+    start.start_training(tmp_path / "run", settings)
+    run = Run(tmp_path / "run")
+    figures = run.evaluate().figures
+    assert [scene["name"] for scene in figures["samples"]] == ["test/000000", "test/000002"]
+    assert [scene["name"] for scene in figures["asked"]["scenes"]] == ["test/000000", "test/000002"]
+    assert run.scope.travel[0] > 0 and run.scope.increment[0] > 0
+    with DatasetWriter(tmp_path / "still.h5", toy.info(dynamic=dynamic)) as writer:
+        writer.add("test", start_only)
+    with pytest.raises(DatasetError, match="the split test has no frame to predict"):
+        run.evaluate(tmp_path / "still.h5")
+
+
 ALL, DEFORMING = slice(None), toy.plate(0).scene.deforming_nodes
 BAD = {
     "obstacles only": (plate(ALL, NodeType.OBSTACLE), NOTHING),

@@ -16,6 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from ast_sim.scene import AttributeValue, Scene, Trajectory
+from ast_sim.simulate.mechanics.case import driven_body
 from ast_sim.simulate.mechanics.contact_and_friction import Contact, ContactSettings
 from ast_sim.simulate.mechanics.unfinished import Checkpoint
 from ast_sim.support.errors import SimulationError
@@ -113,8 +114,7 @@ class Frames(ABC):
         self.arrays: dict[str, list[np.ndarray]] = {}
         self._steps_before = 0
         scene = case.scene
-        travel = np.where(scene.prescribed, np.abs(case.targets - case.targets[0]).max(axis=(0, 2)), 0)
-        self.driven = scene.prescribed & (scene.body == scene.body[np.argmax(travel)])
+        self.driven = scene.prescribed & (scene.body == driven_body(scene, case.targets))
 
     @abstractmethod
     def next_frame(self) -> tuple[dict[str, np.ndarray], FrameRecord]:

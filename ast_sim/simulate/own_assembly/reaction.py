@@ -28,13 +28,17 @@ class Reaction:
     """The force on the moved nodes of a scene of tetrahedra with Young's modulus and Poisson's ratio as its material.
 
     Made once for a scene, because the shape functions do not change.
+
+    Args:
+        driven: the number of the body whose prescribed nodes are the moved ones, where they are away from their places
+            at rest; see `driven_body`.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, driven: int) -> None:
         import igl  # takes 0.2 s
 
         assert scene.material is not None
-        self.scene, self._rest = scene, scene.rest_position.astype(np.float64)
+        self.scene, self.driven, self._rest = scene, driven, scene.rest_position.astype(np.float64)
         soft = np.flatnonzero(scene.deforming_nodes[scene.elements].any(axis=1))
         young, poisson = scene.material[soft, :2].astype(np.float64).T
         self._elasticity = Elasticity(self._rest, scene.elements[soft], NeoHookean(young, poisson))
@@ -49,8 +53,6 @@ class Reaction:
     def of(self, position: np.ndarray) -> np.ndarray:
         """The force [3] that moves the moved nodes, in pascal times the square of the unit of length.
 
-        The moved nodes are the prescribed nodes, away from their places at rest, of the body that moves farthest.
-
         Args:
             position: [N,3].
         """
@@ -64,15 +66,12 @@ class Reaction:
 
     def _ends(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """[N] bool twice: the deforming nodes on which the moved nodes act, and all others that are held or touched."""
-        scene, way = self.scene, np.linalg.norm(position - self._rest, axis=1)
-        way[~scene.prescribed] = 0
-        driven = int(scene.body[np.argmax(way)])
-        nearest = self._nearest_body(position)
+        scene, nearest = self.scene, self._nearest_body(position)
         held = scene.prescribed & self._deforming
-        if scene.node_type[scene.body == driven][0] == NodeType.OBSTACLE:
-            source = (nearest == driven) & ~held
+        if scene.node_type[scene.body == self.driven][0] == NodeType.OBSTACLE:
+            source = (nearest == self.driven) & ~held
         else:
-            source = held & (scene.body == driven) & (way > 0)
+            source = held & (scene.body == self.driven) & (position != self._rest).any(axis=1)
         return source, (held | (nearest >= 0)) & ~source
 
     def _nearest_body(self, position: np.ndarray) -> np.ndarray:

@@ -5,18 +5,25 @@ import os
 import numpy as np
 import pytest
 
-from ast_sim.simulate.own_assembly.grid import grid, parse_setting, read_table
+from ast_sim.simulate.own_assembly.grid import grid, parse_setting, parse_settings, read_table
 from ast_sim.support.errors import ConfigError
 
 
 def test_settings_and_grids():
     texts = ["travel=1:3:3", "pad.young = 1e6, 2e6", "hook.file=long.step", "skew=-5"]
-    values = dict(map(parse_setting, texts))
+    values = parse_settings(texts)
     assert values == {"travel": [1, 2, 3], "pad.young": [1e6, 2e6], "hook.file": ["long.step"], "skew": [-5]}
     rows = grid(values)
     assert len(rows) == 6 and rows[1] == {"travel": 1, "pad.young": 2e6, "hook.file": "long.step", "skew": -5}
     assert grid({"travel": 3.0, "young": {"pad": [1, 2]}}) == [{"travel": 3.0, "pad.young": v} for v in (1, 2)]
     assert grid({"travel": np.linspace(0, 1, 2)}) == [{"travel": 0.0}, {"travel": 1.0}] and grid({}) == [{}]
+
+
+def test_a_parameter_is_set_once_and_options_are_none():
+    with pytest.raises(ConfigError, match="travel is given twice: write all its values behind one travel="):
+        parse_settings(["travel=1,2", "travel=3"])
+    with pytest.raises(ConfigError, match="nodes is no parameter of a specification; .* write --nodes N"):
+        parse_settings(["travel=1", "nodes=300"])
 
 
 @pytest.mark.parametrize(
