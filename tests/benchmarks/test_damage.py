@@ -40,7 +40,11 @@ def test_what_was_expected_has_no_times_but_all_numbers(bench):
 def test_without_a_guard_other_numbers_are_silent_and_an_exception_is_a_traceback(bench, monkeypatch):
     weights = damage.Damage("checkpoints", "run/checkpoints/step-2/model.safetensors", 9000, 6)
     assert bench.outcome(weights)[0] in ("warned", "refused")
-    monkeypatch.setattr(checkpoint, "_read_verified", lambda path, name, record: (path / name).read_bytes())
+
+    def unguarded(path):
+        return {name: (path / name).read_bytes() for name in checkpoint.FILES}
+
+    monkeypatch.setattr(checkpoint, "_read_verified", unguarded)
     assert bench.outcome(weights)[0] == "silent"
     monkeypatch.setattr(checkpoint, "_ERRORS", ())
     header = damage.Damage("checkpoints", "run/checkpoints/step-2/model.safetensors", 3, None)
