@@ -25,17 +25,20 @@ enum {
 _Static_assert(QUERIES % LANES == 0 && (int)KEYS == DROPOUT_KEYS,
                "tasks hold whole panels, blocks one group of the dropout");
 
+/* How a scene is cut. */
 typedef struct {
-  int64_t chunks, parts, part_keys;               /* of queries; of keys; keys of a part */
-  int64_t partial_rows;                           /* queries of the states that the parts leave */
-  int64_t first_task, first_merge, first_partial; /* tasks, merges and floats of such states before this scene */
+  int64_t q0, queries, k0, keys;    /* its rows */
+  int64_t chunks, parts, part_keys; /* of queries; of keys; keys of a part */
+  int64_t partial_rows;             /* queries of the states that the parts leave */
+  int64_t first_partial;            /* floats of such states before this scene */
 } forward_cut;
 
 typedef struct {
   const ast_attention *s;
   const float *q, *k, *v;
   float *out, *maximum, *sum;
-  const forward_cut *cuts; /* [B+1] */
+  const forward_cut *cuts;                 /* [B] */
+  const int64_t *first_task, *first_merge; /* [B+1] of each scene */
   float *partials;
 } forward_job;
 
@@ -54,6 +57,7 @@ typedef struct {
 
 /* The scene, head, queries and keys of a task. */
 typedef struct {
+  const forward_cut *cut;
   int64_t b, h, part, first_query, rows, first_key, keys;
   int32_t shift;
 } forward_range;
@@ -107,45 +111,40 @@ static void forward_panel(forward_scratch *t, const forward_state *state, int64_
     weights(t->scores, n, base, shift, sum);
   }
   EACH(2, c) vstore(l + c * VW, vload(l + c * VW) * vload(fade + c * VW) + sum[c]);
-  columns_product(round_up(rows, ROW_STEP), D, n, t->scores, t->values, state->out + i0 * ROW, (update){first, fade});
+  faded_product(round_up(rows, ROW_STEP), D, n, t->scores, t->values, state->out + i0 * ROW, first ? NULL : fade);
 }
 
 /* ---- tasks ---- */
 
 static forward_cut cut_of(const ast_attention *s, int64_t b) {
-  const int64_t queries = s->q_offsets[b + 1] - s->q_offsets[b], keys = s->k_offsets[b + 1] - s->k_offsets[b];
-  forward_cut cut = {.chunks = (queries + QUERIES - 1) / QUERIES};
-  const int64_t wanted = min64(PARTED_TASKS / max64(cut.chunks * s->H, 1), (keys + PART_KEYS - 1) / PART_KEYS);
-  cut.part_keys = round_up((keys + max64(wanted, 1) - 1) / max64(wanted, 1), KEYS);
-  cut.partial_rows = min64(QUERIES, round_up(queries, LANES));
-  cut.parts = keys ? (keys + cut.part_keys - 1) / cut.part_keys : 1;
+  forward_cut cut = {.q0 = s->q_offsets[b], .k0 = s->k_offsets[b]};
+  cut.queries = s->q_offsets[b + 1] - cut.q0;
+  cut.keys = s->k_offsets[b + 1] - cut.k0;
+  cut.chunks = divide_up(cut.queries, QUERIES);
+  const int64_t wanted = min64(PARTED_TASKS / max64(cut.chunks * s->H, 1), divide_up(cut.keys, PART_KEYS));
+  cut.part_keys = round_up(divide_up(cut.keys, max64(wanted, 1)), KEYS);
+  cut.partial_rows = min64(QUERIES, round_up(cut.queries, LANES));
+  cut.parts = cut.keys ? divide_up(cut.keys, cut.part_keys) : 1;
   return cut;
 }
 
-/* Task `index`, counted by `first_task` or, for the merges, which are not parted, by `first_merge`. */
+/* Task `index`, or that merge: merges are not parted. */
 static forward_range find_forward_range(const forward_job *job, int64_t index, bool merge) {
-  const ast_attention *s = job->s;
-  int64_t b = 0, last = s->B - 1; /* the last scene that has at most `index` tasks before it */
-  while (b < last) {
-    const int64_t middle = (b + last + 1) / 2;
-    if ((merge ? job->cuts[middle].first_merge : job->cuts[middle].first_task) <= index) b = middle;
-    else last = middle - 1;
-  }
+  const int64_t *first = merge ? job->first_merge : job->first_task, b = scene_at(first, job->s->B, index);
   const forward_cut *cut = job->cuts + b;
-  const int64_t keys = s->k_offsets[b + 1] - s->k_offsets[b], parts = merge ? 1 : cut->parts;
-  const int64_t local = index - (merge ? cut->first_merge : cut->first_task);
-  forward_range t = {.b = b, .h = local / (cut->chunks * parts), .part = local / cut->chunks % parts};
+  const int64_t parts = merge ? 1 : cut->parts, local = index - first[b];
+  forward_range t = {.cut = cut, .b = b, .h = local / (cut->chunks * parts), .part = local / cut->chunks % parts};
   t.first_query = local % cut->chunks * QUERIES;
-  t.rows = min64(QUERIES, s->q_offsets[b + 1] - s->q_offsets[b] - t.first_query);
+  t.rows = min64(QUERIES, cut->queries - t.first_query);
   t.first_key = t.part * cut->part_keys;
-  t.keys = min64(merge ? keys : cut->part_keys, keys - t.first_key);
-  while (t.shift < 62 && (int64_t)1 << t.shift < keys) t.shift++;
+  t.keys = min64(cut->part_keys, cut->keys - t.first_key);
+  t.shift = num_bits((uint64_t)max64(cut->keys - 1, 0));
   return t;
 }
 
 /* What `part` leaves of the task's queries. */
 static forward_state partial_of(const forward_job *job, const forward_range *t, int64_t part) {
-  const forward_cut *cut = job->cuts + t->b;
+  const forward_cut *cut = t->cut;
   const int64_t number = (t->h * cut->chunks + t->first_query / QUERIES) * cut->parts + part, rows = cut->partial_rows;
   float *out = job->partials + cut->first_partial + number * rows * (ROW + 2);
   return (forward_state){out, out + rows * ROW, out + rows * (ROW + 1)};
@@ -154,7 +153,7 @@ static forward_state partial_of(const forward_job *job, const forward_range *t, 
 /* out = gain o / l, maximum and sum of the task's queries */
 static void finish(const forward_job *job, const forward_range *t, const forward_state *state) {
   const ast_attention *s = job->s;
-  const int64_t H = s->H, D = s->D, q0 = s->q_offsets[t->b] + t->first_query;
+  const int64_t H = s->H, D = s->D, q0 = t->cut->q0 + t->first_query;
   const float gain = dropout_of(s, t->b, t->h).gain, unit = (float)((int64_t)1 << t->shift);
   for (int64_t i = 0; i < t->rows; i++) {
     const float l = state->sum[i] > 0 ? state->sum[i] : NAN, factor = gain / l;
@@ -169,7 +168,7 @@ static ast_status forward_task(int64_t index, void *context) {
   const forward_job *job = context;
   const ast_attention *s = job->s;
   const forward_range task = find_forward_range(job, index, false);
-  const int64_t H = s->H, D = s->D, h = task.h, rows = task.rows, q0 = s->q_offsets[task.b] + task.first_query;
+  const int64_t H = s->H, D = s->D, h = task.h, rows = task.rows, q0 = task.cut->q0 + task.first_query;
   if (task.keys == 0) {
     fill_rows(0, H * D, rows, D, job->out + (q0 * H + h) * D);
     fill_rows(-INFINITY, H, rows, 1, job->maximum + q0 * H + h);
@@ -178,17 +177,17 @@ static ast_status forward_task(int64_t index, void *context) {
   }
   forward_scratch *t = ast_scratch(sizeof *t);
   if (!t) return AST_NO_MEMORY;
-  const bool whole = job->cuts[task.b].parts == 1;
+  const bool whole = task.cut->parts == 1;
   const forward_state state = whole ? (forward_state){t->out, t->maximum, t->sum} : partial_of(job, &task, task.part);
   const dropout d = dropout_of(s, task.b, h);
-  const int64_t panels = (rows + LANES - 1) / LANES, share = (KEYS + panels - 1) / panels;
+  const int64_t panels = divide_up(rows, LANES), share = divide_up(KEYS, panels);
   for (int64_t p = 0; p < panels; p++)
     pack_panel(job->q + (q0 + p * LANES) * s->q_stride + h * D, s->q_stride, rows - p * LANES, D, s->scale,
                t->queries + p * LANES * D);
   fill_rows(0, 0, 1, panels * LANES, state.sum);
   fill_rows(-INFINITY, 0, 1, panels * LANES, state.maximum);
   for (int64_t k0 = 0; k0 < task.keys; k0 += KEYS) {
-    const int64_t n = min64(KEYS, task.keys - k0), row = s->k_offsets[task.b] + task.first_key + k0;
+    const int64_t n = min64(KEYS, task.keys - k0), row = task.cut->k0 + task.first_key + k0;
     const float *k = job->k + row * s->k_stride + h * D, *v = job->v + row * s->v_stride + h * D;
     copy_rows(k, s->k_stride, n, D, 1, t->keys);
     copy_rows(v, s->v_stride, n, D, 1, t->values);
@@ -208,9 +207,9 @@ static ast_status forward_task(int64_t index, void *context) {
 static ast_status merge_task(int64_t index, void *context) {
   const forward_job *job = context;
   const forward_range task = find_forward_range(job, index, true);
-  const int64_t D = job->s->D, parts = job->cuts[task.b].parts;
+  const int64_t D = job->s->D;
   const forward_state into = partial_of(job, &task, 0);
-  for (int64_t part = 1; part < parts; part++) {
+  for (int64_t part = 1; part < task.cut->parts; part++) {
     const forward_state from = partial_of(job, &task, part);
     float fade[QUERIES], weight[QUERIES];
     for (int64_t i = 0; i < task.rows; i += VW) {
@@ -235,21 +234,22 @@ static ast_status attention(const ast_attention *s, const float *restrict q, con
                             const float *restrict v, float *restrict out, float *restrict maximum,
                             float *restrict sum) {
   AST_SCRATCH_SCOPE;
-  forward_cut *cuts = ast_scratch((s->B + 1) * (int64_t)sizeof *cuts), next = {0};
-  if (!cuts) return AST_NO_MEMORY;
+  forward_cut *cuts = ast_scratch(s->B * (int64_t)sizeof *cuts);
+  int64_t *first_task = ast_scratch(2 * (s->B + 1) * (int64_t)sizeof *first_task), floats = 0;
+  if (!cuts || !first_task) return AST_NO_MEMORY;
+  int64_t *first_merge = first_task + s->B + 1;
+  first_task[0] = first_merge[0] = 0;
   for (int64_t b = 0; b < s->B; b++) {
-    forward_cut *cut = cuts + b;
-    *cut = cut_of(s, b);
-    cut->first_task = next.first_task, cut->first_merge = next.first_merge, cut->first_partial = next.first_partial;
-    next.first_task += s->H * cut->chunks * cut->parts;
-    if (cut->parts == 1) continue;
-    next.first_merge += s->H * cut->chunks;
-    next.first_partial += s->H * cut->chunks * cut->parts * cut->partial_rows * (ROW + 2);
+    cuts[b] = cut_of(s, b);
+    cuts[b].first_partial = floats;
+    const int64_t chunks = s->H * cuts[b].chunks, merges = cuts[b].parts > 1 ? chunks : 0;
+    first_task[b + 1] = first_task[b] + chunks * cuts[b].parts;
+    first_merge[b + 1] = first_merge[b] + merges;
+    floats += merges * cuts[b].parts * cuts[b].partial_rows * (ROW + 2);
   }
-  cuts[s->B] = next;
-  float *partials = ast_scratch(next.first_partial * (int64_t)sizeof *partials);
+  float *partials = ast_scratch(floats * (int64_t)sizeof *partials);
   if (!partials) return AST_NO_MEMORY;
-  forward_job job = {s, q, k, v, out, maximum, sum, cuts, partials};
-  const ast_status status = ast_parallel(next.first_task, forward_task, &job);
-  return status == AST_OK ? ast_parallel(next.first_merge, merge_task, &job) : status;
+  forward_job job = {s, q, k, v, out, maximum, sum, cuts, first_task, first_merge, partials};
+  const ast_status status = ast_parallel(first_task[s->B], forward_task, &job);
+  return status == AST_OK ? ast_parallel(first_merge[s->B], merge_task, &job) : status;
 }

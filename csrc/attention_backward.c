@@ -30,10 +30,14 @@ enum {
 _Static_assert(CHUNK % SQUARE == 0 && GROUP % (int)GEMM_ROWS == 0 && KEYS % (int)LANES == 0,
                "chunks hold whole squares, groups tiles");
 
+/* How a scene is cut. */
 typedef struct {
-  int64_t parts, part_rows; /* rows of a part: queries if there are more of them than keys, else keys */
-  int64_t first_task, first_partial,
-      first_peak; /* tasks, floats of the partial gradients and peaks before this scene */
+  int64_t q0, queries, k0, keys; /* its rows */
+  bool by_queries;               /* parts are of queries, of which there are more than keys; else of keys */
+  int64_t parts, part_rows;      /* rows of a part */
+  int64_t partial_size,
+      first_partial;         /* floats of a partial gradient: of dq, or of dk and dv; those before this scene */
+  int64_t peaks, first_peak; /* of a head: of all queries, once for each part of the keys; those before */
 } backward_cut;
 
 /* Of a query whose weights are nearly all of one key: that key of the scene, or -1 if it is in no block so far, and the
@@ -50,7 +54,8 @@ typedef struct {
   const ast_attention *s;
   const float *q, *k, *v, *out, *maximum, *sum, *dout;
   float *dq, *dk, *dv;
-  const backward_cut *cuts; /* [B+1] */
+  const backward_cut *cuts;  /* [B] */
+  const int64_t *first_task; /* [B+1] of each scene */
   float *partials;
   backward_peak *peaks; /* [parts by keys, queries] of each scene and head */
   bool any_peaks;
@@ -69,6 +74,7 @@ typedef struct {
 
 /* The scene, head, queries and keys of a task, and where its gradients go: rows [.][stride]. */
 typedef struct {
+  const backward_cut *cut;
   int64_t b, h, first_query, queries, first_key, keys;
   float *dq, *dk, *dv;
   int64_t dq_stride, dk_stride, dv_stride;
@@ -141,7 +147,7 @@ static void backward_group(backward_scratch *t, int64_t i, int64_t rows, int64_t
 static void load_queries(const backward_job *job, const backward_range *range, int64_t first, int64_t rows,
                          backward_scratch *t) {
   const ast_attention *s = job->s;
-  const int64_t H = s->H, D = s->D, h = range->h, q0 = s->q_offsets[range->b] + first;
+  const int64_t H = s->H, D = s->D, h = range->h, q0 = range->cut->q0 + first;
   const float *q = job->q + q0 * s->q_stride + h * D, *dout = job->dout + (q0 * H + h) * D,
               *out = job->out + (q0 * H + h) * D;
   copy_rows(q, s->q_stride, rows, D, s->scale, t->queries);
@@ -179,7 +185,7 @@ static void put_rows(const float *from, int64_t rows, int64_t D, float factor, b
 static void backward_block(const backward_job *job, const backward_range *range, int64_t first, int64_t rows,
                            int64_t k0, int64_t n, const dropout *d, backward_scratch *t) {
   const ast_attention *s = job->s;
-  const int64_t D = s->D, row = s->k_offsets[range->b] + k0, whole = round_up(n, ROW_STEP);
+  const int64_t D = s->D, row = range->cut->k0 + k0, whole = round_up(n, ROW_STEP);
   const float *k = job->k + row * s->k_stride + range->h * D, *v = job->v + row * s->v_stride + range->h * D;
   copy_rows(k, s->k_stride, n, D, 1, t->keys);
   for (int64_t c = 0; c < n; c += LANES) {
@@ -189,7 +195,7 @@ static void backward_block(const backward_job *job, const backward_range *range,
   float *dk = range->dk + (k0 - range->first_key) * range->dk_stride,
         *dv = range->dv + (k0 - range->first_key) * range->dv_stride;
   const int64_t left = range->first_key + range->keys - k0 - KEYS;
-  const int64_t groups = (rows + GROUP - 1) / GROUP, share = (KEYS + groups - 1) / groups;
+  const int64_t groups = divide_up(rows, GROUP), share = divide_up(KEYS, groups);
   for (int64_t i0 = 0; i0 < rows; i0 += SQUARE) {
     const int64_t width = min64(SQUARE, rows - i0);
     for (int64_t i = i0; i < i0 + width; i += GROUP) {
@@ -200,34 +206,27 @@ static void backward_block(const backward_job *job, const backward_range *range,
       prefetch_rows(dv + at * range->dv_stride, range->dv_stride, min64(share, n - at), D, 1);
       backward_group(t, i, min64(GROUP, i0 + width - i), first + i, k0, n, D, d);
     }
-    columns_product(whole, D, width, t->weights, t->dout + i0 * ROW, t->dv, (update){.set = i0 == 0});
-    columns_product(whole, D, width, t->dscores, t->queries + i0 * ROW, t->dk, (update){.set = i0 == 0});
-    rows_product(round_up(width, ROW_STEP), D, n, t->dscores, t->keys, t->dq + i0 * ROW,
-                 (update){.set = k0 == range->first_key});
+    gemm(whole, D, width, (gemm_a){t->weights, 1, ROW}, t->dout + i0 * ROW, ROW, t->dv, ROW, i0 > 0);
+    gemm(whole, D, width, (gemm_a){t->dscores, 1, ROW}, t->queries + i0 * ROW, ROW, t->dk, ROW, i0 > 0);
+    gemm(round_up(width, ROW_STEP), D, n, (gemm_a){t->dscores, ROW, 1}, t->keys, ROW, t->dq + i0 * ROW, ROW,
+         k0 > range->first_key);
   }
   put_rows(t->dk, n, D, 1, first > range->first_query, dk, range->dk_stride);
   put_rows(t->dv, n, D, d->gain, first > range->first_query, dv, range->dv_stride);
 }
 
 static backward_cut cut_backward(const ast_attention *s, int64_t b) {
-  const int64_t queries = s->q_offsets[b + 1] - s->q_offsets[b], keys = s->k_offsets[b + 1] - s->k_offsets[b];
-  const int64_t longer = max64(queries, keys), step = queries > keys ? CHUNK : KEYS;
+  backward_cut cut = {.q0 = s->q_offsets[b], .k0 = s->k_offsets[b]};
+  cut.queries = s->q_offsets[b + 1] - cut.q0;
+  cut.keys = s->k_offsets[b + 1] - cut.k0;
+  cut.by_queries = cut.queries > cut.keys;
+  const int64_t longer = max64(cut.queries, cut.keys);
   const int64_t wanted = max64(min64(BACKWARD_TASKS / max64(s->H, 1), longer / BACKWARD_PART), 1);
-  backward_cut cut = {.part_rows = round_up((longer + wanted - 1) / wanted, step)};
-  cut.parts = longer ? (longer + cut.part_rows - 1) / cut.part_rows : 1;
+  cut.part_rows = round_up(divide_up(longer, wanted), cut.by_queries ? CHUNK : KEYS);
+  cut.parts = longer ? divide_up(longer, cut.part_rows) : 1;
+  cut.partial_size = s->D * (cut.by_queries ? 2 * cut.keys : cut.queries);
+  if (cut.keys) cut.peaks = cut.by_queries ? cut.queries : cut.parts * cut.queries;
   return cut;
-}
-
-/* Floats of one partial gradient of the scene: of dq, or of dk and dv. */
-static int64_t partial_size(const ast_attention *s, int64_t b) {
-  const int64_t queries = s->q_offsets[b + 1] - s->q_offsets[b], keys = s->k_offsets[b + 1] - s->k_offsets[b];
-  return s->D * (queries > keys ? 2 * keys : queries);
-}
-
-/* Peaks of a scene and head: of all its queries, once for each part of its keys. */
-static int64_t num_peaks(const ast_attention *s, int64_t b, int64_t parts) {
-  const int64_t queries = s->q_offsets[b + 1] - s->q_offsets[b], keys = s->k_offsets[b + 1] - s->k_offsets[b];
-  return queries > keys ? queries : parts * queries;
 }
 
 /* Leaves the peaks of the queries first..first+rows of the scene. */
@@ -244,20 +243,20 @@ static void put_peaks(backward_job *job, const backward_range *range, int64_t fi
 }
 
 /* Takes off the dS of each peak what its row sums to. */
-static void settle_peaks(const backward_job *job, int64_t b, int64_t h) {
+static void settle_peaks(const backward_job *job, const backward_cut *cut, int64_t h) {
   const ast_attention *s = job->s;
-  const int64_t D = s->D, q0 = s->q_offsets[b], queries = s->q_offsets[b + 1] - q0, k0 = s->k_offsets[b];
-  const int64_t num = s->k_offsets[b + 1] == k0 ? 0 : num_peaks(s, b, job->cuts[b].parts);
-  const backward_peak *peaks = job->peaks + job->cuts[b].first_peak + h * num;
-  for (int64_t i = 0; i < min64(queries, num); i++) {
+  const int64_t D = s->D;
+  const backward_peak *peaks = job->peaks + cut->first_peak + h * cut->peaks;
+  for (int64_t i = 0; i < min64(cut->queries, cut->peaks); i++) {
     backward_peak all = {-1, 0};
-    for (int64_t at = i; at < num; at += queries) {
+    for (int64_t at = i; at < cut->peaks; at += cut->queries) {
       all.sum += peaks[at].sum;
       if (all.key < 0) all.key = peaks[at].key;
     }
     if (all.key < 0 || all.sum == 0 || !isfinite(all.sum)) continue;
-    const float *q = job->q + (q0 + i) * s->q_stride + h * D, *k = job->k + (k0 + all.key) * s->k_stride + h * D;
-    float *dq = job->dq + (q0 + i) * s->dq_stride + h * D, *dk = job->dk + (k0 + all.key) * s->dk_stride + h * D;
+    const int64_t query = cut->q0 + i, key = cut->k0 + all.key;
+    const float *q = job->q + query * s->q_stride + h * D, *k = job->k + key * s->k_stride + h * D;
+    float *dq = job->dq + query * s->dq_stride + h * D, *dk = job->dk + key * s->dk_stride + h * D;
     const float factor = s->scale * all.sum;
     for (int64_t e = 0; e < D; e += VW) {
       vstore(dq + e, vload(dq + e) - factor * vload(k + e));
@@ -266,33 +265,22 @@ static void settle_peaks(const backward_job *job, int64_t b, int64_t h) {
   }
 }
 
-static int64_t scene_of(const backward_job *job, int64_t task) {
-  int64_t b = 0, last = job->s->B - 1; /* the last scene that has at most `task` tasks before it */
-  while (b < last) {
-    const int64_t middle = (b + last + 1) / 2;
-    if (job->cuts[middle].first_task <= task) b = middle;
-    else last = middle - 1;
-  }
-  return b;
-}
-
 static backward_range find_range(const backward_job *job, int64_t index) {
   const ast_attention *s = job->s;
-  const int64_t b = scene_of(job, index), D = s->D, q0 = s->q_offsets[b], k0 = s->k_offsets[b];
+  const int64_t b = scene_at(job->first_task, s->B, index), D = s->D;
   const backward_cut *cut = job->cuts + b;
-  const int64_t h = (index - cut->first_task) / cut->parts, part = (index - cut->first_task) % cut->parts;
-  backward_range r = {.b = b, .h = h, .queries = s->q_offsets[b + 1] - q0, .keys = s->k_offsets[b + 1] - k0};
-  const bool by_queries = r.queries > r.keys;
+  const int64_t h = (index - job->first_task[b]) / cut->parts, part = (index - job->first_task[b]) % cut->parts;
+  backward_range r = {.cut = cut, .b = b, .h = h, .queries = cut->queries, .keys = cut->keys};
   const int64_t before = part * cut->part_rows;
-  float *partial = job->partials + cut->first_partial + (h * (cut->parts - 1) + part - 1) * partial_size(s, b);
-  if (by_queries) r.first_query = before, r.queries = min64(cut->part_rows, r.queries - before);
+  float *partial = job->partials + cut->first_partial + (h * (cut->parts - 1) + part - 1) * cut->partial_size;
+  if (cut->by_queries) r.first_query = before, r.queries = min64(cut->part_rows, r.queries - before);
   else r.first_key = before, r.keys = min64(cut->part_rows, r.keys - before);
-  r.first_peak = cut->first_peak + h * num_peaks(s, b, cut->parts) + (by_queries ? 0 : part * r.queries);
-  r.dq = job->dq + (q0 + r.first_query) * s->dq_stride + h * D, r.dq_stride = s->dq_stride;
-  r.dk = job->dk + (k0 + r.first_key) * s->dk_stride + h * D, r.dk_stride = s->dk_stride;
-  r.dv = job->dv + (k0 + r.first_key) * s->dv_stride + h * D, r.dv_stride = s->dv_stride;
-  if (part > 0 && by_queries) r.dk = partial, r.dv = partial + r.keys * D, r.dk_stride = r.dv_stride = D;
-  if (part > 0 && !by_queries) r.dq = partial, r.dq_stride = D;
+  r.first_peak = cut->first_peak + h * cut->peaks + (cut->by_queries ? 0 : part * r.queries);
+  r.dq = job->dq + (cut->q0 + r.first_query) * s->dq_stride + h * D, r.dq_stride = s->dq_stride;
+  r.dk = job->dk + (cut->k0 + r.first_key) * s->dk_stride + h * D, r.dk_stride = s->dk_stride;
+  r.dv = job->dv + (cut->k0 + r.first_key) * s->dv_stride + h * D, r.dv_stride = s->dv_stride;
+  if (part > 0 && cut->by_queries) r.dk = partial, r.dv = partial + r.keys * D, r.dk_stride = r.dv_stride = D;
+  if (part > 0 && !cut->by_queries) r.dq = partial, r.dq_stride = D;
   return r;
 }
 
@@ -321,20 +309,19 @@ static ast_status backward_task(int64_t index, void *context) {
 static ast_status finish_task(int64_t index, void *context) {
   const backward_job *job = context;
   const ast_attention *s = job->s;
-  const int64_t H = s->H, D = s->D, b = index / H, h = index % H, size = partial_size(s, b), parts = job->cuts[b].parts;
-  const int64_t q0 = s->q_offsets[b], queries = s->q_offsets[b + 1] - q0, k0 = s->k_offsets[b],
-                keys = s->k_offsets[b + 1] - k0;
-  for (int64_t part = 1; part < parts; part++) {
-    const float *partial = job->partials + job->cuts[b].first_partial + (h * (parts - 1) + part - 1) * size;
-    for (int64_t i = 0; i < size / D; i++) {
-      float *to = queries <= keys ? job->dq + (q0 + i) * s->dq_stride
-                  : i < keys      ? job->dk + (k0 + i) * s->dk_stride
-                                  : job->dv + (k0 + i - keys) * s->dv_stride;
-      for (int64_t e = h * D; e < h * D + D; e += VW)
-        vstore(to + e, vload(to + e) + vload(partial + i * D + e - h * D));
+  const int64_t D = s->D, h = index % s->H;
+  const backward_cut *cut = job->cuts + index / s->H;
+  for (int64_t part = 1; part < cut->parts; part++) {
+    const float *partial = job->partials + cut->first_partial + (h * (cut->parts - 1) + part - 1) * cut->partial_size;
+    for (int64_t i = 0; i < cut->partial_size / D; i++, partial += D) {
+      float *to = !cut->by_queries ? job->dq + (cut->q0 + i) * s->dq_stride
+                  : i < cut->keys  ? job->dk + (cut->k0 + i) * s->dk_stride
+                                   : job->dv + (cut->k0 + i - cut->keys) * s->dv_stride;
+      to += h * D;
+      for (int64_t e = 0; e < D; e += VW) vstore(to + e, vload(to + e) + vload(partial + e));
     }
   }
-  if (job->any_peaks) settle_peaks(job, b, h);
+  if (job->any_peaks) settle_peaks(job, cut, h);
   return AST_OK;
 }
 
@@ -343,21 +330,22 @@ static ast_status attention_backward(const ast_attention *s, const float *restri
                                      const float *restrict sum, const float *restrict dout, float *restrict dq,
                                      float *restrict dk, float *restrict dv) {
   AST_SCRATCH_SCOPE;
-  backward_cut *cuts = ast_scratch((s->B + 1) * (int64_t)sizeof *cuts), next = {0};
-  if (!cuts) return AST_NO_MEMORY;
+  backward_cut *cuts = ast_scratch(s->B * (int64_t)sizeof *cuts);
+  int64_t *first_task = ast_scratch((s->B + 1) * (int64_t)sizeof *first_task), floats = 0, num_peaks = 0;
+  if (!cuts || !first_task) return AST_NO_MEMORY;
+  first_task[0] = 0;
   for (int64_t b = 0; b < s->B; b++) {
     cuts[b] = cut_backward(s, b);
-    cuts[b].first_task = next.first_task, cuts[b].first_partial = next.first_partial,
-    cuts[b].first_peak = next.first_peak;
-    next.first_task += s->H * cuts[b].parts;
-    next.first_partial += s->H * (cuts[b].parts - 1) * partial_size(s, b);
-    next.first_peak += s->H * num_peaks(s, b, cuts[b].parts);
+    cuts[b].first_partial = floats;
+    cuts[b].first_peak = num_peaks;
+    first_task[b + 1] = first_task[b] + s->H * cuts[b].parts;
+    floats += s->H * (cuts[b].parts - 1) * cuts[b].partial_size;
+    num_peaks += s->H * cuts[b].peaks;
   }
-  backward_peak *peaks = ast_scratch(next.first_peak * (int64_t)sizeof *peaks);
-  float *partials = ast_scratch(next.first_partial * (int64_t)sizeof *partials);
+  backward_peak *peaks = ast_scratch(num_peaks * (int64_t)sizeof *peaks);
+  float *partials = ast_scratch(floats * (int64_t)sizeof *partials);
   if (!peaks || !partials) return AST_NO_MEMORY;
-  backward_job job = {s, q, k, v, out, maximum, sum, dout, dq, dk, dv, cuts, partials, peaks, false};
-  const ast_status status = ast_parallel(next.first_task, backward_task, &job);
-  return status == AST_OK && (next.first_partial || job.any_peaks) ? ast_parallel(s->B * s->H, finish_task, &job)
-                                                                   : status;
+  backward_job job = {s, q, k, v, out, maximum, sum, dout, dq, dk, dv, cuts, first_task, partials, peaks, false};
+  const ast_status status = ast_parallel(first_task[s->B], backward_task, &job);
+  return status == AST_OK && (floats || job.any_peaks) ? ast_parallel(s->B * s->H, finish_task, &job) : status;
 }

@@ -87,55 +87,33 @@ static void scores_product(int64_t n, int64_t D, const float *a, const float *b,
     EACH_TILE(n, next_chain, min64(D - d, SCORE_DEPTH), a + d, b + d * LANES, x, D > d + SCORE_DEPTH ? NULL : largest)
 }
 
-/* What becomes of c as a product comes to it: c = product, c += product, or row i of c = factor[i] c + product. */
-typedef struct {
-  bool set;
-  const float *factor; /* or NULL */
-} update;
-
-/* c[i][j] is updated by sum_k a_ik b[k][j], rows of b and c ROW apart */
-AST_INLINE void product_tile(const int rows, int64_t i, const int vectors, int64_t K, const float *a,
-                             const int64_t a_row, const int64_t a_column, const float *b, float *c, update how) {
+/* c[i][j] = factor[i] c[i][j] + sum_k a_ki b[k][j], or the sum alone without a factor; rows ROW apart */
+AST_INLINE void faded_tile(const int rows, const int vectors, int64_t i, int64_t K, const float *a, const float *b,
+                           float *c, const float *factor) {
   vf sum[GEMM_ROWS][2];
-  gemm_product(rows, vectors, K, (gemm_a){a + i * a_row, a_row, a_column}, b, ROW, sum);
+  gemm_product(rows, vectors, K, (gemm_a){a + i, 1, ROW}, b, ROW, sum);
   c += i * ROW;
-  if (how.set) {
-    TILE_EACH(r, j) vstore(c + r * ROW + j * VW, sum[r][j]);
-  } else if (how.factor) {
-    TILE_EACH(r, j) {
-      float *to = c + r * ROW + j * VW;
-      vstore(to, how.factor[i + r] * vload(to) + sum[r][j]);
-    }
-  } else {
-    TILE_EACH(r, j) {
-      float *to = c + r * ROW + j * VW;
-      vstore(to, vload(to) + sum[r][j]);
-    }
-  }
+  if (factor) TILE_EACH(r, j) sum[r][j] += factor[i + r] * vload(c + r * ROW + j * VW);
+  TILE_EACH(r, j) vstore(c + r * ROW + j * VW, sum[r][j]);
 }
 
-#define PRODUCT_TILE(name, vectors, a_row, a_column)                                                                 \
-  AST_INLINE void name(const int rows, int64_t i, int64_t K, const float *a, const float *b, float *c, update how) { \
-    product_tile(rows, i, vectors, K, a, a_row, a_column, b, c, how);                                                \
-  }                                                                                                                  \
-  TILE_FUNCTIONS(name, (int64_t i, int64_t K, const float *a, const float *b, float *c, update how), i, K, a, b, c, how)
-PRODUCT_TILE(rows_tile, 2, ROW, 1)
-PRODUCT_TILE(rows_tile_narrow, 1, ROW, 1)
-PRODUCT_TILE(columns_tile, 2, 1, ROW)
-PRODUCT_TILE(columns_tile_narrow, 1, 1, ROW)
-#undef PRODUCT_TILE
+#define FADED_TILE(name, vectors)                                                                                      \
+  AST_INLINE void name(const int rows, int64_t i, int64_t K, const float *a, const float *b, float *c,                 \
+                       const float *factor) {                                                                          \
+    faded_tile(rows, vectors, i, K, a, b, c, factor);                                                                  \
+  }                                                                                                                    \
+  TILE_FUNCTIONS(name, (int64_t i, int64_t K, const float *a, const float *b, float *c, const float *factor), i, K, a, \
+                 b, c, factor)
+FADED_TILE(wide_tile, 2)
+FADED_TILE(narrow_tile, 1)
+#undef FADED_TILE
 
-/* C [M,N] is updated by A B with A row by row, and with A given as its transpose; M a multiple of ROW_STEP, N one of
- * VW. */
-static void rows_product(int64_t M, int64_t N, int64_t K, const float *a, const float *b, float *c, update how) {
+/* The same for C [M,N]; M a multiple of ROW_STEP, N one of VW. */
+static void faded_product(int64_t M, int64_t N, int64_t K, const float *a, const float *b, float *c,
+                          const float *factor) {
   int64_t j = 0;
-  for (; j + 2 * VW <= N; j += 2 * VW) EACH_TILE(M, rows_tile, K, a, b + j, c + j, how)
-  if (j < N) EACH_TILE(M, rows_tile_narrow, K, a, b + j, c + j, how)
-}
-static void columns_product(int64_t M, int64_t N, int64_t K, const float *a, const float *b, float *c, update how) {
-  int64_t j = 0;
-  for (; j + 2 * VW <= N; j += 2 * VW) EACH_TILE(M, columns_tile, K, a, b + j, c + j, how)
-  if (j < N) EACH_TILE(M, columns_tile_narrow, K, a, b + j, c + j, how)
+  for (; j + 2 * VW <= N; j += 2 * VW) EACH_TILE(M, wide_tile, K, a, b + j, c + j, factor)
+  if (j < N) EACH_TILE(M, narrow_tile, K, a, b + j, c + j, factor)
 }
 
 /* ---- rows and panels ---- */

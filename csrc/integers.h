@@ -1,4 +1,4 @@
-/* Integers: the smaller and the larger, division and multiples rounded up, and the search in sorted numbers. */
+/* Integers: the smaller and the larger, division and multiples rounded up, bits, and the search in sorted numbers. */
 #ifndef AST_INTEGERS_H
 #define AST_INTEGERS_H
 
@@ -10,6 +10,9 @@ static inline int64_t max64(int64_t a, int64_t b) { return a > b ? a : b; }
 /* How many parts of size `by` > 0 hold n >= 0, and what they hold. */
 static inline int64_t divide_up(int64_t n, int64_t by) { return (n + by - 1) / by; }
 static inline int64_t round_up(int64_t n, int64_t to) { return divide_up(n, to) * to; }
+
+/* The number of bits of n. */
+static inline int num_bits(uint64_t n) { return n ? 64 - __builtin_clzll(n) : 0; }
 
 /* The first i in [begin, end) with values[i] >= bound, or end; values never fall. */
 static inline int64_t lower_bound(const int64_t *values, int64_t begin, int64_t end, int64_t bound) {

@@ -15,13 +15,6 @@ enum { OCTREE_CHUNK = 1 << 13, OCTREE_TILE = 64 };
 
 static int64_t octree_chunks(int64_t n) { return divide_up(n, OCTREE_CHUNK); }
 
-/* The number of bits of n. */
-static int octree_bits(uint64_t n) {
-  int bits = 0;
-  for (; n; n >>= 1) bits++;
-  return bits;
-}
-
 /* ---- Morton keys ---- */
 
 /* Bit i of x < 2^21 goes to bit 3i. */
@@ -188,9 +181,7 @@ static ast_status octree_sort_task(int64_t b, void *context) {
   if (n == 0) return AST_OK;
   uint64_t *keys = job->keys + begin, *other = job->other + begin, differ = 0;
   for (int64_t i = 0; i < n; i++) differ |= keys[i] ^ keys[0];
-  int low = 0;
-  while (differ && !(differ >> low & 1)) low++;
-  const int high = octree_bits(differ);
+  const int low = differ ? __builtin_ctzll(differ) : 0, high = num_bits(differ);
   if (job->packed) {
     for (int64_t i = 0; i < n; i++) keys[i] = keys[i] << job->index_bits | (uint64_t)i;
     return octree_radix_sort(keys, NULL, other, NULL, n, low + job->index_bits, high + job->index_bits, true);
@@ -306,7 +297,7 @@ static ast_status octree_build(const float *restrict positions, const int64_t *r
   if (N == 0) return AST_OK;
   int64_t largest = 0;
   for (int64_t b = 0; b < B; b++) largest = max64(largest, offsets[b + 1] - offsets[b]);
-  const int index_bits = octree_bits((uint64_t)(largest - 1));
+  const int index_bits = num_bits((uint64_t)(largest - 1));
   const bool packed = 3 * depth + index_bits <= 64;
   const int64_t bytes = (packed ? 1 : 2) * N * (int64_t)sizeof(uint64_t);
   octree_sort_job sort = {offsets, N, index_bits, packed, ast_scratch(bytes), ast_scratch(bytes)};
