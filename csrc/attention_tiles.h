@@ -28,37 +28,14 @@ enum {
 
 /* ---- register tiles ---- */
 
-/* Rows of the next tile when `rest`, a multiple of ROW_STEP, are left: no tile of 4 follows one of 12. */
-AST_INLINE int64_t next_tile(int64_t rest) {
-  if (GEMM_ROWS == 12) return rest == 16 ? 8 : rest >= 12 ? 12 : rest >= 8 ? 8 : 4;
-  if (GEMM_ROWS == 6) return rest >= 6 && rest != 8 ? 6 : 4;
-  return 4;
-}
-
-/* Functions of their own for the tiles of GEMM_ROWS, 8 and 4 rows of `f`: inlined, their loops would compete for
- * registers. */
-#define TILE_FUNCTIONS(f, parameters, ...)                                                          \
-  static __attribute__((noinline)) void f##_whole parameters { f(GEMM_ROWS, __VA_ARGS__); }         \
-  static __attribute__((noinline)) void f##_8 parameters { f(GEMM_ROWS < 8 ? 4 : 8, __VA_ARGS__); } \
-  static __attribute__((noinline)) void f##_4 parameters { f(4, __VA_ARGS__); }
-
-/* Calls them for the tiles i..i+rows of all n rows. */
-#define EACH_TILE(n, f, ...)                                    \
-  for (int64_t tile_ = 0, rows_; tile_ < (n); tile_ += rows_) { \
-    rows_ = next_tile((n) - tile_);                             \
-    if (rows_ == GEMM_ROWS) f##_whole(tile_, __VA_ARGS__);      \
-    else if (rows_ == 8) f##_8(tile_, __VA_ARGS__);             \
-    else f##_4(tile_, __VA_ARGS__);                             \
-  }
-
 /* x[row][lane] = (x[row][lane] +) a[row] . b[lane] over D channels for a tile of rows; raises largest[2], unless NULL,
  * to the maximum of x. */
-AST_INLINE void chain_tile(const int rows, const bool add, int64_t i, int64_t D, const float *a, const float *b,
-                           float *x, vf *largest) {
+AST_INLINE void chain_tile(const int rows, const bool add, int64_t D, const float *a, const float *b, float *x,
+                           vf *largest) {
   vf sum[GEMM_ROWS][2];
-  gemm_product(rows, 2, D, (gemm_a){a + i * ROW, ROW, 1}, b, LANES, sum);
+  gemm_product(rows, 2, D, (gemm_a){a, ROW, 1}, b, LANES, sum);
   EACH(rows, r) EACH(2, j) {
-    float *to = x + (i + r) * ROW + j * VW;
+    float *to = x + r * ROW + j * VW;
     if (add) sum[r][j] += vload(to);
     vstore(to, sum[r][j]);
   }
@@ -69,51 +46,45 @@ AST_INLINE void chain_tile(const int rows, const bool add, int64_t i, int64_t D,
     largest[j] = m;
   }
 }
-#define CHAIN_TILE(name, add)                                                                                         \
-  AST_INLINE void name(const int rows, int64_t i, int64_t D, const float *a, const float *b, float *x, vf *largest) { \
-    chain_tile(rows, add, i, D, a, b, x, largest);                                                                    \
-  }                                                                                                                   \
-  TILE_FUNCTIONS(name, (int64_t i, int64_t D, const float *a, const float *b, float *x, vf *largest), i, D, a, b, x,  \
-                 largest)
-CHAIN_TILE(first_chain, false)
-CHAIN_TILE(next_chain, true)
+
+AST_INLINE void chain_strip(int64_t n, const bool add, int64_t D, const float *a, const float *b, float *x,
+                            vf *largest) {
+#define CHAIN_TILE(rows) chain_tile(rows, add, D, a + i * ROW, b, x + i * ROW, largest)
+  EACH_TILE_OF_ROWS(i, n, CHAIN_TILE);
 #undef CHAIN_TILE
+}
 
 /* x[row][lane] = a[row] . b[lane] for n rows, chain after chain; raises largest[2], unless NULL, to the maximum of x.
  */
 static void scores_product(int64_t n, int64_t D, const float *a, const float *b, float *x, vf *largest) {
-  EACH_TILE(n, first_chain, min64(D, SCORE_DEPTH), a, b, x, D > SCORE_DEPTH ? NULL : largest)
+  chain_strip(n, false, min64(D, SCORE_DEPTH), a, b, x, D > SCORE_DEPTH ? NULL : largest);
   for (int64_t d = SCORE_DEPTH; d < D; d += SCORE_DEPTH)
-    EACH_TILE(n, next_chain, min64(D - d, SCORE_DEPTH), a + d, b + d * LANES, x, D > d + SCORE_DEPTH ? NULL : largest)
+    chain_strip(n, true, min64(D - d, SCORE_DEPTH), a + d, b + d * LANES, x, D > d + SCORE_DEPTH ? NULL : largest);
 }
 
 /* c[i][j] = factor[i] c[i][j] + sum_k a_ki b[k][j], or the sum alone without a factor; rows ROW apart */
-AST_INLINE void faded_tile(const int rows, const int vectors, int64_t i, int64_t K, const float *a, const float *b,
-                           float *c, const float *factor) {
+AST_INLINE void faded_tile(const int rows, const int vectors, int64_t K, const float *a, const float *b, float *c,
+                           const float *factor) {
   vf sum[GEMM_ROWS][2];
-  gemm_product(rows, vectors, K, (gemm_a){a + i, 1, ROW}, b, ROW, sum);
-  c += i * ROW;
-  if (factor) TILE_EACH(r, j) sum[r][j] += factor[i + r] * vload(c + r * ROW + j * VW);
-  TILE_EACH(r, j) vstore(c + r * ROW + j * VW, sum[r][j]);
+  gemm_product(rows, vectors, K, (gemm_a){a, 1, ROW}, b, ROW, sum);
+  if (factor) TILE_EACH(i, j) sum[i][j] += factor[i] * vload(c + i * ROW + j * VW);
+  TILE_EACH(i, j) vstore(c + i * ROW + j * VW, sum[i][j]);
 }
 
-#define FADED_TILE(name, vectors)                                                                                      \
-  AST_INLINE void name(const int rows, int64_t i, int64_t K, const float *a, const float *b, float *c,                 \
-                       const float *factor) {                                                                          \
-    faded_tile(rows, vectors, i, K, a, b, c, factor);                                                                  \
-  }                                                                                                                    \
-  TILE_FUNCTIONS(name, (int64_t i, int64_t K, const float *a, const float *b, float *c, const float *factor), i, K, a, \
-                 b, c, factor)
-FADED_TILE(wide_tile, 2)
-FADED_TILE(narrow_tile, 1)
+AST_INLINE void faded_strip(const int vectors, int64_t M, int64_t K, const float *a, const float *b, float *c,
+                            const float *factor) {
+#define FADED_TILE(rows) faded_tile(rows, vectors, K, a + i, b, c + i * ROW, factor ? factor + i : NULL)
+  EACH_TILE_OF_ROWS(i, M, FADED_TILE);
 #undef FADED_TILE
+}
 
-/* The same for C [M,N]; M a multiple of ROW_STEP, N one of VW. */
+/* The same for C [M,N], N a multiple of VW. */
 static void faded_product(int64_t M, int64_t N, int64_t K, const float *a, const float *b, float *c,
                           const float *factor) {
-  int64_t j = 0;
-  for (; j + 2 * VW <= N; j += 2 * VW) EACH_TILE(M, wide_tile, K, a, b + j, c + j, factor)
-  if (j < N) EACH_TILE(M, narrow_tile, K, a, b + j, c + j, factor)
+  for (int64_t j = 0; j < N; j += GEMM_COLUMNS) {
+    if (N - j >= GEMM_COLUMNS) faded_strip(2, M, K, a, b + j, c + j, factor);
+    else faded_strip(1, M, K, a, b + j, c + j, factor);
+  }
 }
 
 /* ---- rows and panels ---- */
