@@ -140,6 +140,11 @@ static ast_status message_backward_task(int64_t index, void *context) {
   return AST_OK;
 }
 
+/* forward: z += P[sender] + Q[receiver] */
+AST_INLINE void message_add_row(int64_t F, const float *dz, float *to) {
+  for (int64_t c = 0; c < F; c += VW) vstore_upto(to + c, vload_upto(to + c, F - c) + vload(dz + c), F - c);
+}
+
 /* dP of the senders of a part; the first round clears them before. */
 static void message_add_to_senders(const message_backward_job *job, int64_t part) {
   const ast_message *step = job->w.step;
@@ -154,41 +159,26 @@ static void message_add_to_senders(const message_backward_job *job, int64_t part
         __builtin_prefetch(job->dz + ahead * job->w.row + c);
         __builtin_prefetch(job->out->of_senders + senders[ahead] * F + c, 1);
       }
-      const float *dz = job->dz + job->by_part[i] * job->w.row;
-      float *dP = job->out->of_senders + senders[job->by_part[i]] * F;
-      /* forward: z += P[sender] */
-      for (int64_t c = 0; c < F; c += VW) vstore_upto(dP + c, vload_upto(dP + c, F - c) + vload(dz + c), F - c);
+      const int32_t m = job->by_part[i];
+      message_add_row(F, job->dz + m * job->w.row, job->out->of_senders + senders[m] * F);
     }
   }
 }
 
-/* The first edge from m on that is not of the same receiver as the one before it. */
-static int64_t message_next_receiver(const ast_message *step, int64_t m) {
-  return m == 0 ? 0 : step->receiver_offsets[step->receivers[m - 1] + 1];
-}
-
-/* dQ of the receivers whose first edge in this round is in a part of it. A row is cleared before its first edge of all,
- * together with those between it and the row before. */
+/* dQ of the receivers whose first edge is in a part of this round, in the last part of all of those behind it, too, and
+ * in the first part of that whose edges the round before has begun. */
 static void message_add_to_receivers(const message_backward_job *job, int64_t part) {
   const ast_message *step = job->w.step;
-  const int64_t F = step->F, edges = job->end - job->begin;
-  int64_t begin = job->begin + part * edges / PARTS, end = job->begin + (part + 1) * edges / PARTS;
-  if (part) begin = message_next_receiver(step, begin);
-  if (part + 1 < PARTS) end = message_next_receiver(step, end);
-  for (int64_t m = begin; m < min64(end, job->end); m++) {
-    const int64_t r = step->receivers[m];
-    const float *dz = job->dz + (m - job->begin) * job->w.row;
+  const int64_t F = step->F, edges = job->end - job->begin, *offsets = step->receiver_offsets;
+  int64_t r = lower_bound(offsets, 0, step->R, job->begin + part * edges / PARTS);
+  int64_t end = lower_bound(offsets, r, step->R, job->begin + (part + 1) * edges / PARTS);
+  if (part == 0 && job->begin) r--;
+  if (part + 1 == PARTS && job->end == step->M) end = step->R;
+  for (; r < end; r++) {
     float *dQ = job->out->of_receivers + r * F;
-    if (m == step->receiver_offsets[r]) {
-      const int64_t before = m ? step->receivers[m - 1] + 1 : 0;
-      memset(job->out->of_receivers + before * F, 0, (size_t)((r + 1 - before) * F) * sizeof *dQ);
-    }
-    /* forward: z += Q[receiver] */
-    for (int64_t c = 0; c < F; c += VW) vstore_upto(dQ + c, vload_upto(dQ + c, F - c) + vload(dz + c), F - c);
-  }
-  if (end == step->M && part + 1 == PARTS) { /* receivers behind the last edge */
-    const int64_t before = step->M ? step->receivers[step->M - 1] + 1 : 0;
-    memset(job->out->of_receivers + before * F, 0, (size_t)((step->R - before) * F) * sizeof(float));
+    if (offsets[r] >= job->begin) memset(dQ, 0, (size_t)F * sizeof *dQ);
+    for (int64_t m = max64(offsets[r], job->begin); m < min64(offsets[r + 1], job->end); m++)
+      message_add_row(F, job->dz + (m - job->begin) * job->w.row, dQ);
   }
 }
 
