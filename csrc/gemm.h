@@ -87,16 +87,16 @@ AST_INLINE void gemm_sums(const int rows, const int vectors, int64_t K, gemm_a a
 #define TILE_EACH(i, v) \
   _Pragma("GCC unroll 12") for (int i = 0; i < rows; i++) _Pragma("GCC unroll 2") for (int v = 0; v < vectors; v++)
 
-/* Cuts n rows into register tiles: calls tile(rows) for the rows i, i + 1, ... with a constant number of them. The last
- * 16 are 8 and 8 rather than 12 and 4, the last 8 are 4 and 4 rather than 6 and 2. */
-#define EACH_TILE_OF_ROWS(i, n, tile)                                          \
-  do {                                                                         \
-    int64_t i = 0;                                                             \
-    TILES_OF_ROWS(i, (n) - i == GEMM_ROWS * 4 / 3 ? 0 : (n), GEMM_ROWS, tile); \
-    if (GEMM_ROWS > 8) TILES_OF_ROWS(i, n, 8, tile);                           \
-    TILES_OF_ROWS(i, n, 4, tile);                                              \
-    TILES_OF_ROWS(i, n, 2, tile);                                              \
-    TILES_OF_ROWS(i, n, 1, tile);                                              \
+/* Cuts n rows into register tiles: calls tile(rows) for the rows i, i + 1, ... with a constant number of them. Where
+ * there are tiles of 12 the last 16 are 8 and 8. */
+#define EACH_TILE_OF_ROWS(i, n, tile)                                            \
+  do {                                                                           \
+    int64_t i = 0;                                                               \
+    TILES_OF_ROWS(i, GEMM_ROWS > 8 && (n) - i == 16 ? 0 : (n), GEMM_ROWS, tile); \
+    if (GEMM_ROWS > 8) TILES_OF_ROWS(i, n, 8, tile);                             \
+    TILES_OF_ROWS(i, n, 4, tile);                                                \
+    TILES_OF_ROWS(i, n, 2, tile);                                                \
+    TILES_OF_ROWS(i, n, 1, tile);                                                \
   } while (0)
 #define TILES_OF_ROWS(i, n, rows, tile) \
   for (; i + (rows) <= (n); i += (rows)) tile(rows)

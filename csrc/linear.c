@@ -103,12 +103,12 @@ typedef struct {
   const ast_linear *sizes;
   const float *dout, *x, *z;
   float *dx, *dweight, *dbias;
-  dense_layer layers[2];       /* that of z, if z is recomputed, and W^T, if dx is wanted */
-  int64_t columns;             /* of dout */
-  int64_t dz_row, x_row, size; /* floats of a row of the copies; of the partial sums of a chunk: dW, then dbias */
+  dense_layer layers[2]; /* that of z, if z is recomputed, and W^T, if dx is wanted */
+  int64_t columns;       /* of dout */
+  int64_t dz_row, x_row; /* floats of a row of the copies */
   dense_chunks chunks;
-  float *partials;
-  float *all_dz, *all_x; /* by tiles: dz of all rows if it is not dout, and x if its rows do not end with a vector */
+  dense_partials partials; /* dW and dbias */
+  float *all_dz, *all_x;   /* by tiles: dz of all rows if it is not dout, and x if its rows do not end with a vector */
   gemm_a tiles_dz, tiles_x;
   int64_t tiles, across; /* all tiles; tiles beside each other */
   linear_product product;
@@ -168,33 +168,26 @@ static void linear_backward_rows(const linear_backward_job *job, int64_t first, 
 static ast_status linear_chunk_task(int64_t index, void *context) {
   const linear_backward_job *job = context;
   const ast_linear *sizes = job->sizes;
-  const int64_t first = index * job->chunks.rows, last = min64(sizes->M, first + job->chunks.rows),
-                width = round_up(sizes->I, VW);
+  const dense_sum *sums = job->partials.sums;
+  const int64_t first = index * job->chunks.rows, last = min64(sizes->M, first + job->chunks.rows);
   float *dz = ast_scratch(DENSE_ROWS * (job->dz_row + job->x_row) * (int64_t)sizeof *dz),
         *x = dz + DENSE_ROWS * job->dz_row;
   if (!dz) return AST_NO_MEMORY;
-  float *dweight = job->partials + index * job->size, *dbias = dweight + sizes->O * width;
-  memset(dbias, 0, (size_t)round_up(sizes->O, VW) * sizeof *dbias);
-  if (first >= last) memset(dweight, 0, (size_t)(sizes->O * width) * sizeof *dweight);
+  float *partials = dense_start_chunk(&job->partials, index, first >= last);
   for (int64_t i = first; i < last; i += job->chunks.step) {
     const int64_t rows = min64(job->chunks.step, last - i);
-    linear_backward_rows(job, i, rows, dz, x, dbias);
+    linear_backward_rows(job, i, rows, dz, x, partials + sums[1].at);
     if (job->dweight)
-      gemm(sizes->O, width, rows, (gemm_a){dz, 1, job->dz_row}, x, job->x_row, dweight, width, i > first);
+      gemm(sizes->O, sums[0].row, rows, (gemm_a){dz, 1, job->dz_row}, x, job->x_row, partials + sums[0].at, sums[0].row,
+           i > first);
   }
   return AST_OK;
 }
 
 static ast_status linear_by_rows(linear_backward_job *job) {
-  const ast_linear *sizes = job->sizes;
-  const int64_t width = round_up(sizes->I, VW);
-  job->partials = ast_scratch(job->chunks.num * job->size * (int64_t)sizeof(float));
-  if (!job->partials) return AST_NO_MEMORY;
+  if (!dense_new_partials(&job->partials, job->chunks.num)) return AST_NO_MEMORY;
   const ast_status status = ast_parallel(job->chunks.num, linear_chunk_task, job);
-  if (status != AST_OK) return status;
-  const dense_sum sums[2] = {{job->dweight, 0, sizes->O, sizes->I, width},
-                             {job->dbias, sizes->O * width, 1, sizes->O, width}};
-  return dense_add_partials((dense_sum_job){job->partials, job->size, job->chunks.num, sums, 2});
+  return status == AST_OK ? dense_add_partials(&job->partials) : status;
 }
 
 enum { LINEAR_TILE_ROWS = 48, LINEAR_TILE_COLUMNS = 8 * GEMM_COLUMNS, LINEAR_TILE_DEPTH = 256 };
@@ -277,8 +270,11 @@ static ast_status linear_backward(const ast_linear *sizes, const float *restrict
   job.columns = sizes->activation == AST_GEGLU ? sizes->O / 2 : sizes->O;
   job.dz_row = round_up(sizes->O, VW) + DENSE_APART;
   job.x_row = round_up(sizes->I, VW) + DENSE_APART;
-  job.size = sizes->O * round_up(sizes->I, VW) + round_up(sizes->O, VW);
-  job.chunks = dense_cut(sizes->M, job.size);
-  return sizes->M * (job.dz_row + job.x_row) < job.chunks.num * job.size && sizes->M > 0 ? linear_by_tiles(&job)
-                                                                                         : linear_by_rows(&job);
+  job.partials = (dense_partials){
+      .num = 2, .sums = {{.to = dweight, .rows = sizes->O, .n = sizes->I}, {.to = dbias, .rows = 1, .n = sizes->O}}};
+  dense_place_sums(&job.partials);
+  job.chunks = dense_cut(sizes->M, job.partials.size);
+  return sizes->M * (job.dz_row + job.x_row) < job.chunks.num * job.partials.size && sizes->M > 0
+             ? linear_by_tiles(&job)
+             : linear_by_rows(&job);
 }

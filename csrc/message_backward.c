@@ -29,41 +29,20 @@ enum {
   ROWS_AHEAD = 6 /* edges by which prefetching runs ahead */
 };
 
-/* The gradients that are sums over all edges, as tiles add to them. */
-typedef struct {
-  float *W2, *A2, *A1; /* [F2, F], [F, H] and, transposed, [E, H], rows padded to whole vectors */
-  float *b2, *gamma, *beta, *a1, *end;
-} message_sums;
+/* The gradients that are sums over all edges; that of A1 is transposed, [E,H]. */
+enum { MESSAGE_DW2, MESSAGE_DA2, MESSAGE_DA1, MESSAGE_DB2, MESSAGE_DGAMMA, MESSAGE_DBETA, MESSAGE_Da1 };
 
 typedef struct {
   message_weights w;
   const float *dsum, *dmessages;
   const ast_message_gradients *out;
-  float *dz;                  /* of the edges of this round, rows w.row apart */
-  float *partials;            /* the sums of each task of a round */
-  int64_t *part_offsets;      /* [tasks, PARTS + 1] places in by_part */
-  int32_t *by_part;           /* the edges of each task, less `begin`, by the part of their sender */
-  int64_t size, tasks, edges; /* floats of the sums of a task; tasks of a round; edges of a task */
-  int64_t begin, end;         /* the edges of this round */
+  float *dz;               /* of the edges of this round, rows w.row apart */
+  dense_partials partials; /* of each task of a round */
+  int64_t *part_offsets;   /* [tasks, PARTS + 1] places in by_part */
+  int32_t *by_part;        /* the edges of each task, less `begin`, by the part of their sender */
+  int64_t tasks, edges;    /* tasks of a round; edges of a task */
+  int64_t begin, end;      /* the edges of this round */
 } message_backward_job;
-
-static int64_t message_sums_size(const ast_message *step) {
-  const int64_t H = round_up(step->H, VW), F = round_up(step->F, VW), F2 = round_up(step->F2, VW);
-  return round_up(step->F2 * F + step->F * H + step->E * H + 3 * F2 + H, 16);
-}
-
-static message_sums message_sums_at(const ast_message *step, float *memory) {
-  const int64_t H = round_up(step->H, VW), F = round_up(step->F, VW), F2 = round_up(step->F2, VW);
-  message_sums sums = {.W2 = memory};
-  sums.A2 = sums.W2 + step->F2 * F;
-  sums.A1 = sums.A2 + step->F * H;
-  sums.b2 = sums.A1 + step->E * H;
-  sums.gamma = sums.b2 + F2;
-  sums.beta = sums.gamma + F2;
-  sums.a1 = sums.beta + F2;
-  sums.end = sums.a1 + H;
-  return sums;
-}
 
 /* Sorts the edges of a task by the part of their sender, in stored order within each. */
 static void message_sort_by_part(const message_backward_job *job, int64_t begin, int64_t end, int64_t *part_offsets) {
@@ -80,8 +59,9 @@ static void message_sort_by_part(const message_backward_job *job, int64_t begin,
 
 /* y becomes dy. Sums over the tile are added to those of the task at its end: shorter sums are more exact. */
 AST_INLINE void message_norm_backward(const message_backward_job *job, int64_t first, int64_t n, const message_tile *t,
-                                      const message_sums *sums, const bool whole) {
+                                      float *partials, const bool whole) {
   const ast_message *step = job->w.step;
+  const dense_sum *sums = job->partials.sums;
   const int64_t F2 = step->F2, row = job->w.row;
   memset(t->columns.dgamma, 0, (size_t)row * sizeof(float));
   memset(t->columns.dbeta, 0, (size_t)row * sizeof(float));
@@ -92,23 +72,25 @@ AST_INLINE void message_norm_backward(const message_backward_job *job, int64_t f
     norm_backward(F2, whole, step->gamma, job->dsum + step->receivers[first + i] * F2, dmessage, scale, NULL, y,
                   &t->columns);
   }
-  dense_add_rows(t->columns.dgamma, 0, 1, F2, sums->gamma);
-  dense_add_rows(t->columns.dbeta, 0, 1, F2, sums->beta);
-  dense_add_rows(t->y, row, n, F2, sums->b2);
+  dense_add_rows(t->columns.dgamma, 0, 1, F2, partials + sums[MESSAGE_DGAMMA].at);
+  dense_add_rows(t->columns.dbeta, 0, 1, F2, partials + sums[MESSAGE_DBETA].at);
+  dense_add_rows(t->y, row, n, F2, partials + sums[MESSAGE_DB2].at);
 }
 
-/* dz of the tile into the buffer, and the weight gradients added to `sums`, or put there if they are `fresh`. */
+/* dz of the tile into the buffer, and the weight gradients added to the partial sums, or put there if those of the
+ * matrices are `fresh`. */
 static void message_tile_backward(const message_backward_job *job, int64_t first, int64_t n, bool fresh,
-                                  const message_tile *t, const message_sums *sums) {
+                                  const message_tile *t, float *partials) {
   const message_weights *w = &job->w;
   const ast_message *step = w->step;
-  const int64_t H = round_up(step->H, VW), F = round_up(step->F, VW), E = step->E, row = w->row;
+  const dense_sum *sums = job->partials.sums;
+  const int64_t H = sums[MESSAGE_DA2].row, F = sums[MESSAGE_DW2].row, E = step->E, row = w->row;
   float *dz = job->dz + (first - job->begin) * row, *dy = t->y, *dc = t->y;
   message_layers(w, first, n, t);
-  if (step->F2 % VW) message_norm_backward(job, first, n, t, sums, false);
-  else message_norm_backward(job, first, n, t, sums, true);
+  if (step->F2 % VW) message_norm_backward(job, first, n, t, partials, false);
+  else message_norm_backward(job, first, n, t, partials, true);
   /* forward: y = W2 x + b2, so dW2 = dy x^T and dx = W2^T dy */
-  gemm(step->F2, F, n, (gemm_a){dy, 1, row}, t->x, row, sums->W2, F, !fresh);
+  gemm(step->F2, F, n, (gemm_a){dy, 1, row}, t->x, row, partials + sums[MESSAGE_DW2].at, F, !fresh);
   dense_all(&w->layers[MESSAGE_W2_BACK], n, (gemm_a){dy, row, 1},
             (dense_end){.out = dz, .out_row = row, .hidden = t->x, .hidden_row = row});
   /* forward: x = relu(P + Q + e), so de = dz */
@@ -117,12 +99,12 @@ static void message_tile_backward(const message_backward_job *job, int64_t first
     memcpy(de + (first + i) * E, dz + i * row, (size_t)E * sizeof *de);
   if (!H) return;
   /* forward: x = relu(P + Q + A2 h), so dA2 = dz h^T and dh = A2^T dz */
-  gemm(step->F, H, n, (gemm_a){dz, 1, row}, t->h, row, sums->A2, H, !fresh);
+  gemm(step->F, H, n, (gemm_a){dz, 1, row}, t->h, row, partials + sums[MESSAGE_DA2].at, H, !fresh);
   dense_all(&w->layers[MESSAGE_A2_BACK], n, (gemm_a){dz, row, 1},
             (dense_end){.out = dc, .out_row = row, .hidden = t->h, .hidden_row = row});
   /* forward: h = relu(A1 e + a1), so da1 = dc, dA1 = dc e^T and de = A1^T dc */
-  dense_add_rows(dc, row, n, step->H, sums->a1);
-  gemm(E, H, n, (gemm_a){step->edge_features + first * E, 1, E}, dc, row, sums->A1, H, !fresh);
+  dense_add_rows(dc, row, n, step->H, partials + sums[MESSAGE_Da1].at);
+  gemm(E, H, n, (gemm_a){step->edge_features + first * E, 1, E}, dc, row, partials + sums[MESSAGE_DA1].at, H, !fresh);
   if (de)
     dense_all(&w->layers[MESSAGE_A1_BACK], n, (gemm_a){dc, row, 1}, (dense_end){.out = de + first * E, .out_row = E});
 }
@@ -130,13 +112,13 @@ static void message_tile_backward(const message_backward_job *job, int64_t first
 static ast_status message_backward_task(int64_t index, void *context) {
   const message_backward_job *job = context;
   const int64_t begin = job->begin + index * job->edges, end = min64(job->end, begin + job->edges);
-  const message_sums sums = message_sums_at(job->w.step, job->partials + index * job->size);
+  float *partials =
+      job->begin ? job->partials.memory + index * job->partials.size : dense_start_chunk(&job->partials, index, false);
   message_tile t;
   if (!message_new_tile(&job->w, &t)) return AST_NO_MEMORY;
-  if (!job->begin) memset(sums.b2, 0, (size_t)(sums.end - sums.b2) * sizeof *sums.b2);
   message_sort_by_part(job, begin, end, job->part_offsets + index * (PARTS + 1));
   for (int64_t m = begin; m < end; m += MESSAGE_TILE)
-    message_tile_backward(job, m, min64(MESSAGE_TILE, end - m), m == index * job->edges, &t, &sums);
+    message_tile_backward(job, m, min64(MESSAGE_TILE, end - m), m == index * job->edges, &t, partials);
   return AST_OK;
 }
 
@@ -203,28 +185,10 @@ static ast_status message_rounds(message_backward_job *job) {
   return status;
 }
 
-/* The sum over the tasks, dA1 by way of its transpose. */
-static ast_status message_add_partials(const message_backward_job *job, float *dA1) {
-  const ast_message *step = job->w.step;
-  const ast_message_gradients *out = job->out;
-  const message_sums at = message_sums_at(step, job->partials);
-  const int64_t H = round_up(step->H, VW), F = round_up(step->F, VW);
-  const dense_sum sums[] = {
-      {out->W2, at.W2 - job->partials, step->F2, step->F, F}, {out->A2, at.A2 - job->partials, step->F, step->H, H},
-      {dA1, at.A1 - job->partials, step->E, step->H, H},      {out->b2, at.b2 - job->partials, 1, step->F2, 0},
-      {out->gamma, at.gamma - job->partials, 1, step->F2, 0}, {out->beta, at.beta - job->partials, 1, step->F2, 0},
-      {out->a1, at.a1 - job->partials, 1, step->H, 0},
-  };
-  const ast_status status = dense_add_partials((dense_sum_job){job->partials, job->size, job->tasks, sums, 7});
-  for (int64_t h = 0; status == AST_OK && h < step->H; h++)
-    for (int64_t i = 0; i < step->E; i++) out->A1[h * step->E + i] = dA1[i * step->H + h];
-  return status;
-}
-
 static ast_status message_backward(const ast_message *step, const float *restrict dsum, const float *restrict dmessages,
                                    const ast_message_gradients *out) {
   AST_SCRATCH_SCOPE;
-  message_backward_job job = {.dsum = dsum, .dmessages = dmessages, .out = out, .size = message_sums_size(step)};
+  message_backward_job job = {.dsum = dsum, .dmessages = dmessages, .out = out};
   ast_status status = message_pack(step, true, &job.w);
   if (status != AST_OK) return status;
   const int64_t tiles = max64(1, divide_up(step->M, MESSAGE_TILE)), most = ROUND_TASKS * TASK_TILES,
@@ -233,16 +197,27 @@ static ast_status message_backward(const ast_message *step, const float *restric
   job.edges = MESSAGE_TILE * of_task;
   job.tasks = divide_up(of_round, of_task);
 
-  const int64_t round = job.tasks * job.edges, partials = job.tasks * job.size, dz = round * job.w.row,
-                dA1 = step->E * step->H;
-  const int64_t offsets = round_up(job.tasks * (PARTS + 1), 8);
-  job.part_offsets = ast_scratch(offsets * (int64_t)sizeof(int64_t) + (partials + dz + dA1) * (int64_t)sizeof(float) +
-                                 round * (int64_t)sizeof(int32_t));
-  if (!job.part_offsets) return AST_NO_MEMORY;
-  job.partials = (float *)(job.part_offsets + offsets);
-  job.dz = job.partials + partials;
-  job.by_part = (int32_t *)(job.dz + dz + dA1);
-  if (!step->M) memset(job.partials, 0, (size_t)partials * sizeof *job.partials);
+  const int64_t round = job.tasks * job.edges;
+  job.part_offsets = ast_scratch(job.tasks * (PARTS + 1) * (int64_t)sizeof *job.part_offsets);
+  job.by_part = ast_scratch(round * (int64_t)sizeof *job.by_part);
+  job.dz = ast_scratch(round * job.w.row * (int64_t)sizeof *job.dz);
+  float *dA1 = ast_scratch(step->E * step->H * (int64_t)sizeof *dA1);
+  job.partials = (dense_partials){.num = 7,
+                                  .sums = {[MESSAGE_DW2] = {.to = out->W2, .rows = step->F2, .n = step->F},
+                                           [MESSAGE_DA2] = {.to = out->A2, .rows = step->F, .n = step->H},
+                                           [MESSAGE_DA1] = {.to = dA1, .rows = step->E, .n = step->H},
+                                           [MESSAGE_DB2] = {.to = out->b2, .rows = 1, .n = step->F2},
+                                           [MESSAGE_DGAMMA] = {.to = out->gamma, .rows = 1, .n = step->F2},
+                                           [MESSAGE_DBETA] = {.to = out->beta, .rows = 1, .n = step->F2},
+                                           [MESSAGE_Da1] = {.to = out->a1, .rows = 1, .n = step->H}}};
+  dense_place_sums(&job.partials);
+  if (!job.part_offsets || !job.by_part || !job.dz || !dA1 || !dense_new_partials(&job.partials, job.tasks))
+    return AST_NO_MEMORY;
+  if (!step->M) dense_start_chunk(&job.partials, 0, true);
   status = message_rounds(&job);
-  return status == AST_OK ? message_add_partials(&job, job.dz + dz) : status;
+  if (status == AST_OK) status = dense_add_partials(&job.partials);
+  if (status != AST_OK) return status;
+  for (int64_t h = 0; h < step->H; h++)
+    for (int64_t i = 0; i < step->E; i++) out->A1[h * step->E + i] = dA1[i * step->H + h];
+  return AST_OK;
 }

@@ -125,7 +125,8 @@ static ast_status mlp(const ast_mlp *mlp, const float *restrict residual, float 
 
 /* ---- backward ---- */
 
-enum { MLP_DWEIGHT1, MLP_DBIAS1, MLP_DWEIGHT2, MLP_DBIAS2, MLP_DGAMMA, MLP_DBETA, MLP_SUMS };
+/* The partial sums. */
+enum { MLP_DWEIGHT1, MLP_DBIAS1, MLP_DWEIGHT2, MLP_DBIAS2, MLP_DGAMMA, MLP_DBETA };
 
 typedef struct {
   const ast_mlp *mlp;
@@ -136,9 +137,7 @@ typedef struct {
   int64_t input_row, hidden_row, y_row;
   bool into_hidden; /* whether anything before the hidden units wants a gradient */
   dense_chunks chunks;
-  dense_sum sums[MLP_SUMS]; /* dW1, dbias1, dW2, dbias2, dgamma, dbeta in the partial sums of a chunk */
-  float *partials;
-  int64_t size;
+  dense_partials partials;
 } mlp_backward_job;
 
 /* dy of the rows from `first` on, in the place of y, or of n, which is read if it was kept; dgamma and dbeta are added
@@ -158,7 +157,7 @@ AST_INLINE void mlp_norm_backward(const mlp_backward_job *job, int64_t first, in
 static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_t rows, float *input, float *hidden,
                               float *y, float *partials, bool add) {
   const ast_mlp *mlp = job->mlp;
-  const dense_sum *sums = job->sums;
+  const dense_sum *sums = job->partials.sums;
   gemm_a inputs = {input, job->input_row, 1}, units = {hidden, job->hidden_row, 1};
   if (mlp->beside || mlp->I % VW) mlp_copy_inputs(mlp, first, rows, input, job->input_row);
   else inputs = (gemm_a){mlp->x + first * mlp->x_stride, mlp->x_stride, 1};
@@ -218,35 +217,15 @@ static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_
 static ast_status mlp_backward_task(int64_t index, void *context) {
   const mlp_backward_job *job = context;
   const int64_t first = index * job->chunks.rows, last = min64(job->mlp->M, first + job->chunks.rows);
-  const int64_t floats = DENSE_ROWS * (job->input_row + job->hidden_row + job->y_row) + 3 * job->sums[MLP_DGAMMA].row;
+  const int64_t floats =
+      DENSE_ROWS * (job->input_row + job->hidden_row + job->y_row) + 3 * job->partials.sums[MLP_DGAMMA].row;
   float *input = ast_scratch(floats * (int64_t)sizeof *input);
   if (!input) return AST_NO_MEMORY;
   float *hidden = input + DENSE_ROWS * job->input_row, *y = hidden + DENSE_ROWS * job->hidden_row;
-  float *partials = job->partials + index * job->size;
-  for (int k = 0; k < MLP_SUMS; k++) /* the matrices are stored by their first block */
-    if (job->sums[k].rows == 1 || first >= last)
-      memset(partials + job->sums[k].at, 0, (size_t)(job->sums[k].rows * job->sums[k].row) * sizeof *partials);
+  float *partials = dense_start_chunk(&job->partials, index, first >= last);
   for (int64_t i = first; i < last; i += job->chunks.step)
     mlp_backward_rows(job, i, min64(job->chunks.step, last - i), input, hidden, y, partials, i > first);
   return AST_OK;
-}
-
-/* Where each sum lies in the partial sums of a chunk. */
-static void mlp_place_sums(mlp_backward_job *job) {
-  const ast_mlp *mlp = job->mlp;
-  const ast_mlp_gradients *g = &job->g;
-  const dense_sum sums[MLP_SUMS] = {{.to = g->weight1, .rows = mlp->H, .n = mlp->I + mlp->I2},
-                                    {.to = g->bias1, .rows = 1, .n = mlp->H},
-                                    {.to = g->weight2, .rows = mlp->O, .n = mlp->H},
-                                    {.to = g->bias2, .rows = 1, .n = mlp->O},
-                                    {.to = g->gamma, .rows = 1, .n = mlp->O},
-                                    {.to = g->beta, .rows = 1, .n = mlp->O}};
-  for (int k = 0; k < MLP_SUMS; k++) {
-    job->sums[k] = sums[k];
-    job->sums[k].row = round_up(sums[k].n, VW);
-    job->sums[k].at = job->size;
-    job->size += sums[k].rows * job->sums[k].row;
-  }
 }
 
 static ast_status mlp_backward(const ast_mlp *mlp, const float *restrict dout, ast_mlp_kept kept, ast_mlp_gradients g) {
@@ -265,11 +244,16 @@ static ast_status mlp_backward(const ast_mlp *mlp, const float *restrict dout, a
   job.input_row = round_up(mlp->I, VW) + round_up(mlp->I2, VW) + DENSE_APART;
   job.hidden_row = round_up(mlp->H, VW) + DENSE_APART;
   job.y_row = round_up(mlp->O, VW) + DENSE_APART;
-  mlp_place_sums(&job);
-  job.chunks = dense_cut(mlp->M, job.size);
-  job.partials = ast_scratch(job.chunks.num * job.size * (int64_t)sizeof(float));
-  if (!job.partials) return AST_NO_MEMORY;
+  job.partials = (dense_partials){.num = 6,
+                                  .sums = {[MLP_DWEIGHT1] = {.to = g.weight1, .rows = mlp->H, .n = K},
+                                           [MLP_DBIAS1] = {.to = g.bias1, .rows = 1, .n = mlp->H},
+                                           [MLP_DWEIGHT2] = {.to = g.weight2, .rows = mlp->O, .n = mlp->H},
+                                           [MLP_DBIAS2] = {.to = g.bias2, .rows = 1, .n = mlp->O},
+                                           [MLP_DGAMMA] = {.to = g.gamma, .rows = 1, .n = mlp->O},
+                                           [MLP_DBETA] = {.to = g.beta, .rows = 1, .n = mlp->O}}};
+  dense_place_sums(&job.partials);
+  job.chunks = dense_cut(mlp->M, job.partials.size);
+  if (!dense_new_partials(&job.partials, job.chunks.num)) return AST_NO_MEMORY;
   status = ast_parallel(job.chunks.num, mlp_backward_task, &job);
-  if (status != AST_OK) return status;
-  return dense_add_partials((dense_sum_job){job.partials, job.size, job.chunks.num, job.sums, MLP_SUMS});
+  return status == AST_OK ? dense_add_partials(&job.partials) : status;
 }

@@ -281,43 +281,68 @@ static dense_chunks dense_cut(int64_t M, int64_t floats) {
   return (dense_chunks){num, rows, blocks ? round_up(divide_up(rows, blocks), GEMM_ROWS) : DENSE_ROWS};
 }
 
-/* to [rows,n] = the sum over chunks of partials[chunk][at..], rows of it `row` floats apart; `to` may be NULL */
+/* One of the gradients that are sums over rows: to [rows,n], or NULL if it is not wanted. Each chunk has a partial sum
+ * of it, `at` in the memory of the chunk, rows of whole vectors `row` floats apart. Blocks add to vectors; to matrices
+ * only those behind the first one, which sets them. */
 typedef struct {
   float *to;
-  int64_t at, rows, n, row;
+  int64_t rows, n, at, row;
 } dense_sum;
 
-typedef struct {
-  const float *partials;
-  int64_t size, chunks;
-  const dense_sum *sums;
-  int64_t num;
-} dense_sum_job;
+enum { DENSE_SUMS = 7, DENSE_SUM_ROWS = 16 };
 
-enum { DENSE_SUM_ROWS = 16 };
+typedef struct {
+  dense_sum sums[DENSE_SUMS];
+  int64_t num, size, chunks; /* sums; floats of a chunk */
+  float *memory;             /* [chunks,size] */
+} dense_partials;
+
+/* Says where each sum lies. */
+static void dense_place_sums(dense_partials *partials) {
+  for (dense_sum *sum = partials->sums; sum < partials->sums + partials->num; sum++) {
+    sum->row = round_up(sum->n, VW);
+    sum->at = partials->size;
+    partials->size += sum->rows * sum->row;
+  }
+}
+
+static bool dense_new_partials(dense_partials *partials, int64_t chunks) {
+  partials->chunks = chunks;
+  partials->memory = ast_scratch(chunks * partials->size * (int64_t)sizeof(float));
+  return partials->memory;
+}
+
+/* The memory of a chunk, its vectors cleared, and if it is empty its matrices, too. */
+static float *dense_start_chunk(const dense_partials *partials, int64_t chunk, bool empty) {
+  float *memory = partials->memory + chunk * partials->size;
+  for (const dense_sum *sum = partials->sums; sum < partials->sums + partials->num; sum++)
+    if (sum->rows == 1 || empty) memset(memory + sum->at, 0, (size_t)(sum->rows * sum->row) * sizeof *memory);
+  return memory;
+}
 
 AST_INLINE int64_t dense_sum_tasks(const dense_sum *target) {
   return target->to ? divide_up(target->rows, DENSE_SUM_ROWS) : 0;
 }
 
 static ast_status dense_sum_task(int64_t index, void *context) {
-  const dense_sum_job *job = context;
-  const dense_sum *target = job->sums;
+  const dense_partials *partials = context;
+  const dense_sum *target = partials->sums;
   for (; index >= dense_sum_tasks(target); target++) index -= dense_sum_tasks(target);
   for (int64_t i = index * DENSE_SUM_ROWS; i < min64(target->rows, (index + 1) * DENSE_SUM_ROWS); i++)
     for (int64_t j = 0; j < target->n; j += VW) {
-      const float *partial = job->partials + target->at + i * target->row + j;
+      const float *partial = partials->memory + target->at + i * target->row + j;
       vf sum = vload(partial);
-      for (int64_t c = 1; c < job->chunks; c++) sum += vload(partial + c * job->size);
+      for (int64_t c = 1; c < partials->chunks; c++) sum += vload(partial + c * partials->size);
       vstore_upto(target->to + i * target->n + j, sum, target->n - j);
     }
   return AST_OK;
 }
 
-static ast_status dense_add_partials(dense_sum_job job) {
+/* The sums over all chunks, in their order. */
+static ast_status dense_add_partials(dense_partials *partials) {
   int64_t tasks = 0;
-  for (int64_t i = 0; i < job.num; i++) tasks += dense_sum_tasks(&job.sums[i]);
-  return ast_parallel(tasks, dense_sum_task, &job);
+  for (int64_t i = 0; i < partials->num; i++) tasks += dense_sum_tasks(&partials->sums[i]);
+  return ast_parallel(tasks, dense_sum_task, partials);
 }
 
 #endif
