@@ -124,20 +124,24 @@ typedef struct {
 
 enum { OCTREE_MAX_DIGIT = 11, OCTREE_HISTOGRAM = 6 << OCTREE_MAX_DIGIT }; /* 63 bits in 6 digits of 11, or 8 of 8 */
 
+/* Packed words, or keys beside the indices of their rows. */
+typedef struct {
+  uint64_t *keys, *nodes;
+} octree_rows;
+
 /* One pass of the LSD radix sort, by the digit (key >> shift) & mask; count[d] is where digit d starts. */
-AST_INLINE void octree_scatter(const uint64_t *keys, const uint64_t *nodes, uint64_t *keys_out, uint64_t *nodes_out,
-                               int64_t n, int shift, uint64_t mask, int64_t *count, const bool packed) {
+AST_INLINE void octree_scatter(octree_rows from, octree_rows to, int64_t n, int shift, uint64_t mask, int64_t *count,
+                               const bool packed) {
   for (int64_t i = 0; i < n; i++) {
-    const int64_t to = count[keys[i] >> shift & mask]++;
-    keys_out[to] = keys[i];
-    if (!packed) nodes_out[to] = nodes[i];
+    const int64_t place = count[from.keys[i] >> shift & mask]++;
+    to.keys[place] = from.keys[i];
+    if (!packed) to.nodes[place] = from.nodes[i];
   }
 }
 
-/* Sorts n rows by the bits low..high-1 of their keys, the only ones that differ. The result is in `keys` (and `nodes`).
- */
-AST_INLINE ast_status octree_radix_sort(uint64_t *keys, uint64_t *nodes, uint64_t *keys_other, uint64_t *nodes_other,
-                                        int64_t n, int low, int high, const bool packed) {
+/* Sorts n rows by the bits low..high-1 of their keys, the only ones that differ. */
+AST_INLINE ast_status octree_radix_sort(const octree_rows rows, octree_rows other, int64_t n, int low, int high,
+                                        const bool packed) {
   const int max_digit = n < 1 << 12 ? 8 : n < 1 << 20 ? OCTREE_MAX_DIGIT : 9;
   const int passes =
       (high - low + max_digit - 1) / max_digit; /* in int: the loops below come out slower from int64_t */
@@ -149,28 +153,25 @@ AST_INLINE ast_status octree_radix_sort(uint64_t *keys, uint64_t *nodes, uint64_
   memset(count, 0, sizeof *count * (size_t)passes << digit);
   for (int64_t i = 0; i < n; i++)
     for (int pass = 0; pass < passes; pass++)
-      count[(uint64_t)pass << digit | (keys[i] >> (low + pass * digit) & mask)]++;
-  const uint64_t *const home = keys;
+      count[(uint64_t)pass << digit | (rows.keys[i] >> (low + pass * digit) & mask)]++;
+  octree_rows now = rows;
   for (int pass = 0; pass < passes; pass++) {
     const int shift = low + pass * digit;
     int64_t *from = count + ((int64_t)pass << digit), total = 0;
-    if (from[keys[0] >> shift & mask] == n) continue;
+    if (from[now.keys[0] >> shift & mask] == n) continue;
     for (uint64_t d = 0; d <= mask; d++) {
-      const int64_t rows = from[d];
+      const int64_t of_digit = from[d];
       from[d] = total;
-      total += rows;
+      total += of_digit;
     }
-    octree_scatter(keys, nodes, keys_other, nodes_other, n, shift, mask, from, packed);
-    uint64_t *swap = keys;
-    keys = keys_other;
-    keys_other = swap;
-    swap = nodes;
-    nodes = nodes_other;
-    nodes_other = swap;
+    octree_scatter(now, other, n, shift, mask, from, packed);
+    const octree_rows swap = now;
+    now = other;
+    other = swap;
   }
-  if (keys != home) {
-    memcpy(keys_other, keys, sizeof *keys * (size_t)n);
-    if (!packed) memcpy(nodes_other, nodes, sizeof *nodes * (size_t)n);
+  if (now.keys != rows.keys) {
+    memcpy(rows.keys, now.keys, sizeof *now.keys * (size_t)n);
+    if (!packed) memcpy(rows.nodes, now.nodes, sizeof *now.nodes * (size_t)n);
   }
   return AST_OK;
 }
@@ -184,10 +185,12 @@ static ast_status octree_sort_task(int64_t b, void *context) {
   const int low = differ ? __builtin_ctzll(differ) : 0, high = num_bits(differ);
   if (job->packed) {
     for (int64_t i = 0; i < n; i++) keys[i] = keys[i] << job->index_bits | (uint64_t)i;
-    return octree_radix_sort(keys, NULL, other, NULL, n, low + job->index_bits, high + job->index_bits, true);
+    return octree_radix_sort((octree_rows){keys, NULL}, (octree_rows){other, NULL}, n, low + job->index_bits,
+                             high + job->index_bits, true);
   }
   for (int64_t i = 0; i < n; i++) keys[job->N + i] = (uint64_t)i;
-  return octree_radix_sort(keys, keys + job->N, other, other + job->N, n, low, high, false);
+  const octree_rows rows = {keys, keys + job->N}, spare = {other, other + job->N};
+  return octree_radix_sort(rows, spare, n, low, high, false);
 }
 
 /* ---- runs of equal keys ---- */
