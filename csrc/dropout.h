@@ -28,9 +28,10 @@ static dropout dropout_of(const ast_attention *s, int64_t scene, int64_t head) {
   return d;
 }
 
-AST_INLINE void threefry(const uint32_t key[5], vu x[4]) {
+/* The words of a vector of counters. */
+AST_INLINE void dropout_draw(const dropout *d, vu counter, vu query, vu words[4]) {
   static const uint8_t rotation[8][2] = {{10, 26}, {11, 21}, {13, 27}, {23, 5}, {6, 20}, {17, 11}, {25, 10}, {18, 20}};
-  EACH(4, i) x[i] += key[i];
+  vu x[4] = {counter + d->key[0], query + d->key[1], (vu){0} + d->key[2], (vu){0} + d->key[3]};
   EACH(12, round) {
     const int a = round % 2 ? 3 : 1, b = round % 2 ? 1 : 3;
     const uint32_t r = rotation[round % 8][0], t = rotation[round % 8][1];
@@ -41,15 +42,9 @@ AST_INLINE void threefry(const uint32_t key[5], vu x[4]) {
     if (round % 4 != 3) continue;
     const uint32_t s = (uint32_t)round / 4 + 1;
 #pragma GCC unroll 4
-    for (uint32_t i = 0; i < 4; i++) x[i] += key[(i + s) % 5];
+    for (uint32_t i = 0; i < 4; i++) x[i] += d->key[(i + s) % 5];
     x[3] += s;
   }
-}
-
-/* The words of a vector of counters. */
-AST_INLINE void dropout_draw(const dropout *d, vu counter, vu query, vu words[4]) {
-  vu x[4] = {counter, query, {0}, {0}};
-  threefry(d->key, x);
   EACH(4, i) words[i] = x[i];
 }
 

@@ -214,14 +214,10 @@ AST_INLINE void elastic_block(const bool directed, const elastic_job *job, int64
 static ast_status elastic_force_task(int64_t index, void *context) {
   const elastic_job *job = context;
   const int64_t end = min64(job->mesh->E, (index + 1) * ELASTIC_ELEMENTS);
-  for (int64_t e = index * ELASTIC_ELEMENTS; e < end; e += VW) elastic_block(false, job, e, min64(VW, end - e));
-  return AST_OK;
-}
-
-static ast_status elastic_direction_task(int64_t index, void *context) {
-  const elastic_job *job = context;
-  const int64_t end = min64(job->mesh->E, (index + 1) * ELASTIC_ELEMENTS);
-  for (int64_t e = index * ELASTIC_ELEMENTS; e < end; e += VW) elastic_block(true, job, e, min64(VW, end - e));
+  for (int64_t e = index * ELASTIC_ELEMENTS; e < end; e += VW) {
+    if (job->direction) elastic_block(true, job, e, min64(VW, end - e));
+    else elastic_block(false, job, e, min64(VW, end - e));
+  }
   return AST_OK;
 }
 
@@ -250,8 +246,7 @@ static ast_status elastic_run(const ast_elastic *mesh, const float *direction, f
     *to[i] = memcpy(copies + i * length, from[i], (size_t)(3 * mesh->N) * sizeof *copies);
     copies[i * length + 3 * mesh->N] = 0;
   }
-  const ast_status status =
-      ast_parallel(divide_up(mesh->E, ELASTIC_ELEMENTS), direction ? elastic_direction_task : elastic_force_task, &job);
+  const ast_status status = ast_parallel(divide_up(mesh->E, ELASTIC_ELEMENTS), elastic_force_task, &job);
   return status == AST_OK ? ast_parallel(divide_up(mesh->N, ELASTIC_NODES), elastic_sum_task, &job) : status;
 }
 
