@@ -15,9 +15,7 @@
  * The gradient with respect to x is the same kernel with the lists exchanged and W_k^T.
  */
 #include "ast.h"
-#include "gemm.h"
 #include "row_tile.h"
-#include "simd.h"
 
 enum {
   OFFSETS = 27,

@@ -11,7 +11,6 @@
  */
 #include "ast.h"
 #include "row_tile.h"
-#include "simd.h"
 
 enum {
   WEIGHT_TILE = 96,   /* pairs at a time: their rows stay in L2 while the panels and strips of dW_k pass over them */
