@@ -206,10 +206,10 @@ static void backward_block(const backward_job *job, const backward_range *range,
       prefetch_rows(dv + at * range->dv_stride, range->dv_stride, min64(share, n - at), D, 1);
       backward_group(t, i, min64(GROUP, i0 + width - i), first + i, k0, n, D, d);
     }
-    gemm(whole, D, width, (gemm_a){t->weights, 1, ROW}, t->dout + i0 * ROW, ROW, t->dv, ROW, i0 > 0);
-    gemm(whole, D, width, (gemm_a){t->dscores, 1, ROW}, t->queries + i0 * ROW, ROW, t->dk, ROW, i0 > 0);
-    gemm(round_up(width, ROW_STEP), D, n, (gemm_a){t->dscores, ROW, 1}, t->keys, ROW, t->dq + i0 * ROW, ROW,
-         k0 > range->first_key);
+    gemm(whole, D, width, t->weights, ROW, t->dout + i0 * ROW, ROW, t->dv, ROW, i0 > 0);
+    gemm(whole, D, width, t->dscores, ROW, t->queries + i0 * ROW, ROW, t->dk, ROW, i0 > 0);
+    gemm_inlined(round_up(width, ROW_STEP), D, n, (gemm_a){t->dscores, ROW, 1}, t->keys, ROW, t->dq + i0 * ROW, ROW,
+                 k0 > range->first_key);
   }
   put_rows(t->dk, n, D, 1, first > range->first_query, dk, range->dk_stride);
   put_rows(t->dv, n, D, d->gain, first > range->first_query, dv, range->dv_stride);

@@ -128,12 +128,18 @@ AST_INLINE void gemm_strip(const int vectors, int64_t M, int64_t K, gemm_a a, co
 }
 
 /* C [M,N] (+)= A [M,K] B [K,N], N a multiple of VW, rows of B and C b_row and c_row floats apart. */
-static void gemm(int64_t M, int64_t N, int64_t K, gemm_a a, const float *b, int64_t b_row, float *c, int64_t c_row,
-                 bool add) {
+AST_INLINE void gemm_inlined(int64_t M, int64_t N, int64_t K, gemm_a a, const float *b, int64_t b_row, float *c,
+                             int64_t c_row, bool add) {
   for (int64_t j = 0; j < N; j += GEMM_COLUMNS) {
     if (N - j >= GEMM_COLUMNS) gemm_strip(2, M, K, a, b + j, b_row, c + j, c_row, add);
     else gemm_strip(1, M, K, a, b + j, b_row, c + j, c_row, add);
   }
+}
+
+/* C (+)= A^T B, rows of A [K,M] a_row floats apart. Its other stride, 1, is a constant in this function. */
+static __attribute__((noinline)) void gemm(int64_t M, int64_t N, int64_t K, const float *a, int64_t a_row,
+                                           const float *b, int64_t b_row, float *c, int64_t c_row, bool add) {
+  gemm_inlined(M, N, K, (gemm_a){a, 1, a_row}, b, b_row, c, c_row, add);
 }
 
 #endif

@@ -15,10 +15,7 @@
  * Cost: 2 M I O operations for z, for dx and for dW each. Memory: the packed weights, and either the parts or, where
  * they are not dout and x themselves, dz and x.
  */
-#include "ast.h"
 #include "weight_panels.h"
-#include "gemm.h"
-#include "simd.h"
 
 /* ---- a product of all rows ---- */
 
@@ -178,8 +175,7 @@ static ast_status linear_chunk_task(int64_t index, void *context) {
     const int64_t rows = min64(job->chunks.step, last - i);
     linear_backward_rows(job, i, rows, dz, x, partials + sums[1].at);
     if (job->dweight)
-      gemm(sizes->O, sums[0].row, rows, (gemm_a){dz, 1, job->dz_row}, x, job->x_row, partials + sums[0].at, sums[0].row,
-           i > first);
+      gemm(sizes->O, sums[0].row, rows, dz, job->dz_row, x, job->x_row, partials + sums[0].at, sums[0].row, i > first);
   }
   return AST_OK;
 }
@@ -218,7 +214,7 @@ static ast_status linear_tile_task(int64_t index, void *context) {
     float *to = width == columns ? job->dweight + o * sizes->I + k : tile;
     const int64_t to_row = width == columns ? sizes->I : width;
     for (int64_t i = 0; i < sizes->M; i += LINEAR_TILE_DEPTH)
-      gemm(rows, width, min64(LINEAR_TILE_DEPTH, sizes->M - i), (gemm_a){dz.data + i * dz.row + o, 1, dz.row},
+      gemm(rows, width, min64(LINEAR_TILE_DEPTH, sizes->M - i), dz.data + i * dz.row + o, dz.row,
            x.data + i * x.row + k, x.row, to, to_row, i > 0);
     for (int64_t i = 0; to == tile && i < rows; i++)
       memcpy(job->dweight + (o + i) * sizes->I + k, tile + i * width, (size_t)columns * sizeof *tile);
@@ -270,9 +266,8 @@ static ast_status linear_backward(const ast_linear *sizes, const float *restrict
   job.columns = sizes->activation == AST_GEGLU ? sizes->O / 2 : sizes->O;
   job.dz_row = round_up(sizes->O, VW) + DENSE_APART;
   job.x_row = round_up(sizes->I, VW) + DENSE_APART;
-  job.partials = (dense_partials){
-      .num = 2, .sums = {{.to = dweight, .rows = sizes->O, .n = sizes->I}, {.to = dbias, .rows = 1, .n = sizes->O}}};
-  dense_place_sums(&job.partials);
+  dense_sum sums[] = {{.to = dweight, .rows = sizes->O, .n = sizes->I}, {.to = dbias, .rows = 1, .n = sizes->O}};
+  job.partials = dense_place_sums(sums, 2);
   job.chunks = dense_cut(sizes->M, job.partials.size);
   return sizes->M * (job.dz_row + job.x_row) < job.chunks.num * job.partials.size && sizes->M > 0
              ? linear_by_tiles(&job)

@@ -14,11 +14,8 @@
  * Cost per edge: 2 (E H + H F + F F2) flops, a row of P read from anywhere in memory, rows of e, of Q and of the sum in
  * order. Memory: 3 tiles a thread and the packed weights.
  */
-#include "ast.h"
 #include "weight_panels.h"
-#include "gemm.h"
 #include "norm.h"
-#include "simd.h"
 
 enum {
   MESSAGE_TILE = 96, /* edges; a multiple of GEMM_ROWS */

@@ -17,10 +17,7 @@
  * wanted). Memory: at most ROUND_TASKS sums of weight gradients and ROUND_TASKS * TASK_TILES * MESSAGE_TILE rows of dz,
  * 11 MB at 128 channels.
  */
-#include "ast.h"
 #include "weight_panels.h"
-#include "gemm.h"
-#include "simd.h"
 
 enum {
   ROUND_TASKS = 16,
@@ -30,7 +27,7 @@ enum {
 };
 
 /* The gradients that are sums over all edges; that of A1 is transposed, [E,H]. */
-enum { MESSAGE_DW2, MESSAGE_DA2, MESSAGE_DA1, MESSAGE_DB2, MESSAGE_DGAMMA, MESSAGE_DBETA, MESSAGE_Da1 };
+enum { MESSAGE_DW2, MESSAGE_DA2, MESSAGE_DA1, MESSAGE_DB2, MESSAGE_DGAMMA, MESSAGE_DBETA, MESSAGE_Da1, MESSAGE_SUMS };
 
 typedef struct {
   message_weights w;
@@ -90,7 +87,7 @@ static void message_tile_backward(const message_backward_job *job, int64_t first
   if (step->F2 % VW) message_norm_backward(job, first, n, t, partials, false);
   else message_norm_backward(job, first, n, t, partials, true);
   /* forward: y = W2 x + b2, so dW2 = dy x^T and dx = W2^T dy */
-  gemm(step->F2, F, n, (gemm_a){dy, 1, row}, t->x, row, partials + sums[MESSAGE_DW2].at, F, !fresh);
+  gemm(step->F2, F, n, dy, row, t->x, row, partials + sums[MESSAGE_DW2].at, F, !fresh);
   dense_all(&w->layers[MESSAGE_W2_BACK], n, (gemm_a){dy, row, 1},
             (dense_end){.out = dz, .out_row = row, .hidden = t->x, .hidden_row = row});
   /* forward: x = relu(P + Q + e), so de = dz */
@@ -99,12 +96,12 @@ static void message_tile_backward(const message_backward_job *job, int64_t first
     memcpy(de + (first + i) * E, dz + i * row, (size_t)E * sizeof *de);
   if (!H) return;
   /* forward: x = relu(P + Q + A2 h), so dA2 = dz h^T and dh = A2^T dz */
-  gemm(step->F, H, n, (gemm_a){dz, 1, row}, t->h, row, partials + sums[MESSAGE_DA2].at, H, !fresh);
+  gemm(step->F, H, n, dz, row, t->h, row, partials + sums[MESSAGE_DA2].at, H, !fresh);
   dense_all(&w->layers[MESSAGE_A2_BACK], n, (gemm_a){dz, row, 1},
             (dense_end){.out = dc, .out_row = row, .hidden = t->h, .hidden_row = row});
   /* forward: h = relu(A1 e + a1), so da1 = dc, dA1 = dc e^T and de = A1^T dc */
   dense_add_rows(dc, row, n, step->H, partials + sums[MESSAGE_Da1].at);
-  gemm(E, H, n, (gemm_a){step->edge_features + first * E, 1, E}, dc, row, partials + sums[MESSAGE_DA1].at, H, !fresh);
+  gemm(E, H, n, step->edge_features + first * E, E, dc, row, partials + sums[MESSAGE_DA1].at, H, !fresh);
   if (de)
     dense_all(&w->layers[MESSAGE_A1_BACK], n, (gemm_a){dc, row, 1}, (dense_end){.out = de + first * E, .out_row = E});
 }
@@ -202,15 +199,14 @@ static ast_status message_backward(const ast_message *step, const float *restric
   job.by_part = ast_scratch(round * (int64_t)sizeof *job.by_part);
   job.dz = ast_scratch(round * job.w.row * (int64_t)sizeof *job.dz);
   float *dA1 = ast_scratch(step->E * step->H * (int64_t)sizeof *dA1);
-  job.partials = (dense_partials){.num = 7,
-                                  .sums = {[MESSAGE_DW2] = {.to = out->W2, .rows = step->F2, .n = step->F},
-                                           [MESSAGE_DA2] = {.to = out->A2, .rows = step->F, .n = step->H},
-                                           [MESSAGE_DA1] = {.to = dA1, .rows = step->E, .n = step->H},
-                                           [MESSAGE_DB2] = {.to = out->b2, .rows = 1, .n = step->F2},
-                                           [MESSAGE_DGAMMA] = {.to = out->gamma, .rows = 1, .n = step->F2},
-                                           [MESSAGE_DBETA] = {.to = out->beta, .rows = 1, .n = step->F2},
-                                           [MESSAGE_Da1] = {.to = out->a1, .rows = 1, .n = step->H}}};
-  dense_place_sums(&job.partials);
+  dense_sum sums[] = {[MESSAGE_DW2] = {.to = out->W2, .rows = step->F2, .n = step->F},
+                      [MESSAGE_DA2] = {.to = out->A2, .rows = step->F, .n = step->H},
+                      [MESSAGE_DA1] = {.to = dA1, .rows = step->E, .n = step->H},
+                      [MESSAGE_DB2] = {.to = out->b2, .rows = 1, .n = step->F2},
+                      [MESSAGE_DGAMMA] = {.to = out->gamma, .rows = 1, .n = step->F2},
+                      [MESSAGE_DBETA] = {.to = out->beta, .rows = 1, .n = step->F2},
+                      [MESSAGE_Da1] = {.to = out->a1, .rows = 1, .n = step->H}};
+  job.partials = dense_place_sums(sums, MESSAGE_SUMS);
   if (!job.part_offsets || !job.by_part || !job.dz || !dA1 || !dense_new_partials(&job.partials, job.tasks))
     return AST_NO_MEMORY;
   if (!step->M) dense_start_chunk(&job.partials, 0, true);

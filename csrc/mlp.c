@@ -17,11 +17,8 @@
  * Cost: 2 M H (I + I2 + O) operations forward and 4 M H (I + I2 + O) backward, 2 M H (I + I2 + O) more if nothing was
  * kept.
  */
-#include "ast.h"
 #include "weight_panels.h"
-#include "gemm.h"
 #include "norm.h"
-#include "simd.h"
 
 /* Both layers, and for the gradients W2^T and W1^T, to x and to beside. */
 enum { MLP_FIRST, MLP_SECOND, MLP_SECOND_BACK, MLP_FIRST_BACK, MLP_BESIDE_BACK, MLP_LAYERS };
@@ -126,7 +123,7 @@ static ast_status mlp(const ast_mlp *mlp, const float *restrict residual, float 
 /* ---- backward ---- */
 
 /* The partial sums. */
-enum { MLP_DWEIGHT1, MLP_DBIAS1, MLP_DWEIGHT2, MLP_DBIAS2, MLP_DGAMMA, MLP_DBETA };
+enum { MLP_DWEIGHT1, MLP_DBIAS1, MLP_DWEIGHT2, MLP_DBIAS2, MLP_DGAMMA, MLP_DBETA, MLP_SUMS };
 
 typedef struct {
   const ast_mlp *mlp;
@@ -184,8 +181,8 @@ static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_
   }
   /* forward: y = h W2^T + bias2, so dW2 = dy^T h, dbias2 = dy and dh = dy W2 */
   if (sums[MLP_DWEIGHT2].to)
-    gemm(mlp->O, sums[MLP_DWEIGHT2].row, rows, (gemm_a){y, 1, job->y_row}, units.data, units.row,
-         partials + sums[MLP_DWEIGHT2].at, sums[MLP_DWEIGHT2].row, add);
+    gemm(mlp->O, sums[MLP_DWEIGHT2].row, rows, y, job->y_row, units.data, units.row, partials + sums[MLP_DWEIGHT2].at,
+         sums[MLP_DWEIGHT2].row, add);
   if (sums[MLP_DBIAS2].to) dense_add_rows(y, job->y_row, rows, mlp->O, partials + sums[MLP_DBIAS2].at);
   if (!job->into_hidden) return;
   const dense_end masked = {.out = hidden,
@@ -197,7 +194,7 @@ static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_
   dense_all(&job->layers[MLP_SECOND_BACK], rows, (gemm_a){y, job->y_row, 1}, masked);
   /* forward: h = max(0, [x, beside] W1^T + bias1), so dW1 = dz^T [x, beside], dbias1 = dz and d[x, beside] = dz W1 */
   if (sums[MLP_DWEIGHT1].to)
-    gemm(mlp->H, sums[MLP_DWEIGHT1].row, rows, (gemm_a){hidden, 1, job->hidden_row}, inputs.data, inputs.row,
+    gemm(mlp->H, sums[MLP_DWEIGHT1].row, rows, hidden, job->hidden_row, inputs.data, inputs.row,
          partials + sums[MLP_DWEIGHT1].at, sums[MLP_DWEIGHT1].row, add);
   if (sums[MLP_DBIAS1].to) dense_add_rows(hidden, job->hidden_row, rows, mlp->H, partials + sums[MLP_DBIAS1].at);
   const gemm_a dz = {hidden, job->hidden_row, 1};
@@ -244,14 +241,13 @@ static ast_status mlp_backward(const ast_mlp *mlp, const float *restrict dout, a
   job.input_row = round_up(mlp->I, VW) + round_up(mlp->I2, VW) + DENSE_APART;
   job.hidden_row = round_up(mlp->H, VW) + DENSE_APART;
   job.y_row = round_up(mlp->O, VW) + DENSE_APART;
-  job.partials = (dense_partials){.num = 6,
-                                  .sums = {[MLP_DWEIGHT1] = {.to = g.weight1, .rows = mlp->H, .n = K},
-                                           [MLP_DBIAS1] = {.to = g.bias1, .rows = 1, .n = mlp->H},
-                                           [MLP_DWEIGHT2] = {.to = g.weight2, .rows = mlp->O, .n = mlp->H},
-                                           [MLP_DBIAS2] = {.to = g.bias2, .rows = 1, .n = mlp->O},
-                                           [MLP_DGAMMA] = {.to = g.gamma, .rows = 1, .n = mlp->O},
-                                           [MLP_DBETA] = {.to = g.beta, .rows = 1, .n = mlp->O}}};
-  dense_place_sums(&job.partials);
+  dense_sum sums[] = {[MLP_DWEIGHT1] = {.to = g.weight1, .rows = mlp->H, .n = K},
+                      [MLP_DBIAS1] = {.to = g.bias1, .rows = 1, .n = mlp->H},
+                      [MLP_DWEIGHT2] = {.to = g.weight2, .rows = mlp->O, .n = mlp->H},
+                      [MLP_DBIAS2] = {.to = g.bias2, .rows = 1, .n = mlp->O},
+                      [MLP_DGAMMA] = {.to = g.gamma, .rows = 1, .n = mlp->O},
+                      [MLP_DBETA] = {.to = g.beta, .rows = 1, .n = mlp->O}};
+  job.partials = dense_place_sums(sums, MLP_SUMS);
   job.chunks = dense_cut(mlp->M, job.partials.size);
   if (!dense_new_partials(&job.partials, job.chunks.num)) return AST_NO_MEMORY;
   status = ast_parallel(job.chunks.num, mlp_backward_task, &job);

@@ -15,7 +15,6 @@
 
 #include "ast.h"
 #include "gemm.h"
-#include "simd.h"
 
 enum {
   DENSE_ROWS = 96,         /* rows of a block: a multiple of GEMM_ROWS */
@@ -66,14 +65,8 @@ static void dense_pack_panel(const dense_layer *l, int64_t p) {
   }
 }
 
-typedef struct {
-  dense_layer *layers;
-  int64_t num;
-} dense_pack_job;
-
-static ast_status dense_pack_task(int64_t index, void *context) {
-  const dense_pack_job *job = context;
-  const dense_layer *l = job->layers;
+static ast_status dense_pack_task(int64_t index, void *layers) {
+  const dense_layer *l = layers;
   for (; index >= dense_panels(l); l++) index -= dense_panels(l);
   dense_pack_panel(l, index);
   return AST_OK;
@@ -81,7 +74,6 @@ static ast_status dense_pack_task(int64_t index, void *context) {
 
 /* Packs layers into scratch of the calling thread, which its tasks may read. A layer without weight is left out. */
 static ast_status dense_pack(dense_layer *layers, int64_t num) {
-  dense_pack_job job = {layers, num};
   int64_t size = 0, panels = 0;
   for (int64_t i = 0; i < num; i++) {
     if (!layers[i].weight) layers[i].N = 0;
@@ -100,8 +92,8 @@ static ast_status dense_pack(dense_layer *layers, int64_t num) {
     layers[i].panels_bias = packed + dense_panels(&layers[i]) * layers[i].K * GEMM_COLUMNS;
     packed += dense_packed_size(&layers[i]);
   }
-  if (size >= DENSE_PACK) return ast_parallel(panels, dense_pack_task, &job);
-  for (int64_t p = 0; p < panels; p++) dense_pack_task(p, &job);
+  if (size >= DENSE_PACK) return ast_parallel(panels, dense_pack_task, layers);
+  for (int64_t p = 0; p < panels; p++) dense_pack_task(p, layers);
   return AST_OK;
 }
 
@@ -289,21 +281,23 @@ typedef struct {
   int64_t rows, n, at, row;
 } dense_sum;
 
-enum { DENSE_SUMS = 7, DENSE_SUM_ROWS = 16 };
+enum { DENSE_SUM_ROWS = 16 };
 
 typedef struct {
-  dense_sum sums[DENSE_SUMS];
-  int64_t num, size, chunks; /* sums; floats of a chunk */
+  dense_sum *sums;           /* [num] */
+  int64_t num, size, chunks; /* floats of a chunk; chunks */
   float *memory;             /* [chunks,size] */
 } dense_partials;
 
 /* Says where each sum lies. */
-static void dense_place_sums(dense_partials *partials) {
-  for (dense_sum *sum = partials->sums; sum < partials->sums + partials->num; sum++) {
+static dense_partials dense_place_sums(dense_sum *sums, int64_t num) {
+  dense_partials partials = {.sums = sums, .num = num};
+  for (dense_sum *sum = sums; sum < sums + num; sum++) {
     sum->row = round_up(sum->n, VW);
-    sum->at = partials->size;
-    partials->size += sum->rows * sum->row;
+    sum->at = partials.size;
+    partials.size += sum->rows * sum->row;
   }
+  return partials;
 }
 
 static bool dense_new_partials(dense_partials *partials, int64_t chunks) {
