@@ -56,5 +56,6 @@ class Metrics:
         return min(marks, key=lambda mark: mark[1], default=None)
 
     def validation(self, step: int) -> dict[str, Any] | None:
-        """The record of the validation after a step; None if there is none."""
-        return next((record for record in self if record["step"] == step and "valid_rmse" in record), None)
+        """The record of the last validation after a step; None if there is none."""
+        found = [record for record in self if record["step"] == step and "valid_rmse" in record]
+        return found[-1] if found else None
