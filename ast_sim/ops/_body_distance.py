@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ast_sim.ops.library import is_differentiated
-from ast_sim.support.boxes import beside
+from ast_sim.support.nearest_surface import nearest_surface
 
 FINE = 0.1  # the second channel of the gap saturates at this share of the radius
 WIDTH = 5
@@ -69,17 +69,7 @@ def signed_gap(
     Returns:
         [P] and [P, 3].
     """
-    import igl  # takes 0.2 s; only models with this input need it
-
     gap, normal = np.full(len(points), radius), np.zeros((len(points), 3))
-    # All triangles around a nearest point are kept, so the sign is that of the whole surface.
-    close = np.flatnonzero(beside(points, position[triangles], radius))
-    triangles = triangles[beside(position[triangles], points[close], radius)]
-    if len(triangles):
-        points, kind = points[close], igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-        distance, _, nearest, outward = igl.signed_distance(points, position, triangles, kind, -radius, radius)
-        touching = np.abs(distance) <= 1e-12 * radius
-        away = (points - nearest) / np.where(touching, 1, distance)[:, None]
-        near = np.abs(distance) < radius  # the distance is NaN where the surface is farther away
-        gap[close[near]], normal[close[near]] = distance[near], np.where(touching[:, None], outward, away)[near]
+    found = nearest_surface(points, position, triangles, radius, radius)
+    gap[found.rows], normal[found.rows] = found.gap, found.normal
     return gap, normal

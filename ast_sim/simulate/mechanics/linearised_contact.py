@@ -34,8 +34,8 @@ from ast_sim.scene import Scene
 from ast_sim.simulate.mechanics.elasticity import Deformation, Elasticity
 from ast_sim.simulate.mechanics.linear_system import Factorization, LinearSystem
 from ast_sim.simulate.mechanics.material import NeoHookean, cofactor, determinant, von_mises
-from ast_sim.support.boxes import beside
 from ast_sim.support.errors import SimulationError
+from ast_sim.support.nearest_surface import nearest_surface
 
 CLEARANCE = (
     0.8  # bodies that barriers keep apart stand off by this share of the barriers' range (docs/log.md, 2026-11-24)
@@ -198,23 +198,17 @@ class NewtonSteps:
         import igl  # takes 0.2 s
 
         nodes, corners, normals, shares, gaps = [], [], [], [], []
+        deep, near = DEEP * self._length, NEAR * self._length
         for faces, others in self._surfaces:
-            kind, near, deep = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL, NEAR * self._length, DEEP * self._length
-            others = others[beside(position[others], position[faces], deep)]
-            faces = faces[beside(position[faces], position[others], deep)]
-            if not len(faces):
+            found = nearest_surface(position[others], position, faces, inside=deep, outside=near)
+            if not len(found.rows):
                 continue
-            gap, face, nearest, outward = igl.signed_distance(position[others], position, faces, kind, -deep, near)
-            chosen = (gap < near) & (gap > -deep)  # NaN where the surface is farther away
-            point, there = others[chosen], faces[face[chosen]]
-            away = np.sign(gap[chosen])[:, None] * (position[point] - nearest[chosen])
-            size = np.linalg.norm(away, axis=1, keepdims=True)
-            touching = size <= 1e-9 * self._length
-            nodes.append(point)
-            corners.append(there)
-            normals.append(np.where(touching, outward[chosen], away / np.where(touching, 1, size)))
-            shares.append(igl.barycentric_coordinates(nearest[chosen], *(position[there[:, i]] for i in range(3))))
-            gaps.append(gap[chosen])
+            corner_positions = (position[found.triangles[:, i]] for i in range(3))
+            nodes.append(others[found.rows])
+            corners.append(found.triangles)
+            normals.append(found.normal)
+            shares.append(igl.barycentric_coordinates(found.place, *corner_positions))
+            gaps.append(found.gap)
         if not gaps:
             return NearPairs(scipy.sparse.csr_array((0, len(self._system.free))), np.zeros(0), np.zeros(0))
         joined = (np.concatenate(parts) for parts in (nodes, corners, normals, shares, gaps))

@@ -11,6 +11,7 @@ from ast_sim.simulate.mechanics.elasticity import Elasticity
 from ast_sim.simulate.mechanics.linearised_contact import STILL, NewtonSteps
 from ast_sim.simulate.mechanics.material import NeoHookean
 from ast_sim.simulate.mechanics.quasi_static import quasi_static, solve_frame
+from ast_sim.support import nearest_surface
 from ast_sim.support.errors import SimulationError
 
 DHAT = 1e-3  # of `pressed`
@@ -170,8 +171,8 @@ def test_what_is_not_looked_at_is_not_near(squeezed, monkeypatch):
     case, truth, *_ = squeezed
     solver = NewtonSteps(case.scene, case.material, 0.0)
     pairs = solver.near_pairs(truth)
-    kept = linearised_contact.beside(truth, truth[case.scene.body == 1], 0.0)
+    kept = nearest_surface.beside(truth, truth[case.scene.body == 1], 0.0)
     assert 0 < kept.sum() < len(truth)
-    monkeypatch.setattr(linearised_contact, "beside", lambda things, *_: np.ones(len(things), bool))
+    monkeypatch.setattr(nearest_surface, "beside", lambda things, *_: np.ones(len(things), bool))
     whole = solver.near_pairs(truth)
     assert np.array_equal(pairs.gap, whole.gap) and abs(pairs.directions - whole.directions).max() < 1e-12
