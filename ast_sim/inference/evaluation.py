@@ -39,8 +39,7 @@ def evaluate(
 ) -> tuple[dict[str, Any], list[Answer]]:
     """Predict all trajectories of a split and compare.
 
-    Scenes are predicted one at a time; those without a frame to predict are left out. A failed prediction has the error
-    None, and then the summary has None, too.
+    A scene without a frame to predict is left out. Where a prediction fails, its errors and the summary are None.
 
     Returns:
         The predictions, and figures that hold:
@@ -55,13 +54,11 @@ def evaluate(
         length_unit, stress_unit, threads.
 
     Raises:
-        DatasetError: the split is empty.
+        DatasetError: the split has no frame to predict.
     """
     indices = dataset.with_frames(split, model.config.given_frames + 1)
     if not indices:
-        raise DatasetError(
-            f"{dataset.path}: the split {split} has no frame to predict: there is nothing to evaluate on"
-        )
+        raise DatasetError(f"{dataset.path}: the split {split} has no frame to predict")
     constant = _training_stress(dataset) if model.config.stress != "none" else None
     samples, answers, displacement, stress = [], [], [], []
     seconds = read_seconds(dataset).samples

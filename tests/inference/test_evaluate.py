@@ -241,7 +241,7 @@ def test_an_empty_split_is_an_error(tmp_path):
     path = tmp_path / "train_only.h5"
     with DatasetWriter(path, toy.info()) as writer:
         writer.add("train", toy.plate())
-    with Dataset(path) as dataset, pytest.raises(DatasetError, match="split test is empty"):
+    with Dataset(path) as dataset, pytest.raises(DatasetError, match="the split test has no frame to predict"):
         evaluate(toy.LinearSimulator(toy.config(dataset.info)), dataset, "test")
 
 
