@@ -46,7 +46,8 @@ def nearest_surface(
     triangles = triangles[beside(position[triangles], points[close], margin)]
     if not len(triangles):
         return Nearest(close[:0], np.zeros(0), np.zeros((0, 3)), triangles, np.zeros((0, 3)))
-    gap, face, place, outward = igl.signed_distance(points[close], position, triangles, kind, -inside, outside)
+    found = igl.signed_distance(points[close], position, triangles, kind, -inside, outside)
+    gap, face, place, outward = map(np.asarray, found)
     near = (gap < outside) & (gap > -inside)  # NaN where the surface is farther away
     rows, gap, place = close[near], gap[near], place[near]
     touching = np.abs(gap) <= TOUCHING * margin
