@@ -17,8 +17,8 @@ from ast_sim.inference import asked_frame
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.effort import FIRST_CALL, Effort
 from ast_sim.inference.predict import answers as predictions
+from ast_sim.inference.predict_batch import Start, predict_batch
 from ast_sim.inference.question import Question
-from ast_sim.inference.together import Start, predict_together
 from ast_sim.inference.trivial_predictors import Errors, displacement_errors, rmse_of, stress_errors, summarize
 from ast_sim.models.simulator import Simulator
 from ast_sim.scene import Trajectory
@@ -114,7 +114,7 @@ def one_step_predictions(model: Simulator, truth: Trajectory, name: str) -> tupl
     chunk, found = max(1, ONE_STEP_NODES // truth.scene.num_nodes), []
     with model.predicting():
         for first in range(0, len(starts), chunk):
-            found += predict_together(model, starts[first : first + chunk])
+            found += predict_batch(model, starts[first : first + chunk])
     stresses = [stress.numpy() for _, stress, _ in found if stress is not None]
     return np.array([positions[0].numpy() for positions, *_ in found]), np.array(stresses) if stresses else None
 

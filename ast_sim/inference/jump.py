@@ -24,8 +24,8 @@ from ast_sim.batches.carry import Carrier
 from ast_sim.batches.graph import Graph
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.effort import AGAIN, MOST_NEWTON_STEPS, Effort, newton_steps
+from ast_sim.inference.predict_batch import Start, predict_batch
 from ast_sim.inference.question import Question, not_finite, too_far
-from ast_sim.inference.together import Start, predict_together
 from ast_sim.models.simulator import Simulator
 from ast_sim.scene import Scene
 from ast_sim.simulate.mechanics.linearised_contact import STILL, NewtonSteps
@@ -250,7 +250,7 @@ def _groups(model: Simulator, scenes: Sequence[_JumpingScene]) -> Iterator[list[
 def _predict(model: Simulator, group: list[_Frame], corrections: int) -> None:
     """Predict the frames of a batch."""
     try:
-        found = predict_together(model, [frame.start for frame in group], corrections + 1)
+        found = predict_batch(model, [frame.start for frame in group], corrections + 1)
     except RolloutError as error:
         if len(group) > 1:  # one frame must not spoil the others
             for frame in group:

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from ast_sim.batches.batch_builder import State
 from ast_sim.inference.answer import Answer
+from ast_sim.inference.predict_batch import Start, predict_batch
 from ast_sim.inference.question import Question, not_finite, too_far
-from ast_sim.inference.together import Start, predict_together
 from ast_sim.models.simulator import Simulator
 
 
@@ -40,7 +40,7 @@ def rollouts(
             # Only scenes of the same domain are predicted together: none may change another's domain.
             for domain in dict.fromkeys(scene.domain for scene in running):
                 group = [scene for scene in running if scene.domain == domain]
-                found = predict_together(model, [scene.start(frame) for scene in group])
+                found = predict_batch(model, [scene.start(frame) for scene in group])
                 for scene, (positions, stress, seconds) in zip(group, found, strict=True):
                     scene.advance(frame, positions[-1], stress, seconds)
             if progress is not None and running:

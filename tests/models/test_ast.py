@@ -19,8 +19,9 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.models.ast.ast_config import ASTConfig
 from ast_sim.models.ast.cells import build_cells, places
 from ast_sim.models.ast.message_passing import MessagePassing
+from ast_sim.models.ast.position_embedding import PositionEmbedding, rotated, rotations
 from ast_sim.models.ast.presets import PRESETS
-from ast_sim.models.ast.transformer import AttentionBlock, PositionEmbedding, Vectors, rotated, rotations
+from ast_sim.models.ast.transformer import AttentionBlock, Vectors
 from ast_sim.models.layers import FactorizedLinear
 from ast_sim.models.model_config import DataFacts
 from ast_sim.models.normalizer import Normalizer

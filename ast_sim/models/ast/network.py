@@ -20,7 +20,8 @@ from ast_sim.batches.graph import Graph
 from ast_sim.models.ast.ast_config import ASTConfig
 from ast_sim.models.ast.cells import Cells, SparseConv, build_cells, doublings, places
 from ast_sim.models.ast.message_passing import MessagePassing
-from ast_sim.models.ast.transformer import AttentionBlock, PositionEmbedding, Vectors, rotations
+from ast_sim.models.ast.position_embedding import PositionEmbedding, rotations
+from ast_sim.models.ast.transformer import AttentionBlock, Vectors
 from ast_sim.models.layers import MLP, Linear
 from ast_sim.models.node_inputs import edge_features, element_features, node_features, normalizer_of
 from ast_sim.models.normalizer import Normalizer

@@ -30,7 +30,7 @@ class Start(NamedTuple):
     prescribed: Tensor
 
 
-def predict_together(
+def predict_batch(
     model: Simulator, starts: Sequence[Start], calls: int = 1
 ) -> list[tuple[list[Tensor], Tensor | None, float]]:
     """Predict the frames; each call corrects the answer of the one before. Stress on elements is predicted by the last
