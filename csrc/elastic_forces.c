@@ -214,9 +214,11 @@ AST_INLINE void elastic_block(const bool directed, const elastic_job *job, int64
 static ast_status elastic_force_task(int64_t index, void *context) {
   const elastic_job *job = context;
   const int64_t end = min64(job->mesh->E, (index + 1) * ELASTIC_ELEMENTS);
-  for (int64_t e = index * ELASTIC_ELEMENTS; e < end; e += VW) {
-    if (job->direction) elastic_block(true, job, e, min64(VW, end - e));
-    else elastic_block(false, job, e, min64(VW, end - e));
+  int64_t e = index * ELASTIC_ELEMENTS;
+  if (job->direction) {
+    for (; e < end; e += VW) elastic_block(true, job, e, min64(VW, end - e));
+  } else {
+    for (; e < end; e += VW) elastic_block(false, job, e, min64(VW, end - e));
   }
   return AST_OK;
 }
