@@ -6,8 +6,7 @@ from pathlib import Path
 
 from torch import Tensor, nn
 
-from ast_sim.batches.training_jumps import JumpPool
-from ast_sim.batches.training_rollouts import RolloutPool
+from ast_sim.batches.training_pool import Pool
 from ast_sim.dataset.reader import Dataset
 from ast_sim.runs import checkpoint
 from ast_sim.runs.config_toml import read_origin
@@ -27,7 +26,7 @@ class Saver:
         dataset: Dataset,
         model: nn.Module,
         optimizer: Optimizer,
-        pool: RolloutPool | JumpPool | None,
+        pool: Pool | None,
         processes: Processes,
     ) -> None:
         self.run, self.dataset, self.model, self.optimizer = run, dataset, model, optimizer

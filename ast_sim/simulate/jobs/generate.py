@@ -239,8 +239,8 @@ def _unpack(out: Path, folder: Path) -> None:
         for sample in _samples(dataset.splits):
             path = sample_path(folder, *sample)
             if not _is_readable(path):
-                whole = replace(dataset.load(*sample), cauchy_stress=dataset.cauchy_stress(*sample))
-                store_sample(path, pack_sample(whole, seconds.get(sample_name(*sample), {})))
+                trajectory = replace(dataset.load(*sample), cauchy_stress=dataset.cauchy_stress(*sample))
+                store_sample(path, pack_sample(trajectory, seconds.get(sample_name(*sample), {})))
 
 
 def _existing(out: Path, folder: Path, settings: dict[str, Any], counts: dict[str, int]) -> Generated:

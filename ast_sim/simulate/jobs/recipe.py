@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import os
 import shlex
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -77,7 +78,7 @@ def checked_recipe(
     return Recipe(family, seed, nodes, frames, solver, parts, spec, patient, keep)
 
 
-def recipe_of(name: str, info: DatasetInfo, made_from: str | Path | None = None) -> Recipe:
+def recipe_of(name: str, info: DatasetInfo, made_from: str | os.PathLike[str] | None = None) -> Recipe:
     """The recipe by which the bundled solver made a dataset of a family without inertia.
 
     Args:
@@ -100,7 +101,7 @@ def recipe_of(name: str, info: DatasetInfo, made_from: str | Path | None = None)
         raise SimulationError(f"{name} was made without parts of your own or a specification: leave {made_from} out")
     if key is not None and made_from is None:
         raise SimulationError(f"{name} was made of {own[key]}: say where to find that (--made-from)")
-    parts, spec = (Path(made_from) if made_from is not None and key == which else None for which in own)
+    parts, spec = (None if made_from is None or key != which else Path(made_from) for which in own)
     try:
         seed, nodes, frames, keep = made["seed"], made.get("nodes"), made.get("frames"), made.get("keep")
         recipe = checked_recipe(family_module(family), family, seed, nodes, frames, None, parts, False, keep, spec)

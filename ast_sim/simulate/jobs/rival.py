@@ -188,7 +188,7 @@ def rivals(
     if not starts or min(starts) < 0 or repeats < 1:
         raise SimulationError(f"starts {list(starts)} must be at least 0, and repeats {repeats} at least 1")
     with Dataset(dataset) as data:
-        recipe = recipe_of(str(dataset), data.info, None if made_from is None else Path(made_from))
+        recipe = recipe_of(str(dataset), data.info, made_from)
         frames = [_frame(data, split, index, which, frame_of) for which, index in enumerate(indices)]
     request = {
         "dataset": str(Path(dataset).resolve()),

@@ -47,20 +47,19 @@ def parse_setting(text: str) -> tuple[str, list[Any]]:
     try:
         if not (found and name and values):
             raise ValueError(text)
-        if len(ends) == 3 and int(ends[2]) > MOST_ROWS:
-            raise ConfigError(f"{text!r} asks for {int(ends[2]):,} values; at most {MOST_ROWS:,}: take fewer")
-        if len(ends) == 3 and int(ends[2]) >= 1:
-            return name, np.linspace(float(ends[0]), float(ends[1]), int(ends[2])).tolist()
-        if len(ends) == 3:
+        if len(ends) != 3:
+            return name, [_number_or_text(value.strip()) for value in values.split(",")]
+        first, last, count = float(ends[0]), float(ends[1]), int(ends[2])
+        if count < 1:
             raise ValueError(text)
-    except ConfigError:
-        raise
     except ValueError as error:
         raise ConfigError(
             f"{text!r} cannot be read; write travel=4.2, travel=1,2,3, travel=1:7:13 (from, to, how many) or"
             " hook.file=long.step"
         ) from error
-    return name, [_number_or_text(value.strip()) for value in values.split(",")]
+    if count > MOST_ROWS:
+        raise ConfigError(f"{text!r} asks for {count:,} values; at most {MOST_ROWS:,}: take fewer")
+    return name, np.linspace(first, last, count).tolist()
 
 
 def grid(values: Mapping[str, Any]) -> list[dict[str, Any]]:
