@@ -79,12 +79,19 @@ class Answer:
             "status": "complete" if self.failure is None else "truncated",
             **self.source,
             "given_frames": self.given,
-            "frames": list(self.frames),
             "model_seconds": list(self.step_seconds),
             **({"last_newton_steps": list(self.last_steps)} if self.last_steps else {}),
         }
-        location = None if self.stress is None else self.stress_location
-        return Trajectory(self.scene, self.position, self.stress, attributes, stress_location=location)
+        return Trajectory(
+            self.scene,
+            self.position,
+            self.stress,
+            attributes,
+            stress_location=None if self.stress is None else self.stress_location,
+            frames=self.frames,
+            times=None if self.info is None else self.info.times(self.frames),
+            length_unit=None if self.info is None else self.info.length_unit,
+        )
 
     def reaction(self) -> np.ndarray | None:
         """[S, 3] the force in newton that moves the prescribed nodes of the body `driven`.
@@ -152,4 +159,4 @@ class Answer:
             sweep_files.write_table(path, rows)
         else:
             shown = (self.trajectory, None) if truth is None else (truth, self.trajectory)
-            export.write(path, *shown, time_step=self.info.time_step or 1.0)
+            export.write(path, *shown)

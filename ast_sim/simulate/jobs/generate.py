@@ -239,7 +239,8 @@ def _unpack(out: Path, folder: Path) -> None:
         for sample in _samples(dataset.splits):
             path = sample_path(folder, *sample)
             if not _is_readable(path):
-                trajectory = replace(dataset.load(*sample), cauchy_stress=dataset.cauchy_stress(*sample))
+                split, index = sample
+                trajectory = dataset[split][index]
                 store_sample(path, pack_sample(trajectory, seconds.get(sample_name(*sample), {})))
 
 
