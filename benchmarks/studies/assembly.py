@@ -111,7 +111,7 @@ def measured(name: str, row: Row, folder: Path) -> dict[str, Any]:
         "training": validation_curve(run),
         "curves": curves,
         "solver_curves": _solver_curves(row) if row.rivals else [],
-        **found,
+        **asdict(found),
     }
 
 
@@ -219,7 +219,7 @@ def _alone(found: dict[str, Any]) -> str:
     errors = [scene["relative_error"] for scene in found["scenes"] if scene["relative_error"] is not None]
     spent = 60 * (found["generation_minutes"] + found["minutes"])
     seconds = [scene["seconds"] for scene in found["scenes"]]
-    saved = 0.0 if solver is None else solver["seconds"] - found["seconds"]
+    saved = 0.0 if solver is None else solver["seconds"] - solver["model_seconds"]
     return _table_line([
         row["title"],
         f"{row['train']} scenes ({found['generation_minutes']:.1f} min), {row['steps']:,} steps",
