@@ -121,7 +121,7 @@ class Question:
 
 def _whole_numbers(frames: Iterable[int] | int) -> list[int]:
     """The frames as a list; one number is a frame, too."""
-    listed = np.asarray([frames] if np.ndim(frames) == 0 else list(frames))
+    listed = np.asarray(list(frames) if isinstance(frames, Iterable) else [frames])
     if listed.size and (listed.ndim != 1 or listed.dtype.kind not in "iu"):
         raise ConfigError(f"frames must be whole numbers, one such number, or a slice, not {frames!r}")
     return listed.tolist()

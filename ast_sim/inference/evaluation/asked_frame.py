@@ -116,7 +116,7 @@ def _after(model: Simulator, truth: Trajectory, frame: int, corrections: int, mo
             continue
         error = relative_error(positions[steps][0], truth, frame)
         stress = None if way.stress is None else way.stress[steps][0]
-        stress_error = _stress_errors(truth, stress, frame, model.config.stress)["stress_share"]
+        stress_error, _ = _stress_errors(truth, stress, frame, model.config.stress)
         measured.append(EffortErrors(effort, error, stress_error, min(steps, needed), float(0 < steps < needed)))
     return measured
 
@@ -166,6 +166,7 @@ def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: E
         (after,) = calls(model, [question], effort)
         positions = () if isinstance(after, str) else after.position
         by_calls = [relative_error(position[0], truth, frame) for position in positions]
+    share, largest = _stress_errors(truth, stress, frame, model.config.stress)
     return AskedScene(
         name=name,
         nodes=truth.scene.num_nodes,
@@ -175,7 +176,8 @@ def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: E
         by_calls=tuple(by_calls),
         seconds=answer.seconds,
         last_step=answer.last_steps[-1] if answer.last_steps else None,
-        **_stress_errors(truth, stress, frame, model.config.stress),
+        stress_share=share,
+        largest_stress=largest,
     )
 
 
@@ -189,18 +191,20 @@ def _rms(difference: np.ndarray, rows: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(difference[rows], dtype=np.float64))))
 
 
-def _stress_errors(truth: Trajectory, stress: np.ndarray | None, frame: int, location: str) -> dict[str, float | None]:
-    """The error of the stress on what deforms, relative to that of the frame's true mean; and by how much the largest
-    is off. None where they say nothing."""
+def _stress_errors(
+    truth: Trajectory, stress: np.ndarray | None, frame: int, location: str
+) -> tuple[float | None, float | None]:
+    """The error of the stress on what deforms, relative to the error of the frame's true mean; and by how much the
+    largest is off. None where they say nothing."""
     if stress is None or truth.stress is None:
-        return {"stress_share": None, "largest_stress": None}
+        return None, None
     rows = truth.scene.deforming(location)
-    there, found = truth.stress[frame].astype(np.float64), stress.astype(np.float64)
-    spread, largest = float(there[rows].std()), float(there[rows].max())
-    return {
-        "stress_share": _rms(found - there, rows) / spread if spread else None,
-        "largest_stress": abs(float(found[rows].max()) - largest) / largest if largest else None,
-    }
+    there = truth.stress[frame].astype(np.float64)
+    given = stress.astype(np.float64)
+    spread = float(there[rows].std())
+    largest = float(there[rows].max())
+    share = _rms(given - there, rows) / spread if spread else None
+    return share, abs(float(given[rows].max()) - largest) / largest if largest else None
 
 
 def _solver(rival: Rivals, error: float | None) -> SolverFigures:

@@ -99,9 +99,13 @@ def errors_over_scenes(quantity: str, of_scenes: Sequence[Errors]) -> list[MeanE
     """The errors over all scenes, in both conventions."""
     rows = []
     for same in zip(*(_leaves(errors) for errors in of_scenes), strict=True):
-        key, squared = same[0][0], [error for _, error in same]
-        both = (_or_none(rmse_sequence(squared)), _or_none(rmse_pooled(squared)))
-        rows.append(MeanError(quantity, *key, *both))
+        (predictor, horizon, nodes), _ = same[0]
+        squared = [error for _, error in same]
+        rows.append(
+            MeanError(
+                quantity, predictor, horizon, nodes, _or_none(rmse_sequence(squared)), _or_none(rmse_pooled(squared))
+            )
+        )
     return rows
 
 
