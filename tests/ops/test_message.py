@@ -123,6 +123,15 @@ def test_values_by_hand():
     torch.testing.assert_close(total, expected, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("out", [20, 64, 131, 300])
+@pytest.mark.parametrize("value", [0.3, 1.1, 1e5 / 3, 1e15 / 3])
+def test_messages_of_equal_channels_are_beta(out, value):
+    edges = random_edges(200, 9, 50)
+    P, Q, e, *encoder, W2, b2, gamma, beta = inputs_of(edges, 24, 16, 3, out)
+    layer = (torch.zeros_like(W2), torch.full_like(b2, value), gamma, beta)
+    assert torch.equal(fused(edges, message_edges)(P, Q, e, *encoder, *layer)[1], beta.expand(len(edges), out))
+
+
 def test_latents_are_added_as_they_are():
     """With one edge a receiver they and their gradient are those of the receiver's share, to the bit."""
     edges = EdgeSet.from_pairs(torch.arange(500) % 7, torch.arange(500), 7, 500)
