@@ -11,8 +11,8 @@ import numpy as np
 
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import Contact
-from ast_sim.mechanics.elements.elasticity import Elasticity
 from ast_sim.mechanics.elements.material import von_mises
+from ast_sim.mechanics.elements.second_order import elastic_body
 from ast_sim.mechanics.frames import MAX_FRAME_ITERATIONS, FrameRecord, Frames, GivenUp
 from ast_sim.mechanics.load_halving import QuasiStatic
 from ast_sim.mechanics.solver import SolverSettings
@@ -126,7 +126,7 @@ class SolidFrames(Frames):
     def __init__(self, case: SolidCase, settings: SolverSettings | None) -> None:
         scene, rest = case.scene, case.scene.rest_position.astype(np.float64)
         self._deforming = np.flatnonzero(case.deforming)
-        self._elasticity = Elasticity(rest, scene.elements[self._deforming], case.material.of(self._deforming))
+        self._elasticity = elastic_body(rest, scene.elements[self._deforming], case.material.of(self._deforming))
         contact = Contact(rest, scene.surface(), scene.body, case.contact, ~scene.deforming_nodes)
         super().__init__(case, QuasiStatic(self._elasticity, contact, scene.prescribed, rest, settings), contact)
         self._reactions = np.zeros_like(rest)
@@ -156,14 +156,16 @@ class SolidFrames(Frames):
         """The arrays of a frame as they are stored."""
         elasticity, deformation = self._elasticity, self.solver.newton.state.potential
         position = self.solver.newton.position.astype(np.float32)
-        tensor = elasticity.cauchy(deformation)
-        mises = von_mises(tensor)
         if self.case.stress_location == "node":
-            return {"position": position, "stress": elasticity.nodal_mean(mises).astype(np.float32)[:, None]}
+            return {
+                "position": position,
+                "stress": elasticity.von_mises(deformation, "node").astype(np.float32)[:, None],
+            }
+        tensor = elasticity.cauchy(deformation)
         components = np.stack([tensor[i, j] for i, j in COMPONENTS], axis=1)
         return {
             "position": position,
-            "stress": self._of_all_elements(mises[:, None]),
+            "stress": self._of_all_elements(von_mises(tensor)[:, None]),
             "cauchy_stress": self._of_all_elements(components),
         }
 
