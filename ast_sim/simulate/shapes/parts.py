@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ast_sim.mechanics.elements.second_order import points_at_rest
 from ast_sim.simulate.shapes.mesh import hexahedral_grid
 
 
@@ -33,6 +34,12 @@ def volumes(position: np.ndarray, elements: np.ndarray) -> np.ndarray:
     """Signed volumes [E] between the corners of the tetrahedra [E,4] or [E,10] over positions [N,3]."""
     corners = position[elements[:, :4]]
     return np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
+
+
+def quarters(position: np.ndarray, elements: np.ndarray) -> np.ndarray:
+    """Signed volumes [4,E] of the quarters around the points of integration of second-order tetrahedra [E,10]; the
+    volumes [1,E] of the tetrahedra [E,4]."""
+    return points_at_rest(position, elements)[0] if elements.shape[1] == 10 else volumes(position, elements)[None]
 
 
 def oriented(position: np.ndarray, elements: np.ndarray) -> np.ndarray:
