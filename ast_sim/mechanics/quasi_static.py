@@ -36,6 +36,17 @@ class SolidRecord(FrameRecord):
     imbalance: float
 
 
+@dataclass(frozen=True, kw_only=True)
+class TurnedRecord(SolidRecord):
+    """A record where the nodes that the reaction is of turn.
+
+    Attributes:
+        torque: of the reaction in newton metres, around the axis of the turn and positive in its sense.
+    """
+
+    torque: float
+
+
 def quasi_static(
     case: SolidCase,
     settings: SolverSettings | None = None,
@@ -130,6 +141,7 @@ class SolidFrames(Frames):
         contact = Contact(rest, scene.surface(), scene.body, case.contact, ~scene.deforming_nodes)
         super().__init__(case, QuasiStatic(self._elasticity, contact, scene.prescribed, rest, settings), contact)
         self._reactions = np.zeros_like(rest)
+        self.record_type = SolidRecord if self.driven.axis is None else TurnedRecord
 
     def next_frame(self) -> tuple[dict[str, np.ndarray], SolidRecord]:
         """See `Frames`."""
@@ -140,12 +152,14 @@ class SolidFrames(Frames):
         reactions = np.where(self.case.scene.prescribed[:, None], newton.reactions(), 0)
         work = 0.5 * float(np.vdot(reactions + self._reactions, newton.position - start))
         self._reactions = reactions
-        return arrays, SolidRecord(
+        turned = {} if self.driven.axis is None else {"torque": self._torque(reactions)}
+        return arrays, self.record_type(
             **cost,
             **checked,
+            **turned,
             residual=newton.residual(),
             contact_area=self.contact.area(newton.state.contact),
-            reaction=float(np.linalg.norm(reactions[self.driven].sum(axis=0))),
+            reaction=float(np.linalg.norm(reactions[self.driven.nodes].sum(axis=0))),
             imbalance=self._imbalance(reactions),
             elastic_energy=newton.state.potential.energy,
             contact_energy=newton.state.contact.barrier_energy(),
@@ -168,6 +182,11 @@ class SolidFrames(Frames):
             "stress": self._of_all_elements(von_mises(tensor)[:, None]),
             "cauchy_stress": self._of_all_elements(components),
         }
+
+    def _torque(self, reactions: np.ndarray) -> float:
+        """See `TurnedRecord`."""
+        nodes = self.driven.nodes
+        return self.driven.axis.torque(self.solver.newton.position[nodes], reactions[nodes])
 
     def _imbalance(self, reactions: np.ndarray) -> float:
         """See `SolidRecord`. If there are hardly any forces, the divisor is the force of a strain of 1e-3."""
