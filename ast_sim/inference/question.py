@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ast_sim.inference.answer import Answer
-from ast_sim.mechanics.case import driven_body
+from ast_sim.mechanics.driven import Driven
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.support.errors import ConfigError, RolloutError
@@ -115,7 +115,7 @@ class Question:
             stress_location=config.stress,
             frames=numbers,
             last_steps=last_steps,
-            driven=driven_body(self.scene, self.prescribed_position),
+            driven=Driven.of(self.scene, self.prescribed_position),
         )
 
 

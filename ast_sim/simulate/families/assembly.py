@@ -34,7 +34,7 @@ DEFAULT_NODES = None
 MINIMUM_NODES = 20
 MINIMUM_FRAMES = 2
 # Units of the solver, pascal and the unit of length, in newton and joule: so many lengths are in a product.
-_POWERS = {"reaction": 2, "elastic_energy": 3, "contact_energy": 3, "dissipation": 3, "work": 3}
+_POWERS = {"reaction": 2, "torque": 3, "elastic_energy": 3, "contact_energy": 3, "dissipation": 3, "work": 3}
 
 
 def info(spec: AssemblySpec) -> dict[str, Any]:
@@ -123,6 +123,8 @@ def in_newton(trajectory: Trajectory, unit: str) -> Trajectory:
     """The trajectory with forces in newton and energies in joule; lengths and areas stay in the unit of length."""
     attributes = dict(trajectory.attributes)
     for name, power in _POWERS.items():
+        if name not in attributes:
+            continue
         attributes[name] = (LENGTH_UNITS[unit] ** power * np.asarray(attributes[name])).tolist()
     return replace(trajectory, attributes=attributes)
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ast_sim.element_topology import MIDDLES
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.importers.places import Place
 from ast_sim.simulate.own_assembly.assembly_spec import (
@@ -22,6 +23,7 @@ from ast_sim.simulate.own_assembly.assembly_spec import (
 from ast_sim.simulate.own_assembly.expressions import nearest
 from ast_sim.simulate.own_assembly.parameters import Values
 from ast_sim.simulate.shapes.cad import gmsh_version, mesh_own_scale
+from ast_sim.simulate.shapes.mesh import second_order, straightened
 from ast_sim.simulate.shapes.mesh_check import BadMesh, check_mesh, check_no_intersections, check_surface, merged
 from ast_sim.simulate.shapes.parts import oriented, volumes
 from ast_sim.support.errors import ConfigError, MissingExtra
@@ -40,7 +42,7 @@ class PartMesh:
     Attributes:
         name: the name of the part and of its file, for messages.
         position: [N,3] float64 in the unit of the specification.
-        cells: [E,4] tetrahedra of positive volume; [F,3] triangles of a rigid surface.
+        cells: [E,4] or [E,10] tetrahedra of positive volume; [F,3] triangles of a rigid surface.
         groups: numbers of the nodes of each named group.
         fields: [N] values of each point field.
     """
@@ -113,7 +115,12 @@ def _request(spec: AssemblySpec, part: PartSpec, values: Values, factor: float) 
     path = spec.file(file)
     changed = path.stat()
     kind = path.suffix.lower()
-    request: dict[str, Any] = {"name": f"{part.name} ({file})", "scale": part.scale, "surface": part.rigid}
+    request: dict[str, Any] = {
+        "name": f"{part.name} ({file})",
+        "scale": part.scale,
+        "surface": part.rigid,
+        "order": spec.order,
+    }
     request["stamp"] = [str(path), changed.st_mtime_ns, changed.st_size]
     if part.size is None:
         return request
@@ -163,7 +170,24 @@ def _from_file(part: PartSpec, request: dict[str, Any]) -> PartMesh:
             raise BadMesh(f"{request['name']}: a corner is not finite")
         position, elements = merged(position, elements)
         fields, groups = {}, {}
-    return _checked(PartMesh(request["name"], position, elements, groups, fields), part.rigid)
+    mesh = PartMesh(request["name"], position, elements, groups, fields)
+    return _checked(_raised(mesh) if request["order"] == 2 and elements.shape[1] == 4 else mesh, part.rigid)
+
+
+def _raised(mesh: PartMesh) -> PartMesh:
+    """The same tetrahedra with nodes in the middles of their edges. A middle is in a group, or marked, if both its ends
+    are."""
+    position, cells = second_order(mesh.position, mesh.cells)
+    ends = np.zeros((len(position) - len(mesh.position), 2), int)
+    ends[cells[:, 4:] - len(mesh.position)] = cells[:, np.array(MIDDLES)]
+
+    def carried(values: np.ndarray) -> np.ndarray:
+        first, second = values[ends].T
+        return np.concatenate([values, np.where((first != 0) & (second != 0), first, 0)])
+
+    inside = {name: np.isin(np.arange(len(mesh.position)), nodes) for name, nodes in mesh.groups.items()}
+    groups = {name: np.flatnonzero(carried(nodes)) for name, nodes in inside.items()}
+    return PartMesh(mesh.name, position, cells, groups, {name: carried(values) for name, values in mesh.fields.items()})
 
 
 def _checked(mesh: PartMesh, rigid: bool) -> PartMesh:
@@ -180,7 +204,9 @@ def _checked(mesh: PartMesh, rigid: bool) -> PartMesh:
             )
         check_no_intersections(position, cells, mesh.name)
         return mesh
-    if np.isfinite(position).all() and (volumes(position, cells) < 0).all():
-        cells = oriented(position, cells)
+    if np.isfinite(position).all():
+        if (volumes(position, cells) < 0).all():
+            cells = oriented(position, cells)
+        position = straightened(position, cells) if cells.shape[1] == 10 else position
     check_mesh(position, cells, mesh.name, SMALLEST_ANGLE)
     return PartMesh(mesh.name, position, cells, mesh.groups, mesh.fields)

@@ -13,7 +13,7 @@ from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
 from ast_sim.simulate.own_assembly.standing import Reference, point
-from ast_sim.simulate.shapes.parts import volumes
+from ast_sim.simulate.shapes.parts import quarters
 from ast_sim.support.errors import SimulationError
 
 ON_A_LINE = 1e-3  # points lie on a line if their second extent, as a share of the first, is below this
@@ -62,7 +62,7 @@ def _check_turned_over(spec: AssemblySpec, case: SolidCase) -> None:
     scene = case.scene
     rows = scene.elements[scene.prescribed[scene.elements].all(axis=1) & case.deforming]
     for frame, position in enumerate(case.targets):
-        wrong = volumes(position, rows) <= 0
+        wrong = (quarters(position, rows) <= 0).any(axis=0)
         if wrong.any():
             first = rows[np.argmax(wrong)]
             name = spec.parts[scene.body[first[0]]].name

@@ -27,6 +27,7 @@ from ast_sim.support.disk import read_text
 from ast_sim.support.errors import ConfigError
 
 DEFAULT_FRAMES = 6
+DEFAULT_ORDER = 2  # linear tetrahedra are several times too stiff where a part bends, and where rubber is pressed
 
 
 def read_spec(path: str | os.PathLike[str]) -> AssemblySpec:
@@ -50,12 +51,14 @@ def read_spec(path: str | os.PathLike[str]) -> AssemblySpec:
 
 
 def _spec(path: Path, text: str, table: Table) -> AssemblySpec:
-    unit, frames = table.text("unit"), table.take("frames", DEFAULT_FRAMES)
+    unit, frames, order = table.text("unit"), table.take("frames", DEFAULT_FRAMES), table.take("order", DEFAULT_ORDER)
     if unit not in LENGTH_UNITS:
         told = "is missing" if unit is None else f"is {unit!r}"
         raise ConfigError(f"unit {told}; say in which unit lengths are: {', '.join(LENGTH_UNITS)}")
     if not isinstance(frames, int) or isinstance(frames, bool) or frames < 2:
         raise ConfigError(f"frames is {frames!r}; must be a whole number of at least 2")
+    if order not in (1, 2) or isinstance(order, bool):
+        raise ConfigError(f"order is {order!r}; must be 2 (tetrahedra of ten nodes) or 1 (of four nodes)")
     named = Table(table.take("parameters", {}), "parameters")
     parameters: dict[str, Parameter] = {}
     for name in named.values:
@@ -74,7 +77,7 @@ def _spec(path: Path, text: str, table: Table) -> AssemblySpec:
     table.known = plain(free)
     pairs = dict(_pair(row, [part.name for part in parts]) for row in table.tables("contact"))
     table.done()
-    spec = AssemblySpec(path, text, unit, frames, distance, pairs, parameters, parts)
+    spec = AssemblySpec(path, text, unit, frames, int(order), distance, pairs, parameters, parts)
     _check_used(spec, free)
     _check_files(spec)
     return spec

@@ -8,7 +8,8 @@ elements), `finer` (boxes [x,y,z low, x,y,z high] with a smaller size) and one o
     "script": path of a .py file, "function" in it and "arguments" of the call `function(gmsh, **arguments)`
     "geo": path of a .geo script, with "arguments": the values of its numbers (DefineConstant)
 
-With "surface", a STEP file without a solid gives triangles. The answer has own_position_i, own_elements_i and, for each
+With "order" 2, tetrahedra have ten nodes, the middles on the surface of the part. With "surface", a STEP file without a
+solid gives triangles. The answer has own_position_i, own_elements_i and, for each
 physical group of a script, own_group_i_NAME: the numbers of its nodes.
 """
 
@@ -45,7 +46,7 @@ def answer(gmsh, parts: list[dict[str, Any]]) -> dict[str, np.ndarray]:
         start(gmsh)
         try:
             solid = _mesh(gmsh, part)
-            position, elements, tags = tetrahedra(gmsh) if solid else triangles(gmsh)
+            position, elements, tags = tetrahedra(gmsh, part["order"]) if solid else triangles(gmsh)
         except Exception as error:  # gmsh raises Exception itself
             raise BadPart(f"{part['name']}: {str(error).strip() or 'gmsh stopped without a message'}") from error
         arrays |= {f"own_position_{i}": position, f"own_elements_{i}": elements}
@@ -92,7 +93,7 @@ def _make(gmsh, part: dict[str, Any], mend: bool) -> bool:
     solid = not part.get("surface") or bool(gmsh.model.getEntities(3))
     if solid:
         one_solid(gmsh)
-        _check_count(gmsh, part["size"])
+        _check_count(gmsh, part["size"], part["order"])
     _set_sizes(gmsh, part["size"], part["finer"])
     return solid
 
@@ -113,11 +114,12 @@ def _run(gmsh, part: dict[str, Any]) -> None:
     gmsh.model.geo.synchronize()
 
 
-def _check_count(gmsh, size: float) -> None:
+def _check_count(gmsh, size: float, order: int) -> None:
     """Refuse a size that gives too many nodes before minutes go into them."""
     if gmsh.model.occ.getEntities(3):
         volume, area = (sum(gmsh.model.occ.getMass(*e) for e in gmsh.model.occ.getEntities(d)) for d in (3, 2))
-        nodes = 0.72 * volume / size**3 + 1.4 * area / size**2
+        between = size / order
+        nodes = 0.72 * volume / between**3 + 1.4 * area / between**2
         if nodes > MOST_NODES:
             raise BadPart(f"elements of the size {size:g} give about {nodes:,.0f} nodes, more than {MOST_NODES:,}")
 
