@@ -61,13 +61,15 @@ def _check_turned_over(spec: AssemblySpec, case: SolidCase) -> None:
     """Elements whose nodes are all prescribed cannot give way."""
     scene = case.scene
     rows = scene.elements[scene.prescribed[scene.elements].all(axis=1) & case.deforming]
-    for frame, position in enumerate(case.targets):
+    followed, stored = case.followed()
+    for row, position in enumerate(followed.targets):
         wrong = volumes(position, rows) <= 0
         if wrong.any():
             first = rows[np.argmax(wrong)]
             name = spec.parts[scene.body[first[0]]].name
             raise BadAssembly(
-                f"{name}: its prescribed nodes turn {wrong.sum()} elements over in frame {frame}, the first at"
+                f"{name}: its prescribed nodes turn {wrong.sum()} elements over on the way to frame"
+                f" {np.searchsorted(stored, row)}, the first at"
                 f" {point(case.targets[0][first].mean(axis=0))}: make the motion smaller"
             )
 

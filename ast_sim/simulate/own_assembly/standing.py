@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ast_sim.importers.shells import find_shells
+from ast_sim.motion_course import Course, MovedNodes
 from ast_sim.scene import AttributeValue, NodeType, Scene
 from ast_sim.simulate.mechanics.case import SolidCase
 from ast_sim.simulate.mechanics.contact_and_friction import ContactSettings
@@ -129,24 +130,21 @@ def case(spec: AssemblySpec, values: Values, frames: int, parts: list[PlacedPart
     )
     law = material[:, :2].astype(np.float64)
     law[law[:, 0] == 0] = law[np.argmax(law[:, 0] > 0)]  # what rigid elements have is ignored, but must be constants
-    targets = _targets(scene, parts, values, frames, np.array(shared.origin))
+    course = _course(scene, parts, values, frames, np.array(shared.origin))
     attributes: dict[str, AttributeValue] = {f"parameter {name}": value for name, value in values.items()}
     attributes["origin"] = list(shared.origin)
-    return SolidCase(scene, targets, NeoHookean(*law.T), contact, "node", attributes)
+    return SolidCase(scene, course.position, NeoHookean(*law.T), contact, "node", attributes, course)
 
 
-def _targets(scene: Scene, parts: list[PlacedPart], values: Values, frames: int, origin: np.ndarray) -> np.ndarray:
-    """[S,N,3] where the prescribed nodes are; free nodes stay at rest."""
-    rest = scene.rest_position.astype(np.float64)
-    targets = np.repeat(rest[None], frames, axis=0)
+def _course(scene: Scene, parts: list[PlacedPart], values: Values, frames: int, origin: np.ndarray) -> Course:
+    """How the prescribed nodes move; free nodes stay at rest."""
+    rest, moved = scene.rest_position.astype(np.float64), []
     for number, part in enumerate(parts):
         of_body = np.flatnonzero(scene.body == number)
-        for move, moved in enumerate(part.part.moves):
-            motion = moved.motion(values)
+        for move, one in enumerate(part.part.moves):
             nodes = of_body[part.moves == move + 1]
-            for frame in range(1, frames):
-                targets[frame, nodes] = motion.at(frame / (frames - 1), rest[nodes] + origin) - origin
-    return targets
+            moved.append(MovedNodes(nodes, rest[nodes], one.motion(values), origin, one.key))
+    return Course.of(rest, scene.prescribed, tuple(moved), frames)
 
 
 def _contact(spec: AssemblySpec, values: Values, shared: Reference) -> ContactSettings:

@@ -80,7 +80,7 @@ WRONG = {
     "two numbers": (MOVE, "move = { translation = ['travel', 0] }", "must be three numbers, such as"),
     "no axis": (MOVE, "move = { rotation = 'travel', axis = [0, 0, 0] }", "parts.punch.move: axis of a motion must be"),
     "turned over": ('fixed = "zmin"', "fixed = 'x<9 and z<3'\nmove = {where='z>3', translation=[0, 0, '-2 * travel']}",
-                    "with travel=1.5.*: block: its prescribed nodes turn .* elements over in frame 2, the first at"),
+                    "with travel=1.5.*: block: its prescribed nodes turn .* elements over on the way to frame 2"),
     "nothing deforms": (SPEC[SPEC.index("young") : SPEC.index("[parts.punch]")], "rigid = true\n", "parts are rigid"),
     "script fails": (*scripted("broken"), "TypeError: broken.. missing 1 required positional argument: 'height'"),
     "script has no such function": (*scripted("brokn"), "block .made.py:brokn.: the script has no function brokn"),
