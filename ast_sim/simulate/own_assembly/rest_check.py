@@ -120,7 +120,8 @@ def gap_between(case: SolidCase, pair: tuple[int, int]) -> float:
 def _contact_of(case: SolidCase, pair: tuple[int, int]) -> Contact:
     faces = np.concatenate([surface_of(case, number) for number in pair])
     rest = case.scene.rest_position.astype(np.float64)
-    return Contact(rest, faces, case.scene.body, ContactSettings(case.contact.dhat, 1.0))
+    settings = ContactSettings(case.contact.dhat, 1.0)
+    return Contact(rest, faces, case.scene.body, settings, ~case.scene.deforming_nodes)
 
 
 def surface_of(case: SolidCase, body: int) -> np.ndarray:
