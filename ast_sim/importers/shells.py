@@ -2,8 +2,8 @@
 
 A scene has elements of one kind, so a shell becomes a thin layer of tetrahedra: each of its nodes gets a second node
 behind it, half a mesh width along the normal, on the side that looks away from the tetrahedra. The shell itself is the
-front of the layer, so contact takes place where it took place in the file. Where the shell closes a thin wall, the layer
-is a third of the wall; where tetrahedra lie behind an open shell, it takes 1/200 of the way to them.
+front of the layer, so contact takes place where it took place in the file. Where the shell closes a thin wall, the
+layer is a third of the wall; where tetrahedra lie behind an open shell, it takes 1/200 of the way to them.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from ast_sim.scene import LOCAL_FACES, connected_parts
 # The layer is so many mean edge lengths thick.
 _THICKNESS = 0.5
 
-# The share of a wall, and of the way to tetrahedra behind a shell, that the layer takes where it would take more than half
-# of the wall or reach the tetrahedra.
+# The share of a wall, and of the way to tetrahedra behind a shell, that the layer takes where it would take more than
+# half of the wall or reach the tetrahedra.
 _OF_WALL, _OF_WAY = 1 / 3, 1 / 200
 
 # Where the normal of a node leads out through another triangle at it, the layer has this share of the usual thickness.
@@ -136,7 +136,7 @@ def _looks_out(points: np.ndarray, triangles: np.ndarray, tetrahedra: np.ndarray
 def _fitting(
     points: np.ndarray, triangles: np.ndarray, tetrahedra: np.ndarray, thickness: np.ndarray, nodes: np.ndarray
 ) -> np.ndarray:
-    """[k]: the thickness behind the `nodes` [k], less where the shells' own walls or tetrahedra are near behind them."""
+    """[k]: the thickness behind the `nodes` [k]; less where the shells' own walls or tetrahedra are near behind."""
     inwards = -_normals(points, triangles)[nodes]
     thickness = np.where(_sticks_out(points, triangles, inwards, nodes), _LEAST * thickness, thickness)
     start = points[nodes] + 1e-3 * thickness[:, None] * inwards  # behind the triangles that meet at the node
@@ -174,8 +174,8 @@ def _way_to(points: np.ndarray, triangles: np.ndarray, start: np.ndarray, direct
 
 
 def _normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """[n, 3]: unit normals at the points; that of a point is the mean of its triangles, weighted with their angles there:
-    weighted with their areas, a long triangle could turn it out of the others."""
+    """[n, 3]: unit normals at the points; that of a point is the mean of its triangles, weighted with their angles.
+    Weighted with their areas, a long triangle could turn it out of the others."""
     normals = np.zeros_like(points)
     for corner in range(3):
         a, b, c = (points[triangles[:, (corner + i) % 3]] for i in range(3))

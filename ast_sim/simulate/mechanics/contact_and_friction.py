@@ -238,8 +238,8 @@ class Contact:
         return collisions
 
     def intersects(self, position: np.ndarray) -> bool:
-        """Whether any two surface triangles intersect, of one body or of two. Rigid bodies may pass through themselves and
-        each other: the layer behind a rigid surface may."""
+        """Whether any two surface triangles intersect, of one body or of two. Rigid bodies may pass through
+        themselves, as the layer behind a rigid surface may, and through each other."""
         return self._ipctk.has_intersections(self._whole_mesh, self._vertices(position), self._broad_phase)
 
     def gap(self, position: np.ndarray) -> float:
