@@ -89,7 +89,7 @@ def _write_pages(evaluation: Evaluation, out: Path) -> None:
     report.write(out / "report.html", [shown], "Deforming plates: predictions by AST")
     median = shown.scenes[(len(shown.scenes) - 1) // 2]
     picture.write(out / "picture.png", median.truth, median.prediction, shown.model, info.length_unit)
-    export.write(out / "prediction.pvd", median.truth, median.prediction, time_step=info.time_step or 1.0)
+    export.write(out / "prediction.pvd", median.truth, median.prediction)
 
 
 def headlines(found: dict[str, Any]) -> list[str]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
 
@@ -163,6 +164,9 @@ class Trajectory:
             a generated dataset keeps in a separate file (`ast_sim.dataset.solver_seconds`).
         cauchy_stress: [S, E, 6] float32, Cauchy stress of each element (xx, yy, zz, xy, yz, zx), or None.
         stress_location: "node" or "element", where the rows of `stress` are; None: the number of rows decides it.
+        frames: the numbers of the S frames in the whole motion, ascending; None: 0 to S - 1.
+        times: the times of the S frames in seconds, ascending; None: they are not known.
+        length_unit: the unit of all positions, such as "mm"; None: it is not known.
     """
 
     scene: Scene
@@ -171,10 +175,37 @@ class Trajectory:
     attributes: dict[str, AttributeValue] = field(default_factory=dict)
     cauchy_stress: np.ndarray | None = None
     stress_location: str | None = None
+    frames: tuple[int, ...] | None = None
+    times: tuple[float, ...] | None = None
+    length_unit: str | None = None
 
     @property
     def num_frames(self) -> int:
         return len(self.position)
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """The numbers of the S frames in the whole motion."""
+        return tuple(range(self.num_frames)) if self.frames is None else self.frames
+
+    def select(self, frames: Iterable[int]) -> Trajectory:
+        """The frames with these numbers, ascending, as a trajectory.
+
+        Raises:
+            DatasetError: a frame is missing; the text names those that are there.
+        """
+        chosen = sorted(set(frames))
+        missing = [number for number in chosen if number not in self.numbers]
+        if missing:
+            raise DatasetError(f"there is no frame {missing[0]}; there are the frames {ranges(self.numbers)}")
+        rows = [self.numbers.index(number) for number in chosen]
+        framed = {name: getattr(self, name) for name in ("position", "stress", "cauchy_stress")}
+        return replace(
+            self,
+            **{name: None if values is None else values[rows] for name, values in framed.items()},
+            frames=tuple(chosen),
+            times=None if self.times is None else tuple(self.times[row] for row in rows),
+        )
 
     @property
     def stress_at(self) -> str:
@@ -204,6 +235,7 @@ class Trajectory:
         if self.num_frames == 0:
             raise DatasetError(f"{name}: a trajectory needs at least one frame")
         require_finite(name, "position", "node", self.position)
+        self._check_numbering(name)
         if stress_location is not None and (self.stress is None) != (stress_location == "none"):
             found = "no stress" if self.stress is None else "stress"
             raise DatasetError(f"{name}: has {found}, but stress_location is {stress_location!r}")
@@ -222,6 +254,29 @@ class Trajectory:
         if self.stress.shape[1] not in rows:
             raise DatasetError(f"{name}: stress has {self.stress.shape[1]} rows; needs {' or '.join(map(str, rows))}")
         require_finite(name, "stress", location or "row", self.stress)
+
+    def _check_numbering(self, name: str) -> None:
+        """Raise DatasetError unless `frames` and `times` have a number for each frame and ascend."""
+        for what, values in (("frames", self.frames), ("times", self.times)):
+            if values is None:
+                continue
+            if len(values) != self.num_frames:
+                raise DatasetError(f"{name}: {what} has {len(values)} numbers for {self.num_frames} frames")
+            if not np.isfinite(values).all() or (np.diff(values) <= 0).any():
+                raise DatasetError(f"{name}: {what} must be finite and ascend: {list(values)}")
+        if self.frames is not None and self.frames[0] < 0:
+            raise DatasetError(f"{name}: frames starts at {self.frames[0]}; the first frame of a motion is 0")
+
+
+def ranges(numbers: Iterable[int]) -> str:
+    """Ascending whole numbers as text: "0 to 5, 8, 10 to 12"."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    return ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs)
 
 
 def connected_parts(elements: np.ndarray, num_nodes: int) -> np.ndarray:

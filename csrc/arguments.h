@@ -68,8 +68,8 @@ static int64_t value_of(const call *c, const dimension *d) {
   return value;
 }
 
-/* Whether an axis may be as long as this. A letter that stands alone binds at first sight; in a sum an absent one is 0.
- */
+/* Whether an axis may be as long as this. A letter that stands alone binds at first sight; in a sum an absent one is
+ * 0. */
 static bool fits(call *c, const dimension *d, int64_t length) {
   int64_t *size = &c->size[d->letter[0]];
   if (*size == UNBOUND && !d->letter[1]) {

@@ -47,8 +47,7 @@ typedef struct {
  * E = 0 and H = 0: nothing of the edges. E = F and H = 0: latents, without an encoder. H = 0 allows no other E. */
 typedef struct {
   int64_t M, S, R;
-  int64_t E, H, F,
-      F2; /* channels: edge features, encoder's hidden layer (0 without an encoder), first layer, messages */
+  int64_t E, H, F, F2; /* channels: edge features, hidden layer of the encoder (0: none), first layer, messages */
   const int64_t *senders, *receivers, *receiver_offsets; /* [M], [M] ascending, [R+1] */
   const float *of_senders, *of_receivers;                /* [S,F], [R,F]: their products with the first layer */
   const float *edge_features;                            /* [M,E]: raw, or without an encoder such products, too */

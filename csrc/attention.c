@@ -1,10 +1,13 @@
 /* Attention: out = dropout(softmax(scale Q K^T)) V for each scene and head, without a Tq x Tk array.
  *
- * Keys come in blocks. With x_j the scores of one query against a block, m their running maximum and l their running
- * sum, m' = max(m, max_j x_j),  p_j = exp(x_j - m'),  l' = l exp(m - m') + sum_j p_j,  o' = o exp(m - m') + sum_j p_j
- * v_j, and out = o / l at the end. The weights carry a factor 2^-shift with 2^shift >= Tk, so l <= 1 and |o| <= max
- * |v|: nothing overflows that the result would not. A row with a NaN or +inf score, or with nothing but -inf, is NaN,
- * as x - max says.
+ * Keys come in blocks. With x_j the scores of one query against a block, m their running maximum, l the running sum of
+ * the weights and o that of the weighted values,
+ *
+ *   m' = max(m, max_j x_j),   p_j = exp(x_j - m'),
+ *   l' = l exp(m - m') + sum_j p_j,   o' = o exp(m - m') + sum_j p_j v_j,   and out = o / l at the end.
+ *
+ * The weights carry a factor 2^-shift with 2^shift >= Tk, so l <= 1 and |o| <= max |v|: nothing overflows that the
+ * result would not. A row with a NaN or +inf score, or with nothing but -inf, is NaN, as x - max says.
  *
  * A task is one scene and head, QUERIES queries and one part of the keys. Only a scene of few tasks and many keys has
  * more than one part; its parts leave (m, l, o), merged in their order by the same formula. All sizes depend on the

@@ -1,7 +1,9 @@
 /* The gradients of attention, its weights recomputed, without a Tq x Tk array.
  *
  * With y = dout, P the weights, Z the dropout factors (0 or 1/keep) and . the product by elements,
+ *
  *   dV = (P . Z)^T y,   dS = P . (Z . (y V^T) - rowsum(y . out)),   dQ = scale dS K,   dK = scale dS^T Q.
+ *
  * P is recomputed as exp(x - m) / l; the log sum exp in one float would be off by 5e-4 where it is 1e4. Where one
  * weight is 1 and the others vanish, dS is exactly 0: both terms are rounded alike. Where one key takes nearly all the
  * weight of a query, its dS is a small difference of large terms; but a row of dS sums to 0. So that key is noted, and
@@ -32,12 +34,11 @@ _Static_assert(CHUNK % SQUARE == 0 && GROUP % (int)GEMM_ROWS == 0 && KEYS % (int
 
 /* How a scene is cut. */
 typedef struct {
-  int64_t q0, queries, k0, keys; /* its rows */
-  bool by_queries;               /* parts are of queries, of which there are more than keys; else of keys */
-  int64_t parts, part_rows;      /* rows of a part */
-  int64_t partial_size,
-      first_partial;         /* floats of a partial gradient: of dq, or of dk and dv; those before this scene */
-  int64_t peaks, first_peak; /* of a head: of all queries, once for each part of the keys; those before */
+  int64_t q0, queries, k0, keys;       /* its rows */
+  bool by_queries;                     /* parts are of queries, of which there are more than keys; else of keys */
+  int64_t parts, part_rows;            /* rows of a part */
+  int64_t partial_size, first_partial; /* floats of a partial gradient, of dq or of dk and dv; and before this scene */
+  int64_t peaks, first_peak;           /* of a head: of all queries, once for each part of the keys; and before */
 } backward_cut;
 
 /* Of a query whose weights are nearly all of one key: that key of the scene, or -1 if it is in no block so far, and the

@@ -54,8 +54,7 @@ AST_INLINE void chain_strip(int64_t n, const bool add, int64_t D, const float *a
 #undef CHAIN_TILE
 }
 
-/* x[row][lane] = a[row] . b[lane] for n rows, chain after chain; raises largest[2], unless NULL, to the maximum of x.
- */
+/* x[row][lane] = a[row] . b[lane] for n rows, chain after chain; raises largest[2], unless NULL, to the maximum. */
 static void scores_product(int64_t n, int64_t D, const float *a, const float *b, float *x, vf *largest) {
   chain_strip(n, false, min64(D, SCORE_DEPTH), a, b, x, D > SCORE_DEPTH ? NULL : largest);
   for (int64_t d = SCORE_DEPTH; d < D; d += SCORE_DEPTH)

@@ -1,10 +1,10 @@
 /* The elastic forces of St. Venant-Kirchhoff tetrahedra, and the product of their Jacobian with a direction.
  *
- * Element e with nodes 0..3 has the rest edges D = [X1 - X0, X2 - X0, X3 - X0] and the edges d = [x1 - x0, x2 - x0, x3
- * - x0]:
+ * Element e with nodes 0..3 has the edges D at rest and the edges d in the guess, as columns:
  *
+ *   D = [X1 - X0, X2 - X0, X3 - X0],  d = [x1 - x0, x2 - x0, x3 - x0],  V = |det D| / 6
  *   F = d D^-1,  A = (d - D) D^-1 = F - I,  2 G = A + A^T + A^T A = F^T F - I,  S = lambda tr(G) I + 2 mu G
- *   [f1, f2, f3] = -V F S D^-T = -sign(det D) / 6  F S cof(D),  f0 = -(f1 + f2 + f3)          V = |det D| / 6
+ *   [f1, f2, f3] = -V F S D^-T = -sign(det D) / 6 F S cof(D),  f0 = -(f1 + f2 + f3)
  *
  * and in a direction v of the positions, with dF = dv D^-1:
  *

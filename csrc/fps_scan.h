@@ -83,8 +83,7 @@ AST_INLINE uint32_t FPS(near)(const FPS(scene) * scene, const COORDINATE *box, T
   return bits;
 }
 
-/* Shows block b, whose bound is `bound`, the samples that it has not seen of the first `taken`; returns its new bound.
- */
+/* Shows block b those of the first `taken` samples that it has not seen; `bound` is its bound; returns the new one. */
 static T FPS(update)(const FPS(scene) * scene, int64_t b, T bound, int64_t taken) {
   const COORDINATE *box = scene->boxes + 6 * b;
   int64_t list[128];
@@ -150,8 +149,7 @@ static int64_t FPS(find)(const FPS(scene) * scene, int64_t b, T distance) {
 }
 
 /* Writes the indices of the samples, from `begin` on, until there are num or all distances are 0. Returns their number,
- * 0 without memory.
- */
+ * 0 without memory. */
 static int64_t FPS(sample)(const int32_t *coordinates, int64_t n, const int32_t origin[3], int64_t begin, int64_t num,
                            int64_t *indices) {
   FPS(scene) scene;

@@ -3,8 +3,8 @@
  *   z = x W^T + bias,   out = act(z) + residual
  *   dz = act'(z) . dout,   dx = dz W,   dW = dz^T x,   dbias = the sum of the rows of dz
  *
- * with act(z) = z, max(0, z), or a . gelu(b) for z = [a, b] (Shazeer, GLU variants improve transformer, 2020), gelu(b)
- * = b Phi(b).
+ * with act(z) = z, max(0, z), or a . gelu(b) for z = [a, b] (Shazeer, GLU variants improve transformer, 2020), where
+ * gelu(b) = b Phi(b).
  *
  * Forward, a task owns a block of rows and some panels of columns. The gradient of W is a sum over rows, cut by the
  * shapes alone, in one of two ways. By rows: a task owns a chunk of rows, and while a block of them lies in the cache

@@ -1,10 +1,11 @@
 /* Message passing over the edges of a graph, fused: no array of the width of a feature is written per edge.
  *
- *   h_m = relu(A1 e_m + a1)                          edge encoder, absent if H = 0
- *   x_m = relu(P_s(m) + Q_r(m) + A2 h_m)             first layer; P and Q are its products with senders and receivers
- *   x_m = relu(P_s(m) + Q_r(m) + e_m)                the same where e_m, of F channels, is its product with latents of
- * the edges y_m = W2 x_m + b2                                second layer out_m = gamma (y_m - mean y_m) / sqrt(var y_m
- * + eps) + beta,     sum_r = sum of out_m over the edges m into r
+ *   h_m = relu(A1 e_m + a1)                  the edge encoder, absent if H = 0
+ *   x_m = relu(P_s(m) + Q_r(m) + A2 h_m)     the first layer; P and Q are its products with senders and receivers
+ *   x_m = relu(P_s(m) + Q_r(m) + e_m)        or this; e_m, of F channels, is its product with latents of the edges
+ *   y_m = W2 x_m + b2                        the second layer
+ *   out_m = gamma (y_m - mean y_m) / sqrt(var y_m + eps) + beta
+ *   sum_r = sum of out_m over the edges m into r
  *
  * Edges are sorted by receiver. A task owns a range of receivers with about the same number of edges as any other and
  * goes through them in tiles of MESSAGE_TILE edges, whose h, x and y stay in the second-level cache; while it

@@ -2,10 +2,10 @@
  * u_m = (y_m - mean) / sd and <.> the mean over channels:
  *
  *   dgamma = sum_m g_m u_m,   dbeta = sum_m g_m,   p_m = gamma g_m,   dy_m = (p_m - <p_m> - u_m <p_m u_m>) / sd_m
- *   dW2 = sum_m dy_m x_m^T,   db2 = sum_m dy_m,   dz_m = (z_m > 0) W2^T dy_m,         x_m = relu(z_m)
- *   dA2 = sum_m dz_m h_m^T,   dc_m = (h_m > 0) A2^T dz_m,   dA1 = sum_m dc_m e_m^T,   da1 = sum_m dc_m,   de_m = A1^T
- * dc_m de_m = dz_m                                                                       where e_m is added as it is
- *   dP_s = sum of dz_m over the edges from step,   dQ_r = sum of dz_m over the edges into r
+ *   dW2 = sum_m dy_m x_m^T,   db2 = sum_m dy_m,    dz_m = (x_m > 0) W2^T dy_m
+ *   dA2 = sum_m dz_m h_m^T,   dc_m = (h_m > 0) A2^T dz_m
+ *   dA1 = sum_m dc_m e_m^T,   da1 = sum_m dc_m,    de_m = A1^T dc_m, or de_m = dz_m where e_m is added as it is
+ *   dP_s = sum of dz_m over the edges from s,      dQ_r = sum of dz_m over the edges into r
  *
  * Edges come in rounds. First the tasks of a round, each a run of tiles, put dz into a buffer and add to weight
  * gradients of their own, of which there are at most ROUND_TASKS. Then other tasks add the rows of the buffer to dQ,

@@ -4,14 +4,14 @@
  *   h = max(0, [x, beside] W1^T + bias1),   y = h W2^T + bias2,   n = (y - mean(y)) / sqrt(var(y) + eps)
  *   out = gamma . n + beta + residual       (without norm: y + residual)
  *
- * Rows are taken in blocks that stay in the cache with all their intermediate values. Backward, with r = 1 / sqrt(var +
- * eps),
+ * Rows are taken in blocks that stay in the cache with all their intermediate values. Backward, with
+ * r = 1 / sqrt(var(y) + eps),
  *
  *   dn = gamma . dout,   dy = r (dn - mean(dn) - n mean(dn . n)),   dz = [h > 0] . (dy W2)
- *   dW2 = dy^T h,   dW1 = dz^T [x, beside],   d[x, beside] = dz W1,   the other gradients sums of rows of dy, dz, dout
- * and dout . n,
+ *   dW2 = dy^T h,        dW1 = dz^T [x, beside],                    d[x, beside] = dz W1
+ *   dgamma, dbeta, dbias2, dbias1 = the sums of the rows of dout . n, dout, dy, dz
  *
- * h, n and r of a block are computed again, or read if the caller kept them. Sums over rows go chunk by chunk
+ * where h, n and r of a block are computed again, or read if the caller kept them. Sums over rows go chunk by chunk
  * (weight_panels.h): they do not depend on the threads, and a row's results depend on that row alone.
  *
  * Cost: 2 M H (I + I2 + O) operations forward and 4 M H (I + I2 + O) backward, 2 M H (I + I2 + O) more if nothing was

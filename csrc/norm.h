@@ -1,8 +1,7 @@
 /* LayerNorm of rows y of n channels, in both directions, for mlp.c and message.c.
  *
- *   u = (y - mean(y)) / sd,   out = gamma . u + beta,                         sd = sqrt(var(y) + eps)
- *   p = gamma . dout,         dy = (p - mean(p) - u mean(p . u)) / sd,        dgamma = sum of dout . u,   dbeta = sum
- * of dout
+ *   u = (y - mean(y)) / sd,   sd = sqrt(var(y) + eps),   out = gamma . u + beta
+ *   p = gamma . dout,   dy = (p - mean(p) - u mean(p . u)) / sd,   dgamma = sum of dout . u,   dbeta = sum of dout
  *
  * The variance is the mean of squared differences to the mean, in a second pass over a row in the cache. Rows are
  * readable and writable up to whole vectors; `whole`, a constant, says that n is a multiple of VW, so that no vector

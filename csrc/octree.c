@@ -112,8 +112,7 @@ static ast_status octree_coordinates(const int64_t *restrict keys, int64_t C, in
 
 /* ---- sort ---- */
 
-/* Rows to sort by key, stably: one word key << index_bits | index where that fits in 64 bits, else a key and an index.
- */
+/* Rows to sort by key, stably: a word key << index_bits | index where that fits in 64 bits, else a key and an index. */
 typedef struct {
   const int64_t *offsets;
   int64_t N;

@@ -1,9 +1,9 @@
 /* The pairs of the stride-2 convolution between a level of an octree and the next coarser one.
  *
- * Kernel offset k = 9(a+1) + 3(b+1) + (c+1) pairs the coarse cell P with the fine cell 2P + (a,b,c). Along one axis a =
- * 0 if the fine cell is even, and a = +1 (P its parent) or -1 (P the parent's successor) if it is odd. So P pairs with
- * child `octant` of the cell Q at P - (i,j,k) if the octant has the bits d = 4i+2j+k, at (a,b,c) = octant - 2 (i,j,k):
- * a kernel offset is such a pair (octant, d).
+ * Kernel offset k = 9(a+1) + 3(b+1) + (c+1) pairs the coarse cell P with the fine cell 2P + (a,b,c). Along one
+ * axis a = 0 if the fine cell is even, and a = +1 (P its parent) or -1 (P the parent's successor) if it is odd. So P
+ * pairs with child `octant` of the cell Q at P - (i,j,k) if the octant has the bits d = 4i+2j+k, at
+ * (a,b,c) = octant - 2 (i,j,k): a kernel offset is such a pair (octant, d).
  *
  * The pairs of a group are written with P rising, by chunks of P whose places coarsen.c has counted. With d = 0 the
  * fine cell is a child of P and rises too, so the other order is the same. With d > 0 the fine cells of a group are

@@ -118,8 +118,7 @@ AST_INLINE float vsum(vf x) {
 
 /* ---- functions, whose bounds in units in the last place are the table of tests/test_simd.c ---- */
 
-/* ln 2 = LN2 + LN2_REST; LN2 has 17 bits, so that n LN2 is exact for |n| <= 127, with or without FMA (Cody and Waite)
- */
+/* ln 2 = LN2 + LN2_REST; LN2 has 17 bits, so that n LN2 is exact for |n| <= 127, with or without FMA (Cody, Waite). */
 #if defined(__FMA__) || defined(__ARM_FEATURE_FMA)
 enum { FUSED = 1 }; /* whether a product and a sum are rounded once */
 #else

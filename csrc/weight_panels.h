@@ -37,8 +37,7 @@ typedef struct {
   float *panels_bias; /* [panels][GEMM_COLUMNS] */
 } dense_layer;
 
-/* y = x W^T + bias with W [N,K], and dx = dy W of N of its columns, with W [K,row]; a NULL weight leaves the layer out.
- */
+/* y = x W^T + bias with W [N,K], and dx = dy W of N columns of W [K,row]; a NULL weight leaves the layer out. */
 AST_INLINE dense_layer dense_forward(const float *weight, const float *bias, int64_t K, int64_t N) {
   return (dense_layer){.weight = weight, .row = 1, .column = K, .bias = bias, .K = K, .N = N};
 }

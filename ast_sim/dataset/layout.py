@@ -32,6 +32,7 @@ ARRAYS: dict[str, tuple[type, int]] = {
 }
 OPTIONAL = ("material", "stress", "cauchy_stress")
 FRAMED = ("position", "stress", "cauchy_stress")
+NUMBERING = ("frames", "times")  # attributes of a trajectory that tell of its frames; they may be missing
 LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}  # in metres
 GIVEN_FRAMES = {"quasi_static": 1, "dynamic": 2}  # by integration: the first frames, from which a prediction starts
 _LOCATIONS = ("none", "node", "element")
@@ -80,6 +81,10 @@ class DatasetInfo:
             raise DatasetError(f"{name}: domain_center, domain_half_width, contact_radius and time_step must be finite")
         if self.domain_half_width <= 0 or self.contact_radius < 0 or self.time_step < 0:
             raise DatasetError(f"{name}: domain_half_width must be above 0, contact_radius and time_step at least 0")
+
+    def times(self, frames: Iterable[int]) -> tuple[float, ...] | None:
+        """The times of frames in seconds, by their numbers; None if frames have no time."""
+        return tuple(self.time_step * number for number in frames) if self.time_step else None
 
     def attributes(self) -> dict[str, Any]:
         """The attributes of the file's root."""

@@ -27,6 +27,7 @@ from ast_sim.dataset.layout import (
     FRAMED,
     HASH,
     LENGTH_UNITS,
+    NUMBERING,
     OPTIONAL,
     SPLITS,
     VERSION,
@@ -137,10 +138,30 @@ class Dataset:
         return position[start:stop], None if stress is None else stress[start:stop]
 
     def load(self, split: str, index: int) -> Trajectory:
-        """A whole trajectory without its `cauchy_stress`: that is large, so `cauchy_stress` reads it separately."""
+        """A trajectory without its `cauchy_stress`, which is large; `dataset[split][index]` has it."""
         position, stress = self.frames(split, index, 0, self.num_frames(split, index))
-        scene, attributes = self.scene(split, index), self.attributes(split, index)
-        return Trajectory(scene, position, stress, attributes, stress_location=self.info.stress_location)
+        trajectory = Trajectory(
+            self.scene(split, index),
+            position,
+            stress,
+            self.attributes(split, index),
+            stress_location=self.info.stress_location,
+            **self._numbering(split, index),
+            length_unit=self.info.length_unit,
+        )
+        trajectory._check_numbering(self._name(split, index))
+        return trajectory
+
+    def _numbering(self, split: str, index: int) -> dict[str, tuple | None]:
+        """The numbers and the times of the frames of a trajectory. Without times of its own, they follow from the time
+        step of the dataset."""
+        stored = self._file.attributes(self._group(split, index))
+        with self._file.reading(f"{self._name(split, index)}: the numbers of its frames"):
+            frames = tuple(int(number) for number in stored["frames"]) if "frames" in stored else None
+            times = tuple(stored["times"]) if "times" in stored else None
+        if times is None:
+            times = self.info.times(range(self.num_frames(split, index)) if frames is None else frames)
+        return {"frames": frames, "times": times}
 
     def fingerprint(self) -> str:
         """The SHA-256 of what the dataset says of itself and of the hashes of all its trajectories."""
@@ -177,7 +198,7 @@ class Dataset:
         found = self._file.attributes(self._group(split, index))
         if "origin" in found:
             found["origin"] = (self._scale * np.asarray(found["origin"])).tolist()
-        return {key: value for key, value in found.items() if key != HASH}
+        return {key: value for key, value in found.items() if key != HASH and key not in NUMBERING}
 
     def _first_kind(self) -> tuple[int, int]:
         split = next((split for split in SPLITS if self.splits[split]), None)
@@ -311,4 +332,6 @@ class Split(Sequence[Trajectory]):
     def __getitem__(self, index: int | slice) -> Trajectory | Split:
         if isinstance(index, slice):
             return Split(self._dataset, self.name, self._indices[index])
-        return self._dataset.load(self.name, self._indices[index])
+        number = self._indices[index]
+        cauchy_stress = self._dataset.cauchy_stress(self.name, number)
+        return replace(self._dataset.load(self.name, number), cauchy_stress=cauchy_stress)

@@ -67,6 +67,10 @@ class DatasetWriter:
         name = f"{split}/{self.counts[split]:06d}"
         trajectory.check(f"{self.path}: {name}", self.info.stress_location)
         self._kind = require_kind(f"{self.path}: {name}", trajectory.scene, self._kind)
+        if trajectory.length_unit not in (None, self.info.length_unit):
+            raise DatasetError(
+                f"{self.path}: {name} has lengths in {trajectory.length_unit}, the dataset in {self.info.length_unit}"
+            )
         with self._writing():
             group = self._file.create_group(name)
             hashes: dict[str, str] = {}
@@ -77,10 +81,16 @@ class DatasetWriter:
                     stored = group.create_dataset(key, data=array, chunks=chunks, fletcher32=True)
                     hashes[key] = array_hash(array.dtype, array.shape, [array])
                     write_attributes(stored, {HASH: hashes[key]})
-            write_attributes(group, {"status": "complete", **trajectory.attributes})
+            write_attributes(group, {"status": "complete", **trajectory.attributes, **self._numbering(trajectory)})
             attributes = {key: plain_value(value) for key, value in group.attrs.items()}
             write_attributes(group, {HASH: trajectory_hash(hashes, attributes)})
         self.counts[split] += 1
+
+    def _numbering(self, trajectory: Trajectory) -> dict[str, tuple]:
+        """The numbers and the times of the frames, if a reader could not tell them without."""
+        usual = {"frames": tuple(range(trajectory.num_frames)), "times": self.info.times(trajectory.numbers)}
+        given = {key: getattr(trajectory, key) for key in usual}
+        return {key: value for key, value in given.items() if value is not None and value != usual[key]}
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:

@@ -11,8 +11,8 @@ import numpy as np
 
 from ast_sim.dataset.layout import LENGTH_UNITS, DatasetInfo
 from ast_sim.dataset.writer import DatasetWriter
+from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.scene import AttributeValue, Scene, Trajectory
-from ast_sim.simulate.mechanics.linearised_contact import STILL
 from ast_sim.support.errors import AstSimError
 from ast_sim.view import export, sweep_files
 from ast_sim.view.files import make_folder
@@ -79,12 +79,19 @@ class Answer:
             "status": "complete" if self.failure is None else "truncated",
             **self.source,
             "given_frames": self.given,
-            "frames": list(self.frames),
             "model_seconds": list(self.step_seconds),
             **({"last_newton_steps": list(self.last_steps)} if self.last_steps else {}),
         }
-        location = None if self.stress is None else self.stress_location
-        return Trajectory(self.scene, self.position, self.stress, attributes, stress_location=location)
+        return Trajectory(
+            self.scene,
+            self.position,
+            self.stress,
+            attributes,
+            stress_location=None if self.stress is None else self.stress_location,
+            frames=self.frames,
+            times=None if self.info is None else self.info.times(self.frames),
+            length_unit=None if self.info is None else self.info.length_unit,
+        )
 
     def reaction(self) -> np.ndarray | None:
         """[S, 3] the force in newton that moves the prescribed nodes of the body `driven`.
@@ -94,7 +101,7 @@ class Answer:
         """
         if self.info is None or self.info.family not in ELASTIC or self.scene.material is None:
             return None
-        from ast_sim.simulate.own_assembly.reaction import Reaction
+        from ast_sim.mechanics.reaction import Reaction
 
         scale, force = LENGTH_UNITS[self.info.length_unit] ** 2, Reaction(self.scene, self.driven)
         return scale * np.array([force.of(position) for position in self.position]).reshape(-1, 3)
@@ -152,4 +159,4 @@ class Answer:
             sweep_files.write_table(path, rows)
         else:
             shown = (self.trajectory, None) if truth is None else (truth, self.trajectory)
-            export.write(path, *shown, time_step=self.info.time_step or 1.0)
+            export.write(path, *shown)

@@ -20,10 +20,10 @@ from ast_sim.inference.effort import Effort
 from ast_sim.inference.jump import calls
 from ast_sim.inference.predict import answers
 from ast_sim.inference.question import Question
+from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.models.simulator import Simulator
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.jobs.rival import Rivals, cheapest, deepest_frame, rivals
-from ast_sim.simulate.mechanics.linearised_contact import STILL
 from ast_sim.support.errors import SimulationError
 
 

@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.mechanics.linearised_contact import CLEARANCE, NewtonSteps
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.scene import Scene
-from ast_sim.simulate.mechanics.linearised_contact import CLEARANCE, NewtonSteps
-from ast_sim.simulate.mechanics.material import NeoHookean
 from ast_sim.support.errors import ConfigError
 
 GOOD = 0.02  # a relative error that most users call exact

@@ -26,9 +26,9 @@ from ast_sim.inference.answer import Answer
 from ast_sim.inference.effort import AGAIN, MOST_NEWTON_STEPS, Effort, newton_steps
 from ast_sim.inference.predict_batch import Start, predict_batch
 from ast_sim.inference.question import Question, not_finite, too_far
+from ast_sim.mechanics.linearised_contact import STILL, NewtonSteps
 from ast_sim.models.simulator import Simulator
 from ast_sim.scene import Scene
-from ast_sim.simulate.mechanics.linearised_contact import STILL, NewtonSteps
 from ast_sim.support.errors import RolloutError, SimulationError
 
 BATCH_NODES = 4096  # frames are predicted together as long as they have at most about so many nodes

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from ast_sim.inference.answer import Answer
+from ast_sim.mechanics.case import driven_body
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.scene import Scene, Trajectory
-from ast_sim.simulate.mechanics.case import driven_body
 from ast_sim.support.errors import RolloutError
 
 

@@ -12,9 +12,9 @@ from typing import Any
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.assembly_questions import ask
 from ast_sim.inference.effort import Effort, friction_is_drawn
+from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.runs.scope import Scope
-from ast_sim.simulate.mechanics.linearised_contact import STILL
 from ast_sim.support.errors import ConfigError
 from ast_sim.view import sweep_files
 from ast_sim.view.files import make_folder

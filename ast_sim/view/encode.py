@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ast_sim.scene import Scene, Trajectory
+from ast_sim.scene import Scene, Trajectory, ranges
+from ast_sim.support.errors import AstSimError
 from ast_sim.view.fields import displacement_rmse, is_planar, require_same_scene, stress_rmse, surface_owners
 
 Json = dict[str, Any]
@@ -70,11 +71,16 @@ def encode_scene(truth: Trajectory, frames: np.ndarray, predictions: Sequence[Tr
     for prediction in predictions:
         if prediction is not None:
             require_same_scene(truth, prediction)
+            if prediction.numbers != truth.numbers[: prediction.num_frames]:
+                raise AstSimError(
+                    f"a page shows frames from the first one on, but the prediction has {ranges(prediction.numbers)}:"
+                    " predict all frames"
+                )
     surface = Surface(truth.scene)
     low, high = _bounds(truth)
-    ranges = {"displacement": _displacement_range(truth, surface)}
+    scales = {"displacement": _displacement_range(truth, surface)}
     if truth.stress is not None and len(surface.groups["body"][1]):
-        ranges["stress"] = _color_range(surface.stress(truth))
+        scales["stress"] = _color_range(surface.stress(truth))
     return {
         "planar": is_planar(truth.scene),
         "total": truth.num_frames,
@@ -83,7 +89,7 @@ def encode_scene(truth: Trajectory, frames: np.ndarray, predictions: Sequence[Tr
         "low": low.tolist(),
         "high": high.tolist(),
         "stress": truth.stress_at,
-        "ranges": ranges,
+        "ranges": scales,
         "truth": surface.motion(truth, frames),
         "predictions": [None if p is None else surface.motion(p, frames) for p in predictions],
     }

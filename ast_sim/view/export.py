@@ -22,27 +22,23 @@ VTK_TRIANGLE, VTK_TETRA = 5, 10
 CELL_NAME = {3: "triangle", 4: "tetra"}
 
 
-def write(
-    path: str | os.PathLike[str],
-    trajectory: Trajectory,
-    prediction: Trajectory | None = None,
-    time_step: float = 1.0,
-) -> None:
+def write(path: str | os.PathLike[str], trajectory: Trajectory, prediction: Trajectory | None = None) -> None:
     """Write a trajectory for ParaView; with `prediction`, write the prediction and its errors instead.
 
     The suffix chooses the format. `.pvd` is a collection; a folder of the same name beside it holds one binary VTU file
-    a frame. `.vtkhdf` is one file (VTKHDF 2.0, temporal UnstructuredGrid, the mesh stored once). Frame i stands at the
-    time i * time_step.
+    a frame. `.vtkhdf` is one file (VTKHDF 2.0, temporal UnstructuredGrid, the mesh stored once). A frame stands at its
+    time; where times are not known, at its number.
 
-    Point fields: displacement [m, from rest], node_type, body; von_mises [Pa] at nodes or cells, wherever the stress
-    lives. With a prediction, the geometry is the predicted one, and the fields error (vector), error_magnitude and
-    von_mises_error are added. All errors are prediction minus truth. If the prediction is shorter, frames beyond its
-    end are left out.
+    Point fields: displacement (from rest, in the unit of the positions), node_type, body; von_mises [Pa] at nodes or
+    cells, wherever the stress is. With a prediction, the geometry is the predicted one, and the fields error (vector),
+    error_magnitude and von_mises_error are added. All errors are prediction minus truth. Frames that the prediction
+    does not have are left out.
 
     No half-written file is ever left under the final name.
 
     Raises:
-        AstSimError: the suffix is not supported, the prediction is of another scene, or the file cannot be written.
+        AstSimError: the suffix is not supported, the prediction is of another scene or has a frame that the truth does
+            not have, or the file cannot be written.
     """
     path = Path(path)
     writers = {".pvd": _write_pvd, ".vtkhdf": _write_vtkhdf}
@@ -50,10 +46,10 @@ def write(
         raise AstSimError(f"{path}: cannot export to {path.suffix or 'no suffix'!r}; use {' or '.join(writers)}")
     shown = fields(trajectory, prediction)
     with explained(path):
-        writers[path.suffix](output_file(path), trajectory.scene.elements, shown, time_step)
+        writers[path.suffix](output_file(path), trajectory.scene.elements, shown)
 
 
-def _write_pvd(path: Path, elements: np.ndarray, shown: Fields, time_step: float) -> None:
+def _write_pvd(path: Path, elements: np.ndarray, shown: Fields) -> None:
     folder = path.with_suffix("")
     if not is_utf8(folder.name):
         raise AstSimError(f"{path}: a .pvd file cannot hold a name that is not UTF-8: choose another name, or .vtkhdf")
@@ -62,8 +58,8 @@ def _write_pvd(path: Path, elements: np.ndarray, shown: Fields, time_step: float
         for frame, name in enumerate(names):
             _write_vtu(temporary / name, elements, shown, frame)
     lines = [
-        f'    <DataSet timestep="{frame * time_step!r}" part="0" file="{_escape(folder.name)}/{name}"/>'
-        for frame, name in enumerate(names)
+        f'    <DataSet timestep="{time!r}" part="0" file="{_escape(folder.name)}/{name}"/>'
+        for time, name in zip(shown.times.tolist(), names, strict=True)
     ]
     head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">\n  <Collection>'
     with replacing(path) as temporary:
@@ -102,13 +98,13 @@ def _replacing_folder(folder: Path) -> Iterator[Path]:
             shutil.rmtree(leftover, ignore_errors=True)
 
 
-def _write_vtkhdf(path: Path, elements: np.ndarray, shown: Fields, time_step: float) -> None:
+def _write_vtkhdf(path: Path, elements: np.ndarray, shown: Fields) -> None:
     with replacing(path) as temporary, h5py.File(temporary, "w") as file:
         root = file.create_group("VTKHDF")
         root.attrs["Version"] = np.array([2, 0], dtype=np.int64)
         root.attrs.create("Type", b"UnstructuredGrid", dtype=h5py.string_dtype("ascii", len("UnstructuredGrid")))
         _write_mesh(root, elements, shown.position)
-        _write_steps(root, shown, time_step)
+        _write_steps(root, shown)
 
 
 def _write_mesh(root: h5py.Group, elements: np.ndarray, position: np.ndarray) -> None:
@@ -124,13 +120,13 @@ def _write_mesh(root: h5py.Group, elements: np.ndarray, position: np.ndarray) ->
     root.create_dataset("Points", data=position.reshape(frames * nodes, 3), chunks=(nodes, 3), compression="gzip")
 
 
-def _write_steps(root: h5py.Group, shown: Fields, time_step: float) -> None:
+def _write_steps(root: h5py.Group, shown: Fields) -> None:
     """Write the times, and where the points and fields of each step start in the arrays of all steps in a row."""
     frames, nodes = shown.position.shape[:2]
     start, zero = np.arange(frames, dtype=np.int64), np.zeros(frames, dtype=np.int64)
     steps = root.create_group("Steps")
     steps.attrs["NSteps"] = np.int64(frames)
-    steps["Values"] = np.arange(frames) * float(time_step)
+    steps["Values"] = shown.times
     steps["NumberOfParts"] = zero + 1
     steps["PartOffsets"] = zero
     steps["PointOffsets"] = start * nodes

@@ -16,12 +16,14 @@ class Fields:
 
     Attributes:
         position: [S, N, 3], where the nodes are drawn.
+        times: [S] float64, in seconds; where they are not known, the numbers of the frames.
         static: name -> [N], constant in time.
         point: name -> [S, N] or [S, N, 3].
         cell: name -> [S, E].
     """
 
     position: np.ndarray
+    times: np.ndarray
     static: dict[str, np.ndarray]
     point: dict[str, np.ndarray]
     cell: dict[str, np.ndarray]
@@ -30,26 +32,27 @@ class Fields:
 def fields(truth: Trajectory, prediction: Trajectory | None = None) -> Fields:
     """The fields of a trajectory. With a prediction of it, the fields of the prediction and its errors.
 
-    Displacements start at the rest positions. Errors are prediction minus truth. A prediction that is shorter than the
-    truth gives as many frames as it has.
+    Displacements start at the rest positions. Errors are prediction minus truth, frame by frame of the same number. A
+    prediction may have some of the frames of the truth.
     """
     shown = truth if prediction is None else prediction
     if prediction is not None:
         require_same_scene(truth, prediction)
-    frames = min(truth.num_frames, shown.num_frames)
-    position = shown.position[:frames]
+        truth = truth.select(prediction.numbers)
+    position = shown.position
     point = {"displacement": position - truth.scene.rest_position}
     cell: dict[str, np.ndarray] = {}
     if prediction is not None:
-        point["error"] = position - truth.position[:frames]
+        point["error"] = position - truth.position
         point["error_magnitude"] = np.linalg.norm(point["error"], axis=2)
     if shown.stress is not None:
         place = point if shown.stress_at == "node" else cell
-        place["von_mises"] = shown.stress[:frames, :, 0]
+        place["von_mises"] = shown.stress[:, :, 0]
         if prediction is not None and truth.stress_at == shown.stress_at:
-            place["von_mises_error"] = place["von_mises"] - truth.stress[:frames, :, 0]
+            place["von_mises_error"] = place["von_mises"] - truth.stress[:, :, 0]
     static = {"node_type": truth.scene.node_type, "body": truth.scene.body}
-    return Fields(position, static, point, cell)
+    times = np.array(shown.numbers if shown.times is None else shown.times, np.float64)
+    return Fields(position, times, static, point, cell)
 
 
 def require_same_scene(truth: Trajectory, prediction: Trajectory) -> None:

@@ -45,9 +45,10 @@ def write(
     """
     path = Path(path)
     require_same_scene(truth, prediction)
-    frames = min(truth.num_frames, finite_frames(prediction))
+    frames = finite_frames(prediction)
     if frames == 0:
         raise AstSimError("the prediction has no frame that could be drawn")
+    truth = truth.select(prediction.numbers)
     moved = np.linalg.norm(truth.position[:frames] - truth.scene.rest_position, axis=2)
     frame = int(moved[:, truth.scene.deforming_nodes].max(axis=1, initial=0.0).argmax())
     figure = _figure(truth, prediction, frame, model, length_unit)

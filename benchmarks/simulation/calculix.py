@@ -15,10 +15,10 @@ from time import perf_counter
 
 import numpy as np
 
+from ast_sim.mechanics.case import SolidCase
 from ast_sim.scene import NodeType, Trajectory
 from ast_sim.simulate.calculix import solve as calculix
 from ast_sim.simulate.families import abcd
-from ast_sim.simulate.mechanics.case import SolidCase
 
 CRUSH = 0.2
 # What the two solvers must agree in, at the last frame.

@@ -18,9 +18,9 @@ import numpy as np
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import read_seconds
+from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.jobs.generate import generate
-from ast_sim.simulate.mechanics.contact_and_friction import Contact, ContactSettings
 from ast_sim.support.provenance import provenance
 
 COUNT = 40

@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from ast_sim.simulate.mechanics.unfinished import Checkpoint
+from ast_sim.mechanics.unfinished import Checkpoint
 from ast_sim.support.disk import write_json
 from ast_sim.support.provenance import provenance
 

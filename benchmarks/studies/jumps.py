@@ -20,7 +20,7 @@ import numpy as np
 import ast_sim
 from ast_sim.inference.asked_frame import asked_frames
 from ast_sim.inference.effort import MOST_NEWTON_STEPS, Effort, knows_material
-from ast_sim.simulate.mechanics.linearised_contact import STILL
+from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
 from benchmarks.studies.phrases import beside_solver, over_the_scenes

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
+from ast_sim.mechanics.elements.elasticity import Elasticity
+from ast_sim.mechanics.solver import Newton, SolverSettings
 from ast_sim.scene import Scene
-from ast_sim.simulate.mechanics.contact_and_friction import Contact, ContactSettings
-from ast_sim.simulate.mechanics.elasticity import Elasticity
-from ast_sim.simulate.mechanics.solver import Newton, SolverSettings
 from ast_sim.simulate.shapes import mesh
 
 

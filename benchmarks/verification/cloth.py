@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from ast_sim.mechanics.contact_and_friction import ContactSettings
+from ast_sim.mechanics.dynamics import BackwardEuler, ClothCase, DynamicSettings
+from ast_sim.mechanics.elements.cloth import Cloth, ClothMaterial
 from ast_sim.scene import NodeType, Scene
 from ast_sim.simulate.families.sphere_simple import icosphere
-from ast_sim.simulate.mechanics.cloth import Cloth, ClothMaterial
-from ast_sim.simulate.mechanics.contact_and_friction import ContactSettings
-from ast_sim.simulate.mechanics.dynamics import BackwardEuler, ClothCase, DynamicSettings
 from benchmarks.verification.bodies import sheet
 from benchmarks.verification.derivatives import Energy, difference_rows, indifference_rows, of_potential
 from benchmarks.verification.problem import Curve, Outcome, Picture, Problem, Row, at_most, more_than

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from ast_sim.mechanics.case import SolidCase
+from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
+from ast_sim.mechanics.elements.elasticity import Elasticity
+from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.mechanics.quasi_static import quasi_static
+from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.scene import NodeType, Scene
-from ast_sim.simulate.mechanics.case import SolidCase
-from ast_sim.simulate.mechanics.contact_and_friction import Contact, ContactSettings
-from ast_sim.simulate.mechanics.elasticity import Elasticity
-from ast_sim.simulate.mechanics.material import NeoHookean
-from ast_sim.simulate.mechanics.quasi_static import quasi_static
-from ast_sim.simulate.mechanics.solver import SolverSettings
 from ast_sim.simulate.shapes import mesh
 from benchmarks.verification.bodies import Rollers, box, cauchy, newton, nodal_areas, sheet, triangles
 from benchmarks.verification.problem import (

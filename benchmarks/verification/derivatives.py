@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse
 
-from ast_sim.simulate.mechanics.contact_and_friction import Contact, ContactSettings
-from ast_sim.simulate.mechanics.elasticity import Elasticity
-from ast_sim.simulate.mechanics.inertia import Inertia
-from ast_sim.simulate.mechanics.material import NeoHookean
+from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
+from ast_sim.mechanics.elements.elasticity import Elasticity
+from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.mechanics.inertia import Inertia
 from ast_sim.simulate.shapes import mesh
 from benchmarks.verification.bodies import box, triangles
 from benchmarks.verification.problem import Outcome, Problem, Row, at_most

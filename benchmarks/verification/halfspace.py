@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ast_sim.simulate.mechanics.contact_and_friction import Contact, ContactSettings
-from ast_sim.simulate.mechanics.elasticity import Elasticity
-from ast_sim.simulate.mechanics.material import NeoHookean
+from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
+from ast_sim.mechanics.elements.elasticity import Elasticity
+from ast_sim.mechanics.elements.material import NeoHookean
 from ast_sim.simulate.shapes import mesh
 from benchmarks.verification.bodies import Rollers, cauchy, newton, nodal_areas, sheet, triangles
 

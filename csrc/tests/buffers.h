@@ -1,7 +1,7 @@
 /* Buffers beside pages that must not be touched: a read or write past an end stops the program.
  *
- *   slack | data | guard     as a rule: the last byte lies before a guard page, whatever the alignment of the data is
- * then guard | data | slack     with buffers_at_start: aligned to a page, and an index of -1 faults
+ *   slack | data | guard     as a rule: the last byte lies before a guard page, whatever the alignment of the data then
+ *   guard | data | slack     with buffers_at_start: aligned to a page, and an index of -1 faults
  *
  * The slack up to a whole page holds a pattern that is checked when the buffer is freed. READ_ONLY makes the pages of
  * inputs read-only for a call, so that a write to an input stops the program, too.

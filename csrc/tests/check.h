@@ -51,8 +51,7 @@ static void check_accuracy(const char *what, const float *got, const double *exa
 }
 
 /* What the formula gives for a problem, in double and in float. Every table is posed the same problems, and most of the
- * time of a test is that of its formula, so the latest results are kept, under the bits of all that makes the problem.
- */
+ * time of a test is that of its formula, so the latest results are kept, under the bits of all that makes a problem. */
 enum { MOST_RESULTS = 12, MOST_KEPT = 1024 };
 typedef struct {
   uint64_t key;

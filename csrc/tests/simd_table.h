@@ -1,5 +1,4 @@
-/* The functions of simd.h over arrays, as a table of one instruction set: simd_*.c name the set and include this file.
- */
+/* The functions of simd.h over arrays, as a table of one instruction set: simd_*.c name the set and include this. */
 #ifndef AST_SIMD_TABLE_H
 #define AST_SIMD_TABLE_H
 

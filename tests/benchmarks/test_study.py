@@ -17,9 +17,9 @@ import toy
 from toy import one_thread  # noqa: F401
 
 from ast_sim.inference.answer import Answer
+from ast_sim.mechanics.unfinished import Checkpoint
 from ast_sim.runs.config_toml import read_config
 from ast_sim.scene import Trajectory
-from ast_sim.simulate.mechanics.unfinished import Checkpoint
 from ast_sim.support.errors import ConfigError
 from benchmarks.simulation import increments
 from benchmarks.studies import __main__ as study

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import weakref
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -110,6 +111,50 @@ def test_scenes_that_were_not_used_for_longest_are_let_go(tmp_path, monkeypatch)
         assert first() is None
 
 
+def test_numbers_and_times_of_frames_travel_with_a_trajectory(tmp_path):
+    """Frames 2 and 4 of a motion stay frames 2 and 4; times that follow from the time step are not stored."""
+    whole = trajectory(block(2, 1, 1), 5)
+    some = whole.select([4, 2])
+    assert some.numbers == (2, 4) and np.array_equal(some.position, whole.position[[2, 4]])
+    uneven = replace(whole, times=(0.0, 0.1, 0.3, 0.4, 2.0))
+    members = {"train": [whole, some, uneven, uneven.select([1, 4])]}
+    with Dataset(write(tmp_path / "d.h5", members, time_step=0.5)) as dataset:
+        found = list(dataset["train"])
+    assert [one.numbers for one in found] == [(0, 1, 2, 3, 4), (2, 4), (0, 1, 2, 3, 4), (1, 4)]
+    assert [one.times for one in found[1:]] == [(1.0, 2.0), (0.0, 0.1, 0.3, 0.4, 2.0), (0.1, 2.0)]
+    assert found[0].times == (0.0, 0.5, 1.0, 1.5, 2.0) and found[0].length_unit == "m"
+    with h5py.File(tmp_path / "d.h5") as file:
+        assert not {"frames", "times"} & set(file["train/000000"].attrs)
+    with Dataset(write(tmp_path / "copy.h5", {"train": found}, time_step=0.5)) as copy:
+        assert [(one.numbers, one.times) for one in copy["train"]] == [(one.numbers, one.times) for one in found]
+    assert (tmp_path / "copy.h5").read_bytes() == (tmp_path / "d.h5").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"frames": (0, 1)}, "frames has 2 numbers for 3 frames"),
+        ({"frames": (0, 2, 2)}, r"frames must be finite and ascend: \[0, 2, 2\]"),
+        ({"frames": (-1, 0, 1)}, "frames starts at -1; the first frame of a motion is 0"),
+        ({"times": (0.0, float("nan"), 1.0)}, "times must be finite and ascend"),
+        ({"length_unit": "mm"}, "train/000000 has lengths in mm, the dataset in m"),
+    ],
+)
+def test_wrong_numbers_of_frames_and_another_unit_are_refused(tmp_path, changes, message):
+    with pytest.raises(DatasetError, match=message):
+        write(tmp_path / "d.h5", {"train": [replace(trajectory(block(1, 1, 1), 3), **changes)]})
+
+
+def test_a_copy_keeps_the_cauchy_stress(tmp_path):
+    path, wanted = tensors(tmp_path)
+    with Dataset(path) as dataset:
+        copied = write(tmp_path / "copy.h5", {"train": list(dataset["train"])})
+    with Dataset(copied) as dataset:
+        assert np.array_equal(dataset["train"][0].cauchy_stress, wanted)
+        assert dataset["train"][1].cauchy_stress is None
+    assert copied.read_bytes() == path.read_bytes()
+
+
 def tensors(tmp_path):
     """A file whose first trajectory has the Cauchy stress of its elements and whose second has none."""
     members = [trajectory(block(2, 1, 1), 4, 1, tensor=True), trajectory(block(2, 1, 1), 3, 2)]
@@ -150,7 +195,7 @@ def test_cauchy_stress_is_read_by_frames_and_only_when_asked(tmp_path):
 def test_a_hostile_cauchy_stress_is_refused_by_name(tmp_path, edit, message):
     path, _ = tensors(tmp_path)
     with h5py.File(path, "r+") as file:
-        replace(file["train/000000"], "cauchy_stress", edit(file["train/000000/cauchy_stress"][()]))
+        overwrite(file["train/000000"], "cauchy_stress", edit(file["train/000000/cauchy_stress"][()]))
         sign(file)
     with Dataset(path) as dataset, pytest.raises(DatasetError, match=f"{path}: .*{message}"):
         dataset.cauchy_stress("train", 0)
@@ -450,13 +495,13 @@ def test_what_is_no_dataset_is_named(tmp_path, content, message):
         Dataset(path)
 
 
-def replace(group, name, value, **options):
+def overwrite(group, name, value, **options):
     del group[name]
     group.create_dataset(name, data=value, **options)
 
 
 def change(name, function):
-    return lambda file: replace(file["train/000000"], name, function(file[f"train/000000/{name}"][()]))
+    return lambda file: overwrite(file["train/000000"], name, function(file[f"train/000000/{name}"][()]))
 
 
 def put(array, index, value):
@@ -517,7 +562,7 @@ HOSTILE = {
     "absurd nodes": (lambda f: declare(f, "rest_position", (1 << 60, 3), "f4"), "declares the shape"),
     "absurd elements": (lambda f: declare(f, "elements", (1 << 33, 4), "i4"), "declares the shape"),
     "compressed": (
-        lambda f: replace(f["train/000000"], "position", np.zeros((9999, 12, 3), "f4"), compression="gzip"),
+        lambda f: overwrite(f["train/000000"], "position", np.zeros((9999, 12, 3), "f4"), compression="gzip"),
         "position is compressed",
     ),
     "a link to another file": (

@@ -76,7 +76,7 @@ def test_points_that_move_and_displacements_give_the_same(tmp_path, moving):
 def test_what_we_export_is_read_back(tmp_path, stress):
     """The export writes the moved points beside the displacement, node types, bodies and von Mises stress."""
     given = trajectory(block(2, 2, 1), 5, stress=stress)
-    export.write(tmp_path / "run.pvd", given, time_step=0.1)
+    export.write(tmp_path / "run.pvd", given)
     found = read_series(tmp_path / "run.pvd", FieldNames())
     assert found.stress_location == stress
     np.testing.assert_allclose(found.position, given.position, rtol=0, atol=3e-7)
@@ -513,7 +513,7 @@ def test_motion_that_is_lost_nevertheless_is_told(tmp_path):
 def test_our_own_vtkhdf_file_is_read_back(tmp_path, stress):
     given = trajectory(block(2, 2, 1), 5, stress=stress)
     (tmp_path / "r").mkdir()
-    export.write(tmp_path / "r" / "run.vtkhdf", given, time_step=0.1)
+    export.write(tmp_path / "r" / "run.vtkhdf", given)
     found = read(tmp_path / "r" / "run.vtkhdf")
     assert found.stress_location == stress
     np.testing.assert_allclose(found.position, given.position, rtol=0, atol=3e-7)

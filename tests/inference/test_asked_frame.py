@@ -16,11 +16,11 @@ from ast_sim.inference.effort import Effort, cheapest_good, newton_steps
 from ast_sim.inference.jump import calls
 from ast_sim.inference.predict import answers
 from ast_sim.inference.question import Question
+from ast_sim.mechanics.linearised_contact import STILL, NewtonSteps
 from ast_sim.models.model_config import DataFacts
 from ast_sim.models.registry import find_preset
 from ast_sim.models.simulator import Prediction, Simulator
 from ast_sim.simulate.jobs.rival import deepest_frame
-from ast_sim.simulate.mechanics.linearised_contact import STILL, NewtonSteps
 from ast_sim.support.errors import ConfigError, SimulationError
 from ast_sim.training.data_lengths import measure
 

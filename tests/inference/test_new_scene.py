@@ -18,9 +18,9 @@ from ast_sim.cli import main
 from ast_sim.demo import FAMILY, FRAMES, NODES
 from ast_sim.inference import predict
 from ast_sim.inference.question import Question
+from ast_sim.mechanics.case import SolidCase
 from ast_sim.scene import Scene
 from ast_sim.simulate.families import deforming_plate
-from ast_sim.simulate.mechanics.case import SolidCase
 from ast_sim.support.errors import ConfigError, DatasetError
 
 SIZE, CELLS, DEPTH = (0.48, 0.32, 0.03), (11, 8, 2), 0.045

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from dataclasses import replace
 
 import meshio
 import numpy as np
@@ -12,7 +13,7 @@ from view_scenes import plate, strip
 from vtk_series import read
 
 from ast_sim.scene import Trajectory
-from ast_sim.support.errors import AstSimError
+from ast_sim.support.errors import AstSimError, DatasetError
 from ast_sim.view import export
 
 CELL_TYPE = {3: pyvista.CellType.TRIANGLE, 4: pyvista.CellType.TETRA}
@@ -28,7 +29,8 @@ def same(found, expected):
 @pytest.mark.parametrize("truth", [plate(5), plate(3, stress="element"), plate(2, stress="none"), strip(4), plate(1)])
 def test_trajectory_reads_back(tmp_path, suffix, truth):
     path = tmp_path / f"plate & <ball>{suffix}"
-    export.write(path, truth, time_step=0.1)
+    truth = replace(truth, times=tuple(i * 0.1 for i in range(truth.num_frames)))
+    export.write(path, truth)
     times, meshes = read(path)
     assert times == [i * 0.1 for i in range(truth.num_frames)]
     scene, at_nodes = truth.scene, truth.stress is not None and truth.stress.shape[1] == truth.scene.num_nodes
@@ -64,6 +66,24 @@ def test_prediction_carries_its_errors(tmp_path, suffix, stress):
         same(data["von_mises"], prediction.stress[frame, :, 0])
         same(data["von_mises_error"], prediction.stress[frame, :, 0] - truth.stress[frame, :, 0])
     assert np.abs(meshes[2].point_data["error"]).max() > 1e-3
+
+
+@pytest.mark.parametrize("suffix", [".pvd", ".vtkhdf"])
+def test_errors_are_those_of_the_frames_with_the_same_numbers(tmp_path, suffix):
+    """A prediction of the frames 2 and 4 is compared with these frames of the truth, not with its first two."""
+    truth, path = plate(5), tmp_path / f"some{suffix}"
+    predicted = truth.position[[2, 4]] + np.float32(0.5)
+    some = Trajectory(truth.scene, predicted, truth.stress[[2, 4]], frames=(2, 4))
+    export.write(path, truth, some)
+    times, meshes = read(path)
+    assert times == [2.0, 4.0]
+    for mesh in meshes:
+        np.testing.assert_allclose(mesh.point_data["error"], 0.5, atol=1e-6)
+        assert not mesh.point_data["von_mises_error"].any()
+    export.write(path, replace(truth, times=(0.0, 0.1, 0.25, 0.5, 1.0)), replace(some, times=(0.25, 1.0)))
+    assert read(path)[0] == [0.25, 1.0]
+    with pytest.raises(DatasetError, match="there is no frame 5; there are the frames 0 to 4"):
+        export.write(path, truth, replace(some, frames=(4, 5)))
 
 
 @pytest.mark.parametrize("suffix", [".pvd", ".vtkhdf"])

@@ -13,8 +13,8 @@ from typing import TextIO
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ast_sim.mechanics.case import SolidCase
 from ast_sim.scene import NodeType, Scene
-from ast_sim.simulate.mechanics.case import SolidCase
 from ast_sim.support.errors import SimulationError
 
 # Node sets of the faces S1 to S4 of a C3D4.

@@ -19,13 +19,13 @@ from time import perf_counter
 
 import numpy as np
 
+from ast_sim.mechanics.case import SolidCase
+from ast_sim.mechanics.contact_and_friction import Contact
+from ast_sim.mechanics.elements.elasticity import Elasticity
+from ast_sim.mechanics.elements.material import von_mises
 from ast_sim.scene import AttributeValue, Trajectory
 from ast_sim.simulate.calculix.ccx_results import Results, read_results
 from ast_sim.simulate.calculix.deck import Increments, contact_stiffness, write_deck
-from ast_sim.simulate.mechanics.case import SolidCase
-from ast_sim.simulate.mechanics.contact_and_friction import Contact
-from ast_sim.simulate.mechanics.elasticity import Elasticity
-from ast_sim.simulate.mechanics.material import von_mises
 from ast_sim.support.errors import MissingExtra, SimulationError
 
 JOB = "case"

@@ -15,13 +15,13 @@ from functools import partial
 import numpy as np
 
 from ast_sim.dataset.layout import DatasetInfo
+from ast_sim.mechanics.case import Drawn, SolidCase
+from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
+from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.mechanics.quasi_static import quasi_static
+from ast_sim.mechanics.solver import SolverSettings
+from ast_sim.mechanics.unfinished import Checkpoint
 from ast_sim.scene import AttributeValue, NodeType, Scene, Trajectory
-from ast_sim.simulate.mechanics.case import Drawn, SolidCase
-from ast_sim.simulate.mechanics.contact_and_friction import Contact, ContactSettings
-from ast_sim.simulate.mechanics.material import NeoHookean
-from ast_sim.simulate.mechanics.quasi_static import quasi_static
-from ast_sim.simulate.mechanics.solver import SolverSettings
-from ast_sim.simulate.mechanics.unfinished import Checkpoint
 from ast_sim.simulate.shapes.cad import MeshingFailed
 from ast_sim.simulate.shapes.mesh_check import BadMesh
 from ast_sim.simulate.shapes.pairing import HALF_EXTENT, Pair, Unsuitable, put_likewise, put_together

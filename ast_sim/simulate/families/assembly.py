@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from ast_sim.dataset.layout import LENGTH_UNITS
+from ast_sim.mechanics.case import Drawn, SolidCase
+from ast_sim.mechanics.quasi_static import quasi_static
+from ast_sim.mechanics.solver import SolverSettings
+from ast_sim.mechanics.unfinished import Checkpoint
 from ast_sim.scene import Trajectory
-from ast_sim.simulate.mechanics.case import Drawn, SolidCase
-from ast_sim.simulate.mechanics.quasi_static import quasi_static
-from ast_sim.simulate.mechanics.solver import SolverSettings
-from ast_sim.simulate.mechanics.unfinished import Checkpoint
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
 from ast_sim.simulate.own_assembly.parameters import Values, completed, drawn, told
 from ast_sim.simulate.own_assembly.rest_check import BadAssembly, check

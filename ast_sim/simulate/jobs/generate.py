@@ -26,6 +26,7 @@ from ast_sim.dataset.layout import SPLITS
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import Seconds, read_seconds, seconds_path, write_seconds
 from ast_sim.dataset.writer import DatasetWriter, FittedWriter
+from ast_sim.mechanics.contact_and_friction import self_test
 from ast_sim.simulate.families.names import family_module
 from ast_sim.simulate.jobs import cluster, pool
 from ast_sim.simulate.jobs.display import Progress
@@ -40,7 +41,6 @@ from ast_sim.simulate.jobs.samples import (
     sample_path,
     store_sample,
 )
-from ast_sim.simulate.mechanics.contact_and_friction import self_test
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.support.disk import output_file, replacing
 from ast_sim.support.errors import SimulationError
@@ -239,7 +239,8 @@ def _unpack(out: Path, folder: Path) -> None:
         for sample in _samples(dataset.splits):
             path = sample_path(folder, *sample)
             if not _is_readable(path):
-                trajectory = replace(dataset.load(*sample), cauchy_stress=dataset.cauchy_stress(*sample))
+                split, index = sample
+                trajectory = dataset[split][index]
                 store_sample(path, pack_sample(trajectory, seconds.get(sample_name(*sample), {})))
 
 

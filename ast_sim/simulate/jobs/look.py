@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
+from ast_sim.mechanics.case import SolidCase
 from ast_sim.scene import NodeType
 from ast_sim.simulate.families import assembly
 from ast_sim.simulate.jobs.pool import Worker
 from ast_sim.simulate.jobs.recipe import checked_recipe
 from ast_sim.simulate.jobs.samples import Recipe, draw_sample, load_sample, sample_path
-from ast_sim.simulate.mechanics.case import SolidCase
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
 from ast_sim.simulate.own_assembly.parameters import told
 from ast_sim.simulate.own_assembly.rest_check import gap_between

@@ -20,15 +20,15 @@ from typing import Any
 import numpy as np
 
 from ast_sim.dataset.reader import Dataset
+from ast_sim.mechanics.case import Drawn, SolidCase
+from ast_sim.mechanics.linearised_contact import CLEARANCE, NewtonSteps
+from ast_sim.mechanics.quasi_static import OneFrame, solve_frame
+from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.scene import Scene
 from ast_sim.simulate.families.names import family_module
 from ast_sim.simulate.jobs.rival import OUTCOMES, POSITIONS, Outcome, Way
 from ast_sim.simulate.jobs.samples import Recipe, draw_sample
 from ast_sim.simulate.jobs.worker import answers_for
-from ast_sim.simulate.mechanics.case import Drawn, SolidCase
-from ast_sim.simulate.mechanics.linearised_contact import CLEARANCE, NewtonSteps
-from ast_sim.simulate.mechanics.quasi_static import OneFrame, solve_frame
-from ast_sim.simulate.mechanics.solver import SolverSettings
 from ast_sim.simulate.shapes.mesh_transfer import transferred
 from ast_sim.support.errors import SimulationError
 from ast_sim.support.provenance import processor

@@ -17,10 +17,10 @@ import numpy as np
 
 from ast_sim.dataset.layout import SPLITS
 from ast_sim.dataset.solver_seconds import Seconds, split_seconds
+from ast_sim.mechanics.case import NEXT_NOTE, NOTES, Drawn
+from ast_sim.mechanics.unfinished import Checkpoint
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.families.names import family_module
-from ast_sim.simulate.mechanics.case import NEXT_NOTE, NOTES, Drawn
-from ast_sim.simulate.mechanics.unfinished import Checkpoint
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.support.disk import replacing
 from ast_sim.support.provenance import processor

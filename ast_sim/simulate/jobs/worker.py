@@ -27,8 +27,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from ast_sim.mechanics.unfinished import Checkpoint
 from ast_sim.simulate.jobs.samples import Recipe, checkpoint_path, make_sample, sample_path, save_sample
-from ast_sim.simulate.mechanics.unfinished import Checkpoint
 
 SECONDS_BETWEEN_REPORTS = 1.0
 

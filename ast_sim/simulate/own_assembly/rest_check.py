@@ -9,8 +9,8 @@ from itertools import combinations
 
 import numpy as np
 
-from ast_sim.simulate.mechanics.case import SolidCase
-from ast_sim.simulate.mechanics.contact_and_friction import Contact, ContactSettings
+from ast_sim.mechanics.case import SolidCase
+from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
 from ast_sim.simulate.own_assembly.standing import Reference, point
 from ast_sim.simulate.shapes.parts import volumes

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ast_sim.importers.shells import find_shells
+from ast_sim.mechanics.case import SolidCase
+from ast_sim.mechanics.contact_and_friction import ContactSettings
+from ast_sim.mechanics.elements.material import NeoHookean
 from ast_sim.motion_course import Course, MovedNodes
 from ast_sim.scene import AttributeValue, NodeType, Scene
-from ast_sim.simulate.mechanics.case import SolidCase
-from ast_sim.simulate.mechanics.contact_and_friction import ContactSettings
-from ast_sim.simulate.mechanics.material import NeoHookean
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec, PartSpec
 from ast_sim.simulate.own_assembly.parameters import Values, completed
 from ast_sim.simulate.own_assembly.part_mesh import PartMesh, part_meshes

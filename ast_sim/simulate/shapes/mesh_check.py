@@ -12,8 +12,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from ast_sim.mechanics.contact_and_friction import load_ipctk
 from ast_sim.scene import LOCAL_FACES
-from ast_sim.simulate.mechanics.contact_and_friction import load_ipctk
 from ast_sim.simulate.shapes.parts import volumes
 from ast_sim.support.errors import SimulationError
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ast_sim.simulate.mechanics.contact_and_friction import Contact, ContactSettings
+from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
 from ast_sim.simulate.shapes.mesh_check import boundary
 from ast_sim.simulate.shapes.parts import Part
 from ast_sim.support.errors import SimulationError

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ast_sim.mechanics import quasi_static as trajectory
+from ast_sim.mechanics.case import SolidCase
+from ast_sim.mechanics.contact_and_friction import ContactSettings
+from ast_sim.mechanics.elements.material import NeoHookean
 from ast_sim.scene import NodeType, Scene
 from ast_sim.simulate.calculix import solve as calculix
 from ast_sim.simulate.calculix.ccx_results import read_increments, read_results
 from ast_sim.simulate.calculix.deck import Increments, contact_stiffness, slave_first, write_deck
 from ast_sim.simulate.calculix.solve import CalculixSettings
-from ast_sim.simulate.mechanics import quasi_static as trajectory
-from ast_sim.simulate.mechanics.case import SolidCase
-from ast_sim.simulate.mechanics.contact_and_friction import ContactSettings
-from ast_sim.simulate.mechanics.material import NeoHookean
 from ast_sim.simulate.shapes import mesh
 from ast_sim.support.errors import MissingExtra, SimulationError
 from benchmarks.simulation.calculix import agrees, compare, with_crush

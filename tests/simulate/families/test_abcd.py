@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from ast_sim.mechanics.contact_and_friction import Contact
+from ast_sim.mechanics.elements.elasticity import Elasticity
 from ast_sim.scene import NodeType
 from ast_sim.simulate.families import abcd, abcd_xl
-from ast_sim.simulate.mechanics.contact_and_friction import Contact
-from ast_sim.simulate.mechanics.elasticity import Elasticity
 from ast_sim.simulate.shapes.cad import MeshingFailed
 from ast_sim.simulate.shapes.mesh_check import boundary
 from ast_sim.simulate.shapes.pairing import LEAST_OVERLAP, Unsuitable, put_together, shadow_cells, turned

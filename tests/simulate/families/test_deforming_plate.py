@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from ast_sim.mechanics.contact_and_friction import Contact
 from ast_sim.scene import NodeType
 from ast_sim.simulate.families.deforming_plate import (
     CLAMP_MARGIN,
@@ -17,7 +18,6 @@ from ast_sim.simulate.families.deforming_plate import (
     draw_way,
     solve,
 )
-from ast_sim.simulate.mechanics.contact_and_friction import Contact
 from ast_sim.simulate.shapes.mesh_check import BadMesh
 from ast_sim.simulate.shapes.obstacles import SHAPES
 from ast_sim.simulate.shapes.plate_mesh import PlaneMesh, smallest_angle

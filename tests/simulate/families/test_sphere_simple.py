@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ast_sim.mechanics.dynamics import BackwardEuler
 from ast_sim.scene import NodeType
 from ast_sim.simulate.families.sphere_simple import FRAMES, INFO, draw, icosphere, sheet, solve
-from ast_sim.simulate.mechanics.dynamics import BackwardEuler
 
 
 @pytest.mark.parametrize("nodes", [200, 700, 2000])

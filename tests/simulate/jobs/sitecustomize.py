@@ -42,9 +42,9 @@ def remember_resumed(owner) -> None:
 
 if MARK.name:
     from ast_sim.dataset.writer import DatasetWriter
+    from ast_sim.mechanics import unfinished as checkpoint
     from ast_sim.simulate.families import deforming_plate
     from ast_sim.simulate.jobs import generate, samples
-    from ast_sim.simulate.mechanics import unfinished as checkpoint
 
     checkpoint.SECONDS_BETWEEN_WRITES = 0.0
     pausing(deforming_plate, "draw", "drawing")

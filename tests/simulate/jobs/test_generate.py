@@ -241,7 +241,7 @@ def test_a_patient_solve_is_recorded_and_reaches_every_frame(tmp_path, monkeypat
     usual, patient = replace(RECIPE, seed=0), replace(RECIPE, seed=0, patient=True)
     assert recorded(usual)["seed"] == 0 and "patient" not in recorded(usual) and recorded(patient)["patient"] is True
     assert recorded(patient)["command"] == recorded(usual)["command"] + " --patient"
-    monkeypatch.setattr("ast_sim.simulate.mechanics.frames.MAX_FRAME_ITERATIONS", 1)
+    monkeypatch.setattr("ast_sim.mechanics.frames.MAX_FRAME_ITERATIONS", 1)
     assert make_sample(usual, "train", 0).attributes["status"] == "truncated"
     assert make_sample(patient, "train", 0).num_frames == FRAMES
 

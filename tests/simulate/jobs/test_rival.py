@@ -7,12 +7,12 @@ import pytest
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.writer import DatasetWriter
+from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.simulate.jobs.generate import generate
 from ast_sim.simulate.jobs.recipe import recipe_of
 from ast_sim.simulate.jobs.rival import WAYS, Outcome, Way, cheapest, deepest_frame, rivals
 from ast_sim.simulate.jobs.rival_worker import WaySolver
 from ast_sim.simulate.jobs.samples import Recipe, draw_sample
-from ast_sim.simulate.mechanics.solver import SolverSettings
 from ast_sim.simulate.shapes.mesh_check import BadMesh
 from ast_sim.support.errors import DatasetError, SimulationError
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ast_sim.simulate.mechanics.solver import Potential
+from ast_sim.mechanics.solver import Potential
 
 
 @dataclass(frozen=True, eq=False)

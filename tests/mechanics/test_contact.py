@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ast_sim.simulate.mechanics import contact_and_friction as contact_module
-from ast_sim.simulate.mechanics.contact_and_friction import Contact, ContactSettings
+from ast_sim.mechanics import contact_and_friction as contact_module
+from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
 from ast_sim.simulate.shapes import mesh
 from ast_sim.support.errors import MissingExtra, SimulationError
 

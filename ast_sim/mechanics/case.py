@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ast_sim.mechanics.contact_and_friction import ContactSettings
+from ast_sim.mechanics.elements.material import NeoHookean
 from ast_sim.motion_course import Course, Leg
 from ast_sim.scene import AttributeValue, Scene
-from ast_sim.simulate.mechanics.contact_and_friction import ContactSettings
-from ast_sim.simulate.mechanics.material import NeoHookean
 from ast_sim.support.errors import SimulationError
 
 NOTES, NEXT_NOTE = "notes", "; "  # the attribute that holds what a user should know of a scene, and what separates it

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from ast_sim.simulate.mechanics.elasticity import Elasticity
-from ast_sim.simulate.mechanics.linear_system import LinearSystem
-from ast_sim.simulate.mechanics.material import NeoHookean, cofactor, determinant
+from ast_sim.mechanics.elements.elasticity import Elasticity
+from ast_sim.mechanics.elements.material import NeoHookean, cofactor, determinant
+from ast_sim.mechanics.linear_system import LinearSystem
 from ast_sim.simulate.shapes import mesh
 from ast_sim.support.errors import SimulationError
 

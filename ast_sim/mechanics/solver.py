@@ -18,8 +18,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ast_sim.simulate.mechanics.contact_and_friction import Contact, ContactState
-from ast_sim.simulate.mechanics.linear_system import LinearSystem
+from ast_sim.mechanics.contact_and_friction import Contact, ContactState
+from ast_sim.mechanics.linear_system import LinearSystem
 from ast_sim.support.errors import SimulationError
 
 

@@ -15,10 +15,10 @@ from typing import Protocol
 
 import numpy as np
 
+from ast_sim.mechanics.case import driven_body
+from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
+from ast_sim.mechanics.unfinished import Checkpoint
 from ast_sim.scene import AttributeValue, Scene, Trajectory
-from ast_sim.simulate.mechanics.case import driven_body
-from ast_sim.simulate.mechanics.contact_and_friction import Contact, ContactSettings
-from ast_sim.simulate.mechanics.unfinished import Checkpoint
 from ast_sim.support.errors import SimulationError
 
 # Newton iterations after which a frame is given up. Of 1,620 pairs of parts of 400 nodes, one needs more in some frame

@@ -16,13 +16,13 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
+from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
+from ast_sim.mechanics.elements.cloth import Cloth, ClothMaterial
+from ast_sim.mechanics.frames import FrameRecord, Frames
+from ast_sim.mechanics.inertia import Inertia
+from ast_sim.mechanics.solver import Newton, NotConverged, SolverSettings
+from ast_sim.mechanics.unfinished import Checkpoint
 from ast_sim.scene import AttributeValue, Scene, Trajectory
-from ast_sim.simulate.mechanics.cloth import Cloth, ClothMaterial
-from ast_sim.simulate.mechanics.contact_and_friction import Contact, ContactSettings
-from ast_sim.simulate.mechanics.frames import FrameRecord, Frames
-from ast_sim.simulate.mechanics.inertia import Inertia
-from ast_sim.simulate.mechanics.solver import Newton, NotConverged, SolverSettings
-from ast_sim.simulate.mechanics.unfinished import Checkpoint
 
 GRAVITY = (0.0, 0.0, -9.81)
 

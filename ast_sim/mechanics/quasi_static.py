@@ -9,15 +9,15 @@ from time import process_time
 
 import numpy as np
 
+from ast_sim.mechanics.case import SolidCase
+from ast_sim.mechanics.contact_and_friction import Contact
+from ast_sim.mechanics.elements.elasticity import Elasticity
+from ast_sim.mechanics.elements.material import von_mises
+from ast_sim.mechanics.frames import MAX_FRAME_ITERATIONS, FrameRecord, Frames, GivenUp
+from ast_sim.mechanics.load_halving import QuasiStatic
+from ast_sim.mechanics.solver import SolverSettings
+from ast_sim.mechanics.unfinished import Checkpoint
 from ast_sim.scene import AttributeValue, Trajectory
-from ast_sim.simulate.mechanics.case import SolidCase
-from ast_sim.simulate.mechanics.contact_and_friction import Contact
-from ast_sim.simulate.mechanics.elasticity import Elasticity
-from ast_sim.simulate.mechanics.frames import MAX_FRAME_ITERATIONS, FrameRecord, Frames, GivenUp
-from ast_sim.simulate.mechanics.load_halving import QuasiStatic
-from ast_sim.simulate.mechanics.material import von_mises
-from ast_sim.simulate.mechanics.solver import SolverSettings
-from ast_sim.simulate.mechanics.unfinished import Checkpoint
 from ast_sim.support.errors import SimulationError
 
 # Components of a stress tensor as they are stored: xx, yy, zz, xy, yz, zx.

@@ -30,10 +30,10 @@ import numpy as np
 import scipy.sparse
 from scipy.optimize import nnls
 
+from ast_sim.mechanics.elements.elasticity import Deformation, Elasticity
+from ast_sim.mechanics.elements.material import NeoHookean, cofactor, determinant, von_mises
+from ast_sim.mechanics.linear_system import Factorization, LinearSystem
 from ast_sim.scene import Scene
-from ast_sim.simulate.mechanics.elasticity import Deformation, Elasticity
-from ast_sim.simulate.mechanics.linear_system import Factorization, LinearSystem
-from ast_sim.simulate.mechanics.material import NeoHookean, cofactor, determinant, von_mises
 from ast_sim.support.errors import SimulationError
 from ast_sim.support.nearest_surface import nearest_surface
 

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ast_sim.mechanics import unfinished as checkpoint_module
+from ast_sim.mechanics.contact_and_friction import ContactSettings
+from ast_sim.mechanics.dynamics import BackwardEuler, ClothCase, DynamicSettings, implicit_euler
+from ast_sim.mechanics.elements.cloth import ClothMaterial
+from ast_sim.mechanics.unfinished import Checkpoint
 from ast_sim.scene import NodeType, Scene
 from ast_sim.simulate.families.sphere_simple import icosphere
-from ast_sim.simulate.mechanics import unfinished as checkpoint_module
-from ast_sim.simulate.mechanics.cloth import ClothMaterial
-from ast_sim.simulate.mechanics.contact_and_friction import ContactSettings
-from ast_sim.simulate.mechanics.dynamics import BackwardEuler, ClothCase, DynamicSettings, implicit_euler
-from ast_sim.simulate.mechanics.unfinished import Checkpoint
 from ast_sim.support.errors import SimulationError
 
 STEP = 0.01

@@ -5,12 +5,12 @@ import pytest
 from meshes import box
 from solids import blocks, pressed, scene_of
 
+from ast_sim.mechanics import linearised_contact
+from ast_sim.mechanics.elements.elasticity import Elasticity
+from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.mechanics.linearised_contact import STILL, NewtonSteps
+from ast_sim.mechanics.quasi_static import quasi_static, solve_frame
 from ast_sim.scene import NodeType
-from ast_sim.simulate.mechanics import linearised_contact
-from ast_sim.simulate.mechanics.elasticity import Elasticity
-from ast_sim.simulate.mechanics.linearised_contact import STILL, NewtonSteps
-from ast_sim.simulate.mechanics.material import NeoHookean
-from ast_sim.simulate.mechanics.quasi_static import quasi_static, solve_frame
 from ast_sim.support import nearest_surface
 from ast_sim.support.errors import SimulationError
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from ast_sim.mechanics.elements.cloth import Cloth, ClothMaterial, bending_matrix
 from ast_sim.simulate.families.sphere_simple import sheet
-from ast_sim.simulate.mechanics.cloth import Cloth, ClothMaterial, bending_matrix
 from ast_sim.support.errors import SimulationError
 
 STRETCH, POISSON, BENDING = 100.0, 0.3, 1e-2

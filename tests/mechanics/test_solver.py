@@ -7,14 +7,14 @@ import pytest
 from meshes import two_tetrahedra
 from solids import blocks, pressed
 
-from ast_sim.simulate.mechanics.case import SolidCase
-from ast_sim.simulate.mechanics.contact_and_friction import Contact, ContactSettings
-from ast_sim.simulate.mechanics.elasticity import Elasticity
-from ast_sim.simulate.mechanics.load_halving import QuasiStatic
-from ast_sim.simulate.mechanics.material import NeoHookean
-from ast_sim.simulate.mechanics.quasi_static import quasi_static
-from ast_sim.simulate.mechanics.solver import Newton, NotConverged, SolverSettings
-from ast_sim.simulate.mechanics.unfinished import Checkpoint
+from ast_sim.mechanics.case import SolidCase
+from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
+from ast_sim.mechanics.elements.elasticity import Elasticity
+from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.mechanics.load_halving import QuasiStatic
+from ast_sim.mechanics.quasi_static import quasi_static
+from ast_sim.mechanics.solver import Newton, NotConverged, SolverSettings
+from ast_sim.mechanics.unfinished import Checkpoint
 from ast_sim.simulate.shapes import mesh
 from ast_sim.support.errors import SimulationError
 
@@ -124,7 +124,7 @@ def test_friction_holds_what_slides_without_it():
 
 def test_a_resumed_solve_gives_the_same_bits(two_blocks, tmp_path, monkeypatch):
     case, whole = two_blocks
-    monkeypatch.setattr("ast_sim.simulate.mechanics.unfinished.SECONDS_BETWEEN_WRITES", 0.0)
+    monkeypatch.setattr("ast_sim.mechanics.unfinished.SECONDS_BETWEEN_WRITES", 0.0)
     checkpoint, frames = Checkpoint(tmp_path / "a.npz"), []
 
     class Killed(Exception):
@@ -166,12 +166,12 @@ def test_a_frame_that_takes_too_many_newton_iterations_is_given_up(two_blocks, m
     needed = whole.attributes["newton_iterations"]
     limit = max(needed) - 1
     last = next(frame for frame, steps in enumerate(needed) if steps > limit)
-    monkeypatch.setattr("ast_sim.simulate.mechanics.frames.MAX_FRAME_ITERATIONS", limit)
+    monkeypatch.setattr("ast_sim.mechanics.frames.MAX_FRAME_ITERATIONS", limit)
     given_up, patient = quasi_static(case), quasi_static(case, patient=True)
     assert given_up.attributes["status"] == "truncated" and given_up.num_frames == last
     assert given_up.attributes["stopped_by"].startswith(f"frame {last}: more than {limit} Newton iterations")
     np.testing.assert_array_equal(given_up.position, whole.position[:last])
-    monkeypatch.setattr("ast_sim.simulate.mechanics.frames.MAX_FRAME_ITERATIONS", max(needed))
+    monkeypatch.setattr("ast_sim.mechanics.frames.MAX_FRAME_ITERATIONS", max(needed))
     for same in (patient, quasi_static(case)):  # a frame that needs exactly the limit is kept
         assert same.attributes["status"] == "complete"
         np.testing.assert_array_equal(same.position, whole.position)

@@ -5,10 +5,10 @@ import sys
 import numpy as np
 import pytest
 
-from ast_sim.simulate.mechanics import linear_system
-from ast_sim.simulate.mechanics.elasticity import Elasticity
-from ast_sim.simulate.mechanics.linear_system import Cholmod, LinearSystem, Pardiso
-from ast_sim.simulate.mechanics.material import NeoHookean
+from ast_sim.mechanics import linear_system
+from ast_sim.mechanics.elements.elasticity import Elasticity
+from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.mechanics.linear_system import Cholmod, LinearSystem, Pardiso
 from ast_sim.simulate.shapes import mesh
 
 NO_CONTACT = (np.zeros(0, int), np.zeros(0, int), np.zeros(0))

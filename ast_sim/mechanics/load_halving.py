@@ -12,10 +12,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ast_sim.simulate.mechanics.contact_and_friction import Contact
-from ast_sim.simulate.mechanics.elasticity import Elasticity
-from ast_sim.simulate.mechanics.inertia import Inertia
-from ast_sim.simulate.mechanics.solver import Newton, NotConverged, SolverSettings
+from ast_sim.mechanics.contact_and_friction import Contact
+from ast_sim.mechanics.elements.elasticity import Elasticity
+from ast_sim.mechanics.inertia import Inertia
+from ast_sim.mechanics.solver import Newton, NotConverged, SolverSettings
 
 MAX_DAMPED_STEPS = 60
 

@@ -15,9 +15,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import cg
 
+from ast_sim.mechanics.elements.elasticity import Elasticity
+from ast_sim.mechanics.elements.material import NeoHookean
 from ast_sim.scene import NodeType, Scene
-from ast_sim.simulate.mechanics.elasticity import Elasticity
-from ast_sim.simulate.mechanics.material import NeoHookean
 
 REACH = 1.0  # a node counts as touched if another body is nearer than so many mean edge lengths
 OPPOSITE = 0.5  # cosine between opposite normals, at most; at an edge, a normal is the mean of its faces

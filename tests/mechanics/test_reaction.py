@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from simulate.own_assembly.assemblies import SPEC, box, write_assembly
 
+from ast_sim.mechanics.case import driven_body
+from ast_sim.mechanics.elements.elasticity import Elasticity
+from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.mechanics.reaction import Reaction
 from ast_sim.scene import NodeType, Scene
 from ast_sim.simulate.families import assembly
-from ast_sim.simulate.mechanics.case import driven_body
-from ast_sim.simulate.mechanics.elasticity import Elasticity
-from ast_sim.simulate.mechanics.material import NeoHookean
 from ast_sim.simulate.own_assembly.parameters import completed
-from ast_sim.simulate.own_assembly.reaction import Reaction
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.simulate.shapes.parts import rectilinear
 

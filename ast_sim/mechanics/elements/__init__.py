@@ -1,0 +1,1 @@
+"""What resists deformation: the law of the material, tetrahedra and cloth."""
