@@ -169,7 +169,7 @@ def _way_to(points: np.ndarray, triangles: np.ndarray, start: np.ndarray, direct
     nearest = np.full(len(start), np.inf)
     for aside in ((0.0, 0.0, 0.0), (1e-3, 2e-3, -3e-3), (-2e-3, 1e-3, 1e-3)):
         hit, distance, _ = tree.intersect_ray_first(vertices, faces, start, direction + aside)
-        nearest = np.minimum(nearest, np.where(hit >= 0, distance, np.inf))
+        nearest = np.minimum(nearest, np.where(np.asarray(hit) >= 0, distance, np.inf))
     return nearest
 
 

@@ -23,7 +23,7 @@ from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
 from ast_sim.simulate.own_assembly.parameters import Values, completed, drawn, told
 from ast_sim.simulate.own_assembly.rest_check import BadAssembly, check
 from ast_sim.simulate.own_assembly.standing import PlacedPart, Reference, case, placed, reference
-from ast_sim.simulate.shapes.cad import MeshingFailed
+from ast_sim.simulate.shapes.cad.gmsh_process import MeshingFailed
 from ast_sim.simulate.shapes.mesh_check import BadMesh
 from ast_sim.support.errors import ConfigError, SimulationError
 

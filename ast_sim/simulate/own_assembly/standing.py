@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ast_sim.importers.shells import find_shells
-from ast_sim.mechanics.case import SolidCase
+from ast_sim.mechanics.case import NEXT_NOTE, NOTES, SolidCase
 from ast_sim.mechanics.contact_and_friction import ContactSettings
 from ast_sim.mechanics.elements.material import NeoHookean
 from ast_sim.motion_course import Course, MovedNodes
@@ -50,12 +50,14 @@ class PlacedPart:
         position: [N,3] float64, in the assembly.
         cells: [E,4] tetrahedra, [F,3] triangles of a rigid surface.
         moves: [N] 0 for nodes that stand still, k + 1 for those of the k-th move, -1 for free nodes.
+        notes: what a user should know of it, a sentence each.
     """
 
     part: PartSpec
     position: np.ndarray
     cells: np.ndarray
     moves: np.ndarray
+    notes: tuple[str, ...]
 
 
 def reference(spec: AssemblySpec) -> Reference:
@@ -92,7 +94,7 @@ def placed(spec: AssemblySpec, values: Values, factor: float = 1.0) -> list[Plac
 def _placed(part: PartSpec, mesh: PartMesh, values: Values) -> PlacedPart:
     position = part.placement.motion(values).at(1.0, mesh.position)
     if part.rigid:
-        return PlacedPart(part, position, mesh.cells, np.full(len(position), len(part.moves)))
+        return PlacedPart(part, position, mesh.cells, np.full(len(position), len(part.moves)), mesh.notes)
     moves = np.full(len(position), -1)
     regions = [(f"parts.{part.name}.fixed", part.fixed), *((move.key, move.places) for move in part.moves)]
     for number, (key, places) in enumerate(regions):
@@ -104,7 +106,7 @@ def _placed(part: PartSpec, mesh: PartMesh, values: Values) -> PlacedPart:
                 f"{key}: {twice.sum()} of its nodes are also in {other}, the first at {point(mesh.position[twice][0])}"
             )
         moves[nodes] = number
-    return PlacedPart(part, position, mesh.cells, moves)
+    return PlacedPart(part, position, mesh.cells, moves, mesh.notes)
 
 
 def case(spec: AssemblySpec, values: Values, frames: int, parts: list[PlacedPart], shared: Reference) -> SolidCase:
@@ -133,6 +135,8 @@ def case(spec: AssemblySpec, values: Values, frames: int, parts: list[PlacedPart
     course = _course(scene, parts, values, frames, np.array(shared.origin))
     attributes: dict[str, AttributeValue] = {f"parameter {name}": value for name, value in values.items()}
     attributes["origin"] = list(shared.origin)
+    notes = dict.fromkeys(note for part in parts for note in part.notes)
+    attributes |= {NOTES: NEXT_NOTE.join(notes)} if notes else {}
     return SolidCase(scene, course.position, NeoHookean(*law.T), contact, "node", attributes, course)
 
 
@@ -192,7 +196,7 @@ def _layered(part: PlacedPart, deforming: list[PlacedPart]) -> PlacedPart:
     tetrahedra = shells.tetrahedra(np.concatenate([points, behind]))
     tetrahedra = np.where(tetrahedra >= len(points), tetrahedra - len(points) + count, tetrahedra)
     position = np.concatenate([part.position, behind])
-    return PlacedPart(part.part, position, tetrahedra, np.tile(part.moves, 2))
+    return PlacedPart(part.part, position, tetrahedra, np.tile(part.moves, 2), part.notes)
 
 
 def point(x: np.ndarray) -> str:
