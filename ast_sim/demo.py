@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ast_sim.inference import asked_frame
-from ast_sim.inference.trained_run import Evaluation
+from ast_sim.inference.evaluation import asked_frame
+from ast_sim.inference.evaluation.evaluated_run import Evaluation
 from ast_sim.simulate.jobs.generate import generate
 from ast_sim.support.progress import duration
 from ast_sim.training.start import train

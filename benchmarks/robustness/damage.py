@@ -37,6 +37,7 @@ from typing import Any
 import ast_sim
 from ast_sim.cli import main as ast_sim_command
 from ast_sim.runs import checkpoint
+from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.metrics import Metrics
 from ast_sim.support.disk import write_json
 from ast_sim.support.progress import Progress
@@ -95,7 +96,7 @@ def prepare(folder: Path) -> None:
     metrics.forget_after(TRAINED)
     best = metrics.best()
     assert best is not None
-    checkpoint.mark_best(run, *best)
+    RunFolder(run).mark_best(best)
 
 
 def damages(folder: Path, flips: int, cuts: int, seed: int) -> Iterator[Damage]:

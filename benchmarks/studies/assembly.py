@@ -22,8 +22,8 @@ import numpy as np
 
 import ast_sim
 from ast_sim.dataset.solver_seconds import read_seconds
-from ast_sim.inference.asked_frame import asked_frames, relative_error
 from ast_sim.inference.effort import Effort
+from ast_sim.inference.evaluation.asked_frame import asked_frames, relative_error
 from ast_sim.simulate.jobs.rival import deepest_frame
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
@@ -107,7 +107,7 @@ def measured(name: str, row: Row, folder: Path) -> dict[str, Any]:
         "row": {**asdict(row), "spec": f"{row.spec.parent.name}/{row.spec.name}"},
         "generation_minutes": float(sum(map(sum, solver_seconds))) / 60,
         "minutes": minutes_per_step(run) * row.steps,
-        "effort": run.effort._asdict(),
+        "effort": asdict(run.effort),
         "training": validation_curve(run),
         "curves": curves,
         "solver_curves": _solver_curves(row) if row.rivals else [],
@@ -124,7 +124,7 @@ def _curve(run: ast_sim.Run, dataset: ast_sim.Dataset, index: int) -> dict[str, 
     seconds = time.perf_counter() - began
     deepest = deepest_frame(truth)
     return {
-        "frames": len(answer.position) - answer.given,
+        "frames": int(answer.computed.sum()),
         "relative_error": relative_error(answer.position[deepest], truth, deepest),
         "seconds": seconds,
         "reaction": _last_reaction(run, answer),

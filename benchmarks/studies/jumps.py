@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 import ast_sim
-from ast_sim.inference.asked_frame import asked_frames
 from ast_sim.inference.effort import MOST_NEWTON_STEPS, Effort, knows_material
+from ast_sim.inference.evaluation.asked_frame import asked_frames
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
@@ -113,7 +113,7 @@ def measured(row: Row, folder: Path) -> dict[str, Any]:
         **provenance(f"python -m benchmarks.studies.jumps {row.data}"),
         "row": asdict(row),
         "minutes": minutes_per_step(run) * row.steps,
-        "effort": run.effort._asdict(),
+        "effort": asdict(run.effort),
         "curve": validation_curve(run),
         "dial": dial,
         "training_scenes": known,
@@ -135,7 +135,7 @@ def _turned(run: ast_sim.Run, dataset: ast_sim.Dataset, effort: Effort) -> dict[
     found = asked_frames(run.model, dataset, "test", effort)
     scenes = {key: [scene[key] for scene in found["scenes"]] for key in ("relative_error", "seconds")}
     return {
-        **effort._asdict(),
+        **asdict(effort),
         **scenes,
         "stress_share": found["stress_share"],
         "largest_stress": found["largest_stress"],

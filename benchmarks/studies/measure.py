@@ -25,7 +25,7 @@ import numpy as np
 from ast_sim import keep_memory
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.answer import Answer
-from ast_sim.inference.measures import SquaredError, rmse_pooled, rmse_sequence
+from ast_sim.inference.evaluation.measures import SquaredError, rmse_pooled, rmse_sequence
 from ast_sim.inference.predict import answers
 from ast_sim.inference.question import Question
 from ast_sim.inference.trained_run import Run

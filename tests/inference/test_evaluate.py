@@ -16,8 +16,8 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import write_seconds
 from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.inference.answer import Answer
-from ast_sim.inference.evaluation import evaluate, table
-from ast_sim.inference.trivial_predictors import displacement_errors, stress_errors, summarize
+from ast_sim.inference.evaluation.evaluate import evaluate, table
+from ast_sim.inference.evaluation.trivial_predictors import displacement_errors, stress_errors, summarize
 from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.support.errors import DatasetError
 from ast_sim.support.provenance import provenance
@@ -146,7 +146,7 @@ def evaluated(tmp_path_factory):
         model.motion_normalizer.scale.fill_(1e-3)
         truths = [dataset.load("test", index) for index in range(2)]
         train = [dataset.load("train", index) for index in range(3)]
-        return evaluate(model, dataset, "test")[0], truths, train
+        return evaluate(model, dataset, "test"), truths, train
 
 
 def test_evaluation_of_a_dataset_agrees_with_its_formulas(evaluated):
@@ -208,7 +208,7 @@ def test_the_solvers_seconds_beside_the_dataset_count_and_without_them_the_speed
         with Dataset(path) as dataset:
             model = toy.LinearSimulator(toy.config(dataset.info))
             model.motion_normalizer.scale.fill_(1e-3)
-            return evaluate(model, dataset, "test")[0]
+            return evaluate(model, dataset, "test")
 
     path = tmp_path / "toy.h5"
     plate = toy.plate()

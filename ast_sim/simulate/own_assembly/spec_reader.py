@@ -27,20 +27,6 @@ from ast_sim.support.disk import read_text
 from ast_sim.support.errors import ConfigError
 
 DEFAULT_FRAMES = 6
-# Names of arguments of `Run.predict` and `Run.sweep`, which a parameter cannot have.
-RESERVED = (
-    "scene",
-    "motion",
-    "spec",
-    "table",
-    "nodes",
-    "frames",
-    "corrections",
-    "newton_steps",
-    "num_frames",
-    "stress",
-    "name",
-)
 
 
 def read_spec(path: str | os.PathLike[str]) -> AssemblySpec:
@@ -73,7 +59,7 @@ def _spec(path: Path, text: str, table: Table) -> AssemblySpec:
     named = Table(table.take("parameters", {}), "parameters")
     parameters: dict[str, Parameter] = {}
     for name in named.values:
-        if not name.isidentifier() or name in (*FUNCTIONS, *RESERVED):
+        if not name.isidentifier() or name in FUNCTIONS:
             raise ConfigError(f"the parameter {name!r} needs another name, of letters, digits and _")
         parameters[name] = parameter(name, named.take(name))
     if "friction" in parameters and "friction" in table.values:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from ast_sim.dataset.reader import Dataset
-from ast_sim.inference.effort import Effort
+from ast_sim.inference.effort import Effort, EffortErrors
 from ast_sim.inference.jump import calls
 from ast_sim.inference.predict import answers
 from ast_sim.inference.question import Question
@@ -56,7 +56,11 @@ def asked_frames(
     torch.set_num_threads(1)
     try:
         indices = dataset.with_frames(split, model.config.given_frames + 1)
-        scenes = [_scene(model, dataset, split, index, effort) for index in indices]
+        scenes = []
+        for index in indices:
+            scenes.append(_scene(model, dataset, split, index, effort))
+            if progress is not None:
+                progress(scenes[-1]["name"])
     finally:
         torch.set_num_threads(threads)
     why = None
@@ -81,30 +85,37 @@ def asked_frames(
     }
 
 
-def errors_by_effort(model: Simulator, truth: Trajectory, most: Effort) -> np.ndarray:
-    """The errors at the deepest frame after c corrections and up to k Newton steps, up to `most` of them.
+def errors_by_effort(model: Simulator, truth: Trajectory, most: Effort) -> list[EffortErrors]:
+    """The errors at the deepest frame after each number of corrections and of Newton steps, up to `most`; empty where
+    nothing is displaced."""
+    frame = max(deepest_frame(truth), model.config.given_frames)
+    if not _rms(truth.position[frame] - truth.position[0], ~truth.scene.prescribed):
+        return []
+    efforts = range(most.corrections + 1)
+    return [errors for corrections in efforts for errors in _after(model, truth, frame, corrections, most.newton_steps)]
 
-    Returns:
-        [4, C, K]: the error of the displacement, relative to it; that of the stress, relative to that of the frame's
-        true mean; how many Newton steps were made; 1 where these did not end, else 0. NaN where the prediction failed,
-        or where there is no stress.
-    """
-    frame, free = max(deepest_frame(truth), model.config.given_frames), ~truth.scene.prescribed
-    size, found = _rms(truth.position[frame] - truth.position[0], free), np.full((4, most[0] + 1, most[1] + 1), np.nan)
-    for corrections in range(most.corrections + 1) if size else ():
-        for steps in (most.newton_steps, 0):  # where a Newton step fails, the calls before it still count
-            (after,) = calls(model, [Question.of(truth, "validation", [frame])], Effort(corrections, steps))
-            if not isinstance(after, str):
-                moved = [relative_error(x[0], truth, frame) for x in after.position[corrections:]]
-                found[0, corrections, : steps + 1] = moved
-                allowed, made = np.arange(steps + 1), after.steps[0] + (after.last_step[0] > STILL)
-                found[2, corrections, : steps + 1] = np.minimum(allowed, made)
-                found[3, corrections, : steps + 1] = (allowed > 0) & (allowed < made)
-                for step, stress in enumerate(() if after.stress is None else after.stress):
-                    share = _stress_errors(truth, stress[0], frame, model.config.stress)["stress_share"]
-                    found[1, corrections, step] = np.nan if share is None else share
-                break
-    return found
+
+def _after(model: Simulator, truth: Trajectory, frame: int, corrections: int, most: int) -> list[EffortErrors]:
+    """The errors after so many corrections and 0 to `most` Newton steps."""
+    question = Question.of(truth, "validation", [frame])
+    (way,) = calls(model, [question], Effort(corrections, most))
+    if isinstance(way, str) and most:  # a Newton step failed; the calls before it still count
+        (way,) = calls(model, [question], Effort(corrections))
+    if isinstance(way, str):
+        return [EffortErrors(Effort(corrections, steps), None, None, 0, 0) for steps in range(most + 1)]
+    positions = way.position[corrections:]
+    needed = int(way.steps[0]) + bool(way.last_step[0] > STILL)
+    measured = []
+    for steps in range(most + 1):
+        effort = Effort(corrections, steps)
+        if steps >= len(positions):
+            measured.append(EffortErrors(effort, None, None, 0, 0))
+            continue
+        error = relative_error(positions[steps][0], truth, frame)
+        stress = None if way.stress is None else way.stress[steps][0]
+        stress_error = _stress_errors(truth, stress, frame, model.config.stress)["stress_share"]
+        measured.append(EffortErrors(effort, error, stress_error, min(steps, needed), float(0 < steps < needed)))
+    return measured
 
 
 def lines(found: dict[str, Any]) -> list[str]:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ast_sim.inference.answer import Answer
-from ast_sim.inference.measures import SquaredError, rmse_pooled, rmse_sequence
+from ast_sim.inference.evaluation.measures import SquaredError, rmse_pooled, rmse_sequence
 from ast_sim.scene import NodeType, Trajectory
 
 # The errors of one scene, by predictor, horizon and set of nodes.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import os
 from collections.abc import Callable
@@ -13,13 +14,19 @@ import torch
 from ast_sim.batches.batch_builder import State
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import read_seconds
-from ast_sim.inference import asked_frame
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.effort import FIRST_CALL, Effort
+from ast_sim.inference.evaluation import asked_frame
+from ast_sim.inference.evaluation.trivial_predictors import (
+    Errors,
+    displacement_errors,
+    rmse_of,
+    stress_errors,
+    summarize,
+)
 from ast_sim.inference.predict import answers as predictions
 from ast_sim.inference.predict_batch import Start, predict_batch
 from ast_sim.inference.question import Question
-from ast_sim.inference.trivial_predictors import Errors, displacement_errors, rmse_of, stress_errors, summarize
 from ast_sim.models.simulator import Simulator
 from ast_sim.scene import Trajectory
 from ast_sim.support.errors import DatasetError
@@ -36,13 +43,13 @@ def evaluate(
     effort: Effort = FIRST_CALL,
     rival_scenes: int = 0,
     made_from: str | os.PathLike[str] | None = None,
-) -> tuple[dict[str, Any], list[Answer]]:
+) -> dict[str, Any]:
     """Predict all trajectories of a split and compare.
 
     A scene without a frame to predict is left out. Where a prediction fails, its errors and the summary are None.
 
     Returns:
-        The predictions, and figures that hold:
+        Figures that hold:
         samples: for each scene its name, nodes, frames, root mean square errors (`displacement` and `stress`, by
         predictor, horizon and nodes), and the seconds per step of the model and of the solver;
         summary: by predictor, quantity, horizon and nodes the errors `rmse_sequence` and `rmse_pooled` of all scenes;
@@ -60,7 +67,7 @@ def evaluate(
     if not indices:
         raise DatasetError(f"{dataset.path}: the split {split} has no frame to predict")
     constant = _training_stress(dataset) if model.config.stress != "none" else None
-    samples, answers, displacement, stress = [], [], [], []
+    samples, displacement, stress = [], [], []
     seconds = read_seconds(dataset).samples
     for index in indices:
         name, truth = f"{split}/{index:06d}", dataset.load(split, index)
@@ -72,22 +79,20 @@ def evaluate(
         recorded = truth.attributes.get("solve_seconds")
         solver = seconds.get(name, recorded if isinstance(recorded, list) else None)
         samples.append(_sample(truth, answer, displacement[-1], stress[-1] if stress else None, solver))
-        answers.append(answer)
         if progress is not None:
             progress(name)
-    figures = {
+    return {
         "samples": samples,
         "summary": summarize({"displacement": displacement, "stress": stress}),
         "failures": sum(sample["failure"] is not None for sample in samples),
         "jumps": model.config.jumps,
-        **effort._asdict(),
+        **dataclasses.asdict(effort),
         "asked": asked_frame.asked_frames(model, dataset, split, effort, rival_scenes, progress, made_from),
         "speedup": _speedup(samples),
         "length_unit": dataset.info.length_unit,
         "stress_unit": "Pa",
         "threads": torch.get_num_threads(),
     }
-    return figures, answers
 
 
 def _predicted(answer: Answer) -> tuple[np.ndarray | None, np.ndarray | None]:
