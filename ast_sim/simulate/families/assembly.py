@@ -5,6 +5,7 @@ Lengths are in the unit of the specification. Forces and energies of a trajector
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -22,7 +23,7 @@ from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
 from ast_sim.simulate.own_assembly.parameters import Values, completed, drawn, told
 from ast_sim.simulate.own_assembly.rest_check import BadAssembly, check
 from ast_sim.simulate.own_assembly.standing import PlacedPart, Reference, case, placed, reference
-from ast_sim.simulate.shapes.cad import MeshingFailed
+from ast_sim.simulate.shapes.cad.gmsh_process import MeshingFailed
 from ast_sim.simulate.shapes.mesh_check import BadMesh
 from ast_sim.support.errors import ConfigError, SimulationError
 
@@ -95,15 +96,20 @@ def scene_of(
     return Drawn(made, partial(_remeshed, spec, values, frames, shared, factor, made.scene.num_nodes))
 
 
-def check_spec(spec: AssemblySpec, nodes: int | None, frames: int) -> None:
+def check_spec(spec: AssemblySpec, nodes: int | None, frames: int, keep: tuple[int, ...] | None = None) -> None:
     """Make, but do not solve, the scene in the middle of all ranges and those at the ends of each range.
+
+    A warning tells each of their notes.
 
     Raises:
         SimulationError, ConfigError: as `scene_of`.
     """
-    shared = reference(spec)
+    shared, notes = reference(spec), {}
     for values in ends_of_ranges(spec):
-        scene_of(spec, values, nodes, frames, shared)
+        case = scene_of(spec, values, nodes, frames, shared).case
+        notes |= dict.fromkeys((case if keep is None else case.keeping(keep)).notes())
+    for note in notes:
+        warnings.warn(note, stacklevel=2)
 
 
 def ends_of_ranges(spec: AssemblySpec) -> Iterator[Values]:

@@ -61,13 +61,15 @@ def _check_turned_over(spec: AssemblySpec, case: SolidCase) -> None:
     """Elements whose nodes are all prescribed cannot give way."""
     scene = case.scene
     rows = scene.elements[scene.prescribed[scene.elements].all(axis=1) & case.deforming]
-    for frame, position in enumerate(case.targets):
+    followed, stored = case.followed()
+    for row, position in enumerate(followed.targets):
         wrong = (quarters(position, rows) <= 0).any(axis=0)
         if wrong.any():
             first = rows[np.argmax(wrong)]
             name = spec.parts[scene.body[first[0]]].name
             raise BadAssembly(
-                f"{name}: its prescribed nodes turn {wrong.sum()} elements over in frame {frame}, the first at"
+                f"{name}: its prescribed nodes turn {wrong.sum()} elements over on the way to frame"
+                f" {np.searchsorted(stored, row)}, the first at"
                 f" {point(case.targets[0][first].mean(axis=0))}: make the motion smaller"
             )
 
@@ -118,7 +120,8 @@ def gap_between(case: SolidCase, pair: tuple[int, int]) -> float:
 def _contact_of(case: SolidCase, pair: tuple[int, int]) -> Contact:
     faces = np.concatenate([surface_of(case, number) for number in pair])
     rest = case.scene.rest_position.astype(np.float64)
-    return Contact(rest, faces, case.scene.body, ContactSettings(case.contact.dhat, 1.0))
+    settings = ContactSettings(case.contact.dhat, 1.0)
+    return Contact(rest, faces, case.scene.body, settings, ~case.scene.deforming_nodes)
 
 
 def surface_of(case: SolidCase, body: int) -> np.ndarray:
