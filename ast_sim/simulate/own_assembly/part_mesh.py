@@ -12,7 +12,7 @@ import numpy as np
 from ast_sim.dataset.layout import LENGTH_UNITS
 from ast_sim.element_topology import MIDDLES
 from ast_sim.importers.mesh_file import read_mesh
-from ast_sim.importers.places import Place
+from ast_sim.importers.places import Place, marked
 from ast_sim.simulate.own_assembly.assembly_spec import (
     CAD_ENDINGS,
     IGES_ENDINGS,
@@ -69,7 +69,7 @@ class PartMesh:
         """
         nodes = np.zeros(len(self.position), bool)
         for place in places:
-            inside = place.inside(self.position, lambda name: self._known("field", name, key) != 0, self._group(key))
+            inside = place.inside(self.position, lambda name: marked(self._known("field", name, key)), self._group(key))
             if not inside.any():
                 ends = zip("xyz", self.position.min(axis=0), self.position.max(axis=0), strict=True)
                 box = ", ".join(f"{axis} from {low:.6g} to {high:.6g}" for axis, low, high in ends)
@@ -186,7 +186,7 @@ def _from_file(part: PartSpec, request: dict[str, Any]) -> PartMesh:
     """A mesh, or a rigid surface, as it stands in its file."""
     if Path(request["stamp"][0]).suffix.lower() == STL_ENDING:
         return _surface_mesh(part, request, _stl(request))
-    mesh = read_mesh(Path(request["stamp"][0]), curved=True)
+    mesh = read_mesh(Path(request["stamp"][0]))
     used, elements = np.unique(mesh.elements, return_inverse=True)
     elements, position = elements.reshape(-1, mesh.elements.shape[1]), request["scale"] * mesh.points[used]
     fields = {
