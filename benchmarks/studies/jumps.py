@@ -158,7 +158,7 @@ standard error. "Training scenes" has the error on scenes of the training. "Minu
 of a step, on one thread; other work on the machine made some rows slower, so rows with equal steps differ. An "answer"
 is the median time from the question to positions and stress, for a scene alone, with all that is prepared for its mesh.
 Validation has chosen how many corrections and Newton steps follow the first call of the model in the first table;
-`predict(corrections=, newton_steps=)` chooses them for an answer. The tables below the first are the whole dial: they
+`predict(effort=)` chooses them for an answer. The tables below the first are the whole dial: they
 were timed again, so times differ a little from the first table. The stress error in them is a share of the standard
 deviation of the true stress in the frame: 1 is no better than the mean stress everywhere. Newton steps end when one is
 small; where they do not end, the page says so.
