@@ -200,7 +200,7 @@ error). "Reaction" is the error of the force that moves the tool, in the last fr
 the largest von Mises stress. The solver goes to the same frame at its own stop test: straight in one, two or four load
 steps and frame by frame, whichever is fastest. "Fastest way" is the fastest of 13 settings whose error is at most the
 answer's: looser stop tests, coarser meshes, and the same Newton steps without a model. All times count what is prepared
-for a mesh. An answer's time is the median over the test scenes; the solver's are medians over the scenes in which it was
+for a mesh. An answer's time is the median over the test scenes; the solver's are medians over the scenes where it was
 run (ten; one of 6,000 nodes). "Pays after" so many questions, the time that the answers saved is the time of the
 simulations and the training.
 """

@@ -96,7 +96,7 @@ def seeds(models: dict[str, Any]) -> str:
 
 def origins(models: dict[str, Any]) -> list[str]:
     """The commits and processors of the runs, each once."""
-    made = [measured(run) for model in models.values() for run in model["runs"] if measured(run)]
+    made = [measured(run)["origin"] for model in models.values() for run in model["runs"] if measured(run)]
     commits = sorted({(found["commit"] or "?")[:10] for found in made})
     return [
         f"commit{'s' if len(commits) > 1 else ''} {', '.join(commits)}",
