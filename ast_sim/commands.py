@@ -154,12 +154,15 @@ def train(args: argparse.Namespace) -> None:
     if args.data is None and not args.resume:
         raise ConfigError("name the dataset to train on, or give --resume to go on with the run in --out")
     files = {"config": args.config, "from_run": getattr(args, "from")}
-    if args.data is None and (args.model or args.preset or args.set or any(files.values())):
-        raise ConfigError("a resumed run keeps its settings: leave --model, --preset, --config, --from and --set out")
+    if args.data is None and (args.model or args.preset or args.set or args.minutes or any(files.values())):
+        raise ConfigError(
+            "a resumed run keeps its settings: leave --model, --preset, --config, --from, --minutes and --set out"
+        )
     # A resumed run keeps its settings; with a dataset, the given settings are compared with them.
     config = None
     if args.data is not None:
-        config = configure(args.data, args.preset, args.set, args.model, **files)
+        changes = {} if args.minutes is None else {"train.minutes": args.minutes}
+        config = configure(args.data, args.preset, args.set, args.model, **files, changes=changes)
     steps = args.profile or 0
     start_training(args.out, config, resume=args.resume, profile_steps=steps, from_run=files["from_run"])
     if args.profile is None:

@@ -19,7 +19,10 @@ class TrainConfig:
     from the data."""
 
     steps: int | None = setting(None, "optimizer steps; unset: as many as `epochs` asks for")
-    epochs: int = setting(100, "passes over the training pairs; it has no effect if `steps` is set")
+    minutes: float | None = setting(
+        None, "minutes of training: 50 steps are timed first, then the number of steps is fixed; leave `steps` unset"
+    )
+    epochs: int = setting(100, "passes over the training pairs, if neither `steps` nor `minutes` is set")
     batch_size: int = setting(48, "scenes in a batch; each scene is a pair of frames")
     accumulate: int = setting(1, "batches in a step; the step averages their gradients")
     optimizer: OptimizerName = setting(
