@@ -196,8 +196,7 @@ def start_training(
             scales = measure(dataset)
             fit = partial(resolve, dataset=dataset, scales=scales, keep_model=source is not None)
             begin = partial(Training, folder, dataset=dataset, scales=scales, signals=signals, processes=processes)
-            if asked.train.minutes is not None and asked.train.steps is None:
-                asked = _with_steps(asked, saved, fit, begin)
+            asked = _with_steps(asked, saved, fit, begin)
             resolved = asked if config is None else fit(asked)
             batch_size = resolved.train.batch_size
             if batch_size % processes.count:
@@ -219,13 +218,17 @@ def start_training(
 def _with_steps(
     asked: RunConfig, saved: RunConfig | None, fit: Callable[[RunConfig], RunConfig], begin: Callable[..., Training]
 ) -> RunConfig:
-    """The settings with the number of steps that fits into their minutes: of the run that is resumed, or measured."""
-    if saved is not None and saved.train.minutes == asked.train.minutes:
+    """The settings; if they have minutes and no steps, with the number of steps that fits into the minutes: of the run
+    that is resumed, or measured."""
+    minutes = asked.train.minutes
+    if minutes is None or asked.train.steps is not None:
+        return asked
+    if saved is not None and saved.train.minutes == minutes:
         steps = saved.train.steps
     else:
         timed = fit(dataclasses.replace(asked, train=dataclasses.replace(asked.train, steps=UNKNOWN_STEPS)))
         with begin(config=timed) as training:
-            steps = steps_within(asked.train.minutes, training)
+            steps = steps_within(minutes, training)
     return dataclasses.replace(asked, train=dataclasses.replace(asked.train, steps=steps))
 
 
