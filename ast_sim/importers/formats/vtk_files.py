@@ -76,14 +76,26 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
         mesh = _mesh(path, parts, head["time"])
         declared = of_steps[step] if step < len(of_steps) else head.get("declared")
         declared = declared or ([sum(column) for column in zip(*pieces, strict=True)] if pieces else None)
-        counted = [len(mesh.points), sum(len(block.nodes) for block in mesh.blocks)]
-        if declared is not None and declared != counted:
-            raise DatasetError(
-                f"{path}: says that it holds {declared[0]} points and {declared[1]} cells, but VTK reads {counted[0]}"
-                f" and {counted[1]}"
-            )
+        _require_counts(mesh, declared)
         yield _without_ghosts(_with_pieces(mesh, pieces))
         step += 1
+
+
+def _require_counts(mesh: SourceMesh, declared: list[int] | None) -> None:
+    """Check that the points and cells are as many as the file says; a note says if VTK leaves out points of no cell."""
+    if declared is None:
+        return
+    points, cells = len(mesh.points), sum(len(block.nodes) for block in mesh.blocks)
+    if mesh.path.suffix.lower() in EXODUS and mesh.same_point is not None:
+        points = len(np.unique(mesh.same_point))  # each block has its own copies of the points that it uses
+        if points < declared[0]:
+            mesh.notes.append(f"{declared[0] - points} points of no element are left out")
+            points = declared[0]
+    if declared != [points, cells]:
+        raise DatasetError(
+            f"{mesh.path}: says that it holds {declared[0]} points and {declared[1]} cells, but VTK reads {points} and"
+            f" {cells}"
+        )
 
 
 def _checked(path: Path) -> tuple[list[tuple[int, int]], int]:
@@ -135,7 +147,7 @@ def _of_frd(path: Path) -> list[tuple[int, int]]:
                     " of a *STATIC or *DYNAMIC step"
                 )
         for key in (b"2C", b"3C"):
-            declared = re.search(rb"^ {4}" + key + rb" +([0-9]+)", content, re.MULTILINE)
+            declared = re.search(rb" {4}" + key + rb" +([0-9]+) ", content)  # no new line precedes it in a binary file
             counts.append(int(declared[1]) if declared else 0)
     return [(counts[0], counts[1])]
 
