@@ -91,7 +91,7 @@ def read_scene(
 
 def describe(scene: Scene) -> list[str]:
     """A line on the scene, and one on each body: its nodes by type, its elements, its bounding box."""
-    kind = "tetrahedra" if scene.elements.shape[1] == 4 else "triangles"
+    kind = "triangles" if scene.elements.shape[1] == 3 else "tetrahedra"
     body_of_element = scene.body[scene.elements[:, 0]]
     lines = [f"{len(np.unique(scene.body))} bodies, {scene.num_nodes} nodes, {scene.num_elements} {kind}"]
     for body in np.unique(scene.body):

@@ -11,8 +11,8 @@ import numpy as np
 
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import Contact
-from ast_sim.mechanics.elements.elasticity import Elasticity
 from ast_sim.mechanics.elements.material import von_mises
+from ast_sim.mechanics.elements.second_order import elastic_body
 from ast_sim.mechanics.frames import MAX_FRAME_ITERATIONS, FrameRecord, Frames, GivenUp
 from ast_sim.mechanics.load_halving import QuasiStatic
 from ast_sim.mechanics.solver import SolverSettings
@@ -26,7 +26,7 @@ COMPONENTS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))
 
 @dataclass(frozen=True, kw_only=True)
 class SolidRecord(FrameRecord):
-    """A record with the balance of forces. Its work is the trapezoidal rule over the frames.
+    """A record with the balance of forces. Its work is the trapezoidal rule over the legs of the motion.
 
     Attributes:
         imbalance: magnitude of the sum of the forces on all prescribed nodes, divided by the sum of their magnitudes; 0
@@ -34,6 +34,17 @@ class SolidRecord(FrameRecord):
     """
 
     imbalance: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class TurnedRecord(SolidRecord):
+    """A record where the nodes that the reaction is of turn.
+
+    Attributes:
+        torque: of the reaction in newton metres, around the axis of the turn and positive in its sense.
+    """
+
+    torque: float
 
 
 def quasi_static(
@@ -101,8 +112,9 @@ def solve_frame(
     frames.watch(watch)
     position, failure = None, ""
     try:
-        for target in case.targets[frame if first else 1 : frame + 1]:
-            solver.advance(target, first or 1.0)
+        for legs in [case.straight(frame)] if first else map(case.legs, range(1, frame + 1)):
+            for leg in legs:
+                solver.advance(leg.end, first or 1.0, leg.along)
     except SimulationError as error:
         failure = str(error)
     seconds = process_time() - began
@@ -126,46 +138,69 @@ class SolidFrames(Frames):
     def __init__(self, case: SolidCase, settings: SolverSettings | None) -> None:
         scene, rest = case.scene, case.scene.rest_position.astype(np.float64)
         self._deforming = np.flatnonzero(case.deforming)
-        self._elasticity = Elasticity(rest, scene.elements[self._deforming], case.material.of(self._deforming))
+        self._elasticity = elastic_body(rest, scene.elements[self._deforming], case.material.of(self._deforming))
         contact = Contact(rest, scene.surface(), scene.body, case.contact, ~scene.deforming_nodes)
         super().__init__(case, QuasiStatic(self._elasticity, contact, scene.prescribed, rest, settings), contact)
         self._reactions = np.zeros_like(rest)
+        self.record_type = SolidRecord if self.driven.axis is None else TurnedRecord
+        self._work = 0.0
 
     def next_frame(self) -> tuple[dict[str, np.ndarray], SolidRecord]:
         """See `Frames`."""
-        newton, start = self.solver.newton, self.solver.newton.position
+        newton, self._work = self.solver.newton, 0.0
         cost = self.advance()
+        if not self.records:
+            self._reactions = self._held()
         arrays = self._stored()
-        checked = self.check(arrays)
-        reactions = np.where(self.case.scene.prescribed[:, None], newton.reactions(), 0)
-        work = 0.5 * float(np.vdot(reactions + self._reactions, newton.position - start))
-        self._reactions = reactions
-        return arrays, SolidRecord(
+        checked, reactions = self.check(arrays), self._reactions
+        turned = {} if self.driven.axis is None else {"torque": self._torque(reactions)}
+        return arrays, self.record_type(
             **cost,
             **checked,
+            **turned,
             residual=newton.residual(),
             contact_area=self.contact.area(newton.state.contact),
-            reaction=float(np.linalg.norm(reactions[self.driven].sum(axis=0))),
+            reaction=float(np.linalg.norm(reactions[self.driven.nodes].sum(axis=0))),
             imbalance=self._imbalance(reactions),
             elastic_energy=newton.state.potential.energy,
             contact_energy=newton.state.contact.barrier_energy(),
-            work=self.last("work") + work,
+            work=self.last("work") + self._work,
         )
+
+    def bring(self, frame: int) -> None:
+        """See `Frames`. The work of a leg follows by the trapezoidal rule."""
+        for leg in self.case.legs(frame):
+            start, self._steps_before = self.solver.newton.position, self.solver.iterations
+            self.solver.advance(leg.end, along=leg.along)
+            reactions = self._held()
+            self._work += 0.5 * float(np.vdot(reactions + self._reactions, self.solver.newton.position - start))
+            self._reactions = reactions
+
+    def _held(self) -> np.ndarray:
+        """[N,3]: the forces that hold the prescribed nodes; 0 at others."""
+        return np.where(self.case.scene.prescribed[:, None], self.solver.newton.reactions(), 0)
 
     def _stored(self) -> dict[str, np.ndarray]:
         """The arrays of a frame as they are stored."""
         elasticity, deformation = self._elasticity, self.solver.newton.state.potential
         position = self.solver.newton.position.astype(np.float32)
-        tensor = elasticity.cauchy(deformation)
-        mises = von_mises(tensor)
         if self.case.stress_location == "node":
-            return {"position": position, "stress": elasticity.nodal_mean(mises).astype(np.float32)[:, None]}
+            return {
+                "position": position,
+                "stress": elasticity.von_mises(deformation, "node").astype(np.float32)[:, None],
+            }
+        tensor = elasticity.cauchy(deformation)
         components = np.stack([tensor[i, j] for i, j in COMPONENTS], axis=1)
         return {
             "position": position,
-            "stress": self._of_all_elements(mises[:, None]),
+            "stress": self._of_all_elements(von_mises(tensor)[:, None]),
             "cauchy_stress": self._of_all_elements(components),
         }
+
+    def _torque(self, reactions: np.ndarray) -> float:
+        """See `TurnedRecord`."""
+        nodes = self.driven.nodes
+        return self.driven.axis.torque(self.solver.newton.position[nodes], reactions[nodes])
 
     def _imbalance(self, reactions: np.ndarray) -> float:
         """See `SolidRecord`. If there are hardly any forces, the divisor is the force of a strain of 1e-3."""

@@ -80,7 +80,7 @@ def _soft_tools(scene: Scene, position: np.ndarray) -> list[Finding]:
 
 
 def _turn_over(scene: Scene, position: np.ndarray) -> list[Finding]:
-    if scene.elements.shape[1] != 4:
+    if scene.elements.shape[1] == 3:
         return []
     sign = np.sign(signed_volumes(scene.rest_position, scene.elements))
     count, first, frames = 0, None, []

@@ -48,11 +48,20 @@ def overlaps(scene: Scene) -> list[Finding]:
     return found
 
 
-def deepest(rest: np.ndarray, first: np.ndarray, second: np.ndarray, tolerated: float = 0.0) -> Overlap | None:
+def deepest(rest: np.ndarray, first: np.ndarray, second: np.ndarray, tolerated: float) -> Overlap | None:
     """How deep two closed surfaces [F, 3] lie in each other; None if they do not overlap by more than `tolerated`."""
+    depth, where = deepest_node(rest, first, second)
+    if depth > tolerated:
+        return Overlap(depth, where)
+    cut = _cut(rest, first, second, tolerated)
+    return None if cut is None else Overlap(0.0, cut)
+
+
+def deepest_node(rest: np.ndarray, first: np.ndarray, second: np.ndarray) -> tuple[float, np.ndarray]:
+    """How deep a node of one closed surface [F, 3] lies inside the other, and where; 0 if none does."""
     import igl  # takes 0.2 s
 
-    depth, where = tolerated, None
+    depth, where = 0.0, np.zeros(3)
     for mine, other in ((first, second), (second, first)):
         nodes = np.unique(mine)
         low, high = rest[np.unique(other)].min(axis=0), rest[np.unique(other)].max(axis=0)
@@ -62,10 +71,7 @@ def deepest(rest: np.ndarray, first: np.ndarray, second: np.ndarray, tolerated: 
             distance = np.asarray(igl.signed_distance(rest[nodes], rest[used], faces.reshape(-1, 3))[0])
             if -distance.min() > depth:
                 depth, where = float(-distance.min()), rest[nodes[np.argmin(distance)]]
-    if where is not None:
-        return Overlap(depth, where)
-    where = _cut(rest, first, second, tolerated)
-    return None if where is None else Overlap(0.0, where)
+    return depth, where
 
 
 def _cut(rest: np.ndarray, first: np.ndarray, second: np.ndarray, tolerated: float) -> np.ndarray | None:

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from ast_sim.element_topology import LOCAL_FACES
 from ast_sim.plausibility.findings import Finding, places
 from ast_sim.plausibility.overlaps import overlaps
-from ast_sim.scene import LOCAL_FACES, Scene, connected_parts
+from ast_sim.scene import Scene, connected_parts
 
 # Points are at one place if they are nearer than this share of the size of the scene.
 _SAME_PLACE = 1e-6
@@ -19,14 +20,14 @@ _SAME_PLACE = 1e-6
 def at_rest(scene: Scene) -> list[Finding]:
     """What looks wrong in a scene at rest."""
     findings = [*_twice(scene), *_free_nodes(scene), *_single_elements(scene)]
-    if scene.elements.shape[1] == 4:
+    if scene.elements.shape[1] != 3:
         findings += [*_inside_out(scene), *_folds(scene), *_faces_on_faces(scene), *overlaps(scene)]
     return findings
 
 
 def signed_volumes(points: np.ndarray, elements: np.ndarray) -> np.ndarray:
-    """[E] float64: the volumes of tetrahedra [E, 4], negative if they are inside out."""
-    corners = points[elements].astype(np.float64)
+    """[E] float64: the volumes between the corners of tetrahedra [E, 4] or [E, 10], negative if they are inside out."""
+    corners = points[elements[:, :4]].astype(np.float64)
     a, b, c = np.moveaxis(corners[:, 1:] - corners[:, :1], 1, 0)
     return np.einsum("ei,ei->e", a, np.cross(b, c)) / 6
 

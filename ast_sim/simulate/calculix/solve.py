@@ -23,12 +23,14 @@ from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import Contact
 from ast_sim.mechanics.elements.elasticity import Elasticity
 from ast_sim.mechanics.elements.material import von_mises
+from ast_sim.mechanics.elements.second_order import elastic_body
 from ast_sim.scene import AttributeValue, Trajectory
 from ast_sim.simulate.calculix.ccx_results import Results, read_results
 from ast_sim.simulate.calculix.deck import Increments, contact_stiffness, write_deck
 from ast_sim.support.errors import MissingExtra, SimulationError
 
 JOB = "case"
+POINTS = {4: 1, 10: 4}  # of integration, by the number of nodes of an element
 BEST_GUESS = "best solution and residuals are in the frd file"
 FAILED = 201  # what ccx returns when it gives up, for whatever reason
 # These are tried one after another until all frames converge: first softer contact, then shorter increments, too.
@@ -95,6 +97,7 @@ def quasi_static(case: SolidCase, settings: CalculixSettings | None = None) -> T
             output cannot be read. The folder with deck and output is then kept and named.
     """
     settings = settings or CalculixSettings()
+    case, stored = case.followed()
     ccx = find_ccx()
     solver = f"calculix {version(ccx)}"
     best: Trajectory | None = None
@@ -104,7 +107,25 @@ def quasi_static(case: SolidCase, settings: CalculixSettings | None = None) -> T
             best = trajectory
         if best.attributes["status"] == "complete":
             break
-    return replace(best, attributes={**best.attributes, "solver": solver})
+    return _with_frames(replace(best, attributes={**best.attributes, "solver": solver}), stored)
+
+
+def _with_frames(trajectory: Trajectory, stored: list[int]) -> Trajectory:
+    """The trajectory with the frames `stored` only; what was spent on the frames before one of them counts for it."""
+    rows = [row for row in stored if row < trajectory.num_frames]
+    if len(stored) == stored[-1] + 1:
+        return trajectory
+    attributes = dict(trajectory.attributes)
+    for name, values in attributes.items():
+        if isinstance(values, list) and len(values) == trajectory.num_frames:
+            attributes[name] = [values[row] for row in rows]
+            if name in ("solve_seconds", "newton_iterations", "halvings"):
+                attributes[name] = np.diff(np.cumsum(values)[rows], prepend=0).tolist()
+    if "stopped_by" in attributes:
+        attributes["stopped_by"] = f"before frame {len(rows)}: {attributes['stopped_by']}"
+    framed = {key: getattr(trajectory, key) for key in ("position", "stress", "cauchy_stress")}
+    framed = {key: array[rows] for key, array in framed.items() if array is not None}
+    return replace(trajectory, attributes=attributes, **framed)
 
 
 def _attempt(case: SolidCase, ccx: str, increments: Increments, timeout: float) -> Trajectory:
@@ -117,7 +138,8 @@ def _attempt(case: SolidCase, ccx: str, increments: Increments, timeout: float) 
         stopped_by = _run(ccx, folder, timeout)
         seconds = perf_counter() - started
         scene = case.scene
-        results = read_results(folder, JOB, len(case.targets) - 1, scene.num_nodes, scene.num_elements)
+        points = POINTS[scene.elements.shape[1]]
+        results = read_results(folder, JOB, len(case.targets) - 1, scene.num_nodes, scene.num_elements, points)
         trajectory = _trajectory(case, results, increments, stopped_by, seconds)
     except SimulationError as error:
         raise SimulationError(f"{error} (deck and output are kept in {folder})") from error
@@ -198,7 +220,7 @@ def _trajectory(
 def _check(case: SolidCase, position: np.ndarray) -> tuple[list[float], str]:
     """Smallest determinant of a deformation gradient in each frame of [S,N,3] up to the first that fails, and why."""
     scene = case.scene
-    at_rest = _six_volumes(scene.rest_position[scene.elements[case.deforming]])
+    elasticity = _elasticity(case)
     surface = scene.surface()
     bodies = [surface[scene.body[surface[:, 0]] == body] for body in np.unique(scene.body[case.scene.elements])]
     contacts = [Contact(scene.rest_position.astype(np.float64), faces, scene.body, case.contact) for faces in bodies]
@@ -206,7 +228,7 @@ def _check(case: SolidCase, position: np.ndarray) -> tuple[list[float], str]:
     for frame in position:
         if not np.isfinite(frame).all():
             return jacobian, "positions are not finite"
-        smallest = float((_six_volumes(frame[scene.elements[case.deforming]]) / at_rest).min())
+        smallest = float(elasticity.evaluate(frame.astype(np.float64)).J.min())
         if smallest <= 0:
             return jacobian, f"an element is inverted (det F = {smallest:.3g})"
         for body, contact in enumerate(contacts):
@@ -216,10 +238,10 @@ def _check(case: SolidCase, position: np.ndarray) -> tuple[list[float], str]:
     return jacobian, ""
 
 
-def _six_volumes(corners: np.ndarray) -> np.ndarray:
-    """Six times the volumes of tetrahedra with the corners [E,4,3]."""
-    corners = corners.astype(np.float64)
-    return np.linalg.det(corners[:, 1:] - corners[:, :1])
+def _elasticity(case: SolidCase) -> Elasticity:
+    """The deforming bodies."""
+    scene, deforming = case.scene, case.deforming
+    return elastic_body(scene.rest_position.astype(np.float64), scene.elements[deforming], case.material.of(deforming))
 
 
 def _stress_arrays(case: SolidCase, stress: np.ndarray) -> dict[str, np.ndarray]:
@@ -232,10 +254,7 @@ def _stress_arrays(case: SolidCase, stress: np.ndarray) -> dict[str, np.ndarray]
     mises = _von_mises(stress)
     if case.stress_location == "element":
         return {"stress": mises[:, :, None].astype(np.float32), "cauchy_stress": stress.astype(np.float32)}
-    scene = case.scene
-    elasticity = Elasticity(
-        scene.rest_position.astype(np.float64), scene.elements[case.deforming], case.material.of(case.deforming)
-    )
+    elasticity = _elasticity(case)
     nodal = np.stack([elasticity.nodal_mean(frame[case.deforming]) for frame in mises])
     return {"stress": nodal[:, :, None].astype(np.float32)}
 

@@ -5,16 +5,15 @@ Legend: N nodes, E tetrahedra, F triangles; lengths in the units of the part.
 
 from __future__ import annotations
 
-from itertools import combinations
-
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from ast_sim.element_topology import FACE_TRIANGLES, LOCAL_FACES
 from ast_sim.mechanics.contact_and_friction import load_ipctk
-from ast_sim.scene import LOCAL_FACES
-from ast_sim.simulate.shapes.parts import volumes
+from ast_sim.simulate.shapes.cad.surface_mend import Surface, solids_of
+from ast_sim.simulate.shapes.parts import smallest_dihedral, volumes
 from ast_sim.support.errors import SimulationError
 
 SMALLEST_ANGLE = 5.0  # degrees between two faces of a tetrahedron
@@ -28,12 +27,13 @@ class BadMesh(SimulationError):
 
 
 def check_mesh(position: np.ndarray, elements: np.ndarray, name: str, smallest_angle: float = SMALLEST_ANGLE) -> None:
-    """Check a solid body, positions [N,3] and tetrahedra [E,4].
+    """Check a solid body, positions [N,3] and tetrahedra [E,4] or [E,10].
 
     Raises:
         BadMesh: the text names the part, what is wrong and where: no tetrahedra, too many nodes, numbers that are not
             finite, two nodes at one place, elements that are inverted, flat or with a dihedral angle below
-            `smallest_angle` degrees, no volume, several pieces, or a surface that cuts itself.
+            `smallest_angle` degrees, no volume, several pieces, or a surface that cuts itself. Angles and volumes are
+            those between the corners.
     """
     if len(elements) == 0:
         raise BadMesh(f"{name}: it holds no tetrahedra")
@@ -72,7 +72,7 @@ def check_surface(position: np.ndarray, triangles: np.ndarray, name: str) -> Non
 
     Raises:
         BadMesh: the text names the part, what is wrong and where: no triangles, numbers that are not finite, edges of
-            one triangle or of more than two, several pieces, no volume, or triangles that cut one another.
+            one triangle or of more than two, several solids, no volume, or triangles that cut one another.
     """
     if len(triangles) == 0:
         raise BadMesh(f"{name}: it holds no triangles")
@@ -89,9 +89,8 @@ def check_surface(position: np.ndarray, triangles: np.ndarray, name: str) -> Non
             a, b = position[edges[np.argmax(wrong)]]
             text = what.format(_count(wrong, "edge", "edges"))
             raise BadMesh(f"{name}: {text}, the first from {_point(a)} to {_point(b)}")
-    links = coo_array((np.ones(len(edges)), edges.T), shape=(len(position), len(position)))
-    pieces = connected_components(links, directed=False)[1][triangles[:, 0]]
-    _check_pieces(pieces, position[triangles].mean(axis=1), name, "closed by itself")
+    solids = solids_of(Surface(position, triangles))
+    _check_pieces(solids, position[triangles].mean(axis=1), name, "closed by itself")
     a, b, c = np.moveaxis(position[triangles] - position[triangles[0, 0]], 1, 0)
     _check_volume(abs(np.einsum("ij,ij->", a, np.cross(b, c))) / 6, _diagonal(position), name)
     check_no_intersections(position, triangles, name)
@@ -123,31 +122,13 @@ def check_no_intersections(position: np.ndarray, triangles: np.ndarray, name: st
 
 
 def boundary(elements: np.ndarray) -> np.ndarray:
-    """Faces [F,3] that belong to only one tetrahedron. Normals point out if the elements [E,4] have positive volume."""
-    faces = elements[:, np.array(LOCAL_FACES)].reshape(-1, 3)
-    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    return faces[np.sort(first[count == 1])]
-
-
-def smallest_dihedral(position: np.ndarray, elements: np.ndarray) -> np.ndarray:
-    """Smallest angle [E] between two faces of each tetrahedron, in degrees."""
-    corners = position[elements]
-    normals = []
-    for face in LOCAL_FACES:
-        a, b, c = (corners[:, i] for i in face)
-        normal = np.cross(b - a, c - a)
-        normals.append(normal / np.linalg.norm(normal, axis=1, keepdims=True))
-    cosine = np.max([-np.einsum("ei,ei->e", m, n) for m, n in combinations(normals, 2)], axis=0)
-    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-
-
-def merged(position: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Merge corners that lie at one place: the positions [N,3] that remain, and the triangles [F,3] over them."""
-    pairs = cKDTree(position).query_pairs(1e-7 * _diagonal(position), output_type="ndarray")
-    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(position), len(position)))
-    _, label = connected_components(links, directed=False)
-    _, first = np.unique(label, return_index=True)
-    return position[first], label[triangles]
+    """Triangles [F,3] of the faces that belong to only one tetrahedron, one of [E,4] and four of [E,10]. Normals point
+    out if the elements have positive volume."""
+    faces = np.sort(elements[:, np.array(LOCAL_FACES)].reshape(-1, 3), axis=1)
+    _, first, count = np.unique(faces, axis=0, return_index=True, return_counts=True)
+    owner, face = np.divmod(np.sort(first[count == 1]), 4)
+    local = np.array(FACE_TRIANGLES[elements.shape[1]])[face]
+    return np.take_along_axis(elements[owner][:, None, :], local, axis=2).reshape(-1, 3)
 
 
 def _check_points(position: np.ndarray, name: str, what: str) -> None:
