@@ -14,6 +14,7 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -43,6 +44,8 @@ _COPIES = 8
 _OWN_BYTES = 1 << 29
 _LARGEST_RATIO = 40  # of memory to file, where the file does not say what it declares
 
+_CAUSES = "it is damaged, needs too much memory, or holds what VTK cannot read: then write it in another format"
+
 _SECONDS = 120
 _SECONDS_PER_MEGABYTE = 2
 
@@ -68,6 +71,10 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
         MissingExtra: VTK is not installed.
     """
     pieces, budget = _checked(path)
+    if pieces and pieces[0] == (0, 0) and any(pieces[1:]) and path.suffix.lower() == ".vtu":
+        with _without_empty_pieces(path) as copy:
+            yield from (replace(frame, path=path) for frame in vtk_frames(copy))
+        return
     of_steps = declared_in_vtkhdf(path) if path.suffix.lower() == ".vtkhdf" else []
     step, steps = 0, 1
     while step < steps:
@@ -79,6 +86,19 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
         _require_counts(mesh, declared)
         yield _without_ghosts(_with_pieces(mesh, pieces))
         step += 1
+
+
+@contextlib.contextmanager
+def _without_empty_pieces(path: Path) -> Iterator[Path]:
+    """A copy of a file without its pieces that have no points: VTK takes the names of all arrays from the first."""
+    head, mark, data = path.read_bytes().partition(b"<AppendedData")
+    for piece in re.findall(rb"<Piece\b[^>]*/>|<Piece\b.*?</Piece>", head, re.DOTALL):
+        if re.match(rb"<Piece\b[^>]*\bNumberOfPoints\s*=\s*[\"']\s*0+\s*[\"']", piece):
+            head = head.replace(piece, b"", 1)
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / path.name
+        copy.write_bytes(head + mark + data)
+        yield copy
 
 
 def _require_counts(mesh: SourceMesh, declared: list[int] | None) -> None:
@@ -211,8 +231,8 @@ class _Worker:
         if code == -signal.SIGALRM:
             return f"VTK did not finish within {seconds} s"
         if code < 0:
-            return f"VTK crashed on it ({signal.Signals(-code).name}): it is damaged, or larger than its memory allows"
-        return "VTK stopped: it is damaged, or larger than its memory allows"
+            return f"VTK crashed on it ({signal.Signals(-code).name}); {_CAUSES}"
+        return f"VTK stopped; {_CAUSES}"
 
     def stop(self) -> None:
         if self.process is not None and self.owner == os.getpid():

@@ -100,9 +100,7 @@ def _node_block(spell: _Speller, numbers: np.ndarray, points: np.ndarray, rows: 
         spell.data(str(numbers[row]), *entries)
 
 
-def _element_block(
-    spell: _Speller, kind: str, numbers: np.ndarray, nodes: np.ndarray, name: str | None
-) -> None:
+def _element_block(spell: _Speller, kind: str, numbers: np.ndarray, nodes: np.ndarray, name: str | None) -> None:
     options = {"type": str(spell.rng.choice(TYPES[kind])), **({"elset": name} if name else {})}
     for key in spell.rng.permutation(list(options)).tolist():
         options[key] = options.pop(key)
@@ -178,7 +176,9 @@ def _parts(
     placements = {body: _placement(rng, simulation.size) for body in bodies}
     for body in rng.permutation(bodies).tolist():
         spell.keyword("part", name=f"Part-{body}")
-        part = content.part([np.arange(len(c)) * (b == body) if b == body else np.zeros(0, int) for b, _, c in content.blocks])
+        part = content.part(
+            [np.arange(len(c)) * (b == body) if b == body else np.zeros(0, int) for b, _, c in content.blocks]
+        )
         turn, shift, _ = placements[body]
         numbers = _numbered(rng, len(part.points))
         _node_block(spell, numbers, (part.points - shift) @ turn, np.arange(len(numbers)))

@@ -1,4 +1,5 @@
-"""Series that FEniCS writes: `python3 fenics_files.py FOLDER COUNT SEED` by a Python that has dolfinx or dolfin.
+"""Series that FEniCS writes: `python3 fenics_files.py WRITER FOLDER COUNT SEED`, WRITER dolfin or dolfinx,
+by a Python that has it.
 
 Each of the folders FOLDER/0, FOLDER/1, ... gets files of the writers for VTK and XDMF, and `truth.npz`: points [n, 3],
 cells [c, k], displacement [S, n, 3], times [S]. Debian has both packages, `python3-dolfinx` and `python3-dolfin`. This
@@ -47,7 +48,8 @@ def write_by_dolfin(folder, rng):
     fixed = dolfin.interpolate(dolfin.Expression("x[0] < 1e-9 ? 1. : 0.", degree=1), plain)
     fixed.rename("fixed", "fixed")
     stretch, times = rng.normal(0, 0.1, (3, 3)), np.cumsum(rng.uniform(0.01, 1, 3)) - 0.01
-    rows = [" + ".join(f"{stretch[i, j]:.17g}*x[{i}]" for i in range(3)) for j in range(3)]
+    rows = [f"s*(a{j}*x[0] + b{j}*x[1] + c{j}*x[2])" for j in range(3)]
+    given = {f"{name}{j}": float(stretch[i, j]) for i, name in enumerate("abc") for j in range(3)}
     u = dolfin.Function(space)
     u.rename("U", "U")
     encoding = str(rng.choice(["ascii", "base64", "compressed"]))
@@ -56,24 +58,22 @@ def write_by_dolfin(folder, rng):
     xdmf.parameters["functions_share_mesh"] = True
     xdmf.parameters["rewrite_function_mesh"] = False
     for frame, time in enumerate(times):
-        u.assign(dolfin.interpolate(dolfin.Expression([f"{frame / 2}*({row})" for row in rows], degree=1), space))
+        u.assign(dolfin.interpolate(dolfin.Expression(rows, s=frame / 2, **given, degree=1), space))
         file << (u, float(time))
         xdmf.write(u, float(time))
         xdmf.write(fixed, float(time))
-    dolfin.File(str(folder / "mesh.xml")) << domain
     return domain.coordinates(), domain.cells(), stretch, times
 
 
-def main(folder, count, seed):
+def main(writer, folder, count, seed):
     rng = np.random.default_rng(seed)
     for number in range(count):
         one = folder / str(number)
         one.mkdir(parents=True)
-        write = write_by_dolfinx if number % 2 else write_by_dolfin
-        points, cells, stretch, times = write(one, rng)
+        points, cells, stretch, times = {"dolfin": write_by_dolfin, "dolfinx": write_by_dolfinx}[writer](one, rng)
         displacement = np.arange(3)[:, None, None] / 2 * (points @ stretch)
         np.savez(one / "truth.npz", points=points, cells=cells, displacement=displacement, times=times)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]))
+    main(sys.argv[1], Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+from vtkmodules.util.vtkAlgorithm import VTKPythonAlgorithmBase
 from vtkmodules.vtkCommonCore import vtkBitArray, vtkDoubleArray, vtkPoints, vtkStringArray
 from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkMultiBlockDataSet, vtkUnstructuredGrid
-from vtkmodules.util.vtkAlgorithm import VTKPythonAlgorithmBase
 from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline as Pipeline
 from vtkmodules.vtkIOExodus import vtkExodusIIWriter
 from vtkmodules.vtkIOHDF import vtkHDFWriter
@@ -28,7 +28,9 @@ TYPES = {
 NAMES = FieldNames("U", "S", None, "tool", "fixed")
 
 
-def grid(rng: np.random.Generator, content: FileContent, simulation: Simulation, frame: int, moved: bool, bits: bool = True) -> Any:
+def grid(
+    rng: np.random.Generator, content: FileContent, simulation: Simulation, frame: int, moved: bool, bits: bool = True
+) -> Any:
     """An unstructured grid of a frame, with fields that nobody needs beside those that are read."""
     data = vtkUnstructuredGrid()
     at, real = vtkPoints(), np.float64 if rng.random() < 0.7 else np.float32
@@ -147,7 +149,8 @@ def pvd_series(rng: np.random.Generator, simulation: Simulation, folder: Path) -
             entries.append(f'<DataSet timestep="{time!r}" part="{part}" file="frames{slash}{name}"/>')
     listed = "\n".join(entries[row] for row in rng.permutation(len(entries))) if not by_part else "\n".join(entries)
     ending = ".PVD" if rng.random() < 0.1 else ".pvd"
-    text = f'<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1"><Collection>\n{listed}\n</Collection></VTKFile>\n'
+    head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1"><Collection>'
+    text = f"{head}\n{listed}\n</Collection></VTKFile>\n"
     (folder / f"all{ending}").write_text(text.replace("\n", "\r\n" if slash == "\\" else "\n"), newline="")
     return Case(folder / f"all{ending}", NAMES, times=True)
 
@@ -156,14 +159,12 @@ def pieces_series(rng: np.random.Generator, simulation: Simulation, folder: Path
     """A folder of VTU files of several pieces each, or of PVTU files and their pieces."""
     content, by_body = content_of(rng, simulation), bool(rng.random() < 0.5)
     rows = cut_into_pieces(rng, content, by_body)
-    if not by_body and rng.random() < 0.3:
-        rows = [[r[:0] for r in rows[0]], *rows] if rng.random() < 0.0 else rows
     parts = [content.part(one) for one in rows]
     if len(parts) > 1 and not by_body:
         simulation.defects.add("unstitched")
     series = folder / "series"
     series.mkdir()
-    apart = bool(rng.random() < 0.5)
+    apart, empty = rng.random() < 0.5, rng.integers(0, 6)
     for frame in range(len(simulation.times)):
         grids = [grid(np.random.default_rng(7), part, simulation, frame, False) for part in parts]
         if apart:
@@ -171,6 +172,8 @@ def pieces_series(rng: np.random.Generator, simulation: Simulation, folder: Path
                 write_xml(rng, series / f"f{frame}_{number}.vtu", data)
             _write_pvtu(series / f"f{frame}.pvtu", [f"f{frame}_{number}.vtu" for number in range(len(grids))])
         else:
+            if empty < 2:  # a process that has no part of the mesh
+                grids.insert(empty * len(grids), vtkUnstructuredGrid())
             _write_pieces(series / f"f{frame}.vtu", grids)
     return Case(series, NAMES)
 
@@ -224,13 +227,13 @@ class _Frames(VTKPythonAlgorithmBase):
         super().__init__(nInputPorts=0, nOutputPorts=1, outputType="vtkUnstructuredGrid")
         self.grids, self.times = grids, times.tolist()
 
-    def RequestInformation(self, request: Any, inputs: Any, outputs: Any) -> int:  # noqa: N802
+    def RequestInformation(self, request: Any, inputs: Any, outputs: Any) -> int:
         facts = outputs.GetInformationObject(0)
         facts.Set(Pipeline.TIME_STEPS(), self.times, len(self.times))
         facts.Set(Pipeline.TIME_RANGE(), [self.times[0], self.times[-1]], 2)
         return 1
 
-    def RequestData(self, request: Any, inputs: Any, outputs: Any) -> int:  # noqa: N802
+    def RequestData(self, request: Any, inputs: Any, outputs: Any) -> int:
         facts = outputs.GetInformationObject(0)
         time = facts.Get(Pipeline.UPDATE_TIME_STEP()) if facts.Has(Pipeline.UPDATE_TIME_STEP()) else self.times[0]
         frame = int(np.argmin(np.abs(np.array(self.times) - time)))
@@ -243,7 +246,9 @@ class _Frames(VTKPythonAlgorithmBase):
 def all_frames(rng: np.random.Generator, simulation: Simulation, folder: Path) -> Case:
     """A file with all frames, Exodus or VTKHDF."""
     content = content_of(rng, simulation)
-    grids = [grid(np.random.default_rng(3), content, simulation, f, False, bits=False) for f in range(len(simulation.times))]
+    grids = [
+        grid(np.random.default_rng(3), content, simulation, f, False, bits=False) for f in range(len(simulation.times))
+    ]
     source = _Frames(grids, simulation.times)
     exodus = rng.random() < 0.5
     writer = vtkExodusIIWriter() if exodus else vtkHDFWriter()
