@@ -100,7 +100,7 @@ class Dataset:
 
     @property
     def element_size(self) -> int:
-        """The number of nodes per element in every scene: 3 or 4."""
+        """The number of nodes per element in every scene: 3, 4 or 10."""
         return self._first_kind()[0]
 
     def count(self, split: str) -> int:

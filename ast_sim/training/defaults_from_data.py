@@ -41,7 +41,7 @@ def resolve(config: RunConfig, dataset: Dataset, scales: DataScales, keep_model:
         dataset.material_width,
         scales.spacing,
         scales.planar,
-        tetrahedra=dataset.element_size == 4,
+        tetrahedra=dataset.element_size != 3,
         recorded=scales.recorded,
     )
     model = dataclasses.replace(config.model, **facts.recorded) if keep_model else config.model.resolve(facts)

@@ -56,6 +56,7 @@ def _extrapolation() -> np.ndarray:
 
 
 _EXTRAPOLATION = _extrapolation()
+SLOPES = _slopes(POINTS)  # [point, node, 3]
 
 
 def points_at_rest(rest: np.ndarray, elements: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -64,7 +65,7 @@ def points_at_rest(rest: np.ndarray, elements: np.ndarray) -> tuple[np.ndarray, 
     A volume that is not positive belongs to an element that is turned over there; its gradients have no meaning.
     """
     x, volumes, gradients = rest.T[:, elements.T], [], []  # [3, 10, E]
-    for slopes in _slopes(POINTS):  # [10, 3]
+    for slopes in SLOPES:
         jacobian = np.einsum("iae,ak->ike", x, slopes)
         cofactors = cofactor(jacobian)
         six_volumes = determinant(jacobian, cofactors)

@@ -95,6 +95,16 @@ def scene_of(
     return Drawn(made, partial(_remeshed, spec, values, frames, shared, factor, made.scene.num_nodes))
 
 
+def resized(spec: AssemblySpec, values: Values, nodes: int | None, frames: int, relative: float) -> SolidCase:
+    """The scene with these values whose elements are `relative` times as long; errors as `scene_of`.
+
+    Elements of mesh files keep their size, unless `relative` is a half.
+    """
+    factor, _ = _sized(spec, values, nodes)
+    parts = placed(spec, values, factor * relative, halved=relative == 0.5)
+    return _checked(spec, values, frames, parts, reference(spec))
+
+
 def check_spec(spec: AssemblySpec, nodes: int | None, frames: int) -> None:
     """Make, but do not solve, the scene in the middle of all ranges and those at the ends of each range.
 

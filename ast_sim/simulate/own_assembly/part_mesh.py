@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ast_sim.element_topology import MIDDLES
+from ast_sim.element_topology import MIDDLES, linear_elements
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.importers.places import Place
 from ast_sim.simulate.own_assembly.assembly_spec import (
@@ -79,18 +79,19 @@ class PartMesh:
         return known[name]
 
 
-def part_meshes(spec: AssemblySpec, values: Values, factor: float = 1.0) -> list[PartMesh]:
+def part_meshes(spec: AssemblySpec, values: Values, factor: float = 1.0, halved: bool = False) -> list[PartMesh]:
     """The meshes of all parts for these values of the parameters.
 
     Args:
         factor: all element sizes are multiplied by this.
+        halved: the elements of mesh files, but for rigid parts, are cut into eight each.
 
     Raises:
         BadMesh, MeshingFailed: a part cannot be meshed, or its mesh cannot be used; the text names it.
         DatasetError, ConfigError: a mesh file cannot be read, or a size is not above 0.
         MissingExtra: a part needs gmsh, which is not installed.
     """
-    requests = [_request(spec, part, values, factor) for part in spec.parts]
+    requests = [_request(spec, part, values, factor, halved) for part in spec.parts]
     keys = [json.dumps(request, sort_keys=True) for request in requests]
     new = {key: place for place, key in enumerate(keys) if key not in _kept}
     cad = [place for place in new.values() if "size" in requests[place]]
@@ -109,7 +110,7 @@ def part_meshes(spec: AssemblySpec, values: Values, factor: float = 1.0) -> list
     return [found[key] for key in keys]
 
 
-def _request(spec: AssemblySpec, part: PartSpec, values: Values, factor: float) -> dict[str, Any]:
+def _request(spec: AssemblySpec, part: PartSpec, values: Values, factor: float, halved: bool) -> dict[str, Any]:
     """All that the mesh of a part depends on; with "size", it is a request to gmsh."""
     file = str(values[f"{part.name}.file"]) if len(part.files) > 1 else part.files[0]
     path = spec.file(file)
@@ -123,7 +124,7 @@ def _request(spec: AssemblySpec, part: PartSpec, values: Values, factor: float) 
     }
     request["stamp"] = [str(path), changed.st_mtime_ns, changed.st_size]
     if part.size is None:
-        return request
+        return request | {"halved": halved and not part.rigid}
     size = factor * part.size(values) / part.scale
     finer = []
     for one in part.finer:
@@ -171,6 +172,9 @@ def _from_file(part: PartSpec, request: dict[str, Any]) -> PartMesh:
         position, elements = merged(position, elements)
         fields, groups = {}, {}
     mesh = PartMesh(request["name"], position, elements, groups, fields)
+    if request["halved"]:
+        mesh = _raised(mesh)
+        mesh = replace(mesh, cells=linear_elements(mesh.cells))
     return _checked(_raised(mesh) if request["order"] == 2 and elements.shape[1] == 4 else mesh, part.rigid)
 
 
