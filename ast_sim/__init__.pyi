@@ -4,7 +4,8 @@ from .dataset.writer import DatasetWriter as DatasetWriter
 from .importers.convert import convert as convert
 from .importers.scene_mesh import read_scene as read_scene
 from .inference.answer import Answer as Answer
-from .inference.trained_run import Evaluation as Evaluation
+from .inference.effort import Effort as Effort
+from .inference.evaluation.evaluated_run import Evaluation as Evaluation
 from .inference.trained_run import Run as Run
 from .ops.library import keep_memory as keep_memory
 from .ops.library import show_config as show_config

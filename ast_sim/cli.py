@@ -9,14 +9,17 @@ import argparse
 import io
 import os
 import shlex
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ast_sim import __version__, commands
+from ast_sim import __version__, commands, help_lines
+from ast_sim.support.argument_types import at_least, path, whole_numbers
 from ast_sim.support.errors import AstSimError, ConfigError, printable
+from ast_sim.support.stop_signals import Interrupted
 
 
 class _Parser(argparse.ArgumentParser):
@@ -30,45 +33,6 @@ class _Parser(argparse.ArgumentParser):
 
     def format_help(self) -> str:
         return super().format_help() + "".join(f"{line}\n" for line in self.more())
-
-
-def _all_settings() -> list[str]:
-    """All settings for `train --set`."""
-    from ast_sim.models.registry import find_model, find_preset, model_names
-    from ast_sim.runs.train_config import TrainConfig
-    from ast_sim.support.toml_settings import settings
-
-    usual = find_preset("ast", "tiny").train
-    lines = ["", "settings for --set, and their values in the preset tiny (none: unset):"]
-    lines += ["", "training (of ast; other models list what differs):", *_settings("train.", TrainConfig, usual)]
-    for name in model_names():
-        try:
-            model, tiny = find_model(name), find_preset(name, "tiny")
-        except ConfigError as error:
-            lines += ["", str(error)]
-            continue
-        own, common = ({s.key: s.default for s in settings(TrainConfig, train)} for train in (tiny.train, usual))
-        lines += ["", f"{name}, presets {', '.join(model.presets)}:"]
-        lines += [f"  train.{key}={value}  (in tiny)" for key, value in own.items() if value != common[key]]
-        lines += _settings("model.", model.config, vars(tiny.model))
-    return lines
-
-
-def _settings(prefix: str, kind: type, values: Mapping[str, Any]) -> list[str]:
-    from ast_sim.support.toml_settings import settings
-
-    return [f"  {prefix}{s.key}={s.default}  ({s.type})\n        {s.help}" for s in settings(kind, values)]
-
-
-def _families() -> list[str]:
-    """A line about each family of `generate`."""
-    from ast_sim.simulate.families.names import FAMILIES
-
-    lines = ["", "families:"]
-    for name, family in FAMILIES.items():
-        options = "".join(" SPEC" if option == "spec" else f" --{option}" for option in family.options)
-        lines.append(f"  {name:17}{family.about}{f' ({options.strip()})' if options else ''}")
-    return lines
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -85,8 +49,8 @@ def main(argv: list[str] | None = None) -> int:
         args.run(args)
         sys.stdout.flush()
         return 0
-    except KeyboardInterrupt:
-        return 130
+    except KeyboardInterrupt as error:
+        return 128 + (error.number if isinstance(error, Interrupted) else signal.SIGINT)
     except (BrokenPipeError, SystemExit) as error:
         try:
             sys.stdout.flush()
@@ -140,7 +104,7 @@ def _add_each(to: Any, options: Mapping[str, str], **shared: Any) -> None:
 
 
 def _add_out(to: _Parser, metavar: str, about: str, required: bool = True) -> None:
-    to.add_argument("--out", type=_path, metavar=metavar, required=required, help=about)
+    to.add_argument("--out", type=path, metavar=metavar, required=required, help=about)
     _add_overwrite(to)
 
 
@@ -149,63 +113,66 @@ def _add_overwrite(to: _Parser) -> None:
 
 
 def _add_demo(demo: _Parser) -> None:
-    demo.add_argument("--out", type=_path, default=Path("demo"), metavar="DIR", help="result folder (default: demo)")
+    demo.add_argument("--out", type=path, default=Path("demo"), metavar="DIR", help="result folder (default: demo)")
     demo.add_argument("--quick", action="store_true", help="fewer scenes and steps: 90 seconds on 2 cores")
-    demo.add_argument("--seed", type=_at_least(0), default=0, help="seed of scenes and training (default: 0)")
+    demo.add_argument("--seed", type=at_least(0), default=0, help="seed of scenes and training (default: 0)")
 
 
 def _add_generate(generate: _Parser) -> None:
-    generate.more = _families
+    generate.more = help_lines.families
     generate.add_argument("family", metavar="FAMILY", help="kind of scenes; the list is below")
     about = "specification of an assembly (.toml), for the family assembly"
-    generate.add_argument("spec", type=_path, nargs="?", metavar="SPEC", help=about)
-    _add_each(generate, {"--out FILE": "dataset to write (.h5)"}, type=_path)
-    _add_each(generate, {"--count N": "number of training scenes"}, type=_at_least(1))
+    generate.add_argument("spec", type=path, nargs="?", metavar="SPEC", help=about)
+    _add_each(generate, {"--out FILE": "dataset to write (.h5)"}, type=path)
+    _add_each(generate, {"--count N": "number of training scenes"}, type=at_least(1))
     about = "draw the first scenes of an assembly as a picture and say what --count will cost; make no dataset"
     generate.add_argument("--look", action="store_true", help=about)
     splits = {
         "--valid N": "number of validation scenes (default: a tenth of --count)",
         "--test N": "number of test scenes (default: a tenth of --count)",
     }
-    _add_each(generate, splits, type=_at_least(0))
+    _add_each(generate, splits, type=at_least(0))
     sizes = {"--nodes N": "approximate number of nodes of a scene", "--frames N": "number of frames of a scene"}
-    _add_each(generate, sizes, type=_at_least(1))
+    _add_each(generate, sizes, type=at_least(1))
     about = "solve and store only frame 0 and these, such as 1,5,20, each straight from the one before (default: all)"
-    generate.add_argument("--keep", type=_whole_numbers, metavar="K,K,...", help=about)
-    generate.add_argument("--seed", type=_at_least(0), default=0, help="seed of the scenes (default: 0)")
+    generate.add_argument("--keep", type=whole_numbers, metavar="K,K,...", help=about)
+    generate.add_argument("--seed", type=at_least(0), default=0, help="seed of the scenes (default: 0)")
     about = "the bundled solver (own) or CalculiX (default: own)"
     generate.add_argument("--solver", choices=("own", "calculix"), help=about)
-    _add_each(generate, {"--parts PATH": "your parts: a STEP, STL or mesh file, or a folder of them"}, type=_path)
+    _add_each(generate, {"--parts PATH": "your parts: a STEP, STL or mesh file, or a folder of them"}, type=path)
     about = "solve every scene to its last frame (default: give up a frame after 500 Newton iterations)"
     generate.add_argument("--patient", action="store_true", help=about)
     where = generate.add_mutually_exclusive_group()
-    _add_each(where, {"--workers W": "number of processes (default: one per core)"}, type=_at_least(1))
+    _add_each(where, {"--workers W": "number of processes (default: one per core)"}, type=at_least(1))
     _add_each(where, {"--scheduler ADDRESS": "solve on the workers of a Dask scheduler, such as tcp://host:8786"})
 
 
 def _add_convert(convert: _Parser) -> None:
     about = (
-        "a simulation (a .pvd or .vtkhdf file or a folder of .vtu files), a folder that holds several simulations, or a"
-        " folder of meta.json and .tfrecord files"
+        "a simulation (a .vtkhdf, .frd, .xdmf, .exo or d3plot file, a .pvd file, or a folder of .vtu, .pvtu or .vtk"
+        " files), a folder that holds several simulations, or a folder of meta.json and .tfrecord files"
     )
-    convert.add_argument("source", type=_path, metavar="SOURCE", help=about)
+    convert.add_argument("source", type=path, metavar="SOURCE", help=about)
     _add_out(convert, "FILE", "dataset to write (.h5)")
-    fields = convert.add_argument_group("names of the fields in .vtu and .vtkhdf files")
+    fields = convert.add_argument_group("names of the fields in the files")
     names = {
         "--displacement NAME": "point field, displacement from rest; if there is none, the points themselves move",
-        "--stress NAME": "point or cell field with the von Mises stress",
+        "--stress NAME": "point or cell field with the von Mises stress, or with the components of a stress tensor",
         "--node-type NAME": "point field: 0 normal, 1 obstacle, 3 handle",
-        "--obstacle NAME": "point field that is not zero at the nodes of obstacles",
-        "--handle NAME": "point field that is not zero at prescribed nodes of deforming bodies",
+        "--obstacle NAME": "point field that is not zero at the nodes of obstacles; or a group of nodes, or BODY:all",
+        "--handle NAME": "the same for prescribed nodes of deforming bodies; a place is written BODY:PLACE, as 0:zmin",
         "--body NAME": "point or cell field with the numbers of the bodies",
     }
     _add_each(fields, names)
+    about = "components of the stress, such as xx,xy,xz,yy,yz,zz (default: as the file names them, else xx,yy,zz,...)"
+    _add_each(fields, {"--stress-order XX,YY,...": about}, type=_stress_order, default=())
     _add_each(fields, {"--material NAME": "cell fields with one number each"}, nargs="+", default=[])
-    kind = convert.add_argument_group("properties of a dataset made from .vtu files")
+    kind = convert.add_argument_group("properties of a dataset made from such files")
     about = "shares of the simulations, drawn at random (default: 0.8 0.1 0.1 of three or more)"
     kind.add_argument("--shares", nargs=3, type=float, metavar=("TRAIN", "VALID", "TEST"), help=about)
-    kind.add_argument("--seed", type=_at_least(0), default=0, help="seed of this draw (default: 0)")
+    kind.add_argument("--seed", type=at_least(0), default=0, help="seed of this draw (default: 0)")
     kind.add_argument("--incomplete", action="store_true", help="convert although nothing moves or is prescribed")
+    kind.add_argument("--strict", action="store_true", help="refuse simulations in which something looks wrong")
     kind.add_argument("--dynamic", action="store_true", help="inertia matters: models predict the acceleration")
     numbers = {
         "--contact-radius R": "distance below which surfaces are in contact (default: 0)",
@@ -215,36 +182,37 @@ def _add_convert(convert: _Parser) -> None:
     _add_each(kind, {"--length-unit UNIT": "unit of length: m, cm, mm, um or in (default: m)"}, default="m")
     records = convert.add_argument_group("selection from .tfrecord files (meta.json has all other facts)")
     records.add_argument("--split", nargs="+", choices=commands.SPLITS, help="convert only these files (default: all)")
-    _add_each(records, {"--limit N": "first N trajectories of each file (default: all)"}, type=_at_least(1))
-    _add_each(records, {"--every K": "keep every K-th frame (default: 1)"}, type=_at_least(1), default=1)
+    _add_each(records, {"--limit N": "first N trajectories of each file (default: all)"}, type=at_least(1))
+    _add_each(records, {"--every K": "keep every K-th frame (default: 1)"}, type=at_least(1), default=1)
     convert.set_defaults(of_series=(fields, kind), of_records=(records,))
 
 
 def _add_info(info: _Parser) -> None:
-    info.add_argument("path", type=_path, metavar="FILE_OR_RUN", help="dataset (.h5) or run folder")
+    info.add_argument("path", type=path, metavar="FILE_OR_RUN", help="dataset (.h5) or run folder")
     info.add_argument("--json", action="store_true", help="print JSON")
+    info.add_argument("--strict", action="store_true", help="exit with an error if something looks wrong")
 
 
 def _add_train(train: _Parser) -> None:
-    train.more = _all_settings
-    train.add_argument("data", metavar="DATA", nargs="?", type=_path, help="dataset; may be left out with --resume")
-    _add_each(train, {"--out RUN": "run folder"}, type=_path, required=True)
+    train.more = help_lines.all_settings
+    train.add_argument("data", metavar="DATA", nargs="?", type=path, help="dataset; may be left out with --resume")
+    _add_each(train, {"--out RUN": "run folder"}, type=path, required=True)
     _add_each(train, {"--model M": "name of the model; the list is below (default: ast)"})
     _add_each(train, {"--preset P": "settings to start from (default: tiny)"})
     files = {
         "--config FILE": "settings from a TOML file, such as config.toml of a run; --set and options win over it",
         "--from RUN": "start with the weights and the settings of another run, to train it longer or on other data",
     }
-    _add_each(train, files, type=_path)
+    _add_each(train, files, type=path)
     _add_each(train, {"--set k=v": "change a setting; may be repeated"}, action="append", default=[])
     train.add_argument("--resume", action="store_true", help="go on after the last checkpoint, if there is one")
-    _add_each(train, {"--profile N": "only measure N steps and print how their time divides"}, type=_at_least(1))
+    _add_each(train, {"--profile N": "only measure N steps and print how their time divides"}, type=at_least(1))
 
 
 def _add_predict(predict: _Parser) -> None:
-    predict.add_argument("run_folder", type=_path, metavar="RUN", help="run folder")
+    predict.add_argument("run_folder", type=path, metavar="RUN", help="run folder")
     about = "a mesh (.vtu, .msh, .inp, .stl, ...), a dataset (.h5), or the specification of an assembly (.toml)"
-    predict.add_argument("scene", type=_path, metavar="SCENE", help=about)
+    predict.add_argument("scene", type=path, metavar="SCENE", help=about)
     _add_out(predict, "FILE", "file to write: .h5, .pvd or .vtkhdf for ParaView, or .csv")
     moves = {
         "--move BODY=MOTION": 'motion of the prescribed nodes of a body: a translation "1=0,0,-0.01", a path'
@@ -252,16 +220,16 @@ def _add_predict(predict: _Parser) -> None:
     }
     _add_each(predict, moves, action="append", default=[])
     about = "frames that are wanted, such as --frames=-1 for the last one or --frames 5,10,20 (default: all)"
-    _add_each(predict, {"--frames I,...": about}, type=_whole_numbers)
+    _add_each(predict, {"--frames I,...": about}, type=whole_numbers)
     efforts = {
         "--corrections N": "calls that correct the first one, if the run jumps to a frame (default: as its validation"
         " has decided)",
         "--newton-steps N": "at most so many Newton steps of the solver after them, until one is small (default:"
         " likewise; 0 with --corrections)",
     }
-    _add_each(predict, efforts, type=_at_least(0))
+    _add_each(predict, efforts, type=at_least(0))
     about = "number of frames of the motion (default: prescribed nodes move as far in a frame as in training)"
-    _add_each(predict, {"--num-frames N": about}, type=_at_least(2))
+    _add_each(predict, {"--num-frames N": about}, type=at_least(2))
     mesh = predict.add_argument_group("if SCENE is a mesh")
     _add_each(mesh, {"--obstacle BODY": "a rigid body; may be repeated"}, type=int, action="append", default=[])
     marks = {
@@ -277,72 +245,52 @@ def _add_predict(predict: _Parser) -> None:
     _add_each(mesh, fields)
     data = predict.add_argument_group("if SCENE is a dataset")
     data.add_argument("--split", choices=commands.SPLITS, default="test", help="split (default: test)")
-    _add_each(data, {"--index I": "number of the trajectory in the split"}, type=_at_least(0))
+    _add_each(data, {"--index I": "number of the trajectory in the split"}, type=at_least(0))
     spec = predict.add_argument_group("if SCENE is the specification of an assembly")
     about = "value of a parameter, such as travel=4.2 or bumper.young=1.5e6; may be repeated"
     _add_each(spec, {"--set NAME=VALUE": about}, action="append", default=[])
-    _add_each(spec, {"--nodes N": "approximate number of nodes (default: by the sizes)"}, type=_at_least(1))
+    _add_each(spec, {"--nodes N": "approximate number of nodes (default: by the sizes)"}, type=at_least(1))
     predict.set_defaults(of_mesh=(mesh,), of_data=(data,), of_spec=(spec,))
 
 
 def _add_sweep(sweep: _Parser) -> None:
-    sweep.add_argument("run_folder", type=_path, metavar="RUN", help="run folder")
-    sweep.add_argument("spec", type=_path, metavar="SPEC", help="specification of the assembly (.toml)")
+    sweep.add_argument("run_folder", type=path, metavar="RUN", help="run folder")
+    sweep.add_argument("spec", type=path, metavar="SPEC", help="specification of the assembly (.toml)")
     _add_out(sweep, "FILE", "table to write (.csv); a picture with the same name is written beside it (.png)")
     about = "values of a parameter: travel=1:7:13 (from, to, how many), young=1e6,2e6; may be repeated: a grid"
     _add_each(sweep, {"--set NAME=VALUES": about}, action="append", default=[])
-    _add_each(sweep, {"--table FILE": "instead of --set, a CSV file whose first line names parameters"}, type=_path)
+    _add_each(sweep, {"--table FILE": "instead of --set, a CSV file whose first line names parameters"}, type=path)
     about = "what the picture shows (default: reaction)"
     sweep.add_argument("--quantity", choices=("reaction", "largest_stress"), default="reaction", help=about)
-    _add_each(sweep, {"--corrections N": "as for predict", "--newton-steps N": "as for predict"}, type=_at_least(0))
-    _add_each(sweep, {"--nodes N": "approximate number of nodes (default: by the sizes)"}, type=_at_least(1))
+    _add_each(sweep, {"--corrections N": "as for predict", "--newton-steps N": "as for predict"}, type=at_least(0))
+    _add_each(sweep, {"--nodes N": "approximate number of nodes (default: by the sizes)"}, type=at_least(1))
 
 
 def _add_evaluate(evaluate: _Parser) -> None:
-    evaluate.add_argument("run_folder", type=_path, metavar="RUN", help="run folder")
-    evaluate.add_argument("data", type=_path, metavar="DATA", help="dataset")
+    evaluate.add_argument("run_folder", type=path, metavar="RUN", help="run folder")
+    evaluate.add_argument("data", type=path, metavar="DATA", help="dataset")
     evaluate.add_argument("--split", choices=commands.SPLITS, default="test", help="split (default: test)")
     about = "scenes in which the solver solves the deepest frame, to compare (default: 3; 0: none)"
-    _add_each(evaluate, {"--rivals N": about}, type=_at_least(0), default=3)
+    _add_each(evaluate, {"--rivals N": about}, type=at_least(0), default=3)
     about = "the specification or the parts of your own of which DATA was made; the solver needs them"
-    _add_each(evaluate, {"--made-from PATH": about}, type=_path)
+    _add_each(evaluate, {"--made-from PATH": about}, type=path)
     _add_out(evaluate, "FILE.json", "also write all figures to this file", required=False)
 
 
 def _add_report(report: _Parser) -> None:
-    report.add_argument("shown", type=_path, nargs="+", metavar="RUN_OR_DATA", help="run folders, or one dataset (.h5)")
-    _add_each(report, {"--out FILE.html": "page to write"}, type=_path, required=True)
-    _add_each(report, {"--data DATA": "dataset for all runs (default: the training data of each run)"}, type=_path)
+    report.add_argument("shown", type=path, nargs="+", metavar="RUN_OR_DATA", help="run folders, or one dataset (.h5)")
+    _add_each(report, {"--out FILE.html": "page to write"}, type=path, required=True)
+    _add_each(report, {"--data DATA": "dataset for all runs (default: the training data of each run)"}, type=path)
     _add_overwrite(report)
 
 
-def _path(text: str) -> Path:
-    if not text or "\0" in text:
-        raise argparse.ArgumentTypeError(f"{text!r} is no name of a file or a folder")
-    return Path(text)
+def _stress_order(text: str) -> tuple[str, ...]:
+    from ast_sim.importers.stress import parse_order
 
-
-def _whole_numbers(text: str) -> tuple[int, ...]:
     try:
-        numbers = tuple(int(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no list of whole numbers, such as 5,10,-1") from None
-    if any(abs(number) >= 1 << 63 for number in numbers):
-        raise argparse.ArgumentTypeError("a number above 2^63 - 1")
-    return numbers
-
-
-def _at_least(least: int) -> Any:
-    def number(text: str) -> int:
-        value = int(text)
-        if value < least:
-            raise argparse.ArgumentTypeError(f"{value} is below {least}")
-        if value >= 1 << 63:
-            raise argparse.ArgumentTypeError("a number above 2^63 - 1")
-        return value
-
-    number.__name__ = "whole number"
-    return number
+        return parse_order(text)
+    except ConfigError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 if __name__ == "__main__":

@@ -74,10 +74,10 @@ def _counts(counts: dict[str, int]) -> str:
 
 
 def convert(args: argparse.Namespace) -> None:
-    """Make a dataset from simulations of other programs (PVD, VTU, VTKHDF, TFRecord)."""
+    """Make a dataset from simulations of other programs (VTK, CalculiX, Exodus, LS-DYNA, XDMF, TFRecord)."""
     from ast_sim.importers.convert import convert as import_files
     from ast_sim.importers.deepmind import is_deepmind
-    from ast_sim.importers.vtu import FieldNames
+    from ast_sim.importers.series import FieldNames
 
     read = args.source.rglob("*") if args.source.is_dir() else [args.source]
     _check_output(args, args.out, (path for path in read if path.suffix != ".h5"), "a dataset", ".h5")
@@ -88,7 +88,7 @@ def convert(args: argparse.Namespace) -> None:
         _refuse(args, args.of_records, f"{args.source}, which holds no .tfrecord files")
         fields = (args.displacement, args.stress, args.node_type, args.obstacle, args.handle, args.body)
         options = {
-            "names": FieldNames(*fields, tuple(args.material)),
+            "names": FieldNames(*fields, tuple(args.material), args.stress_order),
             "splits": None if args.shares is None else dict(zip(SPLITS, args.shares, strict=True)),
             "seed": args.seed,
             "integration": "dynamic" if args.dynamic else "quasi_static",
@@ -96,6 +96,7 @@ def convert(args: argparse.Namespace) -> None:
             "time_step": args.time_step,
             "length_unit": args.length_unit,
             "incomplete": args.incomplete,
+            "strict": args.strict,
         }
     counts = import_files(args.source, args.out, progress=lambda line: print(printable(line)), **options)
     print(f"{args.out}: {_counts(counts)}")
@@ -134,12 +135,14 @@ def info(args: argparse.Namespace) -> None:
     from ast_sim.dataset.contents import describe_dataset, text
 
     if args.path.is_dir():
-        from ast_sim.runs.folder import describe_run
+        from ast_sim.runs.folder import RunFolder
 
-        found = describe_run(args.path)
+        found = RunFolder(args.path).describe()
     else:
         found = describe_dataset(args.path)
     print(json.dumps(found, indent=1) if args.json else text(found))
+    if args.strict and found.get("looks_wrong"):
+        raise DatasetError(f"{args.path}: {len(found['looks_wrong'])} things look wrong in it")
 
 
 def train(args: argparse.Namespace) -> None:
@@ -170,9 +173,9 @@ def predict(args: argparse.Namespace) -> None:
 
     _check_output(args, args.out, [args.scene], "a prediction", *SUFFIXES)
     moves, run = dict(map(parse_move, args.move)), _open_run(args.run_folder)
-    effort = {"frames": args.frames, "corrections": args.corrections, "newton_steps": args.newton_steps}
+    wanted = {"frames": args.frames, "effort": _effort(run, args), "throw": False}
     if args.scene.suffix == ".toml":
-        _predict_spec(run, args, effort)
+        _predict_spec(run, args, wanted)
         return
     _refuse(args, args.of_spec, f"{args.scene}, which is no specification")
     if args.scene.suffix == ".h5":
@@ -183,14 +186,14 @@ def predict(args: argparse.Namespace) -> None:
         _refuse(args, args.of_data, f"{args.scene}, which is a mesh")
         truth, name = None, str(args.scene)
     if truth is not None and not moves:
-        answer = run.predict(truth, num_frames=args.num_frames, name=name, **effort)
+        answer = run.predict(truth, num_frames=args.num_frames, name=name, **wanted)
     else:
         scene, truth = (_scene(args) if truth is None else truth.scene), None
-        answer = run.predict(scene, moves, num_frames=args.num_frames, name=name, **effort)
+        answer = run.predict(scene, moves, num_frames=args.num_frames, name=name, **wanted)
     _save(answer, args, truth)
 
 
-def _predict_spec(run: Any, args: argparse.Namespace, effort: dict[str, Any]) -> None:
+def _predict_spec(run: Any, args: argparse.Namespace, wanted: dict[str, Any]) -> None:
     """`ast-sim predict RUN SPEC.toml`."""
     from ast_sim.simulate.own_assembly.grid import grid, parse_settings
 
@@ -202,7 +205,7 @@ def _predict_spec(run: Any, args: argparse.Namespace, effort: dict[str, Any]) ->
     if len(rows) > 1:
         raise ConfigError("--set gives several values: ast-sim sweep predicts them all")
     asked = {"nodes": args.nodes, "num_frames": args.num_frames, "name": str(args.scene)}
-    answer = run.predict(spec=args.scene, **asked, **effort, **rows[0])
+    answer = run.predict(spec=args.scene, parameters=rows[0], **asked, **wanted)
     _save(answer, args, None)
     units = {"travel_of_nodes": run.scope.length_unit, "reaction": "N", "largest_stress": "Pa"}
     for frame, row in zip(answer.frames, answer.figures(answer.source["origin"]), strict=True):
@@ -218,8 +221,7 @@ def sweep(args: argparse.Namespace) -> None:
     for out, what, suffix in ((args.out, "a table", ".csv"), (picture, "a picture", ".png")):
         _check_output(args, out, [args.spec, *filter(None, [args.table])], what, suffix)
     run, values = _open_run(args.run_folder), parse_settings(args.set)
-    effort = {"corrections": args.corrections, "newton_steps": args.newton_steps}
-    found = run.sweep(args.spec, table=args.table, nodes=args.nodes, **effort, **values)
+    found = run.sweep(args.spec, values, table=args.table, nodes=args.nodes, effort=_effort(run, args))
     found.save(args.out)
     print(f"{args.out}: {len(found.rows)} rows, {1000 * found.seconds / len(found.rows):.3g} ms each")
     if found.unsettled:
@@ -235,13 +237,22 @@ def _save(answer: Any, args: argparse.Namespace, truth: Any) -> None:
     if answer.failure is not None:
         raise RolloutError(f"{answer.failure}, in {args.out}")
     steps = len(answer.step_seconds)
-    each = f", {1000 * answer.seconds / steps:.3g} ms each" if steps else ""
-    print(f"{args.out}: {steps} frame{'' if steps == 1 else 's'} predicted{each}")
+    print(f"{args.out}: {steps} frame{'' if steps == 1 else 's'} predicted in {1000 * answer.seconds:.3g} ms")
     if answer.expected_error is not None:
         percent = f"{100 * answer.expected_error:.2g} % of the displacement"
         print(f"expected error: {percent}, as in the validation scenes at their deepest frame")
-    if answer.converged is False:
-        print(f"not converged: the last Newton step is too large, with a size of {max(answer.last_steps):.2g}")
+
+
+def _effort(run: Any, args: argparse.Namespace) -> Any:
+    """What --corrections and --newton-steps ask for; None: the default of the run. Without --newton-steps, corrections
+    are followed by no Newton step."""
+    from ast_sim.inference.effort import Effort
+
+    if args.corrections is None and args.newton_steps is None:
+        return None
+    if args.corrections is None:
+        return Effort(run.effort.corrections, args.newton_steps)
+    return Effort(args.corrections, args.newton_steps or 0)
 
 
 def _truth(run: Any, args: argparse.Namespace) -> Any:
@@ -313,7 +324,7 @@ def report(args: argparse.Namespace) -> None:
 
         gallery.write(args.out, datasets[0])
     else:
-        from ast_sim.inference.trained_run import report_evaluations
+        from ast_sim.inference.evaluation.evaluated_run import report_evaluations
 
         found = [_open_run(folder).evaluate(args.data, command=args.command_line) for folder in args.shown]
         report_evaluations(args.out, found, "Learned simulation: predictions and errors")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -15,6 +16,7 @@ from ast_sim.support.errors import ConfigError
 Vector = Sequence[float]
 
 LARGEST = 1e15  # of the numbers of a rigid motion: squares and float32 hold what follows from it
+ROUNDING = 1e-6  # shares of times, lengths and angles below this are rounding
 MOST_BYTES = 1 << 30  # of the positions of a motion
 
 _VECTOR = r"[^\s,]+,[^\s,]+,[^\s,]+"
@@ -71,6 +73,35 @@ class RigidMotion:
         displacement = np.array([np.interp(s, shares, corners[:, axis]) for axis in range(3)])
         return (points - np.asarray(self.point)) @ self._rotated(s).T + self.point + displacement
 
+    def corners(self) -> list[float]:
+        """The values of s between 0 and 1 at which the path turns back or turns off."""
+        shares, corners = self._path()
+        ways = np.diff(corners, axis=0)
+        ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), np.finfo(float).tiny)
+        turns = np.linalg.norm(np.diff(ways, axis=0), axis=1) > ROUNDING
+        return shares[1:-1][turns].tolist()
+
+    def notes(self, name: str, frames: Sequence[int], last: int) -> Iterator[str]:
+        """What frames with these numbers do not show of the motion, which ends at `last`; a sentence each."""
+        times = [last * s for s in self.corners() if last * s < frames[-1]]
+        hidden = [time for time in times if np.abs(time - np.asarray(frames)).min() > last * ROUNDING]
+        if hidden:
+            where = ", ".join(f"{time:.4g}" for time in hidden)
+            yield f"{name} turns at {where} of {last} frames, which no frame shows{self._better(last)}"
+        turn = abs(self.rotation) * max(np.diff(frames)) / last
+        if turn >= 180 * (1 - ROUNDING):
+            yield (
+                f"{name} turns {turn:.4g} degrees from one frame to the next; positions, all that a model sees,"
+                f" look like another turn: take {int(turn / 180 * (1 + ROUNDING)) + 1} times as many frames"
+            )
+
+    def _better(self, last: int) -> str:
+        """The next number of frames that shows all corners, as the end of a sentence."""
+        for more in range(last, 20 * last):
+            if all(abs(more * s - round(more * s)) <= more * ROUNDING for s in self.corners()):
+                return f": with {more + 1} frames one does"
+        return ""
+
     def largest_speed(self, points: np.ndarray) -> float:
         """The largest speed of the undeformed `points` [n, 3], as a length per unit of s."""
         angle = np.radians(abs(self.rotation))
@@ -126,6 +157,8 @@ class Motion:
             motions: the motion of each body by the number of the body; three numbers are a translation.
             frames: S, at least 2.
 
+        A warning tells of a turn that no frame shows.
+
         Raises:
             ConfigError: `frames` is below 2, or the positions would take more than `MOST_BYTES`; there is no such body,
                 or the body has no prescribed node.
@@ -139,7 +172,9 @@ class Motion:
                 " frames with num_frames"
             )
         position = np.repeat(scene.rest_position[None], frames, axis=0)
-        for nodes, motion in _moved(scene, motions):
+        for body, (nodes, motion) in zip(motions, _moved(scene, motions), strict=True):
+            for note in motion.notes(f"the motion of body {body}", range(frames), frames - 1):
+                warnings.warn(note, stacklevel=2)
             start = scene.rest_position[nodes].astype(np.float64)
             for frame in range(1, frames):
                 position[frame, nodes] = motion.at(frame / (frames - 1), start)

@@ -83,7 +83,7 @@ with DatasetWriter("toy.h5", toy.info()) as writer:
         writer.add(split, plate)
 run = ast_sim.train("toy.h5", "run", steps=2)
 with ast_sim.Dataset("toy.h5") as data:
-    answer = run.predict(data["test"][0], frames=[-1], newton_steps=1)
+    answer = run.predict(data["test"][0], frames=[-1], effort=ast_sim.Effort(newton_steps=1))
 print(answer.failure, len(answer.last_steps))
 """
     monkeypatch.chdir(tmp_path)

@@ -2,7 +2,8 @@
 
 A scene has elements of one kind, so a shell becomes a thin layer of tetrahedra: each of its nodes gets a second node
 behind it, half a mesh width along the normal, on the side that looks away from the tetrahedra. The shell itself is the
-front of the layer, so contact takes place where it took place in the file.
+front of the layer, so contact takes place where it took place in the file. Where the shell closes a thin wall, the
+layer is a third of the wall; where tetrahedra lie behind an open shell, it takes 1/200 of the way to them.
 """
 
 from __future__ import annotations
@@ -11,12 +12,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ast_sim.element_topology import LOCAL_FACES
 from ast_sim.scene import connected_parts
 
 # The layer is so many mean edge lengths thick.
 _THICKNESS = 0.5
 
-# The front is the side that looks at the tetrahedra, in this share of the triangles, the nearest ones.
+# The share of a wall, and of the way to tetrahedra behind a shell, that the layer takes where it would take more than
+# half of the wall or reach the tetrahedra.
+_OF_WALL, _OF_WAY = 1 / 3, 1 / 200
+
+# Where the normal of a node leads out through another triangle at it, the layer has this share of the usual thickness.
+_LEAST = 0.01
+
+# The front of an open shell is the side that looks at the tetrahedra, in this share of the triangles, the nearest ones.
 _NEAREST = 0.1
 
 # The edges of a rigid shell keep their lengths up to this share of the mean edge length.
@@ -99,16 +108,82 @@ def find_shells(points: np.ndarray, tetrahedra: np.ndarray, cells: list[np.ndarr
     for one in np.unique(part_of):
         rows = np.flatnonzero(part_of == one)
         near = rows[distance[rows] <= np.quantile(distance[rows], _NEAREST)]
-        if (normal[near] * to_body[near]).sum() < 0:
+        looks = _looks_out(points, triangles[rows], tetrahedra) or (normal[near] * to_body[near]).sum()
+        if looks < 0:
             triangles[rows] = triangles[rows][:, ::-1]
         thickness[triangles[rows]] = _THICKNESS * np.linalg.norm(b[rows] - a[rows], axis=1).mean()
     nodes = np.unique(triangles)
-    return Shells(triangles, nodes, thickness[nodes], cell)
+    return Shells(triangles, nodes, _fitting(points, triangles, tetrahedra, thickness[nodes], nodes), cell)
+
+
+def _looks_out(points: np.ndarray, triangles: np.ndarray, tetrahedra: np.ndarray) -> int:
+    """1 if the normals of a closed shell point to the side where all tetrahedra are, -1 if they point away; 0 if
+    tetrahedra are on both sides, or the shell is open."""
+    import igl
+
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    if (np.unique(edges, axis=0, return_counts=True)[1] != 2).any():
+        return 0
+    _, first = np.unique(connected_parts(tetrahedra, len(points))[tetrahedra[:, 0]], return_index=True)
+    used, corners = np.unique(triangles, return_inverse=True)
+    one_of_each = np.ascontiguousarray(points[tetrahedra[first, 0]])
+    faces = np.ascontiguousarray(corners.reshape(-1, 3), np.int64)
+    inside = np.abs(igl.winding_number(np.ascontiguousarray(points[used]), faces, one_of_each)) > 0.5
+    a, b, c = np.moveaxis(points[triangles] - points[triangles[0, 0]], 1, 0)
+    outwards = 1 if np.einsum("ij,ij->", a, np.cross(b, c)) > 0 else -1
+    return 0 if inside.any() != inside.all() else (-outwards if inside.all() else outwards)
+
+
+def _fitting(
+    points: np.ndarray, triangles: np.ndarray, tetrahedra: np.ndarray, thickness: np.ndarray, nodes: np.ndarray
+) -> np.ndarray:
+    """[k]: the thickness behind the `nodes` [k]; less where the shells' own walls or tetrahedra are near behind."""
+    inwards = -_normals(points, triangles)[nodes]
+    thickness = np.where(_sticks_out(points, triangles, inwards, nodes), _LEAST * thickness, thickness)
+    start = points[nodes] + 1e-3 * thickness[:, None] * inwards  # behind the triangles that meet at the node
+    wall = _way_to(points, triangles, start, inwards)
+    faces = tetrahedra[:, np.array(LOCAL_FACES)].reshape(-1, 3)
+    way = _way_to(points, faces, start, inwards)
+    fitting = np.where(2 * thickness > wall, _OF_WALL * wall, thickness)
+    return np.where(way < wall, np.minimum(fitting, _OF_WAY * way), fitting)
+
+
+def _sticks_out(points: np.ndarray, triangles: np.ndarray, inwards: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """[k] bool: the nodes whose direction inwards leads out of the shell through a triangle at the node."""
+    a, b, c = (points[triangles[:, corner]] for corner in range(3))
+    corner = np.searchsorted(nodes, triangles)
+    outwards = np.einsum("tki,ti->tk", inwards[corner], np.cross(b - a, c - a)) > 0
+    return np.bincount(corner[outwards], minlength=len(nodes)) > 0
+
+
+def _way_to(points: np.ndarray, triangles: np.ndarray, start: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """[n]: the distance from each start [n, 3] along its unit direction to the first triangle; inf if it meets none.
+
+    A ray may pass between two triangles that share an edge, so three go each way, nearly parallel.
+    """
+    import igl
+
+    used, corners = np.unique(triangles, return_inverse=True)
+    vertices, faces = np.ascontiguousarray(points[used]), np.ascontiguousarray(corners.reshape(-1, 3), np.int64)
+    tree = igl.AABB()
+    tree.init(vertices, faces)
+    nearest = np.full(len(start), np.inf)
+    for aside in ((0.0, 0.0, 0.0), (1e-3, 2e-3, -3e-3), (-2e-3, 1e-3, 1e-3)):
+        hit, distance, _ = tree.intersect_ray_first(vertices, faces, start, direction + aside)
+        nearest = np.minimum(nearest, np.where(np.asarray(hit) >= 0, distance, np.inf))
+    return nearest
 
 
 def _normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """[n, 3]: unit normals at the points; that of a point is the mean of its triangles, weighted with their areas."""
-    a, b, c = (points[triangles[:, corner]] for corner in range(3))
+    """[n, 3]: unit normals at the points; that of a point is the mean of its triangles, weighted with their angles.
+    Weighted with their areas, a long triangle could turn it out of the others."""
     normals = np.zeros_like(points)
-    np.add.at(normals, triangles.ravel(), np.repeat(np.cross(b - a, c - a), 3, axis=0))
+    for corner in range(3):
+        a, b, c = (points[triangles[:, (corner + i) % 3]] for i in range(3))
+        normal = np.cross(b - a, c - a)
+        twice_area = np.linalg.norm(normal, axis=1)
+        angle = np.arctan2(twice_area, np.einsum("ti,ti->t", b - a, c - a))
+        np.add.at(
+            normals, triangles[:, corner], (angle / np.maximum(twice_area, np.finfo(float).tiny))[:, None] * normal
+        )
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)

@@ -24,27 +24,31 @@ ELASTIC = ("assembly", "abcd", "abcd_xl")  # families whose material is Young's 
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """The S wanted frames of a prediction. The first `given` of them were given; after a failure some are missing.
+    """The S wanted frames of a prediction, in the order in which they were asked for. After a failure some are missing.
 
     Attributes:
         name: name of the scene, for messages.
         scene: the scene that was predicted.
         position: [S, N, 3] float32, in the run's unit of length.
         stress: [S, N or E, 1] float32 in pascal, or None. A given frame holds the given stress, or zero without one.
-        given: number of given frames among them: of all frames 1, or 2 in dynamic scenes.
-        step_seconds: wall seconds of each frame that was computed; the frames of one batch share its time equally.
+        given: how many first frames of the motion were given: 1, or 2 in dynamic scenes.
+        step_seconds: wall seconds of each frame that was computed, in ascending order of the frames; the frames of one
+            batch share its time equally.
         failure: why the prediction ended early, naming the frame and the node; None if it did not.
         info: the units and the kind of the data; it is written into files of the answer.
         source: the origin of the answer: attributes that `trajectory` gets.
         stress_location: where the rows of the stress are: "node" or "element".
         frames: the numbers of the S frames in the motion that was asked.
+        seconds: the wall seconds that a user waits: from the question to the answer, with all that is prepared for the
+            mesh. Several questions that are asked together share their time equally.
+        notes: what is unusual about the scene for the run, as sentences; they are warnings as well.
         expected_error: how far validation scenes were off with the same corrections and Newton steps: the mean over the
             scenes of the root mean square error at the deepest frame, over that of the displacement. It is no bound for
-            this scene. None: the run did not measure it.
+            this scene. None: the run did not measure it, or there are notes.
         last_steps: of each computed frame the size of its last Newton step: the largest component of a node's move, in
             mean edge lengths of the surfaces, or the root mean square of the moves over that of the displacements, if
-            that is larger. As long as the contact does not change, a next step would be about its square. Empty without
-            Newton steps.
+            that is larger. As long as the contact does not change, a next step would be about its square. Frames
+            ascend. Empty without Newton steps.
         driven: the prescribed nodes that move farthest together in the whole motion.
     """
 
@@ -59,14 +63,16 @@ class Answer:
     source: dict[str, AttributeValue] = field(default_factory=dict)
     stress_location: str | None = None
     frames: tuple[int, ...] = ()
+    seconds: float = 0.0
+    notes: tuple[str, ...] = ()
     expected_error: float | None = None
     last_steps: tuple[float, ...] = ()
     driven: Driven | None = None
 
     @property
-    def seconds(self) -> float:
-        """Wall seconds of the whole prediction."""
-        return sum(self.step_seconds)
+    def computed(self) -> np.ndarray:
+        """[S] bool: the frames that were predicted, not given."""
+        return np.array(self.frames, np.int64) >= self.given
 
     @property
     def converged(self) -> bool | None:
@@ -75,7 +81,10 @@ class Answer:
 
     @property
     def trajectory(self) -> Trajectory:
-        """The answer as a trajectory; its attributes hold the origin, the given frames and the seconds."""
+        """The answer as a trajectory, in ascending order of the frames; its attributes hold the origin, the given
+        frames and the seconds."""
+        order = np.argsort(self.frames, kind="stable")
+        frames = tuple(self.frames[row] for row in order)
         attributes = {
             "status": "complete" if self.failure is None else "truncated",
             **self.source,
@@ -85,12 +94,12 @@ class Answer:
         }
         return Trajectory(
             self.scene,
-            self.position,
-            self.stress,
+            self.position[order],
+            None if self.stress is None else self.stress[order],
             attributes,
             stress_location=None if self.stress is None else self.stress_location,
-            frames=self.frames,
-            times=None if self.info is None else self.info.times(self.frames),
+            frames=frames,
+            times=None if self.info is None else self.info.times(frames),
             length_unit=None if self.info is None else self.info.length_unit,
         )
 
@@ -117,6 +126,8 @@ class Answer:
         """
         scene, rows = self.scene, []
         forces = self.reaction()
+        computed = sorted(number for number in self.frames if number >= self.given)
+        last_steps = dict(zip(computed, self.last_steps, strict=False))
         for frame, position in enumerate(self.position):
             way = np.linalg.norm((position - scene.rest_position)[scene.prescribed], axis=1)
             row = {"travel_of_nodes": float(way.max(initial=0.0))}
@@ -130,8 +141,8 @@ class Answer:
                 place = position[nodes].mean(axis=0) + origin
                 row |= {"largest_stress": float(stress[worst])}
                 row |= {f"stress_at_{axis}": float(x) for axis, x in zip("xyz", place, strict=True)}
-            if self.last_steps and frame >= self.given:
-                row |= {"last_newton_step": self.last_steps[frame - self.given]}
+            if self.frames[frame] in last_steps:
+                row |= {"last_newton_step": last_steps[self.frames[frame]]}
             rows.append(row)
         return rows
 

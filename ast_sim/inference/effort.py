@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from statistics import fmean
+from typing import Any, Self
 
 import numpy as np
 
@@ -19,30 +23,39 @@ AGAIN = 2  # a frame in which so many Newton steps did not end is begun anew wit
 WORTH = 0.05  # a correction or a Newton step must lower an error that is not good by this share
 
 
-class Effort(NamedTuple):
+@dataclass(frozen=True)
+class Effort:
     """What follows the first call of a model that jumps.
 
     Attributes:
-        corrections: so many further calls of the model correct its answer.
-        newton_steps: at most so many Newton steps of the solver then lead towards equilibrium. They end when a step is
+        corrections: how many further calls of the model correct its answer.
+        newton_steps: at most how many Newton steps of the solver then lead towards equilibrium. They end when a step is
             at most `STILL`. Where `MOST_NEWTON_STEPS` or more do not end, they begin anew after more corrections.
+
+    Raises:
+        ConfigError: a number is not whole or negative.
     """
 
     corrections: int = 0
     newton_steps: int = 0
 
+    def __post_init__(self) -> None:
+        for key, count in asdict(self).items():
+            if not isinstance(count, int | np.integer) or isinstance(count, bool):
+                raise ConfigError(f"{key} is {count!r}; it must be a whole number")
+            if count < 0:
+                raise ConfigError(f"{key} is {count}; it must be at least 0")
+
     @property
     def text(self) -> str:
         """Such as "2 corrections, up to 1 Newton step"."""
-        found = [(self.corrections, "correction"), (self.newton_steps, "Newton step")]
-        told = [f"{n} {what}{'' if n == 1 else 's'}" for n, what in found if n or what == "correction"]
+        parts = [(self.corrections, "correction"), (self.newton_steps, "Newton step")]
+        told = [f"{n} {what}{'' if n == 1 else 's'}" for n, what in parts if n or what == "correction"]
         return ", up to ".join(told)
 
     def check(self, config: ModelConfig) -> None:
-        """Raise ConfigError if a number is negative or the model cannot do so."""
-        for key, count in self._asdict().items():
-            if count < 0:
-                raise ConfigError(f"{key} is {count}; it must be at least 0")
+        """Raise ConfigError if the model cannot make this effort."""
+        for key, count in asdict(self).items():
             if count and not config.jumps:
                 raise ConfigError(f"{key} is {count}; it needs a run that jumps, and this one does not")
         if self.newton_steps and not knows_material(config):
@@ -53,6 +66,51 @@ class Effort(NamedTuple):
 
 
 FIRST_CALL = Effort()
+
+
+@dataclass(frozen=True)
+class EffortErrors:
+    """What an effort led to at the deepest frame of a validation scene, or in the mean over such scenes.
+
+    Attributes:
+        effort: the effort.
+        error: of the displacement, relative to it; None: the prediction failed.
+        stress_error: of the stress, relative to the error of the frame's true mean; None: there is no stress.
+        steps: the Newton steps that were made.
+        unsettled: the share of the scenes in which the Newton steps did not end.
+    """
+
+    effort: Effort
+    error: float | None
+    stress_error: float | None
+    steps: float
+    unsettled: float
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Self:
+        """From what `dataclasses.asdict` gave."""
+        return cls(**{**values, "effort": Effort(**values["effort"])})
+
+
+def mean_errors(of_scenes: Sequence[Sequence[EffortErrors]]) -> list[EffortErrors]:
+    """For each effort the mean over the scenes; an error that one scene lacks is None."""
+    means = []
+    for same in zip(*of_scenes, strict=True):
+        means.append(
+            EffortErrors(
+                same[0].effort,
+                _mean([one.error for one in same]),
+                _mean([one.stress_error for one in same]),
+                fmean(one.steps for one in same),
+                fmean(one.unsettled for one in same),
+            )
+        )
+    return means
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return fmean(known) if len(known) == len(values) else None
 
 
 def knows_material(config: ModelConfig) -> bool:
@@ -83,31 +141,27 @@ def newton_steps(config: ModelConfig, scene: Scene) -> NewtonSteps:
     return NewtonSteps(scene, material, CLEARANCE * config.contact_range, friction)
 
 
-def cheapest_good(found: np.ndarray) -> Effort:
+def cheapest_good(measured: Sequence[EffortErrors]) -> Effort:
     """The default effort of a run: Newton steps until one is small, or none, since scenes differ in how many they need.
 
     Stress tells more than the displacement: it follows from strains, and a step that leaves single elements distorted
-    hardly moves their nodes.
+    hardly moves their nodes. So an effort is good if both errors are small, or nearly the smallest that were measured;
+    if no effort is good in both, the error of the displacement decides. Of the good efforts those count whose Newton
+    steps ended in most scenes. The one with the fewest corrections and Newton steps together is taken.
 
     Args:
-        found: [4, C, K], means over validation scenes after c corrections and up to k Newton steps: the relative errors
-            of the displacement and of the stress (NaN where there is none), how many Newton steps were made, and the
-            share of the scenes in which they did not end.
-
-    Returns:
-        Of the efforts whose errors are good, or nearly the smallest of all, those whose Newton steps did not end in the
-        fewest scenes; of these the one with the fewest corrections and Newton steps together. If no effort has both
-        errors so, that of the displacement decides. The first call alone if no error is known.
+        measured: means over validation scenes, by effort. If all predictions failed, the first call alone is returned.
     """
-    if np.isnan(found[0]).all():
+    most = max((one.effort.newton_steps for one in measured), default=0)
+    errors = {one: one.error for one in measured if one.error is not None and one.effort.newton_steps in (0, most)}
+    if not errors:
         return FIRST_CALL
-    ends = sorted({0, found.shape[2] - 1})
-    errors, stress, steps, unsettled = found[:, :, ends]
-    accurate = errors <= max(GOOD, (1 + WORTH) * np.nanmin(errors))
-    least = np.inf if np.isnan(stress).all() else max(GOOD_STRESS, (1 + WORTH) * np.nanmin(stress))
-    both = accurate & ~(stress > least)
-    good = both if both.any() else accurate
-    settled = good & (unsettled <= unsettled[good].min())
-    total = np.where(settled, np.arange(len(errors))[:, None] + steps, np.inf)
-    corrections, column = np.unravel_index(total.argmin(), total.shape)
-    return Effort(int(corrections), ends[column])
+    stresses = {one: math.inf if one.stress_error is None else one.stress_error for one in errors}
+    enough = max(GOOD, (1 + WORTH) * min(errors.values()))
+    enough_stress = max(GOOD_STRESS, (1 + WORTH) * min(stresses.values()))
+    accurate = [one for one, error in errors.items() if error <= enough]
+    both = [one for one in accurate if stresses[one] <= enough_stress]
+    good = both or accurate
+    ended = min(one.unsettled for one in good)
+    settled = [one for one in good if one.unsettled <= ended]
+    return min(settled, key=lambda one: (one.effort.corrections + one.steps, one.effort.corrections)).effort

@@ -81,7 +81,8 @@ def calls(model: Simulator, questions: Sequence[Question], effort: Effort) -> li
         if scene.failure is not None:
             found.append(scene.failure)
             continue
-        position = [_stacked(frame.positions, 1 + sum(effort)) for frame in scene.frames]
+        count = 1 + effort.corrections + effort.newton_steps
+        position = [_stacked(frame.positions, count) for frame in scene.frames]
         known = [frame for frame in scene.frames if model.config.stress != "none"]
         stress = [_stacked(frame.stresses, 1 + effort.newton_steps) for frame in known]
         steps = np.array([len(frame.positions) - 1 - effort.corrections for frame in scene.frames])
@@ -112,12 +113,13 @@ def _predicted(
     with model.predicting():
         for number, group in enumerate(_groups(model, scenes)):
             _predict(model, group, effort.corrections)
-            for frame in group if effort.newton_steps else ():
-                frame.refine(effort.newton_steps, whole_way)
-                if not whole_way and effort.newton_steps >= MOST_NEWTON_STEPS and frame.unsettled:
-                    _start_again(model, frame, effort)
             if progress is not None:
                 progress(number)
+        # In ascending order, whatever the domains: with friction a frame needs to know the one before.
+        for frame in (frame for scene in scenes for frame in scene.frames if effort.newton_steps):
+            frame.refine(effort.newton_steps, whole_way)
+            if not whole_way and effort.newton_steps >= MOST_NEWTON_STEPS and frame.unsettled:
+                _start_again(model, frame, effort)
     return scenes
 
 
@@ -189,19 +191,21 @@ class _JumpingScene:
 
     def __post_init__(self) -> None:
         question, self.given = self.question, self.model.config.given_frames
-        self.script = torch.tensor(question.script)
+        self.prescribed_position = torch.tensor(question.prescribed_position)
         self.stress = question.given_stress(self.model.config, self.given)
-        for number in question.wanted():
+        for number in sorted(question.wanted()):
             if number >= self.given:
-                carried = torch.from_numpy(self.carry(question.script[0], question.script[number]))
+                carried = torch.from_numpy(
+                    self.carry(question.prescribed_position[0], question.prescribed_position[number])
+                )
                 state = State(carried, stress=self.stress[0])
-                start = Start(f"{question.name} frame {number}", self.graph, state, self.script[number])
+                start = Start(f"{question.name} frame {number}", self.graph, state, self.prescribed_position[number])
                 self.frames.append(_Frame(self, number, start))
 
     def settled(self, number: int) -> np.ndarray | None:
         """The positions [N, 3] of a wanted frame that is given or has had its Newton steps, else None."""
         if number < self.given:
-            return _array(self.script[number]) if number in self.question.wanted() else None
+            return _array(self.prescribed_position[number]) if number in self.question.wanted() else None
         done = (frame for frame in self.frames if frame.last_step is not None and frame.failure is None)
         return next((_array(frame.positions[-1]) for frame in done if frame.number == number), None)
 
@@ -213,7 +217,7 @@ class _JumpingScene:
     def answer(self) -> Answer:
         """The frames before the first that failed."""
         predicted = list(takewhile(lambda frame: frame.failure is None, self.frames))
-        frames = dict(enumerate(zip(self.script[: self.given], self.stress, strict=True)))
+        frames = dict(enumerate(zip(self.prescribed_position[: self.given], self.stress, strict=True)))
         return self.question.answer(
             self.model.config,
             frames | {frame.number: (frame.positions[-1], frame.stresses[-1]) for frame in predicted},

@@ -5,21 +5,22 @@ domain where it lies elsewhere.
 from __future__ import annotations
 
 import dataclasses
-import warnings
+import time
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from ast_sim.importers.scene_mesh import SceneMesh
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.effort import FIRST_CALL, Effort
 from ast_sim.inference.jump import jumps
-from ast_sim.inference.question import Question
+from ast_sim.inference.question import Frames, Question
 from ast_sim.inference.rollout import rollouts
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.models.simulator import Simulator
 from ast_sim.prescribed_motion import Motion, RigidMotion, Vector, frames_for
 from ast_sim.runs.scope import Scope
-from ast_sim.scene import Scene, Trajectory
+from ast_sim.scene import Scene, Trajectory, ranges
 from ast_sim.support.errors import ConfigError
 
 Motions = Motion | Mapping[int, RigidMotion | Vector] | np.ndarray
@@ -33,41 +34,69 @@ def answers(
 ) -> list[Answer]:
     """Predict the wanted frames of several scenes, by jumps or step by step as the model does; see `jumps` and
     `rollouts` for the arguments and errors."""
+    began = time.perf_counter()
     if model.config.jumps:
-        return jumps(model, questions, effort, progress)
-    effort.check(model.config)
-    return rollouts(model, questions, progress)
+        found = jumps(model, questions, effort, progress)
+    else:
+        effort.check(model.config)
+        found = rollouts(model, questions, progress)
+    each = (time.perf_counter() - began) / max(1, len(questions))
+    return [dataclasses.replace(answer, seconds=each) for answer in found]
 
 
 def new_question(
     config: ModelConfig,
     scope: Scope,
-    scene: Scene | Trajectory,
+    scene: Scene | SceneMesh | Trajectory,
     motion: Motions | None,
     num_frames: int | None,
     name: str,
-    frames: Sequence[int] | None,
+    frames: Frames | None,
     stress: np.ndarray | None = None,
 ) -> Question:
-    """The question that the arguments of `Run.predict` ask, `scope` is what the model was trained on. A property of a
-    scene outside the training scenes gives a warning.
+    """The question that the arguments of `Run.predict` ask; `scope` is what the model was trained on. Every question
+    passes here, and what is unusual about it is noted.
 
     Raises:
         ConfigError: the motion does not fit the scene, or the scene does not fit the model.
+        DatasetError: an array has another dtype or shape, or holds numbers that are not finite.
     """
     if isinstance(scene, Trajectory):
         if not (motion is None and num_frames is None and stress is None):
             raise ConfigError(
                 f"{name} has a motion, frames and a stress of its own; for others predict its scene (--move BODY=X,Y,Z)"
             )
-        return Question.of(scene, name, frames)
-    scene.check(name)
+        _require_whole(scene, config, scope, name)
+        scene, motion, stress = scene.scene, Motion(scene.position), scene.stress
+    else:
+        scene = scene.scene if isinstance(scene, SceneMesh) else scene
+        scene.check(name)
+        motion = _completed(config, scope, scene, motion, num_frames, name)
+        stress = _given_stress(config, scene, stress, name)
+    scene.require_predictable(name)
     _require_material(config, scope, scene, name)
-    motion = _completed(config, scope, scene, motion, num_frames, name)
-    stress = _given_stress(config, scene, stress, name)
-    for note in scope.notes(scene, motion, bool(config.jumps)):
-        warnings.warn(f"{name}: {note}", stacklevel=3)
-    return Question(name, scene, motion.position, stress, movable=True).asking(frames)
+    notes = tuple(scope.notes(scene, motion, bool(config.jumps)))
+    return Question(name, scene, motion.position, stress, movable=True, notes=notes).asking(frames)
+
+
+def _require_whole(trajectory: Trajectory, config: ModelConfig, scope: Scope, name: str) -> None:
+    """Raise ConfigError or DatasetError unless a trajectory has all frames of its motion, in the unit of the run, and a
+    stress where the model predicts one, if any."""
+    trajectory.check(name)
+    if trajectory.numbers != tuple(range(trajectory.num_frames)):
+        raise ConfigError(
+            f"{name} has the frames {ranges(trajectory.numbers)} of a motion: a prediction needs all frames from 0 on;"
+            " predict its scene with a motion"
+        )
+    if trajectory.length_unit not in (None, scope.length_unit):
+        raise ConfigError(
+            f"{name} has lengths in {trajectory.length_unit}, but the run was trained in {scope.length_unit}: read it"
+            f" with Dataset(path, {scope.length_unit!r}) or Run.open"
+        )
+    place = trajectory.stress_at
+    if place not in ("none", config.stress):
+        needs = "predicts none" if config.stress == "none" else f"predicts it at each {config.stress}"
+        raise ConfigError(f"{name} has a stress at each {place}, but the run {needs}: leave it out, or convert it")
 
 
 def _completed(
@@ -135,22 +164,23 @@ def in_domain(model: Simulator, questions: Sequence[Question], effort: Effort) -
 
 def _moved_question(question: Question, shift: np.ndarray) -> Question:
     scene = dataclasses.replace(question.scene, rest_position=_moved(question.scene.rest_position, shift))
-    return dataclasses.replace(question, scene=scene, script=_moved(question.script, shift))
+    return dataclasses.replace(question, scene=scene, prescribed_position=_moved(question.prescribed_position, shift))
 
 
 def _moved_back(question: Question, answer: Answer, shift: np.ndarray) -> Answer:
-    position, script = _moved(answer.position, -shift), question.script[list(answer.frames)]
+    position = _moved(answer.position, -shift)
+    given = question.prescribed_position[list(answer.frames)]
     # Given numbers stay what they are, to the last bit.
-    position[: answer.given] = script[: answer.given]
-    position = np.where(question.scene.prescribed[:, None], script, position)
+    known = question.scene.prescribed | ~answer.computed[:, None]
+    position = np.where(known[:, :, None], given, position)
     return dataclasses.replace(answer, scene=question.scene, position=position)
 
 
 def _way_into_domain(config: ModelConfig, question: Question) -> np.ndarray | None:
     """[3] float64: from the middle of the start and of all that is prescribed to the middle of the domain; None: both
     lie inside the domain, or the scene stays where it is."""
-    script = question.script
-    known = np.concatenate([script[0], script[:, question.scene.prescribed].reshape(-1, 3)])
+    position = question.prescribed_position
+    known = np.concatenate([position[0], position[:, question.scene.prescribed].reshape(-1, 3)])
     lowest, highest = known.min(axis=0).astype(np.float64), known.max(axis=0).astype(np.float64)
     center = np.array(config.domain_center)
     inside = max((center - lowest).max(), (highest - center).max()) <= config.domain_half_width

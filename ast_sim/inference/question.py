@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +13,9 @@ from ast_sim.inference.answer import Answer
 from ast_sim.mechanics.driven import Driven
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.scene import Scene, Trajectory
-from ast_sim.support.errors import RolloutError
+from ast_sim.support.errors import ConfigError, RolloutError
+
+Frames = Iterable[int] | int | slice  # numbers of frames; negative ones count from the end
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,57 +25,69 @@ class Question:
     Attributes:
         name: name of the scene, for messages.
         scene: the scene.
-        script: [S, N, 3] float32, the positions of the prescribed nodes in each frame; in the given frames, of all
-            nodes. Other entries are not read.
+        prescribed_position: [S, N, 3] float32, the positions of the prescribed nodes in each frame; in the given
+            frames, of all nodes. Other entries are not read.
         stress: [frames, N or E, 1] float32, the stress of at least the given frames; None: zero.
-        frames: the numbers of the frames that are wanted, ascending; None: all of them, the given ones too.
+        frames: the numbers of the frames that are wanted, in the order in which they are asked for; None: all of them,
+            the given ones too.
         movable: the scene may be moved into the domain of the model.
+        notes: what is unusual about the scene for the model, as sentences.
     """
 
     name: str
     scene: Scene
-    script: np.ndarray
+    prescribed_position: np.ndarray
     stress: np.ndarray | None = None
     frames: tuple[int, ...] | None = None
     movable: bool = False
+    notes: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, truth: Trajectory, name: str, frames: Sequence[int] | None = None) -> Question:
-        """The question whose true answer is a known trajectory; negative numbers of frames count from the end."""
+    def of(cls, truth: Trajectory, name: str, frames: Frames | None = None) -> Question:
+        """The question whose true answer is a known trajectory, which has all frames of its motion."""
         return cls(name, truth.scene, truth.position, truth.stress).asking(frames)
 
-    def asking(self, frames: Sequence[int] | None) -> Question:
+    def asking(self, frames: Frames | None) -> Question:
         """The same question for these frames only; negative numbers count from the end.
 
         Raises:
+            ConfigError: the frames are no whole numbers, or one is named twice.
             RolloutError: there is no such frame, or none is named.
         """
         if frames is None:
             return self
-        count = len(self.script)
-        for frame in frames:
-            if not -count <= frame < count:
-                raise RolloutError(f"{self.name} has the frames 0 to {count - 1}; there is no frame {frame}")
-        if not frames:
+        count = len(self.prescribed_position)
+        if isinstance(frames, slice):
+            frames = range(count)[frames]
+        numbers = _whole_numbers(frames)
+        for number in numbers:
+            if not -count <= number < count:
+                raise RolloutError(f"{self.name} has the frames 0 to {count - 1}; there is no frame {number}")
+        wanted = tuple(number % count for number in numbers)
+        if not wanted:
             raise RolloutError(f"{self.name}: name at least one frame")
-        return replace(self, frames=tuple(sorted({frame % count for frame in frames})))
+        twice = next((number for number in wanted if wanted.count(number) > 1), None)
+        if twice is not None:
+            raise ConfigError(f"{self.name}: frame {twice} is asked for twice: name each frame once")
+        return replace(self, frames=wanted)
 
     def check(self, given: int) -> None:
         """Raise RolloutError or DatasetError unless there is a frame to predict and something that can deform."""
         self.scene.require_predictable(self.name)
-        if len(self.script) <= given:
-            raise RolloutError(f"{self.name} has {len(self.script)} frames; a rollout needs at least {given + 1}")
+        if len(self.prescribed_position) <= given:
+            count = len(self.prescribed_position)
+            raise RolloutError(f"{self.name} has {count} frames; a rollout needs at least {given + 1}")
 
     def wanted(self) -> tuple[int, ...]:
         """The numbers of the frames that are wanted."""
-        return tuple(range(len(self.script))) if self.frames is None else self.frames
+        return tuple(range(len(self.prescribed_position))) if self.frames is None else self.frames
 
     def given_stress(self, config: ModelConfig, given: int) -> list[Tensor] | list[None]:
         """The stress of each given frame, [N or E, 1]; None if the model predicts no stress."""
         if config.stress == "none":
             return [None] * given
         rows = self.scene.num_nodes if config.stress == "node" else self.scene.num_elements
-        if self.stress is None or self.stress.shape[1] != rows:
+        if self.stress is None:
             return list(torch.zeros(given, rows, 1))
         return list(torch.tensor(self.stress[:given]))
 
@@ -95,14 +109,22 @@ class Question:
             self.scene,
             position.reshape(len(numbers), self.scene.num_nodes, 3),
             np.array(stress) if stress else None,
-            sum(number < config.given_frames for number in numbers),
+            config.given_frames,
             seconds,
             failure,
             stress_location=config.stress,
             frames=numbers,
             last_steps=last_steps,
-            driven=Driven.of(self.scene, self.script),
+            driven=Driven.of(self.scene, self.prescribed_position),
         )
+
+
+def _whole_numbers(frames: Iterable[int] | int) -> list[int]:
+    """The frames as a list; one number is a frame, too."""
+    listed = np.asarray(list(frames) if isinstance(frames, Iterable) else [frames])
+    if listed.size and (listed.ndim != 1 or listed.dtype.kind not in "iu"):
+        raise ConfigError(f"frames must be whole numbers, one such number, or a slice, not {frames!r}")
+    return listed.tolist()
 
 
 def not_finite(config: ModelConfig, name: str, frame: int, position: Tensor, stress: Tensor | None) -> str | None:

@@ -54,9 +54,11 @@ class _RollingScene:
     def __init__(self, model: Simulator, question: Question, given: int) -> None:
         self.model, self.config, self.question = model, model.config, question
         self.graph = model.graph(question.scene)
-        self.script = torch.tensor(question.script)
+        self.prescribed_position = torch.tensor(question.prescribed_position)
         self.end = max(question.wanted()) + 1
-        self.frames = list(zip(self.script[:given], question.given_stress(model.config, given), strict=True))
+        self.frames = list(
+            zip(self.prescribed_position[:given], question.given_stress(model.config, given), strict=True)
+        )
         self.seconds: list[float] = []
         self.failure: str | None = None
         self.place(given - 1, *self.frames[-1])
@@ -68,7 +70,7 @@ class _RollingScene:
         """What a frame is predicted from."""
         position, stress = self.frames[frame - 1]
         state = State(position, self.frames[frame - 2][0] if self.config.dynamic else None, stress)
-        return Start(f"{self.question.name} frame {frame - 1}", self.graph, state, self.script[frame])
+        return Start(f"{self.question.name} frame {frame - 1}", self.graph, state, self.prescribed_position[frame])
 
     def advance(self, frame: int, position: Tensor, stress: Tensor | None, seconds: float) -> None:
         """Keep the predicted frame, or set `failure` if it is not finite or too far away."""

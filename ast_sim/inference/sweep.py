@@ -91,12 +91,13 @@ def sweep(
     table, seconds, notes = [], 0.0, []
     for start in range(0, len(rows), TOGETHER):
         asked = ask(spec, rows[start : start + TOGETHER], scope, frames, nodes)
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            names = [f"row {start + number}" for number in range(len(asked))]
-            wanted = [-2, -1] if needs_way and len(asked[0].motion.position) > 2 else [-1]
-            answers = predict_scenes([(one.scene, one.motion) for one in asked], names, wanted, *effort)
-        notes += [str(note.message) for note in caught]
+        names = [f"row {start + number}" for number in range(len(asked))]
+        wanted = [-2, -1] if needs_way and len(asked[0].motion.position) > 2 else [-1]
+        scenes = [(one.scene, one.motion) for one in asked]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # told once for all rows
+            answers = predict_scenes(scenes, names=names, frames=wanted, effort=effort, throw=False)
+        notes += [f"{answer.name}: {note}" for answer in answers for note in answer.notes]
         table += [_row(one.values, answer, one.origin) for one, answer in zip(asked, answers, strict=True)]
         seconds += sum(answer.seconds for answer in answers)
     outside = {note.partition(":")[0] for note in notes}

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ast_sim.mechanics.contact_and_friction import ContactSettings
 from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.motion_course import Course, Leg
 from ast_sim.scene import AttributeValue, Scene
 from ast_sim.support.errors import SimulationError
 
+NOTES, NEXT_NOTE = "notes", "; "  # the attribute that holds what a user should know of a scene, and what separates it
 NEARBY = (1.0, 0.95, 1.05, 0.9, 1.1)  # sizes of meshes that are tried, relative to the wanted one
 
 
@@ -27,6 +29,7 @@ class SolidCase:
         contact: contact between bodies.
         stress_location: "node": von Mises stress at nodes. "element": von Mises stress and Cauchy stress of elements.
         attributes: what the drawing wants recorded with the trajectory.
+        course: how the prescribed nodes get from frame to frame; None: straight.
     """
 
     scene: Scene
@@ -35,6 +38,41 @@ class SolidCase:
     contact: ContactSettings
     stress_location: str
     attributes: dict[str, AttributeValue] = field(default_factory=dict)
+    course: Course | None = None
+
+    def keeping(self, frames: tuple[int, ...]) -> SolidCase:
+        """The case with frame 0 and these frames only; load steps go where the nodes turn between them."""
+        stored = (0, *frames)
+        course = self.course or Course(self.targets, self.scene.prescribed)
+        return replace(self, targets=self.targets[list(stored)], course=course.storing(stored))
+
+    def notes(self) -> list[str]:
+        """What a user should know of the scene, a sentence each."""
+        drawn = str(self.attributes.get(NOTES, ""))
+        return [*filter(None, drawn.split(NEXT_NOTE)), *(self.course.notes() if self.course else ())]
+
+    def legs(self, frame: int) -> list[Leg]:
+        """What load steps follow from the frame before to this one."""
+        return [Leg(self.targets[frame])] if self.course is None else self.course.legs(frame)
+
+    def straight(self, frame: int) -> list[Leg]:
+        """What load steps follow from rest to a frame, past the frames between."""
+        return [Leg(self.targets[frame])] if self.course is None else self.course.straight(frame)
+
+    def on_the_way(self, frame: int, share: float) -> np.ndarray:
+        """[N,3]: where the prescribed nodes are at a share of the way from rest to a frame, past the frames between."""
+        leg = Leg(self.targets[frame]) if self.course is None else self.course.direct(frame)
+        if leg.along is not None:
+            return leg.along(share)
+        return self.targets[0] + share * (leg.end - self.targets[0])
+
+    def followed(self) -> tuple[SolidCase, list[int]]:
+        """The same case with a frame wherever a leg ends, and which of its frames are those of this case."""
+        ends, stored = [self.targets[0]], [0]
+        for frame in range(1, len(self.targets)):
+            ends += [leg.end for leg in self.legs(frame)]
+            stored.append(len(ends) - 1)
+        return replace(self, targets=np.stack(ends), course=None), stored
 
     @property
     def deforming(self) -> np.ndarray:

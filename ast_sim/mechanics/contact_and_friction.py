@@ -165,7 +165,7 @@ class Contact:
             if settings.self_contact is not True:
                 fixed = fixed | ~np.isin(body, settings.self_contact)
             self._mesh.can_collide = self._unless_alike(np.where(fixed, together, alone))
-        if len(np.unique(body[whole])) > 1:
+        if whole.any():
             self._whole_mesh.can_collide = self._unless_alike(np.where(whole, together, alone))
         self._barrier = ipctk.BarrierPotential(self._dhat, True)
         self._broad_phase, self._ccd = ipctk.LBVH(), ipctk.AdditiveCCD()
@@ -238,7 +238,8 @@ class Contact:
         return collisions
 
     def intersects(self, position: np.ndarray) -> bool:
-        """Whether any two surface triangles intersect, whether of one body or of two. Two rigid bodies may overlap."""
+        """Whether any two surface triangles intersect, of one body or of two. Rigid bodies may pass through
+        themselves, as the layer behind a rigid surface may, and through each other."""
         return self._ipctk.has_intersections(self._whole_mesh, self._vertices(position), self._broad_phase)
 
     def gap(self, position: np.ndarray) -> float:

@@ -192,7 +192,7 @@ class Frames(ABC):
         before = [getattr(self.solver, name) for name in names]
         self._steps_before = self.solver.iterations
         if self.records:
-            self.solver.advance(self.case.targets[len(self.records)])
+            self.bring(len(self.records))
         seconds = process_time() - started
         steps, factorizations, halvings, lost = (
             getattr(self.solver, name) - value for name, value in zip(names, before, strict=True)
@@ -204,6 +204,10 @@ class Frames(ABC):
             "halvings": halvings,
             "dissipation": self.last("dissipation") + lost,
         }
+
+    def bring(self, frame: int) -> None:
+        """Bring the bodies from the frame before to this one."""
+        self.solver.advance(self.case.targets[frame])
 
     def check(self, arrays: dict[str, np.ndarray]) -> dict[str, float]:
         """Check a frame as it is stored: its numbers are finite, surfaces are apart, no element is inverted.

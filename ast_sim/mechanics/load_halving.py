@@ -8,6 +8,8 @@ any. The result is an equilibrium like any other.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from ast_sim.mechanics.contact_and_friction import Contact
@@ -59,10 +61,13 @@ class QuasiStatic:
         """Work in joule lost to friction so far."""
         return self.newton.dissipation + (self._damped.dissipation if self._damped else 0.0)
 
-    def advance(self, target: np.ndarray, first: float = 1.0) -> None:
+    def advance(
+        self, target: np.ndarray, first: float = 1.0, along: Callable[[float], np.ndarray] | None = None
+    ) -> None:
         """Bring the prescribed nodes to `target` [N,3] (rows of free nodes are ignored) and the others to equilibrium.
 
-        The first load step goes that share of the way; at 1 the whole way is tried in one step.
+        The first load step goes that share of the way; at 1 the whole way is tried in one step. `along` gives the
+        positions at a share of the way; without it, the way is straight.
 
         Raises:
             NotConverged: there is no equilibrium after the allowed halvings and damped steps.
@@ -71,7 +76,8 @@ class QuasiStatic:
         done, part, smallest = 0.0, first, 0.5**self.newton.settings.max_halvings
         while done < 1:
             reached = min(1.0, done + part)
-            goal = target if reached == 1 else start + reached * (target - start)
+            between = start + reached * (target - start) if along is None else along(reached)
+            goal = target if reached == 1 else between
             before = self.newton.position
             try:
                 self.newton.step(goal)

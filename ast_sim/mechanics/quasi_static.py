@@ -26,7 +26,7 @@ COMPONENTS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))
 
 @dataclass(frozen=True, kw_only=True)
 class SolidRecord(FrameRecord):
-    """A record with the balance of forces. Its work is the trapezoidal rule over the frames.
+    """A record with the balance of forces. Its work is the trapezoidal rule over the legs of the motion.
 
     Attributes:
         imbalance: magnitude of the sum of the forces on all prescribed nodes, divided by the sum of their magnitudes; 0
@@ -112,8 +112,9 @@ def solve_frame(
     frames.watch(watch)
     position, failure = None, ""
     try:
-        for target in case.targets[frame if first else 1 : frame + 1]:
-            solver.advance(target, first or 1.0)
+        for legs in [case.straight(frame)] if first else map(case.legs, range(1, frame + 1)):
+            for leg in legs:
+                solver.advance(leg.end, first or 1.0, leg.along)
     except SimulationError as error:
         failure = str(error)
     seconds = process_time() - began
@@ -142,16 +143,16 @@ class SolidFrames(Frames):
         super().__init__(case, QuasiStatic(self._elasticity, contact, scene.prescribed, rest, settings), contact)
         self._reactions = np.zeros_like(rest)
         self.record_type = SolidRecord if self.driven.axis is None else TurnedRecord
+        self._work = 0.0
 
     def next_frame(self) -> tuple[dict[str, np.ndarray], SolidRecord]:
         """See `Frames`."""
-        newton, start = self.solver.newton, self.solver.newton.position
+        newton, self._work = self.solver.newton, 0.0
         cost = self.advance()
+        if not self.records:
+            self._reactions = self._held()
         arrays = self._stored()
-        checked = self.check(arrays)
-        reactions = np.where(self.case.scene.prescribed[:, None], newton.reactions(), 0)
-        work = 0.5 * float(np.vdot(reactions + self._reactions, newton.position - start))
-        self._reactions = reactions
+        checked, reactions = self.check(arrays), self._reactions
         turned = {} if self.driven.axis is None else {"torque": self._torque(reactions)}
         return arrays, self.record_type(
             **cost,
@@ -163,8 +164,21 @@ class SolidFrames(Frames):
             imbalance=self._imbalance(reactions),
             elastic_energy=newton.state.potential.energy,
             contact_energy=newton.state.contact.barrier_energy(),
-            work=self.last("work") + work,
+            work=self.last("work") + self._work,
         )
+
+    def bring(self, frame: int) -> None:
+        """See `Frames`. The work of a leg follows by the trapezoidal rule."""
+        for leg in self.case.legs(frame):
+            start, self._steps_before = self.solver.newton.position, self.solver.iterations
+            self.solver.advance(leg.end, along=leg.along)
+            reactions = self._held()
+            self._work += 0.5 * float(np.vdot(reactions + self._reactions, self.solver.newton.position - start))
+            self._reactions = reactions
+
+    def _held(self) -> np.ndarray:
+        """[N,3]: the forces that hold the prescribed nodes; 0 at others."""
+        return np.where(self.case.scene.prescribed[:, None], self.solver.newton.reactions(), 0)
 
     def _stored(self) -> dict[str, np.ndarray]:
         """The arrays of a frame as they are stored."""

@@ -17,7 +17,7 @@ import shutil
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import safetensors.torch
 import torch
@@ -26,7 +26,7 @@ from torch import Tensor
 
 from ast_sim.support.disk import sync_folder, write_synced, write_text
 from ast_sim.support.errors import CheckpointError
-from ast_sim.support.sealed_line import seal, unseal
+from ast_sim.support.toml_settings import NOTHING
 
 FILES = ("model.safetensors", "training.safetensors", "state.json")
 MANIFEST = "manifest.json"
@@ -38,7 +38,17 @@ _LOCK = ".lock"
 _TEMPORARY = ".tmp-"
 _NAME = re.compile(r"step-(0|[1-9][0-9]{0,17})")
 _MANIFEST_BYTES = 1 << 16
+_MARK_BYTES = 1 << 18
 _ERRORS = (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError, SafetensorError)
+
+
+class Best(NamedTuple):
+    """The mark of the best checkpoint: its step, its validation error, and what was found out about its answers."""
+
+    step: int
+    error: float
+    answers: dict[str, Any]
+
 
 Content = tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Any]]
 
@@ -144,9 +154,12 @@ def best(run_dir: str | os.PathLike[str]) -> Path | None:
     return None
 
 
-def mark_best(run_dir: str | os.PathLike[str], step: int, error: float) -> None:
-    """Mark the checkpoint of this step, with its validation error, as the best one; it is kept until another one is
-    marked.
+def mark_best(run_dir: str | os.PathLike[str], step: int, error: float, answers: dict[str, Any] = NOTHING) -> None:
+    """Mark the checkpoint of this step as the best one; it is kept until another one is marked.
+
+    Args:
+        error: its validation error.
+        answers: what validation found out about answers with this checkpoint, such as the default effort.
 
     Raises:
         CheckpointError: there is no such checkpoint, or the mark cannot be written.
@@ -155,11 +168,12 @@ def mark_best(run_dir: str | os.PathLike[str], step: int, error: float) -> None:
         raise CheckpointError(f"{run_dir}: there is no checkpoint step-{step} to mark as the best")
     path = Path(run_dir) / _BEST
     with _explained(path, "cannot be written"):
-        write_text(path, seal({"step": step, "valid_rmse": error}))
+        mark = {"step": step, "valid_rmse": error, "answers": dict(answers)}
+        write_text(path, _json({**mark, "sha256": _hash(_json(mark))}).decode() + "\n")
 
 
-def read_best(run_dir: str | os.PathLike[str]) -> tuple[int, float] | None:
-    """The step of the checkpoint that is marked as the best, and its validation error; None if none is marked.
+def read_best(run_dir: str | os.PathLike[str]) -> Best | None:
+    """The mark of the best checkpoint; None if none is marked.
 
     Raises:
         CheckpointError: the mark is damaged.
@@ -169,8 +183,10 @@ def read_best(run_dir: str | os.PathLike[str]) -> tuple[int, float] | None:
         return None
     advice = f"is damaged: remove it, then ast-sim train --resume --out {run_dir} writes it again"
     with _explained(path, advice):
-        mark = unseal(_read_file(path, 256).decode())
-        return int(mark["step"]), float(mark["valid_rmse"])
+        mark = json.loads(_read_file(path, _MARK_BYTES))
+        if mark.pop("sha256") != _hash(_json(mark)):
+            raise ValueError("its content does not fit its SHA-256")
+        return Best(int(mark["step"]), float(mark["valid_rmse"]), dict(mark["answers"]))
 
 
 @contextlib.contextmanager
@@ -241,7 +257,7 @@ def _read_manifest(path: Path) -> dict[str, dict[str, Any]]:
             raise CheckpointError(f"{path}: there is no such checkpoint")
         manifest = json.loads(_read_file(path / MANIFEST, _MANIFEST_BYTES))
         records = {name: {key: manifest["files"][name][key] for key in ("size", "sha256")} for name in FILES}
-        if manifest != {"version": VERSION, "step": _step(path), "files": records}:
+        if manifest != {"version": VERSION, "step": step_of(path), "files": records}:
             raise CheckpointError(f"{path / MANIFEST}: is not the manifest of version {VERSION} of this step")
     return records
 
@@ -280,18 +296,19 @@ def _damage(path: Path) -> CheckpointError | None:
     return None
 
 
-def _step(path: Path) -> int:
+def step_of(path: Path) -> int:
+    """The step of a checkpoint's folder."""
     return int(path.name.removeprefix("step-"))
 
 
 def _newest_first(parent: Path) -> list[Path]:
-    return sorted(filter(lambda path: _NAME.fullmatch(path.name), parent.glob("step-*")), key=_step, reverse=True)
+    return sorted(filter(lambda path: _NAME.fullmatch(path.name), parent.glob("step-*")), key=step_of, reverse=True)
 
 
 def _marked(run_dir: Path) -> Path | None:
     """The checkpoint that the file `best` names; None if there is no such file."""
     mark = read_best(run_dir)
-    return None if mark is None else at_step(run_dir, mark[0])
+    return None if mark is None else at_step(run_dir, mark.step)
 
 
 def _prune(run_dir: Path, step: int, keep: int) -> None:

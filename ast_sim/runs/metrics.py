@@ -50,10 +50,10 @@ class Metrics:
             text = f"{self.path} has lost {lines - found} of {lines} lines: its curves are not complete"
             warnings.warn(text, stacklevel=2)
 
-    def best(self) -> tuple[int, float] | None:
-        """The step and the error of the best validation; None if no validation succeeded."""
-        marks = ((record["step"], record["valid_rmse"]) for record in self if record.get("valid_rmse") is not None)
-        return min(marks, key=lambda mark: mark[1], default=None)
+    def best(self) -> dict[str, Any] | None:
+        """The record of the best validation; None if no validation succeeded."""
+        succeeded = (record for record in self if record.get("valid_rmse") is not None)
+        return min(succeeded, key=lambda record: record["valid_rmse"], default=None)
 
     def validation(self, step: int) -> dict[str, Any] | None:
         """The record of the last validation after a step; None if there is none."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 from types import ModuleType
+from typing import Any
 
 
 class AstSimError(Exception):
@@ -31,7 +32,15 @@ class TrainingError(AstSimError):
 
 
 class RolloutError(AstSimError):
-    """A prediction that left the finite numbers or the domain."""
+    """A prediction that left the finite numbers or the domain.
+
+    Attributes:
+        answer: the `Answer` so far, with the frames before the one that failed; None if there is none.
+    """
+
+    def __init__(self, text: str, answer: Any = None) -> None:
+        super().__init__(text)
+        self.answer = answer
 
 
 class SimulationError(AstSimError):

@@ -8,6 +8,18 @@ from types import FrameType
 from typing import Any, Self
 
 
+class Interrupted(KeyboardInterrupt):
+    """A long computation was asked to stop by a signal, and has kept what it had.
+
+    Attributes:
+        number: of the signal; SIGPIPE where nobody reads the output.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(f"stopped by {signal.Signals(number).name}")
+        self.number = number
+
+
 class StopSignals:
     """Within the `with` block a first SIGINT, SIGTERM or SIGHUP (a lost terminal) does not end the process; its number
     is kept in `received`. A process that ignores SIGHUP (`nohup`) goes on ignoring it.

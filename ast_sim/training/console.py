@@ -6,7 +6,6 @@ import errno
 import math
 import signal
 from collections.abc import Callable
-from pathlib import Path
 
 from torch import nn
 
@@ -75,8 +74,8 @@ class StepLog:
         sums: sums of the values of all steps since the last line; a checkpoint keeps them.
     """
 
-    def __init__(self, run: Path, config: RunConfig, dataset: Dataset, clock: Clock) -> None:
-        self.metrics, self.options, self.clock = Metrics(run), config.train, clock
+    def __init__(self, metrics: Metrics, config: RunConfig, dataset: Dataset, clock: Clock) -> None:
+        self.metrics, self.options, self.clock = metrics, config.train, clock
         self.validates = dataset.count("valid") > 0
         self.sums: dict[str, float] = {}
 

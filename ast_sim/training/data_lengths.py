@@ -9,7 +9,7 @@ import numpy as np
 
 from ast_sim.dataset.layout import GIVEN_FRAMES
 from ast_sim.dataset.reader import Dataset
-from ast_sim.inference.measures import SquaredError, rmse_pooled
+from ast_sim.inference.evaluation.measures import SquaredError, rmse_pooled
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.prescribed_motion import Motion
 from ast_sim.runs.scope import Scope, edge_lengths, size_of, spacing_of

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import signal
-from pathlib import Path
 
 import torch
 
@@ -22,10 +21,11 @@ from ast_sim.batches.training_rollouts import RolloutPool
 from ast_sim.dataset.reader import Dataset
 from ast_sim.models.registry import build_model
 from ast_sim.runs import checkpoint
+from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.errors import DatasetError, TrainingError
 from ast_sim.support.progress import Clock, duration
-from ast_sim.support.stop_signals import StopSignals
+from ast_sim.support.stop_signals import Interrupted, StopSignals
 from ast_sim.training.console import Console, StepLog, introduce
 from ast_sim.training.data_lengths import DataScales, largest_error
 from ast_sim.training.optimizer import Optimizer
@@ -47,7 +47,7 @@ class Training:
 
     def __init__(
         self,
-        run: Path,
+        run: RunFolder,
         config: RunConfig,
         dataset: Dataset,
         scales: DataScales,
@@ -63,7 +63,7 @@ class Training:
         self.ahead = Ahead(self.pool or self.sampler)
         self.optimizer = Optimizer(self.model, self.options.optimizer)
         self.clock = Clock()
-        self.log = StepLog(run, config, dataset, self.clock)
+        self.log = StepLog(run.metrics, config, dataset, self.clock)
         self.saver = Saver(run, dataset, self.model, self.optimizer, self.pool, self.processes)
         self.step = 0
         self.stopping = 0  # the number of a signal that some process has received; 0: no signal
@@ -110,8 +110,8 @@ class Training:
         if self.processes.leads:
             self.log.metrics.forget_after(self.step)
             best = self.log.metrics.best()
-            if best is not None and checkpoint.read_best(self.run) is None:
-                checkpoint.mark_best(self.run, *best)
+            if best is not None and checkpoint.read_best(self.run.path) is None:
+                self.run.mark_best(best)
         self.processes.spread(self.model.state_dict().values())
         self.model.train()
 
@@ -154,7 +154,7 @@ class Training:
     def _stop_if_asked(self) -> None:
         if self.stopping:
             self.progress.line(f"stopped after step {self.step:,}: go on with --resume")
-            raise SystemExit(128 + self.stopping)
+            raise Interrupted(self.stopping)
 
     def advance(self) -> None:
         """One optimizer step with the mean gradient of `accumulate` batches."""
@@ -198,7 +198,7 @@ class Training:
         return whole
 
     def _not_finite(self, what: str, value: float, names: list[str]) -> TrainingError:
-        names, last = self.processes.gathered(names), checkpoint.latest(self.run)
+        names, last = self.processes.gathered(names), checkpoint.latest(self.run.path)
         kept = f"the last good checkpoint is {last}" if last else "there is no checkpoint yet"
         return TrainingError(
             f"the {what} of step {self.step + 1} is {value}, so training stopped before this step: check the samples"
@@ -214,19 +214,21 @@ class Training:
         mine = scenes[self.processes.rank :: self.processes.count]
         # Several processes must stop together, so none of them may stop within its own validation.
         progress = self._stop_at_once if self.processes.count == 1 else None
-        found = self.processes.gathered(validate(self.model, self.dataset, mine, self.options.calls, progress))
+        validated = self.processes.gathered(validate(self.model, self.dataset, mine, self.options.calls, progress))
         seconds = self.clock.validation()
         if not self.processes.leads:
             return
-        mark = checkpoint.read_best(self.run)
-        if mark is not None and mark[0] >= self.step:  # a resumed training repeats this step
-            mark = self.log.metrics.best()
-        best = math.inf if mark is None else mark[1]
-        record, text = verdict(found, best, self.dataset.info.length_unit)
-        if record["valid_rmse"] is not None and record["valid_rmse"] < best:
-            checkpoint.mark_best(self.run, self.step, record["valid_rmse"])
-        self.log.metrics.append({"step": self.step, **record, "seconds": seconds})
-        self.progress.line(f"validation after step {self.step:,}: {text} ({duration(seconds)})")
+        mark = checkpoint.read_best(self.run.path)
+        best = math.inf if mark is None else mark.error
+        if mark is not None and mark.step >= self.step:  # a resumed training repeats this step
+            before = self.log.metrics.best()
+            best = math.inf if before is None else before["valid_rmse"]
+        outcome = verdict(validated, best, self.dataset.info.length_unit)
+        record = {"step": self.step, **outcome.record, "seconds": seconds}
+        if outcome.error is not None and outcome.error < best:
+            self.run.mark_best(record)
+        self.log.metrics.append(record)
+        self.progress.line(f"validation after step {self.step:,}: {outcome.text} ({duration(seconds)})")
 
     def _stop_at_once(self, frame: int) -> None:
         self._heed_signals()

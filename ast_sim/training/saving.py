@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from torch import Tensor, nn
 
 from ast_sim.batches.training_pool import Pool
 from ast_sim.dataset.reader import Dataset
 from ast_sim.runs import checkpoint
-from ast_sim.runs.config_toml import read_origin
-from ast_sim.runs.folder import first_weights
-from ast_sim.runs.metrics import Metrics
+from ast_sim.runs.folder import RunFolder
 from ast_sim.support.errors import TrainingError
 from ast_sim.training.optimizer import Optimizer
 from ast_sim.training.processes import Processes
@@ -22,7 +18,7 @@ class Saver:
 
     def __init__(
         self,
-        run: Path,
+        run: RunFolder,
         dataset: Dataset,
         model: nn.Module,
         optimizer: Optimizer,
@@ -39,14 +35,13 @@ class Saver:
             parts = self.processes.gathered([self.pool.state()])
             rolling = {key: value for part in parts for key, value in part.items()}
         if self.processes.leads:
-            lines = sum(1 for _ in Metrics(self.run))
-            run = read_origin(self.run)["sha256"]
+            lines = sum(1 for _ in self.run.metrics)
             checkpoint.save(
-                self.run,
+                self.run.path,
                 step,
                 model=self.model.state_dict(),
                 training={**_under("optimizer.", self.optimizer.state()), **_under("pool.", rolling)},
-                state={"step": step, "sums": sums, "run": run, "lines": lines},
+                state={"step": step, "sums": sums, "run": self.run.origin["sha256"], "lines": lines},
                 keep=keep,
             )
 
@@ -64,28 +59,28 @@ class Saver:
 
     def start(self) -> bool:
         """Load the weights of the run that this one starts from; returns whether there is such a run."""
-        weights = first_weights(self.run)
+        weights = self.run.first_weights()
         if weights is None:
             return False
         self.model.load_state_dict(weights)
-        start = read_origin(self.run)["start"]
+        start = self.run.origin["start"]
         print(f"starts from {start['run']}, step {start['step']:,}", flush=True)
         return True
 
     def _newest(self) -> checkpoint.Content | None:
         """The content of the newest checkpoint, which must be of this run and of this dataset."""
-        path = checkpoint.latest(self.run)
+        path = checkpoint.latest(self.run.path)
         if path is None:
             return None
-        origin = read_origin(self.run)
+        origin = self.run.origin
         content = checkpoint.load(path, origin["sha256"])
         if origin["data"] != self.dataset.fingerprint():
             raise TrainingError(
-                f"{self.dataset.path} is not the dataset that {self.run} was trained on so far: use that dataset, or"
-                " train in another folder"
+                f"{self.dataset.path} is not the dataset that {self.run.path} was trained on so far: use that dataset,"
+                " or train in another folder"
             )
         state = content[2]
-        Metrics(self.run).require(state["lines"])
+        self.run.metrics.require(state["lines"])
         print(f"going on after step {state['step']:,}", flush=True)
         return content
 

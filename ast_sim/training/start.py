@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import errno
 import os
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -15,8 +16,8 @@ from ast_sim.inference.trained_run import Run
 from ast_sim.models.registry import build_model, find_preset
 from ast_sim.models.simulator import Simulator
 from ast_sim.runs import checkpoint
-from ast_sim.runs.config_toml import has_config, read_changes, read_config, read_origin, read_scope, write_config
-from ast_sim.runs.folder import require_fit, start_at
+from ast_sim.runs.config_toml import has_config, read_changes, write_config
+from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.support.errors import CheckpointError, ConfigError, TrainingError
 from ast_sim.support.stop_signals import StopSignals
@@ -54,7 +55,7 @@ def configure(
     elif model or preset:
         raise ConfigError("a run that starts from another one has its model and settings: leave model and preset out")
     else:
-        found = dataclasses.replace(read_config(Path(from_run)), data=str(data))
+        found = dataclasses.replace(RunFolder(Path(from_run)).settings, data=str(data))
     before = found
     with _naming(file):
         found = _changed(found, given, reschedule=from_run is not None)
@@ -114,7 +115,7 @@ def train(
         ConfigError: there is no such model, preset or setting (the text names the nearest one), or a value does not
             fit; a text about `config` names the file. Or the data does not fit the model of `from_run`.
         DatasetError: the dataset cannot be read.
-        TrainingError, CheckpointError: as in `start_training`.
+        TrainingError, CheckpointError, KeyboardInterrupt: as in `start_training`.
     """
     changes = _changes(model_settings, settings)
     chosen = configure(data, preset, (), model, config=config, from_run=from_run, changes=changes)
@@ -159,38 +160,49 @@ def start_training(
         ConfigError: settings are out of range, or differ from those of the run that is resumed, or the data does not
             fit the model of `from_run`.
         CheckpointError: another process trains in this folder, or no checkpoint in it can be read.
-        SystemExit: SIGINT (code 130), SIGTERM (143) or SIGHUP (129) was received, or nobody reads the output (141);
-            a checkpoint of the finished step was written.
+        KeyboardInterrupt: SIGINT, SIGTERM or SIGHUP was received, or nobody reads the output; a checkpoint of the
+            finished step was written. The error is an `Interrupted`, which has the number of the signal.
     """
-    run = Path(run)
+    folder = RunFolder(Path(run))
+    with (
+        _explained(folder.path),
+        Processes() as processes,
+        _held(folder.path, processes),
+        StopSignals() as signals,
+        _told_by_leader(processes),
+    ):
+        saved = processes.of_leader(folder.settings if has_config(folder.path) else None)
+        if saved is not None and not resume:
+            raise TrainingError(f"{run} already holds a run: go on with --resume, or choose another folder")
+        asked = config or saved
+        if asked is None:
+            raise TrainingError(f"{run} holds no run to resume: name the dataset to start one")
+        source = None if from_run is None else RunFolder(Path(from_run))
+        with Dataset(asked.data) as dataset:
+            scales = measure(dataset)
+            resolved = asked if config is None else resolve(asked, dataset, scales, keep_model=source is not None)
+            batch_size = resolved.train.batch_size
+            if batch_size % processes.count:
+                raise ConfigError(f"train.batch_size = {batch_size} cannot be cut for {processes.count} processes")
+            if source is not None:
+                _require_fit(source, resolved, dataset, scales)
+            if saved is not None:
+                _require_same(folder, saved, resolved, source)
+            elif processes.leads:
+                start = None if source is None else source.start()
+                write_config(folder.path, resolved, scope_of(dataset), dataset.fingerprint(), start)
+            with Training(folder, resolved, dataset, scales, signals, processes) as training:
+                if profile_steps:
+                    training.profile(profile_steps)
+                else:
+                    training.go()
+
+
+@contextmanager
+def _explained(run: Path) -> Iterator[None]:
+    """Within the block, errors of the disk become a TrainingError."""
     try:
-        run.mkdir(parents=True, exist_ok=True)
-        with Processes() as processes, _lock(run, processes), StopSignals() as signals, _told_by_leader(processes):
-            saved = processes.of_leader(read_config(run) if has_config(run) else None)
-            if saved is not None and not resume:
-                raise TrainingError(f"{run} already holds a run: go on with --resume, or choose another folder")
-            asked = config or saved
-            if asked is None:
-                raise TrainingError(f"{run} holds no run to resume: name the dataset to start one")
-            source = None if from_run is None else Path(from_run)
-            with Dataset(asked.data) as dataset:
-                scales = measure(dataset)
-                resolved = asked if config is None else resolve(asked, dataset, scales, keep_model=source is not None)
-                batch_size = resolved.train.batch_size
-                if batch_size % processes.count:
-                    raise ConfigError(f"train.batch_size = {batch_size} cannot be cut for {processes.count} processes")
-                if source is not None:
-                    _require_fit(source, resolved, dataset, scales)
-                if saved is not None:
-                    _require_same(run, saved, resolved, source)
-                elif processes.leads:
-                    start = None if source is None else start_at(source)
-                    write_config(run, resolved, scope_of(dataset), dataset.fingerprint(), start)
-                with Training(run, resolved, dataset, scales, signals, processes) as training:
-                    if profile_steps:
-                        training.profile(profile_steps)
-                    else:
-                        training.go()
+        yield
     except BrokenPipeError:  # before the first step
         raise
     except OSError as error:
@@ -200,8 +212,11 @@ def start_training(
 
 
 @contextmanager
-def _lock(run: Path, processes: Processes) -> Iterator[None]:
-    """Within the block the leading process holds the lock of the run folder. If it cannot, all processes raise."""
+def _held(run: Path, processes: Processes) -> Iterator[None]:
+    """Within the block the run folder is there, and the leading process holds its lock. If it cannot, all processes
+    raise. If the block fails before the run has settings, a folder that was made for it is removed."""
+    absent = next((folder for folder in reversed([run, *run.parents]) if not folder.exists()), None)
+    run.mkdir(parents=True, exist_ok=True)
     with ExitStack() as held:
         refusal = None
         try:
@@ -212,7 +227,12 @@ def _lock(run: Path, processes: Processes) -> Iterator[None]:
         refusal = processes.of_leader(refusal)
         if refusal is not None:
             raise CheckpointError(refusal)
-        yield
+        try:
+            yield
+        except BaseException:
+            if processes.leads and absent is not None and not has_config(run):
+                shutil.rmtree(absent, ignore_errors=True)
+            raise
 
 
 @contextmanager
@@ -225,25 +245,26 @@ def _told_by_leader(processes: Processes) -> Iterator[None]:
         yield
 
 
-def _require_fit(source: Path, config: RunConfig, dataset: Dataset, scales: DataScales) -> None:
+def _require_fit(source: RunFolder, config: RunConfig, dataset: Dataset, scales: DataScales) -> None:
     """Raise ConfigError if the model of the run `source` cannot learn from the dataset."""
-    require_fit(source, config.model, read_scope(source), dataset)
+    source.require_fit(dataset)
     if config.model.planar and not scales.planar:
-        raise ConfigError(f"{dataset.path} leaves the plane z = 0, in which {source} keeps all nodes")
+        raise ConfigError(f"{dataset.path} leaves the plane z = 0, in which {source.path} keeps all nodes")
 
 
-def _require_same(run: Path, saved: RunConfig, asked: RunConfig, source: Path | None) -> None:
+def _require_same(run: RunFolder, saved: RunConfig, asked: RunConfig, source: RunFolder | None) -> None:
     """Raise ConfigError if a setting or the run to start from differs, naming the first one; only the path of the
     dataset may differ."""
     for key, old, new in _differences(saved, asked, "model", "train"):
         raise ConfigError(
-            f"{run} was started with {key} = {old!r}, not {new!r}: resume without settings, or train in another folder"
+            f"{run.path} was started with {key} = {old!r}, not {new!r}: resume without settings, or train in another"
+            " folder"
         )
-    start = read_origin(run).get("start")
-    if source is not None and (start is None or Path(start["run"]) != source.resolve()):
+    start = run.origin.get("start")
+    if source is not None and (start is None or Path(start["run"]) != source.path.resolve()):
         begun = "without another run" if start is None else f"from {start['run']}"
         raise ConfigError(
-            f"{run} was started {begun}, not from {source}: resume without it, or train in another folder"
+            f"{run.path} was started {begun}, not from {source.path}: resume without it, or train in another folder"
         )
 
 

@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import asdict
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ast_sim.dataset.reader import Dataset
-from ast_sim.inference.asked_frame import errors_by_effort
-from ast_sim.inference.effort import MOST_NEWTON_STEPS, Effort, cheapest_good, knows_material
+from ast_sim.inference.effort import (
+    FIRST_CALL,
+    MOST_NEWTON_STEPS,
+    Effort,
+    EffortErrors,
+    cheapest_good,
+    knows_material,
+    mean_errors,
+)
+from ast_sim.inference.evaluation.asked_frame import errors_by_effort
+from ast_sim.inference.evaluation.measures import SquaredError, rmse_sequence
 from ast_sim.inference.jump import calls
-from ast_sim.inference.measures import SquaredError, rmse_sequence
 from ast_sim.inference.question import Question
 from ast_sim.inference.rollout import rollouts
 from ast_sim.models.simulator import Simulator
@@ -28,18 +37,37 @@ class Validated(NamedTuple):
 
     Attributes:
         index: number of the scene in its split.
-        errors: error of the prediction, for a model that jumps after each call; empty if the prediction failed.
+        errors: error of the network's prediction, for a model that jumps after each call; empty if it failed.
         hold: error of the prediction that nothing moves.
         failure: why the prediction failed; None if it did not.
-        efforts: [4, calls, Newton steps + 1], the errors of displacement and stress at the deepest frame, the Newton
-            steps made and whether they did not end, as `errors_by_effort` gives them; None if they were not measured.
+        by_effort: the errors of answers at the deepest frame, as `errors_by_effort` gives them; empty if they were not
+            measured.
     """
 
     index: int
     errors: list[SquaredError]
     hold: SquaredError
     failure: str | None
-    efforts: np.ndarray | None = None
+    by_effort: list[EffortErrors]
+
+
+class Verdict(NamedTuple):
+    """What a validation says of a checkpoint.
+
+    Attributes:
+        error: of the network alone after its corrections, without Newton steps: it chooses the checkpoint. With Newton
+            steps all checkpoints look alike. None: a prediction failed.
+        effort: the default effort of the run, if this checkpoint is chosen: the cheapest that leads to good answers.
+        by_effort: the errors of answers by effort.
+        record: for `metrics.jsonl`.
+        text: for people.
+    """
+
+    error: float | None
+    effort: Effort
+    by_effort: list[EffortErrors]
+    record: dict[str, Any]
+    text: str
 
 
 def validate(
@@ -52,35 +80,49 @@ def validate(
     """Predict validation scenes together; `progress` is called after each step and may raise to stop.
 
     Args:
-        most_calls: so many calls correct one another in training.
+        most_calls: how many calls correct one another in training.
     """
     indices = list(indices)
     truths = [dataset.load("valid", index) for index in indices]
     if not truths:
         return []
-    jumps, given = model.config.jumps, model.config.given_frames
-    most_calls += MORE_CALLS if most_calls > 1 else 0
-    frames = [frames_asked(truth.num_frames) if jumps else np.arange(given, truth.num_frames) for truth in truths]
-    questions = [
-        Question.of(truth, f"valid/{index:06d}", asked.tolist() if jumps else None)
-        for index, truth, asked in zip(indices, truths, frames, strict=True)
-    ]
-    if jumps:
-        ways = calls(model, questions, Effort(most_calls - 1))
-        predicted = [(way, ()) if isinstance(way, str) else (None, way.position) for way in ways]
-    else:
-        answers = rollouts(model, questions, progress)
-        predicted = [(a.failure, () if a.failure else a.position[None, given:]) for a in answers]
-    found = []
-    for index, truth, asked, (failure, positions) in zip(indices, truths, frames, predicted, strict=True):
-        errors = [_motion_error(position, truth, asked) for position in positions]
-        hold = _motion_error(truth.position[given - 1], truth, asked)
-        efforts = None
-        if jumps and failure is None and index < EFFORT_SCENES:
-            steps = MOST_NEWTON_STEPS if knows_material(model.config) else 0
-            efforts = errors_by_effort(model, truth, Effort(max(0, most_calls - MORE_CALLS - 1), steps))
-        found.append(Validated(index, errors, hold, failure, efforts))
-    return found
+    if not model.config.jumps:
+        return _by_rollouts(model, indices, truths, progress)
+    return _by_jumps(model, indices, truths, most_calls)
+
+
+def _by_rollouts(
+    model: Simulator, indices: list[int], truths: list[Trajectory], progress: Callable[[int], None] | None
+) -> list[Validated]:
+    given = model.config.given_frames
+    questions = [Question.of(truth, _name(index)) for index, truth in zip(indices, truths, strict=True)]
+    validated = []
+    for index, truth, answer in zip(indices, truths, rollouts(model, questions, progress), strict=True):
+        frames = np.arange(given, truth.num_frames)
+        errors = [] if answer.failure else [_motion_error(answer.position[given:], truth, frames)]
+        hold = _motion_error(truth.position[given - 1], truth, frames)
+        validated.append(Validated(index, errors, hold, answer.failure, []))
+    return validated
+
+
+def _by_jumps(model: Simulator, indices: list[int], truths: list[Trajectory], most_calls: int) -> list[Validated]:
+    corrections = most_calls - 1 + (MORE_CALLS if most_calls > 1 else 0)
+    frames = [frames_asked(truth.num_frames) for truth in truths]
+    asked = zip(indices, truths, frames, strict=True)
+    questions = [Question.of(truth, _name(index), numbers.tolist()) for index, truth, numbers in asked]
+    ways = calls(model, questions, Effort(corrections))
+    newton_steps = MOST_NEWTON_STEPS if knows_material(model.config) else 0
+    validated = []
+    for index, truth, numbers, way in zip(indices, truths, frames, ways, strict=True):
+        hold = _motion_error(truth.position[0], truth, numbers)
+        if isinstance(way, str):
+            validated.append(Validated(index, [], hold, way, []))
+            continue
+        errors = [_motion_error(position, truth, numbers) for position in way.position]
+        measures = index < EFFORT_SCENES
+        by_effort = errors_by_effort(model, truth, Effort(most_calls - 1, newton_steps)) if measures else []
+        validated.append(Validated(index, errors, hold, None, by_effort))
+    return validated
 
 
 def frames_asked(count: int) -> np.ndarray:
@@ -89,33 +131,33 @@ def frames_asked(count: int) -> np.ndarray:
     return spread[spread > 0]
 
 
-def verdict(found: list[Validated], best: float, unit: str) -> tuple[dict[str, Any], str]:
-    """The record of a validation for `metrics.jsonl`, and its text; `best` is the lowest error before."""
-    failure = next((scene.failure for scene in found if scene.failure), None)
+def verdict(validated: list[Validated], best: float, unit: str) -> Verdict:
+    """What the scenes say together; `best` is the lowest error of a checkpoint before."""
+    failure = next((scene.failure for scene in validated if scene.failure), None)
     if failure is not None:
-        return {"valid_rmse": None, "failure": failure}, f"prediction failed: {failure}"
-    found = sorted(found, key=lambda scene: scene.index)
-    by_calls = [rmse_sequence(errors) for errors in zip(*(scene.errors for scene in found), strict=True)]
-    hold = rmse_sequence([scene.hold for scene in found])
-    effort = Effort(_corrections(by_calls))
-    error = by_calls[effort.corrections]
+        record = {"valid_rmse": None, "failure": failure}
+        return Verdict(None, FIRST_CALL, [], record, f"prediction failed: {failure}")
+    validated = sorted(validated, key=lambda scene: scene.index)
+    by_calls = [rmse_sequence(errors) for errors in zip(*(scene.errors for scene in validated), strict=True)]
+    hold = rmse_sequence([scene.hold for scene in validated])
+    network = Effort(_corrections(by_calls))
+    error = by_calls[network.corrections]
+    by_effort = mean_errors([scene.by_effort for scene in validated if scene.by_effort])
+    effort = cheapest_good(by_effort) if by_effort else network
     share = f" = {error / hold:.2f} of the error of hold still" if hold else ""
-    after = f" after {effort.text}" if len(by_calls) > 1 else ""
-    text = f"error {error:.3g} {unit}{share}{after}{', the best so far' if error < best else ''}"
+    after = f" after {network.text}" if len(by_calls) > 1 else ""
+    text = f"network alone: error {error:.3g} {unit}{share}{after}{', the best so far' if error < best else ''}"
+    reached = next((one.error for one in by_effort if one.effort == effort), None)
+    if reached is not None:
+        text += f"; answers at the deepest frame: error {100 * reached:.2g} % of the displacement after {effort.text}"
     record: dict[str, Any] = {"valid_rmse": error, "valid_hold_still": hold}
-    measured = [scene.efforts for scene in found if scene.efforts is not None]
-    if measured:
-        means = np.mean(measured, axis=0)
-        by_effort = means[0]
-        if by_effort.shape[1] > 1:
-            effort = cheapest_good(means)
-        keys = ("valid_by_effort", "valid_stress_by_effort", "valid_newton_steps", "valid_unsettled")
-        record |= zip(keys, np.where(np.isnan(means), None, means).tolist(), strict=True)  # JSON has no NaN
-        if effort.corrections < len(by_effort) and not np.isnan(by_effort[effort]):
-            text += f"; at the deepest frame {100 * by_effort[effort]:.2g} % of the displacement after {effort.text}"
-    if len(by_calls) > 1 or measured:
-        record |= {"valid_by_calls": by_calls, **effort._asdict()}
-    return record, text
+    if len(by_calls) > 1:
+        record["valid_by_calls"] = by_calls
+    if by_effort:
+        record["valid_by_effort"] = [asdict(one) for one in by_effort]
+    if len(by_calls) > 1 or by_effort:
+        record["effort"] = asdict(effort)
+    return Verdict(error, effort, by_effort, record, text)
 
 
 def _corrections(by_calls: list[float]) -> int:
@@ -126,3 +168,7 @@ def _corrections(by_calls: list[float]) -> int:
 def _motion_error(position: np.ndarray, truth: Trajectory, frames: np.ndarray) -> SquaredError:
     """Error on NORMAL nodes of `position` [S, N, 3] in these S frames of the truth; or [N, 3] for all."""
     return SquaredError.between(position, truth.position[frames], ~truth.scene.prescribed)
+
+
+def _name(index: int) -> str:
+    return f"valid/{index:06d}"

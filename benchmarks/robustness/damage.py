@@ -37,6 +37,7 @@ from typing import Any
 import ast_sim
 from ast_sim.cli import main as ast_sim_command
 from ast_sim.runs import checkpoint
+from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.metrics import Metrics
 from ast_sim.support.disk import write_json
 from ast_sim.support.progress import Progress
@@ -95,7 +96,7 @@ def prepare(folder: Path) -> None:
     metrics.forget_after(TRAINED)
     best = metrics.best()
     assert best is not None
-    checkpoint.mark_best(run, *best)
+    RunFolder(run).mark_best(best)
 
 
 def damages(folder: Path, flips: int, cuts: int, seed: int) -> Iterator[Damage]:
@@ -166,7 +167,10 @@ class Bench:
         self.expected: dict[str, Results] = {}
         for name in (INFO_DATA, INFO_RUN, EVALUATE, TRAIN):
             first, *others = [self._intact(name) for _ in range(3)]
-            times = {key for other in others for key in first if other[key] != first[key]} | {".commit"}
+            times = {key for other in others for key in first if other[key] != first[key]} | {
+                ".commit",
+                ".origin.commit",
+            }
             self.expected[name] = {key: value for key, value in first.items() if key not in times}
 
     def _intact(self, name: str) -> Results:

@@ -20,6 +20,7 @@ import ast_sim
 from ast_sim.batches.batch_builder import Batch, State
 from ast_sim.dataset.reader import Dataset
 from ast_sim.ops import library
+from ast_sim.runs.folder import RunFolder
 from ast_sim.support.stop_signals import StopSignals
 from ast_sim.training.data_lengths import measure
 from ast_sim.training.defaults_from_data import resolve
@@ -103,7 +104,7 @@ def main() -> None:
         run = stack.enter_context(tempfile.TemporaryDirectory(dir=setup.folder))
         scales = measure(dataset)
         config = resolve(configure(Path(setup.data), setup.preset, setup.settings, setup.model), dataset, scales)
-        training = stack.enter_context(Training(Path(run), config, dataset, scales, StopSignals()))
+        training = stack.enter_context(Training(RunFolder(Path(run)), config, dataset, scales, StopSignals()))
         training.prepare()
         roll = rollout_step(training)
         rolled_out = rolling_out(training)  # decorates what asks for rollout steps

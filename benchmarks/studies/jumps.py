@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 import ast_sim
-from ast_sim.inference.asked_frame import asked_frames
 from ast_sim.inference.effort import MOST_NEWTON_STEPS, Effort, knows_material
+from ast_sim.inference.evaluation.asked_frame import asked_frames
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
@@ -107,17 +107,17 @@ def measured(row: Row, folder: Path) -> dict[str, Any]:
     )  # fmt: skip
     with run.open(data) as dataset:
         found = asked_frames(run.model, dataset, "test", run.effort, row.rivals)
-        known = asked_frames(run.model, dataset, "train", run.effort)["relative_error"]
+        known = asked_frames(run.model, dataset, "train", run.effort).relative_error
         dial = [_turned(run, dataset, effort) for effort in _efforts(run)]
     return {
         **provenance(f"python -m benchmarks.studies.jumps {row.data}"),
         "row": asdict(row),
         "minutes": minutes_per_step(run) * row.steps,
-        "effort": run.effort._asdict(),
+        "effort": asdict(run.effort),
         "curve": validation_curve(run),
         "dial": dial,
         "training_scenes": known,
-        **found,
+        **asdict(found),
     }
 
 
@@ -133,12 +133,12 @@ def _efforts(run: ast_sim.Run) -> list[Effort]:
 def _turned(run: ast_sim.Run, dataset: ast_sim.Dataset, effort: Effort) -> dict[str, Any]:
     """The answers of one setting of the dial to all test scenes."""
     found = asked_frames(run.model, dataset, "test", effort)
-    scenes = {key: [scene[key] for scene in found["scenes"]] for key in ("relative_error", "seconds")}
     return {
-        **effort._asdict(),
-        **scenes,
-        "stress_share": found["stress_share"],
-        "largest_stress": found["largest_stress"],
+        **asdict(effort),
+        "relative_error": [scene.relative_error for scene in found.scenes],
+        "seconds": [scene.seconds for scene in found.scenes],
+        "stress_share": found.stress_share,
+        "largest_stress": found.largest_stress,
     }
 
 
@@ -158,7 +158,7 @@ standard error. "Training scenes" has the error on scenes of the training. "Minu
 of a step, on one thread; other work on the machine made some rows slower, so rows with equal steps differ. An "answer"
 is the median time from the question to positions and stress, for a scene alone, with all that is prepared for its mesh.
 Validation has chosen how many corrections and Newton steps follow the first call of the model in the first table;
-`predict(corrections=, newton_steps=)` chooses them for an answer. The tables below the first are the whole dial: they
+`predict(effort=)` chooses them for an answer. The tables below the first are the whole dial: they
 were timed again, so times differ a little from the first table. The stress error in them is a share of the standard
 deviation of the true stress in the frame: 1 is no better than the mean stress everywhere. Newton steps end when one is
 small; where they do not end, the page says so.
@@ -168,8 +168,8 @@ whichever is fastest. What it prepares for a mesh is counted, too; the meshing i
 stop test. For "cheapest" 13 settings are tried in each scene: the own stop test and looser ones, a longer range of
 contact, meshes of a half and a quarter of the nodes, and 6 or 12 load steps of one Newton step with linearised contact.
 In each scene the fastest counts whose error is at most the answer's; the own stop test always may. Its time divided by
-the answer's time is the ratio of the scene. "Times as long" is the mean of the ratios over the scenes in which the
-solver was run (ten; five pairs of parts), with its standard error.
+the answer's time is the ratio of the scene. Seconds are medians, and "times as long" is the median of the ratios over
+the scenes in which the solver was run (ten; five pairs of parts), with its standard error.
 """
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ast_sim import Run
+from ast_sim.inference.effort import EffortErrors
 from ast_sim.runs.metrics import Metrics
 
 
@@ -19,9 +20,11 @@ def validation_curve(run: Run) -> list[dict[str, float]]:
     minutes = minutes_per_step(run)
     found: dict[int, dict[str, float]] = {}
     for record in Metrics(run.path):
-        errors = np.array(record.get("valid_by_effort") or np.zeros((0, 0)), dtype=float)
-        if np.isfinite(errors).any():
-            model, newton = float(np.nanmin(errors[:, 0])), float(np.nanmin(errors))
+        measured = [EffortErrors.from_json(one) for one in record.get("valid_by_effort", [])]
+        known = [one for one in measured if one.error is not None]
+        if known:
+            model = min(one.error for one in known if not one.effort.newton_steps)
+            newton = min(one.error for one in known)
             step = record["step"]  # a later validation of a step replaces an earlier one
             found[step] = {"step": step, "minutes": minutes * step, "model": model, "newton": newton}
     return list(found.values())

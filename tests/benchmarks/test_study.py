@@ -175,7 +175,7 @@ def test_a_small_study_from_end_to_end(tmp_path):
     assert [point["step"] for point in made["curve"]] == [2, 4]
     assert made["best_valid"] == min(point["valid_rmse"] for point in made["curve"])
     assert made["best_valid"] == min(found["ast"]["search"].values())
-    summary = made["measured"]["summary"]["model"]["displacement"]["rollout_all"]["normal"]["rmse_sequence"]
+    summary = made["measured"]["errors"]["displacement"]["model"]["rollout_all"]["normal"]["rmse_sequence"]
     assert made["measured"]["horizons"] == 3 and made["measured"]["diverged"] == {} and summary > 0
     # Only the run with the best rate is measured.
     folders = tmp_path / "runs/ast"
@@ -323,7 +323,7 @@ def run_of(rollout: float | None, milliseconds: float) -> dict:
         "seed": 0,
         "seconds_per_step": 4e-3 * milliseconds,
         "batch": 4,
-        "measured": {"summary": {"model": {"displacement": summary}}},
+        "measured": {"errors": {"displacement": {"model": summary}}},
     }
 
 

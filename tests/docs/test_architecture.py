@@ -73,11 +73,11 @@ def test_from_a_scene_to_an_answer(run):
         "Motion.of_bodies", "Question", "Simulator.graph", "Carrier", "State", "Batch.build", "Simulator.advance",
     ]  # fmt: skip
     scene, moves = toy.plate(5).scene, {1: (0.0, 0.0, -0.01)}
-    answer = run.predict(scene, moves, num_frames=4, frames=[-1], corrections=2)
+    answer = run.predict(scene, moves, num_frames=4, frames=[-1], effort=ast_sim.Effort(2))
     motion = ast_sim.Motion.of_bodies(scene, moves, 4)
     question = Question("scene", scene, motion.position)
-    graph, there = run.model.graph(scene), question.script[-1]
-    position, prescribed = torch.from_numpy(Carrier(scene)(question.script[0], there)), torch.tensor(there)
+    graph, there = run.model.graph(scene), question.prescribed_position[-1]
+    position, prescribed = torch.from_numpy(Carrier(scene)(scene.rest_position, there)), torch.tensor(there)
     for _ in range(3):
         state = State(position, None, torch.zeros(scene.num_nodes, 1))
         with torch.inference_mode():

@@ -1,7 +1,7 @@
 """The asked frame: relative errors, stress, times, and the solver's ways to the same frame."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -11,8 +11,8 @@ from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import Dataset, generate
 from ast_sim.inference import jump
-from ast_sim.inference.asked_frame import asked_frames, errors_by_effort, lines
-from ast_sim.inference.effort import Effort, cheapest_good, newton_steps
+from ast_sim.inference.effort import Effort, EffortErrors, cheapest_good, mean_errors, newton_steps
+from ast_sim.inference.evaluation.asked_frame import asked_frames, errors_by_effort, lines
 from ast_sim.inference.jump import calls
 from ast_sim.inference.predict import answers
 from ast_sim.inference.question import Question
@@ -48,26 +48,26 @@ def test_errors_are_shares_of_the_displacement(one):
     frame = deepest_frame(truth)
     assert 0 < frame < 6
     model = Share(replace(toy.config(toy.info()), jumps=True), truth, frame, 0.75)
-    scene, *_ = asked_frames(model, one, "test", Effort(2))["scenes"]
+    scene, *_ = asked_frames(model, one, "test", Effort(2)).scenes
     free = ~truth.scene.prescribed
     size = np.sqrt(np.mean(np.square((truth.position[frame] - truth.position[0])[free].astype(float))))
-    assert (scene["name"], scene["frame"], scene["displacement"]) == ("test/000000", frame, pytest.approx(size))
-    assert scene["by_calls"] == pytest.approx([0.25, 0.25**2, 0.25**3], rel=1e-4)
-    assert scene["relative_error"] == pytest.approx(0.25**3, rel=1e-4) and scene["seconds"] > 0
+    assert (scene.name, scene.frame, scene.displacement) == ("test/000000", frame, pytest.approx(size))
+    assert scene.by_calls == pytest.approx([0.25, 0.25**2, 0.25**3], rel=1e-4)
+    assert scene.relative_error == pytest.approx(0.25**3, rel=1e-4) and scene.seconds > 0
     there = truth.stress[frame][truth.scene.deforming("node")].astype(float)
-    assert scene["stress_share"] == pytest.approx(0.25 * np.sqrt(np.mean(there**2)) / there.std(), rel=1e-5)
-    assert scene["largest_stress"] == pytest.approx(0.25, rel=1e-5)
+    assert scene.stress_share == pytest.approx(0.25 * np.sqrt(np.mean(there**2)) / there.std(), rel=1e-5)
+    assert scene.largest_stress == pytest.approx(0.25, rel=1e-5)
 
 
 def test_a_failure_and_a_dataset_without_a_solver_are_told(one):
     truth = one.load("test", 0)
     model = Share(replace(toy.config(toy.info()), jumps=True), truth, 3, float("nan"))
     found = asked_frames(model, one, "test", Effort(1), rival_scenes=1)
-    assert found["relative_error"] is None and lines(found) == ["the deepest frame: every prediction failed"]
+    assert found.relative_error is None and lines(found) == ["the deepest frame: every prediction failed"]
     model.share = 0.5
     found = asked_frames(model, one, "test", Effort(1), rival_scenes=1)
-    assert found["solver"] is None and "the solver was not run:" in lines(found)[-1]
-    json.dumps(found, allow_nan=False)
+    assert found.solver is None and "the solver was not run:" in lines(found)[-1]
+    json.dumps(asdict(found), allow_nan=False)
 
 
 @pytest.fixture(scope="module")
@@ -100,25 +100,25 @@ def test_newton_steps_lead_from_the_answer_to_equilibrium(pressed, monkeypatch):
         == tuple(truth.attributes[key] for key in ("young", "poisson"))
     )
     monkeypatch.setattr(jump, "STILL", 0.0)
-    found = asked_frames(model, pressed, "test", Effort(1, 3))["scenes"][0]
-    errors = found["by_calls"]
+    found = asked_frames(model, pressed, "test", Effort(1, 3)).scenes[0]
+    errors = found.by_calls
     assert errors[:2] == pytest.approx([0.3, 0.09], rel=1e-3)
-    assert errors[2] < 0.4 * errors[1] and errors[-1] < 0.015 and found["relative_error"] == errors[-1]
-    assert found["stress_share"] < 0.05 and found["largest_stress"] < 0.05
+    assert errors[2] < 0.4 * errors[1] and errors[-1] < 0.015 and found.relative_error == errors[-1]
+    assert found.stress_share < 0.05 and found.largest_stress < 0.05
     (answer,) = answers(model, [Question.of(truth, "plate", [frame])], Effort(1, 3))
     held = truth.scene.prescribed
     assert np.array_equal(answer.position[0][held], truth.position[frame][held])
-    table, stress, steps, unsettled = errors_by_effort(model, truth, Effort(1, 3))
-    assert unsettled.tolist() == [[0, 1, 1, 0]] * 2
-    assert (
-        steps.tolist() == [[0, 1, 2, 3]] * 2
-        and stress[1, 3] == pytest.approx(found["stress_share"])
-        and stress[1, 1] > 1.1 * stress[1, 3]
-    )
+    measured = errors_by_effort(model, truth, Effort(1, 3))
+    assert [one.effort for one in measured] == [Effort(c, k) for c in (0, 1) for k in range(4)]
+    assert [one.unsettled for one in measured] == [0, 1, 1, 0] * 2
+    assert [one.steps for one in measured] == [0, 1, 2, 3] * 2
+    assert measured[7].stress_error == pytest.approx(found.stress_share)
+    assert measured[5].stress_error > 1.1 * measured[7].stress_error
+    assert tuple(one.error for one in measured[4:]) == errors[1:] and measured[0].error == errors[0]
     monkeypatch.setattr(NewtonSteps, "step", collapse)
-    assert np.isnan(errors_by_effort(model, truth, Effort(1, 3))[:, :, 1:]).all()
-    assert errors_by_effort(model, truth, Effort(1, 3))[0, :, 0].tolist() == table[:, 0].tolist()
-    assert table.shape == stress.shape == (2, 4) and table[1].tolist() == errors[1:] and table[0, 0] == errors[0]
+    fallen = errors_by_effort(model, truth, Effort(1, 3))
+    assert [one.error for one in fallen] == [errors[0], None, None, None, errors[1], None, None, None]
+    assert [EffortErrors.from_json(json.loads(json.dumps(asdict(one)))) for one in fallen] == fallen
 
 
 def test_newton_steps_that_do_not_end_begin_anew_after_more_corrections(pressed, monkeypatch):
@@ -176,7 +176,9 @@ def test_newton_steps_need_a_material(one, pressed):
     with pytest.raises(ConfigError, match="corrections is 2; it needs a run that jumps"):
         answers(model, question, Effort(2))
     with pytest.raises(ConfigError, match="newton_steps is -1; it must be at least 0"):
-        Effort(0, -1).check(model.config)
+        Effort(0, -1)
+    with pytest.raises(ConfigError, match="corrections is 1.5; it must be a whole number"):
+        Effort(corrections=1.5)
     assert not any(measure(one).recorded.values())
 
 
@@ -208,38 +210,56 @@ def test_newton_steps_end_when_one_is_small(pressed, monkeypatch):
     assert short.converged is False and short.last_steps == (pytest.approx(sizes[0], rel=1e-3),)
     assert answers(model, question, Effort(1))[0].converged is None
     found = asked_frames(model, pressed, "test", Effort(1, 1))
-    assert found["unsettled"] == 1 and "in 1 of 1 scenes the Newton steps did not end" in "\n".join(lines(found))
-    assert asked_frames(model, pressed, "test", Effort(1, 6))["unsettled"] == 0
+    assert found.unsettled == 1 and "in 1 of 1 scenes the Newton steps did not end" in "\n".join(lines(found))
+    assert asked_frames(model, pressed, "test", Effort(1, 6)).unsettled == 0
+
+
+def measured(errors, stresses, steps, unsettled):
+    """What `cheapest_good` takes, from tables by corrections and Newton steps."""
+    return [
+        EffortErrors(Effort(c, k), error, None if stresses is None else stresses[c][k], steps[c][k], unsettled[c][k])
+        for c, row in enumerate(errors)
+        for k, error in enumerate(row)
+    ]
 
 
 def test_the_default_effort_is_the_cheapest_that_is_good():
     errors = np.array([[0.2, 0.1, 0.05, 0.03], [0.1, 0.05, 0.018, 0.01], [0.08, 0.04, 0.012, 0.009]])
     steps = np.array([[0, 1, 2, 3], [0, 1, 1.9, 2.8], [0, 1, 1.7, 1.7]])
-    unknown, ended = np.full((3, 4), np.nan), np.zeros((3, 4))
-    assert cheapest_good(np.stack([errors, unknown, steps, ended])) == Effort(2, 3)  # 3.7 together; 3.8 after one
+    ended = np.zeros((3, 4))
+    assert cheapest_good(measured(errors, None, steps, ended)) == Effort(2, 3)  # 3.7 together; 3.8 after one
     steps[1, 3] = 2.6
-    assert cheapest_good(np.stack([errors, unknown, steps, ended])) == Effort(1, 3)
+    assert cheapest_good(measured(errors, None, steps, ended)) == Effort(1, 3)
     ended[1, 3] = 0.1  # in one scene of ten the steps did not end
-    assert cheapest_good(np.stack([errors, unknown, steps, ended])) == Effort(2, 3)
+    assert cheapest_good(measured(errors, None, steps, ended)) == Effort(2, 3)
     ended[2, 3] = 0.1
-    assert cheapest_good(np.stack([errors, unknown, steps, ended])) == Effort(1, 3)
-    assert cheapest_good(np.stack([errors / 4.5, unknown, steps, ended])) == Effort(2)  # good without Newton steps
-    assert cheapest_good(np.stack([10 * errors, unknown, steps, ended])) == Effort(2, 3)  # the only one nearly the best
-    errors[2] = np.nan
-    assert cheapest_good(np.stack([errors, unknown, steps, ended])) == Effort(1, 3)
-    assert cheapest_good(np.full((4, 3, 4), np.nan)) == Effort()
-    assert cheapest_good(np.stack([errors, unknown, steps, ended])[:, :, :1]) == Effort(1)
+    assert cheapest_good(measured(errors, None, steps, ended)) == Effort(1, 3)
+    assert cheapest_good(measured(errors / 4.5, None, steps, ended)) == Effort(2)  # good without Newton steps
+    assert cheapest_good(measured(10 * errors, None, steps, ended)) == Effort(2, 3)  # the only one nearly the best
+    failed = [[*row] for row in errors[:2]] + [[None] * 4]
+    assert cheapest_good(measured(failed, None, steps, ended)) == Effort(1, 3)
+    assert cheapest_good(measured([[None] * 4] * 3, None, steps, ended)) == Effort()
+    assert cheapest_good(measured(errors[:2, :1], None, steps, ended)) == Effort(1)
 
 
 def test_stress_decides_the_default_effort_too():
-    errors, steps = np.array([[0.015, 0.002], [0.012, 0.001]]), np.array([[0.0, 2.5], [0.0, 2.0]])
+    errors, steps = [[0.015, 0.002], [0.012, 0.001]], [[0.0, 2.5], [0.0, 2.0]]
     stress, ended = np.array([[0.8, 0.3], [0.6, 0.05]]), np.zeros((2, 2))
-    assert cheapest_good(np.stack([errors, stress, steps, ended])) == Effort(1, 1)
-    assert cheapest_good(np.stack([errors, 10 * stress, steps, ended])) == Effort(1, 1)  # none is good: the best
-    stress = np.array([[0.05, 9.0], [9.0, 9.0]])
-    assert cheapest_good(np.stack([errors, stress, steps, ended])) == Effort()
-    errors[0, 0] = 0.1
-    assert cheapest_good(np.stack([errors, stress, steps, ended])) == Effort(1)  # never both
+    assert cheapest_good(measured(errors, stress, steps, ended)) == Effort(1, 1)
+    assert cheapest_good(measured(errors, 10 * stress, steps, ended)) == Effort(1, 1)  # none is good: the best
+    stress = [[0.05, 9.0], [9.0, 9.0]]
+    assert cheapest_good(measured(errors, stress, steps, ended)) == Effort()
+    errors[0][0] = 0.1
+    assert cheapest_good(measured(errors, stress, steps, ended)) == Effort(1)  # never both
+
+
+def test_means_over_scenes_lack_what_one_scene_lacks():
+    one = measured([[0.2, 0.1]], [[0.5, 0.3]], [[0, 2]], [[0, 0]])
+    other = measured([[0.4, None]], [[None, None]], [[0, 1]], [[0, 1]])
+    assert mean_errors([one, other]) == [
+        EffortErrors(Effort(0, 0), pytest.approx(0.3), None, 0, 0),
+        EffortErrors(Effort(0, 1), None, None, 1.5, 0.5),
+    ]
 
 
 def test_beside_the_solver(tmp_path):
@@ -250,11 +270,11 @@ def test_beside_the_solver(tmp_path):
         frame = deepest_frame(truth)
         config = replace(toy.config(dataset.info), jumps=True, stress="node")
         found = asked_frames(Share(config, truth, frame, 0.99), dataset, "test", Effort(), rival_scenes=1)
-    solver = found["scenes"][0]["solver"]
-    assert found["relative_error"] == pytest.approx(0.01, rel=1e-3)
-    assert solver["ways"]["own stop test"]["relative_error"] < 1e-3
-    assert solver["cheapest_seconds"] <= solver["seconds"]
-    assert solver["ways"][solver["cheapest"]]["relative_error"] <= 0.01
-    assert found["solver"]["ratio"] == pytest.approx(solver["seconds"] / found["scenes"][0]["seconds"])
+    solver = found.scenes[0].solver
+    assert found.relative_error == pytest.approx(0.01, rel=1e-3)
+    assert solver.ways["own stop test"].relative_error < 1e-3
+    assert solver.cheapest_seconds <= solver.seconds
+    assert solver.ways[solver.cheapest].relative_error <= 0.01
+    assert found.solver.ratio == pytest.approx(solver.seconds / found.scenes[0].seconds)
     assert any("the solver for this frame" in line for line in lines(found))
-    json.dumps(found, allow_nan=False)
+    json.dumps(asdict(found), allow_nan=False)

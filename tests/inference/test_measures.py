@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from ast_sim.inference.measures import SquaredError, rmse_pooled, rmse_sequence
+from ast_sim.inference.evaluation.measures import SquaredError, rmse_pooled, rmse_sequence
 
 
 def test_squared_error_counts_frames_rows_and_coordinates_of_the_chosen_rows():

@@ -14,7 +14,7 @@ from ast_sim.batches.carry import Carrier
 from ast_sim.batches.pairs import PairSampler
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.effort import Effort
-from ast_sim.inference.evaluation import evaluate, table
+from ast_sim.inference.evaluation.evaluate import evaluate, table
 from ast_sim.inference.jump import calls
 from ast_sim.inference.predict import answers
 from ast_sim.inference.question import Question
@@ -23,7 +23,7 @@ from ast_sim.models.registry import build_model, find_preset, model_names
 from ast_sim.models.simulator import Prediction, Simulator
 from ast_sim.models.transolver import TransolverConfig
 from ast_sim.runs.config_toml import read_config
-from ast_sim.runs.folder import load_model
+from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.scene import Trajectory
 from ast_sim.support.errors import ConfigError, RolloutError
@@ -101,7 +101,7 @@ def test_each_call_corrects_the_answer_of_the_call_before():
         np.testing.assert_allclose(way, 0.01 * (1 - 0.5 ** (call + 1)), rtol=0, atol=1e-7)
         assert np.array_equal(found[call][:, ~free], truth.position[[2, 6]][:, ~free])
     (answer,) = answers(model, [question], Effort(3))
-    assert np.array_equal(answer.position, found[3]) and answer.frames == (2, 6) and answer.given == 0
+    assert np.array_equal(answer.position, found[3]) and answer.frames == (2, 6) and answer.computed.all()
     assert len(answer.stress) == 2 == len(answer.step_seconds) and np.array_equal(stress[0], answer.stress)
 
 
@@ -112,7 +112,19 @@ def test_only_the_wanted_frames_are_computed(monkeypatch):
     (last,) = answers(model, [Question.of(truth, "scene", [-1])], Effort(2))
     assert seen == [["scene frame 6"]] * 3
     (every,) = answers(model, [Question.of(truth, "scene")], Effort(2))
-    assert every.frames == tuple(range(7)) and every.given == 1
+    assert every.frames == tuple(range(7)) and every.computed.tolist() == [False] + [True] * 6
+    (turned,) = answers(model, [Question.of(truth, "scene", [6, 0, 2])], Effort(2))
+    assert turned.frames == (6, 0, 2) and turned.trajectory.numbers == (0, 2, 6)
+    assert np.array_equal(turned.position[1], truth.position[0])
+    np.testing.assert_allclose(turned.position[[0, 2]], every.position[[6, 2]], rtol=0, atol=2e-6)
+    for same in (slice(-2, None), np.array([5, 6]), range(5, 7)):
+        assert Question.of(truth, "scene", same).frames == (5, 6)
+    assert Question.of(truth, "scene", -1).frames == (6,)
+    for wrong in ([1.5], "last", [True], [[1, 2]]):
+        with pytest.raises(ConfigError, match="frames must be whole numbers, one such number, or a slice, not"):
+            Question.of(truth, "scene", wrong)
+    with pytest.raises(ConfigError, match="scene: frame 6 is asked for twice: name each frame once"):
+        Question.of(truth, "scene", [6, -1])
     np.testing.assert_allclose(last.position[0], every.position[6], rtol=0, atol=2e-6)
     for wrong, message in (([7], "has the frames 0 to 6; there is no frame 7"), ([], "name at least one frame")):
         with pytest.raises(RolloutError, match=message):
@@ -167,12 +179,12 @@ def test_a_frame_that_fails_keeps_the_others_before_it():
 
 def test_the_evaluation_says_that_one_step_is_the_rollout(data):
     with Dataset(data) as dataset:
-        found, _ = evaluate(model_of("transolver"), dataset, effort=Effort(1))
-        stepwise, _ = evaluate(model_of("transolver", jumps=False), dataset)
+        found = evaluate(model_of("transolver"), dataset, effort=Effort(1))
+        stepwise = evaluate(model_of("transolver", jumps=False), dataset)
     for quantity in ("displacement", "stress"):
-        errors = found["summary"]["model"][quantity]
-        assert errors["one_step"] == errors["rollout_all"]
-    assert found["jumps"] is True and stepwise["jumps"] is False
+        step, whole = (found.error(quantity, horizon=horizon) for horizon in ("one_step", "rollout_all"))
+        assert (step.rmse_sequence, step.rmse_pooled) == (whole.rmse_sequence, whole.rmse_pooled)
+    assert found.jumps is True and stepwise.jumps is False
     assert "one jump from the first and 1 correction, so" in table(found) and "one jump" not in table(stepwise)
 
 
@@ -180,10 +192,10 @@ def test_a_failed_prediction_has_no_one_step(data):
     model = model_of("ast")
     model.motion_normalizer.scale.fill_(math.nan)
     with Dataset(data) as dataset:
-        found, _ = evaluate(model, dataset)
-    assert found["failures"] == 2
-    assert found["summary"]["model"]["displacement"]["one_step"]["normal"]["rmse_sequence"] is None
-    assert found["summary"]["model"]["stress"]["one_step"]["deforming"]["rmse_sequence"] is None
+        found = evaluate(model, dataset)
+    assert found.failures == 2
+    for quantity in ("displacement", "stress"):
+        assert found.error(quantity, horizon="one_step").rmse_sequence is None
 
 
 @pytest.mark.parametrize("model", ["ast", "transolver"])
@@ -227,8 +239,8 @@ def test_training_brings_the_error_below_holding_still(model, data, tmp_path):
     start_training(tmp_path / "run", configure(data, "tiny", settings, model=model))
     made = read_config(tmp_path / "run")
     assert made.train.noise == 0.0 and made.model.jumps  # a guess has errors of the model's own
-    trained, _, _ = load_model(tmp_path / "run")
+    trained = RunFolder(tmp_path / "run").load_model()
     with Dataset(data) as dataset:
-        errors = evaluate(trained, dataset, effort=Effort(1))[0]["summary"]
-    reached, still = (errors[key]["displacement"]["rollout_all"]["normal"] for key in ("model", "hold_still"))
-    assert reached["rmse_sequence"] < 0.7 * still["rmse_sequence"]
+        found = evaluate(trained, dataset, effort=Effort(1))
+    reached, still = (found.error("displacement", key).rmse_sequence for key in ("model", "hold_still"))
+    assert reached < 0.7 * still

@@ -10,7 +10,7 @@ from toy import one_thread  # noqa: F401
 from ast_sim.models.model_config import DataFacts
 from ast_sim.models.registry import find_model, find_preset
 from ast_sim.runs.config_toml import read_config
-from ast_sim.runs.folder import load_model
+from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.metrics import Metrics
 from ast_sim.training.start import configure, start_training
 
@@ -29,7 +29,8 @@ def test_it_trains_and_is_found_again(tmp_path, name, dynamic):
     lines = list(Metrics(tmp_path / "run"))
     losses = [line["loss"] for line in lines if "loss" in line]
     assert losses[-1] < 0.75 * losses[0], losses
-    model, found, _ = load_model(tmp_path / "run")
+    trained = RunFolder(tmp_path / "run")
+    model, found = trained.load_model(), trained.settings
     assert type(model) is find_model(name).simulator and found == read_config(tmp_path / "run")
     assert found.model.node_inputs == (("velocity",) if dynamic else ("out_of_balance",))
     assert (found.model.hidden, found.model.world_radius) == (16, 0.07)

@@ -17,10 +17,10 @@ from toy import one_thread  # noqa: F401 (used by being imported)
 from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import Graph
 from ast_sim.dataset.reader import Dataset
-from ast_sim.inference.evaluation import evaluate
+from ast_sim.inference.evaluation.evaluate import evaluate
 from ast_sim.models.registry import build_model
 from ast_sim.models.transolver import PRESETS, PhysicsAttention, Transolver, TransolverConfig
-from ast_sim.runs.folder import load_model
+from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.scene import NodeType, Scene
@@ -324,7 +324,8 @@ def test_training_lowers_the_loss(trained):
 
 
 def test_a_trained_run_rolls_out_and_is_evaluated(trained):
-    model, settings, step = load_model(trained[0])
+    trained_run = RunFolder(trained[0])
+    model, settings, step = trained_run.load_model(), trained_run.settings, trained_run.chosen.step
     assert isinstance(model, Transolver) and settings.model.name == "transolver" and step == 80
     assert (
         settings.model.node_inputs == ("displacement", "proximity", "out_of_balance")
@@ -332,12 +333,11 @@ def test_a_trained_run_rolls_out_and_is_evaluated(trained):
     )
     with Dataset(trained[1]) as dataset:
         truths = [dataset.load("test", index) for index in range(2)]
-        found, _ = evaluate(model, dataset, "test")
+        found = evaluate(model, dataset, "test")
     for truth, result in zip(truths, toy.answers(model, truths, ["a", "b"]), strict=True):
         assert result.failure is None and result.position.shape == truth.position.shape
         prescribed = truth.scene.prescribed
         assert np.array_equal(result.position[:, prescribed], truth.position[:, prescribed])
         assert result.stress.shape == truth.stress.shape
-    errors = {key: found["summary"][key]["displacement"]["rollout_all"]["normal"] for key in ("model", "hold_still")}
-    assert errors["model"]["rmse_sequence"] < errors["hold_still"]["rmse_sequence"]
-    assert found["failures"] == 0
+    model, still = (found.error("displacement", key).rmse_sequence for key in ("model", "hold_still"))
+    assert model < still and found.failures == 0

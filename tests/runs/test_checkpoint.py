@@ -94,7 +94,7 @@ def test_the_newest_and_the_best_are_kept(tmp_path):
         if step in (2, 3):
             checkpoint.mark_best(tmp_path, step, 1.0)
     assert steps(tmp_path) == [3, 6, 7]
-    assert checkpoint.best(tmp_path).name == "step-3" and checkpoint.read_best(tmp_path) == (3, 1.0)
+    assert checkpoint.best(tmp_path).name == "step-3" and checkpoint.read_best(tmp_path) == (3, 1.0, {})
     assert checkpoint.latest(tmp_path).name == "step-7"  # by number: step-10 comes after step-9
     save(tmp_path, 10, keep=2)
     assert checkpoint.latest(tmp_path).name == "step-10"

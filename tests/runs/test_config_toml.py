@@ -10,7 +10,7 @@ from toy import one_thread  # noqa: F401 (used by being imported)
 from ast_sim.cli import main
 from ast_sim.runs import checkpoint
 from ast_sim.runs.config_toml import read_config, read_scope
-from ast_sim.runs.folder import load_model
+from ast_sim.runs.folder import RunFolder
 from ast_sim.support.errors import CheckpointError, ConfigError
 from ast_sim.training import start
 
@@ -90,4 +90,4 @@ def test_a_whole_checkpoint_of_another_run_is_refused(trained, run):
         start.start_training(run, resume=True)
     (run / "best").unlink()
     with pytest.raises(CheckpointError, match=r"is of a run with other settings|best"):
-        load_model(run)
+        RunFolder(run).load_model()

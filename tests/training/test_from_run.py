@@ -17,7 +17,7 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.runs import checkpoint
 from ast_sim.runs.config_toml import read_changes, read_config, read_origin
-from ast_sim.runs.folder import load_model
+from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.metrics import Metrics
 from ast_sim.support.errors import CheckpointError, ConfigError
 from ast_sim.training.rates import step_seed
@@ -50,7 +50,8 @@ def started(data, source, out, *assignments):
 
 
 def test_the_first_loss_is_that_of_the_weights_of_the_source(folder, tmp_path):
-    model, settings, _ = load_model(folder / "source")
+    trained = RunFolder(folder / "source")
+    model, settings = trained.load_model(), trained.settings
     run = started(folder / "toy.h5", folder / "source", tmp_path / "run", "train.steps=2", "train.seed=5")
     options = read_config(run).train
     with Dataset(folder / "toy.h5") as data:
@@ -76,7 +77,7 @@ def test_more_steps_lower_the_error(folder, tmp_path):
 def test_normalizers_are_those_of_the_source_on_other_data(folder, tmp_path):
     other = toy.write(tmp_path / "other.h5", counts=(1, 1, 0))
     run = started(other, folder / "source", tmp_path / "run", "train.steps=1")
-    theirs, ours = load_model(folder / "source")[0], load_model(run)[0]
+    theirs, ours = RunFolder(folder / "source").load_model(), RunFolder(run).load_model()
     fixed = [name for name, _ in theirs.named_buffers()]
     assert "motion_normalizer.scale" in fixed
     for name in fixed:
@@ -86,7 +87,7 @@ def test_normalizers_are_those_of_the_source_on_other_data(folder, tmp_path):
 def test_the_run_records_where_its_weights_came_from(folder, tmp_path, capsys):
     words = ["train", folder / "toy.h5", "--out", tmp_path / "run", "--from", folder / "source"]
     assert main([*map(str, words), "--set", "train.steps=2"]) == 0
-    _, _, step = load_model(folder / "source")
+    step = RunFolder(folder / "source").chosen.step
     assert f"starts from {folder / 'source'}, step {step}" in capsys.readouterr().out
     start = read_origin(tmp_path / "run")["start"]
     chosen = folder / "source" / "checkpoints" / f"step-{step}"
@@ -104,7 +105,7 @@ def test_before_its_first_checkpoint_a_run_needs_the_source_as_it_was(folder, tm
     start_training(run, resume=True)
     again = checkpoint.load(checkpoint.latest(run))[0]
     assert all(torch.equal(expected[key], again[key]) for key in expected)
-    _, _, step = load_model(source)
+    step = RunFolder(source).chosen.step
     shutil.rmtree(run / "checkpoints")
     (run / "best").unlink()
     shutil.rmtree(source / "checkpoints" / f"step-{step}")
@@ -115,7 +116,7 @@ def test_before_its_first_checkpoint_a_run_needs_the_source_as_it_was(folder, tm
 def test_a_source_that_was_trained_anew_is_noticed(folder, tmp_path):
     source = shutil.copytree(folder / "source", tmp_path / "source")
     run = started(folder / "toy.h5", source, tmp_path / "run", "train.steps=2")
-    _, _, step = load_model(source)
+    step = RunFolder(source).chosen.step
     shutil.rmtree(source)
     start_training(source, configure(folder / "toy.h5", None, [*SMALL, "train.seed=3"], "mgn"))
     shutil.rmtree(run / "checkpoints")

@@ -18,8 +18,10 @@ from ast_sim.inference.trained_run import Run
 from ast_sim.models.ast.ast_config import ASTConfig
 from ast_sim.models.registry import find_model, find_preset
 from ast_sim.models.transolver import TransolverConfig
-from ast_sim.runs import checkpoint, folder
+from ast_sim.runs import checkpoint
+from ast_sim.runs import folder as run_folder
 from ast_sim.runs.config_toml import has_config, read_config
+from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.scene import NodeType
@@ -38,7 +40,7 @@ SCALES = DataScales(displacement=0.01, increment=0.002, spacing=0.1, nodes=40, t
 def linear(monkeypatch):
     """The linear model in the place of AST."""
     monkeypatch.setattr(loop, "build_model", toy.LinearSimulator)
-    monkeypatch.setattr(folder, "build_model", toy.LinearSimulator)
+    monkeypatch.setattr(run_folder, "build_model", toy.LinearSimulator)
 
 
 @pytest.fixture(scope="module")
@@ -223,7 +225,8 @@ def test_a_dynamic_dataset_is_trained_with_two_given_frames(tmp_path):
     dynamic = toy.write(tmp_path / "dynamic.h5", dynamic=True)
     small = ["model.hidden=16", "model.d_token=16", "model.L_SA=1", "train.steps=3", "train.batch_size=2"]
     start.start_training(tmp_path / "run", start.configure(dynamic, "tiny", ["model.node_inputs=velocity", *small]))
-    model, resolved, _ = folder.load_model(tmp_path / "run")
+    trained = RunFolder(tmp_path / "run")
+    model, resolved = trained.load_model(), trained.settings
     assert model.config.dynamic
     assert resolved.train.noise_gamma == 0.1 and resolved.train.rollout_pool == 32
     record = next(record for record in Metrics(tmp_path / "run") if "valid_rmse" in record)
@@ -249,7 +252,8 @@ def test_training_writes_settings_metrics_and_checkpoints(linear, data, tmp_path
         assert record["loss"] == pytest.approx(record["motion"] + 0.01 * record["stress"])
     assert steps[-1]["loss"] < steps[0]["loss"]
     assert 0 <= steps[0]["clipped_share"] <= 1
-    model, resolved, step = folder.load_model(tmp_path / "run")
+    trained_run = RunFolder(tmp_path / "run")
+    model, resolved, step = trained_run.load_model(), trained_run.settings, trained_run.chosen.step
     best = min(validations, key=lambda record: record["valid_rmse"])
     assert step == best["step"]
     assert not model.training
@@ -263,7 +267,7 @@ def test_training_writes_settings_metrics_and_checkpoints(linear, data, tmp_path
 def test_validation_error_is_that_of_the_rollouts(linear, data, tmp_path):
     start.start_training(tmp_path / "run", settings(data, "train.keep=10"))
     record = next(r for r in Metrics(tmp_path / "run") if "valid_rmse" in r and r["step"] == 20)
-    model, resolved, _ = folder.load_model(tmp_path / "run")
+    model = RunFolder(tmp_path / "run").load_model()
     model.load_state_dict(weights(tmp_path / "run"))
     roots, holds = [], []
     with Dataset(data) as dataset:
@@ -351,7 +355,7 @@ def test_a_failing_validation_rollout_is_recorded_and_training_goes_on(linear, d
     assert [record["valid_rmse"] for record in records] == [None, None]
     assert "valid/000000" in records[0]["failure"]
     assert checkpoint.best(tmp_path / "run") is None
-    assert folder.load_model(tmp_path / "run")[2] == 20
+    assert RunFolder(tmp_path / "run").chosen.step == 20
 
 
 # Resuming and refusing
@@ -387,7 +391,7 @@ def test_resuming_nothing_needs_a_dataset_and_with_one_starts(linear, data, tmp_
     with pytest.raises(TrainingError, match="holds no run to resume"):
         start.start_training(tmp_path / "run", resume=True)
     start.start_training(tmp_path / "run", settings(data, "train.steps=2"), resume=True)
-    assert folder.load_model(tmp_path / "run")[2] == 2
+    assert RunFolder(tmp_path / "run").chosen.step == 2
 
 
 def test_a_damaged_newest_checkpoint_falls_back_and_ends_in_the_same_bits(linear, data, tmp_path):
@@ -431,15 +435,17 @@ def test_jumps_that_are_resumed_end_in_the_same_bits(linear, data, tmp_path, mon
     for ours, theirs in zip(a[:2], b[:2], strict=True):
         assert ours.keys() == theirs.keys() and all(torch.equal(ours[key], theirs[key]) for key in ours)
     assert a[1]["pool.squares"].isfinite().all() and any(key.endswith(".error") for key in a[1])
-    record = [line for line in Metrics(tmp_path / "run") if "corrections" in line][-1]
-    assert len(record["valid_by_calls"]) == 5 and 0 <= record["corrections"] < 5
-    run = Run(tmp_path / "run")
-    validation = Metrics(run.path).validation(run.step)
-    assert run.effort == Effort(validation["corrections"])
-    errors = [row for (row,) in validation["valid_by_effort"]]
+    record = [line for line in Metrics(tmp_path / "run") if "effort" in line][-1]
+    assert len(record["valid_by_calls"]) == 5 and 0 <= record["effort"]["corrections"] < 5
+    (tmp_path / "run" / "metrics.jsonl").unlink()  # the default effort lies beside the checkpoint
+    with pytest.warns(UserWarning, match="its curves are not complete"):
+        run = Run(tmp_path / "run")
+    validation = Metrics(tmp_path / "whole").validation(run.step)
+    assert run.effort == Effort(**validation["effort"])
+    errors = [one["error"] for one in validation["valid_by_effort"]]
     with run.open() as dataset:
         truth = dataset["valid"][0]
-    answers = [run.predict(truth, frames=[-1], corrections=corrections) for corrections in (0, 2, 3)]
+    answers = [run.predict(truth, frames=[-1], effort=Effort(corrections)) for corrections in (0, 2, 3)]
     assert [answer.expected_error for answer in answers] == [errors[0], errors[2], None] and len(errors) == 3
     assert answers[0].trajectory.attributes["expected_error"] == errors[0]
 
@@ -529,7 +535,7 @@ def test_training_needs_training_data(linear, tmp_path):
 def test_without_validation_scenes_the_latest_checkpoint_is_the_model(linear, tmp_path):
     path = toy.write(tmp_path / "toy.h5", counts=(2, 0, 0))
     start.start_training(tmp_path / "run", settings(path))
-    assert folder.load_model(tmp_path / "run")[2] == 20
+    assert RunFolder(tmp_path / "run").chosen.step == 20
     assert not any("valid_rmse" in record for record in Metrics(tmp_path / "run"))
 
 
@@ -553,7 +559,7 @@ def test_metrics_survive_a_line_that_was_cut_off(tmp_path):
 def test_no_damage_of_the_metrics_changes_a_record_or_the_best_in_silence(linear, data, tmp_path):
     run, draw = tmp_path / "run", random.Random(1)
     start.start_training(run, settings(data))
-    intact, step, content = list(Metrics(run)), folder.load_model(run)[2], (run / "metrics.jsonl").read_bytes()
+    intact, step, content = list(Metrics(run)), RunFolder(run).chosen.step, (run / "metrics.jsonl").read_bytes()
     damages = [content[: draw.randrange(len(content) - 1)] for _ in range(30)]
     for _ in range(100):
         place = draw.randrange(len(content))
@@ -563,7 +569,7 @@ def test_no_damage_of_the_metrics_changes_a_record_or_the_best_in_silence(linear
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
             records = list(Metrics(run))
-            assert folder.load_model(run)[2] == step
+            assert RunFolder(run).chosen.step == step
         assert records == intact or any("metrics.jsonl" in str(warning.message) for warning in told)
         assert all(record in intact for record in records)
 
@@ -571,27 +577,27 @@ def test_no_damage_of_the_metrics_changes_a_record_or_the_best_in_silence(linear
 def test_metrics_without_their_last_lines_give_a_warning(linear, data, tmp_path):
     run = tmp_path / "run"
     start.start_training(run, settings(data))
-    assert folder.describe_run(run)["best_validation"]["step"] == 20
+    assert RunFolder(run).describe()["best_validation"]["step"] == 20
     lines = (run / "metrics.jsonl").read_text().splitlines(keepends=True)
     (run / "metrics.jsonl").write_text("".join(lines[:3]))
     with pytest.warns(UserWarning, match=r"metrics.jsonl has lost 3 of 6 lines"):
-        folder.load_model(run)
+        RunFolder(run).load_model()
     with pytest.warns(UserWarning, match="metrics.jsonl has lost the validation after step 20, the best one"):
-        assert folder.describe_run(run)["best_validation"] is None
+        assert RunFolder(run).describe()["best_validation"] is None
 
 
 def test_a_missing_or_damaged_best_is_refused_until_a_resume_writes_it_again(linear, data, tmp_path):
     run = tmp_path / "run"
     start.start_training(run, settings(data))
-    mark, step = (run / "best").read_text(), folder.load_model(run)[2]
+    mark, step = (run / "best").read_text(), RunFolder(run).chosen.step
     (run / "best").write_text(mark.replace(f'"step": {step}', f'"step": {30 - step}'))
     with pytest.raises(CheckpointError, match=r"best: is damaged: remove it, then ast-sim train --resume --out"):
-        folder.load_model(run)
+        RunFolder(run).load_model()
     (run / "best").unlink()
     with pytest.raises(CheckpointError, match=r"best is missing, but validations were recorded: ast-sim train --resu"):
-        folder.load_model(run)
+        RunFolder(run).load_model()
     start.start_training(run, resume=True)
-    assert (run / "best").read_text() == mark and folder.load_model(run)[2] == step
+    assert (run / "best").read_text() == mark and RunFolder(run).chosen.step == step
 
 
 def test_time_to_go_counts_recent_steps_and_validations(monkeypatch):
@@ -640,3 +646,14 @@ def test_a_changed_dataset_is_not_gone_on_with(linear, tmp_path, part):
         start.start_training(tmp_path / "run", resume=True)
     toy.write(path)
     start.start_training(tmp_path / "run", resume=True)
+
+
+def test_a_call_that_fails_leaves_no_folder(data, tmp_path):
+    for path, changes in ((tmp_path / "missing.h5", {}), (data, {"batch_size": 0}), (data, {"stepps": 3})):
+        with pytest.raises((DatasetError, ConfigError)):
+            start.train(path, tmp_path / "deep" / "run", **changes)
+        assert not (tmp_path / "deep").exists()
+    (tmp_path / "kept").mkdir()
+    with pytest.raises(DatasetError, match="there is no such file"):
+        start.train(tmp_path / "missing.h5", tmp_path / "kept" / "run")
+    assert (tmp_path / "kept").is_dir() and not (tmp_path / "kept" / "run").exists()

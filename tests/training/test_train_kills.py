@@ -26,6 +26,9 @@ SMALL = [
 ]  # fmt: skip
 
 
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "AST_SIM_DEBUG": "0"}
+
+
 def command(*arguments, settings=()) -> list[str]:
     assignments = [part for setting in settings for part in ("--set", setting)]
     return [sys.executable, "-m", "ast_sim.cli", "train", *map(str, arguments), *assignments]
@@ -37,7 +40,7 @@ def start(*arguments, settings=(), **options) -> subprocess.Popen:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1", "AST_SIM_DEBUG": "0"},
+        env=ENVIRONMENT,
         **options,
     )
 
@@ -129,6 +132,29 @@ def test_signals_finish_the_step_write_a_checkpoint_and_exit(undisturbed, tmp_pa
     assert f"stopped after step {newest(run)}: go on with --resume" in out
     assert "Traceback" not in error
     assert 0 < newest(run) < STEPS
+    finish(start("--out", run, "--resume"))
+    assert outcome(run) == expected
+
+
+def test_an_interrupt_in_python_is_a_keyboard_interrupt_after_a_checkpoint(undisturbed, tmp_path):
+    """A notebook goes on after Ctrl-C; only the command line turns it into an exit code."""
+    data, expected = undisturbed
+    run = tmp_path / "run"
+    code = f"""
+import ast_sim
+from ast_sim.training.start import configure, start_training
+try:
+    start_training({str(run)!r}, configure({str(data)!r}, "tiny", {SMALL!r}))
+except KeyboardInterrupt as interrupt:
+    print("interrupted:", interrupt, flush=True)
+"""
+    words = [sys.executable, "-c", code]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen(words, env=ENVIRONMENT, **pipes)
+    wait_for_progress(process, run, -1)
+    process.send_signal(signal.SIGINT)
+    out, _ = finish(process, 0)
+    assert out.splitlines()[-1] == "interrupted: stopped by SIGINT" and 0 < newest(run) < STEPS
     finish(start("--out", run, "--resume"))
     assert outcome(run) == expected
 

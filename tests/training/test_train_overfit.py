@@ -5,8 +5,8 @@ import toy
 from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim.dataset.reader import Dataset
-from ast_sim.inference.evaluation import one_step_predictions
-from ast_sim.runs.folder import load_model
+from ast_sim.inference.evaluation.evaluate import one_step_predictions
+from ast_sim.runs.folder import RunFolder
 from ast_sim.training.start import configure, start_training
 
 
@@ -17,7 +17,7 @@ def test_overfitting_one_trajectory_brings_the_one_step_error_below_2_percent_of
         "model.hidden=32", "model.d_token=32", "model.L_SA=2",
     ]  # fmt: skip
     start_training(tmp_path / "run", configure(data, "tiny", settings))
-    model, _, _ = load_model(tmp_path / "run")
+    model = RunFolder(tmp_path / "run").load_model()
     with Dataset(data) as dataset:
         truth = dataset.load("train", 0)
     predicted, stress = one_step_predictions(model, truth, "train/000000")

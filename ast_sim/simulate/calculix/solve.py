@@ -97,6 +97,7 @@ def quasi_static(case: SolidCase, settings: CalculixSettings | None = None) -> T
             output cannot be read. The folder with deck and output is then kept and named.
     """
     settings = settings or CalculixSettings()
+    case, stored = case.followed()
     ccx = find_ccx()
     solver = f"calculix {version(ccx)}"
     best: Trajectory | None = None
@@ -106,7 +107,25 @@ def quasi_static(case: SolidCase, settings: CalculixSettings | None = None) -> T
             best = trajectory
         if best.attributes["status"] == "complete":
             break
-    return replace(best, attributes={**best.attributes, "solver": solver})
+    return _with_frames(replace(best, attributes={**best.attributes, "solver": solver}), stored)
+
+
+def _with_frames(trajectory: Trajectory, stored: list[int]) -> Trajectory:
+    """The trajectory with the frames `stored` only; what was spent on the frames before one of them counts for it."""
+    rows = [row for row in stored if row < trajectory.num_frames]
+    if len(stored) == stored[-1] + 1:
+        return trajectory
+    attributes = dict(trajectory.attributes)
+    for name, values in attributes.items():
+        if isinstance(values, list) and len(values) == trajectory.num_frames:
+            attributes[name] = [values[row] for row in rows]
+            if name in ("solve_seconds", "newton_iterations", "halvings"):
+                attributes[name] = np.diff(np.cumsum(values)[rows], prepend=0).tolist()
+    if "stopped_by" in attributes:
+        attributes["stopped_by"] = f"before frame {len(rows)}: {attributes['stopped_by']}"
+    framed = {key: getattr(trajectory, key) for key in ("position", "stress", "cauchy_stress")}
+    framed = {key: array[rows] for key, array in framed.items() if array is not None}
+    return replace(trajectory, attributes=attributes, **framed)
 
 
 def _attempt(case: SolidCase, ccx: str, increments: Increments, timeout: float) -> Trajectory:

@@ -22,7 +22,7 @@ from ast_sim.mechanics.quasi_static import quasi_static
 from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.mechanics.unfinished import Checkpoint
 from ast_sim.scene import AttributeValue, NodeType, Scene, Trajectory
-from ast_sim.simulate.shapes.cad import MeshingFailed
+from ast_sim.simulate.shapes.cad.gmsh_process import MeshingFailed
 from ast_sim.simulate.shapes.mesh_check import BadMesh
 from ast_sim.simulate.shapes.pairing import HALF_EXTENT, Pair, Unsuitable, put_likewise, put_together
 from ast_sim.simulate.shapes.part_source import Mesher, PartSource, part_source

@@ -5,6 +5,7 @@ Lengths are in the unit of the specification. Forces and energies of a trajector
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -22,12 +23,15 @@ from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
 from ast_sim.simulate.own_assembly.parameters import Values, completed, drawn, told
 from ast_sim.simulate.own_assembly.rest_check import BadAssembly, check
 from ast_sim.simulate.own_assembly.standing import PlacedPart, Reference, case, placed, reference
-from ast_sim.simulate.shapes.cad import MeshingFailed
+from ast_sim.simulate.shapes.cad.gmsh_process import MeshingFailed
 from ast_sim.simulate.shapes.mesh_check import BadMesh
 from ast_sim.support.errors import ConfigError, SimulationError
 
 DRAWS = 10  # draws of the parameters before a sample is given up
 MESHES, NODE_TOLERANCE = 4, 0.1  # so many meshes are made to come this near to a wanted number of nodes
+# Elements are longer by this power of the factor by which nodes are fewer: between those of surfaces and of volumes. It
+# is larger where elements are about as long as the part: its shape then sets the number of nodes.
+USUAL_POWER, LARGEST_POWER = 0.4, 2.0
 LEAST_SHARE = 0.97  # a coarser mesh has at most this share of the nodes, or there is none
 SETTINGS = SolverSettings(force_tolerance=1e-3, max_iterations=200)
 DEFAULT_NODES = None
@@ -105,15 +109,20 @@ def resized(spec: AssemblySpec, values: Values, nodes: int | None, frames: int, 
     return _checked(spec, values, frames, parts, reference(spec))
 
 
-def check_spec(spec: AssemblySpec, nodes: int | None, frames: int) -> None:
+def check_spec(spec: AssemblySpec, nodes: int | None, frames: int, keep: tuple[int, ...] | None = None) -> None:
     """Make, but do not solve, the scene in the middle of all ranges and those at the ends of each range.
+
+    A warning tells each of their notes.
 
     Raises:
         SimulationError, ConfigError: as `scene_of`.
     """
-    shared = reference(spec)
+    shared, notes = reference(spec), {}
     for values in ends_of_ranges(spec):
-        scene_of(spec, values, nodes, frames, shared)
+        case = scene_of(spec, values, nodes, frames, shared).case
+        notes |= dict.fromkeys((case if keep is None else case.keeping(keep)).notes())
+    for note in notes:
+        warnings.warn(note, stacklevel=2)
 
 
 def ends_of_ranges(spec: AssemblySpec) -> Iterator[Values]:
@@ -142,15 +151,20 @@ def in_newton(trajectory: Trajectory, unit: str) -> Trajectory:
 def _sized(spec: AssemblySpec, values: Values, nodes: int | None) -> tuple[float, list[PlacedPart]]:
     """The factor of all element sizes with which the scene has about that many nodes, and the parts."""
     factor, parts = 1.0, placed(spec, values)
-    best = factor, parts
+    best, power = (factor, parts), USUAL_POWER
     for _ in range(MESHES if nodes else 0):
         count = sum(len(part.position) for part in parts)
         if abs(count - nodes) < abs(sum(len(part.position) for part in best[1]) - nodes):
             best = factor, parts
         if abs(count - nodes) <= NODE_TOLERANCE * nodes:
             break
-        factor *= (count / nodes) ** 0.4  # between the powers of surfaces and of volumes
+        change = (count / nodes) ** power
+        factor *= change
         parts = placed(spec, values, factor)
+        fewer = count / sum(len(part.position) for part in parts)
+        power = (
+            float(np.clip(np.log(change) / np.log(fewer), USUAL_POWER, LARGEST_POWER)) if fewer != 1 else LARGEST_POWER
+        )
     return best
 
 

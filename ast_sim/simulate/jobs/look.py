@@ -78,7 +78,7 @@ def _values(case: SolidCase) -> dict[str, float | str]:
 def _lines(spec: AssemblySpec, case: SolidCase) -> Iterator[str]:
     """What a person should check: the nodes of each part, what stands still and what moves, the gaps."""
     scene, unit = case.scene, spec.unit
-    way = np.linalg.norm(case.targets - case.targets[0], axis=2).max(axis=0)
+    way = np.linalg.norm(case.followed()[0].targets - case.targets[0], axis=2).max(axis=0)
     for number, part in enumerate(spec.parts):
         nodes = scene.body == number
         held = nodes & scene.prescribed

@@ -179,7 +179,7 @@ def check_parts(recipe: Recipe) -> None:
     if recipe.spec is not None:
         from ast_sim.simulate.families import assembly
 
-        assembly.check_spec(read_spec(recipe.spec), recipe.nodes, recipe.frames)
+        assembly.check_spec(read_spec(recipe.spec), recipe.nodes, recipe.frames, recipe.keep)
     if recipe.parts is not None:
         _source(recipe.parts).check()
 

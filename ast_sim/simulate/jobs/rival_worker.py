@@ -183,7 +183,7 @@ class WaySolver:
             newton = NewtonSteps(case.scene, case.material, CLEARANCE * contact.dhat, friction)
             setup = process_time() - began
             for share in np.linspace(0, 1, steps + 1)[1:]:
-                target, before = case.targets[0] + share * (case.targets[self.frame] - case.targets[0]), position
+                target, before = case.on_the_way(self.frame, share), position
                 position = newton.step(np.where(held, target, before), stuck=before)
             position = newton.step(position, stuck=before)
         except SimulationError as error:

@@ -17,7 +17,7 @@ import numpy as np
 
 from ast_sim.dataset.layout import SPLITS
 from ast_sim.dataset.solver_seconds import Seconds, split_seconds
-from ast_sim.mechanics.case import Drawn
+from ast_sim.mechanics.case import NEXT_NOTE, NOTES, Drawn
 from ast_sim.mechanics.unfinished import Checkpoint
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.families.names import family_module
@@ -70,7 +70,7 @@ def make_sample(recipe: Recipe, split: str, index: int, checkpoint: Checkpoint |
     module = family_module(recipe.family)
     case = _drawn_assembly(recipe, split, index).case if recipe.spec else _draw(module.draw, recipe, split, index)
     if recipe.keep is not None:
-        case = replace(case, targets=case.targets[[0, *recipe.keep]])
+        case = case.keeping(recipe.keep)
     if recipe.solver == "calculix":
         from ast_sim.simulate.calculix import solve as calculix
 
@@ -80,6 +80,9 @@ def make_sample(recipe: Recipe, split: str, index: int, checkpoint: Checkpoint |
     if recipe.spec is not None:
         trajectory = module.in_newton(trajectory, read_spec(recipe.spec).unit)
     trajectory.attributes.update(seed=recipe.seed, index=index)
+    if recipe.keep is not None or recipe.spec is not None:
+        notes = case.notes()
+        trajectory.attributes.update({NOTES: NEXT_NOTE.join(notes)} if notes else {})
     return trajectory
 
 

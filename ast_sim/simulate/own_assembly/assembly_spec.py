@@ -14,7 +14,9 @@ from ast_sim.simulate.own_assembly.parameters import Parameter, Values
 from ast_sim.simulate.own_assembly.spec_table import Vector
 from ast_sim.support.errors import ConfigError
 
-CAD_ENDINGS = (".step", ".stp")
+STEP_ENDINGS = (".step", ".stp")
+IGES_ENDINGS = (".iges", ".igs")
+CAD_ENDINGS = (*STEP_ENDINGS, *IGES_ENDINGS, ".brep")
 SCRIPT_ENDINGS = (".py", ".geo")
 STL_ENDING = ".stl"
 FUNCTION = "make"  # of a script, if none is named
@@ -72,6 +74,7 @@ class PartSpec:
     Attributes:
         name: its name.
         files: its variants, as they stand in the specification. A script may be followed by `:FUNCTION`.
+        solid: which solid of a file that holds several: its name, or its number from 1; None: the file holds one.
         arguments: what a script is called with.
         scale: lengths of the file are multiplied by this.
         size: length of the elements; None: the mesh or the surface of the file is used as it is.
@@ -85,6 +88,7 @@ class PartSpec:
 
     name: str
     files: tuple[str, ...]
+    solid: str | int | None
     arguments: dict[str, Expression]
     scale: float
     size: Expression | None

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from ast_sim.simulate.own_assembly.spec_reader import RESERVED
 from ast_sim.support.disk import read_text
 from ast_sim.support.errors import ConfigError
 
@@ -24,14 +23,12 @@ def parse_settings(texts: Sequence[str]) -> dict[str, list[Any]]:
     """The parameters and their values; each text is one of `parse_setting`.
 
     Raises:
-        ConfigError: a text has another form, gives a parameter once more, or names an option.
+        ConfigError: a text has another form, or gives a parameter once more.
     """
     found: dict[str, list[Any]] = {}
     for name, values in map(parse_setting, texts):
         if name in found:
             raise ConfigError(f"{name} is given twice: write all its values behind one {name}=")
-        if name in RESERVED:
-            raise ConfigError(f"{name} is no parameter of a specification; where it is an option, write --{name} N")
         found[name] = values
     return found
 

@@ -9,12 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from ast_sim.dataset.layout import LENGTH_UNITS
 from ast_sim.element_topology import MIDDLES, linear_elements
 from ast_sim.importers.mesh_file import read_mesh
-from ast_sim.importers.places import Place
+from ast_sim.importers.places import Place, marked
 from ast_sim.simulate.own_assembly.assembly_spec import (
     CAD_ENDINGS,
+    IGES_ENDINGS,
     SCRIPT_ENDINGS,
+    STEP_ENDINGS,
     STL_ENDING,
     AssemblySpec,
     PartSpec,
@@ -22,15 +25,18 @@ from ast_sim.simulate.own_assembly.assembly_spec import (
 )
 from ast_sim.simulate.own_assembly.expressions import nearest
 from ast_sim.simulate.own_assembly.parameters import Values
-from ast_sim.simulate.shapes.cad import gmsh_version, mesh_own_scale
+from ast_sim.simulate.shapes.cad.gmsh_process import gmsh_version, mesh_own_scale
+from ast_sim.simulate.shapes.cad.stl_file import BadSurface
+from ast_sim.simulate.shapes.cad.surface_mend import Surface, stl_surface, whole_surface
 from ast_sim.simulate.shapes.mesh import second_order, straightened
-from ast_sim.simulate.shapes.mesh_check import BadMesh, check_mesh, check_no_intersections, check_surface, merged
+from ast_sim.simulate.shapes.mesh_check import BadMesh, check_mesh, check_no_intersections, check_surface
 from ast_sim.simulate.shapes.parts import oriented, volumes
 from ast_sim.support.errors import ConfigError, MissingExtra
 
 SMALLEST_ANGLE = 1.0  # degrees between two faces of a tetrahedron: enough for the solver
 MESHES_KEPT = 64
 UNITS = {"m": "M", "cm": "CM", "mm": "MM", "um": "UM", "in": "INCH"}  # gmsh's names
+MILLIMETRE = 1e-3  # what gmsh gives for IGES files, whatever their unit, in metres
 
 _kept: dict[str, PartMesh] = {}
 
@@ -45,6 +51,7 @@ class PartMesh:
         cells: [E,4] or [E,10] tetrahedra of positive volume; [F,3] triangles of a rigid surface.
         groups: numbers of the nodes of each named group.
         fields: [N] values of each point field.
+        notes: what a user should know of it, a sentence each.
     """
 
     name: str
@@ -52,6 +59,7 @@ class PartMesh:
     cells: np.ndarray
     groups: dict[str, np.ndarray] = field(default_factory=dict)
     fields: dict[str, np.ndarray] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def nodes_in(self, places: tuple[Place, ...], key: str) -> np.ndarray:
         """[N] bool: the nodes in any of the places.
@@ -61,7 +69,7 @@ class PartMesh:
         """
         nodes = np.zeros(len(self.position), bool)
         for place in places:
-            inside = place.inside(self.position, lambda name: self._known("field", name, key) != 0, self._group(key))
+            inside = place.inside(self.position, lambda name: marked(self._known("field", name, key)), self._group(key))
             if not inside.any():
                 ends = zip("xyz", self.position.min(axis=0), self.position.max(axis=0), strict=True)
                 box = ", ".join(f"{axis} from {low:.6g} to {high:.6g}" for axis, low, high in ends)
@@ -98,6 +106,10 @@ def part_meshes(spec: AssemblySpec, values: Values, factor: float = 1.0, halved:
     if cad and gmsh_version() is None:
         name = requests[cad[0]]["name"]
         raise MissingExtra(f'gmsh is needed to mesh {name} but is not installed: pip install "ast_sim[cad]"')
+    for place in cad:
+        if "stl" in requests[place] and not spec.parts[place].rigid:
+            surface = _stl(requests[place])
+            check_surface(surface.position, surface.triangles, requests[place]["name"])
     sent = [{key: v for key, v in requests[place].items() if key not in ("scale", "stamp")} for place in cad]
     meshed = dict(zip(cad, mesh_own_scale(sent) if sent else [], strict=True))
     found = {key: _kept[key] for key in keys if key in _kept}
@@ -116,27 +128,29 @@ def _request(spec: AssemblySpec, part: PartSpec, values: Values, factor: float, 
     path = spec.file(file)
     changed = path.stat()
     kind = path.suffix.lower()
+    scale = part.scale * (MILLIMETRE / LENGTH_UNITS[spec.unit] if kind in IGES_ENDINGS else 1.0)
     request: dict[str, Any] = {
         "name": f"{part.name} ({file})",
-        "scale": part.scale,
+        "scale": scale,
         "surface": part.rigid,
         "order": spec.order,
     }
     request["stamp"] = [str(path), changed.st_mtime_ns, changed.st_size]
+    if part.solid is not None:
+        request["solid"] = part.solid
     if part.size is None:
         return request | {"halved": halved and not part.rigid}
-    size = factor * part.size(values) / part.scale
+    size = factor * part.size(values) / scale
     finer = []
     for one in part.finer:
-        box = [corner(values) / part.scale for corner in (*one.low, *one.high)]
-        finer.append({"box": box, "size": factor * one.size(values) / part.scale})
+        box = [corner(values) / scale for corner in (*one.low, *one.high)]
+        finer.append({"box": box, "size": factor * one.size(values) / scale})
     if min([size, *(one["size"] for one in finer)]) <= 0:
         raise ConfigError(f"parts.{part.name}.size: the length of an element must be above 0")
     request |= {"size": size, "finer": finer}
     if kind in CAD_ENDINGS:
-        return request | {"step": str(path), "unit": UNITS[spec.unit]}
+        return request | {"step": str(path)} | ({"unit": UNITS[spec.unit]} if kind in STEP_ENDINGS else {})
     if kind == STL_ENDING:
-        _check_stl(path, request["name"])
         return request | {"stl": str(path)}
     assert kind in SCRIPT_ENDINGS
     request["arguments"] = {name: one(values) for name, one in part.arguments.items()}
@@ -145,23 +159,37 @@ def _request(spec: AssemblySpec, part: PartSpec, values: Values, factor: float, 
     return request | {"geo": str(path)}
 
 
-def _check_stl(path: Path, name: str) -> None:
-    surface = read_mesh(path)
-    check_surface(*merged(surface.points, surface.elements), name)
+def _stl(request: dict[str, Any]) -> Surface:
+    """The surface of an STL file, or of the one of its solids that is asked for.
+
+    Raises:
+        BadMesh: there is no such surface; the text names the part.
+    """
+    try:
+        return stl_surface(Path(request["stamp"][0]), request.get("solid"), whole=request["surface"])
+    except BadSurface as error:
+        raise BadMesh(f"{request['name']}: {error}") from error
 
 
 def _meshed(part: PartSpec, request: dict[str, Any], arrays: dict[str, np.ndarray]) -> PartMesh:
     """What gmsh has meshed."""
     groups = {key.removeprefix("group "): nodes for key, nodes in arrays.items() if key.startswith("group ")}
-    position, cells = part.scale * arrays["position"], arrays["elements"]
-    return _checked(PartMesh(request["name"], position, cells, groups), part.rigid)
+    position, cells = request["scale"] * arrays["position"], arrays["elements"]
+    notes = [f"{request['name']}: {note}" for note in arrays["notes"]]
+    if arrays["factor"] != 1:
+        size = request["scale"] * request["size"]
+        taken = f"elements of the size {arrays['factor'] * size:.4g} instead of {size:.4g}"
+        notes.append(f"{request['name']}: {taken}, with which Gmsh gives no good mesh ({arrays['failure']})")
+    return _checked(PartMesh(request["name"], position, cells, groups, notes=tuple(notes)), part.rigid)
 
 
 def _from_file(part: PartSpec, request: dict[str, Any]) -> PartMesh:
     """A mesh, or a rigid surface, as it stands in its file."""
-    mesh = read_mesh(Path(request["stamp"][0]), curved=True)
+    if Path(request["stamp"][0]).suffix.lower() == STL_ENDING:
+        return _surface_mesh(part, request, _stl(request))
+    mesh = read_mesh(Path(request["stamp"][0]))
     used, elements = np.unique(mesh.elements, return_inverse=True)
-    elements, position = elements.reshape(-1, mesh.elements.shape[1]), part.scale * mesh.points[used]
+    elements, position = elements.reshape(-1, mesh.elements.shape[1]), request["scale"] * mesh.points[used]
     fields = {
         n: np.asarray(v)[used] for n, v in mesh.fields["point"].items() if np.ndim(v) == 1 and v.dtype.kind in "iufb"
     }
@@ -169,13 +197,18 @@ def _from_file(part: PartSpec, request: dict[str, Any]) -> PartMesh:
     if elements.shape[1] == 3:
         if not np.isfinite(position).all():
             raise BadMesh(f"{request['name']}: a corner is not finite")
-        position, elements = merged(position, elements)
-        fields, groups = {}, {}
+        return _surface_mesh(part, request, whole_surface(mesh.points[used][elements]))
     mesh = PartMesh(request["name"], position, elements, groups, fields)
-    if request["halved"]:
-        mesh = _raised(mesh)
-        mesh = replace(mesh, cells=linear_elements(mesh.cells))
-    return _checked(_raised(mesh) if request["order"] == 2 and elements.shape[1] == 4 else mesh, part.rigid)
+    mesh = _raised(mesh) if request["order"] == 2 and elements.shape[1] == 4 else mesh
+    return _checked(_halved(mesh) if request["halved"] else mesh, part.rigid)
+
+
+def _halved(mesh: PartMesh) -> PartMesh:
+    """The same body in elements half as long: each is cut into eight."""
+    second = mesh.cells.shape[1] == 10
+    raised = mesh if second else _raised(mesh)
+    cut = replace(raised, cells=linear_elements(raised.cells))
+    return _raised(cut) if second else cut
 
 
 def _raised(mesh: PartMesh) -> PartMesh:
@@ -191,7 +224,20 @@ def _raised(mesh: PartMesh) -> PartMesh:
 
     inside = {name: np.isin(np.arange(len(mesh.position)), nodes) for name, nodes in mesh.groups.items()}
     groups = {name: np.flatnonzero(carried(nodes)) for name, nodes in inside.items()}
-    return PartMesh(mesh.name, position, cells, groups, {name: carried(values) for name, values in mesh.fields.items()})
+    return PartMesh(
+        mesh.name,
+        position,
+        cells,
+        groups,
+        {name: carried(values) for name, values in mesh.fields.items()},
+        mesh.notes,
+    )
+
+
+def _surface_mesh(part: PartSpec, request: dict[str, Any], surface: Surface) -> PartMesh:
+    notes = tuple(f"{request['name']}: {note}" for note in surface.notes)
+    mesh = PartMesh(request["name"], request["scale"] * surface.position, surface.triangles, notes=notes)
+    return _checked(mesh, part.rigid)
 
 
 def _checked(mesh: PartMesh, rigid: bool) -> PartMesh:
@@ -213,4 +259,4 @@ def _checked(mesh: PartMesh, rigid: bool) -> PartMesh:
             cells = oriented(position, cells)
         position = straightened(position, cells) if cells.shape[1] == 10 else position
     check_mesh(position, cells, mesh.name, SMALLEST_ANGLE)
-    return PartMesh(mesh.name, position, cells, mesh.groups, mesh.fields)
+    return PartMesh(mesh.name, position, cells, mesh.groups, mesh.fields, mesh.notes)

@@ -28,20 +28,6 @@ from ast_sim.support.errors import ConfigError
 
 DEFAULT_FRAMES = 6
 DEFAULT_ORDER = 2  # linear tetrahedra are several times too stiff where a part bends, and where rubber is pressed
-# Names of arguments of `Run.predict` and `Run.sweep`, which a parameter cannot have.
-RESERVED = (
-    "scene",
-    "motion",
-    "spec",
-    "table",
-    "nodes",
-    "frames",
-    "corrections",
-    "newton_steps",
-    "num_frames",
-    "stress",
-    "name",
-)
 
 
 def read_spec(path: str | os.PathLike[str]) -> AssemblySpec:
@@ -76,7 +62,7 @@ def _spec(path: Path, text: str, table: Table) -> AssemblySpec:
     named = Table(table.take("parameters", {}), "parameters")
     parameters: dict[str, Parameter] = {}
     for name in named.values:
-        if not name.isidentifier() or name in (*FUNCTIONS, *RESERVED):
+        if not name.isidentifier() or name in FUNCTIONS:
             raise ConfigError(f"the parameter {name!r} needs another name, of letters, digits and _")
         parameters[name] = parameter(name, named.take(name))
     if "friction" in parameters and "friction" in table.values:
@@ -133,6 +119,7 @@ def _part(name: str, values: Any, free: dict[str, Parameter], parameters: dict[s
     part = PartSpec(
         name,
         tuple(files),
+        _solid(table),
         {key: expression for key in arguments.values if (expression := arguments.number(key)) is not None},
         float(scale),
         table.number("size"),
@@ -145,6 +132,13 @@ def _part(name: str, values: Any, free: dict[str, Parameter], parameters: dict[s
     )
     table.done()
     return part
+
+
+def _solid(table: Table) -> str | int | None:
+    solid = table.take("solid")
+    if solid is not None and (isinstance(solid, bool) or not isinstance(solid, str | int)):
+        raise ConfigError(f"{table.key('solid')} is {solid!r}; must be the name of a solid, or its number from 1")
+    return solid
 
 
 def _add_material(parameters: dict[str, Parameter], name: str, given: Any, free: dict[str, Parameter]) -> None:
@@ -240,7 +234,7 @@ def _check_files(spec: AssemblySpec) -> None:
             path = spec.file(name)
             suffix = path.suffix.lower()
             if suffix not in known:
-                raise ConfigError(f"parts.{part.name}.file: {name} is no STEP, STL, mesh, .geo or .py file")
+                raise ConfigError(f"parts.{part.name}.file: {name} is no STEP, IGES, BREP, STL, mesh, .geo or .py file")
             if not path.is_file():
                 raise ConfigError(f"parts.{part.name}.file: there is no file {path}")
             meshed = suffix in (*CAD_ENDINGS, *SCRIPT_ENDINGS, STL_ENDING)
@@ -248,6 +242,8 @@ def _check_files(spec: AssemblySpec) -> None:
                 raise ConfigError(f"parts.{part.name}.size is missing; {name} must be meshed: give the element length")
             if not meshed and part.size is not None:
                 raise ConfigError(f"parts.{part.name}.size: {name} is a mesh already, and stays as it is: leave it out")
+            if part.solid is not None and suffix not in (*CAD_ENDINGS, STL_ENDING):
+                raise ConfigError(f"parts.{part.name}.solid: {name} is no CAD or STL file: leave it out")
             if part.arguments and suffix not in SCRIPT_ENDINGS:
                 raise ConfigError(f"parts.{part.name}.arguments: {name} is no script (.py, .geo) that takes any")
 

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ast_sim.importers.shells import find_shells
-from ast_sim.mechanics.case import SolidCase
+from ast_sim.mechanics.case import NEXT_NOTE, NOTES, SolidCase
 from ast_sim.mechanics.contact_and_friction import ContactSettings
 from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.motion_course import Course, MovedNodes
 from ast_sim.scene import AttributeValue, NodeType, Scene
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec, PartSpec
 from ast_sim.simulate.own_assembly.parameters import Values, completed
@@ -50,12 +51,14 @@ class PlacedPart:
         position: [N,3] float64, in the assembly.
         cells: [E,4] or [E,10] tetrahedra, [F,3] triangles of a rigid surface.
         moves: [N] 0 for nodes that stand still, k + 1 for those of the k-th move, -1 for free nodes.
+        notes: what a user should know of it, a sentence each.
     """
 
     part: PartSpec
     position: np.ndarray
     cells: np.ndarray
     moves: np.ndarray
+    notes: tuple[str, ...]
 
 
 def reference(spec: AssemblySpec) -> Reference:
@@ -92,7 +95,7 @@ def placed(spec: AssemblySpec, values: Values, factor: float = 1.0, halved: bool
 def _placed(part: PartSpec, mesh: PartMesh, values: Values) -> PlacedPart:
     position = part.placement.motion(values).at(1.0, mesh.position)
     if part.rigid:
-        return PlacedPart(part, position, mesh.cells, np.full(len(position), len(part.moves)))
+        return PlacedPart(part, position, mesh.cells, np.full(len(position), len(part.moves)), mesh.notes)
     moves = np.full(len(position), -1)
     regions = [(f"parts.{part.name}.fixed", part.fixed), *((move.key, move.places) for move in part.moves)]
     for number, (key, places) in enumerate(regions):
@@ -104,7 +107,7 @@ def _placed(part: PartSpec, mesh: PartMesh, values: Values) -> PlacedPart:
                 f"{key}: {twice.sum()} of its nodes are also in {other}, the first at {point(mesh.position[twice][0])}"
             )
         moves[nodes] = number
-    return PlacedPart(part, position, mesh.cells, moves)
+    return PlacedPart(part, position, mesh.cells, moves, mesh.notes)
 
 
 def case(spec: AssemblySpec, values: Values, frames: int, parts: list[PlacedPart], shared: Reference) -> SolidCase:
@@ -130,24 +133,23 @@ def case(spec: AssemblySpec, values: Values, frames: int, parts: list[PlacedPart
     )
     law = material[:, :2].astype(np.float64)
     law[law[:, 0] == 0] = law[np.argmax(law[:, 0] > 0)]  # what rigid elements have is ignored, but must be constants
-    targets = _targets(scene, parts, values, frames, np.array(shared.origin))
+    course = _course(scene, parts, values, frames, np.array(shared.origin))
     attributes: dict[str, AttributeValue] = {f"parameter {name}": value for name, value in values.items()}
     attributes["origin"] = list(shared.origin)
-    return SolidCase(scene, targets, NeoHookean(*law.T), contact, "node", attributes)
+    notes = dict.fromkeys(note for part in parts for note in part.notes)
+    attributes |= {NOTES: NEXT_NOTE.join(notes)} if notes else {}
+    return SolidCase(scene, course.position, NeoHookean(*law.T), contact, "node", attributes, course)
 
 
-def _targets(scene: Scene, parts: list[PlacedPart], values: Values, frames: int, origin: np.ndarray) -> np.ndarray:
-    """[S,N,3] where the prescribed nodes are; free nodes stay at rest."""
-    rest = scene.rest_position.astype(np.float64)
-    targets = np.repeat(rest[None], frames, axis=0)
+def _course(scene: Scene, parts: list[PlacedPart], values: Values, frames: int, origin: np.ndarray) -> Course:
+    """How the prescribed nodes move; free nodes stay at rest."""
+    rest, moved = scene.rest_position.astype(np.float64), []
     for number, part in enumerate(parts):
         of_body = np.flatnonzero(scene.body == number)
-        for move, moved in enumerate(part.part.moves):
-            motion = moved.motion(values)
+        for move, one in enumerate(part.part.moves):
             nodes = of_body[part.moves == move + 1]
-            for frame in range(1, frames):
-                targets[frame, nodes] = motion.at(frame / (frames - 1), rest[nodes] + origin) - origin
-    return targets
+            moved.append(MovedNodes(nodes, rest[nodes], one.motion(values), origin, one.key))
+    return Course.of(rest, scene.prescribed, tuple(moved), frames)
 
 
 def _contact(spec: AssemblySpec, values: Values, shared: Reference) -> ContactSettings:
@@ -197,7 +199,7 @@ def _layered(part: PlacedPart, deforming: list[PlacedPart], order: int) -> Place
     position = np.concatenate([part.position, behind])
     if order == 2:
         position, tetrahedra = second_order(position, tetrahedra)
-    return PlacedPart(part.part, position, tetrahedra, np.full(len(position), part.moves[0]))
+    return PlacedPart(part.part, position, tetrahedra, np.full(len(position), part.moves[0]), part.notes)
 
 
 def point(x: np.ndarray) -> str:

@@ -5,8 +5,6 @@ Legend: N nodes, E tetrahedra, F triangles; lengths in the units of the part.
 
 from __future__ import annotations
 
-from itertools import combinations
-
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -14,7 +12,8 @@ from scipy.spatial import cKDTree
 
 from ast_sim.element_topology import FACE_TRIANGLES, LOCAL_FACES
 from ast_sim.mechanics.contact_and_friction import load_ipctk
-from ast_sim.simulate.shapes.parts import volumes
+from ast_sim.simulate.shapes.cad.surface_mend import Surface, solids_of
+from ast_sim.simulate.shapes.parts import smallest_dihedral, volumes
 from ast_sim.support.errors import SimulationError
 
 SMALLEST_ANGLE = 5.0  # degrees between two faces of a tetrahedron
@@ -73,7 +72,7 @@ def check_surface(position: np.ndarray, triangles: np.ndarray, name: str) -> Non
 
     Raises:
         BadMesh: the text names the part, what is wrong and where: no triangles, numbers that are not finite, edges of
-            one triangle or of more than two, several pieces, no volume, or triangles that cut one another.
+            one triangle or of more than two, several solids, no volume, or triangles that cut one another.
     """
     if len(triangles) == 0:
         raise BadMesh(f"{name}: it holds no triangles")
@@ -90,9 +89,8 @@ def check_surface(position: np.ndarray, triangles: np.ndarray, name: str) -> Non
             a, b = position[edges[np.argmax(wrong)]]
             text = what.format(_count(wrong, "edge", "edges"))
             raise BadMesh(f"{name}: {text}, the first from {_point(a)} to {_point(b)}")
-    links = coo_array((np.ones(len(edges)), edges.T), shape=(len(position), len(position)))
-    pieces = connected_components(links, directed=False)[1][triangles[:, 0]]
-    _check_pieces(pieces, position[triangles].mean(axis=1), name, "closed by itself")
+    solids = solids_of(Surface(position, triangles))
+    _check_pieces(solids, position[triangles].mean(axis=1), name, "closed by itself")
     a, b, c = np.moveaxis(position[triangles] - position[triangles[0, 0]], 1, 0)
     _check_volume(abs(np.einsum("ij,ij->", a, np.cross(b, c))) / 6, _diagonal(position), name)
     check_no_intersections(position, triangles, name)
@@ -131,27 +129,6 @@ def boundary(elements: np.ndarray) -> np.ndarray:
     owner, face = np.divmod(np.sort(first[count == 1]), 4)
     local = np.array(FACE_TRIANGLES[elements.shape[1]])[face]
     return np.take_along_axis(elements[owner][:, None, :], local, axis=2).reshape(-1, 3)
-
-
-def smallest_dihedral(position: np.ndarray, elements: np.ndarray) -> np.ndarray:
-    """Smallest angle [E] between two faces of each tetrahedron, in degrees."""
-    corners = position[elements]
-    normals = []
-    for face in LOCAL_FACES:
-        a, b, c = (corners[:, i] for i in face)
-        normal = np.cross(b - a, c - a)
-        normals.append(normal / np.linalg.norm(normal, axis=1, keepdims=True))
-    cosine = np.max([-np.einsum("ei,ei->e", m, n) for m, n in combinations(normals, 2)], axis=0)
-    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-
-
-def merged(position: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Merge corners that lie at one place: the positions [N,3] that remain, and the triangles [F,3] over them."""
-    pairs = cKDTree(position).query_pairs(1e-7 * _diagonal(position), output_type="ndarray")
-    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(position), len(position)))
-    _, label = connected_components(links, directed=False)
-    _, first = np.unique(label, return_index=True)
-    return position[first], label[triangles]
 
 
 def _check_points(position: np.ndarray, name: str, what: str) -> None:

@@ -12,8 +12,10 @@ from typing import Any, Protocol
 import meshio
 import numpy as np
 
-from ast_sim.simulate.shapes import cad
-from ast_sim.simulate.shapes.mesh_check import SMALLEST_ANGLE, BadMesh, check_mesh, check_surface, merged
+from ast_sim.simulate.shapes.cad import gmsh_process, grammar
+from ast_sim.simulate.shapes.cad.stl_file import BadSurface
+from ast_sim.simulate.shapes.cad.surface_mend import stl_surface
+from ast_sim.simulate.shapes.mesh_check import SMALLEST_ANGLE, BadMesh, check_mesh, check_surface
 from ast_sim.simulate.shapes.parts import Part, draw_structured, oriented, volumes
 from ast_sim.support.errors import MissingExtra, SimulationError
 
@@ -64,13 +66,13 @@ def part_source(parts: Path | None = None) -> PartSource:
     """
     if parts is not None:
         return FileParts(_files(Path(parts)))
-    version = cad.gmsh_version()
+    version = gmsh_process.gmsh_version()
     return StructuredParts() if version is None else GrammarParts(version)
 
 
 @dataclass(frozen=True)
 class GrammarParts:
-    """Solids of the grammar in `ast_sim.simulate.shapes.cad`."""
+    """Solids of the grammar in `ast_sim.simulate.shapes.cad.grammar`."""
 
     version: str
 
@@ -85,10 +87,10 @@ class GrammarParts:
         """Nothing to check: each part is checked when it is drawn."""
 
     def draw(self, rng: np.random.Generator) -> Mesher:
-        (name_a, steps_a), (name_b, steps_b) = cad.draw_solid(rng), cad.draw_solid(rng)
+        (name_a, steps_a), (name_b, steps_b) = grammar.draw_solid(rng), grammar.draw_solid(rng)
         requests, names = [{"solid": steps_a}, {"solid": steps_b}], [name_a, name_b]
         return lambda nodes, smallest_angle=SMALLEST_ANGLE: _checked(
-            cad.mesh_parts(requests, names, nodes), smallest_angle
+            gmsh_process.mesh_parts(requests, names, nodes), smallest_angle
         )
 
 
@@ -117,7 +119,7 @@ class FileParts:
 
     @property
     def mesher(self) -> str:
-        return f"gmsh {cad.gmsh_version()}" if any(map(_is_cad, self.files)) else "none"
+        return f"gmsh {gmsh_process.gmsh_version()}" if any(map(_is_cad, self.files)) else "none"
 
     def describe(self) -> dict[str, Any]:
         return {"mesher": self.mesher, "parts": {path.name: _sha256(path) for path in self.files}}
@@ -153,7 +155,7 @@ def _files(path: Path) -> tuple[Path, ...]:
     for file in files:
         if file.suffix.lower() not in readable:
             raise SimulationError(f"{file} is no STEP, STL or mesh file: meshio does not know its ending")
-        if _is_cad(file) and cad.gmsh_version() is None:
+        if _is_cad(file) and gmsh_process.gmsh_version() is None:
             raise MissingExtra(f'gmsh is needed to mesh {file.name} but is not installed: pip install "ast_sim[cad]"')
     return tuple(files)
 
@@ -182,9 +184,9 @@ def _load(paths: list[Path], nodes: int) -> list[Part]:
         requests = [_request(paths[i]) for i in solids]
         names = [paths[i].name for i in solids]
         try:
-            meshed = cad.mesh_parts(requests, names, max(left, nodes // 2))
-        except cad.MeshingFailed as error:
-            raise cad.MeshingFailed(f"{' or '.join(dict.fromkeys(names))}: {error}") from error
+            meshed = gmsh_process.mesh_parts(requests, names, max(left, nodes // 2))
+        except gmsh_process.MeshingFailed as error:
+            raise gmsh_process.MeshingFailed(f"{' or '.join(dict.fromkeys(names))}: {error}") from error
         parts |= dict(zip(solids, meshed, strict=True))
     return [parts[i] for i in range(len(paths))]
 
@@ -192,12 +194,11 @@ def _load(paths: list[Path], nodes: int) -> list[Part]:
 def _request(path: Path) -> dict[str, str]:
     if path.suffix.lower() in STEP_ENDINGS:
         return {"step": str(path.resolve())}
-    surface = _read(path)
-    triangles = surface.cells_dict.get("triangle", np.zeros((0, 3), int))
-    position, triangles = np.asarray(surface.points, float), np.asarray(triangles, int)
-    if np.isfinite(position).all() and len(triangles):
-        position, triangles = merged(position, triangles)
-    check_surface(position, triangles, path.name)
+    try:
+        surface = stl_surface(path)
+    except BadSurface as error:
+        raise BadMesh(f"{path.name}: {error}") from error
+    check_surface(surface.position, surface.triangles, path.name)
     return {"stl": str(path.resolve())}
 
 

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
+from ast_sim.element_topology import LOCAL_FACES
 from ast_sim.mechanics.elements.second_order import points_at_rest
 from ast_sim.simulate.shapes.mesh import hexahedral_grid
 
@@ -46,6 +48,20 @@ def oriented(position: np.ndarray, elements: np.ndarray) -> np.ndarray:
     """The tetrahedra [E,4] or [E,10]; where the volume is negative, two corners are swapped, and so are the middles."""
     swapped = elements[:, [0, 2, 1, 3, 6, 5, 4, 7, 9, 8][: elements.shape[1]]]
     return np.where((volumes(position, elements) < 0)[:, None], swapped, elements)
+
+
+def smallest_dihedral(position: np.ndarray, elements: np.ndarray) -> np.ndarray:
+    """Smallest angle [E] between two faces of each tetrahedron, in degrees; 0 if a face has no area."""
+    corners = position[elements]
+    normals, flat = [], np.zeros(len(elements), bool)
+    for face in LOCAL_FACES:
+        a, b, c = (corners[:, i] for i in face)
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        flat |= length[:, 0] == 0
+        normals.append(normal / np.where(length == 0, 1, length))
+    cosine = np.max([-np.einsum("ei,ei->e", m, n) for m, n in combinations(normals, 2)], axis=0)
+    return np.where(flat, 0, np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
 def draw_structured(rng: np.random.Generator) -> Callable[[int], Part]:

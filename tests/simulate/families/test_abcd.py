@@ -7,7 +7,7 @@ from ast_sim.mechanics.contact_and_friction import Contact
 from ast_sim.mechanics.elements.elasticity import Elasticity
 from ast_sim.scene import NodeType
 from ast_sim.simulate.families import abcd, abcd_xl
-from ast_sim.simulate.shapes.cad import MeshingFailed
+from ast_sim.simulate.shapes.cad.gmsh_process import MeshingFailed
 from ast_sim.simulate.shapes.mesh_check import boundary
 from ast_sim.simulate.shapes.pairing import LEAST_OVERLAP, Unsuitable, put_together, shadow_cells, turned
 from ast_sim.simulate.shapes.part_source import StructuredParts, part_source

@@ -7,7 +7,7 @@ import meshio
 import numpy as np
 import pytest
 
-from ast_sim.simulate.shapes import cad
+from ast_sim.simulate.shapes.cad import gmsh_process, grammar
 from ast_sim.simulate.shapes.mesh_check import BadMesh, check_mesh
 from ast_sim.simulate.shapes.part_source import GrammarParts, StructuredParts, part_source, read_mesh
 from ast_sim.simulate.shapes.parts import rectilinear, volumes
@@ -64,7 +64,7 @@ def refusal(path) -> str:
 
 def test_a_solid_has_its_volume_and_its_number_of_nodes():
     for nodes in (400, 2000):
-        a, b = cad.mesh_parts([HOLED, HOLED], ["a", "b"], nodes)
+        a, b = gmsh_process.mesh_parts([HOLED, HOLED], ["a", "b"], nodes)
         check_mesh(a.position, a.elements, "a")
         assert len(a.position) + len(b.position) == pytest.approx(nodes, rel=0.2)
         assert volumes(a.position, a.elements).sum() == pytest.approx(0.4 - np.pi * 0.04 * 0.5, rel=0.02)
@@ -72,7 +72,7 @@ def test_a_solid_has_its_volume_and_its_number_of_nodes():
 
 
 def test_the_same_request_gives_the_same_mesh():
-    first, second = (cad.mesh_parts([HOLED], ["holed"], 500)[0] for _ in range(2))
+    first, second = (gmsh_process.mesh_parts([HOLED], ["holed"], 500)[0] for _ in range(2))
     assert np.array_equal(first.position, second.position) and np.array_equal(first.elements, second.elements)
 
 
@@ -88,31 +88,31 @@ SetFactory("OpenCASCADE");
 DefineConstant[ height = 2 ];
 Box(1) = {0, 0, 0, 1, 1, height};
 """)
-    part = {"size": 0.5, "finer": [], "arguments": {}}
+    part = {"size": 0.5, "finer": [], "order": 1, "arguments": {}}
     ball = {**part, "name": "ball", "script": str(tmp_path / "ball.py"), "function": "make"}
     bar = {**part, "name": "bar", "geo": str(tmp_path / "bar.geo")}
-    *_, after = cad.mesh_own_scale([ball, {**bar, "name": "low", "arguments": {"height": 0.7}}, bar])
-    (alone,) = cad.mesh_own_scale([bar])
+    *_, after = gmsh_process.mesh_own_scale([ball, {**bar, "name": "low", "arguments": {"height": 0.7}}, bar])
+    (alone,) = gmsh_process.mesh_own_scale([bar])
     assert np.ptp(alone["position"], axis=0) == pytest.approx([1, 1, 2])
     assert np.array_equal(after["position"], alone["position"]) and np.array_equal(after["elements"], alone["elements"])
 
 
 def test_the_settings_of_the_user_of_gmsh_do_not_matter(tmp_path, monkeypatch):
     """Whoever saves options in the window of Gmsh has a file of them at home."""
-    (before,) = cad.mesh_parts([HOLED], ["holed"], 300)
+    (before,) = gmsh_process.mesh_parts([HOLED], ["holed"], 300)
     (tmp_path / ".gmsh-options").write_text("Mesh.ElementOrder = 2;\nMesh.Algorithm3D = 10;\n")
     monkeypatch.setenv("HOME", str(tmp_path))
-    (after,) = cad.mesh_parts([HOLED], ["holed"], 300)
+    (after,) = gmsh_process.mesh_parts([HOLED], ["holed"], 300)
     assert np.array_equal(before.position, after.position) and np.array_equal(before.elements, after.elements)
 
 
 def test_every_solid_of_the_grammar_can_be_meshed():
     rng, names, steps = np.random.default_rng(5), [], []
-    while set(names) != set(cad._SOLIDS) or len(names) < 18:
-        name, solid = cad.draw_solid(rng)
+    while set(names) != set(grammar._SOLIDS) or len(names) < 18:
+        name, solid = grammar.draw_solid(rng)
         names.append(name)
         steps.append({"solid": solid})
-    parts = cad.mesh_parts(steps, names, 500 * len(names))
+    parts = gmsh_process.mesh_parts(steps, names, 500 * len(names))
     assert sum(len(part.position) for part in parts) == pytest.approx(500 * len(names), rel=0.2)
     for part in parts:
         check_mesh(part.position, part.elements, part.name)
@@ -120,7 +120,7 @@ def test_every_solid_of_the_grammar_can_be_meshed():
 
 
 def test_the_grammar_draws_the_same_from_the_same_seed():
-    drawn = [cad.draw_solid(np.random.default_rng(seed)) for seed in (1, 1, 2)]
+    drawn = [grammar.draw_solid(np.random.default_rng(seed)) for seed in (1, 1, 2)]
     assert drawn[0] == drawn[1] != drawn[2]
 
 
@@ -131,7 +131,7 @@ def test_pairs_come_from_the_grammar_if_gmsh_is_there_and_from_structured_parts_
     again = source.draw(np.random.default_rng(0))(600)
     assert sum(len(part.position) for part in pair) == pytest.approx(600, rel=0.2)
     assert all(np.array_equal(x.position, y.position) for x, y in zip(pair, again, strict=True))
-    monkeypatch.setattr(cad, "gmsh_version", lambda: None)
+    monkeypatch.setattr(gmsh_process, "gmsh_version", lambda: None)
     source = part_source()
     assert isinstance(source, StructuredParts) and source.describe() == {"mesher": "structured"}
     assert all(part.name.startswith("structured") for part in source.draw(np.random.default_rng(0))(600))
@@ -248,7 +248,7 @@ def test_paths_that_hold_no_parts(tmp_path):
 
 
 def test_without_gmsh_cad_files_name_the_extra_and_mesh_files_work(files, monkeypatch):
-    monkeypatch.setattr(cad, "gmsh_version", lambda: None)
+    monkeypatch.setattr(gmsh_process, "gmsh_version", lambda: None)
     with pytest.raises(MissingExtra, match=r"holed.step .* pip install \"ast_sim\[cad\]\""):
         part_source(files["step"])
     part_source(files["msh"]).check()
@@ -256,18 +256,19 @@ def test_without_gmsh_cad_files_name_the_extra_and_mesh_files_work(files, monkey
 
 def test_a_crash_and_a_hang_of_gmsh_are_told(monkeypatch):
     def failure(code: str, seconds: int = 60, again: bool = True) -> str:
-        monkeypatch.setattr(cad, "WORKER", [sys.executable, "-c", code])
+        monkeypatch.setattr(gmsh_process, "WORKER", [sys.executable, "-c", code])
         with pytest.raises(SimulationError) as caught:
-            cad.mesh_parts([HOLED], ["holed"], 500, seconds)
-        assert isinstance(caught.value, cad.MeshingFailed) == again  # only what would happen again is drawn anew
+            gmsh_process.mesh_parts([HOLED], ["holed"], 500, seconds)
+        # Only what would happen again is drawn anew.
+        assert isinstance(caught.value, gmsh_process.MeshingFailed) == again
         return str(caught.value)
 
     assert failure("import os; os.kill(os.getpid(), 11)") == "gmsh crashed (SIGSEGV): no message"
-    spin = "import ast_sim.simulate.shapes.cad_worker as w; w._load = lambda *_: exec('while True: pass'); w.main()"
+    spin = "import ast_sim.simulate.shapes.cad.cad_worker as w; w._load = lambda *_: exec('while True: pass'); w.main()"
     assert failure(spin, 2) == "gmsh did not finish within 2 s of processor time and was stopped"
     killed = failure("import os; os.kill(os.getpid(), 9)", again=False)
     assert killed == "gmsh was killed by SIGKILL, perhaps because memory ran out: use fewer workers or nodes"
-    monkeypatch.setattr(cad, "PATIENCE", 1)
+    monkeypatch.setattr(gmsh_process, "PATIENCE", 1)
     assert failure("import time; time.sleep(60)", 1, again=False) == "gmsh did not answer within 1 s and was stopped"
     assert failure("import sys; sys.exit('Invalid boundary mesh')") == "Invalid boundary mesh"
 
@@ -276,32 +277,32 @@ def test_a_limit_of_processor_time_that_the_user_has_is_kept():
     """On shared machines `ulimit -t` may be below the limit of a mesh; nobody can raise it."""
     import subprocess
 
-    code = "from ast_sim.simulate.shapes import cad; print(cad.gmsh_version())"
-    command = f"ulimit -t {cad.START_SECONDS - 5} && exec {sys.executable} -c '{code}'"
+    code = "from ast_sim.simulate.shapes.cad import gmsh_process; print(gmsh_process.gmsh_version())"
+    command = f"ulimit -t {gmsh_process.START_SECONDS - 5} && exec {sys.executable} -c '{code}'"
     told = subprocess.run(["bash", "-c", command], check=True, capture_output=True, text=True).stdout
-    assert told.strip() == cad.gmsh_version()
+    assert told.strip() == gmsh_process.gmsh_version()
 
 
 def test_a_gmsh_that_does_not_start_names_what_it_needs(monkeypatch):
-    cad.gmsh_version.cache_clear()
-    monkeypatch.setattr(cad, "WORKER", [sys.executable, "-c", "raise OSError('libGLU.so.1: not there')"])
+    gmsh_process.gmsh_version.cache_clear()
+    monkeypatch.setattr(gmsh_process, "WORKER", [sys.executable, "-c", "raise OSError('libGLU.so.1: not there')"])
     with pytest.raises(MissingExtra, match="libGLU.so.1: not there.*apt install libglu1-mesa"):
-        cad.gmsh_version()
-    cad.gmsh_version.cache_clear()
+        gmsh_process.gmsh_version()
+    gmsh_process.gmsh_version.cache_clear()
 
 
 def test_geometry_that_gmsh_refuses_is_told(tmp_path):
     tool = {"do": "cut", "shape": "box", "at": [-1, -1, -1], "size": [3, 3, 3]}
-    with pytest.raises(cad.MeshingFailed, match="no closed solid"):
-        cad.mesh_parts([{"solid": [HOLED["solid"][0], tool]}], ["nothing"], 500)
-    with pytest.raises(cad.MeshingFailed, match="."):
-        cad.mesh_parts([{"solid": [{**HOLED["solid"][0], "size": [0, 1, 1]}]}], ["flat"], 500)
+    with pytest.raises(gmsh_process.MeshingFailed, match="no closed solid"):
+        gmsh_process.mesh_parts([{"solid": [HOLED["solid"][0], tool]}], ["nothing"], 500)
+    with pytest.raises(gmsh_process.MeshingFailed, match="."):
+        gmsh_process.mesh_parts([{"solid": [{**HOLED["solid"][0], "size": [0, 1, 1]}]}], ["flat"], 500)
 
 
 def test_what_is_checked_when_a_part_is_drawn(monkeypatch):
     """A drawn part with a bad element is refused like one of the user."""
     position, elements = rectilinear([np.linspace(0, 1, 3)] * 3)
     elements[3] = elements[3, [1, 0, 2, 3]]
-    monkeypatch.setattr(cad, "mesh_parts", lambda *_: [cad.Part(position, elements, "bad")] * 2)
+    monkeypatch.setattr(gmsh_process, "mesh_parts", lambda *_: [gmsh_process.Part(position, elements, "bad")] * 2)
     with pytest.raises(BadMesh, match="bad: 1 inverted tetrahedron: element 3"):
         part_source().draw(np.random.default_rng(0))(100)

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from ast_sim.simulate.shapes.mesh_check import BadMesh, boundary, check_mesh, check_surface, merged, smallest_dihedral
+from ast_sim.simulate.shapes.mesh_check import BadMesh, boundary, check_mesh, check_surface, smallest_dihedral
 from ast_sim.simulate.shapes.parts import oriented, rectilinear
 
 
@@ -162,12 +162,3 @@ def test_a_solid_that_runs_through_itself():
     radius = 1 + position[:, 1] + 0.05 * position[:, 0]
     bent = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), position[:, 2]])
     assert "its surface cuts itself: the triangles [" in refusal(check_mesh, bent, oriented(bent, elements))
-
-
-def test_corners_at_one_place_become_one_node():
-    position, elements = block()
-    corners = position[boundary(elements)].reshape(-1, 3)
-    loose = corners + 1e-8 * np.sin(np.arange(corners.size)).reshape(-1, 3)
-    points, faces = merged(loose, np.arange(len(corners)).reshape(-1, 3))
-    assert len(points) == 26
-    check_surface(points, faces, "block")

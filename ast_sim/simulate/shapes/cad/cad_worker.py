@@ -1,11 +1,11 @@
 """A process that makes solids in gmsh's OpenCASCADE kernel or reads CAD files, and meshes them.
 
-`python -m ast_sim.simulate.shapes.cad_worker` reads a request as JSON from its standard input and writes an .npz to its
-standard output. On an error it exits with code 3, and the last line of its standard error says what is wrong. gmsh
+`python -m ast_sim.simulate.shapes.cad.cad_worker` reads a request as JSON from its standard input and writes an .npz to
+its standard output. On an error it exits with code 3, and the last line of its standard error says what is wrong. gmsh
 crashes and hangs on bad geometry and is under the GPL, so no other process of this package loads it.
 
 A request: {"parts": [...], "nodes": wanted number of nodes of all parts, "seconds": limit on the processor time}. Each
-part is {"solid": steps of the grammar (see `cad.py`)}, {"step": path} or {"stl": path}.
+part is {"solid": steps of the grammar (see `grammar`)}, {"step": path} or {"stl": path}.
 The answer: position_i and elements_i of each part, scale_i (the length by which the coordinates of the file were
 divided), and the version of gmsh. Parts that keep their own scale are asked for under "own": see `own_scale`.
 """
@@ -19,21 +19,23 @@ import os
 import resource
 import sys
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ast_sim.simulate.shapes import own_scale
-from ast_sim.simulate.shapes.cad_import import (
+from ast_sim.simulate.shapes.cad import own_scale
+from ast_sim.simulate.shapes.cad.cad_import import (
     BadPart,
     import_step,
     is_top,
     one_solid,
     solid_of_surface,
     start,
-    surface_triangles,
     tetrahedra,
 )
+from ast_sim.simulate.shapes.cad.stl_file import BadSurface
+from ast_sim.simulate.shapes.cad.surface_mend import stl_surface
 
 MESHES = 5  # at most this many meshes are made to find the element size
 NODE_TOLERANCE = 0.1  # a mesh whose number of nodes is this near to the wanted one is good enough
@@ -73,7 +75,7 @@ def main() -> None:
         arrays |= own_scale.answer(gmsh, request.get("own", []))
         models = [_load(gmsh, f"part {i}", part) for i, part in enumerate(request["parts"])]
         meshes = _mesh_all(gmsh, models, request["nodes"]) if models else []
-    except BadPart as error:
+    except (BadPart, BadSurface) as error:
         sys.exit(_refuse(str(error)))
     except Exception as error:  # gmsh raises Exception itself
         sys.exit(_refuse(str(error).strip() or "gmsh stopped without a message"))
@@ -163,13 +165,10 @@ def _slab(occ, at: list[float], size: list[float], corner: float) -> int:
 
 def _load_stl(gmsh, name: str, part: dict[str, Any]) -> Model:
     """A closed surface of triangles, cut along its creases into faces. gmsh meshes these faces anew."""
-    gmsh.merge(part["stl"])
-    triangles = surface_triangles(gmsh)
-    if not len(triangles):
-        raise BadPart("it holds no triangles")
-    scale = float(np.linalg.norm(np.ptp(triangles.reshape(-1, 3), axis=0)))
-    solid_of_surface(gmsh)
-    a, b, c = np.moveaxis(triangles / scale, 1, 0)
+    surface = stl_surface(Path(part["stl"]))
+    scale = surface.diagonal
+    solid_of_surface(gmsh, surface)
+    a, b, c = np.moveaxis(surface.position[surface.triangles] / scale, 1, 0)
     normal = np.cross(b - a, c - a)
     volume = float(np.einsum("ij,ij->", a, normal)) / 6
     area = float(np.linalg.norm(normal, axis=1).sum()) / 2

@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 
+from ast_sim.simulate.shapes.cad.surface_mend import Surface, several_solids
+
 MENDED = ("Degenerated", "SmallEdges", "SmallFaces")
 VTK_ORDER = [0, 1, 2, 3, 4, 5, 6, 7, 9, 8]  # of the nodes of a second-order tetrahedron, in gmsh's
 CREASE_ANGLE = math.radians(40)  # edges of an STL surface sharper than this are edges of the part
@@ -72,6 +74,37 @@ def one_solid(gmsh, scale: float = 1.0) -> None:
         )
 
 
+def pick_solid(gmsh, solid: str | int | None) -> None:
+    """Leave one solid in the model: the one with this name or number (from 1); None: there must be one only.
+
+    The name is the path of the solid in the CAD file, such as "Shapes/frame/BOLT::1/bolt", or a part of this path
+    between two "/"; case does not matter.
+
+    Raises:
+        BadPart: there is no such solid, or several and none is chosen; the text describes those that there are.
+    """
+    volumes = gmsh.model.getEntities(3)
+    if not volumes or (solid is None and len(volumes) == 1):
+        one_solid(gmsh)
+        return
+    boxes = [np.split(np.array(gmsh.model.getBoundingBox(*volume)), 2) for volume in volumes]
+    names = [gmsh.model.getEntityName(*volume) for volume in volumes]
+    told = several_solids([(name.rpartition("/")[2], *box) for name, box in zip(names, boxes, strict=True)])
+    if solid is None:
+        raise BadPart(told)
+    if isinstance(solid, int):
+        chosen = [solid - 1] if 1 <= solid <= len(volumes) else []
+    else:
+        chosen = [i for i, name in enumerate(names) if f"/{solid}/".lower() in f"/{name}/".lower()]
+    if len(chosen) != 1:
+        count = "no" if not chosen else f"{len(chosen)}"
+        raise BadPart(f"it holds {count} solid{'s' * (len(chosen) > 1)} {solid!r}; {told}")
+    others = [volume for i, volume in enumerate(volumes) if i != chosen[0]]
+    gmsh.model.occ.remove(others, recursive=True)
+    gmsh.model.occ.synchronize()
+    gmsh.model.removeEntities([one for one in gmsh.model.getEntities(3) if one in others], recursive=True)
+
+
 def _open_edge(gmsh, scale: float) -> str:
     """Where a shell is open: a point of an edge that bounds only one face. (A seam bounds its face twice.)"""
     uses: dict[int, int] = {}
@@ -90,23 +123,35 @@ def _point(x) -> str:
     return "(" + ", ".join(f"{value:.6g}" for value in x) + ")"
 
 
-def solid_of_surface(gmsh) -> None:
-    """Make a solid of the closed surface of triangles that the model holds, cut along its creases into faces."""
+def solid_of_surface(gmsh, surface: Surface, crease_angle: float = CREASE_ANGLE) -> None:
+    """Make a solid of a closed surface of triangles, cut along its creases into faces. Of an open one, faces only."""
     mesh = gmsh.model.mesh
-    mesh.classifySurfaces(CREASE_ANGLE, True, True, math.pi)
+    gmsh.model.addDiscreteEntity(2, 1)
+    mesh.addNodes(2, 1, np.arange(1, len(surface.position) + 1), surface.position.ravel())
+    mesh.addElementsByType(1, 2, [], surface.triangles.ravel() + 1)
+    mesh.classifySurfaces(crease_angle, True, True, math.pi)
     mesh.createGeometry()
-    loop = gmsh.model.geo.addSurfaceLoop([tag for _, tag in gmsh.model.getEntities(2)])
-    gmsh.model.geo.addVolume([loop])
+    if surface.is_closed:
+        loops = [gmsh.model.geo.addSurfaceLoop(faces) for faces in _joined_faces(gmsh)]
+        gmsh.model.geo.addVolume(loops)
     gmsh.model.geo.synchronize()
 
 
-def surface_triangles(gmsh) -> np.ndarray:
-    """[F,3,3]: the corners of the triangles of a surface that was read."""
-    tags, coordinates, _ = gmsh.model.mesh.getNodes()
-    index = np.zeros(int(tags.max(initial=0)) + 1, int)
-    index[tags] = np.arange(len(tags))
-    _, nodes = gmsh.model.mesh.getElementsByType(2)
-    return coordinates.reshape(-1, 3)[index[nodes]].reshape(-1, 3, 3)
+def _joined_faces(gmsh) -> list[list[int]]:
+    """The faces of the model in groups that share edges: first the largest group, then those in its cavities."""
+    groups: list[tuple[set[int], list[int]]] = []
+    for _, face in gmsh.model.getEntities(2):
+        curves = {abs(curve) for _, curve in gmsh.model.getBoundary([(2, face)], combined=False)}
+        touched = [group for group in groups if group[0] & curves]
+        groups = [group for group in groups if group not in touched]
+        joined = curves.union(*(group[0] for group in touched))
+        groups.append((joined, [*(one for group in touched for one in group[1]), face]))
+
+    def extent(faces: list[int]) -> float:
+        boxes = np.array([gmsh.model.getBoundingBox(2, face) for face in faces])
+        return float(np.linalg.norm(boxes[:, 3:].max(axis=0) - boxes[:, :3].min(axis=0)))
+
+    return sorted((sorted(faces) for _, faces in groups), key=extent, reverse=True)
 
 
 def tetrahedra(gmsh, order: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

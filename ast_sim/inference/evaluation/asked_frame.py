@@ -1,0 +1,246 @@
+"""One frame of every scene, as a user asks for it: its errors, its time, and what the solver takes for the same answer.
+
+The asked frame is the deepest: the free nodes are displaced most in it. The relative error is the root mean square of
+the error over that of the displacement, over the free nodes in this frame. Times are of one thread, and count what is
+prepared for a mesh, for the model and for the solver.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import statistics
+from collections.abc import Callable, Iterable
+
+import numpy as np
+import torch
+
+from ast_sim.dataset.reader import Dataset
+from ast_sim.figures import AskedFigures, AskedScene, Beside, SolverFigures, WayFigures
+from ast_sim.inference.effort import Effort, EffortErrors
+from ast_sim.inference.jump import calls
+from ast_sim.inference.predict import answers
+from ast_sim.inference.question import Question
+from ast_sim.mechanics.linearised_contact import STILL
+from ast_sim.models.simulator import Simulator
+from ast_sim.scene import Trajectory
+from ast_sim.simulate.jobs.rival import Rivals, cheapest, deepest_frame, rivals
+from ast_sim.support.errors import SimulationError
+
+
+def asked_frames(
+    model: Simulator,
+    dataset: Dataset,
+    split: str,
+    effort: Effort,
+    rival_scenes: int = 0,
+    progress: Callable[[str], None] | None = None,
+    made_from: str | os.PathLike[str] | None = None,
+) -> AskedFigures:
+    """Predict the deepest frame of each scene of a split, alone and on one thread.
+
+    Args:
+        effort: what follows the first call of a model that jumps.
+        rival_scenes: in so many scenes the solver goes to the same frame, in several ways; see `simulate.jobs.rival`.
+        made_from: the specification or the parts of which the dataset was made, if any; the solver needs them.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        indices = dataset.with_frames(split, model.config.given_frames + 1)
+        scenes = []
+        for index in indices:
+            scenes.append(_scene(model, dataset, split, index, effort))
+            if progress is not None:
+                progress(scenes[-1].name)
+    finally:
+        torch.set_num_threads(threads)
+    why = None
+    try:
+        asked = [scene.frame for scene in scenes[:rival_scenes]]
+        outcomes = _rivals(dataset, split, indices[:rival_scenes], asked, made_from)
+        for number, rival in enumerate(outcomes):
+            solver = _solver(rival, scenes[number].relative_error)
+            scenes[number] = dataclasses.replace(scenes[number], solver=solver)
+            if progress is not None:
+                progress(scenes[number].name)
+    except SimulationError as error:
+        why = str(error)
+    known = [scene for scene in scenes if scene.relative_error is not None]
+    return AskedFigures(
+        scenes=tuple(scenes),
+        relative_error=_mean([scene.relative_error for scene in known]),
+        stress_share=_mean([scene.stress_share for scene in known]),
+        largest_stress=_mean([scene.largest_stress for scene in known]),
+        by_calls=tuple(np.mean([scene.by_calls for scene in known], axis=0).tolist()) if known else (),
+        seconds=statistics.median(scene.seconds for scene in known) if known else None,
+        unsettled=sum((scene.last_step or 0) > STILL for scene in known),
+        solver=_beside([(scene, scene.solver.seconds) for scene in known if scene.solver]),
+        cheapest=_beside([(scene, scene.solver.cheapest_seconds) for scene in known if scene.solver]),
+        no_solver=why,
+    )
+
+
+def _rivals(
+    dataset: Dataset, split: str, indices: list[int], frames: list[int], made_from: str | os.PathLike[str] | None
+) -> Iterable[Rivals]:
+    """What the solver took to these frames; nothing, where none is asked for."""
+    return rivals(dataset.path, split, indices, frames, made_from=made_from, progress=False) if indices else ()
+
+
+def errors_by_effort(model: Simulator, truth: Trajectory, most: Effort) -> list[EffortErrors]:
+    """The errors at the deepest frame after each number of corrections and of Newton steps, up to `most`; empty where
+    nothing is displaced."""
+    frame = max(deepest_frame(truth), model.config.given_frames)
+    if not _rms(truth.position[frame] - truth.position[0], ~truth.scene.prescribed):
+        return []
+    efforts = range(most.corrections + 1)
+    return [errors for corrections in efforts for errors in _after(model, truth, frame, corrections, most.newton_steps)]
+
+
+def _after(model: Simulator, truth: Trajectory, frame: int, corrections: int, most: int) -> list[EffortErrors]:
+    """The errors after so many corrections and 0 to `most` Newton steps."""
+    question = Question.of(truth, "validation", [frame])
+    (way,) = calls(model, [question], Effort(corrections, most))
+    if isinstance(way, str) and most:  # a Newton step failed; the calls before it still count
+        (way,) = calls(model, [question], Effort(corrections))
+    if isinstance(way, str):
+        return [EffortErrors(Effort(corrections, steps), None, None, 0, 0) for steps in range(most + 1)]
+    positions = way.position[corrections:]
+    needed = int(way.steps[0]) + bool(way.last_step[0] > STILL)
+    measured = []
+    for steps in range(most + 1):
+        effort = Effort(corrections, steps)
+        if steps >= len(positions):
+            measured.append(EffortErrors(effort, None, None, 0, 0))
+            continue
+        error = relative_error(positions[steps][0], truth, frame)
+        stress = None if way.stress is None else way.stress[steps][0]
+        stress_error, _ = _stress_errors(truth, stress, frame, model.config.stress)
+        measured.append(EffortErrors(effort, error, stress_error, min(steps, needed), float(0 < steps < needed)))
+    return measured
+
+
+def lines(asked: AskedFigures) -> list[str]:
+    """The most important figures as sentences."""
+    if asked.relative_error is None or asked.seconds is None:
+        return ["the deepest frame: every prediction failed"]
+    after = [f"{100 * error:.3g}" for error in asked.by_calls]
+    told = [
+        f"the deepest frame at once: error {100 * asked.relative_error:.3g} % of the displacement,"
+        f" {1000 * asked.seconds:.3g} ms in the median, on one thread"
+    ]
+    if len(after) > 1:
+        told.append(f"  after each call, and each Newton step: {', '.join(after)} %")
+    if asked.unsettled:
+        told.append(f"  in {asked.unsettled} of {len(asked.scenes)} scenes the Newton steps did not end")
+    if asked.stress_share is not None and asked.largest_stress is not None:
+        told.append(
+            f"  stress: {asked.stress_share:.2f} of the error of the frame's true mean; the largest is"
+            f" {100 * asked.largest_stress:.3g} % off"
+        )
+    if asked.no_solver is not None:
+        told.append(f"  the solver was not run: {asked.no_solver}")
+    for what, beside in (
+        ("the solver for this frame", asked.solver),
+        ("its fastest setting that is as accurate", asked.cheapest),
+    ):
+        if beside is not None:
+            told.append(
+                f"  {what}: {1000 * beside.seconds:.3g} ms, {beside.ratio:.3g} times as long (medians of"
+                f" {beside.scenes} scenes, one thread)"
+            )
+    return told
+
+
+def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: Effort) -> AskedScene:
+    name, truth = f"{split}/{index:06d}", dataset.load(split, index)
+    frame = max(deepest_frame(truth), model.config.given_frames)
+    question = Question.of(truth, name, [frame])
+    (answer,) = answers(model, [question], effort)
+    size = _rms(truth.position[frame] - truth.position[0], ~truth.scene.prescribed)
+    failed = answer.failure is not None or not size  # where nothing moves, there is no relative error
+    stress = None if answer.stress is None or answer.failure is not None else answer.stress[0]
+    by_calls = []
+    if model.config.jumps and not failed:
+        (after,) = calls(model, [question], effort)
+        positions = () if isinstance(after, str) else after.position
+        by_calls = [relative_error(position[0], truth, frame) for position in positions]
+    share, largest = _stress_errors(truth, stress, frame, model.config.stress)
+    return AskedScene(
+        name=name,
+        nodes=truth.scene.num_nodes,
+        frame=frame,
+        displacement=size,
+        relative_error=None if failed else relative_error(answer.position[0], truth, frame),
+        by_calls=tuple(by_calls),
+        seconds=answer.seconds,
+        last_step=answer.last_steps[-1] if answer.last_steps else None,
+        stress_share=share,
+        largest_stress=largest,
+    )
+
+
+def relative_error(position: np.ndarray, truth: Trajectory, frame: int) -> float:
+    """The error of the free nodes at positions [N, 3] in a frame, over their displacement, which must not be 0."""
+    free, true = ~truth.scene.prescribed, truth.position[frame]
+    return _rms(position - true, free) / _rms(true - truth.position[0], free)
+
+
+def _rms(difference: np.ndarray, rows: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(difference[rows], dtype=np.float64))))
+
+
+def _stress_errors(
+    truth: Trajectory, stress: np.ndarray | None, frame: int, location: str
+) -> tuple[float | None, float | None]:
+    """The error of the stress on what deforms, relative to the error of the frame's true mean; and by how much the
+    largest is off. None where they say nothing."""
+    if stress is None or truth.stress is None:
+        return None, None
+    rows = truth.scene.deforming(location)
+    there = truth.stress[frame].astype(np.float64)
+    given = stress.astype(np.float64)
+    spread = float(there[rows].std())
+    largest = float(there[rows].max())
+    share = _rms(given - there, rows) / spread if spread else None
+    return share, abs(float(given[rows].max()) - largest) / largest if largest else None
+
+
+def _solver(rival: Rivals, error: float | None) -> SolverFigures:
+    """What the solver took: at its own stop test, and in each way; the cheapest has at most the model's error."""
+    ways = {
+        outcome.way.name: WayFigures(
+            seconds=outcome.whole_seconds,
+            setup_seconds=outcome.setup_seconds,
+            relative_error=outcome.relative_error,
+            load_steps=outcome.load_steps,
+            newton_iterations=outcome.newton_iterations,
+        )
+        if outcome.converged
+        else WayFigures(failure=outcome.failure)
+        for outcome in rival.outcomes
+    }
+    best = None if error is None else cheapest(rival.outcomes, error)
+    own = rival.outcomes[0]
+    return SolverFigures(
+        seconds=own.whole_seconds if own.converged else None,
+        cheapest=None if best is None else best.way.name,
+        cheapest_seconds=None if best is None else best.whole_seconds,
+        ways=ways,
+    )
+
+
+def _beside(scenes: list[tuple[AskedScene, float | None]]) -> Beside | None:
+    """The scenes with the solver's seconds, as medians."""
+    both = [(seconds, scene.seconds) for scene, seconds in scenes if seconds is not None]
+    if not both:
+        return None
+    solver, model = zip(*both, strict=True)
+    ratio = statistics.median(theirs / ours for theirs, ours in both)
+    return Beside(len(both), statistics.median(solver), statistics.median(model), ratio)
+
+
+def _mean(values: list[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None

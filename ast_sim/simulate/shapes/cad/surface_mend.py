@@ -1,0 +1,231 @@
+"""Surfaces of triangles made whole: corners that lie at one place, triangles of no area, cracks; and their pieces.
+
+Legend: N nodes, F triangles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from ast_sim.simulate.shapes.cad.stl_file import BadSurface, StlFile, read_stl
+
+SAME_PLACE = 1e-7  # distance of corners that are one, relative to the diagonal
+CRACKS = (1e-6, 1e-5, 1e-4)  # the same where a surface is open otherwise
+MOST_TOLD = 30  # solids that a message describes
+NO_HEIGHT = 1e-6  # height of a triangle that has no area, relative to its longest side
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A surface.
+
+    Attributes:
+        position: [N,3] float64.
+        triangles: [F,3], which share their nodes.
+        notes: what was mended, a sentence each.
+    """
+
+    position: np.ndarray
+    triangles: np.ndarray
+    notes: tuple[str, ...] = ()
+
+    @property
+    def diagonal(self) -> float:
+        return float(np.linalg.norm(np.ptp(self.position, axis=0)))
+
+    def edges(self) -> tuple[np.ndarray, np.ndarray]:
+        """The edges [n,2], and how many triangles meet at each."""
+        edges = np.sort(self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        return np.unique(edges, axis=0, return_counts=True)
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether two triangles meet at every edge."""
+        return bool((self.edges()[1] == 2).all())
+
+    def only(self, rows: np.ndarray) -> Surface:
+        """Some of its triangles, with their nodes."""
+        used, triangles = np.unique(self.triangles[rows], return_inverse=True)
+        return Surface(self.position[used], triangles.reshape(-1, 3), self.notes)
+
+
+def stl_surface(path: Path, solid: str | int | None = None, whole: bool = False) -> Surface:
+    """The surface of one solid of an STL file, mended.
+
+    Args:
+        solid: the name of the solid, or its number from 1; None: there must be one only.
+        whole: take all that the file holds if `solid` is None.
+
+    Raises:
+        BadSurface: the file cannot be read, holds no such solid, or holds several and none is chosen.
+    """
+    file = read_stl(path)
+    if isinstance(solid, str):
+        return whole_surface(file.corners[_named(file, solid)])
+    surface = whole_surface(file.corners)
+    if not len(surface.triangles):
+        raise BadSurface("all its triangles are without an area")
+    if solid is None and whole:
+        return surface
+    number = solids_of(surface) if surface.is_closed else pieces_of(surface)
+    count = int(number.max()) + 1
+    if solid is None and count > 1 and surface.is_closed:
+        boxes = [surface.only(number == one).position for one in range(count)]
+        raise BadSurface(several_solids([("", box.min(axis=0), box.max(axis=0)) for box in boxes]))
+    if solid is None:
+        return surface
+    if not 1 <= solid <= count:
+        raise BadSurface(f"it has no solid {solid}; it holds {count}")
+    return surface.only(number == solid - 1)
+
+
+def _named(file: StlFile, name: str) -> np.ndarray:
+    """[F] bool: the triangles of the solids with this name; case does not matter."""
+    chosen = [i for i, one in enumerate(file.names) if one.lower() == name.lower()]
+    if not chosen:
+        raise BadSurface(f"it has no solid {name!r}; it holds {', '.join(map(repr, file.names))}")
+    return np.isin(file.solid, chosen)
+
+
+def several_solids(solids: list[tuple[str, np.ndarray, np.ndarray]]) -> str:
+    """What a file with several solids is told: their names, where they are and how one is chosen."""
+    shown = []
+    for number, (name, low, high) in enumerate(solids[:MOST_TOLD], 1):
+        middle = "(" + ", ".join(f"{x:.4g}" for x in (low + high) / 2) + ")"
+        size = " x ".join(f"{x:.4g}" for x in high - low)
+        shown.append(f"{number}{f' {name!r}' if name else ''} of {size} around {middle}")
+    more = f", and {len(solids) - MOST_TOLD} more" if len(solids) > MOST_TOLD else ""
+    named = next((f" or {name!r}" for name, _, _ in solids if name), "")
+    return f"it holds {len(solids)} solids: {'; '.join(shown)}{more}; say which one the part is: solid = 1{named}"
+
+
+def whole_surface(corners: np.ndarray) -> Surface:
+    """The surface of triangles with these corners [F,3,3], mended."""
+    found = _joined(corners, SAME_PLACE)
+    for tolerance in () if found.is_closed else CRACKS:
+        wider = _joined(corners, tolerance)
+        if wider.is_closed:
+            crack = f"cracks of up to {tolerance * found.diagonal:.2g} in its surface are closed"
+            return Surface(wider.position, wider.triangles, (*wider.notes, crack))
+    return found
+
+
+def _joined(corners: np.ndarray, tolerance: float) -> Surface:
+    """Corners closer than `tolerance` diagonals become one; triangles without an area go."""
+    points, triangles = _exactly_joined(corners)
+    diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
+    pairs = cKDTree(points).query_pairs(tolerance * diagonal, output_type="ndarray")
+    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points), len(points)))
+    _, label = connected_components(links, directed=False)
+    _, first, label = np.unique(label, return_index=True, return_inverse=True)
+    position, triangles = points[first], label[triangles]
+    points_alone = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
+    found, needles = _without_needles(position, triangles[~points_alone])
+    kept = _without_folds(found)
+    gone, folds = int(points_alone.sum()) + needles, len(found) - len(kept)
+    notes = [f"{gone} triangle{'s' * (gone > 1)} of no area left out"] if gone else []
+    notes += [f"{folds} triangles that stand twice left out"] if folds else []
+    return Surface(position, kept, tuple(notes)).only(np.arange(len(kept)))
+
+
+def _exactly_joined(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The different corners [N,3], in the order of the file, and the triangles [F,3] over them."""
+    points = np.ascontiguousarray(corners.reshape(-1, 3) + 0.0)  # -0 is 0
+    _, first, label = np.unique(points.view([("", points.dtype)] * 3), return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty(len(order), int)
+    rank[order] = np.arange(len(order))
+    return points[first[order]], rank[label.ravel()].reshape(-1, 3)
+
+
+def _without_needles(position: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, int]:
+    """The triangles without those whose corners lie on a line, and how many went.
+
+    The needle a, b, c with b between a and c would leave a gap: its neighbour a, c, d has a side that its other
+    neighbours cut at b. So the neighbour is cut there, too, into a, b, d and b, c, d.
+    """
+    gone = 0
+    while True:
+        sides = position[np.roll(triangles, -1, axis=1)] - position[np.roll(triangles, 1, axis=1)]
+        lengths = np.linalg.norm(sides, axis=2)  # of the side opposite to each corner
+        height = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / lengths.max(axis=1)
+        needles = np.flatnonzero(height <= NO_HEIGHT * lengths.max(axis=1))
+        if not len(needles):
+            return triangles, gone
+        row = int(needles[0])
+        middle = int(lengths[row].argmax())
+        a, b, c = np.roll(triangles[row], 1 - middle)
+        beside = np.flatnonzero((triangles == a).any(axis=1) & (triangles == c).any(axis=1))
+        beside = beside[beside != row]
+        pieces = [triangles[other].copy() for other in beside for _ in range(2)]
+        for number, piece in enumerate(pieces):
+            piece[piece == (c, a)[number % 2]] = b
+        pieces = [piece for piece in pieces if len(set(piece.tolist())) == 3]
+        kept = np.delete(triangles, [row, *beside], axis=0)
+        triangles, gone = np.concatenate([kept, *(piece[None] for piece in pieces)]), gone + 1
+
+
+def _without_folds(triangles: np.ndarray) -> np.ndarray:
+    """The triangles without those that stand twice: of two alike one stays, of two that look apart none."""
+    same, which = np.unique(np.sort(triangles, axis=1), axis=0, return_inverse=True)
+    if len(same) == len(triangles):
+        return triangles
+    which = which.ravel()
+    start = triangles.argmin(axis=1)
+    turned = np.take_along_axis(triangles, (start[:, None] + [1, 2]) % 3, axis=1)
+    way = np.where(turned[:, 0] < turned[:, 1], 1, -1)
+    balance = np.bincount(which, way)
+    first = np.unique(which, return_index=True)[1]
+    return triangles[np.sort(first[balance != 0])]
+
+
+def pieces_of(surface: Surface) -> np.ndarray:
+    """[F]: the piece that each triangle belongs to, from 0, in the order of their first triangles. Triangles that share
+    an edge belong to one piece."""
+    edges = np.sort(surface.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    _, number = np.unique(edges, axis=0, return_inverse=True)
+    owner, count = np.repeat(np.arange(len(surface.triangles)), 3), len(surface.triangles)
+    number = number.ravel() + count
+    size = count + len(number)
+    links = coo_array((np.ones(len(owner)), (owner, number)), shape=(size, size))
+    _, label = connected_components(links, directed=False)
+    _, first, label = np.unique(label[:count], return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[label]
+
+
+def solids_of(surface: Surface) -> np.ndarray:
+    """[F]: the solid that each triangle of a closed surface bounds, from 0: an outer piece and the cavities in it."""
+    piece = pieces_of(surface)
+    count = int(piece.max()) + 1
+    parts = [surface.triangles[piece == one] for one in range(count)]
+    inside = np.zeros((count, count), bool)  # piece i inside piece j
+    for i in range(count):
+        for j in range(count):
+            inside[i, j] = i != j and _contains(surface.position, parts[j], surface.position[parts[i][0, 0]])
+    depth = inside.sum(axis=1)
+    solid = np.full(count, -1)
+    outer = np.flatnonzero(depth % 2 == 0)
+    solid[outer] = np.arange(len(outer))
+    for cavity in np.flatnonzero(depth % 2 == 1):
+        around = [j for j in np.flatnonzero(inside[cavity]) if depth[j] == depth[cavity] - 1]
+        solid[cavity] = solid[around[0]]
+    return solid[piece]
+
+
+def _contains(position: np.ndarray, triangles: np.ndarray, point: np.ndarray) -> bool:
+    """Whether a closed surface winds around a point: its solid angle there, over 4 pi (van Oosterom and Strackee)."""
+    corners = position[triangles]
+    if (point < corners.min(axis=(0, 1))).any() or (point > corners.max(axis=(0, 1))).any():
+        return False
+    a, b, c = np.moveaxis(corners - point, 1, 0)
+    la, lb, lc = (np.linalg.norm(one, axis=1) for one in (a, b, c))
+    above = np.einsum("ij,ij->i", a, np.cross(b, c))
+    ab, bc, ca = (np.einsum("ij,ij->i", *pair) for pair in ((a, b), (b, c), (c, a)))
+    angle = 2 * np.arctan2(above, la * lb * lc + ab * lc + bc * la + ca * lb)
+    return abs(angle.sum()) > 2 * np.pi
