@@ -125,7 +125,10 @@ def _add_generate(generate: _Parser) -> None:
     generate.add_argument("spec", type=path, nargs="?", metavar="SPEC", help=about)
     _add_each(generate, {"--out FILE": "dataset to write (.h5)"}, type=path)
     _add_each(generate, {"--count N": "number of training scenes"}, type=at_least(1))
-    about = "draw the first scenes of an assembly as a picture and say what --count will cost; make no dataset"
+    about = (
+        "draw the first scenes of an assembly as a picture, say what --count will cost and how far the force of the"
+        " mesh is off; make no dataset"
+    )
     generate.add_argument("--look", action="store_true", help=about)
     splits = {
         "--valid N": "number of validation scenes (default: a tenth of --count)",

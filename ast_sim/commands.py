@@ -62,6 +62,7 @@ def _look(args: argparse.Namespace) -> None:
     print("\n".join(map(printable, found.lines)))
     each = found.mesh_seconds + found.solve_seconds
     print(f"one scene: {each:.3g} s ({found.mesh_seconds:.2g} s to mesh), {printable(found.status)}")
+    print(printable(found.mesh_line))
     scenes = sum(checked_counts(args.count or 100, args.valid, args.test).values())
     workers = checked_workers(args.workers, None)
     cost = duration(each * scenes / workers)

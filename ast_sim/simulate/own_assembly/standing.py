@@ -79,16 +79,16 @@ def reference(spec: AssemblySpec) -> Reference:
     return Reference((x, y, z), distance, float(f"{np.exp(np.mean(np.log(young))):.3g}"))
 
 
-def placed(spec: AssemblySpec, values: Values, factor: float = 1.0) -> list[PlacedPart]:
+def placed(spec: AssemblySpec, values: Values, factor: float = 1.0, halved: bool = False) -> list[PlacedPart]:
     """All parts as they stand, with what holds and moves them.
 
     Args:
-        factor: all element sizes are multiplied by this.
+        factor, halved: as for `part_meshes`.
 
     Raises:
         ConfigError: a region holds no node, or nodes are both fixed and moved; or as in `part_meshes`.
     """
-    meshes = part_meshes(spec, values, factor)
+    meshes = part_meshes(spec, values, factor, halved)
     return [_placed(part, mesh, values) for part, mesh in zip(spec.parts, meshes, strict=True)]
 
 
