@@ -27,6 +27,8 @@ from ast_sim.support.disk import read_text
 from ast_sim.support.errors import ConfigError
 
 DEFAULT_FRAMES = 6
+LOADS = ("force", "load", "pressure", "traction", "torque", "moment", "gravity", "acceleration")
+TIES = ("tie", "glue", "bond")
 
 
 def read_spec(path: str | os.PathLike[str]) -> AssemblySpec:
@@ -72,6 +74,8 @@ def _spec(path: Path, text: str, table: Table) -> AssemblySpec:
     if distance is not None and not (_is_number(distance) and distance > 0):
         raise ConfigError(f"contact_distance is {distance!r}; must be a number above 0")
     table.known = plain(free)
+    _refuse_loads(table)
+    _refuse_ties(table)
     pairs = dict(_pair(row, [part.name for part in parts]) for row in table.tables("contact"))
     table.done()
     spec = AssemblySpec(path, text, unit, frames, distance, pairs, parameters, parts)
@@ -93,6 +97,7 @@ def _parts(table: Table) -> dict[str, Any]:
 def _part(name: str, values: Any, free: dict[str, Parameter], parameters: dict[str, Parameter]) -> PartSpec:
     """A part; its quantities are added to the parameters."""
     table = Table(values, f"parts.{name}", plain(free))
+    _refuse_loads(table)
     rigid, files = table.flag("rigid"), table.take("file")
     files = [files] if isinstance(files, str) else files
     if not isinstance(files, list) or not files or not all(isinstance(file, str) for file in files):
@@ -124,7 +129,7 @@ def _part(name: str, values: Any, free: dict[str, Parameter], parameters: dict[s
         rigid,
         table.flag("self_contact"),
         _places(table, "fixed"),
-        tuple(_move(row, rigid) for row in table.tables("move")),
+        _moves(table, rigid),
         _placement(table),
     )
     table.done()
@@ -147,7 +152,34 @@ def _add_material(parameters: dict[str, Parameter], name: str, given: Any, free:
     parameters[name] = found
 
 
+def _moves(table: Table, rigid: bool) -> tuple[Move, ...]:
+    rows = table.tables("move")
+    if rigid and len(rows) > 1:
+        raise ConfigError(f"{table.key('move')}: a rigid part moves as a whole, so it has one move; here {len(rows)}")
+    return tuple(_move(row, rigid) for row in rows)
+
+
+def _refuse_loads(table: Table) -> None:
+    load = next((name for name in table.values if name.rstrip("s") in LOADS), None)
+    if load is not None:
+        raise ConfigError(
+            f"{table.key(load)}: forces cannot be prescribed, only motions: give a move whose travel is a range, and"
+            " read off at which travel the answers have this reaction"
+        )
+
+
+def _refuse_ties(table: Table) -> None:
+    tie = next((name for name in table.values if name.rstrip("sd") in TIES), None)
+    if tie is not None:
+        raise ConfigError(
+            f"there is no {tie}: a part that is glued to a much stiffer one, as rubber to metal, moves with it: make"
+            " the stiffer one rigid, and give the nodes of the other at the joint its move (or fixed), such as"
+            " move = { where = 'zmin', translation = ... }; parts of one material are glued as one part of one mesh"
+        )
+
+
 def _move(table: Table, rigid: bool) -> Move:
+    _refuse_loads(table)
     where = _places(table, "where")
     if rigid and where:
         raise ConfigError(f"{table.key('where')}: a rigid part moves as a whole: leave it out")
