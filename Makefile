@@ -89,16 +89,16 @@ $(VENV)/torch: constraints.txt
 	touch $@
 
 $(VENV)/installed: $(VENV)/torch pyproject.toml setup.py MANIFEST.in $(C_SOURCES)
-	$(PIP) --editable '.[simulate,cad,view]'
+	$(PIP) --editable '.[simulate,cad,read,view]'
 	touch $@
 
 # By name, the package that is there gets its extras; by path, it would be built once more, half a minute on one core.
 $(VENV)/tested: $(VENV)/installed | tools
-	$(PIP) 'ast_sim[simulate,cad,cluster,tfrecord,view,test]'
+	$(PIP) 'ast_sim[simulate,cad,cluster,read,tfrecord,view,test]'
 	touch $@
 
 $(VENV)/benched: $(VENV)/installed
-	$(PIP) --editable '.[simulate,cad,tfrecord,view,bench]'
+	$(PIP) --editable '.[simulate,cad,read,tfrecord,view,bench]'
 	touch $@
 
 # System programs that the tests use; installed where this is allowed, otherwise the tests say what is missing. One at a time if not all

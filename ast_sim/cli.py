@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ast_sim import __version__, commands
+from ast_sim import __version__, commands, help_lines
 from ast_sim.support.argument_types import at_least, path, whole_numbers
 from ast_sim.support.errors import AstSimError, ConfigError, printable
 from ast_sim.support.stop_signals import Interrupted
@@ -33,45 +33,6 @@ class _Parser(argparse.ArgumentParser):
 
     def format_help(self) -> str:
         return super().format_help() + "".join(f"{line}\n" for line in self.more())
-
-
-def _all_settings() -> list[str]:
-    """All settings for `train --set`."""
-    from ast_sim.models.registry import find_model, find_preset, model_names
-    from ast_sim.runs.train_config import TrainConfig
-    from ast_sim.support.toml_settings import settings
-
-    usual = find_preset("ast", "tiny").train
-    lines = ["", "settings for --set, and their values in the preset tiny (none: unset):"]
-    lines += ["", "training (of ast; other models list what differs):", *_settings("train.", TrainConfig, usual)]
-    for name in model_names():
-        try:
-            model, tiny = find_model(name), find_preset(name, "tiny")
-        except ConfigError as error:
-            lines += ["", str(error)]
-            continue
-        own, common = ({s.key: s.default for s in settings(TrainConfig, train)} for train in (tiny.train, usual))
-        lines += ["", f"{name}, presets {', '.join(model.presets)}:"]
-        lines += [f"  train.{key}={value}  (in tiny)" for key, value in own.items() if value != common[key]]
-        lines += _settings("model.", model.config, vars(tiny.model))
-    return lines
-
-
-def _settings(prefix: str, kind: type, values: Mapping[str, Any]) -> list[str]:
-    from ast_sim.support.toml_settings import settings
-
-    return [f"  {prefix}{s.key}={s.default}  ({s.type})\n        {s.help}" for s in settings(kind, values)]
-
-
-def _families() -> list[str]:
-    """A line about each family of `generate`."""
-    from ast_sim.simulate.families.names import FAMILIES
-
-    lines = ["", "families:"]
-    for name, family in FAMILIES.items():
-        options = "".join(" SPEC" if option == "spec" else f" --{option}" for option in family.options)
-        lines.append(f"  {name:17}{family.about}{f' ({options.strip()})' if options else ''}")
-    return lines
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -158,7 +119,7 @@ def _add_demo(demo: _Parser) -> None:
 
 
 def _add_generate(generate: _Parser) -> None:
-    generate.more = _families
+    generate.more = help_lines.families
     generate.add_argument("family", metavar="FAMILY", help="kind of scenes; the list is below")
     about = "specification of an assembly (.toml), for the family assembly"
     generate.add_argument("spec", type=path, nargs="?", metavar="SPEC", help=about)
@@ -188,27 +149,30 @@ def _add_generate(generate: _Parser) -> None:
 
 def _add_convert(convert: _Parser) -> None:
     about = (
-        "a simulation (a .pvd or .vtkhdf file or a folder of .vtu files), a folder that holds several simulations, or a"
-        " folder of meta.json and .tfrecord files"
+        "a simulation (a .vtkhdf, .frd, .xdmf, .exo or d3plot file, a .pvd file, or a folder of .vtu, .pvtu or .vtk"
+        " files), a folder that holds several simulations, or a folder of meta.json and .tfrecord files"
     )
     convert.add_argument("source", type=path, metavar="SOURCE", help=about)
     _add_out(convert, "FILE", "dataset to write (.h5)")
-    fields = convert.add_argument_group("names of the fields in .vtu and .vtkhdf files")
+    fields = convert.add_argument_group("names of the fields in the files")
     names = {
         "--displacement NAME": "point field, displacement from rest; if there is none, the points themselves move",
-        "--stress NAME": "point or cell field with the von Mises stress",
+        "--stress NAME": "point or cell field with the von Mises stress, or with the components of a stress tensor",
         "--node-type NAME": "point field: 0 normal, 1 obstacle, 3 handle",
-        "--obstacle NAME": "point field that is not zero at the nodes of obstacles",
-        "--handle NAME": "point field that is not zero at prescribed nodes of deforming bodies",
+        "--obstacle NAME": "point field that is not zero at the nodes of obstacles; or a group of nodes, or BODY:all",
+        "--handle NAME": "the same for prescribed nodes of deforming bodies; a place is written BODY:PLACE, as 0:zmin",
         "--body NAME": "point or cell field with the numbers of the bodies",
     }
     _add_each(fields, names)
+    about = "components of the stress, such as xx,xy,xz,yy,yz,zz (default: as the file names them, else xx,yy,zz,...)"
+    _add_each(fields, {"--stress-order XX,YY,...": about}, type=_stress_order, default=())
     _add_each(fields, {"--material NAME": "cell fields with one number each"}, nargs="+", default=[])
-    kind = convert.add_argument_group("properties of a dataset made from .vtu files")
+    kind = convert.add_argument_group("properties of a dataset made from such files")
     about = "shares of the simulations, drawn at random (default: 0.8 0.1 0.1 of three or more)"
     kind.add_argument("--shares", nargs=3, type=float, metavar=("TRAIN", "VALID", "TEST"), help=about)
     kind.add_argument("--seed", type=at_least(0), default=0, help="seed of this draw (default: 0)")
     kind.add_argument("--incomplete", action="store_true", help="convert although nothing moves or is prescribed")
+    kind.add_argument("--strict", action="store_true", help="refuse simulations in which something looks wrong")
     kind.add_argument("--dynamic", action="store_true", help="inertia matters: models predict the acceleration")
     numbers = {
         "--contact-radius R": "distance below which surfaces are in contact (default: 0)",
@@ -226,10 +190,11 @@ def _add_convert(convert: _Parser) -> None:
 def _add_info(info: _Parser) -> None:
     info.add_argument("path", type=path, metavar="FILE_OR_RUN", help="dataset (.h5) or run folder")
     info.add_argument("--json", action="store_true", help="print JSON")
+    info.add_argument("--strict", action="store_true", help="exit with an error if something looks wrong")
 
 
 def _add_train(train: _Parser) -> None:
-    train.more = _all_settings
+    train.more = help_lines.all_settings
     train.add_argument("data", metavar="DATA", nargs="?", type=path, help="dataset; may be left out with --resume")
     _add_each(train, {"--out RUN": "run folder"}, type=path, required=True)
     _add_each(train, {"--model M": "name of the model; the list is below (default: ast)"})
@@ -317,6 +282,15 @@ def _add_report(report: _Parser) -> None:
     _add_each(report, {"--out FILE.html": "page to write"}, type=path, required=True)
     _add_each(report, {"--data DATA": "dataset for all runs (default: the training data of each run)"}, type=path)
     _add_overwrite(report)
+
+
+def _stress_order(text: str) -> tuple[str, ...]:
+    from ast_sim.importers.stress import parse_order
+
+    try:
+        return parse_order(text)
+    except ConfigError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 if __name__ == "__main__":

@@ -74,10 +74,10 @@ def _counts(counts: dict[str, int]) -> str:
 
 
 def convert(args: argparse.Namespace) -> None:
-    """Make a dataset from simulations of other programs (PVD, VTU, VTKHDF, TFRecord)."""
+    """Make a dataset from simulations of other programs (VTK, CalculiX, Exodus, LS-DYNA, XDMF, TFRecord)."""
     from ast_sim.importers.convert import convert as import_files
     from ast_sim.importers.deepmind import is_deepmind
-    from ast_sim.importers.vtu import FieldNames
+    from ast_sim.importers.series import FieldNames
 
     read = args.source.rglob("*") if args.source.is_dir() else [args.source]
     _check_output(args, args.out, (path for path in read if path.suffix != ".h5"), "a dataset", ".h5")
@@ -88,7 +88,7 @@ def convert(args: argparse.Namespace) -> None:
         _refuse(args, args.of_records, f"{args.source}, which holds no .tfrecord files")
         fields = (args.displacement, args.stress, args.node_type, args.obstacle, args.handle, args.body)
         options = {
-            "names": FieldNames(*fields, tuple(args.material)),
+            "names": FieldNames(*fields, tuple(args.material), args.stress_order),
             "splits": None if args.shares is None else dict(zip(SPLITS, args.shares, strict=True)),
             "seed": args.seed,
             "integration": "dynamic" if args.dynamic else "quasi_static",
@@ -96,6 +96,7 @@ def convert(args: argparse.Namespace) -> None:
             "time_step": args.time_step,
             "length_unit": args.length_unit,
             "incomplete": args.incomplete,
+            "strict": args.strict,
         }
     counts = import_files(args.source, args.out, progress=lambda line: print(printable(line)), **options)
     print(f"{args.out}: {_counts(counts)}")
@@ -140,6 +141,8 @@ def info(args: argparse.Namespace) -> None:
     else:
         found = describe_dataset(args.path)
     print(json.dumps(found, indent=1) if args.json else text(found))
+    if args.strict and found.get("looks_wrong"):
+        raise DatasetError(f"{args.path}: {len(found['looks_wrong'])} things look wrong in it")
 
 
 def train(args: argparse.Namespace) -> None:

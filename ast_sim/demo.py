@@ -11,8 +11,8 @@ import shlex
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from ast_sim.figures import Figures
 from ast_sim.inference.evaluation import asked_frame
 from ast_sim.inference.evaluation.evaluated_run import Evaluation
 from ast_sim.simulate.jobs.generate import generate
@@ -39,7 +39,7 @@ FULL = Size(train=100, valid=8, test=10, steps=8000)  # at most 10 minutes on 2 
 QUICK = Size(train=16, valid=2, test=3, steps=500)  # at most 90 seconds
 
 
-def demo(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
+def demo(out: Path, quick: bool = False, seed: int = 0) -> Figures:
     """Generate, train, evaluate and report in the folder `out`. The results depend only on `quick` and `seed`.
 
     Returns:
@@ -63,11 +63,10 @@ def demo(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
     command = shlex.join(["ast-sim", "demo", "--out", str(out), *(["--quick"] if quick else []), "--seed", str(seed)])
     evaluation = run.evaluate(data, command=command, rival_scenes=RIVALS)
     evaluation.save(out / "evaluation.json")
-    found = evaluation.figures
     _announce(4, "writing the report")
     _write_pages(evaluation, out)
 
-    for line in headlines(found):
+    for line in headlines(evaluation.figures):
         print(line)
     print(f"report      {out / 'report.html'}")
     print(f"picture     {out / 'picture.png'}")
@@ -75,7 +74,7 @@ def demo(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
     print(f"figures     {out / 'evaluation.json'}")
     print(f"run         {run_folder}")
     print(f"in all {duration(time.perf_counter() - started)}", flush=True)
-    return found
+    return evaluation.figures
 
 
 def _announce(number: int, text: str) -> None:
@@ -92,25 +91,18 @@ def _write_pages(evaluation: Evaluation, out: Path) -> None:
     export.write(out / "prediction.pvd", median.truth, median.prediction)
 
 
-def headlines(found: dict[str, Any]) -> list[str]:
+def headlines(figures: Figures) -> list[str]:
     """The most important figures as sentences."""
     lines = []
-    for quantity, nodes, unit, trivial, words in (
-        ("displacement", "normal", found["length_unit"], "hold_still", "that of holding still"),
-        ("stress", "deforming", found["stress_unit"], "stress_frame_mean", "that of each frame's true mean"),
+    for quantity, trivial, words in (
+        ("displacement", "hold_still", "the error of holding still"),
+        ("stress", "stress_frame_mean", "the error of each frame's true mean"),
     ):
-        model, reference = (_error(found["summary"], name, quantity, nodes) for name in ("model", trivial))
-        if model is not None and reference:
-            lines.append(
-                f"{quantity} error over whole rollouts: {model:.3g} {unit}, {100 * model / reference:.0f} % of {words}"
-            )
-    if found["failures"]:
-        lines.append(f"{found['failures']} of {len(found['samples'])} rollouts failed")
-    return lines + asked_frame.lines(found["asked"])
-
-
-def _error(summary: dict[str, Any], name: str, quantity: str, nodes: str) -> float | None:
-    """The error of a predictor over whole rollouts; None if it predicts no such quantity."""
-    for key in (name, quantity, "rollout_all", nodes):
-        summary = summary.get(key, {})
-    return summary.get("rmse_sequence")
+        model, reference = (figures.error(quantity, name) for name in ("model", trivial))
+        if model and reference and model.rmse_sequence is not None and reference.rmse_sequence:
+            error, unit = model.rmse_sequence, figures.unit(quantity)
+            share = 100 * error / reference.rmse_sequence
+            lines.append(f"{quantity} error over whole rollouts: {error:.3g} {unit}, {share:.0f} % of {words}")
+    if figures.failures:
+        lines.append(f"{figures.failures} of {len(figures.scenes)} rollouts failed")
+    return lines + asked_frame.lines(figures.asked)

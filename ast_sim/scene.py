@@ -6,18 +6,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 
+from ast_sim.element_topology import FACE_TRIANGLES, LOCAL_EDGES, LOCAL_FACES
 from ast_sim.support.errors import ConfigError, DatasetError
 
 AttributeValue = str | int | float | list[float]
-
-# The edges of a triangle and of a tetrahedron, as pairs of local node numbers.
-LOCAL_EDGES = {3: ((0, 1), (0, 2), (1, 2)), 4: ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))}
-
-# The faces of a tetrahedron with positive volume; their normals point outward.
-LOCAL_FACES = ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
 
 # The search for connected parts makes pairs of nodes from so many elements at a time, which limits its memory.
 _ELEMENTS_AT_ONCE = 1 << 13
@@ -37,7 +33,8 @@ class Scene:
 
     Attributes:
         rest_position: [N, 3] float32, the undeformed positions; in 2-D scenes z = 0.
-        elements: [E, k] int32, the numbers of the nodes; k = 3 for triangles, k = 4 for tetrahedra.
+        elements: [E, k] int32, the numbers of the nodes; k = 3 for triangles, k = 4 for tetrahedra, k = 10 for
+            second-order tetrahedra (`element_topology`).
         node_type: [N] uint8, values of `NodeType`.
         body: [N] int32, the number of the body that a node belongs to.
         material: [E, m] float32, material parameters of each element, or None.
@@ -93,14 +90,14 @@ class Scene:
         if n == 0 or e == 0:
             raise DatasetError(f"{name}: a scene needs nodes and elements, this one has {n} and {e}")
         if k not in LOCAL_EDGES:
-            raise DatasetError(f"{name}: elements must have 3 nodes (triangle) or 4 (tetrahedron), not {k}")
+            raise DatasetError(f"{name}: elements must have 3 nodes (triangle), 4 or 10 (tetrahedron), not {k}")
         require_finite(name, "rest_position", "node", self.rest_position)
         if self.material is not None:
             if self.material.shape[1] == 0:
                 raise DatasetError(f"{name}: material has no columns; leave it out (None)")
             require_finite(name, "material", "element", self.material)
         require_nodes(name, "element", self.elements, n)
-        pairs = LOCAL_EDGES[k]
+        pairs = combinations(range(k), 2)
         repeated = np.logical_or.reduce([self.elements[:, a] == self.elements[:, b] for a, b in pairs])
         if repeated.any():
             row = int(np.argmax(repeated))
@@ -129,7 +126,7 @@ class Scene:
         """[F, 3] int32: the triangles of the surface.
 
         In a scene of triangles these are all elements. In a scene of tetrahedra they are the faces that belong to one
-        element only; their nodes run counter-clockwise, seen from outside.
+        element only; their nodes run counter-clockwise, seen from outside. A face of six nodes is cut in four.
         """
         return self._surface
 
@@ -137,7 +134,7 @@ class Scene:
     def _surface(self) -> np.ndarray:
         if self.elements.shape[1] == 3:
             return self.elements
-        faces = self.elements.astype(np.int64)[:, np.array(LOCAL_FACES)].reshape(-1, 3)  # [4 E, 3]
+        faces = self.elements.astype(np.int64)[:, np.array(LOCAL_FACES)].reshape(-1, 3)  # [4 E, 3], of corners
         one, two, three = np.ascontiguousarray(faces.T)
         low, high = np.minimum(np.minimum(one, two), three), np.maximum(np.maximum(one, two), three)
         upper = (one + two + three - low - high) * self.num_nodes + high
@@ -145,9 +142,12 @@ class Scene:
         low, upper = low[order], upper[order]
         like_next = np.append((low[1:] == low[:-1]) & (upper[1:] == upper[:-1]), False)
         outer = np.sort(order[~(like_next | np.roll(like_next, 1))])
-        corners = self.rest_position[self.elements[outer // 4]].astype(np.float64)
+        owner = self.elements[outer // 4]
+        corners = self.rest_position[owner[:, :4]].astype(np.float64)
         turned = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
-        surface = np.where(turned[:, None], faces[outer, ::-1], faces[outer]).astype(np.int32)
+        local = np.array(FACE_TRIANGLES[self.elements.shape[1]])[outer % 4]  # [F, 1 or 4, 3]
+        triangles = np.take_along_axis(owner[:, None, :], local, axis=2)
+        surface = np.where(turned[:, None, None], triangles[:, :, ::-1], triangles).reshape(-1, 3).astype(np.int32)
         surface.setflags(write=False)
         return surface
 

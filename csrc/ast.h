@@ -202,7 +202,7 @@ typedef struct {
   ast_status (*elastic_forces)(const ast_elastic *s, float *restrict force);
   /* dposition [N,3] = (dforce/dposition) dforce, whose matrix is symmetric: the gradient. */
   ast_status (*elastic_forces_backward)(const ast_elastic *s, const float *restrict dforce, float *restrict dposition);
-  /* out[f] = sum of x[n,f] over n, rows in blocks whose sums are added in order: the gradient of a bias. x [N,F], out
+  /* out[f] = sum of x[n,f] over n, rows in blocks whose sums are added by halves: the gradient of a bias. x [N,F], out
    * [F]. */
   ast_status (*column_sum)(const float *restrict x, int64_t N, int64_t F, float *restrict out);
   /* out [M,O] = y, or LayerNorm(y), + residual, which may be NULL. */

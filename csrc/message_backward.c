@@ -10,8 +10,9 @@
  * Edges come in rounds. First the tasks of a round, each a run of tiles, put dz into a buffer and add to weight
  * gradients of their own, of which there are at most ROUND_TASKS. Then other tasks add the rows of the buffer to dQ,
  * each for a run of receivers, and to dP, each for the senders with the same index modulo PARTS. All go through their
- * edges in stored order, so that each sum runs in stored order whatever the rounds, tasks, threads and other scenes. At
- * the end the weight gradients of the tasks are added up in order.
+ * edges in stored order, and count those of a node with many edges, so that each sum runs in stored order and by the
+ * same chains whatever the rounds, tasks, threads and other scenes. At the end the weight gradients of the tasks are
+ * added up in order.
  *
  * Cost per edge: the forward flops again, and twice as many for the two products per layer (but E H once, unless de is
  * wanted). Memory: at most ROUND_TASKS sums of weight gradients and ROUND_TASKS * TASK_TILES * MESSAGE_TILE rows of dz,
@@ -29,10 +30,19 @@ enum {
 /* The gradients that are sums over all edges; that of A1 is transposed, [E,H]. */
 enum { MESSAGE_DW2, MESSAGE_DA2, MESSAGE_DA1, MESSAGE_DB2, MESSAGE_DGAMMA, MESSAGE_DBETA, MESSAGE_Da1, MESSAGE_SUMS };
 
+/* The sums over the edges of each of some nodes. One of more than MESSAGE_CHAIN edges has a chain of its own. */
+typedef struct {
+  float *sums;         /* [nodes, F] */
+  int64_t *chain_of;   /* [nodes]: the number of its chain, or -1 */
+  int64_t *all, *done; /* [chains]: edges of the node, and how many of them are added */
+  float *chains;       /* [chains, F] */
+} message_node_sums;
+
 typedef struct {
   message_weights w;
   const float *dsum, *dmessages;
   const ast_message_gradients *out;
+  message_node_sums dP, dQ;
   float *dz;               /* of the edges of this round, rows w.row apart */
   dense_partials partials; /* of each task of a round */
   int64_t *part_offsets;   /* [tasks, PARTS + 1] places in by_part */
@@ -119,9 +129,44 @@ static ast_status message_backward_task(int64_t index, void *context) {
   return AST_OK;
 }
 
+/* Sums of nodes, of which sums->chain_of counts the edges so far. */
+static bool message_new_sums(const ast_message *step, int64_t nodes, message_node_sums *sums) {
+  int64_t num = 0;
+  for (int64_t i = 0; i < nodes; i++) num += sums->chain_of[i] > MESSAGE_CHAIN;
+  sums->all = ast_scratch(2 * num * (int64_t)sizeof *sums->all);
+  sums->chains = ast_scratch(num * step->F * (int64_t)sizeof *sums->chains);
+  if (!sums->all || !sums->chains) return false;
+  sums->done = sums->all + num;
+  memset(sums->done, 0, (size_t)num * sizeof *sums->done);
+  memset(sums->chains, 0, (size_t)(num * step->F) * sizeof *sums->chains);
+  num = 0;
+  for (int64_t i = 0; i < nodes; i++) {
+    const int64_t edges = sums->chain_of[i];
+    sums->chain_of[i] = edges > MESSAGE_CHAIN ? num : -1;
+    if (edges > MESSAGE_CHAIN) sums->all[num++] = edges;
+  }
+  return true;
+}
+
+static bool message_new_all_sums(message_backward_job *job) {
+  const ast_message *step = job->w.step;
+  int64_t *of_senders = ast_scratch((step->S + step->R) * (int64_t)sizeof *of_senders);
+  if (!of_senders) return false;
+  memset(of_senders, 0, (size_t)step->S * sizeof *of_senders);
+  for (int64_t m = 0; m < step->M; m++) of_senders[step->senders[m]]++;
+  int64_t *of_receivers = of_senders + step->S;
+  for (int64_t r = 0; r < step->R; r++) of_receivers[r] = step->receiver_offsets[r + 1] - step->receiver_offsets[r];
+  job->dP = (message_node_sums){.sums = job->out->of_senders, .chain_of = of_senders};
+  job->dQ = (message_node_sums){.sums = job->out->of_receivers, .chain_of = of_receivers};
+  return message_new_sums(step, step->S, &job->dP) && message_new_sums(step, step->R, &job->dQ);
+}
+
 /* forward: z += P[sender] + Q[receiver] */
-AST_INLINE void message_add_row(int64_t F, const float *dz, float *to) {
+AST_INLINE void message_add_row(const message_node_sums *sums, int64_t node, int64_t F, const float *dz) {
+  const int64_t chain = sums->chain_of[node];
+  float *sum = sums->sums + node * F, *to = chain < 0 ? sum : sums->chains + chain * F;
   for (int64_t c = 0; c < F; c += VW) vstore_upto(to + c, vload_upto(to + c, F - c) + vload(dz + c), F - c);
+  if (chain >= 0 && message_chain_ends(++sums->done[chain], sums->all[chain])) message_end_chain(F, to, sum);
 }
 
 /* dP of the senders of a part; the first round clears them before. */
@@ -139,7 +184,7 @@ static void message_add_to_senders(const message_backward_job *job, int64_t part
         __builtin_prefetch(job->out->of_senders + senders[ahead] * F + c, 1);
       }
       const int32_t m = job->by_part[i];
-      message_add_row(F, job->dz + m * job->w.row, job->out->of_senders + senders[m] * F);
+      message_add_row(&job->dP, senders[m], F, job->dz + m * job->w.row);
     }
   }
 }
@@ -157,7 +202,7 @@ static void message_add_to_receivers(const message_backward_job *job, int64_t pa
     float *dQ = job->out->of_receivers + r * F;
     if (offsets[r] >= job->begin) memset(dQ, 0, (size_t)F * sizeof *dQ);
     for (int64_t m = max64(offsets[r], job->begin); m < min64(offsets[r + 1], job->end); m++)
-      message_add_row(F, job->dz + (m - job->begin) * job->w.row, dQ);
+      message_add_row(&job->dQ, r, F, job->dz + (m - job->begin) * job->w.row);
   }
 }
 
@@ -207,7 +252,8 @@ static ast_status message_backward(const ast_message *step, const float *restric
                       [MESSAGE_DBETA] = {.to = out->beta, .rows = 1, .n = step->F2},
                       [MESSAGE_Da1] = {.to = out->a1, .rows = 1, .n = step->H}};
   job.partials = dense_place_sums(sums, MESSAGE_SUMS);
-  if (!job.part_offsets || !job.by_part || !job.dz || !dA1 || !dense_new_partials(&job.partials, job.tasks))
+  if (!job.part_offsets || !job.by_part || !job.dz || !dA1 || !dense_new_partials(&job.partials, job.tasks) ||
+      !message_new_all_sums(&job))
     return AST_NO_MEMORY;
   if (!step->M) dense_start_chunk(&job.partials, 0, true);
   status = message_rounds(&job);

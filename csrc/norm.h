@@ -3,9 +3,13 @@
  *   u = (y - mean(y)) / sd,   sd = sqrt(var(y) + eps),   out = gamma . u + beta
  *   p = gamma . dout,   dy = (p - mean(p) - u mean(p . u)) / sd,   dgamma = sum of dout . u,   dbeta = sum of dout
  *
- * The variance is the mean of squared differences to the mean, in a second pass over a row in the cache. Rows are
- * readable and writable up to whole vectors; `whole`, a constant, says that n is a multiple of VW, so that no vector
- * asks for its tail.
+ * The mean is that of the differences y - y_0 to the first value, the variance that of their squared differences to it,
+ * in a second pass over a row in the cache. Of nearly equal values the differences are exact; of a large mean the
+ * rounding would stay in all of them. No difference is larger than twice the largest one to the mean, so none loses
+ * digits that count.
+ *
+ * Rows are readable and writable up to whole vectors; `whole`, a constant, says that n is a multiple of VW, so that no
+ * vector asks for its tail.
  */
 #ifndef AST_NORM_H
 #define AST_NORM_H
@@ -19,17 +23,26 @@ static const float NORM_EPSILON = 1e-5f;
 /* the first n lanes of x, 0 in the others */
 AST_INLINE vf norm_lanes(vf x, int64_t n) { return n >= VW ? x : (vf)((vi)x & (LANE_INDICES < (int32_t)n)); }
 
+/* 1 / sd of n differences to the mean whose squares are too large for a float; NaN if one of them is not finite. */
+static __attribute__((noinline)) float norm_of_large(const float *d, int64_t n) {
+  float squares = 0;
+  for (int64_t c = 0; c < n; c++) squares += (0x1p-100f * d[c]) * (0x1p-100f * d[c]);
+  return squares < INFINITY ? 0x1p-100f / sqrtf(squares / (float)n) : NAN;
+}
+
 /* y becomes y - mean(y), 0 behind its n channels; returns 1 / sd, the factor that makes u of it. */
 AST_INLINE float norm_centre(float *y, int64_t n, const bool whole) {
+  const vf first = vsplat(y[0]);
   vf sum = {0}, squares = {0};
-  for (int64_t c = 0; c < n; c += VW) sum += whole ? vload(y + c) : norm_lanes(vload(y + c), n - c);
-  const float mean = vsum(sum) / (float)n;
+  for (int64_t c = 0; c < n; c += VW) sum += whole ? vload(y + c) - first : norm_lanes(vload(y + c) - first, n - c);
+  const float mean = vsum(sum) / (float)n; /* of y - y_0 */
   for (int64_t c = 0; c < n; c += VW) {
-    const vf d = whole ? vload(y + c) - mean : norm_lanes(vload(y + c) - mean, n - c);
+    const vf difference = (vload(y + c) - first) - mean, d = whole ? difference : norm_lanes(difference, n - c);
     squares += d * d;
     vstore(y + c, d);
   }
-  return 1 / sqrtf(vsum(squares) / (float)n + NORM_EPSILON);
+  const float variance = vsum(squares) / (float)n;
+  return variance < INFINITY ? 1 / sqrtf(variance + NORM_EPSILON) : norm_of_large(y, n);
 }
 
 /* gamma . u + beta of the lanes from channel c on, u = scale (y - mean(y)) */

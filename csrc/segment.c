@@ -5,7 +5,8 @@
  *
  * N rows n, C segments c, F channels; s_c is 1, or 1 over the rows of c. N F operations on 4 (N + C) F bytes: memory is
  * the limit. A segment is summed in the stored order, so the result depends on neither threads nor batch. The sum over
- * all rows goes by blocks of COLUMN_ROWS, whose sums are then added in order.
+ * all rows goes by blocks of COLUMN_ROWS, whose sums are then added by halves: one chain of them would collect rounding
+ * errors.
  */
 #include "ast.h"
 #include "simd.h"
@@ -104,7 +105,8 @@ typedef struct {
   float *sums; /* [blocks, F] */
 } column_job;
 
-static void add_rows(const float *restrict x, int64_t rows, int64_t F, float *restrict sum) {
+/* sum = the sum of some rows */
+static void column_add_rows(const float *restrict x, int64_t rows, int64_t F, float *restrict sum) {
   for (int64_t f = 0; f < F; f++) sum[f] = 0;
   for (int64_t n = 0; n < rows; n++)
     for (int64_t f = 0; f < F; f++) sum[f] += x[n * F + f];
@@ -113,16 +115,20 @@ static void add_rows(const float *restrict x, int64_t rows, int64_t F, float *re
 static ast_status column_sum_task(int64_t index, void *context) {
   const column_job *job = context;
   const int64_t first = index * COLUMN_ROWS;
-  add_rows(job->x + first * job->F, min64(COLUMN_ROWS, job->N - first), job->F, job->sums + index * job->F);
+  column_add_rows(job->x + first * job->F, min64(COLUMN_ROWS, job->N - first), job->F, job->sums + index * job->F);
   return AST_OK;
 }
 
 static ast_status column_sum(const float *restrict x, int64_t N, int64_t F, float *restrict out) {
   AST_SCRATCH_SCOPE;
-  const int64_t blocks = divide_up(N, COLUMN_ROWS);
+  const int64_t blocks = max64(1, divide_up(N, COLUMN_ROWS));
   column_job job = {x, N, F, ast_scratch(blocks * F * (int64_t)sizeof *job.sums)};
   if (!job.sums) return AST_NO_MEMORY;
   const ast_status status = ast_parallel(blocks, column_sum_task, &job);
-  if (status == AST_OK) add_rows(job.sums, blocks, F, out);
-  return status;
+  if (status != AST_OK) return status;
+  for (int64_t step = 1; step < blocks; step *= 2)
+    for (int64_t b = 0; b + step < blocks; b += 2 * step)
+      for (int64_t f = 0; f < F; f++) job.sums[b * F + f] += job.sums[(b + step) * F + f];
+  memcpy(out, job.sums, (size_t)F * sizeof *out);
+  return AST_OK;
 }

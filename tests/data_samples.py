@@ -20,6 +20,7 @@ from ast_sim.dataset.layout import (
 )
 from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.scene import NodeType, Scene, Trajectory
+from ast_sim.simulate.shapes.mesh import second_order
 
 
 def block(nx: int, ny: int, nz: int, material: np.ndarray | None = None) -> Scene:
@@ -40,6 +41,13 @@ def block(nx: int, ny: int, nz: int, material: np.ndarray | None = None) -> Scen
         body=np.zeros(len(points), np.int32),
         material=material,
     )
+
+
+def raised(scene: Scene) -> Scene:
+    """The block with nodes in the middles of its edges: second-order tetrahedra."""
+    position, elements = second_order(scene.rest_position.astype(float), scene.elements)
+    types = np.where(position[:, 0] == 0, NodeType.HANDLE, NodeType.NORMAL).astype(np.uint8)
+    return Scene(np.float32(position), np.int32(elements), types, np.zeros(len(position), np.int32), scene.material)
 
 
 def trajectory(

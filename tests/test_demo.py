@@ -2,14 +2,17 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
+from chosen_figures import NOTHING_ASKED, evaluation
 from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import demo
 from ast_sim.cli import main
 from ast_sim.dataset.reader import Dataset
 from ast_sim.demo import FULL, QUICK, Size, headlines
+from ast_sim.figures import Beside
 
 TINY = Size(train=1, valid=1, test=1, steps=4)
 FILES = ("report.html", "prediction.pvd", "picture.png", "evaluation.json", "data.h5", "run/config.toml")
@@ -28,9 +31,9 @@ def made(tmp_path_factory):
 def figures(folder) -> dict:
     """The evaluation without what a clock or a place decides."""
     found = json.loads((folder / "evaluation.json").read_text())
-    for sample in found["samples"]:
-        del sample["model_seconds_per_step"], sample["solver_seconds_per_step"]
-    return {key: found[key] for key in ("samples", "summary", "failures", "step")}
+    for scene in found["scenes"]:
+        del scene["model_seconds_per_step"], scene["solver_seconds_per_step"]
+    return {**{key: found[key] for key in ("scenes", "errors", "failures")}, "step": found["origin"]["step"]}
 
 
 def test_everything_is_made(made):
@@ -40,9 +43,9 @@ def test_everything_is_made(made):
     with Dataset(made / "data.h5") as dataset:
         assert dataset.splits == {"train": 1, "valid": 1, "test": 1}
     found = json.loads((made / "evaluation.json").read_text())
-    assert found["command"] == f"ast-sim demo --out {made} --quick --seed 0"
+    assert found["origin"]["command"] == f"ast-sim demo --out {made} --quick --seed 0"
     assert (found["speedup"] is None) == (found["threads"] > 1)
-    assert found["step"] in (1, 2, 3, 4)
+    assert found["origin"]["step"] in (1, 2, 3, 4)
 
 
 def test_again_in_the_same_folder_reuses_the_parts_and_other_settings_are_refused(made, monkeypatch, capsys):
@@ -72,45 +75,25 @@ def test_the_same_seed_gives_the_same_numbers_elsewhere(made, tmp_path, monkeypa
 
 
 def test_headlines_are_shares_of_the_trivial_predictors():
-    def summary(quantity, nodes, value):
-        return {quantity: {"rollout_all": {nodes: {"rmse_sequence": value}}}}
-
-    found = {
-        "length_unit": "m",
-        "stress_unit": "Pa",
-        "summary": {
-            "model": {**summary("displacement", "normal", 0.002), **summary("stress", "deforming", 600.0)},
-            "hold_still": summary("displacement", "normal", 0.01),
-            "stress_frame_mean": summary("stress", "deforming", 1000.0),
-        },
-        "failures": 1,
-        "samples": [{}, {}],
-        "asked": {
-            "relative_error": 0.0712,
-            "seconds": 0.0251,
-            "by_calls": [0.16, 0.0712],
-            "unsettled": 0,
-            "stress_share": 0.5,
-            "largest_stress": 0.08,
-            "solver": {
-                "scenes": 3,
-                "seconds": 0.06,
-                "ratio": 2.4,
-                "cheapest_scenes": 2,
-                "cheapest_seconds": 0.03,
-                "cheapest_ratio": 1.2,
-            },
-        },
-    }
-    assert headlines(found) == [
-        "displacement error over whole rollouts: 0.002 m, 20 % of that of holding still",
-        "stress error over whole rollouts: 600 Pa, 60 % of that of each frame's true mean",
+    asked = replace(
+        NOTHING_ASKED,
+        relative_error=0.0712,
+        seconds=0.0251,
+        by_calls=(0.16, 0.0712),
+        stress_share=0.5,
+        largest_stress=0.08,
+        solver=Beside(scenes=3, seconds=0.06, model_seconds=0.025, ratio=2.4),
+        cheapest=Beside(scenes=2, seconds=0.03, model_seconds=0.025, ratio=1.2),
+    )
+    assert headlines(evaluation({"a": 1e-3, "b": None}, asked=asked)) == [
+        "displacement error over whole rollouts: 0.00143 m, 22 % of the error of holding still",
+        "stress error over whole rollouts: 6.78e+03 Pa, 60 % of the error of each frame's true mean",
         "1 of 2 rollouts failed",
-        "the deepest frame at once: error 7.12 % of the displacement, 25.1 ms on one thread",
+        "the deepest frame at once: error 7.12 % of the displacement, 25.1 ms in the median, on one thread",
         "  after each call, and each Newton step: 16, 7.12 %",
         "  stress: 0.50 of the error of the frame's true mean; the largest is 8 % off",
-        "  the solver for this frame: 60 ms, 2.4 times as long (mean of 3 scenes, one thread)",
-        "  its cheapest way with at most the model's error: 30 ms, 1.2 times as long (2 scenes)",
+        "  the solver for this frame: 60 ms, 2.4 times as long (medians of 3 scenes, one thread)",
+        "  its fastest setting that is as accurate: 30 ms, 1.2 times as long (medians of 2 scenes, one thread)",
     ]
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from ast_sim.importers.formats.vtk_files import READING_MODULE
 from ast_sim.simulate.families.names import FAMILIES, MODULES
 from ast_sim.simulate.jobs.pool import WORKER_MODULE
 from ast_sim.simulate.jobs.rival import RIVAL_MODULE
@@ -79,7 +80,7 @@ def test_a_name_means_one_thing():
     assert not [name for name, count in names.items() if count > 1]
 
 
-@pytest.mark.parametrize("module", [WORKER_MODULE, RIVAL_MODULE, MESHING_MODULE, *MODULES.values()])
+@pytest.mark.parametrize("module", [WORKER_MODULE, RIVAL_MODULE, MESHING_MODULE, READING_MODULE, *MODULES.values()])
 def test_modules_named_by_strings_are_there(module):
     """The check of imports does not see them."""
     assert find_spec(module) is not None
@@ -90,7 +91,7 @@ def test_modules_are_named_by_strings_only_where_a_test_looks():
     assert MODULES.keys() == FAMILIES.keys()
     by_string = re.compile(r"import_module\(|find_spec\(|\"-m\"|__import__\(")
     found = {path.stem for path in MODULE_FILES if by_string.search(path.read_text(encoding="utf-8"))}
-    known = {"__init__", "errors", "gmsh_process", "names", "pool"}
+    known = {"__init__", "errors", "gmsh_process", "names", "pool", "vtk_files"}
     assert found <= known, "resolve the module it names in the test above"
 
 

@@ -99,7 +99,7 @@ def test_a_good_scene_and_trajectory_pass():
         ({"rest_position": np.zeros((5, 2), np.float32)}, r"rest_position has the shape \[5, 2\], must be \[any, 3\]"),
         ({"rest_position": np.zeros((5, 3))}, "rest_position must be float32, not float64"),
         ({"elements": np.zeros((2, 4), np.int64)}, "elements must be int32, not int64"),
-        ({"elements": np.array([[0, 1, 2, 3, 4]], np.int32)}, "3 nodes .* or 4 .*, not 5"),
+        ({"elements": np.array([[0, 1, 2, 3, 4]], np.int32)}, r"3 nodes \(triangle\), 4 or 10 \(tetrahedron\), not 5"),
         ({"elements": np.array([[0, 1, 2, 5]], np.int32)}, "element 0 refers to node 5, but the nodes are 0 to 4"),
         ({"elements": np.array([[0, 1, 2, 3], [0, 1, -1, 2]], np.int32)}, "element 1 refers to node -1"),
         ({"elements": np.array([[0, 1, 2, 1]], np.int32)}, r"element 0 refers to a node twice: \[0, 1, 2, 1\]"),

@@ -12,6 +12,7 @@ from functools import cache
 import numpy as np
 from scipy.sparse.linalg import splu
 
+from ast_sim.element_topology import linear_elements
 from ast_sim.scene import Scene, connected_parts
 
 RIGID = 1e-3  # prescribed nodes move as a rigid body if no node is farther off, as a share of the largest displacement
@@ -83,7 +84,8 @@ def harmonic_extension(scene: Scene, held: np.ndarray, free: np.ndarray) -> Call
     """A function from the displacements [H, 3] of the held nodes of a body to those [F, 3] of its free nodes."""
     import igl  # takes 0.2 s; only bodies whose handles do not move rigidly need it
 
-    laplacian = -igl.cotmatrix(scene.rest_position.astype(np.float64), scene.elements.astype(np.int64)).tocsr()
+    elements = linear_elements(scene.elements.astype(np.int64))
+    laplacian = -igl.cotmatrix(scene.rest_position.astype(np.float64), elements).tocsr()
     part = connected_parts(scene.elements, scene.num_nodes)
     rows = np.flatnonzero(np.isin(part[free], part[held]))
     if not len(rows):

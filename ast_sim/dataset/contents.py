@@ -9,14 +9,17 @@ from typing import Any
 import numpy as np
 
 from ast_sim.dataset.reader import Dataset
+from ast_sim.plausibility.findings import Finding, told
+from ast_sim.plausibility.motion import in_trajectory
 from ast_sim.scene import NodeType
 from ast_sim.support.errors import printable
 
 
 def describe_dataset(path: Path) -> dict[str, Any]:
     """Counts, sizes, fields and units of a dataset; every trajectory is read and checked."""
+    findings: list[tuple[str, Finding]] = []
     with Dataset(path) as dataset:
-        splits = {split: _describe_split(dataset, split) for split, count in dataset.splits.items() if count}
+        splits = {split: _describe_split(dataset, split, findings) for split, count in dataset.splits.items() if count}
         return {
             "kind": "dataset",
             "path": str(path),
@@ -24,10 +27,12 @@ def describe_dataset(path: Path) -> dict[str, Any]:
             **dataclasses.asdict(dataset.info),
             "splits": splits,
             "checks": "every trajectory has the right shapes, finite numbers and indices in range",
+            "looks_wrong": [{"trajectory": name, **dataclasses.asdict(finding)} for name, finding in findings],
         }
 
 
-def _describe_split(dataset: Dataset, split: str) -> dict[str, Any]:
+def _describe_split(dataset: Dataset, split: str, findings: list[tuple[str, Finding]]) -> dict[str, Any]:
+    """What a split holds; what looks wrong in it is added to the findings."""
     sizes, truncated, outside = [], [], []
     lowest, highest, largest = np.full(3, np.inf), np.full(3, -np.inf), 0.0
     fields: dict[str, str] = {}
@@ -35,6 +40,7 @@ def _describe_split(dataset: Dataset, split: str) -> dict[str, Any]:
     for index in range(dataset.count(split)):
         trajectory = dataset.load(split, index)
         scene = trajectory.scene
+        findings += [(f"{split}/{index:06d}", finding) for finding in in_trajectory(trajectory)]
         sizes.append((scene.num_nodes, scene.num_elements, trajectory.num_frames))
         for kind in NodeType:
             types[kind.name] += int((scene.node_type == kind).sum())
@@ -74,6 +80,8 @@ def _field(array: Any) -> str:
 
 def text(facts: dict[str, Any], indent: str = "") -> str:
     """The facts as lines of text; the facts of a nested dictionary are indented. Control characters are escaped."""
+    facts = dict(facts)
+    findings = [(one["trajectory"], Finding(*list(one.values())[1:])) for one in facts.pop("looks_wrong", ())]
     lines = []
     width = max((len(key) for key, value in facts.items() if not isinstance(value, dict)), default=0)
     for key, value in facts.items():
@@ -82,4 +90,5 @@ def text(facts: dict[str, Any], indent: str = "") -> str:
         else:
             shown = ", ".join(map(str, value)) if isinstance(value, list | tuple) else value
             lines.append(printable(f"{indent}{key:{width}}  {'none' if shown in (None, '') else shown}"))
+    lines += map(printable, told(findings))
     return "\n".join(lines)

@@ -100,7 +100,7 @@ class Dataset:
 
     @property
     def element_size(self) -> int:
-        """The number of nodes per element in every scene: 3 or 4."""
+        """The number of nodes per element in every scene: 3, 4 or 10."""
         return self._first_kind()[0]
 
     def count(self, split: str) -> int:
@@ -140,28 +140,29 @@ class Dataset:
     def load(self, split: str, index: int) -> Trajectory:
         """A trajectory without its `cauchy_stress`, which is large; `dataset[split][index]` has it."""
         position, stress = self.frames(split, index, 0, self.num_frames(split, index))
+        frames, times = self._numbering(split, index)
         trajectory = Trajectory(
             self.scene(split, index),
             position,
             stress,
             self.attributes(split, index),
             stress_location=self.info.stress_location,
-            **self._numbering(split, index),
+            frames=frames,
+            times=times,
             length_unit=self.info.length_unit,
         )
         trajectory._check_numbering(self._name(split, index))
         return trajectory
 
-    def _numbering(self, split: str, index: int) -> dict[str, tuple | None]:
+    def _numbering(self, split: str, index: int) -> tuple[tuple[int, ...] | None, tuple[float, ...] | None]:
         """The numbers and the times of the frames of a trajectory. Without times of its own, they follow from the time
         step of the dataset."""
         stored = self._file.attributes(self._group(split, index))
-        with self._file.reading(f"{self._name(split, index)}: the numbers of its frames"):
-            frames = tuple(int(number) for number in stored["frames"]) if "frames" in stored else None
-            times = tuple(stored["times"]) if "times" in stored else None
+        frames, times = (_listed(stored.get(key)) for key in NUMBERING)
+        numbers = None if frames is None else tuple(int(number) for number in frames)
         if times is None:
-            times = self.info.times(range(self.num_frames(split, index)) if frames is None else frames)
-        return {"frames": frames, "times": times}
+            times = self.info.times(range(self.num_frames(split, index)) if numbers is None else numbers)
+        return numbers, times
 
     def fingerprint(self) -> str:
         """The SHA-256 of what the dataset says of itself and of the hashes of all its trajectories."""
@@ -314,6 +315,11 @@ class Dataset:
             size = sum(array.nbytes for array in chain.from_iterable(arrays))
             self._kept[split] = size <= min(CACHE_BYTES, self._file.size)
         return self._kept[split]
+
+
+def _listed(value: AttributeValue | None) -> tuple[float, ...] | None:
+    """The numbers of an attribute; None if it is missing or no list."""
+    return tuple(value) if isinstance(value, list) else None
 
 
 class Split(Sequence[Trajectory]):

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ast_sim.importers.mesh_file import MeshFile
-from ast_sim.importers.vtu import FieldNames, frames
+from ast_sim.importers.formats.source_mesh import SourceMesh
+from ast_sim.importers.series import FieldNames, frames
 from ast_sim.scene import NodeType, Trajectory
 from ast_sim.support.errors import DatasetError
 
@@ -57,12 +57,13 @@ def _missing(trajectory: Trajectory) -> list[str]:
     return missing
 
 
-def _unused(frame: MeshFile, names: FieldNames) -> list[tuple[str, str]]:
+def _unused(frame: SourceMesh, names: FieldNames) -> list[tuple[str, str]]:
     """(option, name) of the fields that were not used. If only some options can be told, "|" separates them."""
     used = {names.displacement or "displacement", names.stress or "von_mises", names.node_type or "node_type"}
     used |= {names.obstacle, names.handle, names.body or "body", *names.material}
     found = []
-    for place, fields in frame.fields.items():
+    of_cells = {name: np.concatenate(parts) for name, parts in frame.cell_fields.items()}
+    for place, fields in (("point", frame.point_fields), ("cell", of_cells)):
         for name, values in fields.items():
             if name not in used and values.dtype.kind in "iufb":
                 found.append((_option(place, name, values.reshape(len(values), -1)), name))

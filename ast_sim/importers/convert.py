@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -14,7 +15,12 @@ from ast_sim.dataset.layout import SPLITS
 from ast_sim.dataset.writer import FittedWriter
 from ast_sim.importers.completeness import require_complete
 from ast_sim.importers.deepmind import convert_deepmind, is_deepmind
-from ast_sim.importers.vtu import FieldNames, natural_order, read_series
+from ast_sim.importers.frame_order import files_of_frames, natural_order
+from ast_sim.importers.frames_in_file import ONE_FRAME, WITH_FRAMES, holds_frames
+from ast_sim.importers.series import FieldNames, read_series
+from ast_sim.plausibility.findings import Finding, refusal, told
+from ast_sim.plausibility.motion import in_trajectory
+from ast_sim.scene import Trajectory
 from ast_sim.support.errors import DatasetError
 
 SHARES = {"train": 0.8, "valid": 0.1, "test": 0.1}
@@ -50,14 +56,15 @@ def convert_series(
     time_step: float = 0.0,
     length_unit: str = "m",
     incomplete: bool = False,
-    progress: Callable[[str], None] = lambda line: None,
+    strict: bool = False,
+    progress: Callable[[str], None] | None = None,
 ) -> dict[str, int]:
-    """Import simulations from PVD, VTU and VTKHDF files as a dataset.
+    """Import the simulations of other programs as a dataset.
 
     Args:
-        source: one simulation is a `.pvd` or `.vtkhdf` file or a folder of `.vtu` files. The source is one simulation,
-            or a folder that holds several, at any depth; then the path within the source, without suffix, names a
-            simulation.
+        source: one simulation is a file with all frames (`.vtkhdf`, `.frd`, `.xdmf`, `.exo`, d3plot), a `.pvd` file, or
+            a folder with a file for each frame (`.vtu`, `.pvtu`, `.vtk`). The source is one simulation, or a folder
+            that holds several, at any depth; then the path within the source, without suffix, names a simulation.
         out: the dataset file; it is written whole or not at all.
         names: the names of the fields in the files; see `FieldNames` for the defaults.
         splits: for each of "train", "valid" and "test" either the names of its simulations (a simulation that is not
@@ -65,7 +72,9 @@ def convert_series(
             A split whose share is above 0 gets at least one simulation. The default is 0.8, 0.1, 0.1; it needs three.
         integration, contact_radius, time_step, length_unit: as in `DatasetInfo`.
         incomplete: accept simulations in which nothing moves, nothing is prescribed or nothing can be learnt.
-        progress: called with a line of text after each simulation.
+        strict: refuse simulations in which something looks wrong; see `ast_sim.plausibility`.
+        progress: called with a line of text after each simulation, and with a table of what looks wrong at the end.
+            None: what looks wrong is a warning.
 
     Returns:
         The number of trajectories in each split. The dataset's positions are relative to its `generator["origin"]`, in
@@ -77,24 +86,45 @@ def convert_series(
     source, names = Path(source), names or FieldNames()
     found = find_series(source)
     chosen = _assign(source, list(found), splits, seed)
-    origin = None
     made_by = {"program": "ast_sim convert", "source": str(source), "names": asdict(names), "seed": seed}
     facts = {"contact_radius": contact_radius, "time_step": time_step, "length_unit": length_unit}
-    facts |= {"family": source.stem, "integration": integration}
+    facts |= {"family": source.stem, "integration": integration, "generator": made_by}
+    findings: list[tuple[str, Finding]] = []
     with FittedWriter(out, stress_location="none", **facts) as writer:
-        for split, name in chosen:
-            trajectory = read_series(found[name], names, origin)
-            if not incomplete:
-                require_complete(found[name], trajectory, names)
-            if origin is None:
-                origin = np.array(trajectory.attributes.get("origin", [0.0, 0.0, 0.0]))
-                place, made_by = trajectory.stress_at, {**made_by, "origin": origin.tolist()}
-                writer.info = replace(writer.info, stress_location=place, generator=made_by)
+        for split, name, trajectory in _trajectories(found, chosen, names, incomplete):
+            if not any(writer.counts.values()):
+                made_by["origin"] = trajectory.attributes.get("origin", [0.0, 0.0, 0.0])
+                writer.info = replace(writer.info, stress_location=trajectory.stress_at, generator=made_by)
+            findings += [(name, finding) for finding in in_trajectory(trajectory)]
             writer.add(split, trajectory)
-            size = f"{trajectory.num_frames} frames of {trajectory.scene.num_nodes} nodes"
-            notes = trajectory.attributes.get("notes")
-            progress(f"{split}: {name}, {size}" + (f"; {notes}" if notes else ""))
+            if progress is not None:
+                progress(_line(split, name, trajectory))
+        if findings and strict:
+            raise DatasetError(f"{source}: {refusal(findings)}")
+    for line in told(findings):
+        warnings.warn(line, stacklevel=2) if progress is None else progress(line)
     return writer.counts
+
+
+def _trajectories(
+    found: Mapping[str, Path], chosen: Sequence[tuple[str, str]], names: FieldNames, incomplete: bool
+) -> Iterator[tuple[str, str, Trajectory]]:
+    """The split, the name and the trajectory of each chosen simulation; all have the origin of the first."""
+    origin = None
+    for split, name in chosen:
+        trajectory = read_series(found[name], names, origin)
+        if not incomplete:
+            require_complete(found[name], trajectory, names)
+        if origin is None:
+            origin = np.array(trajectory.attributes.get("origin", [0.0, 0.0, 0.0]))
+        yield split, name, trajectory
+
+
+def _line(split: str, name: str, trajectory: Trajectory) -> str:
+    """What was read of a simulation."""
+    size = f"{trajectory.num_frames} frames of {trajectory.scene.num_nodes} nodes"
+    notes = trajectory.attributes.get("notes")
+    return f"{split}: {name}, {size}" + (f"; {notes}" if notes else "")
 
 
 def find_series(source: Path) -> dict[str, Path]:
@@ -110,17 +140,20 @@ def find_series(source: Path) -> dict[str, Path]:
         for path in _series_in(source)
     }
     if not found:
-        raise DatasetError(f"{source}: neither the folder nor a folder in it holds .pvd, .vtkhdf or .vtu files")
+        known = ", ".join((".pvd", *WITH_FRAMES, *ONE_FRAME))
+        raise DatasetError(f"{source}: neither the folder nor a folder in it holds files of results: {known}")
     return found
 
 
 def _series_in(folder: Path) -> Iterator[Path]:
-    """The simulations in a folder. If it holds .pvd or .vtkhdf files, only these count: .pvd files list .vtu files."""
+    """The simulations in a folder. If it holds files with all frames or .pvd files, only these count: .pvd files list
+    files of frames."""
     entries = sorted(folder.iterdir(), key=natural_order)
-    collections = [entry for entry in entries if entry.suffix in (".pvd", ".vtkhdf")]
+    files = [entry for entry in entries if entry.is_file() and not entry.name.startswith(".")]
+    collections = [entry for entry in files if entry.suffix.lower() == ".pvd" or holds_frames(entry)]
     if collections:
         yield from collections
-    elif any(entry.suffix == ".vtu" for entry in entries):
+    elif files_of_frames(folder):
         yield folder
     else:
         for entry in entries:

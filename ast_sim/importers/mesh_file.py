@@ -1,46 +1,66 @@
-"""A mesh of tetrahedra or triangles with its fields, from a file that meshio reads."""
+"""A mesh of tetrahedra or triangles with its fields, from a file of any format that is known, or from a mesh in memory.
+
+Every mesh comes this way: results that are converted, a scene that is predicted, a part of an assembly.
+"""
 
 from __future__ import annotations
 
-import contextlib
-import io
-import string
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ast_sim.importers.places import Mask
+from ast_sim.importers.formats.source_mesh import SourceMesh, from_meshio
+from ast_sim.importers.frames_in_file import frames_in
+from ast_sim.importers.places import Mask, marked
 from ast_sim.importers.shells import Shells, find_shells
-from ast_sim.importers.vtu_sizes import require_declared_sizes
-from ast_sim.scene import NodeType, Scene, connected_parts, require_nodes
+from ast_sim.importers.solids.mesh_elements import Elements, elements_of
+from ast_sim.importers.solids.stitching import Stitching
+from ast_sim.scene import NodeType, Scene, connected_parts
 from ast_sim.support.errors import DatasetError
 
 if TYPE_CHECKING:
     import meshio
 
-# The kinds of cells that become elements, by meshio's names, and their numbers of corners.
-_CORNERS = {"tetra": 4, "triangle": 3}
-
 
 @dataclass(frozen=True, eq=False)
 class MeshFile:
-    """Points [n, 3] float64, elements [E, 3 or 4] int64, fields by place ("point" or "cell") and name, notes on cells
-    that were left out, and the numbers of the nodes of each named group.
+    """The elements of a file.
 
-    If there are `shells` beside the tetrahedra, their layers are among the elements and the points; see `Shells`.
+    Attributes:
+        source: what the file holds.
+        points: [n, 3] float64: the points of the file, and after them those behind its shells.
+        elements: [E, 3 or 4] int64; tetrahedra have a positive volume.
+        node_rows: [n] the point of the file that a point stands for: itself, or the one in front of it.
+        element_rows: [E] the cell of the file that an element is part of, counted over all blocks.
+        notes: sentences on what was not taken as it is.
+        groups: the numbers of the points of each named group.
+        shells: if there are shells beside the tetrahedra; their layers are among the elements and the points.
     """
 
-    path: Path
+    source: SourceMesh
     points: np.ndarray
     elements: np.ndarray
-    fields: dict[str, dict[str, np.ndarray]]
+    node_rows: np.ndarray
+    element_rows: np.ndarray
     notes: list[str]
     groups: dict[str, np.ndarray]
     shells: Shells | None = None
+
+    @property
+    def path(self) -> Path:
+        return self.source.path
+
+    @cached_property
+    def fields(self) -> dict[str, dict[str, np.ndarray]]:
+        """The fields at a place, "point" [n, ...] or "cell" [E, ...], by name."""
+        cells = {name: np.concatenate(parts)[self.element_rows] for name, parts in self.source.cell_fields.items()}
+        points = {name: np.asarray(values)[self.node_rows] for name, values in self.source.point_fields.items()}
+        return {"point": points, "cell": cells}
 
     @property
     def shell_nodes(self) -> np.ndarray:
@@ -51,18 +71,13 @@ class MeshFile:
         return nodes
 
     def field(self, place: str, name: str) -> np.ndarray:
-        """A field of a `place`, "point" or "cell", as [rows, columns] float64.
+        """A field of a `place`, "point" or "cell", as [n or E, columns] float64.
 
         Raises:
             DatasetError: there is no such field, or it does not hold numbers.
         """
-        fields = self.fields[place]
-        if name not in fields:
-            known = ", ".join(sorted(fields)) or "none"
-            raise DatasetError(f"{self.path}: there is no {place} field {name!r}; there are: {known}")
-        if fields[name].dtype.kind not in "iufb":
-            raise DatasetError(f"{self.path}: the {place} field {name!r} does not hold numbers")
-        return fields[name].astype(np.float64).reshape(len(fields[name]), -1)
+        values = raw_field(self.source, place, name)
+        return values[self.node_rows if place == "point" else self.element_rows]
 
     def numbers(self, place: str, name: str) -> np.ndarray:
         """A field with one number in each row, as [rows]; see `field`."""
@@ -82,22 +97,36 @@ class MeshFile:
         """
 
         def group(name: str) -> np.ndarray:
-            if name not in self.groups:
-                known = ", ".join(sorted(self.groups)) or "none"
-                raise DatasetError(f"{self.path}: there is no group of nodes {name!r}; there are: {known}")
-            return np.isin(nodes, self.groups[name])
+            known = {key.casefold(): key for key in self.groups}
+            key = name if name in self.groups else known.get(name.casefold())
+            if key is None:
+                listed = ", ".join(sorted(self.groups)) or "none"
+                raise DatasetError(f"{self.path}: there is no group of nodes {name!r}; there are: {listed}")
+            return np.isin(nodes, self.groups[key])
 
-        return lambda name: self.numbers("point", name)[nodes] != 0, group
+        return lambda name: self.marks(name)[nodes], group
+
+    def marks(self, name: str) -> np.ndarray:
+        """[n] bool: the points at which a point field is not zero. NaN is no mark: programs fill a field with it where
+        a block lacks the field. A note says at how many points."""
+        values = self.numbers("point", name)
+        unset = int(np.isnan(values[np.unique(self.elements)]).sum())
+        note = f"the field {name!r} is NaN at {unset} nodes: they are not marked"
+        if unset and note not in self.notes:
+            self.notes.append(note)
+        return marked(values)
 
     def whole_numbers(self, place: str, name: str, dtype: type) -> np.ndarray:
         """A field with one whole number in each row, as [rows] of an integer type; see `field`."""
         value, limits = self.numbers(place, name), np.iinfo(dtype)
         wrong = ~((value == np.round(value)) & (value >= limits.min) & (value <= limits.max))
+        if place == "point":
+            wrong &= np.isin(np.arange(len(value)), self.elements)
         if wrong.any():
             row = int(np.argmax(wrong))
             at = f"{'node' if place == 'point' else 'element'} {row}"
             raise DatasetError(f"{self.path}: {name} at {at} is {value[row]:g}; must be a whole number")
-        return value.astype(dtype)
+        return np.where(np.isfinite(value), value, 0).clip(limits.min, limits.max).astype(dtype)
 
     def columns(self, names: Sequence[str]) -> np.ndarray | None:
         """Cell fields with one number in each row as the columns of [E, m] float32; None without names."""
@@ -128,131 +157,98 @@ class MeshFile:
         place = "cell" if wanted in self.fields["cell"] and wanted not in self.fields["point"] else "point"
         if name is None and wanted not in self.fields[place]:
             return None
-        found = self.whole_numbers(place, wanted, np.int32)
+        number = self.whole_numbers(place, wanted, np.int32)
         if place == "point":
-            return found
+            return number
         body = np.zeros(len(self.points), np.int32)
-        body[self.elements] = found[:, None]
-        shared = body[self.elements] != found[:, None]
+        body[self.elements] = number[:, None]
+        shared = body[self.elements] != number[:, None]
         if shared.any():
             row, corner = np.argwhere(shared)[0]
             node = self.elements[row, corner]
             raise DatasetError(
-                f"{self.path}: the bodies {found[row]} and {body[node]} share node {node}; bodies must not share"
+                f"{self.path}: the bodies {number[row]} and {body[node]} share node {node}; bodies must not share"
                 " nodes: give each its own, or name another body field"
             )
         return body
 
 
-def read_mesh(source: Path | meshio.Mesh, curved: bool = False, path: Path = Path("mesh")) -> MeshFile:
-    """The tetrahedra of a file or of a meshio mesh; its triangles if it has no three-dimensional cells.
+def raw_field(mesh: SourceMesh, place: str, name: str) -> np.ndarray:
+    """A field of a file as [points or cells, columns] float64; see `MeshFile.field`."""
+    fields = mesh.point_fields if place == "point" else mesh.cell_fields
+    if name not in fields:
+        known = ", ".join(sorted(fields)) or "none"
+        raise DatasetError(f"{mesh.path}: there is no {place} field {name!r}; there are: {known}")
+    values = mesh.point_fields[name] if place == "point" else np.concatenate(mesh.cell_fields[name])
+    if values.dtype.kind not in "iufb":
+        raise DatasetError(f"{mesh.path}: the {place} field {name!r} does not hold numbers")
+    return values.astype(np.float64).reshape(len(values), -1)
 
-    Triangles and quadrilaterals that touch no tetrahedron are shells. All other cells of a lower dimension are left
-    out. With `curved`, elements of higher order are accepted; only their corners are kept. `path` names a mesh in
-    memory in errors.
+
+def read_mesh(
+    source: Path | meshio.Mesh, path: Path = Path("mesh"), used_fields: tuple[str, ...] = ("node_type", "body")
+) -> MeshFile:
+    """The tetrahedra of a file or of a meshio mesh; its triangles if it has no cells with a volume.
+
+    Hexahedra, prisms and pyramids are cut into tetrahedra; elements of higher order keep their corners only. Triangles
+    and quadrilaterals that touch no tetrahedron are shells. All other cells of a lower dimension are left out. Of a
+    file with several frames the first is taken. `path` names a mesh in memory in errors. Points at one place are not
+    joined where one of the `used_fields` says that they are not alike.
 
     Raises:
         DatasetError: the file is missing, damaged or of an unknown kind, or holds other elements; the text names it.
+        MissingExtra: a reader of the format is not installed.
     """
-    path = source if isinstance(source, Path) else path
-    mesh = _read(source) if isinstance(source, Path) else source
-    corners, blocks = _element_blocks(path, mesh.cells, curved)
-    elements = np.concatenate([mesh.cells[block].data[:, :corners] for block in blocks]).astype(np.int64)
-    points = np.zeros((len(mesh.points), 3))
-    points[:, : mesh.points.shape[1]] = mesh.points
-    require_nodes(str(path), "tetra" if corners == 4 else "triangle", elements, len(points))
-    fields = {
-        "point": {name: np.asarray(values) for name, values in mesh.point_data.items()},
-        "cell": {name: np.concatenate([values[b] for b in blocks]) for name, values in mesh.cell_data.items()},
-    }
-    bare = MeshFile(path, points, elements, fields, _notes(mesh.cells, blocks), node_groups(mesh))
-    return bare if corners == 3 else _with_shells(bare, mesh, blocks)
+    mesh = next(frames_in(source)) if isinstance(source, Path) else from_meshio(source, path)
+    mesh.require_consistent()
+    stitching = Stitching(mesh)
+    stitching.look(mesh, used_fields)
+    return mesh_of(mesh, stitching)
 
 
-def node_groups(mesh: meshio.Mesh) -> dict[str, np.ndarray]:
-    """The numbers of the nodes of each named set of points or cells of the mesh."""
-    groups = {name: np.asarray(nodes, np.int64).ravel() for name, nodes in mesh.point_sets.items()}
-    for name, rows in mesh.cell_sets.items():
-        if not name.startswith("gmsh:"):  # what meshio keeps for itself
-            pairs = zip(mesh.cells, rows, strict=True)
-            nodes = [block.data[np.asarray(chosen, int)].ravel() for block, chosen in pairs if chosen is not None]
-            groups[name] = np.unique(np.concatenate(nodes)) if nodes else np.zeros(0, np.int64)
-    return groups
-
-
-def _with_shells(bare: MeshFile, mesh: meshio.Mesh, blocks: list[int]) -> MeshFile:
-    """The mesh with its shells; the points and fields of each node are those of the node behind it as well."""
-    corners = {index: _shell_corners(block.type) for index, block in enumerate(mesh.cells) if len(block)}
-    flat = [index for index, count in corners.items() if count]
-    cells = [mesh.cells[index].data[:, : corners[index]].astype(np.int64) for index in flat]
-    for index, block in zip(flat, cells, strict=True):
-        require_nodes(str(bare.path), mesh.cells[index].type, block, len(bare.points))
-    if cells and not np.isfinite(bare.points).all():
-        raise DatasetError(f"{bare.path}: point {np.argmin(np.isfinite(bare.points).all(axis=1))} is not finite")
-    shells = find_shells(bare.points, bare.elements, cells) if cells else None
+def mesh_of(mesh: SourceMesh, stitching: Stitching) -> MeshFile:
+    """The elements of a mesh, its points joined where they are one."""
+    point_of, joined = stitching.joined()
+    taken = elements_of(mesh, point_of)
+    unused = len(mesh.points) - len(np.unique(np.concatenate([block.nodes.ravel() for block in mesh.blocks])))
+    told = [f"{unused} points of no element are left out"] if unused else []
+    groups = {name: np.unique(point_of[nodes]) for name, nodes in mesh.groups.items()}
+    notes = [*mesh.notes, *joined]
+    everyone = np.arange(len(mesh.points))
+    shells, rows = _shells(mesh, point_of, taken)
+    notes += _counted(mesh, taken, rows) + taken.notes + told
     if shells is None:
-        return bare
-    kinds = np.repeat([mesh.cells[index].type for index in flat], [len(block) for block in cells])
-    taken = Counter(kinds[np.unique(shells.cells)].tolist())
-    rows = np.repeat(shells.cells, 3)
-    points = np.concatenate([bare.points, shells.behind(bare.points)])
-    fields = {
-        "point": {name: np.concatenate([v, v[shells.nodes]]) for name, v in bare.fields["point"].items()},
-        "cell": {
-            name: np.concatenate([v, np.concatenate([mesh.cell_data[name][index] for index in flat])[rows]])
-            for name, v in bare.fields["cell"].items()
-        },
-    }
-    elements, notes = np.concatenate([bare.elements, shells.tetrahedra(points)]), _notes(mesh.cells, blocks, taken)
-    return MeshFile(bare.path, points, elements, fields, notes, bare.groups, shells)
+        return MeshFile(mesh, mesh.points, taken.nodes, everyone, taken.rows, notes, groups)
+    points = np.concatenate([mesh.points, shells.behind(mesh.points)])
+    return MeshFile(
+        mesh,
+        points,
+        np.concatenate([taken.nodes, shells.tetrahedra(points)]),
+        np.concatenate([everyone, shells.nodes]),
+        np.concatenate([taken.rows, np.repeat(rows, 3)]),
+        notes,
+        groups,
+        shells,
+    )
 
 
-def _shell_corners(kind: str) -> int:
-    """The corners of a cell that may belong to a shell; 0 for other cells."""
-    return {"triangle": 3, "quad": 4}.get(kind.rstrip(string.digits), 0)
+def _shells(mesh: SourceMesh, point_of: np.ndarray, taken: Elements) -> tuple[Shells | None, np.ndarray]:
+    """The shells of a mesh, and the cell of the file that each of their triangles is made of."""
+    flat = [index for index, block in enumerate(mesh.blocks) if block.dimension == 2 and index not in taken.blocks]
+    starts = np.cumsum([0, *(len(block.nodes) for block in mesh.blocks)])
+    numbers = [starts[index] + np.arange(len(mesh.blocks[index].nodes)) for index in flat]
+    cells = [point_of[mesh.blocks[index].corners] for index in flat]
+    shells = find_shells(mesh.points, taken.nodes, cells) if cells else None
+    return shells, np.concatenate(numbers)[shells.cells] if shells is not None else np.zeros(0, np.int64)
 
 
-def _read(path: Path) -> meshio.Mesh:
-    """Read a file by meshio. On a damaged file meshio may raise any error, print, or raise SystemExit."""
-    import meshio
-
-    if not path.is_file():
-        raise DatasetError(f"{path}: there is no such file")
-    if path.suffix == ".vtu":
-        require_declared_sizes(path)
-    printed = io.StringIO()
-    try:
-        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
-            return meshio.read(path)
-    except (Exception, SystemExit) as error:
-        told = " ".join(f"{printed.getvalue()} {error if str(error) != '1' else ''}".split())
-        raise DatasetError(f"{path}: cannot be read as a mesh: {told or type(error).__name__}") from error
-
-
-def _element_blocks(path: Path, cells: list[meshio.CellBlock], curved: bool) -> tuple[int, list[int]]:
-    """The number of corners of the elements, and the blocks of cells that hold them."""
-    dimension = max((block.dim for block in cells if len(block)), default=0)
-    blocks = [index for index, block in enumerate(cells) if block.dim == dimension and len(block)]
-    kinds = {cells[index].type for index in blocks}
-    kinds = {kind.rstrip(string.digits) for kind in kinds} if curved else kinds
-    if len(kinds) != 1 or not kinds <= set(_CORNERS):
-        found = ", ".join(dict.fromkeys(block.type for block in cells)) or "no cells"
-        linear = "" if curved else " (linear)"
-        raise DatasetError(
-            f"{path}: holds {found}; the elements must be tetra or triangle{linear}, all of one kind: mesh the bodies"
-            " with tetrahedra"
-        )
-    return _CORNERS[kinds.pop()], blocks
-
-
-def _notes(cells: list[meshio.CellBlock], blocks: list[int], shells: Counter[str] | None = None) -> list[str]:
-    """What was not taken as it is. `shells` counts the cells that became shells, by kind."""
-    left_out, reduced, shells = Counter(), Counter(), shells or Counter()
-    for index, block in enumerate(cells):
-        if index not in blocks:
-            left_out[block.type] += len(block)
-        elif block.type not in _CORNERS:
-            reduced[block.type] += len(block)
-    told = {"are left out": left_out - shells, "keep their corners only": reduced}
-    told["are shells and become obstacles"] = shells
+def _counted(mesh: SourceMesh, taken: Elements, shell_rows: np.ndarray) -> list[str]:
+    """Notes on the cells that were left out or became shells, by kind."""
+    ends = np.cumsum([len(block.nodes) for block in mesh.blocks])
+    shells = Counter(mesh.blocks[index].label for index in np.searchsorted(ends, np.unique(shell_rows), "right"))
+    left_out: Counter[str] = Counter()
+    for index, block in enumerate(mesh.blocks):
+        if index not in taken.blocks:
+            left_out[block.label] += len(block.nodes)
+    told = {"are left out": left_out - shells, "are shells and become obstacles": shells}
     return [f"{n} cells of the kind {kind} {what}" for what, count in told.items() for kind, n in count.items()]

@@ -11,29 +11,32 @@ import numpy as np
 
 from ast_sim.importers.mesh_file import MeshFile, read_mesh
 from ast_sim.importers.places import Place, parse_places
+from ast_sim.importers.solids.mesh_elements import require_extent
+from ast_sim.plausibility.topology import at_rest
 from ast_sim.scene import NodeType, Scene, nodes_of_body
-from ast_sim.support.errors import ConfigError, DatasetError
+from ast_sim.support.errors import ConfigError
 
 if TYPE_CHECKING:
     import meshio
 
-# A tetrahedron (triangle) is flat if its volume (area) is below this share of its longest edge to the power of 3 (2).
-_FLAT = 1e-6
+# Nodes lie on a line if their second extent, as a share of the first, is below this.
+_ON_A_LINE = 1e-3
 
 Numbers = float | Sequence[float]
 
 
 @dataclass(frozen=True, eq=False)
 class SceneMesh:
-    """A scene, and `notes`: sentences that say how it differs from the mesh."""
+    """A scene; `notes`: sentences that say how it differs from the mesh; `warnings`: what looks wrong in it."""
 
     scene: Scene
     notes: list[str]
+    warnings: list[str]
 
     @property
     def description(self) -> list[str]:
-        """Lines of text, with which a person can check the scene: the scene, each body, the notes."""
-        return describe(self.scene) + self.notes
+        """Lines of text, with which a person can check the scene: the scene, each body, the notes, the warnings."""
+        return [*describe(self.scene), *self.notes, *(f"warning: {text}" for text in self.warnings)]
 
 
 def read_scene(
@@ -46,11 +49,12 @@ def read_scene(
     materials: Mapping[int, Numbers] | Numbers | None = None,
     material_fields: Sequence[str] = (),
 ) -> SceneMesh:
-    """The scene of a mesh: a file that meshio reads, or a mesh in memory.
+    """The scene of a mesh: a file of any known format, or a mesh in memory.
 
-    The elements are the tetrahedra; the triangles if there are no three-dimensional cells. Triangles and quadrilaterals
-    beside tetrahedra that touch none are rigid shells: they become obstacles, thin layers of tetrahedra whose front is
-    the shell. Points that belong to no element are left out. Tetrahedra that are inside out are turned over.
+    The elements are the tetrahedra; hexahedra, prisms and pyramids are cut into them; the triangles if there is none of
+    all these. Triangles and quadrilaterals beside tetrahedra that touch none are rigid shells: they become obstacles,
+    thin layers of tetrahedra whose front is the shell. Points that belong to no element are left out. Tetrahedra that
+    are inside out are turned over, and points that stand several times are joined.
 
     Args:
         obstacles: numbers of the bodies that are rigid and move as prescribed.
@@ -67,11 +71,13 @@ def read_scene(
         DatasetError: the file cannot be read, or a node, an element or a field is wrong; the text names the file.
         ConfigError: there is no such body, a place holds no node, a material is missing, or nothing is prescribed.
     """
-    mesh = read_mesh(Path(source) if isinstance(source, str) else source, curved=True)
+    used_fields = (type_field or "node_type", body_field or "body")
+    mesh = read_mesh(Path(source) if isinstance(source, str) else source, used_fields=used_fields)
     scene, used = mesh.scene(body_field, type_field)
     scene.check(str(mesh.path))
-    scene, turned = _turned_over(scene, mesh.path)
-    scene = replace(scene, node_type=_node_type(mesh, scene, used, obstacles, clamps))
+    require_extent(mesh.path, mesh.points[used], scene.elements)
+    types, doubts = _node_type(mesh, scene, used, obstacles, clamps)
+    scene = replace(scene, node_type=types)
     scene = replace(scene, material=_material(mesh, scene, materials, material_fields))
     if not scene.prescribed.any():
         raise ConfigError(
@@ -79,16 +85,13 @@ def read_scene(
             " for example --clamp 0:xmin"
         )
     scene.check(str(mesh.path))
-    unused = len(mesh.points) - len(used)
-    notes = [*mesh.notes]
-    notes += [f"{unused} points of no element are left out"] if unused else []
-    notes += [f"{turned} tetrahedra that were inside out are turned over"] if turned else []
-    return SceneMesh(scene, notes)
+    looks_wrong = [str(finding) for finding in at_rest(scene)]
+    return SceneMesh(scene, [*mesh.notes], [*doubts, *looks_wrong])
 
 
 def describe(scene: Scene) -> list[str]:
     """A line on the scene, and one on each body: its nodes by type, its elements, its bounding box."""
-    kind = "tetrahedra" if scene.elements.shape[1] == 4 else "triangles"
+    kind = "triangles" if scene.elements.shape[1] == 3 else "tetrahedra"
     body_of_element = scene.body[scene.elements[:, 0]]
     lines = [f"{len(np.unique(scene.body))} bodies, {scene.num_nodes} nodes, {scene.num_elements} {kind}"]
     for body in np.unique(scene.body):
@@ -102,22 +105,22 @@ def describe(scene: Scene) -> list[str]:
     return lines
 
 
-def parse_clamp(text: str) -> tuple[int, list[Place]]:
+def parse_clamp(text: str, known: Iterable[str] = ()) -> tuple[int, list[Place]]:
     """The body and the places of `BODY:PLACE[,PLACE...]`; the nodes of the body in any of these places are clamped.
 
     PLACE is `all`, `xmin`, `z<=0.01`, `0<x<2 and 0<y<1`, `field=NAME`, `group=NAME` and the like: see
-    `ast_sim.importers.places`.
+    `ast_sim.importers.places`. `known` are names of fields and groups, which may hold commas and the word "and".
 
     Raises:
         ConfigError: the text has another form; the error gives examples.
     """
     try:
         body, places = text.split(":", 1)
-        return int(body), parse_places(places)
+        return int(body), parse_places(places, known)
     except ValueError as error:
         raise ConfigError(
             f"the clamp {text!r} cannot be read; write BODY:PLACE, for example 0:xmin, 0:xmin,xmax, 0:z<=0.01, 0:all,"
-            " 0:0<x<2 and 0<y<1, 0:field=NAME or 0:group=NAME"
+            ' 0:0<x<2 and 0<y<1, 0:field=NAME, 0:group=NAME or 0:group="A, B and C"'
         ) from error
 
 
@@ -134,45 +137,57 @@ def parse_material(text: str) -> tuple[int, tuple[float, ...]]:
         raise ConfigError(f"the material {text!r} cannot be read; write BODY=NUMBERS, for example 0=2e5,0.3") from error
 
 
-def _turned_over(scene: Scene, path: Path) -> tuple[Scene, int]:
-    """The scene with all tetrahedra of negative volume turned over, and the number of these tetrahedra."""
-    corners = scene.rest_position[scene.elements].astype(np.float64)
-    edges = corners[:, 1:] - corners[:, :1]
-    longest = np.linalg.norm(corners[:, :, None] - corners[:, None], axis=-1).max(axis=(1, 2))
-    if edges.shape[1] == 3:
-        size, kind = np.linalg.det(edges) / 6, "volume"
-    else:
-        size, kind = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2, "area"
-    flat = np.abs(size) <= _FLAT * longest ** edges.shape[1]
-    if flat.any():
-        row = int(np.argmax(flat))
-        raise DatasetError(
-            f"{path}: element {row} with the nodes {scene.elements[row].tolist()} has no {kind}; {flat.sum()} of"
-            f" {len(flat)} elements have none: repair the mesh"
-        )
-    elements = scene.elements.copy()
-    elements[size < 0, -2:] = elements[size < 0, :-3:-1]
-    return replace(scene, elements=elements), int((size < 0).sum())
-
-
 def _node_type(
     mesh: MeshFile, scene: Scene, used: np.ndarray, obstacles: Iterable[int], clamps: Iterable[str]
-) -> np.ndarray:
-    types = scene.node_type.copy()
+) -> tuple[np.ndarray, list[str]]:
+    """The types of the nodes, and warnings of clamps that hold nodes on a line only."""
+    types, doubts = scene.node_type.copy(), []
     for clamp in clamps:
-        body, places = parse_clamp(clamp)
-        nodes = np.flatnonzero(nodes_of_body(scene.body, body))
-        for place in places:
-            inside = place.inside(mesh.points[used[nodes]], *mesh.masks(used[nodes]))
-            if not inside.any():
-                low, high = (scene.rest_position[nodes].min(axis=0), scene.rest_position[nodes].max(axis=0))
-                raise ConfigError(
-                    f"no node of body {body} lies in {place.text!r}; it reaches from {low.tolist()} to {high.tolist()}"
-                )
-            types[nodes[inside]] = NodeType.HANDLE
+        held = clamped(mesh, scene, used, clamp)
+        types[held] = NodeType.HANDLE
+        if scene.elements.shape[1] == 4 and _on_a_line(mesh.points[used[held]]):
+            body = scene.body[held[0]]
+            doubts.append(
+                f"the clamp {clamp!r} holds {len(held)} nodes, which lie on a line: body {body} could turn around it"
+            )
     for body in obstacles:
         types[nodes_of_body(scene.body, body)] = NodeType.OBSTACLE
-    return types
+    return types, doubts
+
+
+def clamped(mesh: MeshFile, scene: Scene, used: np.ndarray, clamp: str) -> np.ndarray:
+    """[k] the nodes of the scene of a mesh that a clamp holds; the node i is the point `used[i]` of the mesh.
+
+    Raises:
+        ConfigError: the clamp cannot be read, there is no such body, or no node lies there.
+        DatasetError: there is no such field or group.
+    """
+    body, places = parse_clamp(clamp, [*mesh.groups, *mesh.source.point_fields])
+    nodes = np.flatnonzero(nodes_of_body(scene.body, body))
+    shortest, held = _shortest_edge(scene, body), np.zeros(len(nodes), bool)
+    for place in places:
+        inside = place.inside(mesh.points[used[nodes]], *mesh.masks(used[nodes]), shortest)
+        if not inside.any():
+            low, high = (mesh.points[used[nodes]].min(axis=0), mesh.points[used[nodes]].max(axis=0))
+            raise ConfigError(
+                f"no node of body {body} lies in {place.text!r}; it reaches from {low.tolist()} to {high.tolist()}"
+            )
+        held |= inside
+    return nodes[held]
+
+
+def _shortest_edge(scene: Scene, body: int) -> float:
+    ends = scene.elements[scene.body[scene.elements[:, 0]] == body]
+    corners = scene.rest_position[ends].astype(np.float64)
+    lengths = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    return float(lengths.min(initial=np.inf)) if len(ends) else 0.0
+
+
+def _on_a_line(points: np.ndarray) -> bool:
+    if len(points) < 3:
+        return True
+    extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(extents[1] <= _ON_A_LINE * extents[0])
 
 
 def _material(

@@ -11,6 +11,7 @@ import numpy as np
 
 from ast_sim.dataset.layout import LENGTH_UNITS, DatasetInfo
 from ast_sim.dataset.writer import DatasetWriter
+from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.scene import AttributeValue, Scene, Trajectory
 from ast_sim.support.errors import AstSimError
@@ -48,7 +49,7 @@ class Answer:
             mean edge lengths of the surfaces, or the root mean square of the moves over that of the displacements, if
             that is larger. As long as the contact does not change, a next step would be about its square. Frames
             ascend. Empty without Newton steps.
-        driven: the number of the body whose prescribed nodes move farthest in the whole motion.
+        driven: the prescribed nodes that move farthest together in the whole motion.
     """
 
     name: str
@@ -66,7 +67,7 @@ class Answer:
     notes: tuple[str, ...] = ()
     expected_error: float | None = None
     last_steps: tuple[float, ...] = ()
-    driven: int = 0
+    driven: Driven | None = None
 
     @property
     def computed(self) -> np.ndarray:
@@ -103,12 +104,12 @@ class Answer:
         )
 
     def reaction(self) -> np.ndarray | None:
-        """[S, 3] the force in newton that moves the prescribed nodes of the body `driven`.
+        """[S, 3] the force in newton on the prescribed nodes `driven`.
 
         It follows from the strains of the predicted positions, by the solver's own law of the material. None where the
         scene has no Young's modulus and Poisson's ratio.
         """
-        if self.info is None or self.info.family not in ELASTIC or self.scene.material is None:
+        if self.info is None or self.driven is None or self.info.family not in ELASTIC or self.scene.material is None:
             return None
         from ast_sim.mechanics.reaction import Reaction
 

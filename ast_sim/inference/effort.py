@@ -153,14 +153,14 @@ def cheapest_good(measured: Sequence[EffortErrors]) -> Effort:
         measured: means over validation scenes, by effort. If all predictions failed, the first call alone is returned.
     """
     most = max((one.effort.newton_steps for one in measured), default=0)
-    known = [one for one in measured if one.error is not None and one.effort.newton_steps in (0, most)]
-    if not known:
+    errors = {one: one.error for one in measured if one.error is not None and one.effort.newton_steps in (0, most)}
+    if not errors:
         return FIRST_CALL
-    enough = max(GOOD, (1 + WORTH) * min(one.error for one in known))
-    stresses = [one.stress_error for one in known if one.stress_error is not None]
-    enough_stress = max(GOOD_STRESS, (1 + WORTH) * min(stresses, default=math.inf))
-    accurate = [one for one in known if one.error <= enough]
-    both = [one for one in accurate if one.stress_error is None or one.stress_error <= enough_stress]
+    stresses = {one: math.inf if one.stress_error is None else one.stress_error for one in errors}
+    enough = max(GOOD, (1 + WORTH) * min(errors.values()))
+    enough_stress = max(GOOD_STRESS, (1 + WORTH) * min(stresses.values()))
+    accurate = [one for one, error in errors.items() if error <= enough]
+    both = [one for one in accurate if stresses[one] <= enough_stress]
     good = both or accurate
     ended = min(one.unsettled for one in good)
     settled = [one for one in good if one.unsettled <= ended]

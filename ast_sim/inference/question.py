@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ast_sim.inference.answer import Answer
-from ast_sim.mechanics.case import driven_body
+from ast_sim.mechanics.driven import Driven
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.support.errors import ConfigError, RolloutError
@@ -115,13 +115,13 @@ class Question:
             stress_location=config.stress,
             frames=numbers,
             last_steps=last_steps,
-            driven=driven_body(self.scene, self.prescribed_position),
+            driven=Driven.of(self.scene, self.prescribed_position),
         )
 
 
 def _whole_numbers(frames: Iterable[int] | int) -> list[int]:
     """The frames as a list; one number is a frame, too."""
-    listed = np.asarray([frames] if np.ndim(frames) == 0 else list(frames))
+    listed = np.asarray(list(frames) if isinstance(frames, Iterable) else [frames])
     if listed.size and (listed.ndim != 1 or listed.dtype.kind not in "iu"):
         raise ConfigError(f"frames must be whole numbers, one such number, or a slice, not {frames!r}")
     return listed.tolist()

@@ -282,7 +282,8 @@ class Run:
                     self.model, dataset, split, lambda name: bar.advance(), self.effort, rival_scenes, made_from
                 )
             origin = {"run": str(self.path), "step": self.step, "data": str(dataset.path), "split": split}
-            return Evaluation(self, dataset.path, {**provenance(command), **origin, **figures})
+            figures = dataclasses.replace(figures, origin={**provenance(command), **origin})
+            return Evaluation(self, dataset.path, figures)
 
     def report(self, path: str | os.PathLike[str], data: str | os.PathLike[str] | None = None) -> None:
         """Evaluate on the test split and write a page with the results."""

@@ -112,13 +112,3 @@ class Drawn:
                 first = first or error
         assert first is not None
         raise first
-
-
-def driven_body(scene: Scene, targets: np.ndarray) -> int:
-    """The number of the body that moves farthest: the one whose prescribed nodes go farthest along an axis.
-
-    Args:
-        targets: [S,N,3] the positions of the prescribed nodes in each frame; other rows are not read.
-    """
-    travel = np.where(scene.prescribed, np.abs(targets - targets[0]).max(axis=(0, 2)), 0)
-    return int(scene.body[np.argmax(travel)])

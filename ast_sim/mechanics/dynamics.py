@@ -235,7 +235,7 @@ class ClothFrames(Frames):
             **checked,
             residual=solver.residual(),
             contact_area=self.contact.area(solver.state.contact),
-            reaction=float(np.linalg.norm(reactions[self.driven].sum(axis=0))),
+            reaction=float(np.linalg.norm(reactions[self.driven.nodes].sum(axis=0))),
             elastic_energy=solver.elastic_energy(),
             contact_energy=solver.state.contact.barrier_energy(),
             kinetic_energy=solver.kinetic_energy(),

@@ -15,8 +15,8 @@ from typing import Protocol
 
 import numpy as np
 
-from ast_sim.mechanics.case import driven_body
 from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
+from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.unfinished import Checkpoint
 from ast_sim.scene import AttributeValue, Scene, Trajectory
 from ast_sim.support.errors import SimulationError
@@ -47,7 +47,7 @@ class FrameRecord:
         jacobian: smallest volume (of cloth: area) of an element, divided by its value at rest.
         residual: residual divided by the largest one that the stop test allows: at most 1.
         contact_area: rest area in square metres around the surface nodes on which contact acts; the mean of both sides.
-        reaction: magnitude in newton of the force on the prescribed nodes of the body that moves farthest.
+        reaction: magnitude in newton of the force on the prescribed nodes that move farthest together (`Driven`).
         elastic_energy, contact_energy: energies in joule.
         dissipation: energy lost to friction so far, in joule.
         work: work of all prescribed nodes so far, in joule.
@@ -103,7 +103,7 @@ class Frames(ABC):
         record_type: type of the record of each frame.
         records: one record for each frame.
         arrays: the stored arrays by name: lists with one entry a frame.
-        driven: [N] bool, the prescribed nodes of the body that moves farthest.
+        driven: the nodes that the reaction is of.
     """
 
     record_type: type[FrameRecord]
@@ -113,8 +113,7 @@ class Frames(ABC):
         self.records: list[FrameRecord] = []
         self.arrays: dict[str, list[np.ndarray]] = {}
         self._steps_before = 0
-        scene = case.scene
-        self.driven = scene.prescribed & (scene.body == driven_body(scene, case.targets))
+        self.driven = Driven.of(case.scene, case.targets)
 
     @abstractmethod
     def next_frame(self) -> tuple[dict[str, np.ndarray], FrameRecord]:

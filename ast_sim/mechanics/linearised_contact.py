@@ -30,8 +30,9 @@ import numpy as np
 import scipy.sparse
 from scipy.optimize import nnls
 
-from ast_sim.mechanics.elements.elasticity import Deformation, Elasticity
-from ast_sim.mechanics.elements.material import NeoHookean, cofactor, determinant, von_mises
+from ast_sim.mechanics.elements.elasticity import Deformation
+from ast_sim.mechanics.elements.material import NeoHookean, cofactor, determinant
+from ast_sim.mechanics.elements.second_order import elastic_body
 from ast_sim.mechanics.linear_system import Factorization, LinearSystem
 from ast_sim.scene import Scene
 from ast_sim.support.errors import SimulationError
@@ -88,7 +89,7 @@ class NewtonSteps:
         self._rest = scene.rest_position.astype(np.float64)
         self._deforming = np.flatnonzero(scene.deforming_nodes[scene.elements].any(axis=1))
         elements = scene.elements[self._deforming].astype(np.int64)
-        self._elasticity = Elasticity(self._rest, elements, material.of(self._deforming))
+        self._elasticity = elastic_body(self._rest, elements, material.of(self._deforming))
         held = scene.prescribed | ~np.isin(np.arange(scene.num_nodes), elements)
         self._system = LinearSystem(*self._elasticity.entry_dofs(), held)
         self._number = np.full(3 * scene.num_nodes, -1)
@@ -185,9 +186,9 @@ class NewtonSteps:
 
     def von_mises(self, position: np.ndarray, location: str) -> np.ndarray:
         """[N, 1] or [E, 1] float32: the stress in pascal at `location`, "node" or "element"; 0 in rigid bodies."""
-        stress = von_mises(self._elasticity.cauchy(self._elasticity.evaluate(position)))
+        stress = self._elasticity.von_mises(self._elasticity.evaluate(position), location)
         if location == "node":
-            return self._elasticity.nodal_mean(stress).astype(np.float32)[:, None]
+            return stress.astype(np.float32)[:, None]
         found = np.zeros((self._scene.num_elements, 1), np.float32)
         found[self._deforming, 0] = stress
         return found

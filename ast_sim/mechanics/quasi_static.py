@@ -11,8 +11,8 @@ import numpy as np
 
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import Contact
-from ast_sim.mechanics.elements.elasticity import Elasticity
 from ast_sim.mechanics.elements.material import von_mises
+from ast_sim.mechanics.elements.second_order import elastic_body
 from ast_sim.mechanics.frames import MAX_FRAME_ITERATIONS, FrameRecord, Frames, GivenUp
 from ast_sim.mechanics.load_halving import QuasiStatic
 from ast_sim.mechanics.solver import SolverSettings
@@ -34,6 +34,17 @@ class SolidRecord(FrameRecord):
     """
 
     imbalance: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class TurnedRecord(SolidRecord):
+    """A record where the nodes that the reaction is of turn.
+
+    Attributes:
+        torque: of the reaction in newton metres, around the axis of the turn and positive in its sense.
+    """
+
+    torque: float
 
 
 def quasi_static(
@@ -127,10 +138,11 @@ class SolidFrames(Frames):
     def __init__(self, case: SolidCase, settings: SolverSettings | None) -> None:
         scene, rest = case.scene, case.scene.rest_position.astype(np.float64)
         self._deforming = np.flatnonzero(case.deforming)
-        self._elasticity = Elasticity(rest, scene.elements[self._deforming], case.material.of(self._deforming))
+        self._elasticity = elastic_body(rest, scene.elements[self._deforming], case.material.of(self._deforming))
         contact = Contact(rest, scene.surface(), scene.body, case.contact, ~scene.deforming_nodes)
         super().__init__(case, QuasiStatic(self._elasticity, contact, scene.prescribed, rest, settings), contact)
         self._reactions = np.zeros_like(rest)
+        self.record_type = SolidRecord if self.driven.axis is None else TurnedRecord
         self._work = 0.0
 
     def next_frame(self) -> tuple[dict[str, np.ndarray], SolidRecord]:
@@ -141,12 +153,14 @@ class SolidFrames(Frames):
             self._reactions = self._held()
         arrays = self._stored()
         checked, reactions = self.check(arrays), self._reactions
-        return arrays, SolidRecord(
+        turned = {} if self.driven.axis is None else {"torque": self._torque(reactions)}
+        return arrays, self.record_type(
             **cost,
             **checked,
+            **turned,
             residual=newton.residual(),
             contact_area=self.contact.area(newton.state.contact),
-            reaction=float(np.linalg.norm(reactions[self.driven].sum(axis=0))),
+            reaction=float(np.linalg.norm(reactions[self.driven.nodes].sum(axis=0))),
             imbalance=self._imbalance(reactions),
             elastic_energy=newton.state.potential.energy,
             contact_energy=newton.state.contact.barrier_energy(),
@@ -170,16 +184,23 @@ class SolidFrames(Frames):
         """The arrays of a frame as they are stored."""
         elasticity, deformation = self._elasticity, self.solver.newton.state.potential
         position = self.solver.newton.position.astype(np.float32)
-        tensor = elasticity.cauchy(deformation)
-        mises = von_mises(tensor)
         if self.case.stress_location == "node":
-            return {"position": position, "stress": elasticity.nodal_mean(mises).astype(np.float32)[:, None]}
+            return {
+                "position": position,
+                "stress": elasticity.von_mises(deformation, "node").astype(np.float32)[:, None],
+            }
+        tensor = elasticity.cauchy(deformation)
         components = np.stack([tensor[i, j] for i, j in COMPONENTS], axis=1)
         return {
             "position": position,
-            "stress": self._of_all_elements(mises[:, None]),
+            "stress": self._of_all_elements(von_mises(tensor)[:, None]),
             "cauchy_stress": self._of_all_elements(components),
         }
+
+    def _torque(self, reactions: np.ndarray) -> float:
+        """See `TurnedRecord`."""
+        nodes = self.driven.nodes
+        return self.driven.axis.torque(self.solver.newton.position[nodes], reactions[nodes])
 
     def _imbalance(self, reactions: np.ndarray) -> float:
         """See `SolidRecord`. If there are hardly any forces, the divisor is the force of a strain of 1e-3."""

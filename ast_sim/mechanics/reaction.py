@@ -15,8 +15,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import cg
 
-from ast_sim.mechanics.elements.elasticity import Elasticity
+from ast_sim.element_topology import linear_elements
+from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.mechanics.elements.second_order import elastic_body
 from ast_sim.scene import NodeType, Scene
 
 REACH = 1.0  # a node counts as touched if another body is nearer than so many mean edge lengths
@@ -30,19 +32,19 @@ class Reaction:
     Made once for a scene, because the shape functions do not change.
 
     Args:
-        driven: the number of the body whose prescribed nodes are the moved ones, where they are away from their places
-            at rest; see `driven_body`.
+        driven: the moved nodes.
     """
 
-    def __init__(self, scene: Scene, driven: int) -> None:
+    def __init__(self, scene: Scene, driven: Driven) -> None:
         import igl  # takes 0.2 s
 
         assert scene.material is not None
         self.scene, self.driven, self._rest = scene, driven, scene.rest_position.astype(np.float64)
         soft = np.flatnonzero(scene.deforming_nodes[scene.elements].any(axis=1))
         young, poisson = scene.material[soft, :2].astype(np.float64).T
-        self._elasticity = Elasticity(self._rest, scene.elements[soft], NeoHookean(young, poisson))
-        self._laplacian = -igl.cotmatrix(self._rest, scene.elements[soft].astype(np.int64)).tocsr()
+        self._elasticity = elastic_body(self._rest, scene.elements[soft], NeoHookean(young, poisson))
+        linear = linear_elements(scene.elements[soft].astype(np.int64))
+        self._laplacian = -igl.cotmatrix(self._rest, linear).tocsr()
         surface = scene.surface()
         self._surfaces = {int(n): surface[scene.body[surface[:, 0]] == n] for n in np.unique(scene.body)}
         a, b = surface[:, [0, 1]].T
@@ -56,22 +58,31 @@ class Reaction:
         Args:
             position: [N,3].
         """
+        return self._shares(position).sum(axis=0)
+
+    def torque(self, position: np.ndarray) -> float:
+        """The torque of that force around the axis of the moved nodes, in pascal times the cube of the unit of length,
+        positive in the sense of their turn; 0 if they do not turn."""
+        axis = self.driven.axis
+        return 0.0 if axis is None else axis.torque(position, self._shares(position))
+
+    def _shares(self, position: np.ndarray) -> np.ndarray:
+        """[N,3] w_i f_i."""
         position = position.astype(np.float64)
         source, sink = self._ends(position)
         if not source.any():
-            return np.zeros(3)
-        deformation = self._elasticity.evaluate(position)
-        forces, _ = self._elasticity.gradient(deformation)
-        return self._field(source, sink, self._folds(position)) @ forces
+            return np.zeros_like(position)
+        forces, _ = self._elasticity.gradient(self._elasticity.evaluate(position))
+        return self._field(source, sink, self._folds(position))[:, None] * forces
 
     def _ends(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """[N] bool twice: the deforming nodes on which the moved nodes act, and all others that are held or touched."""
-        scene, nearest = self.scene, self._nearest_body(position)
+        scene, driven, nearest = self.scene, self.driven, self._nearest_body(position)
         held = scene.prescribed & self._deforming
-        if scene.node_type[scene.body == self.driven][0] == NodeType.OBSTACLE:
-            source = (nearest == self.driven) & ~held
+        if scene.node_type[scene.body == driven.body][0] == NodeType.OBSTACLE:
+            source = (nearest == driven.body) & ~held
         else:
-            source = held & (scene.body == self.driven) & (position != self._rest).any(axis=1)
+            source = held & driven.nodes
         return source, (held | (nearest >= 0)) & ~source
 
     def _nearest_body(self, position: np.ndarray) -> np.ndarray:

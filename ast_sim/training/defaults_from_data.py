@@ -25,7 +25,6 @@ _RANGES = {
     "stress_weight": (0, 1e6),
     "noise_gamma": (0, 1),
 }
-CALLS = 6  # (docs/log.md, 2026-11-24)
 ROLLOUT_BATCHES = 16  # an unset pool of rollouts holds the scenes of so many batches
 
 
@@ -41,7 +40,7 @@ def resolve(config: RunConfig, dataset: Dataset, scales: DataScales, keep_model:
         dataset.material_width,
         scales.spacing,
         scales.planar,
-        tetrahedra=dataset.element_size == 4,
+        tetrahedra=dataset.element_size != 3,
         recorded=scales.recorded,
     )
     model = dataclasses.replace(config.model, **facts.recorded) if keep_model else config.model.resolve(facts)
@@ -66,7 +65,6 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
         "warmup": min(2000, steps // 20),
         "decay": steps if config.steps is not None else steps + epoch,
         "noise_gamma": 0.1 if model.dynamic else 1.0,
-        "calls": CALLS if model.jumps else 1,
         "validate_every": validate_every,
         "checkpoint_every": validate_every,
     }

@@ -18,8 +18,8 @@ from ast_sim.support.errors import AstSimError, is_utf8
 from ast_sim.view.fields import Fields, fields
 from ast_sim.view.files import explained
 
-VTK_TRIANGLE, VTK_TETRA = 5, 10
-CELL_NAME = {3: "triangle", 4: "tetra"}
+VTK_TYPE = {3: 5, 4: 10, 10: 24}
+CELL_NAME = {3: "triangle", 4: "tetra", 10: "tetra10"}
 
 
 def write(path: str | os.PathLike[str], trajectory: Trajectory, prediction: Trajectory | None = None) -> None:
@@ -116,7 +116,7 @@ def _write_mesh(root: h5py.Group, elements: np.ndarray, position: np.ndarray) ->
     root["NumberOfConnectivityIds"] = np.array([elements.size], dtype=np.int64)
     root["Connectivity"] = elements.astype(np.int64).reshape(-1)
     root["Offsets"] = np.arange(count + 1, dtype=np.int64) * corners
-    root["Types"] = np.full(count, {3: VTK_TRIANGLE, 4: VTK_TETRA}[corners], dtype=np.uint8)
+    root["Types"] = np.full(count, VTK_TYPE[corners], dtype=np.uint8)
     root.create_dataset("Points", data=position.reshape(frames * nodes, 3), chunks=(nodes, 3), compression="gzip")
 
 

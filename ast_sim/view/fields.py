@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ast_sim.scene import LOCAL_FACES, NodeType, Scene, Trajectory
+from ast_sim.element_topology import FACE_TRIANGLES
+from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.support.errors import AstSimError
 
 
@@ -75,10 +76,11 @@ def surface_owners(scene: Scene, surface: np.ndarray) -> np.ndarray:
     """[F] int64: the element that each triangle of `Scene.surface()` [F, 3] belongs to."""
     if scene.elements.shape[1] == 3:
         return np.arange(len(surface))
-    faces = scene.elements[:, np.array(LOCAL_FACES)].reshape(-1, 3)
+    local = np.array(FACE_TRIANGLES[scene.elements.shape[1]]).reshape(-1, 3)
+    faces = scene.elements[:, local].reshape(-1, 3)
     both = np.sort(np.concatenate([faces, surface]), axis=1)
     _, first, same = np.unique(both, axis=0, return_index=True, return_inverse=True)
-    return first[same.reshape(-1)[len(faces) :]] // len(LOCAL_FACES)
+    return first[same.reshape(-1)[len(faces) :]] // len(local)
 
 
 def displacement_rmse(truth: Trajectory, position: np.ndarray) -> np.ndarray:

@@ -93,7 +93,7 @@ class View:
         self.center = (low + high) / 2
         self.size = max(float(np.linalg.norm(high - low)), 1e-9)
         self.planar = is_planar(truth.scene)
-        self.closed = truth.scene.elements.shape[1] == 4
+        self.closed = truth.scene.elements.shape[1] != 3
         self.triangles = truth.scene.surface()
         self.obstacle = ~truth.scene.deforming_elements[surface_owners(truth.scene, self.triangles)]
         forward = np.array([0.0, 0.0, -1.0]) if self.planar else -EYE / np.linalg.norm(EYE)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ast_sim.figures import Figures
 from ast_sim.scene import Trajectory
 from ast_sim.support.errors import AstSimError
 from ast_sim.view import page, tables
@@ -40,7 +41,7 @@ class ReportRun:
         name: name of the run for the readers.
         model: name under which the model is registered, such as "ast".
         scenes: predictions to show.
-        evaluation: what `ast-sim evaluate --out` writes, or None.
+        evaluation: what an evaluation measured, or None.
         metrics: the lines of `metrics.jsonl`.
         facts: model, parameters, data, seeds, in the order to show; the evaluation adds facts of its own.
     """
@@ -48,7 +49,7 @@ class ReportRun:
     name: str
     model: str
     scenes: Sequence[ReportScene]
-    evaluation: Mapping[str, Any] | None = None
+    evaluation: Figures | None = None
     metrics: Sequence[Mapping[str, Any]] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
 
@@ -83,7 +84,7 @@ def page_data(runs: Sequence[ReportRun]) -> dict[str, Any]:
     """Everything that the page's scripts show, as JSON."""
     names = _distinct([run.name for run in runs])
     models = [tables.TITLES.get(run.model, run.model) for run in runs]
-    evaluations = [dict(run.evaluation) if run.evaluation else None for run in runs]
+    evaluations = [run.evaluation for run in runs]
     scenes, samples = _scenes(runs), tables.samples(evaluations, names)
     errors = dict(zip(samples["names"], samples["runs"][0], strict=True)) if samples else {}
     for scene in scenes:
@@ -107,7 +108,7 @@ def page_data(runs: Sequence[ReportRun]) -> dict[str, Any]:
 
 def _run(run: ReportRun, name: str) -> dict[str, Any]:
     training, validation = tables.training_curves(run.metrics)
-    facts = {**run.facts, **tables.evaluation_facts(dict(run.evaluation) if run.evaluation else None)}
+    facts = {**run.facts, **tables.evaluation_facts(run.evaluation)}
     rows = [[key, str(value)] for key, value in facts.items()]
     return {"name": name, "training": training, "validation": validation, "facts": rows}
 
@@ -135,8 +136,8 @@ def _scenes(runs: Sequence[ReportRun]) -> list[dict[str, Any]]:
     return encoded
 
 
-def _scenes_note(scenes: Sequence[dict[str, Any]], evaluation: dict[str, Any] | None) -> str:
-    count = len((evaluation or {}).get("samples") or [])
+def _scenes_note(scenes: Sequence[dict[str, Any]], evaluation: Figures | None) -> str:
+    count = len(evaluation.scenes) if evaluation else 0
     note = ""
     if {"Best", "Median", "Worst"} <= {scene["label"] for scene in scenes} and count:
         note = (

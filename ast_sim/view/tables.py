@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from ast_sim.figures import MAIN_NODES, AskedFigures, Figures, SceneFigures
+
 Json = dict[str, Any]
 
+DEFAULT_UNITS = {"displacement": "m", "stress": "Pa"}
 HORIZONS = {"rollout_all": "Full rollout", "rollout_50": "First 50 steps of the rollout", "one_step": "One step"}
 NODES = {"normal": "NORMAL nodes", "all": "all nodes", "deforming": "outside the obstacles"}
 MEASURES = ("rmse_sequence", "rmse_pooled")
@@ -23,61 +26,47 @@ TITLES = {"ast": "AST", "mgn": "MGN", "bsms": "BSMS", "hcmt": "HCMT", "transolve
 TRAINING_POINTS = 400  # a longer training curve is reduced to this many means
 
 
-def units(evaluations: Sequence[Json | None]) -> dict[str, str]:
+def units(evaluations: Sequence[Figures | None]) -> dict[str, str]:
     """The units of displacement and stress; metres and pascal where no evaluation says otherwise."""
-    known = next((evaluation for evaluation in evaluations if evaluation), {})
-    return {"displacement": known.get("length_unit", "m"), "stress": known.get("stress_unit", "Pa")}
+    known = next((evaluation for evaluation in evaluations if evaluation), None)
+    return {quantity: default if known is None else known.unit(quantity) for quantity, default in DEFAULT_UNITS.items()}
 
 
-def lookup(tree: Any, *keys: str) -> Any:
-    """tree[key][key]..., or None if a key is missing."""
-    for key in keys:
-        tree = tree.get(key) if isinstance(tree, Mapping) else None
-    return tree
-
-
-def measure_tables(names: Sequence[str], evaluations: Sequence[Json | None]) -> list[Json]:
+def measure_tables(names: Sequence[str], evaluations: Sequence[Figures | None]) -> list[Json]:
     """Two tables of errors: displacement and stress. Rows are measures; columns are runs and trivial predictors.
 
     The trivial predictors do not depend on the run, so they are taken from the first evaluation that has them. A
     model that jumps has no row for one step, because each of its frames is one step from the first.
     """
     unit = units(evaluations)
-    summaries = [lookup(evaluation, "summary") for evaluation in evaluations]
     tables = []
     for quantity, title in (("displacement", "Displacement"), ("stress", "von Mises stress")):
-        sources = [_of_model(evaluation, quantity) for evaluation in evaluations]
-        for key in TRIVIAL[quantity]:
-            sources.append(next((f for s in summaries if (f := lookup(s, key, quantity))), None))
-        rows = _measure_rows(sources, _horizons(evaluations))
+        columns = [(evaluation, MODEL) for evaluation in evaluations]
+        for predictor in TRIVIAL[quantity]:
+            first = next((e for e in evaluations if e and e.error(quantity, predictor)), None)
+            columns.append((first, predictor))
+        rows = _measure_rows(quantity, columns, _horizons(evaluations))
         if rows:
-            columns = [*names, *TRIVIAL[quantity].values()]
-            tables.append(
-                {"title": title, "unit": unit[quantity], "columns": columns, "rows": rows, "runs": len(names)}
-            )
+            titles = [*names, *TRIVIAL[quantity].values()]
+            tables.append({"title": title, "unit": unit[quantity], "columns": titles, "rows": rows, "runs": len(names)})
     return tables
 
 
-def _of_model(evaluation: Json | None, quantity: str) -> Json | None:
-    found = lookup(evaluation, "summary", MODEL, quantity)
-    if found is None or not evaluation.get("jumps"):
-        return found
-    return {horizon: errors for horizon, errors in found.items() if horizon != "one_step"}
-
-
-def _horizons(evaluations: Sequence[Json | None]) -> dict[str, str]:
-    """The horizons to show. The first 50 steps are the full rollout if no scene has more than these."""
-    frames = [sample.get("frames") for e in evaluations for sample in (e or {}).get("samples") or []]
-    short = bool(frames) and all(count is not None and count <= 51 for count in frames)
+def _horizons(evaluations: Sequence[Figures | None]) -> dict[str, str]:
+    """The horizons to show. The first 50 steps are the full rollout if no scene has more."""
+    frames = [scene.frames for evaluation in evaluations if evaluation for scene in evaluation.scenes]
+    short = bool(frames) and max(frames) <= 51
     return {key: title for key, title in HORIZONS.items() if not (short and key == "rollout_50")}
 
 
-def _measure_rows(sources: Sequence[Json | None], horizons: Mapping[str, str]) -> list[Json]:
+def _measure_rows(
+    quantity: str, columns: Sequence[tuple[Figures | None, str]], horizons: Mapping[str, str]
+) -> list[Json]:
     rows: list[Json] = []
     for horizon, title in horizons.items():
         found = []
         for nodes, measure in itertools.product(NODES, MEASURES):
-            values = [lookup(source, horizon, nodes, measure) for source in sources]
+            values = [_measure(figures, quantity, predictor, horizon, nodes, measure) for figures, predictor in columns]
             if any(value is not None for value in values):
                 found.append({"label": measure, "note": NODES[nodes], "values": values})
         if found:
@@ -85,81 +74,85 @@ def _measure_rows(sources: Sequence[Json | None], horizons: Mapping[str, str]) -
     return rows
 
 
-def tiles(evaluation: Json | None) -> list[Json]:
+def _measure(
+    figures: Figures | None, quantity: str, predictor: str, horizon: str, nodes: str, measure: str
+) -> float | None:
+    if figures is None or (figures.jumps and predictor == MODEL and horizon == "one_step"):
+        return None
+    row = figures.error(quantity, predictor, horizon, nodes)
+    return None if row is None else getattr(row, measure)
+
+
+def tiles(evaluation: Figures | None) -> list[Json]:
     """The figures that matter most, for the head of the page: errors, time, and how much was tested."""
     if not evaluation:
         return []
-    unit, found = units([evaluation]), []
-    for quantity, title, nodes, trivial in (
-        ("displacement", "Displacement error", "normal", "hold_still"),
-        ("stress", "Stress error", "deforming", "stress_frame_mean"),
+    found = []
+    for quantity, title, trivial in (
+        ("displacement", "Displacement error", "hold_still"),
+        ("stress", "Stress error", "stress_frame_mean"),
     ):
-        path = (quantity, "rollout_all", nodes, "rmse_sequence")
-        error = lookup(evaluation, "summary", MODEL, *path)
-        if lookup(evaluation, "summary", MODEL, quantity) is None:
+        model, reference = (evaluation.error(quantity, name) for name in (MODEL, trivial))
+        if model is None:
             continue
-        reference = lookup(evaluation, "summary", trivial, *path)
-        detail = "full rollout, rmse_sequence"
+        error, detail = model.rmse_sequence, "full rollout, rmse_sequence"
         if error is None:
             detail = "no figure, because a rollout failed"
-        elif reference:
-            detail = f"{100 * error / reference:.0f} % of “{TRIVIAL[quantity][trivial].lower()}”, full rollout"
-        found.append({"label": title, "value": error, "unit": unit[quantity], "detail": detail})
-    return found + _asked_tiles(evaluation) + _speed_tiles(evaluation) + _scope_tiles(evaluation)
+        elif reference is not None and reference.rmse_sequence:
+            share = 100 * error / reference.rmse_sequence
+            detail = f"{share:.0f} % of “{TRIVIAL[quantity][trivial].lower()}”, full rollout"
+        found.append({"label": title, "value": error, "unit": evaluation.unit(quantity), "detail": detail})
+    return found + _asked_tiles(evaluation.asked) + _speed_tiles(evaluation) + _scope_tiles(evaluation)
 
 
-def _asked_tiles(evaluation: Json) -> list[Json]:
+def _asked_tiles(asked: AskedFigures) -> list[Json]:
     """The deepest frame, asked for alone, beside the solver."""
-    error, seconds = lookup(evaluation, "asked", "relative_error"), lookup(evaluation, "asked", "seconds")
-    if error is None or seconds is None:
+    if asked.relative_error is None or asked.seconds is None:
         return []
-    detail = f"of the displacement, {1000 * seconds:.3g} ms on one thread"
-    solver = lookup(evaluation, "asked", "solver", "seconds")
-    if solver is not None:
-        detail += f"; the solver: {1000 * solver:.3g} ms"
-    return [{"label": "Deepest frame alone", "value": f"{100 * error:.3g}", "suffix": "%", "detail": detail}]
+    detail = f"of the displacement, {1000 * asked.seconds:.3g} ms on one thread"
+    if asked.solver is not None:
+        detail += f"; the solver: {1000 * asked.solver.seconds:.3g} ms"
+    value = f"{100 * asked.relative_error:.3g}"
+    return [{"label": "Deepest frame alone", "value": value, "suffix": "%", "detail": detail}]
 
 
-def _speed_tiles(evaluation: Json) -> list[Json]:
-    model, solver = (mean_of(evaluation, f"{who}_seconds_per_step") for who in ("model", "solver"))
+def _speed_tiles(evaluation: Figures) -> list[Json]:
+    model, solver = (median_of(evaluation, f"{who}_seconds_per_step") for who in ("model", "solver"))
     if model is None:
         return []
-    threads = evaluation.get("threads")
-    where = f" on {threads} thread{'s' if threads != 1 else ''}" if threads else ""
-    tile = {"label": "Time per step", "value": model, "unit": "s", "detail": f"mean over the scenes{where}"}
+    where = f" on {evaluation.threads} thread{'s' if evaluation.threads != 1 else ''}"
+    tile = {"label": "Time per step", "value": model, "unit": "s", "detail": f"median over the scenes{where}"}
     if solver:
-        tile["detail"] = f"solver: {1000 * solver:.3g} ms on 1 thread" + (f"; model{where}" if where else "")
-    speedup = evaluation.get("speedup")
-    if speedup is None:
+        tile["detail"] = f"solver: {1000 * solver:.3g} ms on 1 thread; model{where}; medians"
+    if evaluation.speedup is None:
         return [tile]
     faster = {
         "label": "Speed-up over the solver",
-        "value": f"{speedup:.3g}",
+        "value": f"{evaluation.speedup:.3g}",
         "suffix": "×",
         "detail": "all frames of the same scenes, one thread each; the solver’s time was recorded when it made them",
     }
     return [tile, faster]
 
 
-def _scope_tiles(evaluation: Json) -> list[Json]:
-    samples = evaluation.get("samples") or []
-    if not samples:
+def _scope_tiles(evaluation: Figures) -> list[Json]:
+    if not evaluation.scenes:
         return []
-    failures = evaluation.get("failures") or 0
-    nodes = np.mean([sample["nodes"] for sample in samples if sample.get("nodes")] or [0])
-    detail = f"{nodes:.0f} nodes on average" if nodes else ""
+    failures = evaluation.failures
+    detail = f"{np.mean([scene.nodes for scene in evaluation.scenes]):.0f} nodes on average"
     if failures:
         detail = f"{failures} rollout{'s' if failures != 1 else ''} failed"
-    return [{"label": "Test scenes", "value": str(len(samples)), "detail": detail}]
+    return [{"label": "Test scenes", "value": str(len(evaluation.scenes)), "detail": detail}]
 
 
-def mean_of(evaluation: Json | None, key: str) -> float | None:
-    """The mean of a number of the samples, over those that have it."""
-    values = [sample[key] for sample in (evaluation or {}).get("samples") or [] if sample.get(key) is not None]
-    return float(np.mean(values)) if values else None
+def median_of(evaluation: Figures | None, key: str) -> float | None:
+    """The median of a number of the scenes, over those that have it."""
+    values = [getattr(scene, key) for scene in (evaluation.scenes if evaluation else ())]
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if known else None
 
 
-def comparison(names: Sequence[str], evaluations: Sequence[Json | None]) -> Json | None:
+def comparison(names: Sequence[str], evaluations: Sequence[Figures | None]) -> Json | None:
     """For several runs, the figures by which one chooses: one row a run."""
     if len(names) < 2 or not any(evaluations):
         return None
@@ -168,39 +161,40 @@ def comparison(names: Sequence[str], evaluations: Sequence[Json | None]) -> Json
     def column(label: str, unit: str, values: list[Any]) -> Json:
         return {"label": label, "unit": unit, "values": values}
 
-    def errors(quantity: str, nodes: str) -> list[Any]:
-        return [lookup(e, "summary", MODEL, quantity, "rollout_all", nodes, "rmse_sequence") for e in evaluations]
+    def errors(quantity: str) -> list[Any]:
+        nodes = MAIN_NODES[quantity]
+        return [_measure(e, quantity, MODEL, "rollout_all", nodes, "rmse_sequence") for e in evaluations]
 
     columns = [
-        column("Displacement error", unit["displacement"], errors("displacement", "normal")),
-        column("Stress error", unit["stress"], errors("stress", "deforming")),
-        column("Time per step", "s", [mean_of(e, "model_seconds_per_step") for e in evaluations]),
-        column("Speed-up over the solver", "×", [lookup(e, "speedup") for e in evaluations]),
+        column("Displacement error", unit["displacement"], errors("displacement")),
+        column("Stress error", unit["stress"], errors("stress")),
+        column("Time per step", "s", [median_of(e, "model_seconds_per_step") for e in evaluations]),
+        column("Speed-up over the solver", "×", [e.speedup if e else None for e in evaluations]),
     ]
     return {"names": list(names), "columns": [c for c in columns if any(v is not None for v in c["values"])]}
 
 
-def samples(evaluations: Sequence[Json | None], names: Sequence[str]) -> Json | None:
+def samples(evaluations: Sequence[Figures | None], names: Sequence[str]) -> Json | None:
     """Errors of every test scene over the full rollout, in ascending order of the first run's; failed ones last."""
-    lists = [{s["name"]: s for s in (e or {}).get("samples") or []} for e in evaluations]
-    scenes = list(dict.fromkeys(name for samples in lists for name in samples))
+    by_run = [{scene.name: scene for scene in (e.scenes if e else ())} for e in evaluations]
+    scenes = list(dict.fromkeys(name for run in by_run for name in run))
     if not scenes:
         return None
 
-    def values(run: int, *path: str) -> list[Any]:
-        return [lookup(lists[run].get(name), *path) for name in scenes]
+    def values(run: int, number: Callable[[SceneFigures], Any]) -> list[Any]:
+        return [number(by_run[run][name]) if name in by_run[run] else None for name in scenes]
 
-    def first(*path: str) -> list[Any]:
-        return [next((f for s in lists if (f := lookup(s.get(name), *path)) is not None), None) for name in scenes]
+    def first(number: Callable[[SceneFigures], Any]) -> list[Any]:
+        columns = [values(run, number) for run in range(len(by_run))]
+        return [next((value for value in row if value is not None), None) for row in zip(*columns, strict=True)]
 
-    path = (MODEL, "rollout_all", "normal")
-    runs = [values(run, "displacement", *path) for run in range(len(lists))]
+    runs = [values(run, lambda scene: scene.error("displacement")) for run in range(len(by_run))]
     order = sorted(range(len(scenes)), key=lambda i: (runs[0][i] is None, runs[0][i] or 0.0, scenes[i]))
     unit = units(evaluations)
-    trivial = first("displacement", "hold_still", "rollout_all", "normal")
+    trivial = first(lambda scene: scene.error("displacement", "hold_still"))
     columns = [
-        {"label": "Nodes", "unit": None, "values": first("nodes")},
-        {"label": "Frames", "unit": None, "values": first("frames")},
+        {"label": "Nodes", "unit": None, "values": first(lambda scene: scene.nodes)},
+        {"label": "Frames", "unit": None, "values": first(lambda scene: scene.frames)},
     ]
 
     def add(label: str, unit: str, per_run: list[list[Any]]) -> None:
@@ -208,12 +202,13 @@ def samples(evaluations: Sequence[Json | None], names: Sequence[str]) -> Json | 
             suffix = f", {name}" if len(names) > 1 else ""
             columns.append({"label": label + suffix, "unit": unit, "values": numbers})
 
-    every = range(len(lists))
+    every = range(len(by_run))
     add("Displacement", unit["displacement"], runs)
     columns.append({"label": "Hold still", "unit": unit["displacement"], "values": trivial})
-    add("Stress", unit["stress"], [values(run, "stress", MODEL, "rollout_all", "deforming") for run in every])
-    add("Model’s step", "s", [values(run, "model_seconds_per_step") for run in every])
-    columns.append({"label": "Solver’s step", "unit": "s", "values": first("solver_seconds_per_step")})
+    add("Stress", unit["stress"], [values(run, lambda scene: scene.error("stress")) for run in every])
+    add("Model’s step", "s", [values(run, lambda scene: scene.model_seconds_per_step) for run in every])
+    solver = first(lambda scene: scene.solver_seconds_per_step)
+    columns.append({"label": "Solver’s step", "unit": "s", "values": solver})
     return {
         "names": scenes,
         "order": order,
@@ -241,21 +236,22 @@ def _curves(metrics: Sequence[Json], labels: Mapping[str, str]) -> list[Json]:
     return curves
 
 
-def evaluation_facts(evaluation: Json | None) -> dict[str, str]:
+def evaluation_facts(evaluation: Figures | None) -> dict[str, str]:
     """Where the figures come from: data, processor, versions, commit, command."""
     if not evaluation:
         return {}
-    versions = ", ".join(f"{name} {number}" for name, number in (evaluation.get("versions") or {}).items() if number)
-    processor, threads = evaluation.get("processor"), evaluation.get("threads")
-    if processor and threads:
-        processor = f"{processor}, {threads} thread{'s' if threads != 1 else ''}"
+    origin = evaluation.origin
+    versions = ", ".join(f"{name} {number}" for name, number in origin.get("versions", {}).items() if number)
+    processor = origin.get("processor")
+    if processor:
+        processor = f"{processor}, {evaluation.threads} thread{'s' if evaluation.threads != 1 else ''}"
     found = {
-        "Run": evaluation.get("run"),
-        "Data file": evaluation.get("data"),
-        "Split": evaluation.get("split"),
+        "Run": origin.get("run"),
+        "Data file": origin.get("data"),
+        "Split": origin.get("split"),
         "Processor": processor,
         "Versions": versions,
-        "Commit": evaluation.get("commit"),
-        "Command": evaluation.get("command"),
+        "Commit": origin.get("commit"),
+        "Command": origin.get("command"),
     }
     return {key: str(value) for key, value in found.items() if value}

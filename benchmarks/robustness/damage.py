@@ -167,7 +167,10 @@ class Bench:
         self.expected: dict[str, Results] = {}
         for name in (INFO_DATA, INFO_RUN, EVALUATE, TRAIN):
             first, *others = [self._intact(name) for _ in range(3)]
-            times = {key for other in others for key in first if other[key] != first[key]} | {".commit"}
+            times = {key for other in others for key in first if other[key] != first[key]} | {
+                ".commit",
+                ".origin.commit",
+            }
             self.expected[name] = {key: value for key, value in first.items() if key not in times}
 
     def _intact(self, name: str) -> Results:

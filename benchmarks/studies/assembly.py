@@ -111,7 +111,7 @@ def measured(name: str, row: Row, folder: Path) -> dict[str, Any]:
         "training": validation_curve(run),
         "curves": curves,
         "solver_curves": _solver_curves(row) if row.rivals else [],
-        **found,
+        **asdict(found),
     }
 
 
@@ -200,7 +200,7 @@ error). "Reaction" is the error of the force that moves the tool, in the last fr
 the largest von Mises stress. The solver goes to the same frame at its own stop test: straight in one, two or four load
 steps and frame by frame, whichever is fastest. "Fastest way" is the fastest of 13 settings whose error is at most the
 answer's: looser stop tests, coarser meshes, and the same Newton steps without a model. All times count what is prepared
-for a mesh. An answer's time is the median over the test scenes; the solver's are means over the scenes in which it was
+for a mesh. An answer's time is the median over the test scenes; the solver's are medians over the scenes where it was
 run (ten; one of 6,000 nodes). "Pays after" so many questions, the time that the answers saved is the time of the
 simulations and the training.
 """
@@ -219,7 +219,7 @@ def _alone(found: dict[str, Any]) -> str:
     errors = [scene["relative_error"] for scene in found["scenes"] if scene["relative_error"] is not None]
     spent = 60 * (found["generation_minutes"] + found["minutes"])
     seconds = [scene["seconds"] for scene in found["scenes"]]
-    saved = 0.0 if solver is None else solver["seconds"] - found["seconds"]
+    saved = 0.0 if solver is None else solver["seconds"] - solver["model_seconds"]
     return _table_line([
         row["title"],
         f"{row['train']} scenes ({found['generation_minutes']:.1f} min), {row['steps']:,} steps",

@@ -83,8 +83,8 @@ def measure(run: Run, horizons: int, command: str) -> dict[str, Any]:
     """The evaluation of a run with `phases` (for each, `rmse_sequence` and `rmse_pooled`), `diverged` (what stopped a
     long rollout, by scene) and `farthest` (the largest distance in all of them from the centre of the domain over the
     largest in the truth)."""
-    found = run.evaluate(command=command).figures
-    del found["data"]  # a path of this machine
+    found = run.evaluate(command=command).figures.to_json()
+    del found["origin"]["data"]  # a path of this machine
     errors: dict[str, list[SquaredError]] = {name: [] for name in PHASES}
     diverged, farthest, center = {}, 0.0, np.array(run.info.domain_center)
     with run.open() as dataset:

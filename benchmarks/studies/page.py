@@ -96,7 +96,7 @@ def seeds(models: dict[str, Any]) -> str:
 
 def origins(models: dict[str, Any]) -> list[str]:
     """The commits and processors of the runs, each once."""
-    made = [measured(run) for model in models.values() for run in model["runs"] if measured(run)]
+    made = [measured(run)["origin"] for model in models.values() for run in model["runs"] if measured(run)]
     commits = sorted({(found["commit"] or "?")[:10] for found in made})
     return [
         f"commit{'s' if len(commits) > 1 else ''} {', '.join(commits)}",
@@ -111,8 +111,8 @@ def measured(run: Run) -> dict[str, Any]:
 
 def _error(predictor: str, quantity: str, horizon: str, nodes: str, key: str, scale: float) -> Callable[[Run], Any]:
     def value(run: Run) -> float | None:
-        summary = measured(run).get("summary", {}).get(predictor, {}).get(quantity)
-        found = None if summary is None else summary[horizon][nodes][key]
+        by_horizon = measured(run).get("errors", {}).get(quantity, {}).get(predictor)
+        found = None if by_horizon is None else by_horizon[horizon][nodes][key]
         return None if found is None else scale * found
 
     return value
@@ -131,7 +131,7 @@ def _phase(name: str) -> Callable[[Run], Any]:
 
 
 def _of_samples(run: Run, key: str) -> float | None:
-    values = [sample[key] for sample in measured(run).get("samples", [])]
+    values = [scene[key] for scene in measured(run).get("scenes", [])]
     return None if not values or None in values else 1e3 * statistics.fmean(values)
 
 

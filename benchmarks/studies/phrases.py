@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 SHOWN_WORST = 5
+RESAMPLES = 2000
 
 
 def beside_solver(scenes: Sequence[dict[str, Any]], errors: Sequence[float | None], seconds: Sequence[float]) -> str:
@@ -15,11 +16,12 @@ def beside_solver(scenes: Sequence[dict[str, Any]], errors: Sequence[float | Non
     scene the fastest way counts that is as accurate as the answer; the own stop test always is."""
     taken, ratios = [], []
     for scene, error, answer in zip(scenes, errors, seconds, strict=True):
-        if "solver" not in scene or scene["solver"]["seconds"] is None or error is None:
+        solver = scene["solver"]
+        if solver is None or solver["seconds"] is None or error is None:
             continue
-        ways = [way for way in scene["solver"]["ways"].values() if "seconds" in way]
+        ways = [way for way in solver["ways"].values() if way["failure"] is None]
         fit = [way["seconds"] for way in ways if way["relative_error"] <= error]
-        taken.append(min([*fit, scene["solver"]["seconds"]]))
+        taken.append(min([*fit, solver["seconds"]]))
         ratios.append(taken[-1] / answer)
     if not taken:
         return "-"
@@ -38,6 +40,13 @@ def over_the_scenes(scenes: Sequence[dict[str, Any]]) -> str:
 
 
 def times_as_long(taken: Sequence[float], ratios: Sequence[float]) -> str:
-    """The mean of the solver's seconds, and of its times over those of the answers, with its standard error."""
-    spread = f" ± {np.std(ratios) / len(ratios) ** 0.5:.1g}" if len(ratios) > 1 else ""
-    return f"{1000 * np.mean(taken):.0f} ms, {np.mean(ratios):.2g}{spread} times as long"
+    """The median of the solver's seconds, and the median of its times over those of the answers, with its standard
+    error."""
+    spread = f" ± {median_error(ratios):.1g}" if len(ratios) > 1 else ""
+    return f"{1000 * np.median(taken):.0f} ms, {np.median(ratios):.2g}{spread} times as long"
+
+
+def median_error(values: Sequence[float]) -> float:
+    """The standard error of the median, by drawing the values anew with replacement (bootstrap)."""
+    drawn = np.random.default_rng(0).choice(np.asarray(values), (RESAMPLES, len(values)))
+    return float(np.median(drawn, axis=1).std())

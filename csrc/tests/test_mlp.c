@@ -122,6 +122,39 @@ static void test_accuracy(const ast_kernels *kernels) {
     }
 }
 
+/* Rows of the LayerNorm that are exact, weight2 being 0: equal values give beta, whatever their size. Nearly equal ones
+ * keep their differences, and values whose squares are too large for a float are normalized, too. Plain float is no
+ * measure of either: the bound is that of the rule where plain float errs by half a unit in the last place. */
+static void test_norm(const ast_kernels *kernels) {
+  static const float means[] = {1.1f, 33333.33f, 3.3e7f, 3e38f, 1e20f, 1e-40f};
+  static const int64_t channels[] = {1, 7, 48, 64, 128, 131, 300};
+  for (int m = 0; m < 6; m++)
+    for (int c = 0; c < 7; c++)
+      for (int spread = 0; spread < 3; spread++) {
+        const int64_t M = 5, O = channels[c];
+        if (spread && (means[m] > 1e30f || means[m] < 1e-30f)) continue;
+        problem a = new_problem(M, 3, 0, 4, O, true);
+        memset(a.arrays[4], 0, (size_t)(4 * O) * sizeof(float));
+        for (int64_t o = 0; o < O; o++)
+          a.arrays[5][o] =
+              spread == 2 ? means[m] * random_float() : means[m] * (1 + 3e-7f * (float)spread * random_float());
+        answer r = solve(kernels, &a, false);
+        double exact_mean = 0, variance = 0, largest = 0;
+        for (int64_t o = 0; o < O; o++) exact_mean += (double)a.arrays[5][o] / (double)O;
+        for (int64_t o = 0; o < O; o++) variance += pow((double)a.arrays[5][o] - exact_mean, 2) / (double)O;
+        for (int64_t i = 0; i < M * O; i++) largest = fmax(largest, fabs((double)r.of[0][i]));
+        for (int64_t i = 0; i < M * O; i++) {
+          const double u = ((double)a.arrays[5][i % O] - exact_mean) / sqrt(variance + 1e-5);
+          const float beta = a.arrays[7][i % O], residual = a.arrays[8][i];
+          const double exact = (double)a.arrays[6][i % O] * u + (double)beta + (double)residual;
+          CHECK(spread ? fabs((double)r.of[0][i] - exact) <= 1.2e-6 * largest : r.of[0][i] == beta + residual,
+                "out[%lld] of %lld channels near %g is %g, not %g", (long long)i, (long long)O, (double)means[m],
+                (double)r.of[0][i], exact);
+        }
+        free_answer(r), free_problem(a);
+      }
+}
+
 /* The same bits whether hidden units are kept or not, on a pool or not, and for rows alone. */
 static void test_same_bits(const ast_kernels *kernels) {
   problem a = new_problem(500, 20, 9, 40, 33, true);
@@ -150,6 +183,7 @@ static void test_same_bits(const ast_kernels *kernels) {
 
 static void test(const ast_kernels *kernels) {
   test_accuracy(kernels);
+  test_norm(kernels);
   test_same_bits(kernels);
 }
 

@@ -34,7 +34,7 @@ samples = 16
 rates = [1e-3]
 validations = 2
 horizons = 3
-settings = ["train.statistics_pairs=4"]
+settings = ["train.statistics_pairs=4", "train.batch_size=4"]
 [data]
 path = "toy.h5"
 [models.ast]
@@ -50,7 +50,7 @@ def written(folder, text: str):
 
 def test_the_file_says_what_is_compared(tmp_path):
     plan, entries = read(written(tmp_path, TOML + '[models.other]\nmodel = "mgn"\nrates = [1e-4, 2e-4]'))
-    common = ("train.statistics_pairs=4",)
+    common = ("train.statistics_pairs=4", "train.batch_size=4")
     assert plan == Study("Toy", Data(path="toy.h5"), (1e-3,), samples=16, validations=2, horizons=3, settings=common)
     assert list(entries) == ["ast", "other"] and entries["other"] == Entry("mgn", rates=(1e-4, 2e-4))
 
@@ -171,11 +171,11 @@ def test_a_small_study_from_end_to_end(tmp_path):
         conducted(odd=Entry(settings=("model.hiden=3",)))
     found = conducted(ast=entries["ast"])
     (made,) = found["ast"]["runs"]
-    assert made["steps"] == 4 and made["batch"] == 4 and made["seconds_per_step"] > 0
+    assert made["steps"] == 2 and made["batch"] == 8 and made["seconds_per_step"] > 0
     assert [point["step"] for point in made["curve"]] == [2, 4]
     assert made["best_valid"] == min(point["valid_rmse"] for point in made["curve"])
     assert made["best_valid"] == min(found["ast"]["search"].values())
-    summary = made["measured"]["summary"]["model"]["displacement"]["rollout_all"]["normal"]["rmse_sequence"]
+    summary = made["measured"]["errors"]["displacement"]["model"]["rollout_all"]["normal"]["rmse_sequence"]
     assert made["measured"]["horizons"] == 3 and made["measured"]["diverged"] == {} and summary > 0
     # Only the run with the best rate is measured.
     folders = tmp_path / "runs/ast"
@@ -323,7 +323,7 @@ def run_of(rollout: float | None, milliseconds: float) -> dict:
         "seed": 0,
         "seconds_per_step": 4e-3 * milliseconds,
         "batch": 4,
-        "measured": {"summary": {"model": {"displacement": summary}}},
+        "measured": {"errors": {"displacement": {"model": summary}}},
     }
 
 

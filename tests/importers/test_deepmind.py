@@ -174,7 +174,7 @@ def test_a_folder_with_a_meta_file_of_another_kind_is_a_series(tmp_path, capsys)
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "meta.json").write_text("{}")
     assert main(["convert", str(tmp_path / "run"), "--out", str(tmp_path / "d.h5")]) == 2
-    assert "neither the folder nor a folder in it holds .pvd, .vtkhdf or .vtu files" in capsys.readouterr().err
+    assert "neither the folder nor a folder in it holds files of results: .pvd" in capsys.readouterr().err
 
 
 def test_a_mesh_that_changes_is_refused(tmp_path):

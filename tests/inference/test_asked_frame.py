@@ -48,26 +48,26 @@ def test_errors_are_shares_of_the_displacement(one):
     frame = deepest_frame(truth)
     assert 0 < frame < 6
     model = Share(replace(toy.config(toy.info()), jumps=True), truth, frame, 0.75)
-    scene, *_ = asked_frames(model, one, "test", Effort(2))["scenes"]
+    scene, *_ = asked_frames(model, one, "test", Effort(2)).scenes
     free = ~truth.scene.prescribed
     size = np.sqrt(np.mean(np.square((truth.position[frame] - truth.position[0])[free].astype(float))))
-    assert (scene["name"], scene["frame"], scene["displacement"]) == ("test/000000", frame, pytest.approx(size))
-    assert scene["by_calls"] == pytest.approx([0.25, 0.25**2, 0.25**3], rel=1e-4)
-    assert scene["relative_error"] == pytest.approx(0.25**3, rel=1e-4) and scene["seconds"] > 0
+    assert (scene.name, scene.frame, scene.displacement) == ("test/000000", frame, pytest.approx(size))
+    assert scene.by_calls == pytest.approx([0.25, 0.25**2, 0.25**3], rel=1e-4)
+    assert scene.relative_error == pytest.approx(0.25**3, rel=1e-4) and scene.seconds > 0
     there = truth.stress[frame][truth.scene.deforming("node")].astype(float)
-    assert scene["stress_share"] == pytest.approx(0.25 * np.sqrt(np.mean(there**2)) / there.std(), rel=1e-5)
-    assert scene["largest_stress"] == pytest.approx(0.25, rel=1e-5)
+    assert scene.stress_share == pytest.approx(0.25 * np.sqrt(np.mean(there**2)) / there.std(), rel=1e-5)
+    assert scene.largest_stress == pytest.approx(0.25, rel=1e-5)
 
 
 def test_a_failure_and_a_dataset_without_a_solver_are_told(one):
     truth = one.load("test", 0)
     model = Share(replace(toy.config(toy.info()), jumps=True), truth, 3, float("nan"))
     found = asked_frames(model, one, "test", Effort(1), rival_scenes=1)
-    assert found["relative_error"] is None and lines(found) == ["the deepest frame: every prediction failed"]
+    assert found.relative_error is None and lines(found) == ["the deepest frame: every prediction failed"]
     model.share = 0.5
     found = asked_frames(model, one, "test", Effort(1), rival_scenes=1)
-    assert found["solver"] is None and "the solver was not run:" in lines(found)[-1]
-    json.dumps(found, allow_nan=False)
+    assert found.solver is None and "the solver was not run:" in lines(found)[-1]
+    json.dumps(asdict(found), allow_nan=False)
 
 
 @pytest.fixture(scope="module")
@@ -100,11 +100,11 @@ def test_newton_steps_lead_from_the_answer_to_equilibrium(pressed, monkeypatch):
         == tuple(truth.attributes[key] for key in ("young", "poisson"))
     )
     monkeypatch.setattr(jump, "STILL", 0.0)
-    found = asked_frames(model, pressed, "test", Effort(1, 3))["scenes"][0]
-    errors = found["by_calls"]
+    found = asked_frames(model, pressed, "test", Effort(1, 3)).scenes[0]
+    errors = found.by_calls
     assert errors[:2] == pytest.approx([0.3, 0.09], rel=1e-3)
-    assert errors[2] < 0.4 * errors[1] and errors[-1] < 0.015 and found["relative_error"] == errors[-1]
-    assert found["stress_share"] < 0.05 and found["largest_stress"] < 0.05
+    assert errors[2] < 0.4 * errors[1] and errors[-1] < 0.015 and found.relative_error == errors[-1]
+    assert found.stress_share < 0.05 and found.largest_stress < 0.05
     (answer,) = answers(model, [Question.of(truth, "plate", [frame])], Effort(1, 3))
     held = truth.scene.prescribed
     assert np.array_equal(answer.position[0][held], truth.position[frame][held])
@@ -112,9 +112,9 @@ def test_newton_steps_lead_from_the_answer_to_equilibrium(pressed, monkeypatch):
     assert [one.effort for one in measured] == [Effort(c, k) for c in (0, 1) for k in range(4)]
     assert [one.unsettled for one in measured] == [0, 1, 1, 0] * 2
     assert [one.steps for one in measured] == [0, 1, 2, 3] * 2
-    assert measured[7].stress_error == pytest.approx(found["stress_share"])
+    assert measured[7].stress_error == pytest.approx(found.stress_share)
     assert measured[5].stress_error > 1.1 * measured[7].stress_error
-    assert [one.error for one in measured[4:]] == errors[1:] and measured[0].error == errors[0]
+    assert tuple(one.error for one in measured[4:]) == errors[1:] and measured[0].error == errors[0]
     monkeypatch.setattr(NewtonSteps, "step", collapse)
     fallen = errors_by_effort(model, truth, Effort(1, 3))
     assert [one.error for one in fallen] == [errors[0], None, None, None, errors[1], None, None, None]
@@ -210,8 +210,8 @@ def test_newton_steps_end_when_one_is_small(pressed, monkeypatch):
     assert short.converged is False and short.last_steps == (pytest.approx(sizes[0], rel=1e-3),)
     assert answers(model, question, Effort(1))[0].converged is None
     found = asked_frames(model, pressed, "test", Effort(1, 1))
-    assert found["unsettled"] == 1 and "in 1 of 1 scenes the Newton steps did not end" in "\n".join(lines(found))
-    assert asked_frames(model, pressed, "test", Effort(1, 6))["unsettled"] == 0
+    assert found.unsettled == 1 and "in 1 of 1 scenes the Newton steps did not end" in "\n".join(lines(found))
+    assert asked_frames(model, pressed, "test", Effort(1, 6)).unsettled == 0
 
 
 def measured(errors, stresses, steps, unsettled):
@@ -270,11 +270,11 @@ def test_beside_the_solver(tmp_path):
         frame = deepest_frame(truth)
         config = replace(toy.config(dataset.info), jumps=True, stress="node")
         found = asked_frames(Share(config, truth, frame, 0.99), dataset, "test", Effort(), rival_scenes=1)
-    solver = found["scenes"][0]["solver"]
-    assert found["relative_error"] == pytest.approx(0.01, rel=1e-3)
-    assert solver["ways"]["own stop test"]["relative_error"] < 1e-3
-    assert solver["cheapest_seconds"] <= solver["seconds"]
-    assert solver["ways"][solver["cheapest"]]["relative_error"] <= 0.01
-    assert found["solver"]["ratio"] == pytest.approx(solver["seconds"] / found["scenes"][0]["seconds"])
+    solver = found.scenes[0].solver
+    assert found.relative_error == pytest.approx(0.01, rel=1e-3)
+    assert solver.ways["own stop test"].relative_error < 1e-3
+    assert solver.cheapest_seconds <= solver.seconds
+    assert solver.ways[solver.cheapest].relative_error <= 0.01
+    assert found.solver.ratio == pytest.approx(solver.seconds / found.scenes[0].seconds)
     assert any("the solver for this frame" in line for line in lines(found))
-    json.dumps(found, allow_nan=False)
+    json.dumps(asdict(found), allow_nan=False)

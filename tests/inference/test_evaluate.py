@@ -17,7 +17,7 @@ from ast_sim.dataset.solver_seconds import write_seconds
 from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.evaluation.evaluate import evaluate, table
-from ast_sim.inference.evaluation.trivial_predictors import displacement_errors, stress_errors, summarize
+from ast_sim.inference.evaluation.trivial_predictors import displacement_errors, errors_over_scenes, stress_errors
 from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.support.errors import DatasetError
 from ast_sim.support.provenance import provenance
@@ -132,9 +132,10 @@ def test_a_failed_rollout_has_no_error_and_no_summary():
     truth = one_triangle([0.0, 1.0, 2.0])
     failed = answer_of(truth, truth.position[:2], None, 1, "node 0 in frame 2 is not finite")
     errors = displacement_errors(truth, truth.position[1:], failed)
-    summary = summarize({"displacement": [errors]})["model"]["displacement"]
-    assert summary["rollout_all"]["normal"] == {"rmse_sequence": None, "rmse_pooled": None}
-    assert summary["one_step"]["normal"]["rmse_sequence"] == 0.0
+    rows = {(r.predictor, r.horizon, r.nodes): r for r in errors_over_scenes("displacement", [errors])}
+    failed = rows["model", "rollout_all", "normal"]
+    assert failed.rmse_sequence is None and failed.rmse_pooled is None
+    assert rows["model", "one_step", "normal"].rmse_sequence == 0.0
 
 
 @pytest.fixture(scope="module")
@@ -157,12 +158,10 @@ def test_evaluation_of_a_dataset_agrees_with_its_formulas(evaluated):
         moved = (truth.position[1:, normal].astype(float) - truth.position[0, normal]) ** 2
         roots.append(math.sqrt(moved.mean()))
         squares, numbers = squares + moved.sum(), numbers + moved.size
-    hold = found["summary"]["hold_still"]["displacement"]["rollout_all"]["normal"]
-    assert hold["rmse_sequence"] == pytest.approx(sum(roots) / 2, rel=1e-12)
-    assert hold["rmse_pooled"] == pytest.approx(math.sqrt(squares / numbers), rel=1e-12)
-    assert [
-        sample["displacement"]["hold_still"]["rollout_all"]["normal"] for sample in found["samples"]
-    ] == pytest.approx(roots)
+    hold = found.error("displacement", "hold_still")
+    assert hold.rmse_sequence == pytest.approx(sum(roots) / 2, rel=1e-12)
+    assert hold.rmse_pooled == pytest.approx(math.sqrt(squares / numbers), rel=1e-12)
+    assert [scene.error("displacement", "hold_still") for scene in found.scenes] == pytest.approx(roots)
 
     rows = [t.scene.node_type != NodeType.OBSTACLE for t in train]
     constant = np.concatenate([t.stress[:, r].ravel() for t, r in zip(train, rows, strict=True)]).mean(dtype=float)
@@ -170,8 +169,7 @@ def test_evaluation_of_a_dataset_agrees_with_its_formulas(evaluated):
     for truth in truths:
         stress = truth.stress[1:, truth.scene.node_type != NodeType.OBSTACLE].astype(float)
         expected.append(math.sqrt(((stress - constant) ** 2).mean()))
-    stress = found["summary"]["stress_constant"]["stress"]["rollout_all"]["deforming"]["rmse_sequence"]
-    assert stress == pytest.approx(sum(expected) / 2, rel=1e-6)
+    assert found.error("stress", "stress_constant").rmse_sequence == pytest.approx(sum(expected) / 2, rel=1e-6)
 
 
 def test_every_predictor_has_every_horizon_and_the_speed_is_the_solvers_over_the_models(evaluated):
@@ -179,27 +177,28 @@ def test_every_predictor_has_every_horizon_and_the_speed_is_the_solvers_over_the
     for predictor in ("model", "hold_still", "repeat_last"):
         for horizon in HORIZONS:
             for nodes in ("normal", "all"):
-                values = found["summary"][predictor]["displacement"][horizon][nodes]
-                assert set(values) == {"rmse_sequence", "rmse_pooled"}
-                assert all(value >= 0 for value in values.values())
+                row = found.error("displacement", predictor, horizon, nodes)
+                assert row.rmse_sequence >= 0 and row.rmse_pooled >= 0
     for predictor in ("model", "stress_zero", "stress_constant", "stress_frame_mean"):
-        assert set(found["summary"][predictor]["stress"]) == set(HORIZONS)
-    for sample, truth in zip(found["samples"], truths, strict=True):
-        assert sample["nodes"] == truth.scene.num_nodes
-        assert sample["frames"] == 7
-        assert sample["solver_seconds_per_step"] == 0.5
-    model = sum(6 * sample["model_seconds_per_step"] for sample in found["samples"])
-    assert found["speedup"] == pytest.approx(2 * 6 * 0.5 / model)
-    assert found["failures"] == 0
+        assert all(found.error("stress", predictor, horizon).rmse_sequence >= 0 for horizon in HORIZONS)
+    for scene, truth in zip(found.scenes, truths, strict=True):
+        assert (scene.nodes, scene.frames, scene.solver_seconds_per_step) == (truth.scene.num_nodes, 7, 0.5)
+    assert found.speedup == pytest.approx(np.median([0.5 / scene.model_seconds_per_step for scene in found.scenes]))
+    assert found.failures == 0
 
 
 def test_the_figures_are_json_and_a_readable_table(evaluated):
     found, _, _ = evaluated
-    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    written = json.loads(json.dumps(found.to_json(), allow_nan=False))
+    pooled = written["errors"]["displacement"]["model"]["one_step"]["all"]["rmse_pooled"]
+    assert pooled == found.error("displacement", horizon="one_step", nodes="all").rmse_pooled
+    scene = written["scenes"][0]
+    assert scene["errors"]["stress"]["model"]["rollout_all"]["deforming"] == found.scenes[0].error("stress")
+    assert (scene["name"], written["effort"]) == ("test/000000", {"corrections": 0, "newton_steps": 0})
     lines = table(found).splitlines()
-    hold = found["summary"]["hold_still"]["displacement"]["rollout_all"]["normal"]
+    hold = found.error("displacement", "hold_still")
     row = next(line for line in lines if line.startswith("  hold_still"))
-    assert row.endswith(f"{hold['rmse_sequence']:.4g} / {hold['rmse_pooled']:.4g}")
+    assert row.endswith(f"{hold.rmse_sequence:.4g} / {hold.rmse_pooled:.4g}")
     assert sum(line.startswith("  model") for line in lines) == 3
 
 
@@ -217,23 +216,23 @@ def test_the_solvers_seconds_beside_the_dataset_count_and_without_them_the_speed
         writer.add("train", plate)
         writer.add("test", plate)
     unknown = speed(path)
-    assert unknown["speedup"] is None and unknown["samples"][0]["solver_seconds_per_step"] is None
+    assert unknown.speedup is None and unknown.scenes[0].solver_seconds_per_step is None
     text = table(unknown)
     assert "scenes: 1, failed: 0, threads: " in text
     assert "speed relative to the solver: unknown." in text and ".seconds.json" in text
     write_seconds(path, toy.info().generator, {"test/000000": {"solve_seconds": [0.0] + [3.0] * 6}})
     known = speed(path)
-    (sample,) = known["samples"]
-    assert sample["solver_seconds_per_step"] == 3.0
-    assert known["speedup"] == pytest.approx(3.0 / sample["model_seconds_per_step"])
-    assert "times as fast as the solver was when it made them (one thread each)" in table(known)
+    (scene,) = known.scenes
+    assert scene.solver_seconds_per_step == 3.0
+    assert known.speedup == pytest.approx(3.0 / scene.model_seconds_per_step)
+    assert "times faster than the solver was when it made them (median, one thread each)" in table(known)
     torch.set_num_threads(2)
     try:
         unequal = speed(path)
     finally:
         torch.set_num_threads(1)
-    assert unequal["speedup"] is None and "times as fast" not in table(unequal)
-    took = 1000 * unequal["samples"][0]["model_seconds_per_step"]
+    assert unequal.speedup is None and "times faster" not in table(unequal)
+    took = 1000 * unequal.scenes[0].model_seconds_per_step
     assert f"the model {took:.3g} ms on 2 threads, the solver 3e+03 ms on one thread" in table(unequal)
 
 

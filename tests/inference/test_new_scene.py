@@ -47,7 +47,7 @@ def run(tmp_path_factory) -> Run:
 @pytest.fixture(scope="module")
 def test_error(run) -> float:
     """The displacement error in metres on the test split."""
-    return run.evaluate().figures["summary"]["model"]["displacement"]["rollout_all"]["normal"]["rmse_sequence"]
+    return run.evaluate().figures.error("displacement").rmse_sequence
 
 
 def solved(scene: Scene, motion: Motion) -> np.ndarray:

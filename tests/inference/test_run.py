@@ -48,8 +48,8 @@ def test_data_in_another_unit_are_converted(tmp_path):
         with DatasetWriter(tmp_path / f"{unit}.h5", replace(info, length_unit=unit, **facts)) as writer:
             writer.add("test", replace(plate, scene=scene, position=(scale * plate.position).astype(np.float32)))
         figures = run.evaluate(tmp_path / f"{unit}.h5").figures
-        assert figures["length_unit"] == "m"
-        found.append(figures["samples"][0]["displacement"]["model"]["rollout_all"]["normal"])
+        assert figures.length_unit == "m"
+        found.append(figures.scenes[0].error("displacement"))
     assert found[1] == pytest.approx(found[0], rel=1e-4) and found[0] > 0
     with pytest.raises(DatasetError, match="length_unit 'parsec' is unknown: use one of m, cm, mm, um, in"):
         Dataset(tmp_path / "mm.h5", "parsec")

@@ -1,15 +1,20 @@
-"""Linear tetrahedra: derivatives by central differences, rigid motions, the patch test."""
+"""Tetrahedra of both orders: derivatives by central differences, rigid motions, the patch test."""
 
 import numpy as np
 import pytest
 
 from ast_sim.mechanics.elements.elasticity import Elasticity
-from ast_sim.mechanics.elements.material import NeoHookean, cofactor, determinant
+from ast_sim.mechanics.elements.material import NeoHookean, cofactor, determinant, von_mises
+from ast_sim.mechanics.elements.second_order import LARGEST, elastic_body, shape_functions
 from ast_sim.mechanics.linear_system import LinearSystem
 from ast_sim.simulate.shapes import mesh
 from ast_sim.support.errors import SimulationError
 
 MATERIAL = NeoHookean(young=1e6, poisson=0.4)
+RUBBER = NeoHookean(young=1e6, poisson=0.499)  # in second-order elements, part of it acts on the mean dilatation
+ORDERS = pytest.mark.parametrize(
+    ("order", "material"), [(1, MATERIAL), (2, MATERIAL), (2, RUBBER)], ids=["linear", "second order", "rubber"]
+)
 
 
 def box(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -18,6 +23,16 @@ def box(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     inner = (np.abs(position) < np.array([1.0, 0.8, 0.6]) - 1e-9).all(axis=1)
     shift = np.random.default_rng(seed).uniform(-0.1, 0.1, position.shape)
     return position + np.where(inner[:, None], shift, 0), elements
+
+
+def body(order: int, material: NeoHookean, curved: float = 0.03) -> tuple[np.ndarray, np.ndarray, Elasticity]:
+    """The box, of coarser elements with curved edges if they are of second order: positions, elements, body."""
+    rest, elements = box()
+    if order == 2:
+        rest, elements = mesh.second_order(*mesh.block((1.0, 0.8, 0.6), 2))
+        inner = (np.abs(rest) < np.array([1.0, 0.8, 0.6]) - 1e-9).all(axis=1)
+        rest = rest + np.where(inner[:, None], np.random.default_rng(0).uniform(-curved, curved, rest.shape), 0)
+    return rest, elements, elastic_body(rest, elements, material)
 
 
 def deformed(position: np.ndarray, seed: int = 1) -> np.ndarray:
@@ -38,9 +53,10 @@ def dense_stiffness(elasticity: Elasticity, position: np.ndarray, project: bool 
     return matrix
 
 
-def test_gradient_is_the_derivative_of_the_energy():
-    rest, elements = box()
-    elasticity, position = Elasticity(rest, elements, MATERIAL), deformed(rest)
+@ORDERS
+def test_gradient_is_the_derivative_of_the_energy(order, material):
+    rest, _, elasticity = body(order, material)
+    position = deformed(rest)
     expected, step = gradient(elasticity, position), 1e-6
     difference = np.empty_like(expected)
     for index in np.ndindex(position.shape):
@@ -51,9 +67,10 @@ def test_gradient_is_the_derivative_of_the_energy():
     np.testing.assert_allclose(difference, expected, atol=1e-6 * np.abs(expected).max())
 
 
-def test_stiffness_is_the_derivative_of_the_gradient():
-    rest, elements = box()
-    elasticity, position = Elasticity(rest, elements, MATERIAL), deformed(rest)
+@ORDERS
+def test_stiffness_is_the_derivative_of_the_gradient(order, material):
+    rest, _, elasticity = body(order, material)
+    position = deformed(rest)
     expected, step = dense_stiffness(elasticity, position), 1e-6
     for column in range(0, position.size, 7):
         shift = np.zeros(position.size)
@@ -63,9 +80,9 @@ def test_stiffness_is_the_derivative_of_the_gradient():
         np.testing.assert_allclose(difference.ravel(), expected[:, column], atol=1e-6 * np.abs(expected).max())
 
 
-def test_projected_stiffness_is_positive_semi_definite_and_otherwise_the_same():
-    rest, elements = box()
-    elasticity = Elasticity(rest, elements, MATERIAL)
+@ORDERS
+def test_projected_stiffness_is_positive_semi_definite_and_otherwise_the_same(order, material):
+    rest, _, elasticity = body(order, material)
     squeezed = deformed(rest) * [0.6, 1.0, 1.0]
     exact = np.linalg.eigvalsh(dense_stiffness(elasticity, squeezed))
     projected = np.linalg.eigvalsh(dense_stiffness(elasticity, squeezed, project=True))
@@ -105,12 +122,12 @@ def test_the_projection_makes_the_negative_eigenvalues_of_the_second_derivative_
     np.testing.assert_allclose(found, expected, atol=1e-7 * np.abs(expected).max())
 
 
-def test_rigid_motion_gives_no_force_and_rotates_forces():
-    rest, elements = box()
-    elasticity = Elasticity(rest, elements, MATERIAL)
+@ORDERS
+def test_rigid_motion_gives_no_force_and_rotates_forces(order, material):
+    rest, _, elasticity = body(order, material)
     q, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
     q *= np.sign(np.linalg.det(q))
-    scale = elasticity.unit_force
+    scale = elasticity.unit_force * max(1, material.lam / material.young)
     assert np.abs(gradient(elasticity, rest @ q.T + [1.0, -2.0, 3.0])).max() < 1e-12 * scale
     position = deformed(rest)
     np.testing.assert_allclose(
@@ -118,23 +135,25 @@ def test_rigid_motion_gives_no_force_and_rotates_forces():
     )
 
 
-def test_forces_sum_to_zero_and_have_no_moment():
-    rest, elements = box()
-    elasticity, position = Elasticity(rest, elements, MATERIAL), deformed(rest)
+@ORDERS
+def test_forces_sum_to_zero_and_have_no_moment(order, material):
+    rest, _, elasticity = body(order, material)
+    position = deformed(rest)
     forces = gradient(elasticity, position)
     np.testing.assert_allclose(forces.sum(axis=0), 0, atol=1e-9 * np.abs(forces).max())
     np.testing.assert_allclose(np.cross(position, forces).sum(axis=0), 0, atol=1e-9 * np.abs(forces).max())
 
 
-def test_patch_test():
+@ORDERS
+def test_patch_test(order, material):
     """With an affine motion of the boundary the equilibrium of the interior is the same affine motion."""
-    rest, elements = box()
-    elasticity = Elasticity(rest, elements, MATERIAL)
+    rest, _, elasticity = body(order, material, curved=0)
     boundary = (np.abs(rest) > np.array([1.0, 0.8, 0.6]) - 1e-9).any(axis=1)
     assert 0 < (~boundary).sum() < len(rest)
     affine = np.eye(3) + np.array([[0.1, 0.05, 0.0], [-0.04, -0.08, 0.1], [0.02, 0.0, 0.06]])
     expected = rest @ affine.T
-    position = np.where(boundary[:, None], expected, expected + 0.02 * np.sin(17 * rest))
+    start = 0.02 if material is MATERIAL else 0.002  # rubber is stable near the solution only
+    position = np.where(boundary[:, None], expected, expected + start * np.sin(17 * rest))
     system = LinearSystem(*elasticity.entry_dofs(), boundary)
     no_contact = (np.zeros(0, int), np.zeros(0, int), np.zeros(0))
     for _ in range(8):
@@ -143,8 +162,50 @@ def test_patch_test():
         position = position + system.solve(values, no_contact, -gradient(elasticity, position))
     np.testing.assert_allclose(position, expected, atol=1e-10)
     deformation = elasticity.evaluate(position)
-    stress = MATERIAL.cauchy(deformation.F, deformation.J)
-    np.testing.assert_allclose(stress, np.broadcast_to(stress[:, :, :1], stress.shape), atol=1e-10 * MATERIAL.young)
+    stress = elasticity.cauchy(deformation)
+    expected = material.cauchy(deformation.F, deformation.J)[:, :, :1]
+    np.testing.assert_allclose(
+        stress, np.broadcast_to(expected, stress.shape), atol=1e-10 * material.young / (0.5 - 0.499)
+    )
+    at_nodes = elasticity.von_mises(deformation, "node")
+    np.testing.assert_allclose(at_nodes, von_mises(expected)[0], rtol=1e-6)
+
+
+def test_second_order_elements_are_quadratic():
+    """A field of degree two is exact between the nodes, and its F at the points; shape functions add up to one."""
+    rest, elements, elasticity = body(2, MATERIAL, curved=0)
+    factors = 0.05 * np.random.default_rng(4).normal(size=(3, 3, 3))
+    moved = rest + np.einsum("ijk,nj,nk->ni", factors, rest, rest)
+    weights = np.random.default_rng(5).dirichlet(np.ones(4), 20)
+    shapes = shape_functions(weights)
+    np.testing.assert_allclose(shapes.sum(axis=1), 1)
+    points, found = (np.einsum("na,eai->eni", shapes, x[elements]).reshape(-1, 3) for x in (rest, moved))
+    np.testing.assert_allclose(found, points + np.einsum("ijk,nj,nk->ni", factors, points, points), atol=1e-12)
+    # The mean of a gradient that is linear is that in the middle of the element.
+    F = elasticity.evaluate(moved).F.reshape(3, 3, 4, -1).mean(axis=2)
+    middle = rest[elements[:, :4]].mean(axis=1)
+    expected = np.eye(3)[:, :, None] + np.einsum("ijk,ej->ike", factors + factors.swapaxes(1, 2), middle)
+    np.testing.assert_allclose(F, expected, atol=1e-12)
+
+
+def test_the_mean_takes_what_is_left_of_the_bulk_modulus():
+    """A dilatation that is zero in the mean costs lambda' only; a uniform one costs the whole of lambda."""
+    rest, elements, elasticity = body(2, RUBBER, curved=0)
+    material, size = RUBBER, 1e-3
+    uniform = elasticity.evaluate((1 + size) * rest).energy
+    volume = 1.0 * 0.8 * 0.6 * 8
+    assert uniform == pytest.approx(volume * (4.5 * material.lam + 3 * material.mu) * size**2, rel=0.01)
+    lam, mu = elasticity.material.lam, elasticity.material.mu
+    np.testing.assert_allclose(lam, LARGEST * mu)
+    stiff = elastic_body(rest, elements, NeoHookean.of_lame(LARGEST * material.mu, material.mu))
+    one = elements[:1]
+    # tr(grad u) is linear in the element and zero in its middle.
+    offset = rest - rest[one[0, :4]].mean(axis=0)
+    bent = rest + size * np.stack([offset[:, 0] ** 2, np.zeros(len(rest)), np.zeros(len(rest))], axis=1)
+    alone, plain = (
+        elastic_body(rest, one, each).evaluate(bent).energy for each in (RUBBER, stiff.material.of(one[:, 0] * 0))
+    )
+    assert alone == pytest.approx(plain, rel=0.02)
 
 
 def test_nodal_mean_is_weighted_by_volume():
@@ -152,6 +213,10 @@ def test_nodal_mean_is_weighted_by_volume():
     elements = np.array([[0, 1, 2, 3], [0, 2, 1, 4]])
     mean = Elasticity(rest, elements, MATERIAL).nodal_mean(np.array([10.0, 2.0]))
     np.testing.assert_allclose(mean, [4, 4, 4, 10, 2, 0])  # volumes 1/6 and 1/2
+    rest, elements = mesh.second_order(rest, elements)
+    mean = elastic_body(rest, elements, MATERIAL).nodal_mean(np.array([10.0, 2.0]))
+    np.testing.assert_allclose(mean[:6], [4, 4, 4, 10, 2, 0])
+    assert sorted(mean[6:].round(9)) == [2, 2, 2, 4, 4, 4, 10, 10, 10]  # three edges in one element, three in both
 
 
 def test_an_inverted_element_has_infinite_energy_and_no_place_at_rest():
@@ -162,3 +227,7 @@ def test_an_inverted_element_has_infinite_energy_and_no_place_at_rest():
         flipped = elements.copy()
         flipped[2, [0, 1]] = flipped[2, [1, 0]]
         Elasticity(rest, flipped, MATERIAL)
+    rest, elements = mesh.second_order(rest, elements)
+    rest[elements[2, 4]] += 2 * (rest[elements[2, 3]] - rest[elements[2, 0]])
+    with pytest.raises(SimulationError, match="is turned over at rest: a quarter of it has the volume -"):
+        elastic_body(rest, elements, MATERIAL)

@@ -1,11 +1,13 @@
 """The force that moves a body: against closed forms, against the solver, and on positions with errors."""
 
+from dataclasses import replace
+
 import meshio
 import numpy as np
 import pytest
 from simulate.own_assembly.assemblies import SPEC, box, write_assembly
 
-from ast_sim.mechanics.case import driven_body
+from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.elements.elasticity import Elasticity
 from ast_sim.mechanics.elements.material import NeoHookean
 from ast_sim.mechanics.reaction import Reaction
@@ -33,7 +35,8 @@ def test_a_block_in_uniaxial_strain():
     scene = Scene(np.float32(position), np.int32(elements), types, np.zeros(len(position), np.int32), material)
     law = NeoHookean(*material[0].astype(float))
     for stretch in (0.8, 1.0, 1.3):
-        force = Reaction(scene, 0).of(position * [1, 1, stretch])
+        moved = np.float32(position * [1, 1, stretch])
+        force = Reaction(scene, Driven.of(scene, np.stack([np.float32(position), moved]))).of(moved)
         expected = 100 * (law.mu * stretch + law.pressure_factor(np.array(stretch)) / stretch)
         assert force == pytest.approx([0, 0, expected], abs=1e-6 * YOUNG)
 
@@ -46,12 +49,72 @@ def test_the_force_is_that_of_the_solver(tmp_path, who_moves):
         spec = spec.replace("move = { translation = [0, 0, '-travel'] }", "")
         spec = spec.replace("frames = 3", "frames = 3\nfriction = 0.3")
     scene, truth = solved(tmp_path, spec, travel=1.2)
-    force = Reaction(scene, driven_body(scene, truth.position))
+    force = Reaction(scene, Driven.of(scene, truth.position))
     found = np.array([force.of(position) for position in truth.position])
     recorded = np.array(truth.attributes["reaction"])
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), recorded, rtol=1e-3, atol=1e-3)
     # The punch is pushed down, the block up.
     assert recorded[-1] > 1e6 and (found[-1, 2] > 0) == (who_moves == "the block")
+
+
+ENDS = """
+unit = "mm"
+frames = 3
+order = {order}
+[parameters]
+young = [1e6, 2e6]
+[parts.bush]
+file = "block.vtu"
+young = "young"
+poisson = 0.3
+fixed = "{held}"
+[[parts.bush.move]]
+where = "{moved}"
+{motion}
+[parts.far]
+file = "punch.vtu"
+rigid = true
+offset = [12, 0, 0]
+"""
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize(
+    ("held", "moved", "motion"),
+    [
+        ("zmin", "zmax", "translation = [0, 0, -0.5]"),
+        ("xmin", "xmax", "translation = [0.3, 0.4, 0.1]"),
+        ("xmin", "xmax", "rotation = 20\naxis = [1, 0, 0]\npoint = [0, 5, 2.5]"),
+        ("xmin", "xmax", "rotation = 8\naxis = [0, 1, 0]\npoint = [10, 0, 2.5]"),
+    ],
+    ids=["pressed", "pulled aside", "twisted", "bent"],
+)
+def test_a_part_that_is_held_at_one_end_and_moved_at_the_other(tmp_path, order, held, moved, motion):
+    """The work of force and torque is the energy: force times way, or torque times angle, over two where it is linear.
+
+    The same figures follow from the positions alone.
+    """
+    scene, truth = solved(tmp_path, ENDS.format(order=order, held=held, moved=moved, motion=motion))
+    driven = Driven.of(scene, truth.position)
+    axis = {"x": 0, "y": 1, "z": 2}[moved[0]]
+    rest = scene.rest_position
+    np.testing.assert_array_equal(
+        driven.nodes, (scene.body == 0) & np.isclose(rest[:, axis], rest[scene.body == 0, axis].max())
+    )
+    found, recorded = Reaction(scene, driven), truth.attributes
+    forces = np.array([np.linalg.norm(found.of(position)) for position in truth.position])
+    np.testing.assert_allclose(forces, recorded["reaction"], rtol=2e-3, atol=1e-3 * max(recorded["reaction"]))
+    energy = recorded["elastic_energy"]
+    if "rotation" in motion:
+        torques = [found.torque(position) for position in truth.position]
+        np.testing.assert_allclose(torques, recorded["torque"], rtol=2e-3, atol=1e-3 * max(recorded["torque"]))
+        angle = np.radians(float(motion.split()[2]))
+        assert recorded["torque"][-1] * angle / 2 == pytest.approx(energy[-1], rel=0.03)
+        assert min(recorded["torque"][1:]) > 0
+    else:
+        way = (truth.position[-1] - rest)[driven.nodes][0]
+        assert found.of(truth.position[-1]) @ way / 2 == pytest.approx(energy[-1], rel=0.15)
+        assert "torque" not in recorded
 
 
 def test_it_is_the_force_on_the_body_that_moves_farthest_in_all_frames(tmp_path):
@@ -61,10 +124,10 @@ def test_it_is_the_force_on_the_body_that_moves_farthest_in_all_frames(tmp_path)
     shorter = punch.replace("'-travel'", "'-0.8 * travel'")
     spec = f"{whole}[parts.left]\noffset = [-2.4, 0, 0]{there_and_back}[parts.right]\noffset = [2.4, 0, 0]{shorter}"
     scene, truth = solved(tmp_path, spec, travel=1.2)
-    force, recorded = Reaction(scene, driven_body(scene, truth.position)), truth.attributes["reaction"]
+    force, recorded = Reaction(scene, Driven.of(scene, truth.position)), truth.attributes["reaction"]
     found = [np.linalg.norm(force.of(position)) for position in truth.position]
     np.testing.assert_allclose(found, recorded, rtol=1e-2, atol=1e-6 * max(recorded))
-    other = Reaction(scene, 2).of(truth.position[-1])
+    other = Reaction(scene, replace(Driven.of(scene, truth.position), body=2)).of(truth.position[-1])
     assert np.linalg.norm(other) > 1e6 > recorded[-1]
 
 
@@ -78,7 +141,7 @@ def test_a_part_that_touches_itself(tmp_path):
     spec = SPEC.replace('"block.vtu"', '"clip.vtu"\nself_contact = true')
     spec = spec.replace("rigid = true", "rigid = true\noffset = [-3, -3, -1]")
     scene, truth = solved(tmp_path, spec, travel=1.4)
-    force, recorded = Reaction(scene, driven_body(scene, truth.position)), np.array(truth.attributes["reaction"])
+    force, recorded = Reaction(scene, Driven.of(scene, truth.position)), np.array(truth.attributes["reaction"])
     found = [np.linalg.norm(force.of(position)) for position in truth.position]
     np.testing.assert_allclose(found, recorded, rtol=0.02, atol=1e-3)
     assert all(len(force._folds(position.astype(float))[0]) > 10 for position in truth.position[1:])
@@ -87,7 +150,7 @@ def test_a_part_that_touches_itself(tmp_path):
 def test_where_nothing_touches_no_force_is_needed(tmp_path):
     scene, truth = solved(tmp_path, travel=0.1)
     assert (
-        np.abs([Reaction(scene, driven_body(scene, truth.position)).of(position) for position in truth.position]).max()
+        np.abs([Reaction(scene, Driven.of(scene, truth.position)).of(position) for position in truth.position]).max()
         < 1e-3
     )
 
@@ -100,7 +163,7 @@ def test_errors_of_positions_average_out(tmp_path):
     elastic = Elasticity(scene.rest_position.astype(float), scene.elements[soft], law)
     held, force, rng = (
         scene.node_type == NodeType.HANDLE,
-        Reaction(scene, driven_body(scene, truth.position)),
+        Reaction(scene, Driven.of(scene, truth.position)),
         np.random.default_rng(0),
     )
     size = 0.03 * np.linalg.norm(truth.position[-1] - truth.position[0], axis=1).max()

@@ -182,9 +182,9 @@ def test_the_evaluation_says_that_one_step_is_the_rollout(data):
         found = evaluate(model_of("transolver"), dataset, effort=Effort(1))
         stepwise = evaluate(model_of("transolver", jumps=False), dataset)
     for quantity in ("displacement", "stress"):
-        errors = found["summary"]["model"][quantity]
-        assert errors["one_step"] == errors["rollout_all"]
-    assert found["jumps"] is True and stepwise["jumps"] is False
+        step, whole = (found.error(quantity, horizon=horizon) for horizon in ("one_step", "rollout_all"))
+        assert (step.rmse_sequence, step.rmse_pooled) == (whole.rmse_sequence, whole.rmse_pooled)
+    assert found.jumps is True and stepwise.jumps is False
     assert "one jump from the first and 1 correction, so" in table(found) and "one jump" not in table(stepwise)
 
 
@@ -193,9 +193,9 @@ def test_a_failed_prediction_has_no_one_step(data):
     model.motion_normalizer.scale.fill_(math.nan)
     with Dataset(data) as dataset:
         found = evaluate(model, dataset)
-    assert found["failures"] == 2
-    assert found["summary"]["model"]["displacement"]["one_step"]["normal"]["rmse_sequence"] is None
-    assert found["summary"]["model"]["stress"]["one_step"]["deforming"]["rmse_sequence"] is None
+    assert found.failures == 2
+    for quantity in ("displacement", "stress"):
+        assert found.error(quantity, horizon="one_step").rmse_sequence is None
 
 
 @pytest.mark.parametrize("model", ["ast", "transolver"])
@@ -241,6 +241,6 @@ def test_training_brings_the_error_below_holding_still(model, data, tmp_path):
     assert made.train.noise == 0.0 and made.model.jumps  # a guess has errors of the model's own
     trained = RunFolder(tmp_path / "run").load_model()
     with Dataset(data) as dataset:
-        errors = evaluate(trained, dataset, effort=Effort(1))["summary"]
-    reached, still = (errors[key]["displacement"]["rollout_all"]["normal"] for key in ("model", "hold_still"))
-    assert reached["rmse_sequence"] < 0.7 * still["rmse_sequence"]
+        found = evaluate(trained, dataset, effort=Effort(1))
+    reached, still = (found.error("displacement", key).rmse_sequence for key in ("model", "hold_still"))
+    assert reached < 0.7 * still

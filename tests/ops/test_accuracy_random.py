@@ -143,6 +143,27 @@ def mlp_case(draw: Draw) -> Case:
     )
 
 
+def norm_case(draw: Draw) -> Case:
+    """Rows for the LayerNorm that are exact in float32: spreads down to the last place of a mean, or none at all."""
+    rows, hidden, outputs = draw.number(1, 50), draw.number(1, 20), draw.number(2, 400)
+    mean, spread = draw.real(1e-3, 1e12), draw.one_of(0.0, draw.real(1e-8, 1e-2), draw.real(1e-8, 1e-2))
+    inputs = [
+        draw.normal(rows, hidden),
+        mean * (1 + draw.normal(outputs, scale=spread)),
+        *(draw.normal(outputs) for _ in range(2)),
+    ]
+
+    def layers(function: Callable) -> Callable:
+        """`function` with weights of the second layer that are 0, so that its bias is the row."""
+        return lambda x, b, c, d: function(x, torch.eye(hidden).to(x), None, x.new_zeros(outputs, hidden), b, c, d)
+
+    return (
+        layers(lambda x, w1, b1, w2, b2, c, d: mlp(x, w1, b1, w2, b2, None, (c, d))),
+        layers(lambda x, w1, b1, w2, b2, c, d: _mlp._reference(x, None, w1, b1, w2, b2, c, d, None, False)[0]),
+        inputs,
+    )
+
+
 def message_case(draw: Draw) -> Case:
     senders, receivers, num = draw.number(1, 300), draw.number(1, 300), draw.number(1, 1000)
     edges = EdgeSet.from_pairs(draw.indices(num, senders), draw.indices(num, receivers), senders, receivers)
@@ -216,7 +237,7 @@ def elastic_case(draw: Draw) -> Case:
     return lambda x: elastic_forces(x, rest, lame, tets), composed, [moved]
 
 
-CASES = [attention_case, linear_case, mlp_case, message_case, convolution_case, segment_case, elastic_case]
+CASES = [attention_case, linear_case, mlp_case, norm_case, message_case, convolution_case, segment_case, elastic_case]
 MISSED_WITHOUT_FMA = {(attention_case, 3)}
 
 

@@ -5,6 +5,7 @@ import torch
 from checks import (
     assert_accurate,
     assert_same_for_threads,
+    errors,
     instruction_sets,
     misaligned_read_only,
     run_forked,
@@ -180,10 +181,36 @@ def test_extreme_values_stay_in_their_row(value, saved, monkeypatch):
     assert (got[1].isnan().any(1) == expected.isnan().any(1)).all()
 
 
-def test_a_row_of_equal_values_is_beta():
-    x, w1, b1, w2, b2, _, gamma, beta, _ = case(5, 4, 8, 6)
-    out = mlp(x, w1, b1, torch.zeros_like(w2), torch.full_like(b2, 0.3), norm=(gamma, beta))
-    assert torch.equal(out, beta.expand(5, 6))
+@pytest.mark.parametrize("outputs", [1, 6, 48, 49, 64, 128, 300])
+@pytest.mark.parametrize("value", [0.3, 1.1, 1e5 / 3, 1e8 / 3, 1e15 / 3, 3e38, 1e-40])
+def test_a_row_of_equal_values_is_beta(outputs, value):
+    """A mean that is rounded would stay in every difference."""
+    x, w1, b1, w2, b2, _, gamma, beta, _ = case(5, 4, 8, outputs)
+    out = mlp(x, w1, b1, torch.zeros_like(w2), torch.full_like(b2, value), norm=(gamma, beta))
+    assert torch.equal(out, beta.expand(5, outputs))
+
+
+@pytest.mark.parametrize("outputs", [20, 64, 131])
+@pytest.mark.parametrize("amplitude", [1e18, 1e19, 1e25, 1e35])
+@pytest.mark.parametrize("saved", [0, ops.SAVED])
+def test_layer_norm_of_large_values(outputs, amplitude, saved, monkeypatch):
+    """Their squares are too large for a float; the composition is 0 or NaN there. The bound is that of the accuracy
+    rule where the composition errs by 5e-7, as it does at 1."""
+    monkeypatch.setattr(ops, "SAVED", saved)
+    inputs, keep = chosen(case(40, 12, 16, outputs, amplitude=amplitude), beside=False, residual=False)
+    inputs[4] *= amplitude
+    for result, _, largest in errors(fused(keep), composed(keep), inputs):
+        assert result <= 2e-6 * largest
+
+
+def test_layer_norm_of_a_row_that_is_not_finite_is_nan():
+    inputs, keep = chosen(case(6, 4, 8, 20), beside=False, residual=False)
+    inputs[0] = inputs[0].abs() + 1
+    inputs[1] = inputs[1].abs()
+    inputs[3] = torch.randn(20, 8).sign()  # outputs of about +-3e38 times 8 hidden units
+    inputs[0][2] = 3e38
+    out = fused(keep)(*inputs)
+    assert out[2].isnan().all() and out[[0, 1, 3, 4, 5]].isfinite().all()
 
 
 def test_no_rows():

@@ -119,6 +119,11 @@ def test_column_sum(rows, channels):
         segment.column_sum(x[None])
 
 
+def test_column_sum_of_a_million_rows():
+    """Of values that do not cancel, where one long chain of sums would collect rounding errors."""
+    assert_accurate(segment.column_sum, lambda x: x.sum(0), [torch.rand(1_000_000, 3)])
+
+
 def test_gradients_in_float64():
     x, order, offsets = case(9, 4, 3)
     assert torch.autograd.gradcheck(lambda x: segment_mean(x, order, offsets), x.double().requires_grad_())

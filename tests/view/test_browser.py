@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from browser import Browser
-from figures import evaluation, metrics
+from chosen_figures import evaluation, metrics
 from on_screen import HOSTILE, differ, drawn, settle, show, texts
 from view_scenes import plate, strip
 
@@ -263,11 +263,9 @@ def test_several_runs_side_by_side(browser, tmp_path):
 
 def test_only_some_units_take_a_prefix(browser, tmp_path):
     """Millimetres, and stress so small that its prefix would be milli: "mPa" would be read as MPa."""
-    errors = {"a": 1.0, "b": 2.0}
+    errors = {"a": 0.268, "b": 2.0}
     chosen = [ReportScene(name, name, plate(5), plate(5, seed=1)) for name in errors]
-    found = evaluation(errors, scale=1e-5)
-    found["length_unit"] = "mm"
-    found["samples"][0]["displacement"]["model"]["rollout_all"]["normal"] = 0.268
+    found = evaluation(errors, scale=1e-5, length_unit="mm")
     write(tmp_path / "report.html", [ReportRun("run", "ast", chosen, found, metrics())], "Millimetres")
     show(browser, tmp_path / "report.html")
     assert texts(browser, ".tile .value")[:2] == ["1.43e−8 mm", "0.0678 Pa"]

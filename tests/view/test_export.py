@@ -9,6 +9,7 @@ import meshio
 import numpy as np
 import pytest
 import pyvista
+from data_samples import block, raised, trajectory
 from view_scenes import plate, strip
 from vtk_series import read
 
@@ -16,7 +17,9 @@ from ast_sim.scene import Trajectory
 from ast_sim.support.errors import AstSimError, DatasetError
 from ast_sim.view import export
 
-CELL_TYPE = {3: pyvista.CellType.TRIANGLE, 4: pyvista.CellType.TETRA}
+CELL_TYPE = {3: pyvista.CellType.TRIANGLE, 4: pyvista.CellType.TETRA, 10: pyvista.CellType.QUADRATIC_TETRA}
+
+QUADRATIC = trajectory(raised(block(2, 1, 1)), 2, stress="node")
 
 
 def same(found, expected):
@@ -26,7 +29,9 @@ def same(found, expected):
 
 
 @pytest.mark.parametrize("suffix", [".pvd", ".vtkhdf"])
-@pytest.mark.parametrize("truth", [plate(5), plate(3, stress="element"), plate(2, stress="none"), strip(4), plate(1)])
+@pytest.mark.parametrize(
+    "truth", [plate(5), plate(3, stress="element"), plate(2, stress="none"), strip(4), plate(1), QUADRATIC]
+)
 def test_trajectory_reads_back(tmp_path, suffix, truth):
     path = tmp_path / f"plate & <ball>{suffix}"
     truth = replace(truth, times=tuple(i * 0.1 for i in range(truth.num_frames)))

@@ -6,13 +6,15 @@ import base64
 import json
 import re
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from figures import evaluation, metrics
+from chosen_figures import NOTHING_ASKED, evaluation, metrics
 from meshes import two_tetrahedra
 from view_scenes import plate, strip
 
+from ast_sim.figures import Beside
 from ast_sim.scene import NodeType, Trajectory
 from ast_sim.support.errors import AstSimError, MissingExtra
 from ast_sim.view import encode, page, report, tables
@@ -128,9 +130,9 @@ def test_all_conventions_stand_beside_the_trivial_predictors():
 
 
 def test_the_first_50_steps_are_shown_where_a_rollout_has_more():
-    for frames, shown in ((51, False), (52, True), (None, True)):
+    for frames, shown in ((51, False), (52, True)):
         found = evaluation({"a": 1e-3, "b": 2e-3})
-        found["samples"][1]["frames"] = frames
+        found = replace(found, scenes=(found.scenes[0], replace(found.scenes[1], frames=frames)))
         for table in tables.measure_tables(["AST"], [found]):
             assert ({"group": "First 50 steps of the rollout"} in table["rows"]) is shown
 
@@ -155,7 +157,7 @@ def test_an_element_that_holds_an_obstacle_node_is_shown_as_rigid():
 
 
 def test_a_run_that_jumps_has_no_figure_of_one_step():
-    runs = [evaluation({"a": 1e-3}), {**evaluation({"a": 1e-3}), "jumps": True}]
+    runs = [evaluation({"a": 1e-3}), evaluation({"a": 1e-3}, jumps=True)]
     for table in tables.measure_tables(["stepwise", "jumps"], runs):
         values, horizon = {}, None
         for row in table["rows"]:
@@ -187,20 +189,21 @@ def test_tiles_state_ratio_speed_and_failures():
 
 
 def test_a_tile_states_the_deepest_frame_beside_the_solver():
-    asked = {"relative_error": 0.0577, "seconds": 0.025, "solver": {"seconds": 0.0612}}
-    found = {tile["label"]: tile for tile in tables.tiles({**evaluation({"a": 3e-3}), "asked": asked})}
+    solver = Beside(scenes=3, seconds=0.0612, model_seconds=0.025, ratio=2.4)
+    asked = replace(NOTHING_ASKED, relative_error=0.0577, seconds=0.025, solver=solver)
+    found = {tile["label"]: tile for tile in tables.tiles(evaluation({"a": 3e-3}, asked=asked))}
     tile = found["Deepest frame alone"]
     assert (tile["value"], tile["suffix"]) == ("5.77", "%")
     assert tile["detail"] == "of the displacement, 25 ms on one thread; the solver: 61.2 ms"
-    for missing in ({**asked, "solver": None}, {**asked, "relative_error": None}):
-        tiles = {tile["label"]: tile for tile in tables.tiles({**evaluation({"a": 3e-3}), "asked": missing})}
+    for missing in (replace(asked, solver=None), replace(asked, relative_error=None)):
+        tiles = {tile["label"]: tile for tile in tables.tiles(evaluation({"a": 3e-3}, asked=missing))}
         assert "solver" not in tiles.get("Deepest frame alone", {"detail": ""})["detail"]
 
 
 def test_a_failed_rollout_has_no_figure():
     failed = evaluation({"a": None})
-    failed["summary"]["model"]["displacement"]["rollout_all"]["normal"]["rmse_sequence"] = None
-    tile = tables.tiles(failed)[0]
+    errors = [replace(row, rmse_sequence=None) if row.predictor == "model" else row for row in failed.errors]
+    tile = tables.tiles(replace(failed, errors=tuple(errors)))[0]
     assert tile["value"] is None and tile["detail"] == "no figure, because a rollout failed"
 
 
@@ -232,8 +235,7 @@ def test_data_cannot_end_its_element():
 
 
 def test_no_number_that_json_does_not_know():
-    damaged = evaluation({"a": float("nan")})
-    damaged["speedup"] = float("inf")
+    damaged = evaluation({"a": float("nan")}, speedup=float("inf"))
     run = report.ReportRun("run", "ast", [], damaged, [{"step": 1, "loss": float("nan")}])
     json.dumps(report.page_data([run]), allow_nan=False)
 

@@ -7,15 +7,16 @@ prepared for a mesh, for the model and for the solver.
 
 from __future__ import annotations
 
+import dataclasses
 import os
-import time
-from collections.abc import Callable
-from typing import Any
+import statistics
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import torch
 
 from ast_sim.dataset.reader import Dataset
+from ast_sim.figures import AskedFigures, AskedScene, Beside, SolverFigures, WayFigures
 from ast_sim.inference.effort import Effort, EffortErrors
 from ast_sim.inference.jump import calls
 from ast_sim.inference.predict import answers
@@ -35,22 +36,13 @@ def asked_frames(
     rival_scenes: int = 0,
     progress: Callable[[str], None] | None = None,
     made_from: str | os.PathLike[str] | None = None,
-) -> dict[str, Any]:
+) -> AskedFigures:
     """Predict the deepest frame of each scene of a split, alone and on one thread.
 
     Args:
         effort: what follows the first call of a model that jumps.
         rival_scenes: in so many scenes the solver goes to the same frame, in several ways; see `simulate.jobs.rival`.
         made_from: the specification or the parts of which the dataset was made, if any; the solver needs them.
-
-    Returns:
-        scenes: for each its name, frame, nodes, displacement, relative_error, by_calls (the relative error after each
-        call of a model that jumps, and after each Newton step, of the first start), seconds, last_step (the size of the
-        last Newton step, None without one), stress_share (the stress error over that of the frame's true mean),
-        largest_stress (relative error of the largest stress), and `solver` where it was run; their means
-        (`relative_error`, `by_calls`, `stress_share`, `largest_stress`), the median of seconds; unsettled: the scenes
-        whose Newton steps did not end;
-        solver: sums over the scenes where it was run, None if there are none, and `no_solver` says why.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -60,29 +52,40 @@ def asked_frames(
         for index in indices:
             scenes.append(_scene(model, dataset, split, index, effort))
             if progress is not None:
-                progress(scenes[-1]["name"])
+                progress(scenes[-1].name)
     finally:
         torch.set_num_threads(threads)
     why = None
     try:
-        indices, frames = indices[:rival_scenes], [scene["frame"] for scene in scenes[:rival_scenes]]
-        found = rivals(dataset.path, split, indices, frames, made_from=made_from, progress=False) if indices else ()
-        for scene, rival in zip(scenes, found, strict=False):
-            scene["solver"] = _solver(rival, scene["relative_error"])
+        asked = [scene.frame for scene in scenes[:rival_scenes]]
+        outcomes = _rivals(dataset, split, indices[:rival_scenes], asked, made_from)
+        for number, rival in enumerate(outcomes):
+            solver = _solver(rival, scenes[number].relative_error)
+            scenes[number] = dataclasses.replace(scenes[number], solver=solver)
             if progress is not None:
-                progress(scene["name"])
+                progress(scenes[number].name)
     except SimulationError as error:
         why = str(error)
-    known = [scene for scene in scenes if scene["relative_error"] is not None]
-    return {
-        "scenes": scenes,
-        **{key: _mean([scene[key] for scene in known]) for key in ("relative_error", "stress_share", "largest_stress")},
-        "by_calls": np.mean([scene["by_calls"] for scene in known], axis=0).tolist() if known else [],
-        "seconds": float(np.median([scene["seconds"] for scene in known])) if known else None,
-        "unsettled": sum((scene["last_step"] or 0) > STILL for scene in known),
-        "solver": _sums([scene for scene in known if "solver" in scene]),
-        "no_solver": why,
-    }
+    known = [scene for scene in scenes if scene.relative_error is not None]
+    return AskedFigures(
+        scenes=tuple(scenes),
+        relative_error=_mean([scene.relative_error for scene in known]),
+        stress_share=_mean([scene.stress_share for scene in known]),
+        largest_stress=_mean([scene.largest_stress for scene in known]),
+        by_calls=tuple(np.mean([scene.by_calls for scene in known], axis=0).tolist()) if known else (),
+        seconds=statistics.median(scene.seconds for scene in known) if known else None,
+        unsettled=sum((scene.last_step or 0) > STILL for scene in known),
+        solver=_beside([(scene, scene.solver.seconds) for scene in known if scene.solver]),
+        cheapest=_beside([(scene, scene.solver.cheapest_seconds) for scene in known if scene.solver]),
+        no_solver=why,
+    )
+
+
+def _rivals(
+    dataset: Dataset, split: str, indices: list[int], frames: list[int], made_from: str | os.PathLike[str] | None
+) -> Iterable[Rivals]:
+    """What the solver took to these frames; nothing, where none is asked for."""
+    return rivals(dataset.path, split, indices, frames, made_from=made_from, progress=False) if indices else ()
 
 
 def errors_by_effort(model: Simulator, truth: Trajectory, most: Effort) -> list[EffortErrors]:
@@ -113,56 +116,48 @@ def _after(model: Simulator, truth: Trajectory, frame: int, corrections: int, mo
             continue
         error = relative_error(positions[steps][0], truth, frame)
         stress = None if way.stress is None else way.stress[steps][0]
-        stress_error = _stress_errors(truth, stress, frame, model.config.stress)["stress_share"]
+        stress_error, _ = _stress_errors(truth, stress, frame, model.config.stress)
         measured.append(EffortErrors(effort, error, stress_error, min(steps, needed), float(0 < steps < needed)))
     return measured
 
 
-def lines(found: dict[str, Any]) -> list[str]:
+def lines(asked: AskedFigures) -> list[str]:
     """The most important figures as sentences."""
-    if found["relative_error"] is None:
+    if asked.relative_error is None or asked.seconds is None:
         return ["the deepest frame: every prediction failed"]
-    after = [f"{100 * error:.3g}" for error in found["by_calls"]]
+    after = [f"{100 * error:.3g}" for error in asked.by_calls]
     told = [
-        f"the deepest frame at once: error {100 * found['relative_error']:.3g} % of the displacement,"
-        f" {1000 * found['seconds']:.3g} ms on one thread"
+        f"the deepest frame at once: error {100 * asked.relative_error:.3g} % of the displacement,"
+        f" {1000 * asked.seconds:.3g} ms in the median, on one thread"
     ]
     if len(after) > 1:
         told.append(f"  after each call, and each Newton step: {', '.join(after)} %")
-    if found["unsettled"]:
-        told.append(f"  in {found['unsettled']} of {len(found['scenes'])} scenes the Newton steps did not end")
-    if found["stress_share"] is not None:
+    if asked.unsettled:
+        told.append(f"  in {asked.unsettled} of {len(asked.scenes)} scenes the Newton steps did not end")
+    if asked.stress_share is not None and asked.largest_stress is not None:
         told.append(
-            f"  stress: {found['stress_share']:.2f} of the error of the frame's true mean; the largest is"
-            f" {100 * found['largest_stress']:.3g} % off"
+            f"  stress: {asked.stress_share:.2f} of the error of the frame's true mean; the largest is"
+            f" {100 * asked.largest_stress:.3g} % off"
         )
-    if found["solver"] is not None:
-        told += _solver_lines(found["solver"])
-    elif found["no_solver"] is not None:
-        told.append(f"  the solver was not run: {found['no_solver']}")
+    if asked.no_solver is not None:
+        told.append(f"  the solver was not run: {asked.no_solver}")
+    for what, beside in (
+        ("the solver for this frame", asked.solver),
+        ("its fastest setting that is as accurate", asked.cheapest),
+    ):
+        if beside is not None:
+            told.append(
+                f"  {what}: {1000 * beside.seconds:.3g} ms, {beside.ratio:.3g} times as long (medians of"
+                f" {beside.scenes} scenes, one thread)"
+            )
     return told
 
 
-def _solver_lines(solver: dict[str, Any]) -> list[str]:
-    told = [
-        f"  the solver for this frame: {1000 * solver['seconds']:.3g} ms, {solver['ratio']:.3g} times as long"
-        f" (mean of {solver['scenes']} scenes, one thread)"
-    ]
-    if solver["cheapest_scenes"]:
-        told.append(
-            f"  its cheapest way with at most the model's error: {1000 * solver['cheapest_seconds']:.3g} ms,"
-            f" {solver['cheapest_ratio']:.3g} times as long ({solver['cheapest_scenes']} scenes)"
-        )
-    return told
-
-
-def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: Effort) -> dict[str, Any]:
+def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: Effort) -> AskedScene:
     name, truth = f"{split}/{index:06d}", dataset.load(split, index)
     frame = max(deepest_frame(truth), model.config.given_frames)
     question = Question.of(truth, name, [frame])
-    began = time.perf_counter()
     (answer,) = answers(model, [question], effort)
-    seconds = time.perf_counter() - began
     size = _rms(truth.position[frame] - truth.position[0], ~truth.scene.prescribed)
     failed = answer.failure is not None or not size  # where nothing moves, there is no relative error
     stress = None if answer.stress is None or answer.failure is not None else answer.stress[0]
@@ -171,17 +166,19 @@ def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: E
         (after,) = calls(model, [question], effort)
         positions = () if isinstance(after, str) else after.position
         by_calls = [relative_error(position[0], truth, frame) for position in positions]
-    return {
-        "name": name,
-        "frame": frame,
-        "nodes": truth.scene.num_nodes,
-        "displacement": size,
-        "relative_error": None if failed else relative_error(answer.position[0], truth, frame),
-        "by_calls": by_calls,
-        "seconds": seconds,
-        "last_step": answer.last_steps[-1] if answer.last_steps else None,
-        **_stress_errors(truth, stress, frame, model.config.stress),
-    }
+    share, largest = _stress_errors(truth, stress, frame, model.config.stress)
+    return AskedScene(
+        name=name,
+        nodes=truth.scene.num_nodes,
+        frame=frame,
+        displacement=size,
+        relative_error=None if failed else relative_error(answer.position[0], truth, frame),
+        by_calls=tuple(by_calls),
+        seconds=answer.seconds,
+        last_step=answer.last_steps[-1] if answer.last_steps else None,
+        stress_share=share,
+        largest_stress=largest,
+    )
 
 
 def relative_error(position: np.ndarray, truth: Trajectory, frame: int) -> float:
@@ -194,56 +191,54 @@ def _rms(difference: np.ndarray, rows: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(difference[rows], dtype=np.float64))))
 
 
-def _stress_errors(truth: Trajectory, stress: np.ndarray | None, frame: int, location: str) -> dict[str, float | None]:
-    """The error of the stress on what deforms, relative to that of the frame's true mean; and by how much the largest
-    is off. None where they say nothing."""
+def _stress_errors(
+    truth: Trajectory, stress: np.ndarray | None, frame: int, location: str
+) -> tuple[float | None, float | None]:
+    """The error of the stress on what deforms, relative to the error of the frame's true mean; and by how much the
+    largest is off. None where they say nothing."""
     if stress is None or truth.stress is None:
-        return {"stress_share": None, "largest_stress": None}
+        return None, None
     rows = truth.scene.deforming(location)
-    there, found = truth.stress[frame].astype(np.float64), stress.astype(np.float64)
-    spread, largest = float(there[rows].std()), float(there[rows].max())
-    return {
-        "stress_share": _rms(found - there, rows) / spread if spread else None,
-        "largest_stress": abs(float(found[rows].max()) - largest) / largest if largest else None,
-    }
+    there = truth.stress[frame].astype(np.float64)
+    given = stress.astype(np.float64)
+    spread = float(there[rows].std())
+    largest = float(there[rows].max())
+    share = _rms(given - there, rows) / spread if spread else None
+    return share, abs(float(given[rows].max()) - largest) / largest if largest else None
 
 
-def _solver(rival: Rivals, error: float | None) -> dict[str, Any]:
+def _solver(rival: Rivals, error: float | None) -> SolverFigures:
     """What the solver took: at its own stop test, and in each way; the cheapest has at most the model's error."""
     ways = {
-        outcome.way.name: {
-            "seconds": outcome.whole_seconds,
-            "setup_seconds": outcome.setup_seconds,
-            "relative_error": outcome.relative_error,
-            "load_steps": outcome.load_steps,
-            "newton_iterations": outcome.newton_iterations,
-        }
+        outcome.way.name: WayFigures(
+            seconds=outcome.whole_seconds,
+            setup_seconds=outcome.setup_seconds,
+            relative_error=outcome.relative_error,
+            load_steps=outcome.load_steps,
+            newton_iterations=outcome.newton_iterations,
+        )
         if outcome.converged
-        else {"failure": outcome.failure}
+        else WayFigures(failure=outcome.failure)
         for outcome in rival.outcomes
     }
     best = None if error is None else cheapest(rival.outcomes, error)
     own = rival.outcomes[0]
-    return {
-        "seconds": own.whole_seconds if own.converged else None,
-        "cheapest": None if best is None else best.way.name,
-        "cheapest_seconds": None if best is None else best.whole_seconds,
-        "ways": ways,
-    }
+    return SolverFigures(
+        seconds=own.whole_seconds if own.converged else None,
+        cheapest=None if best is None else best.way.name,
+        cheapest_seconds=None if best is None else best.whole_seconds,
+        ways=ways,
+    )
 
 
-def _sums(scenes: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """Means over the scenes in which the solver converged, and its time over the model's in these scenes."""
-    own = [scene for scene in scenes if scene["solver"]["seconds"] is not None]
-    best = [scene for scene in scenes if scene["solver"]["cheapest_seconds"] is not None]
-    if not own:
+def _beside(scenes: list[tuple[AskedScene, float | None]]) -> Beside | None:
+    """The scenes with the solver's seconds, as medians."""
+    both = [(seconds, scene.seconds) for scene, seconds in scenes if seconds is not None]
+    if not both:
         return None
-    found: dict[str, Any] = {"scenes": len(own), "cheapest_scenes": len(best)}
-    for which, chosen in (("", own), ("cheapest_", best)):
-        took = [scene["solver"][f"{which}seconds"] for scene in chosen]
-        found[f"{which}seconds"] = _mean(took)
-        found[f"{which}ratio"] = sum(took) / sum(scene["seconds"] for scene in chosen) if chosen else None
-    return found
+    solver, model = zip(*both, strict=True)
+    ratio = statistics.median(theirs / ours for theirs, ours in both)
+    return Beside(len(both), statistics.median(solver), statistics.median(model), ratio)
 
 
 def _mean(values: list[float | None]) -> float | None:

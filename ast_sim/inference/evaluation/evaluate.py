@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import os
+import statistics
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import torch
@@ -14,15 +13,16 @@ import torch
 from ast_sim.batches.batch_builder import State
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import read_seconds
+from ast_sim.figures import Figures, SceneError, SceneFigures
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.effort import FIRST_CALL, Effort
 from ast_sim.inference.evaluation import asked_frame
 from ast_sim.inference.evaluation.trivial_predictors import (
     Errors,
     displacement_errors,
-    rmse_of,
+    errors_over_scenes,
+    scene_errors,
     stress_errors,
-    summarize,
 )
 from ast_sim.inference.predict import answers as predictions
 from ast_sim.inference.predict_batch import Start, predict_batch
@@ -43,22 +43,15 @@ def evaluate(
     effort: Effort = FIRST_CALL,
     rival_scenes: int = 0,
     made_from: str | os.PathLike[str] | None = None,
-) -> dict[str, Any]:
+) -> Figures:
     """Predict all trajectories of a split and compare.
 
-    A scene without a frame to predict is left out. Where a prediction fails, its errors and the summary are None.
+    A scene without a frame to predict is left out. `progress` is called with the name of each scene, once for all of
+    its frames and once for its deepest frame, and of each scene that the solver has solved.
 
-    Returns:
-        Figures that hold:
-        samples: for each scene its name, nodes, frames, root mean square errors (`displacement` and `stress`, by
-        predictor, horizon and nodes), and the seconds per step of the model and of the solver;
-        summary: by predictor, quantity, horizon and nodes the errors `rmse_sequence` and `rmse_pooled` of all scenes;
-        failures: the number of failed predictions;
-        jumps: whether the model predicts each frame from the first one, so that its `one_step` errors are those of its
-        rollout; corrections, newton_steps: what follows the first call of such a model;
-        asked: the deepest frame of each scene, see `asked_frames`; the solver is run in `rival_scenes` scenes;
-        speedup: the solver's recorded time for all frames over the model's, both on one thread; else None;
-        length_unit, stress_unit, threads.
+    Args:
+        rival_scenes: in how many scenes the solver goes to the deepest frame, to compare.
+        made_from: as in `asked_frames`.
 
     Raises:
         DatasetError: the split has no frame to predict.
@@ -67,32 +60,39 @@ def evaluate(
     if not indices:
         raise DatasetError(f"{dataset.path}: the split {split} has no frame to predict")
     constant = _training_stress(dataset) if model.config.stress != "none" else None
-    samples, displacement, stress = [], [], []
+    scenes: list[SceneFigures] = []
+    displacement: list[Errors] = []
+    stress: list[Errors] = []
     seconds = read_seconds(dataset).samples
     for index in indices:
         name, truth = f"{split}/{index:06d}", dataset.load(split, index)
-        answer = predictions(model, [Question.of(truth, name)], effort)[0]
+        (answer,) = predictions(model, [Question.of(truth, name)], effort)
         one_step = _predicted(answer) if model.config.jumps else one_step_predictions(model, truth, name)
         displacement.append(displacement_errors(truth, one_step[0], answer))
+        errors = scene_errors("displacement", displacement[-1])
         if constant is not None:
             stress.append(stress_errors(truth, one_step[1], answer, constant, model.config.stress))
+            errors += scene_errors("stress", stress[-1])
         recorded = truth.attributes.get("solve_seconds")
         solver = seconds.get(name, recorded if isinstance(recorded, list) else None)
-        samples.append(_sample(truth, answer, displacement[-1], stress[-1] if stress else None, solver))
+        scenes.append(_scene_figures(truth, answer, errors, solver))
         if progress is not None:
             progress(name)
-    return {
-        "samples": samples,
-        "summary": summarize({"displacement": displacement, "stress": stress}),
-        "failures": sum(sample["failure"] is not None for sample in samples),
-        "jumps": model.config.jumps,
-        **dataclasses.asdict(effort),
-        "asked": asked_frame.asked_frames(model, dataset, split, effort, rival_scenes, progress, made_from),
-        "speedup": _speedup(samples),
-        "length_unit": dataset.info.length_unit,
-        "stress_unit": "Pa",
-        "threads": torch.get_num_threads(),
-    }
+    return Figures(
+        scenes=tuple(scenes),
+        errors=(
+            *errors_over_scenes("displacement", displacement),
+            *(errors_over_scenes("stress", stress) if stress else ()),
+        ),
+        failures=sum(scene.failure is not None for scene in scenes),
+        jumps=bool(model.config.jumps),
+        effort=dataclasses.asdict(effort),
+        asked=asked_frame.asked_frames(model, dataset, split, effort, rival_scenes, progress, made_from),
+        speedup=_speedup(scenes),
+        length_unit=dataset.info.length_unit,
+        stress_unit="Pa",
+        threads=torch.get_num_threads(),
+    )
 
 
 def _predicted(answer: Answer) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -124,35 +124,33 @@ def one_step_predictions(model: Simulator, truth: Trajectory, name: str) -> tupl
     return np.array([positions[0].numpy() for positions, *_ in found]), np.array(stresses) if stresses else None
 
 
-def _sample(
-    truth: Trajectory,
-    answer: Answer,
-    displacement: Errors,
-    stress: Errors | None,
-    solver: list[float] | None,
-) -> dict[str, Any]:
+def _scene_figures(
+    truth: Trajectory, answer: Answer, errors: list[SceneError], solver: list[float] | None
+) -> SceneFigures:
     """The figures of one scene; `solver`: the solver's seconds of each frame, None if they are not known."""
     steps = truth.num_frames - answer.given
-    return {
-        "name": answer.name,
-        "nodes": truth.scene.num_nodes,
-        "frames": truth.num_frames,
-        "displacement": rmse_of(displacement),
-        "stress": rmse_of(stress) if stress is not None else None,
-        "model_seconds_per_step": answer.seconds / steps if answer.failure is None else None,
-        "solver_seconds_per_step": float(np.sum(solver)) / (truth.num_frames - 1) if solver is not None else None,
-        "failure": answer.failure,
-    }
+    return SceneFigures(
+        name=answer.name,
+        nodes=truth.scene.num_nodes,
+        frames=truth.num_frames,
+        errors=tuple(errors),
+        model_seconds_per_step=answer.seconds / steps if answer.failure is None else None,
+        solver_seconds_per_step=float(np.sum(solver)) / (truth.num_frames - 1) if solver is not None else None,
+        failure=answer.failure,
+    )
 
 
-def _speedup(samples: list[dict[str, Any]]) -> float | None:
-    """The solver's time divided by the model's time, on the scenes where both are known, both on one thread."""
+def _speedup(scenes: list[SceneFigures]) -> float | None:
+    """The solver's time divided by the model's time, in the median of the scenes where both are known, both on one
+    thread."""
     if torch.get_num_threads() != 1:
         return None
-    keys = ("solver_seconds_per_step", "model_seconds_per_step")
-    both = [sample for sample in samples if sample[keys[0]] is not None and sample[keys[1]] is not None]
-    solver, model = (math.fsum(sample[key] * (sample["frames"] - 1) for sample in both) for key in keys)
-    return solver / model if both and model > 0 else None
+    ratios = [
+        scene.solver_seconds_per_step / scene.model_seconds_per_step
+        for scene in scenes
+        if scene.solver_seconds_per_step is not None and scene.model_seconds_per_step
+    ]
+    return statistics.median(ratios) if ratios else None
 
 
 def _training_stress(dataset: Dataset) -> float:
@@ -165,48 +163,54 @@ def _training_stress(dataset: Dataset) -> float:
     return total / number if number else 0.0
 
 
-def table(found: dict[str, Any]) -> str:
-    """The summary as text: for each quantity and set of nodes a table with a row for each predictor."""
+def table(figures: Figures) -> str:
+    """The errors as text: for each quantity and set of nodes a table with a row for each predictor."""
     lines = []
-    units = {"displacement": found["length_unit"], "stress": found["stress_unit"]}
     for quantity, nodes in (("displacement", "normal"), ("displacement", "all"), ("stress", "deforming")):
-        rows = {key: values[quantity] for key, values in found["summary"].items() if quantity in values}
+        rows = [row for row in figures.errors if (row.quantity, row.nodes) == (quantity, nodes)]
         if not rows:
             continue
-        lines.append(f"{quantity} [{units[quantity]}], {nodes} nodes: rmse_sequence / rmse_pooled")
-        horizons = next(iter(rows.values()))
+        horizons = list(dict.fromkeys(row.horizon for row in rows))
+        lines.append(f"{quantity} [{figures.unit(quantity)}], {nodes} nodes: rmse_sequence / rmse_pooled")
         lines.append(" " * 20 + "".join(f"{horizon:>24}" for horizon in horizons))
-        for predictor, values in rows.items():
-            cells = [values[horizon][nodes] for horizon in horizons]
-            shown = [" / ".join(_shown(cell[key]) for key in ("rmse_sequence", "rmse_pooled")) for cell in cells]
+        for predictor in dict.fromkeys(row.predictor for row in rows):
+            cells = [figures.error(quantity, predictor, horizon, nodes) for horizon in horizons]
+            shown = [f"{_shown(cell.rmse_sequence)} / {_shown(cell.rmse_pooled)}" for cell in cells if cell is not None]
             lines.append(f"  {predictor:18}" + "".join(f"{cell:>24}" for cell in shown))
         lines.append("")
-    lines.append(f"scenes: {len(found['samples'])}, failed: {found['failures']}, threads: {found['threads']}")
-    if found["jumps"]:
-        after = Effort(found["corrections"], found["newton_steps"])
+    lines.append(f"scenes: {len(figures.scenes)}, failed: {figures.failures}, threads: {figures.threads}")
+    if figures.jumps:
+        after = Effort(**figures.effort)
         lines.append(f"every frame is one jump from the first and {after.text}, so the model's one_step is its rollout")
-    if all(sample["solver_seconds_per_step"] is None for sample in found["samples"]):
+    if all(scene.solver_seconds_per_step is None for scene in figures.scenes):
         lines.append("speed relative to the solver: unknown. Neither the scenes nor a file beside the dataset")
         lines.append("(its name and .seconds.json) hold the seconds of a solver; a dataset is moved together with it")
     else:
-        lines.append(_all_frames(found))
-    lines += asked_frame.lines(found["asked"])
+        lines.append(_all_frames(figures))
+    lines += asked_frame.lines(figures.asked)
     return "\n".join(lines)
 
 
-def _all_frames(found: dict[str, Any]) -> str:
+def _all_frames(figures: Figures) -> str:
     """A line on the time of all frames, the model's beside the solver's; a ratio only if both had one thread."""
-    if found["speedup"] is not None:
-        return f"all frames: {found['speedup']:.3g} times as fast as the solver was when it made them (one thread each)"
-    known = [sample for sample in found["samples"] if sample["solver_seconds_per_step"] is not None]
-    times = {}
-    for who in ("model", "solver"):
-        seconds = [sample[f"{who}_seconds_per_step"] for sample in known]
-        times[who] = "unknown" if None in seconds else f"{1000 * math.fsum(seconds) / len(seconds):.3g} ms"
+    if figures.speedup is not None:
+        times = (
+            f"{figures.speedup:.3g} times faster" if figures.speedup >= 1 else f"{1 / figures.speedup:.3g} times slower"
+        )
+        return f"all frames: {times} than the solver was when it made them (median, one thread each)"
+    known = [scene for scene in figures.scenes if scene.solver_seconds_per_step is not None]
+    model, solver = (
+        _median([getattr(scene, f"{who}_seconds_per_step") for scene in known]) for who in ("model", "solver")
+    )
     return (
-        f"a frame of all: the model {times['model']} on {found['threads']} threads, the solver {times['solver']} on one"
+        f"a frame of all, in the median: the model {model} on {figures.threads} threads, the solver {solver} on one"
         " thread when it made them"
     )
+
+
+def _median(seconds: list[float | None]) -> str:
+    known = [value for value in seconds if value is not None]
+    return f"{1000 * statistics.median(known):.3g} ms" if len(known) == len(seconds) else "unknown"
 
 
 def _shown(value: float | None) -> str:

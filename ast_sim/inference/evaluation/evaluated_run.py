@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ast_sim.dataset.reader import Dataset
+from ast_sim.figures import Figures
 from ast_sim.inference.evaluation.evaluate import table
 from ast_sim.inference.predict import answers
 from ast_sim.inference.question import Question
@@ -29,19 +30,19 @@ class Evaluation:
     Attributes:
         run: the run.
         data: the path of the dataset.
-        figures: errors, times and their origin, as `save` writes them; see `ast_sim.inference.evaluation.evaluate`.
+        figures: errors, times and their origin, as `save` writes them.
     """
 
     run: Run
     data: Path
-    figures: dict[str, Any]
+    figures: Figures
 
     def __str__(self) -> str:
         return table(self.figures)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all figures as JSON."""
-        write_json(Path(path), self.figures)
+        write_json(Path(path), self.figures.to_json())
 
     def report(self, path: str | os.PathLike[str], title: str = "Learned simulation: predictions and errors") -> None:
         """Write a page with moving scenes, errors, times and settings."""
@@ -50,9 +51,9 @@ class Evaluation:
     def shown(self) -> report.ReportRun:
         """The content of the page: the best, the median and the worst scene, the curves of the training, facts."""
         errors = {}
-        for sample in self.figures["samples"]:
-            error = sample["displacement"]["model"]["rollout_all"]["normal"]
-            errors[sample["name"]] = math.inf if error is None else error
+        for scene in self.figures.scenes:
+            error = scene.error("displacement")
+            errors[scene.name] = math.inf if error is None else error
         with self.run.open(self.data) as dataset:
             scenes = [self._scene(dataset, label, name) for label, name in report.representative(errors)]
             metrics = list(self.run.folder.metrics)

@@ -12,11 +12,11 @@ rollout, or all frames if it is shorter), `rollout_all` (all frames).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
+from ast_sim.figures import MeanError, SceneError
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.evaluation.measures import SquaredError, rmse_pooled, rmse_sequence
 from ast_sim.scene import NodeType, Trajectory
@@ -90,29 +90,33 @@ def _errors_by_horizon(
     }
 
 
-def summarize(errors: dict[str, list[Errors]]) -> dict[str, Any]:
-    """predictor -> quantity -> horizon -> nodes -> {rmse_sequence, rmse_pooled}, over the scenes of each quantity."""
-
-    def both(*scenes: SquaredError) -> dict[str, float | None]:
-        return {"rmse_sequence": _or_none(rmse_sequence(scenes)), "rmse_pooled": _or_none(rmse_pooled(scenes))}
-
-    found: dict[str, Any] = {}
-    for quantity, scenes in errors.items():
-        for predictor, values in (_mapped(both, scenes) if scenes else {}).items():
-            found.setdefault(predictor, {})[quantity] = values
-    return found
+def scene_errors(quantity: str, errors: Errors) -> list[SceneError]:
+    """The root mean square errors of one scene."""
+    return [SceneError(quantity, *key, _or_none(error.rmse)) for key, error in _leaves(errors)]
 
 
-def rmse_of(errors: Errors) -> dict[str, Any]:
-    """The root mean square errors of one scene, in the same nested dictionaries."""
-    return _mapped(lambda error: _or_none(error.rmse), [errors])
+def errors_over_scenes(quantity: str, of_scenes: Sequence[Errors]) -> list[MeanError]:
+    """The errors over all scenes, in both conventions."""
+    rows = []
+    for same in zip(*(_leaves(errors) for errors in of_scenes), strict=True):
+        (predictor, horizon, nodes), _ = same[0]
+        squared = [error for _, error in same]
+        rows.append(
+            MeanError(
+                quantity, predictor, horizon, nodes, _or_none(rmse_sequence(squared)), _or_none(rmse_pooled(squared))
+            )
+        )
+    return rows
 
 
-def _mapped(function: Callable[..., Any], trees: list[Any]) -> Any:
-    """Nested dictionaries whose leaves are `function` of the corresponding leaves of all `trees`, which are alike."""
-    if not isinstance(trees[0], dict):
-        return function(*trees)
-    return {key: _mapped(function, [tree[key] for tree in trees]) for key in trees[0]}
+def _leaves(errors: Errors) -> list[tuple[tuple[str, str, str], SquaredError]]:
+    """Each error with its predictor, horizon and nodes."""
+    return [
+        ((predictor, horizon, nodes), error)
+        for predictor, by_horizon in errors.items()
+        for horizon, by_nodes in by_horizon.items()
+        for nodes, error in by_nodes.items()
+    ]
 
 
 def _or_none(value: float) -> float | None:

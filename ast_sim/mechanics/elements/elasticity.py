@@ -8,11 +8,12 @@ entry of an element's stiffness lands in the global matrix. Legend: N nodes, E e
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from ast_sim.mechanics.elements.material import NeoHookean, cofactor, determinant
+from ast_sim.mechanics.elements.material import NeoHookean, cofactor, determinant, von_mises
 from ast_sim.support.errors import SimulationError
 
 # The 78 entries (p, q), p <= q, of an element's symmetric 12 x 12 stiffness; p = 3 a + i for component i of node a.
@@ -72,6 +73,11 @@ class Elasticity:
         """Energy in joule of a body whose energy density is Young's modulus: a scale for rounding."""
         return float(np.sum(self.material.young * self.volume))
 
+    @property
+    def element_volume(self) -> np.ndarray:
+        """[E] rest volume of each element."""
+        return self.volume
+
     def lumped_volume(self) -> np.ndarray:
         """[N] volume around each node in m^3: a quarter of the volume of each element around it."""
         return np.bincount(self._nodes.ravel(), np.tile(self.volume / 4, 4), minlength=self.num_nodes)
@@ -127,51 +133,73 @@ class Elasticity:
         return self._dofs[_ROW].ravel(), self._dofs[_COLUMN].ravel()
 
     def _lift(self, entries: np.ndarray, deformation: Deformation) -> None:
-        """Add to the entries [78,E] of each element what makes the negative eigenvalues of d2 psi / dF2 zero.
-
-        With F = sum_i s_i u_i v_i^T, the eigenvectors of d2 psi / dF2 are of two kinds (Smith et al. 2019). For each
-        axis k the other two, i and j, have the twist u_i v_j^T - u_j v_i^T with the eigenvalue mu + c s_k / J, and the
-        flip u_i v_j^T + u_j v_i^T with mu - c s_k / J; here c is `pressure_factor`. At most one of them is negative.
-        The other three are sum_i w_i u_i v_i^T, with w an eigenvector of
-
-            A_ij = delta_ij (mu - c / s_i^2) + lambda J^2 / (s_i s_j),
-
-        which has no negative eigenvalue unless c is positive.
-        """
+        """Add to the entries [78,E] of each element what makes the negative eigenvalues of d2 psi / dF2 zero."""
         material, J = self.material, deformation.J
-        mu, c = material.mu, material.pressure_factor(J)
-        squares, right = np.linalg.eigh(np.einsum("kie,kje->eij", deformation.F, deformation.F))
-        stretch, right = np.sqrt(squares.T), np.ascontiguousarray(right.transpose(2, 1, 0))  # [3, E], [axis, 3, E]
-        left = np.einsum("ije,kje->kie", deformation.F, right) / stretch[:, None]
-        across = np.einsum("aje,kje->kae", self.gradients, right)  # v_k . grad N_a
-        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-            value = mu - np.abs(c) * stretch[k] / J
-            below = np.flatnonzero(value < 0)
-            one, other = (across[x][:, None, below] * left[y][None, :, below] for x, y in ((j, i), (i, j)))
-            self._raise(entries, below, one + np.sign(c[below]) * other, -value[below] / 2)
-        widened = np.flatnonzero(c > 0)
-        inverse = 1 / stretch[:, widened]
-        A = (material.lam * J * J)[widened] * inverse[:, None] * inverse[None]
-        A[range(3), range(3)] += np.broadcast_to(mu, J.shape)[widened] - c[widened] * inverse * inverse
-        values, vectors = np.linalg.eigh(A.transpose(2, 0, 1))
-        for value, weight in zip(values.T, vectors.transpose(2, 1, 0), strict=True):
-            below = np.flatnonzero(value < 0)
-            chosen = widened[below]
-            way = np.einsum("ke,kae,kie->aie", weight[:, below], across[:, :, chosen], left[:, :, chosen])
-            self._raise(entries, chosen, way, -value[below])
-
-    def _raise(self, entries: np.ndarray, elements: np.ndarray, way: np.ndarray, value: np.ndarray) -> None:
-        """Add value [n] times volume times b b^T to the entries of some elements, with b = `way` [4,3,n]."""
-        b = way.reshape(12, -1)
-        entries[:, elements] += (b * (value * self.volume[elements]))[_ROW] * b[_COLUMN]
+        arguments = material.mu, material.pressure_factor(J), material.lam * J * J
+        for elements, way, value in negative_directions(deformation, *arguments, self.gradients):
+            b = way.reshape(12, -1)
+            entries[:, elements] += (b * (value * self.volume[elements]))[_ROW] * b[_COLUMN]
 
     def cauchy(self, deformation: Deformation) -> np.ndarray:
         """True stress of each element [3,3,E] in pascal."""
         return self.material.cauchy(deformation.F, deformation.J)
 
+    def von_mises(self, deformation: Deformation, location: str) -> np.ndarray:
+        """Von Mises stress in pascal at `location`: "node" [N] (the mean of the elements around) or "element" [E]."""
+        stress = von_mises(self.cauchy(deformation))
+        return self.nodal_mean(stress) if location == "node" else stress
+
     def nodal_mean(self, element_values: np.ndarray) -> np.ndarray:
         """Mean [N] of the values [E] of the elements around each node, weighted by volume; 0 where there are none."""
-        nodes, weight = self._nodes.ravel(), np.tile(self.volume, 4)
-        total = np.bincount(nodes, np.tile(element_values, 4) * weight, minlength=self.num_nodes)
+        nodes, count = self._nodes.ravel(), len(self._nodes)
+        weight = np.tile(self.element_volume, count)
+        total = np.bincount(nodes, np.tile(element_values, count) * weight, minlength=self.num_nodes)
         volume = np.bincount(nodes, weight, minlength=self.num_nodes)
         return np.divide(total, volume, out=np.zeros(self.num_nodes), where=volume > 0)
+
+
+def negative_directions(
+    deformation: Deformation, mu: float | np.ndarray, c: np.ndarray, spread: np.ndarray, gradients: np.ndarray
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Where the second derivative of an energy by F has negative eigenvalues.
+
+    The derivative is mu I + spread F^-T (x) F^-T - c (dF -> F^-T dF^T F^-T). With F = sum_i s_i u_i v_i^T, its
+    eigenvectors are of two kinds (Smith et al. 2019). For each axis k the other two, i and j, have the twist
+    u_i v_j^T - u_j v_i^T with the eigenvalue mu + c s_k / J, and the flip u_i v_j^T + u_j v_i^T with mu - c s_k / J. At
+    most one of them is negative. The other three are sum_i w_i u_i v_i^T, with w an eigenvector of
+
+        A_ij = delta_ij (mu - c / s_i^2) + spread / (s_i s_j),
+
+    which has no negative eigenvalue unless c is positive or spread is negative.
+
+    Args:
+        mu, c, spread: of each of the E deformations. For Ciarlet's law, c is `pressure_factor` and spread lambda J^2.
+        gradients: [a,3,E] of the shape functions.
+
+    Yields:
+        Numbers [n] of deformations, an eigenvector as the change of F with the nodes, [a,3,n], and minus its eigenvalue
+        [n], with which it is to be added times itself: twists and flips have the length sqrt(2), so theirs is halved.
+    """
+    J = deformation.J
+    squares, right = np.linalg.eigh(np.einsum("kie,kje->eij", deformation.F, deformation.F))
+    stretch, right = np.sqrt(squares.T), np.ascontiguousarray(right.transpose(2, 1, 0))  # [3, E], [axis, 3, E]
+    left = np.einsum("ije,kje->kie", deformation.F, right) / stretch[:, None]
+    across = np.einsum("aje,kje->kae", gradients, right)  # v_k . grad N_a
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        value = mu - np.abs(c) * stretch[k] / J
+        below = np.flatnonzero(value < 0)
+        one, other = (across[x][:, None, below] * left[y][None, :, below] for x, y in ((j, i), (i, j)))
+        yield below, one + np.sign(c[below]) * other, -value[below] / 2
+    widened = np.flatnonzero((c > 0) | (spread < 0))
+    inverse = 1 / stretch[:, widened]
+    A = spread[widened] * inverse[:, None] * inverse[None]
+    A[range(3), range(3)] += np.broadcast_to(mu, J.shape)[widened] - c[widened] * inverse * inverse
+    values, vectors = np.linalg.eigh(A.transpose(2, 0, 1))
+    for value, weight in zip(values.T, vectors.transpose(2, 1, 0), strict=True):
+        below = np.flatnonzero(value < 0)
+        chosen = widened[below]
+        yield (
+            chosen,
+            np.einsum("ke,kae,kie->aie", weight[:, below], across[:, :, chosen], left[:, :, chosen]),
+            -value[below],
+        )

@@ -55,6 +55,11 @@ class NeoHookean:
                 f" got {young[wrong].flat[0]}, {poisson[wrong].flat[0]}"
             )
 
+    @classmethod
+    def of_lame(cls, lam: float | np.ndarray, mu: float | np.ndarray) -> NeoHookean:
+        """The material with these Lame constants."""
+        return cls(mu * (3 * lam + 2 * mu) / (lam + mu), lam / (2 * (lam + mu)))
+
     def of(self, elements: np.ndarray) -> NeoHookean:
         """The material of some of the elements, given by a mask or by their numbers."""
         if np.ndim(self.young) == np.ndim(self.poisson) == 0:

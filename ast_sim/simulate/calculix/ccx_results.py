@@ -33,8 +33,8 @@ class Results:
 
     Attributes:
         displacement: [S,N,3] metres; 0 at nodes of no element.
-        stress: [S,E,6] Cauchy stress in pascal: xx, yy, zz, xy, yz, zx.
-        reaction: [S,3] force in newton on the moving nodes.
+        stress: [S,E,6] Cauchy stress in pascal: xx, yy, zz, xy, yz, zx; the mean over the integration points.
+        reaction: [S,3] force in newton on the driven nodes.
         iterations: [S] iterations of each frame, including those of repeated increments.
         cutbacks: [S] increments of each frame that were repeated with a shorter length.
     """
@@ -46,8 +46,9 @@ class Results:
     cutbacks: np.ndarray
 
 
-def read_results(folder: Path, job: str, frames: int, nodes: int, elements: int) -> Results:
-    """Read the output of `job` in `folder`: the converged ones among frames 1 to `frames`.
+def read_results(folder: Path, job: str, frames: int, nodes: int, elements: int, points: int = 1) -> Results:
+    """Read the output of `job` in `folder`: the converged ones among frames 1 to `frames`; elements have so many
+    integration points.
 
     Raises:
         SimulationError: a file is missing, cut off or not as CalculiX 2.20 writes it.
@@ -56,7 +57,7 @@ def read_results(folder: Path, job: str, frames: int, nodes: int, elements: int)
     count = min(len(iterations), frames)
     displacement = _by_frame(folder / f"{job}.frd", read_displacement(folder / f"{job}.frd", nodes), count)
     tables = {"stresses": [], "total force": []}
-    for kind, time, values in read_tables(folder / f"{job}.dat", elements):
+    for kind, time, values in read_tables(folder / f"{job}.dat", elements, points):
         tables[kind].append((time, values))
     stress = _by_frame(folder / f"{job}.dat", tables["stresses"], count)
     reaction = _by_frame(folder / f"{job}.dat", tables["total force"], count)
@@ -100,13 +101,14 @@ def read_displacement(path: Path, nodes: int) -> Iterator[tuple[float, np.ndarra
         yield _numbers(path, np.array(block[1])).item(), _place(path, number, values, nodes)
 
 
-def read_tables(path: Path, elements: int) -> Iterator[tuple[str, float, np.ndarray]]:
+def read_tables(path: Path, elements: int, points: int) -> Iterator[tuple[str, float, np.ndarray]]:
     """Kind ("stresses" [E,6] or "total force" [3]), time and values of each table of the .dat file."""
     text = _text(path)
     for head in re.finditer(r"^ (stresses|total force) .* and time +(\S+)\n\n", text, re.MULTILINE):
         if head[1] == "stresses":
-            number, values = _rows(path, text, head.end(), elements, DAT_ROW, DAT_NUMBER, DAT_VALUES, DAT_WIDTH)
-            values = _place(path, number, values[:, STRESS_ORDER], elements)
+            rows = elements * points
+            number, values = _rows(path, text, head.end(), rows, DAT_ROW, DAT_NUMBER, DAT_VALUES, DAT_WIDTH)
+            values = _place(path, number, values[:, STRESS_ORDER], elements) / points
         else:
             values = _numbers(path, np.array(text[head.end() :].split("\n", 1)[0].split()))
         yield head[1], _numbers(path, np.array(head[2])).item(), values
@@ -147,10 +149,11 @@ def _numbers(path: Path, words: np.ndarray) -> np.ndarray:
 
 
 def _place(path: Path, number: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """[count,k]: the sum of the rows of values [n,k] with each number [n]."""
     if len(number) and (number.min() < 0 or number.max() >= count):
         raise SimulationError(f"{path} holds the number {number.max() + 1}; the mesh has 1 to {count}")
     placed = np.zeros((count, values.shape[1]))
-    placed[number] = values
+    np.add.at(placed, number, values)
     return placed
 
 

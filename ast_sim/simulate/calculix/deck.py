@@ -14,10 +14,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ast_sim.mechanics.case import SolidCase
+from ast_sim.mechanics.driven import Driven
 from ast_sim.scene import NodeType, Scene
 from ast_sim.support.errors import SimulationError
 
-# Node sets of the faces S1 to S4 of a C3D4.
+# The elements by their number of nodes; the order of the nodes is that of a scene.
+ELEMENT_TYPES = {4: "C3D4", 10: "C3D10"}
+# The corners of the faces S1 to S4.
 CALCULIX_FACES = ((0, 1, 2), (0, 1, 3), (1, 2, 3), (0, 2, 3))
 # A body counts as sharper than another if its convex edges are sharper by more than this angle, in radian.
 SHARPER = np.pi / 12
@@ -36,11 +39,6 @@ class Increments:
     stiffness: float = 1.0
     largest: float = 1.0
     smallest: float = 1e-5
-
-
-def moving_nodes(case: SolidCase) -> np.ndarray:
-    """[N] bool: prescribed nodes that leave their place at any time."""
-    return case.scene.prescribed & (case.targets != case.targets[0]).any(axis=(0, 2))
 
 
 def contact_stiffness(case: SolidCase) -> float:
@@ -68,9 +66,9 @@ def write_deck(file: TextIO, case: SolidCase, increments: Increments) -> None:
     Raises:
         SimulationError: elements are not tetrahedra, or nothing moves.
     """
-    if case.scene.elements.shape[1] != 4:
+    if case.scene.elements.shape[1] not in ELEMENT_TYPES:
         raise SimulationError("CalculiX is used for tetrahedra only: solve cloth with the own solver")
-    if not moving_nodes(case).any():
+    if not (case.scene.prescribed & (case.targets != case.targets[0]).any(axis=(0, 2))).any():
         raise SimulationError("CalculiX needs prescribed nodes that move, but this case has none")
     for block in (_mesh(case), _contact(case, increments), _steps(case, increments)):
         file.writelines(line + "\n" for line in block)
@@ -87,7 +85,7 @@ def _mesh(case: SolidCase) -> Iterator[str]:
     yield "*NODE, NSET=NODES"
     for number, (x, y, z) in enumerate(scene.rest_position.astype(np.float64), start=1):
         yield f"{number}, {x:.9e}, {y:.9e}, {z:.9e}"
-    yield "*ELEMENT, TYPE=C3D4, ELSET=ELEMENTS"
+    yield f"*ELEMENT, TYPE={ELEMENT_TYPES[scene.elements.shape[1]]}, ELSET=ELEMENTS"
     for number, nodes in enumerate(scene.elements + 1, start=1):
         yield f"{number}, " + ", ".join(map(str, nodes))
     constants = np.empty((scene.num_elements, 2))
@@ -101,8 +99,8 @@ def _mesh(case: SolidCase) -> Iterator[str]:
         yield "*USER MATERIAL, CONSTANTS=2"
         yield f"{young:.9e}, {poisson:.9e}"
         yield f"*SOLID SECTION, ELSET=MATERIAL{number}, MATERIAL=CIARLET_EL_{number}"
-    yield "*NSET, NSET=MOVING"
-    yield from _rows(np.flatnonzero(moving_nodes(case)))
+    yield "*NSET, NSET=DRIVEN"
+    yield from _rows(np.flatnonzero(Driven.of(scene, case.targets).nodes))
 
 
 def _contact(case: SolidCase, increments: Increments) -> Iterator[str]:
@@ -201,6 +199,6 @@ def _steps(case: SolidCase, increments: Increments) -> Iterator[str]:
         yield "U"
         yield f"*EL PRINT, ELSET=ELEMENTS, {only_last}"
         yield "S"
-        yield f"*NODE PRINT, NSET=MOVING, TOTALS=ONLY, {only_last}"
+        yield f"*NODE PRINT, NSET=DRIVEN, TOTALS=ONLY, {only_last}"
         yield "RF"
         yield "*END STEP"

@@ -23,12 +23,14 @@ from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import Contact
 from ast_sim.mechanics.elements.elasticity import Elasticity
 from ast_sim.mechanics.elements.material import von_mises
+from ast_sim.mechanics.elements.second_order import elastic_body
 from ast_sim.scene import AttributeValue, Trajectory
 from ast_sim.simulate.calculix.ccx_results import Results, read_results
 from ast_sim.simulate.calculix.deck import Increments, contact_stiffness, write_deck
 from ast_sim.support.errors import MissingExtra, SimulationError
 
 JOB = "case"
+POINTS = {4: 1, 10: 4}  # of integration, by the number of nodes of an element
 BEST_GUESS = "best solution and residuals are in the frd file"
 FAILED = 201  # what ccx returns when it gives up, for whatever reason
 # These are tried one after another until all frames converge: first softer contact, then shorter increments, too.
@@ -136,7 +138,8 @@ def _attempt(case: SolidCase, ccx: str, increments: Increments, timeout: float) 
         stopped_by = _run(ccx, folder, timeout)
         seconds = perf_counter() - started
         scene = case.scene
-        results = read_results(folder, JOB, len(case.targets) - 1, scene.num_nodes, scene.num_elements)
+        points = POINTS[scene.elements.shape[1]]
+        results = read_results(folder, JOB, len(case.targets) - 1, scene.num_nodes, scene.num_elements, points)
         trajectory = _trajectory(case, results, increments, stopped_by, seconds)
     except SimulationError as error:
         raise SimulationError(f"{error} (deck and output are kept in {folder})") from error
@@ -217,7 +220,7 @@ def _trajectory(
 def _check(case: SolidCase, position: np.ndarray) -> tuple[list[float], str]:
     """Smallest determinant of a deformation gradient in each frame of [S,N,3] up to the first that fails, and why."""
     scene = case.scene
-    at_rest = _six_volumes(scene.rest_position[scene.elements[case.deforming]])
+    elasticity = _elasticity(case)
     surface = scene.surface()
     bodies = [surface[scene.body[surface[:, 0]] == body] for body in np.unique(scene.body[case.scene.elements])]
     contacts = [Contact(scene.rest_position.astype(np.float64), faces, scene.body, case.contact) for faces in bodies]
@@ -225,7 +228,7 @@ def _check(case: SolidCase, position: np.ndarray) -> tuple[list[float], str]:
     for frame in position:
         if not np.isfinite(frame).all():
             return jacobian, "positions are not finite"
-        smallest = float((_six_volumes(frame[scene.elements[case.deforming]]) / at_rest).min())
+        smallest = float(elasticity.evaluate(frame.astype(np.float64)).J.min())
         if smallest <= 0:
             return jacobian, f"an element is inverted (det F = {smallest:.3g})"
         for body, contact in enumerate(contacts):
@@ -235,10 +238,10 @@ def _check(case: SolidCase, position: np.ndarray) -> tuple[list[float], str]:
     return jacobian, ""
 
 
-def _six_volumes(corners: np.ndarray) -> np.ndarray:
-    """Six times the volumes of tetrahedra with the corners [E,4,3]."""
-    corners = corners.astype(np.float64)
-    return np.linalg.det(corners[:, 1:] - corners[:, :1])
+def _elasticity(case: SolidCase) -> Elasticity:
+    """The deforming bodies."""
+    scene, deforming = case.scene, case.deforming
+    return elastic_body(scene.rest_position.astype(np.float64), scene.elements[deforming], case.material.of(deforming))
 
 
 def _stress_arrays(case: SolidCase, stress: np.ndarray) -> dict[str, np.ndarray]:
@@ -251,10 +254,7 @@ def _stress_arrays(case: SolidCase, stress: np.ndarray) -> dict[str, np.ndarray]
     mises = _von_mises(stress)
     if case.stress_location == "element":
         return {"stress": mises[:, :, None].astype(np.float32), "cauchy_stress": stress.astype(np.float32)}
-    scene = case.scene
-    elasticity = Elasticity(
-        scene.rest_position.astype(np.float64), scene.elements[case.deforming], case.material.of(case.deforming)
-    )
+    elasticity = _elasticity(case)
     nodal = np.stack([elasticity.nodal_mean(frame[case.deforming]) for frame in mises])
     return {"stress": nodal[:, :, None].astype(np.float32)}
 

@@ -29,13 +29,16 @@ from ast_sim.support.errors import ConfigError, SimulationError
 
 DRAWS = 10  # draws of the parameters before a sample is given up
 MESHES, NODE_TOLERANCE = 4, 0.1  # so many meshes are made to come this near to a wanted number of nodes
+# Elements are longer by this power of the factor by which nodes are fewer: between those of surfaces and of volumes. It
+# is larger where elements are about as long as the part: its shape then sets the number of nodes.
+USUAL_POWER, LARGEST_POWER = 0.4, 2.0
 LEAST_SHARE = 0.97  # a coarser mesh has at most this share of the nodes, or there is none
 SETTINGS = SolverSettings(force_tolerance=1e-3, max_iterations=200)
 DEFAULT_NODES = None
 MINIMUM_NODES = 20
 MINIMUM_FRAMES = 2
 # Units of the solver, pascal and the unit of length, in newton and joule: so many lengths are in a product.
-_POWERS = {"reaction": 2, "elastic_energy": 3, "contact_energy": 3, "dissipation": 3, "work": 3}
+_POWERS = {"reaction": 2, "torque": 3, "elastic_energy": 3, "contact_energy": 3, "dissipation": 3, "work": 3}
 
 
 def info(spec: AssemblySpec) -> dict[str, Any]:
@@ -129,6 +132,8 @@ def in_newton(trajectory: Trajectory, unit: str) -> Trajectory:
     """The trajectory with forces in newton and energies in joule; lengths and areas stay in the unit of length."""
     attributes = dict(trajectory.attributes)
     for name, power in _POWERS.items():
+        if name not in attributes:
+            continue
         attributes[name] = (LENGTH_UNITS[unit] ** power * np.asarray(attributes[name])).tolist()
     return replace(trajectory, attributes=attributes)
 
@@ -136,15 +141,20 @@ def in_newton(trajectory: Trajectory, unit: str) -> Trajectory:
 def _sized(spec: AssemblySpec, values: Values, nodes: int | None) -> tuple[float, list[PlacedPart]]:
     """The factor of all element sizes with which the scene has about that many nodes, and the parts."""
     factor, parts = 1.0, placed(spec, values)
-    best = factor, parts
+    best, power = (factor, parts), USUAL_POWER
     for _ in range(MESHES if nodes else 0):
         count = sum(len(part.position) for part in parts)
         if abs(count - nodes) < abs(sum(len(part.position) for part in best[1]) - nodes):
             best = factor, parts
         if abs(count - nodes) <= NODE_TOLERANCE * nodes:
             break
-        factor *= (count / nodes) ** 0.4  # between the powers of surfaces and of volumes
+        change = (count / nodes) ** power
+        factor *= change
         parts = placed(spec, values, factor)
+        fewer = count / sum(len(part.position) for part in parts)
+        power = (
+            float(np.clip(np.log(change) / np.log(fewer), USUAL_POWER, LARGEST_POWER)) if fewer != 1 else LARGEST_POWER
+        )
     return best
 
 

@@ -108,6 +108,7 @@ class AssemblySpec:
         path, text: its file and what stands in it.
         unit: unit of all lengths.
         frames: frames of a scene; the first is at rest.
+        order: of the elements: 2 for tetrahedra of ten nodes, 1 for those of four.
         contact_distance: distance below which surfaces repel each other; None: it follows from the size.
         pair_friction: friction between two parts, by their numbers; all others have the parameter `friction`.
         parameters: all parameters by name.
@@ -118,6 +119,7 @@ class AssemblySpec:
     text: str
     unit: str
     frames: int
+    order: int
     contact_distance: float | None
     pair_friction: dict[tuple[int, int], Expression]
     parameters: dict[str, Parameter]

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from ast_sim.dataset.layout import LENGTH_UNITS
+from ast_sim.element_topology import MIDDLES
 from ast_sim.importers.mesh_file import read_mesh
-from ast_sim.importers.places import Place
+from ast_sim.importers.places import Place, marked
 from ast_sim.simulate.own_assembly.assembly_spec import (
     CAD_ENDINGS,
     IGES_ENDINGS,
@@ -27,6 +28,7 @@ from ast_sim.simulate.own_assembly.parameters import Values
 from ast_sim.simulate.shapes.cad.gmsh_process import gmsh_version, mesh_own_scale
 from ast_sim.simulate.shapes.cad.stl_file import BadSurface
 from ast_sim.simulate.shapes.cad.surface_mend import Surface, stl_surface, whole_surface
+from ast_sim.simulate.shapes.mesh import second_order, straightened
 from ast_sim.simulate.shapes.mesh_check import BadMesh, check_mesh, check_no_intersections, check_surface
 from ast_sim.simulate.shapes.parts import oriented, volumes
 from ast_sim.support.errors import ConfigError, MissingExtra
@@ -46,7 +48,7 @@ class PartMesh:
     Attributes:
         name: the name of the part and of its file, for messages.
         position: [N,3] float64 in the unit of the specification.
-        cells: [E,4] tetrahedra of positive volume; [F,3] triangles of a rigid surface.
+        cells: [E,4] or [E,10] tetrahedra of positive volume; [F,3] triangles of a rigid surface.
         groups: numbers of the nodes of each named group.
         fields: [N] values of each point field.
         notes: what a user should know of it, a sentence each.
@@ -67,7 +69,7 @@ class PartMesh:
         """
         nodes = np.zeros(len(self.position), bool)
         for place in places:
-            inside = place.inside(self.position, lambda name: self._known("field", name, key) != 0, self._group(key))
+            inside = place.inside(self.position, lambda name: marked(self._known("field", name, key)), self._group(key))
             if not inside.any():
                 ends = zip("xyz", self.position.min(axis=0), self.position.max(axis=0), strict=True)
                 box = ", ".join(f"{axis} from {low:.6g} to {high:.6g}" for axis, low, high in ends)
@@ -126,7 +128,12 @@ def _request(spec: AssemblySpec, part: PartSpec, values: Values, factor: float) 
     changed = path.stat()
     kind = path.suffix.lower()
     scale = part.scale * (MILLIMETRE / LENGTH_UNITS[spec.unit] if kind in IGES_ENDINGS else 1.0)
-    request: dict[str, Any] = {"name": f"{part.name} ({file})", "scale": scale, "surface": part.rigid}
+    request: dict[str, Any] = {
+        "name": f"{part.name} ({file})",
+        "scale": scale,
+        "surface": part.rigid,
+        "order": spec.order,
+    }
     request["stamp"] = [str(path), changed.st_mtime_ns, changed.st_size]
     if part.solid is not None:
         request["solid"] = part.solid
@@ -179,7 +186,7 @@ def _from_file(part: PartSpec, request: dict[str, Any]) -> PartMesh:
     """A mesh, or a rigid surface, as it stands in its file."""
     if Path(request["stamp"][0]).suffix.lower() == STL_ENDING:
         return _surface_mesh(part, request, _stl(request))
-    mesh = read_mesh(Path(request["stamp"][0]), curved=True)
+    mesh = read_mesh(Path(request["stamp"][0]))
     used, elements = np.unique(mesh.elements, return_inverse=True)
     elements, position = elements.reshape(-1, mesh.elements.shape[1]), request["scale"] * mesh.points[used]
     fields = {
@@ -190,7 +197,31 @@ def _from_file(part: PartSpec, request: dict[str, Any]) -> PartMesh:
         if not np.isfinite(position).all():
             raise BadMesh(f"{request['name']}: a corner is not finite")
         return _surface_mesh(part, request, whole_surface(mesh.points[used][elements]))
-    return _checked(PartMesh(request["name"], position, elements, groups, fields), part.rigid)
+    mesh = PartMesh(request["name"], position, elements, groups, fields)
+    return _checked(_raised(mesh) if request["order"] == 2 and elements.shape[1] == 4 else mesh, part.rigid)
+
+
+def _raised(mesh: PartMesh) -> PartMesh:
+    """The same tetrahedra with nodes in the middles of their edges. A middle is in a group, or marked, if both its ends
+    are."""
+    position, cells = second_order(mesh.position, mesh.cells)
+    ends = np.zeros((len(position) - len(mesh.position), 2), int)
+    ends[cells[:, 4:] - len(mesh.position)] = cells[:, np.array(MIDDLES)]
+
+    def carried(values: np.ndarray) -> np.ndarray:
+        first, second = values[ends].T
+        return np.concatenate([values, np.where((first != 0) & (second != 0), first, 0)])
+
+    inside = {name: np.isin(np.arange(len(mesh.position)), nodes) for name, nodes in mesh.groups.items()}
+    groups = {name: np.flatnonzero(carried(nodes)) for name, nodes in inside.items()}
+    return PartMesh(
+        mesh.name,
+        position,
+        cells,
+        groups,
+        {name: carried(values) for name, values in mesh.fields.items()},
+        mesh.notes,
+    )
 
 
 def _surface_mesh(part: PartSpec, request: dict[str, Any], surface: Surface) -> PartMesh:
@@ -213,7 +244,9 @@ def _checked(mesh: PartMesh, rigid: bool) -> PartMesh:
             )
         check_no_intersections(position, cells, mesh.name)
         return mesh
-    if np.isfinite(position).all() and (volumes(position, cells) < 0).all():
-        cells = oriented(position, cells)
+    if np.isfinite(position).all():
+        if (volumes(position, cells) < 0).all():
+            cells = oriented(position, cells)
+        position = straightened(position, cells) if cells.shape[1] == 10 else position
     check_mesh(position, cells, mesh.name, SMALLEST_ANGLE)
     return PartMesh(mesh.name, position, cells, mesh.groups, mesh.fields, mesh.notes)

@@ -11,9 +11,10 @@ import numpy as np
 
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
+from ast_sim.plausibility.overlaps import deepest_node
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
 from ast_sim.simulate.own_assembly.standing import Reference, point
-from ast_sim.simulate.shapes.parts import volumes
+from ast_sim.simulate.shapes.parts import quarters
 from ast_sim.support.errors import SimulationError
 
 ON_A_LINE = 1e-3  # points lie on a line if their second extent, as a share of the first, is below this
@@ -63,7 +64,7 @@ def _check_turned_over(spec: AssemblySpec, case: SolidCase) -> None:
     rows = scene.elements[scene.prescribed[scene.elements].all(axis=1) & case.deforming]
     followed, stored = case.followed()
     for row, position in enumerate(followed.targets):
-        wrong = volumes(position, rows) <= 0
+        wrong = (quarters(position, rows) <= 0).any(axis=0)
         if wrong.any():
             first = rows[np.argmax(wrong)]
             name = spec.parts[scene.body[first[0]]].name
@@ -84,7 +85,7 @@ def _check_apart(
     faces = [surface_of(case, number) for number in pair]
     names = f"{spec.parts[first].name} and {spec.parts[second].name}"
     contact = _contact_of(case, pair)
-    depth, where = deepest(rest, *faces)
+    depth, where = deepest_node(rest, *faces)
     crossing = contact.intersects(rest)
     if crossing or depth > 0:
         told = f"overlap at rest by {depth:.3g} {spec.unit} at" if depth > 0 else "cut each other at rest near"
@@ -131,23 +132,6 @@ def surface_of(case: SolidCase, body: int) -> np.ndarray:
     """[F,3]: the surface triangles of a body."""
     surface = case.scene.surface()
     return surface[case.scene.body[surface[:, 0]] == body]
-
-
-def deepest(rest: np.ndarray, first: np.ndarray, second: np.ndarray) -> tuple[float, np.ndarray]:
-    """How deep a node of one closed surface lies inside the other, and where; 0 if none does."""
-    import igl  # takes 0.2 s
-
-    depth, where = 0.0, np.zeros(3)
-    for mine, other in ((first, second), (second, first)):
-        nodes = np.unique(mine)
-        low, high = rest[np.unique(other)].min(axis=0), rest[np.unique(other)].max(axis=0)
-        nodes = nodes[((rest[nodes] > low) & (rest[nodes] < high)).all(axis=1)]
-        if len(nodes):
-            used, faces = np.unique(other, return_inverse=True)
-            distance = igl.signed_distance(rest[nodes], rest[used], faces.reshape(-1, 3))[0]
-            if -distance.min() > depth:
-                depth, where = float(-distance.min()), rest[nodes[np.argmin(distance)]]
-    return depth, where
 
 
 def nearest_node(rest: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:

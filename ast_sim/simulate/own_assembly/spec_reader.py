@@ -27,8 +27,27 @@ from ast_sim.support.disk import read_text
 from ast_sim.support.errors import ConfigError
 
 DEFAULT_FRAMES = 6
-LOADS = ("force", "load", "pressure", "traction", "torque", "moment", "gravity", "acceleration")
-TIES = ("tie", "glue", "bond")
+DEFAULT_ORDER = 2  # linear tetrahedra are several times too stiff where a part bends, and where rubber is pressed
+# How keys begin that other programs have, and what to do instead.
+INSTEAD = {
+    ("force", "load", "pressure", "traction", "torque", "moment"): (
+        "forces cannot be prescribed, only motions: give a move whose travel is a range, and read off at which travel"
+        " the answers have this reaction"
+    ),
+    ("gravity", "acceleration", "velocity", "density", "mass"): (
+        "scenes are quasi-static, without weight or inertia: leave it out, and give motions by move"
+    ),
+    ("tie", "glue", "bond", "weld"): (
+        "parts cannot be glued to each other. One that is glued to a much stiffer one, as rubber to metal, moves with"
+        " it: make the stiffer one rigid, and give the nodes of the other at the joint its move (or fixed), such as"
+        " move = { where = 'zmin', translation = ... }. Parts of one material are glued as one part of one mesh"
+    ),
+    ("symmetry",): (
+        "nodes stand still in all directions or in none, so half a part cannot slide in its plane of symmetry: simulate"
+        " the whole part"
+    ),
+    ("temperature", "thermal", "expansion"): "there is no heat in these scenes: leave it out",
+}
 
 
 def read_spec(path: str | os.PathLike[str]) -> AssemblySpec:
@@ -52,12 +71,15 @@ def read_spec(path: str | os.PathLike[str]) -> AssemblySpec:
 
 
 def _spec(path: Path, text: str, table: Table) -> AssemblySpec:
-    unit, frames = table.text("unit"), table.take("frames", DEFAULT_FRAMES)
+    _refuse_other_words(table)
+    unit, frames, order = table.text("unit"), table.take("frames", DEFAULT_FRAMES), table.take("order", DEFAULT_ORDER)
     if unit not in LENGTH_UNITS:
         told = "is missing" if unit is None else f"is {unit!r}"
         raise ConfigError(f"unit {told}; say in which unit lengths are: {', '.join(LENGTH_UNITS)}")
     if not isinstance(frames, int) or isinstance(frames, bool) or frames < 2:
         raise ConfigError(f"frames is {frames!r}; must be a whole number of at least 2")
+    if order not in (1, 2) or isinstance(order, bool):
+        raise ConfigError(f"order is {order!r}; must be 2 (tetrahedra of ten nodes) or 1 (of four nodes)")
     named = Table(table.take("parameters", {}), "parameters")
     parameters: dict[str, Parameter] = {}
     for name in named.values:
@@ -74,11 +96,9 @@ def _spec(path: Path, text: str, table: Table) -> AssemblySpec:
     if distance is not None and not (_is_number(distance) and distance > 0):
         raise ConfigError(f"contact_distance is {distance!r}; must be a number above 0")
     table.known = plain(free)
-    _refuse_loads(table)
-    _refuse_ties(table)
     pairs = dict(_pair(row, [part.name for part in parts]) for row in table.tables("contact"))
     table.done()
-    spec = AssemblySpec(path, text, unit, frames, distance, pairs, parameters, parts)
+    spec = AssemblySpec(path, text, unit, frames, int(order), distance, pairs, parameters, parts)
     _check_used(spec, free)
     _check_files(spec)
     return spec
@@ -97,7 +117,7 @@ def _parts(table: Table) -> dict[str, Any]:
 def _part(name: str, values: Any, free: dict[str, Parameter], parameters: dict[str, Parameter]) -> PartSpec:
     """A part; its quantities are added to the parameters."""
     table = Table(values, f"parts.{name}", plain(free))
-    _refuse_loads(table)
+    _refuse_other_words(table)
     rigid, files = table.flag("rigid"), table.take("file")
     files = [files] if isinstance(files, str) else files
     if not isinstance(files, list) or not files or not all(isinstance(file, str) for file in files):
@@ -159,27 +179,15 @@ def _moves(table: Table, rigid: bool) -> tuple[Move, ...]:
     return tuple(_move(row, rigid) for row in rows)
 
 
-def _refuse_loads(table: Table) -> None:
-    load = next((name for name in table.values if name.rstrip("s") in LOADS), None)
-    if load is not None:
-        raise ConfigError(
-            f"{table.key(load)}: forces cannot be prescribed, only motions: give a move whose travel is a range, and"
-            " read off at which travel the answers have this reaction"
-        )
-
-
-def _refuse_ties(table: Table) -> None:
-    tie = next((name for name in table.values if name.rstrip("sd") in TIES), None)
-    if tie is not None:
-        raise ConfigError(
-            f"there is no {tie}: a part that is glued to a much stiffer one, as rubber to metal, moves with it: make"
-            " the stiffer one rigid, and give the nodes of the other at the joint its move (or fixed), such as"
-            " move = { where = 'zmin', translation = ... }; parts of one material are glued as one part of one mesh"
-        )
+def _refuse_other_words(table: Table) -> None:
+    for name in table.values:
+        for words, instead in INSTEAD.items():
+            if name.lower().startswith(words):
+                raise ConfigError(f"{table.key(name)}: {instead}")
 
 
 def _move(table: Table, rigid: bool) -> Move:
-    _refuse_loads(table)
+    _refuse_other_words(table)
     where = _places(table, "where")
     if rigid and where:
         raise ConfigError(f"{table.key('where')}: a rigid part moves as a whole: leave it out")

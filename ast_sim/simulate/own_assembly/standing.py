@@ -22,6 +22,7 @@ from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec, PartSpec
 from ast_sim.simulate.own_assembly.parameters import Values, completed
 from ast_sim.simulate.own_assembly.part_mesh import PartMesh, part_meshes
 from ast_sim.simulate.own_assembly.touching import set_back
+from ast_sim.simulate.shapes.mesh import second_order
 from ast_sim.support.errors import ConfigError
 
 NEAR_ORIGIN = 10  # diagonals of the assembly from the origin up to which positions stay as they are
@@ -51,7 +52,7 @@ class PlacedPart:
     Attributes:
         part: what the specification says of it.
         position: [N,3] float64, in the assembly.
-        cells: [E,4] tetrahedra, [F,3] triangles of a rigid surface.
+        cells: [E,4] or [E,10] tetrahedra, [F,3] triangles of a rigid surface.
         moves: [N] 0 for nodes that stand still, k + 1 for those of the k-th move, -1 for free nodes.
         notes: what a user should know of it, a sentence each.
     """
@@ -118,7 +119,7 @@ def case(spec: AssemblySpec, values: Values, frames: int, parts: list[PlacedPart
     Raises:
         ConfigError: a motion cannot be computed, a material is not allowed, or friction is negative.
     """
-    parts = [_layered(part, [p for p in parts if not p.part.rigid]) for part in parts]
+    parts = [_layered(part, [p for p in parts if not p.part.rigid], spec.order) for part in parts]
     parts, touching = _set_back(spec, parts, shared)
     offset = np.cumsum([0, *(len(part.position) for part in parts)])
     body = np.repeat(np.arange(len(parts)), np.diff(offset)).astype(np.int32)
@@ -201,9 +202,9 @@ def friction_is_drawn(spec: AssemblySpec) -> bool:
     return "friction" in drawn or any(one.names & drawn for one in formulas)
 
 
-def _layered(part: PlacedPart, deforming: list[PlacedPart]) -> PlacedPart:
+def _layered(part: PlacedPart, deforming: list[PlacedPart], order: int) -> PlacedPart:
     """A rigid surface as a thin layer of tetrahedra behind it, because all elements of a scene are of one kind."""
-    if part.cells.shape[1] == 4:
+    if part.cells.shape[1] != 3:
         return part
     count = len(part.position)
     points = np.concatenate([part.position, *(other.position for other in deforming)])
@@ -215,7 +216,9 @@ def _layered(part: PlacedPart, deforming: list[PlacedPart]) -> PlacedPart:
     tetrahedra = shells.tetrahedra(np.concatenate([points, behind]))
     tetrahedra = np.where(tetrahedra >= len(points), tetrahedra - len(points) + count, tetrahedra)
     position = np.concatenate([part.position, behind])
-    return PlacedPart(part.part, position, tetrahedra, np.tile(part.moves, 2), part.notes)
+    if order == 2:
+        position, tetrahedra = second_order(position, tetrahedra)
+    return PlacedPart(part.part, position, tetrahedra, np.full(len(position), part.moves[0]), part.notes)
 
 
 def point(x: np.ndarray) -> str:

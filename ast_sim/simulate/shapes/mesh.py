@@ -10,6 +10,11 @@ from itertools import permutations
 
 import numpy as np
 
+from ast_sim.element_topology import MIDDLES
+from ast_sim.mechanics.elements.second_order import points_at_rest
+
+STRAIGHTENED_BELOW = 0.3  # least volume of a quarter of a curved element, relative to a straight one
+
 
 def kuhn_tetrahedra() -> np.ndarray:
     """The six tetrahedra of a cell as corners [6,4,3] in {0,1}^3, all of positive volume.
@@ -111,3 +116,31 @@ def cylinder(radius: float, half_length: float, cells: int) -> tuple[np.ndarray,
     """Cylinder along x centred at the origin: positions [N,3], tetrahedra [E,4]; cells along each direction."""
     x, elements = _cube(cells)
     return np.concatenate([x[:, :1] * half_length, rounded(x[:, 1:]) * radius], axis=1), elements
+
+
+def second_order(position: np.ndarray, elements: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same tetrahedra with nodes in the middles of their straight edges: positions [N+M,3], elements [E,10].
+
+    The N nodes keep their numbers; the middles follow.
+    """
+    edges = np.sort(elements[:, np.array(MIDDLES)], axis=2)  # [E, 6, 2]
+    unique, middle = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True)
+    position = np.concatenate([position, position[unique].mean(axis=1)])
+    return position, np.concatenate([elements, len(position) - len(unique) + middle.reshape(-1, 6)], axis=1)
+
+
+def straightened(position: np.ndarray, elements: np.ndarray) -> np.ndarray:
+    """The positions [N,3] where no curved edge turns a part of its element [E,10] over, nor nearly so.
+
+    A mesh may be too coarse for its curved surface. There, the edges of the element become straight.
+    """
+    position = position.copy()
+    wanted = STRAIGHTENED_BELOW * np.abs(np.linalg.det(position[elements[:, 1:4]] - position[elements[:, :1]])) / 24
+    for _ in range(len(elements)):
+        bad = elements[(points_at_rest(position, elements)[0] < wanted).any(axis=0)]
+        ends = bad[:, np.array(MIDDLES)]
+        middles = position[ends].mean(axis=2)
+        if np.allclose(position[bad[:, 4:]], middles, rtol=0, atol=1e-12 * np.ptp(position, axis=0).max()):
+            break
+        position[bad[:, 4:]] = middles
+    return position

@@ -10,8 +10,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from ast_sim.element_topology import FACE_TRIANGLES, LOCAL_FACES
 from ast_sim.mechanics.contact_and_friction import load_ipctk
-from ast_sim.scene import LOCAL_FACES
 from ast_sim.simulate.shapes.cad.surface_mend import Surface, solids_of
 from ast_sim.simulate.shapes.parts import smallest_dihedral, volumes
 from ast_sim.support.errors import SimulationError
@@ -27,12 +27,13 @@ class BadMesh(SimulationError):
 
 
 def check_mesh(position: np.ndarray, elements: np.ndarray, name: str, smallest_angle: float = SMALLEST_ANGLE) -> None:
-    """Check a solid body, positions [N,3] and tetrahedra [E,4].
+    """Check a solid body, positions [N,3] and tetrahedra [E,4] or [E,10].
 
     Raises:
         BadMesh: the text names the part, what is wrong and where: no tetrahedra, too many nodes, numbers that are not
             finite, two nodes at one place, elements that are inverted, flat or with a dihedral angle below
-            `smallest_angle` degrees, no volume, several pieces, or a surface that cuts itself.
+            `smallest_angle` degrees, no volume, several pieces, or a surface that cuts itself. Angles and volumes are
+            those between the corners.
     """
     if len(elements) == 0:
         raise BadMesh(f"{name}: it holds no tetrahedra")
@@ -121,10 +122,13 @@ def check_no_intersections(position: np.ndarray, triangles: np.ndarray, name: st
 
 
 def boundary(elements: np.ndarray) -> np.ndarray:
-    """Faces [F,3] that belong to only one tetrahedron. Normals point out if the elements [E,4] have positive volume."""
-    faces = elements[:, np.array(LOCAL_FACES)].reshape(-1, 3)
-    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    return faces[np.sort(first[count == 1])]
+    """Triangles [F,3] of the faces that belong to only one tetrahedron, one of [E,4] and four of [E,10]. Normals point
+    out if the elements have positive volume."""
+    faces = np.sort(elements[:, np.array(LOCAL_FACES)].reshape(-1, 3), axis=1)
+    _, first, count = np.unique(faces, axis=0, return_index=True, return_counts=True)
+    owner, face = np.divmod(np.sort(first[count == 1]), 4)
+    local = np.array(FACE_TRIANGLES[elements.shape[1]])[face]
+    return np.take_along_axis(elements[owner][:, None, :], local, axis=2).reshape(-1, 3)
 
 
 def _check_points(position: np.ndarray, name: str, what: str) -> None:

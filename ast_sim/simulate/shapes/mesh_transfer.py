@@ -4,32 +4,59 @@ from __future__ import annotations
 
 import numpy as np
 
-_NUMBERS_AT_ONCE = 20_000_000  # of distances between points and faces, which limits the memory to some 200 MB
+from ast_sim.mechanics.elements.second_order import shape_functions
+
+_NEAREST = 32  # so many elements are tried for a point outside of all: those whose centres are nearest
 
 
 def transferred(rest: np.ndarray, elements: np.ndarray, displacement: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Displacements [n,3] at points: linear in each element, and continued beyond the nearest element outside.
+    """Displacements [n,3] at points: by the shape functions in each element, continued beyond the nearest one outside.
 
     A curved surface has no element at some points of a finer mesh of it. There, the element counts whose faces the
-    point passes by the smallest distance.
+    point passes by the smallest distance. Second-order elements are searched as if their edges were straight.
 
     Args:
         rest: [N,3] rest positions of a mesh.
-        elements: [E,4] its tetrahedra, none of them flat.
+        elements: [E,4] or [E,10] its tetrahedra, none of them flat.
         displacement: [N,3] displacements of its nodes.
         points: [n,3] rest positions of the points.
     """
-    start = rest[elements[:, 0]]
-    edges = rest[elements[:, 1:]] - start[:, None]
-    gradients = np.linalg.inv(edges).transpose(0, 2, 1)  # of the last three barycentric coordinates
-    gradients = np.concatenate([-gradients.sum(axis=1, keepdims=True), gradients], axis=1)  # [E,4,3]
-    offsets = np.array([1.0, 0.0, 0.0, 0.0]) - np.einsum("ekd,ed->ek", gradients, start)
-    heights = 1 / np.linalg.norm(gradients, axis=2)  # of each corner above the face opposite to it
-    normals, shifts = (gradients * heights[..., None]).reshape(-1, 3).T, (offsets * heights).ravel()
-    owner = np.empty(len(points), int)
-    rows = max(1, _NUMBERS_AT_ONCE // (4 * len(elements)))
-    for first in range(0, len(points), rows):
-        inside = points[first : first + rows] @ normals + shifts  # distances from the faces, positive inside
-        owner[first : first + rows] = inside.reshape(-1, len(elements), 4).min(axis=2).argmax(axis=1)
-    weights = np.einsum("nkd,nd->nk", gradients[owner], points) + offsets[owner]
+    corners = elements[:, :4].astype(np.int64)
+    owner = _owners(rest, corners, points)
+    weights = _barycentric(rest[corners[owner]], points)
+    if elements.shape[1] == 10:
+        weights = shape_functions(weights)
     return np.einsum("nk,nkd->nd", weights, displacement[elements[owner]])
+
+
+def _owners(rest: np.ndarray, corners: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """[n] the element that each point is in or nearest to."""
+    import igl  # takes 0.2 s
+    from scipy.spatial import KDTree
+
+    tree = igl.AABB()
+    tree.init(rest, corners)
+    owner = np.array(igl.in_element(rest, corners, points, tree))
+    outside = np.flatnonzero(owner < 0)
+    if not len(outside):
+        return owner
+    count = min(_NEAREST, len(corners))
+    _, tried = KDTree(rest[corners].mean(axis=1)).query(points[outside], k=range(1, count + 1))
+    weights = _barycentric(rest[corners[tried]].reshape(-1, 4, 3), np.repeat(points[outside], count, axis=0))
+    depth = (weights * _heights(rest[corners])[tried.ravel()]).min(axis=1).reshape(-1, count)
+    owner[outside] = np.take_along_axis(tried, depth.argmax(axis=1)[:, None], axis=1)[:, 0]
+    return owner
+
+
+def _barycentric(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """[n,4] barycentric coordinates of points [n,3], each in the tetrahedron with its corners [n,4,3]."""
+    edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
+    last = np.linalg.solve(edges, (points - corners[:, 0])[:, :, None])[:, :, 0]
+    return np.concatenate([1 - last.sum(axis=1, keepdims=True), last], axis=1)
+
+
+def _heights(corners: np.ndarray) -> np.ndarray:
+    """[E,4] how far each corner of the tetrahedra [E,4,3] is from the face opposite to it."""
+    gradients = np.linalg.inv(corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
+    gradients = np.concatenate([-gradients.sum(axis=1, keepdims=True), gradients], axis=1)
+    return 1 / np.linalg.norm(gradients, axis=2)

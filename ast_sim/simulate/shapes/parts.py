@@ -12,7 +12,8 @@ from itertools import combinations
 
 import numpy as np
 
-from ast_sim.scene import LOCAL_FACES
+from ast_sim.element_topology import LOCAL_FACES
+from ast_sim.mechanics.elements.second_order import points_at_rest
 from ast_sim.simulate.shapes.mesh import hexahedral_grid
 
 
@@ -32,14 +33,20 @@ class Part:
 
 
 def volumes(position: np.ndarray, elements: np.ndarray) -> np.ndarray:
-    """Signed volumes [E] of the tetrahedra [E,4] over positions [N,3]."""
-    corners = position[elements]
+    """Signed volumes [E] between the corners of the tetrahedra [E,4] or [E,10] over positions [N,3]."""
+    corners = position[elements[:, :4]]
     return np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
 
 
+def quarters(position: np.ndarray, elements: np.ndarray) -> np.ndarray:
+    """Signed volumes [4,E] of the quarters around the points of integration of second-order tetrahedra [E,10]; the
+    volumes [1,E] of the tetrahedra [E,4]."""
+    return points_at_rest(position, elements)[0] if elements.shape[1] == 10 else volumes(position, elements)[None]
+
+
 def oriented(position: np.ndarray, elements: np.ndarray) -> np.ndarray:
-    """The tetrahedra [E,4]; where the volume is negative, two nodes are swapped."""
-    swapped = elements[:, [0, 2, 1, 3]]
+    """The tetrahedra [E,4] or [E,10]; where the volume is negative, two corners are swapped, and so are the middles."""
+    swapped = elements[:, [0, 2, 1, 3, 6, 5, 4, 7, 9, 8][: elements.shape[1]]]
     return np.where((volumes(position, elements) < 0)[:, None], swapped, elements)
 
 

@@ -27,7 +27,9 @@ def dataset_facts(dataset: Dataset, samples: Sequence[Sample], seconds: SolverSe
     """Rows of name and text: file, generator, settings and sizes. "not recorded" stands where the file is silent."""
     info, generator = dataset.info, dataset.info.generator
     unit = info.length_unit
-    element = {3: "triangles", 4: "tetrahedra"}[dataset.element_size] if samples else "none"
+    element = (
+        {3: "triangles", 4: "tetrahedra", 10: "second-order tetrahedra"}[dataset.element_size] if samples else "none"
+    )
     center = ", ".join(f"{number:g}" for number in info.domain_center)
     integration = {"quasi_static": "quasi-static: increments are predicted", "dynamic": "accelerations are predicted"}
     stress = {"none": "none", "node": "von Mises, at nodes", "element": "von Mises, one value per element"}

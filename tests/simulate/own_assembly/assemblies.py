@@ -11,6 +11,7 @@ SPEC = """
 unit = "mm"
 frames = 3
 contact_distance = 0.05
+order = 1
 
 [parameters]
 travel = [0.5, 1.5]

@@ -116,11 +116,11 @@ def make(gmsh):
         os.abort()
 """)
     one = {"name": "it", "script": str(tmp_path / "crash.py"), "function": "make", "arguments": {}}
-    (mesh,) = gmsh_process.mesh_own_scale([{**one, "size": 5, "finer": []}])
+    (mesh,) = gmsh_process.mesh_own_scale([{**one, "size": 5, "finer": [], "order": 1}])
     assert (tmp_path / "crashed").exists() and volumes(mesh["position"], mesh["elements"]).sum() == pytest.approx(4000)
     (tmp_path / "crash.py").write_text("import os\n\ndef make(gmsh):\n    os.abort()\n")
     with pytest.raises(gmsh_process.MeshingFailed, match="^it: with elements of the size 5: gmsh crashed in every"):
-        gmsh_process.mesh_own_scale([{**one, "size": 5, "finer": [], "first": 16}])  # the last two attempts
+        gmsh_process.mesh_own_scale([{**one, "size": 5, "finer": [], "order": 1, "first": 16}])  # the last two attempts
 
 
 @pytest.mark.parametrize("ending", ["step", "stp", "iges", "brep", "stl"])

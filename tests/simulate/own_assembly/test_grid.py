@@ -19,11 +19,9 @@ def test_settings_and_grids():
     assert grid({"travel": np.linspace(0, 1, 2)}) == [{"travel": 0.0}, {"travel": 1.0}] and grid({}) == [{}]
 
 
-def test_a_parameter_is_set_once_and_options_are_none():
+def test_a_parameter_is_set_once():
     with pytest.raises(ConfigError, match="travel is given twice: write all its values behind one travel="):
         parse_settings(["travel=1,2", "travel=3"])
-    with pytest.raises(ConfigError, match="nodes is no parameter of a specification; .* write --nodes N"):
-        parse_settings(["travel=1", "nodes=300"])
 
 
 @pytest.mark.parametrize(

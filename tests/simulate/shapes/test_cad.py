@@ -88,7 +88,7 @@ SetFactory("OpenCASCADE");
 DefineConstant[ height = 2 ];
 Box(1) = {0, 0, 0, 1, 1, height};
 """)
-    part = {"size": 0.5, "finer": [], "arguments": {}}
+    part = {"size": 0.5, "finer": [], "order": 1, "arguments": {}}
     ball = {**part, "name": "ball", "script": str(tmp_path / "ball.py"), "function": "make"}
     bar = {**part, "name": "bar", "geo": str(tmp_path / "bar.geo")}
     *_, after = gmsh_process.mesh_own_scale([ball, {**bar, "name": "low", "arguments": {"height": 0.7}}, bar])

@@ -9,6 +9,7 @@ import numpy as np
 from ast_sim.simulate.shapes.cad.surface_mend import Surface, several_solids
 
 MENDED = ("Degenerated", "SmallEdges", "SmallFaces")
+VTK_ORDER = [0, 1, 2, 3, 4, 5, 6, 7, 9, 8]  # of the nodes of a second-order tetrahedron, in gmsh's
 CREASE_ANGLE = math.radians(40)  # edges of an STL surface sharper than this are edges of the part
 
 
@@ -153,12 +154,17 @@ def _joined_faces(gmsh) -> list[list[int]]:
     return sorted((sorted(faces) for _, faces in groups), key=extent, reverse=True)
 
 
-def tetrahedra(gmsh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The mesh of the model: positions [N,3] in its units, tetrahedra [E,4] and gmsh's tags of the nodes [N]."""
-    elements = gmsh.model.mesh.getElementsByType(4)[1]
+def tetrahedra(gmsh, order: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The mesh of the model: positions [N,3] in its units, tetrahedra [E,4], or [E,10] of the order 2, and gmsh's tags
+    of the nodes [N]."""
+    if order == 2:
+        gmsh.model.mesh.setOrder(2)
+    kind, nodes = {1: (4, 4), 2: (11, 10)}[order]
+    elements = gmsh.model.mesh.getElementsByType(kind)[1]
     if not len(elements):
         raise BadPart("no tetrahedra came out: its surface does not enclose a volume")
-    return _used(gmsh, elements, 4)
+    position, elements, tags = _used(gmsh, elements, nodes)
+    return position, elements if order == 1 else elements[:, VTK_ORDER], tags
 
 
 def triangles(gmsh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

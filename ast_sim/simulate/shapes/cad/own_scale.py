@@ -9,7 +9,8 @@ file that holds several) and one of
     "script": path of a .py file, "function" in it and "arguments" of the call `function(gmsh, **arguments)`
     "geo": path of a .geo script, with "arguments": the values of its numbers (DefineConstant)
 
-With "surface", a file without a solid gives triangles. If a part cannot be meshed well, `ATTEMPTS` are made from
+With "order" 2, tetrahedra have ten nodes, the middles on the surface of the part. With "surface", a file without a
+solid gives triangles. If a part cannot be meshed well, `ATTEMPTS` are made from
 "first" on. The answer has own_position_i, own_elements_i, own_notes_i (texts: what was mended), own_factor_i (the size
 that was taken, over the one that was asked for), own_failure_i (why the first attempt failed; empty if it did not) and,
 for each physical group of a script, own_group_i_NAME: the numbers of its nodes.
@@ -80,7 +81,7 @@ class Meshed:
 
     Attributes:
         position: [N,3] float64.
-        elements: [E,4], or [F,3] of a surface.
+        elements: [E,4], [E,10] of the order 2, or [F,3] of a surface.
         tags: [N] gmsh's numbers of the nodes.
         notes: what was mended, a sentence each.
         factor: the size of the elements, over the one that was asked for.
@@ -134,7 +135,7 @@ def _mesh(gmsh, part: dict[str, Any]) -> Meshed:
             gmsh.model.mesh.generate(3 if solid else 2)
             if solid:
                 notes += _without_slivers(gmsh)
-            mesh = tetrahedra(gmsh) if solid else triangles(gmsh)
+            mesh = tetrahedra(gmsh, part["order"]) if solid else triangles(gmsh)
             return Meshed(*mesh, tuple(notes), attempt.factor, (failures or [""])[0])
         except (BadPart, BadSurface):
             raise
@@ -209,7 +210,7 @@ def _make(gmsh, part: dict[str, Any], attempt: Attempt) -> tuple[list[str], bool
     solid = not part.get("surface") or bool(gmsh.model.getEntities(3))
     if solid:
         pick_solid(gmsh, None if "stl" in part else part.get("solid"))
-        _check_count(gmsh, attempt.factor * part["size"])
+        _check_count(gmsh, attempt.factor * part["size"], part["order"])
     finer = [{**one, "size": attempt.factor * one["size"]} for one in part["finer"]]
     _set_sizes(gmsh, attempt.factor * part["size"], finer)
     return notes, solid
@@ -231,11 +232,12 @@ def _run(gmsh, part: dict[str, Any]) -> None:
     gmsh.model.geo.synchronize()
 
 
-def _check_count(gmsh, size: float) -> None:
+def _check_count(gmsh, size: float, order: int) -> None:
     """Refuse a size that gives too many nodes before minutes go into them."""
     if gmsh.model.occ.getEntities(3):
         volume, area = (sum(gmsh.model.occ.getMass(*e) for e in gmsh.model.occ.getEntities(d)) for d in (3, 2))
-        nodes = 0.72 * volume / size**3 + 1.4 * area / size**2
+        between = size / order
+        nodes = 0.72 * volume / between**3 + 1.4 * area / between**2
         if nodes > MOST_NODES:
             raise BadPart(f"elements of the size {size:g} give about {nodes:,.0f} nodes, more than {MOST_NODES:,}")
 

@@ -9,7 +9,7 @@ import zlib
 import meshio
 import numpy as np
 import pytest
-from data_samples import block
+from blocks import block
 
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.support.errors import DatasetError

@@ -1,0 +1,227 @@
+"""What an evaluation of a run measures, as typed records that are written as JSON.
+
+Errors are root mean square errors of a `quantity` ("displacement" in the unit of length, "stress" in pascal) that a
+`predictor` made ("model", or a trivial one such as "hold_still") over a `horizon` ("one_step": each frame from the true
+frame before it; "rollout_50", "rollout_all": the first 50 frames, all frames from the given ones) on some `nodes`
+("normal", "all"; for the stress "deforming").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+MAIN_NODES = {"displacement": "normal", "stress": "deforming"}  # of each quantity, where errors are shown first
+
+
+@dataclass(frozen=True)
+class SceneError:
+    """The error of one scene; None: the prediction failed."""
+
+    quantity: str
+    predictor: str
+    horizon: str
+    nodes: str
+    rmse: float | None
+
+
+@dataclass(frozen=True)
+class MeanError:
+    """The error over all scenes in the two conventions of `ast_sim.inference.evaluation.measures`; None: a prediction
+    failed."""
+
+    quantity: str
+    predictor: str
+    horizon: str
+    nodes: str
+    rmse_sequence: float | None
+    rmse_pooled: float | None
+
+
+@dataclass(frozen=True)
+class SceneFigures:
+    """One scene.
+
+    Attributes:
+        name, nodes, frames: its name and size.
+        errors: of the model and of trivial predictors.
+        model_seconds_per_step: wall seconds of the prediction over the number of predicted frames; None: it failed.
+        solver_seconds_per_step: the same of the solver that made the scene; None: not recorded.
+        failure: why the prediction failed; None: it did not.
+    """
+
+    name: str
+    nodes: int
+    frames: int
+    errors: tuple[SceneError, ...]
+    model_seconds_per_step: float | None
+    solver_seconds_per_step: float | None
+    failure: str | None
+
+    def error(self, quantity: str, predictor: str = "model", horizon: str = "rollout_all") -> float | None:
+        """The error on the main nodes of the quantity; None: it failed or is not known."""
+        row = _row(self.errors, quantity, predictor, horizon, MAIN_NODES[quantity])
+        return None if row is None else row.rmse
+
+
+@dataclass(frozen=True)
+class WayFigures:
+    """What one way of the solver took for a frame, in seconds on one thread; with `failure` there is nothing else."""
+
+    seconds: float | None = None
+    setup_seconds: float | None = None
+    relative_error: float | None = None
+    load_steps: int | None = None
+    newton_iterations: int | None = None
+    failure: str | None = None
+
+
+@dataclass(frozen=True)
+class SolverFigures:
+    """What the solver took for a frame of one scene.
+
+    Attributes:
+        seconds: at its own stop test; None: it did not converge.
+        cheapest: the name of its fastest way that is at least as accurate as the model; None: there is none.
+        cheapest_seconds: of that way.
+        ways: all ways by name.
+    """
+
+    seconds: float | None
+    cheapest: str | None
+    cheapest_seconds: float | None
+    ways: Mapping[str, WayFigures]
+
+
+@dataclass(frozen=True)
+class AskedScene:
+    """The deepest frame of a scene, asked for alone and on one thread.
+
+    Attributes:
+        name, nodes: of the scene.
+        frame: its number.
+        displacement: root mean square of the displacement of the free nodes in this frame.
+        relative_error: the error of the displacement over the displacement; None: the prediction failed.
+        by_calls: the relative error after each call of a model that jumps, and after each Newton step.
+        seconds: wall seconds of the answer.
+        last_step: the size of the last Newton step; None without.
+        stress_share: the error of the stress over the error of the frame's true mean.
+        largest_stress: the relative error of the largest stress.
+        solver: None: it was not run.
+    """
+
+    name: str
+    nodes: int
+    frame: int
+    displacement: float
+    relative_error: float | None
+    by_calls: tuple[float, ...]
+    seconds: float
+    last_step: float | None
+    stress_share: float | None
+    largest_stress: float | None
+    solver: SolverFigures | None = None
+
+
+@dataclass(frozen=True)
+class Beside:
+    """The model beside the solver: medians over the scenes in which both have an answer.
+
+    Attributes:
+        scenes: how many scenes.
+        seconds, model_seconds: medians of the solver and of the model.
+        ratio: the median over the scenes of the solver's time over the model's.
+    """
+
+    scenes: int
+    seconds: float
+    model_seconds: float
+    ratio: float
+
+
+@dataclass(frozen=True)
+class AskedFigures:
+    """The deepest frames of all scenes.
+
+    Attributes:
+        scenes: each scene.
+        relative_error, stress_share, largest_stress, by_calls: means over the scenes that did not fail.
+        seconds: the median of the answers' seconds.
+        unsettled: how many scenes had Newton steps that did not end.
+        solver: beside the solver at its own stop test; None: it was not run.
+        cheapest: beside its fastest way that is at least as accurate; None: likewise.
+        no_solver: why the solver was not run; None: it was, or nobody asked.
+    """
+
+    scenes: tuple[AskedScene, ...]
+    relative_error: float | None
+    stress_share: float | None
+    largest_stress: float | None
+    by_calls: tuple[float, ...]
+    seconds: float | None
+    unsettled: int
+    solver: Beside | None
+    cheapest: Beside | None
+    no_solver: str | None
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What an evaluation measured.
+
+    Attributes:
+        scenes: each scene.
+        errors: over all scenes.
+        failures: how many predictions failed.
+        jumps: whether the model predicts each frame from the first one, so that its "one_step" is its rollout.
+        effort: what follows the first call of such a model: `corrections`, `newton_steps`.
+        asked: the deepest frames.
+        speedup: the solver's recorded time for all frames over the model's, both on one thread; None: not known.
+        length_unit, stress_unit: of the errors.
+        threads: of the model.
+        origin: the run, the data, the command, the processor and the like.
+    """
+
+    scenes: tuple[SceneFigures, ...]
+    errors: tuple[MeanError, ...]
+    failures: int
+    jumps: bool
+    effort: Mapping[str, int]
+    asked: AskedFigures
+    speedup: float | None
+    length_unit: str
+    stress_unit: str
+    threads: int
+    origin: Mapping[str, Any] = field(default_factory=dict)
+
+    def error(
+        self, quantity: str, predictor: str = "model", horizon: str = "rollout_all", nodes: str | None = None
+    ) -> MeanError | None:
+        """The error over all scenes; None: the predictor predicts no such quantity. `nodes`: the main ones if None."""
+        return _row(self.errors, quantity, predictor, horizon, nodes or MAIN_NODES[quantity])
+
+    def unit(self, quantity: str) -> str:
+        """The unit of a quantity's errors."""
+        return self.length_unit if quantity == "displacement" else self.stress_unit
+
+    def to_json(self) -> dict[str, Any]:
+        """Dictionaries, lists, texts and numbers. Errors stand by quantity, predictor, horizon and nodes."""
+        scenes = [{**asdict(scene), "errors": _nested(scene.errors)} for scene in self.scenes]
+        return {**asdict(self), "scenes": scenes, "errors": _nested(self.errors)}
+
+
+def _row(rows: Sequence[Any], quantity: str, predictor: str, horizon: str, nodes: str) -> Any:
+    wanted = (quantity, predictor, horizon, nodes)
+    return next((row for row in rows if (row.quantity, row.predictor, row.horizon, row.nodes) == wanted), None)
+
+
+def _nested(rows: Sequence[SceneError] | Sequence[MeanError]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for row in rows:
+        place = found.setdefault(row.quantity, {}).setdefault(row.predictor, {}).setdefault(row.horizon, {})
+        if isinstance(row, SceneError):
+            place[row.nodes] = row.rmse
+        else:
+            place[row.nodes] = {"rmse_sequence": row.rmse_sequence, "rmse_pooled": row.rmse_pooled}
+    return found

@@ -1,0 +1,299 @@
+"""What a deck says of its mesh: nodes, elements and sets of each part, and the instances of the parts.
+
+Nothing that changes the mesh is passed over: a keyword, an option or a type of element that is not understood is an
+error that names it. Keywords that say something else (materials, loads, steps) are counted and listed.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ast_sim.importers.decks.deck_numbers import elements_of, nodes_of, real, tokens, whole
+from ast_sim.importers.decks.element_types import kind_of
+from ast_sim.importers.decks.keyword_lines import Keyword, read_keywords
+from ast_sim.importers.formats.source_mesh import node_count
+from ast_sim.support.errors import DatasetError
+
+# Keywords that make, move or remove nodes or elements, and that are not understood here.
+_CHANGE_THE_MESH = {
+    *("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "IMPORT", "PARAMETER", "IMPERFECTION", "REFINEMESH"),
+    *("SYMMETRICMODELGENERATION", "SYMMETRICRESULTSTRANSFER", "PARAMETERSHAPEVARIATION", "PARAMETERDEPENDENCE"),
+    *("ADAPTIVEMESH", "MESHREFINEMENT", "NODALTRANSLATION", "IMPORTNSET", "IMPORTELSET"),
+}
+
+_OPTIONS = {
+    "NODE": {"NSET", "SYSTEM", "INPUT"},
+    "ELEMENT": {"TYPE", "ELSET", "INPUT"},
+    "NSET": {"NSET", "GENERATE", "ELSET", "INSTANCE", "INTERNAL", "UNSORTED", "INPUT"},
+    "ELSET": {"ELSET", "GENERATE", "INSTANCE", "INTERNAL", "UNSORTED", "INPUT"},
+    "PART": {"NAME"},
+    "ASSEMBLY": {"NAME"},
+    "INSTANCE": {"NAME", "PART"},
+    "SYSTEM": set(),
+    **dict.fromkeys(("ENDPART", "ENDASSEMBLY", "ENDINSTANCE"), set()),
+}
+
+# A node or an element: the instance that it belongs to ("" for the scope itself), and its number.
+Members = list[tuple[str, np.ndarray]]
+
+
+@dataclass(frozen=True, eq=False)
+class ElementBlock:
+    """Elements of one type: `numbers` [c]; `nodes` [c, k] numbers of nodes, or names "instance.number" in an
+    assembly."""
+
+    type_name: str
+    kind: str
+    numbers: np.ndarray
+    nodes: np.ndarray | list[list[str]]
+    keyword: Keyword
+
+
+@dataclass(eq=False)
+class Content:
+    """Nodes, elements and sets of the deck, of a part, of an instance or of the assembly. Names are in upper case."""
+
+    name: str = ""
+    nodes: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
+    blocks: list[ElementBlock] = field(default_factory=list)
+    node_sets: dict[str, Members] = field(default_factory=dict)
+    element_sets: dict[str, Members] = field(default_factory=dict)
+    nodes_of_elements: dict[str, list[str]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Instance:
+    """A part that is placed: `rotation` [3, 3] and `shift` [3] say where, x -> rotation x + shift."""
+
+    part: Content
+    own: Content
+    rotation: np.ndarray
+    shift: np.ndarray
+
+
+@dataclass(eq=False)
+class Deck:
+    """A deck: all keywords in order, and what they say of the mesh. `written` has names as they were first written."""
+
+    path: Path
+    keywords: list[Keyword]
+    root: Content = field(default_factory=Content)
+    parts: dict[str, Content] = field(default_factory=dict)
+    instances: dict[str, Instance] = field(default_factory=dict)
+    written: dict[str, str] = field(default_factory=dict)
+    ignored: Counter[str] = field(default_factory=Counter)
+    left_out: Counter[str] = field(default_factory=Counter)
+
+
+def read_deck(path: Path) -> Deck:
+    """A deck of Abaqus or CalculiX.
+
+    Raises:
+        DatasetError: a line cannot be read, or a keyword that changes the mesh is not understood; the text names the
+            file and the line.
+    """
+    deck = Deck(path, read_keywords(path))
+    reader = _Reader(deck)
+    for keyword in deck.keywords:
+        reader.take(keyword)
+    return deck
+
+
+class _Reader:
+    """Goes through the keywords of a deck; `content` is what the next ones add to."""
+
+    def __init__(self, deck: Deck) -> None:
+        self.deck = deck
+        self.content = deck.root
+        self.system: np.ndarray | None = None
+        self.handlers: dict[str, Callable[[Keyword], None]] = {
+            "NODE": self._node,
+            "ELEMENT": self._element,
+            "NSET": lambda keyword: self._set(keyword, self.content.node_sets, "NSET"),
+            "ELSET": lambda keyword: self._set(keyword, self.content.element_sets, "ELSET"),
+            "SYSTEM": self._system,
+            "PART": self._part,
+            "INSTANCE": self._instance,
+            "ASSEMBLY": self._leave,
+            **dict.fromkeys(("ENDPART", "ENDASSEMBLY", "ENDINSTANCE"), self._leave),
+        }
+
+    def take(self, keyword: Keyword) -> None:
+        name = keyword.name
+        if name in _CHANGE_THE_MESH:
+            raise keyword.error("this keyword changes the mesh and is not understood here: write the mesh out")
+        if name == "MODELCHANGE" and keyword.options.get("TYPE", "").upper() == "ELEMENT":
+            self.deck.ignored["MODELCHANGE, TYPE=ELEMENT (all elements are kept)"] += 1
+        elif name in self.handlers:
+            unknown = keyword.options.keys() - _OPTIONS[name]
+            if unknown:
+                raise keyword.error(f"the option {min(unknown)} is not understood here")
+            self.handlers[name](keyword)
+        elif len(name) > 2 and any(known.startswith(name) for known in (*_OPTIONS, *_CHANGE_THE_MESH)):
+            raise keyword.error("is this a short form? Write the whole keyword")
+        else:
+            self.deck.ignored[name] += 1
+
+    def _key(self, name: str) -> str:
+        key = name.upper()
+        self.deck.written.setdefault(key, name)
+        return key
+
+    def _node(self, keyword: Keyword) -> None:
+        numbers, points = nodes_of(keyword)
+        kind = (keyword.options.get("SYSTEM") or "R").upper()
+        if kind not in ("R", "C", "S"):
+            raise keyword.error(f"SYSTEM={kind} is not known; must be R, C or S")
+        if kind != "R":
+            points = _from_angles(points, kind == "S")
+        if self.system is not None:
+            points = points @ self.system[:3] + self.system[3]
+        self.content.nodes.append((numbers, points))
+        if keyword.options.get("NSET"):
+            self.content.node_sets.setdefault(self._key(keyword.options["NSET"]), []).append(("", numbers))
+
+    def _element(self, keyword: Keyword) -> None:
+        type_name = keyword.required("TYPE").upper()
+        kind = kind_of(type_name)
+        if kind is None:
+            raise keyword.error(f"elements of the type {type_name} are not known here")
+        name = keyword.options.get("ELSET")
+        if not kind:
+            self.deck.left_out[type_name] += len(keyword.data)
+            if name:
+                self.content.element_sets.setdefault(self._key(name), [])
+            return
+        numbers, nodes = elements_of(keyword, node_count(kind))
+        self.content.blocks.append(ElementBlock(type_name, kind, numbers, nodes, keyword))
+        if name:
+            self.content.element_sets.setdefault(self._key(name), []).append(("", numbers))
+
+    def _set(self, keyword: Keyword, sets: dict[str, Members], option: str) -> None:
+        name = self._key(keyword.required(option))
+        instance = keyword.options.get("INSTANCE", "").upper()
+        if instance and instance not in self.deck.instances:
+            raise keyword.error(f"there is no instance {keyword.options['INSTANCE']!r}")
+        members = sets.setdefault(name, [])
+        if option == "NSET" and keyword.options.get("ELSET"):
+            elements = keyword.options["ELSET"].upper()
+            if elements not in self.content.element_sets:
+                raise keyword.error(f"there is no set of elements {keyword.options['ELSET']!r}")
+            self.content.nodes_of_elements.setdefault(name, []).append(elements)
+        elif "GENERATE" in keyword.options:
+            members.append((instance, _generated(keyword)))
+        else:
+            members.extend(self._listed(keyword, sets, instance))
+
+    def _listed(self, keyword: Keyword, sets: dict[str, Members], instance: str) -> Members:
+        """The members that the data lines list: numbers, names of sets, and both of an instance."""
+        members: Members = []
+        numbers: list[int] = []
+        for line in keyword.data:
+            for text in tokens(line):
+                if text.lstrip("+-").isdigit():
+                    numbers.append(whole(text, line))
+                elif text:
+                    members.extend(self._named(keyword, sets, instance, text.strip('"')))
+        return [(instance, np.array(numbers, np.int64)), *members]
+
+    def _named(self, keyword: Keyword, sets: dict[str, Members], instance: str, text: str) -> Members:
+        key = text.upper()
+        if not instance and key in sets:
+            return list(sets[key])
+        if not instance:
+            instance, _, key = key.rpartition(".")
+        if instance in self.deck.instances:
+            if key.isdigit():
+                return [(instance, np.array([int(key)]))]
+            one = self.deck.instances[instance]
+            which = "node_sets" if keyword.name == "NSET" else "element_sets"
+            parts = [getattr(content, which)[key] for content in (one.part, one.own) if key in getattr(content, which)]
+            if parts:
+                return [(instance, numbers) for members in parts for _, numbers in members]
+        raise keyword.error(f"there is no set {text!r} before this line")
+
+    def _system(self, keyword: Keyword) -> None:
+        values = [real(text, line) for line in keyword.data for text in (*tokens(line), *[""] * 6)[:6]]
+        if not values:
+            self.system = None
+            return
+        if len(values) > 12:
+            raise keyword.error("has more than two data lines")
+        origin, on_x = np.array(values[:3]), np.array(values[3:6])
+        on_y = np.array(values[6:9]) if len(values) > 6 else None
+        if on_y is None:  # turned about z
+            on_y = origin + np.cross([0, 0, 1], on_x - origin)
+        x = on_x - origin
+        z = np.cross(x, on_y - origin)
+        axes = np.stack([x, np.cross(z, x), z])
+        lengths = np.linalg.norm(axes, axis=1, keepdims=True)
+        if not (lengths > 0).all():
+            raise keyword.error("its three points lie on a line")
+        self.system = np.concatenate([axes / lengths, origin[None]])
+
+    def _part(self, keyword: Keyword) -> None:
+        name = self._key(keyword.required("NAME"))
+        if name in self.deck.parts:
+            raise keyword.error(f"there are two parts {keyword.options['NAME']!r}")
+        self.system = None
+        self.content = self.deck.parts[name] = Content(name)
+
+    def _instance(self, keyword: Keyword) -> None:
+        name, part = self._key(keyword.required("NAME")), keyword.required("PART").upper()
+        if part not in self.deck.parts:
+            raise keyword.error(f"there is no part {keyword.options['PART']!r} before this line")
+        if name in self.deck.instances:
+            raise keyword.error(f"there are two instances {keyword.options['NAME']!r}")
+        rotation, shift = _placement(keyword)
+        self.content = Content(name)
+        self.deck.instances[name] = Instance(self.deck.parts[part], self.content, rotation, shift)
+
+    def _leave(self, keyword: Keyword) -> None:
+        if keyword.data:
+            raise DatasetError(f"{keyword.data[0].place}: a data line that belongs to no keyword")
+        self.system = None
+        self.content = self.deck.root
+
+
+def _generated(keyword: Keyword) -> np.ndarray:
+    """The numbers of lines `first, last, step`."""
+    parts = [np.zeros(0, np.int64)]
+    for line in keyword.data:
+        first, last, step = [*(whole(text, line) for text in tokens(line)), 1][:3]
+        if step < 1 or last < first or (last - first) // step > 10**9:
+            raise DatasetError(f"{line.place}: cannot count from {first} to {last} in steps of {step}")
+        parts.append(np.arange(first, last + 1, step))
+    return np.concatenate(parts)
+
+
+def _from_angles(points: np.ndarray, spherical: bool) -> np.ndarray:
+    """Points of cylindrical (radius, angle, z) or spherical (radius, angle, angle from the plane) coordinates; angles
+    are in degrees."""
+    radius, angle, third = points.T
+    angle = np.radians(angle)
+    flat = radius * np.cos(np.radians(third)) if spherical else radius
+    height = radius * np.sin(np.radians(third)) if spherical else third
+    return np.stack([flat * np.cos(angle), flat * np.sin(angle), height], axis=1)
+
+
+def _placement(keyword: Keyword) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation and shift of an instance: it is first moved, then turned about the axis from one point to another."""
+    rows = [[real(text, line) for text in (*tokens(line), *[""] * 7)[:7]] for line in keyword.data]
+    if len(rows) > 2:
+        raise keyword.error("has more than two data lines")
+    shift = np.array(rows[0][:3]) if rows else np.zeros(3)
+    if len(rows) < 2:
+        return np.eye(3), shift
+    start, end, angle = np.array(rows[1][:3]), np.array(rows[1][3:6]), np.radians(rows[1][6])
+    length = np.linalg.norm(end - start)
+    if not length > 0:
+        raise keyword.error("the axis of the rotation has no length")
+    x, y, z = (end - start) / length
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    rotation = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    return rotation, rotation @ (shift - start) + start

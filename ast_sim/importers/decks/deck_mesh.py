@@ -1,0 +1,171 @@
+"""The mesh of a deck: all instances of its parts in their places, with the named sets of their nodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ast_sim.importers.decks.deck_content import Content, Deck, ElementBlock, Members, read_deck
+from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh
+from ast_sim.support.errors import DatasetError
+
+
+@dataclass(frozen=True, eq=False)
+class _Scope:
+    """The nodes and elements of an instance, or of the deck itself. `start` is where its nodes begin in the mesh.
+
+    The nodes of element i of all blocks together are `element_nodes[element_start[i] : element_start[i + 1]]`.
+    """
+
+    name: str
+    numbers: np.ndarray
+    points: np.ndarray
+    start: int
+    contents: tuple[Content, ...]
+
+
+def deck_mesh(path: Path) -> SourceMesh:
+    """The mesh of a deck of Abaqus or CalculiX.
+
+    Groups are the sets of nodes and the nodes of the sets of elements. A set of an instance is called INSTANCE.SET,
+    and SET as well if no other set has this name. An instance is a group, too.
+
+    Raises:
+        DatasetError: a line cannot be read, something that changes the mesh is not understood, or an element refers to
+            a node that there is not; the text names the file and the line.
+    """
+    deck = read_deck(path)
+    return _Assembly(deck).mesh()
+
+
+class _Assembly:
+    """The parts of a deck as they are put together."""
+
+    def __init__(self, deck: Deck) -> None:
+        self.deck = deck
+        self.notes: list[str] = []
+        self.scopes: dict[str, _Scope] = {}
+        self._add("", (deck.root,), np.eye(3), np.zeros(3))
+        for name, one in deck.instances.items():
+            self._add(name, (one.part, one.own), one.rotation, one.shift)
+        if not deck.instances and deck.parts:
+            self._parts_without_instances()
+        self.blocks: list[CellBlock] = []
+        self.elements: dict[str, tuple[np.ndarray, list[np.ndarray]]] = {}
+
+    def _add(self, name: str, contents: tuple[Content, ...], rotation: np.ndarray, shift: np.ndarray) -> None:
+        given = [block for content in contents for block in content.nodes]
+        numbers = np.concatenate([np.zeros(0, np.int64), *(block[0] for block in given)])
+        points = np.concatenate([np.zeros((0, 3)), *(block[1] for block in given)])
+        unique, first = np.unique(numbers[::-1], return_index=True)  # the last definition of a node counts
+        last = len(numbers) - 1 - first
+        if len(unique) < len(numbers):
+            same = points[last[np.searchsorted(unique, numbers)]] == points
+            changed = len(np.unique(numbers[~same.all(axis=1)]))
+            if changed:
+                self.notes.append(f"{changed} nodes stand in the deck more than once: the last place counts")
+        start = sum(len(scope.numbers) for scope in self.scopes.values())
+        self.scopes[name] = _Scope(name, unique, points[last] @ rotation.T + shift, start, contents)
+
+    def _parts_without_instances(self) -> None:
+        """A deck of parts alone, without an assembly: each stands where it was made."""
+        for name, part in self.deck.parts.items():
+            self._add(name, (part,), np.eye(3), np.zeros(3))
+        self.notes.append("the deck has parts and no instances: each part is taken once")
+
+    def mesh(self) -> SourceMesh:
+        for name, scope in self.scopes.items():
+            self._take_elements(name, scope)
+        if not self.blocks:
+            held = ", ".join(f"{count} {name}" for name, count in self.deck.left_out.items()) or "no elements"
+            raise DatasetError(f"{self.deck.path}: holds {held}: a scene needs elements of a volume")
+        notes = [*self.notes]
+        notes += [f"{count} elements of the type {name} are left out" for name, count in self.deck.left_out.items()]
+        if self.deck.ignored:
+            notes.append(f"ignored keywords: {', '.join(sorted(self.deck.ignored))}")
+        points = np.concatenate([scope.points for scope in self.scopes.values()])
+        numbers = np.arange(len(points))
+        return SourceMesh(self.deck.path, points, self.blocks, groups=self._groups(), notes=notes, same_point=numbers)
+
+    def _take_elements(self, name: str, scope: _Scope) -> None:
+        numbers, nodes = [np.zeros(0, np.int64)], []
+        for block in (block for content in scope.contents for block in content.blocks):
+            if not len(block.numbers):
+                continue
+            places = self._places(scope, block)
+            self.blocks.append(CellBlock(block.kind, places, block.type_name))
+            numbers.append(block.numbers)
+            nodes.extend(places)
+        together = np.concatenate(numbers)
+        unique, first = np.unique(together, return_index=True)
+        if len(unique) < len(together):
+            twice = int(together[np.setdiff1d(np.arange(len(together)), first)[0]])
+            where = f" of {self.deck.written[name]}" if name else ""
+            raise DatasetError(f"{self.deck.path}: element {twice}{where} stands in the deck twice")
+        self.elements[name] = (unique, [nodes[row] for row in first])
+
+    def _places(self, scope: _Scope, block: ElementBlock) -> np.ndarray:
+        """[c, k]: where the nodes of elements are in the mesh."""
+        if isinstance(block.nodes, np.ndarray):
+            return self._find(scope, block.nodes, block)
+        places = np.zeros((len(block.nodes), len(block.nodes[0])), np.int64)
+        for row, names in enumerate(block.nodes):
+            for corner, text in enumerate(names):
+                instance, _, number = text.upper().rpartition(".")
+                if instance not in self.scopes or not number.isdigit():
+                    raise block.keyword.error(f"there is no node {text}")
+                places[row, corner] = self._find(self.scopes[instance], np.array([[int(number)]]), block)[0, 0]
+        return places
+
+    def _find(self, scope: _Scope, nodes: np.ndarray, block: ElementBlock) -> np.ndarray:
+        row = np.minimum(np.searchsorted(scope.numbers, nodes), max(len(scope.numbers) - 1, 0))
+        known = scope.numbers[row] == nodes if len(scope.numbers) else np.zeros(nodes.shape, bool)
+        if not known.all():
+            element, corner = np.argwhere(~known)[0]
+            number = block.numbers[element]
+            raise block.keyword.error(f"element {number} refers to node {nodes[element, corner]}, which there is not")
+        return row + scope.start
+
+    def _groups(self) -> dict[str, np.ndarray]:
+        groups: dict[str, np.ndarray] = {}
+        short: dict[str, list[np.ndarray]] = {}
+        for name, scope in self.scopes.items():
+            of_scope: dict[str, np.ndarray] = {}
+            for content in scope.contents:
+                for key, nodes in self._sets_of(name, content).items():
+                    of_scope[key] = np.union1d(of_scope.get(key, np.zeros(0, np.int64)), nodes)
+            if not name:
+                groups |= {self.deck.written[key]: nodes for key, nodes in of_scope.items()}
+                continue
+            shown = self.deck.written[name]
+            groups[shown] = scope.start + np.arange(len(scope.numbers))
+            groups |= {f"{shown}.{self.deck.written[key]}": nodes for key, nodes in of_scope.items()}
+            for key, nodes in of_scope.items():
+                short.setdefault(self.deck.written[key], []).append(nodes)
+        return {**{key: nodes[0] for key, nodes in short.items() if len(nodes) == 1}, **groups}
+
+    def _sets_of(self, name: str, content: Content) -> dict[str, np.ndarray]:
+        """The nodes of each set. Of a set of nodes and one of elements with the same name, the set of nodes counts."""
+        sets = {key: self._nodes_of(name, members, True) for key, members in content.element_sets.items()}
+        own = {key: self._nodes_of(name, members, False) for key, members in content.node_sets.items()}
+        for key, others in content.nodes_of_elements.items():
+            own[key] = np.unique(np.concatenate([own[key], *(sets[other] for other in others)]))
+        for key in sets.keys() & own.keys():
+            if not np.array_equal(sets[key], own[key]):
+                self.notes.append(f"the set {self.deck.written[key]!r} of nodes is taken, not the one of elements")
+        return {**sets, **own}
+
+    def _nodes_of(self, name: str, members: Members, of_elements: bool) -> np.ndarray:
+        """The places of the members of a set that there are; a deck may list others, as Abaqus and CalculiX allow."""
+        found = [np.zeros(0, np.int64)]
+        for instance, numbers in members:
+            scope = self.scopes[instance or name]
+            known, nodes = self.elements[instance or name] if of_elements else (scope.numbers, [])
+            row = np.searchsorted(known, numbers)
+            row = (
+                row[(row < len(known)) & (known[np.minimum(row, len(known) - 1)] == numbers)] if len(known) else row[:0]
+            )
+            found.append(np.concatenate([found[0], *(nodes[one] for one in row)]) if of_elements else row + scope.start)
+        return np.unique(np.concatenate(found))

@@ -1,0 +1,149 @@
+"""The lines of an input deck of Abaqus or CalculiX: keywords with their options and their data lines.
+
+A keyword line is `*NAME, OPTION=VALUE, FLAG`; letters have no case, and spaces have no meaning in names. Lines that
+begin with `**` are comments and may stand anywhere. `*INCLUDE, INPUT=FILE` stands for the lines of that file. This
+module knows no keyword but that one.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from ast_sim.support.errors import DatasetError
+
+# A deck includes files that include files up to this depth.
+_DEEPEST = 32
+
+_NAMED = re.compile(r'\s*("[^"]*"|[^=,"]+?)\s*(?:=\s*("[^"]*"|[^,"]*?)\s*)?(?:,|$)')
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of a deck, and where it stands."""
+
+    text: str
+    file: Path
+    number: int
+
+    @property
+    def place(self) -> str:
+        return f"{self.file}:{self.number}"
+
+
+@dataclass(frozen=True, eq=False)
+class Keyword:
+    """A keyword of a deck.
+
+    Attributes:
+        name: in upper case, without spaces: "NODE", "NODEPRINT".
+        options: by name in upper case; the value as it is written, without quotes; empty for a flag.
+        line: the keyword line.
+        data: its data lines, without comments and empty lines.
+    """
+
+    name: str
+    options: dict[str, str]
+    line: Line
+    data: list[Line]
+
+    def error(self, text: str) -> DatasetError:
+        return DatasetError(f"{self.line.place}: *{self.name}: {text}")
+
+    def required(self, option: str) -> str:
+        """The value of an option that must be there."""
+        if not self.options.get(option):
+            raise self.error(f"has no {option}=")
+        return self.options[option]
+
+
+def read_keywords(path: Path) -> list[Keyword]:
+    """The keywords of a deck and of the files that it includes, in order.
+
+    Raises:
+        DatasetError: a file cannot be read, is included by itself, or does not begin with a keyword.
+    """
+    keywords: list[Keyword] = []
+    lines = _lines(path, ())
+    line = next(lines, None)
+    while line is not None:
+        if not line.text.startswith("*"):
+            raise DatasetError(f"{line.place}: a data line before the first keyword: this is no deck of Abaqus")
+        line, keyword = _keyword(line, lines)
+        keywords.append(keyword)
+    return keywords
+
+
+def _keyword(first: Line, lines: Iterator[Line]) -> tuple[Line | None, Keyword]:
+    """A keyword, and the line after it."""
+    text, line = first.text, next(lines, None)
+    # After a comma at the end, options go on in the next line. A data line does not begin with a letter and an "=".
+    while line is not None and text.endswith(",") and re.match(r"[A-Za-z ]+=|[A-Za-z ]+$", line.text):
+        text, line = text + line.text, next(lines, None)
+    name, _, rest = text[1:].partition(",")
+    keyword = Keyword(re.sub(r"\s+", "", name).upper(), _options(first, rest), first, [])
+    while line is not None and not line.text.startswith("*"):
+        keyword.data.append(line)
+        line = next(lines, None)
+    if "INPUT" in keyword.options and keyword.name in ("NODE", "ELEMENT", "NSET", "ELSET"):
+        more = list(_lines(_included(first, keyword.options["INPUT"]), (first.file,)))
+        wrong = next((one for one in more if one.text.startswith("*")), None)
+        if wrong is not None:
+            raise DatasetError(f"{wrong.place}: a keyword in a file that holds data lines of *{keyword.name} only")
+        keyword.data.extend(more)
+    return line, keyword
+
+
+def _options(line: Line, text: str) -> dict[str, str]:
+    options: dict[str, str] = {}
+    place = 0
+    while text[place:].strip(" \t,"):
+        found = _NAMED.match(text, place)
+        if found is None:
+            raise DatasetError(f"{line.place}: the options {text.strip()!r} cannot be read")
+        options[re.sub(r"\s+", "", found[1]).upper()] = (found[2] or "").strip().strip('"')
+        place = found.end()
+    return options
+
+
+def _lines(path: Path, within: tuple[Path, ...]) -> Iterator[Line]:
+    """The lines of a file without comments and empty lines; includes are replaced by the lines of their file."""
+    if path in within or len(within) > _DEEPEST:
+        raise DatasetError(f"{path}: is included by itself")
+    for number, text in enumerate(re.split(r"\r\n|\r|\n", _text(path)), 1):
+        text = text.strip()
+        if not text or text.startswith("**"):
+            continue
+        line = Line(text, path, number)
+        if re.match(r"\*\s*include\s*,", text, re.IGNORECASE):
+            options = _options(line, text.partition(",")[2])
+            if not options.get("INPUT"):
+                raise DatasetError(f"{line.place}: *INCLUDE has no INPUT=")
+            yield from _lines(_included(line, options["INPUT"]), (*within, path))
+        else:
+            yield line
+
+
+def _included(line: Line, name: str) -> Path:
+    """The file that a line names: relative to the file of the line, or to the first one."""
+    given = Path(name)
+    for candidate in (line.file.parent / given, line.file.parent / name.replace("\\", "/")):
+        if candidate.is_file():
+            return candidate
+    raise DatasetError(f"{line.place}: includes {name}, which does not exist")
+
+
+def _text(path: Path) -> str:
+    """The text of a file: UTF-8 if it is that, else Latin-1, of which only names and comments are made."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return content.decode("utf-16", errors="replace")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")

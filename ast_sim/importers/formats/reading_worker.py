@@ -1,0 +1,325 @@
+"""A process that reads files by the readers of VTK, and CalculiX's .frd files by pyvista-frd-reader. Their C++ code may
+crash on a damaged file, so no other process of this package loads it.
+
+`python -m ast_sim.importers.formats.reading_worker` reads requests, a line of JSON each, from its standard input:
+{"path": ..., "step": number of the frame within the file, "bytes": limit on the memory, "seconds": limit on the time}.
+Its answer on the standard output is a line of JSON and then the bytes of the arrays that the line lists. {"error":
+text} is the answer if the file is refused, with "missing" if a package is not installed.
+
+The answer: "steps" (how many frames the file holds), "time", and "pieces". Each piece has the arrays `points` [n, 3],
+`types` [c], `offsets` [c + 1], `connectivity` (VTK's types and order of nodes), `point NAME`, `cell NAME`, `global`,
+and the sets of nodes of Exodus as `group NAME`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import resource
+import signal
+import sys
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_ENDINGS_OF_EXODUS = {".e", ".ex2", ".exo", ".exoii", ".exii", ".g", ".gen"}
+
+
+class Refused(Exception):
+    """VTK cannot read a file. The text says why."""
+
+
+def main() -> None:
+    """Answer requests until there are no more."""
+    answer = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what VTK prints must not mix with the answers
+    import_vtk()
+    for line in sys.stdin:
+        request = json.loads(line)
+        if request["path"].lower().endswith(".frd"):
+            with contextlib.suppress(ImportError):
+                import pyvista_frd  # noqa: F401
+        base = _address_space()
+        _, hard = resource.getrlimit(resource.RLIMIT_AS)
+        limit = base + request["bytes"]
+        resource.setrlimit(resource.RLIMIT_AS, (limit if hard < 0 else min(limit, hard), hard))
+        signal.alarm(request["seconds"])
+        head, arrays = _answer(request)
+        signal.alarm(0)
+        answer.write(json.dumps(head).encode() + b"\n")
+        for array in arrays:
+            answer.write(np.ascontiguousarray(array).data)
+        answer.flush()
+
+
+def _answer(request: dict[str, Any]) -> tuple[dict[str, Any], list[np.ndarray]]:
+    window = _silent_window()
+    try:
+        head, pieces = _read(Path(request["path"]), request["step"])
+    except MemoryError:
+        head, pieces = {"error": "needs more memory than a file of its size can"}, []
+    except ImportError as error:
+        head, pieces = {"error": str(error), "missing": error.name}, []
+    except Exception as error:  # also what VTK's Python layer raises
+        head, pieces = {"error": str(error) or type(error).__name__}, []
+    told = [line for line in window.GetOutput().splitlines() if line.strip()]
+    if told and "error" not in head:
+        head, pieces = {"error": _first_error(told)}, []
+    listed = [{name: (array.dtype.str, array.shape) for name, array in piece.items()} for piece in pieces]
+    return {**head, "pieces": listed}, [array for piece in pieces for array in piece.values()]
+
+
+def _first_error(lines: list[str]) -> str:
+    """The first sentence of what VTK has told, without the places in its code and the addresses of its objects."""
+    sentences = [
+        line.split("): ", 1)[-1].strip() for line in lines if not line.startswith(("ERROR: In", "Warning: In"))
+    ]
+    return (sentences or lines)[0]
+
+
+def _silent_window() -> Any:
+    """Let VTK tell its errors to a string instead of the screen."""
+    from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
+
+    window = vtkStringOutputWindow()
+    vtkOutputWindow.SetInstance(window)
+    return window
+
+
+def import_vtk() -> None:
+    """Load the readers, so that the memory that they take themselves is known."""
+    import vtkmodules.vtkFiltersCore
+    import vtkmodules.vtkIOExodus
+    import vtkmodules.vtkIOHDF
+    import vtkmodules.vtkIOLegacy
+    import vtkmodules.vtkIOLSDyna
+    import vtkmodules.vtkIOXML  # noqa: F401
+
+
+def _address_space() -> int:
+    """The bytes of addresses that this process uses."""
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[0]) * resource.getpagesize()
+
+
+def _read(path: Path, step: int) -> tuple[dict[str, Any], list[dict[str, np.ndarray]]]:
+    """The facts on a file, and the arrays of each mesh in one of its frames."""
+    state = path.stat()
+    file = _opened(path, state.st_mtime_ns, state.st_size)
+    if not 0 <= step < len(file.times):
+        raise Refused(f"has no frame {step}; it has {len(file.times)}")
+    if isinstance(file, _Results):
+        return {"steps": len(file.times), "time": file.times[step]}, [file.frame(step)]
+    if file.set_step is not None:
+        file.set_step(step)  # by its number: times may stand in a file twice
+    file.reader.Update()
+    data = file.reader.GetOutputDataObject(0)
+    time = _time_of(data) if file.set_step is None else file.times[step]
+    return {"steps": len(file.times), "time": time, **file.facts}, [_arrays_of(part) for part in _parts(data)]
+
+
+@dataclass
+class _Opened:
+    """A reader of VTK with a file, the times of its frames, how a frame is chosen, and what the file says it holds."""
+
+    reader: Any
+    times: list[float | None]
+    set_step: Callable[[int], None] | None = None
+    facts: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class _Results:
+    """An .frd file of CalculiX, and the times of its frames."""
+
+    reader: Any
+    times: list[float | None]
+
+    def frame(self, step: int) -> dict[str, np.ndarray]:
+        if self.times[step] is not None:
+            self.reader.set_active_time_point(step)
+        arrays = _arrays_of((self.reader.read(), ""))
+        arrays.pop("point original_node_ids")
+        return arrays
+
+
+@lru_cache(maxsize=1)
+def _opened(path: Path, changed: int, size: int) -> _Opened | _Results:
+    """The reader of a file. It is kept for the next frame: to open a file of results again means to read all of it."""
+    ending = path.suffix.lower()
+    if ending == ".frd":
+        import pyvista_frd
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # elements that it skips
+            reader = pyvista_frd.FRDReader(path)
+        return _Results(reader, [*reader.time_values] or [None])
+    if ending in _ENDINGS_OF_EXODUS:
+        return _exodus(path)
+    if path.name.lower().startswith("d3plot") or ending == ".d3plot":
+        return _dyna(path)
+    if ending in (".vtkhdf", ".hdf"):
+        return _hdf(path)
+    return _Opened(_xml_or_legacy(path, ending), [None])
+
+
+def _xml_or_legacy(path: Path, ending: str) -> Any:
+    from vtkmodules import vtkIOLegacy, vtkIOXML
+
+    if ending == ".vtk":
+        reader = vtkIOLegacy.vtkGenericDataObjectReader()
+        for what in ("Scalars", "Vectors", "Normals", "Tensors", "TCoords", "ColorScalars", "Fields"):
+            getattr(reader, f"ReadAll{what}On")()
+    else:
+        name = {
+            ".vtu": "UnstructuredGrid",
+            ".pvtu": "PUnstructuredGrid",
+            ".vtp": "PolyData",
+            ".pvtp": "PPolyData",
+            ".vts": "StructuredGrid",
+            ".vtm": "MultiBlockData",
+            ".vtmb": "MultiBlockData",
+        }[ending]
+        reader = getattr(vtkIOXML, f"vtkXML{name}Reader")()
+    reader.SetFileName(_name(path))
+    return reader
+
+
+def _name(path: Path) -> Any:
+    """The bytes of a path, which need not be UTF-8; VTK takes them, though its types say text."""
+    return os.fsencode(path)
+
+
+def _times(reader: Any) -> list[float | None]:
+    from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline as Pipeline
+
+    reader.UpdateInformation()
+    facts = reader.GetOutputInformation(0)
+    return list(facts.Get(Pipeline.TIME_STEPS()) or []) or [None]
+
+
+def _hdf(path: Path) -> _Opened:
+    from vtkmodules.vtkIOHDF import vtkHDFReader
+
+    reader = vtkHDFReader()
+    if not reader.CanReadFile(_name(path)):
+        raise Refused("is no VTKHDF file")
+    reader.SetFileName(_name(path))
+    times = _times(reader)
+    return _Opened(reader, times, None if times == [None] else reader.SetStep)
+
+
+def _exodus(path: Path) -> _Opened:
+    from vtkmodules.vtkIOExodus import vtkExodusIIReader as Reader
+
+    reader = Reader()
+    if not reader.CanReadFile(_name(path)):
+        raise Refused("is no Exodus file")
+    reader.SetFileName(_name(path))
+    reader.UpdateInformation()
+    reader.ApplyDisplacementsOff()
+    reader.GenerateGlobalNodeIdArrayOn()
+    for kind in (Reader.NODAL, Reader.ELEM_BLOCK, Reader.NODE_SET):
+        reader.SetAllArrayStatus(kind, 1)
+    facts = {"declared": [reader.GetTotalNumberOfNodes(), reader.GetTotalNumberOfElements()]}
+    return _Opened(reader, _times(reader), reader.SetTimeStep, facts)
+
+
+def _dyna(path: Path) -> _Opened:
+    from vtkmodules.vtkIOLSDyna import vtkLSDynaReader
+
+    reader = vtkLSDynaReader()
+    if not reader.CanReadFile(_name(path)):
+        raise Refused("is no d3plot file")
+    reader.SetFileName(_name(path))
+    reader.UpdateInformation()
+    reader.SetDeformedMesh(0)
+    reader.SetRemoveDeletedCells(0)
+    for kind in ("Point", "Solid", "ThickShell", "Shell"):
+        for index in range(getattr(reader, f"GetNumberOf{kind}Arrays")()):
+            getattr(reader, f"Set{kind}ArrayStatus")(index, 1)
+    return _Opened(reader, _times(reader), reader.SetTimeStep)
+
+
+def _time_of(data: Any) -> float | None:
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    facts = data.GetFieldData()
+    for name in ("TimeValue", "TIME_VALUE", "TIME"):
+        array = facts.GetArray(name) if facts is not None else None
+        if array is not None and array.GetNumberOfValues() == 1:
+            return float(vtk_to_numpy(array).ravel()[0])
+    return None
+
+
+def _parts(data: Any, name: str = "", in_sets: bool = False) -> list[tuple[Any, str]]:
+    """The meshes of a data set of blocks; (mesh, name of the set of nodes) for the sets of nodes of Exodus."""
+    from vtkmodules.vtkCommonDataModel import vtkCompositeDataSet, vtkDataSet, vtkMultiBlockDataSet
+
+    if isinstance(data, vtkDataSet):
+        return [(data, name if in_sets else "")]
+    if not isinstance(data, vtkCompositeDataSet):
+        raise Refused(f"holds a {data.GetClassName().removeprefix('vtk') if data is not None else 'nothing'}, no mesh")
+    parts = []
+    if isinstance(data, vtkMultiBlockDataSet):
+        for index in range(data.GetNumberOfBlocks()):
+            block, facts = data.GetBlock(index), data.GetMetaData(index) if data.HasMetaData(index) else None
+            label = (facts.Get(vtkCompositeDataSet.NAME()) if facts is not None else None) or ""
+            if block is not None:
+                parts += _parts(block, label, in_sets or label == "Node Sets")
+        return parts
+    iterator = data.NewIterator()
+    while not iterator.IsDoneWithTraversal():
+        parts += _parts(iterator.GetCurrentDataObject(), name, in_sets)
+        iterator.GoToNextItem()
+    return parts
+
+
+def _arrays_of(part: tuple[Any, str]) -> dict[str, np.ndarray]:
+    from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
+    from vtkmodules.vtkFiltersCore import vtkAppendFilter
+
+    data, of_set = part
+    if of_set:
+        ids = _numpy(data.GetPointData().GetGlobalIds())
+        return {} if ids is None else {f"group {of_set}": ids}
+    if not isinstance(data, vtkUnstructuredGrid):
+        append = vtkAppendFilter()
+        append.AddInputData(data)
+        append.Update()
+        data = append.GetOutput()
+    arrays = {"points": np.zeros((0, 3)), "types": np.zeros(0, np.uint8), "connectivity": np.zeros(0, np.int64)}
+    arrays["offsets"] = np.zeros(1, np.int64)
+    if data.GetNumberOfPoints():
+        arrays["points"] = _numpy(data.GetPoints().GetData())
+    if data.GetNumberOfCells():
+        cells = data.GetCells()
+        arrays["types"] = _numpy(data.GetCellTypes())
+        arrays["offsets"] = _numpy(cells.GetOffsetsArray()).astype(np.int64)
+        arrays["connectivity"] = _numpy(cells.GetConnectivityArray()).astype(np.int64)
+    for place, fields in (("point", data.GetPointData()), ("cell", data.GetCellData())):
+        for index in range(fields.GetNumberOfArrays()):
+            array = fields.GetArray(index)  # None for text
+            if array is not None and array.GetName():
+                arrays[f"{place} {array.GetName()}"] = _numpy(array)
+                names = [array.GetComponentName(c) or "" for c in range(array.GetNumberOfComponents())]
+                if any(names):
+                    arrays[f"{place}-columns {array.GetName()}"] = np.array(names, "S")
+    ids = _numpy(data.GetPointData().GetGlobalIds())
+    return arrays if ids is None else {**arrays, "global": ids}
+
+
+def _numpy(array: Any) -> Any:
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    return None if array is None else vtk_to_numpy(array)
+
+
+if __name__ == "__main__":
+    main()

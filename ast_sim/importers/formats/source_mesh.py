@@ -1,0 +1,166 @@
+"""What a mesh file holds, before anything is made of it: every point, every cell of every kind, every field."""
+
+from __future__ import annotations
+
+import string
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ast_sim.scene import require_nodes
+from ast_sim.support.errors import DatasetError
+
+if TYPE_CHECKING:
+    import meshio
+
+# Cells by their shape: the dimension and the number of corners. The kind of a cell is its shape and, if it has further
+# nodes, their number, as in meshio: "tetra", "tetra10". The nodes of a cell stand as in VTK, its corners first.
+SHAPES = {
+    "vertex": (0, 1),
+    "line": (1, 2),
+    "triangle": (2, 3),
+    "quad": (2, 4),
+    "tetra": (3, 4),
+    "pyramid": (3, 5),
+    "wedge": (3, 6),
+    "hexahedron": (3, 8),
+}
+
+
+def node_count(kind: str) -> int:
+    """The number of nodes of a cell of a kind."""
+    shape = kind.rstrip(string.digits)
+    return int(kind.removeprefix(shape) or SHAPES[shape][1])
+
+
+@dataclass(frozen=True, eq=False)
+class CellBlock:
+    """Cells of one kind, [c, k] int64 numbers of points; `label` is what the file calls them."""
+
+    kind: str
+    nodes: np.ndarray
+    label: str
+
+    @property
+    def shape(self) -> str:
+        return self.kind.rstrip(string.digits)
+
+    @property
+    def dimension(self) -> int:
+        return SHAPES[self.shape][0]
+
+    @property
+    def corners(self) -> np.ndarray:
+        """[c, corners]: the cells without the nodes within their edges, faces and volumes."""
+        return self.nodes[:, : SHAPES[self.shape][1]]
+
+    @property
+    def is_curved(self) -> bool:
+        """Whether the cells have nodes beside their corners."""
+        return self.nodes.shape[1] > SHAPES[self.shape][1]
+
+    def rows(self, kept: np.ndarray) -> CellBlock:
+        return CellBlock(self.kind, self.nodes[kept], self.label)
+
+
+@dataclass(frozen=True, eq=False)
+class SourceMesh:
+    """A mesh as it stands in its file.
+
+    Attributes:
+        path: the file, or the name of a mesh in memory.
+        points: [n, 3] float64.
+        blocks: the cells.
+        point_fields: [n, ...] by name.
+        cell_fields: for each block [c, ...], by name.
+        groups: the numbers of the points of each named group.
+        notes: sentences on what was read otherwise than it stands in the file.
+        time: when the frame is, if the file says so.
+        columns: the names of the columns of the fields that have names for them.
+        same_point: [n] int64, the numbers that the file gives its points: points with the same number are one point.
+            None if it gives none.
+        pieces: [n] int64, the piece of the file that each point belongs to; None if there is one.
+    """
+
+    path: Path
+    points: np.ndarray
+    blocks: list[CellBlock]
+    point_fields: dict[str, np.ndarray] = field(default_factory=dict)
+    cell_fields: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    groups: dict[str, np.ndarray] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    time: float | None = None
+    columns: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    same_point: np.ndarray | None = None
+    pieces: np.ndarray | None = None
+
+    def require_consistent(self) -> None:
+        """Check that cells refer to points that there are, that these are finite, and that each field has a row for
+        each point or cell.
+
+        Raises:
+            DatasetError: the text names the file, and the cell, the point or the field.
+        """
+        used = np.zeros(len(self.points), bool)
+        for block in self.blocks:
+            require_nodes(str(self.path), block.label, block.nodes, len(self.points))
+            used[block.nodes] = True
+        bad = used & ~np.isfinite(self.points).all(axis=1)
+        if bad.any():
+            row = int(np.argmax(bad))
+            raise DatasetError(f"{self.path}: point {row} is not finite: {self.points[row].tolist()}")
+        for name, values in self.point_fields.items():
+            self._require_rows(f"point field {name!r}", len(values), len(self.points))
+        for name, parts in self.cell_fields.items():
+            for values, block in zip(parts, self.blocks, strict=True):
+                self._require_rows(f"cell field {name!r}", len(values), len(block.nodes))
+
+    def _require_rows(self, what: str, rows: int, wanted: int) -> None:
+        if rows != wanted:
+            raise DatasetError(f"{self.path}: the {what} has {rows} rows; must have {wanted}")
+
+    def counts(self) -> Counter[str]:
+        """How many cells of each label there are."""
+        counts: Counter[str] = Counter()
+        for block in self.blocks:
+            counts[block.label] += len(block.nodes)
+        return counts
+
+
+def from_meshio(mesh: meshio.Mesh, path: Path) -> SourceMesh:
+    """A mesh in memory, or one that meshio has read.
+
+    Raises:
+        DatasetError: it holds cells of an unknown kind.
+    """
+    points = np.zeros((len(mesh.points), 3))
+    given = np.asarray(mesh.points, np.float64)
+    points[:, : given.shape[1] if given.ndim == 2 else 0] = given
+    kept = [index for index, block in enumerate(mesh.cells) if len(block)]
+    cells = [mesh.cells[index] for index in kept]
+    unknown = [block.type for block in cells if block.type.rstrip(string.digits) not in SHAPES]
+    if unknown:
+        raise DatasetError(f"{path}: holds cells of the kind {unknown[0]}, which are not known here")
+    mesh_fields = {name: [np.asarray(values[index]) for index in kept] for name, values in mesh.cell_data.items()}
+    return SourceMesh(
+        path,
+        points,
+        [CellBlock(block.type, np.asarray(block.data, np.int64), block.type) for block in cells],
+        {name: np.asarray(values) for name, values in mesh.point_data.items()},
+        mesh_fields,
+        _node_groups(mesh),
+    )
+
+
+def _node_groups(mesh: meshio.Mesh) -> dict[str, np.ndarray]:
+    """The numbers of the nodes of each named set of points or cells of the mesh."""
+    groups = {name: np.asarray(nodes, np.int64).ravel() for name, nodes in mesh.point_sets.items()}
+    for name, rows in mesh.cell_sets.items():
+        if not name.startswith("gmsh:"):  # what meshio keeps for itself
+            pairs = zip(mesh.cells, rows, strict=True)
+            nodes = [block.data[np.asarray(chosen, int)].ravel() for block, chosen in pairs if chosen is not None]
+            groups[name] = np.unique(np.concatenate(nodes)) if nodes else np.zeros(0, np.int64)
+    return groups

@@ -1,0 +1,67 @@
+"""Several meshes as one: the blocks, pieces or files of a frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ast_sim.importers.formats.source_mesh import SourceMesh
+
+
+def together(meshes: Sequence[SourceMesh]) -> SourceMesh:
+    """One mesh of several, with all points of the first, then of the second, and so on. A field that one of them lacks
+    is NaN there, and a note says so. The path and the time are those of the first."""
+    if len(meshes) == 1:
+        return meshes[0]
+    starts = np.cumsum([0, *(len(mesh.points) for mesh in meshes)])
+    blocks = [
+        replace(block, nodes=block.nodes + start)
+        for mesh, start in zip(meshes, starts, strict=False)
+        for block in mesh.blocks
+    ]
+    point_fields, notes = _filled([(mesh.point_fields, len(mesh.points)) for mesh in meshes])
+    of_blocks = [
+        ({name: parts[index] for name, parts in mesh.cell_fields.items()}, len(block.nodes))
+        for mesh in meshes
+        for index, block in enumerate(mesh.blocks)
+    ]
+    cell_fields, more = _filled(of_blocks)
+    ends = np.cumsum([0, *(rows for _, rows in of_blocks)])
+    groups: dict[str, np.ndarray] = {}
+    for mesh, start in zip(meshes, starts, strict=False):
+        for name, nodes in mesh.groups.items():
+            groups[name] = np.concatenate([groups.get(name, nodes[:0]), nodes + start])
+    with_ids = [mesh.same_point for mesh in meshes if mesh.same_point is not None]
+    return SourceMesh(
+        meshes[0].path,
+        np.concatenate([mesh.points for mesh in meshes]),
+        blocks,
+        point_fields,
+        {name: [v[a:b] for a, b in zip(ends, ends[1:], strict=False)] for name, v in cell_fields.items()},
+        groups,
+        list(dict.fromkeys([note for mesh in meshes for note in mesh.notes] + notes + more)),
+        meshes[0].time,
+        {name: columns for mesh in meshes for name, columns in mesh.columns.items()},
+        np.concatenate(with_ids) if len(with_ids) == len(meshes) else None,
+        np.repeat(np.arange(len(meshes)), np.diff(starts)),
+    )
+
+
+def _filled(parts: list[tuple[dict[str, np.ndarray], int]]) -> tuple[dict[str, np.ndarray], list[str]]:
+    """The fields of all parts in one array each, NaN where a part lacks one, and notes on these."""
+    fields: dict[str, np.ndarray] = {}
+    notes = []
+    for name in dict.fromkeys(name for given, _ in parts for name in given):
+        given = [(one.get(name), rows) for one, rows in parts]
+        there = [values for values, _ in given if values is not None]
+        if any(values.shape[1:] != there[0].shape[1:] or values.dtype.kind not in "iufb" for values in there):
+            notes.append(f"the field {name!r} has other columns in other blocks and is left out")
+            continue
+        lacking = sum(rows for values, rows in given if values is None)
+        if lacking:
+            notes.append(f"the field {name!r} is missing in some blocks: it is NaN in {lacking} rows")
+        empty = [np.full((rows, *there[0].shape[1:]), np.nan) for values, rows in given if values is None]
+        fields[name] = np.concatenate([v if v is not None else empty.pop(0) for v, _ in given])
+    return fields, notes

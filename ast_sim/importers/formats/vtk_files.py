@@ -1,0 +1,285 @@
+"""Meshes in the files that VTK reads: its own formats, Exodus and the d3plot files of LS-DYNA; and CalculiX's .frd.
+
+They are read in a process of its own (`reading_worker`). Blocks and pieces become one mesh; ghost cells are left out.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import json
+import mmap
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import ast_sim
+from ast_sim.importers.formats.declared_sizes import (
+    declared_in_vtkhdf,
+    declared_in_xml,
+    needed_bytes,
+    stored_in_hdf,
+)
+from ast_sim.importers.formats.source_mesh import SourceMesh
+from ast_sim.importers.formats.together import together
+from ast_sim.importers.formats.vtk_cells import blocks_of
+from ast_sim.support.errors import DatasetError, require
+
+READING_MODULE = "ast_sim.importers.formats.reading_worker"
+EXODUS = (".e", ".ex2", ".exo", ".exoii", ".exii", ".g", ".gen")
+XML = (".vtu", ".pvtu", ".vtp", ".pvtp", ".vts", ".vtm", ".vtmb")
+ENDINGS = (*XML, ".vtk", ".vtkhdf", *EXODUS, ".frd")
+
+# Memory for a file: that for what it declares, for VTK's copies of it, and for what VTK needs itself.
+_COPIES = 8
+_OWN_BYTES = 1 << 29
+_LARGEST_RATIO = 40  # of memory to file, where the file does not say what it declares
+
+_SECONDS = 120
+_SECONDS_PER_MEGABYTE = 2
+
+# Bits of VTK's array of ghosts: copies of the cells of another piece, cells that finer ones replace, hidden cells.
+_GHOST_CELL = 1 | 8 | 32
+
+# The line before a result of CalculiX: name, time, number of nodes, a text, and the kind of the analysis.
+_FRD_RESULT = re.compile(rb"^  100C.{50}(..)", re.MULTILINE)
+_FRD_MODES = {b"2": "modes of vibration", b"4": "modes of buckling"}
+
+Answer = tuple[dict[str, Any], list[dict[str, np.ndarray]]]
+
+
+def is_dyna(path: Path) -> bool:
+    return path.name.lower() == "d3plot" or path.suffix.lower() == ".d3plot"
+
+
+def vtk_frames(path: Path) -> Iterator[SourceMesh]:
+    """The frames of a file, one after the other.
+
+    Raises:
+        DatasetError: VTK refuses the file, crashes on it, or makes something else of it than the file says it holds.
+        MissingExtra: VTK is not installed.
+    """
+    pieces, budget = _checked(path)
+    of_steps = declared_in_vtkhdf(path) if path.suffix.lower() == ".vtkhdf" else []
+    step, steps = 0, 1
+    while step < steps:
+        head, parts = _worker.ask(path, step, budget)
+        steps = head["steps"]
+        mesh = _mesh(path, parts, head["time"])
+        declared = of_steps[step] if step < len(of_steps) else head.get("declared")
+        declared = declared or ([sum(column) for column in zip(*pieces, strict=True)] if pieces else None)
+        counted = [len(mesh.points), sum(len(block.nodes) for block in mesh.blocks)]
+        if declared is not None and declared != counted:
+            raise DatasetError(
+                f"{path}: says that it holds {declared[0]} points and {declared[1]} cells, but VTK reads {counted[0]}"
+                f" and {counted[1]}"
+            )
+        yield _without_ghosts(_with_pieces(mesh, pieces))
+        step += 1
+
+
+def _checked(path: Path) -> tuple[list[tuple[int, int]], int]:
+    """The points and cells of each piece, if the file says them, and the bytes of memory that VTK may take."""
+    ending, size = path.suffix.lower(), path.stat().st_size
+    if ending in (".vtu", ".vtp", ".vts"):
+        declared = declared_in_xml(path)
+        return declared.pieces if ending != ".vts" else [], _OWN_BYTES + _COPIES * (needed_bytes(declared) + size)
+    if ending in (".pvtu", ".pvtp", ".vtm", ".vtmb"):
+        return _of_pieces(path)
+    if ending == ".vtkhdf" or (ending in EXODUS and _is_hdf(path)):
+        return [], _OWN_BYTES + _COPIES * stored_in_hdf(path, "VTKHDF" if ending == ".vtkhdf" else "/")
+    if ending == ".frd":
+        return _of_frd(path), _OWN_BYTES + _LARGEST_RATIO * size
+    if is_dyna(path):
+        size = sum(part.stat().st_size for part in path.parent.glob(f"{path.name}*"))
+    return [], _OWN_BYTES + _LARGEST_RATIO * size
+
+
+def _of_pieces(path: Path) -> tuple[list[tuple[int, int]], int]:
+    """As `_checked`, of a file that lists the files of its pieces or blocks."""
+    listed = declared_in_xml(path).sources
+    if path.suffix.lower() in (".vtm", ".vtmb"):
+        listed = re.findall(r'\bfile="([^"]+)"', path.read_text(errors="replace"))
+    pieces, budget = [], _OWN_BYTES
+    for name in listed:
+        file = path.parent / name
+        if not file.is_file():
+            raise DatasetError(f"{path}: lists {name}, which does not exist")
+        if file.suffix.lower() in (".vtu", ".vtp", ".vts"):
+            declared = declared_in_xml(file)
+            pieces += declared.pieces
+            budget += _COPIES * (needed_bytes(declared) + file.stat().st_size)
+    return (pieces if path.suffix.lower() == ".pvtu" else []), budget
+
+
+def _of_frd(path: Path) -> list[tuple[int, int]]:
+    """The numbers of nodes and elements that CalculiX writes before them.
+
+    Raises:
+        DatasetError: the results are modes, which are no frames of a motion.
+    """
+    counts = []
+    with path.open("rb") as file, contextlib.closing(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)) as content:
+        for result in _FRD_RESULT.finditer(content):
+            if result[1].strip() in _FRD_MODES:
+                raise DatasetError(
+                    f"{path}: holds {_FRD_MODES[result[1].strip()]}, which are no frames of a motion: write the results"
+                    " of a *STATIC or *DYNAMIC step"
+                )
+        for key in (b"2C", b"3C"):
+            declared = re.search(rb"^ {4}" + key + rb" +([0-9]+)", content, re.MULTILINE)
+            counts.append(int(declared[1]) if declared else 0)
+    return [(counts[0], counts[1])]
+
+
+def _is_hdf(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(8) == b"\x89HDF\r\n\x1a\n"
+
+
+class _Worker:
+    """The process in which VTK reads; it is started when it is needed, and again after a crash."""
+
+    def __init__(self) -> None:
+        self.process: subprocess.Popen[bytes] | None = None
+        self.owner = 0
+
+    def ask(self, path: Path, step: int, budget: int) -> Answer:
+        seconds = _SECONDS + _SECONDS_PER_MEGABYTE * (path.stat().st_size >> 20)
+        request = {"path": str(path.absolute()), "step": step, "bytes": budget, "seconds": seconds}
+        process = self._running(path)
+        assert process.stdin is not None and process.stdout is not None
+        try:
+            process.stdin.write(json.dumps(request).encode() + b"\n")
+            process.stdin.flush()
+            line = process.stdout.readline()
+            head = json.loads(line) if line else None
+            parts = _received(process.stdout, head["pieces"]) if head else []
+        except BaseException as error:
+            self.stop()
+            if isinstance(error, OSError | ValueError):
+                raise DatasetError(f"{path}: cannot be read as a mesh: VTK stopped") from error
+            raise
+        if head is None:
+            raise DatasetError(f"{path}: cannot be read as a mesh: {self._cause_of_death(seconds)}")
+        if "missing" in head:
+            require("read", head["missing"])
+        if "error" in head:
+            raise DatasetError(f"{path}: cannot be read as a mesh: {' '.join(head['error'].split())}")
+        return head, parts
+
+    def _running(self, path: Path) -> subprocess.Popen[bytes]:
+        if self.process is None or self.owner != os.getpid() or self.process.poll() is not None:
+            require("read", "vtkmodules")
+            root = str(Path(ast_sim.__file__).parent.parent)
+            search = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+            self.process = subprocess.Popen(
+                [sys.executable, "-P", "-m", READING_MODULE],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                env={**os.environ, "PYTHONPATH": search},
+                start_new_session=True,  # Ctrl-C is for this process alone
+            )
+            self.owner = os.getpid()
+        return self.process
+
+    def _cause_of_death(self, seconds: int) -> str:
+        assert self.process is not None
+        code = self.process.wait()
+        self.stop()
+        if code == -signal.SIGALRM:
+            return f"VTK did not finish within {seconds} s"
+        if code < 0:
+            return f"VTK crashed on it ({signal.Signals(-code).name}): it is damaged, or larger than its memory allows"
+        return "VTK stopped: it is damaged, or larger than its memory allows"
+
+    def stop(self) -> None:
+        if self.process is not None and self.owner == os.getpid():
+            for pipe in (self.process.stdin, self.process.stdout):
+                with contextlib.suppress(OSError):
+                    if pipe is not None:
+                        pipe.close()
+            with contextlib.suppress(OSError):
+                self.process.kill()
+            self.process.wait()
+        self.process = None
+
+
+_worker = _Worker()
+atexit.register(_worker.stop)
+
+
+def _received(stream: Any, listed: list[dict[str, tuple[str, list[int]]]]) -> list[dict[str, np.ndarray]]:
+    pieces = []
+    for names in listed:
+        piece = {}
+        for name, (dtype, shape) in names.items():
+            kind, count = np.dtype(dtype), int(np.prod(shape))
+            data = stream.read(kind.itemsize * count)
+            piece[name] = np.frombuffer(data, kind, count).reshape(shape)
+        pieces.append(piece)
+    return pieces
+
+
+def _mesh(path: Path, parts: list[dict[str, np.ndarray]], time: float | None) -> SourceMesh:
+    """One mesh of all parts; the sets of nodes are given by the numbers of points in the whole file."""
+    meshes = [_part(path, part, time) for part in parts if "points" in part and len(part["points"])]
+    if not meshes:
+        raise DatasetError(f"{path}: holds no points")
+    mesh = together(meshes)
+    for part in parts:
+        for name, ids in _named(part, "group ").items():
+            if mesh.same_point is not None:
+                mesh.groups[name] = np.flatnonzero(np.isin(mesh.same_point, ids))
+    return mesh
+
+
+def _part(path: Path, part: dict[str, np.ndarray], time: float | None) -> SourceMesh:
+    blocks = blocks_of(path, part["types"], part["offsets"], part["connectivity"])
+    names = {**_named(part, "point-columns "), **_named(part, "cell-columns ")}
+    return SourceMesh(
+        path,
+        part["points"].astype(np.float64),
+        [block for block, _ in blocks],
+        _named(part, "point "),
+        {name: [values[rows] for _, rows in blocks] for name, values in _named(part, "cell ").items()},
+        time=time,
+        columns={n: tuple(one.decode(errors="replace") for one in v.tolist()) for n, v in names.items()},
+        same_point=part["global"].astype(np.int64) if "global" in part else None,
+    )
+
+
+def _named(part: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    return {name.removeprefix(prefix): values for name, values in part.items() if name.startswith(prefix)}
+
+
+def _with_pieces(mesh: SourceMesh, pieces: list[tuple[int, int]]) -> SourceMesh:
+    """VTK has joined the pieces of a file in their order; their sizes say which point belongs to which."""
+    if mesh.pieces is not None or sum(count > 0 for count, _ in pieces) < 2:
+        return mesh
+    return replace(mesh, pieces=np.repeat(np.arange(len(pieces)), [count for count, _ in pieces]))
+
+
+def _without_ghosts(mesh: SourceMesh) -> SourceMesh:
+    """The mesh without its ghost cells. A point of a ghost stands for the same point of another piece."""
+    ghosts = mesh.cell_fields.pop("vtkGhostType", None)
+    mesh.point_fields.pop("vtkGhostType", None)
+    if ghosts is None:
+        return mesh
+    kept = [(np.nan_to_num(np.asarray(g, float)).astype(int) & _GHOST_CELL) == 0 for g in ghosts]
+    left_out = sum(int((~rows).sum()) for rows in kept)
+    blocks = [block.rows(rows) for block, rows in zip(mesh.blocks, kept, strict=True)]
+    fields = {
+        name: [v[rows] for v, rows in zip(values, kept, strict=True)] for name, values in mesh.cell_fields.items()
+    }
+    notes = [*mesh.notes, *([f"{left_out} ghost cells are left out"] if left_out else [])]
+    return replace(mesh, blocks=blocks, cell_fields=fields, notes=notes)

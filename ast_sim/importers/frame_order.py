@@ -1,0 +1,129 @@
+"""The files of a simulation in order of time: by the times inside, else by the numbers in their names; PVD files."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+
+from ast_sim.importers.frames_in_file import ONE_FRAME, holds_frames
+from ast_sim.support.errors import DatasetError
+
+_NUMBER = re.compile(r"([0-9]+(?:\.[0-9]+)?(?:[eE][-+]?[0-9]+)?)")
+
+
+class FrameFiles(NamedTuple):
+    """The files of a simulation, those of one frame together, and the time of each frame where a PVD file says it."""
+
+    files: list[list[Path]]
+    times: list[float] | None = None
+
+
+def natural_order(path: Path) -> list[tuple[float, str]]:
+    """A sort key by which frame_10 comes after frame_9, and Result-0.0005 before Result-0.001."""
+    parts = _NUMBER.split(path.stem)
+    return [(float(part), "") if place % 2 else (-1.0, part) for place, part in enumerate(parts)]
+
+
+def frame_files(source: Path) -> FrameFiles:
+    """The files of a simulation, without a look into them.
+
+    Raises:
+        DatasetError: the source is no simulation, it is damaged, or it lists a file that does not exist.
+    """
+    if source.is_dir():
+        files = files_of_frames(source)
+        if not files:
+            raise DatasetError(f"{source}: the folder holds no .vtu file or other file of a frame")
+        return FrameFiles([[file] for file in sorted(files, key=natural_order)])
+    if not source.is_file():
+        raise DatasetError(f"{source}: there is no such file or folder")
+    if source.suffix.lower() == ".pvd":
+        return _collection(source)
+    if source.suffix.lower() in ONE_FRAME or holds_frames(source):
+        return FrameFiles([[source]])
+    raise DatasetError(
+        f"{source}: must be a .pvd file, a folder of files of frames ({', '.join(ONE_FRAME)}), or one file with all"
+        " frames, such as .vtkhdf, .frd, .xdmf or .exo"
+    )
+
+
+def files_of_frames(folder: Path) -> list[Path]:
+    """The files of a folder that are a frame each. Pieces that a .pvtu or .vtm file lists are not counted."""
+    entries = [entry for entry in folder.iterdir() if entry.is_file() and not entry.name.startswith(".")]
+    for endings in ((".pvtu",), (".vtm",), (".vtu",), (".vtk",), (".pvtp",), (".vtp",)):
+        files = [entry for entry in entries if entry.suffix.lower() in endings]
+        if files:
+            return files
+    return []
+
+
+def ordered(files: list[Path], times: list[float | None]) -> tuple[list[int], list[str]]:
+    """The order of files that are a frame each, and a note where it is not certain.
+
+    The times inside the files decide, if each has one and no two are equal. Else the numbers in the names decide, read
+    as numbers: 0.0005, 1e-03, 10.
+
+    Args:
+        files: in natural order.
+        times: what each file says of its time.
+    """
+    as_named = list(range(len(files)))
+    known = [time for time in times if time is not None]
+    if len(set(known)) == len(files) and np.isfinite(known).all():
+        order = np.argsort(known, kind="stable").tolist()
+        by_name = "the times inside the files, not of their names"
+        return order, [] if order == as_named else [_said(files, order, by_name)]
+    if len({tuple(_NUMBER.split(file.stem)[::2]) for file in files}) > 1:
+        return as_named, [_said(files, as_named, "their names, which differ in more than a number")]
+    whole = sorted(as_named, key=lambda index: _whole_numbers(files[index]))
+    by_number = "the numbers in their names, read with their decimal points"
+    return as_named, [] if whole == as_named else [_said(files, as_named, by_number)]
+
+
+def _said(files: list[Path], order: list[int], by_what: str) -> str:
+    first = ", ".join(files[index].name for index in order[:3])
+    return f"the frames stand in the order of {by_what}: {first}{', ...' if len(files) > 3 else ''}"
+
+
+def _whole_numbers(path: Path) -> list[tuple[int, str]]:
+    parts = re.split(r"([0-9]+)", path.stem)
+    return [(int(part), "") if place % 2 else (-1, part) for place, part in enumerate(parts)]
+
+
+def _collection(source: Path) -> FrameFiles:
+    """The files that a PVD file lists, by their time; those of one time are the parts of one frame."""
+    try:
+        root = ElementTree.parse(source).getroot()
+        entries = [
+            (float(entry.get("timestep", "nan")), entry.attrib["file"]) for entry in root.iterfind("Collection/DataSet")
+        ]
+    except (OSError, ElementTree.ParseError, ValueError, KeyError) as error:
+        raise DatasetError(f"{source}: is damaged or no PVD file: {error}") from error
+    if not entries:
+        raise DatasetError(f"{source}: lists no frames (no DataSet in a Collection)")
+    times = [time for time, _ in entries]
+    if len(entries) > 1 and not np.isfinite(times).all():
+        raise DatasetError(f"{source}: every frame needs a timestep")
+    frames: dict[float, list[Path]] = {}
+    for time, name in sorted(entries, key=lambda one: one[0]):
+        frames.setdefault(time, []).append(_listed(source, name))
+    counts = {len(files) for files in frames.values()}
+    if len(counts) > 1:
+        raise DatasetError(f"{source}: lists {min(counts)} to {max(counts)} files for a time; must be equally many")
+    return FrameFiles(list(frames.values()), list(frames) if len(frames) > 1 else None)
+
+
+def _listed(source: Path, name: str) -> Path:
+    """A file that a PVD file lists; Windows writes its path with backslashes."""
+    file = source.parent / name
+    if not file.is_file() and "\\" in name:
+        file = source.parent / name.replace("\\", "/")
+    if file.suffix.lower() not in ONE_FRAME:
+        raise DatasetError(f"{source}: lists {name}, which is no .vtu file nor another file of a frame")
+    if not file.is_file():
+        raise DatasetError(f"{source}: lists {source.parent / name}, which does not exist")
+    return file

@@ -1,0 +1,323 @@
+"""Reading a simulation of another program: a PVD file, a folder with a file for each frame, or one file with all
+frames."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ast_sim.importers.formats.source_mesh import SourceMesh
+from ast_sim.importers.formats.together import together
+from ast_sim.importers.frame_order import frame_files, ordered
+from ast_sim.importers.frames_in_file import frames_in
+from ast_sim.importers.mesh_file import MeshFile, mesh_of, raw_field
+from ast_sim.importers.scene_mesh import clamped
+from ast_sim.importers.shells import Shells
+from ast_sim.importers.solids.frames_match import order_of_cells
+from ast_sim.importers.solids.mesh_elements import require_extent
+from ast_sim.importers.solids.stitching import Stitching
+from ast_sim.importers.stress import order_of, von_mises
+from ast_sim.scene import NodeType, Scene, Trajectory
+from ast_sim.support.errors import DatasetError
+
+# Points count as equal if they differ by less than this share of the size of the mesh.
+_AGREEMENT = 1e-4
+
+# Rounding to float32 may change the displacements by this share of the largest one before a warning is given.
+_ROUNDING = 0.01
+
+
+@dataclass(frozen=True)
+class FieldNames:
+    """The names of the fields in the files. A field that is named here must be present.
+
+    Attributes:
+        displacement: point field, the displacement from rest. None: "displacement" if it is present; else the points
+            themselves move, and the first frame is at rest.
+        stress: point or cell field: the von Mises stress, or the components of a stress tensor. None: "von_mises" if
+            it is present.
+        node_type: point field with the numbers of `NodeType`. None: "node_type" if it is present; else all nodes are
+            NORMAL.
+        obstacle, handle: what the nodes of obstacles and the handles are: a point field that is not zero there, a group
+            of nodes, or a place BODY:PLACE as in `parse_clamp`.
+        body: point or cell field with the numbers of the bodies. None: "body" if it is present; else each connected
+            part of the mesh is a body.
+        material: cell fields with one number each; they become the columns of `Scene.material`.
+        stress_order: the components that the columns of the stress hold, such as ("xx", "xy", "xz", "yy", "yz", "zz").
+            Empty: as the file names them; else the normal stresses come first.
+    """
+
+    displacement: str | None = None
+    stress: str | None = None
+    node_type: str | None = None
+    obstacle: str | None = None
+    handle: str | None = None
+    body: str | None = None
+    material: tuple[str, ...] = ()
+    stress_order: tuple[str, ...] = ()
+
+
+@dataclass(eq=False)
+class _Frames:
+    """What is kept of each frame: points [n, 3] of the file, displacements [n, 3], stress of its points or cells, its
+    time."""
+
+    points: list[np.ndarray] = field(default_factory=list)
+    displacements: list[np.ndarray | None] = field(default_factory=list)
+    stresses: list[np.ndarray] = field(default_factory=list)
+    times: list[float | None] = field(default_factory=list)
+
+    def reorder(self, order: list[int]) -> None:
+        for name, values in vars(self).items():
+            setattr(self, name, [values[index] for index in order] if values else [])
+
+    def ascending_times(self) -> tuple[float, ...] | None:
+        """The times of the frames; None if they are not known or do not ascend."""
+        known = [time for time in self.times if time is not None]
+        whole = len(known) == len(self.times) > 1 and np.isfinite(known).all() and (np.diff(known) > 0).all()
+        return tuple(known) if whole else None
+
+
+def read_series(source: Path, names: FieldNames, origin: np.ndarray | None = None) -> Trajectory:
+    """Read the simulation in a `.pvd` file, in a folder with a file for each frame, or in one file.
+
+    The elements are those of `read_mesh`: nodes that belong to no element are left out, shells beside tetrahedra become
+    rigid obstacles. The mesh must be the same in all frames; its elements may stand in another order.
+
+    Args:
+        origin: [3] float64, subtracted from all points before they are rounded to float32. None: zero if the mesh lies
+            near zero, else near the centre of the first frame; see `far_origin`.
+
+    Returns:
+        The trajectory; its `stress_location` is "none", "node" or "element". Its attribute `origin` is what was
+        subtracted, if that is not zero; `notes` says what was not taken as it stands in the files.
+
+    Raises:
+        DatasetError: a file, field, node or element is missing or wrong; the text names the file and what is wrong.
+        MissingExtra: the reader of a format is not installed.
+    """
+    mesh, kept, notes, place = _read_frames(source, names)
+    scene, used = mesh.scene(names.body, names.node_type)
+    types = _node_type(mesh, names, scene, used)
+    rest, position = _rest_and_position(source, mesh, kept, used)
+    if mesh.shells is not None:
+        rest, position = _with_layers(source, mesh.shells.renumbered(used), rest, position)
+    require_extent(source, rest, scene.elements)
+    origin = far_origin(position[0]) if origin is None else origin
+    _warn_of_rounding(source, rest - origin, position - origin)
+    scene = replace(
+        scene,
+        rest_position=(rest - origin).astype(np.float32),
+        node_type=types,
+        material=mesh.columns(names.material),
+    )
+    stress, more = _stress(mesh, kept, used, place, scene)
+    attributes: dict[str, Any] = {"status": "complete", "source": source.name}
+    attributes |= {"origin": origin.tolist()} if origin.any() else {}
+    told = [*mesh.notes, *notes, *more]
+    attributes |= {"notes": "; ".join(told)} if told else {}
+    trajectory = Trajectory(
+        scene,
+        (position - origin).astype(np.float32),
+        stress,
+        attributes,
+        stress_location=place,
+        times=kept.ascending_times(),
+    )
+    trajectory.check(str(source), place)
+    return trajectory
+
+
+def _read_frames(source: Path, names: FieldNames) -> tuple[MeshFile, _Frames, list[str], str]:
+    """The mesh of a simulation, what is kept of its frames in order of time, notes, and where the stress is."""
+    kept, first, stitching = _Frames(), None, None
+    used_fields = tuple(
+        filter(None, (names.obstacle, names.handle, names.node_type or "node_type", names.body or "body"))
+    )
+    place, order, notes = "none", (), []
+    for frame in frames(source):
+        frame.require_consistent()
+        if first is None or stitching is None:
+            first, stitching = frame, Stitching(frame)
+            place, order, notes = _stress_place(frame, names)
+        cells = order_of_cells(frame, first)
+        if cells is not None and len(notes) < 2:
+            notes.append(f"the elements of {frame.path.name} stand in another order: they are put in that of the first")
+        stitching.look(frame, used_fields)
+        kept.times.append(frame.time)
+        kept.points.append(frame.points)
+        kept.displacements.append(_displacement(frame, names))
+        if place != "none":
+            values = raw_field(frame, "point" if place == "node" else "cell", names.stress or "von_mises")
+            values = von_mises(values, order) if order else values[:, 0]
+            kept.stresses.append(values if place == "node" or cells is None else values[cells])
+    assert first is not None and stitching is not None
+    files, times = frame_files(source)
+    if source.is_dir():
+        by_time, said = ordered([file for (file,) in files], kept.times)
+        kept.reorder(by_time)
+        notes += said
+    elif times is not None:
+        kept.times = list(times)
+    return mesh_of(first, stitching), kept, notes, place
+
+
+def frames(source: Path) -> Iterator[SourceMesh]:
+    """The frames of a simulation, one after the other; see `frame_files` for the errors."""
+    for files in frame_files(source).files:
+        if len(files) > 1:
+            yield together([next(frames_in(file)) for file in files])
+        elif source.is_dir():
+            yield next(frames_in(files[0]))
+        else:
+            yield from frames_in(files[0])
+
+
+def far_origin(points: np.ndarray) -> np.ndarray:
+    """[3] float64: what is subtracted from points [N, 3] before they are rounded to float32.
+
+    float32 has 24 bits: a mesh of size 1 at a distance of 5e6 keeps steps of 0.5. The origin is the centre of the
+    points, rounded to a multiple of a power of ten that is 10 to 100 times the size of the mesh. So it is zero for a
+    mesh near zero.
+    """
+    lowest, highest = points.min(axis=0), points.max(axis=0)
+    size = (highest - lowest).max()
+    if not np.isfinite(size) or size <= 0:
+        return np.zeros(3)
+    unit = 10.0 ** np.ceil(np.log10(10 * size))
+    return np.round((lowest + highest) / 2 / unit) * unit + 0.0
+
+
+def _warn_of_rounding(source: Path, rest: np.ndarray, position: np.ndarray) -> None:
+    """Warn if the displacements change when the rest points [N, 3] and the positions [S, N, 3] become float32."""
+    small = rest.astype(np.float32).astype(np.float64)
+    largest = max(np.abs(one - rest).max() for one in position)
+    worst = max(np.abs(one.astype(np.float32) - small - (one - rest)).max() for one in position)
+    if worst > _ROUNDING * largest:
+        warnings.warn(
+            f"{source}: the largest displacement is {largest:.3g}, and rounding to float32 changes displacements by up"
+            f" to {worst:.3g}: the motion is too small for coordinates of up to {np.abs(position).max():.3g}",
+            stacklevel=3,
+        )
+
+
+def _displacement(frame: SourceMesh, names: FieldNames) -> np.ndarray | None:
+    """The displacements of the points [n, 3]; None if the file holds none."""
+    if names.displacement is None and "displacement" not in frame.point_fields:
+        return None
+    value = raw_field(frame, "point", names.displacement or "displacement")
+    if value.shape[1] not in (2, 3):
+        raise DatasetError(f"{frame.path}: the displacement has {value.shape[1]} components; must have 2 or 3")
+    return np.pad(value, ((0, 0), (0, 3 - value.shape[1])))
+
+
+def _rest_and_position(source: Path, mesh: MeshFile, kept: _Frames, used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rest positions [N, 3] and the positions [S, N, 3] of the used nodes.
+
+    A file with displacements holds either the points at rest or the moved points. If the points are the same in all
+    frames, they are the rest positions. If the points minus their displacements are the same, these are.
+    """
+    rows = mesh.node_rows[used]
+    at = np.stack([points[rows] for points in kept.points])
+    given = [one[rows] for one in kept.displacements if one is not None]
+    if not given:
+        return at[0], at
+    if len(given) < len(kept.displacements):
+        frame = next(frame for frame, one in enumerate(kept.displacements) if one is None)
+        raise DatasetError(f"{source}: frame {frame} has no displacement, others have")
+    moved = np.stack(given)
+    allowed = _AGREEMENT * np.ptp(at[0], axis=0).max()
+    if np.abs(at - at[0]).max() <= allowed:
+        return at[0], at[0] + moved
+    back = at - moved
+    if np.abs(back - back[0]).max() <= allowed:
+        return back[0], at
+    raise DatasetError(
+        f"{source}: the displacement does not fit the points: in some frame the points, and the points minus the"
+        " displacement, differ from frame 0; name the right field"
+    )
+
+
+def _stress_place(frame: SourceMesh, names: FieldNames) -> tuple[str, tuple[str, ...], list[str]]:
+    """Where a file holds the stress ("none", "node" or "element"), the components of its columns, and a note on
+    them."""
+    name = names.stress or "von_mises"
+    place = "node" if name in frame.point_fields else "element" if name in frame.cell_fields else "none"
+    if place == "none":
+        if names.stress is not None:
+            known = ", ".join(sorted({*frame.point_fields, *frame.cell_fields})) or "none"
+            raise DatasetError(f"{frame.path}: there is no field {names.stress!r}; there are: {known}")
+        return place, (), []
+    columns = raw_field(frame, "point" if place == "node" else "cell", name).shape[1]
+    order = order_of(frame.path, name, columns, frame.columns.get(name, ()), names.stress_order)
+    note = f"the von Mises stress is that of the components {', '.join(order)} of {name!r}"
+    return place, order, [note] if order else []
+
+
+def _stress(
+    mesh: MeshFile, kept: _Frames, used: np.ndarray, place: str, scene: Scene
+) -> tuple[np.ndarray | None, list[str]]:
+    """[S, N or E, 1] float32, and a note if obstacles have none: it is 0 there."""
+    if place == "none":
+        return None, []
+    rows = mesh.node_rows[used] if place == "node" else mesh.element_rows
+    stress = np.stack([values[rows] for values in kept.stresses]).astype(np.float32)[:, :, None]
+    lacking = np.isnan(stress[:, :, 0]).any(axis=0) & ~scene.deforming(place)
+    if not lacking.any():
+        return stress, []
+    stress[:, lacking] = 0
+    return stress, [f"the stress is NaN at {lacking.sum()} rows of obstacles: it is 0 there"]
+
+
+def _with_layers(source: Path, shells: Shells, rest: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rest points and positions with the points behind the shells, which turn with the shells.
+
+    Raises:
+        DatasetError: a shell is not rigid.
+    """
+    count = len(shells.nodes)
+    for frame, points in enumerate(position):
+        bent = shells.bent(rest, points)
+        if bent is not None:
+            raise DatasetError(
+                f"{source}: the shell at {np.round(rest[bent[0]], 6).tolist()} is not rigid: in"
+                f" frame {frame} an edge changes by {bent[1]:.3g};"
+                " shells beside tetrahedra must be rigid: mesh this body with tetrahedra"
+            )
+    layers = np.stack([shells.behind(points) for points in position])
+    return (
+        np.concatenate([rest[:-count], shells.behind(rest)]),
+        np.concatenate([position[:, :-count], layers], axis=1),
+    )
+
+
+def _node_type(mesh: MeshFile, names: FieldNames, scene: Scene, used: np.ndarray) -> np.ndarray:
+    """The types of the used nodes; those that are marked as handles and obstacles are replaced."""
+    types = scene.node_type.copy()
+    for name, kind in ((names.handle, NodeType.HANDLE), (names.obstacle, NodeType.OBSTACLE)):
+        if name is not None:
+            types[_marked(mesh, name, scene, used)] = kind
+    types[mesh.shell_nodes[used]] = NodeType.OBSTACLE
+    return types
+
+
+def _marked(mesh: MeshFile, name: str, scene: Scene, used: np.ndarray) -> np.ndarray:
+    """The used nodes that a point field, a group or a place BODY:PLACE marks, as a mask or as numbers."""
+    if name in mesh.source.point_fields:
+        return mesh.marks(name)[used]
+    if name in mesh.groups:
+        return np.isin(used, mesh.groups[name])
+    if re.match(r"\s*[0-9]+\s*:", name):
+        return clamped(mesh, scene, used, name)
+    fields = ", ".join(sorted(mesh.source.point_fields)) or "none"
+    groups = ", ".join(sorted(mesh.groups)) or "none"
+    raise DatasetError(
+        f"{mesh.path}: there is no point field {name!r}; there are: {fields}; groups of nodes: {groups}; places are"
+        " written BODY:PLACE, for example 0:zmin"
+    )

@@ -1,0 +1,149 @@
+"""Which cells of a file become elements: tetrahedra of all cells with a volume, or triangles if there are none.
+
+This is the one place where cells of a higher order are reduced to their corners, where hexahedra, prisms and pyramids
+are cut into tetrahedra, where elements that stand twice are taken once, and where elements are turned over.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ast_sim.importers.formats.source_mesh import SourceMesh
+from ast_sim.importers.solids.splitting import tetrahedra_of
+from ast_sim.support.errors import DatasetError
+
+# A tetrahedron (triangle) is flat if its volume (area) is below this share of its longest edge to the power of 3 (2).
+_FLAT = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Elements:
+    """Elements, and what was done to get them.
+
+    Attributes:
+        nodes: [E, 3 or 4] int64 points of the file; tetrahedra have a positive volume.
+        rows: [E] int64 the cell that each is part of, counted over all blocks of the file.
+        blocks: the numbers of the blocks that became elements.
+        notes: sentences on what was changed.
+    """
+
+    nodes: np.ndarray
+    rows: np.ndarray
+    blocks: list[int]
+    notes: list[str]
+
+
+def elements_of(mesh: SourceMesh, point_of: np.ndarray) -> Elements:
+    """The elements of a mesh.
+
+    Args:
+        point_of: [n] the point that stands for each point of the file.
+
+    Raises:
+        DatasetError: there are none, or a tetrahedron names a node twice; the text names the file and the cell.
+    """
+    dimension = max((block.dimension for block in mesh.blocks), default=0)
+    chosen = [index for index, block in enumerate(mesh.blocks) if block.dimension == dimension]
+    if dimension < 2 or (dimension == 2 and any(mesh.blocks[index].shape != "triangle" for index in chosen)):
+        held = ", ".join(mesh.counts()) or "no cells"
+        raise DatasetError(
+            f"{mesh.path}: holds {held}; the elements must be tetrahedra, hexahedra, prisms or pyramids, or triangles"
+            " alone: mesh the bodies with tetrahedra"
+        )
+    starts = np.cumsum([0, *(len(block.nodes) for block in mesh.blocks)])
+    nodes, rows, notes, told = [], [], Counter(), Counter()
+    twice = 0
+    for shape in dict.fromkeys(mesh.blocks[index].shape for index in chosen):
+        of_shape = [index for index in chosen if mesh.blocks[index].shape == shape]
+        cells = np.concatenate([point_of[mesh.blocks[index].corners] for index in of_shape])
+        row = np.concatenate([starts[index] + np.arange(len(mesh.blocks[index].nodes)) for index in of_shape])
+        first = _first_of_its_nodes(cells)
+        twice += len(cells) - len(first)
+        cells, row = cells[first], row[first]
+        if shape in ("triangle", "tetra"):
+            if shape == "tetra":
+                _require_proper(mesh, cells, row)
+            nodes.append(cells)
+            rows.append(row)
+        else:
+            tetrahedra, owner = tetrahedra_of(shape, cells)
+            told[f"{len(cells)} cells of the kind {shape} are cut into {len(tetrahedra)} tetrahedra"] += 1
+            nodes.append(tetrahedra)
+            rows.append(row[owner])
+    for index in chosen:
+        if mesh.blocks[index].is_curved:
+            notes[mesh.blocks[index].label] += len(mesh.blocks[index].nodes)
+    said = [f"{count} cells of the kind {kind} keep their corners only" for kind, count in notes.items()]
+    said += [*told, *([f"{twice} elements that stand in the file twice are taken once"] if twice else [])]
+    elements, row = np.concatenate(nodes), np.concatenate(rows)
+    if dimension == 2:
+        return Elements(elements, row, chosen, said)
+    elements, more = _turned_over(mesh, elements, row, starts)
+    return Elements(elements, row, chosen, [*said, *more])
+
+
+def _first_of_its_nodes(cells: np.ndarray) -> np.ndarray:
+    """The rows of cells whose nodes are not the nodes of a cell before them, in ascending order."""
+    ordered = np.sort(cells, axis=1)
+    order = np.lexsort(ordered.T)
+    new = np.append(True, (ordered[order[1:]] != ordered[order[:-1]]).any(axis=1)) if len(cells) else order == 0
+    return np.sort(order[new])  # lexsort is stable: the first of equal rows comes first
+
+
+def _require_proper(mesh: SourceMesh, cells: np.ndarray, rows: np.ndarray) -> None:
+    ordered = np.sort(cells, axis=1)
+    repeated = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
+    if repeated.any():
+        first = int(np.argmax(repeated))
+        raise DatasetError(f"{mesh.path}: element {rows[first]} refers to a node twice: {cells[first].tolist()}")
+
+
+def require_extent(path: Path, points: np.ndarray, elements: np.ndarray) -> None:
+    """Check that elements [E, 3 or 4] are not flat.
+
+    Raises:
+        DatasetError: one is; the text names the file and the element.
+    """
+    corners = points[elements]
+    edges = corners[:, 1:] - corners[:, :1]
+    longest = np.linalg.norm(corners[:, :, None] - corners[:, None], axis=-1).max(axis=(1, 2))
+    if edges.shape[1] == 3:
+        size, kind = np.linalg.det(edges) / 6, "volume"
+    else:
+        size, kind = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2, "area"
+    flat = np.abs(size) <= _FLAT * longest ** edges.shape[1]
+    if flat.any():
+        row = int(np.argmax(flat))
+        raise DatasetError(
+            f"{path}: element {row} with the nodes {elements[row].tolist()} has no {kind}; {flat.sum()} of"
+            f" {len(flat)} elements have none: repair the mesh"
+        )
+
+
+def _turned_over(
+    mesh: SourceMesh, elements: np.ndarray, rows: np.ndarray, starts: np.ndarray
+) -> tuple[np.ndarray, list[str]]:
+    """The tetrahedra with positive volumes, and notes on those that were inside out.
+
+    The order of the nodes of a prism differs from program to program, so prisms are turned over without a note. Cells
+    that are so warped that some of their tetrahedra are inside out fold over themselves; the check of the scene tells.
+    """
+    corners = mesh.points[elements]
+    negative = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
+    elements = elements.copy()
+    elements[negative, 2:] = elements[negative, :1:-1]
+    shape_of = np.repeat([block.shape for block in mesh.blocks], np.diff(starts))
+    plain = shape_of[rows] == "tetra"
+    notes = []
+    if (negative & plain).any():
+        notes.append(f"{(negative & plain).sum()} tetrahedra that were inside out are turned over")
+    cells, cell = np.unique(rows[~plain], return_inverse=True)
+    if len(cells):
+        turned = np.bincount(cell.ravel(), negative[~plain]) == np.bincount(cell.ravel())
+        turned &= shape_of[cells] != "wedge"
+        notes += [f"{turned.sum()} cells that were inside out are turned over"] if turned.any() else []
+    return elements, notes

@@ -1,0 +1,147 @@
+"""What looks wrong in the frames of a simulation: tools that change their shape, displacements in other units, elements
+that turn over, frames that repeat, no motion, contact that no model can see.
+
+Legend: S frames, N nodes, E elements.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ast_sim.plausibility.findings import Finding, places, point
+from ast_sim.plausibility.topology import at_rest, signed_volumes
+from ast_sim.scene import NodeType, Scene, Trajectory
+
+# Edges of an obstacle keep their lengths up to this share of the longest edge.
+_RIGID = 0.02
+
+# A displacement of so many times the size of the scene cannot be one.
+_FAR = 10.0
+
+# A node moves if it moves by more than this share of the size of its scene.
+_STILL = 1e-6
+
+# More world edges than this for each node, and an octree deeper than this, tell of a mesh in other units or of a stray
+# part.
+_MOST_WORLD_EDGES = 60
+_DEEPEST = 14
+
+# World edges are counted in so many frames.
+_FRAMES = 5
+
+
+def in_trajectory(trajectory: Trajectory) -> list[Finding]:
+    """What looks wrong in a simulation."""
+    scene, position = trajectory.scene, trajectory.position
+    findings = [*at_rest(scene), *_still(scene, position), *_far(scene, position), *_soft_tools(scene, position)]
+    return [*findings, *_turn_over(scene, position), *_repeats(position, trajectory.stress), *_contact(scene, position)]
+
+
+def _still(scene: Scene, position: np.ndarray) -> list[Finding]:
+    size = float(np.ptp(scene.rest_position, axis=0).max())
+    if len(position) < 2 or np.abs(position - position[0]).max() > _STILL * size:
+        return []
+    meaning = "nothing moves in any frame, so there is nothing to learn: name the field of the displacement"
+    return [Finding("simulations without motion", 1, f"{len(position)} frames", meaning)]
+
+
+def _far(scene: Scene, position: np.ndarray) -> list[Finding]:
+    size = float(np.ptp(scene.rest_position, axis=0).max())
+    moved = np.linalg.norm(position.astype(np.float64) - scene.rest_position, axis=2)
+    largest = moved.max(axis=1)
+    rows = np.flatnonzero(largest > _FAR * size)
+    if not len(rows):
+        return []
+    where = places("frames", rows)
+    meaning = (
+        f"nodes move by {largest.max():.3g}, {largest.max() / size:.3g} times the size of the scene: are displacement"
+        " and mesh in one unit?"
+    )
+    return [Finding("frames with very large displacements", len(rows), where, meaning)]
+
+
+def _soft_tools(scene: Scene, position: np.ndarray) -> list[Finding]:
+    edges = scene.edges()
+    edges = edges[(scene.node_type[edges] == NodeType.OBSTACLE).all(axis=1)]
+    if not len(edges):
+        return []
+    rest = _lengths(scene.rest_position, edges)
+    worst = np.zeros(len(edges))
+    for frame in position:
+        worst = np.maximum(worst, np.abs(_lengths(frame, edges) - rest))
+    rows = edges[worst > _RIGID * rest.max()][:, 0]
+    if not len(rows):
+        return []
+    where = places("nodes", np.unique(rows), scene.rest_position[np.unique(rows)])
+    meaning = f"edges of an obstacle change by up to {worst.max():.3g}: it is no rigid tool; mark clamps as handles"
+    return [Finding("edges of obstacles that change", len(rows), where, meaning)]
+
+
+def _turn_over(scene: Scene, position: np.ndarray) -> list[Finding]:
+    if scene.elements.shape[1] == 3:
+        return []
+    sign = np.sign(signed_volumes(scene.rest_position, scene.elements))
+    count, first, frames = 0, None, []
+    for number, frame in enumerate(position):
+        wrong = (signed_volumes(frame, scene.elements) * sign <= 0) & scene.deforming_elements & (sign != 0)
+        if wrong.any():
+            count += int(wrong.sum())
+            frames.append(number)
+            first = first or f"frame {number}, element {np.argmax(wrong)}"
+    if not frames:
+        return []
+    meaning = f"in {len(frames)} of {len(position)} frames elements are inside out: did the solver converge there?"
+    return [Finding("elements that turn over", count, first or "", meaning)]
+
+
+def _repeats(position: np.ndarray, stress: np.ndarray | None) -> list[Finding]:
+    same = (position[1:] == position[:-1]).all(axis=(1, 2))
+    if stress is not None:
+        same &= (stress[1:] == stress[:-1]).all(axis=(1, 2))
+    rows = 1 + np.flatnonzero(same)
+    moves = len(position) > 1 and not (position == position[0]).all()
+    if not len(rows) or not moves:
+        return []
+    meaning = "each is the frame before it once more: was it written twice?"
+    return [Finding("frames that repeat", len(rows), places("frames", rows), meaning)]
+
+
+def _contact(scene: Scene, position: np.ndarray) -> list[Finding]:
+    """World edges (nodes of two bodies within a mesh spacing) and the depth of the octree that the mesh implies."""
+    from scipy.spatial import KDTree
+
+    deforming = scene.edges()
+    deforming = deforming[(scene.node_type[deforming] != NodeType.OBSTACLE).any(axis=1)]
+    if not len(deforming):
+        return []
+    spacing = float(_lengths(scene.rest_position, deforming).mean())
+    half = 0.5 * float(np.ptp(position.reshape(-1, 3), axis=0).max())
+    findings = []
+    if spacing > 0 and half / spacing > 2**_DEEPEST:
+        far = position[0][np.argmax(np.linalg.norm(position[0] - np.median(position[0], axis=0), axis=1))]
+        meaning = f"the scene is {2 * half / spacing:.3g} mesh spacings across: is a part or a frame in another unit?"
+        findings.append(
+            Finding("levels of cells", math.ceil(math.log2(half / spacing)), f"node at {point(far)}", meaning)
+        )
+    if len(np.unique(scene.body)) < 2:
+        return findings
+    most = 0
+    for frame in np.unique(np.linspace(0, len(position) - 1, _FRAMES).astype(int)).tolist():
+        tree = KDTree(position[frame])
+        total = tree.count_neighbors(tree, spacing) - scene.num_nodes
+        inner = 0
+        for body in np.unique(scene.body):
+            own = KDTree(position[frame][scene.body == body])
+            inner += own.count_neighbors(own, spacing) - int((scene.body == body).sum())
+        most = max(most, int(total - inner))
+    if most > _MOST_WORLD_EDGES * scene.num_nodes:
+        meaning = f"of {scene.num_nodes} nodes; bodies lie in each other, or their meshes differ in size by far"
+        findings.append(Finding("world edges in a frame", most, f"within {spacing:.3g}", meaning))
+    return findings
+
+
+def _lengths(points: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    ends = points[edges].astype(np.float64)
+    return np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)

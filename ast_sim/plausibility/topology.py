@@ -1,0 +1,132 @@
+"""What looks wrong in a mesh at rest: elements that stand twice, fold over each other or have no neighbour, nodes of no
+element, points at one place, bodies inside each other.
+
+Legend: N nodes, E elements.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ast_sim.element_topology import LOCAL_FACES
+from ast_sim.plausibility.findings import Finding, places
+from ast_sim.plausibility.overlaps import overlaps
+from ast_sim.scene import Scene, connected_parts
+
+# Points are at one place if they are nearer than this share of the size of the scene.
+_SAME_PLACE = 1e-6
+
+
+def at_rest(scene: Scene) -> list[Finding]:
+    """What looks wrong in a scene at rest."""
+    findings = [*_twice(scene), *_free_nodes(scene), *_single_elements(scene)]
+    if scene.elements.shape[1] != 3:
+        findings += [*_inside_out(scene), *_folds(scene), *_faces_on_faces(scene), *overlaps(scene)]
+    return findings
+
+
+def signed_volumes(points: np.ndarray, elements: np.ndarray) -> np.ndarray:
+    """[E] float64: the volumes between the corners of tetrahedra [E, 4] or [E, 10], negative if they are inside out."""
+    corners = points[elements[:, :4]].astype(np.float64)
+    a, b, c = np.moveaxis(corners[:, 1:] - corners[:, :1], 1, 0)
+    return np.einsum("ei,ei->e", a, np.cross(b, c)) / 6
+
+
+def turned_over(scene: Scene) -> np.ndarray | None:
+    """[E, 4]: the elements with the last two nodes of those that are inside out exchanged; None if there are none."""
+    if scene.elements.shape[1] != 4:
+        return None
+    wrong = signed_volumes(scene.rest_position, scene.elements) < 0
+    if not wrong.any():
+        return None
+    elements = scene.elements.copy()
+    elements[wrong] = elements[wrong][:, [0, 1, 3, 2]]
+    return elements
+
+
+def _twice(scene: Scene) -> list[Finding]:
+    ordered = np.sort(scene.elements, axis=1)
+    order = np.lexsort(ordered.T)
+    same = (ordered[order[1:]] == ordered[order[:-1]]).all(axis=1)
+    rows = np.sort(order[1:][same])
+    meaning = "the material is twice as stiff there, and faces between bodies are lost: write each element once"
+    return [Finding("elements that stand twice", len(rows), _elements(scene, rows), meaning)] if len(rows) else []
+
+
+def _free_nodes(scene: Scene) -> list[Finding]:
+    used = np.zeros(scene.num_nodes, bool)
+    used[scene.elements] = True
+    rows = np.flatnonzero(~used)
+    if not len(rows):
+        return []
+    meaning = "nothing holds them, and a model learns from them all the same: leave them out"
+    return [Finding("nodes of no element", len(rows), places("nodes", rows, scene.rest_position[rows]), meaning)]
+
+
+def _single_elements(scene: Scene) -> list[Finding]:
+    part = connected_parts(scene.elements, scene.num_nodes)
+    count = np.bincount(part[scene.elements[:, 0]])
+    rows = np.flatnonzero(count[part[scene.elements[:, 0]]] == 1)
+    if not len(rows) or scene.num_elements == 1:
+        return []
+    meaning = "an element without a neighbour: are points of one place not joined?"
+    return [Finding("bodies of one element", len(rows), _elements(scene, rows), meaning)]
+
+
+def _inside_out(scene: Scene) -> list[Finding]:
+    rows = np.flatnonzero(signed_volumes(scene.rest_position, scene.elements) <= 0)
+    meaning = "the order of their nodes is another one, or they are flat: they cannot be computed with"
+    return [Finding("elements inside out", len(rows), _elements(scene, rows), meaning)] if len(rows) else []
+
+
+def _folds(scene: Scene) -> list[Finding]:
+    """Faces of more than two elements, and faces whose two elements lie on the same side of them."""
+    faces = scene.elements[:, np.array(LOCAL_FACES)].reshape(-1, 3).astype(np.int64)
+    negative = np.repeat(signed_volumes(scene.rest_position, scene.elements) < 0, 4)
+    # A face runs one way round or the other, seen from its lowest node; two elements beside each other see it both
+    # ways.
+    turned = np.take_along_axis(faces, (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+    one_way = (turned[:, 1] < turned[:, 2]) ^ negative
+    keys = np.sort(faces, axis=1)
+    order = np.lexsort(keys.T)
+    start = np.append(True, (keys[order[1:]] != keys[order[:-1]]).any(axis=1))
+    group = np.cumsum(start) - 1
+    count, sides = np.bincount(group), np.bincount(group, one_way[order])
+    wrong = (count > 2) | ((count == 2) & (sides != 1))
+    rows = np.unique(order[wrong[group]] // 4)
+    if not len(rows):
+        return []
+    meaning = "the mesh folds over itself there, so it cannot be computed with: mesh it anew"
+    return [Finding("elements that lie on each other", len(rows), _elements(scene, rows), meaning)]
+
+
+def _faces_on_faces(scene: Scene) -> list[Finding]:
+    """Faces of the surface that lie on another face, with points of their own."""
+    from scipy.spatial import KDTree
+
+    surface = scene.surface()
+    nodes = np.unique(surface)
+    points = scene.rest_position[nodes].astype(np.float64)
+    distance = _SAME_PLACE * float(np.ptp(points, axis=0).max())
+    pairs = KDTree(points).query_pairs(distance, output_type="ndarray")
+    if not len(pairs):
+        return []
+    place = np.arange(scene.num_nodes)
+    for _ in range(3):  # chains of points at one place are short
+        np.minimum.at(place, nodes[pairs[:, 1]], place[nodes[pairs[:, 0]]])
+        np.minimum.at(place, nodes[pairs[:, 0]], place[nodes[pairs[:, 1]]])
+    keys = np.sort(place[surface], axis=1)
+    order = np.lexsort(keys.T)
+    same = (keys[order[1:]] == keys[order[:-1]]).all(axis=1)
+    rows = surface[np.sort(order[1:][same]), 0]
+    if not len(rows):
+        return []
+    meaning = "bodies touch there at rest, or a mesh is not joined: one body needs common points"
+    return [
+        Finding("faces that lie on another face", len(rows), places("nodes", rows, scene.rest_position[rows]), meaning)
+    ]
+
+
+def _elements(scene: Scene, rows: np.ndarray) -> str:
+    centre = scene.rest_position[scene.elements[rows[:1]]].mean(axis=1)
+    return places("elements", rows, centre)
