@@ -12,6 +12,7 @@ import h5py
 import meshio
 import numpy as np
 
+from ast_sim.element_topology import CELL_KINDS
 from ast_sim.scene import Trajectory
 from ast_sim.support.disk import output_file, replacing, temporary_name
 from ast_sim.support.errors import AstSimError, is_utf8
@@ -19,7 +20,6 @@ from ast_sim.view.fields import Fields, fields
 from ast_sim.view.files import explained
 
 VTK_TYPE = {3: 5, 4: 10, 10: 24}
-CELL_NAME = {3: "triangle", 4: "tetra", 10: "tetra10"}
 
 
 def write(path: str | os.PathLike[str], trajectory: Trajectory, prediction: Trajectory | None = None) -> None:
@@ -69,7 +69,7 @@ def _write_pvd(path: Path, elements: np.ndarray, shown: Fields) -> None:
 def _write_vtu(path: Path, elements: np.ndarray, shown: Fields, frame: int) -> None:
     mesh = meshio.Mesh(
         shown.position[frame],
-        [(CELL_NAME[elements.shape[1]], elements)],
+        [(CELL_KINDS[elements.shape[1]], elements)],
         point_data={**{name: values[frame] for name, values in shown.point.items()}, **shown.static},
         cell_data={name: [values[frame]] for name, values in shown.cell.items()},
     )
