@@ -191,7 +191,7 @@ def _add_convert(convert: _Parser) -> None:
 
 
 def _add_info(info: _Parser) -> None:
-    info.add_argument("path", type=path, metavar="FILE_OR_RUN", help="dataset (.h5) or run folder")
+    info.add_argument("path", type=path, metavar="FILE_OR_RUN", help="dataset (.h5), run folder or run file (.ast)")
     info.add_argument("--json", action="store_true", help="print JSON")
     info.add_argument("--strict", action="store_true", help="exit with an error if something looks wrong")
 
