@@ -20,9 +20,10 @@ from ast_sim.batches.training_pool import Pool
 from ast_sim.batches.training_rollouts import RolloutPool
 from ast_sim.dataset.reader import Dataset
 from ast_sim.models.registry import build_model
+from ast_sim.models.simulator import Simulator
 from ast_sim.runs import checkpoint
 from ast_sim.runs.folder import RunFolder
-from ast_sim.runs.train_config import RunConfig
+from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.support.errors import DatasetError, TrainingError
 from ast_sim.support.progress import Clock, duration
 from ast_sim.support.stop_signals import Interrupted, StopSignals
@@ -36,6 +37,26 @@ from ast_sim.training.saving import Saver
 from ast_sim.training.validation import validate, verdict
 
 JUMP_BATCHES = 64  # the pool of jumps holds so many batches; with 8, steps learn less: the calls of a jump are alike
+
+
+def sampler_of(model: Simulator, dataset: Dataset, options: TrainConfig, part: tuple[int, int] = (0, 1)) -> PairSampler:
+    """The training pairs of a dataset, as the settings want them; `part` is (number, count) of the process."""
+    return model.pairs(
+        dataset,
+        batch_size=options.batch_size,
+        seed=options.seed,
+        noise=options.noise,
+        gamma=options.noise_gamma or 0.0,
+        part=part,
+        mirror=options.mirror,
+        shift=options.shift,
+    )
+
+
+def fit_statistics(model: Simulator, sampler: PairSampler, options: TrainConfig) -> None:
+    """Measure the statistics of inputs and outputs on the first batches of the training."""
+    batches = range(math.ceil(options.statistics_pairs / options.batch_size))
+    model.fit_statistics(sampler.batch(index) for index in batches)
 
 
 class Training:
@@ -58,7 +79,8 @@ class Training:
         self.options, self.processes = config.train, processes or Processes()
         torch.manual_seed(self.options.seed)
         self.model = build_model(config.model)
-        self.sampler = self._sampler((self.processes.rank, self.processes.count))
+        part = self.processes.rank, self.processes.count
+        self.sampler = sampler_of(self.model, dataset, self.options, part)
         self.pool = self._pool(largest_error(scales, config.model))
         self.ahead = Ahead(self.pool or self.sampler)
         self.optimizer = Optimizer(self.model, self.options.optimizer)
@@ -82,19 +104,6 @@ class Training:
             return JumpPool(self.sampler, JUMP_BATCHES * options.batch_size, options.calls, largest)
         return RolloutPool(self.sampler, options.rollout_pool, largest) if options.rollout_pool else None
 
-    def _sampler(self, part: tuple[int, int]) -> PairSampler:
-        options = self.options
-        return self.model.pairs(
-            self.dataset,
-            batch_size=options.batch_size,
-            seed=options.seed,
-            noise=options.noise,
-            gamma=options.noise_gamma,
-            part=part,
-            mirror=options.mirror,
-            shift=options.shift,
-        )
-
     def prepare(self) -> None:
         """Restore the newest checkpoint. If there is none, take the weights of the run that this one starts from, or
         measure the statistics of the data."""
@@ -102,9 +111,8 @@ class Training:
         if found is not None:
             self.step, self.log.sums = found
         elif self.processes.leads and not self.saver.start():
-            batches = range(math.ceil(self.options.statistics_pairs / self.options.batch_size))
-            whole = self.sampler if self.processes.count == 1 else self._sampler((0, 1))
-            self.model.fit_statistics(whole.batch(index) for index in batches)
+            whole = self.sampler if self.processes.count == 1 else sampler_of(self.model, self.dataset, self.options)
+            fit_statistics(self.model, whole, self.options)
             for line in self.model.remarks():
                 print(line, flush=True)
         if self.processes.leads:
@@ -207,7 +215,8 @@ class Training:
 
     def _validate(self) -> None:
         """Roll out the validation scenes; if their error is the lowest so far, mark the checkpoint of this step."""
-        scenes = self.dataset.with_frames("valid", self.model.config.given_frames + 1)[: self.options.validate_scenes]
+        least = self.model.config.data.given_frames + 1
+        scenes = self.dataset.with_frames("valid", least)[: self.options.validate_scenes]
         if not scenes:
             return
         self.ahead.wait()

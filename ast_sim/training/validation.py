@@ -94,7 +94,7 @@ def validate(
 def _by_rollouts(
     model: Simulator, indices: list[int], truths: list[Trajectory], progress: Callable[[int], None] | None
 ) -> list[Validated]:
-    given = model.config.given_frames
+    given = model.config.data.given_frames
     questions = [Question.of(truth, _name(index)) for index, truth in zip(indices, truths, strict=True)]
     validated = []
     for index, truth, answer in zip(indices, truths, rollouts(model, questions, progress), strict=True):
