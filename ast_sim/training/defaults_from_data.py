@@ -26,7 +26,6 @@ _RANGES = {
     "stress_weight": (0, 1e6),
     "noise_gamma": (0, 1),
 }
-CALLS = 6  # (docs/log.md, 2026-11-24)
 ROLLOUT_BATCHES = 16  # an unset pool of rollouts holds the scenes of so many batches
 
 
@@ -69,7 +68,6 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
         "peak_rate": 1e-4 * math.sqrt(scenes / 2),
         "warmup": min(2000, steps // 20),
         "decay": steps if config.steps is not None else steps + epoch,
-        "calls": CALLS if model.jumps else 1,
         "validate_every": validate_every,
         "checkpoint_every": validate_every,
     }
