@@ -27,6 +27,7 @@ class GuardedFile:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
+        self.closed = False
         with self.reading("the file"):
             if not self.path.is_file():
                 raise DatasetError(f"{self.path}: there is no such file")
@@ -36,6 +37,7 @@ class GuardedFile:
         self._verified: set[str] = set()  # names of arrays and trajectories whose hashes have been compared
 
     def close(self) -> None:
+        self.closed = True
         self.root.close()
 
     @contextlib.contextmanager
@@ -43,6 +45,8 @@ class GuardedFile:
         """Within the block, raise every error of h5py as a DatasetError; `what` names what is read. Gives that name,
         with the path of the file before it."""
         name = f"{self.path}: {what}"
+        if self.closed:
+            raise DatasetError(f"{self.path} is closed: open it again with Dataset(path) before {what} is read")
         try:
             yield name
         except AstSimError:

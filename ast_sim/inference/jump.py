@@ -83,7 +83,7 @@ def calls(model: Simulator, questions: Sequence[Question], effort: Effort) -> li
             continue
         count = 1 + effort.corrections + effort.newton_steps
         position = [_stacked(frame.positions, count) for frame in scene.frames]
-        known = [frame for frame in scene.frames if model.config.stress != "none"]
+        known = [frame for frame in scene.frames if model.config.data.stress != "none"]
         stress = [_stacked(frame.stresses, 1 + effort.newton_steps) for frame in known]
         steps = np.array([len(frame.positions) - 1 - effort.corrections for frame in scene.frames])
         last = np.array([np.nan if frame.last_step is None else frame.last_step for frame in scene.frames])
@@ -106,7 +106,7 @@ def _predicted(
     """The scenes with their predicted frames. `whole_way`: the stress after each Newton step, and no second start."""
     effort.check(model.config)
     for question in questions:
-        question.check(model.config.given_frames)
+        question.check(model.config.data.given_frames)
     # Several questions may share a scene.
     graph, carrier, solver = cache(model.graph), cache(Carrier), cache(partial(newton_steps, model.config))
     scenes = [_JumpingScene(model, q, graph(q.scene), carrier(q.scene), solver) for q in questions]
@@ -160,7 +160,7 @@ class _Frame:
         """
         if self.failure is not None:
             return
-        began, location = time.perf_counter(), self.scene.model.config.stress
+        began, location = time.perf_counter(), self.scene.model.config.data.stress
         try:
             solver, position = self.scene.solver(self.scene.question.scene), _array(self.positions[-1])
             stuck = self.scene.settled(self.number - 1)
@@ -190,7 +190,7 @@ class _JumpingScene:
     frames: list[_Frame] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        question, self.given = self.question, self.model.config.given_frames
+        question, self.given = self.question, self.model.config.data.given_frames
         self.prescribed_position = torch.tensor(question.prescribed_position)
         self.stress = question.given_stress(self.model.config, self.given)
         for number in sorted(question.wanted()):

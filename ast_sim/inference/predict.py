@@ -94,8 +94,8 @@ def _require_whole(trajectory: Trajectory, config: ModelConfig, scope: Scope, na
             f" with Dataset(path, {scope.length_unit!r}) or Run.open"
         )
     place = trajectory.stress_at
-    if place not in ("none", config.stress):
-        needs = "predicts none" if config.stress == "none" else f"predicts it at each {config.stress}"
+    if place not in ("none", config.data.stress):
+        needs = "predicts none" if config.data.stress == "none" else f"predicts it at each {config.data.stress}"
         raise ConfigError(f"{name} has a stress at each {place}, but the run {needs}: leave it out, or convert it")
 
 
@@ -106,7 +106,7 @@ def _completed(
     if motion is None or (isinstance(motion, Mapping) and not motion):
         raise ConfigError(f"{name}: say how its prescribed nodes move: {{BODY: (x, y, z)}} (--move BODY=X,Y,Z)")
     if isinstance(motion, Mapping):
-        least = config.given_frames + 1
+        least = config.data.given_frames + 1
         if frames is None and not scope.usual_increment:
             raise ConfigError(f"{name}: nothing is moved in the training scenes: say how many frames (--num-frames)")
         if frames is None:
@@ -131,8 +131,8 @@ def _given_stress(config: ModelConfig, scene: Scene, stress: np.ndarray | None, 
     if stress is None:
         return None
     stress = np.asarray(stress, np.float32)
-    rows = {"node": scene.num_nodes, "element": scene.num_elements}.get(config.stress)
-    wanted = (config.given_frames, rows, 1)
+    rows = {"node": scene.num_nodes, "element": scene.num_elements}.get(config.data.stress)
+    wanted = (config.data.given_frames, rows, 1)
     if stress.shape != wanted:
         needs = "predicts none" if rows is None else f"needs {list(wanted)}"
         raise ConfigError(f"{name}: the stress has the shape {list(stress.shape)}, but the run {needs}")
@@ -141,7 +141,7 @@ def _given_stress(config: ModelConfig, scene: Scene, stress: np.ndarray | None, 
 
 def _require_material(config: ModelConfig, scope: Scope, scene: Scene, name: str) -> None:
     """Raise ConfigError unless the scene has as many material columns as the training scenes."""
-    wanted, found = config.material_width, 0 if scene.material is None else scene.material.shape[1]
+    wanted, found = config.data.material_width, 0 if scene.material is None else scene.material.shape[1]
     if found == wanted:
         return
     if not wanted:
@@ -182,8 +182,8 @@ def _way_into_domain(config: ModelConfig, question: Question) -> np.ndarray | No
     position = question.prescribed_position
     known = np.concatenate([position[0], position[:, question.scene.prescribed].reshape(-1, 3)])
     lowest, highest = known.min(axis=0).astype(np.float64), known.max(axis=0).astype(np.float64)
-    center = np.array(config.domain_center)
-    inside = max((center - lowest).max(), (highest - center).max()) <= config.domain_half_width
+    center = np.array(config.data.domain_center)
+    inside = max((center - lowest).max(), (highest - center).max()) <= config.data.domain_half_width
     if inside or not question.movable:
         return None
     return center - (lowest + highest) / 2

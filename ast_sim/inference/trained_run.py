@@ -84,11 +84,11 @@ class Run:
         model, scope = self.settings.model, self.scope
         return DatasetInfo(
             family=scope.family,
-            integration=model.integration,
-            stress_location=model.stress,
-            domain_center=model.domain_center,
-            domain_half_width=model.domain_half_width,
-            contact_radius=model.contact_radius,
+            integration=model.data.integration,
+            stress_location=model.data.stress,
+            domain_center=model.data.domain_center,
+            domain_half_width=model.data.domain_half_width,
+            contact_radius=model.data.contact_radius,
             time_step=scope.time_step,
             length_unit=scope.length_unit,
             generator={"program": "ast_sim predict"},

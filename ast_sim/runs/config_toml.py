@@ -12,6 +12,7 @@ import hashlib
 import json
 import tomllib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -49,13 +50,14 @@ def write_config(
 
 
 def read_config(run: Path) -> RunConfig:
-    """The settings of a run.
+    """The settings of a run, with the facts of its data.
 
     Raises:
         CheckpointError: the folder holds no run, or `run.json` cannot be read.
         ConfigError: the file was edited or damaged; the text names the first setting that differs.
     """
-    return from_values(RunConfig, _verified(run, CONFIG))
+    settings = from_values(RunConfig, _verified(run, CONFIG))
+    return replace(settings, model=replace(settings.model, data=read_scope(run).data))
 
 
 def read_scope(run: Path) -> Scope:

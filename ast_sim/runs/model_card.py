@@ -53,8 +53,8 @@ def card(name: str, settings: RunConfig, scope: Scope, chosen: Chosen, parameter
         "optimizer": f"{train.optimizer}, peak rate {train.peak_rate:.3g}",
         "seed": train.seed,
         "dataset": settings.data,
-        "inertia": "yes" if model.integration == "dynamic" else "no",
-        "stress": {"none": "not predicted", "node": "at nodes", "element": "in elements"}[model.stress],
+        "inertia": "yes" if model.data.dynamic else "no",
+        "stress": {"none": "not predicted", "node": "at nodes", "element": "in elements"}[model.data.stress],
     }
     return _TEXT.format(
         name=name,

@@ -77,7 +77,8 @@ class RunFile(RunFolder):
 
     @cached_property
     def settings(self) -> RunConfig:
-        return from_values(RunConfig, self._facts["settings"])
+        settings = from_values(RunConfig, self._facts["settings"])
+        return dataclasses.replace(settings, model=dataclasses.replace(settings.model, data=self.scope.data))
 
     @cached_property
     def scope(self) -> Scope:

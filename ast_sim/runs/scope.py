@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ast_sim.models.data_facts import DataFacts
 from ast_sim.prescribed_motion import Motion
 from ast_sim.scene import NodeType, Scene
 
@@ -27,6 +28,7 @@ class Scope:
         increment: largest displacement of a prescribed node in one frame.
         usual_increment: the median of that displacement over all frames in which one moves; 0 if none ever does.
         material_low, material_high: the lowest and the highest number of each material column.
+        data: what the model knows of its data.
     """
 
     family: str
@@ -41,6 +43,7 @@ class Scope:
     usual_increment: float
     material_low: tuple[float, ...]
     material_high: tuple[float, ...]
+    data: DataFacts
 
     def notes(self, scene: Scene, motion: Motion, jumps: bool) -> Iterator[str]:
         """One sentence for each property of a scene and its prescribed motion that lies outside its range. For a model

@@ -40,7 +40,7 @@ class TrainConfig:
     noise: float | None = setting(
         None,
         "standard deviation of the noise on the input state, in units of length; unset: 0.45 of the rms displacement"
-        " (0.15 with a rollout pool), in dynamic scenes 0.1 of the rms increment",
+        " (0.15 with a rollout pool), in dynamic scenes 0.1 of the rms increment; with model.jumps none",
     )
     rollout_pool: int | None = setting(
         0,
@@ -50,7 +50,7 @@ class TrainConfig:
     )
     calls: int = setting(1, "with model.jumps: so many calls correct one another in training; without jumps 1")
     noise_gamma: float | None = setting(
-        None, "share of the noise that the target takes back; unset: 1, in dynamic scenes 0.1"
+        None, "with noise: share of it that the target takes back; unset: 1, in dynamic scenes 0.1"
     )
     mirror: tuple[Literal["x", "y", "z"], ...] = setting(
         (), "axes along which scenes are mirrored at random; name only axes that gravity, fibres or chirality allow"

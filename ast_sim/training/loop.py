@@ -20,9 +20,10 @@ from ast_sim.batches.training_pool import Pool
 from ast_sim.batches.training_rollouts import RolloutPool
 from ast_sim.dataset.reader import Dataset
 from ast_sim.models.registry import build_model
+from ast_sim.models.simulator import Simulator
 from ast_sim.runs import checkpoint
 from ast_sim.runs.folder import RunFolder
-from ast_sim.runs.train_config import RunConfig
+from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.support.errors import DatasetError, TrainingError
 from ast_sim.support.progress import Clock, duration
 from ast_sim.support.stop_signals import Interrupted, StopSignals
@@ -40,6 +41,26 @@ APART = (
     1.25  # validation scenes have so many times the error of training scenes: the training knows its scenes by heart
 )
 JUMP_BATCHES = 64  # the pool of jumps holds so many batches; with 8, steps learn less: the calls of a jump are alike
+
+
+def sampler_of(model: Simulator, dataset: Dataset, options: TrainConfig, part: tuple[int, int] = (0, 1)) -> PairSampler:
+    """The training pairs of a dataset, as the settings want them; `part` is (number, count) of the process."""
+    return model.pairs(
+        dataset,
+        batch_size=options.batch_size,
+        seed=options.seed,
+        noise=options.noise,
+        gamma=options.noise_gamma or 0.0,
+        part=part,
+        mirror=options.mirror,
+        shift=options.shift,
+    )
+
+
+def fit_statistics(model: Simulator, sampler: PairSampler, options: TrainConfig) -> None:
+    """Measure the statistics of inputs and outputs on the first batches of the training."""
+    batches = range(math.ceil(options.statistics_pairs / options.batch_size))
+    model.fit_statistics(sampler.batch(index) for index in batches)
 
 
 class Training:
@@ -62,7 +83,8 @@ class Training:
         self.options, self.processes = config.train, processes or Processes()
         torch.manual_seed(self.options.seed)
         self.model = build_model(config.model)
-        self.sampler = self._sampler((self.processes.rank, self.processes.count))
+        part = self.processes.rank, self.processes.count
+        self.sampler = sampler_of(self.model, dataset, self.options, part)
         self.pool = self._pool(largest_error(scales, config.model))
         self.ahead = Ahead(self.pool or self.sampler)
         self.optimizer = Optimizer(self.model, self.options.optimizer)
@@ -86,19 +108,6 @@ class Training:
             return JumpPool(self.sampler, JUMP_BATCHES * options.batch_size, options.calls, largest)
         return RolloutPool(self.sampler, options.rollout_pool, largest) if options.rollout_pool else None
 
-    def _sampler(self, part: tuple[int, int]) -> PairSampler:
-        options = self.options
-        return self.model.pairs(
-            self.dataset,
-            batch_size=options.batch_size,
-            seed=options.seed,
-            noise=options.noise,
-            gamma=options.noise_gamma,
-            part=part,
-            mirror=options.mirror,
-            shift=options.shift,
-        )
-
     def prepare(self) -> None:
         """Restore the newest checkpoint. If there is none, take the weights of the run that this one starts from, or
         measure the statistics of the data."""
@@ -106,9 +115,8 @@ class Training:
         if found is not None:
             self.step, self.log.sums = found
         elif self.processes.leads and not self.saver.start():
-            batches = range(math.ceil(self.options.statistics_pairs / self.options.batch_size))
-            whole = self.sampler if self.processes.count == 1 else self._sampler((0, 1))
-            self.model.fit_statistics(whole.batch(index) for index in batches)
+            whole = self.sampler if self.processes.count == 1 else sampler_of(self.model, self.dataset, self.options)
+            fit_statistics(self.model, whole, self.options)
             for line in self.model.remarks():
                 print(line, flush=True)
         if self.processes.leads:
@@ -222,7 +230,8 @@ class Training:
 
     def validated(self, split: str) -> list[Validated]:
         """The errors of the first scenes of a split, predicted by all processes together."""
-        scenes = self.dataset.with_frames(split, self.model.config.given_frames + 1)[: self.options.validate_scenes]
+        least = self.model.config.data.given_frames + 1
+        scenes = self.dataset.with_frames(split, least)[: self.options.validate_scenes]
         self.ahead.wait()
         mine = scenes[self.processes.rank :: self.processes.count]
         # Several processes must stop together, so none of them may stop within its own validation.

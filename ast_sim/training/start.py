@@ -25,7 +25,7 @@ from ast_sim.support.stop_signals import StopSignals
 from ast_sim.support.toml_settings import NONE, NOTHING, assigned, change
 from ast_sim.training.data_lengths import DataScales, measure, scope_of
 from ast_sim.training.defaults_from_data import resolve
-from ast_sim.training.loop import Training
+from ast_sim.training.loop import Training, fit_statistics, sampler_of
 from ast_sim.training.processes import Processes
 from ast_sim.training.time_budget import UNKNOWN_STEPS, steps_within
 
@@ -140,13 +140,17 @@ def train(
 def new_model(
     data: Dataset, model: str = "ast", preset: str = "tiny", model_settings: Mapping[str, Any] | None = None
 ) -> Simulator:
-    """An untrained model that fits a dataset, for a training loop of your own (examples/own_loop.py).
+    """An untrained model that fits a dataset, for a training loop of your own (examples/own_loop.py). The statistics of
+    its inputs and outputs are measured as at the start of `train`.
 
     Raises:
         ConfigError: there is no such model, preset or setting, or the data does not fit.
     """
     config = configure(data.path, preset, (), model, changes=_changes(model_settings, {}))
-    return build_model(resolve(config, data, measure(data)).model)
+    resolved = resolve(config, data, measure(data))
+    built = build_model(resolved.model)
+    fit_statistics(built, sampler_of(built, data, resolved.train), resolved.train)
+    return built
 
 
 def _changes(model_settings: Mapping[str, Any] | None, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -207,7 +211,8 @@ def start_training(
                 _require_same(folder, saved, resolved, source)
             elif processes.leads:
                 start = None if source is None else source.start()
-                write_config(folder.path, resolved, scope_of(dataset), dataset.fingerprint(), start)
+                scope = scope_of(dataset, resolved.model.data)
+                write_config(folder.path, resolved, scope, dataset.fingerprint(), start)
             with begin(config=resolved) as training:
                 if profile_steps:
                     training.profile(profile_steps)
@@ -282,7 +287,7 @@ def _told_by_leader(processes: Processes) -> Iterator[None]:
 def _require_fit(source: RunFolder, config: RunConfig, dataset: Dataset, scales: DataScales) -> None:
     """Raise ConfigError if the model of the run `source` cannot learn from the dataset."""
     source.require_fit(dataset)
-    if config.model.planar and not scales.planar:
+    if config.model.data.planar and not scales.planar:
         raise ConfigError(f"{dataset.path} leaves the plane z = 0, in which {source.path} keeps all nodes")
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import statistics
 import time
 
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.progress import duration
-from ast_sim.training.loop import Training
+from ast_sim.training.loop import Training, fit_statistics
 
 WARM_UP, TIMED = 3, 50  # steps that are made without a clock, since they fill caches; then steps whose median counts
 LARGEST_SHARE = 0.1  # of the minutes: so long steps are timed at most
@@ -24,9 +23,7 @@ def steps_within(minutes: float, training: Training) -> int:
     Raises:
         ConfigError: not one step fits.
     """
-    options = training.options
-    batches = range(math.ceil(options.statistics_pairs / options.batch_size))
-    training.model.fit_statistics(training.sampler.batch(index) for index in batches)
+    fit_statistics(training.model, training.sampler, training.options)
     training.model.train()
     step = _seconds_per_step(training, LARGEST_SHARE * 60 * minutes)
     began = time.perf_counter()

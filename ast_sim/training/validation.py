@@ -102,7 +102,7 @@ def _by_rollouts(
     truths: list[Trajectory],
     progress: Callable[[int], None] | None,
 ) -> list[Validated]:
-    given = model.config.given_frames
+    given = model.config.data.given_frames
     questions = [Question.of(truth, name) for name, truth in zip(names, truths, strict=True)]
     validated = []
     for index, truth, answer in zip(indices, truths, rollouts(model, questions, progress), strict=True):

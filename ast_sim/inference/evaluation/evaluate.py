@@ -56,10 +56,10 @@ def evaluate(
     Raises:
         DatasetError: the split has no frame to predict.
     """
-    indices = dataset.with_frames(split, model.config.given_frames + 1)
+    indices = dataset.with_frames(split, model.config.data.given_frames + 1)
     if not indices:
         raise DatasetError(f"{dataset.path}: the split {split} has no frame to predict")
-    constant = _training_stress(dataset) if model.config.stress != "none" else None
+    constant = _training_stress(dataset) if model.config.data.stress != "none" else None
     scenes: list[SceneFigures] = []
     displacement: list[Errors] = []
     stress: list[Errors] = []
@@ -71,7 +71,7 @@ def evaluate(
         displacement.append(displacement_errors(truth, one_step[0], answer))
         errors = scene_errors("displacement", displacement[-1])
         if constant is not None:
-            stress.append(stress_errors(truth, one_step[1], answer, constant, model.config.stress))
+            stress.append(stress_errors(truth, one_step[1], answer, constant, model.config.data.stress))
             errors += scene_errors("stress", stress[-1])
         recorded = truth.attributes.get("solve_seconds")
         solver = seconds.get(name, recorded if isinstance(recorded, list) else None)
@@ -108,7 +108,7 @@ def one_step_predictions(model: Simulator, truth: Trajectory, name: str) -> tupl
     Returns:
         Positions [S - given, N, 3] and stresses [S - given, N or E, 1] or None.
     """
-    given = model.config.given_frames
+    given = model.config.data.given_frames
     graph = model.graph(truth.scene)
     script = torch.tensor(truth.position)
     known = [None] * len(script) if truth.stress is None else torch.tensor(truth.stress)
