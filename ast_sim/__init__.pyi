@@ -6,6 +6,7 @@ from .importers.scene_mesh import read_scene as read_scene
 from .inference.answer import Answer as Answer
 from .inference.effort import Effort as Effort
 from .inference.evaluation.evaluated_run import Evaluation as Evaluation
+from .inference.example_run import example_run as example_run
 from .inference.trained_run import Run as Run
 from .ops.library import keep_memory as keep_memory
 from .ops.library import show_config as show_config
