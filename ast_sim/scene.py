@@ -136,7 +136,8 @@ class Scene:
             return self.elements
         faces = self.elements.astype(np.int64)[:, np.array(LOCAL_FACES)].reshape(-1, 3)  # [4 E, 3], of corners
         one, two, three = np.ascontiguousarray(faces.T)
-        low, high = np.minimum(np.minimum(one, two), three), np.maximum(np.maximum(one, two), three)
+        low = np.minimum(np.minimum(one, two), three)
+        high = np.maximum(np.maximum(one, two), three)
         upper = (one + two + three - low - high) * self.num_nodes + high
         order = np.lexsort((upper, low))  # a face of two elements stands beside its like
         low, upper = low[order], upper[order]
@@ -237,8 +238,8 @@ class Trajectory:
         require_finite(name, "position", "node", self.position)
         self._check_numbering(name)
         if stress_location is not None and (self.stress is None) != (stress_location == "none"):
-            found = "no stress" if self.stress is None else "stress"
-            raise DatasetError(f"{name}: has {found}, but stress_location is {stress_location!r}")
+            what = "no stress" if self.stress is None else "stress"
+            raise DatasetError(f"{name}: has {what}, but stress_location is {stress_location!r}")
         if self.cauchy_stress is not None:
             require_array(name, "cauchy_stress", self.cauchy_stress, np.float32, (self.num_frames, e, 6))
             require_finite(name, "cauchy_stress", "element", self.cauchy_stress)
@@ -289,7 +290,8 @@ def connected_parts(elements: np.ndarray, num_nodes: int) -> np.ndarray:
     for start in range(0, len(elements), _ELEMENTS_AT_ONCE):
         corners = part[elements[start : start + _ELEMENTS_AT_ONCE]]
         # The edges from the first corner to all others connect the element, so the other edges are not needed.
-        first, other = np.repeat(corners[:, 0], corners.shape[1] - 1), corners[:, 1:].ravel()
+        first = np.repeat(corners[:, 0], corners.shape[1] - 1)
+        other = corners[:, 1:].ravel()
         graph = coo_array((np.ones(len(first), np.int8), (first, other)), shape=(num_nodes, num_nodes))
         part = connected_components(graph, directed=False)[1].astype(np.int32)[part]
     return part

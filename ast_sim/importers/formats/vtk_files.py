@@ -88,7 +88,8 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
 
 def _checked(path: Path) -> tuple[list[tuple[int, int]], int]:
     """The points and cells of each piece, if the file says them, and the bytes of memory that VTK may take."""
-    ending, size = path.suffix.lower(), path.stat().st_size
+    ending = path.suffix.lower()
+    size = path.stat().st_size
     if ending in (".vtu", ".vtp", ".vts"):
         declared = declared_in_xml(path)
         return declared.pieces if ending != ".vts" else [], _OWN_BYTES + _COPIES * (needed_bytes(declared) + size)
@@ -223,7 +224,8 @@ def _received(stream: Any, listed: list[dict[str, tuple[str, list[int]]]]) -> li
     for names in listed:
         piece = {}
         for name, (dtype, shape) in names.items():
-            kind, count = np.dtype(dtype), int(np.prod(shape))
+            kind = np.dtype(dtype)
+            count = int(np.prod(shape))
             data = stream.read(kind.itemsize * count)
             piece[name] = np.frombuffer(data, kind, count).reshape(shape)
         pieces.append(piece)
