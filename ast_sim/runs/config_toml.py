@@ -12,7 +12,6 @@ import hashlib
 import json
 import tomllib
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -56,8 +55,7 @@ def read_config(run: Path) -> RunConfig:
         CheckpointError: the folder holds no run, or `run.json` cannot be read.
         ConfigError: the file was edited or damaged; the text names the first setting that differs.
     """
-    settings = from_values(RunConfig, _verified(run, CONFIG))
-    return replace(settings, model=replace(settings.model, data=read_scope(run).data))
+    return from_values(RunConfig, _verified(run, CONFIG)).knowing(read_scope(run).data)
 
 
 def read_scope(run: Path) -> Scope:

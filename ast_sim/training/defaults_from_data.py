@@ -21,6 +21,7 @@ _COUNTS += ("validate_every", "checkpoint_every", "calls")
 _RANGES = {
     **dict.fromkeys(_COUNTS, (1, LARGEST)),
     **dict.fromkeys(("seed", "warmup", "validate_scenes", "noise"), (0, LARGEST)),
+    "minutes": (1e-3, LARGEST),
     "peak_rate": (1e-30, 1.0),
     "clip": (1e-30, math.inf),
     "stress_weight": (0, 1e6),

@@ -20,6 +20,7 @@ from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.mechanics.unfinished import Checkpoint
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
+from ast_sim.simulate.own_assembly.linear_limits import Limit, limits
 from ast_sim.simulate.own_assembly.parameters import Values, completed, drawn, told
 from ast_sim.simulate.own_assembly.rest_check import BadAssembly, check
 from ast_sim.simulate.own_assembly.standing import PlacedPart, Reference, case, placed, reference
@@ -99,20 +100,34 @@ def scene_of(
     return Drawn(made, partial(_remeshed, spec, values, frames, shared, factor, made.scene.num_nodes))
 
 
+def resized(spec: AssemblySpec, values: Values, nodes: int | None, frames: int, relative: float) -> SolidCase:
+    """The scene with these values whose elements are `relative` times as long; errors as `scene_of`.
+
+    Elements of mesh files keep their size, unless `relative` is a half.
+    """
+    factor, _ = _sized(spec, values, nodes)
+    parts = placed(spec, values, factor * relative, halved=relative == 0.5)
+    return _checked(spec, values, frames, parts, reference(spec))
+
+
 def check_spec(spec: AssemblySpec, nodes: int | None, frames: int, keep: tuple[int, ...] | None = None) -> None:
     """Make, but do not solve, the scene in the middle of all ranges and those at the ends of each range.
 
-    A warning tells each of their notes.
+    Warnings tell each of their notes, and for each part the worst that linear elements get wrong in it.
 
     Raises:
         SimulationError, ConfigError: as `scene_of`.
     """
     shared = reference(spec)
     notes = {}
+    worst: dict[tuple[str, str], Limit] = {}
     for values in ends_of_ranges(spec):
         case = scene_of(spec, values, nodes, frames, shared).case
         notes |= dict.fromkeys((case if keep is None else case.keeping(keep)).notes())
-    for note in notes:
+        for limit in limits(spec, case):
+            key = limit.part, limit.kind
+            worst[key] = max(limit, worst.get(key, limit), key=lambda one: one.badness)
+    for note in [*notes, *(limit.text for limit in worst.values())]:
         warnings.warn(note, stacklevel=2)
 
 
