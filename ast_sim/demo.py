@@ -103,7 +103,8 @@ def headlines(figures: Figures) -> list[str]:
     ):
         model, reference = (figures.error(quantity, name) for name in ("model", trivial))
         if model and reference and model.rmse_sequence is not None and reference.rmse_sequence:
-            error, unit = model.rmse_sequence, figures.unit(quantity)
+            error = model.rmse_sequence
+            unit = figures.unit(quantity)
             share = 100 * error / reference.rmse_sequence
             lines.append(f"{quantity} error over whole rollouts: {error:.3g} {unit}, {share:.0f} % of {words}")
     if figures.failures:

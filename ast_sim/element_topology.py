@@ -71,7 +71,8 @@ def surface_triangles(position: np.ndarray, elements: np.ndarray) -> np.ndarray:
         return elements
     faces = elements.astype(np.int64)[:, np.array(LOCAL_FACES)].reshape(-1, 3)  # [4 E, 3], of corners
     one, two, three = np.ascontiguousarray(faces.T)
-    low, high = np.minimum(np.minimum(one, two), three), np.maximum(np.maximum(one, two), three)
+    low = np.minimum(np.minimum(one, two), three)
+    high = np.maximum(np.maximum(one, two), three)
     upper = (one + two + three - low - high) * len(position) + high
     order = np.lexsort((upper, low))  # a face of two elements stands beside its like
     low, upper = low[order], upper[order]

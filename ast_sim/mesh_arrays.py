@@ -103,7 +103,8 @@ def arrays_of_mesh(mesh: meshio.Mesh) -> tuple[Any, np.ndarray, dict[str, Any]]:
     blocks = [index for index, block in enumerate(mesh.cells) if len(block.data)]
     kinds = sorted({mesh.cells[index].type for index in blocks})
     if len(kinds) != 1 or kinds[0] not in CELL_KINDS.values():
-        known, told = ", ".join(CELL_KINDS.values()), ", ".join(kinds) or "none"
+        known = ", ".join(CELL_KINDS.values())
+        told = ", ".join(kinds) or "none"
         raise DatasetError(
             f"the cells of a scene are of one kind ({known}), but this mesh has: {told}. Use ast_sim.read_scene for it"
         )

@@ -66,7 +66,8 @@ def connected_parts(elements: np.ndarray, num_nodes: int) -> np.ndarray:
     for start in range(0, len(elements), _ELEMENTS_AT_ONCE):
         corners = part[elements[start : start + _ELEMENTS_AT_ONCE]]
         # The edges from the first corner to all others connect the element, so the other edges are not needed.
-        first, other = np.repeat(corners[:, 0], corners.shape[1] - 1), corners[:, 1:].ravel()
+        first = np.repeat(corners[:, 0], corners.shape[1] - 1)
+        other = corners[:, 1:].ravel()
         graph = coo_array((np.ones(len(first), np.int8), (first, other)), shape=(num_nodes, num_nodes))
         part = connected_components(graph, directed=False)[1].astype(np.int32)[part]
     return part

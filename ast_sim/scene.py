@@ -281,8 +281,8 @@ class Trajectory:
         require_finite(name, "position", "node", self.position)
         self._check_numbering(name)
         if stress_location is not None and (self.stress is None) != (stress_location == "none"):
-            found = "no stress" if self.stress is None else "stress"
-            raise DatasetError(f"{name}: has {found}, but stress_location is {stress_location!r}")
+            what = "no stress" if self.stress is None else "stress"
+            raise DatasetError(f"{name}: has {what}, but stress_location is {stress_location!r}")
         if self.cauchy_stress is not None:
             require_array(name, "cauchy_stress", self.cauchy_stress, np.float32, (self.num_frames, e, 6))
             require_finite(name, "cauchy_stress", "element", self.cauchy_stress)

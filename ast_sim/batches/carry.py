@@ -93,7 +93,8 @@ def harmonic_extension(scene: Scene, held: np.ndarray, free: np.ndarray) -> Call
         return lambda way: np.zeros((len(free), 3))
     reached = free[rows]
     # Symmetric and positive definite: no pivoting, and an ordering for such matrices.
-    inner, symmetric = laplacian[reached][:, reached].tocsc(), {"SymmetricMode": True}
+    inner = laplacian[reached][:, reached].tocsc()
+    symmetric = {"SymmetricMode": True}
     solve = splu(inner, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
     pull = -laplacian[reached][:, held]
 

@@ -58,7 +58,8 @@ class Dataset:
     """
 
     def __init__(self, path: str | os.PathLike[str], length_unit: str | None = None) -> None:
-        self.path, self._scale = Path(path), 1.0
+        self.path = Path(path)
+        self._scale = 1.0
         self._file = GuardedFile(self.path)
         try:
             self.info = self._in_unit(self._read_info(), length_unit)
@@ -197,10 +198,10 @@ class Dataset:
 
     def attributes(self, split: str, index: int) -> dict[str, AttributeValue]:
         """The status and the solver's records of a trajectory."""
-        found = self._file.attributes(self._group(split, index))
-        if "origin" in found:
-            found["origin"] = (self._scale * np.asarray(found["origin"])).tolist()
-        return {key: value for key, value in found.items() if key != HASH and key not in NUMBERING}
+        values = self._file.attributes(self._group(split, index))
+        if "origin" in values:
+            values["origin"] = (self._scale * np.asarray(values["origin"])).tolist()
+        return {key: value for key, value in values.items() if key != HASH and key not in NUMBERING}
 
     def _first_kind(self) -> tuple[int, int]:
         split = next((split for split in SPLITS if self.splits[split]), None)
@@ -224,8 +225,8 @@ class Dataset:
         for key in (item.name for item in fields(DatasetInfo)):
             wanted = types.get(key, str)
             if not isinstance(values.get(key), wanted):
-                found = repr(values[key])[:60] if key in values else "missing"
-                raise DatasetError(f"{self.path}: the attribute {key} is {found}; must be a {wanted.__name__}")
+                shown = repr(values[key])[:60] if key in values else "missing"
+                raise DatasetError(f"{self.path}: the attribute {key} is {shown}; must be a {wanted.__name__}")
             known[key] = values[key]
         known["domain_center"] = tuple(known["domain_center"])
         with self._file.reading("the attribute generator"):
@@ -278,16 +279,16 @@ class Dataset:
     def _read_frames(self, split: str, index: int, start: int, stop: int) -> tuple[np.ndarray, np.ndarray | None]:
         rows = {"position": "node", "stress": self.info.stress_location}
         name, arrays = self._name(split, index), self._framed(split, index)
-        found = {key: self._finite(name, rows[key], array, start, stop) for key, array in arrays.items()}
-        return self._scaled(found["position"]), found.get("stress")
+        frames = {key: self._finite(name, rows[key], array, start, stop) for key, array in arrays.items()}
+        return self._scaled(frames["position"]), frames.get("stress")
 
     def _scaled(self, position: np.ndarray) -> np.ndarray:
         """Positions in the unit of `info`."""
         if self._scale == 1:
             return position
-        found = (self._scale * position.astype(np.float64)).astype(np.float32)
-        found.flags.writeable = False
-        return found
+        scaled = (self._scale * position.astype(np.float64)).astype(np.float32)
+        scaled.flags.writeable = False
+        return scaled
 
     def _in_unit(self, info: DatasetInfo, unit: str | None) -> DatasetInfo:
         """The facts in another unit of length."""
@@ -306,9 +307,9 @@ class Dataset:
 
     def _finite(self, name: str, row: str, array: h5py.Dataset, start: int, stop: int) -> np.ndarray:
         """Frames start to stop - 1 of an array, all finite; a `row` of it is a "node" or an "element"."""
-        found = self._file.read(array, start, stop)
-        require_finite(name, str(array.name).rpartition("/")[2], row, found, start)
-        return found
+        values = self._file.read(array, start, stop)
+        require_finite(name, str(array.name).rpartition("/")[2], row, values, start)
+        return values
 
     def _keeps(self, split: str) -> bool:
         if split not in self._kept:

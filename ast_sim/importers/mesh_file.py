@@ -119,7 +119,8 @@ class MeshFile:
 
     def whole_numbers(self, place: str, name: str, dtype: type) -> np.ndarray:
         """A field with one whole number in each row, as [rows] of an integer type; see `field`."""
-        value, limits = self.numbers(place, name), np.iinfo(dtype)
+        value = self.numbers(place, name)
+        limits = np.iinfo(dtype)
         wrong = ~((value == np.round(value)) & (value >= limits.min) & (value <= limits.max))
         if place == "point":
             wrong &= np.isin(np.arange(len(value)), self.elements)

@@ -198,7 +198,8 @@ class Answer:
             return None
         from ast_sim.mechanics.reaction import Reaction
 
-        scale, force = LENGTH_UNITS[self.info.length_unit] ** 2, Reaction(self.scene, self.driven)
+        scale = LENGTH_UNITS[self.info.length_unit] ** 2
+        force = Reaction(self.scene, self.driven)
         return scale * np.array([force.of(position) for position in self.position]).reshape(-1, 3)
 
     def figures(self, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> list[dict[str, float]]:

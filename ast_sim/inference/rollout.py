@@ -40,8 +40,8 @@ def rollouts(
             # Only scenes of the same domain are predicted together: none may change another's domain.
             for domain in dict.fromkeys(scene.domain for scene in running):
                 group = [scene for scene in running if scene.domain == domain]
-                found = predict_batch(model, [scene.start(frame) for scene in group])
-                for scene, (positions, stress, seconds) in zip(group, found, strict=True):
+                predicted = predict_batch(model, [scene.start(frame) for scene in group])
+                for scene, (positions, stress, seconds) in zip(group, predicted, strict=True):
                     scene.advance(frame, positions[-1], stress, seconds)
             if progress is not None and running:
                 progress(frame)

@@ -56,7 +56,8 @@ class Run:
         self.path = Path(path)
         self.folder = run_file.open_run(self.path)
         self.settings, self.scope = self.folder.settings, self.folder.scope
-        self.model, self.step = self.folder.load_model(), self.folder.chosen.step
+        self.model = self.folder.load_model()
+        self.step = self.folder.chosen.step
         answers = self.folder.chosen.answers
         unset = {"corrections": (self.settings.train.calls or 1) - 1}
         self.effort = Effort(**answers.get("effort", unset))

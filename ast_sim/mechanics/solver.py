@@ -199,7 +199,8 @@ class Newton:
         return self._gradient(self.state)[0]
 
     def _evaluate(self, position: np.ndarray) -> State:
-        potential, contact = self.potential.evaluate(position), self.contact.at(position)
+        potential = self.potential.evaluate(position)
+        contact = self.contact.at(position)
         return State(position, potential, contact, potential.energy + contact.energy())
 
     def _count(self) -> None:

@@ -176,8 +176,8 @@ def messages(edge_mlp: DeepMLP, edges: EdgeSet, features: Tensor, nodes: Tensor)
         weights = (rest.weight, rest.bias, norm.weight, norm.bias)
         return message_edges(edges, of_senders, of_receivers, linear(features, of_edge), None, *weights)
     of_nodes = of_senders.index_select(0, edges.senders) + of_receivers.index_select(0, edges.receivers)
-    found = rest(torch.relu(linear(features, of_edge, residual=of_nodes)), norm=norm)
-    return segment_sum(found, *edges.by_receiver), found
+    sent = rest(torch.relu(linear(features, of_edge, residual=of_nodes)), norm=norm)
+    return segment_sum(sent, *edges.by_receiver), sent
 
 
 class Decoder(nn.Module):

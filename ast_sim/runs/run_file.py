@@ -77,8 +77,7 @@ class RunFile(RunFolder):
 
     @cached_property
     def settings(self) -> RunConfig:
-        settings = from_values(RunConfig, self._facts["settings"])
-        return dataclasses.replace(settings, model=dataclasses.replace(settings.model, data=self.scope.data))
+        return from_values(RunConfig, self._facts["settings"]).knowing(self.scope.data)
 
     @cached_property
     def scope(self) -> Scope:

@@ -60,8 +60,8 @@ class Scope:
             *self._materials(scene),
         ):
             if not low - LEEWAY * abs(low) <= value <= high + LEEWAY * abs(high):
-                found, *limits = (f"{number:.4g}{unit}" for number in (value, *dict.fromkeys((low, high))))
-                yield f"{text.format(found)}; in training {' to '.join(limits)}"
+                shown, *limits = (f"{number:.4g}{unit}" for number in (value, *dict.fromkeys((low, high))))
+                yield f"{text.format(shown)}; in training {' to '.join(limits)}"
 
     def _materials(self, scene: Scene) -> Iterator[tuple[tuple[float, float], float, str, str]]:
         """The smallest and the largest number in each material column of the deforming bodies."""

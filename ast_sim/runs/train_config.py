@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.model_config import ModelConfig, setting
 from ast_sim.models.registry import find_model
 from ast_sim.support.errors import ConfigError, is_utf8
@@ -85,6 +86,10 @@ class RunConfig:
     model: ModelConfig = field(metadata={"class_of": _model_class})
     train: TrainConfig
     data: str
+
+    def knowing(self, facts: DataFacts) -> RunConfig:
+        """The settings with the facts of the data, which no file of settings holds."""
+        return replace(self, model=replace(self.model, data=facts))
 
     def __post_init__(self) -> None:
         if not is_utf8(self.data):

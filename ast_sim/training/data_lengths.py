@@ -92,13 +92,14 @@ def scope_of(dataset: Dataset, data: DataFacts) -> Scope:
     """The ranges of the training split, measured on the same trajectories, and what the model knows of its data."""
     rows, materials, increments = [], [], []
     for _, trajectory in dataset.spread("train", MEASURED):
-        scene, motion = trajectory.scene, Motion(trajectory.position)
+        scene = trajectory.scene
+        motion = Motion(trajectory.position)
         moves = motion.increments(scene)
         increments += [length for length in moves if length > 0]
         rows.append((scene.num_nodes, size_of(scene), spacing_of(scene), motion.travel(scene), max(moves)))
         if scene.material is not None:
             materials.append(scene.material[scene.deforming_elements])
-    found = dict(zip(("nodes", "size", "spacing", "travel", "increment"), zip(*rows, strict=True), strict=True))
+    by_name = dict(zip(("nodes", "size", "spacing", "travel", "increment"), zip(*rows, strict=True), strict=True))
     material = np.concatenate(materials) if materials else np.zeros((1, 0))
     info = dataset.info
     return Scope(
@@ -106,7 +107,7 @@ def scope_of(dataset: Dataset, data: DataFacts) -> Scope:
         length_unit=info.length_unit,
         time_step=float(info.time_step),
         corners=dataset.element_size,
-        **{key: (float(min(values)), float(max(values))) for key, values in found.items()},
+        **{key: (float(min(values)), float(max(values))) for key, values in by_name.items()},
         usual_increment=float(np.median(increments or [0.0])),
         material_low=tuple(material.min(axis=0).tolist()),
         material_high=tuple(material.max(axis=0).tolist()),

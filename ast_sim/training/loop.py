@@ -111,9 +111,9 @@ class Training:
     def prepare(self) -> None:
         """Restore the newest checkpoint. If there is none, take the weights of the run that this one starts from, or
         measure the statistics of the data."""
-        found = self.saver.restore()
-        if found is not None:
-            self.step, self.log.sums = found
+        restored = self.saver.restore()
+        if restored is not None:
+            self.step, self.log.sums = restored
         elif self.processes.leads and not self.saver.start():
             whole = self.sampler if self.processes.count == 1 else sampler_of(self.model, self.dataset, self.options)
             fit_statistics(self.model, whole, self.options)
@@ -211,8 +211,8 @@ class Training:
         if self.pool is not None:
             weights = self.pool.weights(number, self.processes.gathered(self.pool.errors(number, target)))
         losses = self.model.loss(prediction, batch, target, self.options.stress_weight, self.processes.share, weights)
-        found = self.processes.add(torch.stack([value.detach() for value in losses.values()]))
-        whole = dict(zip(losses, found.tolist(), strict=True))
+        added = self.processes.add(torch.stack([value.detach() for value in losses.values()]))
+        whole = dict(zip(losses, added.tolist(), strict=True))
         if not math.isfinite(whole["loss"]):
             raise self._not_finite("loss", whole["loss"], batch.names)
         (losses["loss"] / self.options.accumulate).backward()
@@ -221,7 +221,8 @@ class Training:
         return whole
 
     def _not_finite(self, what: str, value: float, names: list[str]) -> TrainingError:
-        names, last = self.processes.gathered(names), checkpoint.latest(self.run.path)
+        names = self.processes.gathered(names)
+        last = checkpoint.latest(self.run.path)
         kept = f"the last good checkpoint is {last}" if last else "there is no checkpoint yet"
         return TrainingError(
             f"the {what} of step {self.step + 1} is {value}, so training stopped before this step: check the samples"

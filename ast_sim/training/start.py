@@ -55,20 +55,20 @@ def configure(
         with _naming(file):
             named = given.pop("model.name", "ast")
             chosen = find_preset(model or str(named), preset or "tiny")
-        found = RunConfig(chosen.model, TrainConfig(**chosen.train), str(data))
+        settings = RunConfig(chosen.model, TrainConfig(**chosen.train), str(data))
     elif model or preset:
         raise ConfigError("a run that starts from another one has its model and settings: leave model and preset out")
     else:
         source = RunFolder(Path(from_run)).settings
-        found = dataclasses.replace(source, train=dataclasses.replace(source.train, minutes=None), data=str(data))
-    before = found
+        settings = dataclasses.replace(source, train=dataclasses.replace(source.train, minutes=None), data=str(data))
+    before = settings
     with _naming(file):
-        found = _changed(found, given, reschedule=from_run is not None)
-    later = {**assigned(found, assignments), **changes}
-    found = _changed(found, later, reschedule=from_run is not None or "train.steps" in given)
-    for key, old, new in _differences(before, found, "model") if from_run is not None else ():
+        settings = _changed(settings, given, reschedule=from_run is not None)
+    later = {**assigned(settings, assignments), **changes}
+    settings = _changed(settings, later, reschedule=from_run is not None or "train.steps" in given)
+    for key, old, new in _differences(before, settings, "model") if from_run is not None else ():
         raise ConfigError(f"{key} is {new!r}, but {from_run} has {old!r}: a run that starts from it keeps its model")
-    return found
+    return settings
 
 
 def _changed(config: RunConfig, values: Mapping[str, Any], reschedule: bool) -> RunConfig:

@@ -60,7 +60,8 @@ def to_pyvista(trajectory: Trajectory) -> pyvista.UnstructuredGrid:
         MissingExtra: pyvista is not installed.
     """
     (pyvista,) = require("pyvista", "pyvista")
-    elements, shown = trajectory.scene.elements, fields(trajectory)
+    elements = trajectory.scene.elements
+    shown = fields(trajectory)
     grid = pyvista.UnstructuredGrid({VTK_TYPE[elements.shape[1]]: elements.astype(np.int64)}, shown.position[0])
     for name, values in {**{name: values[0] for name, values in shown.point.items()}, **shown.static}.items():
         grid.point_data[name] = values
@@ -143,7 +144,8 @@ def _write_mesh(root: h5py.Group, elements: np.ndarray, position: np.ndarray) ->
 def _write_steps(root: h5py.Group, shown: Fields) -> None:
     """Write the times, and where the points and fields of each step start in the arrays of all steps in a row."""
     frames, nodes = shown.position.shape[:2]
-    start, zero = np.arange(frames, dtype=np.int64), np.zeros(frames, dtype=np.int64)
+    start = np.arange(frames, dtype=np.int64)
+    zero = np.zeros(frames, dtype=np.int64)
     steps = root.create_group("Steps")
     steps.attrs["NSteps"] = np.int64(frames)
     steps["Values"] = shown.times

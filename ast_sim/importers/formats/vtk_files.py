@@ -105,7 +105,8 @@ def _require_counts(mesh: SourceMesh, declared: list[int] | None) -> None:
     """Check that the points and cells are as many as the file says; a note says if VTK leaves out points of no cell."""
     if declared is None:
         return
-    points, cells = len(mesh.points), sum(len(block.nodes) for block in mesh.blocks)
+    points = len(mesh.points)
+    cells = sum(len(block.nodes) for block in mesh.blocks)
     if mesh.path.suffix.lower() in EXODUS and mesh.same_point is not None:
         points = len(np.unique(mesh.same_point))  # each block has its own copies of the points that it uses
         if points < declared[0]:
@@ -120,7 +121,8 @@ def _require_counts(mesh: SourceMesh, declared: list[int] | None) -> None:
 
 def _checked(path: Path) -> tuple[list[tuple[int, int]], int]:
     """The points and cells of each piece, if the file says them, and the bytes of memory that VTK may take."""
-    ending, size = path.suffix.lower(), path.stat().st_size
+    ending = path.suffix.lower()
+    size = path.stat().st_size
     if ending in (".vtu", ".vtp", ".vts"):
         declared = declared_in_xml(path)
         return declared.pieces if ending != ".vts" else [], _OWN_BYTES + _COPIES * (needed_bytes(declared) + size)
@@ -255,7 +257,8 @@ def _received(stream: Any, listed: list[dict[str, tuple[str, list[int]]]]) -> li
     for names in listed:
         piece = {}
         for name, (dtype, shape) in names.items():
-            kind, count = np.dtype(dtype), int(np.prod(shape))
+            kind = np.dtype(dtype)
+            count = int(np.prod(shape))
             data = stream.read(kind.itemsize * count)
             piece[name] = np.frombuffer(data, kind, count).reshape(shape)
         pieces.append(piece)

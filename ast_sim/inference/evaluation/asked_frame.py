@@ -154,7 +154,8 @@ def lines(asked: AskedFigures) -> list[str]:
 
 
 def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: Effort) -> AskedScene:
-    name, truth = f"{split}/{index:06d}", dataset.load(split, index)
+    name = f"{split}/{index:06d}"
+    truth = dataset.load(split, index)
     frame = max(deepest_frame(truth), model.config.data.given_frames)
     question = Question.of(truth, name, [frame])
     (answer,) = answers(model, [question], effort)

@@ -48,7 +48,8 @@ class Cells:
 
     def to_mesh(self) -> EdgeSet:
         """C2M: an edge from every cell to each of its nodes."""
-        o, nodes = self.finest, torch.arange(len(self.finest.node_cell) + 1)
+        o = self.finest
+        nodes = torch.arange(len(self.finest.node_cell) + 1)
         return EdgeSet(o.node_cell, nodes[:-1], nodes, len(o.keys))
 
 

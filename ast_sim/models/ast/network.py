@@ -97,7 +97,8 @@ class AST(Simulator):
     def forward(self, batch: Batch) -> Prediction:
         """Normalised outputs for the frame after `batch`."""
         nodes, on_edges, elements = self.inputs_of(batch)
-        edges, encoded = batch.graph.edges, self.node_encoder(nodes)
+        edges = batch.graph.edges
+        encoded = self.node_encoder(nodes)
         if elements is not None:
             elements = self.element_encoder(elements)
             mesh = self.e2m(edges, elements, encoded, on_edges)

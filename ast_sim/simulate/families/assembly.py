@@ -71,12 +71,12 @@ def draw_scene(spec: AssemblySpec, sample: tuple[int, int, int], nodes: int | No
     for attempt in range(DRAWS):
         values = drawn(spec.parameters, *sample, attempt)
         try:
-            found = scene_of(spec, values, nodes, frames, shared)
+            scene = scene_of(spec, values, nodes, frames, shared)
         except (BadMesh, MeshingFailed, BadAssembly) as error:
             first = first or error
             continue
-        case = replace(found.case, attributes={**found.case.attributes, "redrawn": attempt})
-        return replace(found, case=case)
+        case = replace(scene.case, attributes={**scene.case.attributes, "redrawn": attempt})
+        return replace(scene, case=case)
     raise SimulationError(f"none of {DRAWS} draws gave a scene; the first: {first}") from first
 
 
@@ -118,7 +118,8 @@ def check_spec(spec: AssemblySpec, nodes: int | None, frames: int, keep: tuple[i
     Raises:
         SimulationError, ConfigError: as `scene_of`.
     """
-    shared, notes = reference(spec), {}
+    shared = reference(spec)
+    notes = {}
     worst: dict[tuple[str, str], Limit] = {}
     for values in ends_of_ranges(spec):
         case = scene_of(spec, values, nodes, frames, shared).case
@@ -155,7 +156,8 @@ def in_newton(trajectory: Trajectory, unit: str) -> Trajectory:
 
 def _sized(spec: AssemblySpec, values: Values, nodes: int | None) -> tuple[float, list[PlacedPart]]:
     """The factor of all element sizes with which the scene has about that many nodes, and the parts."""
-    factor, parts = 1.0, placed(spec, values)
+    factor = 1.0
+    parts = placed(spec, values)
     best, power = (factor, parts), USUAL_POWER
     for _ in range(MESHES if nodes else 0):
         count = sum(len(part.position) for part in parts)

@@ -87,9 +87,11 @@ def mesh_error(spec: AssemblySpec, case: SolidCase, solved: Trajectory, values: 
         AstSimError: there is no force, or neither mesh can be made and solved; the text says why.
     """
     quantity, power = ("torque", 3) if "torque" in solved.attributes else ("force", 2)
-    curve, unit = _curve(solved, quantity), LENGTH_UNITS[spec.unit]
+    curve = _curve(solved, quantity)
+    unit = LENGTH_UNITS[spec.unit]
     frame = int(np.argmax(curve))
-    value, extent = float(curve[frame]), unit * float(np.linalg.norm(np.ptp(case.scene.rest_position, axis=0)))
+    value = float(curve[frame])
+    extent = unit * float(np.linalg.norm(np.ptp(case.scene.rest_position, axis=0)))
     young = float(np.min(np.broadcast_to(case.material.young, case.scene.num_elements)[case.deforming]))
     if value <= NO_FORCE * young * extent**power:
         raise SimulationError(f"the first scene has no {quantity}")
@@ -132,7 +134,8 @@ def _at_half_the_size(coarse: SolidCase, solved: Trajectory, fine: SolidCase, fr
 
 def _from_coarse(coarse: SolidCase, solved: Trajectory, fine: SolidCase, frame: int, end: float) -> np.ndarray:
     """As `_at_half_the_size`, from the frame of the coarse mesh; `end`: processor time at which it is given up."""
-    friction, stuck = max(coarse.contact.frictions(coarse.scene)), None
+    friction = max(coarse.contact.frictions(coarse.scene))
+    stuck = None
     steps = NewtonSteps(fine.scene, fine.material, CLEARANCE * coarse.contact.dhat, friction)
     if friction:
         stuck = _near(steps, _start(coarse, solved, fine, frame - 1), None)
@@ -159,7 +162,8 @@ def _force(case: SolidCase, position: np.ndarray, quantity: str) -> float:
 def _near(steps: NewtonSteps, position: np.ndarray, stuck: np.ndarray | None) -> np.ndarray:
     """The positions [N,3] after Newton steps until one is small."""
     for _ in range(MOST_STEPS):
-        before, position = position, steps.step(position, stuck=stuck)
+        before = position
+        position = steps.step(position, stuck=stuck)
         if steps.size(before, position) <= STILL:
             return position
     raise SimulationError(f"{MOST_STEPS} Newton steps with linearised contact do not converge")
@@ -167,9 +171,11 @@ def _near(steps: NewtonSteps, position: np.ndarray, stuck: np.ndarray | None) ->
 
 def _start(coarse: SolidCase, solved: Trajectory, fine: SolidCase, frame: int) -> np.ndarray:
     """[N,3] where the nodes of the finer mesh are in a frame if they move as the bodies of the coarse mesh do there."""
-    scene, rest = coarse.scene, coarse.scene.rest_position.astype(np.float64)
+    scene = coarse.scene
+    rest = coarse.scene.rest_position.astype(np.float64)
     displacement = solved.position[frame].astype(np.float64) - rest
-    body_of_element, points = scene.body[scene.elements[:, 0]], fine.scene.rest_position.astype(np.float64)
+    body_of_element = scene.body[scene.elements[:, 0]]
+    points = fine.scene.rest_position.astype(np.float64)
     position = fine.targets[frame].astype(np.float64)
     for body in np.unique(fine.scene.body[~fine.scene.prescribed]):
         free = (fine.scene.body == body) & ~fine.scene.prescribed

@@ -63,7 +63,8 @@ def limits(spec: AssemblySpec, case: SolidCase) -> Iterator[Limit]:
 
 def _thin(spec: AssemblySpec, case: SolidCase, number: int) -> Iterator[Limit]:
     """The wall of a part that has too few elements across, if it is long enough to bend."""
-    rest, faces = case.scene.rest_position.astype(np.float64), surface_of(case, number)
+    rest = case.scene.rest_position.astype(np.float64)
+    faces = surface_of(case, number)
     middle, thickness, other = _across(rest, faces)
     held = case.scene.prescribed[faces].all(axis=1)
     wall = np.flatnonzero((other >= 0) & ~held & ~held[other])
@@ -90,8 +91,10 @@ def _across(rest: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray
     corners = rest[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
-    middle, inward = corners.mean(axis=1), INWARD * np.linalg.norm(np.ptp(corners, axis=(0, 1)))
-    tree, rows = igl.AABB(), faces.astype(np.int64)
+    middle = corners.mean(axis=1)
+    inward = INWARD * np.linalg.norm(np.ptp(corners, axis=(0, 1)))
+    tree = igl.AABB()
+    rows = faces.astype(np.int64)
     tree.init(rest, rows)
     hit, distance, _ = tree.intersect_ray_first(rest, rows, middle - inward * normal, -normal)
     parallel = np.einsum("fi,fi->f", normal, normal[hit]) <= OPPOSITE

@@ -112,14 +112,15 @@ def part_meshes(spec: AssemblySpec, values: Values, factor: float = 1.0, halved:
             check_surface(surface.position, surface.triangles, requests[place]["name"])
     sent = [{key: v for key, v in requests[place].items() if key not in ("scale", "stamp")} for place in cad]
     meshed = dict(zip(cad, mesh_own_scale(sent) if sent else [], strict=True))
-    found = {key: _kept[key] for key in keys if key in _kept}
+    kept = {key: _kept[key] for key in keys if key in _kept}
     for key, place in new.items():
-        arrays, part = meshed.get(place), spec.parts[place]
-        found[key] = _from_file(part, requests[place]) if arrays is None else _meshed(part, requests[place], arrays)
-    _kept.update(found)
+        arrays = meshed.get(place)
+        part = spec.parts[place]
+        kept[key] = _from_file(part, requests[place]) if arrays is None else _meshed(part, requests[place], arrays)
+    _kept.update(kept)
     while len(_kept) > MESHES_KEPT:
         del _kept[next(iter(_kept))]
-    return [found[key] for key in keys]
+    return [kept[key] for key in keys]
 
 
 def _request(spec: AssemblySpec, part: PartSpec, values: Values, factor: float, halved: bool) -> dict[str, Any]:
@@ -189,7 +190,8 @@ def _from_file(part: PartSpec, request: dict[str, Any]) -> PartMesh:
         return _surface_mesh(part, request, _stl(request))
     mesh = read_mesh(Path(request["stamp"][0]))
     used, elements = np.unique(mesh.elements, return_inverse=True)
-    elements, position = elements.reshape(-1, mesh.elements.shape[1]), request["scale"] * mesh.points[used]
+    elements = elements.reshape(-1, mesh.elements.shape[1])
+    position = request["scale"] * mesh.points[used]
     fields = {
         n: np.asarray(v)[used] for n, v in mesh.fields["point"].items() if np.ndim(v) == 1 and v.dtype.kind in "iufb"
     }

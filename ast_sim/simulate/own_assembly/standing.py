@@ -69,7 +69,8 @@ def reference(spec: AssemblySpec) -> Reference:
     values = completed(spec.parameters, {})
     points = np.concatenate([part.position for part in placed(spec, values)])
     low, high = points.min(axis=0), points.max(axis=0)
-    centre, diagonal = (low + high) / 2, float(np.linalg.norm(high - low))
+    centre = (low + high) / 2
+    diagonal = float(np.linalg.norm(high - low))
     origin = np.zeros(3)
     if np.abs(centre).max() > NEAR_ORIGIN * diagonal:
         step = 10.0 ** math.floor(math.log10(diagonal))
@@ -155,7 +156,8 @@ def _set_back(spec: AssemblySpec, parts: list[PlacedPart], shared: Reference) ->
 
 def _course(scene: Scene, parts: list[PlacedPart], values: Values, frames: int, origin: np.ndarray) -> Course:
     """How the prescribed nodes move; free nodes stay at rest."""
-    rest, moved = scene.rest_position.astype(np.float64), []
+    rest = scene.rest_position.astype(np.float64)
+    moved = []
     for number, part in enumerate(parts):
         of_body = np.flatnonzero(scene.body == number)
         for move, one in enumerate(part.part.moves):
