@@ -19,7 +19,9 @@ from ast_sim.mesh_arrays import (
     scene_arrays,
 )
 from ast_sim.number_arrays import require_array, require_finite, require_nodes
+from ast_sim.scene_summary import scene_drawing, scene_facts
 from ast_sim.support.errors import DatasetError
+from ast_sim.support.notebook_table import html_table, one_line
 
 if TYPE_CHECKING:
     import meshio
@@ -109,6 +111,16 @@ class Scene:
         """The scene as a mesh of meshio, with the point fields `node_type` and `body` and the cell field `material`;
         `from_meshio` makes the same scene of it."""
         return mesh_of_arrays(self.rest_position, self.elements, self.node_type, self.body, self.material)
+
+    def _facts(self) -> dict[str, str]:
+        return scene_facts(self.rest_position, self.elements, self.node_type, self.body, self.material)
+
+    def __repr__(self) -> str:
+        return one_line("Scene", self._facts())
+
+    def _repr_html_(self) -> str:
+        drawing = scene_drawing(self.rest_position, self.elements, self.node_type, self.body)
+        return html_table("Scene", self._facts(), drawing)
 
     @property
     def num_nodes(self) -> int:
@@ -222,6 +234,21 @@ class Trajectory:
     frames: tuple[int, ...] | None = None
     times: tuple[float, ...] | None = None
     length_unit: str | None = None
+
+    def _facts(self) -> dict[str, str]:
+        return {
+            "frames": ranges(self.numbers),
+            "nodes": f"{self.scene.num_nodes:,}",
+            "stress": "none" if self.stress is None else f"at each {self.stress_location or 'node or element'}",
+            "lengths": self.length_unit or "in a unit that is not known",
+            "status": str(self.attributes.get("status", "complete")),
+        }
+
+    def __repr__(self) -> str:
+        return one_line("Trajectory", self._facts())
+
+    def _repr_html_(self) -> str:
+        return html_table("Trajectory", self._facts(), self.scene._repr_html_())
 
     @property
     def num_frames(self) -> int:

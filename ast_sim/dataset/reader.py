@@ -11,11 +11,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import fields, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, Self, overload
+from typing import Any, Self
 
 import h5py
 import numpy as np
@@ -34,10 +34,12 @@ from ast_sim.dataset.layout import (
     DatasetInfo,
     require_kind,
 )
+from ast_sim.dataset.split import Split
 from ast_sim.number_arrays import require_finite
 from ast_sim.scene import AttributeValue, Scene, Trajectory
 from ast_sim.support.byte_cache import ByteCache
 from ast_sim.support.errors import DatasetError
+from ast_sim.support.notebook_table import html_table, one_line
 
 CACHE_BYTES = 1 << 30  # limit of the cache of scenes, and the largest split whose frames are kept in memory
 
@@ -73,6 +75,22 @@ class Dataset:
         self._open: dict[tuple[str, int], dict[str, h5py.Dataset]] = {}
         self._kept: dict[str, bool] = {}  # whether the split is small enough to be kept in memory
         self._kind: tuple[int, int] | None = None
+
+    def _facts(self) -> dict[str, str]:
+        counts = ", ".join(f"{count:,} {split}" for split, count in self.splits.items() if count)
+        return {
+            "file": self.path.name,
+            "scenes": counts or "none",
+            "family": self.info.family,
+            "stress": {"none": "none"}.get(self.info.stress_location, f"at each {self.info.stress_location}"),
+            "lengths": self.info.length_unit,
+        }
+
+    def __repr__(self) -> str:
+        return one_line("Dataset", self._facts())
+
+    def _repr_html_(self) -> str:
+        return html_table("Dataset", self._facts())
 
     def __getitem__(self, split: str) -> Split:
         """The trajectories of a split: `dataset["test"][0]`."""
@@ -322,24 +340,3 @@ class Dataset:
 def _listed(value: AttributeValue | None) -> tuple[float, ...] | None:
     """The numbers of an attribute; None if it is missing or no list."""
     return tuple(value) if isinstance(value, list) else None
-
-
-class Split(Sequence[Trajectory]):
-    """The trajectories of a dataset's split, in order; each is read on access. A slice of a split is a `Split`, too."""
-
-    def __init__(self, dataset: Dataset, name: str, indices: range) -> None:
-        self._dataset, self.name, self._indices = dataset, name, indices
-
-    def __len__(self) -> int:
-        return len(self._indices)
-
-    @overload
-    def __getitem__(self, index: int) -> Trajectory: ...
-    @overload
-    def __getitem__(self, index: slice) -> Split: ...
-    def __getitem__(self, index: int | slice) -> Trajectory | Split:
-        if isinstance(index, slice):
-            return Split(self._dataset, self.name, self._indices[index])
-        number = self._indices[index]
-        cauchy_stress = self._dataset.cauchy_stress(self.name, number)
-        return replace(self._dataset.load(self.name, number), cauchy_stress=cauchy_stress)

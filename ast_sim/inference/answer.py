@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -15,7 +16,8 @@ from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.scene import AttributeValue, Scene, Trajectory
-from ast_sim.support.errors import AstSimError, RolloutError
+from ast_sim.support.errors import AstSimError, MissingExtra, RolloutError
+from ast_sim.support.notebook_table import html_picture, html_table, one_line
 from ast_sim.view import export, picture, sweep_files
 from ast_sim.view.files import make_folder
 
@@ -96,6 +98,33 @@ class Answer:
     def computed(self) -> np.ndarray:
         """[S] bool: the frames that were predicted, not given."""
         return np.array(self.frames, np.int64) >= self.given
+
+    def _facts(self) -> dict[str, str]:
+        unit = "" if self.info is None else f" {self.info.length_unit}"
+        moved = np.linalg.norm(self.displacement[:, self.scene.deforming_nodes], axis=2)
+        converged = {None: "no Newton steps", True: "yes", False: "no"}[self.converged]
+        return {
+            "name": self.name,
+            "frames": ", ".join(map(str, self.frames[:10])) + (", ..." if len(self.frames) > 10 else ""),
+            "nodes": f"{self.scene.num_nodes:,}",
+            "largest displacement": f"{moved.max(initial=0.0):.4g}{unit}",
+            "largest stress": "none" if self.stress is None else f"{self.stress.max(initial=0.0):.4g} Pa",
+            "expected error": "not known" if self.expected_error is None else f"{100 * self.expected_error:.2g} %",
+            "converged": converged,
+            "seconds": f"{self.seconds:.3g}",
+            **({} if self.failure is None else {"failure": self.failure}),
+        }
+
+    def __repr__(self) -> str:
+        return one_line("Answer", self._facts())
+
+    def _repr_html_(self) -> str:
+        try:
+            file = io.BytesIO()
+            self.plot().savefig(file, format="png", dpi=96)
+            return html_table("Answer", self._facts(), html_picture(file.getvalue(), 400))
+        except (MissingExtra, RolloutError):  # a table is better than nothing
+            return html_table("Answer", self._facts())
 
     @property
     def displacement(self) -> np.ndarray:

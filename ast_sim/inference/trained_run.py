@@ -27,6 +27,7 @@ from ast_sim.runs import run_file
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.own_assembly.grid import grid, read_table
 from ast_sim.support.errors import ConfigError, RolloutError
+from ast_sim.support.notebook_table import html_table, one_line
 from ast_sim.support.progress import Progress
 from ast_sim.support.provenance import provenance
 from ast_sim.support.toml_settings import NOTHING
@@ -62,6 +63,23 @@ class Run:
         unset = {"corrections": (self.settings.train.calls or 1) - 1}
         self.effort = Effort(**answers.get("effort", unset))
         self._errors = [EffortErrors.from_json(one) for one in answers.get("valid_by_effort", [])]
+
+    def _facts(self) -> dict[str, str]:
+        error = self._expected_error(self.effort)
+        return {
+            "path": self.path.name,
+            "model": f"{self.settings.model.name}, {sum(p.numel() for p in self.model.parameters()):,} parameters",
+            "checkpoint": f"step {self.step:,}",
+            "family": f"{self.scope.family}, lengths in {self.scope.length_unit}",
+            "effort": self.effort.text,
+            "expected error": "not measured" if error is None else f"{100 * error:.2g} %",
+        }
+
+    def __repr__(self) -> str:
+        return one_line("Run", self._facts())
+
+    def _repr_html_(self) -> str:
+        return html_table("Run", self._facts())
 
     def save(self, path: str | os.PathLike[str], licence: str | None = None) -> None:
         """Write the run as one file, `NAME.ast`, that `Run("NAME.ast")` opens on any machine.
@@ -263,8 +281,9 @@ class Run:
         steps = min(effort.newton_steps, most)
         return next((one.error for one in known if one.effort.newton_steps == steps), None)
 
-    def open(self, data: str | os.PathLike[str] | None = None) -> Dataset:
-        """Open a dataset, by default the training data, with lengths in the run's unit. The caller closes it.
+    def open(self, data: str | os.PathLike[str] | Dataset | None = None) -> Dataset:
+        """Open a dataset, by default the training data, with lengths in the run's unit. The caller closes it. A dataset
+        that is open already is opened once more.
 
         Raises:
             DatasetError: the dataset cannot be read.
@@ -273,7 +292,8 @@ class Run:
         """
         if data is None and self.path.is_file():
             raise ConfigError(f"{self.path} holds no dataset: name one; the run learned from {self.settings.data}")
-        dataset = Dataset(data or self.settings.data, self.scope.length_unit)
+        path = data.path if isinstance(data, Dataset) else data or self.settings.data
+        dataset = Dataset(path, self.scope.length_unit)
         try:
             self.folder.require_fit(dataset)
         except BaseException:
@@ -283,7 +303,7 @@ class Run:
 
     def evaluate(
         self,
-        data: str | os.PathLike[str] | None = None,
+        data: str | os.PathLike[str] | Dataset | None = None,
         split: str = "test",
         command: str = "Run.evaluate",
         rival_scenes: int = 0,
@@ -292,7 +312,7 @@ class Run:
         """Predict all scenes of a split and measure the errors; on a terminal a bar shows the progress.
 
         Args:
-            data: a dataset; by default the one that the run was trained on.
+            data: a dataset, its path or open; by default the one that the run was trained on.
             command: the command that is recorded beside the figures.
             rival_scenes: in so many scenes the solver solves the deepest frame, in several ways, to compare.
             made_from: the specification or the parts of your own of which the dataset was made; the solver needs them.
@@ -307,6 +327,6 @@ class Run:
             figures = dataclasses.replace(figures, origin={**provenance(command), **origin})
             return Evaluation(self, dataset.path, figures)
 
-    def report(self, path: str | os.PathLike[str], data: str | os.PathLike[str] | None = None) -> None:
+    def report(self, path: str | os.PathLike[str], data: str | os.PathLike[str] | Dataset | None = None) -> None:
         """Evaluate on the test split and write a page with the results."""
         self.evaluate(data).report(path)

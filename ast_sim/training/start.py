@@ -20,7 +20,7 @@ from ast_sim.runs import checkpoint
 from ast_sim.runs.config_toml import has_config, read_changes, write_config
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.train_config import RunConfig, TrainConfig
-from ast_sim.support.errors import CheckpointError, ConfigError, TrainingError
+from ast_sim.support.errors import CheckpointError, ConfigError, DatasetError, TrainingError
 from ast_sim.support.stop_signals import StopSignals
 from ast_sim.support.toml_settings import NONE, NOTHING, assigned, change
 from ast_sim.training.data_lengths import DataScales, measure, scope_of
@@ -98,7 +98,7 @@ def _naming(file: Path | None) -> Iterator[None]:
 
 
 def train(
-    data: str | os.PathLike[str],
+    data: str | os.PathLike[str] | Dataset,
     out: str | os.PathLike[str],
     *,
     model: str | None = None,
@@ -112,7 +112,7 @@ def train(
     """Train a model on a dataset; returns the run, ready to predict.
 
     Args:
-        data: the dataset file.
+        data: the dataset file, or the open dataset.
         out: the run folder. After a kill the same call with `resume=True` continues, and gives the same weights.
         model: a registered model: "ast" (the default), "mgn", "bsms", "hcmt" or "transolver".
         preset: the settings to start from; by default "tiny".
@@ -132,25 +132,50 @@ def train(
         TrainingError, CheckpointError, KeyboardInterrupt: as in `start_training`.
     """
     changes = _changes(model_settings, settings)
-    chosen = configure(data, preset, (), model, config=config, from_run=from_run, changes=changes)
+    path = _path_of(data)
+    chosen = configure(path, preset, (), model, config=config, from_run=from_run, changes=changes)
     start_training(Path(out), chosen, resume=resume, from_run=from_run)
     return Run(out)
 
 
 def new_model(
-    data: Dataset, model: str = "ast", preset: str = "tiny", model_settings: Mapping[str, Any] | None = None
+    data: str | os.PathLike[str] | Dataset,
+    model: str = "ast",
+    preset: str = "tiny",
+    model_settings: Mapping[str, Any] | None = None,
 ) -> Simulator:
     """An untrained model that fits a dataset, for a training loop of your own (examples/own_loop.py). The statistics of
     its inputs and outputs are measured as at the start of `train`.
 
+    Args:
+        data: the dataset file, or the open dataset.
+        model, preset, model_settings: as for `train`.
+
     Raises:
         ConfigError: there is no such model, preset or setting, or the data does not fit.
     """
+    if not isinstance(data, Dataset):
+        with Dataset(data) as dataset:
+            return new_model(dataset, model, preset, model_settings)
     config = configure(data.path, preset, (), model, changes=_changes(model_settings, {}))
     resolved = resolve(config, data, measure(data))
     built = build_model(resolved.model)
     fit_statistics(built, sampler_of(built, data, resolved.train), resolved.train)
     return built
+
+
+def _path_of(data: str | os.PathLike[str] | Dataset) -> Path:
+    """The path of a dataset that is named by its path or is open.
+
+    Raises:
+        DatasetError: it was opened in another unit of length than the one of the file.
+    """
+    if not isinstance(data, Dataset):
+        return Path(data)
+    with Dataset(data.path) as in_own_unit:
+        if in_own_unit.info.length_unit != data.info.length_unit:
+            raise DatasetError(f"{data.path} was opened in {data.info.length_unit}: open it without length_unit")
+    return data.path
 
 
 def _changes(model_settings: Mapping[str, Any] | None, settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ast_sim.scene import Trajectory
+from ast_sim.scene_summary import EYE, LIGHT
 from ast_sim.support.disk import replacing
 from ast_sim.support.errors import AstSimError, require
 from ast_sim.view.encode import finite_frames
@@ -20,8 +21,6 @@ from ast_sim.view.fields import is_planar, require_same_scene, surface_owners
 from ast_sim.view.files import explained
 from ast_sim.view.tables import TITLES
 
-EYE = np.array([-0.62, -1.32, 0.78])  # from where a solid scene is seen, in units of its diagonal
-LIGHT = np.array([-0.35, -0.45, 0.82])
 OBSTACLE_COLOR = (0.47, 0.51, 0.56, 0.38)
 MESH_COLOR = (0.05, 0.08, 0.12, 0.5)
 INK = "#16202c"

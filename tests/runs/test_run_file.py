@@ -88,8 +88,20 @@ def test_the_dataset_stays_behind(saved):
     found = Run(file)
     with pytest.raises(ConfigError, match=r"toy.ast holds no dataset: name one; the run learned from toy.h5"):
         found.evaluate()
-    with found.open(run.settings.data) as data:
-        assert data.count("test") == 1
+    with Dataset(run.settings.data, "mm") as data:  # an open one; lengths become those of the run
+        evaluation = found.evaluate(data)
+    error = evaluation.figures.error("displacement").rmse_sequence
+    assert f"Evaluation(run: toy.ast, data: toy.h5, scenes: 1, displacement error: {error:.4g} m, " in repr(evaluation)
+    assert "<pre>" in evaluation._repr_html_() and "<td" in evaluation._repr_html_()
+
+
+def test_a_run_shows_what_it_is(saved):
+    file, run = saved
+    parameters = sum(p.numel() for p in run.model.parameters())
+    shown = repr(Run(file))
+    assert shown.startswith(f"Run(path: toy.ast, model: ast, {parameters:,} parameters, checkpoint: step {run.step}, ")
+    assert f"family: toy_plate, lengths in m, effort: {run.effort.text}, expected error: " in shown
+    assert "<td" in run._repr_html_() and f"{parameters:,} parameters" in run._repr_html_()
 
 
 def test_no_damage_is_silent(saved, tmp_path):
