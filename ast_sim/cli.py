@@ -156,6 +156,8 @@ def _add_convert(convert: _Parser) -> None:
         " files), a folder that holds several simulations, or a folder of meta.json and .tfrecord files"
     )
     convert.add_argument("source", type=path, metavar="SOURCE", help=about)
+    about = "results (.frd) of the job whose deck (.inp) is SOURCE: its prescribed nodes and materials are taken"
+    convert.add_argument("results", type=path, nargs="?", metavar="RESULTS", help=about)
     _add_out(convert, "FILE", "dataset to write (.h5)")
     fields = convert.add_argument_group("names of the fields in the files")
     names = {
@@ -182,7 +184,9 @@ def _add_convert(convert: _Parser) -> None:
         "--time-step SECONDS": "time between two frames; 0: frames have no time (default: 0)",
     }
     _add_each(kind, numbers, type=float, default=0.0)
-    _add_each(kind, {"--length-unit UNIT": "unit of length: m, cm, mm, um or in (default: m)"}, default="m")
+    _add_each(kind, {"--length-unit UNIT": "unit of length: m, cm, mm, um or in (default: m; a deck needs it)"})
+    about = "unit of stress and of Young's modulus: Pa, kPa, MPa, GPa or psi (default: Pa; a deck needs it)"
+    _add_each(kind, {"--stress-unit UNIT": about})
     records = convert.add_argument_group("selection from .tfrecord files (meta.json has all other facts)")
     records.add_argument("--split", nargs="+", choices=commands.SPLITS, help="convert only these files (default: all)")
     _add_each(records, {"--limit N": "first N trajectories of each file (default: all)"}, type=at_least(1))

@@ -80,26 +80,30 @@ def convert(args: argparse.Namespace) -> None:
     from ast_sim.importers.deepmind import is_deepmind
     from ast_sim.importers.series import FieldNames
 
-    read = args.source.rglob("*") if args.source.is_dir() else [args.source]
+    source, deck = (args.source, None) if args.results is None else (args.results, args.source)
+    if source.suffix.lower() == ".inp":
+        raise ConfigError(f"{source}: a deck holds no results; name them after it: ast-sim convert JOB.inp JOB.frd")
+    read = args.source.rglob("*") if args.source.is_dir() else filter(None, [source, deck])
     _check_output(args, args.out, (path for path in read if path.suffix != ".h5"), "a dataset", ".h5")
-    if is_deepmind(args.source):
+    if is_deepmind(source):
         _refuse(args, args.of_series, f"{args.source}: its meta.json has the facts")
         options = {"splits": args.split, "limit": args.limit, "every": args.every}
     else:
         _refuse(args, args.of_records, f"{args.source}, which holds no .tfrecord files")
         fields = (args.displacement, args.stress, args.node_type, args.obstacle, args.handle, args.body)
         options = {
-            "names": FieldNames(*fields, tuple(args.material), args.stress_order),
+            "names": FieldNames(*fields, tuple(args.material), args.stress_order, args.stress_unit),
             "splits": None if args.shares is None else dict(zip(SPLITS, args.shares, strict=True)),
             "seed": args.seed,
             "integration": "dynamic" if args.dynamic else "quasi_static",
             "contact_radius": args.contact_radius,
             "time_step": args.time_step,
             "length_unit": args.length_unit,
+            "deck": deck,
             "incomplete": args.incomplete,
             "strict": args.strict,
         }
-    counts = import_files(args.source, args.out, progress=lambda line: print(printable(line)), **options)
+    counts = import_files(source, args.out, progress=lambda line: print(printable(line)), **options)
     print(f"{args.out}: {_counts(counts)}")
 
 

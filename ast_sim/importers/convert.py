@@ -17,6 +17,7 @@ from ast_sim.importers.completeness import require_complete
 from ast_sim.importers.deepmind import convert_deepmind, is_deepmind
 from ast_sim.importers.frame_order import files_of_frames, natural_order
 from ast_sim.importers.frames_in_file import ONE_FRAME, WITH_FRAMES, holds_frames
+from ast_sim.importers.job_files import decks_of, doubt_modulus, with_units
 from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.plausibility.findings import Finding, refusal, told
 from ast_sim.plausibility.motion import in_trajectory
@@ -54,7 +55,8 @@ def convert_series(
     integration: str = "quasi_static",
     contact_radius: float = 0.0,
     time_step: float = 0.0,
-    length_unit: str = "m",
+    length_unit: str | None = None,
+    deck: Path | str | None = None,
     incomplete: bool = False,
     strict: bool = False,
     progress: Callable[[str], None] | None = None,
@@ -62,38 +64,39 @@ def convert_series(
     """Import the simulations of other programs as a dataset.
 
     Args:
-        source: one simulation is a file with all frames (`.vtkhdf`, `.frd`, `.xdmf`, `.exo`, d3plot), a `.pvd` file, or
-            a folder with a file for each frame (`.vtu`, `.pvtu`, `.vtk`). The source is one simulation, or a folder
-            that holds several, at any depth; then the path within the source, without suffix, names a simulation.
+        source: one simulation (see `read_series`), or a folder of several; then their paths, without suffix, are names.
         out: the dataset file; it is written whole or not at all.
-        names: the names of the fields in the files; see `FieldNames` for the defaults.
-        splits: for each of "train", "valid" and "test" either the names of its simulations (a simulation that is not
-            named is left out), or its share of all simulations. Shares add up to 1 and are drawn at random with `seed`.
-            A split whose share is above 0 gets at least one simulation. The default is 0.8, 0.1, 0.1; it needs three.
-        integration, contact_radius, time_step, length_unit: as in `DatasetInfo`.
+        names: the names of the fields in the files.
+        splits: for each of "train", "valid" and "test" the names of its simulations (others are left out), or its
+            share of all simulations. Shares add up to 1 and are drawn at random with `seed`; each above 0 gets at least
+            one simulation. The default is 0.8, 0.1, 0.1; it needs three.
+        integration, contact_radius, time_step: as in `DatasetInfo`.
+        length_unit: as in `DatasetInfo`; None is "m". Beside a deck it must be given, and `names.stress_unit`.
+        deck: the deck of CalculiX (`.inp`) whose results the source is; see `read_job` and `decks_of`.
         incomplete: accept simulations in which nothing moves, nothing is prescribed or nothing can be learnt.
         strict: refuse simulations in which something looks wrong; see `ast_sim.plausibility`.
-        progress: called with a line of text after each simulation, and about what looks wrong; None: this is a warning.
+        progress: called with a line after each simulation, and with what looks wrong. None: that is a warning.
 
     Returns:
-        The number of trajectories in each split. The dataset's positions are relative to its `generator["origin"]`, in
-        double precision, which is zero unless the first simulation lies far from zero.
+        The number of trajectories in each split. Positions are relative to `generator["origin"]` of the dataset.
 
     Raises:
-        DatasetError: a file is wrong or something is missing in it; the text names the file. Nothing is written then.
+        DatasetError: a file is wrong or lacks something; the text names it. Nothing is written then.
     """
     source = Path(source)
     names = names or FieldNames()
     series = find_series(source)
+    decks = decks_of(source, series, deck, names)
+    names = with_units(decks, names, length_unit)
     chosen = _assign(source, list(series), splits, seed)
     made_by = {"program": "ast_sim convert", "source": str(source), "names": asdict(names), "seed": seed}
-    facts = {"contact_radius": contact_radius, "time_step": time_step, "length_unit": length_unit}
+    facts = {"contact_radius": contact_radius, "time_step": time_step, "length_unit": length_unit or "m"}
     facts |= {"family": source.stem, "integration": integration, "generator": made_by}
     findings: list[tuple[str, Finding]] = []
     with FittedWriter(out, stress_location="none", **facts) as writer:
-        for split, name, trajectory in _trajectories(series, chosen, names, incomplete):
+        for split, name, trajectory in _trajectories(series, decks, chosen, names, incomplete):
             if not any(writer.counts.values()):
-                made_by["origin"] = trajectory.attributes.get("origin", [0.0, 0.0, 0.0])
+                made_by |= _facts_of_the_first(trajectory)
                 writer.info = replace(writer.info, stress_location=trajectory.stress_at, generator=made_by)
             findings += [(name, finding) for finding in in_trajectory(trajectory)]
             writer.add(split, trajectory)
@@ -101,23 +104,41 @@ def convert_series(
                 progress(_line(split, name, trajectory))
         if findings and strict:
             raise DatasetError(f"{source}: {refusal(findings)}")
-    for line in told(findings):
-        warnings.warn(line, stacklevel=2) if progress is None else progress(line)
+    _tell(findings, progress)
     return writer.counts
 
 
+def _tell(findings: list[tuple[str, Finding]], progress: Callable[[str], None] | None) -> None:
+    """Print what looks wrong, or warn of it."""
+    for line in told(findings):
+        warnings.warn(line, stacklevel=3) if progress is None else progress(line)
+
+
 def _trajectories(
-    series: Mapping[str, Path], chosen: Sequence[tuple[str, str]], names: FieldNames, incomplete: bool
+    series: Mapping[str, Path],
+    decks: Mapping[str, Path],
+    chosen: Sequence[tuple[str, str]],
+    names: FieldNames,
+    incomplete: bool,
 ) -> Iterator[tuple[str, str, Trajectory]]:
     """The split, the name and the trajectory of each chosen simulation; all have the origin of the first."""
     origin = None
     for split, name in chosen:
-        trajectory = read_series(series[name], names, origin)
+        trajectory = read_series(series[name], names, origin, decks.get(name))
+        if name in decks:
+            doubt_modulus(decks[name], trajectory, names.stress_unit or "Pa")
         if not incomplete:
             require_complete(series[name], trajectory, names)
         if origin is None:
             origin = np.array(trajectory.attributes.get("origin", [0.0, 0.0, 0.0]))
         yield split, name, trajectory
+
+
+def _facts_of_the_first(trajectory: Trajectory) -> dict[str, Any]:
+    """The origin of all simulations, and the names of the columns of their material."""
+    columns = str(trajectory.attributes.get("material", ""))
+    origin = trajectory.attributes.get("origin", [0.0, 0.0, 0.0])
+    return {"origin": origin, **({"material": columns.split(", ")} if columns else {})}
 
 
 def _line(split: str, name: str, trajectory: Trajectory) -> str:

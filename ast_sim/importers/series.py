@@ -16,13 +16,15 @@ from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.formats.together import together
 from ast_sim.importers.frame_order import frame_files, ordered
 from ast_sim.importers.frames_in_file import frames_in
+from ast_sim.importers.jobs.job import Job, read_job
+from ast_sim.importers.jobs.job_results import job_frames
 from ast_sim.importers.mesh_file import MeshFile, mesh_of, raw_field
 from ast_sim.importers.scene_mesh import clamped
 from ast_sim.importers.shells import Shells
 from ast_sim.importers.solids.frames_match import order_of_cells
 from ast_sim.importers.solids.mesh_elements import require_extent
 from ast_sim.importers.solids.stitching import Stitching
-from ast_sim.importers.stress import order_of, von_mises
+from ast_sim.importers.stress import STRESS_UNITS, order_of, von_mises
 from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.support.errors import DatasetError
 
@@ -51,6 +53,7 @@ class FieldNames:
         material: cell fields with one number each; they become the columns of `Scene.material`.
         stress_order: the components that the columns of the stress hold, such as ("xx", "xy", "xz", "yy", "yz", "zz").
             Empty: as the file names them; else the normal stresses come first.
+        stress_unit: the unit of the stress, and of Young's modulus in a deck: one of `STRESS_UNITS`; None is pascal.
     """
 
     displacement: str | None = None
@@ -61,6 +64,7 @@ class FieldNames:
     body: str | None = None
     material: tuple[str, ...] = ()
     stress_order: tuple[str, ...] = ()
+    stress_unit: str | None = None
 
 
 @dataclass(eq=False)
@@ -84,7 +88,9 @@ class _Frames:
         return tuple(known) if whole else None
 
 
-def read_series(source: Path, names: FieldNames, origin: np.ndarray | None = None) -> Trajectory:
+def read_series(
+    source: Path, names: FieldNames, origin: np.ndarray | None = None, deck: Path | None = None
+) -> Trajectory:
     """Read the simulation in a `.pvd` file, in a folder with a file for each frame, or in one file.
 
     The elements are those of `read_mesh`: nodes that belong to no element are left out, shells beside tetrahedra become
@@ -93,16 +99,22 @@ def read_series(source: Path, names: FieldNames, origin: np.ndarray | None = Non
     Args:
         origin: [3] float64, subtracted from all points before they are rounded to float32. None: zero if the mesh lies
             near zero, else near the centre of the first frame; see `far_origin`.
+        deck: the deck of CalculiX whose job has given the results `source`. It says which nodes are prescribed and what
+            the elements are made of; see `read_job`.
 
     Returns:
         The trajectory; its `stress_location` is "none", "node" or "element". Its attribute `origin` is what was
-        subtracted, if that is not zero; `notes` says what was not taken as it stands in the files.
+        subtracted, if that is not zero; `material` has the names of its columns; `notes` says what was not taken as it
+        stands in the files.
 
     Raises:
         DatasetError: a file, field, node or element is missing or wrong; the text names the file and what is wrong.
         MissingExtra: the reader of a format is not installed.
     """
-    mesh, kept, notes, place = _read_frames(source, names)
+    job = None if deck is None else read_job(deck)
+    if job is not None:
+        names = replace(names, material=names.material or tuple(job.materials))
+    mesh, kept, notes, place = _read_frames(source, names, job)
     scene, used = mesh.scene(names.body, names.node_type)
     types = _node_type(mesh, names, scene, used)
     rest, position = _rest_and_position(source, mesh, kept, used)
@@ -117,9 +129,10 @@ def read_series(source: Path, names: FieldNames, origin: np.ndarray | None = Non
         node_type=types,
         material=mesh.columns(names.material),
     )
-    stress, more = _stress(mesh, kept, used, place, scene)
+    stress, more = _stress(mesh, kept, used, place, scene, _pascals(names))
     attributes: dict[str, Any] = {"status": "complete", "source": source.name}
     attributes |= {"origin": origin.tolist()} if origin.any() else {}
+    attributes |= {"material": ", ".join(names.material)} if names.material else {}
     told = [*mesh.notes, *notes, *more]
     attributes |= {"notes": "; ".join(told)} if told else {}
     trajectory = Trajectory(
@@ -134,7 +147,7 @@ def read_series(source: Path, names: FieldNames, origin: np.ndarray | None = Non
     return trajectory
 
 
-def _read_frames(source: Path, names: FieldNames) -> tuple[MeshFile, _Frames, list[str], str]:
+def _read_frames(source: Path, names: FieldNames, job: Job | None) -> tuple[MeshFile, _Frames, list[str], str]:
     """The mesh of a simulation, what is kept of its frames in order of time, notes, and where the stress is."""
     kept = _Frames()
     first = None
@@ -143,7 +156,8 @@ def _read_frames(source: Path, names: FieldNames) -> tuple[MeshFile, _Frames, li
         filter(None, (names.obstacle, names.handle, names.node_type or "node_type", names.body or "body"))
     )
     place, order, notes = "none", (), []
-    for frame in frames(source):
+    given = frames(source) if job is None else job_frames(job, source, _pascals(names))
+    for frame in given:
         frame.require_consistent()
         if first is None or stitching is None:
             first = frame
@@ -247,6 +261,11 @@ def _rest_and_position(source: Path, mesh: MeshFile, kept: _Frames, used: np.nda
     )
 
 
+def _pascals(names: FieldNames) -> float:
+    """The unit of stress of the files in pascal."""
+    return STRESS_UNITS[names.stress_unit or "Pa"]
+
+
 def _stress_place(frame: SourceMesh, names: FieldNames) -> tuple[str, tuple[str, ...], list[str]]:
     """Where a file holds the stress ("none", "node" or "element"), the components of its columns, and a note on
     them."""
@@ -264,13 +283,13 @@ def _stress_place(frame: SourceMesh, names: FieldNames) -> tuple[str, tuple[str,
 
 
 def _stress(
-    mesh: MeshFile, kept: _Frames, used: np.ndarray, place: str, scene: Scene
+    mesh: MeshFile, kept: _Frames, used: np.ndarray, place: str, scene: Scene, pascals: float
 ) -> tuple[np.ndarray | None, list[str]]:
-    """[S, N or E, 1] float32, and a note if obstacles have none: it is 0 there."""
+    """[S, N or E, 1] float32 in pascal, and a note if obstacles have none: it is 0 there."""
     if place == "none":
         return None, []
     rows = mesh.node_rows[used] if place == "node" else mesh.element_rows
-    stress = np.stack([values[rows] for values in kept.stresses]).astype(np.float32)[:, :, None]
+    stress = (pascals * np.stack([values[rows] for values in kept.stresses])).astype(np.float32)[:, :, None]
     lacking = np.isnan(stress[:, :, 0]).any(axis=0) & ~scene.deforming(place)
     if not lacking.any():
         return stress, []

@@ -18,6 +18,9 @@ _ORDERS = {
     6: _NORMAL_FIRST,
     9: ("xx", "xy", "xz", "yx", "yy", "yz", "zx", "zy", "zz"),
 }
+# Units of stress in pascal.
+STRESS_UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9, "psi": 6894.757293168}
+
 _AXES = {"1": "x", "2": "y", "3": "z", **{axis: axis for axis in "xyz"}}
 
 

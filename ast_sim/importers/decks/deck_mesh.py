@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,8 +37,13 @@ def deck_mesh(path: Path) -> SourceMesh:
         DatasetError: a line cannot be read, something that changes the mesh is not understood, or an element refers to
             a node that there is not; the text names the file and the line.
     """
-    deck = read_deck(path)
-    return _Assembly(deck).mesh()
+    return mesh_of_deck(read_deck(path))
+
+
+def mesh_of_deck(deck: Deck, understood: Collection[str] = ()) -> SourceMesh:
+    """As `deck_mesh`. The keywords that are `understood` are not listed as ignored. The points of a deck without parts
+    have the numbers of its nodes."""
+    return _Assembly(deck).mesh(understood)
 
 
 class _Assembly:
@@ -75,7 +81,7 @@ class _Assembly:
             self._add(name, (part,), np.eye(3), np.zeros(3))
         self.notes.append("the deck has parts and no instances: each part is taken once")
 
-    def mesh(self) -> SourceMesh:
+    def mesh(self, understood: Collection[str]) -> SourceMesh:
         for name, scope in self.scopes.items():
             self._take_elements(name, scope)
         if not self.blocks:
@@ -83,10 +89,11 @@ class _Assembly:
             raise DatasetError(f"{self.deck.path}: holds {held}: a scene needs elements of a volume")
         notes = [*self.notes]
         notes += [f"{count} elements of the type {name} are left out" for name, count in self.deck.left_out.items()]
-        if self.deck.ignored:
-            notes.append(f"ignored keywords: {', '.join(sorted(self.deck.ignored))}")
+        ignored = self.deck.ignored.keys() - set(understood)
+        if ignored:
+            notes.append(f"ignored keywords: {', '.join(sorted(ignored))}")
         points = np.concatenate([scope.points for scope in self.scopes.values()])
-        numbers = np.arange(len(points))
+        numbers = self.scopes[""].numbers if len(self.scopes) == 1 else np.arange(len(points))
         return SourceMesh(self.deck.path, points, self.blocks, groups=self._groups(), notes=notes, same_point=numbers)
 
     def _take_elements(self, name: str, scope: _Scope) -> None:

@@ -89,7 +89,7 @@ def _keyword(first: Line, lines: Iterator[Line]) -> tuple[Line | None, Keyword]:
     while line is not None and not line.text.startswith("*"):
         keyword.data.append(line)
         line = next(lines, None)
-    if "INPUT" in keyword.options and keyword.name in ("NODE", "ELEMENT", "NSET", "ELSET"):
+    if "INPUT" in keyword.options and keyword.name in ("NODE", "ELEMENT", "NSET", "ELSET", "BOUNDARY"):
         more = list(_lines(_included(first, keyword.options["INPUT"]), (first.file,)))
         wrong = next((one for one in more if one.text.startswith("*")), None)
         if wrong is not None:

@@ -145,7 +145,7 @@ class _Results:
         if self.times[step] is not None:
             self.reader.set_active_time_point(step)
         arrays = _arrays_of((self.reader.read(), ""))
-        arrays.pop("point original_node_ids")
+        arrays["global"] = arrays.pop("point original_node_ids")
         return arrays
 
 

@@ -96,6 +96,7 @@ def _turned(rng: np.random.Generator, kind: str, cells: np.ndarray) -> np.ndarra
     if kind not in _TURNED:
         return cells
     wrong = rng.random(len(cells)) < 0.5
+    wrong[0] |= not wrong.any()
     cells = cells.copy()
     cells[wrong] = cells[wrong][:, _TURNED[kind]]
     return cells

@@ -1,0 +1,216 @@
+"""What a deck says of its job beside the mesh: prescribed nodes, rigid bodies, materials, the ends of its steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ast_sim.importers.decks.deck_content import Deck, read_deck
+from ast_sim.importers.decks.deck_mesh import mesh_of_deck
+from ast_sim.importers.decks.deck_numbers import real, tokens, whole
+from ast_sim.importers.decks.keyword_lines import Keyword, Line
+from ast_sim.importers.formats.source_mesh import SourceMesh
+from ast_sim.importers.jobs.job_materials import MATERIAL_KEYWORDS, material_columns
+from ast_sim.number_arrays import connected_parts
+from ast_sim.scene import NodeType
+from ast_sim.support.errors import DatasetError
+
+# Directions 1 to 3 are displacements, 4 to 6 turns.
+_DIRECTIONS = 6
+_NAMED = {
+    "ENCASTRE": (1, 2, 3, 4, 5, 6),
+    "PINNED": (1, 2, 3),
+    "XSYMM": (1, 5, 6),
+    "YSYMM": (2, 4, 6),
+    "ZSYMM": (3, 4, 5),
+    "XASYMM": (2, 3, 4),
+    "YASYMM": (1, 3, 5),
+    "ZASYMM": (1, 2, 6),
+}
+
+# What acts on nodes and is in no scene.
+_LOADS = {"CLOAD", "DLOAD", "DSLOAD", "TEMPERATURE", "DFLUX", "CFLUX", "FILM", "RADIATE", "PRETENSIONSECTION"}
+_CONSTRAINTS = {"EQUATION", "MPC", "COUPLING", "KINEMATIC", "DISTRIBUTING", "DISTRIBUTINGCOUPLING", "TIE"}
+_PROCEDURES = {"STATIC", "DYNAMIC", "VISCO"}
+_READ = {"BOUNDARY", "RIGIDBODY", "STEP", "ENDSTEP", *_PROCEDURES, *MATERIAL_KEYWORDS}
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """A deck that was solved.
+
+    Attributes:
+        mesh: its mesh; the points are numbered by `same_point` as the nodes of the deck are.
+        node_type: [n] numbers of `NodeType` at the points.
+        materials: columns by name, [c] for each block: `young`, `poisson`, and `yield_stress` if something is plastic.
+            Empty if some element has no isotropic elastic material.
+        ends: the times at which the steps end.
+    """
+
+    mesh: SourceMesh
+    node_type: np.ndarray
+    materials: dict[str, list[np.ndarray]]
+    ends: tuple[float, ...]
+
+
+@dataclass(eq=False)
+class _Conditions:
+    """Which directions of which points [n, 6] are prescribed now, in some step, and in all; which points [n] are
+    prescribed to move, or belong to a rigid body that is prescribed."""
+
+    now: np.ndarray
+    sometimes: np.ndarray
+    always: np.ndarray
+    moved: np.ndarray
+    rigid: np.ndarray
+    notes: list[str] = field(default_factory=list)
+
+    def end_step(self) -> None:
+        self.sometimes |= self.now
+        self.always &= self.now
+
+
+def read_job(path: Path) -> Job:
+    """The job of a deck of CalculiX.
+
+    Nodes are prescribed if *BOUNDARY holds them in all directions or moves them in one, or if they belong to a
+    *RIGID BODY whose reference node is prescribed. They are obstacles where a whole body is prescribed, else handles.
+
+    Raises:
+        DatasetError: a line cannot be read, or the deck has parts and instances; the text names the file and the line.
+    """
+    deck = read_deck(path)
+    if deck.parts:
+        raise DatasetError(
+            f"{path}: has parts and instances, which CalculiX does not know: its results are of another deck"
+        )
+    mesh = mesh_of_deck(deck, _READ)
+    conditions = _conditions(deck, mesh)
+    materials, more = material_columns(deck)
+    mesh.notes.extend([*conditions.notes, *more, *_not_in_a_scene(deck)])
+    return Job(mesh, _node_type(mesh, conditions), materials, _ends(deck))
+
+
+def _conditions(deck: Deck, mesh: SourceMesh) -> _Conditions:
+    shape = (len(mesh.points), _DIRECTIONS)
+    free = np.zeros(shape, bool)
+    state = _Conditions(free.copy(), free.copy(), np.ones(shape, bool), free[:, 0].copy(), free[:, 0].copy())
+    groups = {name.upper(): nodes for name, nodes in mesh.groups.items()}
+    renewed = False
+    for keyword in deck.keywords:
+        if keyword.name == "BOUNDARY":
+            if keyword.options.get("OP", "").upper() == "NEW" and not renewed:
+                state.now[:] = False
+                renewed = True
+            for line in keyword.data:
+                _prescribe(keyword, line, state, mesh, groups)
+        elif keyword.name == "STEP":
+            renewed = False
+        elif keyword.name == "ENDSTEP":
+            state.end_step()
+    for keyword in deck.keywords:
+        if keyword.name == "RIGIDBODY":
+            _rigid_body(keyword, state, mesh, groups)
+    partly = (state.sometimes & ~state.always)[:, :3].any(axis=1)
+    if partly.any():
+        state.notes.append(f"{partly.sum()} nodes are prescribed in some steps only: they count as prescribed in all")
+    return state
+
+
+def _prescribe(
+    keyword: Keyword, line: Line, state: _Conditions, mesh: SourceMesh, groups: dict[str, np.ndarray]
+) -> None:
+    """A data line of *BOUNDARY: `node or set, first direction, last direction, value`, or `node or set, ENCASTRE`."""
+    target, first, last, value = [*tokens(line), "", "", "", ""][:4]
+    rows = _rows(keyword, target, mesh, groups)
+    if first.upper() in _NAMED:
+        state.now[np.ix_(rows, np.array(_NAMED[first.upper()]) - 1)] = True
+        return
+    lowest = whole(first, line)
+    highest = whole(last, line) if last else lowest
+    for direction in range(lowest, min(highest, _DIRECTIONS) + 1):
+        state.now[rows, direction - 1] = True
+    if lowest <= 3 and real(value, line) != 0:
+        state.moved[rows] = True
+
+
+def _rows(keyword: Keyword, target: str, mesh: SourceMesh, groups: dict[str, np.ndarray]) -> np.ndarray:
+    """The points of a node or of a set of nodes."""
+    if target.isdigit():
+        assert mesh.same_point is not None
+        return np.flatnonzero(mesh.same_point == int(target))
+    if target.upper() not in groups:
+        raise keyword.error(f"there is no set of nodes {target!r}")
+    return groups[target.upper()]
+
+
+def _rigid_body(keyword: Keyword, state: _Conditions, mesh: SourceMesh, groups: dict[str, np.ndarray]) -> None:
+    """The nodes of a *RIGID BODY are prescribed as its reference node is; in CalculiX a second node has the turns."""
+    name = next((keyword.options[key] for key in ("NSET", "ELSET", "TIENSET", "PINNSET") if key in keyword.options), "")
+    nodes = _rows(keyword, name, mesh, groups)
+    reference = keyword.required("REFNODE")
+    at = _rows(keyword, reference, mesh, groups)
+    turns = state.sometimes[at, 3:].any(axis=0)
+    if "ROTNODE" in keyword.options:
+        turns |= state.sometimes[_rows(keyword, keyword.options["ROTNODE"], mesh, groups), :3].any(axis=0)
+    shifts = state.sometimes[at, :3].any(axis=0)
+    if not shifts.any():
+        state.notes.append(f"the rigid body {name} is prescribed nowhere: its nodes count as free")
+        return
+    state.rigid[nodes] = True
+    if not (shifts.all() and turns.all()):
+        axes = [
+            *(f"along {axis}" for axis in np.array([*"xyz"])[~shifts]),
+            *(f"about {a}" for a in np.array([*"xyz"])[~turns]),
+        ]
+        state.notes.append(f"the rigid body {name} is free {', '.join(axes)}: this motion is taken from the results")
+
+
+def _node_type(mesh: SourceMesh, conditions: _Conditions) -> np.ndarray:
+    """[n] uint8: see `read_job`. Only corners of elements count for a whole body; the others lie between them."""
+    held = conditions.sometimes[:, :3]
+    prescribed = held.all(axis=1) | conditions.moved | conditions.rigid
+    corners = np.zeros(len(mesh.points), bool)
+    pairs = [np.zeros((0, 2), np.int64)]
+    for block in mesh.blocks:
+        corners[block.corners] = True
+        rest = block.corners[:, 1:]
+        pairs.append(np.stack([np.repeat(block.corners[:, 0], rest.shape[1]), rest.ravel()], axis=1))
+    body = connected_parts(np.concatenate(pairs), len(mesh.points))
+    open_bodies = np.unique(body[corners & ~prescribed])
+    types = np.where(prescribed, NodeType.HANDLE, NodeType.NORMAL).astype(np.uint8)
+    types[corners & ~np.isin(body, open_bodies)] = NodeType.OBSTACLE
+    sliding = corners & held.any(axis=1) & ~prescribed
+    if sliding.any():
+        conditions_note = (
+            f"{sliding.sum()} nodes are held in some directions only (symmetry, sliding): they count as free"
+        )
+        mesh.notes.append(conditions_note)
+    return types
+
+
+def _ends(deck: Deck) -> tuple[float, ...]:
+    """The sums of the periods of the steps, which stand second in the data line of *STATIC or *DYNAMIC, else 1."""
+    ends: list[float] = []
+    for keyword in deck.keywords:
+        if keyword.name in _PROCEDURES:
+            line = keyword.data[0] if keyword.data else None
+            entries = tokens(line) if line is not None else []
+            period = real(entries[1], line) if line is not None and len(entries) > 1 and entries[1] else 1.0
+            ends.append(period + (ends[-1] if ends else 0.0))
+    return tuple(ends)
+
+
+def _not_in_a_scene(deck: Deck) -> list[str]:
+    names = {keyword.name for keyword in deck.keywords}
+    notes = []
+    if names & _LOADS:
+        notes.append(
+            f"loads are not part of a scene and must be equal in all of them: {', '.join(sorted(names & _LOADS))}"
+        )
+    if names & _CONSTRAINTS:
+        listed = ", ".join(sorted(names & _CONSTRAINTS))
+        notes.append(f"constraints are not read: {listed}; mark nodes that they move with --handle or --obstacle")
+    return notes

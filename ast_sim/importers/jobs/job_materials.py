@@ -1,0 +1,77 @@
+"""The materials of the elements of a deck: *MATERIAL with *ELASTIC and *PLASTIC, *SOLID SECTION."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ast_sim.importers.decks.deck_content import Deck
+from ast_sim.importers.decks.deck_numbers import real, tokens
+from ast_sim.importers.decks.keyword_lines import Keyword
+
+MATERIAL_KEYWORDS = ("MATERIAL", "ELASTIC", "PLASTIC", "SOLIDSECTION", "DENSITY")
+COLUMNS = ("young", "poisson", "yield_stress")
+
+
+@dataclass(eq=False)
+class _Material:
+    """Young's modulus, Poisson's ratio and the first yield stress, 0 if it never yields; NaN: not isotropic elastic."""
+
+    young: float = np.nan
+    poisson: float = np.nan
+    yield_stress: float = 0.0
+
+
+def material_columns(deck: Deck) -> tuple[dict[str, list[np.ndarray]], list[str]]:
+    """Columns by name, [c] for each block of elements, and notes; no columns if an element has no such material.
+
+    Raises:
+        DatasetError: a section names a material or elements that there are not; a number cannot be read.
+    """
+    materials, notes = _materials(deck)
+    blocks = [block for block in deck.root.blocks if len(block.numbers)]
+    rows = [np.full((len(block.numbers), len(COLUMNS)), np.nan) for block in blocks]
+    for keyword in deck.keywords:
+        if keyword.name == "SOLIDSECTION":
+            name, elements = keyword.required("MATERIAL").upper(), keyword.required("ELSET").upper()
+            if name not in materials:
+                raise keyword.error(f"there is no material {keyword.options['MATERIAL']!r}")
+            if elements not in deck.root.element_sets:
+                raise keyword.error(f"there is no set of elements {keyword.options['ELSET']!r}")
+            numbers = np.concatenate([numbers for _, numbers in deck.root.element_sets[elements]])
+            one = materials[name]
+            for block, table in zip(blocks, rows, strict=True):
+                table[np.isin(block.numbers, numbers)] = (one.young, one.poisson, one.yield_stress)
+    lacking = sum(int(np.isnan(table).any(axis=1).sum()) for table in rows)
+    if lacking:
+        return {}, [*notes, f"{lacking} elements have no isotropic *ELASTIC: no material is taken"]
+    plastic = any(table[:, 2].any() for table in rows)
+    used = COLUMNS if plastic else COLUMNS[:2]
+    notes.append(f"the columns of the material are {', '.join(used)}")
+    return {name: [table[:, column] for table in rows] for column, name in enumerate(used)}, notes
+
+
+def _materials(deck: Deck) -> tuple[dict[str, _Material], list[str]]:
+    """The materials by name in upper case."""
+    materials: dict[str, _Material] = {}
+    notes: list[str] = []
+    current = _Material()
+    for keyword in deck.keywords:
+        if keyword.name == "MATERIAL":
+            current = materials[keyword.required("NAME").upper()] = _Material()
+        elif keyword.name == "ELASTIC" and keyword.options.get("TYPE", "ISO").upper() in ("ISO", "ISOTROPIC"):
+            current.young, current.poisson = _first(keyword, 2)
+            if len(keyword.data) > 1:
+                notes.append("*ELASTIC depends on the temperature: its first line is taken")
+        elif keyword.name == "PLASTIC":
+            (current.yield_stress,) = _first(keyword, 1)
+    return materials, notes
+
+
+def _first(keyword: Keyword, count: int) -> Sequence[float]:
+    """The first numbers of the first data line."""
+    if not keyword.data or len(tokens(keyword.data[0])) < count:
+        raise keyword.error(f"its first data line has fewer than {count} numbers")
+    return [real(text, keyword.data[0]) for text in tokens(keyword.data[0])[:count]]

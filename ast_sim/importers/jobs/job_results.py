@@ -1,0 +1,95 @@
+"""The frames of a job: the mesh of its deck, with the results that CalculiX has written."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ast_sim.importers.formats.source_mesh import SourceMesh
+from ast_sim.importers.formats.vtk_files import vtk_frames
+from ast_sim.importers.jobs.job import Job
+from ast_sim.importers.stress import order_of, von_mises
+from ast_sim.support.errors import DatasetError
+
+# The coordinates of a deck and of its results may differ by this share of the size of the mesh; results have 6 digits.
+_AGREEMENT = 1e-4
+
+_PRESSURES = ("young", "yield_stress")
+
+
+def job_frames(job: Job, results: Path, pascals: float) -> Iterator[SourceMesh]:
+    """The frames of a job, the first at rest; fields `displacement`, `von_mises` if there are stresses, `node_type`,
+    and the materials at the elements.
+
+    Args:
+        pascals: the unit of stress of the deck. The columns of the material are in pascal; the stress is as it is.
+
+    Raises:
+        DatasetError: the results are those of another deck, or hold no displacement.
+    """
+    materials = {
+        name: [values * (pascals if name in _PRESSURES else 1.0) for values in parts]
+        for name, parts in job.materials.items()
+    }
+    ends = [f"the steps end at {', '.join(f'{end:g}' for end in job.ends)}"] if job.ends else []
+    mesh = replace(job.mesh, path=results, cell_fields=materials, notes=[*job.mesh.notes, *ends])
+    last = None
+    for frame in vtk_frames(results):
+        fields = {"node_type": job.node_type, **_fields(job, frame)}
+        if last is None and frame.time:
+            rest = {name: values if name == "node_type" else np.zeros_like(values) for name, values in fields.items()}
+            told = [*mesh.notes, "a frame at rest stands before the results"]
+            yield replace(mesh, point_fields=rest, time=0.0, notes=told)
+        last = frame.time
+        yield replace(mesh, point_fields=fields, time=frame.time)
+    if last is not None and job.ends and last < job.ends[-1] * (1 - 1e-6):
+        warnings.warn(
+            f"{results}: ends at the time {last:g}, but the steps of {job.mesh.path.name} end at {job.ends[-1]:g}: the"
+            " job was not solved to its end, or its last increment was not written",
+            stacklevel=2,
+        )
+
+
+def _fields(job: Job, frame: SourceMesh) -> dict[str, np.ndarray]:
+    """Displacement and von Mises stress at the points of the deck; NaN where the results have none."""
+    rows, there = _same_nodes(job, frame)
+    if "DISP" not in frame.point_fields:
+        raise DatasetError(f"{frame.path}: holds no displacement: write U with *NODE FILE or *NODE OUTPUT")
+    fields = {"displacement": np.asarray(frame.point_fields["DISP"], np.float64)[:, :3]}
+    if "STRESS" in frame.point_fields:
+        stress = np.asarray(frame.point_fields["STRESS"], np.float64)
+        order = order_of(frame.path, "STRESS", stress.shape[1], frame.columns.get("STRESS", ()), ())
+        fields["von_mises"] = von_mises(stress, order)
+    given = {}
+    for name, values in fields.items():
+        given[name] = np.full((len(job.mesh.points), *values.shape[1:]), np.nan)
+        given[name][rows] = values[there]
+    return given
+
+
+def _same_nodes(job: Job, frame: SourceMesh) -> tuple[np.ndarray, np.ndarray]:
+    """The points of the deck that are in the results, and where they are there.
+
+    Raises:
+        DatasetError: a node of an element is missing, nodes lie elsewhere, or the elements are not as many.
+    """
+    deck = job.mesh
+    assert deck.same_point is not None and frame.same_point is not None
+    numbers, rows, there = np.intersect1d(deck.same_point, frame.same_point, return_indices=True)
+    used = np.unique(np.concatenate([block.nodes.ravel() for block in deck.blocks]))
+    other = f"{frame.path}: holds results of another deck than {deck.path.name}"
+    missing = np.setdiff1d(deck.same_point[used], numbers)
+    if len(missing):
+        raise DatasetError(f"{other}: node {missing[0]} is not in it")
+    away = np.abs(deck.points[rows] - frame.points[there]).max(axis=1)
+    if away.max() > _AGREEMENT * np.ptp(deck.points[used], axis=0).max():
+        row = rows[np.argmax(away)]
+        raise DatasetError(f"{other}: node {deck.same_point[row]} is off by {away.max():g}")
+    counts = [sum(len(block.nodes) for block in mesh.blocks if block.dimension == 3) for mesh in (deck, frame)]
+    if counts[0] != counts[1]:
+        raise DatasetError(f"{other}: it has {counts[1]} elements of a volume, the deck {counts[0]}")
+    return rows, there

@@ -1,0 +1,253 @@
+"""A deck and what CalculiX has made of it become a simulation, without anything written by hand."""
+
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from blocks import block
+
+from ast_sim import Dataset, cli
+from ast_sim.importers.convert import convert
+from ast_sim.importers.series import FieldNames, read_series
+from ast_sim.scene import NodeType
+from ast_sim.support.errors import AstSimError, ConfigError, DatasetError
+
+HIGH = 1.01  # the punch stands this high over the floor of the pad, whose height is 1
+NAMES = FieldNames(stress_unit="MPa")
+
+
+def lines_of(scene, first_node, first_element, shift, name):
+    """The nodes and elements of a body."""
+    nodes = [
+        f"{first_node + row}, {x:.9g}, {y:.9g}, {z:.9g}" for row, (x, y, z) in enumerate(scene.rest_position + shift)
+    ]
+    elements = [
+        ", ".join(map(str, [first_element + row, *(first_node + nodes)])) for row, nodes in enumerate(scene.elements)
+    ]
+    return ["*NODE", *nodes, f"*ELEMENT, TYPE=C3D4, ELSET={name}", *elements]
+
+
+def deck(pad, punch, steps):
+    """A pad whose floor is held, and a rigid punch over it, 1,001 the first of its nodes, 9,001 and 9,002 its reference
+    nodes."""
+    floor = 1 + np.flatnonzero(pad.rest_position[:, 2] == 0)
+    return [
+        "*HEADING",
+        *lines_of(pad, 1, 1, (0, 0, 0), "PAD"),
+        *lines_of(punch, 1001, 1001, (0.5, 0.5, HIGH), "PUNCH"),
+        "*NODE, NSET=REFERENCE",
+        "9001, 1, 1, 3",
+        "9002, 1, 1, 3",
+        "*NSET, NSET=FLOOR",
+        *map(str, floor),
+        "*MATERIAL, NAME=SOFT",
+        "*ELASTIC",
+        "100., 0.4",
+        "*PLASTIC",
+        "30., 0.",
+        "40., 0.5",
+        "*MATERIAL, NAME=STEEL",
+        "*ELASTIC",
+        "210000., 0.3",
+        "*SOLID SECTION, ELSET=PAD, MATERIAL=SOFT",
+        "*SOLID SECTION, ELSET=PUNCH, MATERIAL=STEEL",
+        "*RIGID BODY, ELSET=PUNCH, REF NODE=9001, ROT NODE=9002",
+        "*SURFACE, NAME=TOP",
+        *(f"{1 + row}, S{side}" for row, side in faces_at(pad, 1)),
+        "*SURFACE, NAME=BELOW",
+        *(f"{1001 + row}, S{side}" for row, side in faces_at(punch, 0)),
+        "*SURFACE INTERACTION, NAME=HARD",
+        "*SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=LINEAR",
+        "2000.",
+        "*CONTACT PAIR, INTERACTION=HARD, TYPE=SURFACE TO SURFACE",
+        "TOP, BELOW",
+        "*BOUNDARY",
+        "FLOOR, 1, 3",
+        "9002, 1, 3",
+        *steps,
+    ]
+
+
+def faces_at(scene, height):
+    """(element, side) of the faces at a height; CalculiX's sides are 1-2-3, 1-4-2, 2-4-3 and 3-4-1."""
+    there = scene.rest_position[scene.elements][:, :, 2] == height
+    for element, corners in enumerate(there):
+        for side, face in enumerate(((0, 1, 2), (0, 3, 1), (1, 3, 2), (2, 3, 0)), 1):
+            if corners[list(face)].all():
+                yield element, side
+
+
+def step(move, period=1.0, op=""):
+    return [
+        "*STEP, NLGEOM",
+        "*STATIC, DIRECT",
+        f"{period / 2}, {period}",
+        f"*BOUNDARY{op}",
+        "9001, 1, 2",
+        f"9001, 3, 3, {move}",
+        "*NODE FILE",
+        "U",
+        "*EL FILE",
+        "S",
+        "*END STEP",
+    ]
+
+
+def solved(folder: Path, lines, name="job"):
+    folder.mkdir(exist_ok=True)
+    (folder / f"{name}.inp").write_text("\n".join(lines) + "\n")
+    done = subprocess.run(["ccx", name], cwd=folder, check=True, capture_output=True, text=True, timeout=100)
+    assert "Job finished" in done.stdout
+    return folder / f"{name}.inp", folder / f"{name}.frd"
+
+
+@pytest.fixture(scope="module")
+def bodies():
+    return block(2, 2, 1), block(1, 1, 1)
+
+
+@pytest.fixture(scope="module")
+def press(bodies, tmp_path_factory):
+    """Down by 0.11 in one step of 1 s, up again by half of it in one of 2 s; two increments each."""
+    return solved(tmp_path_factory.mktemp("press"), deck(*bodies, [*step(-0.11), *step(-0.06, 2.0)]))
+
+
+def test_prescribed_nodes_materials_times_and_positions(press, bodies):
+    job, results = press
+    read = read_series(results, NAMES, deck=job)
+    pad, punch = bodies
+    scene, split = read.scene, pad.num_nodes
+    assert np.array_equal(scene.elements, np.concatenate([pad.elements, punch.elements + split]))
+    np.testing.assert_allclose(scene.rest_position[split:], punch.rest_position + (0.5, 0.5, HIGH), atol=1e-6)
+    floor = pad.rest_position[:, 2] == 0
+    assert np.array_equal(scene.node_type[:split] == NodeType.HANDLE, floor)
+    assert (scene.node_type[:split][~floor] == NodeType.NORMAL).all()
+    assert (scene.node_type[split:] == NodeType.OBSTACLE).all()
+    soft, steel = np.array([1e8, 0.4, 3e7], np.float32), np.array([2.1e11, 0.3, 0], np.float32)
+    assert (scene.material[: pad.num_elements] == soft).all() and (scene.material[pad.num_elements :] == steel).all()
+    assert read.times == (0.0, 0.5, 1.0, 2.0, 3.0)
+    moved = read.position - scene.rest_position
+    np.testing.assert_allclose(moved[:, split:, 2].T, [[0, -0.055, -0.11, -0.085, -0.06]] * punch.num_nodes, atol=2e-6)
+    assert not moved[0].any() and not moved[:, :split][:, floor].any()
+    middle = np.flatnonzero((pad.rest_position == (1, 1, 1)).all(axis=1))[0]
+    assert moved[2, middle, 2] == pytest.approx(-0.1, abs=0.02)  # it goes with the punch, apart from the penalty
+    assert read.stress_location == "node" and read.stress.shape == (5, scene.num_nodes, 1)
+    assert not read.stress[0].any() and 1e6 < read.stress[2].max() < 1e9
+    assert "the steps end at 1, 3" in read.attributes["notes"]
+
+
+def test_one_command_makes_a_dataset(press, tmp_path, capsys):
+    job, results = press
+    command = ["convert", str(job), str(results), "--out", str(tmp_path / "d.h5"), "--shares", "1", "0", "0"]
+    assert cli.main(command) == 2
+    assert "give both, for example --length-unit mm --stress-unit MPa" in capsys.readouterr().err
+    assert cli.main([*command, "--length-unit", "mm", "--stress-unit", "MPa"]) == 0
+    told = capsys.readouterr().out
+    assert "the columns of the material are young, poisson, yield_stress" in told
+    with Dataset(tmp_path / "d.h5") as data:
+        assert data.info.length_unit == "mm"
+        assert data.info.generator["names"]["stress_unit"] == "MPa"
+        assert data.info.generator["material"] == ["young", "poisson", "yield_stress"]
+        assert data["train"][0].num_frames == 5
+
+
+def test_a_folder_of_jobs(press, tmp_path):
+    for name in "ab":
+        for file in press:
+            (tmp_path / f"{name}{file.suffix}").write_bytes(file.read_bytes())
+    counts = convert(tmp_path, tmp_path / "d.h5", names=NAMES, length_unit="mm", splits={"train": 0.5, "test": 0.5})
+    assert counts == {"train": 1, "valid": 0, "test": 1}
+    with pytest.raises(ConfigError, match=r"a.inp: a deck does not say its units"):
+        convert(tmp_path, tmp_path / "e.h5", splits={"train": 1})
+
+
+@pytest.mark.parametrize(
+    ("young", "unit", "warns"), [(1, "MPa", True), (100, "MPa", False), (2.1, "GPa", False), (1, "Pa", True)]
+)
+def test_a_modulus_of_about_one_is_doubted(press, tmp_path, young, unit, warns, recwarn):
+    job = tmp_path / "job.inp"
+    job.write_text(press[0].read_text().replace("100., 0.4", f"{young}, 0.4"))
+    names = FieldNames(stress_unit=unit)
+    convert(press[1], tmp_path / "d.h5", names=names, deck=job, length_unit="mm", splits={"train": 1}, progress=str)
+    told = [str(one.message) for one in recwarn if "Young's modulus is" in str(one.message)]
+    assert bool(told) == warns
+    assert not warns or f"Young's modulus is 1 {unit}: is this the unit" in told[0]
+
+
+EDITS = {
+    "another node": (
+        ("1, 0, 0, 0", "1, 0, 0, 0.5"),
+        "holds results of another deck than job.inp: node 1 is off by 0.5",
+    ),
+    "no set": (("FLOOR, 1, 3", "FLOR, 1, 3"), r"job.inp:\d+: \*BOUNDARY: there is no set of nodes 'FLOR'"),
+    "no material": (("MATERIAL=SOFT", "MATERIAL=HARD"), "there is no material 'HARD'"),
+    "parts": (("*HEADING", "*PART, NAME=A\n*END PART"), "has parts and instances, which CalculiX does not know"),
+}
+
+
+@pytest.mark.parametrize("case", EDITS)
+def test_a_deck_that_does_not_fit_is_refused(press, tmp_path, case):
+    (old, new), message = EDITS[case]
+    text = press[0].read_text()
+    assert old in text
+    (tmp_path / "job.inp").write_text(text.replace(old, new, 1))
+    with pytest.raises(DatasetError, match=message):
+        read_series(press[1], NAMES, deck=tmp_path / "job.inp")
+
+
+def types_of(press, tmp_path, *edits):
+    """The types of the nodes, and the notes, after edits of the deck; the results stay."""
+    text = press[0].read_text()
+    for old, new in edits:
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "job.inp").write_text(text)
+    read = read_series(press[1], NAMES, deck=tmp_path / "job.inp")
+    return read.scene.node_type, read.attributes["notes"], read
+
+
+def test_what_is_held_in_some_directions_is_free_with_a_note(press, tmp_path, bodies):
+    types, notes, _ = types_of(press, tmp_path, ("FLOOR, 1, 3", "FLOOR, ZSYMM"))
+    assert not (types == NodeType.HANDLE).any()
+    assert "9 nodes are held in some directions only (symmetry, sliding): they count as free" in notes
+    types, notes, _ = types_of(press, tmp_path, ("FLOOR, 1, 3", "FLOOR, ENCASTRE"))
+    assert (types == NodeType.HANDLE).sum() == 9 and "some directions" not in notes
+    types, _, _ = types_of(press, tmp_path, ("FLOOR, 1, 3", "FLOOR, 3, 3, 0.1"))  # it drives
+    assert (types == NodeType.HANDLE).sum() == 9
+
+
+def test_a_rigid_body_that_is_free_in_part_or_wholly(press, tmp_path, bodies):
+    punch = slice(bodies[0].num_nodes, None)
+    types, notes, _ = types_of(press, tmp_path, ("9002, 1, 3", "9002, 1, 2"))
+    assert (types[punch] == NodeType.OBSTACLE).all()
+    assert "the rigid body PUNCH is free about z: this motion is taken from the results" in notes
+    types, notes, _ = types_of(press, tmp_path, ("9001, 1, 2\n", ""), ("9001, 3, 3", "9002, 3, 3"))
+    assert (types[punch] == NodeType.NORMAL).all() and "the rigid body PUNCH is prescribed nowhere" in notes
+
+
+def test_other_laws_loads_and_constraints_are_told(press, tmp_path, bodies):
+    *_, read = types_of(press, tmp_path, ("*ELASTIC\n100., 0.4", "*HYPERELASTIC, NEO HOOKE\n20., 0.01"))
+    assert read.scene.material is None
+    lacking = f"{bodies[0].num_elements} elements have no isotropic *ELASTIC: no material is taken"
+    assert lacking in read.attributes["notes"]
+    _, notes, _ = types_of(press, tmp_path, ("*NODE FILE", "*CLOAD\n5, 3, 1.\n*NODE FILE"))
+    assert "loads are not part of a scene and must be equal in all of them: CLOAD" in notes
+    _, notes, _ = types_of(press, tmp_path, ("*STEP", "*EQUATION\n2\n5, 1, 1., 6, 1, -1.\n*STEP"))
+    assert "constraints are not read: EQUATION" in notes
+
+
+def test_nodes_of_some_steps_only_and_a_job_that_stopped(press, tmp_path):
+    _, notes, _ = types_of(press, tmp_path, ("2.0\n*BOUNDARY", "2.0\n*BOUNDARY, OP=NEW"))
+    assert "nodes are prescribed in some steps only: they count as prescribed in all" in notes
+    with pytest.warns(UserWarning, match=r"ends at the time 3, but the steps of job.inp end at 5"):
+        types_of(press, tmp_path, ("1.0, 2.0", "1.0, 4.0"))
+
+
+def test_results_without_displacements_and_other_files(bodies, press, tmp_path):
+    with pytest.raises(AstSimError, match="beside a deck, results must be a file of CalculiX"):
+        convert(tmp_path / "a.vtu", tmp_path / "d.h5", deck=press[0])
+    lines = [line for line in deck(*bodies, step(-0.02)) if line not in ("*NODE FILE", "U")]
+    job, results = solved(tmp_path / "s", lines)
+    with pytest.raises(DatasetError, match="holds no displacement: write U with"):
+        read_series(results, NAMES, deck=job)
