@@ -15,6 +15,10 @@ from .scene import NodeType as NodeType
 from .scene import Scene as Scene
 from .scene import Trajectory as Trajectory
 from .simulate.jobs.generate import generate as generate
+from .simulate.shapes.simple_bodies import ball as ball
+from .simulate.shapes.simple_bodies import box as box
+from .simulate.shapes.simple_bodies import cylinder as cylinder
+from .simulate.shapes.simple_bodies import plate as plate
 from .support.errors import AstSimError as AstSimError
 from .training.start import new_model as new_model
 from .training.start import train as train

@@ -191,7 +191,7 @@ def _add_convert(convert: _Parser) -> None:
 
 
 def _add_info(info: _Parser) -> None:
-    info.add_argument("path", type=path, metavar="FILE_OR_RUN", help="dataset (.h5) or run folder")
+    info.add_argument("path", type=path, metavar="FILE_OR_RUN", help="dataset (.h5), run folder or run file (.ast)")
     info.add_argument("--json", action="store_true", help="print JSON")
     info.add_argument("--strict", action="store_true", help="exit with an error if something looks wrong")
 
@@ -208,6 +208,9 @@ def _add_train(train: _Parser) -> None:
     }
     _add_each(train, files, type=path)
     _add_each(train, {"--set k=v": "change a setting; may be repeated"}, action="append", default=[])
+    _add_each(
+        train, {"--minutes M": "train so long: 50 steps are timed, then the number of steps is fixed"}, type=float
+    )
     train.add_argument("--resume", action="store_true", help="go on after the last checkpoint, if there is one")
     _add_each(train, {"--profile N": "only measure N steps and print how their time divides"}, type=at_least(1))
 

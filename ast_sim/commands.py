@@ -135,10 +135,10 @@ def info(args: argparse.Namespace) -> None:
     """Check a dataset or a run and show what it holds."""
     from ast_sim.dataset.contents import describe_dataset, text
 
-    if args.path.is_dir():
-        from ast_sim.runs.folder import RunFolder
+    if args.path.is_dir() or args.path.suffix == ".ast":
+        from ast_sim.runs.run_file import open_run
 
-        found = RunFolder(args.path).describe()
+        found = open_run(args.path).describe()
     else:
         found = describe_dataset(args.path)
     print(json.dumps(found, indent=1) if args.json else text(found))
@@ -155,12 +155,15 @@ def train(args: argparse.Namespace) -> None:
     if args.data is None and not args.resume:
         raise ConfigError("name the dataset to train on, or give --resume to go on with the run in --out")
     files = {"config": args.config, "from_run": getattr(args, "from")}
-    if args.data is None and (args.model or args.preset or args.set or any(files.values())):
-        raise ConfigError("a resumed run keeps its settings: leave --model, --preset, --config, --from and --set out")
+    if args.data is None and (args.model or args.preset or args.set or args.minutes or any(files.values())):
+        raise ConfigError(
+            "a resumed run keeps its settings: leave --model, --preset, --config, --from, --minutes and --set out"
+        )
     # A resumed run keeps its settings; with a dataset, the given settings are compared with them.
     config = None
     if args.data is not None:
-        config = configure(args.data, args.preset, args.set, args.model, **files)
+        changes = {} if args.minutes is None else {"train.minutes": args.minutes}
+        config = configure(args.data, args.preset, args.set, args.model, **files, changes=changes)
     steps = args.profile or 0
     start_training(args.out, config, resume=args.resume, profile_steps=steps, from_run=files["from_run"])
     if args.profile is None:
@@ -310,7 +313,8 @@ def report(args: argparse.Namespace) -> None:
 
     check_suffix(args.out)
     _check_output(args, args.out, [*args.shown, *filter(None, [args.data])])
-    datasets = [path for path in args.shown if path.is_file() or (path.suffix == ".h5" and not path.is_dir())]
+    no_runs = (path for path in args.shown if not path.is_dir() and path.suffix != ".ast")
+    datasets = [path for path in no_runs if path.is_file() or path.suffix == ".h5"]
     if len(datasets) < len(args.shown) and datasets:
         raise ConfigError(
             f"{datasets[0]} is a dataset, the others are runs: a page shows runs or one dataset;"

@@ -10,7 +10,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from ast_sim.scene import Scene, nodes_of_body
+from ast_sim.number_arrays import nodes_of_body
+from ast_sim.scene import Scene
 from ast_sim.support.errors import ConfigError
 
 Vector = Sequence[float]

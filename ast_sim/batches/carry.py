@@ -13,7 +13,8 @@ import numpy as np
 from scipy.sparse.linalg import splu
 
 from ast_sim.element_topology import linear_elements
-from ast_sim.scene import Scene, connected_parts
+from ast_sim.number_arrays import connected_parts
+from ast_sim.scene import Scene
 
 RIGID = 1e-3  # prescribed nodes move as a rigid body if no node is farther off, as a share of the largest displacement
 PLANAR = 1e-6  # points lie on a line if their second extent, as a share of the first, is below this

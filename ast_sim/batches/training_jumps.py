@@ -6,7 +6,9 @@ go through all these calls side by side while the model trains: the answer that 
 scene's next step. This costs no additional prediction.
 
 The errors of later calls are smaller. So that they count as much, the squared error of call k is divided by the mean
-square of the errors that call k has found so far, relative to that of the first call.
+square of the errors that call k leaves, relative to what the first call leaves. What it leaves is what call k + 1 has
+found so far; what the last call leaves counts as what it finds. A division by what a call finds would give the first
+call, which finds the whole displacement, hardly any weight.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from ast_sim.batches.training_pool import Pool
 
 MEMORY = 0.99  # share of the running mean square that stays when a scene is added
 UNSEEN = 0.3  # the first guess of the errors of later calls, relative to that of the first
-LEAST = 0.02  # the errors of later calls, relative to that of the first, count as at least this
+LEAST = 0.02  # what later calls leave, relative to what the first leaves, counts as at least this
 ELSEWHERE = 0.1  # share of the jumps that start from a later frame than the first
 
 
@@ -65,11 +67,12 @@ class JumpPool(Pool):
         for call, square in errors:
             before = self._squares[call]
             self._squares[call] = square if np.isnan(before) else MEMORY * before + (1 - MEMORY) * square
-        found = [self._going[place].call for place in self._places(number)]
-        known = np.where(np.isnan(self._squares), UNSEEN**2 * self._squares[0], self._squares)
-        shares = known / known[0] if known[0] > 0 else np.ones(self._calls)
+        found = np.where(np.isnan(self._squares), UNSEEN**2 * self._squares[0], self._squares)
+        left = np.append(found[1:], found[-1])
+        shares = left / left[0] if left[0] > 0 else np.ones(self._calls)
         shares = np.where(np.isfinite(shares), np.maximum(shares, LEAST**2), 1)
-        return torch.tensor(1 / shares[found], dtype=torch.float32)
+        calls = [self._going[place].call for place in self._places(number)]
+        return torch.tensor(1 / shares[calls], dtype=torch.float32)
 
     def state(self) -> dict[str, Tensor]:
         return {**super().state(), "squares": torch.from_numpy(self._squares.copy())}

@@ -34,7 +34,8 @@ from ast_sim.dataset.layout import (
     DatasetInfo,
     require_kind,
 )
-from ast_sim.scene import AttributeValue, Scene, Trajectory, require_finite
+from ast_sim.number_arrays import require_finite
+from ast_sim.scene import AttributeValue, Scene, Trajectory
 from ast_sim.support.byte_cache import ByteCache
 from ast_sim.support.errors import DatasetError
 

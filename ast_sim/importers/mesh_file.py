@@ -20,7 +20,8 @@ from ast_sim.importers.places import Mask, marked
 from ast_sim.importers.shells import Shells, find_shells
 from ast_sim.importers.solids.mesh_elements import Elements, elements_of
 from ast_sim.importers.solids.stitching import Stitching
-from ast_sim.scene import NodeType, Scene, connected_parts
+from ast_sim.number_arrays import connected_parts
+from ast_sim.scene import NodeType, Scene
 from ast_sim.support.errors import DatasetError
 
 if TYPE_CHECKING:

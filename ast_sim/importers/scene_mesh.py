@@ -12,8 +12,9 @@ import numpy as np
 from ast_sim.importers.mesh_file import MeshFile, read_mesh
 from ast_sim.importers.places import Place, parse_places
 from ast_sim.importers.solids.mesh_elements import require_extent
+from ast_sim.number_arrays import nodes_of_body
 from ast_sim.plausibility.topology import at_rest
-from ast_sim.scene import NodeType, Scene, nodes_of_body
+from ast_sim.scene import NodeType, Scene
 from ast_sim.support.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ast_sim.element_topology import LOCAL_FACES
-from ast_sim.scene import connected_parts
+from ast_sim.number_arrays import connected_parts
 
 # The layer is so many mean edge lengths thick.
 _THICKNESS = 0.5

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -14,12 +15,34 @@ from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.scene import AttributeValue, Scene, Trajectory
-from ast_sim.support.errors import AstSimError
-from ast_sim.view import export, sweep_files
+from ast_sim.support.errors import AstSimError, RolloutError
+from ast_sim.view import export, picture, sweep_files
 from ast_sim.view.files import make_folder
+
+if TYPE_CHECKING:
+    import pyvista
+    from matplotlib.figure import Figure
 
 SUFFIXES = (".h5", ".pvd", ".vtkhdf", ".csv")
 ELASTIC = ("assembly", "abcd", "abcd_xl")  # families whose material is Young's modulus and Poisson's ratio
+
+
+class AnsweredFrame(NamedTuple):
+    """One frame of an answer.
+
+    Attributes:
+        number: its number in the motion that was asked.
+        time: in seconds; None: it is not known.
+        position: [N, 3].
+        displacement: [N, 3], from the positions at rest.
+        stress: [N or E], von Mises stress in pascal, or None.
+    """
+
+    number: int
+    time: float | None
+    position: np.ndarray
+    displacement: np.ndarray
+    stress: np.ndarray | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +96,68 @@ class Answer:
     def computed(self) -> np.ndarray:
         """[S] bool: the frames that were predicted, not given."""
         return np.array(self.frames, np.int64) >= self.given
+
+    @property
+    def displacement(self) -> np.ndarray:
+        """[S, N, 3]: the displacements from the positions at rest, in the run's unit of length."""
+        return self.position - self.scene.rest_position
+
+    def frame(self, number: int) -> AnsweredFrame:
+        """The frame with this number in the motion that was asked.
+
+        Raises:
+            RolloutError: the answer does not have it; the text names the frames that it has.
+        """
+        if number not in self.frames:
+            known = ", ".join(map(str, self.frames[:20])) + (", ..." if len(self.frames) > 20 else "")
+            raise RolloutError(f"{self.name}: the answer has no frame {number}; it has: {known or 'none'}", self)
+        return self._frame(self.frames.index(number))
+
+    def _frame(self, row: int) -> AnsweredFrame:
+        times = None if self.info is None else self.info.times((self.frames[row],))
+        return AnsweredFrame(
+            self.frames[row],
+            None if times is None else times[0],
+            self.position[row],
+            self.position[row] - self.scene.rest_position,
+            None if self.stress is None else self.stress[row, :, 0],
+        )
+
+    def __iter__(self) -> Iterator[AnsweredFrame]:
+        """The frames, in the order in which they were asked for."""
+        return map(self._frame, range(len(self.frames)))
+
+    def plot(self, number: int | None = None) -> Figure:
+        """A picture of one frame, coloured by stress, or by displacement if the model predicts no stress.
+
+        Args:
+            number: the number of the frame; by default the one in which the deforming bodies are displaced most.
+
+        Returns:
+            A matplotlib figure: `answer.plot().savefig("answer.png")`.
+
+        Raises:
+            RolloutError: the answer has no such frame.
+            MissingExtra: matplotlib is not installed.
+        """
+        shown = self.trajectory
+        if not self.frames:
+            raise RolloutError(f"{self.name}: the answer has no frame to draw", self)
+        number = shown.numbers[picture.farthest(shown)] if number is None else self.frame(number).number
+        return picture.plot(shown, shown.numbers.index(number), self.name, shown.length_unit or "m")
+
+    def to_pyvista(self, number: int | None = None) -> pyvista.UnstructuredGrid:
+        """One frame as a grid of PyVista, with the fields of a file for ParaView.
+
+        Args:
+            number: the number of the frame; by default the last one of the motion that the answer has.
+
+        Raises:
+            RolloutError: the answer has no such frame.
+            MissingExtra: pyvista is not installed: pip install "ast_sim[pyvista]".
+        """
+        chosen = self.frame(max(self.frames, default=0) if number is None else number).number
+        return export.to_pyvista(self.trajectory.select([chosen]))
 
     @property
     def converged(self) -> bool | None:

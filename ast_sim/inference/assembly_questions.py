@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,7 +49,8 @@ def ask(
     frames: int | None = None,
     nodes: int | None = None,
 ) -> list[Asked]:
-    """The scenes with these values of the parameters; equal scenes are one object, which is prepared once.
+    """The scenes with these values of the parameters; equal scenes are one object, which is prepared once. A warning
+    tells each of their notes.
 
     Args:
         spec: the file of the specification.
@@ -66,11 +68,14 @@ def ask(
         raise ConfigError(
             f"{Path(spec).name} has lengths in {read.unit}, but the run was trained in {scope.length_unit}"
         )
-    shared, found, known = reference(read), [], {}
+    shared, found, known, notes = reference(read), [], {}, {}
     for row in rows:
         values = completed(read.parameters, row)
         case = scene_of(read, values, nodes, frames or read.frames, shared).case
+        notes |= dict.fromkeys(case.notes())
         arrays = (case.scene.rest_position, case.scene.elements, case.scene.node_type, case.scene.material)
         scene = known.setdefault(tuple(np.asarray(array).tobytes() for array in arrays), case.scene)
         found.append(Asked(scene, Motion(case.targets.astype(np.float32)), values, list(shared.origin)))
+    for note in notes:
+        warnings.warn(note, stacklevel=2)
     return found

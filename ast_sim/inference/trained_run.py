@@ -23,7 +23,7 @@ from ast_sim.inference.evaluation.evaluated_run import Evaluation
 from ast_sim.inference.predict import Motions, in_domain, new_question
 from ast_sim.inference.question import Frames, Question
 from ast_sim.inference.sweep import Sweep, sweep
-from ast_sim.runs.folder import RunFolder
+from ast_sim.runs import run_file
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.own_assembly.grid import grid, read_table
 from ast_sim.support.errors import ConfigError, RolloutError
@@ -35,8 +35,11 @@ from ast_sim.support.toml_settings import NOTHING
 class Run:
     """A trained run, with the model of its best checkpoint (the last one if none was validated).
 
+    Args:
+        path: the run folder, or a file that `save` wrote.
+
     Attributes:
-        path: the run folder.
+        path: the run folder or the file.
         model: the trained model, an `nn.Module`.
         settings: the settings of the model and of the training.
         step: the step of the checkpoint.
@@ -46,18 +49,34 @@ class Run:
         scope: the ranges of sizes, materials and motions in the training scenes.
 
     Raises:
-        CheckpointError: the folder holds no run, or no checkpoint in it can be read.
+        CheckpointError: the folder holds no run, no checkpoint in it can be read, or the file is damaged.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
-        self.folder = RunFolder(self.path)
+        self.folder = run_file.open_run(self.path)
         self.settings, self.scope = self.folder.settings, self.folder.scope
         self.model, self.step = self.folder.load_model(), self.folder.chosen.step
         answers = self.folder.chosen.answers
         unset = {"corrections": (self.settings.train.calls or 1) - 1}
         self.effort = Effort(**answers.get("effort", unset))
         self._errors = [EffortErrors.from_json(one) for one in answers.get("valid_by_effort", [])]
+
+    def save(self, path: str | os.PathLike[str], licence: str | None = None) -> None:
+        """Write the run as one file, `NAME.ast`, that `Run("NAME.ast")` opens on any machine.
+
+        It holds the weights of the best checkpoint, the settings, the scope, the default effort, the curves of the
+        training, a model card and a licence, as a zip of plain files. The state of the optimizer and the dataset stay
+        behind: a training cannot go on from it.
+
+        Args:
+            path: the file; an earlier one is replaced, whole or not at all.
+            licence: the text of the licence of the weights; by default the file says that none was stated.
+
+        Raises:
+            CheckpointError: the name does not end in `.ast`, or the file cannot be written.
+        """
+        run_file.write(Path(path), self.folder, self.model, licence)
 
     @property
     def info(self) -> DatasetInfo:
@@ -248,9 +267,11 @@ class Run:
 
         Raises:
             DatasetError: the dataset cannot be read.
-            ConfigError: its integration, stress location, material columns or elements differ from those of the
-                training data.
+            ConfigError: the run is a file, and no dataset is named; or its integration, stress location, material
+                columns or elements differ from those of the training data.
         """
+        if data is None and self.path.is_file():
+            raise ConfigError(f"{self.path} holds no dataset: name one; the run learned from {self.settings.data}")
         dataset = Dataset(data or self.settings.data, self.scope.length_unit)
         try:
             self.folder.require_fit(dataset)

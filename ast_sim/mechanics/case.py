@@ -13,7 +13,7 @@ from ast_sim.motion_course import Course, Leg
 from ast_sim.scene import AttributeValue, Scene
 from ast_sim.support.errors import SimulationError
 
-NOTES, NEXT_NOTE = "notes", "; "  # the attribute that holds what a user should know of a scene, and what separates it
+NOTES, NEXT_NOTE = "notes", "\n"  # the attribute that holds what a user should know of a scene, and what separates it
 NEARBY = (1.0, 0.95, 1.05, 0.9, 1.1)  # sizes of meshes that are tried, relative to the wanted one
 
 

@@ -126,7 +126,7 @@ class BSMS(WorldEdgeSimulator):
 
 
 PRESETS = {
-    "tiny": tiny(BSMSConfig(hidden=64, hidden_layers=1, levels=3, contacts="components"), peak_rate=1e-3),
+    "tiny": tiny(BSMSConfig(hidden=64, hidden_layers=1, levels=3, contacts="components"), peak_rate=1e-3, batch_size=4),
     # As the AST paper trains it (sections "Batch Size and Learning Rate", "Baselines").
     "paper": Preset(BSMSConfig(), PAPER_TRAINING),
     # As its authors train it on the plate, except for their schedule (0.794 per epoch) and for stress, which they omit.

@@ -192,7 +192,7 @@ def _gather(q: Tensor, k: Tensor, v: Tensor, edges: EdgeSet, rows: slice) -> tup
 
 
 PRESETS = {
-    "tiny": tiny(HCMTConfig(hidden=64, hidden_layers=1, levels=3), peak_rate=2e-3),
+    "tiny": tiny(HCMTConfig(hidden=64, hidden_layers=1, levels=3), peak_rate=2e-3, batch_size=4),
     # As the AST paper trains it, one scene on each of four GPUs (sections "Batch Size and Learning Rate", "Baselines").
     "paper": Preset(HCMTConfig(), {**PAPER_TRAINING, "batch_size": 4}),
     # As its authors train it, except for their schedule, 0.1^(step / 1e6).

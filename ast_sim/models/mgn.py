@@ -82,7 +82,7 @@ class MGN(WorldEdgeSimulator):
 
 
 PRESETS = {
-    "tiny": tiny(MGNConfig(hidden=64, hidden_layers=1, blocks=8), peak_rate=4e-3),
+    "tiny": tiny(MGNConfig(hidden=64, hidden_layers=1, blocks=8), peak_rate=4e-3, batch_size=4),
     # As the AST paper trains it (sections "Batch Size and Learning Rate", "Baselines").
     "paper": Preset(MGNConfig(), PAPER_TRAINING),
     # As its authors train it, except for their schedule: 0.1^(step / 5e6) over 1e7 steps.

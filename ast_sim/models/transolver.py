@@ -175,7 +175,7 @@ class Transolver(Simulator):
 
 
 PRESETS = {
-    "tiny": tiny(TransolverConfig(hidden=64, blocks=4, heads=4, slices=32, mlp_ratio=2), peak_rate=2e-3),
+    "tiny": tiny(TransolverConfig(hidden=64, blocks=4, heads=4, slices=32, mlp_ratio=2), peak_rate=3e-3),
     # StructBench (github.com/qilinli/StructBench), configs/deforming_plate/transolver.toml; noise of 3 mm, weights 1.
     "original": Preset(
         TransolverConfig(node_inputs=()),

@@ -19,7 +19,10 @@ class TrainConfig:
     from the data."""
 
     steps: int | None = setting(None, "optimizer steps; unset: as many as `epochs` asks for")
-    epochs: int = setting(100, "passes over the training pairs; it has no effect if `steps` is set")
+    minutes: float | None = setting(
+        None, "minutes of training: 50 steps are timed first, then the number of steps is fixed; leave `steps` unset"
+    )
+    epochs: int = setting(100, "passes over the training pairs, if neither `steps` nor `minutes` is set")
     batch_size: int = setting(48, "scenes in a batch; each scene is a pair of frames")
     accumulate: int = setting(1, "batches in a step; the step averages their gradients")
     optimizer: OptimizerName = setting(
@@ -45,9 +48,7 @@ class TrainConfig:
         " 0: it learns from the states of the dataset, with noise; unset: 16 batches if the scenes are dynamic or the"
         " model is ast or transolver, else 0; always 0 with model.jumps and without noise",
     )
-    calls: int | None = setting(
-        None, "with model.jumps: so many calls correct one another in training; unset: 6 with jumps, else 1"
-    )
+    calls: int = setting(1, "with model.jumps: so many calls correct one another in training; without jumps 1")
     noise_gamma: float | None = setting(
         None, "share of the noise that the target takes back; unset: 1, in dynamic scenes 0.1"
     )

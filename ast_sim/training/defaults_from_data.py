@@ -20,12 +20,12 @@ _COUNTS += ("validate_every", "checkpoint_every", "calls")
 _RANGES = {
     **dict.fromkeys(_COUNTS, (1, LARGEST)),
     **dict.fromkeys(("seed", "warmup", "validate_scenes", "noise"), (0, LARGEST)),
+    "minutes": (1e-3, LARGEST),
     "peak_rate": (1e-30, 1.0),
     "clip": (1e-30, math.inf),
     "stress_weight": (0, 1e6),
     "noise_gamma": (0, 1),
 }
-CALLS = 6  # (docs/log.md, 2026-11-24)
 ROLLOUT_BATCHES = 16  # an unset pool of rollouts holds the scenes of so many batches
 
 
@@ -66,7 +66,6 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
         "warmup": min(2000, steps // 20),
         "decay": steps if config.steps is not None else steps + epoch,
         "noise_gamma": 0.1 if model.dynamic else 1.0,
-        "calls": CALLS if model.jumps else 1,
         "validate_every": validate_every,
         "checkpoint_every": validate_every,
     }

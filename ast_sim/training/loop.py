@@ -33,8 +33,12 @@ from ast_sim.training.processes import Processes
 from ast_sim.training.profile import profile, table
 from ast_sim.training.rates import learning_rate, step_seed
 from ast_sim.training.saving import Saver
-from ast_sim.training.validation import validate, verdict
+from ast_sim.training.validation import Validated, error_share, validate, verdict
 
+OFTEN = 16  # passes over the data, from which on little is gained (docs/log.md, 2026-11-26)
+APART = (
+    1.25  # validation scenes have so many times the error of training scenes: the training knows its scenes by heart
+)
 JUMP_BATCHES = 64  # the pool of jumps holds so many batches; with 8, steps learn less: the calls of a jump are alike
 
 
@@ -54,7 +58,7 @@ class Training:
         signals: StopSignals,
         processes: Processes | None = None,
     ) -> None:
-        self.run, self.config, self.dataset, self.signals = run, config, dataset, signals
+        self.run, self.config, self.dataset, self.scales, self.signals = run, config, dataset, scales, signals
         self.options, self.processes = config.train, processes or Processes()
         torch.manual_seed(self.options.seed)
         self.model = build_model(config.model)
@@ -67,7 +71,7 @@ class Training:
         self.saver = Saver(run, dataset, self.model, self.optimizer, self.pool, self.processes)
         self.step = 0
         self.stopping = 0  # the number of a signal that some process has received; 0: no signal
-        introduce(self.model, config, dataset, scales, self.sampler.num_pairs)
+        self.told = False  # whether the user knows that more scenes would help more than more steps
 
     def __enter__(self) -> Training:
         return self
@@ -117,12 +121,14 @@ class Training:
 
     def profile(self, steps: int) -> None:
         """Print how the time of a step divides between its parts, measured on `steps` steps."""
+        self._introduce()
         self.prepare()
         print(table(profile(self.advance, steps)))
 
     def go(self) -> None:
         """Train from the newest checkpoint, or from the beginning, to the last step."""
         options = self.options
+        self._introduce()
         self.prepare()
         with Console(options.steps, self.step, self.signals) as self.progress:
             validated = self.processes.of_leader(self.log.metrics.validation(self.step) is not None)
@@ -144,6 +150,9 @@ class Training:
                 if validates:
                     self._validate()
 
+    def _introduce(self) -> None:
+        introduce(self.model, self.config, self.dataset, self.scales, self.sampler.num_pairs)
+
     def _due(self, every: int) -> bool:
         return self.step % every == 0 or self.step == self.options.steps
 
@@ -154,6 +163,12 @@ class Training:
     def _stop_if_asked(self) -> None:
         if self.stopping:
             self.progress.line(f"stopped after step {self.step:,}: go on with --resume")
+            raise Interrupted(self.stopping)
+
+    def end_if_asked(self) -> None:
+        """End a training that is only timed, if a signal asks for it."""
+        self._heed_signals()
+        if self.stopping:
             raise Interrupted(self.stopping)
 
     def advance(self) -> None:
@@ -205,16 +220,23 @@ class Training:
             f" {', '.join(names)}, or start again with a train.peak_rate below {self.options.peak_rate:.3g}; {kept}"
         )
 
-    def _validate(self) -> None:
-        """Roll out the validation scenes; if their error is the lowest so far, mark the checkpoint of this step."""
-        scenes = self.dataset.with_frames("valid", self.model.config.given_frames + 1)[: self.options.validate_scenes]
-        if not scenes:
-            return
+    def validated(self, split: str) -> list[Validated]:
+        """The errors of the first scenes of a split, predicted by all processes together."""
+        scenes = self.dataset.with_frames(split, self.model.config.given_frames + 1)[: self.options.validate_scenes]
         self.ahead.wait()
         mine = scenes[self.processes.rank :: self.processes.count]
         # Several processes must stop together, so none of them may stop within its own validation.
         progress = self._stop_at_once if self.processes.count == 1 else None
-        validated = self.processes.gathered(validate(self.model, self.dataset, mine, self.options.calls, progress))
+        return self.processes.gathered(
+            validate(self.model, self.dataset, split, mine, self.options.calls, progress, efforts=split == "valid")
+        )
+
+    def _validate(self) -> None:
+        """Roll out the validation scenes; if their error is the lowest so far, mark the checkpoint of this step."""
+        validated = self.validated("valid")
+        if not validated:
+            return
+        self._compare_with_training_scenes(validated)
         seconds = self.clock.validation()
         if not self.processes.leads:
             return
@@ -229,6 +251,21 @@ class Training:
             self.run.mark_best(record)
         self.log.metrics.append(record)
         self.progress.line(f"validation after step {self.step:,}: {outcome.text} ({duration(seconds)})")
+
+    def _compare_with_training_scenes(self, validated: list[Validated]) -> None:
+        """Say once that the training repeats its data in vain, if it does."""
+        scenes = self.step * self.options.batch_size * self.options.accumulate
+        passes = scenes / self.sampler.num_pairs
+        if self.told or passes <= OFTEN:
+            return
+        known, unknown = error_share(self.validated("train")), error_share(validated)
+        if known is not None and unknown is not None and unknown > APART * known:
+            self.told = True
+            self.progress.line(
+                f"each pair of frames was seen {passes:.0f} times. The error is {100 * known:.2g} % of the displacement"
+                f" on training scenes, {100 * unknown:.2g} % on validation scenes: more scenes help more than more"
+                " steps"
+            )
 
     def _stop_at_once(self, frame: int) -> None:
         self._heed_signals()

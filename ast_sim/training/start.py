@@ -6,8 +6,9 @@ import dataclasses
 import errno
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from ast_sim.training.data_lengths import DataScales, measure, scope_of
 from ast_sim.training.defaults_from_data import resolve
 from ast_sim.training.loop import Training
 from ast_sim.training.processes import Processes
+from ast_sim.training.time_budget import UNKNOWN_STEPS, steps_within
 
 _FOLLOW_FROM_STEPS = ("train.warmup", "train.decay", "train.validate_every", "train.checkpoint_every")
 
@@ -47,6 +49,8 @@ def configure(
     """
     file = None if config is None else Path(config)
     given = {} if file is None else read_changes(file)
+    if "train.steps" in given:  # a run that was given minutes has both
+        given.pop("train.minutes", None)
     if from_run is None:
         with _naming(file):
             named = given.pop("model.name", "ast")
@@ -55,7 +59,8 @@ def configure(
     elif model or preset:
         raise ConfigError("a run that starts from another one has its model and settings: leave model and preset out")
     else:
-        found = dataclasses.replace(RunFolder(Path(from_run)).settings, data=str(data))
+        source = RunFolder(Path(from_run)).settings
+        found = dataclasses.replace(source, train=dataclasses.replace(source.train, minutes=None), data=str(data))
     before = found
     with _naming(file):
         found = _changed(found, given, reschedule=from_run is not None)
@@ -67,7 +72,15 @@ def configure(
 
 
 def _changed(config: RunConfig, values: Mapping[str, Any], reschedule: bool) -> RunConfig:
-    """Settings with new values. With `reschedule`, another number of steps leaves open what follows from it."""
+    """Settings with new values. With `reschedule`, another number of steps leaves open what follows from it. Minutes
+    replace a number of steps, and steps replace minutes."""
+    steps, minutes = (key in values and values[key] not in (None, NONE) for key in ("train.steps", "train.minutes"))
+    if steps and minutes:
+        raise ConfigError("train.minutes and train.steps exclude each other: give one of them")
+    if minutes:
+        values = {**dict.fromkeys(("train.steps", *_FOLLOW_FROM_STEPS), NONE), **values}
+    elif steps:
+        values = {"train.minutes": NONE, **values}
     if reschedule and values.get("train.steps", config.train.steps) != config.train.steps:
         values = {**dict.fromkeys(_FOLLOW_FROM_STEPS, NONE), **values}
     return change(config, values)
@@ -106,10 +119,11 @@ def train(
         config: a TOML file with settings, such as `config.toml` of a run. It may leave settings out. It does not
             name the dataset. Other arguments win over it.
         from_run: a run. The new run starts with the weights and scales of its best checkpoint, and with its settings;
-            those of the model stay. If `steps` differs, warm-up, decay, validations and checkpoints are chosen anew.
+            those of the model stay. If `steps` or `minutes` differs, warm-up, decay, validations and checkpoints are
+            chosen anew.
         model_settings: changes of the model's settings, such as {"hidden": 32}.
         resume: continue after the newest checkpoint, if there is one.
-        settings: changes of the training's settings (fields of `TrainConfig`), such as steps=4000, mirror=("x", "y").
+        settings: changes of the training's settings (fields of `TrainConfig`), such as minutes=10, mirror=("x", "y").
 
     Raises:
         ConfigError: there is no such model, preset or setting (the text names the nearest one), or a value does not
@@ -180,7 +194,10 @@ def start_training(
         source = None if from_run is None else RunFolder(Path(from_run))
         with Dataset(asked.data) as dataset:
             scales = measure(dataset)
-            resolved = asked if config is None else resolve(asked, dataset, scales, keep_model=source is not None)
+            fit = partial(resolve, dataset=dataset, scales=scales, keep_model=source is not None)
+            begin = partial(Training, folder, dataset=dataset, scales=scales, signals=signals, processes=processes)
+            asked = _with_steps(asked, saved, fit, begin)
+            resolved = asked if config is None else fit(asked)
             batch_size = resolved.train.batch_size
             if batch_size % processes.count:
                 raise ConfigError(f"train.batch_size = {batch_size} cannot be cut for {processes.count} processes")
@@ -191,11 +208,28 @@ def start_training(
             elif processes.leads:
                 start = None if source is None else source.start()
                 write_config(folder.path, resolved, scope_of(dataset), dataset.fingerprint(), start)
-            with Training(folder, resolved, dataset, scales, signals, processes) as training:
+            with begin(config=resolved) as training:
                 if profile_steps:
                     training.profile(profile_steps)
                 else:
                     training.go()
+
+
+def _with_steps(
+    asked: RunConfig, saved: RunConfig | None, fit: Callable[[RunConfig], RunConfig], begin: Callable[..., Training]
+) -> RunConfig:
+    """The settings; if they have minutes and no steps, with the number of steps that fits into the minutes: of the run
+    that is resumed, or measured."""
+    minutes = asked.train.minutes
+    if minutes is None or asked.train.steps is not None:
+        return asked
+    if saved is not None and saved.train.minutes == minutes:
+        steps = saved.train.steps
+    else:
+        timed = fit(dataclasses.replace(asked, train=dataclasses.replace(asked.train, steps=UNKNOWN_STEPS)))
+        with begin(config=timed) as training:
+            steps = steps_within(minutes, training)
+    return dataclasses.replace(asked, train=dataclasses.replace(asked.train, steps=steps))
 
 
 @contextmanager

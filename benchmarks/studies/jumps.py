@@ -29,7 +29,7 @@ from benchmarks.studies.validation_curve import curve_line, minutes_per_step, va
 RESULTS = Path(__file__).parents[1] / "results" / "jumps.json"
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "jumps.md"
 MORE_CALLS = 2  # the page shows so many corrections more than the model was trained for
-WITH_NEWTON = tuple((corrections, steps) for corrections in (0, 1, 2, 4) for steps in (1, 2, MOST_NEWTON_STEPS))
+WITH_NEWTON = tuple((corrections, steps) for corrections in (0, 1) for steps in (1, 2, MOST_NEWTON_STEPS))
 
 
 @dataclass(frozen=True)
@@ -38,10 +38,10 @@ class Row:
 
     Attributes:
         title: what the page calls it.
-        family, nodes, frames, train, valid, test: of the dataset; its name is that of the first row with these scenes.
-        data: name of the dataset's file.
+        family, data, nodes, frames, keep, seed, train, valid, test: of the dataset; `data` is the name of its file.
         steps: of the training.
-        model: settings of the model, beyond the preset `tiny`.
+        model: a registered model, in its preset `tiny`.
+        model_settings: settings of the model, beyond the preset.
         settings: settings of the training.
         rivals: in so many test scenes the solver is run.
     """
@@ -55,62 +55,76 @@ class Row:
     test: int
     steps: int
     frames: int | None = None
-    model: dict[str, Any] = field(default_factory=dict)
+    keep: tuple[int, ...] | None = None
+    seed: int = 0
+    model: str = "ast"
+    model_settings: dict[str, Any] = field(default_factory=dict)
     settings: dict[str, Any] = field(default_factory=dict)
-    rivals: int = 10
+    rivals: int = 0
 
 
-_PLATES = {"family": "deforming_plate", "frames": 41, "train": 200, "valid": 20, "test": 50}
-_PARTS = {"family": "abcd", "data": "parts400", "nodes": 400, "train": 1200, "valid": 60, "test": 60}
-_SHORT = {"mirror": ("x", "y"), "peak_rate": 2e-3, "validate_scenes": 20}
-_MIRRORED = {**_SHORT, "validate_every": 1500, "checkpoint_every": 1500}
-_TURNED = {**_MIRRORED, "mirror": ("x", "y", "z"), "validate_scenes": 60, "validate_every": 2000}
+_PLATES = {"family": "deforming_plate", "frames": 41}
+_DEEP = {**_PLATES, "keep": (14, 24, 34), "seed": 11, "test": 60, "valid": 60}
+_PLATES_400 = {**_DEEP, "data": "plates400", "nodes": 400, "train": 6000}
+_PLATES_1300 = {**_DEEP, "data": "plates1300", "nodes": 1300, "train": 1500, "valid": 40}
+_PARTS = {"family": "abcd", "data": "parts400", "nodes": 400, "keep": (10, 15, 20), "seed": 11}
+_PARTS = {**_PARTS, "train": 6000, "valid": 120, "test": 60}
+_MIRRORED = {"mirror": ("x", "y"), "validate_scenes": 20}
+_TURNED = {"mirror": ("x", "y", "z"), "validate_scenes": 60}
 ROWS = {
-    "plates400_short": Row(
-        "Plates, 400 nodes, 3,000 steps", data="plates400", nodes=400, steps=3_000, settings=_SHORT, **_PLATES
-    ),
     "plates400": Row(
-        "Plates, 400 nodes, 12,000 steps", data="plates400", nodes=400, steps=12_000, settings=_MIRRORED, **_PLATES
-    ),
-    "plates400_50": Row(
-        "Plates, 400 nodes, 50 scenes", data="plates400_50", nodes=400, steps=12_000, settings=_MIRRORED, rivals=0,
-        **{**_PLATES, "train": 50},
-    ),
-    "plates400_100": Row(
-        "Plates, 400 nodes, 100 scenes", data="plates400_100", nodes=400, steps=12_000, settings=_MIRRORED, rivals=0,
-        **{**_PLATES, "train": 100},
+        "Plates, 400 nodes, 10,000 steps", steps=10_000, settings=_MIRRORED, rivals=10, **_PLATES_400
     ),
     "plates400_long": Row(
-        "Plates, 400 nodes, 45,000 steps", data="plates400", nodes=400, steps=45_000, settings=_MIRRORED, **_PLATES
+        "Plates, 400 nodes, 20,000 steps", steps=20_000, settings=_MIRRORED, rivals=10, **_PLATES_400
+    ),
+    "plates400_transolver": Row(
+        "Plates, 400 nodes, Transolver", steps=11_800, model="transolver", settings=_MIRRORED, **_PLATES_400
+    ),
+    "plates400_mgn": Row(
+        "Plates, 400 nodes, MeshGraphNets", steps=8_200, model="mgn", settings=_MIRRORED, **_PLATES_400
     ),
     "plates400_walk": Row(
-        "Plates, 400 nodes, step by step, 12,000", data="plates400", nodes=400, steps=12_000, model={"jumps": False},
-        settings={**_MIRRORED, "peak_rate": 1e-3}, rivals=0, **_PLATES,
+        "Plates, 400 nodes, step by step", data="plates400_walk", nodes=400, train=200, valid=20, test=50,
+        steps=12_000, model_settings={"jumps": False},
+        settings={**_MIRRORED, "batch_size": 4, "peak_rate": 1e-3, "validate_every": 1500, "checkpoint_every": 1500},
+        **_PLATES,
     ),
-    "plates1300": Row(
-        "Plates, 1,300 nodes", data="plates1300", nodes=1300, steps=3_000, settings={**_SHORT, "validate_scenes": 10},
-        **{**_PLATES, "train": 60, "valid": 10, "test": 30},
+    "plates1300": Row("Plates, 1,300 nodes", steps=5_000, settings=_MIRRORED, rivals=10, **_PLATES_1300),
+    "plates1300_transolver": Row(
+        "Plates, 1,300 nodes, Transolver", steps=5_900, model="transolver", settings=_MIRRORED, **_PLATES_1300
     ),
-    "parts400": Row("Pairs of parts, 400 nodes", steps=9_000, settings=_TURNED, rivals=5, **_PARTS),
+    "parts400": Row("Pairs of parts, 400 nodes", steps=10_000, settings=_TURNED, rivals=5, **_PARTS),
+    "parts400_transolver": Row(
+        "Pairs of parts, 400 nodes, Transolver", steps=11_800, model="transolver", settings=_TURNED, **_PARTS
+    ),
 }  # fmt: skip
 
 
-def measured(row: Row, folder: Path) -> dict[str, Any]:
-    """Generate, train and measure a row; what is there already is not made again."""
+def trained(name: str, folder: Path) -> tuple[ast_sim.Run, Path]:
+    """The run of a row and its dataset; what is there already is not made again."""
+    row = ROWS[name]
     data = ast_sim.generate(
-        row.family, folder / f"{row.data}.h5", train=row.train, valid=row.valid, test=row.test, nodes=row.nodes,
-        frames=row.frames, workers=1,
+        row.family, folder / f"{row.data}.h5", train=row.train, valid=row.valid, test=row.test, seed=row.seed,
+        nodes=row.nodes, frames=row.frames, keep=row.keep,
     ).path  # fmt: skip
     run = ast_sim.train(
-        data, folder / f"run_{row.data}_{row.steps}{'_walk' if row.model else ''}", steps=row.steps, resume=True,
-        model_settings=row.model, **row.settings,
+        data, folder / f"run_{name}", model=row.model, steps=row.steps, resume=True, model_settings=row.model_settings,
+        **row.settings,
     )  # fmt: skip
+    return run, data
+
+
+def measured(name: str, folder: Path) -> dict[str, Any]:
+    """Generate, train and measure a row."""
+    row = ROWS[name]
+    run, data = trained(name, folder)
     with run.open(data) as dataset:
         found = asked_frames(run.model, dataset, "test", run.effort, row.rivals)
         known = asked_frames(run.model, dataset, "train", run.effort).relative_error
         dial = [_turned(run, dataset, effort) for effort in _efforts(run)]
     return {
-        **provenance(f"python -m benchmarks.studies.jumps {row.data}"),
+        **provenance(f"python -m benchmarks.studies.jumps {name}"),
         "row": asdict(row),
         "minutes": minutes_per_step(run) * row.steps,
         "effort": asdict(run.effort),
@@ -183,7 +197,7 @@ def _table(shown: dict[str, Any]) -> list[str]:
             row["title"],
             f"{row['train']:,} scenes, {row['steps']:,} steps",
             f"{found['minutes']:.0f}",
-            Effort(**found["effort"]).text if row["model"].get("jumps", True) else "every frame",
+            Effort(**found["effort"]).text if row["model_settings"].get("jumps", True) else "every frame",
             _percent(errors),
             f"{100 * found['training_scenes']:.1f} %",
             f"{1000 * np.median(seconds):.0f} ms",
@@ -242,7 +256,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ast_sim.keep_memory()
     results = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
     for name in asked.rows or ROWS:
-        results[name] = measured(ROWS[name], asked.folder)
+        results[name] = measured(name, asked.folder)
         write_json(RESULTS, results)
         write_text(PAGE, page(results) + "\n")
         print(f"{name}: {100 * results[name]['relative_error']:.3g} %", flush=True)

@@ -108,23 +108,24 @@ def test_all_frames_and_all_scenes_are_drawn_and_each_jump_gets_its_calls(datase
     assert per_scene[0] == pytest.approx(800, rel=0.05)
 
 
-def test_later_calls_count_as_much_as_the_first(dataset):
-    """The weight is one over the mean square error of the call, relative to the first; unseen calls have a guess."""
-    jumps = pool(dataset, calls=2, mirror=())
-    squares = {}
+def test_each_call_weighs_by_the_error_that_it_leaves(dataset):
+    """The weight is one over the mean square error that the call leaves, relative to the first; the last call counts as
+    if it left what it finds, and calls that nobody has seen yet have a guess."""
+    jumps = pool(dataset, calls=3, mirror=())
+    squares: dict[int, float] = {}
     for number in range(200):
         batch, target = jumps.batch(number)
         calls = [jumps._going[place].call for place in jumps._places(number)]
-        for call, motion, free in zip(
-            calls, scenes(batch, target.motion), scenes(batch, ~batch.graph.prescribed), strict=True
-        ):
-            square = float(motion[free].square().mean())
+        free = scenes(batch, ~batch.graph.prescribed)
+        for call, motion, rows in zip(calls, scenes(batch, target.motion), free, strict=True):
+            square = float(motion[rows].square().mean())
             squares[call] = square if call not in squares else 0.99 * squares[call] + 0.01 * square
-        known = [squares.get(call, UNSEEN**2 * squares[0]) / squares[0] for call in calls]
-        expected = [1 / max(share, LEAST**2) for share in known]
+        left = [squares.get(min(call + 1, 2), UNSEEN**2 * squares[0]) for call in range(3)]
+        expected = [1 / max(left[call] / left[0], LEAST**2) for call in calls]
         np.testing.assert_allclose(jumps.weights(number, jumps.errors(number, target)), expected, rtol=1e-4)
-        jumps.advance(number, residual(batch, number))
-    assert squares[1] < 0.1 * squares[0] and squares[1] / squares[0] > LEAST**2
+        by_node = np.repeat([4.0**-call for call in calls], [len(rows) for rows in free])
+        jumps.advance(number, residual(batch, number) * torch.tensor(by_node, dtype=torch.float32)[:, None])
+    assert squares[1] < 0.1 * squares[0] and 0.04 < squares[2] / squares[1] < 0.09
 
 
 def test_a_guess_too_far_off_is_given_up(dataset):

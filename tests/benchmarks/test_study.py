@@ -34,7 +34,7 @@ samples = 16
 rates = [1e-3]
 validations = 2
 horizons = 3
-settings = ["train.statistics_pairs=4"]
+settings = ["train.statistics_pairs=4", "train.batch_size=4"]
 [data]
 path = "toy.h5"
 [models.ast]
@@ -50,7 +50,7 @@ def written(folder, text: str):
 
 def test_the_file_says_what_is_compared(tmp_path):
     plan, entries = read(written(tmp_path, TOML + '[models.other]\nmodel = "mgn"\nrates = [1e-4, 2e-4]'))
-    common = ("train.statistics_pairs=4",)
+    common = ("train.statistics_pairs=4", "train.batch_size=4")
     assert plan == Study("Toy", Data(path="toy.h5"), (1e-3,), samples=16, validations=2, horizons=3, settings=common)
     assert list(entries) == ["ast", "other"] and entries["other"] == Entry("mgn", rates=(1e-4, 2e-4))
 

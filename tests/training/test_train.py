@@ -200,10 +200,10 @@ def test_tiny_sees_other_bodies_and_learns_along_rollouts_where_that_was_measure
     toy.write(tmp_path / "d.h5", dynamic=True)
     still, moving = resolved(data), resolved(tmp_path / "d.h5")
     assert still.model.node_inputs == ("displacement", "proximity", "out_of_balance")
-    assert still.model.jumps and still.train.calls == 6 and still.train.rollout_pool == 0
-    assert resolved(data, "model.jumps=false").train.rollout_pool == 64
+    assert still.model.jumps and still.train.calls == 1 and still.train.rollout_pool == 0
+    assert resolved(data, "model.jumps=false").train.rollout_pool == 128
     assert still.train.shift == moving.train.shift == 0.025  # 0.05 of the half width
-    assert moving.model.node_inputs == ("displacement", "velocity") and moving.train.rollout_pool == 64
+    assert moving.model.node_inputs == ("displacement", "velocity") and moving.train.rollout_pool == 128
     assert not moving.model.jumps and moving.train.calls == 1
     assert (still.model.places, still.model.exchanges) == ("relative", 2)
     assert (moving.model.places, moving.model.exchanges) == ("absolute", 0)
@@ -474,9 +474,9 @@ def test_a_pool_that_cannot_be_is_refused(linear, data, tmp_path, assignments, m
 def test_a_pool_left_to_the_data_is_of_16_batches_where_there_is_a_drift(config):
     given = TrainConfig(batch_size=4, rollout_pool=None)
     still = resolve_training(given, SCALES, config())
-    assert still.rollout_pool == 64 and still.noise == pytest.approx(0.0015)  # a third of that without a pool
+    assert still.rollout_pool == 128 and still.noise == pytest.approx(0.0015)  # a third of that without a pool
     dynamic = resolve_training(given, SCALES, config(integration="dynamic"))
-    assert dynamic.rollout_pool == 64 and dynamic.noise_gamma == 0.1 and dynamic.noise == pytest.approx(0.0002)
+    assert dynamic.rollout_pool == 128 and dynamic.noise_gamma == 0.1 and dynamic.noise == pytest.approx(0.0002)
     assert resolve_training(given, SCALES, config(jumps=True)).rollout_pool == 0
     assert resolve_training(dataclasses.replace(given, noise=0.0), SCALES, config()).rollout_pool == 0
     assert resolve_training(TrainConfig(), SCALES, config()).rollout_pool == 0  # the papers'
@@ -487,7 +487,7 @@ def test_the_pool_of_a_model_with_edges_between_bodies_is_for_scenes_with_inerti
     still = find_preset(model, "tiny")
     given, moving = TrainConfig(**still.train), dataclasses.replace(still.model, integration="dynamic")
     assert resolve_training(given, SCALES, still.model).rollout_pool == 0
-    assert resolve_training(given, SCALES, moving).rollout_pool == 64
+    assert resolve_training(given, SCALES, moving).rollout_pool == 128
     for name, preset in find_model(model).presets.items():
         assert name == "tiny" or preset.train.get("rollout_pool", 0) == 0  # as published
 

@@ -18,7 +18,7 @@ PRESETS = {
             dropout=0.0, L_cell=None, places=None, exchanges=None, node_inputs=None, element_inputs=None,
             edge_strain=True, factorized=False,
         ),
-        peak_rate=2e-3,
+        peak_rate=3e-3,
         shift=None,
     ),
     "deforming_plate": Preset(ASTConfig(), _PAPER),

@@ -90,7 +90,10 @@ def _check_apart(
     if crossing or depth > 0:
         told = f"overlap at rest by {depth:.3g} {spec.unit} at" if depth > 0 else "cut each other at rest near"
         where = (where if depth > 0 else nearest_node(rest, *faces)) + shared.origin
-        raise BadAssembly(f"{names} {told} {point(where)}: move one of them by an offset")
+        raise BadAssembly(
+            f"{names} {told} {point(where)}: move one of them by an offset, or mesh curved surfaces that touch finer;"
+            " the parts of a press fit begin apart, and a move presses them together"
+        )
     gap = contact.gap(rest)
     if gap < shared.contact_distance:
         where = nearest_node(rest, *faces) + shared.origin

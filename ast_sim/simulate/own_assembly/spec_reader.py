@@ -28,6 +28,26 @@ from ast_sim.support.errors import ConfigError
 
 DEFAULT_FRAMES = 6
 DEFAULT_ORDER = 2  # linear tetrahedra are several times too stiff where a part bends, and where rubber is pressed
+# How keys begin that other programs have, and what to do instead.
+INSTEAD = {
+    ("force", "load", "pressure", "traction", "torque", "moment"): (
+        "forces cannot be prescribed, only motions: give a move whose travel is a range, and read off at which travel"
+        " the answers have this reaction"
+    ),
+    ("gravity", "acceleration", "velocity", "density", "mass"): (
+        "scenes are quasi-static, without weight or inertia: leave it out, and give motions by move"
+    ),
+    ("tie", "glue", "bond", "weld"): (
+        "parts cannot be glued to each other. One that is glued to a much stiffer one, as rubber to metal, moves with"
+        " it: make the stiffer one rigid, and give the nodes of the other at the joint its move (or fixed), such as"
+        " move = { where = 'zmin', translation = ... }. Parts of one material are glued as one part of one mesh"
+    ),
+    ("symmetry",): (
+        "nodes stand still in all directions or in none, so half a part cannot slide in its plane of symmetry: simulate"
+        " the whole part"
+    ),
+    ("temperature", "thermal", "expansion"): "there is no heat in these scenes: leave it out",
+}
 
 
 def read_spec(path: str | os.PathLike[str]) -> AssemblySpec:
@@ -51,6 +71,7 @@ def read_spec(path: str | os.PathLike[str]) -> AssemblySpec:
 
 
 def _spec(path: Path, text: str, table: Table) -> AssemblySpec:
+    _refuse_other_words(table)
     unit, frames, order = table.text("unit"), table.take("frames", DEFAULT_FRAMES), table.take("order", DEFAULT_ORDER)
     if unit not in LENGTH_UNITS:
         told = "is missing" if unit is None else f"is {unit!r}"
@@ -96,6 +117,7 @@ def _parts(table: Table) -> dict[str, Any]:
 def _part(name: str, values: Any, free: dict[str, Parameter], parameters: dict[str, Parameter]) -> PartSpec:
     """A part; its quantities are added to the parameters."""
     table = Table(values, f"parts.{name}", plain(free))
+    _refuse_other_words(table)
     rigid, files = table.flag("rigid"), table.take("file")
     files = [files] if isinstance(files, str) else files
     if not isinstance(files, list) or not files or not all(isinstance(file, str) for file in files):
@@ -127,7 +149,7 @@ def _part(name: str, values: Any, free: dict[str, Parameter], parameters: dict[s
         rigid,
         table.flag("self_contact"),
         _places(table, "fixed"),
-        tuple(_move(row, rigid) for row in table.tables("move")),
+        _moves(table, rigid),
         _placement(table),
     )
     table.done()
@@ -150,7 +172,22 @@ def _add_material(parameters: dict[str, Parameter], name: str, given: Any, free:
     parameters[name] = found
 
 
+def _moves(table: Table, rigid: bool) -> tuple[Move, ...]:
+    rows = table.tables("move")
+    if rigid and len(rows) > 1:
+        raise ConfigError(f"{table.key('move')}: a rigid part moves as a whole, so it has one move; here {len(rows)}")
+    return tuple(_move(row, rigid) for row in rows)
+
+
+def _refuse_other_words(table: Table) -> None:
+    for name in table.values:
+        for words, instead in INSTEAD.items():
+            if name.lower().startswith(words):
+                raise ConfigError(f"{table.key(name)}: {instead}")
+
+
 def _move(table: Table, rigid: bool) -> Move:
+    _refuse_other_words(table)
     where = _places(table, "where")
     if rigid and where:
         raise ConfigError(f"{table.key('where')}: a rigid part moves as a whole: leave it out")

@@ -7,7 +7,8 @@ because float32 would be too coarse for small parts far from the origin.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,11 +21,13 @@ from ast_sim.scene import AttributeValue, NodeType, Scene
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec, PartSpec
 from ast_sim.simulate.own_assembly.parameters import Values, completed
 from ast_sim.simulate.own_assembly.part_mesh import PartMesh, part_meshes
+from ast_sim.simulate.own_assembly.touching import set_back
 from ast_sim.simulate.shapes.mesh import second_order
 from ast_sim.support.errors import ConfigError
 
 NEAR_ORIGIN = 10  # diagonals of the assembly from the origin up to which positions stay as they are
 CONTACT_SHARE = 5e-4  # contact distance, as a share of the diagonal
+SOFTEST = 1e3  # pascal: a smaller Young's modulus is probably meant in MPa
 
 
 @dataclass(frozen=True)
@@ -117,6 +120,7 @@ def case(spec: AssemblySpec, values: Values, frames: int, parts: list[PlacedPart
         ConfigError: a motion cannot be computed, a material is not allowed, or friction is negative.
     """
     parts = [_layered(part, [p for p in parts if not p.part.rigid], spec.order) for part in parts]
+    parts, touching = _set_back(spec, parts, shared)
     offset = np.cumsum([0, *(len(part.position) for part in parts)])
     body = np.repeat(np.arange(len(parts)), np.diff(offset)).astype(np.int32)
     elements = np.concatenate([part.cells + start for part, start in zip(parts, offset, strict=False)])
@@ -136,9 +140,17 @@ def case(spec: AssemblySpec, values: Values, frames: int, parts: list[PlacedPart
     course = _course(scene, parts, values, frames, np.array(shared.origin))
     attributes: dict[str, AttributeValue] = {f"parameter {name}": value for name, value in values.items()}
     attributes["origin"] = list(shared.origin)
-    notes = dict.fromkeys(note for part in parts for note in part.notes)
+    notes = dict.fromkeys([*(note for part in parts for note in part.notes), *touching, *_soft(spec, values)])
     attributes |= {NOTES: NEXT_NOTE.join(notes)} if notes else {}
     return SolidCase(scene, course.position, NeoHookean(*law.T), contact, "node", attributes, course)
+
+
+def _set_back(spec: AssemblySpec, parts: list[PlacedPart], shared: Reference) -> tuple[list[PlacedPart], list[str]]:
+    """The parts, set back where they touch, and notes on it."""
+    bodies, names = [(part.position, part.cells) for part in parts], [part.part.name for part in parts]
+    rigid = tuple(part.part.rigid for part in parts)
+    position, notes = set_back(bodies, names, rigid, shared.contact_distance, spec.unit)
+    return [replace(part, position=after) for part, after in zip(parts, position, strict=True)], notes
 
 
 def _course(scene: Scene, parts: list[PlacedPart], values: Values, frames: int, origin: np.ndarray) -> Course:
@@ -174,6 +186,13 @@ def _material(spec: AssemblySpec, values: Values, contact: ContactSettings) -> n
         others = [[contact.friction_between(a, b) for b in range(count) if b != a] for a in range(count)]
         rows = np.column_stack([rows, np.max(others, axis=1)])
     return rows.astype(np.float32)
+
+
+def _soft(spec: AssemblySpec, values: Values) -> Iterator[str]:
+    """A note on each modulus that looks like one in other units."""
+    for name in (f"{part.name}.young" for part in spec.parts if not part.rigid):
+        if float(values[name]) < SOFTEST:
+            yield f"{name} is {values[name]:.4g} Pa; moduli are in pascal in every unit of length, and 1 MPa is 1e6"
 
 
 def friction_is_drawn(spec: AssemblySpec) -> bool:

@@ -97,7 +97,7 @@ def make(gmsh):
     path = tmp_path / "SPEC.toml"
     path.write_text(SPEC.replace("FILE", "picky.py"))
     note = (
-        "part (picky.py): elements of the size 4.28 instead of 4, with which Gmsh gives no good mesh (tangled, badly)"
+        "part (picky.py): elements of the size 4.28 instead of 4, with which Gmsh gives no good mesh (tangled; badly)"
     )
     volume, notes = part(path)
     assert volume == pytest.approx(4000) and notes == [note]

@@ -140,7 +140,7 @@ def _mesh(gmsh, part: dict[str, Any]) -> Meshed:
         except (BadPart, BadSurface):
             raise
         except Exception as error:  # gmsh raises Exception itself
-            failures.append(" ".join(str(error).replace(";", ",").split()) or "gmsh stopped without a message")
+            failures.append(" ".join(str(error).split()) or "gmsh stopped without a message")
     sizes = [part["size"] * attempt.factor for attempt in ATTEMPTS]
     failures = failures or ["gmsh crashed in every attempt"]
     raise BadPart(
