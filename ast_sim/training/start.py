@@ -190,7 +190,8 @@ def start_training(
                 _require_same(folder, saved, resolved, source)
             elif processes.leads:
                 start = None if source is None else source.start()
-                write_config(folder.path, resolved, scope_of(dataset), dataset.fingerprint(), start)
+                specification = dataset.info.generator.get("spec")
+                write_config(folder.path, resolved, scope_of(dataset), dataset.fingerprint(), start, specification)
             with Training(folder, resolved, dataset, scales, signals, processes) as training:
                 if profile_steps:
                     training.profile(profile_steps)
