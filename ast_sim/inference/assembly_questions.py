@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ast_sim.inference.spec_differences import differences
 from ast_sim.prescribed_motion import Motion
 from ast_sim.runs.scope import Scope
 from ast_sim.scene import Scene
@@ -19,6 +20,8 @@ from ast_sim.simulate.own_assembly.parameters import Values, completed
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.simulate.own_assembly.standing import reference
 from ast_sim.support.errors import ConfigError
+
+NOT_TRAINED = "the run was not trained on a specification, so it is not known how this one differs from its training"
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,12 +32,14 @@ class Asked:
         scene, motion: as `Run.predict` takes them.
         values: the values of all parameters.
         origin: [3] the point that positions are relative to.
+        notes: how it differs from the training, a sentence each.
     """
 
     scene: Scene
     motion: Motion
     values: Values
     origin: list[float]
+    notes: tuple[str, ...]
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -46,6 +51,7 @@ def ask(
     spec: str | os.PathLike[str],
     rows: Sequence[Mapping[str, Any]],
     scope: Scope,
+    trained: Mapping[str, Any] | None,
     frames: int | None = None,
     nodes: int | None = None,
 ) -> list[Asked]:
@@ -56,6 +62,7 @@ def ask(
         spec: the file of the specification.
         rows: values by name; parameters that a row leaves out are in the middle of their ranges.
         scope: what the model was trained on.
+        trained: the specification of the training, as `AssemblySpec.describe` gives it; None: there was none.
         frames: frames of the motion; None: those of the specification.
         nodes: about how many nodes a scene has; None: by the sizes of the specification.
 
@@ -78,7 +85,8 @@ def ask(
         notes |= dict.fromkeys(case.notes())
         arrays = (case.scene.rest_position, case.scene.elements, case.scene.node_type, case.scene.material)
         scene = known.setdefault(tuple(np.asarray(array).tobytes() for array in arrays), case.scene)
-        asked.append(Asked(scene, Motion(case.targets.astype(np.float32)), values, list(shared.origin)))
+        told = tuple(differences(read, values, trained)) if trained else (NOT_TRAINED,)
+        asked.append(Asked(scene, Motion(case.targets.astype(np.float32)), values, list(shared.origin), told))
     for note in notes:
         warnings.warn(note, stacklevel=2)
     return asked

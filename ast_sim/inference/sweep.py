@@ -69,6 +69,7 @@ def sweep(
     predict_scenes: Callable[..., list[Answer]],
     config: ModelConfig,
     scope: Scope,
+    trained: Mapping[str, Any] | None,
     spec: str | os.PathLike[str],
     rows: Sequence[Mapping[str, Any]],
     effort: Effort,
@@ -81,7 +82,7 @@ def sweep(
 
     Args:
         predict_scenes: of a `Run`.
-        config, scope: of its model, and what that was trained on.
+        config, scope, trained: of its model, and the scenes and the specification that it was trained on.
         spec, rows, nodes: those of `Run.sweep`.
     """
     if not rows:
@@ -90,14 +91,15 @@ def sweep(
     frames = 2 if config.jumps and not needs_way else None
     table, seconds, notes = [], 0.0, []
     for start in range(0, len(rows), TOGETHER):
-        asked = ask(spec, rows[start : start + TOGETHER], scope, frames, nodes)
+        asked = ask(spec, rows[start : start + TOGETHER], scope, trained, frames, nodes)
         names = [f"row {start + number}" for number in range(len(asked))]
         wanted = [-2, -1] if needs_way and len(asked[0].motion.position) > 2 else [-1]
         scenes = [(one.scene, one.motion) for one in asked]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # told once for all rows
             answers = predict_scenes(scenes, names=names, frames=wanted, effort=effort, throw=False)
-        notes += [f"{answer.name}: {note}" for answer in answers for note in answer.notes]
+        told = [(*one.notes, *answer.notes) for one, answer in zip(asked, answers, strict=True)]
+        notes += [f"{name}: {note}" for name, row in zip(names, told, strict=True) for note in row]
         table += [_row(one.values, answer, one.origin) for one, answer in zip(asked, answers, strict=True)]
         seconds += sum(answer.seconds for answer in answers)
     outside = {note.partition(":")[0] for note in notes}

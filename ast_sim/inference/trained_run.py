@@ -132,7 +132,8 @@ class Run:
 
         The scene may lie anywhere: if it leaves the model's domain, it is moved to the middle of the domain, predicted
         and moved back. A property outside its range in the training scenes gives a warning, and so do Newton steps that
-        have not converged.
+        have not converged, and each way in which a specification differs from the one of the training: another file of
+        a part, another hold, a value outside its range.
 
         Args:
             scene: a scene, with lengths in the run's unit, or what `read_scene` returns. Or a `Trajectory`: its
@@ -163,14 +164,16 @@ class Run:
         """
         began = time.perf_counter()
         facts: Mapping[str, Any] = NOTHING
+        notes: tuple[str, ...] = ()
         if spec is not None:
             if not (scene is None and motion is None and stress is None):
                 raise ConfigError("a specification gives the scene and the motion: leave scene, motion and stress out")
-            (asked,) = ask(spec, [parameters or {}], self.scope, num_frames, nodes)
-            scene, motion, num_frames, facts = asked.scene, asked.motion, None, asked.facts
+            (asked,) = ask(spec, [parameters or {}], self.scope, self.folder.specification, num_frames, nodes)
+            scene, motion, num_frames, facts, notes = asked.scene, asked.motion, None, asked.facts, asked.notes
         elif parameters is not None or nodes is not None or scene is None:
             raise ConfigError("give a scene, or a specification with its parameters and nodes")
         question = new_question(self.settings.model, self.scope, scene, motion, num_frames, name, frames, stress)
+        question = dataclasses.replace(question, notes=(*notes, *question.notes))
         return self._answers([question], effort, began, throw, facts)[0]
 
     def sweep(
@@ -199,7 +202,8 @@ class Run:
             raise ConfigError("a table has the values of all parameters: leave the others out, or leave the table out")
         rows = table if table is not None else grid(parameters or {})
         rows = rows if isinstance(rows, Sequence) and not isinstance(rows, str) else read_table(rows)
-        return sweep(self.predict_scenes, self.settings.model, self.scope, spec, rows, effort or self.effort, nodes)
+        model, trained = self.settings.model, self.folder.specification
+        return sweep(self.predict_scenes, model, self.scope, trained, spec, rows, effort or self.effort, nodes)
 
     def predict_scenes(
         self,

@@ -1,7 +1,8 @@
 """The settings and the scope of a run as files: `config.toml` and `scope.toml` for people, `run.json` to compare with.
 
 `run.json` holds the settings, the scope and the dataset that the run was started with, the checkpoint that gave its
-first weights if it starts from another run, and the SHA-256 of them all. It is written once. A reader compares the
+first weights if it starts from another run, the specification of an assembly if the dataset was made of one, and the
+SHA-256 of them all. It is written once. A reader compares the
 other two files with it, so a damaged or edited file is noticed. Each checkpoint holds the SHA-256, so a checkpoint of
 another run is noticed.
 """
@@ -26,6 +27,7 @@ ORIGIN = "run.json"
 VERSION = 1
 _KEYS = {"version", CONFIG, SCOPE, "data", "sha256"}
 _START = "start"  # only in a run that starts from another one
+_SPECIFICATION = "specification"  # only in a run that was trained on an assembly
 
 
 def has_config(run: Path) -> bool:
@@ -34,15 +36,21 @@ def has_config(run: Path) -> bool:
 
 
 def write_config(
-    run: Path, settings: RunConfig, scope: Scope, data: str, start: Mapping[str, Any] | None = None
+    run: Path,
+    settings: RunConfig,
+    scope: Scope,
+    data: str,
+    start: Mapping[str, Any] | None = None,
+    specification: Mapping[str, Any] | None = None,
 ) -> None:
     """Write the three files, each whole; `data` is the dataset's fingerprint, `start` the checkpoint that gives the
-    first weights.
+    first weights, `specification` what `AssemblySpec.describe` gave when the dataset was made.
 
     The settings come last: a folder with settings has the other two.
     """
     values = {"version": VERSION, CONFIG: to_values(settings), SCOPE: to_values(scope), "data": data}
     values |= {_START: dict(start)} if start else {}
+    values |= {_SPECIFICATION: dict(specification)} if specification else {}
     write_text(run / SCOPE, _text(scope))
     write_text(run / ORIGIN, json.dumps({**values, "sha256": _hash(values)}, indent=1) + "\n")
     write_text(run / CONFIG, _text(settings))
@@ -84,7 +92,8 @@ def read_changes(path: Path) -> dict[str, Any]:
 
 
 def read_origin(run: Path) -> dict[str, Any]:
-    """The content of `run.json`: `config.toml`, `scope.toml`, `data`, `sha256`, and `start` if there is one.
+    """The content of `run.json`: `config.toml`, `scope.toml`, `data`, `sha256`; `start` and `specification` if there
+    are such.
 
     Raises:
         CheckpointError: the file is missing, damaged or of another version.
@@ -92,7 +101,7 @@ def read_origin(run: Path) -> dict[str, Any]:
     path = run / ORIGIN
     try:
         origin = json.loads(path.read_text(encoding="utf-8"))
-        if origin.keys() - {_START} != _KEYS or origin["sha256"] != _hash(origin):
+        if origin.keys() - {_START, _SPECIFICATION} != _KEYS or origin["sha256"] != _hash(origin):
             raise ValueError
     except OSError as error:
         raise CheckpointError(f"{path} cannot be read ({error.strerror}): {_advice(ORIGIN)}") from error

@@ -64,6 +64,11 @@ class RunFolder:
         """The content of `run.json`: what the run was started with."""
         return read_origin(self.path)
 
+    @property
+    def specification(self) -> dict[str, Any] | None:
+        """The specification that the training data was made of, as `AssemblySpec.describe` gave it; None: of none."""
+        return self.origin.get("specification")
+
     @cached_property
     def chosen(self) -> Chosen:
         """The best checkpoint; the latest one if none was validated.

@@ -85,7 +85,7 @@ class RunFile(RunFolder):
 
     @cached_property
     def origin(self) -> dict[str, Any]:
-        return {"data": self._facts["data"]}
+        return {key: self._facts[key] for key in ("data", "specification") if key in self._facts}
 
     @cached_property
     def chosen(self) -> Chosen:
@@ -145,6 +145,8 @@ def write(path: Path, run: RunFolder, model: Simulator, licence: str | None = No
         "answers": chosen.answers,
         "data": run.origin["data"],
     }
+    if run.specification is not None:
+        facts["specification"] = run.specification
     weights = {key: tensor.detach().clone().contiguous() for key, tensor in model.state_dict().items()}
     members = {
         _CARD: card(path.stem, without_path, run.scope, chosen, sum(p.numel() for p in model.parameters())).encode(),

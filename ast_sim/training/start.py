@@ -237,7 +237,8 @@ def start_training(
             elif processes.leads:
                 start = None if source is None else source.start()
                 scope = scope_of(dataset, resolved.model.data)
-                write_config(folder.path, resolved, scope, dataset.fingerprint(), start)
+                specification = dataset.info.generator.get("spec")
+                write_config(folder.path, resolved, scope, dataset.fingerprint(), start, specification)
             with begin(config=resolved) as training:
                 if profile_steps:
                     training.profile(profile_steps)

@@ -5,7 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
-from simulate.own_assembly.assemblies import SPEC, write_assembly
+from simulate.own_assembly.assemblies import SPEC, write_assembly, write_box
 
 import ast_sim
 from ast_sim.cli import main
@@ -118,9 +118,62 @@ def test_rows_outside_the_training_are_told_once(trained):
         warnings.simplefilter("always")
         run.sweep(spec, {"travel": [1.0, 2.4, 2.6]})
     (note,) = [str(one.message) for one in caught if "training scenes" in str(one.message)]
-    assert note.startswith(
-        "2 of 3 rows lie outside the training scenes; the first: row 1: prescribed nodes move up to 2.4"
+    assert note == (
+        "2 of 3 rows lie outside the training scenes; the first: row 1: travel is 2.4; in training 0.5 to 1.5"
     )
+
+
+CHANGED = {
+    "friction": (("frames = 3", "frames = 3\nfriction = 0.8"), "friction is 0.8; in training 0"),
+    "hold": (("'zmin'", "'zmin,xmin'"), "parts.block.fixed is 'zmin,xmin'; in training it was 'zmin'"),
+    "motion": (("0, 0, '-travel'", "0, 0, '-travel / 2'"), "parts.punch.move is {'translation': [0, 0, '-travel / 2']}"
+               "; in training it was {'translation': [0, 0, '-travel']}"),
+    "self contact": (("poisson", "self_contact = true\npoisson"), "parts.block.self_contact is True; in training it was"
+                     " left out"),
+    "pair": (("[parts.block]", "[[contact]]\nparts = ['block', 'punch']\nfriction = 0.5\n[parts.block]"),
+             "contact is [{'parts': ['block', 'punch'], 'friction': 0.5}]; in training it was left out"),
+    "range": (("[0.5, 1.5]", "[0.5, 4.5]"), "travel is 2.5; in training 0.5 to 1.5"),
+    "file": (("", ""), "the run was trained on another file of part punch: punch.vtu, whose content was not this one"),
+    "name": (("parts.punch", "parts.ram"), "the run was trained without the part ram"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("change", CHANGED)
+def test_what_differs_from_the_specification_of_the_training_is_told(change, trained, tmp_path):
+    (old, new), line = CHANGED[change]
+    text = SPEC.replace('"zmin"', "'zmin'")
+    path = write_assembly(tmp_path, text.replace(old, new))
+    if change == "file":
+        write_box(tmp_path / "punch.vtu", (3, 3, 5.2), (7, 7, 8), (3, 2, 2))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        answer = trained[1].predict(spec=path, frames=[-1])
+    assert f"scene: {line}" in [str(one.message) for one in told]
+    assert line in answer.notes and answer.expected_error is None
+
+
+def test_a_specification_within_that_of_the_training_has_no_notes(trained, tmp_path):
+    """Other comments, another place, one value instead of a range tell nothing."""
+    spec, run = trained
+    path = write_assembly(tmp_path, "# a copy\n" + SPEC.replace("[0.5, 1.5]", "1.2").replace("[1e6, 2e6]", "1.4e6"))
+    assert run.predict(spec=path, frames=[-1]).notes == run.predict(spec=spec, frames=[-1]).notes == ()
+
+
+def test_the_command_and_a_sweep_tell_what_differs(trained, tmp_path, capsys):
+    run = trained[1]
+    path = write_assembly(tmp_path, SPEC.replace("frames = 3", "frames = 3\nfriction = 0.8"))
+    out = str(tmp_path / "y.csv")
+    assert main(["predict", str(run.path), str(path), "--set", "travel=1", "--frames=-1", "--out", out]) == 0
+    assert "friction is 0.8; in training 0" in capsys.readouterr().err
+    with pytest.warns(UserWarning, match="2 of 2 rows lie outside the training scenes; the first: row 0: friction is"):
+        run.sweep(path, {"travel": [0.6, 1.0]})
+
+
+def test_a_run_that_knows_no_specification_says_so(trained):
+    spec, run = trained
+    blind = ast_sim.Run(run.path)
+    blind.folder.origin.pop("specification")
+    assert any("not trained on a specification" in note for note in blind.predict(spec=spec, frames=[-1]).notes)
 
 
 def test_wrong_questions(trained, tmp_path):

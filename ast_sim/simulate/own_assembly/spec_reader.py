@@ -59,11 +59,27 @@ def read_spec(path: str | os.PathLike[str]) -> AssemblySpec:
     """
     path = Path(path)
     try:
-        text = read_text(path)
-        values = tomllib.loads(text)
-    except (OSError, ValueError, RecursionError) as error:
+        spec = parse_spec(path, read_text(path))
+    except (OSError, UnicodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise ConfigError(f"{path}: the specification cannot be read: {reason}") from error
+    try:
+        _check_files(spec)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    return spec
+
+
+def parse_spec(path: Path, text: str) -> AssemblySpec:
+    """The specification with this text; its files need not be there.
+
+    Raises:
+        ConfigError: as in `read_spec`.
+    """
+    try:
+        values = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: the specification cannot be read: {error}") from error
     try:
         return _spec(path.resolve(), text, Table(values, ""))
     except ConfigError as error:
@@ -100,7 +116,6 @@ def _spec(path: Path, text: str, table: Table) -> AssemblySpec:
     table.done()
     spec = AssemblySpec(path, text, unit, frames, int(order), distance, pairs, parameters, parts)
     _check_used(spec, free)
-    _check_files(spec)
     return spec
 
 
