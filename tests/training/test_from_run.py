@@ -188,9 +188,11 @@ def test_a_source_that_is_no_run_is_one_line(folder, tmp_path, capsys):
 
 def test_the_settings_of_a_run_are_those_of_its_file(folder):
     file = folder / "source" / "config.toml"
-    assert configure(folder / "toy.h5", config=file) == read_config(folder / "source")
+    asked = configure(folder / "toy.h5", config=file)
+    facts = read_config(folder / "source").model.data
+    assert asked.knowing(facts) == read_config(folder / "source") and asked.model.data != facts
     longer = configure("other.h5", None, ["train.steps=300", "train.warmup=7"], config=file)
-    assert longer.data == "other.h5" and longer.model == read_config(folder / "source").model
+    assert longer.data == "other.h5" and longer.knowing(facts).model == read_config(folder / "source").model
     assert (longer.train.steps, longer.train.warmup, longer.train.decay) == (300, 7, None)
 
 
