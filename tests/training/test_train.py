@@ -55,7 +55,8 @@ def data(tmp_path_factory):
 def settings(data, *assignments: str) -> RunConfig:
     options = TrainConfig(steps=20, batch_size=2, peak_rate=1e-2, validate_every=10, checkpoint_every=5, log_every=4)
     with Dataset(data) as dataset:
-        config = RunConfig(toy.config(dataset.info), options, str(data))
+        model = dataclasses.replace(toy.config(dataset.info), boundary_motion=None)
+    config = RunConfig(model, options, str(data))
     return change(config, assigned(config, assignments))
 
 
