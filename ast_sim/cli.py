@@ -125,7 +125,10 @@ def _add_generate(generate: _Parser) -> None:
     generate.add_argument("spec", type=path, nargs="?", metavar="SPEC", help=about)
     _add_each(generate, {"--out FILE": "dataset to write (.h5)"}, type=path)
     _add_each(generate, {"--count N": "number of training scenes"}, type=at_least(1))
-    about = "draw the first scenes of an assembly as a picture and say what --count will cost; make no dataset"
+    about = (
+        "draw the first scenes of an assembly as a picture, say what --count will cost and how far the force of the"
+        " mesh is off; make no dataset"
+    )
     generate.add_argument("--look", action="store_true", help=about)
     splits = {
         "--valid N": "number of validation scenes (default: a tenth of --count)",
@@ -188,7 +191,7 @@ def _add_convert(convert: _Parser) -> None:
 
 
 def _add_info(info: _Parser) -> None:
-    info.add_argument("path", type=path, metavar="FILE_OR_RUN", help="dataset (.h5) or run folder")
+    info.add_argument("path", type=path, metavar="FILE_OR_RUN", help="dataset (.h5), run folder or run file (.ast)")
     info.add_argument("--json", action="store_true", help="print JSON")
     info.add_argument("--strict", action="store_true", help="exit with an error if something looks wrong")
 
@@ -205,6 +208,9 @@ def _add_train(train: _Parser) -> None:
     }
     _add_each(train, files, type=path)
     _add_each(train, {"--set k=v": "change a setting; may be repeated"}, action="append", default=[])
+    _add_each(
+        train, {"--minutes M": "train so long: 50 steps are timed, then the number of steps is fixed"}, type=float
+    )
     train.add_argument("--resume", action="store_true", help="go on after the last checkpoint, if there is one")
     _add_each(train, {"--profile N": "only measure N steps and print how their time divides"}, type=at_least(1))
 

@@ -55,13 +55,14 @@ def _look(args: argparse.Namespace) -> None:
 
     if args.family != "assembly" or args.spec is None:
         raise ConfigError("--look is for a specification: ast-sim generate assembly SPEC.toml --look")
-    found = look(args.spec, seed=args.seed, nodes=args.nodes, frames=args.frames)
+    drawn = look(args.spec, seed=args.seed, nodes=args.nodes, frames=args.frames)
     picture = (args.out or args.spec).with_suffix(".look.png")
-    shown = [(case.scene, case.targets[-1]) for case in found.cases]
-    scene_picture.write(picture, shown, found.titles, found.unit)
-    print("\n".join(map(printable, found.lines)))
-    each = found.mesh_seconds + found.solve_seconds
-    print(f"one scene: {each:.3g} s ({found.mesh_seconds:.2g} s to mesh), {printable(found.status)}")
+    shown = [(case.scene, case.targets[-1]) for case in drawn.cases]
+    scene_picture.write(picture, shown, drawn.titles, drawn.unit)
+    print("\n".join(map(printable, drawn.lines)))
+    each = drawn.mesh_seconds + drawn.solve_seconds
+    print(f"one scene: {each:.3g} s ({drawn.mesh_seconds:.2g} s to mesh), {printable(drawn.status)}")
+    print(printable(drawn.mesh_line))
     scenes = sum(checked_counts(args.count or 100, args.valid, args.test).values())
     workers = checked_workers(args.workers, None)
     cost = duration(each * scenes / workers)
@@ -134,15 +135,15 @@ def info(args: argparse.Namespace) -> None:
     """Check a dataset or a run and show what it holds."""
     from ast_sim.dataset.contents import describe_dataset, text
 
-    if args.path.is_dir():
-        from ast_sim.runs.folder import RunFolder
+    if args.path.is_dir() or args.path.suffix == ".ast":
+        from ast_sim.runs.run_file import open_run
 
-        found = RunFolder(args.path).describe()
+        facts = open_run(args.path).describe()
     else:
-        found = describe_dataset(args.path)
-    print(json.dumps(found, indent=1) if args.json else text(found))
-    if args.strict and found.get("looks_wrong"):
-        raise DatasetError(f"{args.path}: {len(found['looks_wrong'])} things look wrong in it")
+        facts = describe_dataset(args.path)
+    print(json.dumps(facts, indent=1) if args.json else text(facts))
+    if args.strict and facts.get("looks_wrong"):
+        raise DatasetError(f"{args.path}: {len(facts['looks_wrong'])} things look wrong in it")
 
 
 def train(args: argparse.Namespace) -> None:
@@ -154,12 +155,15 @@ def train(args: argparse.Namespace) -> None:
     if args.data is None and not args.resume:
         raise ConfigError("name the dataset to train on, or give --resume to go on with the run in --out")
     files = {"config": args.config, "from_run": getattr(args, "from")}
-    if args.data is None and (args.model or args.preset or args.set or any(files.values())):
-        raise ConfigError("a resumed run keeps its settings: leave --model, --preset, --config, --from and --set out")
+    if args.data is None and (args.model or args.preset or args.set or args.minutes or any(files.values())):
+        raise ConfigError(
+            "a resumed run keeps its settings: leave --model, --preset, --config, --from, --minutes and --set out"
+        )
     # A resumed run keeps its settings; with a dataset, the given settings are compared with them.
     config = None
     if args.data is not None:
-        config = configure(args.data, args.preset, args.set, args.model, **files)
+        changes = {} if args.minutes is None else {"train.minutes": args.minutes}
+        config = configure(args.data, args.preset, args.set, args.model, **files, changes=changes)
     steps = args.profile or 0
     start_training(args.out, config, resume=args.resume, profile_steps=steps, from_run=files["from_run"])
     if args.profile is None:
@@ -172,7 +176,8 @@ def predict(args: argparse.Namespace) -> None:
     from ast_sim.prescribed_motion import parse_move
 
     _check_output(args, args.out, [args.scene], "a prediction", *SUFFIXES)
-    moves, run = dict(map(parse_move, args.move)), _open_run(args.run_folder)
+    moves = dict(map(parse_move, args.move))
+    run = _open_run(args.run_folder)
     wanted = {"frames": args.frames, "effort": _effort(run, args), "throw": False}
     if args.scene.suffix == ".toml":
         _predict_spec(run, args, wanted)
@@ -184,7 +189,8 @@ def predict(args: argparse.Namespace) -> None:
         name = f"{args.scene}: {args.split}/{args.index:06d}"
     else:
         _refuse(args, args.of_data, f"{args.scene}, which is a mesh")
-        truth, name = None, str(args.scene)
+        truth = None
+        name = str(args.scene)
     if truth is not None and not moves:
         answer = run.predict(truth, num_frames=args.num_frames, name=name, **wanted)
     else:
@@ -220,14 +226,15 @@ def sweep(args: argparse.Namespace) -> None:
     picture = args.out.with_suffix(".png")
     for out, what, suffix in ((args.out, "a table", ".csv"), (picture, "a picture", ".png")):
         _check_output(args, out, [args.spec, *filter(None, [args.table])], what, suffix)
-    run, values = _open_run(args.run_folder), parse_settings(args.set)
-    found = run.sweep(args.spec, values, table=args.table, nodes=args.nodes, effort=_effort(run, args))
-    found.save(args.out)
-    print(f"{args.out}: {len(found.rows)} rows, {1000 * found.seconds / len(found.rows):.3g} ms each")
-    if found.unsettled:
-        print(f"not converged: {found.unsettled} of {len(found.rows)} rows, where last_newton_step is too large")
-    if found.varied:
-        found.picture(picture, args.quantity)
+    run = _open_run(args.run_folder)
+    values = parse_settings(args.set)
+    swept = run.sweep(args.spec, values, table=args.table, nodes=args.nodes, effort=_effort(run, args))
+    swept.save(args.out)
+    print(f"{args.out}: {len(swept.rows)} rows, {1000 * swept.seconds / len(swept.rows):.3g} ms each")
+    if swept.unsettled:
+        print(f"not converged: {swept.unsettled} of {len(swept.rows)} rows, where last_newton_step is too large")
+    if swept.varied:
+        swept.picture(picture, args.quantity)
         print(f"picture: {picture}")
 
 
@@ -270,7 +277,7 @@ def _scene(args: argparse.Namespace) -> Any:
     """The scene of a mesh; prints its description."""
     from ast_sim.importers.scene_mesh import parse_material, read_scene
 
-    found = read_scene(
+    read = read_scene(
         args.scene,
         obstacles=args.obstacle,
         clamps=args.clamp,
@@ -278,8 +285,8 @@ def _scene(args: argparse.Namespace) -> Any:
         type_field=args.type_field,
         materials=dict(map(parse_material, args.material)) or None,
     )
-    print("\n".join(map(printable, found.description)))
-    return found.scene
+    print("\n".join(map(printable, read.description)))
+    return read.scene
 
 
 def _open_run(folder: Path) -> Any:
@@ -296,10 +303,10 @@ def evaluate(args: argparse.Namespace) -> None:
         if args.out.suffix != ".json":
             raise ConfigError(f"--out {args.out}: the name of a file of figures must end in .json")
     run = _open_run(args.run_folder)
-    found = run.evaluate(args.data, args.split, args.command_line, args.rivals, args.made_from)
-    print(found)
+    evaluation = run.evaluate(args.data, args.split, args.command_line, args.rivals, args.made_from)
+    print(evaluation)
     if args.out is not None:
-        found.save(args.out)
+        evaluation.save(args.out)
         print(f"all figures: {args.out}")
 
 
@@ -309,7 +316,8 @@ def report(args: argparse.Namespace) -> None:
 
     check_suffix(args.out)
     _check_output(args, args.out, [*args.shown, *filter(None, [args.data])])
-    datasets = [path for path in args.shown if path.is_file() or (path.suffix == ".h5" and not path.is_dir())]
+    no_runs = (path for path in args.shown if not path.is_dir() and path.suffix != ".ast")
+    datasets = [path for path in no_runs if path.is_file() or path.suffix == ".h5"]
     if len(datasets) < len(args.shown) and datasets:
         raise ConfigError(
             f"{datasets[0]} is a dataset, the others are runs: a page shows runs or one dataset;"
@@ -326,6 +334,6 @@ def report(args: argparse.Namespace) -> None:
     else:
         from ast_sim.inference.evaluation.evaluated_run import report_evaluations
 
-        found = [_open_run(folder).evaluate(args.data, command=args.command_line) for folder in args.shown]
-        report_evaluations(args.out, found, "Learned simulation: predictions and errors")
+        evaluations = [_open_run(folder).evaluate(args.data, command=args.command_line) for folder in args.shown]
+        report_evaluations(args.out, evaluations, "Learned simulation: predictions and errors")
     print(f"report: {args.out}")

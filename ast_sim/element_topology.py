@@ -9,6 +9,9 @@ from itertools import combinations
 
 import numpy as np
 
+# What meshio calls an element, by the number of its nodes.
+CELL_KINDS = {3: "triangle", 4: "tetra", 10: "tetra10"}
+
 # The faces of a tetrahedron with positive volume; their normals point outward.
 LOCAL_FACES = ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
 
@@ -52,3 +55,34 @@ _EIGHTH = (*_AT_CORNERS, (4, 9, 6, 7), (4, 9, 5, 6), (4, 9, 8, 5), (4, 9, 7, 8))
 def linear_elements(elements: np.ndarray) -> np.ndarray:
     """The elements [E,3] or [E,4] as they are; second-order ones [E,10] cut into [8 E,4], element by element."""
     return elements[:, np.array(_EIGHTH)].reshape(-1, 4) if elements.shape[1] == 10 else elements
+
+
+def unique_edges(elements: np.ndarray, num_nodes: int) -> np.ndarray:
+    """[M, 2] int32: each edge of the elements [E, k] once, its smaller node first, in ascending order."""
+    pairs = np.array(LOCAL_EDGES[elements.shape[1]]).T
+    one, other = (elements[:, ends].ravel().astype(np.int64) for ends in pairs)
+    keys = np.unique(np.minimum(one, other) * num_nodes + np.maximum(one, other))
+    return np.stack([keys // num_nodes, keys % num_nodes], axis=1).astype(np.int32)
+
+
+def surface_triangles(position: np.ndarray, elements: np.ndarray) -> np.ndarray:
+    """[F, 3] int32: the triangles of the surface of the elements [E, k], as `Scene.surface` describes them."""
+    if elements.shape[1] == 3:
+        return elements
+    faces = elements.astype(np.int64)[:, np.array(LOCAL_FACES)].reshape(-1, 3)  # [4 E, 3], of corners
+    one, two, three = np.ascontiguousarray(faces.T)
+    low = np.minimum(np.minimum(one, two), three)
+    high = np.maximum(np.maximum(one, two), three)
+    upper = (one + two + three - low - high) * len(position) + high
+    order = np.lexsort((upper, low))  # a face of two elements stands beside its like
+    low, upper = low[order], upper[order]
+    like_next = np.append((low[1:] == low[:-1]) & (upper[1:] == upper[:-1]), False)
+    outer = np.sort(order[~(like_next | np.roll(like_next, 1))])
+    owner = elements[outer // 4]
+    corners = position[owner[:, :4]].astype(np.float64)
+    turned = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
+    local = np.array(FACE_TRIANGLES[elements.shape[1]])[outer % 4]  # [F, 1 or 4, 3]
+    triangles = np.take_along_axis(owner[:, None, :], local, axis=2)
+    surface = np.where(turned[:, None, None], triangles[:, :, ::-1], triangles).reshape(-1, 3).astype(np.int32)
+    surface.setflags(write=False)
+    return surface

@@ -217,11 +217,11 @@ def _row(rows: Sequence[Any], quantity: str, predictor: str, horizon: str, nodes
 
 
 def _nested(rows: Sequence[SceneError] | Sequence[MeanError]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    table: dict[str, Any] = {}
     for row in rows:
-        place = found.setdefault(row.quantity, {}).setdefault(row.predictor, {}).setdefault(row.horizon, {})
+        place = table.setdefault(row.quantity, {}).setdefault(row.predictor, {}).setdefault(row.horizon, {})
         if isinstance(row, SceneError):
             place[row.nodes] = row.rmse
         else:
             place[row.nodes] = {"rmse_sequence": row.rmse_sequence, "rmse_pooled": row.rmse_pooled}
-    return found
+    return table

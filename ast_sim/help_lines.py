@@ -19,7 +19,8 @@ def all_settings() -> list[str]:
     lines += ["", "training (of ast; other models list what differs):", *_settings("train.", TrainConfig, usual)]
     for name in model_names():
         try:
-            model, tiny = find_model(name), find_preset(name, "tiny")
+            model = find_model(name)
+            tiny = find_preset(name, "tiny")
         except ConfigError as error:
             lines += ["", str(error)]
             continue

@@ -93,7 +93,8 @@ class Course:
         """The legs from one stored frame to the next one, the `frame`-th. They end wherever a node turns back or turns
         off, and after `LARGEST_TURN` degrees of a rotation."""
         stops = [*self._stops(*self.frames[frame - 1 : frame + 1]), float(self.frames[frame])]
-        start, legs = float(self.frames[frame - 1]), []
+        start = float(self.frames[frame - 1])
+        legs = []
         for stop in stops:
             legs += self._cut(start, stop)
             start = stop

@@ -10,7 +10,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from ast_sim.scene import Scene, nodes_of_body
+from ast_sim.number_arrays import nodes_of_body
+from ast_sim.scene import Scene
 from ast_sim.support.errors import ConfigError
 
 Vector = Sequence[float]
@@ -205,7 +206,8 @@ class Motion:
 
     def check(self, scene: Scene) -> None:
         """Raise ConfigError unless the shape fits `scene`, there are two or more frames, and all numbers are finite."""
-        n, p = scene.num_nodes, int(scene.prescribed.sum())
+        n = scene.num_nodes
+        p = int(scene.prescribed.sum())
         shape = self.position.shape
         if len(shape) != 3 or shape[1:] != (n, 3) or shape[0] < 2:
             raise ConfigError(
@@ -261,22 +263,22 @@ def parse_move(text: str) -> tuple[int, RigidMotion]:
     Raises:
         ConfigError: the text has another form; the error gives examples.
     """
-    found = _MOVE.fullmatch(re.sub(r"\s*([,=])\s*", r"\1", " ".join(text.split())))
+    match = _MOVE.fullmatch(re.sub(r"\s*([,=])\s*", r"\1", " ".join(text.split())))
     try:
-        if found is None or not (found["path"] or found["angle"]):
+        if match is None or not (match["path"] or match["angle"]):
             raise ValueError
         motion: dict = {}
-        if found["path"]:
-            motion["translation"] = tuple(_triple(part) for part in found["path"].split(" then "))
-        if found["angle"]:
-            motion["rotation"] = float(found["angle"])
-            motion |= {key: _triple(found[key]) for key in ("axis", "point")}
+        if match["path"]:
+            motion["translation"] = tuple(_triple(part) for part in match["path"].split(" then "))
+        if match["angle"]:
+            motion["rotation"] = float(match["angle"])
+            motion |= {key: _triple(match[key]) for key in ("axis", "point")}
     except ValueError as error:
         raise ConfigError(
             f"the motion {text!r} cannot be read; write it as '1=0,0,-0.01', as '1=0,0,-0.01 then 0.02,0,-0.01' or as"
             " '1=rotate 30 about 0,0,1 at 0,0,0.1'"
         ) from error
-    return int(found["body"]), RigidMotion(**motion)
+    return int(match["body"]), RigidMotion(**motion)
 
 
 def _moved(scene: Scene, motions: Mapping[int, RigidMotion | Vector]) -> Iterator[tuple[np.ndarray, RigidMotion]]:

@@ -4,27 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from enum import IntEnum
 from functools import cached_property
 from itertools import combinations
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ast_sim.element_topology import FACE_TRIANGLES, LOCAL_EDGES, LOCAL_FACES
-from ast_sim.support.errors import ConfigError, DatasetError
+from ast_sim.element_topology import LOCAL_EDGES, surface_triangles, unique_edges
+from ast_sim.mesh_arrays import (
+    NodeType,
+    arrays_of_mesh,
+    joined_arrays,
+    mesh_of_arrays,
+    scene_arrays,
+)
+from ast_sim.number_arrays import require_array, require_finite, require_nodes
+from ast_sim.scene_summary import scene_drawing, scene_facts
+from ast_sim.support.errors import DatasetError
+from ast_sim.support.notebook_table import html_table, one_line
+
+if TYPE_CHECKING:
+    import meshio
 
 AttributeValue = str | int | float | list[float]
-
-# The search for connected parts makes pairs of nodes from so many elements at a time, which limits its memory.
-_ELEMENTS_AT_ONCE = 1 << 13
-
-
-class NodeType(IntEnum):
-    """How a node moves. The numbers are those of the MeshGraphNets data sets."""
-
-    NORMAL = 0  # a free node: it follows the mechanics, and models predict it
-    OBSTACLE = 1  # a node of a rigid body with a prescribed motion
-    HANDLE = 3  # a node of a deforming body with a prescribed position
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +47,80 @@ class Scene:
     node_type: np.ndarray
     body: np.ndarray
     material: np.ndarray | None = None
+
+    @classmethod
+    def of(
+        cls,
+        points: Any,
+        cells: Any,
+        *,
+        node_type: Any = None,
+        body: Any = None,
+        material: Any = None,
+        obstacles: Iterable[int] = (),
+        handles: Any = None,
+        name: str = "scene",
+    ) -> Scene:
+        """A scene from arrays of any type of numbers, or from lists. It is checked.
+
+        Args:
+            points: [N, 3], or [N, 2] in the plane z = 0: the undeformed positions.
+            cells: [E, k], as `elements`.
+            node_type: [N], values of `NodeType`; None: all nodes are free.
+            body: [N]; None: each connected part of the mesh is a body, numbered from 0 in the order of its lowest node.
+            material: [E, m], or [m] for all elements.
+            obstacles: numbers of the bodies all of whose nodes are obstacles.
+            handles: [N] bool, or numbers of nodes: these are handles.
+            name: name of the scene, for messages.
+
+        Raises:
+            DatasetError: an array is wrong; the text names it and the first wrong node or element.
+            ConfigError: there is no such body.
+        """
+        scene = cls(**scene_arrays(name, points, cells, node_type, body, material, obstacles, handles))
+        scene.check(name)
+        return scene
+
+    @classmethod
+    def join(cls, *scenes: Scene) -> Scene:
+        """One scene with the bodies of several, side by side: their numbers, and those of the nodes, count on.
+
+        Raises:
+            DatasetError: the elements have different numbers of nodes, or the materials different columns.
+        """
+        return cls(**joined_arrays([vars(scene) for scene in scenes]))
+
+    @classmethod
+    def from_meshio(cls, mesh: meshio.Mesh, **changes: Any) -> Scene:
+        """The scene of a mesh whose cells are all triangles, or all tetrahedra of 4 or of 10 nodes, taken as they are.
+
+        The point fields `node_type` and `body` and the cell field `material` are taken, if the mesh has them, as
+        `to_meshio` writes them. `ast_sim.read_scene` takes files and all other meshes, cuts other cells into
+        tetrahedra, and selects clamps by place.
+
+        Args:
+            changes: other arguments of `Scene.of`, such as obstacles=[1]; they win over the fields.
+
+        Raises:
+            DatasetError: there are other cells, or cells of several kinds, or an array is wrong.
+        """
+        points, cells, fields = arrays_of_mesh(mesh)
+        return cls.of(points, cells, **{**fields, **changes})
+
+    def to_meshio(self) -> meshio.Mesh:
+        """The scene as a mesh of meshio, with the point fields `node_type` and `body` and the cell field `material`;
+        `from_meshio` makes the same scene of it."""
+        return mesh_of_arrays(self.rest_position, self.elements, self.node_type, self.body, self.material)
+
+    def _facts(self) -> dict[str, str]:
+        return scene_facts(self.rest_position, self.elements, self.node_type, self.body, self.material)
+
+    def __repr__(self) -> str:
+        return one_line("Scene", self._facts())
+
+    def _repr_html_(self) -> str:
+        drawing = scene_drawing(self.rest_position, self.elements, self.node_type, self.body)
+        return html_table("Scene", self._facts(), drawing)
 
     @property
     def num_nodes(self) -> int:
@@ -117,10 +193,7 @@ class Scene:
 
     def edges(self) -> np.ndarray:
         """[M, 2] int32: each edge of the mesh once, its smaller node first, in ascending order."""
-        pairs = np.array(LOCAL_EDGES[self.elements.shape[1]]).T
-        one, other = (self.elements[:, ends].ravel().astype(np.int64) for ends in pairs)
-        keys = np.unique(np.minimum(one, other) * self.num_nodes + np.maximum(one, other))
-        return np.stack([keys // self.num_nodes, keys % self.num_nodes], axis=1).astype(np.int32)
+        return unique_edges(self.elements, self.num_nodes)
 
     def surface(self) -> np.ndarray:
         """[F, 3] int32: the triangles of the surface.
@@ -132,24 +205,7 @@ class Scene:
 
     @cached_property
     def _surface(self) -> np.ndarray:
-        if self.elements.shape[1] == 3:
-            return self.elements
-        faces = self.elements.astype(np.int64)[:, np.array(LOCAL_FACES)].reshape(-1, 3)  # [4 E, 3], of corners
-        one, two, three = np.ascontiguousarray(faces.T)
-        low, high = np.minimum(np.minimum(one, two), three), np.maximum(np.maximum(one, two), three)
-        upper = (one + two + three - low - high) * self.num_nodes + high
-        order = np.lexsort((upper, low))  # a face of two elements stands beside its like
-        low, upper = low[order], upper[order]
-        like_next = np.append((low[1:] == low[:-1]) & (upper[1:] == upper[:-1]), False)
-        outer = np.sort(order[~(like_next | np.roll(like_next, 1))])
-        owner = self.elements[outer // 4]
-        corners = self.rest_position[owner[:, :4]].astype(np.float64)
-        turned = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
-        local = np.array(FACE_TRIANGLES[self.elements.shape[1]])[outer % 4]  # [F, 1 or 4, 3]
-        triangles = np.take_along_axis(owner[:, None, :], local, axis=2)
-        surface = np.where(turned[:, None, None], triangles[:, :, ::-1], triangles).reshape(-1, 3).astype(np.int32)
-        surface.setflags(write=False)
-        return surface
+        return surface_triangles(self.rest_position, self.elements)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +234,21 @@ class Trajectory:
     frames: tuple[int, ...] | None = None
     times: tuple[float, ...] | None = None
     length_unit: str | None = None
+
+    def _facts(self) -> dict[str, str]:
+        return {
+            "frames": ranges(self.numbers),
+            "nodes": f"{self.scene.num_nodes:,}",
+            "stress": "none" if self.stress is None else f"at each {self.stress_location or 'node or element'}",
+            "lengths": self.length_unit or "in a unit that is not known",
+            "status": str(self.attributes.get("status", "complete")),
+        }
+
+    def __repr__(self) -> str:
+        return one_line("Trajectory", self._facts())
+
+    def _repr_html_(self) -> str:
+        return html_table("Trajectory", self._facts(), self.scene._repr_html_())
 
     @property
     def num_frames(self) -> int:
@@ -237,8 +308,8 @@ class Trajectory:
         require_finite(name, "position", "node", self.position)
         self._check_numbering(name)
         if stress_location is not None and (self.stress is None) != (stress_location == "none"):
-            found = "no stress" if self.stress is None else "stress"
-            raise DatasetError(f"{name}: has {found}, but stress_location is {stress_location!r}")
+            what = "no stress" if self.stress is None else "stress"
+            raise DatasetError(f"{name}: has {what}, but stress_location is {stress_location!r}")
         if self.cauchy_stress is not None:
             require_array(name, "cauchy_stress", self.cauchy_stress, np.float32, (self.num_frames, e, 6))
             require_finite(name, "cauchy_stress", "element", self.cauchy_stress)
@@ -277,62 +348,3 @@ def ranges(numbers: Iterable[int]) -> str:
         else:
             runs.append([number])
     return ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs)
-
-
-def connected_parts(elements: np.ndarray, num_nodes: int) -> np.ndarray:
-    """[N] int32: the connected part of the mesh that each node belongs to. Parts are numbered from 0 in the order of
-    their lowest nodes."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    part = np.arange(num_nodes, dtype=np.int32)
-    for start in range(0, len(elements), _ELEMENTS_AT_ONCE):
-        corners = part[elements[start : start + _ELEMENTS_AT_ONCE]]
-        # The edges from the first corner to all others connect the element, so the other edges are not needed.
-        first, other = np.repeat(corners[:, 0], corners.shape[1] - 1), corners[:, 1:].ravel()
-        graph = coo_array((np.ones(len(first), np.int8), (first, other)), shape=(num_nodes, num_nodes))
-        part = connected_components(graph, directed=False)[1].astype(np.int32)[part]
-    return part
-
-
-def nodes_of_body(body: np.ndarray, number: int) -> np.ndarray:
-    """[N] bool: the nodes of the body with this number; `body` [N] is as in `Scene`.
-
-    Raises:
-        ConfigError: there is no such body; the text names the existing bodies.
-    """
-    nodes = body == number
-    if not nodes.any():
-        numbers, counts = np.unique(body, return_counts=True)
-        known = [f"{one} ({count} nodes)" for one, count in zip(numbers[:10], counts[:10], strict=True)]
-        more = ["..."] if len(numbers) > 10 else []
-        raise ConfigError(f"there is no body {number}; there are: {', '.join(known + more)}")
-    return nodes
-
-
-def require_array(name: str, array: str, value: np.ndarray, dtype: type, shape: tuple[int | None, ...]) -> None:
-    """Raise DatasetError unless `value` has the dtype and the shape; None in `shape` allows any size."""
-    if value.dtype != dtype:
-        raise DatasetError(f"{name}: {array} must be {np.dtype(dtype)}, not {value.dtype}")
-    fits = len(value.shape) == len(shape) and all(w in (None, s) for s, w in zip(value.shape, shape, strict=True))
-    if not fits:
-        wanted = ", ".join("any" if size is None else str(size) for size in shape)
-        raise DatasetError(f"{name}: {array} has the shape {list(value.shape)}, must be [{wanted}]")
-
-
-def require_nodes(name: str, kind: str, elements: np.ndarray, count: int) -> None:
-    """Raise DatasetError naming the first of the `elements` [E, k] that refers to a node beyond 0 to `count` - 1."""
-    outside = (elements < 0) | (elements >= count)
-    if outside.any():
-        row, corner = np.unravel_index(np.argmax(outside), outside.shape)
-        node = elements[row, corner]
-        raise DatasetError(f"{name}: {kind} {row} refers to node {node}, but the nodes are 0 to {count - 1}")
-
-
-def require_finite(name: str, array: str, row: str, value: np.ndarray, first_frame: int = 0) -> None:
-    """Raise DatasetError naming the first frame and row of `value`, [S, rows, F] or [rows, F], that is not finite."""
-    finite = np.isfinite(value)
-    if not finite.all():
-        *frame, index, _ = np.unravel_index(np.argmin(finite), finite.shape)
-        at = f"in frame {first_frame + frame[0]} at {row} {index}" if frame else f"of {row} {index}"
-        raise DatasetError(f"{name}: {array} {at} is not finite: {value[*frame, index].tolist()}")

@@ -14,7 +14,6 @@ def main(path: str, steps: int = 300) -> list[float]:
     with Dataset(path) as data:
         model = new_model(data)
         pairs = model.pairs(data, batch_size=4, noise=0.002)  # the noise is a length, in the unit of the data
-        model.fit_statistics(pairs.batch(step) for step in range(50))
         optimizer = torch.optim.AdamW(model.parameters(), lr=1e-3)
         for step in range(steps):
             batch, target = pairs.batch(step)

@@ -11,11 +11,11 @@ from toy import one_thread  # noqa: F401 (used by being imported)
 from ast_sim import demo
 from ast_sim.cli import main
 from ast_sim.dataset.reader import Dataset
-from ast_sim.demo import FULL, QUICK, Size, headlines
+from ast_sim.demo import FULL, KEPT, QUICK, Size, headlines
 from ast_sim.figures import Beside
 
 TINY = Size(train=1, valid=1, test=1, steps=4)
-FILES = ("report.html", "prediction.pvd", "picture.png", "evaluation.json", "data.h5", "run/config.toml")
+FILES = ("report.html", "prediction.pvd", "picture.png", "evaluation.json", "data.h5", "unseen.h5", "run/config.toml")
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,10 @@ def test_everything_is_made(made):
         assert (made / name).stat().st_size > 0, name
     assert (made / "picture.png").read_bytes().startswith(b"\x89PNG")
     with Dataset(made / "data.h5") as dataset:
-        assert dataset.splits == {"train": 1, "valid": 1, "test": 1}
+        assert dataset.splits == {"train": 1, "valid": 1, "test": 0}
+        assert dataset["train"][0].num_frames == 1 + len(KEPT)
+    with Dataset(made / "unseen.h5") as dataset:
+        assert dataset.splits == {"train": 0, "valid": 0, "test": 1} and dataset["test"][0].num_frames == 41
     found = json.loads((made / "evaluation.json").read_text())
     assert found["origin"]["command"] == f"ast-sim demo --out {made} --quick --seed 0"
     assert (found["speedup"] is None) == (found["threads"] > 1)
@@ -69,7 +72,8 @@ def test_again_in_the_same_folder_reuses_the_parts_and_other_settings_are_refuse
 def test_the_same_seed_gives_the_same_numbers_elsewhere(made, tmp_path, monkeypatch):
     monkeypatch.setattr(demo, "QUICK", TINY)
     (tmp_path / "again").mkdir()
-    shutil.copy(made / "data.h5", tmp_path / "again")  # that scenes are the same again is tested with the solver
+    for name in ("data.h5", "unseen.h5"):  # that scenes are the same again is tested with the solver
+        shutil.copy(made / name, tmp_path / "again")
     demo.demo(tmp_path / "again", quick=True)
     assert figures(tmp_path / "again") == figures(made)
 
@@ -98,5 +102,5 @@ def test_headlines_are_shares_of_the_trivial_predictors():
 
 
 def test_the_sizes_of_the_demonstration():
-    assert (FULL.train, FULL.valid, FULL.test) == (100, 8, 10)
+    assert (FULL.train, FULL.valid, FULL.test) == (1300, 20, 10)
     assert QUICK.train < FULL.train and QUICK.steps < FULL.steps

@@ -90,9 +90,52 @@ def test_modules_are_named_by_strings_only_where_a_test_looks():
     """Whoever starts or imports a module by a string names it by a constant that the test above resolves."""
     assert MODULES.keys() == FAMILIES.keys()
     by_string = re.compile(r"import_module\(|find_spec\(|\"-m\"|__import__\(")
-    found = {path.stem for path in MODULE_FILES if by_string.search(path.read_text(encoding="utf-8"))}
+    starting = {path.stem for path in MODULE_FILES if by_string.search(path.read_text(encoding="utf-8"))}
     known = {"__init__", "errors", "gmsh_process", "names", "pool", "vtk_files"}
-    assert found <= known, "resolve the module it names in the test above"
+    assert starting <= known, "resolve the module it names in the test above"
+
+
+MODULES_OF_NUMBERS = {"np", "torch", "math", "time", "nn", "igl", "ipctk"}
+
+
+def alike(values: list[ast.expr]) -> bool:
+    """Whether all values are calls of one function, or of methods of one object."""
+    functions = [value.func for value in values if isinstance(value, ast.Call)]
+    names = {function.attr if isinstance(function, ast.Attribute) else ast.unparse(function) for function in functions}
+    objects = {ast.unparse(f.value) if isinstance(f, ast.Attribute) else "" for f in functions}
+    of_one = len(names) == 1 or (len(objects) == 1 and not objects & {"", *MODULES_OF_NUMBERS})
+    return len(functions) == len(values) and of_one
+
+
+def folded(source: str) -> list[str]:
+    """The assignments of several values to several names in which a call stands beside something unlike it, and those
+    to a name that says nothing."""
+    bad = []
+    for node in ast.walk(ast.parse(source)):
+        if (
+            isinstance(node, ast.Assign)
+            and isinstance(node.value, ast.Tuple)
+            and isinstance(node.targets[0], ast.Tuple)
+        ):
+            values = node.value.elts
+            if any(isinstance(value, ast.Call) for value in values) and not alike(values):
+                bad.append(f"{node.lineno}: {ast.unparse(node)}")
+        named = node.arg if isinstance(node, ast.arg) else node.id if isinstance(node, ast.Name) else ""
+        if named == "found":
+            bad.append(f"{node.lineno}: found")
+    return bad
+
+
+def test_what_is_folded_is_seen():
+    for line in ("a, b = f(x), g(y)", "a, b = 1, g(y)", "a, b = np.zeros(3), np.ones(3)", "found = 1", "a = found"):
+        assert len(folded(line)) == 1, line
+    for line in ("a, b = f(x), f(y)", "low, high = x.min(), x.max()", "a, b = b, a", "a, b = f(x)", "a = f(x), g(y)"):
+        assert not folded(line), line
+
+
+@pytest.mark.parametrize("path", MODULE_FILES, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_each_line_says_one_thing(path):
+    assert not folded(path.read_text(encoding="utf-8")), "one assignment a line; a noun in place of `found`"
 
 
 if __name__ == "__main__":

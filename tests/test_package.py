@@ -38,7 +38,7 @@ def test_wheel_is_one_for_all_pythons_and_whole(wheel):
     for folder, _, files in os.walk(ROOT / "ast_sim"):
         for name in files:
             path = Path(folder, name).relative_to(ROOT).as_posix()
-            if path.endswith((".py", ".pyi", ".typed", ".html", ".css", ".js")):
+            if path.endswith((".py", ".pyi", ".typed", ".html", ".css", ".js", ".ast")):
                 assert path in names, path
     assert not [name for name in names if name.startswith(("tests", "csrc", "benchmarks"))]
 

@@ -7,8 +7,9 @@ import pytest
 from data_samples import block, trajectory
 from meshes import two_tetrahedra
 
-from ast_sim import scene as scene_module
-from ast_sim.scene import NodeType, Scene, Trajectory, connected_parts
+from ast_sim import number_arrays
+from ast_sim.number_arrays import connected_parts
+from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.support.errors import DatasetError
 
 
@@ -26,7 +27,7 @@ def test_edges_of_a_pair_of_triangles():
 @pytest.mark.parametrize("at_once", [1, 3, 1 << 13])
 def test_connected_parts_are_counted_by_their_lowest_nodes(monkeypatch, at_once):
     """However many elements are looked at in one go; a node of no element is a part of its own."""
-    monkeypatch.setattr(scene_module, "_ELEMENTS_AT_ONCE", at_once)
+    monkeypatch.setattr(number_arrays, "_ELEMENTS_AT_ONCE", at_once)
     chain = [[6, 8, 9], [9, 10, 11], [1, 3, 5], [0, 2, 6], [5, 7, 12]]
     assert connected_parts(np.array(chain, np.int32), 14).tolist() == [0, 1, 0, 1, 2, 1, 0, 1, 0, 0, 0, 0, 1, 3]
 

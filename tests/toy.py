@@ -21,7 +21,7 @@ from ast_sim.inference import predict
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.question import Question
 from ast_sim.models.ast.ast_config import ASTConfig
-from ast_sim.models.model_config import DataFacts
+from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.simulator import Prediction, Simulator
 from ast_sim.scene import NodeType, Scene, Trajectory
 
@@ -109,7 +109,7 @@ def config(info: DatasetInfo, mesh_spacing: float = 0.1) -> ASTConfig:
         element_inputs=(),
         edge_strain=True,
     )
-    return small.resolve(DataFacts(info, 0, mesh_spacing))
+    return small.resolve(DataFacts.of(info, 0, mesh_spacing))
 
 
 def answers(model: Simulator, truths: list[Trajectory], names: list[str]) -> list[Answer]:
@@ -127,7 +127,7 @@ class LinearSimulator(Simulator):
 
     def __init__(self, config: ASTConfig) -> None:
         super().__init__(config)
-        self.map = nn.Linear(12, 3 + (config.stress == "node"))
+        self.map = nn.Linear(12, 3 + (config.data.stress == "node"))
         self.dropout = nn.Dropout(0.1)
 
     def observe(self, batch: Batch) -> None:
@@ -138,4 +138,4 @@ class LinearSimulator(Simulator):
         sizes = batch.graph.node_offsets.diff()
         means = torch.cat([part.mean(dim=0).expand(len(part), -1) for part in values.split(sizes.tolist())])
         out: Tensor = self.map(self.dropout(torch.cat([values, means], dim=1)))
-        return Prediction(out[:, :3], out[:, 3:] if self.config.stress == "node" else None)
+        return Prediction(out[:, :3], out[:, 3:] if self.config.data.stress == "node" else None)

@@ -111,5 +111,5 @@ class Target:
 
 def _join(parts: Sequence[State | Batch | Target], key: str) -> Tensor | None:
     """One attribute of all parts, concatenated; None if they do not have it."""
-    found = [getattr(part, key) for part in parts]
-    return None if found[0] is None else torch.cat(found)
+    values = [getattr(part, key) for part in parts]
+    return None if values[0] is None else torch.cat(values)

@@ -13,7 +13,8 @@ import numpy as np
 from scipy.sparse.linalg import splu
 
 from ast_sim.element_topology import linear_elements
-from ast_sim.scene import Scene, connected_parts
+from ast_sim.number_arrays import connected_parts
+from ast_sim.scene import Scene
 
 RIGID = 1e-3  # prescribed nodes move as a rigid body if no node is farther off, as a share of the largest displacement
 PLANAR = 1e-6  # points lie on a line if their second extent, as a share of the first, is below this
@@ -92,7 +93,8 @@ def harmonic_extension(scene: Scene, held: np.ndarray, free: np.ndarray) -> Call
         return lambda way: np.zeros((len(free), 3))
     reached = free[rows]
     # Symmetric and positive definite: no pivoting, and an ordering for such matrices.
-    inner, symmetric = laplacian[reached][:, reached].tocsc(), {"SymmetricMode": True}
+    inner = laplacian[reached][:, reached].tocsc()
+    symmetric = {"SymmetricMode": True}
     solve = splu(inner, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
     pull = -laplacian[reached][:, held]
 

@@ -86,7 +86,8 @@ class Graph:
         """
         n, e = scene.num_nodes, scene.num_elements
         elements = torch.from_numpy(scene.elements.astype("int64"))
-        rest, node_type = torch.tensor(scene.rest_position), torch.from_numpy(scene.node_type.astype("int64"))
+        rest = torch.tensor(scene.rest_position)
+        node_type = torch.from_numpy(scene.node_type.astype("int64"))
         material = None if scene.material is None else torch.tensor(scene.material)
         m2m = e2m = m2e = None
         if element_nodes:
@@ -198,6 +199,7 @@ def _element_mean(elements: Tensor, x: Tensor) -> Tensor:
 
 def _node_mean(elements: Tensor, x: Tensor, num: int) -> Tensor:
     """[E, F] -> [num, F]: the mean over the elements at each node; 0 where there is none."""
-    nodes, share = elements.flatten(), x.repeat_interleave(elements.shape[1], dim=0)
+    nodes = elements.flatten()
+    share = x.repeat_interleave(elements.shape[1], dim=0)
     total = share.new_zeros(num, share.shape[1]).index_add_(0, nodes, share)
     return total / torch.bincount(nodes, minlength=num).clamp(min=1)[:, None]

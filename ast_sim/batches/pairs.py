@@ -127,7 +127,8 @@ class PairSampler:
         self._make_graph, self.dynamic = make_graph, dynamic
         self.first_frame = 1 if dynamic else 0  # the least t of a pair: the acceleration needs a frame before it
         self._jumps = jumps
-        self._mirrored, self._shift = np.array([axis in mirror for axis in "xyz"]), np.float32(shift)
+        self._mirrored = np.array([axis in mirror for axis in "xyz"])
+        self._shift = np.float32(shift)
         frames = np.array([dataset.num_frames(split, i) for i in range(dataset.count(split))], np.int64)
         self._starts = np.concatenate([[0], np.cumsum(np.maximum(frames - 1 - self.first_frame, 0))])
         if self.num_pairs == 0:
@@ -192,7 +193,9 @@ class PairSampler:
 
     def _built(self, pair: Pair | Jump) -> tuple[Batch, Target]:
         """The batch of one pair, mirrored and moved."""
-        member, jumps, name = self._member(pair.index), isinstance(pair, Jump), f"{self._split}/{pair.index:06d}"
+        member = self._member(pair.index)
+        jumps = isinstance(pair, Jump)
+        name = f"{self._split}/{pair.index:06d}"
         source, frame = (pair.source, pair.frame) if jumps else (pair.t, pair.t + 1)
         before, stress = self._dataset.frames(self._split, pair.index, source - self.first_frame, source + 1)
         (after,), next_stress = self._dataset.frames(self._split, pair.index, frame, frame + 1)

@@ -29,8 +29,8 @@ class Ahead:
 
     def batch(self, step: int) -> tuple[Batch, Target]:
         """The batch of a step. The batch of step + 1 is begun."""
-        found = self._next.pop(step, None) or self._thread.submit(self._sampler.batch, step)
-        batch = found.result()
+        future = self._next.pop(step, None) or self._thread.submit(self._sampler.batch, step)
+        batch = future.result()
         self._next = {step + 1: self._thread.submit(self._sampler.batch, step + 1)}
         return batch
 

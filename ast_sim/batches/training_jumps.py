@@ -53,7 +53,8 @@ class JumpPool(Pool):
 
     def __init__(self, sampler: PairSampler, size: int, calls: int, largest: float) -> None:
         super().__init__(sampler, size, largest)
-        self._calls, self._squares = calls, np.full(calls, np.nan)
+        self._calls = calls
+        self._squares = np.full(calls, np.nan)
 
     def errors(self, number: int, target: Target) -> list[tuple[int, float]]:
         """For each jump of a batch the number of its call, and the mean square of the error that the call finds."""
@@ -67,8 +68,8 @@ class JumpPool(Pool):
         for call, square in errors:
             before = self._squares[call]
             self._squares[call] = square if np.isnan(before) else MEMORY * before + (1 - MEMORY) * square
-        found = np.where(np.isnan(self._squares), UNSEEN**2 * self._squares[0], self._squares)
-        left = np.append(found[1:], found[-1])
+        known = np.where(np.isnan(self._squares), UNSEEN**2 * self._squares[0], self._squares)
+        left = np.append(known[1:], known[-1])
         shares = left / left[0] if left[0] > 0 else np.ones(self._calls)
         shares = np.where(np.isfinite(shares), np.maximum(shares, LEAST**2), 1)
         calls = [self._going[place].call for place in self._places(number)]

@@ -78,11 +78,11 @@ class Pool:
 
     def state(self) -> dict[str, Tensor]:
         """The state of all scenes, for `restore`."""
-        found = {f"{place}.begun": torch.tensor(count) for place, count in self._begun.items()}
+        arrays = {f"{place}.begun": torch.tensor(count) for place, count in self._begun.items()}
         for place, scene in self._going.items():
             kept = {key: getattr(scene, key) for key in self.kept}
-            found |= {f"{place}.{key}": torch.as_tensor(value) for key, value in kept.items() if value is not None}
-        return found
+            arrays |= {f"{place}.{key}": torch.as_tensor(value) for key, value in kept.items() if value is not None}
+        return arrays
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Take over what `state` returned, of this part of the batches or of all parts together."""

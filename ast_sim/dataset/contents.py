@@ -34,7 +34,9 @@ def describe_dataset(path: Path) -> dict[str, Any]:
 def _describe_split(dataset: Dataset, split: str, findings: list[tuple[str, Finding]]) -> dict[str, Any]:
     """What a split holds; what looks wrong in it is added to the findings."""
     sizes, truncated, outside = [], [], []
-    lowest, highest, largest = np.full(3, np.inf), np.full(3, -np.inf), 0.0
+    lowest = np.full(3, np.inf)
+    highest = np.full(3, -np.inf)
+    largest = 0.0
     fields: dict[str, str] = {}
     types = dict.fromkeys((kind.name for kind in NodeType), 0)
     for index in range(dataset.count(split)):
@@ -49,7 +51,8 @@ def _describe_split(dataset: Dataset, split: str, findings: list[tuple[str, Find
         if (abs(trajectory.position - dataset.info.domain_center) > dataset.info.domain_half_width).any():
             outside.append(index)
         for position in trajectory.position:
-            lowest, highest = np.minimum(lowest, position.min(axis=0)), np.maximum(highest, position.max(axis=0))
+            lowest = np.minimum(lowest, position.min(axis=0))
+            highest = np.maximum(highest, position.max(axis=0))
             moved = position.astype(np.float64) - scene.rest_position
             largest = max(largest, float(np.linalg.norm(moved, axis=1).max()))
         arrays = {**vars(scene), "position": trajectory.position, "stress": trajectory.stress}
@@ -59,7 +62,7 @@ def _describe_split(dataset: Dataset, split: str, findings: list[tuple[str, Find
             if tensor is None:
                 break
             fields["cauchy_stress"] = _field(tensor)
-    nodes, elements, frames = ([min(found), max(found)] for found in zip(*sizes, strict=True))
+    nodes, elements, frames = ([min(counts), max(counts)] for counts in zip(*sizes, strict=True))
     return {
         "trajectories": len(sizes),
         "nodes": nodes,

@@ -27,6 +27,7 @@ class GuardedFile:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
+        self.closed = False
         with self.reading("the file"):
             if not self.path.is_file():
                 raise DatasetError(f"{self.path}: there is no such file")
@@ -36,6 +37,7 @@ class GuardedFile:
         self._verified: set[str] = set()  # names of arrays and trajectories whose hashes have been compared
 
     def close(self) -> None:
+        self.closed = True
         self.root.close()
 
     @contextlib.contextmanager
@@ -43,6 +45,8 @@ class GuardedFile:
         """Within the block, raise every error of h5py as a DatasetError; `what` names what is read. Gives that name,
         with the path of the file before it."""
         name = f"{self.path}: {what}"
+        if self.closed:
+            raise DatasetError(f"{self.path} is closed: open it again with Dataset(path) before {what} is read")
         try:
             yield name
         except AstSimError:
@@ -73,8 +77,8 @@ class GuardedFile:
             arrays = {key: str(plain_value(group[key].attrs[HASH])) for key in ARRAYS if key in group}
         self._verify(str(group.name), trajectory_hash(arrays, attributes), attributes.get(HASH))
 
-    def _verify(self, name: str, found: str, stored: Any) -> None:
-        if found != (stored.decode() if isinstance(stored, bytes) else stored):
+    def _verify(self, name: str, computed: str, stored: Any) -> None:
+        if computed != (stored.decode() if isinstance(stored, bytes) else stored):
             raise DatasetError(
                 f"{self.path}: {name.strip('/')} is not what was written: it was edited or is damaged (its SHA-256"
                 " differs); write the dataset anew with DatasetWriter"
@@ -104,8 +108,8 @@ class GuardedFile:
         array = self.child(group, key, h5py.Dataset)
         with self.reading(_path(group, key)) as name:
             if array.dtype != dtype or array.ndim != rank:
-                found = f"{array.dtype} with {array.ndim} axes"
-                raise DatasetError(f"{name} is {found}; must be {np.dtype(dtype)} with {rank}")
+                stored = f"{array.dtype} with {array.ndim} axes"
+                raise DatasetError(f"{name} is {stored}; must be {np.dtype(dtype)} with {rank}")
             if array.is_virtual or array.external:
                 raise DatasetError(f"{name} keeps its numbers in another file, which is not followed")
             properties = array.id.get_create_plist()

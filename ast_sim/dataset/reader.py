@@ -11,11 +11,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import fields, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, Self, overload
+from typing import Any, Self
 
 import h5py
 import numpy as np
@@ -34,9 +34,12 @@ from ast_sim.dataset.layout import (
     DatasetInfo,
     require_kind,
 )
-from ast_sim.scene import AttributeValue, Scene, Trajectory, require_finite
+from ast_sim.dataset.split import Split
+from ast_sim.number_arrays import require_finite
+from ast_sim.scene import AttributeValue, Scene, Trajectory
 from ast_sim.support.byte_cache import ByteCache
 from ast_sim.support.errors import DatasetError
+from ast_sim.support.notebook_table import html_table, one_line
 
 CACHE_BYTES = 1 << 30  # limit of the cache of scenes, and the largest split whose frames are kept in memory
 
@@ -57,7 +60,8 @@ class Dataset:
     """
 
     def __init__(self, path: str | os.PathLike[str], length_unit: str | None = None) -> None:
-        self.path, self._scale = Path(path), 1.0
+        self.path = Path(path)
+        self._scale = 1.0
         self._file = GuardedFile(self.path)
         try:
             self.info = self._in_unit(self._read_info(), length_unit)
@@ -71,6 +75,22 @@ class Dataset:
         self._open: dict[tuple[str, int], dict[str, h5py.Dataset]] = {}
         self._kept: dict[str, bool] = {}  # whether the split is small enough to be kept in memory
         self._kind: tuple[int, int] | None = None
+
+    def _facts(self) -> dict[str, str]:
+        counts = ", ".join(f"{count:,} {split}" for split, count in self.splits.items() if count)
+        return {
+            "file": self.path.name,
+            "scenes": counts or "none",
+            "family": self.info.family,
+            "stress": {"none": "none"}.get(self.info.stress_location, f"at each {self.info.stress_location}"),
+            "lengths": self.info.length_unit,
+        }
+
+    def __repr__(self) -> str:
+        return one_line("Dataset", self._facts())
+
+    def _repr_html_(self) -> str:
+        return html_table("Dataset", self._facts())
 
     def __getitem__(self, split: str) -> Split:
         """The trajectories of a split: `dataset["test"][0]`."""
@@ -196,10 +216,10 @@ class Dataset:
 
     def attributes(self, split: str, index: int) -> dict[str, AttributeValue]:
         """The status and the solver's records of a trajectory."""
-        found = self._file.attributes(self._group(split, index))
-        if "origin" in found:
-            found["origin"] = (self._scale * np.asarray(found["origin"])).tolist()
-        return {key: value for key, value in found.items() if key != HASH and key not in NUMBERING}
+        values = self._file.attributes(self._group(split, index))
+        if "origin" in values:
+            values["origin"] = (self._scale * np.asarray(values["origin"])).tolist()
+        return {key: value for key, value in values.items() if key != HASH and key not in NUMBERING}
 
     def _first_kind(self) -> tuple[int, int]:
         split = next((split for split in SPLITS if self.splits[split]), None)
@@ -223,8 +243,8 @@ class Dataset:
         for key in (item.name for item in fields(DatasetInfo)):
             wanted = types.get(key, str)
             if not isinstance(values.get(key), wanted):
-                found = repr(values[key])[:60] if key in values else "missing"
-                raise DatasetError(f"{self.path}: the attribute {key} is {found}; must be a {wanted.__name__}")
+                shown = repr(values[key])[:60] if key in values else "missing"
+                raise DatasetError(f"{self.path}: the attribute {key} is {shown}; must be a {wanted.__name__}")
             known[key] = values[key]
         known["domain_center"] = tuple(known["domain_center"])
         with self._file.reading("the attribute generator"):
@@ -277,16 +297,16 @@ class Dataset:
     def _read_frames(self, split: str, index: int, start: int, stop: int) -> tuple[np.ndarray, np.ndarray | None]:
         rows = {"position": "node", "stress": self.info.stress_location}
         name, arrays = self._name(split, index), self._framed(split, index)
-        found = {key: self._finite(name, rows[key], array, start, stop) for key, array in arrays.items()}
-        return self._scaled(found["position"]), found.get("stress")
+        frames = {key: self._finite(name, rows[key], array, start, stop) for key, array in arrays.items()}
+        return self._scaled(frames["position"]), frames.get("stress")
 
     def _scaled(self, position: np.ndarray) -> np.ndarray:
         """Positions in the unit of `info`."""
         if self._scale == 1:
             return position
-        found = (self._scale * position.astype(np.float64)).astype(np.float32)
-        found.flags.writeable = False
-        return found
+        scaled = (self._scale * position.astype(np.float64)).astype(np.float32)
+        scaled.flags.writeable = False
+        return scaled
 
     def _in_unit(self, info: DatasetInfo, unit: str | None) -> DatasetInfo:
         """The facts in another unit of length."""
@@ -305,9 +325,9 @@ class Dataset:
 
     def _finite(self, name: str, row: str, array: h5py.Dataset, start: int, stop: int) -> np.ndarray:
         """Frames start to stop - 1 of an array, all finite; a `row` of it is a "node" or an "element"."""
-        found = self._file.read(array, start, stop)
-        require_finite(name, str(array.name).rpartition("/")[2], row, found, start)
-        return found
+        values = self._file.read(array, start, stop)
+        require_finite(name, str(array.name).rpartition("/")[2], row, values, start)
+        return values
 
     def _keeps(self, split: str) -> bool:
         if split not in self._kept:
@@ -320,24 +340,3 @@ class Dataset:
 def _listed(value: AttributeValue | None) -> tuple[float, ...] | None:
     """The numbers of an attribute; None if it is missing or no list."""
     return tuple(value) if isinstance(value, list) else None
-
-
-class Split(Sequence[Trajectory]):
-    """The trajectories of a dataset's split, in order; each is read on access. A slice of a split is a `Split`, too."""
-
-    def __init__(self, dataset: Dataset, name: str, indices: range) -> None:
-        self._dataset, self.name, self._indices = dataset, name, indices
-
-    def __len__(self) -> int:
-        return len(self._indices)
-
-    @overload
-    def __getitem__(self, index: int) -> Trajectory: ...
-    @overload
-    def __getitem__(self, index: slice) -> Split: ...
-    def __getitem__(self, index: int | slice) -> Trajectory | Split:
-        if isinstance(index, slice):
-            return Split(self._dataset, self.name, self._indices[index])
-        number = self._indices[index]
-        cauchy_stress = self._dataset.cauchy_stress(self.name, number)
-        return replace(self._dataset.load(self.name, number), cauchy_stress=cauchy_stress)

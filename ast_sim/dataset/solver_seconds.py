@@ -74,11 +74,11 @@ def read_seconds(dataset: Dataset) -> SolverSeconds:
     if not path.exists():
         return SolverSeconds()
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        own = found["generator"] == dataset.info.generator
-        samples = {name: list(map(float, sample["solve_seconds"])) for name, sample in found["samples"].items()}
-        processors = sorted({str(sample.get("processor", "unknown")) for sample in found["samples"].values()})
-        if found.pop("sha256") != _hash(found):
+        record = json.loads(path.read_text(encoding="utf-8"))
+        own = record["generator"] == dataset.info.generator
+        samples = {name: list(map(float, sample["solve_seconds"])) for name, sample in record["samples"].items()}
+        processors = sorted({str(sample.get("processor", "unknown")) for sample in record["samples"].values()})
+        if record.pop("sha256") != _hash(record):
             raise ValueError("its content does not fit its SHA-256")
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         wrong = f"is damaged ({error!r})"

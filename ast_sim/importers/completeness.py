@@ -61,14 +61,14 @@ def _unused(frame: SourceMesh, names: FieldNames) -> list[tuple[str, str]]:
     """(option, name) of the fields that were not used. If only some options can be told, "|" separates them."""
     used = {names.displacement or "displacement", names.stress or "von_mises", names.node_type or "node_type"}
     used |= {names.obstacle, names.handle, names.body or "body", *names.material}
-    found = []
+    unused = []
     of_cells = {name: np.concatenate(parts) for name, parts in frame.cell_fields.items()}
     for place, fields in (("point", frame.point_fields), ("cell", of_cells)):
         for name, values in fields.items():
             if name not in used and values.dtype.kind in "iufb":
-                found.append((_option(place, name, values.reshape(len(values), -1)), name))
+                unused.append((_option(place, name, values.reshape(len(values), -1)), name))
     order = ["--displacement", "--stress", "--obstacle", "--handle"]
-    return sorted(found, key=lambda one: order.index(one[0]) if one[0] in order else len(order))
+    return sorted(unused, key=lambda one: order.index(one[0]) if one[0] in order else len(order))
 
 
 def _option(place: str, name: str, values: np.ndarray) -> str:

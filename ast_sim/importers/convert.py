@@ -73,8 +73,7 @@ def convert_series(
         integration, contact_radius, time_step, length_unit: as in `DatasetInfo`.
         incomplete: accept simulations in which nothing moves, nothing is prescribed or nothing can be learnt.
         strict: refuse simulations in which something looks wrong; see `ast_sim.plausibility`.
-        progress: called with a line of text after each simulation, and with a table of what looks wrong at the end.
-            None: what looks wrong is a warning.
+        progress: called with a line of text after each simulation, and about what looks wrong; None: this is a warning.
 
     Returns:
         The number of trajectories in each split. The dataset's positions are relative to its `generator["origin"]`, in
@@ -83,15 +82,16 @@ def convert_series(
     Raises:
         DatasetError: a file is wrong or something is missing in it; the text names the file. Nothing is written then.
     """
-    source, names = Path(source), names or FieldNames()
-    found = find_series(source)
-    chosen = _assign(source, list(found), splits, seed)
+    source = Path(source)
+    names = names or FieldNames()
+    series = find_series(source)
+    chosen = _assign(source, list(series), splits, seed)
     made_by = {"program": "ast_sim convert", "source": str(source), "names": asdict(names), "seed": seed}
     facts = {"contact_radius": contact_radius, "time_step": time_step, "length_unit": length_unit}
     facts |= {"family": source.stem, "integration": integration, "generator": made_by}
     findings: list[tuple[str, Finding]] = []
     with FittedWriter(out, stress_location="none", **facts) as writer:
-        for split, name, trajectory in _trajectories(found, chosen, names, incomplete):
+        for split, name, trajectory in _trajectories(series, chosen, names, incomplete):
             if not any(writer.counts.values()):
                 made_by["origin"] = trajectory.attributes.get("origin", [0.0, 0.0, 0.0])
                 writer.info = replace(writer.info, stress_location=trajectory.stress_at, generator=made_by)
@@ -107,14 +107,14 @@ def convert_series(
 
 
 def _trajectories(
-    found: Mapping[str, Path], chosen: Sequence[tuple[str, str]], names: FieldNames, incomplete: bool
+    series: Mapping[str, Path], chosen: Sequence[tuple[str, str]], names: FieldNames, incomplete: bool
 ) -> Iterator[tuple[str, str, Trajectory]]:
     """The split, the name and the trajectory of each chosen simulation; all have the origin of the first."""
     origin = None
     for split, name in chosen:
-        trajectory = read_series(found[name], names, origin)
+        trajectory = read_series(series[name], names, origin)
         if not incomplete:
-            require_complete(found[name], trajectory, names)
+            require_complete(series[name], trajectory, names)
         if origin is None:
             origin = np.array(trajectory.attributes.get("origin", [0.0, 0.0, 0.0]))
         yield split, name, trajectory
@@ -135,14 +135,14 @@ def find_series(source: Path) -> dict[str, Path]:
     """
     if not source.is_dir():
         return {source.stem: source}
-    found = {
+    series = {
         path.relative_to(source).with_suffix("").as_posix() if path != source else source.name: path
         for path in _series_in(source)
     }
-    if not found:
+    if not series:
         known = ", ".join((".pvd", *WITH_FRAMES, *ONE_FRAME))
         raise DatasetError(f"{source}: neither the folder nor a folder in it holds files of results: {known}")
-    return found
+    return series
 
 
 def _series_in(folder: Path) -> Iterator[Path]:

@@ -18,7 +18,8 @@ from ast_sim.dataset.layout import SPLITS
 from ast_sim.dataset.writer import FittedWriter
 from ast_sim.importers.deepmind_meta import LENGTH, Meta, read_meta
 from ast_sim.importers.tfrecord import find_values, read_records
-from ast_sim.scene import Scene, Trajectory, connected_parts, require_array
+from ast_sim.number_arrays import connected_parts, require_array
+from ast_sim.scene import Scene, Trajectory
 from ast_sim.support.errors import DatasetError
 
 SUFFIX = ".tfrecord"

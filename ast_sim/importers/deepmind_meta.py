@@ -122,9 +122,9 @@ def _feature(
     where: str, value: Any, length: int, kinds: tuple[str, ...], columns: tuple[int, ...], dtypes: tuple[str, ...]
 ) -> Feature:
     kind, dtype, shape = (_take(where, value, *key) for key in (("type", str), ("dtype", str), ("shape", list)))
-    for key, found, allowed in (("type", kind, kinds), ("dtype", dtype, dtypes)):
-        if found not in allowed:
-            raise DatasetError(f"{where}: {key} is {_shown(found)}; must be one of {', '.join(allowed)}")
+    for key, given, allowed in (("type", kind, kinds), ("dtype", dtype, dtypes)):
+        if given not in allowed:
+            raise DatasetError(f"{where}: {key} is {_shown(given)}; must be one of {', '.join(allowed)}")
     first = {"static": [1], "dynamic": [length], "dynamic_varlen": []}[kind]
     whole = len(shape) == len(first) + 2 and all(type(size) is int for size in shape)
     if not whole or shape[:-2] != first or not (shape[-2] == -1 or shape[-2] > 0) or shape[-1] not in columns:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import io
+import tempfile
+import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -46,7 +48,8 @@ def frames_in(path: Path) -> Iterator[SourceMesh]:
     elif ending == ".msh" and b"$MeshFormat" in _beginning(path):
         yield gmsh_mesh(path)
     elif ending in (".xdmf", ".xmf"):
-        yield from _xdmf_frames(path)
+        with _beside(path) as copy:
+            yield from _xdmf_frames(path, copy)
     else:
         yield _by_meshio(path)
 
@@ -56,29 +59,62 @@ def _beginning(path: Path) -> bytes:
         return file.read(1 << 16)
 
 
-def _by_meshio(path: Path) -> SourceMesh:
-    """Read a file by meshio. On a damaged file meshio may raise any error, print, or raise SystemExit."""
+def _by_meshio(path: Path, copy: Path | None = None) -> SourceMesh:
+    """Read a file, or its copy, by meshio. On a damaged file meshio may raise any error, print, or raise SystemExit."""
     import meshio
 
     printed = io.StringIO()
     try:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
-            mesh = meshio.read(path)
+            mesh = meshio.read(copy or path)
     except (Exception, SystemExit) as error:
-        told = " ".join(f"{printed.getvalue()} {error if str(error) != '1' else ''}".split())
-        raise DatasetError(f"{path}: cannot be read as a mesh: {told or type(error).__name__}") from error
+        raise DatasetError(f"{path}: cannot be read as a mesh: {_told(error, printed.getvalue())}") from error
     return from_meshio(mesh, path)
 
 
-def _xdmf_frames(path: Path) -> Iterator[SourceMesh]:
+def _told(error: BaseException, printed: str = "") -> str:
+    """What meshio says on a file that it cannot read, in one line."""
+    from meshio import ReadError
+
+    if isinstance(error, SystemExit | OSError | ReadError):
+        told = " ".join(f"{printed} {error if str(error) != '1' else ''}".split())
+        return told or "meshio cannot read it"
+    key = error.args[0] if isinstance(error, KeyError) and error.args else None
+    return f"meshio does not know {key}" if key is not None else f"meshio stopped: {' '.join(str(error).split())}"
+
+
+@contextlib.contextmanager
+def _beside(path: Path) -> Iterator[Path]:
+    """An XDMF file; or a copy, if numbers stand in binary files beside it, which meshio looks for in the folder in
+    which the process runs: the copy names them in full."""
+    try:
+        tree = ET.parse(path)
+    except (ET.ParseError, OSError, ValueError, LookupError) as error:
+        raise DatasetError(f"{path}: cannot be read as a mesh: it is no XML: {error}") from error
+    binary = [item for item in tree.iter("DataItem") if item.get("Format") == "Binary" and item.text]
+    for item in binary:
+        item.text = str(path.parent.resolve() / str(item.text).strip())
+    if not binary:
+        yield path
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / path.name
+        for item in tree.iter("DataItem"):
+            if item.get("Format") == "HDF" and item.text:
+                item.text = str(path.parent.resolve() / item.text.strip())
+        tree.write(copy)
+        yield copy
+
+
+def _xdmf_frames(path: Path, copy: Path) -> Iterator[SourceMesh]:
     """The frames of a series that meshio or FEniCS has written; a file without a series is one frame."""
     import meshio
 
     if b"CollectionType" not in _beginning(path):
-        yield _by_meshio(path)
+        yield _by_meshio(path, copy)
         return
     try:
-        with meshio.xdmf.TimeSeriesReader(path) as reader:
+        with meshio.xdmf.TimeSeriesReader(copy) as reader:
             points, cells = reader.read_points_cells()
             for step in range(reader.num_steps):
                 time, point_data, cell_data = reader.read_data(step)
@@ -88,5 +124,4 @@ def _xdmf_frames(path: Path) -> Iterator[SourceMesh]:
     except DatasetError:
         raise
     except (Exception, SystemExit) as error:
-        told = " ".join(str(error).split()) or type(error).__name__
-        raise DatasetError(f"{path}: cannot be read as a mesh: {told}") from error
+        raise DatasetError(f"{path}: cannot be read as a mesh: {_told(error)}") from error

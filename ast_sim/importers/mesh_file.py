@@ -20,7 +20,8 @@ from ast_sim.importers.places import Mask, marked
 from ast_sim.importers.shells import Shells, find_shells
 from ast_sim.importers.solids.mesh_elements import Elements, elements_of
 from ast_sim.importers.solids.stitching import Stitching
-from ast_sim.scene import NodeType, Scene, connected_parts
+from ast_sim.number_arrays import connected_parts
+from ast_sim.scene import NodeType, Scene
 from ast_sim.support.errors import DatasetError
 
 if TYPE_CHECKING:
@@ -118,7 +119,8 @@ class MeshFile:
 
     def whole_numbers(self, place: str, name: str, dtype: type) -> np.ndarray:
         """A field with one whole number in each row, as [rows] of an integer type; see `field`."""
-        value, limits = self.numbers(place, name), np.iinfo(dtype)
+        value = self.numbers(place, name)
+        limits = np.iinfo(dtype)
         wrong = ~((value == np.round(value)) & (value >= limits.min) & (value <= limits.max))
         if place == "point":
             wrong &= np.isin(np.arange(len(value)), self.elements)

@@ -119,14 +119,16 @@ def _terms(text: str, known: list[str]) -> Iterator[tuple[int, list[Rule], bool]
         if named is None:
             end = re.compile(r",|\s+and\s+|$").search(text, place)
             assert end is not None
-            rules, place = _rules(text[place : end.start()]), end.start()
+            rules = _rules(text[place : end.start()])
+            place = end.start()
         else:
             name, place = _name(text, named.end(), known)
             rules = [Rule(named[1], name=name)]
         between = _BETWEEN.match(text, place)
         if between is None:
             raise ValueError(text[place:])
-        place, last = between.end(), not between[1]
+        place = between.end()
+        last = not between[1]
         yield place, rules, last or "," in between[1]
         if last:
             return
@@ -148,17 +150,17 @@ def _name(text: str, start: int, known: list[str]) -> tuple[str, int]:
 
 
 def _rules(text: str) -> list[Rule]:
-    found = _TERM.fullmatch(re.sub(r"\s+", "", text))
-    if found is None:
+    term = _TERM.fullmatch(re.sub(r"\s+", "", text))
+    if term is None:
         raise ValueError(text)
-    if found["all"]:
+    if term["all"]:
         return [Rule("all")]
-    if found["end"]:
-        return [Rule(found["side"], axis="xyz".index(found["end"]))]
-    if found["axis"]:
-        return [_limit(found["rule"], found["axis"], found["limit"])]
-    above = _limit(found["above"].replace("<", ">"), found["between"], found["low"])
-    return [above, _limit(found["below"], found["between"], found["high"])]
+    if term["end"]:
+        return [Rule(term["side"], axis="xyz".index(term["end"]))]
+    if term["axis"]:
+        return [_limit(term["rule"], term["axis"], term["limit"])]
+    above = _limit(term["above"].replace("<", ">"), term["between"], term["low"])
+    return [above, _limit(term["below"], term["between"], term["high"])]
 
 
 def _limit(rule: str, axis: str, number: str) -> Rule:

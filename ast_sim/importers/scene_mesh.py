@@ -12,8 +12,9 @@ import numpy as np
 from ast_sim.importers.mesh_file import MeshFile, read_mesh
 from ast_sim.importers.places import Place, parse_places
 from ast_sim.importers.solids.mesh_elements import require_extent
+from ast_sim.number_arrays import nodes_of_body
 from ast_sim.plausibility.topology import at_rest
-from ast_sim.scene import NodeType, Scene, nodes_of_body
+from ast_sim.scene import NodeType, Scene
 from ast_sim.support.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -141,7 +142,8 @@ def _node_type(
     mesh: MeshFile, scene: Scene, used: np.ndarray, obstacles: Iterable[int], clamps: Iterable[str]
 ) -> tuple[np.ndarray, list[str]]:
     """The types of the nodes, and warnings of clamps that hold nodes on a line only."""
-    types, doubts = scene.node_type.copy(), []
+    types = scene.node_type.copy()
+    doubts = []
     for clamp in clamps:
         held = clamped(mesh, scene, used, clamp)
         types[held] = NodeType.HANDLE
@@ -164,7 +166,8 @@ def clamped(mesh: MeshFile, scene: Scene, used: np.ndarray, clamp: str) -> np.nd
     """
     body, places = parse_clamp(clamp, [*mesh.groups, *mesh.source.point_fields])
     nodes = np.flatnonzero(nodes_of_body(scene.body, body))
-    shortest, held = _shortest_edge(scene, body), np.zeros(len(nodes), bool)
+    shortest = _shortest_edge(scene, body)
+    held = np.zeros(len(nodes), bool)
     for place in places:
         inside = place.inside(mesh.points[used[nodes]], *mesh.masks(used[nodes]), shortest)
         if not inside.any():

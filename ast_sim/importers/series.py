@@ -136,7 +136,9 @@ def read_series(source: Path, names: FieldNames, origin: np.ndarray | None = Non
 
 def _read_frames(source: Path, names: FieldNames) -> tuple[MeshFile, _Frames, list[str], str]:
     """The mesh of a simulation, what is kept of its frames in order of time, notes, and where the stress is."""
-    kept, first, stitching = _Frames(), None, None
+    kept = _Frames()
+    first = None
+    stitching = None
     used_fields = tuple(
         filter(None, (names.obstacle, names.handle, names.node_type or "node_type", names.body or "body"))
     )
@@ -144,7 +146,8 @@ def _read_frames(source: Path, names: FieldNames) -> tuple[MeshFile, _Frames, li
     for frame in frames(source):
         frame.require_consistent()
         if first is None or stitching is None:
-            first, stitching = frame, Stitching(frame)
+            first = frame
+            stitching = Stitching(frame)
             place, order, notes = _stress_place(frame, names)
         cells = order_of_cells(frame, first)
         if cells is not None and len(notes) < 2:

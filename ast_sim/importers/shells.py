@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ast_sim.element_topology import LOCAL_FACES
-from ast_sim.scene import connected_parts
+from ast_sim.number_arrays import connected_parts
 
 # The layer is so many mean edge lengths thick.
 _THICKNESS = 0.5
@@ -99,9 +99,12 @@ def find_shells(points: np.ndarray, tetrahedra: np.ndarray, cells: list[np.ndarr
         return None
     order = np.flatnonzero(free)[np.argsort(cell[free], kind="stable")]
     oriented, _ = igl.bfs_orient(triangles[order])
-    triangles, cell, part_of = np.asarray(oriented, np.int64), cell[order], part[triangles[order, 0]]
+    part_of = part[triangles[order, 0]]
+    cell = cell[order]
+    triangles = np.asarray(oriented, np.int64)
     a, b, c = (points[triangles[:, corner]] for corner in range(3))
-    centre, normal = (a + b + c) / 3, np.cross(b - a, c - a)
+    centre = (a + b + c) / 3
+    normal = np.cross(b - a, c - a)
     distance, nearest = KDTree(points[np.unique(tetrahedra)]).query(centre)
     to_body = points[np.unique(tetrahedra)[nearest]] - centre
     thickness = np.zeros(len(points))

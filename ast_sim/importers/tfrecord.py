@@ -58,12 +58,12 @@ def _payload(file: BinaryIO, size: int, where: str) -> bytes:
     """The payload of the record that starts here in a file of this size."""
 
     def take(count: int, what: str) -> bytes:
-        found = file.read(count)
-        if len(found) < count:
+        data = file.read(count)
+        if len(data) < count:
             raise DatasetError(
-                f"{where}: its {what} has {count} bytes, but {len(found)} are left: the file is truncated"
+                f"{where}: its {what} has {count} bytes, but {len(data)} are left: the file is truncated"
             )
-        return found
+        return data
 
     header = take(_HEADER.size, "header")
     length, checksum = _HEADER.unpack(header)
@@ -108,7 +108,7 @@ def find_values(payload: bytes, names: Collection[str], where: str) -> dict[str,
     """
     wanted: dict[bytes | memoryview, str] = {name.encode(): name for name in names}
     view = memoryview(payload)  # keys are looked up without a copy
-    found: dict[str, Span] = {}
+    spans: dict[str, Span] = {}
     for _, features in _fields(payload, (0, len(payload)), "Example", (1,), where):
         for _, entry in _fields(payload, features, "Features", (1,), where):
             parts = list(islice(_fields(payload, entry, "an entry of Features", (1, 2), where), 3))
@@ -120,10 +120,10 @@ def find_values(payload: bytes, names: Collection[str], where: str) -> dict[str,
             name = wanted.get(view[slice(*key)])
             if name is None:
                 continue
-            if name in found:
+            if name in spans:
                 raise DatasetError(f"{where}: the feature {name} is there twice")
-            found[name] = _bytes_value(payload, feature, f"{where}: the feature {name}")
-    return found
+            spans[name] = _bytes_value(payload, feature, f"{where}: the feature {name}")
+    return spans
 
 
 def _bytes_value(payload: bytes, span: Span, where: str) -> Span:

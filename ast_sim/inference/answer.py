@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -14,12 +16,35 @@ from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.scene import AttributeValue, Scene, Trajectory
-from ast_sim.support.errors import AstSimError
-from ast_sim.view import export, sweep_files
+from ast_sim.support.errors import AstSimError, MissingExtra, RolloutError
+from ast_sim.support.notebook_table import html_picture, html_table, one_line
+from ast_sim.view import export, picture, sweep_files
 from ast_sim.view.files import make_folder
+
+if TYPE_CHECKING:
+    import pyvista
+    from matplotlib.figure import Figure
 
 SUFFIXES = (".h5", ".pvd", ".vtkhdf", ".csv")
 ELASTIC = ("assembly", "abcd", "abcd_xl")  # families whose material is Young's modulus and Poisson's ratio
+
+
+class AnsweredFrame(NamedTuple):
+    """One frame of an answer.
+
+    Attributes:
+        number: its number in the motion that was asked.
+        time: in seconds; None: it is not known.
+        position: [N, 3].
+        displacement: [N, 3], from the positions at rest.
+        stress: [N or E], von Mises stress in pascal, or None.
+    """
+
+    number: int
+    time: float | None
+    position: np.ndarray
+    displacement: np.ndarray
+    stress: np.ndarray | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +99,95 @@ class Answer:
         """[S] bool: the frames that were predicted, not given."""
         return np.array(self.frames, np.int64) >= self.given
 
+    def _facts(self) -> dict[str, str]:
+        unit = "" if self.info is None else f" {self.info.length_unit}"
+        moved = np.linalg.norm(self.displacement[:, self.scene.deforming_nodes], axis=2)
+        converged = {None: "no Newton steps", True: "yes", False: "no"}[self.converged]
+        return {
+            "name": self.name,
+            "frames": ", ".join(map(str, self.frames[:10])) + (", ..." if len(self.frames) > 10 else ""),
+            "nodes": f"{self.scene.num_nodes:,}",
+            "largest displacement": f"{moved.max(initial=0.0):.4g}{unit}",
+            "largest stress": "none" if self.stress is None else f"{self.stress.max(initial=0.0):.4g} Pa",
+            "expected error": "not known" if self.expected_error is None else f"{100 * self.expected_error:.2g} %",
+            "converged": converged,
+            "seconds": f"{self.seconds:.3g}",
+            **({} if self.failure is None else {"failure": self.failure}),
+        }
+
+    def __repr__(self) -> str:
+        return one_line("Answer", self._facts())
+
+    def _repr_html_(self) -> str:
+        try:
+            file = io.BytesIO()
+            self.plot().savefig(file, format="png", dpi=96)
+            return html_table("Answer", self._facts(), html_picture(file.getvalue(), 400))
+        except (MissingExtra, RolloutError):  # a table is better than nothing
+            return html_table("Answer", self._facts())
+
+    @property
+    def displacement(self) -> np.ndarray:
+        """[S, N, 3]: the displacements from the positions at rest, in the run's unit of length."""
+        return self.position - self.scene.rest_position
+
+    def frame(self, number: int) -> AnsweredFrame:
+        """The frame with this number in the motion that was asked.
+
+        Raises:
+            RolloutError: the answer does not have it; the text names the frames that it has.
+        """
+        if number not in self.frames:
+            known = ", ".join(map(str, self.frames[:20])) + (", ..." if len(self.frames) > 20 else "")
+            raise RolloutError(f"{self.name}: the answer has no frame {number}; it has: {known or 'none'}", self)
+        return self._frame(self.frames.index(number))
+
+    def _frame(self, row: int) -> AnsweredFrame:
+        times = None if self.info is None else self.info.times((self.frames[row],))
+        return AnsweredFrame(
+            self.frames[row],
+            None if times is None else times[0],
+            self.position[row],
+            self.position[row] - self.scene.rest_position,
+            None if self.stress is None else self.stress[row, :, 0],
+        )
+
+    def __iter__(self) -> Iterator[AnsweredFrame]:
+        """The frames, in the order in which they were asked for."""
+        return map(self._frame, range(len(self.frames)))
+
+    def plot(self, number: int | None = None) -> Figure:
+        """A picture of one frame, coloured by stress, or by displacement if the model predicts no stress.
+
+        Args:
+            number: the number of the frame; by default the one in which the deforming bodies are displaced most.
+
+        Returns:
+            A matplotlib figure: `answer.plot().savefig("answer.png")`.
+
+        Raises:
+            RolloutError: the answer has no such frame.
+            MissingExtra: matplotlib is not installed.
+        """
+        shown = self.trajectory
+        if not self.frames:
+            raise RolloutError(f"{self.name}: the answer has no frame to draw", self)
+        number = shown.numbers[picture.farthest(shown)] if number is None else self.frame(number).number
+        return picture.plot(shown, shown.numbers.index(number), self.name, shown.length_unit or "m")
+
+    def to_pyvista(self, number: int | None = None) -> pyvista.UnstructuredGrid:
+        """One frame as a grid of PyVista, with the fields of a file for ParaView.
+
+        Args:
+            number: the number of the frame; by default the last one of the motion that the answer has.
+
+        Raises:
+            RolloutError: the answer has no such frame.
+            MissingExtra: pyvista is not installed: pip install "ast_sim[pyvista]".
+        """
+        chosen = self.frame(max(self.frames, default=0) if number is None else number).number
+        return export.to_pyvista(self.trajectory.select([chosen]))
+
     @property
     def converged(self) -> bool | None:
         """Whether the Newton steps of every frame ended because the last one was at most 0.05; None without."""
@@ -113,7 +227,8 @@ class Answer:
             return None
         from ast_sim.mechanics.reaction import Reaction
 
-        scale, force = LENGTH_UNITS[self.info.length_unit] ** 2, Reaction(self.scene, self.driven)
+        scale = LENGTH_UNITS[self.info.length_unit] ** 2
+        force = Reaction(self.scene, self.driven)
         return scale * np.array([force.of(position) for position in self.position]).reshape(-1, 3)
 
     def figures(self, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> list[dict[str, float]]:

@@ -75,7 +75,10 @@ def ask(
         raise ConfigError(
             f"{Path(spec).name} has lengths in {read.unit}, but the run was trained in {scope.length_unit}"
         )
-    shared, found, known, notes = reference(read), [], {}, {}
+    shared = reference(read)
+    asked = []
+    known = {}
+    notes = {}
     for row in rows:
         values = completed(read.parameters, row)
         case = scene_of(read, values, nodes, frames or read.frames, shared).case
@@ -83,7 +86,7 @@ def ask(
         arrays = (case.scene.rest_position, case.scene.elements, case.scene.node_type, case.scene.material)
         scene = known.setdefault(tuple(np.asarray(array).tobytes() for array in arrays), case.scene)
         told = tuple(differences(read, values, trained)) if trained else (NOT_TRAINED,)
-        found.append(Asked(scene, Motion(case.targets.astype(np.float32)), values, list(shared.origin), told))
+        asked.append(Asked(scene, Motion(case.targets.astype(np.float32)), values, list(shared.origin), told))
     for note in notes:
         warnings.warn(note, stacklevel=2)
-    return found
+    return asked

@@ -115,13 +115,13 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 def knows_material(config: ModelConfig) -> bool:
     """Whether Young's modulus and Poisson's ratio are known for the scenes of a model that jumps."""
-    known = config.material_width == 2 or config.young > 0 or friction_is_drawn(config)
-    return bool(config.jumps and config.tetrahedra and known)
+    known = config.data.material_width == 2 or config.data.young > 0 or friction_is_drawn(config)
+    return bool(config.jumps and config.data.tetrahedra and known)
 
 
 def friction_is_drawn(config: ModelConfig) -> bool:
     """Whether the third column of the material is friction, as in assemblies whose scenes differ in it."""
-    return config.material_width == 3 and config.contact_range > 0
+    return config.data.material_width == 3 and config.data.contact_range > 0
 
 
 def newton_steps(config: ModelConfig, scene: Scene) -> NewtonSteps:
@@ -130,15 +130,15 @@ def newton_steps(config: ModelConfig, scene: Scene) -> NewtonSteps:
     Raises:
         SimulationError: the constants of the material are not allowed, or an element has no volume.
     """
-    friction = config.friction
-    if scene.material is not None and (config.material_width == 2 or friction_is_drawn(config)):
+    friction = config.data.friction
+    if scene.material is not None and (config.data.material_width == 2 or friction_is_drawn(config)):
         young, poisson, *drawn = scene.material.astype(np.float64).T
         friction = max((float(column.max()) for column in drawn), default=friction)
         rigid = ~scene.deforming_nodes[scene.elements].any(axis=1)
         material = NeoHookean(np.where(rigid, 1.0, young), np.where(rigid, 0.0, poisson))
     else:
-        material = NeoHookean(config.young, config.poisson)
-    return NewtonSteps(scene, material, CLEARANCE * config.contact_range, friction)
+        material = NeoHookean(config.data.young, config.data.poisson)
+    return NewtonSteps(scene, material, CLEARANCE * config.data.contact_range, friction)
 
 
 def cheapest_good(measured: Sequence[EffortErrors]) -> Effort:

@@ -76,19 +76,19 @@ class Way(NamedTuple):
 def calls(model: Simulator, questions: Sequence[Question], effort: Effort) -> list[Way | str]:
     """For each scene the way to its answer, or a text that says why a frame failed. Arguments and errors as for
     `jumps`."""
-    found: list[Way | str] = []
+    ways: list[Way | str] = []
     for scene in _predicted(model, questions, effort, None, whole_way=True):
         if scene.failure is not None:
-            found.append(scene.failure)
+            ways.append(scene.failure)
             continue
         count = 1 + effort.corrections + effort.newton_steps
         position = [_stacked(frame.positions, count) for frame in scene.frames]
-        known = [frame for frame in scene.frames if model.config.stress != "none"]
+        known = [frame for frame in scene.frames if model.config.data.stress != "none"]
         stress = [_stacked(frame.stresses, 1 + effort.newton_steps) for frame in known]
         steps = np.array([len(frame.positions) - 1 - effort.corrections for frame in scene.frames])
         last = np.array([np.nan if frame.last_step is None else frame.last_step for frame in scene.frames])
-        found.append(Way(np.stack(position, axis=1), np.stack(stress, axis=1) if stress else None, steps, last))
-    return found
+        ways.append(Way(np.stack(position, axis=1), np.stack(stress, axis=1) if stress else None, steps, last))
+    return ways
 
 
 def _stacked(rows: list, count: int) -> np.ndarray:
@@ -106,7 +106,7 @@ def _predicted(
     """The scenes with their predicted frames. `whole_way`: the stress after each Newton step, and no second start."""
     effort.check(model.config)
     for question in questions:
-        question.check(model.config.given_frames)
+        question.check(model.config.data.given_frames)
     # Several questions may share a scene.
     graph, carrier, solver = cache(model.graph), cache(Carrier), cache(partial(newton_steps, model.config))
     scenes = [_JumpingScene(model, q, graph(q.scene), carrier(q.scene), solver) for q in questions]
@@ -160,12 +160,15 @@ class _Frame:
         """
         if self.failure is not None:
             return
-        began, location = time.perf_counter(), self.scene.model.config.stress
+        began = time.perf_counter()
+        location = self.scene.model.config.data.stress
         try:
-            solver, position = self.scene.solver(self.scene.question.scene), _array(self.positions[-1])
+            solver = self.scene.solver(self.scene.question.scene)
+            position = _array(self.positions[-1])
             stuck = self.scene.settled(self.number - 1)
             for step in range(1, most + 1):
-                before, position = position, solver.step(position, from_afar=step == 1, stuck=stuck)
+                before = position
+                position = solver.step(position, from_afar=step == 1, stuck=stuck)
                 self.positions.append(torch.from_numpy(position.astype(np.float32)))
                 self.last_step = solver.size(before, position)
                 ends = step == most or self.last_step <= STILL
@@ -190,7 +193,7 @@ class _JumpingScene:
     frames: list[_Frame] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        question, self.given = self.question, self.model.config.given_frames
+        question, self.given = self.question, self.model.config.data.given_frames
         self.prescribed_position = torch.tensor(question.prescribed_position)
         self.stress = question.given_stress(self.model.config, self.given)
         for number in sorted(question.wanted()):
@@ -254,7 +257,7 @@ def _groups(model: Simulator, scenes: Sequence[_JumpingScene]) -> Iterator[list[
 def _predict(model: Simulator, group: list[_Frame], corrections: int) -> None:
     """Predict the frames of a batch."""
     try:
-        found = predict_batch(model, [frame.start for frame in group], corrections + 1)
+        predicted = predict_batch(model, [frame.start for frame in group], corrections + 1)
     except RolloutError as error:
         if len(group) > 1:  # one frame must not spoil the others
             for frame in group:
@@ -262,6 +265,6 @@ def _predict(model: Simulator, group: list[_Frame], corrections: int) -> None:
         else:
             group[0].failure = f"{group[0].start.name}: {error}"
         return
-    for frame, (positions, stress, seconds) in zip(group, found, strict=True):
+    for frame, (positions, stress, seconds) in zip(group, predicted, strict=True):
         frame.failure = not_finite(model.config, frame.scene.question.name, frame.number, positions[-1], stress)
         frame.positions, frame.stresses, frame.seconds = positions, [stress], seconds

@@ -36,12 +36,12 @@ def answers(
     `rollouts` for the arguments and errors."""
     began = time.perf_counter()
     if model.config.jumps:
-        found = jumps(model, questions, effort, progress)
+        predicted = jumps(model, questions, effort, progress)
     else:
         effort.check(model.config)
-        found = rollouts(model, questions, progress)
+        predicted = rollouts(model, questions, progress)
     each = (time.perf_counter() - began) / max(1, len(questions))
-    return [dataclasses.replace(answer, seconds=each) for answer in found]
+    return [dataclasses.replace(answer, seconds=each) for answer in predicted]
 
 
 def new_question(
@@ -67,7 +67,9 @@ def new_question(
                 f"{name} has a motion, frames and a stress of its own; for others predict its scene (--move BODY=X,Y,Z)"
             )
         _require_whole(scene, config, scope, name)
-        scene, motion, stress = scene.scene, Motion(scene.position), scene.stress
+        stress = scene.stress
+        motion = Motion(scene.position)
+        scene = scene.scene
     else:
         scene = scene.scene if isinstance(scene, SceneMesh) else scene
         scene.check(name)
@@ -94,8 +96,8 @@ def _require_whole(trajectory: Trajectory, config: ModelConfig, scope: Scope, na
             f" with Dataset(path, {scope.length_unit!r}) or Run.open"
         )
     place = trajectory.stress_at
-    if place not in ("none", config.stress):
-        needs = "predicts none" if config.stress == "none" else f"predicts it at each {config.stress}"
+    if place not in ("none", config.data.stress):
+        needs = "predicts none" if config.data.stress == "none" else f"predicts it at each {config.data.stress}"
         raise ConfigError(f"{name} has a stress at each {place}, but the run {needs}: leave it out, or convert it")
 
 
@@ -106,7 +108,7 @@ def _completed(
     if motion is None or (isinstance(motion, Mapping) and not motion):
         raise ConfigError(f"{name}: say how its prescribed nodes move: {{BODY: (x, y, z)}} (--move BODY=X,Y,Z)")
     if isinstance(motion, Mapping):
-        least = config.given_frames + 1
+        least = config.data.given_frames + 1
         if frames is None and not scope.usual_increment:
             raise ConfigError(f"{name}: nothing is moved in the training scenes: say how many frames (--num-frames)")
         if frames is None:
@@ -131,8 +133,8 @@ def _given_stress(config: ModelConfig, scene: Scene, stress: np.ndarray | None, 
     if stress is None:
         return None
     stress = np.asarray(stress, np.float32)
-    rows = {"node": scene.num_nodes, "element": scene.num_elements}.get(config.stress)
-    wanted = (config.given_frames, rows, 1)
+    rows = {"node": scene.num_nodes, "element": scene.num_elements}.get(config.data.stress)
+    wanted = (config.data.given_frames, rows, 1)
     if stress.shape != wanted:
         needs = "predicts none" if rows is None else f"needs {list(wanted)}"
         raise ConfigError(f"{name}: the stress has the shape {list(stress.shape)}, but the run {needs}")
@@ -141,15 +143,16 @@ def _given_stress(config: ModelConfig, scene: Scene, stress: np.ndarray | None, 
 
 def _require_material(config: ModelConfig, scope: Scope, scene: Scene, name: str) -> None:
     """Raise ConfigError unless the scene has as many material columns as the training scenes."""
-    wanted, found = config.material_width, 0 if scene.material is None else scene.material.shape[1]
-    if found == wanted:
+    wanted = config.data.material_width
+    given = 0 if scene.material is None else scene.material.shape[1]
+    if given == wanted:
         return
     if not wanted:
         raise ConfigError(f"{name} has a material, but the run was trained without one: leave it out (--material)")
     columns = zip(scope.material_low, scope.material_high, strict=True)
     ranges = ", ".join(f"{low:.4g} to {high:.4g}" for low, high in columns)
     raise ConfigError(
-        f"{name} has {found or 'no'} material columns, but the run was trained with {wanted} ({ranges}): give each"
+        f"{name} has {given or 'no'} material columns, but the run was trained with {wanted} ({ranges}): give each"
         " body its numbers (--material BODY=NUMBER,...)"
     )
 
@@ -158,8 +161,8 @@ def in_domain(model: Simulator, questions: Sequence[Question], effort: Effort) -
     """Predict scenes where they lie; those that may be moved and leave the domain in the middle of the domain."""
     shifts = [_way_into_domain(model.config, question) for question in questions]
     there = [q if shift is None else _moved_question(q, shift) for q, shift in zip(questions, shifts, strict=True)]
-    found = zip(questions, shifts, answers(model, there, effort), strict=True)
-    return [answer if shift is None else _moved_back(question, answer, shift) for question, shift, answer in found]
+    predicted = zip(questions, shifts, answers(model, there, effort), strict=True)
+    return [answer if shift is None else _moved_back(question, answer, shift) for question, shift, answer in predicted]
 
 
 def _moved_question(question: Question, shift: np.ndarray) -> Question:
@@ -182,8 +185,8 @@ def _way_into_domain(config: ModelConfig, question: Question) -> np.ndarray | No
     position = question.prescribed_position
     known = np.concatenate([position[0], position[:, question.scene.prescribed].reshape(-1, 3)])
     lowest, highest = known.min(axis=0).astype(np.float64), known.max(axis=0).astype(np.float64)
-    center = np.array(config.domain_center)
-    inside = max((center - lowest).max(), (highest - center).max()) <= config.domain_half_width
+    center = np.array(config.data.domain_center)
+    inside = max((center - lowest).max(), (highest - center).max()) <= config.data.domain_half_width
     if inside or not question.movable:
         return None
     return center - (lowest + highest) / 2

@@ -41,9 +41,12 @@ def predict_batch(
     """
     began = time.perf_counter()
     names, graphs, states, prescribed = zip(*starts, strict=True)
-    graph, prescribed = Graph.concatenate(graphs), torch.cat(prescribed)
+    graph = Graph.concatenate(graphs)
+    prescribed = torch.cat(prescribed)
     batch = Batch.build(graph, State.concatenate(states), prescribed, list(names))
-    sizes, positions, stress = graph.node_offsets.diff().tolist(), [], None
+    sizes = graph.node_offsets.diff().tolist()
+    positions = []
+    stress = None
     for call in range(1, calls + 1):
         position, stress = model.advance(replace(batch, wants_stress=call == calls), prescribed)
         positions.append(position.split(sizes))

@@ -84,9 +84,9 @@ class Question:
 
     def given_stress(self, config: ModelConfig, given: int) -> list[Tensor] | list[None]:
         """The stress of each given frame, [N or E, 1]; None if the model predicts no stress."""
-        if config.stress == "none":
+        if config.data.stress == "none":
             return [None] * given
-        rows = self.scene.num_nodes if config.stress == "node" else self.scene.num_elements
+        rows = self.scene.num_nodes if config.data.stress == "node" else self.scene.num_elements
         if self.stress is None:
             return list(torch.zeros(given, rows, 1))
         return list(torch.tensor(self.stress[:given]))
@@ -109,10 +109,10 @@ class Question:
             self.scene,
             position.reshape(len(numbers), self.scene.num_nodes, 3),
             np.array(stress) if stress else None,
-            config.given_frames,
+            config.data.given_frames,
             seconds,
             failure,
-            stress_location=config.stress,
+            stress_location=config.data.stress,
             frames=numbers,
             last_steps=last_steps,
             driven=Driven.of(self.scene, self.prescribed_position),
@@ -132,14 +132,14 @@ def not_finite(config: ModelConfig, name: str, frame: int, position: Tensor, str
     for what, value in (("position", position), ("stress", stress)):
         if value is not None and not value.isfinite().all():
             row = int(torch.nonzero(~value.isfinite().all(dim=1))[0])
-            kind = "element" if what == "stress" and config.stress == "element" else "node"
+            kind = "element" if what == "stress" and config.data.stress == "element" else "node"
             return f"{name}: the predicted {what} of {kind} {row} in frame {frame} is not finite: {value[row].tolist()}"
     return None
 
 
 def too_far(config: ModelConfig, name: str, frame: int, position: Tensor) -> str:
     """The message that a state lies too far from the domain."""
-    center = torch.tensor(config.domain_center, dtype=torch.float64)
+    center = torch.tensor(config.data.domain_center, dtype=torch.float64)
     distance = (position.double() - center).abs().amax(dim=1)
     return (
         f"{name}: in frame {frame} node {int(distance.argmax())} is {float(distance.max()):.3g}"

@@ -30,7 +30,7 @@ def rollouts(
         RolloutError: a scene has no frame to predict.
         DatasetError: in a scene nothing can deform.
     """
-    given = model.config.given_frames
+    given = model.config.data.given_frames
     for question in questions:
         question.check(given)
     scenes = [_RollingScene(model, question, given) for question in questions]
@@ -40,8 +40,8 @@ def rollouts(
             # Only scenes of the same domain are predicted together: none may change another's domain.
             for domain in dict.fromkeys(scene.domain for scene in running):
                 group = [scene for scene in running if scene.domain == domain]
-                found = predict_batch(model, [scene.start(frame) for scene in group])
-                for scene, (positions, stress, seconds) in zip(group, found, strict=True):
+                predicted = predict_batch(model, [scene.start(frame) for scene in group])
+                for scene, (positions, stress, seconds) in zip(group, predicted, strict=True):
                     scene.advance(frame, positions[-1], stress, seconds)
             if progress is not None and running:
                 progress(frame)
@@ -69,7 +69,7 @@ class _RollingScene:
     def start(self, frame: int) -> Start:
         """What a frame is predicted from."""
         position, stress = self.frames[frame - 1]
-        state = State(position, self.frames[frame - 2][0] if self.config.dynamic else None, stress)
+        state = State(position, self.frames[frame - 2][0] if self.config.data.dynamic else None, stress)
         return Start(f"{self.question.name} frame {frame - 1}", self.graph, state, self.prescribed_position[frame])
 
     def advance(self, frame: int, position: Tensor, stress: Tensor | None, seconds: float) -> None:

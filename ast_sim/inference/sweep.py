@@ -87,7 +87,7 @@ def sweep(
     """
     if not rows:
         raise ConfigError("a sweep needs at least one row of values")
-    needs_way = bool((config.friction or friction_is_drawn(config)) and effort.newton_steps)
+    needs_way = bool((config.data.friction or friction_is_drawn(config)) and effort.newton_steps)
     frames = 2 if config.jumps and not needs_way else None
     table, seconds, notes = [], 0.0, []
     for start in range(0, len(rows), TOGETHER):

@@ -23,10 +23,11 @@ from ast_sim.inference.evaluation.evaluated_run import Evaluation
 from ast_sim.inference.predict import Motions, in_domain, new_question
 from ast_sim.inference.question import Frames, Question
 from ast_sim.inference.sweep import Sweep, sweep
-from ast_sim.runs.folder import RunFolder
+from ast_sim.runs import run_file
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.own_assembly.grid import grid, read_table
 from ast_sim.support.errors import ConfigError, RolloutError
+from ast_sim.support.notebook_table import html_table, one_line
 from ast_sim.support.progress import Progress
 from ast_sim.support.provenance import provenance
 from ast_sim.support.toml_settings import NOTHING
@@ -35,8 +36,11 @@ from ast_sim.support.toml_settings import NOTHING
 class Run:
     """A trained run, with the model of its best checkpoint (the last one if none was validated).
 
+    Args:
+        path: the run folder, or a file that `save` wrote.
+
     Attributes:
-        path: the run folder.
+        path: the run folder or the file.
         model: the trained model, an `nn.Module`.
         settings: the settings of the model and of the training.
         step: the step of the checkpoint.
@@ -46,18 +50,52 @@ class Run:
         scope: the ranges of sizes, materials and motions in the training scenes.
 
     Raises:
-        CheckpointError: the folder holds no run, or no checkpoint in it can be read.
+        CheckpointError: the folder holds no run, no checkpoint in it can be read, or the file is damaged.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
-        self.folder = RunFolder(self.path)
+        self.folder = run_file.open_run(self.path)
         self.settings, self.scope = self.folder.settings, self.folder.scope
-        self.model, self.step = self.folder.load_model(), self.folder.chosen.step
+        self.model = self.folder.load_model()
+        self.step = self.folder.chosen.step
         answers = self.folder.chosen.answers
         unset = {"corrections": (self.settings.train.calls or 1) - 1}
         self.effort = Effort(**answers.get("effort", unset))
         self._errors = [EffortErrors.from_json(one) for one in answers.get("valid_by_effort", [])]
+
+    def _facts(self) -> dict[str, str]:
+        error = self._expected_error(self.effort)
+        return {
+            "path": self.path.name,
+            "model": f"{self.settings.model.name}, {sum(p.numel() for p in self.model.parameters()):,} parameters",
+            "checkpoint": f"step {self.step:,}",
+            "family": f"{self.scope.family}, lengths in {self.scope.length_unit}",
+            "effort": self.effort.text,
+            "expected error": "not measured" if error is None else f"{100 * error:.2g} %",
+        }
+
+    def __repr__(self) -> str:
+        return one_line("Run", self._facts())
+
+    def _repr_html_(self) -> str:
+        return html_table("Run", self._facts())
+
+    def save(self, path: str | os.PathLike[str], licence: str | None = None) -> None:
+        """Write the run as one file, `NAME.ast`, that `Run("NAME.ast")` opens on any machine.
+
+        It holds the weights of the best checkpoint, the settings, the scope, the default effort, the curves of the
+        training, a model card and a licence, as a zip of plain files. The state of the optimizer and the dataset stay
+        behind: a training cannot go on from it.
+
+        Args:
+            path: the file; an earlier one is replaced, whole or not at all.
+            licence: the text of the licence of the weights; by default the file says that none was stated.
+
+        Raises:
+            CheckpointError: the name does not end in `.ast`, or the file cannot be written.
+        """
+        run_file.write(Path(path), self.folder, self.model, licence)
 
     @property
     def info(self) -> DatasetInfo:
@@ -65,11 +103,11 @@ class Run:
         model, scope = self.settings.model, self.scope
         return DatasetInfo(
             family=scope.family,
-            integration=model.integration,
-            stress_location=model.stress,
-            domain_center=model.domain_center,
-            domain_half_width=model.domain_half_width,
-            contact_radius=model.contact_radius,
+            integration=model.data.integration,
+            stress_location=model.data.stress,
+            domain_center=model.data.domain_center,
+            domain_half_width=model.data.domain_half_width,
+            contact_radius=model.data.contact_radius,
             time_step=scope.time_step,
             length_unit=scope.length_unit,
             generator={"program": "ast_sim predict"},
@@ -247,15 +285,19 @@ class Run:
         steps = min(effort.newton_steps, most)
         return next((one.error for one in known if one.effort.newton_steps == steps), None)
 
-    def open(self, data: str | os.PathLike[str] | None = None) -> Dataset:
-        """Open a dataset, by default the training data, with lengths in the run's unit. The caller closes it.
+    def open(self, data: str | os.PathLike[str] | Dataset | None = None) -> Dataset:
+        """Open a dataset, by default the training data, with lengths in the run's unit. The caller closes it. A dataset
+        that is open already is opened once more.
 
         Raises:
             DatasetError: the dataset cannot be read.
-            ConfigError: its integration, stress location, material columns or elements differ from those of the
-                training data.
+            ConfigError: the run is a file, and no dataset is named; or its integration, stress location, material
+                columns or elements differ from those of the training data.
         """
-        dataset = Dataset(data or self.settings.data, self.scope.length_unit)
+        if data is None and self.path.is_file():
+            raise ConfigError(f"{self.path} holds no dataset: name one; the run learned from {self.settings.data}")
+        path = data.path if isinstance(data, Dataset) else data or self.settings.data
+        dataset = Dataset(path, self.scope.length_unit)
         try:
             self.folder.require_fit(dataset)
         except BaseException:
@@ -265,7 +307,7 @@ class Run:
 
     def evaluate(
         self,
-        data: str | os.PathLike[str] | None = None,
+        data: str | os.PathLike[str] | Dataset | None = None,
         split: str = "test",
         command: str = "Run.evaluate",
         rival_scenes: int = 0,
@@ -274,7 +316,7 @@ class Run:
         """Predict all scenes of a split and measure the errors; on a terminal a bar shows the progress.
 
         Args:
-            data: a dataset; by default the one that the run was trained on.
+            data: a dataset, its path or open; by default the one that the run was trained on.
             command: the command that is recorded beside the figures.
             rival_scenes: in so many scenes the solver solves the deepest frame, in several ways, to compare.
             made_from: the specification or the parts of your own of which the dataset was made; the solver needs them.
@@ -289,6 +331,6 @@ class Run:
             figures = dataclasses.replace(figures, origin={**provenance(command), **origin})
             return Evaluation(self, dataset.path, figures)
 
-    def report(self, path: str | os.PathLike[str], data: str | os.PathLike[str] | None = None) -> None:
+    def report(self, path: str | os.PathLike[str], data: str | os.PathLike[str] | Dataset | None = None) -> None:
         """Evaluate on the test split and write a page with the results."""
         self.evaluate(data).report(path)

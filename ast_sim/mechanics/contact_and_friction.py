@@ -75,8 +75,8 @@ class ContactSettings:
         """The coefficients of friction that act in a scene, ascending, each once. Rigid bodies do not rub on others."""
         deforms = {int(body): bool(scene.deforming_nodes[scene.body == body].any()) for body in np.unique(scene.body)}
         rubbing = [pair for pair in itertools.combinations(deforms, 2) if deforms[pair[0]] or deforms[pair[1]]]
-        found = {self.friction_between(*pair) for pair in rubbing}
-        return sorted(found | {self.friction} if self.self_contact or not found else found)
+        coefficients = {self.friction_between(*pair) for pair in rubbing}
+        return sorted(coefficients | {self.friction} if self.self_contact or not coefficients else coefficients)
 
 
 def load_ipctk():
@@ -151,14 +151,16 @@ class Contact:
         self.nodes, local_faces = np.unique(faces, return_inverse=True)
         local_faces = np.asfortranarray(local_faces.reshape(-1, 3), dtype=np.int32)
         self._body = body[self.nodes].astype(float)
-        vertices, edges = self._vertices(rest), ipctk.edges(local_faces)
+        vertices = self._vertices(rest)
+        edges = ipctk.edges(local_faces)
         self._mesh = ipctk.CollisionMesh(vertices, edges, local_faces)
         self._skin = (SELF_CONTACT_SKIN if settings.self_contact else SKIN) * self._dhat
         self._whole_mesh = ipctk.CollisionMesh(vertices, edges, local_faces)
         # Nodes of one number do not touch each other: those of a body, and those of all rigid bodies.
         fixed = np.zeros(len(rest), bool) if rigid is None else rigid
         whole = np.zeros(len(rest), bool) if rigid is None else ~np.isin(body, body[~rigid])
-        together, alone = np.where(whole, -1, body), body.max() + 1 + np.arange(len(rest))
+        together = np.where(whole, -1, body)
+        alone = body.max() + 1 + np.arange(len(rest))
         if not settings.self_contact:
             self._mesh.can_collide = self._unless_alike(together)
         elif rigid is not None or settings.self_contact is not True:
@@ -168,7 +170,8 @@ class Contact:
         if whole.any():
             self._whole_mesh.can_collide = self._unless_alike(np.where(whole, together, alone))
         self._barrier = ipctk.BarrierPotential(self._dhat, True)
-        self._broad_phase, self._ccd = ipctk.LBVH(), ipctk.AdditiveCCD()
+        self._broad_phase = ipctk.LBVH()
+        self._ccd = ipctk.AdditiveCCD()
         self._dofs = (3 * self.nodes[:, None] + np.arange(3)).ravel()
         self._friction = ipctk.FrictionPotential(STICKING_SLIP * self._dhat)
         self.restart()
@@ -245,7 +248,8 @@ class Contact:
     def gap(self, position: np.ndarray) -> float:
         """Smallest distance in metres between surfaces that are kept apart; infinite if there are none."""
         vertices = self._vertices(position)
-        radius, extent = self._dhat, np.linalg.norm(np.ptp(vertices, axis=0))
+        radius = self._dhat
+        extent = np.linalg.norm(np.ptp(vertices, axis=0))
         collisions = self._new_collisions()
         while collisions.empty() and radius < 8 * extent:
             collisions.build(self._mesh, vertices, radius, 0.0, self._broad_phase)

@@ -80,7 +80,8 @@ class Driven:
         direction = turns[largest] / angles[largest]
         sense = 1 if direction @ turns[turned[0]] > 0 else -1
         # A point p of the axis moves along it only: (I - R) p is the rest of the shift. `lstsq` takes the nearest p.
-        rotation, near = motions.rotation[largest], self.path[0].mean(axis=0)
+        rotation = motions.rotation[largest]
+        near = self.path[0].mean(axis=0)
         shift = motions.shift[largest] + rotation @ near - near
         across = shift - direction * (direction @ shift)
         return Axis(sense * direction, near + np.linalg.lstsq(np.eye(3) - rotation, across, rcond=1e-8)[0])

@@ -92,14 +92,16 @@ class BackwardEuler(Newton):
     settings: DynamicSettings
 
     def __init__(self, case: ClothCase, settings: DynamicSettings | None = None) -> None:
-        scene, rest = case.scene, case.scene.rest_position.astype(np.float64)
+        scene = case.scene
+        rest = case.scene.rest_position.astype(np.float64)
         self.cloth = Cloth(rest, case.cloth_triangles, case.material)
         self.mass = np.where(scene.prescribed, 0, self.cloth.mass())
         self.velocity = np.zeros_like(rest)
         if case.velocity is not None:
             self.velocity[~scene.prescribed] = case.velocity[~scene.prescribed]
         self.halvings = 0
-        self._time_step, self._gravity = case.time_step, np.asarray(case.gravity, float)
+        self._time_step = case.time_step
+        self._gravity = np.asarray(case.gravity, float)
         self._inertia = Inertia(self.cloth, self.mass, case.time_step)
         self._error = 0.0
         contact = Contact(rest, scene.surface(), scene.body, case.contact, ~scene.deforming_nodes)

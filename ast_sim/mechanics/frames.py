@@ -156,7 +156,8 @@ class Frames(ABC):
         Raises:
             SimulationError: the scene at rest fails its checks.
         """
-        checkpoint, count = checkpoint or Checkpoint(), len(self.case.targets)
+        checkpoint = checkpoint or Checkpoint()
+        count = len(self.case.targets)
         self._restore(checkpoint.load())
 
         def before_step(steps: int) -> None:
@@ -188,7 +189,8 @@ class Frames(ABC):
 
         Returns the fields of the record that say what the solution cost.
         """
-        names, started = ("iterations", "factorizations", "halvings", "dissipation"), process_time()
+        names = ("iterations", "factorizations", "halvings", "dissipation")
+        started = process_time()
         before = [getattr(self.solver, name) for name in names]
         self._steps_before = self.solver.iterations
         if self.records:
@@ -221,7 +223,8 @@ class Frames(ABC):
             if not np.isfinite(array).all():
                 raise CheckFailed(f"{name} is not finite")
         position = arrays["position"].astype(np.float64)
-        gap, jacobian = self.contact.gap(position), float(self.jacobian(position).min())
+        gap = self.contact.gap(position)
+        jacobian = float(self.jacobian(position).min())
         if gap <= 0 or self.contact.intersects(position):
             raise CheckFailed(f"surfaces intersect (gap {gap:.3g} m)")
         if jacobian <= 0:

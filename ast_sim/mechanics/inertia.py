@@ -37,12 +37,14 @@ class Inertia:
     """
 
     def __init__(self, potential: Potential, mass: np.ndarray, step: float) -> None:
-        self.potential, self.predicted = potential, np.zeros((len(mass), 3))
+        self.potential = potential
+        self.predicted = np.zeros((len(mass), 3))
         self.weight = mass / step**2
 
     def evaluate(self, position: np.ndarray) -> InertialState:
         """See `Potential`."""
-        inner, offset = self.potential.evaluate(position), position - self.predicted
+        inner = self.potential.evaluate(position)
+        offset = position - self.predicted
         energy = 0.5 * float(self.weight @ np.einsum("ij,ij->i", offset, offset))
         return InertialState(inner, offset, inner.energy + energy)
 

@@ -27,12 +27,10 @@ import scipy.sparse
 
 from ast_sim.support.errors import SimulationError, interrupted
 
-# Systems with at least this many unknowns keep a factor and iterate with it.
-ITERATE_FROM = 50_000
+ITERATE_FROM = 50_000  # systems with at least this many unknowns keep a factor and iterate with it
 # Conjugate gradients end at this residual, relative to the right side. A Newton step reduces the error by as much.
 RELATIVE_RESIDUAL = 1e-3
-# After this many iterations a new factor is cheaper.
-MAX_ITERATIONS = 40
+MAX_ITERATIONS = 40  # then a new factor is cheaper
 
 
 class Factorization(Protocol):
@@ -85,11 +83,11 @@ class Pardiso:
         weakref.finalize(self, self._solver.free_memory, everything=True)  # MKL keeps the factor until it is told
 
     def factorise(self, upper: scipy.sparse.csr_array, is_new_pattern: bool) -> bool:
-        self._matrix, nothing = upper, np.zeros(upper.shape[0])
+        self._matrix = upper
         try:
             for phase in (11, 22) if is_new_pattern else (22,):
                 self._solver.set_phase(phase)
-                self._solver._call_pardiso(upper, nothing)
+                self._solver._call_pardiso(upper, np.zeros(upper.shape[0]))
         except self._error as error:
             if error.value == self._NOT_POSITIVE_DEFINITE:
                 return False
@@ -175,15 +173,16 @@ def conjugate_gradients(
         The solution, or None if the allowed iterations do not suffice; and whether a direction of negative curvature
         was met. A positive definite matrix has no such direction.
     """
-    diagonal, lower = upper.diagonal(), upper.T
-    solution, residual = np.zeros_like(right_side), right_side.copy()
+    diagonal = upper.diagonal()
+    solution = np.zeros_like(right_side)
+    residual = right_side.copy()
     goal = RELATIVE_RESIDUAL * np.linalg.norm(right_side)
     if goal == 0:
         return solution, False
     direction = preconditioned = precondition(residual)
     product = residual @ preconditioned
     for _ in range(MAX_ITERATIONS):
-        image = upper @ direction + lower @ direction - diagonal * direction
+        image = upper @ direction + upper.T @ direction - diagonal * direction
         curvature = direction @ image
         if curvature <= 0:
             return None, True
@@ -239,10 +238,12 @@ class LinearSystem:
         Two nodes fill a block of 3 x 3 places. So only the blocks are sorted, an eighth of the entries, and the blocks
         in the rows of a node are counted; then the place of an entry follows from its components.
         """
-        entries, nodes = len(rows), self._count // 3
+        entries, nodes = rows.size, self._count // 3
         rows, columns = self._number[rows], self._number[columns]
         inside = np.flatnonzero((rows >= 0) & (columns >= 0))
-        rows, columns = np.minimum(rows[inside], columns[inside]), np.maximum(rows[inside], columns[inside])
+        pair = rows[inside], columns[inside]
+        rows = np.minimum(*pair)
+        columns = np.maximum(*pair)
         node, other = rows // 3, columns // 3
         component, across = rows - 3 * node, columns - 3 * other
         one = (component == 0) & (across == 0)
@@ -287,7 +288,8 @@ class LinearSystem:
             matrix is found not to be positive definite. Not every such matrix is found, but the solution is a direction
             of descent in any case.
         """
-        matrix, right = self._assemble(values, contact), right_side.ravel()[self.free]
+        matrix = self._assemble(values, contact)
+        right = right_side.ravel()[self.free]
         free = None
         if self._has_factor and self._count >= ITERATE_FROM:
             free, is_indefinite = conjugate_gradients(matrix, right, self._factorization.solve)
@@ -340,9 +342,9 @@ class LinearSystem:
     ) -> np.ndarray:
         """Change of the forces on free nodes [N,3], to first order, when prescribed nodes move by `increment` [N,3]."""
         mixed, rows, columns = self._mixed
-        increment, values = increment.ravel(), values[mixed]
+        increment = increment.ravel()
         total = np.zeros(len(increment))
         total += np.bincount(contact[0], contact[2] * increment[contact[1]], minlength=len(increment))
-        total += np.bincount(rows, values * increment[columns], minlength=len(increment))
-        total += np.bincount(columns, values * increment[rows], minlength=len(increment))
+        total += np.bincount(rows, values[mixed] * increment[columns], minlength=len(increment))
+        total += np.bincount(columns, values[mixed] * increment[rows], minlength=len(increment))
         return total.reshape(-1, 3)

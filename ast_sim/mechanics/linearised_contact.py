@@ -97,7 +97,8 @@ class NewtonSteps:
         faces = scene.surface().astype(np.int64)
         owner, edge = scene.body[faces[:, 0]], self._rest[faces[:, 0]] - self._rest[faces[:, 1]]
         self._length = float(np.linalg.norm(edge, axis=1).mean())
-        nodes, self._shortening = np.unique(faces), 1.0  # the share of the last step that was made
+        nodes = np.unique(faces)
+        self._shortening = 1.0  # the share of the last step that was made
         self._surfaces = [(faces[owner == body], nodes[scene.body[nodes] != body]) for body in np.unique(owner)]
 
     def step(self, position: np.ndarray, from_afar: bool = False, stuck: np.ndarray | None = None) -> np.ndarray:
@@ -114,12 +115,12 @@ class NewtonSteps:
         """
         try:
             with np.errstate(all="ignore"):
-                found = self._stepped(position, from_afar, stuck)
+                reached = self._stepped(position, from_afar, stuck)
         except np.linalg.LinAlgError as error:
             raise SimulationError(f"the positions are too far from equilibrium: {error}") from error
-        if not np.isfinite(found).all():
+        if not np.isfinite(reached).all():
             raise SimulationError("the positions are too far from equilibrium: the step is not finite")
-        return found
+        return reached
 
     def _stepped(self, position: np.ndarray, from_afar: bool, stuck: np.ndarray | None) -> np.ndarray:
         """See `step`."""
@@ -168,7 +169,9 @@ class NewtonSteps:
         A response costs half a solution with the stiffness. So pairs get one in rounds, those first that would overlap
         most with the forces so far. At the end no pair overlaps: these are the forces of all pairs.
         """
-        chosen, forces, gap = np.zeros(0, int), np.zeros(0), offset.copy()
+        chosen = np.zeros(0, int)
+        forces = np.zeros(0)
+        gap = offset.copy()
         responses = factor.responses(np.zeros((normals.shape[1], 0)))
         while True:
             missing = np.flatnonzero(gap < -OVERLAP * self._length)
@@ -189,9 +192,9 @@ class NewtonSteps:
         stress = self._elasticity.von_mises(self._elasticity.evaluate(position), location)
         if location == "node":
             return stress.astype(np.float32)[:, None]
-        found = np.zeros((self._scene.num_elements, 1), np.float32)
-        found[self._deforming, 0] = stress
-        return found
+        of_elements = np.zeros((self._scene.num_elements, 1), np.float32)
+        of_elements[self._deforming, 0] = stress
+        return of_elements
 
     def near_pairs(self, position: np.ndarray, stuck: np.ndarray | None = None) -> NearPairs:
         """The pairs that may touch at `position` [N, 3]: a surface node and its nearest point of another body. They
@@ -201,15 +204,15 @@ class NewtonSteps:
         nodes, corners, normals, shares, gaps = [], [], [], [], []
         deep, near = DEEP * self._length, NEAR * self._length
         for faces, others in self._surfaces:
-            found = nearest_surface(position[others], position, faces, inside=deep, outside=near)
-            if not len(found.rows):
+            nearest = nearest_surface(position[others], position, faces, inside=deep, outside=near)
+            if not len(nearest.rows):
                 continue
-            corner_positions = (position[found.triangles[:, i]] for i in range(3))
-            nodes.append(others[found.rows])
-            corners.append(found.triangles)
-            normals.append(found.normal)
-            shares.append(igl.barycentric_coordinates(found.place, *corner_positions))
-            gaps.append(found.gap)
+            corner_positions = (position[nearest.triangles[:, i]] for i in range(3))
+            nodes.append(others[nearest.rows])
+            corners.append(nearest.triangles)
+            normals.append(nearest.normal)
+            shares.append(igl.barycentric_coordinates(nearest.place, *corner_positions))
+            gaps.append(nearest.gap)
         if not gaps:
             return NearPairs(scipy.sparse.csr_array((0, len(self._system.free))), np.zeros(0), np.zeros(0))
         joined = (np.concatenate(parts) for parts in (nodes, corners, normals, shares, gaps))
@@ -233,9 +236,12 @@ class NewtonSteps:
         movable = (columns >= 0).any(axis=(1, 2))
         of_pair, columns, weight, normals = of_pair[movable], columns[movable], weight[movable], normals[movable]
         tangents = _tangents(normals)
-        axes, rows = np.concatenate([normals, *tangents]), np.arange(3 * len(normals))
-        values, columns = np.tile(weight, (3, 1))[:, :, None] * axes[:, None, :], np.tile(columns, (3, 1, 1))
-        free, rows = columns >= 0, np.broadcast_to(rows[:, None, None], columns.shape)
+        axes = np.concatenate([normals, *tangents])
+        rows = np.arange(3 * len(normals))
+        values = np.tile(weight, (3, 1))[:, :, None] * axes[:, None, :]
+        columns = np.tile(columns, (3, 1, 1))
+        free = columns >= 0
+        rows = np.broadcast_to(rows[:, None, None], columns.shape)
         entries = values[free], (rows[free], columns[free])
         directions = scipy.sparse.csr_array(entries, shape=(len(axes), len(self._system.free)))
         relative = np.einsum("pk,pki->pi", weight, slid[of_pair])
@@ -301,22 +307,23 @@ def _rubbed(compliance: np.ndarray, offset: np.ndarray, forces: np.ndarray, fric
         compliance: B [3 P, 3 P], normals first, then the first and the second tangents.
         offset: b [3 P].
     """
-    count, found = len(forces), np.concatenate([forces, np.zeros(2 * len(forces))])
+    count = len(forces)
+    all_forces = np.concatenate([forces, np.zeros(2 * len(forces))])
     of_pair = np.ascontiguousarray(compliance.reshape(3, count, 3 * count).swapaxes(0, 1))  # the three rows of each
     by_normal = of_pair[np.arange(count), :, np.arange(count)].tolist()  # what a pair's own normal force moves
     stiffest = compliance.diagonal().reshape(3, count)[1:].max(axis=0).tolist()
     pairs = list(zip(of_pair, offset.reshape(3, count).T, by_normal, stiffest, strict=True))
     for _ in range(SWEEPS):
-        before = found.copy()
+        before = all_forces.copy()
         for pair, (rows, gap, (own, first_by_normal, second_by_normal), tangential) in enumerate(pairs):
             components = slice(pair, None, count)
-            distance, first, second = (rows @ found + gap).tolist()
-            normal_before, one, other = found[components].tolist()
+            distance, first, second = (rows @ all_forces + gap).tolist()
+            normal_before, one, other = all_forces[components].tolist()
             normal = max(0.0, normal_before - distance / own)
             one -= (first + first_by_normal * (normal - normal_before)) / tangential
             other -= (second + second_by_normal * (normal - normal_before)) / tangential
             share = min(1.0, friction * normal / max(math.hypot(one, other), TINY))
-            found[components] = normal, share * one, share * other
-        if np.abs(found - before).max() <= CHANGE * np.abs(found).max():
+            all_forces[components] = normal, share * one, share * other
+        if np.abs(all_forces - before).max() <= CHANGE * np.abs(all_forces).max():
             break
-    return found
+    return all_forces

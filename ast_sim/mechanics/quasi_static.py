@@ -101,7 +101,8 @@ def solve_frame(
     """
     started = process_time()
     frames = SolidFrames(case, settings)
-    solver, began = frames.solver, process_time()
+    solver = frames.solver
+    began = process_time()
 
     def watch(iterations: int) -> None:
         if iterations > most_iterations:
@@ -136,7 +137,8 @@ class SolidFrames(Frames):
     record_type = SolidRecord
 
     def __init__(self, case: SolidCase, settings: SolverSettings | None) -> None:
-        scene, rest = case.scene, case.scene.rest_position.astype(np.float64)
+        scene = case.scene
+        rest = case.scene.rest_position.astype(np.float64)
         self._deforming = np.flatnonzero(case.deforming)
         self._elasticity = elastic_body(rest, scene.elements[self._deforming], case.material.of(self._deforming))
         contact = Contact(rest, scene.surface(), scene.body, case.contact, ~scene.deforming_nodes)
@@ -152,7 +154,8 @@ class SolidFrames(Frames):
         if not self.records:
             self._reactions = self._held()
         arrays = self._stored()
-        checked, reactions = self.check(arrays), self._reactions
+        checked = self.check(arrays)
+        reactions = self._reactions
         turned = {} if self.driven.axis is None else {"torque": self._torque(reactions)}
         return arrays, self.record_type(
             **cost,

@@ -39,7 +39,9 @@ class Reaction:
         import igl  # takes 0.2 s
 
         assert scene.material is not None
-        self.scene, self.driven, self._rest = scene, driven, scene.rest_position.astype(np.float64)
+        self.scene = scene
+        self.driven = driven
+        self._rest = scene.rest_position.astype(np.float64)
         soft = np.flatnonzero(scene.deforming_nodes[scene.elements].any(axis=1))
         young, poisson = scene.material[soft, :2].astype(np.float64).T
         self._elasticity = elastic_body(self._rest, scene.elements[soft], NeoHookean(young, poisson))
@@ -77,7 +79,9 @@ class Reaction:
 
     def _ends(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """[N] bool twice: the deforming nodes on which the moved nodes act, and all others that are held or touched."""
-        scene, driven, nearest = self.scene, self.driven, self._nearest_body(position)
+        scene = self.scene
+        driven = self.driven
+        nearest = self._nearest_body(position)
         held = scene.prescribed & self._deforming
         if scene.node_type[scene.body == driven.body][0] == NodeType.OBSTACLE:
             source = (nearest == driven.body) & ~held
@@ -89,7 +93,7 @@ class Reaction:
         """[N] the number of the nearest other body within reach of a deforming surface node; -1 for all other nodes."""
         import igl
 
-        found = np.full(len(position), -1)
+        nearest_body = np.full(len(position), -1)
         nearest = np.full(len(position), self._reach**2)
         for body, faces in self._surfaces.items():
             used, local = np.unique(faces, return_inverse=True)
@@ -102,21 +106,22 @@ class Reaction:
                     continue
                 square = igl.point_mesh_squared_distance(position[nodes], position[used], local)[0]
                 closer = square < nearest[nodes]
-                found[nodes[closer]], nearest[nodes[closer]] = body, square[closer]
-        return found
+                nearest_body[nodes[closer]], nearest[nodes[closer]] = body, square[closer]
+        return nearest_body
 
     def _folds(self, position: np.ndarray) -> np.ndarray:
         """[2, P] pairs of nodes of a deforming body whose surfaces look at each other across a gap within reach, and
         have come nearer: there the body may touch itself."""
         from scipy.spatial import KDTree
 
-        outward, found = self._outward(position), [np.zeros((0, 2), int)]
+        outward = self._outward(position)
+        pairs = [np.zeros((0, 2), int)]
         for faces in self._surfaces.values():
             nodes = np.unique(faces)
             nodes = nodes[self._deforming[nodes]]
             if len(nodes):
-                found.append(nodes[KDTree(position[nodes]).query_pairs(self._reach, output_type="ndarray")])
-        first, second = np.concatenate(found).T
+                pairs.append(nodes[KDTree(position[nodes]).query_pairs(self._reach, output_type="ndarray")])
+        first, second = np.concatenate(pairs).T
         way, before = position[second] - position[first], self._rest[second] - self._rest[first]
         facing = np.einsum("pi,pi->p", outward[first] - outward[second], way) > 0
         opposite = np.einsum("pi,pi->p", outward[first], outward[second]) < OPPOSITE
@@ -125,14 +130,16 @@ class Reaction:
 
     def _outward(self, position: np.ndarray) -> np.ndarray:
         """[N,3] the outward unit normals at the nodes of the surfaces; zero at all other nodes."""
-        faces, outward = np.concatenate(list(self._surfaces.values())), np.zeros_like(position)
+        faces = np.concatenate(list(self._surfaces.values()))
+        outward = np.zeros_like(position)
         a, b, c = (position[faces[:, corner]] for corner in range(3))
         np.add.at(outward, faces.ravel(), np.repeat(np.cross(b - a, c - a), 3, axis=0))
         return outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), np.finfo(float).tiny)
 
     def _field(self, source: np.ndarray, sink: np.ndarray, folds: np.ndarray) -> np.ndarray:
         """[N] w: about harmonic between 1 at the sources and 0 at the sinks, and the same on both sides of folds."""
-        count, free = len(source), self._deforming & ~source & ~sink
+        count = len(source)
+        free = self._deforming & ~source & ~sink
         inside = folds[:, free[folds].all(axis=0)]
         links = coo_array((np.ones(len(inside[0])), inside), shape=(count, count))
         groups, group = connected_components(links, directed=False)

@@ -164,6 +164,30 @@ class Newton:
             self._equilibrate()
         self.dissipation += self.state.contact.dissipation()
 
+    def settle(self, position: np.ndarray, stuck: np.ndarray | None = None) -> None:
+        """Find the equilibrium near positions [N,3] at which the prescribed nodes already are.
+
+        The equilibrium without friction comes first: far from equilibrium, normal forces may be far too large, and
+        friction would hold the surfaces there.
+
+        Args:
+            stuck: [N,3] where surfaces in contact stuck to each other before; not read without friction.
+
+        Raises:
+            NotConverged: surfaces cut each other, an element is inverted, or there is no equilibrium.
+        """
+        if self.contact.intersects(position):
+            raise NotConverged("surfaces cut each other at the start")
+        self.restart(position)
+        if not np.isfinite(self.state.energy):
+            raise NotConverged("an element is inverted at the start")
+        self._equilibrate()
+        if stuck is None or not self.contact.settings.has_friction:
+            return
+        for _ in range(1 + self.settings.friction_passes):
+            self._lag_friction(stuck)
+            self._equilibrate()
+
     def residual(self) -> float:
         """Largest component of the forces on free nodes, relative to what counts as zero: at most 1 at equilibrium."""
         gradient, tolerance = self._gradient(self.state)
@@ -175,7 +199,8 @@ class Newton:
         return self._gradient(self.state)[0]
 
     def _evaluate(self, position: np.ndarray) -> State:
-        potential, contact = self.potential.evaluate(position), self.contact.at(position)
+        potential = self.potential.evaluate(position)
+        contact = self.contact.at(position)
         return State(position, potential, contact, potential.energy + contact.energy())
 
     def _count(self) -> None:

@@ -137,13 +137,16 @@ def build_hierarchy(edges: EdgeSet, rest_position: Tensor, levels: int, pooled: 
         pooled: whether the positions of a coarser mesh are pooled like features. Otherwise kept nodes stay in place.
         mesh: all mesh edges. Their connected components become `Hierarchy.component`.
     """
-    adjacency, kept_position = _matrix(edges), rest_position.numpy().astype(np.float64)
-    position, weight = rest_position.double(), np.ones(len(rest_position))
+    adjacency = _matrix(edges)
+    kept_position = rest_position.numpy().astype(np.float64)
+    position = rest_position.double()
+    weight = np.ones(len(rest_position))
     edge_sets, rest_edges, poolings = [edges], [edge_vectors(edges, rest_position, rest_position)], []
     for _ in range(levels):
         kept = select(adjacency, kept_position)
         pooling, weight = _pooling(adjacency, kept, weight, pooled)
-        adjacency, kept_position = coarsen(adjacency, kept), kept_position[kept]
+        adjacency = coarsen(adjacency, kept)
+        kept_position = kept_position[kept]
         position = pooling.positions(position)
         edge_sets.append(_edge_set(adjacency))
         poolings.append(pooling)

@@ -98,8 +98,8 @@ class BSMS(WorldEdgeSimulator):
 
     def world(self, batch: Batch) -> EdgeSet:
         """The contact edges of the finest mesh."""
-        found = super().world(batch)
-        return batch.graph.own.between_components(found) if self.config.contacts == "components" else found
+        edges = super().world(batch)
+        return batch.graph.own.between_components(edges) if self.config.contacts == "components" else edges
 
     def contacts(self, batch: Batch) -> list[EdgeSet]:
         """The contact edges of each mesh, the finest first."""
@@ -109,8 +109,10 @@ class BSMS(WorldEdgeSimulator):
     def forward(self, batch: Batch) -> Prediction:
         """Normalised outputs for the frame after `batch`."""
         nodes, *edges = self.inputs_of(batch)
-        levels, poolings = list(zip(*edges, strict=True)), batch.graph.own.poolings
-        x, skipped = self.node_encoder(nodes), []
+        levels = list(zip(*edges, strict=True))
+        poolings = batch.graph.own.poolings
+        x = self.node_encoder(nodes)
+        skipped = []
         for i, block in enumerate(self.down):
             skipped.append(self._steps(block, x, levels[i], end=i == 0))
             x = poolings[i].pool(skipped[-1])

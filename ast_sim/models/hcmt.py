@@ -67,12 +67,13 @@ class Block(nn.Module):
 
     def forward(self, x: Tensor, *edge_sets: Edges) -> Tensor:
         """x [N, hidden] and the edges of each set with their features [M, hidden] -> [N, hidden]."""
-        y, found = self.norm(x), []
+        y = self.norm(x)
+        attended = []
         q, k, v = self.q(y), self.k(y), self.v(y)
         for norm, (edges, features) in zip(self.edge_norms, edge_sets, strict=True):
             e = norm(features)
-            found.append(channel_attention(edges, q, k, v, self.p(e), self.g(e), self.head_width))
-        x = self.out(torch.cat(found, dim=1), residual=x)
+            attended.append(channel_attention(edges, q, k, v, self.p(e), self.g(e), self.head_width))
+        x = self.out(torch.cat(attended, dim=1), residual=x)
         first, second, last = self.feed_forward
         return last(second(first(self.forward_norm(x), "relu"), "relu"), residual=x)
 
@@ -99,11 +100,11 @@ class HCMT(WorldEdgeSimulator):
 
     def world(self, batch: Batch) -> EdgeSet:
         """The contact edges."""
-        found = super().world(batch)
+        edges = super().world(batch)
         if self.config.contacts == "all":
-            return found
-        ends = torch.stack([batch.graph.node_type[found.senders], batch.graph.node_type[found.receivers]])
-        return subset(found, (ends == NodeType.OBSTACLE).any(0) & (ends == NodeType.NORMAL).any(0))
+            return edges
+        ends = torch.stack([batch.graph.node_type[edges.senders], batch.graph.node_type[edges.receivers]])
+        return subset(edges, (ends == NodeType.OBSTACLE).any(0) & (ends == NodeType.NORMAL).any(0))
 
     def forward(self, batch: Batch) -> Prediction:
         """Normalised outputs for the frame after `batch`."""
@@ -112,7 +113,8 @@ class HCMT(WorldEdgeSimulator):
         kept = [pooling.kept for pooling in batch.graph.own.poolings]
         contacts = (world, self.world_encoder(on_world))
 
-        x, saved = self.node_encoder(nodes), []
+        x = self.node_encoder(nodes)
+        saved = []
         for block in self.contact:
             x = block(x, meshes[0], contacts)
         for block, mesh, chosen in zip(self.down, meshes, kept, strict=False):

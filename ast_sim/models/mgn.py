@@ -42,8 +42,8 @@ class EdgeUpdate(nn.Module):
 
     def forward(self, edges: EdgeSet, latents: Tensor, nodes: Tensor) -> tuple[Tensor, Tensor]:
         """latents [M, hidden], nodes [N, hidden] -> latents plus messages, and sums of the messages [N, hidden]."""
-        total, found = messages(self.update, edges, latents, nodes)
-        return latents + found, total
+        total, sent = messages(self.update, edges, latents, nodes)
+        return latents + sent, total
 
 
 class Block(nn.Module):

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal, Self
+from typing import Any, Self
 
-from ast_sim.dataset.layout import GIVEN_FRAMES, DatasetInfo
+from ast_sim.models.data_facts import DataFacts
 from ast_sim.support.errors import ConfigError
-from ast_sim.support.toml_settings import LARGEST, require_range
+from ast_sim.support.toml_settings import FROM_DATA, LARGEST, require_range
 
 WIDEST = 1 << 16  # the largest width or count of a layer
 
@@ -27,31 +27,13 @@ def count(default: int | None, text: str, least: int = 1) -> Any:
 
 
 @dataclass(frozen=True)
-class DataFacts:
-    """What the settings of a model may depend on in the data.
-
-    Attributes:
-        info: facts of the dataset.
-        material_width: numbers that describe the material of an element; 0 without material.
-        mesh_spacing: mean length of a mesh edge.
-        planar: whether z is 0 in all scenes.
-        tetrahedra: whether the elements are tetrahedra.
-        recorded: what the solver recorded and is the same in all scenes: young, poisson, contact_range, friction.
-    """
-
-    info: DatasetInfo
-    material_width: int
-    mesh_spacing: float
-    planar: bool = False
-    tetrahedra: bool = True
-    recorded: Mapping[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
 class ModelConfig:
     """Settings of any model. Each model derives a class from this one, with a `name` of its own.
 
-    When training starts, `resolve` fills in the settings that are None, and all fields from `integration` on.
+    When training starts, `resolve` fills in the settings that are None, and `data`.
+
+    Attributes:
+        data: what the model must know of its data. It is no setting.
     """
 
     name: str = setting("", "which model")
@@ -59,27 +41,15 @@ class ModelConfig:
     proximity_radius: float | None = setting(
         None, "with proximity: distance within which a node sees another body; unset: 1.5 mesh spacings", least=0
     )
-    boundary_motion: bool = setting(True, "give each prescribed node its next increment as an input; off with jumps")
+    boundary_motion: bool | None = setting(
+        None, "give each prescribed node its next increment as an input; unset: yes, and no with jumps"
+    )
     jumps: bool | None = setting(
         False,
         "predict any frame at once from the first frame, carried along by the prescribed nodes, not step by step;"
         " unset: yes in quasi-static scenes",
     )
-
-    integration: Literal["quasi_static", "dynamic"] = setting(
-        "quasi_static", "next position: p + v if quasi_static, 2 p - p_previous + a if dynamic; from the dataset"
-    )
-    stress: Literal["none", "node", "element"] = setting("none", "where stress is predicted; from the dataset")
-    material_width: int = setting(0, "numbers that describe the material of an element; from the dataset")
-    domain_center: tuple[float, float, float] = setting((0.0, 0.0, 0.0), "centre of the domain; from the dataset")
-    domain_half_width: float = setting(1.0, "half the side of the domain, a cube; from the dataset")
-    contact_radius: float = setting(0.0, "distance within which surfaces count as near; from the dataset")
-    tetrahedra: bool = setting(False, "the elements are tetrahedra; from the dataset")
-    young: float = setting(0.0, "Young's modulus of all elements, if the solver recorded one; from the dataset")
-    poisson: float = setting(0.0, "Poisson's ratio of all elements, likewise; from the dataset")
-    contact_range: float = setting(0.0, "distance below which the solver's surfaces repel, likewise; from the dataset")
-    friction: float = setting(0.0, "coefficient of friction, likewise; from the dataset")
-    planar: bool = setting(False, "nodes stay at their z, as in scenes that lie in the plane z = 0; from the dataset")
+    data: DataFacts = field(default=DataFacts(), metadata={FROM_DATA: True})
 
     def __post_init__(self) -> None:
         self.check_inputs("node_inputs", ("displacement", "velocity", "material", "proximity", "out_of_balance"))
@@ -96,9 +66,9 @@ class ModelConfig:
     def check_available(self, key: str) -> None:
         """Raise ConfigError if the setting `key` names an input that the dataset does not have."""
         inputs = getattr(self, key)
-        if "material" in inputs and not self.material_width:
+        if "material" in inputs and not self.data.material_width:
             raise ConfigError(f"model.{key}: material is an input, but the dataset has no material")
-        if "velocity" in inputs and self.integration != "dynamic":
+        if "velocity" in inputs and not self.data.dynamic:
             raise ConfigError(f"model.{key}: velocity is an input of dynamic scenes only")
 
     def check_heads(self) -> None:
@@ -107,19 +77,10 @@ class ModelConfig:
             raise ConfigError(f"model.hidden = {self.hidden} must be a multiple of model.heads = {self.heads}")
 
     @property
-    def dynamic(self) -> bool:
-        return self.integration == "dynamic"
-
-    @property
-    def given_frames(self) -> int:
-        """The number of first frames from which a prediction starts."""
-        return GIVEN_FRAMES[self.integration]
-
-    @property
     def gains_along_rollouts(self) -> bool:
         """Whether an unset `train.rollout_pool` becomes a pool. With inertia, rollouts diverge without one
         (docs/log.md, 2026-11-23)."""
-        return self.dynamic
+        return self.data.dynamic
 
     @property
     def cell_side(self) -> float:
@@ -131,42 +92,46 @@ class ModelConfig:
         """The parts of the graph that the inputs need: arguments of `Graph.from_scene`."""
         return {"surface": "proximity" in self.node_inputs, "elasticity": "out_of_balance" in self.node_inputs}
 
-    def resolve(self, facts: DataFacts) -> Self:
-        """The settings with nothing left open.
+    def usual_inputs(self, facts: DataFacts, jumps: bool) -> tuple[str, ...]:
+        """The inputs of nodes if `node_inputs` is unset: velocity in dynamic scenes, material in scenes that have one,
+        and with jumps the elastic forces of tetrahedra."""
+        velocity = ("velocity",) if facts.dynamic else ()
+        material = ("material",) if facts.material_width else ()
+        forces = ("out_of_balance",) if jumps and facts.tetrahedra else ()
+        return (*velocity, *material, *forces)
 
-        If `node_inputs` is unset, velocity becomes an input of dynamic scenes, material of scenes that have one, and
-        with jumps the elastic forces of tetrahedra.
+    def resolve(self, facts: DataFacts) -> Self:
+        """The settings with nothing left open that has an effect.
 
         Raises:
-            ConfigError: the data lacks something that the settings ask for.
+            ConfigError: the data lacks something that the settings ask for, or a setting would have no effect.
         """
-        info = facts.info
-        jumps = info.integration == "quasi_static" if self.jumps is None else self.jumps
-        if jumps and info.integration == "dynamic":
+        jumps = not facts.dynamic if self.jumps is None else self.jumps
+        if jumps and facts.dynamic:
             raise ConfigError(
                 "model.jumps: the dataset is dynamic, so the positions of its nodes depend on their motion before, not"
                 " only on the prescribed nodes: predict it step by step"
             )
-        velocity = ("velocity",) if info.integration == "dynamic" else ()
-        forces = ("out_of_balance",) if jumps and facts.tetrahedra else ()
-        chosen = (*velocity, *(("material",) if facts.material_width else ()), *forces)
-        if "out_of_balance" in (self.node_inputs or ()) and not facts.tetrahedra:
+        if jumps and self.boundary_motion:
+            raise ConfigError(
+                "model.boundary_motion is of no use here: with model.jumps, the start has the prescribed nodes in their"
+                " places; leave it unset (none)"
+            )
+        inputs = self.usual_inputs(facts, jumps) if self.node_inputs is None else self.node_inputs
+        if "out_of_balance" in inputs and not facts.tetrahedra:
             raise ConfigError("model.node_inputs: out_of_balance needs tetrahedra, but the elements are triangles")
+        radius = self.proximity_radius
+        if radius is not None and "proximity" not in inputs:
+            raise ConfigError("model.proximity_radius is of no use here: proximity is not in model.node_inputs")
+        if radius is None and "proximity" in inputs:
+            radius = 1.5 * facts.mesh_spacing
         resolved = replace(
             self,
-            node_inputs=chosen if self.node_inputs is None else self.node_inputs,
-            proximity_radius=1.5 * facts.mesh_spacing if self.proximity_radius is None else self.proximity_radius,
-            integration=info.integration,
-            stress=info.stress_location,
-            material_width=facts.material_width,
-            domain_center=tuple(float(c) for c in info.domain_center),
-            domain_half_width=float(info.domain_half_width),
-            contact_radius=float(info.contact_radius),
-            tetrahedra=facts.tetrahedra,
-            **facts.recorded,
-            planar=facts.planar,
+            node_inputs=inputs,
+            proximity_radius=radius,
+            boundary_motion=not jumps and self.boundary_motion is not False,
             jumps=jumps,
-            boundary_motion=self.boundary_motion and not jumps,
+            data=facts,
         )
         resolved.check_available("node_inputs")
         return resolved
@@ -185,14 +150,11 @@ class ProximityConfig(ModelConfig):
         """See `ModelConfig`. Such models have a pool without inertia too."""
         return True
 
-    def resolve(self, facts: DataFacts) -> Self:
-        """See `ModelConfig`. If `node_inputs` is unset, displacement becomes an input, and proximity in quasi-static
-        scenes. Proximity has not been measured in dynamic scenes."""
-        resolved = super().resolve(facts)
-        if self.node_inputs is not None:
-            return resolved
-        proximity = () if resolved.dynamic else ("proximity",)
-        return replace(resolved, node_inputs=("displacement", *proximity, *resolved.node_inputs))
+    def usual_inputs(self, facts: DataFacts, jumps: bool) -> tuple[str, ...]:
+        """See `ModelConfig`. Displacement is an input, too, and proximity in quasi-static scenes. Proximity has not
+        been measured in dynamic scenes."""
+        proximity = () if facts.dynamic else ("proximity",)
+        return ("displacement", *proximity, *super().usual_inputs(facts, jumps))
 
 
 @dataclass(frozen=True)

@@ -73,7 +73,7 @@ def normalizer_of(config: ModelConfig, what: str) -> FeatureNormalizer:
     known: dict[str, tuple[Kind | None, int]] = {  # in the order of the columns
         "displacement": vector,
         "velocity": vector,
-        "material": ("scalar", config.material_width),
+        "material": ("scalar", config.data.material_width),
         "stress": scalar,
         "proximity": (None, PROXIMITY_WIDTH),
         "out_of_balance": (None, 3),

@@ -20,7 +20,13 @@ class Statistics:
 
     def __init__(self, kind: Kind):
         self.kind = kind
-        self._count, self._sum, self._squares = 0, 0.0, 0.0
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin without samples."""
+        self._count = 0
+        self._sum = 0.0
+        self._squares = 0.0
 
     def observe(self, x: Tensor) -> None:
         """Add samples."""
@@ -54,9 +60,10 @@ class Normalizer(nn.Module):
             statistics.observe(x[:, columns])
 
     def fix(self) -> None:
-        """Set mean and scale from all samples."""
+        """Set mean and scale from all samples, and forget these."""
         for columns, statistics in self._statistics:
             self.mean[columns], self.scale[columns] = statistics.result()
+            statistics.forget()
 
     def forward(self, x: Tensor) -> Tensor:
         return (x - self.mean) / self.scale

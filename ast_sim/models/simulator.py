@@ -53,7 +53,7 @@ class Simulator(nn.Module):
         super().__init__()
         self.config = config
         self.motion_normalizer = Normalizer("vector")
-        self.stress_normalizer = Normalizer("scalar") if config.stress != "none" else None
+        self.stress_normalizer = Normalizer("scalar") if config.data.stress != "none" else None
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Simulator:
         try:
@@ -100,13 +100,13 @@ class Simulator(nn.Module):
             options: seed (0 by default), noise (0), gamma (1), mirror, shift and part, as of `PairSampler`.
         """
         options = {"seed": 0, "noise": 0.0, "gamma": 1.0, **options, "batch_size": batch_size}
-        of_model = {"make_graph": self.graph, "dynamic": self.config.dynamic, "jumps": self.config.jumps}
+        of_model = {"make_graph": self.graph, "dynamic": self.config.data.dynamic, "jumps": self.config.jumps}
         return PairSampler(dataset, split, **of_model, **options)
 
     def _stressed(self, batch: Batch) -> Tensor:
         """[*] int64: the nodes or elements that deform. Only their stress counts."""
         graph = batch.graph
-        deforming = graph.deforming_elements if self.config.stress == "element" else graph.deforming_nodes
+        deforming = graph.deforming_elements if self.config.data.stress == "element" else graph.deforming_nodes
         return deforming.nonzero()[:, 0]
 
     @torch.no_grad()
@@ -188,9 +188,9 @@ class Simulator(nn.Module):
 
     def integrate(self, batch: Batch, motion: Tensor) -> Tensor:
         """[N, 3]: positions in the predicted frame, p + v, or 2 p - p_previous + a with inertia."""
-        if self.config.planar:
+        if self.config.data.planar:
             motion = motion * motion.new_tensor([1, 1, 0])
-        if self.config.dynamic:
+        if self.config.data.dynamic:
             return 2 * batch.position - batch.previous_position + motion
         return batch.position + motion
 

@@ -144,8 +144,8 @@ class Transolver(Simulator):
         self.encoder = MLP(self.node_inputs.width + self.positions.width, 2 * config.hidden, config.hidden)
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.blocks))
         self.norm = nn.LayerNorm(config.hidden)
-        self.decoder = Linear(config.hidden, 4 if config.stress == "node" else 3)
-        if config.stress == "element":
+        self.decoder = Linear(config.hidden, 4 if config.data.stress == "node" else 3)
+        if config.data.stress == "element":
             self.element_decoder = Linear(config.hidden, 1)
         for module in self.modules():
             if isinstance(module, Linear):  # as released
@@ -159,7 +159,7 @@ class Transolver(Simulator):
 
     def inputs_of(self, batch: Batch, use: Use = Normalizer.__call__) -> tuple[Tensor, Tensor]:
         """See `Simulator`: of the nodes, and their positions at rest and now from the centre of the domain, [N, 6]."""
-        center = torch.tensor(self.config.domain_center * 2)
+        center = torch.tensor(self.config.data.domain_center * 2)
         positions = torch.cat([batch.graph.rest_position, batch.position], dim=1) - center
         return use(self.node_inputs, node_features(self.config, batch)), use(self.positions, positions)
 
@@ -169,7 +169,7 @@ class Transolver(Simulator):
         for block in self.blocks:
             x = block(x, batch.graph.node_offsets)
         x = self.norm(x)
-        on_elements = self.config.stress == "element" and batch.wants_stress
+        on_elements = self.config.data.stress == "element" and batch.wants_stress
         stress = self.element_decoder(batch.graph.element_mean(x)) if on_elements else None
         return Prediction.of_nodes(self.decoder(x), stress)
 

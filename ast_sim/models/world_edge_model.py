@@ -14,8 +14,9 @@ from torch import Tensor, nn
 
 from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import edge_vectors
+from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.layers import MLP, layer
-from ast_sim.models.model_config import DataFacts, ModelConfig, count, setting
+from ast_sim.models.model_config import ModelConfig, count, setting
 from ast_sim.models.node_inputs import edge_features, node_features, normalizer_of
 from ast_sim.models.normalizer import Normalizer
 from ast_sim.models.simulator import Prediction, Simulator, Use
@@ -47,8 +48,8 @@ class WorldEdgeConfig(ModelConfig):
         resolved = super().resolve(facts)
         if self.world_radius is not None:
             return resolved
-        seen = resolved.contact_radius >= SEEN * facts.mesh_spacing
-        return replace(resolved, world_radius=resolved.contact_radius if seen else facts.mesh_spacing)
+        seen = resolved.data.contact_radius >= SEEN * facts.mesh_spacing
+        return replace(resolved, world_radius=resolved.data.contact_radius if seen else facts.mesh_spacing)
 
     def facts(self, length_unit: str, mesh_spacing: float | None = None) -> dict[str, str]:
         """See `ModelConfig`."""
@@ -175,8 +176,8 @@ def messages(edge_mlp: DeepMLP, edges: EdgeSet, features: Tensor, nodes: Tensor)
         weights = (rest.weight, rest.bias, norm.weight, norm.bias)
         return message_edges(edges, of_senders, of_receivers, linear(features, of_edge), None, *weights)
     of_nodes = of_senders.index_select(0, edges.senders) + of_receivers.index_select(0, edges.receivers)
-    found = rest(torch.relu(linear(features, of_edge, residual=of_nodes)), norm=norm)
-    return segment_sum(found, *edges.by_receiver), found
+    sent = rest(torch.relu(linear(features, of_edge, residual=of_nodes)), norm=norm)
+    return segment_sum(sent, *edges.by_receiver), sent
 
 
 class Decoder(nn.Module):
@@ -185,8 +186,8 @@ class Decoder(nn.Module):
 
     def __init__(self, config: WorldEdgeConfig):
         super().__init__()
-        self.of_nodes = DeepMLP(config, config.hidden, 4 if config.stress == "node" else 3)
-        self.of_elements = DeepMLP(config, config.hidden, 1) if config.stress == "element" else None
+        self.of_nodes = DeepMLP(config, config.hidden, 4 if config.data.stress == "node" else 3)
+        self.of_elements = DeepMLP(config, config.hidden, 1) if config.data.stress == "element" else None
 
     def forward(self, nodes: Tensor, batch: Batch) -> Prediction:
         on_elements = self.of_elements is not None and batch.wants_stress

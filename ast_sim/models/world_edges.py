@@ -24,11 +24,12 @@ def world_edges(batch: Batch, radius: float, most: int | None) -> EdgeSet:
             numbers. A warning says so once. None keeps all.
     """
     graph = batch.graph
-    offsets, position = graph.node_offsets.tolist(), batch.position.double().numpy()
+    offsets = graph.node_offsets.tolist()
+    position = batch.position.double().numpy()
     # Mesh edges lie in both directions, sorted by receiver and sender.
     mesh = _keys(graph.m2m.receivers.numpy(), graph.m2m.senders.numpy(), len(position))
-    found = [start + _pairs(position[start:end], radius) for start, end in zip(offsets[:-1], offsets[1:], strict=True)]
-    kept = [_shortest(_without(pairs, mesh, len(position)), position, most) for pairs in found]
+    near = [start + _pairs(position[start:end], radius) for start, end in zip(offsets[:-1], offsets[1:], strict=True)]
+    kept = [_shortest(_without(pairs, mesh, len(position)), position, most) for pairs in near]
     return both_ways(np.concatenate(kept) if kept else np.zeros((0, 2), np.int64), len(position))
 
 

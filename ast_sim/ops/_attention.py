@@ -117,7 +117,8 @@ _OUTPUTS = "out[Q,H,D], maximum[Q,H], total[Q,H]"
 
 def _ops(name: str, tensors: str, split: Callable, rename: Callable[[str], str] = str) -> tuple[Op, Op]:
     """Attention and its gradient for one way of storing q, k and v in tensors, and what makes q, k and v of these."""
-    num, gradients = tensors.count("["), ", ".join(f"d{x}" for x in tensors.replace(" rows", "").split(", "))
+    num = tensors.count("[")
+    gradients = ", ".join(f"d{x}" for x in tensors.replace(" rows", "").split(", "))
     spec = f"{tensors}, {_SETTINGS} -> {_OUTPUTS}"
     backward_spec = f"{tensors}, {_SETTINGS}, {_OUTPUTS}, dout[Q,H,D] -> {gradients}"
     op = Op(Kernel(name, rename(spec), _check_heads), lambda *args: _reference(*split(*args[:num]), *args[num:]))

@@ -39,16 +39,18 @@ def proximity(
     if any(map(is_differentiated, (position, offsets, body, surface, surface_offsets))):
         raise ValueError("proximity: it has no derivatives: detach the position, and call it outside of torch.func")
     ahead, body, surface = position.numpy(), body.numpy(), surface.numpy()
-    gap, normal = np.full(len(ahead), radius), np.zeros((len(ahead), 3))
+    gap = np.full(len(ahead), radius)
+    normal = np.zeros((len(ahead), 3))
     nodes, faces = offsets.tolist(), surface_offsets.tolist()
     for scene in range(len(nodes) - 1):
-        mine, triangles = slice(nodes[scene], nodes[scene + 1]), surface[faces[scene] : faces[scene + 1]]
+        mine = slice(nodes[scene], nodes[scene + 1])
+        triangles = surface[faces[scene] : faces[scene + 1]]
         for other in np.unique(body[mine]):
             of_others = nodes[scene] + np.flatnonzero(body[mine] != other)
             of_body = triangles[body[triangles[:, 0]] == other]
-            found, outward = signed_gap(ahead[of_others], ahead, of_body, radius)
-            nearer = np.abs(found) < np.abs(gap[of_others])
-            gap[of_others[nearer]], normal[of_others[nearer]] = found[nearer], outward[nearer]
+            gaps, outward = signed_gap(ahead[of_others], ahead, of_body, radius)
+            nearer = np.abs(gaps) < np.abs(gap[of_others])
+            gap[of_others[nearer]], normal[of_others[nearer]] = gaps[nearer], outward[nearer]
     weight = 1 - np.abs(gap) / radius
     fine = np.clip(gap / (FINE * radius), -1, 1)
     columns = [normal * weight[:, None], (gap / radius)[:, None], fine[:, None]]
@@ -69,7 +71,8 @@ def signed_gap(
     Returns:
         [P] and [P, 3].
     """
-    gap, normal = np.full(len(points), radius), np.zeros((len(points), 3))
-    found = nearest_surface(points, position, triangles, radius, radius)
-    gap[found.rows], normal[found.rows] = found.gap, found.normal
+    gap = np.full(len(points), radius)
+    normal = np.zeros((len(points), 3))
+    nearest = nearest_surface(points, position, triangles, radius, radius)
+    gap[nearest.rows], normal[nearest.rows] = nearest.gap, nearest.normal
     return gap, normal

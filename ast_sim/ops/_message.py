@@ -69,7 +69,8 @@ def _check_features(edges: EdgeSet, of_senders: Tensor, edge_features: Tensor | 
         if len(encoder[1]) == 0:
             raise ValueError("message: a1 is empty: an encoder needs hidden channels, or give none")
     elif edge_features is not None and edge_features.shape != (len(edges), of_senders.shape[-1]):
-        wanted, shape = f"[{len(edges)}, {of_senders.shape[-1]}]", tuple(edge_features.shape)
+        wanted = f"[{len(edges)}, {of_senders.shape[-1]}]"
+        shape = tuple(edge_features.shape)
         raise ValueError(f"message: edge_features without an encoder must have shape {wanted}, not {shape}")
 
 

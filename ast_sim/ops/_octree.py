@@ -62,7 +62,8 @@ class Octree(IndexSet):
         """
         if not 0 <= levels <= self.depth:
             raise ValueError(f"octree: a tree of depth {self.depth} has no coarser level {levels} steps up")
-        parts, maps = _coarsen(self.keys, self.cell_offsets, levels), []
+        parts = _coarsen(self.keys, self.cell_offsets, levels)
+        maps = []
         order = torch.arange(len(self.keys), device=self.keys.device)
         for level in range(levels):
             keys, cell_offsets, node_offsets, node_cell, *pairs = parts[9 * level : 9 * level + 9]

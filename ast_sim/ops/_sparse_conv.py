@@ -46,8 +46,8 @@ def _reference(x, weight, bias, transposed, pair_offsets, source, destination, b
 
 def _weight_reference(x, dout, pair_offsets, source, destination):
     groups = _groups(pair_offsets, source, destination)
-    found = {k: x.index_select(0, i).T @ dout.index_select(0, j) for k, i, j in groups}
-    return torch.stack([found.get(k, x.new_zeros(x.shape[1], dout.shape[1])) for k in range(OFFSETS)])
+    gradients = {k: x.index_select(0, i).T @ dout.index_select(0, j) for k, i, j in groups}
+    return torch.stack([gradients.get(k, x.new_zeros(x.shape[1], dout.shape[1])) for k in range(OFFSETS)])
 
 
 _conv = Op(Kernel("sparse_conv", _SPEC), _reference)

@@ -40,8 +40,8 @@ def gradient_op(op: Op, kernel: Kernel, known: dict[str, Callable[[dict], Any]] 
         switches = {name for p, dy in zip(outputs, dys, strict=True) if dy is not None for name in p.names("if")}
         xs = [p.name in switches if "switch" in p.words else given.get(p.name) for p in inputs]
         wanted = [i for i, want in zip(of_inputs, kernel.spec.wanted(*args), strict=True) if want]
-        found = dict(zip(wanted, pull_back(op.composition, xs, wanted, dys), strict=True))
-        return tuple(found.get(i) for i in of_inputs)
+        by_input = dict(zip(wanted, pull_back(op.composition, xs, wanted, dys), strict=True))
+        return tuple(by_input.get(i) for i in of_inputs)
 
     gradient = Op(kernel, composition)
 
@@ -58,15 +58,16 @@ def gradient_op(op: Op, kernel: Kernel, known: dict[str, Callable[[dict], Any]] 
         _keep(ctx, values)
 
     def backward(ctx, *dys):
-        args, needed = _kept(ctx), ctx.needs_input_grad
+        args = _kept(ctx)
+        needed = ctx.needs_input_grad
         for i, output in cotangents.items():
             args[i] = _wanted(dys[output], taken[i])
         for i, which in wants.items():
             args[i] = [needed[k] for k in which] if len(which) > 1 else needed[which[0]]
         dxs: list[Tensor | None] = [None] * len(needed)
         if any(needed[i] for i in of_inputs):
-            found = gradient(*args)
-            for i, dx in zip(of_inputs, found if isinstance(found, tuple) else (found,), strict=True):
+            results = gradient(*args)
+            for i, dx in zip(of_inputs, results if isinstance(results, tuple) else (results,), strict=True):
                 dxs[i] = dx if needed[i] else None
         for i in added:
             dxs[i] = dys[0] if needed[i] else None
@@ -98,8 +99,8 @@ def pull_back(
     given = [i for i, dy in enumerate(dys) if dy is not None]
 
     def part(*some: Tensor) -> tuple[Tensor, ...]:
-        found = dict(zip(wanted, some, strict=True))
-        ys = function(*(found.get(i, x) for i, x in enumerate(xs)))
+        by_input = dict(zip(wanted, some, strict=True))
+        ys = function(*(by_input.get(i, x) for i, x in enumerate(xs)))
         return tuple((ys if isinstance(ys, tuple) else (ys,))[i] for i in given)
 
     return torch.func.vjp(part, *(xs[i] for i in wanted))[1](tuple(dys[i] for i in given))
@@ -120,8 +121,8 @@ def differentiate_by_composition(op: Op, kept: Sequence[int] = ()) -> None:
     def backward(ctx, *gradients):
         args = _kept(ctx)
         wanted = [i for i, needed in enumerate(ctx.needs_input_grad) if needed and i not in kept]
-        found = dict(zip(wanted, pull_back(op.compose, args, wanted, gradients), strict=True))
-        return tuple(found.get(i) for i in range(len(args)))
+        results = dict(zip(wanted, pull_back(op.compose, args, wanted, gradients), strict=True))
+        return tuple(results.get(i) for i in range(len(args)))
 
     differentiate(op, save, backward)
 
@@ -163,5 +164,5 @@ def _backward_of_each(backward: Callable, ctx, gradients: tuple) -> tuple:
     batches = [torch._remove_batch_dim(x, level, 0, 0) if _is_old_batch(x) else x for x in gradients]
     num = next(len(x) for x, y in zip(batches, gradients, strict=True) if _is_old_batch(y))
     samples = [[x[i] if _is_old_batch(y) else x for x, y in zip(batches, gradients, strict=True)] for i in range(num)]
-    found = zip(*(backward(ctx, *sample) for sample in samples), strict=True)
-    return tuple(None if x[0] is None else torch._add_batch_dim(torch.stack(x), 0, level) for x in found)
+    parts = zip(*(backward(ctx, *sample) for sample in samples), strict=True)
+    return tuple(None if x[0] is None else torch._add_batch_dim(torch.stack(x), 0, level) for x in parts)

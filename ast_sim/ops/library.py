@@ -65,8 +65,11 @@ class Kernel:
     """
 
     def __init__(self, name: str, spec: str, more: Callable[[str, Sizes, Given], None] | None = None) -> None:
-        self.name, self.spec, self.more = name, Spec(spec), more
-        taken, self._num = self.spec.taken, len(self.spec.taken)
+        self.name = name
+        self.spec = Spec(spec)
+        self.more = more
+        taken = self.spec.taken
+        self._num = len(self.spec.taken)
         self._parameters = taken + self.spec.outputs
         self._floats = [i for i, p in enumerate(taken) if p.shape is not None and p.dtype.is_floating_point]
         if BACKEND == "c":
@@ -195,8 +198,8 @@ class Op:
     def reference(self, *args) -> Any:
         """The composition, after the checks."""
         self._check(*args)
-        found = self.composition(*args)
-        return Kernel.given(found, args) if isinstance(found, tuple) else found
+        result = self.composition(*args)
+        return Kernel.given(result, args) if isinstance(result, tuple) else result
 
     def _on_cpu(self, *args):
         tensors = [x for x in args if isinstance(x, Tensor)]

@@ -255,7 +255,8 @@ def _check_number(name: str, p: Parameter, value: float) -> None:
 def _check_tensor(name: str, p: Parameter, x: Tensor, sizes: Sizes, exact: bool) -> None:
     if x.dtype != p.dtype and (exact or not (p.dtype.is_floating_point and x.dtype.is_floating_point)):
         raise TypeError(f"{name}: {p.name} must be {str(p.dtype)[6:]}, not {x.dtype}")
-    shape, before = p.shape or (), dict(sizes)
+    shape = p.shape or ()
+    before = dict(sizes)
     if x.dim() != len(shape) or not all(d.fits(n, sizes) for d, n in zip(shape, x.shape, strict=True)):
         wanted = ", ".join(d.show(before) for d in shape)
         raise ValueError(f"{name}: {p.name} must have shape [{wanted}], not {tuple(x.shape)}")
@@ -283,7 +284,8 @@ def check_index(kernel: str, name: str, index: Tensor, bound: int) -> None:
     wrong = ((index < 0) | (index >= bound)).nonzero()
     if len(wrong):
         at = wrong[0].tolist()
-        place, value = ", ".join(map(str, at)), int(index[tuple(at)])
+        place = ", ".join(map(str, at))
+        value = int(index[tuple(at)])
         raise ValueError(f"{kernel}: {name}[{place}] = {value} is not an index below {bound}")
 
 

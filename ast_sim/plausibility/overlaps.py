@@ -26,7 +26,8 @@ class Overlap(NamedTuple):
 
 def overlaps(scene: Scene) -> list[Finding]:
     """One finding for each pair of bodies of tetrahedra that overlap."""
-    surface, rest = scene.surface(), scene.rest_position.astype(np.float64)
+    surface = scene.surface()
+    rest = scene.rest_position.astype(np.float64)
     bodies = np.unique(scene.body)
     if len(bodies) > _MOST_BODIES:
         return []
@@ -35,7 +36,7 @@ def overlaps(scene: Scene) -> list[Finding]:
     rigid = {body for body in faces if not scene.deforming_nodes[scene.body == body].any()}
     boxes = {body: (rest[f].min(axis=(0, 1)), rest[f].max(axis=(0, 1))) for body, f in faces.items()}
     edge = _mean_edge(rest, surface)
-    found = []
+    findings = []
     for one, other in combinations(faces, 2):
         if (one in rigid and other in rigid) or not _meet(boxes[one], boxes[other]):
             continue
@@ -44,8 +45,8 @@ def overlaps(scene: Scene) -> list[Finding]:
             inner, outer = (other, one) if other in rigid or other > one else (one, other)
             told = f"lies {overlap.depth:.3g} inside body {outer}" if overlap.depth else f"cuts body {outer}"
             meaning = f"body {inner} {told} at the start; scenes that can be solved have no overlap: move one of them"
-            found.append(Finding("pairs of bodies that overlap", 1, f"at {point(overlap.where)}", meaning))
-    return found
+            findings.append(Finding("pairs of bodies that overlap", 1, f"at {point(overlap.where)}", meaning))
+    return findings
 
 
 def deepest(rest: np.ndarray, first: np.ndarray, second: np.ndarray, tolerated: float) -> Overlap | None:
@@ -61,7 +62,8 @@ def deepest_node(rest: np.ndarray, first: np.ndarray, second: np.ndarray) -> tup
     """How deep a node of one closed surface [F, 3] lies inside the other, and where; 0 if none does."""
     import igl  # takes 0.2 s
 
-    depth, where = 0.0, np.zeros(3)
+    depth = 0.0
+    where = np.zeros(3)
     for mine, other in ((first, second), (second, first)):
         nodes = np.unique(mine)
         low, high = rest[np.unique(other)].min(axis=0), rest[np.unique(other)].max(axis=0)
@@ -70,7 +72,8 @@ def deepest_node(rest: np.ndarray, first: np.ndarray, second: np.ndarray) -> tup
             used, faces = np.unique(other, return_inverse=True)
             distance = np.asarray(igl.signed_distance(rest[nodes], rest[used], faces.reshape(-1, 3))[0])
             if -distance.min() > depth:
-                depth, where = float(-distance.min()), rest[nodes[np.argmin(distance)]]
+                depth = float(-distance.min())
+                where = rest[nodes[np.argmin(distance)]]
     return depth, where
 
 

@@ -9,9 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from ast_sim.element_topology import LOCAL_FACES
+from ast_sim.number_arrays import connected_parts
 from ast_sim.plausibility.findings import Finding, places
 from ast_sim.plausibility.overlaps import overlaps
-from ast_sim.scene import Scene, connected_parts
+from ast_sim.scene import Scene
 
 # Points are at one place if they are nearer than this share of the size of the scene.
 _SAME_PLACE = 1e-6

@@ -264,17 +264,17 @@ def _read_manifest(path: Path) -> dict[str, dict[str, Any]]:
 
 def _read_verified(path: Path) -> dict[str, bytes]:
     """The content of each file, which is what the manifest says."""
-    found = {}
+    contents = {}
     for name, record in _read_manifest(path).items():
         file = path / name
         with _explained(file, "cannot be read"):
             size = os.lstat(file).st_size
             if size != record["size"]:
                 raise CheckpointError(f"{file}: has {size} bytes, the manifest says {record['size']}")
-            found[name] = _read_file(file, size)
-        if _hash(found[name]) != record["sha256"]:
+            contents[name] = _read_file(file, size)
+        if _hash(contents[name]) != record["sha256"]:
             raise CheckpointError(f"{file}: is damaged: its SHA-256 is not that of the manifest")
-    return found
+    return contents
 
 
 def _read_file(file: Path, most: int) -> bytes:

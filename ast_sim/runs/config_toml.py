@@ -57,13 +57,13 @@ def write_config(
 
 
 def read_config(run: Path) -> RunConfig:
-    """The settings of a run.
+    """The settings of a run, with the facts of its data.
 
     Raises:
         CheckpointError: the folder holds no run, or `run.json` cannot be read.
         ConfigError: the file was edited or damaged; the text names the first setting that differs.
     """
-    return from_values(RunConfig, _verified(run, CONFIG))
+    return from_values(RunConfig, _verified(run, CONFIG)).knowing(read_scope(run).data)
 
 
 def read_scope(run: Path) -> Scope:
@@ -79,16 +79,16 @@ def read_changes(path: Path) -> dict[str, Any]:
         ConfigError: the file cannot be read, is no TOML, or is of another version; the text names the file.
     """
     try:
-        found = _leaves(path)
+        changes = _leaves(path)
     except OSError as error:
         raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
     except ValueError as error:
         raise ConfigError(f"{path} is not valid TOML: {error}") from error
-    found.pop("data", None)
-    version = found.pop("version", VERSION)
+    changes.pop("data", None)
+    version = changes.pop("version", VERSION)
     if version != VERSION:
         raise ConfigError(f"{path} has version {version}, not {VERSION}: use the ast_sim that wrote it")
-    return found
+    return changes
 
 
 def read_origin(run: Path) -> dict[str, Any]:
@@ -100,37 +100,37 @@ def read_origin(run: Path) -> dict[str, Any]:
     """
     path = run / ORIGIN
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        if found.keys() - {_START, _SPECIFICATION} != _KEYS or found["sha256"] != _hash(found):
+        origin = json.loads(path.read_text(encoding="utf-8"))
+        if origin.keys() - {_START, _SPECIFICATION} != _KEYS or origin["sha256"] != _hash(origin):
             raise ValueError
     except OSError as error:
         raise CheckpointError(f"{path} cannot be read ({error.strerror}): {_advice(ORIGIN)}") from error
     except (ValueError, AttributeError, TypeError, RecursionError) as error:
         raise CheckpointError(f"{path} is damaged: its content does not fit its SHA-256: {_advice(ORIGIN)}") from error
-    if found["version"] != VERSION:
-        raise CheckpointError(f"{path} has version {found['version']}, not {VERSION}: use the ast_sim that wrote it")
-    return found
+    if origin["version"] != VERSION:
+        raise CheckpointError(f"{path} has version {origin['version']}, not {VERSION}: use the ast_sim that wrote it")
+    return origin
 
 
 def _verified(run: Path, name: str) -> dict[str, Any]:
     """The table of the file `name` of a run; the file must hold what the run was started with."""
     path = run / name
     try:
-        found = _leaves(path)
+        written = _leaves(path)
     except OSError as error:
         raise CheckpointError(f"{run} is not a run folder: {name} cannot be read ({error.strerror})") from error
     except ValueError as error:
         raise ConfigError(f"{path} is damaged: it is not valid TOML ({error}): {_advice(name)}") from error
     kept = read_origin(run)[name]
     wanted = {"version": VERSION, **dict(leaves(kept))}
-    for key in (*wanted, *found):
-        if key not in found:
+    for key in (*wanted, *written):
+        if key not in written:
             raise ConfigError(f"{path}: {key} is missing; the run was started with {wanted[key]!r}: {_advice(name)}")
         if key not in wanted:
             raise ConfigError(f"{path}: {key} is no setting of this run: {_advice(name)}")
-        if found[key] != wanted[key]:
+        if written[key] != wanted[key]:
             raise ConfigError(
-                f"{path}: {key} is {found[key]!r}, but the run was started with {wanted[key]!r}: {_advice(name)}"
+                f"{path}: {key} is {written[key]!r}, but the run was started with {wanted[key]!r}: {_advice(name)}"
             )
     return kept
 

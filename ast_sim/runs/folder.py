@@ -129,9 +129,9 @@ class RunFolder:
         """Raise ConfigError unless the dataset is of the kind that the run was trained on."""
         model, scope = self.settings.model, self.scope
         for what, ours, theirs in (
-            ("integration", model.integration, dataset.info.integration),
-            ("stress_location", model.stress, dataset.info.stress_location),
-            ("material columns", model.material_width, dataset.material_width),
+            ("integration", model.data.integration, dataset.info.integration),
+            ("stress_location", model.data.stress, dataset.info.stress_location),
+            ("material columns", model.data.material_width, dataset.material_width),
             ("nodes of an element", scope.corners, dataset.element_size),
             ("lengths in", scope.length_unit, dataset.info.length_unit),
         ):

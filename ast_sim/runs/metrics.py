@@ -45,9 +45,9 @@ class Metrics:
 
     def require(self, lines: int) -> None:
         """Warn if fewer lines are intact than a checkpoint says were written before it."""
-        found = sum(1 for _ in self)
-        if found < lines:
-            text = f"{self.path} has lost {lines - found} of {lines} lines: its curves are not complete"
+        count = sum(1 for _ in self)
+        if count < lines:
+            text = f"{self.path} has lost {lines - count} of {lines} lines: its curves are not complete"
             warnings.warn(text, stacklevel=2)
 
     def best(self) -> dict[str, Any] | None:
@@ -57,5 +57,5 @@ class Metrics:
 
     def validation(self, step: int) -> dict[str, Any] | None:
         """The record of the last validation after a step; None if there is none."""
-        found = [record for record in self if record["step"] == step and "valid_rmse" in record]
-        return found[-1] if found else None
+        records = [record for record in self if record["step"] == step and "valid_rmse" in record]
+        return records[-1] if records else None

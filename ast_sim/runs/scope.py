@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ast_sim.models.data_facts import DataFacts
 from ast_sim.prescribed_motion import Motion
 from ast_sim.scene import NodeType, Scene
 
@@ -27,6 +28,7 @@ class Scope:
         increment: largest displacement of a prescribed node in one frame.
         usual_increment: the median of that displacement over all frames in which one moves; 0 if none ever does.
         material_low, material_high: the lowest and the highest number of each material column.
+        data: what the model knows of its data.
     """
 
     family: str
@@ -41,6 +43,7 @@ class Scope:
     usual_increment: float
     material_low: tuple[float, ...]
     material_high: tuple[float, ...]
+    data: DataFacts
 
     def notes(self, scene: Scene, motion: Motion, jumps: bool) -> Iterator[str]:
         """One sentence for each property of a scene and its prescribed motion that lies outside its range. For a model
@@ -57,8 +60,8 @@ class Scope:
             *self._materials(scene),
         ):
             if not low - LEEWAY * abs(low) <= value <= high + LEEWAY * abs(high):
-                found, *limits = (f"{number:.4g}{unit}" for number in (value, *dict.fromkeys((low, high))))
-                yield f"{text.format(found)}; in training {' to '.join(limits)}"
+                shown, *limits = (f"{number:.4g}{unit}" for number in (value, *dict.fromkeys((low, high))))
+                yield f"{text.format(shown)}; in training {' to '.join(limits)}"
 
     def _materials(self, scene: Scene) -> Iterator[tuple[tuple[float, float], float, str, str]]:
         """The smallest and the largest number in each material column of the deforming bodies."""

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.model_config import ModelConfig, setting
 from ast_sim.models.registry import find_model
 from ast_sim.support.errors import ConfigError, is_utf8
@@ -19,7 +20,10 @@ class TrainConfig:
     from the data."""
 
     steps: int | None = setting(None, "optimizer steps; unset: as many as `epochs` asks for")
-    epochs: int = setting(100, "passes over the training pairs; it has no effect if `steps` is set")
+    minutes: float | None = setting(
+        None, "minutes of training: 50 steps are timed first, then the number of steps is fixed; leave `steps` unset"
+    )
+    epochs: int = setting(100, "passes over the training pairs, if neither `steps` nor `minutes` is set")
     batch_size: int = setting(48, "scenes in a batch; each scene is a pair of frames")
     accumulate: int = setting(1, "batches in a step; the step averages their gradients")
     optimizer: OptimizerName = setting(
@@ -37,7 +41,7 @@ class TrainConfig:
     noise: float | None = setting(
         None,
         "standard deviation of the noise on the input state, in units of length; unset: 0.45 of the rms displacement"
-        " (0.15 with a rollout pool), in dynamic scenes 0.1 of the rms increment",
+        " (0.15 with a rollout pool), in dynamic scenes 0.1 of the rms increment; with model.jumps none",
     )
     rollout_pool: int | None = setting(
         0,
@@ -47,7 +51,7 @@ class TrainConfig:
     )
     calls: int = setting(1, "with model.jumps: so many calls correct one another in training; without jumps 1")
     noise_gamma: float | None = setting(
-        None, "share of the noise that the target takes back; unset: 1, in dynamic scenes 0.1"
+        None, "with noise: share of it that the target takes back; unset: 1, in dynamic scenes 0.1"
     )
     mirror: tuple[Literal["x", "y", "z"], ...] = setting(
         (), "axes along which scenes are mirrored at random; name only axes that gravity, fibres or chirality allow"
@@ -82,6 +86,10 @@ class RunConfig:
     model: ModelConfig = field(metadata={"class_of": _model_class})
     train: TrainConfig
     data: str
+
+    def knowing(self, facts: DataFacts) -> RunConfig:
+        """The settings with the facts of the data, which no file of settings holds."""
+        return replace(self, model=replace(self.model, data=facts))
 
     def __post_init__(self) -> None:
         if not is_utf8(self.data):

@@ -86,8 +86,8 @@ def temporary_name(path: Path) -> Path:
 def _remove_leftovers(folder: Path) -> None:
     with contextlib.suppress(OSError):
         for entry in os.scandir(folder):
-            found = _LEFTOVER.fullmatch(entry.name)
-            if found and not _runs(int(found[1])) and time.time() - entry.stat().st_mtime > _LEFTOVER_AGE:
+            match = _LEFTOVER.fullmatch(entry.name)
+            if match and not _runs(int(match[1])) and time.time() - entry.stat().st_mtime > _LEFTOVER_AGE:
                 shutil.rmtree(entry.path) if entry.is_dir() else os.unlink(entry.path)
 
 

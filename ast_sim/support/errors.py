@@ -67,16 +67,16 @@ def require(extra: str, *modules: str) -> list[ModuleType]:
     Raises:
         MissingExtra: a module cannot be imported; the text gives the pip command that installs the extra.
     """
-    found = []
+    imported = []
     for name in modules:
         try:
-            found.append(importlib.import_module(name))
+            imported.append(importlib.import_module(name))
         except ImportError as error:
             if interrupted(error):  # Ctrl-C while a compiled module is imported
                 raise KeyboardInterrupt from error
             line = f'pip install "ast_sim[{extra}]"'
             raise MissingExtra(f"{name} is needed here but cannot be imported ({error}): {line}") from error
-    return found
+    return imported
 
 
 def interrupted(error: BaseException | None) -> bool:

@@ -41,13 +41,14 @@ def nearest_surface(
     import igl  # takes 0.2 s
 
     # All triangles around a nearest point are kept, so the sign is that of the whole surface.
-    margin, kind = max(inside, outside), igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
+    margin = max(inside, outside)
+    kind = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
     close = np.flatnonzero(beside(points, position[triangles], margin))
     triangles = triangles[beside(position[triangles], points[close], margin)]
     if not len(triangles):
         return Nearest(close[:0], np.zeros(0), np.zeros((0, 3)), triangles, np.zeros((0, 3)))
-    found = igl.signed_distance(points[close], position, triangles, kind, -inside, outside)
-    gap, face, place, outward = map(np.asarray, found)
+    nearest = igl.signed_distance(points[close], position, triangles, kind, -inside, outside)
+    gap, face, place, outward = map(np.asarray, nearest)
     near = (gap < outside) & (gap > -inside)  # NaN where the surface is farther away
     rows, gap, place = close[near], gap[near], place[near]
     touching = np.abs(gap) <= TOUCHING * margin

@@ -47,7 +47,8 @@ class Clock:
         return self._validations[-1]
 
     def _lap(self) -> float:
-        before, self._mark = self._mark, time.perf_counter()
+        before = self._mark
+        self._mark = time.perf_counter()
         return self._mark - before
 
     @property

@@ -3,7 +3,8 @@
 The type of a field is bool, int, float, str, a Literal of str, a tuple of these, or a dataclass; any of them may be
 optional. A field may have a default, but no default factory. TOML has no word for None, so None is written as the
 string "none". A field that holds one of several dataclasses has the metadata `class_of`: a function that takes the
-field's TOML table and returns the class.
+field's TOML table and returns the class. A field with the metadata FROM_DATA holds a dataclass of facts of the data.
+These are no settings: nothing here reads, writes or changes them.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 from ast_sim.support.errors import ConfigError
 
 NONE = "none"
+FROM_DATA = "from_data"
 LARGEST = 2**63 - 1  # TOML's integers have 64 bits
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
@@ -57,7 +59,8 @@ def to_toml(obj: Any) -> str:
 def to_values(value: Any) -> Any:
     """Settings as a TOML table: nested dictionaries, lists, texts and numbers."""
     if dataclasses.is_dataclass(value):
-        return {item.name: to_values(getattr(value, item.name)) for item in dataclasses.fields(value)}
+        chosen = [item.name for item in dataclasses.fields(value) if FROM_DATA not in item.metadata]
+        return {name: to_values(getattr(value, name)) for name in chosen}
     if isinstance(value, tuple):
         return [to_values(member) for member in value]
     return NONE if value is None else value
@@ -111,7 +114,8 @@ def change(obj: T, values: Mapping[str, Any]) -> T:
     """A copy with some settings replaced; `values` gives the new values by dotted key.
 
     Raises:
-        ConfigError: a key is unknown (the text names the nearest known key), or a value has the wrong type.
+        ConfigError: a key is unknown (the text names the nearest known key), or a fact of the data, or a value has the
+            wrong type.
     """
     return _with(type(obj), obj, values)
 
@@ -121,7 +125,7 @@ def _with(cls: type[T], given: Any, values: Mapping[str, Any]) -> T:
     kinds = {key: kind for key, _, kind in _leaves(cls, given)}
     for key in values:
         if key not in kinds:
-            raise _unknown(kinds, key)
+            raise _unknown(kinds, key, _facts(cls, given))
     return _build(cls, given, {key: _convert(to_values(value), kinds[key], key) for key, value in values.items()})
 
 
@@ -130,7 +134,9 @@ def _build(cls: Any, given: Any, values: Mapping[str, Any], prefix: str = "") ->
     kinds = get_type_hints(cls)
     for item in dataclasses.fields(cls):
         key, kind = prefix + item.name, kinds[item.name]
-        if dataclasses.is_dataclass(kind):
+        if FROM_DATA in item.metadata:
+            arguments[item.name] = getattr(given, item.name, item.default)
+        elif dataclasses.is_dataclass(kind):
             arguments[item.name] = _build(*_group(item, kind, given, key), values, f"{key}.")
         elif key in values:
             arguments[item.name] = values[key]
@@ -147,10 +153,24 @@ def _leaves(cls: type, given: Any = NOTHING, prefix: str = "") -> Iterator[tuple
     kinds = get_type_hints(cls)
     for item in dataclasses.fields(cls):
         key, kind = prefix + item.name, kinds[item.name]
+        if FROM_DATA in item.metadata:
+            continue
         if dataclasses.is_dataclass(kind):
             yield from _leaves(*_group(item, kind, given, key), f"{key}.")
         else:
             yield key, item, kind
+
+
+def _facts(cls: type, given: Any, prefix: str = "") -> Iterator[str]:
+    """The dotted keys that facts of the data would have if they were settings; arguments as of `_leaves`."""
+    kinds = get_type_hints(cls)
+    for item in dataclasses.fields(cls):
+        key, kind = prefix + item.name, kinds[item.name]
+        if FROM_DATA in item.metadata:
+            names = [fact.name for fact in dataclasses.fields(kind)]
+            yield from (key, *(prefix + name for name in names), *(f"{key}.{name}" for name in names))
+        elif dataclasses.is_dataclass(kind):
+            yield from _facts(*_group(item, kind, given, key), f"{key}.")
 
 
 def _group(item: dataclasses.Field, kind: Any, given: Any, key: str) -> tuple[type, Any]:
@@ -165,7 +185,9 @@ def _group(item: dataclasses.Field, kind: Any, given: Any, key: str) -> tuple[ty
     return (class_of(table) if class_of else kind), table
 
 
-def _unknown(known: Iterable[str], key: str) -> ConfigError:
+def _unknown(known: Iterable[str], key: str, facts: Iterable[str]) -> ConfigError:
+    if key in facts:
+        return ConfigError(f"{key} is no setting but a fact of the data, which the dataset has: leave it out")
     members = [name for name in known if name.startswith(f"{key}.")]
     if members:
         return ConfigError(f"{key} is a group of settings, such as {members[0]}")

@@ -10,13 +10,14 @@ import numpy as np
 from ast_sim.dataset.layout import GIVEN_FRAMES
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.evaluation.measures import SquaredError, rmse_pooled
+from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.prescribed_motion import Motion
 from ast_sim.runs.scope import Scope, edge_lengths, size_of, spacing_of
 from ast_sim.scene import AttributeValue, NodeType
 from ast_sim.support.errors import TrainingError
 
-# Settings of the model, and the attributes of trajectories that hold them.
+# Facts of the data (`DataFacts`), and the attributes of trajectories that hold them.
 RECORDED = {"young": "young", "poisson": "poisson", "contact_range": "dhat", "friction": "friction"}
 MEASURED = 100  # at most so many training trajectories are measured
 
@@ -31,7 +32,7 @@ class DataScales:
         nodes: median number of nodes of a scene.
         trajectories, pairs: number of trajectories, and number of frames that can be a target.
         planar: whether z is 0 in all scenes.
-        recorded: numbers that the solver recorded with all scenes alike, by the setting of the model; see RECORDED. 0:
+        recorded: numbers that the solver recorded with all scenes alike, by the name of the fact; see RECORDED. 0:
             it recorded none, or several.
     """
 
@@ -87,17 +88,18 @@ def _alike(constants: list[dict[str, AttributeValue | None]]) -> dict[str, float
     return {key: float(np.max(known.get(key, 0.0), initial=0.0)) for key in first}
 
 
-def scope_of(dataset: Dataset) -> Scope:
-    """The ranges of the training split, measured on the same trajectories."""
+def scope_of(dataset: Dataset, data: DataFacts) -> Scope:
+    """The ranges of the training split, measured on the same trajectories, and what the model knows of its data."""
     rows, materials, increments = [], [], []
     for _, trajectory in dataset.spread("train", MEASURED):
-        scene, motion = trajectory.scene, Motion(trajectory.position)
+        scene = trajectory.scene
+        motion = Motion(trajectory.position)
         moves = motion.increments(scene)
         increments += [length for length in moves if length > 0]
         rows.append((scene.num_nodes, size_of(scene), spacing_of(scene), motion.travel(scene), max(moves)))
         if scene.material is not None:
             materials.append(scene.material[scene.deforming_elements])
-    found = dict(zip(("nodes", "size", "spacing", "travel", "increment"), zip(*rows, strict=True), strict=True))
+    by_name = dict(zip(("nodes", "size", "spacing", "travel", "increment"), zip(*rows, strict=True), strict=True))
     material = np.concatenate(materials) if materials else np.zeros((1, 0))
     info = dataset.info
     return Scope(
@@ -105,13 +107,14 @@ def scope_of(dataset: Dataset) -> Scope:
         length_unit=info.length_unit,
         time_step=float(info.time_step),
         corners=dataset.element_size,
-        **{key: (float(min(values)), float(max(values))) for key, values in found.items()},
+        **{key: (float(min(values)), float(max(values))) for key, values in by_name.items()},
         usual_increment=float(np.median(increments or [0.0])),
         material_low=tuple(material.min(axis=0).tolist()),
         material_high=tuple(material.max(axis=0).tolist()),
+        data=data,
     )
 
 
 def largest_error(scales: DataScales, model: ModelConfig) -> float:
     """A pool of rollouts drops a state whose error, in units of length, is above this; see docs/log.md."""
-    return (0.4 if model.dynamic else 1.8) * scales.displacement
+    return (0.4 if model.data.dynamic else 1.8) * scales.displacement

@@ -7,7 +7,8 @@ import math
 from pathlib import Path
 
 from ast_sim.dataset.reader import Dataset
-from ast_sim.models.model_config import DataFacts, ModelConfig
+from ast_sim.models.data_facts import DataFacts
+from ast_sim.models.model_config import ModelConfig
 from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.toml_settings import LARGEST, require_range
@@ -20,6 +21,7 @@ _COUNTS += ("validate_every", "checkpoint_every", "calls")
 _RANGES = {
     **dict.fromkeys(_COUNTS, (1, LARGEST)),
     **dict.fromkeys(("seed", "warmup", "validate_scenes", "noise"), (0, LARGEST)),
+    "minutes": (1e-3, LARGEST),
     "peak_rate": (1e-30, 1.0),
     "clip": (1e-30, math.inf),
     "stress_weight": (0, 1e6),
@@ -35,7 +37,7 @@ def resolve(config: RunConfig, dataset: Dataset, scales: DataScales, keep_model:
     Raises:
         ConfigError: a setting is out of its range, or the data does not fit it; the text names the setting.
     """
-    facts = DataFacts(
+    facts = DataFacts.of(
         dataset.info,
         dataset.material_width,
         scales.spacing,
@@ -43,7 +45,10 @@ def resolve(config: RunConfig, dataset: Dataset, scales: DataScales, keep_model:
         tetrahedra=dataset.element_size != 3,
         recorded=scales.recorded,
     )
-    model = dataclasses.replace(config.model, **facts.recorded) if keep_model else config.model.resolve(facts)
+    if keep_model:
+        model = dataclasses.replace(config.model, data=dataclasses.replace(config.model.data, **scales.recorded))
+    else:
+        model = config.model.resolve(facts)
     return RunConfig(model, resolve_training(config.train, scales, model), str(Path(config.data).resolve()))
 
 
@@ -64,14 +69,20 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
         "peak_rate": 1e-4 * math.sqrt(scenes / 2),
         "warmup": min(2000, steps // 20),
         "decay": steps if config.steps is not None else steps + epoch,
-        "noise_gamma": 0.1 if model.dynamic else 1.0,
         "validate_every": validate_every,
         "checkpoint_every": validate_every,
     }
     missing = {key: value for key, value in derived.items() if getattr(config, key) is None}
     pool = _rollout_pool(config, model)
     noise = _noise(config, scales, model, pool > 0)
-    resolved = dataclasses.replace(config, **missing, noise=noise, rollout_pool=pool, shift=_shift(config, model))
+    resolved = dataclasses.replace(
+        config,
+        **missing,
+        noise=noise,
+        noise_gamma=_noise_gamma(config, model, noise),
+        rollout_pool=pool,
+        shift=_shift(config, model),
+    )
     if resolved.calls > 1 and not model.jumps:
         raise ConfigError(f"train.calls is {resolved.calls}; without model.jumps it must be 1")
     if resolved.decay <= resolved.warmup:
@@ -81,13 +92,30 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
 
 def _noise(config: TrainConfig, scales: DataScales, model: ModelConfig, along_rollouts: bool) -> float:
     """The standard deviation of the noise on states; measurements chose the shares (docs/log.md, 2026-11-23)."""
-    if model.jumps:  # a guess has errors of the model's own
+    if model.jumps:
+        if config.noise:
+            raise ConfigError(
+                f"train.noise = {config.noise} is of no use here: with model.jumps, a start has errors of the model's"
+                " own; leave it unset (none)"
+            )
         return 0.0
     if config.noise is not None:
         return config.noise
-    if model.dynamic:  # the noise changes the velocity as well
+    if model.data.dynamic:  # the noise changes the velocity as well
         return 0.1 * scales.increment
     return (0.15 if along_rollouts else 0.45) * scales.displacement
+
+
+def _noise_gamma(config: TrainConfig, model: ModelConfig, noise: float) -> float | None:
+    """The share of the noise that the target takes back; None without noise."""
+    if noise:
+        usual = 0.1 if model.data.dynamic else 1.0
+        return usual if config.noise_gamma is None else config.noise_gamma
+    if config.noise_gamma is not None:
+        raise ConfigError(
+            f"train.noise_gamma = {config.noise_gamma} is of no use here: there is no noise; leave it unset (none)"
+        )
+    return None
 
 
 def _rollout_pool(config: TrainConfig, model: ModelConfig) -> int:
@@ -112,7 +140,7 @@ def _rollout_pool(config: TrainConfig, model: ModelConfig) -> int:
 def _shift(config: TrainConfig, model: ModelConfig) -> float:
     """The largest random shift of a scene. With half a cell's side, all positions within a cell are equally likely."""
     if config.shift is None:
-        return min(model.cell_side / 2, LARGEST_SHIFT * model.domain_half_width)
+        return min(model.cell_side / 2, LARGEST_SHIFT * model.data.domain_half_width)
     if not 0 <= config.shift < math.inf:
         raise ConfigError(f"train.shift is {config.shift}; it must be at least 0")
     return config.shift

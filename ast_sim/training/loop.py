@@ -20,9 +20,10 @@ from ast_sim.batches.training_pool import Pool
 from ast_sim.batches.training_rollouts import RolloutPool
 from ast_sim.dataset.reader import Dataset
 from ast_sim.models.registry import build_model
+from ast_sim.models.simulator import Simulator
 from ast_sim.runs import checkpoint
 from ast_sim.runs.folder import RunFolder
-from ast_sim.runs.train_config import RunConfig
+from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.support.errors import DatasetError, TrainingError
 from ast_sim.support.progress import Clock, duration
 from ast_sim.support.stop_signals import Interrupted, StopSignals
@@ -33,9 +34,33 @@ from ast_sim.training.processes import Processes
 from ast_sim.training.profile import profile, table
 from ast_sim.training.rates import learning_rate, step_seed
 from ast_sim.training.saving import Saver
-from ast_sim.training.validation import validate, verdict
+from ast_sim.training.validation import Validated, error_share, validate, verdict
 
+OFTEN = 16  # passes over the data, from which on little is gained (docs/log.md, 2026-11-26)
+APART = (
+    1.25  # validation scenes have so many times the error of training scenes: the training knows its scenes by heart
+)
 JUMP_BATCHES = 64  # the pool of jumps holds so many batches; with 8, steps learn less: the calls of a jump are alike
+
+
+def sampler_of(model: Simulator, dataset: Dataset, options: TrainConfig, part: tuple[int, int] = (0, 1)) -> PairSampler:
+    """The training pairs of a dataset, as the settings want them; `part` is (number, count) of the process."""
+    return model.pairs(
+        dataset,
+        batch_size=options.batch_size,
+        seed=options.seed,
+        noise=options.noise,
+        gamma=options.noise_gamma or 0.0,
+        part=part,
+        mirror=options.mirror,
+        shift=options.shift,
+    )
+
+
+def fit_statistics(model: Simulator, sampler: PairSampler, options: TrainConfig) -> None:
+    """Measure the statistics of inputs and outputs on the first batches of the training."""
+    batches = range(math.ceil(options.statistics_pairs / options.batch_size))
+    model.fit_statistics(sampler.batch(index) for index in batches)
 
 
 class Training:
@@ -54,11 +79,12 @@ class Training:
         signals: StopSignals,
         processes: Processes | None = None,
     ) -> None:
-        self.run, self.config, self.dataset, self.signals = run, config, dataset, signals
+        self.run, self.config, self.dataset, self.scales, self.signals = run, config, dataset, scales, signals
         self.options, self.processes = config.train, processes or Processes()
         torch.manual_seed(self.options.seed)
         self.model = build_model(config.model)
-        self.sampler = self._sampler((self.processes.rank, self.processes.count))
+        part = self.processes.rank, self.processes.count
+        self.sampler = sampler_of(self.model, dataset, self.options, part)
         self.pool = self._pool(largest_error(scales, config.model))
         self.ahead = Ahead(self.pool or self.sampler)
         self.optimizer = Optimizer(self.model, self.options.optimizer)
@@ -67,7 +93,7 @@ class Training:
         self.saver = Saver(run, dataset, self.model, self.optimizer, self.pool, self.processes)
         self.step = 0
         self.stopping = 0  # the number of a signal that some process has received; 0: no signal
-        introduce(self.model, config, dataset, scales, self.sampler.num_pairs)
+        self.told = False  # whether the user knows that more scenes would help more than more steps
 
     def __enter__(self) -> Training:
         return self
@@ -82,29 +108,15 @@ class Training:
             return JumpPool(self.sampler, JUMP_BATCHES * options.batch_size, options.calls, largest)
         return RolloutPool(self.sampler, options.rollout_pool, largest) if options.rollout_pool else None
 
-    def _sampler(self, part: tuple[int, int]) -> PairSampler:
-        options = self.options
-        return self.model.pairs(
-            self.dataset,
-            batch_size=options.batch_size,
-            seed=options.seed,
-            noise=options.noise,
-            gamma=options.noise_gamma,
-            part=part,
-            mirror=options.mirror,
-            shift=options.shift,
-        )
-
     def prepare(self) -> None:
         """Restore the newest checkpoint. If there is none, take the weights of the run that this one starts from, or
         measure the statistics of the data."""
-        found = self.saver.restore()
-        if found is not None:
-            self.step, self.log.sums = found
+        restored = self.saver.restore()
+        if restored is not None:
+            self.step, self.log.sums = restored
         elif self.processes.leads and not self.saver.start():
-            batches = range(math.ceil(self.options.statistics_pairs / self.options.batch_size))
-            whole = self.sampler if self.processes.count == 1 else self._sampler((0, 1))
-            self.model.fit_statistics(whole.batch(index) for index in batches)
+            whole = self.sampler if self.processes.count == 1 else sampler_of(self.model, self.dataset, self.options)
+            fit_statistics(self.model, whole, self.options)
             for line in self.model.remarks():
                 print(line, flush=True)
         if self.processes.leads:
@@ -117,12 +129,14 @@ class Training:
 
     def profile(self, steps: int) -> None:
         """Print how the time of a step divides between its parts, measured on `steps` steps."""
+        self._introduce()
         self.prepare()
         print(table(profile(self.advance, steps)))
 
     def go(self) -> None:
         """Train from the newest checkpoint, or from the beginning, to the last step."""
         options = self.options
+        self._introduce()
         self.prepare()
         with Console(options.steps, self.step, self.signals) as self.progress:
             validated = self.processes.of_leader(self.log.metrics.validation(self.step) is not None)
@@ -144,6 +158,9 @@ class Training:
                 if validates:
                     self._validate()
 
+    def _introduce(self) -> None:
+        introduce(self.model, self.config, self.dataset, self.scales, self.sampler.num_pairs)
+
     def _due(self, every: int) -> bool:
         return self.step % every == 0 or self.step == self.options.steps
 
@@ -154,6 +171,12 @@ class Training:
     def _stop_if_asked(self) -> None:
         if self.stopping:
             self.progress.line(f"stopped after step {self.step:,}: go on with --resume")
+            raise Interrupted(self.stopping)
+
+    def end_if_asked(self) -> None:
+        """End a training that is only timed, if a signal asks for it."""
+        self._heed_signals()
+        if self.stopping:
             raise Interrupted(self.stopping)
 
     def advance(self) -> None:
@@ -188,8 +211,8 @@ class Training:
         if self.pool is not None:
             weights = self.pool.weights(number, self.processes.gathered(self.pool.errors(number, target)))
         losses = self.model.loss(prediction, batch, target, self.options.stress_weight, self.processes.share, weights)
-        found = self.processes.add(torch.stack([value.detach() for value in losses.values()]))
-        whole = dict(zip(losses, found.tolist(), strict=True))
+        added = self.processes.add(torch.stack([value.detach() for value in losses.values()]))
+        whole = dict(zip(losses, added.tolist(), strict=True))
         if not math.isfinite(whole["loss"]):
             raise self._not_finite("loss", whole["loss"], batch.names)
         (losses["loss"] / self.options.accumulate).backward()
@@ -198,23 +221,32 @@ class Training:
         return whole
 
     def _not_finite(self, what: str, value: float, names: list[str]) -> TrainingError:
-        names, last = self.processes.gathered(names), checkpoint.latest(self.run.path)
+        names = self.processes.gathered(names)
+        last = checkpoint.latest(self.run.path)
         kept = f"the last good checkpoint is {last}" if last else "there is no checkpoint yet"
         return TrainingError(
             f"the {what} of step {self.step + 1} is {value}, so training stopped before this step: check the samples"
             f" {', '.join(names)}, or start again with a train.peak_rate below {self.options.peak_rate:.3g}; {kept}"
         )
 
-    def _validate(self) -> None:
-        """Roll out the validation scenes; if their error is the lowest so far, mark the checkpoint of this step."""
-        scenes = self.dataset.with_frames("valid", self.model.config.given_frames + 1)[: self.options.validate_scenes]
-        if not scenes:
-            return
+    def validated(self, split: str) -> list[Validated]:
+        """The errors of the first scenes of a split, predicted by all processes together."""
+        least = self.model.config.data.given_frames + 1
+        scenes = self.dataset.with_frames(split, least)[: self.options.validate_scenes]
         self.ahead.wait()
         mine = scenes[self.processes.rank :: self.processes.count]
         # Several processes must stop together, so none of them may stop within its own validation.
         progress = self._stop_at_once if self.processes.count == 1 else None
-        validated = self.processes.gathered(validate(self.model, self.dataset, mine, self.options.calls, progress))
+        return self.processes.gathered(
+            validate(self.model, self.dataset, split, mine, self.options.calls, progress, efforts=split == "valid")
+        )
+
+    def _validate(self) -> None:
+        """Roll out the validation scenes; if their error is the lowest so far, mark the checkpoint of this step."""
+        validated = self.validated("valid")
+        if not validated:
+            return
+        self._compare_with_training_scenes(validated)
         seconds = self.clock.validation()
         if not self.processes.leads:
             return
@@ -229,6 +261,21 @@ class Training:
             self.run.mark_best(record)
         self.log.metrics.append(record)
         self.progress.line(f"validation after step {self.step:,}: {outcome.text} ({duration(seconds)})")
+
+    def _compare_with_training_scenes(self, validated: list[Validated]) -> None:
+        """Say once that the training repeats its data in vain, if it does."""
+        scenes = self.step * self.options.batch_size * self.options.accumulate
+        passes = scenes / self.sampler.num_pairs
+        if self.told or passes <= OFTEN:
+            return
+        known, unknown = error_share(self.validated("train")), error_share(validated)
+        if known is not None and unknown is not None and unknown > APART * known:
+            self.told = True
+            self.progress.line(
+                f"each pair of frames was seen {passes:.0f} times. The error is {100 * known:.2g} % of the displacement"
+                f" on training scenes, {100 * unknown:.2g} % on validation scenes: more scenes help more than more"
+                " steps"
+            )
 
     def _stop_at_once(self, frame: int) -> None:
         self._heed_signals()

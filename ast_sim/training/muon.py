@@ -31,7 +31,9 @@ class Muon:
     """
 
     def __init__(self, values: Tensor, gradients: Tensor, shapes: Sequence[tuple[int, int]]) -> None:
-        self.values, self.gradients, self.momentum = values, gradients, torch.zeros_like(values)
+        self.values = values
+        self.gradients = gradients
+        self.momentum = torch.zeros_like(values)
         self.stacks = [(sum(1 for _ in same), *shape) for shape, same in groupby(shapes)]
 
     def step(self, rate: float) -> None:

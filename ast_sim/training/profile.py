@@ -140,15 +140,15 @@ def _with_rest(entries: list[Entry], named: int) -> list[Entry]:
     return entries[:named] + [Entry(rest[0].kind, name, sum(e.calls for e in rest), sum(e.seconds for e in rest))]
 
 
-def table(found: Profile) -> str:
+def table(measured: Profile) -> str:
     """The profile as lines of text."""
     lines = [
-        f"{1e3 * found.seconds:.2f} ms a step ({1e3 * found.watched_seconds:.2f} ms while every op is watched)",
+        f"{1e3 * measured.seconds:.2f} ms a step ({1e3 * measured.watched_seconds:.2f} ms while every op is watched)",
         f"{'':9}{'':42}{'calls':>8}{'ms':>10}{'share':>9}",
     ]
-    for e in found.entries:
-        share = e.seconds / found.seconds
+    for e in measured.entries:
+        share = e.seconds / measured.seconds
         lines.append(f"{e.kind:9}{e.name:42.42}{e.calls:8.4g}{1e3 * e.seconds:10.3f}{share:9.1%}")
     kinds = ("kernel", "torch", "binding", "autograd", "python")
-    lines.append("in all   " + ", ".join(f"{kind} {found.share(kind):.1%}" for kind in kinds))
+    lines.append("in all   " + ", ".join(f"{kind} {measured.share(kind):.1%}" for kind in kinds))
     return "\n".join(lines)

@@ -6,8 +6,9 @@ import dataclasses
 import errno
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +20,14 @@ from ast_sim.runs import checkpoint
 from ast_sim.runs.config_toml import has_config, read_changes, write_config
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.train_config import RunConfig, TrainConfig
-from ast_sim.support.errors import CheckpointError, ConfigError, TrainingError
+from ast_sim.support.errors import CheckpointError, ConfigError, DatasetError, TrainingError
 from ast_sim.support.stop_signals import StopSignals
 from ast_sim.support.toml_settings import NONE, NOTHING, assigned, change
 from ast_sim.training.data_lengths import DataScales, measure, scope_of
 from ast_sim.training.defaults_from_data import resolve
-from ast_sim.training.loop import Training
+from ast_sim.training.loop import Training, fit_statistics, sampler_of
 from ast_sim.training.processes import Processes
+from ast_sim.training.time_budget import UNKNOWN_STEPS, steps_within
 
 _FOLLOW_FROM_STEPS = ("train.warmup", "train.decay", "train.validate_every", "train.checkpoint_every")
 
@@ -47,27 +49,38 @@ def configure(
     """
     file = None if config is None else Path(config)
     given = {} if file is None else read_changes(file)
+    if "train.steps" in given:  # a run that was given minutes has both
+        given.pop("train.minutes", None)
     if from_run is None:
         with _naming(file):
             named = given.pop("model.name", "ast")
             chosen = find_preset(model or str(named), preset or "tiny")
-        found = RunConfig(chosen.model, TrainConfig(**chosen.train), str(data))
+        settings = RunConfig(chosen.model, TrainConfig(**chosen.train), str(data))
     elif model or preset:
         raise ConfigError("a run that starts from another one has its model and settings: leave model and preset out")
     else:
-        found = dataclasses.replace(RunFolder(Path(from_run)).settings, data=str(data))
-    before = found
+        source = RunFolder(Path(from_run)).settings
+        settings = dataclasses.replace(source, train=dataclasses.replace(source.train, minutes=None), data=str(data))
+    before = settings
     with _naming(file):
-        found = _changed(found, given, reschedule=from_run is not None)
-    later = {**assigned(found, assignments), **changes}
-    found = _changed(found, later, reschedule=from_run is not None or "train.steps" in given)
-    for key, old, new in _differences(before, found, "model") if from_run is not None else ():
+        settings = _changed(settings, given, reschedule=from_run is not None)
+    later = {**assigned(settings, assignments), **changes}
+    settings = _changed(settings, later, reschedule=from_run is not None or "train.steps" in given)
+    for key, old, new in _differences(before, settings, "model") if from_run is not None else ():
         raise ConfigError(f"{key} is {new!r}, but {from_run} has {old!r}: a run that starts from it keeps its model")
-    return found
+    return settings
 
 
 def _changed(config: RunConfig, values: Mapping[str, Any], reschedule: bool) -> RunConfig:
-    """Settings with new values. With `reschedule`, another number of steps leaves open what follows from it."""
+    """Settings with new values. With `reschedule`, another number of steps leaves open what follows from it. Minutes
+    replace a number of steps, and steps replace minutes."""
+    steps, minutes = (key in values and values[key] not in (None, NONE) for key in ("train.steps", "train.minutes"))
+    if steps and minutes:
+        raise ConfigError("train.minutes and train.steps exclude each other: give one of them")
+    if minutes:
+        values = {**dict.fromkeys(("train.steps", *_FOLLOW_FROM_STEPS), NONE), **values}
+    elif steps:
+        values = {"train.minutes": NONE, **values}
     if reschedule and values.get("train.steps", config.train.steps) != config.train.steps:
         values = {**dict.fromkeys(_FOLLOW_FROM_STEPS, NONE), **values}
     return change(config, values)
@@ -85,7 +98,7 @@ def _naming(file: Path | None) -> Iterator[None]:
 
 
 def train(
-    data: str | os.PathLike[str],
+    data: str | os.PathLike[str] | Dataset,
     out: str | os.PathLike[str],
     *,
     model: str | None = None,
@@ -99,17 +112,18 @@ def train(
     """Train a model on a dataset; returns the run, ready to predict.
 
     Args:
-        data: the dataset file.
+        data: the dataset file, or the open dataset.
         out: the run folder. After a kill the same call with `resume=True` continues, and gives the same weights.
         model: a registered model: "ast" (the default), "mgn", "bsms", "hcmt" or "transolver".
         preset: the settings to start from; by default "tiny".
         config: a TOML file with settings, such as `config.toml` of a run. It may leave settings out. It does not
             name the dataset. Other arguments win over it.
         from_run: a run. The new run starts with the weights and scales of its best checkpoint, and with its settings;
-            those of the model stay. If `steps` differs, warm-up, decay, validations and checkpoints are chosen anew.
+            those of the model stay. If `steps` or `minutes` differs, warm-up, decay, validations and checkpoints are
+            chosen anew.
         model_settings: changes of the model's settings, such as {"hidden": 32}.
         resume: continue after the newest checkpoint, if there is one.
-        settings: changes of the training's settings (fields of `TrainConfig`), such as steps=4000, mirror=("x", "y").
+        settings: changes of the training's settings (fields of `TrainConfig`), such as minutes=10, mirror=("x", "y").
 
     Raises:
         ConfigError: there is no such model, preset or setting (the text names the nearest one), or a value does not
@@ -118,21 +132,50 @@ def train(
         TrainingError, CheckpointError, KeyboardInterrupt: as in `start_training`.
     """
     changes = _changes(model_settings, settings)
-    chosen = configure(data, preset, (), model, config=config, from_run=from_run, changes=changes)
+    path = _path_of(data)
+    chosen = configure(path, preset, (), model, config=config, from_run=from_run, changes=changes)
     start_training(Path(out), chosen, resume=resume, from_run=from_run)
     return Run(out)
 
 
 def new_model(
-    data: Dataset, model: str = "ast", preset: str = "tiny", model_settings: Mapping[str, Any] | None = None
+    data: str | os.PathLike[str] | Dataset,
+    model: str = "ast",
+    preset: str = "tiny",
+    model_settings: Mapping[str, Any] | None = None,
 ) -> Simulator:
-    """An untrained model that fits a dataset, for a training loop of your own (examples/own_loop.py).
+    """An untrained model that fits a dataset, for a training loop of your own (examples/own_loop.py). The statistics of
+    its inputs and outputs are measured as at the start of `train`.
+
+    Args:
+        data: the dataset file, or the open dataset.
+        model, preset, model_settings: as for `train`.
 
     Raises:
         ConfigError: there is no such model, preset or setting, or the data does not fit.
     """
+    if not isinstance(data, Dataset):
+        with Dataset(data) as dataset:
+            return new_model(dataset, model, preset, model_settings)
     config = configure(data.path, preset, (), model, changes=_changes(model_settings, {}))
-    return build_model(resolve(config, data, measure(data)).model)
+    resolved = resolve(config, data, measure(data))
+    built = build_model(resolved.model)
+    fit_statistics(built, sampler_of(built, data, resolved.train), resolved.train)
+    return built
+
+
+def _path_of(data: str | os.PathLike[str] | Dataset) -> Path:
+    """The path of a dataset that is named by its path or is open.
+
+    Raises:
+        DatasetError: it was opened in another unit of length than the one of the file.
+    """
+    if not isinstance(data, Dataset):
+        return Path(data)
+    with Dataset(data.path) as in_own_unit:
+        if in_own_unit.info.length_unit != data.info.length_unit:
+            raise DatasetError(f"{data.path} was opened in {data.info.length_unit}: open it without length_unit")
+    return data.path
 
 
 def _changes(model_settings: Mapping[str, Any] | None, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -180,7 +223,10 @@ def start_training(
         source = None if from_run is None else RunFolder(Path(from_run))
         with Dataset(asked.data) as dataset:
             scales = measure(dataset)
-            resolved = asked if config is None else resolve(asked, dataset, scales, keep_model=source is not None)
+            fit = partial(resolve, dataset=dataset, scales=scales, keep_model=source is not None)
+            begin = partial(Training, folder, dataset=dataset, scales=scales, signals=signals, processes=processes)
+            asked = _with_steps(asked, saved, fit, begin)
+            resolved = asked if config is None else fit(asked)
             batch_size = resolved.train.batch_size
             if batch_size % processes.count:
                 raise ConfigError(f"train.batch_size = {batch_size} cannot be cut for {processes.count} processes")
@@ -191,12 +237,30 @@ def start_training(
             elif processes.leads:
                 start = None if source is None else source.start()
                 specification = dataset.info.generator.get("spec")
-                write_config(folder.path, resolved, scope_of(dataset), dataset.fingerprint(), start, specification)
-            with Training(folder, resolved, dataset, scales, signals, processes) as training:
+                scope = scope_of(dataset, resolved.model.data)
+                write_config(folder.path, resolved, scope, dataset.fingerprint(), start, specification)
+            with begin(config=resolved) as training:
                 if profile_steps:
                     training.profile(profile_steps)
                 else:
                     training.go()
+
+
+def _with_steps(
+    asked: RunConfig, saved: RunConfig | None, fit: Callable[[RunConfig], RunConfig], begin: Callable[..., Training]
+) -> RunConfig:
+    """The settings; if they have minutes and no steps, with the number of steps that fits into the minutes: of the run
+    that is resumed, or measured."""
+    minutes = asked.train.minutes
+    if minutes is None or asked.train.steps is not None:
+        return asked
+    if saved is not None and saved.train.minutes == minutes:
+        steps = saved.train.steps
+    else:
+        timed = fit(dataclasses.replace(asked, train=dataclasses.replace(asked.train, steps=UNKNOWN_STEPS)))
+        with begin(config=timed) as training:
+            steps = steps_within(minutes, training)
+    return dataclasses.replace(asked, train=dataclasses.replace(asked.train, steps=steps))
 
 
 @contextmanager
@@ -249,7 +313,7 @@ def _told_by_leader(processes: Processes) -> Iterator[None]:
 def _require_fit(source: RunFolder, config: RunConfig, dataset: Dataset, scales: DataScales) -> None:
     """Raise ConfigError if the model of the run `source` cannot learn from the dataset."""
     source.require_fit(dataset)
-    if config.model.planar and not scales.planar:
+    if config.model.data.planar and not scales.planar:
         raise ConfigError(f"{dataset.path} leaves the plane z = 0, in which {source.path} keeps all nodes")
 
 

@@ -73,29 +73,37 @@ class Verdict(NamedTuple):
 def validate(
     model: Simulator,
     dataset: Dataset,
+    split: str,
     indices: Iterable[int],
     most_calls: int = 1,
     progress: Callable[[int], None] | None = None,
+    efforts: bool = True,
 ) -> list[Validated]:
-    """Predict validation scenes together; `progress` is called after each step and may raise to stop.
+    """Predict scenes of a split together; `progress` is called after each step and may raise to stop.
 
     Args:
         most_calls: how many calls correct one another in training.
+        efforts: measure the errors of answers by effort, too, for a model that jumps.
     """
     indices = list(indices)
-    truths = [dataset.load("valid", index) for index in indices]
+    truths = [dataset.load(split, index) for index in indices]
+    names = [f"{split}/{index:06d}" for index in indices]
     if not truths:
         return []
     if not model.config.jumps:
-        return _by_rollouts(model, indices, truths, progress)
-    return _by_jumps(model, indices, truths, most_calls)
+        return _by_rollouts(model, indices, names, truths, progress)
+    return _by_jumps(model, indices, names, truths, most_calls, efforts)
 
 
 def _by_rollouts(
-    model: Simulator, indices: list[int], truths: list[Trajectory], progress: Callable[[int], None] | None
+    model: Simulator,
+    indices: list[int],
+    names: list[str],
+    truths: list[Trajectory],
+    progress: Callable[[int], None] | None,
 ) -> list[Validated]:
-    given = model.config.given_frames
-    questions = [Question.of(truth, _name(index)) for index, truth in zip(indices, truths, strict=True)]
+    given = model.config.data.given_frames
+    questions = [Question.of(truth, name) for name, truth in zip(names, truths, strict=True)]
     validated = []
     for index, truth, answer in zip(indices, truths, rollouts(model, questions, progress), strict=True):
         frames = np.arange(given, truth.num_frames)
@@ -105,11 +113,18 @@ def _by_rollouts(
     return validated
 
 
-def _by_jumps(model: Simulator, indices: list[int], truths: list[Trajectory], most_calls: int) -> list[Validated]:
+def _by_jumps(
+    model: Simulator,
+    indices: list[int],
+    names: list[str],
+    truths: list[Trajectory],
+    most_calls: int,
+    efforts: bool,
+) -> list[Validated]:
     corrections = most_calls - 1 + (MORE_CALLS if most_calls > 1 else 0)
     frames = [frames_asked(truth.num_frames) for truth in truths]
-    asked = zip(indices, truths, frames, strict=True)
-    questions = [Question.of(truth, _name(index), numbers.tolist()) for index, truth, numbers in asked]
+    asked = zip(names, truths, frames, strict=True)
+    questions = [Question.of(truth, name, numbers.tolist()) for name, truth, numbers in asked]
     ways = calls(model, questions, Effort(corrections))
     newton_steps = MOST_NEWTON_STEPS if knows_material(model.config) else 0
     validated = []
@@ -119,7 +134,7 @@ def _by_jumps(model: Simulator, indices: list[int], truths: list[Trajectory], mo
             validated.append(Validated(index, [], hold, way, []))
             continue
         errors = [_motion_error(position, truth, numbers) for position in way.position]
-        measures = index < EFFORT_SCENES
+        measures = efforts and index < EFFORT_SCENES
         by_effort = errors_by_effort(model, truth, Effort(most_calls - 1, newton_steps)) if measures else []
         validated.append(Validated(index, errors, hold, None, by_effort))
     return validated
@@ -149,7 +164,7 @@ def verdict(validated: list[Validated], best: float, unit: str) -> Verdict:
     text = f"network alone: error {error:.3g} {unit}{share}{after}{', the best so far' if error < best else ''}"
     reached = next((one.error for one in by_effort if one.effort == effort), None)
     if reached is not None:
-        text += f"; answers at the deepest frame: error {100 * reached:.2g} % of the displacement after {effort.text}"
+        text += f"; answers at the deepest frame: error {100 * reached:.3g} % of the displacement after {effort.text}"
     record: dict[str, Any] = {"valid_rmse": error, "valid_hold_still": hold}
     if len(by_calls) > 1:
         record["valid_by_calls"] = by_calls
@@ -170,5 +185,11 @@ def _motion_error(position: np.ndarray, truth: Trajectory, frames: np.ndarray) -
     return SquaredError.between(position, truth.position[frames], ~truth.scene.prescribed)
 
 
-def _name(index: int) -> str:
-    return f"valid/{index:06d}"
+def error_share(validated: list[Validated]) -> float | None:
+    """The network's smallest error over its calls, relative to the prediction that nothing moves; None if a prediction
+    failed or nothing moves."""
+    if not validated or any(scene.failure for scene in validated):
+        return None
+    hold = rmse_sequence([scene.hold for scene in validated])
+    by_calls = [rmse_sequence(errors) for errors in zip(*(scene.errors for scene in validated), strict=True)]
+    return min(by_calls) / hold if hold else None

@@ -7,19 +7,23 @@ import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import h5py
 import meshio
 import numpy as np
 
+from ast_sim.element_topology import CELL_KINDS
 from ast_sim.scene import Trajectory
 from ast_sim.support.disk import output_file, replacing, temporary_name
-from ast_sim.support.errors import AstSimError, is_utf8
+from ast_sim.support.errors import AstSimError, is_utf8, require
 from ast_sim.view.fields import Fields, fields
 from ast_sim.view.files import explained
 
+if TYPE_CHECKING:
+    import pyvista
+
 VTK_TYPE = {3: 5, 4: 10, 10: 24}
-CELL_NAME = {3: "triangle", 4: "tetra", 10: "tetra10"}
 
 
 def write(path: str | os.PathLike[str], trajectory: Trajectory, prediction: Trajectory | None = None) -> None:
@@ -49,6 +53,23 @@ def write(path: str | os.PathLike[str], trajectory: Trajectory, prediction: Traj
         writers[path.suffix](output_file(path), trajectory.scene.elements, shown)
 
 
+def to_pyvista(trajectory: Trajectory) -> pyvista.UnstructuredGrid:
+    """The first frame as a grid of PyVista, with the fields that `write` writes.
+
+    Raises:
+        MissingExtra: pyvista is not installed.
+    """
+    (pyvista,) = require("pyvista", "pyvista")
+    elements = trajectory.scene.elements
+    shown = fields(trajectory)
+    grid = pyvista.UnstructuredGrid({VTK_TYPE[elements.shape[1]]: elements.astype(np.int64)}, shown.position[0])
+    for name, values in {**{name: values[0] for name, values in shown.point.items()}, **shown.static}.items():
+        grid.point_data[name] = values
+    for name, values in shown.cell.items():
+        grid.cell_data[name] = values[0]
+    return grid
+
+
 def _write_pvd(path: Path, elements: np.ndarray, shown: Fields) -> None:
     folder = path.with_suffix("")
     if not is_utf8(folder.name):
@@ -69,7 +90,7 @@ def _write_pvd(path: Path, elements: np.ndarray, shown: Fields) -> None:
 def _write_vtu(path: Path, elements: np.ndarray, shown: Fields, frame: int) -> None:
     mesh = meshio.Mesh(
         shown.position[frame],
-        [(CELL_NAME[elements.shape[1]], elements)],
+        [(CELL_KINDS[elements.shape[1]], elements)],
         point_data={**{name: values[frame] for name, values in shown.point.items()}, **shown.static},
         cell_data={name: [values[frame]] for name, values in shown.cell.items()},
     )
@@ -123,7 +144,8 @@ def _write_mesh(root: h5py.Group, elements: np.ndarray, position: np.ndarray) ->
 def _write_steps(root: h5py.Group, shown: Fields) -> None:
     """Write the times, and where the points and fields of each step start in the arrays of all steps in a row."""
     frames, nodes = shown.position.shape[:2]
-    start, zero = np.arange(frames, dtype=np.int64), np.zeros(frames, dtype=np.int64)
+    start = np.arange(frames, dtype=np.int64)
+    zero = np.zeros(frames, dtype=np.int64)
     steps = root.create_group("Steps")
     steps.attrs["NSteps"] = np.int64(frames)
     steps["Values"] = shown.times

@@ -7,11 +7,13 @@ window its wheels need the system's EGL or Mesa libraries, which a bare server l
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ast_sim.scene import Trajectory
+from ast_sim.scene_summary import EYE, LIGHT
 from ast_sim.support.disk import replacing
 from ast_sim.support.errors import AstSimError, require
 from ast_sim.view.encode import finite_frames
@@ -19,8 +21,6 @@ from ast_sim.view.fields import is_planar, require_same_scene, surface_owners
 from ast_sim.view.files import explained
 from ast_sim.view.tables import TITLES
 
-EYE = np.array([-0.62, -1.32, 0.78])  # from where a solid scene is seen, in units of its diagonal
-LIGHT = np.array([-0.35, -0.45, 0.82])
 OBSTACLE_COLOR = (0.47, 0.51, 0.56, 0.38)
 MESH_COLOR = (0.05, 0.08, 0.12, 0.5)
 INK = "#16202c"
@@ -49,37 +49,58 @@ def write(
     if frames == 0:
         raise AstSimError("the prediction has no frame that could be drawn")
     truth = truth.select(prediction.numbers)
-    moved = np.linalg.norm(truth.position[:frames] - truth.scene.rest_position, axis=2)
-    frame = int(moved[:, truth.scene.deforming_nodes].max(axis=1, initial=0.0).argmax())
+    frame = farthest(truth.select(truth.numbers[:frames]))
     figure = _figure(truth, prediction, frame, model, length_unit)
     with explained(path), replacing(path) as temporary:
         figure.savefig(temporary, format="png", dpi=144)
 
 
+def plot(trajectory: Trajectory, row: int, title: str, length_unit: str = "m"):
+    """A matplotlib figure of one frame, the one in this row of the positions, coloured as in `write`.
+
+    Raises:
+        MissingExtra: matplotlib is not installed.
+    """
+    return _panels([trajectory], [title], row, length_unit)
+
+
+def farthest(trajectory: Trajectory) -> int:
+    """The row of the frame in which a deforming node is farthest from its place at rest."""
+    moved = np.linalg.norm(trajectory.position - trajectory.scene.rest_position, axis=2)
+    return int(moved[:, trajectory.scene.deforming_nodes].max(axis=1, initial=0.0).argmax())
+
+
 def _figure(truth: Trajectory, prediction: Trajectory, frame: int, model: str, length_unit: str):
+    names = ["Truth (finite elements)", f"Prediction ({TITLES.get(model, model)})"]
+    return _panels([truth, prediction], names, frame, length_unit)
+
+
+def _panels(sides: Sequence[Trajectory], names: Sequence[str], row: int, length_unit: str):
+    """The sides beside one another, on the colour scale of the first, which is seen whole."""
     figures, agg, cm, colors = require(
         "view", "matplotlib.figure", "matplotlib.backends.backend_agg", "matplotlib.cm", "matplotlib.colors"
     )
-    figure = figures.Figure(figsize=(10, 4), facecolor="white")
+    width = 1 / len(sides)
+    figure = figures.Figure(figsize=(5 * len(sides), 4), facecolor="white")
     agg.FigureCanvasAgg(figure)
-    by_stress = truth.stress is not None and prediction.stress_at == truth.stress_at
+    first = sides[0]
+    by_stress = first.stress is not None and all(side.stress_at == first.stress_at for side in sides)
     label, unit = ("von Mises stress", "Pa") if by_stress else ("Displacement", length_unit)
-    values = [_corner_values(side, frame, by_stress) for side in (truth, prediction)]
-    view = View(truth)
+    values = [_corner_values(side, row, by_stress) for side in sides]
+    view = View(first)
     body = values[0][~view.obstacle]
     upper = float(np.quantile(body, 0.99)) if body.size else 0.0
     upper = upper or float(values[0].max(initial=0.0)) or 1.0
     prefixes = PREFIXED.get(unit, ((1.0, ""),))
     scale, prefix = next(((s, p) for s, p in prefixes if upper >= s), prefixes[-1])
     color_map = cm.ScalarMappable(colors.Normalize(0, upper / scale), "plasma" if by_stress else "viridis")
-    names = ("Truth (finite elements)", f"Prediction ({TITLES.get(model, model)})")
-    for column, (side, name) in enumerate(zip((truth, prediction), names, strict=True)):
-        axes = figure.add_axes((0.01 + 0.5 * column, 0.18, 0.48, 0.73))
-        _draw(axes, view, side.position[frame], color_map, values[column] / scale)
-        figure.text(0.25 + 0.5 * column, 0.93, name, fontsize=12.5, fontweight="bold", color=INK, ha="center")
-    place = figure.add_axes((0.3, 0.125, 0.4, 0.028))
+    for column, (side, name) in enumerate(zip(sides, names, strict=True)):
+        axes = figure.add_axes((width * (column + 0.02), 0.18, 0.96 * width, 0.73))
+        _draw(axes, view, side.position[row], color_map, values[column] / scale)
+        figure.text(width * (column + 0.5), 0.93, name, fontsize=12.5, fontweight="bold", color=INK, ha="center")
+    place = figure.add_axes((0.5 - 0.4 * width, 0.125, 0.8 * width, 0.028))
     bar = figure.colorbar(color_map, cax=place, orientation="horizontal", extend="max")
-    bar.set_label(f"{label} ({prefix}{unit}), frame {frame}", color=INK)
+    bar.set_label(f"{label} ({prefix}{unit}), frame {first.numbers[row]}", color=INK)
     bar.outline.set_visible(False)
     bar.ax.tick_params(colors=INK, length=2)
     return figure

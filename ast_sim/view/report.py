@@ -85,7 +85,8 @@ def page_data(runs: Sequence[ReportRun]) -> dict[str, Any]:
     names = _distinct([run.name for run in runs])
     models = [tables.TITLES.get(run.model, run.model) for run in runs]
     evaluations = [run.evaluation for run in runs]
-    scenes, samples = _scenes(runs), tables.samples(evaluations, names)
+    scenes = _scenes(runs)
+    samples = tables.samples(evaluations, names)
     errors = dict(zip(samples["names"], samples["runs"][0], strict=True)) if samples else {}
     for scene in scenes:
         scene["error"] = errors.get(scene["name"])

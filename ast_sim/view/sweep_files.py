@@ -26,7 +26,8 @@ def write_table(path: str | os.PathLike[str], rows: Sequence[Row]) -> None:
     Raises:
         AstSimError: the file cannot be written.
     """
-    path, names = Path(path), list(dict.fromkeys(name for row in rows for name in row))
+    path = Path(path)
+    names = list(dict.fromkeys(name for row in rows for name in row))
     with explained(path), replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, names, lineterminator="\n")
         writer.writeheader()

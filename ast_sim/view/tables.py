@@ -64,13 +64,13 @@ def _measure_rows(
 ) -> list[Json]:
     rows: list[Json] = []
     for horizon, title in horizons.items():
-        found = []
+        of_title = []
         for nodes, measure in itertools.product(NODES, MEASURES):
             values = [_measure(figures, quantity, predictor, horizon, nodes, measure) for figures, predictor in columns]
             if any(value is not None for value in values):
-                found.append({"label": measure, "note": NODES[nodes], "values": values})
-        if found:
-            rows += [{"group": title}, *found]
+                of_title.append({"label": measure, "note": NODES[nodes], "values": values})
+        if of_title:
+            rows += [{"group": title}, *of_title]
     return rows
 
 
@@ -87,7 +87,7 @@ def tiles(evaluation: Figures | None) -> list[Json]:
     """The figures that matter most, for the head of the page: errors, time, and how much was tested."""
     if not evaluation:
         return []
-    found = []
+    shown = []
     for quantity, title, trivial in (
         ("displacement", "Displacement error", "hold_still"),
         ("stress", "Stress error", "stress_frame_mean"),
@@ -101,8 +101,8 @@ def tiles(evaluation: Figures | None) -> list[Json]:
         elif reference is not None and reference.rmse_sequence:
             share = 100 * error / reference.rmse_sequence
             detail = f"{share:.0f} % of “{TRIVIAL[quantity][trivial].lower()}”, full rollout"
-        found.append({"label": title, "value": error, "unit": evaluation.unit(quantity), "detail": detail})
-    return found + _asked_tiles(evaluation.asked) + _speed_tiles(evaluation) + _scope_tiles(evaluation)
+        shown.append({"label": title, "value": error, "unit": evaluation.unit(quantity), "detail": detail})
+    return shown + _asked_tiles(evaluation.asked) + _speed_tiles(evaluation) + _scope_tiles(evaluation)
 
 
 def _asked_tiles(asked: AskedFigures) -> list[Json]:
@@ -245,7 +245,7 @@ def evaluation_facts(evaluation: Figures | None) -> dict[str, str]:
     processor = origin.get("processor")
     if processor:
         processor = f"{processor}, {evaluation.threads} thread{'s' if evaluation.threads != 1 else ''}"
-    found = {
+    facts = {
         "Run": origin.get("run"),
         "Data file": origin.get("data"),
         "Split": origin.get("split"),
@@ -254,4 +254,4 @@ def evaluation_facts(evaluation: Figures | None) -> dict[str, str]:
         "Commit": origin.get("commit"),
         "Command": origin.get("command"),
     }
-    return {key: str(value) for key, value in found.items() if value}
+    return {key: str(value) for key, value in facts.items() if value}

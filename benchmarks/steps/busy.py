@@ -93,7 +93,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         nodes, _ = write_blocks(folder / "blocks.h5", NODES)
-        settings = ["train.batch_size=1", "train.statistics_pairs=1", "train.steps=100", "train.noise=1e-4"]
+        settings = ["train.batch_size=1", "train.statistics_pairs=1", "train.steps=100"]
         setup = Setup(str(folder / "blocks.h5"), "ast", "tiny", settings, name)
         records = measure(setup, arguments.threads, arguments.samples, arguments.frames, folder)
     found = {

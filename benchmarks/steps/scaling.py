@@ -62,7 +62,7 @@ def write_blocks(path: Path, nodes: int) -> tuple[int, int]:
 
 def measure(model: str, data: Path, threads: int, folder: Path) -> dict[str, Any]:
     """Seconds of a training step and peak resident bytes; `failed` says why there are none."""
-    settings = ["train.batch_size=1", "train.statistics_pairs=1", "train.steps=100", "train.noise=1e-4"]
+    settings = ["train.batch_size=1", "train.statistics_pairs=1", "train.steps=100"]
     worker = Worker("c", threads, Setup(str(data), model, PRESETS[model], settings, str(folder)), folder / "worker.log")
     try:
         worker.ask("step")  # fills caches

@@ -171,7 +171,7 @@ def test_a_small_study_from_end_to_end(tmp_path):
         conducted(odd=Entry(settings=("model.hiden=3",)))
     found = conducted(ast=entries["ast"])
     (made,) = found["ast"]["runs"]
-    assert made["steps"] == 2 and made["batch"] == 8 and made["seconds_per_step"] > 0
+    assert made["steps"] == 4 and made["batch"] == 4 and made["seconds_per_step"] > 0
     assert [point["step"] for point in made["curve"]] == [2, 4]
     assert made["best_valid"] == min(point["valid_rmse"] for point in made["curve"])
     assert made["best_valid"] == min(found["ast"]["search"].values())

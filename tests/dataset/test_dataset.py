@@ -633,3 +633,17 @@ def test_an_empty_dataset_says_so(tmp_path):
 def test_reading_and_writing_need_no_torch(tmp_path):
     program = "import ast_sim.dataset.reader, ast_sim.scene, sys; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program]).returncode == 0
+
+
+def test_a_closed_dataset_says_that_it_is_closed(tmp_path):
+    path = write(tmp_path / "d.h5", {"train": [trajectory(two_tetrahedra(), 3)] * 2})
+    with Dataset(path) as dataset:
+        split = dataset["train"]
+    for read in (
+        lambda: split[0],
+        lambda: dataset.load("train", 1),
+        lambda: dataset.frames("train", 0, 0, 2),
+        lambda: dataset.fingerprint(),
+    ):
+        with pytest.raises(DatasetError, match=r"d.h5 is closed: open it again with Dataset\(path\)"):
+            read()

@@ -58,7 +58,7 @@ def test_the_page_leads_to_a_model(installed, tmp_path):
     losses = [line["loss"] for line in Metrics(tmp_path / "run") if "loss" in line]
     assert losses[-1] < 0.8 * losses[0], losses
     settings = tomllib.loads((tmp_path / "run" / "config.toml").read_text(encoding="utf-8"))["model"]
-    assert (settings["name"], settings["width"], settings["stress"]) == ("local", 32, "node")
+    assert (settings["name"], settings["width"], settings["jumps"]) == ("local", 32, False)
     found = json.loads((tmp_path / "errors.json").read_text())
     errors = found["errors"]["displacement"]
     model, still = (errors[key]["one_step"]["normal"]["rmse_sequence"] for key in ("model", "hold_still"))

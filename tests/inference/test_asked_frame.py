@@ -17,7 +17,7 @@ from ast_sim.inference.jump import calls
 from ast_sim.inference.predict import answers
 from ast_sim.inference.question import Question
 from ast_sim.mechanics.linearised_contact import STILL, NewtonSteps
-from ast_sim.models.model_config import DataFacts
+from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.registry import find_preset
 from ast_sim.models.simulator import Prediction, Simulator
 from ast_sim.simulate.jobs.rival import deepest_frame
@@ -82,7 +82,7 @@ def pressed(tmp_path_factory):
 def pressing(dataset, share):
     """A model that goes a share of the way to the solver's frame, with the settings that its data gives."""
     truth, scales = dataset.load("test", 0), measure(dataset)
-    facts = DataFacts(dataset.info, 0, scales.spacing, recorded=scales.recorded)
+    facts = DataFacts.of(dataset.info, 0, scales.spacing, recorded=scales.recorded)
     settings = replace(find_preset("ast", "tiny").model, jumps=True).resolve(facts)
     return truth, Share(settings, truth, deepest_frame(truth), share)
 
@@ -95,7 +95,7 @@ def test_newton_steps_lead_from_the_answer_to_equilibrium(pressed, monkeypatch):
     truth, model = pressing(pressed, 0.7)
     frame = deepest_frame(truth)
     assert (
-        (model.config.young, model.config.poisson)
+        (model.config.data.young, model.config.data.poisson)
         == (1e6, 0.4)
         == tuple(truth.attributes[key] for key in ("young", "poisson"))
     )
@@ -268,7 +268,8 @@ def test_beside_the_solver(tmp_path):
     with Dataset(made.path) as dataset:
         truth = dataset.load("test", 0)
         frame = deepest_frame(truth)
-        config = replace(toy.config(dataset.info), jumps=True, stress="node")
+        config = replace(toy.config(dataset.info), jumps=True)
+        config = replace(config, data=replace(config.data, stress="node"))
         found = asked_frames(Share(config, truth, frame, 0.99), dataset, "test", Effort(), rival_scenes=1)
     solver = found.scenes[0].solver
     assert found.relative_error == pytest.approx(0.01, rel=1e-3)

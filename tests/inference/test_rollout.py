@@ -33,7 +33,7 @@ class Constant(Simulator):
         motion = self.motion.expand(len(batch.position), 3).clone()
         if self.spoil is not None:
             self.spoil(self.calls, motion)
-        stress = torch.full((len(motion), 1), float(self.calls)) if self.config.stress == "node" else None
+        stress = torch.full((len(motion), 1), float(self.calls)) if self.config.data.stress == "node" else None
         return Prediction(motion, stress)
 
 

@@ -69,7 +69,7 @@ def test_planar_scenes_stay_in_their_plane(tmp_path):
             writer.add(split, Trajectory(scene, pulled.astype(np.float32)))
     start_training(tmp_path / "run", configure(tmp_path / "sheet.h5", "tiny", SETTINGS, model="mgn"))
     run = Run(tmp_path / "run")
-    assert run.settings.model.planar
+    assert run.settings.model.data.planar
     with run.open() as dataset:
         answer = run.predict(dataset["test"][0])
     assert not answer.position[:, :, 2].any()

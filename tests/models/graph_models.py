@@ -13,7 +13,8 @@ from torch import Tensor
 
 from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import Graph
-from ast_sim.models.model_config import DataFacts, ModelConfig
+from ast_sim.models.data_facts import DataFacts
+from ast_sim.models.model_config import ModelConfig
 from ast_sim.models.registry import build_model
 from ast_sim.models.simulator import Prediction, Simulator
 
@@ -22,16 +23,16 @@ Parameters = dict[str, Tensor]
 
 def resolved(config: ModelConfig, radius: float = 0.06, **kind: bool) -> ModelConfig:
     """The settings on the data of tests/toy.py, with world edges between plate and block, and within the plate."""
-    return replace(config, world_radius=radius).resolve(DataFacts(toy.info(**kind), 0, 0.1))
+    return replace(config, world_radius=radius).resolve(DataFacts.of(toy.info(**kind), 0, 0.1))
 
 
 def batch_of(model: Simulator, *seeds: int) -> Batch:
     """One batch of toy scenes in frame 3."""
-    scenes = [toy.plate(seed, dynamic=model.config.dynamic) for seed in seeds]
+    scenes = [toy.plate(seed, dynamic=model.config.data.dynamic) for seed in seeds]
     graph = Graph.concatenate([model.graph(t.scene) for t in scenes])
     before, now, after = (torch.from_numpy(np.concatenate([t.position[i] for t in scenes])) for i in (2, 3, 4))
     motion = torch.where(graph.prescribed[:, None], after - now, 0.0)
-    return Batch(graph, now, before if model.config.dynamic else None, motion, None, [f"scene {s}" for s in seeds])
+    return Batch(graph, now, before if model.config.data.dynamic else None, motion, None, [f"scene {s}" for s in seeds])
 
 
 def made(config: ModelConfig, *seeds: int) -> tuple[Simulator, Batch]:
@@ -75,7 +76,7 @@ def assert_follows(model: Simulator, batch: Batch, formulas: Callable[[Parameter
         }
         return results(formulas(p, dtype), [p[k] for k, _ in model.named_parameters()])
 
-    names = ["motion", *(["stress"] if model.config.stress != "none" else [])]
+    names = ["motion", *(["stress"] if model.config.data.stress != "none" else [])]
     names += [name for name, _ in model.named_parameters()]
     ours, plain, exact = (
         results(model(batch), list(model.parameters())),

@@ -22,8 +22,8 @@ from ast_sim.models.ast.message_passing import MessagePassing
 from ast_sim.models.ast.position_embedding import PositionEmbedding, rotated, rotations
 from ast_sim.models.ast.presets import PRESETS
 from ast_sim.models.ast.transformer import AttentionBlock, Vectors
+from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.layers import FactorizedLinear
-from ast_sim.models.model_config import DataFacts
 from ast_sim.models.normalizer import Normalizer
 from ast_sim.models.registry import build_model
 from ast_sim.ops import EdgeSet
@@ -34,22 +34,22 @@ RELATIVE, EXCHANGES = {"places": "relative"}, {"places": "relative", "exchanges"
 SMALL = {"hidden": 32, "decoder_hidden": 16, "d_token": 32, "heads": 2, "head_dim": 16, "ffn_inner": 32, "L_SA": 2}
 
 DATA = {
-    "deforming_plate": {"stress": "node"},
-    "sphere_simple": {"integration": "dynamic"},
-    "abcd": {"material_width": 1},
-    "abcd_xl": {"material_width": 1, "stress": "element"},
+    "deforming_plate": DataFacts(stress="node"),
+    "sphere_simple": DataFacts(integration="dynamic"),
+    "abcd": DataFacts(material_width=1),
+    "abcd_xl": DataFacts(material_width=1, stress="element"),
 }
 
 
 def small(family: str, **changes) -> ASTConfig:
     """The family's preset on its data, with narrow layers: the same parts, quick to run."""
-    return replace(PRESETS[family].model, **{**SMALL, **DATA[family], **changes})
+    return replace(PRESETS[family].model, **{**SMALL, "boundary_motion": True, "data": DATA[family], **changes})
 
 
 def sampler(path, config: ASTConfig, noise: float = 1e-3) -> PairSampler:
     return PairSampler(
         Dataset(path), "train", batch_size=2, seed=0, noise=noise, make_graph=build_model(config).graph,
-        dynamic=config.dynamic, gamma=1.0,
+        dynamic=config.data.dynamic, gamma=1.0,
     )  # fmt: skip
 
 
@@ -61,7 +61,9 @@ def batch_of(config: ASTConfig, *seeds: int, family: str = "deforming_plate") ->
     stress = (
         torch.from_numpy(np.concatenate([t.stress[2] for t in scenes])) if "stress" in config.element_inputs else None
     )
-    return Batch(graph, now, before if config.dynamic else None, motion, stress, [f"scene {seed}" for seed in seeds])
+    return Batch(
+        graph, now, before if config.data.dynamic else None, motion, stress, [f"scene {seed}" for seed in seeds]
+    )
 
 
 @pytest.mark.parametrize("family", ["deforming_plate", "sphere_simple", "abcd", "abcd_xl"])
@@ -71,8 +73,8 @@ def test_every_preset_takes_a_training_step(family, tmp_path):
     path = write(tmp_path / "data.h5", family)
     with Dataset(path) as dataset:
         material = trajectory(family).scene.material
-        config = PRESETS[family].model.resolve(DataFacts(dataset.info, 0 if material is None else 1, 0.08))
-    assert config.stress == {"deforming_plate": "node", "abcd_xl": "element"}.get(family, "none")
+        config = PRESETS[family].model.resolve(DataFacts.of(dataset.info, 0 if material is None else 1, 0.08))
+    assert config.data.stress == {"deforming_plate": "node", "abcd_xl": "element"}.get(family, "none")
     model, pairs = build_model(replace(config, dropout=0.0)), sampler(path, config)
     model.fit_statistics(pairs.batch(i) for i in range(3))
     batch, target = pairs.batch(0)
@@ -265,10 +267,12 @@ def test_relative_places_follow_a_scene_that_is_moved_by_whole_cells(changes, fo
 
 def test_places_of_nodes_and_cells_are_measured_alike():
     """A node in the middle of a coarse cell is where the cell is, also after the domain has grown."""
-    config = small("deforming_plate", L_cell=4, l_ocnn=1, domain_center=(1.0, 2.0, 3.0), domain_half_width=2.0)
+    config = small(
+        "deforming_plate", L_cell=4, l_ocnn=1, data=DataFacts(domain_center=(1.0, 2.0, 3.0), domain_half_width=2.0)
+    )
     side = 2 * config.cell_side
     middle = torch.tensor([[0.5, 0.5, 0.5], [-2.5, 1.5, 0.5], [5.5, -8.5, 3.5]])
-    position = middle * side + torch.tensor(config.domain_center)
+    position = middle * side + torch.tensor(config.data.domain_center)
     for count, growth in ((2, 0), (3, 2)):
         cells = build_cells(config, position[:count], torch.tensor([0, count]), may_grow=True)
         assert cells.growth == growth
@@ -422,20 +426,20 @@ def test_what_the_dataset_decides():
     """Level by mesh spacing, a stress on elements with the element nodes that it needs, domain and kind of dynamics."""
     info = DatasetInfo("own", "quasi_static", "element", (1.0, 2.0, 3.0), 4.0, 0.01, 0.0)
     tiny = PRESETS["tiny"].model
-    config = tiny.resolve(DataFacts(info, 2, mesh_spacing=0.1))
-    assert config.element_inputs == ("displacement", "material") and config.stress == "element"
+    config = tiny.resolve(DataFacts.of(info, 2, mesh_spacing=0.1))
+    assert config.element_inputs == ("displacement", "material") and config.data.stress == "element"
     assert config.node_inputs == ("displacement", "proximity", "material", "out_of_balance")
-    assert config.material_width == 2
+    assert config.data.material_width == 2
     assert (config.places, config.exchanges) == ("relative", 2)
-    assert config.domain_center == (1.0, 2.0, 3.0) and config.domain_half_width == 4.0
+    assert config.data.domain_center == (1.0, 2.0, 3.0) and config.data.domain_half_width == 4.0
     assert config.L_cell == 6 and config.cell_side == pytest.approx(0.125)  # 1 + log2(4 / 0.15) = 5.7
-    nodal = tiny.resolve(DataFacts(replace(info, stress_location="node"), 0, mesh_spacing=0.1))
+    nodal = tiny.resolve(DataFacts.of(replace(info, stress_location="node"), 0, mesh_spacing=0.1))
     assert nodal.element_inputs == () and nodal.stress == "node"
-    moving = DataFacts(replace(info, integration="dynamic"), 0, mesh_spacing=0.1)
+    moving = DataFacts.of(replace(info, integration="dynamic"), 0, mesh_spacing=0.1)
     dynamic = tiny.resolve(moving)
     assert dynamic.node_inputs == ("displacement", "velocity") and dynamic.element_inputs == ("displacement",)
     assert (dynamic.places, dynamic.exchanges) == ("absolute", 0)
-    assert replace(tiny, places="absolute").resolve(DataFacts(info, 0, 0.1)).exchanges == 0
+    assert replace(tiny, places="absolute").resolve(DataFacts.of(info, 0, 0.1)).exchanges == 0
     asked = replace(tiny, places="relative", exchanges=1, node_inputs=(), element_inputs=("velocity",))
     found = asked.resolve(moving)
     assert (found.places, found.exchanges) == ("relative", 1)
@@ -483,4 +487,4 @@ def test_settings_that_the_data_does_not_fit(changes, stress, message):
     dynamic = stress == "dynamic"
     info = replace(toy.info(dynamic), stress_location="none" if dynamic else stress)
     with pytest.raises(ConfigError, match=message):
-        ASTConfig(**changes).resolve(DataFacts(info, 0, 0.1))
+        ASTConfig(**changes).resolve(DataFacts.of(info, 0, 0.1))

@@ -85,8 +85,8 @@ def formulas(model, batch):
         for level in reversed(range(levels)):
             x = skipped[level] + steps(f"up.{level}", level, pools[level].T @ x, level == 0)
         out = deep_mlp(p, "decoder.of_nodes", x)
-        if model.config.stress != "element":
-            return Prediction(out[:, :3], out[:, 3:] if model.config.stress == "node" else None)
+        if model.config.data.stress != "element":
+            return Prediction(out[:, :3], out[:, 3:] if model.config.data.stress == "node" else None)
         return Prediction(out[:, :3], deep_mlp(p, "decoder.of_elements", x[batch.graph.elements].mean(dim=1)))
 
     return of

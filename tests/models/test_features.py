@@ -8,6 +8,7 @@ from meshes import two_tetrahedra
 from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import Graph
 from ast_sim.models.ast.ast_config import ASTConfig
+from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.node_inputs import edge_features, element_features, node_features, normalizer_of
 from ast_sim.models.normalizer import FeatureNormalizer
 
@@ -23,7 +24,9 @@ def batch_of(element_nodes: bool) -> Batch:
 
 def test_node_features():
     inputs = ("displacement", "velocity", "material")
-    config = ASTConfig(node_inputs=inputs, material_width=1, integration="dynamic")
+    config = ASTConfig(
+        node_inputs=inputs, boundary_motion=True, data=DataFacts(material_width=1, integration="dynamic")
+    )
     batch = batch_of(False)
     expected = []
     for node, kind in enumerate(batch.graph.node_type.tolist()):
@@ -37,7 +40,7 @@ def test_node_features():
 
 def test_element_features():
     inputs = ("displacement", "velocity", "material", "stress")
-    config = ASTConfig(element_inputs=inputs, material_width=1, integration="dynamic", stress="element")
+    config = ASTConfig(element_inputs=inputs, data=DataFacts(material_width=1, integration="dynamic", stress="element"))
     batch = batch_of(True)
     expected = torch.tensor([[0.1, 0, 0, 0.05, 0, 0, 2, 5], [0.125, 0, 0, 0.0625, 0, 0, 6, 7]])
     torch.testing.assert_close(element_features(config, batch), expected, rtol=0, atol=1e-6)

@@ -110,8 +110,8 @@ def formulas(model, batch):
                 rows[node] = x[row]
             x = block(f"up.{i}", torch.stack(rows), meshes[i])
         out = deep_mlp(p, "decoder.of_nodes", x)
-        if c.stress != "element":
-            return Prediction(out[:, :3], out[:, 3:] if c.stress == "node" else None)
+        if c.data.stress != "element":
+            return Prediction(out[:, :3], out[:, 3:] if c.data.stress == "node" else None)
         return Prediction(out[:, :3], deep_mlp(p, "decoder.of_elements", x[batch.graph.elements].mean(dim=1)))
 
     return of

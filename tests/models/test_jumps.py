@@ -18,7 +18,7 @@ from ast_sim.inference.evaluation.evaluate import evaluate, table
 from ast_sim.inference.jump import calls
 from ast_sim.inference.predict import answers
 from ast_sim.inference.question import Question
-from ast_sim.models.model_config import DataFacts
+from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.registry import build_model, find_preset, model_names
 from ast_sim.models.simulator import Prediction, Simulator
 from ast_sim.models.transolver import TransolverConfig
@@ -36,7 +36,7 @@ def config(model: str, **changes):
     if model == "ast":
         return replace(toy.config(toy.info()), **{"jumps": True, "boundary_motion": False, **changes})
     small = TransolverConfig(hidden=32, blocks=2, heads=2, slices=8, jumps=True)
-    return replace(small.resolve(DataFacts(toy.info(), 0, 0.1)), **{"node_inputs": ("displacement",), **changes})
+    return replace(small.resolve(DataFacts.of(toy.info(), 0, 0.1)), **{"node_inputs": ("displacement",), **changes})
 
 
 def model_of(model: str, **changes) -> Simulator:
@@ -201,7 +201,7 @@ def test_a_failed_prediction_has_no_one_step(data):
 @pytest.mark.parametrize("model", ["ast", "transolver"])
 def test_dynamic_scenes_are_refused(model, tmp_path):
     with pytest.raises(ConfigError, match=r"model.jumps: the dataset is dynamic"):
-        config(model).resolve(DataFacts(toy.info(dynamic=True), 0, 0.1))
+        config(model).resolve(DataFacts.of(toy.info(dynamic=True), 0, 0.1))
     moving = toy.write(tmp_path / "moving.h5", dynamic=True)
     with pytest.raises(ConfigError, match=r"model.jumps: the dataset is dynamic"):
         start_training(tmp_path / "run", configure(moving, "tiny", ["model.jumps=true"], model=model))
@@ -210,10 +210,10 @@ def test_dynamic_scenes_are_refused(model, tmp_path):
 @pytest.mark.parametrize("model", model_names())
 def test_the_preset_tiny_jumps_where_there_is_no_inertia_and_the_papers_presets_never(model):
     for dynamic in (False, True):
-        tiny = find_preset(model, "tiny").model.resolve(DataFacts(toy.info(dynamic=dynamic), 0, 0.1))
+        tiny = find_preset(model, "tiny").model.resolve(DataFacts.of(toy.info(dynamic=dynamic), 0, 0.1))
         assert tiny.jumps is not dynamic and tiny.boundary_motion is dynamic
         assert ("out_of_balance" in tiny.node_inputs) is not dynamic
-    shells = find_preset(model, "tiny").model.resolve(DataFacts(toy.info(), 0, 0.1, tetrahedra=False))
+    shells = find_preset(model, "tiny").model.resolve(DataFacts.of(toy.info(), 0, 0.1, tetrahedra=False))
     assert "out_of_balance" not in shells.node_inputs
     assert find_preset("ast", "deforming_plate").model.jumps is False
 
@@ -221,16 +221,16 @@ def test_the_preset_tiny_jumps_where_there_is_no_inertia_and_the_papers_presets_
 def test_forces_need_tetrahedra():
     asked = replace(find_preset("ast", "tiny").model, node_inputs=("out_of_balance",))
     with pytest.raises(ConfigError, match="out_of_balance needs tetrahedra"):
-        asked.resolve(DataFacts(toy.info(), 0, 0.1, tetrahedra=False))
+        asked.resolve(DataFacts.of(toy.info(), 0, 0.1, tetrahedra=False))
 
 
 @pytest.mark.parametrize("model", ["ast", "transolver"])
 def test_the_setting_survives_toml_and_is_off_where_it_is_left_out(model):
-    settings = RunConfig(config(model), TrainConfig(), "data.h5")
+    settings = RunConfig(config(model, data=DataFacts()), TrainConfig(), "data.h5")
     text = to_toml(settings)
     assert from_values(RunConfig, tomllib.loads(text)) == settings
     left_out = from_values(RunConfig, tomllib.loads(text.replace("jumps = true\n", "")))
-    assert left_out.model == config(model, jumps=False)
+    assert left_out.model == config(model, jumps=False, data=DataFacts())
 
 
 @pytest.mark.parametrize("model", ["ast", "transolver", "mgn"])

@@ -35,8 +35,8 @@ def formulas(model, batch):
             sums = [torch.zeros_like(v).index_add(0, s.receivers, x) for s, x in ((mesh, e_new), (world, w_new))]
             v, e, w = v + deep_mlp(p, f"blocks.{i}.node", torch.cat([v, *sums], 1)), e + e_new, w + w_new
         out = deep_mlp(p, "decoder.of_nodes", v)
-        if model.config.stress != "element":
-            return Prediction(out[:, :3], out[:, 3:] if model.config.stress == "node" else None)
+        if model.config.data.stress != "element":
+            return Prediction(out[:, :3], out[:, 3:] if model.config.data.stress == "node" else None)
         means = v[batch.graph.elements].mean(dim=1)
         return Prediction(out[:, :3], deep_mlp(p, "decoder.of_elements", means))
 

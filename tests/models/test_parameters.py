@@ -26,7 +26,7 @@ import toy
 
 from ast_sim.models.ast.ast_config import ASTConfig
 from ast_sim.models.ast.presets import PRESETS
-from ast_sim.models.model_config import DataFacts
+from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.registry import build_model
 
 MESH = 18048 + 17280 + 134144 + 2 * 99840  # encoders, e2m, m2c, c2m = 369152
@@ -53,7 +53,7 @@ def resolved(name: str, **changes) -> ASTConfig:
     """The preset on data of its family's kind; `tiny` on plates."""
     stress = {"deforming_plate": "node", "tiny": "node", "abcd_xl": "element"}.get(name, "none")
     info = replace(toy.info(dynamic=name == "sphere_simple"), stress_location=stress)
-    return replace(PRESETS[name].model, **changes).resolve(DataFacts(info, int(name.startswith("abcd")), 0.1))
+    return replace(PRESETS[name].model, **changes).resolve(DataFacts.of(info, int(name.startswith("abcd")), 0.1))
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -18,6 +18,7 @@ from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import Graph
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.evaluation.evaluate import evaluate
+from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.registry import build_model
 from ast_sim.models.transolver import PRESETS, PhysicsAttention, Transolver, TransolverConfig
 from ast_sim.runs.folder import RunFolder
@@ -32,7 +33,8 @@ SMALL = {"hidden": 32, "blocks": 2, "heads": 2, "slices": 5, "mlp_ratio": 2}
 
 
 def small(stress: str = "node", **changes) -> TransolverConfig:
-    fitting = {"domain_center": (0.1, 0.0, -0.2), "stress": stress, "node_inputs": ("displacement",)}
+    data = DataFacts(domain_center=(0.1, 0.0, -0.2), stress=stress)
+    fitting = {"data": data, "boundary_motion": True, "node_inputs": ("displacement",)}
     return replace(TransolverConfig(**SMALL, **fitting), **changes)
 
 
@@ -92,7 +94,7 @@ def physics_attention(p: dict[str, Tensor], x: Tensor, heads: int, slices: int) 
 def transcribed(model: Transolver, batch: Batch) -> list[Tensor]:
     """The whole model, one scene at a time, in the type of its parameters."""
     config, graph, p = model.config, batch.graph, dict(model.named_parameters())
-    center = torch.tensor(config.domain_center)
+    center = torch.tensor(config.data.domain_center)
     kind = torch.stack([graph.node_type == k for k in NodeType], 1)
     node = torch.cat([kind, batch.position - graph.rest_position, batch.boundary_motion], 1)
     node = (node - model.node_inputs.mean) / model.node_inputs.scale
@@ -119,9 +121,9 @@ def transcribed(model: Transolver, batch: Batch) -> list[Tensor]:
             x = x + mlp(f"blocks.{b}.mlp", norm(f"blocks.{b}.norm_mlp", x))
         x = norm("norm", x)
         motions.append(layer(p, "decoder", x)[:, :3])
-        if config.stress == "node":
+        if config.data.stress == "node":
             stresses.append(layer(p, "decoder", x)[:, 3:])
-        if config.stress == "element":
+        if config.data.stress == "element":
             inside = (graph.elements >= first).all(1) & (graph.elements < last).all(1)
             corners = [x[element - first].mean(0) for element in graph.elements[inside]]
             stresses.append(layer(p, "element_decoder", torch.stack(corners)))
@@ -296,7 +298,7 @@ def test_settings_that_do_not_fit(changes, message):
 
 
 def test_settings_survive_toml():
-    config = RunConfig(small("element"), TrainConfig(steps=3), "data.h5")
+    config = RunConfig(replace(small("element"), data=DataFacts()), TrainConfig(steps=3), "data.h5")
     assert from_values(RunConfig, tomllib.loads(to_toml(config))) == config
 
 
@@ -310,7 +312,7 @@ def trained(tmp_path_factory):
     data = toy.write(folder / "toy.h5")
     # Along rollouts the states grow harder while it learns, so that losses tell nothing.
     settings = [
-        *("train.steps=80", "train.validate_every=80", "train.log_every=20", "train.noise=1e-3"),
+        *("train.steps=80", "train.validate_every=80", "train.log_every=20"),
         "train.rollout_pool=0",
     ]
     config = configure(data, "tiny", settings, model="transolver")
@@ -329,7 +331,7 @@ def test_a_trained_run_rolls_out_and_is_evaluated(trained):
     assert isinstance(model, Transolver) and settings.model.name == "transolver" and step == 80
     assert (
         settings.model.node_inputs == ("displacement", "proximity", "out_of_balance")
-        and settings.model.stress == "node"
+        and settings.model.data.stress == "node"
     )
     with Dataset(trained[1]) as dataset:
         truths = [dataset.load("test", index) for index in range(2)]

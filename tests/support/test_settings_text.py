@@ -9,7 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ast_sim.support.errors import ConfigError
-from ast_sim.support.toml_settings import Setting, assigned, change, from_values, settings, to_toml
+from ast_sim.support.toml_settings import FROM_DATA, Setting, assigned, change, from_values, settings, to_toml
+
+
+@dataclass(frozen=True)
+class Facts:
+    young: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -20,6 +25,12 @@ class Model:
     stress: Literal["none", "node", "element"] = "none"
     noise: float | None = None
     residual: bool = True
+    facts: Facts = field(default=Facts(), metadata={FROM_DATA: True})
+
+
+@dataclass(frozen=True)
+class Facts:
+    young: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -104,6 +115,13 @@ def test_the_last_override_of_a_key_holds():
     assert override(RUN, ["rate=1", "model.hidden=2", "rate=3"]) == Run(Model(hidden=2), "data.h5", 3.0)
 
 
+def test_facts_of_the_data_are_kept_by_a_change_but_neither_written_read_nor_listed():
+    stiff = Run(Model(facts=Facts(3.0)), "data.h5")
+    assert override(stiff, ["model.hidden=2"]) == Run(Model(2, facts=Facts(3.0)), "data.h5")
+    assert from_toml(Run, to_toml(stiff)) == RUN
+    assert not [one.key for one in settings(Run) if "young" in one.key or "facts" in one.key]
+
+
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [
@@ -112,6 +130,10 @@ def test_the_last_override_of_a_key_holds():
         ("modle.residual=true", "there is no setting modle.residual; the nearest is model.residual"),
         ("model=3", "model is a group of settings, such as model.hidden"),
         ("rate.x=3", "there is no setting rate.x; the nearest is rate"),
+        *(
+            (f"{key}=3", f"{key} is no setting but a fact of the data, which the dataset has: leave it out")
+            for key in ("model.young", "model.facts", "model.facts.young")
+        ),
         ("model.hidden", "'model.hidden' is no setting: write key=value"),
         ("model.hidden=1.5", "model.hidden is 1.5; must be an integer"),
         ("model.hidden=true", "model.hidden is True; must be an integer"),

@@ -16,11 +16,12 @@ from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.inference.effort import Effort
 from ast_sim.inference.trained_run import Run
 from ast_sim.models.ast.ast_config import ASTConfig
+from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.registry import find_model, find_preset
 from ast_sim.models.transolver import TransolverConfig
 from ast_sim.runs import checkpoint
 from ast_sim.runs import folder as run_folder
-from ast_sim.runs.config_toml import has_config, read_config
+from ast_sim.runs.config_toml import has_config, read_config, write_config
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.train_config import RunConfig, TrainConfig
@@ -29,11 +30,14 @@ from ast_sim.support.errors import CheckpointError, ConfigError, DatasetError, T
 from ast_sim.support.progress import Clock, duration
 from ast_sim.support.toml_settings import assigned, change
 from ast_sim.training import loop, start
-from ast_sim.training.data_lengths import DataScales, measure
+from ast_sim.training.data_lengths import DataScales, measure, scope_of
 from ast_sim.training.defaults_from_data import resolve, resolve_training
 from ast_sim.training.rates import learning_rate, step_seed
 
+DYNAMIC = DataFacts(integration="dynamic")
 SCALES = DataScales(displacement=0.01, increment=0.002, spacing=0.1, nodes=40, trajectories=3, pairs=100)
+
+JUMPS = ("model.jumps=true", "model.boundary_motion=false")
 
 
 @pytest.fixture
@@ -80,7 +84,7 @@ def test_paper_defaults_follow_from_the_data():
     assert resolved.decay == 101 * 10_000  # the cosine ends one epoch after the last
     assert resolved.noise == pytest.approx(0.0045)
     assert resolved.noise_gamma == 1.0
-    resolved = resolve_training(TrainConfig(), SCALES, ASTConfig(integration="dynamic"))
+    resolved = resolve_training(TrainConfig(), SCALES, ASTConfig(data=DYNAMIC))
     assert resolved.noise_gamma == 0.1 and resolved.noise == pytest.approx(0.0002)
 
 
@@ -189,7 +193,7 @@ def test_configure_opens_no_dataset():
 def test_the_kind_of_the_dataset_decides_which_inputs_there_can_be(data, tmp_path):
     dynamic = toy.write(tmp_path / "dynamic.h5", dynamic=True)
     config = resolved(dynamic, "model.node_inputs=velocity,displacement")
-    assert config.model.integration == "dynamic"
+    assert config.model.data.integration == "dynamic"
     assert config.model.node_inputs == ("velocity", "displacement")
     with pytest.raises(ConfigError, match="model.node_inputs: velocity is an input of dynamic scenes only"):
         start.start_training(tmp_path / "run", start.configure(data, "tiny", ["model.node_inputs=velocity"]))
@@ -227,7 +231,7 @@ def test_a_dynamic_dataset_is_trained_with_two_given_frames(tmp_path):
     start.start_training(tmp_path / "run", start.configure(dynamic, "tiny", ["model.node_inputs=velocity", *small]))
     trained = RunFolder(tmp_path / "run")
     model, resolved = trained.load_model(), trained.settings
-    assert model.config.dynamic
+    assert model.config.data.dynamic
     assert resolved.train.noise_gamma == 0.1 and resolved.train.rollout_pool == 32
     record = next(record for record in Metrics(tmp_path / "run") if "valid_rmse" in record)
     with Dataset(dynamic) as dataset:
@@ -424,7 +428,7 @@ def test_along_rollouts_a_resumed_training_ends_in_the_same_bits(linear, data, t
 def test_jumps_that_are_resumed_end_in_the_same_bits(linear, data, tmp_path, monkeypatch):
     """As along rollouts; the guesses of the pool and the running errors of the calls are in the checkpoint."""
     monkeypatch.setattr(loop, "JUMP_BATCHES", 3)  # so that 20 steps make all calls
-    jumps = settings(data, "model.jumps=true", "train.calls=3", "train.mirror=x,y")
+    jumps = settings(data, *JUMPS, "train.calls=3", "train.mirror=x,y")
     start.start_training(tmp_path / "whole", jumps)
     start.start_training(tmp_path / "run", jumps)
     newest = checkpoint.latest(tmp_path / "run") / "training.safetensors"
@@ -461,7 +465,7 @@ def test_jumps_that_are_resumed_end_in_the_same_bits(linear, data, tmp_path, mon
         ),
         (["train.rollout_pool=-4"], r"train.rollout_pool is -4"),
         (["train.rollout_pool=4", "train.noise=0"], r"of no use here: without train.noise"),
-        (["train.rollout_pool=4", "model.jumps=true"], r"of no use here: with model.jumps, each frame follows"),
+        (["train.rollout_pool=4", *JUMPS], r"of no use here: with model.jumps, each frame follows"),
     ],
 )
 def test_a_pool_that_cannot_be_is_refused(linear, data, tmp_path, assignments, match):
@@ -474,9 +478,9 @@ def test_a_pool_that_cannot_be_is_refused(linear, data, tmp_path, assignments, m
 def test_a_pool_left_to_the_data_is_of_16_batches_where_there_is_a_drift(config):
     given = TrainConfig(batch_size=4, rollout_pool=None)
     still = resolve_training(given, SCALES, config())
-    assert still.rollout_pool == 128 and still.noise == pytest.approx(0.0015)  # a third of that without a pool
-    dynamic = resolve_training(given, SCALES, config(integration="dynamic"))
-    assert dynamic.rollout_pool == 128 and dynamic.noise_gamma == 0.1 and dynamic.noise == pytest.approx(0.0002)
+    assert still.rollout_pool == 64 and still.noise == pytest.approx(0.0015)  # a third of that without a pool
+    dynamic = resolve_training(given, SCALES, config(data=DYNAMIC))
+    assert dynamic.rollout_pool == 64 and dynamic.noise_gamma == 0.1 and dynamic.noise == pytest.approx(0.0002)
     assert resolve_training(given, SCALES, config(jumps=True)).rollout_pool == 0
     assert resolve_training(dataclasses.replace(given, noise=0.0), SCALES, config()).rollout_pool == 0
     assert resolve_training(TrainConfig(), SCALES, config()).rollout_pool == 0  # the papers'
@@ -485,16 +489,16 @@ def test_a_pool_left_to_the_data_is_of_16_batches_where_there_is_a_drift(config)
 @pytest.mark.parametrize("model", ["bsms", "hcmt", "mgn"])
 def test_the_pool_of_a_model_with_edges_between_bodies_is_for_scenes_with_inertia(model):
     still = find_preset(model, "tiny")
-    given, moving = TrainConfig(**still.train), dataclasses.replace(still.model, integration="dynamic")
+    given, moving = TrainConfig(**still.train), dataclasses.replace(still.model, data=DYNAMIC)
     assert resolve_training(given, SCALES, still.model).rollout_pool == 0
-    assert resolve_training(given, SCALES, moving).rollout_pool == 128
+    assert resolve_training(given, SCALES, moving).rollout_pool == 64
     for name, preset in find_model(model).presets.items():
         assert name == "tiny" or preset.train.get("rollout_pool", 0) == 0  # as published
 
 
 def test_a_shift_left_open_is_half_a_cell_as_far_as_the_domain_has_room():
     given = TrainConfig(shift=None)
-    fine = ASTConfig(L_cell=6, domain_half_width=2.0)
+    fine = ASTConfig(L_cell=6, data=DataFacts(domain_half_width=2.0))
     assert fine.cell_side == 0.0625 and resolve_training(given, SCALES, fine).shift == 0.03125
     coarse = dataclasses.replace(fine, L_cell=2)
     assert coarse.cell_side == 1.0 and resolve_training(given, SCALES, coarse).shift == pytest.approx(0.1)
@@ -515,6 +519,57 @@ def test_a_pool_that_is_of_no_use_is_refused(data, tmp_path, setting, message):
     with pytest.raises(ConfigError, match=f"of no use here: .*{message}"):
         asked = ["model.jumps=false", "train.rollout_pool=8", setting]
         start.start_training(tmp_path / "run", start.configure(data, "tiny", asked))
+
+
+@pytest.mark.parametrize(
+    "settings, message",
+    [
+        (["model.jumps=true", "train.noise=0.05"], "train.noise = 0.05 is of no use here: with model.jumps"),
+        (["model.jumps=true", "train.noise_gamma=0.5"], "train.noise_gamma = 0.5 is of no use here: there is no noise"),
+        (
+            ["model.jumps=false", "train.noise=0", "train.noise_gamma=0.5"],
+            "train.noise_gamma = 0.5 is of no use here: there is no noise",
+        ),
+        (
+            ["model.jumps=true", "model.boundary_motion=true"],
+            "model.boundary_motion is of no use here: with model.jumps",
+        ),
+        (
+            ["model.node_inputs=displacement", "model.proximity_radius=0.1"],
+            "model.proximity_radius is of no use here: proximity is not in model.node_inputs",
+        ),
+        (["model.L_cell=4", "model.cell_spacings=2"], "model.cell_spacings is of no use with model.L_cell"),
+        (["model.young=5"], "model.young is no setting but a fact of the data"),
+    ],
+)
+def test_settings_without_effect_are_refused(data, tmp_path, settings, message):
+    with pytest.raises(ConfigError, match=message):
+        start.start_training(tmp_path / "run", start.configure(data, "tiny", settings))
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("jumps", [True, False])
+def test_resolved_settings_are_themselves_settings_to_start_from(data, tmp_path, jumps):
+    """What had no effect is unset in them, so nothing in them is refused; the facts of the data are not among them."""
+    with Dataset(data) as dataset:
+        asked = start.configure(data, "tiny", [f"model.jumps={str(jumps).lower()}", "train.steps=9"])
+        resolved = resolve(asked, dataset, measure(dataset))
+        write_config(tmp_path, resolved, scope_of(dataset, resolved.model.data), dataset.fingerprint())
+        again = resolve(start.configure(data, config=tmp_path / "config.toml"), dataset, measure(dataset))
+    assert again == resolved == read_config(tmp_path)
+    assert resolved.model.data.domain_half_width == 0.5 and resolved.model.data.stress == "node"
+    text = (tmp_path / "config.toml").read_text()
+    assert "domain_half_width" not in text and "domain_half_width = 0.5" in (tmp_path / "scope.toml").read_text()
+
+
+def test_a_new_model_has_the_statistics_of_a_training(data, tmp_path):
+    few = {"hidden": 16, "blocks": 1}
+    run = start.train(data, tmp_path / "run", model="mgn", model_settings=few, steps=1, validate_scenes=0)
+    with Dataset(data) as dataset:
+        model = start.new_model(dataset, "mgn", model_settings=few)
+    fitted, trained = ({k: v for k, v in m.state_dict().items() if "normalizer" in k} for m in (model, run.model))
+    assert fitted.keys() == trained.keys() and all(torch.equal(fitted[key], trained[key]) for key in fitted)
+    assert 0 < float(model.motion_normalizer.scale) < 0.1  # an untrained one has 1
 
 
 def test_a_second_writer_is_refused(linear, data, tmp_path):

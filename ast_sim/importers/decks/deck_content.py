@@ -244,7 +244,8 @@ class _Reader:
         self.content = self.deck.parts[name] = Content(name)
 
     def _instance(self, keyword: Keyword) -> None:
-        name, part = self._key(keyword.required("NAME")), keyword.required("PART").upper()
+        name = self._key(keyword.required("NAME"))
+        part = keyword.required("PART").upper()
         if part not in self.deck.parts:
             raise keyword.error(f"there is no part {keyword.options['PART']!r} before this line")
         if name in self.deck.instances:
@@ -289,7 +290,9 @@ def _placement(keyword: Keyword) -> tuple[np.ndarray, np.ndarray]:
     shift = np.array(rows[0][:3]) if rows else np.zeros(3)
     if len(rows) < 2:
         return np.eye(3), shift
-    start, end, angle = np.array(rows[1][:3]), np.array(rows[1][3:6]), np.radians(rows[1][6])
+    start = np.array(rows[1][:3])
+    end = np.array(rows[1][3:6])
+    angle = np.radians(rows[1][6])
     length = np.linalg.norm(end - start)
     if not length > 0:
         raise keyword.error("the axis of the rotation has no length")

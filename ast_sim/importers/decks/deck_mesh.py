@@ -159,7 +159,7 @@ class _Assembly:
 
     def _nodes_of(self, name: str, members: Members, of_elements: bool) -> np.ndarray:
         """The places of the members of a set that there are; a deck may list others, as Abaqus and CalculiX allow."""
-        found = [np.zeros(0, np.int64)]
+        groups = [np.zeros(0, np.int64)]
         for instance, numbers in members:
             scope = self.scopes[instance or name]
             known, nodes = self.elements[instance or name] if of_elements else (scope.numbers, [])
@@ -167,5 +167,7 @@ class _Assembly:
             row = (
                 row[(row < len(known)) & (known[np.minimum(row, len(known) - 1)] == numbers)] if len(known) else row[:0]
             )
-            found.append(np.concatenate([found[0], *(nodes[one] for one in row)]) if of_elements else row + scope.start)
-        return np.unique(np.concatenate(found))
+            groups.append(
+                np.concatenate([groups[0], *(nodes[one] for one in row)]) if of_elements else row + scope.start
+            )
+        return np.unique(np.concatenate(groups))

@@ -46,7 +46,8 @@ def kind_of(type_name: str) -> str | None:
     split = _NAME.fullmatch(name)
     if split is None or name == "F3D4":  # a tetrahedron in CalculiX, a surface in Abaqus
         return None
-    family, count = split[1], int(split[2])
+    family = split[1]
+    count = int(split[2])
     if family in _VOLUMES:
         return _KIND_OF_VOLUME.get(count)
     return _KIND_OF_SURFACE.get(count) if family in _SURFACES else None

@@ -78,10 +78,12 @@ def read_keywords(path: Path) -> list[Keyword]:
 
 def _keyword(first: Line, lines: Iterator[Line]) -> tuple[Line | None, Keyword]:
     """A keyword, and the line after it."""
-    text, line = first.text, next(lines, None)
+    text = first.text
+    line = next(lines, None)
     # After a comma at the end, options go on in the next line. A data line does not begin with a letter and an "=".
     while line is not None and text.endswith(",") and re.match(r"[A-Za-z ]+=|[A-Za-z ]+$", line.text):
-        text, line = text + line.text, next(lines, None)
+        text = text + line.text
+        line = next(lines, None)
     name, _, rest = text[1:].partition(",")
     keyword = Keyword(re.sub(r"\s+", "", name).upper(), _options(first, rest), first, [])
     while line is not None and not line.text.startswith("*"):
@@ -100,11 +102,11 @@ def _options(line: Line, text: str) -> dict[str, str]:
     options: dict[str, str] = {}
     place = 0
     while text[place:].strip(" \t,"):
-        found = _NAMED.match(text, place)
-        if found is None:
+        option = _NAMED.match(text, place)
+        if option is None:
             raise DatasetError(f"{line.place}: the options {text.strip()!r} cannot be read")
-        options[re.sub(r"\s+", "", found[1]).upper()] = (found[2] or "").strip().strip('"')
-        place = found.end()
+        options[re.sub(r"\s+", "", option[1]).upper()] = (option[2] or "").strip().strip('"')
+        place = option.end()
     return options
 
 

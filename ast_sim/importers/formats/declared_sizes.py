@@ -67,14 +67,14 @@ def declared_in_xml(path: Path) -> Declared:
             than the file can hold; the text names the file and the array.
     """
     try:
-        found = _scanned(path)
-        _require_sizes(path, found)
+        declared = _scanned(path)
+        _require_sizes(path, declared)
     except (expat.ExpatError, ValueError, LookupError, binascii.Error) as error:
         told = " ".join(str(error).split())
         raise DatasetError(f"{path}: cannot be read as a mesh: it is damaged or no XML file of VTK: {told}") from error
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
-    return found
+    return declared
 
 
 def needed_bytes(declared: Declared) -> int:
@@ -84,31 +84,33 @@ def needed_bytes(declared: Declared) -> int:
 
 def _scanned(path: Path) -> Declared:
     """Go through the tags of a file, up to the raw bytes that may follow them."""
-    found, open_tags = Declared(), []
+    declared = Declared()
+    open_tags = []
     parser = expat.ParserCreate()
     parser.buffer_text = False
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         place = open_tags[-1] if open_tags else ""
         if tag == "VTKFile":
-            found.root, found.kind = attributes, attributes.get("type", "")
+            declared.root = attributes
+            declared.kind = attributes.get("type", "")
         elif tag == "Piece":
-            found.sources += [attributes["Source"]] if "Source" in attributes else []
+            declared.sources += [attributes["Source"]] if "Source" in attributes else []
             if "NumberOfPoints" in attributes:
                 cells = ("NumberOfCells", "NumberOfVerts", "NumberOfLines", "NumberOfStrips", "NumberOfPolys")
                 counts = [int(attributes.get(name, 0)) for name in ("NumberOfPoints", *cells)]
                 if min(counts) < 0:
                     raise ValueError(f"a piece has {min(counts)} points or cells")
-                found.pieces.append((counts[0], sum(counts[1:])))
+                declared.pieces.append((counts[0], sum(counts[1:])))
         elif tag == "DataArray":
-            found.arrays.append(Array(attributes.get("Name", place), place, attributes, len(found.pieces) - 1))
+            declared.arrays.append(Array(attributes.get("Name", place), place, attributes, len(declared.pieces) - 1))
         elif tag == "AppendedData":
-            found.appended = attributes.get("encoding", "raw")
+            declared.appended = attributes.get("encoding", "raw")
         open_tags.append(tag)
 
     def text(characters: str) -> None:
-        if open_tags and open_tags[-1] == "DataArray" and len(found.arrays[-1].text) < 64:
-            found.arrays[-1].text = (found.arrays[-1].text + characters).lstrip()[:64]
+        if open_tags and open_tags[-1] == "DataArray" and len(declared.arrays[-1].text) < 64:
+            declared.arrays[-1].text = (declared.arrays[-1].text + characters).lstrip()[:64]
 
     parser.StartElementHandler = start
     parser.EndElementHandler = lambda tag: open_tags.pop()
@@ -121,29 +123,30 @@ def _scanned(path: Path) -> Declared:
                 chunk += file.read(1024)
                 end = chunk.index(b"_", chunk.index(b">", mark))
                 parser.Parse(chunk[:end])
-                found.data_start = before + end + 1
-                return found
+                declared.data_start = before + end + 1
+                return declared
             parser.Parse(chunk)
             before += len(chunk)
     parser.Parse(b"", True)
-    return found
+    return declared
 
 
-def _require_sizes(path: Path, found: Declared) -> None:
+def _require_sizes(path: Path, declared: Declared) -> None:
     size = path.stat().st_size
-    compressed = "compressor" in found.root
+    compressed = "compressor" in declared.root
     ratio = _RATIO_PACKED if compressed else _RATIO_PLAIN
-    header = np.dtype("u8" if found.root.get("header_type") == "UInt64" else "u4")
-    header = header.newbyteorder(">" if found.root.get("byte_order") == "BigEndian" else "<")
+    header = np.dtype("u8" if declared.root.get("header_type") == "UInt64" else "u4")
+    header = header.newbyteorder(">" if declared.root.get("byte_order") == "BigEndian" else "<")
     offsets: set[str] = set()
-    for points, cells in found.pieces:
+    for points, cells in declared.pieces:
         if points + cells > ratio * size:
             raise DatasetError(
                 f"{path}: declares {points} points and {cells} cells, more than a file of {size} bytes can hold"
             )
     with path.open("rb") as file:
-        for array in found.arrays:
-            limit, kind = _limit(array, found.pieces), array.attributes.get("format")
+        for array in declared.arrays:
+            limit = _limit(array, declared.pieces)
+            kind = array.attributes.get("format")
             if kind == "appended":
                 offset = array.attributes.get("offset", "")
                 if offset in offsets and limit:
@@ -153,7 +156,7 @@ def _require_sizes(path: Path, found: Declared) -> None:
                 offsets.add(offset)
             if not compressed or kind not in ("appended", "binary") or array.attributes.get("type") == "String":
                 continue
-            unpacked = _unpacked(_first_bytes(file, found, array), header)
+            unpacked = _unpacked(_first_bytes(file, declared, array), header)
             if unpacked > limit:
                 raise DatasetError(
                     f"{path}: the array {array.name} unpacks to more than {limit} bytes, which is all that the declared"
@@ -169,18 +172,18 @@ def _limit(array: Array, pieces: list[tuple[int, int]]) -> int:
     columns = int(array.attributes.get("NumberOfComponents") or 1)
     rows = points if array.place in ("Points", "PointData") else cells
     if array.place not in ("Points", "PointData", "CellData"):  # of the cells themselves
-        columns = 1 if array.name in ("offsets", "types") else _MOST_NODES
+        columns = 1 if array.name == "types" else _MOST_NODES  # dolfin's offsets are as long as its connectivity
     return rows * columns * _BYTES.get("".join(filter(str.isdigit, array.attributes.get("type", ""))), 8)
 
 
-def _first_bytes(file: Any, found: Declared, array: Array) -> bytes:
+def _first_bytes(file: Any, declared: Declared, array: Array) -> bytes:
     """The first bytes of the data of an array, at least three numbers of its header."""
     if array.attributes.get("format") == "binary":
         text = array.text.encode()
     else:
-        file.seek(found.data_start + int(array.attributes.get("offset", 0)))
+        file.seek(declared.data_start + int(array.attributes.get("offset", 0)))
         text = file.read(64)
-        if found.appended == "raw":
+        if declared.appended == "raw":
             return text
     text = text[: len(text) // 4 * 4]
     return base64.b64decode(text.partition(b"=")[0][: len(text.partition(b"=")[0]) // 4 * 4] or text)

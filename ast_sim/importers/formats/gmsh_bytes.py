@@ -93,9 +93,11 @@ class Section:
         for row in range(count):
             if self.order is None:
                 entries = self.line().split()
-                numbers[row], points[row] = int(entries[0]), [float(text) for text in entries[1:4]]
+                numbers[row] = int(entries[0])
+                points[row] = [float(text) for text in entries[1:4]]
             else:
-                numbers[row], points[row] = self.ints(1)[0], self.reals(3)
+                numbers[row] = self.ints(1)[0]
+                points[row] = self.reals(3)
                 dimension = int(self.ints(2)[0])
                 self.reals(dimension if dimension in (1, 2) else 0)
         return numbers, points

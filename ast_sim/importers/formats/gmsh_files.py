@@ -169,7 +169,8 @@ def _elements_4(section: Section, content: _Content) -> None:
     held = 0
     for _ in range(blocks):
         dimension, entity, kind_number = section.ints(3).tolist()
-        kind, count = _kind(kind_number), int(section.sizes(1)[0])
+        kind = _kind(kind_number)
+        count = int(section.sizes(1)[0])
         rows = section.sizes(count * (1 + node_count(kind))).reshape(count, -1)
         groups = [(dimension, group, np.arange(count)) for group in content.physical.get((dimension, entity), [])]
         first = groups[0][1] if groups else 0
@@ -226,7 +227,8 @@ def _source(path: Path, content: _Content) -> SourceMesh:
     if len(sorted_numbers) and (np.diff(sorted_numbers) == 0).any():
         twice = sorted_numbers[np.argmax(np.diff(sorted_numbers) == 0)]
         raise DatasetError(f"{path}: cannot be read as a mesh: node {twice} stands in the file twice")
-    blocks, groups = [], defaultdict(list)
+    blocks = []
+    groups = defaultdict(list)
     for block in content.blocks:
         row = np.minimum(np.searchsorted(sorted_numbers, block.nodes), max(len(order) - 1, 0))
         if not len(order) or (sorted_numbers[row] != block.nodes).any():

@@ -269,7 +269,8 @@ def _parts(data: Any, name: str = "", in_sets: bool = False) -> list[tuple[Any, 
     parts = []
     if isinstance(data, vtkMultiBlockDataSet):
         for index in range(data.GetNumberOfBlocks()):
-            block, facts = data.GetBlock(index), data.GetMetaData(index) if data.HasMetaData(index) else None
+            block = data.GetBlock(index)
+            facts = data.GetMetaData(index) if data.HasMetaData(index) else None
             label = (facts.Get(vtkCompositeDataSet.NAME()) if facts is not None else None) or ""
             if block is not None:
                 parts += _parts(block, label, in_sets or label == "Node Sets")

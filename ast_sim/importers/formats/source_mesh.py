@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ast_sim.scene import require_nodes
+from ast_sim.number_arrays import require_nodes
 from ast_sim.support.errors import DatasetError
 
 if TYPE_CHECKING:

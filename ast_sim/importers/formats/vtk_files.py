@@ -14,6 +14,7 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -43,6 +44,8 @@ _COPIES = 8
 _OWN_BYTES = 1 << 29
 _LARGEST_RATIO = 40  # of memory to file, where the file does not say what it declares
 
+_CAUSES = "it is damaged, needs too much memory, or holds what VTK cannot read: then write it in another format"
+
 _SECONDS = 120
 _SECONDS_PER_MEGABYTE = 2
 
@@ -68,6 +71,10 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
         MissingExtra: VTK is not installed.
     """
     pieces, budget = _checked(path)
+    if pieces and pieces[0] == (0, 0) and any(pieces[1:]) and path.suffix.lower() == ".vtu":
+        with _without_empty_pieces(path) as copy:
+            yield from (replace(frame, path=path) for frame in vtk_frames(copy))
+        return
     of_steps = declared_in_vtkhdf(path) if path.suffix.lower() == ".vtkhdf" else []
     step, steps = 0, 1
     while step < steps:
@@ -76,19 +83,46 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
         mesh = _mesh(path, parts, head["time"])
         declared = of_steps[step] if step < len(of_steps) else head.get("declared")
         declared = declared or ([sum(column) for column in zip(*pieces, strict=True)] if pieces else None)
-        counted = [len(mesh.points), sum(len(block.nodes) for block in mesh.blocks)]
-        if declared is not None and declared != counted:
-            raise DatasetError(
-                f"{path}: says that it holds {declared[0]} points and {declared[1]} cells, but VTK reads {counted[0]}"
-                f" and {counted[1]}"
-            )
+        _require_counts(mesh, declared)
         yield _without_ghosts(_with_pieces(mesh, pieces))
         step += 1
 
 
+@contextlib.contextmanager
+def _without_empty_pieces(path: Path) -> Iterator[Path]:
+    """A copy of a file without its pieces that have no points: VTK takes the names of all arrays from the first."""
+    head, mark, data = path.read_bytes().partition(b"<AppendedData")
+    for piece in re.findall(rb"<Piece\b[^>]*/>|<Piece\b.*?</Piece>", head, re.DOTALL):
+        if re.match(rb"<Piece\b[^>]*\bNumberOfPoints\s*=\s*[\"']\s*0+\s*[\"']", piece):
+            head = head.replace(piece, b"", 1)
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / path.name
+        copy.write_bytes(head + mark + data)
+        yield copy
+
+
+def _require_counts(mesh: SourceMesh, declared: list[int] | None) -> None:
+    """Check that the points and cells are as many as the file says; a note says if VTK leaves out points of no cell."""
+    if declared is None:
+        return
+    points = len(mesh.points)
+    cells = sum(len(block.nodes) for block in mesh.blocks)
+    if mesh.path.suffix.lower() in EXODUS and mesh.same_point is not None:
+        points = len(np.unique(mesh.same_point))  # each block has its own copies of the points that it uses
+        if points < declared[0]:
+            mesh.notes.append(f"{declared[0] - points} points of no element are left out")
+            points = declared[0]
+    if declared != [points, cells]:
+        raise DatasetError(
+            f"{mesh.path}: says that it holds {declared[0]} points and {declared[1]} cells, but VTK reads {points} and"
+            f" {cells}"
+        )
+
+
 def _checked(path: Path) -> tuple[list[tuple[int, int]], int]:
     """The points and cells of each piece, if the file says them, and the bytes of memory that VTK may take."""
-    ending, size = path.suffix.lower(), path.stat().st_size
+    ending = path.suffix.lower()
+    size = path.stat().st_size
     if ending in (".vtu", ".vtp", ".vts"):
         declared = declared_in_xml(path)
         return declared.pieces if ending != ".vts" else [], _OWN_BYTES + _COPIES * (needed_bytes(declared) + size)
@@ -135,7 +169,7 @@ def _of_frd(path: Path) -> list[tuple[int, int]]:
                     " of a *STATIC or *DYNAMIC step"
                 )
         for key in (b"2C", b"3C"):
-            declared = re.search(rb"^ {4}" + key + rb" +([0-9]+)", content, re.MULTILINE)
+            declared = re.search(rb" {4}" + key + rb" +([0-9]+) ", content)  # no new line precedes it in a binary file
             counts.append(int(declared[1]) if declared else 0)
     return [(counts[0], counts[1])]
 
@@ -199,8 +233,8 @@ class _Worker:
         if code == -signal.SIGALRM:
             return f"VTK did not finish within {seconds} s"
         if code < 0:
-            return f"VTK crashed on it ({signal.Signals(-code).name}): it is damaged, or larger than its memory allows"
-        return "VTK stopped: it is damaged, or larger than its memory allows"
+            return f"VTK crashed on it ({signal.Signals(-code).name}); {_CAUSES}"
+        return f"VTK stopped; {_CAUSES}"
 
     def stop(self) -> None:
         if self.process is not None and self.owner == os.getpid():
@@ -223,7 +257,8 @@ def _received(stream: Any, listed: list[dict[str, tuple[str, list[int]]]]) -> li
     for names in listed:
         piece = {}
         for name, (dtype, shape) in names.items():
-            kind, count = np.dtype(dtype), int(np.prod(shape))
+            kind = np.dtype(dtype)
+            count = int(np.prod(shape))
             data = stream.read(kind.itemsize * count)
             piece[name] = np.frombuffer(data, kind, count).reshape(shape)
         pieces.append(piece)

@@ -55,7 +55,10 @@ def elements_of(mesh: SourceMesh, point_of: np.ndarray) -> Elements:
             " alone: mesh the bodies with tetrahedra"
         )
     starts = np.cumsum([0, *(len(block.nodes) for block in mesh.blocks)])
-    nodes, rows, notes, told = [], [], Counter(), Counter()
+    nodes = []
+    rows = []
+    notes = Counter()
+    told = Counter()
     twice = 0
     for shape in dict.fromkeys(mesh.blocks[index].shape for index in chosen):
         of_shape = [index for index in chosen if mesh.blocks[index].shape == shape]

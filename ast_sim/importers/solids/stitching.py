@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.solids.splitting import faces_of
-from ast_sim.scene import connected_parts
+from ast_sim.number_arrays import connected_parts
 from ast_sim.support.errors import DatasetError
 
 # Points are at one place if they are nearer than this share of the size of the mesh.

@@ -47,7 +47,7 @@ def asked_frames(
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        indices = dataset.with_frames(split, model.config.given_frames + 1)
+        indices = dataset.with_frames(split, model.config.data.given_frames + 1)
         scenes = []
         for index in indices:
             scenes.append(_scene(model, dataset, split, index, effort))
@@ -91,7 +91,7 @@ def _rivals(
 def errors_by_effort(model: Simulator, truth: Trajectory, most: Effort) -> list[EffortErrors]:
     """The errors at the deepest frame after each number of corrections and of Newton steps, up to `most`; empty where
     nothing is displaced."""
-    frame = max(deepest_frame(truth), model.config.given_frames)
+    frame = max(deepest_frame(truth), model.config.data.given_frames)
     if not _rms(truth.position[frame] - truth.position[0], ~truth.scene.prescribed):
         return []
     efforts = range(most.corrections + 1)
@@ -116,7 +116,7 @@ def _after(model: Simulator, truth: Trajectory, frame: int, corrections: int, mo
             continue
         error = relative_error(positions[steps][0], truth, frame)
         stress = None if way.stress is None else way.stress[steps][0]
-        stress_error, _ = _stress_errors(truth, stress, frame, model.config.stress)
+        stress_error, _ = _stress_errors(truth, stress, frame, model.config.data.stress)
         measured.append(EffortErrors(effort, error, stress_error, min(steps, needed), float(0 < steps < needed)))
     return measured
 
@@ -154,8 +154,9 @@ def lines(asked: AskedFigures) -> list[str]:
 
 
 def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: Effort) -> AskedScene:
-    name, truth = f"{split}/{index:06d}", dataset.load(split, index)
-    frame = max(deepest_frame(truth), model.config.given_frames)
+    name = f"{split}/{index:06d}"
+    truth = dataset.load(split, index)
+    frame = max(deepest_frame(truth), model.config.data.given_frames)
     question = Question.of(truth, name, [frame])
     (answer,) = answers(model, [question], effort)
     size = _rms(truth.position[frame] - truth.position[0], ~truth.scene.prescribed)
@@ -166,7 +167,7 @@ def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: E
         (after,) = calls(model, [question], effort)
         positions = () if isinstance(after, str) else after.position
         by_calls = [relative_error(position[0], truth, frame) for position in positions]
-    share, largest = _stress_errors(truth, stress, frame, model.config.stress)
+    share, largest = _stress_errors(truth, stress, frame, model.config.data.stress)
     return AskedScene(
         name=name,
         nodes=truth.scene.num_nodes,

@@ -56,22 +56,23 @@ def evaluate(
     Raises:
         DatasetError: the split has no frame to predict.
     """
-    indices = dataset.with_frames(split, model.config.given_frames + 1)
+    indices = dataset.with_frames(split, model.config.data.given_frames + 1)
     if not indices:
         raise DatasetError(f"{dataset.path}: the split {split} has no frame to predict")
-    constant = _training_stress(dataset) if model.config.stress != "none" else None
+    constant = _training_stress(dataset) if model.config.data.stress != "none" else None
     scenes: list[SceneFigures] = []
     displacement: list[Errors] = []
     stress: list[Errors] = []
     seconds = read_seconds(dataset).samples
     for index in indices:
-        name, truth = f"{split}/{index:06d}", dataset.load(split, index)
+        name = f"{split}/{index:06d}"
+        truth = dataset.load(split, index)
         (answer,) = predictions(model, [Question.of(truth, name)], effort)
         one_step = _predicted(answer) if model.config.jumps else one_step_predictions(model, truth, name)
         displacement.append(displacement_errors(truth, one_step[0], answer))
         errors = scene_errors("displacement", displacement[-1])
         if constant is not None:
-            stress.append(stress_errors(truth, one_step[1], answer, constant, model.config.stress))
+            stress.append(stress_errors(truth, one_step[1], answer, constant, model.config.data.stress))
             errors += scene_errors("stress", stress[-1])
         recorded = truth.attributes.get("solve_seconds")
         solver = seconds.get(name, recorded if isinstance(recorded, list) else None)
@@ -108,7 +109,7 @@ def one_step_predictions(model: Simulator, truth: Trajectory, name: str) -> tupl
     Returns:
         Positions [S - given, N, 3] and stresses [S - given, N or E, 1] or None.
     """
-    given = model.config.given_frames
+    given = model.config.data.given_frames
     graph = model.graph(truth.scene)
     script = torch.tensor(truth.position)
     known = [None] * len(script) if truth.stress is None else torch.tensor(truth.stress)
@@ -116,12 +117,13 @@ def one_step_predictions(model: Simulator, truth: Trajectory, name: str) -> tupl
     for frame in range(given, truth.num_frames):
         state = State(script[frame - 1], script[frame - 2] if given == 2 else None, known[frame - 1])
         starts.append(Start(f"{name} frame {frame - 1}", graph, state, script[frame]))
-    chunk, found = max(1, ONE_STEP_NODES // truth.scene.num_nodes), []
+    chunk = max(1, ONE_STEP_NODES // truth.scene.num_nodes)
+    predicted = []
     with model.predicting():
         for first in range(0, len(starts), chunk):
-            found += predict_batch(model, starts[first : first + chunk])
-    stresses = [stress.numpy() for _, stress, _ in found if stress is not None]
-    return np.array([positions[0].numpy() for positions, *_ in found]), np.array(stresses) if stresses else None
+            predicted += predict_batch(model, starts[first : first + chunk])
+    stresses = [stress.numpy() for _, stress, _ in predicted if stress is not None]
+    return np.array([positions[0].numpy() for positions, *_ in predicted]), np.array(stresses) if stresses else None
 
 
 def _scene_figures(

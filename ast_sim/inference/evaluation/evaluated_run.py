@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ from ast_sim.inference.evaluation.evaluate import table
 from ast_sim.inference.predict import answers
 from ast_sim.inference.question import Question
 from ast_sim.support.disk import write_json
+from ast_sim.support.notebook_table import html_table, one_line
 from ast_sim.view import report
 from ast_sim.view.files import make_folder
 
@@ -39,6 +41,20 @@ class Evaluation:
 
     def __str__(self) -> str:
         return table(self.figures)
+
+    def _headline(self) -> dict[str, str]:
+        facts = {"run": self.run.path.name, "data": self.data.name, "scenes": f"{len(self.figures.scenes):,}"}
+        for quantity in ("displacement", "stress"):
+            error = self.figures.error(quantity)
+            if error is not None:
+                facts[f"{quantity} error"] = f"{error.rmse_sequence:.4g} {self.figures.unit(quantity)}"
+        return facts
+
+    def __repr__(self) -> str:
+        return one_line("Evaluation", self._headline())
+
+    def _repr_html_(self) -> str:
+        return html_table("Evaluation", self._headline(), f"<pre>{escape(str(self))}</pre>")
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all figures as JSON."""

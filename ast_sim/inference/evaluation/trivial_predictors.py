@@ -32,7 +32,9 @@ def displacement_errors(truth: Trajectory, one_step: np.ndarray | None, answer: 
         one_step: [S - given, N, 3], the model's predictions from the true frames; None if there are none.
         answer: the model's rollout.
     """
-    position, given, scene = truth.position.astype(np.float64), answer.given, truth.scene
+    position = truth.position.astype(np.float64)
+    given = answer.given
+    scene = truth.scene
     target, present = position[given:], position[given - 1 : -1]
     # The increment before frame 0 is zero, since the scene was at rest.
     before = np.concatenate([position[:1], position])[given - 1 : -2]

@@ -95,7 +95,8 @@ class MembraneState:
         pressure = lam * (e11 + e22)
         plain = np.stack([2 * mu * e11 + pressure, 2 * mu * e22 + pressure, 2 * mu * e12])
         density = 0.5 * (plain[0] * e11 + plain[1] * e22 + 2 * plain[2] * e12)
-        mean, radius = (e11 + e22) / 2, np.hypot((e11 - e22) / 2, e12)
+        mean = (e11 + e22) / 2
+        radius = np.hypot((e11 - e22) / 2, e12)
         self._large, self._small = mean + radius, mean - radius
         self._taut = self._small > -nu * self._large
         self._wrinkled = ~self._taut & (self._large > 0)
@@ -242,7 +243,8 @@ def positive_part(S: np.ndarray) -> np.ndarray:
 
     With eigenvalues l1 >= l2 it is a S + b I, where a = (max(l1,0) - max(l2,0)) / (l1 - l2), b = max(l1,0) - a l1.
     """
-    mean, radius = (S[0] + S[1]) / 2, np.hypot((S[0] - S[1]) / 2, S[2])
+    mean = (S[0] + S[1]) / 2
+    radius = np.hypot((S[0] - S[1]) / 2, S[2])
     large, small = np.maximum(mean + radius, 0), np.maximum(mean - radius, 0)
     a = np.divide(large - small, 2 * radius, out=np.ones_like(mean), where=radius > 0)
     b = large - a * (mean + radius)

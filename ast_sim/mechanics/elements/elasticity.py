@@ -151,7 +151,8 @@ class Elasticity:
 
     def nodal_mean(self, element_values: np.ndarray) -> np.ndarray:
         """Mean [N] of the values [E] of the elements around each node, weighted by volume; 0 where there are none."""
-        nodes, count = self._nodes.ravel(), len(self._nodes)
+        nodes = self._nodes.ravel()
+        count = len(self._nodes)
         weight = np.tile(self.element_volume, count)
         total = np.bincount(nodes, np.tile(element_values, count) * weight, minlength=self.num_nodes)
         volume = np.bincount(nodes, weight, minlength=self.num_nodes)
@@ -182,7 +183,8 @@ def negative_directions(
     """
     J = deformation.J
     squares, right = np.linalg.eigh(np.einsum("kie,kje->eij", deformation.F, deformation.F))
-    stretch, right = np.sqrt(squares.T), np.ascontiguousarray(right.transpose(2, 1, 0))  # [3, E], [axis, 3, E]
+    stretch = np.sqrt(squares.T)
+    right = np.ascontiguousarray(right.transpose(2, 1, 0))  # [3, E], [axis, 3, E]
     left = np.einsum("ije,kje->kie", deformation.F, right) / stretch[:, None]
     across = np.einsum("aje,kje->kae", gradients, right)  # v_k . grad N_a
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):

@@ -85,7 +85,9 @@ class SecondOrder(Elasticity):
     """
 
     def __init__(self, rest: np.ndarray, elements: np.ndarray, material: NeoHookean) -> None:
-        self.elements, self.num_nodes, self._count = elements, len(rest), len(elements)
+        self.elements = elements
+        self.num_nodes = len(rest)
+        self._count = len(elements)
         self._nodes = np.ascontiguousarray(elements.T)
         self._dofs = (3 * self._nodes[:, None, :] + np.arange(3)[None, :, None]).reshape(30, -1)
         volume, gradients = points_at_rest(rest, elements)
@@ -95,7 +97,8 @@ class SecondOrder(Elasticity):
                 f"element {worst} is turned over at rest: a quarter of it has the volume"
                 f" {volume[:, worst].min():.3g}, must be positive"
             )
-        self.volume, self.gradients = volume.ravel(), gradients.reshape(10, 3, -1)  # [P], [10, 3, P]
+        self.volume = volume.ravel()
+        self.gradients = gradients.reshape(10, 3, -1)  # [P], [10, 3, P]
         self._element_volume = volume.sum(axis=0)
         lam, mu = (np.broadcast_to(value, self._count) for value in (material.lam, material.mu))
         at_points = np.minimum(lam, LARGEST * mu)
@@ -158,7 +161,9 @@ class SecondOrder(Elasticity):
             deformation: the deformation at the positions in question.
             project: replace the negative eigenvalues of the sum in brackets, as a function of F, by zero at each point.
         """
-        J, material, mean = deformation.J, self.material, self._mean_dilatation(deformation.J)
+        J = deformation.J
+        material = self.material
+        mean = self._mean_dilatation(deformation.J)
         pressure = self._mean_pressure(J) * J
         spread, c = material.lam * J * J + pressure, material.pressure_factor(J) + pressure
         g = np.einsum("ijp,ajp->aip", deformation.cofactor / J, self.gradients).reshape(30, 4, -1)
@@ -188,7 +193,8 @@ class SecondOrder(Elasticity):
     def _lift(self, entries: np.ndarray, negative: Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> None:
         """Add to the entries [E,465] of each element what makes the negative eigenvalues at its points zero."""
         for points, way, value in negative:
-            b, scale = way.reshape(30, -1), value * self.volume[points]
+            b = way.reshape(30, -1)
+            scale = value * self.volume[points]
             for point in range(4):  # an element has only one of each, so the sums below lose nothing
                 at = points // self._count == point
                 entries[points[at] % self._count] += ((b[:, at] * scale[at])[_ROW] * b[_COLUMN][:, at]).T
@@ -210,7 +216,8 @@ class SecondOrder(Elasticity):
             return von_mises(self.cauchy(deformation))
         at_points = self._cauchy_at_points(deformation).reshape(3, 3, 4, -1)
         at_nodes = np.einsum("ap,ijpe->ijae", _EXTRAPOLATION, at_points) * self._element_volume
-        nodes, weight = self._nodes.ravel(), np.tile(self._element_volume, 10)
+        nodes = self._nodes.ravel()
+        weight = np.tile(self._element_volume, 10)
         volume = np.bincount(nodes, weight, minlength=self.num_nodes)
         total = [np.bincount(nodes, one.ravel(), minlength=self.num_nodes) for one in at_nodes.reshape(9, -1)]
         mean = np.divide(total, volume, out=np.zeros((9, self.num_nodes)), where=volume > 0)

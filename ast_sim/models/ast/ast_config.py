@@ -6,8 +6,11 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal, Self
 
-from ast_sim.models.model_config import NODE_INPUTS, DataFacts, ProximityConfig, count, setting
+from ast_sim.models.data_facts import DataFacts
+from ast_sim.models.model_config import NODE_INPUTS, ProximityConfig, count, setting
 from ast_sim.support.errors import ConfigError
+
+CELL_SPACINGS = 1.5  # an unset side of a cell, in mesh spacings
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,9 @@ class ASTConfig(ProximityConfig):
     dropout: float = setting(0.1, "dropout on attention weights and feed-forward outputs", 0, 0.99)
     mesh_steps: int = count(0, "additional message passing steps on the mesh, before the cells and again after them", 0)
     L_cell: int | None = setting(5, "octree level of the cells; unset: chosen by `cell_spacings`")
-    cell_spacings: float = setting(1.5, "approximate side of a cell, in mesh spacings, if L_cell is unset", 0.01, 1e6)
+    cell_spacings: float | None = setting(
+        None, "approximate side of a cell, in mesh spacings, if L_cell is unset; unset: 1.5", 0.01, 1e6
+    )
     places: Literal["absolute", "relative"] | None = setting(
         "absolute",
         "what attention knows: the position of each cell (absolute), or the offset between two (relative);"
@@ -59,6 +64,8 @@ class ASTConfig(ProximityConfig):
             raise ConfigError("model.exchanges needs model.places=relative: attention knows no other place of a node")
         if self.head_dim % 16 or not 16 <= self.head_dim <= 128:
             raise ConfigError(f"model.head_dim must be a multiple of 16 up to 128, not {self.head_dim}")
+        if self.L_cell is not None and self.cell_spacings is not None:
+            raise ConfigError("model.cell_spacings is of no use with model.L_cell: leave one of them unset (none)")
         if self.L_cell is not None and not 0 <= self.L_cell - self.l_ocnn <= self.L_cell <= 21:
             raise ConfigError(
                 f"model.L_cell = {self.L_cell} and l_ocnn = {self.l_ocnn} must satisfy 0 <= l_ocnn <= L_cell <= 21"
@@ -67,7 +74,7 @@ class ASTConfig(ProximityConfig):
     @property
     def cell_side(self) -> float:
         """See `ModelConfig`. The side is 2^(1-L) half widths (paper, section Sparse Convolution)."""
-        return self.domain_half_width * 2.0 ** (1 - self.L_cell)
+        return self.data.domain_half_width * 2.0 ** (1 - self.L_cell)
 
     def resolve(self, facts: DataFacts) -> Self:
         """See `ProximityConfig`. An unset L_cell follows from the mesh spacing. Dynamic scenes get no exchanges:
@@ -75,20 +82,22 @@ class ASTConfig(ProximityConfig):
         resolved = super().resolve(facts)
         depth, elements, places, exchanges = self.L_cell, self.element_inputs, self.places, self.exchanges
         if depth is None:
-            side = self.cell_spacings * facts.mesh_spacing
-            depth = min(max(round(1 + math.log2(resolved.domain_half_width / side)), self.l_ocnn + 1), 21)
+            side = (self.cell_spacings or CELL_SPACINGS) * facts.mesh_spacing
+            depth = min(max(round(1 + math.log2(resolved.data.domain_half_width / side)), self.l_ocnn + 1), 21)
         if elements is None:
             material = ("material",) if facts.material_width else ()
-            elements = ("displacement", *material) if resolved.stress == "element" else ()
+            elements = ("displacement", *material) if resolved.data.stress == "element" else ()
         if places is None:
-            places = "absolute" if resolved.dynamic else "relative"
+            places = "absolute" if resolved.data.dynamic else "relative"
         if exchanges is None:
-            exchanges = 2 if places == "relative" and not resolved.dynamic else 0
-        resolved = replace(resolved, L_cell=depth, element_inputs=elements, places=places, exchanges=exchanges)
+            exchanges = 2 if places == "relative" and not resolved.data.dynamic else 0
+        resolved = replace(
+            resolved, L_cell=depth, cell_spacings=None, element_inputs=elements, places=places, exchanges=exchanges
+        )
         resolved.check_available("element_inputs")
-        if "stress" in elements and resolved.stress != "element":
+        if "stress" in elements and resolved.data.stress != "element":
             raise ConfigError("model.element_inputs: stress needs a dataset with stress on elements")
-        if resolved.stress == "element" and not elements:
+        if resolved.data.stress == "element" and not elements:
             raise ConfigError("model.element_inputs: a stress on elements needs element nodes, such as displacement")
         return resolved
 

@@ -48,23 +48,24 @@ class Cells:
 
     def to_mesh(self) -> EdgeSet:
         """C2M: an edge from every cell to each of its nodes."""
-        o, nodes = self.finest, torch.arange(len(self.finest.node_cell) + 1)
+        o = self.finest
+        nodes = torch.arange(len(self.finest.node_cell) + 1)
         return EdgeSet(o.node_cell, nodes[:-1], nodes, len(o.keys))
 
 
 def doublings(config: ASTConfig, position: Tensor) -> int | None:
     """How often the domain must double around its centre to hold positions [N, 3]; None if L would pass 21."""
-    center = torch.tensor(config.domain_center, dtype=torch.float64)
+    center = torch.tensor(config.data.domain_center, dtype=torch.float64)
     reach = float((position.double() - center).abs().max()) if len(position) else 0.0
     for growth in range(22 - config.L_cell):
-        if reach <= config.domain_half_width * 2.0**growth:
+        if reach <= config.data.domain_half_width * 2.0**growth:
             return growth
     return None
 
 
 def places(config: ASTConfig, position: Tensor) -> Tensor:
     """[N, 3] float64: positions [N, 3] relative to the centre of the domain, in sides of the coarsest cells."""
-    center = torch.tensor(config.domain_center, dtype=torch.float64)
+    center = torch.tensor(config.data.domain_center, dtype=torch.float64)
     return (position.double() - center) / (config.cell_side * 2.0**config.l_ocnn)
 
 
@@ -82,11 +83,11 @@ def build_cells(config: ASTConfig, position: Tensor, offsets: Tensor, may_grow: 
     error = RolloutError if may_grow else DatasetError
     if growth is None:
         raise error(
-            f"a node is so far from the domain centre {config.domain_center} that the octree would pass level 21"
+            f"a node is so far from the domain centre {config.data.domain_center} that the octree would pass level 21"
         )
     try:
-        half_width, depth = config.domain_half_width * 2.0**growth, config.L_cell + growth
-        finest = octree(position, offsets, config.domain_center, half_width, depth)
+        half_width, depth = config.data.domain_half_width * 2.0**growth, config.L_cell + growth
+        finest = octree(position, offsets, config.data.domain_center, half_width, depth)
     except ValueError as problem:
         advice = "; give the dataset a domain_half_width that holds all frames with train.noise and train.shift"
         advice += " (a run that starts from another one keeps the domain of that one)"

@@ -63,8 +63,8 @@ class AST(Simulator):
             self.lower = Linear(c.d_token, width)
             self.up = nn.ModuleList(SparseConv(width, up=True) for _ in range(c.l_ocnn))
             self.c2m = self._message_passing("c2m")
-        self.decoder = MLP(2 * width, c.decoder_hidden, 4 if c.stress == "node" else 3, c.factorized)
-        if c.stress == "element":
+        self.decoder = MLP(2 * width, c.decoder_hidden, 4 if c.data.stress == "node" else 3, c.factorized)
+        if c.data.stress == "element":
             self.m2e = self._message_passing("m2e")
             self.element_decoder = MLP(width, c.decoder_hidden, 1, c.factorized)
 
@@ -97,7 +97,8 @@ class AST(Simulator):
     def forward(self, batch: Batch) -> Prediction:
         """Normalised outputs for the frame after `batch`."""
         nodes, on_edges, elements = self.inputs_of(batch)
-        edges, encoded = batch.graph.edges, self.node_encoder(nodes)
+        edges = batch.graph.edges
+        encoded = self.node_encoder(nodes)
         if elements is not None:
             elements = self.element_encoder(elements)
             mesh = self.e2m(edges, elements, encoded, on_edges)
@@ -118,7 +119,7 @@ class AST(Simulator):
         for step in self.after_cells:
             mesh = step(edges, mesh, mesh, on_edges)
 
-        on_elements = self.config.stress == "element" and batch.wants_stress
+        on_elements = self.config.data.stress == "element" and batch.wants_stress
         stress = self.element_decoder(self.m2e(batch.graph.m2e, mesh, elements)) if on_elements else None
         return Prediction.of_nodes(self.decoder(mesh, beside=encoded), stress)
 

@@ -18,9 +18,15 @@ from ast_sim.support.errors import SimulationError
 
 # A line of the .frd file: its length with the end of line, then the columns of the node and of its three displacements.
 # The line starts with " -1".
-FRD_ROW, FRD_NUMBER, FRD_VALUES, FRD_WIDTH = 50, slice(3, 13), 13, 12
+FRD_ROW = 50
+FRD_NUMBER = slice(3, 13)
+FRD_VALUES = 13
+FRD_WIDTH = 12
 # A line of the .dat file likewise: an element, its integration point (not read) and its six stresses.
-DAT_ROW, DAT_NUMBER, DAT_VALUES, DAT_WIDTH = 99, slice(0, 10), 14, 14
+DAT_ROW = 99
+DAT_NUMBER = slice(0, 10)
+DAT_VALUES = 14
+DAT_WIDTH = 14
 # CalculiX writes xx, yy, zz, xy, xz, yz. These columns of it are xx, yy, zz, xy, yz, zx.
 STRESS_ORDER = [0, 1, 2, 3, 5, 4]
 # Frame k is at time k. The files have few digits: within some hundred frames, times differ from k by at most this.
@@ -82,7 +88,8 @@ def read_increments(path: Path) -> tuple[list[int], list[int]]:
         words = line.replace("U", " U ").split()
         diverged = "U" in words
         try:
-            tried, time = int(words[3 + diverged]), float(words[5 + diverged])
+            tried = int(words[3 + diverged])
+            time = float(words[5 + diverged])
         except (IndexError, ValueError) as error:
             raise SimulationError(f"{path}: not a line of increments: {line.strip()!r}") from error
         spent, cut = spent + tried, cut + diverged
@@ -159,12 +166,12 @@ def _place(path: Path, number: np.ndarray, values: np.ndarray, count: int) -> np
 
 def _by_frame(path: Path, blocks: Iterable[tuple[float, np.ndarray]], count: int) -> list[np.ndarray]:
     """The first block at each of the times 1 to `count`."""
-    found: dict[int, np.ndarray] = {}
+    frames: dict[int, np.ndarray] = {}
     for time, values in blocks:
         frame = round(time)
         if abs(time - frame) <= TIME_TOLERANCE:
-            found.setdefault(frame, values)
-    missing = [frame for frame in range(1, count + 1) if frame not in found]
+            frames.setdefault(frame, values)
+    missing = [frame for frame in range(1, count + 1) if frame not in frames]
     if missing:
         raise SimulationError(f"{path} holds nothing for frame {missing[0]}, which converged")
-    return [found[frame] for frame in range(1, count + 1)]
+    return [frames[frame] for frame in range(1, count + 1)]

@@ -57,11 +57,11 @@ def find_ccx() -> str:
         MissingExtra: there is no such program.
     """
     wanted = os.environ.get("CCX_BIN")
-    found = shutil.which(wanted or "ccx")
-    if found is None:
+    program = shutil.which(wanted or "ccx")
+    if program is None:
         where = f"CCX_BIN={wanted} is no program" if wanted else "ccx is not in PATH and CCX_BIN is not set"
         raise MissingExtra(f"CalculiX is needed here but {where}: apt install calculix-ccx")
-    return os.path.abspath(found)  # ccx runs in another folder
+    return os.path.abspath(program)  # ccx runs in another folder
 
 
 def version(ccx: str) -> str:
@@ -74,10 +74,10 @@ def version(ccx: str) -> str:
         answer = subprocess.run([ccx, "-v"], capture_output=True, text=True, timeout=60, stdin=subprocess.DEVNULL)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise SimulationError(f"{ccx} does not run: {error}") from error
-    found = re.search(r"[Vv]ersion (\d[\w.]*)", answer.stdout)
-    if not found:
+    match = re.search(r"[Vv]ersion (\d[\w.]*)", answer.stdout)
+    if not match:
         raise SimulationError(f"{ccx} -v reports no version; is it CalculiX? {_last_line(answer.stdout)}")
-    return found[1]
+    return match[1]
 
 
 def quasi_static(case: SolidCase, settings: CalculixSettings | None = None) -> Trajectory:
@@ -271,8 +271,8 @@ def _read(path: Path) -> str:
 
 def _error(log: str) -> str:
     """The last message that ccx marks as an error, on one line; else its last words."""
-    found = re.findall(r"\*ERROR:? *(.*(?:\n(?! *\n| *\*).*)*)", log)
-    return " ".join(found[-1].split()).removesuffix(" " + BEST_GUESS) if found else _last_line(log)
+    errors = re.findall(r"\*ERROR:? *(.*(?:\n(?! *\n| *\*).*)*)", log)
+    return " ".join(errors[-1].split()).removesuffix(" " + BEST_GUESS) if errors else _last_line(log)
 
 
 def _last_line(text: str) -> str:

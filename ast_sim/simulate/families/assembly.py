@@ -20,6 +20,7 @@ from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.mechanics.unfinished import Checkpoint
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
+from ast_sim.simulate.own_assembly.linear_limits import Limit, limits
 from ast_sim.simulate.own_assembly.parameters import Values, completed, drawn, told
 from ast_sim.simulate.own_assembly.rest_check import BadAssembly, check
 from ast_sim.simulate.own_assembly.standing import PlacedPart, Reference, case, placed, reference
@@ -70,12 +71,12 @@ def draw_scene(spec: AssemblySpec, sample: tuple[int, int, int], nodes: int | No
     for attempt in range(DRAWS):
         values = drawn(spec.parameters, *sample, attempt)
         try:
-            found = scene_of(spec, values, nodes, frames, shared)
+            scene = scene_of(spec, values, nodes, frames, shared)
         except (BadMesh, MeshingFailed, BadAssembly) as error:
             first = first or error
             continue
-        case = replace(found.case, attributes={**found.case.attributes, "redrawn": attempt})
-        return replace(found, case=case)
+        case = replace(scene.case, attributes={**scene.case.attributes, "redrawn": attempt})
+        return replace(scene, case=case)
     raise SimulationError(f"none of {DRAWS} draws gave a scene; the first: {first}") from first
 
 
@@ -99,19 +100,34 @@ def scene_of(
     return Drawn(made, partial(_remeshed, spec, values, frames, shared, factor, made.scene.num_nodes))
 
 
+def resized(spec: AssemblySpec, values: Values, nodes: int | None, frames: int, relative: float) -> SolidCase:
+    """The scene with these values whose elements are `relative` times as long; errors as `scene_of`.
+
+    Elements of mesh files keep their size, unless `relative` is a half.
+    """
+    factor, _ = _sized(spec, values, nodes)
+    parts = placed(spec, values, factor * relative, halved=relative == 0.5)
+    return _checked(spec, values, frames, parts, reference(spec))
+
+
 def check_spec(spec: AssemblySpec, nodes: int | None, frames: int, keep: tuple[int, ...] | None = None) -> None:
     """Make, but do not solve, the scene in the middle of all ranges and those at the ends of each range.
 
-    A warning tells each of their notes.
+    Warnings tell each of their notes, and for each part the worst that linear elements get wrong in it.
 
     Raises:
         SimulationError, ConfigError: as `scene_of`.
     """
-    shared, notes = reference(spec), {}
+    shared = reference(spec)
+    notes = {}
+    worst: dict[tuple[str, str], Limit] = {}
     for values in ends_of_ranges(spec):
         case = scene_of(spec, values, nodes, frames, shared).case
         notes |= dict.fromkeys((case if keep is None else case.keeping(keep)).notes())
-    for note in notes:
+        for limit in limits(spec, case):
+            key = limit.part, limit.kind
+            worst[key] = max(limit, worst.get(key, limit), key=lambda one: one.badness)
+    for note in [*notes, *(limit.text for limit in worst.values())]:
         warnings.warn(note, stacklevel=2)
 
 
@@ -140,7 +156,8 @@ def in_newton(trajectory: Trajectory, unit: str) -> Trajectory:
 
 def _sized(spec: AssemblySpec, values: Values, nodes: int | None) -> tuple[float, list[PlacedPart]]:
     """The factor of all element sizes with which the scene has about that many nodes, and the parts."""
-    factor, parts = 1.0, placed(spec, values)
+    factor = 1.0
+    parts = placed(spec, values)
     best, power = (factor, parts), USUAL_POWER
     for _ in range(MESHES if nodes else 0):
         count = sum(len(part.position) for part in parts)

@@ -237,7 +237,8 @@ def _draw_touch(rng: np.random.Generator, plate: _Plate, obstacle: np.ndarray, p
     along, across = rng.uniform(-1, 1, 2)
     side = np.abs(plate.position[:, 1]).max()
     touch = np.array([(left + right) / 2 + 0.35 * along * (right - left), 0.7 * across * side])
-    sides, holes = np.concatenate(plate.shape.outline.pieces), plate.shape.outline.holes
+    sides = np.concatenate(plate.shape.outline.pieces)
+    holes = plate.shape.outline.holes
     solid = distance_to(sides, touch) < -0.2 * side
     return touch if solid and all(distance_to(hole, touch) >= plate.shape.spacing() / 2 for hole in holes) else None
 

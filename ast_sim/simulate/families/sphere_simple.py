@@ -46,7 +46,8 @@ def draw(rng: np.random.Generator, nodes: int = DEFAULT_NODES) -> ClothCase:
     spacing = _spacing(size, nodes - len(ball))
     corner = np.abs(flat) > size / 2 - 1.6 * spacing
     held = corner.all(axis=1) & (flat[:, 1] > 0)
-    tilt, side = np.radians(rng.uniform(15, 75)), rng.choice([-1.0, 1.0])
+    tilt = np.radians(rng.uniform(15, 75))
+    side = rng.choice([-1.0, 1.0])
     down = flat[:, 1] - size[1] / 2
     cloth = np.stack([flat[:, 0], -side * down * np.sin(tilt), size[1] / 2 + down * np.cos(tilt)], axis=1)
     radius = rng.uniform(0.1, 0.2)

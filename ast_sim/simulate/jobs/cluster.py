@@ -152,7 +152,8 @@ def sample_task(
         `sample`, the bytes of the sample's file; or `error` with `host` and perhaps `traceback`.
     """
     (distributed,) = require("cluster", "distributed")
-    host, made_of = platform.node(), Recipe(**recipe)
+    host = platform.node()
+    made_of = Recipe(**recipe)
     worker = distributed.get_worker()
     try:
         differs = difference(recorded(made_of), settings, "on the worker", "at the client")
@@ -204,7 +205,7 @@ def _is_wanted(worker: Any, key: str) -> bool:
 def _is_shared(parts: Path, settings: dict[str, Any]) -> bool:
     """Whether this machine sees the client's folder and may write to it."""
     try:
-        found = json.loads((parts / "settings.json").read_text())
+        seen = json.loads((parts / "settings.json").read_text())
     except (OSError, ValueError):
         return False
-    return found == settings and os.access(parts, os.W_OK)
+    return seen == settings and os.access(parts, os.W_OK)

@@ -44,7 +44,8 @@ class Progress:
 
     def __init__(self, total: int, done: int, unit: str, shown: bool) -> None:
         self.total, self.done, self.unit = total, done, unit
-        self._before, self._started = done, time.monotonic()
+        self._before = done
+        self._started = time.monotonic()
         self._last_line = self._started
         self._inside: dict[str, Inside] = {}
         self._lines = shown and not sys.stderr.isatty()

@@ -31,7 +31,7 @@ from ast_sim.simulate.families.names import family_module
 from ast_sim.simulate.jobs import cluster, pool
 from ast_sim.simulate.jobs.display import Progress
 from ast_sim.simulate.jobs.manifest import Manifest, Watch
-from ast_sim.simulate.jobs.recipe import check_parts, checked_recipe, difference, recorded, whole
+from ast_sim.simulate.jobs.recipe import check_parts, checked_recipe, difference, recorded
 from ast_sim.simulate.jobs.samples import (
     Recipe,
     Sample,
@@ -106,18 +106,18 @@ def generate(
             with other settings, another process uses the folder, or samples failed: the same call goes on from there.
         MissingExtra: a package that the family, the solver or the scheduler needs is not installed.
     """
-    module, numbers = family_module(family), whole(seed=seed, nodes=nodes, frames=frames)
+    module = family_module(family)
     self_test()
-    counts, workers = checked_counts(train, valid, test), checked_workers(workers, scheduler)
-    recipe = checked_recipe(module, family, *numbers, solver, parts, patient, keep, spec)
-    out, settings = Path(out), recorded(recipe)
-    output_file(out)
+    counts = checked_counts(train, valid, test)
+    workers = checked_workers(workers, scheduler)
+    recipe = checked_recipe(module, family, seed, nodes, frames, solver, parts, patient, keep, spec)
+    output_file(out := Path(out))
+    settings = recorded(recipe)
     folder = out.with_name(out.name + ".parts")
     if out.exists() and not _grows(out, settings, counts):
         return _existing(out, folder, settings, counts)
     samples = _samples(counts)
-    if not folder.exists():
-        _check_start(out, len(samples), recipe, module)
+    _check_start(out, folder, len(samples), recipe, module)
     with _locked(folder, settings):
         _unpack(out, folder)
         _make(samples, folder, recipe, workers, scheduler, progress, _notes(settings))
@@ -204,10 +204,14 @@ def checked_counts(train: int, valid: int | None, test: int | None) -> dict[str,
     return counts
 
 
-def _check_start(out: Path, scenes: int, recipe: Recipe, module: ModuleType) -> None:
-    """Refuse broken parts, and what cannot fit on the disk: positions and stress take four float32 a node and frame."""
+def _check_start(out: Path, made: Path, scenes: int, recipe: Recipe, module: ModuleType) -> None:
+    """Refuse broken parts, and what cannot fit on the disk: positions and stress take four float32 a node and frame.
+    Where the folder `made` is there, this was checked before."""
+    if made.exists():
+        return
     check_parts(recipe)
-    nodes, frames = recipe.nodes or 1, _frames(recipe, module)
+    nodes = recipe.nodes or 1
+    frames = _frames(recipe, module)
     folder = next(parent for parent in out.absolute().parents if parent.exists())
     least, free = 16 * scenes * nodes * frames, shutil.disk_usage(folder).free
     if least > free:

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from ast_sim.mechanics.case import SolidCase
-from ast_sim.scene import NodeType
+from ast_sim.scene import NodeType, Trajectory
 from ast_sim.simulate.families import assembly
+from ast_sim.simulate.jobs.mesh_error import MeshError, mesh_error
 from ast_sim.simulate.jobs.pool import Worker
 from ast_sim.simulate.jobs.recipe import checked_recipe
 from ast_sim.simulate.jobs.samples import Recipe, draw_sample, load_sample, sample_path
@@ -22,7 +23,7 @@ from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
 from ast_sim.simulate.own_assembly.parameters import told
 from ast_sim.simulate.own_assembly.rest_check import gap_between
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
-from ast_sim.support.errors import SimulationError
+from ast_sim.support.errors import AstSimError, SimulationError
 
 SCENES = 4
 
@@ -38,6 +39,8 @@ class Look:
         lines: what a person should check in the first scene.
         mesh_seconds, solve_seconds: processor time that one scene takes.
         status: whether the scene that was solved is complete, or why it is not.
+        mesh_error: of the largest force in that scene, on its mesh; None: it is not known.
+        mesh_line: the same as a sentence, or why it is not known.
     """
 
     unit: str
@@ -47,10 +50,12 @@ class Look:
     mesh_seconds: float
     solve_seconds: float
     status: str
+    mesh_error: MeshError | None
+    mesh_line: str
 
 
 def look(spec: str | os.PathLike[str], *, seed: int = 0, nodes: int | None = None, frames: int | None = None) -> Look:
-    """Draw the first scenes of a specification, and solve one of them to see what it takes.
+    """Draw the first scenes of a specification, and solve one of them, on two meshes, to see what it takes and gives.
 
     Args:
         spec: the specification of an assembly.
@@ -67,8 +72,16 @@ def look(spec: str | os.PathLike[str], *, seed: int = 0, nodes: int | None = Non
     cases = [draw_sample(recipe, "train", index).case for index in range(SCENES)]
     mesh_seconds = (time.perf_counter() - began) / SCENES
     titles = [told(read.parameters, _values(case)) for case in cases]
-    solve_seconds, status = _solved(recipe)
-    return Look(read.unit, cases, titles, list(_lines(read, cases[0])), mesh_seconds, solve_seconds, status)
+    solved, solve_seconds = _solved(recipe)
+    status = str(solved.attributes.get("stopped_by", "complete"))
+    error = None
+    try:
+        error = mesh_error(read, cases[0], solved, _values(cases[0]), recipe.nodes)
+        line = str(error)
+    except AstSimError as reason:
+        line = f"how far the force of this mesh is off is not known: {reason}"
+    lines = list(_lines(read, cases[0]))
+    return Look(read.unit, cases, titles, lines, mesh_seconds, solve_seconds, status, error, line)
 
 
 def _values(case: SolidCase) -> dict[str, float | str]:
@@ -92,8 +105,8 @@ def _lines(spec: AssemblySpec, case: SolidCase) -> Iterator[str]:
         yield f"{names}: {gap_between(case, pair):.4g} {unit} apart"
 
 
-def _solved(recipe: Recipe) -> tuple[float, str]:
-    """The processor time in which a worker solves the first scene, and how that ended."""
+def _solved(recipe: Recipe) -> tuple[Trajectory, float]:
+    """The first scene as a worker solves it, and the processor time that it takes."""
     with tempfile.TemporaryDirectory(prefix="ast_sim-") as folder:
         worker = Worker(Path(folder), recipe)
         try:
@@ -106,5 +119,5 @@ def _solved(recipe: Recipe) -> tuple[float, str]:
         if "error" in message:
             raise SimulationError(f"the first scene cannot be solved: {message['error']}")
         trajectory, seconds = load_sample(sample_path(Path(folder), "train", 0))
-    stopped = trajectory.attributes.get("stopped_by", "complete")
-    return float(np.sum(seconds["solve_seconds"])), str(stopped)
+    trajectory.attributes.update(solve_seconds=seconds["solve_seconds"])
+    return trajectory, float(np.sum(seconds["solve_seconds"]))

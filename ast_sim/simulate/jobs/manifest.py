@@ -65,18 +65,18 @@ class Manifest:
 
     def _last_states(self) -> dict[str, dict[str, Any]]:
         """The last line of each sample. Lines that cannot be read, such as one cut short by a crash, are left out."""
-        found: dict[str, dict[str, Any]] = {}
+        states: dict[str, dict[str, Any]] = {}
         try:
             lines = (self.folder / NAME).read_text(encoding="utf-8", errors="replace").splitlines()
         except OSError:
-            return found
+            return states
         for line in lines:
             try:
                 values = json.loads(line)
-                found[str(values["sample"])] = values
+                states[str(values["sample"])] = values
             except (ValueError, TypeError, KeyError):
                 continue
-        return found
+        return states
 
 
 def _line(sample: Sample, values: dict[str, Any]) -> str:

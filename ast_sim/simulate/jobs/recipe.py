@@ -46,6 +46,7 @@ def checked_recipe(
     Raises:
         SimulationError: a value is invalid, or the family does not have an option.
     """
+    seed, nodes, frames = whole(seed=seed, nodes=nodes, frames=frames)
     for name, value in (("frames", frames), ("keep", keep), ("solver", solver), ("parts", parts), ("spec", spec)):
         if value is not None and name not in FAMILIES[family].options:
             having = ", ".join(key for key, known in FAMILIES.items() if name in known.options)
@@ -103,7 +104,10 @@ def recipe_of(name: str, info: DatasetInfo, made_from: str | os.PathLike[str] | 
         raise SimulationError(f"{name} was made of {own[key]}: say where to find that (--made-from)")
     parts, spec = (None if made_from is None or key != which else Path(made_from) for which in own)
     try:
-        seed, nodes, frames, keep = made["seed"], made.get("nodes"), made.get("frames"), made.get("keep")
+        seed = made["seed"]
+        nodes = made.get("nodes")
+        frames = made.get("frames")
+        keep = made.get("keep")
         recipe = checked_recipe(family_module(family), family, seed, nodes, frames, None, parts, False, keep, spec)
     except (KeyError, TypeError) as error:
         raise SimulationError(f"{name}: its settings cannot be read ({error!r})") from error
@@ -161,10 +165,10 @@ def recorded(recipe: Recipe) -> dict[str, Any]:
     }
 
 
-def difference(found: dict[str, Any], wanted: dict[str, Any], there: str = "there", here: str = "here") -> str:
+def difference(stored: dict[str, Any], wanted: dict[str, Any], there: str = "there", here: str = "here") -> str:
     """The first setting that differs, in words; empty if all agree."""
     for key, value in wanted.items():
-        other = found.get(key)
+        other = stored.get(key)
         if isinstance(value, dict) and isinstance(other, dict):
             inner = difference(other, value, there, here) or next((f"{k} {there}" for k in other.keys() - value), "")
             if inner:

@@ -220,10 +220,10 @@ def _all(tasks: list[dict[str, Any]], progress: bool) -> Iterator[Rivals]:
         for task in tasks:
             name = sample_name(task["split"], task["index"])
             bar.begin(name)
-            found = _one(task, name, bar)
+            rivals = _one(task, name, bar)
             bar.end(name)
             bar.advance()
-            yield found
+            yield rivals
 
 
 def _one(task: dict[str, Any], name: str, bar: Progress) -> Rivals:

@@ -38,7 +38,8 @@ SAME_PLACE = 1e-6  # largest distance of a node from its place in the dataset, r
 
 def main() -> None:
     """Answer one task."""
-    folder, parent = Path(sys.argv[1]), int(sys.argv[2])
+    folder = Path(sys.argv[1])
+    parent = int(sys.argv[2])
     answer = answers_for(parent)
     try:
         facts, positions = outcomes_of(json.loads(sys.stdin.readline()))
@@ -63,14 +64,14 @@ def outcomes_of(task: dict[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndar
     draw_seconds = _seconds() - started
     _require_same(drawn.case.scene, scene)
     solver = WaySolver(drawn, frame, truth, family_module(recipe.family).SETTINGS, task)
-    found = [solver.outcome(Way(**way)) for way in task["ways"]]
+    outcomes = [solver.outcome(Way(**way)) for way in task["ways"]]
     facts = {
         "displacement": solver.displacement,
         "draw_seconds": draw_seconds,
         "processor": processor(),
-        "outcomes": [asdict(replace(outcome, position=None)) for outcome in found],
+        "outcomes": [asdict(replace(outcome, position=None)) for outcome in outcomes],
     }
-    return facts, {str(i): outcome.position for i, outcome in enumerate(found) if outcome.position is not None}
+    return facts, {str(i): outcome.position for i, outcome in enumerate(outcomes) if outcome.position is not None}
 
 
 def _seconds() -> float:
@@ -124,24 +125,25 @@ class WaySolver:
         case = replace(case, contact=replace(case.contact, dhat=way.dhat * case.contact.dhat))
         settings = replace(self.settings, force_tolerance=way.tolerance * self.settings.force_tolerance)
         if way.linearised:
-            start, found = way.linearised, self._linearised(case, way.linearised)
+            start = way.linearised
+            solved = self._linearised(case, way.linearised)
         else:
-            start, found = self._fastest(case, settings)
+            start, solved = self._fastest(case, settings)
         position, error = None, np.inf
-        if found.position is not None:
-            position = found.position if way.nodes == 1 else self._on_own_mesh(case, found.position)
+        if solved.position is not None:
+            position = solved.position if way.nodes == 1 else self._on_own_mesh(case, solved.position)
             error = _root_mean_square((position - self.truth)[self.free])
         return Outcome(
             way,
-            found.failure,
+            solved.failure,
             case.scene.num_nodes,
             start,
-            found.seconds,
-            found.setup_seconds,
+            solved.seconds,
+            solved.setup_seconds,
             mesh_seconds,
-            found.load_steps,
-            found.newton_iterations,
-            found.halvings,
+            solved.load_steps,
+            solved.newton_iterations,
+            solved.halvings,
             position,
             error,
             error / max(self.displacement, np.finfo(float).tiny),
@@ -151,10 +153,10 @@ class WaySolver:
         """The scene with that share of the nodes, or why there is none; and the processor time of all tries."""
         started = _seconds()
         try:
-            found: SolidCase | str = self.drawn.remesh_nearly(share)
+            coarser: SolidCase | str = self.drawn.remesh_nearly(share)
         except SimulationError as error:
-            found = str(error)
-        return found, _seconds() - started
+            coarser = str(error)
+        return coarser, _seconds() - started
 
     def _fastest(self, case: SolidCase, settings: SolverSettings) -> tuple[int, OneFrame]:
         """The start with the fastest solution, and the solution; without any, the start that failed fastest."""
@@ -164,17 +166,18 @@ class WaySolver:
                 # Whoever takes longer than the best so far cannot be the fastest.
                 most = best[1].seconds if best is not None and not best[1].failure else np.inf
                 first = 1 / start if start else 0.0
-                found = solve_frame(
+                solved = solve_frame(
                     case, self.frame, settings, first, self.effort["most_iterations"], most_seconds=most
                 )
-                if best is None or (bool(found.failure), found.seconds) < (bool(best[1].failure), best[1].seconds):
-                    best = start, found
+                if best is None or (bool(solved.failure), solved.seconds) < (bool(best[1].failure), best[1].seconds):
+                    best = start, solved
         assert best is not None
         return best
 
     def _linearised(self, case: SolidCase, steps: int) -> OneFrame:
         """So many load steps of one Newton step with linearised contact, and one Newton step more."""
-        held, began = case.scene.prescribed[:, None], process_time()
+        held = case.scene.prescribed[:, None]
+        began = process_time()
         position = before = case.targets[0]
         contact, failure = case.contact, ""
         try:
@@ -183,11 +186,14 @@ class WaySolver:
             newton = NewtonSteps(case.scene, case.material, CLEARANCE * contact.dhat, friction)
             setup = process_time() - began
             for share in np.linspace(0, 1, steps + 1)[1:]:
-                target, before = case.on_the_way(self.frame, share), position
+                target = case.on_the_way(self.frame, share)
+                before = position
                 position = newton.step(np.where(held, target, before), stuck=before)
             position = newton.step(position, stuck=before)
         except SimulationError as error:
-            position, failure, setup = None, str(error), 0.0
+            position = None
+            failure = str(error)
+            setup = 0.0
         return OneFrame(position, failure, process_time() - began - setup, setup, steps, steps + 1, 0)
 
     def _on_own_mesh(self, case: SolidCase, position: np.ndarray) -> np.ndarray:

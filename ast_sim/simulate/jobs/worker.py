@@ -37,7 +37,10 @@ Answer = Callable[[dict[str, Any]], None]
 
 def main() -> None:
     """Serve until the standard input ends, or the parent process is gone."""
-    folder, checkpoints, recipe, parent = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], int(sys.argv[4])
+    folder = Path(sys.argv[1])
+    checkpoints = Path(sys.argv[2])
+    recipe = sys.argv[3]
+    parent = int(sys.argv[4])
     answer = answers_for(parent)
     for line in sys.stdin:
         split, index = line.split()

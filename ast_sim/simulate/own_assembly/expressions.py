@@ -48,8 +48,8 @@ class Expression:
     @property
     def names(self) -> set[str]:
         """The parameters that it depends on."""
-        found = {node.id for node in ast.walk(self._tree) if isinstance(node, ast.Name)}
-        return found - FUNCTIONS.keys()
+        used = {node.id for node in ast.walk(self._tree) if isinstance(node, ast.Name)}
+        return used - FUNCTIONS.keys()
 
     def __call__(self, values: Mapping[str, Any]) -> float:
         """Its value for these values of the parameters.
@@ -94,11 +94,11 @@ def expression(key: str, value: Any, known: Iterable[str]) -> Expression:
     except (SyntaxError, ValueError, RecursionError) as error:
         reason = error.msg if isinstance(error, SyntaxError) else error
         raise ConfigError(f"{key} = {value!r} is no arithmetic of numbers and parameters: {reason}") from error
-    found = Expression(key, value.strip())
+    parsed = Expression(key, value.strip())
     known = list(known)
-    for name in sorted(found.names - set(known)):
+    for name in sorted(parsed.names - set(known)):
         raise ConfigError(f"{key} = {value!r}: there is no parameter {name!r}{nearest(name, known)}")
-    return _finite(found) if not found.names else found
+    return _finite(parsed) if not parsed.names else parsed
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
@@ -110,9 +110,9 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f"; there are: {', '.join(known)}" if known else "; there are none"
 
 
-def _finite(found: Expression) -> Expression:
-    found({})
-    return found
+def _finite(parsed: Expression) -> Expression:
+    parsed({})
+    return parsed
 
 
 def _check(node: ast.expr) -> None:

@@ -25,12 +25,12 @@ def parse_settings(texts: Sequence[str]) -> dict[str, list[Any]]:
     Raises:
         ConfigError: a text has another form, or gives a parameter once more.
     """
-    found: dict[str, list[Any]] = {}
+    settings: dict[str, list[Any]] = {}
     for name, values in map(parse_setting, texts):
-        if name in found:
+        if name in settings:
             raise ConfigError(f"{name} is given twice: write all its values behind one {name}=")
-        found[name] = values
-    return found
+        settings[name] = values
+    return settings
 
 
 def parse_setting(text: str) -> tuple[str, list[Any]]:
@@ -39,14 +39,16 @@ def parse_setting(text: str) -> tuple[str, list[Any]]:
     Raises:
         ConfigError: the text has another form (the error gives examples), or there are too many values.
     """
-    name, found, values = (part.strip() for part in text.partition("="))
+    name, equals, values = (part.strip() for part in text.partition("="))
     ends = values.split(":")
     try:
-        if not (found and name and values):
+        if not (equals and name and values):
             raise ValueError(text)
         if len(ends) != 3:
             return name, [_number_or_text(value.strip()) for value in values.split(",")]
-        first, last, count = float(ends[0]), float(ends[1]), int(ends[2])
+        first = float(ends[0])
+        last = float(ends[1])
+        count = int(ends[2])
         if count < 1:
             raise ValueError(text)
     except ValueError as error:

@@ -94,7 +94,8 @@ def parameter(name: str, value: Any, known: Mapping[str, Parameter] | None = Non
         unknown = next((key for key in value if key not in ("low", "high", "log")), None)
         if unknown is not None:
             raise ConfigError(f"there is no key {name}.{unknown}{nearest(unknown, ('low', 'high', 'log'))}")
-        log, value = value.get("log", False), [value.get("low"), value.get("high")]
+        log = value.get("log", False)
+        value = [value.get("low"), value.get("high")]
     ends = value if isinstance(value, list) else [value, value]
     if len(ends) != 2 or not all(isinstance(end, int | float) and not isinstance(end, bool) for end in ends):
         also = ", or an expression" if known is not None else ""

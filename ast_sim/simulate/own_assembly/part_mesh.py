@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ast_sim.dataset.layout import LENGTH_UNITS
-from ast_sim.element_topology import MIDDLES
+from ast_sim.element_topology import MIDDLES, linear_elements
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.importers.places import Place, marked
 from ast_sim.simulate.own_assembly.assembly_spec import (
@@ -87,18 +87,19 @@ class PartMesh:
         return known[name]
 
 
-def part_meshes(spec: AssemblySpec, values: Values, factor: float = 1.0) -> list[PartMesh]:
+def part_meshes(spec: AssemblySpec, values: Values, factor: float = 1.0, halved: bool = False) -> list[PartMesh]:
     """The meshes of all parts for these values of the parameters.
 
     Args:
         factor: all element sizes are multiplied by this.
+        halved: the elements of mesh files, but for rigid parts, are cut into eight each.
 
     Raises:
         BadMesh, MeshingFailed: a part cannot be meshed, or its mesh cannot be used; the text names it.
         DatasetError, ConfigError: a mesh file cannot be read, or a size is not above 0.
         MissingExtra: a part needs gmsh, which is not installed.
     """
-    requests = [_request(spec, part, values, factor) for part in spec.parts]
+    requests = [_request(spec, part, values, factor, halved) for part in spec.parts]
     keys = [json.dumps(request, sort_keys=True) for request in requests]
     new = {key: place for place, key in enumerate(keys) if key not in _kept}
     cad = [place for place in new.values() if "size" in requests[place]]
@@ -111,17 +112,18 @@ def part_meshes(spec: AssemblySpec, values: Values, factor: float = 1.0) -> list
             check_surface(surface.position, surface.triangles, requests[place]["name"])
     sent = [{key: v for key, v in requests[place].items() if key not in ("scale", "stamp")} for place in cad]
     meshed = dict(zip(cad, mesh_own_scale(sent) if sent else [], strict=True))
-    found = {key: _kept[key] for key in keys if key in _kept}
+    kept = {key: _kept[key] for key in keys if key in _kept}
     for key, place in new.items():
-        arrays, part = meshed.get(place), spec.parts[place]
-        found[key] = _from_file(part, requests[place]) if arrays is None else _meshed(part, requests[place], arrays)
-    _kept.update(found)
+        arrays = meshed.get(place)
+        part = spec.parts[place]
+        kept[key] = _from_file(part, requests[place]) if arrays is None else _meshed(part, requests[place], arrays)
+    _kept.update(kept)
     while len(_kept) > MESHES_KEPT:
         del _kept[next(iter(_kept))]
-    return [found[key] for key in keys]
+    return [kept[key] for key in keys]
 
 
-def _request(spec: AssemblySpec, part: PartSpec, values: Values, factor: float) -> dict[str, Any]:
+def _request(spec: AssemblySpec, part: PartSpec, values: Values, factor: float, halved: bool) -> dict[str, Any]:
     """All that the mesh of a part depends on; with "size", it is a request to gmsh."""
     file = str(values[f"{part.name}.file"]) if len(part.files) > 1 else part.files[0]
     path = spec.file(file)
@@ -138,7 +140,7 @@ def _request(spec: AssemblySpec, part: PartSpec, values: Values, factor: float) 
     if part.solid is not None:
         request["solid"] = part.solid
     if part.size is None:
-        return request
+        return request | {"halved": halved and not part.rigid}
     size = factor * part.size(values) / scale
     finer = []
     for one in part.finer:
@@ -188,7 +190,8 @@ def _from_file(part: PartSpec, request: dict[str, Any]) -> PartMesh:
         return _surface_mesh(part, request, _stl(request))
     mesh = read_mesh(Path(request["stamp"][0]))
     used, elements = np.unique(mesh.elements, return_inverse=True)
-    elements, position = elements.reshape(-1, mesh.elements.shape[1]), request["scale"] * mesh.points[used]
+    elements = elements.reshape(-1, mesh.elements.shape[1])
+    position = request["scale"] * mesh.points[used]
     fields = {
         n: np.asarray(v)[used] for n, v in mesh.fields["point"].items() if np.ndim(v) == 1 and v.dtype.kind in "iufb"
     }
@@ -198,7 +201,16 @@ def _from_file(part: PartSpec, request: dict[str, Any]) -> PartMesh:
             raise BadMesh(f"{request['name']}: a corner is not finite")
         return _surface_mesh(part, request, whole_surface(mesh.points[used][elements]))
     mesh = PartMesh(request["name"], position, elements, groups, fields)
-    return _checked(_raised(mesh) if request["order"] == 2 and elements.shape[1] == 4 else mesh, part.rigid)
+    mesh = _raised(mesh) if request["order"] == 2 and elements.shape[1] == 4 else mesh
+    return _checked(_halved(mesh) if request["halved"] else mesh, part.rigid)
+
+
+def _halved(mesh: PartMesh) -> PartMesh:
+    """The same body in elements half as long: each is cut into eight."""
+    second = mesh.cells.shape[1] == 10
+    raised = mesh if second else _raised(mesh)
+    cut = replace(raised, cells=linear_elements(raised.cells))
+    return _raised(cut) if second else cut
 
 
 def _raised(mesh: PartMesh) -> PartMesh:

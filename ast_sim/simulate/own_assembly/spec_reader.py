@@ -179,12 +179,12 @@ def _solid(table: Table) -> str | int | None:
 
 
 def _add_material(parameters: dict[str, Parameter], name: str, given: Any, free: dict[str, Parameter]) -> None:
-    found = parameter(name, given, free)
+    made = parameter(name, given, free)
     limit = 0.5 if name.endswith("poisson") else float("inf")
-    if found.formula is None and not (found.low >= 0 and found.high < limit and (limit == 0.5 or found.low > 0)):
+    if made.formula is None and not (made.low >= 0 and made.high < limit and (limit == 0.5 or made.low > 0)):
         wanted = "at least 0 and below 0.5" if limit == 0.5 else "above 0 (pascal)"
-        raise ConfigError(f"{name} is {found.low:g} to {found.high:g}; must be {wanted}")
-    parameters[name] = found
+        raise ConfigError(f"{name} is {made.low:g} to {made.high:g}; must be {wanted}")
+    parameters[name] = made
 
 
 def _moves(table: Table, rigid: bool) -> tuple[Move, ...]:
@@ -216,7 +216,8 @@ def _move(table: Table, rigid: bool) -> Move:
 
 def _rigid_motion(table: Table, places: tuple[Place, ...], path: tuple[Vector, ...] | None) -> Move:
     axis, point = table.vector("axis", [0, 0, 1]), table.vector("point", [0, 0, 0])
-    rotation, still = table.number("rotation", 0), Table({"still": [0, 0, 0]}, table.place).path("still")
+    rotation = table.number("rotation", 0)
+    still = Table({"still": [0, 0, 0]}, table.place).path("still")
     table.done()
     assert axis is not None and point is not None and rotation is not None and still is not None
     return Move(table.place, places, path or still, rotation, axis, point)

@@ -26,7 +26,9 @@ class Table:
     def __init__(self, values: Any, place: str, known: Iterable[str] = ()) -> None:
         if not isinstance(values, dict):
             raise ConfigError(f"{place} is {values!r}; must be a table")
-        self.values, self.place, self.known = values, place, list(known)
+        self.values = values
+        self.place = place
+        self.known = list(known)
         self._read: list[str] = []
 
     def key(self, name: str) -> str:

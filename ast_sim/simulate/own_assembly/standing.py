@@ -69,7 +69,8 @@ def reference(spec: AssemblySpec) -> Reference:
     values = completed(spec.parameters, {})
     points = np.concatenate([part.position for part in placed(spec, values)])
     low, high = points.min(axis=0), points.max(axis=0)
-    centre, diagonal = (low + high) / 2, float(np.linalg.norm(high - low))
+    centre = (low + high) / 2
+    diagonal = float(np.linalg.norm(high - low))
     origin = np.zeros(3)
     if np.abs(centre).max() > NEAR_ORIGIN * diagonal:
         step = 10.0 ** math.floor(math.log10(diagonal))
@@ -82,16 +83,16 @@ def reference(spec: AssemblySpec) -> Reference:
     return Reference((x, y, z), distance, float(f"{np.exp(np.mean(np.log(young))):.3g}"))
 
 
-def placed(spec: AssemblySpec, values: Values, factor: float = 1.0) -> list[PlacedPart]:
+def placed(spec: AssemblySpec, values: Values, factor: float = 1.0, halved: bool = False) -> list[PlacedPart]:
     """All parts as they stand, with what holds and moves them.
 
     Args:
-        factor: all element sizes are multiplied by this.
+        factor, halved: as for `part_meshes`.
 
     Raises:
         ConfigError: a region holds no node, or nodes are both fixed and moved; or as in `part_meshes`.
     """
-    meshes = part_meshes(spec, values, factor)
+    meshes = part_meshes(spec, values, factor, halved)
     return [_placed(part, mesh, values) for part, mesh in zip(spec.parts, meshes, strict=True)]
 
 
@@ -155,7 +156,8 @@ def _set_back(spec: AssemblySpec, parts: list[PlacedPart], shared: Reference) ->
 
 def _course(scene: Scene, parts: list[PlacedPart], values: Values, frames: int, origin: np.ndarray) -> Course:
     """How the prescribed nodes move; free nodes stay at rest."""
-    rest, moved = scene.rest_position.astype(np.float64), []
+    rest = scene.rest_position.astype(np.float64)
+    moved = []
     for number, part in enumerate(parts):
         of_body = np.flatnonzero(scene.body == number)
         for move, one in enumerate(part.part.moves):

@@ -44,11 +44,11 @@ class Surfaces:
     @cached_property
     def at_node(self) -> dict[int, set[int]]:
         """The triangles at each node of a surface."""
-        found: dict[int, set[int]] = {}
+        rows: dict[int, set[int]] = {}
         for row, corners in enumerate(self.faces.tolist()):
             for node in corners:
-                found.setdefault(node, set()).add(row)
-        return found
+                rows.setdefault(node, set()).add(row)
+        return rows
 
     @cached_property
     def arcs(self) -> np.ndarray:
@@ -57,7 +57,8 @@ class Surfaces:
         twice_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
         edges = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         length = np.linalg.norm(self.position[edges[:, 0]] - self.position[edges[:, 1]], axis=1)
-        width, owner = np.repeat(twice_area, 3) / length, np.repeat(np.arange(len(self.faces)), 3)
+        width = np.repeat(twice_area, 3) / length
+        owner = np.repeat(np.arange(len(self.faces)), 3)
         order = np.lexsort(edges.T)
         same = (edges[order[1:]] == edges[order[:-1]]).all(axis=1)
         one, other = order[:-1][same], order[1:][same]

@@ -44,7 +44,8 @@ def set_back(
     start = np.concatenate([position for position, _ in bodies])
     faces = np.concatenate([boundary(cells) + first for (_, cells), first in zip(bodies, offset, strict=False)])
     surfaces = Surfaces(start, faces, np.repeat(np.arange(len(bodies)), np.diff(offset)), rigid)
-    depth, moved = _overlaps(surfaces, distance), dict[Pair, set[int]]()
+    depth = _overlaps(surfaces, distance)
+    moved = dict[Pair, set[int]]()
     for _ in range(ROUNDS):
         near = places_nearer(surfaces, distance, MARGIN * distance, depth)
         if not near:
@@ -57,7 +58,8 @@ def set_back(
     for (before, cells), position in zip(bodies, after, strict=True):
         if _turned(cells, before, position):
             return [position for position, _ in bodies], []
-    notes, way = [], np.linalg.norm(surfaces.position - start, axis=1)
+    notes = []
+    way = np.linalg.norm(surfaces.position - start, axis=1)
     for pair, nodes in moved.items():
         over = f", where facets overlap by up to {depth[pair]:.2g} {unit}" if depth[pair] > distance else ""
         notes.append(

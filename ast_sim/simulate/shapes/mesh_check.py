@@ -41,7 +41,8 @@ def check_mesh(position: np.ndarray, elements: np.ndarray, name: str, smallest_a
         raise BadMesh(f"{name}: it has {len(position):,} nodes, more than the {MOST_NODES:,} of the largest part")
     _check_points(position, name, "nodes")
     diagonal = _diagonal(position)
-    volume, centre = volumes(position, elements), position[elements].mean(axis=1)
+    volume = volumes(position, elements)
+    centre = position[elements].mean(axis=1)
     flat = np.abs(volume) <= 1e-12 * diagonal**3
     if flat.any():
         first = int(np.argmax(flat))

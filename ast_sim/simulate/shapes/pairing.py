@@ -138,10 +138,13 @@ def turned(rng: np.random.Generator, position: np.ndarray) -> np.ndarray:
     """
     extent = np.ptp(position, axis=0)
     upright = [axis for axis in range(3) if extent[axis] <= SLENDEREST * np.delete(extent, axis).min()]
-    axis, sign, yaw = int(rng.choice(upright)), int(rng.choice([-1, 1])), rng.uniform(0, 2 * np.pi)
+    axis = int(rng.choice(upright))
+    sign = int(rng.choice([-1, 1]))
+    yaw = rng.uniform(0, 2 * np.pi)
     result = sign * np.roll(position, 2 - axis, axis=1)  # a cyclic change of axes is a rotation
     result[:, 0] *= sign  # and so is reversing two axes
-    c, s = np.cos(yaw), np.sin(yaw)
+    c = np.cos(yaw)
+    s = np.sin(yaw)
     result[:, :2] = result[:, :2] @ np.array([[c, s], [-s, c]])
     result[:, :2] -= (result[:, :2].max(axis=0) + result[:, :2].min(axis=0)) / 2
     result[:, 2] -= result[:, 2].min()
@@ -192,15 +195,15 @@ def shadow_cells(points: np.ndarray, faces: np.ndarray, cell: float) -> np.ndarr
     corners = points[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     level = np.ceil(np.log2(np.maximum(2 * longest / cell, 1))).astype(int)
-    found = []
+    cells = []
     for power in np.unique(level):
         parts = 2**power
         i, j = np.array([(i, j) for i in range(parts + 1) for j in range(parts + 1 - i)]).T / parts
         weights = np.stack([1 - i - j, i, j])
         samples = np.einsum("ks,fkd->fsd", weights, corners[level == power]).reshape(-1, 2)
         index = np.floor(samples / cell).astype(np.int64)
-        found.append(np.unique(index[:, 0] * 2**20 + index[:, 1]))
-    return np.unique(np.concatenate(found))
+        cells.append(np.unique(index[:, 0] * 2**20 + index[:, 1]))
+    return np.unique(np.concatenate(cells))
 
 
 def _lowered(position: np.ndarray, faces: np.ndarray, body: np.ndarray) -> np.ndarray:

@@ -213,12 +213,13 @@ def read_mesh(path: Path) -> Part:
     mesh = _read(path)
     blocks = [block.data[:, :4] for block in mesh.cells if block.type in ("tetra", "tetra10")]
     if not blocks or sum(map(len, blocks)) == 0:
-        found = ", ".join(sorted({block.type for block in mesh.cells})) or "nothing"
-        raise BadMesh(f"{path.name}: it holds no tetrahedra, but {found}")
+        kinds = ", ".join(sorted({block.type for block in mesh.cells})) or "nothing"
+        raise BadMesh(f"{path.name}: it holds no tetrahedra, but {kinds}")
     used, elements = np.unique(np.concatenate(blocks), return_inverse=True)
     if used[0] < 0 or used[-1] >= len(mesh.points):
         raise BadMesh(f"{path.name}: a tetrahedron refers to a node that is not there (there are {len(mesh.points)})")
-    position, elements = np.asarray(mesh.points, float)[used], elements.reshape(-1, 4)
+    position = np.asarray(mesh.points, float)[used]
+    elements = elements.reshape(-1, 4)
     if position.shape[1] != 3:
         raise BadMesh(f"{path.name}: its nodes have {position.shape[1]} coordinates, not 3")
     if (volumes(position, elements) < 0).all():

@@ -53,7 +53,8 @@ def oriented(position: np.ndarray, elements: np.ndarray) -> np.ndarray:
 def smallest_dihedral(position: np.ndarray, elements: np.ndarray) -> np.ndarray:
     """Smallest angle [E] between two faces of each tetrahedron, in degrees; 0 if a face has no area."""
     corners = position[elements]
-    normals, flat = [], np.zeros(len(elements), bool)
+    normals = []
+    flat = np.zeros(len(elements), bool)
     for face in LOCAL_FACES:
         a, b, c = (corners[:, i] for i in face)
         normal = np.cross(b - a, c - a)
@@ -216,7 +217,9 @@ def _holed_rectangle(length: float, width: float, radius: float, spacing: float)
 
 def _cut_quads(i: np.ndarray, j: np.ndarray, columns: int, rising: np.ndarray, closed: bool = False) -> np.ndarray:
     """Triangles [m,3] of the cells at rows i and columns j of a grid of nodes. A rising diagonal starts at (i, j)."""
-    i, j, rising = i.ravel(), j.ravel(), rising.ravel()[:, None, None]
+    i = i.ravel()
+    j = j.ravel()
+    rising = rising.ravel()[:, None, None]
     following = (j + 1) % columns if closed else j + 1
     a, b = i * columns + j, (i + 1) * columns + j
     d, c = i * columns + following, (i + 1) * columns + following

@@ -143,8 +143,8 @@ def _smoothed(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 def _has_rim(triangles: np.ndarray, edges: np.ndarray) -> bool:
     """Whether the given edges are exactly those that belong to only one triangle."""
     sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    found, count = np.unique(sides, axis=0, return_counts=True)
-    return np.array_equal(found[count == 1], np.unique(np.sort(edges, axis=1), axis=0))
+    outline, count = np.unique(sides, axis=0, return_counts=True)
+    return np.array_equal(outline[count == 1], np.unique(np.sort(edges, axis=1), axis=0))
 
 
 def smallest_angle(mesh: PlaneMesh) -> float:

@@ -107,7 +107,8 @@ def _draw_hole(rng: np.random.Generator, length: float, width: float) -> tuple[s
         circle[:, 0] += np.where(np.cos(angle) > 0, 1, -1) * (1 - ratio) * radius
         circle[-1] = circle[0]
     turn = rng.uniform(0, np.pi)
-    cosine, sine = np.cos(turn), np.sin(turn)
+    cosine = np.cos(turn)
+    sine = np.sin(turn)
     centre = rng.uniform(-1, 1, 2) * (0.42 * length, 0.42 * width)
     return kind, circle @ np.array([[cosine, sine], [-sine, cosine]]) + centre
 

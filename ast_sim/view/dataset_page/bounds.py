@@ -103,11 +103,11 @@ def verdicts(samples: Sequence[Sample], length_unit: str) -> list[dict[str, Any]
 
 
 def _verdict(samples: Sequence[Sample], bound: Bound) -> dict[str, Any]:
-    found = {s.name: value for s in samples if (value := bound.figure(s)) is not None}
-    failed = [name for name, value in found.items() if not bound.holds(value)]
+    figures = {s.name: value for s in samples if (value := bound.figure(s)) is not None}
+    failed = [name for name, value in figures.items() if not bound.holds(value)]
     # NaN is worse than any other figure. An infinite gap means that there is nothing to touch: it is not shown.
-    wrong = [name for name, value in found.items() if math.isnan(value)]
-    numbers = {name: value for name, value in found.items() if math.isfinite(value)}
+    wrong = [name for name, value in figures.items() if math.isnan(value)]
+    numbers = {name: value for name, value in figures.items() if math.isfinite(value)}
     worst = bound.worst(list(numbers.values())) if numbers else None
     named = wrong or [name for name, value in numbers.items() if value == worst]
     return {
@@ -117,7 +117,7 @@ def _verdict(samples: Sequence[Sample], bound: Bound) -> dict[str, Any]:
         "range": [min(numbers.values()), max(numbers.values())] if numbers else None,
         "unit": bound.unit,
         "worst": named[0] if named else None,
-        "recorded": len(found),
+        "recorded": len(figures),
         "failed": len(failed),
-        "passed": not failed if found else None,
+        "passed": not failed if figures else None,
     }

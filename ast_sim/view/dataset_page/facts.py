@@ -74,14 +74,16 @@ def _spread(samples: Sequence[Sample], key: str, unit: str) -> str:
     numbers = [number for sample in samples for number in sample.numbers(key)]
     if not numbers:
         return ""
-    low, high = min(numbers), max(numbers)
+    low = min(numbers)
+    high = max(numbers)
     return f"{low:,.9g}{'' if low == high else f' to {high:,.9g}'} {unit}".strip()
 
 
 def _sizes(samples: Sequence[Sample]) -> str:
     def span(name: str) -> str:
         values = [getattr(sample, name) for sample in samples]
-        low, high = min(values), max(values)
+        low = min(values)
+        high = max(values)
         return f"{low:,}{'' if low == high else f' to {high:,}'} {name}"
 
     return ", ".join(map(span, ("nodes", "elements", "frames", "bodies"))) if samples else ""

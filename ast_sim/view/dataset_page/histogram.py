@@ -62,7 +62,8 @@ def _edges(values: np.ndarray, whole: bool) -> tuple[np.ndarray, bool]:
     step = _round_up((upper - low) / wanted or 0.1 * abs(upper) or 1.0)
     if whole:
         step = max(1.0, step)
-    first, last = math.floor(low / step), math.floor(upper / step) + 1
+    first = math.floor(low / step)
+    last = math.floor(upper / step) + 1
     if not whole and upper == (last - 1) * step and last - 1 > first:
         last -= 1
     return step * np.arange(first, last + 1), is_open

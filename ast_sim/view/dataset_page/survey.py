@@ -127,7 +127,8 @@ def figures(name: str, trajectory: Trajectory, info: Any, seconds: list[float] |
     if trajectory.stress is not None:
         stress = float(trajectory.stress[:, scene.deforming(trajectory.stress_at)].max(initial=0.0))
     low, high = trajectory.position.min(axis=(0, 1)), trajectory.position.max(axis=(0, 1))
-    center, half = np.array(info.domain_center), info.domain_half_width
+    center = np.array(info.domain_center)
+    half = info.domain_half_width
     old = attributes.get("solve_seconds")  # files of earlier versions kept the seconds here
     return Sample(
         name=name,

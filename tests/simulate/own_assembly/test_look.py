@@ -27,8 +27,9 @@ def test_a_look_says_what_was_made_and_what_it_costs(tmp_path, capfd):
     assert found and 0.5 <= float(found[1]) <= 1.5
     assert told[2] == "block and punch: 0.2 mm apart"
     assert re.fullmatch(r"one scene: .* s \(.* s to mesh\), complete", told[3])
-    assert re.fullmatch("--count 50: 60 scenes, about .* with 2 processes", told[4])
-    assert told[5] == f"picture: {tmp_path / 'SPEC.look.png'}"
+    assert re.fullmatch("force .* N, at half the size .* N: this mesh is .* % off", told[4])
+    assert re.fullmatch("--count 50: 60 scenes, about .* with 2 processes", told[5])
+    assert told[6] == f"picture: {tmp_path / 'SPEC.look.png'}"
     assert colors_of(tmp_path / "SPEC.look.png") == {"blue", "orange", "red"}
     assert not list(tmp_path.glob("*.h5*"))
 

@@ -8,8 +8,8 @@ from simulate.own_assembly.assemblies import write_box
 
 from ast_sim.importers.shells import find_shells
 from ast_sim.simulate.families import assembly
-from ast_sim.simulate.jobs.look import look
 from ast_sim.simulate.own_assembly.parameters import completed
+from ast_sim.simulate.own_assembly.rest_check import gap_between
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.simulate.shapes.mesh_check import boundary
 
@@ -93,8 +93,9 @@ def test_the_layer_of_a_closed_tool_lies_inside_it(name, turned, tmp_path):
 def test_a_thin_tool_presses_as_its_tetrahedra_would(tmp_path):
     """The blade of 0.4 mm, 8 mm above the pad, with edges of 4.8 mm: half a mesh width is six times its thickness."""
     path = write(tmp_path, TOOLS["blade"])
-    assert "pad and tool: 8 mm apart" in look(path).lines
-    as_surface = assembly.in_newton(assembly.solve(case_of(path)), "mm")
+    case = case_of(path)
+    assert gap_between(case, (0, 1)) == pytest.approx(8, rel=1e-3)
+    as_surface = assembly.in_newton(assembly.solve(case), "mm")
     write_box(tmp_path / "tool.vtu", (-12, -12, 8), (12, 12, 8.4), (5, 5, 1))
     path.write_text(SPEC.replace("tool.stl", "tool.vtu"))
     as_solid = assembly.in_newton(assembly.solve(case_of(path)), "mm")
@@ -110,8 +111,9 @@ def test_a_sheet_between_two_parts_leaves_the_gap_behind_it(tmp_path):
     assert len(flat) == 50
     write_box(tmp_path / "lid.vtu", (-12, -12, 8.5), (12, 12, 18), (4, 4, 2))
     path = write(tmp_path, (points, flat), SPEC.replace("-8.5", "-0.1") + SECOND)
-    lines = look(path).lines
-    assert {"pad and tool: 7.96 mm apart", "tool and lid: 0.5 mm apart"} <= set(lines)
+    case = case_of(path)
+    assert gap_between(case, (0, 1)) == pytest.approx(7.96, abs=0.005)
+    assert gap_between(case, (1, 2)) == pytest.approx(0.5, rel=1e-3)
 
 
 def test_a_closed_die_around_a_body_has_its_layer_outside(tmp_path):

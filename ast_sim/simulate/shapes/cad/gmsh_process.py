@@ -105,13 +105,13 @@ def mesh_own_scale(requests: list[dict[str, Any]]) -> list[dict[str, np.ndarray]
     except MeshingFailed as error:
         named = any(str(error).startswith(part["name"]) for part in requests)
         raise error if named else MeshingFailed(f"{names}: {error}") from error
-    found: list[dict[str, np.ndarray]] = [{} for _ in requests]
+    meshes: list[dict[str, np.ndarray]] = [{} for _ in requests]
     for key, array in answer.items():
         kind, _, rest = key.removeprefix("own_").partition("_")
         number, _, name = rest.partition("_")
         if key.startswith("own_"):
-            found[int(number)][f"group {name}" if kind == "group" else kind] = array
-    return found
+            meshes[int(number)][f"group {name}" if kind == "group" else kind] = array
+    return meshes
 
 
 def _past_crashes(requests: list[dict[str, Any]]) -> dict[str, np.ndarray]:

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-_HEADER, _TRIANGLE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("colour", "<u2")])
+_HEADER = 84
+_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("colour", "<u2")])
 _WORDS = re.compile(rb"[^\s]+")
 _SOLID = re.compile(rb"(?im)^[ \t]*solid\b[ \t]*(.*?)[ \t]*$")
 _END = re.compile(rb"(?im)^[ \t]*endsolid\b")
@@ -46,13 +47,13 @@ def read_stl(path: Path) -> StlFile:
         data = path.read_bytes()
     except OSError as error:
         raise BadSurface(f"it cannot be read: {error.strerror}") from error
-    found = _text(data) if _is_text(data) else _binary(data)
-    if not len(found.corners):
+    stl = _text(data) if _is_text(data) else _binary(data)
+    if not len(stl.corners):
         raise BadSurface("it holds no triangles")
-    if not np.isfinite(found.corners).all():
-        first = int(np.argmin(np.isfinite(found.corners).all(axis=(1, 2))))
-        raise BadSurface(f"a corner of triangle {first} is not finite: {found.corners[first].tolist()}")
-    return found
+    if not np.isfinite(stl.corners).all():
+        first = int(np.argmin(np.isfinite(stl.corners).all(axis=(1, 2))))
+        raise BadSurface(f"a corner of triangle {first} is not finite: {stl.corners[first].tolist()}")
+    return stl
 
 
 def _is_text(data: bytes) -> bool:
@@ -93,7 +94,8 @@ def _facets(block: bytes) -> np.ndarray:
     """[F,3,3]: the triangles of a block of text."""
     end = _END.search(block)
     words = np.array(_WORDS.findall(block[: end.start() if end else None].lower()), dtype="S32")
-    vertex, facets = np.flatnonzero(words == b"vertex"), int((words == b"facet").sum())
+    vertex = np.flatnonzero(words == b"vertex")
+    facets = int((words == b"facet").sum())
     if end is None or int((words == b"endfacet").sum()) != facets:
         raise BadSurface(f"it is cut off after {facets:,} facets: 'endfacet' or 'endsolid' is missing")
     if len(vertex) != 3 * facets:

@@ -107,13 +107,13 @@ def several_solids(solids: list[tuple[str, np.ndarray, np.ndarray]]) -> str:
 
 def whole_surface(corners: np.ndarray) -> Surface:
     """The surface of triangles with these corners [F,3,3], mended."""
-    found = _joined(corners, SAME_PLACE)
-    for tolerance in () if found.is_closed else CRACKS:
+    surface = _joined(corners, SAME_PLACE)
+    for tolerance in () if surface.is_closed else CRACKS:
         wider = _joined(corners, tolerance)
         if wider.is_closed:
-            crack = f"cracks of up to {tolerance * found.diagonal:.2g} in its surface are closed"
+            crack = f"cracks of up to {tolerance * surface.diagonal:.2g} in its surface are closed"
             return Surface(wider.position, wider.triangles, (*wider.notes, crack))
-    return found
+    return surface
 
 
 def _joined(corners: np.ndarray, tolerance: float) -> Surface:
@@ -126,9 +126,9 @@ def _joined(corners: np.ndarray, tolerance: float) -> Surface:
     _, first, label = np.unique(label, return_index=True, return_inverse=True)
     position, triangles = points[first], label[triangles]
     points_alone = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
-    found, needles = _without_needles(position, triangles[~points_alone])
-    kept = _without_folds(found)
-    gone, folds = int(points_alone.sum()) + needles, len(found) - len(kept)
+    whole, needles = _without_needles(position, triangles[~points_alone])
+    kept = _without_folds(whole)
+    gone, folds = int(points_alone.sum()) + needles, len(whole) - len(kept)
     notes = [f"{gone} triangle{'s' * (gone > 1)} of no area left out"] if gone else []
     notes += [f"{folds} triangles that stand twice left out"] if folds else []
     return Surface(position, kept, tuple(notes)).only(np.arange(len(kept)))
@@ -168,7 +168,8 @@ def _without_needles(position: np.ndarray, triangles: np.ndarray) -> tuple[np.nd
             piece[piece == (c, a)[number % 2]] = b
         pieces = [piece for piece in pieces if len(set(piece.tolist())) == 3]
         kept = np.delete(triangles, [row, *beside], axis=0)
-        triangles, gone = np.concatenate([kept, *(piece[None] for piece in pieces)]), gone + 1
+        triangles = np.concatenate([kept, *(piece[None] for piece in pieces)])
+        gone = gone + 1
 
 
 def _without_folds(triangles: np.ndarray) -> np.ndarray:
@@ -190,7 +191,8 @@ def pieces_of(surface: Surface) -> np.ndarray:
     an edge belong to one piece."""
     edges = np.sort(surface.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     _, number = np.unique(edges, axis=0, return_inverse=True)
-    owner, count = np.repeat(np.arange(len(surface.triangles)), 3), len(surface.triangles)
+    owner = np.repeat(np.arange(len(surface.triangles)), 3)
+    count = len(surface.triangles)
     number = number.ravel() + count
     size = count + len(number)
     links = coo_array((np.ones(len(owner)), (owner, number)), shape=(size, size))

@@ -1,0 +1,43 @@
+"""A split of a dataset as a sequence of trajectories."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, overload
+
+from ast_sim.scene import Trajectory
+from ast_sim.support.notebook_table import html_table, one_line
+
+if TYPE_CHECKING:
+    from ast_sim.dataset.reader import Dataset
+
+
+class Split(Sequence[Trajectory]):
+    """The trajectories of a dataset's split, in order; each is read on access. A slice of a split is a `Split`, too."""
+
+    def __init__(self, dataset: Dataset, name: str, indices: range) -> None:
+        self._dataset, self.name, self._indices = dataset, name, indices
+
+    def _facts(self) -> dict[str, str]:
+        return {"name": self.name, "scenes": f"{len(self):,}", "file": self._dataset.path.name}
+
+    def __repr__(self) -> str:
+        return one_line("Split", self._facts())
+
+    def _repr_html_(self) -> str:
+        return html_table("Split", self._facts())
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    @overload
+    def __getitem__(self, index: int) -> Trajectory: ...
+    @overload
+    def __getitem__(self, index: slice) -> Split: ...
+    def __getitem__(self, index: int | slice) -> Trajectory | Split:
+        if isinstance(index, slice):
+            return Split(self._dataset, self.name, self._indices[index])
+        number = self._indices[index]
+        cauchy_stress = self._dataset.cauchy_stress(self.name, number)
+        return replace(self._dataset.load(self.name, number), cauchy_stress=cauchy_stress)

@@ -1,0 +1,129 @@
+"""The arrays of a scene: made of what a user has, joined, and exchanged with meshio."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from enum import IntEnum
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ast_sim.element_topology import CELL_KINDS
+from ast_sim.number_arrays import (
+    connected_parts,
+    nodes_of_body,
+    real_numbers,
+    require_array,
+    require_nodes,
+    whole_numbers,
+)
+from ast_sim.support.errors import DatasetError
+
+if TYPE_CHECKING:
+    import meshio
+
+
+class NodeType(IntEnum):
+    """How a node moves. The numbers are those of the MeshGraphNets data sets."""
+
+    NORMAL = 0  # a free node: it follows the mechanics, and models predict it
+    OBSTACLE = 1  # a node of a rigid body with a prescribed motion
+    HANDLE = 3  # a node of a deforming body with a prescribed position
+
+
+def scene_arrays(
+    name: str,
+    points: Any,
+    cells: Any,
+    node_type: Any,
+    body: Any,
+    material: Any,
+    obstacles: Iterable[int],
+    handles: Any,
+) -> dict[str, Any]:
+    """The arrays of a scene by name; arguments and errors are those of `Scene.of`."""
+    position = real_numbers(name, "points", points)
+    if position.ndim == 2 and position.shape[1] == 2:
+        position = np.pad(position, ((0, 0), (0, 1)))
+    require_array(name, "points", position, np.float32, (None, 3))
+    count = len(position)
+    elements = whole_numbers(name, "cells", cells, np.int32)
+    require_array(name, "cells", elements, np.int32, (None, None))
+    require_nodes(name, "cell", elements, count)
+    parts = connected_parts(elements, count) if body is None else whole_numbers(name, "body", body, np.int32)
+    require_array(name, "body", parts, np.int32, (count,))
+    types = whole_numbers(name, "node_type", np.zeros(count) if node_type is None else node_type, np.uint8)
+    require_array(name, "node_type", types, np.uint8, (count,))
+    if handles is not None:
+        types[_nodes(name, handles, count)] = NodeType.HANDLE
+    for number in obstacles:
+        types[nodes_of_body(parts, number)] = NodeType.OBSTACLE
+    columns = None if material is None else real_numbers(name, "material", material)
+    if columns is not None and columns.ndim == 1:
+        columns = np.tile(columns, (len(elements), 1))
+    return {"rest_position": position, "elements": elements, "node_type": types, "body": parts, "material": columns}
+
+
+def _nodes(name: str, handles: Any, count: int) -> np.ndarray:
+    """The numbers of the nodes, from numbers or from a mask [N]."""
+    nodes = np.asarray(handles)
+    if nodes.dtype == bool:
+        require_array(name, "handles", nodes, np.bool_, (count,))
+        return np.flatnonzero(nodes)
+    nodes = whole_numbers(name, "handles", handles, np.int64).reshape(-1)
+    require_nodes(name, "handle", nodes[:, None], count)
+    return nodes
+
+
+def joined_arrays(scenes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The arrays of one scene, from the arrays of several; errors are those of `Scene.join`."""
+    kinds = {
+        (scene["elements"].shape[1], 0 if scene["material"] is None else scene["material"].shape[1]) for scene in scenes
+    }
+    if len(kinds) != 1:
+        told = "; ".join(f"{nodes} and {columns}" for nodes, columns in sorted(kinds)) or "no scene"
+        raise DatasetError(
+            f"scenes to join must agree in the nodes of an element and the columns of the material; here are: {told}"
+        )
+    keys = ("rest_position", "elements", "node_type", "body", "material")
+    columns: dict[str, list[Any]] = {key: [] for key in keys}
+    first_node = first_body = 0
+    for scene in scenes:
+        shifted = {**scene, "elements": scene["elements"] + np.int32(first_node)}
+        shifted["body"] = scene["body"] + np.int32(first_body)
+        for key in keys:
+            columns[key].append(shifted[key])
+        first_node += len(scene["rest_position"])
+        first_body = int(shifted["body"].max()) + 1
+    return {key: None if parts[0] is None else np.concatenate(parts) for key, parts in columns.items()}
+
+
+def arrays_of_mesh(mesh: meshio.Mesh) -> tuple[Any, np.ndarray, dict[str, Any]]:
+    """Points, cells, and the fields of the scene that the mesh has; errors are those of `Scene.from_meshio`."""
+    blocks = [index for index, block in enumerate(mesh.cells) if len(block.data)]
+    kinds = sorted({mesh.cells[index].type for index in blocks})
+    if len(kinds) != 1 or kinds[0] not in CELL_KINDS.values():
+        known = ", ".join(CELL_KINDS.values())
+        told = ", ".join(kinds) or "none"
+        raise DatasetError(
+            f"the cells of a scene are of one kind ({known}), but this mesh has: {told}. Use ast_sim.read_scene for it"
+        )
+    fields = {key: mesh.point_data[key] for key in ("node_type", "body") if key in mesh.point_data}
+    if "material" in mesh.cell_data:
+        parts = [np.asarray(mesh.cell_data["material"][index]) for index in blocks]
+        fields["material"] = np.concatenate([part.reshape(len(part), -1) for part in parts])
+    return mesh.points, np.concatenate([mesh.cells[index].data for index in blocks]), fields
+
+
+def mesh_of_arrays(
+    position: np.ndarray, elements: np.ndarray, node_type: np.ndarray, body: np.ndarray, material: np.ndarray | None
+) -> meshio.Mesh:
+    """What `Scene.to_meshio` returns."""
+    import meshio
+
+    return meshio.Mesh(
+        position,
+        [(CELL_KINDS[elements.shape[1]], elements)],
+        point_data={"node_type": node_type, "body": body},
+        cell_data={} if material is None else {"material": [material]},
+    )

@@ -1,0 +1,76 @@
+"""What a model must know of its data. These facts are no settings: the dataset has them, and nobody chooses them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from ast_sim.dataset.layout import GIVEN_FRAMES, DatasetInfo
+from ast_sim.support.toml_settings import NOTHING
+
+
+@dataclass(frozen=True)
+class DataFacts:
+    """Facts of a dataset; lengths in its unit. They are written into `scope.toml` of a run.
+
+    Attributes:
+        integration: "quasi_static" (next position: p + v) or "dynamic" (2 p - p_previous + a).
+        stress: where stress is predicted: "none", "node" or "element".
+        material_width: numbers that describe the material of an element; 0 without material.
+        domain_center, domain_half_width: the cube that holds all positions.
+        contact_radius: distance within which surfaces count as near.
+        mesh_spacing: mean length of a mesh edge of the deforming bodies at rest.
+        tetrahedra: whether the elements are tetrahedra.
+        planar: whether z is 0 in all scenes.
+        young, poisson, contact_range, friction: what the solver recorded, and is the same in all scenes: Young's
+            modulus and Poisson's ratio of all elements, distance below which its surfaces repel, coefficient of
+            friction; 0: it recorded none, or several.
+    """
+
+    integration: Literal["quasi_static", "dynamic"] = "quasi_static"
+    stress: Literal["none", "node", "element"] = "none"
+    material_width: int = 0
+    domain_center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    domain_half_width: float = 1.0
+    contact_radius: float = 0.0
+    mesh_spacing: float = 0.0
+    tetrahedra: bool = False
+    planar: bool = False
+    young: float = 0.0
+    poisson: float = 0.0
+    contact_range: float = 0.0
+    friction: float = 0.0
+
+    @staticmethod
+    def of(
+        info: DatasetInfo,
+        material_width: int,
+        mesh_spacing: float,
+        planar: bool = False,
+        tetrahedra: bool = True,
+        recorded: Mapping[str, float] = NOTHING,
+    ) -> DataFacts:
+        """The facts of a dataset with this `info`; `recorded` has the last four, the others are as above."""
+        x, y, z = (float(c) for c in info.domain_center)
+        return DataFacts(
+            integration=info.integration,
+            stress=info.stress_location,
+            material_width=material_width,
+            domain_center=(x, y, z),
+            domain_half_width=float(info.domain_half_width),
+            contact_radius=float(info.contact_radius),
+            mesh_spacing=mesh_spacing,
+            tetrahedra=tetrahedra,
+            planar=planar,
+            **recorded,
+        )
+
+    @property
+    def dynamic(self) -> bool:
+        return self.integration == "dynamic"
+
+    @property
+    def given_frames(self) -> int:
+        """The number of first frames from which a prediction starts."""
+        return GIVEN_FRAMES[self.integration]

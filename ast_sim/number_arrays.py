@@ -1,0 +1,116 @@
+"""Arrays of numbers: conversion from any type, checks that name what is wrong; the parts of a mesh."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ast_sim.support.errors import ConfigError, DatasetError
+
+# The search for connected parts makes pairs of nodes from so many elements at a time, which limits its memory.
+_ELEMENTS_AT_ONCE = 1 << 13
+
+
+def real_numbers(name: str, array: str, value: Any, columns: int | None = None) -> np.ndarray:
+    """Numbers of any real type, an array or lists, as float32; with `columns` as [rows, columns].
+
+    Raises:
+        DatasetError: these are no numbers, or a finite one is too large for float32; the text names `name` and `array`.
+    """
+    given = _as_array(name, array, value)
+    if given.dtype.kind not in "fiub":
+        raise DatasetError(f"{name}: {array} must be numbers, not {given.dtype}")
+    with np.errstate(over="ignore"):
+        single = np.array(given, np.float32, order="C")
+    too_large = np.isfinite(given) & ~np.isfinite(single)
+    if too_large.any():
+        raise DatasetError(f"{name}: {array} holds {given[too_large][0]:g}, which is too large for float32")
+    require_array(name, array, single, np.float32, (None,) * given.ndim if columns is None else (None, columns))
+    return single
+
+
+def whole_numbers(name: str, array: str, value: Any, dtype: type) -> np.ndarray:
+    """Whole numbers of any type, an array or lists, as an array of the integer type `dtype`.
+
+    Raises:
+        DatasetError: one is not whole, or does not fit into the type; the text names `name`, `array` and the number.
+    """
+    given = _as_array(name, array, value)
+    if given.dtype.kind not in "fiub":
+        raise DatasetError(f"{name}: {array} must be whole numbers, not {given.dtype}")
+    limits = np.iinfo(dtype)
+    wrong = ~((given == np.round(given)) & (given >= limits.min) & (given <= limits.max))
+    if wrong.any():
+        at = [int(i) for i in np.argwhere(wrong)[0]]
+        raise DatasetError(
+            f"{name}: {array} holds {given[wrong][0]} at {at}; must be whole numbers of {np.dtype(dtype)}"
+        )
+    return np.array(given, dtype, order="C")
+
+
+def _as_array(name: str, array: str, value: Any) -> np.ndarray:
+    try:
+        return np.asarray(value)
+    except ValueError as error:  # rows of different lengths
+        raise DatasetError(f"{name}: {array} must be an array: {error}") from error
+
+
+def connected_parts(elements: np.ndarray, num_nodes: int) -> np.ndarray:
+    """[N] int32: the connected part of the mesh that each node belongs to. Parts are numbered from 0 in the order of
+    their lowest nodes."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    part = np.arange(num_nodes, dtype=np.int32)
+    for start in range(0, len(elements), _ELEMENTS_AT_ONCE):
+        corners = part[elements[start : start + _ELEMENTS_AT_ONCE]]
+        # The edges from the first corner to all others connect the element, so the other edges are not needed.
+        first = np.repeat(corners[:, 0], corners.shape[1] - 1)
+        other = corners[:, 1:].ravel()
+        graph = coo_array((np.ones(len(first), np.int8), (first, other)), shape=(num_nodes, num_nodes))
+        part = connected_components(graph, directed=False)[1].astype(np.int32)[part]
+    return part
+
+
+def nodes_of_body(body: np.ndarray, number: int) -> np.ndarray:
+    """[N] bool: the nodes of the body with this number; `body` [N] is as in `Scene`.
+
+    Raises:
+        ConfigError: there is no such body; the text names the existing bodies.
+    """
+    nodes = body == number
+    if not nodes.any():
+        numbers, counts = np.unique(body, return_counts=True)
+        known = [f"{one} ({count} nodes)" for one, count in zip(numbers[:10], counts[:10], strict=True)]
+        more = ["..."] if len(numbers) > 10 else []
+        raise ConfigError(f"there is no body {number}; there are: {', '.join(known + more)}")
+    return nodes
+
+
+def require_array(name: str, array: str, value: np.ndarray, dtype: type, shape: tuple[int | None, ...]) -> None:
+    """Raise DatasetError unless `value` has the dtype and the shape; None in `shape` allows any size."""
+    if value.dtype != dtype:
+        raise DatasetError(f"{name}: {array} must be {np.dtype(dtype)}, not {value.dtype}")
+    fits = len(value.shape) == len(shape) and all(w in (None, s) for s, w in zip(value.shape, shape, strict=True))
+    if not fits:
+        wanted = ", ".join("any" if size is None else str(size) for size in shape)
+        raise DatasetError(f"{name}: {array} has the shape {list(value.shape)}, must be [{wanted}]")
+
+
+def require_nodes(name: str, kind: str, elements: np.ndarray, count: int) -> None:
+    """Raise DatasetError naming the first of the `elements` [E, k] that refers to a node beyond 0 to `count` - 1."""
+    outside = (elements < 0) | (elements >= count)
+    if outside.any():
+        row, corner = np.unravel_index(np.argmax(outside), outside.shape)
+        node = elements[row, corner]
+        raise DatasetError(f"{name}: {kind} {row} refers to node {node}, but the nodes are 0 to {count - 1}")
+
+
+def require_finite(name: str, array: str, row: str, value: np.ndarray, first_frame: int = 0) -> None:
+    """Raise DatasetError naming the first frame and row of `value`, [S, rows, F] or [rows, F], that is not finite."""
+    finite = np.isfinite(value)
+    if not finite.all():
+        *frame, index, _ = np.unravel_index(np.argmin(finite), finite.shape)
+        at = f"in frame {first_frame + frame[0]} at {row} {index}" if frame else f"of {row} {index}"
+        raise DatasetError(f"{name}: {array} {at} is not finite: {value[*frame, index].tolist()}")

@@ -1,0 +1,95 @@
+"""The card of a model: what it predicts, for which scenes, how well, and how it was trained."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import ast_sim
+from ast_sim.runs.folder import Chosen
+from ast_sim.runs.scope import Scope
+from ast_sim.runs.train_config import RunConfig
+
+_TEXT = """# {name}
+
+A trained model of `ast_sim` {version}. It predicts how deforming bodies in contact move, for scenes like those that it
+learned from (family `{family}`, lengths in {unit}). It warns of a scene outside the ranges below. It does not check the
+shapes of bodies: for other shapes its answer is wrong without a warning.
+
+```
+import ast_sim
+
+run = ast_sim.Run("{name}.ast")
+answer = run.predict(scene, motion)
+```
+
+## Training scenes
+
+| | from | to |
+| --- | ---: | ---: |
+{ranges}
+
+## Errors on validation scenes
+
+{errors}
+
+## Training
+
+| | |
+| --- | --- |
+{training}
+
+The terms of use are in `LICENSE`.
+"""
+
+
+def card(name: str, settings: RunConfig, scope: Scope, chosen: Chosen, parameters: int) -> str:
+    """The card as Markdown; `parameters` is their number."""
+    model, train = settings.model, settings.train
+    training = {
+        "model": f"{model.name}, {parameters:,} parameters",
+        "checkpoint": f"step {chosen.step:,} of {train.steps:,}",
+        "scenes in a step": train.batch_size * train.accumulate,
+        "optimizer": f"{train.optimizer}, peak rate {train.peak_rate:.3g}",
+        "seed": train.seed,
+        "dataset": settings.data,
+        "inertia": "yes" if model.data.dynamic else "no",
+        "stress": {"none": "not predicted", "node": "at nodes", "element": "in elements"}[model.data.stress],
+    }
+    return _TEXT.format(
+        name=name,
+        version=ast_sim.__version__,
+        family=scope.family,
+        unit=scope.length_unit,
+        ranges="\n".join(f"| {what} | {low:.4g} | {high:.4g} |" for what, low, high in _ranges(scope)),
+        errors=_errors(chosen.answers),
+        training="\n".join(f"| {what} | {value} |" for what, value in training.items()),
+    )
+
+
+def _ranges(scope: Scope) -> Iterator[tuple[str, float, float]]:
+    unit = scope.length_unit
+    yield "nodes", *scope.nodes
+    yield f"size of the deforming bodies [{unit}]", *scope.size
+    yield f"mesh spacing [{unit}]", *scope.spacing
+    yield f"travel of prescribed nodes [{unit}]", *scope.travel
+    for column, limits in enumerate(zip(scope.material_low, scope.material_high, strict=True)):
+        yield f"material column {column}", *limits
+
+
+def _errors(answers: Mapping[str, Any]) -> str:
+    """A table of the efforts that validation measured; the default one is marked."""
+    measured = [one for one in answers.get("valid_by_effort", []) if one["error"] is not None]
+    if not measured:
+        return "No validation measured the errors of single answers."
+    lines = [
+        "Relative to the displacement, at the deepest frame. `*` marks the effort that the model takes by default.",
+        "",
+        "| corrections | Newton steps, at most | error |",
+        "| ---: | ---: | ---: |",
+    ]
+    for one in measured:
+        effort = one["effort"]
+        mark = " *" if effort == answers.get("effort") else ""
+        lines.append(f"| {effort['corrections']} | {effort['newton_steps']}{mark} | {100 * one['error']:.3g} % |")
+    return "\n".join(lines)

@@ -1,0 +1,123 @@
+"""Where linear tetrahedra are far too stiff: in walls that bend with few of them across, and in rubber.
+
+Legend: N nodes, F triangles of the surface of a part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+
+from ast_sim.element_topology import LOCAL_EDGES
+from ast_sim.mechanics.case import SolidCase
+from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
+from ast_sim.simulate.own_assembly.rest_check import surface_of
+from ast_sim.simulate.own_assembly.standing import point
+
+ENOUGH = 3  # elements across a wall that bends
+LARGEST_POISSON = 0.45
+OPPOSITE = -0.9  # cosine between the normals of the two sides of a wall, at most
+SLENDER = 4  # a wall bends if it is so many times as long as thick
+INWARD = 1e-6  # rays start that far inside, as a share of the size of the part
+CURE = "leave out order = 1"
+
+
+@dataclass(frozen=True)
+class Limit:
+    """What is wrong with a part.
+
+    Attributes:
+        part: its name.
+        kind: "thin" or "rubber".
+        badness: the larger, the worse, among those of one kind.
+        text: a sentence.
+    """
+
+    part: str
+    kind: str
+    badness: float
+    text: str
+
+
+def limits(spec: AssemblySpec, case: SolidCase) -> Iterator[Limit]:
+    """What linear elements get wrong in a drawn scene; nothing for other elements."""
+    if case.scene.elements.shape[1] != 4:
+        return
+    poisson = np.broadcast_to(case.material.poisson, case.scene.num_elements)
+    for number, part in enumerate(spec.parts):
+        elements = case.scene.body[case.scene.elements[:, 0]] == number
+        if part.rigid:
+            continue
+        ratio = float(poisson[elements].max())
+        if ratio > LARGEST_POISSON:
+            text = (
+                f"{part.name}: its {elements.sum()} linear elements lock at Poisson's ratio {ratio:.4g}, above"
+                f" {LARGEST_POISSON}, and its forces are too large: {CURE}"
+            )
+            yield Limit(part.name, "rubber", ratio, text)
+        yield from _thin(spec, case, number)
+
+
+def _thin(spec: AssemblySpec, case: SolidCase, number: int) -> Iterator[Limit]:
+    """The wall of a part that has too few elements across, if it is long enough to bend."""
+    rest = case.scene.rest_position.astype(np.float64)
+    faces = surface_of(case, number)
+    middle, thickness, other = _across(rest, faces)
+    held = case.scene.prescribed[faces].all(axis=1)
+    wall = np.flatnonzero((other >= 0) & ~held & ~held[other])
+    few = wall[_elements_across(case, number, faces[wall], faces[other[wall]]) < ENOUGH]
+    if not len(few):
+        return
+    if np.linalg.norm(np.ptp(middle[few], axis=0)) < SLENDER * np.median(thickness[few]):
+        return
+    first = few[np.argmin(thickness[few])]
+    where = point(middle[first] + np.asarray(case.attributes["origin"]))
+    text = (
+        f"{spec.parts[number].name}: fewer than {ENOUGH} linear elements lie across its wall at {len(few)} of"
+        f" {len(faces)} triangles of its surface, such as {where}, where it is {thickness[first]:.3g} {spec.unit}"
+        f" thick. If it bends there, it is several times too stiff: {CURE}, or choose a smaller size"
+    )
+    yield Limit(spec.parts[number].name, "thin", len(few) / len(faces), text)
+
+
+def _across(rest: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The middles [F,3] of triangles, the thickness [F] of the wall behind each, and the triangle [F] on its other
+    side; -1 where the other side is not about parallel."""
+    import igl  # takes 0.2 s
+
+    corners = rest[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
+    middle = corners.mean(axis=1)
+    inward = INWARD * np.linalg.norm(np.ptp(corners, axis=(0, 1)))
+    tree = igl.AABB()
+    rows = faces.astype(np.int64)
+    tree.init(rest, rows)
+    hit, distance, _ = tree.intersect_ray_first(rest, rows, middle - inward * normal, -normal)
+    parallel = np.einsum("fi,fi->f", normal, normal[hit]) <= OPPOSITE
+    return middle, distance, np.where((hit >= 0) & parallel, hit, -1)
+
+
+def _elements_across(case: SolidCase, number: int, near: np.ndarray, far: np.ndarray) -> np.ndarray:
+    """[n]: on how many edges of elements one gets from each triangle [n,3] to the one on the other side; at most
+    `ENOUGH`."""
+    elements = case.scene.elements[case.scene.body[case.scene.elements[:, 0]] == number]
+    edges = elements[:, np.array(LOCAL_EDGES[4])].reshape(-1, 2)
+    count = case.scene.num_nodes
+    neighbours = coo_array((np.ones(len(edges)), tuple(edges.T)), shape=(count, count)).tocsr()
+    neighbours = neighbours + neighbours.T
+    reached, target = _marked(near, count), _marked(far, count)
+    across = np.full(len(near), ENOUGH)
+    for steps in range(ENOUGH):
+        across[(across == ENOUGH) & (reached.multiply(target).sum(axis=1) > 0)] = steps
+        reached = reached @ neighbours
+    return across
+
+
+def _marked(triangles: np.ndarray, count: int) -> csr_array:
+    """[n,N] sparse: 1 for the corners of each triangle."""
+    rows = np.repeat(np.arange(len(triangles)), 3)
+    return coo_array((np.ones(triangles.size), (rows, triangles.ravel())), shape=(len(triangles), count)).tocsr()

@@ -1,0 +1,93 @@
+"""Bodies to start from, as scenes: a box, a plate, a ball, a cylinder. `Scene.join` puts them side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ast_sim.scene import Scene
+from ast_sim.simulate.shapes import mesh
+from ast_sim.support.errors import ConfigError
+
+
+def box(low: Sequence[float], high: Sequence[float], cells: Sequence[int], **arrays: Any) -> Scene:
+    """A box of tetrahedra between two corners; all nodes are free.
+
+    Args:
+        low, high: [3], the lowest and the highest corner.
+        cells: [3], the cells along x, y and z. Each is cut into six tetrahedra.
+        arrays: other arguments of `Scene.of`, such as handles or material.
+
+    Raises:
+        ConfigError: a size or a number of cells is not above 0.
+    """
+    size = np.subtract(high, low)
+    _require_above_zero("the box", size, cells)
+    coordinates, elements = mesh.hexahedral_grid(tuple(cells))
+    return Scene.of(coordinates / np.asarray(cells) * size + low, elements, **arrays)
+
+
+def plate(size: Sequence[float], cells: Sequence[int], holes: Sequence[Sequence[float]] = (), **arrays: Any) -> Scene:
+    """A plate of tetrahedra around the origin, with round holes through its thickness; all nodes are free.
+
+    Args:
+        size: [3], along x, y and z; z is the thickness.
+        cells: [3], the cells along x, y and z.
+        holes: [H, 3], centre x, centre y and radius; a cell whose centre lies in a hole is left out.
+        arrays: other arguments of `Scene.of`.
+
+    Raises:
+        ConfigError: a size or a number of cells is not above 0.
+    """
+    _require_above_zero("the plate", size, cells)
+    return Scene.of(*mesh.plate(tuple(size), tuple(cells), np.reshape(np.asarray(holes, float), (-1, 3))), **arrays)
+
+
+def ball(center: Sequence[float], radius: float, cells: int, **arrays: Any) -> Scene:
+    """A ball of tetrahedra; all nodes are free.
+
+    Args:
+        center: [3].
+        radius: its radius.
+        cells: the cells across the diameter, an even number.
+        arrays: other arguments of `Scene.of`.
+
+    Raises:
+        ConfigError: the radius is not above 0, or the number of cells is not even.
+    """
+    _require_above_zero("the ball", [radius], [cells], even=True)
+    position, elements = mesh.ball(radius, cells)
+    return Scene.of(position + np.asarray(center), elements, **arrays)
+
+
+def cylinder(
+    center: Sequence[float], radius: float, length: float, cells: int, axis: str = "z", **arrays: Any
+) -> Scene:
+    """A cylinder of tetrahedra; all nodes are free.
+
+    Args:
+        center: [3], the middle of its axis.
+        radius, length: its radius, and its length along the axis.
+        cells: the cells across the diameter and along the axis, an even number.
+        axis: "x", "y" or "z".
+        arrays: other arguments of `Scene.of`.
+
+    Raises:
+        ConfigError: a size is not above 0, the number of cells is not even, or there is no such axis.
+    """
+    _require_above_zero("the cylinder", [radius, length], [cells], even=True)
+    if axis not in ("x", "y", "z"):
+        raise ConfigError(f"the axis of the cylinder is {axis!r}; must be x, y or z")
+    position, elements = mesh.cylinder(radius, length / 2, cells)
+    return Scene.of(np.roll(position, "xyz".index(axis), axis=1) + np.asarray(center), elements, **arrays)
+
+
+def _require_above_zero(
+    what: str, sizes: Sequence[float] | np.ndarray, cells: Sequence[int], even: bool = False
+) -> None:
+    if not (np.asarray(sizes) > 0).all():
+        raise ConfigError(f"{what} has the size {np.asarray(sizes).tolist()}; every size must be above 0")
+    if not all(int(count) == count and count > 0 and not (even and count % 2) for count in cells):
+        raise ConfigError(f"{what} has {list(cells)} cells; must be {'even ' if even else ''}whole numbers above 0")

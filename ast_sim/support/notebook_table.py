@@ -1,0 +1,30 @@
+"""How an object shows itself: one line of text at a prompt, a table in a notebook."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from html import escape
+from typing import Any
+
+
+def one_line(kind: str, facts: Mapping[str, Any]) -> str:
+    """Such as "Scene(bodies: 2, nodes: 351)"."""
+    return f"{kind}({', '.join(f'{key}: {value}' for key, value in facts.items())})"
+
+
+def html_table(title: str, facts: Mapping[str, Any], picture: str = "") -> str:
+    """A table of facts in HTML, and a picture (HTML) beside it; titles and facts are texts, not HTML."""
+    rows = "".join(
+        f'<tr><th style="text-align:left">{escape(key)}</th><td style="text-align:left">{escape(str(value))}</td></tr>'
+        for key, value in facts.items()
+    )
+    table = f"<table><caption><b>{escape(title)}</b></caption><tbody>{rows}</tbody></table>"
+    if not picture:
+        return table
+    return f'<div style="display:flex;align-items:center;gap:1em"><div>{table}</div><div>{picture}</div></div>'
+
+
+def html_picture(png: bytes, width: int) -> str:
+    """A PNG as HTML, `width` pixels wide."""
+    return f'<img width="{width}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'

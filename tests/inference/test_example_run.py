@@ -1,0 +1,30 @@
+"""The run that comes with the package answers plates that it has never seen, nearly as the solver does."""
+
+import numpy as np
+import pytest
+from toy import one_thread  # noqa: F401 (used by being imported)
+
+import ast_sim
+from ast_sim.support.errors import ConfigError
+
+
+def test_it_predicts_a_new_plate_by_one_call_and_better_with_newton_steps(tmp_path):
+    data = tmp_path / "plates.h5"
+    ast_sim.generate("deforming_plate", data, train=0, valid=0, test=3, nodes=400, frames=41, keep=(24,), seed=123)
+    run, errors = ast_sim.example_run("plates"), []
+    with ast_sim.Dataset(data) as dataset:
+        for truth in dataset["test"]:
+            free = ~truth.scene.prescribed
+            moved = np.sqrt(np.mean((truth.position[1] - truth.position[0])[free] ** 2))
+            answers = [run.predict(truth, frames=[1], effort=ast_sim.Effort(0, steps)) for steps in (0, 10)]
+            errors.append([np.sqrt(np.mean((a.position[0] - truth.position[1])[free] ** 2)) / moved for a in answers])
+    network, with_newton = np.mean(errors, axis=0)
+    assert network < 0.08 and with_newton < 0.03
+
+
+def test_it_says_where_it_comes_from_and_an_unknown_name_is_one_line():
+    run = ast_sim.example_run("plates")
+    assert (run.step, run.settings.train.calls, run.settings.data) == (10_000, 1, "plates400.h5")
+    assert run.effort == ast_sim.Effort(0, 10) and run.scope.family == "deforming_plate"
+    with pytest.raises(ConfigError, match="there is no example run 'plate'; the nearest is 'plates' of plates"):
+        ast_sim.example_run("plate")

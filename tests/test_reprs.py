@@ -1,0 +1,96 @@
+"""What objects show of themselves: a line at a prompt, a table in a notebook, a drawing of a scene."""
+
+import re
+import sys
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import toy
+from meshes import two_tetrahedra
+
+import ast_sim
+from ast_sim import Dataset, Scene, scene_summary
+from ast_sim.inference.answer import Answer
+
+TRUTH = toy.plate()
+
+
+def answer(**changes) -> Answer:
+    asked = {"given": 1, "step_seconds": [0.1], "info": toy.info(), "stress_location": "node", "frames": (0, 3)}
+    asked |= {"position": TRUTH.position[[0, 3]], "stress": TRUTH.stress[[0, 3]]}
+    return Answer("<b>toy</b>", TRUTH.scene, **{**asked, **changes})
+
+
+def test_lines():
+    assert repr(two_tetrahedra(material=np.ones((2, 2), np.float32))) == (
+        "Scene(bodies: 2, nodes: 5 (3 normal, 1 obstacle, 1 handle), tetrahedra: 2, extent: 1 x 1 x 1,"
+        " material: 2 columns)"
+    )
+    assert repr(replace(TRUTH, stress_location="node", length_unit="m")) == (
+        "Trajectory(frames: 0 to 6, nodes: 48, stress: at each node, lengths: m, status: complete)"
+    )
+    assert repr(replace(TRUTH, stress=None)) == (
+        "Trajectory(frames: 0 to 6, nodes: 48, stress: none, lengths: in a unit that is not known, status: complete)"
+    )
+    moved = np.linalg.norm(TRUTH.position[3] - TRUTH.scene.rest_position, axis=1)[:-8].max()
+    assert repr(answer(expected_error=0.025, last_steps=(0.01,), seconds=0.5)) == (
+        f"Answer(name: <b>toy</b>, frames: 0, 3, nodes: 48, largest displacement: {moved:.4g} m,"
+        f" largest stress: {TRUTH.stress[3].max():.4g} Pa, expected error: 2.5 %, converged: yes, seconds: 0.5)"
+    )
+    failed = answer(failure="too far", info=None)
+    assert "expected error: not known, converged: no Newton steps" in repr(failed)
+    assert repr(failed).endswith("failure: too far)")
+
+
+def test_a_dataset_and_a_split(tmp_path):
+    with Dataset(toy.write(tmp_path / "a<b.h5", (3, 0, 2))) as data:
+        assert repr(data) == (
+            "Dataset(file: a<b.h5, scenes: 3 train, 2 test, family: toy_plate, stress: at each node, lengths: m)"
+        )
+        assert repr(data["train"][1:]) == "Split(name: train, scenes: 2, file: a<b.h5)"
+        for shown in (data._repr_html_(), data["test"]._repr_html_()):
+            assert "a&lt;b.h5" in shown and "a<b.h5" not in shown
+            assert [cell.text for cell in ElementTree.fromstring(shown).iter("th")][0] in ("file", "name")
+    assert repr(data).startswith("Dataset(")  # a closed one, too
+
+
+def test_a_scene_is_drawn_from_far_to_near():
+    """Of a box the eye sees three sides, an obstacle is see-through, and bodies have colours of their own."""
+    box = ast_sim.box((0, 0, 0), (1, 1, 1), (2, 2, 2))
+    scene = Scene.join(box, Scene.of(box.rest_position + [0, 0, 2], box.elements, obstacles=[0]))
+    root = ElementTree.fromstring(re.search("<svg.*</svg>", scene._repr_html_())[0])
+    polygons = list(root)
+    assert len(polygons) == 2 * 3 * 8  # two bodies, three sides, eight triangles each
+    corners = np.array([[float(x) for x in re.split("[ ,]", polygon.get("points"))] for polygon in polygons])
+    width, height = float(root.get("width")), float(root.get("height"))
+    assert (
+        (corners >= 4.9).all() and (corners[:, ::2] <= width - 4.9).all() and (corners[:, 1::2] <= height - 4.9).all()
+    )
+    see_through = [polygon.get("fill-opacity") is not None for polygon in polygons]
+    assert sum(see_through) == 24
+    assert corners[np.array(see_through), 1::2].mean() < corners[~np.array(see_through), 1::2].mean()  # it is above
+    assert len({polygon.get("fill") for polygon in polygons}) == 6
+
+
+def test_a_scene_in_the_plane_is_drawn_as_it_lies():
+    scene = Scene.of([[0, 0], [2, 0], [0, 1]], [[0, 1, 2]])
+    root = ElementTree.fromstring(re.search("<svg.*</svg>", scene._repr_html_())[0])
+    assert root[0].get("points") == "5,180 355,180 5,5"
+
+
+def test_a_scene_of_very_many_triangles_has_a_table_only(monkeypatch):
+    monkeypatch.setattr(scene_summary, "MOST_TRIANGLES", 5)
+    shown = two_tetrahedra()._repr_html_()
+    assert "<svg" not in shown and "<th" in shown
+
+
+@pytest.mark.parametrize("extra", [True, False])
+def test_an_answer_is_a_table_and_a_picture_if_matplotlib_is_there(monkeypatch, extra):
+    if not extra:
+        monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    shown = answer()._repr_html_()
+    assert ("data:image/png;base64,iVBOR" in shown) == extra
+    assert "&lt;b&gt;toy" in shown and "<b>toy" not in shown
+    assert "<th" in answer(position=TRUTH.position[:0], stress=None, frames=(), failure="too far")._repr_html_()
