@@ -85,7 +85,7 @@ class RunFile(RunFolder):
 
     @cached_property
     def origin(self) -> dict[str, Any]:
-        return {"data": self._facts["data"]}
+        return {key: self._facts[key] for key in ("data", "specification") if key in self._facts}
 
     @cached_property
     def chosen(self) -> Chosen:
@@ -144,6 +144,7 @@ def write(path: Path, run: RunFolder, model: Simulator, licence: str | None = No
         "step": chosen.step,
         "answers": chosen.answers,
         "data": run.origin["data"],
+        **({"specification": run.specification} if run.specification else {}),
     }
     weights = {key: tensor.detach().clone().contiguous() for key, tensor in model.state_dict().items()}
     members = {
