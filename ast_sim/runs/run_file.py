@@ -144,9 +144,8 @@ def write(path: Path, run: RunFolder, model: Simulator, licence: str | None = No
         "step": chosen.step,
         "answers": chosen.answers,
         "data": run.origin["data"],
+        **({"specification": run.specification} if run.specification else {}),
     }
-    if run.specification is not None:
-        facts["specification"] = run.specification
     weights = {key: tensor.detach().clone().contiguous() for key, tensor in model.state_dict().items()}
     members = {
         _CARD: card(path.stem, without_path, run.scope, chosen, sum(p.numel() for p in model.parameters())).encode(),
