@@ -195,7 +195,7 @@ def _table(shown: dict[str, Any]) -> list[str]:
         seconds = [scene["seconds"] for scene in found["scenes"]]
         lines.append("| " + " | ".join([
             row["title"],
-            f"{row['train']:,} scenes, {row['steps']:,} steps",
+            _trained_text(row),
             f"{found['minutes']:.0f}",
             Effort(**found["effort"]).text if row["model_settings"].get("jumps", True) else "every frame",
             _percent(errors),
@@ -205,6 +205,12 @@ def _table(shown: dict[str, Any]) -> list[str]:
             beside_solver(found["scenes"], errors, seconds),
         ]) + " |")  # fmt: skip
     return lines
+
+
+def _trained_text(row: dict[str, Any]) -> str:
+    calls = row["settings"].get("calls", 1)
+    together = f", {calls} calls trained together" if calls > 1 else ""
+    return f"{row['train']:,} scenes, {row['steps']:,} steps{together}"
 
 
 def _percent(errors: list[float | None]) -> str:
