@@ -66,10 +66,9 @@ def convert_series(
     Args:
         source: one simulation (see `read_series`), or a folder of several; then their paths, without suffix, are names.
         out: the dataset file; it is written whole or not at all.
-        names: the names of the fields in the files.
-        splits: for each of "train", "valid" and "test" the names of its simulations (others are left out), or its
-            share of all simulations. Shares add up to 1 and are drawn at random with `seed`; each above 0 gets at least
-            one simulation. The default is 0.8, 0.1, 0.1; it needs three.
+        names: the names of the fields.
+        splits: for each split the names of its simulations (others are left out), or its share, drawn with `seed`.
+            Shares add up to 1; each above 0 gets one simulation at least. The default is 0.8, 0.1, 0.1; it needs three.
         integration, contact_radius, time_step: as in `DatasetInfo`.
         length_unit: as in `DatasetInfo`; None is "m". Beside a deck it must be given, and `names.stress_unit`.
         deck: the deck of CalculiX (`.inp`) whose results the source is; see `read_job` and `decks_of`.

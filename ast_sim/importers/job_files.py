@@ -19,7 +19,7 @@ _SOFTEST = 1e2
 _STIFFEST = 2e12
 
 
-def decks_of(source: Path, found: Mapping[str, Path], deck: Path | str | None, names: FieldNames) -> dict[str, Path]:
+def decks_of(source: Path, series: Mapping[str, Path], deck: Path | str | None, names: FieldNames) -> dict[str, Path]:
     """The decks of the simulations that have one: `deck`, or in a folder those with the names of `.frd` files, unless
     the field of the displacement is named: then the results are read alone.
 
@@ -29,10 +29,10 @@ def decks_of(source: Path, found: Mapping[str, Path], deck: Path | str | None, n
     if deck is not None:
         if source.suffix.lower() != ".frd":
             raise DatasetError(f"{source}: beside a deck, results must be a file of CalculiX (.frd)")
-        return dict.fromkeys(found, Path(deck))
+        return dict.fromkeys(series, Path(deck))
     if not source.is_dir() or names.displacement is not None:
         return {}
-    beside = {name: path.with_suffix(".inp") for name, path in found.items() if path.suffix.lower() == ".frd"}
+    beside = {name: path.with_suffix(".inp") for name, path in series.items() if path.suffix.lower() == ".frd"}
     return {name: path for name, path in beside.items() if path.is_file()}
 
 

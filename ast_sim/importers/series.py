@@ -16,14 +16,14 @@ from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.formats.together import together
 from ast_sim.importers.frame_order import frame_files, ordered
 from ast_sim.importers.frames_in_file import frames_in
-from ast_sim.importers.jobs.job import Job, read_job
-from ast_sim.importers.jobs.job_results import job_frames
 from ast_sim.importers.mesh_file import MeshFile, mesh_of, raw_field
 from ast_sim.importers.scene_mesh import clamped
 from ast_sim.importers.shells import Shells
 from ast_sim.importers.solids.frames_match import order_of_cells
 from ast_sim.importers.solids.mesh_elements import require_extent
 from ast_sim.importers.solids.stitching import Stitching
+from ast_sim.importers.solved_jobs.job import Job, read_job
+from ast_sim.importers.solved_jobs.job_results import job_frames
 from ast_sim.importers.stress import STRESS_UNITS, order_of, von_mises
 from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.support.errors import DatasetError

@@ -132,8 +132,7 @@ class Run:
 
         The scene may lie anywhere: if it leaves the model's domain, it is moved to the middle of the domain, predicted
         and moved back. A property outside its range in the training scenes gives a warning, and so do Newton steps that
-        have not converged, and each way in which a specification differs from the one of the training: another file of
-        a part, another hold, a value outside its range.
+        have not converged, and each way in which a specification differs from the one of the training.
 
         Args:
             scene: a scene, with lengths in the run's unit, or what `read_scene` returns. Or a `Trajectory`: its
@@ -157,8 +156,7 @@ class Run:
             throw: raise an error if the prediction fails; else the answer says why in `failure`.
 
         Raises:
-            ConfigError: the motion does not fit the scene, the scene does not fit the run, or a specification has a
-                mistake.
+            ConfigError: motion and scene, or scene and run, do not fit, or a specification has a mistake.
             DatasetError: an array has another dtype or shape, or holds numbers that are not finite.
             RolloutError: there is no such frame; or the prediction failed: the error's `answer` has the frames before.
         """

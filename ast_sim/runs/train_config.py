@@ -21,7 +21,7 @@ class TrainConfig:
 
     steps: int | None = setting(None, "optimizer steps; unset: as many as `epochs` asks for")
     minutes: float | None = setting(
-        None, "minutes of training: 50 steps are timed first, then the number of steps is fixed; leave `steps` unset"
+        None, "minutes of training: 50 steps are timed, then `steps` is fixed; unset: `steps` or `epochs` decides"
     )
     epochs: int = setting(100, "passes over the training pairs, if neither `steps` nor `minutes` is set")
     batch_size: int = setting(48, "scenes in a batch; each scene is a pair of frames")

@@ -227,9 +227,7 @@ def start_training(
             begin = partial(Training, folder, dataset=dataset, scales=scales, signals=signals, processes=processes)
             asked = _with_steps(asked, saved, fit, begin)
             resolved = asked if config is None else fit(asked)
-            batch_size = resolved.train.batch_size
-            if batch_size % processes.count:
-                raise ConfigError(f"train.batch_size = {batch_size} cannot be cut for {processes.count} processes")
+            _require_cuttable(resolved.train.batch_size, processes.count)
             if source is not None:
                 _require_fit(source, resolved, dataset, scales)
             if saved is not None:
@@ -237,8 +235,8 @@ def start_training(
             elif processes.leads:
                 start = None if source is None else source.start()
                 scope = scope_of(dataset, resolved.model.data)
-                specification = dataset.info.generator.get("spec")
-                write_config(folder.path, resolved, scope, dataset.fingerprint(), start, specification)
+                spec = dataset.info.generator.get("spec")
+                write_config(folder.path, resolved, scope, dataset.fingerprint(), start, spec)
             with begin(config=resolved) as training:
                 if profile_steps:
                     training.profile(profile_steps)
@@ -308,6 +306,11 @@ def _told_by_leader(processes: Processes) -> Iterator[None]:
         return
     with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
         yield
+
+
+def _require_cuttable(batch_size: int, processes: int) -> None:
+    if batch_size % processes:
+        raise ConfigError(f"train.batch_size = {batch_size} cannot be cut for {processes} processes")
 
 
 def _require_fit(source: RunFolder, config: RunConfig, dataset: Dataset, scales: DataScales) -> None:

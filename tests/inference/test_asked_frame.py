@@ -169,7 +169,7 @@ def test_friction_knows_the_frame_before_if_that_is_wanted_too(pressed, monkeypa
 def test_newton_steps_need_a_material(one, pressed):
     truth, model = pressing(pressed, 0.7)
     question = [Question.of(truth, "plate", [-1])]
-    model.config = replace(model.config, young=0.0)
+    model.config = replace(model.config, data=replace(model.config.data, young=0.0))
     with pytest.raises(ConfigError, match="newton_steps is 1; they need tetrahedra and their material"):
         answers(model, question, Effort(0, 1))
     model.config = replace(model.config, jumps=False)

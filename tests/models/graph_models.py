@@ -26,6 +26,11 @@ def resolved(config: ModelConfig, radius: float = 0.06, **kind: bool) -> ModelCo
     return replace(config, world_radius=radius).resolve(DataFacts.of(toy.info(**kind), 0, 0.1))
 
 
+def with_stress(config: ModelConfig, stress: str, **changes: object) -> ModelConfig:
+    """The settings with another place of the stress in the data."""
+    return replace(config, data=replace(config.data, stress=stress), **changes)
+
+
 def batch_of(model: Simulator, *seeds: int) -> Batch:
     """One batch of toy scenes in frame 3."""
     scenes = [toy.plate(seed, dynamic=model.config.data.dynamic) for seed in seeds]

@@ -434,7 +434,7 @@ def test_what_the_dataset_decides():
     assert config.data.domain_center == (1.0, 2.0, 3.0) and config.data.domain_half_width == 4.0
     assert config.L_cell == 6 and config.cell_side == pytest.approx(0.125)  # 1 + log2(4 / 0.15) = 5.7
     nodal = tiny.resolve(DataFacts.of(replace(info, stress_location="node"), 0, mesh_spacing=0.1))
-    assert nodal.element_inputs == () and nodal.stress == "node"
+    assert nodal.element_inputs == () and nodal.data.stress == "node"
     moving = DataFacts.of(replace(info, integration="dynamic"), 0, mesh_spacing=0.1)
     dynamic = tiny.resolve(moving)
     assert dynamic.node_inputs == ("displacement", "velocity") and dynamic.element_inputs == ("displacement",)

@@ -7,7 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 import toy
-from graph_models import assert_follows, batch_of, deep_mlp, made, resolved
+from graph_models import assert_follows, batch_of, deep_mlp, made, resolved, with_stress
 from toy import one_thread  # noqa: F401
 
 from ast_sim.models.bsms import PRESETS, BSMSConfig
@@ -101,7 +101,7 @@ def formulas(model, batch):
     ],
 )
 def test_it_follows_the_formulas(stress, more):
-    model, batch = made(replace(resolved(SMALL, 0.07), stress=stress, **more), 0, 1)
+    model, batch = made(with_stress(resolved(SMALL, 0.07), stress, **more), 0, 1)
     assert all(len(contacts) > 4 for contacts in model.contacts(batch))
     assert_follows(model, batch, formulas(model, batch))
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from checks import assert_accurate
-from graph_models import assert_follows, batch_of, deep_mlp, made, resolved
+from graph_models import assert_follows, batch_of, deep_mlp, made, resolved, with_stress
 from toy import one_thread  # noqa: F401
 
 from ast_sim.models import hcmt as attention_module
@@ -119,7 +119,7 @@ def formulas(model, batch):
 
 @pytest.mark.parametrize("stress", ["none", "node", "element"])
 def test_it_follows_the_formulas(stress):
-    model, batch = made(replace(resolved(SMALL), stress=stress), 0, 1)
+    model, batch = made(with_stress(resolved(SMALL), stress), 0, 1)
     assert len(model.world(batch)) > 20 and len(batch.graph.own.edges[2]) > 10
     assert_follows(model, batch, formulas(model, batch))
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from graph_models import assert_follows, batch_of, deep_mlp, made, resolved
+from graph_models import assert_follows, batch_of, deep_mlp, made, resolved, with_stress
 from toy import one_thread  # noqa: F401
 
 from ast_sim.batches.graph import edge_vectors
@@ -46,7 +46,7 @@ def formulas(model, batch):
 @pytest.mark.parametrize("layers", [1, 2])
 @pytest.mark.parametrize("stress", ["none", "node", "element"])
 def test_it_follows_the_formulas(stress, layers):
-    model, batch = made(replace(resolved(SMALL), stress=stress, hidden_layers=layers), 0, 1)
+    model, batch = made(with_stress(resolved(SMALL), stress, hidden_layers=layers), 0, 1)
     assert len(model.world(batch)) > 20
     assert_follows(model, batch, formulas(model, batch))
 

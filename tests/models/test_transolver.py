@@ -279,7 +279,7 @@ def test_number_of_parameters_of_the_original():
     A block: a and v 128 -> 256: 33024; slices 16 -> 64: 1088; temperatures 8; query, key, value 3 * 256; out 16512;
     MLP 128 -> 128 -> 128: 33024; two norms 512: 84936.
     """
-    model = build_model(replace(PRESETS["original"].model, stress="node"))
+    model = build_model(replace(PRESETS["original"].model, data=DataFacts(stress="node"), boundary_motion=True))
     expected = 12 * 256 + 256 + 256 * 128 + 128 + 8 * 84936 + 256 + 128 * 4 + 4
     assert sum(p.numel() for p in model.parameters()) == expected == 716484
 

@@ -119,7 +119,7 @@ def test_it_is_an_input_of_any_model(tmp_path):
         assert "proximity" in config.model.node_inputs
         start_training(tmp_path / model, config)
     batch = batch_of(0)
-    config = replace(config.model, proximity_radius=0.1)
+    config = replace(config.model, proximity_radius=0.1, boundary_motion=True)
     features = node_features(config, batch)
     assert features.shape[1] == normalizer_of(config, "node").width == 3 + 5 + 3
     assert torch.equal(features[:, 3:8], near(batch, 0.1))

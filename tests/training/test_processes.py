@@ -43,7 +43,11 @@ def data(tmp_path_factory) -> Path:
 
 @pytest.mark.parametrize(
     "along",
-    [[], ["--set", "train.rollout_pool=8"], ["--set", "model.jumps=true", "--set", "train.calls=3"]],
+    [
+        [],
+        ["--set", "train.rollout_pool=8"],
+        ["--set", "model.jumps=true", "--set", "train.noise=none", "--set", "train.calls=3"],
+    ],
     ids=["pairs", "rollouts", "jumps"],
 )
 def test_two_processes_do_what_one_does(data, tmp_path, along):

@@ -104,12 +104,13 @@ def recipe_of(name: str, info: DatasetInfo, made_from: str | os.PathLike[str] | 
         raise SimulationError(f"{name} was made of {own[key]}: say where to find that (--made-from)")
     parts, spec = (None if made_from is None or key != which else Path(made_from) for which in own)
     try:
-        seed = made["seed"]
-        nodes = made.get("nodes")
-        frames = made.get("frames")
+        numbers = whole(seed=made["seed"], nodes=made.get("nodes"), frames=made.get("frames"))
+    except (KeyError, SimulationError) as error:
+        raise SimulationError(f"{name}: its settings cannot be read ({error!r})") from error
+    try:
         keep = made.get("keep")
-        recipe = checked_recipe(family_module(family), family, seed, nodes, frames, None, parts, False, keep, spec)
-    except (KeyError, TypeError) as error:
+        recipe = checked_recipe(family_module(family), family, *numbers, None, parts, False, keep, spec)
+    except TypeError as error:
         raise SimulationError(f"{name}: its settings cannot be read ({error!r})") from error
     if parts is not None and _source(parts).describe().get("parts") != made["parts"]:
         raise SimulationError(f"{parts} holds other parts than those that {name} was made of")

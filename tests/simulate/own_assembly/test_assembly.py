@@ -310,7 +310,7 @@ def test_the_solver_goes_straight_to_a_frame(tmp_path):
 
 def test_a_draw_that_cannot_stand_is_drawn_again(tmp_path):
     """Both ends of each range are fine, but not where they come together."""
-    spec = SPEC.replace("[0.5, 1.5]", "[0.5, 1.5]\na = [0, 0.16]\nb = [0, 0.16]")
+    spec = SPEC.replace("[0.5, 1.5]", "[0.5, 1.5]\na = [0, 0.22]\nb = [0, 0.22]")
     spec = read_spec(write_assembly(tmp_path, spec.replace("rigid", 'offset = [0, 0, "0.1 - a - b"]\nrigid')))
     assembly.check_spec(replace(spec), None, spec.frames)
     again = [assembly.draw_scene(spec, (0, 0, i), None, 3).case.attributes["redrawn"] for i in range(12)]

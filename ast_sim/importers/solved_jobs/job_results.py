@@ -11,7 +11,7 @@ import numpy as np
 
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.formats.vtk_files import vtk_frames
-from ast_sim.importers.jobs.job import Job
+from ast_sim.importers.solved_jobs.job import Job
 from ast_sim.importers.stress import order_of, von_mises
 from ast_sim.support.errors import DatasetError
 

@@ -12,7 +12,7 @@ from ast_sim.importers.decks.deck_mesh import mesh_of_deck
 from ast_sim.importers.decks.deck_numbers import real, tokens, whole
 from ast_sim.importers.decks.keyword_lines import Keyword, Line
 from ast_sim.importers.formats.source_mesh import SourceMesh
-from ast_sim.importers.jobs.job_materials import MATERIAL_KEYWORDS, material_columns
+from ast_sim.importers.solved_jobs.job_materials import MATERIAL_KEYWORDS, material_columns
 from ast_sim.number_arrays import connected_parts
 from ast_sim.scene import NodeType
 from ast_sim.support.errors import DatasetError
