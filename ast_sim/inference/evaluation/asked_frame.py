@@ -34,6 +34,7 @@ def asked_frames(
     split: str,
     effort: Effort,
     rival_scenes: int = 0,
+    most_scenes: int | None = None,
     progress: Callable[[str], None] | None = None,
     made_from: str | os.PathLike[str] | None = None,
 ) -> AskedFigures:
@@ -41,13 +42,14 @@ def asked_frames(
 
     Args:
         effort: what follows the first call of a model that jumps.
+        most_scenes: only the first scenes of the split are predicted, at most so many; None: all.
         rival_scenes: in so many scenes the solver goes to the same frame, in several ways; see `simulate.jobs.rival`.
         made_from: the specification or the parts of which the dataset was made, if any; the solver needs them.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        indices = dataset.with_frames(split, model.config.data.given_frames + 1)
+        indices = dataset.with_frames(split, model.config.data.given_frames + 1)[:most_scenes]
         scenes = []
         for index in indices:
             scenes.append(_scene(model, dataset, split, index, effort))
