@@ -34,17 +34,17 @@ def asked_frames(
     split: str,
     effort: Effort,
     rival_scenes: int = 0,
-    most_scenes: int | None = None,
     progress: Callable[[str], None] | None = None,
     made_from: str | os.PathLike[str] | None = None,
+    most_scenes: int | None = None,
 ) -> AskedFigures:
     """Predict the deepest frame of each scene of a split, alone and on one thread.
 
     Args:
         effort: what follows the first call of a model that jumps.
-        most_scenes: only the first scenes of the split are predicted, at most so many; None: all.
         rival_scenes: in so many scenes the solver goes to the same frame, in several ways; see `simulate.jobs.rival`.
         made_from: the specification or the parts of which the dataset was made, if any; the solver needs them.
+        most_scenes: only the first scenes of the split are predicted, at most so many; None: all.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
