@@ -153,8 +153,7 @@ def verdict(validated: list[Validated], best: float, unit: str) -> Verdict:
         record = {"valid_rmse": None, "failure": failure}
         return Verdict(None, FIRST_CALL, [], record, f"prediction failed: {failure}")
     validated = sorted(validated, key=lambda scene: scene.index)
-    by_calls = [rmse_sequence(errors) for errors in zip(*(scene.errors for scene in validated), strict=True)]
-    hold = rmse_sequence([scene.hold for scene in validated])
+    by_calls, hold = _errors_and_hold(validated)
     network = Effort(_corrections(by_calls))
     error = by_calls[network.corrections]
     by_effort = mean_errors([scene.by_effort for scene in validated if scene.by_effort])
@@ -175,6 +174,12 @@ def verdict(validated: list[Validated], best: float, unit: str) -> Verdict:
     return Verdict(error, effort, by_effort, record, text)
 
 
+def _errors_and_hold(validated: list[Validated]) -> tuple[list[float], float]:
+    """The error of all scenes after each call, and the one of the prediction that nothing moves."""
+    by_calls = [rmse_sequence(errors) for errors in zip(*(scene.errors for scene in validated), strict=True)]
+    return by_calls, rmse_sequence([scene.hold for scene in validated])
+
+
 def _corrections(by_calls: list[float]) -> int:
     """The number of corrections after which no further call lowers the error by more than `ENOUGH`."""
     return next(i for i, error in enumerate(by_calls) if min(by_calls[i:]) >= (1 - ENOUGH) * error)
@@ -190,6 +195,5 @@ def error_share(validated: list[Validated]) -> float | None:
     failed or nothing moves."""
     if not validated or any(scene.failure for scene in validated):
         return None
-    hold = rmse_sequence([scene.hold for scene in validated])
-    by_calls = [rmse_sequence(errors) for errors in zip(*(scene.errors for scene in validated), strict=True)]
+    by_calls, hold = _errors_and_hold(validated)
     return min(by_calls) / hold if hold else None

@@ -3,27 +3,15 @@
 from types import SimpleNamespace
 
 import pytest
-import toy
 from toy import one_thread  # noqa: F401 (used by being imported)
 
-from ast_sim.runs import folder as run_folder
 from ast_sim.runs.config_toml import read_config
 from ast_sim.runs.metrics import Metrics
 from ast_sim.support.errors import ConfigError
 from ast_sim.training import loop, start, time_budget
 
+pytestmark = pytest.mark.usefixtures("linear")
 SMALL = ["train.batch_size=2", "train.statistics_pairs=4", "train.checkpoint_every=5"]
-
-
-@pytest.fixture(autouse=True)
-def linear(monkeypatch):
-    monkeypatch.setattr(loop, "build_model", toy.LinearSimulator)
-    monkeypatch.setattr(run_folder, "build_model", toy.LinearSimulator)
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return toy.write(tmp_path_factory.mktemp("data") / "toy.h5")
 
 
 def minutes(data, value: float, *more: str):

@@ -20,7 +20,6 @@ from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.registry import find_model, find_preset
 from ast_sim.models.transolver import TransolverConfig
 from ast_sim.runs import checkpoint
-from ast_sim.runs import folder as run_folder
 from ast_sim.runs.config_toml import has_config, read_config, write_config
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.metrics import Metrics
@@ -38,18 +37,6 @@ DYNAMIC = DataFacts(integration="dynamic")
 SCALES = DataScales(displacement=0.01, increment=0.002, spacing=0.1, nodes=40, trajectories=3, pairs=100)
 
 JUMPS = ("model.jumps=true", "model.boundary_motion=false")
-
-
-@pytest.fixture
-def linear(monkeypatch):
-    """The linear model in the place of AST."""
-    monkeypatch.setattr(loop, "build_model", toy.LinearSimulator)
-    monkeypatch.setattr(run_folder, "build_model", toy.LinearSimulator)
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return toy.write(tmp_path_factory.mktemp("data") / "toy.h5")
 
 
 def settings(data, *assignments: str) -> RunConfig:

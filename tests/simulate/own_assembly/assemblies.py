@@ -28,6 +28,25 @@ rigid = true
 move = { translation = [0, 0, '-travel'] }
 """
 
+# A strip that is held at one end, and a rigid roller that comes down on the other.
+STRIP = """
+unit = "mm"
+frames = 3
+contact_distance = 0.02
+{settings}
+[parameters]
+down = [1, 2]
+[parts.strip]
+file = "strip.vtu"
+young = 1e9
+poisson = 0.3
+fixed = "xmin"
+[parts.roller]
+file = "roller.vtu"
+rigid = true
+move = {{ translation = [0, 0, "-0.2 - down"] }}
+"""
+
 
 def box(low, high, cells):
     lines = [np.linspace(a, b, n + 1) for a, b, n in zip(low, high, cells, strict=True)]

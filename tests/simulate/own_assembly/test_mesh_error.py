@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from simulate.own_assembly.assemblies import SPEC, box, write_assembly, write_box
+from simulate.own_assembly.assemblies import SPEC, STRIP, box, write_assembly, write_box
 
 from ast_sim.simulate.families import assembly
 from ast_sim.simulate.jobs import mesh_error as module
@@ -14,24 +14,6 @@ from ast_sim.simulate.own_assembly.parameters import completed
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.support.errors import SimulationError
 
-STRIP = """
-unit = "mm"
-frames = 3
-contact_distance = 0.02
-order = 1
-friction = {friction}
-[parameters]
-down = [1, 2]
-[parts.strip]
-file = "strip.vtu"
-young = 1e9
-poisson = 0.3
-fixed = "xmin"
-[parts.roller]
-file = "roller.vtu"
-rigid = true
-move = {{ translation = [0, 0, "-0.2 - down"] }}
-"""
 SCRIPT = """
 def block(gmsh):
     gmsh.model.occ.addBox(0, 0, 0, 10, 10, 5)
@@ -51,7 +33,7 @@ def write_strip(folder, friction=0.0):
     write_box(folder / "strip.vtu", (0, -5, 0), (60, 5, 1), (30, 5, 1))
     write_box(folder / "roller.vtu", (49, -6, 1.2), (51, 6, 4), (2, 6, 2))
     path = folder / "SPEC.toml"
-    path.write_text(STRIP.format(friction=friction))
+    path.write_text(STRIP.format(settings=f"order = 1\nfriction = {friction}"))
     return path
 
 

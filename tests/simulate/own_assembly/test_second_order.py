@@ -5,7 +5,7 @@ import re
 import meshio
 import numpy as np
 import pytest
-from simulate.own_assembly.assemblies import SPEC, box, write_assembly
+from simulate.own_assembly.assemblies import SPEC, STRIP, box, write_assembly
 
 from ast_sim.cli import main
 from ast_sim.element_topology import MIDDLES
@@ -20,23 +20,6 @@ DEFAULT = SPEC.replace("order = 1\n", "")
 BALL = """
 def ball(gmsh, radius):
     gmsh.model.occ.addSphere(0, 0, radius + 5.3, radius)
-"""
-STRIP = """
-unit = "mm"
-frames = 3
-contact_distance = 0.02
-{order}
-[parameters]
-down = [1, 2]
-[parts.strip]
-file = "strip.vtu"
-young = 1e9
-poisson = 0.3
-fixed = "xmin"
-[parts.roller]
-file = "roller.vtu"
-rigid = true
-move = {{ translation = [0, 0, "-0.2 - down"] }}
 """
 
 
@@ -106,7 +89,7 @@ def test_the_reaction_of_a_strip_that_bends_is_that_of_a_beam(tmp_path):
         meshio.Mesh(position, {"tetra": elements}).write(tmp_path / f"{name}.vtu")
     forces = {}
     for order in ("order = 1", ""):
-        (tmp_path / "SPEC.toml").write_text(STRIP.format(order=order))
+        (tmp_path / "SPEC.toml").write_text(STRIP.format(settings=order))
         found = assembly.in_newton(assembly.solve(scene_of(tmp_path / "SPEC.toml", down=2).case), "mm")
         assert found.attributes["status"] == "complete"
         forces[order] = found.attributes["reaction"][-1]
