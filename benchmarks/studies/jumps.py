@@ -76,6 +76,12 @@ ROWS = {
     "plates400": Row(
         "Plates, 400 nodes, 10,000 steps", steps=10_000, settings=_MIRRORED, rivals=10, **_PLATES_400
     ),
+    "plates400_seed1": Row(
+        "Plates, 400 nodes, second seed", steps=10_000, settings={**_MIRRORED, "seed": 1}, **_PLATES_400
+    ),
+    "plates400_seed2": Row(
+        "Plates, 400 nodes, third seed", steps=10_000, settings={**_MIRRORED, "seed": 2}, **_PLATES_400
+    ),
     "plates400_long": Row(
         "Plates, 400 nodes, 20,000 steps", steps=20_000, settings=_MIRRORED, rivals=10, **_PLATES_400
     ),
