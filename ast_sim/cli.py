@@ -135,6 +135,8 @@ def _add_generate(generate: _Parser) -> None:
         "--test N": "number of test scenes (default: a tenth of --count)",
     }
     _add_each(generate, splits, type=at_least(0))
+    about = "number of scenes of the split calibration, on which a trained run measures its errors (default: 0)"
+    _add_each(generate, {"--calibration N": about}, type=at_least(0), default=0)
     sizes = {"--nodes N": "approximate number of nodes of a scene", "--frames N": "number of frames of a scene"}
     _add_each(generate, sizes, type=at_least(1))
     about = "solve and store only frame 0 and these, such as 1,5,20, each straight from the one before (default: all)"
@@ -175,6 +177,8 @@ def _add_convert(convert: _Parser) -> None:
     kind = convert.add_argument_group("properties of a dataset made from such files")
     about = "shares of the simulations, drawn at random (default: 0.8 0.1 0.1 of three or more)"
     kind.add_argument("--shares", nargs=3, type=float, metavar=("TRAIN", "VALID", "TEST"), help=about)
+    about = "so many simulations are drawn first, for the split calibration; the shares divide the others (default: 0)"
+    _add_each(kind, {"--calibration N": about}, type=at_least(0), default=0)
     kind.add_argument("--seed", type=at_least(0), default=0, help="seed of this draw (default: 0)")
     kind.add_argument("--incomplete", action="store_true", help="convert although nothing moves or is prescribed")
     kind.add_argument("--strict", action="store_true", help="refuse simulations in which something looks wrong")

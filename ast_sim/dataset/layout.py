@@ -18,7 +18,7 @@ from ast_sim.support.errors import DatasetError
 FORMAT = "ast_sim"
 VERSION = 2
 HASH = "sha256"  # attribute of every array and, over these and its attributes, of every trajectory
-SPLITS: tuple[str, ...] = ("train", "valid", "test")
+SPLITS: tuple[str, ...] = ("train", "valid", "test", "calibration")
 
 ARRAYS: dict[str, tuple[type, int]] = {
     "rest_position": (np.float32, 2),

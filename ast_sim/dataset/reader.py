@@ -1,9 +1,9 @@
 """Reading a dataset file; its content is checked, never trusted.
 
-Layout: the root has the attributes of `DatasetInfo`, `format` and `version`. It holds the groups `train`, `valid` and
-`test`. Each of them holds one group per trajectory (`000000`, `000001`, ...) with the arrays of `Scene` and
-`Trajectory`. Each frame is a chunk. To find flipped bits, every array has the Fletcher-32 filter, and the version of
-HDF5's file format is one that adds checksums to its own structures.
+Layout: the root has the attributes of `DatasetInfo`, `format` and `version`. It holds the groups `train`, `valid`,
+`test` and `calibration`. Each of them holds one group per trajectory (`000000`, `000001`, ...) with the arrays of
+`Scene` and `Trajectory`. Each frame is a chunk. To find flipped bits, every array has the Fletcher-32 filter, and the
+version of HDF5's file format is one that adds checksums to its own structures.
 """
 
 from __future__ import annotations
@@ -112,6 +112,12 @@ class Dataset:
 
     def close(self) -> None:
         self._file.close()
+
+    @property
+    def calibration(self) -> Split:
+        """Scenes for measuring the errors of a trained model beforehand: they take no part in its training, in the
+        choice of its checkpoint and in its test."""
+        return self["calibration"]
 
     @property
     def material_width(self) -> int:

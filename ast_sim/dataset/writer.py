@@ -61,7 +61,7 @@ class DatasetWriter:
         self._file = h5py.File(self._disk, "w", libver=("v110", "v110"))
 
     def add(self, split: str, trajectory: Trajectory) -> None:
-        """Check a trajectory and append it to the split "train", "valid" or "test"."""
+        """Check a trajectory and append it to the split "train", "valid", "test" or "calibration"."""
         if split not in SPLITS:
             raise DatasetError(f"{self.path}: there is no split {split!r}; use one of {', '.join(SPLITS)}")
         name = f"{split}/{self.counts[split]:06d}"

@@ -57,7 +57,7 @@ def test_what_was_written_is_read(tmp_path, stress):
     assert os.listdir(path.parent) == ["d.h5"]
     with Dataset(path) as dataset:
         assert dataset.info == info(stress_location=stress, time_step=0.5, generator=generator)
-        assert dataset.splits == {"train": 2, "valid": 0, "test": 1} and dataset.count("train") == 2
+        assert dataset.splits == {"train": 2, "valid": 0, "test": 1, "calibration": 0} and dataset.count("train") == 2
         assert (dataset.material_width, dataset.element_size) == (1, 4)
         for split, members in given.items():
             for index, member in enumerate(members):
@@ -326,7 +326,7 @@ def test_an_error_while_writing_leaves_the_old_file(tmp_path):
     assert path.read_bytes() == before and os.listdir(tmp_path) == ["d.h5"]
     write(path, {"valid": [trajectory(two_tetrahedra(), 2)]})
     with Dataset(path) as dataset:
-        assert dataset.splits == {"train": 0, "valid": 1, "test": 0}
+        assert dataset.splits == {"train": 0, "valid": 1, "test": 0, "calibration": 0}
 
 
 LARGE = """

@@ -157,7 +157,7 @@ def test_a_folder_of_jobs(press, tmp_path):
         for file in press:
             (tmp_path / f"{name}{file.suffix}").write_bytes(file.read_bytes())
     counts = convert(tmp_path, tmp_path / "d.h5", names=NAMES, length_unit="mm", splits={"train": 0.5, "test": 0.5})
-    assert counts == {"train": 1, "valid": 0, "test": 1}
+    assert counts == {"train": 1, "valid": 0, "test": 1, "calibration": 0}
     with pytest.raises(ConfigError, match=r"a.inp: a deck does not say its units"):
         convert(tmp_path, tmp_path / "e.h5", splits={"train": 1})
 
