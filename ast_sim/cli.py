@@ -21,6 +21,8 @@ from ast_sim.support.argument_types import at_least, path, whole_numbers
 from ast_sim.support.errors import AstSimError, ConfigError, printable
 from ast_sim.support.stop_signals import Interrupted
 
+CORNERS = "take only the corners of second-order tetrahedra: forces are then those of another, stiffer mesh"
+
 
 class _Parser(argparse.ArgumentParser):
     """A parser that reports wrong arguments in one line. Its help ends with the lines that `more` makes when it is
@@ -180,6 +182,7 @@ def _add_convert(convert: _Parser) -> None:
     about = "so many simulations are drawn first, for the split calibration; the shares divide the others (default: 0)"
     _add_each(kind, {"--calibration N": about}, type=at_least(0), default=0)
     kind.add_argument("--seed", type=at_least(0), default=0, help="seed of this draw (default: 0)")
+    kind.add_argument("--corners", action="store_true", help=CORNERS)
     kind.add_argument("--incomplete", action="store_true", help="convert although nothing moves or is prescribed")
     kind.add_argument("--strict", action="store_true", help="refuse simulations in which something looks wrong")
     kind.add_argument("--dynamic", action="store_true", help="inertia matters: models predict the acceleration")
@@ -257,6 +260,7 @@ def _add_predict(predict: _Parser) -> None:
         "--type-field NAME": "point field: 0 normal, 1 obstacle, 3 handle (default: node_type)",
     }
     _add_each(mesh, fields)
+    mesh.add_argument("--corners", action="store_true", help=CORNERS)
     data = predict.add_argument_group("if SCENE is a dataset")
     data.add_argument("--split", choices=commands.SPLITS, default="test", help="split (default: test)")
     _add_each(data, {"--index I": "number of the trajectory in the split"}, type=at_least(0))

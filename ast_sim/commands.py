@@ -103,6 +103,7 @@ def convert(args: argparse.Namespace) -> None:
             "time_step": args.time_step,
             "length_unit": args.length_unit,
             "deck": deck,
+            "corners": args.corners,
             "incomplete": args.incomplete,
             "strict": args.strict,
         }
@@ -291,6 +292,7 @@ def _scene(args: argparse.Namespace) -> Any:
         body_field=args.body_field,
         type_field=args.type_field,
         materials=dict(map(parse_material, args.material)) or None,
+        corners=args.corners,
     )
     print("\n".join(map(printable, read.description)))
     return read.scene

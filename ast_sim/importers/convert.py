@@ -58,6 +58,7 @@ def convert_series(
     time_step: float = 0.0,
     length_unit: str | None = None,
     deck: Path | str | None = None,
+    corners: bool = False,
     incomplete: bool = False,
     strict: bool = False,
     progress: Callable[[str], None] | None = None,
@@ -71,11 +72,11 @@ def convert_series(
         splits: for each split the names of its simulations (others are left out), or its share, drawn with `seed`.
             Shares add up to 1; each above 0 gets one simulation at least. The default is 0.8, 0.1, 0.1; it needs three.
         calibration: so many simulations are drawn first for the split "calibration"; shares divide the others.
-        integration, contact_radius, time_step: as in `DatasetInfo`.
-        length_unit: as in `DatasetInfo`; None is "m". Beside a deck it must be given, and `names.stress_unit`.
+        integration, contact_radius, time_step, length_unit: as in `DatasetInfo`; no unit is "m", but a deck needs one.
         deck: the deck of CalculiX (`.inp`) whose results the source is; see `read_job` and `decks_of`.
-        incomplete: accept simulations in which nothing moves, nothing is prescribed or nothing can be learnt.
-        strict: refuse simulations in which something looks wrong; see `ast_sim.plausibility`.
+        corners: take only the corners of second-order tetrahedra: no force of such a mesh is right.
+        incomplete: accept simulations in which nothing moves, is prescribed or can be learnt.
+        strict: refuse what looks wrong; see `ast_sim.plausibility`.
         progress: called with a line after each simulation, and with what looks wrong. None: that is a warning.
 
     Returns:
@@ -84,18 +85,17 @@ def convert_series(
     Raises:
         DatasetError: a file is wrong or lacks something; the text names it. Nothing is written then.
     """
-    source = Path(source)
     names = names or FieldNames()
-    series = find_series(source)
+    series = find_series(source := Path(source))
     decks = decks_of(source, series, deck, names)
     names = with_units(decks, names, length_unit)
     chosen = _assign(source, list(series), splits, calibration, seed)
     made_by = {"program": "ast_sim convert", "source": str(source), "names": asdict(names), "seed": seed}
-    facts = {"contact_radius": contact_radius, "time_step": time_step, "length_unit": length_unit or "m"}
-    facts |= {"family": source.stem, "integration": integration, "generator": made_by}
+    facts: dict[str, Any] = {"family": source.stem, "integration": integration, "generator": made_by}
+    facts |= {"contact_radius": contact_radius, "time_step": time_step, "length_unit": length_unit or "m"}
     findings: list[tuple[str, Finding]] = []
     with FittedWriter(out, stress_location="none", **facts) as writer:
-        for split, name, trajectory in _trajectories(series, decks, chosen, names, incomplete):
+        for split, name, trajectory in _trajectories(series, decks, chosen, names, corners, incomplete):
             if not any(writer.counts.values()):
                 made_by |= _facts_of_the_first(trajectory)
                 writer.info = replace(writer.info, stress_location=trajectory.stress_at, generator=made_by)
@@ -122,12 +122,13 @@ def _trajectories(
     decks: Mapping[str, Path],
     chosen: Sequence[tuple[str, str]],
     names: FieldNames,
+    corners: bool,
     incomplete: bool,
 ) -> Iterator[tuple[str, str, Trajectory]]:
     """The split, the name and the trajectory of each chosen simulation; all have the origin of the first."""
     origin = None
     for split, name in chosen:
-        trajectory = read_series(series[name], names, origin, decks.get(name))
+        trajectory = read_series(series[name], names, origin, decks.get(name), corners)
         if name in decks:
             doubt_modulus(decks[name], trajectory, names.stress_unit or "Pa")
         if not incomplete:

@@ -17,7 +17,8 @@ from vtkmodules.vtkIOHDF import vtkHDFWriter
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.importers.convert import convert, find_series
-from ast_sim.importers.series import FieldNames, far_origin, read_series
+from ast_sim.importers.series import FieldNames, read_series
+from ast_sim.importers.solids.positions import far_origin
 from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.support.errors import DatasetError
 from ast_sim.view import export
