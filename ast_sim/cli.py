@@ -176,6 +176,10 @@ def _add_convert(convert: _Parser) -> None:
     about = "components of the stress, such as xx,xy,xz,yy,yz,zz (default: as the file names them, else xx,yy,zz,...)"
     _add_each(fields, {"--stress-order XX,YY,...": about}, type=_stress_order, default=())
     _add_each(fields, {"--material NAME": "cell fields with one number each"}, nargs="+", default=[])
+    about = "a further field that the dataset keeps by its name, such as PEEQ or CPRESS=MPa; may be repeated"
+    _add_each(fields, {"--field NAME[=UNIT]": about}, action="append", default=[])
+    about = "point field with the forces on the nodes, such as RF, in newton (in the unit of force of a deck)"
+    _add_each(fields, {"--reaction NAME": about})
     kind = convert.add_argument_group("properties of a dataset made from such files")
     about = "shares of the simulations, drawn at random (default: 0.8 0.1 0.1 of three or more)"
     kind.add_argument("--shares", nargs=3, type=float, metavar=("TRAIN", "VALID", "TEST"), help=about)

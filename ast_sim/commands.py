@@ -93,8 +93,9 @@ def convert(args: argparse.Namespace) -> None:
     else:
         _refuse(args, args.of_records, f"{args.source}, which holds no .tfrecord files")
         fields = (args.displacement, args.stress, args.node_type, args.obstacle, args.handle, args.body)
+        more = (args.stress_order, args.stress_unit, tuple(args.field), args.reaction)
         options = {
-            "names": FieldNames(*fields, tuple(args.material), args.stress_order, args.stress_unit),
+            "names": FieldNames(*fields, tuple(args.material), *more),
             "splits": None if args.shares is None else dict(zip(SHARES, args.shares, strict=True)),
             "calibration": args.calibration,
             "seed": args.seed,

@@ -9,13 +9,12 @@ version of HDF5's file format is one that adds checksums to its own structures.
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 from collections.abc import Iterator
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import h5py
 import numpy as np
@@ -23,18 +22,19 @@ import numpy as np
 from ast_sim.dataset.guard import GuardedFile
 from ast_sim.dataset.layout import (
     ARRAYS,
-    FORMAT,
+    FIELD_KIND,
+    FIELDS,
     FRAMED,
     HASH,
     LENGTH_UNITS,
     NUMBERING,
     OPTIONAL,
     SPLITS,
-    VERSION,
     DatasetInfo,
     require_kind,
 )
 from ast_sim.dataset.split import Split
+from ast_sim.named_field import NamedField
 from ast_sim.number_arrays import require_finite
 from ast_sim.scene import AttributeValue, Scene, Trajectory
 from ast_sim.support.byte_cache import ByteCache
@@ -64,7 +64,7 @@ class Dataset:
         self._scale = 1.0
         self._file = GuardedFile(self.path)
         try:
-            self.info = self._in_unit(self._read_info(), length_unit)
+            self.info = self._in_unit(self._file.info(), length_unit)
             with self._file.reading("the list of samples"):
                 self.splits = {split: self._count(split) for split in SPLITS}
         except BaseException:
@@ -164,7 +164,7 @@ class Dataset:
         return position[start:stop], None if stress is None else stress[start:stop]
 
     def load(self, split: str, index: int) -> Trajectory:
-        """A trajectory without its `cauchy_stress`, which is large; `dataset[split][index]` has it."""
+        """A trajectory without its `cauchy_stress` and `fields`, which are large; `dataset[split][index]` has them."""
         position, stress = self.frames(split, index, 0, self.num_frames(split, index))
         frames, times = self._numbering(split, index)
         trajectory = Trajectory(
@@ -220,6 +220,21 @@ class Dataset:
         array = self._file.array(group, "cauchy_stress", shape)
         return self._finite(self._name(split, index), "element", array, start, stop)
 
+    def fields(self, split: str, index: int) -> dict[str, NamedField]:
+        """The named fields of a trajectory, all frames of them."""
+        group, count = self._group(split, index), self.num_frames(split, index)
+        if not self._file.has(group, FIELDS):
+            return {}
+        scene, name = self.scene(split, index), self._name(split, index)
+        stored = self._file.child(group, FIELDS, h5py.Group)
+        fields: dict[str, NamedField] = {}
+        for key in sorted(stored):
+            array = self._file.array(stored, key, kind=FIELD_KIND)
+            facts = self._file.attributes(array)
+            fields[key] = NamedField(self._file.read(array), str(facts.get("location")), str(facts.get("unit", "")))
+            fields[key].check(name, key, count, scene.num_nodes, scene.num_elements)
+        return fields
+
     def attributes(self, split: str, index: int) -> dict[str, AttributeValue]:
         """The status and the solver's records of a trajectory."""
         values = self._file.attributes(self._group(split, index))
@@ -235,31 +250,6 @@ class Dataset:
 
     def _name(self, split: str, index: int) -> str:
         return f"{self.path}: {split}/{index:06d}"
-
-    def _read_info(self) -> DatasetInfo:
-        values = self._file.attributes(self._file.root)
-        if values.get("format") != FORMAT:
-            raise DatasetError(f"{self.path}: is no dataset of ast_sim (its attribute format is not {FORMAT!r})")
-        if values.get("version") != VERSION:
-            raise DatasetError(
-                f"{self.path}: has the version {values.get('version')} of the format; this program reads {VERSION}"
-            )
-        types = {"domain_center": list, "domain_half_width": float, "contact_radius": float, "time_step": float}
-        known: dict[str, Any] = {}
-        for key in (item.name for item in fields(DatasetInfo)):
-            wanted = types.get(key, str)
-            if not isinstance(values.get(key), wanted):
-                shown = repr(values[key])[:60] if key in values else "missing"
-                raise DatasetError(f"{self.path}: the attribute {key} is {shown}; must be a {wanted.__name__}")
-            known[key] = values[key]
-        known["domain_center"] = tuple(known["domain_center"])
-        with self._file.reading("the attribute generator"):
-            known["generator"] = json.loads(known["generator"])
-            if not isinstance(known["generator"], dict):
-                raise DatasetError(f"{self.path}: the attribute generator must be a JSON object")
-        info = DatasetInfo(**known)
-        info.check(str(self.path))
-        return info
 
     def _count(self, split: str) -> int:
         if split not in self._file.root:

@@ -6,7 +6,7 @@ Every mesh comes this way: results that are converted, a scene that is predicted
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -90,6 +90,10 @@ class MeshFile:
             values = values.copy()
             values[-len(self.edges) :] = values[self.edges].mean(axis=1)
         return values
+
+    def at_nodes(self, used: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        """From values at the points of the file to values at the points `used`."""
+        return lambda values: self.between(values[self.node_rows])[used]
 
     def field(self, place: str, name: str) -> np.ndarray:
         """A field of a `place`, "point" or "cell", as [n or E, columns] float64.

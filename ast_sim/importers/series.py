@@ -18,6 +18,7 @@ from ast_sim.importers.frames_in_file import frames_in
 from ast_sim.importers.mesh_file import MeshFile, mesh_of, raw_field
 from ast_sim.importers.scene_mesh import clamped
 from ast_sim.importers.solids.frames_match import order_of_cells
+from ast_sim.importers.solids.kept_fields import KeptFields
 from ast_sim.importers.solids.mesh_elements import require_extent
 from ast_sim.importers.solids.positions import far_origin, rest_and_position, warn_of_rounding, with_layers
 from ast_sim.importers.solids.stitching import Stitching
@@ -47,6 +48,9 @@ class FieldNames:
         stress_order: the components that the columns of the stress hold, such as ("xx", "xy", "xz", "yy", "yz", "zz").
             Empty: as the file names them; else the normal stresses come first.
         stress_unit: the unit of the stress, and of Young's modulus in a deck: one of `STRESS_UNITS`; None is pascal.
+        fields: further point or cell fields, as NAME or NAME=UNIT, that become named fields of the dataset.
+        reaction: point field, the forces that act on the nodes from outside.
+        newton: the unit of these forces in newton.
     """
 
     displacement: str | None = None
@@ -58,6 +62,9 @@ class FieldNames:
     material: tuple[str, ...] = ()
     stress_order: tuple[str, ...] = ()
     stress_unit: str | None = None
+    fields: tuple[str, ...] = ()
+    reaction: str | None = None
+    newton: float = 1.0
 
 
 @dataclass(eq=False)
@@ -110,9 +117,9 @@ def read_series(
         MissingExtra: the reader of a format is not installed.
     """
     job = None if deck is None else read_job(deck)
-    if job is not None:
-        names = replace(names, material=names.material or tuple(job.materials))
-    mesh, kept, notes, place = _read_frames(source, names, job, corners)
+    names = names if job is None else replace(names, material=names.material or tuple(job.materials))
+    further = KeptFields.of(names.fields, names.reaction)
+    mesh, kept, notes, place = _read_frames(source, names, job, corners, further)
     scene, used = mesh.scene(names.body, names.node_type)
     types = _node_type(mesh, names, scene, used)
     rest, position = _rest_and_position(source, mesh, kept, used)
@@ -126,25 +133,32 @@ def read_series(
         material=mesh.columns(names.material),
     )
     stress, more = _stress(mesh, kept, used, place, scene, _pascals(names))
-    attributes: dict[str, Any] = {"status": "complete", "source": source.name}
-    attributes |= {"origin": origin.tolist()} if origin.any() else {}
-    attributes |= {"material": ", ".join(names.material)} if names.material else {}
-    told = [*mesh.notes, *notes, *more]
-    attributes |= {"notes": "; ".join(told)} if told else {}
+    rigid = {at: ~scene.deforming(at) for at in ("node", "element")}
+    fields, missing = further.named(source, mesh.at_nodes(used), mesh.element_rows, rigid, names.newton)
+    told = [*mesh.notes, *notes, *more, *missing]
     trajectory = Trajectory(
         scene,
         (position - origin).astype(np.float32),
         stress,
-        attributes,
+        _attributes(source, origin, names, told),
         stress_location=place,
         times=kept.ascending_times(),
+        fields=fields,
     )
     trajectory.check(str(source), place)
     return trajectory
 
 
+def _attributes(source: Path, origin: np.ndarray, names: FieldNames, notes: list[str]) -> dict[str, Any]:
+    """What a trajectory says of its source."""
+    attributes: dict[str, Any] = {"status": "complete", "source": source.name}
+    attributes |= {"origin": origin.tolist()} if origin.any() else {}
+    attributes |= {"material": ", ".join(names.material)} if names.material else {}
+    return attributes | ({"notes": "; ".join(notes)} if notes else {})
+
+
 def _read_frames(
-    source: Path, names: FieldNames, job: Job | None, corners: bool
+    source: Path, names: FieldNames, job: Job | None, corners: bool, further: KeptFields
 ) -> tuple[MeshFile, _Frames, list[str], str]:
     """The mesh of a simulation, what is kept of its frames in order of time, notes, and where the stress is."""
     kept = _Frames()
@@ -154,7 +168,7 @@ def _read_frames(
         filter(None, (names.obstacle, names.handle, names.node_type or "node_type", names.body or "body"))
     )
     place, order, notes = "none", (), []
-    given = frames(source) if job is None else job_frames(job, source, _pascals(names))
+    given = frames(source) if job is None else job_frames(job, source, _pascals(names), tuple(further.wanted.values()))
     for frame in given:
         frame.require_consistent()
         if first is None or stitching is None:
@@ -168,6 +182,7 @@ def _read_frames(
         kept.times.append(frame.time)
         kept.points.append(frame.points)
         kept.displacements.append(_displacement(frame, names))
+        further.look(frame, cells, raw_field)
         if place != "none":
             values = raw_field(frame, "point" if place == "node" else "cell", names.stress or "von_mises")
             values = von_mises(values, order) if order else values[:, 0]
@@ -177,6 +192,7 @@ def _read_frames(
     if source.is_dir():
         by_time, said = ordered([file for (file,) in files], kept.times)
         kept.reorder(by_time)
+        further.reorder(by_time)
         notes += said
     elif times is not None:
         kept.times = list(times)
@@ -232,7 +248,7 @@ def _stress(
     if place == "none":
         return None, []
     if place == "node":
-        values = [mesh.between(values[mesh.node_rows])[used] for values in kept.stresses]
+        values = list(map(mesh.at_nodes(used), kept.stresses))
     else:
         values = [values[mesh.element_rows] for values in kept.stresses]
     stress = (pascals * np.stack(values)).astype(np.float32)[:, :, None]

@@ -54,7 +54,9 @@ def test_convert_train_predict_and_the_force(pulled, tmp_path, capsys):
     job, results, nodes, elements = pulled
     data, run = tmp_path / "d.h5", tmp_path / "run"
     units = ["--length-unit", "mm", "--stress-unit", "MPa"]
-    assert cli.main(["convert", str(job), str(results), "--out", str(data), "--shares", "1", "0", "0", *units]) == 0
+    kept = ["--reaction", "RF", "--field", "ERROR=%"]
+    shares = ["--shares", "1", "0", "0"]
+    assert cli.main(["convert", str(job), str(results), "--out", str(data), *shares, *units, *kept]) == 0
     assert "corners only" not in capsys.readouterr().out
     with Dataset(data) as dataset:
         assert dataset.element_size == 10
@@ -68,9 +70,19 @@ def test_convert_train_predict_and_the_force(pulled, tmp_path, capsys):
     answer = ast_sim.Run(run).predict(scene, truth.position, effort=effort, frames=[-1])
     assert answer.converged
     np.testing.assert_allclose(answer.position[-1], truth.position[-1], atol=0.01 * PULL)
+    # The dataset keeps the forces of the job in newton: lengths in mm and stress in MPa go with these.
+    top = nodes[:, 2] == 2
+    reaction = truth.fields["reaction"]
+    assert (reaction.location, reaction.unit, reaction.values.shape) == ("node", "N", (3, len(nodes), 3))
+    assert not reaction.values[0].any() and (truth.fields["ERROR"].location, truth.fields["ERROR"].unit) == (
+        "node",
+        "%",
+    )
     # CalculiX's law (Saint Venant-Kirchhoff) and ours (Neo-Hooke) differ by about 2.5 times the strain, PULL / 2.
     *_, last = vtk_frames(results)
-    force = last.point_fields["FORC"][nodes[:, 2] == 2].sum(axis=0)  # in newton, as lengths are in mm and MPa
+    force = last.point_fields["FORC"][top].sum(axis=0)
+    np.testing.assert_allclose(reaction.values[-1][top].sum(axis=0), force, rtol=1e-5, atol=1e-5 * force[2])
+    assert reaction.values[-1].sum(axis=0) == pytest.approx(0, abs=1e-4 * force[2])
     assert answer.reaction()[0] == pytest.approx(force, rel=2.5e-3, abs=2.5e-3 * force[2])
 
 
