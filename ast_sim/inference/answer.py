@@ -221,9 +221,12 @@ class Answer:
         """[S, 3] the force in newton on the prescribed nodes `driven`.
 
         It follows from the strains of the predicted positions, by the solver's own law of the material. None where the
-        scene has no Young's modulus and Poisson's ratio.
+        scene has no Young's modulus and Poisson's ratio: two columns of its material, as of a converted job, count as
+        these.
         """
-        if self.info is None or self.driven is None or self.info.family not in ELASTIC or self.scene.material is None:
+        if self.info is None or self.driven is None or self.scene.material is None:
+            return None
+        if self.info.family not in ELASTIC and self.scene.material.shape[1] != 2:
             return None
         from ast_sim.mechanics.reaction import Reaction
 
