@@ -171,7 +171,8 @@ def _add_convert(convert: _Parser) -> None:
     _add_each(fields, names)
     about = "components of the stress, such as xx,xy,xz,yy,yz,zz (default: as the file names them, else xx,yy,zz,...)"
     _add_each(fields, {"--stress-order XX,YY,...": about}, type=_stress_order, default=())
-    _add_each(fields, {"--material NAME": "cell fields with one number each"}, nargs="+", default=[])
+    about = "cell fields with one number each; young=E takes the field E as the column young"
+    _add_each(fields, {"--material NAME": about}, nargs="+", default=[])
     kind = convert.add_argument_group("properties of a dataset made from such files")
     about = "shares of the simulations, drawn at random (default: 0.8 0.1 0.1 of three or more)"
     kind.add_argument("--shares", nargs=3, type=float, metavar=("TRAIN", "VALID", "TEST"), help=about)

@@ -35,6 +35,7 @@ from ast_sim.dataset.layout import (
     require_kind,
 )
 from ast_sim.dataset.split import Split
+from ast_sim.material import Material
 from ast_sim.number_arrays import require_finite
 from ast_sim.scene import AttributeValue, Scene, Trajectory
 from ast_sim.support.byte_cache import ByteCache
@@ -117,6 +118,18 @@ class Dataset:
     def material_width(self) -> int:
         """The number of material columns that every scene has."""
         return self._first_kind()[1]
+
+    @property
+    def material(self) -> Material:
+        """The names of the material columns that every scene has.
+
+        Raises:
+            DatasetError: the file names another number of columns.
+        """
+        try:
+            return self.info.material(self.material_width)
+        except DatasetError as error:
+            raise DatasetError(f"{self.path}: {error}") from error
 
     @property
     def element_size(self) -> int:
