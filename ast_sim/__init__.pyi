@@ -8,6 +8,7 @@ from .inference.effort import Effort as Effort
 from .inference.evaluation.evaluated_run import Evaluation as Evaluation
 from .inference.example_run import example_run as example_run
 from .inference.trained_run import Run as Run
+from .material import Material as Material
 from .ops.library import keep_memory as keep_memory
 from .ops.library import show_config as show_config
 from .prescribed_motion import Motion as Motion

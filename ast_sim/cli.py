@@ -175,7 +175,8 @@ def _add_convert(convert: _Parser) -> None:
     _add_each(fields, names)
     about = "components of the stress, such as xx,xy,xz,yy,yz,zz (default: as the file names them, else xx,yy,zz,...)"
     _add_each(fields, {"--stress-order XX,YY,...": about}, type=_stress_order, default=())
-    _add_each(fields, {"--material NAME": "cell fields with one number each"}, nargs="+", default=[])
+    about = "cell fields with one number each; young=E takes the field E as the column young"
+    _add_each(fields, {"--material NAME": about}, nargs="+", default=[])
     about = "a further field that the dataset keeps by its name, such as PEEQ or CPRESS=MPa; may be repeated"
     _add_each(fields, {"--field NAME[=UNIT]": about}, action="append", default=[])
     about = "point field with the forces on the nodes, such as RF, in newton (in the unit of force of a deck)"

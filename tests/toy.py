@@ -109,7 +109,7 @@ def config(info: DatasetInfo, mesh_spacing: float = 0.1) -> ASTConfig:
         element_inputs=(),
         edge_strain=True,
     )
-    return small.resolve(DataFacts.of(info, 0, mesh_spacing))
+    return small.resolve(DataFacts.of(info, (), mesh_spacing))
 
 
 def answers(model: Simulator, truths: list[Trajectory], names: list[str]) -> list[Answer]:

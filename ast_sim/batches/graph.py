@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ast_sim.batches.mirror_and_shift import Placement
 from ast_sim.batches.out_of_balance import Elasticity
+from ast_sim.material import Material
 from ast_sim.ops import EdgeSet
 from ast_sim.ops._edges import join_indices, join_offsets
 from ast_sim.scene import NodeType, Scene
@@ -76,13 +77,13 @@ class Graph:
     own: Own | None = None
 
     @staticmethod
-    def from_scene(scene: Scene, element_nodes: bool, surface: bool = False, elasticity: bool = False) -> Graph:
+    def from_scene(scene: Scene, element_nodes: bool, surface: bool = False, elastic: Material | None = None) -> Graph:
         """The graph of one scene.
 
         Args:
             element_nodes: elements are nodes of the graph too: it has e2m and m2e, not m2m.
             surface: the graph has the surface and the bodies.
-            elasticity: the graph has the elasticity of its tetrahedra.
+            elastic: the material of its tetrahedra; the graph has their elasticity.
         """
         n, e = scene.num_nodes, scene.num_elements
         elements = torch.from_numpy(scene.elements.astype("int64"))
@@ -115,7 +116,7 @@ class Graph:
             m2e=m2e,
             rest_edges=rest_edges,
             **(_surface_of(scene) if surface else {}),
-            elasticity=Elasticity.of(scene) if elasticity else None,
+            elasticity=None if elastic is None else Elasticity.of(scene, elastic),
         )
 
     @staticmethod

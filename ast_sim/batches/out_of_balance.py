@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ast_sim.material import ELASTIC, Material
 from ast_sim.mechanics.elements.second_order import LARGEST, SLOPES
 from ast_sim.ops import TetrahedronSet, elastic_forces
 from ast_sim.ops._edges import join_indices
@@ -43,9 +44,9 @@ class Elasticity:
     nodes: Tensor | None = None
 
     @staticmethod
-    def of(scene: Scene) -> Elasticity:
-        """Of one scene. Two columns of material are Young's modulus and Poisson's ratio, if they can be; else all
-        elements have the same stiffness.
+    def of(scene: Scene, material: Material) -> Elasticity:
+        """Of one scene. Young's modulus and Poisson's ratio are taken where they are the columns of its material, and
+        allowed in all elements. Else all elements have the same stiffness.
 
         Raises:
             DatasetError: the elements are no tetrahedra.
@@ -56,8 +57,8 @@ class Elasticity:
             )
         elements = torch.from_numpy(scene.elements.astype("int64"))
         young, poisson = torch.full((len(elements),), YOUNG), torch.full((len(elements),), POISSON)
-        if scene.material is not None and scene.material.shape[1] == 2:
-            given, ratio = torch.tensor(scene.material).unbind(1)
+        if sorted(material.columns) == sorted(ELASTIC):
+            given, ratio = (torch.from_numpy(material.numbers(name, scene.material)).float() for name in ELASTIC)
             if bool((given > 0).all() and (ratio >= 0).all() and (ratio < 0.5).all()):
                 young, poisson = given, ratio
         young = young * torch.from_numpy(scene.deforming_elements)

@@ -12,6 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from ast_sim.material import FRICTION, POISSON, YOUNG, Material
 from ast_sim.scene import AttributeValue, Scene
 from ast_sim.support.errors import DatasetError
 
@@ -39,6 +40,14 @@ NUMBERING = ("frames", "times")  # attributes of a trajectory that tell of its f
 LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}  # in metres
 GIVEN_FRAMES = {"quasi_static": 1, "dynamic": 2}  # by integration: the first frames, from which a prediction starts
 _LOCATIONS = ("none", "node", "element")
+# The columns of the material in the scenes of the families that are generated here; an assembly has the third one if
+# its scenes differ in friction.
+_GENERATED = {
+    "abcd": (YOUNG, POISSON),
+    "abcd_xl": (YOUNG, POISSON),
+    "assembly": (YOUNG, POISSON, FRICTION),
+    "sphere_simple": ("stretch", "bending", "density"),
+}
 
 
 @dataclass(frozen=True)
@@ -53,7 +62,8 @@ class DatasetInfo:
         contact_radius: distance below which surfaces are in contact.
         time_step: time between two frames; 0 if frames have no time.
         length_unit: "m", "cm", "mm", "um" or "in".
-        generator: the origin of the data, such as program, versions, command, seed and licence.
+        generator: the origin of the data, such as program, versions, command, seed and licence. Its entry `material` is
+            a list: the name of each column of `Scene.material`, such as ["young", "poisson"] (`ast_sim.Material`).
     """
 
     family: str
@@ -84,6 +94,27 @@ class DatasetInfo:
             raise DatasetError(f"{name}: domain_center, domain_half_width, contact_radius and time_step must be finite")
         if self.domain_half_width <= 0 or self.contact_radius < 0 or self.time_step < 0:
             raise DatasetError(f"{name}: domain_half_width must be above 0, contact_radius and time_step at least 0")
+
+    def material(self, width: int) -> Material:
+        """The material of scenes with this number of columns, by the names that the origin of the data gives them, or
+        by the family, if it is one that is generated here. Other columns have no meaning: they are called "column 0",
+        "column 1" and so on.
+
+        Raises:
+            DatasetError: there are names for another number of columns, or a name twice.
+        """
+        named = self.generator.get("material")
+        if named is None:
+            generated = _GENERATED.get(self.family, ())[:width]
+            unnamed = tuple(f"column {number}" for number in range(width))
+            return Material(generated if len(generated) == width else unnamed)
+        names = tuple(map(str, named)) if isinstance(named, list | tuple) else (str(named),)
+        if len(names) != width or len(set(names)) != width:
+            raise DatasetError(
+                f"the material has {width} columns, but generator['material'] names {', '.join(names) or 'none'}: give"
+                " each column one name"
+            )
+        return Material(names)
 
     def times(self, frames: Iterable[int]) -> tuple[float, ...] | None:
         """The times of frames in seconds, by their numbers; None if frames have no time."""

@@ -1,9 +1,8 @@
 """Reading a dataset file; its content is checked, never trusted.
 
-Layout: the root has the attributes of `DatasetInfo`, `format` and `version`. It holds the groups `train`, `valid`,
-`test` and `calibration`. Each of them holds one group per trajectory (`000000`, `000001`, ...) with the arrays of
-`Scene` and `Trajectory`. Each frame is a chunk. To find flipped bits, every array has the Fletcher-32 filter, and the
-version of HDF5's file format is one that adds checksums to its own structures.
+Layout: the root has the attributes of `DatasetInfo`, `format` and `version`, and a group for each split, with one group
+for each trajectory (`000000`, `000001`, ...), which has the arrays of `Scene` and `Trajectory`. Each frame is a chunk.
+Flipped bits are found: every array has the Fletcher-32 filter, and HDF5's own structures have checksums.
 """
 
 from __future__ import annotations
@@ -34,6 +33,7 @@ from ast_sim.dataset.layout import (
     require_kind,
 )
 from ast_sim.dataset.split import Split
+from ast_sim.material import Material
 from ast_sim.named_field import NamedField
 from ast_sim.number_arrays import require_finite
 from ast_sim.scene import AttributeValue, Scene, Trajectory
@@ -123,6 +123,18 @@ class Dataset:
     def material_width(self) -> int:
         """The number of material columns that every scene has."""
         return self._first_kind()[1]
+
+    @property
+    def material(self) -> Material:
+        """The names of the material columns that every scene has.
+
+        Raises:
+            DatasetError: the file names another number of columns.
+        """
+        try:
+            return self.info.material(self.material_width)
+        except DatasetError as error:
+            raise DatasetError(f"{self.path}: {error}") from error
 
     @property
     def element_size(self) -> int:

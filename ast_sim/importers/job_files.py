@@ -12,6 +12,7 @@ import numpy as np
 from ast_sim.dataset.layout import LENGTH_UNITS
 from ast_sim.importers.series import FieldNames
 from ast_sim.importers.stress import STRESS_UNITS
+from ast_sim.material import YOUNG
 from ast_sim.scene import Trajectory
 from ast_sim.support.errors import ConfigError, DatasetError
 
@@ -58,9 +59,10 @@ def with_units(decks: Mapping[str, Path], names: FieldNames, length_unit: str | 
 
 def doubt_modulus(deck: Path, trajectory: Trajectory, unit: str) -> None:
     """Warn if Young's modulus is one that no common material has, or about 1: then another unit may be meant."""
-    if trajectory.scene.material is None or not str(trajectory.attributes.get("material")).startswith("young"):
+    columns = str(trajectory.attributes.get("material")).split(", ")
+    if trajectory.scene.material is None or YOUNG not in columns:
         return
-    moduli = np.unique(trajectory.scene.material[trajectory.scene.deforming("element"), 0])
+    moduli = np.unique(trajectory.scene.material[trajectory.scene.deforming("element"), columns.index(YOUNG)])
     shown = moduli / STRESS_UNITS[unit]
     doubtful = (moduli < _SOFTEST) | (moduli > _STIFFEST) | ((shown > 0.1) & (shown < 10) & (unit != "GPa"))
     if doubtful.any():

@@ -44,7 +44,8 @@ class FieldNames:
             of nodes, or a place BODY:PLACE as in `parse_clamp`.
         body: point or cell field with the numbers of the bodies. None: "body" if it is present; else each connected
             part of the mesh is a body.
-        material: cell fields with one number each; they become the columns of `Scene.material`.
+        material: cell fields with one number each; they become the columns of `Scene.material`. "young=E" takes the
+            field E and calls the column young; `ast_sim.Material` says which names have a meaning.
         stress_order: the components that the columns of the stress hold, such as ("xx", "xy", "xz", "yy", "yz", "zz").
             Empty: as the file names them; else the normal stresses come first.
         stress_unit: the unit of the stress, and of Young's modulus in a deck: one of `STRESS_UNITS`; None is pascal.
@@ -65,6 +66,16 @@ class FieldNames:
     fields: tuple[str, ...] = ()
     reaction: str | None = None
     newton: float = 1.0
+
+    @property
+    def material_columns(self) -> tuple[str, ...]:
+        """The names of the columns of the material."""
+        return tuple(name.partition("=")[0] for name in self.material)
+
+    @property
+    def material_fields(self) -> tuple[str, ...]:
+        """The cell fields that they come from."""
+        return tuple(name.partition("=")[2] or name for name in self.material)
 
 
 @dataclass(eq=False)
@@ -130,7 +141,7 @@ def read_series(
         scene,
         rest_position=(rest - origin).astype(np.float32),
         node_type=types,
-        material=mesh.columns(names.material),
+        material=mesh.columns(names.material_fields),
     )
     stress, more = _stress(mesh, kept, used, place, scene, _pascals(names))
     rigid = {at: ~scene.deforming(at) for at in ("node", "element")}
@@ -153,7 +164,7 @@ def _attributes(source: Path, origin: np.ndarray, names: FieldNames, notes: list
     """What a trajectory says of its source."""
     attributes: dict[str, Any] = {"status": "complete", "source": source.name}
     attributes |= {"origin": origin.tolist()} if origin.any() else {}
-    attributes |= {"material": ", ".join(names.material)} if names.material else {}
+    attributes |= {"material": ", ".join(names.material_columns)} if names.material else {}
     return attributes | ({"notes": "; ".join(notes)} if notes else {})
 
 

@@ -13,10 +13,11 @@ import numpy as np
 
 from ast_sim.dataset.layout import LENGTH_UNITS, DatasetInfo
 from ast_sim.dataset.writer import DatasetWriter
+from ast_sim.material import Material
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.scene import AttributeValue, Scene, Trajectory
-from ast_sim.support.errors import AstSimError, MissingExtra, RolloutError
+from ast_sim.support.errors import AstSimError, ConfigError, MissingExtra, RolloutError, SimulationError
 from ast_sim.support.notebook_table import html_picture, html_table, one_line
 from ast_sim.view import export, picture, sweep_files
 from ast_sim.view.files import make_folder
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SUFFIXES = (".h5", ".pvd", ".vtkhdf", ".csv")
-ELASTIC = ("assembly", "abcd", "abcd_xl")  # families whose material is Young's modulus and Poisson's ratio
 
 
 class AnsweredFrame(NamedTuple):
@@ -75,6 +75,7 @@ class Answer:
             that is larger. As long as the contact does not change, a next step would be about its square. Frames
             ascend. Empty without Newton steps.
         driven: the prescribed nodes that move farthest together in the whole motion.
+        material: the material of the scene, as the run knows it.
     """
 
     name: str
@@ -93,6 +94,7 @@ class Answer:
     expected_error: float | None = None
     last_steps: tuple[float, ...] = ()
     driven: Driven | None = None
+    material: Material | None = None
 
     @property
     def computed(self) -> np.ndarray:
@@ -217,33 +219,46 @@ class Answer:
             length_unit=None if self.info is None else self.info.length_unit,
         )
 
-    def reaction(self) -> np.ndarray | None:
+    def reaction(self) -> np.ndarray:
         """[S, 3] the force in newton on the prescribed nodes `driven`.
 
-        It follows from the strains of the predicted positions, by the solver's own law of the material. None where the
-        scene has no Young's modulus and Poisson's ratio: two columns of its material, as of a converted job, count as
-        these.
+        It follows from the strains of the predicted positions, by the law of the material, as the bundled solver has
+        it. If the data follow another law, so would their force.
+
+        Raises:
+            ConfigError: there is none; the text says why: no prescribed node moves, the scene has inertia or no
+                tetrahedra, or the law of its material is not known.
         """
-        if self.info is None or self.driven is None or self.scene.material is None:
-            return None
-        if self.info.family not in ELASTIC and self.scene.material.shape[1] != 2:
-            return None
+        if self.info is None or self.driven is None or self.material is None:
+            raise ConfigError(f"{self.name} has no reaction: no prescribed node moves, or the answer is of no run")
+        if self.info.integration == "dynamic":
+            raise ConfigError(f"{self.name} has no reaction: it has inertia; the reaction is a force at equilibrium")
+        if self.scene.elements.shape[1] == 3:
+            raise ConfigError(f"{self.name} has no reaction: its elements are triangles; it needs tetrahedra")
+        from ast_sim.mechanics.elements.neo_hookean import NeoHookean
         from ast_sim.mechanics.reaction import Reaction
 
+        try:
+            law = NeoHookean.of_scene(self.scene, self.material)
+        except (ConfigError, SimulationError) as error:
+            raise ConfigError(f"{self.name} has no reaction: {error}") from error
         scale = LENGTH_UNITS[self.info.length_unit] ** 2
-        force = Reaction(self.scene, self.driven)
+        force = Reaction(self.scene, self.driven, law)
         return scale * np.array([force.of(position) for position in self.position]).reshape(-1, 3)
 
     def figures(self, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> list[dict[str, float]]:
         """What an engineer asks of each frame: the travel of the prescribed nodes, the reaction and its components (if
-        there is a material), the largest stress and where it is (if the model predicts one), the size of the last
+        `reaction` knows it), the largest stress and where it is (if the model predicts one), the size of the last
         Newton step (if any was made).
 
         Args:
             origin: [3] the point that positions are relative to.
         """
         scene, rows = self.scene, []
-        forces = self.reaction()
+        try:
+            forces = self.reaction()
+        except ConfigError:  # a figure that this scene has not
+            forces = None
         computed = sorted(number for number in self.frames if number >= self.given)
         last_steps = dict(zip(computed, self.last_steps, strict=False))
         for frame, position in enumerate(self.position):

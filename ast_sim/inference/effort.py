@@ -10,7 +10,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.material import FRICTION
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.linearised_contact import CLEARANCE, NewtonSteps
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.scene import Scene
@@ -58,11 +59,13 @@ class Effort:
         for key, count in asdict(self).items():
             if count and not config.jumps:
                 raise ConfigError(f"{key} is {count}; it needs a run that jumps, and this one does not")
-        if self.newton_steps and not knows_material(config):
-            raise ConfigError(
-                f"newton_steps is {self.newton_steps}; they need tetrahedra and their material: the training"
-                " scenes have no columns of Young's modulus and Poisson's ratio, and no solver recorded them"
-            )
+        if self.newton_steps and not config.data.tetrahedra:
+            raise ConfigError(f"newton_steps is {self.newton_steps}; they need tetrahedra, and the elements have none")
+        if self.newton_steps:
+            try:
+                config.data.material.require_law()
+            except ConfigError as error:
+                raise ConfigError(f"newton_steps is {self.newton_steps}, but {error}") from error
 
 
 FIRST_CALL = Effort()
@@ -113,32 +116,22 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return fmean(known) if len(known) == len(values) else None
 
 
-def knows_material(config: ModelConfig) -> bool:
-    """Whether Young's modulus and Poisson's ratio are known for the scenes of a model that jumps."""
-    known = config.data.material_width == 2 or config.data.young > 0 or friction_is_drawn(config)
-    return bool(config.jumps and config.data.tetrahedra and known)
-
-
-def friction_is_drawn(config: ModelConfig) -> bool:
-    """Whether the third column of the material is friction, as in assemblies whose scenes differ in it."""
-    return config.data.material_width == 3 and config.data.contact_range > 0
+def can_make_newton_steps(config: ModelConfig) -> bool:
+    """Whether the scenes of a model that jumps are tetrahedra of a material whose law is known."""
+    return bool(config.jumps and config.data.tetrahedra and config.data.material.law)
 
 
 def newton_steps(config: ModelConfig, scene: Scene) -> NewtonSteps:
     """The Newton steps of a scene, in the material and with the contact of the training scenes.
 
     Raises:
+        ConfigError: the law of the material is not known.
         SimulationError: the constants of the material are not allowed, or an element has no volume.
     """
-    friction = config.data.friction
-    if scene.material is not None and (config.data.material_width == 2 or friction_is_drawn(config)):
-        young, poisson, *drawn = scene.material.astype(np.float64).T
-        friction = max((float(column.max()) for column in drawn), default=friction)
-        rigid = ~scene.deforming_nodes[scene.elements].any(axis=1)
-        material = NeoHookean(np.where(rigid, 1.0, young), np.where(rigid, 0.0, poisson))
-    else:
-        material = NeoHookean(config.data.young, config.data.poisson)
-    return NewtonSteps(scene, material, CLEARANCE * config.data.contact_range, friction)
+    material = config.data.material
+    friction = float(np.max(material.numbers(FRICTION, scene.material)))
+    law = NeoHookean.of_scene(scene, material)
+    return NewtonSteps(scene, law, CLEARANCE * config.data.contact_range, friction)
 
 
 def cheapest_good(measured: Sequence[EffortErrors]) -> Effort:

@@ -116,6 +116,7 @@ class Question:
             frames=numbers,
             last_steps=last_steps,
             driven=Driven.of(self.scene, self.prescribed_position),
+            material=config.data.material,
         )
 
 

@@ -11,7 +11,8 @@ from typing import Any
 
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.assembly_questions import ask
-from ast_sim.inference.effort import Effort, friction_is_drawn
+from ast_sim.inference.effort import Effort
+from ast_sim.material import FRICTION
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.runs.scope import Scope
@@ -87,7 +88,7 @@ def sweep(
     """
     if not rows:
         raise ConfigError("a sweep needs at least one row of values")
-    needs_way = bool((config.data.friction or friction_is_drawn(config)) and effort.newton_steps)
+    needs_way = bool((config.data.friction or FRICTION in config.data.columns) and effort.newton_steps)
     frames = 2 if config.jumps and not needs_way else None
     table, seconds, notes = [], 0.0, []
     for start in range(0, len(rows), TOGETHER):

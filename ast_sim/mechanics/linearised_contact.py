@@ -31,7 +31,7 @@ import scipy.sparse
 from scipy.optimize import nnls
 
 from ast_sim.mechanics.elements.elasticity import Deformation
-from ast_sim.mechanics.elements.material import NeoHookean, cofactor, determinant
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean, cofactor, determinant
 from ast_sim.mechanics.elements.second_order import elastic_body
 from ast_sim.mechanics.linear_system import Factorization, LinearSystem
 from ast_sim.scene import Scene

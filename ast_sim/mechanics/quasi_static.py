@@ -11,7 +11,7 @@ import numpy as np
 
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import Contact
-from ast_sim.mechanics.elements.material import von_mises
+from ast_sim.mechanics.elements.neo_hookean import von_mises
 from ast_sim.mechanics.elements.second_order import elastic_body
 from ast_sim.mechanics.frames import MAX_FRAME_ITERATIONS, FrameRecord, Frames, GivenUp
 from ast_sim.mechanics.load_halving import QuasiStatic

@@ -17,7 +17,7 @@ from scipy.sparse.linalg import cg
 
 from ast_sim.element_topology import linear_elements
 from ast_sim.mechanics.driven import Driven
-from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.elements.second_order import elastic_body
 from ast_sim.scene import NodeType, Scene
 
@@ -27,24 +27,23 @@ SMOOTH = 1e-3  # residual to which the smooth field is computed; every field is 
 
 
 class Reaction:
-    """The force on the moved nodes of a scene of tetrahedra with Young's modulus and Poisson's ratio as its material.
+    """The force on the moved nodes of a scene of tetrahedra.
 
     Made once for a scene, because the shape functions do not change.
 
     Args:
         driven: the moved nodes.
+        law: of all elements; that of rigid ones is ignored.
     """
 
-    def __init__(self, scene: Scene, driven: Driven) -> None:
+    def __init__(self, scene: Scene, driven: Driven, law: NeoHookean) -> None:
         import igl  # takes 0.2 s
 
-        assert scene.material is not None
         self.scene = scene
         self.driven = driven
         self._rest = scene.rest_position.astype(np.float64)
         soft = np.flatnonzero(scene.deforming_nodes[scene.elements].any(axis=1))
-        young, poisson = scene.material[soft, :2].astype(np.float64).T
-        self._elasticity = elastic_body(self._rest, scene.elements[soft], NeoHookean(young, poisson))
+        self._elasticity = elastic_body(self._rest, scene.elements[soft], law.of(soft))
         linear = linear_elements(scene.elements[soft].astype(np.int64))
         self._laplacian = -igl.cotmatrix(self._rest, linear).tocsr()
         surface = scene.surface()

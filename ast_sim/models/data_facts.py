@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ast_sim.dataset.layout import GIVEN_FRAMES, DatasetInfo
+from ast_sim.material import Material
 from ast_sim.support.toml_settings import NOTHING
 
 
@@ -17,7 +18,7 @@ class DataFacts:
     Attributes:
         integration: "quasi_static" (next position: p + v) or "dynamic" (2 p - p_previous + a).
         stress: where stress is predicted: "none", "node" or "element".
-        material_width: numbers that describe the material of an element; 0 without material.
+        columns: the name of each column of the material of an element; none without material.
         domain_center, domain_half_width: the cube that holds all positions.
         contact_radius: distance within which surfaces count as near.
         mesh_spacing: mean length of a mesh edge of the deforming bodies at rest.
@@ -30,7 +31,7 @@ class DataFacts:
 
     integration: Literal["quasi_static", "dynamic"] = "quasi_static"
     stress: Literal["none", "node", "element"] = "none"
-    material_width: int = 0
+    columns: tuple[str, ...] = ()
     domain_center: tuple[float, float, float] = (0.0, 0.0, 0.0)
     domain_half_width: float = 1.0
     contact_radius: float = 0.0
@@ -45,7 +46,7 @@ class DataFacts:
     @staticmethod
     def of(
         info: DatasetInfo,
-        material_width: int,
+        columns: tuple[str, ...],
         mesh_spacing: float,
         planar: bool = False,
         tetrahedra: bool = True,
@@ -56,7 +57,7 @@ class DataFacts:
         return DataFacts(
             integration=info.integration,
             stress=info.stress_location,
-            material_width=material_width,
+            columns=columns,
             domain_center=(x, y, z),
             domain_half_width=float(info.domain_half_width),
             contact_radius=float(info.contact_radius),
@@ -65,6 +66,17 @@ class DataFacts:
             planar=planar,
             **recorded,
         )
+
+    @property
+    def material(self) -> Material:
+        """The material of the scenes: its columns, and what the solver recorded."""
+        elastic = {"young": self.young, "poisson": self.poisson} if self.young else {}
+        return Material(self.columns, {**elastic, "friction": self.friction})
+
+    @property
+    def material_width(self) -> int:
+        """The number of columns of the material."""
+        return len(self.columns)
 
     @property
     def dynamic(self) -> bool:

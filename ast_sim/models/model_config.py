@@ -88,9 +88,10 @@ class ModelConfig:
         return 0.0
 
     @property
-    def graph_parts(self) -> dict[str, bool]:
+    def graph_parts(self) -> dict[str, Any]:
         """The parts of the graph that the inputs need: arguments of `Graph.from_scene`."""
-        return {"surface": "proximity" in self.node_inputs, "elasticity": "out_of_balance" in self.node_inputs}
+        elastic = "out_of_balance" in self.node_inputs
+        return {"surface": "proximity" in self.node_inputs, "elastic": self.data.material if elastic else None}
 
     def usual_inputs(self, facts: DataFacts, jumps: bool) -> tuple[str, ...]:
         """The inputs of nodes if `node_inputs` is unset: velocity in dynamic scenes, material in scenes that have one,

@@ -131,7 +131,7 @@ class RunFolder:
         for what, ours, theirs in (
             ("integration", model.data.integration, dataset.info.integration),
             ("stress_location", model.data.stress, dataset.info.stress_location),
-            ("material columns", model.data.material_width, dataset.material_width),
+            ("material columns", _listed(model.data.columns), _listed(dataset.material.columns)),
             ("nodes of an element", scope.corners, dataset.element_size),
             ("lengths in", scope.length_unit, dataset.info.length_unit),
         ):
@@ -159,3 +159,7 @@ class RunFolder:
             "best_validation": validation,
             "answers": mark.answers if mark else {},
         }
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    return ", ".join(names) or "none"

@@ -39,7 +39,7 @@ def resolve(config: RunConfig, dataset: Dataset, scales: DataScales, keep_model:
     """
     facts = DataFacts.of(
         dataset.info,
-        dataset.material_width,
+        dataset.material.columns,
         scales.spacing,
         scales.planar,
         tetrahedra=dataset.element_size != 3,

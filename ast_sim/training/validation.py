@@ -14,8 +14,8 @@ from ast_sim.inference.effort import (
     MOST_NEWTON_STEPS,
     Effort,
     EffortErrors,
+    can_make_newton_steps,
     cheapest_good,
-    knows_material,
     mean_errors,
 )
 from ast_sim.inference.evaluation.asked_frame import errors_by_effort
@@ -126,7 +126,7 @@ def _by_jumps(
     asked = zip(names, truths, frames, strict=True)
     questions = [Question.of(truth, name, numbers.tolist()) for name, truth, numbers in asked]
     ways = calls(model, questions, Effort(corrections))
-    newton_steps = MOST_NEWTON_STEPS if knows_material(model.config) else 0
+    newton_steps = MOST_NEWTON_STEPS if can_make_newton_steps(model.config) else 0
     validated = []
     for index, truth, numbers, way in zip(indices, truths, frames, ways, strict=True):
         hold = _motion_error(truth.position[0], truth, numbers)

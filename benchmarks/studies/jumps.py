@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 import ast_sim
-from ast_sim.inference.effort import MOST_NEWTON_STEPS, Effort, knows_material
+from ast_sim.inference.effort import MOST_NEWTON_STEPS, Effort, can_make_newton_steps
 from ast_sim.inference.evaluation.asked_frame import asked_frames
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.support.disk import write_json, write_text
@@ -148,7 +148,7 @@ def _efforts(run: ast_sim.Run) -> list[Effort]:
     if not config.jumps:
         return []
     calls = [Effort(corrections) for corrections in range(run.settings.train.calls + MORE_CALLS)]
-    return calls + ([Effort(*pair) for pair in WITH_NEWTON] if knows_material(config) else [])
+    return calls + ([Effort(*pair) for pair in WITH_NEWTON] if can_make_newton_steps(config) else [])
 
 
 def _turned(run: ast_sim.Run, dataset: ast_sim.Dataset, effort: Effort) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import numpy as np
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
 from ast_sim.mechanics.elements.elasticity import Elasticity
-from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.quasi_static import quasi_static
 from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.scene import NodeType, Scene

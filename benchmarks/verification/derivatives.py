@@ -9,7 +9,7 @@ import scipy.sparse
 
 from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
 from ast_sim.mechanics.elements.elasticity import Elasticity
-from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.inertia import Inertia
 from ast_sim.simulate.shapes import mesh
 from benchmarks.verification.bodies import box, triangles

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ast_sim.mechanics.elements.elasticity import Elasticity
-from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from benchmarks.verification.bodies import Rollers, box, cauchy, newton, on_box
 from benchmarks.verification.problem import Curve, Outcome, Picture, Problem, Row, at_most, relative
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
 from ast_sim.mechanics.elements.elasticity import Elasticity
-from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.simulate.shapes import mesh
 from benchmarks.verification.bodies import Rollers, cauchy, newton, nodal_areas, sheet, triangles
 

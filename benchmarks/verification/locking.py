@@ -12,7 +12,7 @@ from time import process_time
 import numpy as np
 
 from ast_sim.element_topology import LOCAL_FACES, MIDDLES
-from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.elements.second_order import elastic_body
 from ast_sim.simulate.shapes.mesh import hexahedral_grid, second_order
 from benchmarks.verification import ccx

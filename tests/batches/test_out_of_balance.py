@@ -9,12 +9,14 @@ from data_samples import block, raised
 
 from ast_sim.batches.out_of_balance import SHARPNESS, Elasticity
 from ast_sim.element_topology import MIDDLES
-from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.material import Material
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.elements.second_order import elastic_body, points_at_rest
 from ast_sim.scene import Scene
 from ast_sim.simulate.shapes.parts import oriented
 
 YOUNG, POISSON = 2.0, 0.3
+MATERIAL = Material(("young", "poisson"))
 
 
 def scene(order: int) -> Scene:
@@ -24,13 +26,17 @@ def scene(order: int) -> Scene:
     return raised(made) if order == 2 else made
 
 
+def elasticity(made: Scene) -> Elasticity:
+    return Elasticity.of(made, Material() if made.material is None else MATERIAL)
+
+
 def tensors(*arrays: np.ndarray) -> list[torch.Tensor]:
     return [torch.tensor(x, dtype=torch.float32) for x in arrays]
 
 
 def forces_of(made: Scene, position: np.ndarray) -> np.ndarray:
     """The forces themselves, in pascal times square metres."""
-    of = Elasticity.of(made)
+    of = Elasticity.of(made, MATERIAL)
     values = of.out_of_balance(*tensors(position, made.rest_position))
     return (torch.sinh(values.double()) * of.force[:, None] / SHARPNESS).numpy()
 
@@ -71,12 +77,11 @@ def test_second_order_forces_are_minus_the_derivative_of_the_energy():
 def test_scenes_of_a_batch_keep_their_forces_and_gradients_flow():
     scenes = [scene(2), raised(block(1, 1, 1)), scene(2)]
     positions = [waves(one.rest_position.astype(float), 0.05) for one in scenes]
-    joined = Elasticity.concatenate([Elasticity.of(one) for one in scenes])
+    joined = Elasticity.concatenate([elasticity(one) for one in scenes])
     position, rest = tensors(np.concatenate(positions), np.concatenate([one.rest_position for one in scenes]))
     together = joined.out_of_balance(position.requires_grad_(), rest)
     alone = [
-        Elasticity.of(one).out_of_balance(*tensors(x, one.rest_position))
-        for one, x in zip(scenes, positions, strict=True)
+        elasticity(one).out_of_balance(*tensors(x, one.rest_position)) for one, x in zip(scenes, positions, strict=True)
     ]
     torch.testing.assert_close(together, torch.cat(alone), rtol=1e-5, atol=1e-5)
     together.square().sum().backward()

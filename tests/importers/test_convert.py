@@ -98,8 +98,9 @@ def test_fields_by_other_names(tmp_path):
     write_series(tmp_path / "run", given, False, displacement="U", **fields)
     found = read_series(
         tmp_path / "run",
-        FieldNames(displacement="U", stress="S_Mises", obstacle="tool", handle="held", material=("nu", "E")),
+        FieldNames(displacement="U", stress="S_Mises", obstacle="tool", handle="held", material=("poisson=nu", "E")),
     )
+    assert found.attributes["material"] == "poisson, E"
     assert found.stress_location == "element"
     assert np.array_equal(found.stress, mises.astype(np.float32)[:, :, None])
     assert np.array_equal(found.scene.material, np.stack([2 * modulus, modulus], 1).astype(np.float32))

@@ -82,7 +82,7 @@ def pressed(tmp_path_factory):
 def pressing(dataset, share):
     """A model that goes a share of the way to the solver's frame, with the settings that its data gives."""
     truth, scales = dataset.load("test", 0), measure(dataset)
-    facts = DataFacts.of(dataset.info, 0, scales.spacing, recorded=scales.recorded)
+    facts = DataFacts.of(dataset.info, (), scales.spacing, recorded=scales.recorded)
     settings = replace(find_preset("ast", "tiny").model, jumps=True).resolve(facts)
     return truth, Share(settings, truth, deepest_frame(truth), share)
 
@@ -170,7 +170,9 @@ def test_newton_steps_need_a_material(one, pressed):
     truth, model = pressing(pressed, 0.7)
     question = [Question.of(truth, "plate", [-1])]
     model.config = replace(model.config, data=replace(model.config.data, young=0.0))
-    with pytest.raises(ConfigError, match="newton_steps is 1; they need tetrahedra and their material"):
+    with pytest.raises(
+        ConfigError, match="newton_steps is 1, but the law of the material is not known: it has no columns"
+    ):
         answers(model, question, Effort(0, 1))
     model.config = replace(model.config, jumps=False)
     with pytest.raises(ConfigError, match="corrections is 2; it needs a run that jumps"):

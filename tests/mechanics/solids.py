@@ -4,7 +4,7 @@ import numpy as np
 
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import ContactSettings
-from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.scene import NodeType, Scene
 from ast_sim.simulate.shapes import mesh
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ast_sim.mechanics.elements.elasticity import Elasticity
-from ast_sim.mechanics.elements.material import NeoHookean, cofactor, determinant, von_mises
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean, cofactor, determinant, von_mises
 from ast_sim.mechanics.elements.second_order import LARGEST, elastic_body, shape_functions
 from ast_sim.mechanics.linear_system import LinearSystem
 from ast_sim.simulate.shapes import mesh

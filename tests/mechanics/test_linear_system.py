@@ -7,7 +7,7 @@ import pytest
 
 from ast_sim.mechanics import linear_system
 from ast_sim.mechanics.elements.elasticity import Elasticity
-from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.linear_system import Cholmod, LinearSystem, Pardiso
 from ast_sim.simulate.shapes import mesh
 

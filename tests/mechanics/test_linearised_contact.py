@@ -9,7 +9,7 @@ from solids import blocks, pressed, scene_of
 
 from ast_sim.mechanics import linearised_contact
 from ast_sim.mechanics.elements.elasticity import Elasticity
-from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.linearised_contact import STILL, NewtonSteps
 from ast_sim.mechanics.quasi_static import quasi_static, solve_frame
 from ast_sim.scene import NodeType

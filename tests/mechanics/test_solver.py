@@ -10,7 +10,7 @@ from solids import blocks, pressed
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
 from ast_sim.mechanics.elements.elasticity import Elasticity
-from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.load_halving import QuasiStatic
 from ast_sim.mechanics.quasi_static import quasi_static
 from ast_sim.mechanics.solver import Newton, NotConverged, SolverSettings

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from benchmarks.verification import __main__ as verification
 from benchmarks.verification import elasticity as verification_elasticity
 from benchmarks.verification.problem import Row, at_most, more_than, observed_order, relative

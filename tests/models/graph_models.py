@@ -23,7 +23,7 @@ Parameters = dict[str, Tensor]
 
 def resolved(config: ModelConfig, radius: float = 0.06, **kind: bool) -> ModelConfig:
     """The settings on the data of tests/toy.py, with world edges between plate and block, and within the plate."""
-    return replace(config, world_radius=radius).resolve(DataFacts.of(toy.info(**kind), 0, 0.1))
+    return replace(config, world_radius=radius).resolve(DataFacts.of(toy.info(**kind), (), 0.1))
 
 
 def with_stress(config: ModelConfig, stress: str, **changes: object) -> ModelConfig:

@@ -36,8 +36,8 @@ SMALL = {"hidden": 32, "decoder_hidden": 16, "d_token": 32, "heads": 2, "head_di
 DATA = {
     "deforming_plate": DataFacts(stress="node"),
     "sphere_simple": DataFacts(integration="dynamic"),
-    "abcd": DataFacts(material_width=1),
-    "abcd_xl": DataFacts(material_width=1, stress="element"),
+    "abcd": DataFacts(columns=("stiffness",)),
+    "abcd_xl": DataFacts(columns=("stiffness",), stress="element"),
 }
 
 
@@ -73,7 +73,9 @@ def test_every_preset_takes_a_training_step(family, tmp_path):
     path = write(tmp_path / "data.h5", family)
     with Dataset(path) as dataset:
         material = trajectory(family).scene.material
-        config = PRESETS[family].model.resolve(DataFacts.of(dataset.info, 0 if material is None else 1, 0.08))
+        config = PRESETS[family].model.resolve(
+            DataFacts.of(dataset.info, () if material is None else ("stiffness",), 0.08)
+        )
     assert config.data.stress == {"deforming_plate": "node", "abcd_xl": "element"}.get(family, "none")
     model, pairs = build_model(replace(config, dropout=0.0)), sampler(path, config)
     model.fit_statistics(pairs.batch(i) for i in range(3))
@@ -445,20 +447,20 @@ def test_what_the_dataset_decides():
     """Level by mesh spacing, a stress on elements with the element nodes that it needs, domain and kind of dynamics."""
     info = DatasetInfo("own", "quasi_static", "element", (1.0, 2.0, 3.0), 4.0, 0.01, 0.0)
     tiny = PRESETS["tiny"].model
-    config = tiny.resolve(DataFacts.of(info, 2, mesh_spacing=0.1))
+    config = tiny.resolve(DataFacts.of(info, ("young", "poisson"), mesh_spacing=0.1))
     assert config.element_inputs == ("displacement", "material") and config.data.stress == "element"
     assert config.node_inputs == ("displacement", "proximity", "material", "out_of_balance")
     assert config.data.material_width == 2
     assert (config.places, config.exchanges) == ("relative", 2)
     assert config.data.domain_center == (1.0, 2.0, 3.0) and config.data.domain_half_width == 4.0
     assert config.L_cell == 6 and config.cell_side == pytest.approx(0.125)  # 1 + log2(4 / 0.15) = 5.7
-    nodal = tiny.resolve(DataFacts.of(replace(info, stress_location="node"), 0, mesh_spacing=0.1))
+    nodal = tiny.resolve(DataFacts.of(replace(info, stress_location="node"), (), mesh_spacing=0.1))
     assert nodal.element_inputs == () and nodal.data.stress == "node"
-    moving = DataFacts.of(replace(info, integration="dynamic"), 0, mesh_spacing=0.1)
+    moving = DataFacts.of(replace(info, integration="dynamic"), (), mesh_spacing=0.1)
     dynamic = tiny.resolve(moving)
     assert dynamic.node_inputs == ("displacement", "velocity") and dynamic.element_inputs == ("displacement",)
     assert (dynamic.places, dynamic.exchanges) == ("absolute", 0)
-    assert replace(tiny, places="absolute").resolve(DataFacts.of(info, 0, 0.1)).exchanges == 0
+    assert replace(tiny, places="absolute").resolve(DataFacts.of(info, (), 0.1)).exchanges == 0
     asked = replace(tiny, places="relative", exchanges=1, node_inputs=(), element_inputs=("velocity",))
     found = asked.resolve(moving)
     assert (found.places, found.exchanges) == ("relative", 1)
@@ -506,4 +508,4 @@ def test_settings_that_the_data_does_not_fit(changes, stress, message):
     dynamic = stress == "dynamic"
     info = replace(toy.info(dynamic), stress_location="none" if dynamic else stress)
     with pytest.raises(ConfigError, match=message):
-        ASTConfig(**changes).resolve(DataFacts.of(info, 0, 0.1))
+        ASTConfig(**changes).resolve(DataFacts.of(info, (), 0.1))

@@ -25,7 +25,7 @@ def batch_of(element_nodes: bool) -> Batch:
 def test_node_features():
     inputs = ("displacement", "velocity", "material")
     config = ASTConfig(
-        node_inputs=inputs, boundary_motion=True, data=DataFacts(material_width=1, integration="dynamic")
+        node_inputs=inputs, boundary_motion=True, data=DataFacts(columns=("stiffness",), integration="dynamic")
     )
     batch = batch_of(False)
     expected = []
@@ -40,7 +40,9 @@ def test_node_features():
 
 def test_element_features():
     inputs = ("displacement", "velocity", "material", "stress")
-    config = ASTConfig(element_inputs=inputs, data=DataFacts(material_width=1, integration="dynamic", stress="element"))
+    config = ASTConfig(
+        element_inputs=inputs, data=DataFacts(columns=("stiffness",), integration="dynamic", stress="element")
+    )
     batch = batch_of(True)
     expected = torch.tensor([[0.1, 0, 0, 0.05, 0, 0, 2, 5], [0.125, 0, 0, 0.0625, 0, 0, 6, 7]])
     torch.testing.assert_close(element_features(config, batch), expected, rtol=0, atol=1e-6)

@@ -36,7 +36,7 @@ def config(model: str, **changes):
     if model == "ast":
         return replace(toy.config(toy.info()), **{"jumps": True, "boundary_motion": False, **changes})
     small = TransolverConfig(hidden=32, blocks=2, heads=2, slices=8, jumps=True)
-    return replace(small.resolve(DataFacts.of(toy.info(), 0, 0.1)), **{"node_inputs": ("displacement",), **changes})
+    return replace(small.resolve(DataFacts.of(toy.info(), (), 0.1)), **{"node_inputs": ("displacement",), **changes})
 
 
 def model_of(model: str, **changes) -> Simulator:
@@ -201,7 +201,7 @@ def test_a_failed_prediction_has_no_one_step(data):
 @pytest.mark.parametrize("model", ["ast", "transolver"])
 def test_dynamic_scenes_are_refused(model, tmp_path):
     with pytest.raises(ConfigError, match=r"model.jumps: the dataset is dynamic"):
-        config(model).resolve(DataFacts.of(toy.info(dynamic=True), 0, 0.1))
+        config(model).resolve(DataFacts.of(toy.info(dynamic=True), (), 0.1))
     moving = toy.write(tmp_path / "moving.h5", dynamic=True)
     with pytest.raises(ConfigError, match=r"model.jumps: the dataset is dynamic"):
         start_training(tmp_path / "run", configure(moving, "tiny", ["model.jumps=true"], model=model))
@@ -210,10 +210,10 @@ def test_dynamic_scenes_are_refused(model, tmp_path):
 @pytest.mark.parametrize("model", model_names())
 def test_the_preset_tiny_jumps_where_there_is_no_inertia_and_the_papers_presets_never(model):
     for dynamic in (False, True):
-        tiny = find_preset(model, "tiny").model.resolve(DataFacts.of(toy.info(dynamic=dynamic), 0, 0.1))
+        tiny = find_preset(model, "tiny").model.resolve(DataFacts.of(toy.info(dynamic=dynamic), (), 0.1))
         assert tiny.jumps is not dynamic and tiny.boundary_motion is dynamic
         assert ("out_of_balance" in tiny.node_inputs) is not dynamic
-    shells = find_preset(model, "tiny").model.resolve(DataFacts.of(toy.info(), 0, 0.1, tetrahedra=False))
+    shells = find_preset(model, "tiny").model.resolve(DataFacts.of(toy.info(), (), 0.1, tetrahedra=False))
     assert "out_of_balance" not in shells.node_inputs
     assert find_preset("ast", "deforming_plate").model.jumps is False
 
@@ -221,7 +221,7 @@ def test_the_preset_tiny_jumps_where_there_is_no_inertia_and_the_papers_presets_
 def test_forces_need_tetrahedra():
     asked = replace(find_preset("ast", "tiny").model, node_inputs=("out_of_balance",))
     with pytest.raises(ConfigError, match="out_of_balance needs tetrahedra"):
-        asked.resolve(DataFacts.of(toy.info(), 0, 0.1, tetrahedra=False))
+        asked.resolve(DataFacts.of(toy.info(), (), 0.1, tetrahedra=False))
 
 
 @pytest.mark.parametrize("model", ["ast", "transolver"])

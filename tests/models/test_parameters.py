@@ -53,7 +53,9 @@ def resolved(name: str, **changes) -> ASTConfig:
     """The preset on data of its family's kind; `tiny` on plates."""
     stress = {"deforming_plate": "node", "tiny": "node", "abcd_xl": "element"}.get(name, "none")
     info = replace(toy.info(dynamic=name == "sphere_simple"), stress_location=stress)
-    return replace(PRESETS[name].model, **changes).resolve(DataFacts.of(info, int(name.startswith("abcd")), 0.1))
+    return replace(PRESETS[name].model, **changes).resolve(
+        DataFacts.of(info, ("stiffness",) if name.startswith("abcd") else (), 0.1)
+    )
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -150,7 +150,7 @@ def test_data_that_cannot_fit_are_refused_in_one_line(folder, tmp_path):
     material = np.ones((plate.scene.num_elements, 2), np.float32)
     soft = dataclasses.replace(plate, scene=dataclasses.replace(plate.scene, material=material))
     for name, path in (
-        ("material columns 2", changed(tmp_path / "material.h5", soft)),
+        ("material columns column 0, column 1", changed(tmp_path / "material.h5", soft)),
         ("lengths in mm", changed(tmp_path / "mm.h5", plate, length_unit="mm")),
         ("stress_location none", toy.write(tmp_path / "none.h5", stress=False)),
         ("integration dynamic", toy.write(tmp_path / "dynamic.h5", dynamic=True)),

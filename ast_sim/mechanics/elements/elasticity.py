@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ast_sim.mechanics.elements.material import NeoHookean, cofactor, determinant, von_mises
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean, cofactor, determinant, von_mises
 from ast_sim.support.errors import SimulationError
 
 # The 78 entries (p, q), p <= q, of an element's symmetric 12 x 12 stiffness; p = 3 a + i for component i of node a.

@@ -21,7 +21,7 @@ import numpy as np
 
 from ast_sim.element_topology import MIDDLES
 from ast_sim.mechanics.elements.elasticity import Deformation, Elasticity, negative_directions
-from ast_sim.mechanics.elements.material import NeoHookean, cofactor, determinant, von_mises
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean, cofactor, determinant, von_mises
 from ast_sim.support.errors import SimulationError
 
 LARGEST = 20.0

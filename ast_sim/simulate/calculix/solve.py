@@ -22,7 +22,7 @@ import numpy as np
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import Contact
 from ast_sim.mechanics.elements.elasticity import Elasticity
-from ast_sim.mechanics.elements.material import von_mises
+from ast_sim.mechanics.elements.neo_hookean import von_mises
 from ast_sim.mechanics.elements.second_order import elastic_body
 from ast_sim.scene import AttributeValue, Trajectory
 from ast_sim.simulate.calculix.ccx_results import Results, read_results

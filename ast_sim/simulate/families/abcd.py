@@ -17,7 +17,7 @@ import numpy as np
 from ast_sim.dataset.layout import DatasetInfo
 from ast_sim.mechanics.case import Drawn, SolidCase
 from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
-from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.quasi_static import quasi_static
 from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.mechanics.unfinished import Checkpoint

@@ -50,7 +50,7 @@ def dataset_facts(dataset: Dataset, samples: Sequence[Sample], seconds: SolverSe
         "Domain": f"cube around ({center}), half width {info.domain_half_width:g} {unit}",
         **{name: _spread(samples, key, unit if u == "length" else u) for key, (name, u) in SETTINGS.items()},
         "Elements": element,
-        "Material columns": str(dataset.material_width) if samples else None,
+        "Material columns": ", ".join(dataset.material.columns) or "none" if samples else None,
         "Sizes": _sizes(samples),
         "Solved on": ", ".join(seconds.processors) or None,
     }

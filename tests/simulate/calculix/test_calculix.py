@@ -10,7 +10,7 @@ import pytest
 from ast_sim.mechanics import quasi_static as trajectory
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import ContactSettings
-from ast_sim.mechanics.elements.material import NeoHookean
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.scene import NodeType, Scene
 from ast_sim.simulate.calculix import solve as calculix
 from ast_sim.simulate.calculix.ccx_results import read_increments, read_results

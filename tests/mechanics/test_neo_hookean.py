@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ast_sim.mechanics.elements.material import NeoHookean, cofactor, determinant, von_mises
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean, cofactor, determinant, von_mises
 from ast_sim.support.errors import SimulationError
 
 MATERIAL = NeoHookean(young=1e6, poisson=0.4)

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ast_sim.material import ELASTIC, Material
+from ast_sim.scene import Scene
 from ast_sim.support.errors import SimulationError
 
 
@@ -54,6 +56,21 @@ class NeoHookean:
                 "Young's modulus must be positive and Poisson's ratio in [0, 0.5):"
                 f" got {young[wrong].flat[0]}, {poisson[wrong].flat[0]}"
             )
+
+    @classmethod
+    def of_scene(cls, scene: Scene, material: Material) -> NeoHookean:
+        """The law of each element of a scene. What rigid elements have is ignored: they get constants that are allowed.
+
+        Raises:
+            ConfigError: the law of the material is not known.
+            SimulationError: the constants of an element that deforms are not allowed.
+        """
+        material.require_law()
+        young, poisson = (material.numbers(name, scene.material) for name in ELASTIC)
+        if np.ndim(young) == np.ndim(poisson) == 0:
+            return cls(young, poisson)
+        rigid = ~scene.deforming_nodes[scene.elements].any(axis=1)
+        return cls(np.where(rigid, 1.0, young), np.where(rigid, 0.0, poisson))
 
     @classmethod
     def of_lame(cls, lam: float | np.ndarray, mu: float | np.ndarray) -> NeoHookean:

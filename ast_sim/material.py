@@ -1,0 +1,64 @@
+"""What deforming bodies are made of: the law, and what each number of a scene's material is, by its name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ast_sim.support.errors import ConfigError
+
+YOUNG, POISSON, FRICTION = "young", "poisson", "friction"
+ELASTIC = (YOUNG, POISSON)  # Young's modulus in pascal, Poisson's ratio
+_PLASTIC = "yield_stress"  # with this column a body yields, and its law is none that is known here
+
+
+@dataclass(frozen=True)
+class Material:
+    """The material of all scenes of a dataset, or of one scene.
+
+    Attributes:
+        columns: the name of each column of `Scene.material`: "young" (Young's modulus in pascal), "poisson" (Poisson's
+            ratio), "friction", or what else the data have.
+        constants: numbers that are the same in all elements of all scenes, by name. A column wins over a constant.
+    """
+
+    columns: tuple[str, ...] = ()
+    constants: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def law(self) -> str | None:
+        """ "neo_hookean" (of Ciarlet, as the bundled solver has it), if Young's modulus and Poisson's ratio are known
+        and no yield stress; None: the law is not known."""
+        known = {*self.columns, *self.constants}
+        return "neo_hookean" if known.issuperset(ELASTIC) and _PLASTIC not in known else None
+
+    def require_law(self) -> None:
+        """Raise ConfigError unless the law is known; the text says what there is."""
+        if self.law is None:
+            columns = f"the columns {', '.join(self.columns)}" if self.columns else "no columns"
+            raise ConfigError(
+                f"the law of the material is not known: it has {columns}, but needs Young's modulus and Poisson's ratio"
+                " and no yield stress. Name the columns where the data are made: DatasetInfo(generator={'material':"
+                " ['young', 'poisson']}), or --material young poisson"
+            )
+
+    def numbers(self, name: str, values: np.ndarray | None) -> np.ndarray | float:
+        """[E] float64, the column of this name in `values` [E, m]; or the constant of this name.
+
+        Raises:
+            ConfigError: there is neither; or `values` has other columns.
+        """
+        width = 0 if values is None else values.shape[1]
+        if width != len(self.columns):
+            raise ConfigError(
+                f"the material has {width} columns, but {len(self.columns)} names: {', '.join(self.columns)}"
+            )
+        if values is not None and name in self.columns:
+            return values[:, self.columns.index(name)].astype(np.float64)
+        if name not in self.constants:
+            raise ConfigError(
+                f"the material has no {name}; it has {', '.join(dict.fromkeys((*self.columns, *self.constants)))}"
+            )
+        return self.constants[name]

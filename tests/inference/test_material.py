@@ -1,0 +1,105 @@
+"""A material is known by the names of its columns, never by their number or order."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import toy
+from toy import one_thread  # noqa: F401 (used by being imported)
+
+from ast_sim import Answer, Dataset, DatasetInfo, DatasetWriter, Effort, Material, Run, example_run, generate, train
+from ast_sim.batches.out_of_balance import Elasticity
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean
+from ast_sim.mechanics.reaction import Reaction
+from ast_sim.support.errors import ConfigError, DatasetError, SimulationError
+
+NUMBERS = (2e5, 0.25)
+
+
+def trained(folder, names, numbers) -> tuple[Run, Answer]:
+    """A run that jumps, of plates with these columns, and its answer to one of them."""
+    info = replace(toy.info(), generator={} if names is None else {"material": names})
+    with DatasetWriter(folder / "d.h5", info) as writer:
+        for split, seed in (("train", 0), ("valid", 1)):
+            truth = toy.plate(seed)
+            material = np.full((truth.scene.num_elements, len(numbers)), numbers, np.float32)
+            writer.add(split, replace(truth, scene=replace(truth.scene, material=material)))
+    run = train(folder / "d.h5", folder / "run", model="mgn", model_settings={"hidden": 16, "jumps": True}, steps=1)
+    with Dataset(folder / "d.h5") as data:
+        return run, run.predict(data["train"][0])
+
+
+@pytest.mark.parametrize("names", [["thickness", "density"], None, ["young", "poisson", "yield_stress"]])
+def test_columns_of_another_meaning_are_no_moduli(tmp_path, names):
+    """Their numbers would do for Young's modulus and Poisson's ratio."""
+    numbers = NUMBERS if names is None else (*NUMBERS, 1e3)[: len(names)]
+    run, answer = trained(tmp_path, names, numbers)
+    known = ", ".join(names or ["column 0", "column 1"])
+    message = f"the law of the material is not known: it has the columns {known}, but needs Young's modulus"
+    with pytest.raises(ConfigError, match=f"scene has no reaction: {message}"):
+        answer.reaction()
+    with pytest.raises(ConfigError, match=f"newton_steps is 1, but {message}"):
+        run.predict(answer.scene, {1: (0, 0, -0.01)}, effort=Effort(0, 1))
+    assert "reaction" not in answer.figures()[-1] and run.settings.model.data.columns == tuple(known.split(", "))
+    same = Elasticity.of(answer.scene, Material()).lame  # all elements have one stiffness
+    assert np.array_equal(Elasticity.of(answer.scene, run.settings.model.data.material).lame, same)
+
+
+def test_own_data_have_a_reaction_in_any_order_of_the_columns(tmp_path):
+    run, answer = trained(tmp_path, ["poisson", "young"], NUMBERS[::-1])
+    force = Reaction(answer.scene, answer.driven, NeoHookean(*np.float32(NUMBERS).astype(float)))
+    expected = [force.of(position) for position in answer.position]
+    np.testing.assert_allclose(answer.reaction(), expected, rtol=1e-12)
+    assert answer.figures()[-1]["reaction"] == pytest.approx(np.linalg.norm(expected[-1])) and np.any(expected[-1])
+    exact = run.predict(answer.scene, {1: (0, 0, -0.001)}, frames=[-1], effort=Effort(0, 20))
+    assert exact.converged and np.isfinite(exact.reaction()).all()
+
+
+def test_plates_have_the_reaction_of_the_solver(tmp_path):
+    """Their constants are recorded, and are no columns."""
+    generate("deforming_plate", tmp_path / "d.h5", train=1, nodes=150, frames=3, workers=1, progress=False)
+    with Dataset(tmp_path / "d.h5") as data:
+        truth = data["train"][0]
+    assert truth.scene.material is None
+    with pytest.warns(UserWarning, match="in training"):
+        answer = replace(example_run("plates").predict(truth, effort=Effort()), position=truth.position)
+    forces = np.linalg.norm(answer.reaction(), axis=1)
+    np.testing.assert_allclose(forces, truth.attributes["reaction"], rtol=0.05, atol=1e-3)
+    assert forces[1] > 1
+
+
+def test_names_come_from_the_dataset_or_its_family():
+    info = replace(toy.info(), generator={"material": ["nu", "E"]})
+    assert info.material(2).columns == ("nu", "E") and info.material(2).law is None
+    assert toy.info().material(2).columns == ("column 0", "column 1") and toy.info().material(0) == Material()
+    assembly = replace(toy.info(), family="assembly")
+    assert [assembly.material(width).law for width in (0, 1, 2, 3, 4)] == [
+        None,
+        None,
+        "neo_hookean",
+        "neo_hookean",
+        None,
+    ]
+    assert assembly.material(3).columns == ("young", "poisson", "friction")
+    for names, told in ((["young"], "young"), (["young", "young"], "young, young"), ([], "none")):
+        wrong: DatasetInfo = replace(toy.info(), generator={"material": names})
+        with pytest.raises(DatasetError, match=f"has 2 columns, but generator\\['material'\\] names {told}: give"):
+            wrong.material(2)
+
+
+def test_numbers_by_name():
+    values = np.float32([[1, 2], [3, 4]])
+    material = Material(("friction", "young"), {"young": 7.0, "poisson": 0.3})
+    assert material.numbers("young", values).tolist() == [2, 4] and material.numbers("poisson", values) == 0.3
+    with pytest.raises(ConfigError, match="the material has no density; it has friction, young, poisson"):
+        material.numbers("density", values)
+    with pytest.raises(ConfigError, match="the material has 0 columns, but 2 names: friction, young"):
+        material.numbers("young", None)
+
+
+def test_constants_that_are_not_allowed_have_no_reaction(tmp_path):
+    _, answer = trained(tmp_path, ["young", "poisson"], (2e5, 0.5))
+    with pytest.raises(ConfigError, match=r"no reaction: Young's modulus must be positive and Poisson's ratio in \["):
+        answer.reaction()
+    with pytest.raises(SimulationError):
+        NeoHookean.of_scene(answer.scene, answer.material)
