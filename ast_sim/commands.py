@@ -252,6 +252,8 @@ def _save(answer: Any, args: argparse.Namespace, truth: Any) -> None:
     if answer.expected_error is not None:
         percent = f"{100 * answer.expected_error:.2g} % of the displacement"
         print(f"expected error: {percent}, as in the validation scenes at their deepest frame")
+    if args.check:
+        print(printable(str(answer.check())))
 
 
 def _effort(run: Any, args: argparse.Namespace) -> Any:

@@ -14,7 +14,9 @@ import numpy as np
 from ast_sim.dataset.layout import LENGTH_UNITS, DatasetInfo
 from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.mechanics.driven import Driven
+from ast_sim.mechanics.elements.material import NeoHookean
 from ast_sim.mechanics.linearised_contact import STILL
+from ast_sim.mechanics.physics_check import Law, PhysicsCheck, check_physics
 from ast_sim.scene import AttributeValue, Scene, Trajectory
 from ast_sim.support.errors import AstSimError, MissingExtra, RolloutError
 from ast_sim.support.notebook_table import html_picture, html_table, one_line
@@ -75,6 +77,7 @@ class Answer:
             that is larger. As long as the contact does not change, a next step would be about its square. Frames
             ascend. Empty without Newton steps.
         driven: the prescribed nodes that move farthest together in the whole motion.
+        law: the law of the material and of contact, where the run knows it.
     """
 
     name: str
@@ -93,6 +96,7 @@ class Answer:
     expected_error: float | None = None
     last_steps: tuple[float, ...] = ()
     driven: Driven | None = None
+    law: Law | None = None
 
     @property
     def computed(self) -> np.ndarray:
@@ -221,15 +225,38 @@ class Answer:
         """[S, 3] the force in newton on the prescribed nodes `driven`.
 
         It follows from the strains of the predicted positions, by the solver's own law of the material. None where the
-        scene has no Young's modulus and Poisson's ratio.
+        law is not known: the scene has no Young's modulus and Poisson's ratio, and no solver recorded them.
         """
-        if self.info is None or self.driven is None or self.info.family not in ELASTIC or self.scene.material is None:
+        material = self._material()
+        if self.info is None or self.driven is None or material is None:
             return None
         from ast_sim.mechanics.reaction import Reaction
 
         scale = LENGTH_UNITS[self.info.length_unit] ** 2
-        force = Reaction(self.scene, self.driven)
+        force = Reaction(self.scene, self.driven, material)
         return scale * np.array([force.of(position) for position in self.position]).reshape(-1, 3)
+
+    def _material(self) -> NeoHookean | None:
+        """The material of all elements; None if it is not known."""
+        if self.law is not None:
+            return self.law.material
+        if self.info is None or self.info.family not in ELASTIC or self.scene.material is None:
+            return None
+        rigid = ~self.scene.deforming_nodes[self.scene.elements].any(axis=1)
+        young, poisson = self.scene.material[:, :2].astype(np.float64).T
+        return NeoHookean(np.where(rigid, 1.0, young), np.where(rigid, 0.0, poisson))
+
+    def check(self) -> PhysicsCheck:
+        """Is it physics? Elements turned over, penetration, the forces out of balance: the worst over the computed
+        frames, each with a sentence. It takes about as long as a Newton step for each frame, and no truth.
+
+        Returns:
+            What was found; `print(answer.check())` shows a table. Forces need the law of the material.
+        """
+        unit = "" if self.info is None else self.info.length_unit
+        rows = np.flatnonzero(self.computed)
+        numbers = [self.frames[row] for row in rows]
+        return check_physics(self.scene, self.position[rows], numbers, self.law, unit)
 
     def figures(self, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> list[dict[str, float]]:
         """What an engineer asks of each frame: the travel of the prescribed nodes, the reaction and its components (if

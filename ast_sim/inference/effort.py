@@ -10,11 +10,11 @@ from typing import Any, Self
 
 import numpy as np
 
-from ast_sim.mechanics.elements.material import NeoHookean
-from ast_sim.mechanics.linearised_contact import CLEARANCE, NewtonSteps
+from ast_sim.mechanics.linearised_contact import NewtonSteps
+from ast_sim.mechanics.physics_check import Law
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.scene import Scene
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import ConfigError, SimulationError
 
 GOOD = 0.02  # a relative error that most users call exact
 GOOD_STRESS = 0.1  # the same of the stress, relative to the error of its mean
@@ -124,21 +124,32 @@ def friction_is_drawn(config: ModelConfig) -> bool:
     return config.data.material_width == 3 and config.data.contact_range > 0
 
 
-def newton_steps(config: ModelConfig, scene: Scene) -> NewtonSteps:
-    """The Newton steps of a scene, in the material and with the contact of the training scenes.
-
-    Raises:
-        SimulationError: the constants of the material are not allowed, or an element has no volume.
-    """
+def law_of(config: ModelConfig, scene: Scene) -> Law | None:
+    """The law of a scene: the material and the contact of the training scenes; None where they are not known."""
     friction = config.data.friction
+    if not knows_material(config):
+        return None
     if scene.material is not None and (config.data.material_width == 2 or friction_is_drawn(config)):
         young, poisson, *drawn = scene.material.astype(np.float64).T
         friction = max((float(column.max()) for column in drawn), default=friction)
         rigid = ~scene.deforming_nodes[scene.elements].any(axis=1)
-        material = NeoHookean(np.where(rigid, 1.0, young), np.where(rigid, 0.0, poisson))
-    else:
-        material = NeoHookean(config.data.young, config.data.poisson)
-    return NewtonSteps(scene, material, CLEARANCE * config.data.contact_range, friction)
+        young = np.where(rigid, 1.0, young)
+        poisson = np.where(rigid, 0.0, poisson)
+        return Law(young, poisson, config.data.contact_range, friction)
+    return Law(config.data.young, config.data.poisson, config.data.contact_range, friction)
+
+
+def newton_steps(config: ModelConfig, scene: Scene) -> NewtonSteps:
+    """The Newton steps of a scene, in the material and with the contact of the training scenes.
+
+    Raises:
+        SimulationError: the law is not known, the constants of the material are not allowed, or an element has no
+            volume.
+    """
+    law = law_of(config, scene)
+    if law is None:
+        raise SimulationError("the law of the material is not known")
+    return law.newton_steps(scene)
 
 
 def cheapest_good(measured: Sequence[EffortErrors]) -> Effort:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ast_sim.inference.answer import Answer
+from ast_sim.inference.effort import law_of
 from ast_sim.mechanics.driven import Driven
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.scene import Scene, Trajectory
@@ -116,6 +117,7 @@ class Question:
             frames=numbers,
             last_steps=last_steps,
             driven=Driven.of(self.scene, self.prescribed_position),
+            law=law_of(config, self.scene),
         )
 
 

@@ -27,24 +27,23 @@ SMOOTH = 1e-3  # residual to which the smooth field is computed; every field is 
 
 
 class Reaction:
-    """The force on the moved nodes of a scene of tetrahedra with Young's modulus and Poisson's ratio as its material.
+    """The force on the moved nodes of a scene of tetrahedra.
 
     Made once for a scene, because the shape functions do not change.
 
     Args:
         driven: the moved nodes.
+        material: of all elements.
     """
 
-    def __init__(self, scene: Scene, driven: Driven) -> None:
+    def __init__(self, scene: Scene, driven: Driven, material: NeoHookean) -> None:
         import igl  # takes 0.2 s
 
-        assert scene.material is not None
         self.scene = scene
         self.driven = driven
         self._rest = scene.rest_position.astype(np.float64)
         soft = np.flatnonzero(scene.deforming_nodes[scene.elements].any(axis=1))
-        young, poisson = scene.material[soft, :2].astype(np.float64).T
-        self._elasticity = elastic_body(self._rest, scene.elements[soft], NeoHookean(young, poisson))
+        self._elasticity = elastic_body(self._rest, scene.elements[soft], material.of(soft))
         linear = linear_elements(scene.elements[soft].astype(np.int64))
         self._laplacian = -igl.cotmatrix(self._rest, linear).tocsr()
         surface = scene.surface()

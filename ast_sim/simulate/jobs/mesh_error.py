@@ -155,7 +155,7 @@ def _from_coarse(coarse: SolidCase, solved: Trajectory, fine: SolidCase, frame: 
 
 def _force(case: SolidCase, position: np.ndarray, quantity: str) -> float:
     """In pascal times the square of the unit of length (torque: the cube), at equilibrium."""
-    reaction = Reaction(case.scene, Driven.of(case.scene, case.targets))
+    reaction = Reaction(case.scene, Driven.of(case.scene, case.targets), case.material)
     return abs(reaction.torque(position)) if quantity == "torque" else float(np.linalg.norm(reaction.of(position)))
 
 
