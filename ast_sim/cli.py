@@ -21,6 +21,8 @@ from ast_sim.support.argument_types import at_least, path, whole_numbers
 from ast_sim.support.errors import AstSimError, ConfigError, printable
 from ast_sim.support.stop_signals import Interrupted
 
+CORNERS = "take only the corners of second-order tetrahedra: forces are then those of another, stiffer mesh"
+
 
 class _Parser(argparse.ArgumentParser):
     """A parser that reports wrong arguments in one line. Its help ends with the lines that `more` makes when it is
@@ -135,6 +137,8 @@ def _add_generate(generate: _Parser) -> None:
         "--test N": "number of test scenes (default: a tenth of --count)",
     }
     _add_each(generate, splits, type=at_least(0))
+    about = "number of scenes of the split calibration, on which a trained run measures its errors (default: 0)"
+    _add_each(generate, {"--calibration N": about}, type=at_least(0), default=0)
     sizes = {"--nodes N": "approximate number of nodes of a scene", "--frames N": "number of frames of a scene"}
     _add_each(generate, sizes, type=at_least(1))
     about = "solve and store only frame 0 and these, such as 1,5,20, each straight from the one before (default: all)"
@@ -172,10 +176,17 @@ def _add_convert(convert: _Parser) -> None:
     about = "components of the stress, such as xx,xy,xz,yy,yz,zz (default: as the file names them, else xx,yy,zz,...)"
     _add_each(fields, {"--stress-order XX,YY,...": about}, type=_stress_order, default=())
     _add_each(fields, {"--material NAME": "cell fields with one number each"}, nargs="+", default=[])
+    about = "a further field that the dataset keeps by its name, such as PEEQ or CPRESS=MPa; may be repeated"
+    _add_each(fields, {"--field NAME[=UNIT]": about}, action="append", default=[])
+    about = "point field with the forces on the nodes, such as RF, in newton (in the unit of force of a deck)"
+    _add_each(fields, {"--reaction NAME": about})
     kind = convert.add_argument_group("properties of a dataset made from such files")
     about = "shares of the simulations, drawn at random (default: 0.8 0.1 0.1 of three or more)"
     kind.add_argument("--shares", nargs=3, type=float, metavar=("TRAIN", "VALID", "TEST"), help=about)
+    about = "so many simulations are drawn first, for the split calibration; the shares divide the others (default: 0)"
+    _add_each(kind, {"--calibration N": about}, type=at_least(0), default=0)
     kind.add_argument("--seed", type=at_least(0), default=0, help="seed of this draw (default: 0)")
+    kind.add_argument("--corners", action="store_true", help=CORNERS)
     kind.add_argument("--incomplete", action="store_true", help="convert although nothing moves or is prescribed")
     kind.add_argument("--strict", action="store_true", help="refuse simulations in which something looks wrong")
     kind.add_argument("--dynamic", action="store_true", help="inertia matters: models predict the acceleration")
@@ -255,6 +266,7 @@ def _add_predict(predict: _Parser) -> None:
         "--type-field NAME": "point field: 0 normal, 1 obstacle, 3 handle (default: node_type)",
     }
     _add_each(mesh, fields)
+    mesh.add_argument("--corners", action="store_true", help=CORNERS)
     data = predict.add_argument_group("if SCENE is a dataset")
     data.add_argument("--split", choices=commands.SPLITS, default="test", help="split (default: test)")
     _add_each(data, {"--index I": "number of the trajectory in the split"}, type=at_least(0))

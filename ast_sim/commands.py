@@ -16,7 +16,7 @@ from ast_sim.runs import CONFIG, SCOPE
 from ast_sim.support.disk import output_file
 from ast_sim.support.errors import ConfigError, DatasetError, RolloutError, printable
 
-SPLITS = ("train", "valid", "test")
+SPLITS = ("train", "valid", "test", "calibration")
 
 
 def demo(args: argparse.Namespace) -> None:
@@ -38,8 +38,8 @@ def generate(args: argparse.Namespace) -> None:
     for option, value in (("--out FILE", args.out), ("--count N", args.count)):
         if value is None:
             raise ConfigError(f"give {option}" + (", or --look" if args.spec is not None else ""))
-    chosen = ("valid", "test", "seed", "nodes", "frames", "keep", "workers", "solver", "parts", "spec", "patient")
-    options = {name: getattr(args, name) for name in (*chosen, "scheduler")}
+    chosen = ("valid", "test", "calibration", "seed", "nodes", "frames", "keep", "workers", "solver", "parts", "spec")
+    options = {name: getattr(args, name) for name in (*chosen, "patient", "scheduler")}
     made = simulate(args.family, args.out, train=args.count, **options)
     print(f"{made.path}: {_counts(made.counts)}")
     if made.truncated:
@@ -63,7 +63,7 @@ def _look(args: argparse.Namespace) -> None:
     each = drawn.mesh_seconds + drawn.solve_seconds
     print(f"one scene: {each:.3g} s ({drawn.mesh_seconds:.2g} s to mesh), {printable(drawn.status)}")
     print(printable(drawn.mesh_line))
-    scenes = sum(checked_counts(args.count or 100, args.valid, args.test).values())
+    scenes = sum(checked_counts(args.count or 100, args.valid, args.test, args.calibration).values())
     workers = checked_workers(args.workers, None)
     cost = duration(each * scenes / workers)
     print(f"--count {args.count or 100}: {scenes} scenes, about {cost} with {workers} processes")
@@ -71,11 +71,13 @@ def _look(args: argparse.Namespace) -> None:
 
 
 def _counts(counts: dict[str, int]) -> str:
-    return ", ".join(f"{count} {split}" for split, count in counts.items())
+    """What was made; most datasets have no scenes for calibration, so these are told of only where there are some."""
+    return ", ".join(f"{count} {split}" for split, count in counts.items() if count or split != "calibration")
 
 
 def convert(args: argparse.Namespace) -> None:
     """Make a dataset from simulations of other programs (VTK, CalculiX, Exodus, LS-DYNA, XDMF, TFRecord)."""
+    from ast_sim.importers.convert import SHARES
     from ast_sim.importers.convert import convert as import_files
     from ast_sim.importers.deepmind import is_deepmind
     from ast_sim.importers.series import FieldNames
@@ -91,15 +93,18 @@ def convert(args: argparse.Namespace) -> None:
     else:
         _refuse(args, args.of_records, f"{args.source}, which holds no .tfrecord files")
         fields = (args.displacement, args.stress, args.node_type, args.obstacle, args.handle, args.body)
+        more = (args.stress_order, args.stress_unit, tuple(args.field), args.reaction)
         options = {
-            "names": FieldNames(*fields, tuple(args.material), args.stress_order, args.stress_unit),
-            "splits": None if args.shares is None else dict(zip(SPLITS, args.shares, strict=True)),
+            "names": FieldNames(*fields, tuple(args.material), *more),
+            "splits": None if args.shares is None else dict(zip(SHARES, args.shares, strict=True)),
+            "calibration": args.calibration,
             "seed": args.seed,
             "integration": "dynamic" if args.dynamic else "quasi_static",
             "contact_radius": args.contact_radius,
             "time_step": args.time_step,
             "length_unit": args.length_unit,
             "deck": deck,
+            "corners": args.corners,
             "incomplete": args.incomplete,
             "strict": args.strict,
         }
@@ -257,8 +262,7 @@ def _save(answer: Any, args: argparse.Namespace, truth: Any) -> None:
 
 
 def _effort(run: Any, args: argparse.Namespace) -> Any:
-    """What --corrections and --newton-steps ask for; None: the default of the run. Without --newton-steps, corrections
-    are followed by no Newton step."""
+    """What --corrections and --newton-steps ask for; None: the run's default. Corrections alone: no Newton step."""
     from ast_sim.inference.effort import Effort
 
     if args.corrections is None and args.newton_steps is None:
@@ -290,6 +294,7 @@ def _scene(args: argparse.Namespace) -> Any:
         body_field=args.body_field,
         type_field=args.type_field,
         materials=dict(map(parse_material, args.material)) or None,
+        corners=args.corners,
     )
     print("\n".join(map(printable, read.description)))
     return read.scene

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -114,3 +115,14 @@ def require_finite(name: str, array: str, row: str, value: np.ndarray, first_fra
         *frame, index, _ = np.unravel_index(np.argmin(finite), finite.shape)
         at = f"in frame {first_frame + frame[0]} at {row} {index}" if frame else f"of {row} {index}"
         raise DatasetError(f"{name}: {array} {at} is not finite: {value[*frame, index].tolist()}")
+
+
+def ranges(numbers: Iterable[int]) -> str:
+    """Ascending whole numbers as text: "0 to 5, 8, 10 to 12"."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    return ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs)

@@ -18,7 +18,8 @@ from ast_sim.mesh_arrays import (
     mesh_of_arrays,
     scene_arrays,
 )
-from ast_sim.number_arrays import require_array, require_finite, require_nodes
+from ast_sim.named_field import NamedField
+from ast_sim.number_arrays import ranges, require_array, require_finite, require_nodes
 from ast_sim.scene_summary import scene_drawing, scene_facts
 from ast_sim.support.errors import DatasetError
 from ast_sim.support.notebook_table import html_table, one_line
@@ -223,6 +224,7 @@ class Trajectory:
         frames: the numbers of the S frames in the whole motion, ascending; None: 0 to S - 1.
         times: the times of the S frames in seconds, ascending; None: they are not known.
         length_unit: the unit of all positions, such as "mm"; None: it is not known.
+        fields: other quantities of the results by name; `ast_sim.named_field.REACTION` has the nodal reactions.
     """
 
     scene: Scene
@@ -234,6 +236,7 @@ class Trajectory:
     frames: tuple[int, ...] | None = None
     times: tuple[float, ...] | None = None
     length_unit: str | None = None
+    fields: dict[str, NamedField] = field(default_factory=dict)
 
     def _facts(self) -> dict[str, str]:
         return {
@@ -274,6 +277,7 @@ class Trajectory:
         return replace(
             self,
             **{name: None if values is None else values[rows] for name, values in framed.items()},
+            fields={name: one.select(rows) for name, one in self.fields.items()},
             frames=tuple(chosen),
             times=None if self.times is None else tuple(self.times[row] for row in rows),
         )
@@ -307,6 +311,8 @@ class Trajectory:
             raise DatasetError(f"{name}: a trajectory needs at least one frame")
         require_finite(name, "position", "node", self.position)
         self._check_numbering(name)
+        for key, one in self.fields.items():
+            one.check(name, key, self.num_frames, n, e)
         if stress_location is not None and (self.stress is None) != (stress_location == "none"):
             what = "no stress" if self.stress is None else "stress"
             raise DatasetError(f"{name}: has {what}, but stress_location is {stress_location!r}")
@@ -337,14 +343,3 @@ class Trajectory:
                 raise DatasetError(f"{name}: {what} must be finite and ascend: {list(values)}")
         if self.frames is not None and self.frames[0] < 0:
             raise DatasetError(f"{name}: frames starts at {self.frames[0]}; the first frame of a motion is 0")
-
-
-def ranges(numbers: Iterable[int]) -> str:
-    """Ascending whole numbers as text: "0 to 5, 8, 10 to 12"."""
-    runs: list[list[int]] = []
-    for number in numbers:
-        if runs and number == runs[-1][-1] + 1:
-            runs[-1].append(number)
-        else:
-            runs.append([number])
-    return ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs)

@@ -101,11 +101,14 @@ def test_generate_help_tells_of_every_family_and_imports_no_solver():
 
 def test_generate_makes_a_dataset_of_the_settings_given(tmp_path, capsys):
     out = tmp_path / "plates.h5"
-    options = ["--count", "1", "--valid", "0", "--test", "0", "--seed", "3", "--nodes", "80", "--frames", "3"]
-    assert main(["generate", "deforming_plate", "--out", str(out), *options, "--workers", "1"]) == 0
-    assert f"{out}: 1 train, 0 valid, 0 test" in capsys.readouterr().out
+    counts = ["--count", "1", "--valid", "0", "--test", "0", "--calibration", "1"]
+    options = [*counts, "--seed", "3", "--nodes", "80", "--frames", "3", "--workers", "1"]
+    assert main(["generate", "deforming_plate", "--out", str(out), *options]) == 0
+    assert f"{out}: 1 train, 0 valid, 0 test, 1 calibration" in capsys.readouterr().out
     with Dataset(out) as dataset:
         assert dataset.num_frames("train", 0) == 3
+        first, other = dataset["train"][0], dataset.calibration[0]
+        assert not np.array_equal(first.scene.rest_position[:3], other.scene.rest_position[:3])  # another draw
         assert dataset.info.generator["command"] == "ast-sim generate deforming_plate --seed 3 --nodes 80 --frames 3"
 
 
@@ -233,9 +236,9 @@ def test_a_series_of_another_program_becomes_a_dataset(tmp_path, capsys):
     (tmp_path / "results").mkdir()
     for seed in range(3):
         export.write(tmp_path / "results" / f"case{seed}.pvd", toy.plate(seed))
-    shares = ["--shares", "0.34", "0.33", "0.33"]
+    shares = ["--shares", "0.5", "0", "0.5", "--calibration", "1"]
     assert main(["convert", str(tmp_path / "results"), "--out", str(tmp_path / "own.h5"), *shares]) == 0
-    assert "1 train, 1 valid, 1 test" in capsys.readouterr().out
+    assert "1 train, 0 valid, 1 test, 1 calibration" in capsys.readouterr().out
     with Dataset(tmp_path / "own.h5") as dataset:
         assert dataset.info.stress_location == "node"
         assert dataset.num_frames("test", 0) == 7

@@ -41,10 +41,13 @@ def test_everything_is_made(made):
         assert (made / name).stat().st_size > 0, name
     assert (made / "picture.png").read_bytes().startswith(b"\x89PNG")
     with Dataset(made / "data.h5") as dataset:
-        assert dataset.splits == {"train": 1, "valid": 1, "test": 0}
+        assert dataset.splits == {"train": 1, "valid": 1, "test": 0, "calibration": 0}
         assert dataset["train"][0].num_frames == 1 + len(KEPT)
     with Dataset(made / "unseen.h5") as dataset:
-        assert dataset.splits == {"train": 0, "valid": 0, "test": 1} and dataset["test"][0].num_frames == 41
+        assert (
+            dataset.splits == {"train": 0, "valid": 0, "test": 1, "calibration": 0}
+            and dataset["test"][0].num_frames == 41
+        )
     found = json.loads((made / "evaluation.json").read_text())
     assert found["origin"]["command"] == f"ast-sim demo --out {made} --quick --seed 0"
     assert (found["speedup"] is None) == (found["threads"] > 1)

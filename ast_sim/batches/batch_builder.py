@@ -45,6 +45,7 @@ class Batch:
         boundary_motion: [N, 3], how far the prescribed nodes move from the state to the frame to predict; 0 elsewhere.
         names: for messages, one for each scene: "train/000012 frame 7".
         wants_stress: False: a model may leave out the stress on elements.
+        proximity: [N, 5] of these positions, if it was computed ahead; None: a model that wants it computes it.
     """
 
     graph: Graph
@@ -54,6 +55,7 @@ class Batch:
     stress: Tensor | None
     names: list[str]
     wants_stress: bool = True
+    proximity: Tensor | None = None
 
     @staticmethod
     def build(graph: Graph, state: State, prescribed: Tensor, names: list[str]) -> Batch:
@@ -83,6 +85,7 @@ class Batch:
             position=placement.points(self.position),
             previous_position=None if previous is None else placement.points(previous),
             boundary_motion=placement.vectors(self.boundary_motion),
+            proximity=None,
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 from ast_sim.batches.batch_builder import Batch, Target
@@ -14,10 +15,13 @@ class Ahead:
 
     So the making of a batch must not depend on the use of the batch before it. The thread ends with this context
     manager. An error in making a batch is raised when that batch is asked for.
+
+    Args:
+        prepare: what the thread does to each batch: what a model needs of it that does not depend on its parameters.
     """
 
-    def __init__(self, sampler: PairSampler | Pool) -> None:
-        self._sampler = sampler
+    def __init__(self, sampler: PairSampler | Pool, prepare: Callable[[Batch], Batch] = lambda batch: batch) -> None:
+        self._sampler, self._prepare = sampler, prepare
         self._thread = ThreadPoolExecutor(1, "sampler")
         self._next: dict[int, Future[tuple[Batch, Target]]] = {}
 
@@ -29,10 +33,14 @@ class Ahead:
 
     def batch(self, step: int) -> tuple[Batch, Target]:
         """The batch of a step. The batch of step + 1 is begun."""
-        future = self._next.pop(step, None) or self._thread.submit(self._sampler.batch, step)
+        future = self._next.pop(step, None) or self._thread.submit(self._made, step)
         batch = future.result()
-        self._next = {step + 1: self._thread.submit(self._sampler.batch, step + 1)}
+        self._next = {step + 1: self._thread.submit(self._made, step + 1)}
         return batch
+
+    def _made(self, step: int) -> tuple[Batch, Target]:
+        batch, target = self._sampler.batch(step)
+        return self._prepare(batch), target
 
     def wait(self) -> None:
         """Wait until the batch that was begun is ready. Then the thread no longer reads the dataset."""

@@ -55,6 +55,8 @@ def _describe_split(dataset: Dataset, split: str, findings: list[tuple[str, Find
             highest = np.maximum(highest, position.max(axis=0))
             moved = position.astype(np.float64) - scene.rest_position
             largest = max(largest, float(np.linalg.norm(moved, axis=1).max()))
+        for name, one in dataset.fields(split, index).items():
+            fields[name] = f"{_field(one.values)} at each {one.location}, {one.unit or 'no unit'}"
         arrays = {**vars(scene), "position": trajectory.position, "stress": trajectory.stress}
         fields |= {name: _field(array) for name, array in arrays.items() if array is not None}
         for frame in range(trajectory.num_frames):  # one frame at a time saves memory: six numbers per element

@@ -3,16 +3,29 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import os
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
-from ast_sim.dataset.layout import ARRAYS, HASH, array_hash, plain_value, trajectory_hash
+from ast_sim.dataset.layout import (
+    ARRAYS,
+    FIELDS,
+    FORMAT,
+    HASH,
+    READABLE,
+    DatasetInfo,
+    array_hash,
+    field_key,
+    plain_value,
+    trajectory_hash,
+)
 from ast_sim.scene import AttributeValue
 from ast_sim.support.errors import AstSimError, DatasetError
 
@@ -57,8 +70,35 @@ class GuardedFile:
                 f"{name} cannot be read; the file is damaged or no dataset of ast_sim ({text})"
             ) from error
 
-    def attributes(self, group: h5py.Group) -> dict[str, AttributeValue]:
-        """The attributes of a group."""
+    def info(self) -> DatasetInfo:
+        """What the dataset says of itself."""
+        values = self.attributes(self.root)
+        if values.get("format") != FORMAT:
+            raise DatasetError(f"{self.path}: is no dataset of ast_sim (its attribute format is not {FORMAT!r})")
+        if values.get("version") not in READABLE:
+            raise DatasetError(
+                f"{self.path}: has the version {values.get('version')} of the format; this program reads"
+                f" {' and '.join(map(str, READABLE))}"
+            )
+        types = {"domain_center": list, "domain_half_width": float, "contact_radius": float, "time_step": float}
+        known: dict[str, Any] = {}
+        for key in (item.name for item in fields(DatasetInfo)):
+            wanted = types.get(key, str)
+            if not isinstance(values.get(key), wanted):
+                shown = repr(values[key])[:60] if key in values else "missing"
+                raise DatasetError(f"{self.path}: the attribute {key} is {shown}; must be a {wanted.__name__}")
+            known[key] = values[key]
+        known["domain_center"] = tuple(known["domain_center"])
+        with self.reading("the attribute generator"):
+            known["generator"] = json.loads(known["generator"])
+            if not isinstance(known["generator"], dict):
+                raise DatasetError(f"{self.path}: the attribute generator must be a JSON object")
+        info = DatasetInfo(**known)
+        info.check(str(self.path))
+        return info
+
+    def attributes(self, group: h5py.Group | h5py.Dataset) -> dict[str, AttributeValue]:
+        """The attributes of a group or of an array."""
         values = {}
         with self.reading(f"an attribute of {_path(group) or 'the file'}") as name:
             for key in group.attrs:
@@ -75,7 +115,17 @@ class GuardedFile:
         attributes = self.attributes(group)
         with self.reading(f"sample {_path(group)}"):
             arrays = {key: str(plain_value(group[key].attrs[HASH])) for key in ARRAYS if key in group}
+            if FIELDS in group:
+                arrays |= self._hashes_of_fields(self.child(group, FIELDS, h5py.Group))
         self._verify(str(group.name), trajectory_hash(arrays, attributes), attributes.get(HASH))
+
+    def _hashes_of_fields(self, fields: h5py.Group) -> dict[str, str]:
+        """The hashes of named fields by `field_key`."""
+        hashes = {}
+        for key in map(str, fields):
+            facts = self.attributes(self.child(fields, key, h5py.Dataset))
+            hashes[field_key(key, str(facts["unit"]), str(facts["location"]))] = str(facts[HASH])
+        return hashes
 
     def _verify(self, name: str, computed: str, stored: Any) -> None:
         if computed != (stored.decode() if isinstance(stored, bytes) else stored):
@@ -102,9 +152,16 @@ class GuardedFile:
                 raise DatasetError(f"{name} is no {kind.__name__.lower()}")
             return child
 
-    def array(self, group: h5py.Group, key: str, shape: tuple[int, ...] | None = None) -> h5py.Dataset:
-        """An array of a sample. Its dtype, rank, size and (if `shape` is given) shape are checked; nothing is read."""
-        dtype, rank = ARRAYS[key]
+    def array(
+        self,
+        group: h5py.Group,
+        key: str,
+        shape: tuple[int, ...] | None = None,
+        kind: tuple[type, int] | None = None,
+    ) -> h5py.Dataset:
+        """An array of a sample. Its dtype and rank (`kind`; else as its name says), its size and, if `shape` is given,
+        its shape are checked; nothing is read."""
+        dtype, rank = ARRAYS[key] if kind is None else kind
         array = self.child(group, key, h5py.Dataset)
         with self.reading(_path(group, key)) as name:
             if array.dtype != dtype or array.ndim != rank:
@@ -139,7 +196,7 @@ class GuardedFile:
         return value
 
 
-def _path(group: h5py.Group, key: str = "") -> str:
+def _path(group: h5py.Group | h5py.Dataset, key: str = "") -> str:
     """The path of a group or of its member within the file, without a slash in front."""
     return f"{group.name or ''}/{key}".strip("/")
 

@@ -16,9 +16,10 @@ from ast_sim.scene import AttributeValue, Scene
 from ast_sim.support.errors import DatasetError
 
 FORMAT = "ast_sim"
-VERSION = 2
+VERSION = 3
+READABLE = (2, VERSION)  # a file of version 2 is one of version 3 without named fields
 HASH = "sha256"  # attribute of every array and, over these and its attributes, of every trajectory
-SPLITS: tuple[str, ...] = ("train", "valid", "test")
+SPLITS: tuple[str, ...] = ("train", "valid", "test", "calibration")
 
 ARRAYS: dict[str, tuple[type, int]] = {
     "rest_position": (np.float32, 2),
@@ -32,6 +33,8 @@ ARRAYS: dict[str, tuple[type, int]] = {
 }
 OPTIONAL = ("material", "stress", "cauchy_stress")
 FRAMED = ("position", "stress", "cauchy_stress")
+FIELDS = "fields"  # the group of the named fields of a trajectory; each is an array of this kind
+FIELD_KIND = (np.float32, 3)
 NUMBERING = ("frames", "times")  # attributes of a trajectory that tell of its frames; they may be missing
 LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}  # in metres
 GIVEN_FRAMES = {"quasi_static": 1, "dynamic": 2}  # by integration: the first frames, from which a prediction starts
@@ -155,6 +158,11 @@ def array_hash(dtype: np.dtype, shape: tuple[int, ...], parts: Iterable[np.ndarr
     for part in parts:
         digest.update(np.ascontiguousarray(part).data)
     return digest.hexdigest()
+
+
+def field_key(name: str, unit: str, location: str) -> str:
+    """What stands for a named field in the hash of its trajectory: so its unit and its place cannot be edited."""
+    return f"{FIELDS}/{name} in {unit} at {location}"
 
 
 def trajectory_hash(arrays: dict[str, str], attributes: dict[str, AttributeValue]) -> str:

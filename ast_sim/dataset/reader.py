@@ -1,21 +1,20 @@
 """Reading a dataset file; its content is checked, never trusted.
 
-Layout: the root has the attributes of `DatasetInfo`, `format` and `version`. It holds the groups `train`, `valid` and
-`test`. Each of them holds one group per trajectory (`000000`, `000001`, ...) with the arrays of `Scene` and
-`Trajectory`. Each frame is a chunk. To find flipped bits, every array has the Fletcher-32 filter, and the version of
-HDF5's file format is one that adds checksums to its own structures.
+Layout: the root has the attributes of `DatasetInfo`, `format` and `version`. It holds the groups `train`, `valid`,
+`test` and `calibration`. Each of them holds one group per trajectory (`000000`, `000001`, ...) with the arrays of
+`Scene` and `Trajectory`. Each frame is a chunk. To find flipped bits, every array has the Fletcher-32 filter, and the
+version of HDF5's file format is one that adds checksums to its own structures.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 from collections.abc import Iterator
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import h5py
 import numpy as np
@@ -23,18 +22,19 @@ import numpy as np
 from ast_sim.dataset.guard import GuardedFile
 from ast_sim.dataset.layout import (
     ARRAYS,
-    FORMAT,
+    FIELD_KIND,
+    FIELDS,
     FRAMED,
     HASH,
     LENGTH_UNITS,
     NUMBERING,
     OPTIONAL,
     SPLITS,
-    VERSION,
     DatasetInfo,
     require_kind,
 )
 from ast_sim.dataset.split import Split
+from ast_sim.named_field import NamedField
 from ast_sim.number_arrays import require_finite
 from ast_sim.scene import AttributeValue, Scene, Trajectory
 from ast_sim.support.byte_cache import ByteCache
@@ -64,7 +64,7 @@ class Dataset:
         self._scale = 1.0
         self._file = GuardedFile(self.path)
         try:
-            self.info = self._in_unit(self._read_info(), length_unit)
+            self.info = self._in_unit(self._file.info(), length_unit)
             with self._file.reading("the list of samples"):
                 self.splits = {split: self._count(split) for split in SPLITS}
         except BaseException:
@@ -114,6 +114,12 @@ class Dataset:
         self._file.close()
 
     @property
+    def calibration(self) -> Split:
+        """Scenes for measuring the errors of a trained model beforehand: they take no part in its training, in the
+        choice of its checkpoint and in its test."""
+        return self["calibration"]
+
+    @property
     def material_width(self) -> int:
         """The number of material columns that every scene has."""
         return self._first_kind()[1]
@@ -158,7 +164,7 @@ class Dataset:
         return position[start:stop], None if stress is None else stress[start:stop]
 
     def load(self, split: str, index: int) -> Trajectory:
-        """A trajectory without its `cauchy_stress`, which is large; `dataset[split][index]` has it."""
+        """A trajectory without its `cauchy_stress` and `fields`, which are large; `dataset[split][index]` has them."""
         position, stress = self.frames(split, index, 0, self.num_frames(split, index))
         frames, times = self._numbering(split, index)
         trajectory = Trajectory(
@@ -214,6 +220,21 @@ class Dataset:
         array = self._file.array(group, "cauchy_stress", shape)
         return self._finite(self._name(split, index), "element", array, start, stop)
 
+    def fields(self, split: str, index: int) -> dict[str, NamedField]:
+        """The named fields of a trajectory, all frames of them."""
+        group, count = self._group(split, index), self.num_frames(split, index)
+        if not self._file.has(group, FIELDS):
+            return {}
+        scene, name = self.scene(split, index), self._name(split, index)
+        stored = self._file.child(group, FIELDS, h5py.Group)
+        fields: dict[str, NamedField] = {}
+        for key in sorted(stored):
+            array = self._file.array(stored, key, kind=FIELD_KIND)
+            facts = self._file.attributes(array)
+            fields[key] = NamedField(self._file.read(array), str(facts.get("location")), str(facts.get("unit", "")))
+            fields[key].check(name, key, count, scene.num_nodes, scene.num_elements)
+        return fields
+
     def attributes(self, split: str, index: int) -> dict[str, AttributeValue]:
         """The status and the solver's records of a trajectory."""
         values = self._file.attributes(self._group(split, index))
@@ -229,31 +250,6 @@ class Dataset:
 
     def _name(self, split: str, index: int) -> str:
         return f"{self.path}: {split}/{index:06d}"
-
-    def _read_info(self) -> DatasetInfo:
-        values = self._file.attributes(self._file.root)
-        if values.get("format") != FORMAT:
-            raise DatasetError(f"{self.path}: is no dataset of ast_sim (its attribute format is not {FORMAT!r})")
-        if values.get("version") != VERSION:
-            raise DatasetError(
-                f"{self.path}: has the version {values.get('version')} of the format; this program reads {VERSION}"
-            )
-        types = {"domain_center": list, "domain_half_width": float, "contact_radius": float, "time_step": float}
-        known: dict[str, Any] = {}
-        for key in (item.name for item in fields(DatasetInfo)):
-            wanted = types.get(key, str)
-            if not isinstance(values.get(key), wanted):
-                shown = repr(values[key])[:60] if key in values else "missing"
-                raise DatasetError(f"{self.path}: the attribute {key} is {shown}; must be a {wanted.__name__}")
-            known[key] = values[key]
-        known["domain_center"] = tuple(known["domain_center"])
-        with self._file.reading("the attribute generator"):
-            known["generator"] = json.loads(known["generator"])
-            if not isinstance(known["generator"], dict):
-                raise DatasetError(f"{self.path}: the attribute generator must be a JSON object")
-        info = DatasetInfo(**known)
-        info.check(str(self.path))
-        return info
 
     def _count(self, split: str) -> int:
         if split not in self._file.root:

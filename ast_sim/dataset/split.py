@@ -40,4 +40,5 @@ class Split(Sequence[Trajectory]):
             return Split(self._dataset, self.name, self._indices[index])
         number = self._indices[index]
         cauchy_stress = self._dataset.cauchy_stress(self.name, number)
-        return replace(self._dataset.load(self.name, number), cauchy_stress=cauchy_stress)
+        fields = self._dataset.fields(self.name, number)
+        return replace(self._dataset.load(self.name, number), cauchy_stress=cauchy_stress, fields=fields)

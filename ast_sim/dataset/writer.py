@@ -14,16 +14,19 @@ import numpy as np
 
 from ast_sim.dataset.layout import (
     ARRAYS,
+    FIELDS,
     FRAMED,
     HASH,
     SPLITS,
     DatasetInfo,
     array_hash,
+    field_key,
     plain_value,
     require_kind,
     trajectory_hash,
     write_attributes,
 )
+from ast_sim.named_field import require_same_fields
 from ast_sim.scene import Trajectory
 from ast_sim.support.disk import Disk, output_file, sync_folder, temporary_name
 from ast_sim.support.errors import DatasetError
@@ -50,6 +53,7 @@ class DatasetWriter:
         self.info = info
         self.counts = dict.fromkeys(SPLITS, 0)
         self._kind: tuple[int, int] | None = None  # (nodes per element, material width) of all trajectories
+        self._fields: dict[str, tuple[str, str, int]] | None = None  # the named fields of all trajectories
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file_path = output_file(self.path)
@@ -61,12 +65,13 @@ class DatasetWriter:
         self._file = h5py.File(self._disk, "w", libver=("v110", "v110"))
 
     def add(self, split: str, trajectory: Trajectory) -> None:
-        """Check a trajectory and append it to the split "train", "valid" or "test"."""
+        """Check a trajectory and append it to the split "train", "valid", "test" or "calibration"."""
         if split not in SPLITS:
             raise DatasetError(f"{self.path}: there is no split {split!r}; use one of {', '.join(SPLITS)}")
         name = f"{split}/{self.counts[split]:06d}"
         trajectory.check(f"{self.path}: {name}", self.info.stress_location)
         self._kind = require_kind(f"{self.path}: {name}", trajectory.scene, self._kind)
+        self._fields = require_same_fields(f"{self.path}: {name}", trajectory.fields, self._fields)
         if trajectory.length_unit not in (None, self.info.length_unit):
             raise DatasetError(
                 f"{self.path}: {name} has lengths in {trajectory.length_unit}, the dataset in {self.info.length_unit}"
@@ -78,13 +83,30 @@ class DatasetWriter:
                 array = getattr(trajectory if key in FRAMED else trajectory.scene, key)
                 if array is not None:
                     chunks = (1, *array.shape[1:]) if key in FRAMED else array.shape
-                    stored = group.create_dataset(key, data=array, chunks=chunks, fletcher32=True)
-                    hashes[key] = array_hash(array.dtype, array.shape, [array])
-                    write_attributes(stored, {HASH: hashes[key]})
+                    hashes[key] = self._store(group, key, array, chunks)
+            hashes |= self._store_fields(group, trajectory)
             write_attributes(group, {"status": "complete", **trajectory.attributes, **self._numbering(trajectory)})
             attributes = {key: plain_value(value) for key, value in group.attrs.items()}
             write_attributes(group, {HASH: trajectory_hash(hashes, attributes)})
         self.counts[split] += 1
+
+    def _store(self, group: h5py.Group, key: str, array: np.ndarray, chunks: tuple[int, ...], **facts: str) -> str:
+        """Store an array with its hash and other facts; return the hash."""
+        stored = group.create_dataset(key, data=array, chunks=chunks, fletcher32=True)
+        value = array_hash(array.dtype, array.shape, [array])
+        write_attributes(stored, {HASH: value, **facts})
+        return value
+
+    def _store_fields(self, group: h5py.Group, trajectory: Trajectory) -> dict[str, str]:
+        """Store the named fields of a trajectory; return their hashes by `field_key`."""
+        hashes = {}
+        for name, one in sorted(trajectory.fields.items()):
+            chunks = (1, *one.values.shape[1:])
+            facts = {"unit": one.unit, "location": one.location}
+            hashes[field_key(name, one.unit, one.location)] = self._store(
+                group.require_group(FIELDS), name, one.values, chunks, **facts
+            )
+        return hashes
 
     def _numbering(self, trajectory: Trajectory) -> dict[str, tuple]:
         """The numbers and the times of the frames, if a reader could not tell them without."""

@@ -60,6 +60,7 @@ def _missing(trajectory: Trajectory) -> list[str]:
 def _unused(frame: SourceMesh, names: FieldNames) -> list[tuple[str, str]]:
     """(option, name) of the fields that were not used. If only some options can be told, "|" separates them."""
     used = {names.displacement or "displacement", names.stress or "von_mises", names.node_type or "node_type"}
+    used |= {*(text.partition("=")[0] for text in names.fields), names.reaction}
     used |= {names.obstacle, names.handle, names.body or "body", *names.material}
     unused = []
     of_cells = {name: np.concatenate(parts) for name, parts in frame.cell_fields.items()}

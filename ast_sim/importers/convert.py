@@ -51,12 +51,14 @@ def convert_series(
     *,
     names: FieldNames | None = None,
     splits: Splits | None = None,
+    calibration: int = 0,
     seed: int = 0,
     integration: str = "quasi_static",
     contact_radius: float = 0.0,
     time_step: float = 0.0,
     length_unit: str | None = None,
     deck: Path | str | None = None,
+    corners: bool = False,
     incomplete: bool = False,
     strict: bool = False,
     progress: Callable[[str], None] | None = None,
@@ -69,11 +71,12 @@ def convert_series(
         names: the names of the fields.
         splits: for each split the names of its simulations (others are left out), or its share, drawn with `seed`.
             Shares add up to 1; each above 0 gets one simulation at least. The default is 0.8, 0.1, 0.1; it needs three.
-        integration, contact_radius, time_step: as in `DatasetInfo`.
-        length_unit: as in `DatasetInfo`; None is "m". Beside a deck it must be given, and `names.stress_unit`.
+        calibration: so many simulations are drawn first for the split "calibration"; shares divide the others.
+        integration, contact_radius, time_step, length_unit: as in `DatasetInfo`; no unit is "m", but a deck needs one.
         deck: the deck of CalculiX (`.inp`) whose results the source is; see `read_job` and `decks_of`.
-        incomplete: accept simulations in which nothing moves, nothing is prescribed or nothing can be learnt.
-        strict: refuse simulations in which something looks wrong; see `ast_sim.plausibility`.
+        corners: take only the corners of second-order tetrahedra: no force of such a mesh is right.
+        incomplete: accept simulations in which nothing moves, is prescribed or can be learnt.
+        strict: refuse what looks wrong; see `ast_sim.plausibility`.
         progress: called with a line after each simulation, and with what looks wrong. None: that is a warning.
 
     Returns:
@@ -82,18 +85,17 @@ def convert_series(
     Raises:
         DatasetError: a file is wrong or lacks something; the text names it. Nothing is written then.
     """
-    source = Path(source)
     names = names or FieldNames()
-    series = find_series(source)
+    series = find_series(source := Path(source))
     decks = decks_of(source, series, deck, names)
     names = with_units(decks, names, length_unit)
-    chosen = _assign(source, list(series), splits, seed)
+    chosen = _assign(source, list(series), splits, calibration, seed)
     made_by = {"program": "ast_sim convert", "source": str(source), "names": asdict(names), "seed": seed}
-    facts = {"contact_radius": contact_radius, "time_step": time_step, "length_unit": length_unit or "m"}
-    facts |= {"family": source.stem, "integration": integration, "generator": made_by}
+    facts: dict[str, Any] = {"family": source.stem, "integration": integration, "generator": made_by}
+    facts |= {"contact_radius": contact_radius, "time_step": time_step, "length_unit": length_unit or "m"}
     findings: list[tuple[str, Finding]] = []
     with FittedWriter(out, stress_location="none", **facts) as writer:
-        for split, name, trajectory in _trajectories(series, decks, chosen, names, incomplete):
+        for split, name, trajectory in _trajectories(series, decks, chosen, names, corners, incomplete):
             if not any(writer.counts.values()):
                 made_by |= _facts_of_the_first(trajectory)
                 writer.info = replace(writer.info, stress_location=trajectory.stress_at, generator=made_by)
@@ -101,14 +103,16 @@ def convert_series(
             writer.add(split, trajectory)
             if progress is not None:
                 progress(_line(split, name, trajectory))
-        if findings and strict:
-            raise DatasetError(f"{source}: {refusal(findings)}")
-    _tell(findings, progress)
+        _tell(source, findings, strict, progress)
     return writer.counts
 
 
-def _tell(findings: list[tuple[str, Finding]], progress: Callable[[str], None] | None) -> None:
-    """Print what looks wrong, or warn of it."""
+def _tell(
+    source: Path, findings: list[tuple[str, Finding]], strict: bool, progress: Callable[[str], None] | None
+) -> None:
+    """Print what looks wrong, or warn of it; refuse it if `strict`."""
+    if findings and strict:
+        raise DatasetError(f"{source}: {refusal(findings)}")
     for line in told(findings):
         warnings.warn(line, stacklevel=3) if progress is None else progress(line)
 
@@ -118,12 +122,13 @@ def _trajectories(
     decks: Mapping[str, Path],
     chosen: Sequence[tuple[str, str]],
     names: FieldNames,
+    corners: bool,
     incomplete: bool,
 ) -> Iterator[tuple[str, str, Trajectory]]:
     """The split, the name and the trajectory of each chosen simulation; all have the origin of the first."""
     origin = None
     for split, name in chosen:
-        trajectory = read_series(series[name], names, origin, decks.get(name))
+        trajectory = read_series(series[name], names, origin, decks.get(name), corners)
         if name in decks:
             doubt_modulus(decks[name], trajectory, names.stress_unit or "Pa")
         if not incomplete:
@@ -181,12 +186,16 @@ def _series_in(folder: Path) -> Iterator[Path]:
                 yield from _series_in(entry)
 
 
-def _assign(source: Path, names: list[str], splits: Splits | None, seed: int) -> list[tuple[str, str]]:
+def _assign(
+    source: Path, names: list[str], splits: Splits | None, calibration: int, seed: int
+) -> list[tuple[str, str]]:
     """(split, name) of every simulation that is imported, ordered by split."""
-    if splits is None and len(names) < len(SPLITS):
+    rest = len(names) - calibration
+    if splits is None and rest < len(SHARES):
+        beside = f" beside {calibration} for calibration" if calibration else ""
         raise DatasetError(
-            f"{source}: the splits {', '.join(SPLITS)} need three simulations, found: {len(names)}; say with --shares"
-            " where they go, for example --shares 1 0 0 to train on all or --shares 0 0 1 to test on all"
+            f"{source}: the splits {', '.join(SHARES)} need three simulations{beside}, found: {len(names)}; say with"
+            " --shares where they go, for example --shares 1 0 0 to train on all or --shares 0 0 1 to test on all"
         )
     splits = SHARES if splits is None else splits
     unknown = next((split for split in splits if split not in SPLITS), None)
@@ -195,26 +204,37 @@ def _assign(source: Path, names: list[str], splits: Splits | None, seed: int) ->
     given = {split: splits.get(split, 0.0) for split in SPLITS}
     shares = {split: float(share) for split, share in given.items() if isinstance(share, int | float)}
     if len(shares) == len(given):
-        lists = _draw(names, shares, seed)
+        lists = _draw(source, names, shares, calibration, seed)
     else:
+        if calibration:
+            raise DatasetError("where splits lists names, it lists those of calibration, too: leave calibration out")
         lists = {split: [] if isinstance(members, int | float) else list(members) for split, members in given.items()}
         _require_known(source, names, lists)
     return [(split, name) for split in SPLITS for name in lists[split]]
 
 
-def _draw(names: list[str], shares: dict[str, float], seed: int) -> dict[str, list[str]]:
+def _draw(
+    source: Path, names: list[str], shares: dict[str, float], calibration: int, seed: int
+) -> dict[str, list[str]]:
     """Draw the names of each split at random; within a split they keep their order. A half is rounded up for train.
     Every share above 0 gets a simulation if there are enough."""
+    if shares.pop("calibration"):
+        raise DatasetError("calibration is a number of simulations, no share: calibration=10 or --calibration 10")
+    if not 0 <= calibration < len(names):
+        raise DatasetError(
+            f"{source}: calibration is {calibration}; must be at least 0 and leave a simulation of {len(names)}"
+        )
     if min(shares.values()) < 0 or abs(sum(shares.values()) - 1) > 1e-6:
         raise DatasetError(f"the shares of the splits must be at least 0 and add up to 1, not {shares}")
     order = np.random.default_rng(seed).permutation(len(names))
-    least = int(len(names) >= sum(share > 0 for share in shares.values()))
+    rest = len(names) - calibration
+    least = int(rest >= sum(share > 0 for share in shares.values()))
     ends, total = [0], 0.0
     for split in ("valid", "test"):
         total += shares[split]
-        end = max(int(len(names) * total + 0.5 - 1e-9), ends[-1] + least * (shares[split] > 0))
-        ends.append(min(end, len(names) - least * (shares["train"] > 0)))
-    bounds = zip(("valid", "test", "train"), ends, [*ends[1:], len(names)], strict=True)
+        end = max(int(rest * total + 0.5 - 1e-9), ends[-1] + least * (shares[split] > 0))
+        ends.append(min(end, rest - least * (shares["train"] > 0)))
+    bounds = zip(("valid", "test", "train", "calibration"), [*ends, rest], [*ends[1:], rest, len(names)], strict=True)
     return {split: [names[i] for i in sorted(order[start:end])] for split, start, end in bounds}
 
 

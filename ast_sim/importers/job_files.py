@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ast_sim.dataset.layout import LENGTH_UNITS
 from ast_sim.importers.series import FieldNames
 from ast_sim.importers.stress import STRESS_UNITS
 from ast_sim.scene import Trajectory
@@ -37,7 +38,7 @@ def decks_of(source: Path, series: Mapping[str, Path], deck: Path | str | None, 
 
 
 def with_units(decks: Mapping[str, Path], names: FieldNames, length_unit: str | None) -> FieldNames:
-    """The names, with a unit of stress.
+    """The names, with a unit of stress and, beside a deck, the unit of force that goes with it and with the lengths.
 
     Raises:
         ConfigError: the unit is unknown, or there is a deck, which does not say its units, and one is not given.
@@ -49,7 +50,10 @@ def with_units(decks: Mapping[str, Path], names: FieldNames, length_unit: str | 
             f"{next(iter(decks.values()))}: a deck does not say its units; give both, for example --length-unit mm"
             " --stress-unit MPa, or --length-unit m --stress-unit Pa"
         )
-    return replace(names, stress_unit=names.stress_unit or "Pa")
+    names = replace(names, stress_unit=names.stress_unit or "Pa")
+    if decks and length_unit in LENGTH_UNITS:
+        names = replace(names, newton=STRESS_UNITS[names.stress_unit or "Pa"] * LENGTH_UNITS[length_unit] ** 2)
+    return names
 
 
 def doubt_modulus(deck: Path, trajectory: Trajectory, unit: str) -> None:

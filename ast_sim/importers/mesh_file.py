@@ -6,8 +6,8 @@ Every mesh comes this way: results that are converted, a scene that is predicted
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,6 +19,7 @@ from ast_sim.importers.frames_in_file import frames_in
 from ast_sim.importers.places import Mask, marked
 from ast_sim.importers.shells import Shells, find_shells
 from ast_sim.importers.solids.mesh_elements import Elements, elements_of
+from ast_sim.importers.solids.middles import NO_NODE, completed
 from ast_sim.importers.solids.stitching import Stitching
 from ast_sim.number_arrays import connected_parts
 from ast_sim.scene import NodeType, Scene
@@ -34,13 +35,16 @@ class MeshFile:
 
     Attributes:
         source: what the file holds.
-        points: [n, 3] float64: the points of the file, and after them those behind its shells.
-        elements: [E, 3 or 4] int64; tetrahedra have a positive volume.
-        node_rows: [n] the point of the file that a point stands for: itself, or the one in front of it.
+        points: [n, 3] float64: the points of the file, after them those behind its shells, and at last those in the
+            middles of edges that have no node in the file.
+        elements: [E, 3, 4 or 10] int64; tetrahedra have a positive volume.
+        node_rows: [n] the point of the file that a point stands for: itself, the one in front of it, or an end of its
+            edge.
         element_rows: [E] the cell of the file that an element is part of, counted over all blocks.
         notes: sentences on what was not taken as it is.
         groups: the numbers of the points of each named group.
         shells: if there are shells beside the tetrahedra; their layers are among the elements and the points.
+        edges: [M, 2] the points at the ends of the edges in whose middles the last M points lie.
     """
 
     source: SourceMesh
@@ -51,6 +55,7 @@ class MeshFile:
     notes: list[str]
     groups: dict[str, np.ndarray]
     shells: Shells | None = None
+    edges: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
 
     @property
     def path(self) -> Path:
@@ -60,7 +65,7 @@ class MeshFile:
     def fields(self) -> dict[str, dict[str, np.ndarray]]:
         """The fields at a place, "point" [n, ...] or "cell" [E, ...], by name."""
         cells = {name: np.concatenate(parts)[self.element_rows] for name, parts in self.source.cell_fields.items()}
-        points = {name: np.asarray(values)[self.node_rows] for name, values in self.source.point_fields.items()}
+        points = {name: self._kept(np.asarray(v)[self.node_rows]) for name, v in self.source.point_fields.items()}
         return {"point": points, "cell": cells}
 
     @property
@@ -68,8 +73,27 @@ class MeshFile:
         """[n] bool: the nodes of shells and those behind them."""
         nodes = np.zeros(len(self.points), bool)
         if self.shells is not None:
-            nodes[self.shells.nodes] = nodes[-len(self.shells.nodes) :] = True
-        return nodes
+            nodes[self.shells.nodes] = nodes[len(self.source.points) : len(nodes) - len(self.edges)] = True
+        return self._kept(nodes)
+
+    def _kept(self, marks: np.ndarray) -> np.ndarray:
+        """Marks or whole numbers [n, ...] of the points; the middle of an edge has one where both ends have one."""
+        if len(self.edges) and marks.dtype.kind in "iufb":
+            one, other = np.moveaxis(marks[self.edges], 1, 0)
+            marks = marks.copy()
+            marks[-len(self.edges) :] = np.where((one != 0) & (other != 0), np.maximum(one, other), 0)
+        return marks
+
+    def between(self, values: np.ndarray) -> np.ndarray:
+        """Values [n, ...] at the points; in the middle of an edge without a node in the file, the mean of its ends."""
+        if len(self.edges):
+            values = values.copy()
+            values[-len(self.edges) :] = values[self.edges].mean(axis=1)
+        return values
+
+    def at_nodes(self, used: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        """From values at the points of the file to values at the points `used`."""
+        return lambda values: self.between(values[self.node_rows])[used]
 
     def field(self, place: str, name: str) -> np.ndarray:
         """A field of a `place`, "point" or "cell", as [n or E, columns] float64.
@@ -78,7 +102,7 @@ class MeshFile:
             DatasetError: there is no such field, or it does not hold numbers.
         """
         values = raw_field(self.source, place, name)
-        return values[self.node_rows if place == "point" else self.element_rows]
+        return self.between(values[self.node_rows]) if place == "point" else values[self.element_rows]
 
     def numbers(self, place: str, name: str) -> np.ndarray:
         """A field with one number in each row, as [rows]; see `field`."""
@@ -115,11 +139,12 @@ class MeshFile:
         note = f"the field {name!r} is NaN at {unset} nodes: they are not marked"
         if unset and note not in self.notes:
             self.notes.append(note)
-        return marked(values)
+        return self._kept(marked(values))
 
     def whole_numbers(self, place: str, name: str, dtype: type) -> np.ndarray:
         """A field with one whole number in each row, as [rows] of an integer type; see `field`."""
         value = self.numbers(place, name)
+        value = self._kept(value) if place == "point" else value
         limits = np.iinfo(dtype)
         wrong = ~((value == np.round(value)) & (value >= limits.min) & (value <= limits.max))
         if place == "point":
@@ -188,14 +213,18 @@ def raw_field(mesh: SourceMesh, place: str, name: str) -> np.ndarray:
 
 
 def read_mesh(
-    source: Path | meshio.Mesh, path: Path = Path("mesh"), used_fields: tuple[str, ...] = ("node_type", "body")
+    source: Path | meshio.Mesh,
+    path: Path = Path("mesh"),
+    used_fields: tuple[str, ...] = ("node_type", "body"),
+    corners: bool = False,
 ) -> MeshFile:
     """The tetrahedra of a file or of a meshio mesh; its triangles if it has no cells with a volume.
 
-    Hexahedra, prisms and pyramids are cut into tetrahedra; elements of higher order keep their corners only. Triangles
-    and quadrilaterals that touch no tetrahedron are shells. All other cells of a lower dimension are left out. Of a
-    file with several frames the first is taken. `path` names a mesh in memory in errors. Points at one place are not
-    joined where one of the `used_fields` says that they are not alike.
+    Hexahedra, prisms and pyramids are cut into tetrahedra. Tetrahedra of ten nodes keep them, and then all others get
+    nodes in the middles of their edges; with `corners`, and in other elements of higher order, the corners only are
+    taken. Triangles and quadrilaterals that touch no tetrahedron are shells. All other cells of a lower dimension are
+    left out. Of a file with several frames the first is taken. `path` names a mesh in memory in errors. Points at one
+    place are not joined where one of the `used_fields` says that they are not alike.
 
     Raises:
         DatasetError: the file is missing, damaged or of an unknown kind, or holds other elements; the text names it.
@@ -205,13 +234,13 @@ def read_mesh(
     mesh.require_consistent()
     stitching = Stitching(mesh)
     stitching.look(mesh, used_fields)
-    return mesh_of(mesh, stitching)
+    return mesh_of(mesh, stitching, corners)
 
 
-def mesh_of(mesh: SourceMesh, stitching: Stitching) -> MeshFile:
-    """The elements of a mesh, its points joined where they are one."""
+def mesh_of(mesh: SourceMesh, stitching: Stitching, corners: bool = False) -> MeshFile:
+    """The elements of a mesh, its points joined where they are one; `corners` as in `read_mesh`."""
     point_of, joined = stitching.joined()
-    taken = elements_of(mesh, point_of)
+    taken = elements_of(mesh, point_of, corners)
     unused = len(mesh.points) - len(np.unique(np.concatenate([block.nodes.ravel() for block in mesh.blocks])))
     told = [f"{unused} points of no element are left out"] if unused else []
     groups = {name: np.unique(point_of[nodes]) for name, nodes in mesh.groups.items()}
@@ -219,18 +248,33 @@ def mesh_of(mesh: SourceMesh, stitching: Stitching) -> MeshFile:
     everyone = np.arange(len(mesh.points))
     shells, rows = _shells(mesh, point_of, taken)
     notes += _counted(mesh, taken, rows) + taken.notes + told
-    if shells is None:
-        return MeshFile(mesh, mesh.points, taken.nodes, everyone, taken.rows, notes, groups)
-    points = np.concatenate([mesh.points, shells.behind(mesh.points)])
-    return MeshFile(
+    points, elements, node_rows, element_rows = mesh.points, taken.nodes, everyone, taken.rows
+    if shells is not None:
+        points = np.concatenate([points, shells.behind(points)])
+        elements = np.concatenate([elements, shells.tetrahedra(points)])
+        node_rows = np.concatenate([node_rows, shells.nodes])
+        element_rows = np.concatenate([element_rows, np.repeat(rows, 3)])
+    plain = MeshFile(mesh, points, elements, node_rows, element_rows, notes, groups, shells)
+    return plain if taken.middles is None else _of_second_order(plain, taken.middles)
+
+
+def _of_second_order(mesh: MeshFile, middles: np.ndarray) -> MeshFile:
+    """The mesh with the middles [e, 6] of its first e elements; all other edges get new points."""
+    unknown = np.full((len(mesh.elements) - len(middles), middles.shape[1]), NO_NODE)
+    elements, edges = completed(mesh.elements, np.concatenate([middles, unknown]), len(mesh.points))
+    new = len(mesh.points) + np.arange(len(edges))
+    groups = {
+        name: np.concatenate([nodes, new[np.isin(edges, nodes).all(axis=1)]]) for name, nodes in mesh.groups.items()
+    }
+    if len(edges):
+        mesh.notes.append(f"{len(edges)} edges of elements that have corners only get a node in their middle")
+    return replace(
         mesh,
-        points,
-        np.concatenate([taken.nodes, shells.tetrahedra(points)]),
-        np.concatenate([everyone, shells.nodes]),
-        np.concatenate([taken.rows, np.repeat(rows, 3)]),
-        notes,
-        groups,
-        shells,
+        points=np.concatenate([mesh.points, mesh.points[edges].mean(axis=1)]),
+        elements=elements,
+        node_rows=np.concatenate([mesh.node_rows, mesh.node_rows[edges[:, 0]]]),
+        groups=groups,
+        edges=edges,
     )
 
 

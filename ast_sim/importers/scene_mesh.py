@@ -49,6 +49,7 @@ def read_scene(
     type_field: str | None = None,
     materials: Mapping[int, Numbers] | Numbers | None = None,
     material_fields: Sequence[str] = (),
+    corners: bool = False,
 ) -> SceneMesh:
     """The scene of a mesh: a file of any known format, or a mesh in memory.
 
@@ -67,13 +68,14 @@ def read_scene(
         materials: the material of each body by its number, or one material for all bodies. A body whose nodes are all
             obstacles has zeros if it is not named.
         material_fields: instead of `materials`, cell fields with one number each.
+        corners: take only the corners of second-order tetrahedra.
 
     Raises:
         DatasetError: the file cannot be read, or a node, an element or a field is wrong; the text names the file.
         ConfigError: there is no such body, a place holds no node, a material is missing, or nothing is prescribed.
     """
     used_fields = (type_field or "node_type", body_field or "body")
-    mesh = read_mesh(Path(source) if isinstance(source, str) else source, used_fields=used_fields)
+    mesh = read_mesh(Path(source) if isinstance(source, str) else source, used_fields=used_fields, corners=corners)
     scene, used = mesh.scene(body_field, type_field)
     scene.check(str(mesh.path))
     require_extent(mesh.path, mesh.points[used], scene.elements)
@@ -92,7 +94,7 @@ def read_scene(
 
 def describe(scene: Scene) -> list[str]:
     """A line on the scene, and one on each body: its nodes by type, its elements, its bounding box."""
-    kind = "triangles" if scene.elements.shape[1] == 3 else "tetrahedra"
+    kind = {3: "triangles", 4: "tetrahedra", 10: "second-order tetrahedra"}[scene.elements.shape[1]]
     body_of_element = scene.body[scene.elements[:, 0]]
     lines = [f"{len(np.unique(scene.body))} bodies, {scene.num_nodes} nodes, {scene.num_elements} {kind}"]
     for body in np.unique(scene.body):
@@ -147,7 +149,7 @@ def _node_type(
     for clamp in clamps:
         held = clamped(mesh, scene, used, clamp)
         types[held] = NodeType.HANDLE
-        if scene.elements.shape[1] == 4 and _on_a_line(mesh.points[used[held]]):
+        if scene.elements.shape[1] != 3 and _on_a_line(mesh.points[used[held]]):
             body = scene.body[held[0]]
             doubts.append(
                 f"the clamp {clamp!r} holds {len(held)} nodes, which lie on a line: body {body} could turn around it"
@@ -180,7 +182,7 @@ def clamped(mesh: MeshFile, scene: Scene, used: np.ndarray, clamp: str) -> np.nd
 
 
 def _shortest_edge(scene: Scene, body: int) -> float:
-    ends = scene.elements[scene.body[scene.elements[:, 0]] == body]
+    ends = scene.elements[scene.body[scene.elements[:, 0]] == body][:, :4]
     corners = scene.rest_position[ends].astype(np.float64)
     lengths = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     return float(lengths.min(initial=np.inf)) if len(ends) else 0.0

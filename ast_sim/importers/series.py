@@ -4,7 +4,6 @@ frames."""
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,21 +17,16 @@ from ast_sim.importers.frame_order import frame_files, ordered
 from ast_sim.importers.frames_in_file import frames_in
 from ast_sim.importers.mesh_file import MeshFile, mesh_of, raw_field
 from ast_sim.importers.scene_mesh import clamped
-from ast_sim.importers.shells import Shells
 from ast_sim.importers.solids.frames_match import order_of_cells
+from ast_sim.importers.solids.kept_fields import KeptFields
 from ast_sim.importers.solids.mesh_elements import require_extent
+from ast_sim.importers.solids.positions import far_origin, rest_and_position, warn_of_rounding, with_layers
 from ast_sim.importers.solids.stitching import Stitching
 from ast_sim.importers.solved_jobs.job import Job, read_job
 from ast_sim.importers.solved_jobs.job_results import job_frames
 from ast_sim.importers.stress import STRESS_UNITS, order_of, von_mises
 from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.support.errors import DatasetError
-
-# Points count as equal if they differ by less than this share of the size of the mesh.
-_AGREEMENT = 1e-4
-
-# Rounding to float32 may change the displacements by this share of the largest one before a warning is given.
-_ROUNDING = 0.01
 
 
 @dataclass(frozen=True)
@@ -54,6 +48,9 @@ class FieldNames:
         stress_order: the components that the columns of the stress hold, such as ("xx", "xy", "xz", "yy", "yz", "zz").
             Empty: as the file names them; else the normal stresses come first.
         stress_unit: the unit of the stress, and of Young's modulus in a deck: one of `STRESS_UNITS`; None is pascal.
+        fields: further point or cell fields, as NAME or NAME=UNIT, that become named fields of the dataset.
+        reaction: point field, the forces that act on the nodes from outside.
+        newton: the unit of these forces in newton.
     """
 
     displacement: str | None = None
@@ -65,6 +62,9 @@ class FieldNames:
     material: tuple[str, ...] = ()
     stress_order: tuple[str, ...] = ()
     stress_unit: str | None = None
+    fields: tuple[str, ...] = ()
+    reaction: str | None = None
+    newton: float = 1.0
 
 
 @dataclass(eq=False)
@@ -89,7 +89,11 @@ class _Frames:
 
 
 def read_series(
-    source: Path, names: FieldNames, origin: np.ndarray | None = None, deck: Path | None = None
+    source: Path,
+    names: FieldNames,
+    origin: np.ndarray | None = None,
+    deck: Path | None = None,
+    corners: bool = False,
 ) -> Trajectory:
     """Read the simulation in a `.pvd` file, in a folder with a file for each frame, or in one file.
 
@@ -101,6 +105,7 @@ def read_series(
             near zero, else near the centre of the first frame; see `far_origin`.
         deck: the deck of CalculiX whose job has given the results `source`. It says which nodes are prescribed and what
             the elements are made of; see `read_job`.
+        corners: take only the corners of second-order tetrahedra.
 
     Returns:
         The trajectory; its `stress_location` is "none", "node" or "element". Its attribute `origin` is what was
@@ -112,17 +117,15 @@ def read_series(
         MissingExtra: the reader of a format is not installed.
     """
     job = None if deck is None else read_job(deck)
-    if job is not None:
-        names = replace(names, material=names.material or tuple(job.materials))
-    mesh, kept, notes, place = _read_frames(source, names, job)
+    names = names if job is None else replace(names, material=names.material or tuple(job.materials))
+    further = KeptFields.of(names.fields, names.reaction)
+    mesh, kept, notes, place = _read_frames(source, names, job, corners, further)
     scene, used = mesh.scene(names.body, names.node_type)
     types = _node_type(mesh, names, scene, used)
     rest, position = _rest_and_position(source, mesh, kept, used)
-    if mesh.shells is not None:
-        rest, position = _with_layers(source, mesh.shells.renumbered(used), rest, position)
     require_extent(source, rest, scene.elements)
     origin = far_origin(position[0]) if origin is None else origin
-    _warn_of_rounding(source, rest - origin, position - origin)
+    warn_of_rounding(source, rest - origin, position - origin)
     scene = replace(
         scene,
         rest_position=(rest - origin).astype(np.float32),
@@ -130,24 +133,33 @@ def read_series(
         material=mesh.columns(names.material),
     )
     stress, more = _stress(mesh, kept, used, place, scene, _pascals(names))
-    attributes: dict[str, Any] = {"status": "complete", "source": source.name}
-    attributes |= {"origin": origin.tolist()} if origin.any() else {}
-    attributes |= {"material": ", ".join(names.material)} if names.material else {}
-    told = [*mesh.notes, *notes, *more]
-    attributes |= {"notes": "; ".join(told)} if told else {}
+    rigid = {at: ~scene.deforming(at) for at in ("node", "element")}
+    fields, missing = further.named(source, mesh.at_nodes(used), mesh.element_rows, rigid, names.newton)
+    told = [*mesh.notes, *notes, *more, *missing]
     trajectory = Trajectory(
         scene,
         (position - origin).astype(np.float32),
         stress,
-        attributes,
+        _attributes(source, origin, names, told),
         stress_location=place,
         times=kept.ascending_times(),
+        fields=fields,
     )
     trajectory.check(str(source), place)
     return trajectory
 
 
-def _read_frames(source: Path, names: FieldNames, job: Job | None) -> tuple[MeshFile, _Frames, list[str], str]:
+def _attributes(source: Path, origin: np.ndarray, names: FieldNames, notes: list[str]) -> dict[str, Any]:
+    """What a trajectory says of its source."""
+    attributes: dict[str, Any] = {"status": "complete", "source": source.name}
+    attributes |= {"origin": origin.tolist()} if origin.any() else {}
+    attributes |= {"material": ", ".join(names.material)} if names.material else {}
+    return attributes | ({"notes": "; ".join(notes)} if notes else {})
+
+
+def _read_frames(
+    source: Path, names: FieldNames, job: Job | None, corners: bool, further: KeptFields
+) -> tuple[MeshFile, _Frames, list[str], str]:
     """The mesh of a simulation, what is kept of its frames in order of time, notes, and where the stress is."""
     kept = _Frames()
     first = None
@@ -156,7 +168,7 @@ def _read_frames(source: Path, names: FieldNames, job: Job | None) -> tuple[Mesh
         filter(None, (names.obstacle, names.handle, names.node_type or "node_type", names.body or "body"))
     )
     place, order, notes = "none", (), []
-    given = frames(source) if job is None else job_frames(job, source, _pascals(names))
+    given = frames(source) if job is None else job_frames(job, source, _pascals(names), tuple(further.wanted.values()))
     for frame in given:
         frame.require_consistent()
         if first is None or stitching is None:
@@ -170,6 +182,7 @@ def _read_frames(source: Path, names: FieldNames, job: Job | None) -> tuple[Mesh
         kept.times.append(frame.time)
         kept.points.append(frame.points)
         kept.displacements.append(_displacement(frame, names))
+        further.look(frame, cells, raw_field)
         if place != "none":
             values = raw_field(frame, "point" if place == "node" else "cell", names.stress or "von_mises")
             values = von_mises(values, order) if order else values[:, 0]
@@ -179,10 +192,11 @@ def _read_frames(source: Path, names: FieldNames, job: Job | None) -> tuple[Mesh
     if source.is_dir():
         by_time, said = ordered([file for (file,) in files], kept.times)
         kept.reorder(by_time)
+        further.reorder(by_time)
         notes += said
     elif times is not None:
         kept.times = list(times)
-    return mesh_of(first, stitching), kept, notes, place
+    return mesh_of(first, stitching, corners), kept, notes, place
 
 
 def frames(source: Path) -> Iterator[SourceMesh]:
@@ -196,34 +210,6 @@ def frames(source: Path) -> Iterator[SourceMesh]:
             yield from frames_in(files[0])
 
 
-def far_origin(points: np.ndarray) -> np.ndarray:
-    """[3] float64: what is subtracted from points [N, 3] before they are rounded to float32.
-
-    float32 has 24 bits: a mesh of size 1 at a distance of 5e6 keeps steps of 0.5. The origin is the centre of the
-    points, rounded to a multiple of a power of ten that is 10 to 100 times the size of the mesh. So it is zero for a
-    mesh near zero.
-    """
-    lowest, highest = points.min(axis=0), points.max(axis=0)
-    size = (highest - lowest).max()
-    if not np.isfinite(size) or size <= 0:
-        return np.zeros(3)
-    unit = 10.0 ** np.ceil(np.log10(10 * size))
-    return np.round((lowest + highest) / 2 / unit) * unit + 0.0
-
-
-def _warn_of_rounding(source: Path, rest: np.ndarray, position: np.ndarray) -> None:
-    """Warn if the displacements change when the rest points [N, 3] and the positions [S, N, 3] become float32."""
-    small = rest.astype(np.float32).astype(np.float64)
-    largest = max(np.abs(one - rest).max() for one in position)
-    worst = max(np.abs(one.astype(np.float32) - small - (one - rest)).max() for one in position)
-    if worst > _ROUNDING * largest:
-        warnings.warn(
-            f"{source}: the largest displacement is {largest:.3g}, and rounding to float32 changes displacements by up"
-            f" to {worst:.3g}: the motion is too small for coordinates of up to {np.abs(position).max():.3g}",
-            stacklevel=3,
-        )
-
-
 def _displacement(frame: SourceMesh, names: FieldNames) -> np.ndarray | None:
     """The displacements of the points [n, 3]; None if the file holds none."""
     if names.displacement is None and "displacement" not in frame.point_fields:
@@ -232,33 +218,6 @@ def _displacement(frame: SourceMesh, names: FieldNames) -> np.ndarray | None:
     if value.shape[1] not in (2, 3):
         raise DatasetError(f"{frame.path}: the displacement has {value.shape[1]} components; must have 2 or 3")
     return np.pad(value, ((0, 0), (0, 3 - value.shape[1])))
-
-
-def _rest_and_position(source: Path, mesh: MeshFile, kept: _Frames, used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rest positions [N, 3] and the positions [S, N, 3] of the used nodes.
-
-    A file with displacements holds either the points at rest or the moved points. If the points are the same in all
-    frames, they are the rest positions. If the points minus their displacements are the same, these are.
-    """
-    rows = mesh.node_rows[used]
-    at = np.stack([points[rows] for points in kept.points])
-    given = [one[rows] for one in kept.displacements if one is not None]
-    if not given:
-        return at[0], at
-    if len(given) < len(kept.displacements):
-        frame = next(frame for frame, one in enumerate(kept.displacements) if one is None)
-        raise DatasetError(f"{source}: frame {frame} has no displacement, others have")
-    moved = np.stack(given)
-    allowed = _AGREEMENT * np.ptp(at[0], axis=0).max()
-    if np.abs(at - at[0]).max() <= allowed:
-        return at[0], at[0] + moved
-    back = at - moved
-    if np.abs(back - back[0]).max() <= allowed:
-        return back[0], at
-    raise DatasetError(
-        f"{source}: the displacement does not fit the points: in some frame the points, and the points minus the"
-        " displacement, differ from frame 0; name the right field"
-    )
 
 
 def _pascals(names: FieldNames) -> float:
@@ -288,8 +247,11 @@ def _stress(
     """[S, N or E, 1] float32 in pascal, and a note if obstacles have none: it is 0 there."""
     if place == "none":
         return None, []
-    rows = mesh.node_rows[used] if place == "node" else mesh.element_rows
-    stress = (pascals * np.stack([values[rows] for values in kept.stresses])).astype(np.float32)[:, :, None]
+    if place == "node":
+        values = list(map(mesh.at_nodes(used), kept.stresses))
+    else:
+        values = [values[mesh.element_rows] for values in kept.stresses]
+    stress = (pascals * np.stack(values)).astype(np.float32)[:, :, None]
     lacking = np.isnan(stress[:, :, 0]).any(axis=0) & ~scene.deforming(place)
     if not lacking.any():
         return stress, []
@@ -297,25 +259,21 @@ def _stress(
     return stress, [f"the stress is NaN at {lacking.sum()} rows of obstacles: it is 0 there"]
 
 
-def _with_layers(source: Path, shells: Shells, rest: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rest points and positions with the points behind the shells, which turn with the shells.
-
-    Raises:
-        DatasetError: a shell is not rigid.
-    """
-    count = len(shells.nodes)
-    for frame, points in enumerate(position):
-        bent = shells.bent(rest, points)
-        if bent is not None:
-            raise DatasetError(
-                f"{source}: the shell at {np.round(rest[bent[0]], 6).tolist()} is not rigid: in"
-                f" frame {frame} an edge changes by {bent[1]:.3g};"
-                " shells beside tetrahedra must be rigid: mesh this body with tetrahedra"
-            )
-    layers = np.stack([shells.behind(points) for points in position])
+def _rest_and_position(source: Path, mesh: MeshFile, kept: _Frames, used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rest positions [N, 3] and the positions [S, N, 3] of the used nodes, the last of which are not in the file:
+    they lie behind shells and in the middles of edges."""
+    rows = mesh.node_rows[used]
+    at = np.stack([points[rows] for points in kept.points])
+    moved = [None if one is None else one[rows] for one in kept.displacements]
+    rest, position = rest_and_position(source, at, moved)
+    edges = np.searchsorted(used, mesh.edges)
+    count = len(used) - len(edges)
+    if mesh.shells is not None:
+        shells = mesh.shells.renumbered(used)
+        rest, position = with_layers(source, shells, rest[:count], position[:, :count])
     return (
-        np.concatenate([rest[:-count], shells.behind(rest)]),
-        np.concatenate([position[:, :-count], layers], axis=1),
+        np.concatenate([rest[:count], rest[edges].mean(axis=1)]),
+        np.concatenate([position[:, :count], position[:, edges].mean(axis=2)], axis=1),
     )
 
 

@@ -225,7 +225,8 @@ class Answer:
         """[S, 3] the force in newton on the prescribed nodes `driven`.
 
         It follows from the strains of the predicted positions, by the solver's own law of the material. None where the
-        law is not known: the scene has no Young's modulus and Poisson's ratio, and no solver recorded them.
+        law is not known: the scene has no Young's modulus and Poisson's ratio (two columns of its material, as of a
+        converted job, count as these), and no solver recorded them.
         """
         material = self._material()
         if self.info is None or self.driven is None or material is None:
@@ -240,7 +241,9 @@ class Answer:
         """The material of all elements; None if it is not known."""
         if self.law is not None:
             return self.law.material
-        if self.info is None or self.info.family not in ELASTIC or self.scene.material is None:
+        if self.info is None or self.scene.material is None:
+            return None
+        if self.info.family not in ELASTIC and self.scene.material.shape[1] != 2:
             return None
         rigid = ~self.scene.deforming_nodes[self.scene.elements].any(axis=1)
         young, poisson = self.scene.material[:, :2].astype(np.float64).T

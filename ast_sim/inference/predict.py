@@ -18,9 +18,10 @@ from ast_sim.inference.question import Frames, Question
 from ast_sim.inference.rollout import rollouts
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.models.simulator import Simulator
+from ast_sim.number_arrays import ranges
 from ast_sim.prescribed_motion import Motion, RigidMotion, Vector, frames_for
 from ast_sim.runs.scope import Scope
-from ast_sim.scene import Scene, Trajectory, ranges
+from ast_sim.scene import Scene, Trajectory
 from ast_sim.support.errors import ConfigError
 
 Motions = Motion | Mapping[int, RigidMotion | Vector] | np.ndarray

@@ -50,7 +50,7 @@ def predict_batch(
     for call in range(1, calls + 1):
         position, stress = model.advance(replace(batch, wants_stress=call == calls), prescribed)
         positions.append(position.split(sizes))
-        batch = replace(batch, position=position)
+        batch = replace(batch, position=position, proximity=None)
     rows = [0 if state.stress is None else len(state.stress) for state in states]
     stresses = [None] * len(starts) if stress is None else stress.split(rows)
     seconds = (time.perf_counter() - began) / len(starts)

@@ -5,6 +5,8 @@ Legend: N nodes, E elements, M edges.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -33,12 +35,19 @@ def node_features(config: ModelConfig, batch: Batch) -> Tensor:
     if "material" in config.node_inputs:
         values.append(batch.graph.node_material)
     if "proximity" in config.node_inputs:
-        values.append(_proximity(batch, config.proximity_radius))
+        values.append(_proximity(batch, config.proximity_radius) if batch.proximity is None else batch.proximity)
     if "out_of_balance" in config.node_inputs:
         values.append(batch.graph.elasticity.out_of_balance(batch.position, batch.graph.rest_position))
     if config.boundary_motion:
         values.append(batch.boundary_motion)
     return torch.cat(values, dim=1)
+
+
+def with_proximity(config: ModelConfig, batch: Batch) -> Batch:
+    """The batch with its `proximity`, if that is an input."""
+    if "proximity" not in config.node_inputs:
+        return batch
+    return replace(batch, proximity=_proximity(batch, config.proximity_radius))
 
 
 def _proximity(batch: Batch, radius: float) -> Tensor:

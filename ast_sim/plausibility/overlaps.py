@@ -28,10 +28,10 @@ def overlaps(scene: Scene) -> list[Finding]:
     """One finding for each pair of bodies of tetrahedra that overlap."""
     surface = scene.surface()
     rest = scene.rest_position.astype(np.float64)
-    bodies = np.unique(scene.body)
+    owner = scene.body[surface[:, 0]]
+    bodies = np.unique(owner)  # nodes may have the number of a body without a face
     if len(bodies) > _MOST_BODIES:
         return []
-    owner = scene.body[surface[:, 0]]
     faces = {body: surface[owner == body] for body in bodies.tolist()}
     rigid = {body for body in faces if not scene.deforming_nodes[scene.body == body].any()}
     boxes = {body: (rest[f].min(axis=(0, 1)), rest[f].max(axis=(0, 1))) for body, f in faces.items()}

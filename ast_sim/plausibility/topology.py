@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ast_sim.element_topology import LOCAL_FACES
+from ast_sim.element_topology import LOCAL_FACES, linear_elements
 from ast_sim.number_arrays import connected_parts
 from ast_sim.plausibility.findings import Finding, places
 from ast_sim.plausibility.overlaps import overlaps
@@ -75,7 +75,8 @@ def _single_elements(scene: Scene) -> list[Finding]:
 
 
 def _inside_out(scene: Scene) -> list[Finding]:
-    rows = np.flatnonzero(signed_volumes(scene.rest_position, scene.elements) <= 0)
+    volumes = signed_volumes(scene.rest_position, linear_elements(scene.elements)).reshape(scene.num_elements, -1)
+    rows = np.flatnonzero((volumes <= 0).any(axis=1))
     meaning = "the order of their nodes is another one, or they are flat: they cannot be computed with"
     return [Finding("elements inside out", len(rows), _elements(scene, rows), meaning)] if len(rows) else []
 

@@ -5,13 +5,19 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import is_dataclass
+from itertools import islice
 from typing import Any, Generic, TypeVar
 
 V = TypeVar("V")
 
+RECENT = 512  # the scenes of a pool of jumps, which come again while they are corrected
+
 
 class ByteCache(Generic[V]):
-    """Keeps the values that were used last, together at most `limit` bytes; the newest value is always kept.
+    """Keeps values of together at most `limit` bytes; the newest value is always kept.
+
+    The RECENT values that were used last stay. Of the others the one that was used last is let go first: a training
+    asks for all its scenes once in each pass, and what was used longest ago comes next.
 
     Only one thread at a time may use it.
     """
@@ -27,7 +33,8 @@ class ByteCache(Generic[V]):
         self._values[key] = value, size
         self.held += size - counted
         while self.held > self.limit and len(self._values) > 1:
-            self.held -= self._values.popitem(last=False)[1][1]
+            recent = min(RECENT, len(self._values) - 1)
+            self.held -= self._values.pop(next(islice(reversed(self._values), recent, None)))[1]
         return value
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import signal
+from functools import partial
 
 import torch
 
@@ -19,6 +20,7 @@ from ast_sim.batches.training_jumps import JumpPool
 from ast_sim.batches.training_pool import Pool
 from ast_sim.batches.training_rollouts import RolloutPool
 from ast_sim.dataset.reader import Dataset
+from ast_sim.models.node_inputs import with_proximity
 from ast_sim.models.registry import build_model
 from ast_sim.models.simulator import Simulator
 from ast_sim.runs import checkpoint
@@ -86,7 +88,7 @@ class Training:
         part = self.processes.rank, self.processes.count
         self.sampler = sampler_of(self.model, dataset, self.options, part)
         self.pool = self._pool(largest_error(scales, config.model))
-        self.ahead = Ahead(self.pool or self.sampler)
+        self.ahead = Ahead(self.pool or self.sampler, partial(with_proximity, config.model))
         self.optimizer = Optimizer(self.model, self.options.optimizer)
         self.clock = Clock()
         self.log = StepLog(run.metrics, config, dataset, self.clock)

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ast_sim.scene import Scene, Trajectory, ranges
+from ast_sim.number_arrays import ranges
+from ast_sim.scene import Scene, Trajectory
 from ast_sim.support.errors import AstSimError
 from ast_sim.view.fields import displacement_rmse, is_planar, require_same_scene, stress_rmse, surface_owners
 

@@ -19,8 +19,8 @@ class Fields:
         position: [S, N, 3], where the nodes are drawn.
         times: [S] float64, in seconds; where they are not known, the numbers of the frames.
         static: name -> [N], constant in time.
-        point: name -> [S, N] or [S, N, 3].
-        cell: name -> [S, E].
+        point: name -> [S, N] or [S, N, c].
+        cell: name -> [S, E] or [S, E, c].
     """
 
     position: np.ndarray
@@ -51,6 +51,10 @@ def fields(truth: Trajectory, prediction: Trajectory | None = None) -> Fields:
         place["von_mises"] = shown.stress[:, :, 0]
         if prediction is not None and truth.stress_at == shown.stress_at:
             place["von_mises_error"] = place["von_mises"] - truth.stress[:, :, 0]
+    if prediction is None:
+        for name, one in shown.fields.items():
+            place = point if one.location == "node" else cell
+            place.setdefault(name, one.values[:, :, 0] if one.values.shape[2] == 1 else one.values)
     static = {"node_type": truth.scene.node_type, "body": truth.scene.body}
     times = np.array(shown.numbers if shown.times is None else shown.times, np.float64)
     return Fields(position, times, static, point, cell)

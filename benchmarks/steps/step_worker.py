@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
+from torch.profiler import ProfilerActivity
+from torch.profiler import profile as profiler
 from torch.utils.flop_counter import FlopCounterMode
 
 import ast_sim
@@ -88,6 +90,19 @@ def rolling_out(training: Training) -> Iterator[None]:
     training.model.train()
 
 
+def counts(step: Callable[[], object]) -> dict[str, int]:
+    """What one step runs: nodes of autograd (without those that accumulate gradients), those that accumulate, torch's
+    ops, and the ops of the C core, forward and backward."""
+    node = "autograd::engine::evaluate_function: "
+    with profiler(activities=[ProfilerActivity.CPU]) as watched:
+        step()
+    events = {event.key: event.count for event in watched.key_averages()}
+    nodes = sum(count for key, count in events.items() if key.startswith(node))
+    sums = sum(count for key, count in events.items() if key.startswith(node) and "AccumulateGrad" in key)
+    ops = {kind: sum(n for key, n in events.items() if key.startswith(kind)) for kind in ("aten::", "ast_sim")}
+    return {"nodes": nodes - sums, "accumulating": sums, "torch_ops": ops["aten::"], "own_ops": ops["ast_sim"]}
+
+
 def flops_of(step: Callable[[], object]) -> int:
     """Useful floating point operations: matrix products and what benchmarks.kernels.flops counts of our ops."""
     with FlopCounterMode(display=False, custom_mapping=FORMULAS) as counter:
@@ -114,6 +129,7 @@ def main() -> None:
             "rollout": rolled_out(lambda count: mean_seconds(roll, count)),
             "profile": lambda count: shares(training.advance, count),
             "profile_rollout": rolled_out(lambda count: shares(roll, count)),
+            "counts": lambda _: counts(training.advance),
             "flops": lambda count: flops_of(training.advance),
             "resident": lambda count: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
         }

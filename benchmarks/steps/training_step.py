@@ -31,17 +31,25 @@ MEMORY = 20 << 30  # bytes of address space that a worker may take
 class Worker:
     """A process with one backend that does what it is told, a line of JSON at a time.
 
-    `variables` are environment variables that only this process has.
+    `variables` are environment variables that only this process has. `tree` is the folder whose package and worker it
+    runs; None: these.
     """
 
     def __init__(
-        self, backend: str, threads: int, setup: Setup, log: Path, variables: dict[str, str] | None = None
+        self,
+        backend: str,
+        threads: int,
+        setup: Setup,
+        log: Path,
+        variables: dict[str, str] | None = None,
+        tree: Path | None = None,
     ) -> None:
         environment = {"AST_SIM_BACKEND": backend, "OMP_NUM_THREADS": str(threads), "MKL_NUM_THREADS": str(threads)}
         self._log = open(log, "w")  # noqa: SIM115 (closed with the process)
         self._process = subprocess.Popen(
             [sys.executable, "-m", "benchmarks.steps.step_worker", json.dumps(setup._asdict(), default=str)],
             env={**_environment(), **environment, **(variables or {})},
+            cwd=tree,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._log,

@@ -1,6 +1,7 @@
 """Batches drawn ahead are those of the sampler, in any order, and errors come with the batch that they belong to."""
 
 import threading
+from dataclasses import replace
 
 import pytest
 import torch
@@ -37,17 +38,29 @@ def test_the_next_batch_is_made_while_the_caller_is_busy(dataset):
         assert ahead._next[5].done() and len(ahead._next[5].result()[0].names) == 2
 
 
+def test_the_thread_prepares_each_batch(dataset):
+    by: list[str] = []
+
+    def prepare(batch):
+        by.append(threading.current_thread().name)
+        return replace(batch, names=[*batch.names, "prepared"])
+
+    with Ahead(PairSampler(dataset, "train", **OPTIONS), prepare) as ahead:
+        assert ahead.batch(0)[0].names[-1] == ahead.batch(1)[0].names[-1] == "prepared"
+    assert len(by) >= 2 and all(name.startswith("sampler") for name in by)
+
+
 def test_an_error_comes_with_its_batch_and_the_thread_ends(dataset):
     class Broken:
-        def batch(self, step: int) -> int:
+        def batch(self, step: int) -> tuple[int, str]:
             if step == 1:
                 raise DatasetError("unreadable")
-            return step
+            return step, "target"
 
     with Ahead(Broken()) as ahead:
-        assert ahead.batch(0) == 0
+        assert ahead.batch(0) == (0, "target")
         ahead.wait()
         with pytest.raises(DatasetError, match="unreadable"):
             ahead.batch(1)
-        assert ahead.batch(2) == 2
+        assert ahead.batch(2) == (2, "target")
     assert not any(thread.name.startswith("sampler") for thread in threading.enumerate())

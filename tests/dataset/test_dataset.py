@@ -57,7 +57,7 @@ def test_what_was_written_is_read(tmp_path, stress):
     assert os.listdir(path.parent) == ["d.h5"]
     with Dataset(path) as dataset:
         assert dataset.info == info(stress_location=stress, time_step=0.5, generator=generator)
-        assert dataset.splits == {"train": 2, "valid": 0, "test": 1} and dataset.count("train") == 2
+        assert dataset.splits == {"train": 2, "valid": 0, "test": 1, "calibration": 0} and dataset.count("train") == 2
         assert (dataset.material_width, dataset.element_size) == (1, 4)
         for split, members in given.items():
             for index, member in enumerate(members):
@@ -255,7 +255,7 @@ def test_the_fingerprint_tells_any_number_from_another(tmp_path):
 def test_the_layout_is_the_documented_one(tmp_path):
     path = write(tmp_path / "d.h5", some("element"), stress_location="element")
     with h5py.File(path) as file:
-        assert file.attrs["format"] == b"ast_sim" and file.attrs["version"] == 2
+        assert file.attrs["format"] == b"ast_sim" and file.attrs["version"] == 3
         assert sorted(file.attrs) == sorted(
             ["format", "version", "family", "integration", "stress_location", "domain_center", "domain_half_width"]
             + ["contact_radius", "time_step", "length_unit", "generator"]
@@ -326,7 +326,7 @@ def test_an_error_while_writing_leaves_the_old_file(tmp_path):
     assert path.read_bytes() == before and os.listdir(tmp_path) == ["d.h5"]
     write(path, {"valid": [trajectory(two_tetrahedra(), 2)]})
     with Dataset(path) as dataset:
-        assert dataset.splits == {"train": 0, "valid": 1, "test": 0}
+        assert dataset.splits == {"train": 0, "valid": 1, "test": 0, "calibration": 0}
 
 
 LARGE = """
@@ -518,7 +518,7 @@ def declare(file, name, shape, dtype):
 HOSTILE = {
     "another format": (lambda f: f.attrs.__setitem__("format", "other"), "no dataset of ast_sim"),
     "no format": (lambda f: f.attrs.__delitem__("format"), "no dataset of ast_sim"),
-    "a later version": (lambda f: f.attrs.__setitem__("version", 3), "has the version 3 of the format"),
+    "a later version": (lambda f: f.attrs.__setitem__("version", 4), "has the version 4 of the format"),
     "no family": (lambda f: f.attrs.__delitem__("family"), "attribute family is missing; must be a str"),
     "a number as text": (
         lambda f: f.attrs.__setitem__("time_step", "x"),

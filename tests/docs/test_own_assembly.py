@@ -17,10 +17,13 @@ from ast_sim.scene import NodeType
 PAGE = ROOT / "docs" / "how-to" / "own-assembly.md"
 # What makes the walk short: every text must stand on the page.
 SHORTER = {
-    "size = 5.0": "size = 6.0",
+    "[1, 2, 3, 4, 5, 6, 7]": "[1, 7]",
+    "[1e6, 2e6, 4e6]": "[1e6, 4e6]",
+    "size = 5.0": "size = 8.0",
     "train=100, valid=8, test=10": "train=4, valid=1, test=1, workers=1, progress=False",
     "steps=2000)": "steps=20, validate_every=20, checkpoint_every=20)",
 }
+SHORTER_CALL = {"travel=1:7:7": "travel=1:7:2", "bumper.young=1e6,2e6,4e6": "bumper.young=1e6,4e6"}
 
 
 @pytest.fixture(scope="module")
@@ -45,8 +48,8 @@ def test_the_python_of_the_page_gives_answers(walk):
     folder, printed = walk
     assert re.search(r"^\S+ N, \S+ MPa at z = \S+ mm$", printed, re.M)
     rows = list(csv.DictReader((folder / "force.csv").open()))
-    assert len(rows) == 21 and {row["skew"] for row in rows} == {"0.0"}
-    assert [float(row["travel_of_nodes"]) for row in rows[::3]] == pytest.approx([1, 2, 3, 4, 5, 6, 7], abs=1e-4)
+    assert len(rows) == 4 and {row["skew"] for row in rows} == {"0.0"}
+    assert [float(row["travel_of_nodes"]) for row in rows[::2]] == pytest.approx([1, 7], abs=1e-4)
     for name in ("bumper.step", "ram.step", "study.h5", "answer.vtkhdf", "force.png"):
         assert (folder / name).stat().st_size > 0, name
 
@@ -72,6 +75,7 @@ def test_the_commands_of_the_page_run(walk, tmp_path, capfd):
     try:
         for call in calls_of(blocks(PAGE.read_text(encoding="utf-8"))):
             capfd.readouterr()
+            call = [SHORTER_CALL.get(word, word) for word in call]
             assert main([*call, *(["--overwrite"] if "--out" in call else [])]) == 0, call
             ran.append((call[0], capfd.readouterr().out))
     finally:
@@ -80,4 +84,4 @@ def test_the_commands_of_the_page_run(walk, tmp_path, capfd):
     look, answer, sweep = (out for _, out in ran)
     assert "bumper and ram: 0.5 mm apart" in look and (folder / "SPEC.look.png").exists()
     assert re.search(r"^frame 3: travel_of_nodes 4.2 mm, reaction \S+ N, largest_stress \S+ Pa$", answer, re.M)
-    assert sweep.startswith("force.csv: 21 rows")
+    assert sweep.startswith("force.csv: 4 rows")

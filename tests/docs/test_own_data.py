@@ -83,7 +83,7 @@ def test_results_of_calculix(tmp_path, monkeypatch, capsys):
         command = [find_ccx(), "-i", f"press{index}"]
         subprocess.run(command, cwd="simulations", check=True, capture_output=True)
     with follow("--displacement", "DISP", "--stress", "STRESS", "--handle", "0:zmin,zmax") as dataset:
-        assert dataset.splits == {"train": 2, "valid": 1, "test": 1}
+        assert dataset.splits == {"train": 2, "valid": 1, "test": 1, "calibration": 0}
         found = [dataset[split][i] for split, count in dataset.splits.items() for i in range(count)]
         for truth in found:
             index = int(truth.attributes["source"].removeprefix("press")[0])
@@ -114,7 +114,7 @@ def test_fields_called_u_s_mises_tool_and_fixed(tmp_path, monkeypatch):
             meshio.Mesh(truth.scene.rest_position, cells, fields).write(folder / f"{frame}.vtu")
     names = ("--displacement", "U", "--stress", "S_Mises", "--obstacle", "tool", "--handle", "fixed")
     with follow(*names) as dataset:
-        assert dataset.splits == {"train": 2, "valid": 1, "test": 1}
+        assert dataset.splits == {"train": 2, "valid": 1, "test": 1, "calibration": 0}
         found = dataset["test"][0]
         truth = toy.plate(int(found.attributes["source"].removeprefix("case")))
         np.testing.assert_allclose(found.position, truth.position, atol=1e-7)

@@ -17,7 +17,8 @@ from vtkmodules.vtkIOHDF import vtkHDFWriter
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.importers.convert import convert, find_series
-from ast_sim.importers.series import FieldNames, far_origin, read_series
+from ast_sim.importers.series import FieldNames, read_series
+from ast_sim.importers.solids.positions import far_origin
 from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.support.errors import DatasetError
 from ast_sim.view import export
@@ -165,7 +166,7 @@ def test_many_simulations_become_a_dataset(tmp_path):
         length_unit="mm",
         progress=told.append,
     )
-    assert counts == {"train": 8, "valid": 1, "test": 1} and len(told) == 10
+    assert counts == counted(8, 1, 1) and len(told) == 10
     with Dataset(tmp_path / "d.h5") as dataset:
         info = dataset.info
         assert (info.family, info.integration, info.stress_location) == ("results", "dynamic", "none")
@@ -185,6 +186,10 @@ def test_many_simulations_become_a_dataset(tmp_path):
         assert info.domain_half_width == pytest.approx(0.6 * np.ptp(points, axis=0).max(), rel=1e-6)
 
 
+def counted(train=0, valid=0, test=0, calibration=0) -> dict[str, int]:
+    return {"train": train, "valid": valid, "test": test, "calibration": calibration}
+
+
 def sources_of(path) -> dict[str, list[str]]:
     with Dataset(path) as dataset:
         return {
@@ -196,10 +201,15 @@ def sources_of(path) -> dict[str, list[str]]:
 def test_splits_by_list_and_by_share(tmp_path):
     many(tmp_path / "r", 5)
     lists = {"test": ["run_4"], "train": ["run_3", "run_0"]}
-    assert convert(tmp_path / "r", tmp_path / "d.h5", splits=lists) == {"train": 2, "valid": 0, "test": 1}
-    assert sources_of(tmp_path / "d.h5") == {"train": ["run_3", "run_0"], "valid": [], "test": ["run_4"]}
+    assert convert(tmp_path / "r", tmp_path / "d.h5", splits=lists) == counted(2, 0, 1)
+    assert sources_of(tmp_path / "d.h5") == {
+        "train": ["run_3", "run_0"],
+        "valid": [],
+        "test": ["run_4"],
+        "calibration": [],
+    }
     shares = {"train": 0.4, "test": 0.6}
-    assert convert(tmp_path / "r", tmp_path / "d.h5", splits=shares) == {"train": 2, "valid": 0, "test": 3}
+    assert convert(tmp_path / "r", tmp_path / "d.h5", splits=shares) == counted(2, 0, 3)
     first = sources_of(tmp_path / "d.h5")
     convert(tmp_path / "r", tmp_path / "d.h5", splits=shares)
     assert sources_of(tmp_path / "d.h5") == first
@@ -208,11 +218,42 @@ def test_splits_by_list_and_by_share(tmp_path):
         convert(tmp_path / "r", tmp_path / "d.h5", splits=shares, seed=seed)
         drawn.add(tuple(sources_of(tmp_path / "d.h5")["train"]))
     assert len(drawn) > 2
-    assert convert(tmp_path / "r" / "run_0", tmp_path / "d.h5", splits={"test": 1}) == {
-        "train": 0,
-        "valid": 0,
-        "test": 1,
-    }
+    assert convert(tmp_path / "r" / "run_0", tmp_path / "d.h5", splits={"test": 1}) == counted(0, 0, 1)
+
+
+def test_simulations_for_calibration_take_no_part_in_the_other_splits(tmp_path):
+    many(tmp_path / "r", 9)
+    convert(tmp_path / "r", tmp_path / "without.h5")
+    found = convert(tmp_path / "r", tmp_path / "d.h5", calibration=3)
+    assert found == counted(4, 1, 1, 3)
+    sources = sources_of(tmp_path / "d.h5")
+    assert sorted(sum(sources.values(), [])) == [f"run_{number}" for number in range(9)]
+    assert sources["test"] == sources_of(tmp_path / "without.h5")["test"]  # the same draw
+    with Dataset(tmp_path / "d.h5") as dataset:
+        assert [one.attributes["source"] for one in dataset.calibration] == sources["calibration"]
+    lists = {"train": ["run_1"], "calibration": ["run_8", "run_2"]}
+    assert convert(tmp_path / "r", tmp_path / "d.h5", splits=lists) == counted(1, 0, 0, 2)
+    assert sources_of(tmp_path / "d.h5")["calibration"] == ["run_8", "run_2"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"calibration": 5, "splits": {"train": 1}},
+            "calibration is 5; must be at least 0 and leave a simulation of 5",
+        ),
+        ({"calibration": -1, "splits": {"train": 1}}, "calibration is -1; must be at least 0"),
+        ({"calibration": 3}, "need three simulations beside 3 for calibration, found: 5"),
+        ({"splits": {"train": 0.5, "calibration": 0.5}}, "calibration is a number of simulations, no share"),
+        ({"calibration": 1, "splits": {"train": ["run_0"]}}, "leave calibration out"),
+    ],
+)
+def test_a_calibration_that_cannot_be_drawn_is_refused(tmp_path, options, message):
+    many(tmp_path / "r", 5)
+    with pytest.raises(DatasetError, match=message):
+        convert(tmp_path / "r", tmp_path / "d.h5", **options)
+    assert not (tmp_path / "d.h5").exists()
 
 
 @pytest.mark.parametrize(
@@ -230,7 +271,7 @@ def test_splits_by_list_and_by_share(tmp_path):
 def test_every_split_gets_a_simulation_if_there_are_enough(tmp_path, count, shares, expected):
     many(tmp_path / "r", count)
     found = convert(tmp_path / "r", tmp_path / "d.h5", splits=shares)
-    assert tuple(found.values()) == expected
+    assert found == counted(*expected)
 
 
 @pytest.mark.parametrize("count", [1, 2])
@@ -447,14 +488,14 @@ def test_fields_that_were_not_used_are_named_with_their_options(tmp_path):
     assert f"; try {options}; " in str(error.value) and "temperature (--stress|--body)" in str(error.value)
     assert not (tmp_path / "d.h5").exists()
     names = FieldNames(displacement="U", stress="S_Mises", obstacle="tool", handle="fixed")
-    assert convert(source, tmp_path / "d.h5", names=names) == {"train": 1, "valid": 1, "test": 1}
+    assert convert(source, tmp_path / "d.h5", names=names) == counted(1, 1, 1)
     with Dataset(tmp_path / "d.h5") as dataset:
         found = dataset.load("test", 0)
         assert np.bincount(found.scene.node_type, minlength=4).tolist() == [8, 4, 0, 4]
         assert np.ptp(found.position, axis=0).min() > 0 and dataset.info.stress_location == "element"
     with pytest.raises(DatasetError, match="run_.: nothing is prescribed; these fields were not used: tool"):
         convert(source, tmp_path / "e.h5", names=FieldNames(displacement="U", stress="S_Mises"))
-    assert convert(source, tmp_path / "e.h5", incomplete=True) == {"train": 1, "valid": 1, "test": 1}
+    assert convert(source, tmp_path / "e.h5", incomplete=True) == counted(1, 1, 1)
 
 
 def test_the_motion_of_the_tool_alone_is_nothing_to_learn_from(tmp_path):

@@ -42,9 +42,9 @@ def features(family: str, **changes) -> dict:
 @pytest.mark.parametrize("writer", ["TensorFlow", "the definition"])
 def test_arrays_arrive_as_they_were_written(tmp_path, family, writer):
     source = BY_TENSORFLOW / family if writer == "TensorFlow" else write(tmp_path, family)
-    assert convert_deepmind(source, tmp_path / "d.h5") == COUNTS
+    assert convert_deepmind(source, tmp_path / "d.h5") == {**COUNTS, "calibration": 0}
     with Dataset(tmp_path / "d.h5") as dataset:
-        assert dataset.splits == COUNTS
+        assert dataset.splits == {**COUNTS, "calibration": 0}
         for split in COUNTS:
             for index, wanted in enumerate(records(family, split)):
                 found = dataset.load(split, index)
@@ -108,7 +108,7 @@ def test_splits_limit_and_every(tmp_path):
     counts = convert_deepmind(
         source, tmp_path / "d.h5", splits=["test", "train"], limit=2, every=3, progress=told.append
     )
-    assert counts == {"train": 2, "valid": 0, "test": 2}
+    assert counts == {"train": 2, "valid": 0, "test": 2, "calibration": 0}
     assert told[0] == "train: train.tfrecord 0, 3 frames of 18 nodes" and len(told) == 4
     with Dataset(tmp_path / "d.h5") as dataset:
         assert dataset.info.time_step == pytest.approx(0.03)
@@ -124,7 +124,7 @@ def test_splits_limit_and_every(tmp_path):
 def test_files_that_are_not_there(tmp_path):
     source = write(tmp_path, "deforming_plate")
     (source / "valid.tfrecord").unlink()
-    assert convert_deepmind(source, tmp_path / "d.h5") == {**COUNTS, "valid": 0}
+    assert convert_deepmind(source, tmp_path / "d.h5") == {**COUNTS, "valid": 0, "calibration": 0}
     with pytest.raises(DatasetError, match=f"{source}/valid.tfrecord: there is no such file"):
         convert_deepmind(source, tmp_path / "e.h5", splits=["train", "valid"])
     (source / "train.tfrecord").write_bytes(b"")

@@ -1,6 +1,7 @@
 """A deck and what CalculiX has made of it become a simulation, without anything written by hand."""
 
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -89,7 +90,7 @@ def step(move, period=1.0, op=""):
         "*NODE FILE",
         "U",
         "*EL FILE",
-        "S",
+        "S, PEEQ",
         "*END STEP",
     ]
 
@@ -137,6 +138,23 @@ def test_prescribed_nodes_materials_times_and_positions(press, bodies):
     assert "the steps end at 1, 3" in read.attributes["notes"]
 
 
+def test_fields_are_kept_by_the_names_of_the_deck(bodies, tmp_path):
+    lines = deck(*bodies, [*step(-0.11), *step(-0.06, 2.0)])
+    lines[lines.index("30., 0.")] = "3., 0."  # so that it yields
+    job, results = solved(tmp_path / "soft", lines)
+    read = read_series(results, replace(NAMES, fields=("PEEQ", "STRESS=MPa")), deck=job)
+    strain = read.fields["PEEQ"]
+    assert (strain.location, strain.unit, strain.values.shape) == ("node", "", (5, read.scene.num_nodes, 1))
+    assert not strain.values[0].any() and 0.01 < strain.values[2].max() < 1
+    assert (strain.values[4].max(axis=0) >= strain.values[2].max(axis=0)).all()  # it never goes back
+    assert read.fields["STRESS"].unit == "MPa" and read.fields["STRESS"].values.shape[2] == 6
+    with pytest.raises(DatasetError, match=r"holds no field 'CPRESS' \(as CPRESS\); there are: .*DISP"):
+        read_series(results, replace(NAMES, fields=("CPRESS",)), deck=job)
+    for wrong in ("", "a/b", "reaction=N"):
+        with pytest.raises(ConfigError, match="write NAME or NAME=UNIT"):
+            read_series(results, replace(NAMES, fields=(wrong,)), deck=job)
+
+
 def test_one_command_makes_a_dataset(press, tmp_path, capsys):
     job, results = press
     command = ["convert", str(job), str(results), "--out", str(tmp_path / "d.h5"), "--shares", "1", "0", "0"]
@@ -157,7 +175,7 @@ def test_a_folder_of_jobs(press, tmp_path):
         for file in press:
             (tmp_path / f"{name}{file.suffix}").write_bytes(file.read_bytes())
     counts = convert(tmp_path, tmp_path / "d.h5", names=NAMES, length_unit="mm", splits={"train": 0.5, "test": 0.5})
-    assert counts == {"train": 1, "valid": 0, "test": 1}
+    assert counts == {"train": 1, "valid": 0, "test": 1, "calibration": 0}
     with pytest.raises(ConfigError, match=r"a.inp: a deck does not say its units"):
         convert(tmp_path, tmp_path / "e.h5", splits={"train": 1})
 

@@ -78,7 +78,7 @@ def test_higher_order_lower_dimensions_unused_points_and_inverted_elements():
     tets[:3] = tets[:3, [1, 0, 2, 3]]
     cells = [("tetra10", np.concatenate([tets, middle], axis=1)[:700]), ("tetra", tets[700:])]
     cells += [("triangle", tets[:7, :3]), ("line", tets[:5, :2]), ("line", tets[:2, :2])]
-    found = read_scene(meshio.Mesh(points, cells), **PRESCRIBED)
+    found = read_scene(meshio.Mesh(points, cells), **PRESCRIBED, corners=True)
     assert np.array_equal(found.scene.rest_position, POINTS.astype(np.float32))
     assert np.array_equal(found.scene.elements[3:], TETS[3:])
     assert np.array_equal(np.sort(found.scene.elements[:3]), np.sort(TETS[:3]))

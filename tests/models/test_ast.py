@@ -91,31 +91,50 @@ def test_every_preset_takes_a_training_step(family, tmp_path):
     assert not without, without
 
 
-@pytest.mark.parametrize("changes", [{}, RELATIVE, EXCHANGES])
-@pytest.mark.parametrize("family", ["deforming_plate", "sphere_simple", "abcd", "abcd_xl"])
-def test_c_core_and_torch_composition_agree(family, changes, tmp_path):
-    """The same weights and batch give the same outputs and gradients on both backends, for each parameter there is."""
-    config = small(family, dropout=0.0, **changes, **({"L_cell": 7, "l_ocnn": 3} if family == "abcd_xl" else {}))
-    code = f"""
-import sys, torch
+BACKEND_CASES = [
+    (family, changes)
+    for family in ("deforming_plate", "sphere_simple", "abcd", "abcd_xl")
+    for changes in ({}, RELATIVE, EXCHANGES)
+]
+
+
+def outputs_and_gradients(family: str, changes: dict) -> dict[str, torch.Tensor]:
+    """Of a small model of a family on two scenes."""
+    deep = {"L_cell": 7, "l_ocnn": 3} if family == "abcd_xl" else {}
+    config = small(family, dropout=0.0, **changes, **deep)
+    torch.manual_seed(1)
+    model = build_model(config)
+    out = model(batch_of(config, 0, 1, family=family))
+    value = out.motion.square().sum() + (0 if out.stress is None else out.stress.square().sum())
+    value.backward()
+    gradient = torch.cat([p.grad.flatten() for p in model.parameters()])
+    return {"motion": out.motion.detach().contiguous(), "gradient": gradient}
+
+
+@pytest.fixture(scope="module")
+def by_backend(tmp_path_factory) -> dict[str, dict[str, torch.Tensor]]:
+    """The outputs and gradients of all cases, named "motion 0" and so on, by each backend in a process of its own."""
+    folder = tmp_path_factory.mktemp("backends")
+    code = """
+import sys
 from safetensors.torch import save_file
 sys.path[:0] = ["tests", "tests/models"]
 from test_ast import *
-torch.manual_seed(1)
-config = {config!r}
-model = build_model(config)
-batch = batch_of(config, 0, 1, family={family!r})
-out = model(batch)
-value = out.motion.square().sum() + (0 if out.stress is None else out.stress.square().sum())
-value.backward()
-gradient = torch.cat([p.grad.flatten() for p in model.parameters()])
-save_file({{"motion": out.motion.detach().contiguous(), "gradient": gradient}}, {str(tmp_path)!r} + "/" + BACKEND)
+cases = [outputs_and_gradients(*case) for case in BACKEND_CASES]
+save_file({f"{name} {number}": x for number, case in enumerate(cases) for name, x in case.items()}, PATH)
 """
     for backend in ("c", "torch"):
-        run_python(f"BACKEND = {backend!r}\n{code}", AST_SIM_BACKEND=backend)
-    ours, reference = (load_file(tmp_path / name) for name in ("c", "torch"))
-    for x, y in ((ours[name], reference[name]) for name in ("motion", "gradient")):
-        assert float((x - y).abs().max()) <= 2e-5 * float(y.abs().max()), (x - y).abs().max() / y.abs().max()
+        run_python(f"PATH = {str(folder / backend)!r}\n{code}", AST_SIM_BACKEND=backend)
+    return {backend: load_file(folder / backend) for backend in ("c", "torch")}
+
+
+@pytest.mark.parametrize("number", range(len(BACKEND_CASES)), ids=[str(case) for case in BACKEND_CASES])
+def test_c_core_and_torch_composition_agree(number, by_backend):
+    """The same weights and batch give the same outputs and gradients on both backends, for each parameter there is."""
+    for name in (f"motion {number}", f"gradient {number}"):
+        ours, reference = by_backend["c"][name], by_backend["torch"][name]
+        difference = float((ours - reference).abs().max())
+        assert difference <= 2e-5 * float(reference.abs().max()), difference / float(reference.abs().max())
 
 
 def test_scene_alone_equals_scene_in_a_batch():

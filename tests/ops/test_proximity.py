@@ -10,8 +10,9 @@ from meshes import box
 
 from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import Graph
+from ast_sim.batches.mirror_and_shift import Placement
 from ast_sim.models.node_inputs import _proximity as near
-from ast_sim.models.node_inputs import node_features, normalizer_of
+from ast_sim.models.node_inputs import node_features, normalizer_of, with_proximity
 from ast_sim.ops._body_distance import FINE, signed_gap
 from ast_sim.scene import Scene
 from ast_sim.training.start import configure, start_training
@@ -123,3 +124,8 @@ def test_it_is_an_input_of_any_model(tmp_path):
     features = node_features(config, batch)
     assert features.shape[1] == normalizer_of(config, "node").width == 3 + 5 + 3
     assert torch.equal(features[:, 3:8], near(batch, 0.1))
+    ahead = with_proximity(config, batch)
+    assert torch.equal(ahead.proximity, near(batch, 0.1)) and torch.equal(node_features(config, ahead), features)
+    placed = ahead.placed(Placement(np.float32([-1, 1, 1]), np.zeros(3, np.float32), np.zeros(3, np.float32)))
+    assert placed.proximity is None  # it belongs to the positions before
+    assert with_proximity(replace(config, node_inputs=("displacement",)), batch).proximity is None

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from ast_sim.support import byte_cache
 from ast_sim.support.byte_cache import ByteCache, array_bytes
 
 
@@ -21,7 +22,7 @@ def test_arrays_and_tensors_are_counted_however_deep():
     assert array_bytes("text") == array_bytes(None) == 0
 
 
-def test_the_least_lately_used_is_let_go():
+def test_among_few_values_the_least_lately_used_is_let_go():
     made = []
 
     def value(key, count=10):
@@ -34,6 +35,16 @@ def test_the_least_lately_used_is_let_go():
     assert value(2)[0] == 2 and made == [1, 2, 3, 4, 2] and cache.held == 30
     assert len(value(5, 100)) == 100 and cache.held == 100  # too large, and yet it is kept until the next comes
     assert value(5) is value(5) and value(6)[0] == 6 and cache.held == 10
+
+
+def test_passes_over_more_values_than_fit_find_some_of_them(monkeypatch):
+    monkeypatch.setattr(byte_cache, "RECENT", 2)
+    made: list[int] = []
+    cache = ByteCache(40)
+    for key in [*range(8), *range(8)]:
+        cache.get(key, lambda key=key: made.append(key) or np.zeros(10, np.uint8))
+    assert made == [*range(8), 2, 3, 4, 5]  # all of them, twice, if the one used longest ago were let go
+    assert cache.held == 40
 
 
 def test_a_value_that_grew_counts_as_it_is():

@@ -1,7 +1,8 @@
 """Which cells of a file become elements: tetrahedra of all cells with a volume, or triangles if there are none.
 
-This is the one place where cells of a higher order are reduced to their corners, where hexahedra, prisms and pyramids
-are cut into tetrahedra, where elements that stand twice are taken once, and where elements are turned over.
+This is the one place where cells of a higher order than the second, and curved hexahedra, prisms, pyramids and
+triangles, are reduced to their corners, where hexahedra, prisms and pyramids are cut into tetrahedra, where elements
+that stand twice are taken once, and where elements are turned over.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ast_sim.importers.formats.source_mesh import SourceMesh
+from ast_sim.importers.solids.middles import NO_NODE, TURNED, middles_of, require_near
 from ast_sim.importers.solids.splitting import tetrahedra_of
 from ast_sim.support.errors import DatasetError
 
@@ -25,23 +27,27 @@ class Elements:
     """Elements, and what was done to get them.
 
     Attributes:
-        nodes: [E, 3 or 4] int64 points of the file; tetrahedra have a positive volume.
+        nodes: [E, 3 or 4] int64 points of the file, the corners; tetrahedra have a positive volume.
+        middles: [E, 6] int64 points of the file in the middles of the edges of tetrahedra, `NO_NODE` where an element
+            has none; None if none has any.
         rows: [E] int64 the cell that each is part of, counted over all blocks of the file.
         blocks: the numbers of the blocks that became elements.
         notes: sentences on what was changed.
     """
 
     nodes: np.ndarray
+    middles: np.ndarray | None
     rows: np.ndarray
     blocks: list[int]
     notes: list[str]
 
 
-def elements_of(mesh: SourceMesh, point_of: np.ndarray) -> Elements:
+def elements_of(mesh: SourceMesh, point_of: np.ndarray, corners: bool = False) -> Elements:
     """The elements of a mesh.
 
     Args:
         point_of: [n] the point that stands for each point of the file.
+        corners: leave out the nodes within the edges of second-order tetrahedra.
 
     Raises:
         DatasetError: there are none, or a tetrahedron names a node twice; the text names the file and the cell.
@@ -55,38 +61,46 @@ def elements_of(mesh: SourceMesh, point_of: np.ndarray) -> Elements:
             " alone: mesh the bodies with tetrahedra"
         )
     starts = np.cumsum([0, *(len(block.nodes) for block in mesh.blocks)])
-    nodes = []
-    rows = []
-    notes = Counter()
-    told = Counter()
+    nodes, middles, rows, told = [], [], [], []
     twice = 0
     for shape in dict.fromkeys(mesh.blocks[index].shape for index in chosen):
         of_shape = [index for index in chosen if mesh.blocks[index].shape == shape]
         cells = np.concatenate([point_of[mesh.blocks[index].corners] for index in of_shape])
+        middle = np.concatenate([middles_of(mesh.blocks[index], point_of) for index in of_shape])
         row = np.concatenate([starts[index] + np.arange(len(mesh.blocks[index].nodes)) for index in of_shape])
         first = _first_of_its_nodes(cells)
         twice += len(cells) - len(first)
-        cells, row = cells[first], row[first]
-        if shape in ("triangle", "tetra"):
-            if shape == "tetra":
-                _require_proper(mesh, cells, row)
-            nodes.append(cells)
-            rows.append(row)
-        else:
+        cells, middle, row = cells[first], middle[first], row[first]
+        if shape == "tetra":
+            _require_proper(mesh, cells, row)
+        elif shape != "triangle":
             tetrahedra, owner = tetrahedra_of(shape, cells)
-            told[f"{len(cells)} cells of the kind {shape} are cut into {len(tetrahedra)} tetrahedra"] += 1
-            nodes.append(tetrahedra)
-            rows.append(row[owner])
-    for index in chosen:
-        if mesh.blocks[index].is_curved:
-            notes[mesh.blocks[index].label] += len(mesh.blocks[index].nodes)
-    said = [f"{count} cells of the kind {kind} keep their corners only" for kind, count in notes.items()]
-    said += [*told, *([f"{twice} elements that stand in the file twice are taken once"] if twice else [])]
-    elements, row = np.concatenate(nodes), np.concatenate(rows)
+            told.append(f"{len(cells)} cells of the kind {shape} are cut into {len(tetrahedra)} tetrahedra")
+            cells, middle, row = tetrahedra, middle[owner], row[owner]
+        nodes.append(cells)
+        middles.append(middle)
+        rows.append(row)
+    said = [*_reduced(mesh, chosen, corners), *told]
+    said += [f"{twice} elements that stand in the file twice are taken once"] if twice else []
+    elements, middle, row = (np.concatenate(parts) for parts in (nodes, middles, rows))
     if dimension == 2:
-        return Elements(elements, row, chosen, said)
-    elements, more = _turned_over(mesh, elements, row, starts)
-    return Elements(elements, row, chosen, [*said, *more])
+        return Elements(elements, None, row, chosen, said)
+    second = not corners and bool((middle != NO_NODE).any())
+    if second:
+        require_near(mesh, elements, middle, row)
+    turned, more = _turned_over(mesh, elements, row, starts)
+    elements[turned] = elements[turned][:, [0, 1, 3, 2]]
+    middle[turned] = middle[turned][:, TURNED]
+    return Elements(elements, middle if second else None, row, chosen, [*said, *more])
+
+
+def _reduced(mesh: SourceMesh, chosen: list[int], corners: bool) -> list[str]:
+    """Notes on the cells that keep their corners only, by kind."""
+    counts: Counter[str] = Counter()
+    for block in (mesh.blocks[index] for index in chosen):
+        if block.is_curved and (corners or block.kind != "tetra10"):
+            counts[block.label] += len(block.nodes)
+    return [f"{count} cells of the kind {kind} keep their corners only" for kind, count in counts.items()]
 
 
 def _first_of_its_nodes(cells: np.ndarray) -> np.ndarray:
@@ -106,12 +120,12 @@ def _require_proper(mesh: SourceMesh, cells: np.ndarray, rows: np.ndarray) -> No
 
 
 def require_extent(path: Path, points: np.ndarray, elements: np.ndarray) -> None:
-    """Check that elements [E, 3 or 4] are not flat.
+    """Check that elements [E, 3, 4 or 10] are not flat.
 
     Raises:
         DatasetError: one is; the text names the file and the element.
     """
-    corners = points[elements]
+    corners = points[elements[:, :4]]
     edges = corners[:, 1:] - corners[:, :1]
     longest = np.linalg.norm(corners[:, :, None] - corners[:, None], axis=-1).max(axis=(1, 2))
     if edges.shape[1] == 3:
@@ -130,15 +144,13 @@ def require_extent(path: Path, points: np.ndarray, elements: np.ndarray) -> None
 def _turned_over(
     mesh: SourceMesh, elements: np.ndarray, rows: np.ndarray, starts: np.ndarray
 ) -> tuple[np.ndarray, list[str]]:
-    """The tetrahedra with positive volumes, and notes on those that were inside out.
+    """[E] bool: the tetrahedra that are inside out, and notes on them.
 
     The order of the nodes of a prism differs from program to program, so prisms are turned over without a note. Cells
     that are so warped that some of their tetrahedra are inside out fold over themselves; the check of the scene tells.
     """
     corners = mesh.points[elements]
     negative = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
-    elements = elements.copy()
-    elements[negative, 2:] = elements[negative, :1:-1]
     shape_of = np.repeat([block.shape for block in mesh.blocks], np.diff(starts))
     plain = shape_of[rows] == "tetra"
     notes = []
@@ -149,4 +161,4 @@ def _turned_over(
         turned = np.bincount(cell.ravel(), negative[~plain]) == np.bincount(cell.ravel())
         turned &= shape_of[cells] != "wedge"
         notes += [f"{turned.sum()} cells that were inside out are turned over"] if turned.any() else []
-    return elements, notes
+    return negative, notes

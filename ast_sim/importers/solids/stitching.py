@@ -71,12 +71,17 @@ class Stitching:
             return ""
         return self._between_parts()
 
+    def _parts(self) -> np.ndarray:
+        """[n]: the part of the mesh to which each point belongs, the nodes within edges and faces included."""
+        links = [np.repeat(block.nodes[:, :1], block.nodes.shape[1], axis=1).ravel() for block in self.blocks]
+        ends = [block.nodes.ravel() for block in self.blocks]
+        pairs = np.stack([np.concatenate(links), np.concatenate(ends)], axis=1)
+        return connected_parts(pairs, len(self.mesh.points))
+
     def _between_parts(self) -> str:
         """Keep the pairs of points between parts that have a whole face in common."""
         size = len(self.mesh.points)
-        links = [np.repeat(block.corners[:, :1], block.corners.shape[1], axis=1).ravel() for block in self.blocks]
-        ends = [block.corners.ravel() for block in self.blocks]
-        part = connected_parts(np.stack([np.concatenate(links), np.concatenate(ends)], axis=1), size)
+        part = self._parts()
         place = _joined(self.pairs, size)
         faces = [_padded(face) for block in self.blocks for face in faces_of(block.shape, block.corners)]
         together = np.concatenate(faces)
@@ -157,8 +162,7 @@ class Stitching:
         """The pairs between parts that agree at all of them."""
         if self.agree.all():
             return self.pairs
-        nodes = np.concatenate([block.corners[:, [0, corner]] for block in self.blocks for corner in range(3)])
-        part = connected_parts(nodes, len(self.mesh.points))
+        part = self._parts()
         keys, group = np.unique(np.sort(part[self.pairs], axis=1), axis=0, return_inverse=True)
         whole = np.ones(len(keys), bool)
         whole[group.ravel()[~self.agree]] = False

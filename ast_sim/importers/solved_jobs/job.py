@@ -169,20 +169,21 @@ def _rigid_body(keyword: Keyword, state: _Conditions, mesh: SourceMesh, groups: 
 
 
 def _node_type(mesh: SourceMesh, conditions: _Conditions) -> np.ndarray:
-    """[n] uint8: see `read_job`. Only corners of elements count for a whole body; the others lie between them."""
+    """[n] uint8: see `read_job`. For a whole body the nodes count that a scene keeps: the corners, and the middles of
+    the edges of tetrahedra."""
     held = conditions.sometimes[:, :3]
     prescribed = held.all(axis=1) | conditions.moved | conditions.rigid
-    corners = np.zeros(len(mesh.points), bool)
+    kept = np.zeros(len(mesh.points), bool)
     pairs = [np.zeros((0, 2), np.int64)]
     for block in mesh.blocks:
-        corners[block.corners] = True
-        rest = block.corners[:, 1:]
-        pairs.append(np.stack([np.repeat(block.corners[:, 0], rest.shape[1]), rest.ravel()], axis=1))
+        kept[block.nodes if block.kind == "tetra10" else block.corners] = True
+        rest = block.nodes[:, 1:]
+        pairs.append(np.stack([np.repeat(block.nodes[:, 0], rest.shape[1]), rest.ravel()], axis=1))
     body = connected_parts(np.concatenate(pairs), len(mesh.points))
-    open_bodies = np.unique(body[corners & ~prescribed])
+    open_bodies = np.unique(body[kept & ~prescribed])
     types = np.where(prescribed, NodeType.HANDLE, NodeType.NORMAL).astype(np.uint8)
-    types[corners & ~np.isin(body, open_bodies)] = NodeType.OBSTACLE
-    sliding = corners & held.any(axis=1) & ~prescribed
+    types[kept & ~np.isin(body, open_bodies)] = NodeType.OBSTACLE
+    sliding = kept & held.any(axis=1) & ~prescribed
     if sliding.any():
         conditions_note = (
             f"{sliding.sum()} nodes are held in some directions only (symmetry, sliding): they count as free"

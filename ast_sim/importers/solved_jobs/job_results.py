@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,16 +20,24 @@ _AGREEMENT = 1e-4
 
 _PRESSURES = ("young", "yield_stress")
 
+# What the keywords of a deck call a field, and how it is called in the results.
+_IN_RESULTS = {"PEEQ": "PE", "RF": "FORC", "NT": "NDTEMP"}
 
-def job_frames(job: Job, results: Path, pascals: float) -> Iterator[SourceMesh]:
+# A field that is not zero at rest.
+_TEMPERATURE = "NDTEMP"
+
+
+def job_frames(job: Job, results: Path, pascals: float, wanted: Sequence[str] = ()) -> Iterator[SourceMesh]:
     """The frames of a job, the first at rest; fields `displacement`, `von_mises` if there are stresses, `node_type`,
-    and the materials at the elements.
+    the wanted ones, and the materials at the elements.
 
     Args:
         pascals: the unit of stress of the deck. The columns of the material are in pascal; the stress is as it is.
+        wanted: further fields at the nodes, by their names in the deck (PEEQ, RF) or in the results (PE, FORC).
 
     Raises:
-        DatasetError: the results are those of another deck, or hold no displacement.
+        DatasetError: the results are those of another deck, hold no displacement or not a wanted field, or start after
+            the rest with a temperature, which is not known at rest.
     """
     materials = {
         name: [values * (pascals if name in _PRESSURES else 1.0) for values in parts]
@@ -39,8 +47,10 @@ def job_frames(job: Job, results: Path, pascals: float) -> Iterator[SourceMesh]:
     mesh = replace(job.mesh, path=results, cell_fields=materials, notes=[*job.mesh.notes, *ends])
     last = None
     for frame in vtk_frames(results):
-        fields = {"node_type": job.node_type, **_fields(job, frame)}
+        fields = {"node_type": job.node_type, **_fields(job, frame, wanted)}
         if last is None and frame.time:
+            if any(_IN_RESULTS.get(name, name) == _TEMPERATURE for name in wanted):
+                raise DatasetError(f"{results}: holds no frame at rest, so the temperature there is not known")
             rest = {name: values if name == "node_type" else np.zeros_like(values) for name, values in fields.items()}
             told = [*mesh.notes, "a frame at rest stands before the results"]
             yield replace(mesh, point_fields=rest, time=0.0, notes=told)
@@ -54,8 +64,8 @@ def job_frames(job: Job, results: Path, pascals: float) -> Iterator[SourceMesh]:
         )
 
 
-def _fields(job: Job, frame: SourceMesh) -> dict[str, np.ndarray]:
-    """Displacement and von Mises stress at the points of the deck; NaN where the results have none."""
+def _fields(job: Job, frame: SourceMesh, wanted: Sequence[str]) -> dict[str, np.ndarray]:
+    """Displacement, von Mises stress and wanted fields at the points of the deck; NaN where the results have none."""
     rows, there = _same_nodes(job, frame)
     if "DISP" not in frame.point_fields:
         raise DatasetError(f"{frame.path}: holds no displacement: write U with *NODE FILE or *NODE OUTPUT")
@@ -64,6 +74,12 @@ def _fields(job: Job, frame: SourceMesh) -> dict[str, np.ndarray]:
         stress = np.asarray(frame.point_fields["STRESS"], np.float64)
         order = order_of(frame.path, "STRESS", stress.shape[1], frame.columns.get("STRESS", ()), ())
         fields["von_mises"] = von_mises(stress, order)
+    for name in wanted:
+        stored = _IN_RESULTS.get(name, name)
+        if stored not in frame.point_fields:
+            known = ", ".join(sorted(frame.point_fields))
+            raise DatasetError(f"{frame.path}: holds no field {name!r} (as {stored}); there are: {known}")
+        fields[name] = np.asarray(frame.point_fields[stored], np.float64)
     given = {}
     for name, values in fields.items():
         given[name] = np.full((len(job.mesh.points), *values.shape[1:]), np.nan)

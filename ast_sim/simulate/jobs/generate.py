@@ -70,6 +70,7 @@ def generate(
     train: int = 100,
     valid: int | None = None,
     test: int | None = None,
+    calibration: int = 0,
     seed: int = 0,
     nodes: int | None = None,
     frames: int | None = None,
@@ -87,7 +88,7 @@ def generate(
     Args:
         family: scene family, such as "deforming_plate".
         out: the dataset file. If it exists and was made with the same settings, only scenes that it lacks are made.
-        train, valid, test: scenes of each split. `valid` and `test` are a tenth of `train` if None.
+        train, valid, test, calibration: scenes of each split. `valid` and `test` are a tenth of `train` if None.
         seed: of all random draws. A sample depends only on the seed, its split, its index and the settings.
         nodes: about how many nodes a scene has; None: the family's default, or by the sizes of a specification.
         frames: frames of a scene, for families that have this option; None: the default of family or specification.
@@ -102,13 +103,13 @@ def generate(
 
     Raises:
         AstSimError: `out` is no place for a file.
-        SimulationError: a setting is invalid, the scenes cannot fit on the disk, `out` or its parts folder was made
-            with other settings, another process uses the folder, or samples failed: the same call goes on from there.
+        SimulationError: a setting is invalid, the disk is too small, `out` was made otherwise or is in use by another
+            process, or samples failed: the same call goes on from there.
         MissingExtra: a package that the family, the solver or the scheduler needs is not installed.
     """
     module = family_module(family)
     self_test()
-    counts = checked_counts(train, valid, test)
+    counts = checked_counts(train, valid, test, calibration)
     workers = checked_workers(workers, scheduler)
     recipe = checked_recipe(module, family, seed, nodes, frames, solver, parts, patient, keep, spec)
     output_file(out := Path(out))
@@ -116,11 +117,10 @@ def generate(
     folder = out.with_name(out.name + ".parts")
     if out.exists() and not _grows(out, settings, counts):
         return _existing(out, folder, settings, counts)
-    samples = _samples(counts)
-    _check_start(out, folder, len(samples), recipe, module)
+    _check_start(out, folder, sum(counts.values()), recipe, module)
     with _locked(folder, settings):
         _unpack(out, folder)
-        _make(samples, folder, recipe, workers, scheduler, progress, _notes(settings))
+        _make(samples := _samples(counts), folder, recipe, workers, scheduler, progress, _notes(settings))
         truncated = _merge(out, folder, samples, _writer(out, recipe, module, {**settings, "counts": counts}))
     return Generated(out, counts, truncated)
 
@@ -189,13 +189,14 @@ def checked_workers(workers: int | None, scheduler: str | None) -> int:
     return os.cpu_count() or 1
 
 
-def checked_counts(train: int, valid: int | None, test: int | None) -> dict[str, int]:
+def checked_counts(train: int, valid: int | None, test: int | None, calibration: int = 0) -> dict[str, int]:
     """The number of scenes of each split; a tenth of `train` where None."""
     tenth = -(-train // 10)
     counts = {
         "train": train,
         "valid": tenth if valid is None else valid,
         "test": tenth if test is None else test,
+        "calibration": calibration,
     }
     if min(counts.values()) < 0 or sum(counts.values()) == 0:
         raise SimulationError(f"counts must be at least 0 and not all 0, got {counts}")

@@ -63,7 +63,7 @@ def make_sample(recipe: Recipe, split: str, index: int, checkpoint: Checkpoint |
 
     Args:
         recipe: the settings that all samples share.
-        split: "train", "valid" or "test".
+        split: "train", "valid", "test" or "calibration".
         index: which sample of the split.
         checkpoint: where an unfinished solve is kept. If there is one already, it goes on.
     """

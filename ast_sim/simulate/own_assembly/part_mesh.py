@@ -188,7 +188,7 @@ def _from_file(part: PartSpec, request: dict[str, Any]) -> PartMesh:
     """A mesh, or a rigid surface, as it stands in its file."""
     if Path(request["stamp"][0]).suffix.lower() == STL_ENDING:
         return _surface_mesh(part, request, _stl(request))
-    mesh = read_mesh(Path(request["stamp"][0]))
+    mesh = read_mesh(Path(request["stamp"][0]), corners=request["order"] == 1)
     used, elements = np.unique(mesh.elements, return_inverse=True)
     elements = elements.reshape(-1, mesh.elements.shape[1])
     position = request["scale"] * mesh.points[used]

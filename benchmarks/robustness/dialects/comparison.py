@@ -56,13 +56,13 @@ def check(case: Case, simulation: Simulation) -> None:
         DatasetError: the file is refused.
     """
     if case.names is None:
-        mesh = read_mesh(case.path)
+        mesh = read_mesh(case.path, corners=True)
         scene, used = mesh.scene(None, None)
         nodes = _check_scene(scene, mesh.points[used], simulation)
         _check_groups(case, mesh.groups, used, nodes)
         _require_notes(simulation, "; ".join(mesh.notes))
         return
-    trajectory = read_series(case.path, case.names)
+    trajectory = read_series(case.path, case.names, corners=True)
     origin = np.array(trajectory.attributes.get("origin", [0.0, 0.0, 0.0]))
     nodes = _check_scene(trajectory.scene, trajectory.scene.rest_position + origin, simulation)
     _check_frames(case, trajectory, simulation, nodes)

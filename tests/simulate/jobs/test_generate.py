@@ -52,7 +52,7 @@ def states(folder) -> dict[str, list[dict]]:
 def undisturbed(tmp_path_factory):
     out = tmp_path_factory.mktemp("undisturbed") / "plates.h5"
     generated = plates(out, workers=2)
-    assert generated.path == out and generated.counts == COUNTS and generated.truncated == []
+    assert generated.path == out and generated.counts == {**COUNTS, "calibration": 0} and generated.truncated == []
     assert sorted(path.name for path in out.parent.iterdir()) == ["plates.h5", "plates.h5.seconds.json"]
     return out
 
@@ -64,7 +64,12 @@ def test_the_dataset_is_whole_and_says_where_it_is_from(undisturbed):
         assert (info.family, info.integration, info.stress_location) == ("deforming_plate", "quasi_static", "node")
         assert (info.domain_half_width, info.contact_radius) == (1.0, 0.03)
         made = info.generator
-        assert (made["seed"], made["nodes"], made["frames"], made["counts"]) == (5, NODES, FRAMES, COUNTS)
+        assert (made["seed"], made["nodes"], made["frames"], made["counts"]) == (
+            5,
+            NODES,
+            FRAMES,
+            {**COUNTS, "calibration": 0},
+        )
         assert (made["solver"], made["command"]) == (
             "own", f"ast-sim generate deforming_plate --seed 5 --nodes {NODES} --frames {FRAMES}"
         )  # fmt: skip
@@ -180,7 +185,7 @@ def test_parts_of_other_settings_are_refused(tmp_path):
 
 def test_an_existing_dataset_is_kept(undisturbed):
     before = undisturbed.stat().st_mtime_ns
-    assert plates(undisturbed).counts == COUNTS
+    assert plates(undisturbed).counts == {**COUNTS, "calibration": 0}
     with pytest.raises(SimulationError, match="exists and holds other data"):
         plates(undisturbed, seed=6)
     assert undisturbed.stat().st_mtime_ns == before
@@ -206,7 +211,7 @@ def test_a_dataset_grows_without_solving_a_scene_twice(undisturbed, tmp_path, mo
     assert (folder / "train-000001.npz").exists()
 
     monkeypatch.setattr(pool, "run_all", lambda samples, *rest: (made.extend(samples), run_all(samples, *rest)))
-    assert plates(out).counts == COUNTS
+    assert plates(out).counts == {**COUNTS, "calibration": 0}
     assert made[2:] == [("test", 0)]
     assert out.read_bytes() == undisturbed.read_bytes() and not folder.exists()
     with Dataset(out) as dataset:
@@ -267,7 +272,7 @@ def test_kept_frames_are_those_of_the_whole_motion_and_recorded(undisturbed, tmp
                 assert np.abs(part.position - wanted).max() <= 1e-3 * moved
                 assert sum(part.attributes["newton_iterations"]) < sum(full.attributes["newton_iterations"])
     before = out.read_bytes()
-    assert plates(out, keep=[3, 7]).counts == COUNTS and out.read_bytes() == before
+    assert plates(out, keep=[3, 7]).counts == {**COUNTS, "calibration": 0} and out.read_bytes() == before
     for other in ({"keep": (3, 6)}, {}):
         with pytest.raises(SimulationError, match="holds other data"):
             plates(out, **other)

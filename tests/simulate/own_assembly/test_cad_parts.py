@@ -20,13 +20,13 @@ unit = "mm"
 frames = 2
 [parts.part]
 file = "FILE"
-size = 4
+size = 8
 young = 1e9
 poisson = 0.3
 fixed = "zmin"
 [parts.block]
 file = "block.vtu"
-offset = [0, 0, 100]
+offset = [0, 0, 34]
 rigid = true
 """
 CAD = """
@@ -73,7 +73,7 @@ def part(path):
 @pytest.mark.parametrize("size", [4, 5, 15])
 def test_fillets_smaller_than_the_elements_are_meshed(size, tmp_path):
     """Gmsh alone gives flat elements at 4 and 15."""
-    volume, notes = part(write(tmp_path / "plate.step", "fillet", SPEC.replace("size = 4", f"size = {size}")))
+    volume, notes = part(write(tmp_path / "plate.step", "fillet", SPEC.replace("size = 8", f"size = {size}")))
     assert volume == pytest.approx(39_935, rel=1e-3)
     assert all(note.startswith("part (plate.step): ") for note in notes)
 
@@ -95,7 +95,7 @@ def make(gmsh):
 """)
     write_box(tmp_path / "block.vtu", (0, 0, 0), (10, 10, 10), (2, 2, 2))
     path = tmp_path / "SPEC.toml"
-    path.write_text(SPEC.replace("FILE", "picky.py"))
+    path.write_text(SPEC.replace("FILE", "picky.py").replace("size = 8", "size = 4"))
     note = (
         "part (picky.py): elements of the size 4.28 instead of 4, with which Gmsh gives no good mesh (tangled; badly)"
     )
@@ -131,7 +131,7 @@ def test_formats_of_cad_programs(ending, tmp_path):
 
 @pytest.mark.parametrize("ending", ["step", "iges"])
 def test_files_that_know_their_unit_are_taken_in_the_unit_of_the_specification(ending, tmp_path):
-    inches = SPEC.replace('"mm"', '"in"').replace("size = 4", "size = 0.16").replace("100]", "4]")
+    inches = SPEC.replace('"mm"', '"in"').replace("size = 8", "size = 0.32").replace("34]", "1.4]")
     volume, _ = part(write(tmp_path / f"plate.{ending}", "hollow", inches))
     assert volume == pytest.approx((40_000 - 1_600) / 25.4**3, rel=1e-6)
 
@@ -148,7 +148,7 @@ def test_one_solid_of_several_is_chosen(ending, tmp_path):
     assert text.endswith("solid = 1" + (" or 'Base plate'" if ending == "step" else ""))
     chosen = {1: 40_000, 2: 720} | ({"Base plate": 40_000, "pin": 720} if ending == "step" else {})
     for name, volume in chosen.items():
-        path.write_text(SPEC.replace("FILE", f"both.{ending}").replace("size = 4", f"size = 4\nsolid = {name!r}"))
+        path.write_text(SPEC.replace("FILE", f"both.{ending}").replace("size = 8", f"size = 8\nsolid = {name!r}"))
         assert part(path)[0] == pytest.approx(volume)
     path.write_text(path.read_text().replace("solid = ", "solid = 3 # "))
     with pytest.raises(SimulationError, match="solid 3; it holds 2"):

@@ -1,0 +1,95 @@
+"""Where the nodes of a simulation are: at rest and in each frame, from the points and displacements of its files."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from ast_sim.importers.shells import Shells
+from ast_sim.support.errors import DatasetError
+
+# Points count as equal if they differ by less than this share of the size of the mesh.
+_AGREEMENT = 1e-4
+
+# Rounding to float32 may change the displacements by this share of the largest one before a warning is given.
+_ROUNDING = 0.01
+
+
+def rest_and_position(
+    source: Path, at: np.ndarray, displacements: list[np.ndarray | None]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The rest positions [N, 3] and the positions [S, N, 3] of nodes, from the points [S, N, 3] and the displacements
+    of each frame.
+
+    A file with displacements holds either the points at rest or the moved points. If the points are the same in all
+    frames, they are the rest positions. If the points minus their displacements are the same, these are.
+    """
+    given = [one for one in displacements if one is not None]
+    if not given:
+        return at[0], at
+    if len(given) < len(displacements):
+        frame = next(frame for frame, one in enumerate(displacements) if one is None)
+        raise DatasetError(f"{source}: frame {frame} has no displacement, others have")
+    moved = np.stack(given)
+    allowed = _AGREEMENT * np.ptp(at[0], axis=0).max()
+    if np.abs(at - at[0]).max() <= allowed:
+        return at[0], at[0] + moved
+    back = at - moved
+    if np.abs(back - back[0]).max() <= allowed:
+        return back[0], at
+    raise DatasetError(
+        f"{source}: the displacement does not fit the points: in some frame the points, and the points minus the"
+        " displacement, differ from frame 0; name the right field"
+    )
+
+
+def with_layers(source: Path, shells: Shells, rest: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rest points and positions with the points behind the shells, which turn with the shells.
+
+    Raises:
+        DatasetError: a shell is not rigid.
+    """
+    count = len(shells.nodes)
+    for frame, points in enumerate(position):
+        bent = shells.bent(rest, points)
+        if bent is not None:
+            raise DatasetError(
+                f"{source}: the shell at {np.round(rest[bent[0]], 6).tolist()} is not rigid: in"
+                f" frame {frame} an edge changes by {bent[1]:.3g};"
+                " shells beside tetrahedra must be rigid: mesh this body with tetrahedra"
+            )
+    layers = np.stack([shells.behind(points) for points in position])
+    return (
+        np.concatenate([rest[:-count], shells.behind(rest)]),
+        np.concatenate([position[:, :-count], layers], axis=1),
+    )
+
+
+def far_origin(points: np.ndarray) -> np.ndarray:
+    """[3] float64: what is subtracted from points [N, 3] before they are rounded to float32.
+
+    float32 has 24 bits: a mesh of size 1 at a distance of 5e6 keeps steps of 0.5. The origin is the centre of the
+    points, rounded to a multiple of a power of ten that is 10 to 100 times the size of the mesh. So it is zero for a
+    mesh near zero.
+    """
+    lowest, highest = points.min(axis=0), points.max(axis=0)
+    size = (highest - lowest).max()
+    if not np.isfinite(size) or size <= 0:
+        return np.zeros(3)
+    unit = 10.0 ** np.ceil(np.log10(10 * size))
+    return np.round((lowest + highest) / 2 / unit) * unit + 0.0
+
+
+def warn_of_rounding(source: Path, rest: np.ndarray, position: np.ndarray) -> None:
+    """Warn if the displacements change when the rest points [N, 3] and the positions [S, N, 3] become float32."""
+    small = rest.astype(np.float32).astype(np.float64)
+    largest = max(np.abs(one - rest).max() for one in position)
+    worst = max(np.abs(one.astype(np.float32) - small - (one - rest)).max() for one in position)
+    if worst > _ROUNDING * largest:
+        warnings.warn(
+            f"{source}: the largest displacement is {largest:.3g}, and rounding to float32 changes displacements by up"
+            f" to {worst:.3g}: the motion is too small for coordinates of up to {np.abs(position).max():.3g}",
+            stacklevel=3,
+        )

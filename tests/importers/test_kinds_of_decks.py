@@ -1,0 +1,147 @@
+"""Kinds of inputs that once came in wrong or without a word: elements beside tetrahedra, keywords that change the mesh,
+marks that are not a number, bodies that lie in each other at rest."""
+
+import meshio
+import numpy as np
+import pytest
+from blocks import block
+
+from ast_sim import cli
+from ast_sim.importers.mesh_file import read_mesh
+from ast_sim.importers.scene_mesh import read_scene
+from ast_sim.importers.series import FieldNames, read_series
+from ast_sim.scene import NodeType
+from ast_sim.support.errors import DatasetError
+
+PAD = block(2, 2, 1)
+TETRAHEDRA = len(PAD.elements)
+
+
+def deck(folder, *more):
+    """A deck of the pad, whose nodes are 1 to 18, and more lines after it."""
+    nodes = [f"{1 + row}, {x:g}, {y:g}, {z:g}" for row, (x, y, z) in enumerate(PAD.rest_position)]
+    cells = [", ".join(map(str, [1 + row, *(1 + cell)])) for row, cell in enumerate(PAD.elements)]
+    path = folder / "deck.inp"
+    path.write_text("\n".join(["*NODE", *nodes, "*ELEMENT, TYPE=C3D4", *cells, *more]) + "\n")
+    return path
+
+
+def on_top(count):
+    """Numbers of nodes of the deck around a square of the top."""
+    corners = np.array([(0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)])[:count]
+    return [1 + int(np.flatnonzero((PAD.rest_position == corner).all(axis=1))[0]) for corner in corners]
+
+
+@pytest.mark.parametrize(
+    ("kind", "count", "note"),
+    [
+        ("R3D3", 3, "1 cells of the kind R3D3 are left out"),
+        ("r3d4", 4, "1 cells of the kind r3d4 are left out"),
+        ("SPRINGA", 2, "1 elements of the type SPRINGA are left out"),
+        ("Spring1", 1, "1 elements of the type SPRING1 are left out"),
+        ("DASHPOTA", 2, "1 elements of the type DASHPOTA are left out"),
+        ("MASS", 1, "1 elements of the type MASS are left out"),
+        ("T3D2", 2, "1 elements of the type T3D2 are left out"),
+    ],
+)
+def test_elements_on_the_nodes_of_tetrahedra_are_left_out_with_a_note(tmp_path, kind, count, note):
+    nodes = ", ".join(map(str, on_top(count)))
+    mesh = read_mesh(deck(tmp_path, f"*ELEMENT, TYPE={kind}", f"1001, {nodes}"))
+    assert mesh.elements.shape == (TETRAHEDRA, 4) and mesh.shells is None
+    assert note.lower() in "; ".join(mesh.notes).lower()
+
+
+@pytest.mark.parametrize(
+    ("kind", "cells"), [("R3D3", ["101, 102, 103", "101, 103, 104"]), ("R3D4", ["101, 102, 103, 104"])]
+)
+def test_rigid_elements_of_their_own_become_an_obstacle(tmp_path, kind, cells):
+    sheet = [f"{101 + row}, {x}, {y}, 1.5" for row, (x, y) in enumerate([(0, 0), (2, 0), (2, 2), (0, 2)])]
+    rows = [f"{1001 + row}, {cell}" for row, cell in enumerate(cells)]
+    path = deck(
+        tmp_path, "*NODE", *sheet, f"*ELEMENT, TYPE={kind}, ELSET=TOOL", *rows, "*RIGID BODY, ELSET=TOOL, REF NODE=1"
+    )
+    read = read_scene(path, clamps=["0:zmin"])
+    assert f"{len(cells)} cells of the kind {kind} are shells and become obstacles" in read.notes
+    assert np.bincount(read.scene.body).tolist() == [PAD.num_nodes, 8]
+    assert (read.scene.node_type[read.scene.body == 1] == NodeType.OBSTACLE).all()
+    front = read.scene.rest_position[read.scene.body == 1][:4]
+    assert (front[:, 2] == 1.5).all()
+
+
+@pytest.mark.parametrize("keyword", ["NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "IMPORT", "PARAMETER"])
+def test_keywords_that_change_the_mesh_are_refused_by_name(tmp_path, keyword):
+    path = deck(tmp_path, f"*{keyword[:2].lower()}{keyword[2:]}, NSET=A", "1, 3, 1")
+    with pytest.raises(DatasetError, match=rf"deck.inp:\d+: \*{keyword}: this keyword changes the mesh"):
+        read_mesh(path)
+
+
+@pytest.mark.parametrize("lines", [("*ELEMENT, TYPE=C3D99", "1001, 1, 2"), ("*ELEMENT, TYPE=U1", "1001, 1, 2")])
+def test_unknown_elements_are_refused_by_name(tmp_path, lines):
+    with pytest.raises(DatasetError, match=r"elements of the type (C3D99|U1) are not known here"):
+        read_mesh(deck(tmp_path, *lines))
+
+
+@pytest.mark.parametrize("unset", [np.nan, 0.0])
+@pytest.mark.parametrize("kind", ["frames", "clamp"])
+def test_marks_that_are_not_a_number_mark_nothing(tmp_path, unset, kind):
+    marked = PAD.rest_position[:, 2] == 0
+    marks = np.where(marked, 1.0, unset)
+    told = f"the field 'held' is NaN at {(~marked).sum()} nodes: they are not marked"
+    if kind == "clamp":
+        read = read_scene(
+            meshio.Mesh(PAD.rest_position, [("tetra", PAD.elements)], {"held": marks}), clamps=["0:field=held"]
+        )
+        scene, notes = read.scene, read.notes
+    else:
+        for frame in range(2):
+            fields = {"displacement": np.full((PAD.num_nodes, 3), 0.1 * frame), "held": marks}
+            meshio.write(tmp_path / f"f{frame}.vtu", meshio.Mesh(PAD.rest_position, [("tetra", PAD.elements)], fields))
+        read = read_series(tmp_path, FieldNames(handle="held"))
+        scene, notes = read.scene, read.attributes.get("notes", "")
+    assert np.array_equal(scene.node_type == NodeType.HANDLE, marked)
+    assert (told in notes) == np.isnan(unset)
+
+
+def two(gap: float) -> meshio.Mesh:
+    """The pad, and a cube whose lower face lies so far above it."""
+    cube = block(1, 1, 1)
+    points = np.concatenate([PAD.rest_position, cube.rest_position + np.float32([0.5, 0.5, 1 + gap])])
+    return meshio.Mesh(points, [("tetra", np.concatenate([PAD.elements, cube.elements + PAD.num_nodes]))])
+
+
+@pytest.mark.parametrize(("gap", "depth"), [(-0.2, "0.2"), (-0.05, "0.05"), (-0.01, None), (0.01, None), (0.5, None)])
+def test_bodies_in_each_other_at_rest_are_told_with_the_depth(gap, depth):
+    """Depths below 2 % of the mean edge, which is 1.1 here, are left to rounding and to soft contact."""
+    read = read_scene(two(gap), obstacles=[1], clamps=["0:zmin"])
+    told = [text for text in read.warnings if "overlap" in text]
+    assert len(told) == (depth is not None)
+    assert depth is None or f"body 1 lies {depth} inside body 0 at the start" in told[0]
+
+
+def test_convert_tells_of_bodies_in_each_other_and_strict_refuses_them(tmp_path, capsys):
+    mesh = two(-0.2)
+    (tmp_path / "r").mkdir()
+    tool = (np.arange(len(mesh.points)) >= PAD.num_nodes).astype(float)
+    for frame in range(2):
+        mesh.point_data = {
+            "displacement": -0.1 * frame * np.outer(tool, (0, 0, 1)),
+            "tool": tool,
+            "von_mises": tool + frame,
+        }
+        meshio.write(tmp_path / "r" / f"f{frame}.vtu", mesh)
+    command = [
+        "convert",
+        str(tmp_path / "r"),
+        "--out",
+        str(tmp_path / "d.h5"),
+        "--shares",
+        "1",
+        "0",
+        "0",
+        "--obstacle",
+        "tool",
+    ]
+    assert cli.main([*command, "--strict"]) == 2
+    assert "body 1 lies 0.2 inside body 0" in capsys.readouterr().err and not (tmp_path / "d.h5").exists()
+    assert cli.main(command) == 0
+    assert "body 1 lies 0.2 inside body 0 at the start" in capsys.readouterr().out

@@ -1,0 +1,95 @@
+"""A body of second-order tetrahedra that CalculiX pulls: its ten nodes are kept from the files to the force."""
+
+import subprocess
+
+import numpy as np
+import pytest
+from blocks import block
+
+import ast_sim
+from ast_sim import Dataset, cli
+from ast_sim.importers.formats.vtk_files import vtk_frames
+from ast_sim.importers.series import FieldNames, read_series
+from ast_sim.scene import NodeType
+from ast_sim.simulate.shapes.mesh import second_order
+
+NAMES = FieldNames(stress_unit="MPa")
+PULL = 0.001
+YOUNG, POISSON = 100.0, 0.3  # MPa
+
+
+def deck(nodes, elements) -> str:
+    """A block whose floor z = 0 is held and whose top z = 2 is moved up, in two increments."""
+    rows = [f"{1 + row}, {x:.9g}, {y:.9g}, {z:.9g}" for row, (x, y, z) in enumerate(nodes)]
+    cells = [", ".join(map(str, [1 + row, *(1 + cell)])) for row, cell in enumerate(elements)]
+    floor, top = (1 + np.flatnonzero(nodes[:, 2] == height) for height in (0, 2))
+    lines = ["*NODE", *rows, "*ELEMENT, TYPE=C3D10, ELSET=PAD", *cells]
+    lines += ["*NSET, NSET=FLOOR", *map(str, floor), "*NSET, NSET=TOP", *map(str, top)]
+    lines += ["*MATERIAL, NAME=SOFT", "*ELASTIC", f"{YOUNG}, {POISSON}", "*SOLID SECTION, ELSET=PAD, MATERIAL=SOFT"]
+    lines += [
+        "*STEP, NLGEOM",
+        "*STATIC, DIRECT",
+        "0.5, 1.",
+        "*BOUNDARY",
+        "FLOOR, 1, 3",
+        "TOP, 1, 2",
+        f"TOP, 3, 3, {PULL}",
+    ]
+    lines += ["*NODE FILE", "U, RF", "*EL FILE", "S", "*END STEP"]
+    return "\n".join(lines) + "\n"
+
+
+@pytest.fixture(scope="module")
+def pulled(tmp_path_factory):
+    """The deck and the results of a job, its nodes [N, 3] and elements [E, 10]."""
+    folder = tmp_path_factory.mktemp("pulled")
+    corners = block(2, 2, 2)
+    nodes, elements = second_order(corners.rest_position.astype(float), corners.elements)
+    (folder / "job.inp").write_text(deck(nodes, elements))
+    subprocess.run(["ccx", "job"], cwd=folder, check=True, capture_output=True, timeout=100)
+    return folder / "job.inp", folder / "job.frd", nodes, elements
+
+
+def test_convert_train_predict_and_the_force(pulled, tmp_path, capsys):
+    job, results, nodes, elements = pulled
+    data, run = tmp_path / "d.h5", tmp_path / "run"
+    units = ["--length-unit", "mm", "--stress-unit", "MPa"]
+    kept = ["--reaction", "RF", "--field", "ERROR=%"]
+    shares = ["--shares", "1", "0", "0"]
+    assert cli.main(["convert", str(job), str(results), "--out", str(data), *shares, *units, *kept]) == 0
+    assert "corners only" not in capsys.readouterr().out
+    with Dataset(data) as dataset:
+        assert dataset.element_size == 10
+        truth = dataset["train"][0]
+    scene = truth.scene
+    assert np.array_equal(scene.elements, elements)
+    assert np.array_equal(scene.node_type == NodeType.HANDLE, np.isin(nodes[:, 2], (0, 2)))
+    np.testing.assert_allclose(truth.position[-1][nodes[:, 2] == 2], nodes[nodes[:, 2] == 2] + (0, 0, PULL), atol=1e-6)
+    assert cli.main(["train", str(data), "--out", str(run), "--set", "train.steps=20"]) == 0
+    effort = ast_sim.Effort(newton_steps=10)
+    answer = ast_sim.Run(run).predict(scene, truth.position, effort=effort, frames=[-1])
+    assert answer.converged
+    np.testing.assert_allclose(answer.position[-1], truth.position[-1], atol=0.01 * PULL)
+    # The dataset keeps the forces of the job in newton: lengths in mm and stress in MPa go with these.
+    top = nodes[:, 2] == 2
+    reaction = truth.fields["reaction"]
+    assert (reaction.location, reaction.unit, reaction.values.shape) == ("node", "N", (3, len(nodes), 3))
+    assert not reaction.values[0].any() and (truth.fields["ERROR"].location, truth.fields["ERROR"].unit) == (
+        "node",
+        "%",
+    )
+    # CalculiX's law (Saint Venant-Kirchhoff) and ours (Neo-Hooke) differ by about 2.5 times the strain, PULL / 2.
+    *_, last = vtk_frames(results)
+    force = last.point_fields["FORC"][top].sum(axis=0)
+    np.testing.assert_allclose(reaction.values[-1][top].sum(axis=0), force, rtol=1e-5, atol=1e-5 * force[2])
+    assert reaction.values[-1].sum(axis=0) == pytest.approx(0, abs=1e-4 * force[2])
+    assert answer.reaction()[0] == pytest.approx(force, rel=2.5e-3, abs=2.5e-3 * force[2])
+
+
+def test_corners_are_taken_when_they_are_asked_for(pulled):
+    job, results, nodes, elements = pulled
+    read = read_series(results, NAMES, deck=job, corners=True)
+    used = np.unique(elements[:, :4])
+    assert np.array_equal(used[read.scene.elements], elements[:, :4])
+    np.testing.assert_allclose(read.scene.rest_position, nodes[used], atol=1e-6)
+    assert f"{len(elements)} cells of the kind C3D10 keep their corners only" in read.attributes["notes"]
