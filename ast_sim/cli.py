@@ -252,6 +252,8 @@ def _add_predict(predict: _Parser) -> None:
     _add_each(predict, efforts, type=at_least(0))
     about = "number of frames of the motion (default: prescribed nodes move as far in a frame as in training)"
     _add_each(predict, {"--num-frames N": about}, type=at_least(2))
+    about = "say whether the answer is physics: elements turned over, penetration, forces out of balance"
+    predict.add_argument("--check", action="store_true", help=about)
     mesh = predict.add_argument_group("if SCENE is a mesh")
     _add_each(mesh, {"--obstacle BODY": "a rigid body; may be repeated"}, type=int, action="append", default=[])
     marks = {

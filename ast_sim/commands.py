@@ -257,11 +257,12 @@ def _save(answer: Any, args: argparse.Namespace, truth: Any) -> None:
     if answer.expected_error is not None:
         percent = f"{100 * answer.expected_error:.2g} % of the displacement"
         print(f"expected error: {percent}, as in the validation scenes at their deepest frame")
+    if args.check:
+        print(printable(str(answer.check())))
 
 
 def _effort(run: Any, args: argparse.Namespace) -> Any:
-    """What --corrections and --newton-steps ask for; None: the default of the run. Without --newton-steps, corrections
-    are followed by no Newton step."""
+    """What --corrections and --newton-steps ask for; None: the run's default. Corrections alone: no Newton step."""
     from ast_sim.inference.effort import Effort
 
     if args.corrections is None and args.newton_steps is None:

@@ -10,9 +10,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from ast_sim.material import FRICTION
-from ast_sim.mechanics.elements.neo_hookean import NeoHookean
-from ast_sim.mechanics.linearised_contact import CLEARANCE, NewtonSteps
+from ast_sim.mechanics.linearised_contact import NewtonSteps
+from ast_sim.mechanics.physics_check import Law
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.scene import Scene
 from ast_sim.support.errors import ConfigError
@@ -128,10 +127,7 @@ def newton_steps(config: ModelConfig, scene: Scene) -> NewtonSteps:
         ConfigError: the law of the material is not known.
         SimulationError: the constants of the material are not allowed, or an element has no volume.
     """
-    material = config.data.material
-    friction = float(np.max(material.numbers(FRICTION, scene.material)))
-    law = NeoHookean.of_scene(scene, material)
-    return NewtonSteps(scene, law, CLEARANCE * config.data.contact_range, friction)
+    return Law(config.data.material, config.data.contact_range).newton_steps(scene)
 
 
 def cheapest_good(measured: Sequence[EffortErrors]) -> Effort:

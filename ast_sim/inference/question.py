@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ast_sim.inference.answer import Answer
 from ast_sim.mechanics.driven import Driven
+from ast_sim.mechanics.physics_check import Law
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.support.errors import ConfigError, RolloutError
@@ -116,7 +117,7 @@ class Question:
             frames=numbers,
             last_steps=last_steps,
             driven=Driven.of(self.scene, self.prescribed_position),
-            material=config.data.material,
+            law=Law(config.data.material, config.data.contact_range),
         )
 
 

@@ -1,14 +1,17 @@
 """The run that comes with the package answers plates that it has never seen, nearly as the solver does."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from toy import one_thread  # noqa: F401 (used by being imported)
 
 import ast_sim
+from ast_sim.cli import main
 from ast_sim.support.errors import ConfigError
 
 
-def test_it_predicts_a_new_plate_by_one_call_and_better_with_newton_steps(tmp_path):
+def test_it_predicts_a_new_plate_by_one_call_and_better_with_newton_steps(tmp_path, capsys):
     data = tmp_path / "plates.h5"
     ast_sim.generate("deforming_plate", data, train=0, valid=0, test=3, nodes=400, frames=41, keep=(24,), seed=123)
     run, errors = ast_sim.example_run("plates"), []
@@ -18,8 +21,16 @@ def test_it_predicts_a_new_plate_by_one_call_and_better_with_newton_steps(tmp_pa
             moved = np.sqrt(np.mean((truth.position[1] - truth.position[0])[free] ** 2))
             answers = [run.predict(truth, frames=[1], effort=ast_sim.Effort(0, steps)) for steps in (0, 10)]
             errors.append([np.sqrt(np.mean((a.position[0] - truth.position[1])[free] ** 2)) / moved for a in answers])
+            assert replace(answers[1], position=truth.position[1:]).check().residual.value < 100
+            steps = answers[1].check()
+            assert answers[0].check().residual.value > 5 * steps.residual.value and steps.imbalance.value < 0.02
+            assert np.linalg.norm(answers[1].reaction()) == pytest.approx(truth.attributes["reaction"][1], rel=0.02)
     network, with_newton = np.mean(errors, axis=0)
     assert network < 0.08 and with_newton < 0.03
+    told = ["predict", str(tmp_path / "run.ast"), str(data), "--index", "2", "--out", str(tmp_path / "a.h5"), "--check"]
+    run.save(tmp_path / "run.ast")
+    assert main(told) == 0
+    assert "balance of reactions" in capsys.readouterr().out
 
 
 def test_it_says_where_it_comes_from_and_an_unknown_name_is_one_line():

@@ -102,4 +102,4 @@ def test_constants_that_are_not_allowed_have_no_reaction(tmp_path):
     with pytest.raises(ConfigError, match=r"no reaction: Young's modulus must be positive and Poisson's ratio in \["):
         answer.reaction()
     with pytest.raises(SimulationError):
-        NeoHookean.of_scene(answer.scene, answer.material)
+        answer.law.of_elements(answer.scene)

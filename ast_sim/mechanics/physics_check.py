@@ -1,0 +1,284 @@
+"""Is an answer physics? What can be said of positions alone, without a truth.
+
+At equilibrium the elastic forces f on the free nodes are those of contact, C^T l with l >= 0, where a row of C is the
+direction of the force of a near pair (`linearised_contact`). On positions that are nearly right the l >= 0 are taken
+that leave least, min |f - C^T l|; what is left is the residual. With friction a pair of a node and a face has four
+directions, the corners of a pyramid inside Coulomb's cone. Where nothing overlaps, pairs of edges push, too (ipctk).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+from scipy.optimize import nnls
+
+from ast_sim.material import FRICTION, Material
+from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings, load_ipctk
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean
+from ast_sim.mechanics.elements.second_order import elastic_body
+from ast_sim.mechanics.linearised_contact import CLEARANCE, NewtonSteps
+from ast_sim.mechanics.solver import SolverSettings
+from ast_sim.plausibility.overlaps import nodes_inside
+from ast_sim.plausibility.topology import signed_volumes
+from ast_sim.scene import Scene
+from ast_sim.support.errors import ConfigError, MissingExtra, SimulationError
+
+SLIGHT_STRAIN = 1e-3  # forces below that of this strain are hardly any: the balance is relative to it at least
+
+
+@dataclass(frozen=True)
+class Law:
+    """The law of scenes: the material of their elements, and their contact.
+
+    Attributes:
+        material: names what the numbers of a scene's material are, and has those that all scenes share.
+        contact_range: the distance in the scene's unit of length below which surfaces repel each other.
+    """
+
+    material: Material
+    contact_range: float
+
+    def of_elements(self, scene: Scene) -> NeoHookean:
+        """The law of each element.
+
+        Raises:
+            ConfigError: the law of the material is not known.
+            SimulationError: the constants of an element are not allowed.
+        """
+        return NeoHookean.of_scene(scene, self.material)
+
+    def friction(self, scene: Scene) -> float:
+        """Coulomb's coefficient, the largest of the scene."""
+        return float(np.max(self.material.numbers(FRICTION, scene.material)))
+
+    def newton_steps(self, scene: Scene) -> NewtonSteps:
+        """The Newton steps of a scene under this law.
+
+        Raises:
+            ConfigError: the law of the material is not known.
+            SimulationError: the constants are not allowed, or an element has no volume.
+        """
+        friction = self.friction(scene)
+        return NewtonSteps(scene, self.of_elements(scene), CLEARANCE * self.contact_range, friction)
+
+
+@dataclass(frozen=True)
+class CheckRow:
+    """One property of an answer: its worst value over the frames, the number of that frame, and a sentence."""
+
+    what: str
+    value: float | None
+    frame: int | None
+    sentence: str
+
+
+@dataclass(frozen=True)
+class PhysicsCheck:
+    """What `Answer.check` found. A value is the worst over the frames, or None where it is not known; the sentence says
+    why.
+
+    Attributes:
+        turned_over: the number of deforming elements that are turned over.
+        depth: of the deepest surface node inside another body, in the unit of length.
+        volume: of all that overlaps, to first order: the depth of each node inside another body times its share of
+            the surface that faces the other one; in the cube of the unit of length.
+        residual: the largest component of the forces on free nodes that contact does not explain, over the largest
+            one that the solver's stop test allows. Frames of the solver have some 10 here, not 1, since stored
+            positions are in single precision.
+        imbalance: the sum of these forces over the magnitudes of the forces that hold and touch the bodies: how far the
+            reactions are from balance.
+    """
+
+    turned_over: CheckRow
+    depth: CheckRow
+    volume: CheckRow
+    residual: CheckRow
+    imbalance: CheckRow
+
+    @property
+    def rows(self) -> tuple[CheckRow, ...]:
+        """All of them, in the order of the table."""
+        return self.turned_over, self.depth, self.volume, self.residual, self.imbalance
+
+    def __str__(self) -> str:
+        rows = [("check", "worst", "frame", "in words")]
+        for one in self.rows:
+            value = "-" if one.value is None else f"{one.value:.3g}"
+            rows.append((one.what, value, "-" if one.frame is None else str(one.frame), one.sentence))
+        widths = [max(len(row[column]) for row in rows) for column in range(3)]
+        return "\n".join(
+            f"{what:{widths[0]}}  {value:>{widths[1]}}  {frame:>{widths[2]}}  {text}"
+            for what, value, frame, text in rows
+        )
+
+
+def check_physics(
+    scene: Scene, positions: np.ndarray, frames: Sequence[int], law: Law | None, unit: str
+) -> PhysicsCheck:
+    """Check frames [S, N, 3] with these numbers; `law` None: it is not known. `unit` is that of lengths."""
+    turned = [_turned_over(scene, position) for position in positions]
+    overlaps = [_overlap(scene, position.astype(np.float64)) for position in positions]
+    why = "the law of the material is not known: no forces are"
+    forces: list[tuple[float, float]] = []
+    if law is not None and len(positions):
+        try:
+            balance = _Balance(scene, law)
+            forces = [balance.of(position.astype(np.float64)) for position in positions]
+        except (ConfigError, SimulationError, MissingExtra) as error:
+            why = f"no forces are known: {error}"
+
+    def worst(what: str, values: list[float], text: str, zero: str) -> CheckRow:
+        if not values:
+            return CheckRow(what, None, None, "no frame was predicted" if not len(positions) else why)
+        row = int(np.argmax(values))
+        return CheckRow(what, values[row], frames[row], text.format(values[row]) if values[row] else zero)
+
+    depths, volumes = zip(*overlaps, strict=True) if overlaps else ((), ())
+    residuals, imbalances = zip(*forces, strict=True) if forces else ((), ())
+    return PhysicsCheck(
+        worst("elements turned over", turned, "{:.0f} elements are inside out: their stress means nothing", "none is"),
+        worst("deepest penetration", list(depths), f"a node lies {{:.3g}} {unit} inside another body", "none is"),
+        worst("penetrated volume", list(volumes), f"bodies share about {{:.3g}} {unit}^3", "bodies share none"),
+        worst("force residual", list(residuals), "the worst force is {:.3g} times what the solver accepts", "no force"),
+        worst("balance of reactions", list(imbalances), "the reactions miss balance by {:.2g} of their size", "exact"),
+    )
+
+
+def _turned_over(scene: Scene, position: np.ndarray) -> float:
+    """How many deforming tetrahedra have another sign than at rest."""
+    elements = scene.elements[scene.deforming_nodes[scene.elements].any(axis=1)]
+    if elements.shape[1] == 3:
+        return 0.0
+    sign = np.sign(signed_volumes(scene.rest_position, elements))
+    return float((sign * signed_volumes(position, elements) <= 0).sum())
+
+
+def _overlap(scene: Scene, position: np.ndarray) -> tuple[float, float]:
+    """The depth of the deepest node inside another body, and the volume that all pairs of bodies share.
+
+    Both bodies of a pair say how much they share; the larger volume counts.
+    """
+    if scene.elements.shape[1] == 3:
+        return 0.0, 0.0
+    surface = scene.surface()
+    owner = scene.body[surface[:, 0]]
+    faces = {body: surface[owner == body] for body in np.unique(owner).tolist()}
+    movable = {body for body in faces if scene.deforming_nodes[scene.body == body].any()}
+    areas = _vector_areas(position, surface)
+    deepest = total = 0.0
+    for one, other in combinations(faces, 2):
+        if not movable & {one, other}:
+            continue
+        volumes = [0.0]
+        for mine, theirs in ((one, other), (other, one)):
+            nodes, depths, nearest = nodes_inside(position, faces[mine], faces[theirs])
+            if len(nodes):
+                deepest = max(deepest, float(depths.max()))
+                normal = _normals(position, faces[theirs][nearest])
+                normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
+                volumes.append(float(depths @ np.maximum(0, -np.einsum("ni,ni->n", areas[nodes], normal))))
+        total += max(volumes)
+    return deepest, total
+
+
+def _normals(position: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """[F, 3]: the outward normals of triangles [F, 3], as long as their areas."""
+    a, b, c = (position[triangles[:, corner]] for corner in range(3))
+    return np.cross(b - a, c - a) / 2
+
+
+def _vector_areas(position: np.ndarray, surface: np.ndarray) -> np.ndarray:
+    """[N, 3]: a third of the normals of the triangles around each node."""
+    areas = np.zeros_like(position)
+    np.add.at(areas, surface.ravel(), np.repeat(_normals(position, surface) / 3, 3, axis=0))
+    return areas
+
+
+class _Balance:
+    """The balance of forces of a scene; made once, because what depends on its rest does not change."""
+
+    def __init__(self, scene: Scene, law: Law) -> None:
+        self._range = law.contact_range
+        self._friction = law.friction(scene)
+        self._pairs = law.newton_steps(scene)
+        rest = scene.rest_position.astype(np.float64)
+        deforming = np.flatnonzero(scene.deforming_nodes[scene.elements].any(axis=1))
+        elements = scene.elements[deforming].astype(np.int64)
+        self._elasticity = elastic_body(rest, elements, law.of_elements(scene).of(deforming))
+        settings = ContactSettings(law.contact_range, 1.0)
+        surface = scene.surface()
+        self._contact = Contact(rest, surface, scene.body, settings, ~scene.deforming_nodes)
+        local = np.unique(surface, return_inverse=True)[1].reshape(-1, 3).astype(np.int32)
+        self._edges_and_faces = load_ipctk().edges(local), local
+        held = scene.prescribed | ~np.isin(np.arange(scene.num_nodes), elements)
+        self._free = np.flatnonzero(np.repeat(~held, 3))
+        self._held = scene.prescribed
+
+    def of(self, position: np.ndarray) -> tuple[float, float]:
+        """The residual and the imbalance of positions [N, 3]; infinite where an element is turned over."""
+        deformation = self._elasticity.evaluate(position)
+        if deformation.J.min() <= 0:
+            return float("inf"), float("inf")
+        forces, element_force = self._elasticity.gradient(deformation)
+        left, pressed = self._left(forces.ravel()[self._free], self._cone(position))
+        unit = self._elasticity.unit_force
+        allowed = max(SolverSettings().force_tolerance * element_force, 1e-8 * unit)
+        total = np.zeros(forces.size)
+        total[self._free] = left
+        magnitude = float(np.linalg.norm(forces[self._held], axis=1).sum()) + pressed
+        unbalanced = float(np.linalg.norm(total.reshape(-1, 3).sum(axis=0)))
+        return float(np.abs(left).max(initial=0)) / allowed, unbalanced / max(magnitude, SLIGHT_STRAIN * unit)
+
+    def _cone(self, position: np.ndarray) -> scipy.sparse.csr_array:
+        """[P, F] the directions in which contact may push the free dofs; see the head of this file."""
+        pairs = self._pairs.near_pairs(position)
+        touching = np.flatnonzero(pairs.gap <= self._range)
+        normal = pairs.directions[touching]
+        count = len(pairs.gap)
+        parts = [normal]
+        if self._friction:
+            tangents = [self._friction * pairs.directions[touching + axis * count] for axis in (1, 2)]
+            parts = [normal + sign * tangent for tangent in tangents for sign in (1, -1)]
+        if not (pairs.gap < 0).any():  # a distance knows no sides: it says nothing of bodies that overlap
+            parts.append(self._near_directions(position)[:, self._free])
+        return scipy.sparse.csr_array(scipy.sparse.vstack(parts))
+
+    def _near_directions(self, position: np.ndarray) -> scipy.sparse.csr_array:
+        """[P, 3 N]: of each pair of nodes, edges or faces within the range of contact the derivative of its distance by
+        the positions, with a length of 1."""
+        contact = self._contact
+        contact.restart()
+        contact.collision_free_fraction(position, position)
+        state = contact.at(position)
+        rows = [np.zeros(0, int)]
+        columns = [np.zeros(0, int)]
+        values = [np.zeros(0)]
+        for row in range(len(state.collisions)):
+            # No name keeps the pair: ipctk's pairs must not outlive their collection.
+            nodes, gradient = self._of_pair(state.collisions[row], state.vertices)
+            columns.append((3 * nodes[:, None] + np.arange(3)).ravel())
+            rows.append(np.full(gradient.size, row))
+            values.append(gradient / np.linalg.norm(gradient))
+        entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+        return scipy.sparse.csr_array(entries, shape=(len(state.collisions), 3 * contact.num_nodes))
+
+    def _of_pair(self, pair: Any, vertices: Any) -> tuple[np.ndarray, np.ndarray]:
+        """The nodes [n] of a pair of ipctk, and the derivative [3 n] of its squared distance by their positions."""
+        nodes = self._contact.nodes[[vertex for vertex in pair.vertex_ids(*self._edges_and_faces) if vertex >= 0]]
+        return nodes, np.array(pair.compute_distance_gradient(pair.dof(vertices, *self._edges_and_faces)))
+
+    def _left(self, forces: np.ndarray, cone: scipy.sparse.csr_array) -> tuple[np.ndarray, float]:
+        """The forces [F] that contact does not explain, and the sum of those of contact; see the head of this file."""
+        touched = np.unique(cone.nonzero()[1])
+        if not len(touched):
+            return forces, 0.0
+        try:
+            pressed = nnls(cone[:, touched].toarray().T, forces[touched], maxiter=30 * cone.shape[0])[0]
+        except RuntimeError as error:
+            raise SimulationError(f"the forces of contact were not found: {error}") from error
+        return forces - cone.T @ pressed, float(pressed.sum())
