@@ -25,7 +25,7 @@ def test_plates(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(EXAMPLES))
     import plates
 
-    errors = plates.main(tmp_path, scenes=6, nodes=200, steps=300)
+    errors = plates.main(tmp_path, scenes=6, nodes=200, steps=150)
     assert 0 < errors["model"] < 0.9 * errors["hold_still"]
     assert 1e-4 < errors["hold_still"] < 0.1
 

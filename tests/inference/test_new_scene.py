@@ -39,7 +39,7 @@ def run(tmp_path_factory) -> Run:
 
     def make(folder: Path) -> None:
         generate(FAMILY, folder / "data.h5", train=16, valid=2, test=3, nodes=NODES, frames=FRAMES, workers=1)
-        train(folder / "data.h5", folder / "run", steps=250, mirror=("x", "y"))
+        train(folder / "data.h5", folder / "run", steps=250, mirror=("x", "y"), batch_size=4, peak_rate=1e-3)
 
     return Run(made_once(tmp_path_factory, "new_scene", make) / "run")
 
@@ -280,11 +280,18 @@ def test_newton_steps_that_do_not_converge_warn(run):
     assert answer.converged is False
 
 
-def test_seconds_count_what_a_user_waits_for(run):
+def test_seconds_count_what_a_user_waits_for(run, monkeypatch):
+    """What is prepared for a mesh, too: here it takes half a second."""
+    make_graph = run.model.graph
+
+    def slow_graph(*arguments, **options):
+        time.sleep(0.5)
+        return make_graph(*arguments, **options)
+
+    monkeypatch.setattr(run.model, "graph", slow_graph)
     began = time.perf_counter()
     answer = run.predict(scene_of(), PRESS, num_frames=3)
-    waited = time.perf_counter() - began
-    assert sum(answer.step_seconds) < answer.seconds <= waited and answer.seconds > 0.9 * waited
+    assert sum(answer.step_seconds) + 0.5 <= answer.seconds <= time.perf_counter() - began
 
 
 @pytest.mark.parametrize(
