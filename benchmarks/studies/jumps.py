@@ -178,6 +178,7 @@ free nodes, divided by the root mean square of their displacement; tables have t
 standard error. "Training scenes" has the error on scenes of the training. "Minutes" are the steps times the median time
 of a step, on one thread; other work on the machine made some rows slower, so rows with equal steps differ. An "answer"
 is the median time from the question to positions and stress, for a scene alone, with all that is prepared for its mesh.
+Rows without a solver were measured beside other work: their errors count, their times say little.
 Validation has chosen how many corrections and Newton steps follow the first call of the model in the first table;
 `predict(effort=)` chooses them for an answer. The tables below the first are the whole dial: they
 were timed again, so times differ a little from the first table. The stress error in them is a share of the standard
