@@ -94,6 +94,7 @@ def build_parser() -> argparse.ArgumentParser:
     add(_add_predict, commands.predict)
     add(_add_sweep, commands.sweep)
     add(_add_evaluate, commands.evaluate)
+    add(_add_calibrate, commands.calibrate)
     add(_add_report, commands.report)
     return parser
 
@@ -300,6 +301,13 @@ def _add_evaluate(evaluate: _Parser) -> None:
     about = "the specification or the parts of your own of which DATA was made; the solver needs them"
     _add_each(evaluate, {"--made-from PATH": about}, type=path)
     _add_out(evaluate, "FILE.json", "also write all figures to this file", required=False)
+
+
+def _add_calibrate(calibrate: _Parser) -> None:
+    calibrate.add_argument("run_folder", type=path, metavar="RUN", help="run folder")
+    calibrate.add_argument("data", type=path, metavar="DATA", help="dataset with 19 or more scenes new to RUN")
+    about = "split (default: calibration)"
+    calibrate.add_argument("--split", choices=commands.SPLITS, default="calibration", help=about)
 
 
 def _add_report(report: _Parser) -> None:

@@ -187,7 +187,7 @@ def predict(args: argparse.Namespace) -> None:
     _check_output(args, args.out, [args.scene], "a prediction", *SUFFIXES)
     moves = dict(map(parse_move, args.move))
     run = _open_run(args.run_folder)
-    wanted = {"frames": args.frames, "effort": _effort(run, args), "throw": False}
+    wanted = {"frames": args.frames, "effort": run.effort.asked(args.corrections, args.newton_steps), "throw": False}
     if args.scene.suffix == ".toml":
         _predict_spec(run, args, wanted)
         return
@@ -237,7 +237,13 @@ def sweep(args: argparse.Namespace) -> None:
         _check_output(args, out, [args.spec, *filter(None, [args.table])], what, suffix)
     run = _open_run(args.run_folder)
     values = parse_settings(args.set)
-    swept = run.sweep(args.spec, values, table=args.table, nodes=args.nodes, effort=_effort(run, args))
+    swept = run.sweep(
+        args.spec,
+        values,
+        table=args.table,
+        nodes=args.nodes,
+        effort=run.effort.asked(args.corrections, args.newton_steps),
+    )
     swept.save(args.out)
     print(f"{args.out}: {len(swept.rows)} rows, {1000 * swept.seconds / len(swept.rows):.3g} ms each")
     if swept.unsettled:
@@ -254,22 +260,9 @@ def _save(answer: Any, args: argparse.Namespace, truth: Any) -> None:
         raise RolloutError(f"{answer.failure}, in {args.out}")
     steps = len(answer.step_seconds)
     print(f"{args.out}: {steps} frame{'' if steps == 1 else 's'} predicted in {1000 * answer.seconds:.3g} ms")
-    if answer.expected_error is not None:
-        percent = f"{100 * answer.expected_error:.2g} % of the displacement"
-        print(f"expected error: {percent}, as in the validation scenes at their deepest frame")
+    print("".join(f"{line}\n" for line in answer.how_far), end="")
     if args.check:
         print(printable(str(answer.check())))
-
-
-def _effort(run: Any, args: argparse.Namespace) -> Any:
-    """What --corrections and --newton-steps ask for; None: the run's default. Corrections alone: no Newton step."""
-    from ast_sim.inference.effort import Effort
-
-    if args.corrections is None and args.newton_steps is None:
-        return None
-    if args.corrections is None:
-        return Effort(run.effort.corrections, args.newton_steps)
-    return Effort(args.corrections, args.newton_steps or 0)
 
 
 def _truth(run: Any, args: argparse.Namespace) -> Any:
@@ -319,6 +312,13 @@ def evaluate(args: argparse.Namespace) -> None:
     if args.out is not None:
         evaluation.save(args.out)
         print(f"all figures: {args.out}")
+
+
+def calibrate(args: argparse.Namespace) -> None:
+    """Measure on new scenes how far answers are from the truth, so that each has a band."""
+    from ast_sim.inference.calibration import calibrate as measure
+
+    print(measure(_open_run(args.run_folder), args.data, args.split).text)
 
 
 def report(args: argparse.Namespace) -> None:

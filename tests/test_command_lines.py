@@ -32,7 +32,7 @@ from ast_sim.view import export
 
 LINES = int(os.environ.get("AST_SIM_COMMAND_LINES", "250"))
 
-COMMANDS = {"demo", "generate", "convert", "info", "train", "predict", "sweep", "evaluate", "report"}
+COMMANDS = {"calibrate", "demo", "generate", "convert", "info", "train", "predict", "sweep", "evaluate", "report"}
 
 # Texts without a slash: an output must not leave the folder of the test.
 TEXT = st.text(st.characters(exclude_characters="\0/", exclude_categories=["Cs"]), max_size=6).filter(

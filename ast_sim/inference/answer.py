@@ -76,6 +76,8 @@ class Answer:
             ascend. Empty without Newton steps.
         driven: the prescribed nodes that move farthest together in the whole motion.
         law: the law of the material and of contact, as the run knows it.
+        band: [S], with a probability of 95 % all free nodes of all frames lie within this distance of the truth, in the
+            unit of length (`calibration`). None: the run was not calibrated, or a warning has said why.
     """
 
     name: str
@@ -95,6 +97,20 @@ class Answer:
     last_steps: tuple[float, ...] = ()
     driven: Driven | None = None
     law: Law | None = None
+    band: np.ndarray | None = None
+
+    @property
+    def how_far(self) -> list[str]:
+        """What is known of the distance to the truth, as sentences."""
+        told = []
+        if self.expected_error is not None:
+            percent = f"{100 * self.expected_error:.2g} % of the displacement"
+            told.append(f"expected error: {percent}, as in the validation scenes at their deepest frame")
+        if self.band is not None:
+            unit = "" if self.info is None else f" {self.info.length_unit}"
+            widest = f"{self.band.max():.3g}{unit}, in frame {self.frames[int(self.band.argmax())]}"
+            told.append(f"band: with 95 % all free nodes lie within {widest} the most")
+        return told
 
     @property
     def computed(self) -> np.ndarray:
@@ -113,6 +129,7 @@ class Answer:
             "largest stress": "none" if self.stress is None else f"{self.stress.max(initial=0.0):.4g} Pa",
             "expected error": "not known" if self.expected_error is None else f"{100 * self.expected_error:.2g} %",
             "converged": converged,
+            **({} if self.band is None else {"band (95 %)": f"{self.band.max():.3g}{unit}"}),
             "seconds": f"{self.seconds:.3g}",
             **({} if self.failure is None else {"failure": self.failure}),
         }

@@ -53,6 +53,12 @@ class Effort:
         told = [f"{n} {what}{'' if n == 1 else 's'}" for n, what in parts if n or what == "correction"]
         return ", up to ".join(told)
 
+    def asked(self, corrections: int | None, newton_steps: int | None) -> Effort | None:
+        """What is asked instead of this default: corrections alone mean no Newton step; None: nothing is asked."""
+        if corrections is None and newton_steps is None:
+            return None
+        return Effort(self.corrections if corrections is None else corrections, newton_steps or 0)
+
     def check(self, config: ModelConfig) -> None:
         """Raise ConfigError if the model cannot make this effort."""
         for key, count in asdict(self).items():

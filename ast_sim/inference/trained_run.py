@@ -17,6 +17,7 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.importers.scene_mesh import SceneMesh
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.assembly_questions import ask
+from ast_sim.inference.calibration import Calibration
 from ast_sim.inference.effort import Effort, EffortErrors
 from ast_sim.inference.evaluation.evaluate import evaluate
 from ast_sim.inference.evaluation.evaluated_run import Evaluation
@@ -47,6 +48,7 @@ class Run:
         folder: the files of the run.
         effort: what follows the first call by default, as validation has decided; nothing for a model that predicts
             step by step.
+        calibration: how far its answers are from the truth, as `ast_sim.calibrate` has measured; or None.
         scope: the ranges of sizes, materials and motions in the training scenes.
 
     Raises:
@@ -62,6 +64,7 @@ class Run:
         answers = self.folder.chosen.answers
         unset = {"corrections": (self.settings.train.calls or 1) - 1}
         self.effort = Effort(**answers.get("effort", unset))
+        self.calibration = Calibration.from_json(answers["calibration"]) if "calibration" in answers else None
         self._errors = [EffortErrors.from_json(one) for one in answers.get("valid_by_effort", [])]
 
     def _facts(self) -> dict[str, str]:
@@ -263,7 +266,8 @@ class Run:
             if expected is not None:
                 origin["expected_error"] = expected
             shared = {"info": self.info, "expected_error": expected, "seconds": seconds, "notes": question.notes}
-            answer = dataclasses.replace(answer, source=origin, **shared)
+            band = None if self.calibration is None else self.calibration.band(answer, effort, question.notes)
+            answer = dataclasses.replace(answer, source=origin, band=band, **shared)
             told.append(answer)
             if answer.failure is not None and throw:
                 raise RolloutError(answer.failure, answer)

@@ -30,8 +30,8 @@ class Chosen(NamedTuple):
     Attributes:
         path: its folder.
         step: its step.
-        answers: what validation found out about answers with it: `effort`, the default effort, and `valid_by_effort`.
-            Empty where no validation was made.
+        answers: what is known of answers with it: by validation `effort`, the default effort, and `valid_by_effort`;
+            by calibration `calibration`. Empty where none was made.
     """
 
     path: Path
@@ -104,6 +104,13 @@ class RunFolder:
         """Mark the checkpoint of a validation, which is a record of `metrics.jsonl`, as the best one."""
         answers = {key: validation[key] for key in _ANSWERS if key in validation}
         checkpoint.mark_best(self.path, validation["step"], validation["valid_rmse"], answers)
+
+    def keep_calibration(self, calibration: Mapping[str, Any]) -> None:
+        """Keep what was measured of the answers of the best checkpoint beside it, until a better one is marked."""
+        best = checkpoint.read_best(self.path)
+        if best is None:
+            raise CheckpointError(f"{self.path} has no best checkpoint yet: train it until it is validated")
+        checkpoint.mark_best(self.path, best.step, best.error, {**best.answers, "calibration": dict(calibration)})
 
     def start(self) -> dict[str, Any]:
         """What a run that starts from this one records: `run`, `step` and `sha256` of the weights."""

@@ -1,0 +1,97 @@
+"""Bands: the quantile of scores, what a calibrated run says, and when it says nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import toy
+from scipy.stats import betabinom
+
+import ast_sim
+from ast_sim.inference.calibration import Calibration, quantile, scales, score
+from ast_sim.inference.effort import Effort
+from ast_sim.support.errors import ConfigError
+
+
+def test_the_quantile_is_the_score_of_the_rank():
+    assert quantile(list(range(1, 20))) == 19  # ceil(20 * 0.95) = 19
+    assert quantile(list(range(100, 0, -1))) == 96  # ceil(101 * 0.95) = 96
+    assert quantile([1.0] * 19 + [np.inf]) == np.inf
+    with pytest.raises(ConfigError, match="at least 19 calibration scenes, and there are 18"):
+        quantile([1.0] * 18)
+
+
+def test_fresh_scores_lie_within_the_quantile_as_often_as_is_promised():
+    """The number of m fresh scores at most q is beta-binomial: by the rank 96 of 100, with 96 and 5."""
+    rng = np.random.default_rng(5)
+    held = np.array([(rng.lognormal(size=300) <= quantile(rng.lognormal(size=100).tolist())).sum() for _ in range(400)])
+    expected = betabinom(300, 96, 5)
+    assert held.mean() == pytest.approx(expected.mean(), abs=4 * expected.std() / 20)
+    assert held.std() == pytest.approx(expected.std(), rel=0.2)
+
+
+def test_a_score_is_the_largest_error_over_the_scale():
+    scene = toy.plate(0).scene
+    free = np.flatnonzero(~scene.prescribed)
+    position = np.stack([scene.rest_position, scene.rest_position + np.float32([0.01, 0, 0])])
+    truth = position.copy()
+    truth[1, free[3]] += np.float32([0, 0.003, 0.004])
+    assert scales(scene, position)[1] == pytest.approx(0.01, rel=1e-4)
+    assert 0 < scales(scene, position)[0] < 1e-5
+    assert score(scene, position, truth) == pytest.approx(0.5, rel=1e-3)
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    """A run that has learned for a moment, calibrated on the test plates that lie within the training; its dataset."""
+    folder = tmp_path_factory.mktemp("calibrated")
+    data = toy.write(folder / "toy.h5", (40, 1, 24))
+    run = ast_sim.train(
+        data, folder / "run", steps=2, batch_size=2, model="mgn", model_settings={"hidden": 8, "blocks": 1}
+    )
+    result = ast_sim.calibrate(run, data, "test")
+    return run, data, result
+
+
+def test_the_calibration_is_the_score_of_the_rank(calibrated):
+    run, data, result = calibrated
+    with ast_sim.Dataset(data) as dataset:
+        asked = [dataset["test"][index] for index in range(24)]
+    pairs = [(answer, truth) for truth in asked if not (answer := run.predict(truth)).notes]
+    answers, truths = zip(*pairs, strict=True)
+    scores = [score(a.scene, a.position, t.position) for a, t in zip(answers, truths, strict=True)]
+    assert 19 <= len(scores) == result.scenes <= 24 and result.quantile == max(scores)  # of up to 38 the last
+    assert answers[0].band == pytest.approx(result.quantile * scales(truths[0].scene, answers[0].position))
+    assert f"band: with 95 % all free nodes lie within {answers[0].band.max():.3g} m" in answers[0].how_far[-1]
+
+
+def test_a_run_keeps_its_calibration_and_so_does_its_file(calibrated, tmp_path):
+    run, _, result = calibrated
+    assert ast_sim.Run(run.path).calibration == result
+    ast_sim.Run(run.path).save(tmp_path / "toy.ast")
+    assert ast_sim.Run(tmp_path / "toy.ast").calibration == result
+
+
+def test_no_band_where_nothing_is_known(calibrated):
+    run, data, result = calibrated
+    with ast_sim.Dataset(data) as dataset:
+        asked = [dataset["test"][index] for index in range(24)]
+    answer = next(answer for truth in asked if not (answer := run.predict(truth)).notes)
+    for other, notes, words in (
+        (replace(result, effort=Effort(3)), (), "no band: the run was calibrated with 3 corrections"),
+        (result, ("it is large",), "no band: the scene lies outside the ranges of the training"),
+        (replace(result, spacing=(1.0, 2.0)), (), "no band: the mesh edges are .* in the calibration scenes 1 to 2"),
+    ):
+        with pytest.warns(UserWarning, match=words):
+            assert other.band(answer, run.effort, notes) is None
+
+
+def test_what_cannot_be_calibrated_is_refused(calibrated):
+    run, data, _ = calibrated
+    with pytest.raises(ConfigError, match="have trained or chosen the run"):
+        ast_sim.calibrate(run, data, "train")
+    with pytest.raises(ConfigError, match="there are 0: make more with --calibration N"):
+        ast_sim.calibrate(run, data)
+    kept = Calibration.from_json(calibrated[2].to_json())
+    run.calibration = kept
+    assert kept == calibrated[2]
