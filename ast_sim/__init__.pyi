@@ -24,6 +24,7 @@ from .simulate.shapes.simple_bodies import box as box
 from .simulate.shapes.simple_bodies import cylinder as cylinder
 from .simulate.shapes.simple_bodies import plate as plate
 from .support.errors import AstSimError as AstSimError
+from .training.callbacks import TensorBoard as TensorBoard
 from .training.start import new_model as new_model
 from .training.start import train as train
 

@@ -14,6 +14,7 @@ from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.progress import Clock, Progress
 from ast_sim.support.stop_signals import StopSignals
+from ast_sim.training.callbacks import Listener
 from ast_sim.training.data_lengths import DataScales
 from ast_sim.training.rates import learning_rate
 
@@ -74,8 +75,9 @@ class StepLog:
         sums: sums of the values of all steps since the last line; a checkpoint keeps them.
     """
 
-    def __init__(self, metrics: Metrics, config: RunConfig, dataset: Dataset, clock: Clock) -> None:
+    def __init__(self, metrics: Metrics, config: RunConfig, dataset: Dataset, clock: Clock, listener: Listener) -> None:
         self.metrics, self.options, self.clock = metrics, config.train, clock
+        self.listener = listener
         self.validates = dataset.count("valid") > 0
         self.sums: dict[str, float] = {}
 
@@ -92,7 +94,9 @@ class StepLog:
         seconds = self.clock.seconds_per_step
         if writes:
             rate = learning_rate(self.options, step - 1)
-            self.metrics.append({"step": step, **means, "rate": rate, "seconds": seconds})
+            record = {**means, "rate": rate, "seconds": seconds}
+            self.metrics.append({"step": step, **record})
+            self.listener.hear(step, record)
         stress = f", stress {means['stress']:.4f}" if "stress" in means else ""
         to_go = self.clock.to_go(self.options.steps - step, self._validations_to_go(step))
         progress.show(

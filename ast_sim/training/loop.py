@@ -29,6 +29,7 @@ from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.support.errors import DatasetError, TrainingError
 from ast_sim.support.progress import Clock, duration
 from ast_sim.support.stop_signals import Interrupted, StopSignals
+from ast_sim.training.callbacks import Callback, Listener
 from ast_sim.training.console import Console, StepLog, introduce
 from ast_sim.training.data_lengths import DataScales, largest_error
 from ast_sim.training.optimizer import Optimizer
@@ -80,6 +81,7 @@ class Training:
         scales: DataScales,
         signals: StopSignals,
         processes: Processes | None = None,
+        callback: Callback | None = None,
     ) -> None:
         self.run, self.config, self.dataset, self.scales, self.signals = run, config, dataset, scales, signals
         self.options, self.processes = config.train, processes or Processes()
@@ -91,7 +93,8 @@ class Training:
         self.ahead = Ahead(self.pool or self.sampler, partial(with_proximity, config.model))
         self.optimizer = Optimizer(self.model, self.options.optimizer)
         self.clock = Clock()
-        self.log = StepLog(run.metrics, config, dataset, self.clock)
+        self.listener = Listener(callback)
+        self.log = StepLog(run.metrics, config, dataset, self.clock, self.listener)
         self.saver = Saver(run, dataset, self.model, self.optimizer, self.pool, self.processes)
         self.step = 0
         self.stopping = 0  # the number of a signal that some process has received; 0: no signal
@@ -144,6 +147,8 @@ class Training:
             validated = self.processes.of_leader(self.log.metrics.validation(self.step) is not None)
             if self.step and self._due(options.validate_every) and not validated:
                 self._validate()
+                self._heed_callback()
+                self._stop_if_asked()
             self.clock.restart()
             while self.step < options.steps:
                 self.advance()
@@ -152,6 +157,7 @@ class Training:
                     self.log.show(self.step, self.progress, self.processes.leads)
                 validates = self._due(options.validate_every)
                 self._heed_signals()
+                self._heed_callback()
                 if validates or self._due(options.checkpoint_every) or self.stopping:
                     self.ahead.wait()
                     self.saver.save(self.step, self.log.sums, options.keep)
@@ -159,6 +165,8 @@ class Training:
                 self.clock.step()
                 if validates:
                     self._validate()
+                    self._heed_callback()
+                    self._stop_if_asked()
 
     def _introduce(self) -> None:
         introduce(self.model, self.config, self.dataset, self.scales, self.sampler.num_pairs)
@@ -170,9 +178,15 @@ class Training:
         if self.processes.any(self.signals.received is not None):
             self.stopping = self.signals.received or signal.SIGTERM
 
+    def _heed_callback(self) -> None:
+        if self.processes.any(self.listener.error is not None):
+            self.stopping = signal.SIGTERM
+
     def _stop_if_asked(self) -> None:
         if self.stopping:
             self.progress.line(f"stopped after step {self.step:,}: go on with --resume")
+            if self.listener.error is not None:
+                raise self.listener.error
             raise Interrupted(self.stopping)
 
     def end_if_asked(self) -> None:
@@ -262,6 +276,7 @@ class Training:
         if outcome.error is not None and outcome.error < best:
             self.run.mark_best(record)
         self.log.metrics.append(record)
+        self.listener.hear(self.step, {**outcome.record, "valid_seconds": seconds})
         self.progress.line(f"validation after step {self.step:,}: {outcome.text} ({duration(seconds)})")
 
     def _compare_with_training_scenes(self, validated: list[Validated]) -> None:

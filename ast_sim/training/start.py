@@ -23,6 +23,7 @@ from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.support.errors import CheckpointError, ConfigError, DatasetError, TrainingError
 from ast_sim.support.stop_signals import StopSignals
 from ast_sim.support.toml_settings import NONE, NOTHING, assigned, change
+from ast_sim.training.callbacks import Callback
 from ast_sim.training.data_lengths import DataScales, measure, scope_of
 from ast_sim.training.defaults_from_data import resolve
 from ast_sim.training.loop import Training, fit_statistics, sampler_of
@@ -107,6 +108,7 @@ def train(
     from_run: str | os.PathLike[str] | None = None,
     model_settings: Mapping[str, Any] | None = None,
     resume: bool = False,
+    callback: Callback | None = None,
     **settings: Any,
 ) -> Run:
     """Train a model on a dataset; returns the run, ready to predict.
@@ -123,6 +125,8 @@ def train(
             chosen anew.
         model_settings: changes of the model's settings, such as {"hidden": 32}.
         resume: continue after the newest checkpoint, if there is one.
+        callback: called with (step, {name: float}) when the losses are logged and after validations, such as
+            `TensorBoard(folder)`. What it raises ends the training, after a checkpoint of the step.
         settings: changes of the training's settings (fields of `TrainConfig`), such as minutes=10, mirror=("x", "y").
 
     Raises:
@@ -134,7 +138,7 @@ def train(
     changes = _changes(model_settings, settings)
     path = _path_of(data)
     chosen = configure(path, preset, (), model, config=config, from_run=from_run, changes=changes)
-    start_training(Path(out), chosen, resume=resume, from_run=from_run)
+    start_training(Path(out), chosen, resume=resume, from_run=from_run, callback=callback)
     return Run(out)
 
 
@@ -189,6 +193,7 @@ def start_training(
     resume: bool = False,
     profile_steps: int = 0,
     from_run: str | os.PathLike[str] | None = None,
+    callback: Callback | None = None,
 ) -> None:
     """Train a model in the run folder `run`, or resume the training of the run in it.
 
@@ -197,6 +202,7 @@ def start_training(
         resume: continue after the newest checkpoint, if there is one.
         profile_steps: if above 0, print how the time of so many steps divides, instead of training.
         from_run: the run whose best checkpoint gives the first weights; `config` has its model.
+        callback: as for `train`; the leading process calls it.
 
     Raises:
         TrainingError: a loss or a gradient is not finite, the disk is full, or the folder already holds a run.
@@ -237,11 +243,9 @@ def start_training(
                 scope = scope_of(dataset, resolved.model.data)
                 spec = dataset.info.generator.get("spec")
                 write_config(folder.path, resolved, scope, dataset.fingerprint(), start, spec)
-            with begin(config=resolved) as training:
-                if profile_steps:
-                    training.profile(profile_steps)
-                else:
-                    training.go()
+            with begin(config=resolved, callback=callback) as training:
+                go = partial(training.profile, profile_steps) if profile_steps else training.go
+                go()
 
 
 def _with_steps(
