@@ -13,6 +13,7 @@ import numpy as np
 
 from ast_sim.dataset.layout import LENGTH_UNITS, DatasetInfo
 from ast_sim.dataset.writer import DatasetWriter
+from ast_sim.inference.calibration import LEVEL
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.mechanics.physics_check import Law, PhysicsCheck, check_physics
@@ -109,7 +110,7 @@ class Answer:
         if self.band is not None:
             unit = "" if self.info is None else f" {self.info.length_unit}"
             widest = f"{self.band.max():.3g}{unit}, in frame {self.frames[int(self.band.argmax())]}"
-            told.append(f"band: with 95 % all free nodes lie within {widest} the most")
+            told.append(f"band: with {100 * LEVEL:g} % all free nodes lie within {widest} at most")
         return told
 
     @property
@@ -129,7 +130,7 @@ class Answer:
             "largest stress": "none" if self.stress is None else f"{self.stress.max(initial=0.0):.4g} Pa",
             "expected error": "not known" if self.expected_error is None else f"{100 * self.expected_error:.2g} %",
             "converged": converged,
-            **({} if self.band is None else {"band (95 %)": f"{self.band.max():.3g}{unit}"}),
+            **({} if self.band is None else {f"band ({100 * LEVEL:g} %)": f"{self.band.max():.3g}{unit}"}),
             "seconds": f"{self.seconds:.3g}",
             **({} if self.failure is None else {"failure": self.failure}),
         }

@@ -151,7 +151,6 @@ def _measured(run: Run, dataset: Dataset, split: str) -> tuple[Calibration, list
     scores: list[float] = []
     spacings: list[float] = []
     left_out: list[str] = []
-    run.calibration = None
     with Progress(dataset.count(split), 0, "scenes") as bar, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what they tell is counted here
         for index in range(dataset.count(split)):
