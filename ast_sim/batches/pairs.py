@@ -14,9 +14,9 @@ from ast_sim.batches.batch_builder import Batch, State, Target
 from ast_sim.batches.carry import Carrier
 from ast_sim.batches.graph import Graph
 from ast_sim.batches.mirror_and_shift import Placement
-from ast_sim.dataset.reader import CACHE_BYTES, Dataset
+from ast_sim.dataset.reader import Dataset
 from ast_sim.scene import Scene
-from ast_sim.support.byte_cache import ByteCache
+from ast_sim.support.byte_cache import ByteCache, cache_bytes
 from ast_sim.support.errors import DatasetError
 
 # The order, the noise and the placements draw from separate sequences of random numbers.
@@ -134,7 +134,7 @@ class PairSampler:
         if self.num_pairs == 0:
             least = f"at least {2 + self.first_frame} frames"
             raise DatasetError(f"{dataset.path}: {split} has no trajectory of {least} to draw pairs from")
-        self._members: ByteCache[_Member] = ByteCache(CACHE_BYTES)
+        self._members: ByteCache[_Member] = ByteCache(cache_bytes())
         self._order = lru_cache(maxsize=2)(lambda epoch: self.random(_ORDER, epoch).permutation(self.num_pairs))
 
     @property

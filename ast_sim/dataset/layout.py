@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import h5py
@@ -94,6 +94,24 @@ class DatasetInfo:
             raise DatasetError(f"{name}: domain_center, domain_half_width, contact_radius and time_step must be finite")
         if self.domain_half_width <= 0 or self.contact_radius < 0 or self.time_step < 0:
             raise DatasetError(f"{name}: domain_half_width must be above 0, contact_radius and time_step at least 0")
+
+    def in_unit(self, unit: str, name: str) -> DatasetInfo:
+        """The same facts in another unit of length.
+
+        Raises:
+            DatasetError: there is no such unit; the text names `name`.
+        """
+        if unit not in LENGTH_UNITS:
+            raise DatasetError(f"{name}: length_unit {unit!r} is unknown: use one of {', '.join(LENGTH_UNITS)}")
+        scale = LENGTH_UNITS[self.length_unit] / LENGTH_UNITS[unit]
+        center_x, center_y, center_z = self.domain_center
+        return replace(
+            self,
+            length_unit=unit,
+            domain_center=(scale * center_x, scale * center_y, scale * center_z),
+            domain_half_width=scale * self.domain_half_width,
+            contact_radius=scale * self.contact_radius,
+        )
 
     def material(self, width: int) -> Material:
         """The material of scenes with this number of columns, by the names that the origin of the data gives them, or

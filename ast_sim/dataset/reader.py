@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterator
-from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Self
@@ -29,7 +28,6 @@ from ast_sim.dataset.layout import (
     NUMBERING,
     OPTIONAL,
     SPLITS,
-    DatasetInfo,
     require_kind,
 )
 from ast_sim.dataset.split import Split
@@ -37,18 +35,17 @@ from ast_sim.material import Material
 from ast_sim.named_field import NamedField
 from ast_sim.number_arrays import require_finite
 from ast_sim.scene import AttributeValue, Scene, Trajectory
-from ast_sim.support.byte_cache import ByteCache
+from ast_sim.support.byte_cache import ByteCache, cache_bytes
 from ast_sim.support.errors import DatasetError
 from ast_sim.support.notebook_table import html_table, one_line
-
-CACHE_BYTES = 1 << 30  # limit of the cache of scenes, and the largest split whose frames are kept in memory
 
 
 class Dataset:
     """Reads a dataset file; a context manager.
 
     Each trajectory is checked when it is first read: dtypes, shapes, index ranges. All numbers are finite, and arrays
-    are read-only. A split of up to 1 GiB stays in memory after its first reading.
+    are read-only. A split of at most an eighth of the machine's memory, and at most 4 GiB, stays in memory after
+    its first reading.
 
     Args:
         path: the file.
@@ -61,16 +58,17 @@ class Dataset:
 
     def __init__(self, path: str | os.PathLike[str], length_unit: str | None = None) -> None:
         self.path = Path(path)
-        self._scale = 1.0
         self._file = GuardedFile(self.path)
         try:
-            self.info = self._in_unit(self._file.info(), length_unit)
+            stored = self._file.info()
+            self.info = stored if length_unit is None else stored.in_unit(length_unit, str(self.path))
+            self._scale = LENGTH_UNITS[stored.length_unit] / LENGTH_UNITS[self.info.length_unit]
             with self._file.reading("the list of samples"):
                 self.splits = {split: self._count(split) for split in SPLITS}
         except BaseException:
             self.close()
             raise
-        self._scenes: ByteCache[Scene] = ByteCache(CACHE_BYTES)
+        self._scenes: ByteCache[Scene] = ByteCache(cache_bytes())
         self._frames: dict[tuple[str, int], tuple[np.ndarray, np.ndarray | None]] = {}
         self._open: dict[tuple[str, int], dict[str, h5py.Dataset]] = {}
         self._kept: dict[str, bool] = {}  # whether the split is small enough to be kept in memory
@@ -148,7 +146,7 @@ class Dataset:
         return self.splits[split]
 
     def scene(self, split: str, index: int) -> Scene:
-        """The scene of a trajectory, checked. The last used scenes stay in memory, up to 1 GiB."""
+        """The scene of a trajectory, checked. The last used scenes stay in memory."""
         return self._scenes.get((split, index), lambda: self._read_scene(split, index))
 
     def _read_scene(self, split: str, index: int) -> Scene:
@@ -207,7 +205,7 @@ class Dataset:
         digest = hashlib.sha256(repr((self.info, self.splits)).encode())
         for split, count in self.splits.items():
             for index in range(count):
-                digest.update(str(self._file.attributes(self._group(split, index))[HASH]).encode())
+                digest.update(self._file.stored_hash(self._unverified(split, index)).encode())
         return digest.hexdigest()
 
     def with_frames(self, split: str, least: int) -> list[int]:
@@ -274,18 +272,23 @@ class Dataset:
         return count
 
     def _group(self, split: str, index: int) -> h5py.Group:
-        count = self.count(split)
-        if not 0 <= index < count:
-            raise DatasetError(f"{self.path}: there is no sample {index} in {split}, which has {count}")
-        group = self._file.child(self._file.child(self._file.root, split, h5py.Group), f"{index:06d}", h5py.Group)
+        group = self._unverified(split, index)
         self._file.verify(group)
         return group
 
+    def _unverified(self, split: str, index: int) -> h5py.Group:
+        """The group of a trajectory before its hash was compared."""
+        count = self.count(split)
+        if not 0 <= index < count:
+            raise DatasetError(f"{self.path}: there is no sample {index} in {split}, which has {count}")
+        return self._file.child(self._file.child(self._file.root, split, h5py.Group), f"{index:06d}", h5py.Group)
+
     def _framed(self, split: str, index: int) -> dict[str, h5py.Dataset]:
-        """The open arrays of a trajectory that have frames; their shapes fit the mesh."""
+        """The open arrays of a trajectory that have frames; their shapes fit the mesh. A training asks for the number
+        of frames of all trajectories before it begins, so hashes are compared later, where numbers are read."""
         key = (split, index)
         if key not in self._open:
-            group = self._group(split, index)
+            group = self._unverified(split, index)
             count = len(self._file.array(group, "position"))
             if count == 0:
                 raise DatasetError(f"{self._name(split, index)}: position has no frames")
@@ -304,6 +307,7 @@ class Dataset:
 
     def _read_frames(self, split: str, index: int, start: int, stop: int) -> tuple[np.ndarray, np.ndarray | None]:
         rows = {"position": "node", "stress": self.info.stress_location}
+        self._group(split, index)  # compares its hash
         name, arrays = self._name(split, index), self._framed(split, index)
         frames = {key: self._finite(name, rows[key], array, start, stop) for key, array in arrays.items()}
         return self._scaled(frames["position"]), frames.get("stress")
@@ -316,21 +320,6 @@ class Dataset:
         scaled.flags.writeable = False
         return scaled
 
-    def _in_unit(self, info: DatasetInfo, unit: str | None) -> DatasetInfo:
-        """The facts in another unit of length."""
-        if unit is None or unit == info.length_unit:
-            return info
-        if unit not in LENGTH_UNITS:
-            raise DatasetError(f"{self.path}: length_unit {unit!r} is unknown: use one of {', '.join(LENGTH_UNITS)}")
-        self._scale = LENGTH_UNITS[info.length_unit] / LENGTH_UNITS[unit]
-        return replace(
-            info,
-            length_unit=unit,
-            domain_center=tuple(self._scale * value for value in info.domain_center),
-            domain_half_width=self._scale * info.domain_half_width,
-            contact_radius=self._scale * info.contact_radius,
-        )
-
     def _finite(self, name: str, row: str, array: h5py.Dataset, start: int, stop: int) -> np.ndarray:
         """Frames start to stop - 1 of an array, all finite; a `row` of it is a "node" or an "element"."""
         values = self._file.read(array, start, stop)
@@ -341,7 +330,7 @@ class Dataset:
         if split not in self._kept:
             arrays = [self._framed(split, index).values() for index in range(self.splits[split])]
             size = sum(array.nbytes for array in chain.from_iterable(arrays))
-            self._kept[split] = size <= min(CACHE_BYTES, self._file.size)
+            self._kept[split] = size <= min(cache_bytes(), self._file.size)
         return self._kept[split]
 
 

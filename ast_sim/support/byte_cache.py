@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import is_dataclass
@@ -11,6 +12,16 @@ from typing import Any, Generic, TypeVar
 V = TypeVar("V")
 
 RECENT = 512  # the scenes of a pool of jumps, which come again while they are corrected
+
+SHARE = 8  # a cache may take the memory of the machine divided by this
+MOST = 1 << 32
+
+
+def cache_bytes() -> int:
+    """The limit of a cache of scenes: an eighth of the machine's memory, at most 4 GiB; processes that train one model
+    together (`LOCAL_WORLD_SIZE`, as `torchrun` sets it) divide it among them."""
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return min(memory // SHARE, MOST) // int(os.environ.get("LOCAL_WORLD_SIZE", 1))
 
 
 class ByteCache(Generic[V]):

@@ -337,7 +337,7 @@ def test_members_that_were_not_used_for_longest_are_let_go(dataset, monkeypatch)
     assert plenty._members.held == sum(array_bytes(plenty._member(index)) for index in range(3))
     unused = sampler(dataset, noise=0.1, batch_size=1)
     sizes = [array_bytes(unused._member(index)) for index in range(3)]  # graphs grow when they are used
-    monkeypatch.setattr(pairs, "CACHE_BYTES", sum(sizes) - 1)
+    monkeypatch.setattr(pairs, "cache_bytes", lambda: sum(sizes) - 1)
     tight = sampler(dataset, noise=0.1, batch_size=1)
     first = weakref.ref(tight._member(0))
     assert [tight.num_nodes(index) for index in (1, 2)] == [5, 8] and first() is None

@@ -68,7 +68,7 @@ def test_what_was_written_is_read(tmp_path, stress):
 
 @pytest.mark.parametrize("cache_bytes", [1 << 30, 0])
 def test_frames_are_slices_from_memory_or_from_disk(tmp_path, monkeypatch, cache_bytes):
-    monkeypatch.setattr(dataset_file, "CACHE_BYTES", cache_bytes)
+    monkeypatch.setattr(dataset_file, "cache_bytes", lambda: cache_bytes)
     given = some()
     with Dataset(write(tmp_path / "d.h5", given, stress_location="node")) as dataset:
         wanted = given["train"][0]
@@ -98,7 +98,7 @@ def test_a_trajectory_knows_where_its_stress_is(tmp_path, location):
 def test_scenes_that_were_not_used_for_longest_are_let_go(tmp_path, monkeypatch):
     given = {"train": [trajectory(block(2, 1, 1), 3, seed) for seed in range(4)]}
     one = array_bytes(given["train"][0].scene)
-    monkeypatch.setattr(dataset_file, "CACHE_BYTES", 2 * one)
+    monkeypatch.setattr(dataset_file, "cache_bytes", lambda: 2 * one)
     with Dataset(write(tmp_path / "d.h5", given)) as dataset:
         first = weakref.ref(dataset.scene("train", 0))
         dataset.scene("train", 1)
