@@ -251,7 +251,7 @@ def _unpack(out: Path, folder: Path) -> None:
 
 def _existing(out: Path, folder: Path, settings: dict[str, Any], counts: dict[str, int]) -> Generated:
     with Dataset(out) as dataset:
-        differs = difference(dataset.info.generator, {**settings, "counts": counts})
+        differs = difference({**dataset.info.generator, "counts": dataset.splits}, {**settings, "counts": counts})
         if differs:
             raise SimulationError(f"{out} exists and holds other data ({differs}): remove it or choose another name")
         names = _samples(dataset.splits)
