@@ -228,6 +228,7 @@ def _add_train(train: _Parser) -> None:
     _add_each(
         train, {"--minutes M": "train so long: 50 steps are timed, then the number of steps is fixed"}, type=float
     )
+    _add_each(train, {"--processes N": "so many processes train together (default: train.processes)"}, type=at_least(1))
     train.add_argument("--resume", action="store_true", help="go on after the last checkpoint, if there is one")
     _add_each(train, {"--profile N": "only measure N steps and print how their time divides"}, type=at_least(1))
 

@@ -158,23 +158,22 @@ def info(args: argparse.Namespace) -> None:
 def train(args: argparse.Namespace) -> None:
     """Train a model on a dataset."""
     from ast_sim import keep_memory
-    from ast_sim.training.start import configure, start_training
+    from ast_sim.training.asked_settings import configure
+    from ast_sim.training.start import start_training
 
     keep_memory()
     if args.data is None and not args.resume:
         raise ConfigError("name the dataset to train on, or give --resume to go on with the run in --out")
     files = {"config": args.config, "from_run": getattr(args, "from")}
-    if args.data is None and (args.model or args.preset or args.set or args.minutes or any(files.values())):
-        raise ConfigError(
-            "a resumed run keeps its settings: leave --model, --preset, --config, --from, --minutes and --set out"
-        )
+    given = {"train.minutes": args.minutes, "train.processes": args.processes}
+    changes = {key: value for key, value in given.items() if value is not None}
+    if args.data is None and (args.model or args.preset or args.set or changes or any(files.values())):
+        raise ConfigError("a resumed run keeps its settings: give only --out and --resume, or all settings once more")
     # A resumed run keeps its settings; with a dataset, the given settings are compared with them.
     config = None
     if args.data is not None:
-        changes = {} if args.minutes is None else {"train.minutes": args.minutes}
         config = configure(args.data, args.preset, args.set, args.model, **files, changes=changes)
-    steps = args.profile or 0
-    start_training(args.out, config, resume=args.resume, profile_steps=steps, from_run=files["from_run"])
+    start_training(args.out, config, args.resume, profile_steps=args.profile or 0, from_run=files["from_run"])
     if args.profile is None:
         print(f"run: {args.out}")
 

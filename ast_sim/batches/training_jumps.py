@@ -54,6 +54,7 @@ class JumpPool(Pool):
     def __init__(self, sampler: PairSampler, size: int, calls: int, largest: float) -> None:
         super().__init__(sampler, size, largest)
         self._calls = calls
+        self.weighs = calls > 1
         self._squares = np.full(calls, np.nan)
 
     def errors(self, number: int, target: Target) -> list[tuple[int, float]]:

@@ -30,6 +30,7 @@ class Pool:
 
     streams: tuple[int, int]  # the order and the scenes draw from separate sequences of random numbers
     kept: tuple[str, ...]  # of each scene, in `state`: arrays, numbers and None; the first one is never None
+    weighs = False  # whether some scenes count more than others
 
     def __init__(self, sampler: PairSampler, size: int, largest: float) -> None:
         self._sampler, self._size, self._batches = sampler, size, size // sampler.batch_size
@@ -58,16 +59,16 @@ class Pool:
         return self._sampler.assemble([self._frames(place, self._going[place]) for place in self._places(number)])
 
     def errors(self, number: int, target: Target) -> list[tuple[int, float]]:
-        """What `weights` needs to know of a batch; nothing, where every scene counts as much."""
-        return []
+        """What `weights` needs to know of a batch; asked for only if the pool `weighs`."""
+        raise NotImplementedError
 
-    def weights(self, number: int, errors: list[tuple[int, float]]) -> Tensor | None:
-        """[B]: how much the squared error of each scene of a batch counts; None: every scene as much.
+    def weights(self, number: int, errors: list[tuple[int, float]]) -> Tensor:
+        """[B]: how much the squared error of each scene of a batch counts; asked for only if the pool `weighs`.
 
         Args:
             errors: those of all parts of the batch, in their order.
         """
-        return None
+        raise NotImplementedError
 
     def advance(self, number: int, residual: Tensor) -> None:
         """Move the scenes of a batch on; `residual` [N, 3] is `Simulator.residual` of the batch."""

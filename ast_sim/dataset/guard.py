@@ -103,7 +103,7 @@ class GuardedFile:
         with self.reading(f"an attribute of {_path(group) or 'the file'}") as name:
             for key in group.attrs:
                 size = h5py.h5a.get_info(group.id, key.encode("utf-8", "surrogateescape")).data_size
-                value = group.attrs[key] if size <= self.size else None
+                value: Any = group.attrs[key] if size <= self.size else None
                 if value is None or np.ndim(value) > 1:
                     raise DatasetError(f"{name}, {key}, is larger than the file, or no list")
                 values[key] = plain_value(value)

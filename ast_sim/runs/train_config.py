@@ -26,6 +26,11 @@ class TrainConfig:
     epochs: int = setting(100, "passes over the training pairs, if neither `steps` nor `minutes` is set")
     batch_size: int = setting(48, "scenes in a batch; each scene is a pair of frames")
     accumulate: int = setting(1, "batches in a step; the step averages their gradients")
+    processes: int | None = setting(
+        None,
+        "processes that train together, each with its part of every batch; unset: at most one for each core, each with"
+        " at least 3000 nodes a step, and 1 if the training takes about a minute; with torchrun, as many as it starts",
+    )
     optimizer: OptimizerName = setting(
         "adamw", "adamw; or muon for the matrices inside the model: it needs fewer steps, but each step is slower"
     )

@@ -17,7 +17,7 @@ from ast_sim.training.data_lengths import DataScales
 # An unset shift is at most this share of the domain's half width; the margin of `Domain` is larger.
 LARGEST_SHIFT = 0.05
 _COUNTS = ("batch_size", "accumulate", "epochs", "statistics_pairs", "steps", "decay", "log_every", "keep")
-_COUNTS += ("validate_every", "checkpoint_every", "calls")
+_COUNTS += ("validate_every", "checkpoint_every", "calls", "processes")
 _RANGES = {
     **dict.fromkeys(_COUNTS, (1, LARGEST)),
     **dict.fromkeys(("seed", "warmup", "validate_scenes", "noise"), (0, LARGEST)),

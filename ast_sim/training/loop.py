@@ -33,7 +33,7 @@ from ast_sim.training.callbacks import Callback, Listener
 from ast_sim.training.console import Console, StepLog, introduce
 from ast_sim.training.data_lengths import DataScales, largest_error
 from ast_sim.training.optimizer import Optimizer
-from ast_sim.training.processes import Processes
+from ast_sim.training.parallel.processes import Processes
 from ast_sim.training.profile import profile, table
 from ast_sim.training.rates import learning_rate, step_seed
 from ast_sim.training.saving import Saver
@@ -224,7 +224,7 @@ class Training:
         except DatasetError as error:
             raise DatasetError(f"{self.dataset.path}: in one of {', '.join(batch.names)}: {error}") from error
         weights = None
-        if self.pool is not None:
+        if self.pool is not None and self.pool.weighs:
             weights = self.pool.weights(number, self.processes.gathered(self.pool.errors(number, target)))
         losses = self.model.loss(prediction, batch, target, self.options.stress_weight, self.processes.share, weights)
         added = self.processes.add(torch.stack([value.detach() for value in losses.values()]))

@@ -10,7 +10,7 @@ from ast_sim.runs import checkpoint
 from ast_sim.runs.folder import RunFolder
 from ast_sim.support.errors import TrainingError
 from ast_sim.training.optimizer import Optimizer
-from ast_sim.training.processes import Processes
+from ast_sim.training.parallel.processes import Processes
 
 
 class Saver:

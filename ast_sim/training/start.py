@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 import errno
 import os
+import pickle
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from functools import partial
 from pathlib import Path
@@ -14,88 +16,23 @@ from typing import Any
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.trained_run import Run
-from ast_sim.models.registry import build_model, find_preset
+from ast_sim.models.registry import build_model
 from ast_sim.models.simulator import Simulator
+from ast_sim.ops.library import keep_memory
 from ast_sim.runs import checkpoint
-from ast_sim.runs.config_toml import has_config, read_changes, write_config
+from ast_sim.runs.config_toml import has_config, write_config
 from ast_sim.runs.folder import RunFolder
-from ast_sim.runs.train_config import RunConfig, TrainConfig
+from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.errors import CheckpointError, ConfigError, DatasetError, TrainingError
 from ast_sim.support.stop_signals import StopSignals
-from ast_sim.support.toml_settings import NONE, NOTHING, assigned, change
+from ast_sim.training.asked_settings import configure, differences
 from ast_sim.training.callbacks import Callback
 from ast_sim.training.data_lengths import DataScales, measure, scope_of
 from ast_sim.training.defaults_from_data import resolve
 from ast_sim.training.loop import Training, fit_statistics, sampler_of
-from ast_sim.training.processes import Processes
+from ast_sim.training.parallel.launch import READY, together, usual_processes
+from ast_sim.training.parallel.processes import Processes
 from ast_sim.training.time_budget import UNKNOWN_STEPS, steps_within
-
-_FOLLOW_FROM_STEPS = ("train.warmup", "train.decay", "train.validate_every", "train.checkpoint_every")
-
-
-def configure(
-    data: str | os.PathLike[str],
-    preset: str | None = None,
-    assignments: Sequence[str] = (),
-    model: str | None = None,
-    *,
-    config: str | os.PathLike[str] | None = None,
-    from_run: str | os.PathLike[str] | None = None,
-    changes: Mapping[str, Any] = NOTHING,
-) -> RunConfig:
-    """The settings of a preset or of a run, changed by a file, then by assignments `key=value` and by `changes`, values
-    by dotted key. Unset settings are filled in when training starts.
-
-    Arguments and errors are those of `train`.
-    """
-    file = None if config is None else Path(config)
-    given = {} if file is None else read_changes(file)
-    if "train.steps" in given:  # a run that was given minutes has both
-        given.pop("train.minutes", None)
-    if from_run is None:
-        with _naming(file):
-            named = given.pop("model.name", "ast")
-            chosen = find_preset(model or str(named), preset or "tiny")
-        settings = RunConfig(chosen.model, TrainConfig(**chosen.train), str(data))
-    elif model or preset:
-        raise ConfigError("a run that starts from another one has its model and settings: leave model and preset out")
-    else:
-        source = RunFolder(Path(from_run)).settings
-        settings = dataclasses.replace(source, train=dataclasses.replace(source.train, minutes=None), data=str(data))
-    before = settings
-    with _naming(file):
-        settings = _changed(settings, given, reschedule=from_run is not None)
-    later = {**assigned(settings, assignments), **changes}
-    settings = _changed(settings, later, reschedule=from_run is not None or "train.steps" in given)
-    for key, old, new in _differences(before, settings, "model") if from_run is not None else ():
-        raise ConfigError(f"{key} is {new!r}, but {from_run} has {old!r}: a run that starts from it keeps its model")
-    return settings
-
-
-def _changed(config: RunConfig, values: Mapping[str, Any], reschedule: bool) -> RunConfig:
-    """Settings with new values. With `reschedule`, another number of steps leaves open what follows from it. Minutes
-    replace a number of steps, and steps replace minutes."""
-    steps, minutes = (key in values and values[key] not in (None, NONE) for key in ("train.steps", "train.minutes"))
-    if steps and minutes:
-        raise ConfigError("train.minutes and train.steps exclude each other: give one of them")
-    if minutes:
-        values = {**dict.fromkeys(("train.steps", *_FOLLOW_FROM_STEPS), NONE), **values}
-    elif steps:
-        values = {"train.minutes": NONE, **values}
-    if reschedule and values.get("train.steps", config.train.steps) != config.train.steps:
-        values = {**dict.fromkeys(_FOLLOW_FROM_STEPS, NONE), **values}
-    return change(config, values)
-
-
-@contextmanager
-def _naming(file: Path | None) -> Iterator[None]:
-    """Within the block, a ConfigError names the file, if there is one."""
-    try:
-        yield
-    except ConfigError as error:
-        if file is None:
-            raise
-        raise ConfigError(f"{file}: {error}") from error
 
 
 def train(
@@ -213,8 +150,10 @@ def start_training(
             finished step was written. The error is an `Interrupted`, which has the number of the signal.
     """
     folder = RunFolder(Path(run))
+    along = {"run": run, "config": config, "resume": resume, "profile_steps": profile_steps, "from_run": from_run}
     with (
         _explained(folder.path),
+        together(_process_count(folder, config, resume), config, along),
         Processes() as processes,
         _held(folder.path, processes),
         StopSignals() as signals,
@@ -233,7 +172,7 @@ def start_training(
             begin = partial(Training, folder, dataset=dataset, scales=scales, signals=signals, processes=processes)
             asked = _with_steps(asked, saved, fit, begin)
             resolved = asked if config is None else fit(asked)
-            _require_cuttable(resolved.train.batch_size, processes.count)
+            resolved = _cut(resolved, processes.count)
             if source is not None:
                 _require_fit(source, resolved, dataset, scales)
             if saved is not None:
@@ -246,6 +185,16 @@ def start_training(
             with begin(config=resolved, callback=callback) as training:
                 go = partial(training.profile, profile_steps) if profile_steps else training.go
                 go()
+
+
+def train_along() -> None:
+    """A process that trains along with the one that started it: it makes the same training, with its part of each
+    batch. The arguments of `start_training` come through standard input; see `together`."""
+    keep_memory()
+    arguments = pickle.load(sys.stdin.buffer)
+    sys.stdout.buffer.write(READY)
+    sys.stdout.flush()
+    start_training(**arguments)
 
 
 def _with_steps(
@@ -312,9 +261,23 @@ def _told_by_leader(processes: Processes) -> Iterator[None]:
         yield
 
 
-def _require_cuttable(batch_size: int, processes: int) -> None:
-    if batch_size % processes:
-        raise ConfigError(f"train.batch_size = {batch_size} cannot be cut for {processes} processes")
+def _process_count(folder: RunFolder, config: RunConfig | None, resume: bool) -> int:
+    """The number of processes to train in: as asked, as the run that is resumed had it, or as usual. A process that is
+    one of several already starts no others."""
+    if Processes().count > 1:
+        return 1
+    if config is not None and config.train.processes is not None:
+        return config.train.processes
+    if resume and has_config(folder.path):
+        return folder.settings.train.processes or 1
+    return 1 if config is None else usual_processes(config)
+
+
+def _cut(config: RunConfig, processes: int) -> RunConfig:
+    """The settings with the number of processes, each of which takes its part of every batch."""
+    if config.train.batch_size % processes:
+        raise ConfigError(f"train.batch_size = {config.train.batch_size} cannot be cut for {processes} processes")
+    return dataclasses.replace(config, train=dataclasses.replace(config.train, processes=processes))
 
 
 def _require_fit(source: RunFolder, config: RunConfig, dataset: Dataset, scales: DataScales) -> None:
@@ -326,8 +289,10 @@ def _require_fit(source: RunFolder, config: RunConfig, dataset: Dataset, scales:
 
 def _require_same(run: RunFolder, saved: RunConfig, asked: RunConfig, source: RunFolder | None) -> None:
     """Raise ConfigError if a setting or the run to start from differs, naming the first one; only the path of the
-    dataset may differ."""
-    for key, old, new in _differences(saved, asked, "model", "train"):
+    dataset and the number of processes may differ."""
+    for key, old, new in differences(saved, asked, "model", "train"):
+        if key == "train.processes":
+            continue
         raise ConfigError(
             f"{run.path} was started with {key} = {old!r}, not {new!r}: resume without settings, or train in another"
             " folder"
@@ -338,10 +303,3 @@ def _require_same(run: RunFolder, saved: RunConfig, asked: RunConfig, source: Ru
         raise ConfigError(
             f"{run.path} was started {begun}, not from {source.path}: resume without it, or train in another folder"
         )
-
-
-def _differences(old: RunConfig, new: RunConfig, *parts: str) -> Iterator[tuple[str, Any, Any]]:
-    """The settings that differ: dotted key, old value, new value."""
-    for part in parts:
-        before, after = vars(getattr(old, part)), vars(getattr(new, part))
-        yield from ((f"{part}.{key}", before[key], after[key]) for key in before if before[key] != after[key])

@@ -15,7 +15,8 @@ from ast_sim.models.node_inputs import _proximity as near
 from ast_sim.models.node_inputs import node_features, normalizer_of, with_proximity
 from ast_sim.ops._body_distance import FINE, signed_gap
 from ast_sim.scene import Scene
-from ast_sim.training.start import configure, start_training
+from ast_sim.training.asked_settings import configure
+from ast_sim.training.start import start_training
 
 
 def surface_of(cells, size) -> tuple[np.ndarray, np.ndarray]:

@@ -20,8 +20,9 @@ from ast_sim.runs.config_toml import read_changes, read_config, read_origin
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.metrics import Metrics
 from ast_sim.support.errors import CheckpointError, ConfigError
+from ast_sim.training.asked_settings import configure
 from ast_sim.training.rates import step_seed
-from ast_sim.training.start import configure, start_training
+from ast_sim.training.start import start_training
 
 SMALL = [
     "train.steps=200", "train.batch_size=2", "train.validate_every=100", "train.statistics_pairs=8", "model.hidden=8",
@@ -240,7 +241,7 @@ def test_an_error_names_the_file(tmp_path, capsys, text, message):
 def test_a_resumed_run_takes_neither(folder, capsys):
     for option in ("--config", "--from"):
         assert main(["train", "--out", str(folder / "source"), "--resume", option, str(folder / "source")]) == 2
-        assert "a resumed run keeps its settings: leave --model, --preset, --config, --from" in capsys.readouterr().err
+        assert "a resumed run keeps its settings: give only --out and --resume" in capsys.readouterr().err
 
 
 def test_a_settings_file_that_is_a_pipe_is_refused_at_once(tmp_path):

@@ -1,5 +1,6 @@
-"""Training in two processes under torchrun: the same as in one with the whole batch; goes on with another number."""
+"""Training in two processes, by `--processes` and under torchrun: the same as in one with the whole batch."""
 
+import os
 import shutil
 import signal
 import subprocess
@@ -12,8 +13,13 @@ import torch
 import toy
 from safetensors.torch import load_file
 
+import ast_sim
+from ast_sim.dataset.reader import Dataset
 from ast_sim.runs import checkpoint
+from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.metrics import Metrics
+from ast_sim.training.asked_settings import configure
+from ast_sim.training.parallel import launch
 
 SETTINGS = [
     "model.hidden=16", "model.L_SA=1", "model.L_cell=3", "train.batch_size=4", "train.statistics_pairs=8",
@@ -21,15 +27,19 @@ SETTINGS = [
 ]  # fmt: skip
 
 
-def command(processes: int, *words: str, program: tuple[str, ...] = ("-m", "ast_sim.cli")) -> list[str]:
+def command(processes: int, *words: str) -> list[str]:
     start = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"] if processes > 1 else []
-    return [sys.executable, *start, *program, "train", *words]
+    return [sys.executable, *start, "-m", "ast_sim.cli", "train", *words]
+
+
+def words_of(data: Path, run: Path, steps: int, *words: str) -> tuple[str, ...]:
+    settings = [word for setting in (*SETTINGS, f"train.steps={steps}") for word in ("--set", setting)]
+    return (str(data), "--out", str(run), *settings, *words)
 
 
 def train(processes: int, data: Path, run: Path, steps: int, *words: str, check: bool = True):
-    settings = [word for setting in (*SETTINGS, f"train.steps={steps}") for word in ("--set", setting)]
-    words = (str(data), "--out", str(run), *settings, *words)
-    return subprocess.run(command(processes, *words), capture_output=True, text=True, check=check, timeout=300)
+    words = words_of(data, run, steps, "--processes", str(processes), *words)
+    return subprocess.run(command(1, *words), capture_output=True, text=True, check=check, timeout=300)
 
 
 def weights(run: Path) -> dict[str, torch.Tensor]:
@@ -64,26 +74,80 @@ def test_two_processes_do_what_one_does(data, tmp_path, along):
         for key in {"loss", "grad_norm", "valid_rmse", "valid_hold_still"} & ours.keys():
             assert theirs[key] == pytest.approx(ours[key], rel=1e-3), key
     assert told.count("parameters") == 1  # one process tells
+    assert RunFolder(tmp_path / "two").settings.train.processes == 2
 
-    # Two that were interrupted end in the same bits.
+    # Two that were interrupted end in the same bits: a run that goes on keeps its number of processes.
     shutil.rmtree(tmp_path / "two/checkpoints/step-8")
-    subprocess.run(command(2, "--out", str(tmp_path / "two"), "--resume"), check=True, timeout=300)
+    subprocess.run(command(1, "--out", str(tmp_path / "two"), "--resume"), check=True, timeout=300)
     assert all(torch.equal(value, two[name]) for name, value in weights(tmp_path / "two").items())
 
-    # What one began two go on with, and the group that they are ends with training.
-    script = tmp_path / "train_then_count.py"
-    script.write_text(
-        "import sys\n"
-        "from pathlib import Path\n"
-        "from ast_sim.cli import main\n"
-        "status = main()\n"
-        "threads = [name.read_text().strip() for name in Path('/proc/self/task').glob('*/comm')]\n"
-        "assert not any('gloo' in name for name in threads), threads\n"
-        "sys.exit(status)\n"
-    )
-    launch = command(2, "--out", str(tmp_path / "one"), "--resume", program=(str(script),))
-    done = subprocess.run(launch, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0 and "going on after step 8" in done.stdout, done.stderr
+
+def test_torchrun_and_a_notebook_give_the_same_bits(data, tmp_path):
+    one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}  # of each process: sums over threads round otherwise
+    subprocess.run(command(2, *words_of(data, tmp_path / "torchrun", 8)), check=True, timeout=300, env=one_thread)
+    settings = dict(setting.split("=") for setting in SETTINGS)
+    given = {key.removeprefix("train."): float(value) for key, value in settings.items() if key.startswith("train.")}
+    given |= {key: int(given[key]) for key in ("batch_size", "statistics_pairs", "log_every", "validate_every")}
+    model = {"hidden": 16, "L_SA": 1, "L_cell": 3, "jumps": False}
+    steps: list[int] = []
+    threads = torch.get_num_threads()
+    assert threads == 2
+    ast_sim.train(
+        data, tmp_path / "notebook", model_settings=model, callback=lambda step, _: steps.append(step), steps=8,
+        processes=2, **given,
+    )  # fmt: skip
+    assert steps == [4, 4, 8, 8]
+    assert "WORLD_SIZE" not in os.environ and torch.get_num_threads() == threads
+    ours, theirs = (weights(tmp_path / name) for name in ("notebook", "torchrun"))
+    assert all(torch.equal(value, theirs[name]) for name, value in ours.items())
+    assert RunFolder(tmp_path / "torchrun").settings.train.processes == 2
+    names = [name.read_text().strip() for name in Path("/proc/self/task").glob("*/comm")]
+    assert not any("gloo" in name for name in names), names
+
+    # What two began one goes on with.
+    words = words_of(data, tmp_path / "torchrun", 12, "--resume", "--processes", "1")
+    refused = subprocess.run(command(1, *words), capture_output=True, text=True, timeout=300)
+    assert "was started with train.steps = 8, not 12" in refused.stderr  # only the number of processes may differ
+    shutil.rmtree(tmp_path / "torchrun/checkpoints/step-8")
+    words = words_of(data, tmp_path / "torchrun", 8, "--resume", "--processes", "1")
+    done = subprocess.run(command(1, *words), capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0 and "going on after step 4" in done.stdout, done.stderr
+
+
+def test_the_usual_number_follows_from_the_size_of_a_step(data, monkeypatch):
+    def usual(threads: int, least: int, **settings) -> int:
+        monkeypatch.setattr(launch, "LEAST_NODES", least)
+        monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+        changes = {f"train.{key}": value for key, value in settings.items()}
+        return launch.usual_processes(configure(data, changes=changes))
+
+    with Dataset(data) as dataset:
+        nodes = dataset.scene("train", 0).num_nodes
+    long = 1_000_000
+    assert usual(2, 4 * nodes, batch_size=8, steps=long) == 2
+    assert usual(2, 4 * nodes + 1, batch_size=8, steps=long) == 1  # the parts would be too small
+    assert usual(1, 1, batch_size=8, steps=long) == 1
+    assert usual(6, 1, batch_size=8, steps=long) == 4  # six would not cut the batch
+    assert usual(2, 1, batch_size=8, steps=10) == 1
+    assert usual(2, 1, batch_size=8, minutes=10) == 2 and usual(2, 1, batch_size=8, minutes=0.5) == 1
+
+
+def test_a_process_that_is_killed_ends_the_training_with_its_cause(data, tmp_path):
+    words = words_of(data, tmp_path / "run", 100_000, "--processes", "2", "--set", "train.log_every=1")
+    process = subprocess.Popen(command(1, *words), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    try:
+        deadline = time.monotonic() + 300
+        while not list(Metrics(tmp_path / "run")):
+            assert time.monotonic() < deadline and process.poll() is None
+            time.sleep(0.1)
+        along = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True).stdout.split()
+        assert len(along) == 1
+        os.kill(int(along[0]), signal.SIGKILL)
+        _, error = process.communicate(timeout=120)
+    finally:
+        process.kill()
+    assert process.returncode == 2
+    assert error.strip() == ("ast-sim train: a process that trains along has ended (signal 9): go on with --resume")
 
 
 def test_a_batch_that_cannot_be_cut_is_refused(data, tmp_path):

@@ -7,7 +7,8 @@ from toy import one_thread  # noqa: F401 (used by being imported)
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.evaluation.evaluate import one_step_predictions
 from ast_sim.runs.folder import RunFolder
-from ast_sim.training.start import configure, start_training
+from ast_sim.training.asked_settings import configure
+from ast_sim.training.start import start_training
 
 
 def test_overfitting_one_trajectory_brings_the_one_step_error_below_2_percent_of_the_mean_increment(tmp_path):

@@ -1,0 +1,91 @@
+"""The settings that a training is asked for: of a preset or of a run, changed by a file and by assignments."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from ast_sim.models.registry import find_preset
+from ast_sim.runs.config_toml import read_changes
+from ast_sim.runs.folder import RunFolder
+from ast_sim.runs.train_config import RunConfig, TrainConfig
+from ast_sim.support.errors import ConfigError
+from ast_sim.support.toml_settings import NONE, NOTHING, assigned, change
+
+_FOLLOW_FROM_STEPS = ("train.warmup", "train.decay", "train.validate_every", "train.checkpoint_every")
+
+
+def configure(
+    data: str | os.PathLike[str],
+    preset: str | None = None,
+    assignments: Sequence[str] = (),
+    model: str | None = None,
+    *,
+    config: str | os.PathLike[str] | None = None,
+    from_run: str | os.PathLike[str] | None = None,
+    changes: Mapping[str, Any] = NOTHING,
+) -> RunConfig:
+    """The settings of a preset or of a run, changed by a file, then by assignments `key=value` and by `changes`, values
+    by dotted key. Unset settings are filled in when training starts.
+
+    Arguments and errors are those of `train`.
+    """
+    file = None if config is None else Path(config)
+    given = {} if file is None else read_changes(file)
+    if "train.steps" in given:  # a run that was given minutes has both
+        given.pop("train.minutes", None)
+    if from_run is None:
+        with _naming(file):
+            named = given.pop("model.name", "ast")
+            chosen = find_preset(model or str(named), preset or "tiny")
+        settings = RunConfig(chosen.model, TrainConfig(**chosen.train), str(data))
+    elif model or preset:
+        raise ConfigError("a run that starts from another one has its model and settings: leave model and preset out")
+    else:
+        source = RunFolder(Path(from_run)).settings
+        settings = dataclasses.replace(source, train=dataclasses.replace(source.train, minutes=None), data=str(data))
+    before = settings
+    with _naming(file):
+        settings = _changed(settings, given, reschedule=from_run is not None)
+    later = {**assigned(settings, assignments), **changes}
+    settings = _changed(settings, later, reschedule=from_run is not None or "train.steps" in given)
+    for key, old, new in differences(before, settings, "model") if from_run is not None else ():
+        raise ConfigError(f"{key} is {new!r}, but {from_run} has {old!r}: a run that starts from it keeps its model")
+    return settings
+
+
+def _changed(config: RunConfig, values: Mapping[str, Any], reschedule: bool) -> RunConfig:
+    """Settings with new values. With `reschedule`, another number of steps leaves open what follows from it. Minutes
+    replace a number of steps, and steps replace minutes."""
+    steps, minutes = (key in values and values[key] not in (None, NONE) for key in ("train.steps", "train.minutes"))
+    if steps and minutes:
+        raise ConfigError("train.minutes and train.steps exclude each other: give one of them")
+    if minutes:
+        values = {**dict.fromkeys(("train.steps", *_FOLLOW_FROM_STEPS), NONE), **values}
+    elif steps:
+        values = {"train.minutes": NONE, **values}
+    if reschedule and values.get("train.steps", config.train.steps) != config.train.steps:
+        values = {**dict.fromkeys(_FOLLOW_FROM_STEPS, NONE), **values}
+    return change(config, values)
+
+
+@contextmanager
+def _naming(file: Path | None) -> Iterator[None]:
+    """Within the block, a ConfigError names the file, if there is one."""
+    try:
+        yield
+    except ConfigError as error:
+        if file is None:
+            raise
+        raise ConfigError(f"{file}: {error}") from error
+
+
+def differences(old: RunConfig, new: RunConfig, *parts: str) -> Iterator[tuple[str, Any, Any]]:
+    """The settings that differ: dotted key, old value, new value."""
+    for part in parts:
+        before, after = vars(getattr(old, part)), vars(getattr(new, part))
+        yield from ((f"{part}.{key}", before[key], after[key]) for key in before if before[key] != after[key])

@@ -1,0 +1,1 @@
+"""Training a model: settings that follow from the data, the loop, optimizers, validation, checkpoints."""
