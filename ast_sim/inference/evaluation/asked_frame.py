@@ -25,7 +25,7 @@ from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.models.simulator import Simulator
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.jobs.rival import Rivals, cheapest, deepest_frame, rivals
-from ast_sim.support.errors import SimulationError
+from ast_sim.support.errors import ConfigError, SimulationError
 
 
 def asked_frames(
@@ -66,7 +66,7 @@ def asked_frames(
             scenes[number] = dataclasses.replace(scenes[number], solver=solver)
             if progress is not None:
                 progress(scenes[number].name)
-    except SimulationError as error:
+    except (ConfigError, SimulationError) as error:
         why = str(error)
     known = [scene for scene in scenes if scene.relative_error is not None]
     return AskedFigures(

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.driven import Driven
 from ast_sim.scene import NodeType, Scene
-from ast_sim.support.errors import SimulationError
+from ast_sim.support.errors import ConfigError, SimulationError
 
 # The elements by their number of nodes; the order of the nodes is that of a scene.
 ELEMENT_TYPES = {4: "C3D4", 10: "C3D10"}
@@ -64,10 +64,11 @@ def write_deck(file: TextIO, case: SolidCase, increments: Increments) -> None:
     """Write the deck of a case.
 
     Raises:
-        SimulationError: elements are not tetrahedra, or nothing moves.
+        ConfigError: elements are not tetrahedra.
+        SimulationError: nothing moves.
     """
     if case.scene.elements.shape[1] not in ELEMENT_TYPES:
-        raise SimulationError("CalculiX is used for tetrahedra only: solve cloth with the own solver")
+        raise ConfigError("CalculiX is used for tetrahedra only: solve cloth with the own solver")
     if not (case.scene.prescribed & (case.targets != case.targets[0]).any(axis=(0, 2))).any():
         raise SimulationError("CalculiX needs prescribed nodes that move, but this case has none")
     for block in (_mesh(case), _contact(case, increments), _steps(case, increments)):

@@ -24,7 +24,7 @@ from ast_sim.simulate.shapes import plate_mesh
 from ast_sim.simulate.shapes.mesh_check import BadMesh
 from ast_sim.simulate.shapes.obstacles import draw_obstacle
 from ast_sim.simulate.shapes.plate_outline_and_holes import Outline, distance_to, draw_outline
-from ast_sim.support.errors import SimulationError
+from ast_sim.support.errors import ConfigError
 
 FRAMES = 400
 DEFAULT_NODES = 1300
@@ -134,10 +134,10 @@ def draw_geometry(rng: np.random.Generator, nodes: int = DEFAULT_NODES, frames: 
         frames: how many frames the press and the release take.
 
     Raises:
-        SimulationError: there are too few frames for a press and a release.
+        ConfigError: there are too few frames for a press and a release.
     """
     if frames < MINIMUM_FRAMES:
-        raise SimulationError(f"frames is {frames}; a press and its release need at least {MINIMUM_FRAMES}")
+        raise ConfigError(f"frames is {frames}; a press and its release need at least {MINIMUM_FRAMES}")
     while True:
         drawn = _try_draw(rng, nodes, frames)
         if drawn is not None and 0.5 * nodes <= drawn.case.scene.num_nodes <= 1.7 * nodes:

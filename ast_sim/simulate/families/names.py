@@ -13,7 +13,7 @@ import importlib
 from dataclasses import dataclass
 from types import ModuleType
 
-from ast_sim.support.errors import SimulationError
+from ast_sim.support.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,9 @@ def family_module(family: str) -> ModuleType:
     """The module of a scene family.
 
     Raises:
-        SimulationError: the family is unknown.
+        ConfigError: the family is unknown.
         MissingExtra: an extra that the family needs is not installed.
     """
     if family not in FAMILIES:
-        raise SimulationError(f"there is no scene family {family!r}; use one of {', '.join(FAMILIES)}")
+        raise ConfigError(f"there is no scene family {family!r}; use one of {', '.join(FAMILIES)}")
     return importlib.import_module(MODULES[family])

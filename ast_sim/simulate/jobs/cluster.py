@@ -29,7 +29,7 @@ from ast_sim.simulate.jobs import pool
 from ast_sim.simulate.jobs.manifest import Watch
 from ast_sim.simulate.jobs.recipe import difference, recorded
 from ast_sim.simulate.jobs.samples import Recipe, Sample, load_sample, sample_name, sample_path, store_sample
-from ast_sim.support.errors import SimulationError, require
+from ast_sim.support.errors import ConfigError, SimulationError, require
 
 SECONDS_TO_CONNECT = 10.0
 SECONDS_BETWEEN_EVENTS = 5.0
@@ -157,7 +157,7 @@ def sample_task(
     worker = distributed.get_worker()
     try:
         differs = difference(recorded(made_of), settings, "on the worker", "at the client")
-    except SimulationError as error:
+    except (ConfigError, SimulationError) as error:
         return {"error": str(error), "host": host}
     if differs:
         return {"error": f"the worker is set up differently: {differs}", "host": host}

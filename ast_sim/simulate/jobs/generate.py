@@ -43,7 +43,7 @@ from ast_sim.simulate.jobs.samples import (
 )
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.support.disk import output_file, replacing
-from ast_sim.support.errors import SimulationError
+from ast_sim.support.errors import ConfigError, SimulationError
 
 MOST_SCENES = 1_000_000  # names of samples have six digits
 
@@ -103,8 +103,9 @@ def generate(
 
     Raises:
         AstSimError: `out` is no place for a file.
-        SimulationError: a setting is invalid, the disk is too small, `out` was made otherwise or is in use by another
-            process, or samples failed: the same call goes on from there.
+        ConfigError: a setting is invalid, or `out` was made with other settings.
+        SimulationError: the disk is too small, `out` is in use by another process, or samples failed: the same call
+            goes on from there.
         MissingExtra: a package that the family, the solver or the scheduler needs is not installed.
     """
     module = family_module(family)
@@ -179,9 +180,9 @@ def _make(
 def checked_workers(workers: int | None, scheduler: str | None) -> int:
     """The number of processes; one per available core if None."""
     if workers is not None and scheduler is not None:
-        raise SimulationError("workers run on this machine, but a scheduler has its own workers: give one of them")
+        raise ConfigError("workers run on this machine, but a scheduler has its own workers: give one of them")
     if workers is not None and workers < 1:
-        raise SimulationError(f"workers is {workers}; must be at least 1")
+        raise ConfigError(f"workers is {workers}; must be at least 1")
     if workers is not None:
         return workers
     if hasattr(os, "sched_getaffinity"):  # not on macOS
@@ -199,9 +200,9 @@ def checked_counts(train: int, valid: int | None, test: int | None, calibration:
         "calibration": calibration,
     }
     if min(counts.values()) < 0 or sum(counts.values()) == 0:
-        raise SimulationError(f"counts must be at least 0 and not all 0, got {counts}")
+        raise ConfigError(f"counts must be at least 0 and not all 0, got {counts}")
     if sum(counts.values()) > MOST_SCENES:
-        raise SimulationError(f"{sum(counts.values()):,} scenes are too many for one dataset: at most {MOST_SCENES:,}")
+        raise ConfigError(f"{sum(counts.values()):,} scenes are too many for one dataset: at most {MOST_SCENES:,}")
     return counts
 
 
@@ -253,7 +254,7 @@ def _existing(out: Path, folder: Path, settings: dict[str, Any], counts: dict[st
     with Dataset(out) as dataset:
         differs = difference({**dataset.info.generator, "counts": dataset.splits}, {**settings, "counts": counts})
         if differs:
-            raise SimulationError(f"{out} exists and holds other data ({differs}): remove it or choose another name")
+            raise ConfigError(f"{out} exists and holds other data ({differs}): remove it or choose another name")
         names = _samples(dataset.splits)
         truncated = [sample_name(*sample) for sample in names if dataset.attributes(*sample)["status"] == "truncated"]
     if set(folder.glob("*.npz")) <= {sample_path(folder, *sample) for sample in names}:  # else it is about to grow
@@ -281,7 +282,7 @@ def _locked(folder: Path, settings: dict[str, Any]) -> Iterator[None]:
         if path.exists():
             differs = difference(_read_settings(path), settings)
             if differs:
-                raise SimulationError(
+                raise ConfigError(
                     f"{folder} holds samples of other settings ({differs}): give those settings, or remove the folder"
                 )
         else:

@@ -27,7 +27,7 @@ from ast_sim.simulate.jobs.display import Progress
 from ast_sim.simulate.jobs.pool import Process
 from ast_sim.simulate.jobs.recipe import recipe_of
 from ast_sim.simulate.jobs.samples import sample_name
-from ast_sim.support.errors import SimulationError
+from ast_sim.support.errors import ConfigError, SimulationError
 
 RIVAL_MODULE = "ast_sim.simulate.jobs.rival_worker"
 OUTCOMES, POSITIONS = "outcomes.json", "positions.npz"
@@ -181,12 +181,13 @@ def rivals(
         progress: show a bar on a terminal and lines elsewhere.
 
     Raises:
-        SimulationError: the dataset was not made by the bundled solver or from a family with inertia; there is no such
-            frame; drawing the scene again gives another one; or a process ended before its time.
+        ConfigError: the dataset was not made by the bundled solver or from a family with inertia, or there is no such
+            frame.
+        SimulationError: drawing the scene again gives another one, or a process ended before its time.
         DatasetError: the dataset cannot be read, or there is no such trajectory.
     """
     if not starts or min(starts) < 0 or repeats < 1:
-        raise SimulationError(f"starts {list(starts)} must be at least 0, and repeats {repeats} at least 1")
+        raise ConfigError(f"starts {list(starts)} must be at least 0, and repeats {repeats} at least 1")
     with Dataset(dataset) as data:
         recipe = recipe_of(str(dataset), data.info, made_from)
         frames = [_frame(data, split, index, which, frame_of) for which, index in enumerate(indices)]
@@ -207,11 +208,11 @@ def _frame(
 ) -> int:
     """The wanted frame of a trajectory, after a check; `which` is the place of its index among the indices."""
     if not callable(frame_of) and which >= len(frame_of):
-        raise SimulationError(f"{len(frame_of)} frames are too few: give one for each index")
+        raise ConfigError(f"{len(frame_of)} frames are too few: give one for each index")
     frame = frame_of(data.load(split, index)) if callable(frame_of) else frame_of[which]
     count = data.num_frames(split, index)
     if not 1 <= frame < count:
-        raise SimulationError(f"{data.path}: {sample_name(split, index)} has no frame {frame}: 1 to {count - 1}")
+        raise ConfigError(f"{data.path}: {sample_name(split, index)} has no frame {frame}: 1 to {count - 1}")
     return int(frame)
 
 

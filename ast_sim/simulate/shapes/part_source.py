@@ -17,7 +17,7 @@ from ast_sim.simulate.shapes.cad.stl_file import BadSurface
 from ast_sim.simulate.shapes.cad.surface_mend import stl_surface
 from ast_sim.simulate.shapes.mesh_check import SMALLEST_ANGLE, BadMesh, check_mesh, check_surface
 from ast_sim.simulate.shapes.parts import Part, draw_structured, oriented, volumes
-from ast_sim.support.errors import MissingExtra, SimulationError
+from ast_sim.support.errors import ConfigError, MissingExtra
 
 STEP_ENDINGS = (".step", ".stp")
 STL_ENDING = ".stl"
@@ -61,7 +61,7 @@ def part_source(parts: Path | None = None) -> PartSource:
     If `parts` is None, the source is gmsh's grammar, or structured parts where gmsh is not installed.
 
     Raises:
-        SimulationError: the path does not exist or holds no such file.
+        ConfigError: the path does not exist or holds no such file.
         MissingExtra: STEP or STL files need gmsh, which is not installed.
     """
     if parts is not None:
@@ -145,16 +145,16 @@ def _checked(parts: list[Part], smallest_angle: float) -> tuple[Part, Part]:
 
 def _files(path: Path) -> tuple[Path, ...]:
     if not path.exists():
-        raise SimulationError(f"{path} does not exist: give a STEP, STL or mesh file, or a folder of them")
+        raise ConfigError(f"{path} does not exist: give a STEP, STL or mesh file, or a folder of them")
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     if path.is_dir():
         files = [f for f in files if f.is_file() and not f.name.startswith(".") and f.suffix.lower() not in _IGNORED]
     if not files:
-        raise SimulationError(f"{path} holds no files: give a STEP, STL or mesh file, or a folder of them")
+        raise ConfigError(f"{path} holds no files: give a STEP, STL or mesh file, or a folder of them")
     readable = {*STEP_ENDINGS, STL_ENDING, *meshio.extension_to_filetypes}
     for file in files:
         if file.suffix.lower() not in readable:
-            raise SimulationError(f"{file} is no STEP, STL or mesh file: meshio does not know its ending")
+            raise ConfigError(f"{file} is no STEP, STL or mesh file: meshio does not know its ending")
         if _is_cad(file) and gmsh_process.gmsh_version() is None:
             raise MissingExtra(f'gmsh is needed to mesh {file.name} but is not installed: pip install "ast_sim[cad]"')
     return tuple(files)

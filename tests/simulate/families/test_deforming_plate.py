@@ -22,7 +22,7 @@ from ast_sim.simulate.shapes.mesh_check import BadMesh
 from ast_sim.simulate.shapes.obstacles import SHAPES
 from ast_sim.simulate.shapes.plate_mesh import PlaneMesh, smallest_angle
 from ast_sim.simulate.shapes.plate_outline_and_holes import OUTLINES
-from ast_sim.support.errors import SimulationError
+from ast_sim.support.errors import ConfigError
 
 NODES, SHORT = 150, 41
 
@@ -163,7 +163,7 @@ def test_few_frames_hold_press_and_release(frames):
     for index in range(40):
         way = draw_way(np.random.default_rng(index), frames)
         assert len(way) == frames and way[[0, -1]] == pytest.approx([0, 0]) and way.max() == 1
-    with pytest.raises(SimulationError, match="frames is 2; a press and its release need at least 3"):
+    with pytest.raises(ConfigError, match="frames is 2; a press and its release need at least 3"):
         draw(np.random.default_rng(0), NODES, 2)
 
 

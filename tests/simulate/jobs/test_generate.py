@@ -25,7 +25,7 @@ from ast_sim.simulate.jobs.generate import generate
 from ast_sim.simulate.jobs.manifest import Manifest
 from ast_sim.simulate.jobs.recipe import recorded
 from ast_sim.simulate.jobs.samples import Recipe, load_sample, make_sample, sample_path, save_sample
-from ast_sim.support.errors import MissingExtra, SimulationError, require
+from ast_sim.support.errors import ConfigError, MissingExtra, SimulationError, require
 
 NODES, FRAMES = 80, 9
 RECIPE = Recipe("deforming_plate", 5, NODES, FRAMES)
@@ -172,11 +172,11 @@ def test_parts_of_other_settings_are_refused(tmp_path):
     out, folder = tmp_path / "plates.h5", tmp_path / "plates.h5.parts"
     folder.mkdir()
     (folder / "settings.json").write_text(json.dumps(recorded(RECIPE)))
-    with pytest.raises(SimulationError, match=r"other settings \(seed 5 there, 2 here\)"):
+    with pytest.raises(ConfigError, match=r"other settings \(seed 5 there, 2 here\)"):
         plates(out, {"train": 1}, seed=2)
     older = {**recorded(RECIPE), "versions": {"numpy": "1.0"}}
     (folder / "settings.json").write_text(json.dumps(older))
-    with pytest.raises(SimulationError, match=r"other settings \(versions: numpy 1.0 there, [2-9].* here\)"):
+    with pytest.raises(ConfigError, match=r"other settings \(versions: numpy 1.0 there, [2-9].* here\)"):
         plates(out, {"train": 1})
     (folder / "settings.json").write_text("{")
     with pytest.raises(SimulationError, match="settings.json is damaged"):
@@ -186,7 +186,7 @@ def test_parts_of_other_settings_are_refused(tmp_path):
 def test_an_existing_dataset_is_kept(undisturbed):
     before = undisturbed.stat().st_mtime_ns
     assert plates(undisturbed).counts == {**COUNTS, "calibration": 0}
-    with pytest.raises(SimulationError, match="exists and holds other data"):
+    with pytest.raises(ConfigError, match="exists and holds other data"):
         plates(undisturbed, seed=6)
     assert undisturbed.stat().st_mtime_ns == before
 
@@ -217,7 +217,7 @@ def test_a_dataset_grows_without_solving_a_scene_twice(undisturbed, tmp_path, mo
     with Dataset(out) as dataset:
         after = read_seconds(dataset).samples
     assert len(after) == 4 and {name: after[name] for name in before} == before
-    with pytest.raises(SimulationError, match=r"holds other data \(counts: train 2 there, 1 here\)"):
+    with pytest.raises(ConfigError, match=r"holds other data \(counts: train 2 there, 1 here\)"):
         plates(out, {"train": 1, "valid": 1, "test": 1})
 
 
@@ -274,9 +274,9 @@ def test_kept_frames_are_those_of_the_whole_motion_and_recorded(undisturbed, tmp
     before = out.read_bytes()
     assert plates(out, keep=[3, 7]).counts == {**COUNTS, "calibration": 0} and out.read_bytes() == before
     for other in ({"keep": (3, 6)}, {}):
-        with pytest.raises(SimulationError, match="holds other data"):
+        with pytest.raises(ConfigError, match="holds other data"):
             plates(out, **other)
-    with pytest.raises(SimulationError, match=r"holds other data \(keep None there, \[3, 7\] here\)"):
+    with pytest.raises(ConfigError, match=r"holds other data \(keep None there, \[3, 7\] here\)"):
         plates(undisturbed, keep=kept)
 
 
@@ -327,7 +327,7 @@ def test_two_runs_on_one_file_exclude_each_other(tmp_path):
     ],
 )
 def test_settings_that_cannot_be(tmp_path, arguments, message):
-    with pytest.raises(SimulationError, match=message):
+    with pytest.raises(ConfigError, match=message):
         generate(**{"family": "deforming_plate", "out": tmp_path / "a.h5", **arguments})
     assert list(tmp_path.iterdir()) == []
 

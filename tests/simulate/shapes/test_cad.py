@@ -11,7 +11,7 @@ from ast_sim.simulate.shapes.cad import gmsh_process, grammar
 from ast_sim.simulate.shapes.mesh_check import BadMesh, check_mesh
 from ast_sim.simulate.shapes.part_source import GrammarParts, StructuredParts, part_source, read_mesh
 from ast_sim.simulate.shapes.parts import rectilinear, volumes
-from ast_sim.support.errors import MissingExtra, SimulationError
+from ast_sim.support.errors import ConfigError, MissingExtra, SimulationError
 
 HOLED = {"solid": [
     {"do": "add", "shape": "box", "at": [0, 0, 0], "size": [1, 0.8, 0.5]},
@@ -240,10 +240,10 @@ def test_broken_mesh_files_are_refused(tmp_path, files):
 
 def test_paths_that_hold_no_parts(tmp_path):
     for path, words in ((tmp_path / "absent.step", "does not exist"), (tmp_path, "holds no files")):
-        with pytest.raises(SimulationError, match=words):
+        with pytest.raises(ConfigError, match=words):
             part_source(path)
     (tmp_path / "drawing.pdf").write_text("")
-    with pytest.raises(SimulationError, match="drawing.pdf is no STEP, STL or mesh file"):
+    with pytest.raises(ConfigError, match="drawing.pdf is no STEP, STL or mesh file"):
         part_source(tmp_path)
 
 
