@@ -171,8 +171,7 @@ def start_training(
             fit = partial(resolve, dataset=dataset, scales=scales, keep_model=source is not None)
             begin = partial(Training, folder, dataset=dataset, scales=scales, signals=signals, processes=processes)
             asked = _with_steps(asked, saved, fit, begin)
-            resolved = asked if config is None else fit(asked)
-            resolved = _cut(resolved, processes.count)
+            resolved = _cut(asked if config is None else fit(asked), processes.count)
             if source is not None:
                 _require_fit(source, resolved, dataset, scales)
             if saved is not None:

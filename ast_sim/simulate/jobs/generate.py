@@ -104,8 +104,7 @@ def generate(
     Raises:
         AstSimError: `out` is no place for a file.
         ConfigError: a setting is invalid, or `out` was made with other settings.
-        SimulationError: the disk is too small, `out` is in use by another process, or samples failed: the same call
-            goes on from there.
+        SimulationError: the disk is too small, `out` is in use, or samples failed: the same call goes on from there.
         MissingExtra: a package that the family, the solver or the scheduler needs is not installed.
     """
     module = family_module(family)
