@@ -1,0 +1,62 @@
+"""The study of nested iteration, from end to end on a scene of 100 nodes."""
+
+import json
+
+import pytest
+import torch
+
+from benchmarks.studies import nested
+
+
+@pytest.fixture
+def one_thread(monkeypatch):
+    """The study changes the threads of this process and of others; they are set back."""
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+
+
+def test_a_scene_from_end_to_end(tmp_path, monkeypatch, one_thread):
+    plates = nested.Plates("Small plates", 100, "test", 1, frames=5, keep=None, run=True)
+    monkeypatch.setattr(nested, "SETS", (plates,))
+    monkeypatch.setattr(nested, "ROUNDS", 1)
+    monkeypatch.setattr(nested, "ANSWERS", 1)
+    monkeypatch.setattr(nested, "RESULTS", tmp_path / "results" / "nested.json")
+    monkeypatch.setattr(nested, "PAGE", tmp_path / "nested.md")
+    nested.main(["--folder", str(tmp_path)])
+    (plates,) = json.loads(nested.RESULTS.read_text())["sets"]
+    (scene,) = plates["measured"]
+    assert (
+        len(scene["ways"]) == 32
+        and len(nested.NESTED) == 18
+        and list(scene["answers"]) == [effort.text for effort in nested.EFFORTS]
+    )
+    assert nested.cheapest(scene, 0.1, nested=True)[1] <= nested.cheapest(scene, 0.1, nested=False)[1]
+    text = nested.PAGE.read_text()
+    assert "## Small plates, 1 scenes" in text and text.count("| 0.5 % |") == 1
+    assert f"| {nested.EFFORTS[1].text} |" in text
+
+
+def test_the_cheapest_of_a_scene():
+    name = min(nested.NESTED)
+    ways = {
+        "own stop test": {"seconds": 3.0, "relative_error": 0.0},
+        "1/2 nodes": {"seconds": 1.0, "relative_error": 0.08},
+        name: {"seconds": 2.0, "relative_error": 0.004},
+        "6 linearised steps": {"seconds": None, "relative_error": None},
+    }
+    scene = {"ways": ways}
+    assert nested.cheapest(scene, 0.1, nested=True) == ("1/2 nodes", 1.0)
+    assert nested.cheapest(scene, 0.01, nested=True) == (name, 2.0)
+    assert nested.cheapest(scene, 0.01, nested=False) == ("own stop test", 3.0)
+    assert nested.cheapest({"ways": {"1/2 nodes": ways["1/2 nodes"]}}, 0.01, nested=True) is None
+    without, with_nested, ratio, names = nested._compared([scene, scene], [0.01, 0.01])
+    assert (without, with_nested, ratio, names) == ("3000 ms", "2000 ms", "1.50 ± 0.00", f"{name}: 2")
+
+
+def test_a_faster_time_is_kept():
+    known = {}
+    for seconds in (None, 2.0, 3.0, 1.0, None):
+        nested._keep_faster(known, "way", {"seconds": seconds})
+    assert known == {"way": {"seconds": pytest.approx(1.0)}}
