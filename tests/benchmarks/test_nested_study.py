@@ -5,7 +5,9 @@ import json
 import pytest
 import torch
 
+from ast_sim.simulate.jobs.rival import WAYS
 from benchmarks.studies import nested
+from benchmarks.studies.phrases import settings_tried
 
 
 @pytest.fixture
@@ -18,9 +20,8 @@ def one_thread(monkeypatch):
 
 
 def test_a_scene_from_end_to_end(tmp_path, monkeypatch, one_thread):
-    plates = nested.Plates("Small plates", 100, "test", 1, frames=5, keep=None, run=True)
+    plates = nested.Plates("Small plates", 100, "test", 1, frames=5, keep=None, rounds=1, run=True)
     monkeypatch.setattr(nested, "SETS", (plates,))
-    monkeypatch.setattr(nested, "ROUNDS", 1)
     monkeypatch.setattr(nested, "ANSWERS", 1)
     monkeypatch.setattr(nested, "RESULTS", tmp_path / "results" / "nested.json")
     monkeypatch.setattr(nested, "PAGE", tmp_path / "nested.md")
@@ -34,7 +35,7 @@ def test_a_scene_from_end_to_end(tmp_path, monkeypatch, one_thread):
     )
     assert nested.cheapest(scene, 0.1, nested=True)[1] <= nested.cheapest(scene, 0.1, nested=False)[1]
     text = nested.PAGE.read_text()
-    assert "## Small plates, 1 scenes" in text and text.count("| 0.5 % |") == 1
+    assert "Scenes: 1, of the split test, measured once." in text and text.count("| 0.5 % |") == 1
     assert f"| {nested.EFFORTS[1].text} |" in text
 
 
@@ -60,3 +61,17 @@ def test_a_faster_time_is_kept():
     for seconds in (None, 2.0, 3.0, 1.0, None):
         nested._keep_faster(known, "way", {"seconds": seconds})
     assert known == {"way": {"seconds": pytest.approx(1.0)}}
+
+
+def test_rows_say_in_how_many_settings_the_solver_was_run():
+    def row(title, *names):
+        return {"row": {"title": title}, "scenes": [{"solver": {"ways": dict.fromkeys(names)}}, {"solver": None}]}
+
+    plain = [way.name for way in WAYS[:13]]
+    every = [way.name for way in WAYS]
+    old = [row("A", *plain), row("B", *plain)]
+    assert settings_tried(old) == "13 settings"
+    assert settings_tried([row("C", *every)]) == settings_tried([]) == "32 settings, nested iteration among them,"
+    assert settings_tried([*old, row("C", *every), row("D", *every)]) == (
+        "13 settings (32, nested iteration among them, for C, D)"
+    )
