@@ -1,13 +1,14 @@
 """The solver at its best, with nested iteration and without it, beside the run of plates that comes with the package.
 
-`python -m benchmarks.studies.nested` generates a few plates, goes to the deepest frame of each in every way of
-`ast_sim.simulate.jobs.rival`, and asks the run for the same frame. It writes benchmarks/results/nested.json and
-docs/results/nested.md. The scenes lie in `--folder`. Everything runs on one thread.
+`python -m benchmarks.studies.nested [NODES ...]` generates a few plates of each size, goes to the deepest frame of each
+in every way of `ast_sim.simulate.jobs.rival`, and asks the run for the same frame. It writes
+benchmarks/results/nested.json and docs/results/nested.md. The scenes lie in `--folder`. Everything runs on one thread.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import warnings
 from collections import Counter
@@ -31,7 +32,6 @@ from benchmarks.studies.phrases import median_error
 
 RESULTS = Path(__file__).parents[1] / "results" / "nested.json"
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "nested.md"
-ANSWERS = 5  # so often is each question asked in a round
 LEVELS = (0.1, 0.05, 0.025, 0.01, 0.005, 0.002)
 EFFORTS = (Effort(0), Effort(0, 1), Effort(0, MOST_NEWTON_STEPS))
 NESTED = frozenset(way.name for way in WAYS if way.newton)
@@ -54,7 +54,7 @@ class Plates:
     scenes: int
     frames: int = 41
     keep: tuple[int, ...] | None = (14, 24, 34)
-    rounds: int = 2
+    rounds: int = 3
     run: bool = False
 
 
@@ -91,24 +91,25 @@ def measured(plates: Plates, folder: Path) -> dict[str, Any]:
             print(
                 f"{plates.title}, round {turn + 1} of {plates.rounds}: {index + 1} of {len(scenes)} scenes", flush=True
             )
-    return {**asdict(plates), "measured": scenes}
+    return {
+        **provenance(f"python -m benchmarks.studies.nested {plates.nodes}"), **asdict(plates), "measured": scenes
+    }  # fmt: skip
 
 
 def _ask(
     model: Any, dataset: ast_sim.Dataset, split: str, index: int, frame: int, known: dict[str, dict[str, Any]]
 ) -> None:
-    """Ask for the frame with every effort in turn; scenes are loaded anew, so nothing is prepared for their meshes."""
-    for _ in range(ANSWERS):
-        for effort in EFFORTS:
-            truth = dataset.load(split, index)
-            question = Question.of(truth, "plate", [frame])
-            began = process_time()
-            (answer,) = answers(model, [question], effort)
-            seconds = process_time() - began
-            failed = answer.failure is not None
-            error = None if failed else relative_error(answer.position[0], truth, frame)
-            figures = {"seconds": None if failed else seconds, "relative_error": error, "failure": answer.failure}
-            _keep_faster(known, effort.text, figures)
+    """Ask for the frame with every effort; the scene is loaded anew each time, so nothing is prepared for its mesh."""
+    for effort in EFFORTS:
+        truth = dataset.load(split, index)
+        question = Question.of(truth, "plate", [frame])
+        began = process_time()
+        (answer,) = answers(model, [question], effort)
+        seconds = process_time() - began
+        failed = answer.failure is not None
+        error = None if failed else relative_error(answer.position[0], truth, frame)
+        figures = {"seconds": None if failed else seconds, "relative_error": error, "failure": answer.failure}
+        _keep_faster(known, effort.text, figures)
 
 
 def _keep_faster(known: dict[str, dict[str, Any]], name: str, figures: dict[str, Any]) -> None:
@@ -128,9 +129,10 @@ def cheapest(scene: dict[str, Any], error: float, nested: bool) -> tuple[str, fl
 
 
 def page(results: dict[str, Any]) -> str:
-    names = set(results["sets"][0]["measured"][0]["ways"])
-    introduction = _INTRODUCTION.format(both=len(names), plain=len(names - NESTED), processor=results["processor"])
-    return "\n".join([introduction, *(line for plates in results["sets"] for line in _section(plates))])
+    shown = [results[str(plates.nodes)] for plates in SETS if str(plates.nodes) in results]
+    names = set(shown[0]["measured"][0]["ways"])
+    introduction = _INTRODUCTION.format(both=len(names), plain=len(names - NESTED), processor=shown[0]["processor"])
+    return "\n".join([introduction, *(line for plates in shown for line in _section(plates))])
 
 
 _INTRODUCTION = """# The solver at its best: nested iteration
@@ -240,21 +242,25 @@ def _ratio(ratios: Sequence[float]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("nodes", nargs="*", type=int, metavar="NODES", help="sizes of plates (default: all)")
     parser.add_argument("--folder", type=Path, default=Path("build/nested"), help="scenes (default: build/nested)")
-    folder = parser.parse_args(arguments).folder
+    asked = parser.parse_args(arguments)
+    unknown = set(asked.nodes) - {plates.nodes for plates in SETS}
+    if unknown:
+        parser.error(f"no plates of {sorted(unknown)} nodes: choose from {[plates.nodes for plates in SETS]}")
     import torch  # after ast_sim, which says how its threads wait
 
     torch.set_num_threads(1)
     os.environ["OMP_NUM_THREADS"] = "1"  # of the generator's and the solver's processes
     ast_sim.keep_memory()
+    results = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of Newton steps that do not end: their errors count
-        sets = []
         for plates in SETS:
-            sets.append(measured(plates, folder))
-            results = {**provenance("python -m benchmarks.studies.nested"), "sets": sets}
-            write_json(RESULTS, results)
-            write_text(PAGE, page(results) + "\n")
+            if not asked.nodes or plates.nodes in asked.nodes:
+                results[str(plates.nodes)] = measured(plates, asked.folder)
+                write_json(RESULTS, results)
+                write_text(PAGE, page(results) + "\n")
 
 
 if __name__ == "__main__":

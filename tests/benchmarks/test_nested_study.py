@@ -22,18 +22,18 @@ def one_thread(monkeypatch):
 def test_a_scene_from_end_to_end(tmp_path, monkeypatch, one_thread):
     plates = nested.Plates("Small plates", 100, "test", 1, frames=5, keep=None, rounds=1, run=True)
     monkeypatch.setattr(nested, "SETS", (plates,))
-    monkeypatch.setattr(nested, "ANSWERS", 1)
     monkeypatch.setattr(nested, "RESULTS", tmp_path / "results" / "nested.json")
     monkeypatch.setattr(nested, "PAGE", tmp_path / "nested.md")
-    nested.main(["--folder", str(tmp_path)])
-    (plates,) = json.loads(nested.RESULTS.read_text())["sets"]
-    (scene,) = plates["measured"]
+    nested.main(["100", "--folder", str(tmp_path)])
+    (scene,) = json.loads(nested.RESULTS.read_text())["100"]["measured"]
     assert (
         len(scene["ways"]) == 32
         and len(nested.NESTED) == 18
         and list(scene["answers"]) == [effort.text for effort in nested.EFFORTS]
     )
     assert nested.cheapest(scene, 0.1, nested=True)[1] <= nested.cheapest(scene, 0.1, nested=False)[1]
+    with pytest.raises(SystemExit):
+        nested.main(["400"])
     text = nested.PAGE.read_text()
     assert "Scenes: 1, of the split test, measured once." in text and text.count("| 0.5 % |") == 1
     assert f"| {nested.EFFORTS[1].text} |" in text
