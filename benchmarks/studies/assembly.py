@@ -27,7 +27,7 @@ from ast_sim.inference.evaluation.asked_frame import asked_frames, relative_erro
 from ast_sim.simulate.jobs.rival import deepest_frame
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
-from benchmarks.studies.phrases import beside_solver, over_the_scenes, times_as_long
+from benchmarks.studies.phrases import beside_solver, over_the_scenes, settings_tried, times_as_long
 from benchmarks.studies.validation_curve import curve_line, minutes_per_step, validation_curve
 
 ROOT = Path(__file__).parents[2]
@@ -165,7 +165,8 @@ def page(results: dict[str, Any]) -> str:
         "pays after",
     ]
     together = ["product", "frames", "error", "reaction", "answer", "solver"]
-    lines = [_INTRODUCTION, *_head(alone, texts=2), *map(_alone, shown)]
+    introduction = _INTRODUCTION.format(settings=settings_tried(shown))
+    lines = [introduction, *_head(alone, texts=2), *map(_alone, shown)]
     lines += [_TOGETHER, *_head(together, texts=1), *map(_together, shown)]
     return "\n".join([*lines, *(line for found in shown for line in _section(found))])
 
@@ -198,7 +199,7 @@ Each product of `examples` was generated, trained and asked for frames of test s
 error of the displacement on the free nodes at the deepest frame, relative to the displacement (mean and standard
 error). "Reaction" is the error of the force that moves the tool, in the last frame. "Largest stress" is the error of
 the largest von Mises stress. The solver goes to the same frame at its own stop test: straight in one, two or four load
-steps and frame by frame, whichever is fastest. "Fastest way" is the fastest of 13 settings whose error is at most the
+steps and frame by frame, whichever is fastest. "Fastest way" is the fastest of {settings} whose error is at most the
 answer's: looser stop tests, coarser meshes, and the same Newton steps without a model. All times count what is prepared
 for a mesh. An answer's time is the median over the test scenes; the solver's are medians over the scenes where it was
 run (ten; one of 6,000 nodes). "Pays after" so many questions, the time that the answers saved is the time of the

@@ -23,7 +23,7 @@ from ast_sim.inference.evaluation.asked_frame import asked_frames
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
-from benchmarks.studies.phrases import beside_solver, over_the_scenes
+from benchmarks.studies.phrases import beside_solver, over_the_scenes, settings_tried
 from benchmarks.studies.validation_curve import curve_line, minutes_per_step, validation_curve
 
 RESULTS = Path(__file__).parents[1] / "results" / "jumps.json"
@@ -166,7 +166,8 @@ def _turned(run: ast_sim.Run, dataset: ast_sim.Dataset, effort: Effort) -> dict[
 def page(results: dict[str, Any]) -> str:
     """The page of all rows that have a result."""
     shown = {name: results[name] for name in ROWS if name in results}
-    return "\n".join([_INTRODUCTION, *_table(shown), *(line for found in shown.values() for line in _section(found))])
+    introduction = _INTRODUCTION.format(settings=settings_tried(shown.values()))
+    return "\n".join([introduction, *_table(shown), *(line for found in shown.values() for line in _section(found))])
 
 
 _INTRODUCTION = """# Any frame in one jump
@@ -187,7 +188,7 @@ small; where they do not end, the page says so.
 
 The solver goes from rest to the same frame, on one thread: straight in one, two or four load steps and frame by frame,
 whichever is fastest. What it prepares for a mesh is counted, too; the meshing is not. "Solver" is its time at its own
-stop test. For "cheapest" 13 settings are tried in each scene: the own stop test and looser ones, a longer range of
+stop test. For "cheapest" {settings} are tried in each scene: the own stop test and looser ones, a longer range of
 contact, meshes of a half and a quarter of the nodes, and 6 or 12 load steps of one Newton step with linearised contact.
 In each scene the fastest counts whose error is at most the answer's; the own stop test always may. Its time divided by
 the answer's time is the ratio of the scene. Seconds are medians, and "times as long" is the median of the ratios over

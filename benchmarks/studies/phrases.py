@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+
+from ast_sim.simulate.jobs.rival import WAYS
 
 SHOWN_WORST = 5
 RESAMPLES = 2000
@@ -37,6 +39,25 @@ def over_the_scenes(scenes: Sequence[dict[str, Any]]) -> str:
         f"Over the scenes: a tenth below {low:.2g} %, the median {middle:.2g} %, a tenth above {high:.2g} %."
         f" Worst: {worst}."
     )
+
+
+def settings_tried(rows: Iterable[dict[str, Any]]) -> str:
+    """In how many settings the solver was run, such as "13 settings": rows may be older than some of its ways."""
+    titles: dict[str, list[str]] = {}
+    for row in rows:
+        ways = {name for scene in row["scenes"] if scene["solver"] for name in scene["solver"]["ways"]}
+        if ways:
+            titles.setdefault(_settings(ways), []).append(row["row"]["title"])
+    first, *others = sorted(titles, key=lambda text: int(text.split()[0])) or [_settings({way.name for way in WAYS})]
+    if not others:
+        return first
+    later = "; ".join(f"{text.replace(' settings', '')} for {', '.join(titles[text])}" for text in others)
+    return f"{first} ({later})"
+
+
+def _settings(ways: set[str]) -> str:
+    nested = any(way.name in ways for way in WAYS if way.newton)
+    return f"{len(ways)} settings" + (", nested iteration among them," if nested else "")
 
 
 def times_as_long(taken: Sequence[float], ratios: Sequence[float]) -> str:

@@ -10,6 +10,7 @@ import toy
 from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import Dataset, generate
+from ast_sim.figures import WayFigures
 from ast_sim.inference import jump
 from ast_sim.inference.effort import Effort, EffortErrors, cheapest_good, mean_errors, newton_steps
 from ast_sim.inference.evaluation.asked_frame import asked_frames, errors_by_effort, lines
@@ -280,4 +281,13 @@ def test_beside_the_solver(tmp_path):
     assert solver.ways[solver.cheapest].relative_error <= 0.01
     assert found.solver.ratio == pytest.approx(solver.seconds / found.scenes[0].seconds)
     assert any("the solver for this frame" in line for line in lines(found))
+    assert not any("coarser mesh" in line for line in lines(found))
+    halves = {name: way for name, way in solver.ways.items() if "1/2 nodes" in name}
+    assert len(halves) == 13
+    unmeshed = {name: WayFigures(failure="could not be meshed: too thin") for name in halves}
+    scene = replace(found.scenes[0], solver=replace(solver, ways={**solver.ways, **unmeshed}))
+    assert lines(replace(found, scenes=(scene,)))[-1] == (
+        "  in 1 of 1 scenes the solver has no coarser mesh to begin on, also not for nested iteration: could not be"
+        " meshed: too thin"
+    )
     json.dumps(asdict(found), allow_nan=False)

@@ -24,7 +24,7 @@ from ast_sim.inference.question import Question
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.models.simulator import Simulator
 from ast_sim.scene import Trajectory
-from ast_sim.simulate.jobs.rival import Rivals, cheapest, deepest_frame, rivals
+from ast_sim.simulate.jobs.rival import UNMESHED, Rivals, cheapest, deepest_frame, rivals
 from ast_sim.support.errors import ConfigError, SimulationError
 
 
@@ -152,7 +152,21 @@ def lines(asked: AskedFigures) -> list[str]:
                 f"  {what}: {1000 * beside.seconds:.3g} ms, {beside.ratio:.3g} times as long (medians of"
                 f" {beside.scenes} scenes, one thread)"
             )
-    return told
+    return told + _unmeshed(asked.scenes)
+
+
+def _unmeshed(scenes: Iterable[AskedScene]) -> list[str]:
+    """In how many scenes the solver has no coarser mesh, so that ways which begin on one are missing, and why."""
+    solvers = [scene.solver for scene in scenes if scene.solver is not None]
+    failures = [[way.failure for way in solver.ways.values() if way.failure is not None] for solver in solvers]
+    reasons = [next((why for why in each if why.startswith(UNMESHED)), None) for each in failures]
+    without = [why for why in reasons if why is not None]
+    if not without:
+        return []
+    return [
+        f"  in {len(without)} of {len(solvers)} scenes the solver has no coarser mesh to begin on, also not for nested"
+        f" iteration: {without[0]}"
+    ]
 
 
 def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: Effort) -> AskedScene:

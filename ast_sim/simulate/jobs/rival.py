@@ -2,7 +2,8 @@
 
 Such a user need not solve all frames before. The solver goes from rest to the wanted frame, straight, in a few load
 steps, and frame by frame; the fastest counts. It is run in several ways that trade accuracy for time: looser stop
-tests, a longer range of contact, coarser meshes, Newton steps with linearised contact. `cheapest` finds the fastest way
+tests, a longer range of contact, coarser meshes, Newton steps with linearised contact, and nested iteration: a coarse
+solution is carried over to the mesh of the dataset and Newton steps correct it there. `cheapest` finds the fastest way
 that is as accurate as the model.
 Each scene is solved in a process of its own, on one thread and without torch.
 """
@@ -32,6 +33,7 @@ from ast_sim.support.errors import ConfigError, SimulationError
 RIVAL_MODULE = "ast_sim.simulate.jobs.rival_worker"
 OUTCOMES, POSITIONS = "outcomes.json", "positions.npz"
 MOST_ITERATIONS = 1000
+UNMESHED = "could not be meshed"  # with why, of ways that need a coarser mesh where there is none
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,8 @@ class Way:
         tolerance: factor of the stop test, `SolverSettings.force_tolerance`.
         linearised: so many load steps, each of one Newton step with linearised contact, and one more step at the end.
             0: the bundled solver, with barriers and to its stop test.
+        newton: the solution is carried over to the mesh of the dataset, and so many Newton steps with linearised
+            contact follow there, as after a model. In them, surfaces have slid as `NewtonSteps.step` supposes.
     """
 
     name: str
@@ -52,8 +56,20 @@ class Way:
     dhat: float = 1.0
     tolerance: float = 1.0
     linearised: int = 0
+    newton: int = 0
 
 
+_NESTED = tuple(
+    Way(
+        f"{share} nodes, {solution}, {newton} Newton step{'s' * (newton > 1)}",
+        nodes=nodes,
+        linearised=linearised,
+        newton=newton,
+    )
+    for share, nodes in (("1/2", 0.5), ("1/4", 0.25))
+    for solution, linearised in (("own stop test", 0), ("6 linearised steps", 6), ("12 linearised steps", 12))
+    for newton in (1, 2, 3)
+)
 WAYS = (
     Way("own stop test"),
     Way("10x looser", tolerance=10),
@@ -68,6 +84,8 @@ WAYS = (
     Way("12 linearised steps", linearised=12),
     Way("1/2 nodes, 6 linearised steps", nodes=0.5, linearised=6),
     Way("1/2 nodes, 12 linearised steps", nodes=0.5, linearised=12),
+    Way("24 linearised steps", linearised=24),
+    *_NESTED,
 )
 STARTS = (1, 2, 4, 0)
 
@@ -79,14 +97,15 @@ class Outcome:
     Attributes:
         way: how the solver was run.
         failure: why there is no solution, such as "could not be meshed: ..."; empty if there is one.
-        nodes: nodes of the scene, obstacles included.
+        nodes: nodes of the mesh that was solved, obstacles included; of nested iteration, of the coarse one.
         start: the load steps that were planned, 0: one for each frame. A step that did not converge was halved, and
             steps then grew again.
         seconds: processor time of the solution on one thread, with that of the steps that did not converge, but
-            without meshing and setting up. The smallest of all repeats; infinite without a mesh.
-        setup_seconds: processor time in which the solver was set up for the mesh.
+            without meshing and setting up. The smallest of all repeats; infinite without a mesh. Nested iteration: with
+            the transfer and the Newton steps that follow.
+        setup_seconds: processor time in which the solver was set up for the mesh; of nested iteration, for both.
         mesh_seconds: processor time of the meshing; 0 for the mesh of the dataset.
-        load_steps, newton_iterations, halvings: how many of them the solution took.
+        load_steps, newton_iterations, halvings: how many of them the solution took, on all its meshes.
         position: [N,3] float64, the nodes of the dataset's mesh in metres; None without a solution. A coarser mesh
             gives the displacement of free nodes by linear interpolation; prescribed nodes are where they should be.
         error: root of the mean square of the distances in metres to the dataset's frame, over the free nodes.

@@ -1,0 +1,77 @@
+"""The study of nested iteration, from end to end on a scene of 100 nodes."""
+
+import json
+
+import pytest
+import torch
+
+from ast_sim.simulate.jobs.rival import WAYS
+from benchmarks.studies import nested
+from benchmarks.studies.phrases import settings_tried
+
+
+@pytest.fixture
+def one_thread(monkeypatch):
+    """The study changes the threads of this process and of others; they are set back."""
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+
+
+def test_a_scene_from_end_to_end(tmp_path, monkeypatch, one_thread):
+    plates = nested.Plates("Small plates", 100, "test", 1, frames=5, keep=None, rounds=1, run=True)
+    monkeypatch.setattr(nested, "SETS", (plates,))
+    monkeypatch.setattr(nested, "RESULTS", tmp_path / "results" / "nested.json")
+    monkeypatch.setattr(nested, "PAGE", tmp_path / "nested.md")
+    nested.main(["100", "--folder", str(tmp_path)])
+    (scene,) = json.loads(nested.RESULTS.read_text())["100"]["measured"]
+    assert (
+        len(scene["ways"]) == 32
+        and len(nested.NESTED) == 18
+        and list(scene["answers"]) == [effort.text for effort in nested.EFFORTS]
+    )
+    assert nested.cheapest(scene, 0.1, nested=True)[1] <= nested.cheapest(scene, 0.1, nested=False)[1]
+    with pytest.raises(SystemExit):
+        nested.main(["400"])
+    text = nested.PAGE.read_text()
+    assert "Scenes: 1, of the split test, measured once." in text and text.count("| 0.5 % |") == 1
+    assert f"| {nested.EFFORTS[1].text} |" in text
+
+
+def test_the_cheapest_of_a_scene():
+    name = min(nested.NESTED)
+    ways = {
+        "own stop test": {"seconds": 3.0, "relative_error": 0.0},
+        "1/2 nodes": {"seconds": 1.0, "relative_error": 0.08},
+        name: {"seconds": 2.0, "relative_error": 0.004},
+        "6 linearised steps": {"seconds": None, "relative_error": None},
+    }
+    scene = {"ways": ways}
+    assert nested.cheapest(scene, 0.1, nested=True) == ("1/2 nodes", 1.0)
+    assert nested.cheapest(scene, 0.01, nested=True) == (name, 2.0)
+    assert nested.cheapest(scene, 0.01, nested=False) == ("own stop test", 3.0)
+    assert nested.cheapest({"ways": {"1/2 nodes": ways["1/2 nodes"]}}, 0.01, nested=True) is None
+    without, with_nested, ratio, names = nested._compared([scene, scene], [0.01, 0.01])
+    assert (without, with_nested, ratio, names) == ("3000 ms", "2000 ms", "1.50 ± 0.00", f"{name}: 2")
+
+
+def test_a_faster_time_is_kept():
+    known = {}
+    for seconds in (None, 2.0, 3.0, 1.0, None):
+        nested._keep_faster(known, "way", {"seconds": seconds})
+    assert known == {"way": {"seconds": pytest.approx(1.0)}}
+
+
+def test_rows_say_in_how_many_settings_the_solver_was_run():
+    def row(title, *names):
+        return {"row": {"title": title}, "scenes": [{"solver": {"ways": dict.fromkeys(names)}}, {"solver": None}]}
+
+    plain = [way.name for way in WAYS[:13]]
+    every = [way.name for way in WAYS]
+    old = [row("A", *plain), row("B", *plain)]
+    assert settings_tried(old) == "13 settings"
+    assert settings_tried([row("C", *every)]) == settings_tried([]) == "32 settings, nested iteration among them,"
+    assert settings_tried([*old, row("C", *every), row("D", *every)]) == (
+        "13 settings (32, nested iteration among them, for C, D)"
+    )
