@@ -168,7 +168,7 @@ def train(args: argparse.Namespace) -> None:
     given = {"train.minutes": args.minutes, "train.processes": args.processes}
     changes = {key: value for key, value in given.items() if value is not None}
     if args.data is None and (args.model or args.preset or args.set or changes or any(files.values())):
-        raise ConfigError("a resumed run keeps its settings: give only --out and --resume, or all settings once more")
+        raise ConfigError("a resumed run keeps its settings: leave out --set and all options but --out and --resume")
     # A resumed run keeps its settings; with a dataset, the given settings are compared with them.
     config = None
     if args.data is not None:

@@ -56,6 +56,15 @@ def test_the_cheapest_of_a_scene():
     assert (without, with_nested, ratio, names) == ("3000 ms", "2000 ms", "1.50 ± 0.00", f"{name}: 2")
 
 
+def test_the_solver_wins_where_the_run_is_slower_or_not_as_accurate():
+    ways = {"own stop test": {"seconds": 0.03, "relative_error": 0.0}}
+    answers = {"0": {"seconds": 0.02, "relative_error": 0.04}, "1": {"seconds": 0.04, "relative_error": 0.01}}
+    scenes = [{"ways": ways, "answers": answers}, {"ways": ways, "answers": {"0": answers["1"]}}]
+    assert nested._run_at(scenes, 0.05) == ("30 ms in 2", 1)
+    assert nested._run_at(scenes, 0.02) == ("40 ms in 2", 2)
+    assert nested._run_at(scenes, 0.005) == ("none", 2)
+
+
 def test_a_faster_time_is_kept():
     known = {}
     for seconds in (None, 2.0, 3.0, 1.0, None):

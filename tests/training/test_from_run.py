@@ -241,7 +241,10 @@ def test_an_error_names_the_file(tmp_path, capsys, text, message):
 def test_a_resumed_run_takes_neither(folder, capsys):
     for option in ("--config", "--from"):
         assert main(["train", "--out", str(folder / "source"), "--resume", option, str(folder / "source")]) == 2
-        assert "a resumed run keeps its settings: give only --out and --resume" in capsys.readouterr().err
+        assert (
+            "a resumed run keeps its settings: leave out --set and all options but --out and --resume"
+            in capsys.readouterr().err
+        )
 
 
 def test_a_settings_file_that_is_a_pipe_is_refused_at_once(tmp_path):

@@ -18,7 +18,7 @@ from ast_sim.simulate.jobs.samples import draw_sample
 from ast_sim.simulate.own_assembly.parameters import completed
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.simulate.shapes.parts import volumes
-from ast_sim.support.errors import SimulationError
+from ast_sim.support.errors import ConfigError, SimulationError
 
 STEP = """
 import gmsh, sys
@@ -261,13 +261,13 @@ def test_other_contents_are_another_dataset(tmp_path):
     counts = {"train": 1, "valid": 0, "test": 0, "workers": 1, "progress": False}
     generate("assembly", out, spec=path, **counts)
     write_box(tmp_path / "punch.vtu", (3, 3, 5.3), (7, 7, 8), (2, 2, 2))
-    with pytest.raises(SimulationError, match="holds other data .spec: files: punch.vtu"):
+    with pytest.raises(ConfigError, match="holds other data .spec: files: punch.vtu"):
         generate("assembly", out, spec=path, **counts)
     with Dataset(out) as data:
         info = data.info
-    with pytest.raises(SimulationError, match="SPEC.toml or a file that it names differs from what a.h5 was made of"):
+    with pytest.raises(ConfigError, match="SPEC.toml or a file that it names differs from what a.h5 was made of"):
         recipe_of("a.h5", info, path)
-    with pytest.raises(SimulationError, match="a.h5 was made of a specification: say where to find that"):
+    with pytest.raises(ConfigError, match="a.h5 was made of a specification: say where to find that"):
         recipe_of("a.h5", info)
 
 
@@ -304,7 +304,7 @@ def test_the_solver_goes_straight_to_a_frame(tmp_path):
     assert found.frame == 2 and own.converged and coarse.converged, (own.failure, coarse.failure)
     assert own.relative_error < 0.02 and own.relative_error < coarse.relative_error < 0.8
     assert coarse.nodes < 0.75 * own.nodes
-    with pytest.raises(SimulationError, match="was made of a specification: say where to find that"):
+    with pytest.raises(ConfigError, match="was made of a specification: say where to find that"):
         rivals(out, "test", [0], progress=False)
 
 
