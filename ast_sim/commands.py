@@ -186,7 +186,8 @@ def predict(args: argparse.Namespace) -> None:
     _check_output(args, args.out, [args.scene], "a prediction", *SUFFIXES)
     moves = dict(map(parse_move, args.move))
     run = _open_run(args.run_folder)
-    wanted = {"frames": args.frames, "effort": run.effort.asked(args.corrections, args.newton_steps), "throw": False}
+    effort = run.effort.asked(args.corrections, args.newton_steps)
+    wanted = {"frames": args.frames, "effort": effort, "error": args.error, "throw": False}
     if args.scene.suffix == ".toml":
         _predict_spec(run, args, wanted)
         return

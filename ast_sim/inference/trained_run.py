@@ -17,7 +17,7 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.importers.scene_mesh import SceneMesh
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.assembly_questions import ask
-from ast_sim.inference.calibration import Calibration
+from ast_sim.inference.calibration import Calibration, promised_effort
 from ast_sim.inference.effort import Effort, EffortErrors
 from ast_sim.inference.evaluation.evaluate import evaluate
 from ast_sim.inference.evaluation.evaluated_run import Evaluation
@@ -126,6 +126,7 @@ class Run:
         nodes: int | None = None,
         frames: Frames | None = None,
         effort: Effort | None = None,
+        error: float | None = None,
         num_frames: int | None = None,
         stress: np.ndarray | None = None,
         name: str = "scene",
@@ -141,25 +142,23 @@ class Run:
             scene: a scene, with lengths in the run's unit, or what `read_scene` returns. Or a `Trajectory`: its
                 prescribed nodes give the motion, its first frames the start. Then leave motion, num_frames and stress
                 out.
-            motion: the motion of the prescribed nodes: rigid motions by body, such as {1: (0, 0, -0.01)}; or positions
-                [S, N, 3] of all nodes or [S, P, 3] of the prescribed ones; or a `Motion`.
+            motion: of the prescribed nodes: rigid motions by body, such as {1: (0, 0, -0.01)}; or positions [S, N, 3]
+                of all nodes or [S, P, 3] of the prescribed ones; or a `Motion`.
             spec, parameters, nodes: instead of a scene and a motion, the specification of an assembly, values of its
                 parameters, and about how many nodes (None: by its sizes): spec="SPEC.toml", parameters={"travel": 4.2,
                 "young": {"bumper": 1.5e6}}. Other parameters are in the middle of their ranges.
-            frames: the numbers of the frames that are wanted, such as [-1] for the last one, or a slice; the answer has
-                them in this order. By default all. A model that jumps computes no other frame. With friction ask for
-                [-2, -1]: a body may be in equilibrium in two places, and the frame before says in which.
-            effort: what follows the first call of a model that jumps; by default `self.effort`. Newton steps need
-                tetrahedra and their material; the stress then follows from the material.
-            num_frames: S, only for rigid motions; by default as many as let the prescribed nodes move as far in one
-                frame as in training.
-            stress: [given, N or E, 1], the stress of the given frames in pascal; by default zero. One frame is given,
-                two where there is inertia.
-            name: name of the scene, for messages.
+            frames: numbers of the frames that are wanted, such as [-1], or a slice, in the order of the answer; by
+                default all. A model that jumps computes no other frame. With friction ask for [-2, -1]: a body may be
+                in equilibrium in two places, and the frame before says in which.
+            effort: what follows the first call of a model that jumps; by default `self.effort`. After Newton steps,
+                stress follows from the material.
+            error: a relative error, such as 0.02, that chooses the effort (`Calibration.effort_for`).
+            num_frames: S, only for rigid motions; by default the prescribed nodes move as far in one as in training.
+            stress, name: [given, N or E, 1] in pascal, of the given frames, by default zero; a name for messages.
             throw: raise an error if the prediction fails; else the answer says why in `failure`.
 
         Raises:
-            ConfigError: motion and scene, or scene and run, do not fit, or a specification has a mistake.
+            ConfigError: motion and scene, or scene and run, do not fit; or no effort keeps the error.
             DatasetError: an array has another dtype or shape, or holds numbers that are not finite.
             RolloutError: there is no such frame; or the prediction failed: the error's `answer` has the frames before.
         """
@@ -175,7 +174,8 @@ class Run:
             raise ConfigError("give a scene, or a specification with its parameters and nodes")
         question = new_question(self.settings.model, self.scope, scene, motion, num_frames, name, frames, stress)
         question = dataclasses.replace(question, notes=(*notes, *question.notes))
-        return self._answers([question], effort, began, throw, facts)[0]
+        effort, chosen = promised_effort(self, error, effort, question)
+        return self._answers([question], effort, began, throw, {**facts, **chosen})[0]
 
     def sweep(
         self,

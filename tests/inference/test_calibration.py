@@ -8,7 +8,7 @@ import toy
 from scipy.stats import betabinom
 
 import ast_sim
-from ast_sim.inference.calibration import Calibration, quantile, scales, score
+from ast_sim.inference.calibration import Calibration, Promise, bound, quantile, scales, score
 from ast_sim.inference.effort import Effort
 from ast_sim.support.errors import ConfigError
 
@@ -94,3 +94,54 @@ def test_what_cannot_be_calibrated_is_refused(calibrated):
         ast_sim.calibrate(run, data)
     assert run.calibration == calibrated[2]  # what was known stays known
     assert Calibration.from_json(calibrated[2].to_json()) == calibrated[2]
+
+
+def test_bounds_of_several_efforts_hold_at_once():
+    assert bound(list(range(1, 40)), 4) == 39  # ceil(40 * 0.975) = 39
+    assert bound(list(range(1, 39)), 4) is None  # ceil(39 * 0.975) = 39 of 38
+    assert bound(list(range(1, 40)), 1) == 36  # ceil(40 * 0.9)
+    assert bound([1.0] * 38 + [np.inf], 4) is None
+    rng = np.random.default_rng(6)
+    kept = 0
+    for _ in range(2000):
+        errors = rng.lognormal(size=(4, 100))
+        bounds = [bound(list(one), 4) for one in errors]
+        chosen = int(np.argmin(bounds))  # the luckiest of four equal efforts
+        kept += rng.lognormal() <= bounds[chosen]
+    assert kept >= 0.9 * 2000
+
+
+def test_the_cheapest_effort_that_keeps_an_error_is_chosen():
+    promises = (Promise(Effort(), 0.08), Promise(Effort(0, 1), 0.03), Promise(Effort(0, 10), 0.01))
+    known = Calibration(0.5, 60, Effort(), (1.0, 2.0), promises)
+    assert known.effort_for(0.08) == Effort() and known.effort_for(0.05) == Effort(0, 1)
+    assert known.effort_for(0.01) == Effort(0, 10)
+    with pytest.raises(ConfigError, match="0.5 % in 90 % of the scenes: the smallest is 1 %, with .*10 Newton steps"):
+        known.effort_for(0.005)
+    with pytest.raises(ConfigError, match="between 0 and 1, as 0.02 for 2 %"):
+        known.effort_for(2)
+    few = replace(known, promises=(Promise(Effort(), None), Promise(Effort(0, 1), None)))
+    with pytest.raises(ConfigError, match="calibrated with 60 scenes, and needs at least 19"):
+        few.effort_for(0.05)
+    with pytest.raises(ConfigError, match="step by step"):
+        replace(known, promises=()).effort_for(0.05)
+    assert Calibration.from_json(known.to_json()) == known
+
+
+def test_a_prediction_that_asks_for_an_error_makes_the_chosen_effort(calibrated):
+    run, data, result = calibrated
+    with ast_sim.Dataset(data) as dataset:
+        truth = next(t for t in (dataset["test"][i] for i in range(24)) if not run.predict(t).notes)
+    run.calibration = None
+    try:
+        with pytest.raises(ConfigError, match="before it is calibrated: ast-sim calibrate RUN DATA"):
+            run.predict(truth, error=0.5)
+        run.calibration = replace(result, promises=(Promise(Effort(), 0.4),))
+        with pytest.raises(ConfigError, match="an error chooses the effort"):
+            run.predict(truth, error=0.5, effort=Effort())
+        answer = run.predict(truth, error=0.5)
+    finally:
+        run.calibration = result
+    assert answer.source["effort"] == Effort().text and answer.source["asked_error"] == 0.5
+    assert answer.how_far[0] == "effort: 0 corrections, the cheapest that keeps 50 % in 90 % of scenes like it"
+    assert np.array_equal(answer.position, run.predict(truth, effort=Effort()).position)
