@@ -263,11 +263,9 @@ def _choices(run: Run) -> list[Effort]:
 
 def _errors(run: Run, truth: Trajectory, choices: Sequence[Effort]) -> dict[Effort, float]:
     """The relative error of each effort at the deepest frame of a scene; infinite if the prediction failed."""
-    from ast_sim.inference.evaluation.asked_frame import errors_by_effort
-
     if not choices:
         return {}
     most = Effort(max(one.corrections for one in choices), max(one.newton_steps for one in choices))
-    measured = {one.effort: one.error for one in errors_by_effort(run.model, truth, most)}
+    measured = {one.effort: one.error for one in run.errors_by_effort(truth, most)}
     known = {effort: measured.get(effort) for effort in choices}
     return {effort: math.inf if error is None else error for effort, error in known.items()}

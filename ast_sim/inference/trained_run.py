@@ -19,6 +19,7 @@ from ast_sim.inference.answer import Answer
 from ast_sim.inference.assembly_questions import ask
 from ast_sim.inference.calibration import Calibration, promised_effort
 from ast_sim.inference.effort import Effort, EffortErrors
+from ast_sim.inference.evaluation.asked_frame import errors_by_effort
 from ast_sim.inference.evaluation.evaluate import evaluate
 from ast_sim.inference.evaluation.evaluated_run import Evaluation
 from ast_sim.inference.predict import Motions, in_domain, new_question
@@ -278,6 +279,10 @@ class Run:
                     stacklevel=3,
                 )
         return told
+
+    def errors_by_effort(self, truth: Trajectory, most: Effort) -> list[EffortErrors]:
+        """The errors at the deepest frame of a known scene, by effort up to `most`; empty where nothing moves."""
+        return errors_by_effort(self.model, truth, most)
 
     def _expected_error(self, effort: Effort) -> float | None:
         """The mean error that validation scenes had with this effort; with more Newton steps than were measured, that
