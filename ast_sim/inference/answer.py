@@ -106,7 +106,8 @@ class Answer:
         told = []
         if "asked_error" in self.source:
             asked = f"{100 * self.source['asked_error']:.3g} %"
-            told.append(f"effort: {self.source['effort']}, the cheapest that keeps {asked} in 90 % of scenes like it")
+            kept = f"the cheapest that keeps {asked} at the deepest frame in 90 % of scenes like it"
+            told.append(f"effort: {self.source['effort']}, {kept}")
         if self.expected_error is not None:
             percent = f"{100 * self.expected_error:.2g} % of the displacement"
             told.append(f"expected error: {percent}, as in the validation scenes at their deepest frame")

@@ -113,7 +113,7 @@ class Calibration:
             why = (
                 f"it was calibrated with {self.scenes} scenes, and needs at least {least}"
                 if self.promises
-                else ("it predicts step by step, so there is no effort to choose")
+                else "its calibration holds no errors; calibrate it again (a model that goes step by step has none)"
             )
             raise ConfigError(f"the run can promise no error: {why}")
         smallest, effort = min(known, key=lambda one: one[0])
@@ -122,18 +122,24 @@ class Calibration:
             f" smallest is {100 * smallest:.3g} %, with {effort.text}"
         )
 
+    def unlike(self, scene: Scene, notes: Sequence[str]) -> str:
+        """Why the calibration scenes say nothing of a scene with `notes`; empty if they do."""
+        spacing = spacing_of(scene)
+        low, high = self.spacing
+        if notes:
+            return "the scene lies outside the ranges of the training"
+        if not (1 - LEEWAY) * low <= spacing <= (1 + LEEWAY) * high:
+            return f"the mesh edges are {spacing:.3g} long, in the calibration scenes {low:.3g} to {high:.3g}"
+        return ""
+
     def band(self, answer: Answer, effort: Effort, notes: Sequence[str]) -> np.ndarray | None:
         """[S] how far from the truth a free node may be in each frame; None, and a warning that says why, where nothing
         is known: with another effort, for a scene with `notes`, on another mesh."""
-        spacing = spacing_of(answer.scene)
-        low, high = self.spacing
         if effort != self.effort:
             why = f"the run was calibrated with {self.effort.text}"
-        elif notes:
-            why = "the scene lies outside the ranges of the training"
-        elif not (1 - LEEWAY) * low <= spacing <= (1 + LEEWAY) * high:
-            why = f"the mesh edges are {spacing:.3g} long, in the calibration scenes {low:.3g} to {high:.3g}"
         else:
+            why = self.unlike(answer.scene, notes)
+        if not why:
             return self.quantile * scales(answer.scene, answer.position)
         warnings.warn(f"{answer.name}: no band: {why}", stacklevel=4)
         return None
@@ -150,9 +156,11 @@ def promised_effort(
         raise ConfigError("an error chooses the effort: give one of them")
     if run.calibration is None:
         raise ConfigError(f"{run.path} promises no error before it is calibrated: ast-sim calibrate RUN DATA")
-    if question.notes:
-        warnings.warn(f"{question.name}: outside the ranges of the training no error is promised", stacklevel=3)
     chosen = run.calibration.effort_for(error)
+    why = run.calibration.unlike(question.scene, question.notes)
+    if why:
+        warnings.warn(f"{question.name}: no error is promised: {why}", stacklevel=3)
+        return chosen, {"effort": chosen.text}
     return chosen, {"asked_error": error, "effort": chosen.text}
 
 

@@ -123,7 +123,7 @@ def test_the_cheapest_effort_that_keeps_an_error_is_chosen():
     few = replace(known, promises=(Promise(Effort(), None), Promise(Effort(0, 1), None)))
     with pytest.raises(ConfigError, match="calibrated with 60 scenes, and needs at least 19"):
         few.effort_for(0.05)
-    with pytest.raises(ConfigError, match="step by step"):
+    with pytest.raises(ConfigError, match="calibrate it again"):
         replace(known, promises=()).effort_for(0.05)
     assert Calibration.from_json(known.to_json()) == known
 
@@ -140,8 +140,15 @@ def test_a_prediction_that_asks_for_an_error_makes_the_chosen_effort(calibrated)
         with pytest.raises(ConfigError, match="an error chooses the effort"):
             run.predict(truth, error=0.5, effort=Effort())
         answer = run.predict(truth, error=0.5)
+        run.calibration = replace(run.calibration, spacing=(1.0, 2.0))
+        with pytest.warns(UserWarning, match="no error is promised: the mesh edges are"):
+            unlike = run.predict(truth, error=0.5)
+        assert "asked_error" not in unlike.source and not any("cheapest" in line for line in unlike.how_far)
     finally:
         run.calibration = result
     assert answer.source["effort"] == Effort().text and answer.source["asked_error"] == 0.5
-    assert answer.how_far[0] == "effort: 0 corrections, the cheapest that keeps 50 % in 90 % of scenes like it"
+    assert (
+        answer.how_far[0]
+        == "effort: 0 corrections, the cheapest that keeps 50 % at the deepest frame in 90 % of scenes like it"
+    )
     assert np.array_equal(answer.position, run.predict(truth, effort=Effort()).position)
