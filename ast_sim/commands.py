@@ -164,17 +164,17 @@ def train(args: argparse.Namespace) -> None:
     if args.data is None and not args.resume:
         raise ConfigError("name the dataset to train on, or give --resume to go on with the run in --out")
     files = {"config": args.config, "from_run": getattr(args, "from")}
-    if args.data is None and (args.model or args.preset or args.set or args.minutes or any(files.values())):
+    if args.data is None and any((args.model, args.preset, args.set, args.state, args.minutes, *files.values())):
         raise ConfigError(
-            "a resumed run keeps its settings: leave --model, --preset, --config, --from, --minutes and --set out"
+            "a resumed run keeps its settings: leave --model, --preset, --config, --from, --minutes, --state, --set out"
         )
     # A resumed run keeps its settings; with a dataset, the given settings are compared with them.
     config = None
     if args.data is not None:
         changes = {} if args.minutes is None else {"train.minutes": args.minutes}
+        changes |= {"model.state": tuple(args.state)} if args.state else {}
         config = configure(args.data, args.preset, args.set, args.model, **files, changes=changes)
-    steps = args.profile or 0
-    start_training(args.out, config, resume=args.resume, profile_steps=steps, from_run=files["from_run"])
+    start_training(args.out, config, args.resume, args.profile or 0, files["from_run"])
     if args.profile is None:
         print(f"run: {args.out}")
 
@@ -185,6 +185,8 @@ def predict(args: argparse.Namespace) -> None:
     from ast_sim.prescribed_motion import parse_move
 
     _check_output(args, args.out, [args.scene], "a prediction", *SUFFIXES)
+    if args.forces is not None:
+        _check_output(args, args.forces, [args.scene, args.out], "a table of forces", ".csv")
     moves = dict(map(parse_move, args.move))
     run = _open_run(args.run_folder)
     wanted = {"frames": args.frames, "effort": run.effort.asked(args.corrections, args.newton_steps), "throw": False}
@@ -261,6 +263,8 @@ def _save(answer: Any, args: argparse.Namespace, truth: Any) -> None:
     steps = len(answer.step_seconds)
     print(f"{args.out}: {steps} frame{'' if steps == 1 else 's'} predicted in {1000 * answer.seconds:.3g} ms")
     print("".join(f"{line}\n" for line in answer.how_far), end="")
+    if args.forces is not None:
+        answer.save_forces(args.forces)
     if args.check:
         print(printable(str(answer.check())))
 
@@ -280,15 +284,9 @@ def _scene(args: argparse.Namespace) -> Any:
     """The scene of a mesh; prints its description."""
     from ast_sim.importers.scene_mesh import parse_material, read_scene
 
-    read = read_scene(
-        args.scene,
-        obstacles=args.obstacle,
-        clamps=args.clamp,
-        body_field=args.body_field,
-        type_field=args.type_field,
-        materials=dict(map(parse_material, args.material)) or None,
-        corners=args.corners,
-    )
+    marks = {"obstacles": args.obstacle, "clamps": args.clamp, "corners": args.corners}
+    fields = {"body_field": args.body_field, "type_field": args.type_field}
+    read = read_scene(args.scene, **marks, **fields, materials=dict(map(parse_material, args.material)) or None)
     print("\n".join(map(printable, read.description)))
     return read.scene
 
