@@ -23,6 +23,8 @@ from ast_sim.support.errors import ConfigError
 
 Use = Callable[[Normalizer, Tensor], Any]  # what becomes of the values of an input: normalised, or observed
 
+FIELD = "field "  # stands before the name of a named field among the losses
+
 _CPU_ONLY = "models run on the CPU only"
 
 
@@ -180,9 +182,13 @@ class Simulator(nn.Module):
         losses["spread"] = part * motion.detach().std(dim=0).mean() if len(motion) > 1 else motion.new_ones(())
         for output, normalizer in self._outputs:
             rows = self._counting(output, batch).nonzero()[:, 0]
+            if output.name not in prediction.fields:
+                raise ConfigError(
+                    f"model.state: the model {self.config.name} does not predict {output.name}: leave it out"
+                )
             predicted = prediction.fields[output.name].index_select(0, rows)
             error = predicted - normalizer(target.fields[output.name].index_select(0, rows))
-            key = output.name if output.name == STRESS else f"field {output.name}"
+            key = output.name if output.name == STRESS else f"{FIELD}{output.name}"
             losses[key] = share(len(rows)) * error.square().mean()
             losses["loss"] = losses["loss"] + stress_weight * losses[key]
         return losses

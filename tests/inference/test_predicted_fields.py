@@ -165,3 +165,11 @@ def test_an_evaluation_has_their_errors(run, data):
         size = np.sqrt(np.mean(np.square(truth.fields[name].values[1:, rows], dtype=float)))
         assert figures.relative(name) == pytest.approx(rmse / size, rel=1e-3)
     assert figures.unit("heat flux") == "J/m2" and figures.to_json()["errors"][REACTION]["model"]
+
+
+def test_a_model_that_predicts_the_stress_alone_is_refused(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        Prediction, "of", lambda facts, out, on_elements=None: Prediction(out[:, :3], {"stress": out[:, 3:4]})
+    )
+    with pytest.raises(ConfigError, match="the model transolver does not predict PEEQ: leave it out"):
+        ast_sim.train(data, tmp_path / "run", model="transolver", steps=1, state=("PEEQ",))
