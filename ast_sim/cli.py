@@ -224,7 +224,8 @@ def _add_train(train: _Parser) -> None:
         "--from RUN": "start with the weights and the settings of another run, to train it longer or on other data",
     }
     _add_each(train, files, type=path)
-    _add_each(train, {"--set k=v": "change a setting; may be repeated"}, action="append", default=[])
+    states = {"--state NAME": "field of the dataset to predict, such as PEEQ, or reaction; may be repeated"}
+    _add_each(train, {**states, "--set k=v": "change a setting; may be repeated"}, action="append", default=[])
     _add_each(
         train, {"--minutes M": "train so long: 50 steps are timed, then the number of steps is fixed"}, type=float
     )
@@ -258,6 +259,8 @@ def _add_predict(predict: _Parser) -> None:
     _add_each(predict, {"--num-frames N": about}, type=at_least(2))
     about = "say whether the answer is physics: elements turned over, penetration, forces out of balance"
     predict.add_argument("--check", action="store_true", help=about)
+    about = "also write the force and the torque on each body, frame by frame, as a table"
+    _add_each(predict, {"--forces FILE.csv": about}, type=path)
     mesh = predict.add_argument_group("if SCENE is a mesh")
     _add_each(mesh, {"--obstacle BODY": "a rigid body; may be repeated"}, type=int, action="append", default=[])
     marks = {

@@ -165,8 +165,8 @@ def train(args: argparse.Namespace) -> None:
     if args.data is None and not args.resume:
         raise ConfigError("name the dataset to train on, or give --resume to go on with the run in --out")
     files = {"config": args.config, "from_run": getattr(args, "from")}
-    given = {"train.minutes": args.minutes, "train.processes": args.processes}
-    changes = {key: value for key, value in given.items() if value is not None}
+    given = {"train.minutes": args.minutes, "train.processes": args.processes, "model.state": tuple(args.state)}
+    changes = {key: value for key, value in given.items() if value not in (None, ())}
     if args.data is None and (args.model or args.preset or args.set or changes or any(files.values())):
         raise ConfigError("a resumed run keeps its settings: leave out --set and all options but --out and --resume")
     # A resumed run keeps its settings; with a dataset, the given settings are compared with them.
@@ -184,6 +184,8 @@ def predict(args: argparse.Namespace) -> None:
     from ast_sim.prescribed_motion import parse_move
 
     _check_output(args, args.out, [args.scene], "a prediction", *SUFFIXES)
+    if args.forces is not None:
+        _check_output(args, args.forces, [args.scene, args.out], "a table of forces", ".csv")
     moves = dict(map(parse_move, args.move))
     run = _open_run(args.run_folder)
     effort = run.effort.asked(args.corrections, args.newton_steps)
@@ -261,6 +263,8 @@ def _save(answer: Any, args: argparse.Namespace, truth: Any) -> None:
     steps = len(answer.step_seconds)
     print(f"{args.out}: {steps} frame{'' if steps == 1 else 's'} predicted in {1000 * answer.seconds:.3g} ms")
     print("".join(f"{line}\n" for line in answer.how_far), end="")
+    if args.forces is not None:
+        answer.save_forces(args.forces)
     if args.check:
         print(printable(str(answer.check())))
 
@@ -280,15 +284,9 @@ def _scene(args: argparse.Namespace) -> Any:
     """The scene of a mesh; prints its description."""
     from ast_sim.importers.scene_mesh import parse_material, read_scene
 
-    read = read_scene(
-        args.scene,
-        obstacles=args.obstacle,
-        clamps=args.clamp,
-        body_field=args.body_field,
-        type_field=args.type_field,
-        materials=dict(map(parse_material, args.material)) or None,
-        corners=args.corners,
-    )
+    marks = {"obstacles": args.obstacle, "clamps": args.clamp, "corners": args.corners}
+    fields = {"body_field": args.body_field, "type_field": args.type_field}
+    read = read_scene(args.scene, **marks, **fields, materials=dict(map(parse_material, args.material)) or None)
     print("\n".join(map(printable, read.description)))
     return read.scene
 

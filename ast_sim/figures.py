@@ -1,9 +1,10 @@
 """What an evaluation of a run measures, as typed records that are written as JSON.
 
-Errors are root mean square errors of a `quantity` ("displacement" in the unit of length, "stress" in pascal) that a
+Errors are root mean square errors of a `quantity` ("displacement" in the unit of length, "stress" in pascal, or a named
+field in its unit) that a
 `predictor` made ("model", or a trivial one such as "hold_still") over a `horizon` ("one_step": each frame from the true
 frame before it; "rollout_50", "rollout_all": the first 50 frames, all frames from the given ones) on some `nodes`
-("normal", "all"; for the stress "deforming").
+("normal", "all"; for the stress and named fields "deforming", for reactions "prescribed").
 """
 
 from __future__ import annotations
@@ -12,7 +13,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-MAIN_NODES = {"displacement": "normal", "stress": "deforming"}  # of each quantity, where errors are shown first
+from ast_sim.named_field import REACTION
+
+
+def main_nodes(quantity: str) -> str:
+    """Where the errors of a quantity are shown first."""
+    return {"displacement": "normal", REACTION: "prescribed"}.get(quantity, "deforming")
 
 
 @dataclass(frozen=True)
@@ -61,7 +67,7 @@ class SceneFigures:
 
     def error(self, quantity: str, predictor: str = "model", horizon: str = "rollout_all") -> float | None:
         """The error on the main nodes of the quantity; None: it failed or is not known."""
-        row = _row(self.errors, quantity, predictor, horizon, MAIN_NODES[quantity])
+        row = _row(self.errors, quantity, predictor, horizon, main_nodes(quantity))
         return None if row is None else row.rmse
 
 
@@ -179,6 +185,7 @@ class Figures:
         asked: the deepest frames.
         speedup: the solver's recorded time for all frames over the model's, both on one thread; None: not known.
         length_unit, stress_unit: of the errors.
+        field_units: of the errors of each named field.
         threads: of the model.
         origin: the run, the data, the command, the processor and the like.
     """
@@ -193,17 +200,26 @@ class Figures:
     length_unit: str
     stress_unit: str
     threads: int
+    field_units: Mapping[str, str] = field(default_factory=dict)
     origin: Mapping[str, Any] = field(default_factory=dict)
 
     def error(
         self, quantity: str, predictor: str = "model", horizon: str = "rollout_all", nodes: str | None = None
     ) -> MeanError | None:
         """The error over all scenes; None: the predictor predicts no such quantity. `nodes`: the main ones if None."""
-        return _row(self.errors, quantity, predictor, horizon, nodes or MAIN_NODES[quantity])
+        return _row(self.errors, quantity, predictor, horizon, nodes or main_nodes(quantity))
 
     def unit(self, quantity: str) -> str:
         """The unit of a quantity's errors."""
-        return self.length_unit if quantity == "displacement" else self.stress_unit
+        return {"displacement": self.length_unit, "stress": self.stress_unit, **self.field_units}[quantity]
+
+    def relative(self, quantity: str) -> float | None:
+        """The model's error of the stress or of a named field over all frames and scenes, over the root mean square of
+        the truth, which is the error of the prediction 0; None: a prediction failed, or the truth is 0."""
+        model, zero = self.error(quantity), self.error(quantity, f"{quantity}_zero")
+        if model is None or zero is None or model.rmse_pooled is None or not zero.rmse_pooled:
+            return None
+        return model.rmse_pooled / zero.rmse_pooled
 
     def to_json(self) -> dict[str, Any]:
         """Dictionaries, lists, texts and numbers. Errors stand by quantity, predictor, horizon and nodes."""

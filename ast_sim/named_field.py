@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,7 +13,24 @@ from ast_sim.support.errors import DatasetError
 
 # The name of the nodal reactions, [S, N, 3] in newton: the forces that act on the nodes from outside.
 REACTION = "reaction"
+STRESS = "stress"  # the name of the von Mises stress among what a model predicts
 LOCATIONS = ("node", "element")
+
+
+class Output(NamedTuple):
+    """A quantity that a model predicts beside the motion.
+
+    Attributes:
+        name: `STRESS`, or the name of a field of the dataset.
+        location: "node" or "element".
+        columns: how many numbers it has in a row.
+        unit: such as "Pa"; empty where it has none.
+    """
+
+    name: str
+    location: str
+    columns: int
+    unit: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +68,23 @@ class NamedField:
         if key == REACTION and (self.location, self.unit, self.values.shape[2]) != ("node", "N", 3):
             raise DatasetError(f"{name}: {REACTION} must have 3 columns at the nodes, in N")
         require_finite(name, key, self.location, self.values)
+
+
+def require_fields(name: str, fields: Mapping[str, NamedField], wanted: Iterable[tuple[str, str, int, str]]) -> None:
+    """Check that a trajectory has the wanted fields, each as in `Output`.
+
+    Raises:
+        DatasetError: one is missing, or is at another place, in another unit or of other columns.
+    """
+    for output in wanted:
+        key, place, columns, unit = output
+        one = fields.get(key)
+        if one is None or (one.location, one.unit, one.values.shape[2]) != (place, unit, columns):
+            has = require_same_fields(name, dict(fields), None)
+            raise DatasetError(
+                f"{name}: needs the field {_listed({key: (place, unit, columns)})}; it has {_listed(has)}: keep it with"
+                " ast-sim convert --field, or train without it"
+            )
 
 
 def require_same_fields(

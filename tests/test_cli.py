@@ -210,7 +210,7 @@ def test_a_failing_prediction_keeps_the_frames_before(trained, tmp_path, capsys,
         prediction = real(self, batch)
         wrong = torch.tensor([name.endswith("frame 3") for name in batch.names])
         rows = wrong.repeat_interleave(batch.graph.node_offsets.diff())
-        return Prediction(torch.where(rows[:, None], torch.inf, prediction.motion), prediction.stress)
+        return Prediction(torch.where(rows[:, None], torch.inf, prediction.motion), prediction.fields)
 
     monkeypatch.setattr(Simulator, "predict", predict)
     data, run = trained

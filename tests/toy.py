@@ -127,7 +127,7 @@ class LinearSimulator(Simulator):
 
     def __init__(self, config: ASTConfig) -> None:
         super().__init__(config)
-        self.map = nn.Linear(12, 3 + (config.data.stress == "node"))
+        self.map = nn.Linear(12, 3 + config.data.output_columns("node"))
         self.dropout = nn.Dropout(0.1)
 
     def observe(self, batch: Batch) -> None:
@@ -138,4 +138,4 @@ class LinearSimulator(Simulator):
         sizes = batch.graph.node_offsets.diff()
         means = torch.cat([part.mean(dim=0).expand(len(part), -1) for part in values.split(sizes.tolist())])
         out: Tensor = self.map(self.dropout(torch.cat([values, means], dim=1)))
-        return Prediction(out[:, :3], out[:, 3:] if self.config.data.stress == "node" else None)
+        return Prediction.of(self.config.data, out)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ast_sim.batches.graph import Graph
 from ast_sim.batches.mirror_and_shift import Placement
+from ast_sim.named_field import REACTION
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +45,7 @@ class Batch:
         position, previous_position, stress: as in `State`.
         boundary_motion: [N, 3], how far the prescribed nodes move from the state to the frame to predict; 0 elsewhere.
         names: for messages, one for each scene: "train/000012 frame 7".
-        wants_stress: False: a model may leave out the stress on elements.
+        wants_elements: False: a model may leave out what it predicts on elements.
         proximity: [N, 5] of these positions, if it was computed ahead; None: a model that wants it computes it.
     """
 
@@ -54,7 +55,7 @@ class Batch:
     boundary_motion: Tensor
     stress: Tensor | None
     names: list[str]
-    wants_stress: bool = True
+    wants_elements: bool = True
     proximity: Tensor | None = None
 
     @staticmethod
@@ -96,23 +97,27 @@ class Target:
     Attributes:
         motion: [N, 3], the increment from the state to the frame to predict. With inertia it is the acceleration
             p_{t+1} - 2 p_t + p_{t-1}. Both are corrected for the noise on p_t.
-        stress: [N, 1] or [E, 1] in the frame to predict, or None.
+        fields: [N or E, *] in the frame to predict, by name: the stress, if there is one, and the named fields.
     """
 
     motion: Tensor
-    stress: Tensor | None
+    fields: dict[str, Tensor]
 
     @staticmethod
     def concatenate(targets: Sequence[Target]) -> Target:
         """Several targets as one."""
-        return Target(_join(targets, "motion"), _join(targets, "stress"))
+        fields = {name: torch.cat([target.fields[name] for target in targets]) for name in targets[0].fields}
+        return Target(torch.cat([target.motion for target in targets]), fields)
 
     def placed(self, placement: Placement) -> Target:
-        """The target of the same scene, mirrored and moved."""
-        return Target(placement.vectors(self.motion), self.stress)
+        """The target of the same scene, mirrored and moved. Reactions are vectors; other fields do not change."""
+        fields = dict(self.fields)
+        if REACTION in fields:
+            fields[REACTION] = placement.vectors(fields[REACTION])
+        return Target(placement.vectors(self.motion), fields)
 
 
-def _join(parts: Sequence[State | Batch | Target], key: str) -> Tensor | None:
+def _join(parts: Sequence[State | Batch], key: str) -> Tensor | None:
     """One attribute of all parts, concatenated; None if they do not have it."""
     values = [getattr(part, key) for part in parts]
     return None if values[0] is None else torch.cat(values)

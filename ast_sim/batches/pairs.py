@@ -15,6 +15,7 @@ from ast_sim.batches.carry import Carrier
 from ast_sim.batches.graph import Graph
 from ast_sim.batches.mirror_and_shift import Placement
 from ast_sim.dataset.reader import Dataset
+from ast_sim.named_field import STRESS, require_fields
 from ast_sim.scene import Scene
 from ast_sim.support.byte_cache import ByteCache, cache_bytes
 from ast_sim.support.errors import DatasetError
@@ -32,12 +33,14 @@ class _Member:
     noisy: [N, 3] float32, 1 where noise is added, else 0: at NORMAL nodes, in a plane scene only in x and y.
     center: [3] float32, the middle of the box around the scene at rest.
     carry: moves a state along with the prescribed nodes; None if frames are predicted step by step.
+    fields: [S, N or E, *] float32 of each named field to predict.
     """
 
     graph: Graph
     noisy: np.ndarray
     center: np.ndarray
     carry: Carrier | None
+    fields: list[np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +102,8 @@ class PairSampler:
 
     Noise, mirroring and shift depend on seed, epoch and pair only, not on the batch of the pair.
 
+    Targets have the stress, if there is one, and the named fields that `fields` tells of as in `Output`.
+
     With `part` = (i, n), `batch` returns the i-th of n equal parts of the whole batch.
 
     Raises:
@@ -120,13 +125,14 @@ class PairSampler:
         jumps: bool = False,
         mirror: tuple[str, ...] = (),
         shift: float = 0.0,
+        fields: tuple[tuple[str, str, int, str], ...] = (),
     ) -> None:
         self.batch_size, self.seed, self.noise = batch_size, seed, noise
         self.left = np.float32(1 - gamma)  # share of the noise that stays in the target
         self._dataset, self._split, self.part = dataset, split, part
         self._make_graph, self.dynamic = make_graph, dynamic
         self.first_frame = 1 if dynamic else 0  # the least t of a pair: the acceleration needs a frame before it
-        self._jumps = jumps
+        self._jumps, self._fields = jumps, fields
         self._mirrored = np.array([axis in mirror for axis in "xyz"])
         self._shift = np.float32(shift)
         frames = np.array([dataset.num_frames(split, i) for i in range(dataset.count(split))], np.int64)
@@ -201,7 +207,10 @@ class PairSampler:
         (after,), next_stress = self._dataset.frames(self._split, pair.index, frame, frame + 1)
         position, previous, motion = (self._jump if jumps else self._step)(pair, member, before, after)
         state = State(torch.from_numpy(position), previous, None if stress is None else torch.tensor(stress[-1]))
-        target = Target(torch.from_numpy(motion), None if next_stress is None else torch.tensor(next_stress[0]))
+        fields = {} if next_stress is None else {STRESS: torch.tensor(next_stress[0])}
+        for (key, *_), values in zip(self._fields, member.fields, strict=True):
+            fields[key] = torch.tensor(values[frame])
+        target = Target(torch.from_numpy(motion), fields)
         names = [f"{name} frame {frame if jumps else source}"]
         batch = Batch.build(member.graph, state, torch.tensor(after), names)
         return batch.placed(pair.placement), target.placed(pair.placement)
@@ -247,4 +256,12 @@ class PairSampler:
             position, _ = self._dataset.frames(self._split, index, 0, self._dataset.num_frames(self._split, index))
             noisy[:, 2] *= position[:, :, 2].any()
         center = (scene.rest_position.min(0) + scene.rest_position.max(0)) / 2
-        return _Member(self._make_graph(scene), noisy, center, Carrier(scene) if self._jumps else None)
+        carry = Carrier(scene) if self._jumps else None
+        return _Member(self._make_graph(scene), noisy, center, carry, self._read_fields(index))
+
+    def _read_fields(self, index: int) -> list[np.ndarray]:
+        """The values of the named fields to predict, [S, N or E, *] each."""
+        names = [key for key, *_ in self._fields]
+        read = self._dataset.fields(self._split, index, names) if names else {}
+        require_fields(f"{self._dataset.path}: {self._split}/{index:06d}", read, self._fields)
+        return [read[key].values for key in names]

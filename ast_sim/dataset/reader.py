@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from itertools import chain
 from pathlib import Path
 from typing import Self
@@ -173,8 +173,9 @@ class Dataset:
         position, stress = self._frames[key]
         return position[start:stop], None if stress is None else stress[start:stop]
 
-    def load(self, split: str, index: int) -> Trajectory:
-        """A trajectory without its `cauchy_stress` and `fields`, which are large; `dataset[split][index]` has them."""
+    def load(self, split: str, index: int, fields: Collection[str] = ()) -> Trajectory:
+        """A trajectory without its `cauchy_stress`, and with those `fields` that are named, if it has them: all are
+        large; `dataset[split][index]` has all."""
         position, stress = self.frames(split, index, 0, self.num_frames(split, index))
         frames, times = self._numbering(split, index)
         trajectory = Trajectory(
@@ -186,6 +187,7 @@ class Dataset:
             frames=frames,
             times=times,
             length_unit=self.info.length_unit,
+            fields=self.fields(split, index, fields) if fields else {},
         )
         trajectory._check_numbering(self._name(split, index))
         return trajectory
@@ -213,11 +215,12 @@ class Dataset:
         is there."""
         return [index for index in range(self.count(split)) if self.num_frames(split, index) >= least]
 
-    def spread(self, split: str, most: int) -> Iterator[tuple[str, Trajectory]]:
-        """At most `most` trajectories of a split that move, evenly spread over it, and their names for messages."""
+    def spread(self, split: str, most: int, fields: Collection[str] = ()) -> Iterator[tuple[str, Trajectory]]:
+        """At most `most` trajectories of a split that move, as `load` reads them, evenly spread over it, and names
+        for messages."""
         moving = self.with_frames(split, 2)
         for place in np.unique(np.linspace(0, len(moving) - 1, min(len(moving), most)).astype(int)):
-            yield self._name(split, moving[place]), self.load(split, moving[place])
+            yield self._name(split, moving[place]), self.load(split, moving[place], fields)
 
     def cauchy_stress(self, split: str, index: int, start: int = 0, stop: int | None = None) -> np.ndarray | None:
         """Cauchy stress [stop - start, E, 6] of frames start to stop - 1; None if the trajectory has none."""
@@ -230,15 +233,15 @@ class Dataset:
         array = self._file.array(group, "cauchy_stress", shape)
         return self._finite(self._name(split, index), "element", array, start, stop)
 
-    def fields(self, split: str, index: int) -> dict[str, NamedField]:
-        """The named fields of a trajectory, all frames of them."""
+    def fields(self, split: str, index: int, names: Collection[str] | None = None) -> dict[str, NamedField]:
+        """The named fields of a trajectory, all frames of them; with `names`, those of these that it has."""
         group, count = self._group(split, index), self.num_frames(split, index)
         if not self._file.has(group, FIELDS):
             return {}
         scene, name = self.scene(split, index), self._name(split, index)
         stored = self._file.child(group, FIELDS, h5py.Group)
         fields: dict[str, NamedField] = {}
-        for key in sorted(stored):
+        for key in sorted(stored if names is None else set(stored).intersection(names)):
             array = self._file.array(stored, key, kind=FIELD_KIND)
             facts = self._file.attributes(array)
             fields[key] = NamedField(self._file.read(array), str(facts.get("location")), str(facts.get("unit", "")))

@@ -11,14 +11,22 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ast_sim.dataset.layout import LENGTH_UNITS, DatasetInfo
+from ast_sim.dataset.layout import DatasetInfo
 from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.inference.calibration import LEVEL
+from ast_sim.inference.forces_and_figures import (
+    BodyForce,
+    figures_of,
+    force_on_driven,
+    forces_on_bodies,
+    write_forces,
+)
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.mechanics.physics_check import Law, PhysicsCheck, check_physics
+from ast_sim.named_field import NamedField
 from ast_sim.scene import AttributeValue, Scene, Trajectory
-from ast_sim.support.errors import AstSimError, ConfigError, MissingExtra, RolloutError, SimulationError
+from ast_sim.support.errors import AstSimError, MissingExtra, RolloutError
 from ast_sim.support.notebook_table import html_picture, html_table, one_line
 from ast_sim.view import export, picture, sweep_files
 from ast_sim.view.files import make_folder
@@ -39,6 +47,7 @@ class AnsweredFrame(NamedTuple):
         position: [N, 3].
         displacement: [N, 3], from the positions at rest.
         stress: [N or E], von Mises stress in pascal, or None.
+        fields: [N or E, *], the named fields that the model predicts, by name.
     """
 
     number: int
@@ -46,6 +55,7 @@ class AnsweredFrame(NamedTuple):
     position: np.ndarray
     displacement: np.ndarray
     stress: np.ndarray | None
+    fields: dict[str, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +87,8 @@ class Answer:
             ascend. Empty without Newton steps.
         driven: the prescribed nodes that move farthest together in the whole motion.
         law: the law of the material and of contact, as the run knows it.
+        fields: the named fields that the model predicts, [S, N or E, *] each with its unit. Newton steps do not change
+            them. A given frame holds the given values, or zero.
         band: [S], with a probability of 95 % all free nodes of all frames lie within this distance of the truth, in the
             unit of length (`calibration`). None: the run was not calibrated, or a warning has said why.
     """
@@ -99,6 +111,7 @@ class Answer:
     driven: Driven | None = None
     law: Law | None = None
     band: np.ndarray | None = None
+    fields: dict[str, NamedField] = field(default_factory=dict)
 
     @property
     def how_far(self) -> list[str]:
@@ -174,6 +187,7 @@ class Answer:
             self.position[row],
             self.position[row] - self.scene.rest_position,
             None if self.stress is None else self.stress[row, :, 0],
+            {name: one.values[row] for name, one in self.fields.items()},
         )
 
     def __iter__(self) -> Iterator[AnsweredFrame]:
@@ -239,33 +253,39 @@ class Answer:
             frames=frames,
             times=None if self.info is None else self.info.times(frames),
             length_unit=None if self.info is None else self.info.length_unit,
+            fields={name: one.select(order.tolist()) for name, one in self.fields.items()},
         )
 
     def reaction(self) -> np.ndarray:
         """[S, 3] the force in newton on the prescribed nodes `driven`.
 
-        It follows from the strains of the predicted positions, by the law of the material, as the bundled solver has
-        it. If the data follow another law, so would their force.
+        If the law of the material is known and elastic, it follows from the strains of the predicted positions, as the
+        bundled solver has it; if the data follow another law, so would their force. Elsewhere it is the sum of the
+        nodal reactions, if the model predicts them (`fields["reaction"]`).
 
         Raises:
-            ConfigError: there is none; the text says why: no prescribed node moves, the scene has inertia or no
-                tetrahedra, or the law of its material is not known.
+            ConfigError: there is none; the text says why: no prescribed node moves; or the scene has inertia or no
+                tetrahedra, or the law of its material is not known, and the model predicts no reactions.
         """
-        if self.info is None or self.driven is None or self.law is None:
-            raise ConfigError(f"{self.name} has no reaction: no prescribed node moves, or the answer is of no run")
-        if self.info.integration == "dynamic":
-            raise ConfigError(f"{self.name} has no reaction: it has inertia; the reaction is a force at equilibrium")
-        if self.scene.elements.shape[1] == 3:
-            raise ConfigError(f"{self.name} has no reaction: its elements are triangles; it needs tetrahedra")
-        from ast_sim.mechanics.reaction import Reaction
+        return force_on_driven(self)
 
-        try:
-            law = self.law.of_elements(self.scene)
-        except (ConfigError, SimulationError) as error:
-            raise ConfigError(f"{self.name} has no reaction: {error}") from error
-        scale = LENGTH_UNITS[self.info.length_unit] ** 2
-        force = Reaction(self.scene, self.driven, law)
-        return scale * np.array([force.of(position) for position in self.position]).reshape(-1, 3)
+    def body_forces(self) -> list[BodyForce]:
+        """The force and the torque on the prescribed nodes of each body that has some, frame by frame, by the law or by
+        predicted reactions as in `reaction`.
+
+        Raises:
+            ConfigError: as in `reaction`.
+        """
+        return forces_on_bodies(self)
+
+    def save_forces(self, path: str | os.PathLike[str]) -> None:
+        """Write `body_forces` as a table (.csv): frame, time, body, force_x, ... [N], torque_x, ... [N m].
+
+        Raises:
+            ConfigError: as in `reaction`.
+            AstSimError: the suffix is another one, or the file cannot be written.
+        """
+        write_forces(Path(path), self.body_forces())
 
     def check(self) -> PhysicsCheck:
         """Is it physics? Elements turned over, penetration, the forces out of balance: the worst over the computed
@@ -281,36 +301,13 @@ class Answer:
 
     def figures(self, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> list[dict[str, float]]:
         """What an engineer asks of each frame: the travel of the prescribed nodes, the reaction and its components (if
-        `reaction` knows it), the largest stress and where it is (if the model predicts one), the size of the last
-        Newton step (if any was made).
+        `reaction` knows it), the largest stress and where it is (if the model predicts one), the largest number of
+        each named field (of several columns: the largest norm), the size of the last Newton step (if any was made).
 
         Args:
             origin: [3] the point that positions are relative to.
         """
-        scene, rows = self.scene, []
-        try:
-            forces = self.reaction()
-        except ConfigError:  # a figure that this scene has not
-            forces = None
-        computed = sorted(number for number in self.frames if number >= self.given)
-        last_steps = dict(zip(computed, self.last_steps, strict=False))
-        for frame, position in enumerate(self.position):
-            way = np.linalg.norm((position - scene.rest_position)[scene.prescribed], axis=1)
-            row = {"travel_of_nodes": float(way.max(initial=0.0))}
-            if forces is not None:
-                row |= {"reaction": float(np.linalg.norm(forces[frame]))}
-                row |= {f"reaction_{axis}": float(force) for axis, force in zip("xyz", forces[frame], strict=True)}
-            if self.stress is not None:
-                stress = self.stress[frame, :, 0]
-                worst = int(np.where(scene.deforming(self.stress_location or "node"), stress, -np.inf).argmax())
-                nodes = scene.elements[worst] if self.stress_location == "element" else [worst]
-                place = position[nodes].mean(axis=0) + origin
-                row |= {"largest_stress": float(stress[worst])}
-                row |= {f"stress_at_{axis}": float(x) for axis, x in zip("xyz", place, strict=True)}
-            if self.frames[frame] in last_steps:
-                row |= {"last_newton_step": last_steps[self.frames[frame]]}
-            rows.append(row)
-        return rows
+        return figures_of(self, origin)
 
     def save(self, path: str | os.PathLike[str], truth: Trajectory | None = None) -> None:
         """Write the answer as a dataset (.h5), as a file for ParaView (.pvd, .vtkhdf), or its `figures` (.csv).

@@ -28,6 +28,7 @@ from ast_sim.inference.predict_batch import Start, predict_batch
 from ast_sim.inference.question import Question, not_finite, too_far
 from ast_sim.mechanics.linearised_contact import STILL, NewtonSteps
 from ast_sim.models.simulator import Simulator
+from ast_sim.named_field import STRESS
 from ast_sim.scene import Scene
 from ast_sim.support.errors import RolloutError, SimulationError
 
@@ -84,7 +85,7 @@ def calls(model: Simulator, questions: Sequence[Question], effort: Effort) -> li
         count = 1 + effort.corrections + effort.newton_steps
         position = [_stacked(frame.positions, count) for frame in scene.frames]
         known = [frame for frame in scene.frames if model.config.data.stress != "none"]
-        stress = [_stacked(frame.stresses, 1 + effort.newton_steps) for frame in known]
+        stress = [_stacked([one[STRESS] for one in frame.fields], 1 + effort.newton_steps) for frame in known]
         steps = np.array([len(frame.positions) - 1 - effort.corrections for frame in scene.frames])
         last = np.array([np.nan if frame.last_step is None else frame.last_step for frame in scene.frames])
         ways.append(Way(np.stack(position, axis=1), np.stack(stress, axis=1) if stress else None, steps, last))
@@ -125,24 +126,24 @@ def _predicted(
 
 def _start_again(model: Simulator, frame: _Frame, effort: Effort) -> None:
     """Newton steps need a nearly right start: more corrections give a better one."""
-    first, spent = (frame.positions, frame.stresses, frame.last_step), frame.seconds
+    first, spent = (frame.positions, frame.fields, frame.last_step), frame.seconds
     _predict(model, [frame], effort.corrections + AGAIN)
     frame.refine(effort.newton_steps, every_stress=False)
     frame.seconds += spent
     if frame.failure is not None:  # the first answer at least says that it has not converged
-        frame.failure, (frame.positions, frame.stresses, frame.last_step) = None, first
+        frame.failure, (frame.positions, frame.fields, frame.last_step) = None, first
 
 
 @dataclass(eq=False)
 class _Frame:
-    """A frame to predict: its start, the positions after each call and each Newton step, the stress after the last call
-    and after Newton steps, and the size of the last Newton step."""
+    """A frame to predict: its start, the positions after each call and each Newton step, the fields after the last call
+    and after Newton steps, which change the stress alone, and the size of the last Newton step."""
 
     scene: _JumpingScene
     number: int
     start: Start
     positions: list[Tensor] = field(default_factory=list)
-    stresses: list[Tensor | None] = field(default_factory=list)
+    fields: list[dict[str, Tensor]] = field(default_factory=list)
     last_step: float | None = None
     seconds: float = 0.0
     failure: str | None = None
@@ -173,7 +174,8 @@ class _Frame:
                 self.last_step = solver.size(before, position)
                 ends = step == most or self.last_step <= STILL
                 if location != "none" and (every_stress or ends):
-                    self.stresses.append(torch.from_numpy(solver.von_mises(position, location)))
+                    stress = torch.from_numpy(solver.von_mises(position, location))
+                    self.fields.append({**self.fields[-1], STRESS: stress})
                 if ends:
                     break
         except SimulationError as error:
@@ -195,13 +197,13 @@ class _JumpingScene:
     def __post_init__(self) -> None:
         question, self.given = self.question, self.model.config.data.given_frames
         self.prescribed_position = torch.tensor(question.prescribed_position)
-        self.stress = question.given_stress(self.model.config, self.given)
+        self.fields = question.given_fields(self.model.config.data, self.given)
         for number in sorted(question.wanted()):
             if number >= self.given:
                 carried = torch.from_numpy(
                     self.carry(question.prescribed_position[0], question.prescribed_position[number])
                 )
-                state = State(carried, stress=self.stress[0])
+                state = State(carried, stress=self.fields[0].get(STRESS))
                 start = Start(f"{question.name} frame {number}", self.graph, state, self.prescribed_position[number])
                 self.frames.append(_Frame(self, number, start))
 
@@ -220,10 +222,10 @@ class _JumpingScene:
     def answer(self) -> Answer:
         """The frames before the first that failed."""
         predicted = list(takewhile(lambda frame: frame.failure is None, self.frames))
-        frames = dict(enumerate(zip(self.prescribed_position[: self.given], self.stress, strict=True)))
+        frames = dict(enumerate(zip(self.prescribed_position[: self.given], self.fields, strict=True)))
         return self.question.answer(
             self.model.config,
-            frames | {frame.number: (frame.positions[-1], frame.stresses[-1]) for frame in predicted},
+            frames | {frame.number: (frame.positions[-1], frame.fields[-1]) for frame in predicted},
             [frame.seconds for frame in predicted],
             self.failure and f"{self.failure}; the frames before it are kept",
             tuple(frame.last_step for frame in predicted if frame.last_step is not None),
@@ -265,6 +267,6 @@ def _predict(model: Simulator, group: list[_Frame], corrections: int) -> None:
         else:
             group[0].failure = f"{group[0].start.name}: {error}"
         return
-    for frame, (positions, stress, seconds) in zip(group, predicted, strict=True):
-        frame.failure = not_finite(model.config, frame.scene.question.name, frame.number, positions[-1], stress)
-        frame.positions, frame.stresses, frame.seconds = positions, [stress], seconds
+    for frame, (positions, fields, seconds) in zip(group, predicted, strict=True):
+        frame.failure = not_finite(model.config, frame.scene.question.name, frame.number, positions[-1], fields)
+        frame.positions, frame.fields, frame.seconds = positions, [fields], seconds

@@ -14,10 +14,11 @@ from ast_sim.importers.scene_mesh import SceneMesh
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.effort import FIRST_CALL, Effort
 from ast_sim.inference.jump import jumps
-from ast_sim.inference.question import Frames, Question
+from ast_sim.inference.question import Frames, Question, fields_of
 from ast_sim.inference.rollout import rollouts
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.models.simulator import Simulator
+from ast_sim.named_field import STRESS, require_fields
 from ast_sim.number_arrays import ranges
 from ast_sim.prescribed_motion import Motion, RigidMotion, Vector, frames_for
 from ast_sim.runs.scope import Scope
@@ -68,7 +69,7 @@ def new_question(
                 f"{name} has a motion, frames and a stress of its own; for others predict its scene (--move BODY=X,Y,Z)"
             )
         _require_whole(scene, config, scope, name)
-        stress = scene.stress
+        fields = fields_of(scene)
         motion = Motion(scene.position)
         scene = scene.scene
     else:
@@ -76,10 +77,11 @@ def new_question(
         scene.check(name)
         motion = _completed(config, scope, scene, motion, num_frames, name)
         stress = _given_stress(config, scene, stress, name)
+        fields = {} if stress is None else {STRESS: stress}
     scene.require_predictable(name)
     _require_material(config, scope, scene, name)
     notes = tuple(scope.notes(scene, motion, bool(config.jumps)))
-    return Question(name, scene, motion.position, stress, movable=True, notes=notes).asking(frames)
+    return Question(name, scene, motion.position, fields, movable=True, notes=notes).asking(frames)
 
 
 def _require_whole(trajectory: Trajectory, config: ModelConfig, scope: Scope, name: str) -> None:
@@ -100,6 +102,8 @@ def _require_whole(trajectory: Trajectory, config: ModelConfig, scope: Scope, na
     if place not in ("none", config.data.stress):
         needs = "predicts none" if config.data.stress == "none" else f"predicts it at each {config.data.stress}"
         raise ConfigError(f"{name} has a stress at each {place}, but the run {needs}: leave it out, or convert it")
+    named = [one for one in config.data.fields if one[0] in trajectory.fields]  # those that are missing start at zero
+    require_fields(name, trajectory.fields, named)
 
 
 def _completed(

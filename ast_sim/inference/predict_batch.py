@@ -32,12 +32,12 @@ class Start(NamedTuple):
 
 def predict_batch(
     model: Simulator, starts: Sequence[Start], calls: int = 1
-) -> list[tuple[list[Tensor], Tensor | None, float]]:
-    """Predict the frames; each call corrects the answer of the one before. Stress on elements is predicted by the last
+) -> list[tuple[list[Tensor], dict[str, Tensor], float]]:
+    """Predict the frames; each call corrects the answer of the one before. Fields on elements are predicted by the last
     call only.
 
     Returns:
-        For each frame its positions [N, 3] after each call, its stress, and its share of the wall seconds.
+        For each frame its positions [N, 3] after each call, its fields by name, and its share of the wall seconds.
     """
     began = time.perf_counter()
     names, graphs, states, prescribed = zip(*starts, strict=True)
@@ -46,12 +46,14 @@ def predict_batch(
     batch = Batch.build(graph, State.concatenate(states), prescribed, list(names))
     sizes = graph.node_offsets.diff().tolist()
     positions = []
-    stress = None
+    fields: dict[str, Tensor] = {}
     for call in range(1, calls + 1):
-        position, stress = model.advance(replace(batch, wants_stress=call == calls), prescribed)
+        position, fields = model.advance(replace(batch, wants_elements=call == calls), prescribed)
         positions.append(position.split(sizes))
         batch = replace(batch, position=position, proximity=None)
-    rows = [0 if state.stress is None else len(state.stress) for state in states]
-    stresses = [None] * len(starts) if stress is None else stress.split(rows)
+    rows = {"node": sizes, "element": graph.element_offsets.diff().tolist()}
+    places = {output.name: output.location for output in model.config.data.outputs}
+    parts = {name: values.split(rows[places[name]]) for name, values in fields.items()}
+    of_starts = [{name: part[row] for name, part in parts.items()} for row in range(len(starts))]
     seconds = (time.perf_counter() - began) / len(starts)
-    return [(way, end, seconds) for *way, end in zip(*positions, stresses, strict=True)]
+    return [(way, end, seconds) for *way, end in zip(*positions, of_starts, strict=True)]

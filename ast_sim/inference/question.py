@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -12,7 +12,9 @@ from torch import Tensor
 from ast_sim.inference.answer import Answer
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.physics_check import Law
+from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.model_config import ModelConfig
+from ast_sim.named_field import STRESS, NamedField
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.support.errors import ConfigError, RolloutError
 
@@ -28,7 +30,8 @@ class Question:
         scene: the scene.
         prescribed_position: [S, N, 3] float32, the positions of the prescribed nodes in each frame; in the given
             frames, of all nodes. Other entries are not read.
-        stress: [frames, N or E, 1] float32, the stress of at least the given frames; None: zero.
+        fields: [frames, N or E, *] float32, the stress and named fields of at least the given frames, by name; those
+            that are missing are zero.
         frames: the numbers of the frames that are wanted, in the order in which they are asked for; None: all of them,
             the given ones too.
         movable: the scene may be moved into the domain of the model.
@@ -38,7 +41,7 @@ class Question:
     name: str
     scene: Scene
     prescribed_position: np.ndarray
-    stress: np.ndarray | None = None
+    fields: Mapping[str, np.ndarray] = field(default_factory=dict)
     frames: tuple[int, ...] | None = None
     movable: bool = False
     notes: tuple[str, ...] = ()
@@ -46,7 +49,7 @@ class Question:
     @classmethod
     def of(cls, truth: Trajectory, name: str, frames: Frames | None = None) -> Question:
         """The question whose true answer is a known trajectory, which has all frames of its motion."""
-        return cls(name, truth.scene, truth.position, truth.stress).asking(frames)
+        return cls(name, truth.scene, truth.position, fields_of(truth)).asking(frames)
 
     def asking(self, frames: Frames | None) -> Question:
         """The same question for these frames only; negative numbers count from the end.
@@ -83,42 +86,58 @@ class Question:
         """The numbers of the frames that are wanted."""
         return tuple(range(len(self.prescribed_position))) if self.frames is None else self.frames
 
-    def given_stress(self, config: ModelConfig, given: int) -> list[Tensor] | list[None]:
-        """The stress of each given frame, [N or E, 1]; None if the model predicts no stress."""
-        if config.data.stress == "none":
-            return [None] * given
-        rows = self.scene.num_nodes if config.data.stress == "node" else self.scene.num_elements
-        if self.stress is None:
-            return list(torch.zeros(given, rows, 1))
-        return list(torch.tensor(self.stress[:given]))
+    def given_fields(self, data: DataFacts, given: int) -> list[dict[str, Tensor]]:
+        """What the model predicts, in each given frame: [N or E, *] by name."""
+        rows = {"node": self.scene.num_nodes, "element": self.scene.num_elements}
+        values = {
+            output.name: torch.tensor(self.fields[output.name][:given])
+            if output.name in self.fields
+            else torch.zeros(given, rows[output.location], output.columns)
+            for output in data.outputs
+        }
+        return [{name: one[frame] for name, one in values.items()} for frame in range(given)]
 
     def answer(
         self,
         config: ModelConfig,
-        frames: Mapping[int, tuple[Tensor, Tensor | None]],
+        frames: Mapping[int, tuple[Tensor, dict[str, Tensor]]],
         seconds: list[float],
         failure: str | None,
         last_steps: tuple[float, ...] = (),
     ) -> Answer:
-        """The answer with the wanted ones of these frames: positions and stress, by number of the frame. The other
+        """The answer with the wanted ones of these frames: positions and fields, by number of the frame. The other
         arguments are as in `Answer`."""
         numbers = tuple(number for number in self.wanted() if number in frames)
         position = np.array([frames[number][0].numpy() for number in numbers], np.float32)
-        stress = [value.numpy() for value in (frames[number][1] for number in numbers) if value is not None]
+        fields = {
+            output.name: NamedField(
+                np.array([frames[number][1][output.name].numpy() for number in numbers]), output.location, output.unit
+            )
+            for output in config.data.outputs
+            if numbers
+        }
+        stress = fields.pop(STRESS, None)
         return Answer(
             self.name,
             self.scene,
             position.reshape(len(numbers), self.scene.num_nodes, 3),
-            np.array(stress) if stress else None,
+            None if stress is None else stress.values,
             config.data.given_frames,
             seconds,
             failure,
             stress_location=config.data.stress,
             frames=numbers,
+            fields=fields,
             last_steps=last_steps,
             driven=Driven.of(self.scene, self.prescribed_position),
             law=Law(config.data.material, config.data.contact_range),
         )
+
+
+def fields_of(trajectory: Trajectory) -> dict[str, np.ndarray]:
+    """The stress, if there is one, and the named fields of a trajectory: [S, N or E, *] by name."""
+    stress = {} if trajectory.stress is None else {STRESS: trajectory.stress}
+    return {**{name: one.values for name, one in trajectory.fields.items()}, **stress}
 
 
 def _whole_numbers(frames: Iterable[int] | int) -> list[int]:
@@ -129,12 +148,15 @@ def _whole_numbers(frames: Iterable[int] | int) -> list[int]:
     return listed.tolist()
 
 
-def not_finite(config: ModelConfig, name: str, frame: int, position: Tensor, stress: Tensor | None) -> str | None:
+def not_finite(
+    config: ModelConfig, name: str, frame: int, position: Tensor, fields: Mapping[str, Tensor]
+) -> str | None:
     """Where a predicted frame is not finite; None if it is finite everywhere."""
-    for what, value in (("position", position), ("stress", stress)):
-        if value is not None and not value.isfinite().all():
+    places = {output.name: output.location for output in config.data.outputs}
+    for what, value in {"position": position, **fields}.items():
+        if not value.isfinite().all():
             row = int(torch.nonzero(~value.isfinite().all(dim=1))[0])
-            kind = "element" if what == "stress" and config.data.stress == "element" else "node"
+            kind = places.get(what, "node")
             return f"{name}: the predicted {what} of {kind} {row} in frame {frame} is not finite: {value[row].tolist()}"
     return None
 

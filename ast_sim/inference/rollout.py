@@ -16,6 +16,7 @@ from ast_sim.inference.answer import Answer
 from ast_sim.inference.predict_batch import Start, predict_batch
 from ast_sim.inference.question import Question, not_finite, too_far
 from ast_sim.models.simulator import Simulator
+from ast_sim.named_field import STRESS
 
 
 def rollouts(
@@ -41,8 +42,8 @@ def rollouts(
             for domain in dict.fromkeys(scene.domain for scene in running):
                 group = [scene for scene in running if scene.domain == domain]
                 predicted = predict_batch(model, [scene.start(frame) for scene in group])
-                for scene, (positions, stress, seconds) in zip(group, predicted, strict=True):
-                    scene.advance(frame, positions[-1], stress, seconds)
+                for scene, (positions, fields, seconds) in zip(group, predicted, strict=True):
+                    scene.advance(frame, positions[-1], fields, seconds)
             if progress is not None and running:
                 progress(frame)
     return [scene.answer() for scene in scenes]
@@ -57,7 +58,7 @@ class _RollingScene:
         self.prescribed_position = torch.tensor(question.prescribed_position)
         self.end = max(question.wanted()) + 1
         self.frames = list(
-            zip(self.prescribed_position[:given], question.given_stress(model.config, given), strict=True)
+            zip(self.prescribed_position[:given], question.given_fields(model.config.data, given), strict=True)
         )
         self.seconds: list[float] = []
         self.failure: str | None = None
@@ -68,20 +69,21 @@ class _RollingScene:
 
     def start(self, frame: int) -> Start:
         """What a frame is predicted from."""
-        position, stress = self.frames[frame - 1]
-        state = State(position, self.frames[frame - 2][0] if self.config.data.dynamic else None, stress)
+        position, fields = self.frames[frame - 1]
+        previous = self.frames[frame - 2][0] if self.config.data.dynamic else None
+        state = State(position, previous, fields.get(STRESS))
         return Start(f"{self.question.name} frame {frame - 1}", self.graph, state, self.prescribed_position[frame])
 
-    def advance(self, frame: int, position: Tensor, stress: Tensor | None, seconds: float) -> None:
+    def advance(self, frame: int, position: Tensor, fields: dict[str, Tensor], seconds: float) -> None:
         """Keep the predicted frame, or set `failure` if it is not finite or too far away."""
-        self.place(frame, position, stress)
+        self.place(frame, position, fields)
         if self.failure is None:
-            self.frames.append((position, stress))
+            self.frames.append((position, fields))
             self.seconds.append(seconds)
 
-    def place(self, frame: int, position: Tensor, stress: Tensor | None) -> None:
+    def place(self, frame: int, position: Tensor, fields: dict[str, Tensor]) -> None:
         """Find the domain that holds the state from which the frame after `frame` is predicted, or set `failure`."""
-        failure = not_finite(self.config, self.question.name, frame, position, stress)
+        failure = not_finite(self.config, self.question.name, frame, position, fields)
         if failure is None:
             self.domain = self.model.domain(position)
             failure = too_far(self.config, self.question.name, frame, position) if self.domain is None else None

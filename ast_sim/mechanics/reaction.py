@@ -59,16 +59,16 @@ class Reaction:
         Args:
             position: [N,3].
         """
-        return self._shares(position).sum(axis=0)
+        return self.shares(position).sum(axis=0)
 
     def torque(self, position: np.ndarray) -> float:
         """The torque of that force around the axis of the moved nodes, in pascal times the cube of the unit of length,
         positive in the sense of their turn; 0 if they do not turn."""
         axis = self.driven.axis
-        return 0.0 if axis is None else axis.torque(position, self._shares(position))
+        return 0.0 if axis is None else axis.torque(position, self.shares(position))
 
-    def _shares(self, position: np.ndarray) -> np.ndarray:
-        """[N,3] w_i f_i."""
+    def shares(self, position: np.ndarray) -> np.ndarray:
+        """[N,3] w_i f_i, the share of each node in that force."""
         position = position.astype(np.float64)
         source, sink = self._ends(position)
         if not source.any():

@@ -8,6 +8,7 @@ from typing import Literal
 
 from ast_sim.dataset.layout import GIVEN_FRAMES, DatasetInfo
 from ast_sim.material import Material
+from ast_sim.named_field import STRESS, Output
 from ast_sim.support.toml_settings import NOTHING
 
 
@@ -18,6 +19,7 @@ class DataFacts:
     Attributes:
         integration: "quasi_static" (next position: p + v) or "dynamic" (2 p - p_previous + a).
         stress: where stress is predicted: "none", "node" or "element".
+        fields: the named fields that are predicted: name, location, columns and unit of each, as in `Output`.
         columns: the name of each column of the material of an element; none without material.
         domain_center, domain_half_width: the cube that holds all positions.
         contact_radius: distance within which surfaces count as near.
@@ -31,6 +33,7 @@ class DataFacts:
 
     integration: Literal["quasi_static", "dynamic"] = "quasi_static"
     stress: Literal["none", "node", "element"] = "none"
+    fields: tuple[tuple[str, str, int, str], ...] = ()
     columns: tuple[str, ...] = ()
     domain_center: tuple[float, float, float] = (0.0, 0.0, 0.0)
     domain_half_width: float = 1.0
@@ -51,12 +54,14 @@ class DataFacts:
         planar: bool = False,
         tetrahedra: bool = True,
         recorded: Mapping[str, float] = NOTHING,
+        fields: tuple[tuple[str, str, int, str], ...] = (),
     ) -> DataFacts:
         """The facts of a dataset with this `info`; `recorded` has the last four, the others are as above."""
         x, y, z = (float(c) for c in info.domain_center)
         return DataFacts(
             integration=info.integration,
             stress=info.stress_location,
+            fields=fields,
             columns=columns,
             domain_center=(x, y, z),
             domain_half_width=float(info.domain_half_width),
@@ -66,6 +71,16 @@ class DataFacts:
             planar=planar,
             **recorded,
         )
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """What is predicted beside the motion: the stress, if any, then the named fields."""
+        stress = () if self.stress == "none" else (Output(STRESS, self.stress, 1, "Pa"),)
+        return (*stress, *(Output(*field) for field in self.fields))
+
+    def output_columns(self, location: str) -> int:
+        """The number of columns of all outputs at each "node" or "element"; the motion does not count."""
+        return sum(output.columns for output in self.outputs if output.location == location)
 
     @property
     def material(self) -> Material:

@@ -49,6 +49,9 @@ class ModelConfig:
         "predict any frame at once from the first frame, carried along by the prescribed nodes, not step by step;"
         " unset: yes in quasi-static scenes",
     )
+    state: tuple[str, ...] = setting(
+        (), "fields of the dataset to predict beside motion and stress, by name, such as PEEQ; reaction: nodal forces"
+    )
     data: DataFacts = field(default=DataFacts(), metadata={FROM_DATA: True})
 
     def __post_init__(self) -> None:

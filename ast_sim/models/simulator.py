@@ -14,12 +14,16 @@ from ast_sim.batches.batch_builder import Batch, Target
 from ast_sim.batches.graph import Graph
 from ast_sim.batches.pairs import PairSampler
 from ast_sim.dataset.reader import Dataset
+from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.models.normalizer import Normalizer
+from ast_sim.named_field import REACTION, STRESS, Output
 from ast_sim.scene import Scene
 from ast_sim.support.errors import ConfigError
 
 Use = Callable[[Normalizer, Tensor], Any]  # what becomes of the values of an input: normalised, or observed
+
+FIELD = "field "  # stands before the name of a named field among the losses
 
 _CPU_ONLY = "models run on the CPU only"
 
@@ -30,16 +34,25 @@ class Prediction:
 
     Attributes:
         motion: [N, 3], the increment from the state to the predicted frame, or the acceleration with inertia.
-        stress: [N, 1] or [E, 1] in the predicted frame, or None.
+        fields: [N or E, *] in the predicted frame, by name: the stress, if there is one, and the named fields.
     """
 
     motion: Tensor
-    stress: Tensor | None
+    fields: dict[str, Tensor]
 
     @staticmethod
-    def of_nodes(out: Tensor, element_stress: Tensor | None = None) -> Prediction:
-        """From motion [N, 3], or motion and stress [N, 4], of the nodes, and the stress [E, 1] of elements if any."""
-        return Prediction(out[:, :3], out[:, 3:] if out.shape[1] == 4 else element_stress)
+    def of(data: DataFacts, on_nodes: Tensor, on_elements: Tensor | None = None) -> Prediction:
+        """From the columns of all outputs at the nodes, motion first, and of those at the elements, in the order of
+        `data.outputs`; without `on_elements` the latter are left out."""
+        fields = {}
+        ends = {"node": 3, "element": 0}
+        for output in data.outputs:
+            columns = on_nodes if output.location == "node" else on_elements
+            start = ends[output.location]
+            ends[output.location] = start + output.columns
+            if columns is not None:
+                fields[output.name] = columns[:, start : start + output.columns]
+        return Prediction(on_nodes[:, :3], fields)
 
 
 class Simulator(nn.Module):
@@ -54,6 +67,9 @@ class Simulator(nn.Module):
         self.config = config
         self.motion_normalizer = Normalizer("vector")
         self.stress_normalizer = Normalizer("scalar") if config.data.stress != "none" else None
+        # The components of a field with several columns share one scale, as those of a vector do.
+        kinds = ("scalar" if columns == 1 else "vector" for _, _, columns, _ in config.data.fields)
+        self.field_normalizers = nn.ModuleList(map(Normalizer, kinds))
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Simulator:
         try:
@@ -100,14 +116,24 @@ class Simulator(nn.Module):
             options: seed (0 by default), noise (0), gamma (1), mirror, shift and part, as of `PairSampler`.
         """
         options = {"seed": 0, "noise": 0.0, "gamma": 1.0, **options, "batch_size": batch_size}
-        of_model = {"make_graph": self.graph, "dynamic": self.config.data.dynamic, "jumps": self.config.jumps}
+        data = self.config.data
+        of_model = {"make_graph": self.graph, "dynamic": data.dynamic, "jumps": self.config.jumps}
+        of_model |= {"fields": data.fields}
         return PairSampler(dataset, split, **of_model, **options)
 
-    def _stressed(self, batch: Batch) -> Tensor:
-        """[*] int64: the nodes or elements that deform. Only their stress counts."""
+    @property
+    def _outputs(self) -> Iterator[tuple[Output, Normalizer]]:
+        """What is predicted beside the motion, each with its normalizer."""
+        first = () if self.stress_normalizer is None else (self.stress_normalizer,)
+        return zip(self.config.data.outputs, (*first, *self.field_normalizers), strict=True)
+
+    def _counting(self, output: Output, batch: Batch) -> Tensor:
+        """[N or E] bool: where an output counts: at the nodes or elements that deform; of reactions at the prescribed
+        nodes, since no other node has any."""
         graph = batch.graph
-        deforming = graph.deforming_elements if self.config.data.stress == "element" else graph.deforming_nodes
-        return deforming.nonzero()[:, 0]
+        if output.name == REACTION:
+            return graph.prescribed
+        return graph.deforming_elements if output.location == "element" else graph.deforming_nodes
 
     @torch.no_grad()
     def fit_statistics(self, batches: Iterable[tuple[Batch, Target]]) -> None:
@@ -115,8 +141,8 @@ class Simulator(nn.Module):
         for batch, target in batches:
             self.observe(batch)
             self.motion_normalizer.observe(target.motion[batch.graph.normal_nodes])
-            if self.stress_normalizer is not None:
-                self.stress_normalizer.observe(target.stress[self._stressed(batch)])
+            for output, normalizer in self._outputs:
+                normalizer.observe(target.fields[output.name][self._counting(output, batch)])
         for module in self.modules():
             if isinstance(module, Normalizer):
                 module.fix()
@@ -130,7 +156,7 @@ class Simulator(nn.Module):
         share: Callable[[int], float] = lambda rows: 1.0,
         weights: Tensor | None = None,
     ) -> dict[str, Tensor]:
-        """Mean squared errors of normalised outputs: motion of NORMAL nodes, and stress of what deforms.
+        """Mean squared errors of normalised outputs: motion of NORMAL nodes, stress and fields of what deforms.
 
         If the batch is part of a larger one, `share` returns the share of its rows (nodes or elements) in all rows. The
         losses of all parts then add up to the loss of the larger batch.
@@ -140,8 +166,9 @@ class Simulator(nn.Module):
             weights: [B], how much the squared error of the motion of each scene counts; None: 1.
 
         Returns:
-            "motion", "stress" (if there is one) and "loss" = motion + stress_weight * stress. "spread" is the standard
-            deviation of the predicted motion over the nodes: if it is 0, the decoder is dead.
+            "motion", "stress" (if there is one), "field NAME" of each named field, and "loss" = motion + stress_weight
+            * (stress + fields). "spread" is the standard deviation of the predicted motion over the nodes: if it is 0,
+            the decoder is dead.
         """
         normal = batch.graph.normal_nodes
         motion = prediction.motion.index_select(0, normal)
@@ -153,12 +180,17 @@ class Simulator(nn.Module):
         losses = {"motion": part * error.square().mean()}
         losses["loss"] = losses["motion"]
         losses["spread"] = part * motion.detach().std(dim=0).mean() if len(motion) > 1 else motion.new_ones(())
-        if self.stress_normalizer is not None:
-            rows = self._stressed(batch)
-            stress = prediction.stress.index_select(0, rows)
-            error = stress - self.stress_normalizer(target.stress.index_select(0, rows))
-            losses["stress"] = share(len(rows)) * error.square().mean()
-            losses["loss"] = losses["loss"] + stress_weight * losses["stress"]
+        for output, normalizer in self._outputs:
+            rows = self._counting(output, batch).nonzero()[:, 0]
+            if output.name not in prediction.fields:
+                raise ConfigError(
+                    f"model.state: the model {self.config.name} does not predict {output.name}: leave it out"
+                )
+            predicted = prediction.fields[output.name].index_select(0, rows)
+            error = predicted - normalizer(target.fields[output.name].index_select(0, rows))
+            key = output.name if output.name == STRESS else f"{FIELD}{output.name}"
+            losses[key] = share(len(rows)) * error.square().mean()
+            losses["loss"] = losses["loss"] + stress_weight * losses[key]
         return losses
 
     @torch.no_grad()
@@ -180,11 +212,17 @@ class Simulator(nn.Module):
 
     @torch.inference_mode()
     def predict(self, batch: Batch) -> Prediction:
-        """The outputs in physical units: motion in the dataset's unit of length, stress in pascal."""
+        """The outputs in physical units: motion in the dataset's unit of length, stress in pascal, named fields in
+        theirs. Named fields are 0 where they have no meaning: on rigid bodies, reactions at free nodes."""
         prediction = self(batch)
-        known = self.stress_normalizer is not None and prediction.stress is not None
-        stress = self.stress_normalizer.inverse(prediction.stress) if known else None
-        return Prediction(self.motion_normalizer.inverse(prediction.motion), stress)
+        fields = {}
+        for output, normalizer in self._outputs:
+            if output.name in prediction.fields:
+                values = normalizer.inverse(prediction.fields[output.name])
+                if output.name != STRESS:
+                    values = torch.where(self._counting(output, batch)[:, None], values, 0)
+                fields[output.name] = values
+        return Prediction(self.motion_normalizer.inverse(prediction.motion), fields)
 
     def integrate(self, batch: Batch, motion: Tensor) -> Tensor:
         """[N, 3]: positions in the predicted frame, p + v, or 2 p - p_previous + a with inertia."""
@@ -194,11 +232,11 @@ class Simulator(nn.Module):
             return 2 * batch.position - batch.previous_position + motion
         return batch.position + motion
 
-    def advance(self, batch: Batch, prescribed: Tensor) -> tuple[Tensor, Tensor | None]:
-        """The positions [N, 3] and the stress in the predicted frame. Prescribed nodes are at `prescribed` [N, 3]."""
+    def advance(self, batch: Batch, prescribed: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """The positions [N, 3] and the fields in the predicted frame. Prescribed nodes are at `prescribed` [N, 3]."""
         prediction = self.predict(batch)
         position = self.integrate(batch, prediction.motion)
-        return torch.where(batch.graph.prescribed[:, None], prescribed, position), prediction.stress
+        return torch.where(batch.graph.prescribed[:, None], prescribed, position), prediction.fields
 
 
 def _require_cpu(what: str, device: torch.device) -> None:

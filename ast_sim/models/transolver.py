@@ -144,9 +144,9 @@ class Transolver(Simulator):
         self.encoder = MLP(self.node_inputs.width + self.positions.width, 2 * config.hidden, config.hidden)
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.blocks))
         self.norm = nn.LayerNorm(config.hidden)
-        self.decoder = Linear(config.hidden, 4 if config.data.stress == "node" else 3)
-        if config.data.stress == "element":
-            self.element_decoder = Linear(config.hidden, 1)
+        self.decoder = Linear(config.hidden, 3 + config.data.output_columns("node"))
+        if on_elements := config.data.output_columns("element"):
+            self.element_decoder = Linear(config.hidden, on_elements)
         for module in self.modules():
             if isinstance(module, Linear):  # as released
                 nn.init.trunc_normal_(module.weight, std=0.02)
@@ -169,9 +169,10 @@ class Transolver(Simulator):
         for block in self.blocks:
             x = block(x, batch.graph.node_offsets)
         x = self.norm(x)
-        on_elements = self.config.data.stress == "element" and batch.wants_stress
-        stress = self.element_decoder(batch.graph.element_mean(x)) if on_elements else None
-        return Prediction.of_nodes(self.decoder(x), stress)
+        data = self.config.data
+        wanted = data.output_columns("element") and batch.wants_elements
+        on_elements = self.element_decoder(batch.graph.element_mean(x)) if wanted else None
+        return Prediction.of(data, self.decoder(x), on_elements)
 
 
 PRESETS = {

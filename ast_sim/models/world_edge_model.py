@@ -181,15 +181,17 @@ def messages(edge_mlp: DeepMLP, edges: EdgeSet, features: Tensor, nodes: Tensor)
 
 
 class Decoder(nn.Module):
-    """Node features [N, hidden] -> motion, and stress if the data has it. The stress of an element follows from the
+    """Node features [N, hidden] -> motion, stress and named fields. What is predicted on an element follows from the
     mean of its nodes' features."""
 
     def __init__(self, config: WorldEdgeConfig):
         super().__init__()
-        self.of_nodes = DeepMLP(config, config.hidden, 4 if config.data.stress == "node" else 3)
-        self.of_elements = DeepMLP(config, config.hidden, 1) if config.data.stress == "element" else None
+        self.data = config.data
+        self.of_nodes = DeepMLP(config, config.hidden, 3 + config.data.output_columns("node"))
+        on_elements = config.data.output_columns("element")
+        self.of_elements = DeepMLP(config, config.hidden, on_elements) if on_elements else None
 
     def forward(self, nodes: Tensor, batch: Batch) -> Prediction:
-        on_elements = self.of_elements is not None and batch.wants_stress
-        stress = self.of_elements(batch.graph.element_mean(nodes)) if on_elements else None
-        return Prediction.of_nodes(self.of_nodes(nodes), stress)
+        wanted = self.of_elements is not None and batch.wants_elements
+        on_elements = self.of_elements(batch.graph.element_mean(nodes)) if wanted else None
+        return Prediction.of(self.data, self.of_nodes(nodes), on_elements)

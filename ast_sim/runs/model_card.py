@@ -55,6 +55,7 @@ def card(name: str, settings: RunConfig, scope: Scope, chosen: Chosen, parameter
         "dataset": settings.data,
         "inertia": "yes" if model.data.dynamic else "no",
         "stress": {"none": "not predicted", "node": "at nodes", "element": "in elements"}[model.data.stress],
+        "named fields": ", ".join(model.state) or "none",
     }
     return _TEXT.format(
         name=name,

@@ -10,6 +10,8 @@ from collections.abc import Callable
 from torch import nn
 
 from ast_sim.dataset.reader import Dataset
+from ast_sim.models.simulator import FIELD
+from ast_sim.named_field import STRESS
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.progress import Clock, Progress
@@ -97,11 +99,12 @@ class StepLog:
             record = {**means, "rate": rate, "seconds": seconds}
             self.metrics.append({"step": step, **record})
             self.listener.hear(step, record)
-        stress = f", stress {means['stress']:.4f}" if "stress" in means else ""
+        shown = {key.removeprefix(FIELD): mean for key, mean in means.items() if key == STRESS or key.startswith(FIELD)}
+        fields = "".join(f", {name} {mean:.4f}" for name, mean in shown.items())
         to_go = self.clock.to_go(self.options.steps - step, self._validations_to_go(step))
         progress.show(
             f"step {step:,}/{self.options.steps:,}: loss {means['loss']:.4f}, motion {means['motion']:.4f}"
-            f"{stress}, {1000 * seconds:.1f} ms a step, {to_go} to go"
+            f"{fields}, {1000 * seconds:.1f} ms a step, {to_go} to go"
         )
         if means["spread"] < CONSTANT:
             # If all units of the decoder are dead, it gives every node the same output and never recovers.

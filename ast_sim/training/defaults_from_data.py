@@ -9,6 +9,7 @@ from pathlib import Path
 from ast_sim.dataset.reader import Dataset
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.model_config import ModelConfig
+from ast_sim.named_field import REACTION, STRESS
 from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.toml_settings import LARGEST, require_range
@@ -44,12 +45,32 @@ def resolve(config: RunConfig, dataset: Dataset, scales: DataScales, keep_model:
         scales.planar,
         tetrahedra=dataset.element_size != 3,
         recorded=scales.recorded,
+        fields=_fields(dataset, config.model.state),
     )
     if keep_model:
         model = dataclasses.replace(config.model, data=dataclasses.replace(config.model.data, **scales.recorded))
     else:
         model = config.model.resolve(facts)
     return RunConfig(model, resolve_training(config.train, scales, model), str(Path(config.data).resolve()))
+
+
+def _fields(dataset: Dataset, names: tuple[str, ...]) -> tuple[tuple[str, str, int, str], ...]:
+    """Name, location, columns and unit of the fields to predict.
+
+    Raises:
+        ConfigError: the dataset does not have one of them, or one is named twice.
+    """
+    known = dataset.fields("train", 0) if names and dataset.count("train") else {}
+    known.pop(STRESS, None)  # the name of the von Mises stress, which is predicted anyway
+    for name in names:
+        if name not in known:
+            raise ConfigError(
+                f"model.state: {dataset.path} has no field {name!r}; it has: {', '.join(known) or 'none'}; keep one"
+                " with ast-sim convert --field NAME or --reaction NAME"
+            )
+        if names.count(name) > 1:
+            raise ConfigError(f"model.state names {name!r} twice")
+    return tuple((name, known[name].location, known[name].values.shape[2], known[name].unit) for name in names)
 
 
 def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig) -> TrainConfig:
@@ -72,6 +93,11 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
         "validate_every": validate_every,
         "checkpoint_every": validate_every,
     }
+    turning = [name for name, _, columns, _ in model.data.fields if columns > 1 and name != REACTION]
+    if config.mirror and turning:
+        raise ConfigError(
+            f"train.mirror: {turning[0]} has several columns, and nobody knows how a mirror changes them: leave it out"
+        )
     missing = {key: value for key, value in derived.items() if getattr(config, key) is None}
     pool = _rollout_pool(config, model)
     noise = _noise(config, scales, model, pool > 0)

@@ -8,7 +8,7 @@ import os
 import pickle
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from functools import partial
 from pathlib import Path
@@ -43,6 +43,7 @@ def train(
     preset: str | None = None,
     config: str | os.PathLike[str] | None = None,
     from_run: str | os.PathLike[str] | None = None,
+    state: Sequence[str] = (),
     model_settings: Mapping[str, Any] | None = None,
     resume: bool = False,
     callback: Callback | None = None,
@@ -60,6 +61,7 @@ def train(
         from_run: a run. The new run starts with the weights and scales of its best checkpoint, and with its settings;
             those of the model stay. If `steps` or `minutes` differs, warm-up, decay, validations and checkpoints are
             chosen anew.
+        state: fields of the dataset that are predicted beside motion and stress, such as ("PEEQ", "reaction").
         model_settings: changes of the model's settings, such as {"hidden": 32}.
         resume: continue after the newest checkpoint, if there is one.
         callback: called with (step, {name: float}) when the losses are logged and after validations, such as
@@ -72,7 +74,7 @@ def train(
         DatasetError: the dataset cannot be read.
         TrainingError, CheckpointError, KeyboardInterrupt: as in `start_training`.
     """
-    changes = _changes(model_settings, settings)
+    changes = _changes({**({"state": tuple(state)} if state else {}), **(model_settings or {})}, settings)
     path = _path_of(data)
     chosen = configure(path, preset, (), model, config=config, from_run=from_run, changes=changes)
     start_training(Path(out), chosen, resume=resume, from_run=from_run, callback=callback)

@@ -34,9 +34,9 @@ def write(path: str | os.PathLike[str], trajectory: Trajectory, prediction: Traj
     time; where times are not known, at its number.
 
     Point fields: displacement (from rest, in the unit of the positions), node_type, body; von_mises [Pa] at nodes or
-    cells, wherever the stress is. With a prediction, the geometry is the predicted one, and the fields error (vector),
-    error_magnitude and von_mises_error are added. All errors are prediction minus truth. Frames that the prediction
-    does not have are left out.
+    cells, wherever the stress is, and named fields likewise. With a prediction, the geometry is the predicted one, and
+    the fields error (vector), error_magnitude, von_mises_error and NAME_error are added: prediction minus truth. Frames
+    that the prediction does not have are left out.
 
     No half-written file is ever left under the final name.
 

@@ -1,4 +1,4 @@
-"""The fields that a trajectory and its prediction show: displacement, von Mises stress, and the errors of both."""
+"""The fields that a trajectory and its prediction show: displacement, stress, named fields, and their errors."""
 
 from __future__ import annotations
 
@@ -51,13 +51,20 @@ def fields(truth: Trajectory, prediction: Trajectory | None = None) -> Fields:
         place["von_mises"] = shown.stress[:, :, 0]
         if prediction is not None and truth.stress_at == shown.stress_at:
             place["von_mises_error"] = place["von_mises"] - truth.stress[:, :, 0]
-    if prediction is None:
-        for name, one in shown.fields.items():
-            place = point if one.location == "node" else cell
-            place.setdefault(name, one.values[:, :, 0] if one.values.shape[2] == 1 else one.values)
+    for name, one in shown.fields.items():
+        place = point if one.location == "node" else cell
+        place.setdefault(name, _columns(one.values))
+        true = None if prediction is None else truth.fields.get(name)
+        if true is not None and true.values.shape == one.values.shape:
+            place.setdefault(f"{name}_error", _columns(one.values - true.values))
     static = {"node_type": truth.scene.node_type, "body": truth.scene.body}
     times = np.array(shown.numbers if shown.times is None else shown.times, np.float64)
     return Fields(position, times, static, point, cell)
+
+
+def _columns(values: np.ndarray) -> np.ndarray:
+    """[S, rows, c], without the last axis if c is 1."""
+    return values[:, :, 0] if values.shape[2] == 1 else values
 
 
 def require_same_scene(truth: Trajectory, prediction: Trajectory) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ast_sim.figures import MAIN_NODES, AskedFigures, Figures, SceneFigures
+from ast_sim.figures import AskedFigures, Figures, SceneFigures, main_nodes
 
 Json = dict[str, Any]
 
@@ -162,7 +162,7 @@ def comparison(names: Sequence[str], evaluations: Sequence[Figures | None]) -> J
         return {"label": label, "unit": unit, "values": values}
 
     def errors(quantity: str) -> list[Any]:
-        nodes = MAIN_NODES[quantity]
+        nodes = main_nodes(quantity)
         return [_measure(e, quantity, MODEL, "rollout_all", nodes, "rmse_sequence") for e in evaluations]
 
     columns = [

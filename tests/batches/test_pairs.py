@@ -86,9 +86,9 @@ def test_without_noise_everything_is_as_in_the_file(dataset):
             expected = np.where(prescribed[:, None], position[t + 1] - position[t], 0)
             assert prescribed.any() and np.array_equal(batch.boundary_motion[nodes], expected)
             assert np.array_equal(batch.stress[nodes], truth.stress[t])
-            assert np.array_equal(target.stress[nodes], truth.stress[t + 1])
+            assert np.array_equal(target.fields["stress"][nodes], truth.stress[t + 1])
             assert np.array_equal(batch.graph.rest_position[nodes], truth.scene.rest_position)
-            for tensor in (batch.position, batch.boundary_motion, target.motion, target.stress):
+            for tensor in (batch.position, batch.boundary_motion, target.motion, target.fields["stress"]):
                 assert tensor.dtype == torch.float32
 
 
@@ -239,7 +239,7 @@ def test_a_mirrored_pair_is_the_mirror_image_of_the_pair(dataset, dynamic):
                     s * (plain.previous_position[nodes] - rest), rtol=0, atol=1e-6,
                 )  # fmt: skip
             drawn.add(tuple(signs))
-        assert torch.equal(batch.stress, plain.stress) and torch.equal(target.stress, aim.stress)
+        assert torch.equal(batch.stress, plain.stress) and torch.equal(target.fields["stress"], aim.fields["stress"])
     assert drawn == {(1, 1, 1), (-1, 1, 1), (1, 1, -1), (-1, 1, -1)}
 
 
@@ -283,7 +283,7 @@ def test_a_moved_pair_is_the_pair_elsewhere(dataset, dynamic):
             torch.testing.assert_close(way, way[0].expand_as(way), rtol=0, atol=1e-6)
         assert torch.equal(there.graph.rest_edges, batch.graph.rest_edges)
         assert torch.equal(there.boundary_motion, batch.boundary_motion)
-        assert torch.equal(target.motion, aim.motion) and torch.equal(target.stress, aim.stress)
+        assert torch.equal(target.motion, aim.motion) and torch.equal(target.fields["stress"], aim.fields["stress"])
     drawn = torch.stack(shifts)
     assert drawn.abs().max() <= 0.25 + 1e-6 and (drawn.abs().amax(0) > 0.23).all()
     # Each coordinate has a standard deviation of 0.25 / sqrt(3), and the mean of n draws one of that over sqrt(n).

@@ -62,7 +62,7 @@ def test_from_the_file_to_the_loss(run):
             state = State(torch.from_numpy(start), None, torch.tensor(stress))
             batch = Batch.build(model.graph(scene), state, torch.tensor(after), [name])
             batches.append(batch.placed(unmoved))
-            targets.append(Target(torch.from_numpy(after - start), torch.tensor(next_stress)))
+            targets.append(Target(torch.from_numpy(after - start), {"stress": torch.tensor(next_stress)}))
     batch, target = Batch.concatenate(batches), Target.concatenate(targets)
     loss = model.loss(model(batch), batch, target, run.settings.train.stress_weight)["loss"]
     assert loss.item() == first
@@ -82,6 +82,6 @@ def test_from_a_scene_to_an_answer(run):
         state = State(position, None, torch.zeros(scene.num_nodes, 1))
         with torch.inference_mode():
             batch = Batch.build(graph, state, prescribed, ["scene"])
-            position, stress = run.model.advance(batch, prescribed)
+            position, fields = run.model.advance(batch, prescribed)
     assert np.array_equal(position.numpy()[None], answer.position)
-    assert np.array_equal(stress.numpy()[None], answer.stress)
+    assert np.array_equal(fields["stress"].numpy()[None], answer.stress)

@@ -34,7 +34,9 @@ class Share(Simulator):
         self.truth, self.stress, self.share = torch.tensor(truth.position[frame]), truth.stress[frame], share
 
     def forward(self, batch):
-        return Prediction(self.share * (self.truth - batch.position), torch.tensor(self.share * self.stress))
+        return Prediction(
+            self.share * (self.truth - batch.position), {"stress": torch.tensor(self.share * self.stress)}
+        )
 
 
 @pytest.fixture

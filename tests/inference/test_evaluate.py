@@ -17,7 +17,7 @@ from ast_sim.dataset.solver_seconds import write_seconds
 from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.evaluation.evaluate import evaluate, table
-from ast_sim.inference.evaluation.trivial_predictors import displacement_errors, errors_over_scenes, stress_errors
+from ast_sim.inference.evaluation.trivial_predictors import displacement_errors, errors_over_scenes, field_errors
 from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.support.errors import DatasetError
 from ast_sim.support.provenance import provenance
@@ -102,7 +102,7 @@ def test_stress_errors_by_hand():
     stress = np.array([[0, 0, 0], [2, 4, 100], [6, 2, 100]], np.float32)[:, :, None]
     truth = Trajectory(truth.scene, truth.position, stress)
     result = answer_of(truth, truth.position, np.array([[0, 0, 0], [2, 3, 0], [6, 0, 0]], np.float32)[:, :, None], 1)
-    errors = stress_errors(truth, result.stress[1:] + np.float32(1.0), result, constant=3.0, location="node")
+    errors = field_errors("stress", "node", truth, result.stress[1:] + np.float32(1.0), result, constant=3.0)
     by = {key: value["rollout_all"]["deforming"] for key, value in errors.items()}
     # The obstacle's node 2 does not count. Truths 2, 4 and 6, 2.
     assert by["model"].total == 1.0 + 4.0
@@ -123,7 +123,7 @@ def test_stress_of_elements_leaves_out_those_with_an_obstacle_node():
     position = np.repeat(scene.rest_position[None], 2, axis=0)
     truth = Trajectory(scene, position, np.array([[0, 0], [5, 50]], np.float32)[:, :, None])
     result = answer_of(truth, position, np.zeros((2, 2, 1), np.float32), 1)
-    errors = stress_errors(truth, result.stress[1:], result, constant=4.0, location="element")
+    errors = field_errors("stress", "element", truth, result.stress[1:], result, constant=4.0)
     assert errors["model"]["rollout_all"]["deforming"].total == 25.0
     assert errors["stress_constant"]["rollout_all"]["deforming"].total == 1.0
 

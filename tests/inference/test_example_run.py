@@ -25,6 +25,16 @@ def test_it_predicts_a_new_plate_by_one_call_and_better_with_newton_steps(tmp_pa
             steps = answers[1].check()
             assert answers[0].check().residual.value > 5 * steps.residual.value and steps.imbalance.value < 0.02
             assert np.linalg.norm(answers[1].reaction()) == pytest.approx(truth.attributes["reaction"][1], rel=0.02)
+            held, pressed = answers[1].body_forces()
+            assert (held.body, pressed.body) == (0, 1) and np.allclose(pressed.force, answers[1].reaction()[0])
+            assert np.linalg.norm(held.force + pressed.force) < 0.05 * np.linalg.norm(held.force)
+            # About one point, all torques from outside add up to nothing.
+            centres = [answers[1].position[0, truth.scene.body == body].mean(axis=0) for body in (0, 1)]
+            arm = (centres[1] - centres[0]).astype(float)
+            rest = held.torque + pressed.torque + np.cross(arm, pressed.force)
+            assert np.linalg.norm(rest) < 0.05 * np.linalg.norm(held.force) * np.linalg.norm(
+                np.ptp(answers[1].position[0], axis=0)
+            )
     network, with_newton = np.mean(errors, axis=0)
     assert network < 0.08 and with_newton < 0.03
     told = ["predict", str(tmp_path / "run.ast"), str(data), "--index", "2", "--out", str(tmp_path / "a.h5"), "--check"]

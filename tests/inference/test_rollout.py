@@ -33,8 +33,8 @@ class Constant(Simulator):
         motion = self.motion.expand(len(batch.position), 3).clone()
         if self.spoil is not None:
             self.spoil(self.calls, motion)
-        stress = torch.full((len(motion), 1), float(self.calls)) if self.config.data.stress == "node" else None
-        return Prediction(motion, stress)
+        stress = torch.full((len(motion), 1), float(self.calls))
+        return Prediction(motion, {"stress": stress} if self.config.data.stress == "node" else {})
 
 
 def model_of(kind=toy.LinearSimulator, dynamic=False, stress=True, **options):

@@ -69,7 +69,7 @@ def assert_follows(model: Simulator, batch: Batch, formulas: Callable[[Parameter
     float32, relative to the largest entry of each."""
 
     def results(out: Prediction, parameters: list[Tensor]) -> list[Tensor]:
-        outputs = [x for x in (out.motion, out.stress) if x is not None]
+        outputs = [out.motion, *out.fields.values()]
         generator = torch.Generator().manual_seed(7)
         weights = [torch.randn(x.shape, generator=generator, dtype=torch.float64).to(x.dtype) for x in outputs]
         total = sum((x * w).sum() for x, w in zip(outputs, weights, strict=True))

@@ -107,7 +107,7 @@ def outputs_and_gradients(family: str, changes: dict) -> dict[str, torch.Tensor]
     torch.manual_seed(1)
     model = build_model(config)
     out = model(batch_of(config, 0, 1, family=family))
-    value = out.motion.square().sum() + (0 if out.stress is None else out.stress.square().sum())
+    value = out.motion.square().sum() + sum(x.square().sum() for x in out.fields.values())
     value.backward()
     gradient = torch.cat([p.grad.flatten() for p in model.parameters()])
     return {"motion": out.motion.detach().contiguous(), "gradient": gradient}
@@ -144,9 +144,8 @@ def test_scene_alone_equals_scene_in_a_batch():
     config = small("deforming_plate")
     model = build_model(config).eval()
     both, alone = model(batch_of(config, 0, 1)), [model(batch_of(config, seed)) for seed in (0, 1)]
-    for name in ("motion", "stress"):
-        joined = torch.cat([getattr(x, name) for x in alone])
-        torch.testing.assert_close(getattr(both, name), joined, rtol=1e-4, atol=1e-5)
+    for values in (lambda x: x.motion, lambda x: x.fields["stress"]):
+        torch.testing.assert_close(values(both), torch.cat(list(map(values, alone))), rtol=1e-4, atol=1e-5)
 
 
 def test_bitwise_equal_from_run_to_run():
@@ -159,7 +158,7 @@ def test_bitwise_equal_from_run_to_run():
         torch.manual_seed(5)
         model.zero_grad()
         out = model(batch)
-        (out.motion.square().sum() + out.stress.sum()).backward()
+        (out.motion.square().sum() + out.fields["stress"].sum()).backward()
         return [out.motion.detach(), *(p.grad.clone() for p in model.parameters())]
 
     for first, second in zip(step(), step(), strict=True):
@@ -310,7 +309,7 @@ def test_every_part_of_the_exchanges_counts(exchanges):
     model = build_model(config)
     assert (len(model.processor), len(model.to_nodes), len(model.from_nodes)) == (2, exchanges, exchanges - 1)
     out = model(batch_of(config, 0))
-    (out.motion.square().sum() + out.stress.square().sum()).backward()
+    (out.motion.square().sum() + out.fields["stress"].square().sum()).backward()
     silent = [name for name, p in model.named_parameters() if p.grad is None or not p.grad.abs().max() > 0]
     assert not silent, silent
 
@@ -398,7 +397,7 @@ def test_loss_counts_the_right_nodes(tmp_path):
     out = model(batch)
     normal, free = batch.graph.normal_nodes, batch.graph.node_type != NodeType.OBSTACLE
     motion = (out.motion - target.motion / model.motion_normalizer.scale)[normal].square().mean()
-    stress = (out.stress - model.stress_normalizer(target.stress))[free].square().mean()
+    stress = (out.fields["stress"] - model.stress_normalizer(target.fields["stress"]))[free].square().mean()
     torch.testing.assert_close(losses["motion"], motion)
     torch.testing.assert_close(losses["stress"], stress)
     torch.testing.assert_close(losses["loss"], motion + 0.3 * stress)
@@ -497,7 +496,7 @@ def test_settings_that_do_not_fit(changes, message):
     "changes, stress, message",
     [
         ({"element_inputs": ("stress",)}, "node", "model.element_inputs: stress needs a dataset with stress on elem"),
-        ({"element_inputs": ()}, "element", "a stress on elements needs element nodes"),
+        ({"element_inputs": ()}, "element", "what is predicted on elements needs some"),
         ({"element_inputs": ("velocity",)}, "node", "model.element_inputs: velocity is an input of dynamic scenes"),
         ({"node_inputs": ("velocity",)}, "node", "model.node_inputs: velocity is an input of dynamic scenes"),
         ({"node_inputs": ("material",)}, "none", "model.node_inputs: material is an input, but the dataset has no"),

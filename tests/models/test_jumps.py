@@ -76,7 +76,7 @@ def test_the_sampler_carries_the_first_frame_to_every_other(data):
         shares.append(share)
         assert not batch.boundary_motion[nodes].any()
         assert np.array_equal(batch.stress[nodes], truth.stress[0])
-        assert np.array_equal(target.stress[nodes], truth.stress[frame])
+        assert np.array_equal(target.fields["stress"][nodes], truth.stress[frame])
     whole = [share for share in shares if share > 0.999999]
     assert 4 < len(whole) < 15 and 0 < min(shares) < 0.5
 
@@ -86,7 +86,7 @@ class Halving(Simulator):
 
     def forward(self, batch):
         missing = batch.graph.rest_position + torch.tensor([0.01, 0.0, 0.0]) - batch.position
-        return Prediction(missing / 2, torch.full((len(missing), 1), float(missing[0, 0])))
+        return Prediction(missing / 2, {"stress": torch.full((len(missing), 1), float(missing[0, 0]))})
 
 
 def test_each_call_corrects_the_answer_of_the_call_before():
@@ -170,7 +170,7 @@ def test_a_frame_that_fails_keeps_the_others_before_it():
         found = predict(batch)
         wrong = torch.tensor([name.endswith("frame 4") for name in batch.names])
         rows = wrong.repeat_interleave(batch.graph.node_offsets.diff())
-        return Prediction(torch.where(rows[:, None], torch.nan, found.motion), found.stress)
+        return Prediction(torch.where(rows[:, None], torch.nan, found.motion), found.fields)
 
     model.predict = spoiled
     result = toy.answer(model, truth)

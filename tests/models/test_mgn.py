@@ -36,9 +36,9 @@ def formulas(model, batch):
             v, e, w = v + deep_mlp(p, f"blocks.{i}.node", torch.cat([v, *sums], 1)), e + e_new, w + w_new
         out = deep_mlp(p, "decoder.of_nodes", v)
         if model.config.data.stress != "element":
-            return Prediction(out[:, :3], out[:, 3:] if model.config.data.stress == "node" else None)
+            return Prediction(out[:, :3], {"stress": out[:, 3:]} if model.config.data.stress == "node" else {})
         means = v[batch.graph.elements].mean(dim=1)
-        return Prediction(out[:, :3], deep_mlp(p, "decoder.of_elements", means))
+        return Prediction(out[:, :3], {"stress": deep_mlp(p, "decoder.of_elements", means)})
 
     return of
 

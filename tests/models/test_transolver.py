@@ -140,7 +140,7 @@ def test_the_model_is_its_formulas(stress):
     rest = replace(batch.graph, rest_position=batch.graph.rest_position.double(), one_hot=batch.graph.one_hot.double())
     batch = replace(batch, graph=rest, position=position, boundary_motion=motion)
     out = model(batch)
-    ours = [out.motion] if out.stress is None else [out.motion, out.stress]
+    ours = [out.motion, *out.fields.values()]
     theirs = transcribed(model, batch)
     generator = torch.Generator().manual_seed(1)
     weights = [torch.randn(x.shape, generator=generator, dtype=torch.float64) for x in theirs]
@@ -243,7 +243,7 @@ def test_scenes_of_a_batch_do_not_see_each_other():
     for nodes, alone in ((slice(0, 18), scene(0)), (slice(18, None), scene(2))):
         single = model(batch_of(model, alone))
         torch.testing.assert_close(out.motion[nodes], single.motion, rtol=1e-5, atol=2e-6)
-        torch.testing.assert_close(out.stress[nodes], single.stress, rtol=1e-5, atol=2e-6)
+        torch.testing.assert_close(out.fields["stress"][nodes], single.fields["stress"], rtol=1e-5, atol=2e-6)
     # Whatever happens in the second scene, the first keeps its bits.
     elsewhere = both.position.clone()
     elsewhere[18:] *= 3.0
@@ -266,7 +266,7 @@ def test_the_order_of_the_nodes_does_not_matter():
         boundary_motion=batch.boundary_motion[index],
     )
     torch.testing.assert_close(model(again).motion, model(batch).motion[index], rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(model(again).stress, model(batch).stress, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(model(again).fields["stress"], model(batch).fields["stress"], rtol=1e-4, atol=1e-5)
 
 
 def test_it_knows_no_edges():

@@ -330,7 +330,7 @@ def test_a_gradient_that_is_not_finite_stops_before_the_step(linear, data, tmp_p
 def test_a_dead_decoder_is_reported(linear, data, tmp_path, monkeypatch, capsys):
     def forward(self, batch):
         out = self.map.bias.expand(len(batch.position), -1)
-        return toy.Prediction(out[:, :3], out[:, 3:])
+        return toy.Prediction.of(self.config.data, out)
 
     monkeypatch.setattr(toy.LinearSimulator, "forward", forward)
     start.start_training(tmp_path / "run", settings(data, "train.steps=4"))
@@ -339,7 +339,9 @@ def test_a_dead_decoder_is_reported(linear, data, tmp_path, monkeypatch, capsys)
 
 def test_a_failing_validation_rollout_is_recorded_and_training_goes_on(linear, data, tmp_path, monkeypatch, capsys):
     def predict(self, batch):
-        return toy.Prediction(torch.full_like(batch.position, torch.nan), torch.zeros(len(batch.position), 1))
+        return toy.Prediction(
+            torch.full_like(batch.position, torch.nan), {"stress": torch.zeros(len(batch.position), 1)}
+        )
 
     monkeypatch.setattr(toy.LinearSimulator, "predict", predict)
     start.start_training(tmp_path / "run", settings(data))

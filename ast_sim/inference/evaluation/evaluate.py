@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -21,13 +21,17 @@ from ast_sim.inference.evaluation.trivial_predictors import (
     Errors,
     displacement_errors,
     errors_over_scenes,
+    field_errors,
     scene_errors,
-    stress_errors,
+    values_of,
+    where_it_counts,
 )
 from ast_sim.inference.predict import answers as predictions
 from ast_sim.inference.predict_batch import Start, predict_batch
 from ast_sim.inference.question import Question
+from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.simulator import Simulator
+from ast_sim.named_field import STRESS, Output, require_fields
 from ast_sim.scene import Trajectory
 from ast_sim.support.errors import DatasetError
 
@@ -59,32 +63,28 @@ def evaluate(
     indices = dataset.with_frames(split, model.config.data.given_frames + 1)
     if not indices:
         raise DatasetError(f"{dataset.path}: the split {split} has no frame to predict")
-    constant = _training_stress(dataset) if model.config.data.stress != "none" else None
+    outputs = model.config.data.outputs
+    constants = _training_means(dataset, outputs)
     scenes: list[SceneFigures] = []
-    displacement: list[Errors] = []
-    stress: list[Errors] = []
+    errors: dict[str, list[Errors]] = {"displacement": [], **{output.name: [] for output in outputs}}
     seconds = read_seconds(dataset).samples
     for index in indices:
         name = f"{split}/{index:06d}"
-        truth = dataset.load(split, index)
+        truth = _truth(dataset, split, index, model.config.data)
         (answer,) = predictions(model, [Question.of(truth, name)], effort)
         one_step = _predicted(answer) if model.config.jumps else one_step_predictions(model, truth, name)
-        displacement.append(displacement_errors(truth, one_step[0], answer))
-        errors = scene_errors("displacement", displacement[-1])
-        if constant is not None:
-            stress.append(stress_errors(truth, one_step[1], answer, constant, model.config.data.stress))
-            errors += scene_errors("stress", stress[-1])
+        errors["displacement"].append(displacement_errors(truth, one_step[0], answer))
+        for key, location, *_ in outputs:
+            errors[key].append(field_errors(key, location, truth, one_step[1].get(key), answer, constants[key]))
+        own = [row for quantity, of_scenes in errors.items() for row in scene_errors(quantity, of_scenes[-1])]
         recorded = truth.attributes.get("solve_seconds")
         solver = seconds.get(name, recorded if isinstance(recorded, list) else None)
-        scenes.append(_scene_figures(truth, answer, errors, solver))
+        scenes.append(_scene_figures(truth, answer, own, solver))
         if progress is not None:
             progress(name)
     return Figures(
         scenes=tuple(scenes),
-        errors=(
-            *errors_over_scenes("displacement", displacement),
-            *(errors_over_scenes("stress", stress) if stress else ()),
-        ),
+        errors=tuple(row for quantity, of_scenes in errors.items() for row in errors_over_scenes(quantity, of_scenes)),
         failures=sum(scene.failure is not None for scene in scenes),
         jumps=bool(model.config.jumps),
         effort=dataclasses.asdict(effort),
@@ -93,21 +93,32 @@ def evaluate(
         length_unit=dataset.info.length_unit,
         stress_unit="Pa",
         threads=torch.get_num_threads(),
+        field_units={key: unit for key, _, _, unit in model.config.data.fields},
     )
 
 
-def _predicted(answer: Answer) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """The predicted positions and stresses of a rollout, without the given frames; None if the rollout failed."""
+def _truth(dataset: Dataset, split: str, index: int, data: DataFacts) -> Trajectory:
+    """A trajectory with the named fields that a model predicts."""
+    names = [key for key, *_ in data.fields]
+    truth = dataset.load(split, index, names)
+    require_fields(f"{dataset.path}: {split}/{index:06d}", truth.fields, data.fields)
+    return truth
+
+
+def _predicted(answer: Answer) -> tuple[np.ndarray | None, dict[str, np.ndarray]]:
+    """The predicted positions and fields of a rollout, without the given frames; none if the rollout failed."""
     if answer.failure is not None:
-        return None, None
-    return answer.position[answer.given :], None if answer.stress is None else answer.stress[answer.given :]
+        return None, {}
+    fields = {output: one.values[answer.given :] for output, one in answer.fields.items()}
+    stress = {} if answer.stress is None else {STRESS: answer.stress[answer.given :]}
+    return answer.position[answer.given :], fields | stress
 
 
-def one_step_predictions(model: Simulator, truth: Trajectory, name: str) -> tuple[np.ndarray, np.ndarray | None]:
+def one_step_predictions(model: Simulator, truth: Trajectory, name: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Each frame after the given ones, predicted from the true frame before it.
 
     Returns:
-        Positions [S - given, N, 3] and stresses [S - given, N or E, 1] or None.
+        Positions [S - given, N, 3] and fields [S - given, N or E, *] by name.
     """
     given = model.config.data.given_frames
     graph = model.graph(truth.scene)
@@ -122,8 +133,11 @@ def one_step_predictions(model: Simulator, truth: Trajectory, name: str) -> tupl
     with model.predicting():
         for first in range(0, len(starts), chunk):
             predicted += predict_batch(model, starts[first : first + chunk])
-    stresses = [stress.numpy() for _, stress, _ in predicted if stress is not None]
-    return np.array([positions[0].numpy() for positions, *_ in predicted]), np.array(stresses) if stresses else None
+    fields = {
+        output.name: np.array([fields[output.name].numpy() for _, fields, _ in predicted])
+        for output in model.config.data.outputs
+    }
+    return np.array([positions[0].numpy() for positions, *_ in predicted]), fields
 
 
 def _scene_figures(
@@ -155,23 +169,24 @@ def _speedup(scenes: list[SceneFigures]) -> float | None:
     return statistics.median(ratios) if ratios else None
 
 
-def _training_stress(dataset: Dataset) -> float:
-    """Mean stress of the training split on the nodes or elements that deform; 0 without training data."""
-    total, number = 0.0, 0
-    for _, trajectory in dataset.spread("train", MEAN_TRAJECTORIES):
-        assert trajectory.stress is not None
-        stress = trajectory.stress[:, trajectory.scene.deforming(dataset.info.stress_location)]
-        total, number = total + float(stress.sum(dtype=np.float64)), number + stress.size
-    return total / number if number else 0.0
+def _training_means(dataset: Dataset, outputs: Sequence[Output]) -> dict[str, float]:
+    """The mean of the stress and of each named field in the training split, where they count; 0 where there is none."""
+    totals = dict.fromkeys((output.name for output in outputs), 0.0)
+    numbers = dict.fromkeys(totals, 0)
+    for _, trajectory in dataset.spread("train", MEAN_TRAJECTORIES, totals) if totals else ():
+        for name, location, *_ in outputs:
+            if name == STRESS or name in trajectory.fields:
+                values = values_of(trajectory, name)[:, where_it_counts(trajectory.scene, name, location)]
+                totals[name] += float(values.sum(dtype=np.float64))
+                numbers[name] += values.size
+    return {name: total / max(numbers[name], 1) for name, total in totals.items()}
 
 
 def table(figures: Figures) -> str:
     """The errors as text: for each quantity and set of nodes a table with a row for each predictor."""
     lines = []
-    for quantity, nodes in (("displacement", "normal"), ("displacement", "all"), ("stress", "deforming")):
+    for quantity, nodes in dict.fromkeys((row.quantity, row.nodes) for row in figures.errors):
         rows = [row for row in figures.errors if (row.quantity, row.nodes) == (quantity, nodes)]
-        if not rows:
-            continue
         horizons = list(dict.fromkeys(row.horizon for row in rows))
         lines.append(f"{quantity} [{figures.unit(quantity)}], {nodes} nodes: rmse_sequence / rmse_pooled")
         lines.append(" " * 20 + "".join(f"{horizon:>24}" for horizon in horizons))
@@ -179,6 +194,9 @@ def table(figures: Figures) -> str:
             cells = [figures.error(quantity, predictor, horizon, nodes) for horizon in horizons]
             shown = [f"{_shown(cell.rmse_sequence)} / {_shown(cell.rmse_pooled)}" for cell in cells if cell is not None]
             lines.append(f"  {predictor:18}" + "".join(f"{cell:>24}" for cell in shown))
+        share = figures.relative(quantity) if quantity in figures.field_units else None
+        if share is not None:
+            lines.append(f"  relative: {100 * share:.3g} % of the root mean square of {quantity} in all frames")
         lines.append("")
     lines.append(f"scenes: {len(figures.scenes)}, failed: {figures.failures}, threads: {figures.threads}")
     if figures.jumps:

@@ -2,8 +2,9 @@
 
 Predictors of the displacement: the model; `hold_still` (the next position equals the present one); `repeat_last` (the
 next increment equals the last one). Predictors of the stress: the model; `stress_zero`; `stress_constant` (the mean of
-the training split); `stress_frame_mean` (the mean of the true frame). All predictors have the prescribed nodes at their
-true positions. The stress is compared on the nodes or elements that deform (`Scene.deforming`).
+the training split); `stress_frame_mean` (the mean of the true frame); of a named field likewise, with its name. All
+predictors have the prescribed nodes at their true positions. Stress and fields are compared on the nodes or elements
+that deform (`Scene.deforming`), reactions at the prescribed nodes.
 
 Horizons: `one_step` (each frame is predicted from the true frame before it), `rollout_50` (the first 50 frames of the
 rollout, or all frames if it is shorter), `rollout_all` (all frames).
@@ -16,10 +17,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ast_sim.figures import MeanError, SceneError
+from ast_sim.figures import MeanError, SceneError, main_nodes
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.evaluation.measures import SquaredError, rmse_pooled, rmse_sequence
-from ast_sim.scene import NodeType, Trajectory
+from ast_sim.named_field import REACTION, STRESS
+from ast_sim.scene import NodeType, Scene, Trajectory
 
 # The errors of one scene, by predictor, horizon and set of nodes.
 Errors = dict[str, dict[str, dict[str, SquaredError]]]
@@ -54,21 +56,34 @@ def displacement_errors(truth: Trajectory, one_step: np.ndarray | None, answer: 
     return _errors_by_horizon(placed, target, rows)
 
 
-def stress_errors(
-    truth: Trajectory, one_step: np.ndarray | None, answer: Answer, constant: float, location: str
+def field_errors(
+    name: str, location: str, truth: Trajectory, one_step: np.ndarray | None, answer: Answer, constant: float
 ) -> Errors:
-    """Errors of the stress on the nodes or elements that deform; `constant` is the value of `stress_constant`."""
-    assert truth.stress is not None and answer.stress is not None
-    target = truth.stress[answer.given :].astype(np.float64)
-    rows = truth.scene.deforming(location)
+    """Errors of the stress, or of another field by name, where it counts; `constant` is the value of
+    `NAME_constant`."""
+    target = values_of(truth, name)[answer.given :].astype(np.float64)
+    rows = where_it_counts(truth.scene, name, location)
     mean = target[:, rows].mean(axis=1, keepdims=True)
     predictors = {
-        "model": (one_step, answer.stress[answer.given :] if answer.failure is None else None),
-        "stress_zero": (np.zeros(1), np.zeros(1)),
-        "stress_constant": (np.full(1, constant), np.full(1, constant)),
-        "stress_frame_mean": (mean, mean),
+        "model": (one_step, values_of(answer, name)[answer.given :] if answer.failure is None else None),
+        f"{name}_zero": (np.zeros(1), np.zeros(1)),
+        f"{name}_constant": (np.full(1, constant), np.full(1, constant)),
+        f"{name}_frame_mean": (mean, mean),
     }
-    return _errors_by_horizon(predictors, target, {"deforming": rows})
+    return _errors_by_horizon(predictors, target, {main_nodes(name): rows})
+
+
+def values_of(shown: Trajectory | Answer, name: str) -> np.ndarray:
+    """[S, N or E, *]: the stress or a named field."""
+    if name != STRESS:
+        return shown.fields[name].values
+    assert shown.stress is not None
+    return shown.stress
+
+
+def where_it_counts(scene: Scene, name: str, location: str) -> np.ndarray:
+    """[N or E] bool: where a field is compared."""
+    return scene.prescribed if name == REACTION else scene.deforming(location)
 
 
 def _errors_by_horizon(

@@ -86,7 +86,7 @@ class ASTConfig(ProximityConfig):
             depth = min(max(round(1 + math.log2(resolved.data.domain_half_width / side)), self.l_ocnn + 1), 21)
         if elements is None:
             material = ("material",) if facts.material_width else ()
-            elements = ("displacement", *material) if resolved.data.stress == "element" else ()
+            elements = ("displacement", *material) if resolved.data.output_columns("element") else ()
         if places is None:
             places = "absolute" if resolved.data.dynamic else "relative"
         if exchanges is None:
@@ -97,8 +97,8 @@ class ASTConfig(ProximityConfig):
         resolved.check_available("element_inputs")
         if "stress" in elements and resolved.data.stress != "element":
             raise ConfigError("model.element_inputs: stress needs a dataset with stress on elements")
-        if resolved.data.stress == "element" and not elements:
-            raise ConfigError("model.element_inputs: a stress on elements needs element nodes, such as displacement")
+        if resolved.data.output_columns("element") and not elements:
+            raise ConfigError("model.element_inputs: what is predicted on elements needs some, such as displacement")
         return resolved
 
     def facts(self, length_unit: str, mesh_spacing: float | None = None) -> dict[str, str]:

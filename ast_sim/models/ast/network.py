@@ -63,10 +63,10 @@ class AST(Simulator):
             self.lower = Linear(c.d_token, width)
             self.up = nn.ModuleList(SparseConv(width, up=True) for _ in range(c.l_ocnn))
             self.c2m = self._message_passing("c2m")
-        self.decoder = MLP(2 * width, c.decoder_hidden, 4 if c.data.stress == "node" else 3, c.factorized)
-        if c.data.stress == "element":
+        self.decoder = MLP(2 * width, c.decoder_hidden, 3 + c.data.output_columns("node"), c.factorized)
+        if on_elements := c.data.output_columns("element"):
             self.m2e = self._message_passing("m2e")
-            self.element_decoder = MLP(width, c.decoder_hidden, 1, c.factorized)
+            self.element_decoder = MLP(width, c.decoder_hidden, on_elements, c.factorized)
 
     def _message_passing(self, name: str, edge_inputs: int = 0) -> MessagePassing:
         return MessagePassing(self.config, edge_inputs, name in self.config.residual)
@@ -119,9 +119,9 @@ class AST(Simulator):
         for step in self.after_cells:
             mesh = step(edges, mesh, mesh, on_edges)
 
-        on_elements = self.config.data.stress == "element" and batch.wants_stress
-        stress = self.element_decoder(self.m2e(batch.graph.m2e, mesh, elements)) if on_elements else None
-        return Prediction.of_nodes(self.decoder(mesh, beside=encoded), stress)
+        wanted = self.config.data.output_columns("element") and batch.wants_elements
+        on_elements = self.element_decoder(self.m2e(batch.graph.m2e, mesh, elements)) if wanted else None
+        return Prediction.of(self.config.data, self.decoder(mesh, beside=encoded), on_elements)
 
     def _embedded(self, cells: Cells, mesh: Tensor) -> Vectors:
         """Mesh features [N, hidden] -> the coarsest cells [C, d_token] with their places."""

@@ -1,0 +1,144 @@
+"""What an engineer asks of an answer: the forces on its bodies from outside, and figures of each frame.
+
+Where the law of the material is known and elastic, forces follow from the predicted positions. Elsewhere, if the model
+predicts the nodal reactions of its data, these are summed over the prescribed nodes: free nodes have none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ast_sim.dataset.layout import LENGTH_UNITS
+from ast_sim.mechanics.driven import Driven
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean
+from ast_sim.named_field import REACTION
+from ast_sim.support.errors import AstSimError, ConfigError, SimulationError
+from ast_sim.view import sweep_files
+from ast_sim.view.files import make_folder
+
+if TYPE_CHECKING:
+    from ast_sim.inference.answer import Answer
+
+
+class BodyForce(NamedTuple):
+    """What acts on the prescribed nodes of a body in one frame.
+
+    Attributes:
+        frame: the number of the frame in the motion that was asked.
+        time: in seconds; None: it is not known.
+        body: the number of the body.
+        force: [3] in newton.
+        torque: [3] in newton metres, about the mean position of the nodes of the body in this frame.
+    """
+
+    frame: int
+    time: float | None
+    body: int
+    force: np.ndarray
+    torque: np.ndarray
+
+
+def force_on_driven(answer: Answer) -> np.ndarray:
+    """[S, 3]: the force in newton on the prescribed nodes `answer.driven`; errors as in `Answer.reaction`."""
+    if answer.info is None or answer.driven is None:
+        raise ConfigError(f"{answer.name} has no reaction: no prescribed node moves, or the answer is of no run")
+    return _newton(answer, answer.driven).sum(axis=1)
+
+
+def forces_on_bodies(answer: Answer) -> list[BodyForce]:
+    """The force and the torque on each body that has prescribed nodes, frame by frame; errors as in
+    `Answer.reaction`."""
+    scene = answer.scene
+    if answer.info is None:
+        raise ConfigError(f"{answer.name} has no reaction: the answer is of no run")
+    metres = LENGTH_UNITS[answer.info.length_unit]
+    rows = []
+    for body in np.unique(scene.body[scene.prescribed]).tolist():
+        own = scene.body == body
+        nodes = scene.prescribed & own
+        shares = _newton(answer, Driven(body, nodes, answer.position[:, nodes].astype(np.float64)))
+        position = answer.position.astype(np.float64)
+        arms = metres * (position - position[:, own].mean(axis=1, keepdims=True))
+        torques = np.cross(arms, shares).sum(axis=1)
+        times = answer.info.times(answer.frames) or (None,) * len(answer.frames)
+        forces = zip(answer.frames, times, shares.sum(axis=1), torques, strict=True)
+        rows += [BodyForce(frame, time, body, force, torque) for frame, time, force, torque in forces]
+    return sorted(rows, key=lambda row: (answer.frames.index(row.frame), row.body))
+
+
+def write_forces(path: Path, forces: list[BodyForce]) -> None:
+    """Write a table (.csv) with a row for each frame and body; errors as in `Answer.save_forces`."""
+    if path.suffix != ".csv":
+        raise AstSimError(f"{path}: the name of a table of forces must end in .csv")
+    rows = []
+    for one in forces:
+        row = {"frame": one.frame, "time": one.time, "body": one.body}
+        for name, values in (("force", one.force), ("torque", one.torque)):
+            row |= {f"{name}_{axis}": float(value) for axis, value in zip("xyz", values, strict=True)}
+        rows.append(row)
+    make_folder(path.parent)
+    sweep_files.write_table(path, rows)
+
+
+def figures_of(answer: Answer, origin: Sequence[float]) -> list[dict[str, float]]:
+    """See `Answer.figures`."""
+    scene, rows = answer.scene, []
+    try:
+        forces = answer.reaction()
+    except ConfigError:  # a figure that this scene has not
+        forces = None
+    computed = sorted(number for number in answer.frames if number >= answer.given)
+    last_steps = dict(zip(computed, answer.last_steps, strict=False))
+    for frame, position in enumerate(answer.position):
+        way = np.linalg.norm((position - scene.rest_position)[scene.prescribed], axis=1)
+        row = {"travel_of_nodes": float(way.max(initial=0.0))}
+        if forces is not None:
+            row |= {"reaction": float(np.linalg.norm(forces[frame]))}
+            row |= {f"reaction_{axis}": float(force) for axis, force in zip("xyz", forces[frame], strict=True)}
+        if answer.stress is not None:
+            stress = answer.stress[frame, :, 0]
+            worst = int(np.where(scene.deforming(answer.stress_location or "node"), stress, -np.inf).argmax())
+            nodes = scene.elements[worst] if answer.stress_location == "element" else [worst]
+            place = position[nodes].mean(axis=0) + origin
+            row |= {"largest_stress": float(stress[worst])}
+            row |= {f"stress_at_{axis}": float(x) for axis, x in zip("xyz", place, strict=True)}
+        for name, one in answer.fields.items():
+            if name != REACTION:
+                values = one.values[frame]
+                size = values if values.shape[1] == 1 else np.linalg.norm(values, axis=1)
+                row |= {f"largest_{name}": float(size.max())}
+        if answer.frames[frame] in last_steps:
+            row |= {"last_newton_step": last_steps[answer.frames[frame]]}
+        rows.append(row)
+    return rows
+
+
+def _newton(answer: Answer, driven: Driven) -> np.ndarray:
+    """[S, N, 3] in newton: the shares of the nodes in the force on the prescribed nodes `driven`."""
+    try:
+        law = _elastic_law(answer)
+    except (ConfigError, SimulationError) as error:
+        if REACTION in answer.fields:
+            return np.where(driven.nodes[:, None], answer.fields[REACTION].values, 0).astype(np.float64)
+        raise ConfigError(f"{answer.name} has no reaction: {error}") from error
+    from ast_sim.mechanics.reaction import Reaction
+
+    assert answer.info is not None
+    reaction = Reaction(answer.scene, driven, law)
+    shares = [reaction.shares(position) for position in answer.position]
+    return LENGTH_UNITS[answer.info.length_unit] ** 2 * np.array(shares).reshape(-1, answer.scene.num_nodes, 3)
+
+
+def _elastic_law(answer: Answer) -> NeoHookean:
+    """The law of each element, if the scene has one from which the force follows."""
+    if answer.info is None or answer.law is None:
+        raise ConfigError("the answer is of no run")
+    if answer.info.integration == "dynamic":
+        raise ConfigError("it has inertia; the reaction is a force at equilibrium")
+    if answer.scene.elements.shape[1] == 3:
+        raise ConfigError("its elements are triangles; it needs tetrahedra")
+    return answer.law.of_elements(answer.scene)
