@@ -4,11 +4,11 @@ from .dataset.writer import DatasetWriter as DatasetWriter
 from .importers.convert import convert as convert
 from .importers.scene_mesh import read_scene as read_scene
 from .inference.answer import Answer as Answer
-from .inference.calibration import Calibration as Calibration
-from .inference.calibration import calibrate as calibrate
 from .inference.effort import Effort as Effort
 from .inference.evaluation.evaluated_run import Evaluation as Evaluation
 from .inference.example_run import example_run as example_run
+from .inference.promises.calibration import Calibration as Calibration
+from .inference.promises.calibration import calibrate as calibrate
 from .inference.trained_run import Run as Run
 from .material import Material as Material
 from .ops.library import keep_memory as keep_memory

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from ast_sim import __version__, commands, help_lines
-from ast_sim.support.argument_types import at_least, path, whole_numbers
-from ast_sim.support.errors import AstSimError, ConfigError, printable
+from ast_sim.support.argument_types import at_least, path, read_by, whole_numbers
+from ast_sim.support.errors import AstSimError, printable
 from ast_sim.support.stop_signals import Interrupted
 
 CORNERS = "take only the corners of second-order tetrahedra: forces are then those of another, stiffer mesh"
@@ -175,7 +175,9 @@ def _add_convert(convert: _Parser) -> None:
     }
     _add_each(fields, names)
     about = "components of the stress, such as xx,xy,xz,yy,yz,zz (default: as the file names them, else xx,yy,zz,...)"
-    _add_each(fields, {"--stress-order XX,YY,...": about}, type=_stress_order, default=())
+    _add_each(
+        fields, {"--stress-order XX,YY,...": about}, type=read_by("ast_sim.importers.stress:parse_order"), default=()
+    )
     about = "cell fields with one number each; young=E takes the field E as the column young"
     _add_each(fields, {"--material NAME": about}, nargs="+", default=[])
     about = "a further field that the dataset keeps by its name, such as PEEQ or CPRESS=MPa; may be repeated"
@@ -253,8 +255,9 @@ def _add_predict(predict: _Parser) -> None:
         " likewise; 0 with --corrections)",
     }
     _add_each(predict, efforts, type=at_least(0))
-    about = "instead: the cheapest effort that keeps this error, such as 0.02, in 90 %% of scenes (`calibrate` first)"
-    _add_each(predict, {"--error E": about}, type=float)
+    _add_errors(predict)
+    about = "instead: the most accurate effort that takes at most so many milliseconds on this machine"
+    _add_each(predict, {"--ms T": about}, type=float)
     about = "number of frames of the motion (default: prescribed nodes move as far in a frame as in training)"
     _add_each(predict, {"--num-frames N": about}, type=at_least(2))
     about = "say whether the answer is physics: elements turned over, penetration, forces out of balance"
@@ -285,6 +288,20 @@ def _add_predict(predict: _Parser) -> None:
     predict.set_defaults(of_mesh=(mesh,), of_data=(data,), of_spec=(spec,))
 
 
+def _add_errors(parser: _Parser) -> None:
+    about = (
+        "instead: the cheapest effort that keeps this error of the displacement, such as 2%%, or of another quantity,"
+        " such as reaction=5%% or stress=10%%, in 90 %% of scenes (`calibrate` first); may be repeated"
+    )
+    _add_each(
+        parser,
+        {"--error E": about},
+        type=read_by("ast_sim.inference.promises.chosen_effort:parse_error"),
+        action="append",
+        default=[],
+    )
+
+
 def _add_sweep(sweep: _Parser) -> None:
     sweep.add_argument("run_folder", type=path, metavar="RUN", help="run folder")
     sweep.add_argument("spec", type=path, metavar="SPEC", help="specification of the assembly (.toml)")
@@ -295,6 +312,7 @@ def _add_sweep(sweep: _Parser) -> None:
     about = "what the picture shows (default: reaction)"
     sweep.add_argument("--quantity", choices=("reaction", "largest_stress"), default="reaction", help=about)
     _add_each(sweep, {"--corrections N": "as for predict", "--newton-steps N": "as for predict"}, type=at_least(0))
+    _add_errors(sweep)
     _add_each(sweep, {"--nodes N": "approximate number of nodes (default: by the sizes)"}, type=at_least(1))
 
 
@@ -321,15 +339,6 @@ def _add_report(report: _Parser) -> None:
     _add_each(report, {"--out FILE.html": "page to write"}, type=path, required=True)
     _add_each(report, {"--data DATA": "dataset for all runs (default: the training data of each run)"}, type=path)
     _add_overwrite(report)
-
-
-def _stress_order(text: str) -> tuple[str, ...]:
-    from ast_sim.importers.stress import parse_order
-
-    try:
-        return parse_order(text)
-    except ConfigError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 if __name__ == "__main__":

@@ -189,7 +189,7 @@ def predict(args: argparse.Namespace) -> None:
     moves = dict(map(parse_move, args.move))
     run = _open_run(args.run_folder)
     effort = run.effort.asked(args.corrections, args.newton_steps)
-    wanted = {"frames": args.frames, "effort": effort, "error": args.error, "throw": False}
+    wanted = {"frames": args.frames, "effort": effort, "error": dict(args.error) or None, "ms": args.ms, "throw": False}
     if args.scene.suffix == ".toml":
         _predict_spec(run, args, wanted)
         return
@@ -245,6 +245,7 @@ def sweep(args: argparse.Namespace) -> None:
         table=args.table,
         nodes=args.nodes,
         effort=run.effort.asked(args.corrections, args.newton_steps),
+        error=dict(args.error) or None,
     )
     swept.save(args.out)
     print(f"{args.out}: {len(swept.rows)} rows, {1000 * swept.seconds / len(swept.rows):.3g} ms each")
@@ -314,7 +315,7 @@ def evaluate(args: argparse.Namespace) -> None:
 
 def calibrate(args: argparse.Namespace) -> None:
     """Measure on new scenes how far answers are from the truth, so that each has a band."""
-    from ast_sim.inference.calibration import calibrate as measure
+    from ast_sim.inference.promises.calibration import calibrate as measure
 
     print(measure(_open_run(args.run_folder), args.data, args.split).text)
 

@@ -13,7 +13,6 @@ import numpy as np
 
 from ast_sim.dataset.layout import DatasetInfo
 from ast_sim.dataset.writer import DatasetWriter
-from ast_sim.inference.calibration import LEVEL
 from ast_sim.inference.forces_and_figures import (
     BodyForce,
     figures_of,
@@ -21,6 +20,7 @@ from ast_sim.inference.forces_and_figures import (
     forces_on_bodies,
     write_forces,
 )
+from ast_sim.inference.relative_errors import errors_of
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.mechanics.physics_check import Law, PhysicsCheck, check_physics
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     import pyvista
     from matplotlib.figure import Figure
 
+LEVEL = 0.95  # the probability with which a band holds
 SUFFIXES = (".h5", ".pvd", ".vtkhdf", ".csv")
 
 
@@ -117,10 +118,8 @@ class Answer:
     def how_far(self) -> list[str]:
         """What is known of the distance to the truth, as sentences."""
         told = []
-        if "asked_error" in self.source:
-            asked = f"{100 * self.source['asked_error']:.3g} %"
-            kept = f"the cheapest that keeps {asked} at the deepest frame in 90 % of scenes like it"
-            told.append(f"effort: {self.source['effort']}, {kept}")
+        if "promise" in self.source:
+            told.append(f"effort: {self.source['effort']}, {self.source['promise']}")
         if self.expected_error is not None:
             percent = f"{100 * self.expected_error:.2g} % of the displacement"
             told.append(f"expected error: {percent}, as in the validation scenes at their deepest frame")
@@ -268,6 +267,19 @@ class Answer:
                 tetrahedra, or the law of its material is not known, and the model predicts no reactions.
         """
         return force_on_driven(self)
+
+    def errors(self, truth: Trajectory) -> dict[str, float]:
+        """Relative errors of the last frame of the answer, where a simulation is known.
+
+        Args:
+            truth: all frames of the same motion; something must be displaced in the frame.
+
+        Returns:
+            "displacement": the root mean square error of the free nodes over the root mean square displacement;
+            "reaction": the distance of the forces on the moved body over the true force; "stress": by how much the
+            largest stress is off, over the true one. The last two are missing where there is none.
+        """
+        return errors_of(self, truth)
 
     def body_forces(self) -> list[BodyForce]:
         """The force and the torque on the prescribed nodes of each body that has some, frame by frame, by the law or by

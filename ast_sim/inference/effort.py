@@ -20,6 +20,7 @@ GOOD = 0.02  # a relative error that most users call exact
 GOOD_STRESS = 0.1  # the same of the stress, relative to the error of its mean
 MOST_NEWTON_STEPS = 10  # by default; they end earlier where one is small
 AGAIN = 2  # a frame in which so many Newton steps did not end is begun anew with so many more corrections
+CHOSEN_STEPS = (0, 1, 2, MOST_NEWTON_STEPS)  # among these numbers of Newton steps an effort is chosen
 WORTH = 0.05  # a correction or a Newton step must lower an error that is not good by this share
 
 
@@ -31,6 +32,7 @@ class Effort:
         corrections: how many further calls of the model correct its answer.
         newton_steps: at most how many Newton steps of the solver then lead towards equilibrium. They end when a step is
             at most `STILL`. Where `MOST_NEWTON_STEPS` or more do not end, they begin anew after more corrections.
+            Stress then follows from the material.
 
     Raises:
         ConfigError: a number is not whole or negative.
@@ -124,6 +126,15 @@ def _mean(values: Sequence[float | None]) -> float | None:
 def can_make_newton_steps(config: ModelConfig) -> bool:
     """Whether the scenes of a model that jumps are tetrahedra of a material whose law is known."""
     return bool(config.jumps and config.data.tetrahedra and config.data.material.law)
+
+
+def choices(config: ModelConfig, calls: int | None) -> tuple[Effort, ...]:
+    """The efforts among which one is chosen for an asked error or time, from the cheapest to the dearest, for a model
+    that was trained for so many calls: a Newton step costs more than a correction. None for one that does not jump."""
+    if not config.jumps:
+        return ()
+    steps = CHOSEN_STEPS if can_make_newton_steps(config) else (0,)
+    return tuple(Effort(corrections, count) for count in steps for corrections in range(calls or 1))
 
 
 def newton_steps(config: ModelConfig, scene: Scene) -> NewtonSteps:

@@ -55,9 +55,10 @@ def new_question(
     name: str,
     frames: Frames | None,
     stress: np.ndarray | None = None,
+    notes: tuple[str, ...] = (),
 ) -> Question:
     """The question that the arguments of `Run.predict` ask; `scope` is what the model was trained on. Every question
-    passes here, and what is unusual about it is noted.
+    passes here, and what is unusual about it is noted, after the `notes` that are known already.
 
     Raises:
         ConfigError: the motion does not fit the scene, or the scene does not fit the model.
@@ -80,7 +81,7 @@ def new_question(
         fields = {} if stress is None else {STRESS: stress}
     scene.require_predictable(name)
     _require_material(config, scope, scene, name)
-    notes = tuple(scope.notes(scene, motion, bool(config.jumps)))
+    notes = (*notes, *scope.notes(scene, motion, bool(config.jumps)))
     return Question(name, scene, motion.position, fields, movable=True, notes=notes).asking(frames)
 
 

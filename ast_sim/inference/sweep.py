@@ -12,6 +12,7 @@ from typing import Any
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.assembly_questions import ask
 from ast_sim.inference.effort import Effort
+from ast_sim.inference.promises.chosen_effort import AskedError
 from ast_sim.material import FRICTION
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.models.model_config import ModelConfig
@@ -74,6 +75,7 @@ def sweep(
     spec: str | os.PathLike[str],
     rows: Sequence[Mapping[str, Any]],
     effort: Effort,
+    error: AskedError | None,
     nodes: int | None,
 ) -> Sweep:
     """Predict the last frame for each row of values.
@@ -84,13 +86,15 @@ def sweep(
     Args:
         predict_scenes: of a `Run`.
         config, scope, trained: of its model, and the scenes and the specification that it was trained on.
-        spec, rows, nodes: those of `Run.sweep`.
+        spec, rows, error, nodes: those of `Run.sweep`.
+        effort: as it is asked, or as the error has chosen it.
     """
     if not rows:
         raise ConfigError("a sweep needs at least one row of values")
     needs_way = bool((config.data.friction or FRICTION in config.data.columns) and effort.newton_steps)
     frames = 2 if config.jumps and not needs_way else None
-    table, seconds, notes = [], 0.0, []
+    asked_for = {"effort": effort} if error is None else {"error": error}
+    table, seconds, notes, unpromised = [], 0.0, [], 0
     for start in range(0, len(rows), TOGETHER):
         asked = ask(spec, rows[start : start + TOGETHER], scope, trained, frames, nodes)
         names = [f"row {start + number}" for number in range(len(asked))]
@@ -98,15 +102,22 @@ def sweep(
         scenes = [(one.scene, one.motion) for one in asked]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # told once for all rows
-            answers = predict_scenes(scenes, names=names, frames=wanted, effort=effort, throw=False)
+            answers = predict_scenes(scenes, names=names, frames=wanted, throw=False, **asked_for)
         told = [(*one.notes, *answer.notes) for one, answer in zip(asked, answers, strict=True)]
         notes += [f"{name}: {note}" for name, row in zip(names, told, strict=True) for note in row]
         table += [_row(one.values, answer, one.origin) for one, answer in zip(asked, answers, strict=True)]
+        unpromised += sum(error is not None and "promise" not in answer.source for answer in answers)
         seconds += sum(answer.seconds for answer in answers)
     outside = {note.partition(":")[0] for note in notes}
     if outside:
         warnings.warn(
             f"{len(outside)} of {len(rows)} rows lie outside the training scenes; the first: {notes[0]}", stacklevel=3
+        )
+    if unpromised:
+        warnings.warn(
+            f"no error is promised in {unpromised} of {len(rows)} rows: their mesh or their ranges are not those of the"
+            " calibration scenes",
+            stacklevel=3,
         )
     return Sweep(table, _varied(rows, table), scope.length_unit, seconds)
 

@@ -17,12 +17,12 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.importers.scene_mesh import SceneMesh
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.assembly_questions import ask
-from ast_sim.inference.calibration import Calibration, promised_effort
 from ast_sim.inference.effort import Effort, EffortErrors
-from ast_sim.inference.evaluation.asked_frame import errors_by_effort
 from ast_sim.inference.evaluation.evaluate import evaluate
 from ast_sim.inference.evaluation.evaluated_run import Evaluation
 from ast_sim.inference.predict import Motions, in_domain, new_question
+from ast_sim.inference.promises.calibration import Calibration
+from ast_sim.inference.promises.chosen_effort import AskedError, chosen_effort
 from ast_sim.inference.question import Frames, Question
 from ast_sim.inference.sweep import Sweep, sweep
 from ast_sim.runs import run_file
@@ -69,7 +69,7 @@ class Run:
         self._errors = [EffortErrors.from_json(one) for one in answers.get("valid_by_effort", [])]
 
     def _facts(self) -> dict[str, str]:
-        error = self._expected_error(self.effort)
+        error = self.expected_error(self.effort)
         return {
             "path": self.path.name,
             "model": f"{self.settings.model.name}, {sum(p.numel() for p in self.model.parameters()):,} parameters",
@@ -127,7 +127,8 @@ class Run:
         nodes: int | None = None,
         frames: Frames | None = None,
         effort: Effort | None = None,
-        error: float | None = None,
+        error: AskedError | None = None,
+        ms: float | None = None,
         num_frames: int | None = None,
         stress: np.ndarray | None = None,
         name: str = "scene",
@@ -140,9 +141,8 @@ class Run:
         have not converged, and each way in which a specification differs from the one of the training.
 
         Args:
-            scene: a scene, with lengths in the run's unit, or what `read_scene` returns. Or a `Trajectory`: its
-                prescribed nodes give the motion, its first frames the start. Then leave motion, num_frames and stress
-                out.
+            scene: a scene, with lengths in the run's unit, or what `read_scene` returns. Or a `Trajectory`, which has
+                motion and start of its own: then leave motion, num_frames and stress out.
             motion: of the prescribed nodes: rigid motions by body, such as {1: (0, 0, -0.01)}; or positions [S, N, 3]
                 of all nodes or [S, P, 3] of the prescribed ones; or a `Motion`.
             spec, parameters, nodes: instead of a scene and a motion, the specification of an assembly, values of its
@@ -151,9 +151,10 @@ class Run:
             frames: numbers of the frames that are wanted, such as [-1], or a slice, in the order of the answer; by
                 default all. A model that jumps computes no other frame. With friction ask for [-2, -1]: a body may be
                 in equilibrium in two places, and the frame before says in which.
-            effort: what follows the first call of a model that jumps; by default `self.effort`. After Newton steps,
-                stress follows from the material.
-            error: a relative error, such as 0.02, that chooses the effort (`Calibration.effort_for`).
+            effort: what follows the first call of a model that jumps; by default `self.effort`.
+            error: instead, the relative error of the displacement at the deepest frame that 90 % of scenes keep, or by
+                quantity {"displacement": 0.05, "reaction": 0.1, "stress": 0.1} (`ast_sim.calibrate` first).
+            ms: instead, at most how long it takes, in milliseconds on this machine.
             num_frames: S, only for rigid motions; by default the prescribed nodes move as far in one as in training.
             stress, name: [given, N or E, 1] in pascal, of the given frames, by default zero; a name for messages.
             throw: raise an error if the prediction fails; else the answer says why in `failure`.
@@ -173,10 +174,9 @@ class Run:
             scene, motion, num_frames, facts, notes = asked.scene, asked.motion, None, asked.facts, asked.notes
         elif parameters is not None or nodes is not None or scene is None:
             raise ConfigError("give a scene, or a specification with its parameters and nodes")
-        question = new_question(self.settings.model, self.scope, scene, motion, num_frames, name, frames, stress)
-        question = dataclasses.replace(question, notes=(*notes, *question.notes))
-        effort, chosen = promised_effort(self, error, effort, question)
-        return self._answers([question], effort, began, throw, {**facts, **chosen})[0]
+        question = new_question(self.settings.model, self.scope, scene, motion, num_frames, name, frames, stress, notes)
+        chosen, promises = chosen_effort(self, [question], effort, error, ms)
+        return self._answers([question], chosen, began, throw, [{**facts, **promises[0]}])[0]
 
     def sweep(
         self,
@@ -185,6 +185,7 @@ class Run:
         *,
         table: str | os.PathLike[str] | Sequence[Mapping[str, Any]] | None = None,
         effort: Effort | None = None,
+        error: AskedError | None = None,
         nodes: int | None = None,
     ) -> Sweep:
         """Predict the last frame of an assembly for many values of its parameters, in batches.
@@ -194,7 +195,7 @@ class Run:
             parameters: values of the parameters by name: one, or a list. The sweep takes every combination.
             table: instead of parameters, a CSV file whose first line names parameters, or a list of mappings from names
                 to values.
-            effort, nodes: as for `predict`.
+            effort, error, nodes: as for `predict`.
 
         Raises:
             ConfigError: as for `predict`; or values and a table are both given.
@@ -204,8 +205,9 @@ class Run:
             raise ConfigError("a table has the values of all parameters: leave the others out, or leave the table out")
         rows = table if table is not None else grid(parameters or {})
         rows = rows if isinstance(rows, Sequence) and not isinstance(rows, str) else read_table(rows)
+        chosen, _ = chosen_effort(self, [], effort, error)
         model, trained = self.settings.model, self.folder.specification
-        return sweep(self.predict_scenes, model, self.scope, trained, spec, rows, effort or self.effort, nodes)
+        return sweep(self.predict_scenes, model, self.scope, trained, spec, rows, chosen, error, nodes)
 
     def predict_scenes(
         self,
@@ -214,6 +216,7 @@ class Run:
         names: Sequence[str] | None = None,
         frames: Frames | None = None,
         effort: Effort | None = None,
+        error: AskedError | None = None,
         num_frames: int | None = None,
         throw: bool = True,
     ) -> list[Answer]:
@@ -226,7 +229,8 @@ class Run:
             new_question(config, scope, scene, motion, num_frames, name, frames)
             for (scene, motion), name in zip(scenes, names, strict=True)
         ]
-        return self._answers(questions, effort, began, throw)
+        chosen, promises = chosen_effort(self, questions, effort, error)
+        return self._answers(questions, chosen, began, throw, promises)
 
     def predict_motions(
         self,
@@ -235,6 +239,7 @@ class Run:
         *,
         frames: Frames | None = None,
         effort: Effort | None = None,
+        error: AskedError | None = None,
         num_frames: int | None = None,
         name: str = "scene",
         throw: bool = True,
@@ -246,24 +251,23 @@ class Run:
         names = [f"{name}, motion {number}" for number in range(len(motions))]
         scenes = [(scene, motion) for motion in motions]
         return self.predict_scenes(
-            scenes, names=names, frames=frames, effort=effort, num_frames=num_frames, throw=throw
+            scenes, names=names, frames=frames, effort=effort, error=error, num_frames=num_frames, throw=throw
         )
 
     def _answers(
-        self, questions: list[Question], effort: Effort | None, began: float, throw: bool, facts: Mapping = NOTHING
+        self, questions: list[Question], effort: Effort, began: float, throw: bool, facts: Sequence[Mapping[str, Any]]
     ) -> list[Answer]:
-        """The answers with their units, their origin, to which `facts` belong, and the error that is to be expected.
-        What is unusual is told as warnings; `began` is when the questions were asked."""
-        effort = self.effort if effort is None else effort
+        """The answers with their units, their origin, to which `facts` of each belong, and the error that is to be
+        expected. What is unusual is told as warnings; `began` is when the questions were asked."""
         for question in questions:
             for note in question.notes:
                 warnings.warn(f"{question.name}: {note}", stacklevel=3)
         answers = in_domain(self.model, questions, effort)
         seconds = (time.perf_counter() - began) / max(1, len(questions))
         told = []
-        for question, answer in zip(questions, answers, strict=True):
-            expected = None if question.notes else self._expected_error(effort)
-            origin = {"predicted_by": str(self.path), "step": self.step, **facts, "source": answer.name}
+        for question, answer, known in zip(questions, answers, facts, strict=True):
+            expected = None if question.notes else self.expected_error(effort)
+            origin = {"predicted_by": str(self.path), "step": self.step, **known, "source": answer.name}
             if expected is not None:
                 origin["expected_error"] = expected
             shared = {"info": self.info, "expected_error": expected, "seconds": seconds, "notes": question.notes}
@@ -280,13 +284,9 @@ class Run:
                 )
         return told
 
-    def errors_by_effort(self, truth: Trajectory, most: Effort) -> list[EffortErrors]:
-        """The errors at the deepest frame of a known scene, by effort up to `most`; empty where nothing moves."""
-        return errors_by_effort(self.model, truth, most)
-
-    def _expected_error(self, effort: Effort) -> float | None:
-        """The mean error that validation scenes had with this effort; with more Newton steps than were measured, that
-        after the most."""
+    def expected_error(self, effort: Effort) -> float | None:
+        """The mean relative error of the displacement that validation scenes had at their deepest frame with this
+        effort; with more Newton steps than were measured, the error after the most; None: it was not measured."""
         known = [one for one in self._errors if one.effort.corrections == effort.corrections]
         most = max((one.effort.newton_steps for one in known), default=0)
         steps = min(effort.newton_steps, most)

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import pkgutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from ast_sim.support.errors import ConfigError
 
 
 def path(text: str) -> Path:
@@ -38,3 +42,16 @@ def at_least(least: int) -> Any:
 
     number.__name__ = "whole number"
     return number
+
+
+def read_by(place: str) -> Callable[[str], Any]:
+    """An argument that a function of ours reads, such as "package.module:function", which is imported when it is
+    needed; its ConfigError becomes the parser's own error."""
+
+    def read(text: str) -> Any:
+        try:
+            return pkgutil.resolve_name(place)(text)
+        except ConfigError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+
+    return read

@@ -23,7 +23,8 @@ import numpy as np
 import ast_sim
 from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.inference.effort import Effort
-from ast_sim.inference.evaluation.asked_frame import asked_frames, relative_error
+from ast_sim.inference.evaluation.asked_frame import asked_frames
+from ast_sim.inference.relative_errors import relative_error
 from ast_sim.simulate.jobs.rival import deepest_frame
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance

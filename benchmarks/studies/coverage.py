@@ -18,7 +18,7 @@ import numpy as np
 from scipy.stats import betabinom
 
 import ast_sim
-from ast_sim.inference.calibration import LEVEL, score
+from ast_sim.inference.promises.calibration import LEVEL, score
 from ast_sim.support.disk import write_json
 from ast_sim.support.provenance import provenance
 

@@ -22,9 +22,9 @@ import numpy as np
 
 import ast_sim
 from ast_sim.inference.effort import MOST_NEWTON_STEPS, Effort
-from ast_sim.inference.evaluation.asked_frame import relative_error
 from ast_sim.inference.predict import answers
 from ast_sim.inference.question import Question
+from ast_sim.inference.relative_errors import relative_error
 from ast_sim.simulate.jobs.rival import WAYS, rivals
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance

@@ -8,8 +8,9 @@ import toy
 from scipy.stats import betabinom
 
 import ast_sim
-from ast_sim.inference.calibration import Calibration, Promise, bound, quantile, scales, score
 from ast_sim.inference.effort import Effort
+from ast_sim.inference.promises.calibration import Calibration, quantile, scales, score
+from ast_sim.inference.promises.kept_errors import KeptErrors
 from ast_sim.support.errors import ConfigError
 
 
@@ -96,36 +97,21 @@ def test_what_cannot_be_calibrated_is_refused(calibrated):
     assert Calibration.from_json(calibrated[2].to_json()) == calibrated[2]
 
 
-def test_bounds_of_several_efforts_hold_at_once():
-    assert bound(list(range(1, 40)), 4) == 39  # ceil(40 * 0.975) = 39
-    assert bound(list(range(1, 39)), 4) is None  # ceil(39 * 0.975) = 39 of 38
-    assert bound(list(range(1, 40)), 1) == 36  # ceil(40 * 0.9)
-    assert bound([1.0] * 38 + [np.inf], 4) is None
-    rng = np.random.default_rng(6)
-    kept = 0
-    for _ in range(2000):
-        errors = rng.lognormal(size=(4, 100))
-        bounds = [bound(list(one), 4) for one in errors]
-        chosen = int(np.argmin(bounds))  # the luckiest of four equal efforts
-        kept += rng.lognormal() <= bounds[chosen]
-    assert kept >= 0.9 * 2000
-
-
-def test_the_cheapest_effort_that_keeps_an_error_is_chosen():
-    promises = (Promise(Effort(), 0.08), Promise(Effort(0, 1), 0.03), Promise(Effort(0, 10), 0.01))
-    known = Calibration(0.5, 60, Effort(), (1.0, 2.0), promises)
-    assert known.effort_for(0.08) == Effort() and known.effort_for(0.05) == Effort(0, 1)
-    assert known.effort_for(0.01) == Effort(0, 10)
-    with pytest.raises(ConfigError, match="0.5 % in 90 % of the scenes: the smallest is 1 %, with .*10 Newton steps"):
-        known.effort_for(0.005)
-    with pytest.raises(ConfigError, match="between 0 and 1, as 0.02 for 2 %"):
-        known.effort_for(2)
-    few = replace(known, promises=(Promise(Effort(), None), Promise(Effort(0, 1), None)))
-    with pytest.raises(ConfigError, match="calibrated with 60 scenes, and needs at least 19"):
-        few.effort_for(0.05)
-    with pytest.raises(ConfigError, match="calibrate it again"):
-        replace(known, promises=()).effort_for(0.05)
-    assert Calibration.from_json(known.to_json()) == known
+def test_the_kept_errors_are_those_of_answers_to_each_effort(calibrated):
+    """The errors of an effort, worked out by hand, scene by scene."""
+    run, data, result = calibrated
+    assert result.kept.efforts == (Effort(),) and set(result.kept.errors) == {"displacement", "stress"}
+    expected = []
+    with ast_sim.Dataset(data) as dataset:
+        for truth in (dataset["test"][index] for index in range(24)):
+            moved = (truth.position - truth.position[0])[:, ~truth.scene.prescribed].astype(np.float64)
+            frame = int(np.square(moved).sum(axis=(1, 2)).argmax())
+            answer = run.predict(truth, frames=frame, effort=Effort())
+            if not answer.notes:
+                wrong = (answer.position[0] - truth.position[frame])[~truth.scene.prescribed]
+                expected.append(np.linalg.norm(wrong) / np.linalg.norm(moved[frame]))
+    assert result.kept.errors["displacement"][0] == pytest.approx(expected, rel=1e-4)
+    assert "displacement: error at the deepest frame in 90 % of scenes: " in result.text
 
 
 def test_a_prediction_that_asks_for_an_error_makes_the_chosen_effort(calibrated):
@@ -136,19 +122,21 @@ def test_a_prediction_that_asks_for_an_error_makes_the_chosen_effort(calibrated)
     try:
         with pytest.raises(ConfigError, match="before it is calibrated: ast-sim calibrate RUN DATA"):
             run.predict(truth, error=0.5)
-        run.calibration = replace(result, promises=(Promise(Effort(), 0.4),))
-        with pytest.raises(ConfigError, match="an error chooses the effort"):
-            run.predict(truth, error=0.5, effort=Effort())
-        answer = run.predict(truth, error=0.5)
+        errors = {"displacement": ((0.4,) * 20,), "reaction": ((0.01,) * 20,)}
+        run.calibration = replace(result, kept=KeptErrors((Effort(),), errors))
+        for more in ({"effort": Effort()}, {"ms": 50}):
+            with pytest.raises(ConfigError, match="an effort, an error and a time each choose"):
+                run.predict(truth, error=0.5, **more)
+        answer = run.predict(truth, error={"displacement": 0.5, "reaction": 0.02})
+        (same,) = run.predict_scenes([(truth.scene, truth.position)], error=0.5)
         run.calibration = replace(run.calibration, spacing=(1.0, 2.0))
         with pytest.warns(UserWarning, match="no error is promised: the mesh edges are"):
             unlike = run.predict(truth, error=0.5)
-        assert "asked_error" not in unlike.source and not any("cheapest" in line for line in unlike.how_far)
+        assert "promise" not in unlike.source and not any("cheapest" in line for line in unlike.how_far)
     finally:
         run.calibration = result
-    assert answer.source["effort"] == Effort().text and answer.source["asked_error"] == 0.5
-    assert (
-        answer.how_far[0]
-        == "effort: 0 corrections, the cheapest that keeps 50 % at the deepest frame in 90 % of scenes like it"
-    )
+    kept = "0 corrections, the cheapest that keeps 50 % of the displacement"
+    where = "at the deepest frame in 90 % of scenes like it"
+    assert answer.how_far[0] == f"effort: {kept} and 2 % of the reaction {where}"
+    assert same.how_far[0] == f"effort: {kept} {where}"
     assert np.array_equal(answer.position, run.predict(truth, effort=Effort()).position)

@@ -21,6 +21,7 @@ from ast_sim.inference.effort import Effort, EffortErrors
 from ast_sim.inference.jump import calls
 from ast_sim.inference.predict import answers
 from ast_sim.inference.question import Question
+from ast_sim.inference.relative_errors import relative_error, rms, stress_errors
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.models.simulator import Simulator
 from ast_sim.scene import Trajectory
@@ -94,7 +95,7 @@ def errors_by_effort(model: Simulator, truth: Trajectory, most: Effort) -> list[
     """The errors at the deepest frame after each number of corrections and of Newton steps, up to `most`; empty where
     nothing is displaced."""
     frame = max(deepest_frame(truth), model.config.data.given_frames)
-    if not _rms(truth.position[frame] - truth.position[0], ~truth.scene.prescribed):
+    if not rms(truth.position[frame] - truth.position[0], ~truth.scene.prescribed):
         return []
     efforts = range(most.corrections + 1)
     return [errors for corrections in efforts for errors in _after(model, truth, frame, corrections, most.newton_steps)]
@@ -118,7 +119,7 @@ def _after(model: Simulator, truth: Trajectory, frame: int, corrections: int, mo
             continue
         error = relative_error(positions[steps][0], truth, frame)
         stress = None if way.stress is None else way.stress[steps][0]
-        stress_error, _ = _stress_errors(truth, stress, frame, model.config.data.stress)
+        stress_error, _ = stress_errors(truth, stress, frame, model.config.data.stress)
         measured.append(EffortErrors(effort, error, stress_error, min(steps, needed), float(0 < steps < needed)))
     return measured
 
@@ -175,7 +176,7 @@ def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: E
     frame = max(deepest_frame(truth), model.config.data.given_frames)
     question = Question.of(truth, name, [frame])
     (answer,) = answers(model, [question], effort)
-    size = _rms(truth.position[frame] - truth.position[0], ~truth.scene.prescribed)
+    size = rms(truth.position[frame] - truth.position[0], ~truth.scene.prescribed)
     failed = answer.failure is not None or not size  # where nothing moves, there is no relative error
     stress = None if answer.stress is None or answer.failure is not None else answer.stress[0]
     by_calls = []
@@ -183,7 +184,7 @@ def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: E
         (after,) = calls(model, [question], effort)
         positions = () if isinstance(after, str) else after.position
         by_calls = [relative_error(position[0], truth, frame) for position in positions]
-    share, largest = _stress_errors(truth, stress, frame, model.config.data.stress)
+    share, largest = stress_errors(truth, stress, frame, model.config.data.stress)
     return AskedScene(
         name=name,
         nodes=truth.scene.num_nodes,
@@ -196,32 +197,6 @@ def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: E
         stress_share=share,
         largest_stress=largest,
     )
-
-
-def relative_error(position: np.ndarray, truth: Trajectory, frame: int) -> float:
-    """The error of the free nodes at positions [N, 3] in a frame, over their displacement, which must not be 0."""
-    free, true = ~truth.scene.prescribed, truth.position[frame]
-    return _rms(position - true, free) / _rms(true - truth.position[0], free)
-
-
-def _rms(difference: np.ndarray, rows: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(difference[rows], dtype=np.float64))))
-
-
-def _stress_errors(
-    truth: Trajectory, stress: np.ndarray | None, frame: int, location: str
-) -> tuple[float | None, float | None]:
-    """The error of the stress on what deforms, relative to the error of the frame's true mean; and by how much the
-    largest is off. None where they say nothing."""
-    if stress is None or truth.stress is None:
-        return None, None
-    rows = truth.scene.deforming(location)
-    there = truth.stress[frame].astype(np.float64)
-    given = stress.astype(np.float64)
-    spread = float(there[rows].std())
-    largest = float(there[rows].max())
-    share = _rms(given - there, rows) / spread if spread else None
-    return share, abs(float(given[rows].max()) - largest) / largest if largest else None
 
 
 def _solver(rival: Rivals, error: float | None) -> SolverFigures:

@@ -8,51 +8,38 @@ model is (Vovk, Gammerman, Shafer 2005; Angelopoulos, Bates 2023, section 1). It
 fresh scenes. The calibration scenes must not have trained or chosen the model; so nothing needs to be crossed, and n
 scores are enough from the n on for which the rank is at most n.
 
-The same holds for the relative error at the deepest frame: the ceil((n + 1) (1 - a))-th smallest of n errors bounds the
-error of a fresh scene with a probability of at least 1 - a. `effort_for` chooses among K efforts by such bounds, and
-any of them may be wrong. So each has a = (1 - KEPT) / K; then all K bounds hold at once with a probability of at least
-KEPT (Bonferroni), and with it the bound of the effort that is chosen.
+What errors the answers keep, and which effort is enough for an asked one: `kept_errors`.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import os
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from ast_sim.inference.effort import MOST_NEWTON_STEPS, Effort, can_make_newton_steps
+from ast_sim.inference.answer import LEVEL
+from ast_sim.inference.effort import Effort, choices
+from ast_sim.inference.promises.kept_errors import KEPT, KeptErrors
+from ast_sim.inference.relative_errors import moves
 from ast_sim.runs.scope import LEEWAY, size_of, spacing_of
 from ast_sim.scene import Scene
+from ast_sim.simulate.jobs.rival import deepest_frame
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.progress import Progress
 
 if TYPE_CHECKING:
     from ast_sim.dataset.reader import Dataset
     from ast_sim.inference.answer import Answer
-    from ast_sim.inference.question import Question
     from ast_sim.inference.trained_run import Run
-    from ast_sim.scene import Trajectory
 
-LEVEL = 0.95
 FLOOR = 1e-6  # of a scale, relative to the size of the deforming bodies: where nothing moves, rounding is left
-KEPT = 0.9  # of the scenes keep the error that was asked for
-STEPS = (0, 1, 2, MOST_NEWTON_STEPS)  # among these numbers of Newton steps `effort_for` chooses
 FEWEST = math.ceil(LEVEL / (1 - LEVEL) - 1e-9)  # scenes with which the rank of the quantile is at most their number
-
-
-@dataclass(frozen=True)
-class Promise:
-    """An effort, and the bound of its relative error at the deepest frame; None: too few scenes, or too many failed."""
-
-    effort: Effort
-    error: float | None
 
 
 @dataclass(frozen=True)
@@ -64,63 +51,43 @@ class Calibration:
         scenes: the number of calibration scenes.
         effort: the effort of the answers.
         spacing: (lowest, highest) mean length of the mesh edges of the deforming bodies in these scenes.
-        promises: bounds of the relative error, from the cheapest effort to the dearest; none for a model that predicts
-            step by step.
+        kept: the errors of these scenes after each effort.
     """
 
     quantile: float
     scenes: int
     effort: Effort
     spacing: tuple[float, float]
-    promises: tuple[Promise, ...] = ()
+    kept: KeptErrors = field(default_factory=KeptErrors, repr=False)
 
     @property
     def text(self) -> str:
         """The band in words."""
-        promised = [f"{100 * one.error:.2g} % with {one.effort.text}" for one in self.promises if one.error is not None]
-        more = (
-            f"; error at the deepest frame in {100 * KEPT:g} % of the scenes: {', '.join(promised)}" if promised else ""
-        )
         return (
             f"band: with {100 * LEVEL:g} % all free nodes of all frames lie within {self.quantile:.3g} times the root"
-            f" mean square displacement of the frame, by {self.scenes} scenes ({self.effort.text}){more}"
+            f" mean square displacement of the frame, by {self.scenes} scenes ({self.effort.text}){self._kept}"
         )
+
+    @property
+    def _kept(self) -> str:
+        """The errors that efforts keep, in words."""
+        told = ""
+        for quantity in self.kept.errors:
+            bounds = zip(self.kept.bounds(quantity), self.kept.efforts, strict=True)
+            known = [f"{100 * bound:.2g} % with {effort.text}" for bound, effort in bounds if math.isfinite(bound)]
+            if known:
+                told += f"\n{quantity}: error at the deepest frame in {100 * KEPT:g} % of scenes: {'; '.join(known)}"
+        return told
 
     def to_json(self) -> dict[str, Any]:
         """As `from_json` reads it."""
-        return {**dataclasses.asdict(self), "spacing": list(self.spacing)}
+        return {**asdict(self), "spacing": list(self.spacing), "kept": self.kept.to_json()}
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self:
         low, high = values["spacing"]
-        promises = tuple(Promise(Effort(**one["effort"]), one["error"]) for one in values.get("promises", ()))
-        return cls(values["quantile"], values["scenes"], Effort(**values["effort"]), (low, high), promises)
-
-    def effort_for(self, error: float) -> Effort:
-        """The cheapest effort whose relative error at the deepest frame is at most `error` in 90 % of fresh scenes.
-
-        Raises:
-            ConfigError: no effort keeps this error; the text names the smallest that can be had.
-        """
-        if not 0 < error < 1:
-            raise ConfigError(f"error is {error}; it must lie between 0 and 1, as 0.02 for 2 %")
-        for promise in self.promises:
-            if promise.error is not None and promise.error <= error:
-                return promise.effort
-        known = [(one.error, one.effort) for one in self.promises if one.error is not None]
-        if not known:
-            least = math.ceil(len(self.promises) / (1 - KEPT) - 1e-9) - 1
-            why = (
-                f"it was calibrated with {self.scenes} scenes, and needs at least {least}"
-                if self.promises
-                else "its calibration holds no errors; calibrate it again (a model that goes step by step has none)"
-            )
-            raise ConfigError(f"the run can promise no error: {why}")
-        smallest, effort = min(known, key=lambda one: one[0])
-        raise ConfigError(
-            f"no effort of this run keeps an error of {100 * error:.3g} % in {100 * KEPT:g} % of the scenes: the"
-            f" smallest is {100 * smallest:.3g} %, with {effort.text}"
-        )
+        kept = KeptErrors.from_json(values["kept"]) if "kept" in values else KeptErrors()
+        return cls(values["quantile"], values["scenes"], Effort(**values["effort"]), (low, high), kept)
 
     def unlike(self, scene: Scene, notes: Sequence[str]) -> str:
         """Why the calibration scenes say nothing of a scene with `notes`; empty if they do."""
@@ -143,25 +110,6 @@ class Calibration:
             return self.quantile * scales(answer.scene, answer.position)
         warnings.warn(f"{answer.name}: no band: {why}", stacklevel=4)
         return None
-
-
-def promised_effort(
-    run: Run, error: float | None, effort: Effort | None, question: Question
-) -> tuple[Effort | None, dict[str, Any]]:
-    """The effort for a question that asks for an error in place of an effort, and what the answer keeps of it; without
-    an error, the effort as it is asked. See `Run.predict`."""
-    if error is None:
-        return effort, {}
-    if effort is not None:
-        raise ConfigError("an error chooses the effort: give one of them")
-    if run.calibration is None:
-        raise ConfigError(f"{run.path} promises no error before it is calibrated: ast-sim calibrate RUN DATA")
-    chosen = run.calibration.effort_for(error)
-    why = run.calibration.unlike(question.scene, question.notes)
-    if why:
-        warnings.warn(f"{question.name}: no error is promised: {why}", stacklevel=3)
-        return chosen, {"effort": chosen.text}
-    return chosen, {"asked_error": error, "effort": chosen.text}
 
 
 def scales(scene: Scene, position: np.ndarray) -> np.ndarray:
@@ -188,13 +136,6 @@ def quantile(scores: Sequence[float]) -> float:
             " more with --calibration N"
         )
     return sorted(scores)[math.ceil((len(scores) + 1) * LEVEL - 1e-9) - 1]
-
-
-def bound(errors: Sequence[float], efforts: int) -> float | None:
-    """The ceil((n + 1) (1 - (1 - KEPT) / efforts))-th smallest of n errors; None: it is not among them, or infinite."""
-    rank = math.ceil((len(errors) + 1) * (1 - (1 - KEPT) / efforts) - 1e-9)
-    value = sorted(errors)[rank - 1] if rank <= len(errors) else math.inf
-    return value if math.isfinite(value) else None
 
 
 def calibrate(
@@ -234,15 +175,16 @@ def _measured(run: Run, dataset: Dataset, split: str) -> tuple[Calibration, list
     scores: list[float] = []
     spacings: list[float] = []
     left_out: list[str] = []
-    choices = _choices(run)
-    errors: dict[Effort, list[float]] = {effort: [] for effort in choices}
+    efforts = choices(run.settings.model, run.settings.train.calls)
+    errors: list[list[dict[str, float] | None]] = [[] for _ in efforts]
+    fields = [name for name, *_ in run.settings.model.data.fields]
     with Progress(dataset.count(split), 0, "scenes") as bar, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what they tell is counted here
         for index in range(dataset.count(split)):
             bar.advance()
-            truth = dataset[split][index]
+            truth = dataset.load(split, index, fields)
             name = f"{split}/{index:06d}"
-            answer = run.predict(truth, throw=False, name=name) if truth.num_frames > 1 else None
+            answer = run.predict(truth, throw=False, name=name) if moves(truth) else None
             if answer is None or answer.notes:
                 left_out.append(name)
                 continue
@@ -250,30 +192,22 @@ def _measured(run: Run, dataset: Dataset, split: str) -> tuple[Calibration, list
             failed = answer.failure is not None
             scores.append(math.inf if failed else score(answer.scene, answer.position, true_position))
             spacings.append(spacing_of(truth.scene))
-            for effort, error in _errors(run, truth, choices).items():
-                errors[effort].append(error)
+            for effort, of_scenes in zip(efforts, errors, strict=True):
+                deepest = run.predict(truth, frames=deepest_frame(truth), effort=effort, throw=False, name=name)
+                of_scenes.append(None if deepest.failure is not None else deepest.errors(truth))
     width = quantile(scores)
     if math.isinf(width):
         raise ConfigError(f"{scores.count(math.inf)} of {len(scores)} predictions failed: no band holds")
-    promises = tuple(Promise(effort, bound(errors[effort], len(choices))) for effort in choices)
     spacing = min(spacings), max(spacings)
-    return Calibration(width, len(scores), run.effort, spacing, promises), left_out
+    return Calibration(width, len(scores), run.effort, spacing, _kept_errors(efforts, errors)), left_out
 
 
-def _choices(run: Run) -> list[Effort]:
-    """The efforts to choose from, from the cheapest to the dearest: a Newton step costs more than a correction."""
-    config = run.settings.model
-    if not config.jumps:
-        return []
-    steps = STEPS if can_make_newton_steps(config) else (0,)
-    return [Effort(corrections, count) for count in steps for corrections in range(run.settings.train.calls)]
-
-
-def _errors(run: Run, truth: Trajectory, choices: Sequence[Effort]) -> dict[Effort, float]:
-    """The relative error of each effort at the deepest frame of a scene; infinite if the prediction failed."""
-    if not choices:
-        return {}
-    most = Effort(max(one.corrections for one in choices), max(one.newton_steps for one in choices))
-    measured = {one.effort: one.error for one in run.errors_by_effort(truth, most)}
-    known = {effort: measured.get(effort) for effort in choices}
-    return {effort: math.inf if error is None else error for effort, error in known.items()}
+def _kept_errors(efforts: Sequence[Effort], errors: Sequence[Sequence[Mapping[str, float] | None]]) -> KeptErrors:
+    """The errors by quantity, effort and scene; None, where the prediction failed, is infinite."""
+    known = [one for of_scenes in errors for one in of_scenes if one is not None]
+    shared = [quantity for quantity in (known[0] if known else ()) if all(quantity in one for one in known)]
+    by_quantity = {
+        quantity: tuple(tuple(math.inf if one is None else one[quantity] for one in of_scenes) for of_scenes in errors)
+        for quantity in shared
+    }
+    return KeptErrors(tuple(efforts), by_quantity)

@@ -1,0 +1,70 @@
+"""The effort of answers for which an error or a time is asked in place of an effort."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from ast_sim.inference.effort import Effort
+from ast_sim.inference.promises.kept_errors import DISPLACEMENT, KEPT
+from ast_sim.inference.promises.milliseconds import effort_within
+from ast_sim.support.errors import ConfigError
+
+if TYPE_CHECKING:
+    from ast_sim.inference.question import Question
+    from ast_sim.inference.trained_run import Run
+
+AskedError = float | Mapping[str, float]  # of the displacement, or by quantity: {"reaction": 0.05}
+
+
+def chosen_effort(
+    run: Run, questions: Sequence[Question], effort: Effort | None, error: AskedError | None, ms: float | None = None
+) -> tuple[Effort, list[dict[str, str]]]:
+    """The effort, and for each question what its answer keeps of the choice; see `Run.predict`.
+
+    Raises:
+        ConfigError: more than one of effort, error and time is given; no effort keeps the error, or the time; or the
+            run is not calibrated.
+    """
+    if sum(one is not None for one in (effort, error, ms)) > 1:
+        raise ConfigError("an effort, an error and a time each choose what is computed: give one of them")
+    if ms is not None:
+        within, told = effort_within(run, questions[0], ms)
+        return within, [{"effort": within.text, "promise": told} for _ in questions]
+    if error is not None:
+        return _keeping(run, questions, error if isinstance(error, Mapping) else {DISPLACEMENT: error})
+    return (run.effort if effort is None else effort), [{} for _ in questions]
+
+
+def _keeping(
+    run: Run, questions: Sequence[Question], asked: Mapping[str, float]
+) -> tuple[Effort, list[dict[str, str]]]:
+    """The cheapest effort that keeps errors; a question unlike the calibration scenes is told, and promised nothing."""
+    if run.calibration is None:
+        raise ConfigError(f"{run.path} promises no error before it is calibrated: ast-sim calibrate RUN DATA")
+    effort = run.calibration.kept.effort_for(asked)
+    wanted = " and ".join(f"{100 * error:.3g} % of the {quantity}" for quantity, error in asked.items())
+    promise = f"the cheapest that keeps {wanted} at the deepest frame in {100 * KEPT:g} % of scenes like it"
+    facts = []
+    for question in questions:
+        why = run.calibration.unlike(question.scene, question.notes)
+        if why:
+            warnings.warn(f"{question.name}: no error is promised: {why}", stacklevel=4)
+        facts.append({"effort": effort.text} if why else {"effort": effort.text, "promise": promise})
+    return effort, facts
+
+
+def parse_error(text: str) -> tuple[str, float]:
+    """A quantity and its error from "2%", "0.02", "reaction=5%" or "stress=0.1".
+
+    Raises:
+        ConfigError: it is none of these.
+    """
+    quantity, _, number = text.rpartition("=")
+    try:
+        percent = number.strip().endswith("%")
+        value = float(number.strip().removesuffix("%")) / (100 if percent else 1)
+    except ValueError as error:
+        raise ConfigError(f"{text} is no error: give one such as 2%, 0.02 or reaction=5%") from error
+    return quantity.strip() or DISPLACEMENT, value

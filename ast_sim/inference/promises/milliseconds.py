@@ -1,0 +1,106 @@
+"""The most accurate effort that takes no longer than an asked time, as measured on this machine.
+
+What an effort takes follows from the processor, the threads, the nodes of the scene and the frames that are asked. At
+the first question of its kind each effort is made once to warm up and then timed; the times are kept in the user's
+cache folder, outside the run, since they say nothing on another machine.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import statistics
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import platformdirs
+import torch
+
+from ast_sim.inference.effort import Effort, choices
+from ast_sim.inference.predict import in_domain
+from ast_sim.support.disk import write_json
+from ast_sim.support.errors import AstSimError, ConfigError
+from ast_sim.support.provenance import processor
+
+if TYPE_CHECKING:
+    from ast_sim.inference.question import Question
+    from ast_sim.inference.trained_run import Run
+
+REPEATS = 3
+SIMILAR = 0.1  # scenes whose numbers of nodes differ by at most this share take the same time
+
+
+def effort_within(run: Run, question: Question, ms: float) -> tuple[Effort, str]:
+    """The effort with the smallest error in the validation scenes among those that take at most `ms` milliseconds for
+    such a question, and what is said of the choice.
+
+    Raises:
+        ConfigError: the fastest takes longer; the run has one effort, since it predicts step by step; or no errors of
+            its efforts were measured.
+    """
+    efforts = choices(run.settings.model, run.settings.train.calls)
+    errors = {effort: run.expected_error(effort) for effort in efforts}
+    known = {effort: error for effort, error in errors.items() if error is not None}
+    if not known:
+        raise ConfigError(
+            "ms chooses among efforts whose errors are known, and this run has none: it predicts step by step, or no"
+            " validation has measured them"
+        )
+    times = _times(run, question, tuple(known))
+    within = [effort for effort in known if times[effort] <= ms]
+    if not within:
+        fastest = min(times, key=lambda effort: times[effort])
+        raise ConfigError(
+            f"no effort takes at most {ms:g} ms on this machine: the fastest takes {times[fastest]:.3g} ms for such a"
+            f" question, with {fastest.text}"
+        )
+    best = min(within, key=lambda effort: (known[effort], times[effort]))
+    return best, f"the most accurate within {ms:g} ms: such a question took {times[best]:.3g} ms on this machine"
+
+
+def _times(run: Run, question: Question, efforts: tuple[Effort, ...]) -> dict[Effort, float]:
+    """Milliseconds of each effort for such a question, from the cache or measured."""
+    path = platformdirs.user_cache_path("ast_sim") / "milliseconds.json"
+    kept = _read(path)
+    where = f"{_identity(run.model)} on {processor()}, {torch.get_num_threads()} threads"
+    frames = len(question.wanted())
+    nodes = question.scene.num_nodes
+    for one in kept.get(where, []):
+        times = {Effort(**each["effort"]): each["ms"] for each in one["times"]}
+        if one["frames"] == frames and abs(one["nodes"] - nodes) <= SIMILAR * nodes and set(efforts) <= set(times):
+            return times
+    times = {effort: _timed(run, question, effort) for effort in efforts}
+    told = [{"effort": vars(effort), "ms": ms} for effort, ms in times.items()]
+    kept.setdefault(where, []).append({"nodes": nodes, "frames": frames, "times": told})
+    with contextlib.suppress(AstSimError):  # no home that can be written to: they are measured again the next time
+        write_json(path, kept)
+    return times
+
+
+def _read(path: Path) -> dict[str, list[dict[str, Any]]]:
+    """What was measured before; nothing, if the file is missing or damaged."""
+    try:
+        kept = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return kept if isinstance(kept, dict) else {}
+
+
+def _identity(model: torch.nn.Module) -> str:
+    """A hash of the weights: Newton steps end earlier after a better model."""
+    known = hashlib.sha256()
+    for values in model.state_dict().values():
+        known.update(values.contiguous().numpy().tobytes())
+    return known.hexdigest()
+
+
+def _timed(run: Run, question: Question, effort: Effort) -> float:
+    """The median of the milliseconds of an answer, after one that does not count."""
+    seconds = []
+    for _ in range(REPEATS + 1):
+        began = time.perf_counter()
+        in_domain(run.model, [question], effort)
+        seconds.append(time.perf_counter() - began)
+    return 1000 * statistics.median(seconds[1:])

@@ -1,0 +1,92 @@
+"""What an asked time chooses, with the run that comes with the package: times are measured once and kept."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from toy import one_thread  # noqa: F401 (used by being imported)
+
+import ast_sim
+from ast_sim.inference.effort import Effort
+from ast_sim.support.errors import ConfigError
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """The file with the times, in a home of its own."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "ast_sim" / "milliseconds.json"
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory):
+    """A plate like those of the training, in its deepest frame."""
+    data = tmp_path_factory.mktemp("plate") / "plate.h5"
+    ast_sim.generate("deforming_plate", data, train=0, valid=0, test=1, nodes=400, frames=41, keep=(24,), seed=123)
+    with ast_sim.Dataset(data) as dataset:
+        return dataset["test"][0]
+
+
+def times(cache, **changes):
+    """The kept times by number of Newton steps; with changes, such as steps10=50.0, written back."""
+    kept = json.loads(cache.read_text())
+    ((one,),) = kept.values()
+    for each in one["times"]:
+        each["ms"] = changes.get(f"steps{each['effort']['newton_steps']}", each["ms"])
+    cache.write_text(json.dumps(kept))
+    return {each["effort"]["newton_steps"]: each["ms"] for each in one["times"]}
+
+
+def test_the_most_accurate_effort_within_the_time_is_made(cache, truth):
+    run = ast_sim.example_run("plates")
+    slow = run.predict(truth, frames=[1], ms=1e6)
+    assert slow.source["effort"] == Effort(0, 10).text  # the smallest error of the validation scenes
+    measured = times(cache)
+    assert measured.keys() == {0, 1, 2, 10} and all(0 < ms < 1e6 for ms in measured.values())
+    times(cache, steps0=10.0, steps1=20.0, steps2=30.0, steps10=40.0)
+    chosen = {ms: run.predict(truth, frames=[1], ms=ms) for ms in (10, 25, 40)}
+    assert [answer.source["effort"] for answer in chosen.values()] == [Effort(0, n).text for n in (0, 1, 10)]
+    told = "effort: 0 corrections, up to 1 Newton step, the most accurate within 25 ms: such a question took 20 ms on"
+    assert chosen[25].how_far[0].startswith(told)
+    assert np.array_equal(chosen[10].position, run.predict(truth, frames=[1], effort=Effort()).position)
+    with pytest.raises(ConfigError, match="at most 9.9 ms on this machine: the fastest takes 10 ms .* 0 corrections"):
+        run.predict(truth, frames=[1], ms=9.9)
+
+
+def test_other_questions_are_timed_anew_and_a_damaged_file_is_no_obstacle(cache, truth):
+    run = ast_sim.example_run("plates")
+    cache.parent.mkdir()
+    cache.write_text("{")
+    run.predict(truth, frames=[1], ms=1e6)
+    times(cache, steps0=1e9, steps1=1e9, steps2=1e9, steps10=1e9)
+    with pytest.raises(ConfigError, match="no effort takes at most"):
+        run.predict(truth, frames=[1], ms=1e6)
+    assert run.predict(truth, ms=1e6).frames == (0, 1)  # both frames: another question
+    cache.unlink()
+    cache.parent.rmdir()
+    cache.parent.write_text("no folder")
+    assert run.predict(truth, frames=[1], ms=1e6).converged
+
+
+def test_a_model_without_known_errors_cannot_choose(cache, truth, tmp_path):
+    run = ast_sim.example_run("plates")
+    run._errors = []
+    with pytest.raises(ConfigError, match="ms chooses among efforts whose errors are known"):
+        run.predict(truth, ms=50)
+
+
+def test_the_errors_of_an_answer_beside_the_truth(truth):
+    run = ast_sim.example_run("plates")
+    answer = run.predict(truth, effort=Effort())
+    errors = answer.errors(truth)
+    true = replace(answer, position=truth.position).reaction()[1]
+    assert np.linalg.norm(true) == pytest.approx(truth.attributes["reaction"][1], rel=1e-3)
+    assert errors["reaction"] == pytest.approx(np.linalg.norm(answer.reaction()[1] - true) / np.linalg.norm(true))
+    body = truth.scene.deforming("node")
+    largest = answer.stress[1, body].max() / truth.stress[1, body].max() - 1
+    assert errors["stress"] == pytest.approx(abs(largest), rel=1e-5)
+    free = ~truth.scene.prescribed
+    wrong = np.linalg.norm((answer.position[1] - truth.position[1])[free])
+    moved = np.linalg.norm((truth.position[1] - truth.position[0])[free])
+    assert errors["displacement"] == pytest.approx(wrong / moved, rel=1e-4)
