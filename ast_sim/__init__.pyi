@@ -6,6 +6,8 @@ from .importers.scene_mesh import read_scene as read_scene
 from .inference.answer import Answer as Answer
 from .inference.effort import Effort as Effort
 from .inference.evaluation.evaluated_run import Evaluation as Evaluation
+from .inference.evaluation.trade import Trade as Trade
+from .inference.evaluation.trade import trade as trade
 from .inference.example_run import example_run as example_run
 from .inference.promises.calibration import Calibration as Calibration
 from .inference.promises.calibration import calibrate as calibrate

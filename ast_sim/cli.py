@@ -12,29 +12,23 @@ import shlex
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn
 
-from ast_sim import __version__, commands, help_lines
-from ast_sim.support.argument_types import at_least, path, read_by, whole_numbers
+from ast_sim import __version__, commands, help_lines, judging_commands
+from ast_sim.support.argument_types import (
+    Parser,
+    add_each,
+    add_out,
+    at_least,
+    path,
+    read_by,
+    whole_numbers,
+)
 from ast_sim.support.errors import AstSimError, printable
 from ast_sim.support.stop_signals import Interrupted
 
 CORNERS = "take only the corners of second-order tetrahedra: forces are then those of another, stiffer mesh"
-
-
-class _Parser(argparse.ArgumentParser):
-    """A parser that reports wrong arguments in one line. Its help ends with the lines that `more` makes when it is
-    printed, since what they tell of takes time to import."""
-
-    more: Callable[[], list[str]] = list
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {printable(message)} (see {self.prog} --help)\n")
-
-    def format_help(self) -> str:
-        return super().format_help() + "".join(f"{line}\n" for line in self.more())
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -75,11 +69,11 @@ def _tell(what: str, message: object) -> None:
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
-    parser = _Parser(prog="ast-sim", description="Learned simulation of deforming bodies in contact.")
+    parser = Parser(prog="ast-sim", description="Learned simulation of deforming bodies in contact.")
     parser.add_argument("--version", action="version", version=f"ast_sim {__version__}")
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def add(fill: Callable[[_Parser], None], run: Callable[[argparse.Namespace], None]) -> None:
+    def add(fill: Callable[[Parser], None], run: Callable[[argparse.Namespace], None]) -> None:
         about = run.__doc__ or ""
         sub = subparsers.add_parser(run.__name__, help=about[:1].lower() + about[1:-1], description=about)
         sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
@@ -93,41 +87,26 @@ def build_parser() -> argparse.ArgumentParser:
     add(_add_train, commands.train)
     add(_add_predict, commands.predict)
     add(_add_sweep, commands.sweep)
-    add(_add_evaluate, commands.evaluate)
-    add(_add_calibrate, commands.calibrate)
-    add(_add_report, commands.report)
+    add(judging_commands.add_evaluate, judging_commands.evaluate)
+    add(judging_commands.add_calibrate, judging_commands.calibrate)
+    add(judging_commands.add_trade, judging_commands.trade)
+    add(judging_commands.add_report, judging_commands.report)
     return parser
 
 
-def _add_each(to: Any, options: Mapping[str, str], **shared: Any) -> None:
-    """Add options that differ only in their names and helps: a key is "--name METAVAR", its value is the help."""
-    for option, text in options.items():
-        name, metavar = option.split()
-        to.add_argument(name, metavar=metavar, help=text, **shared)
-
-
-def _add_out(to: _Parser, metavar: str, about: str, required: bool = True) -> None:
-    to.add_argument("--out", type=path, metavar=metavar, required=required, help=about)
-    _add_overwrite(to)
-
-
-def _add_overwrite(to: _Parser) -> None:
-    to.add_argument("--overwrite", action="store_true", help="replace the output if it exists")
-
-
-def _add_demo(demo: _Parser) -> None:
+def _add_demo(demo: Parser) -> None:
     demo.add_argument("--out", type=path, default=Path("demo"), metavar="DIR", help="result folder (default: demo)")
     demo.add_argument("--quick", action="store_true", help="fewer scenes and steps: 90 seconds on 2 cores")
     demo.add_argument("--seed", type=at_least(0), default=0, help="seed of scenes and training (default: 0)")
 
 
-def _add_generate(generate: _Parser) -> None:
+def _add_generate(generate: Parser) -> None:
     generate.more = help_lines.families
     generate.add_argument("family", metavar="FAMILY", help="kind of scenes; the list is below")
     about = "specification of an assembly (.toml), for the family assembly"
     generate.add_argument("spec", type=path, nargs="?", metavar="SPEC", help=about)
-    _add_each(generate, {"--out FILE": "dataset to write (.h5)"}, type=path)
-    _add_each(generate, {"--count N": "number of training scenes"}, type=at_least(1))
+    add_each(generate, {"--out FILE": "dataset to write (.h5)"}, type=path)
+    add_each(generate, {"--count N": "number of training scenes"}, type=at_least(1))
     about = (
         "draw the first scenes of an assembly as a picture, say what --count will cost and how far the force of the"
         " mesh is off; make no dataset"
@@ -137,25 +116,25 @@ def _add_generate(generate: _Parser) -> None:
         "--valid N": "number of validation scenes (default: a tenth of --count)",
         "--test N": "number of test scenes (default: a tenth of --count)",
     }
-    _add_each(generate, splits, type=at_least(0))
+    add_each(generate, splits, type=at_least(0))
     about = "number of scenes of the split calibration, on which a trained run measures its errors (default: 0)"
-    _add_each(generate, {"--calibration N": about}, type=at_least(0), default=0)
+    add_each(generate, {"--calibration N": about}, type=at_least(0), default=0)
     sizes = {"--nodes N": "approximate number of nodes of a scene", "--frames N": "number of frames of a scene"}
-    _add_each(generate, sizes, type=at_least(1))
+    add_each(generate, sizes, type=at_least(1))
     about = "solve and store only frame 0 and these, such as 1,5,20, each straight from the one before (default: all)"
     generate.add_argument("--keep", type=whole_numbers, metavar="K,K,...", help=about)
     generate.add_argument("--seed", type=at_least(0), default=0, help="seed of the scenes (default: 0)")
     about = "the bundled solver (own) or CalculiX (default: own)"
     generate.add_argument("--solver", choices=("own", "calculix"), help=about)
-    _add_each(generate, {"--parts PATH": "your parts: a STEP, STL or mesh file, or a folder of them"}, type=path)
+    add_each(generate, {"--parts PATH": "your parts: a STEP, STL or mesh file, or a folder of them"}, type=path)
     about = "solve every scene to its last frame (default: give up a frame after 500 Newton iterations)"
     generate.add_argument("--patient", action="store_true", help=about)
     where = generate.add_mutually_exclusive_group()
-    _add_each(where, {"--workers W": "number of processes (default: one per core)"}, type=at_least(1))
-    _add_each(where, {"--scheduler ADDRESS": "solve on the workers of a Dask scheduler, such as tcp://host:8786"})
+    add_each(where, {"--workers W": "number of processes (default: one per core)"}, type=at_least(1))
+    add_each(where, {"--scheduler ADDRESS": "solve on the workers of a Dask scheduler, such as tcp://host:8786"})
 
 
-def _add_convert(convert: _Parser) -> None:
+def _add_convert(convert: Parser) -> None:
     about = (
         "a simulation (a .vtkhdf, .frd, .xdmf, .exo or d3plot file, a .pvd file, or a folder of .vtu, .pvtu or .vtk"
         " files), a folder that holds several simulations, or a folder of meta.json and .tfrecord files"
@@ -163,7 +142,7 @@ def _add_convert(convert: _Parser) -> None:
     convert.add_argument("source", type=path, metavar="SOURCE", help=about)
     about = "results (.frd) of the job whose deck (.inp) is SOURCE: its prescribed nodes and materials are taken"
     convert.add_argument("results", type=path, nargs="?", metavar="RESULTS", help=about)
-    _add_out(convert, "FILE", "dataset to write (.h5)")
+    add_out(convert, "FILE", "dataset to write (.h5)")
     fields = convert.add_argument_group("names of the fields in the files")
     names = {
         "--displacement NAME": "point field, displacement from rest; if there is none, the points themselves move",
@@ -173,22 +152,22 @@ def _add_convert(convert: _Parser) -> None:
         "--handle NAME": "the same for prescribed nodes of deforming bodies; a place is written BODY:PLACE, as 0:zmin",
         "--body NAME": "point or cell field with the numbers of the bodies",
     }
-    _add_each(fields, names)
+    add_each(fields, names)
     about = "components of the stress, such as xx,xy,xz,yy,yz,zz (default: as the file names them, else xx,yy,zz,...)"
-    _add_each(
+    add_each(
         fields, {"--stress-order XX,YY,...": about}, type=read_by("ast_sim.importers.stress:parse_order"), default=()
     )
     about = "cell fields with one number each; young=E takes the field E as the column young"
-    _add_each(fields, {"--material NAME": about}, nargs="+", default=[])
+    add_each(fields, {"--material NAME": about}, nargs="+", default=[])
     about = "a further field that the dataset keeps by its name, such as PEEQ or CPRESS=MPa; may be repeated"
-    _add_each(fields, {"--field NAME[=UNIT]": about}, action="append", default=[])
+    add_each(fields, {"--field NAME[=UNIT]": about}, action="append", default=[])
     about = "point field with the forces on the nodes, such as RF, in newton (in the unit of force of a deck)"
-    _add_each(fields, {"--reaction NAME": about})
+    add_each(fields, {"--reaction NAME": about})
     kind = convert.add_argument_group("properties of a dataset made from such files")
     about = "shares of the simulations, drawn at random (default: 0.8 0.1 0.1 of three or more)"
     kind.add_argument("--shares", nargs=3, type=float, metavar=("TRAIN", "VALID", "TEST"), help=about)
     about = "so many simulations are drawn first, for the split calibration; the shares divide the others (default: 0)"
-    _add_each(kind, {"--calibration N": about}, type=at_least(0), default=0)
+    add_each(kind, {"--calibration N": about}, type=at_least(0), default=0)
     kind.add_argument("--seed", type=at_least(0), default=0, help="seed of this draw (default: 0)")
     kind.add_argument("--corners", action="store_true", help=CORNERS)
     kind.add_argument("--incomplete", action="store_true", help="convert although nothing moves or is prescribed")
@@ -198,102 +177,100 @@ def _add_convert(convert: _Parser) -> None:
         "--contact-radius R": "distance below which surfaces are in contact (default: 0)",
         "--time-step SECONDS": "time between two frames; 0: frames have no time (default: 0)",
     }
-    _add_each(kind, numbers, type=float, default=0.0)
-    _add_each(kind, {"--length-unit UNIT": "unit of length: m, cm, mm, um or in (default: m; a deck needs it)"})
+    add_each(kind, numbers, type=float, default=0.0)
+    add_each(kind, {"--length-unit UNIT": "unit of length: m, cm, mm, um or in (default: m; a deck needs it)"})
     about = "unit of stress and of Young's modulus: Pa, kPa, MPa, GPa or psi (default: Pa; a deck needs it)"
-    _add_each(kind, {"--stress-unit UNIT": about})
+    add_each(kind, {"--stress-unit UNIT": about})
     records = convert.add_argument_group("selection from .tfrecord files (meta.json has all other facts)")
     records.add_argument("--split", nargs="+", choices=commands.SPLITS, help="convert only these files (default: all)")
-    _add_each(records, {"--limit N": "first N trajectories of each file (default: all)"}, type=at_least(1))
-    _add_each(records, {"--every K": "keep every K-th frame (default: 1)"}, type=at_least(1), default=1)
+    add_each(records, {"--limit N": "first N trajectories of each file (default: all)"}, type=at_least(1))
+    add_each(records, {"--every K": "keep every K-th frame (default: 1)"}, type=at_least(1), default=1)
     convert.set_defaults(of_series=(fields, kind), of_records=(records,))
 
 
-def _add_info(info: _Parser) -> None:
+def _add_info(info: Parser) -> None:
     info.add_argument("path", type=path, metavar="FILE_OR_RUN", help="dataset (.h5), run folder or run file (.ast)")
     info.add_argument("--json", action="store_true", help="print JSON")
     info.add_argument("--strict", action="store_true", help="exit with an error if something looks wrong")
 
 
-def _add_train(train: _Parser) -> None:
+def _add_train(train: Parser) -> None:
     train.more = help_lines.all_settings
     train.add_argument("data", metavar="DATA", nargs="?", type=path, help="dataset; may be left out with --resume")
-    _add_each(train, {"--out RUN": "run folder"}, type=path, required=True)
-    _add_each(train, {"--model M": "name of the model; the list is below (default: ast)"})
-    _add_each(train, {"--preset P": "settings to start from (default: tiny)"})
+    add_each(train, {"--out RUN": "run folder"}, type=path, required=True)
+    add_each(train, {"--model M": "name of the model; the list is below (default: ast)"})
+    add_each(train, {"--preset P": "settings to start from (default: tiny)"})
     files = {
         "--config FILE": "settings from a TOML file, such as config.toml of a run; --set and options win over it",
         "--from RUN": "start with the weights and the settings of another run, to train it longer or on other data",
     }
-    _add_each(train, files, type=path)
+    add_each(train, files, type=path)
     states = {"--state NAME": "field of the dataset to predict, such as PEEQ, or reaction; may be repeated"}
-    _add_each(train, {**states, "--set k=v": "change a setting; may be repeated"}, action="append", default=[])
-    _add_each(
-        train, {"--minutes M": "train so long: 50 steps are timed, then the number of steps is fixed"}, type=float
-    )
-    _add_each(train, {"--processes N": "so many processes train together (default: train.processes)"}, type=at_least(1))
+    add_each(train, {**states, "--set k=v": "change a setting; may be repeated"}, action="append", default=[])
+    add_each(train, {"--minutes M": "train so long: 50 steps are timed, then the number of steps is fixed"}, type=float)
+    add_each(train, {"--processes N": "so many processes train together (default: train.processes)"}, type=at_least(1))
     train.add_argument("--resume", action="store_true", help="go on after the last checkpoint, if there is one")
-    _add_each(train, {"--profile N": "only measure N steps and print how their time divides"}, type=at_least(1))
+    add_each(train, {"--profile N": "only measure N steps and print how their time divides"}, type=at_least(1))
 
 
-def _add_predict(predict: _Parser) -> None:
+def _add_predict(predict: Parser) -> None:
     predict.add_argument("run_folder", type=path, metavar="RUN", help="run folder")
     about = "a mesh (.vtu, .msh, .inp, .stl, ...), a dataset (.h5), or the specification of an assembly (.toml)"
     predict.add_argument("scene", type=path, metavar="SCENE", help=about)
-    _add_out(predict, "FILE", "file to write: .h5, .pvd or .vtkhdf for ParaView, or .csv")
+    add_out(predict, "FILE", "file to write: .h5, .pvd or .vtkhdf for ParaView, or .csv")
     moves = {
         "--move BODY=MOTION": 'motion of the prescribed nodes of a body: a translation "1=0,0,-0.01", a path'
         ' "1=0,0,-0.01 then 0.02,0,-0.01", or a rotation "1=rotate 30 about 0,0,1 at 0,0,0"; may be repeated'
     }
-    _add_each(predict, moves, action="append", default=[])
+    add_each(predict, moves, action="append", default=[])
     about = "frames that are wanted, such as --frames=-1 for the last one or --frames 5,10,20 (default: all)"
-    _add_each(predict, {"--frames I,...": about}, type=whole_numbers)
+    add_each(predict, {"--frames I,...": about}, type=whole_numbers)
     efforts = {
         "--corrections N": "calls that correct the first one, if the run jumps to a frame (default: as its validation"
         " has decided)",
         "--newton-steps N": "at most so many Newton steps of the solver after them, until one is small (default:"
         " likewise; 0 with --corrections)",
     }
-    _add_each(predict, efforts, type=at_least(0))
+    add_each(predict, efforts, type=at_least(0))
     _add_errors(predict)
     about = "instead: the most accurate effort that takes at most so many milliseconds on this machine"
-    _add_each(predict, {"--ms T": about}, type=float)
+    add_each(predict, {"--ms T": about}, type=float)
     about = "number of frames of the motion (default: prescribed nodes move as far in a frame as in training)"
-    _add_each(predict, {"--num-frames N": about}, type=at_least(2))
+    add_each(predict, {"--num-frames N": about}, type=at_least(2))
     about = "say whether the answer is physics: elements turned over, penetration, forces out of balance"
     predict.add_argument("--check", action="store_true", help=about)
     about = "also write the force and the torque on each body, frame by frame, as a table"
-    _add_each(predict, {"--forces FILE.csv": about}, type=path)
+    add_each(predict, {"--forces FILE.csv": about}, type=path)
     mesh = predict.add_argument_group("if SCENE is a mesh")
-    _add_each(mesh, {"--obstacle BODY": "a rigid body; may be repeated"}, type=int, action="append", default=[])
+    add_each(mesh, {"--obstacle BODY": "a rigid body; may be repeated"}, type=int, action="append", default=[])
     marks = {
         "--clamp BODY:PLACE": "prescribed nodes of a deforming body: 0:xmin, 0:xmin,xmax, 0:z<=0.01, 0:all,"
         " 0:field=NAME; may be repeated",
         "--material BODY=NUMBERS": "material of a body, such as 0=2e5,0.3; may be repeated",
     }
-    _add_each(mesh, marks, action="append", default=[])
+    add_each(mesh, marks, action="append", default=[])
     fields = {
         "--body-field NAME": "field with the numbers of the bodies (default: body; without it, connected parts)",
         "--type-field NAME": "point field: 0 normal, 1 obstacle, 3 handle (default: node_type)",
     }
-    _add_each(mesh, fields)
+    add_each(mesh, fields)
     mesh.add_argument("--corners", action="store_true", help=CORNERS)
     data = predict.add_argument_group("if SCENE is a dataset")
     data.add_argument("--split", choices=commands.SPLITS, default="test", help="split (default: test)")
-    _add_each(data, {"--index I": "number of the trajectory in the split"}, type=at_least(0))
+    add_each(data, {"--index I": "number of the trajectory in the split"}, type=at_least(0))
     spec = predict.add_argument_group("if SCENE is the specification of an assembly")
     about = "value of a parameter, such as travel=4.2 or bumper.young=1.5e6; may be repeated"
-    _add_each(spec, {"--set NAME=VALUE": about}, action="append", default=[])
-    _add_each(spec, {"--nodes N": "approximate number of nodes (default: by the sizes)"}, type=at_least(1))
+    add_each(spec, {"--set NAME=VALUE": about}, action="append", default=[])
+    add_each(spec, {"--nodes N": "approximate number of nodes (default: by the sizes)"}, type=at_least(1))
     predict.set_defaults(of_mesh=(mesh,), of_data=(data,), of_spec=(spec,))
 
 
-def _add_errors(parser: _Parser) -> None:
+def _add_errors(parser: Parser) -> None:
     about = (
         "instead: the cheapest effort that keeps this error of the displacement, such as 2%%, or of another quantity,"
         " such as reaction=5%% or stress=10%%, in 90 %% of scenes (`calibrate` first); may be repeated"
     )
-    _add_each(
+    add_each(
         parser,
         {"--error E": about},
         type=read_by("ast_sim.inference.promises.chosen_effort:parse_error"),
@@ -302,43 +279,18 @@ def _add_errors(parser: _Parser) -> None:
     )
 
 
-def _add_sweep(sweep: _Parser) -> None:
+def _add_sweep(sweep: Parser) -> None:
     sweep.add_argument("run_folder", type=path, metavar="RUN", help="run folder")
     sweep.add_argument("spec", type=path, metavar="SPEC", help="specification of the assembly (.toml)")
-    _add_out(sweep, "FILE", "table to write (.csv); a picture with the same name is written beside it (.png)")
+    add_out(sweep, "FILE", "table to write (.csv); a picture with the same name is written beside it (.png)")
     about = "values of a parameter: travel=1:7:13 (from, to, how many), young=1e6,2e6; may be repeated: a grid"
-    _add_each(sweep, {"--set NAME=VALUES": about}, action="append", default=[])
-    _add_each(sweep, {"--table FILE": "instead of --set, a CSV file whose first line names parameters"}, type=path)
+    add_each(sweep, {"--set NAME=VALUES": about}, action="append", default=[])
+    add_each(sweep, {"--table FILE": "instead of --set, a CSV file whose first line names parameters"}, type=path)
     about = "what the picture shows (default: reaction)"
     sweep.add_argument("--quantity", choices=("reaction", "largest_stress"), default="reaction", help=about)
-    _add_each(sweep, {"--corrections N": "as for predict", "--newton-steps N": "as for predict"}, type=at_least(0))
+    add_each(sweep, {"--corrections N": "as for predict", "--newton-steps N": "as for predict"}, type=at_least(0))
     _add_errors(sweep)
-    _add_each(sweep, {"--nodes N": "approximate number of nodes (default: by the sizes)"}, type=at_least(1))
-
-
-def _add_evaluate(evaluate: _Parser) -> None:
-    evaluate.add_argument("run_folder", type=path, metavar="RUN", help="run folder")
-    evaluate.add_argument("data", type=path, metavar="DATA", help="dataset")
-    evaluate.add_argument("--split", choices=commands.SPLITS, default="test", help="split (default: test)")
-    about = "scenes in which the solver solves the deepest frame, to compare (default: 3; 0: none)"
-    _add_each(evaluate, {"--rivals N": about}, type=at_least(0), default=3)
-    about = "the specification or the parts of your own of which DATA was made; the solver needs them"
-    _add_each(evaluate, {"--made-from PATH": about}, type=path)
-    _add_out(evaluate, "FILE.json", "also write all figures to this file", required=False)
-
-
-def _add_calibrate(calibrate: _Parser) -> None:
-    calibrate.add_argument("run_folder", type=path, metavar="RUN", help="run folder")
-    calibrate.add_argument("data", type=path, metavar="DATA", help="dataset with 19 or more scenes new to RUN")
-    about = "split (default: calibration)"
-    calibrate.add_argument("--split", choices=commands.SPLITS, default="calibration", help=about)
-
-
-def _add_report(report: _Parser) -> None:
-    report.add_argument("shown", type=path, nargs="+", metavar="RUN_OR_DATA", help="run folders, or one dataset (.h5)")
-    _add_each(report, {"--out FILE.html": "page to write"}, type=path, required=True)
-    _add_each(report, {"--data DATA": "dataset for all runs (default: the training data of each run)"}, type=path)
-    _add_overwrite(report)
+    add_each(sweep, {"--nodes N": "approximate number of nodes (default: by the sizes)"}, type=at_least(1))
 
 
 if __name__ == "__main__":

@@ -86,7 +86,7 @@ def convert(args: argparse.Namespace) -> None:
     if source.suffix.lower() == ".inp":
         raise ConfigError(f"{source}: a deck holds no results; name them after it: ast-sim convert JOB.inp JOB.frd")
     read = args.source.rglob("*") if args.source.is_dir() else filter(None, [source, deck])
-    _check_output(args, args.out, (path for path in read if path.suffix != ".h5"), "a dataset", ".h5")
+    check_output(args, args.out, (path for path in read if path.suffix != ".h5"), "a dataset", ".h5")
     if is_deepmind(source):
         _refuse(args, args.of_series, f"{args.source}: its meta.json has the facts")
         options = {"splits": args.split, "limit": args.limit, "every": args.every}
@@ -119,7 +119,7 @@ def _refuse(args: argparse.Namespace, groups: tuple[Any, ...], what: str) -> Non
             raise ConfigError(f"{action.option_strings[0]} has no meaning for {what}")
 
 
-def _check_output(args: argparse.Namespace, out: Path, inputs: Iterable[Path], what: str = "", *suffixes: str) -> None:
+def check_output(args: argparse.Namespace, out: Path, inputs: Iterable[Path], what: str = "", *suffixes: str) -> None:
     """Raise ConfigError if the name of the output does not end as that of `what` must, or if the output is an input,
     lies in a run, or exists and --overwrite was not given."""
     if suffixes and out.suffix not in suffixes:
@@ -183,11 +183,11 @@ def predict(args: argparse.Namespace) -> None:
     from ast_sim.inference.answer import SUFFIXES
     from ast_sim.prescribed_motion import parse_move
 
-    _check_output(args, args.out, [args.scene], "a prediction", *SUFFIXES)
+    check_output(args, args.out, [args.scene], "a prediction", *SUFFIXES)
     if args.forces is not None:
-        _check_output(args, args.forces, [args.scene, args.out], "a table of forces", ".csv")
+        check_output(args, args.forces, [args.scene, args.out], "a table of forces", ".csv")
     moves = dict(map(parse_move, args.move))
-    run = _open_run(args.run_folder)
+    run = open_run(args.run_folder)
     effort = run.effort.asked(args.corrections, args.newton_steps)
     wanted = {"frames": args.frames, "effort": effort, "error": dict(args.error) or None, "ms": args.ms, "throw": False}
     if args.scene.suffix == ".toml":
@@ -236,8 +236,8 @@ def sweep(args: argparse.Namespace) -> None:
 
     picture = args.out.with_suffix(".png")
     for out, what, suffix in ((args.out, "a table", ".csv"), (picture, "a picture", ".png")):
-        _check_output(args, out, [args.spec, *filter(None, [args.table])], what, suffix)
-    run = _open_run(args.run_folder)
+        check_output(args, out, [args.spec, *filter(None, [args.table])], what, suffix)
+    run = open_run(args.run_folder)
     values = parse_settings(args.set)
     swept = run.sweep(
         args.spec,
@@ -292,58 +292,9 @@ def _scene(args: argparse.Namespace) -> Any:
     return read.scene
 
 
-def _open_run(folder: Path) -> Any:
+def open_run(folder: Path) -> Any:
+    """A run whose predictions keep their memory."""
     from ast_sim import Run, keep_memory
 
     keep_memory()
     return Run(folder)
-
-
-def evaluate(args: argparse.Namespace) -> None:
-    """Measure the errors and the speed of a run on a dataset."""
-    if args.out is not None:
-        _check_output(args, args.out, [args.data])
-        if args.out.suffix != ".json":
-            raise ConfigError(f"--out {args.out}: the name of a file of figures must end in .json")
-    run = _open_run(args.run_folder)
-    evaluation = run.evaluate(args.data, args.split, args.command_line, args.rivals, args.made_from)
-    print(evaluation)
-    if args.out is not None:
-        evaluation.save(args.out)
-        print(f"all figures: {args.out}")
-
-
-def calibrate(args: argparse.Namespace) -> None:
-    """Measure on new scenes how far answers are from the truth, so that each has a band."""
-    from ast_sim.inference.promises.calibration import calibrate as measure
-
-    print(measure(_open_run(args.run_folder), args.data, args.split).text)
-
-
-def report(args: argparse.Namespace) -> None:
-    """Write a page that shows runs (moving scenes, errors), or a dataset."""
-    from ast_sim.view.page import check_suffix
-
-    check_suffix(args.out)
-    _check_output(args, args.out, [*args.shown, *filter(None, [args.data])])
-    no_runs = (path for path in args.shown if not path.is_dir() and path.suffix != ".ast")
-    datasets = [path for path in no_runs if path.is_file() or path.suffix == ".h5"]
-    if len(datasets) < len(args.shown) and datasets:
-        raise ConfigError(
-            f"{datasets[0]} is a dataset, the others are runs: a page shows runs or one dataset;"
-            " name the dataset of runs with --data"
-        )
-    if len(datasets) > 1:
-        raise ConfigError(f"a page shows one dataset, not {len(datasets)}: write one page for each")
-    if datasets and args.data is not None:
-        raise ConfigError(f"--data names the dataset of runs, but {datasets[0]} is a dataset itself: leave --data out")
-    if datasets:
-        from ast_sim.view.dataset_page import gallery
-
-        gallery.write(args.out, datasets[0])
-    else:
-        from ast_sim.inference.evaluation.evaluated_run import report_evaluations
-
-        evaluations = [_open_run(folder).evaluate(args.data, command=args.command_line) for folder in args.shown]
-        report_evaluations(args.out, evaluations, "Learned simulation: predictions and errors")
-    print(f"report: {args.out}")

@@ -32,7 +32,19 @@ from ast_sim.view import export
 
 LINES = int(os.environ.get("AST_SIM_COMMAND_LINES", "250"))
 
-COMMANDS = {"calibrate", "demo", "generate", "convert", "info", "train", "predict", "sweep", "evaluate", "report"}
+COMMANDS = {
+    "calibrate",
+    "demo",
+    "generate",
+    "convert",
+    "info",
+    "train",
+    "predict",
+    "sweep",
+    "evaluate",
+    "report",
+    "trade",
+}
 
 # Texts without a slash: an output must not leave the folder of the test.
 TEXT = st.text(st.characters(exclude_characters="\0/", exclude_categories=["Cs"]), max_size=6).filter(
@@ -56,6 +68,7 @@ OUT = {
     "generate": ["new.h5"],
     "report": ["new.html"],
     "sweep": ["new.csv"],
+    "trade": ["new.html"],
     "predict": ["new.h5", "new.pvd", "new.vtkhdf"],
 }
 USUAL = {  # what a user may well give, by the name that the parser has for it

@@ -1,14 +1,43 @@
-"""What the text of an argument of the command line may be."""
+"""The arguments of the command line: a parser, options in groups, and what their texts may be."""
 
 from __future__ import annotations
 
 import argparse
 import pkgutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import ConfigError, printable
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that reports wrong arguments in one line. Its help ends with the lines that `more` makes when it is
+    printed, since what they tell of takes time to import."""
+
+    more: Callable[[], list[str]] = list
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {printable(message)} (see {self.prog} --help)\n")
+
+    def format_help(self) -> str:
+        return super().format_help() + "".join(f"{line}\n" for line in self.more())
+
+
+def add_each(to: Any, options: Mapping[str, str], **shared: Any) -> None:
+    """Add options that differ only in their names and helps: a key is "--name METAVAR", its value is the help."""
+    for option, text in options.items():
+        name, metavar = option.split()
+        to.add_argument(name, metavar=metavar, help=text, **shared)
+
+
+def add_out(to: Parser, metavar: str, about: str, required: bool = True) -> None:
+    to.add_argument("--out", type=path, metavar=metavar, required=required, help=about)
+    add_overwrite(to)
+
+
+def add_overwrite(to: Parser) -> None:
+    to.add_argument("--overwrite", action="store_true", help="replace the output if it exists")
 
 
 def path(text: str) -> Path:

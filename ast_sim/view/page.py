@@ -19,7 +19,7 @@ from ast_sim.support.disk import replacing
 from ast_sim.support.errors import AstSimError, require
 from ast_sim.view.files import explained
 
-SCRIPTS = ("common.js", "panel.js", "viewer.js", "charts.js", "gallery.js", "dataset.js", "page.js")
+SCRIPTS = ("common.js", "panel.js", "viewer.js", "charts.js", "gallery.js", "dataset.js", "trade.js", "page.js")
 SUFFIXES = (".html", ".htm")
 FOOTER = "Made by ast_sim. This page is one file and loads nothing from anywhere."
 

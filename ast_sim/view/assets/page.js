@@ -127,9 +127,9 @@ const data = JSON.parse(byId("report-data").textContent);
 byId("lead").textContent = data.lead;
 byId("footer").textContent = data.footer;
 tiles(data);
-// The page of runs and the page of a dataset share the template. When it is filled, sections of the other kind go.
-const facts = data.kind === "dataset" ? [{ facts: data.facts }] : data.runs;
-(data.kind === "dataset" ? showDataset : showRuns)(data);
+// The pages of runs, of a dataset and of a trade share the template. When it is filled, sections of the other kinds go.
+const facts = data.runs || [{ facts: data.facts }];
+({ runs: showRuns, dataset: showDataset, trade: showTrade })[data.kind](data);
 document.querySelectorAll("[data-kind]").forEach((part) => { if (part.dataset.kind !== data.kind) part.remove(); });
 byId("facts").hidden = !facts.some((run) => run.facts.length);
 byId("facts-tables").append(factTables(facts));

@@ -1,0 +1,186 @@
+"""What an error costs: efforts of a run and ways of the solver on the same scenes, timed in turns on one thread."""
+
+from __future__ import annotations
+
+import math
+import os
+import shlex
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from ast_sim.dataset.reader import Dataset
+from ast_sim.dataset.solver_seconds import read_seconds
+from ast_sim.inference.effort import Effort, choices
+from ast_sim.inference.predict import answers
+from ast_sim.inference.question import Question
+from ast_sim.inference.relative_errors import moves, relative_error
+from ast_sim.simulate.jobs.rival import Rivals, deepest_frame, rivals
+from ast_sim.support.disk import write_json
+from ast_sim.support.errors import ConfigError, SimulationError
+from ast_sim.support.progress import Progress
+from ast_sim.support.provenance import provenance
+from ast_sim.trade_figures import Setting, TradeFigures
+from ast_sim.view import trade_page
+from ast_sim.view.files import make_folder
+
+if TYPE_CHECKING:
+    from ast_sim.inference.trained_run import Run
+
+SCENES = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Trade:
+    """Speed against accuracy of a run, beside the solver. `str` gives the table at fixed errors.
+
+    Attributes:
+        figures: what was measured.
+    """
+
+    figures: TradeFigures
+
+    def __str__(self) -> str:
+        return "\n".join(self.figures.lines())
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write all figures as JSON."""
+        write_json(Path(path), self.figures.to_json())
+
+    def report(self, path: str | os.PathLike[str], title: str = "Speed against accuracy") -> None:
+        """Write a page: error against seconds, and the table; a missing folder is made.
+
+        Raises:
+            AstSimError: the suffix is neither .html nor .htm, or the file cannot be written.
+            MissingExtra: plotly is not installed.
+        """
+        make_folder(Path(path).parent)
+        trade_page.write(path, self.figures, title)
+
+
+def trade(
+    run: Run,
+    data: str | os.PathLike[str] | Dataset | None = None,
+    split: str = "test",
+    *,
+    scenes: int = SCENES,
+    solver_seconds: float | None = None,
+    made_from: str | os.PathLike[str] | None = None,
+    command: str = "ast_sim.trade",
+) -> Trade:
+    """Measure what each error costs: by every effort of a run, and by the solver in every way that it can be run.
+
+    Each answer is of the deepest frame of a scene, alone, on one thread. Times are processor seconds, and count what is
+    prepared for a mesh. On a terminal a bar shows the progress.
+
+    Args:
+        data: a dataset, its path or open; by default the one that the run was trained on.
+        split: whose scenes are asked. They must be new to the run, or its errors are too small.
+        scenes: at most so many, the first of the split.
+        solver_seconds: what another program takes for such a scene, to the error of its mesh; our solver is not run.
+        made_from: the specification or the parts of your own of which the dataset was made; the solver needs them.
+        command: what is recorded as the origin of the figures.
+
+    Raises:
+        ConfigError: no scene of the split moves, or the solver's seconds are not above 0.
+        DatasetError: the dataset cannot be read.
+    """
+    if solver_seconds is not None and not 0 < solver_seconds < math.inf:
+        raise ConfigError(f"the solver's seconds are {solver_seconds}; they must be above 0")
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with run.open(data) as dataset:
+            moving = (index for index in range(dataset.count(split)) if moves(dataset.load(split, index)))
+            indices = [index for index, _ in zip(moving, range(scenes), strict=False)]
+            if not indices:
+                raise ConfigError(f"{dataset.path}: no scene of the split {split} moves")
+            return Trade(_measured(run, dataset, split, indices, solver_seconds, made_from, command))
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _measured(
+    run: Run,
+    dataset: Dataset,
+    split: str,
+    indices: Sequence[int],
+    stated: float | None,
+    made_from: str | os.PathLike[str] | None,
+    command: str,
+) -> TradeFigures:
+    efforts = choices(run.settings.model, run.settings.train.calls) or (run.effort,)
+    own: dict[Effort, list[tuple[float, float]]] = {effort: [] for effort in efforts}
+    ways: dict[str, list[tuple[float, float]]] = {}
+    no_solver = ""
+    solved: Iterator[Rivals] | None = None
+    try:
+        if stated is None:
+            solved = rivals(dataset.path, split, indices, made_from=made_from, progress=False)
+    except (ConfigError, SimulationError) as error:
+        no_solver = str(error)
+    with Progress(len(indices), 0, "scenes") as bar:
+        for number, index in enumerate(indices):
+            for effort in efforts:
+                if not number:
+                    _answer(run, dataset, split, index, effort)  # the first answer takes longer; it does not count
+                own[effort].append(_answer(run, dataset, split, index, effort))
+            try:
+                for outcome in next(solved).outcomes if solved is not None else ():
+                    pair = (outcome.relative_error, outcome.whole_seconds) if outcome.converged else _NONE
+                    ways.setdefault(outcome.way.name, []).append(pair)
+            except (ConfigError, SimulationError) as error:
+                no_solver, solved, ways = str(error), None, {}
+            bar.advance()
+    if stated is not None:
+        ways = {"as stated": [(0.0, stated)] * len(indices)}
+    return TradeFigures(
+        scenes=tuple(f"{split}/{index:06d}" for index in indices),
+        run=tuple(_setting(effort.text, pairs, _command(run, dataset, split, effort)) for effort, pairs in own.items()),
+        solver=tuple(_setting(name, pairs) for name, pairs in ways.items()),
+        no_solver=no_solver,
+        invested=_invested(run, dataset),
+        origin={**provenance(command), "run": str(run.path), "step": run.step, "data": str(dataset.path)},
+    )
+
+
+_NONE = (math.inf, math.inf)  # error and seconds, where there is no answer
+
+
+def _answer(run: Run, dataset: Dataset, split: str, index: int, effort: Effort) -> tuple[float, float]:
+    """The error and the seconds of an answer; the scene is loaded anew, so nothing is prepared for its mesh."""
+    truth = dataset.load(split, index)
+    frame = max(deepest_frame(truth), run.settings.model.data.given_frames)
+    question = Question.of(truth, f"{split}/{index:06d}", [frame])
+    began = time.process_time()
+    (answer,) = answers(run.model, [question], effort)
+    seconds = time.process_time() - began
+    return _NONE if answer.failure is not None else (relative_error(answer.position[0], truth, frame), seconds)
+
+
+def _setting(name: str, pairs: Sequence[tuple[float, float]], command: str = "") -> Setting:
+    errors, seconds = zip(*pairs, strict=True)
+    return Setting(name, errors, seconds, command)
+
+
+def _command(run: Run, dataset: Dataset, split: str, effort: Effort) -> str:
+    """What predicts the first scene with this effort."""
+    asked = ["--corrections", str(effort.corrections), "--newton-steps", str(effort.newton_steps)]
+    what = asked if run.settings.model.jumps else []
+    scene = [str(dataset.path), "--split", split, "--index", "0"]
+    return shlex.join(["ast-sim", "predict", str(run.path), *scene, "--out", "answer.h5", *what])
+
+
+def _invested(run: Run, dataset: Dataset) -> float | None:
+    """The processor seconds of the solver for the training scenes, if the dataset is that of the training, and the
+    seconds of the training."""
+    steps = [record["seconds"] for record in run.folder.metrics if "loss" in record]
+    samples = read_seconds(dataset).samples
+    simulated = [sum(seconds) for name, seconds in samples.items() if name.startswith(("train/", "valid/"))]
+    if not steps or not simulated or Path(run.settings.data).resolve() != dataset.path.resolve():
+        return None
+    return sum(simulated) + sorted(steps)[len(steps) // 2] * run.settings.train.steps

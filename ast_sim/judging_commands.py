@@ -1,0 +1,124 @@
+"""The commands that judge a trained run, each with its arguments: evaluate, calibrate, trade, report."""
+
+from __future__ import annotations
+
+import argparse
+
+from ast_sim.commands import SPLITS, check_output, open_run
+from ast_sim.support.argument_types import Parser, add_each, add_out, add_overwrite, at_least, path
+from ast_sim.support.errors import ConfigError
+
+
+def add_evaluate(evaluate: Parser) -> None:
+    """The arguments of `evaluate`."""
+    evaluate.add_argument("run_folder", type=path, metavar="RUN", help="run folder")
+    evaluate.add_argument("data", type=path, metavar="DATA", help="dataset")
+    evaluate.add_argument("--split", choices=SPLITS, default="test", help="split (default: test)")
+    about = "scenes in which the solver solves the deepest frame, to compare (default: 3; 0: none)"
+    add_each(evaluate, {"--rivals N": about}, type=at_least(0), default=3)
+    about = "the specification or the parts of your own of which DATA was made; the solver needs them"
+    add_each(evaluate, {"--made-from PATH": about}, type=path)
+    add_out(evaluate, "FILE.json", "also write all figures to this file", required=False)
+
+
+def evaluate(args: argparse.Namespace) -> None:
+    """Measure the errors and the speed of a run on a dataset."""
+    if args.out is not None:
+        check_output(args, args.out, [args.data])
+        if args.out.suffix != ".json":
+            raise ConfigError(f"--out {args.out}: the name of a file of figures must end in .json")
+    run = open_run(args.run_folder)
+    evaluation = run.evaluate(args.data, args.split, args.command_line, args.rivals, args.made_from)
+    print(evaluation)
+    if args.out is not None:
+        evaluation.save(args.out)
+        print(f"all figures: {args.out}")
+
+
+def add_calibrate(calibrate: Parser) -> None:
+    """The arguments of `calibrate`."""
+    calibrate.add_argument("run_folder", type=path, metavar="RUN", help="run folder")
+    calibrate.add_argument("data", type=path, metavar="DATA", help="dataset with 19 or more scenes new to RUN")
+    about = "split (default: calibration)"
+    calibrate.add_argument("--split", choices=SPLITS, default="calibration", help=about)
+
+
+def calibrate(args: argparse.Namespace) -> None:
+    """Measure on new scenes how far answers are from the truth, so that each has a band."""
+    from ast_sim.inference.promises.calibration import calibrate as measure
+
+    print(measure(open_run(args.run_folder), args.data, args.split).text)
+
+
+def add_trade(trade: Parser) -> None:
+    """The arguments of `trade`."""
+    trade.add_argument("run_folder", type=path, metavar="RUN", help="run folder")
+    trade.add_argument("data", type=path, metavar="DATA", help="dataset with scenes new to RUN (.h5)")
+    add_out(trade, "FILE.html", "page to write; all figures lie beside it (.json)")
+    trade.add_argument("--split", choices=SPLITS, default="test", help="split (default: test)")
+    add_each(trade, {"--scenes N": "at most so many scenes (default: 20)"}, type=at_least(1), default=20)
+    about = "what another program takes for such a scene: our solver is not run"
+    add_each(trade, {"--solver-seconds S": about}, type=float)
+    about = "the specification or the parts of your own of which DATA was made; the solver needs them"
+    add_each(trade, {"--made-from PATH": about}, type=path)
+
+
+def trade(args: argparse.Namespace) -> None:
+    """Measure what each error costs, by the run and by the solver: a table and a page."""
+    from ast_sim import trade as measure
+    from ast_sim.view.page import check_suffix
+
+    check_suffix(args.out)
+    figures = args.out.with_suffix(".json")
+    for out in (args.out, figures):
+        check_output(args, out, [args.data])
+    result = measure(
+        open_run(args.run_folder),
+        args.data,
+        args.split,
+        scenes=args.scenes,
+        solver_seconds=args.solver_seconds,
+        made_from=args.made_from,
+        command=args.command_line,
+    )
+    print(result)
+    result.report(args.out)
+    result.save(figures)
+    print(f"page: {args.out}, all figures: {figures}")
+
+
+def add_report(report: Parser) -> None:
+    """The arguments of `report`."""
+    report.add_argument("shown", type=path, nargs="+", metavar="RUN_OR_DATA", help="run folders, or one dataset (.h5)")
+    add_each(report, {"--out FILE.html": "page to write"}, type=path, required=True)
+    add_each(report, {"--data DATA": "dataset for all runs (default: the training data of each run)"}, type=path)
+    add_overwrite(report)
+
+
+def report(args: argparse.Namespace) -> None:
+    """Write a page that shows runs (moving scenes, errors), or a dataset."""
+    from ast_sim.view.page import check_suffix
+
+    check_suffix(args.out)
+    check_output(args, args.out, [*args.shown, *filter(None, [args.data])])
+    no_runs = (path for path in args.shown if not path.is_dir() and path.suffix != ".ast")
+    datasets = [path for path in no_runs if path.is_file() or path.suffix == ".h5"]
+    if len(datasets) < len(args.shown) and datasets:
+        raise ConfigError(
+            f"{datasets[0]} is a dataset, the others are runs: a page shows runs or one dataset;"
+            " name the dataset of runs with --data"
+        )
+    if len(datasets) > 1:
+        raise ConfigError(f"a page shows one dataset, not {len(datasets)}: write one page for each")
+    if datasets and args.data is not None:
+        raise ConfigError(f"--data names the dataset of runs, but {datasets[0]} is a dataset itself: leave --data out")
+    if datasets:
+        from ast_sim.view.dataset_page import gallery
+
+        gallery.write(args.out, datasets[0])
+    else:
+        from ast_sim.inference.evaluation.evaluated_run import report_evaluations
+
+        evaluations = [open_run(folder).evaluate(args.data, command=args.command_line) for folder in args.shown]
+        report_evaluations(args.out, evaluations, "Learned simulation: predictions and errors")
+    print(f"report: {args.out}")

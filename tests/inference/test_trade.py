@@ -1,0 +1,57 @@
+"""A trade, measured for real: the run that comes with the package and the solver on a small plate."""
+
+import json
+
+import pytest
+import toy
+from toy import one_thread  # noqa: F401 (used by being imported)
+
+import ast_sim
+from ast_sim.cli import main
+from ast_sim.simulate.jobs.rival import WAYS
+from ast_sim.support.errors import ConfigError
+
+
+@pytest.fixture(scope="module")
+def plates(tmp_path_factory):
+    data = tmp_path_factory.mktemp("plates") / "plates.h5"
+    ast_sim.generate("deforming_plate", data, train=0, valid=0, test=1, nodes=200, frames=41, keep=(24,), seed=5)
+    return data
+
+
+def test_efforts_and_ways_are_measured_on_the_same_scene(plates, tmp_path, capsys):
+    ast_sim.example_run("plates").save(tmp_path / "plates.ast")
+    told = [str(tmp_path / "plates.ast"), str(plates), "--out", str(tmp_path / "pages" / "trade.html")]
+    assert main(["trade", *told]) == 0
+    assert "10 %: run: " in capsys.readouterr().out
+    figures = json.loads((tmp_path / "pages" / "trade.json").read_text())
+    assert [len(figures[side]) for side in ("run", "solver")] == [4, len(WAYS)]
+    own = next(one for one in figures["solver"] if one["name"] == "own stop test")
+    assert own["errors"][0] < 1e-3 and own["seconds"][0] > 0
+    call, *_, newton = figures["run"]
+    assert newton["errors"][0] < call["errors"][0] < 0.3
+    assert call["command"].endswith("--corrections 0 --newton-steps 0") and figures["scenes"] == ["test/000000"]
+    assert figures["origin"]["command"].startswith("ast-sim trade ")
+    assert "What an error costs" in (tmp_path / "pages" / "trade.html").read_text()
+
+
+def test_another_program_is_represented_by_its_seconds(plates):
+    figures = ast_sim.trade(ast_sim.example_run("plates"), plates, solver_seconds=95.0).figures
+    (stated,) = figures.solver
+    assert (stated.errors, stated.seconds) == ((0.0,), (95.0,))
+    rows = figures.rows()
+    assert rows[0].verdict == "the run" and rows[0].ratio > 100
+    with pytest.raises(ConfigError, match="seconds are -1; they must be above 0"):
+        ast_sim.trade(ast_sim.example_run("plates"), plates, solver_seconds=-1)
+
+
+def test_where_our_solver_did_not_make_the_scenes_it_says_so(tmp_path):
+    data = toy.write(tmp_path / "toy.h5", (3, 1, 2))
+    small = {"hidden": 8, "blocks": 1}
+    run = ast_sim.train(data, tmp_path / "run", steps=2, batch_size=2, model="mgn", model_settings=small)
+    result = ast_sim.trade(run, data)
+    assert result.figures.solver == () and result.figures.invested is None
+    assert len(result.figures.scenes) == 2
+    assert str(result).splitlines()[-1].startswith("the solver was not run: ")
+    with pytest.raises(ConfigError, match="split valid moves|no scene"):
+        ast_sim.trade(run, toy.write(tmp_path / "none.h5", (1, 0, 1)), "valid")

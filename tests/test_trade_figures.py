@@ -1,0 +1,76 @@
+"""Which setting keeps an error and is the fastest, on both sides; who is ahead; when simulation and training pay."""
+
+import math
+
+import pytest
+
+from ast_sim.trade_figures import Setting, TradeFigures, front
+
+SCENES = tuple(f"test/{index:06d}" for index in range(10))
+
+
+def setting(name, error, seconds, failed=0):
+    """A setting with errors of 0.1 to 1 times `error`, and so many scenes without an answer."""
+    errors = [error * (k + 1) / 10 for k in range(10 - failed)] + [math.inf] * failed
+    return Setting(name, tuple(errors), (seconds,) * (10 - failed) + (math.inf,) * failed)
+
+
+def figures(**more):
+    run = (setting("call", 0.08, 0.02), setting("Newton", 0.01, 0.04))
+    solver = (setting("own", 0.0, 0.1), setting("coarse", 0.04, 0.05), setting("lucky", 0.001, 0.001, failed=2))
+    return TradeFigures(SCENES, run, solver, **more)
+
+
+def test_nine_of_ten_scenes_keep_an_error():
+    assert setting("one", 0.1, 1.0).kept == pytest.approx(0.09)
+    assert setting("one", 0.1, 1.0, failed=1).kept == pytest.approx(0.09)
+    assert setting("one", 0.1, 1.0, failed=2).kept == math.inf
+    assert Setting("few", (0.1, 0.2, 0.3), (1.0,) * 3).kept == 0.3
+
+
+def test_at_each_error_the_fastest_setting_that_keeps_it_counts_on_both_sides():
+    rows = {row.tolerance: row for row in figures().rows()}
+    chosen = {
+        tolerance: (row.run.name if row.run else None, row.solver.name if row.solver else None, row.verdict)
+        for tolerance, row in rows.items()
+    }
+    assert chosen == {
+        0.1: ("call", "coarse", "the run"),
+        0.05: ("Newton", "coarse", "the run"),
+        0.025: ("Newton", "own", "the run"),
+        0.01: ("Newton", "own", "the run"),
+        0.005: (None, "own", "the solver alone"),
+        0.002: (None, "own", "the solver alone"),
+    }
+    assert rows[0.1].ratio == pytest.approx(2.5) == rows[0.1].low == rows[0.1].high
+    assert rows[0.005].ratio is None
+
+
+def test_the_interval_decides_who_is_faster():
+    """Ratios of 0.5 to 2 are level; below 1 in all draws, the solver is ahead."""
+    run = Setting("run", (0.0,) * 10, (1.0,) * 10)
+    mixed = Setting("solver", (0.0,) * 10, (0.5,) * 5 + (2.0,) * 5)
+    fast = Setting("solver", (0.0,) * 10, (0.5,) * 9 + (2.0,))
+    (level, *_), (ahead, *_) = (TradeFigures(SCENES, (run,), (one,)).rows() for one in (mixed, fast))
+    assert level.verdict == "level" and level.low == 0.5 and level.high == 2.0
+    assert ahead.verdict == "the solver" and ahead.ratio == 0.5 and ahead.pays_after is None
+
+
+def test_what_was_invested_is_repaid_by_the_time_that_each_answer_saves():
+    rows = figures(invested=30.0).rows()
+    assert [row.pays_after for row in rows] == [1000, 3000, 500, 500, None, None]
+    assert all(row.pays_after is None for row in figures().rows())
+
+
+def test_the_front_holds_what_nothing_beats():
+    slow = setting("slow", 0.5, 1.0)
+    assert [one.name for one in front([slow, *figures().solver])] == ["coarse", "own"]
+
+
+def test_the_text_and_the_json_say_it():
+    told = figures(no_solver="it was not made here", origin={"run": "r"})
+    assert told.lines()[1] == ("10 %: run: 20 ms (call); solver: 50 ms (coarse); ratio 2.50 (2.50 to 2.50): the run")
+    assert told.lines()[-1] == "the solver was not run: it was not made here"
+    values = told.to_json()
+    assert values["rows"][0]["solver"] == "coarse" and values["rows"][4]["run"] is None
+    assert values["solver"][2]["errors"][-1] is None and values["origin"] == {"run": "r"}

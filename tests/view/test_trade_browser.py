@@ -1,0 +1,64 @@
+"""The page of a trade in a real browser, at three widths."""
+
+from __future__ import annotations
+
+import pytest
+from browser import Browser
+from on_screen import HOSTILE, show, texts
+
+from ast_sim.trade_figures import Setting, TradeFigures
+from ast_sim.view import trade_page
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with Browser(1000, 700) as browser:
+        browser.prefer(color_scheme="light", reduced_motion="reduce")
+        yield browser
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    run = (
+        Setting("call", (0.05, 0.08), (0.02, 0.02), f"ast-sim predict '{HOSTILE}'"),
+        Setting("Newton", (0.01, 0.009), (0.04, 0.04)),
+        Setting("no use", (0.05, 0.2), (0.06, 0.06)),
+    )
+    solver = (Setting("own", (0.0, 0.0), (0.1, 0.1)), Setting("coarse", (0.04, 0.03), (0.05, 0.05)))
+    figures = TradeFigures(("test/000000", "test/000001"), run, solver, invested=600.0, origin={"run": HOSTILE})
+    path = tmp_path_factory.mktemp("trade") / "trade.html"
+    trade_page.write(path, figures, HOSTILE)
+    return path
+
+
+def test_the_table_and_the_chart_show_the_settings(browser, path):
+    show(browser, path, still=False)
+    assert browser.errors == [] and browser.requests == [path.as_uri()]
+    first = ["10 %", "20 mscall", "50 mscoarse", "2.50 (2.50 to 2.50)", "the run", "20,000 questions"]
+    assert texts(browser, "#trade-tables tbody tr:first-child > *") == first
+    assert texts(browser, "#trade-tables tbody tr:last-child > *")[1:5] == [
+        "none",
+        "100 msown",
+        "–",
+        "the solver alone",
+    ]
+    lead = "2 scenes that the run has not learned from: the run is faster at 10 % and 5 % and 2.5 % and 1 %"
+    assert texts(browser, "#lead")[0].startswith(lead)
+    drawn = browser.evaluate("document.querySelector('#trade-chart .plot').data.map(({ x, y }) => [x, y])")
+    assert drawn[0] == [[60], [20]] and drawn[1] == [[20, 40], [8, 1]]
+    assert drawn[3][0] == [50, 100] and drawn[3][1][0] == 4
+    assert len(texts(browser, "#trade-settings tbody tr")) == 5
+    assert texts(browser, "#facts-tables td") == [HOSTILE]
+    assert not texts(browser, "#gallery, #scenes, #training")  # what belongs to other pages is gone
+
+
+@pytest.mark.parametrize("width", [390, 820, 1600])
+def test_nothing_is_wider_than_the_page(browser, path, width):
+    browser.call("Emulation.setDeviceMetricsOverride", width=width, height=800, deviceScaleFactor=1, mobile=False)
+    show(browser, path, still=False)
+    assert browser.evaluate("document.documentElement.scrollWidth") <= width
+    plot = "document.querySelector('#trade-chart .plot')"
+    assert (
+        browser.evaluate(f"{plot}.querySelector('.main-svg').clientWidth")
+        <= browser.evaluate(f"{plot}.clientWidth") + 1
+    )
