@@ -1,6 +1,7 @@
 """The demonstration: from simulations to a report, in one folder.
 
-It simulates plates that an obstacle presses, trains a small model on them, and predicts plates that the model has not
+First the run that comes with the package answers a plate, at once. Then the demonstration makes such a run: it
+simulates plates that an obstacle presses, trains a small model on them, and predicts plates that the model has not
 seen. A second run in the same folder goes on where the first one stopped; if its settings differ, it stops with an
 error.
 """
@@ -11,10 +12,14 @@ import shlex
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from ast_sim.dataset.reader import Dataset
 from ast_sim.figures import Figures
+from ast_sim.inference.effort import Effort
 from ast_sim.inference.evaluation import asked_frame
 from ast_sim.inference.evaluation.evaluated_run import Evaluation
+from ast_sim.inference.example_run import example_run
 from ast_sim.simulate.jobs.generate import generate
 from ast_sim.support.progress import duration
 from ast_sim.training.start import train
@@ -54,6 +59,9 @@ def demo(out: Path, quick: bool = False, seed: int = 0) -> Figures:
     data, unseen, run_folder = out / "data.h5", out / "unseen.h5", out / "run"
     plates = {"seed": seed, "nodes": NODES, "frames": FRAMES}
 
+    _announce(0, "a new plate, answered by the run that comes with the package")
+    _show_first(out, plates)
+
     _announce(1, f"simulating {size.train + size.valid} plates in {len(KEPT)} frames, {size.test} in all frames")
     generate(FAMILY, data, train=size.train, valid=size.valid, test=0, keep=KEPT, **plates)
     generate(FAMILY, unseen, train=0, valid=0, test=size.test, **plates)
@@ -78,6 +86,25 @@ def demo(out: Path, quick: bool = False, seed: int = 0) -> Figures:
     print(f"run         {run_folder}")
     print(f"in all {duration(time.perf_counter() - started)}", flush=True)
     return evaluation.figures
+
+
+def _show_first(out: Path, plates: dict[str, Any]) -> None:
+    """Predict a plate that no run has seen, by the run that was trained before, and draw it beside the simulation."""
+    kept = KEPT[-1:]
+    data = generate(FAMILY, out / "first.h5", train=0, valid=0, test=1, keep=kept, progress=False, **plates)
+    run = example_run("plates")
+    with Dataset(data.path) as dataset:
+        truth = dataset["test"][0]
+    deepest = [truth.num_frames - 1]
+    run.predict(truth, frames=deepest)  # the first answer takes longer; it does not count
+    network = run.predict(truth, frames=deepest, effort=Effort())
+    answer = run.predict(truth, frames=deepest)
+    picture.write(out / "first.png", truth, answer.trajectory, run.settings.model.name, run.info.length_unit)
+    errors = [100 * one.errors(truth)["displacement"] for one in (network, answer)]
+    print(
+        f"  error {errors[0]:.2g} % of the displacement by one call of the model in {1000 * network.seconds:.0f} ms,"
+        f" {errors[1]:.2g} % with Newton steps in {1000 * answer.seconds:.0f} ms: {out / 'first.png'}"
+    )
 
 
 def _announce(number: int, text: str) -> None:

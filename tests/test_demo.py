@@ -15,7 +15,16 @@ from ast_sim.demo import FULL, KEPT, QUICK, Size, headlines
 from ast_sim.figures import Beside
 
 TINY = Size(train=1, valid=1, test=1, steps=4)
-FILES = ("report.html", "prediction.pvd", "picture.png", "evaluation.json", "data.h5", "unseen.h5", "run/config.toml")
+FILES = (
+    "first.png",
+    "report.html",
+    "prediction.pvd",
+    "picture.png",
+    "evaluation.json",
+    "data.h5",
+    "unseen.h5",
+    "run/config.toml",
+)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +48,7 @@ def figures(folder) -> dict:
 def test_everything_is_made(made):
     for name in FILES:
         assert (made / name).stat().st_size > 0, name
-    assert (made / "picture.png").read_bytes().startswith(b"\x89PNG")
+    assert all((made / name).read_bytes().startswith(b"\x89PNG") for name in ("first.png", "picture.png"))
     with Dataset(made / "data.h5") as dataset:
         assert dataset.splits == {"train": 1, "valid": 1, "test": 0, "calibration": 0}
         assert dataset["train"][0].num_frames == 1 + len(KEPT)
@@ -61,12 +70,13 @@ def test_again_in_the_same_folder_reuses_the_parts_and_other_settings_are_refuse
     assert main(["demo", "--quick", "--out", str(made)]) == 0
     shown = capsys.readouterr().out
     assert "going on after step 4" in shown
-    for name in FILES[:4]:
+    for name in FILES[:5]:
         assert str(made / name) in shown
+    assert "of the displacement by one call of the model in" in shown
     assert figures(made) == before
     assert (made / "run" / "checkpoints" / "step-4" / "manifest.json").read_bytes() == weights
     assert main(["demo", "--quick", "--out", str(made), "--seed", "1"]) == 2
-    assert "data.h5 exists and holds other data" in capsys.readouterr().err
+    assert "first.h5 exists and holds other data" in capsys.readouterr().err
     monkeypatch.setattr(demo, "QUICK", Size(train=1, valid=1, test=1, steps=5))
     assert main(["demo", "--quick", "--out", str(made)]) == 2
     assert "train.steps = 4, not 5" in capsys.readouterr().err
