@@ -1,0 +1,139 @@
+"""What an error costs: runs and the solver at fixed errors, on scenes that no training has seen.
+
+`python -m benchmarks.studies.trade [ROW ...]` makes the scenes of each row, takes the run that comes with the package
+or trains the one of `benchmarks.studies.jumps`, and measures both sides with `ast_sim.trade`. It writes
+benchmarks/results/trade.json and docs/results/trade.md. Data and runs lie in `--folder`. Everything runs on one thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import ast_sim
+from ast_sim.support.disk import write_json, write_text
+from benchmarks.studies import jumps
+
+RESULTS = Path(__file__).parents[1] / "results" / "trade.json"
+PAGE = Path(__file__).parents[2] / "docs" / "results" / "trade.md"
+DEEP_PLATES = {"family": "deforming_plate", "frames": 41, "keep": (14, 24, 34)}
+
+
+@dataclass(frozen=True)
+class Row:
+    """A run and fresh scenes.
+
+    Attributes:
+        title: what the page calls them.
+        run: the name of an example run, or of a row of `benchmarks.studies.jumps`.
+        scenes: how many are measured.
+        plates: the settings of `generate` for fresh plates, which chose nothing; None: the test scenes of the row.
+    """
+
+    title: str
+    run: str
+    scenes: int
+    plates: dict[str, Any] | None = None
+
+
+ROWS = {
+    "plates400": Row("Plates, 400 nodes", "plates", 40, {**DEEP_PLATES, "nodes": 400, "seed": 912}),
+    "plates1300": Row("Plates, 1,300 nodes", "plates1300", 15),
+    "parts400": Row("Pairs of parts, 400 nodes, with friction", "parts400", 15),
+}
+
+
+def measured(name: str, folder: Path) -> dict[str, Any]:
+    """The figures of a row."""
+    row = ROWS[name]
+    if row.plates is None:
+        run, data = jumps.trained(row.run, folder)
+    else:
+        run = ast_sim.example_run(row.run)
+        data = ast_sim.generate(out=folder / f"{name}_fresh.h5", train=0, valid=0, test=row.scenes, **row.plates).path
+    command = f"python -m benchmarks.studies.trade {name}"
+    figures = ast_sim.trade(run, data, scenes=row.scenes, command=command).figures.to_json()
+    figures["origin"] |= {"run": run.path.name, "data": Path(data).name}
+    return {"title": row.title, **figures}
+
+
+def page(results: dict[str, Any]) -> str:
+    """The page of all rows that have a result."""
+    shown = [results[name] for name in ROWS if name in results]
+    return "\n".join([_INTRODUCTION.rstrip(), *(line for row in shown for line in _section(row))]) + "\n"
+
+
+_INTRODUCTION = """# What an error costs
+
+Made by `python -m benchmarks.studies.trade` from `benchmarks/results/trade.json`; do not edit.
+
+On each side the fastest setting counts that keeps the error in 90 % of the scenes, by its median time: of the run the
+efforts that it can make, of the solver the 32 ways in which it can be run (stop tests, ranges of contact, coarser
+meshes, linearised steps, nested iteration). Neither side may choose scene by scene. The error is that of the
+displacement at the frame in which a scene is deformed most, relative to it. Times are processor time on one thread,
+beside other work on the same machine, with all that is prepared for a mesh; meshing is not counted. A ratio is the
+median over the scenes of the solver's time over the run's, with an interval of 95 % by bootstrap over the scenes. Who
+is faster follows from the interval. "Pays after" counts simulation and training against the time that an answer saves.
+
+For a run of your own: `ast-sim trade RUN DATA --out trade.html`.
+"""
+
+
+def _section(row: dict[str, Any]) -> list[str]:
+    origin, invested = row["origin"], row["invested"]
+    lines = [
+        "",
+        f"## {row['title']}",
+        "",
+        f"{len(row['scenes'])} scenes, {origin['processor']}."
+        + ("" if invested is None else f" Simulation and training took {invested / 3600:.1f} hours of a core."),
+        "",
+        "| error at most | the run | the solver | solver / run | faster | pays after |",
+        "| ---: | --- | --- | --- | --- | ---: |",
+    ]
+    middles = {
+        side: {one["name"]: median(math.inf if s is None else s for s in one["seconds"]) for one in row[side]}
+        for side in ("run", "solver")
+    }
+    for one in row["rows"]:
+        cells = [
+            "none" if one[side] is None else f"{1000 * middles[side][one[side]]:.3g} ms: {one[side]}"
+            for side in ("run", "solver")
+        ]
+        ratio = "-" if one["ratio"] is None else f"{one['ratio']:.2f} ({one['low']:.2f} to {one['high']:.2f})"
+        pays = "-" if one["pays_after"] is None else f"{one['pays_after']:,}"
+        lines.append(f"| {100 * one['tolerance']:g} % | " + " | ".join([*cells, ratio, one["verdict"], pays]) + " |")
+    ahead = sum(one["verdict"] == "the run" for one in row["rows"])
+    alone = sum(one["verdict"] in ("the solver", "the solver alone") for one in row["rows"])
+    return [*lines, "", f"The run is ahead in {ahead} of {len(row['rows'])} cells, the solver in {alone}."]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("rows", nargs="*", metavar="ROW", help="what is measured (default: all)")
+    parser.add_argument("--folder", type=Path, default=Path("build/trade"), help="data, runs (default: build/trade)")
+    asked = parser.parse_args(arguments)
+    unknown = set(asked.rows) - set(ROWS)
+    if unknown:
+        parser.error(f"there is no row {sorted(unknown)}: choose from {list(ROWS)}")
+    os.environ["OMP_NUM_THREADS"] = "1"  # of the generator's and the solver's processes
+    ast_sim.keep_memory()
+    results = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of Newton steps that do not end: their errors count
+        for name in asked.rows or ROWS:
+            results[name] = measured(name, asked.folder)
+            write_json(RESULTS, results)
+            write_text(PAGE, page(results))
+
+
+if __name__ == "__main__":
+    main()
