@@ -20,11 +20,13 @@ from ast_sim.models.model_config import ModelConfig
 from ast_sim.models.simulator import Simulator
 from ast_sim.named_field import STRESS, require_fields
 from ast_sim.number_arrays import ranges
+from ast_sim.plausibility.topology import signed_volumes
 from ast_sim.prescribed_motion import Motion, RigidMotion, Vector, frames_for
 from ast_sim.runs.scope import Scope
 from ast_sim.scene import Scene, Trajectory
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import ConfigError, DatasetError
 
+LEAST_RESOLVED = 0.01  # of a mean edge: rounding of the positions may be as large
 Motions = Motion | Mapping[int, RigidMotion | Vector] | np.ndarray
 
 
@@ -81,8 +83,30 @@ def new_question(
         fields = {} if stress is None else {STRESS: stress}
     scene.require_predictable(name)
     _require_material(config, scope, scene, name)
-    notes = (*notes, *scope.notes(scene, motion, bool(config.jumps)))
+    _require_resolved(scene, name)
+    notes = (*notes, *_loose(scene), *scope.notes(scene, motion, bool(config.jumps)))
     return Question(name, scene, motion.position, fields, movable=True, notes=notes).asking(frames)
+
+
+def _require_resolved(scene: Scene, name: str) -> None:
+    """Raise DatasetError if single precision does not tell the nodes apart where the scene lies."""
+    position = scene.rest_position
+    coarse = float(np.spacing(np.abs(position).max()))
+    edges = np.linalg.norm(position[scene.elements[:, 0]] - position[scene.elements[:, 1]], axis=1)
+    if coarse > LEAST_RESOLVED * edges.mean():
+        raise DatasetError(
+            f"{name} lies {np.abs(position).max():.3g} from the origin, where single precision keeps steps of"
+            f" {coarse:.2g}, and its edges have a mean length of {edges.mean():.2g}: move it to the origin before its"
+            " positions are rounded"
+        )
+
+
+def _loose(scene: Scene) -> list[str]:
+    """A note if there are free nodes that belong to no element."""
+    loose = ~scene.prescribed
+    loose[scene.elements.ravel()] = False
+    count = int(loose.sum())
+    return [f"{count} free nodes belong to no element: what is predicted for them means nothing"] if count else []
 
 
 def _require_whole(trajectory: Trajectory, config: ModelConfig, scope: Scope, name: str) -> None:
@@ -169,6 +193,25 @@ def in_domain(model: Simulator, questions: Sequence[Question], effort: Effort) -
     there = [q if shift is None else _moved_question(q, shift) for q, shift in zip(questions, shifts, strict=True)]
     predicted = zip(questions, shifts, answers(model, there, effort), strict=True)
     return [answer if shift is None else _moved_back(question, answer, shift) for question, shift, answer in predicted]
+
+
+def doubts(answer: Answer) -> list[str]:
+    """What speaks against an answer, whatever the question was: Newton steps that have not converged, and elements of
+    deforming bodies that are turned over."""
+    told = []
+    if answer.converged is False:
+        told.append(
+            f"the Newton steps have not converged: the last one has a size of {max(answer.last_steps):.2g}"
+            " (Answer.last_steps)"
+        )
+    elements = answer.scene.elements[answer.scene.deforming_elements]
+    if elements.shape[1] >= 4:
+        for frame, position in zip(answer.frames, answer.position, strict=False):
+            count = int((signed_volumes(position, elements) <= 0).sum())
+            if count:
+                told.append(f"{count} elements are turned over in frame {frame}, which no body can do (Answer.check)")
+                break
+    return told
 
 
 def _moved_question(question: Question, shift: np.ndarray) -> Question:

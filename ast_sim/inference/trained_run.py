@@ -20,7 +20,7 @@ from ast_sim.inference.assembly_questions import ask
 from ast_sim.inference.effort import Effort, EffortErrors
 from ast_sim.inference.evaluation.evaluate import evaluate
 from ast_sim.inference.evaluation.evaluated_run import Evaluation
-from ast_sim.inference.predict import Motions, in_domain, new_question
+from ast_sim.inference.predict import Motions, doubts, in_domain, new_question
 from ast_sim.inference.promises.calibration import Calibration
 from ast_sim.inference.promises.chosen_effort import AskedError, chosen_effort
 from ast_sim.inference.question import Frames, Question
@@ -276,12 +276,8 @@ class Run:
             told.append(answer)
             if answer.failure is not None and throw:
                 raise RolloutError(answer.failure, answer)
-            if answer.converged is False:
-                warnings.warn(
-                    f"{answer.name}: the Newton steps have not converged: the last one has a size of"
-                    f" {max(answer.last_steps):.2g} (Answer.last_steps)",
-                    stacklevel=3,
-                )
+            for doubt in doubts(answer):
+                warnings.warn(f"{answer.name}: {doubt}", stacklevel=3)
         return told
 
     def expected_error(self, effort: Effort) -> float | None:
