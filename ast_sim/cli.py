@@ -124,7 +124,7 @@ def _add_generate(generate: Parser) -> None:
     about = "solve and store only frame 0 and these, such as 1,5,20, each straight from the one before (default: all)"
     generate.add_argument("--keep", type=whole_numbers, metavar="K,K,...", help=about)
     generate.add_argument("--seed", type=at_least(0), default=0, help="seed of the scenes (default: 0)")
-    about = "the bundled solver (own) or CalculiX (default: own)"
+    about = "the bundled solver (own) or CalculiX (default: own; CalculiX if a part is elastoplastic)"
     generate.add_argument("--solver", choices=("own", "calculix"), help=about)
     add_each(generate, {"--parts PATH": "your parts: a STEP, STL or mesh file, or a folder of them"}, type=path)
     about = "solve every scene to its last frame (default: give up a frame after 500 Newton iterations)"

@@ -30,6 +30,7 @@ def demo(args: argparse.Namespace) -> None:
 
 def generate(args: argparse.Namespace) -> None:
     """Simulate scenes with the bundled contact solver; a second call resumes a stopped one."""
+    from ast_sim.simulate.jobs.failures import failures
     from ast_sim.simulate.jobs.generate import generate as simulate
 
     if args.look:
@@ -43,7 +44,7 @@ def generate(args: argparse.Namespace) -> None:
     made = simulate(args.family, args.out, train=args.count, **options)
     print(f"{made.path}: {_counts(made.counts)}")
     if made.truncated:
-        print(f"stopped before their last frame: {', '.join(made.truncated)}")
+        print("\n".join(map(printable, failures(made.path, args.spec))))
 
 
 def _look(args: argparse.Namespace) -> None:
@@ -55,14 +56,14 @@ def _look(args: argparse.Namespace) -> None:
 
     if args.family != "assembly" or args.spec is None:
         raise ConfigError("--look is for a specification: ast-sim generate assembly SPEC.toml --look")
-    drawn = look(args.spec, seed=args.seed, nodes=args.nodes, frames=args.frames)
+    drawn = look(args.spec, seed=args.seed, nodes=args.nodes, frames=args.frames, solver=args.solver)
     picture = (args.out or args.spec).with_suffix(".look.png")
-    shown = [(case.scene, case.targets[-1]) for case in drawn.cases]
+    shown = [(case.scene, case.farthest) for case in drawn.cases]
     scene_picture.write(picture, shown, drawn.titles, drawn.unit)
     print("\n".join(map(printable, drawn.lines)))
     each = drawn.mesh_seconds + drawn.solve_seconds
     print(f"one scene: {each:.3g} s ({drawn.mesh_seconds:.2g} s to mesh), {printable(drawn.status)}")
-    print(printable(drawn.mesh_line))
+    print("\n".join(map(printable, filter(None, [drawn.outcome, drawn.mesh_line]))))
     scenes = sum(checked_counts(args.count or 100, args.valid, args.test, args.calibration).values())
     workers = checked_workers(args.workers, None)
     cost = duration(each * scenes / workers)

@@ -11,7 +11,7 @@ from ast_sim.support.errors import ConfigError
 
 YOUNG, POISSON, FRICTION = "young", "poisson", "friction"
 ELASTIC = (YOUNG, POISSON)  # Young's modulus in pascal, Poisson's ratio
-_PLASTIC = "yield_stress"  # with this column a body yields, and its law is none that is known here
+YIELD_STRESS = "yield_stress"  # with this column a body yields, and its law is none that is known here
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Material:
         """ "neo_hookean" (of Ciarlet, as the bundled solver has it), if Young's modulus and Poisson's ratio are known
         and no yield stress; None: the law is not known."""
         known = {*self.columns, *self.constants}
-        return "neo_hookean" if known.issuperset(ELASTIC) and _PLASTIC not in known else None
+        return "neo_hookean" if known.issuperset(ELASTIC) and YIELD_STRESS not in known else None
 
     def require_law(self) -> None:
         """Raise ConfigError unless the law is known; the text says what there is."""

@@ -16,7 +16,7 @@ from ast_sim.prescribed_motion import Motion
 from ast_sim.runs.scope import Scope
 from ast_sim.scene import Scene
 from ast_sim.simulate.families.assembly import scene_of
-from ast_sim.simulate.own_assembly.parameters import Values, completed
+from ast_sim.simulate.own_assembly.parameters import Values, completed, recorded
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.simulate.own_assembly.standing import reference
 from ast_sim.support.errors import ConfigError
@@ -44,7 +44,7 @@ class Asked:
     @property
     def facts(self) -> dict[str, Any]:
         """The attributes of an answer that tell of the assembly."""
-        return {**{f"parameter {name}": value for name, value in self.values.items()}, "origin": self.origin}
+        return {**recorded(self.values), "origin": self.origin}
 
 
 def ask(

@@ -30,6 +30,8 @@ class SolidCase:
         stress_location: "node": von Mises stress at nodes. "element": von Mises stress and Cauchy stress of elements.
         attributes: what the drawing wants recorded with the trajectory.
         course: how the prescribed nodes get from frame to frame; None: straight.
+        hardening: of the bodies that yield, by their numbers: rows of true stress in pascal and plastic strain.
+            `material` has their elastic constants.
     """
 
     scene: Scene
@@ -39,6 +41,7 @@ class SolidCase:
     stress_location: str
     attributes: dict[str, AttributeValue] = field(default_factory=dict)
     course: Course | None = None
+    hardening: dict[int, np.ndarray] = field(default_factory=dict)
 
     def keeping(self, frames: tuple[int, ...]) -> SolidCase:
         """The case with frame 0 and these frames only; load steps go where the nodes turn between them."""
@@ -73,6 +76,13 @@ class SolidCase:
             ends += [leg.end for leg in self.legs(frame)]
             stored.append(len(ends) - 1)
         return replace(self, targets=np.stack(ends), course=None), stored
+
+    @property
+    def farthest(self) -> np.ndarray:
+        """[N,3]: where the prescribed nodes are in the frame in which one of them is farthest from its place at rest;
+        the last one of several."""
+        way = np.linalg.norm(self.targets - self.targets[0], axis=2)[:, self.scene.prescribed].max(axis=1, initial=0)
+        return self.targets[len(way) - 1 - int(np.argmax(way[::-1]))]
 
     @property
     def deforming(self) -> np.ndarray:

@@ -137,6 +137,9 @@ class SolidFrames(Frames):
     record_type = SolidRecord
 
     def __init__(self, case: SolidCase, settings: SolverSettings | None) -> None:
+        if case.hardening:
+            bodies = ", ".join(map(str, case.hardening))
+            raise SimulationError(f"the bundled solver knows elastic laws only, but body {bodies} yields: use CalculiX")
         scene = case.scene
         rest = case.scene.rest_position.astype(np.float64)
         self._deforming = np.flatnonzero(case.deforming)

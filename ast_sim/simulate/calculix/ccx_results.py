@@ -1,4 +1,4 @@
-"""What CalculiX wrote: displacements (.frd), stresses and reactions (.dat), increments (.sta).
+"""What CalculiX wrote: values at nodes (.frd), stresses and the force on the driven nodes (.dat), increments (.sta).
 
 Numbers stand in columns of fixed width without blanks between them, so a line is cut by position. CalculiX also writes
 a frame that did not converge ("best guess"). `read_results` keeps only the frames that converged according to the .sta
@@ -8,7 +8,7 @@ file.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,9 +16,7 @@ import numpy as np
 
 from ast_sim.support.errors import SimulationError
 
-# A line of the .frd file: its length with the end of line, then the columns of the node and of its three displacements.
-# The line starts with " -1".
-FRD_ROW = 50
+# A line of the .frd file: the columns of the node and of its values. The line starts with " -1".
 FRD_NUMBER = slice(3, 13)
 FRD_VALUES = 13
 FRD_WIDTH = 12
@@ -27,6 +25,8 @@ DAT_ROW = 99
 DAT_NUMBER = slice(0, 10)
 DAT_VALUES = 14
 DAT_WIDTH = 14
+# Blocks of the .frd file and how many values a node has in them: displacement, force from outside, plastic strain.
+FRD_BLOCKS = {"DISP": 3, "FORC": 3, "PE": 1}
 # CalculiX writes xx, yy, zz, xy, xz, yz. These columns of it are xx, yy, zz, xy, yz, zx.
 STRESS_ORDER = [0, 1, 2, 3, 5, 4]
 # Frame k is at time k. The files have few digits: within some hundred frames, times differ from k by at most this.
@@ -43,6 +43,8 @@ class Results:
         reaction: [S,3] force in newton on the driven nodes.
         iterations: [S] iterations of each frame, including those of repeated increments.
         cutbacks: [S] increments of each frame that were repeated with a shorter length.
+        nodal_forces: [S,N,3] newton, the forces from outside on each node; None: they were not asked for.
+        plastic_strain: [S,N,1] equivalent plastic strain, extrapolated to the nodes; None: it was not asked for.
     """
 
     displacement: np.ndarray
@@ -50,29 +52,49 @@ class Results:
     reaction: np.ndarray
     iterations: np.ndarray
     cutbacks: np.ndarray
+    nodal_forces: np.ndarray | None = None
+    plastic_strain: np.ndarray | None = None
+
+    @classmethod
+    def none(cls, nodes: int, elements: int, yields: bool) -> Results:
+        """Those of a run without a frame."""
+        frames = np.zeros((0, nodes, 3)), np.zeros((0, elements, 6)), np.zeros((0, 3))
+        counts = np.zeros(0, int), np.zeros(0, int)
+        return cls(*frames, *counts, *((frames[0], frames[0][:, :, :1]) if yields else ()))
 
 
-def read_results(folder: Path, job: str, frames: int, nodes: int, elements: int, points: int = 1) -> Results:
+def read_results(
+    folder: Path, job: str, frames: int, nodes: int, elements: int, points: int = 1, yields: bool = False
+) -> Results:
     """Read the output of `job` in `folder`: the converged ones among frames 1 to `frames`; elements have so many
-    integration points.
+    integration points. Nodal forces and plastic strains are read if a material `yields`.
 
     Raises:
         SimulationError: a file is missing, cut off or not as CalculiX 2.20 writes it.
     """
     iterations, cutbacks = read_increments(folder / f"{job}.sta")
     count = min(len(iterations), frames)
-    displacement = _by_frame(folder / f"{job}.frd", read_displacement(folder / f"{job}.frd", nodes), count)
+    wanted = FRD_BLOCKS if yields else {"DISP": 3}
+    nodal = {name: [] for name in wanted}
+    for name, time, values in read_nodal(folder / f"{job}.frd", nodes, wanted):
+        nodal[name].append((time, values))
+    nodal = {
+        name: np.reshape(_by_frame(folder / f"{job}.frd", blocks, count), (count, nodes, wanted[name]))
+        for name, blocks in nodal.items()
+    }
     tables = {"stresses": [], "total force": []}
     for kind, time, values in read_tables(folder / f"{job}.dat", elements, points):
         tables[kind].append((time, values))
     stress = _by_frame(folder / f"{job}.dat", tables["stresses"], count)
     reaction = _by_frame(folder / f"{job}.dat", tables["total force"], count)
     return Results(
-        displacement=np.reshape(displacement, (count, nodes, 3)),
+        displacement=nodal["DISP"],
         stress=np.reshape(stress, (count, elements, 6)),
         reaction=np.reshape(reaction, (count, 3)),
         iterations=np.array(iterations[:count], int),
         cutbacks=np.array(cutbacks[:count], int),
+        nodal_forces=nodal.get("FORC"),
+        plastic_strain=nodal.get("PE"),
     )
 
 
@@ -100,12 +122,15 @@ def read_increments(path: Path) -> tuple[list[int], list[int]]:
     return iterations, cutbacks
 
 
-def read_displacement(path: Path, nodes: int) -> Iterator[tuple[float, np.ndarray]]:
-    """Time and displacements [N,3] of each block DISP of the .frd file."""
+def read_nodal(path: Path, nodes: int, wanted: Mapping[str, int]) -> Iterator[tuple[str, float, np.ndarray]]:
+    """Name, time and values [N,k] of each block of the .frd file whose name is wanted; k stands with the name."""
     text = _text(path)
-    for block in re.finditer(r"^  100CL +\S+ +(\S+) +(\d+) .*\n -4  DISP .*\n(?: -5 .*\n)+", text, re.MULTILINE):
-        number, values = _rows(path, text, block.end(), int(block[2]), FRD_ROW, FRD_NUMBER, FRD_VALUES, FRD_WIDTH)
-        yield _numbers(path, np.array(block[1])).item(), _place(path, number, values, nodes)
+    for block in re.finditer(r"^  100CL +\S+ +(\S+) +(\d+) .*\n -4  (\S+) .*\n(?: -5 .*\n)+", text, re.MULTILINE):
+        if block[3] not in wanted:
+            continue
+        row = FRD_VALUES + FRD_WIDTH * wanted[block[3]] + 1  # with the end of the line
+        number, values = _rows(path, text, block.end(), int(block[2]), row, FRD_NUMBER, FRD_VALUES, FRD_WIDTH)
+        yield block[3], _numbers(path, np.array(block[1])).item(), _place(path, number, values, nodes)
 
 
 def read_tables(path: Path, elements: int, points: int) -> Iterator[tuple[str, float, np.ndarray]]:

@@ -33,22 +33,28 @@ class Increments:
     Attributes:
         stiffness: factor on the default contact stiffness.
         largest: longest increment.
+        first: the increment that a frame begins with.
         smallest: shortest increment. A solve that needs a shorter one ends.
     """
 
     stiffness: float = 1.0
     largest: float = 1.0
+    first: float = 1.0
     smallest: float = 1e-5
 
 
 def contact_stiffness(case: SolidCase) -> float:
-    """Pressure per penetration in Pa/m: 100 E/h.
+    """Pressure per penetration in Pa/m: 100 E/h, but 10 Y/h where a body yields and this is less.
 
-    E is Young's modulus of the softest deforming element, and h is the mean length of the surface's edges.
+    E is Young's modulus of the softest deforming element, Y the lowest yield stress, and h the mean length of the
+    surface's edges. Where a tool goes back, CalculiX moves it before it looks for contact. If it moves by more than the
+    surfaces have passed into each other, contact is lost and the body springs back as a whole within one iteration;
+    with 100 E/h, metal and tool are some micrometres in each other, and no increment is short enough.
     """
     scene = case.scene
     young = np.broadcast_to(case.material.young, scene.num_elements)[case.deforming]
-    return 100 * float(young.min()) / _mean_edge(scene, case.deforming)
+    pressures = [100 * float(young.min()), *(10 * float(table[0, 0]) for table in case.hardening.values())]
+    return min(pressures) / _mean_edge(scene, case.deforming)
 
 
 def _mean_edge(scene: Scene, elements: np.ndarray) -> float:
@@ -89,19 +95,31 @@ def _mesh(case: SolidCase) -> Iterator[str]:
     yield f"*ELEMENT, TYPE={ELEMENT_TYPES[scene.elements.shape[1]]}, ELSET=ELEMENTS"
     for number, nodes in enumerate(scene.elements + 1, start=1):
         yield f"{number}, " + ", ".join(map(str, nodes))
-    constants = np.empty((scene.num_elements, 2))
-    constants[:, 0], constants[:, 1] = case.material.young, case.material.poisson
-    constants[~case.deforming] = constants[case.deforming][0]  # rigid: moved as a whole, so no constant matters
-    kinds, kind = np.unique(constants, axis=0, return_inverse=True)
-    for number, (young, poisson) in enumerate(kinds):
-        yield f"*ELSET, ELSET=MATERIAL{number}"
-        yield from _rows(np.flatnonzero(kind.ravel() == number))
-        yield f"*MATERIAL, NAME=CIARLET_EL_{number}"
-        yield "*USER MATERIAL, CONSTANTS=2"
-        yield f"{young:.9e}, {poisson:.9e}"
-        yield f"*SOLID SECTION, ELSET=MATERIAL{number}, MATERIAL=CIARLET_EL_{number}"
+    yield from _materials(case)
     yield "*NSET, NSET=DRIVEN"
     yield from _rows(np.flatnonzero(Driven.of(scene, case.targets).nodes))
+
+
+def _materials(case: SolidCase) -> Iterator[str]:
+    """A section for each material: of Ciarlet, or with a body of its own that yields."""
+    scene = case.scene
+    body = scene.body[scene.elements[:, 0]]
+    constants = np.empty((scene.num_elements, 3))
+    constants[:, 0], constants[:, 1] = case.material.young, case.material.poisson
+    constants[:, 2] = np.where(np.isin(body, list(case.hardening)), body, -1)
+    constants[~case.deforming] = constants[case.deforming][0]  # rigid: moved as a whole, so no constant matters
+    kinds, kind = np.unique(constants, axis=0, return_inverse=True)
+    for number, (young, poisson, yielding) in enumerate(kinds):
+        yield f"*ELSET, ELSET=MATERIAL{number}"
+        yield from _rows(np.flatnonzero(kind.ravel() == number))
+        law = "CIARLET_EL" if yielding < 0 else "ELASTOPLASTIC"
+        yield f"*MATERIAL, NAME={law}_{number}"
+        yield "*USER MATERIAL, CONSTANTS=2" if yielding < 0 else "*ELASTIC"
+        yield f"{young:.9e}, {poisson:.9e}"
+        if yielding >= 0:
+            yield "*PLASTIC"
+            yield from (f"{stress:.9e}, {strain:.9e}" for stress, strain in case.hardening[int(yielding)])
+        yield f"*SOLID SECTION, ELSET=MATERIAL{number}, MATERIAL={law}_{number}"
 
 
 def _contact(case: SolidCase, increments: Increments) -> Iterator[str]:
@@ -116,19 +134,22 @@ def _contact(case: SolidCase, increments: Increments) -> Iterator[str]:
         for number, side in zip(element[of_body] + 1, face[of_body] + 1, strict=True):
             yield f"{number}, S{side}"
     stiffness = contact_stiffness(case) * increments.stiffness
-    yield "*SURFACE INTERACTION, NAME=CONTACT"
-    yield "*SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=LINEAR"
-    yield f"{stiffness:.9e}"
-    if case.contact.friction > 0:
-        yield "*FRICTION"
-        yield f"{case.contact.friction:.9e}, {stiffness / 10:.9e}"
     rigid = {body: bool((scene.node_type[scene.body == body] == NodeType.OBSTACLE).all()) for body in bodies}
-    for pair in combinations(bodies, 2):
-        if not (rigid[pair[0]] and rigid[pair[1]]):
-            # An obstacle is the master.
-            slave, master = slave_first(scene, *pair) if not any(map(rigid.get, pair)) else sorted(pair, key=rigid.get)
-            yield "*CONTACT PAIR, INTERACTION=CONTACT, TYPE=SURFACE TO SURFACE"
-            yield f"BODY{slave}, BODY{master}"
+    pairs = [pair for pair in combinations(bodies, 2) if not (rigid[pair[0]] and rigid[pair[1]])]
+    frictions = sorted({case.contact.friction_between(*pair) for pair in pairs})
+    for number, friction in enumerate(frictions):
+        yield f"*SURFACE INTERACTION, NAME=CONTACT{number}"
+        yield "*SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=LINEAR"
+        yield f"{stiffness:.9e}"
+        if friction > 0:
+            yield "*FRICTION"
+            yield f"{friction:.9e}, {stiffness / 10:.9e}"
+    for pair in pairs:
+        # An obstacle is the master.
+        slave, master = slave_first(scene, *pair) if not any(map(rigid.get, pair)) else sorted(pair, key=rigid.get)
+        number = frictions.index(case.contact.friction_between(*pair))
+        yield f"*CONTACT PAIR, INTERACTION=CONTACT{number}, TYPE=SURFACE TO SURFACE"
+        yield f"BODY{slave}, BODY{master}"
 
 
 def slave_first(scene: Scene, one: int, other: int) -> tuple[int, int]:
@@ -190,14 +211,17 @@ def _steps(case: SolidCase, increments: Increments) -> Iterator[str]:
     for target in case.targets[1:]:
         yield "*STEP, NLGEOM, INC=100000"
         yield "*STATIC"
-        yield f"{increments.largest}, 1., {increments.smallest}, {increments.largest}"
+        yield f"{min(increments.first, increments.largest)}, 1., {increments.smallest}, {increments.largest}"
         yield "*BOUNDARY"
         displacement = target[prescribed] - case.targets[0, prescribed]
         for node, vector in zip(prescribed + 1, displacement, strict=True):
             for axis, value in enumerate(vector, start=1):
                 yield f"{node}, {axis}, {axis}, {value:.9e}"
         yield f"*NODE FILE, {only_last}"
-        yield "U"
+        yield "U, RF" if case.hardening else "U"
+        if case.hardening:
+            yield f"*EL FILE, {only_last}"
+            yield "PEEQ"
         yield f"*EL PRINT, ELSET=ELEMENTS, {only_last}"
         yield "S"
         yield f"*NODE PRINT, NSET=DRIVEN, TOTALS=ONLY, {only_last}"

@@ -1,6 +1,7 @@
 """CalculiX (`ccx`) as a second solver of quasi-static cases: an independent check of the bundled solver.
 
-Mesh, material (CIARLET_EL) and motion of the prescribed nodes are the same. Only contact differs: CalculiX uses a
+Mesh, material (CIARLET_EL) and motion of the prescribed nodes are the same; bodies that yield (*PLASTIC) are solved by
+CalculiX only. Contact differs: CalculiX uses a
 face-to-face penalty, so surfaces penetrate a little. The barrier of the bundled solver leaves a little air instead.
 CalculiX is licensed under the GPL and runs as a program of its own. Debian and Ubuntu have it as `calculix-ccx`. The
 environment variable CCX_BIN names another binary.
@@ -10,12 +11,13 @@ from __future__ import annotations
 
 import os
 import re
+import resource
 import shutil
+import signal
 import subprocess
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import perf_counter
 
 import numpy as np
 
@@ -24,6 +26,7 @@ from ast_sim.mechanics.contact_and_friction import Contact
 from ast_sim.mechanics.elements.elasticity import Elasticity
 from ast_sim.mechanics.elements.neo_hookean import von_mises
 from ast_sim.mechanics.elements.second_order import elastic_body
+from ast_sim.named_field import REACTION, NamedField
 from ast_sim.scene import AttributeValue, Trajectory
 from ast_sim.simulate.calculix.ccx_results import Results, read_results
 from ast_sim.simulate.calculix.deck import Increments, contact_stiffness, write_deck
@@ -31,10 +34,13 @@ from ast_sim.support.errors import MissingExtra, SimulationError
 
 JOB = "case"
 POINTS = {4: 1, 10: 4}  # of integration, by the number of nodes of an element
+PLASTIC_STRAIN = "PEEQ"  # the name of the field, as CalculiX and Abaqus have it
 BEST_GUESS = "best solution and residuals are in the frd file"
 FAILED = 201  # what ccx returns when it gives up, for whatever reason
 # These are tried one after another until all frames converge: first softer contact, then shorter increments, too.
 LADDER = (Increments(), Increments(stiffness=0.1), Increments(stiffness=0.1, largest=0.5))
+# Those where bodies yield: shorter increments follow the way of the load.
+YIELDING = (Increments(1.0, 0.25, 0.05), Increments(1.0, 0.05, 0.01), Increments(0.1, 0.05, 0.01))
 
 
 @dataclass(frozen=True)
@@ -42,11 +48,12 @@ class CalculixSettings:
     """How CalculiX is run.
 
     Attributes:
-        ladder: increments that are tried one after another until all frames converge.
+        ladder: increments that are tried one after another until all frames converge; None: `YIELDING` if a body of
+            the case yields, else `LADDER`.
         timeout: seconds after which one attempt is killed.
     """
 
-    ladder: tuple[Increments, ...] = LADDER
+    ladder: tuple[Increments, ...] | None = None
     timeout: float = 7200.0
 
 
@@ -93,15 +100,15 @@ def quasi_static(case: SolidCase, settings: CalculixSettings | None = None) -> T
 
     Raises:
         MissingExtra: CalculiX is not installed.
-        SimulationError: CalculiX is not used for such a case, a run failed for another reason than divergence, or the
-            output cannot be read. The folder with deck and output is then kept and named.
+        SimulationError: CalculiX is not used for such a case, ccx refuses the deck, or the output cannot be read. The
+            folder with deck and output is then kept and named.
     """
     settings = settings or CalculixSettings()
     case, stored = case.followed()
     ccx = find_ccx()
     solver = f"calculix {version(ccx)}"
     best: Trajectory | None = None
-    for increments in settings.ladder:
+    for increments in settings.ladder or (YIELDING if case.hardening else LADDER):
         trajectory = _attempt(case, ccx, increments, settings.timeout)
         if best is None or trajectory.num_frames > best.num_frames:
             best = trajectory
@@ -125,7 +132,8 @@ def _with_frames(trajectory: Trajectory, stored: list[int]) -> Trajectory:
         attributes["stopped_by"] = f"before frame {len(rows)}: {attributes['stopped_by']}"
     framed = {key: getattr(trajectory, key) for key in ("position", "stress", "cauchy_stress")}
     framed = {key: array[rows] for key, array in framed.items() if array is not None}
-    return replace(trajectory, attributes=attributes, **framed)
+    fields = {name: one.select(rows) for name, one in trajectory.fields.items()}
+    return replace(trajectory, attributes=attributes, fields=fields, **framed)
 
 
 def _attempt(case: SolidCase, ccx: str, increments: Increments, timeout: float) -> Trajectory:
@@ -134,13 +142,15 @@ def _attempt(case: SolidCase, ccx: str, increments: Increments, timeout: float) 
     try:
         with open(folder / f"{JOB}.inp", "w", encoding="ascii") as file:
             write_deck(file, case, increments)
-        started = perf_counter()
-        stopped_by = _run(ccx, folder, timeout)
-        seconds = perf_counter() - started
-        scene = case.scene
-        points = POINTS[scene.elements.shape[1]]
-        results = read_results(folder, JOB, len(case.targets) - 1, scene.num_nodes, scene.num_elements, points)
-        trajectory = _trajectory(case, results, increments, stopped_by, seconds)
+        before = _processor_seconds()
+        try:
+            stopped_by = _run(ccx, folder, timeout)
+        finally:
+            seconds = _processor_seconds() - before
+        trajectory = _trajectory(case, _results(case, folder), increments, stopped_by, seconds)
+    except _Ended as error:
+        none = Results.none(case.scene.num_nodes, case.scene.num_elements, bool(case.hardening))
+        trajectory = _trajectory(case, none, increments, str(error), seconds)
     except SimulationError as error:
         raise SimulationError(f"{error} (deck and output are kept in {folder})") from error
     except BaseException:
@@ -150,11 +160,29 @@ def _attempt(case: SolidCase, ccx: str, increments: Increments, timeout: float) 
     return trajectory
 
 
+class _Ended(SimulationError):
+    """A run crashed or took too long, which other increments may mend. What it wrote may be cut off."""
+
+
+def _processor_seconds() -> float:
+    """Processor time of all programs that this process has started and that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def _results(case: SolidCase, folder: Path) -> Results:
+    scene = case.scene
+    points = POINTS[scene.elements.shape[1]]
+    size = len(case.targets) - 1, scene.num_nodes, scene.num_elements, points
+    return read_results(folder, JOB, *size, yields=bool(case.hardening))
+
+
 def _run(ccx: str, folder: Path, timeout: float) -> str:
     """Run the deck in the folder; return why it ended early, or "".
 
     Raises:
-        SimulationError: ccx did not end in time, or failed for another reason than missing convergence.
+        _Ended: ccx did not end in time, or crashed.
+        SimulationError: ccx failed for another reason than missing convergence.
     """
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "CCX_NPROC_EQUATION_SOLVER": "1", "CCX_NPROC_RESULTS": "1"}
     log = folder / f"{JOB}.log"
@@ -170,11 +198,13 @@ def _run(ccx: str, folder: Path, timeout: float) -> str:
                 timeout=timeout,
             ).returncode
         except subprocess.TimeoutExpired:
-            raise SimulationError(f"ccx did not end within {timeout:g} s") from None
+            raise _Ended(f"ccx did not end within {timeout:g} s") from None
         except OSError as error:
             raise SimulationError(f"{ccx} does not run: {error}") from error
     if code == 0:
         return ""
+    if code < 0:
+        raise _Ended(f"ccx was killed by {signal.Signals(-code).name}")
     reason = _error(_read(log))
     if code == FAILED and re.match(r"too many|increment size smaller", reason):
         return f"no convergence in CalculiX: {reason}"
@@ -200,6 +230,7 @@ def _trajectory(
         scene=scene,
         position=position[:frames],
         **_stress_arrays(case, results.stress[: frames - 1]),
+        fields=_fields(case, results, frames),
         attributes={
             **status,
             **case.attributes,
@@ -215,6 +246,23 @@ def _trajectory(
             "friction": case.contact.friction,
         },
     )
+
+
+def _fields(case: SolidCase, results: Results, frames: int) -> dict[str, NamedField]:
+    """Where a body yields: the equivalent plastic strain, and the forces on the prescribed nodes from outside.
+
+    Strains that are extrapolated to nodes may be below 0 where there are none. Free nodes have no force but the rest
+    of the iterations.
+    """
+    if results.plastic_strain is None or results.nodal_forces is None:
+        return {}
+    strain = np.maximum(results.plastic_strain, 0)
+    forces = np.where(case.scene.prescribed[:, None], results.nodal_forces, 0)
+    strain, forces = (np.concatenate([np.zeros((1, *of.shape[1:])), of]) for of in (strain, forces))
+    return {
+        PLASTIC_STRAIN: NamedField(strain[:frames].astype(np.float32), "node"),
+        REACTION: NamedField(forces[:frames].astype(np.float32), "node", "N"),
+    }
 
 
 def _check(case: SolidCase, position: np.ndarray) -> tuple[list[float], str]:

@@ -18,6 +18,7 @@ from ast_sim.mechanics.case import Drawn, SolidCase
 from ast_sim.mechanics.quasi_static import quasi_static
 from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.mechanics.unfinished import Checkpoint
+from ast_sim.named_field import REACTION
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
 from ast_sim.simulate.own_assembly.linear_limits import Limit, limits
@@ -151,7 +152,11 @@ def in_newton(trajectory: Trajectory, unit: str) -> Trajectory:
         if name not in attributes:
             continue
         attributes[name] = (LENGTH_UNITS[unit] ** power * np.asarray(attributes[name])).tolist()
-    return replace(trajectory, attributes=attributes)
+    fields = dict(trajectory.fields)
+    if REACTION in fields:
+        scale = np.float32(LENGTH_UNITS[unit] ** 2)
+        fields[REACTION] = replace(fields[REACTION], values=scale * fields[REACTION].values)
+    return replace(trajectory, attributes=attributes, fields=fields)
 
 
 def _sized(spec: AssemblySpec, values: Values, nodes: int | None) -> tuple[float, list[PlacedPart]]:

@@ -41,7 +41,7 @@ FAMILIES = {
     "abcd": Family("two CAD-like parts squeezed together, 4,000 nodes", ("keep", "parts", "solver"), _PARTS),
     "abcd_xl": Family("abcd with 100,000 nodes: a scene takes hours", ("keep", "parts", "solver"), _PARTS),
     "assembly": Family(
-        "your own parts with your own motion and ranges, from SPEC.toml", ("spec", "frames", "keep"), _PARTS
+        "your own parts with your own motion and ranges, from SPEC.toml", ("spec", "frames", "keep", "solver"), _PARTS
     ),
 }
 

@@ -94,7 +94,7 @@ def generate(
         frames: frames of a scene, for families that have this option; None: the default of family or specification.
         keep: ascending numbers of the frames to solve, straight from one to the next, and store; all frames if None.
         workers: number of processes; one per available core if None.
-        solver: "own" or "calculix", for families of solids; "own" if None.
+        solver: "own" or "calculix", for families of solids; if None, "own", but "calculix" if a part is elastoplastic.
         parts: a file or folder of parts (STEP, STL, meshes), for families that squeeze parts; None: drawn ones.
         spec: the specification of an assembly (TOML), for the family "assembly".
         patient: solve every scene to its last frame. Else a scene ends before a frame of over 500 Newton iterations.
@@ -120,7 +120,7 @@ def generate(
     _check_start(out, folder, sum(counts.values()), recipe, module)
     with _locked(folder, settings):
         _unpack(out, folder)
-        _make(samples := _samples(counts), folder, recipe, workers, scheduler, progress, _notes(settings))
+        _make(samples := _samples(counts), folder, recipe, workers, scheduler, progress, _notes(recipe, settings))
         truncated = _merge(out, folder, samples, _writer(out, recipe, module, {**settings, "counts": counts}))
     return Generated(out, counts, truncated)
 
@@ -139,8 +139,11 @@ def _frames(recipe: Recipe, module: ModuleType) -> int:
     return (recipe.frames or module.FRAMES) if recipe.keep is None else 1 + len(recipe.keep)
 
 
-def _notes(settings: dict[str, Any]) -> list[str]:
+def _notes(recipe: Recipe, settings: dict[str, Any]) -> list[str]:
     """What a user should know before the run takes hours."""
+    yielding = () if recipe.spec is None else read_spec(recipe.spec).yielding
+    if yielding:
+        return [f"{', '.join(yielding)}: elastoplastic, so CalculiX solves these scenes, each with one thread"]
     if settings.get("mesher") == "structured":
         line = 'pip install "ast_sim[cad]"'
         return [f"gmsh is not installed, so parts are blocks, cylinders and plates; for CAD-like parts: {line}"]

@@ -20,12 +20,13 @@ from ast_sim.simulate.jobs.pool import Worker
 from ast_sim.simulate.jobs.recipe import checked_recipe
 from ast_sim.simulate.jobs.samples import Recipe, draw_sample, load_sample, sample_path
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
-from ast_sim.simulate.own_assembly.parameters import told
+from ast_sim.simulate.own_assembly.parameters import told, values_of
 from ast_sim.simulate.own_assembly.rest_check import gap_between
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.support.errors import AstSimError, SimulationError
 
 SCENES = 4
+UNLOADED = 0.01  # a force below this share of the largest one is none
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +40,7 @@ class Look:
         lines: what a person should check in the first scene.
         mesh_seconds, solve_seconds: processor time that one scene takes.
         status: whether the scene that was solved is complete, or why it is not.
+        outcome: the peak force of that scene and its permanent set, as a sentence, if a part yields; else empty.
         mesh_error: of the largest force in that scene, on its mesh; None: it is not known.
         mesh_line: the same as a sentence, or why it is not known.
     """
@@ -50,42 +52,62 @@ class Look:
     mesh_seconds: float
     solve_seconds: float
     status: str
+    outcome: str
     mesh_error: MeshError | None
     mesh_line: str
 
 
-def look(spec: str | os.PathLike[str], *, seed: int = 0, nodes: int | None = None, frames: int | None = None) -> Look:
+def look(
+    spec: str | os.PathLike[str],
+    *,
+    seed: int = 0,
+    nodes: int | None = None,
+    frames: int | None = None,
+    solver: str | None = None,
+) -> Look:
     """Draw the first scenes of a specification, and solve one of them, on two meshes, to see what it takes and gives.
 
     Args:
         spec: the specification of an assembly.
-        seed, nodes, frames: as for `generate`.
+        seed, nodes, frames, solver: as for `generate`.
 
     Raises:
         AstSimError: the specification has a mistake, a scene cannot be made, or the first one cannot be solved.
     """
-    recipe = checked_recipe(assembly, "assembly", seed, nodes, frames, None, None, spec=Path(spec))
+    recipe = checked_recipe(assembly, "assembly", seed, nodes, frames, solver, None, spec=Path(spec))
     read = read_spec(spec)
     assert recipe.frames is not None
     assembly.check_spec(read, recipe.nodes, recipe.frames)
     began = time.perf_counter()
     cases = [draw_sample(recipe, "train", index).case for index in range(SCENES)]
     mesh_seconds = (time.perf_counter() - began) / SCENES
-    titles = [told(read.parameters, _values(case)) for case in cases]
+    titles = [told(read.parameters, values_of(case.attributes)) for case in cases]
     solved, solve_seconds = _solved(recipe)
     status = str(solved.attributes.get("stopped_by", "complete"))
     error = None
     try:
-        error = mesh_error(read, cases[0], solved, _values(cases[0]), recipe.nodes)
+        error = mesh_error(read, cases[0], solved, values_of(cases[0].attributes), recipe.nodes, recipe.solver)
         line = str(error)
     except AstSimError as reason:
         line = f"how far the force of this mesh is off is not known: {reason}"
     lines = list(_lines(read, cases[0]))
-    return Look(read.unit, cases, titles, lines, mesh_seconds, solve_seconds, status, error, line)
+    return Look(
+        read.unit, cases, titles, lines, mesh_seconds, solve_seconds, status, outcome(read, solved), error, line
+    )
 
 
-def _values(case: SolidCase) -> dict[str, float | str]:
-    return {key.removeprefix("parameter "): value for key, value in case.attributes.items() if "parameter " in key}
+def outcome(spec: AssemblySpec, solved: Trajectory) -> str:
+    """The peak force of a scene, and the largest displacement of the parts that yield after they are let go."""
+    if not spec.yielding:
+        return ""
+    force = np.asarray(solved.attributes["reaction"])
+    peak = f"peak force {force.max():.3g} N"
+    if force[-1] > UNLOADED * force.max():
+        return f"{peak}; {force[-1]:.3g} N act in the last frame: no permanent set before the parts are let go"
+    yielding = [number for number, part in enumerate(spec.parts) if part.hardening]
+    free = np.isin(solved.scene.body, yielding) & ~solved.scene.prescribed
+    way = np.linalg.norm(solved.position[:, free] - solved.position[0, free], axis=2).max(axis=1)
+    return f"{peak}, permanent set {way[-1]:.3g} {spec.unit} of {way.max():.3g} {spec.unit}"
 
 
 def _lines(spec: AssemblySpec, case: SolidCase) -> Iterator[str]:

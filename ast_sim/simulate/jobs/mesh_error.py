@@ -24,6 +24,7 @@ from ast_sim.mechanics.linearised_contact import CLEARANCE, STILL, NewtonSteps
 from ast_sim.mechanics.quasi_static import SolidFrames, solve_frame
 from ast_sim.mechanics.reaction import Reaction
 from ast_sim.scene import Trajectory
+from ast_sim.simulate.calculix import solve as calculix
 from ast_sim.simulate.families import assembly
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
 from ast_sim.simulate.own_assembly.parameters import Values
@@ -74,7 +75,9 @@ class MeshError:
         return f"{forces}: this mesh is {off} off"
 
 
-def mesh_error(spec: AssemblySpec, case: SolidCase, solved: Trajectory, values: Values, nodes: int | None) -> MeshError:
+def mesh_error(
+    spec: AssemblySpec, case: SolidCase, solved: Trajectory, values: Values, nodes: int | None, solver: str = "own"
+) -> MeshError:
     """Solve a scene of an assembly on a second mesh.
 
     Args:
@@ -82,6 +85,7 @@ def mesh_error(spec: AssemblySpec, case: SolidCase, solved: Trajectory, values: 
         case, solved: the scene, and its frames as `ast_sim generate` makes them.
         values: of the parameters in it.
         nodes: about how many nodes the scene was asked to have; None: as the sizes give.
+        solver: of the scene, "own" or "calculix". CalculiX solves it on a mesh of twice the size.
 
     Raises:
         AstSimError: there is no force, or neither mesh can be made and solved; the text says why.
@@ -96,6 +100,8 @@ def mesh_error(spec: AssemblySpec, case: SolidCase, solved: Trajectory, values: 
     if value <= NO_FORCE * young * extent**power:
         raise SimulationError(f"the first scene has no {quantity}")
     try:
+        if solver != "own":
+            raise SimulationError("CalculiX does not start from a coarse solution")
         _check_seconds(solved)
         finer = assembly.resized(spec, values, nodes, len(case.targets), HALF)
         position = _at_half_the_size(case, solved, finer, frame)
@@ -103,7 +109,7 @@ def mesh_error(spec: AssemblySpec, case: SolidCase, solved: Trajectory, values: 
     except AstSimError as error:
         reason = error
     try:
-        return MeshError(quantity, value, TWICE, _at_twice_the_size(spec, case, values, nodes, frame, quantity))
+        return MeshError(quantity, value, TWICE, _at_twice_the_size(spec, case, values, nodes, frame, quantity, solver))
     except AstSimError as error:
         raise SimulationError(f"at half the size: {reason}; at twice the size: {error}") from error
 
@@ -185,7 +191,7 @@ def _start(coarse: SolidCase, solved: Trajectory, fine: SolidCase, frame: int) -
 
 
 def _at_twice_the_size(
-    spec: AssemblySpec, case: SolidCase, values: Values, nodes: int | None, frame: int, quantity: str
+    spec: AssemblySpec, case: SolidCase, values: Values, nodes: int | None, frame: int, quantity: str, solver: str
 ) -> float:
     """The force in newton (torque: newton metres) of a frame on a mesh of twice the size.
 
@@ -198,7 +204,8 @@ def _at_twice_the_size(
     coarser = assembly.resized(spec, values, nodes, len(case.targets), TWICE)
     if coarser.scene.num_nodes > LEAST_COARSER * case.scene.num_nodes:
         raise SimulationError("there is no coarser mesh of these parts")
-    solved = assembly.in_newton(assembly.solve(coarser), spec.unit)
+    solve = assembly.solve if solver == "own" else calculix.quasi_static
+    solved = assembly.in_newton(solve(coarser), spec.unit)
     if solved.num_frames <= frame:
         raise SimulationError(str(solved.attributes["stopped_by"]))
     return float(_curve(solved, quantity)[frame])

@@ -18,6 +18,8 @@ from ast_sim.dataset.layout import DatasetInfo
 from ast_sim.simulate.families.names import FAMILIES, family_module
 from ast_sim.simulate.jobs.samples import Recipe
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
+from ast_sim.simulate.own_assembly.standing import friction_is_drawn
+from ast_sim.simulate.own_assembly.yielding import material_columns
 from ast_sim.support.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -65,7 +67,13 @@ def checked_recipe(
             raise ConfigError(f"{name} is {value}; must be at least {minimum}")
     if seed > LARGEST_SEED:
         raise ConfigError(f"seed is {seed}; must be at most 2^63 - 1, the largest number that the file can hold")
-    solver = solver or "own"
+    yielding = () if spec is None else read_spec(spec).yielding
+    solver = solver or ("calculix" if yielding else "own")
+    if solver == "own" and yielding:
+        raise ConfigError(
+            f"{', '.join(yielding)}: the own solver knows elastic laws only, and this one is elastoplastic: CalculiX"
+            " solves it (leave --solver out, or --solver calculix)"
+        )
     if solver not in SOLVERS:
         raise ConfigError(f"there is no solver {solver!r}; use one of {', '.join(SOLVERS)}")
     if patient and solver != "own":
@@ -156,7 +164,9 @@ def recorded(recipe: Recipe) -> dict[str, Any]:
     if "parts" in FAMILIES[recipe.family].options:
         used |= _source(recipe.parts).describe()
     if recipe.spec is not None:
-        used["spec"] = read_spec(recipe.spec).describe()
+        spec = read_spec(recipe.spec)
+        used["spec"] = spec.describe()
+        used |= {"material": material_columns(spec, friction_is_drawn(spec))} if spec.yielding else {}
     return {
         "program": f"ast_sim {ast_sim.__version__}",
         "versions": _versions(recipe),

@@ -19,6 +19,7 @@ from ast_sim.dataset.layout import SPLITS
 from ast_sim.dataset.solver_seconds import Seconds, split_seconds
 from ast_sim.mechanics.case import NEXT_NOTE, NOTES, Drawn
 from ast_sim.mechanics.unfinished import Checkpoint
+from ast_sim.named_field import NamedField
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.families.names import family_module
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
@@ -29,6 +30,7 @@ Sample = tuple[str, int]  # split and index in it
 
 _SCENE = ("rest_position", "elements", "node_type", "body", "material")
 _FRAMED = ("position", "stress", "cauchy_stress")
+FIELD = "field "  # the name of an array of a named field begins so
 
 
 @dataclass(frozen=True)
@@ -148,7 +150,10 @@ def pack_sample(trajectory: Trajectory, seconds: Seconds | None = None) -> bytes
     kept, taken = split_seconds(trajectory.attributes)
     arrays = {key: getattr(trajectory.scene, key) for key in _SCENE}
     arrays |= {key: getattr(trajectory, key) for key in _FRAMED}
-    texts = {"attributes": kept, "seconds": {**taken, "processor": processor()} if seconds is None else seconds}
+    arrays |= {FIELD + name: one.values for name, one in trajectory.fields.items()}
+    places = {name: [one.location, one.unit] for name, one in trajectory.fields.items()}
+    seconds = {**taken, "processor": processor()} if seconds is None else seconds
+    texts = {"attributes": kept, "fields": places, "seconds": seconds}
     file = io.BytesIO()
     np.savez(
         file,
@@ -163,5 +168,6 @@ def load_sample(path: Path) -> tuple[Trajectory, Seconds]:
     with np.load(path, allow_pickle=False) as file:
         scene = Scene(**{key: file[key] for key in _SCENE if key in file})
         framed = {key: file[key] for key in _FRAMED if key in file}
-        attributes, seconds = (json.loads(str(file[key])) for key in ("attributes", "seconds"))
-    return replace(Trajectory(scene, framed.pop("position"), attributes=attributes), **framed), seconds
+        attributes, seconds, places = (json.loads(str(file[key])) for key in ("attributes", "seconds", "fields"))
+        fields = {name: NamedField(file[FIELD + name], *place) for name, place in places.items()}
+    return replace(Trajectory(scene, framed.pop("position"), attributes=attributes, fields=fields), **framed), seconds

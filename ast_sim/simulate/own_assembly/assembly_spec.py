@@ -80,6 +80,7 @@ class PartSpec:
         size: length of the elements; None: the mesh or the surface of the file is used as it is.
         finer: where elements are smaller.
         rigid: whether it is a rigid tool.
+        hardening: of a part that yields: rows of true stress in pascal and plastic strain; empty: it is elastic.
         self_contact: whether it may touch itself.
         fixed: nodes that stand still.
         moves: nodes that move; of a rigid part, all.
@@ -94,6 +95,7 @@ class PartSpec:
     size: Expression | None
     finer: tuple[Finer, ...]
     rigid: bool
+    hardening: tuple[tuple[Expression, Expression], ...]
     self_contact: bool
     fixed: tuple[Place, ...]
     moves: tuple[Move, ...]
@@ -124,6 +126,11 @@ class AssemblySpec:
     pair_friction: dict[tuple[int, int], Expression]
     parameters: dict[str, Parameter]
     parts: tuple[PartSpec, ...]
+
+    @property
+    def yielding(self) -> tuple[str, ...]:
+        """The names of the parts that yield; only CalculiX solves them."""
+        return tuple(part.name for part in self.parts if part.hardening)
 
     def file(self, name: str) -> Path:
         """The path of a file that the specification names."""

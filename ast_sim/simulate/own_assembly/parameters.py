@@ -17,6 +17,7 @@ from ast_sim.simulate.own_assembly.expressions import Expression, expression, ne
 from ast_sim.support.errors import ConfigError
 
 Values = dict[str, float | str]
+PARAMETER = "parameter "  # the names of attributes that record values begin so
 
 
 @dataclass(frozen=True)
@@ -159,6 +160,16 @@ def completed(parameters: Mapping[str, Parameter], given: Mapping[str, Any]) -> 
         else:
             values[name] = one.formula(values)
     return values
+
+
+def recorded(values: Values) -> dict[str, Any]:
+    """The attributes of a trajectory that record the values of its parameters."""
+    return {PARAMETER + name: value for name, value in values.items()}
+
+
+def values_of(attributes: Mapping[str, Any]) -> Values:
+    """The values of the parameters that a trajectory records."""
+    return {key.removeprefix(PARAMETER): value for key, value in attributes.items() if key.startswith(PARAMETER)}
 
 
 def told(parameters: Mapping[str, Parameter], values: Values) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tomllib
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from ast_sim.support.errors import ConfigError
 
 DEFAULT_FRAMES = 6
 DEFAULT_ORDER = 2  # linear tetrahedra are several times too stiff where a part bends, and where rubber is pressed
+ELASTIC, ELASTOPLASTIC = "neo_hookean", "elastoplastic"  # the laws that a part may have
 # How keys begin that other programs have, and what to do instead.
 INSTEAD = {
     ("force", "load", "pressure", "traction", "torque", "moment"): (
@@ -162,6 +164,7 @@ def _part(name: str, values: Any, free: dict[str, Parameter], parameters: dict[s
         table.number("size"),
         tuple(_finer(row) for row in table.tables("finer")),
         rigid,
+        _hardening(table, rigid),
         table.flag("self_contact"),
         _places(table, "fixed"),
         _moves(table, rigid),
@@ -169,6 +172,21 @@ def _part(name: str, values: Any, free: dict[str, Parameter], parameters: dict[s
     )
     table.done()
     return part
+
+
+def _hardening(table: Table, rigid: bool) -> tuple[tuple[Expression, Expression], ...]:
+    """The rows of the table of a part that yields; empty if it does not."""
+    law, rows = table.text("law"), table.pairs("hardening")
+    if law not in (None, ELASTIC, ELASTOPLASTIC):
+        raise ConfigError(f"{table.key('law')} is {law!r}; must be {ELASTOPLASTIC}, or {ELASTIC} (if left out)")
+    if rigid and law is not None:
+        raise ConfigError(f"{table.key('law')}: a rigid part has no law: leave it out, or leave out rigid")
+    if (law == ELASTOPLASTIC) != bool(rows):
+        raise ConfigError(
+            f"{table.key('hardening')}: rows of true stress in pascal and plastic strain, such as [['yield_stress', 0],"
+            f" ['yield_stress + 2e8', 0.2]], go with law = '{ELASTOPLASTIC}', and only with it"
+        )
+    return rows
 
 
 def _solid(table: Table) -> str | int | None:
@@ -268,7 +286,7 @@ def _check_used(spec: AssemblySpec, free: dict[str, Parameter]) -> None:
     """Refuse a parameter that nothing depends on: it is a slip of the pen."""
     used: set[str] = set()
     for part in spec.parts:
-        numbers = [*part.arguments.values(), *filter(None, [part.size])]
+        numbers = [*part.arguments.values(), *filter(None, [part.size]), *chain.from_iterable(part.hardening)]
         numbers += [one for finer in part.finer for one in (*finer.low, *finer.high, finer.size)]
         for move in (*part.moves, part.placement):
             numbers += [*(one for corner in move.path for one in corner), move.rotation, *move.axis, *move.point]

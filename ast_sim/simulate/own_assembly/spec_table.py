@@ -70,6 +70,15 @@ class Table:
             return tuple(self._vector(name, one) for one in value)
         return (self._vector(name, value),)
 
+    def pairs(self, name: str) -> tuple[tuple[Expression, Expression], ...]:
+        """A list of pairs of numbers or expressions; empty if there is none."""
+        value = self.take(name, [])
+        if not isinstance(value, list) or not all(isinstance(row, list) and len(row) == 2 for row in value):
+            raise ConfigError(f"{self.key(name)} is {value!r}; must be a list of pairs of numbers")
+        key = self.key(name)
+        rows = [[expression(f"{key}[{i}]", one, self.known) for one in row] for i, row in enumerate(value)]
+        return tuple((first, second) for first, second in rows)
+
     def tables(self, name: str) -> list[Table]:
         """The tables of a list of tables; one table may stand for a list of one."""
         value = self.take(name, [])

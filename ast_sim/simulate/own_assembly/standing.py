@@ -19,9 +19,10 @@ from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.motion_course import Course, MovedNodes
 from ast_sim.scene import AttributeValue, NodeType, Scene
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec, PartSpec
-from ast_sim.simulate.own_assembly.parameters import Values, completed
+from ast_sim.simulate.own_assembly.parameters import Values, completed, recorded
 from ast_sim.simulate.own_assembly.part_mesh import PartMesh, part_meshes
 from ast_sim.simulate.own_assembly.touching import set_back
+from ast_sim.simulate.own_assembly.yielding import hardening_columns, hardening_of
 from ast_sim.simulate.shapes.mesh import second_order
 from ast_sim.support.errors import ConfigError
 
@@ -139,11 +140,11 @@ def case(spec: AssemblySpec, values: Values, frames: int, parts: list[PlacedPart
     law = material[:, :2].astype(np.float64)
     law[law[:, 0] == 0] = law[np.argmax(law[:, 0] > 0)]  # what rigid elements have is ignored, but must be constants
     course = _course(scene, parts, values, frames, np.array(shared.origin))
-    attributes: dict[str, AttributeValue] = {f"parameter {name}": value for name, value in values.items()}
-    attributes["origin"] = list(shared.origin)
+    attributes: dict[str, AttributeValue] = {**recorded(values), "origin": list(shared.origin)}
     notes = dict.fromkeys([*(note for part in parts for note in part.notes), *touching, *_soft(spec, values)])
     attributes |= {NOTES: NEXT_NOTE.join(notes)} if notes else {}
-    return SolidCase(scene, course.position, NeoHookean(*law.T), contact, "node", attributes, course)
+    hardening = {number: table for number, part in enumerate(spec.parts) if len(table := hardening_of(part, values))}
+    return SolidCase(scene, course.position, NeoHookean(*law.T), contact, "node", attributes, course, hardening)
 
 
 def _set_back(spec: AssemblySpec, parts: list[PlacedPart], shared: Reference) -> tuple[list[PlacedPart], list[str]]:
@@ -176,8 +177,8 @@ def _contact(spec: AssemblySpec, values: Values, shared: Reference) -> ContactSe
 
 
 def _material(spec: AssemblySpec, values: Values, contact: ContactSettings) -> np.ndarray:
-    """[bodies, 2 or 3] float32: Young's modulus, Poisson's ratio and, where it is drawn, the largest friction with
-    another part; zeros in the first two for rigid parts."""
+    """[bodies, columns] float32: Young's modulus, Poisson's ratio, where it is drawn the largest friction with another
+    part, and where parts yield their hardening; zeros in the first two for rigid parts."""
     count = len(spec.parts)
     rows = np.zeros((count, 2))
     for number, part in enumerate(spec.parts):
@@ -187,14 +188,16 @@ def _material(spec: AssemblySpec, values: Values, contact: ContactSettings) -> n
     if friction_is_drawn(spec):
         others = [[contact.friction_between(a, b) for b in range(count) if b != a] for a in range(count)]
         rows = np.column_stack([rows, np.max(others, axis=1)])
-    return rows.astype(np.float32)
+    return np.column_stack([rows, hardening_columns(spec, values)]).astype(np.float32)
 
 
 def _soft(spec: AssemblySpec, values: Values) -> Iterator[str]:
-    """A note on each modulus that looks like one in other units."""
-    for name in (f"{part.name}.young" for part in spec.parts if not part.rigid):
-        if float(values[name]) < SOFTEST:
-            yield f"{name} is {values[name]:.4g} Pa; moduli are in pascal in every unit of length, and 1 MPa is 1e6"
+    """A note on each modulus and each yield stress that looks like one in other units."""
+    moduli = {f"{part.name}.young": float(values[f"{part.name}.young"]) for part in spec.parts if not part.rigid}
+    yields = {f"{part.name}.hardening": part.hardening[0][0](values) for part in spec.parts if part.hardening}
+    for name, value in {**moduli, **yields}.items():
+        if value < SOFTEST:
+            yield f"{name} is {value:.4g} Pa; moduli are in pascal in every unit of length, and 1 MPa is 1e6"
 
 
 def friction_is_drawn(spec: AssemblySpec) -> bool:

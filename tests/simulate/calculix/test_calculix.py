@@ -2,6 +2,7 @@
 
 import io
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -344,9 +345,19 @@ def test_a_failed_run_says_why_and_keeps_its_folder(tmp_path, monkeypatch):
         calculix.quasi_static(case)
     kept = Path(str(error.value).rpartition(" kept in ")[2].rstrip(")"))
     assert (kept / "case.inp").exists() and kept.parent == tmp_path
-    fake_ccx(tmp_path, monkeypatch, "exec sleep 10")
-    with pytest.raises(SimulationError, match=r"ccx did not end within 0\.2 s"):
-        calculix.quasi_static(case, CalculixSettings(timeout=0.2))
+
+
+@pytest.mark.parametrize(
+    ("script", "why"), [("exec sleep 10", "did not end within 0.2 s"), ("kill -SEGV $$", "was killed by SIGSEGV")]
+)
+def test_a_run_that_crashes_or_takes_too_long_leaves_the_frame_at_rest(tmp_path, monkeypatch, script, why):
+    """So one scene of many does not end the others."""
+    case = uniaxial(np.array([1, 1.1]))
+    fake_ccx(tmp_path, monkeypatch, script)
+    solved = calculix.quasi_static(case, CalculixSettings(timeout=0.2))
+    assert solved.attributes["status"] == "truncated" and solved.attributes["stopped_by"] == f"frame 1: ccx {why}"
+    np.testing.assert_array_equal(solved.position, [case.scene.rest_position])
+    assert [path.name for path in tmp_path.iterdir()] == ["ccx"]
 
 
 def test_a_run_leaves_nothing_behind(tmp_path, monkeypatch):
@@ -354,3 +365,30 @@ def test_a_run_leaves_nothing_behind(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", None)
     assert calculix.quasi_static(uniaxial(np.array([1, 1.1]))).num_frames == 2
     assert list(tmp_path.iterdir()) == []
+
+
+def test_metal_follows_its_hardening_and_keeps_its_plastic_strain():
+    """A block that is pulled and let go. Its ends follow the motion of J2 flow with isotropic hardening: the plastic
+    strain p solves strain = p + Y(p) / E in logarithmic strains; sideways, metal shrinks by p / 2 + poisson Y / E."""
+    young, poisson, table = 2e11, 0.3, np.array([[3e8, 0], [5e8, 0.1], [6e8, 0.3]])
+    plastic = np.array([0, 0.02, 0.15, 0.15])
+    stress = np.interp(plastic, *table.T[::-1]) * [0, 1, 1, 0]
+    strain, lateral = plastic + stress / young, -plastic / 2 - poisson * stress / young
+    pulled = uniaxial(np.exp(strain))
+    targets = pulled.scene.rest_position * np.exp(np.stack([lateral, lateral, strain], axis=1))[:, None]
+    case = replace(pulled, targets=targets, material=NeoHookean(young, poisson), hardening={0: table})
+    solved = calculix.quasi_static(case)
+    assert solved.attributes["status"] == "complete"
+    solved.check(stress_location="element")
+    np.testing.assert_allclose(solved.position, targets, atol=3e-4)  # the elastic part is not quite logarithmic
+    strains = solved.fields["PEEQ"].values
+    # Each increment of CalculiX is too long by half of its own strain, of which the longest has a quarter of a frame's.
+    np.testing.assert_allclose(strains, plastic[:, None, None] + 0 * strains, atol=0.15 * (0.14 / 4) / 2)
+    np.testing.assert_allclose(solved.stress[:, :, 0], stress[:, None] + 0 * solved.stress[:, :, 0], atol=2e-4 * young)
+    forces = solved.fields["reaction"].values
+    upper = pulled.scene.rest_position[:, 2] == 0.5
+    area = 0.3 * 0.4 * np.exp(2 * lateral)
+    np.testing.assert_allclose(forces[:, upper, 2].sum(axis=1), stress * area, atol=2e-4 * young * 0.12)
+    assert not forces[:, ~case.scene.prescribed].any()
+    with pytest.raises(SimulationError, match="body 0 yields: use CalculiX"):
+        trajectory.quasi_static(case)
