@@ -205,6 +205,9 @@ typedef struct {
   /* out[f] = sum of x[n,f] over n, rows in blocks whose sums are added by halves: the gradient of a bias. x [N,F], out
    * [F]. */
   ast_status (*column_sum)(const float *restrict x, int64_t N, int64_t F, float *restrict out);
+  /* out[k] = U V^T, about, where x[k] = U S V^T: five iterations of Muon. Singular values below 0.002 of the norm stay
+   * smaller; of a norm below 1e-37 they do, too. x and out [K,R,C]. */
+  ast_status (*orthogonalize)(const float *restrict x, int64_t K, int64_t R, int64_t C, float *restrict out);
   /* out [M,O] = y, or LayerNorm(y), + residual, which may be NULL. */
   ast_status (*mlp)(const ast_mlp *s, const float *restrict residual, float *restrict out, ast_mlp_kept kept);
   /* Its gradients; what was not kept is computed again. */
@@ -232,6 +235,7 @@ typedef struct {
   KERNEL(elastic_forces)          \
   KERNEL(elastic_forces_backward) \
   KERNEL(column_sum)              \
+  KERNEL(orthogonalize)           \
   KERNEL(mlp)                     \
   KERNEL(mlp_backward)
 

@@ -13,6 +13,7 @@
 #include "message_backward.c" /* after message.c, whose tiles it uses */
 #include "mlp.c"
 #include "octree.c"
+#include "orthogonalize.c"
 #include "coarsen.c" /* after octree.c, whose chunks it uses */
 #include "pairs.c"   /* after coarsen.c, whose levels it counts */
 #include "segment.c"

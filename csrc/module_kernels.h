@@ -65,6 +65,10 @@ KERNEL(segment_spread, dout, node_order, node_offsets, mean, dx) {
 
 KERNEL(column_sum, x, out) { return kernels->column_sum(a->x.data, n['N'], n['F'], a->out.data); }
 
+/* ---- the step of Muon ---- */
+
+KERNEL(orthogonalize, x, out) { return kernels->orthogonalize(a->x.data, n['K'], n['R'], n['C'], a->out.data); }
+
 /* ---- elastic forces ---- */
 
 #define ELASTIC position, rest_position, lame, elements, node_order, node_offsets
@@ -374,6 +378,7 @@ static binding bindings[] = {
     BINDING(octree, COUNTED(octree), .check = octree_check),
     BINDING(octree_coarsen, COUNTED(octree_coarsen)),
     BINDING(octree_coordinates),
+    BINDING(orthogonalize),
     BINDING(segment_spread),
     BINDING(segment_sum),
     BINDING(sparse_conv),

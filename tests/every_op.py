@@ -27,6 +27,7 @@ from ast_sim.ops import (
     sparse_conv,
     sparse_conv_transposed,
 )
+from ast_sim.training.muon import orthogonalized
 
 Results = tuple[list[list[Tensor]], list[Tensor]]
 SIZES = [700, 1, 0, 2500, 130]  # rows of scene 0, 1, ...
@@ -248,6 +249,12 @@ def mlp_results(scenes: Sequence[int]) -> Results:
     )
 
 
+def orthogonalized_results(scenes: Sequence[int]) -> Results:
+    """A scene is two matrices here."""
+    matrices = rows(scenes, 40, 24, sizes=[2] * len(SIZES))
+    return by_rows(orthogonalized, (matrices,), 1, offsets_of(scenes, [2] * len(SIZES)))
+
+
 OPS: dict[str, Callable[[Sequence[int]], Results]] = {
     "octree": octree_results,
     "farthest_point_sample": sample_results,
@@ -262,6 +269,7 @@ OPS: dict[str, Callable[[Sequence[int]], Results]] = {
     "elastic_forces": elastic_results,
     "linear": linear_results,
     "mlp": mlp_results,
+    "orthogonalized": orthogonalized_results,
 }
 BY_PLACE = {"attention with dropout"}  # the mask of a scene depends on its place in the batch
 ALL = range(len(SIZES))

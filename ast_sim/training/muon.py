@@ -1,8 +1,8 @@
 """Muon (Jordan et al. 2024, kellerjordan.github.io/posts/muon), an optimizer for matrices.
 
 The step of a matrix is its momentum with all singular values set to about 1. Matrices of the same shape are computed
-together, in float32. torch's implementation computes them one by one in bfloat16. For a small model that takes 1.5
-times as long on a processor with bfloat16 instructions, and 15 times as long on a processor without them.
+together, in float32, by a kernel of the C core. torch's implementation computes them one by one in bfloat16. For a
+small model that takes four times as long on a processor with bfloat16 instructions, and more without them.
 
 Legend: K matrices of R rows and C columns.
 """
@@ -16,10 +16,14 @@ from math import prod
 import torch
 from torch import Tensor
 
+from ast_sim.ops.derivatives import differentiate_by_composition
+from ast_sim.ops.library import Kernel, Op
+
 MOMENTUM = 0.95
 # x <- A x + B (x x^T) x + C (x x^T)^2 x. Five iterations move each singular value from [0.002, 1] into [0.68, 1.21].
 A, B, C = 3.4445, -4.7750, 2.0315
 ITERATIONS = 5
+LEAST = 1e-37  # a smaller norm counts as this
 
 
 class Muon:
@@ -47,13 +51,33 @@ class Muon:
             value.view(stack).sub_(moved, alpha=0.2 * rate * max(stack[1:]) ** 0.5)
 
 
-def orthogonalized(x: Tensor) -> Tensor:
-    """[K, R, C] -> [K, R, C]: about U V^T, where x = U S V^T. Singular values below 0.002 of the norm stay smaller."""
+def _reference(x: Tensor) -> Tensor:
     if x.shape[1] > x.shape[2]:
-        return orthogonalized(x.mT).mT
-    norm = torch.linalg.vector_norm(x, dim=(1, 2), keepdim=True, dtype=torch.float64)  # squares may overflow float32
-    x = x / norm.float().clamp(min=1e-37)
+        return _reference(x.mT).mT.contiguous()
+    wide = x.double()  # squares may overflow float32, and so may the norm
+    x = (wide / torch.linalg.vector_norm(wide, dim=(1, 2), keepdim=True).clamp(min=LEAST)).to(x.dtype)
     for _ in range(ITERATIONS):
         gram = x @ x.mT
         x = torch.baddbmm(x, torch.baddbmm(gram, gram, gram, beta=B, alpha=C), x, beta=A)
     return x
+
+
+_orthogonalize = Op(Kernel("orthogonalize", "x[K,R,C] -> out[K,R,C]"), _reference)
+differentiate_by_composition(_orthogonalize)
+
+
+def orthogonalized(x: Tensor) -> Tensor:
+    """About U V^T of each matrix x = U S V^T, by Newton-Schulz iterations (Jordan et al. 2024,
+    kellerjordan.github.io/posts/muon). The result has the same bits for any number of threads.
+
+    Args:
+        x: [K, R, C]; entries may have any magnitude.
+
+    Returns:
+        [K, R, C]. Singular values below 0.002 of the norm of a matrix stay smaller; 0 stays 0. A matrix with an entry
+        that is not finite becomes NaN.
+
+    Raises:
+        ValueError: x is not [K, R, C].
+    """
+    return _orthogonalize(x)

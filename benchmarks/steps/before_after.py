@@ -1,7 +1,8 @@
 """Times a training step of another state of this repository beside today's, in turns, and counts what a step runs.
 
 `python -m benchmarks.steps.before_after --before FOLDER --data FILE --json FILE`. FOLDER holds the other state, built
-in place. Each state has a process of its own; both draw the same batches.
+in place. Each state has a process of its own; both draw the same batches. `processor` is the processor time of all
+threads of a process, which other work on the machine disturbs less.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import sys
 import tempfile
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 from ast_sim.support.provenance import provenance
 from benchmarks.steps.step_worker import KINDS, Setup
@@ -22,7 +24,8 @@ SETTINGS = ["train.batch_size=8", "train.steps=100000", "train.mirror=x,y"]  # o
 
 
 def compare(before: Path, data: Path, threads: int, repeats: int, steps: int) -> dict:
-    """Milliseconds of a step of each state, least and median; the median of the ratios of neighbours; the counts."""
+    """Milliseconds of a step of each state, least and median, by the clock and of the processor; the medians of the
+    ratios of neighbours; the counts."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         setup = Setup(str(data.resolve()), "ast", "tiny", SETTINGS, str(folder))
@@ -32,19 +35,30 @@ def compare(before: Path, data: Path, threads: int, repeats: int, steps: int) ->
             stack.callback(worker.close)
             worker.ask("step", 10)
         seconds: dict[str, list[float]] = {name: [] for name in workers}
+        processor: dict[str, list[float]] = {name: [] for name in workers}
         for _ in range(repeats):
             for name, worker in workers.items():
+                before_steps = worker.processor_seconds()
                 seconds[name].append(worker.ask("step", steps))
+                processor[name].append((worker.processor_seconds() - before_steps) / steps)
         shares = workers["now"].ask("profile", 10)
         return {
             "threads": threads,
-            "min_ms": {name: 1e3 * min(values) for name, values in seconds.items()},
-            "median_ms": {name: 1e3 * statistics.median(values) for name, values in seconds.items()},
-            "ratio": statistics.median(b / n for b, n in zip(seconds["before"], seconds["now"], strict=True)),
+            **summary(seconds),
+            "processor": summary(processor),
             "shares": {kind: shares[kind] for kind in KINDS},
-            "counts": workers["now"].ask("counts"),
+            "counts": {name: worker.ask("counts") for name, worker in workers.items()},
             "seconds": seconds,
         }
+
+
+def summary(seconds: dict[str, list[float]]) -> dict[str, Any]:
+    """Of the samples of "before" and "now"."""
+    return {
+        "min_ms": {name: 1e3 * min(values) for name, values in seconds.items()},
+        "median_ms": {name: 1e3 * statistics.median(values) for name, values in seconds.items()},
+        "ratio": statistics.median(b / n for b, n in zip(seconds["before"], seconds["now"], strict=True)),
+    }
 
 
 def main() -> None:

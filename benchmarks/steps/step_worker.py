@@ -32,6 +32,7 @@ from ast_sim.training.profile import profile
 from benchmarks.kernels.flops import FORMULAS
 
 KINDS = ("kernel", "torch", "binding", "autograd", "python")
+NODE = "autograd::engine::evaluate_function: "  # stands before the name of a node of autograd
 M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = -3, -1  # malloc.h of glibc
 
 
@@ -90,17 +91,27 @@ def rolling_out(training: Training) -> Iterator[None]:
     training.model.train()
 
 
+def events(step: Callable[[], object]) -> dict[str, int]:
+    """How often one step runs each event of torch's profiler."""
+    with profiler(activities=[ProfilerActivity.CPU]) as watched:
+        step()
+    return {event.key: event.count for event in watched.key_averages()}
+
+
+def nodes(counted: dict[str, int]) -> dict[str, int]:
+    """The nodes of autograd by name, of what `events` counted."""
+    return {key.removeprefix(NODE): count for key, count in counted.items() if key.startswith(NODE)}
+
+
 def counts(step: Callable[[], object]) -> dict[str, int]:
     """What one step runs: nodes of autograd (without those that accumulate gradients), those that accumulate, torch's
     ops, and the ops of the C core, forward and backward."""
-    node = "autograd::engine::evaluate_function: "
-    with profiler(activities=[ProfilerActivity.CPU]) as watched:
-        step()
-    events = {event.key: event.count for event in watched.key_averages()}
-    nodes = sum(count for key, count in events.items() if key.startswith(node))
-    sums = sum(count for key, count in events.items() if key.startswith(node) and "AccumulateGrad" in key)
-    ops = {kind: sum(n for key, n in events.items() if key.startswith(kind)) for kind in ("aten::", "ast_sim")}
-    return {"nodes": nodes - sums, "accumulating": sums, "torch_ops": ops["aten::"], "own_ops": ops["ast_sim"]}
+    counted = events(step)
+    of_autograd = nodes(counted)
+    sums = sum(count for key, count in of_autograd.items() if "AccumulateGrad" in key)
+    ops = {kind: sum(n for key, n in counted.items() if key.startswith(kind)) for kind in ("aten::", "ast_sim")}
+    of_nodes = {"nodes": sum(of_autograd.values()) - sums, "accumulating": sums}
+    return {**of_nodes, "torch_ops": ops["aten::"], "own_ops": ops["ast_sim"]}
 
 
 def flops_of(step: Callable[[], object]) -> int:
@@ -110,10 +121,9 @@ def flops_of(step: Callable[[], object]) -> int:
     return counter.get_total_flops()
 
 
-def main() -> None:
-    setup = Setup(**json.loads(sys.argv[1]))
-    keep_memory()
-    out, sys.stdout = sys.stdout, sys.stderr  # what training prints is no answer
+@contextmanager
+def training_of(setup: Setup) -> Iterator[Training]:
+    """A training that is ready for its first step."""
     with ExitStack() as stack:
         dataset = stack.enter_context(Dataset(Path(setup.data)))
         run = stack.enter_context(tempfile.TemporaryDirectory(dir=setup.folder))
@@ -121,6 +131,14 @@ def main() -> None:
         config = resolve(configure(Path(setup.data), setup.preset, setup.settings, setup.model), dataset, scales)
         training = stack.enter_context(Training(RunFolder(Path(run)), config, dataset, scales, StopSignals()))
         training.prepare()
+        yield training
+
+
+def main() -> None:
+    setup = Setup(**json.loads(sys.argv[1]))
+    keep_memory()
+    out, sys.stdout = sys.stdout, sys.stderr  # what training prints is no answer
+    with training_of(setup) as training:
         roll = rollout_step(training)
         rolled_out = rolling_out(training)  # decorates what asks for rollout steps
         answers: dict[str, Callable[[int], object]] = {

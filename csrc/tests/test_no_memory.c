@@ -307,6 +307,12 @@ static outcome column_sum(const ast_kernels *kernels) {
   return FINISH(KERNEL(kernels->column_sum(x, N, F, out)), out);
 }
 
+static outcome orthogonalize(const ast_kernels *kernels) {
+  enum { K = 5, R = 70, C = 90 };
+  float *x = random_floats(K * R * C), *out = new_floats(K * R * C);
+  return FINISH(KERNEL(kernels->orthogonalize(x, K, R, C, out)), out);
+}
+
 static const struct {
   const char *name;
   outcome (*run)(const ast_kernels *);
@@ -327,6 +333,7 @@ static const struct {
     {"linear", linear},
     {"linear_backward", linear_backward},
     {"mlp", mlp},
+    {"orthogonalize", orthogonalize},
     {"mlp_backward", mlp_backward},
     {"elastic_forces", elastic_forces},
     {"elastic_forces_backward", elastic_forces_backward},

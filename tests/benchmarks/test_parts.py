@@ -1,0 +1,21 @@
+"""The part of a step that no scene causes."""
+
+import pytest
+
+from benchmarks.steps import before_after, parts
+from benchmarks.steps.step_worker import nodes
+
+
+def test_the_fixed_part_is_where_the_line_through_the_times_meets_no_scene():
+    assert parts.fixed_part({1: 12.0, 4: 18.0, 8: 26.0}) == pytest.approx((10.0, 2.0))
+    assert parts.fixed_part({1: 13.0, 4: 18.0, 8: 27.0})[0] == pytest.approx(10.61, abs=0.01)  # least squares
+
+
+def test_only_nodes_of_autograd_are_counted():
+    counted = {"autograd::engine::evaluate_function: ViewBackward0": 3, "ViewBackward0": 3, "aten::view": 5}
+    assert nodes(counted) == {"ViewBackward0": 3}
+
+
+def test_a_ratio_is_of_neighbours():
+    told = before_after.summary({"before": [2.0, 9.0, 4.0], "now": [1.0, 3.0, 4.0]})
+    assert told == {"min_ms": {"before": 2e3, "now": 1e3}, "median_ms": {"before": 4e3, "now": 3e3}, "ratio": 2.0}
