@@ -1,4 +1,4 @@
-"""The command line `ast-sim COMMAND`: its commands and their arguments; `commands.py` has what they do.
+"""The command line `ast-sim COMMAND`: its commands and their arguments; `command_line` has what they do.
 
 An error that a user can act on is printed as one line on stderr, and the exit code is 2.
 """
@@ -15,7 +15,8 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-from ast_sim import __version__, commands, help_lines, judging_commands
+from ast_sim import __version__
+from ast_sim.command_line import commands, help_lines, judging_commands
 from ast_sim.support.argument_types import (
     Parser,
     add_each,

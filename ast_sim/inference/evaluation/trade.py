@@ -134,7 +134,9 @@ def _measured(
                     pair = (outcome.relative_error, outcome.whole_seconds) if outcome.converged else _NONE
                     ways.setdefault(outcome.way.name, []).append(pair)
             except (ConfigError, SimulationError) as error:
-                no_solver, solved, ways = str(error), None, {}
+                no_solver = str(error)
+                solved = None
+                ways = {}
             bar.advance()
     if stated is not None:
         ways = {"as stated": [(0.0, stated)] * len(indices)}

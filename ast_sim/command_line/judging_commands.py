@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ast_sim.commands import SPLITS, check_output, open_run
+from ast_sim.command_line.commands import SPLITS, check_output, open_run
 from ast_sim.support.argument_types import Parser, add_each, add_out, add_overwrite, at_least, path
 from ast_sim.support.errors import ConfigError
 
