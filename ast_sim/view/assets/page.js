@@ -128,7 +128,7 @@ byId("lead").textContent = data.lead;
 byId("footer").textContent = data.footer;
 tiles(data);
 // The pages of runs, of a dataset and of a trade share the template. When it is filled, sections of the other kinds go.
-const facts = data.runs || [{ facts: data.facts }];
+const facts = data.kind === "runs" ? data.runs : [{ facts: data.facts }];
 ({ runs: showRuns, dataset: showDataset, trade: showTrade })[data.kind](data);
 document.querySelectorAll("[data-kind]").forEach((part) => { if (part.dataset.kind !== data.kind) part.remove(); });
 byId("facts").hidden = !facts.some((run) => run.facts.length);

@@ -357,9 +357,10 @@ def test_parts_of_the_user_make_scenes_that_say_which_parts_they_are_of(tmp_path
 
 def test_parts_without_gmsh_are_announced(monkeypatch):
     monkeypatch.setattr("ast_sim.simulate.shapes.cad.gmsh_process.gmsh_version", lambda: None)
-    (note,) = generate_module._notes(recorded(Recipe("abcd", 0, 200)))
+    parts = Recipe("abcd", 0, 200)
+    (note,) = generate_module._notes(parts, recorded(parts))
     assert note.startswith("gmsh is not installed") and 'pip install "ast_sim[cad]"' in note
-    assert generate_module._notes(recorded(RECIPE)) == []
+    assert generate_module._notes(RECIPE, recorded(RECIPE)) == []
 
 
 def test_a_missing_ipctk_is_named_before_anything_starts(tmp_path, monkeypatch):
