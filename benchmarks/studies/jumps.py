@@ -97,9 +97,9 @@ ROWS = {
         settings={**_MIRRORED, "batch_size": 4, "peak_rate": 1e-3, "validate_every": 1500, "checkpoint_every": 1500},
         **_PLATES,
     ),
-    "plates1300": Row("Plates, 1,300 nodes", steps=5_000, settings=_MIRRORED, rivals=10, **_PLATES_1300),
+    "plates1300": Row("Plates, 1,300 nodes, 12,000 steps", steps=12_000, settings=_MIRRORED, rivals=10, **_PLATES_1300),
     "plates1300_transolver": Row(
-        "Plates, 1,300 nodes, Transolver", steps=5_900, model="transolver", settings=_MIRRORED, **_PLATES_1300
+        "Plates, 1,300 nodes, Transolver", steps=14_100, model="transolver", settings=_MIRRORED, **_PLATES_1300
     ),
     "parts400": Row("Pairs of parts, 400 nodes", steps=10_000, settings=_TURNED, rivals=5, **_PARTS),
     "parts400_transolver": Row(
