@@ -16,11 +16,11 @@ from ast_sim.inference.effort import FIRST_CALL, Effort
 from ast_sim.inference.jump import jumps
 from ast_sim.inference.question import Frames, Question, fields_of
 from ast_sim.inference.rollout import rollouts
+from ast_sim.mechanics.physics_check import turned_over
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.models.simulator import Simulator
 from ast_sim.named_field import STRESS, require_fields
 from ast_sim.number_arrays import ranges
-from ast_sim.plausibility.topology import signed_volumes
 from ast_sim.prescribed_motion import Motion, RigidMotion, Vector, frames_for
 from ast_sim.runs.scope import Scope
 from ast_sim.scene import Scene, Trajectory
@@ -204,13 +204,10 @@ def doubts(answer: Answer) -> list[str]:
             f"the Newton steps have not converged: the last one has a size of {max(answer.last_steps):.2g}"
             " (Answer.last_steps)"
         )
-    elements = answer.scene.elements[answer.scene.deforming_elements]
-    if elements.shape[1] >= 4:
-        for frame, position in zip(answer.frames, answer.position, strict=False):
-            count = int((signed_volumes(position, elements) <= 0).sum())
-            if count:
-                told.append(f"{count} elements are turned over in frame {frame}, which no body can do (Answer.check)")
-                break
+    counts = (turned_over(answer.scene, position) for position in answer.position)
+    first = next(((frame, count) for frame, count in zip(answer.frames, counts, strict=False) if count), None)
+    if first is not None:
+        told.append(f"{first[1]:.0f} elements are turned over in frame {first[0]}, which no body can do (Answer.check)")
     return told
 
 

@@ -121,7 +121,7 @@ def check_physics(
     scene: Scene, positions: np.ndarray, frames: Sequence[int], law: Law | None, unit: str
 ) -> PhysicsCheck:
     """Check frames [S, N, 3] with these numbers; `law` None: it is not known. `unit` is that of lengths."""
-    turned = [_turned_over(scene, position) for position in positions]
+    turned = [turned_over(scene, position) for position in positions]
     overlaps = [_overlap(scene, position.astype(np.float64)) for position in positions]
     why = "the law of the material is not known: no forces are"
     forces: list[tuple[float, float]] = []
@@ -149,8 +149,8 @@ def check_physics(
     )
 
 
-def _turned_over(scene: Scene, position: np.ndarray) -> float:
-    """How many deforming tetrahedra have another sign than at rest."""
+def turned_over(scene: Scene, position: np.ndarray) -> float:
+    """How many deforming tetrahedra have another sign at positions [N, 3] than at rest; 0 in a scene of triangles."""
     elements = scene.elements[scene.deforming_nodes[scene.elements].any(axis=1)]
     if elements.shape[1] == 3:
         return 0.0

@@ -46,6 +46,14 @@ def test_elements_that_are_turned_over_are_told_with_their_number_and_frame(plat
     assert doubts(answer) == []
 
 
+def test_elements_that_are_numbered_inside_out_are_not_turned_over(plate):
+    """As `Answer.check` counts: what matters is the sign at rest."""
+    scene, motion = plate
+    numbered = replace(scene, elements=scene.elements[:, [0, 1, 3, 2]])
+    answer, lines = told(numbered, motion)
+    assert answer.check().turned_over.value == 0 and not any("turned over" in line for line in lines)
+
+
 def test_a_scene_so_flat_that_its_answer_turns_over_is_told(plate):
     """Its size and its edges are as in training; before, only Newton steps said that something is wrong."""
     scene, motion = plate

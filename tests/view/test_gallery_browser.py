@@ -8,7 +8,6 @@ import io
 
 import numpy as np
 import pytest
-from browser import Browser
 from on_screen import HOSTILE, differ, drawn, show, texts
 from PIL import Image
 from view_scenes import cloth, pair
@@ -23,13 +22,6 @@ BLOCKS = DatasetInfo(
 )
 FRAMES = 11
 TILES = [f".tile-scene:nth-child({number}) canvas" for number in (1, 2, 3)]
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with Browser(1000, 700) as browser:
-        browser.prefer(color_scheme="light", reduced_motion="reduce")
-        yield browser
 
 
 @pytest.fixture(scope="module")

@@ -3,18 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from browser import Browser
 from on_screen import HOSTILE, show, texts
 
 from ast_sim.trade_figures import Setting, TradeFigures
 from ast_sim.view import trade_page
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with Browser(1000, 700) as browser:
-        browser.prefer(color_scheme="light", reduced_motion="reduce")
-        yield browser
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from ast_sim.inference.effort import Effort
-from ast_sim.inference.promises.kept_errors import DISPLACEMENT, KEPT
+from ast_sim.inference.promises.kept_errors import DISPLACEMENT, KEPT, in_words
 from ast_sim.inference.promises.milliseconds import effort_within
 from ast_sim.support.errors import ConfigError
 
@@ -44,8 +44,7 @@ def _keeping(
     if run.calibration is None:
         raise ConfigError(f"{run.path} promises no error before it is calibrated: ast-sim calibrate RUN DATA")
     effort = run.calibration.kept.effort_for(asked)
-    wanted = " and ".join(f"{100 * error:.3g} % of the {quantity}" for quantity, error in asked.items())
-    promise = f"the cheapest that keeps {wanted} at the deepest frame in {100 * KEPT:g} % of scenes like it"
+    promise = f"the cheapest that keeps {in_words(asked)} at the deepest frame in {100 * KEPT:g} % of scenes like it"
     facts = []
     for question in questions:
         why = run.calibration.unlike(question.scene, question.notes)

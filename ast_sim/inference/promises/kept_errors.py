@@ -76,9 +76,8 @@ class KeptErrors:
         if len(kept):
             return self.efforts[kept[0]]
         smallest = [f"{quantity} {_percent(self.bounds(quantity)[-1])}" for quantity in asked]
-        wanted = " and ".join(f"{_percent(error)} of the {quantity}" for quantity, error in asked.items())
         raise ConfigError(
-            f"no effort of this run keeps an error of {wanted} in {_percent(KEPT)} of the scenes; the smallest"
+            f"no effort of this run keeps an error of {in_words(asked)} in {_percent(KEPT)} of the scenes; the smallest"
             f"{' are, each alone,' if len(asked) > 1 else ' is'} {', '.join(smallest)}, with {self.efforts[-1].text}"
         )
 
@@ -98,6 +97,11 @@ class KeptErrors:
             raise ConfigError(
                 f"the run can promise no error: it was calibrated with {scenes} scenes, and needs at least {FEWEST}"
             )
+
+
+def in_words(asked: Mapping[str, float]) -> str:
+    """Asked errors by quantity, such as "2 % of the displacement and 5 % of the reaction"."""
+    return " and ".join(f"{_percent(error)} of the {quantity}" for quantity, error in asked.items())
 
 
 def _allowed(scenes: int) -> int:
