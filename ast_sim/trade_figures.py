@@ -8,15 +8,16 @@ frame.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from statistics import median
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 TOLERANCES = (0.1, 0.05, 0.025, 0.01, 0.005, 0.002)
 WITHIN = 0.9
+COLUMNS = ("error at most", "the run", "the solver", "solver / run", "faster", "pays after")  # of `TradeRow.cells`
 RESAMPLES = 2000  # of the bootstrap over scenes
 
 
@@ -74,6 +75,14 @@ class TradeRow:
         assert self.low is not None and self.high is not None
         return "the run" if self.low > 1 else "the solver" if self.high < 1 else "level"
 
+    @property
+    def cells(self) -> list[str]:
+        """The error, both settings, the ratio, the verdict and when it pays, as texts of a table."""
+        both = ["none" if one is None else f"{1000 * one.middle:.3g} ms: {one.name}" for one in (self.run, self.solver)]
+        ratio = "–" if self.ratio is None else f"{self.ratio:.2f} ({self.low:.2f} to {self.high:.2f})"
+        pays = "–" if self.pays_after is None else f"{self.pays_after:,} questions"
+        return [f"{100 * self.tolerance:g} %", *both, ratio, self.verdict, pays]
+
 
 @dataclass(frozen=True)
 class TradeFigures:
@@ -122,6 +131,13 @@ class TradeFigures:
             told.append(f"{100 * row.tolerance:g} %: {'; '.join(parts)}")
         return told + ([f"the solver was not run: {self.no_solver}"] if self.no_solver else [])
 
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Self:
+        """From what `to_json` gave."""
+        known = {key: values[key] for key in ("no_solver", "invested", "origin")}
+        run, solver = (tuple(map(_setting, values[side])) for side in ("run", "solver"))
+        return cls(tuple(values["scenes"]), run, solver, **known)
+
     def to_json(self) -> dict[str, Any]:
         """All figures; an infinite number is null."""
         settings = {
@@ -159,6 +175,11 @@ def _fastest(settings: Sequence[Setting], tolerance: float) -> Setting | None:
 
 def _told(who: str, setting: Setting | None) -> str:
     return f"{who}: none" if setting is None else f"{who}: {1000 * setting.middle:.3g} ms ({setting.name})"
+
+
+def _setting(values: Mapping[str, Any]) -> Setting:
+    errors, seconds = (tuple(math.inf if one is None else one for one in values[key]) for key in ("errors", "seconds"))
+    return Setting(values["name"], errors, seconds, values["command"])
 
 
 def _finite(values: Sequence[float]) -> list[float | None]:

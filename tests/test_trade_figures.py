@@ -74,3 +74,8 @@ def test_the_text_and_the_json_say_it():
     values = told.to_json()
     assert values["rows"][0]["solver"] == "coarse" and values["rows"][4]["run"] is None
     assert values["solver"][2]["errors"][-1] is None and values["origin"] == {"run": "r"}
+
+
+def test_the_figures_are_read_back_from_their_json():
+    known = figures(no_solver="no", invested=30.0, origin={"run": "r"})
+    assert TradeFigures.from_json(known.to_json()) == known

@@ -9,6 +9,11 @@ from ast_sim.support.argument_types import Parser, add_each, add_out, add_overwr
 from ast_sim.support.errors import ConfigError
 
 
+def _add_made_from(to: Parser) -> None:
+    about = "the specification or the parts of your own of which DATA was made; the solver needs them"
+    add_each(to, {"--made-from PATH": about}, type=path)
+
+
 def add_evaluate(evaluate: Parser) -> None:
     """The arguments of `evaluate`."""
     evaluate.add_argument("run_folder", type=path, metavar="RUN", help="run folder")
@@ -16,8 +21,7 @@ def add_evaluate(evaluate: Parser) -> None:
     evaluate.add_argument("--split", choices=SPLITS, default="test", help="split (default: test)")
     about = "scenes in which the solver solves the deepest frame, to compare (default: 3; 0: none)"
     add_each(evaluate, {"--rivals N": about}, type=at_least(0), default=3)
-    about = "the specification or the parts of your own of which DATA was made; the solver needs them"
-    add_each(evaluate, {"--made-from PATH": about}, type=path)
+    _add_made_from(evaluate)
     add_out(evaluate, "FILE.json", "also write all figures to this file", required=False)
 
 
@@ -59,8 +63,7 @@ def add_trade(trade: Parser) -> None:
     add_each(trade, {"--scenes N": "at most so many scenes (default: 20)"}, type=at_least(1), default=20)
     about = "what another program takes for such a scene: our solver is not run"
     add_each(trade, {"--solver-seconds S": about}, type=float)
-    about = "the specification or the parts of your own of which DATA was made; the solver needs them"
-    add_each(trade, {"--made-from PATH": about}, type=path)
+    _add_made_from(trade)
 
 
 def trade(args: argparse.Namespace) -> None:

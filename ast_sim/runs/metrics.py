@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import statistics
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -49,6 +50,11 @@ class Metrics:
         if count < lines:
             text = f"{self.path} has lost {lines - count} of {lines} lines: its curves are not complete"
             warnings.warn(text, stacklevel=2)
+
+    def seconds_per_step(self) -> float | None:
+        """The median of the seconds of a training step; None if no step was recorded."""
+        seconds = [record["seconds"] for record in self if "loss" in record]
+        return statistics.median(seconds) if seconds else None
 
     def best(self) -> dict[str, Any] | None:
         """The record of the best validation; None if no validation succeeded."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from typing import Any
 
 from ast_sim.support.progress import duration
-from ast_sim.trade_figures import WITHIN, Setting, TradeFigures, TradeRow, front
+from ast_sim.trade_figures import COLUMNS, WITHIN, Setting, TradeFigures, front
 from ast_sim.view import page
 from ast_sim.view.encode import finite_json
 
@@ -28,14 +29,13 @@ def page_data(figures: TradeFigures) -> dict[str, Any]:
                 {"name": "The run", "points": _points(figures.run)},
                 {"name": "The solver", "points": _points(figures.solver)},
             ],
-            "columns": ["Error at most", "The run", "The solver", "Solver over run", "Faster", "Pays after"],
-            "rows": [_cells(row) for row in figures.rows()],
+            "columns": [name.capitalize() for name in COLUMNS],
+            "rows": [row.cells for row in figures.rows()],
             "note": _note(figures),
             "settings": [
                 [side, one.name, f"{100 * one.kept:.3g} %", f"{1000 * one.middle:.3g} ms", one.command or "–"]
                 for side, settings in (("the run", figures.run), ("the solver", figures.solver))
-                for one in sorted(settings, key=lambda one: one.middle)
-                if one.kept < float("inf")
+                for one in _answered(settings)
             ],
             "facts": [[key.capitalize(), str(value)] for key, value in figures.origin.items()],
             "footer": page.FOOTER,
@@ -69,20 +69,14 @@ def _note(figures: TradeFigures) -> str:
 
 
 def _points(settings: Sequence[Setting]) -> list[dict[str, Any]]:
-    """The settings that have an answer in enough scenes; `front` marks those that none beats."""
+    """The settings as points; `front` marks those that none beats."""
     best = {one.name for one in front(settings)}
     return [
         {"name": one.name, "error": one.kept, "seconds": one.middle, "front": one.name in best, "command": one.command}
-        for one in sorted(settings, key=lambda one: one.middle)
-        if one.kept < float("inf")
+        for one in _answered(settings)
     ]
 
 
-def _cells(row: TradeRow) -> list[str]:
-    ratio = "–" if row.ratio is None else f"{row.ratio:.2f} ({row.low:.2f} to {row.high:.2f})"
-    pays = "–" if row.pays_after is None else f"{row.pays_after:,} questions"
-    return [f"{100 * row.tolerance:g} %", _cell(row.run), _cell(row.solver), ratio, row.verdict, pays]
-
-
-def _cell(setting: Setting | None) -> str:
-    return "none" if setting is None else f"{1000 * setting.middle:.3g} ms: {setting.name}"
+def _answered(settings: Sequence[Setting]) -> list[Setting]:
+    """The settings that have an answer in enough scenes to keep an error, from the fastest to the slowest."""
+    return sorted((one for one in settings if math.isfinite(one.kept)), key=lambda one: one.middle)

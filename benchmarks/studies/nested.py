@@ -15,24 +15,21 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from time import process_time
 from typing import Any
 
 import numpy as np
 
 import ast_sim
 from ast_sim.inference.effort import MOST_NEWTON_STEPS, Effort
-from ast_sim.inference.predict import answers
-from ast_sim.inference.question import Question
-from ast_sim.inference.relative_errors import relative_error
+from ast_sim.inference.evaluation.trade import timed_answer
 from ast_sim.simulate.jobs.rival import WAYS, rivals
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
+from ast_sim.trade_figures import TOLERANCES
 from benchmarks.studies.phrases import median_error
 
 RESULTS = Path(__file__).parents[1] / "results" / "nested.json"
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "nested.md"
-LEVELS = (0.1, 0.05, 0.025, 0.01, 0.005, 0.002)
 EFFORTS = (Effort(0), Effort(0, 1), Effort(0, MOST_NEWTON_STEPS))
 NESTED = frozenset(way.name for way in WAYS if way.newton)
 
@@ -87,7 +84,7 @@ def measured(plates: Plates, folder: Path) -> dict[str, Any]:
                 _keep_faster(scene["ways"], outcome.way.name, figures)
             if model is not None:
                 with ast_sim.Dataset(data) as dataset:
-                    _ask(model, dataset, plates.split, index, solved.frame, scene["answers"])
+                    _ask(model, dataset, plates.split, index, scene["answers"])
             print(
                 f"{plates.title}, round {turn + 1} of {plates.rounds}: {index + 1} of {len(scenes)} scenes", flush=True
             )
@@ -96,19 +93,16 @@ def measured(plates: Plates, folder: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _ask(
-    model: Any, dataset: ast_sim.Dataset, split: str, index: int, frame: int, known: dict[str, dict[str, Any]]
-) -> None:
-    """Ask for the frame with every effort; the scene is loaded anew each time, so nothing is prepared for its mesh."""
+def _ask(model: Any, dataset: ast_sim.Dataset, split: str, index: int, known: dict[str, dict[str, Any]]) -> None:
+    """Ask for the deepest frame with every effort."""
     for effort in EFFORTS:
-        truth = dataset.load(split, index)
-        question = Question.of(truth, "plate", [frame])
-        began = process_time()
-        (answer,) = answers(model, [question], effort)
-        seconds = process_time() - began
-        failed = answer.failure is not None
-        error = None if failed else relative_error(answer.position[0], truth, frame)
-        figures = {"seconds": None if failed else seconds, "relative_error": error, "failure": answer.failure}
+        error, seconds, failure = timed_answer(model, dataset, split, index, effort)
+        answered = failure is None
+        figures = {
+            "seconds": seconds if answered else None,
+            "relative_error": error if answered else None,
+            "failure": failure,
+        }
         _keep_faster(known, effort.text, figures)
 
 
@@ -167,7 +161,7 @@ def _section(plates: dict[str, Any]) -> list[str]:
         *_head([*head, "most often fastest, in how many scenes"]),
     ]
     won = []
-    for level in LEVELS:
+    for level in TOLERANCES:
         *times, names = _compared(scenes, [level] * len(scenes))
         run = []
         if plates["run"]:

@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import ast_sim
 from ast_sim.support.disk import write_json, write_text
+from ast_sim.support.progress import duration
+from ast_sim.trade_figures import COLUMNS, TradeFigures
 from benchmarks.studies import jumps
 
 RESULTS = Path(__file__).parents[1] / "results" / "trade.json"
@@ -62,13 +62,14 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
     command = f"python -m benchmarks.studies.trade {name}"
     figures = ast_sim.trade(run, data, scenes=row.scenes, command=command).figures.to_json()
     figures["origin"] |= {"run": run.path.name, "data": Path(data).name}
-    return {"title": row.title, **figures}
+    return figures
 
 
 def page(results: dict[str, Any]) -> str:
     """The page of all rows that have a result."""
-    shown = [results[name] for name in ROWS if name in results]
-    return "\n".join([_INTRODUCTION.rstrip(), *(line for row in shown for line in _section(row))]) + "\n"
+    shown = {row.title: TradeFigures.from_json(results[name]) for name, row in ROWS.items() if name in results}
+    lines = [line for title, figures in shown.items() for line in _section(title, figures)]
+    return "\n".join([_INTRODUCTION.rstrip(), *lines]) + "\n"
 
 
 _INTRODUCTION = """# What an error costs
@@ -87,33 +88,23 @@ For a run of your own: `ast-sim trade RUN DATA --out trade.html`.
 """
 
 
-def _section(row: dict[str, Any]) -> list[str]:
-    origin, invested = row["origin"], row["invested"]
-    lines = [
+def _section(title: str, figures: TradeFigures) -> list[str]:
+    rows, invested = figures.rows(), figures.invested
+    trained = "" if invested is None else f" Simulation and training took {duration(invested)} of a core."
+    ahead = sum(row.verdict == "the run" for row in rows)
+    alone = sum(row.verdict in ("the solver", "the solver alone") for row in rows)
+    return [
         "",
-        f"## {row['title']}",
+        f"## {title}",
         "",
-        f"{len(row['scenes'])} scenes, {origin['processor']}."
-        + ("" if invested is None else f" Simulation and training took {invested / 3600:.1f} hours of a core."),
+        f"{len(figures.scenes)} scenes, {figures.origin['processor']}.{trained}",
         "",
-        "| error at most | the run | the solver | solver / run | faster | pays after |",
+        f"| {' | '.join(COLUMNS)} |",
         "| ---: | --- | --- | --- | --- | ---: |",
+        *(f"| {' | '.join(row.cells)} |" for row in rows),
+        "",
+        f"The run is ahead in {ahead} of {len(rows)} cells, the solver in {alone}.",
     ]
-    middles = {
-        side: {one["name"]: median(math.inf if s is None else s for s in one["seconds"]) for one in row[side]}
-        for side in ("run", "solver")
-    }
-    for one in row["rows"]:
-        cells = [
-            "none" if one[side] is None else f"{1000 * middles[side][one[side]]:.3g} ms: {one[side]}"
-            for side in ("run", "solver")
-        ]
-        ratio = "-" if one["ratio"] is None else f"{one['ratio']:.2f} ({one['low']:.2f} to {one['high']:.2f})"
-        pays = "-" if one["pays_after"] is None else f"{one['pays_after']:,}"
-        lines.append(f"| {100 * one['tolerance']:g} % | " + " | ".join([*cells, ratio, one["verdict"], pays]) + " |")
-    ahead = sum(one["verdict"] == "the run" for one in row["rows"])
-    alone = sum(one["verdict"] in ("the solver", "the solver alone") for one in row["rows"])
-    return [*lines, "", f"The run is ahead in {ahead} of {len(row['rows'])} cells, the solver in {alone}."]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

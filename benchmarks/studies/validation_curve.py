@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from ast_sim import Run
 from ast_sim.inference.effort import EffortErrors
 from ast_sim.runs.metrics import Metrics
@@ -11,7 +9,9 @@ from ast_sim.runs.metrics import Metrics
 
 def minutes_per_step(run: Run) -> float:
     """The median time of a training step, in minutes."""
-    return float(np.median([record["seconds"] for record in Metrics(run.path) if "loss" in record])) / 60
+    seconds = run.folder.metrics.seconds_per_step()
+    assert seconds is not None
+    return seconds / 60
 
 
 def validation_curve(run: Run) -> list[dict[str, float]]:

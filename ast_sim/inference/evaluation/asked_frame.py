@@ -91,10 +91,15 @@ def _rivals(
     return rivals(dataset.path, split, indices, frames, made_from=made_from, progress=False) if indices else ()
 
 
+def deepest_predicted(model: Simulator, truth: Trajectory) -> int:
+    """The number of the deepest frame, or of the first frame after the given ones if that comes later."""
+    return max(deepest_frame(truth), model.config.data.given_frames)
+
+
 def errors_by_effort(model: Simulator, truth: Trajectory, most: Effort) -> list[EffortErrors]:
     """The errors at the deepest frame after each number of corrections and of Newton steps, up to `most`; empty where
     nothing is displaced."""
-    frame = max(deepest_frame(truth), model.config.data.given_frames)
+    frame = deepest_predicted(model, truth)
     if not rms(truth.position[frame] - truth.position[0], ~truth.scene.prescribed):
         return []
     efforts = range(most.corrections + 1)
@@ -173,7 +178,7 @@ def _unmeshed(scenes: Iterable[AskedScene]) -> list[str]:
 def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: Effort) -> AskedScene:
     name = f"{split}/{index:06d}"
     truth = dataset.load(split, index)
-    frame = max(deepest_frame(truth), model.config.data.given_frames)
+    frame = deepest_predicted(model, truth)
     question = Question.of(truth, name, [frame])
     (answer,) = answers(model, [question], effort)
     size = rms(truth.position[frame] - truth.position[0], ~truth.scene.prescribed)

@@ -8,6 +8,7 @@ import shlex
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,10 +17,12 @@ import torch
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.inference.effort import Effort, choices
+from ast_sim.inference.evaluation.asked_frame import deepest_predicted
 from ast_sim.inference.predict import answers
 from ast_sim.inference.question import Question
 from ast_sim.inference.relative_errors import moves, relative_error
-from ast_sim.simulate.jobs.rival import Rivals, deepest_frame, rivals
+from ast_sim.models.simulator import Simulator
+from ast_sim.simulate.jobs.rival import Outcome, rivals
 from ast_sim.support.disk import write_json
 from ast_sim.support.errors import ConfigError, SimulationError
 from ast_sim.support.progress import Progress
@@ -96,7 +99,7 @@ def trade(
     try:
         with run.open(data) as dataset:
             moving = (index for index in range(dataset.count(split)) if moves(dataset.load(split, index)))
-            indices = [index for index, _ in zip(moving, range(scenes), strict=False)]
+            indices = list(islice(moving, scenes))
             if not indices:
                 raise ConfigError(f"{dataset.path}: no scene of the split {split} moves")
             return Trade(_measured(run, dataset, split, indices, solver_seconds, made_from, command))
@@ -117,20 +120,15 @@ def _measured(
     own: dict[Effort, list[tuple[float, float]]] = {effort: [] for effort in efforts}
     ways: dict[str, list[tuple[float, float]]] = {}
     no_solver = ""
-    solved: Iterator[Rivals] | None = None
-    try:
-        if stated is None:
-            solved = rivals(dataset.path, split, indices, made_from=made_from, progress=False)
-    except (ConfigError, SimulationError) as error:
-        no_solver = str(error)
+    solved = _outcomes(dataset, split, indices, made_from) if stated is None else None
     with Progress(len(indices), 0, "scenes") as bar:
-        for number, index in enumerate(indices):
+        for effort in efforts:
+            timed_answer(run.model, dataset, split, indices[0], effort)  # the first takes longer; it does not count
+        for index in indices:
             for effort in efforts:
-                if not number:
-                    _answer(run, dataset, split, index, effort)  # the first answer takes longer; it does not count
-                own[effort].append(_answer(run, dataset, split, index, effort))
+                own[effort].append(timed_answer(run.model, dataset, split, index, effort)[:2])
             try:
-                for outcome in next(solved).outcomes if solved is not None else ():
+                for outcome in next(solved) if solved is not None else ():
                     pair = (outcome.relative_error, outcome.whole_seconds) if outcome.converged else _NONE
                     ways.setdefault(outcome.way.name, []).append(pair)
             except (ConfigError, SimulationError) as error:
@@ -153,15 +151,30 @@ def _measured(
 _NONE = (math.inf, math.inf)  # error and seconds, where there is no answer
 
 
-def _answer(run: Run, dataset: Dataset, split: str, index: int, effort: Effort) -> tuple[float, float]:
-    """The error and the seconds of an answer; the scene is loaded anew, so nothing is prepared for its mesh."""
+def _outcomes(
+    dataset: Dataset, split: str, indices: Sequence[int], made_from: str | os.PathLike[str] | None
+) -> Iterator[tuple[Outcome, ...]]:
+    """What the solver took for each scene in every way. It begins with the first one, where all its errors come up."""
+    for solved in rivals(dataset.path, split, indices, made_from=made_from, progress=False):
+        yield solved.outcomes
+
+
+def timed_answer(
+    model: Simulator, dataset: Dataset, split: str, index: int, effort: Effort
+) -> tuple[float, float, str | None]:
+    """The error of an answer at the deepest frame, its processor seconds, and why it failed: both are infinite then.
+
+    The scene is loaded anew, so nothing is prepared for its mesh.
+    """
     truth = dataset.load(split, index)
-    frame = max(deepest_frame(truth), run.settings.model.data.given_frames)
+    frame = deepest_predicted(model, truth)
     question = Question.of(truth, f"{split}/{index:06d}", [frame])
     began = time.process_time()
-    (answer,) = answers(run.model, [question], effort)
+    (answer,) = answers(model, [question], effort)
     seconds = time.process_time() - began
-    return _NONE if answer.failure is not None else (relative_error(answer.position[0], truth, frame), seconds)
+    if answer.failure is not None:
+        return (*_NONE, answer.failure)
+    return relative_error(answer.position[0], truth, frame), seconds, None
 
 
 def _setting(name: str, pairs: Sequence[tuple[float, float]], command: str = "") -> Setting:
@@ -180,9 +193,10 @@ def _command(run: Run, dataset: Dataset, split: str, effort: Effort) -> str:
 def _invested(run: Run, dataset: Dataset) -> float | None:
     """The processor seconds of the solver for the training scenes, if the dataset is that of the training, and the
     seconds of the training."""
-    steps = [record["seconds"] for record in run.folder.metrics if "loss" in record]
+    steps = run.settings.train.steps
+    step = run.folder.metrics.seconds_per_step()
     samples = read_seconds(dataset).samples
     simulated = [sum(seconds) for name, seconds in samples.items() if name.startswith(("train/", "valid/"))]
-    if not steps or not simulated or Path(run.settings.data).resolve() != dataset.path.resolve():
+    if step is None or steps is None or not simulated or Path(run.settings.data).resolve() != dataset.path.resolve():
         return None
-    return sum(simulated) + sorted(steps)[len(steps) // 2] * run.settings.train.steps
+    return sum(simulated) + step * steps
