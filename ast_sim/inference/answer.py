@@ -69,29 +69,28 @@ class Answer:
         position: [S, N, 3] float32, in the run's unit of length.
         stress: [S, N or E, 1] float32 in pascal, or None. A given frame holds the given stress, or zero without one.
         given: how many first frames of the motion were given: 1, or 2 in dynamic scenes.
-        step_seconds: wall seconds of each frame that was computed, in ascending order of the frames; the frames of one
-            batch share its time equally.
+        step_seconds: wall seconds of each computed frame, in ascending order; frames of one batch share its time.
         failure: why the prediction ended early, naming the frame and the node; None if it did not.
         info: the units and the kind of the data; it is written into files of the answer.
         source: the origin of the answer: attributes that `trajectory` gets.
         stress_location: where the rows of the stress are: "node" or "element".
         frames: the numbers of the S frames in the motion that was asked.
-        seconds: the wall seconds that a user waits: from the question to the answer, with all that is prepared for the
-            mesh. Several questions that are asked together share their time equally.
+        seconds: the wall seconds from the question to the answer, with all that is prepared for the mesh. Several
+            questions that are asked together share their time equally.
         notes: what is unusual about the scene for the run, as sentences; they are warnings as well.
-        expected_error: how far validation scenes were off with the same corrections and Newton steps: the mean over the
-            scenes of the root mean square error at the deepest frame, over that of the displacement. It is no bound for
-            this scene. None: the run did not measure it, or there are notes.
-        last_steps: of each computed frame the size of its last Newton step: the largest component of a node's move, in
-            mean edge lengths of the surfaces, or the root mean square of the moves over that of the displacements, if
-            that is larger. As long as the contact does not change, a next step would be about its square. Frames
-            ascend. Empty without Newton steps.
+        latents: what the network made of each computed frame, [D] by number (`familiarity`).
+        p_value: how usual the scene is beside the calibration scenes, up to 1; a note tells one of 0.05 or less.
+        expected_error: the mean relative error of the displacement of validation scenes, at their deepest frame, with
+            the same effort. It is no bound for this scene. None: the run did not measure it, or there are notes.
+        last_steps: of each computed frame, in ascending order, the size of its last Newton step: the largest component
+            of a node's move, in mean edge lengths of the surfaces, or the root mean square of the moves over that of
+            the displacements, if that is larger. A next step would be about its square. Empty without Newton steps.
         driven: the prescribed nodes that move farthest together in the whole motion.
         law: the law of the material and of contact, as the run knows it.
         fields: the named fields that the model predicts, [S, N or E, *] each with its unit. Newton steps do not change
             them. A given frame holds the given values, or zero.
-        band: [S], with a probability of 95 % all free nodes of all frames lie within this distance of the truth, in the
-            unit of length (`calibration`). None: the run was not calibrated, or a warning has said why.
+        band: [S], with a probability of 95 % all free nodes of all frames lie within this distance of the truth
+            (`calibration`). None: the run was not calibrated, or a warning has said why.
     """
 
     name: str
@@ -113,6 +112,8 @@ class Answer:
     law: Law | None = None
     band: np.ndarray | None = None
     fields: dict[str, NamedField] = field(default_factory=dict)
+    latents: dict[int, np.ndarray] = field(default_factory=dict)
+    p_value: float | None = None
 
     @property
     def how_far(self) -> list[str]:
@@ -209,8 +210,8 @@ class Answer:
         shown = self.trajectory
         if not self.frames:
             raise RolloutError(f"{self.name}: the answer has no frame to draw", self)
-        number = shown.numbers[picture.farthest(shown)] if number is None else self.frame(number).number
-        return picture.plot(shown, shown.numbers.index(number), self.name, shown.length_unit or "m")
+        row = picture.farthest(shown) if number is None else shown.numbers.index(self.frame(number).number)
+        return picture.plot(shown, row, self.name, shown.length_unit or "m")
 
     def to_pyvista(self, number: int | None = None) -> pyvista.UnstructuredGrid:
         """One frame as a grid of PyVista, with the fields of a file for ParaView.
@@ -227,7 +228,7 @@ class Answer:
 
     @property
     def converged(self) -> bool | None:
-        """Whether the Newton steps of every frame ended because the last one was at most 0.05; None without."""
+        """Whether the last Newton step of every frame was at most 0.05; None without Newton steps."""
         return max(self.last_steps) <= STILL if self.last_steps else None
 
     @property

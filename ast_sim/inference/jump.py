@@ -137,7 +137,8 @@ def _start_again(model: Simulator, frame: _Frame, effort: Effort) -> None:
 @dataclass(eq=False)
 class _Frame:
     """A frame to predict: its start, the positions after each call and each Newton step, the fields after the last call
-    and after Newton steps, which change the stress alone, and the size of the last Newton step."""
+    and after Newton steps, which change the stress alone, the size of the last Newton step, and what the network made
+    of it."""
 
     scene: _JumpingScene
     number: int
@@ -145,6 +146,7 @@ class _Frame:
     positions: list[Tensor] = field(default_factory=list)
     fields: list[dict[str, Tensor]] = field(default_factory=list)
     last_step: float | None = None
+    latent: np.ndarray | None = None
     seconds: float = 0.0
     failure: str | None = None
 
@@ -228,6 +230,7 @@ class _JumpingScene:
             frames | {frame.number: (frame.positions[-1], frame.fields[-1]) for frame in predicted},
             [frame.seconds for frame in predicted],
             self.failure and f"{self.failure}; the frames before it are kept",
+            {frame.number: frame.latent for frame in predicted},
             tuple(frame.last_step for frame in predicted if frame.last_step is not None),
         )
 
@@ -267,6 +270,6 @@ def _predict(model: Simulator, group: list[_Frame], corrections: int) -> None:
         else:
             group[0].failure = f"{group[0].start.name}: {error}"
         return
-    for frame, (positions, fields, seconds) in zip(group, predicted, strict=True):
+    for frame, (positions, fields, latent, seconds) in zip(group, predicted, strict=True):
         frame.failure = not_finite(model.config, frame.scene.question.name, frame.number, positions[-1], fields)
-        frame.positions, frame.fields, frame.seconds = positions, [fields], seconds
+        frame.positions, frame.fields, frame.latent, frame.seconds = positions, [fields], latent, seconds

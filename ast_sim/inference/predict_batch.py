@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -30,15 +31,25 @@ class Start(NamedTuple):
     prescribed: Tensor
 
 
-def predict_batch(
-    model: Simulator, starts: Sequence[Start], calls: int = 1
-) -> list[tuple[list[Tensor], dict[str, Tensor], float]]:
-    """Predict the frames; each call corrects the answer of the one before. Fields on elements are predicted by the last
-    call only.
+class PredictedFrame(NamedTuple):
+    """A frame of a scene.
 
-    Returns:
-        For each frame its positions [N, 3] after each call, its fields by name, and its share of the wall seconds.
+    Attributes:
+        positions: [N, 3] after each call.
+        fields: [N or E, *] by name, after the last call.
+        latent: [D], the mean of what the network made of it in the first call; None: the model does not tell.
+        seconds: its share of the wall seconds.
     """
+
+    positions: list[Tensor]
+    fields: dict[str, Tensor]
+    latent: np.ndarray | None
+    seconds: float
+
+
+def predict_batch(model: Simulator, starts: Sequence[Start], calls: int = 1) -> list[PredictedFrame]:
+    """Predict the frames; each call corrects the answer of the one before. Fields on elements are predicted by the last
+    call only."""
     began = time.perf_counter()
     names, graphs, states, prescribed = zip(*starts, strict=True)
     graph = Graph.concatenate(graphs)
@@ -46,14 +57,20 @@ def predict_batch(
     batch = Batch.build(graph, State.concatenate(states), prescribed, list(names))
     sizes = graph.node_offsets.diff().tolist()
     positions = []
-    fields: dict[str, Tensor] = {}
+    predictions = []
     for call in range(1, calls + 1):
-        position, fields = model.advance(replace(batch, wants_elements=call == calls), prescribed)
+        position, prediction = model.advance(replace(batch, wants_elements=call == calls), prescribed)
         positions.append(position.split(sizes))
+        predictions.append(prediction)
         batch = replace(batch, position=position, proximity=None)
+    first, last = predictions[0], predictions[-1]
     rows = {"node": sizes, "element": graph.element_offsets.diff().tolist()}
     places = {output.name: output.location for output in model.config.data.outputs}
-    parts = {name: values.split(rows[places[name]]) for name, values in fields.items()}
+    parts = {name: values.split(rows[places[name]]) for name, values in last.fields.items()}
     of_starts = [{name: part[row] for name, part in parts.items()} for row in range(len(starts))]
+    latents = [None] * len(starts) if first.latent is None else list(first.latent.means().numpy())
     seconds = (time.perf_counter() - began) / len(starts)
-    return [(way, end, seconds) for *way, end in zip(*positions, of_starts, strict=True)]
+    return [
+        PredictedFrame(way, fields, latent, seconds)
+        for *way, fields, latent in zip(*positions, of_starts, latents, strict=True)
+    ]

@@ -103,10 +103,11 @@ class Question:
         frames: Mapping[int, tuple[Tensor, dict[str, Tensor]]],
         seconds: list[float],
         failure: str | None,
+        latents: Mapping[int, np.ndarray | None],
         last_steps: tuple[float, ...] = (),
     ) -> Answer:
-        """The answer with the wanted ones of these frames: positions and fields, by number of the frame. The other
-        arguments are as in `Answer`."""
+        """The answer with the wanted ones of these frames: positions and fields, by number of the frame; and the
+        `latents` of those that were predicted. The other arguments are as in `Answer`."""
         numbers = tuple(number for number in self.wanted() if number in frames)
         position = np.array([frames[number][0].numpy() for number in numbers], np.float32)
         fields = {
@@ -131,6 +132,7 @@ class Question:
             last_steps=last_steps,
             driven=Driven.of(self.scene, self.prescribed_position),
             law=Law(config.data.material, config.data.contact_range),
+            latents={number: row for number in numbers if (row := latents.get(number)) is not None},
         )
 
 

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ast_sim.batches.batch_builder import State
 from ast_sim.inference.answer import Answer
-from ast_sim.inference.predict_batch import Start, predict_batch
+from ast_sim.inference.predict_batch import PredictedFrame, Start, predict_batch
 from ast_sim.inference.question import Question, not_finite, too_far
 from ast_sim.models.simulator import Simulator
 from ast_sim.named_field import STRESS
@@ -42,8 +43,8 @@ def rollouts(
             for domain in dict.fromkeys(scene.domain for scene in running):
                 group = [scene for scene in running if scene.domain == domain]
                 predicted = predict_batch(model, [scene.start(frame) for scene in group])
-                for scene, (positions, fields, seconds) in zip(group, predicted, strict=True):
-                    scene.advance(frame, positions[-1], fields, seconds)
+                for scene, of_scene in zip(group, predicted, strict=True):
+                    scene.advance(frame, of_scene)
             if progress is not None and running:
                 progress(frame)
     return [scene.answer() for scene in scenes]
@@ -61,6 +62,7 @@ class _RollingScene:
             zip(self.prescribed_position[:given], question.given_fields(model.config.data, given), strict=True)
         )
         self.seconds: list[float] = []
+        self.latents: dict[int, np.ndarray | None] = {}
         self.failure: str | None = None
         self.place(given - 1, *self.frames[-1])
 
@@ -74,12 +76,14 @@ class _RollingScene:
         state = State(position, previous, fields.get(STRESS))
         return Start(f"{self.question.name} frame {frame - 1}", self.graph, state, self.prescribed_position[frame])
 
-    def advance(self, frame: int, position: Tensor, fields: dict[str, Tensor], seconds: float) -> None:
+    def advance(self, frame: int, predicted: PredictedFrame) -> None:
         """Keep the predicted frame, or set `failure` if it is not finite or too far away."""
-        self.place(frame, position, fields)
+        position = predicted.positions[-1]
+        self.place(frame, position, predicted.fields)
         if self.failure is None:
-            self.frames.append((position, fields))
-            self.seconds.append(seconds)
+            self.frames.append((position, predicted.fields))
+            self.seconds.append(predicted.seconds)
+            self.latents[frame] = predicted.latent
 
     def place(self, frame: int, position: Tensor, fields: dict[str, Tensor]) -> None:
         """Find the domain that holds the state from which the frame after `frame` is predicted, or set `failure`."""
@@ -91,4 +95,5 @@ class _RollingScene:
 
     def answer(self) -> Answer:
         """The wanted frames so far as an answer."""
-        return self.question.answer(self.config, dict(enumerate(self.frames)), self.seconds, self.failure)
+        frames = dict(enumerate(self.frames))
+        return self.question.answer(self.config, frames, self.seconds, self.failure, self.latents)

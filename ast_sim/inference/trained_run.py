@@ -94,7 +94,7 @@ class Run:
 
         Args:
             path: the file; an earlier one is replaced, whole or not at all.
-            licence: the text of the licence of the weights; by default the file says that none was stated.
+            licence: the text of the licence of the weights; by default the one of the file that was opened, if any.
 
         Raises:
             CheckpointError: the name does not end in `.ast`, or the file cannot be written.
@@ -266,17 +266,21 @@ class Run:
         seconds = (time.perf_counter() - began) / max(1, len(questions))
         told = []
         for question, answer, known in zip(questions, answers, facts, strict=True):
-            expected = None if question.notes else self.expected_error(effort)
+            p_value, unlike = (None, ()) if self.calibration is None else self.calibration.compared(answer)
+            notes = (*question.notes, *unlike)
+            expected = None if notes else self.expected_error(effort)
             origin = {"predicted_by": str(self.path), "step": self.step, **known, "source": answer.name}
+            if notes:
+                origin.pop("promise", None)
             if expected is not None:
                 origin["expected_error"] = expected
-            shared = {"info": self.info, "expected_error": expected, "seconds": seconds, "notes": question.notes}
-            band = None if self.calibration is None else self.calibration.band(answer, effort, question.notes)
-            answer = dataclasses.replace(answer, source=origin, band=band, **shared)
+            band = None if self.calibration is None else self.calibration.band(answer, effort, notes)
+            shared = {"info": self.info, "expected_error": expected, "seconds": seconds, "band": band}
+            answer = dataclasses.replace(answer, source=origin, notes=notes, p_value=p_value, **shared)
             told.append(answer)
             if answer.failure is not None and throw:
                 raise RolloutError(answer.failure, answer)
-            for doubt in doubts(answer):
+            for doubt in (*unlike, *doubts(answer)):
                 warnings.warn(f"{answer.name}: {doubt}", stacklevel=3)
         return told
 

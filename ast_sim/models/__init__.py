@@ -7,7 +7,7 @@ from ast_sim.models.model_config import ModelConfig, Preset, count, setting
 from ast_sim.models.node_inputs import node_features, normalizer_of
 from ast_sim.models.normalizer import Normalizer
 from ast_sim.models.registry import Model
-from ast_sim.models.simulator import Prediction, Simulator
+from ast_sim.models.simulator import Latent, Prediction, Simulator
 from ast_sim.support.errors import ConfigError
 
 __all__ = [
@@ -15,6 +15,7 @@ __all__ = [
     "ConfigError",
     "DataFacts",
     "Graph",
+    "Latent",
     "Model",
     "ModelConfig",
     "Normalizer",

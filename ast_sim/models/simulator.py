@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -28,6 +28,22 @@ FIELD = "field "  # stands before the name of a named field among the losses
 _CPU_ONLY = "models run on the CPU only"
 
 
+class Latent(NamedTuple):
+    """What a network makes of the B scenes of a batch before it decodes.
+
+    Attributes:
+        values: [R, D], rows of all scenes: tokens of AST, nodes of the other models.
+        offsets: [B + 1], where the rows of each scene begin and end.
+    """
+
+    values: Tensor
+    offsets: Tensor
+
+    def means(self) -> Tensor:
+        """[B, D] float64: the mean over the rows of each scene, which the other scenes do not change."""
+        return torch.stack([rows.double().mean(dim=0) for rows in self.values.split(self.offsets.diff().tolist())])
+
+
 @dataclass(frozen=True)
 class Prediction:
     """What a model predicts for a batch.
@@ -35,13 +51,17 @@ class Prediction:
     Attributes:
         motion: [N, 3], the increment from the state to the predicted frame, or the acceleration with inertia.
         fields: [N or E, *] in the predicted frame, by name: the stress, if there is one, and the named fields.
+        latent: what it was decoded from, by which a scene is compared with others; None: the model does not tell.
     """
 
     motion: Tensor
     fields: dict[str, Tensor]
+    latent: Latent | None = None
 
     @staticmethod
-    def of(data: DataFacts, on_nodes: Tensor, on_elements: Tensor | None = None) -> Prediction:
+    def of(
+        data: DataFacts, on_nodes: Tensor, on_elements: Tensor | None = None, latent: Latent | None = None
+    ) -> Prediction:
         """From the columns of all outputs at the nodes, motion first, and of those at the elements, in the order of
         `data.outputs`; without `on_elements` the latter are left out."""
         fields = {}
@@ -52,7 +72,7 @@ class Prediction:
             ends[output.location] = start + output.columns
             if columns is not None:
                 fields[output.name] = columns[:, start : start + output.columns]
-        return Prediction(on_nodes[:, :3], fields)
+        return Prediction(on_nodes[:, :3], fields, latent)
 
 
 class Simulator(nn.Module):
@@ -222,7 +242,7 @@ class Simulator(nn.Module):
                 if output.name != STRESS:
                     values = torch.where(self._counting(output, batch)[:, None], values, 0)
                 fields[output.name] = values
-        return Prediction(self.motion_normalizer.inverse(prediction.motion), fields)
+        return Prediction(self.motion_normalizer.inverse(prediction.motion), fields, prediction.latent)
 
     def integrate(self, batch: Batch, motion: Tensor) -> Tensor:
         """[N, 3]: positions in the predicted frame, p + v, or 2 p - p_previous + a with inertia."""
@@ -232,11 +252,12 @@ class Simulator(nn.Module):
             return 2 * batch.position - batch.previous_position + motion
         return batch.position + motion
 
-    def advance(self, batch: Batch, prescribed: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """The positions [N, 3] and the fields in the predicted frame. Prescribed nodes are at `prescribed` [N, 3]."""
+    def advance(self, batch: Batch, prescribed: Tensor) -> tuple[Tensor, Prediction]:
+        """The positions [N, 3] in the predicted frame, and the prediction. Prescribed nodes are at `prescribed`
+        [N, 3]."""
         prediction = self.predict(batch)
         position = self.integrate(batch, prediction.motion)
-        return torch.where(batch.graph.prescribed[:, None], prescribed, position), prediction.fields
+        return torch.where(batch.graph.prescribed[:, None], prescribed, position), prediction
 
 
 def _require_cpu(what: str, device: torch.device) -> None:

@@ -29,7 +29,7 @@ from ast_sim.models.model_config import Preset, ProximityConfig, count, setting,
 from ast_sim.models.node_inputs import node_features, normalizer_of
 from ast_sim.models.normalizer import FeatureNormalizer, Normalizer
 from ast_sim.models.registry import Model
-from ast_sim.models.simulator import Prediction, Simulator, Use
+from ast_sim.models.simulator import Latent, Prediction, Simulator, Use
 from ast_sim.scene import Scene
 
 EPSILON = 1e-5  # added to the weight of a slice, so that an empty one is 0
@@ -172,7 +172,7 @@ class Transolver(Simulator):
         data = self.config.data
         wanted = data.output_columns("element") and batch.wants_elements
         on_elements = self.element_decoder(batch.graph.element_mean(x)) if wanted else None
-        return Prediction.of(data, self.decoder(x), on_elements)
+        return Prediction.of(data, self.decoder(x), on_elements, Latent(x, batch.graph.node_offsets))
 
 
 PRESETS = {

@@ -19,7 +19,7 @@ from ast_sim.models.layers import MLP, layer
 from ast_sim.models.model_config import ModelConfig, count, setting
 from ast_sim.models.node_inputs import edge_features, node_features, normalizer_of
 from ast_sim.models.normalizer import Normalizer
-from ast_sim.models.simulator import Prediction, Simulator, Use
+from ast_sim.models.simulator import Latent, Prediction, Simulator, Use
 from ast_sim.models.world_edges import world_edges
 from ast_sim.ops import EdgeSet, linear, message_edges, mlp, segment_sum
 
@@ -194,4 +194,5 @@ class Decoder(nn.Module):
     def forward(self, nodes: Tensor, batch: Batch) -> Prediction:
         wanted = self.of_elements is not None and batch.wants_elements
         on_elements = self.of_elements(batch.graph.element_mean(nodes)) if wanted else None
-        return Prediction.of(self.data, self.of_nodes(nodes), on_elements)
+        latent = Latent(nodes, batch.graph.node_offsets)
+        return Prediction.of(self.data, self.of_nodes(nodes), on_elements, latent)

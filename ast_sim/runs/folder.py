@@ -65,6 +65,11 @@ class RunFolder:
         return read_origin(self.path)
 
     @property
+    def licence(self) -> str | None:
+        """The text of the licence of the weights; None: none is stated."""
+        return None
+
+    @property
     def specification(self) -> dict[str, Any] | None:
         """The specification that the training data was made of, as `AssemblySpec.describe` gave it; None: of none."""
         return self.origin.get("specification")

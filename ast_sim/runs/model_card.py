@@ -13,8 +13,7 @@ from ast_sim.runs.train_config import RunConfig
 _TEXT = """# {name}
 
 A trained model of `ast_sim` {version}. It predicts how deforming bodies in contact move, for scenes like those that it
-learned from (family `{family}`, lengths in {unit}). It warns of a scene outside the ranges below. It does not check the
-shapes of bodies: for other shapes its answer is wrong without a warning.
+learned from (family `{family}`, lengths in {unit}). It warns of a scene outside the ranges below. {familiar}
 
 ```
 import ast_sim
@@ -62,10 +61,19 @@ def card(name: str, settings: RunConfig, scope: Scope, chosen: Chosen, parameter
         version=ast_sim.__version__,
         family=scope.family,
         unit=scope.length_unit,
+        familiar=_familiar(chosen.answers.get("calibration")),
         ranges="\n".join(f"| {what} | {low:.4g} | {high:.4g} |" for what, low, high in _ranges(scope)),
         errors=_errors(chosen.answers),
         training="\n".join(f"| {what} | {value} |" for what, value in training.items()),
     )
+
+
+def _familiar(calibration: Mapping[str, Any] | None) -> str:
+    """What the run tells of shapes and motions that it does not know."""
+    if calibration is None or calibration["familiarity"] is None:
+        return "It does not check the\nshapes of bodies: for other shapes its answer is wrong without a warning."
+    scenes = calibration["scenes"]
+    return f"It also warns if its network\nfinds a scene unlike the {scenes} scenes with which it was calibrated."
 
 
 def _ranges(scope: Scope) -> Iterator[tuple[str, float, float]]:

@@ -17,7 +17,7 @@ import dataclasses
 import hashlib
 import json
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -91,6 +91,14 @@ class RunFile(RunFolder):
     def chosen(self) -> Chosen:
         return Chosen(self.path, self._facts["step"], self._facts["answers"])
 
+    @property
+    def licence(self) -> str | None:
+        return self._members[_LICENCE].decode()
+
+    def keep_calibration(self, calibration: Mapping[str, Any]) -> None:
+        """Keep it in this object, and so in a file that is written of it; this file stays as it is."""
+        self.chosen = self.chosen._replace(answers={**self.chosen.answers, "calibration": dict(calibration)})
+
     def load_model(self) -> Simulator:
         model = build_model(self.settings.model)
         try:
@@ -108,7 +116,7 @@ class RunFile(RunFolder):
             **dataclasses.asdict(self.settings),
             "step": self.chosen.step,
             "answers": self.chosen.answers,
-            "licence": self._members[_LICENCE].decode().partition("\n")[0],
+            "licence": (self.licence or "").partition("\n")[0],
         }
 
 
@@ -129,7 +137,8 @@ def open_run(path: Path) -> RunFolder:
 
 
 def write(path: Path, run: RunFolder, model: Simulator, licence: str | None = None) -> None:
-    """Write the run as one file, whole or not at all; `licence` is the text of the licence of the weights.
+    """Write the run as one file, whole or not at all; `licence` is the text of the licence of the weights, by default
+    the one that the run has.
 
     Raises:
         CheckpointError: the name does not end in `.ast`, or the file cannot be written.
@@ -149,7 +158,7 @@ def write(path: Path, run: RunFolder, model: Simulator, licence: str | None = No
     weights = {key: tensor.detach().clone().contiguous() for key, tensor in model.state_dict().items()}
     members = {
         _CARD: card(path.stem, without_path, run.scope, chosen, sum(p.numel() for p in model.parameters())).encode(),
-        _LICENCE: (licence or _NO_LICENCE).encode(),
+        _LICENCE: (licence or run.licence or _NO_LICENCE).encode(),
         _FACTS: json.dumps(facts, indent=1, allow_nan=False).encode(),
         METRICS: "".join(map(seal, run.metrics)).encode(),
         _WEIGHTS: safetensors.torch.save(weights),

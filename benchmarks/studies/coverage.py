@@ -1,9 +1,9 @@
-"""Do bands and asked errors hold? In how many of a hundred fresh plates all free nodes lie within the band, and how
-many keep an error that an effort was chosen for.
+"""Do bands and asked errors hold? In how many of a hundred fresh plates all free nodes lie within the band, how many
+keep an error that an effort was chosen for, and how many strange plates are told.
 
 `python -m benchmarks.studies.coverage` calibrates the run of plates that comes with the package on a hundred plates,
-and predicts a hundred others: with one call, with the run's default effort, and with each effort to choose. It writes
-benchmarks/results/coverage.json. The scenes lie in `--folder`; a second call goes on with what is there.
+and predicts a hundred others, and changed ones, with each effort. It writes benchmarks/results/coverage.json. The
+scenes lie in `--folder`; a second call goes on with what is there.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import warnings
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from scipy.stats import betabinom
 
 import ast_sim
 from ast_sim.inference.promises.calibration import LEVEL, score
+from ast_sim.inference.promises.familiarity import UNUSUAL
 from ast_sim.simulate.jobs.rival import deepest_frame
 from ast_sim.support.disk import write_json
 from ast_sim.support.errors import ConfigError
@@ -35,45 +36,105 @@ ASKED = {
 }
 
 
-def measured(run: ast_sim.Run, calibration: Path, fresh: Path) -> dict[str, Any]:
-    """The calibration of a run, and how its bands hold in the scenes of another dataset."""
-    result = ast_sim.calibrate(run, calibration, "test")
+def plates(folder: Path, name: str) -> Path:
+    """The dataset with the plates `name`, made if it is not there yet."""
+    return ast_sim.generate("deforming_plate", folder / f"{name}.h5", seed=SEEDS[name], **PLATES).path
+
+
+def bands(run: ast_sim.Run, truths: Sequence[ast_sim.Trajectory], effort: ast_sim.Effort) -> dict[str, Any]:
+    """How the bands of an effort hold in fresh scenes."""
+    assert run.calibration is not None
+    result = run.calibration
+    width = dict(zip(result.efforts, result.quantiles, strict=True))[effort]
     scores: list[float] = []
-    outside = 0
-    bands: list[float] = []
+    widths: list[float] = []
     errors: list[float] = []
-    with ast_sim.Dataset(fresh) as data:
-        truths = [data["test"][index] for index in range(data.count("test"))]
     for truth in truths:
-        answer = run.predict(truth, throw=False)
+        answer = run.predict(truth, effort=effort, throw=False)
         if answer.band is None:
-            outside += 1
             continue
         true_position = truth.position[list(answer.frames)]
         scores.append(score(answer.scene, answer.position, true_position))
-        bands.append(float(answer.band.max()))
+        widths.append(float(answer.band.max()))
         error = (answer.position - true_position)[:, ~truth.scene.prescribed]
         errors.append(float(np.linalg.norm(error, axis=2).max()))
     rank = int(np.ceil((result.scenes + 1) * LEVEL - 1e-9))
     low, high = betabinom(len(scores), rank, result.scenes + 1 - rank).interval(0.99)
     return {
-        **{key: value for key, value in asdict(result).items() if key != "kept"},
+        "effort": effort.text,
+        "quantile": width,
         "fresh_scenes": len(scores),
-        "without_band": outside,
-        "held": sum(value <= result.quantile for value in scores),
+        "without_band": len(truths) - len(scores),
+        "held": sum(value <= width for value in scores),
         "held_interval_99": [int(low), int(high)],
-        "median_band": float(np.median(bands)),
+        "median_band": float(np.median(widths)),
         "median_largest_error": float(np.median(errors)),
     }
 
 
-def promises(run: ast_sim.Run, fresh: Path) -> dict[str, Any]:
+def strange(truths: Sequence[ast_sim.Trajectory]) -> dict[str, list[tuple[ast_sim.Scene, np.ndarray]]]:
+    """Questions by what is strange about them: each of these plates, changed."""
+    quarter = np.float32([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    upside_down = np.float32([[1, 0, 0], [0, -1, 0], [0, 0, -1]])
+    kinds: dict[str, list[tuple[ast_sim.Scene, np.ndarray]]] = {}
+    for truth in truths:
+        scene, motion = truth.scene, truth.position
+        way = motion - motion[:1]
+        held = scene.node_type == ast_sim.NodeType.HANDLE
+        one_end = held & (scene.rest_position[:, 0] > scene.rest_position[held, 0].mean())
+        for kind, question in {
+            "turned by 180 degrees: nothing strange": _turned(scene, motion, quarter @ quarter),
+            "turned by 90 degrees in its plane": _turned(scene, motion, quarter),
+            "pressed from below": _turned(scene, motion, upside_down),
+            "pressed sideways": (scene, motion[:1] + way[..., [2, 1, 0]]),
+            "twice the travel": (scene, motion[:1] + 2 * way),
+            "held at one end": (_free(scene, one_end), motion),
+            "held by nothing": (_free(scene, held), motion),
+        }.items():
+            kinds.setdefault(kind, []).append(question)
+    kinds["a beam in place of a plate"] = [_beam(height) for height in np.linspace(0.06, 0.14, len(truths))]
+    return kinds
+
+
+def _turned(scene: ast_sim.Scene, motion: np.ndarray, turn: np.ndarray) -> tuple[ast_sim.Scene, np.ndarray]:
+    return replace(scene, rest_position=scene.rest_position @ turn.T), motion @ turn.T
+
+
+def _free(scene: ast_sim.Scene, nodes: np.ndarray) -> ast_sim.Scene:
+    return replace(scene, node_type=np.where(nodes, ast_sim.NodeType.NORMAL, scene.node_type).astype(np.uint8))
+
+
+def _beam(height: float) -> tuple[ast_sim.Scene, np.ndarray]:
+    """A beam that is held at one end and pressed at the other, within the ranges of the plates."""
+    body = ast_sim.box((0, 0, 0), (0.5, 0.1, height), cells=(13, 3, 3))
+    kinds = np.where(body.rest_position[:, 0] == 0, ast_sim.NodeType.HANDLE, body.node_type).astype(np.uint8)
+    punch = ast_sim.box((0.4, 0.0, height + 0.01), (0.48, 0.1, height + 0.11), cells=(2, 2, 2))
+    rigid = replace(punch, node_type=np.full_like(punch.node_type, ast_sim.NodeType.OBSTACLE))
+    scene = ast_sim.Scene.join(replace(body, node_type=kinds), rigid)
+    motion = np.repeat(scene.rest_position[None], 2, axis=0)
+    motion[1, scene.body == 1] -= np.float32([0, 0, 0.06])
+    return scene, motion
+
+
+def unusual(run: ast_sim.Run, questions: Sequence[tuple[ast_sim.Scene, np.ndarray]]) -> dict[str, int]:
+    """Of so many questions, at the last frame by one call: those outside the ranges of the training, those that the
+    network finds unlike the calibration scenes, and those that are told by either."""
+    answers = [run.predict(*one, frames=[-1], effort=ast_sim.Effort(), throw=False) for one in questions]
+    unlike = [one.p_value is not None and one.p_value <= UNUSUAL for one in answers]
+    outside = [len(one.notes) > alike for one, alike in zip(answers, unlike, strict=True)]
+    return {
+        "questions": len(answers),
+        "outside": sum(outside),
+        "unlike": sum(unlike),
+        "told": sum(bool(one.notes) for one in answers),
+    }
+
+
+def promises(run: ast_sim.Run, truths: Sequence[ast_sim.Trajectory]) -> dict[str, Any]:
     """The errors that each effort of a calibrated run keeps; for asked ones the effort that is chosen, and in how many
     of the fresh scenes within its ranges it keeps them."""
     assert run.calibration is not None
     kept = run.calibration.kept
-    with ast_sim.Dataset(fresh) as data:
-        truths = [data["test"][index] for index in range(data.count("test"))]
     errors = []
     for truth in truths:
         frame = deepest_frame(truth)
@@ -108,24 +169,27 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--folder", type=Path, default=Path("build/coverage"), help="scenes (default: build/coverage)")
     folder = parser.parse_args(arguments).folder
-    files = {
-        name: ast_sim.generate("deforming_plate", folder / f"{name}.h5", seed=seed, **PLATES).path
-        for name, seed in SEEDS.items()
-    }
     run = ast_sim.example_run("plates")
-    rows = []
-    for effort in (ast_sim.Effort(), run.effort):
-        run.effort = effort
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # scenes outside the training are counted
-            rows.append(measured(run, files["calibration"], files["fresh"]))
-        print(f"{effort.text}: held in {rows[-1]['held']} of {rows[-1]['fresh_scenes']}", flush=True)
+    with ast_sim.Dataset(plates(folder, "fresh")) as data:
+        truths = [data["test"][index] for index in range(data.count("test"))]
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        asked = promises(run, files["fresh"])
+        warnings.simplefilter("ignore")  # what they tell is counted
+        calibration = ast_sim.calibrate(run, plates(folder, "calibration"), "test")
+        rows = [bands(run, truths, effort) for effort in calibration.efforts]
+        asked = promises(run, truths)
+        ordinary = [(truth.scene, truth.position) for truth in truths]
+        kinds = {"fresh plates": ordinary, **strange(truths[:40])}
+        told = {kind: unusual(run, questions) for kind, questions in kinds.items()}
+    for row in rows:
+        print(f"{row['effort']}: held in {row['held']} of {row['fresh_scenes']}")
     for one in asked["promises"]:
         print(f"{one['quantity']} {one['error']:g}: {one.get('effort', one.get('refused'))}: {one.get('held')}")
-    write_json(RESULTS, {**provenance("python -m benchmarks.studies.coverage"), "rows": rows, **asked})
+    for kind, counts in told.items():
+        print(f"{kind}: {counts['told']} of {counts['questions']} told, {counts['unlike']} by the network")
+    known = {"calibration_scenes": calibration.scenes, "spacing": list(calibration.spacing)}
+    write_json(
+        RESULTS, {**provenance("python -m benchmarks.studies.coverage"), **known, "rows": rows, **asked, "told": told}
+    )
 
 
 if __name__ == "__main__":

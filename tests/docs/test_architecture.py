@@ -82,6 +82,6 @@ def test_from_a_scene_to_an_answer(run):
         state = State(position, None, torch.zeros(scene.num_nodes, 1))
         with torch.inference_mode():
             batch = Batch.build(graph, state, prescribed, ["scene"])
-            position, fields = run.model.advance(batch, prescribed)
+            position, prediction = run.model.advance(batch, prescribed)
     assert np.array_equal(position.numpy()[None], answer.position)
-    assert np.array_equal(fields["stress"].numpy()[None], answer.stress)
+    assert np.array_equal(prediction.fields["stress"].numpy()[None], answer.stress)

@@ -61,8 +61,8 @@ def test_the_calibration_is_the_score_of_the_rank(calibrated):
     pairs = [(answer, truth) for truth in asked if not (answer := run.predict(truth)).notes]
     answers, truths = zip(*pairs, strict=True)
     scores = [score(a.scene, a.position, t.position) for a, t in zip(answers, truths, strict=True)]
-    assert 19 <= len(scores) == result.scenes <= 24 and result.quantile == max(scores)  # of up to 38 the last
-    assert answers[0].band == pytest.approx(result.quantile * scales(truths[0].scene, answers[0].position))
+    assert 19 <= len(scores) == result.scenes <= 24 and result.quantiles == (max(scores),)  # of up to 38 the last
+    assert answers[0].band == pytest.approx(result.quantiles[0] * scales(truths[0].scene, answers[0].position))
     assert f"band: with 95 % all free nodes lie within {answers[0].band.max():.3g} m" in answers[0].how_far[-1]
 
 
@@ -73,18 +73,34 @@ def test_a_run_keeps_its_calibration_and_so_does_its_file(calibrated, tmp_path):
     assert ast_sim.Run(tmp_path / "toy.ast").calibration == result
 
 
+def test_a_file_is_calibrated_by_saving_it_once_more_and_keeps_its_licence(calibrated, tmp_path):
+    run, data, result = calibrated
+    ast_sim.Run(run.path).save(tmp_path / "toy.ast", "for tests only")
+    opened = ast_sim.Run(tmp_path / "toy.ast")
+    before = (tmp_path / "toy.ast").read_bytes()
+    opened.folder.keep_calibration({**result.to_json(), "scenes": 77})
+    opened.save(tmp_path / "again.ast")
+    assert (tmp_path / "toy.ast").read_bytes() == before
+    again = ast_sim.Run(tmp_path / "again.ast")
+    assert again.calibration == replace(result, scenes=77) and again.folder.licence == "for tests only"
+    with pytest.warns(UserWarning, match="toy.ast is a file, which is not changed: Run.save writes one with the band"):
+        assert ast_sim.calibrate(opened, data, "test") == result
+
+
 def test_no_band_where_nothing_is_known(calibrated):
     run, data, result = calibrated
     with ast_sim.Dataset(data) as dataset:
         asked = [dataset["test"][index] for index in range(24)]
     answer = next(answer for truth in asked if not (answer := run.predict(truth)).notes)
-    for other, notes, words in (
-        (replace(result, effort=Effort(3)), (), "no band: the run was calibrated with 3 corrections"),
-        (result, ("it is large",), "no band: the scene lies outside the ranges of the training"),
-        (replace(result, spacing=(1.0, 2.0)), (), "no band: the mesh edges are .* in the calibration scenes 1 to 2"),
+    assert result.band(answer, run.effort, ()) is not None
+    assert result.band(answer, run.effort, ("it is large",)) is None  # which is told already
+    for other, words in (
+        (replace(result, efforts=(Effort(3),)), "no band: the run was calibrated with 3 corrections"),
+        (replace(result, quantiles=(np.inf,)), "no band: too many calibration scenes failed with 0 corrections"),
+        (replace(result, spacing=(1.0, 2.0)), "no band: the mesh edges are .* in the calibration scenes 1 to 2"),
     ):
         with pytest.warns(UserWarning, match=words):
-            assert other.band(answer, run.effort, notes) is None
+            assert other.band(answer, run.effort, ()) is None
 
 
 def test_what_cannot_be_calibrated_is_refused(calibrated):

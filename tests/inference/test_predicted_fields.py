@@ -168,8 +168,6 @@ def test_an_evaluation_has_their_errors(run, data):
 
 
 def test_a_model_that_predicts_the_stress_alone_is_refused(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        Prediction, "of", lambda facts, out, on_elements=None: Prediction(out[:, :3], {"stress": out[:, 3:4]})
-    )
+    monkeypatch.setattr(Prediction, "of", lambda facts, out, *_: Prediction(out[:, :3], {"stress": out[:, 3:4]}))
     with pytest.raises(ConfigError, match="the model transolver does not predict PEEQ: leave it out"):
         ast_sim.train(data, tmp_path / "run", model="transolver", steps=1, state=("PEEQ",))

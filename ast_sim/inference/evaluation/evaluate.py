@@ -134,10 +134,10 @@ def one_step_predictions(model: Simulator, truth: Trajectory, name: str) -> tupl
         for first in range(0, len(starts), chunk):
             predicted += predict_batch(model, starts[first : first + chunk])
     fields = {
-        output.name: np.array([fields[output.name].numpy() for _, fields, _ in predicted])
+        output.name: np.array([frame.fields[output.name].numpy() for frame in predicted])
         for output in model.config.data.outputs
     }
-    return np.array([positions[0].numpy() for positions, *_ in predicted]), fields
+    return np.array([frame.positions[0].numpy() for frame in predicted]), fields
 
 
 def _scene_figures(

@@ -8,7 +8,8 @@ model is (Vovk, Gammerman, Shafer 2005; Angelopoulos, Bates 2023, section 1). It
 fresh scenes. The calibration scenes must not have trained or chosen the model; so nothing needs to be crossed, and n
 scores are enough from the n on for which the rank is at most n.
 
-What errors the answers keep, and which effort is enough for an asked one: `kept_errors`.
+What errors the answers keep, and which effort is enough for an asked one: `kept_errors`. Whether a scene is like the
+calibration scenes: `familiarity`.
 """
 
 from __future__ import annotations
@@ -19,16 +20,17 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
 from ast_sim.inference.answer import LEVEL
 from ast_sim.inference.effort import Effort, choices
+from ast_sim.inference.promises.familiarity import Familiarity
 from ast_sim.inference.promises.kept_errors import KEPT, KeptErrors
 from ast_sim.inference.relative_errors import moves
 from ast_sim.runs.scope import LEEWAY, size_of, spacing_of
-from ast_sim.scene import Scene
+from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.jobs.rival import deepest_frame
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.progress import Progress
@@ -44,28 +46,32 @@ FEWEST = math.ceil(LEVEL / (1 - LEVEL) - 1e-9)  # scenes with which the rank of 
 
 @dataclass(frozen=True)
 class Calibration:
-    """What the calibration scenes say of the answers of a run with one effort.
+    """What the calibration scenes say of the answers of a run.
 
     Attributes:
-        quantile: q, the width of the band over the scale.
         scenes: the number of calibration scenes.
-        effort: the effort of the answers.
+        efforts: the efforts that have a band, from the cheapest to the dearest.
+        quantiles: q of each, the width of the band over the scale; infinite where too many predictions failed.
         spacing: (lowest, highest) mean length of the mesh edges of the deforming bodies in these scenes.
         kept: the errors of these scenes after each effort.
+        familiarity: these scenes as the network sees them; None: the model does not tell.
     """
 
-    quantile: float
     scenes: int
-    effort: Effort
+    efforts: tuple[Effort, ...]
+    quantiles: tuple[float, ...]
     spacing: tuple[float, float]
     kept: KeptErrors = field(default_factory=KeptErrors, repr=False)
+    familiarity: Familiarity | None = field(default=None, repr=False)
 
     @property
     def text(self) -> str:
-        """The band in words."""
+        """The bands and the kept errors in words."""
+        bands = zip(self.quantiles, self.efforts, strict=True)
+        widths = [f"{width:.3g} with {effort.text}" for width, effort in bands if math.isfinite(width)]
         return (
-            f"band: with {100 * LEVEL:g} % all free nodes of all frames lie within {self.quantile:.3g} times the root"
-            f" mean square displacement of the frame, by {self.scenes} scenes ({self.effort.text}){self._kept}"
+            f"band: with {100 * LEVEL:g} % all free nodes of all frames lie within so many root mean square"
+            f" displacements of the frame, by {self.scenes} scenes: {'; '.join(widths)}{self._kept}"
         )
 
     @property
@@ -81,35 +87,61 @@ class Calibration:
 
     def to_json(self) -> dict[str, Any]:
         """As `from_json` reads it."""
-        return {**asdict(self), "spacing": list(self.spacing), "kept": self.kept.to_json()}
+        familiarity = None if self.familiarity is None else self.familiarity.to_json()
+        return {
+            "scenes": self.scenes,
+            "efforts": [asdict(effort) for effort in self.efforts],
+            "quantiles": [width if math.isfinite(width) else None for width in self.quantiles],
+            "spacing": list(self.spacing),
+            "kept": self.kept.to_json(),
+            "familiarity": familiarity,
+        }
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self:
         low, high = values["spacing"]
-        kept = KeptErrors.from_json(values["kept"]) if "kept" in values else KeptErrors()
-        return cls(values["quantile"], values["scenes"], Effort(**values["effort"]), (low, high), kept)
+        known = values["familiarity"]
+        return cls(
+            values["scenes"],
+            tuple(Effort(**one) for one in values["efforts"]),
+            tuple(math.inf if width is None else width for width in values["quantiles"]),
+            (low, high),
+            KeptErrors.from_json(values["kept"]),
+            None if known is None else Familiarity.from_json(known),
+        )
 
     def unlike(self, scene: Scene, notes: Sequence[str]) -> str:
         """Why the calibration scenes say nothing of a scene with `notes`; empty if they do."""
         spacing = spacing_of(scene)
         low, high = self.spacing
         if notes:
-            return "the scene lies outside the ranges of the training"
+            return "the scene is unlike those that the run knows"
         if not (1 - LEEWAY) * low <= spacing <= (1 + LEEWAY) * high:
             return f"the mesh edges are {spacing:.3g} long, in the calibration scenes {low:.3g} to {high:.3g}"
         return ""
 
+    def compared(self, answer: Answer) -> tuple[float | None, tuple[str, ...]]:
+        """The p-value of the scene of an answer, None if it is not known, and a note if the scene is unlike these."""
+        p_value = None if self.familiarity is None else self.familiarity.p_value(answer)
+        return p_value, () if self.familiarity is None or p_value is None else self.familiarity.notes(p_value)
+
     def band(self, answer: Answer, effort: Effort, notes: Sequence[str]) -> np.ndarray | None:
-        """[S] how far from the truth a free node may be in each frame; None, and a warning that says why, where nothing
-        is known: with another effort, for a scene with `notes`, on another mesh."""
-        if effort != self.effort:
-            why = f"the run was calibrated with {self.effort.text}"
+        """[S] how far from the truth a free node may be in each frame; None where nothing is known: for a scene with
+        `notes`, which are warnings already; and with a warning that says why, with another effort and on another
+        mesh."""
+        if notes:
+            return None
+        width = dict(zip(self.efforts, self.quantiles, strict=True)).get(effort)
+        if width is None:
+            why = f"the run was calibrated with {'; '.join(one.text for one in self.efforts)}"
+        elif math.isinf(width):
+            why = f"too many calibration scenes failed with {effort.text}"
         else:
-            why = self.unlike(answer.scene, notes)
-        if not why:
-            return self.quantile * scales(answer.scene, answer.position)
-        warnings.warn(f"{answer.name}: no band: {why}", stacklevel=4)
-        return None
+            why = self.unlike(answer.scene, ())
+        if why or width is None:
+            warnings.warn(f"{answer.name}: no band: {why}", stacklevel=4)
+            return None
+        return width * scales(answer.scene, answer.position)
 
 
 def scales(scene: Scene, position: np.ndarray) -> np.ndarray:
@@ -141,14 +173,15 @@ def quantile(scores: Sequence[float]) -> float:
 def calibrate(
     run: Run, data: str | os.PathLike[str] | Dataset | None = None, split: str = "calibration"
 ) -> Calibration:
-    """Measure how far the answers of a run's default effort are from the truth; then each of its answers has a band.
+    """Measure how far the answers of a run are from the truth, after its default effort and each effort among which one
+    is chosen for an asked error; then answers with these efforts have a band.
 
     The scenes must be new to the run: they have neither trained nor chosen it. Scenes outside the ranges of the
     training do not count, since no band is given there; neither do those without motion. A warning says how many. The
     folder of a run keeps the result beside its best checkpoint, and `Run.save` takes it along.
 
     Args:
-        run: the run. If it is a file, only this object knows the band.
+        run: the run. A file is not changed: only this object knows the band, and a file that `run.save` writes of it.
         data: a dataset, its path or open; by default the one that the run was trained on.
         split: whose scenes are predicted.
 
@@ -159,47 +192,85 @@ def calibrate(
         known = Path(run.settings.data).resolve() == dataset.path.resolve()
         if known and split in ("train", "valid"):
             raise ConfigError(f"the scenes of {split} have trained or chosen the run: calibrate with other scenes")
-        run.calibration, left_out = _measured(run, dataset, split)
+        before, run.calibration = run.calibration, None  # it has no say in which scenes count
+        try:
+            result, left_out = _measured(run, dataset, split)
+        except BaseException:
+            run.calibration = before
+            raise
+    run.calibration = result
     if left_out:
         told = f"{len(left_out)} scenes lie outside the training or do not move, the first is {left_out[0]}"
         warnings.warn(f"{told}: they do not count", stacklevel=2)
-    if run.path.is_dir():
-        run.folder.keep_calibration(run.calibration.to_json())
-    else:
-        warnings.warn(f"{run.path} is a file, which is not changed: only this program knows the band", stacklevel=2)
-    return run.calibration
+    run.folder.keep_calibration(result.to_json())
+    if run.path.is_file():
+        warnings.warn(f"{run.path} is a file, which is not changed: Run.save writes one with the band", stacklevel=2)
+    return result
+
+
+class _Measured(NamedTuple):
+    """A calibration scene.
+
+    Attributes:
+        scores: of all frames, for each effort with a band; infinite where the prediction failed.
+        errors: of the deepest frame, for each effort among which one is chosen; None where the prediction failed.
+        spacing: as `Calibration` has it.
+        latents: [frames, D]; None: the model does not tell.
+    """
+
+    scores: list[float]
+    errors: list[dict[str, float] | None]
+    spacing: float
+    latents: np.ndarray | None
 
 
 def _measured(run: Run, dataset: Dataset, split: str) -> tuple[Calibration, list[str]]:
     """The calibration by the scenes of a split, and the names of those that do not count."""
-    scores: list[float] = []
-    spacings: list[float] = []
+    to_choose = choices(run.settings.model, run.settings.train.calls)
+    efforts = to_choose if run.effort in to_choose else (*to_choose, run.effort)
+    scenes: list[_Measured] = []
     left_out: list[str] = []
-    efforts = choices(run.settings.model, run.settings.train.calls)
-    errors: list[list[dict[str, float] | None]] = [[] for _ in efforts]
     fields = [name for name, *_ in run.settings.model.data.fields]
     with Progress(dataset.count(split), 0, "scenes") as bar, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what they tell is counted here
         for index in range(dataset.count(split)):
             bar.advance()
-            truth = dataset.load(split, index, fields)
             name = f"{split}/{index:06d}"
-            answer = run.predict(truth, throw=False, name=name) if moves(truth) else None
-            if answer is None or answer.notes:
+            one = _measured_scene(run, dataset.load(split, index, fields), name, efforts, to_choose)
+            if one is None:
                 left_out.append(name)
-                continue
-            true_position = truth.position[list(answer.frames)]
-            failed = answer.failure is not None
-            scores.append(math.inf if failed else score(answer.scene, answer.position, true_position))
-            spacings.append(spacing_of(truth.scene))
-            for effort, of_scenes in zip(efforts, errors, strict=True):
-                deepest = run.predict(truth, frames=deepest_frame(truth), effort=effort, throw=False, name=name)
-                of_scenes.append(None if deepest.failure is not None else deepest.errors(truth))
-    width = quantile(scores)
-    if math.isinf(width):
-        raise ConfigError(f"{scores.count(math.inf)} of {len(scores)} predictions failed: no band holds")
-    spacing = min(spacings), max(spacings)
-    return Calibration(width, len(scores), run.effort, spacing, _kept_errors(efforts, errors)), left_out
+            else:
+                scenes.append(one)
+    scores = list(zip(*(one.scores for one in scenes), strict=True)) or [()]
+    quantiles = tuple(quantile(of_effort) for of_effort in scores)
+    if all(map(math.isinf, quantiles)):
+        failed = min(of_effort.count(math.inf) for of_effort in scores)
+        raise ConfigError(f"{failed} of {len(scenes)} predictions failed: no band holds")
+    spacings = [one.spacing for one in scenes]
+    latents = [one.latents for one in scenes if one.latents is not None]
+    familiarity = Familiarity.of(latents) if len(latents) >= FEWEST else None
+    kept = _kept_errors(to_choose, [list(of_effort) for of_effort in zip(*(one.errors for one in scenes), strict=True)])
+    return Calibration(len(scenes), efforts, quantiles, (min(spacings), max(spacings)), kept, familiarity), left_out
+
+
+def _measured_scene(
+    run: Run, truth: Trajectory, name: str, efforts: Sequence[Effort], to_choose: Sequence[Effort]
+) -> _Measured | None:
+    """A calibration scene; None: nothing moves in it, or it lies outside the training."""
+    if not moves(truth):
+        return None
+    answers = [run.predict(truth, effort=effort, throw=False, name=name) for effort in efforts]
+    if answers[0].notes:
+        return None
+    scores = [
+        math.inf if one.failure is not None else score(one.scene, one.position, truth.position[list(one.frames)])
+        for one in answers
+    ]
+    deepest = deepest_frame(truth)
+    alone = [run.predict(truth, frames=deepest, effort=effort, throw=False, name=name) for effort in to_choose]
+    errors = [None if one.failure is not None else one.errors(truth) for one in alone]
+    latents = np.stack(list(answers[0].latents.values())) if answers[0].latents else None
+    return _Measured(scores, errors, spacing_of(truth.scene), latents)
 
 
 def _kept_errors(efforts: Sequence[Effort], errors: Sequence[Sequence[Mapping[str, float] | None]]) -> KeptErrors:

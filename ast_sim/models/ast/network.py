@@ -25,7 +25,7 @@ from ast_sim.models.ast.transformer import AttentionBlock, Vectors
 from ast_sim.models.layers import MLP, Linear
 from ast_sim.models.node_inputs import edge_features, element_features, node_features, normalizer_of
 from ast_sim.models.normalizer import Normalizer
-from ast_sim.models.simulator import Prediction, Simulator, Use
+from ast_sim.models.simulator import Latent, Prediction, Simulator, Use
 from ast_sim.ops import farthest_point_sample, segment_mean
 from ast_sim.scene import Scene
 
@@ -113,15 +113,17 @@ class AST(Simulator):
         tokens = self._tokens(cells, coarse)
         if self.config.exchanges:
             nodes = Vectors(mesh, batch.graph.node_offsets, rotations(places(self.config, now), self.config.head_dim))
-            mesh = self._exchange(nodes, tokens)
+            mesh, tokens = self._exchange(nodes, tokens)
         else:
-            mesh = self._back_to_mesh(cells, self.to_cells(coarse, self.processor(tokens)).x, mesh)
+            tokens = self.processor(tokens)
+            mesh = self._back_to_mesh(cells, self.to_cells(coarse, tokens).x, mesh)
         for step in self.after_cells:
             mesh = step(edges, mesh, mesh, on_edges)
 
         wanted = self.config.data.output_columns("element") and batch.wants_elements
         on_elements = self.element_decoder(self.m2e(batch.graph.m2e, mesh, elements)) if wanted else None
-        return Prediction.of(self.config.data, self.decoder(mesh, beside=encoded), on_elements)
+        latent = Latent(tokens.x, tokens.offsets)
+        return Prediction.of(self.config.data, self.decoder(mesh, beside=encoded), on_elements, latent)
 
     def _embedded(self, cells: Cells, mesh: Tensor) -> Vectors:
         """Mesh features [N, hidden] -> the coarsest cells [C, d_token] with their places."""
@@ -142,15 +144,15 @@ class AST(Simulator):
         turned = None if coarse.rotations is None else coarse.rotations.index_select(0, chosen)
         return self.to_tokens(Vectors(coarse.x.index_select(0, chosen), offsets, turned), coarse)
 
-    def _exchange(self, nodes: Vectors, tokens: Vectors) -> Tensor:
-        """Nodes and tokens attend to each other in turn -> mesh features [N, hidden]."""
+    def _exchange(self, nodes: Vectors, tokens: Vectors) -> tuple[Tensor, Vectors]:
+        """Nodes and tokens attend to each other in turn -> mesh features [N, hidden], and the last tokens."""
         blocks, times = len(self.processor), len(self.to_nodes)
         for i, to_nodes in enumerate(self.to_nodes):
             if i:
                 tokens = self.from_nodes[i - 1](tokens, nodes)
             tokens = self.processor[blocks * i // times : blocks * (i + 1) // times](tokens)
             nodes = to_nodes(nodes, tokens)
-        return nodes.x
+        return nodes.x, tokens
 
     def _back_to_mesh(self, cells: Cells, x: Tensor, mesh: Tensor) -> Tensor:
         """The coarsest cells [C, d_token] and mesh features [N, hidden] -> mesh features [N, hidden]."""
