@@ -233,6 +233,8 @@ def _add_predict(predict: Parser) -> None:
         " likewise; 0 with --corrections)",
     }
     add_each(predict, efforts, type=at_least(0))
+    about = "have the solver go on to its own stop test, from the answer of the run; with friction, from rest"
+    predict.add_argument("--exact", action="store_true", help=about)
     _add_errors(predict)
     about = "instead: the most accurate effort that takes at most so many milliseconds on this machine"
     add_each(predict, {"--ms T": about}, type=float)
@@ -290,6 +292,7 @@ def _add_sweep(sweep: Parser) -> None:
     about = "what the picture shows (default: reaction)"
     sweep.add_argument("--quantity", choices=("reaction", "largest_stress"), default="reaction", help=about)
     add_each(sweep, {"--corrections N": "as for predict", "--newton-steps N": "as for predict"}, type=at_least(0))
+    sweep.add_argument("--exact", action="store_true", help="as for predict")
     _add_errors(sweep)
     add_each(sweep, {"--nodes N": "approximate number of nodes (default: by the sizes)"}, type=at_least(1))
 

@@ -181,7 +181,7 @@ class Figures:
         errors: over all scenes.
         failures: how many predictions failed.
         jumps: whether the model predicts each frame from the first one, so that its "one_step" is its rollout.
-        effort: what follows the first call of such a model: `corrections`, `newton_steps`.
+        effort: what follows the first call of such a model: `corrections`, `newton_steps`, `solved`.
         asked: the deepest frames.
         speedup: the solver's recorded time for all frames over the model's, both on one thread; None: not known.
         length_unit, stress_unit: of the errors.
@@ -194,7 +194,7 @@ class Figures:
     errors: tuple[MeanError, ...]
     failures: int
     jumps: bool
-    effort: Mapping[str, int]
+    effort: Mapping[str, Any]
     asked: AskedFigures
     speedup: float | None
     length_unit: str

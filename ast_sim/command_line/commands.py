@@ -189,7 +189,7 @@ def predict(args: argparse.Namespace) -> None:
         check_output(args, args.forces, [args.scene, args.out], "a table of forces", ".csv")
     moves = dict(map(parse_move, args.move))
     run = open_run(args.run_folder)
-    effort = run.effort.asked(args.corrections, args.newton_steps)
+    effort = run.effort.asked(args.corrections, args.newton_steps, args.exact)
     wanted = {"frames": args.frames, "effort": effort, "error": dict(args.error) or None, "ms": args.ms, "throw": False}
     if args.scene.suffix == ".toml":
         _predict_spec(run, args, wanted)
@@ -245,7 +245,7 @@ def sweep(args: argparse.Namespace) -> None:
         values,
         table=args.table,
         nodes=args.nodes,
-        effort=run.effort.asked(args.corrections, args.newton_steps),
+        effort=run.effort.asked(args.corrections, args.newton_steps, args.exact),
         error=dict(args.error) or None,
     )
     swept.save(args.out)

@@ -64,8 +64,7 @@ class Answer:
     """The S wanted frames of a prediction, in the order in which they were asked for. After a failure some are missing.
 
     Attributes:
-        name: name of the scene, for messages.
-        scene: the scene that was predicted.
+        name, scene: of the question.
         position: [S, N, 3] float32, in the run's unit of length.
         stress: [S, N or E, 1] float32 in pascal, or None. A given frame holds the given stress, or zero without one.
         given: how many first frames of the motion were given: 1, or 2 in dynamic scenes.
@@ -82,13 +81,12 @@ class Answer:
         p_value: how usual the scene is beside the calibration scenes, up to 1; a note tells one of 0.05 or less.
         expected_error: the mean relative error of the displacement of validation scenes, at their deepest frame, with
             the same effort. It is no bound for this scene. None: the run did not measure it, or there are notes.
-        last_steps: of each computed frame, in ascending order, the size of its last Newton step: the largest component
-            of a node's move, in mean edge lengths of the surfaces, or the root mean square of the moves over that of
-            the displacements, if that is larger. A next step would be about its square. Empty without Newton steps.
+        last_steps: of each computed frame, in ascending order, the size of its last Newton step (`NewtonSteps.size`);
+            a next step would be about its square. 0 after the solver; empty without Newton steps.
         driven: the prescribed nodes that move farthest together in the whole motion.
         law: the law of the material and of contact, as the run knows it.
-        fields: the named fields that the model predicts, [S, N or E, *] each with its unit. Newton steps do not change
-            them. A given frame holds the given values, or zero.
+        fields: the named fields that the model predicts, [S, N or E, *] each with its unit; a given frame holds zero,
+            or what was given. Newton steps do not change them.
         band: [S], with a probability of 95 % all free nodes of all frames lie within this distance of the truth
             (`calibration`). None: the run was not calibrated, or a warning has said why.
     """
@@ -121,6 +119,7 @@ class Answer:
         told = []
         if "promise" in self.source:
             told.append(f"effort: {self.source['effort']}, {self.source['promise']}")
+        told += [self.source["solved"]] if "solved" in self.source else []
         if self.expected_error is not None:
             percent = f"{100 * self.expected_error:.2g} % of the displacement"
             told.append(f"expected error: {percent}, as in the validation scenes at their deepest frame")

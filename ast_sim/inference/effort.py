@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from statistics import fmean
 from typing import Any, Self
 
 import numpy as np
 
+from ast_sim.material import FRICTION
 from ast_sim.mechanics.linearised_contact import NewtonSteps
 from ast_sim.mechanics.physics_check import Law
 from ast_sim.models.model_config import ModelConfig
@@ -20,6 +21,7 @@ GOOD = 0.02  # a relative error that most users call exact
 GOOD_STRESS = 0.1  # the same of the stress, relative to the error of its mean
 MOST_NEWTON_STEPS = 10  # by default; they end earlier where one is small
 AGAIN = 2  # a frame in which so many Newton steps did not end is begun anew with so many more corrections
+STEPS_BEFORE_SOLVER = 2  # more hardly bring it nearer to equilibrium (docs/log.md, 2026-11-27)
 CHOSEN_STEPS = (0, 1, 2, MOST_NEWTON_STEPS)  # among these numbers of Newton steps an effort is chosen
 WORTH = 0.05  # a correction or a Newton step must lower an error that is not good by this share
 
@@ -33,6 +35,8 @@ class Effort:
         newton_steps: at most how many Newton steps of the solver then lead towards equilibrium. They end when a step is
             at most `STILL`. Where `MOST_NEWTON_STEPS` or more do not end, they begin anew after more corrections.
             Stress then follows from the material.
+        solved: the bundled solver then goes on to its own stop test; with friction, and where bodies still overlap, it
+            goes the way of the load from rest, frame by frame, as if there were no model.
 
     Raises:
         ConfigError: a number is not whole or negative.
@@ -40,30 +44,54 @@ class Effort:
 
     corrections: int = 0
     newton_steps: int = 0
+    solved: bool = False
+
+    @classmethod
+    def exact(cls) -> Self:
+        """The effort whose answers end where the solver's stop test holds. A scene with several equilibria may end in
+        another one than along the way of the load."""
+        return cls(newton_steps=STEPS_BEFORE_SOLVER, solved=True)
 
     def __post_init__(self) -> None:
-        for key, count in asdict(self).items():
+        for key, count in self._counts.items():
             if not isinstance(count, int | np.integer) or isinstance(count, bool):
                 raise ConfigError(f"{key} is {count!r}; it must be a whole number")
             if count < 0:
                 raise ConfigError(f"{key} is {count}; it must be at least 0")
 
     @property
+    def _counts(self) -> dict[str, int]:
+        return {"corrections": self.corrections, "newton_steps": self.newton_steps}
+
+    @property
     def text(self) -> str:
-        """Such as "2 corrections, up to 1 Newton step"."""
+        """Such as "2 corrections, up to 1 Newton step, then the solver"."""
         parts = [(self.corrections, "correction"), (self.newton_steps, "Newton step")]
         told = [f"{n} {what}{'' if n == 1 else 's'}" for n, what in parts if n or what == "correction"]
-        return ", up to ".join(told)
+        return ", up to ".join(told) + (", then the solver" if self.solved else "")
 
-    def asked(self, corrections: int | None, newton_steps: int | None) -> Effort | None:
-        """What is asked instead of this default: corrections alone mean no Newton step; None: nothing is asked."""
+    def asked(self, corrections: int | None, newton_steps: int | None, exact: bool) -> Effort | None:
+        """What is asked instead of this default: corrections alone mean no Newton step; None: nothing is asked.
+
+        Raises:
+            ConfigError: numbers are given for an exact answer.
+        """
+        if exact:
+            if corrections is not None or newton_steps is not None:
+                raise ConfigError("an exact answer needs no numbers: leave --corrections and --newton-steps out")
+            return Effort.exact()
         if corrections is None and newton_steps is None:
             return None
         return Effort(self.corrections if corrections is None else corrections, newton_steps or 0)
 
     def check(self, config: ModelConfig) -> None:
         """Raise ConfigError if the model cannot make this effort."""
-        for key, count in asdict(self).items():
+        if self.solved and not (can_make_newton_steps(config) and config.data.contact_range):
+            raise ConfigError(
+                "an exact answer needs a run that jumps, tetrahedra, a known law of the material, and the range of"
+                " contact that the solver recorded with the dataset"
+            )
+        for key, count in self._counts.items():
             if count and not config.jumps:
                 raise ConfigError(f"{key} is {count}; it needs a run that jumps, and this one does not")
         if self.newton_steps and not config.data.tetrahedra:
@@ -130,11 +158,20 @@ def can_make_newton_steps(config: ModelConfig) -> bool:
 
 def choices(config: ModelConfig, calls: int | None) -> tuple[Effort, ...]:
     """The efforts among which one is chosen for an asked error or time, from the cheapest to the dearest, for a model
-    that was trained for so many calls: a Newton step costs more than a correction. None for one that does not jump."""
+    that was trained for so many calls: a Newton step costs more than a correction, and the solver most. With friction
+    the solver is left to be asked for: it takes its whole way. None for a model that does not jump."""
     if not config.jumps:
         return ()
-    steps = CHOSEN_STEPS if can_make_newton_steps(config) else (0,)
-    return tuple(Effort(corrections, count) for count in steps for corrections in range(calls or 1))
+    known_law = can_make_newton_steps(config)
+    steps = CHOSEN_STEPS if known_law else (0,)
+    efforts = tuple(Effort(corrections, count) for count in steps for corrections in range(calls or 1))
+    frictionless = not config.data.friction and FRICTION not in config.data.columns
+    return (*efforts, Effort.exact()) if known_law and config.data.contact_range and frictionless else efforts
+
+
+def law_of(config: ModelConfig) -> Law:
+    """The law of the training scenes."""
+    return Law(config.data.material, config.data.contact_range)
 
 
 def newton_steps(config: ModelConfig, scene: Scene) -> NewtonSteps:
@@ -144,7 +181,7 @@ def newton_steps(config: ModelConfig, scene: Scene) -> NewtonSteps:
         ConfigError: the law of the material is not known.
         SimulationError: the constants of the material are not allowed, or an element has no volume.
     """
-    return Law(config.data.material, config.data.contact_range).newton_steps(scene)
+    return law_of(config).newton_steps(scene)
 
 
 def cheapest_good(measured: Sequence[EffortErrors]) -> Effort:

@@ -3,7 +3,7 @@
 The start is the first frame, carried along by the prescribed nodes. Each call of the model gets the answer of the call
 before and predicts what is missing. Newton steps of the solver may follow. The model predicts the frames of all scenes
 side by side, in ragged batches. With friction, Newton steps know the way of the load as far as the frames before are
-wanted, too; in all else a frame does not depend on the others.
+wanted, too; in all else a frame does not depend on the others. The bundled solver may end an answer (`Effort.solved`).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from itertools import takewhile
 from typing import NamedTuple
 
@@ -23,9 +23,10 @@ from ast_sim.batches.batch_builder import State
 from ast_sim.batches.carry import Carrier
 from ast_sim.batches.graph import Graph
 from ast_sim.inference.answer import Answer
-from ast_sim.inference.effort import AGAIN, MOST_NEWTON_STEPS, Effort, newton_steps
+from ast_sim.inference.effort import AGAIN, MOST_NEWTON_STEPS, Effort, law_of, newton_steps
 from ast_sim.inference.predict_batch import Start, predict_batch
 from ast_sim.inference.question import Question, not_finite, too_far
+from ast_sim.mechanics.equilibria import Equilibria
 from ast_sim.mechanics.linearised_contact import STILL, NewtonSteps
 from ast_sim.models.simulator import Simulator
 from ast_sim.named_field import STRESS
@@ -121,6 +122,8 @@ def _predicted(
             frame.refine(effort.newton_steps, whole_way)
             if not whole_way and effort.newton_steps >= MOST_NEWTON_STEPS and frame.unsettled:
                 _start_again(model, frame, effort)
+        for frame in (frame for scene in scenes for frame in scene.frames if effort.solved):
+            frame.solve()
     return scenes
 
 
@@ -147,6 +150,7 @@ class _Frame:
     fields: list[dict[str, Tensor]] = field(default_factory=list)
     last_step: float | None = None
     latent: np.ndarray | None = None
+    walked: bool | None = None  # whether the solver went the way of the load; None: it was not asked
     seconds: float = 0.0
     failure: str | None = None
 
@@ -184,6 +188,24 @@ class _Frame:
             self.failure = f"{self.start.name}: a Newton step failed: {error}"
         self.seconds += time.perf_counter() - began
 
+    def solve(self) -> None:
+        """Have the solver go on to its stop test, from where the Newton steps have ended, if they have not failed."""
+        if not self.positions:  # the model has failed
+            return
+        began = time.perf_counter()
+        location = self.scene.model.config.data.stress
+        start = _array(self.positions[-1]) if self.failure is None else None
+        try:
+            position, self.walked = self.scene.equilibria.solve(self.number, start)
+            self.failure, self.last_step = None, 0.0
+            self.positions.append(torch.from_numpy(position.astype(np.float32)))
+            if location != "none":
+                stress = self.scene.solver(self.scene.question.scene).von_mises(position, location)
+                self.fields.append({**self.fields[-1], STRESS: torch.from_numpy(stress)})
+        except SimulationError as error:
+            self.failure = f"{self.start.name}: the solver found no equilibrium: {error}"
+        self.seconds += time.perf_counter() - began
+
 
 @dataclass(eq=False)
 class _JumpingScene:
@@ -209,6 +231,11 @@ class _JumpingScene:
                 start = Start(f"{question.name} frame {number}", self.graph, state, self.prescribed_position[number])
                 self.frames.append(_Frame(self, number, start))
 
+    @cached_property
+    def equilibria(self) -> Equilibria:
+        """What the solver finds in this scene."""
+        return Equilibria(self.question.scene, law_of(self.model.config), self.question.prescribed_position)
+
     def settled(self, number: int) -> np.ndarray | None:
         """The positions [N, 3] of a wanted frame that is given or has had its Newton steps, else None."""
         if number < self.given:
@@ -232,7 +259,17 @@ class _JumpingScene:
             self.failure and f"{self.failure}; the frames before it are kept",
             {frame.number: frame.latent for frame in predicted},
             tuple(frame.last_step for frame in predicted if frame.last_step is not None),
+            _solved(predicted),
         )
+
+
+def _solved(frames: Sequence[_Frame]) -> dict[str, str]:
+    """How the solver reached the frames, as a fact of an answer; empty if it was not asked."""
+    ways = {frame.walked for frame in frames} - {None}
+    if not ways:
+        return {}
+    way = "along the way of the load, frame by frame" if True in ways else "from the answer of the model"
+    return {"solved": f"solved to the stop test of the solver, {way}"}
 
 
 def _array(positions: Tensor) -> np.ndarray:

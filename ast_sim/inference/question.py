@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 from ast_sim.inference.answer import Answer
+from ast_sim.inference.effort import law_of
 from ast_sim.mechanics.driven import Driven
-from ast_sim.mechanics.physics_check import Law
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.named_field import STRESS, NamedField
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.support.errors import ConfigError, RolloutError
+from ast_sim.support.toml_settings import NOTHING
 
 Frames = Iterable[int] | int | slice  # numbers of frames; negative ones count from the end
 
@@ -105,6 +106,7 @@ class Question:
         failure: str | None,
         latents: Mapping[int, np.ndarray | None],
         last_steps: tuple[float, ...] = (),
+        source: Mapping[str, str] = NOTHING,
     ) -> Answer:
         """The answer with the wanted ones of these frames: positions and fields, by number of the frame; and the
         `latents` of those that were predicted. The other arguments are as in `Answer`."""
@@ -131,7 +133,8 @@ class Question:
             fields=fields,
             last_steps=last_steps,
             driven=Driven.of(self.scene, self.prescribed_position),
-            law=Law(config.data.material, config.data.contact_range),
+            law=law_of(config),
+            source=dict(source),
             latents={number: row for number in numbers if (row := latents.get(number)) is not None},
         )
 

@@ -269,7 +269,8 @@ class Run:
             p_value, unlike = (None, ()) if self.calibration is None else self.calibration.compared(answer)
             notes = (*question.notes, *unlike)
             expected = None if notes else self.expected_error(effort)
-            origin = {"predicted_by": str(self.path), "step": self.step, **known, "source": answer.name}
+            origin = {"predicted_by": str(self.path), "step": self.step, **answer.source, **known}
+            origin["source"] = answer.name
             if notes:
                 origin.pop("promise", None)
             if expected is not None:
@@ -287,7 +288,7 @@ class Run:
     def expected_error(self, effort: Effort) -> float | None:
         """The mean relative error of the displacement that validation scenes had at their deepest frame with this
         effort; with more Newton steps than were measured, the error after the most; None: it was not measured."""
-        known = [one for one in self._errors if one.effort.corrections == effort.corrections]
+        known = [one for one in self._errors if one.effort.corrections == effort.corrections and not effort.solved]
         most = max((one.effort.newton_steps for one in known), default=0)
         steps = min(effort.newton_steps, most)
         return next((one.error for one in known if one.effort.newton_steps == steps), None)

@@ -18,8 +18,8 @@ import numpy as np
 
 from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
 from ast_sim.mechanics.elements.cloth import Cloth, ClothMaterial
+from ast_sim.mechanics.elements.inertia import Inertia
 from ast_sim.mechanics.frames import FrameRecord, Frames
-from ast_sim.mechanics.inertia import Inertia
 from ast_sim.mechanics.solver import Newton, NotConverged, SolverSettings
 from ast_sim.mechanics.unfinished import Checkpoint
 from ast_sim.scene import AttributeValue, Scene, Trajectory

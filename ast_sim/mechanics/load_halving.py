@@ -14,7 +14,7 @@ import numpy as np
 
 from ast_sim.mechanics.contact_and_friction import Contact
 from ast_sim.mechanics.elements.elasticity import Elasticity
-from ast_sim.mechanics.inertia import Inertia
+from ast_sim.mechanics.elements.inertia import Inertia
 from ast_sim.mechanics.solver import Newton, NotConverged, SolverSettings
 
 MAX_DAMPED_STEPS = 60

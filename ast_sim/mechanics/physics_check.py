@@ -56,6 +56,16 @@ class Law:
         """Coulomb's coefficient, the largest of the scene."""
         return float(np.max(self.material.numbers(FRICTION, scene.material)))
 
+    def contact(self, scene: Scene) -> ContactSettings:
+        """Contact between bodies by barriers that are about as stiff as the bodies.
+
+        Raises:
+            ConfigError: the law of the material is not known.
+            SimulationError: the range of contact is 0.
+        """
+        young = np.broadcast_to(self.of_elements(scene).young, scene.num_elements)[scene.deforming_elements]
+        return ContactSettings(self.contact_range, float(young.mean()), self.friction(scene))
+
     def newton_steps(self, scene: Scene) -> NewtonSteps:
         """The Newton steps of a scene under this law.
 

@@ -9,8 +9,8 @@ import scipy.sparse
 
 from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
 from ast_sim.mechanics.elements.elasticity import Elasticity
+from ast_sim.mechanics.elements.inertia import Inertia
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
-from ast_sim.mechanics.inertia import Inertia
 from ast_sim.simulate.shapes import mesh
 from benchmarks.verification.bodies import box, triangles
 from benchmarks.verification.problem import Outcome, Problem, Row, at_most

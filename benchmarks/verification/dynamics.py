@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from ast_sim.mechanics.elements.elasticity import Elasticity
+from ast_sim.mechanics.elements.inertia import Inertia
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
-from ast_sim.mechanics.inertia import Inertia
 from benchmarks.verification.bodies import DeadLoad, box, newton
 from benchmarks.verification.problem import Curve, Outcome, Picture, Problem, at_most, relative
 

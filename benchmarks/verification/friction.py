@@ -8,8 +8,8 @@ import numpy as np
 
 from ast_sim.mechanics.contact_and_friction import STICKING_SLIP, Contact, ContactSettings
 from ast_sim.mechanics.elements.elasticity import Elasticity
+from ast_sim.mechanics.elements.inertia import Inertia
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
-from ast_sim.mechanics.inertia import Inertia
 from benchmarks.verification.bodies import DeadLoad, box, newton, sheet, triangles
 from benchmarks.verification.problem import Curve, Outcome, Picture, Problem, at_most, relative
 

@@ -184,10 +184,11 @@ def _setting(name: str, pairs: Sequence[tuple[float, float]], command: str = "")
 
 def _command(run: Run, dataset: Dataset, split: str, effort: Effort) -> str:
     """What predicts the first scene with this effort."""
-    asked = ["--corrections", str(effort.corrections), "--newton-steps", str(effort.newton_steps)]
+    counts = ["--corrections", str(effort.corrections), "--newton-steps", str(effort.newton_steps)]
+    asked = ["--exact"] if effort == Effort.exact() else counts
     what = asked if run.settings.model.jumps else []
-    scene = [str(dataset.path), "--split", split, "--index", "0"]
-    return shlex.join(["ast-sim", "predict", str(run.path), *scene, "--out", "answer.h5", *what])
+    scene = [dataset.path.name, "--split", split, "--index", "0"]
+    return shlex.join(["ast-sim", "predict", run.path.name, *scene, "--out", "answer.h5", *what])
 
 
 def _invested(run: Run, dataset: Dataset) -> float | None:

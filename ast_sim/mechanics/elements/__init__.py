@@ -1,1 +1,1 @@
-"""What resists deformation: the law of the material, tetrahedra and cloth."""
+"""What resists motion: the law of the material, tetrahedra and cloth, and inertia."""

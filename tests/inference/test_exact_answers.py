@@ -1,0 +1,127 @@
+"""Exact answers: where the solver ends, from the answer of a model or along the way of the load."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import ast_sim
+from ast_sim.cli import main
+from ast_sim.inference.effort import choices
+from ast_sim.mechanics.equilibria import Equilibria
+from ast_sim.support.errors import ConfigError
+
+FROM_MODEL = "solved to the stop test of the solver, from the answer of the model"
+WALKED = "solved to the stop test of the solver, along the way of the load, frame by frame"
+
+
+@pytest.fixture(scope="module")
+def plates(tmp_path_factory):
+    """Plates of the solver, in a file."""
+    path = tmp_path_factory.mktemp("plates") / "plates.h5"
+    ast_sim.generate("deforming_plate", path, train=0, valid=0, test=4, nodes=400, frames=41, keep=(14, 24), seed=77)
+    return path
+
+
+def loaded(path):
+    with ast_sim.Dataset(path) as data:
+        return [data["test"][index] for index in range(data.count("test"))]
+
+
+def test_an_exact_answer_ends_where_the_solver_ended(plates):
+    """One of these plates has two equilibria: the way of the load leads to the one of the dataset."""
+    run = ast_sim.example_run("plates")
+    others = []
+    for truth in loaded(plates):
+        answer = run.predict(truth, effort=ast_sim.Effort.exact())
+        assert answer.converged and answer.source["solved"] == FROM_MODEL == answer.how_far[0]
+        assert answer.expected_error is None  # no validation has measured it
+        rounding = replace(answer, position=truth.position).check().residual.value  # of float32
+        assert answer.check().residual.value < 2 * rounding
+        if answer.errors(truth)["displacement"] > 1e-5:
+            others.append(truth)
+            continue
+        assert answer.errors(truth)["stress"] < 1e-4
+        force = np.linalg.norm(answer.reaction(), axis=1)[1:]
+        assert force == pytest.approx(truth.attributes["reaction"][1:], rel=1e-3)
+    assert len(others) == 1
+    walked, along = Equilibria(others[0].scene, answer.law, others[0].position).solve(2, None)
+    assert along and np.abs(walked - others[0].position[2]).max() < 1e-6
+
+
+def test_a_poor_start_makes_the_solver_go_the_way_of_the_load(plates, monkeypatch):
+    """The weights of nobody: bodies overlap after the Newton steps, or these fail."""
+    run = ast_sim.example_run("plates")
+    run.calibration = None
+    truth = loaded(plates)[0]
+    walked = []
+    solve = Equilibria.solve
+    monkeypatch.setattr(
+        Equilibria, "solve", lambda self, frame, start: walked.append(frame) or solve(self, frame, None)
+    )
+    answer = run.predict(truth, frames=[2], effort=ast_sim.Effort.exact())
+    assert walked == [2] and answer.source["solved"] == WALKED
+    assert answer.errors(truth)["displacement"] < 1e-5
+
+
+def test_only_a_start_without_overlap_is_taken(plates):
+    run = ast_sim.example_run("plates")
+    truth = loaded(plates)[0]
+    law = run.predict(truth, effort=ast_sim.Effort()).law
+    there = truth.position.astype(float)
+    equilibria = Equilibria(truth.scene, law, there)
+    position, walked = equilibria.solve(2, there[2])
+    assert not walked and np.abs(position - there[2]).max() < 1e-6
+    inside = np.where(truth.scene.prescribed[:, None], there[2], there[0])  # the plate at rest, the obstacle in it
+    position, walked = equilibria.solve(2, inside)
+    assert walked and np.abs(position - there[2]).max() < 1e-4
+    assert Equilibria(truth.scene, law, there).solve(1, None)[1]
+
+
+def test_with_friction_the_solver_goes_the_way_of_the_load(plates):
+    """It sticks where it touched first; the answer is the one of the solver frame by frame."""
+    run = ast_sim.example_run("plates")
+    truth = loaded(plates)[1]
+    law = run.predict(truth, effort=ast_sim.Effort()).law
+    rough = replace(law, material=replace(law.material, constants={**law.material.constants, "friction": 0.4}))
+    equilibria = Equilibria(truth.scene, rough, truth.position)
+    position, walked = equilibria.solve(2, truth.position[2].astype(float))
+    again, _ = Equilibria(truth.scene, rough, truth.position).solve(2, None)
+    assert walked and np.array_equal(position, again)
+    smooth, _ = Equilibria(truth.scene, law, truth.position).solve(2, None)
+    assert np.abs(position - smooth).max() > 1e-5
+
+
+def test_an_asked_error_below_all_others_is_given_to_the_solver(plates):
+    run = ast_sim.example_run("plates")
+    truth = loaded(plates)[0]
+    assert choices(run.settings.model, 1)[-1] == ast_sim.Effort.exact()
+    answer = run.predict(truth, frames=[-1], error=0.001)
+    assert answer.source["effort"] == "0 corrections, up to 2 Newton steps, then the solver"
+    assert answer.errors(truth)["displacement"] < 1e-3
+
+
+def test_the_command_line_has_exact_answers(plates, tmp_path, capsys):
+    ast_sim.example_run("plates").save(tmp_path / "run.ast")
+    told = [
+        "predict",
+        str(tmp_path / "run.ast"),
+        str(plates),
+        "--index",
+        "0",
+        "--out",
+        str(tmp_path / "a.h5"),
+        "--exact",
+    ]
+    assert main(told) == 0
+    assert FROM_MODEL in capsys.readouterr().out
+    assert main([*told, "--newton-steps", "3", "--overwrite"]) != 0
+    assert "an exact answer needs no numbers" in capsys.readouterr().err
+
+
+def test_what_has_no_law_has_no_exact_answer(plates):
+    run = ast_sim.example_run("plates")
+    data = replace(run.settings.model.data, contact_range=0.0)
+    run.model.config = replace(run.settings.model, data=data)
+    with pytest.raises(ConfigError, match="the range of contact that the solver recorded"):
+        run.predict(loaded(plates)[0], effort=ast_sim.Effort.exact())
