@@ -179,7 +179,7 @@ class Scene:
         if repeated.any():
             row = int(np.argmax(repeated))
             raise DatasetError(f"{name}: element {row} refers to a node twice: {self.elements[row].tolist()}")
-        unknown = ~np.isin(self.node_type, list(NodeType))
+        unknown = np.logical_and.reduce([self.node_type != kind for kind in NodeType])
         if unknown.any():
             node = int(np.argmax(unknown))
             known = ", ".join(f"{kind.value} {kind.name}" for kind in NodeType)
@@ -194,6 +194,10 @@ class Scene:
 
     def edges(self) -> np.ndarray:
         """[M, 2] int32: each edge of the mesh once, its smaller node first, in ascending order."""
+        return self._edges
+
+    @cached_property
+    def _edges(self) -> np.ndarray:
         return unique_edges(self.elements, self.num_nodes)
 
     def surface(self) -> np.ndarray:
