@@ -189,7 +189,8 @@ class Scene:
         """Raise DatasetError if no node is free, or if the deforming bodies have no extent; the text names `name`."""
         if self.prescribed.all():
             raise DatasetError(f"{name}: all nodes are obstacles or handles, so nothing deforms: leave this scene out")
-        if not np.ptp(self.rest_position[self.deforming_nodes], axis=0).any():
+        points = self.rest_position[self.deforming_nodes]
+        if (points == points[0]).all():
             raise DatasetError(f"{name}: all nodes that deform lie at one point at rest: give them their positions")
 
     def edges(self) -> np.ndarray:

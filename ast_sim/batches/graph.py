@@ -103,7 +103,7 @@ class Graph:
         return Graph(
             rest_position=rest,
             node_type=node_type,
-            one_hot=torch.stack([node_type == kind for kind in NodeType], dim=1).float(),
+            one_hot=torch.from_numpy(np.equal.outer(scene.node_type, list(NodeType)).astype(np.float32)),
             elements=elements,
             deforming_nodes=torch.from_numpy(scene.deforming_nodes),
             deforming_elements=torch.from_numpy(scene.deforming_elements),

@@ -1,7 +1,7 @@
 """The process of one state of the repository in `predictions`: it predicts what is asked on stdin, answers on stdout.
 
-Usage: `prediction_worker.py FILE`, a dataset. A request is a line of JSON: the number of a test scene and Newton steps.
-It is run as a file, since the other state need not have it.
+Usage: `prediction_worker.py FILE`, a dataset. A request is a line of JSON: Newton steps, and how many predictions of
+the first test scene are made one after another. It is run as a file, since the other state need not have it.
 """
 
 from __future__ import annotations
@@ -23,15 +23,18 @@ def main() -> None:
     out, sys.stdout = sys.stdout, sys.stderr
     run = ast_sim.example_run("plates")
     with ast_sim.Dataset(sys.argv[1]) as dataset:
-        truths = [dataset.load("test", index) for index in range(dataset.count("test"))]
+        truth = dataset.load("test", 0)
     for line in sys.stdin:
-        index, newton_steps = json.loads(line)
-        scene = dataclasses.replace(truths[index].scene)  # a new one, which keeps nothing of the calls before
-        motion, effort = ast_sim.Motion(truths[index].position), ast_sim.Effort(0, newton_steps)
+        newton_steps, count = json.loads(line)
+        # New scenes, which keep nothing of the calls before.
+        scenes = [dataclasses.replace(truth.scene) for _ in range(count)]
+        motion, effort = ast_sim.Motion(truth.position), ast_sim.Effort(0, newton_steps)
         clock, processor = time.perf_counter(), time.process_time()
-        answer = run.predict(scene, motion, frames=-1, effort=effort)
-        told = {"clock": time.perf_counter() - clock, "processor": time.process_time() - processor}
-        print(json.dumps({**told, "position": answer.position.ravel().tolist()}), file=out, flush=True)
+        answers = [run.predict(scene, motion, frames=-1, effort=effort) for scene in scenes]
+        clock, processor = time.perf_counter() - clock, time.process_time() - processor
+        position = answers[-1].position.ravel().tolist()
+        told = {"clock": clock / count, "processor": processor / count, "position": position}
+        print(json.dumps(told), file=out, flush=True)
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ from ast_sim.support.provenance import processor
 
 NODES = (400, 1300)
 NEWTON_STEPS = (0, 1)
+AT_ONCE = 5  # predictions of a sample
 PLATES = {"train": 0, "valid": 0, "test": 1, "seed": 912, "frames": 41, "keep": (14, 24, 34)}
 WORKER = Path(__file__).with_name("prediction_worker.py")
 
@@ -38,10 +39,10 @@ def worker(tree: Path, data: Path) -> subprocess.Popen[str]:
 
 
 def ask(process: subprocess.Popen[str], newton_steps: int) -> dict[str, Any]:
-    """The seconds and the positions of one prediction."""
+    """The seconds of a prediction, as the mean of a few, and its positions."""
     if process.stdin is None or process.stdout is None:
         raise RuntimeError("the process has no pipes")
-    process.stdin.write(json.dumps([0, newton_steps]) + "\n")
+    process.stdin.write(json.dumps([newton_steps, AT_ONCE]) + "\n")
     process.stdin.flush()
     return json.loads(process.stdout.readline())
 
@@ -80,7 +81,7 @@ def line_of(told: dict[str, dict[str, list[float]]]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--before", type=Path, required=True, metavar="FOLDER", help="the other state, built in place")
-    parser.add_argument("--repeats", type=int, default=100, help="predictions of each state (%(default)s)")
+    parser.add_argument("--repeats", type=int, default=40, help="samples of each state (%(default)s)")
     arguments = parser.parse_args()
     trees = {"before": arguments.before.resolve(), "now": Path(__file__).resolve().parents[2]}
     print(f"{processor()}: at least, in parentheses the median")
