@@ -179,7 +179,7 @@ class Scene:
         if repeated.any():
             row = int(np.argmax(repeated))
             raise DatasetError(f"{name}: element {row} refers to a node twice: {self.elements[row].tolist()}")
-        unknown = ~np.isin(self.node_type, list(NodeType))
+        unknown = np.logical_and.reduce([self.node_type != kind for kind in NodeType])
         if unknown.any():
             node = int(np.argmax(unknown))
             known = ", ".join(f"{kind.value} {kind.name}" for kind in NodeType)
@@ -189,11 +189,16 @@ class Scene:
         """Raise DatasetError if no node is free, or if the deforming bodies have no extent; the text names `name`."""
         if self.prescribed.all():
             raise DatasetError(f"{name}: all nodes are obstacles or handles, so nothing deforms: leave this scene out")
-        if not np.ptp(self.rest_position[self.deforming_nodes], axis=0).any():
+        points = self.rest_position[self.deforming_nodes]
+        if (points == points[0]).all():
             raise DatasetError(f"{name}: all nodes that deform lie at one point at rest: give them their positions")
 
     def edges(self) -> np.ndarray:
         """[M, 2] int32: each edge of the mesh once, its smaller node first, in ascending order."""
+        return self._edges
+
+    @cached_property
+    def _edges(self) -> np.ndarray:
         return unique_edges(self.elements, self.num_nodes)
 
     def surface(self) -> np.ndarray:

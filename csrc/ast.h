@@ -67,7 +67,7 @@ typedef enum { AST_IDENTITY = 0, AST_RELU, AST_GEGLU } ast_activation;
  * for GEGLU. */
 typedef struct {
   int64_t M, I, O;
-  int64_t x_stride, residual_stride, dout_stride; /* floats from row to row */
+  int64_t x_stride, weight_stride, residual_stride, dout_stride; /* floats from row to row */
   ast_activation activation;
 } ast_linear;
 

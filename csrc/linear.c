@@ -72,6 +72,7 @@ static ast_status linear_product_task(int64_t index, void *context) {
 
 static dense_layer linear_layer(const ast_linear *sizes, const float *weight, const float *bias, bool paired) {
   dense_layer layer = dense_forward(weight, bias, sizes->I, paired ? sizes->O / 2 : sizes->O);
+  layer.column = sizes->weight_stride;
   layer.paired = paired;
   return layer;
 }
@@ -260,7 +261,7 @@ static ast_status linear_backward(const ast_linear *sizes, const float *restrict
   linear_backward_job job = {
       .sizes = sizes, .dout = dout, .x = x, .z = z, .dx = dx, .dweight = dweight, .dbias = dbias};
   job.layers[0] = linear_layer(sizes, recompute ? weight : NULL, bias, false);
-  job.layers[1] = dense_backward(dx ? weight : NULL, sizes->I, sizes->O, sizes->I);
+  job.layers[1] = dense_backward(dx ? weight : NULL, sizes->weight_stride, sizes->O, sizes->I);
   const ast_status status = dense_pack(job.layers, 2);
   if (status != AST_OK) return status;
   job.columns = sizes->activation == AST_GEGLU ? sizes->O / 2 : sizes->O;

@@ -298,20 +298,24 @@ KERNEL(message_backward, dsum, dmessages, MESSAGE, dof_senders, dof_receivers, d
 /* ---- dense layers ---- */
 
 /* O outputs, or P pairs of them. */
-static ast_linear linear_of(const argument *x, const int64_t *n, int64_t activation) {
+static ast_linear linear_of(const argument *x, const argument *weight, const int64_t *n, int64_t activation) {
   const int64_t O = activation == AST_GEGLU ? 2 * n['P'] : n['O'];
-  return (ast_linear){
-      .M = n['M'], .I = n['I'], .O = O, .x_stride = x->row_stride, .activation = (ast_activation)activation};
+  return (ast_linear){.M = n['M'],
+                      .I = n['I'],
+                      .O = O,
+                      .x_stride = x->row_stride,
+                      .weight_stride = weight->row_stride,
+                      .activation = (ast_activation)activation};
 }
 
 KERNEL(linear, x, weight, bias, residual, activation, out, z) {
-  ast_linear s = linear_of(&a->x, n, a->activation.integer);
+  ast_linear s = linear_of(&a->x, &a->weight, n, a->activation.integer);
   s.residual_stride = a->residual.row_stride;
   return kernels->linear(&s, a->x.data, a->weight.data, a->bias.data, a->residual.data, a->out.data, a->z.data);
 }
 
 KERNEL(linear_backward, dout, x, weight, bias, z, activation, dx, dweight, dbias) {
-  ast_linear s = linear_of(&a->x, n, a->activation.integer);
+  ast_linear s = linear_of(&a->x, &a->weight, n, a->activation.integer);
   s.dout_stride = a->dout.row_stride;
   return kernels->linear_backward(&s, a->dout.data, a->x.data, a->weight.data, a->bias.data, a->z.data, a->dx.data,
                                   a->dweight.data, a->dbias.data);

@@ -10,10 +10,12 @@ from collections.abc import Callable
 from functools import cache
 
 import numpy as np
+from scipy.sparse import csc_array, csr_array
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from ast_sim.element_topology import linear_elements
-from ast_sim.number_arrays import connected_parts
+from ast_sim.mechanics.elements.neo_hookean import cofactor, determinant
 from ast_sim.scene import Scene
 
 RIGID = 1e-3  # prescribed nodes move as a rigid body if no node is farther off, as a share of the largest displacement
@@ -83,24 +85,43 @@ def rigid_motion(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.
 
 def harmonic_extension(scene: Scene, held: np.ndarray, free: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     """A function from the displacements [H, 3] of the held nodes of a body to those [F, 3] of its free nodes."""
-    import igl  # takes 0.2 s; only bodies whose handles do not move rigidly need it
-
-    elements = linear_elements(scene.elements.astype(np.int64))
-    laplacian = -igl.cotmatrix(scene.rest_position.astype(np.float64), elements).tocsr()
-    part = connected_parts(scene.elements, scene.num_nodes)
-    rows = np.flatnonzero(np.isin(part[free], part[held]))
-    if not len(rows):
-        return lambda way: np.zeros((len(free), 3))
-    reached = free[rows]
+    count = len(free)
+    stiffness = _stiffness(scene, np.concatenate([free, held]))
+    part = connected_components(stiffness, directed=False)[1]
+    reached = np.isin(part[:count], part[count:])
+    if not reached.any():
+        return lambda way: np.zeros((count, 3))
+    if not reached.all():
+        inner = harmonic_extension(scene, held, free[reached])
+        place = np.cumsum(reached) - 1
+        return lambda way: np.where(reached[:, None], inner(way)[place], 0)
+    of_free, pull = stiffness[:count, :count], stiffness[:count, count:]
     # Symmetric and positive definite: no pivoting, and an ordering for such matrices.
-    inner = laplacian[reached][:, reached].tocsc()
-    symmetric = {"SymmetricMode": True}
-    solve = splu(inner, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
-    pull = -laplacian[reached][:, held]
+    symmetric = csc_array((of_free.data, of_free.indices, of_free.indptr), shape=of_free.shape)
+    solver = splu(symmetric, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return lambda way: solver.solve(-(pull @ way))
 
-    def extend(way: np.ndarray) -> np.ndarray:
-        moved = np.zeros((len(free), 3))
-        moved[rows] = solve.solve(pull @ way)
-        return moved
 
-    return extend
+def _stiffness(scene: Scene, nodes: np.ndarray) -> csr_array:
+    """[n, n]: the integrals of grad N_a . grad N_b over the mesh at rest for `nodes` [n] with linear shape functions N.
+
+    Let o_a be the side opposite to node a of an element, as a vector: the edge of a triangle, or of a tetrahedron the
+    normal of the face, as long as twice its area. All of them are taken in one sense, so they add up to 0. Then the
+    integral over the element is o_a . o_b / (4 area), or o_a . o_b / (36 volume).
+    """
+    elements = linear_elements(scene.elements).T  # [k, E]
+    corners = scene.rest_position.astype(np.float64)[elements].swapaxes(1, 2)  # [k, 3, E]
+    edges = corners[1:] - corners[:1]
+    if len(elements) == 3:
+        opposite = np.roll(corners, 1, axis=0) - np.roll(corners, -1, axis=0)
+        size = 2 * np.linalg.norm(np.cross(*edges, axis=0), axis=0)
+    else:
+        normals = cofactor(edges)
+        opposite = np.concatenate([-normals.sum(axis=0, keepdims=True), normals])
+        size = 6 * np.abs(determinant(edges, normals))
+    number = np.full(scene.num_nodes, -1, np.int32)
+    number[nodes] = np.arange(len(nodes), dtype=np.int32)
+    integrals = np.einsum("aie,bie->abe", opposite, opposite) / size
+    rows, columns = np.broadcast_arrays(number[elements][:, None], number[elements])
+    among = (rows >= 0) & (columns >= 0)
+    return csr_array((integrals[among], (rows[among], columns[among])), shape=(len(nodes), len(nodes)))

@@ -18,7 +18,7 @@ from ast_sim.batches.mirror_and_shift import Placement
 from ast_sim.batches.out_of_balance import Elasticity
 from ast_sim.material import Material
 from ast_sim.ops import EdgeSet
-from ast_sim.ops._edges import join_indices, join_offsets
+from ast_sim.ops._edges import join_indices, join_offsets, offsets_of
 from ast_sim.scene import NodeType, Scene
 
 
@@ -103,7 +103,7 @@ class Graph:
         return Graph(
             rest_position=rest,
             node_type=node_type,
-            one_hot=torch.stack([node_type == kind for kind in NodeType], dim=1).float(),
+            one_hot=torch.from_numpy(np.equal.outer(scene.node_type, list(NodeType)).astype(np.float32)),
             elements=elements,
             deforming_nodes=torch.from_numpy(scene.deforming_nodes),
             deforming_elements=torch.from_numpy(scene.deforming_elements),
@@ -183,8 +183,10 @@ def _surface_of(scene: Scene) -> dict[str, Tensor]:
 
 def both_ways(pairs: np.ndarray, num_nodes: int) -> EdgeSet:
     """The edges among the nodes that join each pair of `pairs` [P, 2] int64 in both directions."""
-    first, second = torch.from_numpy(pairs).unbind(1)
-    return EdgeSet.from_pairs(torch.cat([first, second]), torch.cat([second, first]), num_nodes, num_nodes)
+    first, second = pairs.T
+    keys = np.sort(np.concatenate([first * num_nodes + second, second * num_nodes + first]))
+    receivers, senders = map(torch.from_numpy, np.divmod(keys, num_nodes))
+    return EdgeSet(senders, receivers, offsets_of(receivers, num_nodes), num_nodes)
 
 
 def edge_vectors(edges: EdgeSet, senders: Tensor, receivers: Tensor) -> Tensor:

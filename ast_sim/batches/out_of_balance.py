@@ -9,9 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from ast_sim.element_topology import signed_volumes
 from ast_sim.material import ELASTIC, Material
 from ast_sim.mechanics.elements.second_order import LARGEST, SLOPES
 from ast_sim.ops import TetrahedronSet, elastic_forces
@@ -56,23 +58,24 @@ class Elasticity:
                 "the elements are triangles, but the model takes elastic forces of tetrahedra as an input"
             )
         elements = torch.from_numpy(scene.elements.astype("int64"))
-        young, poisson = torch.full((len(elements),), YOUNG), torch.full((len(elements),), POISSON)
+        count, corners = elements.shape
+        young, poisson = np.full(count, YOUNG, np.float32), np.full(count, POISSON, np.float32)
         if sorted(material.columns) == sorted(ELASTIC):
-            given, ratio = (torch.from_numpy(material.numbers(name, scene.material)).float() for name in ELASTIC)
-            if bool((given > 0).all() and (ratio >= 0).all() and (ratio < 0.5).all()):
+            given, ratio = (material.numbers(name, scene.material).astype(np.float32) for name in ELASTIC)
+            if (given > 0).all() and (ratio >= 0).all() and (ratio < 0.5).all():
                 young, poisson = given, ratio
-        young = young * torch.from_numpy(scene.deforming_elements)
-        lame = torch.stack([young * poisson / ((1 + poisson) * (1 - 2 * poisson)), young / (2 * (1 + poisson))], dim=1)
-        corners = torch.tensor(scene.rest_position, dtype=torch.float64)[elements[:, :4]]
-        volume = torch.linalg.det(corners[:, 1:] - corners[:, :1]).abs() / 6
-        if elements.shape[1] == 10:
+        young = young * scene.deforming_elements
+        lame = np.stack([young * poisson / ((1 + poisson) * (1 - 2 * poisson)), young / (2 * (1 + poisson))], axis=1)
+        lame = torch.from_numpy(lame)
+        volume = np.abs(signed_volumes(scene.rest_position, scene.elements))
+        if corners == 10:
             volume = volume / 8  # of an eighth, whose edges are as long as nodes are apart
-        share = (young * volume ** (2 / 3)).float().repeat_interleave(elements.shape[1])
+        share = torch.from_numpy(np.repeat((young * volume ** (2 / 3)).astype(np.float32), corners))
         force = torch.zeros(scene.num_nodes).index_add_(0, elements.reshape(-1), share)
-        if elements.shape[1] == 4:
+        if corners == 4:
             return Elasticity(TetrahedronSet.from_elements(elements, scene.num_nodes), lame, force)
         lame[:, 0] = torch.minimum(lame[:, 0], LARGEST * lame[:, 1])  # as the points of the solver's elements
-        own = torch.arange(16 * len(elements)).view(-1, 4)
+        own = torch.arange(16 * count).view(-1, 4)
         tangent = TetrahedronSet.from_elements(own, own.numel())
         return Elasticity(tangent, (lame / 4).repeat_interleave(4, dim=0), force, elements)
 

@@ -52,7 +52,7 @@ class Driven:
     @staticmethod
     def of(scene: Scene, targets: np.ndarray) -> Driven:
         """Of a scene with positions [S,N,3] of the prescribed nodes in each frame; other rows are not read."""
-        way = np.where(scene.prescribed, np.abs(targets - targets[0]).max(axis=(0, 2)), 0)
+        way = np.where(scene.prescribed, np.abs(targets - targets[0]).max(axis=0).max(axis=1), 0)
         farthest = int(np.argmax(way))
         body = int(scene.body[farthest])
         own, moves = scene.prescribed & (scene.body == body), way > RIGID * way[farthest]

@@ -17,6 +17,7 @@ import numpy as np
 import scipy.sparse
 from scipy.optimize import nnls
 
+from ast_sim.element_topology import signed_volumes
 from ast_sim.material import FRICTION, Material
 from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings, load_ipctk
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
@@ -24,7 +25,6 @@ from ast_sim.mechanics.elements.second_order import elastic_body
 from ast_sim.mechanics.linearised_contact import CLEARANCE, NewtonSteps
 from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.plausibility.overlaps import nodes_inside
-from ast_sim.plausibility.topology import signed_volumes
 from ast_sim.scene import Scene
 from ast_sim.support.errors import ConfigError, MissingExtra, SimulationError
 

@@ -223,12 +223,14 @@ class Simulator(nn.Module):
     def predicting(self) -> Iterator[None]:
         """Predict in here: without gradients and dropout. Afterwards the module trains again if it did."""
         training = self.training
-        self.eval()
+        if training:  # each of its modules is told, so only if it must be
+            self.eval()
         try:
             with torch.inference_mode():
                 yield
         finally:
-            self.train(training)
+            if training:
+                self.train()
 
     @torch.inference_mode()
     def predict(self, batch: Batch) -> Prediction:

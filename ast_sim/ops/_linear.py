@@ -18,7 +18,7 @@ SAVED = 1 << 24  # an activation's input with more elements is not kept for the 
 
 
 # What stands behind `linear` and `linear_backward` in a spec; P is O, or O/2 for "geglu".
-_INPUTS = "x[M,I] rows, weight[O,I] filled, bias?[O]"
+_INPUTS = "x[M,I] rows, weight[O,I] rows filled, bias?[O]"
 _SPEC = f"{_INPUTS}, residual?[M,P] rows added, activation integer(0,1); save switch -> out[M,P], z[M,O] if(save)"
 _BACKWARD_SPEC = (
     f"dout[M,P] rows late, {_INPUTS}, z?[M,O], activation integer(0,1); wanted wants(x,weight,bias)"
@@ -66,7 +66,7 @@ def linear(
 
     Args:
         x: [M, I]; rows may lie apart, as in a slice of columns.
-        weight: [O, I].
+        weight: [O, I]; rows may lie apart, too.
         bias: [O].
         activation: "none", "relu", or "geglu": a * gelu(b) with a and b the halves of the O columns.
         residual: [M, O], or [M, O / 2] for "geglu".

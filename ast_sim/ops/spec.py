@@ -1,6 +1,6 @@
 """What an op takes and gives, said once: its schema, its outputs, the checks here and those of the core follow from it.
 
-    x[M,I] rows, weight[O,I] filled, bias?[O], source[P] index(M), depth integer(0,21); save switch
+    x[M,I] rows, weight[O,I] rows filled, bias?[O], source[P] index(M), depth integer(0,21); save switch
     -> out[M,O], z[M,O] if(save)
 
 `csrc/README.md` explains the words.

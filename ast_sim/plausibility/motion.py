@@ -10,8 +10,9 @@ import math
 
 import numpy as np
 
+from ast_sim.element_topology import signed_volumes
 from ast_sim.plausibility.findings import Finding, places, point
-from ast_sim.plausibility.topology import at_rest, signed_volumes
+from ast_sim.plausibility.topology import at_rest
 from ast_sim.scene import NodeType, Scene, Trajectory
 
 # Edges of an obstacle keep their lengths up to this share of the longest edge.

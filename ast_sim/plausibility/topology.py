@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ast_sim.element_topology import LOCAL_FACES, linear_elements
+from ast_sim.element_topology import LOCAL_FACES, linear_elements, signed_volumes
 from ast_sim.number_arrays import connected_parts
 from ast_sim.plausibility.findings import Finding, places
 from ast_sim.plausibility.overlaps import overlaps
@@ -24,13 +24,6 @@ def at_rest(scene: Scene) -> list[Finding]:
     if scene.elements.shape[1] != 3:
         findings += [*_inside_out(scene), *_folds(scene), *_faces_on_faces(scene), *overlaps(scene)]
     return findings
-
-
-def signed_volumes(points: np.ndarray, elements: np.ndarray) -> np.ndarray:
-    """[E] float64: the volumes between the corners of tetrahedra [E, 4] or [E, 10], negative if they are inside out."""
-    corners = points[elements[:, :4]].astype(np.float64)
-    a, b, c = np.moveaxis(corners[:, 1:] - corners[:, :1], 1, 0)
-    return np.einsum("ei,ei->e", a, np.cross(b, c)) / 6
 
 
 def turned_over(scene: Scene) -> np.ndarray | None:

@@ -24,18 +24,19 @@ static void check_rows(const ast_kernels *kernels, const problem *a, const answe
 /* Rows `gap` floats more apart, and only the gradients in the set `wanted`, z recomputed. */
 static void check_strides(const ast_kernels *kernels, const problem *a, const answer *all, int64_t gap, int wanted) {
   ast_linear s = a->s;
-  s.x_stride += gap, s.residual_stride += gap, s.dout_stride += gap;
-  float *x = apart(a->x, s.M, s.I, s.x_stride), *residual = apart(a->residual, s.M, a->columns, s.residual_stride);
+  s.x_stride += gap, s.weight_stride += gap, s.residual_stride += gap, s.dout_stride += gap;
+  float *x = apart(a->x, s.M, s.I, s.x_stride), *weight = apart(a->weight, s.O, s.I, s.weight_stride);
+  float *residual = apart(a->residual, s.M, a->columns, s.residual_stride);
   float *dout = apart(a->dout, s.M, a->columns, s.dout_stride), *r[RESULTS] = {0};
   for (int i = 0; i < RESULTS; i++)
     if (i == 0 || wanted >> (i - 1) & 1) r[i] = new_floats(a->sizes[i]);
-  READ_ONLY(x, residual, dout);
-  CHECK(kernels->linear(&s, x, a->weight, a->bias, residual, r[0], NULL) == AST_OK, "status");
-  CHECK(kernels->linear_backward(&s, dout, x, a->weight, a->bias, NULL, r[1], r[2], r[3]) == AST_OK, "status");
+  READ_ONLY(x, weight, residual, dout);
+  CHECK(kernels->linear(&s, x, weight, a->bias, residual, r[0], NULL) == AST_OK, "status");
+  CHECK(kernels->linear_backward(&s, dout, x, weight, a->bias, NULL, r[1], r[2], r[3]) == AST_OK, "status");
   for (int i = 0; i < RESULTS; i++)
     CHECK(!r[i] || same_floats(r[i], all->of[i], a->sizes[i]), "%s differs with strides and the gradients %#x",
           names[i], wanted);
-  FREE(x, residual, dout, r[0], r[1], r[2], r[3]);
+  FREE(x, weight, residual, dout, r[0], r[1], r[2], r[3]);
 }
 
 /* GEGLU multiplies a value by another; its slope is below 1.2. */
@@ -71,7 +72,7 @@ static void fuzz(const ast_kernels *kernels) {
   const int64_t O = activation == AST_GEGLU ? 2 * half : half + take_byte() % 2;
   const int64_t M = within(1 << 18, I * O, take_size(600) + (tall ? 6100 : 0));
   const uint8_t byte = take_byte();
-  problem a = {.s = {M, I, O, I, 0, 0, activation}, .columns = activation == AST_GEGLU ? O / 2 : O};
+  problem a = {.s = {M, I, O, I, I, 0, 0, activation}, .columns = activation == AST_GEGLU ? O / 2 : O};
   a.s.residual_stride = a.s.dout_stride = a.columns;
   const int64_t sizes[RESULTS] = {M * a.columns, M * I, O * I, O};
   memcpy(a.sizes, sizes, sizeof sizes);

@@ -22,7 +22,7 @@ typedef struct {
 } answer;
 
 static problem new_problem(int64_t M, int64_t I, int64_t O, ast_activation activation, float amplitude) {
-  problem a = {.s = {M, I, O, I, 0, 0, activation}, .columns = activation == AST_GEGLU ? O / 2 : O};
+  problem a = {.s = {M, I, O, I, I, 0, 0, activation}, .columns = activation == AST_GEGLU ? O / 2 : O};
   a.s.residual_stride = a.s.dout_stride = a.columns;
   const int64_t sizes[RESULTS] = {M * a.columns, M * I, O * I, O};
   memcpy(a.sizes, sizes, sizeof sizes);
@@ -141,24 +141,26 @@ static void test_strides_and_absent_arrays(const ast_kernels *kernels) {
     memcpy(wide + i * apart, a.x + i * I, (size_t)I * sizeof *wide);
     memcpy(wide + i * apart + I, a.dout + i * O, (size_t)O * sizeof *wide);
   }
+  float *weights = new_floats(O * apart);
+  for (int64_t j = 0; j < O; j++) memcpy(weights + j * apart, a.weight + j * I, (size_t)I * sizeof *weights);
   ast_linear s = a.s;
-  s.x_stride = s.dout_stride = apart;
+  s.x_stride = s.dout_stride = s.weight_stride = apart;
   float *dx = new_floats(M * I), *dweight = new_floats(O * I), *dbias = new_floats(O), *out = new_floats(M * O);
-  READ_ONLY(wide, a.weight, a.bias, a.residual);
-  CHECK(kernels->linear(&s, wide, a.weight, a.bias, a.residual, out, NULL) == AST_OK, "status");
+  READ_ONLY(wide, weights, a.bias, a.residual);
+  CHECK(kernels->linear(&s, wide, weights, a.bias, a.residual, out, NULL) == AST_OK, "status");
   CHECK(same_bits(out, dense.of[0], M * O), "strides change the result");
-  CHECK(kernels->linear_backward(&s, wide + I, wide, a.weight, a.bias, NULL, dx, NULL, NULL) == AST_OK, "status");
+  CHECK(kernels->linear_backward(&s, wide + I, wide, weights, a.bias, NULL, dx, NULL, NULL) == AST_OK, "status");
   CHECK(same_bits(dx, dense.of[1], M * I), "dx alone");
-  CHECK(kernels->linear_backward(&s, wide + I, wide, a.weight, a.bias, NULL, NULL, dweight, NULL) == AST_OK, "status");
+  CHECK(kernels->linear_backward(&s, wide + I, wide, weights, a.bias, NULL, NULL, dweight, NULL) == AST_OK, "status");
   CHECK(same_bits(dweight, dense.of[2], O * I), "dweight alone");
-  CHECK(kernels->linear_backward(&s, wide + I, wide, a.weight, a.bias, NULL, NULL, NULL, dbias) == AST_OK, "status");
+  CHECK(kernels->linear_backward(&s, wide + I, wide, weights, a.bias, NULL, NULL, NULL, dbias) == AST_OK, "status");
   CHECK(same_bits(dbias, dense.of[3], O), "dbias alone");
   WRITABLE(a.bias, a.residual);
   memset(a.bias, 0, (size_t)O * sizeof *a.bias), memset(a.residual, 0, (size_t)(M * O) * sizeof *a.residual);
   answer zero = solve(kernels, &a, false);
-  CHECK(kernels->linear(&s, wide, a.weight, NULL, NULL, out, NULL) == AST_OK, "status");
+  CHECK(kernels->linear(&s, wide, weights, NULL, NULL, out, NULL) == AST_OK, "status");
   CHECK(same_bits(out, zero.of[0], M * O), "without bias and residual");
-  FREE(wide, dx, dweight, dbias, out);
+  FREE(wide, weights, dx, dweight, dbias, out);
   free_answer(dense), free_answer(zero), free_problem(a);
 }
 

@@ -226,7 +226,7 @@ static outcome message_backward(const ast_kernels *kernels) {
 enum { LINEAR_ROWS = 700, INPUTS = 40, OUTPUTS = 70 };
 
 static outcome linear(const ast_kernels *kernels) {
-  const ast_linear s = {LINEAR_ROWS, INPUTS, OUTPUTS, INPUTS, OUTPUTS / 2, OUTPUTS / 2, AST_GEGLU};
+  const ast_linear s = {LINEAR_ROWS, INPUTS, OUTPUTS, INPUTS, INPUTS, OUTPUTS / 2, OUTPUTS / 2, AST_GEGLU};
   float *x = random_floats(LINEAR_ROWS * INPUTS), *weight = random_floats(OUTPUTS * INPUTS),
         *bias = random_floats(OUTPUTS);
   float *residual = random_floats(LINEAR_ROWS * OUTPUTS / 2), *out = new_floats(LINEAR_ROWS * OUTPUTS / 2);
@@ -234,7 +234,7 @@ static outcome linear(const ast_kernels *kernels) {
 }
 
 static outcome linear_backward(const ast_kernels *kernels) {
-  const ast_linear s = {LINEAR_ROWS, INPUTS, OUTPUTS, INPUTS, OUTPUTS / 2, OUTPUTS / 2, AST_GEGLU};
+  const ast_linear s = {LINEAR_ROWS, INPUTS, OUTPUTS, INPUTS, INPUTS, OUTPUTS / 2, OUTPUTS / 2, AST_GEGLU};
   float *x = random_floats(LINEAR_ROWS * INPUTS), *weight = random_floats(OUTPUTS * INPUTS),
         *bias = random_floats(OUTPUTS);
   float *dout = random_floats(LINEAR_ROWS * OUTPUTS / 2), *dx = new_floats(LINEAR_ROWS * INPUTS);

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from blocks import block
 
+from ast_sim.element_topology import signed_volumes
 from ast_sim.importers.scene_mesh import read_scene
 from ast_sim.importers.series import FieldNames, read_series
-from ast_sim.plausibility.topology import at_rest, signed_volumes
+from ast_sim.plausibility.topology import at_rest
 
 GRID = {place: row for row, place in enumerate(product(range(3), range(3), range(2)))}
 

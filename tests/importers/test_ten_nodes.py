@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from blocks import block
 
-from ast_sim.element_topology import MIDDLES, linear_elements
+from ast_sim.element_topology import MIDDLES, linear_elements, signed_volumes
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.importers.scene_mesh import read_scene
 from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.importers.solids.middles import TURNED
-from ast_sim.plausibility.topology import at_rest, signed_volumes
+from ast_sim.plausibility.topology import at_rest
 from ast_sim.scene import NodeType
 from ast_sim.simulate.shapes.mesh import second_order
 from ast_sim.support.errors import DatasetError

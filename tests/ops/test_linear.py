@@ -236,10 +236,16 @@ def test_any_subset_requires_grad(wanted, activation):
 
 def test_slices_of_columns_are_read_in_place():
     wide = torch.randn(150, 60)
-    x, residual = wide[:, 3:20], wide[:, 20:26]
-    assert library.dense(x, ops._linear.spec.taken[0]) is x
-    weight = torch.randn(6, 17)
-    assert torch.equal(linear(x, weight, residual=residual), linear(x.clone(), weight, residual=residual.clone()))
+    x, residual, weight = wide[:, 3:20], wide[:, 20:26], torch.randn(6, 40)[:, 9:26]
+    for tensor, parameter in zip((x, weight), ops._linear.spec.taken, strict=False):
+        assert library.dense(tensor, parameter) is tensor
+    inputs, copies = (x, weight), (x.clone(), weight.clone())
+    assert torch.equal(linear(*inputs, residual=residual), linear(*copies, residual=residual.clone()))
+    for one in (*inputs, *copies):
+        one.requires_grad_()
+    for pair in (inputs, copies):
+        linear(*pair, activation="geglu").square().sum().backward()
+    assert all(torch.equal(one.grad, copy.grad) for one, copy in zip(inputs, copies, strict=True))
 
 
 def test_unusual_layouts_and_unchanged_inputs():

@@ -39,7 +39,7 @@ def rotations(places: Tensor, head_dim: int) -> Tensor:
     pairs = head_dim // 2
     angles = (places[:, :, None] * (math.pi * 0.5 ** torch.arange(pairs // 3, dtype=torch.float64))).flatten(1)
     angles = F.pad(angles, (0, pairs - angles.shape[1]))
-    return torch.polar(torch.ones_like(angles), angles)[:, None].to(torch.complex64)
+    return torch.complex(angles.cos().float(), angles.sin().float())[:, None]
 
 
 def rotated(x: Tensor, by: Tensor | None) -> Tensor:
