@@ -5,7 +5,7 @@ Legend: N nodes, E elements of k nodes, M edges, B scenes; a batch is the concat
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -17,6 +17,7 @@ from torch import Tensor
 from ast_sim.batches.mirror_and_shift import Placement
 from ast_sim.batches.out_of_balance import Elasticity
 from ast_sim.material import Material
+from ast_sim.named_field import Output
 from ast_sim.ops import EdgeSet
 from ast_sim.ops._edges import join_indices, join_offsets
 from ast_sim.scene import NodeType, Scene
@@ -173,6 +174,15 @@ class Graph:
     def element_mean(self, x: Tensor) -> Tensor:
         """[N, F] -> [E, F]: the mean over the nodes of each element."""
         return _element_mean(self.elements, x)
+
+    def at_nodes(self, outputs: Sequence[Output], values: Mapping[str, Tensor]) -> Tensor:
+        """[N, *]: the values [N or E, *] of these outputs, side by side. A node has the mean of its elements."""
+        num = len(self.rest_position)
+        columns = [self.rest_position.new_zeros(num, 0)]
+        for output in outputs:
+            value = values[output.name]
+            columns.append(value if output.location == "node" else _node_mean(self.elements, value, num))
+        return torch.cat(columns, dim=1)
 
 
 def _surface_of(scene: Scene) -> dict[str, Tensor]:

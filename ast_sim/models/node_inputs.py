@@ -29,8 +29,9 @@ def _states(names: tuple[str, ...], batch: Batch) -> list[Tensor]:
 
 
 def node_features(config: ModelConfig, batch: Batch) -> Tensor:
-    """[N, *]: node type (one-hot), displacement and velocity, material, proximity, forces out of balance and boundary
-    motion, as far as they are inputs. docs/reference/model.md explains them."""
+    """[N, *]: node type (one-hot), displacement and velocity, material, proximity, forces out of balance, the way from
+    the source and what is known there, and boundary motion, as far as they are inputs. docs/reference/model.md explains
+    them."""
     values = [batch.graph.one_hot, *_states(config.node_inputs, batch)]
     if "material" in config.node_inputs:
         values.append(batch.graph.node_material)
@@ -38,6 +39,8 @@ def node_features(config: ModelConfig, batch: Batch) -> Tensor:
         values.append(_proximity(batch, config.proximity_radius) if batch.proximity is None else batch.proximity)
     if "out_of_balance" in config.node_inputs:
         values.append(batch.graph.elasticity.out_of_balance(batch.position, batch.graph.rest_position))
+    if "history" in config.node_inputs:
+        values += [batch.position - batch.source, batch.history]
     if config.boundary_motion:
         values.append(batch.boundary_motion)
     return torch.cat(values, dim=1)
@@ -91,5 +94,7 @@ def normalizer_of(config: ModelConfig, what: str) -> FeatureNormalizer:
     kinds = [kind for name, kind in known.items() if name in inputs]
     if what == "node":
         kinds = [(None, len(NodeType)), *kinds]
+        if config.history is not None:
+            kinds += [vector, ("scalar", sum(output.columns for output in config.history))]
         kinds += [vector] * config.boundary_motion
     return FeatureNormalizer(kinds)
