@@ -50,7 +50,7 @@ class Graph:
         m2m: node to node, every element edge in both directions; None with element nodes.
         e2m, m2e: element to each of its nodes, and the reverse; None without element nodes.
         rest_edges: [M, 4] float32, `edge_vectors` of `edges` at rest. An element is at the mean of its nodes.
-        body: [N] int64; None if the surface is not needed.
+        body: [N] int64, the number of each node's body in its scene.
         surface: [F, 3] int64, boundary triangles, counter-clockwise seen from outside; None if it is not needed.
         surface_offsets: [B + 1] int64, where each scene's triangles start and end; None if they are not needed.
         elasticity: what elastic forces need; None if they are not needed.
@@ -83,7 +83,7 @@ class Graph:
 
         Args:
             element_nodes: elements are nodes of the graph too: it has e2m and m2e, not m2m.
-            surface: the graph has the surface and the bodies.
+            surface: the graph has the surface.
             elastic: the material of its tetrahedra; the graph has their elasticity.
         """
         n, e = scene.num_nodes, scene.num_elements
@@ -116,6 +116,7 @@ class Graph:
             e2m=e2m,
             m2e=m2e,
             rest_edges=rest_edges,
+            body=torch.from_numpy(scene.body.astype("int64")),
             **(_surface_of(scene) if surface else {}),
             elasticity=None if elastic is None else Elasticity.of(scene, elastic),
         )
@@ -171,6 +172,14 @@ class Graph:
         """[*] int64: the nodes that a model moves."""
         return (self.node_type == NodeType.NORMAL).nonzero()[:, 0]
 
+    def body_sums(self, x: Tensor) -> Tensor:
+        """[N, F] -> [K, F]: the sums over the prescribed nodes of each body that has some, scene by scene."""
+        scene = torch.arange(self.num_scenes).repeat_interleave(self.node_offsets.diff())
+        nodes = self.prescribed.nonzero()[:, 0]
+        names = torch.stack([scene, self.body], dim=1)[nodes]
+        bodies, row = names.unique(dim=0, return_inverse=True)
+        return x.new_zeros(len(bodies), x.shape[1]).index_add(0, row, x.index_select(0, nodes))
+
     def element_mean(self, x: Tensor) -> Tensor:
         """[N, F] -> [E, F]: the mean over the nodes of each element."""
         return _element_mean(self.elements, x)
@@ -187,8 +196,7 @@ class Graph:
 
 def _surface_of(scene: Scene) -> dict[str, Tensor]:
     triangles = torch.from_numpy(scene.surface().astype("int64"))
-    body = torch.from_numpy(scene.body.astype("int64"))
-    return {"body": body, "surface": triangles, "surface_offsets": torch.tensor([0, len(triangles)])}
+    return {"surface": triangles, "surface_offsets": torch.tensor([0, len(triangles)])}
 
 
 def both_ways(pairs: np.ndarray, num_nodes: int) -> EdgeSet:

@@ -82,19 +82,21 @@ def normalizer_of(config: ModelConfig, what: str) -> FeatureNormalizer:
     vector, scalar = ("vector", 3), ("scalar", 1)
     if what in ("edge", "world_edge"):
         return FeatureNormalizer([vector, scalar] * (2 if what == "edge" else 1))
-    known: dict[str, tuple[Kind | None, int]] = {  # in the order of the columns
-        "displacement": vector,
-        "velocity": vector,
-        "material": ("scalar", config.data.material_width),
-        "stress": scalar,
-        "proximity": (None, PROXIMITY_WIDTH),
-        "out_of_balance": (None, 3),
+    # Where metal yields, each column of the material has a scale of its own, or the yield stress would drown in Young's
+    # modulus. The columns of elastic materials share one.
+    material = ("scalar", config.data.material_width)
+    known: dict[str, list[tuple[Kind | None, int]]] = {  # in the order of the columns
+        "displacement": [vector],
+        "velocity": [vector],
+        "material": [material] if config.history is None else [scalar] * config.data.material_width,
+        "stress": [scalar],
+        "proximity": [(None, PROXIMITY_WIDTH)],
+        "out_of_balance": [(None, 3)],
+        "history": [vector, *[scalar] * sum(output.columns for output in config.history or ())],
     }
     inputs = config.node_inputs if what == "node" else config.element_inputs
-    kinds = [kind for name, kind in known.items() if name in inputs]
+    kinds = [kind for name, kinds in known.items() if name in inputs for kind in kinds]
     if what == "node":
         kinds = [(None, len(NodeType)), *kinds]
-        if config.history is not None:
-            kinds += [vector, ("scalar", sum(output.columns for output in config.history))]
         kinds += [vector] * config.boundary_motion
     return FeatureNormalizer(kinds)

@@ -24,6 +24,7 @@ from ast_sim.support.errors import ConfigError
 Use = Callable[[Normalizer, Tensor], Any]  # what becomes of the values of an input: normalised, or observed
 
 FIELD = "field "  # stands before the name of a named field among the losses
+FORCE = "force"  # the name of the forces on bodies among the losses
 
 _CPU_ONLY = "models run on the CPU only"
 
@@ -70,6 +71,8 @@ class Simulator(nn.Module):
         # The components of a field with several columns share one scale, as those of a vector do.
         kinds = ("scalar" if columns == 1 else "vector" for _, _, columns, _ in config.data.fields)
         self.field_normalizers = nn.ModuleList(map(Normalizer, kinds))
+        reactions = any(name == REACTION for name, *_ in config.data.fields)
+        self.force_normalizer = Normalizer("vector") if reactions else None
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Simulator:
         try:
@@ -143,6 +146,8 @@ class Simulator(nn.Module):
             self.motion_normalizer.observe(target.motion[batch.graph.normal_nodes])
             for output, normalizer in self._outputs:
                 normalizer.observe(target.fields[output.name][self._counting(output, batch)])
+            if self.force_normalizer is not None:
+                self.force_normalizer.observe(batch.graph.body_sums(target.fields[REACTION]))
         for module in self.modules():
             if isinstance(module, Normalizer):
                 module.fix()
@@ -166,9 +171,9 @@ class Simulator(nn.Module):
             weights: [B], how much the squared error of the motion of each scene counts; None: 1.
 
         Returns:
-            "motion", "stress" (if there is one), "field NAME" of each named field, and "loss" = motion + stress_weight
-            * (stress + fields). "spread" is the standard deviation of the predicted motion over the nodes: if it is 0,
-            the decoder is dead.
+            "motion", "stress" (if there is one), "field NAME" of each named field, "force" of the sums of reactions
+            over bodies (if they are predicted), and "loss" = motion + stress_weight * (all the others). "spread" is the
+            standard deviation of the predicted motion over the nodes: if it is 0, the decoder is dead.
         """
         normal = batch.graph.normal_nodes
         motion = prediction.motion.index_select(0, normal)
@@ -191,7 +196,18 @@ class Simulator(nn.Module):
             key = output.name if output.name == STRESS else f"{FIELD}{output.name}"
             losses[key] = share(len(rows)) * error.square().mean()
             losses["loss"] = losses["loss"] + stress_weight * losses[key]
+        if self.force_normalizer is not None:
+            error = self._force_errors(prediction, batch, target)
+            losses[FORCE] = share(len(error)) * error.square().mean()
+            losses["loss"] = losses["loss"] + stress_weight * losses[FORCE]
         return losses
+
+    def _force_errors(self, prediction: Prediction, batch: Batch, target: Target) -> Tensor:
+        """[K, 3]: the errors of the forces on the bodies, normalised. Nodal reactions whose errors are small, but alike
+        at many nodes, add up to wrong forces."""
+        *_, normalizer = (one for output, one in self._outputs if output.name == REACTION)
+        off = normalizer.inverse(prediction.fields[REACTION]) - target.fields[REACTION]
+        return batch.graph.body_sums(off) / self.force_normalizer.scale
 
     @torch.no_grad()
     def residual(self, prediction: Prediction, batch: Batch, target: Target) -> Tensor:

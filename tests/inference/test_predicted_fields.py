@@ -20,6 +20,7 @@ from ast_sim.named_field import REACTION, NamedField
 from ast_sim.support.errors import ConfigError, DatasetError
 
 STATES = ("heat flux", "PEEQ", REACTION)
+PARTS = ("stress", "force", *(f"field {name}" for name in STATES))  # of the loss, beside the motion
 
 
 def with_fields(truth, unit="J/m2"):
@@ -107,6 +108,29 @@ def test_a_force_on_bodies_is_the_sum_of_predicted_reactions(run, data):
     np.testing.assert_allclose(last.force, predicted[3, own].sum(axis=0), atol=1e-9)
     np.testing.assert_allclose(last.torque, np.cross(arms, predicted[3])[own].sum(axis=0), atol=1e-9)
     assert last.time == 3.0
+
+
+def test_the_loss_counts_the_forces_on_bodies(run, data):
+    """The same error at all nodes of a body is small at each, and large in their sum."""
+    model = run.model
+    with Dataset(data) as dataset:
+        batch, target = model.pairs(dataset, batch_size=6).batch(0)
+    with model.predicting():
+        prediction = model(batch)
+    losses = model.loss(prediction, batch, target)
+    off = model.predict(batch).fields[REACTION] - target.fields[REACTION]
+    sums, true = [], []
+    for first, last in zip(batch.graph.node_offsets, batch.graph.node_offsets[1:], strict=False):
+        rows = torch.arange(len(off))
+        for body in (0, 1):
+            own = (rows >= first) & (rows < last) & (batch.graph.body == body) & batch.graph.prescribed
+            sums.append(off[own].sum(dim=0))
+            true.append(target.fields[REACTION][own].sum(dim=0))
+    scale = float(model.force_normalizer.scale)
+    assert 0.5 < scale / float(torch.stack(true).square().mean().sqrt()) < 2
+    assert float(losses["force"]) == pytest.approx(float((torch.stack(sums) / scale).square().mean()), rel=1e-4)
+    whole = losses["motion"] + 0.01 * sum(value for key, value in losses.items() if key in PARTS)
+    assert float(losses["loss"]) == pytest.approx(float(whole), rel=1e-5)
 
 
 def test_reactions_turn_in_a_mirror_and_columns_are_told_apart():

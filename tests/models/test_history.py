@@ -13,6 +13,7 @@ from ast_sim.inference.effort import Effort
 from ast_sim.inference.jump import calls
 from ast_sim.inference.predict import answers
 from ast_sim.inference.question import Question
+from ast_sim.models.node_inputs import node_features
 from ast_sim.models.registry import model_names
 from ast_sim.named_field import NamedField
 from ast_sim.scene import Trajectory
@@ -25,7 +26,7 @@ METAL = ["young", "poisson", "yield_stress"]
 def pressed(depth: float) -> Trajectory:
     """A plate of metal that a block presses in until frame 3 and lets go; what is deeper than `ELASTIC` stays."""
     truth = toy.plate(0)
-    scene = replace(truth.scene, material=np.tile(np.float32([2e11, 0.3, 3e8]), (truth.scene.num_elements, 1)))
+    scene = replace(truth.scene, material=np.float32([2e11, 0.3, 3e8]) * truth.scene.deforming_elements[:, None])
     shape = (truth.position[TURN] - truth.position[0]).astype(float)
     shape /= np.abs(shape[-1, 2])  # 1 at the block
     down = depth * np.interp(np.arange(LAST + 1), [0, TURN, LAST], [0, 1, 0])
@@ -112,6 +113,20 @@ def test_a_turning_point_that_fails_takes_what_starts_from_it_along(data, tmp_pa
     run.model.predict = spoiled
     (answer,) = answers(run.model, [Question.of(pressed(0.05), "scene", [2, 5])])
     assert answer.frames == (2,) and "of node 8 in frame 3 is not finite" in answer.failure
+
+
+def test_each_number_of_material_and_history_has_a_scale_of_its_own(data, tmp_path):
+    """Young's modulus is 2e11, the yield stress 3e8, the plastic strain 0.01."""
+    run = small(data, tmp_path)
+    assert run.settings.model.node_inputs == ("displacement", "proximity", "material", "history")
+    with Dataset(data) as dataset:
+        batch, _ = run.model.pairs(dataset, batch_size=40).batch(0)
+        seen = node_features(run.settings.model, batch)
+    scales = run.model.node_inputs.scale
+    material, way, known = slice(6, 9), slice(14, 17), slice(17, 19)  # after type, displacement; proximity between
+    np.testing.assert_allclose(scales[material], seen[:, material].double().std(dim=0, correction=0), rtol=0.2)
+    assert 0.5 < scales[known][0] / seen[:, 17].std() < 2 and 0.5 < scales[known][1] / seen[:, 18].std() < 2
+    assert len(set(scales[way].tolist())) == 1
 
 
 def test_a_history_needs_jumps(data, tmp_path):
