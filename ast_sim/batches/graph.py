@@ -172,13 +172,14 @@ class Graph:
         """[*] int64: the nodes that a model moves."""
         return (self.node_type == NodeType.NORMAL).nonzero()[:, 0]
 
-    def body_sums(self, x: Tensor) -> Tensor:
-        """[N, F] -> [K, F]: the sums over the prescribed nodes of each body that has some, scene by scene."""
+    def body_sums(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """[N, F] -> [N, F] and [N, 1] float64: for each node the sum over the prescribed nodes of its body, and their
+        number, at least 1."""
         scene = torch.arange(self.num_scenes).repeat_interleave(self.node_offsets.diff())
-        nodes = self.prescribed.nonzero()[:, 0]
-        names = torch.stack([scene, self.body], dim=1)[nodes]
-        bodies, row = names.unique(dim=0, return_inverse=True)
-        return x.new_zeros(len(bodies), x.shape[1]).index_add(0, row, x.index_select(0, nodes))
+        body = scene * (int(self.body.max()) + 1) + self.body
+        counted = torch.cat([x.double(), torch.ones(len(x), 1)], dim=1) * self.prescribed[:, None]
+        sums = counted.new_zeros(int(body.max()) + 1, counted.shape[1]).index_add_(0, body, counted)[body]
+        return sums[:, :-1], sums[:, -1:].clamp(min=1)
 
     def element_mean(self, x: Tensor) -> Tensor:
         """[N, F] -> [E, F]: the mean over the nodes of each element."""

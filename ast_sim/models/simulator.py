@@ -24,7 +24,6 @@ from ast_sim.support.errors import ConfigError
 Use = Callable[[Normalizer, Tensor], Any]  # what becomes of the values of an input: normalised, or observed
 
 FIELD = "field "  # stands before the name of a named field among the losses
-FORCE = "force"  # the name of the forces on bodies among the losses
 
 _CPU_ONLY = "models run on the CPU only"
 
@@ -138,6 +137,26 @@ class Simulator(nn.Module):
             return graph.prescribed
         return graph.deforming_elements if output.location == "element" else graph.deforming_nodes
 
+    def _normalised(self, output: Output, normalizer: Normalizer, values: Tensor, batch: Batch) -> Tensor:
+        """What the network should say for these values [N or E, *].
+
+        The reactions r of the nodes of a body add up to the force F on it. Small errors that are alike at many nodes
+        would make it wrong. So the mean of what the network says is F, and the deviations from the mean are those of r,
+        each with its own scale.
+        """
+        if output.name != REACTION:
+            return normalizer(values)
+        force, count = batch.graph.body_sums(values)
+        return (normalizer(values - force / count) + self.force_normalizer(force)).float()
+
+    def _physical(self, output: Output, normalizer: Normalizer, said: Tensor, batch: Batch) -> Tensor:
+        """The inverse of `_normalised`."""
+        if output.name != REACTION:
+            return normalizer.inverse(said)
+        total, count = batch.graph.body_sums(said)
+        mean = total / count
+        return (normalizer.inverse(said - mean) + self.force_normalizer.inverse(mean) / count).float()
+
     @torch.no_grad()
     def fit_statistics(self, batches: Iterable[tuple[Batch, Target]]) -> None:
         """Fix the statistics of inputs and targets, in float64, from batches like those of training, with noise."""
@@ -145,9 +164,13 @@ class Simulator(nn.Module):
             self.observe(batch)
             self.motion_normalizer.observe(target.motion[batch.graph.normal_nodes])
             for output, normalizer in self._outputs:
-                normalizer.observe(target.fields[output.name][self._counting(output, batch)])
-            if self.force_normalizer is not None:
-                self.force_normalizer.observe(batch.graph.body_sums(target.fields[REACTION]))
+                counting = self._counting(output, batch)
+                values = target.fields[output.name]
+                if output.name == REACTION:
+                    sums, count = batch.graph.body_sums(values)
+                    self.force_normalizer.observe(sums[counting])
+                    values = values - sums / count
+                normalizer.observe(values[counting])
         for module in self.modules():
             if isinstance(module, Normalizer):
                 module.fix()
@@ -171,9 +194,9 @@ class Simulator(nn.Module):
             weights: [B], how much the squared error of the motion of each scene counts; None: 1.
 
         Returns:
-            "motion", "stress" (if there is one), "field NAME" of each named field, "force" of the sums of reactions
-            over bodies (if they are predicted), and "loss" = motion + stress_weight * (all the others). "spread" is the
-            standard deviation of the predicted motion over the nodes: if it is 0, the decoder is dead.
+            "motion", "stress" (if there is one), "field NAME" of each named field, and "loss" = motion + stress_weight
+            * (stress + fields). "spread" is the standard deviation of the predicted motion over the nodes: if it is 0,
+            the decoder is dead.
         """
         normal = batch.graph.normal_nodes
         motion = prediction.motion.index_select(0, normal)
@@ -192,22 +215,12 @@ class Simulator(nn.Module):
                     f"model.state: the model {self.config.name} does not predict {output.name}: leave it out"
                 )
             predicted = prediction.fields[output.name].index_select(0, rows)
-            error = predicted - normalizer(target.fields[output.name].index_select(0, rows))
+            wanted = self._normalised(output, normalizer, target.fields[output.name], batch)
+            error = predicted - wanted.index_select(0, rows)
             key = output.name if output.name == STRESS else f"{FIELD}{output.name}"
             losses[key] = share(len(rows)) * error.square().mean()
             losses["loss"] = losses["loss"] + stress_weight * losses[key]
-        if self.force_normalizer is not None:
-            error = self._force_errors(prediction, batch, target)
-            losses[FORCE] = share(len(error)) * error.square().mean()
-            losses["loss"] = losses["loss"] + stress_weight * losses[FORCE]
         return losses
-
-    def _force_errors(self, prediction: Prediction, batch: Batch, target: Target) -> Tensor:
-        """[K, 3]: the errors of the forces on the bodies, normalised. Nodal reactions whose errors are small, but alike
-        at many nodes, add up to wrong forces."""
-        *_, normalizer = (one for output, one in self._outputs if output.name == REACTION)
-        off = normalizer.inverse(prediction.fields[REACTION]) - target.fields[REACTION]
-        return batch.graph.body_sums(off) / self.force_normalizer.scale
 
     @torch.no_grad()
     def residual(self, prediction: Prediction, batch: Batch, target: Target) -> Tensor:
@@ -234,7 +247,7 @@ class Simulator(nn.Module):
         fields = {}
         for output, normalizer in self._outputs:
             if output.name in prediction.fields:
-                values = normalizer.inverse(prediction.fields[output.name])
+                values = self._physical(output, normalizer, prediction.fields[output.name], batch)
                 if output.name != STRESS:
                     values = torch.where(self._counting(output, batch)[:, None], values, 0)
                 fields[output.name] = values

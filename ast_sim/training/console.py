@@ -10,7 +10,7 @@ from collections.abc import Callable
 from torch import nn
 
 from ast_sim.dataset.reader import Dataset
-from ast_sim.models.simulator import FIELD, FORCE
+from ast_sim.models.simulator import FIELD
 from ast_sim.named_field import STRESS
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.train_config import RunConfig
@@ -99,8 +99,7 @@ class StepLog:
             record = {**means, "rate": rate, "seconds": seconds}
             self.metrics.append({"step": step, **record})
             self.listener.hear(step, record)
-        told = [key for key in means if key in (STRESS, FORCE) or key.startswith(FIELD)]
-        shown = {key.removeprefix(FIELD): means[key] for key in told}
+        shown = {key.removeprefix(FIELD): mean for key, mean in means.items() if key == STRESS or key.startswith(FIELD)}
         fields = "".join(f", {name} {mean:.4f}" for name, mean in shown.items())
         to_go = self.clock.to_go(self.options.steps - step, self._validations_to_go(step))
         progress.show(
