@@ -28,11 +28,16 @@ class Material:
     constants: Mapping[str, float] = field(default_factory=dict)
 
     @property
+    def yields(self) -> bool:
+        """Whether the state of the material depends on the way of the load."""
+        return YIELD_STRESS in {*self.columns, *self.constants}
+
+    @property
     def law(self) -> str | None:
         """ "neo_hookean" (of Ciarlet, as the bundled solver has it), if Young's modulus and Poisson's ratio are known
         and no yield stress; None: the law is not known."""
         known = {*self.columns, *self.constants}
-        return "neo_hookean" if known.issuperset(ELASTIC) and YIELD_STRESS not in known else None
+        return "neo_hookean" if known.issuperset(ELASTIC) and not self.yields else None
 
     def require_law(self) -> None:
         """Raise ConfigError unless the law is known; the text says what there is."""

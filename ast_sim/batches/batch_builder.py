@@ -6,7 +6,7 @@ Legend: N nodes, E elements, B scenes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -24,16 +24,21 @@ class State:
         position: [N, 3] float32, p_t, with noise in training. In a jump the prescribed nodes are where they will be.
         previous: [N, 3], p_{t-1}; None in a scene without inertia.
         stress: [N, 1] or [E, 1] at t, or None.
+        source: [N, 3], the frame that was carried along to be this state; None where the way of the load does not
+            count.
+        history: [N, *], what is known of that frame at the nodes (`Graph.at_nodes`), or None.
     """
 
     position: Tensor
     previous: Tensor | None = None
     stress: Tensor | None = None
+    source: Tensor | None = None
+    history: Tensor | None = None
 
     @staticmethod
     def concatenate(states: Sequence[State]) -> State:
         """The states of several scenes as one."""
-        return State(*(_join(states, key) for key in ("position", "previous", "stress")))
+        return State(*(_join(states, key.name) for key in fields(State)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +47,7 @@ class Batch:
 
     Attributes:
         graph: what does not change with time.
-        position, previous_position, stress: as in `State`.
+        position, previous_position, stress, source, history: as in `State`.
         boundary_motion: [N, 3], how far the prescribed nodes move from the state to the frame to predict; 0 elsewhere.
         names: for messages, one for each scene: "train/000012 frame 7".
         wants_elements: False: a model may leave out what it predicts on elements.
@@ -57,6 +62,8 @@ class Batch:
     names: list[str]
     wants_elements: bool = True
     proximity: Tensor | None = None
+    source: Tensor | None = None
+    history: Tensor | None = None
 
     @staticmethod
     def build(graph: Graph, state: State, prescribed: Tensor, names: list[str]) -> Batch:
@@ -66,7 +73,8 @@ class Batch:
             prescribed: [N, 3], the positions of the prescribed nodes in the frame to predict. Other rows are not read.
         """
         motion = torch.where(graph.prescribed[:, None], prescribed - state.position, 0.0)
-        return Batch(graph, state.position, state.previous, motion, state.stress, names)
+        known = {"source": state.source, "history": state.history}
+        return Batch(graph, state.position, state.previous, motion, state.stress, names, **known)
 
     @staticmethod
     def concatenate(batches: Sequence[Batch]) -> Batch:
@@ -75,11 +83,13 @@ class Batch:
             Graph.concatenate([batch.graph for batch in batches]),
             *(_join(batches, key) for key in ("position", "previous_position", "boundary_motion", "stress")),
             [name for batch in batches for name in batch.names],
+            source=_join(batches, "source"),
+            history=_join(batches, "history"),
         )
 
     def placed(self, placement: Placement) -> Batch:
         """The same scene, mirrored and moved."""
-        previous = self.previous_position
+        previous, source = self.previous_position, self.source
         return replace(
             self,
             graph=self.graph.placed(placement),
@@ -87,6 +97,7 @@ class Batch:
             previous_position=None if previous is None else placement.points(previous),
             boundary_motion=placement.vectors(self.boundary_motion),
             proximity=None,
+            source=None if source is None else placement.points(source),
         )
 
 
@@ -106,15 +117,15 @@ class Target:
     @staticmethod
     def concatenate(targets: Sequence[Target]) -> Target:
         """Several targets as one."""
-        fields = {name: torch.cat([target.fields[name] for target in targets]) for name in targets[0].fields}
-        return Target(torch.cat([target.motion for target in targets]), fields)
+        joined = {name: torch.cat([target.fields[name] for target in targets]) for name in targets[0].fields}
+        return Target(torch.cat([target.motion for target in targets]), joined)
 
     def placed(self, placement: Placement) -> Target:
         """The target of the same scene, mirrored and moved. Reactions are vectors; other fields do not change."""
-        fields = dict(self.fields)
-        if REACTION in fields:
-            fields[REACTION] = placement.vectors(fields[REACTION])
-        return Target(placement.vectors(self.motion), fields)
+        placed = dict(self.fields)
+        if REACTION in placed:
+            placed[REACTION] = placement.vectors(placed[REACTION])
+        return Target(placement.vectors(self.motion), placed)
 
 
 def _join(parts: Sequence[State | Batch], key: str) -> Tensor | None:

@@ -5,7 +5,7 @@ Legend: N nodes, E elements of k nodes, M edges, B scenes; a batch is the concat
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -17,6 +17,7 @@ from torch import Tensor
 from ast_sim.batches.mirror_and_shift import Placement
 from ast_sim.batches.out_of_balance import Elasticity
 from ast_sim.material import Material
+from ast_sim.named_field import Output
 from ast_sim.ops import EdgeSet
 from ast_sim.ops._edges import join_indices, join_offsets, offsets_of
 from ast_sim.scene import NodeType, Scene
@@ -49,7 +50,7 @@ class Graph:
         m2m: node to node, every element edge in both directions; None with element nodes.
         e2m, m2e: element to each of its nodes, and the reverse; None without element nodes.
         rest_edges: [M, 4] float32, `edge_vectors` of `edges` at rest. An element is at the mean of its nodes.
-        body: [N] int64; None if the surface is not needed.
+        body: [N] int64, the number of each node's body in its scene.
         surface: [F, 3] int64, boundary triangles, counter-clockwise seen from outside; None if it is not needed.
         surface_offsets: [B + 1] int64, where each scene's triangles start and end; None if they are not needed.
         elasticity: what elastic forces need; None if they are not needed.
@@ -82,7 +83,7 @@ class Graph:
 
         Args:
             element_nodes: elements are nodes of the graph too: it has e2m and m2e, not m2m.
-            surface: the graph has the surface and the bodies.
+            surface: the graph has the surface.
             elastic: the material of its tetrahedra; the graph has their elasticity.
         """
         n, e = scene.num_nodes, scene.num_elements
@@ -115,6 +116,7 @@ class Graph:
             e2m=e2m,
             m2e=m2e,
             rest_edges=rest_edges,
+            body=torch.from_numpy(scene.body.astype("int64")),
             **(_surface_of(scene) if surface else {}),
             elasticity=None if elastic is None else Elasticity.of(scene, elastic),
         )
@@ -170,15 +172,32 @@ class Graph:
         """[*] int64: the nodes that a model moves."""
         return (self.node_type == NodeType.NORMAL).nonzero()[:, 0]
 
+    def body_sums(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """[N, F] -> [N, F] and [N, 1] float64: for each node the sum over the prescribed nodes of its body, and their
+        number, at least 1."""
+        scene = torch.arange(self.num_scenes).repeat_interleave(self.node_offsets.diff())
+        body = scene * (int(self.body.max()) + 1) + self.body
+        counted = torch.cat([x.double(), torch.ones(len(x), 1)], dim=1) * self.prescribed[:, None]
+        sums = counted.new_zeros(int(body.max()) + 1, counted.shape[1]).index_add_(0, body, counted)[body]
+        return sums[:, :-1], sums[:, -1:].clamp(min=1)
+
     def element_mean(self, x: Tensor) -> Tensor:
         """[N, F] -> [E, F]: the mean over the nodes of each element."""
         return _element_mean(self.elements, x)
 
+    def at_nodes(self, outputs: Sequence[Output], values: Mapping[str, Tensor]) -> Tensor:
+        """[N, *]: the values [N or E, *] of these outputs, side by side. A node has the mean of its elements."""
+        num = len(self.rest_position)
+        columns = [self.rest_position.new_zeros(num, 0)]
+        for output in outputs:
+            value = values[output.name]
+            columns.append(value if output.location == "node" else _node_mean(self.elements, value, num))
+        return torch.cat(columns, dim=1)
+
 
 def _surface_of(scene: Scene) -> dict[str, Tensor]:
     triangles = torch.from_numpy(scene.surface().astype("int64"))
-    body = torch.from_numpy(scene.body.astype("int64"))
-    return {"body": body, "surface": triangles, "surface_offsets": torch.tensor([0, len(triangles)])}
+    return {"surface": triangles, "surface_offsets": torch.tensor([0, len(triangles)])}
 
 
 def both_ways(pairs: np.ndarray, num_nodes: int) -> EdgeSet:

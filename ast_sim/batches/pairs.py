@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -14,8 +14,9 @@ from ast_sim.batches.batch_builder import Batch, State, Target
 from ast_sim.batches.carry import Carrier
 from ast_sim.batches.graph import Graph
 from ast_sim.batches.mirror_and_shift import Placement
+from ast_sim.batches.turning_points import jump_sources
 from ast_sim.dataset.reader import Dataset
-from ast_sim.named_field import STRESS, require_fields
+from ast_sim.named_field import STRESS, Output, require_fields
 from ast_sim.scene import Scene
 from ast_sim.support.byte_cache import ByteCache, cache_bytes
 from ast_sim.support.errors import DatasetError
@@ -34,6 +35,7 @@ class _Member:
     center: [3] float32, the middle of the box around the scene at rest.
     carry: moves a state along with the prescribed nodes; None if frames are predicted step by step.
     fields: [S, N or E, *] float32 of each named field to predict.
+    sources: [S] int64, the frame that a jump to each frame starts from.
     """
 
     graph: Graph
@@ -41,6 +43,7 @@ class _Member:
     center: np.ndarray
     carry: Carrier | None
     fields: list[np.ndarray]
+    sources: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +75,7 @@ class Jump:
         error: [N, 3] float32, the error of a guess of the frame to predict, which is to be corrected, before the scene
             is mirrored; None: there is no guess yet, and the jump starts from the source.
         share: without a guess, the state has this share of the error of the source, carried along.
+        source_error: [N, 3] float32, the error of the source, as a prediction of it has; None: the source is true.
     """
 
     index: int
@@ -80,13 +84,16 @@ class Jump:
     placement: Placement
     error: np.ndarray | None = None
     share: float = 1.0
+    source_error: np.ndarray | None = None
 
 
 class PairSampler:
     """Draws batches of frame pairs (t, t + 1) of a split. Each epoch is a new random order of all pairs.
 
     With `jumps`, t + 1 is predicted from the first frame, carried along. There is no noise; instead, half of the pairs
-    start from a guess that has a random share of the error of this start, as a correction does.
+    start from a guess that has a random share of the error of this start, as a correction does. With `history`, t + 1
+    is predicted from the last frame before in which the motion turns back, if it does, and from the values of these
+    outputs there.
 
     White Gaussian noise n of standard deviation `noise` (in the unit of length) is added to p_t of the NORMAL nodes.
     The next position in the target is p_{t+1} + (1 - gamma) n (MeshGraphNets, add_noise), so the target is
@@ -126,13 +133,14 @@ class PairSampler:
         mirror: tuple[str, ...] = (),
         shift: float = 0.0,
         fields: tuple[tuple[str, str, int, str], ...] = (),
+        history: tuple[Output, ...] | None = None,
     ) -> None:
         self.batch_size, self.seed, self.noise = batch_size, seed, noise
         self.left = np.float32(1 - gamma)  # share of the noise that stays in the target
         self._dataset, self._split, self.part = dataset, split, part
         self._make_graph, self.dynamic = make_graph, dynamic
         self.first_frame = 1 if dynamic else 0  # the least t of a pair: the acceleration needs a frame before it
-        self._jumps, self._fields = jumps, fields
+        self._jumps, self._fields, self._history = jumps, fields, history
         self._mirrored = np.array([axis in mirror for axis in "xyz"])
         self._shift = np.float32(shift)
         frames = np.array([dataset.num_frames(split, i) for i in range(dataset.count(split))], np.int64)
@@ -167,13 +175,17 @@ class PairSampler:
         placement = self.random_placement(index, self.random(_PLACE, epoch, number))
         if self._jumps:
             draw = self.random(_NOISE, epoch, number).random()
-            return Jump(index, self.first_frame, t + 1, placement, share=min(2 * draw, 1.0))
+            return Jump(index, self.source(index, t + 1), t + 1, placement, share=min(2 * draw, 1.0))
         noise = self.white_noise(index, self.random(_NOISE, epoch, number))
         return Pair(index, t, placement, noise, None, self.left * noise)
 
     def last_frame(self, index: int) -> int:
         """The number of the last frame of a trajectory."""
         return self._dataset.num_frames(self._split, index) - 1
+
+    def source(self, index: int, frame: int) -> int:
+        """The frame of a trajectory that a jump to a frame starts from."""
+        return int(self._member(index).sources[frame])
 
     @property
     def trajectories(self) -> np.ndarray:
@@ -204,16 +216,26 @@ class PairSampler:
         name = f"{self._split}/{pair.index:06d}"
         source, frame = (pair.source, pair.frame) if jumps else (pair.t, pair.t + 1)
         before, stress = self._dataset.frames(self._split, pair.index, source - self.first_frame, source + 1)
+        if jumps and pair.source_error is not None:
+            before = before + pair.source_error * member.noisy
         (after,), next_stress = self._dataset.frames(self._split, pair.index, frame, frame + 1)
         position, previous, motion = (self._jump if jumps else self._step)(pair, member, before, after)
-        state = State(torch.from_numpy(position), previous, None if stress is None else torch.tensor(stress[-1]))
-        fields = {} if next_stress is None else {STRESS: torch.tensor(next_stress[0])}
-        for (key, *_), values in zip(self._fields, member.fields, strict=True):
-            fields[key] = torch.tensor(values[frame])
-        target = Target(torch.from_numpy(motion), fields)
+        known = self._values(member, stress, -1, source)
+        state = State(torch.from_numpy(position), previous, known.get(STRESS))
+        if self._history is not None:
+            history = member.graph.at_nodes(self._history, known)
+            state = replace(state, source=torch.tensor(before[-1]), history=history)
+        target = Target(torch.from_numpy(motion), self._values(member, next_stress, 0, frame))
         names = [f"{name} frame {frame if jumps else source}"]
         batch = Batch.build(member.graph, state, torch.tensor(after), names)
         return batch.placed(pair.placement), target.placed(pair.placement)
+
+    def _values(self, member: _Member, stress: np.ndarray | None, row: int, frame: int) -> dict[str, Tensor]:
+        """What is predicted beside the motion, [N or E, *] by name, in a frame, whose stress is in this row."""
+        values = {} if stress is None else {STRESS: torch.tensor(stress[row])}
+        for (key, *_), field in zip(self._fields, member.fields, strict=True):
+            values[key] = torch.tensor(field[frame])
+        return values
 
     def _jump(self, jump: Jump, member: _Member, before: np.ndarray, after: np.ndarray) -> _Motion:
         if jump.error is not None:
@@ -252,12 +274,18 @@ class PairSampler:
     def _make_member(self, index: int) -> _Member:
         scene = self._dataset.scene(self._split, index)
         noisy = np.repeat(~scene.prescribed[:, None], 3, axis=1).astype(np.float32)
-        if not scene.rest_position[:, 2].any():  # only here must the whole trajectory be read
-            position, _ = self._dataset.frames(self._split, index, 0, self._dataset.num_frames(self._split, index))
-            noisy[:, 2] *= position[:, :, 2].any()
+        count = self._dataset.num_frames(self._split, index)
+        sources = np.full(count, self.first_frame)
+        plane = not scene.rest_position[:, 2].any()
+        if plane or self._history is not None:  # only here must the whole trajectory be read
+            position, _ = self._dataset.frames(self._split, index, 0, count)
+            if plane:
+                noisy[:, 2] *= position[:, :, 2].any()
+            if self._history is not None:
+                sources = jump_sources(position, scene.prescribed)
         center = (scene.rest_position.min(0) + scene.rest_position.max(0)) / 2
         carry = Carrier(scene) if self._jumps else None
-        return _Member(self._make_graph(scene), noisy, center, carry, self._read_fields(index))
+        return _Member(self._make_graph(scene), noisy, center, carry, self._read_fields(index), sources)
 
     def _read_fields(self, index: int) -> list[np.ndarray]:
         """The values of the named fields to predict, [S, N or E, *] each."""

@@ -26,30 +26,39 @@ from ast_sim.batches.training_pool import Pool
 MEMORY = 0.99  # share of the running mean square that stays when a scene is added
 UNSEEN = 0.3  # the first guess of the errors of later calls, relative to that of the first
 LEAST = 0.02  # what later calls leave, relative to what the first leaves, counts as at least this
-ELSEWHERE = 0.1  # share of the jumps that start from a later frame than the first
+OWN = 0.5  # share of the jumps from a later frame than the first that start from the model's own answer for it
+ELSEWHERE = 0.1  # share of the jumps that start from a later frame than `PairSampler.source` says
 
 
 @dataclass(eq=False)
 class _Guess(Jump):
-    """A jump that is being corrected. `call` counts the calls that led to its guess; after `last` it is given up."""
+    """A jump that is being corrected. `call` counts the calls that led to its guess; after `last` it ends. Then the
+    model's answer is the start of a jump to the frame `then`, if there is one."""
 
     call: int = 0
     last: int = 1
+    then: int | None = None
+
+    def take_next(self) -> None:
+        """Jump from the frame that was predicted to the frame `then`."""
+        self.source, self.frame, self.then = self.frame, self.then, None
 
 
 class JumpPool(Pool):
     """Jumps that are corrected side by side; see `Pool` for the other arguments.
 
-    A jump leads from the first frame of a scene, or in some cases from a later one, to a frame that is drawn; after
-    `calls` calls another jump follows at its place. Only the first jump at each place gets a random number of calls, so
-    that all calls occur equally often from the beginning. A guess whose error is too large to learn from is given up.
+    A jump leads from `PairSampler.source`, or in some cases from a later frame, to a frame that is drawn; after
+    `calls` calls another jump follows at its place. Where the source is not the first frame, half of the jumps start
+    from the model's own answer for the source, to which a jump led just before. Only the first jump at each place gets
+    a random number of calls, so that all calls occur equally often from the beginning. A guess whose error is too large
+    to learn from is given up.
 
     Args:
         calls: how many calls correct one another.
     """
 
     streams = (20, 21)
-    kept = ("call", "error")
+    kept = ("call", "error", "source_error")
 
     def __init__(self, sampler: PairSampler, size: int, calls: int, largest: float) -> None:
         super().__init__(sampler, size, largest)
@@ -81,15 +90,28 @@ class JumpPool(Pool):
 
     def restore(self, state: dict[str, Tensor]) -> None:
         super().restore(state)
+        for guess in self._going.values():
+            if guess.source_error is not None:
+                guess.take_next()
         self._squares = state["squares"].numpy().copy()
 
     def _start(self, index: int, first: bool, generator: np.random.Generator) -> _Guess:
         earliest = self._sampler.first_frame
         frame = int(generator.integers(earliest + 1, self._sampler.last_frame(index) + 1))
-        source = int(generator.integers(earliest, frame)) if generator.random() < ELSEWHERE else earliest
+        way = [self._sampler.source(index, frame), frame]
+        if generator.random() < ELSEWHERE:
+            way[0] = int(generator.integers(way[0], frame))
+        elif way[0] > earliest and generator.random() < OWN:
+            way.insert(0, self._sampler.source(index, way[0]))
         last = int(generator.integers(1, self._calls + 1)) if first else self._calls
-        return _Guess(index, source, frame, self._sampler.random_placement(index, generator), last=last)
+        placement = self._sampler.random_placement(index, generator)
+        return _Guess(index, way[0], way[1], placement, last=last, then=way[2] if len(way) > 2 else None)
 
     def _goes_on(self, scene: _Guess, error: np.ndarray) -> bool:
         scene.call, scene.error = scene.call + 1, error
-        return scene.call < scene.last and not self._lost(error)
+        if self._lost(error):
+            return False
+        if scene.call == scene.last and scene.then is not None:
+            scene.take_next()
+            scene.call, scene.error, scene.source_error = 0, None, error
+        return scene.call < scene.last

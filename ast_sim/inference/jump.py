@@ -1,16 +1,18 @@
 """Jumps: each wanted frame is predicted at once from the first frame, then corrected; no other frame is computed.
 
-The start is the first frame, carried along by the prescribed nodes. Each call of the model gets the answer of the call
-before and predicts what is missing. Newton steps of the solver may follow. The model predicts the frames of all scenes
-side by side, in ragged batches. With friction, Newton steps know the way of the load as far as the frames before are
-wanted, too; in all else a frame does not depend on the others. The bundled solver may end an answer (`Effort.solved`).
+The start is the first frame, carried along by the prescribed nodes. Where the material yields, it is the last frame in
+which the motion turned back, if it did; such frames are predicted before the others. Each call of the model gets the
+answer of the call before and predicts what is missing. Newton steps of the solver may follow. The model predicts the
+frames of all scenes side by side, in ragged batches. With friction, Newton steps know the way of the load as far as the
+frames before are wanted, too; in all else a frame does not depend on others than its start. The bundled solver may end
+an answer (`Effort.solved`).
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from itertools import takewhile
 from typing import NamedTuple
@@ -22,6 +24,7 @@ from torch import Tensor
 from ast_sim.batches.batch_builder import State
 from ast_sim.batches.carry import Carrier
 from ast_sim.batches.graph import Graph
+from ast_sim.batches.turning_points import jump_sources
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.effort import AGAIN, MOST_NEWTON_STEPS, Effort, law_of, newton_steps
 from ast_sim.inference.predict_batch import Start, predict_batch
@@ -84,11 +87,12 @@ def calls(model: Simulator, questions: Sequence[Question], effort: Effort) -> li
             ways.append(scene.failure)
             continue
         count = 1 + effort.corrections + effort.newton_steps
-        position = [_stacked(frame.positions, count) for frame in scene.frames]
-        known = [frame for frame in scene.frames if model.config.data.stress != "none"]
+        wanted = scene.wanted
+        position = [_stacked(frame.positions, count) for frame in wanted]
+        known = [frame for frame in wanted if model.config.data.stress != "none"]
         stress = [_stacked([one[STRESS] for one in frame.fields], 1 + effort.newton_steps) for frame in known]
-        steps = np.array([len(frame.positions) - 1 - effort.corrections for frame in scene.frames])
-        last = np.array([np.nan if frame.last_step is None else frame.last_step for frame in scene.frames])
+        steps = np.array([len(frame.positions) - 1 - effort.corrections for frame in wanted])
+        last = np.array([np.nan if frame.last_step is None else frame.last_step for frame in wanted])
         ways.append(Way(np.stack(position, axis=1), np.stack(stress, axis=1) if stress else None, steps, last))
     return ways
 
@@ -113,7 +117,7 @@ def _predicted(
     graph, carrier, solver = cache(model.graph), cache(Carrier), cache(partial(newton_steps, model.config))
     scenes = [_JumpingScene(model, q, graph(q.scene), carrier(q.scene), solver) for q in questions]
     with model.predicting():
-        for number, group in enumerate(_groups(model, scenes)):
+        for number, group in enumerate(group for wave in _waves(scenes) for group in _groups(model, wave)):
             _predict(model, group, effort.corrections)
             if progress is not None:
                 progress(number)
@@ -139,20 +143,50 @@ def _start_again(model: Simulator, frame: _Frame, effort: Effort) -> None:
 
 @dataclass(eq=False)
 class _Frame:
-    """A frame to predict: its start, the positions after each call and each Newton step, the fields after the last call
-    and after Newton steps, which change the stress alone, the size of the last Newton step, and what the network made
-    of it."""
+    """A frame to predict.
+
+    Attributes:
+        source: the frame that it starts from; None: the first one, which is given.
+        start: made when the source is predicted.
+        positions: after each call and each Newton step.
+        fields: after the last call and after Newton steps, which change the stress alone.
+        last_step: the size of the last Newton step.
+        latent: what the network made of it in the first call.
+        walked: whether the solver went the way of the load; None: it was not asked.
+    """
 
     scene: _JumpingScene
     number: int
-    start: Start
+    source: _Frame | None
+    start: Start = field(init=False)
     positions: list[Tensor] = field(default_factory=list)
     fields: list[dict[str, Tensor]] = field(default_factory=list)
     last_step: float | None = None
     latent: np.ndarray | None = None
-    walked: bool | None = None  # whether the solver went the way of the load; None: it was not asked
+    walked: bool | None = None
     seconds: float = 0.0
     failure: str | None = None
+
+    @property
+    def depth(self) -> int:
+        """How many frames are predicted one after another before this one."""
+        return 0 if self.source is None else 1 + self.source.depth
+
+    @property
+    def name(self) -> str:
+        return f"{self.scene.question.name} frame {self.number}"
+
+    def begin(self) -> None:
+        """Make the start, when the source is predicted."""
+        scene, source = self.scene, self.source
+        if source is None:
+            state = scene.state(scene.question.prescribed_position[0], scene.fields[0], self.number)
+        elif source.failure is None:
+            state = scene.state(source.positions[-1].numpy(), source.fields[-1], self.number)
+        else:
+            self.failure = source.failure
+            return
+        self.start = Start(self.name, scene.graph, state, scene.prescribed_position[self.number])
 
     @property
     def unsettled(self) -> bool:
@@ -185,7 +219,7 @@ class _Frame:
                 if ends:
                     break
         except SimulationError as error:
-            self.failure = f"{self.start.name}: a Newton step failed: {error}"
+            self.failure = f"{self.name}: a Newton step failed: {error}"
         self.seconds += time.perf_counter() - began
 
     def solve(self) -> None:
@@ -203,13 +237,14 @@ class _Frame:
                 stress = self.scene.solver(self.scene.question.scene).von_mises(position, location)
                 self.fields.append({**self.fields[-1], STRESS: torch.from_numpy(stress)})
         except SimulationError as error:
-            self.failure = f"{self.start.name}: the solver found no equilibrium: {error}"
+            self.failure = f"{self.name}: the solver found no equilibrium: {error}"
         self.seconds += time.perf_counter() - began
 
 
 @dataclass(eq=False)
 class _JumpingScene:
-    """A scene and the frames of it that are wanted."""
+    """A scene and the frames of it that are predicted, in ascending order: those that are wanted, and those that they
+    start from."""
 
     model: Simulator
     question: Question
@@ -222,14 +257,32 @@ class _JumpingScene:
         question, self.given = self.question, self.model.config.data.given_frames
         self.prescribed_position = torch.tensor(question.prescribed_position)
         self.fields = question.given_fields(self.model.config.data, self.given)
-        for number in sorted(question.wanted()):
-            if number >= self.given:
-                carried = torch.from_numpy(
-                    self.carry(question.prescribed_position[0], question.prescribed_position[number])
-                )
-                state = State(carried, stress=self.fields[0].get(STRESS))
-                start = Start(f"{question.name} frame {number}", self.graph, state, self.prescribed_position[number])
-                self.frames.append(_Frame(self, number, start))
+        self.history = self.model.config.history
+        sources = np.zeros(len(question.prescribed_position), np.int64)
+        if self.history is not None:
+            sources = jump_sources(question.prescribed_position, question.scene.prescribed)
+        needed: set[int] = set()
+        for number in question.wanted():
+            while number >= self.given and number not in needed:
+                needed.add(number)
+                number = int(sources[number])
+        by_number: dict[int, _Frame] = {}
+        for number in sorted(needed):
+            by_number[number] = _Frame(self, number, by_number.get(int(sources[number])))
+        self.frames += by_number.values()
+
+    @property
+    def wanted(self) -> list[_Frame]:
+        """The frames that are wanted, in ascending order."""
+        return [frame for frame in self.frames if frame.number in self.question.wanted()]
+
+    def state(self, position: np.ndarray, fields: dict[str, Tensor], number: int) -> State:
+        """The positions [N, 3] and fields of a frame, carried along to a later one."""
+        carried = torch.from_numpy(self.carry(position, self.question.prescribed_position[number]))
+        state = State(carried, stress=fields.get(STRESS))
+        if self.history is None:
+            return state
+        return replace(state, source=torch.tensor(position), history=self.graph.at_nodes(self.history, fields))
 
     @cached_property
     def equilibria(self) -> Equilibria:
@@ -250,7 +303,7 @@ class _JumpingScene:
 
     def answer(self) -> Answer:
         """The frames before the first that failed."""
-        predicted = list(takewhile(lambda frame: frame.failure is None, self.frames))
+        predicted = list(takewhile(lambda frame: frame.failure is None, self.wanted))
         frames = dict(enumerate(zip(self.prescribed_position[: self.given], self.fields, strict=True)))
         return self.question.answer(
             self.model.config,
@@ -276,19 +329,30 @@ def _array(positions: Tensor) -> np.ndarray:
     return positions.numpy().astype(np.float64)
 
 
-def _groups(model: Simulator, scenes: Sequence[_JumpingScene]) -> Iterator[list[_Frame]]:
-    """The frames of all scenes in batches. Only frames in the same domain are predicted together."""
+def _waves(scenes: Sequence[_JumpingScene]) -> Iterator[list[_Frame]]:
+    """The frames of all scenes with their starts: those that start from a given frame, then, when these are predicted,
+    those that start from one of these, and so on."""
+    frames = [frame for scene in scenes for frame in scene.frames]
+    for depth in range(1 + max((frame.depth for frame in frames), default=-1)):
+        wave = [frame for frame in frames if frame.depth == depth]
+        for frame in wave:
+            frame.begin()
+        yield [frame for frame in wave if frame.failure is None]
+
+
+def _groups(model: Simulator, frames: Sequence[_Frame]) -> Iterator[list[_Frame]]:
+    """The frames in batches. Only frames in the same domain are predicted together."""
     of_domain: dict[int, list[_Frame]] = {}
-    for frame in (frame for scene in scenes for frame in scene.frames):
+    for frame in frames:
         position = frame.start.state.position
         domain = model.domain(position)
         if domain is None:
             frame.failure = too_far(model.config, frame.scene.question.name, frame.number, position)
         else:
             of_domain.setdefault(domain, []).append(frame)
-    for frames in of_domain.values():
+    for together in of_domain.values():
         group: list[_Frame] = []
-        for frame in frames:
+        for frame in together:
             if group and sum(len(other.start.prescribed) for other in [*group, frame]) > BATCH_NODES:
                 yield group
                 group = []
@@ -305,7 +369,7 @@ def _predict(model: Simulator, group: list[_Frame], corrections: int) -> None:
             for frame in group:
                 _predict(model, [frame], corrections)
         else:
-            group[0].failure = f"{group[0].start.name}: {error}"
+            group[0].failure = f"{group[0].name}: {error}"
         return
     for frame, (positions, fields, latent, seconds) in zip(group, predicted, strict=True):
         frame.failure = not_finite(model.config, frame.scene.question.name, frame.number, positions[-1], fields)

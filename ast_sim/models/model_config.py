@@ -7,12 +7,16 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self
 
 from ast_sim.models.data_facts import DataFacts
+from ast_sim.named_field import REACTION, Output
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.toml_settings import FROM_DATA, LARGEST, require_range
 
 WIDEST = 1 << 16  # the largest width or count of a layer
 
-NODE_INPUTS = "node features, of displacement, velocity, material, proximity and out_of_balance (elastic forces)"
+NODE_INPUTS = (
+    "node features, of displacement, velocity, material, proximity, out_of_balance (elastic forces) and history (jumps"
+    " start where the motion turned back last, and know what is predicted there)"
+)
 
 
 def setting(default: Any, text: str, least: float | None = None, most: float = LARGEST) -> Any:
@@ -55,7 +59,8 @@ class ModelConfig:
     data: DataFacts = field(default=DataFacts(), metadata={FROM_DATA: True})
 
     def __post_init__(self) -> None:
-        self.check_inputs("node_inputs", ("displacement", "velocity", "material", "proximity", "out_of_balance"))
+        known = ("displacement", "velocity", "material", "proximity", "out_of_balance", "history")
+        self.check_inputs("node_inputs", known)
         for item in fields(self):
             if limits := item.metadata.get("limits"):
                 require_range(f"model.{item.name}", getattr(self, item.name), *limits)
@@ -96,11 +101,21 @@ class ModelConfig:
         elastic = "out_of_balance" in self.node_inputs
         return {"surface": "proximity" in self.node_inputs, "elastic": self.data.material if elastic else None}
 
+    @property
+    def history(self) -> tuple[Output, ...] | None:
+        """What a jump knows of the frame in which the motion turned back last: the outputs but the reactions, which
+        follow from the others; None: all jumps start from the first frame."""
+        if "history" not in self.node_inputs:
+            return None
+        return tuple(output for output in self.data.outputs if output.name != REACTION)
+
     def usual_inputs(self, facts: DataFacts, jumps: bool) -> tuple[str, ...]:
         """The inputs of nodes if `node_inputs` is unset: velocity in dynamic scenes, material in scenes that have one,
-        and with jumps the elastic forces of tetrahedra."""
+        and with jumps the elastic forces of tetrahedra, or the history where the material yields."""
         velocity = ("velocity",) if facts.dynamic else ()
         material = ("material",) if facts.material_width else ()
+        if jumps and facts.material.yields:
+            return (*velocity, *material, "history")
         forces = ("out_of_balance",) if jumps and facts.tetrahedra else ()
         return (*velocity, *material, *forces)
 
@@ -124,6 +139,8 @@ class ModelConfig:
         inputs = self.usual_inputs(facts, jumps) if self.node_inputs is None else self.node_inputs
         if "out_of_balance" in inputs and not facts.tetrahedra:
             raise ConfigError("model.node_inputs: out_of_balance needs tetrahedra, but the elements are triangles")
+        if "history" in inputs and not jumps:
+            raise ConfigError("model.node_inputs: history is an input of models that jump (model.jumps)")
         radius = self.proximity_radius
         if radius is not None and "proximity" not in inputs:
             raise ConfigError("model.proximity_radius is of no use here: proximity is not in model.node_inputs")

@@ -29,8 +29,9 @@ def _states(names: tuple[str, ...], batch: Batch) -> list[Tensor]:
 
 
 def node_features(config: ModelConfig, batch: Batch) -> Tensor:
-    """[N, *]: node type (one-hot), displacement and velocity, material, proximity, forces out of balance and boundary
-    motion, as far as they are inputs. docs/reference/model.md explains them."""
+    """[N, *]: node type (one-hot), displacement and velocity, material, proximity, forces out of balance, the way from
+    the source and what is known there, and boundary motion, as far as they are inputs. docs/reference/model.md explains
+    them."""
     values = [batch.graph.one_hot, *_states(config.node_inputs, batch)]
     if "material" in config.node_inputs:
         values.append(batch.graph.node_material)
@@ -38,6 +39,8 @@ def node_features(config: ModelConfig, batch: Batch) -> Tensor:
         values.append(_proximity(batch, config.proximity_radius) if batch.proximity is None else batch.proximity)
     if "out_of_balance" in config.node_inputs:
         values.append(batch.graph.elasticity.out_of_balance(batch.position, batch.graph.rest_position))
+    if "history" in config.node_inputs:
+        values += [batch.position - batch.source, batch.history]
     if config.boundary_motion:
         values.append(batch.boundary_motion)
     return torch.cat(values, dim=1)
@@ -79,16 +82,20 @@ def normalizer_of(config: ModelConfig, what: str) -> FeatureNormalizer:
     vector, scalar = ("vector", 3), ("scalar", 1)
     if what in ("edge", "world_edge"):
         return FeatureNormalizer([vector, scalar] * (2 if what == "edge" else 1))
-    known: dict[str, tuple[Kind | None, int]] = {  # in the order of the columns
-        "displacement": vector,
-        "velocity": vector,
-        "material": ("scalar", config.data.material_width),
-        "stress": scalar,
-        "proximity": (None, PROXIMITY_WIDTH),
-        "out_of_balance": (None, 3),
+    # Where metal yields, each column of the material has a scale of its own, or the yield stress would drown in Young's
+    # modulus. The columns of elastic materials share one.
+    material = ("scalar", config.data.material_width)
+    known: dict[str, list[tuple[Kind | None, int]]] = {  # in the order of the columns
+        "displacement": [vector],
+        "velocity": [vector],
+        "material": [material] if config.history is None else [scalar] * config.data.material_width,
+        "stress": [scalar],
+        "proximity": [(None, PROXIMITY_WIDTH)],
+        "out_of_balance": [(None, 3)],
+        "history": [vector, *[scalar] * sum(output.columns for output in config.history or ())],
     }
     inputs = config.node_inputs if what == "node" else config.element_inputs
-    kinds = [kind for name, kind in known.items() if name in inputs]
+    kinds = [kind for name, kinds in known.items() if name in inputs for kind in kinds]
     if what == "node":
         kinds = [(None, len(NodeType)), *kinds]
         kinds += [vector] * config.boundary_motion

@@ -90,6 +90,8 @@ class Simulator(nn.Module):
         # The components of a field with several columns share one scale, as those of a vector do.
         kinds = ("scalar" if columns == 1 else "vector" for _, _, columns, _ in config.data.fields)
         self.field_normalizers = nn.ModuleList(map(Normalizer, kinds))
+        reactions = any(name == REACTION for name, *_ in config.data.fields)
+        self.force_normalizer = Normalizer("vector") if reactions else None
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Simulator:
         try:
@@ -138,7 +140,7 @@ class Simulator(nn.Module):
         options = {"seed": 0, "noise": 0.0, "gamma": 1.0, **options, "batch_size": batch_size}
         data = self.config.data
         of_model = {"make_graph": self.graph, "dynamic": data.dynamic, "jumps": self.config.jumps}
-        of_model |= {"fields": data.fields}
+        of_model |= {"fields": data.fields, "history": self.config.history}
         return PairSampler(dataset, split, **of_model, **options)
 
     @property
@@ -155,6 +157,26 @@ class Simulator(nn.Module):
             return graph.prescribed
         return graph.deforming_elements if output.location == "element" else graph.deforming_nodes
 
+    def _normalised(self, output: Output, normalizer: Normalizer, values: Tensor, batch: Batch) -> Tensor:
+        """What the network should say for these values [N or E, *].
+
+        The reactions r of the nodes of a body add up to the force F on it. Small errors that are alike at many nodes
+        would make it wrong. So the mean of what the network says is F, and the deviations from the mean are those of r,
+        each with its own scale.
+        """
+        if output.name != REACTION:
+            return normalizer(values)
+        force, count = batch.graph.body_sums(values)
+        return (normalizer(values - force / count) + self.force_normalizer(force)).float()
+
+    def _physical(self, output: Output, normalizer: Normalizer, said: Tensor, batch: Batch) -> Tensor:
+        """The inverse of `_normalised`."""
+        if output.name != REACTION:
+            return normalizer.inverse(said)
+        total, count = batch.graph.body_sums(said)
+        mean = total / count
+        return (normalizer.inverse(said - mean) + self.force_normalizer.inverse(mean) / count).float()
+
     @torch.no_grad()
     def fit_statistics(self, batches: Iterable[tuple[Batch, Target]]) -> None:
         """Fix the statistics of inputs and targets, in float64, from batches like those of training, with noise."""
@@ -162,7 +184,13 @@ class Simulator(nn.Module):
             self.observe(batch)
             self.motion_normalizer.observe(target.motion[batch.graph.normal_nodes])
             for output, normalizer in self._outputs:
-                normalizer.observe(target.fields[output.name][self._counting(output, batch)])
+                counting = self._counting(output, batch)
+                values = target.fields[output.name]
+                if output.name == REACTION:
+                    sums, count = batch.graph.body_sums(values)
+                    self.force_normalizer.observe(sums[counting])
+                    values = values - sums / count
+                normalizer.observe(values[counting])
         for module in self.modules():
             if isinstance(module, Normalizer):
                 module.fix()
@@ -207,7 +235,8 @@ class Simulator(nn.Module):
                     f"model.state: the model {self.config.name} does not predict {output.name}: leave it out"
                 )
             predicted = prediction.fields[output.name].index_select(0, rows)
-            error = predicted - normalizer(target.fields[output.name].index_select(0, rows))
+            wanted = self._normalised(output, normalizer, target.fields[output.name], batch)
+            error = predicted - wanted.index_select(0, rows)
             key = output.name if output.name == STRESS else f"{FIELD}{output.name}"
             losses[key] = share(len(rows)) * error.square().mean()
             losses["loss"] = losses["loss"] + stress_weight * losses[key]
@@ -240,7 +269,7 @@ class Simulator(nn.Module):
         fields = {}
         for output, normalizer in self._outputs:
             if output.name in prediction.fields:
-                values = normalizer.inverse(prediction.fields[output.name])
+                values = self._physical(output, normalizer, prediction.fields[output.name], batch)
                 if output.name != STRESS:
                     values = torch.where(self._counting(output, batch)[:, None], values, 0)
                 fields[output.name] = values

@@ -29,7 +29,7 @@ def with_fields(truth, unit="J/m2"):
     fields = {
         "PEEQ": NamedField(depth.astype(np.float32), "node"),
         "heat flux": NamedField(1e4 * moved[:, scene.elements].mean(axis=2), "element", unit),
-        REACTION: NamedField(1e3 * moved, "node", "N"),
+        REACTION: NamedField(moved * np.float32(1e3 + np.arange(scene.num_nodes) % 3)[:, None], "node", "N"),
     }
     return replace(truth, fields=fields)
 
@@ -107,6 +107,30 @@ def test_a_force_on_bodies_is_the_sum_of_predicted_reactions(run, data):
     np.testing.assert_allclose(last.force, predicted[3, own].sum(axis=0), atol=1e-9)
     np.testing.assert_allclose(last.torque, np.cross(arms, predicted[3])[own].sum(axis=0), atol=1e-9)
     assert last.time == 3.0
+
+
+def test_what_the_network_says_of_a_body_is_in_the_mean_the_force_on_it(run, data):
+    """An error that is alike at all nodes of a body counts as much as one of the force, not as one of a node."""
+    model = run.model
+    with Dataset(data) as dataset:
+        batch, target = model.pairs(dataset, batch_size=6).batch(0)
+    with model.predicting():
+        said, nodal = model(batch).fields[REACTION], model.predict(batch).fields[REACTION]
+        losses = model.loss(model(batch), batch, target)
+    force, scale = float(model.force_normalizer.scale), float(model.field_normalizers[2].scale)
+    rows, sums, errors = torch.arange(len(said)), [], []
+    for first, last in zip(batch.graph.node_offsets, batch.graph.node_offsets[1:], strict=False):
+        for body in (0, 1):
+            own = (rows >= first) & (rows < last) & (batch.graph.body == body) & batch.graph.prescribed
+            true = target.fields[REACTION][own]
+            sums.append(true.sum(dim=0).expand_as(true))
+            wanted = (true - true.mean(dim=0)) / scale + true.sum(dim=0) / force
+            errors.append(said[own] - wanted)
+            np.testing.assert_allclose(nodal[own].sum(dim=0), force * said[own].mean(dim=0), rtol=1e-3, atol=1e-4)
+            deviation = said[own] - said[own].mean(dim=0)
+            np.testing.assert_allclose(nodal[own] - nodal[own].mean(dim=0), scale * deviation, rtol=1e-3, atol=1e-4)
+    assert 0.5 < force / float(torch.cat(sums).square().mean().sqrt()) < 2
+    assert float(losses[f"field {REACTION}"]) == pytest.approx(float(torch.cat(errors).square().mean()), rel=1e-4)
 
 
 def test_reactions_turn_in_a_mirror_and_columns_are_told_apart():
