@@ -19,7 +19,7 @@ from ast_sim.dataset.layout import DatasetInfo
 from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.inference import predict
 from ast_sim.inference.answer import Answer
-from ast_sim.inference.question import Question
+from ast_sim.inference.predicting.question import Question
 from ast_sim.models.ast.ast_config import ASTConfig
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.simulator import Prediction, Simulator

@@ -13,9 +13,9 @@ import numpy as np
 from ast_sim.importers.scene_mesh import SceneMesh
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.effort import FIRST_CALL, Effort
-from ast_sim.inference.jump import jumps
-from ast_sim.inference.question import Frames, Question, fields_of
-from ast_sim.inference.rollout import rollouts
+from ast_sim.inference.predicting.jump import jumps
+from ast_sim.inference.predicting.question import Frames, Question, fields_of
+from ast_sim.inference.predicting.rollout import rollouts
 from ast_sim.mechanics.physics_check import turned_over
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.models.simulator import Simulator

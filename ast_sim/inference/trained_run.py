@@ -21,9 +21,9 @@ from ast_sim.inference.effort import Effort, EffortErrors
 from ast_sim.inference.evaluation.evaluate import evaluate
 from ast_sim.inference.evaluation.evaluated_run import Evaluation
 from ast_sim.inference.predict import Motions, doubts, in_domain, new_question
+from ast_sim.inference.predicting.question import Frames, Question
 from ast_sim.inference.promises.calibration import Calibration
 from ast_sim.inference.promises.chosen_effort import AskedError, chosen_effort
-from ast_sim.inference.question import Frames, Question
 from ast_sim.inference.sweep import Sweep, sweep
 from ast_sim.runs import run_file
 from ast_sim.scene import Scene, Trajectory

@@ -43,7 +43,8 @@ def nearest_surface(
     margin = max(inside, outside)
     kind = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
     corners = position.T[:, triangles.T]  # [3, 3, F]: component, corner
-    low, high, across = corners.min(axis=1), corners.max(axis=1), np.ascontiguousarray(points.T)
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    across = np.ascontiguousarray(points.T)
     close = np.flatnonzero(beside(across, across, low, high, margin))
     # All triangles around a nearest point are kept, so the sign is that of the whole surface.
     triangles = triangles[beside(low, high, across[:, close], across[:, close], margin)]

@@ -20,9 +20,9 @@ from ast_sim.inference.effort import (
 )
 from ast_sim.inference.evaluation.asked_frame import errors_by_effort
 from ast_sim.inference.evaluation.measures import SquaredError, rmse_sequence
-from ast_sim.inference.jump import calls
-from ast_sim.inference.question import Question
-from ast_sim.inference.rollout import rollouts
+from ast_sim.inference.predicting.jump import calls
+from ast_sim.inference.predicting.question import Question
+from ast_sim.inference.predicting.rollout import rollouts
 from ast_sim.models.simulator import Simulator
 from ast_sim.scene import Trajectory
 

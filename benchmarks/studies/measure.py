@@ -27,7 +27,7 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.evaluation.measures import SquaredError, rmse_pooled, rmse_sequence
 from ast_sim.inference.predict import answers
-from ast_sim.inference.question import Question
+from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.trained_run import Run
 from ast_sim.scene import NodeType, Trajectory
 from ast_sim.support.disk import write_json

@@ -11,12 +11,12 @@ from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import Dataset, generate
 from ast_sim.figures import WayFigures
-from ast_sim.inference import jump
 from ast_sim.inference.effort import Effort, EffortErrors, cheapest_good, mean_errors, newton_steps
 from ast_sim.inference.evaluation.asked_frame import asked_frames, errors_by_effort, lines
-from ast_sim.inference.jump import calls
 from ast_sim.inference.predict import answers
-from ast_sim.inference.question import Question
+from ast_sim.inference.predicting import jump, jumping_scene
+from ast_sim.inference.predicting.jump import calls
+from ast_sim.inference.predicting.question import Question
 from ast_sim.mechanics.linearised_contact import STILL, NewtonSteps
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.registry import find_preset
@@ -102,7 +102,7 @@ def test_newton_steps_lead_from_the_answer_to_equilibrium(pressed, monkeypatch):
         == (1e6, 0.4)
         == tuple(truth.attributes[key] for key in ("young", "poisson"))
     )
-    monkeypatch.setattr(jump, "STILL", 0.0)
+    monkeypatch.setattr(jumping_scene, "STILL", 0.0)
     found = asked_frames(model, pressed, "test", Effort(1, 3)).scenes[0]
     errors = found.by_calls
     assert errors[:2] == pytest.approx([0.3, 0.09], rel=1e-3)
@@ -190,7 +190,7 @@ def test_newton_steps_need_a_material(one, pressed):
 def test_newton_steps_end_when_one_is_small(pressed, monkeypatch):
     truth, model = pressing(pressed, 0.6)
     question = [Question.of(truth, "plate", [deepest_frame(truth)])]
-    monkeypatch.setattr(jump, "STILL", 0.0)
+    monkeypatch.setattr(jumping_scene, "STILL", 0.0)
     (all_steps,) = calls(model, question, Effort(1, 6))
     sizes = [
         newton_steps(model.config, truth.scene).size(*(all_steps.position[i, 0].astype(float) for i in (k, k + 1)))

@@ -25,7 +25,7 @@ def test_efforts_and_ways_are_measured_on_the_same_scene(plates, tmp_path, capsy
     assert main(["trade", *told]) == 0
     assert "10 %: run: " in capsys.readouterr().out
     figures = json.loads((tmp_path / "pages" / "trade.json").read_text())
-    assert [len(figures[side]) for side in ("run", "solver")] == [4, len(WAYS)]
+    assert [len(figures[side]) for side in ("run", "solver")] == [5, len(WAYS)]
     own = next(one for one in figures["solver"] if one["name"] == "own stop test")
     assert own["errors"][0] < 1e-3 and own["seconds"][0] > 0
     call, *_, newton = figures["run"]

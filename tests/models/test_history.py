@@ -10,9 +10,9 @@ from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import Dataset, train
 from ast_sim.inference.effort import Effort
-from ast_sim.inference.jump import calls
 from ast_sim.inference.predict import answers
-from ast_sim.inference.question import Question
+from ast_sim.inference.predicting.jump import calls
+from ast_sim.inference.predicting.question import Question
 from ast_sim.models.node_inputs import node_features
 from ast_sim.models.registry import model_names
 from ast_sim.named_field import NamedField

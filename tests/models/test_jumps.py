@@ -15,9 +15,9 @@ from ast_sim.batches.pairs import PairSampler
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.effort import Effort
 from ast_sim.inference.evaluation.evaluate import evaluate, table
-from ast_sim.inference.jump import calls
 from ast_sim.inference.predict import answers
-from ast_sim.inference.question import Question
+from ast_sim.inference.predicting.jump import calls
+from ast_sim.inference.predicting.question import Question
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.registry import build_model, find_preset, model_names
 from ast_sim.models.simulator import Prediction, Simulator

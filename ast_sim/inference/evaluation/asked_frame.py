@@ -18,9 +18,9 @@ import torch
 from ast_sim.dataset.reader import Dataset
 from ast_sim.figures import AskedFigures, AskedScene, Beside, SolverFigures, WayFigures
 from ast_sim.inference.effort import Effort, EffortErrors
-from ast_sim.inference.jump import calls
 from ast_sim.inference.predict import answers
-from ast_sim.inference.question import Question
+from ast_sim.inference.predicting.jump import calls
+from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.relative_errors import relative_error, rms, stress_errors
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.models.simulator import Simulator

@@ -27,8 +27,8 @@ from ast_sim.inference.evaluation.trivial_predictors import (
     where_it_counts,
 )
 from ast_sim.inference.predict import answers as predictions
-from ast_sim.inference.predict_batch import Start, predict_batch
-from ast_sim.inference.question import Question
+from ast_sim.inference.predicting.predict_batch import Start, predict_batch
+from ast_sim.inference.predicting.question import Question
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.simulator import Simulator
 from ast_sim.named_field import STRESS, Output, require_fields

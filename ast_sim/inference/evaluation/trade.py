@@ -19,7 +19,7 @@ from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.inference.effort import Effort, choices
 from ast_sim.inference.evaluation.asked_frame import deepest_predicted
 from ast_sim.inference.predict import answers
-from ast_sim.inference.question import Question
+from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.relative_errors import moves, relative_error
 from ast_sim.models.simulator import Simulator
 from ast_sim.simulate.jobs.rival import Outcome, rivals

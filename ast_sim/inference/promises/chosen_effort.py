@@ -12,7 +12,7 @@ from ast_sim.inference.promises.milliseconds import effort_within
 from ast_sim.support.errors import ConfigError
 
 if TYPE_CHECKING:
-    from ast_sim.inference.question import Question
+    from ast_sim.inference.predicting.question import Question
     from ast_sim.inference.trained_run import Run
 
 AskedError = float | Mapping[str, float]  # of the displacement, or by quantity: {"reaction": 0.05}

@@ -25,7 +25,7 @@ from ast_sim.support.errors import AstSimError, ConfigError
 from ast_sim.support.provenance import processor
 
 if TYPE_CHECKING:
-    from ast_sim.inference.question import Question
+    from ast_sim.inference.predicting.question import Question
     from ast_sim.inference.trained_run import Run
 
 REPEATS = 3

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from ast_sim.batches.batch_builder import State
 from ast_sim.inference.answer import Answer
-from ast_sim.inference.predict_batch import PredictedFrame, Start, predict_batch
-from ast_sim.inference.question import Question, not_finite, too_far
+from ast_sim.inference.predicting.predict_batch import PredictedFrame, Start, predict_batch
+from ast_sim.inference.predicting.question import Question, not_finite, too_far
 from ast_sim.models.simulator import Simulator
 from ast_sim.named_field import STRESS
 

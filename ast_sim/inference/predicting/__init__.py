@@ -1,0 +1,1 @@
+"""How a model predicts the frames of scenes: by jumps, or step by step."""

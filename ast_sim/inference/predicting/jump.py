@@ -1,0 +1,179 @@
+"""Jumps: each wanted frame is predicted at once from the first frame, then corrected; no other frame is computed.
+
+The start is the first frame, carried along by the prescribed nodes. Where the material yields, it is the last frame in
+which the motion turned back, if it did; such frames are predicted before the others. Each call of the model gets the
+answer of the call before and predicts what is missing. Newton steps of the solver may follow. The model predicts the
+frames of all scenes side by side, in ragged batches. With friction, Newton steps know the way of the load as far as the
+frames before are wanted, too; in all else a frame does not depend on others than its start. The bundled solver may end
+an answer (`Effort.solved`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache, partial
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from ast_sim.batches.carry import Carrier
+from ast_sim.inference.answer import Answer
+from ast_sim.inference.effort import AGAIN, MOST_NEWTON_STEPS, Effort, newton_steps
+from ast_sim.inference.predicting.jumping_scene import JumpingFrame, JumpingScene
+from ast_sim.inference.predicting.predict_batch import predict_batch
+from ast_sim.inference.predicting.question import Question, not_finite, too_far
+from ast_sim.models.simulator import Simulator
+from ast_sim.named_field import STRESS
+from ast_sim.support.errors import RolloutError
+
+BATCH_NODES = 4096  # frames are predicted together as long as they have at most about so many nodes
+
+
+def jumps(
+    model: Simulator,
+    questions: Sequence[Question],
+    effort: Effort,
+    progress: Callable[[int], None] | None = None,
+) -> list[Answer]:
+    """Predict the wanted frames of several scenes; the other scenes of a batch do not change a frame.
+
+    If a frame fails, the answer of its scene says why in `failure` and keeps the frames before. `progress` is called
+    with the number of each batch and may raise to stop.
+
+    Args:
+        effort: what follows the first call.
+
+    Raises:
+        RolloutError: a scene has no frame to predict.
+        DatasetError: in a scene nothing can deform.
+        ConfigError: the model cannot make this effort.
+    """
+    return [scene.answer() for scene in _predicted(model, questions, effort, progress)]
+
+
+class Way(NamedTuple):
+    """The wanted frames of a scene on the way to the answer.
+
+    Attributes:
+        position: [1 + corrections + Newton steps, S, N, 3] float32, after the first call, each correction, and each
+            Newton step. Where a frame needed fewer Newton steps, its last positions are repeated; stress likewise.
+        stress: [1 + Newton steps, S, N or E, 1] float32, after the last call and each Newton step; None without stress.
+        steps: [S], the Newton steps that were made.
+        last_step: [S], the size of the last one, NaN where none was made.
+    """
+
+    position: np.ndarray
+    stress: np.ndarray | None
+    steps: np.ndarray
+    last_step: np.ndarray
+
+
+def calls(model: Simulator, questions: Sequence[Question], effort: Effort) -> list[Way | str]:
+    """For each scene the way to its answer, or a text that says why a frame failed. Arguments and errors as for
+    `jumps`."""
+    ways: list[Way | str] = []
+    for scene in _predicted(model, questions, effort, None, whole_way=True):
+        if scene.failure is not None:
+            ways.append(scene.failure)
+            continue
+        count = 1 + effort.corrections + effort.newton_steps
+        wanted = scene.wanted
+        position = [_stacked(frame.positions, count) for frame in wanted]
+        known = [frame for frame in wanted if model.config.data.stress != "none"]
+        stress = [_stacked([one[STRESS] for one in frame.fields], 1 + effort.newton_steps) for frame in known]
+        steps = np.array([len(frame.positions) - 1 - effort.corrections for frame in wanted])
+        last = np.array([np.nan if frame.last_step is None else frame.last_step for frame in wanted])
+        ways.append(Way(np.stack(position, axis=1), np.stack(stress, axis=1) if stress else None, steps, last))
+    return ways
+
+
+def _stacked(rows: list, count: int) -> np.ndarray:
+    """The rows, and the last one again until they are so many."""
+    return torch.stack([*rows, *[rows[-1]] * (count - len(rows))]).numpy()
+
+
+def _predicted(
+    model: Simulator,
+    questions: Sequence[Question],
+    effort: Effort,
+    progress: Callable[[int], None] | None,
+    whole_way: bool = False,
+) -> list[JumpingScene]:
+    """The scenes with their predicted frames. `whole_way`: the stress after each Newton step, and no second start."""
+    effort.check(model.config)
+    for question in questions:
+        question.check(model.config.data.given_frames)
+    # Several questions may share a scene.
+    graph, carrier, solver = cache(model.graph), cache(Carrier), cache(partial(newton_steps, model.config))
+    scenes = [JumpingScene(model, q, graph(q.scene), carrier(q.scene), solver) for q in questions]
+    with model.predicting():
+        for number, group in enumerate(group for wave in _waves(scenes) for group in _groups(model, wave)):
+            _predict(model, group, effort.corrections)
+            if progress is not None:
+                progress(number)
+        # In ascending order, whatever the domains: with friction a frame needs to know the one before.
+        for frame in (frame for scene in scenes for frame in scene.frames if effort.newton_steps):
+            frame.refine(effort.newton_steps, whole_way)
+            if not whole_way and effort.newton_steps >= MOST_NEWTON_STEPS and frame.unsettled:
+                _start_again(model, frame, effort)
+        for frame in (frame for scene in scenes for frame in scene.frames if effort.solved):
+            frame.solve()
+    return scenes
+
+
+def _start_again(model: Simulator, frame: JumpingFrame, effort: Effort) -> None:
+    """Newton steps need a nearly right start: more corrections give a better one."""
+    first, spent = (frame.positions, frame.fields, frame.last_step), frame.seconds
+    _predict(model, [frame], effort.corrections + AGAIN)
+    frame.refine(effort.newton_steps, every_stress=False)
+    frame.seconds += spent
+    if frame.failure is not None:  # the first answer at least says that it has not converged
+        frame.failure, (frame.positions, frame.fields, frame.last_step) = None, first
+
+
+def _waves(scenes: Sequence[JumpingScene]) -> Iterator[list[JumpingFrame]]:
+    """The frames of all scenes with their starts: those that start from a given frame, then, when these are predicted,
+    those that start from one of these, and so on."""
+    frames = [frame for scene in scenes for frame in scene.frames]
+    for depth in range(1 + max((frame.depth for frame in frames), default=-1)):
+        wave = [frame for frame in frames if frame.depth == depth]
+        for frame in wave:
+            frame.begin()
+        yield [frame for frame in wave if frame.failure is None]
+
+
+def _groups(model: Simulator, frames: Sequence[JumpingFrame]) -> Iterator[list[JumpingFrame]]:
+    """The frames in batches. Only frames in the same domain are predicted together."""
+    of_domain: dict[int, list[JumpingFrame]] = {}
+    for frame in frames:
+        position = frame.start.state.position
+        domain = model.domain(position)
+        if domain is None:
+            frame.failure = too_far(model.config, frame.scene.question.name, frame.number, position)
+        else:
+            of_domain.setdefault(domain, []).append(frame)
+    for together in of_domain.values():
+        group: list[JumpingFrame] = []
+        for frame in together:
+            if group and sum(len(other.start.prescribed) for other in [*group, frame]) > BATCH_NODES:
+                yield group
+                group = []
+            group.append(frame)
+        yield group
+
+
+def _predict(model: Simulator, group: list[JumpingFrame], corrections: int) -> None:
+    """Predict the frames of a batch."""
+    try:
+        predicted = predict_batch(model, [frame.start for frame in group], corrections + 1)
+    except RolloutError as error:
+        if len(group) > 1:  # one frame must not spoil the others
+            for frame in group:
+                _predict(model, [frame], corrections)
+        else:
+            group[0].failure = f"{group[0].name}: {error}"
+        return
+    for frame, (positions, fields, latent, seconds) in zip(group, predicted, strict=True):
+        frame.failure = not_finite(model.config, frame.scene.question.name, frame.number, positions[-1], fields)
+        frame.positions, frame.fields, frame.latent, frame.seconds = positions, [fields], latent, seconds
