@@ -344,7 +344,7 @@ def test_unknown_keys_presets_and_commands_name_what_there_is(trained, tmp_path,
     out = ("--out", tmp_path / "run")
     assert "train.batch_size" in fails(capsys, "train", data, *out, "--set", "train.batchsize=3")
     assert "train.steps" in fails(capsys, "train", data, *out, "--set", "train.steps=many")
-    assert "did you mean tiny" in fails(capsys, "train", data, *out, "--preset", "tny")
+    assert "did you mean 'tiny'" in fails(capsys, "train", data, *out, "--preset", "tny")
     assert "invalid choice" in fails(capsys, "trian")
     assert "--set" in fails(capsys, "train", "--out", tmp_path / "run", "--resume", "--set", "train.steps=3")
     assert not (tmp_path / "run").exists()

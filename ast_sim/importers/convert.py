@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -22,7 +21,7 @@ from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.plausibility.findings import Finding, refusal, told
 from ast_sim.plausibility.motion import in_trajectory
 from ast_sim.scene import Trajectory
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, nearest_name
 
 SHARES = {"train": 0.8, "valid": 0.1, "test": 0.1}
 
@@ -243,8 +242,7 @@ def _require_known(source: Path, names: list[str], lists: dict[str, list[str]]) 
     for split, members in lists.items():
         for name in members:
             if name not in names:
-                nearest = difflib.get_close_matches(name, names, n=1, cutoff=0.0)[0]
-                raise DatasetError(f"{source}: there is no simulation {name!r} for {split}; the nearest is {nearest!r}")
+                raise DatasetError(f"{source}: there is no simulation {name!r} for {split}{nearest_name(name, names)}")
             if name in seen:
                 raise DatasetError(f"{source}: {name!r} is listed for {seen[name]} and again for {split}")
             seen[name] = split

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 from importlib.resources import as_file, files
 
 from ast_sim.inference.trained_run import Run
 from ast_sim.runs.run_file import SUFFIX
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import ConfigError, nearest_name
 
 
 def example_run(name: str) -> Run:
@@ -22,7 +21,6 @@ def example_run(name: str) -> Run:
     folder = files("ast_sim") / "example_runs"
     names = sorted(file.name.removesuffix(SUFFIX) for file in folder.iterdir() if file.name.endswith(SUFFIX))
     if name not in names:
-        nearest = difflib.get_close_matches(name, names, 1, 0.0)
-        raise ConfigError(f"there is no example run {name!r}; the nearest is {nearest[0]!r} of {', '.join(names)}")
+        raise ConfigError(f"there is no example run {name!r}{nearest_name(name, names)}")
     with as_file(folder / f"{name}{SUFFIX}") as path:
         return Run(path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -10,7 +9,7 @@ from importlib.metadata import EntryPoint, entry_points
 
 from ast_sim.models.model_config import ModelConfig, Preset
 from ast_sim.models.simulator import Simulator
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import ConfigError, nearest_name
 
 GROUP = "ast_sim.models"
 
@@ -85,6 +84,6 @@ def build_model(config: ModelConfig) -> Simulator:
 
 
 def _missing(what: str, name: str, known: Iterable[str]) -> ConfigError:
-    near = difflib.get_close_matches(name, known, 1, 0)
-    hint = f"did you mean {near[0]}? There are {', '.join(known)}" if near else "install ast_sim with pip"
-    return ConfigError(f"there is no {what} {name!r}: {hint}")
+    known = list(known)
+    hint = nearest_name(name, known) if known else ": install ast_sim with pip"
+    return ConfigError(f"there is no {what} {name!r}{hint}")

@@ -6,7 +6,9 @@ command line prints this text as one line on stderr and exits with code 2. In Py
 
 from __future__ import annotations
 
+import difflib
 import importlib
+from collections.abc import Iterable
 from types import ModuleType
 from typing import Any
 
@@ -49,6 +51,15 @@ class SimulationError(AstSimError):
 
 class MissingExtra(AstSimError, ImportError):
     """An optional dependency that is not installed."""
+
+
+def nearest_name(name: str, known: Iterable[str]) -> str:
+    """An ending for a message about an unknown name: the nearest known one, or all that there are."""
+    known = list(known)
+    close = difflib.get_close_matches(name, known, 1, 0.5)
+    if close:
+        return f"; did you mean {close[0]!r}?"
+    return f"; there are: {', '.join(known)}" if known else "; there are none"
 
 
 def printable(text: str) -> str:

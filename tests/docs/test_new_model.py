@@ -66,7 +66,7 @@ def test_the_page_leads_to_a_model(installed, tmp_path):
     assert "local" in (tmp_path / "run.html").read_text(encoding="utf-8")
     # A run names its model, not code: without the package it cannot be opened.
     done = run("ast_sim.cli", "evaluate", "run", "plates.h5", folder=tmp_path)
-    assert done.returncode == 2 and "there is no model 'local': did you mean" in done.stderr
+    assert done.returncode == 2 and "there is no model 'local'; there are: " in done.stderr
 
 
 def test_its_settings_are_known(installed, tmp_path):

@@ -286,7 +286,7 @@ def test_fewer_than_three_simulations_need_shares(tmp_path, count):
 @pytest.mark.parametrize(
     ("splits", "message"),
     [
-        ({"train": ["run_0", "run1"]}, "there is no simulation 'run1' for train; the nearest is 'run_1'"),
+        ({"train": ["run_0", "run1"]}, "there is no simulation 'run1' for train; did you mean 'run_1'"),
         ({"train": ["run_0"], "test": ["run_0"]}, "'run_0' is listed for train and again for test"),
         ({"training": ["run_0"]}, "there is no split 'training'"),
         ({"train": []}, "no simulation is listed for any split"),

@@ -51,11 +51,9 @@ def test_only_the_model_that_is_asked_for_is_imported():
 
 
 def test_a_name_that_there_is_not_names_the_nearest():
-    with pytest.raises(ConfigError, match="there is no model 'mgm': did you mean mgn[?] There are .*transolver"):
+    with pytest.raises(ConfigError, match="there is no model 'mgm'; did you mean 'mgn'[?]"):
         find_model("mgm")
-    with pytest.raises(
-        ConfigError, match="no preset of mgn 'papre': did you mean paper[?] There are tiny, paper, orig"
-    ):
+    with pytest.raises(ConfigError, match="no preset of mgn 'papre'; did you mean 'paper'[?]"):
         find_preset("mgn", "papre")
 
 

@@ -151,11 +151,11 @@ def test_scales_of_the_data_by_hand(data):
 
 
 def test_a_preset_that_does_not_exist_names_the_nearest():
-    with pytest.raises(ConfigError, match="did you mean deforming_plate"):
+    with pytest.raises(ConfigError, match="did you mean 'deforming_plate'"):
         start.configure("data.h5", "deforming_plaet")
-    with pytest.raises(ConfigError, match=r"no preset of mgn 'deforming_plate'.*There are tiny, paper, original"):
+    with pytest.raises(ConfigError, match=r"no preset of mgn 'deforming_plate'; there are: tiny, paper, original"):
         start.configure("data.h5", "deforming_plate", model="mgn")
-    with pytest.raises(ConfigError, match="no model 'mgm': did you mean mgn"):
+    with pytest.raises(ConfigError, match="no model 'mgm'; did you mean 'mgn'"):
         start.configure("data.h5", "tiny", model="mgm")
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import ast
-import difflib
 import math
 import operator
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import ConfigError, nearest_name
 
 _OPERATORS: dict[type, Callable[..., float]] = {
     ast.Add: operator.add,
@@ -97,17 +96,8 @@ def expression(key: str, value: Any, known: Iterable[str]) -> Expression:
     parsed = Expression(key, value.strip())
     known = list(known)
     for name in sorted(parsed.names - set(known)):
-        raise ConfigError(f"{key} = {value!r}: there is no parameter {name!r}{nearest(name, known)}")
+        raise ConfigError(f"{key} = {value!r}: there is no parameter {name!r}{nearest_name(name, known)}")
     return _finite(parsed) if not parsed.names else parsed
-
-
-def nearest(name: str, known: Iterable[str]) -> str:
-    """An ending for a message about an unknown name: the nearest known one, or all that there are."""
-    known = list(known)
-    close = difflib.get_close_matches(name, known, 1, 0.5)
-    if close:
-        return f"; did you mean {close[0]!r}?"
-    return f"; there are: {', '.join(known)}" if known else "; there are none"
 
 
 def _finite(parsed: Expression) -> Expression:

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ast_sim.simulate.own_assembly.expressions import Expression, expression, nearest
-from ast_sim.support.errors import ConfigError
+from ast_sim.simulate.own_assembly.expressions import Expression, expression
+from ast_sim.support.errors import ConfigError, nearest_name
 
 Values = dict[str, float | str]
 PARAMETER = "parameter "  # the names of attributes that record values begin so
@@ -94,7 +94,7 @@ def parameter(name: str, value: Any, known: Mapping[str, Parameter] | None = Non
     if isinstance(value, dict):
         unknown = next((key for key in value if key not in ("low", "high", "log")), None)
         if unknown is not None:
-            raise ConfigError(f"there is no key {name}.{unknown}{nearest(unknown, ('low', 'high', 'log'))}")
+            raise ConfigError(f"there is no key {name}.{unknown}{nearest_name(unknown, ('low', 'high', 'log'))}")
         log = value.get("log", False)
         value = [value.get("low"), value.get("high")]
     ends = value if isinstance(value, list) else [value, value]
@@ -150,7 +150,7 @@ def completed(parameters: Mapping[str, Parameter], given: Mapping[str, Any]) -> 
         flat |= {f"{part}.{name}": v for part, v in value.items()} if isinstance(value, Mapping) else {name: value}
     for name in flat:
         if name not in parameters:
-            raise ConfigError(f"there is no parameter {name!r}{nearest(name, parameters)}")
+            raise ConfigError(f"there is no parameter {name!r}{nearest_name(name, parameters)}")
     values: Values = {}
     for name, one in parameters.items():
         if name in flat:

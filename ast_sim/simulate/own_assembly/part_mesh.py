@@ -23,7 +23,6 @@ from ast_sim.simulate.own_assembly.assembly_spec import (
     PartSpec,
     script_and_function,
 )
-from ast_sim.simulate.own_assembly.expressions import nearest
 from ast_sim.simulate.own_assembly.parameters import Values
 from ast_sim.simulate.shapes.cad.gmsh_process import gmsh_version, mesh_own_scale
 from ast_sim.simulate.shapes.cad.stl_file import BadSurface
@@ -31,7 +30,7 @@ from ast_sim.simulate.shapes.cad.surface_mend import Surface, stl_surface, whole
 from ast_sim.simulate.shapes.mesh import second_order, straightened
 from ast_sim.simulate.shapes.mesh_check import BadMesh, check_mesh, check_no_intersections, check_surface
 from ast_sim.simulate.shapes.parts import oriented, volumes
-from ast_sim.support.errors import ConfigError, MissingExtra
+from ast_sim.support.errors import ConfigError, MissingExtra, nearest_name
 
 SMALLEST_ANGLE = 1.0  # degrees between two faces of a tetrahedron: enough for the solver
 MESHES_KEPT = 64
@@ -83,7 +82,7 @@ class PartMesh:
     def _known(self, kind: str, name: str, key: str) -> np.ndarray:
         known = self.fields if kind == "field" else self.groups
         if name not in known:
-            raise ConfigError(f"{key}: {self.name} has no {kind} {name!r}{nearest(name, known)}")
+            raise ConfigError(f"{key}: {self.name} has no {kind} {name!r}{nearest_name(name, known)}")
         return known[name]
 
 

@@ -21,11 +21,11 @@ from ast_sim.simulate.own_assembly.assembly_spec import (
     Move,
     PartSpec,
 )
-from ast_sim.simulate.own_assembly.expressions import FUNCTIONS, Expression, nearest
+from ast_sim.simulate.own_assembly.expressions import FUNCTIONS, Expression
 from ast_sim.simulate.own_assembly.parameters import Parameter, parameter, plain
 from ast_sim.simulate.own_assembly.spec_table import Table, Vector
 from ast_sim.support.disk import read_text
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import ConfigError, nearest_name
 
 DEFAULT_FRAMES = 6
 DEFAULT_ORDER = 2  # linear tetrahedra are several times too stiff where a part bends, and where rubber is pressed
@@ -274,7 +274,7 @@ def _pair(table: Table, names: list[str]) -> tuple[tuple[int, int], Expression]:
         raise ConfigError(f"{table.key('parts')} is {pair!r}; must name two parts")
     for name in pair:
         if name not in names:
-            raise ConfigError(f"{table.key('parts')}: there is no part {name!r}{nearest(str(name), names)}")
+            raise ConfigError(f"{table.key('parts')}: there is no part {name!r}{nearest_name(str(name), names)}")
     if friction is None:
         raise ConfigError(f"{table.key('friction')} is missing")
     table.done()

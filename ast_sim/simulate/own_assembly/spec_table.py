@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from ast_sim.simulate.own_assembly.expressions import Expression, expression, nearest
-from ast_sim.support.errors import ConfigError
+from ast_sim.simulate.own_assembly.expressions import Expression, expression
+from ast_sim.support.errors import ConfigError, nearest_name
 
 Vector = tuple[Expression, Expression, Expression]
 
@@ -90,7 +90,7 @@ class Table:
         """Raise ConfigError if the table has a key that nobody asked for; the text names the nearest known one."""
         unknown = next((name for name in self.values if name not in self._read), None)
         if unknown is not None:
-            raise ConfigError(f"there is no key {self.key(unknown)}{nearest(unknown, self._read)}")
+            raise ConfigError(f"there is no key {self.key(unknown)}{nearest_name(unknown, self._read)}")
 
     def _vector(self, name: str, value: Any) -> Vector:
         if not isinstance(value, list) or len(value) != 3:
