@@ -247,7 +247,8 @@ class LinearSystem:
         node, other = rows // 3, columns // 3
         component, across = rows - 3 * node, columns - 3 * other
         one = (component == 0) & (across == 0)
-        blocks = np.unique(np.concatenate([node[one] * np.int64(nodes) + other[one], np.arange(nodes) * (nodes + 1)]))
+        blocks = np.sort(np.concatenate([node[one] * np.int64(nodes) + other[one], np.arange(nodes) * (nodes + 1)]))
+        blocks = blocks[np.diff(blocks, prepend=-1) > 0]  # each once
         of_block = np.divmod(blocks, nodes)
         first = np.searchsorted(of_block[0], np.arange(nodes + 1))
         numbers = scipy.sparse.csr_array((np.arange(len(blocks)), of_block[1], first), shape=(nodes, nodes))
