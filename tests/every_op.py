@@ -16,6 +16,7 @@ from ast_sim.ops import (
     Octree,
     TetrahedronSet,
     attention,
+    attention_block,
     elastic_forces,
     farthest_point_sample,
     linear,
@@ -27,7 +28,6 @@ from ast_sim.ops import (
     sparse_conv,
     sparse_conv_transposed,
 )
-from ast_sim.ops._attention_block import attention_block
 from ast_sim.training.muon import orthogonalized
 
 Results = tuple[list[list[Tensor]], list[Tensor]]

@@ -18,8 +18,7 @@ from ast_sim.batches.mirror_and_shift import Placement
 from ast_sim.batches.out_of_balance import Elasticity
 from ast_sim.material import Material
 from ast_sim.named_field import Output
-from ast_sim.ops import EdgeSet
-from ast_sim.ops._edges import join_indices, join_offsets, offsets_of
+from ast_sim.ops import EdgeSet, join_indices, join_offsets, offsets_of
 from ast_sim.scene import NodeType, Scene
 
 

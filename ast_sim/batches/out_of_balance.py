@@ -16,8 +16,7 @@ from torch import Tensor
 from ast_sim.element_topology import signed_volumes
 from ast_sim.material import ELASTIC, Material
 from ast_sim.mechanics.elements.second_order import LARGEST, SLOPES
-from ast_sim.ops import TetrahedronSet, elastic_forces
-from ast_sim.ops._edges import join_indices
+from ast_sim.ops import TetrahedronSet, elastic_forces, join_indices
 from ast_sim.scene import Scene
 from ast_sim.support.errors import DatasetError
 

@@ -28,8 +28,7 @@ import scipy.sparse
 from ast_sim.support.errors import SimulationError, interrupted
 
 ITERATE_FROM = 50_000  # systems with at least this many unknowns keep a factor and iterate with it
-# Conjugate gradients end at this residual, relative to the right side. A Newton step reduces the error by as much.
-RELATIVE_RESIDUAL = 1e-3
+RELATIVE_RESIDUAL = 1e-3  # of conjugate gradients, to the right side; a Newton step reduces the error by as much
 MAX_ITERATIONS = 40  # then a new factor is cheaper
 
 
@@ -247,8 +246,8 @@ class LinearSystem:
         node, other = rows // 3, columns // 3
         component, across = rows - 3 * node, columns - 3 * other
         one = (component == 0) & (across == 0)
-        blocks = np.sort(np.concatenate([node[one] * np.int64(nodes) + other[one], np.arange(nodes) * (nodes + 1)]))
-        blocks = blocks[np.diff(blocks, prepend=-1) > 0]  # each once
+        sorted_blocks = np.sort(np.append(node[one] * np.int64(nodes) + other[one], np.arange(nodes) * (nodes + 1)))
+        blocks = sorted_blocks[np.diff(sorted_blocks, prepend=-1) > 0]  # each once
         of_block = np.divmod(blocks, nodes)
         first = np.searchsorted(of_block[0], np.arange(nodes + 1))
         numbers = scipy.sparse.csr_array((np.arange(len(blocks)), of_block[1], first), shape=(nodes, nodes))

@@ -30,8 +30,7 @@ from torch import Tensor
 
 from ast_sim.batches.graph import edge_vectors
 from ast_sim.batches.mirror_and_shift import Placement
-from ast_sim.ops import EdgeSet, segment_sum
-from ast_sim.ops._edges import join_indices, offsets_of
+from ast_sim.ops import EdgeSet, join_indices, offsets_of, segment_sum
 from ast_sim.ops.spec import segment_of
 
 NEAR_CENTRE = 1.2  # nodes up to this multiple of the least distance from the centroid may start the search

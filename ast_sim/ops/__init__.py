@@ -1,9 +1,9 @@
 """The ops of ast_sim: torch custom ops over the C core, each beside its torch composition."""
 
-from ast_sim.ops._attention import attention
+from ast_sim.ops._attention import attention, attention_block, cross_attention, rotated, self_attention
 from ast_sim.ops._body_distance import WIDTH as PROXIMITY_WIDTH
 from ast_sim.ops._body_distance import proximity
-from ast_sim.ops._edges import EdgeSet
+from ast_sim.ops._edges import EdgeSet, join_indices, join_offsets, offsets_of
 from ast_sim.ops._elastic_forces import TetrahedronSet, elastic_forces
 from ast_sim.ops._fps import farthest_point_sample
 from ast_sim.ops._linear import linear
@@ -20,16 +20,23 @@ __all__ = [
     "Octree",
     "TetrahedronSet",
     "attention",
+    "attention_block",
+    "cross_attention",
     "elastic_forces",
     "farthest_point_sample",
+    "join_indices",
+    "join_offsets",
     "linear",
     "message_edges",
     "message_sum",
     "mlp",
     "octree",
+    "offsets_of",
     "proximity",
+    "rotated",
     "segment_mean",
     "segment_sum",
+    "self_attention",
     "sparse_conv",
     "sparse_conv_transposed",
 ]

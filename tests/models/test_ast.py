@@ -26,8 +26,7 @@ from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.layers import FactorizedLinear
 from ast_sim.models.normalizer import Normalizer
 from ast_sim.models.registry import build_model
-from ast_sim.ops import EdgeSet
-from ast_sim.ops._attention_block import rotated
+from ast_sim.ops import EdgeSet, rotated
 from ast_sim.scene import NodeType
 from ast_sim.support.errors import ConfigError, DatasetError, RolloutError
 

@@ -5,8 +5,8 @@ import torch
 from checks import assert_accurate
 from torch import Tensor
 
-from ast_sim.ops import _attention_block as ops
-from ast_sim.ops._attention_block import attention_block
+from ast_sim.ops import _attention as ops
+from ast_sim.ops import attention_block
 
 HEADS, WIDTH = 2, 16
 
@@ -33,7 +33,7 @@ def fused(*given: Tensor | None) -> Tensor:
 @pytest.mark.parametrize("sizes", [([1], [1]), ([130, 0, 5], [7, 9, 300]), ([3, 4], [0, 5])])
 def test_accuracy(sizes, rotated):
     inputs = case(*sizes, 40, 24, rotated)
-    assert_accurate(fused, lambda *given: ops._reference(*given, HEADS), inputs)
+    assert_accurate(fused, lambda *given: ops._block_reference(*given, HEADS), inputs)
 
 
 def test_no_vectors():
@@ -45,7 +45,7 @@ def test_vectors_that_attend_to_themselves_and_slices_of_a_weight():
     together = torch.cat([weights[4], weights[5]])
     query, key_value = together.split((HEADS * WIDTH, 2 * HEADS * WIDTH))
     given = (x, x, turns, turns, offsets, offsets, *weights[:4], query, key_value, *weights[6:])
-    torch.testing.assert_close(fused(*given), ops._reference(*given, HEADS), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(fused(*given), ops._block_reference(*given, HEADS), rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize(

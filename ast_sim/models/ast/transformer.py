@@ -13,8 +13,7 @@ from torch import Tensor, nn
 
 from ast_sim.models.ast.ast_config import ASTConfig
 from ast_sim.models.layers import Linear
-from ast_sim.ops._attention import cross_attention, self_attention
-from ast_sim.ops._attention_block import attention_block, rotated
+from ast_sim.ops import attention_block, cross_attention, rotated, self_attention
 
 
 class Vectors(NamedTuple):
