@@ -21,7 +21,7 @@ GOOD = 0.02  # a relative error that most users call exact
 GOOD_STRESS = 0.1  # the same of the stress, relative to the error of its mean
 MOST_NEWTON_STEPS = 10  # by default; they end earlier where one is small
 AGAIN = 2  # a frame in which so many Newton steps did not end is begun anew with so many more corrections
-STEPS_BEFORE_SOLVER = 2  # more hardly bring it nearer to equilibrium (docs/log.md, 2026-11-27)
+STEPS_BEFORE_SOLVER = 1  # more hardly bring it nearer to equilibrium (docs/log.md, 2026-11-27)
 CHOSEN_STEPS = (0, 1, 2, MOST_NEWTON_STEPS)  # among these numbers of Newton steps an effort is chosen
 WORTH = 0.05  # a correction or a Newton step must lower an error that is not good by this share
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.frames import MAX_FRAME_ITERATIONS, GivenUp
+from ast_sim.mechanics.linearised_contact import NewtonSteps
 from ast_sim.mechanics.physics_check import Law
 from ast_sim.mechanics.quasi_static import SolidFrames
 from ast_sim.scene import Scene
@@ -24,17 +25,18 @@ class Equilibria:
         scene: tetrahedra.
         law: of its material and of contact. Bodies are not kept from passing through themselves.
         targets: [S, N, 3], the positions of the prescribed nodes in each frame. Other rows are not read.
+        prepared: the Newton steps of the scene: what they have prepared is used.
 
     Raises:
         ConfigError: the law of the material is not known.
         SimulationError: the constants of the material or of contact are not allowed.
     """
 
-    def __init__(self, scene: Scene, law: Law, targets: np.ndarray) -> None:
+    def __init__(self, scene: Scene, law: Law, targets: np.ndarray, prepared: NewtonSteps) -> None:
         rest = scene.rest_position.astype(np.float64)
         prescribed = scene.prescribed[:, None]
         case = SolidCase(scene, np.where(prescribed, targets, rest), law.of_elements(scene), law.contact(scene), "node")
-        self._frames = SolidFrames(case, None)
+        self._frames = SolidFrames(case, None, prepared)
         self._walked = 0
         self._reached = rest
         self._before = 0

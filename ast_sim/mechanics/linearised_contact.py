@@ -80,6 +80,10 @@ class NewtonSteps:
         clearance: in the unit of length, the gap that bodies in contact keep.
         friction: Coulomb's coefficient.
 
+    Attributes:
+        elasticity: the deforming bodies.
+        system: of their free nodes.
+
     Raises:
         SimulationError: the rest volume of an element is not positive.
     """
@@ -89,13 +93,13 @@ class NewtonSteps:
         self._rest = scene.rest_position.astype(np.float64)
         self._deforming = np.flatnonzero(scene.deforming_nodes[scene.elements].any(axis=1))
         elements = scene.elements[self._deforming].astype(np.int64)
-        self._elasticity = elastic_body(self._rest, elements, material.of(self._deforming))
+        self.elasticity = elastic_body(self._rest, elements, material.of(self._deforming))
         held = np.ones(scene.num_nodes, bool)
         held[elements] = False
         held |= scene.prescribed
-        self._system = LinearSystem(*self._elasticity.entry_dofs(), held)
+        self.system = LinearSystem(*self.elasticity.entry_dofs(), held)
         self._number = np.full(3 * scene.num_nodes, -1)
-        self._number[self._system.free] = np.arange(len(self._system.free))
+        self._number[self.system.free] = np.arange(len(self.system.free))
         faces = scene.surface().astype(np.int64)
         owner, edge = scene.body[faces[:, 0]], self._rest[faces[:, 0]] - self._rest[faces[:, 1]]
         self._length = float(np.linalg.norm(edge, axis=1).mean())
@@ -126,10 +130,10 @@ class NewtonSteps:
 
     def _stepped(self, position: np.ndarray, from_afar: bool, stuck: np.ndarray | None) -> np.ndarray:
         """See `step`."""
-        deformation = _upright(self._elasticity.evaluate(position))
-        force = self._elasticity.gradient(deformation)[0].ravel()[self._system.free]
+        deformation = _upright(self.elasticity.evaluate(position))
+        force = self.elasticity.gradient(deformation)[0].ravel()[self.system.free]
         for project in (True,) if from_afar else (False, True):
-            factor = self._system.factorise(self._elasticity.hessian(deformation, project))
+            factor = self.system.factorise(self.elasticity.hessian(deformation, project))
             if factor is not None:
                 break
         else:
@@ -141,7 +145,7 @@ class NewtonSteps:
         the surfaces, or the root mean square of the moves over that of the displacements from rest, if that is larger.
         Displacements below `SLIGHT` count as `SLIGHT`. A step that was shortened has the size of the whole one: where
         elements stop it, it has not converged."""
-        free = self._system.free
+        free = self.system.free
         move, displacement = ((after - start).ravel()[free] for start in (before, self._rest))
         slight = SLIGHT * self._length * math.sqrt(len(free))
         share = np.linalg.norm(move) / max(np.linalg.norm(displacement), slight)
@@ -191,7 +195,7 @@ class NewtonSteps:
 
     def von_mises(self, position: np.ndarray, location: str) -> np.ndarray:
         """[N, 1] or [E, 1] float32: the stress in pascal at `location`, "node" or "element"; 0 in rigid bodies."""
-        stress = self._elasticity.von_mises(self._elasticity.evaluate(position), location)
+        stress = self.elasticity.von_mises(self.elasticity.evaluate(position), location)
         if location == "node":
             return stress.astype(np.float32)[:, None]
         of_elements = np.zeros((self._scene.num_elements, 1), np.float32)
@@ -216,7 +220,7 @@ class NewtonSteps:
             shares.append(igl.barycentric_coordinates(nearest.place, *corner_positions))
             gaps.append(nearest.gap)
         if not gaps:
-            return NearPairs(scipy.sparse.csr_array((0, len(self._system.free))), np.zeros(0), np.zeros(0))
+            return NearPairs(scipy.sparse.csr_array((0, len(self.system.free))), np.zeros(0), np.zeros(0))
         joined = (np.concatenate(parts) for parts in (nodes, corners, normals, shares, gaps))
         slid = SLID * (position - self._rest) if stuck is None else position - stuck
         return self._pairs(*joined, slid)
@@ -245,7 +249,7 @@ class NewtonSteps:
         free = columns >= 0
         rows = np.broadcast_to(rows[:, None, None], columns.shape)
         entries = values[free], (rows[free], columns[free])
-        directions = scipy.sparse.csr_array(entries, shape=(len(axes), len(self._system.free)))
+        directions = scipy.sparse.csr_array(entries, shape=(len(axes), len(self.system.free)))
         relative = np.einsum("pk,pki->pi", weight, slid[of_pair])
         slip = np.concatenate([np.einsum("pi,pi->p", relative, tangent) for tangent in tangents])
         return NearPairs(directions, gaps[movable], slip)
@@ -256,9 +260,9 @@ class NewtonSteps:
         while True:
             self._shortening = share
             moved = position.ravel().copy()
-            moved[self._system.free] += share * way
+            moved[self.system.free] += share * way
             moved = moved.reshape(-1, 3)
-            if share <= SMALLEST or self._elasticity.evaluate(moved).J.min() > 0:
+            if share <= SMALLEST or self.elasticity.evaluate(moved).J.min() > 0:
                 return moved
             share /= 2
 

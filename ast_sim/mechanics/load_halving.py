@@ -15,6 +15,7 @@ import numpy as np
 from ast_sim.mechanics.contact_and_friction import Contact
 from ast_sim.mechanics.elements.elasticity import Elasticity
 from ast_sim.mechanics.elements.inertia import Inertia
+from ast_sim.mechanics.linear_system import LinearSystem
 from ast_sim.mechanics.solver import Newton, NotConverged, SolverSettings
 
 MAX_DAMPED_STEPS = 60
@@ -30,6 +31,7 @@ class QuasiStatic:
             element.
         position: [N,3] positions at the start, free of intersections and in equilibrium.
         settings: tolerances.
+        system: as for `Newton`.
     """
 
     def __init__(
@@ -39,9 +41,10 @@ class QuasiStatic:
         prescribed: np.ndarray,
         position: np.ndarray,
         settings: SolverSettings | None = None,
+        system: LinearSystem | None = None,
     ) -> None:
         self.elasticity = elasticity
-        self.newton = Newton(elasticity, contact, prescribed, position, settings)
+        self.newton = Newton(elasticity, contact, prescribed, position, settings, system)
         self._damped: Newton | None = None
         self.halvings = 0
         self.load_steps = 0  # those that converged

@@ -14,6 +14,7 @@ from ast_sim.mechanics.contact_and_friction import Contact
 from ast_sim.mechanics.elements.neo_hookean import von_mises
 from ast_sim.mechanics.elements.second_order import elastic_body
 from ast_sim.mechanics.frames import MAX_FRAME_ITERATIONS, FrameRecord, Frames, GivenUp
+from ast_sim.mechanics.linearised_contact import NewtonSteps
 from ast_sim.mechanics.load_halving import QuasiStatic
 from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.mechanics.unfinished import Checkpoint
@@ -130,22 +131,33 @@ def solve_frame(
 
 
 class SolidFrames(Frames):
-    """The frames of a quasi-static case and its solver; arguments as for `quasi_static`."""
+    """The frames of a quasi-static case and its solver.
+
+    Args:
+        case, settings: as for `quasi_static`.
+        prepared: the Newton steps of the same bodies, if they have been made already: what they have prepared is used.
+    """
 
     case: SolidCase
     solver: QuasiStatic
     record_type = SolidRecord
 
-    def __init__(self, case: SolidCase, settings: SolverSettings | None) -> None:
+    def __init__(self, case: SolidCase, settings: SolverSettings | None, prepared: NewtonSteps | None = None) -> None:
         if case.hardening:
             bodies = ", ".join(map(str, case.hardening))
             raise SimulationError(f"the bundled solver knows elastic laws only, but body {bodies} yields: use CalculiX")
         scene = case.scene
         rest = case.scene.rest_position.astype(np.float64)
         self._deforming = np.flatnonzero(case.deforming)
-        self._elasticity = elastic_body(rest, scene.elements[self._deforming], case.material.of(self._deforming))
+        if prepared is None:
+            self._elasticity = elastic_body(rest, scene.elements[self._deforming], case.material.of(self._deforming))
+            system = None
+        else:
+            self._elasticity = prepared.elasticity
+            system = prepared.system
         contact = Contact(rest, scene.surface(), scene.body, case.contact, ~scene.deforming_nodes)
-        super().__init__(case, QuasiStatic(self._elasticity, contact, scene.prescribed, rest, settings), contact)
+        solver = QuasiStatic(self._elasticity, contact, scene.prescribed, rest, settings, system)
+        super().__init__(case, solver, contact)
         self._reactions = np.zeros_like(rest)
         self.record_type = SolidRecord if self.driven.axis is None else TurnedRecord
         self._work = 0.0

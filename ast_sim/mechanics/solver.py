@@ -99,6 +99,7 @@ class Newton:
         prescribed: [N] nodes whose positions are given.
         position: [N,3] positions at the start, free of intersections.
         settings: tolerances.
+        system: the system of the potential and the prescribed nodes, if it has been made already.
 
     Attributes:
         state: where it stands.
@@ -114,10 +115,11 @@ class Newton:
         prescribed: np.ndarray,
         position: np.ndarray,
         settings: SolverSettings | None = None,
+        system: LinearSystem | None = None,
     ) -> None:
         self.potential, self.contact, self.prescribed = potential, contact, prescribed
         self.settings = settings or SolverSettings()
-        self.system = LinearSystem(*potential.entry_dofs(), prescribed)
+        self.system = system or LinearSystem(*potential.entry_dofs(), prescribed)
         self.iterations, self.dissipation = 0, 0.0
         self.watch: Callable[[], None] = lambda: None
         self.restart(position)

@@ -174,7 +174,8 @@ class JumpingScene:
     @cached_property
     def equilibria(self) -> Equilibria:
         """What the solver finds in this scene."""
-        return Equilibria(self.question.scene, law_of(self.model.config), self.question.prescribed_position)
+        scene = self.question.scene
+        return Equilibria(scene, law_of(self.model.config), self.question.prescribed_position, self.solver(scene))
 
     def settled(self, number: int) -> np.ndarray | None:
         """The positions [N, 3] of a wanted frame that is given or has had its Newton steps, else None."""
