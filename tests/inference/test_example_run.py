@@ -59,6 +59,14 @@ def test_a_clip_that_is_asked_for_by_its_parameters_has_the_set_and_the_force_of
         assert answer.fields["PEEQ"].values[-1].max() > 0.01 and answer.frames == tuple(range(LAST + 1))
 
 
+def test_a_sweep_sees_where_the_ram_turns():
+    """In the last frame the ram is back, whatever its travel."""
+    sweep = ast_sim.example_run("clip").sweep(SPEC, {"travel": [1.2, 2.4, 3.6]}, nodes=1400)
+    assert [row["travel_of_nodes"] for row in sweep.rows] == [0, 0, 0]
+    strains = [row["largest_PEEQ"] for row in sweep.rows]
+    assert strains[1] > 1.2 * strains[0] and strains[2] > 1.2 * strains[1]
+
+
 def test_it_says_where_it_comes_from_and_an_unknown_name_is_one_line():
     run = ast_sim.example_run("plates")
     assert (run.step, run.settings.train.calls, run.settings.data) == (10_000, 1, "plates400.h5")
