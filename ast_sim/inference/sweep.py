@@ -81,7 +81,8 @@ def sweep(
     """Predict the last frame for each row of values.
 
     With friction a body may be in equilibrium in two places. So the frame before is predicted, too: Newton steps from
-    there find the place that the way leads to. Otherwise a model that jumps needs no frame between.
+    there find the place that the way leads to. A model of metal that yields must see where the motion turns back. Other
+    models that jump need no frame between.
 
     Args:
         predict_scenes: of a `Run`.
@@ -92,7 +93,7 @@ def sweep(
     if not rows:
         raise ConfigError("a sweep needs at least one row of values")
     needs_way = bool((config.data.friction or FRICTION in config.data.columns) and effort.newton_steps)
-    frames = 2 if config.jumps and not needs_way else None
+    frames = 2 if config.jumps and not needs_way and config.history is None else None
     asked_for = {"effort": effort} if error is None else {"error": error}
     table, seconds, notes, unpromised = [], 0.0, [], 0
     for start in range(0, len(rows), TOGETHER):

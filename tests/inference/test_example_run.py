@@ -1,5 +1,6 @@
 """The run that comes with the package answers plates that it has never seen, nearly as the solver does."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,9 @@ from toy import one_thread  # noqa: F401 (used by being imported)
 
 import ast_sim
 from ast_sim.cli import main
+from ast_sim.named_field import REACTION
 from ast_sim.support.errors import ConfigError
+from benchmarks.studies.clip import LAST, RESULTS, SPEC, outcome
 
 
 def test_it_predicts_a_new_plate_by_one_call_and_better_with_newton_steps(tmp_path, capsys):
@@ -41,6 +44,27 @@ def test_it_predicts_a_new_plate_by_one_call_and_better_with_newton_steps(tmp_pa
     run.save(tmp_path / "run.ast")
     assert main(told) == 0
     assert "balance of reactions" in capsys.readouterr().out
+
+
+def test_a_clip_that_is_asked_for_by_its_parameters_has_the_set_and_the_force_of_calculix():
+    """Test scenes of the study, which no training has seen; benchmarks/results/clip.json has what CalculiX found."""
+    run = ast_sim.example_run("clip")
+    assert run.scope.length_unit == "mm" and run.calibration.scenes == 40 and run.settings.model.history is not None
+    for known in json.loads(RESULTS.read_text())["scenes"][:2]:
+        asked = {key: known["parameters"][key] for key in ("length", "thickness", "place", "travel", "yield_stress")}
+        asked["file"] = {"clip": known["parameters"]["clip.file"]}
+        answer = run.predict(spec=SPEC, parameters=asked, nodes=1400)
+        said = outcome(answer.scene, answer.position[0], answer.position[-1], answer.fields[REACTION].values)
+        assert said == pytest.approx(tuple(known["true"].values()), rel=0.1)
+        assert answer.fields["PEEQ"].values[-1].max() > 0.01 and answer.frames == tuple(range(LAST + 1))
+
+
+def test_a_sweep_sees_where_the_ram_turns():
+    """In the last frame the ram is back, whatever its travel."""
+    sweep = ast_sim.example_run("clip").sweep(SPEC, {"travel": [1.2, 2.4, 3.6]}, nodes=1400)
+    assert [row["travel_of_nodes"] for row in sweep.rows] == [0, 0, 0]
+    strains = [row["largest_PEEQ"] for row in sweep.rows]
+    assert strains[1] > 1.2 * strains[0] and strains[2] > 1.2 * strains[1]
 
 
 def test_it_says_where_it_comes_from_and_an_unknown_name_is_one_line():

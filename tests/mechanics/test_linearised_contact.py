@@ -178,7 +178,7 @@ def test_what_slides_feels_friction_against_its_way(monkeypatch):
 
     def pulled(position: np.ndarray) -> float:
         """The force along the way, of the force that presses."""
-        forces = solver._elasticity.gradient(solver._elasticity.evaluate(position))[0][upper & ~free].sum(axis=0)
+        forces = solver.elasticity.gradient(solver.elasticity.evaluate(position))[0][upper & ~free].sum(axis=0)
         return forces[0] / -forces[2]
 
     left, pull = {}, {}
