@@ -29,7 +29,7 @@ class Material:
 
     @property
     def yields(self) -> bool:
-        """Whether the state of the material depends on the way of the load."""
+        """Whether the state of the material depends on the load path."""
         return YIELD_STRESS in {*self.columns, *self.constants}
 
     @property

@@ -24,7 +24,7 @@ class State:
         position: [N, 3] float32, p_t, with noise in training. In a jump the prescribed nodes are where they will be.
         previous: [N, 3], p_{t-1}; None in a scene without inertia.
         stress: [N, 1] or [E, 1] at t, or None.
-        source: [N, 3], the frame that was carried along to be this state; None where the way of the load does not
+        source: [N, 3], the frame that was carried along to be this state; None where the load path does not
             count.
         history: [N, *], what is known of that frame at the nodes (`Graph.at_nodes`), or None.
     """

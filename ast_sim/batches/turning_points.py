@@ -1,4 +1,4 @@
-"""The way of the load: where the motion of the prescribed nodes turns back.
+"""The load path: where the motion of the prescribed nodes turns back.
 
 Metal that yields keeps a set, so a frame depends on the way there, not only on where the prescribed nodes end. On a way
 that never turns back, the plastic strain follows from its two ends. So a jump starts from the last frame in which the

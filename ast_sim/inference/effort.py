@@ -36,7 +36,7 @@ class Effort:
             at most `STILL`. Where `MOST_NEWTON_STEPS` or more do not end, they begin anew after more corrections.
             Stress then follows from the material.
         solved: the bundled solver then goes on to its own stop test; with friction, and where bodies still overlap, it
-            goes the way of the load from rest, frame by frame, as if there were no model.
+            goes the load path from rest, frame by frame, as if there were no model.
 
     Raises:
         ConfigError: a number is not whole or negative.
@@ -49,7 +49,7 @@ class Effort:
     @classmethod
     def exact(cls) -> Self:
         """The effort whose answers end where the solver's stop test holds. A scene with several equilibria may end in
-        another one than along the way of the load."""
+        another one than along the load path."""
         return cls(newton_steps=STEPS_BEFORE_SOLVER, solved=True)
 
     def __post_init__(self) -> None:

@@ -2,8 +2,8 @@
 
 Without friction an equilibrium does not depend on the way to it, unless something snaps. So the solver may start from
 positions that are nearly right, such as those of a model after a Newton step: a few iterations are left of the many
-from rest. Where bodies overlap there or an element is turned over, and always with friction, it goes the way of the
-load from rest, frame by frame.
+from rest. Where bodies overlap there or an element is turned over, and always with friction, it goes the load
+path from rest, frame by frame.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Equilibria:
         self._frames.watch(self._require_patience)
 
     def solve(self, frame: int, start: np.ndarray | None) -> tuple[np.ndarray, bool]:
-        """The positions [N, 3] of a frame, float64, and whether they were found along the way of the load.
+        """The positions [N, 3] of a frame, float64, and whether they were found along the load path.
 
         Args:
             start: [N, 3] nearly right positions; None: there are none.

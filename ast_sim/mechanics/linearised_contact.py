@@ -13,7 +13,7 @@ sequential quadratic programming. Its dual has one unknown a pair, the force of 
 With the factorization K = L L^T, B is the product of L^-1 C^T with itself.
 
 With Coulomb friction each pair has tangential forces, too, at most the coefficient times the normal force. They resist
-slip from where the surfaces stuck to each other. A single step does not know the way of the load. If nothing else is
+slip from where the surfaces stuck to each other. A single step does not know the load path. If nothing else is
 given, its surfaces have slid along the last fiftieth of a straight way from rest: those that slide get the whole
 friction against their way, and those that stick hardly feel it (docs/log.md, 2026-11-25). Bodies may overlap at x, and
 elements may be turned over: these get the forces and the stiffness of the nearest upright shape (Irving, Teran and

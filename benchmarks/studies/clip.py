@@ -209,7 +209,7 @@ and kind of the cutout, travel and yield stress are drawn. The set is the length
 free end in the last frame, the peak force the largest force on the ram in all frames. Errors are relative to what
 CalculiX found on the same mesh, in test scenes that no training has seen. The run predicts all frames of a scene,
 those after the turn from its own answer for the turn
-([the way of the load](../reference/model.md#jumps-and-corrections)). The Gaussian process (scikit-learn, a squared
+([the load path](../reference/model.md#jumps-and-corrections)). The Gaussian process (scikit-learn, a squared
 exponential with a length for each parameter) maps the drawn parameters to both numbers; it knows nothing else of a
 scene, and can be asked for nothing else. Times are processor times of one thread ({processor}).
 """

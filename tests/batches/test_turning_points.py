@@ -1,4 +1,4 @@
-"""The frames that jumps start from, where the way of the load counts: sources of given motions, and what training makes
+"""The frames that jumps start from, where the load path counts: sources of given motions, and what training makes
 of them."""
 
 from dataclasses import replace

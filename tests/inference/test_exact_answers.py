@@ -1,4 +1,4 @@
-"""Exact answers: where the solver ends, from the answer of a model or along the way of the load."""
+"""Exact answers: where the solver ends, from the answer of a model or along the load path."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from ast_sim.mechanics.equilibria import Equilibria
 from ast_sim.support.errors import ConfigError
 
 FROM_MODEL = "solved to the stop test of the solver, from the answer of the model"
-WALKED = "solved to the stop test of the solver, along the way of the load, frame by frame"
+WALKED = "solved to the stop test of the solver, along the load path, frame by frame"
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def equilibria_of(scene, law, targets):
 
 
 def test_an_exact_answer_ends_where_the_solver_ended(plates):
-    """One of these plates has two equilibria: the way of the load leads to the one of the dataset."""
+    """One of these plates has two equilibria: the load path leads to the one of the dataset."""
     run = ast_sim.example_run("plates")
     others = []
     for truth in loaded(plates):

@@ -3,7 +3,7 @@
 The start is the first frame, carried along by the prescribed nodes. Where the material yields, it is the last frame in
 which the motion turned back, if it did; such frames are predicted before the others. Each call of the model gets the
 answer of the call before and predicts what is missing. Newton steps of the solver may follow. The model predicts the
-frames of all scenes side by side, in ragged batches. With friction, Newton steps know the way of the load as far as the
+frames of all scenes side by side, in ragged batches. With friction, Newton steps know the load path as far as the
 frames before are wanted, too; in all else a frame does not depend on others than its start. The bundled solver may end
 an answer (`Effort.solved`).
 """

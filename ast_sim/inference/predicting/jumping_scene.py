@@ -39,7 +39,7 @@ class JumpingFrame:
         fields: after the last call and after Newton steps, which change the stress alone.
         last_step: the size of the last Newton step.
         latent: what the network made of it in the first call.
-        walked: whether the solver went the way of the load; None: it was not asked.
+        walked: whether the solver went the load path; None: it was not asked.
     """
 
     scene: JumpingScene
@@ -209,7 +209,7 @@ def _solved(frames: Sequence[JumpingFrame]) -> dict[str, str]:
     ways = {frame.walked for frame in frames} - {None}
     if not ways:
         return {}
-    way = "along the way of the load, frame by frame" if True in ways else "from the answer of the model"
+    way = "along the load path, frame by frame" if True in ways else "from the answer of the model"
     return {"solved": f"solved to the stop test of the solver, {way}"}
 
 

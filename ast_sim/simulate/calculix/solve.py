@@ -39,7 +39,7 @@ BEST_GUESS = "best solution and residuals are in the frd file"
 FAILED = 201  # what ccx returns when it gives up, for whatever reason
 # These are tried one after another until all frames converge: first softer contact, then shorter increments, too.
 LADDER = (Increments(), Increments(stiffness=0.1), Increments(stiffness=0.1, largest=0.5))
-# Those where bodies yield: shorter increments follow the way of the load.
+# Those where bodies yield: shorter increments follow the load path.
 YIELDING = (Increments(1.0, 0.25, 0.05), Increments(1.0, 0.05, 0.01), Increments(0.1, 0.05, 0.01))
 
 
