@@ -186,7 +186,7 @@ def test_the_evaluation_says_that_one_step_is_the_rollout(data):
         step, whole = (found.error(quantity, horizon=horizon) for horizon in ("one_step", "rollout_all"))
         assert (step.rmse_sequence, step.rmse_pooled) == (whole.rmse_sequence, whole.rmse_pooled)
     assert found.jumps is True and stepwise.jumps is False
-    assert "one jump from the first and 1 correction, so" in table(found) and "one jump" not in table(stepwise)
+    assert "one jump and 1 correction, so" in table(found) and "one jump" not in table(stepwise)
 
 
 def test_a_failed_prediction_has_no_one_step(data):

@@ -201,7 +201,7 @@ def table(figures: Figures) -> str:
     lines.append(f"scenes: {len(figures.scenes)}, failed: {figures.failures}, threads: {figures.threads}")
     if figures.jumps:
         after = Effort(**figures.effort)
-        lines.append(f"every frame is one jump from the first and {after.text}, so the model's one_step is its rollout")
+        lines.append(f"every frame is one jump and {after.text}, so the model's one_step is its rollout")
     if all(scene.solver_seconds_per_step is None for scene in figures.scenes):
         lines.append("speed relative to the solver: unknown. Neither the scenes nor a file beside the dataset")
         lines.append("(its name and .seconds.json) hold the seconds of a solver; a dataset is moved together with it")
