@@ -77,7 +77,7 @@ _INTRODUCTION = """# What an error costs
 Made by `python -m benchmarks.studies.trade` from `benchmarks/results/trade.json`; do not edit.
 
 On each side the fastest setting counts that keeps the error in 90 % of the scenes, by its median time: of the run the
-efforts that it can make, of the solver the 32 ways in which it can be run (stop tests, ranges of contact, coarser
+efforts that it can make, of the solver the ways in which it can be run (stop tests, ranges of contact, coarser
 meshes, linearised steps, nested iteration). Neither side may choose scene by scene. The error is that of the
 displacement at the frame in which a scene is deformed most, relative to it. Times are processor time on one thread,
 beside other work on the same machine, with all that is prepared for a mesh; meshing is not counted. A ratio is the
@@ -97,7 +97,7 @@ def _section(title: str, figures: TradeFigures) -> list[str]:
         "",
         f"## {title}",
         "",
-        f"{len(figures.scenes)} scenes, {figures.origin['processor']}.{trained}",
+        f"{len(figures.scenes)} scenes, {len(figures.solver)} ways of the solver, {figures.origin['processor']}.{trained}",
         "",
         f"| {' | '.join(COLUMNS)} |",
         "| ---: | --- | --- | --- | --- | ---: |",

@@ -3,8 +3,8 @@
 Such a user need not solve all frames before. The solver goes from rest to the wanted frame, straight, in a few load
 steps, and frame by frame; the fastest counts. It is run in several ways that trade accuracy for time: looser stop
 tests, a longer range of contact, coarser meshes, Newton steps with linearised contact, and nested iteration: a coarse
-solution is carried over to the mesh of the dataset and Newton steps correct it there. `cheapest` finds the fastest way
-that is as accurate as the model.
+solution is carried over to the mesh of the dataset and Newton steps correct it there, which the solver may finish.
+`cheapest` finds the fastest way that is as accurate as the model.
 Each scene is solved in a process of its own, on one thread and without torch.
 """
 
@@ -49,6 +49,8 @@ class Way:
             0: the bundled solver, with barriers and to its stop test.
         newton: the solution is carried over to the mesh of the dataset, and so many Newton steps with linearised
             contact follow there, as after a model. In them, surfaces have slid as `NewtonSteps.step` supposes.
+        finished: the bundled solver then goes on there to its own stop test, as it may after a model. Where bodies
+            overlap or an element is turned over, it cannot.
     """
 
     name: str
@@ -57,6 +59,7 @@ class Way:
     tolerance: float = 1.0
     linearised: int = 0
     newton: int = 0
+    finished: bool = False
 
 
 _NESTED = tuple(
@@ -86,6 +89,11 @@ WAYS = (
     Way("1/2 nodes, 12 linearised steps", nodes=0.5, linearised=12),
     Way("24 linearised steps", linearised=24),
     *_NESTED,
+    Way("6 linearised steps, then own stop test", linearised=6, finished=True),
+    *(
+        Way(f"{name} nodes, 6 linearised steps, 1 Newton step, then own stop test", share, 1.0, 1.0, 6, 1, True)
+        for name, share in (("1/2", 0.5), ("1/4", 0.25))
+    ),
 )
 STARTS = (1, 2, 4, 0)
 

@@ -23,7 +23,7 @@ import numpy as np
 from ast_sim.dataset.reader import Dataset
 from ast_sim.mechanics.case import Drawn, SolidCase
 from ast_sim.mechanics.linearised_contact import CLEARANCE, NewtonSteps
-from ast_sim.mechanics.quasi_static import OneFrame, solve_frame
+from ast_sim.mechanics.quasi_static import OneFrame, SolidFrames, solve_frame
 from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.scene import Scene
 from ast_sim.simulate.families.names import family_module
@@ -126,10 +126,11 @@ class WaySolver:
         if not isinstance(case, SolidCase):
             return Outcome(way, f"{UNMESHED}: {case}", mesh_seconds=mesh_seconds)
         start, first = self._solution(case, way)
-        solved = self._best(lambda: self._nested(case, first, way.newton)) if way.newton else first
+        more = way.newton or way.finished
+        solved = self._best(lambda: self._continued(case, first, way)) if more else first
         position, error = None, np.inf
         if solved.position is not None:
-            own = way.nodes == 1 or way.newton > 0
+            own = way.nodes == 1 or more
             position = solved.position if own else self._on_own_mesh(case, solved.position)
             error = _root_mean_square((position - self.truth)[self.free])
         return Outcome(
@@ -159,7 +160,7 @@ class WaySolver:
 
     def _solution(self, case: SolidCase, way: Way) -> tuple[int, OneFrame]:
         """The start and the solution on the mesh of a way; ways that differ in what follows share it."""
-        alone = replace(way, name="", newton=0)
+        alone = replace(way, name="", newton=0, finished=False)
         if alone not in self._solved:
             case = replace(case, contact=replace(case.contact, dhat=way.dhat * case.contact.dhat))
             settings = replace(self.settings, force_tolerance=way.tolerance * self.settings.force_tolerance)
@@ -210,19 +211,24 @@ class WaySolver:
             setup = 0.0
         return OneFrame(position, failure, process_time() - began - setup, setup, steps, steps + 1, 0)
 
-    def _nested(self, coarse: SolidCase, solved: OneFrame, steps: int) -> OneFrame:
-        """A solution on another mesh, carried over to the mesh of the dataset, and so many Newton steps there."""
+    def _continued(self, case: SolidCase, solved: OneFrame, way: Way) -> OneFrame:
+        """A solution, carried over to the mesh of the dataset, and what follows there: Newton steps, and the solver."""
         if solved.position is None:
             return solved
         began = process_time()
         position, failure = None, ""
         setup = 0.0
+        iterations = 0
         try:
             newton = _newton_steps(self.drawn.case)
+            frames = SolidFrames(self.drawn.case, self.settings, newton) if way.finished else None
             setup = process_time() - began
-            position = self._on_own_mesh(coarse, solved.position)
-            for step in range(steps):
+            position = solved.position if way.nodes == 1 else self._on_own_mesh(case, solved.position)
+            for step in range(way.newton):
                 position = newton.step(position, from_afar=step == 0)
+            if frames is not None:
+                position = self._finished(frames, position)
+                iterations = frames.solver.iterations
         except SimulationError as error:
             position = None
             failure = f"on the mesh of the dataset: {error}"
@@ -232,8 +238,20 @@ class WaySolver:
             failure=failure,
             seconds=solved.seconds + process_time() - began - setup,
             setup_seconds=solved.setup_seconds + setup,
-            newton_iterations=solved.newton_iterations + steps,
+            newton_iterations=solved.newton_iterations + way.newton + iterations,
         )
+
+    def _finished(self, frames: SolidFrames, position: np.ndarray) -> np.ndarray:
+        """Where the solver ends from nearly right positions.
+
+        Raises:
+            SimulationError: it cannot start from them, finds no equilibrium, or what it found fails its checks.
+        """
+        frames.check({"position": position})
+        frames.solver.newton.restart(position)
+        frames.solver.advance(self.drawn.case.targets[self.frame])
+        frames.check({"position": frames.solver.newton.position.astype(np.float32)})
+        return frames.solver.newton.position
 
     def _on_own_mesh(self, case: SolidCase, position: np.ndarray) -> np.ndarray:
         """Positions of the nodes of the dataset's mesh, from those of another mesh of the same bodies."""

@@ -68,7 +68,9 @@ def test_every_way_is_solved_and_compared_with_the_dataset(plates, no_torch, cap
                 if outcome.way.linearised:
                     steps = outcome.way.linearised
                     assert (outcome.start, outcome.load_steps) == (steps, steps)
-                    assert outcome.newton_iterations == steps + 1 + outcome.way.newton
+                    counted = steps + 1 + outcome.way.newton
+                    assert (outcome.newton_iterations > counted) == outcome.way.finished
+                    assert outcome.newton_iterations >= counted
                     assert outcome.way.nodes < 1 or outcome.relative_error < 0.03
                 if outcome.way.newton:
                     assert outcome.relative_error < {1: 0.03, 2: 0.005, 3: 0.005}[outcome.way.newton]
@@ -115,6 +117,22 @@ def test_nested_iteration_counts_the_coarse_solution_and_corrects_it(plates):
         assert after.newton_iterations == before.newton_iterations + after.way.newton
     assert before.relative_error > 5 * one.relative_error > 10 * two.relative_error
     np.testing.assert_allclose(six.position, straight.position, rtol=0, atol=1e-5 * scene.displacement)
+
+
+def test_the_solver_finishes_what_began_nearly_right(plates):
+    """It ends where it ends from rest, in fewer iterations there; from overlaps it does not begin."""
+    coarse = Way("coarse", nodes=0.5, linearised=6, newton=1)
+    straight = Way("straight", linearised=6)
+    finished = [replace(way, finished=True) for way in (coarse, straight)]
+    overlapping = Way("overlapping", nodes=0.5, linearised=6, finished=True)
+    ways = [OWN, coarse, straight, *finished, overlapping]
+    (scene,) = rivals(plates, "train", [0], ways=ways, progress=False)
+    own, *begun, from_coarse, from_straight, refused = scene.outcomes
+    for start, end in zip(begun, (from_coarse, from_straight), strict=True):
+        assert end.relative_error < 1e-4 < start.relative_error
+        assert start.newton_iterations < end.newton_iterations < start.newton_iterations + own.newton_iterations
+        assert end.whole_seconds > start.whole_seconds
+    assert "surfaces intersect" in refused.failure
 
 
 def test_what_fails_is_said_and_not_raised(plates):
