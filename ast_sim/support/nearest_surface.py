@@ -40,11 +40,14 @@ def nearest_surface(
     """
     import igl  # takes 0.2 s
 
-    # All triangles around a nearest point are kept, so the sign is that of the whole surface.
     margin = max(inside, outside)
     kind = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-    close = np.flatnonzero(beside(points, position[triangles], margin))
-    triangles = triangles[beside(position[triangles], points[close], margin)]
+    corners = position.T[:, triangles.T]  # [3, 3, F]: component, corner
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    across = np.ascontiguousarray(points.T)
+    close = np.flatnonzero(beside(across, across, low, high, margin))
+    # All triangles around a nearest point are kept, so the sign is that of the whole surface.
+    triangles = triangles[beside(low, high, across[:, close], across[:, close], margin)]
     if not len(triangles):
         return Nearest(close[:0], np.zeros(0), np.zeros((0, 3)), triangles, np.zeros((0, 3)))
     nearest = igl.signed_distance(points[close], position, triangles, kind, -inside, outside)
@@ -56,10 +59,11 @@ def nearest_surface(
     return Nearest(rows, gap, np.where(touching[:, None], outward[near], away), triangles[face[near]], place)
 
 
-def beside(things: np.ndarray, others: np.ndarray, distance: float) -> np.ndarray:
-    """[n] bool: which points [n, 3] or triangles [n, 3, 3] come as near as `distance` to the box around the others."""
-    if not len(others):
-        return np.zeros(len(things), bool)
-    box = others.reshape(-1, 3).min(axis=0) - distance, others.reshape(-1, 3).max(axis=0) + distance
-    low, high = (things, things) if things.ndim == 2 else (things.min(axis=1), things.max(axis=1))
-    return ((high >= box[0]) & (low <= box[1])).all(axis=1)
+def beside(
+    low: np.ndarray, high: np.ndarray, low_others: np.ndarray, high_others: np.ndarray, distance: float
+) -> np.ndarray:
+    """[n] bool: which boxes from low to high [3, n] come as near as `distance` to the box around the other ones."""
+    if not low_others.size:
+        return np.zeros(low.shape[1], bool)
+    least, most = low_others.min(axis=1) - distance, high_others.max(axis=1) + distance
+    return ((high >= least[:, None]) & (low <= most[:, None])).all(axis=0)

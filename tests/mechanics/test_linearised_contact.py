@@ -197,8 +197,9 @@ def test_what_is_not_looked_at_is_not_near(squeezed, monkeypatch):
     case, truth, *_ = squeezed
     solver = NewtonSteps(case.scene, case.material, 0.0)
     pairs = solver.near_pairs(truth)
-    kept = nearest_surface.beside(truth, truth[case.scene.body == 1], 0.0)
+    points, others = truth.T, truth[case.scene.body == 1].T
+    kept = nearest_surface.beside(points, points, others, others, 0.0)
     assert 0 < kept.sum() < len(truth)
-    monkeypatch.setattr(nearest_surface, "beside", lambda things, *_: np.ones(len(things), bool))
+    monkeypatch.setattr(nearest_surface, "beside", lambda low, *_: np.ones(low.shape[1], bool))
     whole = solver.near_pairs(truth)
     assert np.array_equal(pairs.gap, whole.gap) and abs(pairs.directions - whole.directions).max() < 1e-12
