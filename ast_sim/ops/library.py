@@ -115,8 +115,8 @@ class Kernel:
             return error
         return None
 
-    def run(self, *arguments) -> Any:
-        """The op: call the C core with new outputs, unless it makes them."""
+    def outputs(self, *arguments) -> Any:
+        """Call the C core with new outputs, unless it makes them; None stands for one that is not wanted."""
         if self.spec.counts:
             return [torch.from_numpy(x) for x in self(*arguments)]
         try:
@@ -124,7 +124,13 @@ class Kernel:
         except Exception as error:  # no outputs for such arguments
             raise self._reason(self.spec.inputs, arguments) or error from None
         self(*given)
-        return self.given(given[self._num :], arguments)
+        outputs = given[self._num :]
+        return outputs if len(outputs) > 1 else outputs[0]
+
+    def run(self, *arguments) -> Any:
+        """The op: what the C core computes, as an op returns it."""
+        outputs = self.outputs(*arguments)
+        return self.given(outputs, arguments) if isinstance(outputs, tuple) else outputs
 
     def fake(self, *arguments):
         """The outputs without values, for tracing."""
@@ -153,9 +159,9 @@ class Op:
     """An op as its users call it; `overload` is the same op as torch registered it.
 
     For plain float32 tensors on the CPU a call goes straight to the kernel: torch's dispatcher would take longer than a
-    small kernel does. The dispatcher is used for tracing, dispatch modes, autocast, functorch, other devices and other
-    dtypes. Tangents and functorch take the composition. With AST_SIM_BACKEND=torch an op is its composition, and torch
-    differentiates it like any other code.
+    small kernel does, and outputs that are not wanted are None. The dispatcher is used for tracing, dispatch modes,
+    autocast, functorch, other devices and other dtypes. Tangents and functorch take the composition. With
+    AST_SIM_BACKEND=torch an op is its composition, and torch differentiates it like any other code.
 
     Args:
         kernel: the function of the core; the op has its name. The op changes no input, and no output is a view of one.
@@ -166,7 +172,7 @@ class Op:
 
     def __init__(self, kernel: Kernel, composition: Callable, fake: Callable | None = None) -> None:
         self.name, self.spec, self.composition = kernel.name, kernel.spec, composition
-        self.kernel, self._check = kernel.run, kernel.check
+        self.kernel, self._outputs, self._check = kernel.run, kernel.outputs, kernel.check
         self.function: type[torch.autograd.Function] | None = None  # set by `derivatives.differentiate`
         LIBRARY.define(self.name + self.spec.schema)
         LIBRARY.impl(self.name, self._on_cpu, "CPU")
@@ -185,15 +191,18 @@ class Op:
             return self.compose(*args)
         wants_gradient = False
         for x in args:
-            if isinstance(x, torch.Tensor):
-                if type(x) not in _PLAIN_TYPES or x.dtype not in _PLAIN_DTYPES or not x.is_cpu:
+            kind = type(x)
+            if kind is torch.Tensor or kind is torch.nn.Parameter:
+                if x.dtype not in _PLAIN_DTYPES or not x.is_cpu:
                     return self.overload(*args)
                 wants_gradient = wants_gradient or x.requires_grad
+            elif kind not in _NO_TENSORS and isinstance(x, torch.Tensor):
+                return self.overload(*args)
         if _is_watched():
             return self.overload(*args)
         if wants_gradient and self.function and torch.is_grad_enabled():
             return self.function.apply(*args)
-        return self.kernel(*args)
+        return self._outputs(*args)
 
     def reference(self, *args) -> Any:
         """The composition, after the checks."""
@@ -224,7 +233,7 @@ class Op:
             return self.reference(*(x.float() if getattr(x, "dtype", None) in _LOW_DTYPES else x for x in args))
 
 
-_PLAIN_TYPES = (torch.Tensor, torch.nn.Parameter)
+_NO_TENSORS = (type(None), int, bool, float, list)
 _PLAIN_DTYPES = (torch.float32, torch.int64, torch.int32)
 _LOW_DTYPES = (torch.float16, torch.bfloat16)
 

@@ -5,8 +5,7 @@ Legend: T vectors (cells, tokens or nodes), C cells, B scenes, H heads of width 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -18,8 +17,7 @@ from ast_sim.models.layers import Linear
 from ast_sim.ops._attention import cross_attention, self_attention
 
 
-@dataclass(frozen=True)
-class Vectors:
+class Vectors(NamedTuple):
     """The vectors of several scenes, which attend or are attended to.
 
     Attributes:
@@ -77,7 +75,7 @@ class AttentionBlock(nn.Module):
         dropout = self.dropout if self.training else 0.0
         options = {"dropout_p": dropout, "seed": int(torch.randint(2**62, (1,))) if dropout else 0}
         mixed = self._among(vectors, options) if context is None else self._to(context, vectors, options)
-        return replace(vectors, x=self.feed_forward(self.out(mixed.flatten(1), residual=vectors.x)))
+        return vectors._replace(x=self.feed_forward(self.out(mixed.flatten(1), residual=vectors.x)))
 
     def _among(self, vectors: Vectors, options: dict[str, Any]) -> Tensor:
         """[T, H, D]: the vectors attend to themselves."""
