@@ -71,6 +71,18 @@ typedef struct {
   ast_activation activation;
 } ast_linear;
 
+/* An attention block (attention_block.c): vectors x [Q,W] attend to a context [K,C] with H heads of D channels, and have
+ * F hidden units. */
+typedef struct {
+  int64_t B, Q, K, W, C, H, D, F;
+  const float *x, *context, *rotations, *context_rotations; /* [Q,W], [K,C]; [Q,D], [K,D] or NULL: cosines and sines */
+  const int64_t *q_offsets, *k_offsets;                     /* [B+1] */
+  const float *gamma, *beta, *context_gamma, *context_beta; /* [W], [W], [C], [C] */
+  const float *query, *key_value, *weight, *bias;           /* [H*D,W], [2*H*D,C], [W,H*D], [W] */
+  const float *inner_gamma, *inner_beta;                    /* [W] */
+  const float *first, *first_bias, *second, *second_bias;   /* [2F,W], [2F], [W,F], [W] */
+} ast_attention_block;
+
 /* Two dense layers: h = max(0, [x, beside] weight1^T + bias1), y = h weight2^T + bias2, then LayerNorm if there is a
  * gamma. */
 typedef struct {
@@ -179,6 +191,9 @@ typedef struct {
                                    const float *restrict sum, const float *restrict dout, float *restrict dq,
                                    float *restrict dk, float *restrict dv);
 
+  /* The block's vectors, out [Q,W], without dropout. D is a multiple of 16 up to 128. */
+  ast_status (*attention_block)(const ast_attention_block *s, float *restrict out);
+
   /* sum[r] = sum over the edges m into r, in stored order, of messages[m] = LN(W2 relu(z_m) + b2; gamma, beta), where
    * z_m = of_senders[s] + of_receivers[r] + A2 relu(A1 e_m + a1), or + e_m without an encoder; 0 without edges.
    * sum [R,F2]; messages [M,F2] or NULL. */
@@ -228,6 +243,7 @@ typedef struct {
   KERNEL(sparse_conv_weight)      \
   KERNEL(attention)               \
   KERNEL(attention_backward)      \
+  KERNEL(attention_block)         \
   KERNEL(message)                 \
   KERNEL(message_backward)        \
   KERNEL(linear)                  \

@@ -9,6 +9,7 @@
 #include "elastic_forces.c"
 #include "fps.c"
 #include "linear.c"
+#include "attention_block.c" /* after attention.c and linear.c, of which it is made */
 #include "message.c"
 #include "message_backward.c" /* after message.c, whose tiles it uses */
 #include "mlp.c"

@@ -345,6 +345,28 @@ KERNEL(mlp_backward, dout, MLP, MLP_KEPT, dx, dbeside, dweight1, dbias1, dweight
                                (ast_mlp_gradients){EACH(GRADIENT, MLP)});
 }
 
+/* ---- attention blocks ---- */
+
+#define BLOCK_ROWS x, context, rotations, context_rotations, q_offsets, k_offsets
+#define BLOCK_WEIGHTS                                                                                       \
+  gamma, beta, context_gamma, context_beta, query, key_value, weight, bias, inner_gamma, inner_beta, first, \
+      first_bias, second, second_bias
+
+KERNEL(attention_block, BLOCK_ROWS, BLOCK_WEIGHTS, heads, out) {
+  const int64_t H = a->heads.integer;
+  const ast_attention_block s = {EACH(SIZE, B, Q, K, W, C, F), .H = H, .D = n['I'] / H, EACH(FIELD, BLOCK_ROWS),
+                                 EACH(FIELD, BLOCK_WEIGHTS)};
+  return kernels->attention_block(&s, a->out.data);
+}
+
+static bool attention_block_check(const call *c) {
+  const attention_block_arguments *a = (const void *)c->arguments;
+  const int64_t I = c->size['I'], H = a->heads.integer, D = I / H;
+  const bool rotated = a->rotations.data || a->context_rotations.data;
+  return (I % H == 0 && D % 16 == 0 && D >= 16 && D <= 128 && (!rotated || c->size['E'] == D)) ||
+         fail(c, "the head dimension must be a multiple of 16 up to 128, and that of the rotations");
+}
+
 /* ---- all kernels ---- */
 
 typedef struct {
@@ -363,6 +385,7 @@ typedef struct {
 static binding bindings[] = {
     BINDING(attention, .check = attention_check),
     BINDING(attention_backward, .check = attention_check),
+    BINDING(attention_block, .check = attention_block_check),
     BINDING(attention_kv, .check = attention_check),
     BINDING(attention_kv_backward, .check = attention_check),
     BINDING(attention_qkv, .check = attention_check),

@@ -27,6 +27,7 @@ from ast_sim.ops import (
     sparse_conv,
     sparse_conv_transposed,
 )
+from ast_sim.ops._attention import attention_block
 from ast_sim.training.muon import orthogonalized
 
 Results = tuple[list[list[Tensor]], list[Tensor]]
@@ -161,6 +162,27 @@ def dropout_results(scenes: Sequence[int]) -> Results:
     return attention_results(scenes, 0.2)
 
 
+def block_results(scenes: Sequence[int]) -> Results:
+    """Without gradients: those are of the composition."""
+    keys = [90, 300, 7, 40, 600]
+    q_offsets, k_offsets = offsets_of(scenes), offsets_of(scenes, keys)
+    turns = (rows(scenes, 16, key=3), rows(scenes, 16, key=4, sizes=keys))
+    weights = [
+        shared(40),
+        shared(40),
+        shared(24),
+        shared(24),
+        shared(32, 40),
+        shared(64, 24),
+        shared(40, 32),
+        shared(40),
+    ]
+    weights += [shared(40), shared(40), shared(66, 40), shared(66), shared(40, 33), shared(40)]
+    vectors = (rows(scenes, 40, key=1), rows(scenes, 24, key=2, sizes=keys))
+    out = attention_block(*vectors, *turns, q_offsets, k_offsets, weights, 2)
+    return [[x] for x in split(out, q_offsets)], []
+
+
 def edges_of(scenes: Sequence[int]) -> EdgeSet:
     """About six random edges a node within each scene."""
     sets = []
@@ -262,6 +284,7 @@ OPS: dict[str, Callable[[Sequence[int]], Results]] = {
     "sparse_conv_transposed": conv_transposed_results,
     "attention": attention_results,
     "attention with dropout": dropout_results,
+    "attention_block": block_results,
     "message_sum": message_results,
     "message_sum with latents": message_results_with_latents,
     "segment_sum": lambda scenes: segment_results(scenes, segment_sum),

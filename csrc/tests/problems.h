@@ -158,4 +158,25 @@ static ast_elastic new_elastic(int64_t E, float scale) {
 #define ELASTIC_BUFFERS(s) \
   (s)->elements, (s)->node_order, (s)->node_offsets, (s)->position, (s)->rest_position, (s)->lame
 
+/* ---- attention blocks ---- */
+
+/* Q vectors that attend to K others in scenes of the given offsets, which it takes. `floats` makes the numbers. */
+static ast_attention_block new_block(int64_t *q_offsets, int64_t *k_offsets, int64_t B, int64_t W, int64_t C, int64_t H,
+                                     int64_t D, int64_t F, bool rotated, float *(*floats)(int64_t)) {
+  const int64_t I = H * D, queries = q_offsets[B], keys = k_offsets[B];
+  ast_attention_block s = {.B = B, .Q = queries, .K = keys, .W = W, .C = C, .H = H, .D = D, .F = F};
+  s.q_offsets = q_offsets, s.k_offsets = k_offsets;
+  s.x = floats(queries * W), s.context = floats(keys * C);
+  if (rotated) s.rotations = floats(queries * D), s.context_rotations = floats(keys * D);
+  s.gamma = floats(W), s.beta = floats(W), s.context_gamma = floats(C), s.context_beta = floats(C);
+  s.query = floats(I * W), s.key_value = floats(2 * I * C), s.weight = floats(W * I), s.bias = floats(W);
+  s.inner_gamma = floats(W), s.inner_beta = floats(W);
+  s.first = floats(2 * F * W), s.first_bias = floats(2 * F), s.second = floats(W * F), s.second_bias = floats(W);
+  return s;
+}
+#define BLOCK_BUFFERS(s)                                                                                       \
+  (s).x, (s).context, (s).rotations, (s).context_rotations, (s).q_offsets, (s).k_offsets, (s).gamma, (s).beta, \
+      (s).context_gamma, (s).context_beta, (s).query, (s).key_value, (s).weight, (s).bias, (s).inner_gamma,    \
+      (s).inner_beta, (s).first, (s).first_bias, (s).second, (s).second_bias
+
 #endif

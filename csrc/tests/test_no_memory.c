@@ -205,6 +205,13 @@ static outcome attention_backward(const ast_kernels *kernels) {
   return FINISH(KERNEL(kernels->attention_backward(&s, q, k, v, out, maximum, sum, dout, dq, dk, dv)), dq, dk, dv);
 }
 
+static outcome attention_block(const ast_kernels *kernels) {
+  const ast_attention_block s = new_block(even_offsets(SCENES, QUERIES), even_offsets(SCENES, KEYS), SCENES, 40, 30, H,
+                                          D, 24, true, random_floats);
+  float *out = new_floats(s.Q * s.W);
+  return FINISH(KERNEL(kernels->attention_block(&s, out)), out);
+}
+
 static ast_message message_case(void) { return new_message(6000, 3000, 3000, 3, 16, 24, 20, 1); }
 
 static outcome message(const ast_kernels *kernels) {
@@ -328,6 +335,7 @@ static const struct {
     {"sparse_conv_weight", sparse_conv_weight},
     {"attention", attention},
     {"attention_backward", attention_backward},
+    {"attention_block", attention_block},
     {"message", message},
     {"message_backward", message_backward},
     {"linear", linear},

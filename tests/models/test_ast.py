@@ -19,7 +19,7 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.models.ast.ast_config import ASTConfig
 from ast_sim.models.ast.cells import build_cells, places
 from ast_sim.models.ast.message_passing import MessagePassing
-from ast_sim.models.ast.position_embedding import PositionEmbedding, rotated, rotations
+from ast_sim.models.ast.position_embedding import PositionEmbedding, rotations
 from ast_sim.models.ast.presets import PRESETS
 from ast_sim.models.ast.transformer import AttentionBlock, Vectors
 from ast_sim.models.data_facts import DataFacts
@@ -27,6 +27,7 @@ from ast_sim.models.layers import FactorizedLinear
 from ast_sim.models.normalizer import Normalizer
 from ast_sim.models.registry import build_model
 from ast_sim.ops import EdgeSet
+from ast_sim.ops._attention import rotated
 from ast_sim.scene import NodeType
 from ast_sim.support.errors import ConfigError, DatasetError, RolloutError
 
@@ -244,6 +245,28 @@ def test_attention_block_is_the_formula():
     y = x + block.out(mixed)
     a, b = block.feed_forward.first(block.feed_forward.norm(y)).chunk(2, dim=1)
     torch.testing.assert_close(out, y + block.feed_forward.second(a * F.gelu(b)), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("rotates", [True, False])
+@pytest.mark.parametrize("to_itself", [True, False])
+def test_a_block_at_once_is_the_block_in_steps_and_follows_its_parameters(to_itself, rotates):
+    torch.manual_seed(0)
+    block = AttentionBlock(small("deforming_plate", dropout=0.0), 32, None if to_itself else 48)
+    vectors, context = (
+        Vectors(
+            torch.randn(n, width),
+            torch.tensor([0, 5, n]),
+            rotations(torch.randn(n, 3).double(), 16) if rotates else None,
+        )
+        for n, width in ((9, 32), (11, 48))
+    )
+    given = (vectors,) if to_itself else (vectors, context)
+    for change in (0.0, 0.3):
+        with torch.no_grad():
+            for parameter in block.parameters():
+                parameter.add_(change * torch.randn(parameter.shape))
+            at_once = block(*given).x
+        torch.testing.assert_close(at_once, block(*given).x.detach(), rtol=1e-5, atol=1e-5)
 
 
 def test_rotations_turn_each_pair_by_its_angle():

@@ -40,10 +40,3 @@ def rotations(places: Tensor, head_dim: int) -> Tensor:
     angles = (places[:, :, None] * (math.pi * 0.5 ** torch.arange(pairs // 3, dtype=torch.float64))).flatten(1)
     angles = F.pad(angles, (0, pairs - angles.shape[1]))
     return torch.complex(angles.cos().float(), angles.sin().float())[:, None]
-
-
-def rotated(x: Tensor, by: Tensor | None) -> Tensor:
-    """x [..., D] with each pair (x_2i, x_2i+1) rotated by `rotations` [..., D / 2]. None: x itself."""
-    if by is None:
-        return x
-    return torch.view_as_real(torch.view_as_complex(x.unflatten(-1, (-1, 2))) * by).flatten(-2)
