@@ -10,8 +10,7 @@ from collections.abc import Callable
 from functools import cache
 
 import numpy as np
-from scipy.sparse import csc_array, csr_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse import csr_array
 from scipy.sparse.linalg import splu
 
 from ast_sim.element_topology import linear_elements
@@ -19,6 +18,7 @@ from ast_sim.mechanics.elements.neo_hookean import cofactor, determinant
 from ast_sim.scene import Scene
 
 RIGID = 1e-3  # prescribed nodes move as a rigid body if no node is farther off, as a share of the largest displacement
+LOOSE = 1e-13  # is added to the diagonal, as a share of the largest entry: far below the rounding of positions
 PLANAR = 1e-6  # points lie on a line if their second extent, as a share of the first, is below this
 
 
@@ -87,19 +87,15 @@ def harmonic_extension(scene: Scene, held: np.ndarray, free: np.ndarray) -> Call
     """A function from the displacements [H, 3] of the held nodes of a body to those [F, 3] of its free nodes."""
     count = len(free)
     stiffness = _stiffness(scene, np.concatenate([free, held]))
-    part = connected_components(stiffness, directed=False)[1]
-    reached = np.isin(part[:count], part[count:])
-    if not reached.any():
-        return lambda way: np.zeros((count, 3))
-    if not reached.all():
-        inner = harmonic_extension(scene, held, free[reached])
-        place = np.cumsum(reached) - 1
-        return lambda way: np.where(reached[:, None], inner(way)[place], 0)
-    of_free, pull = stiffness[:count, :count], stiffness[:count, count:]
-    # Symmetric and positive definite: no pivoting, and an ordering for such matrices.
-    symmetric = csc_array((of_free.data, of_free.indices, of_free.indptr), shape=of_free.shape)
-    solver = splu(symmetric, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return lambda way: solver.solve(-(pull @ way))
+    # Symmetric and positive definite: its transpose holds it by columns, no pivoting, an ordering for such matrices.
+    inner, symmetric = stiffness[:count, :count].T, {"SymmetricMode": True}
+    solver = splu(inner, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
+
+    def extend(way: np.ndarray) -> np.ndarray:
+        pull = stiffness @ np.concatenate([np.zeros((count, 3)), way])
+        return solver.solve(-pull[:count])
+
+    return extend
 
 
 def _stiffness(scene: Scene, nodes: np.ndarray) -> csr_array:
@@ -108,6 +104,8 @@ def _stiffness(scene: Scene, nodes: np.ndarray) -> csr_array:
     Let o_a be the side opposite to node a of an element, as a vector: the edge of a triangle, or of a tetrahedron the
     normal of the face, as long as twice its area. All of them are taken in one sense, so they add up to 0. Then the
     integral over the element is o_a . o_b / (4 area), or o_a . o_b / (36 volume).
+
+    Nodes that no element joins to a held one are pulled by nothing. What `LOOSE` adds to the diagonal lets them stay.
     """
     elements = linear_elements(scene.elements).T  # [k, E]
     corners = scene.rest_position.astype(np.float64)[elements].swapaxes(1, 2)  # [k, 3, E]
@@ -119,9 +117,13 @@ def _stiffness(scene: Scene, nodes: np.ndarray) -> csr_array:
         normals = cofactor(edges)
         opposite = np.concatenate([-normals.sum(axis=0, keepdims=True), normals])
         size = 6 * np.abs(determinant(edges, normals))
-    number = np.full(scene.num_nodes, -1, np.int32)
-    number[nodes] = np.arange(len(nodes), dtype=np.int32)
     integrals = np.einsum("aie,bie->abe", opposite, opposite) / size
+    count = len(nodes)
+    number = np.full(scene.num_nodes, -1, np.int32)
+    number[nodes] = diagonal = np.arange(count, dtype=np.int32)
     rows, columns = np.broadcast_arrays(number[elements][:, None], number[elements])
     among = (rows >= 0) & (columns >= 0)
-    return csr_array((integrals[among], (rows[among], columns[among])), shape=(len(nodes), len(nodes)))
+    values = integrals[among]
+    loose = np.full(count, LOOSE * values.max(initial=np.finfo(float).tiny))
+    places = np.append(rows[among], diagonal), np.append(columns[among], diagonal)
+    return csr_array((np.append(values, loose), places), shape=(count, count))

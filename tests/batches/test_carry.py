@@ -91,6 +91,34 @@ def test_a_piece_of_a_body_that_no_handle_holds_stays():
     assert (found[: scene.num_nodes, 0] > rest[: scene.num_nodes, 0]).sum() > 4
 
 
+def test_nodes_of_no_element_stay():
+    scene = bar()
+    loose = Scene(
+        np.concatenate([scene.rest_position, np.float32([[9, 9, 9], [0, 0, 0]])]),
+        scene.elements,
+        np.append(scene.node_type, np.zeros(2, np.uint8)),
+        np.zeros(scene.num_nodes + 2, np.int32),
+    )
+    rest = loose.rest_position
+    pulled = rest + np.where(rest[:, :1] == 4, [1, 0, 0], 0).astype(np.float32)
+    found = Carrier(loose)(rest, pulled)
+    assert np.array_equal(found[-2:], rest[-2:])
+    np.testing.assert_allclose(found[:-2], Carrier(scene)(rest[:-2], pulled[:-2]), rtol=0, atol=1e-7)
+
+
+def test_a_sheet_is_stretched_evenly():
+    x, y = np.meshgrid(np.arange(5.0), np.arange(3.0), indexing="ij")
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(15)], axis=1).astype(np.float32)
+    low = np.array([3 * i + j for i in range(4) for j in range(2)])
+    triangles = np.concatenate([np.stack([low, low + 3, low + 4], 1), np.stack([low, low + 4, low + 1], 1)])
+    ends = np.isin(points[:, 0], (0, 4))
+    types = np.where(ends, NodeType.HANDLE, NodeType.NORMAL).astype(np.uint8)
+    sheet = Scene(points, triangles.astype(np.int32), types, np.zeros(15, np.int32))
+    pulled = points + np.where(points[:, :1] == 4, [1.0, 0.5, 0.0], 0.0).astype(np.float32)
+    found = Carrier(sheet)(points, pulled)
+    np.testing.assert_allclose(found - points, points[:, :1] / 4 * [1.0, 0.5, 0.0], rtol=0, atol=1e-6)
+
+
 def test_points_on_a_line_that_turn_do_not_say_how():
     line = np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
     assert rigid_motion(line, turned(line, 40)) is None
