@@ -13,7 +13,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import splu
 
-from ast_sim.element_topology import linear_elements
+from ast_sim.element_topology import LOCAL_EDGES, linear_elements
 from ast_sim.mechanics.elements.neo_hookean import cofactor, determinant
 from ast_sim.scene import Scene
 
@@ -103,27 +103,39 @@ def _stiffness(scene: Scene, nodes: np.ndarray) -> csr_array:
 
     Let o_a be the side opposite to node a of an element, as a vector: the edge of a triangle, or of a tetrahedron the
     normal of the face, as long as twice its area. All of them are taken in one sense, so they add up to 0. Then the
-    integral over the element is o_a . o_b / (4 area), or o_a . o_b / (36 volume).
+    integral over the element is o_a . o_b / (4 area), or o_a . o_b / (36 volume). Rows add up to 0, too.
 
     Nodes that no element joins to a held one are pulled by nothing. What `LOOSE` adds to the diagonal lets them stay.
     """
     elements = linear_elements(scene.elements).T  # [k, E]
     corners = scene.rest_position.astype(np.float64)[elements].swapaxes(1, 2)  # [k, 3, E]
-    edges = corners[1:] - corners[:1]
+    sides = corners[1:] - corners[:1]
     if len(elements) == 3:
         opposite = np.roll(corners, 1, axis=0) - np.roll(corners, -1, axis=0)
-        size = 2 * np.linalg.norm(np.cross(*edges, axis=0), axis=0)
+        size = 2 * np.linalg.norm(np.cross(*sides, axis=0), axis=0)
     else:
-        normals = cofactor(edges)
+        normals = cofactor(sides)
         opposite = np.concatenate([-normals.sum(axis=0, keepdims=True), normals])
-        size = 6 * np.abs(determinant(edges, normals))
-    integrals = np.einsum("aie,bie->abe", opposite, opposite) / size
+        size = 6 * np.abs(determinant(sides, normals))
     count = len(nodes)
-    number = np.full(scene.num_nodes, -1, np.int32)
-    number[nodes] = diagonal = np.arange(count, dtype=np.int32)
-    rows, columns = np.broadcast_arrays(number[elements][:, None], number[elements])
-    among = (rows >= 0) & (columns >= 0)
-    values = integrals[among]
-    loose = np.full(count, LOOSE * values.max(initial=np.finfo(float).tiny))
-    places = np.append(rows[among], diagonal), np.append(columns[among], diagonal)
-    return csr_array((np.append(values, loose), places), shape=(count, count))
+    number = np.full(scene.num_nodes, -1)
+    number[nodes] = np.arange(count)
+    ends = np.array(LOCAL_EDGES[len(elements)]).T
+    one, other = number[elements[ends]]  # [2, edges, E]
+    among = (one >= 0) & (other >= 0)
+    integrals = (np.einsum("pie,pie->pe", *opposite[ends]) / size)[among]
+    # One sort brings the elements at an edge together; another one puts both places of an edge, and the diagonal, in
+    # the order of a matrix by rows.
+    keys = (np.minimum(one, other) * count + np.maximum(one, other))[among]
+    order = np.argsort(keys)
+    keys = keys[order]
+    first = np.flatnonzero(np.diff(keys, prepend=-1))
+    of_edges = np.add.reduceat(integrals[order], first) if len(first) else integrals
+    low, high = np.divmod(keys[first], count)
+    diagonal = np.bincount(np.concatenate([low, high]), np.tile(-of_edges, 2), minlength=count)
+    diagonal += LOOSE * diagonal.max(initial=np.finfo(float).tiny)
+    keys = np.concatenate([keys[first], high * count + low, np.arange(count) * (count + 1)])
+    order = np.argsort(keys)
+    rows, columns = np.divmod(keys[order], count)
+    values = np.concatenate([of_edges, of_edges, diagonal])[order]
+    return csr_array((values, columns, np.searchsorted(rows, np.arange(count + 1))), shape=(count, count))
