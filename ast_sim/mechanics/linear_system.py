@@ -5,10 +5,9 @@ earlier matrix, conjugate gradients therefore converge in about ten iterations. 
 hundredth of a factorization, and iterating is far faster. At 4,000 nodes it costs a fifteenth, and iterating is not
 faster. If the iterations do not suffice, the matrix itself is factorised.
 
-Elements couple the same unknowns at all times; contact couples more as it spreads. The sparsity pattern holds the
-entries of the elements and of every contact since the last `restart`. As long as no new entries come, the symbolic
-factorization is used again. PARDISO factorises where there is MKL, CHOLMOD elsewhere. Both use one thread, and both
-report a matrix that is not positive definite.
+Elements always couple the same unknowns; contact couples more as it spreads. The pattern holds the entries of elements
+and of every contact since the last `restart`. Without new entries the symbolic factorization is used again. PARDISO
+factorises where there is MKL, else CHOLMOD, both on one thread; both report a matrix that is not positive definite.
 """
 
 from __future__ import annotations
@@ -247,7 +246,8 @@ class LinearSystem:
         node, other = rows // 3, columns // 3
         component, across = rows - 3 * node, columns - 3 * other
         one = (component == 0) & (across == 0)
-        blocks = np.unique(np.concatenate([node[one] * np.int64(nodes) + other[one], np.arange(nodes) * (nodes + 1)]))
+        blocks = np.sort(np.concatenate([node[one] * np.int64(nodes) + other[one], np.arange(nodes) * (nodes + 1)]))
+        blocks = blocks[np.diff(blocks, prepend=-1) > 0]  # each once
         of_block = np.divmod(blocks, nodes)
         first = np.searchsorted(of_block[0], np.arange(nodes + 1))
         numbers = scipy.sparse.csr_array((np.arange(len(blocks)), of_block[1], first), shape=(nodes, nodes))

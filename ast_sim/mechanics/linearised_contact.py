@@ -90,7 +90,9 @@ class NewtonSteps:
         self._deforming = np.flatnonzero(scene.deforming_nodes[scene.elements].any(axis=1))
         elements = scene.elements[self._deforming].astype(np.int64)
         self._elasticity = elastic_body(self._rest, elements, material.of(self._deforming))
-        held = scene.prescribed | ~np.isin(np.arange(scene.num_nodes), elements)
+        held = np.ones(scene.num_nodes, bool)
+        held[elements] = False
+        held |= scene.prescribed
         self._system = LinearSystem(*self._elasticity.entry_dofs(), held)
         self._number = np.full(3 * scene.num_nodes, -1)
         self._number[self._system.free] = np.arange(len(self._system.free))
