@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.steps import before_after, parts
+from benchmarks.steps import before_after, parts, predictions
 from benchmarks.steps.step_worker import nodes
 
 
@@ -19,3 +19,12 @@ def test_only_nodes_of_autograd_are_counted():
 def test_a_ratio_is_of_neighbours():
     told = before_after.summary({"before": [2.0, 9.0, 4.0], "now": [1.0, 3.0, 4.0]})
     assert told == {"min_ms": {"before": 2e3, "now": 1e3}, "median_ms": {"before": 4e3, "now": 3e3}, "ratio": 2.0}
+
+
+def test_times_of_predictions_and_the_roundings_between_them():
+    before = {"clock": [4.0, 2.0, 9.0], "processor": [3.0, 1.0, 8.0], "position": [1.0, -2.0]}
+    now = {"clock": [1.0, 3.0, 2.0], "processor": [1.0, 3.0, 0.5], "position": [1.0, -2.0 + 2**-22]}
+    assert predictions.line_of({"before": before, "now": now}) == (
+        "clock: before 2.00 (4.00), now 1.00 (2.00) ms; processor: before 1.00 (3.00), now 0.50 (1.00) ms;"
+        " positions differ by 2 roundings"
+    )

@@ -307,7 +307,9 @@ def test_seconds_count_what_a_user_waits_for(run, monkeypatch):
 def test_what_lies_outside_the_training_scenes_is_told(run, scene, press, options, words):
     with pytest.warns(UserWarning) as told:
         run.predict(scene, {1: (0, 0, -press)}, name="plate.vtu", **options)
-    texts = [str(warning.message)[: len(words) + 11] for warning in told if "converged" not in str(warning.message)]
+    texts = [str(warning.message) for warning in told]
+    doubts = ("have not converged", "are turned over")  # of the answer, as this training happens to make it
+    texts = [text[: len(words) + 11] for text in texts if not any(doubt in text for doubt in doubts)]
     assert texts == [f"plate.vtu: {words}"]
     assert told[0].filename == __file__
 
