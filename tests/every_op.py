@@ -28,7 +28,6 @@ from ast_sim.ops import (
     sparse_conv,
     sparse_conv_transposed,
 )
-from ast_sim.ops._attention import attention_block
 from ast_sim.training.muon import orthogonalized
 
 Results = tuple[list[list[Tensor]], list[Tensor]]

@@ -90,6 +90,7 @@ For a run of your own: `ast-sim trade RUN DATA --out trade.html`.
 
 def _section(title: str, figures: TradeFigures) -> list[str]:
     rows, invested = figures.rows(), figures.invested
+    processor = figures.origin["processor"]
     trained = "" if invested is None else f" Simulation and training took {duration(invested)} of a core."
     ahead = sum(row.verdict == "the run" for row in rows)
     alone = sum(row.verdict in ("the solver", "the solver alone") for row in rows)
@@ -97,7 +98,7 @@ def _section(title: str, figures: TradeFigures) -> list[str]:
         "",
         f"## {title}",
         "",
-        f"{len(figures.scenes)} scenes, {len(figures.solver)} ways of the solver, {figures.origin['processor']}.{trained}",
+        f"{len(figures.scenes)} scenes, {len(figures.solver)} ways of the solver, {processor}.{trained}",
         "",
         f"| {' | '.join(COLUMNS)} |",
         "| ---: | --- | --- | --- | --- | ---: |",
