@@ -14,6 +14,7 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 
 def test_every_example_is_tested():
     assert sorted(p.name for p in EXAMPLES.iterdir() if p.suffix in (".py", ".ipynb")) == [
+        "ask_a_run.ipynb",
         "own_loop.py",
         "own_simulations.ipynb",
         "plates.py",
@@ -42,14 +43,33 @@ def test_own_loop(tmp_path):
     assert 0 < losses[-1] < 0.5 * losses[0]
 
 
-def test_own_simulations():
-    notebook = nbformat.read(EXAMPLES / "own_simulations.ipynb", as_version=4)
+def outputs_of(name):
+    """What a notebook shows when it is run, and its printed text."""
+    notebook = nbformat.read(EXAMPLES / name, as_version=4)
     os.environ.setdefault("PYDEVD_DISABLE_FILE_VALIDATION", "1")
     NotebookClient(
         notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(EXAMPLES)}}
     ).execute()
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
-    text = "".join(output.get("text", "") for output in outputs if output.output_type == "stream")
+    return outputs, "".join(output.get("text", "") for output in outputs if output.output_type == "stream")
+
+
+def test_ask_a_run():
+    """Each object shows itself as a table, the error falls with the effort, and the plate from below is told."""
+    outputs, text = outputs_of("ask_a_run.ipynb")
+    shown = [output["data"]["text/html"] for output in outputs if "text/html" in output.get("data", {})]
+    kinds = ["Run", "Scene", "Answer", "Dataset", "Split", "Trajectory", "Evaluation"]
+    assert [kind for kind, table in zip(kinds, shown, strict=True) if f"{kind}</" in table] == kinds
+    errors = {
+        line.split(":")[0]: float(line.split(": ")[1].split()[0]) for line in text.splitlines() if "off, " in line
+    }
+    assert errors["exact"] == 0 < errors["error=0.02"] < 2 < errors["one call"] < 10
+    assert "the network finds the scene more unusual than 99 of 99 calibration scenes" in text
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+
+
+def test_own_simulations():
+    outputs, text = outputs_of("own_simulations.ipynb")
     line = next(line for line in text.splitlines() if line.startswith("error "))
     error, hold = (float(part.split()[-2]) for part in line.split(","))
     assert error < 0.5 * hold, line
