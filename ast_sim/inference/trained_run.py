@@ -65,7 +65,7 @@ class Run:
         answers = self.folder.chosen.answers
         unset = {"corrections": (self.settings.train.calls or 1) - 1}
         self.effort = Effort(**answers.get("effort", unset))
-        self.calibration = Calibration.from_json(answers["calibration"]) if "calibration" in answers else None
+        self.calibration = Calibration.of_run(self.path, answers)
         self._errors = [EffortErrors.from_json(one) for one in answers.get("valid_by_effort", [])]
 
     def _facts(self) -> dict[str, str]:

@@ -87,6 +87,16 @@ def test_a_file_is_calibrated_by_saving_it_once_more_and_keeps_its_licence(calib
         assert ast_sim.calibrate(opened, data, "test") == result
 
 
+def test_the_calibration_of_another_version_does_not_count(calibrated, tmp_path):
+    run, _, result = calibrated
+    run.folder.keep_calibration({"quantile": 0.4, "scenes": 20})
+    try:
+        with pytest.warns(UserWarning, match="was calibrated by another version of ast_sim, which does not count"):
+            assert ast_sim.Run(run.path).calibration is None
+    finally:
+        run.folder.keep_calibration(result.to_json())
+
+
 def test_no_band_where_nothing_is_known(calibrated):
     run, data, result = calibrated
     with ast_sim.Dataset(data) as dataset:

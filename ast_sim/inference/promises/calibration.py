@@ -110,6 +110,19 @@ class Calibration:
             None if known is None else Familiarity.from_json(known),
         )
 
+    @classmethod
+    def of_run(cls, path: Path, answers: Mapping[str, Any]) -> Self | None:
+        """The calibration among what is known of the answers of a run; None, and a warning, if another version of this
+        program has made it."""
+        if "calibration" not in answers:
+            return None
+        try:
+            return cls.from_json(answers["calibration"])
+        except (KeyError, TypeError):
+            told = "was calibrated by another version of ast_sim, which does not count: ast-sim calibrate RUN DATA"
+            warnings.warn(f"{path} {told}", stacklevel=3)
+            return None
+
     def unlike(self, scene: Scene, notes: Sequence[str]) -> str:
         """Why the calibration scenes say nothing of a scene with `notes`; empty if they do."""
         spacing = spacing_of(scene)
