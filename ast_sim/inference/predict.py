@@ -81,6 +81,7 @@ def new_question(
         motion = _completed(config, scope, scene, motion, num_frames, name)
         stress = _given_stress(config, scene, stress, name)
         fields = {} if stress is None else {STRESS: stress}
+    scene.require_predictable(name)  # before anything is told of such a scene
     _require_material(config, scope, scene, name)
     _require_resolved(scene, name)
     notes = (*notes, *_loose(scene), *scope.notes(scene, motion, bool(config.jumps)))

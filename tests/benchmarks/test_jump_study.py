@@ -39,9 +39,12 @@ def test_a_row_is_trained_measured_and_shown_and_found_again(small):
     assert set(dial) == {(0, 0), (1, 0), (2, 0), (3, 0), *((c, n) for c in (0, 1) for n in (1, 2, 10))}
     assert np.mean(dial[1, 2]["relative_error"]) != np.mean(dial[1, 0]["relative_error"])
     assert row["by_calls"][0] == pytest.approx(np.mean(dial[0, 0]["relative_error"]), rel=1e-6)
-    default = dial[tuple(row["effort"].values())]
+    default = dial[row["effort"]["corrections"], row["effort"]["newton_steps"]]
     assert row["relative_error"] == pytest.approx(np.mean(default["relative_error"]), rel=1e-6)
-    assert walk["effort"] == {"corrections": 0, "newton_steps": 0} and walk["by_calls"] == walk["dial"] == []
+    assert (
+        walk["effort"] == {"corrections": 0, "newton_steps": 0, "solved": False}
+        and walk["by_calls"] == walk["dial"] == []
+    )
     text = jumps.PAGE.read_text()
     assert f"{100 * row['relative_error']:.1f} ±" in text and "times as long" in text and "every frame" in text
     assert text.count("\n## ") == 2 and "Worst: test/" in text

@@ -285,7 +285,7 @@ def test_beside_the_solver(tmp_path):
     assert any("the solver for this frame" in line for line in lines(found))
     assert not any("coarser mesh" in line for line in lines(found))
     halves = {name: way for name, way in solver.ways.items() if "1/2 nodes" in name}
-    assert len(halves) == 13
+    assert len(halves) == 14
     unmeshed = {name: WayFigures(failure="could not be meshed: too thin") for name in halves}
     scene = replace(found.scenes[0], solver=replace(solver, ways={**solver.ways, **unmeshed}))
     assert lines(replace(found, scenes=(scene,)))[-1] == (
