@@ -12,7 +12,7 @@ C_FUZZERS := $(patsubst csrc/tests/fuzz_%.c,%,$(wildcard csrc/tests/fuzz_*.c))
 C_TEST_HEADERS := $(wildcard csrc/tests/*.h)
 X86 := $(filter x86_64,$(shell uname -m))
 
-.PHONY: demo test check fuzz corpus lint docs bench tools clean
+.PHONY: demo test check fuzz corpus lint docs bench shipped tools clean
 
 demo: $(VENV)/installed
 	$(BIN)/ast-sim demo
@@ -33,6 +33,10 @@ test: $(VENV)/tested
 
 bench: $(VENV)/benched
 	$(BIN)/python -m benchmarks.kernels --json benchmarks/results/kernels.json
+
+# The runs that come with the package, from nothing: some hours. CalculiX must be installed.
+shipped: $(VENV)/tested
+	$(BIN)/python -m benchmarks.studies.shipped
 
 # `make check` compiles all of the core but its Python module, which needs the headers of Python and numpy.
 INCLUDE := import numpy, sysconfig; print('-isystem', numpy.get_include(), '-isystem', sysconfig.get_path('include'))

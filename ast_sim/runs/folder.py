@@ -115,7 +115,9 @@ class RunFolder:
         best = checkpoint.read_best(self.path)
         if best is None:
             raise CheckpointError(f"{self.path} has no best checkpoint yet: train it until it is validated")
-        checkpoint.mark_best(self.path, best.step, best.error, {**best.answers, "calibration": dict(calibration)})
+        answers = {**best.answers, "calibration": dict(calibration)}
+        checkpoint.mark_best(self.path, best.step, best.error, answers)
+        self.chosen = self.chosen._replace(answers=answers)
 
     def start(self) -> dict[str, Any]:
         """What a run that starts from this one records: `run`, `step` and `sha256` of the weights."""

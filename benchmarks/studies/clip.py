@@ -131,14 +131,20 @@ def _fitted(x: np.ndarray, y: np.ndarray) -> Any:
         return process.fit(x, y)
 
 
-def measured(plan: Plan, folder: Path) -> dict[str, Any]:
-    """Solve, train and measure; what is there already is not made again."""
+def trained(plan: Plan, folder: Path) -> tuple[ast_sim.Run, Path]:
+    """The run and its dataset; what is there already is not made again."""
     data = ast_sim.generate(
         "assembly", folder / "clip.h5", spec=SPEC, nodes=plan.nodes, workers=1, train=plan.train, valid=plan.valid,
         test=plan.test, calibration=plan.calibration,
     ).path  # fmt: skip
     settings = dict(plan.settings)
     run = ast_sim.train(data, folder / f"run_{plan.steps}", steps=plan.steps, state=STATE, resume=True, **settings)
+    return run, data
+
+
+def measured(plan: Plan, folder: Path) -> dict[str, Any]:
+    """Solve, train and measure."""
+    run, data = trained(plan, folder)
     with run.open(data) as dataset:
         seconds = read_seconds(dataset).samples
         known = _solved(dataset, "train")
@@ -154,7 +160,7 @@ def measured(plan: Plan, folder: Path) -> dict[str, Any]:
             scene["gaussian_process"] = {**scene.get("gaussian_process", {}), key: float(value)}
     return {
         **provenance("python -m benchmarks.studies.clip"),
-        "plan": {**plan.__dict__, "settings": settings},
+        "plan": {**plan.__dict__, "settings": dict(plan.settings)},
         "solved": {"train": len(known), "test": len(scenes)},
         "generation_minutes": sum(map(sum, seconds.values())) / 60,
         "training_minutes": minutes_per_step(run) * plan.steps,

@@ -68,6 +68,8 @@ def test_the_calibration_is_the_score_of_the_rank(calibrated):
 
 def test_a_run_keeps_its_calibration_and_so_does_its_file(calibrated, tmp_path):
     run, _, result = calibrated
+    run.save(tmp_path / "at_once.ast")
+    assert ast_sim.Run(tmp_path / "at_once.ast").calibration == result
     assert ast_sim.Run(run.path).calibration == result
     ast_sim.Run(run.path).save(tmp_path / "toy.ast")
     assert ast_sim.Run(tmp_path / "toy.ast").calibration == result
