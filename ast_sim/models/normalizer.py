@@ -36,13 +36,14 @@ class Statistics:
         self._squares += float(x.square().sum())
 
     def result(self) -> tuple[float, float]:
-        """Mean and scale of all samples. A quantity that never varies has the scale 1."""
+        """Mean and scale of all samples. A quantity that never varies has the size of its value for a scale, or 1: so
+        another value than in training does not become a huge input."""
         if not self._count:
             return 0.0, 1.0
         mean = 0.0 if self.kind == "vector" else self._sum / self._count
         variance = max(self._squares / self._count - mean**2, 0.0)
         negligible = 1e-12 * self._squares / self._count
-        return mean, variance**0.5 if variance > negligible else 1.0
+        return mean, variance**0.5 if variance > negligible else abs(mean) or 1.0
 
 
 class Normalizer(nn.Module):

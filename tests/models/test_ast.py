@@ -393,7 +393,7 @@ def test_normalizers_by_hand():
         normalizer.fix()
     assert float(vector.mean) == 0 and float(vector.scale) == pytest.approx((25 / 6) ** 0.5)
     assert float(scalar.mean) == 3 and float(scalar.scale) == pytest.approx((14 / 3) ** 0.5)
-    assert float(constant.mean) == 7 and float(constant.scale) == 1
+    assert float(constant.mean) == 7 and float(constant.scale) == 7
     x = torch.randn(4, 1)
     torch.testing.assert_close(scalar.inverse(scalar(x)), x)
 
