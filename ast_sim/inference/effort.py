@@ -86,7 +86,7 @@ class Effort:
 
     def check(self, config: ModelConfig) -> None:
         """Raise ConfigError if the model cannot make this effort."""
-        if self.solved and not (can_make_newton_steps(config) and config.data.contact_range):
+        if self.solved and not can_be_solved(config):
             raise ConfigError(
                 "an exact answer needs a run that jumps, tetrahedra, a known law of the material, and the range of"
                 " contact that the solver recorded with the dataset"
@@ -156,17 +156,21 @@ def can_make_newton_steps(config: ModelConfig) -> bool:
     return bool(config.jumps and config.data.tetrahedra and config.data.material.law)
 
 
+def can_be_solved(config: ModelConfig) -> bool:
+    """Whether the solver can end an answer: the range of contact must be known, too."""
+    return can_make_newton_steps(config) and config.data.contact_range > 0
+
+
 def choices(config: ModelConfig, calls: int | None) -> tuple[Effort, ...]:
     """The efforts among which one is chosen for an asked error or time, from the cheapest to the dearest, for a model
     that was trained for so many calls: a Newton step costs more than a correction, and the solver most. With friction
     the solver is left to be asked for: it takes its whole way. None for a model that does not jump."""
     if not config.jumps:
         return ()
-    known_law = can_make_newton_steps(config)
-    steps = CHOSEN_STEPS if known_law else (0,)
+    steps = CHOSEN_STEPS if can_make_newton_steps(config) else (0,)
     efforts = tuple(Effort(corrections, count) for count in steps for corrections in range(calls or 1))
     frictionless = not config.data.friction and FRICTION not in config.data.columns
-    return (*efforts, Effort.exact()) if known_law and config.data.contact_range and frictionless else efforts
+    return (*efforts, Effort.exact()) if frictionless and can_be_solved(config) else efforts
 
 
 def law_of(config: ModelConfig) -> Law:

@@ -25,6 +25,7 @@ from typing import Protocol
 import numpy as np
 import scipy.sparse
 
+from ast_sim.element_topology import distinct
 from ast_sim.support.errors import SimulationError, interrupted
 
 ITERATE_FROM = 50_000  # systems with at least this many unknowns keep a factor and iterate with it
@@ -246,8 +247,7 @@ class LinearSystem:
         node, other = rows // 3, columns // 3
         component, across = rows - 3 * node, columns - 3 * other
         one = (component == 0) & (across == 0)
-        sorted_blocks = np.sort(np.append(node[one] * np.int64(nodes) + other[one], np.arange(nodes) * (nodes + 1)))
-        blocks = sorted_blocks[np.diff(sorted_blocks, prepend=-1) > 0]  # each once
+        blocks = distinct(np.append(node[one] * np.int64(nodes) + other[one], np.arange(nodes) * (nodes + 1)))
         of_block = np.divmod(blocks, nodes)
         first = np.searchsorted(of_block[0], np.arange(nodes + 1))
         numbers = scipy.sparse.csr_array((np.arange(len(blocks)), of_block[1], first), shape=(nodes, nodes))

@@ -50,7 +50,8 @@ def test_fields_come_back_with_place_and_unit(tmp_path):
 
 
 def test_a_file_for_paraview_has_the_fields(tmp_path):
-    pyvista = pytest.importorskip("pyvista")
+    import pyvista
+
     given = with_fields(block(2, 1, 1), 2)
     export.write(tmp_path / "a.pvd", given)
     grid = pyvista.read(tmp_path / "a" / "frame_00001.vtu")

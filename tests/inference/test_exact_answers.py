@@ -29,7 +29,7 @@ def loaded(path):
 
 
 def equilibria_of(scene, law, targets):
-    return Equilibria(scene, law, targets, law.newton_steps(scene))
+    return Equilibria.of(scene, law, targets, law.newton_steps(scene))
 
 
 def test_an_exact_answer_ends_where_the_solver_ended(plates):

@@ -175,7 +175,7 @@ class JumpingScene:
     def equilibria(self) -> Equilibria:
         """What the solver finds in this scene."""
         scene = self.question.scene
-        return Equilibria(scene, law_of(self.model.config), self.question.prescribed_position, self.solver(scene))
+        return Equilibria.of(scene, law_of(self.model.config), self.question.prescribed_position, self.solver(scene))
 
     def settled(self, number: int) -> np.ndarray | None:
         """The positions [N, 3] of a wanted frame that is given or has had its Newton steps, else None."""

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -60,11 +61,17 @@ class Familiarity:
             return None
         travel = np.linalg.norm(answer.displacement[:, answer.scene.prescribed], axis=2).max(axis=1, initial=0.0)
         farthest = max(answer.latents, key=lambda number: travel[answer.frames.index(number)])
+        center, metric, scores = self._arrays
+        distance = _distances(answer.latents[farthest][None], center, metric)[0]
+        return float((1 + np.sum(scores >= distance)) / (len(scores) + 1))
+
+    @cached_property
+    def _arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """m [D], W [D, D] and the scores [n]; every answer needs them."""
         metric = np.zeros((len(self.center), len(self.center)))
         for number, row in enumerate(self.metric):
             metric[number, : number + 1] = row
-        distance = _distances(answer.latents[farthest][None], np.array(self.center), metric)[0]
-        return float((1 + np.sum(np.array(self.scores) >= distance)) / (len(self.scores) + 1))
+        return np.array(self.center), metric, np.array(self.scores)
 
     def notes(self, p_value: float) -> tuple[str, ...]:
         """A sentence for a scene that is unlike the calibration scenes; none for others."""

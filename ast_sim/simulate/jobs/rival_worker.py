@@ -22,8 +22,9 @@ import numpy as np
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.mechanics.case import Drawn, SolidCase
+from ast_sim.mechanics.equilibria import Equilibria
 from ast_sim.mechanics.linearised_contact import CLEARANCE, NewtonSteps
-from ast_sim.mechanics.quasi_static import OneFrame, SolidFrames, solve_frame
+from ast_sim.mechanics.quasi_static import OneFrame, solve_frame
 from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.scene import Scene
 from ast_sim.simulate.families.names import family_module
@@ -221,14 +222,14 @@ class WaySolver:
         iterations = 0
         try:
             newton = _newton_steps(self.drawn.case)
-            frames = SolidFrames(self.drawn.case, self.settings, newton) if way.finished else None
+            equilibria = Equilibria(self.drawn.case, newton, self.settings) if way.finished else None
             setup = process_time() - began
             position = solved.position if way.nodes == 1 else self._on_own_mesh(case, solved.position)
             for step in range(way.newton):
                 position = newton.step(position, from_afar=step == 0)
-            if frames is not None:
-                position = self._finished(frames, position)
-                iterations = frames.solver.iterations
+            if equilibria is not None:
+                position = equilibria.finish(self.frame, position)
+                iterations = equilibria.iterations
         except SimulationError as error:
             position = None
             failure = f"on the mesh of the dataset: {error}"
@@ -240,18 +241,6 @@ class WaySolver:
             setup_seconds=solved.setup_seconds + setup,
             newton_iterations=solved.newton_iterations + way.newton + iterations,
         )
-
-    def _finished(self, frames: SolidFrames, position: np.ndarray) -> np.ndarray:
-        """Where the solver ends from nearly right positions.
-
-        Raises:
-            SimulationError: it cannot start from them, finds no equilibrium, or what it found fails its checks.
-        """
-        frames.check({"position": position})
-        frames.solver.newton.restart(position)
-        frames.solver.advance(self.drawn.case.targets[self.frame])
-        frames.check({"position": frames.solver.newton.position.astype(np.float32)})
-        return frames.solver.newton.position
 
     def _on_own_mesh(self, case: SolidCase, position: np.ndarray) -> np.ndarray:
         """Positions of the nodes of the dataset's mesh, from those of another mesh of the same bodies."""
