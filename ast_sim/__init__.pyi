@@ -15,6 +15,10 @@ from .inference.trained_run import Run as Run
 from .material import Material as Material
 from .ops.library import keep_memory as keep_memory
 from .ops.library import show_config as show_config
+from .planning.plan import Plan as Plan
+from .planning.plan import plan as plan
+from .planning.worth import Worth as Worth
+from .planning.worth import worth as worth
 from .prescribed_motion import Motion as Motion
 from .prescribed_motion import RigidMotion as RigidMotion
 from .scene import NodeType as NodeType

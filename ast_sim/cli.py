@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ast_sim import __version__
-from ast_sim.command_line import commands, help_lines, judging_commands
+from ast_sim.command_line import commands, help_lines, judging_commands, planning_commands
 from ast_sim.support.argument_types import (
     Parser,
     add_each,
@@ -88,6 +88,7 @@ def build_parser() -> argparse.ArgumentParser:
     add(_add_train, commands.train)
     add(_add_predict, commands.predict)
     add(_add_sweep, commands.sweep)
+    add(planning_commands.add_plan, planning_commands.plan)
     add(judging_commands.add_evaluate, judging_commands.evaluate)
     add(judging_commands.add_calibrate, judging_commands.calibrate)
     add(judging_commands.add_trade, judging_commands.trade)

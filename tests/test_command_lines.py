@@ -38,6 +38,7 @@ COMMANDS = {
     "generate",
     "convert",
     "info",
+    "plan",
     "train",
     "predict",
     "sweep",

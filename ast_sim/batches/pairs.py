@@ -111,7 +111,8 @@ class PairSampler:
 
     Targets have the stress, if there is one, and the named fields that `fields` tells of as in `Output`.
 
-    With `part` = (i, n), `batch` returns the i-th of n equal parts of the whole batch.
+    With `part` = (i, n), `batch` returns the i-th of n equal parts of the whole batch. With `scenes` = k, the pairs are
+    those of the first k scenes of the split.
 
     Raises:
         DatasetError: the split has no pair, or a sample cannot be read.
@@ -134,6 +135,7 @@ class PairSampler:
         shift: float = 0.0,
         fields: tuple[tuple[str, str, int, str], ...] = (),
         history: tuple[Output, ...] | None = None,
+        scenes: int | None = None,
     ) -> None:
         self.batch_size, self.seed, self.noise = batch_size, seed, noise
         self.left = np.float32(1 - gamma)  # share of the noise that stays in the target
@@ -143,7 +145,8 @@ class PairSampler:
         self._jumps, self._fields, self._history = jumps, fields, history
         self._mirrored = np.array([axis in mirror for axis in "xyz"])
         self._shift = np.float32(shift)
-        frames = np.array([dataset.num_frames(split, i) for i in range(dataset.count(split))], np.int64)
+        chosen = range(dataset.count(split))[:scenes]
+        frames = np.array([dataset.num_frames(split, i) for i in chosen], np.int64)
         self._starts = np.concatenate([[0], np.cumsum(np.maximum(frames - 1 - self.first_frame, 0))])
         if self.num_pairs == 0:
             least = f"at least {2 + self.first_frame} frames"

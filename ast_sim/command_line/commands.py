@@ -89,10 +89,10 @@ def convert(args: argparse.Namespace) -> None:
     read = args.source.rglob("*") if args.source.is_dir() else filter(None, [source, deck])
     check_output(args, args.out, (path for path in read if path.suffix != ".h5"), "a dataset", ".h5")
     if is_deepmind(source):
-        _refuse(args, args.of_series, f"{args.source}: its meta.json has the facts")
+        refuse(args, args.of_series, f"{args.source}: its meta.json has the facts")
         options = {"splits": args.split, "limit": args.limit, "every": args.every}
     else:
-        _refuse(args, args.of_records, f"{args.source}, which holds no .tfrecord files")
+        refuse(args, args.of_records, f"{args.source}, which holds no .tfrecord files")
         fields = (args.displacement, args.stress, args.node_type, args.obstacle, args.handle, args.body)
         more = (args.stress_order, args.stress_unit, tuple(args.field), args.reaction)
         options = {
@@ -113,7 +113,7 @@ def convert(args: argparse.Namespace) -> None:
     print(f"{args.out}: {_counts(counts)}")
 
 
-def _refuse(args: argparse.Namespace, groups: tuple[Any, ...], what: str) -> None:
+def refuse(args: argparse.Namespace, groups: tuple[Any, ...], what: str) -> None:
     """Raise ConfigError if an option of these groups was given."""
     for action in (action for group in groups for action in group._group_actions):
         if getattr(args, action.dest) != action.default:
@@ -194,13 +194,13 @@ def predict(args: argparse.Namespace) -> None:
     if args.scene.suffix == ".toml":
         _predict_spec(run, args, wanted)
         return
-    _refuse(args, args.of_spec, f"{args.scene}, which is no specification")
+    refuse(args, args.of_spec, f"{args.scene}, which is no specification")
     if args.scene.suffix == ".h5":
-        _refuse(args, args.of_mesh, f"{args.scene}, which is a dataset")
+        refuse(args, args.of_mesh, f"{args.scene}, which is a dataset")
         truth = _truth(run, args)
         name = f"{args.scene}: {args.split}/{args.index:06d}"
     else:
-        _refuse(args, args.of_data, f"{args.scene}, which is a mesh")
+        refuse(args, args.of_data, f"{args.scene}, which is a mesh")
         truth = None
         name = str(args.scene)
     if truth is not None and not moves:
@@ -216,7 +216,7 @@ def _predict_spec(run: Any, args: argparse.Namespace, wanted: dict[str, Any]) ->
     from ast_sim.simulate.own_assembly.grid import grid, parse_settings
 
     for group in (args.of_mesh, args.of_data):
-        _refuse(args, group, f"{args.scene}, which is a specification")
+        refuse(args, group, f"{args.scene}, which is a specification")
     if args.move:
         raise ConfigError(f"{args.scene} says what moves: change its parameters with --set, or leave --move out")
     rows = grid(parse_settings(args.set))

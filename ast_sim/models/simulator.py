@@ -135,7 +135,7 @@ class Simulator(nn.Module):
         batch, target = model.pairs(dataset, batch_size=4).batch(step)
 
         Args:
-            options: seed (0 by default), noise (0), gamma (1), mirror, shift and part, as of `PairSampler`.
+            options: seed (0 by default), noise (0), gamma (1), mirror, shift, scenes and part, as of `PairSampler`.
         """
         options = {"seed": 0, "noise": 0.0, "gamma": 1.0, **options, "batch_size": batch_size}
         data = self.config.data

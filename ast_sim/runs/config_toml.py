@@ -56,6 +56,11 @@ def write_config(
     write_text(run / CONFIG, _text(settings))
 
 
+def write_settings(path: Path, settings: RunConfig) -> None:
+    """Write settings for `train(config=)`; what is unset stays unset."""
+    write_text(path, _text(settings))
+
+
 def read_config(run: Path) -> RunConfig:
     """The settings of a run, with the facts of its data.
 

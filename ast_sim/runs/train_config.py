@@ -23,6 +23,7 @@ class TrainConfig:
     minutes: float | None = setting(
         None, "minutes of training: 50 steps are timed, then `steps` is fixed; unset: `steps` or `epochs` decides"
     )
+    scenes: int | None = setting(None, "train on the first so many scenes of the training split; unset: on all of them")
     epochs: int = setting(100, "passes over the training pairs, if neither `steps` nor `minutes` is set")
     batch_size: int = setting(48, "scenes in a batch; each scene is a pair of frames")
     accumulate: int = setting(1, "batches in a step; the step averages their gradients")

@@ -9,11 +9,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from ast_sim.dataset.reader import Dataset
 from ast_sim.models.registry import find_preset
 from ast_sim.runs.config_toml import read_changes
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.train_config import RunConfig, TrainConfig
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import ConfigError, DatasetError
 from ast_sim.support.toml_settings import NONE, NOTHING, assigned, change
 
 _FOLLOW_FROM_STEPS = ("train.warmup", "train.decay", "train.validate_every", "train.checkpoint_every")
@@ -56,6 +57,29 @@ def configure(
     for key, old, new in differences(before, settings, "model") if from_run is not None else ():
         raise ConfigError(f"{key} is {new!r}, but {from_run} has {old!r}: a run that starts from it keeps its model")
     return settings
+
+
+def path_of(data: str | os.PathLike[str] | Dataset) -> Path:
+    """The path of a dataset that is named by its path or is open.
+
+    Raises:
+        DatasetError: it was opened in another unit of length than the one of the file.
+    """
+    if not isinstance(data, Dataset):
+        return Path(data)
+    with Dataset(data.path) as in_own_unit:
+        if in_own_unit.info.length_unit != data.info.length_unit:
+            raise DatasetError(f"{data.path} was opened in {data.info.length_unit}: open it without length_unit")
+    return data.path
+
+
+def changes_of(
+    state: Sequence[str], model_settings: Mapping[str, Any] | None, train_settings: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The changes of settings that the arguments of `train` ask for, by dotted key."""
+    of_model = {**({"state": tuple(state)} if state else {}), **(model_settings or {})}
+    changes = {f"model.{key}": value for key, value in of_model.items()}
+    return changes | {f"train.{key}": value for key, value in train_settings.items()}
 
 
 def _changed(config: RunConfig, values: Mapping[str, Any], reschedule: bool) -> RunConfig:

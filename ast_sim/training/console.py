@@ -31,7 +31,10 @@ def introduce(model: nn.Module, config: RunConfig, dataset: Dataset, scales: Dat
     epochs = options.steps * scenes / pairs
     rms, spacing = max(scales.increment, 1e-300), max(scales.spacing, 1e-300)
     print(f"parameters  {sum(p.numel() for p in model.parameters()):,}")
-    print(f"data        {scales.trajectories:,} scenes of about {scales.nodes:,} nodes, {scales.pairs:,} pairs")
+    scenes_used = (
+        f"{scales.trajectories:,}" if options.scenes is None else f"{options.scenes:,} of {scales.trajectories:,}"
+    )
+    print(f"data        {scenes_used} scenes of about {scales.nodes:,} nodes, {pairs:,} pairs")
     print(f"steps       {options.steps:,} of {scenes} scenes each: {epochs:.3g} epochs")
     print(
         f"noise       {options.noise:.3g} {unit} = {options.noise / rms:.2g} x rms increment"

@@ -56,7 +56,6 @@ def measure(dataset: Dataset) -> DataScales:
     count = dataset.count("train")
     if count == 0:
         raise TrainingError(f"{dataset.path} has no trajectories to train on: the split train is empty")
-    given = GIVEN_FRAMES[dataset.info.integration]  # these cannot be a target
     displacement, increment, lengths, nodes, constants, planar = [], [], [], [], [], True
     for name, trajectory in dataset.spread("train", MEASURED):
         scene, position = trajectory.scene, trajectory.position
@@ -74,10 +73,16 @@ def measure(dataset: Dataset) -> DataScales:
         spacing=float(np.concatenate(lengths).mean(dtype=np.float64)),
         nodes=int(np.median(nodes)),
         trajectories=count,
-        pairs=sum(max(0, dataset.num_frames("train", index) - given) for index in range(count)),
+        pairs=pairs_of(dataset, count),
         planar=planar,
         recorded=_alike(constants),
     )
+
+
+def pairs_of(dataset: Dataset, scenes: int) -> int:
+    """The number of frames that can be a target, in the first so many scenes of the training split."""
+    given = GIVEN_FRAMES[dataset.info.integration]  # these cannot be a target
+    return sum(max(0, dataset.num_frames("train", index) - given) for index in range(scenes))
 
 
 def _alike(constants: list[dict[str, AttributeValue | None]]) -> dict[str, float]:

@@ -13,7 +13,7 @@ from ast_sim.named_field import REACTION, STRESS
 from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.toml_settings import LARGEST, require_range
-from ast_sim.training.data_lengths import DataScales
+from ast_sim.training.data_lengths import DataScales, pairs_of
 
 # An unset shift is at most this share of the domain's half width; the margin of `Domain` is larger.
 LARGEST_SHIFT = 0.05
@@ -51,7 +51,22 @@ def resolve(config: RunConfig, dataset: Dataset, scales: DataScales, keep_model:
         model = dataclasses.replace(config.model, data=dataclasses.replace(config.model.data, **scales.recorded))
     else:
         model = config.model.resolve(facts)
+    if config.train.scenes is not None:
+        scales = dataclasses.replace(scales, pairs=_pairs_of_first(config.train.scenes, dataset))
     return RunConfig(model, resolve_training(config.train, scales, model), str(Path(config.data).resolve()))
+
+
+def _pairs_of_first(scenes: int, dataset: Dataset) -> int:
+    """The number of targets in the first scenes of the training split.
+
+    Raises:
+        ConfigError: the split has fewer scenes, or the number is below 1.
+    """
+    require_range("train.scenes", scenes, 1)
+    count = dataset.count("train")
+    if scenes > count:
+        raise ConfigError(f"train.scenes is {scenes}, but {dataset.path} has {count} training scenes")
+    return pairs_of(dataset, scenes)
 
 
 def _fields(dataset: Dataset, names: tuple[str, ...]) -> tuple[tuple[str, str, int, str], ...]:

@@ -57,6 +57,7 @@ def sampler_of(model: Simulator, dataset: Dataset, options: TrainConfig, part: t
         part=part,
         mirror=options.mirror,
         shift=options.shift,
+        scenes=options.scenes,
     )
 
 

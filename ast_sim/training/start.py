@@ -23,9 +23,9 @@ from ast_sim.runs import checkpoint
 from ast_sim.runs.config_toml import has_config, write_config
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.train_config import RunConfig
-from ast_sim.support.errors import CheckpointError, ConfigError, DatasetError, TrainingError
+from ast_sim.support.errors import CheckpointError, ConfigError, TrainingError
 from ast_sim.support.stop_signals import StopSignals
-from ast_sim.training.asked_settings import configure, differences
+from ast_sim.training.asked_settings import changes_of, configure, differences, path_of
 from ast_sim.training.callbacks import Callback
 from ast_sim.training.data_lengths import DataScales, measure, scope_of
 from ast_sim.training.defaults_from_data import resolve
@@ -74,8 +74,8 @@ def train(
         DatasetError: the dataset cannot be read.
         TrainingError, CheckpointError, KeyboardInterrupt: as in `start_training`.
     """
-    changes = _changes({**({"state": tuple(state)} if state else {}), **(model_settings or {})}, settings)
-    path = _path_of(data)
+    changes = changes_of(state, model_settings, settings)
+    path = path_of(data)
     chosen = configure(path, preset, (), model, config=config, from_run=from_run, changes=changes)
     start_training(Path(out), chosen, resume=resume, from_run=from_run, callback=callback)
     return Run(out)
@@ -100,30 +100,11 @@ def new_model(
     if not isinstance(data, Dataset):
         with Dataset(data) as dataset:
             return new_model(dataset, model, preset, model_settings)
-    config = configure(data.path, preset, (), model, changes=_changes(model_settings, {}))
+    config = configure(data.path, preset, (), model, changes=changes_of((), model_settings, {}))
     resolved = resolve(config, data, measure(data))
     built = build_model(resolved.model)
     fit_statistics(built, sampler_of(built, data, resolved.train), resolved.train)
     return built
-
-
-def _path_of(data: str | os.PathLike[str] | Dataset) -> Path:
-    """The path of a dataset that is named by its path or is open.
-
-    Raises:
-        DatasetError: it was opened in another unit of length than the one of the file.
-    """
-    if not isinstance(data, Dataset):
-        return Path(data)
-    with Dataset(data.path) as in_own_unit:
-        if in_own_unit.info.length_unit != data.info.length_unit:
-            raise DatasetError(f"{data.path} was opened in {data.info.length_unit}: open it without length_unit")
-    return data.path
-
-
-def _changes(model_settings: Mapping[str, Any] | None, settings: Mapping[str, Any]) -> dict[str, Any]:
-    changes = {f"model.{key}": value for key, value in (model_settings or {}).items()}
-    return changes | {f"train.{key}": value for key, value in settings.items()}
 
 
 def start_training(

@@ -56,6 +56,12 @@ def test_each_epoch_has_every_pair_once_in_a_new_order(dataset):
     assert names(sampler(dataset, seed=1), (0, 1)) != first
 
 
+def test_pairs_of_the_first_scenes_alone(dataset):
+    draws = sampler(dataset, scenes=2, batch_size=5)
+    assert draws.num_pairs == 5
+    assert sorted(names(draws, [0])) == PAIRS[:5]
+
+
 def test_inertia_needs_a_frame_before(dataset):
     draws = sampler(dataset, dynamic=True, gamma=0.1, batch_size=5)
     expected = [f"train/000000 frame {t}" for t in (1, 2, 3)] + [f"train/000002 frame {t}" for t in (1, 2)]

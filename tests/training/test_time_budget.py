@@ -75,3 +75,13 @@ def test_it_says_nothing_before_the_data_was_seen_often(data, tmp_path, monkeypa
     monkeypatch.setattr(loop, "APART", 0.0)
     start.start_training(tmp_path / "run", start.configure(data, "tiny", [*SMALL, "train.steps=100"]))
     assert "more scenes help" not in capsys.readouterr().out
+
+
+def test_epochs_count_the_scenes_that_are_trained_on(data, tmp_path, capsys):
+    """A scene has 6 pairs, a batch 2: 2 epochs of one scene are 6 steps."""
+    config = start.configure(data, "tiny", [*SMALL, "train.epochs=2", "train.scenes=1"])
+    start.start_training(tmp_path / "run", config)
+    assert read_config(tmp_path / "run").train.steps == 6
+    assert "data        1 of 3 scenes of about" in capsys.readouterr().out
+    with pytest.raises(ConfigError, match=r"train.scenes is 4, but .*toy.h5 has 3 training scenes"):
+        start.start_training(tmp_path / "more", start.configure(data, "tiny", [*SMALL, "train.scenes=4"]))

@@ -1,0 +1,1 @@
+"""What a training will give, from short trials of it, and when a model pays."""

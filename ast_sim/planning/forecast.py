@@ -1,0 +1,41 @@
+"""The error of a long training from those of shorter ones, by a power law.
+
+The error of whole trainings, each with a learning rate that falls to zero at its end, falls about as a power of the
+number of their steps (Hestness et al. 2017, arXiv:1712.00409). The power gets smaller as trainings get longer, so the
+slope between the two longest trials is damped. `DAMPING` and `SPREAD` come from measured curves
+(`python -m benchmarks.studies.forecasts`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+DAMPING = 0.8  # of the slope, beyond the longest trial
+SPREAD = 0.25  # the interval reaches so far around the expected error, relative to it
+
+
+class Forecast(NamedTuple):
+    """An expected error, and an interval that four of five trainings ended in."""
+
+    error: float
+    low: float
+    high: float
+
+
+def slope(points: Sequence[tuple[int, float]]) -> float:
+    """The power by which the error falls with the steps, between the last two points (steps, error); at least 0."""
+    (before, worse), (after, better) = points[-2:]
+    return max(0.0, math.log(worse / better) / math.log(after / before))
+
+
+def forecast(points: Sequence[tuple[int, float]], steps: int) -> Forecast:
+    """The error after so many steps.
+
+    Args:
+        points: steps and error of two trainings or more, the longest one last.
+    """
+    longest, error = points[-1]
+    expected = error * (steps / longest) ** (-DAMPING * slope(points))
+    return Forecast(expected, expected / (1 + SPREAD), expected * (1 + SPREAD))

@@ -1,0 +1,186 @@
+"""A plan of a training: the settings to take, the error to expect, and what would lower it further."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ast_sim.dataset.reader import Dataset
+from ast_sim.planning.forecast import Forecast, forecast
+from ast_sim.planning.trials import GROWTH, MINUTES, Trial, Trials, candidates
+from ast_sim.runs.config_toml import write_settings
+from ast_sim.runs.train_config import RunConfig
+from ast_sim.support.disk import write_json
+from ast_sim.support.errors import ConfigError
+from ast_sim.support.progress import duration
+from ast_sim.support.provenance import provenance
+from ast_sim.support.toml_settings import require_range
+from ast_sim.training.asked_settings import changes_of, configure, differences, path_of
+from ast_sim.training.data_lengths import pairs_of
+from ast_sim.training.parallel.launch import usual_processes
+
+SETTINGS, FIGURES = "best.toml", "plan.json"
+LEAST_SCENES = 4  # of the training split: a trial has half of them
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What short trials say of a training. `str` gives what follows, in sentences.
+
+    Attributes:
+        minutes, steps: of the training that is planned; the steps follow from the longest trial.
+        trials: in the order in which they were made; the last one has half of the training scenes, the one before it is
+            the longest of the best settings.
+        settings: of the training, by dotted key, where they differ from those that were asked for.
+        expected: the error of the network alone on validation scenes, relative to their displacement.
+        passes: how often the training will see each of its frames.
+        more_minutes, more_scenes: the share of the error that twice the minutes and twice the scenes leave, as the
+            trials saw it.
+        command: what trains.
+        origin: command, commit and processor.
+    """
+
+    minutes: float
+    steps: int
+    trials: tuple[Trial, ...]
+    settings: Mapping[str, Any]
+    expected: Forecast
+    passes: float
+    more_minutes: float
+    more_scenes: float
+    command: str
+    origin: Mapping[str, Any]
+
+    def __str__(self) -> str:
+        longest = self.trials[-2]
+        error, low, high = map(_percent, self.expected)
+        minutes, scenes = self.more_minutes, self.more_scenes
+        return "\n".join([
+            f"take: {longest.name}",
+            f"{duration(60 * self.minutes)} are {self.steps:,} steps of {1000 * longest.seconds:.3g} ms; each frame is"
+            f" seen {self.passes:.2g} times",
+            f"expected error of one call of the network: {error} of the displacement ({low} to {high})",
+            f"in the trials, twice the steps leave {_percent(minutes)} of the error, twice the scenes"
+            f" {_percent(scenes)}: more {'minutes' if minutes < scenes else 'scenes'} help more",
+            self.command,
+        ])  # fmt: skip
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write all figures as JSON."""
+        write_json(Path(path), dataclasses.asdict(self))
+
+
+def plan(
+    data: str | os.PathLike[str] | Dataset,
+    out: str | os.PathLike[str],
+    minutes: float,
+    *,
+    model: str | None = None,
+    preset: str | None = None,
+    state: Sequence[str] = (),
+    model_settings: Mapping[str, Any] | None = None,
+    **settings: Any,
+) -> Plan:
+    """Find good settings for a training of so many minutes by short trials, and say what it will give. The trials take
+    about half of the minutes; each is a run in a folder, and a second call goes on with what is there.
+
+    Three learning rates and a wider model are tried. All trials are judged by the network alone, on validation scenes.
+
+    Args:
+        data: the dataset file, or the open dataset.
+        out: folder for the trials, the figures (`plan.json`) and the settings to train with (`best.toml`).
+        minutes: of the training that is planned.
+        model, preset, state, model_settings, settings: as for `train`, without `minutes` and `steps`.
+
+    Raises:
+        ConfigError: the minutes are too few to plan, the dataset has too few scenes or no validation scenes, or as for
+            `train`.
+        TrainingError: the validation of a trial failed, or as for `train`.
+        DatasetError: the dataset cannot be read.
+    """
+    config = configure(path_of(data), preset, (), model, changes=changes_of(state, model_settings, settings))
+    return planned(config, Path(out), minutes, preset or "tiny")
+
+
+def planned(config: RunConfig, out: Path, minutes: float, preset: str = "tiny", command: str = "ast_sim.plan") -> Plan:
+    """`plan` for settings as `train` has them; each trial is printed."""
+    require_range("minutes", minutes, *MINUTES)
+    _require_open(config)
+    scenes, valid, pairs = _counted(config)
+    config = _with_processes(config, minutes)
+    trials = Trials(out, scenes, valid)
+    tried = candidates(config, preset)
+    made = []
+    for trial in trials.rounds(tried, trials.first_steps(tried, minutes)):
+        _tell(trial)
+        made.append(trial)
+    longest = made[-1]
+    best = tried[longest.name]
+    half = trials.trained(longest.name, best, longest.steps, scenes // 2)
+    _tell(half)
+    own = [(trial.steps, trial.error) for trial in made if trial.name == longest.name]
+    steps = int(60 * minutes / longest.seconds)
+    batch = best.train.batch_size * best.train.accumulate
+    settings = out / SETTINGS
+    write_settings(settings, dataclasses.replace(best, train=dataclasses.replace(best.train, minutes=minutes)))
+    result = Plan(
+        minutes=minutes,
+        steps=steps,
+        trials=(*made, half),
+        settings={key: new for key, _, new in differences(config, best, "model", "train")},
+        expected=forecast(own, steps),
+        passes=steps * batch / pairs,
+        more_minutes=(own[-1][1] / own[-2][1]) ** (math.log(2) / math.log(GROWTH)),
+        more_scenes=longest.error / half.error,
+        command=shlex.join(["ast-sim", "train", config.data, "--config", str(settings), "--out", "RUN"]),
+        origin=provenance(command),
+    )
+    result.save(out / FIGURES)
+    return result
+
+
+def _require_open(config: RunConfig) -> None:
+    """Raise ConfigError if a setting that the plan chooses is given, or one that it varies is not."""
+    for key in ("steps", "minutes"):
+        if getattr(config.train, key) is not None:
+            raise ConfigError(f"train.{key} is given, but it follows from the minutes of the plan: leave it out")
+    if config.train.peak_rate is None:
+        raise ConfigError("train.peak_rate is unset; a plan tries half of it and twice as much: give one")
+
+
+def _with_processes(config: RunConfig, minutes: float) -> RunConfig:
+    """The settings with the processes of the whole training: a trial alone would take fewer."""
+    if config.train.processes is not None:
+        return config
+    whole = dataclasses.replace(config, train=dataclasses.replace(config.train, minutes=minutes))
+    return dataclasses.replace(config, train=dataclasses.replace(config.train, processes=usual_processes(whole)))
+
+
+def _counted(config: RunConfig) -> tuple[int, int, int]:
+    """The training scenes, the validation scenes and the training pairs of a dataset.
+
+    Raises:
+        ConfigError: they are too few for trials.
+    """
+    with Dataset(config.data) as dataset:
+        scenes = config.train.scenes or dataset.count("train")
+        valid = dataset.count("valid")
+        if scenes < LEAST_SCENES:
+            raise ConfigError(f"{dataset.path} has {scenes} training scenes; a plan needs {LEAST_SCENES} or more")
+        if valid == 0:
+            raise ConfigError(f"{dataset.path} has no validation scenes, on which a plan judges its trials")
+        return scenes, valid, pairs_of(dataset, scenes)
+
+
+def _tell(trial: Trial) -> None:
+    print(f"{trial.name}: {trial.steps:,} steps, {trial.scenes:,} scenes, error {_percent(trial.error)}", flush=True)
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %"

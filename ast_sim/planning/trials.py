@@ -1,0 +1,162 @@
+"""Short trainings of several settings, of which the better ones are trained longer: successive halving.
+
+Each trial is a whole training: its learning rate falls to zero at its end (Jamieson and Talwalkar 2016). Trials that
+are compared take equal minutes. Each one is a run in a folder, so a plan that was stopped goes on where it was.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ast_sim.runs.folder import RunFolder
+from ast_sim.runs.train_config import RunConfig
+from ast_sim.support.errors import ConfigError, TrainingError
+from ast_sim.training.start import start_training
+
+GROWTH = 3  # a trial of the next round has so many times the steps
+ROUNDS = 3
+LONGEST = 1 / 6  # of the minutes of the training that is planned, for a trial of the last round
+RATES = {"": 1.0, ", half the rate": 0.5, ", twice the rate": 2.0}
+WIDER = 1.5  # times the width of the preset
+WIDTHS = ("hidden", "decoder_hidden", "d_token", "heads", "ffn_inner")  # settings of models that a width consists of
+MINUTES = (1e-3, 1e7)  # that a training may take
+TIMED = 50  # steps whose time tells how many fit into a trial
+LEAST = 20  # steps of a trial of the first round: from fewer nothing is learnt
+VALIDATION_SCENES = 40  # at most, of a trial
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A short training.
+
+    Attributes:
+        name: of its settings, such as "tiny, twice the rate".
+        steps, scenes: how long it was, and on how many training scenes.
+        seconds: of a step.
+        error: of the network alone on validation scenes, relative to their displacement.
+        run: the name of its run folder.
+    """
+
+    name: str
+    steps: int
+    scenes: int
+    seconds: float
+    error: float
+    run: str
+
+
+def candidates(base: RunConfig, preset: str) -> dict[str, RunConfig]:
+    """The settings that are tried, by name: three learning rates, and a wider model."""
+    tried = {
+        preset + name: dataclasses.replace(
+            base, train=dataclasses.replace(base.train, peak_rate=factor * base.train.peak_rate)
+        )
+        for name, factor in RATES.items()
+    }
+    widths = {name: getattr(base.model, name) for name in WIDTHS if isinstance(getattr(base.model, name, None), int)}
+    wider: dict[str, Any] = {name: int(WIDER * width) for name, width in widths.items()}
+    with suppress(ConfigError):  # there is no model of this width
+        if wider:
+            tried[f"{preset}, wider"] = dataclasses.replace(base, model=dataclasses.replace(base.model, **wider))
+    return tried
+
+
+class Trials:
+    """Trains candidates in a folder; what is there already is not trained again.
+
+    Args:
+        folder: for the runs.
+        scenes, valid: the numbers of training and validation scenes.
+    """
+
+    def __init__(self, folder: Path, scenes: int, valid: int) -> None:
+        self.folder = folder
+        self.scenes = scenes
+        self.valid = min(valid, VALIDATION_SCENES)
+
+    def trained(self, name: str, config: RunConfig, steps: int, scenes: int | None = None) -> Trial:
+        """Train a candidate for so many steps, on all training scenes or on the first ones.
+
+        Raises:
+            TrainingError: the validation failed, or as `start_training`.
+        """
+        options = dataclasses.replace(
+            config.train,
+            steps=steps,
+            minutes=None,
+            scenes=scenes or config.train.scenes,
+            warmup=None,
+            decay=None,
+            validate_every=steps,
+            validate_scenes=self.valid,
+            checkpoint_every=steps,
+            log_every=max(1, steps // 10),
+        )
+        about = f"{name}, {steps} steps" + (f", {scenes} scenes" if scenes else "")
+        folder = self.folder / about.replace(", ", "_").replace(" ", "-")
+        with _told_in(folder.with_name(folder.name + ".log")):
+            start_training(folder, dataclasses.replace(config, train=options), resume=True)
+        metrics = RunFolder(folder).metrics
+        record, seconds = metrics.validation(steps), metrics.seconds_per_step()
+        if record is None or record["valid_rmse"] is None or seconds is None:
+            why = "it was not validated" if record is None else record.get("failure")
+            raise TrainingError(f"the trial {about} has no error: {why}; see {folder}")
+        error = record["valid_rmse"] / record["valid_hold_still"]
+        return Trial(name, steps, scenes or self.scenes, seconds, error, folder.name)
+
+    def first_steps(self, tried: dict[str, RunConfig], minutes: float) -> dict[str, int]:
+        """The steps of each candidate in the first round; a few steps are timed.
+
+        Args:
+            minutes: of the training that is planned.
+
+        Raises:
+            ConfigError: the trials would be too short.
+        """
+        seconds = {name: self.trained(name, config, TIMED).seconds for name, config in _of_one_cost(tried).items()}
+        first = 60 * minutes * LONGEST / GROWTH ** (ROUNDS - 1)
+        steps = {name: int(first / seconds[_cost(name)]) for name in tried}
+        if min(steps.values()) < LEAST:
+            least = minutes * LEAST * max(seconds.values()) / first
+            raise ConfigError(
+                f"{minutes:g} minutes are too few to plan: the first trials would have {min(steps.values())} steps;"
+                f" plan for {least:.2g} minutes or more, or train at once"
+            )
+        return steps
+
+    def rounds(self, tried: dict[str, RunConfig], steps: dict[str, int]) -> Iterator[Trial]:
+        """The trials of all rounds, each after it was trained; the last one is of the best candidate.
+
+        Args:
+            steps: of each candidate in the first round.
+        """
+        left = list(tried)
+        for number in range(ROUNDS):
+            made = []
+            for name in left:
+                made.append(self.trained(name, tried[name], steps[name] * GROWTH**number))
+                yield made[-1]
+            made.sort(key=lambda trial: trial.error)
+            left = [trial.name for trial in made[: max(1, len(made) // 2)]]
+
+
+def _cost(name: str) -> str:
+    """The candidate whose steps take as long: learning rates do not matter."""
+    return name.split(",")[0] + (", wider" if name.endswith(", wider") else "")
+
+
+def _of_one_cost(tried: dict[str, RunConfig]) -> dict[str, RunConfig]:
+    return {name: config for name, config in tried.items() if _cost(name) == name}
+
+
+@contextmanager
+def _told_in(log: Path) -> Iterator[None]:
+    """Within the block what a training prints goes into a file; its bar stays on the terminal."""
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with open(log, "a", encoding="utf-8") as file, redirect_stdout(file):
+        yield

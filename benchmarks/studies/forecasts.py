@@ -1,0 +1,152 @@
+"""Forecasts of trainings, each checked by the training itself.
+
+`python -m benchmarks.studies.forecasts [ROW ...]` makes the trials of `ast-sim plan` for some datasets, with given
+numbers of steps, then the training that they forecast. It writes benchmarks/results/forecasts.json and
+docs/results/forecasts.md. Data and runs lie in `--folder`; a second call goes on with what is there. Everything runs on
+one thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import ast_sim
+from ast_sim.planning.forecast import DAMPING, SPREAD, forecast
+from ast_sim.planning.trials import GROWTH, LONGEST, WIDER, Trials, candidates
+from ast_sim.support.disk import write_json, write_text
+from ast_sim.support.provenance import provenance
+from ast_sim.training.asked_settings import configure
+
+RESULTS = Path(__file__).parents[1] / "results" / "forecasts.json"
+PAGE = Path(__file__).parents[2] / "docs" / "results" / "forecasts.md"
+SLOWER = 1.6  # times as long takes a step of the wider model
+
+
+@dataclass(frozen=True)
+class Row:
+    """A training that is forecast.
+
+    Attributes:
+        title: what the page calls it.
+        family, made: of the dataset, as for `generate`.
+        first: steps of a trial of the first round.
+        settings: changes of the settings, by dotted key.
+    """
+
+    title: str
+    family: str
+    made: dict[str, Any]
+    first: int
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+_PLATES = {"frames": 41, "keep": (14, 24, 34), "seed": 21, "valid": 40, "test": 0}
+_CLIP = {"spec": Path(__file__).parents[2] / "examples" / "clip" / "SPEC.toml", "nodes": 1400, "frames": 7}
+_CLIP = {**_CLIP, "solver": "calculix", "train": 80, "valid": 6, "test": 30}
+_YIELDS = {"model.state": ("PEEQ", "reaction"), "train.mirror": ("y",), "train.stress_weight": 0.3}
+_MIRRORED = {"train.mirror": ("x", "y")}
+ROWS = {
+    "plates200": Row(
+        "300 plates, 200 nodes", "deforming_plate", {**_PLATES, "train": 300, "nodes": 200}, 50, _MIRRORED
+    ),
+    "plates400": Row(
+        "600 plates, 400 nodes", "deforming_plate", {**_PLATES, "train": 600, "nodes": 400}, 50, _MIRRORED
+    ),
+    "clip": Row("80 metal clips, 1,400 nodes", "assembly", _CLIP, 40, _YIELDS),
+}  # fmt: skip
+
+
+def measured(name: str, folder: Path) -> dict[str, Any]:
+    """The trials, the forecast and the training of a row."""
+    row = ROWS[name]
+    data = ast_sim.generate(row.family, folder / f"{name}.h5", **row.made)
+    tried = candidates(configure(data.path, changes=row.settings), "tiny")
+    trials = Trials(folder / f"trials_{name}", data.counts["train"], data.counts["valid"])
+    steps = {name: int(row.first / (SLOWER if name.endswith("wider") else 1)) for name in tried}
+    made = list(trials.rounds(tried, steps))
+    longest = made[-1]
+    half = trials.trained(longest.name, tried[longest.name], longest.steps, longest.scenes // 2)
+    whole = trials.trained(longest.name, tried[longest.name], round(longest.steps / LONGEST))
+    own = [(trial.steps, trial.error) for trial in made if trial.name == longest.name]
+    expected = forecast(own, whole.steps)
+    return {
+        **provenance(f"python -m benchmarks.studies.forecasts {name}"),
+        "title": row.title,
+        "trials": [asdict(trial) for trial in made],
+        "half": asdict(half),
+        "whole": asdict(whole),
+        "expected": expected._asdict(),
+    }
+
+
+_INTRODUCTION = f"""# Forecasts of trainings
+
+Made by `python -m benchmarks.studies.forecasts` from `benchmarks/results/forecasts.json`; do not edit.
+
+`ast-sim plan` forecasts the error of a training from shorter ones ([how](../how-to/plan-training.md)). Here each
+forecast is checked by the training itself, which has {1 / LONGEST:g} times the steps of the longest trial. The trials
+are whole trainings of `tiny` at three learning rates and of a model that is {WIDER:g} times as wide; in each of three
+rounds the better half goes on, with {GROWTH} times the steps. Errors are those of the network alone on validation
+scenes, relative to their displacement. The forecast goes on along the power of the two longest trials, times {DAMPING:g}; its
+interval reaches {100 * SPREAD:.0f} % above it and as far below as a factor. The steps of each trial are given, not
+measured, so that other work on the machine does not matter.
+"""
+
+
+def page(results: dict[str, Any]) -> str:
+    """The page of all rows that have a result."""
+    shown = [results[name] for name in ROWS if name in results]
+    head = ["training", "best settings", "steps: error of its trials", "half of the scenes", "forecast", "training"]
+    lines = [_INTRODUCTION, "| " + " | ".join(head) + " |", "| --- | --- | --- | ---: | ---: | ---: |"]
+    inside = 0
+    for row in shown:
+        best, whole, expected = row["trials"][-1]["name"], row["whole"], row["expected"]
+        own = [f"{trial['steps']:,}: {_percent(trial['error'])}" for trial in row["trials"] if trial["name"] == best]
+        inside += expected["low"] <= whole["error"] <= expected["high"]
+        interval = f"{_percent(expected['low'])} to {_percent(expected['high'])}"
+        cells = [
+            row["title"],
+            best,
+            ", ".join(own),
+            _percent(row["half"]["error"]),
+            f"{whole['steps']:,} steps: {_percent(expected['error'])} ({interval})",
+            _percent(whole["error"]),
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join([*lines, "", f"{inside} of {len(shown)} trainings ended within the interval of their forecast."])
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.3g} %"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("rows", nargs="*", metavar="ROW", help=f"of {', '.join(ROWS)} (default: all)")
+    about = "data and runs (default: build/forecasts)"
+    parser.add_argument("--folder", type=Path, default=Path("build/forecasts"), help=about)
+    asked = parser.parse_args(arguments)
+    unknown = set(asked.rows) - set(ROWS)
+    if unknown:
+        parser.error(f"there is no row {', '.join(sorted(unknown))}")
+    import torch  # after ast_sim, which says how its threads wait
+
+    torch.set_num_threads(1)
+    os.environ["OMP_NUM_THREADS"] = "1"  # of the generator's processes
+    ast_sim.keep_memory()
+    results = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
+    for name in asked.rows or ROWS:
+        results[name] = measured(name, asked.folder)
+        write_json(RESULTS, results)
+        write_text(PAGE, page(results) + "\n")
+        print(f"{name}: {_percent(results[name]['whole']['error'])}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,156 @@
+"""Plans of trainings of the toy: real trainings of a small AST."""
+
+import dataclasses
+import json
+from types import SimpleNamespace
+
+import pytest
+import toy
+from toy import one_thread  # noqa: F401 (used by being imported)
+
+import ast_sim
+from ast_sim.planning import plan as plan_module
+from ast_sim.planning import trials as module
+from ast_sim.planning.plan import planned
+from ast_sim.planning.trials import Trial, Trials, candidates
+from ast_sim.runs.config_toml import read_config
+from ast_sim.support.errors import ConfigError
+from ast_sim.training.asked_settings import configure
+
+SMALL = {"hidden": 16, "decoder_hidden": 16, "d_token": 32, "heads": 2, "head_dim": 16, "ffn_inner": 16}
+QUICK = {"batch_size": 2, "statistics_pairs": 4}
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return toy.write(tmp_path_factory.mktemp("data") / "toy.h5", (6, 3, 1))
+
+
+def asked(data, **train):
+    changes = {f"model.{key}": value for key, value in SMALL.items()}
+    return configure(data, changes=changes | {f"train.{key}": value for key, value in {**QUICK, **train}.items()})
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """The first round has trials of four steps, on a machine as busy as it is."""
+    monkeypatch.setattr(Trials, "first_steps", lambda _, tried, __: dict.fromkeys(tried, 4))
+
+
+def test_a_plan_of_real_trainings(short, data, tmp_path, capsys, monkeypatch):
+    made = ast_sim.plan(data, tmp_path / "plan", 0.3, model_settings=SMALL, **QUICK)
+    longest, half = made.trials[-2:]
+    by_round = [made.trials[:4], made.trials[4:6], made.trials[6:7]]
+    assert [len(trials) for trials in by_round] == [4, 2, 1] and len(made.trials) == 8
+    assert longest.name == min(by_round[1], key=lambda trial: trial.error).name
+    assert {trial.name for trial in by_round[1]} == {
+        trial.name for trial in sorted(by_round[0], key=lambda trial: trial.error)[:2]
+    }
+    own = [trial for trial in made.trials if trial.name == longest.name]
+    assert [trial.steps for trial in own] == [4, 12, 36, 36]
+    assert half.scenes == longest.scenes // 2
+    assert made.expected.low < made.expected.error < made.expected.high
+    assert made.expected.error <= longest.error
+    kept = json.loads((tmp_path / "plan" / "plan.json").read_text())
+    assert kept["trials"] == [dataclasses.asdict(trial) for trial in made.trials]
+    assert kept["expected"] == list(made.expected)
+    said = capsys.readouterr().out
+    assert said.count("scenes, error") == 8 and "step " not in said
+    assert f"take: {longest.name}" in str(made) and "help more" in str(made)
+    monkeypatch.setattr("ast_sim.training.loop.Training.advance", lambda *_: pytest.fail("trained again"))
+    again = ast_sim.plan(data, tmp_path / "plan", 0.3, model_settings=SMALL, **QUICK)
+    assert (again.trials, again.expected) == (made.trials, made.expected)
+
+
+def test_its_settings_train(short, data, tmp_path):
+    made = planned(asked(data), tmp_path / "plan", 0.3)
+    settings = tmp_path / "plan" / "best.toml"
+    run = ast_sim.train(data, tmp_path / "run", config=settings, steps=2)
+    assert str(settings) in made.command
+    for key, value in made.settings.items():
+        part, name = key.split(".")
+        assert getattr(getattr(run.settings, part), name) == value
+
+
+def test_candidates_vary_the_rate_and_the_width(data):
+    tried = candidates(asked(data), "tiny")
+    rates = [config.train.peak_rate for config in tried.values()]
+    assert rates == [3e-3, 1.5e-3, 6e-3, 3e-3]
+    wider = tried["tiny, wider"].model
+    assert (wider.hidden, wider.heads, wider.head_dim, wider.d_token) == (24, 3, 16, 48)
+    assert tried["tiny"].model == tried["tiny, half the rate"].model
+
+
+def test_a_trial_with_some_of_the_scenes_sees_no_other(data, tmp_path):
+    trial = Trials(tmp_path, 3, 1).trained("tiny", asked(data), 4, scenes=1)
+    assert (trial.scenes, trial.steps) == (1, 4)
+    assert read_config(tmp_path / trial.run).train.scenes == 1
+    assert "data        1 of " in (tmp_path / f"{trial.run}.log").read_text()
+
+
+def test_better_candidates_go_on(data, tmp_path, monkeypatch):
+    """Errors by name: the wider model is best and slow, so it gets fewer steps in equal minutes."""
+    errors = {"tiny": 0.4, "tiny, half the rate": 0.6, "tiny, twice the rate": 0.5, "tiny, wider": 0.3}
+    seconds = {name: 0.02 if "wider" in name else 0.01 for name in errors}
+    monkeypatch.setattr(
+        Trials, "trained", lambda _, name, config, steps: Trial(name, steps, 4, seconds[name], errors[name], "run")
+    )
+    trials, tried = Trials(tmp_path, 4, 1), candidates(asked(data), "tiny")
+    made = list(trials.rounds(tried, trials.first_steps(tried, 2.0)))
+    assert [(trial.name, trial.steps) for trial in made] == [
+        ("tiny", 222), ("tiny, half the rate", 222), ("tiny, twice the rate", 222), ("tiny, wider", 111),
+        ("tiny, wider", 333), ("tiny", 666), ("tiny, wider", 999),
+    ]  # fmt: skip
+    with pytest.raises(ConfigError, match=r"0.2 minutes are too few to plan: .* 11 steps; plan for 0.36 minutes"):
+        trials.first_steps(tried, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("train", "match"),
+    [
+        ({"steps": 5}, "train.steps is given, but it follows from the minutes"),
+        ({"minutes": 5.0}, "train.minutes is given"),
+        ({"peak_rate": None}, "train.peak_rate is unset"),
+        ({"scenes": 2}, "has 2 training scenes; a plan needs 4 or more"),
+    ],
+)
+def test_what_cannot_be_planned_is_refused(data, tmp_path, train, match):
+    with pytest.raises(ConfigError, match=match):
+        planned(asked(data, **train), tmp_path / "plan", 1.0)
+    assert not (tmp_path / "plan").exists()
+
+
+def test_a_dataset_without_validation_scenes_is_refused(tmp_path):
+    alone = toy.write(tmp_path / "alone.h5", (6, 0, 1))
+    with pytest.raises(ConfigError, match="has no validation scenes"):
+        planned(asked(alone), tmp_path / "plan", 1.0)
+
+
+def test_a_trial_whose_validation_failed_is_told(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "RunFolder", lambda _: SimpleNamespace(metrics=Failed()))
+    with pytest.raises(ast_sim.AstSimError, match="the trial tiny, 4 steps has no error: it exploded"):
+        Trials(tmp_path, 3, 1).trained("tiny", asked(data), 4)
+
+
+class Failed:
+    """Metrics of a training whose validation failed."""
+
+    def validation(self, _step):
+        return {"valid_rmse": None, "failure": "it exploded"}
+
+    def seconds_per_step(self):
+        return 0.1
+
+
+def test_the_trials_have_the_processes_of_the_whole_training(data, monkeypatch):
+    monkeypatch.setattr(plan_module, "usual_processes", lambda config: 2 if config.train.minutes == 30 else 1)
+    assert plan_module._with_processes(asked(data), 30).train.processes == 2
+    assert plan_module._with_processes(asked(data, processes=1), 30).train.processes == 1
+
+
+@pytest.mark.parametrize("minutes", [0, -1, float("inf"), float("nan")])
+def test_minutes_that_are_none_are_refused(data, tmp_path, minutes):
+    with pytest.raises(ConfigError, match="minutes"):
+        planned(asked(data), tmp_path / "plan", minutes)
+    with pytest.raises(ConfigError, match="minutes"):
+        ast_sim.worth(tmp_path / "SPEC.toml", tmp_path / "worth", minutes)
