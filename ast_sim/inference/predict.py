@@ -40,7 +40,7 @@ def answers(
     """Predict the wanted frames of several scenes, by jumps or step by step as the model does; see `jumps` and
     `rollouts` for the arguments and errors."""
     began = time.perf_counter()
-    if model.config.jumps:
+    if model.config.scheme.jumps:
         predicted = jumps(model, questions, effort, progress)
     else:
         effort.check(model.config)
@@ -85,7 +85,7 @@ def new_question(
     scene.require_predictable(name)  # before anything is told of such a scene
     _require_material(config, scope, scene, name)
     _require_resolved(scene, name)
-    notes = (*notes, *_loose(scene), *scope.notes(scene, motion, bool(config.jumps)))
+    notes = (*notes, *_loose(scene), *scope.notes(scene, motion, config.scheme.needs_each_frame))
     return Question(name, scene, motion.position, fields, movable=True, notes=notes).asking(frames)
 
 

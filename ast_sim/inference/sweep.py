@@ -95,7 +95,7 @@ def sweep(
     if not rows:
         raise ConfigError("a sweep needs at least one row of values")
     needs_way = bool((config.data.friction or FRICTION in config.data.columns) and effort.newton_steps)
-    frames = 2 if config.jumps and not needs_way and config.history is None else None
+    frames = None if needs_way or config.scheme.follows_motion else 2
     asked_for = {"effort": effort} if error is None else {"error": error}
     table, seconds, notes, unpromised = [], 0.0, [], 0
     with Progress(len(rows), "rows", progress) as bar:

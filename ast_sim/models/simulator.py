@@ -141,7 +141,7 @@ class Simulator(nn.Module):
         """
         options = {"seed": 0, "noise": 0.0, "gamma": 1.0, **options, "batch_size": batch_size}
         data = self.config.data
-        of_model = {"make_graph": self.graph, "dynamic": data.dynamic, "jumps": self.config.jumps}
+        of_model = {"make_graph": self.graph, "dynamic": data.dynamic, "jumps": self.config.scheme.jumps}
         of_model |= {"fields": data.fields, "history": self.config.history}
         return PairSampler(dataset, split, **of_model, **options)
 

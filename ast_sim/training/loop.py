@@ -111,7 +111,7 @@ class Training:
     def _pool(self, largest: float) -> Pool | None:
         """The pool of scenes that go on from the model's own answers; None: each batch is drawn anew."""
         options = self.options
-        if self.config.model.jumps:
+        if self.config.model.scheme.jumps:
             return JumpPool(self.sampler, JUMP_BATCHES * options.batch_size, options.calls, largest)
         return RolloutPool(self.sampler, options.rollout_pool, largest) if options.rollout_pool else None
 

@@ -92,7 +92,7 @@ def validate(
     names = [f"{split}/{index:06d}" for index in indices]
     if not truths:
         return []
-    if not model.config.jumps:
+    if not model.config.scheme.jumps:
         return _by_rollouts(model, indices, names, truths, progress)
     return _by_jumps(model, indices, names, truths, most_calls, efforts)
 

@@ -183,7 +183,7 @@ def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: E
     failed = answer.failure is not None or not size  # where nothing moves, there is no relative error
     stress = None if answer.stress is None or answer.failure is not None else answer.stress[0]
     by_calls = []
-    if model.config.jumps and not failed:
+    if model.config.scheme.corrects and not failed:
         (after,) = calls(model, [question], effort)
         positions = () if isinstance(after, str) else after.position
         by_calls = [relative_error(position[0], truth, frame) for position in positions]

@@ -64,6 +64,7 @@ def evaluate(
     if not indices:
         raise DatasetError(f"{dataset.path}: the split {split} has no frame to predict")
     outputs = model.config.data.outputs
+    scheme = model.config.scheme
     constants = _training_means(dataset, outputs)
     scenes: list[SceneFigures] = []
     errors: dict[str, list[Errors]] = {"displacement": [], **{output.name: [] for output in outputs}}
@@ -72,7 +73,7 @@ def evaluate(
         name = f"{split}/{index:06d}"
         truth = _truth(dataset, split, index, model.config.data)
         (answer,) = predictions(model, [Question.of(truth, name)], effort)
-        one_step = _predicted(answer) if model.config.jumps else one_step_predictions(model, truth, name)
+        one_step = one_step_predictions(model, truth, name) if scheme.errors_add_up else _predicted(answer)
         errors["displacement"].append(displacement_errors(truth, one_step[0], answer))
         for key, location, *_ in outputs:
             errors[key].append(field_errors(key, location, truth, one_step[1].get(key), answer, constants[key]))
@@ -85,7 +86,7 @@ def evaluate(
         scenes=tuple(scenes),
         errors=tuple(row for quantity, of_scenes in errors.items() for row in errors_over_scenes(quantity, of_scenes)),
         failures=sum(scene.failure is not None for scene in scenes),
-        jumps=bool(model.config.jumps),
+        jumps=scheme.jumps,
         effort=dataclasses.asdict(effort),
         asked=asked_frame.asked_frames(model, dataset, split, effort, rival_scenes, advance, made_from),
         speedup=_speedup(scenes),

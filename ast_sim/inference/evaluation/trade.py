@@ -189,7 +189,7 @@ def _command(run: Run, dataset: Dataset, split: str, effort: Effort) -> str:
     """What predicts the first scene with this effort."""
     counts = ["--corrections", str(effort.corrections), "--newton-steps", str(effort.newton_steps)]
     asked = ["--exact"] if effort == Effort.exact() else counts
-    what = asked if run.settings.model.jumps else []
+    what = asked if run.settings.model.scheme.corrects else []
     scene = [dataset.path.name, "--split", split, "--index", "0"]
     return shlex.join(["ast-sim", "predict", run.path.name, *scene, "--out", "answer.h5", *what])
 
