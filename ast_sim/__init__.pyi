@@ -1,3 +1,4 @@
+from .batches.frame_pairs import FramePairs as FramePairs
 from .dataset.layout import DatasetInfo as DatasetInfo
 from .dataset.reader import Dataset as Dataset
 from .dataset.writer import DatasetWriter as DatasetWriter

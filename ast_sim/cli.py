@@ -26,7 +26,7 @@ from ast_sim.support.argument_types import (
     read_by,
     whole_numbers,
 )
-from ast_sim.support.errors import AstSimError, printable
+from ast_sim.support.errors import AstSimError, LooksWrong, printable
 from ast_sim.support.stop_signals import Interrupted
 
 CORNERS = "take only the corners of second-order tetrahedra: forces are then those of another, stiffer mesh"
@@ -41,7 +41,7 @@ def main(argv: list[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="backslashreplace")  # names of files may hold bytes that are no text
     args = build_parser().parse_args(argv)
     args.command_line = shlex.join(["ast-sim", *(sys.argv[1:] if argv is None else argv)])
-    warnings.showwarning = lambda message, *_: _tell("warning", message)
+    warnings.showwarning = lambda message, category, *_: _show(message, category)
     try:
         args.run(args)
         sys.stdout.flush()
@@ -62,6 +62,14 @@ def main(argv: list[str] | None = None) -> int:
             raise
         _tell(f"ast-sim {args.command}", error)
         return 2
+
+
+def _show(message: object, category: type[Warning]) -> None:
+    """Show a warning; what looks wrong in data is a table."""
+    if category is LooksWrong:
+        print(printable(str(message)))
+    else:
+        _tell("warning", message)
 
 
 def _tell(what: str, message: object) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from enum import IntEnum
+from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -127,3 +128,18 @@ def mesh_of_arrays(
         point_data={"node_type": node_type, "body": body},
         cell_data={} if material is None else {"material": [material]},
     )
+
+
+def require_mesh(name: str, elements: np.ndarray, node_type: np.ndarray) -> None:
+    """Raise DatasetError if an element refers to a node twice, or if the type of a node is no `NodeType`; the text
+    names `name` and the first one."""
+    pairs = combinations(range(elements.shape[1]), 2)
+    repeated = np.logical_or.reduce([elements[:, a] == elements[:, b] for a, b in pairs])
+    if repeated.any():
+        row = int(np.argmax(repeated))
+        raise DatasetError(f"{name}: element {row} refers to a node twice: {elements[row].tolist()}")
+    unknown = np.logical_and.reduce([node_type != kind for kind in NodeType])
+    if unknown.any():
+        node = int(np.argmax(unknown))
+        known = ", ".join(f"{kind.value} {kind.name}" for kind in NodeType)
+        raise DatasetError(f"{name}: node {node} has the type {node_type[node]}; known are {known}")

@@ -5,19 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ast_sim.element_topology import LOCAL_EDGES, surface_triangles, unique_edges
-from ast_sim.mesh_arrays import (
-    NodeType,
-    arrays_of_mesh,
-    joined_arrays,
-    mesh_of_arrays,
-    scene_arrays,
-)
+from ast_sim.mesh_arrays import NodeType, arrays_of_mesh, joined_arrays, mesh_of_arrays, require_mesh, scene_arrays
 from ast_sim.named_field import NamedField
 from ast_sim.number_arrays import ranges, require_array, require_finite, require_nodes
 from ast_sim.scene_summary import scene_drawing, scene_facts
@@ -143,8 +136,19 @@ class Scene:
 
     @property
     def deforming_elements(self) -> np.ndarray:
-        """[E] bool: the elements without a node of an obstacle."""
+        """[E] bool: the elements without a node of an obstacle. They have a stress."""
         return np.all(self.deforming_nodes[self.elements], axis=1)
+
+    @property
+    def rigid_elements(self) -> np.ndarray:
+        """[E] bool: the elements all of whose nodes are of obstacles. One with other nodes, too, has elastic forces,
+        since it is strained when these move, but no stress."""
+        return ~np.any(self.deforming_nodes[self.elements], axis=1)
+
+    @property
+    def rigid_bodies(self) -> set[int]:
+        """The bodies all of whose nodes are of obstacles."""
+        return set(self.body.tolist()) - set(self.body[self.deforming_nodes].tolist())
 
     def deforming(self, location: str) -> np.ndarray:
         """[N] or [E] bool, one for each row of the stress: the nodes that deform, or the elements if `location` is
@@ -174,16 +178,7 @@ class Scene:
                 raise DatasetError(f"{name}: material has no columns; leave it out (None)")
             require_finite(name, "material", "element", self.material)
         require_nodes(name, "element", self.elements, n)
-        pairs = combinations(range(k), 2)
-        repeated = np.logical_or.reduce([self.elements[:, a] == self.elements[:, b] for a, b in pairs])
-        if repeated.any():
-            row = int(np.argmax(repeated))
-            raise DatasetError(f"{name}: element {row} refers to a node twice: {self.elements[row].tolist()}")
-        unknown = np.logical_and.reduce([self.node_type != kind for kind in NodeType])
-        if unknown.any():
-            node = int(np.argmax(unknown))
-            known = ", ".join(f"{kind.value} {kind.name}" for kind in NodeType)
-            raise DatasetError(f"{name}: node {node} has the type {self.node_type[node]}; known are {known}")
+        require_mesh(name, self.elements, self.node_type)
 
     def require_predictable(self, name: str) -> None:
         """Raise DatasetError if no node is free, or if the deforming bodies have no extent; the text names `name`."""

@@ -230,6 +230,20 @@ def test_report_is_one_page(trained, tmp_path, capsys):
     assert "test/000001" in page
 
 
+def test_what_looks_wrong_is_a_table(tmp_path, capsys):
+    from ast_sim.view import export
+
+    still = toy.plate(0)
+    still.position[:, -1] += np.linspace(0, 0.01, len(still.position))[:, None]  # a corner of the rigid tool is pulled
+    export.write(tmp_path / "case.pvd", still)
+    out = tmp_path / "own.h5"
+    assert main(["convert", str(tmp_path / "case.pvd"), "--out", str(out), "--shares", "1", "0", "0"]) == 0
+    shown = capsys.readouterr()
+    first, second, *_ = [line for line in shown.out.splitlines() if "  " in line]
+    assert first.split("  ")[0] == "what looks wrong" and "edges of obstacles that change" in second
+    assert first.index("what it means") == second.index("edges of an obstacle change by") and shown.err == ""
+
+
 def test_a_series_of_another_program_becomes_a_dataset(tmp_path, capsys):
     from ast_sim.view import export
 

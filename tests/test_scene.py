@@ -151,3 +151,15 @@ def test_a_wrong_trajectory_is_named():
 
 def test_node_types_are_those_of_meshgraphnets():
     assert {kind.name: kind.value for kind in NodeType} == {"NORMAL": 0, "OBSTACLE": 1, "HANDLE": 3}
+
+
+def test_a_body_is_rigid_if_all_its_nodes_are_obstacles():
+    """Body 0 is free, body 1 an obstacle, body 2 has nodes of both kinds, body 3 handles alone."""
+    points = np.concatenate([two_tetrahedra().rest_position[:4] + 10 * number for number in range(4)])
+    cells = np.arange(16).reshape(4, 4)
+    node_type = np.repeat([0, 1, 1, 3], 4)
+    node_type[8] = 0
+    scene = Scene.of(points, cells, node_type=node_type)
+    assert scene.rigid_bodies == {1}
+    assert scene.rigid_elements.tolist() == [False, True, False, False]
+    assert scene.deforming_elements.tolist() == [True, False, False, True]

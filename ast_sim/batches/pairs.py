@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,6 +24,7 @@ from ast_sim.support.errors import DatasetError
 
 # The order, the noise and the placements draw from separate sequences of random numbers.
 _ORDER, _NOISE, _PLACE = 0, 1, 2
+_LARGEST_SEED = 1 << 62
 
 _Motion = tuple[np.ndarray, Tensor | None, np.ndarray]  # the position in the state, the one before it, the target
 
@@ -90,6 +92,9 @@ class Jump:
 class PairSampler:
     """Draws batches of frame pairs (t, t + 1) of a split. Each epoch is a new random order of all pairs.
 
+    A DataLoader of torch takes it, too, as a map-style dataset: `DataLoader(pairs, batch_size=4, shuffle=True,
+    collate_fn=pairs.collate)`. The loader then chooses the pairs.
+
     With `jumps`, t + 1 is predicted from the first frame, carried along. There is no noise; instead, half of the pairs
     start from a guess that has a random share of the error of this start, as a correction does. With `history`, t + 1
     is predicted from the last frame before in which the motion turns back, if it does, and from the values of these
@@ -151,8 +156,34 @@ class PairSampler:
         if self.num_pairs == 0:
             least = f"at least {2 + self.first_frame} frames"
             raise DatasetError(f"{dataset.path}: {split} has no trajectory of {least} to draw pairs from")
+        self._make_caches()
+
+    def _make_caches(self) -> None:
         self._members: ByteCache[_Member] = ByteCache(cache_bytes())
         self._order = lru_cache(maxsize=2)(lambda epoch: self.random(_ORDER, epoch).permutation(self.num_pairs))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What the processes of a DataLoader need; each makes caches of its own."""
+        return {key: value for key, value in vars(self).items() if key not in ("_members", "_order")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._make_caches()
+
+    def __len__(self) -> int:
+        return self.num_pairs
+
+    def __getitem__(self, number: int) -> tuple[Batch, Target]:
+        """One pair of all, as a batch of its own. Its noise and its placement are new at each call; the seed of torch
+        determines them."""
+        number = range(len(self))[number]  # an IndexError where there is none ends a loop over all
+        return self._built(self._pair(int(torch.randint(_LARGEST_SEED, ())), number))
+
+    @staticmethod
+    def collate(pairs: Sequence[tuple[Batch, Target]]) -> tuple[Batch, Target]:
+        """Several pairs as one batch."""
+        batches, targets = zip(*pairs, strict=True)
+        return Batch.concatenate(batches), Target.concatenate(targets)
 
     @property
     def num_pairs(self) -> int:
@@ -209,8 +240,7 @@ class PairSampler:
 
     def assemble(self, pairs: Sequence[Pair | Jump]) -> tuple[Batch, Target]:
         """The batch of these pairs. Their errors are added only where noise would be."""
-        batches, targets = zip(*map(self._built, pairs), strict=True)
-        return Batch.concatenate(batches), Target.concatenate(targets)
+        return self.collate([self._built(pair) for pair in pairs])
 
     def _built(self, pair: Pair | Jump) -> tuple[Batch, Target]:
         """The batch of one pair, mirrored and moved."""

@@ -109,7 +109,7 @@ def convert(args: argparse.Namespace) -> None:
             "incomplete": args.incomplete,
             "strict": args.strict,
         }
-    counts = import_files(source, args.out, progress=lambda line: print(printable(line)), **options)
+    counts = import_files(source, args.out, progress=lambda done, total, line: print(printable(line)), **options)
     print(f"{args.out}: {_counts(counts)}")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -218,3 +218,10 @@ def trajectory_hash(arrays: dict[str, str], attributes: dict[str, AttributeValue
     """The SHA-256 of a trajectory, from the hashes of its arrays and its attributes."""
     content = {"arrays": arrays, "attributes": {key: attributes[key] for key in attributes if key != HASH}}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def numbering(attributes: Mapping[str, AttributeValue]) -> tuple[tuple[int, ...] | None, tuple[float, ...] | None]:
+    """The numbers and the times of the frames, as the attributes of a trajectory tell; None if they do not."""
+    frames, times = (attributes.get(key) for key in NUMBERING)
+    numbers = tuple(int(number) for number in frames) if isinstance(frames, list) else None
+    return numbers, tuple(times) if isinstance(times, list) else None

@@ -12,7 +12,7 @@ import os
 from collections.abc import Collection, Iterator
 from itertools import chain
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import h5py
 import numpy as np
@@ -28,6 +28,7 @@ from ast_sim.dataset.layout import (
     NUMBERING,
     OPTIONAL,
     SPLITS,
+    numbering,
     require_kind,
 )
 from ast_sim.dataset.split import Split
@@ -38,6 +39,9 @@ from ast_sim.scene import AttributeValue, Scene, Trajectory
 from ast_sim.support.byte_cache import ByteCache, cache_bytes
 from ast_sim.support.errors import DatasetError
 from ast_sim.support.notebook_table import html_table, one_line
+
+if TYPE_CHECKING:
+    from ast_sim import FramePairs
 
 
 class Dataset:
@@ -108,8 +112,18 @@ class Dataset:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def __reduce__(self) -> tuple[type[Self], tuple[str, str]]:
+        """Another process, such as one of a DataLoader, opens the file for itself."""
+        return type(self), (str(self.path), self.info.length_unit)
+
     def close(self) -> None:
         self._file.close()
+
+    def torch(self, split: str) -> FramePairs:
+        """The pairs of frames of a split as tensors by name, for a DataLoader of torch and a network of your own."""
+        from ast_sim import FramePairs  # by its public name: this room is used without torch
+
+        return FramePairs(self, split)
 
     @property
     def calibration(self) -> Split:
@@ -195,9 +209,7 @@ class Dataset:
     def _numbering(self, split: str, index: int) -> tuple[tuple[int, ...] | None, tuple[float, ...] | None]:
         """The numbers and the times of the frames of a trajectory. Without times of its own, they follow from the time
         step of the dataset."""
-        stored = self._file.attributes(self._group(split, index))
-        frames, times = (_listed(stored.get(key)) for key in NUMBERING)
-        numbers = None if frames is None else tuple(int(number) for number in frames)
+        numbers, times = numbering(self._file.attributes(self._group(split, index)))
         if times is None:
             times = self.info.times(range(self.num_frames(split, index)) if numbers is None else numbers)
         return numbers, times
@@ -335,8 +347,3 @@ class Dataset:
             size = sum(array.nbytes for array in chain.from_iterable(arrays))
             self._kept[split] = size <= min(cache_bytes(), self._file.size)
         return self._kept[split]
-
-
-def _listed(value: AttributeValue | None) -> tuple[float, ...] | None:
-    """The numbers of an attribute; None if it is missing or no list."""
-    return tuple(value) if isinstance(value, list) else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,8 @@ from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.plausibility.findings import Finding, refusal, told
 from ast_sim.plausibility.motion import in_trajectory
 from ast_sim.scene import Trajectory
-from ast_sim.support.errors import DatasetError, nearest_name
+from ast_sim.support.errors import DatasetError, LooksWrong, nearest_name
+from ast_sim.support.progress import Progress, ShowProgress
 
 SHARES = {"train": 0.8, "valid": 0.1, "test": 0.1}
 
@@ -33,6 +34,7 @@ def convert(source: Path | str, out: Path | str, **options: Any) -> dict[str, in
 
     Args:
         options: the options of `convert_deepmind` if the source holds .tfrecord files, else those of `convert_series`.
+            Both have `progress`, as in `generate`.
 
     Returns:
         The number of trajectories in each split.
@@ -60,7 +62,7 @@ def convert_series(
     corners: bool = False,
     incomplete: bool = False,
     strict: bool = False,
-    progress: Callable[[str], None] | None = None,
+    progress: ShowProgress = True,
 ) -> dict[str, int]:
     """Import the simulations of other programs as a dataset.
 
@@ -76,7 +78,7 @@ def convert_series(
         corners: take only the corners of second-order tetrahedra: no force of such a mesh is right.
         incomplete: accept simulations in which nothing moves, is prescribed or can be learnt.
         strict: refuse what looks wrong; see `ast_sim.plausibility`.
-        progress: called with a line after each simulation, and with what looks wrong. None: that is a warning.
+        progress: as in `generate`; the text tells of each simulation. What looks wrong is a warning.
 
     Returns:
         The number of trajectories in each split. Positions are relative to `generator["origin"]` of the dataset.
@@ -93,27 +95,25 @@ def convert_series(
     facts: dict[str, Any] = {"family": source.stem, "integration": integration, "generator": made_by}
     facts |= {"contact_radius": contact_radius, "time_step": time_step, "length_unit": length_unit or "m"}
     findings: list[tuple[str, Finding]] = []
-    with FittedWriter(out, stress_location="none", **facts) as writer:
+    opened = FittedWriter(out, stress_location="none", **facts)
+    with opened as writer, Progress(len(chosen), "simulations", progress) as bar:
         for split, name, trajectory in _trajectories(series, decks, chosen, names, corners, incomplete):
             if not any(writer.counts.values()):
                 made_by |= _facts_of_the_first(trajectory)
                 writer.info = replace(writer.info, stress_location=trajectory.stress_at, generator=made_by)
             findings += [(name, finding) for finding in in_trajectory(trajectory)]
             writer.add(split, trajectory)
-            if progress is not None:
-                progress(_line(split, name, trajectory))
-        _tell(source, findings, strict, progress)
+            bar.advance(_line(split, name, trajectory))
+        _tell(source, findings, strict)
     return writer.counts
 
 
-def _tell(
-    source: Path, findings: list[tuple[str, Finding]], strict: bool, progress: Callable[[str], None] | None
-) -> None:
-    """Print what looks wrong, or warn of it; refuse it if `strict`."""
+def _tell(source: Path, findings: list[tuple[str, Finding]], strict: bool) -> None:
+    """Warn of what looks wrong; refuse it if `strict`."""
     if findings and strict:
         raise DatasetError(f"{source}: {refusal(findings)}")
     for line in told(findings):
-        warnings.warn(line, stacklevel=3) if progress is None else progress(line)
+        warnings.warn(line, LooksWrong, stacklevel=3)
 
 
 def _trajectories(

@@ -7,7 +7,7 @@ and, in deforming_plate, nodal von Mises `stress`. `meta.json` says which arrays
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import count, islice
 from pathlib import Path
@@ -17,10 +17,11 @@ import numpy as np
 from ast_sim.dataset.layout import SPLITS
 from ast_sim.dataset.writer import FittedWriter
 from ast_sim.importers.deepmind_meta import LENGTH, Meta, read_meta
-from ast_sim.importers.tfrecord import find_values, read_records
+from ast_sim.importers.tfrecord import count_records, find_values, read_records
 from ast_sim.number_arrays import connected_parts, require_array
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.support.errors import DatasetError
+from ast_sim.support.progress import Progress, ShowProgress
 
 SUFFIX = ".tfrecord"
 META = "meta.json"
@@ -44,7 +45,7 @@ def convert_deepmind(
     splits: Sequence[str] | None = None,
     limit: int | None = None,
     every: int = 1,
-    progress: Callable[[str], None] = lambda line: None,
+    progress: ShowProgress = True,
 ) -> dict[str, int]:
     """Import a folder with `meta.json` and `train.tfrecord`, `valid.tfrecord`, `test.tfrecord` as a dataset.
 
@@ -58,7 +59,7 @@ def convert_deepmind(
         limit: import only the first `limit` trajectories of each split (published results on deforming_plate train on
             the first 1,000 of 1,200).
         every: keep the frames 0, `every`, 2 `every`, ...; the time step grows accordingly.
-        progress: called with a line of text after each trajectory.
+        progress: as in `generate`; the text tells of each trajectory.
 
     Returns:
         The number of trajectories in each split.
@@ -71,20 +72,21 @@ def convert_deepmind(
     files = _split_files(source, splits)
     meta = read_meta(source / META)
     taken = {"source": str(source), "simulator": meta.simulator, "limit": limit, "every": every}
-    with FittedWriter(
-        out,
-        family=source.resolve().name,
-        integration="dynamic" if meta.dt > 0 else "quasi_static",
-        stress_location="node" if "stress" in meta.features else "none",
-        contact_radius=meta.collision_radius,
-        time_step=meta.dt * every,
-        generator={"program": "ast_sim convert", **taken},
-    ) as writer:
+    facts = {
+        "family": source.resolve().name,
+        "integration": "dynamic" if meta.dt > 0 else "quasi_static",
+        "stress_location": "node" if "stress" in meta.features else "none",
+        "contact_radius": meta.collision_radius,
+        "time_step": meta.dt * every,
+        "generator": {"program": "ast_sim convert", **taken},
+    }
+    total = sum(count_records(path, limit) for path in files.values())
+    with FittedWriter(out, **facts) as writer, Progress(total, "trajectories", progress) as bar:
         for split, path in files.items():
             for trajectory in read_trajectories(path, meta, limit, every):
                 size = f"{trajectory.num_frames} frames of {trajectory.scene.num_nodes} nodes"
                 writer.add(split, trajectory)
-                progress(f"{split}: {path.name} {writer.counts[split] - 1}, {size}")
+                bar.advance(f"{split}: {path.name} {writer.counts[split] - 1}, {size}")
                 del trajectory  # to free its memory before the next one is read
     return writer.counts
 

@@ -204,7 +204,8 @@ def _material(
     if fields:
         raise ConfigError("the material is given twice: by body and by cell fields; leave one out")
     bodies = [int(body) for body in np.unique(scene.body)]
-    deforming = [b for b in bodies if (scene.node_type[scene.body == b] != NodeType.OBSTACLE).any()]
+    rigid = scene.rigid_bodies
+    deforming = [body for body in bodies if body not in rigid]
     given = materials if isinstance(materials, Mapping) else dict.fromkeys(deforming, materials)
     rows = {body: np.atleast_1d(np.asarray(numbers, np.float32)) for body, numbers in given.items()}
     for body in rows:

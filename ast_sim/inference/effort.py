@@ -92,7 +92,7 @@ class Effort:
                 " contact that the solver recorded with the dataset"
             )
         for key, count in self._counts.items():
-            if count and not config.jumps:
+            if count and not config.scheme.corrects:
                 raise ConfigError(f"{key} is {count}; it needs a run that jumps, and this one does not")
         if self.newton_steps and not config.data.tetrahedra:
             raise ConfigError(f"newton_steps is {self.newton_steps}; they need tetrahedra, and the elements have none")
@@ -153,7 +153,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 def can_make_newton_steps(config: ModelConfig) -> bool:
     """Whether the scenes of a model that jumps are tetrahedra of a material whose law is known."""
-    return bool(config.jumps and config.data.tetrahedra and config.data.material.law)
+    return bool(config.scheme.corrects and config.data.tetrahedra and config.data.material.law)
 
 
 def can_be_solved(config: ModelConfig) -> bool:
@@ -165,7 +165,7 @@ def choices(config: ModelConfig, calls: int | None) -> tuple[Effort, ...]:
     """The efforts among which one is chosen for an asked error or time, from the cheapest to the dearest, for a model
     that was trained for so many calls: a Newton step costs more than a correction, and the solver most. With friction
     the solver is left to be asked for: it takes its whole way. None for a model that does not jump."""
-    if not config.jumps:
+    if not config.scheme.corrects:
         return ()
     steps = CHOSEN_STEPS if can_make_newton_steps(config) else (0,)
     efforts = tuple(Effort(corrections, count) for count in steps for corrections in range(calls or 1))

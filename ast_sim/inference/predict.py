@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from ast_sim.prescribed_motion import Motion, RigidMotion, Vector, frames_for
 from ast_sim.runs.scope import Scope
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.support.errors import ConfigError, DatasetError
+from ast_sim.support.progress import ShowProgress
 
 LEAST_RESOLVED = 0.01  # of a mean edge: rounding of the positions may be as large
 Motions = Motion | Mapping[int, RigidMotion | Vector] | np.ndarray
@@ -34,12 +35,12 @@ def answers(
     model: Simulator,
     questions: Sequence[Question],
     effort: Effort = FIRST_CALL,
-    progress: Callable[[int], None] | None = None,
+    progress: ShowProgress = False,
 ) -> list[Answer]:
     """Predict the wanted frames of several scenes, by jumps or step by step as the model does; see `jumps` and
     `rollouts` for the arguments and errors."""
     began = time.perf_counter()
-    if model.config.jumps:
+    if model.config.scheme.jumps:
         predicted = jumps(model, questions, effort, progress)
     else:
         effort.check(model.config)
@@ -84,7 +85,7 @@ def new_question(
     scene.require_predictable(name)  # before anything is told of such a scene
     _require_material(config, scope, scene, name)
     _require_resolved(scene, name)
-    notes = (*notes, *_loose(scene), *scope.notes(scene, motion, bool(config.jumps)))
+    notes = (*notes, *_loose(scene), *scope.notes(scene, motion, config.scheme.needs_each_frame))
     return Question(name, scene, motion.position, fields, movable=True, notes=notes).asking(frames)
 
 
@@ -187,11 +188,13 @@ def _require_material(config: ModelConfig, scope: Scope, scene: Scene, name: str
     )
 
 
-def in_domain(model: Simulator, questions: Sequence[Question], effort: Effort) -> list[Answer]:
+def in_domain(
+    model: Simulator, questions: Sequence[Question], effort: Effort, progress: ShowProgress = False
+) -> list[Answer]:
     """Predict scenes where they lie; those that may be moved and leave the domain in the middle of the domain."""
     shifts = [_way_into_domain(model.config, question) for question in questions]
     there = [q if shift is None else _moved_question(q, shift) for q, shift in zip(questions, shifts, strict=True)]
-    predicted = zip(questions, shifts, answers(model, there, effort), strict=True)
+    predicted = zip(questions, shifts, answers(model, there, effort, progress), strict=True)
     return [answer if shift is None else _moved_back(question, answer, shift) for question, shift, answer in predicted]
 
 

@@ -18,6 +18,7 @@ from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.runs.scope import Scope
 from ast_sim.support.errors import ConfigError
+from ast_sim.support.progress import Progress, ShowProgress
 from ast_sim.view import sweep_files
 from ast_sim.view.files import make_folder
 
@@ -77,6 +78,7 @@ def sweep(
     effort: Effort,
     error: AskedError | None,
     nodes: int | None,
+    progress: ShowProgress,
 ) -> Sweep:
     """Predict the last frame for each row of values.
 
@@ -87,28 +89,30 @@ def sweep(
     Args:
         predict_scenes: of a `Run`.
         config, scope, trained: of its model, and the scenes and the specification that it was trained on.
-        spec, rows, error, nodes: those of `Run.sweep`.
+        spec, rows, error, nodes, progress: those of `Run.sweep`.
         effort: as it is asked, or as the error has chosen it.
     """
     if not rows:
         raise ConfigError("a sweep needs at least one row of values")
     needs_way = bool((config.data.friction or FRICTION in config.data.columns) and effort.newton_steps)
-    frames = 2 if config.jumps and not needs_way and config.history is None else None
+    frames = None if needs_way or config.scheme.follows_motion else 2
     asked_for = {"effort": effort} if error is None else {"error": error}
     table, seconds, notes, unpromised = [], 0.0, [], 0
-    for start in range(0, len(rows), TOGETHER):
-        asked = ask(spec, rows[start : start + TOGETHER], scope, trained, frames, nodes)
-        names = [f"row {start + number}" for number in range(len(asked))]
-        wanted = [-2, -1] if needs_way and len(asked[0].motion.position) > 2 else [-1]
-        scenes = [(one.scene, one.motion) for one in asked]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # told once for all rows
-            answers = predict_scenes(scenes, names=names, frames=wanted, throw=False, **asked_for)
-        told = [(*one.notes, *answer.notes) for one, answer in zip(asked, answers, strict=True)]
-        notes += [f"{name}: {note}" for name, row in zip(names, told, strict=True) for note in row]
-        table += [_row(one.values, answer, one.origin) for one, answer in zip(asked, answers, strict=True)]
-        unpromised += sum(error is not None and "promise" not in answer.source for answer in answers)
-        seconds += sum(answer.seconds for answer in answers)
+    with Progress(len(rows), "rows", progress) as bar:
+        for start in range(0, len(rows), TOGETHER):
+            asked = ask(spec, rows[start : start + TOGETHER], scope, trained, frames, nodes)
+            names = [f"row {start + number}" for number in range(len(asked))]
+            wanted = [-2, -1] if needs_way and len(asked[0].motion.position) > 2 else [-1]
+            scenes = [(one.scene, one.motion) for one in asked]
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # told once for all rows
+                answers = predict_scenes(scenes, names=names, frames=wanted, throw=False, progress=False, **asked_for)
+            told = [(*one.notes, *answer.notes) for one, answer in zip(asked, answers, strict=True)]
+            notes += [f"{name}: {note}" for name, row in zip(names, told, strict=True) for note in row]
+            table += [_row(one.values, answer, one.origin) for one, answer in zip(asked, answers, strict=True)]
+            unpromised += sum(error is not None and "promise" not in answer.source for answer in answers)
+            seconds += sum(answer.seconds for answer in answers)
+            bar.advance(names[-1], len(asked))
     outside = {note.partition(":")[0] for note in notes}
     if outside:
         warnings.warn(

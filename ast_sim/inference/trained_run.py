@@ -30,7 +30,7 @@ from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.own_assembly.grid import grid, read_table
 from ast_sim.support.errors import ConfigError, RolloutError
 from ast_sim.support.notebook_table import html_table, one_line
-from ast_sim.support.progress import Progress
+from ast_sim.support.progress import Progress, ShowProgress
 from ast_sim.support.provenance import provenance
 from ast_sim.support.toml_settings import NOTHING
 
@@ -187,6 +187,7 @@ class Run:
         effort: Effort | None = None,
         error: AskedError | None = None,
         nodes: int | None = None,
+        progress: ShowProgress = True,
     ) -> Sweep:
         """Predict the last frame of an assembly for many values of its parameters, in batches.
 
@@ -195,7 +196,7 @@ class Run:
             parameters: values of the parameters by name: one, or a list. The sweep takes every combination.
             table: instead of parameters, a CSV file whose first line names parameters, or a list of mappings from names
                 to values.
-            effort, error, nodes: as for `predict`.
+            effort, error, nodes, progress: as for `predict`; as for `generate`.
 
         Raises:
             ConfigError: as for `predict`; or values and a table are both given.
@@ -207,7 +208,7 @@ class Run:
         rows = rows if isinstance(rows, Sequence) and not isinstance(rows, str) else read_table(rows)
         chosen, _ = chosen_effort(self, [], effort, error)
         model, trained = self.settings.model, self.folder.specification
-        return sweep(self.predict_scenes, model, self.scope, trained, spec, rows, chosen, error, nodes)
+        return sweep(self.predict_scenes, model, self.scope, trained, spec, rows, chosen, error, nodes, progress)
 
     def predict_scenes(
         self,
@@ -219,9 +220,10 @@ class Run:
         error: AskedError | None = None,
         num_frames: int | None = None,
         throw: bool = True,
+        progress: ShowProgress = True,
     ) -> list[Answer]:
-        """Predict several scenes, each under a motion, as one batch; the other arguments and errors are those of
-        `predict`."""
+        """Predict several scenes, each under a motion, as one batch. `progress` is as in `generate`; errors
+        and other arguments are those of `predict`."""
         began = time.perf_counter()
         names = [f"scene {number}" for number in range(len(scenes))] if names is None else names
         config, scope = self.settings.model, self.scope
@@ -230,7 +232,7 @@ class Run:
             for (scene, motion), name in zip(scenes, names, strict=True)
         ]
         chosen, promises = chosen_effort(self, questions, effort, error)
-        return self._answers(questions, chosen, began, throw, promises)
+        return self._answers(questions, chosen, began, throw, promises, progress)
 
     def predict_motions(
         self,
@@ -243,26 +245,30 @@ class Run:
         num_frames: int | None = None,
         name: str = "scene",
         throw: bool = True,
+        progress: ShowProgress = True,
     ) -> list[Answer]:
-        """Predict one scene under several motions, as one batch; the answers have the order of the motions.
-
-        Arguments and errors are those of `predict`.
-        """
+        """Predict one scene under several motions, as one batch; the answers have the order of the motions. Arguments
+        and errors are those of `predict_scenes`."""
         names = [f"{name}, motion {number}" for number in range(len(motions))]
         scenes = [(scene, motion) for motion in motions]
-        return self.predict_scenes(
-            scenes, names=names, frames=frames, effort=effort, error=error, num_frames=num_frames, throw=throw
-        )
+        shared = {"frames": frames, "effort": effort, "error": error, "num_frames": num_frames}
+        return self.predict_scenes(scenes, names=names, throw=throw, progress=progress, **shared)
 
     def _answers(
-        self, questions: list[Question], effort: Effort, began: float, throw: bool, facts: Sequence[Mapping[str, Any]]
+        self,
+        questions: list[Question],
+        effort: Effort,
+        began: float,
+        throw: bool,
+        facts: Sequence[Mapping[str, Any]],
+        progress: ShowProgress = False,
     ) -> list[Answer]:
         """The answers with their units, their origin, to which `facts` of each belong, and the error that is to be
         expected. What is unusual is told as warnings; `began` is when the questions were asked."""
         for question in questions:
             for note in question.notes:
                 warnings.warn(f"{question.name}: {note}", stacklevel=3)
-        answers = in_domain(self.model, questions, effort)
+        answers = in_domain(self.model, questions, effort, progress)
         seconds = (time.perf_counter() - began) / max(1, len(questions))
         told = []
         for question, answer, known in zip(questions, answers, facts, strict=True):
@@ -320,21 +326,20 @@ class Run:
         command: str = "Run.evaluate",
         rival_scenes: int = 0,
         made_from: str | os.PathLike[str] | None = None,
+        progress: ShowProgress = True,
     ) -> Evaluation:
-        """Predict all scenes of a split and measure the errors; on a terminal a bar shows the progress.
+        """Predict all scenes of a split and measure the errors.
 
         Args:
             data: a dataset, its path or open; by default the one that the run was trained on.
             command: the command that is recorded beside the figures.
             rival_scenes: in so many scenes the solver solves the deepest frame, in several ways, to compare.
             made_from: the specification or the parts of your own of which the dataset was made; the solver needs them.
+            progress: as in `generate`; it counts scenes, once for all frames, once for the deepest, once solved.
         """
         with self.open(data) as dataset:
-            scenes = dataset.count(split)
-            with Progress(2 * scenes + rival_scenes, 0, "scenes") as bar:
-                figures = evaluate(
-                    self.model, dataset, split, lambda name: bar.advance(), self.effort, rival_scenes, made_from
-                )
+            with Progress(2 * dataset.count(split) + rival_scenes, "scenes", progress) as bar:
+                figures = evaluate(self.model, dataset, split, bar.advance, self.effort, rival_scenes, made_from)
             origin = {"run": str(self.path), "step": self.step, "data": str(dataset.path), "split": split}
             figures = dataclasses.replace(figures, origin={**provenance(command), **origin})
             return Evaluation(self, dataset.path, figures)

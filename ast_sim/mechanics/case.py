@@ -84,15 +84,6 @@ class SolidCase:
         way = np.linalg.norm(self.targets - self.targets[0], axis=2)[:, self.scene.prescribed].max(axis=1, initial=0)
         return self.targets[len(way) - 1 - int(np.argmax(way[::-1]))]
 
-    @property
-    def deforming(self) -> np.ndarray:
-        """[E] bool: the elements that are not rigid. They have a node that is not an OBSTACLE node.
-
-        `Scene.deforming_elements` has fewer elements: those without any OBSTACLE node. The solver needs more. An
-        element with some OBSTACLE nodes is strained when its other nodes move, so it has elastic forces.
-        """
-        return self.scene.deforming_nodes[self.scene.elements].any(axis=1)
-
 
 @dataclass(frozen=True, eq=False)
 class Drawn:

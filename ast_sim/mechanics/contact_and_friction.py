@@ -73,8 +73,9 @@ class ContactSettings:
 
     def frictions(self, scene: Scene) -> list[float]:
         """The coefficients of friction that act in a scene, ascending, each once. Rigid bodies do not rub on others."""
-        deforms = {int(body): bool(scene.deforming_nodes[scene.body == body].any()) for body in np.unique(scene.body)}
-        rubbing = [pair for pair in itertools.combinations(deforms, 2) if deforms[pair[0]] or deforms[pair[1]]]
+        rigid = scene.rigid_bodies
+        pairs = itertools.combinations(np.unique(scene.body).tolist(), 2)
+        rubbing = [pair for pair in pairs if not rigid.issuperset(pair)]
         coefficients = {self.friction_between(*pair) for pair in rubbing}
         return sorted(coefficients | {self.friction} if self.self_contact or not coefficients else coefficients)
 

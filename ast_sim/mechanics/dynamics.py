@@ -69,8 +69,8 @@ class ClothCase:
 
     @property
     def cloth_triangles(self) -> np.ndarray:
-        """[T,3] the triangles that are not rigid, by the rule of `SolidCase.deforming`."""
-        return self.scene.elements[self.scene.deforming_nodes[self.scene.elements].any(axis=1)]
+        """[T,3] the triangles that are not rigid, by `Scene.rigid_elements`."""
+        return self.scene.elements[~self.scene.rigid_elements]
 
 
 class BackwardEuler(Newton):

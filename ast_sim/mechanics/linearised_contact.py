@@ -91,7 +91,7 @@ class NewtonSteps:
     def __init__(self, scene: Scene, material: NeoHookean, clearance: float, friction: float = 0.0) -> None:
         self._scene, self._clearance, self._friction = scene, clearance, friction
         self._rest = scene.rest_position.astype(np.float64)
-        self._deforming = np.flatnonzero(scene.deforming_nodes[scene.elements].any(axis=1))
+        self._deforming = np.flatnonzero(~scene.rigid_elements)
         elements = scene.elements[self._deforming].astype(np.int64)
         self.elasticity = elastic_body(self._rest, elements, material.of(self._deforming))
         held = np.ones(scene.num_nodes, bool)

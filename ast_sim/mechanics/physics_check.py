@@ -161,7 +161,7 @@ def check_physics(
 
 def turned_over(scene: Scene, position: np.ndarray) -> float:
     """How many deforming tetrahedra have another sign at positions [N, 3] than at rest; 0 in a scene of triangles."""
-    elements = scene.elements[scene.deforming_nodes[scene.elements].any(axis=1)]
+    elements = scene.elements[~scene.rigid_elements]
     if elements.shape[1] == 3:
         return 0.0
     sign = np.sign(signed_volumes(scene.rest_position, elements))
@@ -178,11 +178,11 @@ def _overlap(scene: Scene, position: np.ndarray) -> tuple[float, float]:
     surface = scene.surface()
     owner = scene.body[surface[:, 0]]
     faces = {body: surface[owner == body] for body in np.unique(owner).tolist()}
-    movable = {body for body in faces if scene.deforming_nodes[scene.body == body].any()}
+    rigid = scene.rigid_bodies
     areas = _vector_areas(position, surface)
     deepest = total = 0.0
     for one, other in combinations(faces, 2):
-        if not movable & {one, other}:
+        if rigid >= {one, other}:
             continue
         volumes = [0.0]
         for mine, theirs in ((one, other), (other, one)):
@@ -217,7 +217,7 @@ class _Balance:
         self._friction = law.friction(scene)
         self._pairs = law.newton_steps(scene)
         rest = scene.rest_position.astype(np.float64)
-        deforming = np.flatnonzero(scene.deforming_nodes[scene.elements].any(axis=1))
+        deforming = np.flatnonzero(~scene.rigid_elements)
         elements = scene.elements[deforming].astype(np.int64)
         self._elasticity = elastic_body(rest, elements, law.of_elements(scene).of(deforming))
         settings = ContactSettings(law.contact_range, 1.0)

@@ -148,7 +148,7 @@ class SolidFrames(Frames):
             raise SimulationError(f"the bundled solver knows elastic laws only, but body {bodies} yields: use CalculiX")
         scene = case.scene
         rest = case.scene.rest_position.astype(np.float64)
-        self._deforming = np.flatnonzero(case.deforming)
+        self._deforming = np.flatnonzero(~case.scene.rigid_elements)
         if prepared is None:
             self._elasticity = elastic_body(rest, scene.elements[self._deforming], case.material.of(self._deforming))
             system = None

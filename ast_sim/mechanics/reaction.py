@@ -19,7 +19,7 @@ from ast_sim.element_topology import linear_elements
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.elements.second_order import elastic_body
-from ast_sim.scene import NodeType, Scene
+from ast_sim.scene import Scene
 
 REACH = 1.0  # a node counts as touched if another body is nearer than so many mean edge lengths
 OPPOSITE = 0.5  # cosine between opposite normals, at most; at an edge, a normal is the mean of its faces
@@ -42,7 +42,7 @@ class Reaction:
         self.scene = scene
         self.driven = driven
         self._rest = scene.rest_position.astype(np.float64)
-        soft = np.flatnonzero(scene.deforming_nodes[scene.elements].any(axis=1))
+        soft = np.flatnonzero(~scene.rigid_elements)
         self._elasticity = elastic_body(self._rest, scene.elements[soft], law.of(soft))
         linear = linear_elements(scene.elements[soft].astype(np.int64))
         self._laplacian = -igl.cotmatrix(self._rest, linear).tocsr()
@@ -82,10 +82,8 @@ class Reaction:
         driven = self.driven
         nearest = self._nearest_body(position)
         held = scene.prescribed & self._deforming
-        if scene.node_type[scene.body == driven.body][0] == NodeType.OBSTACLE:
-            source = (nearest == driven.body) & ~held
-        else:
-            source = held & driven.nodes
+        touched = (nearest == driven.body) & ~held
+        source = touched if driven.body in scene.rigid_bodies else held & driven.nodes
         return source, (held | (nearest >= 0)) & ~source
 
     def _nearest_body(self, position: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self
 
+from ast_sim.batches.scheme import Scheme
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.named_field import REACTION, Output
 from ast_sim.support.errors import ConfigError
@@ -100,6 +101,11 @@ class ModelConfig:
         """The parts of the graph that the inputs need: arguments of `Graph.from_scene`."""
         elastic = "out_of_balance" in self.node_inputs
         return {"surface": "proximity" in self.node_inputs, "elastic": self.data.material if elastic else None}
+
+    @property
+    def scheme(self) -> Scheme:
+        """How the model predicts, when nothing is left open."""
+        return Scheme(bool(self.jumps), self.data.given_frames, turns=self.history is not None)
 
     @property
     def history(self) -> tuple[Output, ...] | None:

@@ -129,17 +129,19 @@ class Simulator(nn.Module):
         model. Scenes in different domains are not predicted together."""
         return 0
 
-    def pairs(self, dataset: Dataset, split: str = "train", *, batch_size: int, **options: Any) -> PairSampler:
-        """The frame pairs of a split in batches that fit this model.
+    def pairs(self, dataset: Dataset, split: str = "train", *, batch_size: int = 1, **options: Any) -> PairSampler:
+        """The frame pairs of a split in batches that fit this model, for a DataLoader of torch or by number:
 
+        loader = DataLoader(pairs := model.pairs(dataset), batch_size=4, shuffle=True, collate_fn=pairs.collate)
         batch, target = model.pairs(dataset, batch_size=4).batch(step)
 
         Args:
+            batch_size: of `batch`; a DataLoader has its own.
             options: seed (0 by default), noise (0), gamma (1), mirror, shift, scenes and part, as of `PairSampler`.
         """
         options = {"seed": 0, "noise": 0.0, "gamma": 1.0, **options, "batch_size": batch_size}
         data = self.config.data
-        of_model = {"make_graph": self.graph, "dynamic": data.dynamic, "jumps": self.config.jumps}
+        of_model = {"make_graph": self.graph, "dynamic": data.dynamic, "jumps": self.config.scheme.jumps}
         of_model |= {"fields": data.fields, "history": self.config.history}
         return PairSampler(dataset, split, **of_model, **options)
 

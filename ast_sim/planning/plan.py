@@ -13,12 +13,12 @@ from typing import Any
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.planning.forecast import Forecast, forecast
-from ast_sim.planning.trials import GROWTH, MINUTES, Trial, Trials, candidates
+from ast_sim.planning.trials import GROWTH, LONGEST, MINUTES, Trial, Trials, candidates, trials_of
 from ast_sim.runs.config_toml import write_settings
 from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.disk import write_json
 from ast_sim.support.errors import ConfigError
-from ast_sim.support.progress import duration
+from ast_sim.support.progress import Progress, ShowProgress, duration
 from ast_sim.support.provenance import provenance
 from ast_sim.support.toml_settings import require_range
 from ast_sim.training.asked_settings import changes_of, configure, differences, path_of
@@ -26,6 +26,7 @@ from ast_sim.training.data_lengths import pairs_of
 from ast_sim.training.parallel.launch import usual_processes
 
 SETTINGS, FIGURES = "best.toml", "plan.json"
+SHARE = 28 / 9 * LONGEST  # of the minutes, for all trials: 4 of a ninth, 2 of a third and 2 of the longest
 LEAST_SCENES = 4  # of the training split: a trial has half of them
 
 
@@ -85,6 +86,7 @@ def plan(
     preset: str | None = None,
     state: Sequence[str] = (),
     model_settings: Mapping[str, Any] | None = None,
+    progress: ShowProgress = True,
     **settings: Any,
 ) -> Plan:
     """Find good settings for a training of so many minutes by short trials, and say what it will give. The trials take
@@ -97,6 +99,8 @@ def plan(
         out: folder for the trials, the figures (`plan.json`) and the settings to train with (`best.toml`).
         minutes: of the training that is planned.
         model, preset, state, model_settings, settings: as for `train`, without `minutes` and `steps`.
+        progress: True: a line for each trial, on a terminal a bar; False: nothing is written, but the lines go to the
+            logger "ast_sim"; or a function of (trials done, all trials, which one).
 
     Raises:
         ConfigError: the minutes are too few to plan, the dataset has too few scenes or no validation scenes, or as for
@@ -105,25 +109,34 @@ def plan(
         DatasetError: the dataset cannot be read.
     """
     config = configure(path_of(data), preset, (), model, changes=changes_of(state, model_settings, settings))
-    return planned(config, Path(out), minutes, preset or "tiny")
+    return planned(config, Path(out), minutes, preset or "tiny", progress=progress)
 
 
-def planned(config: RunConfig, out: Path, minutes: float, preset: str = "tiny", command: str = "ast_sim.plan") -> Plan:
-    """`plan` for settings as `train` has them; each trial is printed."""
+def planned(
+    config: RunConfig,
+    out: Path,
+    minutes: float,
+    preset: str = "tiny",
+    command: str = "ast_sim.plan",
+    progress: ShowProgress = True,
+) -> Plan:
+    """`plan` for settings as `train` has them."""
     require_range("minutes", minutes, *MINUTES)
     _require_open(config)
     scenes, valid, pairs = _counted(config)
     config = _with_processes(config, minutes)
     trials = Trials(out, scenes, valid)
     tried = candidates(config, preset)
-    made = []
-    for trial in trials.rounds(tried, trials.first_steps(tried, minutes)):
-        _tell(trial)
-        made.append(trial)
-    longest = made[-1]
-    best = tried[longest.name]
-    half = trials.trained(longest.name, best, longest.steps, scenes // 2)
-    _tell(half)
+    made: list[Trial] = []
+    with Progress(trials_of(len(tried)) + 1, "trials", progress) as bar:
+        bar.line(f"the trials take about {duration(60 * minutes * SHARE)}")
+        for trial in trials.rounds(tried, trials.first_steps(tried, minutes)):
+            made.append(trial)
+            _tell(trial, bar)
+        longest = made[-1]
+        best = tried[longest.name]
+        half = trials.trained(longest.name, best, longest.steps, scenes // 2)
+        _tell(half, bar)
     own = [(trial.steps, trial.error) for trial in made if trial.name == longest.name]
     steps = int(60 * minutes / longest.seconds)
     batch = best.train.batch_size * best.train.accumulate
@@ -178,8 +191,10 @@ def _counted(config: RunConfig) -> tuple[int, int, int]:
         return scenes, valid, pairs_of(dataset, scenes)
 
 
-def _tell(trial: Trial) -> None:
-    print(f"{trial.name}: {trial.steps:,} steps, {trial.scenes:,} scenes, error {_percent(trial.error)}", flush=True)
+def _tell(trial: Trial, bar: Progress) -> None:
+    text = f"{trial.name}: {trial.steps:,} steps, {trial.scenes:,} scenes, error {_percent(trial.error)}"
+    bar.line(text)
+    bar.advance(text)
 
 
 def _percent(share: float) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -66,6 +66,14 @@ def candidates(base: RunConfig, preset: str) -> dict[str, RunConfig]:
     return tried
 
 
+def trials_of(candidates: int) -> int:
+    """The number of trials in all rounds."""
+    counts = [candidates]
+    while len(counts) < ROUNDS:
+        counts.append(max(1, counts[-1] // 2))
+    return sum(counts)
+
+
 class Trials:
     """Trains candidates in a folder; what is there already is not trained again.
 
@@ -99,8 +107,7 @@ class Trials:
         )
         about = f"{name}, {steps} steps" + (f", {scenes} scenes" if scenes else "")
         folder = self.folder / about.replace(", ", "_").replace(" ", "-")
-        with _told_in(folder.with_name(folder.name + ".log")):
-            start_training(folder, dataclasses.replace(config, train=options), resume=True)
+        start_training(folder, dataclasses.replace(config, train=options), resume=True, progress=False)
         metrics = RunFolder(folder).metrics
         record, seconds = metrics.validation(steps), metrics.seconds_per_step()
         if record is None or record["valid_rmse"] is None or seconds is None:
@@ -152,11 +159,3 @@ def _cost(name: str) -> str:
 
 def _of_one_cost(tried: dict[str, RunConfig]) -> dict[str, RunConfig]:
     return {name: config for name, config in tried.items() if _cost(name) == name}
-
-
-@contextmanager
-def _told_in(log: Path) -> Iterator[None]:
-    """Within the block what a training prints goes into a file; its bar stays on the terminal."""
-    log.parent.mkdir(parents=True, exist_ok=True)
-    with open(log, "a", encoding="utf-8") as file, redirect_stdout(file):
-        yield

@@ -17,7 +17,7 @@ from ast_sim.inference.effort import Effort
 from ast_sim.inference.trained_run import Run
 from ast_sim.planning.trials import MINUTES, TIMED, Trials
 from ast_sim.simulate.jobs.generate import checked_workers, generate
-from ast_sim.support.progress import duration
+from ast_sim.support.progress import ShowProgress, duration
 from ast_sim.support.toml_settings import require_range
 from ast_sim.training.asked_settings import configure
 from ast_sim.training.loop import OFTEN
@@ -81,6 +81,7 @@ def worth(
     nodes: int | None = None,
     frames: int | None = None,
     solver: str | None = None,
+    progress: ShowProgress = True,
 ) -> Worth:
     """Solve a few scenes of a specification and time training steps and answers, to say when a model pays.
 
@@ -88,7 +89,7 @@ def worth(
         spec: the specification of an assembly (TOML).
         out: folder for the scenes and a training of a few steps; a second call goes on with what is there.
         minutes: of the training.
-        nodes, frames, solver: as for `generate`.
+        nodes, frames, solver, progress: as for `generate`.
 
     Raises:
         AstSimError: the specification has a mistake, or scenes cannot be solved.
@@ -97,7 +98,7 @@ def worth(
     make_folder(folder := Path(out))
     made = generate(
         "assembly", folder / "scenes.h5", train=SOLVED - 1, valid=1, test=0, nodes=nodes, frames=frames, solver=solver,
-        spec=spec,
+        spec=spec, progress=progress,
     )  # fmt: skip
     config = configure(made.path)
     with Dataset(made.path) as dataset:

@@ -13,7 +13,7 @@ import numpy as np
 from ast_sim.element_topology import signed_volumes
 from ast_sim.plausibility.findings import Finding, places, point
 from ast_sim.plausibility.topology import at_rest
-from ast_sim.scene import NodeType, Scene, Trajectory
+from ast_sim.scene import Scene, Trajectory
 
 # Edges of an obstacle keep their lengths up to this share of the longest edge.
 _RIGID = 0.02
@@ -65,7 +65,7 @@ def _far(scene: Scene, position: np.ndarray) -> list[Finding]:
 
 def _soft_tools(scene: Scene, position: np.ndarray) -> list[Finding]:
     edges = scene.edges()
-    edges = edges[(scene.node_type[edges] == NodeType.OBSTACLE).all(axis=1)]
+    edges = edges[~scene.deforming_nodes[edges].any(axis=1)]
     if not len(edges):
         return []
     rest = _lengths(scene.rest_position, edges)
@@ -114,7 +114,7 @@ def _contact(scene: Scene, position: np.ndarray) -> list[Finding]:
     from scipy.spatial import KDTree
 
     deforming = scene.edges()
-    deforming = deforming[(scene.node_type[deforming] != NodeType.OBSTACLE).any(axis=1)]
+    deforming = deforming[scene.deforming_nodes[deforming].any(axis=1)]
     if not len(deforming):
         return []
     spacing = float(_lengths(scene.rest_position, deforming).mean())

@@ -33,7 +33,7 @@ def overlaps(scene: Scene) -> list[Finding]:
     if len(bodies) > _MOST_BODIES:
         return []
     faces = {body: surface[owner == body] for body in bodies.tolist()}
-    rigid = {body for body in faces if not scene.deforming_nodes[scene.body == body].any()}
+    rigid = scene.rigid_bodies
     boxes = {body: (rest[f].min(axis=(0, 1)), rest[f].max(axis=(0, 1))) for body, f in faces.items()}
     edge = _mean_edge(rest, surface)
     findings = []

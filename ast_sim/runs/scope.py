@@ -45,11 +45,11 @@ class Scope:
     material_high: tuple[float, ...]
     data: DataFacts
 
-    def notes(self, scene: Scene, motion: Motion, jumps: bool) -> Iterator[str]:
-        """One sentence for each property of a scene and its prescribed motion that lies outside its range. For a model
-        that jumps, it does not matter how far prescribed nodes move in one frame."""
+    def notes(self, scene: Scene, motion: Motion, each_frame: bool) -> Iterator[str]:
+        """One sentence for each property of a scene and its prescribed motion that lies outside its range. How far
+        prescribed nodes move in one frame matters where `each_frame` is predicted from the one before."""
         length = f" {self.length_unit}"
-        increment = 0.0 if jumps else max(motion.increments(scene))
+        increment = max(motion.increments(scene)) if each_frame else 0.0
         for (low, high), value, text, unit in (
             ((self.corners, self.corners), scene.elements.shape[1], "the elements have {} nodes", ""),
             (self.nodes, scene.num_nodes, "the scene has {} nodes", ""),

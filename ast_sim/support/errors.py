@@ -17,6 +17,10 @@ class AstSimError(Exception):
     """Base of all errors that a user can act on."""
 
 
+class LooksWrong(UserWarning):
+    """A line of the table of what can be read but is probably wrong in data."""
+
+
 class ConfigError(AstSimError, ValueError):
     """A setting that does not exist or does not fit."""
 

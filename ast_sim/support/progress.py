@@ -1,13 +1,34 @@
-"""Long computations: how they show their progress and the remaining time."""
+"""Long computations: how they show their progress and the remaining time.
+
+A function that may take long has the argument `progress`:
+
+    True          a bar on a terminal, a line every ten seconds elsewhere; nothing in the first second
+    False         nothing
+    a function    it is called with (done, total, text), where the text says what was done or how it goes
+
+Lines that tell more than how far the work is go to the logger "ast_sim", and where `progress` is True they are shown.
+"""
 
 from __future__ import annotations
 
+import logging
 import sys
 import time
 from collections import deque
+from collections.abc import Callable
 from typing import Self
 
 from tqdm import tqdm
+
+from ast_sim.support.errors import ConfigError
+
+ShowProgress = bool | Callable[[int, int, str], None]
+
+LOG = logging.getLogger("ast_sim")
+LOG.addHandler(logging.NullHandler())  # the user decides whether it is shown
+
+SECONDS_BETWEEN_LINES = 10.0
+SECONDS_BEFORE_BAR = 1.0
 
 
 def duration(seconds: float) -> str:
@@ -66,31 +87,79 @@ class Clock:
 
 
 class Progress:
-    """Shows progress: as a bar on a terminal, as plain lines elsewhere."""
+    """Counts up to `total`; a context manager, which begins the count.
 
-    def __init__(self, total: int, done: int, unit: str) -> None:
-        layout = "{percentage:3.0f} % |{bar:24}| {n_fmt}/{total_fmt} {unit}{postfix}"
-        self._bar = tqdm(
-            total=total, initial=done, unit=unit, bar_format=layout, disable=not sys.stderr.isatty(), dynamic_ncols=True
-        )
+    Args:
+        unit: what is counted, such as "scenes".
+        progress: how it is shown, see above.
+        done: so many were made before; rate and time to go are those of the others.
 
-    def advance(self) -> None:
-        self._bar.update()
+    Raises:
+        ConfigError: `progress` is neither True, False nor a function.
+    """
 
-    def show(self, text: str) -> None:
-        """Replace the text behind the bar; without a bar print a line."""
-        if self._bar.disable:
-            self.line(text)
-        else:
-            self._bar.set_postfix_str(text)
+    bar_format: str | None = None  # of tqdm
 
-    def line(self, text: str) -> None:
-        """Print a line that stays."""
-        self._bar.write(text)
-        sys.stdout.flush()
+    def __init__(self, total: int, unit: str, progress: ShowProgress, done: int = 0) -> None:
+        if not (isinstance(progress, bool) or callable(progress)):
+            raise ConfigError(f"progress is {progress!r}: it must be True, False or a function of (done, total, text)")
+        self.total, self.unit, self.done = total, unit, done
+        self.shown = progress is True
+        self._call = None if isinstance(progress, bool) else progress
+        self._bar: tqdm | None = None
 
     def __enter__(self) -> Self:
+        self._before = self.done
+        self._started = time.monotonic()
+        self._last_line = self._started
+        if self.shown and sys.stderr.isatty():
+            self._bar = tqdm(
+                total=self.total,
+                initial=self.done,
+                unit=f" {self.unit}",
+                bar_format=self.bar_format,
+                delay=SECONDS_BEFORE_BAR,
+                dynamic_ncols=True,
+                smoothing=0,
+            )
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._bar.close()
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+    def advance(self, text: str = "", count: int = 1) -> None:
+        """So many more are done; the text says what was."""
+        self.done += count
+        if self._bar is not None:
+            self._bar.update(count)
+        elif self._call is not None:
+            self._call(self.done, self.total, text)
+        elif self.shown:
+            self._tell_count()
+
+    def line(self, text: str, level: int = logging.INFO) -> None:
+        """Tell what is no progress."""
+        LOG.log(level, text)
+        if self.shown:
+            self.print(text)
+
+    def print(self, text: str) -> None:
+        """Show a line that stays, without disturbing the bar."""
+        if self._bar is not None:
+            self._bar.write(text, file=sys.stderr)
+        else:
+            print(text, file=sys.stderr, flush=True)
+
+    def _tell_count(self) -> None:
+        """Now and then, and at the end of long work, show a line that says how far it is."""
+        now = time.monotonic()
+        since = self._started if self.done == self.total else self._last_line
+        if now - since < SECONDS_BETWEEN_LINES:
+            return
+        self._last_line = now
+        rate = (self.done - self._before) / max(now - self._started, 1e-9)
+        left = duration((self.total - self.done) / rate)
+        speed = f"{rate:.3g}/s" if rate >= 1 else f"{duration(1 / rate)} each"
+        self.print(f"{self.done} of {self.total} {self.unit}, {speed}, {left} to go")

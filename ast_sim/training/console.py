@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import logging
 import math
 import signal
+import sys
 from collections.abc import Callable
 
 from torch import nn
@@ -14,7 +16,7 @@ from ast_sim.models.simulator import FIELD
 from ast_sim.named_field import STRESS
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.train_config import RunConfig
-from ast_sim.support.progress import Clock, Progress
+from ast_sim.support.progress import Clock, Progress, ShowProgress
 from ast_sim.support.stop_signals import StopSignals
 from ast_sim.training.callbacks import Listener
 from ast_sim.training.data_lengths import DataScales
@@ -24,25 +26,22 @@ from ast_sim.training.rates import learning_rate
 CONSTANT = 1e-3
 
 
-def introduce(model: nn.Module, config: RunConfig, dataset: Dataset, scales: DataScales, pairs: int) -> None:
-    """Print the sizes of the model and the data, the number of steps, and the noise relative to lengths of the data."""
+def introduction(model: nn.Module, config: RunConfig, dataset: Dataset, scales: DataScales, pairs: int) -> list[str]:
+    """Lines with the sizes of the model and the data, the number of steps, and the noise relative to lengths of the
+    data."""
     options, unit = config.train, dataset.info.length_unit
     scenes = options.batch_size * options.accumulate
     epochs = options.steps * scenes / pairs
     rms, spacing = max(scales.increment, 1e-300), max(scales.spacing, 1e-300)
-    print(f"parameters  {sum(p.numel() for p in model.parameters()):,}")
-    scenes_used = (
-        f"{scales.trajectories:,}" if options.scenes is None else f"{options.scenes:,} of {scales.trajectories:,}"
-    )
-    print(f"data        {scenes_used} scenes of about {scales.nodes:,} nodes, {pairs:,} pairs")
-    print(f"steps       {options.steps:,} of {scenes} scenes each: {epochs:.3g} epochs")
-    print(
+    used = f"{scales.trajectories:,}" if options.scenes is None else f"{options.scenes:,} of {scales.trajectories:,}"
+    return [
+        f"parameters  {sum(p.numel() for p in model.parameters()):,}",
+        f"data        {used} scenes of about {scales.nodes:,} nodes, {pairs:,} pairs",
+        f"steps       {options.steps:,} of {scenes} scenes each: {epochs:.3g} epochs",
         f"noise       {options.noise:.3g} {unit} = {options.noise / rms:.2g} x rms increment"
         f" = {options.noise / spacing:.2g} x mesh spacing",
-        flush=True,
-    )
-    for what, fact in config.model.facts(unit, spacing).items():
-        print(f"{what.lower():12}{fact}", flush=True)
+        *(f"{what.lower():12}{fact}" for what, fact in config.model.facts(unit, spacing).items()),
+    ]
 
 
 def _heard(method: Callable[..., None]) -> Callable[..., None]:
@@ -52,7 +51,7 @@ def _heard(method: Callable[..., None]) -> Callable[..., None]:
         try:
             method(self, *arguments)
         except OSError as error:
-            if error.errno not in (errno.EPIPE, errno.EIO):
+            if error.errno not in (errno.EPIPE, errno.EIO) or not self.began:
                 raise
             self.signals.received = self.signals.received or signal.SIGPIPE
 
@@ -60,15 +59,48 @@ def _heard(method: Callable[..., None]) -> Callable[..., None]:
 
 
 class Console(Progress):
-    """The progress of a training. If nobody reads the output any more (a closed pipe, a lost terminal), the training is
-    asked to stop as by the signal SIGPIPE."""
+    """The progress of a training; where there is no bar, lines with the losses take its place. If nobody reads the
+    output any more (a closed pipe, a lost terminal) once the steps have begun, the training is asked to stop as by the
+    signal SIGPIPE."""
 
-    def __init__(self, total: int, done: int, signals: StopSignals) -> None:
+    bar_format = "{percentage:3.0f} % |{bar:24}| {n_fmt}/{total_fmt} {unit}{postfix}"
+
+    def __init__(self, total: int, signals: StopSignals, progress: ShowProgress) -> None:
+        super().__init__(total, "steps", progress)
         self.signals = signals
-        super().__init__(total, done, "steps")
+        self.began = False
+        self._text = ""
 
-    advance = _heard(Progress.advance)
-    show = _heard(Progress.show)
+    def begin(self, done: int) -> Console:
+        """The steps begin; so many were made before."""
+        self.done = done
+        self.began = True
+        return self
+
+    def show(self, text: str) -> None:
+        """How the steps go: replace the text behind the bar, or show a line."""
+        self._text = text
+        if self._bar is not None:
+            self._bar.set_postfix_str(text)
+        elif self.shown:
+            self.print(text)
+
+    def print(self, text: str) -> None:
+        """Show a line that stays, on the standard output."""
+        if self._bar is not None:
+            self._bar.write(text)
+        else:
+            print(text, flush=True)
+        sys.stdout.flush()
+
+    def _advance(self) -> None:
+        super().advance(self._text)
+
+    def _tell_count(self) -> None:
+        """The lines of `show` tell it."""
+
+    advance = _heard(_advance)
+    show = _heard(show)
     line = _heard(Progress.line)
     __exit__ = _heard(Progress.__exit__)
 
@@ -91,7 +123,7 @@ class StepLog:
         for key, value in {**values, "steps": 1}.items():
             self.sums[key] = self.sums.get(key, 0.0) + value
 
-    def show(self, step: int, progress: Progress, writes: bool) -> None:
+    def show(self, step: int, progress: Console, writes: bool) -> None:
         """Show the means, and write them to `metrics.jsonl` if this process writes."""
         count = self.sums.pop("steps")
         means = {key: value / count for key, value in self.sums.items()}
@@ -113,7 +145,8 @@ class StepLog:
             # If all units of the decoder are dead, it gives every node the same output and never recovers.
             progress.line(
                 "warning: the predicted motion is the same at all nodes: the decoder is dead. Start again with another"
-                " train.seed, a lower train.peak_rate or a higher train.noise"
+                " train.seed, a lower train.peak_rate or a higher train.noise",
+                logging.WARNING,
             )
 
     def _validations_to_go(self, step: int) -> int:

@@ -124,7 +124,7 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
         rollout_pool=pool,
         shift=_shift(config, model),
     )
-    if resolved.calls > 1 and not model.jumps:
+    if resolved.calls > 1 and not model.scheme.corrects:
         raise ConfigError(f"train.calls is {resolved.calls}; without model.jumps it must be 1")
     if resolved.decay <= resolved.warmup:
         raise ConfigError(f"train.warmup is {resolved.warmup}; it must be below train.decay = {resolved.decay}")
@@ -133,7 +133,7 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
 
 def _noise(config: TrainConfig, scales: DataScales, model: ModelConfig, along_rollouts: bool) -> float:
     """The standard deviation of the noise on states; measurements chose the shares (docs/log.md, 2026-11-23)."""
-    if model.jumps:
+    if not model.scheme.errors_add_up:
         if config.noise:
             raise ConfigError(
                 f"train.noise = {config.noise} is of no use here: with model.jumps, a start has errors of the model's"
@@ -162,7 +162,7 @@ def _noise_gamma(config: TrainConfig, model: ModelConfig, noise: float) -> float
 def _rollout_pool(config: TrainConfig, model: ModelConfig) -> int:
     """The number of scenes in the pool of rollouts; 0: there is no pool."""
     useless = None
-    if model.jumps:
+    if not model.scheme.errors_add_up:
         useless = "with model.jumps, each frame follows from the first"
     elif config.noise == 0:
         useless = "without train.noise, states have no error"

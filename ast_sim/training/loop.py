@@ -27,10 +27,10 @@ from ast_sim.runs import checkpoint
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.support.errors import DatasetError, TrainingError
-from ast_sim.support.progress import Clock, duration
+from ast_sim.support.progress import Clock, ShowProgress, duration
 from ast_sim.support.stop_signals import Interrupted, StopSignals
 from ast_sim.training.callbacks import Callback, Listener
-from ast_sim.training.console import Console, StepLog, introduce
+from ast_sim.training.console import Console, StepLog, introduction
 from ast_sim.training.data_lengths import DataScales, largest_error
 from ast_sim.training.optimizer import Optimizer
 from ast_sim.training.parallel.processes import Processes
@@ -83,6 +83,7 @@ class Training:
         signals: StopSignals,
         processes: Processes | None = None,
         callback: Callback | None = None,
+        progress: ShowProgress = True,
     ) -> None:
         self.run, self.config, self.dataset, self.scales, self.signals = run, config, dataset, scales, signals
         self.options, self.processes = config.train, processes or Processes()
@@ -96,7 +97,8 @@ class Training:
         self.clock = Clock()
         self.listener = Listener(callback)
         self.log = StepLog(run.metrics, config, dataset, self.clock, self.listener)
-        self.saver = Saver(run, dataset, self.model, self.optimizer, self.pool, self.processes)
+        self.progress = Console(self.options.steps, signals, progress)
+        self.saver = Saver(run, dataset, self.model, self.optimizer, self.pool, self.processes, self.progress.line)
         self.step = 0
         self.stopping = 0  # the number of a signal that some process has received; 0: no signal
         self.told = False  # whether the user knows that more scenes would help more than more steps
@@ -110,7 +112,7 @@ class Training:
     def _pool(self, largest: float) -> Pool | None:
         """The pool of scenes that go on from the model's own answers; None: each batch is drawn anew."""
         options = self.options
-        if self.config.model.jumps:
+        if self.config.model.scheme.jumps:
             return JumpPool(self.sampler, JUMP_BATCHES * options.batch_size, options.calls, largest)
         return RolloutPool(self.sampler, options.rollout_pool, largest) if options.rollout_pool else None
 
@@ -124,7 +126,7 @@ class Training:
             whole = self.sampler if self.processes.count == 1 else sampler_of(self.model, self.dataset, self.options)
             fit_statistics(self.model, whole, self.options)
             for line in self.model.remarks():
-                print(line, flush=True)
+                self.progress.line(line)
         if self.processes.leads:
             self.log.metrics.forget_after(self.step)
             best = self.log.metrics.best()
@@ -144,7 +146,7 @@ class Training:
         options = self.options
         self._introduce()
         self.prepare()
-        with Console(options.steps, self.step, self.signals) as self.progress:
+        with self.progress.begin(self.step):
             validated = self.processes.of_leader(self.log.metrics.validation(self.step) is not None)
             if self.step and self._due(options.validate_every) and not validated:
                 self._validate()
@@ -170,7 +172,8 @@ class Training:
                     self._stop_if_asked()
 
     def _introduce(self) -> None:
-        introduce(self.model, self.config, self.dataset, self.scales, self.sampler.num_pairs)
+        for line in introduction(self.model, self.config, self.dataset, self.scales, self.sampler.num_pairs):
+            self.progress.line(line)
 
     def _due(self, every: int) -> bool:
         return self.step % every == 0 or self.step == self.options.steps
@@ -253,7 +256,7 @@ class Training:
         self.ahead.wait()
         mine = scenes[self.processes.rank :: self.processes.count]
         # Several processes must stop together, so none of them may stop within its own validation.
-        progress = self._stop_at_once if self.processes.count == 1 else None
+        progress = self._stop_at_once if self.processes.count == 1 else False
         return self.processes.gathered(
             validate(self.model, self.dataset, split, mine, self.options.calls, progress, efforts=split == "valid")
         )
@@ -295,6 +298,6 @@ class Training:
                 " steps"
             )
 
-    def _stop_at_once(self, frame: int) -> None:
+    def _stop_at_once(self, *_: object) -> None:
         self._heed_signals()
         self._stop_if_asked()

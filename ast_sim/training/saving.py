@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from torch import Tensor, nn
 
 from ast_sim.batches.training_pool import Pool
@@ -14,7 +16,8 @@ from ast_sim.training.parallel.processes import Processes
 
 
 class Saver:
-    """Saves and restores a training. Only the leading process uses files; it sends the others what they need."""
+    """Saves and restores a training. Only the leading process uses files; it sends the others what they need. `tell`
+    takes lines for the user."""
 
     def __init__(
         self,
@@ -24,9 +27,10 @@ class Saver:
         optimizer: Optimizer,
         pool: Pool | None,
         processes: Processes,
+        tell: Callable[[str], None],
     ) -> None:
         self.run, self.dataset, self.model, self.optimizer = run, dataset, model, optimizer
-        self.pool, self.processes = pool, processes
+        self.pool, self.processes, self.tell = pool, processes, tell
 
     def save(self, step: int, sums: dict[str, float], keep: int) -> None:
         """Write the checkpoint of a step; it holds the number of lines in `metrics.jsonl`."""
@@ -64,7 +68,7 @@ class Saver:
             return False
         self.model.load_state_dict(weights)
         start = self.run.origin["start"]
-        print(f"starts from {start['run']}, step {start['step']:,}", flush=True)
+        self.tell(f"starts from {start['run']}, step {start['step']:,}")
         return True
 
     def _newest(self) -> checkpoint.Content | None:
@@ -81,7 +85,7 @@ class Saver:
             )
         state = content[2]
         self.run.metrics.require(state["lines"])
-        print(f"going on after step {state['step']:,}", flush=True)
+        self.tell(f"going on after step {state['step']:,}")
         return content
 
 

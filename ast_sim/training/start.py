@@ -24,6 +24,7 @@ from ast_sim.runs.config_toml import has_config, write_config
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.errors import CheckpointError, ConfigError, TrainingError
+from ast_sim.support.progress import ShowProgress
 from ast_sim.support.stop_signals import StopSignals
 from ast_sim.training.asked_settings import changes_of, configure, differences, path_of
 from ast_sim.training.callbacks import Callback
@@ -47,6 +48,7 @@ def train(
     model_settings: Mapping[str, Any] | None = None,
     resume: bool = False,
     callback: Callback | None = None,
+    progress: ShowProgress = True,
     **settings: Any,
 ) -> Run:
     """Train a model on a dataset; returns the run, ready to predict.
@@ -66,6 +68,8 @@ def train(
         resume: continue after the newest checkpoint, if there is one.
         callback: called with (step, {name: float}) when the losses are logged and after validations, such as
             `TensorBoard(folder)`. What it raises ends the training, after a checkpoint of the step.
+        progress: True: a bar on a terminal, lines elsewhere; False: nothing is written, but the lines go to
+            `logging.getLogger("ast_sim")`, as always; or a function that is called with (step, steps, text).
         settings: changes of the training's settings (fields of `TrainConfig`), such as minutes=10, mirror=("x", "y").
 
     Raises:
@@ -77,7 +81,7 @@ def train(
     changes = changes_of(state, model_settings, settings)
     path = path_of(data)
     chosen = configure(path, preset, (), model, config=config, from_run=from_run, changes=changes)
-    start_training(Path(out), chosen, resume=resume, from_run=from_run, callback=callback)
+    start_training(Path(out), chosen, resume=resume, from_run=from_run, callback=callback, progress=progress)
     return Run(out)
 
 
@@ -114,6 +118,7 @@ def start_training(
     profile_steps: int = 0,
     from_run: str | os.PathLike[str] | None = None,
     callback: Callback | None = None,
+    progress: ShowProgress = True,
 ) -> None:
     """Train a model in the run folder `run`, or resume the training of the run in it.
 
@@ -121,8 +126,7 @@ def start_training(
         config: the settings; with `resume` they must equal those of the run, and None takes those of the run.
         resume: continue after the newest checkpoint, if there is one.
         profile_steps: if above 0, print how the time of so many steps divides, instead of training.
-        from_run: the run whose best checkpoint gives the first weights; `config` has its model.
-        callback: as for `train`; the leading process calls it.
+        from_run, callback, progress: as for `train`; `config` has the model of that run. The leading process calls.
 
     Raises:
         TrainingError: a loss or a gradient is not finite, the disk is full, or the folder already holds a run.
@@ -152,7 +156,8 @@ def start_training(
         with Dataset(asked.data) as dataset:
             scales = measure(dataset)
             fit = partial(resolve, dataset=dataset, scales=scales, keep_model=source is not None)
-            begin = partial(Training, folder, dataset=dataset, scales=scales, signals=signals, processes=processes)
+            shared = {"signals": signals, "processes": processes, "progress": progress}
+            begin = partial(Training, folder, dataset=dataset, scales=scales, **shared)
             asked = _with_steps(asked, saved, fit, begin)
             resolved = _cut(asked if config is None else fit(asked), processes.count)
             if source is not None:
@@ -165,8 +170,7 @@ def start_training(
                 spec = dataset.info.generator.get("spec")
                 write_config(folder.path, resolved, scope, dataset.fingerprint(), start, spec)
             with begin(config=resolved, callback=callback) as training:
-                go = partial(training.profile, profile_steps) if profile_steps else training.go
-                go()
+                training.profile(profile_steps) if profile_steps else training.go()
 
 
 def train_along() -> None:

@@ -34,7 +34,7 @@ def steps_within(minutes: float, training: Training) -> int:
     text = f"a step takes {1000 * step:.1f} ms, a validation {duration(validation)}"
     if count < 1:
         raise ConfigError(f"train.minutes is {minutes:g}, too few for one step: {text}")
-    print(f"{minutes:g} min     {count:,} steps, since {text}", flush=True)
+    training.progress.line(f"{minutes:g} min     {count:,} steps, since {text}")
     return count
 
 

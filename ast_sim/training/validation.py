@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
@@ -25,6 +25,7 @@ from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.predicting.rollout import rollouts
 from ast_sim.models.simulator import Simulator
 from ast_sim.scene import Trajectory
+from ast_sim.support.progress import ShowProgress
 
 MORE_CALLS = 2  # a model that jumps is validated with so many more calls than it is trained with
 ENOUGH = 0.01  # a further call must lower the error by this share
@@ -76,10 +77,11 @@ def validate(
     split: str,
     indices: Iterable[int],
     most_calls: int = 1,
-    progress: Callable[[int], None] | None = None,
+    progress: ShowProgress = False,
     efforts: bool = True,
 ) -> list[Validated]:
-    """Predict scenes of a split together; `progress` is called after each step and may raise to stop.
+    """Predict scenes of a split together; `progress` counts the frames of a model that goes step by
+    step; a function may raise to stop.
 
     Args:
         most_calls: how many calls correct one another in training.
@@ -90,7 +92,7 @@ def validate(
     names = [f"{split}/{index:06d}" for index in indices]
     if not truths:
         return []
-    if not model.config.jumps:
+    if not model.config.scheme.jumps:
         return _by_rollouts(model, indices, names, truths, progress)
     return _by_jumps(model, indices, names, truths, most_calls, efforts)
 
@@ -100,7 +102,7 @@ def _by_rollouts(
     indices: list[int],
     names: list[str],
     truths: list[Trajectory],
-    progress: Callable[[int], None] | None,
+    progress: ShowProgress,
 ) -> list[Validated]:
     given = model.config.data.given_frames
     questions = [Question.of(truth, name) for name, truth in zip(names, truths, strict=True)]

@@ -203,16 +203,14 @@ def measure(flips: int, cuts: int, seed: int, folder: Path) -> dict[str, Any]:
     bench = Bench(folder)
     counts: dict[str, dict[str, Counter[str]]] = {g: {"flips": Counter(), "cuts": Counter()} for g in GROUPS}
     bad = []
-    with Progress(flips + cuts, 0, "damages") as progress:
-        for done, damage in enumerate(damages(bench.intact, flips, cuts, seed), 1):
+    with Progress(flips + cuts, "damages", True) as progress:
+        for damage in damages(bench.intact, flips, cuts, seed):
             outcome, text = bench.outcome(damage)
             counts[damage.group]["cuts" if damage.bit is None else "flips"][outcome] += 1
             if outcome in ("silent", "traceback"):
                 bad.append({**vars(damage), "outcome": outcome, "text": text.replace(str(folder), "")})
                 progress.line(f"{damage}: {outcome}: {text.strip().splitlines()[-1]}")
-            progress.advance()
-            if not done % 500:
-                progress.show(f"{done:,} of {flips + cuts:,}")
+            progress.advance(str(damage))
     shown = {g: {kind: {o: c[o] for o in OUTCOMES} for kind, c in kinds.items()} for g, kinds in counts.items()}
     totals = {o: sum(c[o] for kinds in counts.values() for c in kinds.values()) for o in OUTCOMES}
     sizes = {str(p.relative_to(bench.intact)): p.stat().st_size for p in sorted(bench.intact.rglob("*")) if p.is_file()}

@@ -165,7 +165,7 @@ def test_many_simulations_become_a_dataset(tmp_path):
         contact_radius=0.02,
         time_step=0.25,
         length_unit="mm",
-        progress=told.append,
+        progress=lambda done, total, line: told.append(line),
     )
     assert counts == counted(8, 1, 1) and len(told) == 10
     with Dataset(tmp_path / "d.h5") as dataset:

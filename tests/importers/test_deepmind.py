@@ -105,11 +105,10 @@ def test_the_dataset_says_what_the_meta_file_says(tmp_path, family):
 def test_splits_limit_and_every(tmp_path):
     source = write(tmp_path, "sphere_simple")
     told = []
-    counts = convert_deepmind(
-        source, tmp_path / "d.h5", splits=["test", "train"], limit=2, every=3, progress=told.append
-    )
+    tell = lambda done, total, line: told.append((done, total, line))  # noqa: E731
+    counts = convert_deepmind(source, tmp_path / "d.h5", splits=["test", "train"], limit=2, every=3, progress=tell)
     assert counts == {"train": 2, "valid": 0, "test": 2, "calibration": 0}
-    assert told[0] == "train: train.tfrecord 0, 3 frames of 18 nodes" and len(told) == 4
+    assert told[0] == (1, 4, "train: train.tfrecord 0, 3 frames of 18 nodes") and len(told) == 4
     with Dataset(tmp_path / "d.h5") as dataset:
         assert dataset.info.time_step == pytest.approx(0.03)
         for split in ("train", "test"):

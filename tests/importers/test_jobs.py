@@ -187,7 +187,7 @@ def test_a_modulus_of_about_one_is_doubted(press, tmp_path, young, unit, warns, 
     job = tmp_path / "job.inp"
     job.write_text(press[0].read_text().replace("100., 0.4", f"{young}, 0.4"))
     names = FieldNames(stress_unit=unit)
-    convert(press[1], tmp_path / "d.h5", names=names, deck=job, length_unit="mm", splits={"train": 1}, progress=str)
+    convert(press[1], tmp_path / "d.h5", names=names, deck=job, length_unit="mm", splits={"train": 1}, progress=False)
     told = [str(one.message) for one in recwarn if "Young's modulus is" in str(one.message)]
     assert bool(told) == warns
     assert not warns or f"Young's modulus is 1 {unit}: is this the unit" in told[0]

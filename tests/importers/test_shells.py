@@ -113,7 +113,13 @@ def test_the_layer_turns_with_its_shell(tmp_path):
     assert material[: len(BLOCK.elements)].tolist() == own["E"][0].tolist()
     assert sorted(material[len(BLOCK.elements) :]) == sorted([*own["E"][1]] * 3)
     told = []
-    convert(tmp_path / "r", tmp_path / "d.h5", splits={"test": 1}, incomplete=True, progress=told.append)
+    convert(
+        tmp_path / "r",
+        tmp_path / "d.h5",
+        splits={"test": 1},
+        incomplete=True,
+        progress=lambda done, total, line: told.append(line),
+    )
     assert told == [
         f"test: a, 4 frames of {N + 50} nodes; 32 cells of the kind triangle are shells and become obstacles"
     ]

@@ -158,9 +158,9 @@ def test_only_a_scene_that_leaves_the_domain_is_moved(run, monkeypatch):
 
     answers = predict.answers
 
-    def kept(model, questions, effort):
+    def kept(model, questions, effort, progress):
         asked.extend(questions)
-        return answers(model, questions, effort)
+        return answers(model, questions, effort, progress)
 
     monkeypatch.setattr(predict, "answers", kept)
     scene = scene_of()

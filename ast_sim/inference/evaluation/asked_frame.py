@@ -35,7 +35,7 @@ def asked_frames(
     split: str,
     effort: Effort,
     rival_scenes: int = 0,
-    progress: Callable[[str], None] | None = None,
+    advance: Callable[[str], None] = lambda name: None,
     made_from: str | os.PathLike[str] | None = None,
     most_scenes: int | None = None,
 ) -> AskedFigures:
@@ -54,8 +54,7 @@ def asked_frames(
         scenes = []
         for index in indices:
             scenes.append(_scene(model, dataset, split, index, effort))
-            if progress is not None:
-                progress(scenes[-1].name)
+            advance(scenes[-1].name)
     finally:
         torch.set_num_threads(threads)
     why = None
@@ -65,8 +64,7 @@ def asked_frames(
         for number, rival in enumerate(outcomes):
             solver = _solver(rival, scenes[number].relative_error)
             scenes[number] = dataclasses.replace(scenes[number], solver=solver)
-            if progress is not None:
-                progress(scenes[number].name)
+            advance(scenes[number].name)
     except (ConfigError, SimulationError) as error:
         why = str(error)
     known = [scene for scene in scenes if scene.relative_error is not None]
@@ -185,7 +183,7 @@ def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: E
     failed = answer.failure is not None or not size  # where nothing moves, there is no relative error
     stress = None if answer.stress is None or answer.failure is not None else answer.stress[0]
     by_calls = []
-    if model.config.jumps and not failed:
+    if model.config.scheme.corrects and not failed:
         (after,) = calls(model, [question], effort)
         positions = () if isinstance(after, str) else after.position
         by_calls = [relative_error(position[0], truth, frame) for position in positions]

@@ -43,14 +43,14 @@ def evaluate(
     model: Simulator,
     dataset: Dataset,
     split: str = "test",
-    progress: Callable[[str], None] | None = None,
+    advance: Callable[[str], None] = lambda name: None,
     effort: Effort = FIRST_CALL,
     rival_scenes: int = 0,
     made_from: str | os.PathLike[str] | None = None,
 ) -> Figures:
     """Predict all trajectories of a split and compare.
 
-    A scene without a frame to predict is left out. `progress` is called with the name of each scene, once for all of
+    A scene without a frame to predict is left out. `advance` is called with the name of each scene, once for all of
     its frames and once for its deepest frame, and of each scene that the solver has solved.
 
     Args:
@@ -64,6 +64,7 @@ def evaluate(
     if not indices:
         raise DatasetError(f"{dataset.path}: the split {split} has no frame to predict")
     outputs = model.config.data.outputs
+    scheme = model.config.scheme
     constants = _training_means(dataset, outputs)
     scenes: list[SceneFigures] = []
     errors: dict[str, list[Errors]] = {"displacement": [], **{output.name: [] for output in outputs}}
@@ -72,7 +73,7 @@ def evaluate(
         name = f"{split}/{index:06d}"
         truth = _truth(dataset, split, index, model.config.data)
         (answer,) = predictions(model, [Question.of(truth, name)], effort)
-        one_step = _predicted(answer) if model.config.jumps else one_step_predictions(model, truth, name)
+        one_step = one_step_predictions(model, truth, name) if scheme.errors_add_up else _predicted(answer)
         errors["displacement"].append(displacement_errors(truth, one_step[0], answer))
         for key, location, *_ in outputs:
             errors[key].append(field_errors(key, location, truth, one_step[1].get(key), answer, constants[key]))
@@ -80,15 +81,14 @@ def evaluate(
         recorded = truth.attributes.get("solve_seconds")
         solver = seconds.get(name, recorded if isinstance(recorded, list) else None)
         scenes.append(_scene_figures(truth, answer, own, solver))
-        if progress is not None:
-            progress(name)
+        advance(name)
     return Figures(
         scenes=tuple(scenes),
         errors=tuple(row for quantity, of_scenes in errors.items() for row in errors_over_scenes(quantity, of_scenes)),
         failures=sum(scene.failure is not None for scene in scenes),
-        jumps=bool(model.config.jumps),
+        jumps=scheme.jumps,
         effort=dataclasses.asdict(effort),
-        asked=asked_frame.asked_frames(model, dataset, split, effort, rival_scenes, progress, made_from),
+        asked=asked_frame.asked_frames(model, dataset, split, effort, rival_scenes, advance, made_from),
         speedup=_speedup(scenes),
         length_unit=dataset.info.length_unit,
         stress_unit="Pa",

@@ -25,7 +25,7 @@ from ast_sim.models.simulator import Simulator
 from ast_sim.simulate.jobs.rival import Outcome, rivals
 from ast_sim.support.disk import write_json
 from ast_sim.support.errors import ConfigError, SimulationError
-from ast_sim.support.progress import Progress
+from ast_sim.support.progress import Progress, ShowProgress
 from ast_sim.support.provenance import provenance
 from ast_sim.trade_figures import Setting, TradeFigures
 from ast_sim.view import trade_page
@@ -74,11 +74,12 @@ def trade(
     solver_seconds: float | None = None,
     made_from: str | os.PathLike[str] | None = None,
     command: str = "ast_sim.trade",
+    progress: ShowProgress = True,
 ) -> Trade:
     """Measure what each error costs: by every effort of a run, and by the solver in every way that it can be run.
 
     Each answer is of the deepest frame of a scene, alone, on one thread. Times are processor seconds, and count what is
-    prepared for a mesh. On a terminal a bar shows the progress.
+    prepared for a mesh.
 
     Args:
         data: a dataset, its path or open; by default the one that the run was trained on.
@@ -87,6 +88,7 @@ def trade(
         solver_seconds: what another program takes for such a scene, to the error of its mesh; our solver is not run.
         made_from: the specification or the parts of your own of which the dataset was made; the solver needs them.
         command: what is recorded as the origin of the figures.
+        progress: as in `generate`.
 
     Raises:
         ConfigError: no scene of the split moves, or the solver's seconds are not above 0.
@@ -102,7 +104,7 @@ def trade(
             indices = list(islice(moving, scenes))
             if not indices:
                 raise ConfigError(f"{dataset.path}: no scene of the split {split} moves")
-            return Trade(_measured(run, dataset, split, indices, solver_seconds, made_from, command))
+            return Trade(_measured(run, dataset, split, indices, solver_seconds, made_from, command, progress))
     finally:
         torch.set_num_threads(threads)
 
@@ -115,13 +117,14 @@ def _measured(
     stated: float | None,
     made_from: str | os.PathLike[str] | None,
     command: str,
+    progress: ShowProgress,
 ) -> TradeFigures:
     efforts = choices(run.settings.model, run.settings.train.calls) or (run.effort,)
     own: dict[Effort, list[tuple[float, float]]] = {effort: [] for effort in efforts}
     ways: dict[str, list[tuple[float, float]]] = {}
     no_solver = ""
     solved = _outcomes(dataset, split, indices, made_from) if stated is None else None
-    with Progress(len(indices), 0, "scenes") as bar:
+    with Progress(len(indices), "scenes", progress) as bar:
         for effort in efforts:
             timed_answer(run.model, dataset, split, indices[0], effort)  # the first takes longer; it does not count
         for index in indices:
@@ -135,7 +138,7 @@ def _measured(
                 no_solver = str(error)
                 solved = None
                 ways = {}
-            bar.advance()
+            bar.advance(f"{split}/{index:06d}")
     if stated is not None:
         ways = {"as stated": [(0.0, stated)] * len(indices)}
     return TradeFigures(
@@ -186,7 +189,7 @@ def _command(run: Run, dataset: Dataset, split: str, effort: Effort) -> str:
     """What predicts the first scene with this effort."""
     counts = ["--corrections", str(effort.corrections), "--newton-steps", str(effort.newton_steps)]
     asked = ["--exact"] if effort == Effort.exact() else counts
-    what = asked if run.settings.model.jumps else []
+    what = asked if run.settings.model.scheme.corrects else []
     scene = [dataset.path.name, "--split", split, "--index", "0"]
     return shlex.join(["ast-sim", "predict", run.path.name, *scene, "--out", "answer.h5", *what])
 

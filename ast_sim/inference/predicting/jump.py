@@ -10,7 +10,7 @@ an answer (`Effort.solved`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache, partial
 from typing import NamedTuple
 
@@ -26,6 +26,7 @@ from ast_sim.inference.predicting.question import Question, not_finite, too_far
 from ast_sim.models.simulator import Simulator
 from ast_sim.named_field import STRESS
 from ast_sim.support.errors import RolloutError
+from ast_sim.support.progress import Progress, ShowProgress
 
 BATCH_NODES = 4096  # frames are predicted together as long as they have at most about so many nodes
 
@@ -34,12 +35,12 @@ def jumps(
     model: Simulator,
     questions: Sequence[Question],
     effort: Effort,
-    progress: Callable[[int], None] | None = None,
+    progress: ShowProgress = False,
 ) -> list[Answer]:
     """Predict the wanted frames of several scenes; the other scenes of a batch do not change a frame.
 
-    If a frame fails, the answer of its scene says why in `failure` and keeps the frames before. `progress` is called
-    with the number of each batch and may raise to stop.
+    If a frame fails, the answer of its scene says why in `failure` and keeps the frames before. `progress`
+    (`support.progress`) counts frames; a function may raise to stop.
 
     Args:
         effort: what follows the first call.
@@ -73,7 +74,7 @@ def calls(model: Simulator, questions: Sequence[Question], effort: Effort) -> li
     """For each scene the way to its answer, or a text that says why a frame failed. Arguments and errors as for
     `jumps`."""
     ways: list[Way | str] = []
-    for scene in _predicted(model, questions, effort, None, whole_way=True):
+    for scene in _predicted(model, questions, effort, whole_way=True):
         if scene.failure is not None:
             ways.append(scene.failure)
             continue
@@ -97,7 +98,7 @@ def _predicted(
     model: Simulator,
     questions: Sequence[Question],
     effort: Effort,
-    progress: Callable[[int], None] | None,
+    progress: ShowProgress = False,
     whole_way: bool = False,
 ) -> list[JumpingScene]:
     """The scenes with their predicted frames. `whole_way`: the stress after each Newton step, and no second start."""
@@ -107,18 +108,22 @@ def _predicted(
     # Several questions may share a scene.
     graph, carrier, solver = cache(model.graph), cache(Carrier), cache(partial(newton_steps, model.config))
     scenes = [JumpingScene(model, q, graph(q.scene), carrier(q.scene), solver) for q in questions]
-    with model.predicting():
-        for number, group in enumerate(group for wave in _waves(scenes) for group in _groups(model, wave)):
+    frames = [frame for scene in scenes for frame in scene.frames]
+    with model.predicting(), Progress(len(frames), "frames", progress) as bar:
+        for group in (group for wave in _waves(scenes) for group in _groups(model, wave)):
             _predict(model, group, effort.corrections)
-            if progress is not None:
-                progress(number)
+            if not effort.newton_steps and not effort.solved:
+                bar.advance(group[-1].name, len(group))
         # In ascending order, whatever the domains: with friction a frame needs to know the one before.
-        for frame in (frame for scene in scenes for frame in scene.frames if effort.newton_steps):
+        for frame in frames if effort.newton_steps else ():
             frame.refine(effort.newton_steps, whole_way)
             if not whole_way and effort.newton_steps >= MOST_NEWTON_STEPS and frame.unsettled:
                 _start_again(model, frame, effort)
-        for frame in (frame for scene in scenes for frame in scene.frames if effort.solved):
+            if not effort.solved:
+                bar.advance(frame.name)
+        for frame in frames if effort.solved else ():
             frame.solve()
+            bar.advance(frame.name)
     return scenes
 
 

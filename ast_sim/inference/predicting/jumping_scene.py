@@ -15,7 +15,6 @@ from torch import Tensor
 from ast_sim.batches.batch_builder import State
 from ast_sim.batches.carry import Carrier
 from ast_sim.batches.graph import Graph
-from ast_sim.batches.turning_points import jump_sources
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.effort import law_of
 from ast_sim.inference.predicting.predict_batch import Start
@@ -145,16 +144,10 @@ class JumpingScene:
         self.prescribed_position = torch.tensor(question.prescribed_position)
         self.fields = question.given_fields(self.model.config.data, self.given)
         self.history = self.model.config.history
-        sources = np.zeros(len(question.prescribed_position), np.int64)
-        if self.history is not None:
-            sources = jump_sources(question.prescribed_position, question.scene.prescribed)
-        needed: set[int] = set()
-        for number in question.wanted():
-            while number >= self.given and number not in needed:
-                needed.add(number)
-                number = int(sources[number])
+        scheme = self.model.config.scheme
+        sources = scheme.sources(question.prescribed_position, question.scene.prescribed)
         by_number: dict[int, JumpingFrame] = {}
-        for number in sorted(needed):
+        for number in scheme.computed(question.wanted(), sources):
             by_number[number] = JumpingFrame(self, number, by_number.get(int(sources[number])))
         self.frames += by_number.values()
 

@@ -6,7 +6,7 @@ positions. Several scenes are predicted together as one ragged batch; a scene th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -18,15 +18,14 @@ from ast_sim.inference.predicting.predict_batch import PredictedFrame, Start, pr
 from ast_sim.inference.predicting.question import Question, not_finite, too_far
 from ast_sim.models.simulator import Simulator
 from ast_sim.named_field import STRESS
+from ast_sim.support.progress import Progress, ShowProgress
 
 
-def rollouts(
-    model: Simulator, questions: Sequence[Question], progress: Callable[[int], None] | None = None
-) -> list[Answer]:
+def rollouts(model: Simulator, questions: Sequence[Question], progress: ShowProgress = False) -> list[Answer]:
     """Predict several scenes as one ragged batch; the batch does not change the prediction of a scene.
 
     If a scene fails, its answer says why in `failure` and keeps the frames before; the other scenes go on. `progress`
-    is called after each step with the number of its frame and may raise to stop.
+    (`support.progress`) counts frames; a function may raise to stop.
 
     Raises:
         RolloutError: a scene has no frame to predict.
@@ -36,7 +35,8 @@ def rollouts(
     for question in questions:
         question.check(given)
     scenes = [_RollingScene(model, question, given) for question in questions]
-    with model.predicting():
+    count = sum(scene.end - given for scene in scenes)
+    with model.predicting(), Progress(count, "frames", progress) as bar:
         for frame in range(given, max(scene.end for scene in scenes)):
             running = [scene for scene in scenes if scene.runs_at(frame)]
             # Only scenes of the same domain are predicted together: none may change another's domain.
@@ -45,8 +45,8 @@ def rollouts(
                 predicted = predict_batch(model, [scene.start(frame) for scene in group])
                 for scene, of_scene in zip(group, predicted, strict=True):
                     scene.advance(frame, of_scene)
-            if progress is not None and running:
-                progress(frame)
+            if running:
+                bar.advance(f"frame {frame}", len(running))
     return [scene.answer() for scene in scenes]
 
 

@@ -33,7 +33,7 @@ from ast_sim.runs.scope import LEEWAY, size_of, spacing_of
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.jobs.rival import deepest_frame
 from ast_sim.support.errors import ConfigError
-from ast_sim.support.progress import Progress
+from ast_sim.support.progress import Progress, ShowProgress
 
 if TYPE_CHECKING:
     from ast_sim.dataset.reader import Dataset
@@ -184,7 +184,11 @@ def quantile(scores: Sequence[float]) -> float:
 
 
 def calibrate(
-    run: Run, data: str | os.PathLike[str] | Dataset | None = None, split: str = "calibration"
+    run: Run,
+    data: str | os.PathLike[str] | Dataset | None = None,
+    split: str = "calibration",
+    *,
+    progress: ShowProgress = True,
 ) -> Calibration:
     """Measure how far the answers of a run are from the truth, after its default effort and each effort among which one
     is chosen for an asked error; then answers with these efforts have a band.
@@ -197,6 +201,7 @@ def calibrate(
         run: the run. A file is not changed: only this object knows the band, and a file that `run.save` writes of it.
         data: a dataset, its path or open; by default the one that the run was trained on.
         split: whose scenes are predicted.
+        progress: as in `generate`.
 
     Raises:
         ConfigError: the split has trained or chosen the run, there are fewer than 19 scenes, or too many fail.
@@ -207,7 +212,7 @@ def calibrate(
             raise ConfigError(f"the scenes of {split} have trained or chosen the run: calibrate with other scenes")
         before, run.calibration = run.calibration, None  # it has no say in which scenes count
         try:
-            result, left_out = _measured(run, dataset, split)
+            result, left_out = _measured(run, dataset, split, progress)
         except BaseException:
             run.calibration = before
             raise
@@ -237,19 +242,19 @@ class _Measured(NamedTuple):
     latents: np.ndarray | None
 
 
-def _measured(run: Run, dataset: Dataset, split: str) -> tuple[Calibration, list[str]]:
+def _measured(run: Run, dataset: Dataset, split: str, progress: ShowProgress) -> tuple[Calibration, list[str]]:
     """The calibration by the scenes of a split, and the names of those that do not count."""
     to_choose = choices(run.settings.model, run.settings.train.calls)
     efforts = to_choose if run.effort in to_choose else (*to_choose, run.effort)
     scenes: list[_Measured] = []
     left_out: list[str] = []
     fields = [name for name, *_ in run.settings.model.data.fields]
-    with Progress(dataset.count(split), 0, "scenes") as bar, warnings.catch_warnings():
+    with Progress(dataset.count(split), "scenes", progress) as bar, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what they tell is counted here
         for index in range(dataset.count(split)):
-            bar.advance()
             name = f"{split}/{index:06d}"
             one = _measured_scene(run, dataset.load(split, index, fields), name, efforts, to_choose)
+            bar.advance(name)
             if one is None:
                 left_out.append(name)
             else:

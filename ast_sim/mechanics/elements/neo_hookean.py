@@ -69,8 +69,7 @@ class NeoHookean:
         young, poisson = (material.numbers(name, scene.material) for name in ELASTIC)
         if np.ndim(young) == np.ndim(poisson) == 0:
             return cls(young, poisson)
-        rigid = ~scene.deforming_nodes[scene.elements].any(axis=1)
-        return cls(np.where(rigid, 1.0, young), np.where(rigid, 0.0, poisson))
+        return cls(np.where(scene.rigid_elements, 1.0, young), np.where(scene.rigid_elements, 0.0, poisson))
 
     @classmethod
     def of_lame(cls, lam: float | np.ndarray, mu: float | np.ndarray) -> NeoHookean:

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.driven import Driven
-from ast_sim.scene import NodeType, Scene
+from ast_sim.scene import Scene
 from ast_sim.support.errors import ConfigError, SimulationError
 
 # The elements by their number of nodes; the order of the nodes is that of a scene.
@@ -52,9 +52,9 @@ def contact_stiffness(case: SolidCase) -> float:
     with 100 E/h, metal and tool are some micrometres in each other, and no increment is short enough.
     """
     scene = case.scene
-    young = np.broadcast_to(case.material.young, scene.num_elements)[case.deforming]
+    young = np.broadcast_to(case.material.young, scene.num_elements)[~scene.rigid_elements]
     pressures = [100 * float(young.min()), *(10 * float(table[0, 0]) for table in case.hardening.values())]
-    return min(pressures) / _mean_edge(scene, case.deforming)
+    return min(pressures) / _mean_edge(scene, ~scene.rigid_elements)
 
 
 def _mean_edge(scene: Scene, elements: np.ndarray) -> float:
@@ -107,7 +107,8 @@ def _materials(case: SolidCase) -> Iterator[str]:
     constants = np.empty((scene.num_elements, 3))
     constants[:, 0], constants[:, 1] = case.material.young, case.material.poisson
     constants[:, 2] = np.where(np.isin(body, list(case.hardening)), body, -1)
-    constants[~case.deforming] = constants[case.deforming][0]  # rigid: moved as a whole, so no constant matters
+    rigid = scene.rigid_elements
+    constants[rigid] = constants[~rigid][0]  # moved as a whole, so no constant matters
     kinds, kind = np.unique(constants, axis=0, return_inverse=True)
     for number, (young, poisson, yielding) in enumerate(kinds):
         yield f"*ELSET, ELSET=MATERIAL{number}"
@@ -134,8 +135,8 @@ def _contact(case: SolidCase, increments: Increments) -> Iterator[str]:
         for number, side in zip(element[of_body] + 1, face[of_body] + 1, strict=True):
             yield f"{number}, S{side}"
     stiffness = contact_stiffness(case) * increments.stiffness
-    rigid = {body: bool((scene.node_type[scene.body == body] == NodeType.OBSTACLE).all()) for body in bodies}
-    pairs = [pair for pair in combinations(bodies, 2) if not (rigid[pair[0]] and rigid[pair[1]])]
+    rigid = scene.rigid_bodies
+    pairs = [pair for pair in combinations(bodies, 2) if not rigid.issuperset(pair)]
     frictions = sorted({case.contact.friction_between(*pair) for pair in pairs})
     for number, friction in enumerate(frictions):
         yield f"*SURFACE INTERACTION, NAME=CONTACT{number}"
@@ -146,7 +147,8 @@ def _contact(case: SolidCase, increments: Increments) -> Iterator[str]:
             yield f"{friction:.9e}, {stiffness / 10:.9e}"
     for pair in pairs:
         # An obstacle is the master.
-        slave, master = slave_first(scene, *pair) if not any(map(rigid.get, pair)) else sorted(pair, key=rigid.get)
+        soft = rigid.isdisjoint(pair)
+        slave, master = slave_first(scene, *pair) if soft else sorted(pair, key=rigid.__contains__)
         number = frictions.index(case.contact.friction_between(*pair))
         yield f"*CONTACT PAIR, INTERACTION=CONTACT{number}, TYPE=SURFACE TO SURFACE"
         yield f"BODY{slave}, BODY{master}"

@@ -288,8 +288,9 @@ def _check(case: SolidCase, position: np.ndarray) -> tuple[list[float], str]:
 
 def _elasticity(case: SolidCase) -> Elasticity:
     """The deforming bodies."""
-    scene, deforming = case.scene, case.deforming
-    return elastic_body(scene.rest_position.astype(np.float64), scene.elements[deforming], case.material.of(deforming))
+    scene = case.scene
+    soft = ~scene.rigid_elements
+    return elastic_body(scene.rest_position.astype(np.float64), scene.elements[soft], case.material.of(soft))
 
 
 def _stress_arrays(case: SolidCase, stress: np.ndarray) -> dict[str, np.ndarray]:
@@ -298,12 +299,13 @@ def _stress_arrays(case: SolidCase, stress: np.ndarray) -> dict[str, np.ndarray]
     A frame at rest is put before the frames of `stress` [S-1,E,6].
     """
     stress = np.concatenate([np.zeros((1, *stress.shape[1:])), stress])
-    stress[:, ~case.deforming] = 0  # rigid: stress has no meaning
+    rigid = case.scene.rigid_elements
+    stress[:, rigid] = 0  # it has no meaning
     mises = _von_mises(stress)
     if case.stress_location == "element":
         return {"stress": mises[:, :, None].astype(np.float32), "cauchy_stress": stress.astype(np.float32)}
     elasticity = _elasticity(case)
-    nodal = np.stack([elasticity.nodal_mean(frame[case.deforming]) for frame in mises])
+    nodal = np.stack([elasticity.nodal_mean(frame[~rigid]) for frame in mises])
     return {"stress": nodal[:, :, None].astype(np.float32)}
 
 

@@ -49,7 +49,7 @@ def run_all(samples: list[Sample], parts: Path, recipe: Recipe, scheduler: str, 
     with _connected(scheduler) as client:
         client.subscribe_topic(topic, lambda event: events.put(("said", event[1])))
         if not client.scheduler_info()["workers"]:
-            watch.bar.note(f"the scheduler at {scheduler} has no workers yet: waiting for them")
+            watch.bar.line(f"the scheduler at {scheduler} has no workers yet: waiting for them")
         waiting: dict[Any, Sample] = {}
         for sample in samples:
             name = sample_name(*sample)

@@ -29,7 +29,7 @@ from ast_sim.dataset.writer import DatasetWriter, FittedWriter
 from ast_sim.mechanics.contact_and_friction import self_test
 from ast_sim.simulate.families.names import family_module
 from ast_sim.simulate.jobs import cluster, pool
-from ast_sim.simulate.jobs.display import Progress
+from ast_sim.simulate.jobs.display import SceneProgress
 from ast_sim.simulate.jobs.manifest import Manifest, Watch
 from ast_sim.simulate.jobs.recipe import check_parts, checked_recipe, difference, recorded
 from ast_sim.simulate.jobs.samples import (
@@ -44,6 +44,7 @@ from ast_sim.simulate.jobs.samples import (
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.support.disk import output_file, replacing
 from ast_sim.support.errors import ConfigError, SimulationError
+from ast_sim.support.progress import ShowProgress
 
 MOST_SCENES = 1_000_000  # names of samples have six digits
 
@@ -81,7 +82,7 @@ def generate(
     spec: str | os.PathLike[str] | None = None,
     patient: bool = False,
     scheduler: str | None = None,
-    progress: bool = True,
+    progress: ShowProgress = True,
 ) -> Generated:
     """Generate a dataset file of simulated scenes.
 
@@ -99,7 +100,7 @@ def generate(
         spec: the specification of an assembly (TOML), for the family "assembly".
         patient: solve every scene to its last frame. Else a scene ends before a frame of over 500 Newton iterations.
         scheduler: address of a Dask scheduler. Its workers make the samples; no processes start on this machine.
-        progress: show a bar on a terminal and lines elsewhere.
+        progress: True: a bar on a terminal, lines elsewhere; False: nothing; or a function of (done, total, text).
 
     Raises:
         AstSimError: `out` is no place for a file.
@@ -156,16 +157,19 @@ def _make(
     recipe: Recipe,
     workers: int,
     scheduler: str | None,
-    progress: bool,
+    progress: ShowProgress,
     notes: list[str],
 ) -> None:
     """Make the samples that the folder lacks."""
     present = {sample for sample in samples if _is_readable(sample_path(folder, *sample))}
     missing = [sample for sample in samples if sample not in present]
     manifest = Manifest(folder, samples, present)
-    with contextlib.closing(manifest), Progress(len(samples), len(present), "scenes", progress) as bar:
+    with (
+        contextlib.closing(manifest),
+        SceneProgress(len(samples), "scenes", progress, done=len(present)) as bar,
+    ):
         for note in (*notes, *(f"{name} failed before: {why}" for name, why in manifest.failures.items())):
-            bar.note(note)
+            bar.line(note)
         watch = Watch(manifest, bar)
         if missing and scheduler is None:
             pool.run_all(missing, folder, recipe, workers, watch)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import platform
 import time
 from collections.abc import Callable
@@ -17,7 +18,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ast_sim.simulate.jobs.display import Progress
+from ast_sim.simulate.jobs.display import SceneProgress
 from ast_sim.simulate.jobs.samples import Sample, sample_name, sample_path
 from ast_sim.support.disk import replacing
 
@@ -91,7 +92,7 @@ class Watch:
         failures: the samples that failed, with the reason.
     """
 
-    def __init__(self, manifest: Manifest, bar: Progress, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, manifest: Manifest, bar: SceneProgress, clock: Callable[[], float] = time.monotonic) -> None:
         self.manifest, self.bar, self.clock = manifest, bar, clock
         self.failures: dict[Sample, str] = {}
         self._since: dict[Sample, float] = {}
@@ -110,14 +111,14 @@ class Watch:
         """A sample is finished: its file is there."""
         self.bar.end(sample_name(*sample))
         self.manifest.write(sample, "done", seconds=round(self._seconds(sample), 3))
-        self.bar.advance()
+        self.bar.advance(sample_name(*sample))
 
     def failed(self, sample: Sample, reason: str, trace: str = "") -> None:
         """A sample cannot be made; the others go on."""
         self.failures[sample] = reason
         self.bar.end(sample_name(*sample))
         self.manifest.write(sample, "failed", reason=reason, seconds=round(self._seconds(sample), 3))
-        self.bar.note(f"{sample_name(*sample)} failed: {reason}\n{trace}".strip())
+        self.bar.line(f"{sample_name(*sample)} failed: {reason}\n{trace}".strip(), logging.WARNING)
 
     def tick(self) -> None:
         """Call this about once a second."""

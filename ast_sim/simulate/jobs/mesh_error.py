@@ -96,7 +96,7 @@ def mesh_error(
     frame = int(np.argmax(curve))
     value = float(curve[frame])
     extent = unit * float(np.linalg.norm(np.ptp(case.scene.rest_position, axis=0)))
-    young = float(np.min(np.broadcast_to(case.material.young, case.scene.num_elements)[case.deforming]))
+    young = float(np.min(np.broadcast_to(case.material.young, case.scene.num_elements)[~case.scene.rigid_elements]))
     if value <= NO_FORCE * young * extent**power:
         raise SimulationError(f"the first scene has no {quantity}")
     try:

@@ -24,11 +24,12 @@ import numpy as np
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.scene import Trajectory
-from ast_sim.simulate.jobs.display import Progress
+from ast_sim.simulate.jobs.display import SceneProgress
 from ast_sim.simulate.jobs.pool import Process
 from ast_sim.simulate.jobs.recipe import recipe_of
 from ast_sim.simulate.jobs.samples import sample_name
 from ast_sim.support.errors import ConfigError, SimulationError
+from ast_sim.support.progress import ShowProgress
 
 RIVAL_MODULE = "ast_sim.simulate.jobs.rival_worker"
 OUTCOMES, POSITIONS = "outcomes.json", "positions.npz"
@@ -192,7 +193,7 @@ def rivals(
     repeats: int = 1,
     made_from: str | os.PathLike[str] | None = None,
     most_iterations: int = MOST_ITERATIONS,
-    progress: bool = True,
+    progress: ShowProgress = True,
 ) -> Iterator[Rivals]:
     """Solve one frame of each scene in every way; one scene after another, each in a process of its own.
 
@@ -205,7 +206,7 @@ def rivals(
         repeats: how often each is timed. The smallest time counts.
         made_from: where the parts or the specification lie, if the dataset was made of the user's own.
         most_iterations: Newton iterations after which a try is given up.
-        progress: show a bar on a terminal and lines elsewhere.
+        progress: as in `generate`.
 
     Raises:
         ConfigError: the dataset was not made by the bundled solver or from a family with inertia, or there is no such
@@ -243,18 +244,18 @@ def _frame(
     return int(frame)
 
 
-def _all(tasks: list[dict[str, Any]], progress: bool) -> Iterator[Rivals]:
-    with Progress(len(tasks), 0, "scenes", progress) as bar:
+def _all(tasks: list[dict[str, Any]], progress: ShowProgress) -> Iterator[Rivals]:
+    with SceneProgress(len(tasks), "scenes", progress) as bar:
         for task in tasks:
             name = sample_name(task["split"], task["index"])
             bar.begin(name)
             rivals = _one(task, name, bar)
             bar.end(name)
-            bar.advance()
+            bar.advance(name)
             yield rivals
 
 
-def _one(task: dict[str, Any], name: str, bar: Progress) -> Rivals:
+def _one(task: dict[str, Any], name: str, bar: SceneProgress) -> Rivals:
     """Have a process solve a scene; read what it leaves in a folder."""
     with tempfile.TemporaryDirectory(prefix="ast_sim-") as folder, selectors.DefaultSelector() as selector:
         process = Process(RIVAL_MODULE, folder)

@@ -61,7 +61,7 @@ def _check_held(spec: AssemblySpec, case: SolidCase) -> None:
 def _check_turned_over(spec: AssemblySpec, case: SolidCase) -> None:
     """Elements whose nodes are all prescribed cannot give way."""
     scene = case.scene
-    rows = scene.elements[scene.prescribed[scene.elements].all(axis=1) & case.deforming]
+    rows = scene.elements[scene.prescribed[scene.elements].all(axis=1) & ~scene.rigid_elements]
     followed, stored = case.followed()
     for row, position in enumerate(followed.targets):
         wrong = (quarters(position, rows) <= 0).any(axis=0)

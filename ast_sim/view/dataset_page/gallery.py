@@ -15,7 +15,7 @@ import numpy as np
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import SolverSeconds, read_seconds
-from ast_sim.support.progress import Progress
+from ast_sim.support.progress import Progress, ShowProgress
 from ast_sim.view import page
 from ast_sim.view.dataset_page import survey
 from ast_sim.view.dataset_page.bounds import verdicts
@@ -35,10 +35,10 @@ MIN_FRAMES, MAX_FRAMES = 12, 60  # frames of a panel
 LISTED = 500  # a table lists at most this many samples
 
 
-def write(path: str | os.PathLike[str], data: str | os.PathLike[str]) -> None:
+def write(path: str | os.PathLike[str], data: str | os.PathLike[str], progress: ShowProgress = True) -> None:
     """Write the report of a dataset file as one HTML file; its folder is made if it is not there.
 
-    Every sample is read once; a bar on a terminal shows how far that is. The solver's seconds are taken from the file
+    Every sample is read once, of which `progress` tells as in `generate`. The solver's seconds are taken from the file
     beside the dataset (`ast_sim.dataset.solver_seconds`) if there is one.
 
     Raises:
@@ -50,11 +50,11 @@ def write(path: str | os.PathLike[str], data: str | os.PathLike[str]) -> None:
     with Dataset(data) as dataset:
         seconds = read_seconds(dataset)
         make_folder(path.parent)
-        with Progress(sum(dataset.splits.values()), 0, "scenes") as bar:
+        with Progress(sum(dataset.splits.values()), "scenes", progress) as bar:
             samples = []
             for sample in survey.survey(dataset, seconds):
                 samples.append(sample)
-                bar.advance()
+                bar.advance(sample.name)
         content = page_data(dataset, samples, seconds)
     page.write(path, content, f"{dataset.info.family}: {data.name}")
 

@@ -13,7 +13,7 @@ import pytest
 from processes import environment, is_running, paused_process, wait_for
 
 from ast_sim.simulate.jobs import cluster
-from ast_sim.simulate.jobs.display import Progress
+from ast_sim.simulate.jobs.display import SceneProgress
 from ast_sim.simulate.jobs.generate import generate
 from ast_sim.simulate.jobs.recipe import recorded
 from ast_sim.support.errors import MissingExtra, SimulationError
@@ -117,15 +117,15 @@ def test_solvers_end_when_the_generator_is_killed(scheduler, workers, tmp_path):
 
 def test_a_scheduler_that_goes_away_is_one_clear_error(tmp_path, monkeypatch, capfd):
     process, address = start_scheduler(tmp_path)
-    note = Progress.note
+    line = SceneProgress.line
 
     def kill_the_scheduler(bar, text):
         if "has no workers yet: waiting for them" in text:  # the client is connected
             process.kill()
             process.wait()
-        note(bar, text)
+        line(bar, text)
 
-    monkeypatch.setattr(Progress, "note", kill_the_scheduler)
+    monkeypatch.setattr(SceneProgress, "line", kill_the_scheduler)
     with pytest.raises(SimulationError, match=f"scheduler at {address} went away. The finished samples are kept in"):
         generate("deforming_plate", tmp_path / "plates.h5", **COUNTS, scheduler=address, **SETTINGS)
     assert process.returncode == -signal.SIGKILL

@@ -20,7 +20,7 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import read_seconds, seconds_path
 from ast_sim.simulate.jobs import generate as generate_module
 from ast_sim.simulate.jobs import pool
-from ast_sim.simulate.jobs.display import Progress
+from ast_sim.simulate.jobs.display import SceneProgress
 from ast_sim.simulate.jobs.generate import generate
 from ast_sim.simulate.jobs.manifest import Manifest
 from ast_sim.simulate.jobs.recipe import recorded
@@ -435,15 +435,15 @@ def test_a_torn_manifest_is_only_what_a_person_reads(tmp_path):
 
 
 def test_progress_prints_lines_where_there_is_no_terminal(capsys, monkeypatch):
-    monkeypatch.setattr("ast_sim.simulate.jobs.display.SECONDS_BETWEEN_LINES", 0.0)
-    with Progress(4, 1, "scenes", True) as bar:
+    monkeypatch.setattr("ast_sim.support.progress.SECONDS_BETWEEN_LINES", 0.0)
+    with SceneProgress(4, "scenes", True, done=1) as bar:
         bar.advance()
-        bar.note("a note")
+        bar.line("a note")
         bar.advance()
     first, second, note, third = capsys.readouterr().err.splitlines()
     assert first == "1 of 4 scenes are there already" and note == "a note"
     assert second.startswith("2 of 4 scenes, ") and third.startswith("3 of 4 scenes, ") and third.endswith(" s to go")
-    with Progress(2, 0, "scenes", False) as bar:
+    with SceneProgress(2, "scenes", False) as bar:
         bar.advance()
     assert capsys.readouterr().err == ""
 
@@ -451,7 +451,7 @@ def test_progress_prints_lines_where_there_is_no_terminal(capsys, monkeypatch):
 def test_long_scenes_tell_how_far_they_are(capsys, monkeypatch):
     now = [0.0]
     monkeypatch.setattr("ast_sim.simulate.jobs.display.time.monotonic", lambda: now[0])
-    with Progress(2, 0, "scenes", True) as bar:
+    with SceneProgress(2, "scenes", True) as bar:
         bar.begin("train/000000")
         bar.inside("train/000000", 4, 21, 120)  # an earlier run left four frames
         bar.begin("train/000001")
