@@ -1,9 +1,10 @@
 """A metal clip that a ram bends open and lets go: the permanent set, and the peak force on the ram.
 
 `python -m benchmarks.studies.clip` solves scenes of `examples/clip` by CalculiX, trains a run on them and asks it for
-test scenes, beside a Gaussian process that maps the drawn parameters to both numbers. It writes
-benchmarks/results/clip.json and docs/results/clip.md. Data and run lie in `--folder`; a second call goes on with what
-is there. Everything runs on one thread, and all times are processor times.
+test scenes, beside a Gaussian process that maps the drawn parameters to both numbers, and beside CalculiX on other
+meshes and with larger increments. It writes benchmarks/results/clip.json, docs/results/clip.md and
+examples/clip/test_scenes.h5. Data and run lie in `--folder`; a second call goes on with what is there. Everything runs
+on one thread, and all times are processor times.
 """
 
 from __future__ import annotations
@@ -13,27 +14,29 @@ import os
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 import ast_sim
-from ast_sim.dataset.solver_seconds import read_seconds
+from ast_sim.dataset.solver_seconds import SolverSeconds, read_seconds, write_seconds
+from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.inference.relative_errors import relative_error
 from ast_sim.named_field import REACTION
+from ast_sim.simulate.own_assembly.parameters import values_of
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
-from benchmarks.studies.phrases import median_error
+from benchmarks.studies import clip_ways
+from benchmarks.studies.clip_outcome import LAST, SPEC, TURN, Outcome, outcome, true_outcome
+from benchmarks.studies.clip_page import page
 from benchmarks.studies.validation_curve import minutes_per_step
 
 ROOT = Path(__file__).parents[2]
-SPEC = ROOT / "examples" / "clip" / "SPEC.toml"
 RESULTS = ROOT / "benchmarks" / "results" / "clip.json"
 PAGE = ROOT / "docs" / "results" / "clip.md"
-CLIP, RAM = 0, 1  # bodies
-TURN, LAST = 3, 6  # the frames in which the ram turns and is back
+SHARED = SPEC.with_name("test_scenes.h5")
 FOLDS = 5  # of the cross-validation that chooses the scale of a Gaussian process
 STATE = ("PEEQ", REACTION)
 
@@ -51,41 +54,9 @@ class Plan:
     train: int = 80
     valid: int = 6
     test: int = 30
-    calibration: int = 0
+    calibration: int = 40
     steps: int = 3600
     settings: tuple[tuple[str, Any], ...] = (("mirror", ("y",)), ("stress_weight", 0.3))
-
-
-class Outcome(NamedTuple):
-    """What an engineer asks of a clip: the permanent set in the unit of length, the peak force on the ram in newton."""
-
-    set: float
-    peak: float
-
-
-def outcome(scene: ast_sim.Scene, first: np.ndarray, last: np.ndarray, reaction: np.ndarray) -> Outcome:
-    """The set is the length of the mean displacement of the free end of the arm, its upper face, when the ram is back.
-
-    Args:
-        first, last: [N, 3], the positions in the first and in the last frame.
-        reaction: [S, N, 3], the forces on the prescribed nodes in all frames.
-    """
-    height = np.where(scene.body == CLIP, scene.rest_position[:, 2], -np.inf)
-    end = height > height.max() - 1e-3 * np.ptp(scene.rest_position[:, 2])
-    way = (last[end].astype(np.float64) - first[end]).mean(axis=0)
-    force = reaction[:, scene.body == RAM].astype(np.float64).sum(axis=1)
-    return Outcome(float(np.linalg.norm(way)), float(np.linalg.norm(force, axis=1).max()))
-
-
-def true_outcome(truth: ast_sim.Trajectory) -> Outcome:
-    """The one that CalculiX found."""
-    return outcome(truth.scene, truth.position[0], truth.position[-1], truth.fields[REACTION].values)
-
-
-def parameters(truth: ast_sim.Trajectory) -> dict[str, Any]:
-    """The drawn parameters of a scene, by name."""
-    marked = {name: value for name, value in truth.attributes.items() if name.startswith("parameter ")}
-    return {name.removeprefix("parameter "): value for name, value in marked.items()}
 
 
 def features(drawn: Sequence[dict[str, Any]], known: Sequence[dict[str, Any]]) -> np.ndarray:
@@ -146,27 +117,56 @@ def measured(plan: Plan, folder: Path) -> dict[str, Any]:
     """Solve, train and measure."""
     run, data = trained(plan, folder)
     with run.open(data) as dataset:
-        seconds = read_seconds(dataset).samples
-        known = _solved(dataset, "train")
-        scenes = [
-            {"name": name, "solver_seconds": sum(seconds[name]), **_asked(run, truth)}
-            for name, truth in _solved(dataset, "test")
-        ]
-    drawn, outcomes = [parameters(truth) for _, truth in known], [true_outcome(truth) for _, truth in known]
-    asked = features([scene["parameters"] for scene in scenes], drawn)
+        taken = read_seconds(dataset)
+        seconds = {name: sum(frames) for name, frames in taken.samples.items()}
+        known, tests, others = (_solved(dataset, split) for split in ("train", "test", "calibration"))
+        share_scenes(dataset, [(name, truth) for name, truth in tests if name in clip_ways.SCENES], taken)
+    scenes, unseen = (
+        [{"name": name, "solver_seconds": seconds[name], **_asked(run, truth)} for name, truth in asked]
+        for asked in (tests, others)
+    )
+    drawn, outcomes = [values_of(truth.attributes) for _, truth in known], [true_outcome(truth) for _, truth in known]
     for key in Outcome._fields:
         values = np.array([getattr(one, key) for one in outcomes])
-        for scene, value in zip(scenes, gaussian_process(features(drawn, drawn), values, asked), strict=True):
-            scene["gaussian_process"] = {**scene.get("gaussian_process", {}), key: float(value)}
+        for asked in (scenes, unseen):
+            points = features([scene["parameters"] for scene in asked], drawn)
+            for scene, value in zip(asked, gaussian_process(features(drawn, drawn), values, points), strict=True):
+                scene["gaussian_process"] = {**scene.get("gaussian_process", {}), key: float(value)}
+    beside = [scene["parameters"] for scene in scenes if scene["name"] in clip_ways.SCENES]
     return {
         **provenance("python -m benchmarks.studies.clip"),
         "plan": {**plan.__dict__, "settings": dict(plan.settings)},
-        "solved": {"train": len(known), "test": len(scenes)},
-        "generation_minutes": sum(map(sum, seconds.values())) / 60,
-        "training_minutes": minutes_per_step(run) * plan.steps,
+        "simulation_seconds": {
+            split: sum(value for name, value in seconds.items() if name.startswith(split))
+            for split in ("train", "valid", "test", "calibration")
+        },
+        "training_seconds": 60 * minutes_per_step(run) * plan.steps,
         "parameters": sum(weights.numel() for weights in run.model.parameters()),
         "scenes": scenes,
+        "unseen": unseen,
+        "ways": clip_ways.solved(beside, plan.nodes, folder / "ways.json"),
     }
+
+
+def share_scenes(
+    dataset: ast_sim.Dataset, scenes: Sequence[tuple[str, ast_sim.Trajectory]], taken: SolverSeconds
+) -> None:
+    """Write named scenes to `SHARED` as a motion of two steps, the ram's way out and back: rest, turn and last frame;
+    the seconds of CalculiX beside it."""
+    kept = [0, TURN, LAST]
+    origin = dataset.info.generator
+    counts = {**dict.fromkeys(origin.get("counts", {}), 0), "test": len(scenes)}
+    origin = {**origin, "counts": counts, "note": f"frames {kept} of {', '.join(name for name, _ in scenes)}"}
+    seconds = {}
+    with DatasetWriter(SHARED, replace(dataset.info, generator=origin)) as writer:
+        for index, (name, truth) in enumerate(scenes):
+            lists = {key: value for key, value in truth.attributes.items() if isinstance(value, list)}
+            cut = {key: [value[frame] for frame in kept] for key, value in lists.items() if len(value) > LAST}
+            writer.add("test", replace(truth.select(kept), frames=None, attributes={**truth.attributes, **cut}))
+            until = np.cumsum(taken.samples[name])[kept]
+            spent = {"solve_seconds": np.diff(until, prepend=0).tolist(), "processor": ", ".join(taken.processors)}
+            seconds[f"test/{index:06d}"] = spent
+    write_seconds(SHARED, origin, seconds)
 
 
 def _solved(dataset: ast_sim.Dataset, split: str) -> list[tuple[str, ast_sim.Trajectory]]:
@@ -182,18 +182,24 @@ def _asked(run: ast_sim.Run, truth: ast_sim.Trajectory) -> dict[str, Any]:
     turned, seconds_of_two = _timed(run, truth, [TURN, LAST])
     two = Outcome(*outcome(truth.scene, truth.position[0], turned.position[-1], turned.fields[REACTION].values))
     metal = truth.scene.deforming_nodes
-    strain, true_strain = (one.fields["PEEQ"].values[-1, metal].astype(np.float64) for one in (answer, truth))
+    strain, true_strain = (one.fields["PEEQ"].values[-1, metal] for one in (answer, truth))
+    force, true_force = (one.fields[REACTION].values[TURN] for one in (answer, truth))
     return {
-        "parameters": parameters(truth),
+        "parameters": values_of(truth.attributes),
         "true": true_outcome(truth)._asdict(),
         "run": outcome(truth.scene, truth.position[0], answer.position[-1], answer.fields[REACTION].values)._asdict(),
         "run_two_frames": two._asdict(),
         "turn_error": relative_error(answer.position[TURN], truth, TURN),
         "last_error": relative_error(answer.position[LAST], truth, LAST),
-        "strain_error": float(np.linalg.norm(strain - true_strain) / np.linalg.norm(true_strain)),
+        "strain_error": _relative(strain, true_strain),
+        "force_error": _relative(force, true_force),
         "seconds": seconds,
         "seconds_of_two": seconds_of_two,
     }
+
+
+def _relative(values: np.ndarray, true: np.ndarray) -> float:
+    return float(np.linalg.norm(values.astype(np.float64) - true) / np.linalg.norm(true.astype(np.float64)))
 
 
 def _timed(run: ast_sim.Run, truth: ast_sim.Trajectory, frames: list[int] | None) -> tuple[ast_sim.Answer, float]:
@@ -204,86 +210,6 @@ def _timed(run: ast_sim.Run, truth: ast_sim.Trajectory, frames: list[int] | None
         answer = run.predict(truth, frames=frames)
         spent.append(time.process_time() - began)
     return answer, min(spent)
-
-
-_INTRODUCTION = """# A metal clip: permanent set and peak force
-
-Made by `python -m benchmarks.studies.clip` from `benchmarks/results/clip.json`; do not edit.
-
-`examples/clip`: a ram bends the arm of a metal clip open, turns in frame 3 of 6 and goes back. Length, thickness, place
-and kind of the cutout, travel and yield stress are drawn. The set is the length of the mean displacement of the arm's
-free end in the last frame, the peak force the largest force on the ram in all frames. Errors are relative to what
-CalculiX found on the same mesh, in test scenes that no training has seen. The run predicts all frames of a scene,
-those after the turn from its own answer for the turn
-([the load path](../reference/model.md#jumps-and-corrections)). The Gaussian process (scikit-learn, a squared
-exponential with a length for each parameter) maps the drawn parameters to both numbers; it knows nothing else of a
-scene, and can be asked for nothing else. Times are processor times of one thread ({processor}).
-"""
-
-
-def page(found: dict[str, Any]) -> str:
-    """The page of the results."""
-    scenes, plan = found["scenes"], found["plan"]
-    solver = float(np.median([scene["solver_seconds"] for scene in scenes]))
-    lines = [_INTRODUCTION.format(processor=found["processor"])]
-    kinds = ("median", "mean", "90 % below")
-    heads = [f"{what}: {kind}" for what in ("set", "peak force") for kind in kinds]
-    lines += [f"| answer | {' | '.join(heads)} |", "| --- |" + " ---: |" * 6]
-    for title, key in (
-        ("the run, all frames", "run"),
-        ("the run, the frames 3 and 6 alone", "run_two_frames"),
-        ("Gaussian process", "gaussian_process"),
-    ):
-        cells = [_cells(errors(scenes, key, number)) for number in Outcome._fields]
-        lines.append(f"| {title} | {' | '.join(cells)} |")
-    lines += ["| springs back wholly | 100 % | 100 % | 100 % | - | - | - |", ""]
-    ours, theirs = ([np.median(errors(scenes, key, n)) for n in Outcome._fields] for key in ("run", "gaussian_process"))
-    lines.append(
-        f"- The median error of the run is {ours[0] / theirs[0]:.2g} times that of the Gaussian process in the set,"
-        f" {ours[1] / theirs[1]:.2g} times in the peak force."
-    )
-    for key, what in (("seconds", "all frames"), ("seconds_of_two", "the frames 3 and 6")):
-        ratios = [scene["solver_seconds"] / scene[key] for scene in scenes]
-        spent = 1000 * np.median([scene[key] for scene in scenes])
-        lines.append(
-            f"- An answer with {what} takes {spent:.0f} ms, CalculiX {solver:.3g} s a scene:"
-            f" {np.median(ratios):.0f} ± {median_error(ratios):.0f} times as long."
-        )
-    lines += [
-        f"- The run: {found['solved']['train']} scenes of about {plan['nodes']:,} nodes, {plan['steps']:,} steps in"
-        f" {found['training_minutes']:.0f} min, {found['parameters']:,} weights. CalculiX took"
-        f" {found['generation_minutes']:.0f} min for the scenes of all splits. {found['solved']['test']} test scenes.",
-        f"- Errors of the run in the field, medians: displacement {_median(scenes, 'turn_error')} when the ram turns,"
-        f" {_median(scenes, 'last_error')} when it is back; plastic strain there {_median(scenes, 'strain_error')}.",
-        f"- Sets from {_range(scenes, 'set')} mm, peak forces from {_range(scenes, 'peak')} N. {_worst(scenes)}",
-    ]
-    return "\n".join(lines)
-
-
-def errors(scenes: Sequence[dict[str, Any]], key: str, number: str) -> np.ndarray:
-    """[n]: the relative errors of the set or the peak force in an answer."""
-    return np.array([abs(scene[key][number] / scene["true"][number] - 1) for scene in scenes])
-
-
-def _cells(values: np.ndarray) -> str:
-    middle = f"{100 * np.median(values):.2g} ± {100 * median_error(values):.1g} %"
-    return f"{middle} | {100 * values.mean():.2g} % | {100 * np.quantile(values, 0.9):.2g} %"
-
-
-def _median(scenes: Sequence[dict[str, Any]], key: str) -> str:
-    return f"{100 * np.median([scene[key] for scene in scenes]):.2g} %"
-
-
-def _range(scenes: Sequence[dict[str, Any]], number: str) -> str:
-    values = [scene["true"][number] for scene in scenes]
-    return f"{min(values):.3g} to {max(values):.3g}"
-
-
-def _worst(scenes: Sequence[dict[str, Any]]) -> str:
-    off = errors(scenes, "run", "set")
-    worst = (scenes[i] for i in np.argsort(-off)[:3])
-    told = (f"{one['name']} {one['run']['set']:.2g} for {one['true']['set']:.2g} mm" for one in worst)
-    return f"The worst sets of the run: {', '.join(told)}."
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

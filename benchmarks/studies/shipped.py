@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import ast_sim
@@ -18,7 +17,6 @@ from benchmarks.studies import clip, coverage, jumps
 
 SHIPPED = Path(ast_sim.__file__).parent / "example_runs"
 LICENCE = "CC0 1.0: do with it what you like."
-CLIP = replace(clip.Plan(), calibration=40)
 
 
 def plates_run(folder: Path) -> tuple[ast_sim.Run, Path, str]:
@@ -29,7 +27,7 @@ def plates_run(folder: Path) -> tuple[ast_sim.Run, Path, str]:
 
 def clip_run(folder: Path) -> tuple[ast_sim.Run, Path, str]:
     """As `plates_run`."""
-    return *clip.trained(CLIP, folder), "calibration"
+    return *clip.trained(clip.Plan(), folder), "calibration"
 
 
 RUNS = {"plates": plates_run, "clip": clip_run}

@@ -11,7 +11,9 @@ import ast_sim
 from ast_sim.cli import main
 from ast_sim.named_field import REACTION
 from ast_sim.support.errors import ConfigError
-from benchmarks.studies.clip import LAST, RESULTS, SPEC, outcome
+from benchmarks.studies.clip import RESULTS
+from benchmarks.studies.clip_outcome import LAST, SPEC, outcome, true_outcome
+from benchmarks.studies.clip_ways import SCENES
 
 
 def test_it_predicts_a_new_plate_by_one_call_and_better_with_newton_steps(tmp_path, capsys):
@@ -57,6 +59,21 @@ def test_a_clip_that_is_asked_for_by_its_parameters_has_the_set_and_the_force_of
         said = outcome(answer.scene, answer.position[0], answer.position[-1], answer.fields[REACTION].values)
         assert said == pytest.approx(tuple(known["true"].values()), rel=0.1)
         assert answer.fields["PEEQ"].values[-1].max() > 0.01 and answer.frames == tuple(range(LAST + 1))
+
+
+def test_ten_scenes_of_the_repository_have_the_errors_of_the_page():
+    """The medians of the page are known to 0.2 %: half of this is the margin, and rounding is far below it."""
+    run = ast_sim.example_run("clip")
+    known = {one["name"]: one for one in json.loads(RESULTS.read_text())["scenes"]}
+    with ast_sim.Dataset(SPEC.with_name("test_scenes.h5")) as dataset:
+        for name, truth in zip(SCENES, dataset["test"], strict=True):
+            true = true_outcome(truth)
+            assert true == pytest.approx(tuple(known[name]["true"].values()), rel=1e-6)
+            answer = run.predict(truth)
+            said = outcome(truth.scene, truth.position[0], answer.position[-1], answer.fields[REACTION].values)
+            of_page = np.array(tuple(known[name]["run"].values())) / true - 1
+            np.testing.assert_allclose(np.array(said) / true - 1, of_page, atol=1e-3)
+            assert np.all(np.abs(of_page) < (0.03, 0.09))  # set and force
 
 
 def test_a_sweep_sees_where_the_ram_turns():

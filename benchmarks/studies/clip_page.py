@@ -1,0 +1,230 @@
+"""The page of `benchmarks.studies.clip`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ast_sim.support.progress import duration
+from ast_sim.trade_figures import Setting
+from benchmarks.studies import clip_ways
+from benchmarks.studies.clip_outcome import Outcome, errors
+from benchmarks.studies.clip_ways import FINER, OWN
+from benchmarks.studies.phrases import median_error
+
+ANSWERS = (
+    ("the run, all frames", "run"),
+    ("the run, the frames 3 and 6 alone", "run_two_frames"),
+    ("Gaussian process", "gaussian_process"),
+)
+
+_INTRODUCTION = """# A metal clip: permanent set and peak force
+
+Made by `python -m benchmarks.studies.clip` from `benchmarks/results/clip.json`; do not edit.
+
+`examples/clip`: a ram bends the arm of a metal clip open, turns in frame 3 of 6 and goes back. Length, thickness, place
+and kind of the cutout, travel and yield stress are drawn. The set is the length of the mean displacement of the arm's
+free end in the last frame, the peak force the largest force on the ram in all frames. Errors are relative to what
+CalculiX found on the same mesh, in scenes that no training has seen. The run predicts all frames of a scene,
+those after the turn from its own answer for the turn
+([the load path](../reference/model.md#jumps-and-corrections)). The Gaussian process (scikit-learn, a squared
+exponential with a length for each parameter) maps the drawn parameters to both numbers; it knows nothing else of a
+scene, and can be asked for nothing else. Times are processor times of one thread ({processor}), beside other work.
+"""
+
+_WAYS = """
+## CalculiX on coarser meshes and with larger increments
+
+The same scenes solved in other ways, {count} of the test scenes ({first} to {last}). Errors are those against the
+scene's own mesh, as the run's are. A frame of the dataset is solved in at least 4 increments; two steps are the ram's
+way out and back, which is all that both numbers need. Where CalculiX finds no solution on a coarser mesh, or does not
+end, meshes of nearly that size are tried, and the failed tries cost nothing here. Meshing is counted on neither side.
+"""
+
+_FINER = """
+## What the mesh itself gets wrong
+
+The mesh of the dataset against one of about {nodes:,} nodes, and the run, which asks for the dataset's mesh, against
+both. The run learns the error of its mesh with the rest.
+"""
+
+
+def page(found: dict[str, Any]) -> str:
+    """The page of the results."""
+    lines = [_INTRODUCTION.format(processor=found["processor"])]
+    for title, scenes in (
+        ("test scenes", found["scenes"]),
+        ("more scenes, which nobody had looked at", found["unseen"]),
+    ):
+        if scenes:
+            lines += [*_answers(scenes, f"{len(scenes)} {title}"), ""]
+    lines += _figures(found)
+    lines += _ways(found)
+    return "\n".join([*lines, *_finer(found)])
+
+
+def _answers(scenes: Sequence[dict[str, Any]], title: str) -> list[str]:
+    """The table of the errors."""
+    kinds = ("median", "mean", "90 % below")
+    heads = [f"{what}: {kind}" for what in ("set", "peak force") for kind in kinds]
+    lines = [f"| {title} | {' | '.join(heads)} |", "| --- |" + " ---: |" * 6]
+    for name, key in ANSWERS:
+        lines.append(f"| {name} | {' | '.join(_cells(errors(scenes, key, number)) for number in Outcome._fields)} |")
+    return [*lines, "| springs back wholly | 100 % | 100 % | 100 % | - | - | - |"]
+
+
+def _cells(values: np.ndarray) -> str:
+    middle = f"{100 * np.median(values):.2g} ± {100 * median_error(values):.1g} %"
+    return f"{middle} | {100 * values.mean():.2g} % | {100 * np.quantile(values, 0.9):.2g} %"
+
+
+def _figures(found: dict[str, Any]) -> list[str]:
+    """What else was measured in the test scenes."""
+    scenes, plan, simulated = found["scenes"], found["plan"], found["simulation_seconds"]
+    ours, theirs = ([np.median(errors(scenes, key, n)) for n in Outcome._fields] for key in ("run", "gaussian_process"))
+    lines = [
+        f"- The median error of the run is {ours[0] / theirs[0]:.2g} times that of the Gaussian process in the set,"
+        f" {ours[1] / theirs[1]:.2g} times in the peak force."
+    ]
+    solver = float(np.median([scene["solver_seconds"] for scene in scenes]))
+    for key, what in (("seconds", "all frames"), ("seconds_of_two", "the frames 3 and 6")):
+        ratios = [scene["solver_seconds"] / scene[key] for scene in scenes]
+        spent = 1000 * np.median([scene[key] for scene in scenes])
+        lines.append(
+            f"- An answer with {what} takes {spent:.0f} ms, CalculiX {solver:.3g} s a scene:"
+            f" {np.median(ratios):.0f} ± {median_error(ratios):.0f} times as long."
+        )
+    return [
+        *lines,
+        f"- The run: {plan['train']} scenes of about {plan['nodes']:,} nodes, {plan['steps']:,} steps in"
+        f" {duration(found['training_seconds'])}, {found['parameters']:,} weights. CalculiX took"
+        f" {duration(simulated['train'] + simulated['valid'])} for the scenes of training and validation.",
+        f"- Errors of the run in the field, medians: displacement {_median(scenes, 'turn_error')} when the ram turns,"
+        f" {_median(scenes, 'last_error')} when it is back; plastic strain there {_median(scenes, 'strain_error')};"
+        f" forces on single nodes when the ram turns {_median(scenes, 'force_error')}: only their sum is of use.",
+        f"- Sets from {_range(scenes, 'set')} mm, peak forces from {_range(scenes, 'peak')} N. {_worst(scenes)}",
+    ]
+
+
+def _median(scenes: Sequence[dict[str, Any]], key: str) -> str:
+    return f"{100 * np.median([scene[key] for scene in scenes]):.2g} %"
+
+
+def _range(scenes: Sequence[dict[str, Any]], number: str) -> str:
+    values = [scene["true"][number] for scene in scenes]
+    return f"{min(values):.3g} to {max(values):.3g}"
+
+
+def _worst(scenes: Sequence[dict[str, Any]]) -> str:
+    off = errors(scenes, "run", "set")
+    worst = (scenes[i] for i in np.argsort(-off)[:3])
+    told = (f"{one['name']} {one['run']['set']:.2g} for {one['true']['set']:.2g} mm" for one in worst)
+    return f"The worst sets of the run: {', '.join(told)}."
+
+
+def settings(found: dict[str, Any], number: str) -> dict[str, Setting]:
+    """The errors and the seconds of the run, of the Gaussian process and of every way of CalculiX in the scenes that
+    were solved in other ways, by their names; infinite where there is no solution."""
+    scenes = [scene for scene in found["scenes"] if scene["name"] in clip_ways.SCENES]
+    seconds = {"run": "seconds", "run_two_frames": "seconds_of_two"}
+    made = {}
+    for name, key in ANSWERS:
+        spent = [scene[seconds[key]] if key in seconds else 0.0 for scene in scenes]
+        made[name] = Setting(name, tuple(errors(scenes, key, number).tolist()), tuple(spent))
+    for name, solved in found["ways"].items():
+        if name != FINER.name:
+            pairs = [
+                (abs(one[number] / scene["true"][number] - 1), one["seconds"])
+                if number in one
+                else (math.inf, math.inf)
+                for scene, one in zip(scenes, solved, strict=True)
+            ]
+            made[name] = Setting(name, *zip(*pairs, strict=True))
+    return made
+
+
+def _ways(found: dict[str, Any]) -> list[str]:
+    """The table of the ways, who is as accurate as the run, and after how many questions each answer pays."""
+    off = {number: settings(found, number) for number in Outcome._fields}
+    count = len(off["set"][OWN.name].errors)
+    within = f"{math.ceil(0.9 * count)} of {count} below"
+    lines = [
+        _WAYS.format(count=count, first=clip_ways.SCENES[0], last=clip_ways.SCENES[-1]),
+        f"| answer | nodes | failed tries | set: median | set: {within} | force: median | force: {within} | time |",
+        "| --- |" + " ---: |" * 7,
+    ]
+    for name, of_set in off["set"].items():
+        solved = found["ways"].get(name, [])
+        nodes = f"{np.median([one['nodes'] for one in solved if 'nodes' in one]):,.0f}" if solved else "-"
+        failed = str(sum(len(one["failures"]) for one in solved)) if solved else "-"
+        cells = [
+            text for one in (of_set, off["peak"][name]) for text in (_share(np.median(one.errors)), _share(one.kept))
+        ]
+        lines.append(f"| {name} | {nodes} | {failed} | {' | '.join(cells)} | {_time(of_set.middle)} |")
+    return [*lines, "", *_verdicts(found, off)]
+
+
+def _share(value: float) -> str:
+    return f"{100 * value:.2g} %" if math.isfinite(value) else "-"
+
+
+def _time(seconds: float) -> str:
+    return f"{1000 * seconds:.0f} ms" if 0 < seconds < 1 else f"{seconds:.3g} s" if 0 < seconds < math.inf else "-"
+
+
+def _verdicts(found: dict[str, Any], off: dict[str, dict[str, Setting]]) -> list[str]:
+    """The fastest way that is as accurate as the run, and the questions after which the run pays."""
+    run = off["set"][ANSWERS[1][0]]
+    simulated = found["simulation_seconds"]
+    invested = simulated["train"] + simulated["valid"] + found["training_seconds"]
+    own = off["set"][OWN.name]
+    lines = [
+        f"- Simulation and training took {duration(invested)} of one core. Beside CalculiX on the scene's own mesh, as"
+        f" in the dataset, the run pays after {_questions(invested, own, run)}, the Gaussian process, which needs the"
+        f" training scenes alone, after {_questions(simulated['train'], own)}."
+    ]
+    for numbers, what in ((("set",), "in the set"), (("peak",), "in the force"), (("set", "peak"), "in both numbers")):
+        fit = [
+            off["set"][name]
+            for name in found["ways"]
+            if name != FINER.name and all(off[n][name].kept <= off[n][run.name].kept for n in numbers)
+        ]
+        best = min(fit, key=lambda one: one.middle)
+        ratios = np.array(best.seconds) / np.array(run.seconds)
+        lines.append(
+            f"- The fastest way of CalculiX that is as accurate as the run {what}, in 90 % of the scenes: {best.name},"
+            f" {_time(best.middle)}, {np.median(ratios):.0f} ± {median_error(ratios):.0f} times as long as the frames 3"
+            f" and 6 of the run. Beside it the run pays after {_questions(invested, best, run)}."
+        )
+    return lines
+
+
+def _questions(invested: float, solver: Setting, run: Setting | None = None) -> str:
+    saved = solver.middle - (0.0 if run is None else run.middle)
+    return f"{math.ceil(invested / saved):,} questions"
+
+
+def _finer(found: dict[str, Any]) -> list[str]:
+    """The error of the mesh beside that of the run."""
+    solved = found["ways"][FINER.name]
+    lines = [
+        _FINER.format(nodes=round(FINER.share * found["plan"]["nodes"])),
+        "| scene | nodes | set: own mesh off | run off own mesh | run off finer mesh | force: own mesh off"
+        " | run off own mesh | run off finer mesh | time |",
+        "| --- |" + " ---: |" * 8,
+    ]
+    scenes = [scene for scene in found["scenes"] if scene["name"] in clip_ways.SCENES]
+    for scene, one in zip(scenes, solved, strict=False):
+        if "set" not in one:
+            continue
+        cells = []
+        for number in Outcome._fields:
+            ours, true, finer = scene["run"][number], scene["true"][number], one[number]
+            cells += [
+                f"{100 * (value / base - 1):+.1f} %" for value, base in ((true, finer), (ours, true), (ours, finer))
+            ]
+        lines.append(f"| {scene['name']} | {one['nodes']:,} | {' | '.join(cells)} | {_time(one['seconds'])} |")
+    return lines
