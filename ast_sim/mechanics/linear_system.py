@@ -44,14 +44,12 @@ class Factorization(Protocol):
     def solve(self, right_side: np.ndarray) -> np.ndarray:
         """Solution for the matrix last factorised, to the last bits."""
 
-    def responses(self, loads: np.ndarray) -> np.ndarray:
-        """What `compliance` and `displacement` need of the loads P [F, A], a column each: L^-1 P, half of K^-1 P."""
+    def halves(self, loads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """For loads [A, F] what half of a solution makes of them, left and right [A, F] each: the products of the left
+        with the right are P K^-1 P^T. With a library that gives L both are the same array, P L^-T."""
 
-    def compliance(self, responses: np.ndarray) -> np.ndarray:
-        """P^T K^-1 P [A, A]."""
-
-    def displacement(self, responses: np.ndarray, forces: np.ndarray) -> np.ndarray:
-        """K^-1 P times the forces [A]: [F]."""
+    def other_half(self, rights: np.ndarray) -> np.ndarray:
+        """K^-1 P^T f [F], where `rights` [F] is the sum of the rights of the loads times the forces f."""
 
 
 @functools.cache
@@ -98,18 +96,14 @@ class Pardiso:
         # PARDISO refines it twice, which triples the time: barriers make the matrices of the solver stiff.
         return self._applied(33, right_side, refinements=2)
 
-    def responses(self, loads: np.ndarray) -> np.ndarray:
-        return self._applied(331, loads)  # L^-1
+    def halves(self, loads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        half = self._applied(331, loads.T).T  # L^-1
+        return half, half
 
-    def compliance(self, responses: np.ndarray) -> np.ndarray:
-        return responses.T @ responses
-
-    def displacement(self, responses: np.ndarray, forces: np.ndarray) -> np.ndarray:
-        return self._applied(333, responses @ forces)  # L^-T
+    def other_half(self, rights: np.ndarray) -> np.ndarray:
+        return self._applied(333, rights)  # L^-T
 
     def _applied(self, phase: int, columns: np.ndarray, refinements: int = 0) -> np.ndarray:
-        if not columns.size:
-            return columns
         self._solver.set_phase(phase)
         self._solver.set_iparm(8, refinements)
         return self._solver._call_pardiso(self._matrix, np.asfortranarray(columns))
@@ -141,17 +135,12 @@ class Cholmod:
         self._solver.solve(right_side, solution)
         return solution
 
-    def responses(self, loads: np.ndarray) -> np.ndarray:
-        """Loads and solutions, since cholespy does not give L: [2 F, A]."""
-        solutions = [self.solve(load) for load in np.ascontiguousarray(loads.T)]
-        return np.concatenate([loads, np.reshape(solutions, loads.T.shape).T])
+    def halves(self, loads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Loads and solutions, since cholespy does not give L."""
+        return loads, np.stack([self.solve(load) for load in np.ascontiguousarray(loads)])
 
-    def compliance(self, responses: np.ndarray) -> np.ndarray:
-        loads, solutions = np.split(responses, 2)
-        return loads.T @ solutions
-
-    def displacement(self, responses: np.ndarray, forces: np.ndarray) -> np.ndarray:
-        return np.split(responses, 2)[1] @ forces
+    def other_half(self, rights: np.ndarray) -> np.ndarray:
+        return rights
 
 
 def factorization() -> Factorization:

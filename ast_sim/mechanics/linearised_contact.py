@@ -28,8 +28,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
-from scipy.optimize import nnls
 
+from ast_sim.mechanics.contact_forces import Compliance, pressed, rubbed
 from ast_sim.mechanics.elements.elasticity import Deformation
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean, cofactor, determinant
 from ast_sim.mechanics.elements.second_order import elastic_body
@@ -45,11 +45,8 @@ NEAR = 0.5  # pairs with a gap below this may touch, in mean edge lengths of the
 DEEP = 2.0  # a node deeper inside another body than this is not taken for one in contact with it, in the same
 OVERLAP = 1e-6  # pairs may overlap by this much at the end of a step, in the same
 FEW, SHARE = 8, 4  # a round takes so many of the pairs that would overlap, or this part of them if that is more
-ROUNDING = 1e-10  # is added to the diagonal of B, relative to its mean: equal pairs make B singular
 SLID = 0.02  # surfaces have slid along this last part of the way from rest to x, if nothing else is known
-SWEEPS, CHANGE = 100, 1e-3  # forces of friction are found when a sweep over the pairs changes them by less
 FLATTEST = 0.2  # the least stretch of an element that forces and stiffness follow
-TINY = 1e-300  # instead of zero in a denominator
 STILL = 0.05  # a step of this size (`NewtonSteps.size`) or less is the last one (docs/log.md, 2026-11-25)
 SLIGHT = 1e-3  # a displacement below this, in mean edge lengths, is none: before bodies touch, only rounding is left
 SMALLEST = 1 / 64  # a step is shortened at most so far where it turns an element over
@@ -153,45 +150,46 @@ class NewtonSteps:
 
     def _constrained(self, factor: Factorization, force: np.ndarray, pairs: NearPairs) -> np.ndarray:
         """The displacement [F] of the free dofs; see the head of this file."""
-        unconstrained = factor.displacement(factor.responses(-force[:, None]), np.ones(1))
+        unconstrained = factor.other_half(factor.halves(-force[None])[1][0])
         count = len(pairs.gap)
-        offset = pairs.directions[:count] @ unconstrained + pairs.gap - self._clearance
-        active, responses, forces = self._pressed_pairs(factor, pairs.directions[:count], offset)
-        if not len(active):
-            return unconstrained
-        if self._friction:
-            along = np.concatenate([active, active + count])
-            tangents = pairs.directions[count + along]
-            responses = np.concatenate([responses, factor.responses(tangents.toarray().T)], axis=1)
-            offset = np.concatenate([offset[active], tangents @ unconstrained + pairs.slip[along]])
-            forces = _rubbed(_regular(factor.compliance(responses)), offset, forces, self._friction)
-        return unconstrained + factor.displacement(responses, forces)
+        offset = pairs.directions @ unconstrained + np.concatenate([pairs.gap - self._clearance, pairs.slip])
+        compliance = Compliance(factor, pairs.directions)
+        chosen, forces = self._pressed_pairs(compliance, offset[:count], pairs.directions[:count])
+        if not self._friction or not forces.any():
+            return unconstrained + (compliance.displacement(forces) if forces.any() else 0)
+        active = np.flatnonzero(forces)
+        active = active[np.argsort(chosen[active])]
+        along = np.concatenate([chosen[active] + count, chosen[active] + 2 * count])
+        compliance.want(along)
+        columns = np.concatenate([active, np.arange(len(chosen), len(chosen) + len(along))])
+        rows = np.concatenate([chosen[active], along])
+        all_forces = np.zeros(len(chosen) + len(along))
+        all_forces[columns] = rubbed(
+            compliance.matrix[np.ix_(columns, columns)], offset[rows], forces[active], self._friction
+        )
+        return unconstrained + compliance.displacement(all_forces)
 
     def _pressed_pairs(
-        self, factor: Factorization, normals: scipy.sparse.csr_array, offset: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The pairs [A] that press on each other, their responses [., A] and forces [A], without friction.
+        self, compliance: Compliance, offset: np.ndarray, normals: scipy.sparse.csr_array
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The pairs [A] that may press on each other and their forces [A] >= 0, without friction.
 
-        A response costs half a solution with the stiffness. So pairs get one in rounds, those first that would overlap
-        most with the forces so far. At the end no pair overlaps: these are the forces of all pairs.
+        The compliance of a pair costs half a solution with the stiffness. So pairs get one in rounds, those first that
+        would overlap most with the forces so far. At the end no pair overlaps: these are the forces of all pairs.
         """
         chosen = np.zeros(0, int)
         forces = np.zeros(0)
         gap = offset.copy()
-        responses = factor.responses(np.zeros((normals.shape[1], 0)))
         while True:
             missing = np.flatnonzero(gap < -OVERLAP * self._length)
             if not len(missing):
-                break
+                return chosen, forces
             deepest = missing[np.argsort(gap[missing], kind="stable")][: max(FEW, len(missing) // SHARE)]
             chosen = np.concatenate([chosen, deepest])
-            responses = np.concatenate([responses, factor.responses(normals[deepest].toarray().T)], axis=1)
-            forces = _pressed(_regular(factor.compliance(responses)), offset[chosen])
-            gap = offset + normals @ factor.displacement(responses, forces)
+            compliance.want(deepest)
+            forces = pressed(compliance.matrix, offset[chosen])
+            gap = offset + normals @ compliance.displacement(forces)
             gap[chosen] = 0
-        order = np.argsort(chosen)
-        active = order[forces[order] > 0]
-        return chosen[active], responses[:, active], forces[active]
 
     def von_mises(self, position: np.ndarray, location: str) -> np.ndarray:
         """[N, 1] or [E, 1] float32: the stress in pascal at `location`, "node" or "element"; 0 in rigid bodies."""
@@ -288,48 +286,3 @@ def _tangents(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     first = np.cross(normals, across)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return first, np.cross(normals, first)
-
-
-def _regular(compliance: np.ndarray) -> np.ndarray:
-    """The compliance, exactly symmetric and without zero eigenvalues."""
-    ridge = ROUNDING * np.trace(compliance) / len(compliance)
-    return (compliance + compliance.T) / 2 + ridge * np.eye(len(compliance))
-
-
-def _pressed(compliance: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """The forces [P] >= 0 of contact without friction: with B = L L^T they minimise |L^T l + L^-1 b|."""
-    try:
-        lower = np.linalg.cholesky(compliance)
-        return nnls(lower.T, -np.linalg.solve(lower, offset), maxiter=30 * len(offset))[0]
-    except (np.linalg.LinAlgError, RuntimeError) as error:
-        raise SimulationError(f"the forces of contact were not found: {error}") from error
-
-
-def _rubbed(compliance: np.ndarray, offset: np.ndarray, forces: np.ndarray, friction: float) -> np.ndarray:
-    """The forces [3, P] of contact with Coulomb friction, from those [P] without, by nonlinear block Gauss-Seidel
-    (Jourdan, Alart and Jean 1998): each pair in turn gets the force that is right if the others stay.
-
-    Args:
-        compliance: B [3 P, 3 P], normals first, then the first and the second tangents.
-        offset: b [3 P].
-    """
-    count = len(forces)
-    all_forces = np.concatenate([forces, np.zeros(2 * len(forces))])
-    of_pair = np.ascontiguousarray(compliance.reshape(3, count, 3 * count).swapaxes(0, 1))  # the three rows of each
-    by_normal = of_pair[np.arange(count), :, np.arange(count)].tolist()  # what a pair's own normal force moves
-    stiffest = compliance.diagonal().reshape(3, count)[1:].max(axis=0).tolist()
-    pairs = list(zip(of_pair, offset.reshape(3, count).T, by_normal, stiffest, strict=True))
-    for _ in range(SWEEPS):
-        before = all_forces.copy()
-        for pair, (rows, gap, (own, first_by_normal, second_by_normal), tangential) in enumerate(pairs):
-            components = slice(pair, None, count)
-            distance, first, second = (rows @ all_forces + gap).tolist()
-            normal_before, one, other = all_forces[components].tolist()
-            normal = max(0.0, normal_before - distance / own)
-            one -= (first + first_by_normal * (normal - normal_before)) / tangential
-            other -= (second + second_by_normal * (normal - normal_before)) / tangential
-            share = min(1.0, friction * normal / max(math.hypot(one, other), TINY))
-            all_forces[components] = normal, share * one, share * other
-        if np.abs(all_forces - before).max() <= CHANGE * np.abs(all_forces).max():
-            break
-    return all_forces
