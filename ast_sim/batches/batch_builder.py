@@ -66,13 +66,13 @@ class Batch:
     history: Tensor | None = None
 
     @staticmethod
-    def build(graph: Graph, state: State, prescribed: Tensor, names: list[str]) -> Batch:
+    def build(graph: Graph, state: State, prescribed_position: Tensor, names: list[str]) -> Batch:
         """The batch of one scene, or of several scenes whose arrays are concatenated.
 
         Args:
-            prescribed: [N, 3], the positions of the prescribed nodes in the frame to predict. Other rows are not read.
+            prescribed_position: [N, 3], of the prescribed nodes in the frame to predict. Other rows are not read.
         """
-        motion = torch.where(graph.prescribed[:, None], prescribed - state.position, 0.0)
+        motion = torch.where(graph.prescribed[:, None], prescribed_position - state.position, 0.0)
         known = {"source": state.source, "history": state.history}
         return Batch(graph, state.position, state.previous, motion, state.stress, names, **known)
 

@@ -39,19 +39,19 @@ class Carrier:
         ]
         self._extension = cache(lambda number: harmonic_extension(scene, *bodies[number]))
 
-    def __call__(self, position: np.ndarray, prescribed: np.ndarray) -> np.ndarray:
+    def __call__(self, position: np.ndarray, prescribed_position: np.ndarray) -> np.ndarray:
         """Move a state to where the prescribed nodes will be.
 
         Args:
             position: [N, 3], the state.
-            prescribed: [N, 3], the positions of the prescribed nodes. Other rows are not read.
+            prescribed_position: [N, 3], of the prescribed nodes. Other rows are not read.
 
         Returns:
             [N, 3] float32.
         """
-        there = np.where(self._prescribed[:, None], prescribed, position).astype(np.float32)
+        there = np.where(self._prescribed[:, None], prescribed_position, position).astype(np.float32)
         for number, (held, free) in enumerate(self._bodies):
-            before, after = position[held].astype(np.float64), prescribed[held].astype(np.float64)
+            before, after = position[held].astype(np.float64), prescribed_position[held].astype(np.float64)
             if np.array_equal(before, after):
                 continue
             move = rigid_motion(before, after)

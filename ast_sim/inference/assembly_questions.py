@@ -86,7 +86,9 @@ def ask(
         arrays = (case.scene.rest_position, case.scene.elements, case.scene.node_type, case.scene.material)
         scene = known.setdefault(tuple(np.asarray(array).tobytes() for array in arrays), case.scene)
         told = tuple(differences(read, values, trained)) if trained else (NOT_TRAINED,)
-        asked.append(Asked(scene, Motion(case.targets.astype(np.float32)), values, list(shared.origin), told))
+        asked.append(
+            Asked(scene, Motion(case.prescribed_position.astype(np.float32)), values, list(shared.origin), told)
+        )
     for note in notes:
         warnings.warn(note, stacklevel=2)
     return asked

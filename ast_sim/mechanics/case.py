@@ -23,7 +23,7 @@ class SolidCase:
 
     Attributes:
         scene: what does not change. Elements whose nodes are all OBSTACLE nodes are rigid; all others deform.
-        targets: [S,N,3] float64, positions of the prescribed nodes in each frame in metres. Rows of other nodes are
+        prescribed_position: [S,N,3] float64, of the prescribed nodes in each frame in metres. Rows of other nodes are
             ignored. Frame 0 is at rest.
         material: material of all elements; the constants of rigid elements are ignored.
         contact: contact between bodies.
@@ -35,7 +35,7 @@ class SolidCase:
     """
 
     scene: Scene
-    targets: np.ndarray
+    prescribed_position: np.ndarray
     material: NeoHookean
     contact: ContactSettings
     stress_location: str
@@ -46,8 +46,8 @@ class SolidCase:
     def keeping(self, frames: tuple[int, ...]) -> SolidCase:
         """The case with frame 0 and these frames only; load steps go where the nodes turn between them."""
         stored = (0, *frames)
-        course = self.course or Course(self.targets, self.scene.prescribed)
-        return replace(self, targets=self.targets[list(stored)], course=course.storing(stored))
+        course = self.course or Course(self.prescribed_position, self.scene.prescribed)
+        return replace(self, prescribed_position=self.prescribed_position[list(stored)], course=course.storing(stored))
 
     def notes(self) -> list[str]:
         """What a user should know of the scene, a sentence each."""
@@ -56,33 +56,35 @@ class SolidCase:
 
     def legs(self, frame: int) -> list[Leg]:
         """What load steps follow from the frame before to this one."""
-        return [Leg(self.targets[frame])] if self.course is None else self.course.legs(frame)
+        return [Leg(self.prescribed_position[frame])] if self.course is None else self.course.legs(frame)
 
     def straight(self, frame: int) -> list[Leg]:
         """What load steps follow from rest to a frame, past the frames between."""
-        return [Leg(self.targets[frame])] if self.course is None else self.course.straight(frame)
+        return [Leg(self.prescribed_position[frame])] if self.course is None else self.course.straight(frame)
 
     def on_the_way(self, frame: int, share: float) -> np.ndarray:
         """[N,3]: where the prescribed nodes are at a share of the way from rest to a frame, past the frames between."""
-        leg = Leg(self.targets[frame]) if self.course is None else self.course.direct(frame)
+        leg = Leg(self.prescribed_position[frame]) if self.course is None else self.course.direct(frame)
         if leg.along is not None:
             return leg.along(share)
-        return self.targets[0] + share * (leg.end - self.targets[0])
+        return self.prescribed_position[0] + share * (leg.end - self.prescribed_position[0])
 
     def followed(self) -> tuple[SolidCase, list[int]]:
         """The same case with a frame wherever a leg ends, and which of its frames are those of this case."""
-        ends, stored = [self.targets[0]], [0]
-        for frame in range(1, len(self.targets)):
+        ends, stored = [self.prescribed_position[0]], [0]
+        for frame in range(1, len(self.prescribed_position)):
             ends += [leg.end for leg in self.legs(frame)]
             stored.append(len(ends) - 1)
-        return replace(self, targets=np.stack(ends), course=None), stored
+        return replace(self, prescribed_position=np.stack(ends), course=None), stored
 
     @property
     def farthest(self) -> np.ndarray:
         """[N,3]: where the prescribed nodes are in the frame in which one of them is farthest from its place at rest;
         the last one of several."""
-        way = np.linalg.norm(self.targets - self.targets[0], axis=2)[:, self.scene.prescribed].max(axis=1, initial=0)
-        return self.targets[len(way) - 1 - int(np.argmax(way[::-1]))]
+        way = np.linalg.norm(self.prescribed_position - self.prescribed_position[0], axis=2)[
+            :, self.scene.prescribed
+        ].max(axis=1, initial=0)
+        return self.prescribed_position[len(way) - 1 - int(np.argmax(way[::-1]))]
 
 
 @dataclass(frozen=True, eq=False)

@@ -50,17 +50,19 @@ class Driven:
     path: np.ndarray
 
     @staticmethod
-    def of(scene: Scene, targets: np.ndarray) -> Driven:
+    def of(scene: Scene, prescribed_position: np.ndarray) -> Driven:
         """Of a scene with positions [S,N,3] of the prescribed nodes in each frame; other rows are not read."""
-        way = np.where(scene.prescribed, np.abs(targets - targets[0]).max(axis=0).max(axis=1), 0)
+        way = np.where(
+            scene.prescribed, np.abs(prescribed_position - prescribed_position[0]).max(axis=0).max(axis=1), 0
+        )
         farthest = int(np.argmax(way))
         body = int(scene.body[farthest])
         own, moves = scene.prescribed & (scene.body == body), way > RIGID * way[farthest]
         if scene.node_type[farthest] == NodeType.OBSTACLE or not moves.any():
             nodes = own
         else:
-            nodes = _moved_together(_edges_between(scene, own), own, moves, targets, farthest)
-        return Driven(body, nodes, targets[:, nodes].astype(np.float64))
+            nodes = _moved_together(_edges_between(scene, own), own, moves, prescribed_position, farthest)
+        return Driven(body, nodes, prescribed_position[:, nodes].astype(np.float64))
 
     @cached_property
     def axis(self) -> Axis | None:
@@ -136,19 +138,23 @@ def _joined(edges: np.ndarray, nodes: np.ndarray, start: int) -> np.ndarray:
 
 
 def _moved_together(
-    edges: np.ndarray, own: np.ndarray, moves: np.ndarray, targets: np.ndarray, farthest: int
+    edges: np.ndarray, own: np.ndarray, moves: np.ndarray, prescribed_position: np.ndarray, farthest: int
 ) -> np.ndarray:
     """[N] bool: the nodes of `own` that move with the farthest one."""
-    most = RIGID * np.abs(targets[:, farthest] - targets[0, farthest]).max()
-    length = np.linalg.norm(targets[:, edges[0]] - targets[:, edges[1]], axis=2)
+    most = RIGID * np.abs(prescribed_position[:, farthest] - prescribed_position[0, farthest]).max()
+    length = np.linalg.norm(prescribed_position[:, edges[0]] - prescribed_position[:, edges[1]], axis=2)
     rigid = edges[:, np.abs(length - length[0]).max(axis=0) <= most]
     alike, nodes = _joined(rigid, own, farthest), _joined(edges, own & moves, farthest)
     if not alike[nodes].all():
         return nodes
-    motions = RigidMotions.of(targets[:, alike].astype(np.float64))
+    motions = RigidMotions.of(prescribed_position[:, alike].astype(np.float64))
     if not motions.fit.all():
         return alike
-    off = np.einsum("sij,nj->sni", motions.rotation, targets[0][own]) + motions.shift[:, None] - targets[:, own]
+    off = (
+        np.einsum("sij,nj->sni", motions.rotation, prescribed_position[0][own])
+        + motions.shift[:, None]
+        - prescribed_position[:, own]
+    )
     follows = np.zeros_like(own)
     follows[own] = np.abs(off).max(axis=(0, 2)) <= most
     for start in np.flatnonzero(follows & moves & ~alike):

@@ -48,7 +48,7 @@ class ClothCase:
     Attributes:
         scene: triangles. Those whose nodes are all OBSTACLE nodes are rigid; all others are cloth. The rest position is
             the start; there the cloth is flat and unstrained.
-        targets: [S,N,3] float64, positions of the prescribed nodes in each frame in metres. Rows of other nodes are
+        prescribed_position: [S,N,3] float64, of the prescribed nodes in each frame in metres. Rows of other nodes are
             ignored. Frame 0 is at rest.
         material: material of the cloth.
         contact: contact between the surfaces.
@@ -59,7 +59,7 @@ class ClothCase:
     """
 
     scene: Scene
-    targets: np.ndarray
+    prescribed_position: np.ndarray
     material: ClothMaterial
     contact: ContactSettings
     time_step: float

@@ -38,17 +38,17 @@ class Equilibria:
         self._frames.watch(self._require_patience)
 
     @classmethod
-    def of(cls, scene: Scene, law: Law, targets: np.ndarray, prepared: NewtonSteps) -> Self:
+    def of(cls, scene: Scene, law: Law, prescribed_position: np.ndarray, prepared: NewtonSteps) -> Self:
         """The equilibria of tetrahedra under a law. Bodies are not kept from passing through themselves.
 
         Args:
-            targets: [S, N, 3], the positions of the prescribed nodes in each frame. Other rows are not read.
+            prescribed_position: [S, N, 3], of the prescribed nodes in each frame. Other rows are not read.
 
         Raises:
             ConfigError: the law of the material is not known.
             SimulationError: the constants of the material or of contact are not allowed.
         """
-        known = np.where(scene.prescribed[:, None], targets, scene.rest_position.astype(np.float64))
+        known = np.where(scene.prescribed[:, None], prescribed_position, scene.rest_position.astype(np.float64))
         return cls(SolidCase(scene, known, law.of_elements(scene), law.contact(scene), "node"), prepared)
 
     @property
@@ -94,7 +94,7 @@ class Equilibria:
 
     def _finished(self, frame: int, start: np.ndarray) -> np.ndarray:
         self._restart(start)
-        self._frames.solver.advance(self._frames.case.targets[frame])
+        self._frames.solver.advance(self._frames.case.prescribed_position[frame])
         return self._checked()
 
     def _restart(self, position: np.ndarray) -> None:

@@ -72,7 +72,7 @@ class Case(Protocol):
     """A scene, positions [S,N,3] of its prescribed nodes in each frame, its contact, and what its drawing records."""
 
     scene: Scene
-    targets: np.ndarray
+    prescribed_position: np.ndarray
     contact: ContactSettings
     attributes: dict[str, AttributeValue]
 
@@ -113,7 +113,7 @@ class Frames(ABC):
         self.records: list[FrameRecord] = []
         self.arrays: dict[str, list[np.ndarray]] = {}
         self._steps_before = 0
-        self.driven = Driven.of(case.scene, case.targets)
+        self.driven = Driven.of(case.scene, case.prescribed_position)
 
     @abstractmethod
     def next_frame(self) -> tuple[dict[str, np.ndarray], FrameRecord]:
@@ -157,7 +157,7 @@ class Frames(ABC):
             SimulationError: the scene at rest fails its checks.
         """
         checkpoint = checkpoint or Checkpoint()
-        count = len(self.case.targets)
+        count = len(self.case.prescribed_position)
         self._restore(checkpoint.load())
 
         def before_step(steps: int) -> None:
@@ -209,7 +209,7 @@ class Frames(ABC):
 
     def bring(self, frame: int) -> None:
         """Bring the bodies from the frame before to this one."""
-        self.solver.advance(self.case.targets[frame])
+        self.solver.advance(self.case.prescribed_position[frame])
 
     def check(self, arrays: dict[str, np.ndarray]) -> dict[str, float]:
         """Check a frame as it is stored: its numbers are finite, surfaces are apart, no element is inverted.

@@ -285,12 +285,12 @@ class Simulator(nn.Module):
             return 2 * batch.position - batch.previous_position + motion
         return batch.position + motion
 
-    def advance(self, batch: Batch, prescribed: Tensor) -> tuple[Tensor, Prediction]:
-        """The positions [N, 3] in the predicted frame, and the prediction. Prescribed nodes are at `prescribed`
-        [N, 3]."""
+    def advance(self, batch: Batch, prescribed_position: Tensor) -> tuple[Tensor, Prediction]:
+        """The positions [N, 3] in the predicted frame, and the prediction. Prescribed nodes are at
+        `prescribed_position` [N, 3]."""
         prediction = self.predict(batch)
         position = self.integrate(batch, prediction.motion)
-        return torch.where(batch.graph.prescribed[:, None], prescribed, position), prediction
+        return torch.where(batch.graph.prescribed[:, None], prescribed_position, position), prediction
 
 
 def _require_cpu(what: str, device: torch.device) -> None:

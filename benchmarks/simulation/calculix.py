@@ -71,10 +71,10 @@ def agrees(figures: dict) -> bool:
 def with_crush(case: SolidCase, crush: float) -> SolidCase:
     """A case of `abcd` squeezed by another share of its height than the drawn one: the same way, scaled."""
     drawn, air = case.attributes["crush"], 2 * case.contact.dhat
-    travel = float(np.linalg.norm(case.targets[-1] - case.targets[0], axis=1).max())
+    travel = float(np.linalg.norm(case.prescribed_position[-1] - case.prescribed_position[0], axis=1).max())
     factor = ((travel - air) * crush / drawn + air) / travel
-    targets = case.targets[0] + factor * (case.targets - case.targets[0])
-    return replace(case, targets=targets, attributes={**case.attributes, "crush": crush})
+    targets = case.prescribed_position[0] + factor * (case.prescribed_position - case.prescribed_position[0])
+    return replace(case, prescribed_position=targets, attributes={**case.attributes, "crush": crush})
 
 
 def measure(seed: int, nodes: int) -> dict:

@@ -94,7 +94,7 @@ def march(case: ClothCase, steps: int) -> tuple[BackwardEuler, np.ndarray, np.nd
 
     energies, momenta, gap = [energy()], [(mass * solver.velocity).sum(axis=0)], np.inf
     for _ in range(steps):
-        solver.advance(case.targets[0])
+        solver.advance(case.prescribed_position[0])
         energies.append(energy())
         momenta.append((mass * solver.velocity).sum(axis=0))
         gap = min(gap, solver.contact.gap(solver.position))

@@ -49,7 +49,10 @@ def case(frames: int, cells: int = 4, held=None, ball: tuple[float, float] | Non
     targets = np.repeat(scene.rest_position.astype(float)[None], frames, axis=0)
     contact = ContactSettings(0.02, 300.0, self_contact=True)
     return ClothCase(
-        **{**dict(scene=scene, targets=targets, material=MATERIAL, contact=contact, time_step=STEP), **settings}
+        **{
+            **dict(scene=scene, prescribed_position=targets, material=MATERIAL, contact=contact, time_step=STEP),
+            **settings,
+        }
     )
 
 
@@ -146,11 +149,13 @@ def test_the_sphere_stands_where_it_is_told_and_carries_the_cloth():
     moving = case(25, cells=8, ball=(0.2, -0.23), gravity=(0.0, 0.0, 0.0))
     sphere = moving.scene.body == 1
     lift = 1.0 * STEP * np.arange(25)
-    moving.targets[:, sphere, 2] += lift[:, None]
+    moving.prescribed_position[:, sphere, 2] += lift[:, None]
     trajectory = implicit_euler(moving)
     attributes = trajectory.attributes
     assert attributes["status"] == "complete", attributes.get("stopped_by")
-    np.testing.assert_array_equal(trajectory.position[:, sphere], moving.targets[:, sphere].astype(np.float32))
+    np.testing.assert_array_equal(
+        trajectory.position[:, sphere], moving.prescribed_position[:, sphere].astype(np.float32)
+    )
     assert trajectory.position[-1, ~sphere, 2].max() > 0.2
     assert attributes["work"][-1] > 0 and max(attributes["reaction"]) > 0
     energy = sum(attributes[name][-1] for name in ("elastic_energy", "contact_energy", "kinetic_energy"))
@@ -174,7 +179,10 @@ def on_slope(slope: float, friction: float, frames: int) -> ClothCase:
     )
     targets = np.repeat(scene.rest_position.astype(float)[None], frames, axis=0)
     return replace(
-        flat, scene=scene, targets=targets, contact=ContactSettings(0.02, 300.0, friction, self_contact=True)
+        flat,
+        scene=scene,
+        prescribed_position=targets,
+        contact=ContactSettings(0.02, 300.0, friction, self_contact=True),
     )
 
 

@@ -29,11 +29,11 @@ def rms(difference: np.ndarray) -> float:
 def squeezed():
     """Two blocks that are pressed together by 8 mm: the case, the solver's positions, and how far free nodes went."""
     case = pressed(*blocks(), depth=0.01)
-    frame = len(case.targets) - 1
+    frame = len(case.prescribed_position) - 1
     found = solve_frame(case, frame)
     assert found.failure == ""
     free = ~case.scene.prescribed
-    return case, found.position, free, rms((found.position - case.targets[0])[free])
+    return case, found.position, free, rms((found.position - case.prescribed_position[0])[free])
 
 
 def nearly(truth: np.ndarray, free: np.ndarray, size: float) -> np.ndarray:
@@ -76,8 +76,8 @@ def test_steps_of_second_order_tetrahedra_lead_to_the_solution_of_the_solver(loc
     truth, free = stored.position[-1].astype(float), ~case.scene.prescribed
     solver = NewtonSteps(case.scene, case.material, 0.92 * DHAT)
     size, position = (
-        rms((truth - case.targets[0])[free]),
-        nearly(truth, free, 0.1 * rms((truth - case.targets[0])[free])),
+        rms((truth - case.prescribed_position[0])[free]),
+        nearly(truth, free, 0.1 * rms((truth - case.prescribed_position[0])[free])),
     )
     for _ in range(3):
         position = solver.step(position)

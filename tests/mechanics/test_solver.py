@@ -41,7 +41,7 @@ def test_two_free_bodies_carry_the_same_load(two_blocks):
     assert attributes["young"] == [1e6, 2e6] and attributes["poisson"] == 0.3
     assert attributes["contact_area"][0] == 0 and 1 < attributes["contact_area"][-1] / 0.14**2 < 2.5
     solver = solver_of(case)
-    for target in case.targets[1:]:
+    for target in case.prescribed_position[1:]:
         solver.advance(target)
     np.testing.assert_array_equal(solver.newton.position.astype(np.float32), trajectory.position[-1])
     forces = solver.newton.reactions()
@@ -67,7 +67,7 @@ def test_von_mises_is_that_of_the_tensor(two_blocks):
 def test_the_solution_does_not_depend_on_the_number_of_load_steps(two_blocks):
     case, trajectory = two_blocks
     coarse = solver_of(case)
-    coarse.advance(case.targets[-1])
+    coarse.advance(case.prescribed_position[-1])
     # Two solutions that both stop at a residual of the tolerance differ by about that share of the displacement.
     np.testing.assert_allclose(coarse.newton.position, trajectory.position[-1], atol=3e-4 * 0.02)
 
@@ -75,10 +75,10 @@ def test_the_solution_does_not_depend_on_the_number_of_load_steps(two_blocks):
 def test_a_load_step_that_fails_is_halved():
     case = pressed(*blocks(), depth=0.02)
     with pytest.raises(NotConverged, match="not at its target after 1 moves, also after 0 halvings and 60 damped"):
-        solver_of(case, SolverSettings(max_moves=1, max_halvings=0)).advance(case.targets[-1])
+        solver_of(case, SolverSettings(max_moves=1, max_halvings=0)).advance(case.prescribed_position[-1])
     solver, expected = solver_of(case, SolverSettings(max_moves=2)), solver_of(case)
-    solver.advance(case.targets[-1])
-    expected.advance(case.targets[-1])
+    solver.advance(case.prescribed_position[-1])
+    expected.advance(case.prescribed_position[-1])
     assert solver.halvings > 0
     np.testing.assert_allclose(solver.newton.position, expected.newton.position, atol=3e-4 * 0.02)
 
@@ -110,7 +110,7 @@ def test_friction_holds_what_slides_without_it():
     for friction in (0.0, 0.2, 2.0):
         case = pressed(*blocks(), depth=0.01, shift=0.03, friction=friction)
         solver = solver_of(case)
-        for target in case.targets[1:]:
+        for target in case.prescribed_position[1:]:
             solver.advance(target)
         assert (solver.dissipation > 0) == (friction > 0)
         state, upper = solver.newton.state.contact, case.scene.body[solver.newton.contact.nodes] == 1

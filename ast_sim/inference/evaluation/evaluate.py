@@ -122,12 +122,12 @@ def one_step_predictions(model: Simulator, truth: Trajectory, name: str) -> tupl
     """
     given = model.config.data.given_frames
     graph = model.graph(truth.scene)
-    script = torch.tensor(truth.position)
-    known = [None] * len(script) if truth.stress is None else torch.tensor(truth.stress)
+    position = torch.tensor(truth.position)
+    known = [None] * len(position) if truth.stress is None else torch.tensor(truth.stress)
     starts = []
     for frame in range(given, truth.num_frames):
-        state = State(script[frame - 1], script[frame - 2] if given == 2 else None, known[frame - 1])
-        starts.append(Start(f"{name} frame {frame - 1}", graph, state, script[frame]))
+        state = State(position[frame - 1], position[frame - 2] if given == 2 else None, known[frame - 1])
+        starts.append(Start(f"{name} frame {frame - 1}", graph, state, position[frame]))
     chunk = max(1, ONE_STEP_NODES // truth.scene.num_nodes)
     predicted = []
     with model.predicting():

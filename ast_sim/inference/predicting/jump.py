@@ -161,7 +161,7 @@ def _groups(model: Simulator, frames: Sequence[JumpingFrame]) -> Iterator[list[J
     for together in of_domain.values():
         group: list[JumpingFrame] = []
         for frame in together:
-            if group and sum(len(other.start.prescribed) for other in [*group, frame]) > BATCH_NODES:
+            if group and sum(len(other.start.prescribed_position) for other in [*group, frame]) > BATCH_NODES:
                 yield group
                 group = []
             group.append(frame)

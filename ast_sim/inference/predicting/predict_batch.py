@@ -22,13 +22,13 @@ class Start(NamedTuple):
     Attributes:
         name: for messages.
         graph, state: of the scene.
-        prescribed: [N, 3], the positions of the prescribed nodes in the frame. Other rows are not read.
+        prescribed_position: [N, 3], the positions of the prescribed nodes in the frame. Other rows are not read.
     """
 
     name: str
     graph: Graph
     state: State
-    prescribed: Tensor
+    prescribed_position: Tensor
 
 
 class PredictedFrame(NamedTuple):
@@ -51,15 +51,15 @@ def predict_batch(model: Simulator, starts: Sequence[Start], calls: int = 1) -> 
     """Predict the frames; each call corrects the answer of the one before. Fields on elements are predicted by the last
     call only."""
     began = time.perf_counter()
-    names, graphs, states, prescribed = zip(*starts, strict=True)
+    names, graphs, states, prescribed_position = zip(*starts, strict=True)
     graph = Graph.concatenate(graphs)
-    prescribed = torch.cat(prescribed)
-    batch = Batch.build(graph, State.concatenate(states), prescribed, list(names))
+    prescribed_position = torch.cat(prescribed_position)
+    batch = Batch.build(graph, State.concatenate(states), prescribed_position, list(names))
     sizes = graph.node_offsets.diff().tolist()
     positions = []
     predictions = []
     for call in range(1, calls + 1):
-        position, prediction = model.advance(replace(batch, wants_elements=call == calls), prescribed)
+        position, prediction = model.advance(replace(batch, wants_elements=call == calls), prescribed_position)
         positions.append(position.split(sizes))
         predictions.append(prediction)
         batch = replace(batch, position=position, proximity=None)

@@ -51,7 +51,7 @@ def rollouts(model: Simulator, questions: Sequence[Question], progress: ShowProg
 
 
 class _RollingScene:
-    """A scene during its rollout: its graph, its script and the frames so far."""
+    """A scene during its rollout: its graph, its motion and the frames so far."""
 
     def __init__(self, model: Simulator, question: Question, given: int) -> None:
         self.model, self.config, self.question = model, model.config, question

@@ -75,7 +75,7 @@ def write_deck(file: TextIO, case: SolidCase, increments: Increments) -> None:
     """
     if case.scene.elements.shape[1] not in ELEMENT_TYPES:
         raise ConfigError("CalculiX is used for tetrahedra only: solve cloth with the own solver")
-    if not (case.scene.prescribed & (case.targets != case.targets[0]).any(axis=(0, 2))).any():
+    if not (case.scene.prescribed & (case.prescribed_position != case.prescribed_position[0]).any(axis=(0, 2))).any():
         raise SimulationError("CalculiX needs prescribed nodes that move, but this case has none")
     for block in (_mesh(case), _contact(case, increments), _steps(case, increments)):
         file.writelines(line + "\n" for line in block)
@@ -97,7 +97,7 @@ def _mesh(case: SolidCase) -> Iterator[str]:
         yield f"{number}, " + ", ".join(map(str, nodes))
     yield from _materials(case)
     yield "*NSET, NSET=DRIVEN"
-    yield from _rows(np.flatnonzero(Driven.of(scene, case.targets).nodes))
+    yield from _rows(np.flatnonzero(Driven.of(scene, case.prescribed_position).nodes))
 
 
 def _materials(case: SolidCase) -> Iterator[str]:
@@ -210,12 +210,12 @@ def _steps(case: SolidCase, increments: Increments) -> Iterator[str]:
     """
     prescribed = np.flatnonzero(case.scene.prescribed)
     only_last = "FREQUENCY=1000000"
-    for target in case.targets[1:]:
+    for target in case.prescribed_position[1:]:
         yield "*STEP, NLGEOM, INC=100000"
         yield "*STATIC"
         yield f"{min(increments.first, increments.largest)}, 1., {increments.smallest}, {increments.largest}"
         yield "*BOUNDARY"
-        displacement = target[prescribed] - case.targets[0, prescribed]
+        displacement = target[prescribed] - case.prescribed_position[0, prescribed]
         for node, vector in zip(prescribed + 1, displacement, strict=True):
             for axis, value in enumerate(vector, start=1):
                 yield f"{node}, {axis}, {axis}, {value:.9e}"

@@ -173,7 +173,7 @@ def _processor_seconds() -> float:
 def _results(case: SolidCase, folder: Path) -> Results:
     scene = case.scene
     points = POINTS[scene.elements.shape[1]]
-    size = len(case.targets) - 1, scene.num_nodes, scene.num_elements, points
+    size = len(case.prescribed_position) - 1, scene.num_nodes, scene.num_elements, points
     return read_results(folder, JOB, *size, yields=bool(case.hardening))
 
 
@@ -218,12 +218,12 @@ def _trajectory(
     scene = case.scene
     rest = scene.rest_position.astype(np.float64)
     position = np.concatenate([rest[None], rest + results.displacement])
-    position[:, scene.prescribed] = case.targets[: len(position), scene.prescribed]
+    position[:, scene.prescribed] = case.prescribed_position[: len(position), scene.prescribed]
     position = position.astype(np.float32)
     jacobian, failure = _check(case, position)
     frames = len(jacobian)
     status: dict[str, AttributeValue] = {"status": "complete"}
-    if frames < len(case.targets):
+    if frames < len(case.prescribed_position):
         status = {"status": "truncated", "stopped_by": f"frame {frames}: {failure or stopped_by}"}
     iterations = np.concatenate([[0], results.iterations])
     return Trajectory(

@@ -160,11 +160,11 @@ def _case(pair: Pair, squeeze: _Squeeze) -> SolidCase:
         material=material,
     )
     down = np.linspace(0, squeeze.travel, FRAMES)[:, None] * (pair.clamped & (pair.body == 1))
-    targets = np.repeat(scene.rest_position.astype(np.float64)[None], FRAMES, axis=0)
-    targets[:, :, 2] -= down
+    prescribed_position = np.repeat(scene.rest_position.astype(np.float64)[None], FRAMES, axis=0)
+    prescribed_position[:, :, 2] -= down
     return SolidCase(
         scene=scene,
-        targets=targets,
+        prescribed_position=prescribed_position,
         material=NeoHookean(*material.astype(np.float64).T),
         contact=CONTACT,
         stress_location="element",

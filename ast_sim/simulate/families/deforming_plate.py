@@ -179,11 +179,11 @@ def _try_draw(rng: np.random.Generator, nodes: int, frames: int) -> Drawn | None
 def _case(plate: _Plate, press: _Press) -> SolidCase:
     n, frames = len(plate.position), len(press.travel)
     scene = _assemble(plate, press.obstacle, press.elements)
-    targets = np.repeat(scene.rest_position.astype(np.float64)[None], frames, axis=0)
-    targets[:, n:] += press.travel[:, None]
+    prescribed_position = np.repeat(scene.rest_position.astype(np.float64)[None], frames, axis=0)
+    prescribed_position[:, n:] += press.travel[:, None]
     for clamp, moves in enumerate(press.drift, 1):
-        targets[:, :n][:, plate.clamps == clamp] += moves[:, None]
-    return SolidCase(scene, targets, MATERIAL, CONTACT, INFO.stress_location, press.attributes)
+        prescribed_position[:, :n][:, plate.clamps == clamp] += moves[:, None]
+    return SolidCase(scene, prescribed_position, MATERIAL, CONTACT, INFO.stress_location, press.attributes)
 
 
 def _draw_plate(rng: np.random.Generator, nodes: float) -> _Plate | None:

@@ -74,7 +74,7 @@ def draw(rng: np.random.Generator, nodes: int = DEFAULT_NODES) -> ClothCase:
     moved = np.where((scene.body == 1)[:, None], (path - path[0])[:, None, :], 0)
     return ClothCase(
         scene=scene,
-        targets=scene.rest_position.astype(np.float64) + moved,
+        prescribed_position=scene.rest_position.astype(np.float64) + moved,
         material=material,
         contact=ContactSettings(_distance(nodes), STIFFNESS, self_contact=True),
         time_step=INFO.time_step,

@@ -103,7 +103,7 @@ def mesh_error(
         if solver != "own":
             raise SimulationError("CalculiX does not start from a coarse solution")
         _check_seconds(solved)
-        finer = assembly.resized(spec, values, nodes, len(case.targets), HALF)
+        finer = assembly.resized(spec, values, nodes, len(case.prescribed_position), HALF)
         position = _at_half_the_size(case, solved, finer, frame)
         return MeshError(quantity, value, HALF, _force(finer, position, quantity) * unit**power)
     except AstSimError as error:
@@ -161,7 +161,7 @@ def _from_coarse(coarse: SolidCase, solved: Trajectory, fine: SolidCase, frame: 
 
 def _force(case: SolidCase, position: np.ndarray, quantity: str) -> float:
     """In pascal times the square of the unit of length (torque: the cube), at equilibrium."""
-    reaction = Reaction(case.scene, Driven.of(case.scene, case.targets), case.material)
+    reaction = Reaction(case.scene, Driven.of(case.scene, case.prescribed_position), case.material)
     return abs(reaction.torque(position)) if quantity == "torque" else float(np.linalg.norm(reaction.of(position)))
 
 
@@ -182,7 +182,7 @@ def _start(coarse: SolidCase, solved: Trajectory, fine: SolidCase, frame: int) -
     displacement = solved.position[frame].astype(np.float64) - rest
     body_of_element = scene.body[scene.elements[:, 0]]
     points = fine.scene.rest_position.astype(np.float64)
-    position = fine.targets[frame].astype(np.float64)
+    position = fine.prescribed_position[frame].astype(np.float64)
     for body in np.unique(fine.scene.body[~fine.scene.prescribed]):
         free = (fine.scene.body == body) & ~fine.scene.prescribed
         elements = scene.elements[body_of_element == body]
@@ -201,7 +201,7 @@ def _at_twice_the_size(
     whole = next((part.name for part in spec.parts if not part.rigid and part.size is None), None)
     if whole is not None:
         raise SimulationError(f"the mesh of {whole} stands in its file")
-    coarser = assembly.resized(spec, values, nodes, len(case.targets), TWICE)
+    coarser = assembly.resized(spec, values, nodes, len(case.prescribed_position), TWICE)
     if coarser.scene.num_nodes > LEAST_COARSER * case.scene.num_nodes:
         raise SimulationError("there is no coarser mesh of these parts")
     solve = assembly.solve if solver == "own" else calculix.quasi_static

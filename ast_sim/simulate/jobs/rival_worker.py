@@ -196,7 +196,7 @@ class WaySolver:
         """So many load steps of one Newton step with linearised contact, and one Newton step more."""
         held = case.scene.prescribed[:, None]
         began = process_time()
-        position = before = case.targets[0]
+        position = before = case.prescribed_position[0]
         failure = ""
         try:
             newton = _newton_steps(case)
@@ -246,7 +246,7 @@ class WaySolver:
         """Positions of the nodes of the dataset's mesh, from those of another mesh of the same bodies."""
         scene = case.scene
         rest = scene.rest_position.astype(np.float64)
-        result = self.drawn.case.targets[self.frame].copy()
+        result = self.drawn.case.prescribed_position[self.frame].copy()
         body = scene.body[scene.elements[:, 0]]
         for number in np.unique(self.drawn.case.scene.body[self.free]):
             nodes = self.free & (self.drawn.case.scene.body == number)

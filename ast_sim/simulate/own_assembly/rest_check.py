@@ -63,7 +63,7 @@ def _check_turned_over(spec: AssemblySpec, case: SolidCase) -> None:
     scene = case.scene
     rows = scene.elements[scene.prescribed[scene.elements].all(axis=1) & ~scene.rigid_elements]
     followed, stored = case.followed()
-    for row, position in enumerate(followed.targets):
+    for row, position in enumerate(followed.prescribed_position):
         wrong = (quarters(position, rows) <= 0).any(axis=0)
         if wrong.any():
             first = rows[np.argmax(wrong)]
@@ -71,7 +71,7 @@ def _check_turned_over(spec: AssemblySpec, case: SolidCase) -> None:
             raise BadAssembly(
                 f"{name}: its prescribed nodes turn {wrong.sum()} elements over on the way to frame"
                 f" {np.searchsorted(stored, row)}, the first at"
-                f" {point(case.targets[0][first].mean(axis=0))}: make the motion smaller"
+                f" {point(case.prescribed_position[0][first].mean(axis=0))}: make the motion smaller"
             )
 
 

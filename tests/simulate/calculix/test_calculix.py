@@ -108,7 +108,9 @@ def test_a_uniaxially_deformed_block_has_the_stress_of_the_closed_form():
     solved = calculix.quasi_static(case)
     assert solved.attributes["status"] == "complete" and solved.attributes["solver"].startswith("calculix 2")
     solved.check(stress_location="element")
-    np.testing.assert_allclose(solved.position, case.targets, atol=2e-6)  # the deformation is affine everywhere
+    np.testing.assert_allclose(
+        solved.position, case.prescribed_position, atol=2e-6
+    )  # the deformation is affine everywhere
     s = lateral_square(stretches)
     sigma = case.material.mu * (stretches**2 - s) / (stretches * s)
     expected = np.zeros((4, case.scene.num_elements, 6))
@@ -141,7 +143,9 @@ def test_both_solvers_agree_on_a_rigid_obstacle_on_a_bent_way():
     figures = compare(case, ours, referee)
     assert agrees(figures), figures
     obstacle = case.scene.body == 1
-    np.testing.assert_array_equal(referee.position[:, obstacle], case.targets[:, obstacle].astype(np.float32))
+    np.testing.assert_array_equal(
+        referee.position[:, obstacle], case.prescribed_position[:, obstacle].astype(np.float32)
+    )
     assert (referee.stress[:, obstacle] == 0).all() and referee.cauchy_stress is None
 
 
@@ -151,7 +155,7 @@ def test_figures_tell_solutions_apart():
     stress = np.linspace(1, 2, case.scene.num_elements, dtype=np.float32)[None, :, None].repeat(2, axis=0)
 
     def solution(factor):
-        position = (rest + factor * (case.targets - case.targets[0])).astype(np.float32)
+        position = (rest + factor * (case.prescribed_position - case.prescribed_position[0])).astype(np.float32)
         position[1, 0] += np.float32(factor * 0.1)  # a free node
         attributes = {"reaction": [0.0, 7 * factor]}
         return trajectory.Trajectory(case.scene, position, factor * stress, attributes=attributes)
@@ -179,22 +183,26 @@ def test_the_crush_of_a_case_can_be_chosen():
     drawn = squeezed(crush=0.2 + 2 * CONTACT.dhat / 0.902)  # the air between the parts comes on top
     drawn.attributes["crush"] = 0.2
     halved = with_crush(drawn, 0.1)
-    travel = (halved.targets[-1] - halved.targets[0])[:, 2].min()
+    travel = (halved.prescribed_position[-1] - halved.prescribed_position[0])[:, 2].min()
     assert travel == pytest.approx(-0.1 * 0.902 - 2 * CONTACT.dhat, rel=1e-6)
     assert halved.attributes["crush"] == 0.1
-    np.testing.assert_allclose(with_crush(drawn, 0.2).targets, drawn.targets, atol=1e-12)
+    np.testing.assert_allclose(with_crush(drawn, 0.2).prescribed_position, drawn.prescribed_position, atol=1e-12)
 
 
 def test_a_solve_that_does_not_converge_keeps_the_frames_that_did():
     case = uniaxial(np.array([1, 0.9, 0.8, 0.7]))
-    case.targets[3] = case.targets[2] - [0, 0, 1]
-    case.targets[3, case.targets[2, :, 2] == 0] += [0, 0, 1]  # the ends would have to pass through each other
+    case.prescribed_position[3] = case.prescribed_position[2] - [0, 0, 1]
+    case.prescribed_position[3, case.prescribed_position[2, :, 2] == 0] += [
+        0,
+        0,
+        1,
+    ]  # the ends would have to pass through each other
     solved = calculix.quasi_static(case)
     assert solved.attributes["status"] == "truncated" and solved.num_frames == 3
     expected = "frame 3: no convergence in CalculiX: increment size smaller than minimum"
     assert solved.attributes["stopped_by"] == expected
     solved.check(stress_location="element")
-    np.testing.assert_allclose(solved.position, case.targets[:3], atol=2e-6)
+    np.testing.assert_allclose(solved.position, case.prescribed_position[:3], atol=2e-6)
     for record in ("reaction", "halvings", "newton_iterations", "jacobian", "solve_seconds"):
         assert len(solved.attributes[record]) == 3
 
@@ -376,7 +384,7 @@ def test_metal_follows_its_hardening_and_keeps_its_plastic_strain():
     strain, lateral = plastic + stress / young, -plastic / 2 - poisson * stress / young
     pulled = uniaxial(np.exp(strain))
     targets = pulled.scene.rest_position * np.exp(np.stack([lateral, lateral, strain], axis=1))[:, None]
-    case = replace(pulled, targets=targets, material=NeoHookean(young, poisson), hardening={0: table})
+    case = replace(pulled, prescribed_position=targets, material=NeoHookean(young, poisson), hardening={0: table})
     solved = calculix.quasi_static(case)
     assert solved.attributes["status"] == "complete"
     solved.check(stress_location="element")

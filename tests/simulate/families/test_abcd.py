@@ -33,7 +33,7 @@ def check_pair(case) -> None:
     scene, rest = case.scene, case.scene.rest_position.astype(float)
     scene.check()
     assert np.ptp(rest, axis=0).max() == pytest.approx(1.8, abs=0.01)
-    assert np.abs(case.targets).max() < 1
+    assert np.abs(case.prescribed_position).max() < 1
     lower, clamped = scene.body == 0, scene.node_type == NodeType.HANDLE
     assert set(np.unique(scene.node_type)) == {NodeType.NORMAL, NodeType.HANDLE}
     height = {body: np.ptp(rest[scene.body == body, 2]) for body in (0, 1)}
@@ -44,7 +44,7 @@ def check_pair(case) -> None:
     assert 1.9 * case.contact.dhat <= contact.gap(rest) <= 2.1 * case.contact.dhat
     assert not contact.intersects(rest)
     assert Elasticity(rest, scene.elements, case.material).evaluate(rest).J.min() > 0.99
-    travel = case.targets - case.targets[0]
+    travel = case.prescribed_position - case.prescribed_position[0]
     assert travel.shape == (21, scene.num_nodes, 3)
     moving = np.abs(travel).max(axis=(0, 2)) > 0
     assert np.array_equal(moving, clamped & ~lower)
@@ -84,7 +84,9 @@ def test_pairs_of_the_grammar_are_sound():
 def test_the_same_seed_gives_the_same_case():
     first, second, other = (abcd.draw(np.random.default_rng(seed), 300, SOURCE) for seed in (3, 3, 4))
     assert np.array_equal(first.scene.rest_position, second.scene.rest_position)
-    assert np.array_equal(first.targets, second.targets) and first.attributes == second.attributes
+    assert (
+        np.array_equal(first.prescribed_position, second.prescribed_position) and first.attributes == second.attributes
+    )
     assert first.attributes != other.attributes
     assert first.attributes["mesher"] == "structured"
 
@@ -188,10 +190,12 @@ def test_the_same_pair_on_coarser_meshes(source, nodes):
             ]
             assert sizes[1] == pytest.approx(sizes[0], rel=0.06)
         # The clamps end at the same heights, although the upper part may start a little higher.
-        tops = [c.targets[-1, c.scene.prescribed & (c.scene.body == 1), 2].max() for c in (case, coarse)]
+        tops = [c.prescribed_position[-1, c.scene.prescribed & (c.scene.body == 1), 2].max() for c in (case, coarse)]
         assert tops[1] == pytest.approx(tops[0], abs=2e-3)
-        contact = Contact(*(coarse.targets[0], coarse.scene.surface(), coarse.scene.body, coarse.contact))
-        assert contact.gap(coarse.targets[0]) >= 1.9 * coarse.contact.dhat and not contact.intersects(coarse.targets[0])
+        contact = Contact(*(coarse.prescribed_position[0], coarse.scene.surface(), coarse.scene.body, coarse.contact))
+        assert contact.gap(coarse.prescribed_position[0]) >= 1.9 * coarse.contact.dhat and not contact.intersects(
+            coarse.prescribed_position[0]
+        )
 
 
 def test_parts_that_are_meshes_have_no_other_mesh():
@@ -220,7 +224,7 @@ def test_a_pair_is_squeezed():
     von_mises = np.sqrt(0.5 * squares + 3 * (xy**2 + yz**2 + zx**2))
     assert np.allclose(von_mises, trajectory.stress[-1, :, 0], rtol=1e-4)
     handles = scene.prescribed
-    assert np.allclose(trajectory.position[:, handles], case.targets[:, handles], atol=1e-6)
+    assert np.allclose(trajectory.position[:, handles], case.prescribed_position[:, handles], atol=1e-6)
     assert attributes["min_gap"] > 0 and attributes["min_jacobian"] > 0 and attributes["max_residual"] <= 1
     assert np.abs(trajectory.position).max() < abcd.INFO.domain_half_width
     assert trajectory.stress[0].max() < 1e-6 and trajectory.stress[-1].max() > 1e4

@@ -55,7 +55,7 @@ def test_scenes_have_the_size_asked_for_and_are_valid(nodes, count):
         scene.check()
         sizes.append(scene.num_nodes)
         assert 0.5 * nodes <= scene.num_nodes <= 1.7 * nodes
-        assert np.abs(case.targets).max() < 0.5  # within the domain of the dataset
+        assert np.abs(case.prescribed_position).max() < 0.5  # within the domain of the dataset
         plate = scene.body == 0
         rest = scene.rest_position
         length = np.ptp(rest[plate], axis=0)
@@ -91,8 +91,10 @@ def test_the_same_generator_draws_the_same_scene():
     one, two, other = (draw(np.random.default_rng(seed), NODES, SHORT) for seed in (5, 5, 6))
     np.testing.assert_array_equal(one.scene.rest_position, two.scene.rest_position)
     np.testing.assert_array_equal(one.scene.elements, two.scene.elements)
-    np.testing.assert_array_equal(one.targets, two.targets)
-    assert one.targets.shape != other.targets.shape or not np.array_equal(one.targets, other.targets)
+    np.testing.assert_array_equal(one.prescribed_position, two.prescribed_position)
+    assert one.prescribed_position.shape != other.prescribed_position.shape or not np.array_equal(
+        one.prescribed_position, other.prescribed_position
+    )
 
 
 def test_the_same_plate_on_coarser_meshes():
@@ -101,17 +103,21 @@ def test_the_same_plate_on_coarser_meshes():
         case = drawn.case
         again = drawn.remesh(1.0)
         np.testing.assert_array_equal(again.scene.rest_position, case.scene.rest_position)
-        np.testing.assert_array_equal(again.targets, case.targets)
+        np.testing.assert_array_equal(again.prescribed_position, case.prescribed_position)
         for share in (0.5, 0.25):
             coarse = drawn.remesh_nearly(share)
             coarse.scene.check()
             plates = [c.scene.rest_position[c.scene.body == 0] for c in (case, coarse)]
             assert 0.7 * share <= len(plates[1]) / len(plates[0]) <= 1.5 * share
             np.testing.assert_allclose(np.ptp(plates[1], axis=0), np.ptp(plates[0], axis=0), rtol=0.06)
-            obstacles = [c.targets[:, c.scene.body == 1] for c in (case, coarse)]
+            obstacles = [c.prescribed_position[:, c.scene.body == 1] for c in (case, coarse)]
             np.testing.assert_array_equal(obstacles[1], obstacles[0])  # it keeps its mesh and its way
             for end in (np.argmin, np.argmax):  # each clamp drifts as before
-                moves = [c.targets[:, k] - c.targets[0, k] for c in (case, coarse) for k in [_held(c, end)]]
+                moves = [
+                    c.prescribed_position[:, k] - c.prescribed_position[0, k]
+                    for c in (case, coarse)
+                    for k in [_held(c, end)]
+                ]
                 np.testing.assert_allclose(moves[1], moves[0], atol=1e-12)
 
 
@@ -130,9 +136,9 @@ def test_the_obstacle_comes_down_and_returns():
     for index in range(12):
         case = draw(np.random.default_rng(index), NODES, FRAMES)
         scene, attributes = case.scene, case.attributes
-        np.testing.assert_array_equal(case.targets[0], scene.rest_position)
+        np.testing.assert_array_equal(case.prescribed_position[0], scene.rest_position)
         obstacle, plate = scene.body == 1, scene.body == 0
-        travel = case.targets[:, obstacle] - case.targets[0, obstacle]
+        travel = case.prescribed_position[:, obstacle] - case.prescribed_position[0, obstacle]
         np.testing.assert_allclose(travel, np.repeat(travel[:, :1], obstacle.sum(), axis=1), atol=1e-12)  # rigid
         gap = scene.rest_position[obstacle, 2].min() - scene.rest_position[plate, 2].max()
         assert 0.0039 < gap < 0.0151 and 0.02 <= attributes["depth"] <= 0.065
@@ -141,7 +147,7 @@ def test_the_obstacle_comes_down_and_returns():
             assert -travel[:, 0, 2].min() == pytest.approx(attributes["depth"] + gap, rel=1e-5)
         clamps = scene.rest_position[scene.node_type == NodeType.HANDLE, 0]
         inner = clamps[clamps < 0].max(), clamps[clamps > 0].min()
-        lowest = case.targets[:, obstacle][:, np.argmin(scene.rest_position[obstacle, 2])]
+        lowest = case.prescribed_position[:, obstacle][:, np.argmin(scene.rest_position[obstacle, 2])]
         assert inner[0] + CLAMP_MARGIN <= lowest[0, 0] <= inner[1] - CLAMP_MARGIN  # stays between the clamps
 
 
@@ -202,7 +208,9 @@ def test_a_scene_solved_end_to_end(trajectory):
     assert -0.08 < deflection[:, plate, 2].min() < -0.015
     case = draw(np.random.default_rng(8), NODES, SHORT)
     prescribed = scene.prescribed
-    np.testing.assert_array_equal(trajectory.position[:, prescribed], case.targets[:, prescribed].astype(np.float32))
+    np.testing.assert_array_equal(
+        trajectory.position[:, prescribed], case.prescribed_position[:, prescribed].astype(np.float32)
+    )
     stress = trajectory.stress[..., 0]
     assert 2e4 < stress.max() < 6e5
     assert np.all(stress[:, ~plate] == 0)

@@ -24,11 +24,11 @@ def test_scenes_have_the_size_asked_for_and_are_valid(nodes):
         assert np.ptp(scene.rest_position[~obstacle], axis=0)[0] > 0.85
         cloth_triangles = ~obstacle[scene.elements].all(axis=1)
         assert (scene.material[cloth_triangles] > 0).all() and (scene.material[~cloth_triangles] == 0).all()
-        assert case.targets.shape == (FRAMES, scene.num_nodes, 3)
-        np.testing.assert_array_equal(case.targets[0], scene.rest_position)
-        assert (case.targets[:, held] == case.targets[0, held]).all()
-        assert np.abs(case.targets).max() < INFO.domain_half_width
-        path = case.targets[:, obstacle].mean(axis=1)
+        assert case.prescribed_position.shape == (FRAMES, scene.num_nodes, 3)
+        np.testing.assert_array_equal(case.prescribed_position[0], scene.rest_position)
+        assert (case.prescribed_position[:, held] == case.prescribed_position[0, held]).all()
+        assert np.abs(case.prescribed_position).max() < INFO.domain_half_width
+        path = case.prescribed_position[:, obstacle].mean(axis=1)
         speed = np.linalg.norm(np.diff(path, axis=0), axis=1) / INFO.time_step
         assert speed[0] < 0.05 and 0.4 < speed.max() < 2
         assert np.ptp(np.sign(path[:, 1])) == 2  # it passes through the plane in which the cloth hangs
@@ -57,7 +57,7 @@ def test_scenes_vary_and_share_their_contact_settings():
 
 def test_a_scene_depends_on_its_generator_alone():
     one, same, other = (draw(np.random.default_rng(seed), 300) for seed in (5, 5, 6))
-    assert one.targets.tobytes() == same.targets.tobytes() and one.material == same.material
+    assert one.prescribed_position.tobytes() == same.prescribed_position.tobytes() and one.material == same.material
     assert one.attributes != other.attributes
 
 
@@ -83,7 +83,7 @@ def test_the_icosphere_is_closed_round_and_outward(level):
 
 def test_a_scene_is_solved():
     case = draw(np.random.default_rng(0), 250)
-    case = replace(case, targets=case.targets[:90])
+    case = replace(case, prescribed_position=case.prescribed_position[:90])
     trajectory = solve(case)
     trajectory.check("trajectory", INFO.stress_location)
     attributes = trajectory.attributes

@@ -287,7 +287,7 @@ def test_the_same_scene_on_a_coarser_mesh(tmp_path):
     coarse = drawn.remesh(0.5)
     of_block = [(case.scene.body == 0).sum() for case in (drawn.case, coarse)]
     assert 0.35 < of_block[1] / of_block[0] < 0.7
-    assert np.array_equal(coarse.targets[-1, -1], drawn.case.targets[-1, -1])
+    assert np.array_equal(coarse.prescribed_position[-1, -1], drawn.case.prescribed_position[-1, -1])
     with pytest.raises(SimulationError, match="there is no coarser mesh"):
         scene_of(write_assembly(tmp_path)).remesh(0.5)
 
