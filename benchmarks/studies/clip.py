@@ -48,6 +48,7 @@ class Plan:
     Attributes:
         nodes, train, valid, test, calibration: of the dataset.
         steps, settings: of the training.
+        seeds: of the trainings; the run of the first one ships.
     """
 
     nodes: int = 1400
@@ -57,6 +58,7 @@ class Plan:
     calibration: int = 40
     steps: int = 3600
     settings: tuple[tuple[str, Any], ...] = (("mirror", ("y",)), ("stress_weight", 0.3))
+    seeds: tuple[int, ...] = (0,)
 
 
 def features(drawn: Sequence[dict[str, Any]], known: Sequence[dict[str, Any]]) -> np.ndarray:
@@ -102,28 +104,29 @@ def _fitted(x: np.ndarray, y: np.ndarray) -> Any:
         return process.fit(x, y)
 
 
-def trained(plan: Plan, folder: Path) -> tuple[ast_sim.Run, Path]:
+def trained(plan: Plan, folder: Path, seed: int = 0) -> tuple[ast_sim.Run, Path]:
     """The run and its dataset; what is there already is not made again."""
     data = ast_sim.generate(
         "assembly", folder / "clip.h5", spec=SPEC, nodes=plan.nodes, workers=1, train=plan.train, valid=plan.valid,
         test=plan.test, calibration=plan.calibration,
     ).path  # fmt: skip
-    settings = dict(plan.settings)
-    run = ast_sim.train(data, folder / f"run_{plan.steps}", steps=plan.steps, state=STATE, resume=True, **settings)
+    settings = {**dict(plan.settings), "steps": plan.steps, "seed": seed}
+    run = ast_sim.train(data, folder / f"run_{plan.steps}_seed{seed}", state=STATE, resume=True, **settings)
     return run, data
 
 
 def measured(plan: Plan, folder: Path) -> dict[str, Any]:
     """Solve, train and measure."""
     run, data = trained(plan, folder)
+    others = {f"seed {seed}": trained(plan, folder, seed)[0] for seed in plan.seeds[1:]}
     with run.open(data) as dataset:
         taken = read_seconds(dataset)
         seconds = {name: sum(frames) for name, frames in taken.samples.items()}
-        known, tests, others = (_solved(dataset, split) for split in ("train", "test", "calibration"))
+        known, tests, calibration = (_solved(dataset, split) for split in ("train", "test", "calibration"))
         share_scenes(dataset, [(name, truth) for name, truth in tests if name in clip_ways.SCENES], taken)
     scenes, unseen = (
-        [{"name": name, "solver_seconds": seconds[name], **_asked(run, truth)} for name, truth in asked]
-        for asked in (tests, others)
+        [{"name": name, "solver_seconds": seconds[name], **_asked(run, truth, others)} for name, truth in asked]
+        for asked in (tests, calibration)
     )
     drawn, outcomes = [values_of(truth.attributes) for _, truth in known], [true_outcome(truth) for _, truth in known]
     for key in Outcome._fields:
@@ -175,20 +178,20 @@ def _solved(dataset: ast_sim.Dataset, split: str) -> list[tuple[str, ast_sim.Tra
     return [(name, truth) for name, truth in scenes if truth.num_frames == LAST + 1]
 
 
-def _asked(run: ast_sim.Run, truth: ast_sim.Trajectory) -> dict[str, Any]:
-    """A test scene: its parameters, both outcomes, relative errors, and the seconds of an answer with all frames and of
+def _asked(run: ast_sim.Run, truth: ast_sim.Trajectory, others: dict[str, ast_sim.Run]) -> dict[str, Any]:
+    """A test scene: its parameters, the outcomes, relative errors, and the seconds of an answer with all frames and of
     one with the two frames that the outcomes need."""
     answer, seconds = _timed(run, truth, None)
     turned, seconds_of_two = _timed(run, truth, [TURN, LAST])
-    two = Outcome(*outcome(truth.scene, truth.position[0], turned.position[-1], turned.fields[REACTION].values))
     metal = truth.scene.deforming_nodes
     strain, true_strain = (one.fields["PEEQ"].values[-1, metal] for one in (answer, truth))
     force, true_force = (one.fields[REACTION].values[TURN] for one in (answer, truth))
     return {
         "parameters": values_of(truth.attributes),
         "true": true_outcome(truth)._asdict(),
-        "run": outcome(truth.scene, truth.position[0], answer.position[-1], answer.fields[REACTION].values)._asdict(),
-        "run_two_frames": two._asdict(),
+        "run": _said(answer, truth),
+        "run_two_frames": _said(turned, truth),
+        **{name: _said(other.predict(truth), truth) for name, other in others.items()},
         "turn_error": relative_error(answer.position[TURN], truth, TURN),
         "last_error": relative_error(answer.position[LAST], truth, LAST),
         "strain_error": _relative(strain, true_strain),
@@ -196,6 +199,11 @@ def _asked(run: ast_sim.Run, truth: ast_sim.Trajectory) -> dict[str, Any]:
         "seconds": seconds,
         "seconds_of_two": seconds_of_two,
     }
+
+
+def _said(answer: ast_sim.Answer, truth: ast_sim.Trajectory) -> dict[str, float]:
+    forces = answer.fields[REACTION].values
+    return outcome(truth.scene, truth.position[0], answer.position[-1], forces)._asdict()
 
 
 def _relative(values: np.ndarray, true: np.ndarray) -> float:
