@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ast_sim.batches.mirror_and_shift import Placement
-from ast_sim.batches.out_of_balance import Elasticity
+from ast_sim.batches.out_of_balance import ElasticTetrahedra
 from ast_sim.material import Material
 from ast_sim.named_field import Output
 from ast_sim.ops import EdgeSet, join_indices, join_offsets, offsets_of
@@ -73,7 +73,7 @@ class Graph:
     body: Tensor | None = None
     surface: Tensor | None = None
     surface_offsets: Tensor | None = None
-    elasticity: Elasticity | None = None
+    elasticity: ElasticTetrahedra | None = None
     own: Own | None = None
 
     @staticmethod
@@ -117,7 +117,7 @@ class Graph:
             rest_edges=rest_edges,
             body=torch.from_numpy(scene.body.astype("int64")),
             **(_surface_of(scene) if surface else {}),
-            elasticity=None if elastic is None else Elasticity.of(scene, elastic),
+            elasticity=None if elastic is None else ElasticTetrahedra.of(scene, elastic),
         )
 
     @staticmethod

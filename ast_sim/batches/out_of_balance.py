@@ -25,7 +25,7 @@ SHARPNESS = 20.0  # forces of strains of 1 / SHARPNESS are of order one
 
 
 @dataclass(frozen=True, eq=False)
-class Elasticity:
+class ElasticTetrahedra:
     """The elastic properties of the tetrahedra of one scene, or of a batch of scenes.
 
     Second-order tetrahedra have four points of integration. The positions are about linear around each, so each stands
@@ -45,7 +45,7 @@ class Elasticity:
     nodes: Tensor | None = None
 
     @staticmethod
-    def of(scene: Scene, material: Material) -> Elasticity:
+    def of(scene: Scene, material: Material) -> ElasticTetrahedra:
         """Of one scene. Young's modulus and Poisson's ratio are taken where they are the columns of its material, and
         allowed in all elements. Else all elements have the same stiffness.
 
@@ -72,17 +72,17 @@ class Elasticity:
         share = torch.from_numpy(np.repeat((young * volume ** (2 / 3)).astype(np.float32), corners))
         force = torch.zeros(scene.num_nodes).index_add_(0, elements.reshape(-1), share)
         if corners == 4:
-            return Elasticity(TetrahedronSet.from_elements(elements, scene.num_nodes), lame, force)
+            return ElasticTetrahedra(TetrahedronSet.from_elements(elements, scene.num_nodes), lame, force)
         lame[:, 0] = torch.minimum(lame[:, 0], LARGEST * lame[:, 1])  # as the points of the solver's elements
         own = torch.arange(16 * count).view(-1, 4)
         tangent = TetrahedronSet.from_elements(own, own.numel())
-        return Elasticity(tangent, (lame / 4).repeat_interleave(4, dim=0), force, elements)
+        return ElasticTetrahedra(tangent, (lame / 4).repeat_interleave(4, dim=0), force, elements)
 
     @staticmethod
-    def concatenate(parts: Sequence[Elasticity]) -> Elasticity:
+    def concatenate(parts: Sequence[ElasticTetrahedra]) -> ElasticTetrahedra:
         """Of several scenes as one."""
         nodes = [part.nodes for part in parts if part.nodes is not None]
-        return Elasticity(
+        return ElasticTetrahedra(
             TetrahedronSet.concatenate([part.tetrahedra for part in parts]),
             torch.cat([part.lame for part in parts]),
             torch.cat([part.force for part in parts]),

@@ -39,7 +39,7 @@ def _settings(prefix: str, kind: type, values: Mapping[str, Any]) -> list[str]:
 
 def families() -> list[str]:
     """A line about each family of `generate`."""
-    from ast_sim.simulate.families.names import FAMILIES
+    from ast_sim.simulate.families.known_families import FAMILIES
 
     lines = ["", "families:"]
     for name, family in FAMILIES.items():

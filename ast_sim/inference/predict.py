@@ -180,8 +180,7 @@ def _require_material(config: ModelConfig, scope: Scope, scene: Scene, name: str
         return
     if not wanted:
         raise ConfigError(f"{name} has a material, but the run was trained without one: leave it out (--material)")
-    columns = zip(scope.material_low, scope.material_high, strict=True)
-    ranges = ", ".join(f"{low:.4g} to {high:.4g}" for low, high in columns)
+    ranges = ", ".join(f"{column} {low:.4g} to {high:.4g}" for column, (low, high) in scope.material_ranges.items())
     raise ConfigError(
         f"{name} has {given or 'no'} material columns, but the run was trained with {wanted} ({ranges}): give each"
         " body its numbers (--material BODY=NUMBER,...)"

@@ -82,8 +82,8 @@ def _ranges(scope: Scope) -> Iterator[tuple[str, float, float]]:
     yield f"size of the deforming bodies [{unit}]", *scope.size
     yield f"mesh spacing [{unit}]", *scope.spacing
     yield f"travel of prescribed nodes [{unit}]", *scope.travel
-    for column, limits in enumerate(zip(scope.material_low, scope.material_high, strict=True)):
-        yield f"material column {column}", *limits
+    for name, limits in scope.material_ranges.items():
+        yield f"{name} of the material", *limits
 
 
 def _errors(answers: Mapping[str, Any]) -> str:

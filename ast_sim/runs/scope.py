@@ -45,6 +45,11 @@ class Scope:
     material_high: tuple[float, ...]
     data: DataFacts
 
+    @property
+    def material_ranges(self) -> dict[str, tuple[float, float]]:
+        """The lowest and the highest number of each material column, by its name."""
+        return dict(zip(self.data.columns, zip(self.material_low, self.material_high, strict=True), strict=True))
+
     def notes(self, scene: Scene, motion: Motion, each_frame: bool) -> Iterator[str]:
         """One sentence for each property of a scene and its prescribed motion that lies outside its range. How far
         prescribed nodes move in one frame matters where `each_frame` is predicted from the one before."""
@@ -67,10 +72,10 @@ class Scope:
         """The smallest and the largest number in each material column of the deforming bodies."""
         if scene.material is None:
             return
-        values = scene.material[scene.deforming_elements]
-        for column, limits in enumerate(zip(self.material_low, self.material_high, strict=True)):
-            for value in (values[:, column].min(initial=limits[0]), values[:, column].max(initial=limits[1])):
-                yield limits, float(value), f"material column {column} holds {{}}", ""
+        for name, limits in self.material_ranges.items():
+            values = self.data.material.numbers(name, scene.material)[scene.deforming_elements]
+            for value in (values.min(initial=limits[0]), values.max(initial=limits[1])):
+                yield limits, float(value), f"{name} of the material is {{}}", ""
 
 
 def size_of(scene: Scene) -> float:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from data_samples import block, raised
 
-from ast_sim.batches.out_of_balance import SHARPNESS, Elasticity
+from ast_sim.batches.out_of_balance import SHARPNESS, ElasticTetrahedra
 from ast_sim.element_topology import MIDDLES
 from ast_sim.material import Material
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
@@ -26,8 +26,8 @@ def scene(order: int) -> Scene:
     return raised(made) if order == 2 else made
 
 
-def elasticity(made: Scene) -> Elasticity:
-    return Elasticity.of(made, Material() if made.material is None else MATERIAL)
+def elasticity(made: Scene) -> ElasticTetrahedra:
+    return ElasticTetrahedra.of(made, Material() if made.material is None else MATERIAL)
 
 
 def tensors(*arrays: np.ndarray) -> list[torch.Tensor]:
@@ -36,7 +36,7 @@ def tensors(*arrays: np.ndarray) -> list[torch.Tensor]:
 
 def forces_of(made: Scene, position: np.ndarray) -> np.ndarray:
     """The forces themselves, in pascal times square metres."""
-    of = Elasticity.of(made, MATERIAL)
+    of = ElasticTetrahedra.of(made, MATERIAL)
     values = of.out_of_balance(*tensors(position, made.rest_position))
     return (torch.sinh(values.double()) * of.force[:, None] / SHARPNESS).numpy()
 
@@ -77,7 +77,7 @@ def test_second_order_forces_are_minus_the_derivative_of_the_energy():
 def test_scenes_of_a_batch_keep_their_forces_and_gradients_flow():
     scenes = [scene(2), raised(block(1, 1, 1)), scene(2)]
     positions = [waves(one.rest_position.astype(float), 0.05) for one in scenes]
-    joined = Elasticity.concatenate([elasticity(one) for one in scenes])
+    joined = ElasticTetrahedra.concatenate([elasticity(one) for one in scenes])
     position, rest = tensors(np.concatenate(positions), np.concatenate([one.rest_position for one in scenes]))
     together = joined.out_of_balance(position.requires_grad_(), rest)
     alone = [

@@ -414,7 +414,7 @@ def test_a_scene_with_inertia_may_start_with_a_velocity(dynamic_run):
 
 
 def test_a_missing_material_names_the_columns(dynamic_run):
-    wanted = r"trained with 2 \(1e\+05 to 2e\+05, 0\.3 to 0\.3\): give each body its numbers"
+    wanted = r"trained with 2 \(column 0 1e\+05 to 2e\+05, column 1 0\.3 to 0\.3\): give each body its numbers"
     for materials, has in ((None, "no"), (1e5, "1")):
         with pytest.raises(ConfigError, match=f"scene has {has} material columns, but the run was {wanted}"):
             dynamic_run.predict(small_scene(materials), {1: (0, 0, -0.02)})
@@ -424,7 +424,7 @@ def test_a_material_that_the_run_has_not_seen_is_told(dynamic_run):
     with pytest.warns(UserWarning) as told:
         dynamic_run.predict(small_scene((3e5, 0.3)), {1: (0, 0, -0.02)})
     assert [str(warning.message) for warning in told] == [
-        "scene: material column 0 holds 3e+05; in training 1e+05 to 2e+05"
+        "scene: column 0 of the material is 3e+05; in training 1e+05 to 2e+05"
     ]
 
 

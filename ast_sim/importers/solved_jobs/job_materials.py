@@ -10,9 +10,10 @@ import numpy as np
 from ast_sim.importers.decks.deck_content import Deck
 from ast_sim.importers.decks.deck_numbers import real, tokens
 from ast_sim.importers.decks.keyword_lines import Keyword
+from ast_sim.material import ELASTIC, YIELD_STRESS
 
 MATERIAL_KEYWORDS = ("MATERIAL", "ELASTIC", "PLASTIC", "SOLIDSECTION", "DENSITY")
-COLUMNS = ("young", "poisson", "yield_stress")
+COLUMNS = (*ELASTIC, YIELD_STRESS)  # each an attribute of `_Material`
 
 
 @dataclass(eq=False)
@@ -32,7 +33,7 @@ def material_columns(deck: Deck) -> tuple[dict[str, list[np.ndarray]], list[str]
     """
     materials, notes = _materials(deck)
     blocks = [block for block in deck.root.blocks if len(block.numbers)]
-    rows = [np.full((len(block.numbers), len(COLUMNS)), np.nan) for block in blocks]
+    tables = [{name: np.full(len(block.numbers), np.nan) for name in COLUMNS} for block in blocks]
     for keyword in deck.keywords:
         if keyword.name == "SOLIDSECTION":
             name, elements = keyword.required("MATERIAL").upper(), keyword.required("ELSET").upper()
@@ -42,15 +43,17 @@ def material_columns(deck: Deck) -> tuple[dict[str, list[np.ndarray]], list[str]
                 raise keyword.error(f"there is no set of elements {keyword.options['ELSET']!r}")
             numbers = np.concatenate([numbers for _, numbers in deck.root.element_sets[elements]])
             one = materials[name]
-            for block, table in zip(blocks, rows, strict=True):
-                table[np.isin(block.numbers, numbers)] = (one.young, one.poisson, one.yield_stress)
-    lacking = sum(int(np.isnan(table).any(axis=1).sum()) for table in rows)
+            for block, table in zip(blocks, tables, strict=True):
+                here = np.isin(block.numbers, numbers)
+                for column in COLUMNS:
+                    table[column][here] = getattr(one, column)
+    lacking = sum(int(np.isnan(list(table.values())).any(axis=0).sum()) for table in tables)
     if lacking:
         return {}, [*notes, f"{lacking} elements have no isotropic *ELASTIC: no material is taken"]
-    plastic = any(table[:, 2].any() for table in rows)
-    used = COLUMNS if plastic else COLUMNS[:2]
+    plastic = any(table[YIELD_STRESS].any() for table in tables)
+    used = COLUMNS if plastic else ELASTIC
     notes.append(f"the columns of the material are {', '.join(used)}")
-    return {name: [table[:, column] for table in rows] for column, name in enumerate(used)}, notes
+    return {name: [table[name] for table in tables] for name in used}, notes
 
 
 def _materials(deck: Deck) -> tuple[dict[str, _Material], list[str]]:

@@ -53,7 +53,7 @@ def jumps(
     return [scene.answer() for scene in _predicted(model, questions, effort, progress)]
 
 
-class Way(NamedTuple):
+class AnswerSteps(NamedTuple):
     """The wanted frames of a scene on the way to the answer.
 
     Attributes:
@@ -70,10 +70,10 @@ class Way(NamedTuple):
     last_step: np.ndarray
 
 
-def calls(model: Simulator, questions: Sequence[Question], effort: Effort) -> list[Way | str]:
+def calls(model: Simulator, questions: Sequence[Question], effort: Effort) -> list[AnswerSteps | str]:
     """For each scene the way to its answer, or a text that says why a frame failed. Arguments and errors as for
     `jumps`."""
-    ways: list[Way | str] = []
+    ways: list[AnswerSteps | str] = []
     for scene in _predicted(model, questions, effort, whole_way=True):
         if scene.failure is not None:
             ways.append(scene.failure)
@@ -85,7 +85,7 @@ def calls(model: Simulator, questions: Sequence[Question], effort: Effort) -> li
         stress = [_stacked([one[STRESS] for one in frame.fields], 1 + effort.newton_steps) for frame in known]
         steps = np.array([len(frame.positions) - 1 - effort.corrections for frame in wanted])
         last = np.array([np.nan if frame.last_step is None else frame.last_step for frame in wanted])
-        ways.append(Way(np.stack(position, axis=1), np.stack(stress, axis=1) if stress else None, steps, last))
+        ways.append(AnswerSteps(np.stack(position, axis=1), np.stack(stress, axis=1) if stress else None, steps, last))
     return ways
 
 

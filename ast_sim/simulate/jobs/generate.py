@@ -27,7 +27,7 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import Seconds, read_seconds, seconds_path, write_seconds
 from ast_sim.dataset.writer import DatasetWriter, FittedWriter
 from ast_sim.mechanics.contact_and_friction import self_test
-from ast_sim.simulate.families.names import family_module
+from ast_sim.simulate.families.known_families import family_module
 from ast_sim.simulate.jobs import cluster, pool
 from ast_sim.simulate.jobs.display import SceneProgress
 from ast_sim.simulate.jobs.manifest import Manifest, Watch

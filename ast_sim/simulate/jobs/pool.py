@@ -102,7 +102,7 @@ class Worker(Process):
         self.say(f"{sample[0]} {sample[1]}")
 
 
-class Pool:
+class WorkerPool:
     """Workers that share a list of samples. If a worker dies, its current sample fails and another worker takes its
     place.
     """
@@ -155,7 +155,7 @@ def run_all(samples: list[Sample], parts: Path, recipe: Recipe, workers: int, wa
     Raises:
         SimulationError: an error that every sample would meet, such as a full disk.
     """
-    pool = Pool(samples, parts, recipe, watch)
+    pool = WorkerPool(samples, parts, recipe, watch)
     try:
         while pool.waiting and len(pool.active) < workers:
             pool.start_worker()

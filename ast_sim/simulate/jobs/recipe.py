@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import ast_sim
 from ast_sim.dataset.layout import DatasetInfo
-from ast_sim.simulate.families.names import FAMILIES, family_module
+from ast_sim.simulate.families.known_families import FAMILIES, family_module
 from ast_sim.simulate.jobs.samples import Recipe
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.simulate.own_assembly.standing import friction_is_drawn

@@ -27,7 +27,7 @@ from ast_sim.mechanics.linearised_contact import CLEARANCE, NewtonSteps
 from ast_sim.mechanics.quasi_static import OneFrame, solve_frame
 from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.scene import Scene
-from ast_sim.simulate.families.names import family_module
+from ast_sim.simulate.families.known_families import family_module
 from ast_sim.simulate.jobs.rival import OUTCOMES, POSITIONS, UNMESHED, Outcome, Way
 from ast_sim.simulate.jobs.samples import Recipe, draw_sample
 from ast_sim.simulate.jobs.worker import answers_for

@@ -21,7 +21,7 @@ from ast_sim.mechanics.case import NEXT_NOTE, NOTES, Drawn
 from ast_sim.mechanics.unfinished import Checkpoint
 from ast_sim.named_field import NamedField
 from ast_sim.scene import Scene, Trajectory
-from ast_sim.simulate.families.names import family_module
+from ast_sim.simulate.families.known_families import family_module
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.support.disk import replacing
 from ast_sim.support.provenance import processor

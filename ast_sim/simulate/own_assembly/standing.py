@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ast_sim.importers.shells import find_shells
+from ast_sim.material import ELASTIC, YOUNG, Material
 from ast_sim.mechanics.case import NEXT_NOTE, NOTES, SolidCase
 from ast_sim.mechanics.contact_and_friction import ContactSettings
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
@@ -22,7 +23,7 @@ from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec, PartSpec
 from ast_sim.simulate.own_assembly.parameters import Values, completed, recorded
 from ast_sim.simulate.own_assembly.part_mesh import PartMesh, part_meshes
 from ast_sim.simulate.own_assembly.touching import set_back
-from ast_sim.simulate.own_assembly.yielding import hardening_columns, hardening_of
+from ast_sim.simulate.own_assembly.yielding import hardening_columns, hardening_of, material_columns
 from ast_sim.simulate.shapes.mesh import second_order
 from ast_sim.support.errors import ConfigError
 
@@ -137,14 +138,16 @@ def case(spec: AssemblySpec, values: Values, frames: int, parts: list[PlacedPart
         body=body,
         material=material,
     )
-    law = material[:, :2].astype(np.float64)
-    law[law[:, 0] == 0] = law[np.argmax(law[:, 0] > 0)]  # what rigid elements have is ignored, but must be constants
+    columns = Material(tuple(material_columns(spec, friction_is_drawn(spec))))
+    law = np.stack([columns.numbers(name, material) for name in ELASTIC])
+    deforms = law[ELASTIC.index(YOUNG)] > 0
+    law[:, ~deforms] = law[:, [np.argmax(deforms)]]  # what rigid elements have is ignored, but must be constants
     course = _course(scene, parts, values, frames, np.array(shared.origin))
     attributes: dict[str, AttributeValue] = {**recorded(values), "origin": list(shared.origin)}
     notes = dict.fromkeys([*(note for part in parts for note in part.notes), *touching, *_soft(spec, values)])
     attributes |= {NOTES: NEXT_NOTE.join(notes)} if notes else {}
     hardening = {number: table for number, part in enumerate(spec.parts) if len(table := hardening_of(part, values))}
-    return SolidCase(scene, course.position, NeoHookean(*law.T), contact, "node", attributes, course, hardening)
+    return SolidCase(scene, course.position, NeoHookean(*law), contact, "node", attributes, course, hardening)
 
 
 def _set_back(spec: AssemblySpec, parts: list[PlacedPart], shared: Reference) -> tuple[list[PlacedPart], list[str]]:
@@ -180,10 +183,10 @@ def _material(spec: AssemblySpec, values: Values, contact: ContactSettings) -> n
     """[bodies, columns] float32: Young's modulus, Poisson's ratio, where it is drawn the largest friction with another
     part, and where parts yield their hardening; zeros in the first two for rigid parts."""
     count = len(spec.parts)
-    rows = np.zeros((count, 2))
+    rows = np.zeros((count, len(ELASTIC)))
     for number, part in enumerate(spec.parts):
         if not part.rigid:
-            rows[number] = values[f"{part.name}.young"], values[f"{part.name}.poisson"]
+            rows[number] = [values[f"{part.name}.{name}"] for name in ELASTIC]
             NeoHookean(*rows[number])
     if friction_is_drawn(spec):
         others = [[contact.friction_between(a, b) for b in range(count) if b != a] for a in range(count)]
