@@ -24,6 +24,7 @@ is nearest: the start must be nearly right.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,7 +34,8 @@ from scipy.optimize import nnls
 from ast_sim.mechanics.elements.elasticity import Deformation
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean, cofactor, determinant
 from ast_sim.mechanics.elements.second_order import elastic_body
-from ast_sim.mechanics.linear_system import Factorization, LinearSystem
+from ast_sim.mechanics.linear_algebra.compliance import Compliance
+from ast_sim.mechanics.linear_algebra.linear_system import Factorization, LinearSystem
 from ast_sim.scene import Scene
 from ast_sim.support.errors import SimulationError
 from ast_sim.support.nearest_surface import nearest_surface
@@ -44,8 +46,11 @@ CLEARANCE = (
 NEAR = 0.5  # pairs with a gap below this may touch, in mean edge lengths of the surfaces
 DEEP = 2.0  # a node deeper inside another body than this is not taken for one in contact with it, in the same
 OVERLAP = 1e-6  # pairs may overlap by this much at the end of a step, in the same
-FEW, SHARE = 8, 4  # a round takes so many of the pairs that would overlap, or this part of them if that is more
-ROUNDING = 1e-10  # is added to the diagonal of B, relative to its mean: equal pairs make B singular
+FEW, SHARE, MORE = (
+    8,
+    4,
+    16,
+)  # a round takes so many of the pairs that would overlap, or this part of them or of all before
 SLID = 0.02  # surfaces have slid along this last part of the way from rest to x, if nothing else is known
 SWEEPS, CHANGE = 100, 1e-3  # forces of friction are found when a sweep over the pairs changes them by less
 FLATTEST = 0.2  # the least stretch of an element that forces and stiffness follow
@@ -83,6 +88,7 @@ class NewtonSteps:
     Attributes:
         elasticity: the deforming bodies.
         system: of their free nodes.
+        watch: is called now and then in a step, with how many forces of contact it knows. It may raise to stop.
 
     Raises:
         SimulationError: the rest volume of an element is not positive.
@@ -104,6 +110,7 @@ class NewtonSteps:
         owner, edge = scene.body[faces[:, 0]], self._rest[faces[:, 0]] - self._rest[faces[:, 1]]
         self._length = float(np.linalg.norm(edge, axis=1).mean())
         nodes = np.unique(faces)
+        self.watch: Callable[[int], None] = lambda forces: None
         self._shortening = 1.0  # the share of the last step that was made
         self._surfaces = [(faces[owner == body], nodes[scene.body[nodes] != body]) for body in np.unique(owner)]
 
@@ -153,45 +160,47 @@ class NewtonSteps:
 
     def _constrained(self, factor: Factorization, force: np.ndarray, pairs: NearPairs) -> np.ndarray:
         """The displacement [F] of the free dofs; see the head of this file."""
-        unconstrained = factor.displacement(factor.responses(-force[:, None]), np.ones(1))
+        unconstrained = factor.other_half(factor.halves(-force[None])[1][0])
         count = len(pairs.gap)
-        offset = pairs.directions[:count] @ unconstrained + pairs.gap - self._clearance
-        active, responses, forces = self._pressed_pairs(factor, pairs.directions[:count], offset)
-        if not len(active):
-            return unconstrained
-        if self._friction:
-            along = np.concatenate([active, active + count])
-            tangents = pairs.directions[count + along]
-            responses = np.concatenate([responses, factor.responses(tangents.toarray().T)], axis=1)
-            offset = np.concatenate([offset[active], tangents @ unconstrained + pairs.slip[along]])
-            forces = _rubbed(_regular(factor.compliance(responses)), offset, forces, self._friction)
-        return unconstrained + factor.displacement(responses, forces)
+        offset = pairs.directions @ unconstrained + np.concatenate([pairs.gap - self._clearance, pairs.slip])
+        compliance = Compliance(factor, pairs.directions, self.watch)
+        chosen, forces = self._pressed_pairs(compliance, offset[:count], pairs.directions[:count])
+        if not self._friction or not forces.any():
+            return unconstrained + (compliance.displacement(forces) if forces.any() else 0)
+        active = np.flatnonzero(forces)
+        active = active[np.argsort(chosen[active])]
+        along = np.concatenate([chosen[active] + count, chosen[active] + 2 * count])
+        compliance.want(along)
+        columns = np.concatenate([active, np.arange(len(chosen), len(chosen) + len(along))])
+        rows = np.concatenate([chosen[active], along])
+        all_forces = np.zeros(len(chosen) + len(along))
+        all_forces[columns] = _rubbed(
+            compliance.matrix[np.ix_(columns, columns)], offset[rows], forces[active], self._friction
+        )
+        return unconstrained + compliance.displacement(all_forces)
 
     def _pressed_pairs(
-        self, factor: Factorization, normals: scipy.sparse.csr_array, offset: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The pairs [A] that press on each other, their responses [., A] and forces [A], without friction.
+        self, compliance: Compliance, offset: np.ndarray, normals: scipy.sparse.csr_array
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The pairs [A] that may press on each other and their forces [A] >= 0, without friction.
 
-        A response costs half a solution with the stiffness. So pairs get one in rounds, those first that would overlap
-        most with the forces so far. At the end no pair overlaps: these are the forces of all pairs.
+        The compliance of a pair costs half a solution with the stiffness. So pairs get one in rounds, those first that
+        would overlap most with the forces so far. At the end no pair overlaps: these are the forces of all pairs.
         """
         chosen = np.zeros(0, int)
         forces = np.zeros(0)
         gap = offset.copy()
-        responses = factor.responses(np.zeros((normals.shape[1], 0)))
         while True:
             missing = np.flatnonzero(gap < -OVERLAP * self._length)
             if not len(missing):
-                break
-            deepest = missing[np.argsort(gap[missing], kind="stable")][: max(FEW, len(missing) // SHARE)]
+                return chosen, forces
+            most = max(FEW, len(missing) // SHARE, len(chosen) // MORE)
+            deepest = missing[np.argsort(gap[missing], kind="stable")][:most]
             chosen = np.concatenate([chosen, deepest])
-            responses = np.concatenate([responses, factor.responses(normals[deepest].toarray().T)], axis=1)
-            forces = _pressed(_regular(factor.compliance(responses)), offset[chosen])
-            gap = offset + normals @ factor.displacement(responses, forces)
+            compliance.want(deepest)
+            forces = _pressed(compliance.matrix, offset[chosen])
+            gap = offset + normals @ compliance.displacement(forces)
             gap[chosen] = 0
-        order = np.argsort(chosen)
-        active = order[forces[order] > 0]
-        return chosen[active], responses[:, active], forces[active]
 
     def von_mises(self, position: np.ndarray, location: str) -> np.ndarray:
         """[N, 1] or [E, 1] float32: the stress in pascal at `location`, "node" or "element"; 0 in rigid bodies."""
@@ -288,12 +297,6 @@ def _tangents(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     first = np.cross(normals, across)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return first, np.cross(normals, first)
-
-
-def _regular(compliance: np.ndarray) -> np.ndarray:
-    """The compliance, exactly symmetric and without zero eigenvalues."""
-    ridge = ROUNDING * np.trace(compliance) / len(compliance)
-    return (compliance + compliance.T) / 2 + ridge * np.eye(len(compliance))
 
 
 def _pressed(compliance: np.ndarray, offset: np.ndarray) -> np.ndarray:
