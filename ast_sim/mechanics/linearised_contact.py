@@ -24,16 +24,18 @@ is nearest: the start must be nearly right.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
+from scipy.optimize import nnls
 
-from ast_sim.mechanics.contact_forces import Compliance, pressed, rubbed
 from ast_sim.mechanics.elements.elasticity import Deformation
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean, cofactor, determinant
 from ast_sim.mechanics.elements.second_order import elastic_body
-from ast_sim.mechanics.linear_system import Factorization, LinearSystem
+from ast_sim.mechanics.linear_algebra.compliance import Compliance
+from ast_sim.mechanics.linear_algebra.linear_system import Factorization, LinearSystem
 from ast_sim.scene import Scene
 from ast_sim.support.errors import SimulationError
 from ast_sim.support.nearest_surface import nearest_surface
@@ -44,9 +46,13 @@ CLEARANCE = (
 NEAR = 0.5  # pairs with a gap below this may touch, in mean edge lengths of the surfaces
 DEEP = 2.0  # a node deeper inside another body than this is not taken for one in contact with it, in the same
 OVERLAP = 1e-6  # pairs may overlap by this much at the end of a step, in the same
-FEW, SHARE = 8, 4  # a round takes so many of the pairs that would overlap, or this part of them if that is more
+FEW = 8  # a round takes so many of the pairs that would overlap,
+SHARE = 4  # or this part of them,
+MORE = 16  # or this part of all that were taken before, if that is more
 SLID = 0.02  # surfaces have slid along this last part of the way from rest to x, if nothing else is known
+SWEEPS, CHANGE = 100, 1e-3  # forces of friction are found when a sweep over the pairs changes them by less
 FLATTEST = 0.2  # the least stretch of an element that forces and stiffness follow
+TINY = 1e-300  # instead of zero in a denominator
 STILL = 0.05  # a step of this size (`NewtonSteps.size`) or less is the last one (docs/log.md, 2026-11-25)
 SLIGHT = 1e-3  # a displacement below this, in mean edge lengths, is none: before bodies touch, only rounding is left
 SMALLEST = 1 / 64  # a step is shortened at most so far where it turns an element over
@@ -80,6 +86,7 @@ class NewtonSteps:
     Attributes:
         elasticity: the deforming bodies.
         system: of their free nodes.
+        watch: is called now and then in a step, with how many forces of contact it knows. It may raise to stop.
 
     Raises:
         SimulationError: the rest volume of an element is not positive.
@@ -101,6 +108,7 @@ class NewtonSteps:
         owner, edge = scene.body[faces[:, 0]], self._rest[faces[:, 0]] - self._rest[faces[:, 1]]
         self._length = float(np.linalg.norm(edge, axis=1).mean())
         nodes = np.unique(faces)
+        self.watch: Callable[[int], None] = lambda forces: None
         self._shortening = 1.0  # the share of the last step that was made
         self._surfaces = [(faces[owner == body], nodes[scene.body[nodes] != body]) for body in np.unique(owner)]
 
@@ -153,7 +161,7 @@ class NewtonSteps:
         unconstrained = factor.other_half(factor.halves(-force[None])[1][0])
         count = len(pairs.gap)
         offset = pairs.directions @ unconstrained + np.concatenate([pairs.gap - self._clearance, pairs.slip])
-        compliance = Compliance(factor, pairs.directions)
+        compliance = Compliance(factor, pairs.directions, self.watch)
         chosen, forces = self._pressed_pairs(compliance, offset[:count], pairs.directions[:count])
         if not self._friction or not forces.any():
             return unconstrained + (compliance.displacement(forces) if forces.any() else 0)
@@ -164,7 +172,7 @@ class NewtonSteps:
         columns = np.concatenate([active, np.arange(len(chosen), len(chosen) + len(along))])
         rows = np.concatenate([chosen[active], along])
         all_forces = np.zeros(len(chosen) + len(along))
-        all_forces[columns] = rubbed(
+        all_forces[columns] = _rubbed(
             compliance.matrix[np.ix_(columns, columns)], offset[rows], forces[active], self._friction
         )
         return unconstrained + compliance.displacement(all_forces)
@@ -184,10 +192,11 @@ class NewtonSteps:
             missing = np.flatnonzero(gap < -OVERLAP * self._length)
             if not len(missing):
                 return chosen, forces
-            deepest = missing[np.argsort(gap[missing], kind="stable")][: max(FEW, len(missing) // SHARE)]
+            most = max(FEW, len(missing) // SHARE, len(chosen) // MORE)
+            deepest = missing[np.argsort(gap[missing], kind="stable")][:most]
             chosen = np.concatenate([chosen, deepest])
             compliance.want(deepest)
-            forces = pressed(compliance.matrix, offset[chosen])
+            forces = _pressed(compliance.matrix, offset[chosen])
             gap = offset + normals @ compliance.displacement(forces)
             gap[chosen] = 0
 
@@ -286,3 +295,42 @@ def _tangents(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     first = np.cross(normals, across)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return first, np.cross(normals, first)
+
+
+def _pressed(compliance: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """The forces [P] >= 0 of contact without friction: with B = L L^T they minimise |L^T l + L^-1 b|."""
+    try:
+        lower = np.linalg.cholesky(compliance)
+        return nnls(lower.T, -np.linalg.solve(lower, offset), maxiter=30 * len(offset))[0]
+    except (np.linalg.LinAlgError, RuntimeError) as error:
+        raise SimulationError(f"the forces of contact were not found: {error}") from error
+
+
+def _rubbed(compliance: np.ndarray, offset: np.ndarray, forces: np.ndarray, friction: float) -> np.ndarray:
+    """The forces [3, P] of contact with Coulomb friction, from those [P] without, by nonlinear block Gauss-Seidel
+    (Jourdan, Alart and Jean 1998): each pair in turn gets the force that is right if the others stay.
+
+    Args:
+        compliance: B [3 P, 3 P], normals first, then the first and the second tangents.
+        offset: b [3 P].
+    """
+    count = len(forces)
+    all_forces = np.concatenate([forces, np.zeros(2 * len(forces))])
+    of_pair = np.ascontiguousarray(compliance.reshape(3, count, 3 * count).swapaxes(0, 1))  # the three rows of each
+    by_normal = of_pair[np.arange(count), :, np.arange(count)].tolist()  # what a pair's own normal force moves
+    stiffest = compliance.diagonal().reshape(3, count)[1:].max(axis=0).tolist()
+    pairs = list(zip(of_pair, offset.reshape(3, count).T, by_normal, stiffest, strict=True))
+    for _ in range(SWEEPS):
+        before = all_forces.copy()
+        for pair, (rows, gap, (own, first_by_normal, second_by_normal), tangential) in enumerate(pairs):
+            components = slice(pair, None, count)
+            distance, first, second = (rows @ all_forces + gap).tolist()
+            normal_before, one, other = all_forces[components].tolist()
+            normal = max(0.0, normal_before - distance / own)
+            one -= (first + first_by_normal * (normal - normal_before)) / tangential
+            other -= (second + second_by_normal * (normal - normal_before)) / tangential
+            share = min(1.0, friction * normal / max(math.hypot(one, other), TINY))
+            all_forces[components] = normal, share * one, share * other
+        if np.abs(all_forces - before).max() <= CHANGE * np.abs(all_forces).max():
+            break
+    return all_forces

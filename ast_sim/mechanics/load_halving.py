@@ -15,7 +15,7 @@ import numpy as np
 from ast_sim.mechanics.contact_and_friction import Contact
 from ast_sim.mechanics.elements.elasticity import Elasticity
 from ast_sim.mechanics.elements.inertia import Inertia
-from ast_sim.mechanics.linear_system import LinearSystem
+from ast_sim.mechanics.linear_algebra.linear_system import LinearSystem
 from ast_sim.mechanics.solver import Newton, NotConverged, SolverSettings
 
 MAX_DAMPED_STEPS = 60

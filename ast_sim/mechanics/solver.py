@@ -19,7 +19,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ast_sim.mechanics.contact_and_friction import Contact, ContactState
-from ast_sim.mechanics.linear_system import LinearSystem
+from ast_sim.mechanics.linear_algebra.linear_system import LinearSystem
 from ast_sim.support.errors import SimulationError
 
 

@@ -86,6 +86,21 @@ class Clock:
         return duration(seconds + validations * sum(self._validations) / len(self._validations))
 
 
+class Patience:
+    """Tells on stderr what takes long: a line whenever `QUIET` seconds have passed without one."""
+
+    QUIET = SECONDS_BETWEEN_LINES
+
+    def __init__(self) -> None:
+        self._told = time.perf_counter()
+
+    def tell(self, text: str) -> None:
+        """Print the text, if it is time to."""
+        if time.perf_counter() - self._told >= self.QUIET:
+            tqdm.write(text, file=sys.stderr)
+            self._told = time.perf_counter()
+
+
 class Progress:
     """Counts up to `total`; a context manager, which begins the count.
 

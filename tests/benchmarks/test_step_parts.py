@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.steps import before_after, parts, predictions
+from benchmarks.steps import before_after, newton, newton_worker, parts, predictions
 from benchmarks.steps.step_worker import nodes
 
 
@@ -28,3 +28,23 @@ def test_times_of_predictions_and_the_roundings_between_them():
         "clock: before 2.00 (4.00), now 1.00 (2.00) ms; processor: before 1.00 (3.00), now 0.50 (1.00) ms;"
         " positions differ by 2 roundings"
     )
+
+
+def test_newton_steps_are_told_by_least_and_median():
+    told = [{"setup": [2.0, 1.0], "steps": [[5.0, 3.0], [4.0, 6.0]]}, {"setup": [3.0], "steps": [[9.0, 9.0]]}]
+    times = newton.summary(told)
+    assert times == {"least": [1.0, 4.0, 3.0], "median": [2.0, 5.0, 6.0]}
+    row = {"before": None, "now": times, "difference": 1e-12}
+    assert newton.line_of("a plate", row, 60) == (
+        "| a plate | not within 60 s | 1e+03 (2e+03), 4e+03 (5e+03), 3e+03 (6e+03) | 1e-12 |"
+    )
+    assert newton.summary([]) is None
+
+
+def test_the_scenes_of_newton_steps_have_the_sizes_of_their_names():
+    for name, cells in newton.CASES.items():
+        if cells[2] <= 8 and cells[0] < 100:
+            make = newton_worker.plate if name.startswith("plate") else newton_worker.two_blocks
+            scene, position, _ = make(cells)
+            assert f" {scene.num_nodes:,} nodes" in name
+            assert position.shape == scene.rest_position.shape

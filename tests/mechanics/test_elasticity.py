@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from ast_sim.mechanics.elements.elasticity import Elasticity
+from ast_sim.mechanics.elements.elasticity import Elasticity, eigenvectors
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean, cofactor, determinant, von_mises
 from ast_sim.mechanics.elements.second_order import LARGEST, elastic_body, shape_functions
-from ast_sim.mechanics.linear_system import LinearSystem
+from ast_sim.mechanics.linear_algebra.linear_system import LinearSystem
 from ast_sim.simulate.shapes import mesh
 from ast_sim.support.errors import SimulationError
 
@@ -231,3 +231,17 @@ def test_an_inverted_element_has_infinite_energy_and_no_place_at_rest():
     rest[elements[2, 4]] += 2 * (rest[elements[2, 3]] - rest[elements[2, 0]])
     with pytest.raises(SimulationError, match="is turned over at rest: a quarter of it has the volume -"):
         elastic_body(rest, elements, MATERIAL)
+
+
+def test_rotations_of_many_matrices_find_their_eigenvectors():
+    """Also of matrices that differ by sixteen orders of magnitude, that have equal values, or that are zero."""
+    random = np.random.default_rng(2)
+    half = random.normal(size=(3, 3, 500)) * 10.0 ** random.integers(-8, 8, 500)
+    special = np.stack([np.zeros((3, 3)), np.eye(3), np.ones((3, 3)), np.diag([1.0, 1.0, 2.0])], axis=2)
+    matrices = np.concatenate([half + half.transpose(1, 0, 2), special], axis=2)
+    values, vectors = eigenvectors(matrices)
+    size = np.abs(matrices).max(axis=(0, 1)) + np.finfo(float).tiny
+    again = np.einsum("aie,ae,aje->ije", vectors, values, vectors)
+    assert np.abs((again - matrices) / size).max() < 1e-14
+    products = np.einsum("aie,bie->abe", vectors, vectors)
+    np.testing.assert_allclose(products, np.broadcast_to(np.eye(3)[:, :, None], products.shape), atol=1e-14)

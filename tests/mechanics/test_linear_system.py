@@ -5,10 +5,11 @@ import sys
 import numpy as np
 import pytest
 
-from ast_sim.mechanics import linear_system
 from ast_sim.mechanics.elements.elasticity import Elasticity
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
-from ast_sim.mechanics.linear_system import Cholmod, LinearSystem, Pardiso
+from ast_sim.mechanics.linear_algebra import factorization, linear_system
+from ast_sim.mechanics.linear_algebra.factorization import Cholmod, Pardiso
+from ast_sim.mechanics.linear_algebra.linear_system import LinearSystem
 from ast_sim.simulate.shapes import mesh
 
 NO_CONTACT = (np.zeros(0, int), np.zeros(0, int), np.zeros(0))
@@ -48,10 +49,10 @@ def assert_solves(system: LinearSystem, values, contact, dense, fixed, residual:
 
 
 def test_where_there_is_no_mkl_cholmod_factorises(monkeypatch):
-    assert isinstance(linear_system.factorization(), Pardiso)
+    assert isinstance(factorization.factorization(), Pardiso)
     monkeypatch.setitem(sys.modules, "pypardiso", None)
-    linear_system._pypardiso.cache_clear()
-    assert isinstance(linear_system.factorization(), Cholmod)
+    factorization._pypardiso.cache_clear()
+    assert isinstance(factorization.factorization(), Cholmod)
 
 
 def test_it_solves_what_the_dense_matrix_does_with_contact_that_changes(problem):

@@ -168,6 +168,26 @@ def test_forces_found_in_rounds_are_those_of_all_pairs_at_once(squeezed, monkeyp
     assert rms(found[0] - found[1]) > 1e-4 * size  # friction is felt
 
 
+def test_a_step_can_be_watched_and_stopped(squeezed):
+    """As by Ctrl-C: what the step knows so far is told, and the next step is not disturbed."""
+    case, truth, free, size = squeezed
+    start, told = nearly(truth, free, 0.1 * size), []
+    solver = NewtonSteps(case.scene, case.material, 0.8 * DHAT, 0.3)
+    solver.watch = told.append
+    whole = solver.step(start)
+    assert told[0] == 0 and told == sorted(told) and len(told) > 2
+
+    def stop(forces: int) -> None:
+        if forces:
+            raise KeyboardInterrupt
+
+    solver.watch = stop
+    with pytest.raises(KeyboardInterrupt):
+        solver.step(start)
+    solver.watch = told.append
+    assert np.array_equal(solver.step(start), whole)
+
+
 def test_what_slides_feels_friction_against_its_way(monkeypatch):
     """A block is pressed down, then pushed aside until it slides; the steps start from nearly what the solver finds. If
     it stuck where each step begins, any force would hold it; in truth the whole friction acts against its way."""

@@ -6,7 +6,7 @@ import pytest
 
 from ast_sim.support import progress
 from ast_sim.support.errors import ConfigError
-from ast_sim.support.progress import Progress
+from ast_sim.support.progress import Patience, Progress
 
 
 @pytest.fixture
@@ -66,3 +66,13 @@ def test_a_bar_on_a_terminal(monkeypatch, capsys):
 def test_what_is_no_progress_is_refused():
     with pytest.raises(ConfigError, match="progress is 'yes': it must be True, False or a function of"):
         Progress(1, "scenes", "yes")
+
+
+def test_only_what_takes_long_is_told(monkeypatch, capsys):
+    patience = Patience()
+    patience.tell("soon")
+    monkeypatch.setattr(Patience, "QUIET", 0.0)
+    patience.tell("late")
+    monkeypatch.setattr(Patience, "QUIET", 100.0)
+    patience.tell("again soon")
+    assert capsys.readouterr().err == "late\n"

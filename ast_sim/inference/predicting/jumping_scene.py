@@ -25,6 +25,7 @@ from ast_sim.models.simulator import Simulator
 from ast_sim.named_field import STRESS
 from ast_sim.scene import Scene
 from ast_sim.support.errors import SimulationError
+from ast_sim.support.progress import Patience
 
 
 @dataclass(eq=False)
@@ -93,7 +94,11 @@ class JumpingFrame:
             solver = self.scene.solver(self.scene.question.scene)
             position = _array(self.positions[-1])
             stuck = self.scene.settled(self.number - 1)
+            patience = Patience()
             for step in range(1, most + 1):
+                told = f"{self.name}: Newton step {step} of at most {most}"
+                patience.tell(told)
+                solver.watch = lambda forces, told=told: patience.tell(f"{told}, {forces:,} forces of contact so far")
                 before = position
                 position = solver.step(position, from_afar=step == 1, stuck=stuck)
                 self.positions.append(torch.from_numpy(position.astype(np.float32)))

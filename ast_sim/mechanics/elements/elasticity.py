@@ -22,6 +22,7 @@ _ENTRY = np.zeros((12, 12), int)
 _ENTRY[_ROW, _COLUMN] = _ENTRY[_COLUMN, _ROW] = np.arange(len(_ROW))
 # Entry of the pair with the two nodes exchanged and the components kept: (a i, b j) -> (b i, a j).
 _SWAPPED = _ENTRY[3 * (_COLUMN // 3) + _ROW % 3, 3 * (_ROW // 3) + _COLUMN % 3]
+SWEEPS = 12  # of rotations, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +139,13 @@ class Elasticity:
         arguments = material.mu, material.pressure_factor(J), material.lam * J * J
         for elements, way, value in negative_directions(deformation, *arguments, self.gradients):
             b = way.reshape(12, -1)
-            entries[:, elements] += (b * (value * self.volume[elements]))[_ROW] * b[_COLUMN]
+            # Of all elements: to pick those that have any takes twice as long.
+            whole = np.zeros((12, entries.shape[1]))
+            whole[:, elements] = b * np.sqrt(value * self.volume[elements])
+            first = 0
+            for row in range(12):
+                entries[first : first + 12 - row] += whole[row] * whole[row:]
+                first += 12 - row
 
     def cauchy(self, deformation: Deformation) -> np.ndarray:
         """True stress of each element [3,3,E] in pascal."""
@@ -180,11 +187,15 @@ def negative_directions(
     Yields:
         Numbers [n] of deformations, an eigenvector as the change of F with the nodes, [a,3,n], and minus its eigenvalue
         [n], with which it is to be added times itself: twists and flips have the length sqrt(2), so theirs is halved.
+
+    Raises:
+        numpy.linalg.LinAlgError: an element is longer than flat by more than 1e7, or its deformation is not finite.
     """
     J = deformation.J
-    squares, right = np.linalg.eigh(np.einsum("kie,kje->eij", deformation.F, deformation.F))
-    stretch = np.sqrt(squares.T)
-    right = np.ascontiguousarray(right.transpose(2, 1, 0))  # [3, E], [axis, 3, E]
+    squares, right = eigenvectors(np.einsum("kie,kje->ije", deformation.F, deformation.F))
+    if (squares.min(axis=0) <= np.finfo(float).eps * squares.max(axis=0)).any():
+        raise np.linalg.LinAlgError("an element is so flat that its stretch is lost in rounding")
+    stretch = np.sqrt(squares)
     left = np.einsum("ije,kje->kie", deformation.F, right) / stretch[:, None]
     across = np.einsum("aje,kje->kae", gradients, right)  # v_k . grad N_a
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -196,8 +207,7 @@ def negative_directions(
     inverse = 1 / stretch[:, widened]
     A = spread[widened] * inverse[:, None] * inverse[None]
     A[range(3), range(3)] += np.broadcast_to(mu, J.shape)[widened] - c[widened] * inverse * inverse
-    values, vectors = np.linalg.eigh(A.transpose(2, 0, 1))
-    for value, weight in zip(values.T, vectors.transpose(2, 1, 0), strict=True):
+    for value, weight in zip(*eigenvectors(A), strict=True):
         below = np.flatnonzero(value < 0)
         chosen = widened[below]
         yield (
@@ -205,3 +215,35 @@ def negative_directions(
             np.einsum("ke,kae,kie->aie", weight[:, below], across[:, :, chosen], left[:, :, chosen]),
             -value[below],
         )
+
+
+def eigenvectors(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvalues [3,E], in no order, and eigenvectors [axis,3,E] of symmetric matrices [3,3,E].
+
+    By Jacobi's rotations of all matrices at once, which take half the time of LAPACK, matrix by matrix. They converge
+    quadratically: four or five sweeps.
+
+    Raises:
+        numpy.linalg.LinAlgError: a number is not finite.
+    """
+    if not np.isfinite(matrices).all():
+        raise np.linalg.LinAlgError("a matrix without finite numbers has no eigenvalues")
+    diagonal = [matrices[i, i].copy() for i in range(3)]
+    beside = [matrices[1, 2].copy(), matrices[0, 2].copy(), matrices[0, 1].copy()]  # by the third axis
+    vectors = [np.broadcast_to(axis[:, None], matrices.shape[1:]) for axis in np.eye(3)]
+    rounding = np.finfo(float).eps * np.abs(matrices).max(axis=(0, 1), initial=0)
+    for _ in range(SWEEPS):
+        if all((np.abs(one) <= rounding).all() for one in beside):
+            break
+        for p, q, r in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
+            half = (diagonal[q] - diagonal[p]) / 2
+            length = np.abs(half) + np.sqrt(half * half + beside[r] * beside[r])
+            tangent = np.copysign(beside[r], beside[r] * half) / np.maximum(length, np.finfo(float).tiny)
+            cosine = 1 / np.sqrt(1 + tangent * tangent)
+            sine = tangent * cosine
+            diagonal[p] -= tangent * beside[r]
+            diagonal[q] += tangent * beside[r]
+            beside[r] = np.zeros_like(cosine)
+            beside[q], beside[p] = cosine * beside[q] - sine * beside[p], sine * beside[q] + cosine * beside[p]
+            vectors[p], vectors[q] = cosine * vectors[p] - sine * vectors[q], sine * vectors[p] + cosine * vectors[q]
+    return np.stack(diagonal), np.stack(vectors)

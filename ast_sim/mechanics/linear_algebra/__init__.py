@@ -1,0 +1,1 @@
+"""Sparse systems: their factorization, their solution, and what forces along some directions do."""

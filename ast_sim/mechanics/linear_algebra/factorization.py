@@ -1,0 +1,137 @@
+"""Cholesky factorizations of sparse matrices by the fastest library that there is: PARDISO where there is MKL, CHOLMOD
+elsewhere. Both use one thread, and both report a matrix that is not positive definite."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib.metadata
+import os
+import weakref
+from types import ModuleType
+from typing import Protocol
+
+import numpy as np
+import scipy.sparse
+
+from ast_sim.support.errors import SimulationError, interrupted
+
+
+class Factorization(Protocol):
+    """Cholesky factorization K = L L^T of symmetric matrices that are given by their upper triangles."""
+
+    name: str
+
+    def factorise(self, upper: scipy.sparse.csr_array, is_new_pattern: bool) -> bool:
+        """Factorise; return False if the matrix is not positive definite."""
+
+    def solve(self, right_side: np.ndarray) -> np.ndarray:
+        """Solution for the matrix last factorised, to the last bits."""
+
+    def halves(self, loads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """For loads [A, F] what half of a solution makes of them, left and right [A, F] each: the products of the left
+        with the right are P K^-1 P^T. With a library that gives L both are the same array, P L^-T."""
+
+    def other_half(self, rights: np.ndarray) -> np.ndarray:
+        """K^-1 P^T f [F], where `rights` [F] is the sum of the rights of the loads times the forces f."""
+
+
+@functools.cache
+def _pypardiso() -> tuple[ModuleType, str]:
+    """The module, ready for use, and its name and version."""
+    # One thread, no second OpenMP runtime in this process, and the same bits wherever arrays lie in memory.
+    os.environ.setdefault("MKL_THREADING_LAYER", "SEQUENTIAL")
+    os.environ.setdefault("MKL_CBWR", "AVX2")
+    # Without this variable, the import of pypardiso searches the whole Python installation for the library.
+    if "PYPARDISO_MKL_RT" not in os.environ:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            for file in importlib.metadata.files("mkl") or ():
+                if "mkl_rt" in file.name:
+                    os.environ["PYPARDISO_MKL_RT"] = str(file.locate())
+    import pypardiso
+
+    return pypardiso, f"PARDISO (pypardiso {importlib.metadata.version('pypardiso')})"
+
+
+class Pardiso:
+    """PARDISO in Intel's MKL; the symbolic factorization is made for new patterns only."""
+
+    _NOT_POSITIVE_DEFINITE = -4
+
+    def __init__(self) -> None:
+        pypardiso, self.name = _pypardiso()
+        self._error = pypardiso.pardiso_wrapper.PyPardisoError
+        self._solver = pypardiso.PyPardisoSolver(mtype=2)  # real, symmetric, positive definite
+        weakref.finalize(self, self._solver.free_memory, everything=True)  # MKL keeps the factor until it is told
+
+    def factorise(self, upper: scipy.sparse.csr_array, is_new_pattern: bool) -> bool:
+        self._matrix = upper
+        try:
+            for phase in (11, 22) if is_new_pattern else (22,):
+                self._solver.set_phase(phase)
+                self._solver._call_pardiso(upper, np.zeros(upper.shape[0]))
+        except self._error as error:
+            if error.value == self._NOT_POSITIVE_DEFINITE:
+                return False
+            raise SimulationError(f"PARDISO failed with error {error.value} ({upper.shape[0]} unknowns)") from error
+        return True
+
+    def solve(self, right_side: np.ndarray) -> np.ndarray:
+        # PARDISO refines it twice, which triples the time: barriers make the matrices of the solver stiff.
+        return self._applied(33, right_side, refinements=2)
+
+    def halves(self, loads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        half = self._applied(331, loads.T).T  # L^-1
+        return half, half
+
+    def other_half(self, rights: np.ndarray) -> np.ndarray:
+        return self._applied(333, rights)  # L^-T
+
+    def _applied(self, phase: int, columns: np.ndarray, refinements: int = 0) -> np.ndarray:
+        self._solver.set_phase(phase)
+        self._solver.set_iparm(8, refinements)
+        return self._solver._call_pardiso(self._matrix, np.asfortranarray(columns))
+
+
+class Cholmod:
+    """CHOLMOD through cholespy, which factorises symbolically each time."""
+
+    name = "CHOLMOD (cholespy)"
+
+    def factorise(self, upper: scipy.sparse.csr_array, is_new_pattern: bool) -> bool:
+        import cholespy
+
+        whole = (upper + scipy.sparse.triu(upper, 1).T).tocsc()
+        try:
+            self._solver = cholespy.CholeskySolverD(
+                whole.shape[0],
+                whole.indptr.astype(np.int32),
+                whole.indices.astype(np.int32),
+                whole.data,
+                cholespy.MatrixType.CSC,
+            )
+        except ValueError:
+            return False
+        return True
+
+    def solve(self, right_side: np.ndarray) -> np.ndarray:
+        solution = np.zeros_like(right_side)
+        self._solver.solve(right_side, solution)
+        return solution
+
+    def halves(self, loads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Loads and solutions, since cholespy does not give L."""
+        return loads, np.stack([self.solve(load) for load in np.ascontiguousarray(loads)])
+
+    def other_half(self, rights: np.ndarray) -> np.ndarray:
+        return rights
+
+
+def factorization() -> Factorization:
+    """The fastest library that there is for this machine."""
+    try:
+        return Pardiso()
+    except ImportError as error:
+        if interrupted(error):  # by Ctrl-C
+            raise KeyboardInterrupt from error
+        return Cholmod()
