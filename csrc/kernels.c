@@ -15,8 +15,9 @@
 #include "mlp.c"
 #include "octree.c"
 #include "orthogonalize.c"
-#include "coarsen.c" /* after octree.c, whose chunks it uses */
-#include "pairs.c"   /* after coarsen.c, whose levels it counts */
+#include "coarsen.c"   /* after octree.c, whose chunks it uses */
+#include "pairs.c"     /* after coarsen.c, whose levels it counts */
+#include "proximity.c" /* after octree.c, whose sort it uses */
 #include "segment.c"
 #include "sparse_conv.c"
 #include "sparse_conv_weight.c" /* after sparse_conv.c, whose constants it uses */

@@ -308,6 +308,12 @@ static outcome elastic_forces_backward(const ast_kernels *kernels) {
   return FINISH(KERNEL(kernels->elastic_forces_backward(&s, dforce, dposition)), dposition);
 }
 
+static outcome proximity(const ast_kernels *kernels) {
+  const ast_proximity s = new_balls(3, 3, 12, 1, 0.2);
+  float *out = new_floats(5 * s.N);
+  return FINISH(KERNEL(kernels->proximity(&s, out)), out);
+}
+
 static outcome column_sum(const ast_kernels *kernels) {
   enum { N = 9000, F = 70 };
   float *x = random_floats(N * F), *out = new_floats(F);
@@ -345,6 +351,7 @@ static const struct {
     {"mlp_backward", mlp_backward},
     {"elastic_forces", elastic_forces},
     {"elastic_forces_backward", elastic_forces_backward},
+    {"proximity", proximity},
     {"column_sum", column_sum},
 };
 
