@@ -230,6 +230,10 @@ typedef struct {
    * radius and gap / (0.1 radius), clipped to -1..1. The gap is negative inside the body. 0, 0, 0, 1, 1 if none is
    * nearer than the radius. Triangles without an area do not count. */
   ast_status (*proximity)(const ast_proximity *s, float *restrict out);
+  /* rank[n] = the place of a wanted node in an order in which the nodes of each of the elements [E,K] are near each
+   * other, or -1 (breadth_first.c). wanted and rank [N]. */
+  ast_status (*breadth_first)(const int64_t *restrict elements, int64_t E, int64_t K, const int64_t *restrict wanted,
+                              int64_t N, int64_t *restrict rank);
   /* out[f] = sum of x[n,f] over n, rows in blocks whose sums are added by halves: the gradient of a bias. x [N,F], out
    * [F]. */
   ast_status (*column_sum)(const float *restrict x, int64_t N, int64_t F, float *restrict out);
@@ -264,6 +268,7 @@ typedef struct {
   KERNEL(elastic_forces)          \
   KERNEL(elastic_forces_backward) \
   KERNEL(proximity)               \
+  KERNEL(breadth_first)           \
   KERNEL(column_sum)              \
   KERNEL(orthogonalize)           \
   KERNEL(mlp)                     \

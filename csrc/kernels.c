@@ -6,6 +6,7 @@
 
 #include "attention.c"
 #include "attention_backward.c"
+#include "breadth_first.c"
 #include "elastic_forces.c"
 #include "fps.c"
 #include "linear.c"

@@ -109,6 +109,12 @@ static bool proximity_check(const call *c) {
          fail(c, "position, motion and radius must be finite, and the radius positive");
 }
 
+/* ---- the order of nodes ---- */
+
+KERNEL(breadth_first, elements, wanted, rank) {
+  return kernels->breadth_first(a->elements.data, n['E'], n['K'], a->wanted.data, n['N'], a->rank.data);
+}
+
 /* ---- octree ---- */
 
 KERNEL(octree, positions, offsets, x, y, z, half_width, depth, keys, cell_offsets, node_cell, node_order,
@@ -410,6 +416,7 @@ static binding bindings[] = {
     BINDING(attention_kv_backward, .check = attention_check),
     BINDING(attention_qkv, .check = attention_check),
     BINDING(attention_qkv_backward, .check = attention_check),
+    BINDING(breadth_first),
     BINDING(column_sum),
     BINDING(elastic_forces),
     BINDING(elastic_forces_backward),

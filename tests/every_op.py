@@ -17,6 +17,7 @@ from ast_sim.ops import (
     TetrahedronSet,
     attention,
     attention_block,
+    breadth_first,
     elastic_forces,
     farthest_point_sample,
     linear,
@@ -270,6 +271,14 @@ def proximity_results(scenes: Sequence[int]) -> Results:
     return [[x] for x in split(out, offsets)], []
 
 
+def breadth_first_results(scenes: Sequence[int]) -> Results:
+    tets, offsets = tets_of(scenes), offsets_of(scenes)
+    wanted = torch.cat([(torch.arange(SIZES[s]) % 7 > 0).long() for s in scenes])
+    rank = breadth_first(tets.elements, wanted)
+    parts = zip(split(rank, offsets), split(wanted, offsets), strict=True)
+    return [[torch.where(mine > 0, x - x[mine > 0].min(), -1)] if mine.any() else [x] for x, mine in parts], []
+
+
 def linear_results(scenes: Sequence[int]) -> Results:
     inputs = (rows(scenes, 48, key=1), rows(scenes, 35, key=2), shared(70, 48), shared(70))
     return by_rows(lambda x, residual, w, b: linear(x, w, b, "geglu", residual), inputs, 2, offsets_of(scenes))
@@ -306,6 +315,7 @@ OPS: dict[str, Callable[[Sequence[int]], Results]] = {
     "segment_mean": lambda scenes: segment_results(scenes, segment_mean),
     "elastic_forces": elastic_results,
     "proximity": proximity_results,
+    "breadth_first": breadth_first_results,
     "linear": linear_results,
     "mlp": mlp_results,
     "orthogonalized": orthogonalized_results,

@@ -314,6 +314,14 @@ static outcome proximity(const ast_kernels *kernels) {
   return FINISH(KERNEL(kernels->proximity(&s, out)), out);
 }
 
+static outcome breadth_first(const ast_kernels *kernels) {
+  const ast_elastic s = new_elastic(3000, 1);
+  int64_t *wanted = new_ints(s.N), *rank = new_ints(s.N);
+  for (int64_t n = 0; n < s.N; n++) wanted[n] = n % 7 > 0;
+  const ast_status status = KERNEL(kernels->breadth_first(s.elements, s.E, 4, wanted, s.N, rank));
+  return FINISH(status, rank);
+}
+
 static outcome column_sum(const ast_kernels *kernels) {
   enum { N = 9000, F = 70 };
   float *x = random_floats(N * F), *out = new_floats(F);
@@ -352,6 +360,7 @@ static const struct {
     {"elastic_forces", elastic_forces},
     {"elastic_forces_backward", elastic_forces_backward},
     {"proximity", proximity},
+    {"breadth_first", breadth_first},
     {"column_sum", column_sum},
 };
 
