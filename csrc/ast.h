@@ -112,6 +112,15 @@ typedef struct {
   const float *lame;                                   /* [E,2]: lambda and mu */
 } ast_elastic;
 
+/* Surfaces of bodies: triangles whose nodes belong to the body of the first, counter-clockwise seen from outside. */
+typedef struct {
+  int64_t B, N, F;                          /* scenes, nodes, triangles */
+  const float *position, *motion;           /* [N,3]; their sum counts, and is finite */
+  const int64_t *offsets, *surface_offsets; /* [B+1], of nodes and of triangles */
+  const int64_t *body, *surface;            /* [N], [F,3] */
+  double radius;                            /* positive and finite */
+} ast_proximity;
+
 /* A level of an octree and how it follows from the next finer one. It lies in scratch memory of the calling thread: the
  * caller of octree_coarsen sets a mark before, and releases it when the levels are written out. */
 typedef struct {
@@ -217,6 +226,14 @@ typedef struct {
   ast_status (*elastic_forces)(const ast_elastic *s, float *restrict force);
   /* dposition [N,3] = (dforce/dposition) dforce, whose matrix is symmetric: the gradient. */
   ast_status (*elastic_forces_backward)(const ast_elastic *s, const float *restrict dforce, float *restrict dposition);
+  /* out [N,5]: the outward normal at the nearest point of another body of the scene, times 1 - |gap| / radius; then gap /
+   * radius and gap / (0.1 radius), clipped to -1..1. The gap is negative inside the body. 0, 0, 0, 1, 1 if none is
+   * nearer than the radius. Triangles without an area do not count. */
+  ast_status (*proximity)(const ast_proximity *s, float *restrict out);
+  /* rank[n] = the place of a wanted node in an order in which the nodes of each of the elements [E,K] are near each
+   * other, or -1 (breadth_first.c). wanted and rank [N]. */
+  ast_status (*breadth_first)(const int64_t *restrict elements, int64_t E, int64_t K, const int64_t *restrict wanted,
+                              int64_t N, int64_t *restrict rank);
   /* out[f] = sum of x[n,f] over n, rows in blocks whose sums are added by halves: the gradient of a bias. x [N,F], out
    * [F]. */
   ast_status (*column_sum)(const float *restrict x, int64_t N, int64_t F, float *restrict out);
@@ -250,6 +267,8 @@ typedef struct {
   KERNEL(linear_backward)         \
   KERNEL(elastic_forces)          \
   KERNEL(elastic_forces_backward) \
+  KERNEL(proximity)               \
+  KERNEL(breadth_first)           \
   KERNEL(column_sum)              \
   KERNEL(orthogonalize)           \
   KERNEL(mlp)                     \

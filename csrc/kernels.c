@@ -6,6 +6,7 @@
 
 #include "attention.c"
 #include "attention_backward.c"
+#include "breadth_first.c"
 #include "elastic_forces.c"
 #include "fps.c"
 #include "linear.c"
@@ -15,8 +16,9 @@
 #include "mlp.c"
 #include "octree.c"
 #include "orthogonalize.c"
-#include "coarsen.c" /* after octree.c, whose chunks it uses */
-#include "pairs.c"   /* after coarsen.c, whose levels it counts */
+#include "coarsen.c"   /* after octree.c, whose chunks it uses */
+#include "pairs.c"     /* after coarsen.c, whose levels it counts */
+#include "proximity.c" /* after octree.c, whose sort it uses */
 #include "segment.c"
 #include "sparse_conv.c"
 #include "sparse_conv_weight.c" /* after sparse_conv.c, whose constants it uses */

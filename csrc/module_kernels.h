@@ -8,6 +8,8 @@
 #ifndef AST_MODULE_KERNELS_H
 #define AST_MODULE_KERNELS_H
 
+#include <math.h>
+
 #include "arguments.h"
 
 #define NAMES_OF(...) #__VA_ARGS__
@@ -87,6 +89,30 @@ KERNEL(elastic_forces, ELASTIC, force) {
 KERNEL(elastic_forces_backward, dforce, ELASTIC, dposition) {
   const ast_elastic s = elastic_of(&a->position, n);
   return kernels->elastic_forces_backward(&s, a->dforce.data, a->dposition.data);
+}
+
+/* ---- proximity ---- */
+
+#define PROXIMITY position, motion, offsets, body, surface, surface_offsets
+
+KERNEL(proximity, PROXIMITY, radius, out) {
+  const ast_proximity s = {EACH(SIZE, B, N, F), EACH(FIELD, PROXIMITY), .radius = a->radius.number};
+  return kernels->proximity(&s, a->out.data);
+}
+
+static bool proximity_check(const call *c) {
+  const proximity_arguments *a = (const void *)c->arguments;
+  const float *position = a->position.data, *motion = a->motion.data;
+  bool finite = true;
+  for (int64_t i = 0; i < 3 * c->size['N']; i++) finite &= isfinite((double)position[i] + (double)motion[i]);
+  return (finite && a->radius.number > 0 && isfinite(a->radius.number)) ||
+         fail(c, "position, motion and radius must be finite, and the radius positive");
+}
+
+/* ---- the order of nodes ---- */
+
+KERNEL(breadth_first, elements, wanted, rank) {
+  return kernels->breadth_first(a->elements.data, n['E'], n['K'], a->wanted.data, n['N'], a->rank.data);
 }
 
 /* ---- octree ---- */
@@ -390,6 +416,7 @@ static binding bindings[] = {
     BINDING(attention_kv_backward, .check = attention_check),
     BINDING(attention_qkv, .check = attention_check),
     BINDING(attention_qkv_backward, .check = attention_check),
+    BINDING(breadth_first),
     BINDING(column_sum),
     BINDING(elastic_forces),
     BINDING(elastic_forces_backward),
@@ -406,6 +433,7 @@ static binding bindings[] = {
     BINDING(octree_coarsen, COUNTED(octree_coarsen)),
     BINDING(octree_coordinates),
     BINDING(orthogonalize),
+    BINDING(proximity, .check = proximity_check),
     BINDING(segment_spread),
     BINDING(segment_sum),
     BINDING(sparse_conv),

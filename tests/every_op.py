@@ -17,12 +17,14 @@ from ast_sim.ops import (
     TetrahedronSet,
     attention,
     attention_block,
+    breadth_first,
     elastic_forces,
     farthest_point_sample,
     linear,
     message_sum,
     mlp,
     octree,
+    proximity,
     segment_mean,
     segment_sum,
     sparse_conv,
@@ -255,6 +257,28 @@ def elastic_results(scenes: Sequence[int]) -> Results:
     return by_rows(lambda x: elastic_forces(x, rest, lame, tets), (rows(scenes, 3),), 1, offsets)
 
 
+def proximity_results(scenes: Sequence[int]) -> Results:
+    """Random triangles of four bodies; a scene of fewer than four nodes has none."""
+    offsets, sizes = offsets_of(scenes), [SIZES[s] if SIZES[s] > 3 else 0 for s in scenes]
+    body = torch.cat([torch.arange(SIZES[s]) % 4 for s in scenes])
+    surfaces = []
+    for s, start in zip(scenes, offsets.tolist(), strict=False):
+        g = torch.Generator().manual_seed(s)
+        surfaces.append(start + torch.randint(0, max(SIZES[s], 1), (SIZES[s] if SIZES[s] > 3 else 0, 3), generator=g))
+    surface_offsets = torch.tensor([0, *sizes]).cumsum(0)
+    motion = 0.1 * rows(scenes, 3, key=1)
+    out = proximity(rows(scenes, 3), motion, offsets, body, torch.cat(surfaces), surface_offsets, 0.3)
+    return [[x] for x in split(out, offsets)], []
+
+
+def breadth_first_results(scenes: Sequence[int]) -> Results:
+    tets, offsets = tets_of(scenes), offsets_of(scenes)
+    wanted = torch.cat([(torch.arange(SIZES[s]) % 7 > 0).long() for s in scenes])
+    rank = breadth_first(tets.elements, wanted)
+    parts = zip(split(rank, offsets), split(wanted, offsets), strict=True)
+    return [[torch.where(mine > 0, x - x[mine > 0].min(), -1)] if mine.any() else [x] for x, mine in parts], []
+
+
 def linear_results(scenes: Sequence[int]) -> Results:
     inputs = (rows(scenes, 48, key=1), rows(scenes, 35, key=2), shared(70, 48), shared(70))
     return by_rows(lambda x, residual, w, b: linear(x, w, b, "geglu", residual), inputs, 2, offsets_of(scenes))
@@ -290,6 +314,8 @@ OPS: dict[str, Callable[[Sequence[int]], Results]] = {
     "segment_sum": lambda scenes: segment_results(scenes, segment_sum),
     "segment_mean": lambda scenes: segment_results(scenes, segment_mean),
     "elastic_forces": elastic_results,
+    "proximity": proximity_results,
+    "breadth_first": breadth_first_results,
     "linear": linear_results,
     "mlp": mlp_results,
     "orthogonalized": orthogonalized_results,

@@ -10,11 +10,12 @@ from collections.abc import Callable
 from functools import cache
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.linalg import splu
+import torch
+from scipy.linalg.lapack import dpbtrf, dpbtrs
 
 from ast_sim.element_topology import LOCAL_EDGES, linear_elements
 from ast_sim.mechanics.elements.neo_hookean import cofactor, determinant
+from ast_sim.ops import breadth_first
 from ast_sim.scene import Scene
 
 RIGID = 1e-3  # prescribed nodes move as a rigid body if no node is farther off, as a share of the largest displacement
@@ -84,31 +85,62 @@ def rigid_motion(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def harmonic_extension(scene: Scene, held: np.ndarray, free: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """A function from the displacements [H, 3] of the held nodes of a body to those [F, 3] of its free nodes."""
+    """A function from the displacements [H, 3] of the held nodes of a body to those [F, 3] of its free nodes.
+
+    Nodes of an element are near each other in the order of the free nodes, so their matrix has a narrow band. Its
+    Cholesky factor takes a quarter of the time of a sparse LU factor that keeps as few numbers as it can.
+
+    Raises:
+        LinAlgError: an element is so flat that rounding makes the matrix indefinite.
+    """
     count = len(free)
-    stiffness = _stiffness(scene, np.concatenate([free, held]))
-    # Symmetric and positive definite: its transpose holds it by columns, no pivoting, an ordering for such matrices.
-    inner, symmetric = stiffness[:count, :count].T, {"SymmetricMode": True}
-    solver = splu(inner, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
+    elements = linear_elements(scene.elements).astype(np.int64)
+    wanted = np.zeros(scene.num_nodes, np.int64)
+    wanted[free] = 1
+    number = breadth_first(torch.from_numpy(elements), torch.from_numpy(wanted)).numpy()
+    place = number[free]
+    number[held] = count + np.arange(len(held))
+    one, other, integrals = _integrals(scene.rest_position, elements, number)
+    low, high = np.minimum(one, other), np.maximum(one, other)
+    diagonal = np.bincount(np.concatenate([low, high]), np.tile(-integrals, 2), minlength=count)[:count]
+    inner, outer = high < count, (low < count) & (high >= count)
+    width = 1 + int((high - low)[inner].max(initial=0))
+    places = (low * width + high - low)[inner]
+    band = np.bincount(places, integrals[inner], minlength=count * width).reshape(count, width)
+    band[:, 0] = diagonal + LOOSE * diagonal.max(initial=np.finfo(float).tiny)
+    factor, failed = dpbtrf(band.T, lower=1, overwrite_ab=1)
+    if failed:
+        raise np.linalg.LinAlgError("the matrix of the harmonic extension is not positive definite")
+    pulled, pulling, strength = low[outer], high[outer] - count, integrals[outer]
 
     def extend(way: np.ndarray) -> np.ndarray:
-        pull = stiffness @ np.concatenate([np.zeros((count, 3)), way])
-        return solver.solve(-pull[:count])
+        pull = [np.bincount(pulled, strength * component[pulling], minlength=count) for component in way.T]
+        return dpbtrs(factor, -np.stack(pull).T, lower=1, overwrite_b=1)[0][place]
 
     return extend
 
 
-def _stiffness(scene: Scene, nodes: np.ndarray) -> csr_array:
-    """[n, n]: the integrals of grad N_a . grad N_b over the mesh at rest for `nodes` [n] with linear shape functions N.
+def _integrals(rest: np.ndarray, elements: np.ndarray, number: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The integrals of grad N_a . grad N_b over each of the elements [E, k] with linear shape functions N, at rest.
 
     Let o_a be the side opposite to node a of an element, as a vector: the edge of a triangle, or of a tetrahedron the
     normal of the face, as long as twice its area. All of them are taken in one sense, so they add up to 0. Then the
-    integral over the element is o_a . o_b / (4 area), or o_a . o_b / (36 volume). Rows add up to 0, too.
+    integral over the element is o_a . o_b / (4 area), or o_a . o_b / (36 volume). The rows of their matrix add up to 0,
+    too. An element without a size pulls nothing. Nodes that no element joins to a held one are pulled by nothing,
+    either; what `LOOSE` adds to the diagonal lets them stay.
 
-    Nodes that no element joins to a held one are pulled by nothing. What `LOOSE` adds to the diagonal lets them stay.
+    Args:
+        rest: [N, 3].
+        number: [N], what stands for a node, or -1: it does not count.
+
+    Returns:
+        The numbers of a and b, and the integrals, for each edge of each element.
     """
-    elements = linear_elements(scene.elements).T  # [k, E]
-    corners = scene.rest_position.astype(np.float64)[elements].swapaxes(1, 2)  # [k, 3, E]
+    elements = elements.T  # [k, E]
+    number = number[elements]
+    counted = number.max(axis=0) >= 0
+    elements, number = elements[:, counted], number[:, counted]
+    corners = rest.astype(np.float64)[elements].swapaxes(1, 2)  # [k, 3, E]
     sides = corners[1:] - corners[:1]
     if len(elements) == 3:
         opposite = np.roll(corners, 1, axis=0) - np.roll(corners, -1, axis=0)
@@ -117,25 +149,8 @@ def _stiffness(scene: Scene, nodes: np.ndarray) -> csr_array:
         normals = cofactor(sides)
         opposite = np.concatenate([-normals.sum(axis=0, keepdims=True), normals])
         size = 6 * np.abs(determinant(sides, normals))
-    count = len(nodes)
-    number = np.full(scene.num_nodes, -1)
-    number[nodes] = np.arange(count)
     ends = np.array(LOCAL_EDGES[len(elements)]).T
-    one, other = number[elements[ends]]  # [2, edges, E]
+    one, other = number[ends]  # [2, edges, E]
+    integrals = np.einsum("pie,pie->pe", *opposite[ends]) / np.where(size > 0, size, np.inf)
     among = (one >= 0) & (other >= 0)
-    integrals = (np.einsum("pie,pie->pe", *opposite[ends]) / size)[among]
-    # One sort brings the elements at an edge together; another one puts both places of an edge, and the diagonal, in
-    # the order of a matrix by rows.
-    keys = (np.minimum(one, other) * count + np.maximum(one, other))[among]
-    order = np.argsort(keys)
-    keys = keys[order]
-    first = np.flatnonzero(np.diff(keys, prepend=-1))
-    of_edges = np.add.reduceat(integrals[order], first) if len(first) else integrals
-    low, high = np.divmod(keys[first], count)
-    diagonal = np.bincount(np.concatenate([low, high]), np.tile(-of_edges, 2), minlength=count)
-    diagonal += LOOSE * diagonal.max(initial=np.finfo(float).tiny)
-    keys = np.concatenate([keys[first], high * count + low, np.arange(count) * (count + 1)])
-    order = np.argsort(keys)
-    rows, columns = np.divmod(keys[order], count)
-    values = np.concatenate([of_edges, of_edges, diagonal])[order]
-    return csr_array((values, columns, np.searchsorted(rows, np.arange(count + 1))), shape=(count, count))
+    return one[among], other[among], integrals[among]

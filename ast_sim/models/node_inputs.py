@@ -56,8 +56,9 @@ def with_proximity(config: ModelConfig, batch: Batch) -> Batch:
 def _proximity(batch: Batch, radius: float) -> Tensor:
     """[N, 5]: `proximity` with the prescribed nodes at their next positions and the others at their current ones. So
     it tells whether contact begins in the next frame."""
-    graph, ahead = batch.graph, batch.position.double() + batch.boundary_motion.double()
-    return proximity(ahead, graph.node_offsets, graph.body, graph.surface, graph.surface_offsets, radius)
+    graph, motion = batch.graph, batch.boundary_motion
+    offsets, surface_offsets = graph.node_offsets, graph.surface_offsets
+    return proximity(batch.position, motion, offsets, graph.body, graph.surface, surface_offsets, radius)
 
 
 def element_features(config: ModelConfig, batch: Batch) -> Tensor:

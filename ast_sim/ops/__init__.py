@@ -3,6 +3,7 @@
 from ast_sim.ops._attention import attention, attention_block, cross_attention, rotated, self_attention
 from ast_sim.ops._body_distance import WIDTH as PROXIMITY_WIDTH
 from ast_sim.ops._body_distance import proximity
+from ast_sim.ops._breadth_first import breadth_first
 from ast_sim.ops._edges import EdgeSet, join_indices, join_offsets, offsets_of
 from ast_sim.ops._elastic_forces import TetrahedronSet, elastic_forces
 from ast_sim.ops._fps import farthest_point_sample
@@ -21,6 +22,7 @@ __all__ = [
     "TetrahedronSet",
     "attention",
     "attention_block",
+    "breadth_first",
     "cross_attention",
     "elastic_forces",
     "farthest_point_sample",

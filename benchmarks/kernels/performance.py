@@ -23,6 +23,7 @@ FAMILIES = {
     "Octree": ("octree",),
     "Sums over segments": ("segment", "column_sum"),
     "Elastic forces": ("elastic_forces",),
+    "Distance to other bodies": ("proximity",),
 }
 INTRODUCTION = """# How fast it is
 

@@ -158,6 +158,51 @@ static ast_elastic new_elastic(int64_t E, float scale) {
 #define ELASTIC_BUFFERS(s) \
   (s)->elements, (s)->node_order, (s)->node_offsets, (s)->position, (s)->rest_position, (s)->lame
 
+/* ---- surfaces of bodies ---- */
+
+/* B scenes of `bodies` balls each, of R rings of R + 2 nodes and two poles, with dents: they touch and overlap. The last
+ * node of each scene belongs to no triangle, and the first scene is empty. */
+static ast_proximity new_balls(int64_t B, int64_t bodies, int64_t R, float scale, double radius) {
+  const int64_t S = R + 2, per_ball = R * S + 2, faces = 2 * R * S, scenes = B ? B - 1 : 0;
+  const int64_t N = scenes * (bodies * per_ball + 1), F = scenes * bodies * faces;
+  int64_t *offsets = new_ints(B + 1), *surface_offsets = new_ints(B + 1), *body = new_ints(N),
+          *surface = new_ints(3 * F);
+  float *position = new_floats(3 * N), *motion = random_floats(3 * N);
+  int64_t n = 0, f = 0;
+  offsets[0] = surface_offsets[0] = 0;
+  for (int64_t b = 0; b < B; b++) {
+    for (int64_t k = 0; b && k < bodies; k++) {
+      const double center[3] = {random_unit(), random_unit(), random_unit()};
+      const int64_t first = n, south = n + per_ball - 2, north = south + 1;
+      for (int64_t i = 0; i < per_ball; i++, n++) {
+        const double height = i < R * S ? M_PI * (double)(i / S + 1) / (double)(R + 1) : i == per_ball - 1 ? 0 : M_PI;
+        const double turn = 2 * M_PI * (double)(i % S) / (double)S, size = 0.4 + 0.1 * random_unit();
+        const double way[3] = {sin(height) * cos(turn), sin(height) * sin(turn), cos(height)};
+        for (int a = 0; a < 3; a++) position[3 * n + a] = scale * (float)(center[a] + size * way[a]);
+        body[n] = 5 - 2 * k;
+      }
+      for (int64_t i = 0; i < faces; i++, f++) { /* two around each node of a ring: to the ring after, or the poles */
+        const int64_t ring = i / 2 / S, at = i / 2 % S, next = (at + 1) % S, here = first + ring * S, after = here + S;
+        const bool last = ring == R - 1;
+        const int64_t down[3] = {here + at, last ? south : after + at, here + next};
+        const int64_t up[3] = {here + next, last ? first + next : after + at, last ? first + at : after + next};
+        for (int a = 0; a < 3; a++) surface[3 * f + a] = i % 2 == 0 ? down[a] : last && a == 0 ? north : up[a];
+        if (i % 2 && last) surface[3 * f + 1] = first + at, surface[3 * f + 2] = first + next;
+      }
+    }
+    if (b) {
+      body[n] = 100;
+      for (int a = 0; a < 3; a++) position[3 * n + a] = scale * random_float();
+      n++;
+    }
+    offsets[b + 1] = n, surface_offsets[b + 1] = f;
+  }
+  for (int64_t i = 0; i < 3 * N; i++) motion[i] *= 0.01f * scale;
+  return (ast_proximity){B, N, F, position, motion, offsets, surface_offsets, body, surface, radius * (double)scale};
+}
+
+#define PROXIMITY_BUFFERS(s) (s)->position, (s)->motion, (s)->offsets, (s)->surface_offsets, (s)->body, (s)->surface
+
 /* ---- attention blocks ---- */
 
 /* Q vectors that attend to K others in scenes of the given offsets, which it takes. `floats` makes the numbers. */

@@ -308,6 +308,20 @@ static outcome elastic_forces_backward(const ast_kernels *kernels) {
   return FINISH(KERNEL(kernels->elastic_forces_backward(&s, dforce, dposition)), dposition);
 }
 
+static outcome proximity(const ast_kernels *kernels) {
+  const ast_proximity s = new_balls(3, 3, 12, 1, 0.2);
+  float *out = new_floats(5 * s.N);
+  return FINISH(KERNEL(kernels->proximity(&s, out)), out);
+}
+
+static outcome breadth_first(const ast_kernels *kernels) {
+  const ast_elastic s = new_elastic(3000, 1);
+  int64_t *wanted = new_ints(s.N), *rank = new_ints(s.N);
+  for (int64_t n = 0; n < s.N; n++) wanted[n] = n % 7 > 0;
+  const ast_status status = KERNEL(kernels->breadth_first(s.elements, s.E, 4, wanted, s.N, rank));
+  return FINISH(status, rank);
+}
+
 static outcome column_sum(const ast_kernels *kernels) {
   enum { N = 9000, F = 70 };
   float *x = random_floats(N * F), *out = new_floats(F);
@@ -345,6 +359,8 @@ static const struct {
     {"mlp_backward", mlp_backward},
     {"elastic_forces", elastic_forces},
     {"elastic_forces_backward", elastic_forces_backward},
+    {"proximity", proximity},
+    {"breadth_first", breadth_first},
     {"column_sum", column_sum},
 };
 

@@ -106,6 +106,16 @@ def test_nodes_of_no_element_stay():
     np.testing.assert_allclose(found[:-2], Carrier(scene)(rest[:-2], pulled[:-2]), rtol=0, atol=1e-7)
 
 
+def test_an_element_without_a_volume_pulls_nothing():
+    scene = bar()
+    free = np.flatnonzero(~scene.prescribed)
+    flat = np.append(scene.elements, np.int32([[free[0], free[1], free[2], free[0]]]), axis=0)
+    rest = scene.rest_position
+    pulled = rest + np.where(rest[:, :1] == 4, [1.0, 0.0, 0.5], 0.0).astype(np.float32)
+    found = Carrier(replace(scene, elements=flat))(rest, pulled)
+    np.testing.assert_allclose(found, Carrier(scene)(rest, pulled), rtol=0, atol=1e-6)
+
+
 def test_a_sheet_is_stretched_evenly():
     x, y = np.meshgrid(np.arange(5.0), np.arange(3.0), indexing="ij")
     points = np.stack([x.ravel(), y.ravel(), np.zeros(15)], axis=1).astype(np.float32)

@@ -374,7 +374,8 @@ def test_octree_has_no_tangent():
 
 def proximity_of(x: Tensor) -> Tensor:
     offsets, surface_offsets = torch.tensor([0, 4]), torch.tensor([0, 1])
-    return proximity(x, offsets, torch.tensor([0, 0, 0, 1]), torch.tensor([[0, 1, 2]]), surface_offsets, 1.0)
+    body, surface = torch.tensor([0, 0, 0, 1]), torch.tensor([[0, 1, 2]])
+    return proximity(x, torch.zeros_like(x), offsets, body, surface, surface_offsets, 1.0)
 
 
 def test_proximity_refuses_derivatives():

@@ -13,7 +13,8 @@ from ast_sim.batches.graph import Graph
 from ast_sim.batches.mirror_and_shift import Placement
 from ast_sim.models.node_inputs import _proximity as near
 from ast_sim.models.node_inputs import node_features, normalizer_of, with_proximity
-from ast_sim.ops._body_distance import FINE, signed_gap
+from ast_sim.ops import proximity
+from ast_sim.ops._body_distance import FINE, _proximity, signed_gap
 from ast_sim.scene import Scene
 from ast_sim.training.asked_settings import configure
 from ast_sim.training.start import start_training
@@ -27,57 +28,112 @@ def surface_of(cells, size) -> tuple[np.ndarray, np.ndarray]:
     return nodes, scene.surface()
 
 
+def gap_of_kernel(points: np.ndarray, nodes: np.ndarray, triangles: np.ndarray, radius: float):
+    """What `signed_gap` returns, from the columns of the kernel; the points are a body without triangles."""
+    position = torch.from_numpy(np.concatenate([nodes, points]).astype(np.float32))
+    body = (torch.arange(len(position)) >= len(nodes)).long()
+    ends = [torch.tensor([0, n]) for n in (len(position), len(triangles))]
+    surface = torch.from_numpy(triangles.astype(np.int64))
+    columns = proximity(position, torch.zeros_like(position), ends[0], body, surface, ends[1], radius)
+    columns = columns[len(nodes) :].double().numpy()
+    gap = columns[:, 3] * radius
+    return gap, columns[:, :3] / np.where(np.abs(gap) < radius, 1 - np.abs(gap) / radius, 1)[:, None]
+
+
+both_bodies = pytest.mark.parametrize(("gap_of", "close"), [(signed_gap, 1e-12), (gap_of_kernel, 2e-6)])
+
+
+def single(*shape: int, seed: int) -> np.ndarray:
+    """Numbers from -1 to 1 that float32 has, as float64."""
+    return np.random.default_rng(seed).uniform(-1, 1, shape).astype(np.float32).astype(np.float64)
+
+
 def gap_to_box(points: np.ndarray, half: np.ndarray) -> np.ndarray:
     """The signed distance from a box around the origin, in closed form."""
     q = np.abs(points) - half
     return np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0)
 
 
+@both_bodies
 @pytest.mark.parametrize("cells", [(1, 1, 1), (4, 2, 3)])
-def test_the_gap_to_a_box_is_that_of_the_closed_form(cells):
-    half = np.array([0.5, 0.3, 0.2])
-    points = np.random.default_rng(0).uniform(-1, 1, (4000, 3))
-    gap, normal = signed_gap(points, *surface_of(cells, 2 * half), radius=10.0)
-    np.testing.assert_allclose(gap, gap_to_box(points, half), atol=1e-12)
+def test_the_gap_to_a_box_is_that_of_the_closed_form(cells, gap_of, close):
+    half = np.array([0.5, 0.25, 0.125])
+    points = single(4000, 3, seed=0)
+    gap, normal = gap_of(points, *surface_of(cells, 2 * half), radius=10.0)
+    np.testing.assert_allclose(gap, gap_to_box(points, half), atol=close)
     assert (gap < 0).sum() > 50
-    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=close)
     step = 1e-6  # the normal is the gradient of the gap
     risen = gap_to_box(points + step * normal, half)
-    np.testing.assert_allclose((risen - gap) / step, 1, atol=1e-5)
+    np.testing.assert_allclose((risen - gap_to_box(points, half)) / step, 1, atol=1e-5)
 
 
-def test_within_the_radius_alone():
-    half = np.array([0.5, 0.3, 0.2])
-    points = np.random.default_rng(1).uniform(-1, 1, (2000, 3))
+@both_bodies
+def test_within_the_radius_alone(gap_of, close):
+    half = np.array([0.5, 0.25, 0.125])
+    points = single(2000, 3, seed=1)
     exact = gap_to_box(points, half)
-    gap, normal = signed_gap(points, *surface_of((3, 2, 1), 2 * half), radius=0.15)
+    gap, normal = gap_of(points, *surface_of((3, 2, 1), 2 * half), radius=0.15)
     near = np.abs(exact) < 0.15
-    np.testing.assert_allclose(gap[near], exact[near], atol=1e-12)
+    np.testing.assert_allclose(gap[near], exact[near], atol=close)
     assert (gap[~near] == 0.15).all() and not normal[~near].any() and 100 < near.sum() < 1900
 
 
-def test_flat_triangles_of_a_surface_do_no_harm():
+@both_bodies
+def test_flat_triangles_of_a_surface_do_no_harm(gap_of, close):
     """A box whose faces are cut by nodes on an edge: triangles of no area."""
-    half = np.array([0.5, 0.3, 0.2])
+    half = np.array([0.5, 0.25, 0.125])
     nodes, triangles = surface_of((2, 2, 2), 2 * half)
     a, b, c = triangles[0]
     middle = len(nodes)
     nodes = np.vstack([nodes, (nodes[a] + nodes[b]) / 2])
     triangles = np.vstack([triangles, [[a, middle, b]]])
-    points = np.random.default_rng(3).uniform(-1, 1, (4000, 3))
-    gap, normal = signed_gap(points, nodes, triangles, radius=10.0)
-    np.testing.assert_allclose(gap, gap_to_box(points, half), atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=1e-12)
+    points = single(4000, 3, seed=3)
+    gap, normal = gap_of(points, nodes, triangles, radius=10.0)
+    np.testing.assert_allclose(gap, gap_to_box(points, half), atol=close)
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=close)
 
 
-def test_points_on_the_surface_have_its_normal():
-    half = np.array([0.5, 0.3, 0.2])
+@both_bodies
+def test_points_on_the_surface_have_its_normal(gap_of, close):
+    half = np.array([0.5, 0.25, 0.125])
     nodes, triangles = surface_of((2, 2, 2), 2 * half)
     corners = nodes[triangles]
-    gap, normal = signed_gap(corners.mean(axis=1), nodes, triangles, radius=1.0)
+    inside = (2 * corners[:, 0] + corners[:, 1] + corners[:, 2]) / 4  # exact in float32
+    gap, normal = gap_of(inside, nodes, triangles, radius=1.0)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     np.testing.assert_allclose(gap, 0, atol=1e-15)
     np.testing.assert_allclose(normal, cross / np.linalg.norm(cross, axis=1, keepdims=True), atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])
+def test_the_kernel_is_the_composition(scale):
+    """Bodies that overlap, and points that a hundred triangles are about as near to."""
+    generator = np.random.default_rng(4)
+    nodes, triangles = surface_of((3, 4, 2), np.array([0.5, 0.4, 0.3]))
+    parts = [nodes + generator.uniform(-0.3, 0.3, 3) for _ in range(6)]
+    position = scale * torch.from_numpy(np.concatenate(parts)).float()
+    body = torch.arange(3).repeat_interleave(len(nodes)).repeat(2)
+    surface = torch.cat([torch.from_numpy(triangles.astype(np.int64)) + part * len(nodes) for part in range(6)])
+    motion = 0.01 * scale * torch.randn(position.shape, generator=torch.Generator().manual_seed(5))
+    ends = [torch.tensor([0, 3, 6]) * n for n in (len(nodes), len(triangles))]
+    arguments = (position, motion, ends[0], body, surface, ends[1], 0.2 * scale)
+    ours, composed = proximity(*arguments), _proximity.composition(*arguments)
+    assert ours.dtype == composed.dtype == torch.float32
+    torch.testing.assert_close(ours, composed, atol=2e-7, rtol=0)
+    assert (ours[:, 3] < 0).sum() > 20 and ((ours[:, 3] > 0) & (ours[:, 3] < 1)).sum() > 50
+
+
+def test_a_radius_or_a_place_that_is_not_finite_is_refused():
+    position, motion = torch.zeros(4, 3), torch.zeros(4, 3)
+    ends = torch.tensor([0, 4]), torch.tensor([0, 1])
+    rest = (ends[0], torch.tensor([0, 0, 0, 1]), torch.tensor([[0, 1, 2]]), ends[1])
+    for radius in (0.0, -1.0, np.inf, np.nan):
+        with pytest.raises(ValueError, match=f"proximity: radius must be positive and finite, not {radius}"):
+            proximity(position, motion, *rest, radius)
+    motion[2, 1] = np.nan
+    with pytest.raises(ValueError, match=r"proximity: node 2 moves to \(0, nan, 0\), which is not finite"):
+        proximity(position, motion, *rest, 1.0)
 
 
 def batch_of(*seeds: int, down: float = 0.005) -> Batch:
