@@ -10,8 +10,10 @@ from collections.abc import Callable
 from functools import cache
 
 import numpy as np
+import scipy.sparse
 import torch
 from scipy.linalg.lapack import dpbtrf, dpbtrs
+from scipy.sparse.linalg import splu
 
 from ast_sim.element_topology import LOCAL_EDGES, linear_elements
 from ast_sim.mechanics.elements.neo_hookean import cofactor, determinant
@@ -20,6 +22,7 @@ from ast_sim.scene import Scene
 
 RIGID = 1e-3  # prescribed nodes move as a rigid body if no node is farther off, as a share of the largest displacement
 LOOSE = 1e-13  # is added to the diagonal, as a share of the largest entry: far below the rounding of positions
+LARGEST_BAND = 50_000_000  # numbers, of 8 bytes
 PLANAR = 1e-6  # points lie on a line if their second extent, as a share of the first, is below this
 
 
@@ -88,10 +91,8 @@ def harmonic_extension(scene: Scene, held: np.ndarray, free: np.ndarray) -> Call
     """A function from the displacements [H, 3] of the held nodes of a body to those [F, 3] of its free nodes.
 
     Nodes of an element are near each other in the order of the free nodes, so their matrix has a narrow band. Its
-    Cholesky factor takes a quarter of the time of a sparse LU factor that keeps as few numbers as it can.
-
-    Raises:
-        LinAlgError: an element is so flat that rounding makes the matrix indefinite.
+    Cholesky factor takes a quarter of the time of a sparse LU factor. The LU factor keeps fewer numbers; it is taken
+    where the band would hold more than `LARGEST_BAND`, or where rounding makes the matrix of flat elements indefinite.
     """
     count = len(free)
     elements = linear_elements(scene.elements).astype(np.int64)
@@ -105,19 +106,42 @@ def harmonic_extension(scene: Scene, held: np.ndarray, free: np.ndarray) -> Call
     diagonal = np.bincount(np.concatenate([low, high]), np.tile(-integrals, 2), minlength=count)[:count]
     inner, outer = high < count, (low < count) & (high >= count)
     width = 1 + int((high - low)[inner].max(initial=0))
-    places = (low * width + high - low)[inner]
-    band = np.bincount(places, integrals[inner], minlength=count * width).reshape(count, width)
-    band[:, 0] = diagonal + LOOSE * diagonal.max(initial=np.finfo(float).tiny)
-    factor, failed = dpbtrf(band.T, lower=1, overwrite_ab=1)
-    if failed:
-        raise np.linalg.LinAlgError("the matrix of the harmonic extension is not positive definite")
+    diagonal += LOOSE * diagonal.max(initial=np.finfo(float).tiny)
+    upper = low[inner], high[inner], integrals[inner]
+    solve = _solver_of_band(diagonal, *upper, width) if count * width <= LARGEST_BAND else None
+    solve = solve or _solver_of_sparse(diagonal, *upper)
     pulled, pulling, strength = low[outer], high[outer] - count, integrals[outer]
 
     def extend(way: np.ndarray) -> np.ndarray:
         pull = [np.bincount(pulled, strength * component[pulling], minlength=count) for component in way.T]
-        return dpbtrs(factor, -np.stack(pull).T, lower=1, overwrite_b=1)[0][place]
+        return solve(-np.stack(pull).T)[place]
 
     return extend
+
+
+def _solver_of_band(
+    diagonal: np.ndarray, low: np.ndarray, high: np.ndarray, values: np.ndarray, width: int
+) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Solves with a symmetric matrix of so many diagonals; None if it is not positive definite.
+
+    Args:
+        diagonal: [F].
+        low, high, values: [M], row, column and value of entries above the diagonal, which add up.
+    """
+    count = len(diagonal)
+    band = np.bincount(low * width + high - low, values, minlength=count * width).reshape(count, width)
+    band[:, 0] = diagonal
+    factor, failed = dpbtrf(band.T, lower=1, overwrite_ab=1)
+    return None if failed else lambda right: dpbtrs(factor, right, lower=1)[0]
+
+
+def _solver_of_sparse(
+    diagonal: np.ndarray, low: np.ndarray, high: np.ndarray, values: np.ndarray
+) -> Callable[[np.ndarray], np.ndarray]:
+    """The same by a sparse factor."""
+    upper = scipy.sparse.csc_array((values, (low, high)), shape=(len(diagonal), len(diagonal)))
+    whole = (upper + upper.T + scipy.sparse.diags_array(diagonal)).tocsc()
+    return splu(whole, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}).solve
 
 
 def _integrals(rest: np.ndarray, elements: np.ndarray, number: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-DAMPING = 0.8  # of the slope, beyond the longest trial
+DAMPING = 0.9  # of the slope, beyond the longest trial
 SPREAD = 0.25  # the interval reaches so far around the expected error, relative to it
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from data_samples import block
 
+from ast_sim.batches import carry
 from ast_sim.batches.carry import Carrier, rigid_motion
 from ast_sim.scene import NodeType, Scene
 
@@ -139,3 +140,17 @@ def test_points_on_a_line_that_turn_do_not_say_how():
 def test_a_mirror_image_is_no_rigid_motion():
     points = np.random.default_rng(0).standard_normal((5, 3))
     assert rigid_motion(points, points * [1, 1, -1]) is None
+
+
+def test_a_wide_band_and_an_indefinite_matrix_are_solved_by_a_sparse_factor(monkeypatch):
+    scene = bar()
+    held, free = np.flatnonzero(scene.prescribed), np.flatnonzero(~scene.prescribed)
+    way = np.random.default_rng(0).normal(size=(len(held), 3))
+    by_band = carry.harmonic_extension(scene, held, free)(way)
+    with monkeypatch.context() as patched:
+        patched.setattr(carry, "LARGEST_BAND", 0)
+        patched.setattr(carry, "_solver_of_band", lambda *_: pytest.fail("the band is too wide"))
+        by_sparse = carry.harmonic_extension(scene, held, free)(way)
+    np.testing.assert_allclose(by_sparse, by_band, rtol=0, atol=1e-9)
+    monkeypatch.setattr(carry, "_solver_of_band", lambda *_: None)
+    np.testing.assert_allclose(carry.harmonic_extension(scene, held, free)(way), by_band, rtol=0, atol=1e-9)

@@ -21,7 +21,7 @@ def one_thread(monkeypatch):
 def test_a_row_from_end_to_end(tmp_path, monkeypatch, one_thread):
     made = {"train": 4, "valid": 1, "test": 0, "nodes": 80, "frames": 5, "keep": (2, 3), "seed": 1}
     few = {"train.batch_size": 2, "train.statistics_pairs": 4, "model.num_tokens": 16}
-    monkeypatch.setattr(forecasts, "ROWS", {"few": forecasts.Row("Few plates", "deforming_plate", made, 3, few)})
+    monkeypatch.setattr(forecasts, "ROWS", {"few": forecasts.Row("Few plates", "few", "deforming_plate", made, 3, few)})
     monkeypatch.setattr(forecasts, "RESULTS", tmp_path / "results" / "forecasts.json")
     monkeypatch.setattr(forecasts, "PAGE", tmp_path / "forecasts.md")
     forecasts.main(["few", "--folder", str(tmp_path)])
