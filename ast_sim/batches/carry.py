@@ -102,7 +102,8 @@ def harmonic_extension(scene: Scene, held: np.ndarray, free: np.ndarray) -> Call
     place = number[free]
     number[held] = count + np.arange(len(held))
     one, other, integrals = _integrals(scene.rest_position, elements, number)
-    low, high = np.minimum(one, other), np.maximum(one, other)
+    low = np.minimum(one, other)
+    high = np.maximum(one, other)
     diagonal = np.bincount(np.concatenate([low, high]), np.tile(-integrals, 2), minlength=count)[:count]
     inner, outer = high < count, (low < count) & (high >= count)
     width = 1 + int((high - low)[inner].max(initial=0))

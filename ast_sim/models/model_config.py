@@ -111,7 +111,7 @@ class ModelConfig:
     def history(self) -> tuple[Output, ...] | None:
         """What a jump knows of the frame in which the motion turned back last: the outputs but the reactions, which
         follow from the others; None: all jumps start from the first frame."""
-        if "history" not in self.node_inputs:
+        if "history" not in (self.node_inputs or ()):
             return None
         return tuple(output for output in self.data.outputs if output.name != REACTION)
 

@@ -3,8 +3,7 @@
 from ast_sim.ops._attention import attention, attention_block, cross_attention, rotated, self_attention
 from ast_sim.ops._body_distance import WIDTH as PROXIMITY_WIDTH
 from ast_sim.ops._body_distance import proximity
-from ast_sim.ops._breadth_first import breadth_first
-from ast_sim.ops._edges import EdgeSet, join_indices, join_offsets, offsets_of
+from ast_sim.ops._edges import EdgeSet, breadth_first, join_indices, join_offsets, offsets_of
 from ast_sim.ops._elastic_forces import TetrahedronSet, elastic_forces
 from ast_sim.ops._fps import farthest_point_sample
 from ast_sim.ops._linear import linear

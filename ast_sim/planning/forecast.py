@@ -17,7 +17,7 @@ SPREAD = 0.25  # the interval reaches so far around the expected error, relative
 
 
 class Forecast(NamedTuple):
-    """An expected error, and an interval that four of five trainings ended in."""
+    """An expected error and an interval around it; two of four trainings that were checked ended in theirs."""
 
     error: float
     low: float

@@ -8,7 +8,7 @@ import toy
 from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import Answer, Dataset, DatasetInfo, DatasetWriter, Effort, Material, Run, example_run, generate, train
-from ast_sim.batches.out_of_balance import Elasticity
+from ast_sim.batches.out_of_balance import ElasticTetrahedra
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.reaction import Reaction
 from ast_sim.support.errors import ConfigError, DatasetError, SimulationError
@@ -41,8 +41,8 @@ def test_columns_of_another_meaning_are_no_moduli(tmp_path, names):
     with pytest.raises(ConfigError, match=f"newton_steps is 1, but {message}"):
         run.predict(answer.scene, {1: (0, 0, -0.01)}, effort=Effort(0, 1))
     assert "reaction" not in answer.figures()[-1] and run.settings.model.data.columns == tuple(known.split(", "))
-    same = Elasticity.of(answer.scene, Material()).lame  # all elements have one stiffness
-    assert np.array_equal(Elasticity.of(answer.scene, run.settings.model.data.material).lame, same)
+    same = ElasticTetrahedra.of(answer.scene, Material()).lame  # all elements have one stiffness
+    assert np.array_equal(ElasticTetrahedra.of(answer.scene, run.settings.model.data.material).lame, same)
 
 
 def test_own_data_have_a_reaction_in_any_order_of_the_columns(tmp_path):

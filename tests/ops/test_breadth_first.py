@@ -7,7 +7,7 @@ from checks import assert_same_everywhere
 from meshes import box
 
 from ast_sim.ops import breadth_first
-from ast_sim.ops._breadth_first import _breadth_first
+from ast_sim.ops._edges import _breadth_first
 
 
 def test_values_by_hand():

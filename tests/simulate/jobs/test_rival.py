@@ -47,8 +47,9 @@ def changed(plates, path, generator=None, **changes):
 
 
 def test_every_way_is_solved_and_compared_with_the_dataset(plates, no_torch, capsys):
-    found = list(rivals(plates, "train", [0, 1], repeats=2))
-    assert "2 of 2 scenes" in capsys.readouterr().err
+    told = []
+    found = list(rivals(plates, "train", [0, 1], repeats=2, progress=lambda *values: told.append(values)))
+    assert [values[:2] for values in told] == [(1, 2), (2, 2)] and capsys.readouterr().err == ""
     assert [(scene.split, scene.index) for scene in found] == [("train", 0), ("train", 1)]
     with Dataset(plates) as data:
         for scene in found:
