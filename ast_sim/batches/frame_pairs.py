@@ -15,6 +15,12 @@ from ast_sim.ops import join_indices
 from ast_sim.support.errors import DatasetError
 
 
+def target_counts(dataset: Dataset, split: str) -> list[int]:
+    """How many frames of each trajectory of a split can be predicted: all but those that are given."""
+    given = GIVEN_FRAMES[dataset.info.integration]
+    return [max(0, dataset.num_frames(split, index) - given) for index in range(dataset.count(split))]
+
+
 class FramePairs(TorchDataset[dict[str, Tensor]]):
     """Each frame of a split that can be predicted, with the frame before it: a map-style dataset of torch, whose items
     are tensors by name. `dataset.torch("train")` makes it.
@@ -42,8 +48,7 @@ class FramePairs(TorchDataset[dict[str, Tensor]]):
         self._dataset = dataset
         self._split = split
         self._given = GIVEN_FRAMES[dataset.info.integration]
-        counts = [max(0, dataset.num_frames(split, index) - self._given) for index in range(dataset.count(split))]
-        self._starts = np.cumsum([0, *counts])
+        self._starts = np.cumsum([0, *target_counts(dataset, split)])
         if not len(self):
             raise DatasetError(f"{dataset.path}: no trajectory of {split} has {self._given + 1} frames")
 

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ast_sim.batches.frame_pairs import target_counts
 from ast_sim.dataset.reader import Dataset
 from ast_sim.planning.forecast import Forecast, forecast
-from ast_sim.planning.trials import GROWTH, LONGEST, MINUTES, Trial, Trials, candidates, trials_of
+from ast_sim.planning.trials import GROWTH, LONGEST, MINUTES, Trial, Trials, candidates, round_sizes
 from ast_sim.runs.config_toml import write_settings
 from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.disk import write_json
@@ -22,11 +23,9 @@ from ast_sim.support.progress import Progress, ShowProgress, duration
 from ast_sim.support.provenance import provenance
 from ast_sim.support.toml_settings import require_range
 from ast_sim.training.asked_settings import changes_of, configure, differences, path_of
-from ast_sim.training.data_lengths import pairs_of
 from ast_sim.training.parallel.launch import usual_processes
 
 SETTINGS, FIGURES = "best.toml", "plan.json"
-SHARE = 28 / 9 * LONGEST  # of the minutes, for all trials: 4 of a ninth, 2 of a third and 2 of the longest
 LEAST_SCENES = 4  # of the training split: a trial has half of them
 
 
@@ -128,8 +127,11 @@ def planned(
     trials = Trials(out, scenes, valid)
     tried = candidates(config, preset)
     made: list[Trial] = []
-    with Progress(trials_of(len(tried)) + 1, "trials", progress) as bar:
-        bar.line(f"the trials take about {duration(60 * minutes * SHARE)}")
+    sizes = round_sizes(len(tried))
+    # As many of the longest trial; one more of them has half of the scenes.
+    in_longest = 1 + sum(size / GROWTH**later for later, size in enumerate(reversed(sizes)))
+    with Progress(sum(sizes) + 1, "trials", progress) as bar:
+        bar.line(f"the trials take about {duration(60 * minutes * LONGEST * in_longest)}")
         for trial in trials.rounds(tried, trials.first_steps(tried, minutes)):
             made.append(trial)
             _tell(trial, bar)
@@ -188,7 +190,7 @@ def _counted(config: RunConfig) -> tuple[int, int, int]:
             raise ConfigError(f"{dataset.path} has {scenes} training scenes; a plan needs {LEAST_SCENES} or more")
         if valid == 0:
             raise ConfigError(f"{dataset.path} has no validation scenes, on which a plan judges its trials")
-        return scenes, valid, pairs_of(dataset, scenes)
+        return scenes, valid, sum(target_counts(dataset, "train")[:scenes])
 
 
 def _tell(trial: Trial, bar: Progress) -> None:

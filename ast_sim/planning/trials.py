@@ -66,12 +66,12 @@ def candidates(base: RunConfig, preset: str) -> dict[str, RunConfig]:
     return tried
 
 
-def trials_of(candidates: int) -> int:
-    """The number of trials in all rounds."""
-    counts = [candidates]
-    while len(counts) < ROUNDS:
-        counts.append(max(1, counts[-1] // 2))
-    return sum(counts)
+def round_sizes(candidates: int) -> list[int]:
+    """The number of trials in each round: the better half goes on."""
+    sizes = [candidates]
+    while len(sizes) < ROUNDS:
+        sizes.append(max(1, sizes[-1] // 2))
+    return sizes
 
 
 class Trials:
@@ -125,9 +125,12 @@ class Trials:
         Raises:
             ConfigError: the trials would be too short.
         """
-        seconds = {name: self.trained(name, config, TIMED).seconds for name, config in _of_one_cost(tried).items()}
+        seconds: dict[str, float] = {}
+        for name, config in tried.items():  # a learning rate does not matter
+            alike = next((other for other in seconds if tried[other].model == config.model), None)
+            seconds[name] = self.trained(name, config, TIMED).seconds if alike is None else seconds[alike]
         first = 60 * minutes * LONGEST / GROWTH ** (ROUNDS - 1)
-        steps = {name: int(first / seconds[_cost(name)]) for name in tried}
+        steps = {name: int(first / seconds[name]) for name in tried}
         if min(steps.values()) < LEAST:
             least = minutes * LEAST * max(seconds.values()) / first
             raise ConfigError(
@@ -142,20 +145,10 @@ class Trials:
         Args:
             steps: of each candidate in the first round.
         """
-        left = list(tried)
-        for number in range(ROUNDS):
+        order = list(tried)
+        for number, size in enumerate(round_sizes(len(tried))):
             made = []
-            for name in left:
+            for name in order[:size]:
                 made.append(self.trained(name, tried[name], steps[name] * GROWTH**number))
                 yield made[-1]
-            made.sort(key=lambda trial: trial.error)
-            left = [trial.name for trial in made[: max(1, len(made) // 2)]]
-
-
-def _cost(name: str) -> str:
-    """The candidate whose steps take as long: learning rates do not matter."""
-    return name.split(",")[0] + (", wider" if name.endswith(", wider") else "")
-
-
-def _of_one_cost(tried: dict[str, RunConfig]) -> dict[str, RunConfig]:
-    return {name: config for name, config in tried.items() if _cost(name) == name}
+            order = [trial.name for trial in sorted(made, key=lambda trial: trial.error)]

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ast_sim.dataset.layout import GIVEN_FRAMES
+from ast_sim.batches.frame_pairs import target_counts
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.evaluation.measures import SquaredError, rmse_pooled
 from ast_sim.models.data_facts import DataFacts
@@ -73,16 +73,10 @@ def measure(dataset: Dataset) -> DataScales:
         spacing=float(np.concatenate(lengths).mean(dtype=np.float64)),
         nodes=int(np.median(nodes)),
         trajectories=count,
-        pairs=pairs_of(dataset, count),
+        pairs=sum(target_counts(dataset, "train")),
         planar=planar,
         recorded=_alike(constants),
     )
-
-
-def pairs_of(dataset: Dataset, scenes: int) -> int:
-    """The number of frames that can be a target, in the first so many scenes of the training split."""
-    given = GIVEN_FRAMES[dataset.info.integration]  # these cannot be a target
-    return sum(max(0, dataset.num_frames("train", index) - given) for index in range(scenes))
 
 
 def _alike(constants: list[dict[str, AttributeValue | None]]) -> dict[str, float]:

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from pathlib import Path
 
+from ast_sim.batches.frame_pairs import target_counts
 from ast_sim.dataset.reader import Dataset
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.model_config import ModelConfig
@@ -13,7 +14,7 @@ from ast_sim.named_field import REACTION, STRESS
 from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.toml_settings import LARGEST, require_range
-from ast_sim.training.data_lengths import DataScales, pairs_of
+from ast_sim.training.data_lengths import DataScales
 
 # An unset shift is at most this share of the domain's half width; the margin of `Domain` is larger.
 LARGEST_SHIFT = 0.05
@@ -66,7 +67,7 @@ def _pairs_of_first(scenes: int, dataset: Dataset) -> int:
     count = dataset.count("train")
     if scenes > count:
         raise ConfigError(f"train.scenes is {scenes}, but {dataset.path} has {count} training scenes")
-    return pairs_of(dataset, scenes)
+    return sum(target_counts(dataset, "train")[:scenes])
 
 
 def _fields(dataset: Dataset, names: tuple[str, ...]) -> tuple[tuple[str, str, int, str], ...]:

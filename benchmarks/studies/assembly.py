@@ -8,9 +8,6 @@ second call goes on with what is there. Everything runs on one thread.
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
 import tempfile
 import time
 from collections.abc import Sequence
@@ -26,9 +23,9 @@ from ast_sim.inference.effort import Effort
 from ast_sim.inference.evaluation.asked_frame import asked_frames
 from ast_sim.inference.relative_errors import relative_error
 from ast_sim.simulate.jobs.rival import deepest_frame
-from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
 from benchmarks.studies.phrases import beside_solver, over_the_scenes, settings_tried, times_as_long
+from benchmarks.studies.rows import study_rows
 from benchmarks.studies.validation_curve import curve_line, minutes_per_step, validation_curve
 
 ROOT = Path(__file__).parents[2]
@@ -89,8 +86,9 @@ ROWS = {
 }
 
 
-def measured(name: str, row: Row, folder: Path) -> dict[str, Any]:
+def measured(name: str, folder: Path) -> dict[str, Any]:
     """Generate, train and measure a row; what is there already is not made again."""
+    row = ROWS[name]
     data = ast_sim.generate(
         "assembly", folder / f"{name}.h5", spec=row.spec, train=row.train, valid=row.valid, test=row.test,
         nodes=row.nodes, workers=1,
@@ -259,26 +257,11 @@ def _reaction(found: dict[str, Any], key: str) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("rows", nargs="*", metavar="ROW", help=f"of {', '.join(ROWS)} (default: all)")
-    default = Path("build/assembly")
-    parser.add_argument("--folder", type=Path, default=default, help=f"data and runs (default: {default})")
-    asked = parser.parse_args(arguments)
-    unknown = set(asked.rows) - set(ROWS)
-    if unknown:
-        parser.error(f"there is no row {', '.join(sorted(unknown))}")
-    import torch  # after ast_sim, which says how its threads wait
+    study_rows(__doc__, ROWS, arguments, measured, _said, (RESULTS, PAGE), page)
 
-    torch.set_num_threads(1)
-    os.environ["OMP_NUM_THREADS"] = "1"  # of the generator's and the solver's processes
-    ast_sim.keep_memory()
-    results = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
-    for name in asked.rows or ROWS:
-        results[name] = measured(name, ROWS[name], asked.folder)
-        write_json(RESULTS, results)
-        write_text(PAGE, page(results) + "\n")
-        found = results[name]
-        print(f"{name}: {100 * found['relative_error']:.3g} %, reaction {_reaction(found, 'reaction')}", flush=True)
+
+def _said(found: dict[str, Any]) -> str:
+    return f"{100 * found['relative_error']:.3g} %, reaction {_reaction(found, 'reaction')}"
 
 
 if __name__ == "__main__":

@@ -8,9 +8,6 @@ one thread.
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -19,9 +16,9 @@ from typing import Any
 import ast_sim
 from ast_sim.planning.forecast import DAMPING, SPREAD, forecast
 from ast_sim.planning.trials import GROWTH, LONGEST, WIDER, Trials, candidates
-from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
 from ast_sim.training.asked_settings import configure
+from benchmarks.studies.rows import study_rows
 
 RESULTS = Path(__file__).parents[1] / "results" / "forecasts.json"
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "forecasts.md"
@@ -129,25 +126,11 @@ def _percent(share: float) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("rows", nargs="*", metavar="ROW", help=f"of {', '.join(ROWS)} (default: all)")
-    about = "data and runs (default: build/forecasts)"
-    parser.add_argument("--folder", type=Path, default=Path("build/forecasts"), help=about)
-    asked = parser.parse_args(arguments)
-    unknown = set(asked.rows) - set(ROWS)
-    if unknown:
-        parser.error(f"there is no row {', '.join(sorted(unknown))}")
-    import torch  # after ast_sim, which says how its threads wait
+    study_rows(__doc__, ROWS, arguments, measured, _said, (RESULTS, PAGE), page)
 
-    torch.set_num_threads(1)
-    os.environ["OMP_NUM_THREADS"] = "1"  # of the generator's processes
-    ast_sim.keep_memory()
-    results = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
-    for name in asked.rows or ROWS:
-        results[name] = measured(name, asked.folder)
-        write_json(RESULTS, results)
-        write_text(PAGE, page(results) + "\n")
-        print(f"{name}: {_percent(results[name]['whole']['error'])}", flush=True)
+
+def _said(found: dict[str, Any]) -> str:
+    return _percent(found["whole"]["error"])
 
 
 if __name__ == "__main__":

@@ -7,9 +7,6 @@ runs lie in `--folder`; a second call goes on with what is there. Everything run
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -21,9 +18,9 @@ import ast_sim
 from ast_sim.inference.effort import MOST_NEWTON_STEPS, Effort, can_make_newton_steps
 from ast_sim.inference.evaluation.asked_frame import asked_frames
 from ast_sim.mechanics.linearised_contact import STILL
-from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
 from benchmarks.studies.phrases import beside_solver, over_the_scenes, settings_tried
+from benchmarks.studies.rows import study_rows
 from benchmarks.studies.validation_curve import curve_line, minutes_per_step, validation_curve
 
 RESULTS = Path(__file__).parents[1] / "results" / "jumps.json"
@@ -257,24 +254,11 @@ def _section(found: dict[str, Any]) -> list[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("rows", nargs="*", metavar="ROW", help=f"of {', '.join(ROWS)} (default: all)")
-    parser.add_argument("--folder", type=Path, default=Path("build/jumps"), help="data and runs (default: build/jumps)")
-    asked = parser.parse_args(arguments)
-    unknown = set(asked.rows) - set(ROWS)
-    if unknown:
-        parser.error(f"there is no row {', '.join(sorted(unknown))}")
-    import torch  # after ast_sim, which says how its threads wait
+    study_rows(__doc__, ROWS, arguments, measured, _said, (RESULTS, PAGE), page)
 
-    torch.set_num_threads(1)
-    os.environ["OMP_NUM_THREADS"] = "1"  # of the generator's and the solver's processes
-    ast_sim.keep_memory()
-    results = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
-    for name in asked.rows or ROWS:
-        results[name] = measured(name, asked.folder)
-        write_json(RESULTS, results)
-        write_text(PAGE, page(results) + "\n")
-        print(f"{name}: {100 * results[name]['relative_error']:.3g} %", flush=True)
+
+def _said(found: dict[str, Any]) -> str:
+    return f"{100 * found['relative_error']:.3g} %"
 
 
 if __name__ == "__main__":

@@ -9,15 +9,6 @@ from ast_sim.planning.forecast import DAMPING
 from benchmarks.studies import forecasts
 
 
-@pytest.fixture
-def one_thread(monkeypatch):
-    """The study changes the threads of this process and of others; they are set back."""
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    threads = torch.get_num_threads()
-    yield
-    torch.set_num_threads(threads)
-
-
 def test_a_row_from_end_to_end(tmp_path, monkeypatch, one_thread):
     made = {"train": 4, "valid": 1, "test": 0, "nodes": 80, "frames": 5, "keep": (2, 3), "seed": 1}
     few = {"train.batch_size": 2, "train.statistics_pairs": 4, "model.num_tokens": 16}

@@ -3,20 +3,10 @@
 import json
 
 import pytest
-import torch
 
 from ast_sim.simulate.jobs.rival import WAYS
 from benchmarks.studies import nested
 from benchmarks.studies.phrases import settings_tried
-
-
-@pytest.fixture
-def one_thread(monkeypatch):
-    """The study changes the threads of this process and of others; they are set back."""
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    threads = torch.get_num_threads()
-    yield
-    torch.set_num_threads(threads)
 
 
 def test_a_scene_from_end_to_end(tmp_path, monkeypatch, one_thread):

@@ -12,7 +12,7 @@ import ast_sim
 from ast_sim.planning import plan as plan_module
 from ast_sim.planning import trials as module
 from ast_sim.planning.plan import planned
-from ast_sim.planning.trials import Trial, Trials, candidates, trials_of
+from ast_sim.planning.trials import Trial, Trials, candidates, round_sizes
 from ast_sim.runs.config_toml import read_config
 from ast_sim.support.errors import ConfigError
 from ast_sim.training.asked_settings import configure
@@ -56,7 +56,7 @@ def test_a_plan_of_real_trainings(short, data, tmp_path, capsys, monkeypatch):
     assert kept["expected"] == list(made.expected)
     said = capsys.readouterr().err
     assert said.count("scenes, error") == 8 and "the trials take about 9 s" in said
-    assert trials_of(4) == 7
+    assert round_sizes(4) == [4, 2, 1]
     assert f"take: {longest.name}" in str(made) and "help more" in str(made)
     monkeypatch.setattr("ast_sim.training.loop.Training.advance", lambda *_: pytest.fail("trained again"))
     again = ast_sim.plan(data, tmp_path / "plan", 0.3, model_settings=SMALL, **QUICK)
