@@ -91,6 +91,8 @@ class TradeFigures:
     Attributes:
         scenes: the names of the scenes.
         run, solver: the settings; no solver: `no_solver` says why.
+        mesh_errors: of some scenes, how far the solver's frame is from the one on a mesh of half the element size,
+            relative to the displacement; empty: not known.
         invested: the seconds of simulation and training before the first answer; None: not known.
         origin: command, commit, processor, run and dataset.
     """
@@ -99,6 +101,7 @@ class TradeFigures:
     run: tuple[Setting, ...]
     solver: tuple[Setting, ...]
     no_solver: str = ""
+    mesh_errors: tuple[float, ...] = ()
     invested: float | None = None
     origin: dict[str, Any] = field(default_factory=dict)
 
@@ -119,6 +122,22 @@ class TradeFigures:
         pays = math.ceil(self.invested / saved) if known and self.invested is not None else None
         return TradeRow(tolerance, run, solver, float(np.median(ratios)), float(low), float(high), pays)
 
+    @property
+    def mesh_error(self) -> float | None:
+        """The median of `mesh_errors`. An answer with a smaller error is no nearer to the truth."""
+        return median(self.mesh_errors) if self.mesh_errors else None
+
+    @property
+    def mesh_line(self) -> str:
+        """One sentence on the error of the mesh itself; empty: it is not known."""
+        if self.mesh_error is None:
+            return ""
+        scenes = f"{len(self.mesh_errors)} scene{'s' * (len(self.mesh_errors) > 1)}"
+        return (
+            f"The mesh itself is {100 * self.mesh_error:.2g} % off (median of {scenes}, against half the element size):"
+            " an answer with a smaller error is no nearer to the truth"
+        )
+
     def lines(self) -> list[str]:
         """The table as text."""
         told = [f"{len(self.scenes)} scenes, deepest frame, one thread; error kept in {100 * WITHIN:g} % of them"]
@@ -129,12 +148,14 @@ class TradeFigures:
             if row.pays_after is not None:
                 parts.append(f"pays after {row.pays_after:,} questions")
             told.append(f"{100 * row.tolerance:g} %: {'; '.join(parts)}")
+        told += [self.mesh_line] if self.mesh_line else []
         return told + ([f"the solver was not run: {self.no_solver}"] if self.no_solver else [])
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self:
         """From what `to_json` gave."""
         known = {key: values[key] for key in ("no_solver", "invested", "origin")}
+        known["mesh_errors"] = tuple(values.get("mesh_errors", ()))
         run, solver = (tuple(map(_setting, values[side])) for side in ("run", "solver"))
         return cls(tuple(values["scenes"]), run, solver, **known)
 

@@ -29,6 +29,7 @@ def page_data(figures: TradeFigures) -> dict[str, Any]:
                 {"name": "The run", "points": _points(figures.run)},
                 {"name": "The solver", "points": _points(figures.solver)},
             ],
+            "mesh": figures.mesh_error,
             "columns": [name.capitalize() for name in COLUMNS],
             "rows": [row.cells for row in figures.rows()],
             "note": _note(figures),
@@ -65,6 +66,7 @@ def _note(figures: TradeFigures) -> str:
     if figures.invested is not None:
         spent = duration(figures.invested)
         text += f" Simulation and training took {spent} of a core; after so many questions they are repaid."
+    text += f" {figures.mesh_line}." if figures.mesh_line else ""
     return text + (f" The solver was not run: {figures.no_solver}." if figures.no_solver else "")
 
 

@@ -105,6 +105,7 @@ def _section(title: str, figures: TradeFigures) -> list[str]:
         *(f"| {' | '.join(row.cells)} |" for row in rows),
         "",
         f"The run is ahead in {ahead} of {len(rows)} cells, the solver in {alone}.",
+        *([f"{figures.mesh_line}."] if figures.mesh_line else []),
     ]
 
 

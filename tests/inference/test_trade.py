@@ -28,6 +28,8 @@ def test_efforts_and_ways_are_measured_on_the_same_scene(plates, tmp_path, capsy
     assert [len(figures[side]) for side in ("run", "solver")] == [5, len(WAYS)]
     own = next(one for one in figures["solver"] if one["name"] == "own stop test")
     assert own["errors"][0] < 1e-3 and own["seconds"][0] > 0
+    (mesh,) = figures["mesh_errors"]  # a plate of 200 nodes is thin, and too stiff
+    assert 0.02 < mesh < 0.3
     call, *_, newton = figures["run"]
     assert newton["errors"][0] < call["errors"][0] < 0.3
     assert call["command"].endswith("--corrections 0 --newton-steps 0") and figures["scenes"] == ["test/000000"]

@@ -17,7 +17,8 @@ def path(tmp_path_factory):
         Setting("no use", (0.05, 0.2), (0.06, 0.06)),
     )
     solver = (Setting("own", (0.0, 0.0), (0.1, 0.1)), Setting("coarse", (0.04, 0.03), (0.05, 0.05)))
-    figures = TradeFigures(("test/000000", "test/000001"), run, solver, invested=600.0, origin={"run": HOSTILE})
+    more = {"mesh_errors": (0.02, 0.03, 0.07), "invested": 600.0, "origin": {"run": HOSTILE}}
+    figures = TradeFigures(("test/000000", "test/000001"), run, solver, **more)
     path = tmp_path_factory.mktemp("trade") / "trade.html"
     trade_page.write(path, figures, HOSTILE)
     return path
@@ -39,6 +40,9 @@ def test_the_table_and_the_chart_show_the_settings(browser, path):
     drawn = browser.evaluate("document.querySelector('#trade-chart .plot').data.map(({ x, y }) => [x, y])")
     assert drawn[0] == [[60], [20]] and drawn[1] == [[20, 40], [8, 1]]
     assert drawn[3][0] == [50, 100] and drawn[3][1][0] == 4
+    assert drawn[4] == [[20, 100], [3, 3]]  # the mesh itself, over all times
+    assert texts(browser, "#trade-chart .legend li") == ["The run", "The solver", "The mesh itself"]
+    assert "The mesh itself is 3 % off (median of 3 scenes, against half" in texts(browser, "#trade-note")[0]
     assert len(texts(browser, "#trade-settings tbody tr")) == 5
     assert texts(browser, "#facts-tables td") == [HOSTILE]
     assert not texts(browser, "#gallery, #scenes, #training")  # what belongs to other pages is gone

@@ -6,7 +6,7 @@ import math
 import os
 import shlex
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -22,7 +22,7 @@ from ast_sim.inference.predict import answers
 from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.relative_errors import moves, relative_error
 from ast_sim.models.simulator import Simulator
-from ast_sim.simulate.jobs.rival import Outcome, rivals
+from ast_sim.simulate.jobs.rival import FINER, OWN_STOP_TEST, Outcome, rivals
 from ast_sim.support.disk import write_json
 from ast_sim.support.errors import ConfigError, SimulationError
 from ast_sim.support.progress import Progress, ShowProgress
@@ -35,6 +35,9 @@ if TYPE_CHECKING:
     from ast_sim.inference.trained_run import Run
 
 SCENES = 20
+MESH_SCENES = 3  # in which the mesh's own error is measured
+MOST_SECONDS = 60.0  # processor time that the finer mesh of such a scene may take
+LONGER = 24.0  # than the mesh of the scene it takes, as in `simulate.jobs.mesh_error`
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +149,7 @@ def _measured(
         run=tuple(_setting(effort.text, pairs, _command(run, dataset, split, effort)) for effort, pairs in own.items()),
         solver=tuple(_setting(name, pairs) for name, pairs in ways.items()),
         no_solver=no_solver,
+        mesh_errors=_mesh_errors(dataset, split, indices[:MESH_SCENES], made_from, ways),
         invested=_invested(run, dataset),
         origin={**provenance(command), "run": str(run.path), "step": run.step, "data": str(dataset.path)},
     )
@@ -160,6 +164,25 @@ def _outcomes(
     """What the solver took for each scene in every way. It begins with the first one, where all its errors come up."""
     for solved in rivals(dataset.path, split, indices, made_from=made_from, progress=False):
         yield solved.outcomes
+
+
+def _mesh_errors(
+    dataset: Dataset,
+    split: str,
+    indices: Sequence[int],
+    made_from: str | os.PathLike[str] | None,
+    ways: Mapping[str, Sequence[tuple[float, float]]],
+) -> tuple[float, ...]:
+    """How far frames of the dataset are from those on a mesh of half the element size, relative to the displacement.
+
+    Scenes that cannot be solved there are left out. None is tried if our solver has not run or would take too long.
+    """
+    own = [seconds for _, seconds in ways.get(OWN_STOP_TEST, ())]
+    if not own or LONGER * max(own[: len(indices)]) > MOST_SECONDS:
+        return ()
+    solved = rivals(dataset.path, split, indices, ways=(FINER,), starts=(1,), made_from=made_from, progress=False)
+    outcomes = [scene.outcomes[0] for scene in solved]
+    return tuple(outcome.relative_error for outcome in outcomes if outcome.converged)
 
 
 def timed_answer(

@@ -43,7 +43,7 @@ class Way:
 
     Attributes:
         name: what it is called.
-        nodes: share of the nodes of the deforming bodies.
+        nodes: share of the nodes of the deforming bodies; above 1 a finer mesh.
         dhat: factor of the range of contact.
         tolerance: factor of the stop test, `SolverSettings.force_tolerance`.
         linearised: so many load steps, each of one Newton step with linearised contact, and one more step at the end.
@@ -74,8 +74,9 @@ _NESTED = tuple(
     for solution, linearised in (("own stop test", 0), ("6 linearised steps", 6), ("12 linearised steps", 12))
     for newton in (1, 2, 3)
 )
+OWN_STOP_TEST = "own stop test"
 WAYS = (
-    Way("own stop test"),
+    Way(OWN_STOP_TEST),
     Way("10x looser", tolerance=10),
     Way("100x looser", tolerance=100),
     Way("2x dhat", dhat=2),
@@ -96,6 +97,7 @@ WAYS = (
         for name, share in (("1/2", 0.5), ("1/4", 0.25))
     ),
 )
+FINER = Way("half the element size", nodes=8.0)  # no rival: it shows what the mesh of the dataset gets wrong
 STARTS = (1, 2, 4, 0)
 
 

@@ -1,8 +1,15 @@
 // The page of a trade: one chart of all settings, with the front of each side, and two tables.
 
-function tradeChart(part, sides) {
+function tradeChart(part, sides, mesh) {
+  const entries = sides.map(({ name }, side) => ({ text: name, color: `run-${side}` }));
+  if (mesh !== null) entries.push({ text: "The mesh itself", color: "soft", dashed: true });
   const host = element("div", { class: "plot", role: "img", "aria-label": "Error against seconds of an answer, both on logarithmic scales" });
-  part.append(element("div", { class: "chart" }, legend(sides.map(({ name }, side) => ({ text: name, color: `run-${side}` }))), host));
+  part.append(element("div", { class: "chart" }, legend(entries), host));
+  const times = sides.flatMap(({ points }) => points.map((point) => 1000 * point.seconds));
+  const meshLine = () => mesh === null ? [] : [{
+    x: [Math.min(...times), Math.max(...times)], y: [100 * mesh, 100 * mesh], name: "The mesh itself", mode: "lines",
+    line: { color: cssColor("soft"), width: 2, dash: "dash" }, hovertemplate: "The mesh itself<br>%{y:.3g} %<extra></extra>",
+  }];
   const traces = () => sides.flatMap(({ name, points }, side) => {
     const part = (kept, extra) => ({
       x: kept.map((point) => 1000 * point.seconds), y: kept.map((point) => 100 * Math.max(point.error, 1e-4)),
@@ -12,7 +19,7 @@ function tradeChart(part, sides) {
       part(points.filter((point) => !point.front), { mode: "markers", marker: { color: runColor(side), size: 6, opacity: 0.4 } }),
       part(points.filter((point) => point.front), { mode: "lines+markers", line: { color: runColor(side), width: 2 }, marker: { color: runColor(side), size: 9 } }),
     ];
-  });
+  }).concat(meshLine());
   const steps = Array.from({ length: 12 }, (_, power) => [1, 2, 5].map((digit) => digit * 10 ** (power - 4))).flat();
   const log = (spare) => ({ type: "log", rangemode: "normal", showgrid: true, tickvals: steps, ticktext: steps.map((step) => (spare && String(step).match(/[25]/) ? "" : String(step))) });
   chart(host, () => [traces(), chartLayout("Milliseconds of an answer (median)", "Error (%)", { hovermode: "closest", xaxis: log(false), yaxis: log(true) })]);
@@ -31,7 +38,7 @@ function textRows(rows, cell = (text) => element("td", {}, text)) {
 function showTrade(data) {
   byId("trade-note").textContent = data.note;
   byId("trade-tables").append(table(data.columns, textRows(data.rows, textCell), { className: "prices" }));
-  tradeChart(byId("trade-chart"), data.sides.filter(({ points }) => points.length));
+  tradeChart(byId("trade-chart"), data.sides.filter(({ points }) => points.length), data.mesh);
   const all = table(["Side", "Setting", "Error kept", "Median time", "Command"], textRows(data.settings), { className: "dense words" });
   byId("trade-settings").append(element("details", {}, element("summary", {}, `All ${data.settings.length} settings`), all));
 }
