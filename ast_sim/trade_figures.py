@@ -1,8 +1,8 @@
 """Speed against accuracy on the same scenes: the settings of a run and of the solver, and who is faster at an error.
 
 A setting keeps an error if at least `WITHIN` of the scenes are within it. At each tolerance the setting that keeps it
-and has the smallest median time counts, on both sides. Errors are of the displacement, relative to it, at the deepest
-frame.
+and has the smallest median time counts, on both sides. Errors are relative and at the deepest frame: of the
+displacement, of the reaction (the force on the driven nodes) or of the largest stress.
 """
 
 from __future__ import annotations
@@ -92,9 +92,10 @@ class TradeFigures:
         scenes: the names of the scenes.
         run, solver: the settings; no solver: `no_solver` says why.
         mesh_errors: of some scenes, how far the solver's frame is from the one on a mesh of half the element size,
-            relative to the displacement; empty: not known.
+            of the quantity; empty: not known.
         invested: the seconds of simulation and training before the first answer; None: not known.
         origin: command, commit, processor, run and dataset.
+        quantity: what the errors are of: "displacement", "reaction" or "stress".
     """
 
     scenes: tuple[str, ...]
@@ -104,6 +105,7 @@ class TradeFigures:
     mesh_errors: tuple[float, ...] = ()
     invested: float | None = None
     origin: dict[str, Any] = field(default_factory=dict)
+    quantity: str = "displacement"
 
     def rows(self) -> list[TradeRow]:
         """A row for each of `TOLERANCES`."""
@@ -134,13 +136,14 @@ class TradeFigures:
             return ""
         scenes = f"{len(self.mesh_errors)} scene{'s' * (len(self.mesh_errors) > 1)}"
         return (
-            f"The mesh itself is {100 * self.mesh_error:.2g} % off (median of {scenes}, against half the element size):"
-            " an answer with a smaller error is no nearer to the truth"
+            f"The mesh alone makes the {self.quantity} {100 * self.mesh_error:.2g} % wrong (median of {scenes}, against"
+            " half the element size): an answer with a smaller error is no nearer to the truth"
         )
 
     def lines(self) -> list[str]:
         """The table as text."""
-        told = [f"{len(self.scenes)} scenes, deepest frame, one thread; error kept in {100 * WITHIN:g} % of them"]
+        counts = f"{len(self.scenes)} scenes, deepest frame, one thread"
+        told = [f"{counts}; error of the {self.quantity} kept in {100 * WITHIN:g} % of them"]
         for row in self.rows():
             parts = [_told("run", row.run), _told("solver", row.solver)]
             if row.ratio is not None:
@@ -154,8 +157,8 @@ class TradeFigures:
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self:
         """From what `to_json` gave."""
-        known = {key: values[key] for key in ("no_solver", "invested", "origin")}
-        known["mesh_errors"] = tuple(values.get("mesh_errors", ()))
+        known = {key: values[key] for key in ("no_solver", "invested", "origin", "quantity")}
+        known["mesh_errors"] = tuple(values["mesh_errors"])
         run, solver = (tuple(map(_setting, values[side])) for side in ("run", "solver"))
         return cls(tuple(values["scenes"]), run, solver, **known)
 

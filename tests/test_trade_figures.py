@@ -82,8 +82,9 @@ def test_the_figures_are_read_back_from_their_json():
 
 
 def test_the_error_of_the_mesh_is_the_median_of_its_scenes():
-    assert figures().mesh_error is None and figures().mesh_line == ""
+    assert figures().mesh_error is None
+    assert figures().mesh_line == ""
     known = figures(mesh_errors=(0.07, 0.02, 0.034))
     assert known.mesh_error == 0.034
-    assert known.lines()[-1].startswith("The mesh itself is 3.4 % off (median of 3 scenes, against half the element")
+    assert known.lines()[-1].startswith("The mesh alone makes the displacement 3.4 % wrong (median of 3 scenes, ")
     assert TradeFigures.from_json(known.to_json()) == known

@@ -13,12 +13,12 @@ from ast_sim.view import page
 from ast_sim.view.encode import finite_json
 
 
-def write(path: str | os.PathLike[str], figures: TradeFigures, title: str) -> None:
-    """Write the page. Errors as in `page.write`."""
-    page.write(path, page_data(figures), title)
+def write(path: str | os.PathLike[str], figures: Sequence[TradeFigures], title: str) -> None:
+    """Write the page of the figures of each quantity; the first is drawn. Errors as in `page.write`."""
+    page.write(path, page_data(*figures), title)
 
 
-def page_data(figures: TradeFigures) -> dict[str, Any]:
+def page_data(figures: TradeFigures, *others: TradeFigures) -> dict[str, Any]:
     """Everything that the page's scripts show, as JSON."""
     return finite_json(
         {
@@ -31,17 +31,28 @@ def page_data(figures: TradeFigures) -> dict[str, Any]:
             ],
             "mesh": figures.mesh_error,
             "columns": [name.capitalize() for name in COLUMNS],
-            "rows": [row.cells for row in figures.rows()],
-            "note": _note(figures),
-            "settings": [
-                [side, one.name, f"{100 * one.kept:.3g} %", f"{1000 * one.middle:.3g} ms", one.command or "–"]
-                for side, settings in (("the run", figures.run), ("the solver", figures.solver))
-                for one in _answered(settings)
+            "tables": [
+                {"name": one.quantity.capitalize(), "rows": [row.cells for row in one.rows()], "mesh": one.mesh_line}
+                for one in (figures, *others)
             ],
+            "note": _note(figures),
+            "settings": _settings([figures, *others]),
             "facts": [[key.capitalize(), str(value)] for key, value in figures.origin.items()],
             "footer": page.FOOTER,
         }
     )
+
+
+def _settings(figures: Sequence[TradeFigures]) -> dict[str, Any]:
+    """A table of all settings that have an answer, with the error of each quantity that they keep."""
+    columns = ["Side", "Setting", *(f"{one.quantity.capitalize()} kept" for one in figures), "Median time", "Command"]
+    rows = []
+    for side, of_side in (("the run", lambda one: one.run), ("the solver", lambda one: one.solver)):
+        kept = [{setting.name: setting.kept for setting in of_side(one)} for one in figures]
+        for setting in _answered(of_side(figures[0])):
+            errors = [f"{100 * by_name[setting.name]:.3g} %" for by_name in kept]
+            rows.append([side, setting.name, *errors, f"{1000 * setting.middle:.3g} ms", setting.command or "–"])
+    return {"columns": columns, "rows": rows}
 
 
 def _lead(figures: TradeFigures) -> str:
@@ -60,13 +71,12 @@ def _note(figures: TradeFigures) -> str:
     text = (
         f"Of each side the fastest setting counts that keeps the error in {100 * WITHIN:g} % of the scenes, by its"
         " median time. A ratio is the median over the scenes, with an interval of 95 % by bootstrap. Errors are"
-        " relative to the displacement at the deepest frame; times are processor time on one thread, with all that is"
-        " prepared for a mesh."
+        " relative, at the deepest frame; the stress is the largest one. Times are processor time on one thread, with"
+        " all that is prepared for a mesh."
     )
     if figures.invested is not None:
         spent = duration(figures.invested)
         text += f" Simulation and training took {spent} of a core; after so many questions they are repaid."
-    text += f" {figures.mesh_line}." if figures.mesh_line else ""
     return text + (f" The solver was not run: {figures.no_solver}." if figures.no_solver else "")
 
 

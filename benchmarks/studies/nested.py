@@ -96,11 +96,11 @@ def measured(plates: Plates, folder: Path) -> dict[str, Any]:
 def _ask(model: Any, dataset: ast_sim.Dataset, split: str, index: int, known: dict[str, dict[str, Any]]) -> None:
     """Ask for the deepest frame with every effort."""
     for effort in EFFORTS:
-        error, seconds, failure = timed_answer(model, dataset, split, index, effort)
+        errors, seconds, failure = timed_answer(model, dataset, split, index, effort)
         answered = failure is None
         figures = {
             "seconds": seconds if answered else None,
-            "relative_error": error if answered else None,
+            "relative_error": errors["displacement"] if answered else None,
             "failure": failure,
         }
         _keep_faster(known, effort.text, figures)

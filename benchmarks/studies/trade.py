@@ -60,15 +60,20 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
         run = ast_sim.example_run(row.run)
         data = ast_sim.generate(out=folder / f"{name}_fresh.h5", train=0, valid=0, test=row.scenes, **row.plates).path
     command = f"python -m benchmarks.studies.trade {name}"
-    figures = ast_sim.trade(run, data, scenes=row.scenes, command=command).figures.to_json()
-    figures["origin"] |= {"run": run.path.name, "data": Path(data).name}
-    return figures
+    by_quantity = ast_sim.trade(run, data, scenes=row.scenes, command=command).to_json()
+    for figures in by_quantity.values():
+        figures["origin"] |= {"run": run.path.name, "data": Path(data).name}
+    return by_quantity
 
 
 def page(results: dict[str, Any]) -> str:
     """The page of all rows that have a result."""
-    shown = {row.title: TradeFigures.from_json(results[name]) for name, row in ROWS.items() if name in results}
-    lines = [line for title, figures in shown.items() for line in _section(title, figures)]
+    shown = {
+        row.title: {quantity: TradeFigures.from_json(values) for quantity, values in results[name].items()}
+        for name, row in ROWS.items()
+        if name in results
+    }
+    lines = [line for title, by_quantity in shown.items() for line in _section(title, by_quantity)]
     return "\n".join([_INTRODUCTION.rstrip(), *lines]) + "\n"
 
 
@@ -78,8 +83,9 @@ Made by `python -m benchmarks.studies.trade` from `benchmarks/results/trade.json
 
 On each side the fastest setting counts that keeps the error in 90 % of the scenes, by its median time: of the run the
 efforts that it can make, of the solver the ways in which it can be run (stop tests, ranges of contact, coarser
-meshes, linearised steps, nested iteration). Neither side may choose scene by scene. The error is that of the
-displacement at the frame in which a scene is deformed most, relative to it. Times are processor time on one thread,
+meshes, linearised steps, nested iteration). Neither side may choose scene by scene. Errors are relative, at the frame
+in which a scene is deformed most: of the displacement, of the force on the moved body, of the largest stress. A
+solution on a coarser mesh gives the force and the stress of that mesh. Times are processor time on one thread,
 beside other work on the same machine, with all that is prepared for a mesh; meshing is not counted. A ratio is the
 median over the scenes of the solver's time over the run's, with an interval of 95 % by bootstrap over the scenes. Who
 is faster follows from the interval. "Pays after" counts simulation and training against the time that an answer saves.
@@ -88,17 +94,28 @@ For a run of your own: `ast-sim trade RUN DATA --out trade.html`.
 """
 
 
-def _section(title: str, figures: TradeFigures) -> list[str]:
-    rows, invested = figures.rows(), figures.invested
+def _section(title: str, by_quantity: dict[str, TradeFigures]) -> list[str]:
+    figures = by_quantity["displacement"]
     processor = figures.origin["processor"]
-    trained = "" if invested is None else f" Simulation and training took {duration(invested)} of a core."
-    ahead = sum(row.verdict == "the run" for row in rows)
-    alone = sum(row.verdict in ("the solver", "the solver alone") for row in rows)
+    trained = (
+        "" if figures.invested is None else f" Simulation and training took {duration(figures.invested)} of a core."
+    )
     return [
         "",
         f"## {title}",
         "",
         f"{len(figures.scenes)} scenes, {len(figures.solver)} ways of the solver, {processor}.{trained}",
+        *(line for one in by_quantity.values() for line in _table(one)),
+    ]
+
+
+def _table(figures: TradeFigures) -> list[str]:
+    rows = figures.rows()
+    ahead = sum(row.verdict == "the run" for row in rows)
+    alone = sum(row.verdict in ("the solver", "the solver alone") for row in rows)
+    return [
+        "",
+        f"### {figures.quantity.capitalize()}",
         "",
         f"| {' | '.join(COLUMNS)} |",
         "| ---: | --- | --- | --- | --- | ---: |",

@@ -24,12 +24,21 @@ def test_efforts_and_ways_are_measured_on_the_same_scene(plates, tmp_path, capsy
     told = [str(tmp_path / "plates.ast"), str(plates), "--out", str(tmp_path / "pages" / "trade.html")]
     assert main(["trade", *told]) == 0
     assert "10 %: run: " in capsys.readouterr().out
-    figures = json.loads((tmp_path / "pages" / "trade.json").read_text())
+    by_quantity = json.loads((tmp_path / "pages" / "trade.json").read_text())
+    assert list(by_quantity) == ["displacement", "reaction", "stress"]
+    figures = by_quantity["displacement"]
     assert [len(figures[side]) for side in ("run", "solver")] == [5, len(WAYS)]
     own = next(one for one in figures["solver"] if one["name"] == "own stop test")
     assert own["errors"][0] < 1e-3 and own["seconds"][0] > 0
     (mesh,) = figures["mesh_errors"]  # a plate of 200 nodes is thin, and too stiff
     assert 0.02 < mesh < 0.3
+    force, stress = by_quantity["reaction"], by_quantity["stress"]
+    for one in (force, stress):
+        kept = {way["name"]: way["errors"][0] for way in one["solver"]}
+        assert kept["own stop test"] < 2e-3 < 0.02 < min(kept["1/2 nodes"], kept["1/4 nodes"])
+        assert kept["1/2 nodes, own stop test, 3 Newton steps"] < 0.02
+        assert one["run"][-1]["errors"][0] < 0.02 < one["run"][0]["errors"][0]
+        assert 0.02 < one["mesh_errors"][0] < 1.5
     call, *_, newton = figures["run"]
     assert newton["errors"][0] < call["errors"][0] < 0.3
     assert call["command"].endswith("--corrections 0 --newton-steps 0") and figures["scenes"] == ["test/000000"]
@@ -38,7 +47,9 @@ def test_efforts_and_ways_are_measured_on_the_same_scene(plates, tmp_path, capsy
 
 
 def test_another_program_is_represented_by_its_seconds(plates):
-    figures = ast_sim.trade(ast_sim.example_run("plates"), plates, solver_seconds=95.0).figures
+    trade = ast_sim.trade(ast_sim.example_run("plates"), plates, solver_seconds=95.0)
+    assert [one.solver[0].errors for one in trade.by_quantity.values()] == [(0.0,)] * 3
+    figures = trade.figures
     (stated,) = figures.solver
     assert (stated.errors, stated.seconds) == ((0.0,), (95.0,))
     rows = figures.rows()

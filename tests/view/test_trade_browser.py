@@ -20,7 +20,9 @@ def path(tmp_path_factory):
     more = {"mesh_errors": (0.02, 0.03, 0.07), "invested": 600.0, "origin": {"run": HOSTILE}}
     figures = TradeFigures(("test/000000", "test/000001"), run, solver, **more)
     path = tmp_path_factory.mktemp("trade") / "trade.html"
-    trade_page.write(path, figures, HOSTILE)
+    bare = Setting("call", (0.3, 0.4), (0.02, 0.02))
+    force = TradeFigures(figures.scenes, (bare, *run[1:]), solver, quantity="reaction")
+    trade_page.write(path, [figures, force], HOSTILE)
     return path
 
 
@@ -28,8 +30,8 @@ def test_the_table_and_the_chart_show_the_settings(browser, path):
     show(browser, path, still=False)
     assert browser.errors == [] and browser.requests == [path.as_uri()]
     first = ["10 %", "20 mscall", "50 mscoarse", "2.50 (2.50 to 2.50)", "the run", "20,000 questions"]
-    assert texts(browser, "#trade-tables tbody tr:first-child > *") == first
-    assert texts(browser, "#trade-tables tbody tr:last-child > *")[1:5] == [
+    assert texts(browser, "#trade-tables .table-card:first-child tbody tr:first-child > *") == first
+    assert texts(browser, "#trade-tables .table-card:first-child tbody tr:last-child > *")[1:5] == [
         "none",
         "100 msown",
         "–",
@@ -42,7 +44,11 @@ def test_the_table_and_the_chart_show_the_settings(browser, path):
     assert drawn[3][0] == [50, 100] and drawn[3][1][0] == 4
     assert drawn[4] == [[20, 100], [3, 3]]  # the mesh itself, over all times
     assert texts(browser, "#trade-chart .legend li") == ["The run", "The solver", "The mesh itself"]
-    assert "The mesh itself is 3 % off (median of 3 scenes, against half" in texts(browser, "#trade-note")[0]
+    assert texts(browser, "#trade-tables h3") == ["Displacement", "Reaction"]
+    (mesh,) = texts(browser, "#trade-tables p")
+    assert mesh.startswith("The mesh alone makes the displacement 3 % wrong (median of 3 scenes, against half")
+    call = ["the run", "call", "8 %", "40 %", "20 ms", f"ast-sim predict '{HOSTILE}'"]
+    assert texts(browser, "#trade-settings tbody tr:first-child td, #trade-settings tbody tr:first-child th") == call
     assert len(texts(browser, "#trade-settings tbody tr")) == 5
     assert texts(browser, "#facts-tables td") == [HOSTILE]
     assert not texts(browser, "#gallery, #scenes, #training")  # what belongs to other pages is gone

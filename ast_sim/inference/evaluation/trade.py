@@ -6,11 +6,11 @@ import math
 import os
 import shlex
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 
@@ -20,7 +20,7 @@ from ast_sim.inference.effort import Effort, choices
 from ast_sim.inference.evaluation.asked_frame import deepest_predicted
 from ast_sim.inference.predict import answers
 from ast_sim.inference.predicting.question import Question
-from ast_sim.inference.relative_errors import moves, relative_error
+from ast_sim.inference.relative_errors import errors_of, moves
 from ast_sim.models.simulator import Simulator
 from ast_sim.simulate.jobs.rival import FINER, OWN_STOP_TEST, Outcome, rivals
 from ast_sim.support.disk import write_json
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from ast_sim.inference.trained_run import Run
 
 SCENES = 20
+QUANTITIES = ("displacement", "reaction", "stress")  # as `errors_of` names them
 MESH_SCENES = 3  # in which the mesh's own error is measured
 MOST_SECONDS = 60.0  # processor time that the finer mesh of such a scene may take
 LONGER = 24.0  # than the mesh of the scene it takes, as in `simulate.jobs.mesh_error`
@@ -42,30 +43,40 @@ LONGER = 24.0  # than the mesh of the scene it takes, as in `simulate.jobs.mesh_
 
 @dataclass(frozen=True, eq=False)
 class Trade:
-    """Speed against accuracy of a run, beside the solver. `str` gives the table at fixed errors.
+    """Speed against accuracy of a run, beside the solver. `str` gives the tables at fixed errors.
 
     Attributes:
-        figures: what was measured.
+        by_quantity: what was measured, by what the errors are of: "displacement", and "reaction" and "stress" where all
+            scenes have them.
     """
 
-    figures: TradeFigures
+    by_quantity: Mapping[str, TradeFigures]
+
+    @property
+    def figures(self) -> TradeFigures:
+        """Of the displacement."""
+        return self.by_quantity["displacement"]
 
     def __str__(self) -> str:
-        return "\n".join(self.figures.lines())
+        return "\n".join(line for figures in self.by_quantity.values() for line in figures.lines())
+
+    def to_json(self) -> dict[str, Any]:
+        """All figures, by quantity."""
+        return {quantity: figures.to_json() for quantity, figures in self.by_quantity.items()}
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all figures as JSON."""
-        write_json(Path(path), self.figures.to_json())
+        write_json(Path(path), self.to_json())
 
     def report(self, path: str | os.PathLike[str], title: str = "Speed against accuracy") -> None:
-        """Write a page: error against seconds, and the table; a missing folder is made.
+        """Write a page: error against seconds, and the tables; a missing folder is made.
 
         Raises:
             AstSimError: the suffix is neither .html nor .htm, or the file cannot be written.
             MissingExtra: plotly is not installed.
         """
         make_folder(Path(path).parent)
-        trade_page.write(path, self.figures, title)
+        trade_page.write(path, list(self.by_quantity.values()), title)
 
 
 def trade(
@@ -121,10 +132,10 @@ def _measured(
     made_from: str | os.PathLike[str] | None,
     command: str,
     progress: ShowProgress,
-) -> TradeFigures:
+) -> dict[str, TradeFigures]:
     efforts = choices(run.settings.model, run.settings.train.calls) or (run.effort,)
-    own: dict[Effort, list[tuple[float, float]]] = {effort: [] for effort in efforts}
-    ways: dict[str, list[tuple[float, float]]] = {}
+    own: dict[Effort, list[_Timed]] = {effort: [] for effort in efforts}
+    ways: dict[str, list[_Timed]] = {}
     no_solver = ""
     solved = _outcomes(dataset, split, indices, made_from) if stated is None else None
     with Progress(len(indices), "scenes", progress) as bar:
@@ -132,30 +143,55 @@ def _measured(
             timed_answer(run.model, dataset, split, indices[0], effort)  # the first takes longer; it does not count
         for index in indices:
             for effort in efforts:
-                own[effort].append(timed_answer(run.model, dataset, split, index, effort)[:2])
+                own[effort].append(_Timed(*timed_answer(run.model, dataset, split, index, effort)[:2]))
             try:
                 for outcome in next(solved) if solved is not None else ():
-                    pair = (outcome.relative_error, outcome.whole_seconds) if outcome.converged else _NONE
-                    ways.setdefault(outcome.way.name, []).append(pair)
+                    one = _Timed(outcome.errors, outcome.whole_seconds) if outcome.converged else _NONE
+                    ways.setdefault(outcome.way.name, []).append(one)
             except (ConfigError, SimulationError) as error:
                 no_solver = str(error)
                 solved = None
                 ways = {}
             bar.advance(f"{split}/{index:06d}")
+    quantities = _quantities(one for timed in own.values() for one in timed)
     if stated is not None:
-        ways = {"as stated": [(0.0, stated)] * len(indices)}
-    return TradeFigures(
-        scenes=tuple(f"{split}/{index:06d}" for index in indices),
-        run=tuple(_setting(effort.text, pairs, _command(run, dataset, split, effort)) for effort, pairs in own.items()),
-        solver=tuple(_setting(name, pairs) for name, pairs in ways.items()),
-        no_solver=no_solver,
-        mesh_errors=_mesh_errors(dataset, split, indices[:MESH_SCENES], made_from, ways),
-        invested=_invested(run, dataset),
-        origin={**provenance(command), "run": str(run.path), "step": run.step, "data": str(dataset.path)},
-    )
+        ways = {"as stated": [_Timed(dict.fromkeys(quantities, 0.0), stated)] * len(indices)}
+    finer = _on_finer_mesh(dataset, split, indices[:MESH_SCENES], made_from, ways)
+    commands = {effort: _command(run, dataset, split, effort) for effort in efforts}
+    return {
+        quantity: TradeFigures(
+            scenes=tuple(f"{split}/{index:06d}" for index in indices),
+            run=tuple(_setting(effort.text, timed, quantity, commands[effort]) for effort, timed in own.items()),
+            solver=tuple(_setting(name, timed, quantity) for name, timed in ways.items()),
+            no_solver=no_solver,
+            mesh_errors=tuple(outcome.errors[quantity] for outcome in finer),
+            invested=_invested(run, dataset),
+            origin={**provenance(command), "run": str(run.path), "step": run.step, "data": str(dataset.path)},
+            quantity=quantity,
+        )
+        for quantity in quantities
+    }
 
 
-_NONE = (math.inf, math.inf)  # error and seconds, where there is no answer
+class _Timed(NamedTuple):
+    """The errors of an answer by quantity, and its seconds."""
+
+    errors: Mapping[str, float]
+    seconds: float
+
+
+_NONE = _Timed({}, math.inf)  # where there is no answer
+
+
+def _quantities(answers: Iterable[_Timed]) -> list[str]:
+    """What all answers have an error of."""
+    answered = [one.errors for one in answers if one.errors]
+    return [quantity for quantity in QUANTITIES if all(quantity in errors for errors in answered)]
+
+
+def _setting(name: str, timed: Sequence[_Timed], quantity: str, command: str = "") -> Setting:
+    errors = tuple(one.errors.get(quantity, math.inf) for one in timed)
+    return Setting(name, errors, tuple(one.seconds for one in timed), command)
 
 
 def _outcomes(
@@ -166,29 +202,29 @@ def _outcomes(
         yield solved.outcomes
 
 
-def _mesh_errors(
+def _on_finer_mesh(
     dataset: Dataset,
     split: str,
     indices: Sequence[int],
     made_from: str | os.PathLike[str] | None,
-    ways: Mapping[str, Sequence[tuple[float, float]]],
-) -> tuple[float, ...]:
-    """How far frames of the dataset are from those on a mesh of half the element size, relative to the displacement.
+    ways: Mapping[str, Sequence[_Timed]],
+) -> list[Outcome]:
+    """Frames of the dataset on a mesh of half the element size.
 
     Scenes that cannot be solved there are left out. None is tried if our solver has not run or would take too long.
     """
-    own = [seconds for _, seconds in ways.get(OWN_STOP_TEST, ())]
+    own = [one.seconds for one in ways.get(OWN_STOP_TEST, ())]
     if not own or LONGER * max(own[: len(indices)]) > MOST_SECONDS:
-        return ()
+        return []
     solved = rivals(dataset.path, split, indices, ways=(FINER,), starts=(1,), made_from=made_from, progress=False)
-    outcomes = [scene.outcomes[0] for scene in solved]
-    return tuple(outcome.relative_error for outcome in outcomes if outcome.converged)
+    return [outcome for scene in solved for outcome in scene.outcomes if outcome.converged]
 
 
 def timed_answer(
     model: Simulator, dataset: Dataset, split: str, index: int, effort: Effort
-) -> tuple[float, float, str | None]:
-    """The error of an answer at the deepest frame, its processor seconds, and why it failed: both are infinite then.
+) -> tuple[dict[str, float], float, str | None]:
+    """The errors of an answer at the deepest frame by quantity, its processor seconds, and why it failed: it has no
+    errors and infinite seconds then.
 
     The scene is loaded anew, so nothing is prepared for its mesh.
     """
@@ -199,13 +235,8 @@ def timed_answer(
     (answer,) = answers(model, [question], effort)
     seconds = time.process_time() - began
     if answer.failure is not None:
-        return (*_NONE, answer.failure)
-    return relative_error(answer.position[0], truth, frame), seconds, None
-
-
-def _setting(name: str, pairs: Sequence[tuple[float, float]], command: str = "") -> Setting:
-    errors, seconds = zip(*pairs, strict=True)
-    return Setting(name, errors, seconds, command)
+        return {}, math.inf, answer.failure
+    return errors_of(replace(answer, info=dataset.info), truth), seconds, None
 
 
 def _command(run: Run, dataset: Dataset, split: str, effort: Effort) -> str:

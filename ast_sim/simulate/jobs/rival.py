@@ -122,6 +122,9 @@ class Outcome:
         error: root of the mean square of the distances in metres to the dataset's frame, over the free nodes.
         relative_error: `error` over the same root of the displacement of the dataset's frame. It says little where
             hardly anything has moved.
+        reaction_error, stress_error: of the force on the driven nodes and of the largest von Mises stress on the mesh
+            that was solved (nested iteration: on the dataset's), relative to those of the dataset's frame; infinite
+            without a solution, or where they are 0 there.
     """
 
     way: Way
@@ -137,6 +140,13 @@ class Outcome:
     position: np.ndarray | None = None
     error: float = math.inf
     relative_error: float = math.inf
+    reaction_error: float = math.inf
+    stress_error: float = math.inf
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """The relative errors by quantity."""
+        return {"displacement": self.relative_error, "reaction": self.reaction_error, "stress": self.stress_error}
 
     @property
     def converged(self) -> bool:

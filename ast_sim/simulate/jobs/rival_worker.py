@@ -22,9 +22,11 @@ import numpy as np
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.mechanics.case import Drawn, SolidCase
+from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.equilibria import Equilibria
 from ast_sim.mechanics.linearised_contact import CLEARANCE, NewtonSteps
 from ast_sim.mechanics.quasi_static import OneFrame, solve_frame
+from ast_sim.mechanics.reaction import Reaction
 from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.scene import Scene
 from ast_sim.simulate.families.known_families import family_module
@@ -112,6 +114,7 @@ class WaySolver:
         self.free = ~drawn.case.scene.prescribed
         self.rest = drawn.case.scene.rest_position.astype(np.float64)
         self.displacement = _root_mean_square((truth - self.rest)[self.free])
+        self._loads: dict[float, _Loads] = {}
         self._meshes: dict[float, tuple[SolidCase | str, float]] = {1.0: (drawn.case, 0.0)}
         self._solved: dict[Way, tuple[int, OneFrame]] = {}
         # The libraries are loaded in the first solution; nobody's time should hold that.
@@ -130,10 +133,12 @@ class WaySolver:
         more = way.newton or way.finished
         solved = self._best(lambda: self._continued(case, first, way)) if more else first
         position, error = None, np.inf
+        load_errors = np.inf, np.inf
         if solved.position is not None:
             own = way.nodes == 1 or more
             position = solved.position if own else self._on_own_mesh(case, solved.position)
             error = _root_mean_square((position - self.truth)[self.free])
+            load_errors = self._load_errors(1.0 if own else way.nodes, solved.position)
         return Outcome(
             way,
             solved.failure,
@@ -148,7 +153,24 @@ class WaySolver:
             position,
             error,
             error / max(self.displacement, np.finfo(float).tiny),
+            *load_errors,
         )
+
+    def _load_errors(self, share: float, position: np.ndarray) -> tuple[float, float]:
+        """Of the force and of the largest stress of positions on the mesh with this share of the nodes, relative to
+        those of the dataset's frame."""
+        true_force, true_stress = self._loads_on(1.0).at(self.truth)
+        force, stress = self._loads_on(share).at(position)
+        size = float(np.linalg.norm(true_force))
+        off = float(np.linalg.norm(force - true_force))
+        return off / size if size else np.inf, abs(stress - true_stress) / true_stress if true_stress else np.inf
+
+    def _loads_on(self, share: float) -> _Loads:
+        if share not in self._loads:
+            case, _ = self._meshes[share]
+            assert isinstance(case, SolidCase)
+            self._loads[share] = _Loads(case)
+        return self._loads[share]
 
     def _meshed(self, share: float) -> tuple[SolidCase | str, float]:
         """The scene with that share of the nodes, or why there is none; and the processor time of all tries."""
@@ -253,6 +275,21 @@ class WaySolver:
             elements = scene.elements[body == number]
             result[nodes] = self.rest[nodes] + transferred(rest, elements, position - rest, self.rest[nodes])
         return result
+
+
+class _Loads:
+    """The force on the driven nodes of a case, and its largest von Mises stress."""
+
+    def __init__(self, case: SolidCase) -> None:
+        self._reaction = Reaction(case.scene, Driven.of(case.scene, case.prescribed_position), case.material)
+        self._newton = _newton_steps(case)
+        self._location = case.stress_location
+        self._rows = case.scene.deforming(case.stress_location)
+
+    def at(self, position: np.ndarray) -> tuple[np.ndarray, float]:
+        """At positions [N,3]: the force [3], and the stress in pascal."""
+        stress = self._newton.von_mises(position, self._location)
+        return self._reaction.of(position), float(stress[self._rows].max())
 
 
 def _newton_steps(case: SolidCase) -> NewtonSteps:

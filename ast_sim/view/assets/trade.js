@@ -22,7 +22,7 @@ function tradeChart(part, sides, mesh) {
   }).concat(meshLine());
   const steps = Array.from({ length: 12 }, (_, power) => [1, 2, 5].map((digit) => digit * 10 ** (power - 4))).flat();
   const log = (spare) => ({ type: "log", rangemode: "normal", showgrid: true, tickvals: steps, ticktext: steps.map((step) => (spare && String(step).match(/[25]/) ? "" : String(step))) });
-  chart(host, () => [traces(), chartLayout("Milliseconds of an answer (median)", "Error (%)", { hovermode: "closest", xaxis: log(false), yaxis: log(true) })]);
+  chart(host, () => [traces(), chartLayout("Milliseconds of an answer (median)", "Error of the displacement (%)", { hovermode: "closest", xaxis: log(false), yaxis: log(true) })]);
 }
 
 // "20 ms: a setting" has its setting below, smaller.
@@ -37,8 +37,10 @@ function textRows(rows, cell = (text) => element("td", {}, text)) {
 
 function showTrade(data) {
   byId("trade-note").textContent = data.note;
-  byId("trade-tables").append(table(data.columns, textRows(data.rows, textCell), { className: "prices" }));
+  data.tables.forEach(({ name, rows, mesh }) => byId("trade-tables").append(
+    table(data.columns, textRows(rows, textCell), { title: name, className: "prices" }), mesh ? element("p", {}, `${mesh}.`) : "",
+  ));
   tradeChart(byId("trade-chart"), data.sides.filter(({ points }) => points.length), data.mesh);
-  const all = table(["Side", "Setting", "Error kept", "Median time", "Command"], textRows(data.settings), { className: "dense words" });
-  byId("trade-settings").append(element("details", {}, element("summary", {}, `All ${data.settings.length} settings`), all));
+  const all = table(data.settings.columns, textRows(data.settings.rows), { className: "dense words" });
+  byId("trade-settings").append(element("details", {}, element("summary", {}, `All ${data.settings.rows.length} settings`), all));
 }
