@@ -7,9 +7,6 @@ benchmarks/results/trade.json and docs/results/trade.md. Data and runs lie in `-
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import ast_sim
-from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.progress import duration
 from ast_sim.trade_figures import COLUMNS, TradeFigures
 from benchmarks.studies import jumps
+from benchmarks.studies.rows import study_rows
 
 RESULTS = Path(__file__).parents[1] / "results" / "trade.json"
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "trade.md"
@@ -60,7 +57,9 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
         run = ast_sim.example_run(row.run)
         data = ast_sim.generate(out=folder / f"{name}_fresh.h5", train=0, valid=0, test=row.scenes, **row.plates).path
     command = f"python -m benchmarks.studies.trade {name}"
-    by_quantity = ast_sim.trade(run, data, scenes=row.scenes, command=command).to_json()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of Newton steps that do not end: their errors count
+        by_quantity = ast_sim.trade(run, data, scenes=row.scenes, command=command).to_json()
     for figures in by_quantity.values():
         figures["origin"] |= {"run": run.path.name, "data": Path(data).name}
     return by_quantity
@@ -74,7 +73,7 @@ def page(results: dict[str, Any]) -> str:
         if name in results
     }
     lines = [line for title, by_quantity in shown.items() for line in _section(title, by_quantity)]
-    return "\n".join([_INTRODUCTION.rstrip(), *lines]) + "\n"
+    return "\n".join([_INTRODUCTION.rstrip(), *lines])
 
 
 _INTRODUCTION = """# What an error costs
@@ -127,22 +126,15 @@ def _table(figures: TradeFigures) -> list[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("rows", nargs="*", metavar="ROW", help="what is measured (default: all)")
-    parser.add_argument("--folder", type=Path, default=Path("build/trade"), help="data, runs (default: build/trade)")
-    asked = parser.parse_args(arguments)
-    unknown = set(asked.rows) - set(ROWS)
-    if unknown:
-        parser.error(f"there is no row {sorted(unknown)}: choose from {list(ROWS)}")
-    os.environ["OMP_NUM_THREADS"] = "1"  # of the generator's and the solver's processes
-    ast_sim.keep_memory()
-    results = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of Newton steps that do not end: their errors count
-        for name in asked.rows or ROWS:
-            results[name] = measured(name, asked.folder)
-            write_json(RESULTS, results)
-            write_text(PAGE, page(results))
+    study_rows(__doc__, ROWS, arguments, measured, _said, (RESULTS, PAGE), page)
+
+
+def _said(by_quantity: dict[str, Any]) -> str:
+    told = []
+    for quantity, values in by_quantity.items():
+        rows = TradeFigures.from_json(values).rows()
+        told.append(f"{quantity} {sum(row.verdict == 'the run' for row in rows)} of {len(rows)}")
+    return f"cells in which the run is ahead: {', '.join(told)}"
 
 
 if __name__ == "__main__":
