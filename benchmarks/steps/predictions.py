@@ -1,9 +1,9 @@
 """Times predictions of another state of this repository beside today's, in turns, and compares their answers.
 
-`python -m benchmarks.steps.predictions --before FOLDER`. FOLDER holds the other state, built in place. The run that
-comes with the package predicts the last frame of new plates of 400 and of 1,300 nodes, by one call alone and with one
-Newton step, on one thread. Each state has a process of its own. `processor` is the processor time of the process, which
-other work on the machine disturbs less.
+`python -m benchmarks.steps.predictions --before FOLDER [--json FILE]`. FOLDER holds the other state, built in place.
+The run that comes with the package predicts the last frame of new plates of 400 and of 1,300 nodes, by one call alone
+and with one Newton step, on one thread. Each state has a process of its own. `processor` is the processor time of the
+process, which other work on the machine disturbs less.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 
 from ast_sim.simulate.jobs.generate import generate
-from ast_sim.support.provenance import processor
+from ast_sim.support.disk import write_json
+from ast_sim.support.provenance import processor, provenance
 
 NODES = (400, 1300)
 NEWTON_STEPS = (0, 1)
@@ -78,13 +79,20 @@ def line_of(told: dict[str, dict[str, list[float]]]) -> str:
     return "; ".join(parts) + f"; positions differ by {far:.2g} roundings"
 
 
+def samples_of(told: dict[str, dict[str, list[float]]]) -> dict[str, dict[str, list[float]]]:
+    """The times of each state, without its positions."""
+    return {name: {clock: one[clock] for clock in ("clock", "processor")} for name, one in told.items()}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--before", type=Path, required=True, metavar="FOLDER", help="the other state, built in place")
     parser.add_argument("--repeats", type=int, default=40, help="samples of each state (%(default)s)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all samples here")
     arguments = parser.parse_args()
     trees = {"before": arguments.before.resolve(), "now": Path(__file__).resolve().parents[2]}
     print(f"{processor()}: at least, in parentheses the median")
+    rows = []
     with tempfile.TemporaryDirectory() as folder:
         for nodes in NODES:
             data = Path(folder) / f"plates{nodes}.h5"
@@ -92,6 +100,10 @@ def main() -> None:
             for newton_steps in NEWTON_STEPS:
                 told = compare(trees, data, newton_steps, arguments.repeats)
                 print(f"{nodes} nodes, {newton_steps} Newton steps: {line_of(told)}", flush=True)
+                rows.append({"nodes": nodes, "newton_steps": newton_steps, "milliseconds": samples_of(told)})
+    if arguments.json is not None:
+        command = " ".join(["python -m benchmarks.steps.predictions", *sys.argv[1:]])
+        write_json(arguments.json, {**provenance(command), "rows": rows})
 
 
 if __name__ == "__main__":
