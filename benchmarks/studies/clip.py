@@ -58,7 +58,7 @@ class Plan:
     calibration: int = 40
     steps: int = 3600
     settings: tuple[tuple[str, Any], ...] = (("mirror", ("y",)), ("stress_weight", 0.3))
-    seeds: tuple[int, ...] = (0,)
+    seeds: tuple[int, ...] = (0, 1)
 
 
 def features(drawn: Sequence[dict[str, Any]], known: Sequence[dict[str, Any]]) -> np.ndarray:
