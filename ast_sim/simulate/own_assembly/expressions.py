@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import math
 import operator
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -16,7 +17,7 @@ _OPERATORS: dict[type, Callable[..., float]] = {
     ast.Sub: operator.sub,
     ast.Mult: operator.mul,
     ast.Div: operator.truediv,
-    ast.Pow: operator.pow,
+    ast.Pow: math.pow,  # in floating point: as a whole number, 9 ** 9 ** 9 has 370 million digits
     ast.USub: operator.neg,
     ast.UAdd: operator.pos,
 }
@@ -78,13 +79,15 @@ def expression(key: str, value: Any, known: Iterable[str]) -> Expression:
         known: the names of the parameters.
 
     Raises:
-        ConfigError: it is neither, uses anything but arithmetic, or names an unknown parameter (the text gives the
-            nearest one).
+        ConfigError: it is neither, uses anything but arithmetic, is not finite, or names an unknown parameter (the text
+            gives the nearest one).
     """
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         raise ConfigError(f"{key} is {value!r}; must be a number or an expression such as '-travel'")
     if not isinstance(value, str):
-        return _finite(Expression(key, repr(float(value))))
+        if not abs(value) <= sys.float_info.max:
+            raise ConfigError(f"{key} is {value}; must be finite")
+        return Expression(key, repr(float(value)))
     try:
         if len(value) > _MOST_LETTERS:
             raise ValueError("it is too long")
@@ -97,16 +100,13 @@ def expression(key: str, value: Any, known: Iterable[str]) -> Expression:
     known = list(known)
     for name in sorted(parsed.names - set(known)):
         raise ConfigError(f"{key} = {value!r}: there is no parameter {name!r}{nearest_name(name, known)}")
-    return _finite(parsed) if not parsed.names else parsed
-
-
-def _finite(parsed: Expression) -> Expression:
-    parsed({})
+    if not parsed.names:
+        parsed({})
     return parsed
 
 
 def _check(node: ast.expr) -> None:
-    if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load):
+    if isinstance(node, ast.Name) and node.id not in FUNCTIONS:
         return
     if isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool):
         return
