@@ -106,33 +106,29 @@ def expression(key: str, value: Any, known: Iterable[str]) -> Expression:
 
 
 def _check(node: ast.expr) -> None:
-    if isinstance(node, ast.Name) and node.id not in FUNCTIONS:
-        return
-    if isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool):
-        return
-    if isinstance(node, ast.BinOp) and type(node.op) in _OPERATORS:
-        _check(node.left)
-        _check(node.right)
-    elif isinstance(node, ast.UnaryOp) and type(node.op) in _OPERATORS:
-        _check(node.operand)
-    elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in FUNCTIONS:
-        if node.keywords or not node.args:
-            raise ValueError(f"{node.func.id} takes numbers")
-        for argument in node.args:
-            _check(argument)
-    else:
-        raise ValueError(f"{ast.unparse(node)!r} is not allowed; functions are {', '.join(FUNCTIONS)}")
+    number = isinstance(node, ast.Constant) and type(node.value) in (int, float)
+    if not number and not (isinstance(node, ast.Name) and node.id not in FUNCTIONS):
+        for operand in _operation(node)[1]:
+            _check(operand)
 
 
-def _value(node: ast.expr, values: Mapping[str, Any]) -> float:
+def _value(node: ast.expr, values: Mapping[str, Any]) -> Any:
     if isinstance(node, ast.Name):
         return values[node.id]
-    if isinstance(node, ast.BinOp):
-        return _OPERATORS[type(node.op)](_value(node.left, values), _value(node.right, values))
-    if isinstance(node, ast.UnaryOp):
-        return _OPERATORS[type(node.op)](_value(node.operand, values))
-    if isinstance(node, ast.Call):
-        assert isinstance(node.func, ast.Name)
-        return FUNCTIONS[node.func.id](*(_value(argument, values) for argument in node.args))
-    assert isinstance(node, ast.Constant)
-    return node.value  # pyright: ignore[reportReturnType]
+    if isinstance(node, ast.Constant):
+        return node.value
+    compute, operands = _operation(node)
+    return compute(*(_value(operand, values) for operand in operands))
+
+
+def _operation(node: ast.expr) -> tuple[Callable[..., float], list[ast.expr]]:
+    """What a node computes, and of which operands. Raises ValueError if it is no arithmetic."""
+    if isinstance(node, ast.BinOp) and type(node.op) in _OPERATORS:
+        return _OPERATORS[type(node.op)], [node.left, node.right]
+    if isinstance(node, ast.UnaryOp) and type(node.op) in _OPERATORS:
+        return _OPERATORS[type(node.op)], [node.operand]
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in FUNCTIONS:
+        if node.keywords or not node.args:
+            raise ValueError(f"{node.func.id} takes numbers")
+        return FUNCTIONS[node.func.id], node.args
+    raise ValueError(f"{ast.unparse(node)!r} is not allowed; functions are {', '.join(FUNCTIONS)}")
