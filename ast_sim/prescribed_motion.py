@@ -131,10 +131,11 @@ class RigidMotion:
         return way / way[-1], corners[kept]
 
     def _rotated(self, s: float) -> np.ndarray:
-        """R(s) [3, 3] = I + sin(angle) K + (1 - cos(angle)) K^2, where K v = axis x v (Rodrigues)."""
-        angle = np.radians(self.rotation) * s
-        cross = np.cross(np.eye(3), np.asarray(self.axis) / np.linalg.norm(self.axis))
-        return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
+        """R(s) [3, 3]."""
+        from scipy.spatial.transform import Rotation
+
+        axis = np.asarray(self.axis) / np.linalg.norm(self.axis)
+        return Rotation.from_rotvec(np.radians(self.rotation) * s * axis).as_matrix()
 
 
 @dataclass(frozen=True, eq=False)

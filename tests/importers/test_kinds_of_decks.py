@@ -7,6 +7,7 @@ import pytest
 from blocks import block
 
 from ast_sim import cli
+from ast_sim.importers.decks.deck_mesh import deck_mesh
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.importers.scene_mesh import read_scene
 from ast_sim.importers.series import FieldNames, read_series
@@ -66,6 +67,29 @@ def test_rigid_elements_of_their_own_become_an_obstacle(tmp_path, kind, cells):
     assert (read.scene.node_type[read.scene.body == 1] == NodeType.OBSTACLE).all()
     front = read.scene.rest_position[read.scene.body == 1][:4]
     assert (front[:, 2] == 1.5).all()
+
+
+def test_an_instance_is_moved_and_then_turned_counter_clockwise(tmp_path):
+    path = tmp_path / "deck.inp"
+    path.write_text("""*PART, NAME=A
+*NODE
+1, 0, 0, 0
+2, 1, 0, 0
+3, 0, 1, 0
+4, 0, 0, 1
+*ELEMENT, TYPE=C3D4
+1, 1, 2, 3, 4
+*END PART
+*ASSEMBLY, NAME=B
+*INSTANCE, NAME=C, PART=A
+5, 0, 0
+1, 1, 0, 1, 1, 7, 90
+*END INSTANCE
+*END ASSEMBLY
+""")
+    # (x, y) + (5, 0) about (1, 1): (5, 0) - (1, 1) = (4, -1) goes to (1, 4), and (1, 1) is added again
+    points = deck_mesh(path).points
+    np.testing.assert_allclose(points, [[2, 5, 0], [2, 6, 0], [1, 5, 0], [2, 5, 1]], atol=1e-12)
 
 
 @pytest.mark.parametrize("keyword", ["NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "IMPORT", "PARAMETER"])

@@ -284,6 +284,8 @@ def _from_angles(points: np.ndarray, spherical: bool) -> np.ndarray:
 
 def _placement(keyword: Keyword) -> tuple[np.ndarray, np.ndarray]:
     """Rotation and shift of an instance: it is first moved, then turned about the axis from one point to another."""
+    from scipy.spatial.transform import Rotation
+
     rows = [[real(text, line) for text in (*tokens(line), *[""] * 7)[:7]] for line in keyword.data]
     if len(rows) > 2:
         raise keyword.error("has more than two data lines")
@@ -296,7 +298,5 @@ def _placement(keyword: Keyword) -> tuple[np.ndarray, np.ndarray]:
     length = np.linalg.norm(end - start)
     if not length > 0:
         raise keyword.error("the axis of the rotation has no length")
-    x, y, z = (end - start) / length
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    rotation = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    rotation = Rotation.from_rotvec(angle * (end - start) / length).as_matrix()
     return rotation, rotation @ (shift - start) + start

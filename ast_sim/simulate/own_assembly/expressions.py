@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import math
 import operator
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -16,7 +17,7 @@ _OPERATORS: dict[type, Callable[..., float]] = {
     ast.Sub: operator.sub,
     ast.Mult: operator.mul,
     ast.Div: operator.truediv,
-    ast.Pow: operator.pow,
+    ast.Pow: math.pow,  # in floating point: as a whole number, 9 ** 9 ** 9 has 370 million digits
     ast.USub: operator.neg,
     ast.UAdd: operator.pos,
 }
@@ -78,13 +79,15 @@ def expression(key: str, value: Any, known: Iterable[str]) -> Expression:
         known: the names of the parameters.
 
     Raises:
-        ConfigError: it is neither, uses anything but arithmetic, or names an unknown parameter (the text gives the
-            nearest one).
+        ConfigError: it is neither, uses anything but arithmetic, is not finite, or names an unknown parameter (the text
+            gives the nearest one).
     """
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         raise ConfigError(f"{key} is {value!r}; must be a number or an expression such as '-travel'")
     if not isinstance(value, str):
-        return _finite(Expression(key, repr(float(value))))
+        if not abs(value) <= sys.float_info.max:
+            raise ConfigError(f"{key} is {value}; must be finite")
+        return Expression(key, repr(float(value)))
     try:
         if len(value) > _MOST_LETTERS:
             raise ValueError("it is too long")
@@ -97,42 +100,35 @@ def expression(key: str, value: Any, known: Iterable[str]) -> Expression:
     known = list(known)
     for name in sorted(parsed.names - set(known)):
         raise ConfigError(f"{key} = {value!r}: there is no parameter {name!r}{nearest_name(name, known)}")
-    return _finite(parsed) if not parsed.names else parsed
-
-
-def _finite(parsed: Expression) -> Expression:
-    parsed({})
+    if not parsed.names:
+        parsed({})
     return parsed
 
 
 def _check(node: ast.expr) -> None:
-    if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load):
-        return
-    if isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool):
-        return
-    if isinstance(node, ast.BinOp) and type(node.op) in _OPERATORS:
-        _check(node.left)
-        _check(node.right)
-    elif isinstance(node, ast.UnaryOp) and type(node.op) in _OPERATORS:
-        _check(node.operand)
-    elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in FUNCTIONS:
-        if node.keywords or not node.args:
-            raise ValueError(f"{node.func.id} takes numbers")
-        for argument in node.args:
-            _check(argument)
-    else:
-        raise ValueError(f"{ast.unparse(node)!r} is not allowed; functions are {', '.join(FUNCTIONS)}")
+    number = isinstance(node, ast.Constant) and type(node.value) in (int, float)
+    if not number and not (isinstance(node, ast.Name) and node.id not in FUNCTIONS):
+        for operand in _operation(node)[1]:
+            _check(operand)
 
 
-def _value(node: ast.expr, values: Mapping[str, Any]) -> float:
+def _value(node: ast.expr, values: Mapping[str, Any]) -> Any:
     if isinstance(node, ast.Name):
         return values[node.id]
-    if isinstance(node, ast.BinOp):
-        return _OPERATORS[type(node.op)](_value(node.left, values), _value(node.right, values))
-    if isinstance(node, ast.UnaryOp):
-        return _OPERATORS[type(node.op)](_value(node.operand, values))
-    if isinstance(node, ast.Call):
-        assert isinstance(node.func, ast.Name)
-        return FUNCTIONS[node.func.id](*(_value(argument, values) for argument in node.args))
-    assert isinstance(node, ast.Constant)
-    return node.value  # pyright: ignore[reportReturnType]
+    if isinstance(node, ast.Constant):
+        return node.value
+    compute, operands = _operation(node)
+    return compute(*(_value(operand, values) for operand in operands))
+
+
+def _operation(node: ast.expr) -> tuple[Callable[..., float], list[ast.expr]]:
+    """What a node computes, and of which operands. Raises ValueError if it is no arithmetic."""
+    if isinstance(node, ast.BinOp) and type(node.op) in _OPERATORS:
+        return _OPERATORS[type(node.op)], [node.left, node.right]
+    if isinstance(node, ast.UnaryOp) and type(node.op) in _OPERATORS:
+        return _OPERATORS[type(node.op)], [node.operand]
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in FUNCTIONS:
+        if node.keywords or not node.args:
+            raise ValueError(f"{node.func.id} takes numbers")
+        return FUNCTIONS[node.func.id], node.args
+    raise ValueError(f"{ast.unparse(node)!r} is not allowed; functions are {', '.join(FUNCTIONS)}")

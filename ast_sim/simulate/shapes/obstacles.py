@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ast_sim.simulate.shapes import mesh
 
@@ -71,10 +72,5 @@ def draw_obstacle(rng: np.random.Generator, cells: int) -> tuple[str, np.ndarray
     position, elements = SHAPES[shape](rng.uniform(0.035, 0.075, 3), cells)
     yaw, tilt, about = rng.uniform(0, np.pi), rng.uniform(0, 0.2), rng.uniform(0, 2 * np.pi)
     axis = np.array([np.cos(about), np.sin(about), 0])
-    return shape, position @ _rotation(np.array([0, 0, 1]), yaw).T @ _rotation(axis, tilt).T, elements
-
-
-def _rotation(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Rotation matrix about a unit axis (Rodrigues)."""
-    cross = np.cross(np.eye(3), -axis)
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    turn = Rotation.from_rotvec(-tilt * axis) * Rotation.from_rotvec([0, 0, -yaw])  # clockwise
+    return shape, turn.apply(position), elements
