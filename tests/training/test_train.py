@@ -594,7 +594,7 @@ def test_metrics_survive_a_line_that_was_cut_off(tmp_path):
     metrics.append({"step": 3, "valid_rmse": 0.5})
     with open(metrics.path, "a") as file:
         file.write('{"step": 4, "lo')
-    with pytest.warns(UserWarning, match=r"metrics.jsonl: line 5 is damaged and left out"):
+    with pytest.warns(UserWarning, match=r"metrics.jsonl: 1 of 5 lines are damaged and left out, the first is line 5"):
         assert [record["step"] for record in metrics] == [1, 2, 3, 3]
     with pytest.warns(UserWarning, match="line 5"):
         metrics.forget_after(2)
