@@ -148,8 +148,8 @@ class JumpingScene:
         question, self.given = self.question, self.model.config.data.given_frames
         self.prescribed_position = torch.tensor(question.prescribed_position)
         self.fields = question.given_fields(self.model.config.data, self.given)
-        self.history = self.model.config.history
         scheme = self.model.config.scheme
+        self.history = scheme.history
         sources = scheme.sources(question.prescribed_position, question.scene.prescribed)
         by_number: dict[int, JumpingFrame] = {}
         for number in scheme.computed(question.wanted(), sources):
