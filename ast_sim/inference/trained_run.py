@@ -63,7 +63,7 @@ class Run:
         self.model = self.folder.load_model()
         self.step = self.folder.chosen.step
         answers = self.folder.chosen.answers
-        unset = {"corrections": (self.settings.train.calls or 1) - 1}
+        unset = {"corrections": self.settings.train.corrections}
         self.effort = Effort(**answers.get("effort", unset))
         self.calibration = Calibration.of_run(self.path, answers)
         self._errors = [EffortErrors.from_json(one) for one in answers.get("valid_by_effort", [])]

@@ -237,7 +237,7 @@ def test_the_setting_survives_toml_and_is_off_where_it_is_left_out(model):
 
 @pytest.mark.parametrize("model", ["ast", "transolver", "mgn"])
 def test_training_brings_the_error_below_holding_still(model, data, tmp_path):
-    settings = ["train.steps=120", "train.validate_every=120", "train.peak_rate=2e-3", "train.calls=2"]
+    settings = ["train.steps=120", "train.validate_every=120", "train.peak_rate=2e-3", "train.corrections=1"]
     start_training(tmp_path / "run", configure(data, "tiny", settings, model=model))
     made = read_config(tmp_path / "run")
     assert made.train.noise == 0.0 and made.model.jumps  # a guess has errors of the model's own

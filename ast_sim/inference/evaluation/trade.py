@@ -119,7 +119,7 @@ def _measured(
     command: str,
     progress: ShowProgress,
 ) -> TradeFigures:
-    efforts = choices(run.settings.model, run.settings.train.calls) or (run.effort,)
+    efforts = choices(run.settings.model, run.settings.train.corrections) or (run.effort,)
     own: dict[Effort, list[tuple[float, float]]] = {effort: [] for effort in efforts}
     ways: dict[str, list[tuple[float, float]]] = {}
     no_solver = ""

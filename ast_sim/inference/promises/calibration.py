@@ -244,7 +244,7 @@ class _Measured(NamedTuple):
 
 def _measured(run: Run, dataset: Dataset, split: str, progress: ShowProgress) -> tuple[Calibration, list[str]]:
     """The calibration by the scenes of a split, and the names of those that do not count."""
-    to_choose = choices(run.settings.model, run.settings.train.calls)
+    to_choose = choices(run.settings.model, run.settings.train.corrections)
     efforts = to_choose if run.effort in to_choose else (*to_choose, run.effort)
     scenes: list[_Measured] = []
     left_out: list[str] = []
