@@ -126,3 +126,8 @@ def ranges(numbers: Iterable[int]) -> str:
         else:
             runs.append([number])
     return ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs)
+
+
+def point(x: Iterable[float]) -> str:
+    """A point as text: (0.1, 2, 3)."""
+    return "(" + ", ".join(f"{value:.6g}" for value in x) + ")"

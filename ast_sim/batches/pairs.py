@@ -15,9 +15,9 @@ from ast_sim.batches.batch_builder import Batch, State, Target
 from ast_sim.batches.carry import Carrier
 from ast_sim.batches.graph import Graph
 from ast_sim.batches.mirror_and_shift import Placement
-from ast_sim.batches.turning_points import jump_sources
+from ast_sim.batches.scheme import Scheme
 from ast_sim.dataset.reader import Dataset
-from ast_sim.named_field import STRESS, Output, require_fields
+from ast_sim.named_field import STRESS, require_fields
 from ast_sim.scene import Scene
 from ast_sim.support.byte_cache import ByteCache, cache_bytes
 from ast_sim.support.errors import DatasetError
@@ -37,7 +37,7 @@ class _Member:
     center: [3] float32, the middle of the box around the scene at rest.
     carry: moves a state along with the prescribed nodes; None if frames are predicted step by step.
     fields: [S, N or E, *] float32 of each named field to predict.
-    sources: [S] int64, the frame that a jump to each frame starts from.
+    sources: [S] int64, the frame that each frame is predicted from.
     """
 
     graph: Graph
@@ -95,10 +95,9 @@ class PairSampler:
     A DataLoader of torch takes it, too, as a map-style dataset: `DataLoader(pairs, batch_size=4, shuffle=True,
     collate_fn=pairs.collate)`. The loader then chooses the pairs.
 
-    With `jumps`, t + 1 is predicted from the first frame, carried along. There is no noise; instead, half of the pairs
-    start from a guess that has a random share of the error of this start, as a correction does. With `history`, t + 1
-    is predicted from the last frame before in which the motion turns back, if it does, and from the values of these
-    outputs there.
+    The `scheme` says what t + 1 is predicted from: frame t, or, by a jump, an earlier frame, carried along. In jumps
+    there is no noise; instead, half of the pairs start from a guess that has a random share of the error of this start,
+    as a correction does.
 
     White Gaussian noise n of standard deviation `noise` (in the unit of length) is added to p_t of the NORMAL nodes.
     The next position in the target is p_{t+1} + (1 - gamma) n (MeshGraphNets, add_noise), so the target is
@@ -132,22 +131,20 @@ class PairSampler:
         seed: int,
         noise: float,
         make_graph: Callable[[Scene], Graph],
-        dynamic: bool,
+        scheme: Scheme,
         gamma: float,
         part: tuple[int, int] = (0, 1),
-        jumps: bool = False,
         mirror: tuple[str, ...] = (),
         shift: float = 0.0,
         fields: tuple[tuple[str, str, int, str], ...] = (),
-        history: tuple[Output, ...] | None = None,
         scenes: int | None = None,
     ) -> None:
         self.batch_size, self.seed, self.noise = batch_size, seed, noise
         self.left = np.float32(1 - gamma)  # share of the noise that stays in the target
         self._dataset, self._split, self.part = dataset, split, part
-        self._make_graph, self.dynamic = make_graph, dynamic
-        self.first_frame = 1 if dynamic else 0  # the least t of a pair: the acceleration needs a frame before it
-        self._jumps, self._fields, self._history = jumps, fields, history
+        self._make_graph, self._fields = make_graph, fields
+        self.scheme = scheme
+        self.first_frame = scheme.given_frames - 1  # the least t of a pair
         self._mirrored = np.array([axis in mirror for axis in "xyz"])
         self._shift = np.float32(shift)
         chosen = range(dataset.count(split))[:scenes]
@@ -207,7 +204,7 @@ class PairSampler:
         index = int(np.searchsorted(self._starts, number, side="right")) - 1
         t = number - int(self._starts[index]) + self.first_frame
         placement = self.random_placement(index, self.random(_PLACE, epoch, number))
-        if self._jumps:
+        if self.scheme.jumps:
             draw = self.random(_NOISE, epoch, number).random()
             return Jump(index, self.source(index, t + 1), t + 1, placement, share=min(2 * draw, 1.0))
         noise = self.white_noise(index, self.random(_NOISE, epoch, number))
@@ -255,8 +252,8 @@ class PairSampler:
         position, previous, motion = (self._jump if jumps else self._step)(pair, member, before, after)
         known = self._values(member, stress, -1, source)
         state = State(torch.from_numpy(position), previous, known.get(STRESS))
-        if self._history is not None:
-            history = member.graph.at_nodes(self._history, known)
+        if self.scheme.history is not None:
+            history = member.graph.at_nodes(self.scheme.history, known)
             state = replace(state, source=torch.tensor(before[-1]), history=history)
         target = Target(torch.from_numpy(motion), self._values(member, next_stress, 0, frame))
         names = [f"{name} frame {frame if jumps else source}"]
@@ -282,7 +279,7 @@ class PairSampler:
         before, now = position[0], position[-1]
         error, error_after = pair.error * member.noisy, pair.error_after * member.noisy
         motion, previous = after - now + (error_after - error), None
-        if self.dynamic:
+        if self.scheme.has_inertia:
             if pair.error_before is not None:
                 before = before + pair.error_before * member.noisy
             motion -= now - before + error
@@ -308,16 +305,15 @@ class PairSampler:
         scene = self._dataset.scene(self._split, index)
         noisy = np.repeat(~scene.prescribed[:, None], 3, axis=1).astype(np.float32)
         count = self._dataset.num_frames(self._split, index)
-        sources = np.full(count, self.first_frame)
+        position = np.broadcast_to(scene.rest_position, (count, *scene.rest_position.shape))
         plane = not scene.rest_position[:, 2].any()
-        if plane or self._history is not None:  # only here must the whole trajectory be read
+        if plane or self.scheme.turns:  # else the motion does not matter here, and the trajectory need not be read
             position, _ = self._dataset.frames(self._split, index, 0, count)
-            if plane:
-                noisy[:, 2] *= position[:, :, 2].any()
-            if self._history is not None:
-                sources = jump_sources(position, scene.prescribed)
+        if plane:
+            noisy[:, 2] *= position[:, :, 2].any()
+        sources = self.scheme.sources(position, scene.prescribed)
         center = (scene.rest_position.min(0) + scene.rest_position.max(0)) / 2
-        carry = Carrier(scene) if self._jumps else None
+        carry = Carrier(scene) if self.scheme.jumps else None
         return _Member(self._make_graph(scene), noisy, center, carry, self._read_fields(index), sources)
 
     def _read_fields(self, index: int) -> list[np.ndarray]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ast_sim.batches.turning_points import jump_sources
+from ast_sim.named_field import Output
 
 
 @dataclass(frozen=True)
@@ -18,12 +19,23 @@ class Scheme:
         jumps: a frame is predicted at once from an earlier one, which is carried along with the prescribed nodes; else
             from the frame before.
         given_frames: the first frames of a scene, which are not predicted.
-        turns: a jump starts from the last frame in which the motion turned back, if it did; else from the first one.
+        history: a jump starts from the last frame in which the motion turned back, if it did, and knows these outputs
+            there; None: it starts from the first one.
     """
 
     jumps: bool
     given_frames: int = 1
-    turns: bool = False
+    history: tuple[Output, ...] | None = None
+
+    @property
+    def turns(self) -> bool:
+        """Whether a jump may start from a later frame than the first one."""
+        return self.history is not None
+
+    @property
+    def has_inertia(self) -> bool:
+        """Whether a frame follows from two frames before it."""
+        return self.given_frames > 1
 
     @property
     def corrects(self) -> bool:

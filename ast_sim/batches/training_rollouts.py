@@ -74,7 +74,7 @@ class RolloutPool(Pool):
     def _led_back(self, scene: _Rolling) -> np.ndarray:
         """How much of the error that the last step left in p_t the target leaves in p_{t+1}."""
         left = self._sampler.left
-        if not self._sampler.dynamic:
+        if not self._sampler.scheme.has_inertia:
             return left * scene.error
         before = np.float32(0) if scene.error_before is None else scene.error_before
         return 2 * left * scene.error - left**2 * before
@@ -82,6 +82,6 @@ class RolloutPool(Pool):
     def _goes_on(self, scene: _Rolling, error: np.ndarray) -> bool:
         scene.t += 1
         error = error + scene.pair.error_after  # the residual counts from the target, which has an error of its own
-        before = scene.pair.error if self._sampler.dynamic else None
+        before = scene.pair.error if self._sampler.scheme.has_inertia else None
         scene.error, scene.error_before = (None, None) if self._lost(error) else (error, before)
         return scene.t < self._sampler.last_frame(scene.index)

@@ -93,14 +93,17 @@ def read_meta(path: Path) -> Meta:
 
 def _read_json(path: Path) -> Any:
     try:
-        if path.stat().st_size > LARGEST:
-            raise DatasetError(
-                f"{path}: has {path.stat().st_size} bytes; no meta.json of a data set has above {LARGEST}"
-            )
-        return json.loads(path.read_bytes())
+        size = path.stat().st_size
+        content = path.read_bytes() if size <= LARGEST else b""
     except FileNotFoundError as error:
         raise DatasetError(f"{path} is missing; it says what is in the records: download it too") from error
-    except (OSError, ValueError, RecursionError) as error:
+    except OSError as error:  # its text would name the file again
+        raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if size > LARGEST:
+        raise DatasetError(f"{path}: has {size} bytes; no meta.json of a data set has above {LARGEST}")
+    try:
+        return json.loads(content)
+    except (ValueError, RecursionError) as error:
         raise DatasetError(f"{path}: cannot be read as JSON: {error}") from error
 
 

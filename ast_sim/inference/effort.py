@@ -161,14 +161,14 @@ def can_be_solved(config: ModelConfig) -> bool:
     return can_make_newton_steps(config) and config.data.contact_range > 0
 
 
-def choices(config: ModelConfig, calls: int | None) -> tuple[Effort, ...]:
+def choices(config: ModelConfig, corrections: int) -> tuple[Effort, ...]:
     """The efforts among which one is chosen for an asked error or time, from the cheapest to the dearest, for a model
-    that was trained for so many calls: a Newton step costs more than a correction, and the solver most. With friction
-    the solver is left to be asked for: it takes its whole way. None for a model that does not jump."""
+    that was trained for so many corrections: a Newton step costs more than a correction, and the solver most. With
+    friction the solver is left to be asked for: it takes its whole way. None for a model that does not jump."""
     if not config.scheme.corrects:
         return ()
     steps = CHOSEN_STEPS if can_make_newton_steps(config) else (0,)
-    efforts = tuple(Effort(corrections, count) for count in steps for corrections in range(calls or 1))
+    efforts = tuple(Effort(made, count) for count in steps for made in range(corrections + 1))
     frictionless = not config.data.friction and FRICTION not in config.data.columns
     return (*efforts, Effort.exact()) if frictionless and can_be_solved(config) else efforts
 

@@ -22,7 +22,7 @@ from ast_sim.models.simulator import Simulator
 from ast_sim.named_field import STRESS, require_fields
 from ast_sim.number_arrays import ranges
 from ast_sim.prescribed_motion import Motion, RigidMotion, Vector, frames_for
-from ast_sim.runs.scope import Scope
+from ast_sim.runs.scope import Scope, spacing_of
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.support.errors import ConfigError, DatasetError
 from ast_sim.support.progress import ShowProgress
@@ -91,14 +91,13 @@ def new_question(
 
 def _require_resolved(scene: Scene, name: str) -> None:
     """Raise DatasetError if single precision does not tell the nodes apart where the scene lies."""
-    position = scene.rest_position
-    coarse = float(np.spacing(np.abs(position).max()))
-    edges = np.linalg.norm(position[scene.elements[:, 0]] - position[scene.elements[:, 1]], axis=1)
-    if coarse > LEAST_RESOLVED * edges.mean():
+    farthest = np.abs(scene.rest_position).max()
+    coarse = float(np.spacing(farthest))
+    spacing = spacing_of(scene)
+    if coarse > LEAST_RESOLVED * spacing:
         raise DatasetError(
-            f"{name} lies {np.abs(position).max():.3g} from the origin, where single precision keeps steps of"
-            f" {coarse:.2g}, and its edges have a mean length of {edges.mean():.2g}: move it to the origin before its"
-            " positions are rounded"
+            f"{name} lies {farthest:.3g} from the origin, where single precision keeps steps of {coarse:.2g}, and its"
+            f" edges have a mean length of {spacing:.2g}: move it to the origin before its positions are rounded"
         )
 
 

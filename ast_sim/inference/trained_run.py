@@ -63,7 +63,7 @@ class Run:
         self.model = self.folder.load_model()
         self.step = self.folder.chosen.step
         answers = self.folder.chosen.answers
-        unset = {"corrections": (self.settings.train.calls or 1) - 1}
+        unset = {"corrections": self.settings.train.corrections}
         self.effort = Effort(**answers.get("effort", unset))
         self.calibration = Calibration.of_run(self.path, answers)
         self._errors = [EffortErrors.from_json(one) for one in answers.get("valid_by_effort", [])]
@@ -133,12 +133,12 @@ class Run:
         stress: np.ndarray | None = None,
         name: str = "scene",
         throw: bool = True,
+        progress: ShowProgress = True,
     ) -> Answer:
         """Predict a scene. Its true trajectory need not be known.
 
-        The scene may lie anywhere: if it leaves the model's domain, it is moved to the middle of the domain, predicted
-        and moved back. A property outside its range in the training scenes gives a warning, and so do Newton steps that
-        have not converged, and each way in which a specification differs from the one of the training.
+        A scene outside the model's domain is moved there, predicted and moved back. Warnings tell of properties outside
+        their ranges in training, of Newton steps that have not converged, and of changes of the specification.
 
         Args:
             scene: a scene, with lengths in the run's unit, or what `read_scene` returns. Or a `Trajectory`, which has
@@ -157,7 +157,7 @@ class Run:
             ms: instead, at most how long it takes, in milliseconds on this machine.
             num_frames: S, only for rigid motions; by default the prescribed nodes move as far in one as in training.
             stress, name: [given, N or E, 1] in pascal, of the given frames, by default zero; a name for messages.
-            throw: raise an error if the prediction fails; else the answer says why in `failure`.
+            throw, progress: raise an error if it fails, else the answer's `failure` says why; as in `generate`.
 
         Raises:
             ConfigError: motion and scene, or scene and run, do not fit; or no effort keeps the error.
@@ -176,7 +176,7 @@ class Run:
             raise ConfigError("give a scene, or a specification with its parameters and nodes")
         question = new_question(self.settings.model, self.scope, scene, motion, num_frames, name, frames, stress, notes)
         chosen, promises = chosen_effort(self, [question], effort, error, ms)
-        return self._answers([question], chosen, began, throw, [{**facts, **promises[0]}])[0]
+        return self._answers([question], chosen, began, throw, [{**facts, **promises[0]}], progress)[0]
 
     def sweep(
         self,
@@ -261,7 +261,7 @@ class Run:
         began: float,
         throw: bool,
         facts: Sequence[Mapping[str, Any]],
-        progress: ShowProgress = False,
+        progress: ShowProgress,
     ) -> list[Answer]:
         """The answers with their units, their origin, to which `facts` of each belong, and the error that is to be
         expected. What is unusual is told as warnings; `began` is when the questions were asked."""

@@ -249,14 +249,14 @@ class Contact:
     def gap(self, position: np.ndarray) -> float:
         """Smallest distance in metres between surfaces that are kept apart; infinite if there are none."""
         vertices = self._vertices(position)
-        radius = self._dhat
         extent = np.linalg.norm(np.ptp(vertices, axis=0))
+        # Each search finds all pairs within its radius; a wide one of close surfaces would find far too many.
+        radius = 0.0
         collisions = self._new_collisions()
-        while collisions.empty() and radius < 8 * extent:
+        while collisions.empty() and radius <= extent:
+            radius = max(self._dhat, 4 * radius)
             collisions.build(self._mesh, vertices, radius, 0.0, self._broad_phase)
-            radius *= 4
-        square = collisions.compute_minimum_distance(self._mesh, vertices)  # so ipctk gives it
-        return float(np.sqrt(square)) / self._zoom
+        return math.sqrt(collisions.compute_minimum_distance(self._mesh, vertices)) / self._zoom  # ipctk gives squares
 
     def area(self, state: ContactState) -> float:
         """Rest area in square metres around the surface nodes on which a barrier acts. It is the mean of both sides."""

@@ -105,7 +105,7 @@ class ModelConfig:
     @property
     def scheme(self) -> Scheme:
         """How the model predicts, when nothing is left open."""
-        return Scheme(bool(self.jumps), self.data.given_frames, turns=self.history is not None)
+        return Scheme(bool(self.jumps), self.data.given_frames, self.history)
 
     @property
     def history(self) -> tuple[Output, ...] | None:

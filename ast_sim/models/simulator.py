@@ -140,9 +140,7 @@ class Simulator(nn.Module):
             options: seed (0 by default), noise (0), gamma (1), mirror, shift, scenes and part, as of `PairSampler`.
         """
         options = {"seed": 0, "noise": 0.0, "gamma": 1.0, **options, "batch_size": batch_size}
-        data = self.config.data
-        of_model = {"make_graph": self.graph, "dynamic": data.dynamic, "jumps": self.config.scheme.jumps}
-        of_model |= {"fields": data.fields, "history": self.config.history}
+        of_model = {"make_graph": self.graph, "scheme": self.config.scheme, "fields": self.config.data.fields}
         return PairSampler(dataset, split, **of_model, **options)
 
     @property

@@ -112,7 +112,7 @@ def worth(
         warnings.simplefilter("ignore")  # its weights are of no use; only its time counts
         for _ in range(1 + ASKED):
             began = time.process_time()
-            run.predict(truth, effort=Effort(), throw=False)
+            run.predict(truth, effort=Effort(), throw=False, progress=False)
             seconds.append(time.process_time() - began)
     steps = int(60 * minutes / trial.seconds)
     options = {"--nodes": nodes, "--frames": frames, "--solver": solver}

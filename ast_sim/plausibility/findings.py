@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ast_sim.number_arrays import point
+
 _PLACES = 3  # so many places are named
 
 
@@ -66,7 +68,3 @@ def places(kind: str, rows: np.ndarray, points: np.ndarray | None = None) -> str
     shown = ", ".join(str(row) for row in rows[:_PLACES].tolist()) + (", ..." if len(rows) > _PLACES else "")
     at = f", the first at {point(points[0])}" if points is not None and len(points) else ""
     return f"{kind} {shown}{at}"
-
-
-def point(x: np.ndarray) -> str:
-    return "(" + ", ".join(f"{value:.4g}" for value in x) + ")"

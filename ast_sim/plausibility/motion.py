@@ -11,7 +11,8 @@ import math
 import numpy as np
 
 from ast_sim.element_topology import signed_volumes
-from ast_sim.plausibility.findings import Finding, places, point
+from ast_sim.number_arrays import point
+from ast_sim.plausibility.findings import Finding, places
 from ast_sim.plausibility.topology import at_rest
 from ast_sim.scene import Scene, Trajectory
 

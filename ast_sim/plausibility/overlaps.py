@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ast_sim.plausibility.findings import Finding, point
+from ast_sim.number_arrays import point
+from ast_sim.plausibility.findings import Finding
 from ast_sim.scene import Scene
 
 # Depths below this share of the mean edge of the surfaces are left to rounding and to the softness of contact.

@@ -23,16 +23,20 @@ class Metrics:
         self.path = run / METRICS
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        """The intact lines, in order. A damaged line gives a warning; a kill may leave one at the end."""
+        """The intact lines, in order. At the end, one warning counts the damaged ones; a kill may leave one."""
         if not self.path.exists():
             return
+        damaged: list[str] = []
+        number = 0
         with open(self.path, encoding="utf-8", errors="replace") as file:
             for number, line in enumerate(file, 1):
                 try:
                     yield unseal(line)
                 except ValueError as error:
-                    text = f"{self.path}: line {number} is damaged and left out: {error}"
-                    warnings.warn(text, stacklevel=2)
+                    damaged.append(f"line {number}: {error}")
+        if damaged:
+            text = f"{self.path}: {len(damaged)} of {number} lines are damaged and left out, the first is {damaged[0]}"
+            warnings.warn(text, stacklevel=2)
 
     def append(self, record: dict[str, Any]) -> None:
         with open(self.path, "a", encoding="utf-8") as file:

@@ -55,7 +55,9 @@ class TrainConfig:
         " 0: it learns from the states of the dataset, with noise; unset: 16 batches if the scenes are dynamic or the"
         " model is ast or transolver, else 0; always 0 with model.jumps and without noise",
     )
-    calls: int = setting(1, "with model.jumps: so many calls correct one another in training; without jumps 1")
+    corrections: int = setting(
+        0, "with model.jumps: so many further calls correct the first one in training; without jumps 0"
+    )
     noise_gamma: float | None = setting(
         None, "with noise: share of it that the target takes back; unset: 1, in dynamic scenes 0.1"
     )

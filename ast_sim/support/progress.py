@@ -86,21 +86,6 @@ class Clock:
         return duration(seconds + validations * sum(self._validations) / len(self._validations))
 
 
-class Patience:
-    """Tells on stderr what takes long: a line whenever `QUIET` seconds have passed without one."""
-
-    QUIET = SECONDS_BETWEEN_LINES
-
-    def __init__(self) -> None:
-        self._told = time.perf_counter()
-
-    def tell(self, text: str) -> None:
-        """Print the text, if it is time to."""
-        if time.perf_counter() - self._told >= self.QUIET:
-            tqdm.write(text, file=sys.stderr)
-            self._told = time.perf_counter()
-
-
 class Progress:
     """Counts up to `total`; a context manager, which begins the count.
 
@@ -178,3 +163,19 @@ class Progress:
         left = duration((self.total - self.done) / rate)
         speed = f"{rate:.3g}/s" if rate >= 1 else f"{duration(1 / rate)} each"
         self.print(f"{self.done} of {self.total} {self.unit}, {speed}, {left} to go")
+
+
+class Patience:
+    """Tells what takes long within one step of a progress: a line whenever `QUIET` seconds have passed without one."""
+
+    QUIET = SECONDS_BETWEEN_LINES
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._told = time.perf_counter()
+
+    def tell(self, text: str) -> None:
+        """Tell the text, if it is time to."""
+        if time.perf_counter() - self._told >= self.QUIET:
+            self._progress.line(text)
+            self._told = time.perf_counter()

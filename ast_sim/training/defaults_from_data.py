@@ -19,10 +19,10 @@ from ast_sim.training.data_lengths import DataScales
 # An unset shift is at most this share of the domain's half width; the margin of `Domain` is larger.
 LARGEST_SHIFT = 0.05
 _COUNTS = ("batch_size", "accumulate", "epochs", "statistics_pairs", "steps", "decay", "log_every", "keep")
-_COUNTS += ("validate_every", "checkpoint_every", "calls", "processes")
+_COUNTS += ("validate_every", "checkpoint_every", "processes")
 _RANGES = {
     **dict.fromkeys(_COUNTS, (1, LARGEST)),
-    **dict.fromkeys(("seed", "warmup", "validate_scenes", "noise"), (0, LARGEST)),
+    **dict.fromkeys(("seed", "warmup", "validate_scenes", "noise", "corrections"), (0, LARGEST)),
     "minutes": (1e-3, LARGEST),
     "peak_rate": (1e-30, 1.0),
     "clip": (1e-30, math.inf),
@@ -125,8 +125,8 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
         rollout_pool=pool,
         shift=_shift(config, model),
     )
-    if resolved.calls > 1 and not model.scheme.corrects:
-        raise ConfigError(f"train.calls is {resolved.calls}; without model.jumps it must be 1")
+    if resolved.corrections and not model.scheme.corrects:
+        raise ConfigError(f"train.corrections is {resolved.corrections}; without model.jumps it must be 0")
     if resolved.decay <= resolved.warmup:
         raise ConfigError(f"train.warmup is {resolved.warmup}; it must be below train.decay = {resolved.decay}")
     return resolved

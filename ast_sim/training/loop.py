@@ -113,7 +113,7 @@ class Training:
         """The pool of scenes that go on from the model's own answers; None: each batch is drawn anew."""
         options = self.options
         if self.config.model.scheme.jumps:
-            return JumpPool(self.sampler, JUMP_BATCHES * options.batch_size, options.calls, largest)
+            return JumpPool(self.sampler, JUMP_BATCHES * options.batch_size, 1 + options.corrections, largest)
         return RolloutPool(self.sampler, options.rollout_pool, largest) if options.rollout_pool else None
 
     def prepare(self) -> None:
@@ -258,7 +258,9 @@ class Training:
         # Several processes must stop together, so none of them may stop within its own validation.
         progress = self._stop_at_once if self.processes.count == 1 else False
         return self.processes.gathered(
-            validate(self.model, self.dataset, split, mine, self.options.calls, progress, efforts=split == "valid")
+            validate(
+                self.model, self.dataset, split, mine, self.options.corrections, progress, efforts=split == "valid"
+            )
         )
 
     def _validate(self) -> None:

@@ -27,7 +27,7 @@ from ast_sim.models.simulator import Simulator
 from ast_sim.scene import Trajectory
 from ast_sim.support.progress import ShowProgress
 
-MORE_CALLS = 2  # a model that jumps is validated with so many more calls than it is trained with
+MORE_CALLS = 2  # a model that is trained to correct its answers is validated with so many more calls
 ENOUGH = 0.01  # a further call must lower the error by this share
 EFFORT_SCENES = 10  # the default effort is chosen on at most so many validation scenes, at the deepest frame
 JUMPS = 4  # a model that jumps is validated at so many frames of a scene, evenly spread, the last one included
@@ -76,7 +76,7 @@ def validate(
     dataset: Dataset,
     split: str,
     indices: Iterable[int],
-    most_calls: int = 1,
+    corrections: int = 0,
     progress: ShowProgress = False,
     efforts: bool = True,
 ) -> list[Validated]:
@@ -84,7 +84,7 @@ def validate(
     step; a function may raise to stop.
 
     Args:
-        most_calls: how many calls correct one another in training.
+        corrections: how many calls correct the first one in training.
         efforts: measure the errors of answers by effort, too, for a model that jumps.
     """
     indices = list(indices)
@@ -94,7 +94,7 @@ def validate(
         return []
     if not model.config.scheme.jumps:
         return _by_rollouts(model, indices, names, truths, progress)
-    return _by_jumps(model, indices, names, truths, most_calls, efforts)
+    return _by_jumps(model, indices, names, truths, corrections, efforts)
 
 
 def _by_rollouts(
@@ -120,14 +120,13 @@ def _by_jumps(
     indices: list[int],
     names: list[str],
     truths: list[Trajectory],
-    most_calls: int,
+    corrections: int,
     efforts: bool,
 ) -> list[Validated]:
-    corrections = most_calls - 1 + (MORE_CALLS if most_calls > 1 else 0)
     frames = [frames_asked(truth.num_frames) for truth in truths]
     asked = zip(names, truths, frames, strict=True)
     questions = [Question.of(truth, name, numbers.tolist()) for name, truth, numbers in asked]
-    ways = calls(model, questions, Effort(corrections))
+    ways = calls(model, questions, Effort(corrections + MORE_CALLS if corrections else 0))
     newton_steps = MOST_NEWTON_STEPS if can_make_newton_steps(model.config) else 0
     validated = []
     for index, truth, numbers, way in zip(indices, truths, frames, ways, strict=True):
@@ -137,7 +136,7 @@ def _by_jumps(
             continue
         errors = [_motion_error(position, truth, numbers) for position in way.position]
         measures = efforts and index < EFFORT_SCENES
-        by_effort = errors_by_effort(model, truth, Effort(most_calls - 1, newton_steps)) if measures else []
+        by_effort = errors_by_effort(model, truth, Effort(corrections, newton_steps)) if measures else []
         validated.append(Validated(index, errors, hold, None, by_effort))
     return validated
 

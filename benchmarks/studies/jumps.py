@@ -144,7 +144,7 @@ def _efforts(run: ast_sim.Run) -> list[Effort]:
     config = run.settings.model
     if not config.jumps:
         return []
-    calls = [Effort(corrections) for corrections in range(run.settings.train.calls + MORE_CALLS)]
+    calls = [Effort(corrections) for corrections in range(1 + run.settings.train.corrections + MORE_CALLS)]
     return calls + ([Effort(*pair) for pair in WITH_NEWTON] if can_make_newton_steps(config) else [])
 
 
@@ -214,8 +214,8 @@ def _table(shown: dict[str, Any]) -> list[str]:
 
 
 def _trained_text(row: dict[str, Any]) -> str:
-    calls = row["settings"].get("calls", 1)
-    together = f", {calls} calls trained together" if calls > 1 else ""
+    corrections = row["settings"].get("corrections", 0)
+    together = f", {corrections + 1} calls trained together" if corrections else ""
     return f"{row['train']:,} scenes, {row['steps']:,} steps{together}"
 
 

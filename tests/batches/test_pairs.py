@@ -11,6 +11,7 @@ from meshes import two_tetrahedra
 
 from ast_sim.batches import pairs
 from ast_sim.batches.pairs import PairSampler
+from ast_sim.batches.scheme import Scheme
 from ast_sim.dataset.reader import Dataset
 from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.support.byte_cache import array_bytes
@@ -30,7 +31,14 @@ def dataset(tmp_path):
 
 
 def sampler(dataset, **changes) -> PairSampler:
-    options = {"batch_size": 4, "seed": 0, "noise": 0.0, "make_graph": mesh_graph, "dynamic": False, "gamma": 1.0}
+    options = {
+        "batch_size": 4,
+        "seed": 0,
+        "noise": 0.0,
+        "make_graph": mesh_graph,
+        "scheme": Scheme(False),
+        "gamma": 1.0,
+    }
     return PairSampler(dataset, "train", **{**options, **changes})
 
 
@@ -63,7 +71,7 @@ def test_pairs_of_the_first_scenes_alone(dataset):
 
 
 def test_inertia_needs_a_frame_before(dataset):
-    draws = sampler(dataset, dynamic=True, gamma=0.1, batch_size=5)
+    draws = sampler(dataset, scheme=Scheme(False, given_frames=2), gamma=0.1, batch_size=5)
     expected = [f"train/000000 frame {t}" for t in (1, 2, 3)] + [f"train/000002 frame {t}" for t in (1, 2)]
     assert draws.num_pairs == 5 and sorted(names(draws, [0])) == expected
 
@@ -118,7 +126,7 @@ def test_the_increment_undoes_the_share_gamma_of_the_noise(dataset, gamma):
 
 @pytest.mark.parametrize("gamma", [1.0, 0.1])
 def test_the_acceleration_with_noise(dataset, gamma):
-    options = {"dynamic": True, "batch_size": 5}
+    options = {"scheme": Scheme(False, given_frames=2), "batch_size": 5}
     clean, _ = sampler(dataset, **options).batch(0)
     noisy, target = sampler(dataset, noise=0.02, gamma=gamma, **options).batch(0)
     assert torch.equal(noisy.previous_position, clean.previous_position)  # the noise is on p_t alone
@@ -138,7 +146,7 @@ def test_a_hand_calculation(tmp_path):
     position = np.repeat(scene.rest_position[None], 3, axis=0)
     position[:, 4] = [[1, 1, 1], [3, 1, 1], [4, 1, 1]]
     with Dataset(write(tmp_path / "d.h5", {"train": [Trajectory(scene, position)]})) as dataset:
-        draws = sampler(dataset, dynamic=True, noise=0.5, gamma=0.1, batch_size=1)
+        draws = sampler(dataset, scheme=Scheme(False, given_frames=2), noise=0.5, gamma=0.1, batch_size=1)
         batch, target = draws.batch(0)
         n = float(batch.position[4, 0]) - 3
         assert abs(n) > 1e-3
@@ -224,7 +232,12 @@ def mirror_of(dataset, name: str, nodes: slice, batch) -> np.ndarray:
 
 @pytest.mark.parametrize("dynamic", [False, True])
 def test_a_mirrored_pair_is_the_mirror_image_of_the_pair(dataset, dynamic):
-    options = {"noise": 0.02, "dynamic": dynamic, "gamma": 0.3, "batch_size": 5 if dynamic else 8}
+    options = {
+        "noise": 0.02,
+        "scheme": Scheme(False, 1 + dynamic),
+        "gamma": 0.3,
+        "batch_size": 5 if dynamic else 8,
+    }
     drawn = set()
     for step in range(8):
         plain, aim = sampler(dataset, **options).batch(step)
@@ -275,7 +288,12 @@ def test_half_of_the_pairs_are_mirrored_along_an_axis(dataset):
 
 @pytest.mark.parametrize("dynamic", [False, True])
 def test_a_moved_pair_is_the_pair_elsewhere(dataset, dynamic):
-    options = {"noise": 0.02, "dynamic": dynamic, "gamma": 0.3, "batch_size": 5 if dynamic else 8}
+    options = {
+        "noise": 0.02,
+        "scheme": Scheme(False, 1 + dynamic),
+        "gamma": 0.3,
+        "batch_size": 5 if dynamic else 8,
+    }
     plain, moved, shifts = sampler(dataset, **options), sampler(dataset, shift=0.25, **options), []
     for step in range(40):
         (batch, target), (there, aim) = plain.batch(step), moved.batch(step)
@@ -361,4 +379,4 @@ def test_a_split_without_pairs_is_an_error(tmp_path):
         with pytest.raises(DatasetError, match="train has no trajectory of at least 2 frames"):
             sampler(dataset)
         with pytest.raises(DatasetError, match="train has no trajectory of at least 3 frames"):
-            sampler(dataset, dynamic=True)
+            sampler(dataset, scheme=Scheme(False, given_frames=2))

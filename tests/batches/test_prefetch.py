@@ -10,10 +10,18 @@ from meshes import two_tetrahedra
 
 from ast_sim.batches.pairs import PairSampler
 from ast_sim.batches.prefetch import Ahead
+from ast_sim.batches.scheme import Scheme
 from ast_sim.dataset.reader import Dataset
 from ast_sim.support.errors import DatasetError
 
-OPTIONS = {"batch_size": 2, "seed": 3, "noise": 0.1, "make_graph": mesh_graph, "dynamic": False, "gamma": 1.0}
+OPTIONS = {
+    "batch_size": 2,
+    "seed": 3,
+    "noise": 0.1,
+    "make_graph": mesh_graph,
+    "scheme": Scheme(False),
+    "gamma": 1.0,
+}
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ import torch
 from data_samples import block, mesh_graph, trajectory, write
 
 from ast_sim.batches.pairs import PairSampler
+from ast_sim.batches.scheme import Scheme
 from ast_sim.batches.training_rollouts import SHARE, RolloutPool
 from ast_sim.dataset.reader import Dataset
 
@@ -27,7 +28,7 @@ def pool(dataset, **changed) -> RolloutPool:
         "seed": 0,
         "noise": NOISE,
         "mirror": ("x", "y"),
-        "dynamic": False,
+        "scheme": Scheme(False),
         "gamma": 1.0,
         **changed,
     }
@@ -60,7 +61,7 @@ def frame(name: str) -> tuple[int, int]:
 @pytest.mark.parametrize("gamma", [1.0, 0.3])
 def test_the_state_is_where_the_model_led_and_the_target_leads_back(dataset, dynamic, least, gamma):
     """With inertia a state is two positions, each with the error that it had when it was the newest."""
-    rolls, stays = pool(dataset, mirror=(), dynamic=dynamic, gamma=gamma), 1 - gamma
+    rolls, stays = pool(dataset, mirror=(), scheme=Scheme(False, 1 + dynamic), gamma=gamma), 1 - gamma
     last: dict[int, tuple] = {}
     went_on = 0
     for number in range(24):
@@ -99,7 +100,7 @@ def test_with_inertia_a_faultless_model_leads_an_error_back_without_overshoot(tm
     """After an error e of a scene that had none come 2 r e, 3 r^2 e, 4 r^3 e, as of a critically damped spring."""
     r, kick, found = 0.7, 1e-3, {}
     with Dataset(write(tmp_path / "long.h5", {"train": [trajectory(block(1, 1, 1), 12)]})) as dataset:
-        rolls = pool(dataset, mirror=(), dynamic=True, gamma=1 - r, noise=1e-12)
+        rolls = pool(dataset, mirror=(), scheme=Scheme(False, given_frames=2), gamma=1 - r, noise=1e-12)
         truth = torch.tensor(dataset.load("train", 0).position)
         for number in range(0, 60, 2):  # at least one scene from its beginning to its end
             batch, target = rolls.batch(number)
@@ -165,11 +166,11 @@ def test_from_a_state_too_far_off_it_goes_on_with_white_noise(dataset):
 
 @pytest.mark.parametrize("dynamic", [False, True])
 def test_it_goes_on_from_its_state_with_the_same_bits(dataset, dynamic):
-    whole = run(pool(dataset, dynamic=dynamic), range(20))[11:]
-    first = pool(dataset, dynamic=dynamic)
+    whole = run(pool(dataset, scheme=Scheme(False, 1 + dynamic)), range(20))[11:]
+    first = pool(dataset, scheme=Scheme(False, 1 + dynamic))
     run(first, range(11))
     first.batch(11)  # begun ahead, as in training
-    again = pool(dataset, dynamic=dynamic)
+    again = pool(dataset, scheme=Scheme(False, 1 + dynamic))
     again.restore(first.state())
     for (a, x), (b, y) in zip(whole, run(again, range(11, 20)), strict=True):
         assert a.names == b.names and torch.equal(a.position, b.position) and torch.equal(x.motion, y.motion)

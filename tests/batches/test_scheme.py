@@ -21,7 +21,7 @@ PRESCRIBED = np.array([True, False])
         (Scheme(jumps=False), [-1, 0, 1, 2, 3, 4], [1, 2, 3, 4, 5]),
         (Scheme(jumps=False, given_frames=2), [-1, 0, 1, 2, 3, 4], [2, 3, 4, 5]),
         (Scheme(jumps=True), [0, 0, 0, 0, 0, 0], [5]),
-        (Scheme(jumps=True, turns=True), [0, 0, 0, 2, 2, 4], [2, 4, 5]),
+        (Scheme(jumps=True, history=()), [0, 0, 0, 2, 2, 4], [2, 4, 5]),
     ],
 )
 def test_the_frames_that_the_last_one_needs(scheme, sources, computed):
@@ -31,7 +31,7 @@ def test_the_frames_that_the_last_one_needs(scheme, sources, computed):
 
 
 def test_what_follows_from_it():
-    steps, jumps, path = Scheme(False), Scheme(True), Scheme(True, turns=True)
+    steps, jumps, path = Scheme(False), Scheme(True), Scheme(True, history=())
     assert [one.corrects for one in (steps, jumps, path)] == [False, True, True]
     assert [one.errors_add_up for one in (steps, jumps, path)] == [True, False, False]
     assert [one.needs_each_frame for one in (steps, jumps, path)] == [True, False, False]
@@ -43,4 +43,4 @@ def test_a_model_tells_its_scheme():
     settings = MODEL.presets["tiny"].model
     assert settings.resolve(DataFacts(mesh_spacing=1.0)).scheme == Scheme(True)
     assert settings.resolve(DataFacts("dynamic", mesh_spacing=1.0)).scheme == Scheme(False, given_frames=2)
-    assert settings.resolve(DataFacts(**known)).scheme == Scheme(True, turns=True)
+    assert settings.resolve(DataFacts(**known)).scheme == Scheme(True, history=())

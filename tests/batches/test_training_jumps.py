@@ -10,6 +10,7 @@ from data_samples import block, mesh_graph, trajectory, write
 from ast_sim.batches import training_jumps
 from ast_sim.batches.carry import Carrier
 from ast_sim.batches.pairs import PairSampler
+from ast_sim.batches.scheme import Scheme
 from ast_sim.batches.training_jumps import LEAST, UNSEEN, JumpPool
 from ast_sim.dataset.reader import Dataset
 
@@ -25,8 +26,15 @@ def dataset(tmp_path):
 
 
 def pool(dataset, calls=CALLS, largest=LARGEST, **changed) -> JumpPool:
-    options = {"batch_size": 4, "seed": 0, "noise": 0.0, "mirror": ("x", "y"), "dynamic": False, "gamma": 1.0}
-    sampler = PairSampler(dataset, "train", make_graph=mesh_graph, jumps=True, **{**options, **changed})
+    options = {
+        "batch_size": 4,
+        "seed": 0,
+        "noise": 0.0,
+        "mirror": ("x", "y"),
+        "scheme": Scheme(jumps=True),
+        "gamma": 1.0,
+    }
+    sampler = PairSampler(dataset, "train", make_graph=mesh_graph, **{**options, **changed})
     return JumpPool(sampler, 8, calls, largest)
 
 

@@ -12,6 +12,7 @@ from data_samples import mesh_graph
 from ast_sim.batches.carry import Carrier
 from ast_sim.batches.mirror_and_shift import Placement
 from ast_sim.batches.pairs import PairSampler
+from ast_sim.batches.scheme import Scheme
 from ast_sim.batches.training_jumps import JumpPool
 from ast_sim.batches.turning_points import jump_sources
 from ast_sim.dataset.reader import Dataset
@@ -71,10 +72,10 @@ def dataset(tmp_path):
         yield dataset
 
 
-def sampler(dataset, **changes) -> PairSampler:
-    options = {"batch_size": 2, "seed": 0, "noise": 0.0, "dynamic": False, "gamma": 1.0, "fields": FIELDS}
-    options |= {"history": HISTORY, **changes}
-    return PairSampler(dataset, "train", make_graph=mesh_graph, jumps=True, **options)
+def sampler(dataset, history=HISTORY, **changes) -> PairSampler:
+    options = {"batch_size": 2, "seed": 0, "noise": 0.0, "gamma": 1.0, "fields": FIELDS}
+    scheme = Scheme(jumps=True, history=history)
+    return PairSampler(dataset, "train", make_graph=mesh_graph, scheme=scheme, **{**options, **changes})
 
 
 def test_a_pair_has_the_true_source_and_what_is_known_there(dataset):

@@ -16,7 +16,7 @@ def small(monkeypatch, tmp_path):
     row = replace(
         jumps.ROWS["plates400"], data="small", nodes=100, frames=5, keep=None, train=2, valid=1, test=2,
         steps=4, rivals=1,
-        settings={"mirror": ("x", "y"), "calls": 2, "batch_size": 2, "statistics_pairs": 4},
+        settings={"mirror": ("x", "y"), "corrections": 1, "batch_size": 2, "statistics_pairs": 4},
     )  # fmt: skip
     walk = replace(row, model_settings={"jumps": False}, settings={"batch_size": 2, "statistics_pairs": 4}, rivals=0)
     monkeypatch.setattr(jumps, "ROWS", {"small": row, "walk": walk})

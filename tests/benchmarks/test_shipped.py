@@ -11,7 +11,7 @@ from benchmarks.studies import coverage, jumps, shipped
 def test_a_run_is_simulated_trained_calibrated_and_saved(tmp_path, monkeypatch, capsys):
     row = replace(
         jumps.ROWS["plates400"], data="small", nodes=100, frames=5, keep=None, train=30, valid=1, test=1, steps=4,
-        settings={"mirror": ("x", "y"), "calls": 1, "batch_size": 2, "statistics_pairs": 4},
+        settings={"mirror": ("x", "y"), "corrections": 0, "batch_size": 2, "statistics_pairs": 4},
     )  # fmt: skip
     monkeypatch.setitem(jumps.ROWS, "plates400", row)
     small = {"train": 0, "valid": 0, "test": 24, "nodes": 100, "frames": 5, "keep": None}

@@ -50,7 +50,9 @@ def test_from_the_file_to_the_loss(run):
     unmoved = Placement(np.ones(3, np.float32), np.zeros(3, np.float32), np.zeros(3, np.float32))
     batches, targets = [], []
     with ast_sim.Dataset(run.settings.data) as dataset:
-        pool = JumpPool(model.pairs(dataset, "train", batch_size=8), JUMP_BATCHES * 8, run.settings.train.calls, 1.0)
+        pool = JumpPool(
+            model.pairs(dataset, "train", batch_size=8), JUMP_BATCHES * 8, 1 + run.settings.train.corrections, 1.0
+        )
         drawn, _ = pool.batch(0)
         for name, place in zip(drawn.names, range(8), strict=True):
             jump = pool._going[place]

@@ -377,7 +377,16 @@ def test_a_damaged_meta_file_is_named(tmp_path, case):
     (source / "meta.json").write_bytes(TEXTS[case])
     with pytest.raises(DatasetError, match=f"{source}/meta.json: ") as error:
         convert_deepmind(source, tmp_path / "d.h5")
-    assert len(str(error.value)) < 300
+    assert len(str(error.value)) < 300 and str(error.value).count("meta.json: ") == 1
+
+
+def test_a_meta_file_that_is_a_folder_is_named_once(tmp_path):
+    source = write(tmp_path, "deforming_plate")
+    (source / "meta.json").unlink()
+    (source / "meta.json").mkdir()
+    with pytest.raises(DatasetError) as error:
+        convert_deepmind(source, tmp_path / "d.h5")
+    assert str(error.value) == f"{source}/meta.json: cannot be read: Is a directory"
 
 
 def test_from_the_command_line(tmp_path, capsys):

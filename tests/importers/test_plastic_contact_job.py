@@ -69,7 +69,7 @@ def relative(predicted, true):
 
 def test_plastic_strain_and_forces_are_predicted(data, tmp_path, capsys):
     run, out, forces = tmp_path / "run", tmp_path / "answer.h5", tmp_path / "forces.csv"
-    chosen = ["train.steps=400", "train.batch_size=2", "train.stress_weight=1", "train.calls=1"]
+    chosen = ["train.steps=400", "train.batch_size=2", "train.stress_weight=1"]
     settings = [part for setting in chosen for part in ("--set", setting)]
     states = ["--state", "PEEQ", "--state", "reaction"]
     assert cli.main(["train", str(data), "--out", str(run), "--model", "transolver", *states, *settings]) == 0

@@ -23,6 +23,7 @@ from ast_sim.models.registry import find_preset
 from ast_sim.models.simulator import Prediction, Simulator
 from ast_sim.simulate.jobs.rival import deepest_frame
 from ast_sim.support.errors import ConfigError, SimulationError
+from ast_sim.support.progress import Patience
 from ast_sim.training.data_lengths import measure
 
 
@@ -217,6 +218,16 @@ def test_newton_steps_end_when_one_is_small(pressed, monkeypatch):
     found = asked_frames(model, pressed, "test", Effort(1, 1))
     assert found.unsettled == 1 and "in 1 of 1 scenes the Newton steps did not end" in "\n".join(lines(found))
     assert asked_frames(model, pressed, "test", Effort(1, 6)).unsettled == 0
+
+
+def test_a_quiet_prediction_says_nothing_of_newton_steps_that_take_long(pressed, monkeypatch, capfd):
+    truth, model = pressing(pressed, 0.7)
+    question = [Question.of(truth, "plate", [deepest_frame(truth)])]
+    monkeypatch.setattr(Patience, "QUIET", 0.0)
+    answers(model, question, Effort(0, 2), progress=False)
+    assert capfd.readouterr() == ("", "")
+    answers(model, question, Effort(0, 2), progress=True)
+    assert f"plate frame {deepest_frame(truth)}: Newton step 2 of at most 2\n" in capfd.readouterr().err
 
 
 def measured(errors, stresses, steps, unsettled):

@@ -129,7 +129,9 @@ def test_kept_candidates_find_the_same_pairs_as_a_new_search():
 def test_gap_is_a_distance():
     for gap in (0.3e-3, 4e-3, 0.08):
         rest, faces, body = two_bodies(gap)
-        assert Contact(rest, faces, body, ContactSettings(DHAT, 1e6)).gap(rest) == pytest.approx(gap, rel=1e-9)
+        for dhat in (1e-5, DHAT, 10.0):
+            assert Contact(rest, faces, body, ContactSettings(dhat, 1e6)).gap(rest) == pytest.approx(gap, rel=1e-9)
+        assert Contact(rest, faces, 0 * body, ContactSettings(DHAT, 1e6)).gap(rest) == np.inf
 
 
 def test_intersections_are_found_between_bodies_and_within_one():

@@ -49,7 +49,7 @@ def small(family: str, **changes) -> ASTConfig:
 def sampler(path, config: ASTConfig, noise: float = 1e-3) -> PairSampler:
     return PairSampler(
         Dataset(path), "train", batch_size=2, seed=0, noise=noise, make_graph=build_model(config).graph,
-        dynamic=config.data.dynamic, gamma=1.0,
+        scheme=config.scheme, gamma=1.0,
     )  # fmt: skip
 
 

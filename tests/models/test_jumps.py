@@ -12,6 +12,7 @@ from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim.batches.carry import Carrier
 from ast_sim.batches.pairs import PairSampler
+from ast_sim.batches.scheme import Scheme
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.effort import Effort
 from ast_sim.inference.evaluation.evaluate import evaluate, table
@@ -55,8 +56,8 @@ def data(tmp_path_factory):
 def test_the_sampler_carries_the_first_frame_to_every_other(data):
     with Dataset(data) as dataset:
         draws = PairSampler(
-            dataset, "train", batch_size=18, seed=0, noise=0.0, make_graph=model_of("ast").graph, dynamic=False,
-            gamma=1.0, jumps=True,
+            dataset, "train", batch_size=18, seed=0, noise=0.0, make_graph=model_of("ast").graph, scheme=Scheme(True),
+            gamma=1.0,
         )  # fmt: skip
         assert draws.num_pairs == 18
         batch, target = draws.batch(0)
@@ -236,7 +237,7 @@ def test_the_setting_survives_toml_and_is_off_where_it_is_left_out(model):
 
 @pytest.mark.parametrize("model", ["ast", "transolver", "mgn"])
 def test_training_brings_the_error_below_holding_still(model, data, tmp_path):
-    settings = ["train.steps=120", "train.validate_every=120", "train.peak_rate=2e-3", "train.calls=2"]
+    settings = ["train.steps=120", "train.validate_every=120", "train.peak_rate=2e-3", "train.corrections=1"]
     start_training(tmp_path / "run", configure(data, "tiny", settings, model=model))
     made = read_config(tmp_path / "run")
     assert made.train.noise == 0.0 and made.model.jumps  # a guess has errors of the model's own

@@ -69,10 +69,18 @@ def test_what_is_no_progress_is_refused():
 
 
 def test_only_what_takes_long_is_told(monkeypatch, capsys):
-    patience = Patience()
+    patience = Patience(Progress(1, "frames", True))
     patience.tell("soon")
     monkeypatch.setattr(Patience, "QUIET", 0.0)
     patience.tell("late")
     monkeypatch.setattr(Patience, "QUIET", 100.0)
     patience.tell("again soon")
     assert capsys.readouterr().err == "late\n"
+
+
+@pytest.mark.parametrize("progress", [False, lambda done, total, text: None])
+def test_what_takes_long_goes_to_the_log_alone_where_no_progress_is_shown(progress, monkeypatch, capsys, caplog):
+    caplog.set_level(logging.INFO, "ast_sim")
+    monkeypatch.setattr(Patience, "QUIET", 0.0)
+    Patience(Progress(1, "frames", progress)).tell("late")
+    assert capsys.readouterr() == ("", "") and [record.message for record in caplog.records] == ["late"]

@@ -56,7 +56,7 @@ def data(tmp_path_factory) -> Path:
     [
         [],
         ["--set", "train.rollout_pool=8"],
-        ["--set", "model.jumps=true", "--set", "train.noise=none", "--set", "train.calls=3"],
+        ["--set", "model.jumps=true", "--set", "train.noise=none", "--set", "train.corrections=2"],
     ],
     ids=["pairs", "rollouts", "jumps"],
 )

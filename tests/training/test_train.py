@@ -192,11 +192,11 @@ def test_tiny_sees_other_bodies_and_learns_along_rollouts_where_that_was_measure
     toy.write(tmp_path / "d.h5", dynamic=True)
     still, moving = resolved(data), resolved(tmp_path / "d.h5")
     assert still.model.node_inputs == ("displacement", "proximity", "out_of_balance")
-    assert still.model.jumps and still.train.calls == 1 and still.train.rollout_pool == 0
+    assert still.model.jumps and still.train.corrections == 0 and still.train.rollout_pool == 0
     assert resolved(data, "model.jumps=false").train.rollout_pool == 128
     assert still.train.shift == moving.train.shift == 0.025  # 0.05 of the half width
     assert moving.model.node_inputs == ("displacement", "velocity") and moving.train.rollout_pool == 128
-    assert not moving.model.jumps and moving.train.calls == 1
+    assert not moving.model.jumps and moving.train.corrections == 0
     assert (still.model.places, still.model.exchanges) == ("relative", 2)
     assert (moving.model.places, moving.model.exchanges) == ("absolute", 0)
     assert resolved(tmp_path / "d.h5", "model.places=relative", "model.exchanges=1").model.exchanges == 1
@@ -418,7 +418,7 @@ def test_along_rollouts_a_resumed_training_ends_in_the_same_bits(linear, data, t
 def test_jumps_that_are_resumed_end_in_the_same_bits(linear, data, tmp_path, monkeypatch):
     """As along rollouts; the guesses of the pool and the running errors of the calls are in the checkpoint."""
     monkeypatch.setattr(loop, "JUMP_BATCHES", 3)  # so that 20 steps make all calls
-    jumps = settings(data, *JUMPS, "train.calls=3", "train.mirror=x,y")
+    jumps = settings(data, *JUMPS, "train.corrections=2", "train.mirror=x,y")
     start.start_training(tmp_path / "whole", jumps)
     start.start_training(tmp_path / "run", jumps)
     newest = checkpoint.latest(tmp_path / "run") / "training.safetensors"
@@ -447,7 +447,7 @@ def test_jumps_that_are_resumed_end_in_the_same_bits(linear, data, tmp_path, mon
 @pytest.mark.parametrize(
     ("assignments", "match"),
     [
-        (["train.calls=2"], r"train.calls is 2; without model.jumps it must be 1"),
+        (["train.corrections=1"], r"train.corrections is 1; without model.jumps it must be 0"),
         (["train.rollout_pool=5"], r"train.rollout_pool is 5; it must be a multiple.*train.batch_size = 2"),
         (
             ["train.rollout_pool=2"],
@@ -594,7 +594,7 @@ def test_metrics_survive_a_line_that_was_cut_off(tmp_path):
     metrics.append({"step": 3, "valid_rmse": 0.5})
     with open(metrics.path, "a") as file:
         file.write('{"step": 4, "lo')
-    with pytest.warns(UserWarning, match=r"metrics.jsonl: line 5 is damaged and left out"):
+    with pytest.warns(UserWarning, match=r"metrics.jsonl: 1 of 5 lines are damaged and left out, the first is line 5"):
         assert [record["step"] for record in metrics] == [1, 2, 3, 3]
     with pytest.warns(UserWarning, match="line 5"):
         metrics.forget_after(2)

@@ -133,7 +133,7 @@ def _measured(
     command: str,
     progress: ShowProgress,
 ) -> dict[str, TradeFigures]:
-    efforts = choices(run.settings.model, run.settings.train.calls) or (run.effort,)
+    efforts = choices(run.settings.model, run.settings.train.corrections) or (run.effort,)
     own: dict[Effort, list[_Timed]] = {effort: [] for effort in efforts}
     ways: dict[str, list[_Timed]] = {}
     no_solver = ""

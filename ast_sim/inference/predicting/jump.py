@@ -116,9 +116,9 @@ def _predicted(
                 bar.advance(group[-1].name, len(group))
         # In ascending order, whatever the domains: with friction a frame needs to know the one before.
         for frame in frames if effort.newton_steps else ():
-            frame.refine(effort.newton_steps, whole_way)
+            frame.refine(effort.newton_steps, whole_way, bar)
             if not whole_way and effort.newton_steps >= MOST_NEWTON_STEPS and frame.unsettled:
-                _start_again(model, frame, effort)
+                _start_again(model, frame, effort, bar)
             if not effort.solved:
                 bar.advance(frame.name)
         for frame in frames if effort.solved else ():
@@ -127,11 +127,11 @@ def _predicted(
     return scenes
 
 
-def _start_again(model: Simulator, frame: JumpingFrame, effort: Effort) -> None:
+def _start_again(model: Simulator, frame: JumpingFrame, effort: Effort, progress: Progress) -> None:
     """Newton steps need a nearly right start: more corrections give a better one."""
     first, spent = (frame.positions, frame.fields, frame.last_step), frame.seconds
     _predict(model, [frame], effort.corrections + AGAIN)
-    frame.refine(effort.newton_steps, every_stress=False)
+    frame.refine(effort.newton_steps, False, progress)
     frame.seconds += spent
     if frame.failure is not None:  # the first answer at least says that it has not converged
         frame.failure, (frame.positions, frame.fields, frame.last_step) = None, first

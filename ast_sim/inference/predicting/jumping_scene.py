@@ -25,7 +25,7 @@ from ast_sim.models.simulator import Simulator
 from ast_sim.named_field import STRESS
 from ast_sim.scene import Scene
 from ast_sim.support.errors import SimulationError
-from ast_sim.support.progress import Patience
+from ast_sim.support.progress import Patience, Progress
 
 
 @dataclass(eq=False)
@@ -80,11 +80,11 @@ class JumpingFrame:
         """Whether the Newton steps did not end."""
         return self.failure is None and self.last_step is not None and self.last_step > STILL
 
-    def refine(self, most: int, every_stress: bool) -> None:
+    def refine(self, most: int, every_stress: bool, progress: Progress) -> None:
         """Make Newton steps from the answer of the model until one is `STILL`; the stress then is that of the material.
 
         Friction resists slip from the frame before, where that is wanted, too. The stress is that of the last step, or
-        of every one.
+        of every one. `progress` tells of those that take long.
         """
         if self.failure is not None:
             return
@@ -94,7 +94,7 @@ class JumpingFrame:
             solver = self.scene.solver(self.scene.question.scene)
             position = _array(self.positions[-1])
             stuck = self.scene.settled(self.number - 1)
-            patience = Patience()
+            patience = Patience(progress)
             for step in range(1, most + 1):
                 told = f"{self.name}: Newton step {step} of at most {most}"
                 patience.tell(told)
@@ -148,8 +148,8 @@ class JumpingScene:
         question, self.given = self.question, self.model.config.data.given_frames
         self.prescribed_position = torch.tensor(question.prescribed_position)
         self.fields = question.given_fields(self.model.config.data, self.given)
-        self.history = self.model.config.history
         scheme = self.model.config.scheme
+        self.history = scheme.history
         sources = scheme.sources(question.prescribed_position, question.scene.prescribed)
         by_number: dict[int, JumpingFrame] = {}
         for number in scheme.computed(question.wanted(), sources):

@@ -244,7 +244,7 @@ class _Measured(NamedTuple):
 
 def _measured(run: Run, dataset: Dataset, split: str, progress: ShowProgress) -> tuple[Calibration, list[str]]:
     """The calibration by the scenes of a split, and the names of those that do not count."""
-    to_choose = choices(run.settings.model, run.settings.train.calls)
+    to_choose = choices(run.settings.model, run.settings.train.corrections)
     efforts = to_choose if run.effort in to_choose else (*to_choose, run.effort)
     scenes: list[_Measured] = []
     left_out: list[str] = []
@@ -277,7 +277,7 @@ def _measured_scene(
     """A calibration scene; None: nothing moves in it, or it lies outside the training."""
     if not moves(truth):
         return None
-    answers = [run.predict(truth, effort=effort, throw=False, name=name) for effort in efforts]
+    answers = [run.predict(truth, effort=effort, throw=False, name=name, progress=False) for effort in efforts]
     if answers[0].notes:
         return None
     scores = [
@@ -285,7 +285,10 @@ def _measured_scene(
         for one in answers
     ]
     deepest = deepest_frame(truth)
-    alone = [run.predict(truth, frames=deepest, effort=effort, throw=False, name=name) for effort in to_choose]
+    alone = [
+        run.predict(truth, frames=deepest, effort=effort, throw=False, name=name, progress=False)
+        for effort in to_choose
+    ]
     errors = [None if one.failure is not None else one.errors(truth) for one in alone]
     latents = np.stack(list(answers[0].latents.values())) if answers[0].latents else None
     return _Measured(scores, errors, spacing_of(truth.scene), latents)

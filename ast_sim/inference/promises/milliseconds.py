@@ -40,7 +40,7 @@ def effort_within(run: Run, question: Question, ms: float) -> tuple[Effort, str]
         ConfigError: the fastest takes longer; the run has one effort, since it predicts step by step; or no errors of
             its efforts were measured.
     """
-    efforts = choices(run.settings.model, run.settings.train.calls)
+    efforts = choices(run.settings.model, run.settings.train.corrections)
     errors = {effort: run.expected_error(effort) for effort in efforts}
     known = {effort: error for effort, error in errors.items() if error is not None}
     if not known:

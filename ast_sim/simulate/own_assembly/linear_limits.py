@@ -13,9 +13,9 @@ from scipy.sparse import coo_array, csr_array
 
 from ast_sim.element_topology import LOCAL_EDGES
 from ast_sim.mechanics.case import SolidCase
+from ast_sim.number_arrays import point
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
 from ast_sim.simulate.own_assembly.rest_check import surface_of
-from ast_sim.simulate.own_assembly.standing import point
 
 ENOUGH = 3  # elements across a wall that bends
 LARGEST_POISSON = 0.45

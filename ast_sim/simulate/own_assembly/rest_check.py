@@ -11,9 +11,10 @@ import numpy as np
 
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
+from ast_sim.number_arrays import point
 from ast_sim.plausibility.overlaps import deepest_node
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
-from ast_sim.simulate.own_assembly.standing import Reference, point
+from ast_sim.simulate.own_assembly.standing import Reference
 from ast_sim.simulate.shapes.parts import quarters
 from ast_sim.support.errors import SimulationError
 

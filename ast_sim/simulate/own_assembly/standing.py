@@ -18,6 +18,7 @@ from ast_sim.mechanics.case import NEXT_NOTE, NOTES, SolidCase
 from ast_sim.mechanics.contact_and_friction import ContactSettings
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.motion_course import Course, MovedNodes
+from ast_sim.number_arrays import point
 from ast_sim.scene import AttributeValue, NodeType, Scene
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec, PartSpec
 from ast_sim.simulate.own_assembly.parameters import Values, completed, recorded
@@ -227,8 +228,3 @@ def _layered(part: PlacedPart, deforming: list[PlacedPart], order: int) -> Place
     if order == 2:
         position, tetrahedra = second_order(position, tetrahedra)
     return PlacedPart(part.part, position, tetrahedra, np.full(len(position), part.moves[0]), part.notes)
-
-
-def point(x: np.ndarray) -> str:
-    """A point in messages."""
-    return "(" + ", ".join(f"{value:.6g}" for value in x) + ")"

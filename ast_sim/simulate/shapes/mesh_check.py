@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from ast_sim.element_topology import FACE_TRIANGLES, LOCAL_FACES
 from ast_sim.mechanics.contact_and_friction import load_ipctk
+from ast_sim.number_arrays import point
 from ast_sim.simulate.shapes.cad.surface_mend import Surface, solids_of
 from ast_sim.simulate.shapes.parts import smallest_dihedral, volumes
 from ast_sim.support.errors import SimulationError
@@ -79,7 +80,7 @@ def check_surface(position: np.ndarray, triangles: np.ndarray, name: str) -> Non
         raise BadMesh(f"{name}: it holds no triangles")
     finite = np.isfinite(position).all(axis=1)
     if not finite.all():
-        raise BadMesh(f"{name}: a corner is not finite: {_point(position[np.argmin(finite)])}")
+        raise BadMesh(f"{name}: a corner is not finite: {point(position[np.argmin(finite)])}")
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     edges, uses = np.unique(edges, axis=0, return_counts=True)
     for wrong, what in (
@@ -89,7 +90,7 @@ def check_surface(position: np.ndarray, triangles: np.ndarray, name: str) -> Non
         if wrong.any():
             a, b = position[edges[np.argmax(wrong)]]
             text = what.format(_count(wrong, "edge", "edges"))
-            raise BadMesh(f"{name}: {text}, the first from {_point(a)} to {_point(b)}")
+            raise BadMesh(f"{name}: {text}, the first from {point(a)} to {point(b)}")
     solids = solids_of(Surface(position, triangles))
     _check_pieces(solids, position[triangles].mean(axis=1), name, "closed by itself")
     a, b, c = np.moveaxis(position[triangles] - position[triangles[0, 0]], 1, 0)
@@ -117,7 +118,7 @@ def check_no_intersections(position: np.ndarray, triangles: np.ndarray, name: st
             where = position[triangles[candidate.face_id]].mean(axis=0)
             raise BadMesh(
                 f"{name}: its surface cuts itself: the triangles {triangles[owner].tolist()} and"
-                f" {triangles[candidate.face_id].tolist()} near {_point(where)} meet"
+                f" {triangles[candidate.face_id].tolist()} near {point(where)} meet"
             )
     raise BadMesh(f"{name}: its surface cuts itself")
 
@@ -136,12 +137,12 @@ def _check_points(position: np.ndarray, name: str, what: str) -> None:
     finite = np.isfinite(position).all(axis=1)
     if not finite.all():
         index = int(np.argmin(finite))
-        raise BadMesh(f"{name}: the position of node {index} is not finite: {_point(position[index])}")
+        raise BadMesh(f"{name}: the position of node {index} is not finite: {point(position[index])}")
     pairs = cKDTree(position).query_pairs(SAME_PLACE * _diagonal(position), output_type="ndarray")
     if len(pairs):
         a, b = pairs[np.lexsort(pairs.T[::-1])[0]]
         raise BadMesh(
-            f"{name}: {len(pairs)} pairs of {what} lie at one place, the first {a} and {b} at {_point(position[a])}:"
+            f"{name}: {len(pairs)} pairs of {what} lie at one place, the first {a} and {b} at {point(position[a])}:"
             " merge them"
         )
 
@@ -156,7 +157,7 @@ def _check_pieces(label: np.ndarray, centre: np.ndarray, name: str, how: str) ->
     if len(pieces) > 1:
         first, second = (centre[label == piece].mean(axis=0) for piece in pieces[:2])
         raise BadMesh(
-            f"{name}: it has {len(pieces)} pieces {how}, the first two around {_point(first)} and {_point(second)};"
+            f"{name}: it has {len(pieces)} pieces {how}, the first two around {point(first)} and {point(second)};"
             " a part is one solid: give each a file of its own"
         )
 
@@ -181,8 +182,4 @@ def _count(mask: np.ndarray, one: str, many: str) -> str:
 
 
 def _at(element: int, elements: np.ndarray, centre: np.ndarray) -> str:
-    return f"element {element} (nodes {elements[element].tolist()}) at {_point(centre[element])}"
-
-
-def _point(x: np.ndarray) -> str:
-    return "(" + ", ".join(f"{value:.6g}" for value in x) + ")"
+    return f"element {element} (nodes {elements[element].tolist()}) at {point(centre[element])}"

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from ast_sim.number_arrays import point
 from ast_sim.simulate.shapes.cad.surface_mend import Surface, several_solids
 
 MENDED = ("Degenerated", "SmallEdges", "SmallFaces")
@@ -69,8 +70,8 @@ def one_solid(gmsh, scale: float = 1.0) -> None:
     if len(volumes) > 1:
         boxes = [[scale * x for x in gmsh.model.occ.getCenterOfMass(*volume)] for volume in volumes[:2]]
         raise BadPart(
-            f"it holds {len(volumes)} separate solids (the first two around {_point(boxes[0])} and"
-            f" {_point(boxes[1])}); a part is one solid: export each to a file of its own"
+            f"it holds {len(volumes)} separate solids (the first two around {point(boxes[0])} and"
+            f" {point(boxes[1])}); a part is one solid: export each to a file of its own"
         )
 
 
@@ -116,11 +117,7 @@ def _open_edge(gmsh, scale: float) -> str:
         return ""
     low, high = gmsh.model.getParametrizationBounds(1, single[0])
     where = [scale * x for x in gmsh.model.getValue(1, single[0], [(low[0] + high[0]) / 2])]
-    return f": its shell is open, {len(single)} edges bound only one face, the first at {_point(where)}"
-
-
-def _point(x) -> str:
-    return "(" + ", ".join(f"{value:.6g}" for value in x) + ")"
+    return f": its shell is open, {len(single)} edges bound only one face, the first at {point(where)}"
 
 
 def solid_of_surface(gmsh, surface: Surface, crease_angle: float = CREASE_ANGLE) -> None:
