@@ -91,7 +91,7 @@ class TradeFigures:
     Attributes:
         scenes: the names of the scenes.
         run, solver: the settings; no solver: `no_solver` says why.
-        mesh_errors: of some scenes, how far the solver's frame is from the one on a mesh of half the element size,
+        mesh_errors: of some scenes, how far the solver's frame is from the one on a mesh of 8 times the nodes,
             of the quantity; empty: not known.
         invested: the seconds of simulation and training before the first answer; None: not known.
         origin: command, commit, processor, run and dataset.
@@ -137,7 +137,7 @@ class TradeFigures:
         scenes = f"{len(self.mesh_errors)} scene{'s' * (len(self.mesh_errors) > 1)}"
         return (
             f"The mesh alone makes the {self.quantity} {100 * self.mesh_error:.2g} % wrong (median of {scenes}, against"
-            " half the element size): an answer with a smaller error is no nearer to the truth"
+            " 8 times the nodes): an answer with a smaller error is no nearer to the truth"
         )
 
     def lines(self) -> list[str]:

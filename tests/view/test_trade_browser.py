@@ -46,7 +46,7 @@ def test_the_table_and_the_chart_show_the_settings(browser, path):
     assert texts(browser, "#trade-chart .legend li") == ["The run", "The solver", "The mesh itself"]
     assert texts(browser, "#trade-tables h3") == ["Displacement", "Reaction"]
     (mesh,) = texts(browser, "#trade-tables p")
-    assert mesh.startswith("The mesh alone makes the displacement 3 % wrong (median of 3 scenes, against half")
+    assert mesh.startswith("The mesh alone makes the displacement 3 % wrong (median of 3 scenes, against 8 times")
     call = ["the run", "call", "8 %", "40 %", "20 ms", f"ast-sim predict '{HOSTILE}'"]
     assert texts(browser, "#trade-settings tbody tr:first-child td, #trade-settings tbody tr:first-child th") == call
     assert len(texts(browser, "#trade-settings tbody tr")) == 5

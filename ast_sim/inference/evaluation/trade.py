@@ -209,7 +209,7 @@ def _on_finer_mesh(
     made_from: str | os.PathLike[str] | None,
     ways: Mapping[str, Sequence[_Timed]],
 ) -> list[Outcome]:
-    """Frames of the dataset on a mesh of half the element size.
+    """Frames of the dataset on a mesh of 8 times the nodes.
 
     Scenes that cannot be solved there are left out. None is tried if our solver has not run or would take too long.
     """
