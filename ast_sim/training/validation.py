@@ -18,7 +18,7 @@ from ast_sim.inference.effort import (
     cheapest_good,
     mean_errors,
 )
-from ast_sim.inference.evaluation.asked_frame import errors_by_effort
+from ast_sim.inference.evaluation.deepest_frames import errors_by_effort
 from ast_sim.inference.evaluation.measures import SquaredError, rmse_sequence
 from ast_sim.inference.predicting.jump import calls
 from ast_sim.inference.predicting.question import Question
