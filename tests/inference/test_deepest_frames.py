@@ -15,7 +15,7 @@ from ast_sim.inference.effort import Effort, EffortErrors, cheapest_good, mean_e
 from ast_sim.inference.evaluation.deepest_frames import deepest_frames, errors_by_effort, lines
 from ast_sim.inference.predict import answers
 from ast_sim.inference.predicting import jump, jumping_scene
-from ast_sim.inference.predicting.jump import calls
+from ast_sim.inference.predicting.jump import answer_steps
 from ast_sim.inference.predicting.question import Question
 from ast_sim.mechanics.linearised_contact import STILL, NewtonSteps
 from ast_sim.models.data_facts import DataFacts
@@ -129,9 +129,9 @@ def test_newton_steps_that_do_not_end_begin_anew_after_more_corrections(pressed,
     truth, model = pressing(pressed, 0.4)
     frame = deepest_frame(truth)
     question, free = [Question.of(truth, "plate", [frame])], ~truth.scene.prescribed
-    (first,) = calls(model, question, Effort(1, 10))
+    (first,) = answer_steps(model, question, Effort(1, 10))
     assert first.steps == [10] and first.last_step[0] > STILL  # with 0.36 of the way missing
-    (again,) = calls(model, question, Effort(3, 10))  # with 0.13 missing
+    (again,) = answer_steps(model, question, Effort(3, 10))  # with 0.13 missing
     (answer,) = answers(model, question, Effort(1, 10))
     assert answer.converged and np.array_equal(answer.position[0], again.position[-1, 0])
     assert np.array_equal(answer.stress[0], again.stress[-1, 0]) and answer.seconds > 0
@@ -192,7 +192,7 @@ def test_newton_steps_end_when_one_is_small(pressed, monkeypatch):
     truth, model = pressing(pressed, 0.6)
     question = [Question.of(truth, "plate", [deepest_frame(truth)])]
     monkeypatch.setattr(jumping_scene, "STILL", 0.0)
-    (all_steps,) = calls(model, question, Effort(1, 6))
+    (all_steps,) = answer_steps(model, question, Effort(1, 6))
     sizes = [
         newton_steps(model.config, truth.scene).size(*(all_steps.position[i, 0].astype(float) for i in (k, k + 1)))
         for k in range(1, 7)
@@ -201,7 +201,7 @@ def test_newton_steps_end_when_one_is_small(pressed, monkeypatch):
     assert all_steps.steps == [6] and all_steps.last_step[0] == pytest.approx(sizes[-1], abs=1e-5)
     monkeypatch.undo()
     needed = next(k for k, size in enumerate(sizes, 1) if size <= STILL)
-    (ended,) = calls(model, question, Effort(1, 6))
+    (ended,) = answer_steps(model, question, Effort(1, 6))
     assert ended.steps == [needed] and ended.last_step[0] == pytest.approx(sizes[needed - 1], rel=1e-3)
     assert np.array_equal(ended.position[: 2 + needed], all_steps.position[: 2 + needed])
     assert np.array_equal(ended.position[2 + needed :], np.repeat(ended.position[1 + needed][None], 6 - needed, axis=0))

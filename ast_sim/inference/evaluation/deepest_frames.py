@@ -19,7 +19,7 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.figures import Beside, DeepestFrame, DeepestFrames, SolverFigures, WayFigures
 from ast_sim.inference.effort import Effort, EffortErrors
 from ast_sim.inference.predict import answers
-from ast_sim.inference.predicting.jump import calls
+from ast_sim.inference.predicting.jump import answer_steps
 from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.relative_errors import relative_error, rms, stress_errors
 from ast_sim.mechanics.linearised_contact import STILL
@@ -107,9 +107,9 @@ def errors_by_effort(model: Simulator, truth: Trajectory, most: Effort) -> list[
 def _after(model: Simulator, truth: Trajectory, frame: int, corrections: int, most: int) -> list[EffortErrors]:
     """The errors after so many corrections and 0 to `most` Newton steps."""
     question = Question.of(truth, "validation", [frame])
-    (way,) = calls(model, [question], Effort(corrections, most))
+    (way,) = answer_steps(model, [question], Effort(corrections, most))
     if isinstance(way, str) and most:  # a Newton step failed; the calls before it still count
-        (way,) = calls(model, [question], Effort(corrections))
+        (way,) = answer_steps(model, [question], Effort(corrections))
     if isinstance(way, str):
         return [EffortErrors(Effort(corrections, steps), None, None, 0, 0) for steps in range(most + 1)]
     positions = way.position[corrections:]
@@ -184,7 +184,7 @@ def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: E
     stress = None if answer.stress is None or answer.failure is not None else answer.stress[0]
     by_calls = []
     if model.config.scheme.corrects and not failed:
-        (after,) = calls(model, [question], effort)
+        (after,) = answer_steps(model, [question], effort)
         positions = () if isinstance(after, str) else after.position
         by_calls = [relative_error(position[0], truth, frame) for position in positions]
     share, largest = stress_errors(truth, stress, frame, model.config.data.stress)

@@ -27,7 +27,7 @@ from ast_sim.inference.evaluation.trivial_predictors import (
     where_it_counts,
 )
 from ast_sim.inference.predict import answers as predictions
-from ast_sim.inference.predicting.predict_batch import Start, predict_batch
+from ast_sim.inference.predicting.predicted_frames import Start, predict_frames
 from ast_sim.inference.predicting.question import Question
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.simulator import Simulator
@@ -132,7 +132,7 @@ def one_step_predictions(model: Simulator, truth: Trajectory, name: str) -> tupl
     predicted = []
     with model.predicting():
         for first in range(0, len(starts), chunk):
-            predicted += predict_batch(model, starts[first : first + chunk])
+            predicted += predict_frames(model, starts[first : first + chunk])
     fields = {
         output.name: np.array([frame.fields[output.name].numpy() for frame in predicted])
         for output in model.config.data.outputs
