@@ -11,9 +11,9 @@ from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import Dataset, generate
 from ast_sim.figures import WayFigures
+from ast_sim.inference.answering import answers
 from ast_sim.inference.effort import Effort, EffortErrors, cheapest_good, mean_errors, newton_steps
 from ast_sim.inference.evaluation.deepest_frames import deepest_frames, errors_by_effort, lines
-from ast_sim.inference.predict import answers
 from ast_sim.inference.predicting import jump, jumping_scene
 from ast_sim.inference.predicting.jump import answer_steps
 from ast_sim.inference.predicting.question import Question

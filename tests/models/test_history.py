@@ -9,8 +9,8 @@ import toy
 from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import Dataset, train
+from ast_sim.inference.answering import answers
 from ast_sim.inference.effort import Effort
-from ast_sim.inference.predict import answers
 from ast_sim.inference.predicting.jump import answer_steps
 from ast_sim.inference.predicting.question import Question
 from ast_sim.models.node_inputs import node_features

@@ -14,9 +14,9 @@ from ast_sim.batches.carry import Carrier
 from ast_sim.batches.pairs import PairSampler
 from ast_sim.batches.scheme import Scheme
 from ast_sim.dataset.reader import Dataset
+from ast_sim.inference.answering import answers
 from ast_sim.inference.effort import Effort
 from ast_sim.inference.evaluation.evaluate import evaluate, table
-from ast_sim.inference.predict import answers
 from ast_sim.inference.predicting.jump import answer_steps
 from ast_sim.inference.predicting.question import Question
 from ast_sim.models.data_facts import DataFacts

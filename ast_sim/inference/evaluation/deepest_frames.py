@@ -17,8 +17,8 @@ import torch
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.figures import Beside, DeepestFrame, DeepestFrames, SolverFigures, WayFigures
+from ast_sim.inference.answering import answers
 from ast_sim.inference.effort import Effort, EffortErrors
-from ast_sim.inference.predict import answers
 from ast_sim.inference.predicting.jump import answer_steps
 from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.relative_errors import relative_error, rms, stress_errors

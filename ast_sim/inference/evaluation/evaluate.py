@@ -15,6 +15,7 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.figures import Figures, SceneError, SceneFigures
 from ast_sim.inference.answer import Answer
+from ast_sim.inference.answering import answers as predictions
 from ast_sim.inference.effort import FIRST_CALL, Effort
 from ast_sim.inference.evaluation import deepest_frames
 from ast_sim.inference.evaluation.trivial_predictors import (
@@ -26,7 +27,6 @@ from ast_sim.inference.evaluation.trivial_predictors import (
     values_of,
     where_it_counts,
 )
-from ast_sim.inference.predict import answers as predictions
 from ast_sim.inference.predicting.predicted_frames import Start, predict_frames
 from ast_sim.inference.predicting.question import Question
 from ast_sim.models.data_facts import DataFacts
