@@ -17,7 +17,7 @@ from typing import Any
 from ast_sim.dataset.reader import Dataset
 from ast_sim.figures import Figures
 from ast_sim.inference.effort import Effort
-from ast_sim.inference.evaluation import asked_frame
+from ast_sim.inference.evaluation import deepest_frames
 from ast_sim.inference.evaluation.evaluated_run import Evaluation
 from ast_sim.inference.example_run import example_run
 from ast_sim.simulate.jobs.generate import generate
@@ -136,4 +136,4 @@ def headlines(figures: Figures) -> list[str]:
             lines.append(f"{quantity} error over whole rollouts: {error:.3g} {unit}, {share:.0f} % of {words}")
     if figures.failures:
         lines.append(f"{figures.failures} of {len(figures.scenes)} rollouts failed")
-    return lines + asked_frame.lines(figures.asked)
+    return lines + deepest_frames.lines(figures.deepest)

@@ -101,7 +101,7 @@ class SolverFigures:
 
 
 @dataclass(frozen=True)
-class AskedScene:
+class DeepestFrame:
     """The deepest frame of a scene, asked for alone and on one thread.
 
     Attributes:
@@ -147,7 +147,7 @@ class Beside:
 
 
 @dataclass(frozen=True)
-class AskedFigures:
+class DeepestFrames:
     """The deepest frames of all scenes.
 
     Attributes:
@@ -160,7 +160,7 @@ class AskedFigures:
         no_solver: why the solver was not run; None: it was, or nobody asked.
     """
 
-    scenes: tuple[AskedScene, ...]
+    scenes: tuple[DeepestFrame, ...]
     relative_error: float | None
     stress_share: float | None
     largest_stress: float | None
@@ -182,7 +182,7 @@ class Figures:
         failures: how many predictions failed.
         jumps: whether the model predicts each frame from the first one, so that its "one_step" is its rollout.
         effort: what follows the first call of such a model: `corrections`, `newton_steps`, `solved`.
-        asked: the deepest frames.
+        deepest: the deepest frames.
         speedup: the solver's recorded time for all frames over the model's, both on one thread; None: not known.
         length_unit, stress_unit: of the errors.
         field_units: of the errors of each named field.
@@ -195,7 +195,7 @@ class Figures:
     failures: int
     jumps: bool
     effort: Mapping[str, Any]
-    asked: AskedFigures
+    deepest: DeepestFrames
     speedup: float | None
     length_unit: str
     stress_unit: str

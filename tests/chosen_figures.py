@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from ast_sim.figures import AskedFigures, Figures, MeanError, SceneError, SceneFigures
+from ast_sim.figures import DeepestFrames, Figures, MeanError, SceneError, SceneFigures
 
 
 def _errors(quantity: str, predictor: str, one_step: float, rollout: float) -> list[MeanError]:
@@ -30,7 +30,7 @@ def _scene(name: str, error: float | None) -> SceneFigures:
     return SceneFigures(name, 400, 9, tuple(errors), None if error is None else 0.002, 0.034, failure)
 
 
-NOTHING_ASKED = AskedFigures((), None, None, None, (), None, 0, None, None, None)
+NO_DEEPEST = DeepestFrames((), None, None, None, (), None, 0, None, None, None)
 
 
 def evaluation(errors: dict[str, float | None], scale: float = 1.0, **changes: Any) -> Figures:
@@ -49,7 +49,7 @@ def evaluation(errors: dict[str, float | None], scale: float = 1.0, **changes: A
         failures=sum(error is None for error in errors.values()),
         jumps=False,
         effort={"corrections": 0, "newton_steps": 0},
-        asked=NOTHING_ASKED,
+        deepest=NO_DEEPEST,
         speedup=17.0,
         length_unit="m",
         stress_unit="Pa",

@@ -5,7 +5,7 @@ import shutil
 from dataclasses import replace
 
 import pytest
-from chosen_figures import NOTHING_ASKED, evaluation
+from chosen_figures import NO_DEEPEST, evaluation
 from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import demo
@@ -92,8 +92,8 @@ def test_the_same_seed_gives_the_same_numbers_elsewhere(made, tmp_path, monkeypa
 
 
 def test_headlines_are_shares_of_the_trivial_predictors():
-    asked = replace(
-        NOTHING_ASKED,
+    deepest = replace(
+        NO_DEEPEST,
         relative_error=0.0712,
         seconds=0.0251,
         by_calls=(0.16, 0.0712),
@@ -102,7 +102,7 @@ def test_headlines_are_shares_of_the_trivial_predictors():
         solver=Beside(scenes=3, seconds=0.06, model_seconds=0.025, ratio=2.4),
         cheapest=Beside(scenes=2, seconds=0.03, model_seconds=0.025, ratio=1.2),
     )
-    assert headlines(evaluation({"a": 1e-3, "b": None}, asked=asked)) == [
+    assert headlines(evaluation({"a": 1e-3, "b": None}, deepest=deepest)) == [
         "displacement error over whole rollouts: 0.00143 m, 22 % of the error of holding still",
         "stress error over whole rollouts: 6.78e+03 Pa, 60 % of the error of each frame's true mean",
         "1 of 2 rollouts failed",

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from ast_sim.batches.batch_builder import Batch
 from ast_sim.dataset.layout import DatasetInfo
 from ast_sim.dataset.writer import DatasetWriter
-from ast_sim.inference import predict
+from ast_sim.inference import answering
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.predicting.question import Question
 from ast_sim.models.ast.ast_config import ASTConfig
@@ -114,7 +114,7 @@ def config(info: DatasetInfo, mesh_spacing: float = 0.1) -> ASTConfig:
 
 def answers(model: Simulator, truths: list[Trajectory], names: list[str]) -> list[Answer]:
     """The scenes of the trajectories, predicted together."""
-    return predict.answers(model, [Question.of(truth, name) for truth, name in zip(truths, names, strict=True)])
+    return answering.answers(model, [Question.of(truth, name) for truth, name in zip(truths, names, strict=True)])
 
 
 def answer(model: Simulator, truth: Trajectory, name: str = "scene") -> Answer:

@@ -16,11 +16,12 @@ from ast_sim.dataset.layout import DatasetInfo
 from ast_sim.dataset.reader import Dataset
 from ast_sim.importers.scene_mesh import SceneMesh
 from ast_sim.inference.answer import Answer
+from ast_sim.inference.answering import doubts, in_domain
 from ast_sim.inference.assembly_questions import ask
 from ast_sim.inference.effort import Effort, EffortErrors
 from ast_sim.inference.evaluation.evaluate import evaluate
 from ast_sim.inference.evaluation.evaluated_run import Evaluation
-from ast_sim.inference.predict import Motions, doubts, in_domain, new_question
+from ast_sim.inference.new_question import Motions, new_question
 from ast_sim.inference.predicting.question import Frames, Question
 from ast_sim.inference.promises.calibration import Calibration
 from ast_sim.inference.promises.chosen_effort import AskedError, chosen_effort

@@ -18,9 +18,9 @@ from ast_sim.inference.effort import (
     cheapest_good,
     mean_errors,
 )
-from ast_sim.inference.evaluation.asked_frame import errors_by_effort
+from ast_sim.inference.evaluation.deepest_frames import errors_by_effort
 from ast_sim.inference.evaluation.measures import SquaredError, rmse_sequence
-from ast_sim.inference.predicting.jump import calls
+from ast_sim.inference.predicting.jump import answer_steps
 from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.predicting.rollout import rollouts
 from ast_sim.models.simulator import Simulator
@@ -126,7 +126,7 @@ def _by_jumps(
     frames = [frames_asked(truth.num_frames) for truth in truths]
     asked = zip(names, truths, frames, strict=True)
     questions = [Question.of(truth, name, numbers.tolist()) for name, truth, numbers in asked]
-    ways = calls(model, questions, Effort(corrections + MORE_CALLS if corrections else 0))
+    ways = answer_steps(model, questions, Effort(corrections + MORE_CALLS if corrections else 0))
     newton_steps = MOST_NEWTON_STEPS if can_make_newton_steps(model.config) else 0
     validated = []
     for index, truth, numbers, way in zip(indices, truths, frames, ways, strict=True):

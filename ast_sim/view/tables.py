@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ast_sim.figures import AskedFigures, Figures, SceneFigures, main_nodes
+from ast_sim.figures import DeepestFrames, Figures, SceneFigures, main_nodes
 
 Json = dict[str, Any]
 
@@ -102,17 +102,17 @@ def tiles(evaluation: Figures | None) -> list[Json]:
             share = 100 * error / reference.rmse_sequence
             detail = f"{share:.0f} % of “{TRIVIAL[quantity][trivial].lower()}”, full rollout"
         shown.append({"label": title, "value": error, "unit": evaluation.unit(quantity), "detail": detail})
-    return shown + _asked_tiles(evaluation.asked) + _speed_tiles(evaluation) + _scope_tiles(evaluation)
+    return shown + _deepest_tiles(evaluation.deepest) + _speed_tiles(evaluation) + _scope_tiles(evaluation)
 
 
-def _asked_tiles(asked: AskedFigures) -> list[Json]:
+def _deepest_tiles(frames: DeepestFrames) -> list[Json]:
     """The deepest frame, asked for alone, beside the solver."""
-    if asked.relative_error is None or asked.seconds is None:
+    if frames.relative_error is None or frames.seconds is None:
         return []
-    detail = f"of the displacement, {1000 * asked.seconds:.3g} ms on one thread"
-    if asked.solver is not None:
-        detail += f"; the solver: {1000 * asked.solver.seconds:.3g} ms"
-    value = f"{100 * asked.relative_error:.3g}"
+    detail = f"of the displacement, {1000 * frames.seconds:.3g} ms on one thread"
+    if frames.solver is not None:
+        detail += f"; the solver: {1000 * frames.solver.seconds:.3g} ms"
+    value = f"{100 * frames.relative_error:.3g}"
     return [{"label": "Deepest frame alone", "value": value, "suffix": "%", "detail": detail}]
 
 

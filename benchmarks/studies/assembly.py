@@ -20,7 +20,7 @@ import numpy as np
 import ast_sim
 from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.inference.effort import Effort
-from ast_sim.inference.evaluation.asked_frame import asked_frames
+from ast_sim.inference.evaluation.deepest_frames import deepest_frames
 from ast_sim.inference.relative_errors import relative_error
 from ast_sim.simulate.jobs.rival import deepest_frame
 from ast_sim.support.provenance import provenance
@@ -98,7 +98,7 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
         data, row.run_folder(name, folder), from_run=start, steps=row.steps, resume=True, **row.settings
     )
     with run.open(data) as dataset:
-        found = asked_frames(run.model, dataset, "test", run.effort, row.rivals, made_from=row.spec)
+        found = deepest_frames(run.model, dataset, "test", run.effort, row.rivals, made_from=row.spec)
         curves = [_curve(run, dataset, index) for index in range(row.test)]
         solver_seconds = read_seconds(dataset).samples.values()
     return {

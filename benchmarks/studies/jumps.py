@@ -1,4 +1,4 @@
-"""Any frame in one jump: errors at the asked frame, the time of an answer, and the solver at its best.
+"""Any frame in one jump: errors at the deepest frame, the time of an answer, and the solver at its best.
 
 `python -m benchmarks.studies.jumps [ROW ...]` generates the scenes of each row, trains its runs and measures them on
 the test scenes, which no training has seen. It writes benchmarks/results/jumps.json and docs/results/jumps.md. Data and
@@ -16,7 +16,7 @@ import numpy as np
 
 import ast_sim
 from ast_sim.inference.effort import MOST_NEWTON_STEPS, Effort, can_make_newton_steps
-from ast_sim.inference.evaluation.asked_frame import asked_frames
+from ast_sim.inference.evaluation.deepest_frames import deepest_frames
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.support.provenance import provenance
 from benchmarks.studies.phrases import beside_solver, over_the_scenes, settings_tried
@@ -124,8 +124,8 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
     row = ROWS[name]
     run, data = trained(name, folder)
     with run.open(data) as dataset:
-        found = asked_frames(run.model, dataset, "test", run.effort, row.rivals)
-        known = asked_frames(run.model, dataset, "train", run.effort, most_scenes=TRAINING_SCENES).relative_error
+        found = deepest_frames(run.model, dataset, "test", run.effort, row.rivals)
+        known = deepest_frames(run.model, dataset, "train", run.effort, most_scenes=TRAINING_SCENES).relative_error
         dial = [_turned(run, dataset, effort) for effort in _efforts(run)]
     return {
         **provenance(f"python -m benchmarks.studies.jumps {name}"),
@@ -150,7 +150,7 @@ def _efforts(run: ast_sim.Run) -> list[Effort]:
 
 def _turned(run: ast_sim.Run, dataset: ast_sim.Dataset, effort: Effort) -> dict[str, Any]:
     """The answers of one setting of the dial to all test scenes."""
-    found = asked_frames(run.model, dataset, "test", effort)
+    found = deepest_frames(run.model, dataset, "test", effort)
     return {
         **asdict(effort),
         "relative_error": [scene.relative_error for scene in found.scenes],
@@ -171,7 +171,7 @@ _INTRODUCTION = """# Any frame in one jump
 
 Made by `python -m benchmarks.studies.jumps` from `benchmarks/results/jumps.json`; do not edit.
 
-The asked frame is the one in which a scene is deformed most. Its error is the root mean square of the error over the
+The deepest frame is the one in which a scene is deformed most. Its error is the root mean square of the error over the
 free nodes, divided by the root mean square of their displacement; tables have the mean over the test scenes and its
 standard error. "Training scenes" has the error on scenes of the training. "Minutes" are the steps times the median time
 of a step, on one thread; other work on the machine made some rows slower, so rows with equal steps differ. An "answer"

@@ -25,8 +25,8 @@ import numpy as np
 from ast_sim import keep_memory
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.answer import Answer
+from ast_sim.inference.answering import answers
 from ast_sim.inference.evaluation.measures import SquaredError, rmse_pooled, rmse_sequence
-from ast_sim.inference.predict import answers
 from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.trained_run import Run
 from ast_sim.scene import NodeType, Trajectory

@@ -1,4 +1,4 @@
-"""What the pages of asked frames and of own assemblies say in the same words."""
+"""What the pages of deepest frames and of own assemblies say in the same words."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ import pytest
 from toy import one_thread  # noqa: F401 (used by being imported)
 
 import ast_sim
-from ast_sim.inference.predict import doubts
+from ast_sim.inference.answering import doubts
 from ast_sim.support.errors import DatasetError
 
 

@@ -18,7 +18,7 @@ from vtk_series import read
 from ast_sim import Dataset, DatasetWriter, Effort, Motion, Run, generate, read_scene, train
 from ast_sim.cli import main
 from ast_sim.demo import FAMILY, FRAMES, NODES
-from ast_sim.inference import predict
+from ast_sim.inference import answering
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.scene import Scene
 from ast_sim.simulate.families import deforming_plate
@@ -156,13 +156,13 @@ def test_a_scene_far_away_gets_the_same_answer_there(run, tmp_path):
 def test_only_a_scene_that_leaves_the_domain_is_moved(run, monkeypatch):
     asked = []
 
-    answers = predict.answers
+    answers = answering.answers
 
     def kept(model, questions, effort, progress):
         asked.extend(questions)
         return answers(model, questions, effort, progress)
 
-    monkeypatch.setattr(predict, "answers", kept)
+    monkeypatch.setattr(answering, "answers", kept)
     scene = scene_of()
     scene = with_positions(scene, scene.rest_position + [0.7, 0.1, 0.0])  # up to x = 0.94 of 1
     run.predict(scene, PRESS, num_frames=3)

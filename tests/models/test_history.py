@@ -9,9 +9,9 @@ import toy
 from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import Dataset, train
+from ast_sim.inference.answering import answers
 from ast_sim.inference.effort import Effort
-from ast_sim.inference.predict import answers
-from ast_sim.inference.predicting.jump import calls
+from ast_sim.inference.predicting.jump import answer_steps
 from ast_sim.inference.predicting.question import Question
 from ast_sim.models.node_inputs import node_features
 from ast_sim.models.registry import model_names
@@ -96,7 +96,7 @@ def test_turning_points_are_predicted_first_and_are_the_starts(data, tmp_path, n
     carried = second.position[: scene.num_nodes]
     assert np.array_equal(carried[scene.prescribed], truth.position[5][scene.prescribed])
     assert torch.equal(carried[~torch.from_numpy(scene.prescribed)], there[~torch.from_numpy(scene.prescribed)])
-    (way,) = calls(model, [Question.of(truth, "scene", [5, LAST])], Effort())
+    (way,) = answer_steps(model, [Question.of(truth, "scene", [5, LAST])], Effort())
     assert np.array_equal(way.position[0], answer.position)
 
 

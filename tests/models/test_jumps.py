@@ -14,10 +14,10 @@ from ast_sim.batches.carry import Carrier
 from ast_sim.batches.pairs import PairSampler
 from ast_sim.batches.scheme import Scheme
 from ast_sim.dataset.reader import Dataset
+from ast_sim.inference.answering import answers
 from ast_sim.inference.effort import Effort
 from ast_sim.inference.evaluation.evaluate import evaluate, table
-from ast_sim.inference.predict import answers
-from ast_sim.inference.predicting.jump import calls
+from ast_sim.inference.predicting.jump import answer_steps
 from ast_sim.inference.predicting.question import Question
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.registry import build_model, find_preset, model_names
@@ -94,7 +94,7 @@ def test_each_call_corrects_the_answer_of_the_call_before():
     truth, model = toy.plate(1), Halving(config("ast"))
     free = ~truth.scene.prescribed
     question = Question.of(truth, "scene", [2, -1])
-    ((found, stress, steps, _),) = calls(model, [question], Effort(3))
+    ((found, stress, steps, _),) = answer_steps(model, [question], Effort(3))
     assert steps.tolist() == [0, 0]
     assert found.shape == (4, 2, truth.scene.num_nodes, 3)
     start = truth.position[0, free]

@@ -45,7 +45,7 @@ def test_where_the_solver_gave_up_at_once_there_is_nothing_to_learn_or_measure(t
     run = Run(tmp_path / "run")
     figures = run.evaluate().figures
     assert [scene.name for scene in figures.scenes] == ["test/000000", "test/000002"]
-    assert [scene.name for scene in figures.asked.scenes] == ["test/000000", "test/000002"]
+    assert [scene.name for scene in figures.deepest.scenes] == ["test/000000", "test/000002"]
     assert run.scope.travel[0] > 0 and run.scope.increment[0] > 0
     with DatasetWriter(tmp_path / "still.h5", toy.info(dynamic=dynamic)) as writer:
         writer.add("test", start_only)

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from chosen_figures import NOTHING_ASKED, evaluation, metrics
+from chosen_figures import NO_DEEPEST, evaluation, metrics
 from meshes import two_tetrahedra
 from view_scenes import plate, strip
 
@@ -190,13 +190,13 @@ def test_tiles_state_ratio_speed_and_failures():
 
 def test_a_tile_states_the_deepest_frame_beside_the_solver():
     solver = Beside(scenes=3, seconds=0.0612, model_seconds=0.025, ratio=2.4)
-    asked = replace(NOTHING_ASKED, relative_error=0.0577, seconds=0.025, solver=solver)
-    found = {tile["label"]: tile for tile in tables.tiles(evaluation({"a": 3e-3}, asked=asked))}
+    deepest = replace(NO_DEEPEST, relative_error=0.0577, seconds=0.025, solver=solver)
+    found = {tile["label"]: tile for tile in tables.tiles(evaluation({"a": 3e-3}, deepest=deepest))}
     tile = found["Deepest frame alone"]
     assert (tile["value"], tile["suffix"]) == ("5.77", "%")
     assert tile["detail"] == "of the displacement, 25 ms on one thread; the solver: 61.2 ms"
-    for missing in (replace(asked, solver=None), replace(asked, relative_error=None)):
-        tiles = {tile["label"]: tile for tile in tables.tiles(evaluation({"a": 3e-3}, asked=missing))}
+    for missing in (replace(deepest, solver=None), replace(deepest, relative_error=None)):
+        tiles = {tile["label"]: tile for tile in tables.tiles(evaluation({"a": 3e-3}, deepest=missing))}
         assert "solver" not in tiles.get("Deepest frame alone", {"detail": ""})["detail"]
 
 

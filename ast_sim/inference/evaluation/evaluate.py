@@ -15,8 +15,9 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.figures import Figures, SceneError, SceneFigures
 from ast_sim.inference.answer import Answer
+from ast_sim.inference.answering import answers as predictions
 from ast_sim.inference.effort import FIRST_CALL, Effort
-from ast_sim.inference.evaluation import asked_frame
+from ast_sim.inference.evaluation import deepest_frames
 from ast_sim.inference.evaluation.trivial_predictors import (
     Errors,
     displacement_errors,
@@ -26,8 +27,7 @@ from ast_sim.inference.evaluation.trivial_predictors import (
     values_of,
     where_it_counts,
 )
-from ast_sim.inference.predict import answers as predictions
-from ast_sim.inference.predicting.predict_batch import Start, predict_batch
+from ast_sim.inference.predicting.predicted_frames import Start, predict_frames
 from ast_sim.inference.predicting.question import Question
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.simulator import Simulator
@@ -55,7 +55,7 @@ def evaluate(
 
     Args:
         rival_scenes: in how many scenes the solver goes to the deepest frame, to compare.
-        made_from: as in `asked_frames`.
+        made_from: as in `deepest_frames`.
 
     Raises:
         DatasetError: the split has no frame to predict.
@@ -88,7 +88,7 @@ def evaluate(
         failures=sum(scene.failure is not None for scene in scenes),
         jumps=scheme.jumps,
         effort=dataclasses.asdict(effort),
-        asked=asked_frame.asked_frames(model, dataset, split, effort, rival_scenes, advance, made_from),
+        deepest=deepest_frames.deepest_frames(model, dataset, split, effort, rival_scenes, advance, made_from),
         speedup=_speedup(scenes),
         length_unit=dataset.info.length_unit,
         stress_unit="Pa",
@@ -132,7 +132,7 @@ def one_step_predictions(model: Simulator, truth: Trajectory, name: str) -> tupl
     predicted = []
     with model.predicting():
         for first in range(0, len(starts), chunk):
-            predicted += predict_batch(model, starts[first : first + chunk])
+            predicted += predict_frames(model, starts[first : first + chunk])
     fields = {
         output.name: np.array([frame.fields[output.name].numpy() for frame in predicted])
         for output in model.config.data.outputs
@@ -207,7 +207,7 @@ def table(figures: Figures) -> str:
         lines.append("(its name and .seconds.json) hold the seconds of a solver; a dataset is moved together with it")
     else:
         lines.append(_all_frames(figures))
-    lines += asked_frame.lines(figures.asked)
+    lines += deepest_frames.lines(figures.deepest)
     return "\n".join(lines)
 
 

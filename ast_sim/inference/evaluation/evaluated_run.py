@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.figures import Figures
+from ast_sim.inference.answering import answers
 from ast_sim.inference.evaluation.evaluate import table
-from ast_sim.inference.predict import answers
 from ast_sim.inference.predicting.question import Question
 from ast_sim.support.disk import write_json
 from ast_sim.support.notebook_table import html_table, one_line

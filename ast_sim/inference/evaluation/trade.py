@@ -16,9 +16,9 @@ import torch
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import read_seconds
+from ast_sim.inference.answering import answers
 from ast_sim.inference.effort import Effort, choices
-from ast_sim.inference.evaluation.asked_frame import deepest_predicted
-from ast_sim.inference.predict import answers
+from ast_sim.inference.evaluation.deepest_frames import deepest_predicted
 from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.relative_errors import errors_of, moves
 from ast_sim.models.simulator import Simulator

@@ -21,7 +21,7 @@ from ast_sim.batches.carry import Carrier
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.effort import AGAIN, MOST_NEWTON_STEPS, Effort, newton_steps
 from ast_sim.inference.predicting.jumping_scene import JumpingFrame, JumpingScene
-from ast_sim.inference.predicting.predict_batch import predict_batch
+from ast_sim.inference.predicting.predicted_frames import predict_frames
 from ast_sim.inference.predicting.question import Question, not_finite, too_far
 from ast_sim.models.simulator import Simulator
 from ast_sim.named_field import STRESS
@@ -70,7 +70,7 @@ class AnswerSteps(NamedTuple):
     last_step: np.ndarray
 
 
-def calls(model: Simulator, questions: Sequence[Question], effort: Effort) -> list[AnswerSteps | str]:
+def answer_steps(model: Simulator, questions: Sequence[Question], effort: Effort) -> list[AnswerSteps | str]:
     """For each scene the way to its answer, or a text that says why a frame failed. Arguments and errors as for
     `jumps`."""
     ways: list[AnswerSteps | str] = []
@@ -171,7 +171,7 @@ def _groups(model: Simulator, frames: Sequence[JumpingFrame]) -> Iterator[list[J
 def _predict(model: Simulator, group: list[JumpingFrame], corrections: int) -> None:
     """Predict the frames of a batch."""
     try:
-        predicted = predict_batch(model, [frame.start for frame in group], corrections + 1)
+        predicted = predict_frames(model, [frame.start for frame in group], corrections)
     except RolloutError as error:
         if len(group) > 1:  # one frame must not spoil the others
             for frame in group:

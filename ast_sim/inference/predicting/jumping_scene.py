@@ -17,7 +17,7 @@ from ast_sim.batches.carry import Carrier
 from ast_sim.batches.graph import Graph
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.effort import law_of
-from ast_sim.inference.predicting.predict_batch import Start
+from ast_sim.inference.predicting.predicted_frames import Start
 from ast_sim.inference.predicting.question import Question
 from ast_sim.mechanics.equilibria import Equilibria
 from ast_sim.mechanics.linearised_contact import STILL, NewtonSteps

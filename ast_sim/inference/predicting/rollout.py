@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ast_sim.batches.batch_builder import State
 from ast_sim.inference.answer import Answer
-from ast_sim.inference.predicting.predict_batch import PredictedFrame, Start, predict_batch
+from ast_sim.inference.predicting.predicted_frames import PredictedFrame, Start, predict_frames
 from ast_sim.inference.predicting.question import Question, not_finite, too_far
 from ast_sim.models.simulator import Simulator
 from ast_sim.named_field import STRESS
@@ -42,7 +42,7 @@ def rollouts(model: Simulator, questions: Sequence[Question], progress: ShowProg
             # Only scenes of the same domain are predicted together: none may change another's domain.
             for domain in dict.fromkeys(scene.domain for scene in running):
                 group = [scene for scene in running if scene.domain == domain]
-                predicted = predict_batch(model, [scene.start(frame) for scene in group])
+                predicted = predict_frames(model, [scene.start(frame) for scene in group])
                 for scene, of_scene in zip(group, predicted, strict=True):
                     scene.advance(frame, of_scene)
             if running:

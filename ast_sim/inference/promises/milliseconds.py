@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 import platformdirs
 import torch
 
+from ast_sim.inference.answering import in_domain
 from ast_sim.inference.effort import Effort, choices
-from ast_sim.inference.predict import in_domain
 from ast_sim.support.disk import write_json
 from ast_sim.support.errors import AstSimError, ConfigError
 from ast_sim.support.provenance import processor

@@ -1,4 +1,4 @@
-"""The asked frame: relative errors, stress, times, and the solver's ways to the same frame."""
+"""The deepest frame: relative errors, stress, times, and the solver's ways to the same frame."""
 
 import json
 from dataclasses import asdict, replace
@@ -11,11 +11,11 @@ from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import Dataset, generate
 from ast_sim.figures import WayFigures
+from ast_sim.inference.answering import answers
 from ast_sim.inference.effort import Effort, EffortErrors, cheapest_good, mean_errors, newton_steps
-from ast_sim.inference.evaluation.asked_frame import asked_frames, errors_by_effort, lines
-from ast_sim.inference.predict import answers
+from ast_sim.inference.evaluation.deepest_frames import deepest_frames, errors_by_effort, lines
 from ast_sim.inference.predicting import jump, jumping_scene
-from ast_sim.inference.predicting.jump import calls
+from ast_sim.inference.predicting.jump import answer_steps
 from ast_sim.inference.predicting.question import Question
 from ast_sim.mechanics.linearised_contact import STILL, NewtonSteps
 from ast_sim.models.data_facts import DataFacts
@@ -52,7 +52,7 @@ def test_errors_are_shares_of_the_displacement(one):
     frame = deepest_frame(truth)
     assert 0 < frame < 6
     model = Share(replace(toy.config(toy.info()), jumps=True), truth, frame, 0.75)
-    scene, *_ = asked_frames(model, one, "test", Effort(2)).scenes
+    scene, *_ = deepest_frames(model, one, "test", Effort(2)).scenes
     free = ~truth.scene.prescribed
     size = np.sqrt(np.mean(np.square((truth.position[frame] - truth.position[0])[free].astype(float))))
     assert (scene.name, scene.frame, scene.displacement) == ("test/000000", frame, pytest.approx(size))
@@ -66,10 +66,10 @@ def test_errors_are_shares_of_the_displacement(one):
 def test_a_failure_and_a_dataset_without_a_solver_are_told(one):
     truth = one.load("test", 0)
     model = Share(replace(toy.config(toy.info()), jumps=True), truth, 3, float("nan"))
-    found = asked_frames(model, one, "test", Effort(1), rival_scenes=1)
+    found = deepest_frames(model, one, "test", Effort(1), rival_scenes=1)
     assert found.relative_error is None and lines(found) == ["the deepest frame: every prediction failed"]
     model.share = 0.5
-    found = asked_frames(model, one, "test", Effort(1), rival_scenes=1)
+    found = deepest_frames(model, one, "test", Effort(1), rival_scenes=1)
     assert found.solver is None and "the solver was not run:" in lines(found)[-1]
     json.dumps(asdict(found), allow_nan=False)
 
@@ -104,7 +104,7 @@ def test_newton_steps_lead_from_the_answer_to_equilibrium(pressed, monkeypatch):
         == tuple(truth.attributes[key] for key in ("young", "poisson"))
     )
     monkeypatch.setattr(jumping_scene, "STILL", 0.0)
-    found = asked_frames(model, pressed, "test", Effort(1, 3)).scenes[0]
+    found = deepest_frames(model, pressed, "test", Effort(1, 3)).scenes[0]
     errors = found.by_calls
     assert errors[:2] == pytest.approx([0.3, 0.09], rel=1e-3)
     assert errors[2] < 0.4 * errors[1] and errors[-1] < 0.015 and found.relative_error == errors[-1]
@@ -129,9 +129,9 @@ def test_newton_steps_that_do_not_end_begin_anew_after_more_corrections(pressed,
     truth, model = pressing(pressed, 0.4)
     frame = deepest_frame(truth)
     question, free = [Question.of(truth, "plate", [frame])], ~truth.scene.prescribed
-    (first,) = calls(model, question, Effort(1, 10))
+    (first,) = answer_steps(model, question, Effort(1, 10))
     assert first.steps == [10] and first.last_step[0] > STILL  # with 0.36 of the way missing
-    (again,) = calls(model, question, Effort(3, 10))  # with 0.13 missing
+    (again,) = answer_steps(model, question, Effort(3, 10))  # with 0.13 missing
     (answer,) = answers(model, question, Effort(1, 10))
     assert answer.converged and np.array_equal(answer.position[0], again.position[-1, 0])
     assert np.array_equal(answer.stress[0], again.stress[-1, 0]) and answer.seconds > 0
@@ -192,7 +192,7 @@ def test_newton_steps_end_when_one_is_small(pressed, monkeypatch):
     truth, model = pressing(pressed, 0.6)
     question = [Question.of(truth, "plate", [deepest_frame(truth)])]
     monkeypatch.setattr(jumping_scene, "STILL", 0.0)
-    (all_steps,) = calls(model, question, Effort(1, 6))
+    (all_steps,) = answer_steps(model, question, Effort(1, 6))
     sizes = [
         newton_steps(model.config, truth.scene).size(*(all_steps.position[i, 0].astype(float) for i in (k, k + 1)))
         for k in range(1, 7)
@@ -201,7 +201,7 @@ def test_newton_steps_end_when_one_is_small(pressed, monkeypatch):
     assert all_steps.steps == [6] and all_steps.last_step[0] == pytest.approx(sizes[-1], abs=1e-5)
     monkeypatch.undo()
     needed = next(k for k, size in enumerate(sizes, 1) if size <= STILL)
-    (ended,) = calls(model, question, Effort(1, 6))
+    (ended,) = answer_steps(model, question, Effort(1, 6))
     assert ended.steps == [needed] and ended.last_step[0] == pytest.approx(sizes[needed - 1], rel=1e-3)
     assert np.array_equal(ended.position[: 2 + needed], all_steps.position[: 2 + needed])
     assert np.array_equal(ended.position[2 + needed :], np.repeat(ended.position[1 + needed][None], 6 - needed, axis=0))
@@ -215,9 +215,9 @@ def test_newton_steps_end_when_one_is_small(pressed, monkeypatch):
     (short,) = answers(model, question, Effort(1, 1))
     assert short.converged is False and short.last_steps == (pytest.approx(sizes[0], rel=1e-3),)
     assert answers(model, question, Effort(1))[0].converged is None
-    found = asked_frames(model, pressed, "test", Effort(1, 1))
+    found = deepest_frames(model, pressed, "test", Effort(1, 1))
     assert found.unsettled == 1 and "in 1 of 1 scenes the Newton steps did not end" in "\n".join(lines(found))
-    assert asked_frames(model, pressed, "test", Effort(1, 6)).unsettled == 0
+    assert deepest_frames(model, pressed, "test", Effort(1, 6)).unsettled == 0
 
 
 def test_a_quiet_prediction_says_nothing_of_newton_steps_that_take_long(pressed, monkeypatch, capfd):
@@ -286,7 +286,7 @@ def test_beside_the_solver(tmp_path):
         frame = deepest_frame(truth)
         config = replace(toy.config(dataset.info), jumps=True)
         config = replace(config, data=replace(config.data, stress="node"))
-        found = asked_frames(Share(config, truth, frame, 0.99), dataset, "test", Effort(), rival_scenes=1)
+        found = deepest_frames(Share(config, truth, frame, 0.99), dataset, "test", Effort(), rival_scenes=1)
     solver = found.scenes[0].solver
     assert found.relative_error == pytest.approx(0.01, rel=1e-3)
     assert solver.ways["own stop test"].relative_error < 1e-3

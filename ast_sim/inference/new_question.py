@@ -1,52 +1,23 @@
-"""Predicting scenes, by jumps or step by step. The motion of a new scene is completed, and it is moved into the model's
-domain where it lies elsewhere.
-"""
+"""The question that the arguments of a prediction ask: the motion is completed, and all is checked."""
 
 from __future__ import annotations
 
-import dataclasses
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
 from ast_sim.importers.scene_mesh import SceneMesh
-from ast_sim.inference.answer import Answer
-from ast_sim.inference.effort import FIRST_CALL, Effort
-from ast_sim.inference.predicting.jump import jumps
 from ast_sim.inference.predicting.question import Frames, Question, fields_of
-from ast_sim.inference.predicting.rollout import rollouts
-from ast_sim.mechanics.physics_check import turned_over
 from ast_sim.models.model_config import ModelConfig
-from ast_sim.models.simulator import Simulator
 from ast_sim.named_field import STRESS, require_fields
 from ast_sim.number_arrays import ranges
 from ast_sim.prescribed_motion import Motion, RigidMotion, Vector, frames_for
 from ast_sim.runs.scope import Scope, spacing_of
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.support.errors import ConfigError, DatasetError
-from ast_sim.support.progress import ShowProgress
 
 LEAST_RESOLVED = 0.01  # of a mean edge: rounding of the positions may be as large
 Motions = Motion | Mapping[int, RigidMotion | Vector] | np.ndarray
-
-
-def answers(
-    model: Simulator,
-    questions: Sequence[Question],
-    effort: Effort = FIRST_CALL,
-    progress: ShowProgress = False,
-) -> list[Answer]:
-    """Predict the wanted frames of several scenes, by jumps or step by step as the model does; see `jumps` and
-    `rollouts` for the arguments and errors."""
-    began = time.perf_counter()
-    if model.config.scheme.jumps:
-        predicted = jumps(model, questions, effort, progress)
-    else:
-        effort.check(model.config)
-        predicted = rollouts(model, questions, progress)
-    each = (time.perf_counter() - began) / max(1, len(questions))
-    return [dataclasses.replace(answer, seconds=each) for answer in predicted]
 
 
 def new_question(
@@ -184,62 +155,3 @@ def _require_material(config: ModelConfig, scope: Scope, scene: Scene, name: str
         f"{name} has {given or 'no'} material columns, but the run was trained with {wanted} ({ranges}): give each"
         " body its numbers (--material BODY=NUMBER,...)"
     )
-
-
-def in_domain(
-    model: Simulator, questions: Sequence[Question], effort: Effort, progress: ShowProgress = False
-) -> list[Answer]:
-    """Predict scenes where they lie; those that may be moved and leave the domain in the middle of the domain."""
-    shifts = [_way_into_domain(model.config, question) for question in questions]
-    there = [q if shift is None else _moved_question(q, shift) for q, shift in zip(questions, shifts, strict=True)]
-    predicted = zip(questions, shifts, answers(model, there, effort, progress), strict=True)
-    return [answer if shift is None else _moved_back(question, answer, shift) for question, shift, answer in predicted]
-
-
-def doubts(answer: Answer) -> list[str]:
-    """What speaks against an answer, whatever the question was: Newton steps that have not converged, and elements of
-    deforming bodies that are turned over."""
-    told = []
-    if answer.converged is False:
-        told.append(
-            f"the Newton steps have not converged: the last one has a size of {max(answer.last_steps):.2g}"
-            " (Answer.last_steps)"
-        )
-    counts = (turned_over(answer.scene, position) for position in answer.position)
-    first = next(((frame, count) for frame, count in zip(answer.frames, counts, strict=False) if count), None)
-    if first is not None:
-        told.append(f"{first[1]:.0f} elements are turned over in frame {first[0]}, which no body can do (Answer.check)")
-    return told
-
-
-def _moved_question(question: Question, shift: np.ndarray) -> Question:
-    scene = dataclasses.replace(question.scene, rest_position=_moved(question.scene.rest_position, shift))
-    return dataclasses.replace(question, scene=scene, prescribed_position=_moved(question.prescribed_position, shift))
-
-
-def _moved_back(question: Question, answer: Answer, shift: np.ndarray) -> Answer:
-    position = _moved(answer.position, -shift)
-    given = question.prescribed_position[list(answer.frames)]
-    # Given numbers stay what they are, to the last bit.
-    known = question.scene.prescribed | ~answer.computed[:, None]
-    position = np.where(known[:, :, None], given, position)
-    return dataclasses.replace(answer, scene=question.scene, position=position)
-
-
-def _way_into_domain(config: ModelConfig, question: Question) -> np.ndarray | None:
-    """[3] float64: from the middle of the start and of all that is prescribed to the middle of the domain; None: both
-    lie inside the domain, or the scene stays where it is."""
-    position = question.prescribed_position
-    known = np.concatenate([position[0], position[:, question.scene.prescribed].reshape(-1, 3)])
-    known = known.T.astype(np.float64, order="C")  # rows are reduced faster
-    lowest, highest = known.min(axis=1), known.max(axis=1)
-    center = np.array(config.data.domain_center)
-    inside = max((center - lowest).max(), (highest - center).max()) <= config.data.domain_half_width
-    if inside or not question.movable:
-        return None
-    return center - (lowest + highest) / 2
-
-
-def _moved(points: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Points [..., 3] float32, moved by `shift` [3] float64 and rounded once."""
-    return (points.astype(np.float64) + shift).astype(np.float32)

@@ -1,8 +1,8 @@
-"""One frame of every scene, as a user asks for it: its errors, its time, and what the solver takes for the same answer.
+"""The deepest frame of every scene, asked for alone: errors, times, and what the solver takes for the same answer.
 
-The asked frame is the deepest: the free nodes are displaced most in it. The relative error is the root mean square of
-the error over that of the displacement, over the free nodes in this frame. Times are of one thread, and count what is
-prepared for a mesh, for the model and for the solver.
+In the deepest frame the free nodes are displaced most. The relative error is the root mean square of the error over
+that of the displacement, over the free nodes in this frame. Times are of one thread, and count what is prepared for a
+mesh, for the model and for the solver.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ import numpy as np
 import torch
 
 from ast_sim.dataset.reader import Dataset
-from ast_sim.figures import AskedFigures, AskedScene, Beside, SolverFigures, WayFigures
+from ast_sim.figures import Beside, DeepestFrame, DeepestFrames, SolverFigures, WayFigures
+from ast_sim.inference.answering import answers
 from ast_sim.inference.effort import Effort, EffortErrors
-from ast_sim.inference.predict import answers
-from ast_sim.inference.predicting.jump import calls
+from ast_sim.inference.predicting.jump import answer_steps
 from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.relative_errors import relative_error, rms, stress_errors
 from ast_sim.mechanics.linearised_contact import STILL
@@ -29,7 +29,7 @@ from ast_sim.simulate.jobs.rival import UNMESHED, Rivals, cheapest, deepest_fram
 from ast_sim.support.errors import ConfigError, SimulationError
 
 
-def asked_frames(
+def deepest_frames(
     model: Simulator,
     dataset: Dataset,
     split: str,
@@ -38,7 +38,7 @@ def asked_frames(
     advance: Callable[[str], None] = lambda name: None,
     made_from: str | os.PathLike[str] | None = None,
     most_scenes: int | None = None,
-) -> AskedFigures:
+) -> DeepestFrames:
     """Predict the deepest frame of each scene of a split, alone and on one thread.
 
     Args:
@@ -59,8 +59,8 @@ def asked_frames(
         torch.set_num_threads(threads)
     why = None
     try:
-        asked = [scene.frame for scene in scenes[:rival_scenes]]
-        outcomes = _rivals(dataset, split, indices[:rival_scenes], asked, made_from)
+        numbers = [scene.frame for scene in scenes[:rival_scenes]]
+        outcomes = _rivals(dataset, split, indices[:rival_scenes], numbers, made_from)
         for number, rival in enumerate(outcomes):
             solver = _solver(rival, scenes[number].relative_error)
             scenes[number] = dataclasses.replace(scenes[number], solver=solver)
@@ -68,7 +68,7 @@ def asked_frames(
     except (ConfigError, SimulationError) as error:
         why = str(error)
     known = [scene for scene in scenes if scene.relative_error is not None]
-    return AskedFigures(
+    return DeepestFrames(
         scenes=tuple(scenes),
         relative_error=_mean([scene.relative_error for scene in known]),
         stress_share=_mean([scene.stress_share for scene in known]),
@@ -107,9 +107,9 @@ def errors_by_effort(model: Simulator, truth: Trajectory, most: Effort) -> list[
 def _after(model: Simulator, truth: Trajectory, frame: int, corrections: int, most: int) -> list[EffortErrors]:
     """The errors after so many corrections and 0 to `most` Newton steps."""
     question = Question.of(truth, "validation", [frame])
-    (way,) = calls(model, [question], Effort(corrections, most))
+    (way,) = answer_steps(model, [question], Effort(corrections, most))
     if isinstance(way, str) and most:  # a Newton step failed; the calls before it still count
-        (way,) = calls(model, [question], Effort(corrections))
+        (way,) = answer_steps(model, [question], Effort(corrections))
     if isinstance(way, str):
         return [EffortErrors(Effort(corrections, steps), None, None, 0, 0) for steps in range(most + 1)]
     positions = way.position[corrections:]
@@ -127,39 +127,39 @@ def _after(model: Simulator, truth: Trajectory, frame: int, corrections: int, mo
     return measured
 
 
-def lines(asked: AskedFigures) -> list[str]:
+def lines(frames: DeepestFrames) -> list[str]:
     """The most important figures as sentences."""
-    if asked.relative_error is None or asked.seconds is None:
+    if frames.relative_error is None or frames.seconds is None:
         return ["the deepest frame: every prediction failed"]
-    after = [f"{100 * error:.3g}" for error in asked.by_calls]
+    after = [f"{100 * error:.3g}" for error in frames.by_calls]
     told = [
-        f"the deepest frame at once: error {100 * asked.relative_error:.3g} % of the displacement,"
-        f" {1000 * asked.seconds:.3g} ms in the median, on one thread"
+        f"the deepest frame at once: error {100 * frames.relative_error:.3g} % of the displacement,"
+        f" {1000 * frames.seconds:.3g} ms in the median, on one thread"
     ]
     if len(after) > 1:
         told.append(f"  after each call, and each Newton step: {', '.join(after)} %")
-    if asked.unsettled:
-        told.append(f"  in {asked.unsettled} of {len(asked.scenes)} scenes the Newton steps did not end")
-    if asked.stress_share is not None and asked.largest_stress is not None:
+    if frames.unsettled:
+        told.append(f"  in {frames.unsettled} of {len(frames.scenes)} scenes the Newton steps did not end")
+    if frames.stress_share is not None and frames.largest_stress is not None:
         told.append(
-            f"  stress: {asked.stress_share:.2f} of the error of the frame's true mean; the largest is"
-            f" {100 * asked.largest_stress:.3g} % off"
+            f"  stress: {frames.stress_share:.2f} of the error of the frame's true mean; the largest is"
+            f" {100 * frames.largest_stress:.3g} % off"
         )
-    if asked.no_solver is not None:
-        told.append(f"  the solver was not run: {asked.no_solver}")
+    if frames.no_solver is not None:
+        told.append(f"  the solver was not run: {frames.no_solver}")
     for what, beside in (
-        ("the solver for this frame", asked.solver),
-        ("its fastest setting that is as accurate", asked.cheapest),
+        ("the solver for this frame", frames.solver),
+        ("its fastest setting that is as accurate", frames.cheapest),
     ):
         if beside is not None:
             told.append(
                 f"  {what}: {1000 * beside.seconds:.3g} ms, {beside.ratio:.3g} times as long (medians of"
                 f" {beside.scenes} scenes, one thread)"
             )
-    return told + _unmeshed(asked.scenes)
+    return told + _unmeshed(frames.scenes)
 
 
-def _unmeshed(scenes: Iterable[AskedScene]) -> list[str]:
+def _unmeshed(scenes: Iterable[DeepestFrame]) -> list[str]:
     """In how many scenes the solver has no coarser mesh, so that ways which begin on one are missing, and why."""
     solvers = [scene.solver for scene in scenes if scene.solver is not None]
     failures = [[way.failure for way in solver.ways.values() if way.failure is not None] for solver in solvers]
@@ -173,7 +173,7 @@ def _unmeshed(scenes: Iterable[AskedScene]) -> list[str]:
     ]
 
 
-def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: Effort) -> AskedScene:
+def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: Effort) -> DeepestFrame:
     name = f"{split}/{index:06d}"
     truth = dataset.load(split, index)
     frame = deepest_predicted(model, truth)
@@ -184,11 +184,11 @@ def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: E
     stress = None if answer.stress is None or answer.failure is not None else answer.stress[0]
     by_calls = []
     if model.config.scheme.corrects and not failed:
-        (after,) = calls(model, [question], effort)
+        (after,) = answer_steps(model, [question], effort)
         positions = () if isinstance(after, str) else after.position
         by_calls = [relative_error(position[0], truth, frame) for position in positions]
     share, largest = stress_errors(truth, stress, frame, model.config.data.stress)
-    return AskedScene(
+    return DeepestFrame(
         name=name,
         nodes=truth.scene.num_nodes,
         frame=frame,
@@ -226,7 +226,7 @@ def _solver(rival: Rivals, error: float | None) -> SolverFigures:
     )
 
 
-def _beside(scenes: list[tuple[AskedScene, float | None]]) -> Beside | None:
+def _beside(scenes: list[tuple[DeepestFrame, float | None]]) -> Beside | None:
     """The scenes with the solver's seconds, as medians."""
     both = [(seconds, scene.seconds) for scene, seconds in scenes if seconds is not None]
     if not both:

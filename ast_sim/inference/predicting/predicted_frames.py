@@ -47,9 +47,9 @@ class PredictedFrame(NamedTuple):
     seconds: float
 
 
-def predict_batch(model: Simulator, starts: Sequence[Start], calls: int = 1) -> list[PredictedFrame]:
-    """Predict the frames; each call corrects the answer of the one before. Fields on elements are predicted by the last
-    call only."""
+def predict_frames(model: Simulator, starts: Sequence[Start], corrections: int = 0) -> list[PredictedFrame]:
+    """Predict the frames by one call, then by corrections, each of which corrects the answer before it. Fields on
+    elements are predicted by the last call only."""
     began = time.perf_counter()
     names, graphs, states, prescribed_position = zip(*starts, strict=True)
     graph = Graph.concatenate(graphs)
@@ -58,8 +58,9 @@ def predict_batch(model: Simulator, starts: Sequence[Start], calls: int = 1) -> 
     sizes = graph.node_offsets.diff().tolist()
     positions = []
     predictions = []
-    for call in range(1, calls + 1):
-        position, prediction = model.advance(replace(batch, wants_elements=call == calls), prescribed_position)
+    for call in range(corrections + 1):
+        last_call = call == corrections
+        position, prediction = model.advance(replace(batch, wants_elements=last_call), prescribed_position)
         positions.append(position.split(sizes))
         predictions.append(prediction)
         batch = replace(batch, position=position, proximity=None)
