@@ -1,5 +1,6 @@
 """Training in two processes, by `--processes` and under torchrun: the same as in one with the whole batch."""
 
+import functools
 import os
 import shutil
 import signal
@@ -82,7 +83,7 @@ def test_two_processes_do_what_one_does(data, tmp_path, along):
     assert all(torch.equal(value, two[name]) for name, value in weights(tmp_path / "two").items())
 
 
-def test_torchrun_and_a_notebook_train_the_same_model(data, tmp_path):
+def test_torchrun_and_a_notebook_train_the_same_model(data, tmp_path, request):
     one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}  # of each process: sums over threads round otherwise
     subprocess.run(command(2, *words_of(data, tmp_path / "torchrun", 8)), check=True, timeout=300, env=one_thread)
     settings = dict(setting.split("=") for setting in SETTINGS)
@@ -90,14 +91,14 @@ def test_torchrun_and_a_notebook_train_the_same_model(data, tmp_path):
     given |= {key: int(given[key]) for key in ("batch_size", "statistics_pairs", "log_every", "validate_every")}
     model = {"hidden": 16, "L_SA": 1, "L_cell": 3, "jumps": False}
     steps: list[int] = []
-    threads = torch.get_num_threads()
-    assert threads == 2
+    request.addfinalizer(functools.partial(torch.set_num_threads, torch.get_num_threads()))
+    torch.set_num_threads(2)
     ast_sim.train(
         data, tmp_path / "notebook", model_settings=model, callback=lambda step, _: steps.append(step), steps=8,
         processes=2, **given,
     )  # fmt: skip
     assert steps == [4, 4, 8, 8]
-    assert "WORLD_SIZE" not in os.environ and torch.get_num_threads() == threads
+    assert "WORLD_SIZE" not in os.environ and torch.get_num_threads() == 2
     ours, theirs = (weights(tmp_path / name) for name in ("notebook", "torchrun"))
     for name, value in ours.items():  # earlier tests have used this process: its arrays lie elsewhere, sums differ
         torch.testing.assert_close(value, theirs[name], rtol=1e-4, atol=2e-5, msg=name)
