@@ -64,7 +64,7 @@ def _lead(figures: TradeFigures) -> str:
         if rows
     ]
     told = "; ".join(parts) or "neither is faster by the intervals" if figures.solver else "the solver was not run"
-    return f"{len(figures.scenes)} scenes that the run has not learned from: {told}."
+    return f"{len(figures.scenes)} scenes that the run has not learned from. {figures.quantity.capitalize()}: {told}."
 
 
 def _note(figures: TradeFigures) -> str:

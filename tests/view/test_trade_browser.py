@@ -37,7 +37,9 @@ def test_the_table_and_the_chart_show_the_settings(browser, path):
         "–",
         "the solver alone",
     ]
-    lead = "2 scenes that the run has not learned from: the run is faster at 10 % and 5 % and 2.5 % and 1 %"
+    lead = (
+        "2 scenes that the run has not learned from. Displacement: the run is faster at 10 % and 5 % and 2.5 % and 1 %"
+    )
     assert texts(browser, "#lead")[0].startswith(lead)
     drawn = browser.evaluate("document.querySelector('#trade-chart .plot').data.map(({ x, y }) => [x, y])")
     assert drawn[0] == [[60], [20]] and drawn[1] == [[20, 40], [8, 1]]
