@@ -79,6 +79,12 @@ def line_of(told: dict[str, dict[str, list[float]]]) -> str:
     return "; ".join(parts) + f"; positions differ by {far:.2g} roundings"
 
 
+def commit_of(tree: Path) -> str:
+    """The commit of a state of this repository."""
+    command = ["git", "-C", str(tree), "rev-parse", "HEAD"]
+    return subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
+
+
 def samples_of(told: dict[str, dict[str, list[float]]]) -> dict[str, dict[str, list[float]]]:
     """The times of each state, without its positions."""
     return {name: {clock: one[clock] for clock in ("clock", "processor")} for name, one in told.items()}
@@ -102,8 +108,8 @@ def main() -> None:
                 print(f"{nodes} nodes, {newton_steps} Newton steps: {line_of(told)}", flush=True)
                 rows.append({"nodes": nodes, "newton_steps": newton_steps, "milliseconds": samples_of(told)})
     if arguments.json is not None:
-        command = " ".join(["python -m benchmarks.steps.predictions", *sys.argv[1:]])
-        write_json(arguments.json, {**provenance(command), "rows": rows})
+        command = f"python -m benchmarks.steps.predictions --before FOLDER --repeats {arguments.repeats} --json FILE"
+        write_json(arguments.json, {**provenance(command), "before": commit_of(trees["before"]), "rows": rows})
 
 
 if __name__ == "__main__":
