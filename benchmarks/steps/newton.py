@@ -21,6 +21,7 @@ import numpy as np
 from ast_sim.support.disk import write_json
 from ast_sim.support.provenance import processor, provenance
 from benchmarks.steps.newton_worker import CASES
+from benchmarks.steps.predictions import commit_of
 
 WORKER = Path(__file__).with_name("newton_worker.py")
 
@@ -87,8 +88,9 @@ def main() -> None:
         rows[case] = measure(trees, case, rounds, repeats, arguments.limit)
         print(line_of(case, rows[case], arguments.limit), flush=True)
     if arguments.json is not None:
-        command = " ".join(["python -m benchmarks.steps.newton", *sys.argv[1:]])
-        write_json(arguments.json, {**provenance(command), "limit": arguments.limit, "cases": rows})
+        command = "python -m benchmarks.steps.newton --before FOLDER --json FILE"
+        before = commit_of(trees["before"])
+        write_json(arguments.json, {**provenance(command), "before": before, "limit": arguments.limit, "cases": rows})
 
 
 if __name__ == "__main__":
