@@ -111,6 +111,16 @@ class TradeFigures:
         """A row for each of `TOLERANCES`."""
         return [self._row(tolerance) for tolerance in TOLERANCES]
 
+    @property
+    def ahead(self) -> list[TradeRow]:
+        """The rows in which the run is faster."""
+        return [row for row in self.rows() if row.verdict == "the run"]
+
+    @property
+    def behind(self) -> list[TradeRow]:
+        """The rows in which the solver is faster, or alone keeps the error."""
+        return [row for row in self.rows() if row.verdict in ("the solver", "the solver alone")]
+
     def _row(self, tolerance: float) -> TradeRow:
         run = _fastest(self.run, tolerance)
         solver = _fastest(self.solver, tolerance)

@@ -17,16 +17,15 @@ def provenance(command: str) -> dict[str, Any]:
     """The command, the commit, the processor, the number of cores and the versions: what to keep beside figures."""
     return {
         "command": command,
-        "commit": _commit(),
+        "commit": commit_of(Path(__file__).resolve().parents[2]),
         "processor": processor(),
         "cores": os.cpu_count(),
         "versions": {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}},
     }
 
 
-def _commit() -> str | None:
-    """The commit of the source tree that this package is imported from; None if the package is installed."""
-    root = Path(__file__).resolve().parents[2]
+def commit_of(root: Path) -> str | None:
+    """The commit of a source tree; None if the folder is none, as where the package is installed."""
     if not (root / ".git").exists():
         return None
     try:

@@ -56,11 +56,9 @@ def _settings(figures: Sequence[TradeFigures]) -> dict[str, Any]:
 
 
 def _lead(figures: TradeFigures) -> str:
-    ahead = [row for row in figures.rows() if row.verdict == "the run"]
-    behind = [row for row in figures.rows() if row.verdict in ("the solver", "the solver alone")]
     parts = [
         f"{who} at {' and '.join(f'{100 * row.tolerance:g} %' for row in rows)}"
-        for who, rows in (("the run is faster", ahead), ("the solver is the better choice", behind))
+        for who, rows in (("the run is faster", figures.ahead), ("the solver is the better choice", figures.behind))
         if rows
     ]
     told = "; ".join(parts) or "neither is faster by the intervals" if figures.solver else "the solver was not run"

@@ -19,9 +19,8 @@ from typing import Any
 import numpy as np
 
 from ast_sim.support.disk import write_json
-from ast_sim.support.provenance import processor, provenance
+from ast_sim.support.provenance import commit_of, processor, provenance
 from benchmarks.steps.newton_worker import CASES
-from benchmarks.steps.predictions import commit_of
 
 WORKER = Path(__file__).with_name("newton_worker.py")
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from ast_sim.simulate.jobs.generate import generate
 from ast_sim.support.disk import write_json
-from ast_sim.support.provenance import processor, provenance
+from ast_sim.support.provenance import commit_of, processor, provenance
 
 NODES = (400, 1300)
 NEWTON_STEPS = (0, 1)
@@ -77,12 +77,6 @@ def line_of(told: dict[str, dict[str, list[float]]]) -> str:
     positions = [np.array(one["position"]) for one in told.values()]
     far = float(np.abs(positions[-1] - positions[0]).max() / np.abs(positions[0]).max()) * 2**24
     return "; ".join(parts) + f"; positions differ by {far:.2g} roundings"
-
-
-def commit_of(tree: Path) -> str:
-    """The commit of a state of this repository."""
-    command = ["git", "-C", str(tree), "rev-parse", "HEAD"]
-    return subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
 
 
 def samples_of(told: dict[str, dict[str, list[float]]]) -> dict[str, dict[str, list[float]]]:

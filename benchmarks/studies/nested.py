@@ -7,9 +7,6 @@ benchmarks/results/nested.json and docs/results/nested.md. The scenes lie in `--
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
 import warnings
 from collections import Counter
 from collections.abc import Sequence
@@ -23,10 +20,10 @@ import ast_sim
 from ast_sim.inference.effort import MOST_NEWTON_STEPS, Effort
 from ast_sim.inference.evaluation.trade import timed_answer
 from ast_sim.simulate.jobs.rival import WAYS, rivals
-from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
 from ast_sim.trade_figures import TOLERANCES
 from benchmarks.studies.phrases import median_error
+from benchmarks.studies.rows import study_rows
 
 RESULTS = Path(__file__).parents[1] / "results" / "nested.json"
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "nested.md"
@@ -267,26 +264,14 @@ def _ratio(ratios: Sequence[float]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("nodes", nargs="*", type=int, metavar="NODES", help="sizes of plates (default: all)")
-    parser.add_argument("--folder", type=Path, default=Path("build/nested"), help="scenes (default: build/nested)")
-    asked = parser.parse_args(arguments)
-    unknown = set(asked.nodes) - {plates.nodes for plates in SETS}
-    if unknown:
-        parser.error(f"no plates of {sorted(unknown)} nodes: choose from {[plates.nodes for plates in SETS]}")
-    import torch  # after ast_sim, which says how its threads wait
+    rows = {str(plates.nodes): plates for plates in SETS}
 
-    torch.set_num_threads(1)
-    os.environ["OMP_NUM_THREADS"] = "1"  # of the generator's and the solver's processes
-    ast_sim.keep_memory()
-    results = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
+    def of_row(name: str, folder: Path) -> dict[str, Any]:
+        return measured(rows[name], folder)
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of Newton steps that do not end: their errors count
-        for plates in SETS:
-            if not asked.nodes or plates.nodes in asked.nodes:
-                results[str(plates.nodes)] = measured(plates, asked.folder)
-                write_json(RESULTS, results)
-                write_text(PAGE, page(results) + "\n")
+        study_rows(__doc__, rows, arguments, of_row, _measured_text, (RESULTS, PAGE), page)
 
 
 if __name__ == "__main__":

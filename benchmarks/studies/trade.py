@@ -96,9 +96,8 @@ For a run of your own: `ast-sim trade RUN DATA --out trade.html`.
 def _section(title: str, by_quantity: dict[str, TradeFigures]) -> list[str]:
     figures = by_quantity["displacement"]
     processor = figures.origin["processor"]
-    trained = (
-        "" if figures.invested is None else f" Simulation and training took {duration(figures.invested)} of a core."
-    )
+    spent = figures.invested
+    trained = "" if spent is None else f" Simulation and training took {duration(spent)} of a core."
     return [
         "",
         f"## {title}",
@@ -110,8 +109,6 @@ def _section(title: str, by_quantity: dict[str, TradeFigures]) -> list[str]:
 
 def _table(figures: TradeFigures) -> list[str]:
     rows = figures.rows()
-    ahead = sum(row.verdict == "the run" for row in rows)
-    alone = sum(row.verdict in ("the solver", "the solver alone") for row in rows)
     return [
         "",
         f"### {figures.quantity.capitalize()}",
@@ -120,7 +117,7 @@ def _table(figures: TradeFigures) -> list[str]:
         "| ---: | --- | --- | --- | --- | ---: |",
         *(f"| {' | '.join(row.cells)} |" for row in rows),
         "",
-        f"The run is ahead in {ahead} of {len(rows)} cells, the solver in {alone}.",
+        f"The run is ahead in {len(figures.ahead)} of {len(rows)} cells, the solver in {len(figures.behind)}.",
         *([f"{figures.mesh_line}."] if figures.mesh_line else []),
     ]
 
@@ -132,8 +129,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _said(by_quantity: dict[str, Any]) -> str:
     told = []
     for quantity, values in by_quantity.items():
-        rows = TradeFigures.from_json(values).rows()
-        told.append(f"{quantity} {sum(row.verdict == 'the run' for row in rows)} of {len(rows)}")
+        figures = TradeFigures.from_json(values)
+        told.append(f"{quantity} {len(figures.ahead)} of {len(figures.rows())}")
     return f"cells in which the run is ahead: {', '.join(told)}"
 
 

@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 SCENES = 20
 QUANTITIES = ("displacement", "reaction", "stress")  # as `errors_of` names them
 MESH_SCENES = 3  # in which the mesh's own error is measured
-MOST_SECONDS = 60.0  # processor time that the finer mesh of such a scene may take
-LONGER = 24.0  # than the mesh of the scene it takes, as in `simulate.jobs.mesh_error`
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,16 +156,19 @@ def _measured(
         ways = {"as stated": [_Timed(dict.fromkeys(quantities, 0.0), stated)] * len(indices)}
     finer = _on_finer_mesh(dataset, split, indices[:MESH_SCENES], made_from, ways)
     commands = {effort: _command(run, dataset, split, effort) for effort in efforts}
+    shared = {
+        "scenes": tuple(f"{split}/{index:06d}" for index in indices),
+        "no_solver": no_solver,
+        "invested": _invested(run, dataset),
+        "origin": {**provenance(command), "run": str(run.path), "step": run.step, "data": str(dataset.path)},
+    }
     return {
         quantity: TradeFigures(
-            scenes=tuple(f"{split}/{index:06d}" for index in indices),
             run=tuple(_setting(effort.text, timed, quantity, commands[effort]) for effort, timed in own.items()),
             solver=tuple(_setting(name, timed, quantity) for name, timed in ways.items()),
-            no_solver=no_solver,
             mesh_errors=tuple(outcome.errors[quantity] for outcome in finer),
-            invested=_invested(run, dataset),
-            origin={**provenance(command), "run": str(run.path), "step": run.step, "data": str(dataset.path)},
             quantity=quantity,
+            **shared,
         )
         for quantity in quantities
     }
@@ -213,6 +214,8 @@ def _on_finer_mesh(
 
     Scenes that cannot be solved there are left out. None is tried if our solver has not run or would take too long.
     """
+    from ast_sim.simulate.jobs.mesh_error import LONGER, MOST_SECONDS  # takes 0.2 s
+
     own = [one.seconds for one in ways.get(OWN_STOP_TEST, ())]
     if not own or LONGER * max(own[: len(indices)]) > MOST_SECONDS:
         return []
