@@ -258,9 +258,9 @@ class Answer:
     def reaction(self) -> np.ndarray:
         """[S, 3] the force in newton on the prescribed nodes `driven`.
 
-        If the law of the material is known and elastic, it follows from the strains of the predicted positions, as the
-        bundled solver has it; if the data follow another law, so would their force. Elsewhere it is the sum of the
-        nodal reactions, if the model predicts them (`fields["reaction"]`).
+        If the model predicts nodal reactions (`fields["reaction"]`), it is their sum. Without them, and after Newton
+        steps, which make the positions right, it follows from the strains of the positions, if the law of the material
+        is known and elastic. The bundled solver has this law; if the data follow another one, so would their force.
 
         Raises:
             ConfigError: there is none; the text says why: no prescribed node moves; or the scene has inertia or no

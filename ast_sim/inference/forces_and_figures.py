@@ -1,7 +1,8 @@
 """What an engineer asks of an answer: the forces on its bodies from outside, and figures of each frame.
 
-Where the law of the material is known and elastic, forces follow from the predicted positions. Elsewhere, if the model
-predicts the nodal reactions of its data, these are summed over the prescribed nodes: free nodes have none.
+A model may predict the nodal reactions of its data. They are summed over the prescribed nodes, since free nodes have
+none. Otherwise, and after Newton steps, forces follow from the positions, if the law of the material is known and
+elastic: small errors of the network's positions make large ones in these forces, and Newton steps remove them.
 """
 
 from __future__ import annotations
@@ -119,11 +120,13 @@ def figures_of(answer: Answer, origin: Sequence[float]) -> list[dict[str, float]
 
 def _newton(answer: Answer, driven: Driven) -> np.ndarray:
     """[S, N, 3] in newton: the shares of the nodes in the force on the prescribed nodes `driven`."""
+    if REACTION in answer.fields and not answer.last_steps:  # the positions are the network's own
+        return _predicted(answer, driven)
     try:
         law = _elastic_law(answer)
     except (ConfigError, SimulationError) as error:
         if REACTION in answer.fields:
-            return np.where(driven.nodes[:, None], answer.fields[REACTION].values, 0).astype(np.float64)
+            return _predicted(answer, driven)
         raise ConfigError(f"{answer.name} has no reaction: {error}") from error
     from ast_sim.mechanics.reaction import Reaction
 
@@ -131,6 +134,11 @@ def _newton(answer: Answer, driven: Driven) -> np.ndarray:
     reaction = Reaction(answer.scene, driven, law)
     shares = [reaction.shares(position) for position in answer.position]
     return LENGTH_UNITS[answer.info.length_unit] ** 2 * np.array(shares).reshape(-1, answer.scene.num_nodes, 3)
+
+
+def _predicted(answer: Answer, driven: Driven) -> np.ndarray:
+    """[S, N, 3] in newton: the nodal reactions that the model predicts at the prescribed nodes `driven`."""
+    return np.where(driven.nodes[:, None], answer.fields[REACTION].values, 0).astype(np.float64)
 
 
 def _elastic_law(answer: Answer) -> NeoHookean:

@@ -18,6 +18,7 @@ import numpy as np
 from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.unfinished import Checkpoint
+from ast_sim.named_field import REACTION, NamedField
 from ast_sim.scene import AttributeValue, Scene, Trajectory
 from ast_sim.support.errors import SimulationError
 
@@ -182,7 +183,10 @@ class Frames(ABC):
                 checkpoint.save(self._saved())
         records = {name: self.recorded(name) for name in asdict(self.records[0])}
         attributes = {**status, **records, **self.case.attributes, **self.attributes()}
-        return Trajectory(self.case.scene, attributes=attributes, **self._stacked())
+        arrays = self._stacked()
+        forces = arrays.pop(REACTION, None)
+        fields = {} if forces is None else {REACTION: NamedField(forces, "node", "N")}
+        return Trajectory(self.case.scene, attributes=attributes, fields=fields, **arrays)
 
     def advance(self) -> dict[str, float]:
         """Solve for the next frame; the first frame is where the solver stands.

@@ -18,6 +18,7 @@ from ast_sim.mechanics.linearised_contact import NewtonSteps
 from ast_sim.mechanics.load_halving import QuasiStatic
 from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.mechanics.unfinished import Checkpoint
+from ast_sim.named_field import REACTION
 from ast_sim.scene import AttributeValue, Trajectory
 from ast_sim.support.errors import SimulationError
 
@@ -201,16 +202,15 @@ class SolidFrames(Frames):
     def _stored(self) -> dict[str, np.ndarray]:
         """The arrays of a frame as they are stored."""
         elasticity, deformation = self._elasticity, self.solver.newton.state.potential
-        position = self.solver.newton.position.astype(np.float32)
+        common = {
+            "position": self.solver.newton.position.astype(np.float32),
+            REACTION: self._reactions.astype(np.float32),
+        }
         if self.case.stress_location == "node":
-            return {
-                "position": position,
-                "stress": elasticity.von_mises(deformation, "node").astype(np.float32)[:, None],
-            }
+            return common | {"stress": elasticity.von_mises(deformation, "node").astype(np.float32)[:, None]}
         tensor = elasticity.cauchy(deformation)
         components = np.stack([tensor[i, j] for i, j in COMPONENTS], axis=1)
-        return {
-            "position": position,
+        return common | {
             "stress": self._of_all_elements(von_mises(tensor)[:, None]),
             "cauchy_stress": self._of_all_elements(components),
         }

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from ast_sim.mechanics.contact_and_friction import Contact
+from ast_sim.named_field import REACTION
 from ast_sim.scene import NodeType
 from ast_sim.simulate.families.deforming_plate import (
     CLAMP_MARGIN,
@@ -218,6 +219,11 @@ def test_a_scene_solved_end_to_end(trajectory):
     assert still[0] and stress[still].max() < 1e-3  # pascal: nothing before anything moves
     assert len(attributes["solve_seconds"]) == len(attributes["newton_iterations"]) == SHORT
     assert sum(attributes["newton_iterations"]) > 40
+    reaction = trajectory.fields[REACTION]
+    force = reaction.values.astype(float).sum(axis=1, where=(scene.body == 1)[:, None])  # of all nodes of the obstacle
+    np.testing.assert_allclose(np.linalg.norm(force, axis=1), attributes["reaction"], rtol=1e-5, atol=1e-6)
+    assert (reaction.location, reaction.unit) == ("node", "N") and not reaction.values[:, ~prescribed].any()
+    assert np.abs(reaction.values.sum(axis=1)).max() < 1e-4 * np.abs(reaction.values).sum(axis=1).max() > 0
     expected = {"young": 1e6, "poisson": 0.4, "dhat": 1e-3, "kappa": MATERIAL.young, **case.attributes}
     assert {key: attributes[key] for key in expected} == expected
 
