@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -13,14 +13,15 @@ import numpy as np
 
 from ast_sim.dataset.layout import DatasetInfo
 from ast_sim.dataset.writer import DatasetWriter
-from ast_sim.inference.forces_and_figures import (
+from ast_sim.inference.quantities.band import LEVEL, Band, how_far
+from ast_sim.inference.quantities.forces_and_figures import (
     BodyForce,
     figures_of,
     force_on_driven,
     forces_on_bodies,
     write_forces,
 )
-from ast_sim.inference.relative_errors import errors_of
+from ast_sim.inference.quantities.relative_errors import errors_of
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.mechanics.physics_check import Law, PhysicsCheck, check_physics
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
     import pyvista
     from matplotlib.figure import Figure
 
-LEVEL = 0.95  # the probability with which a band holds
 SUFFIXES = (".h5", ".pvd", ".vtkhdf", ".csv")
 
 
@@ -87,8 +87,7 @@ class Answer:
         law: the law of the material and of contact, as the run knows it.
         fields: the named fields that the model predicts, [S, N or E, *] each with its unit; a given frame holds zero,
             or what was given. Newton steps do not change them.
-        band: [S], with a probability of 95 % all free nodes of all frames lie within this distance of the truth
-            (`calibration`). None: the run was not calibrated, or a warning has said why.
+        bands: of each quantity, as `band` takes them.
     """
 
     name: str
@@ -108,7 +107,7 @@ class Answer:
     last_steps: tuple[float, ...] = ()
     driven: Driven | None = None
     law: Law | None = None
-    band: np.ndarray | None = None
+    bands: Mapping[str, Band] = field(default_factory=dict)
     fields: dict[str, NamedField] = field(default_factory=dict)
     latents: dict[int, np.ndarray] = field(default_factory=dict)
     p_value: float | None = None
@@ -116,18 +115,7 @@ class Answer:
     @property
     def how_far(self) -> list[str]:
         """What is known of the distance to the truth, as sentences."""
-        told = []
-        if "promise" in self.source:
-            told.append(f"effort: {self.source['effort']}, {self.source['promise']}")
-        told += [self.source["solved"]] if "solved" in self.source else []
-        if self.expected_error is not None:
-            percent = f"{100 * self.expected_error:.2g} % of the displacement"
-            told.append(f"expected error: {percent}, as in the validation scenes at their deepest frame")
-        if self.band is not None:
-            unit = "" if self.info is None else f" {self.info.length_unit}"
-            widest = f"{self.band.max():.3g}{unit}, in frame {self.frames[int(self.band.argmax())]}"
-            told.append(f"band: with {100 * LEVEL:g} % all free nodes lie within {widest} at most")
-        return told
+        return how_far(self)
 
     @property
     def computed(self) -> np.ndarray:
@@ -146,7 +134,7 @@ class Answer:
             "largest stress": "none" if self.stress is None else f"{self.stress.max(initial=0.0):.4g} Pa",
             "expected error": "not known" if self.expected_error is None else f"{100 * self.expected_error:.2g} %",
             "converged": converged,
-            **({} if self.band is None else {f"band ({100 * LEVEL:g} %)": f"{self.band.max():.3g}{unit}"}),
+            **({} if (band := self.band()) is None else {f"band ({100 * LEVEL:g} %)": f"{band.max():.3g}{unit}"}),
             "seconds": f"{self.seconds:.3g}",
             **({} if self.failure is None else {"failure": self.failure}),
         }
@@ -267,6 +255,16 @@ class Answer:
                 tetrahedra, or the law of its material is not known, and the model predicts no reactions.
         """
         return force_on_driven(self)
+
+    def band(self, quantity: str = "displacement") -> np.ndarray | None:
+        """[S] how far from the truth the answer may be, with a probability of 95 % in all frames at once
+        (`calibration`); None: the run was not calibrated, or a warning has said why, or the scene has no such quantity.
+
+        Args:
+            quantity: "displacement": of all free nodes, in the unit of length; "reaction": of the force on `driven`, in
+                newton; "stress": of the largest stress, in pascal.
+        """
+        return self.bands[quantity].around(self, quantity) if quantity in self.bands else None
 
     def errors(self, truth: Trajectory) -> dict[str, float]:
         """Relative errors of the last frame of the answer, where a simulation is known.

@@ -282,8 +282,8 @@ class Run:
                 origin.pop("promise", None)
             if expected is not None:
                 origin["expected_error"] = expected
-            band = None if self.calibration is None else self.calibration.band(answer, effort, notes)
-            shared = {"info": self.info, "expected_error": expected, "seconds": seconds, "band": band}
+            bands = {} if self.calibration is None else self.calibration.bands(answer, effort, notes)
+            shared = {"info": self.info, "expected_error": expected, "seconds": seconds, "bands": bands}
             answer = dataclasses.replace(answer, source=origin, notes=notes, p_value=p_value, **shared)
             told.append(answer)
             if answer.failure is not None and throw:

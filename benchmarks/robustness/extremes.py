@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 import ast_sim
-from ast_sim.inference.relative_errors import rms
+from ast_sim.inference.quantities.relative_errors import rms
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.errors import AstSimError
 from ast_sim.support.provenance import provenance

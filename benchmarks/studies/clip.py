@@ -23,7 +23,7 @@ import numpy as np
 import ast_sim
 from ast_sim.dataset.solver_seconds import SolverSeconds, read_seconds, write_seconds
 from ast_sim.dataset.writer import DatasetWriter
-from ast_sim.inference.relative_errors import relative_error
+from ast_sim.inference.quantities.relative_errors import relative_error
 from ast_sim.named_field import REACTION
 from ast_sim.simulate.own_assembly.parameters import values_of
 from ast_sim.support.disk import write_json, write_text

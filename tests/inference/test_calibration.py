@@ -9,8 +9,9 @@ from scipy.stats import betabinom
 
 import ast_sim
 from ast_sim.inference.effort import Effort
-from ast_sim.inference.promises.calibration import Calibration, quantile, scales, score
+from ast_sim.inference.promises.calibration import Calibration, quantile
 from ast_sim.inference.promises.kept_errors import KeptErrors
+from ast_sim.inference.quantities.band import Comparison, compared
 from ast_sim.support.errors import ConfigError
 
 
@@ -18,8 +19,6 @@ def test_the_quantile_is_the_score_of_the_rank():
     assert quantile(list(range(1, 20))) == 19  # ceil(20 * 0.95) = 19
     assert quantile(list(range(100, 0, -1))) == 96  # ceil(101 * 0.95) = 96
     assert quantile([1.0] * 19 + [np.inf]) == np.inf
-    with pytest.raises(ConfigError, match="at least 19 calibration scenes, and there are 18"):
-        quantile([1.0] * 18)
 
 
 def test_fresh_scores_lie_within_the_quantile_as_often_as_is_promised():
@@ -32,14 +31,9 @@ def test_fresh_scores_lie_within_the_quantile_as_often_as_is_promised():
 
 
 def test_a_score_is_the_largest_error_over_the_scale():
-    scene = toy.plate(0).scene
-    free = np.flatnonzero(~scene.prescribed)
-    position = np.stack([scene.rest_position, scene.rest_position + np.float32([0.01, 0, 0])])
-    truth = position.copy()
-    truth[1, free[3]] += np.float32([0, 0.003, 0.004])
-    assert scales(scene, position)[1] == pytest.approx(0.01, rel=1e-4)
-    assert 0 < scales(scene, position)[0] < 1e-5
-    assert score(scene, position, truth) == pytest.approx(0.5, rel=1e-3)
+    comparison = Comparison(np.array([0.0, 0.01]), np.array([0.0, 0.02]), np.array([0.001, 0.005]))
+    assert comparison.score(0.01) == pytest.approx(0.25) and comparison.score(0.001) == pytest.approx(1)
+    assert Comparison(np.zeros(2), np.zeros(2), np.zeros(2)).score(0.0) == 0
 
 
 @pytest.fixture(scope="module")
@@ -54,16 +48,35 @@ def calibrated(tmp_path_factory):
     return run, data, result
 
 
+def by_hand(answer, truth):
+    """[S - 1, 2] three times: of displacement and largest stress the sizes in the answer, in truth, and the errors."""
+    free = ~truth.scene.prescribed
+    moved = [(one.position - truth.scene.rest_position)[1:, free].astype(np.float64) for one in (answer, truth)]
+    highest = [one.stress[1:, truth.scene.deforming_nodes].max(axis=(1, 2)) for one in (answer, truth)]
+    columns = [(np.sqrt(np.square(a).sum(axis=2).mean(axis=1)), b) for a, b in zip(moved, highest, strict=True)]
+    errors = np.linalg.norm(moved[0] - moved[1], axis=2).max(axis=1), np.abs(highest[0] - highest[1])
+    return [np.stack(each, axis=1) for each in (*columns, errors)]
+
+
 def test_the_calibration_is_the_score_of_the_rank(calibrated):
     run, data, result = calibrated
     with ast_sim.Dataset(data) as dataset:
         asked = [dataset["test"][index] for index in range(24)]
     pairs = [(answer, truth) for truth in asked if not (answer := run.predict(truth)).notes]
     answers, truths = zip(*pairs, strict=True)
-    scores = [score(a.scene, a.position, t.position) for a, t in zip(answers, truths, strict=True)]
-    assert 19 <= len(scores) == result.scenes <= 24 and result.quantiles == (max(scores),)  # of up to 38 the last
-    assert answers[0].band == pytest.approx(result.quantiles[0] * scales(truths[0].scene, answers[0].position))
-    assert f"band: with 95 % all free nodes lie within {answers[0].band.max():.3g} m" in answers[0].how_far[-1]
+    assert 19 <= len(pairs) == result.scenes <= 24 and set(result.quantiles) == {"displacement", "stress"}
+    sizes, true_sizes, errors = (np.array(each) for each in zip(*(by_hand(a, t) for a, t in pairs), strict=True))
+    typical = np.sqrt(np.square(true_sizes).mean(axis=(0, 1)))  # of displacement and stress
+    assert list(result.typical.values()) == pytest.approx(typical, rel=1e-5)
+    widths = (errors / (sizes + typical)).max(axis=(0, 1))  # of up to 38 scores the last
+    assert [one for (one,) in result.quantiles.values()] == pytest.approx(widths, rel=1e-4)
+    for column, quantity in enumerate(("displacement", "stress")):
+        band = answers[0].band(quantity)
+        assert band[1:] == pytest.approx(widths[column] * (sizes[0] + typical)[:, column], rel=1e-4)
+        assert band[0] == 0  # the frame is given
+    assert f"band: with 95 % all free nodes lie within {answers[0].band().max():.3g} m" in answers[0].how_far[-1]
+    assert answers[0].band("reaction") is None  # the law of these plates is not known
+    assert set(compared(answers[0], truths[0])) == {"displacement", "stress"}
 
 
 def test_a_run_keeps_its_calibration_and_so_does_its_file(calibrated, tmp_path):
@@ -104,15 +117,18 @@ def test_no_band_where_nothing_is_known(calibrated):
     with ast_sim.Dataset(data) as dataset:
         asked = [dataset["test"][index] for index in range(24)]
     answer = next(answer for truth in asked if not (answer := run.predict(truth)).notes)
-    assert result.band(answer, run.effort, ()) is not None
-    assert result.band(answer, run.effort, ("it is large",)) is None  # which is told already
+    assert set(result.bands(answer, run.effort, ())) == {"displacement", "stress"}
+    assert not result.bands(answer, run.effort, ("it is large",))  # which is told already
     for other, words in (
         (replace(result, efforts=(Effort(3),)), "no band: the run was calibrated with 3 corrections"),
-        (replace(result, quantiles=(np.inf,)), "no band: too many calibration scenes failed with 0 corrections"),
+        (
+            replace(result, quantiles={"displacement": (np.inf,)}),
+            "no band: too many calibration scenes failed with 0 corrections",
+        ),
         (replace(result, spacing=(1.0, 2.0)), "no band: the mesh edges are .* in the calibration scenes 1 to 2"),
     ):
         with pytest.warns(UserWarning, match=words):
-            assert other.band(answer, run.effort, ()) is None
+            assert not other.bands(answer, run.effort, ())
 
 
 def test_what_cannot_be_calibrated_is_refused(calibrated):

@@ -110,7 +110,7 @@ def strange(truth, kind):
 def test_the_shipped_run_knows_its_plates(plates):
     run = ast_sim.example_run("plates")
     answers = [run.predict(truth, frames=[-1]) for truth in plates]
-    assert sum(not answer.notes and answer.band is not None for answer in answers) >= 5
+    assert sum(not answer.notes and answer.band() is not None for answer in answers) >= 5
     assert all(0 < answer.p_value <= 1 for answer in answers)
 
 
@@ -123,7 +123,7 @@ def test_the_shipped_run_tells_a_strange_plate(plates, kind):
             UserWarning, match="the network finds the scene more unusual than .* of 99 calibration scenes"
         ):
             answer = run.predict(*strange(truth, kind), frames=[-1], effort=one_call, throw=False)
-        assert answer.p_value <= 0.05 and answer.band is None and answer.expected_error is None
+        assert answer.p_value <= 0.05 and answer.band() is None and answer.expected_error is None
     with pytest.warns(UserWarning, match="neither a band nor an error is promised"):
         answer = run.predict(*strange(plates[0], kind), frames=[-1], error=0.1, throw=False)
     assert "promise" not in answer.source and "effort" in answer.source

@@ -20,7 +20,7 @@ from ast_sim.inference.answering import answers
 from ast_sim.inference.effort import Effort, choices
 from ast_sim.inference.evaluation.deepest_frames import deepest_predicted
 from ast_sim.inference.predicting.question import Question
-from ast_sim.inference.relative_errors import errors_of, moves
+from ast_sim.inference.quantities.relative_errors import errors_of, moves
 from ast_sim.models.simulator import Simulator
 from ast_sim.simulate.jobs.rival import FINER, OWN_STOP_TEST, Outcome, rivals
 from ast_sim.support.disk import write_json

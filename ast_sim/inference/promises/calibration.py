@@ -1,12 +1,12 @@
 """How far to trust an answer: split conformal prediction, by scene.
 
 Frames and nodes of one scene depend on each other, so the scene is what is exchangeable. The score of a calibration
-scene is the largest error of a free node in any frame, over the scale of that frame: the root mean square displacement
-of the free nodes in the answer. Let q be the ceil((n + 1) LEVEL)-th smallest of n scores. Then in a fresh scene of the
-same kind all free nodes of all frames lie within q times the scale, with a probability of at least LEVEL, whatever the
-model is (Vovk, Gammerman, Shafer 2005; Angelopoulos, Bates 2023, section 1). It holds on average over calibrations and
-fresh scenes. The calibration scenes must not have trained or chosen the model; so nothing needs to be crossed, and n
-scores are enough from the n on for which the rank is at most n.
+scene is the largest error in any frame, over the scale of that frame (`band`). Let q be the ceil((n + 1) LEVEL)-th
+smallest of n scores. Then in a fresh scene of the same kind the errors of all frames lie within q times the scale, with
+a probability of at least LEVEL, whatever the model is (Vovk, Gammerman, Shafer 2005; Angelopoulos, Bates 2023, section
+1), but for the small change of the typical size by one scene. It holds on average over calibrations and fresh scenes,
+and for each quantity alone. The calibration scenes must not have trained or chosen the model; so nothing needs to be
+crossed, and n scores are enough from the n on for which the rank is at most n.
 
 What errors the answers keep, and which effort is enough for an asked one: `kept_errors`. Whether a scene is like the
 calibration scenes: `familiarity`.
@@ -24,12 +24,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
-from ast_sim.inference.answer import LEVEL
 from ast_sim.inference.effort import Effort, choices
 from ast_sim.inference.promises.familiarity import Familiarity
 from ast_sim.inference.promises.kept_errors import KEPT, KeptErrors
-from ast_sim.inference.relative_errors import moves
-from ast_sim.runs.scope import LEEWAY, size_of, spacing_of
+from ast_sim.inference.quantities.band import LEVEL, Band, Comparison, compared
+from ast_sim.inference.quantities.relative_errors import moves
+from ast_sim.runs.scope import LEEWAY, spacing_of
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.jobs.rival import deepest_frame
 from ast_sim.support.errors import ConfigError
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from ast_sim.inference.answer import Answer
     from ast_sim.inference.trained_run import Run
 
-FLOOR = 1e-6  # of a scale, relative to the size of the deforming bodies: where nothing moves, rounding is left
+DISPLACEMENT = "displacement"  # the quantity that every scene has
 FEWEST = math.ceil(LEVEL / (1 - LEVEL) - 1e-9)  # scenes with which the rank of the quantile is at most their number
 
 
@@ -51,7 +51,9 @@ class Calibration:
     Attributes:
         scenes: the number of calibration scenes.
         efforts: the efforts that have a band, from the cheapest to the dearest.
-        quantiles: q of each, the width of the band over the scale; infinite where too many predictions failed.
+        quantiles: q of each quantity and effort, the width of the band over the scale; infinite where too many
+            predictions failed.
+        typical: of each quantity, the root mean square of its true sizes in these scenes.
         spacing: (lowest, highest) mean length of the mesh edges of the deforming bodies in these scenes.
         kept: the errors of these scenes after each effort.
         familiarity: these scenes as the network sees them; None: the model does not tell.
@@ -59,7 +61,8 @@ class Calibration:
 
     scenes: int
     efforts: tuple[Effort, ...]
-    quantiles: tuple[float, ...]
+    quantiles: Mapping[str, tuple[float, ...]]
+    typical: Mapping[str, float]
     spacing: tuple[float, float]
     kept: KeptErrors = field(default_factory=KeptErrors, repr=False)
     familiarity: Familiarity | None = field(default=None, repr=False)
@@ -67,12 +70,12 @@ class Calibration:
     @property
     def text(self) -> str:
         """The bands and the kept errors in words."""
-        bands = zip(self.quantiles, self.efforts, strict=True)
-        widths = [f"{width:.3g} with {effort.text}" for width, effort in bands if math.isfinite(width)]
-        return (
-            f"band: with {100 * LEVEL:g} % all free nodes of all frames lie within so many root mean square"
-            f" displacements of the frame, by {self.scenes} scenes: {'; '.join(widths)}{self._kept}"
-        )
+        told = f"bands by {self.scenes} scenes: with {100 * LEVEL:g} % the errors of all frames lie within"
+        for quantity, quantiles in self.quantiles.items():
+            widths = zip(quantiles, self.efforts, strict=True)
+            known = [f"{width:.3g} with {effort.text}" for width, effort in widths if math.isfinite(width)]
+            told += f"\n{quantity}: its size plus {self.typical[quantity]:.3g}, times {'; '.join(known)}"
+        return told + self._kept
 
     @property
     def _kept(self) -> str:
@@ -91,7 +94,11 @@ class Calibration:
         return {
             "scenes": self.scenes,
             "efforts": [asdict(effort) for effort in self.efforts],
-            "quantiles": [width if math.isfinite(width) else None for width in self.quantiles],
+            "quantiles": {
+                quantity: [width if math.isfinite(width) else None for width in widths]
+                for quantity, widths in self.quantiles.items()
+            },
+            "typical": dict(self.typical),
             "spacing": list(self.spacing),
             "kept": self.kept.to_json(),
             "familiarity": familiarity,
@@ -101,10 +108,15 @@ class Calibration:
     def from_json(cls, values: Mapping[str, Any]) -> Self:
         low, high = values["spacing"]
         known = values["familiarity"]
+        typical = values["typical"]
         return cls(
             values["scenes"],
             tuple(Effort(**one) for one in values["efforts"]),
-            tuple(math.inf if width is None else width for width in values["quantiles"]),
+            {
+                quantity: tuple(math.inf if width is None else width for width in widths)
+                for quantity, widths in values["quantiles"].items()
+            },
+            typical,
             (low, high),
             KeptErrors.from_json(values["kept"]),
             None if known is None else Familiarity.from_json(known),
@@ -138,48 +150,29 @@ class Calibration:
         p_value = None if self.familiarity is None else self.familiarity.p_value(answer)
         return p_value, () if self.familiarity is None or p_value is None else self.familiarity.notes(p_value)
 
-    def band(self, answer: Answer, effort: Effort, notes: Sequence[str]) -> np.ndarray | None:
-        """[S] how far from the truth a free node may be in each frame; None where nothing is known: for a scene with
-        `notes`, which are warnings already; and with a warning that says why, with another effort and on another
-        mesh."""
+    def bands(self, answer: Answer, effort: Effort, notes: Sequence[str]) -> dict[str, Band]:
+        """The band of each quantity; none where nothing is known: for a scene with `notes`, which are warnings already;
+        and with a warning that says why, with another effort and on another mesh."""
         if notes:
-            return None
-        width = dict(zip(self.efforts, self.quantiles, strict=True)).get(effort)
-        if width is None:
+            return {}
+        why = self.unlike(answer.scene, ())
+        if effort not in self.efforts:
             why = f"the run was calibrated with {'; '.join(one.text for one in self.efforts)}"
-        elif math.isinf(width):
+        elif math.isinf(self._widths(effort)[DISPLACEMENT]):
             why = f"too many calibration scenes failed with {effort.text}"
-        else:
-            why = self.unlike(answer.scene, ())
-        if why or width is None:
+        if why:
             warnings.warn(f"{answer.name}: no band: {why}", stacklevel=4)
-            return None
-        return width * scales(answer.scene, answer.position)
+            return {}
+        return {quantity: Band(width, self.typical[quantity]) for quantity, width in self._widths(effort).items()}
 
-
-def scales(scene: Scene, position: np.ndarray) -> np.ndarray:
-    """[S] the root mean square displacement of the free nodes in frames [S, N, 3]."""
-    moved = (position - scene.rest_position)[:, ~scene.prescribed].astype(np.float64)
-    return np.maximum(np.sqrt(np.square(moved).sum(axis=2).mean(axis=1)), FLOOR * size_of(scene))
-
-
-def score(scene: Scene, position: np.ndarray, truth: np.ndarray) -> float:
-    """The largest error of a free node over the scale of its frame; both are [S, N, 3]."""
-    error = (position - truth)[:, ~scene.prescribed].astype(np.float64)
-    return float((np.linalg.norm(error, axis=2).max(axis=1) / scales(scene, position)).max())
+    def _widths(self, effort: Effort) -> dict[str, float]:
+        """The quantile of each quantity."""
+        number = self.efforts.index(effort)
+        return {quantity: widths[number] for quantity, widths in self.quantiles.items()}
 
 
 def quantile(scores: Sequence[float]) -> float:
-    """The ceil((n + 1) LEVEL)-th smallest of n scores.
-
-    Raises:
-        ConfigError: there are fewer than `FEWEST`.
-    """
-    if len(scores) < FEWEST:
-        raise ConfigError(
-            f"a band of {100 * LEVEL:g} % needs at least {FEWEST} calibration scenes, and there are {len(scores)}: make"
-            " more with --calibration N"
-        )
+    """The ceil((n + 1) LEVEL)-th smallest of n scores; n is at least `FEWEST`."""
     return sorted(scores)[math.ceil((len(scores) + 1) * LEVEL - 1e-9) - 1]
 
 
@@ -230,13 +223,13 @@ class _Measured(NamedTuple):
     """A calibration scene.
 
     Attributes:
-        scores: of all frames, for each effort with a band; infinite where the prediction failed.
+        comparisons: of the quantities in all frames, for each effort with a band; None where the prediction failed.
         errors: of the deepest frame, for each effort among which one is chosen; None where the prediction failed.
         spacing: as `Calibration` has it.
         latents: [frames, D]; None: the model does not tell.
     """
 
-    scores: list[float]
+    comparisons: list[dict[str, Comparison] | None]
     errors: list[dict[str, float] | None]
     spacing: float
     latents: np.ndarray | None
@@ -259,16 +252,44 @@ def _measured(run: Run, dataset: Dataset, split: str, progress: ShowProgress) ->
                 left_out.append(name)
             else:
                 scenes.append(one)
-    scores = list(zip(*(one.scores for one in scenes), strict=True)) or [()]
-    quantiles = tuple(quantile(of_effort) for of_effort in scores)
-    if all(map(math.isinf, quantiles)):
-        failed = min(of_effort.count(math.inf) for of_effort in scores)
-        raise ConfigError(f"{failed} of {len(scenes)} predictions failed: no band holds")
+    if len(scenes) < FEWEST:
+        raise ConfigError(
+            f"a band of {100 * LEVEL:g} % needs at least {FEWEST} calibration scenes, and there are {len(scenes)}: make"
+            " more with --calibration N"
+        )
+    quantiles, typical = _quantiles([one.comparisons for one in scenes])
     spacings = [one.spacing for one in scenes]
     latents = [one.latents for one in scenes if one.latents is not None]
     familiarity = Familiarity.of(latents) if len(latents) >= FEWEST else None
     kept = _kept_errors(to_choose, [list(of_effort) for of_effort in zip(*(one.errors for one in scenes), strict=True)])
-    return Calibration(len(scenes), efforts, quantiles, (min(spacings), max(spacings)), kept, familiarity), left_out
+    reach = (min(spacings), max(spacings))
+    return Calibration(len(scenes), efforts, quantiles, typical, reach, kept, familiarity), left_out
+
+
+def _quantiles(
+    scenes: Sequence[Sequence[Mapping[str, Comparison] | None]],
+) -> tuple[dict[str, tuple[float, ...]], dict[str, float]]:
+    """The quantiles of each quantity, one for each effort, and the typical sizes, from the comparisons by scene.
+
+    Raises:
+        ConfigError: with each effort too many predictions failed.
+    """
+    known = [one for scene in scenes for one in scene if one is not None]
+    quantiles: dict[str, tuple[float, ...]] = {}
+    typical: dict[str, float] = {}
+    for quantity in known[0] if known else ():
+        if not all(quantity in one for one in known):
+            continue
+        sizes = np.concatenate([one[quantity].true_sizes for one in known])
+        typical[quantity] = float(np.sqrt(np.square(sizes).mean()))
+        quantiles[quantity] = tuple(
+            quantile([math.inf if one is None else one[quantity].score(typical[quantity]) for one in of_effort])
+            for of_effort in zip(*scenes, strict=True)
+        )
+    if all(map(math.isinf, quantiles.get(DISPLACEMENT, ()))):
+        failed = min(of_effort.count(None) for of_effort in zip(*scenes, strict=True))
+        raise ConfigError(f"{failed} of {len(scenes)} predictions failed: no band holds")
+    return quantiles, typical
 
 
 def _measured_scene(
@@ -280,10 +301,7 @@ def _measured_scene(
     answers = [run.predict(truth, effort=effort, throw=False, name=name, progress=False) for effort in efforts]
     if answers[0].notes:
         return None
-    scores = [
-        math.inf if one.failure is not None else score(one.scene, one.position, truth.position[list(one.frames)])
-        for one in answers
-    ]
+    comparisons = [None if one.failure is not None else compared(one, truth) for one in answers]
     deepest = deepest_frame(truth)
     alone = [
         run.predict(truth, frames=deepest, effort=effort, throw=False, name=name, progress=False)
@@ -291,7 +309,7 @@ def _measured_scene(
     ]
     errors = [None if one.failure is not None else one.errors(truth) for one in alone]
     latents = np.stack(list(answers[0].latents.values())) if answers[0].latents else None
-    return _Measured(scores, errors, spacing_of(truth.scene), latents)
+    return _Measured(comparisons, errors, spacing_of(truth.scene), latents)
 
 
 def _kept_errors(efforts: Sequence[Effort], errors: Sequence[Sequence[Mapping[str, float] | None]]) -> KeptErrors:
