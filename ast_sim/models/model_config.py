@@ -203,5 +203,5 @@ PAPER_TRAINING = {"batch_size": 48, "peak_rate": 1e-4, "noise": 0.003, "stress_w
 
 def tiny(model: ModelConfig, peak_rate: float, **train: Any) -> Preset:
     """The preset `tiny` of a model: for any dataset, of a size that two cores train in minutes."""
-    shared = {"batch_size": 8, "optimizer": "muon", "stress_weight": 0.1, "rollout_pool": None}
+    shared = {"batch_size": 8, "optimizer": "muon", "stress_weight": 0.1, "strain_weight": None, "rollout_pool": None}
     return Preset(replace(model, jumps=None), {**shared, "peak_rate": peak_rate, **train})

@@ -14,6 +14,7 @@ from ast_sim.batches.batch_builder import Batch, Target
 from ast_sim.batches.graph import Graph
 from ast_sim.batches.pairs import PairSampler
 from ast_sim.dataset.reader import Dataset
+from ast_sim.element_topology import LOCAL_EDGES
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.models.normalizer import Normalizer
@@ -86,6 +87,7 @@ class Simulator(nn.Module):
         super().__init__()
         self.config = config
         self.motion_normalizer = Normalizer("vector")
+        self.strain_normalizer = Normalizer("vector")
         self.stress_normalizer = Normalizer("scalar") if config.data.stress != "none" else None
         # The components of a field with several columns share one scale, as those of a vector do.
         kinds = ("scalar" if columns == 1 else "vector" for _, _, columns, _ in config.data.fields)
@@ -183,6 +185,7 @@ class Simulator(nn.Module):
         for batch, target in batches:
             self.observe(batch)
             self.motion_normalizer.observe(target.motion[batch.graph.normal_nodes])
+            self.strain_normalizer.observe(_strains(batch.graph, target.motion).flatten(0, 1))
             for output, normalizer in self._outputs:
                 counting = self._counting(output, batch)
                 values = target.fields[output.name]
@@ -203,8 +206,12 @@ class Simulator(nn.Module):
         stress_weight: float = 0.01,
         share: Callable[[int], float] = lambda rows: 1.0,
         weights: Tensor | None = None,
+        strain_weight: float = 0.0,
     ) -> dict[str, Tensor]:
         """Mean squared errors of normalised outputs: motion of NORMAL nodes, stress and fields of what deforms.
+
+        The error of the motion may also count by its differences along the edges of deforming elements, over their
+        lengths. Forces and stresses follow from these.
 
         If the batch is part of a larger one, `share` returns the share of its rows (nodes or elements) in all rows. The
         losses of all parts then add up to the loss of the larger batch.
@@ -212,11 +219,12 @@ class Simulator(nn.Module):
         Args:
             prediction: `self(batch)`.
             weights: [B], how much the squared error of the motion of each scene counts; None: 1.
+            strain_weight: of the differences along edges.
 
         Returns:
-            "motion", "stress" (if there is one), "field NAME" of each named field, and "loss" = motion + stress_weight
-            * (stress + fields). "spread" is the standard deviation of the predicted motion over the nodes: if it is 0,
-            the decoder is dead.
+            "motion", "strain" (if it has a weight), "stress" (if there is one), "field NAME" of each named field, and
+            "loss" = motion + strain_weight * strain + stress_weight * (stress + fields). "spread" is the standard
+            deviation of the predicted motion over the nodes: if it is 0, the decoder is dead.
         """
         normal = batch.graph.normal_nodes
         motion = prediction.motion.index_select(0, normal)
@@ -227,6 +235,11 @@ class Simulator(nn.Module):
         part = share(len(normal))
         losses = {"motion": part * error.square().mean()}
         losses["loss"] = losses["motion"]
+        if strain_weight:
+            wrong = torch.zeros_like(target.motion).index_copy(0, normal, error) * self.motion_normalizer.scale
+            strains = _strains(batch.graph, wrong) / self.strain_normalizer.scale
+            losses["strain"] = share(len(strains)) * strains.square().mean()
+            losses["loss"] = losses["loss"] + strain_weight * losses["strain"]
         losses["spread"] = part * motion.detach().std(dim=0).mean() if len(motion) > 1 else motion.new_ones(())
         for output, normalizer in self._outputs:
             rows = self._counting(output, batch).nonzero()[:, 0]
@@ -289,6 +302,19 @@ class Simulator(nn.Module):
         prediction = self.predict(batch)
         position = self.integrate(batch, prediction.motion)
         return torch.where(batch.graph.prescribed[:, None], prescribed_position, position), prediction
+
+
+def _strains(graph: Graph, motion: Tensor) -> Tensor:
+    """[E, K, 3]: the differences of a motion [N, 3] along the K edges of each deforming element, over their lengths at
+    rest."""
+    nodes = graph.elements[graph.deforming_elements]
+    first, second = torch.tensor(LOCAL_EDGES[nodes.shape[1]]).T
+
+    def along_edges(values: Tensor) -> Tensor:
+        at_nodes = values.index_select(0, nodes.flatten()).view(*nodes.shape, 3)
+        return at_nodes[:, first] - at_nodes[:, second]
+
+    return along_edges(motion) / along_edges(graph.rest_position).norm(dim=2, keepdim=True)
 
 
 def _require_cpu(what: str, device: torch.device) -> None:

@@ -70,6 +70,11 @@ class TrainConfig:
         " of the model's cells, at most 0.05 of the domain's half width",
     )
     stress_weight: float = setting(0.01, "weight of the stress in the loss; the motion has the weight 1")
+    strain_weight: float | None = setting(
+        0.0,
+        "weight of the error's differences along the edges of deforming elements in the loss, from which the errors of"
+        " forces and stresses follow; unset: 1 with model.jumps, else 0",
+    )
     statistics_pairs: int = setting(400, "pairs of frames from which the scales of inputs and outputs are measured")
     seed: int = setting(0, "seed of the initial weights, the order of the pairs, the noise and dropout")
     validate_every: int | None = setting(

@@ -26,7 +26,7 @@ _RANGES = {
     "minutes": (1e-3, LARGEST),
     "peak_rate": (1e-30, 1.0),
     "clip": (1e-30, math.inf),
-    "stress_weight": (0, 1e6),
+    **dict.fromkeys(("stress_weight", "strain_weight"), (0, 1e6)),
     "noise_gamma": (0, 1),
 }
 ROLLOUT_BATCHES = 16  # an unset pool of rollouts holds the scenes of so many batches
@@ -108,6 +108,7 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
         "decay": steps if config.steps is not None else steps + epoch,
         "validate_every": validate_every,
         "checkpoint_every": validate_every,
+        "strain_weight": 1.0 if model.scheme.jumps else 0.0,
     }
     turning = [name for name, _, columns, _ in model.data.fields if columns > 1 and name != REACTION]
     if config.mirror and turning:

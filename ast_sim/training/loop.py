@@ -230,12 +230,15 @@ class Training:
         weights = None
         if self.pool is not None and self.pool.weighs:
             weights = self.pool.weights(number, self.processes.gathered(self.pool.errors(number, target)))
-        losses = self.model.loss(prediction, batch, target, self.options.stress_weight, self.processes.share, weights)
+        options = self.options
+        losses = self.model.loss(
+            prediction, batch, target, options.stress_weight, self.processes.share, weights, options.strain_weight
+        )
         added = self.processes.add(torch.stack([value.detach() for value in losses.values()]))
         whole = dict(zip(losses, added.tolist(), strict=True))
         if not math.isfinite(whole["loss"]):
             raise self._not_finite("loss", whole["loss"], batch.names)
-        (losses["loss"] / self.options.accumulate).backward()
+        (losses["loss"] / options.accumulate).backward()
         if self.pool is not None:
             self.pool.advance(number, self.model.residual(prediction, batch, target))
         return whole

@@ -14,11 +14,12 @@ def test_a_run_is_simulated_trained_calibrated_and_saved(tmp_path, monkeypatch, 
         settings={"mirror": ("x", "y"), "corrections": 0, "batch_size": 2, "statistics_pairs": 4},
     )  # fmt: skip
     monkeypatch.setitem(jumps.ROWS, "plates400", row)
-    small = {"train": 0, "valid": 0, "test": 24, "nodes": 100, "frames": 5, "keep": None}
+    small = {"train": 0, "valid": 0, "nodes": 100, "frames": 5, "keep": None}
     monkeypatch.setattr(coverage, "PLATES", small)
+    monkeypatch.setitem(coverage.SETS, "calibration", {"seed": 911, "test": 24})
     monkeypatch.setattr(shipped, "SHIPPED", tmp_path)
     shipped.main(["plates", "--folder", str(tmp_path / "data")])
-    assert "plates: band: with 95 %" in capsys.readouterr().out
+    assert "plates: bands by " in capsys.readouterr().out
     run = ast_sim.Run(tmp_path / "plates.ast")
     assert run.step == 4 and run.folder.licence == shipped.LICENCE
     assert 19 <= run.calibration.scenes <= 24 and run.calibration.efforts[-1] == ast_sim.Effort.exact()

@@ -66,7 +66,8 @@ def test_from_the_file_to_the_loss(run):
             batches.append(batch.placed(unmoved))
             targets.append(Target(torch.from_numpy(after - start), {"stress": torch.tensor(next_stress)}))
     batch, target = Batch.concatenate(batches), Target.concatenate(targets)
-    loss = model.loss(model(batch), batch, target, run.settings.train.stress_weight)["loss"]
+    options = run.settings.train
+    loss = model.loss(model(batch), batch, target, options.stress_weight, strain_weight=options.strain_weight)["loss"]
     assert loss.item() == first
 
 

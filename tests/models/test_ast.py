@@ -1,5 +1,6 @@
 """The model as a whole and part by part, against the formulas of docs/reference/model.md."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -423,6 +424,19 @@ def test_loss_counts_the_right_nodes(tmp_path):
     torch.testing.assert_close(losses["motion"], motion)
     torch.testing.assert_close(losses["stress"], stress)
     torch.testing.assert_close(losses["loss"], motion + 0.3 * stress)
+    assert "strain" not in losses
+    weighed = model.loss(out, batch, target, stress_weight=0.3, strain_weight=2.0)
+    torch.testing.assert_close(weighed["loss"], motion + 0.3 * stress + 2 * weighed["strain"])
+    wrong = (model.motion_normalizer.scale * out.motion - target.motion).detach()
+    wrong[batch.graph.prescribed] = 0
+    rest = batch.graph.rest_position
+    squares = []
+    for element in batch.graph.elements[batch.graph.deforming_elements].tolist():
+        for a, b in itertools.combinations(element, 2):
+            length = float((rest[a] - rest[b]).norm())
+            squares.append(float((wrong[a] - wrong[b]).square().mean()) / length**2)
+    scale = float(model.strain_normalizer.scale)
+    assert weighed["strain"].item() == pytest.approx(np.mean(squares) / scale**2, rel=1e-4)
 
 
 def test_domain_grows_in_a_rollout_and_cells_keep_their_size():

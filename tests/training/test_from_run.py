@@ -60,7 +60,9 @@ def test_the_first_loss_is_that_of_the_weights_of_the_source(folder, tmp_path):
             data, batch_size=2, seed=5, noise=options.noise, gamma=options.noise_gamma, mirror=("y",)
         ).batch(0)
     torch.manual_seed(step_seed(5, 0))
-    expected = model.train().loss(model(batch), batch, target, options.stress_weight)["loss"]
+    expected = model.train().loss(
+        model(batch), batch, target, options.stress_weight, strain_weight=options.strain_weight
+    )["loss"]
     first = next(iter(Metrics(run)))
     assert first["step"] == 1 and first["loss"] == expected.item()
     assert settings.model == read_config(run).model
