@@ -95,7 +95,7 @@ def test_generate_help_tells_of_every_family_and_imports_no_solver():
     shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     for name in ("deforming_plate", "sphere_simple", "abcd", "abcd_xl"):
         assert f"\n  {name} " in shown
-    for option in ("nodes", "frames", "keep", "solver", "parts", "workers", "scheduler"):
+    for option in ("nodes", "frames", "keep", "order", "solver", "parts", "workers", "scheduler"):
         assert f"--{option}" in shown
 
 

@@ -39,8 +39,8 @@ def generate(args: argparse.Namespace) -> None:
     for option, value in (("--out FILE", args.out), ("--count N", args.count)):
         if value is None:
             raise ConfigError(f"give {option}" + (", or --look" if args.spec is not None else ""))
-    chosen = ("valid", "test", "calibration", "seed", "nodes", "frames", "keep", "workers", "solver", "parts", "spec")
-    options = {name: getattr(args, name) for name in (*chosen, "patient", "scheduler")}
+    chosen = ("valid", "test", "calibration", "seed", "nodes", "frames", "keep", "order", "workers", "solver", "parts")
+    options = {name: getattr(args, name) for name in (*chosen, "spec", "patient", "scheduler")}
     made = simulate(args.family, args.out, train=args.count, **options)
     print(f"{made.path}: {_counts(made.counts)}")
     if made.truncated:
@@ -56,6 +56,8 @@ def _look(args: argparse.Namespace) -> None:
 
     if args.family != "assembly" or args.spec is None:
         raise ConfigError("--look is for a specification: ast-sim generate assembly SPEC.toml --look")
+    if args.order is not None:
+        raise ConfigError("a specification says the order of its elements (order = 1): leave out --order")
     drawn = look(args.spec, seed=args.seed, nodes=args.nodes, frames=args.frames, solver=args.solver)
     picture = (args.out or args.spec).with_suffix(".look.png")
     shown = [(case.scene, case.farthest) for case in drawn.cases]

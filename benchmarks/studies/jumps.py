@@ -36,7 +36,8 @@ class Row:
 
     Attributes:
         title: what the page calls it.
-        family, data, nodes, frames, keep, seed, train, valid, test: of the dataset; `data` is the name of its file.
+        family, data, nodes, frames, keep, order, seed, train, valid, test: of the dataset; `data` is the name of its
+            file.
         steps: of the training.
         model: a registered model, in its preset `tiny`.
         model_settings: settings of the model, beyond the preset.
@@ -54,6 +55,7 @@ class Row:
     steps: int
     frames: int | None = None
     keep: tuple[int, ...] | None = None
+    order: int | None = None
     seed: int = 0
     model: str = "ast"
     model_settings: dict[str, Any] = field(default_factory=dict)
@@ -65,6 +67,7 @@ _PLATES = {"family": "deforming_plate", "frames": 41}
 _DEEP = {**_PLATES, "keep": (14, 24, 34), "seed": 11, "test": 60, "valid": 60}
 _PLATES_400 = {**_DEEP, "data": "plates400", "nodes": 400, "train": 6000}
 _PLATES_1300 = {**_DEEP, "data": "plates1300", "nodes": 1300, "train": 1500, "valid": 40}
+_SECOND_ORDER = {**_PLATES_1300, "data": "plates1300_second_order", "order": 2}
 _PARTS = {"family": "abcd", "data": "parts400", "nodes": 400, "keep": (10, 15, 20), "seed": 11}
 _PARTS = {**_PARTS, "train": 6000, "valid": 120, "test": 60}
 _MIRRORED = {"mirror": ("x", "y"), "validate_scenes": 20}
@@ -99,6 +102,9 @@ ROWS = {
     "plates1300_transolver": Row(
         "Plates, 1,300 nodes, Transolver", steps=14_100, model="transolver", settings=_MIRRORED, **_PLATES_1300
     ),
+    "plates1300_second_order": Row(
+        "Plates, 1,300 nodes, second-order", steps=12_000, settings=_MIRRORED, rivals=10, **_SECOND_ORDER
+    ),
     "parts400": Row("Pairs of parts, 400 nodes", steps=10_000, settings=_TURNED, rivals=5, **_PARTS),
     "parts400_transolver": Row(
         "Pairs of parts, 400 nodes, Transolver", steps=11_800, model="transolver", settings=_TURNED, **_PARTS
@@ -111,7 +117,7 @@ def trained(name: str, folder: Path) -> tuple[ast_sim.Run, Path]:
     row = ROWS[name]
     data = ast_sim.generate(
         row.family, folder / f"{row.data}.h5", train=row.train, valid=row.valid, test=row.test, seed=row.seed,
-        nodes=row.nodes, frames=row.frames, keep=row.keep,
+        nodes=row.nodes, frames=row.frames, keep=row.keep, order=row.order,
     ).path  # fmt: skip
     run = ast_sim.train(
         data, folder / f"run_{name}", model=row.model, steps=row.steps, resume=True, model_settings=row.model_settings,

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ast_sim.dataset.layout import DatasetInfo
+from ast_sim.element_topology import MIDDLES
 from ast_sim.mechanics.case import Drawn, SolidCase
 from ast_sim.mechanics.contact_and_friction import ContactSettings
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
@@ -21,6 +22,7 @@ from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.mechanics.unfinished import Checkpoint
 from ast_sim.scene import AttributeValue, NodeType, Scene, Trajectory
 from ast_sim.simulate.shapes import plate_mesh
+from ast_sim.simulate.shapes.mesh import second_order
 from ast_sim.simulate.shapes.mesh_check import BadMesh
 from ast_sim.simulate.shapes.obstacles import draw_obstacle
 from ast_sim.simulate.shapes.plate_outline_and_holes import Outline, distance_to, draw_outline
@@ -29,12 +31,15 @@ from ast_sim.support.errors import ConfigError
 FRAMES = 400
 DEFAULT_NODES = 1300
 MINIMUM_NODES = 80
+SECOND_ORDER_NODES = 400  # at least, of a scene of second-order elements
 MINIMUM_FRAMES = 3  # a press and its release need this many
 MATERIAL = NeoHookean(young=1e6, poisson=0.4)
 CONTACT = ContactSettings(dhat=1e-3, stiffness=MATERIAL.young)
 SETTINGS = SolverSettings()
-LAYERS = 2  # layers of elements through the thickness
+LAYERS = {1: 2, 2: 1}  # of elements through the thickness, by their order: three nodes lie across it either way
+ACROSS = 3
 OBSTACLE_SHARE = 0.16  # share of the nodes that belong to the obstacle
+SECOND_ORDER_CELLS = 4  # at least, along each side of an obstacle of second-order elements, which are two cells long
 SMALLEST_ANGLE = np.radians(22)  # smallest angle of a triangle of the middle plane
 COARSE_ANGLE = np.radians(10)  # the same where the plate is meshed anew: the mesh need not be that good, but must exist
 CLAMP_MARGIN = 0.05  # distance in metres, seen from above, between the obstacle and the clamps
@@ -60,11 +65,12 @@ class _Shape:
 
     Attributes:
         outline: the middle plane.
-        columns: about how many nodes the mesh of the middle plane has.
+        columns: about how many nodes the mesh of the middle plane has, those within its edges too.
         area, perimeter: of the middle plane.
         length: distance between the clamps of the unsheared plate.
         thickness: where x = 0.
         taper: by which share the thickness grows from there to x = length.
+        order: of the elements.
     """
 
     outline: Outline
@@ -74,10 +80,11 @@ class _Shape:
     length: float
     thickness: float
     taper: float = 0.0
+    order: int = 1
 
     def spacing(self, share: float = 1.0) -> float:
         """Length of the edges of a mesh with that share of the columns."""
-        return plate_mesh.spacing_for(share * self.columns, self.area, self.perimeter)
+        return self.order * plate_mesh.spacing_for(share * self.columns, self.area, self.perimeter)
 
     def flat_mesh(self, share: float, smallest_angle: float) -> plate_mesh.PlaneMesh | None:
         """The mesh of the middle plane with that share of the columns; None if it has a triangle of poor shape."""
@@ -91,7 +98,7 @@ class _Plate:
 
     Attributes:
         shape: what was meshed.
-        position, elements: [N,3] and [E,4].
+        position, elements: [N,3] and [E,k].
         clamps: [N] 1 for nodes of the left clamp, 2 for nodes of the right clamp, 0 elsewhere.
     """
 
@@ -106,7 +113,7 @@ class _Press:
     """What presses the plate, and how everything moves.
 
     Attributes:
-        obstacle, elements: [N,3] at the start and [E,4].
+        obstacle, elements: [N,3] at the start and [E,k].
         travel: displacement [S,3] of the obstacle.
         drift: displacements [2,S,3] of the clamps.
         attributes: what is recorded of the drawing.
@@ -119,12 +126,12 @@ class _Press:
     attributes: dict[str, AttributeValue]
 
 
-def draw(rng: np.random.Generator, nodes: int = DEFAULT_NODES, frames: int = FRAMES) -> SolidCase:
+def draw(rng: np.random.Generator, nodes: int = DEFAULT_NODES, frames: int = FRAMES, order: int = 1) -> SolidCase:
     """The case of `draw_geometry`."""
-    return draw_geometry(rng, nodes, frames).case
+    return draw_geometry(rng, nodes, frames, order).case
 
 
-def draw_geometry(rng: np.random.Generator, nodes: int = DEFAULT_NODES, frames: int = FRAMES) -> Drawn:
+def draw_geometry(rng: np.random.Generator, nodes: int = DEFAULT_NODES, frames: int = FRAMES, order: int = 1) -> Drawn:
     """Draw a scene.
 
     Args:
@@ -132,6 +139,7 @@ def draw_geometry(rng: np.random.Generator, nodes: int = DEFAULT_NODES, frames: 
         nodes: about how many nodes a scene of the dataset has, obstacle included. The drawn scene has 0.5 to 1.7 times
             as many.
         frames: how many frames the press and the release take.
+        order: 1 for linear tetrahedra, 2 for those of ten nodes.
 
     Raises:
         ConfigError: there are too few frames for a press and a release.
@@ -139,19 +147,19 @@ def draw_geometry(rng: np.random.Generator, nodes: int = DEFAULT_NODES, frames: 
     if frames < MINIMUM_FRAMES:
         raise ConfigError(f"frames is {frames}; a press and its release need at least {MINIMUM_FRAMES}")
     while True:
-        drawn = _try_draw(rng, nodes, frames)
+        drawn = _try_draw(rng, nodes, frames, order)
         if drawn is not None and 0.5 * nodes <= drawn.case.scene.num_nodes <= 1.7 * nodes:
             return drawn
 
 
-def _try_draw(rng: np.random.Generator, nodes: int, frames: int) -> Drawn | None:
+def _try_draw(rng: np.random.Generator, nodes: int, frames: int, order: int) -> Drawn | None:
     """One draw; None if the plate cannot be meshed well, or if the obstacle does not fit or comes down on a hole."""
     wanted = nodes * rng.triangular(0.53, 0.95, 1.6)
-    cells = max(2, round((OBSTACLE_SHARE * wanted) ** (1 / 3)) - 1)
-    plate = _draw_plate(rng, wanted - (cells + 1) ** 3)
+    cells = _obstacle_cells(OBSTACLE_SHARE * wanted, order)
+    plate = _draw_plate(rng, wanted - (cells + 1) ** 3, order)
     if plate is None:
         return None
-    shape, obstacle, obstacle_elements = draw_obstacle(rng, cells)
+    shape, obstacle, obstacle_elements = draw_obstacle(rng, cells, order)
     way = draw_way(rng, frames)
     depth = rng.uniform(0.02, 0.065)
     direction = np.array([*rng.uniform(-0.25, 0.25, 2), -1.0])
@@ -176,6 +184,12 @@ def _try_draw(rng: np.random.Generator, nodes: int, frames: int) -> Drawn | None
     return Drawn(_case(plate, press), lambda share: _case(_remeshed(plate.shape, share), press))
 
 
+def _obstacle_cells(nodes: float, order: int) -> int:
+    """Cells along each side of an obstacle of about that many nodes; an even number for second-order elements."""
+    side = nodes ** (1 / 3) - 1
+    return max(2, round(side)) if order == 1 else max(SECOND_ORDER_CELLS, 2 * int(side / 2))
+
+
 def _case(plate: _Plate, press: _Press) -> SolidCase:
     n, frames = len(plate.position), len(press.travel)
     scene = _assemble(plate, press.obstacle, press.elements)
@@ -186,14 +200,15 @@ def _case(plate: _Plate, press: _Press) -> SolidCase:
     return SolidCase(scene, prescribed_position, MATERIAL, CONTACT, INFO.stress_location, press.attributes)
 
 
-def _draw_plate(rng: np.random.Generator, nodes: float) -> _Plate | None:
+def _draw_plate(rng: np.random.Generator, nodes: float, order: int) -> _Plate | None:
     """A plate of about `nodes` nodes; None if it has an element of poor shape."""
     length, width, thickness = rng.uniform([0.42, 0.24, 0.025], [0.54, 0.40, 0.045])
-    columns = nodes / (LAYERS + 1)
-    outline = draw_outline(rng, length, width, plate_mesh.spacing_for(columns, length * width, 2 * (length + width)))
+    columns = nodes / ACROSS
+    spacing = order * plate_mesh.spacing_for(columns, length * width, 2 * (length + width))
+    outline = draw_outline(rng, length, width, spacing)
     loops = [np.concatenate(outline.pieces), *outline.holes]
     area = sum(abs(plate_mesh.area(loop)) * (1 if loop is loops[0] else -1) for loop in loops)
-    shape = _Shape(outline, columns, area, sum(map(plate_mesh.length, loops)), length, thickness)
+    shape = _Shape(outline, columns, area, sum(map(plate_mesh.length, loops)), length, thickness, order=order)
     mesh = shape.flat_mesh(1.0, SMALLEST_ANGLE)
     if mesh is None:
         return None
@@ -203,11 +218,23 @@ def _draw_plate(rng: np.random.Generator, nodes: float) -> _Plate | None:
 
 def _extruded(shape: _Shape, mesh: plate_mesh.PlaneMesh) -> _Plate:
     thickness = shape.thickness * (1 + shape.taper * mesh.points[:, 0] / shape.length)
-    position, elements = plate_mesh.extrude(mesh, thickness, LAYERS)
+    layers = LAYERS[shape.order]
+    position, elements = plate_mesh.extrude(mesh, thickness, layers)
     clamps = np.zeros(len(mesh.points), int)
     for clamp, piece in enumerate(shape.outline.ends, 1):
         clamps[mesh.pieces[piece]] = clamp
-    return _Plate(shape, position, elements, np.repeat(clamps, LAYERS + 1))
+    plate = _Plate(shape, position, elements, np.repeat(clamps, layers + 1))
+    return plate if shape.order == 1 else _raised(plate)
+
+
+def _raised(plate: _Plate) -> _Plate:
+    """The plate in second-order elements. A middle is clamped where both ends of its edge are, by the same clamp."""
+    position, elements = second_order(plate.position, plate.elements)
+    ends = plate.clamps[elements[:, np.array(MIDDLES)]]  # [E,6,2]
+    clamps = np.zeros(len(position), int)
+    clamps[elements[:, :4]] = plate.clamps[elements[:, :4]]
+    clamps[elements[:, 4:]] = np.where(ends[..., 0] == ends[..., 1], ends[..., 0], 0)
+    return _Plate(plate.shape, position, elements, clamps)
 
 
 def _remeshed(shape: _Shape, share: float) -> _Plate:

@@ -3,7 +3,8 @@
 Such a module has `INFO` (DatasetInfo), `DEFAULT_NODES`, `MINIMUM_NODES`, `FRAMES` (frames of a scene, unless it is an
 option), `draw(rng, nodes, ...) -> case`, which takes all of its draws from `rng`, and
 `solve(case, checkpoint) -> Trajectory`. One without inertia also has `SETTINGS` (SolverSettings) and
-`draw_geometry(rng, nodes, ...) -> Drawn`, which draws the same and can be meshed anew. The family `assembly` has
+`draw_geometry(rng, nodes, ...) -> Drawn`, which draws the same and can be meshed anew. One with the option order also
+has `SECOND_ORDER_NODES`, the `MINIMUM_NODES` of such scenes. The family `assembly` has
 `info`, `check_spec` and `draw_scene` instead of `INFO` and the two: they depend on a specification.
 """
 
@@ -22,8 +23,8 @@ class Family:
 
     Attributes:
         about: one line for a user.
-        options: the options of `generate` that it has beside the number of nodes: "frames", "keep", "parts", "solver",
-            "spec" (which is an argument).
+        options: the options of `generate` that it has beside the number of nodes: "frames", "keep", "order", "parts",
+            "solver", "spec" (which is an argument).
         packages: packages that only its scenes depend on. The dataset records their versions.
     """
 
@@ -35,7 +36,7 @@ class Family:
 _PARTS = ("gmsh", "meshio")
 FAMILIES = {
     "deforming_plate": Family(
-        "clamped plates that a rigid obstacle presses in and lets go", ("frames", "keep", "solver")
+        "clamped plates that a rigid obstacle presses in and lets go", ("frames", "keep", "order", "solver")
     ),
     "sphere_simple": Family("a hanging cloth and a sphere that pushes into it, with inertia"),
     "abcd": Family("two CAD-like parts squeezed together, 4,000 nodes", ("keep", "parts", "solver"), _PARTS),

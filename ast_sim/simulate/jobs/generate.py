@@ -76,6 +76,7 @@ def generate(
     nodes: int | None = None,
     frames: int | None = None,
     keep: Sequence[int] | None = None,
+    order: int | None = None,
     workers: int | None = None,
     solver: str | None = None,
     parts: str | os.PathLike[str] | None = None,
@@ -87,13 +88,12 @@ def generate(
     """Generate a dataset file of simulated scenes.
 
     Args:
-        family: scene family, such as "deforming_plate".
-        out: the dataset file. If it exists and was made with the same settings, only scenes that it lacks are made.
+        family, out: scene family, such as "deforming_plate"; dataset file. One with these settings gets what it lacks.
         train, valid, test, calibration: scenes of each split. `valid` and `test` are a tenth of `train` if None.
         seed: of all random draws. A sample depends only on the seed, its split, its index and the settings.
-        nodes: about how many nodes a scene has; None: the family's default, or by the sizes of a specification.
-        frames: frames of a scene, for families that have this option; None: the default of family or specification.
+        nodes, frames: of a scene, about so many nodes; None: the default of the family or of the specification.
         keep: ascending numbers of the frames to solve, straight from one to the next, and store; all frames if None.
+        order: of the tetrahedra, 1 (four nodes) or 2 (ten nodes), for families that have this option; 1 if None.
         workers: number of processes; one per available core if None.
         solver: "own" or "calculix", for families of solids; if None, "own", but "calculix" if a part is elastoplastic.
         parts: a file or folder of parts (STEP, STL, meshes), for families that squeeze parts; None: drawn ones.
@@ -112,7 +112,7 @@ def generate(
     self_test()
     counts = checked_counts(train, valid, test, calibration)
     workers = checked_workers(workers, scheduler)
-    recipe = checked_recipe(module, family, seed, nodes, frames, solver, parts, patient, keep, spec)
+    recipe = checked_recipe(module, family, seed, nodes, frames, solver, parts, patient, keep, spec, order)
     output_file(out := Path(out))
     settings = recorded(recipe)
     folder = out.with_name(out.name + ".parts")
@@ -122,8 +122,8 @@ def generate(
     with _locked(folder, settings):
         _unpack(out, folder)
         _make(samples := _samples(counts), folder, recipe, workers, scheduler, progress, _notes(recipe, settings))
-        truncated = _merge(out, folder, samples, _writer(out, recipe, module, {**settings, "counts": counts}))
-    return Generated(out, counts, truncated)
+        opened = _writer(out, recipe, module, {**settings, "counts": counts})
+        return Generated(out, counts, _merge(out, folder, samples, opened))
 
 
 def _writer(out: Path, recipe: Recipe, module: ModuleType, generator: dict[str, Any]) -> DatasetWriter:

@@ -42,14 +42,16 @@ def checked_recipe(
     patient: bool = False,
     keep: Sequence[int] | None = None,
     spec: str | Path | None = None,
+    order: int | None = None,
 ) -> Recipe:
     """The recipe with these settings, after a check. A setting that is None takes the family's default.
 
     Raises:
         ConfigError: a value is invalid, or the family does not have an option.
     """
-    seed, nodes, frames = whole(seed=seed, nodes=nodes, frames=frames)
-    for name, value in (("frames", frames), ("keep", keep), ("solver", solver), ("parts", parts), ("spec", spec)):
+    seed, nodes, frames, order = whole(seed=seed, nodes=nodes, frames=frames, order=order)
+    options = {"frames": frames, "keep": keep, "order": order, "parts": parts, "solver": solver, "spec": spec}
+    for name, value in options.items():
         if value is not None and name not in FAMILIES[family].options:
             having = ", ".join(key for key, known in FAMILIES.items() if name in known.options)
             raise ConfigError(f"{family} has no option {name}; these families have it: {having}")
@@ -62,7 +64,11 @@ def checked_recipe(
         frames = module.FRAMES if frames is None else frames
         if frames < module.MINIMUM_FRAMES:
             raise ConfigError(f"frames is {frames}; must be at least {module.MINIMUM_FRAMES}")
-    for name, value, minimum in (("seed", seed, 0), ("nodes", nodes, module.MINIMUM_NODES)):
+    if order not in (None, 1, 2):
+        raise ConfigError(f"order is {order}; must be 2 (tetrahedra of ten nodes) or 1 (of four nodes)")
+    order = None if order == 1 else order
+    fewest = module.MINIMUM_NODES if order is None else module.SECOND_ORDER_NODES
+    for name, value, minimum in (("seed", seed, 0), ("nodes", nodes, fewest)):
         if value is not None and value < minimum:
             raise ConfigError(f"{name} is {value}; must be at least {minimum}")
     if seed > LARGEST_SEED:
@@ -84,7 +90,7 @@ def checked_recipe(
         keep = _checked_keep(keep, (frames or module.FRAMES) - 1)
     parts = None if parts is None else str(Path(parts).resolve())
     spec = None if spec is None else str(Path(spec).resolve())
-    return Recipe(family, seed, nodes, frames, solver, parts, spec, patient, keep)
+    return Recipe(family, seed, nodes, frames, solver, parts, spec, patient, keep, order)
 
 
 def recipe_of(name: str, info: DatasetInfo, made_from: str | os.PathLike[str] | None = None) -> Recipe:
@@ -116,8 +122,8 @@ def recipe_of(name: str, info: DatasetInfo, made_from: str | os.PathLike[str] | 
     except (KeyError, ConfigError) as error:
         raise ConfigError(f"{name}: its settings cannot be read ({error!r})") from error
     try:
-        keep = made.get("keep")
-        recipe = checked_recipe(family_module(family), family, *numbers, None, parts, False, keep, spec)
+        keep, order = made.get("keep"), made.get("order")
+        recipe = checked_recipe(family_module(family), family, *numbers, None, parts, False, keep, spec, order)
     except TypeError as error:
         raise ConfigError(f"{name}: its settings cannot be read ({error!r})") from error
     if parts is not None and _source(parts).describe().get("parts") != made["parts"]:
@@ -226,6 +232,8 @@ def _command(recipe: Recipe) -> str:
         words += ["--nodes", str(recipe.nodes)]
     if recipe.frames is not None:
         words += ["--frames", str(recipe.frames)]
+    if recipe.order is not None:
+        words += ["--order", str(recipe.order)]
     if recipe.solver != "own":
         words += ["--solver", recipe.solver]
     if recipe.parts is not None:

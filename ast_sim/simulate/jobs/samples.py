@@ -47,6 +47,7 @@ class Recipe:
         patient: whether the own solver may take any number of Newton iterations for a frame.
         spec: the specification of an assembly, for the family `assembly`.
         keep: the frames that are solved and stored after frame 0, by their numbers in the whole motion; None: all.
+        order: 2 if a family with this option makes second-order tetrahedra; None: linear ones.
     """
 
     family: str
@@ -58,6 +59,7 @@ class Recipe:
     spec: str | None = None
     patient: bool = False
     keep: tuple[int, ...] | None = None
+    order: int | None = None
 
 
 def make_sample(recipe: Recipe, split: str, index: int, checkpoint: Checkpoint | None = None) -> Trajectory:
@@ -111,7 +113,8 @@ def _drawn_assembly(recipe: Recipe, split: str, index: int) -> Drawn:
 
 def _options(recipe: Recipe) -> dict[str, Any]:
     """The arguments of the drawing beside the number of nodes."""
-    options: dict[str, Any] = {} if recipe.frames is None else {"frames": recipe.frames}
+    given = {"frames": recipe.frames, "order": recipe.order}
+    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if recipe.parts is not None:
         from ast_sim.simulate.shapes.part_source import part_source
 

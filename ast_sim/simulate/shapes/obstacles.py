@@ -61,15 +61,24 @@ SHAPES: dict[str, Callable[[np.ndarray, int], Mesh]] = {
 }
 
 
-def draw_obstacle(rng: np.random.Generator, cells: int) -> tuple[str, np.ndarray, np.ndarray]:
-    """Draw an obstacle, turned by a yaw and a small tilt: its shape, positions [N,3] and tetrahedra [E,4].
+def _second_order(cells: int) -> np.ndarray:
+    """[E,10] tetrahedra two cells long over the nodes of a cube of cells: their middles lie on the shape, too."""
+    position, elements = mesh.second_order(*mesh.block((1.0, 1.0, 1.0), cells // 2))
+    place = np.rint((position + 1) * cells / 2).astype(int)
+    return np.ravel_multi_index(tuple(place.T), (cells + 1,) * 3)[elements]
+
+
+def draw_obstacle(rng: np.random.Generator, cells: int, order: int = 1) -> tuple[str, np.ndarray, np.ndarray]:
+    """Draw an obstacle, turned by a yaw and a small tilt: its shape, positions [N,3] and tetrahedra [E,4] or [E,10].
 
     Args:
         rng: where the draws come from.
-        cells: number of cells along each side.
+        cells: number of cells along each side; an even number of second-order elements.
+        order: of the elements.
     """
     shape = list(SHAPES)[rng.integers(len(SHAPES))]
     position, elements = SHAPES[shape](rng.uniform(0.035, 0.075, 3), cells)
+    elements = elements if order == 1 else _second_order(cells)
     yaw, tilt, about = rng.uniform(0, np.pi), rng.uniform(0, 0.2), rng.uniform(0, 2 * np.pi)
     axis = np.array([np.cos(about), np.sin(about), 0])
     turn = Rotation.from_rotvec(-tilt * axis) * Rotation.from_rotvec([0, 0, -yaw])  # clockwise

@@ -3,7 +3,11 @@
 import numpy as np
 import pytest
 
+from ast_sim.element_topology import MIDDLES, signed_volumes
 from ast_sim.mechanics.contact_and_friction import Contact
+from ast_sim.mechanics.driven import Driven
+from ast_sim.mechanics.quasi_static import solve_frame
+from ast_sim.mechanics.reaction import Reaction
 from ast_sim.named_field import REACTION
 from ast_sim.scene import NodeType
 from ast_sim.simulate.families.deforming_plate import (
@@ -13,6 +17,7 @@ from ast_sim.simulate.families.deforming_plate import (
     FRAMES,
     MATERIAL,
     MINIMUM_NODES,
+    SETTINGS,
     draw,
     draw_drift,
     draw_geometry,
@@ -120,6 +125,48 @@ def test_the_same_plate_on_coarser_meshes():
                     for k in [_held(c, end)]
                 ]
                 np.testing.assert_allclose(moves[1], moves[0], atol=1e-12)
+
+
+def test_plates_of_second_order_elements():
+    sizes = []
+    for seed in range(10):
+        drawn = draw_geometry(np.random.default_rng(seed), DEFAULT_NODES, 9, order=2)
+        case = drawn.case
+        scene = case.scene
+        scene.check()
+        sizes.append(scene.num_nodes)
+        rest = scene.rest_position.astype(float)
+        plate = scene.elements[scene.body[scene.elements[:, 0]] == 0]
+        assert plate.shape[1] == 10 and (signed_volumes(rest, plate) > 0).all()
+        ends = plate[:, np.array(MIDDLES)]
+        np.testing.assert_allclose(rest[plate[:, 4:]], rest[ends].mean(axis=2), atol=1e-7)
+        _, across = np.unique(np.rint(1e6 * rest[scene.body == 0, :2]), axis=0, return_counts=True)
+        assert set(across) == {3}  # as many nodes as in two layers of linear elements
+        held = scene.node_type == NodeType.HANDLE
+        for end in (held & (rest[:, 0] < 0), held & (rest[:, 0] > 0)):  # all of a plane end
+            flat = rest[end][:, :2] - rest[end][:, :2].mean(axis=0)
+            normal = np.linalg.svd(flat)[2][1]
+            assert np.abs(flat @ normal).max() < 1e-6
+            away = np.abs((rest[scene.body == 0, :2] - rest[end][:, :2].mean(axis=0)) @ normal)
+            assert (away < 1e-6).sum() == end.sum()
+        for share in (0.5, 8.0):
+            other = drawn.remesh_nearly(share).scene
+            assert other.elements.shape[1] == 10
+            assert 0.7 * share <= (other.body == 0).sum() / (scene.body == 0).sum() <= 1.5 * share
+    assert 1000 < np.median(sizes) < 1600
+
+
+def test_the_force_of_second_order_plates_is_nearly_that_of_a_finer_mesh():
+    drawn = draw_geometry(np.random.default_rng(7), DEFAULT_NODES, 9, order=2)
+    forces = []
+    for case in (drawn.case, drawn.remesh_nearly(4.0)):
+        solved = solve_frame(case, 6, SETTINGS, first=0.5)
+        driven = Driven.of(case.scene, case.prescribed_position)
+        forces.append(Reaction(case.scene, driven, case.material).of(solved.position))
+    size = np.linalg.norm(forces[1])
+    assert size == pytest.approx(52.9, rel=0.01)  # newton
+    assert np.linalg.norm(forces[0]) / size == pytest.approx(1.054, abs=0.01)  # a coarse mesh is too stiff
+    assert np.linalg.norm(forces[0] - forces[1]) < 0.07 * size
 
 
 def _held(case, end) -> int:

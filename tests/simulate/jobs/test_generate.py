@@ -23,8 +23,8 @@ from ast_sim.simulate.jobs import pool
 from ast_sim.simulate.jobs.display import SceneProgress
 from ast_sim.simulate.jobs.generate import generate
 from ast_sim.simulate.jobs.manifest import Manifest
-from ast_sim.simulate.jobs.recipe import recorded
-from ast_sim.simulate.jobs.samples import Recipe, load_sample, make_sample, sample_path, save_sample
+from ast_sim.simulate.jobs.recipe import recipe_of, recorded
+from ast_sim.simulate.jobs.samples import Recipe, draw_sample, load_sample, make_sample, sample_path, save_sample
 from ast_sim.support.errors import ConfigError, MissingExtra, SimulationError, require
 
 NODES, FRAMES = 80, 9
@@ -280,6 +280,33 @@ def test_kept_frames_are_those_of_the_whole_motion_and_recorded(undisturbed, tmp
         plates(undisturbed, keep=kept)
 
 
+def test_second_order_scenes_are_recorded_and_are_other_scenes(undisturbed, tmp_path):
+    out = plates(tmp_path / "ten.h5", {"train": 1}, nodes=400, keep=(7,), order=2, workers=1).path
+    with Dataset(out) as ten, Dataset(undisturbed) as linear:
+        made = ten.info.generator
+        assert made["order"] == 2 and "order" not in linear.info.generator
+        assert (
+            made["command"]
+            == f"ast-sim generate deforming_plate --seed 5 --nodes 400 --frames {FRAMES} --order 2 --keep 7"
+        )
+        assert ten.element_size == 10 and linear.element_size == 4
+        again = draw_sample(recipe_of("ten.h5", ten.info), "train", 0).case.scene
+        np.testing.assert_array_equal(again.elements, ten.scene("train", 0).elements)
+    before = out.read_bytes()
+    same = {"nodes": 400, "keep": (7,)}
+    assert plates(out, {"train": 1}, **same, order=2).path == out and out.read_bytes() == before
+    for order in (None, 1):
+        with pytest.raises(ConfigError, match="holds other data"):
+            plates(out, {"train": 1}, **same, order=order)
+    assert plates(undisturbed, order=1).counts == {**COUNTS, "calibration": 0}  # 1 is the default
+    with pytest.raises(ConfigError, match="holds other data"):
+        plates(undisturbed, nodes=400, order=2)
+    more = plates(out, {"train": 2}, **same, order=2, workers=1)
+    assert more.counts["train"] == 2 and more.truncated == []
+    with Dataset(out) as ten:
+        assert all(t.scene.elements.shape[1] == 10 for t in ten["train"])
+
+
 def test_calculix_keeps_frames_too():
     recipe = Recipe("deforming_plate", 5, 150, FRAMES, keep=(3, 7))
     own, other = (make_sample(replace(recipe, solver=solver), "train", 2) for solver in ("own", "calculix"))
@@ -320,6 +347,10 @@ def test_two_runs_on_one_file_exclude_each_other(tmp_path):
         ({"family": "abcd", "keep": [21]}, r"keep is \[21\]; must be numbers of frames from 1 to 20"),
         ({"keep": [3, 2]}, r"keep is \[3, 2\]; the numbers of frames must ascend"),
         ({"keep": [3, 3]}, "must ascend"),
+        ({"order": 3}, r"order is 3; must be 2 \(tetrahedra of ten nodes\) or 1 \(of four nodes\)"),
+        ({"order": "2"}, "order is '2'; must be a whole number"),
+        ({"order": 2, "nodes": 399}, "nodes is 399; must be at least 400"),
+        ({"family": "abcd", "order": 2}, "abcd has no option order; these families have it: deforming_plate"),
         (  # it has inertia: every frame follows from the one before
             {"family": "sphere_simple", "keep": [3]},
             "sphere_simple has no option keep; these families have it: deforming_plate, abcd, abcd_xl",

@@ -10,7 +10,7 @@ from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.simulate.jobs.generate import generate
 from ast_sim.simulate.jobs.recipe import recipe_of
-from ast_sim.simulate.jobs.rival import WAYS, Outcome, Way, cheapest, deepest_frame, rivals
+from ast_sim.simulate.jobs.rival import FINER, WAYS, Outcome, Way, cheapest, deepest_frame, rivals
 from ast_sim.simulate.jobs.rival_worker import WaySolver
 from ast_sim.simulate.jobs.samples import Recipe, draw_sample
 from ast_sim.simulate.shapes.mesh_check import BadMesh
@@ -44,6 +44,21 @@ def changed(plates, path, generator=None, **changes):
             for trajectory in data["train"]:
                 writer.add("train", trajectory)
     return path
+
+
+def test_other_meshes_of_second_order_plates_are_of_second_order_too(tmp_path):
+    settings = {**SETTINGS, "nodes": 600, "order": 2, "keep": (5,)}
+    ten = generate("deforming_plate", tmp_path / "ten.h5", train=1, valid=0, test=0, **settings).path
+    half, nested = Way("half", nodes=0.5), Way("nested", nodes=0.5, linearised=6, newton=2)
+    (scene,) = rivals(ten, "train", [0], ways=(OWN, half, nested, FINER), starts=(1,), progress=False)
+    own, coarse, kept, finer = scene.outcomes
+    with Dataset(ten) as data:
+        assert data.element_size == 10 and own.nodes == data.scene("train", 0).num_nodes == 497
+    assert coarse.nodes == kept.nodes == 278 and finer.nodes == 3155
+    assert max(own.errors.values()) < 1e-4
+    assert 0.02 < coarse.relative_error < 0.15 and 0.1 < coarse.reaction_error < 0.5
+    assert kept.relative_error < 0.02 and kept.reaction_error < 0.03  # by quadratic shape functions, on a coarse mesh
+    assert 0.02 < finer.relative_error < 0.08 and 0.1 < finer.reaction_error < 0.3  # 500 nodes are few
 
 
 def test_every_way_is_solved_and_compared_with_the_dataset(plates, no_torch, capsys):

@@ -39,6 +39,7 @@ def test_a_look_tells_mistakes_and_needs_a_specification(tmp_path, capsys):
     for words, line in (
         (["assembly", str(path), "--look"], "no node of block .block.vtu. lies in 'z>9'"),
         (["abcd", "--look"], "--look is for a specification"),
+        (["assembly", str(path), "--look", "--order", "2"], "leave out --order$"),
         (["assembly", str(path), "--count", "3"], "give --out FILE, or --look"),
         (["abcd", "--out", "a.h5"], "give --count N$"),
     ):

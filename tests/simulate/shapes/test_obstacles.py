@@ -60,3 +60,16 @@ def test_drawn_obstacles_are_turned_without_changing_their_size():
         assert volumes(position, elements).min() > 0
         shapes.add(shape)
     assert shapes == set(SHAPES)
+
+
+@pytest.mark.parametrize("cells", [2, 4, 6])
+def test_obstacles_of_second_order_elements_have_the_nodes_and_the_surface_of_the_linear_ones(cells):
+    for seed in range(8):
+        _, position, linear = draw_obstacle(np.random.default_rng(seed), cells)
+        _, same, elements = draw_obstacle(np.random.default_rng(seed), cells, order=2)
+        np.testing.assert_array_equal(same, position)
+        assert elements.shape == (6 * (cells // 2) ** 3, 10)
+        assert np.array_equal(np.unique(elements), np.arange(len(position)))
+        one, two = (as_scene(position, e).surface() for e in (linear, elements))
+        assert len(two) == len(one) == 12 * cells**2
+        assert np.array_equal(np.unique(two), np.unique(one))
