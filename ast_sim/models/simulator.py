@@ -306,7 +306,7 @@ class Simulator(nn.Module):
 
 def _strains(graph: Graph, motion: Tensor) -> Tensor:
     """[E, K, 3]: the differences of a motion [N, 3] along the K edges of each deforming element, over their lengths at
-    rest."""
+    rest; 0 along an edge without length."""
     nodes = graph.elements[graph.deforming_elements]
     first, second = torch.tensor(LOCAL_EDGES[nodes.shape[1]]).T
 
@@ -314,7 +314,8 @@ def _strains(graph: Graph, motion: Tensor) -> Tensor:
         at_nodes = values.index_select(0, nodes.flatten()).view(*nodes.shape, 3)
         return at_nodes[:, first] - at_nodes[:, second]
 
-    return along_edges(motion) / along_edges(graph.rest_position).norm(dim=2, keepdim=True)
+    lengths = along_edges(graph.rest_position).norm(dim=2, keepdim=True)
+    return along_edges(motion) * torch.where(lengths > 0, 1 / lengths, 0)
 
 
 def _require_cpu(what: str, device: torch.device) -> None:
