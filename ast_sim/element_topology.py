@@ -86,19 +86,28 @@ def surface_triangles(position: np.ndarray, elements: np.ndarray) -> np.ndarray:
     """[F, 3] int32: the triangles of the surface of the elements [E, k], as `Scene.surface` describes them."""
     if elements.shape[1] == 3:
         return elements
+    return triangles_of_faces(position, elements, _outer_faces(elements, len(position)))
+
+
+def _outer_faces(elements: np.ndarray, num_nodes: int) -> np.ndarray:
+    """[F]: the numbers 4 e + face of the faces whose corners no other face has, ascending."""
     faces = elements.astype(np.int64)[:, np.array(LOCAL_FACES)].reshape(-1, 3)  # [4 E, 3], of corners
     one, two, three = np.ascontiguousarray(faces.T)
     low = np.minimum(np.minimum(one, two), three)
     high = np.maximum(np.maximum(one, two), three)
-    upper = (one + two + three - low - high) * len(position) + high
+    upper = (one + two + three - low - high) * num_nodes + high
     # A face of two elements stands beside its like. Numbers of few bits have the fastest stable order.
     order = np.argsort(upper)
-    order = order[np.argsort(low[order].astype(np.min_scalar_type(len(position))), kind="stable")]
+    order = order[np.argsort(low[order].astype(np.min_scalar_type(num_nodes)), kind="stable")]
     low, upper = low[order], upper[order]
     like_next = (low[1:] == low[:-1]) & (upper[1:] == upper[:-1])
     alone = np.ones(len(faces), bool)
     alone[order[1:][like_next]] = alone[order[:-1][like_next]] = False
-    outer = np.flatnonzero(alone)
+    return np.flatnonzero(alone)
+
+
+def triangles_of_faces(position: np.ndarray, elements: np.ndarray, outer: np.ndarray) -> np.ndarray:
+    """[F, 3] int32: the triangles of faces by number, 4 e + face; seen from outside they run counter-clockwise."""
     owner = elements[outer // 4]
     turned = signed_volumes(position, owner) < 0
     local = np.array(FACE_TRIANGLES[elements.shape[1]])[outer % 4]  # [F, 1 or 4, 3]

@@ -132,6 +132,7 @@ static bool take_number(call *c, int i, PyObject *object) {
   }
   if (p->kind == INTEGER) inside &= a->integer >= p->low && a->integer <= p->high;
   if (p->kind == NUMBER && p->low < p->high) inside &= a->number >= (double)p->low && a->number < (double)p->high;
+  if (p->shape[0].letter[0]) c->size[p->shape[0].letter[0]] = a->integer;
   return inside || refuse(c, i, PyExc_ValueError, "is out of range");
 }
 

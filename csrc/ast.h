@@ -234,6 +234,20 @@ typedef struct {
    * other, or -1 (breadth_first.c). wanted and rank [N]. */
   ast_status (*breadth_first)(const int64_t *restrict elements, int64_t E, int64_t K, const int64_t *restrict wanted,
                               int64_t N, int64_t *restrict rank);
+  /* order [M]: the places of an index [M] of numbers below N, by number, then ascending. The number n stands at
+   * order[offsets[n]:offsets[n+1]]; offsets [N+1]. */
+  ast_status (*counting_sort)(const int64_t *restrict index, int64_t M, int64_t N, int64_t *restrict order,
+                              int64_t *restrict offsets);
+  /* The edges of the elements [E,K], in both directions and each once, by receiver, then by sender. ends [P,2] are the
+   * local edges of an element. offsets [N+1] say where the edges into each node stand in senders and receivers, which
+   * have room for 2 P E. */
+  ast_status (*mesh_edges)(const int64_t *restrict elements, int64_t E, int64_t K, const int64_t *restrict ends,
+                           int64_t P, int64_t N, int64_t *restrict senders, int64_t *restrict receivers,
+                           int64_t *restrict offsets);
+  /* The numbers e Q + q, ascending, of the faces whose corners no other face has: face q of element e has the corners
+   * elements[e, faces[q]]; faces [Q,3]. outer has room for E Q; *num are found. */
+  ast_status (*outer_faces)(const int64_t *restrict elements, int64_t E, int64_t K, const int64_t *restrict faces,
+                            int64_t Q, int64_t N, int64_t *restrict outer, int64_t *num);
   /* out[f] = sum of x[n,f] over n, rows in blocks whose sums are added by halves: the gradient of a bias. x [N,F], out
    * [F]. */
   ast_status (*column_sum)(const float *restrict x, int64_t N, int64_t F, float *restrict out);
@@ -269,6 +283,9 @@ typedef struct {
   KERNEL(elastic_forces_backward) \
   KERNEL(proximity)               \
   KERNEL(breadth_first)           \
+  KERNEL(counting_sort)           \
+  KERNEL(mesh_edges)              \
+  KERNEL(outer_faces)             \
   KERNEL(column_sum)              \
   KERNEL(orthogonalize)           \
   KERNEL(mlp)                     \

@@ -40,10 +40,8 @@ static ast_status breadth_first(const int64_t *restrict elements, int64_t E, int
   int64_t *offsets = ast_scratch((N + 1) * word), *at_node = ast_scratch(E * K * word);
   int64_t *seen = ast_scratch(N * word), *reached = ast_scratch(N * word);
   if (!offsets || !at_node || !seen || !reached) return AST_NO_MEMORY;
-  memset(offsets, 0, (size_t)(N + 1) * sizeof *offsets);
-  for (int64_t i = 0; i < E * K; i++) offsets[elements[i]]++;
-  for (int64_t n = 0; n < N; n++) offsets[n + 1] += offsets[n];              /* the end of each node, */
-  for (int64_t i = E * K; i-- > 0;) at_node[--offsets[elements[i]]] = i / K; /* which goes down to its beginning */
+  counting_sort(elements, E * K, N, at_node, offsets);
+  for (int64_t i = 0; i < E * K; i++) at_node[i] /= K;
   for (int64_t n = 0; n < N; n++) seen[n] = wanted[n] ? 0 : INT64_MAX, rank[n] = -1;
   const breadth_first_mesh mesh = {elements, offsets, at_node, K, seen};
   int64_t walk = 0, num = 0;

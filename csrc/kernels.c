@@ -6,11 +6,13 @@
 
 #include "attention.c"
 #include "attention_backward.c"
-#include "breadth_first.c"
+#include "counting_sort.c"
+#include "breadth_first.c" /* after counting_sort.c */
 #include "elastic_forces.c"
 #include "fps.c"
 #include "linear.c"
 #include "attention_block.c" /* after attention.c and linear.c, of which it is made */
+#include "mesh.c"
 #include "message.c"
 #include "message_backward.c" /* after message.c, whose tiles it uses */
 #include "mlp.c"

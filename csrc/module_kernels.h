@@ -115,6 +115,39 @@ KERNEL(breadth_first, elements, wanted, rank) {
   return kernels->breadth_first(a->elements.data, n['E'], n['K'], a->wanted.data, n['N'], a->rank.data);
 }
 
+/* ---- meshes ---- */
+
+KERNEL(counting_sort, num, index, order, offsets) {
+  return kernels->counting_sort(a->index.data, n['M'], n['N'], a->order.data, a->offsets.data);
+}
+
+KERNEL(mesh_edges, num_nodes, elements, ends, senders, receivers, offsets) {
+  return kernels->mesh_edges(a->elements.data, n['E'], n['K'], a->ends.data, n['P'], n['N'], a->senders.data,
+                             a->receivers.data, a->offsets.data);
+}
+
+static bool mesh_edges_count(call *c, PyObject *list) {
+  const mesh_edges_arguments *a = (const void *)c->arguments;
+  ast_status status;
+  c->size['M'] = 2 * c->size['P'] * c->size['E']; /* room; pages that stay empty take no memory */
+  if (!make_outputs(c) || !run(c, mesh_edges_run, NULL, &status)) return false;
+  c->size['M'] = ((const int64_t *)a->offsets.data)[c->size['N']];
+  return append_outputs(c, list);
+}
+
+KERNEL(outer_faces, num_nodes, elements, faces, outer) {
+  return kernels->outer_faces(a->elements.data, n['E'], n['K'], a->faces.data, n['Q'], n['N'], a->outer.data, result);
+}
+
+static bool outer_faces_count(call *c, PyObject *list) {
+  ast_status status;
+  int64_t num = 0;
+  c->size['F'] = c->size['E'] * c->size['Q'];
+  if (!make_outputs(c) || !run(c, outer_faces_run, &num, &status)) return false;
+  c->size['F'] = num;
+  return append_outputs(c, list);
+}
+
 /* ---- octree ---- */
 
 KERNEL(octree, positions, offsets, x, y, z, half_width, depth, keys, cell_offsets, node_cell, node_order,
@@ -417,6 +450,9 @@ static binding bindings[] = {
     BINDING(attention_qkv, .check = attention_check),
     BINDING(attention_qkv_backward, .check = attention_check),
     BINDING(breadth_first),
+    BINDING(counting_sort),
+    BINDING(mesh_edges, COUNTED(mesh_edges)),
+    BINDING(outer_faces, COUNTED(outer_faces)),
     BINDING(column_sum),
     BINDING(elastic_forces),
     BINDING(elastic_forces_backward),

@@ -35,7 +35,7 @@ typedef struct {
   int64_t low, high; /* of an integer from low to high, or of a number in [low, high) if low < high */
   int64_t with;      /* given exactly if that parameter is */
   int64_t ndim, num_checks;
-  dimension shape[MAX_SHAPE];
+  dimension shape[MAX_SHAPE]; /* of an integer the first is the letter whose size it is, if it is one */
   value_check checks[MAX_CHECKS];
 } parameter;
 
@@ -55,7 +55,7 @@ static bool read_spec(spec *s, const char *names, const char *numbers, Py_ssize_
   for (s->num_inputs = 0; s->num_inputs < s->num && !s->parameters[s->num_inputs].output; s->num_inputs++) {
   }
   for (int i = 0; i < s->num_inputs; i++)
-    for (int d = 0; d < s->parameters[i].ndim; d++)
+    for (int d = 0; d < MAX_SHAPE; d++)
       for (int term = 0; term < 2; term++) s->of_inputs[s->parameters[i].shape[d].letter[term]] = true;
   return true;
 }

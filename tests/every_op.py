@@ -18,12 +18,15 @@ from ast_sim.ops import (
     attention,
     attention_block,
     breadth_first,
+    counting_sort,
     elastic_forces,
     farthest_point_sample,
     linear,
+    mesh_edges,
     message_sum,
     mlp,
     octree,
+    outer_faces,
     proximity,
     segment_mean,
     segment_sum,
@@ -279,6 +282,30 @@ def breadth_first_results(scenes: Sequence[int]) -> Results:
     return [[torch.where(mine > 0, x - x[mine > 0].min(), -1)] if mine.any() else [x] for x, mine in parts], []
 
 
+def sort_results(scenes: Sequence[int]) -> Results:
+    """The places in each scene, which are those of its corners."""
+    tets, offsets = tets_of(scenes), offsets_of(scenes)
+    order, ends = counting_sort(tets.elements.flatten(), tets.num_nodes)
+    starts = ends[offsets]
+    return [[x - a] for x, a in zip(split(order, starts), starts, strict=False)], []
+
+
+def edges_results(scenes: Sequence[int]) -> Results:
+    tets, offsets = tets_of(scenes), offsets_of(scenes)
+    edges = mesh_edges(tets.elements, tets.num_nodes)
+    parts = split(edges.senders, edges.receiver_offsets[offsets])
+    return [[x - a] for x, a in zip(parts, offsets, strict=False)], []
+
+
+def faces_results(scenes: Sequence[int]) -> Results:
+    tets = tets_of(scenes)
+    faces = [0, *(4 * len(tets_of([s])) for s in scenes)]
+    starts = torch.tensor(faces).cumsum(0)
+    outer = outer_faces(tets.elements, tets.num_nodes)
+    parts = split(outer, torch.searchsorted(outer, starts))
+    return [[x - a] for x, a in zip(parts, starts, strict=False)], []
+
+
 def linear_results(scenes: Sequence[int]) -> Results:
     inputs = (rows(scenes, 48, key=1), rows(scenes, 35, key=2), shared(70, 48), shared(70))
     return by_rows(lambda x, residual, w, b: linear(x, w, b, "geglu", residual), inputs, 2, offsets_of(scenes))
@@ -316,6 +343,9 @@ OPS: dict[str, Callable[[Sequence[int]], Results]] = {
     "elastic_forces": elastic_results,
     "proximity": proximity_results,
     "breadth_first": breadth_first_results,
+    "counting_sort": sort_results,
+    "mesh_edges": edges_results,
+    "outer_faces": faces_results,
     "linear": linear_results,
     "mlp": mlp_results,
     "orthogonalized": orthogonalized_results,

@@ -16,9 +16,10 @@ from torch import Tensor
 
 from ast_sim.batches.mirror_and_shift import Placement
 from ast_sim.batches.out_of_balance import ElasticTetrahedra
+from ast_sim.element_topology import triangles_of_faces
 from ast_sim.material import Material
 from ast_sim.named_field import Output
-from ast_sim.ops import EdgeSet, join_indices, join_offsets, offsets_of
+from ast_sim.ops import EdgeSet, join_indices, join_offsets, mesh_edges, outer_faces
 from ast_sim.scene import NodeType, Scene
 
 
@@ -98,7 +99,7 @@ class Graph:
             m2e = EdgeSet.from_pairs(nodes, owners, n, e)
             rest_edges = edge_vectors(e2m, _element_mean(elements, rest), rest)
         else:
-            m2m = both_ways(scene.edges().astype("int64"), n)
+            m2m = mesh_edges(elements, n)
             rest_edges = edge_vectors(m2m, rest, rest)
         return Graph(
             rest_position=rest,
@@ -116,7 +117,7 @@ class Graph:
             m2e=m2e,
             rest_edges=rest_edges,
             body=torch.from_numpy(scene.body.astype("int64")),
-            **(_surface_of(scene) if surface else {}),
+            **(_surface_of(scene, elements) if surface else {}),
             elasticity=None if elastic is None else ElasticTetrahedra.of(scene, elastic),
         )
 
@@ -194,17 +195,15 @@ class Graph:
         return torch.cat(columns, dim=1)
 
 
-def _surface_of(scene: Scene) -> dict[str, Tensor]:
-    triangles = torch.from_numpy(scene.surface().astype("int64"))
+def _surface_of(scene: Scene, elements: Tensor) -> dict[str, Tensor]:
+    """As `Scene.surface`, with the kernel, which this room may use."""
+    if elements.shape[1] == 3:
+        triangles = elements
+    else:
+        outer = outer_faces(elements, scene.num_nodes).numpy()
+        oriented = triangles_of_faces(scene.rest_position, scene.elements, outer)
+        triangles = torch.from_numpy(oriented.astype("int64"))
     return {"surface": triangles, "surface_offsets": torch.tensor([0, len(triangles)])}
-
-
-def both_ways(pairs: np.ndarray, num_nodes: int) -> EdgeSet:
-    """The edges among the nodes that join each pair of `pairs` [P, 2] int64 in both directions."""
-    first, second = pairs.T
-    keys = np.sort(np.concatenate([first * num_nodes + second, second * num_nodes + first]))
-    receivers, senders = map(torch.from_numpy, np.divmod(keys, num_nodes))
-    return EdgeSet(senders, receivers, offsets_of(receivers, num_nodes), num_nodes)
 
 
 def edge_vectors(edges: EdgeSet, senders: Tensor, receivers: Tensor) -> Tensor:

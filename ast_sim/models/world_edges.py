@@ -5,11 +5,11 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
+import torch
 from scipy.spatial import KDTree
 
 from ast_sim.batches.batch_builder import Batch
-from ast_sim.batches.graph import both_ways
-from ast_sim.ops import EdgeSet
+from ast_sim.ops import EdgeSet, mesh_edges
 
 
 def world_edges(batch: Batch, radius: float, most: int | None) -> EdgeSet:
@@ -30,7 +30,8 @@ def world_edges(batch: Batch, radius: float, most: int | None) -> EdgeSet:
     mesh = _keys(graph.m2m.receivers.numpy(), graph.m2m.senders.numpy(), len(position))
     near = [start + _pairs(position[start:end], radius) for start, end in zip(offsets[:-1], offsets[1:], strict=True)]
     kept = [_shortest(_without(pairs, mesh, len(position)), position, most) for pairs in near]
-    return both_ways(np.concatenate(kept) if kept else np.zeros((0, 2), np.int64), len(position))
+    pairs = np.concatenate(kept) if kept else np.zeros((0, 2), np.int64)
+    return mesh_edges(torch.from_numpy(pairs), len(position))
 
 
 def _pairs(position: np.ndarray, radius: float) -> np.ndarray:

@@ -3,7 +3,16 @@
 from ast_sim.ops._attention import attention, attention_block, cross_attention, rotated, self_attention
 from ast_sim.ops._body_distance import WIDTH as PROXIMITY_WIDTH
 from ast_sim.ops._body_distance import proximity
-from ast_sim.ops._edges import EdgeSet, breadth_first, join_indices, join_offsets, offsets_of
+from ast_sim.ops._edges import (
+    EdgeSet,
+    breadth_first,
+    counting_sort,
+    join_indices,
+    join_offsets,
+    mesh_edges,
+    offsets_of,
+    outer_faces,
+)
 from ast_sim.ops._elastic_forces import TetrahedronSet, elastic_forces
 from ast_sim.ops._fps import farthest_point_sample
 from ast_sim.ops._linear import linear
@@ -22,17 +31,20 @@ __all__ = [
     "attention",
     "attention_block",
     "breadth_first",
+    "counting_sort",
     "cross_attention",
     "elastic_forces",
     "farthest_point_sample",
     "join_indices",
     "join_offsets",
     "linear",
+    "mesh_edges",
     "message_edges",
     "message_sum",
     "mlp",
     "octree",
     "offsets_of",
+    "outer_faces",
     "proximity",
     "rotated",
     "segment_mean",

@@ -1,7 +1,7 @@
-"""A set of directed edges, which is sorted once and along which messages are passed many times; and an order of nodes
-in which those of each element are near each other, for matrices with a narrow band.
+"""A set of directed edges, which is sorted once and along which messages are passed many times. What a mesh has: its
+edges, the faces that belong to one element only, and an order in which nodes of an element are near each other.
 
-Legend: M edges, S senders, R receivers; N nodes, E elements of K nodes.
+Legend: M edges, S senders, R receivers; N nodes, E elements of K nodes; P edges, Q faces of an element; F outer faces.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ast_sim.element_topology import LOCAL_EDGES, LOCAL_FACES
 from ast_sim.ops.library import IndexSet, Kernel, Op, frozen
 from ast_sim.ops.spec import check_index
 
@@ -34,6 +35,32 @@ def join_indices(parts: Sequence[Tensor], sizes: Sequence[int]) -> Tensor:
 def join_offsets(parts: Sequence[Tensor]) -> Tensor:
     """The offsets of several scenes as one, from 0 to the sum of their last ones."""
     return F.pad(torch.cat([offsets.diff() for offsets in parts]).cumsum(0), (1, 0))
+
+
+def _counting_sort_reference(num: int, index: Tensor) -> tuple[Tensor, Tensor]:
+    return torch.argsort(index, stable=True), offsets_of(index, num)
+
+
+_counting_sort = Op(
+    Kernel("counting_sort", "num size(N), index[M] index(N) -> order[M] int64, offsets[N+1] int64"),
+    _counting_sort_reference,
+)
+
+
+def counting_sort(index: Tensor, num: int) -> tuple[Tensor, Tensor]:
+    """The places of each value of an index.
+
+    Args:
+        index: [M] int64, numbers below `num`.
+
+    Returns:
+        order: [M] int64, the places sorted by value, then ascending.
+        offsets: [num + 1] int64; the places of the value n are order[offsets[n]:offsets[n + 1]].
+
+    Raises:
+        ValueError: a value is out of range; the message names its place.
+    """
+    return _counting_sort(num, index)
 
 
 @dataclass(frozen=True)
@@ -61,9 +88,10 @@ class EdgeSet(IndexSet):
         """
         check_index("EdgeSet", "senders", senders, num_senders)
         check_index("EdgeSet", "receivers", receivers, num_receivers)
-        order = torch.argsort(receivers * max(num_senders, 1) + senders, stable=True)
-        senders, receivers = senders[order], receivers[order]
-        return EdgeSet(senders, receivers, offsets_of(receivers, num_receivers), num_senders)
+        by_sender, _ = counting_sort(senders, num_senders)
+        order, offsets = counting_sort(receivers[by_sender], num_receivers)
+        order = by_sender[order]
+        return EdgeSet(senders[order], receivers[order], offsets, num_senders)
 
     @staticmethod
     def concatenate(sets: list[EdgeSet]) -> EdgeSet:
@@ -87,10 +115,64 @@ class EdgeSet(IndexSet):
     @cached_property
     def by_sender(self) -> tuple[Tensor, ...]:
         """The edges sorted by sender, and the offsets of each sender's edges, as segment ops take them."""
-        return frozen(torch.argsort(self.senders, stable=True), offsets_of(self.senders, self.num_senders))
+        return frozen(*counting_sort(self.senders, self.num_senders))
 
     def __len__(self) -> int:
         return len(self.senders)
+
+
+_ENDS = {2: ((0, 1),), **LOCAL_EDGES}  # two nodes are an edge
+
+
+def _edges_reference(num_nodes: int, elements: Tensor, ends: Tensor) -> list[Tensor]:
+    one, other = (elements[:, ends[:, side]].flatten() for side in (0, 1))
+    apart = one != other
+    one, other = one[apart], other[apart]
+    keys = torch.cat([one * num_nodes + other, other * num_nodes + one]).unique()
+    receivers = keys // max(num_nodes, 1)
+    return [keys - receivers * num_nodes, receivers, offsets_of(receivers, num_nodes)]
+
+
+def _faces_reference(num_nodes: int, elements: Tensor, faces: Tensor) -> list[Tensor]:
+    corners = elements[:, faces].flatten(0, 1).sort(dim=1).values
+    _, same, count = corners.unique(dim=0, return_inverse=True, return_counts=True)
+    return [(count[same] == 1).nonzero()[:, 0]]
+
+
+_mesh_edges = Op(
+    Kernel(
+        "mesh_edges",
+        "num_nodes size(N), elements[E,K] index(N), ends[P,2] index(K)"
+        " -> senders[M] int64, receivers[M] int64, offsets[N+1] int64",
+    ),
+    _edges_reference,
+)
+_outer_faces = Op(
+    Kernel("outer_faces", "num_nodes size(N), elements[E,K] index(N), faces[Q,3] index(K) -> outer[F] int64"),
+    _faces_reference,
+)
+
+
+def mesh_edges(elements: Tensor, num_nodes: int) -> EdgeSet:
+    """The edges of triangles, tetrahedra or pairs of nodes [E, K] int64, in both directions and each once.
+
+    Raises:
+        ValueError: a node is out of range; the message names its place and value.
+    """
+    ends = elements.new_tensor(_ENDS[elements.shape[1]])
+    senders, receivers, offsets = _mesh_edges(num_nodes, elements, ends)
+    return EdgeSet(senders, receivers, offsets, num_nodes)
+
+
+def outer_faces(elements: Tensor, num_nodes: int) -> Tensor:
+    """[F] int64, ascending: the numbers 4 e + face of the faces of tetrahedra [E, 4] or [E, 10] whose corners no other
+    face has.
+
+    Raises:
+        ValueError: a node is out of range; the message names its place and value.
+    """
+    (outer,) = _outer_faces(num_nodes, elements, elements.new_tensor(LOCAL_FACES))
+    return outer
 
 
 WALKS = 3

@@ -13,11 +13,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from ast_sim.ops._edges import join_indices, join_offsets, offsets_of
+from ast_sim.ops._edges import counting_sort, join_indices, join_offsets
 from ast_sim.ops.derivatives import gradient_op
 from ast_sim.ops.library import IndexSet, Kernel, Op
 from ast_sim.ops.spec import check_index
@@ -52,11 +51,7 @@ class TetrahedronSet(IndexSet):
         if elements.dim() != 2 or elements.shape[1] != 4:
             raise ValueError(f"TetrahedronSet: elements must have shape [E, 4], not {tuple(elements.shape)}")
         check_index("TetrahedronSet", "elements", elements, num_nodes)
-        corners = elements.flatten()
-        count = len(corners)
-        keys = np.sort((corners * count + torch.arange(count)).numpy())  # faster than a stable order of the corners
-        order = torch.from_numpy(keys % max(count, 1))
-        return TetrahedronSet(elements, order, offsets_of(corners, num_nodes))
+        return TetrahedronSet(elements, *counting_sort(elements.flatten(), num_nodes))
 
     @staticmethod
     def concatenate(parts: list[TetrahedronSet]) -> TetrahedronSet:

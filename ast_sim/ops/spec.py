@@ -95,7 +95,8 @@ class Parameter:
 
     @property
     def bounds(self) -> tuple[int, int]:
-        low, high = self.names("integer") or self.names("number") or (0, 1 if "flag" in self.words else 0)
+        most = 2**48 if "size" in self.words else int("flag" in self.words)
+        low, high = self.names("integer") or self.names("number") or (0, most)
         return int(low), int(high)
 
     @property
@@ -112,8 +113,9 @@ class Parameter:
         flags = (self.optional or "if" in self.words, self.output, "rows" in self.words, "filled" in self.words)
         other = places[self.words["with"]] if "with" in self.words else -1
         shape, mine = self.shape or (), [word for word in self.words if word in CHECKS]
+        sizes = [Dimension.of(name) for name in self.names("size")] or shape
         numbers = [kind, _TYPES[self.dtype], *map(int, flags), *self.bounds, other, len(shape), len(mine)]
-        rows = [d.numbers() for d in shape] + [[0] * 5] * (4 - len(shape))
+        rows = [d.numbers() for d in sizes] + [[0] * 5] * (4 - len(sizes))
         for word in mine:
             bound, arrays = _inside(self.words[word])
             rows.append([checks.index(word), *bound.numbers(), *([places[name] for name in arrays] + [-1, -1])[:2]])
@@ -246,7 +248,7 @@ def check(name: str, parameters: list[Parameter], given: Given, exact: bool = Fa
 
 def _check_number(name: str, p: Parameter, value: float) -> None:
     low, high = p.bounds
-    if "integer" in p.words and not low <= value <= high:
+    if p.words.keys() & {"integer", "size"} and not low <= value <= high:
         raise ValueError(f"{name}: {p.name} must lie in {low}..{high}, not {value}")
     if p.words.get("number") and not low <= value < high:
         raise ValueError(f"{name}: {p.name} must lie in [{low}, {high}), not {value}")

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import numpy as np
+import torch
 
 from ast_sim.models.data_facts import DataFacts
+from ast_sim.ops import mesh_edges
 from ast_sim.prescribed_motion import Motion
 from ast_sim.scene import Scene
 
@@ -85,13 +88,21 @@ def size_of(scene: Scene) -> float:
 
 
 def spacing_of(scene: Scene) -> float:
-    """The mean length of the mesh edges of the deforming bodies at rest; 0 if there are none."""
-    lengths = edge_lengths(scene)
-    return float(lengths.mean(dtype=np.float64)) if len(lengths) else 0.0
+    """The mean length of the mesh edges of the deforming bodies at rest; 0 if there are none. It is computed once for
+    each scene."""
+    if scene not in _SPACINGS:
+        lengths = edge_lengths(scene)
+        _SPACINGS[scene] = float(lengths.mean(dtype=np.float64)) if len(lengths) else 0.0
+    return _SPACINGS[scene]
+
+
+_SPACINGS: WeakKeyDictionary[Scene, float] = WeakKeyDictionary()
 
 
 def edge_lengths(scene: Scene) -> np.ndarray:
     """The lengths of the mesh edges of the deforming bodies at rest."""
-    one, other = scene.edges().T
-    deforming = scene.deforming_nodes[one] & scene.deforming_nodes[other]
-    return np.linalg.norm(scene.rest_position[one[deforming]] - scene.rest_position[other[deforming]], axis=1)
+    edges = mesh_edges(torch.from_numpy(scene.elements.astype(np.int64)), scene.num_nodes)
+    one, other = edges.receivers.numpy(), edges.senders.numpy()
+    deforming = (one < other) & scene.deforming_nodes[one] & scene.deforming_nodes[other]
+    one, other = one[deforming], other[deforming]
+    return np.linalg.norm(scene.rest_position[one] - scene.rest_position[other], axis=1)

@@ -25,7 +25,18 @@ from benchmarks.kernels.case import Case
 from benchmarks.kernels.peak import peak
 from benchmarks.kernels.targets import judge
 
-FAMILIES = ("octree", "fps", "sparse_conv", "attention", "segment", "elastic_forces", "proximity", "message", "linear")
+FAMILIES = (
+    "octree",
+    "fps",
+    "sparse_conv",
+    "attention",
+    "segment",
+    "elastic_forces",
+    "proximity",
+    "mesh",
+    "message",
+    "linear",
+)
 SHORTEST = 2e-3  # seconds of a sample at least: faster calls are repeated within it
 
 

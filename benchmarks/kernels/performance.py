@@ -24,6 +24,7 @@ FAMILIES = {
     "Sums over segments": ("segment", "column_sum"),
     "Elastic forces": ("elastic_forces",),
     "Distance to other bodies": ("proximity",),
+    "Meshes": ("mesh_edges", "outer_faces", "counting_sort"),
 }
 INTRODUCTION = """# How fast it is
 

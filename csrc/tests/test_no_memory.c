@@ -322,6 +322,33 @@ static outcome breadth_first(const ast_kernels *kernels) {
   return FINISH(status, rank);
 }
 
+static outcome counting_sort(const ast_kernels *kernels) {
+  const ast_elastic s = new_elastic(3000, 1);
+  int64_t *order = new_ints(4 * s.E), *offsets = new_ints(s.N + 1);
+  const ast_status status = KERNEL(kernels->counting_sort(s.elements, 4 * s.E, s.N, order, offsets));
+  return FINISH(status, order, offsets);
+}
+
+static outcome mesh_edges(const ast_kernels *kernels) {
+  const ast_elastic s = new_elastic(3000, 1);
+  int64_t *senders = new_ints(12 * s.E), *receivers = new_ints(12 * s.E), *offsets = new_ints(s.N + 1);
+  const int64_t ends[] = {0, 1, 0, 2, 0, 3, 1, 2, 1, 3, 2, 3};
+  const ast_status status = KERNEL(kernels->mesh_edges(s.elements, s.E, 4, ends, 6, s.N, senders, receivers, offsets));
+  FREE(senders, receivers);
+  return FINISH(status, offsets);
+}
+
+/* All elements share a node: the faces at it are too many to be compared pair by pair. */
+static outcome outer_faces(const ast_kernels *kernels) {
+  const ast_elastic s = new_elastic(300, 1);
+  int64_t *elements = new_ints(4 * s.E), *outer = new_ints(4 * s.E), num = 0;
+  for (int64_t i = 0; i < 4 * s.E; i++) elements[i] = i % 4 ? s.elements[i] : 0;
+  const int64_t faces[] = {0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3};
+  const ast_status status = KERNEL(kernels->outer_faces(elements, s.E, 4, faces, 4, s.N, outer, &num));
+  for (int64_t i = num; i < 4 * s.E; i++) outer[i] = -1;
+  return FINISH(status, outer);
+}
+
 static outcome column_sum(const ast_kernels *kernels) {
   enum { N = 9000, F = 70 };
   float *x = random_floats(N * F), *out = new_floats(F);
@@ -361,6 +388,9 @@ static const struct {
     {"elastic_forces_backward", elastic_forces_backward},
     {"proximity", proximity},
     {"breadth_first", breadth_first},
+    {"counting_sort", counting_sort},
+    {"mesh_edges", mesh_edges},
+    {"outer_faces", outer_faces},
     {"column_sum", column_sum},
 };
 
