@@ -17,6 +17,7 @@ from pathlib import Path
 
 from ast_sim import __version__
 from ast_sim.command_line import commands, help_lines, judging_commands, planning_commands
+from ast_sim.command_line.effort_options import add_effort
 from ast_sim.support.argument_types import (
     Parser,
     add_each,
@@ -237,16 +238,7 @@ def _add_predict(predict: Parser) -> None:
     add_each(predict, moves, action="append", default=[])
     about = "frames that are wanted, such as --frames=-1 for the last one or --frames 5,10,20 (default: all)"
     add_each(predict, {"--frames I,...": about}, type=whole_numbers)
-    efforts = {
-        "--corrections N": "calls that correct the first one, if the run jumps to a frame (default: as its validation"
-        " has decided)",
-        "--newton-steps N": "at most so many Newton steps of the solver after them, until one is small (default:"
-        " likewise; 0 with --corrections)",
-    }
-    add_each(predict, efforts, type=at_least(0))
-    about = "have the solver go on to its own stop test, from the answer of the run; with friction, from rest"
-    predict.add_argument("--exact", action="store_true", help=about)
-    _add_errors(predict)
+    add_effort(predict)
     about = "instead: the most accurate effort that takes at most so many milliseconds on this machine"
     add_each(predict, {"--ms T": about}, type=float)
     about = "number of frames of the motion (default: prescribed nodes move as far in a frame as in training)"
@@ -279,20 +271,6 @@ def _add_predict(predict: Parser) -> None:
     predict.set_defaults(of_mesh=(mesh,), of_data=(data,), of_spec=(spec,))
 
 
-def _add_errors(parser: Parser) -> None:
-    about = (
-        "instead: the cheapest effort that keeps this error of the displacement, such as 2%%, or of another quantity,"
-        " such as reaction=5%% or stress=10%%, in 90 %% of scenes (`calibrate` first); may be repeated"
-    )
-    add_each(
-        parser,
-        {"--error E": about},
-        type=read_by("ast_sim.inference.promises.chosen_effort:parse_error"),
-        action="append",
-        default=[],
-    )
-
-
 def _add_sweep(sweep: Parser) -> None:
     sweep.add_argument("run_folder", type=path, metavar="RUN", help="run folder")
     sweep.add_argument("spec", type=path, metavar="SPEC", help="specification of the assembly (.toml)")
@@ -302,9 +280,7 @@ def _add_sweep(sweep: Parser) -> None:
     add_each(sweep, {"--table FILE": "instead of --set, a CSV file whose first line names parameters"}, type=path)
     about = "what the picture shows (default: reaction)"
     sweep.add_argument("--quantity", choices=("reaction", "largest_stress"), default="reaction", help=about)
-    add_each(sweep, {"--corrections N": "as for predict", "--newton-steps N": "as for predict"}, type=at_least(0))
-    sweep.add_argument("--exact", action="store_true", help="as for predict")
-    _add_errors(sweep)
+    add_effort(sweep, "as for predict")
     add_each(sweep, {"--nodes N": "approximate number of nodes (default: by the sizes)"}, type=at_least(1))
 
 

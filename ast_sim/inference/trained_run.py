@@ -18,7 +18,7 @@ from ast_sim.importers.scene_mesh import SceneMesh
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.answering import doubts, in_domain
 from ast_sim.inference.assembly_questions import ask
-from ast_sim.inference.effort import Effort, EffortErrors
+from ast_sim.inference.effort import Effort, EffortErrors, error_with
 from ast_sim.inference.evaluation.evaluate import evaluate
 from ast_sim.inference.evaluation.evaluated_run import Evaluation
 from ast_sim.inference.new_question import Motions, new_question
@@ -295,10 +295,7 @@ class Run:
     def expected_error(self, effort: Effort) -> float | None:
         """The mean relative error of the displacement that validation scenes had at their deepest frame with this
         effort; with more Newton steps than were measured, the error after the most; None: it was not measured."""
-        known = [one for one in self._errors if one.effort.corrections == effort.corrections and not effort.solved]
-        most = max((one.effort.newton_steps for one in known), default=0)
-        steps = min(effort.newton_steps, most)
-        return next((one.error for one in known if one.effort.newton_steps == steps), None)
+        return error_with(effort, self._errors)
 
     def open(self, data: str | os.PathLike[str] | Dataset | None = None) -> Dataset:
         """Open a dataset, by default the training data, with lengths in the run's unit. The caller closes it. A dataset

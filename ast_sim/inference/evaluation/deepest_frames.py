@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import statistics
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 import torch
@@ -94,29 +94,28 @@ def deepest_predicted(model: Simulator, truth: Trajectory) -> int:
     return max(deepest_frame(truth), model.config.data.given_frames)
 
 
-def errors_by_effort(model: Simulator, truth: Trajectory, most: Effort) -> list[EffortErrors]:
-    """The errors at the deepest frame after each number of corrections and of Newton steps, up to `most`; empty where
+def errors_by_effort(model: Simulator, truth: Trajectory, efforts: Sequence[Effort]) -> list[EffortErrors]:
+    """The errors at the deepest frame after each number of Newton steps up to the one of each effort; empty where
     nothing is displaced."""
     frame = deepest_predicted(model, truth)
     if not rms(truth.position[frame] - truth.position[0], ~truth.scene.prescribed):
         return []
-    efforts = range(most.corrections + 1)
-    return [errors for corrections in efforts for errors in _after(model, truth, frame, corrections, most.newton_steps)]
+    return [errors for effort in efforts for errors in _after(model, truth, frame, effort)]
 
 
-def _after(model: Simulator, truth: Trajectory, frame: int, corrections: int, most: int) -> list[EffortErrors]:
-    """The errors after so many corrections and 0 to `most` Newton steps."""
+def _after(model: Simulator, truth: Trajectory, frame: int, most: Effort) -> list[EffortErrors]:
+    """The errors after 0 Newton steps up to the number of an effort."""
+    efforts = [dataclasses.replace(most, newton_steps=steps) for steps in range(most.newton_steps + 1)]
     question = Question.of(truth, "validation", [frame])
-    (way,) = answer_steps(model, [question], Effort(corrections, most))
-    if isinstance(way, str) and most:  # a Newton step failed; the calls before it still count
-        (way,) = answer_steps(model, [question], Effort(corrections))
+    (way,) = answer_steps(model, [question], most)
+    if isinstance(way, str) and most.newton_steps:  # a Newton step failed; the calls before it still count
+        (way,) = answer_steps(model, [question], efforts[0])
     if isinstance(way, str):
-        return [EffortErrors(Effort(corrections, steps), None, None, 0, 0) for steps in range(most + 1)]
-    positions = way.position[corrections:]
+        return [EffortErrors(effort, None, None, 0, 0) for effort in efforts]
+    positions = way.position[most.corrections :]
     needed = int(way.steps[0]) + bool(way.last_step[0] > STILL)
     measured = []
-    for steps in range(most + 1):
-        effort = Effort(corrections, steps)
+    for steps, effort in enumerate(efforts):
         if steps >= len(positions):
             measured.append(EffortErrors(effort, None, None, 0, 0))
             continue

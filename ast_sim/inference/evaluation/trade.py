@@ -17,7 +17,7 @@ import torch
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.inference.answering import answers
-from ast_sim.inference.effort import Effort, choices
+from ast_sim.inference.effort import Effort, choices, options_of
 from ast_sim.inference.evaluation.deepest_frames import deepest_predicted
 from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.quantities.relative_errors import errors_of, moves
@@ -244,9 +244,7 @@ def timed_answer(
 
 def _command(run: Run, dataset: Dataset, split: str, effort: Effort) -> str:
     """What predicts the first scene with this effort."""
-    counts = ["--corrections", str(effort.corrections), "--newton-steps", str(effort.newton_steps)]
-    asked = ["--exact"] if effort == Effort.exact() else counts
-    what = asked if run.settings.model.scheme.corrects else []
+    what = options_of(effort) if run.settings.model.scheme.corrects else []
     scene = [dataset.path.name, "--split", split, "--index", "0"]
     return shlex.join(["ast-sim", "predict", run.path.name, *scene, "--out", "answer.h5", *what])
 
