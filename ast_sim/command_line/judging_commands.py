@@ -20,7 +20,7 @@ def add_evaluate(evaluate: Parser) -> None:
     evaluate.add_argument("data", type=path, metavar="DATA", help="dataset")
     evaluate.add_argument("--split", choices=SPLITS, default="test", help="split (default: test)")
     about = "scenes in which the solver solves the deepest frame, to compare (default: 3; 0: none)"
-    add_each(evaluate, {"--rivals N": about}, type=at_least(0), default=3)
+    add_each(evaluate, {"--solver-scenes N": about}, type=at_least(0), default=3)
     _add_made_from(evaluate)
     add_out(evaluate, "FILE.json", "also write all figures to this file", required=False)
 
@@ -32,7 +32,7 @@ def evaluate(args: argparse.Namespace) -> None:
         if args.out.suffix != ".json":
             raise ConfigError(f"--out {args.out}: the name of a file of figures must end in .json")
     run = open_run(args.run_folder)
-    evaluation = run.evaluate(args.data, args.split, args.command_line, args.rivals, args.made_from)
+    evaluation = run.evaluate(args.data, args.split, args.command_line, args.solver_scenes, args.made_from)
     print(evaluation)
     if args.out is not None:
         evaluation.save(args.out)

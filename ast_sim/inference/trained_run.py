@@ -322,7 +322,7 @@ class Run:
         data: str | os.PathLike[str] | Dataset | None = None,
         split: str = "test",
         command: str = "Run.evaluate",
-        rival_scenes: int = 0,
+        solver_scenes: int = 0,
         made_from: str | os.PathLike[str] | None = None,
         progress: ShowProgress = True,
     ) -> Evaluation:
@@ -331,13 +331,13 @@ class Run:
         Args:
             data: a dataset, its path or open; by default the one that the run was trained on.
             command: the command that is recorded beside the figures.
-            rival_scenes: in so many scenes the solver solves the deepest frame, in several ways, to compare.
+            solver_scenes: in so many scenes the solver solves the deepest frame, in several ways, to compare.
             made_from: the specification or the parts of your own of which the dataset was made; the solver needs them.
             progress: as in `generate`; it counts scenes, once for all frames, once for the deepest, once solved.
         """
         with self.open(data) as dataset:
-            with Progress(2 * dataset.count(split) + rival_scenes, "scenes", progress) as bar:
-                figures = evaluate(self.model, dataset, split, bar.advance, self.effort, rival_scenes, made_from)
+            with Progress(2 * dataset.count(split) + solver_scenes, "scenes", progress) as bar:
+                figures = evaluate(self.model, dataset, split, bar.advance, self.effort, solver_scenes, made_from)
             origin = {"run": str(self.path), "step": self.step, "data": str(dataset.path), "split": split}
             figures = dataclasses.replace(figures, origin={**provenance(command), **origin})
             return Evaluation(self, dataset.path, figures)
