@@ -17,7 +17,7 @@ from ast_sim.batches.batch_builder import Batch, Target
 from ast_sim.batches.pairs import PairSampler
 from ast_sim.batches.prefetch import Ahead
 from ast_sim.batches.training_corrections import JumpPool
-from ast_sim.batches.training_pool import Pool
+from ast_sim.batches.training_pool import TrainingPool
 from ast_sim.batches.training_rollouts import RolloutPool
 from ast_sim.dataset.reader import Dataset
 from ast_sim.models.node_inputs import with_proximity
@@ -109,7 +109,7 @@ class Training:
     def __exit__(self, *error: object) -> None:
         self.ahead.__exit__(*error)
 
-    def _pool(self, largest: float) -> Pool | None:
+    def _pool(self, largest: float) -> TrainingPool | None:
         """The pool of scenes that go on from the model's own answers; None: each batch is drawn anew."""
         options = self.options
         if self.config.model.scheme.jumps:
