@@ -9,7 +9,7 @@ from ast_sim.inference.effort import DIALS, Effort, option
 from ast_sim.support.argument_types import Parser, add_each, at_least, read_by
 from ast_sim.support.errors import ConfigError
 
-EXACT = "have the solver go on to its own stop test, from the answer of the run; with friction, from rest"
+EXACT = "let the solver continue from the answer of the run (with friction: from rest) until its stop test holds"
 
 
 def add_effort(parser: Parser, about: str | None = None) -> None:

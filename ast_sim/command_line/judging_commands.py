@@ -60,8 +60,8 @@ def add_trade(trade: Parser) -> None:
     trade.add_argument("data", type=path, metavar="DATA", help="dataset with scenes new to RUN (.h5)")
     add_out(trade, "FILE.html", "page to write; all figures lie beside it (.json)")
     trade.add_argument("--split", choices=SPLITS, default="test", help="split (default: test)")
-    add_each(trade, {"--scenes N": "at most so many scenes (default: 20)"}, type=at_least(1), default=20)
-    about = "what another program takes for such a scene: our solver is not run"
+    add_each(trade, {"--scenes N": "scenes, at most (default: 20)"}, type=at_least(1), default=20)
+    about = "seconds that another program takes for such a scene; our solver is not run then"
     add_each(trade, {"--solver-seconds S": about}, type=float)
     _add_made_from(trade)
 

@@ -49,11 +49,11 @@ class Effort:
     """
 
     corrections: int = _dial(
-        "calls that correct the first one, if the run jumps to a frame (default: as its validation has decided)"
+        "calls that correct the first one, in a run that predicts a frame directly (default: as its validation decided)"
     )
     newton_steps: int = _dial(
-        "at most so many Newton steps of the solver after them, until one is small (default: likewise; 0 with"
-        " --corrections)"
+        "Newton steps of the solver after these calls, at most; they end when one is small (default: as validation"
+        " decided; 0 with --corrections)"
     )
     solved: bool = False
 

@@ -119,7 +119,7 @@ def sweep(
         )
     if unpromised:
         warnings.warn(
-            f"no error is promised in {unpromised} of {len(rows)} rows: their mesh or their ranges are not those of the"
+            f"no error is promised in {unpromised} of {len(rows)} rows: their mesh or their ranges differ from the"
             " calibration scenes",
             stacklevel=3,
         )
