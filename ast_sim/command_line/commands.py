@@ -162,7 +162,7 @@ def info(args: argparse.Namespace) -> None:
 def train(args: argparse.Namespace) -> None:
     """Train a model on a dataset."""
     from ast_sim import keep_memory
-    from ast_sim.training.asked_settings import configure
+    from ast_sim.training.configure import configure
     from ast_sim.training.start import start_training
 
     keep_memory()

@@ -21,7 +21,7 @@ from ast_sim.inference.assembly_questions import ask
 from ast_sim.inference.effort import Effort, EffortErrors, error_with
 from ast_sim.inference.evaluation.evaluate import evaluate
 from ast_sim.inference.evaluation.evaluated_run import Evaluation
-from ast_sim.inference.new_question import Motions, new_question
+from ast_sim.inference.predict_arguments import Motions, new_question
 from ast_sim.inference.predicting.question import Frames, Question
 from ast_sim.inference.promises.calibration import Calibration
 from ast_sim.inference.promises.chosen_effort import AskedError, chosen_effort
