@@ -21,14 +21,14 @@ def plate(tmp_path_factory):
         return run, data["test"][0]
 
 
-def test_the_network_alone_predicts_it_and_newton_steps_correct_it(plate):
+def test_the_network_alone_predicts_it_and_an_exact_answer_has_the_right_one(plate):
     run, truth = plate
     moved = truth.scene.body == 1
     alone = run.predict(truth, effort=ast_sim.Effort())
     predicted = alone.fields[REACTION].values.astype(float)[:, moved].sum(axis=1)
     np.testing.assert_allclose(alone.reaction(), predicted, atol=1e-9)
     assert alone.errors(truth)["reaction"] > 0.1  # two steps teach little
-    finished = run.predict(truth, effort=ast_sim.Effort(newton_steps=10))
+    finished = run.predict(truth, effort=ast_sim.Effort.exact())
     assert finished.errors(truth)["reaction"] < 0.01
     by_law = replace(finished, fields={}).reaction()
     assert np.array_equal(finished.reaction(), by_law) and not np.allclose(by_law, predicted, rtol=0.1)
