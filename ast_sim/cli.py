@@ -17,6 +17,7 @@ from pathlib import Path
 
 from ast_sim import __version__
 from ast_sim.command_line import commands, help_lines, judging_commands, planning_commands
+from ast_sim.command_line.effort_options import add_effort
 from ast_sim.support.argument_types import (
     Parser,
     add_each,
@@ -29,7 +30,7 @@ from ast_sim.support.argument_types import (
 from ast_sim.support.errors import AstSimError, LooksWrong, printable
 from ast_sim.support.stop_signals import Interrupted
 
-CORNERS = "take only the corners of second-order tetrahedra: forces are then those of another, stiffer mesh"
+CORNERS = "take only the corners of second-order tetrahedra: the mesh is then stiffer, and its forces are wrong"
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -133,7 +134,7 @@ def _add_generate(generate: Parser) -> None:
     add_each(generate, sizes, type=at_least(1))
     about = "solve and store only frame 0 and these, such as 1,5,20, each straight from the one before (default: all)"
     generate.add_argument("--keep", type=whole_numbers, metavar="K,K,...", help=about)
-    about = "order of the elements: 1 for tetrahedra of four nodes, 2 for those of ten, whose forces hold (default: 1)"
+    about = "order of the tetrahedra: 1 (four nodes), or 2 (ten nodes, with accurate forces) (default: 1)"
     generate.add_argument("--order", type=int, choices=(1, 2), help=about)
     generate.add_argument("--seed", type=at_least(0), default=0, help="seed of the scenes (default: 0)")
     about = "the bundled solver (own) or CalculiX (default: own; CalculiX if a part is elastoplastic)"
@@ -178,7 +179,7 @@ def _add_convert(convert: Parser) -> None:
     kind = convert.add_argument_group("properties of a dataset made from such files")
     about = "shares of the simulations, drawn at random (default: 0.8 0.1 0.1 of three or more)"
     kind.add_argument("--shares", nargs=3, type=float, metavar=("TRAIN", "VALID", "TEST"), help=about)
-    about = "so many simulations are drawn first, for the split calibration; the shares divide the others (default: 0)"
+    about = "simulations that are drawn first, for the split calibration; the shares divide the others (default: 0)"
     add_each(kind, {"--calibration N": about}, type=at_least(0), default=0)
     kind.add_argument("--seed", type=at_least(0), default=0, help="seed of this draw (default: 0)")
     kind.add_argument("--corners", action="store_true", help=CORNERS)
@@ -219,8 +220,12 @@ def _add_train(train: Parser) -> None:
     add_each(train, files, type=path)
     states = {"--state NAME": "field of the dataset to predict, such as PEEQ, or reaction; may be repeated"}
     add_each(train, {**states, "--set k=v": "change a setting; may be repeated"}, action="append", default=[])
-    add_each(train, {"--minutes M": "train so long: 50 steps are timed, then the number of steps is fixed"}, type=float)
-    add_each(train, {"--processes N": "so many processes train together (default: train.processes)"}, type=at_least(1))
+    add_each(
+        train,
+        {"--minutes M": "minutes of the training: 50 steps are timed, then the number of steps is set"},
+        type=float,
+    )
+    add_each(train, {"--processes N": "processes that train together (default: train.processes)"}, type=at_least(1))
     train.add_argument("--resume", action="store_true", help="go on after the last checkpoint, if there is one")
     add_each(train, {"--profile N": "only measure N steps and print how their time divides"}, type=at_least(1))
 
@@ -237,17 +242,8 @@ def _add_predict(predict: Parser) -> None:
     add_each(predict, moves, action="append", default=[])
     about = "frames that are wanted, such as --frames=-1 for the last one or --frames 5,10,20 (default: all)"
     add_each(predict, {"--frames I,...": about}, type=whole_numbers)
-    efforts = {
-        "--corrections N": "calls that correct the first one, if the run jumps to a frame (default: as its validation"
-        " has decided)",
-        "--newton-steps N": "at most so many Newton steps of the solver after them, until one is small (default:"
-        " likewise; 0 with --corrections)",
-    }
-    add_each(predict, efforts, type=at_least(0))
-    about = "have the solver go on to its own stop test, from the answer of the run; with friction, from rest"
-    predict.add_argument("--exact", action="store_true", help=about)
-    _add_errors(predict)
-    about = "instead: the most accurate effort that takes at most so many milliseconds on this machine"
+    add_effort(predict)
+    about = "instead: the most accurate effort that takes at most T milliseconds on this machine"
     add_each(predict, {"--ms T": about}, type=float)
     about = "number of frames of the motion (default: prescribed nodes move as far in a frame as in training)"
     add_each(predict, {"--num-frames N": about}, type=at_least(2))
@@ -279,20 +275,6 @@ def _add_predict(predict: Parser) -> None:
     predict.set_defaults(of_mesh=(mesh,), of_data=(data,), of_spec=(spec,))
 
 
-def _add_errors(parser: Parser) -> None:
-    about = (
-        "instead: the cheapest effort that keeps this error of the displacement, such as 2%%, or of another quantity,"
-        " such as reaction=5%% or stress=10%%, in 90 %% of scenes (`calibrate` first); may be repeated"
-    )
-    add_each(
-        parser,
-        {"--error E": about},
-        type=read_by("ast_sim.inference.promises.chosen_effort:parse_error"),
-        action="append",
-        default=[],
-    )
-
-
 def _add_sweep(sweep: Parser) -> None:
     sweep.add_argument("run_folder", type=path, metavar="RUN", help="run folder")
     sweep.add_argument("spec", type=path, metavar="SPEC", help="specification of the assembly (.toml)")
@@ -302,9 +284,7 @@ def _add_sweep(sweep: Parser) -> None:
     add_each(sweep, {"--table FILE": "instead of --set, a CSV file whose first line names parameters"}, type=path)
     about = "what the picture shows (default: reaction)"
     sweep.add_argument("--quantity", choices=("reaction", "largest_stress"), default="reaction", help=about)
-    add_each(sweep, {"--corrections N": "as for predict", "--newton-steps N": "as for predict"}, type=at_least(0))
-    sweep.add_argument("--exact", action="store_true", help="as for predict")
-    _add_errors(sweep)
+    add_effort(sweep, "as for predict")
     add_each(sweep, {"--nodes N": "approximate number of nodes (default: by the sizes)"}, type=at_least(1))
 
 

@@ -72,8 +72,8 @@ class SceneFigures:
 
 
 @dataclass(frozen=True)
-class WayFigures:
-    """What one way of the solver took for a frame, in seconds on one thread; with `failure` there is nothing else."""
+class VariantFigures:
+    """What a variant of the solver took for a frame, in seconds on one thread; with `failure` there is nothing else."""
 
     seconds: float | None = None
     setup_seconds: float | None = None
@@ -89,15 +89,15 @@ class SolverFigures:
 
     Attributes:
         seconds: at its own stop test; None: it did not converge.
-        cheapest: the name of its fastest way that is at least as accurate as the model; None: there is none.
-        cheapest_seconds: of that way.
-        ways: all ways by name.
+        cheapest: the name of its fastest variant that is at least as accurate as the model; None: there is none.
+        cheapest_seconds: of that variant.
+        ways: all variants by name.
     """
 
     seconds: float | None
     cheapest: str | None
     cheapest_seconds: float | None
-    ways: Mapping[str, WayFigures]
+    ways: Mapping[str, VariantFigures]
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,7 @@ class DeepestFrames:
         seconds: the median of the answers' seconds.
         unsettled: how many scenes had Newton steps that did not end.
         solver: beside the solver at its own stop test; None: it was not run.
-        cheapest: beside its fastest way that is at least as accurate; None: likewise.
+        cheapest: beside its fastest variant that is at least as accurate; None: likewise.
         no_solver: why the solver was not run; None: it was, or nobody asked.
     """
 

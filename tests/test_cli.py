@@ -18,7 +18,7 @@ from ast_sim.cli import main
 from ast_sim.dataset.reader import Dataset
 from ast_sim.support.errors import AstSimError
 from ast_sim.support.toml_settings import settings
-from ast_sim.training.asked_settings import configure
+from ast_sim.training.configure import configure
 
 SMALL = [
     "train.steps=6", "train.batch_size=2", "train.log_every=2", "train.statistics_pairs=4", "model.hidden=16",

@@ -76,7 +76,7 @@ USUAL = {  # what a user may well give, by the name that the parser has for it
     "run_folder": ["run"], "from": ["run"], "data": ["toy.h5", "toy.h5", "dynamic.h5"], "path": ["toy.h5", "run"],
     "scene": ["toy.h5", "cases/a/frame_00000.vtu"], "source": ["cases", "cases/a.pvd", "mesh.vtkhdf"],
     "shown": ["run", "toy.h5"], "config": ["my.toml", "run/config.toml"], "count": ["1", "3"],
-    "index": ["0", "1"], "rivals": ["0"], "nodes": ["80", "400"], "frames": ["5", "9", "-1", "1,2,3", "0"],
+    "index": ["0", "1"], "solver_scenes": ["0"], "nodes": ["80", "400"], "frames": ["5", "9", "-1", "1,2,3", "0"],
     "shares": ["1", "0", "0.5"], "obstacle": ["0", "1"], "corrections": ["0", "2"], "num_frames": ["2", "4"],
     "move": ["1=0,0,-0.01", "1=0,0,-0.01 then 0.02,0,-0.01", "1=rotate 30 about 0,0,1 at 0,0,0", "0=0,0,0", "9=1,1,1",
              "1=nan,0,0", "1=1e300,0,0", "1=", "=", "1=rotate 30 about 0,0,0"],

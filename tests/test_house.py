@@ -15,8 +15,8 @@ import pytest
 
 from ast_sim.importers.formats.vtk_files import READING_MODULE
 from ast_sim.simulate.families.known_families import FAMILIES, MODULES
+from ast_sim.simulate.jobs.fastest_solver import SOLVER_MODULE
 from ast_sim.simulate.jobs.pool import WORKER_MODULE
-from ast_sim.simulate.jobs.rival import RIVAL_MODULE
 from ast_sim.simulate.shapes.cad.gmsh_process import MESHING_MODULE
 
 ROOT = Path(__file__).parent.parent / "ast_sim"
@@ -80,7 +80,7 @@ def test_a_name_means_one_thing():
     assert not [name for name, count in names.items() if count > 1]
 
 
-@pytest.mark.parametrize("module", [WORKER_MODULE, RIVAL_MODULE, MESHING_MODULE, READING_MODULE, *MODULES.values()])
+@pytest.mark.parametrize("module", [WORKER_MODULE, SOLVER_MODULE, MESHING_MODULE, READING_MODULE, *MODULES.values()])
 def test_modules_named_by_strings_are_there(module):
     """The check of imports does not see them."""
     assert find_spec(module) is not None

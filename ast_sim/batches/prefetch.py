@@ -7,7 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 from ast_sim.batches.batch_builder import Batch, Target
 from ast_sim.batches.pairs import PairSampler
-from ast_sim.batches.training_pool import Pool
+from ast_sim.batches.training_pool import TrainingPool
 
 
 class Ahead:
@@ -20,7 +20,9 @@ class Ahead:
         prepare: what the thread does to each batch: what a model needs of it that does not depend on its parameters.
     """
 
-    def __init__(self, sampler: PairSampler | Pool, prepare: Callable[[Batch], Batch] = lambda batch: batch) -> None:
+    def __init__(
+        self, sampler: PairSampler | TrainingPool, prepare: Callable[[Batch], Batch] = lambda batch: batch
+    ) -> None:
         self._sampler, self._prepare = sampler, prepare
         self._thread = ThreadPoolExecutor(1, "sampler")
         self._next: dict[int, Future[tuple[Batch, Target]]] = {}

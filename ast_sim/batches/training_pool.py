@@ -12,7 +12,7 @@ from ast_sim.batches.batch_builder import Batch, Target
 from ast_sim.batches.pairs import Jump, Pair, PairSampler
 
 
-class Pool:
+class TrainingPool:
     """Training scenes that go on from the model's own answers. The pool has `size` places, and batches take them in
     turn.
 

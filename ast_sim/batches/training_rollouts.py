@@ -19,7 +19,7 @@ import numpy as np
 
 from ast_sim.batches.mirror_and_shift import Placement
 from ast_sim.batches.pairs import Pair
-from ast_sim.batches.training_pool import Pool
+from ast_sim.batches.training_pool import TrainingPool
 
 SHARE = np.float32(1 / 3)  # share of the white noise that is added in each step of a rollout
 _NOISE = 12  # the noise draws from a sequence of random numbers of its own
@@ -42,8 +42,8 @@ class _Rolling:
     pair: Pair | None = None
 
 
-class RolloutPool(Pool):
-    """Training scenes that are rolled out side by side; see `Pool` for the arguments.
+class RolloutPool(TrainingPool):
+    """Training scenes that are rolled out side by side; see `TrainingPool` for the arguments.
 
     A scene starts at its first frame, and another scene follows it after its last frame. Only the first scene at each
     place starts at a random frame, so that all frames occur equally often from the beginning. A scene whose error is

@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from ast_sim.command_line.effort_options import effort_of
 from ast_sim.runs import CONFIG, SCOPE
 from ast_sim.support.disk import output_file
 from ast_sim.support.errors import ConfigError, DatasetError, RolloutError, printable
@@ -161,7 +162,7 @@ def info(args: argparse.Namespace) -> None:
 def train(args: argparse.Namespace) -> None:
     """Train a model on a dataset."""
     from ast_sim import keep_memory
-    from ast_sim.training.asked_settings import configure
+    from ast_sim.training.configure import configure
     from ast_sim.training.start import start_training
 
     keep_memory()
@@ -191,7 +192,7 @@ def predict(args: argparse.Namespace) -> None:
         check_output(args, args.forces, [args.scene, args.out], "a table of forces", ".csv")
     moves = dict(map(parse_move, args.move))
     run = open_run(args.run_folder)
-    effort = run.effort.asked(args.corrections, args.newton_steps, args.exact)
+    effort = effort_of(args, run.effort)
     wanted = {"frames": args.frames, "effort": effort, "error": dict(args.error) or None, "ms": args.ms, "throw": False}
     if args.scene.suffix == ".toml":
         _predict_spec(run, args, wanted)
@@ -247,7 +248,7 @@ def sweep(args: argparse.Namespace) -> None:
         values,
         table=args.table,
         nodes=args.nodes,
-        effort=run.effort.asked(args.corrections, args.newton_steps, args.exact),
+        effort=effort_of(args, run.effort),
         error=dict(args.error) or None,
     )
     swept.save(args.out)

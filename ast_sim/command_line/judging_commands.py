@@ -20,7 +20,7 @@ def add_evaluate(evaluate: Parser) -> None:
     evaluate.add_argument("data", type=path, metavar="DATA", help="dataset")
     evaluate.add_argument("--split", choices=SPLITS, default="test", help="split (default: test)")
     about = "scenes in which the solver solves the deepest frame, to compare (default: 3; 0: none)"
-    add_each(evaluate, {"--rivals N": about}, type=at_least(0), default=3)
+    add_each(evaluate, {"--solver-scenes N": about}, type=at_least(0), default=3)
     _add_made_from(evaluate)
     add_out(evaluate, "FILE.json", "also write all figures to this file", required=False)
 
@@ -32,7 +32,7 @@ def evaluate(args: argparse.Namespace) -> None:
         if args.out.suffix != ".json":
             raise ConfigError(f"--out {args.out}: the name of a file of figures must end in .json")
     run = open_run(args.run_folder)
-    evaluation = run.evaluate(args.data, args.split, args.command_line, args.rivals, args.made_from)
+    evaluation = run.evaluate(args.data, args.split, args.command_line, args.solver_scenes, args.made_from)
     print(evaluation)
     if args.out is not None:
         evaluation.save(args.out)
@@ -60,8 +60,8 @@ def add_trade(trade: Parser) -> None:
     trade.add_argument("data", type=path, metavar="DATA", help="dataset with scenes new to RUN (.h5)")
     add_out(trade, "FILE.html", "page to write; all figures lie beside it (.json)")
     trade.add_argument("--split", choices=SPLITS, default="test", help="split (default: test)")
-    add_each(trade, {"--scenes N": "at most so many scenes (default: 20)"}, type=at_least(1), default=20)
-    about = "what another program takes for such a scene: our solver is not run"
+    add_each(trade, {"--scenes N": "scenes, at most (default: 20)"}, type=at_least(1), default=20)
+    about = "seconds that another program takes for such a scene; our solver is not run then"
     add_each(trade, {"--solver-seconds S": about}, type=float)
     _add_made_from(trade)
 

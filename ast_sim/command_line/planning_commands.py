@@ -30,7 +30,7 @@ def plan(args: argparse.Namespace) -> None:
     from ast_sim import keep_memory
     from ast_sim.planning.plan import planned
     from ast_sim.planning.worth import worth
-    from ast_sim.training.asked_settings import configure
+    from ast_sim.training.configure import configure
 
     keep_memory()
     if args.data.suffix == ".toml":

@@ -137,7 +137,7 @@ class GuardedFile:
         if computed != (stored.decode() if isinstance(stored, bytes) else stored):
             raise DatasetError(
                 f"{self.path}: {name.strip('/')} is not what was written: it was edited or is damaged (its SHA-256"
-                " differs); write the dataset anew with DatasetWriter"
+                " differs); write the dataset again with DatasetWriter"
             )
         self._verified.add(name)
 

@@ -206,7 +206,7 @@ def _assign(
         lists = _draw(source, names, shares, calibration, seed)
     else:
         if calibration:
-            raise DatasetError("where splits lists names, it lists those of calibration, too: leave calibration out")
+            raise DatasetError("splits lists names, so it lists the ones of calibration, too: leave calibration out")
         lists = {split: [] if isinstance(members, int | float) else list(members) for split, members in given.items()}
         _require_known(source, names, lists)
     return [(split, name) for split in SPLITS for name in lists[split]]

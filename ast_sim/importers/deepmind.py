@@ -159,7 +159,7 @@ class _Record:
         frames = self.frames(name)
         for frame in range(1, len(frames)):
             if not np.array_equal(frames[frame], frames[0], equal_nan=True):
-                self._fail_changing(f"{name} in frame {frame} is not that of frame 0")
+                self._fail_changing(f"{name} in frame {frame} differs from frame 0")
         return frames[0]
 
     def _fail_changing(self, what: str) -> None:

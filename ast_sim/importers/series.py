@@ -188,7 +188,9 @@ def _read_frames(
             place, order, notes = _stress_place(frame, names)
         cells = order_of_cells(frame, first)
         if cells is not None and len(notes) < 2:
-            notes.append(f"the elements of {frame.path.name} stand in another order: they are put in that of the first")
+            notes.append(
+                f"the elements of {frame.path.name} stand in another order: they are reordered as in the first"
+            )
         stitching.look(frame, used_fields)
         kept.times.append(frame.time)
         kept.points.append(frame.points)
@@ -248,7 +250,7 @@ def _stress_place(frame: SourceMesh, names: FieldNames) -> tuple[str, tuple[str,
         return place, (), []
     columns = raw_field(frame, "point" if place == "node" else "cell", name).shape[1]
     order = order_of(frame.path, name, columns, frame.columns.get(name, ()), names.stress_order)
-    note = f"the von Mises stress is that of the components {', '.join(order)} of {name!r}"
+    note = f"the von Mises stress is computed from the components {', '.join(order)} of {name!r}"
     return place, order, [note] if order else []
 
 

@@ -1,21 +1,22 @@
-"""How much is computed for an answer: one dial from the fastest answer to an exact one."""
+"""How much is computed for an answer: one dial from the fastest answer to an exact one.
+
+The command line takes its options from here, so this module needs neither torch nor numpy. What a new dial needs:
+docs/how-to/new-dial-or-band.md.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, replace
+from numbers import Integral
 from statistics import fmean
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
-import numpy as np
-
-from ast_sim.material import FRICTION
-from ast_sim.mechanics.linearised_contact import NewtonSteps
-from ast_sim.mechanics.physics_check import Law
-from ast_sim.models.model_config import ModelConfig
-from ast_sim.scene import Scene
 from ast_sim.support.errors import ConfigError
+
+if TYPE_CHECKING:
+    from ast_sim.models.model_config import ModelConfig
 
 GOOD = 0.02  # a relative error that most users call exact
 GOOD_STRESS = 0.1  # the same of the stress, relative to the error of its mean
@@ -24,6 +25,11 @@ AGAIN = 2  # a frame in which so many Newton steps did not end is begun anew wit
 STEPS_BEFORE_SOLVER = 1  # more hardly bring it nearer to equilibrium (docs/log.md, 2026-11-27)
 CHOSEN_STEPS = (0, 1, 2, MOST_NEWTON_STEPS)  # among these numbers of Newton steps an effort is chosen
 WORTH = 0.05  # a correction or a Newton step must lower an error that is not good by this share
+
+
+def _dial(text: str) -> Any:
+    """A number of an effort, 0 by default; `text` is the help of its option on the command line."""
+    return field(default=0, metadata={"help": text})
 
 
 @dataclass(frozen=True)
@@ -42,8 +48,13 @@ class Effort:
         ConfigError: a number is not whole or negative.
     """
 
-    corrections: int = 0
-    newton_steps: int = 0
+    corrections: int = _dial(
+        "calls that correct the first one, in a run that predicts a frame directly (default: as its validation decided)"
+    )
+    newton_steps: int = _dial(
+        "Newton steps of the solver after these calls, at most; they end when one is small (default: as validation"
+        " decided; 0 with --corrections)"
+    )
     solved: bool = False
 
     @classmethod
@@ -54,14 +65,14 @@ class Effort:
 
     def __post_init__(self) -> None:
         for key, count in self._counts.items():
-            if not isinstance(count, int | np.integer) or isinstance(count, bool):
+            if not isinstance(count, Integral) or isinstance(count, bool):
                 raise ConfigError(f"{key} is {count!r}; it must be a whole number")
             if count < 0:
                 raise ConfigError(f"{key} is {count}; it must be at least 0")
 
     @property
     def _counts(self) -> dict[str, int]:
-        return {"corrections": self.corrections, "newton_steps": self.newton_steps}
+        return {name: getattr(self, name) for name in DIALS}
 
     @property
     def text(self) -> str:
@@ -69,20 +80,6 @@ class Effort:
         parts = [(self.corrections, "correction"), (self.newton_steps, "Newton step")]
         told = [f"{n} {what}{'' if n == 1 else 's'}" for n, what in parts if n or what == "correction"]
         return ", up to ".join(told) + (", then the solver" if self.solved else "")
-
-    def asked(self, corrections: int | None, newton_steps: int | None, exact: bool) -> Effort | None:
-        """What is asked instead of this default: corrections alone mean no Newton step; None: nothing is asked.
-
-        Raises:
-            ConfigError: numbers are given for an exact answer.
-        """
-        if exact:
-            if corrections is not None or newton_steps is not None:
-                raise ConfigError("an exact answer needs no numbers: leave --corrections and --newton-steps out")
-            return Effort.exact()
-        if corrections is None and newton_steps is None:
-            return None
-        return Effort(self.corrections if corrections is None else corrections, newton_steps or 0)
 
     def check(self, config: ModelConfig) -> None:
         """Raise ConfigError if the model cannot make this effort."""
@@ -103,7 +100,20 @@ class Effort:
                 raise ConfigError(f"newton_steps is {self.newton_steps}, but {error}") from error
 
 
+DIALS = {one.name: one.metadata["help"] for one in fields(Effort) if one.metadata}  # its numbers, and their help
 FIRST_CALL = Effort()
+
+
+def option(dial: str) -> str:
+    """The option of a dial on the command line, such as --newton-steps."""
+    return f"--{dial.replace('_', '-')}"
+
+
+def options_of(effort: Effort) -> list[str]:
+    """The options that ask for an effort on the command line."""
+    if effort == Effort.exact():
+        return ["--exact"]
+    return [text for dial in DIALS for text in (option(dial), str(getattr(effort, dial)))]
 
 
 @dataclass(frozen=True)
@@ -146,6 +156,19 @@ def mean_errors(of_scenes: Sequence[Sequence[EffortErrors]]) -> list[EffortError
     return means
 
 
+def error_with(effort: Effort, measured: Sequence[EffortErrors]) -> float | None:
+    """The error that was measured with this effort; with more Newton steps than were measured, the error after the
+    most; None: it was not measured."""
+    steps = {one.effort.newton_steps: one for one in measured if _but_newton_steps(one.effort, effort)}
+    nearest = steps.get(min(effort.newton_steps, max(steps, default=0)))
+    return None if nearest is None else nearest.error
+
+
+def _but_newton_steps(one: Effort, other: Effort) -> bool:
+    """Whether two efforts differ in nothing, or in their Newton steps alone."""
+    return replace(one, newton_steps=other.newton_steps) == other
+
+
 def _mean(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return fmean(known) if len(known) == len(values) else None
@@ -169,23 +192,14 @@ def choices(config: ModelConfig, corrections: int) -> tuple[Effort, ...]:
         return ()
     steps = CHOSEN_STEPS if can_make_newton_steps(config) else (0,)
     efforts = tuple(Effort(made, count) for count in steps for made in range(corrections + 1))
-    frictionless = not config.data.friction and FRICTION not in config.data.columns
-    return (*efforts, Effort.exact()) if frictionless and can_be_solved(config) else efforts
+    return (*efforts, Effort.exact()) if can_be_solved(config) and not config.data.rubs else efforts
 
 
-def law_of(config: ModelConfig) -> Law:
-    """The law of the training scenes."""
-    return Law(config.data.material, config.data.contact_range)
-
-
-def newton_steps(config: ModelConfig, scene: Scene) -> NewtonSteps:
-    """The Newton steps of a scene, in the material and with the contact of the training scenes.
-
-    Raises:
-        ConfigError: the law of the material is not known.
-        SimulationError: the constants of the material are not allowed, or an element has no volume.
-    """
-    return law_of(config).newton_steps(scene)
+def to_measure(config: ModelConfig, corrections: int) -> tuple[Effort, ...]:
+    """The efforts whose errors validation measures, each with up to so many Newton steps, for a model that was trained
+    for so many corrections."""
+    steps = MOST_NEWTON_STEPS if can_make_newton_steps(config) else 0
+    return tuple(Effort(made, steps) for made in range(corrections + 1))
 
 
 def cheapest_good(measured: Sequence[EffortErrors]) -> Effort:

@@ -13,7 +13,6 @@ from ast_sim.inference.answer import Answer
 from ast_sim.inference.assembly_questions import ask
 from ast_sim.inference.effort import Effort
 from ast_sim.inference.promises.chosen_effort import AskedError
-from ast_sim.material import FRICTION
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.runs.scope import Scope
@@ -94,7 +93,7 @@ def sweep(
     """
     if not rows:
         raise ConfigError("a sweep needs at least one row of values")
-    needs_way = bool((config.data.friction or FRICTION in config.data.columns) and effort.newton_steps)
+    needs_way = config.data.rubs and effort.newton_steps > 0
     frames = None if needs_way or config.scheme.follows_motion else 2
     asked_for = {"effort": effort} if error is None else {"error": error}
     table, seconds, notes, unpromised = [], 0.0, [], 0
@@ -120,7 +119,7 @@ def sweep(
         )
     if unpromised:
         warnings.warn(
-            f"no error is promised in {unpromised} of {len(rows)} rows: their mesh or their ranges are not those of the"
+            f"no error is promised in {unpromised} of {len(rows)} rows: their mesh or their ranges differ from the"
             " calibration scenes",
             stacklevel=3,
         )

@@ -18,10 +18,10 @@ from ast_sim.importers.scene_mesh import SceneMesh
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.answering import doubts, in_domain
 from ast_sim.inference.assembly_questions import ask
-from ast_sim.inference.effort import Effort, EffortErrors
+from ast_sim.inference.effort import Effort, EffortErrors, error_with
 from ast_sim.inference.evaluation.evaluate import evaluate
 from ast_sim.inference.evaluation.evaluated_run import Evaluation
-from ast_sim.inference.new_question import Motions, new_question
+from ast_sim.inference.predict_arguments import Motions, new_question
 from ast_sim.inference.predicting.question import Frames, Question
 from ast_sim.inference.promises.calibration import Calibration
 from ast_sim.inference.promises.chosen_effort import AskedError, chosen_effort
@@ -295,10 +295,7 @@ class Run:
     def expected_error(self, effort: Effort) -> float | None:
         """The mean relative error of the displacement that validation scenes had at their deepest frame with this
         effort; with more Newton steps than were measured, the error after the most; None: it was not measured."""
-        known = [one for one in self._errors if one.effort.corrections == effort.corrections and not effort.solved]
-        most = max((one.effort.newton_steps for one in known), default=0)
-        steps = min(effort.newton_steps, most)
-        return next((one.error for one in known if one.effort.newton_steps == steps), None)
+        return error_with(effort, self._errors)
 
     def open(self, data: str | os.PathLike[str] | Dataset | None = None) -> Dataset:
         """Open a dataset, by default the training data, with lengths in the run's unit. The caller closes it. A dataset
@@ -325,7 +322,7 @@ class Run:
         data: str | os.PathLike[str] | Dataset | None = None,
         split: str = "test",
         command: str = "Run.evaluate",
-        rival_scenes: int = 0,
+        solver_scenes: int = 0,
         made_from: str | os.PathLike[str] | None = None,
         progress: ShowProgress = True,
     ) -> Evaluation:
@@ -334,13 +331,13 @@ class Run:
         Args:
             data: a dataset, its path or open; by default the one that the run was trained on.
             command: the command that is recorded beside the figures.
-            rival_scenes: in so many scenes the solver solves the deepest frame, in several ways, to compare.
+            solver_scenes: in so many scenes the solver solves the deepest frame, in several ways, to compare.
             made_from: the specification or the parts of your own of which the dataset was made; the solver needs them.
             progress: as in `generate`; it counts scenes, once for all frames, once for the deepest, once solved.
         """
         with self.open(data) as dataset:
-            with Progress(2 * dataset.count(split) + rival_scenes, "scenes", progress) as bar:
-                figures = evaluate(self.model, dataset, split, bar.advance, self.effort, rival_scenes, made_from)
+            with Progress(2 * dataset.count(split) + solver_scenes, "scenes", progress) as bar:
+                figures = evaluate(self.model, dataset, split, bar.advance, self.effort, solver_scenes, made_from)
             origin = {"run": str(self.path), "step": self.step, "data": str(dataset.path), "split": split}
             figures = dataclasses.replace(figures, origin={**provenance(command), **origin})
             return Evaluation(self, dataset.path, figures)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ast_sim.mechanics.contact_and_friction import ContactSettings
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
-from ast_sim.motion_course import Course, Leg
+from ast_sim.motion_between_frames import Course, Leg
 from ast_sim.scene import AttributeValue, Scene
 from ast_sim.support.errors import SimulationError
 

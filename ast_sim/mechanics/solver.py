@@ -78,7 +78,7 @@ class SolverSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class Iterate:
     """Positions [N,3] with the states of the potential and of contact there, and their energy in joule."""
 
     position: np.ndarray
@@ -200,10 +200,10 @@ class Newton:
         """Forces [N,3] in newton that hold the prescribed nodes where they are; the residual at free nodes."""
         return self._gradient(self.state)[0]
 
-    def _evaluate(self, position: np.ndarray) -> State:
+    def _evaluate(self, position: np.ndarray) -> Iterate:
         potential = self.potential.evaluate(position)
         contact = self.contact.at(position)
-        return State(position, potential, contact, potential.energy + contact.energy())
+        return Iterate(position, potential, contact, potential.energy + contact.energy())
 
     def _count(self) -> None:
         self.iterations += 1
@@ -213,13 +213,13 @@ class Newton:
         self.contact.lag_friction(self.state.contact, start)
         self.state = self._evaluate(self.position)
 
-    def _gradient(self, state: State) -> tuple[np.ndarray, float]:
+    def _gradient(self, state: Iterate) -> tuple[np.ndarray, float]:
         """Derivative of the energy [N,3] and the residual up to which it counts as zero."""
         gradient, element_force = self.potential.gradient(state.potential)
         rounding = 1e-8 * self.potential.unit_force
         return gradient + state.contact.gradient(), max(self.settings.force_tolerance * element_force, rounding)
 
-    def _direction(self, state: State, gradient: np.ndarray, increment: np.ndarray | None) -> np.ndarray:
+    def _direction(self, state: Iterate, gradient: np.ndarray, increment: np.ndarray | None) -> np.ndarray:
         """Newton direction [N,3]; prescribed nodes take `increment` [N,3] (zero if None)."""
         for project in (False, True):
             values, contact = self.potential.hessian(state.potential, project), state.contact.hessian(project)
@@ -263,7 +263,7 @@ class Newton:
             self.state = self._line_search(gradient, direction)
         raise NotConverged(f"no equilibrium after {self.settings.max_iterations} Newton iterations")
 
-    def _line_search(self, gradient: np.ndarray, direction: np.ndarray) -> State:
+    def _line_search(self, gradient: np.ndarray, direction: np.ndarray) -> Iterate:
         """First state along the direction that lowers the energy enough (Armijo), within the collision-free part."""
         start = self.state
         slope = float(np.vdot(gradient, direction))

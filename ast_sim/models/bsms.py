@@ -54,7 +54,7 @@ class PlainNorm(nn.Module):
         self.register_buffer("bias", torch.zeros(width), persistent=False)
 
 
-class Block(nn.Module):
+class MessagePassingBlock(nn.Module):
     """One step on the mesh and the contacts of a level."""
 
     def __init__(self, config: BSMSConfig):
@@ -82,9 +82,9 @@ class BSMS(WorldEdgeSimulator):
         self.mesh_inputs = nn.ModuleList(normalizer_of(config, "edge") for _ in range(config.levels + 1))
         self.world_inputs = nn.ModuleList(normalizer_of(config, "world_edge") for _ in range(config.levels + 1))
         self.node_encoder = DeepMLP(config, self.node_inputs.width, norm=PlainNorm)
-        self.down = nn.ModuleList(Block(config) for _ in range(config.levels))
-        self.bottom = Block(config)
-        self.up = nn.ModuleList(Block(config) for _ in range(config.levels))
+        self.down = nn.ModuleList(MessagePassingBlock(config) for _ in range(config.levels))
+        self.bottom = MessagePassingBlock(config)
+        self.up = nn.ModuleList(MessagePassingBlock(config) for _ in range(config.levels))
         self.decoder = Decoder(config)
 
     def graph(self, scene: Scene) -> Graph:
@@ -121,7 +121,7 @@ class BSMS(WorldEdgeSimulator):
             x = skipped[i] + self._steps(block, poolings[i].unpool(x), levels[i], end=i == 0)
         return self.decoder(x, batch)
 
-    def _steps(self, block: Block, x: Tensor, level: tuple[Edges, Edges], end: bool) -> Tensor:
+    def _steps(self, block: MessagePassingBlock, x: Tensor, level: tuple[Edges, Edges], end: bool) -> Tensor:
         for _ in range(2 if end and self.config.repeat_ends else 1):
             x = block(x, *level)
         return x

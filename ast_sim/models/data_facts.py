@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ast_sim.dataset.layout import GIVEN_FRAMES, DatasetInfo
-from ast_sim.material import Material
+from ast_sim.material import FRICTION, Material
 from ast_sim.named_field import STRESS, Output
 from ast_sim.support.toml_settings import NOTHING
 
@@ -87,6 +87,11 @@ class DataFacts:
         """The material of the scenes: its columns, and what the solver recorded."""
         elastic = {"young": self.young, "poisson": self.poisson} if self.young else {}
         return Material(self.columns, {**elastic, "friction": self.friction})
+
+    @property
+    def rubs(self) -> bool:
+        """Whether friction acts in a scene."""
+        return bool(self.friction) or FRICTION in self.columns
 
     @property
     def material_width(self) -> int:

@@ -51,7 +51,7 @@ class HCMTConfig(WorldEdgeConfig):
         self.check_heads()
 
 
-class Block(nn.Module):
+class MeshTransformerBlock(nn.Module):
     """Attention along one or two sets of edges, then a feed-forward network. No layer has a bias."""
 
     def __init__(self, config: HCMTConfig, edge_sets: int):
@@ -86,10 +86,10 @@ class HCMT(WorldEdgeSimulator):
     def __init__(self, config: HCMTConfig):
         super().__init__(config)
         self.node_encoder, self.mesh_encoder, self.world_encoder = self.encoders()
-        self.contact = nn.ModuleList(Block(config, 2) for _ in range(config.contact_blocks))
-        self.down = nn.ModuleList(Block(config, 1) for _ in range(config.levels))
-        self.bottom = Block(config, 1)
-        self.up = nn.ModuleList(Block(config, 1) for _ in range(config.levels))
+        self.contact = nn.ModuleList(MeshTransformerBlock(config, 2) for _ in range(config.contact_blocks))
+        self.down = nn.ModuleList(MeshTransformerBlock(config, 1) for _ in range(config.levels))
+        self.bottom = MeshTransformerBlock(config, 1)
+        self.up = nn.ModuleList(MeshTransformerBlock(config, 1) for _ in range(config.levels))
         self.decoder = Decoder(config)
 
     def graph(self, scene: Scene) -> Graph:

@@ -46,7 +46,7 @@ class EdgeUpdate(nn.Module):
         return latents + sent, total
 
 
-class Block(nn.Module):
+class GraphNetBlock(nn.Module):
     """One step on both edge sets."""
 
     def __init__(self, config: MGNConfig):
@@ -69,7 +69,7 @@ class MGN(WorldEdgeSimulator):
     def __init__(self, config: MGNConfig):
         super().__init__(config)
         self.node_encoder, self.mesh_encoder, self.world_encoder = self.encoders()
-        self.blocks = nn.ModuleList(Block(config) for _ in range(config.blocks))
+        self.blocks = nn.ModuleList(GraphNetBlock(config) for _ in range(config.blocks))
         self.decoder = Decoder(config)
 
     def forward(self, batch: Batch) -> Prediction:

@@ -51,7 +51,7 @@ class ModelConfig:
     )
     jumps: bool | None = setting(
         False,
-        "predict any frame at once from the first frame, carried along by the prescribed nodes, not step by step;"
+        "predict each frame directly from the first one, moved along with the prescribed nodes, not step by step;"
         " unset: yes in quasi-static scenes",
     )
     state: tuple[str, ...] = setting(

@@ -112,7 +112,7 @@ def _mean(weights: Tensor, value: Tensor) -> Tensor:
     return weights.mT @ value / (weights.sum(dim=1) + EPSILON)[:, :, None]
 
 
-class Block(nn.Module):
+class TransolverBlock(nn.Module):
     """x + PhysicsAttention(LN(x)), then x + MLP(LN(x))."""
 
     def __init__(self, config: TransolverConfig):
@@ -142,7 +142,7 @@ class Transolver(Simulator):
         self.node_inputs = normalizer_of(config, "node")
         self.positions = FeatureNormalizer([("vector", 3), ("vector", 3)])
         self.encoder = MLP(self.node_inputs.width + self.positions.width, 2 * config.hidden, config.hidden)
-        self.blocks = nn.ModuleList(Block(config) for _ in range(config.blocks))
+        self.blocks = nn.ModuleList(TransolverBlock(config) for _ in range(config.blocks))
         self.norm = nn.LayerNorm(config.hidden)
         self.decoder = Linear(config.hidden, 3 + config.data.output_columns("node"))
         if on_elements := config.data.output_columns("element"):

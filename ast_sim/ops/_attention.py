@@ -214,7 +214,7 @@ def _check_block_heads(name: str, sizes: Sizes, given: Given) -> None:
     width, rest = divmod(sizes["I"], given["heads"])
     if rest or width % 16 or not 16 <= width <= 128 or sizes.get("E", width) != width:
         raise ValueError(
-            f"{name}: the head dimension must be a multiple of 16 up to 128, and that of the rotations, not"
+            f"{name}: the head dimension must be a multiple of 16 up to 128, and equal to the one of the rotations, not"
             f" {sizes['I'] / given['heads']:g} and {sizes.get('E', 'none')}"
         )
 

@@ -22,7 +22,7 @@ from ast_sim.support.errors import ConfigError
 from ast_sim.support.progress import Progress, ShowProgress, duration
 from ast_sim.support.provenance import provenance
 from ast_sim.support.toml_settings import require_range
-from ast_sim.training.asked_settings import changes_of, configure, differences, path_of
+from ast_sim.training.configure import changes_of, configure, differences, path_of
 from ast_sim.training.parallel.launch import usual_processes
 
 SETTINGS, FIGURES = "best.toml", "plan.json"

@@ -19,7 +19,7 @@ from ast_sim.planning.trials import MINUTES, TIMED, Trials
 from ast_sim.simulate.jobs.generate import checked_workers, generate
 from ast_sim.support.progress import ShowProgress, duration
 from ast_sim.support.toml_settings import require_range
-from ast_sim.training.asked_settings import configure
+from ast_sim.training.configure import configure
 from ast_sim.training.loop import OFTEN
 from ast_sim.view.files import make_folder
 

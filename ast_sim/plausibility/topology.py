@@ -43,7 +43,7 @@ def _twice(scene: Scene) -> list[Finding]:
     order = np.lexsort(ordered.T)
     same = (ordered[order[1:]] == ordered[order[:-1]]).all(axis=1)
     rows = np.sort(order[1:][same])
-    meaning = "the material is twice as stiff there, and faces between bodies are lost: write each element once"
+    meaning = "the material is twice as stiff there, and faces between bodies are missed: write each element once"
     return [Finding("elements that stand twice", len(rows), _elements(scene, rows), meaning)] if len(rows) else []
 
 
@@ -91,7 +91,7 @@ def _folds(scene: Scene) -> list[Finding]:
     rows = np.unique(order[wrong[group]] // 4)
     if not len(rows):
         return []
-    meaning = "the mesh folds over itself there, so it cannot be computed with: mesh it anew"
+    meaning = "the mesh folds over itself there, so it cannot be computed with: mesh it again"
     return [Finding("elements that lie on each other", len(rows), _elements(scene, rows), meaning)]
 
 

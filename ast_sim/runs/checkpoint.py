@@ -273,7 +273,7 @@ def _read_verified(path: Path) -> dict[str, bytes]:
                 raise CheckpointError(f"{file}: has {size} bytes, the manifest says {record['size']}")
             contents[name] = _read_file(file, size)
         if _hash(contents[name]) != record["sha256"]:
-            raise CheckpointError(f"{file}: is damaged: its SHA-256 is not that of the manifest")
+            raise CheckpointError(f"{file}: is damaged: its SHA-256 differs from the manifest")
     return contents
 
 

@@ -161,7 +161,7 @@ class RunFolder:
         latest, best, mark = checkpoint.latest(self.path), checkpoint.best(self.path), checkpoint.read_best(self.path)
         validation = self.metrics.validation(mark.step) if mark else None
         if mark and not validation:
-            text = f"{self.metrics.path} has lost the validation after step {mark.step}, the best one"
+            text = f"{self.metrics.path} misses the validation after step {mark.step}, the best one"
             warnings.warn(text, stacklevel=2)
         return {
             "kind": "run",

@@ -52,7 +52,7 @@ class Metrics:
         """Warn if fewer lines are intact than a checkpoint says were written before it."""
         count = sum(1 for _ in self)
         if count < lines:
-            text = f"{self.path} has lost {lines - count} of {lines} lines: its curves are not complete"
+            text = f"{self.path} misses {lines - count} of {lines} lines: its curves are not complete"
             warnings.warn(text, stacklevel=2)
 
     def seconds_per_step(self) -> float | None:

@@ -91,14 +91,17 @@ def _errors(answers: Mapping[str, Any]) -> str:
     measured = [one for one in answers.get("valid_by_effort", []) if one["error"] is not None]
     if not measured:
         return "No validation measured the errors of single answers."
+    efforts = [one["effort"] for one in measured]
+    dials = [dial for dial in efforts[-1] if any(type(effort.get(dial)) is int for effort in efforts)]
     lines = [
-        "Relative to the displacement, at the deepest frame. `*` marks the effort that the model takes by default.",
+        "Relative to the displacement, at the deepest frame; `newton_steps` are the most that were made. `*` marks the"
+        " effort that the model takes by default.",
         "",
-        "| corrections | Newton steps, at most | error |",
-        "| ---: | ---: | ---: |",
+        f"| {' | '.join(f'`{dial}`' for dial in dials)} | error |",
+        f"| {'---: | ' * len(dials)}---: |",
     ]
     for one in measured:
-        effort = one["effort"]
-        mark = " *" if effort == answers.get("effort") else ""
-        lines.append(f"| {effort['corrections']} | {effort['newton_steps']}{mark} | {100 * one['error']:.3g} % |")
+        mark = " *" if one["effort"] == answers.get("effort") else ""
+        numbers = " | ".join(str(one["effort"].get(dial, "")) for dial in dials)
+        lines.append(f"| {numbers}{mark} | {100 * one['error']:.3g} % |")
     return "\n".join(lines)

@@ -23,7 +23,7 @@ class TrainConfig:
     minutes: float | None = setting(
         None, "minutes of training: 50 steps are timed, then `steps` is fixed; unset: `steps` or `epochs` decides"
     )
-    scenes: int | None = setting(None, "train on the first so many scenes of the training split; unset: on all of them")
+    scenes: int | None = setting(None, "train on this number of scenes, the first of the training split; unset: on all")
     epochs: int = setting(100, "passes over the training pairs, if neither `steps` nor `minutes` is set")
     batch_size: int = setting(48, "scenes in a batch; each scene is a pair of frames")
     accumulate: int = setting(1, "batches in a step; the step averages their gradients")
@@ -56,7 +56,7 @@ class TrainConfig:
         " model is ast or transolver, else 0; always 0 with model.jumps and without noise",
     )
     corrections: int = setting(
-        0, "with model.jumps: so many further calls correct the first one in training; without jumps 0"
+        0, "with model.jumps: further calls that correct the first one in training; without jumps 0"
     )
     noise_gamma: float | None = setting(
         None, "with noise: share of it that the target takes back; unset: 1, in dynamic scenes 0.1"

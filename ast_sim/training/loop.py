@@ -16,8 +16,8 @@ import torch
 from ast_sim.batches.batch_builder import Batch, Target
 from ast_sim.batches.pairs import PairSampler
 from ast_sim.batches.prefetch import Ahead
-from ast_sim.batches.training_jumps import JumpPool
-from ast_sim.batches.training_pool import Pool
+from ast_sim.batches.training_corrections import JumpPool
+from ast_sim.batches.training_pool import TrainingPool
 from ast_sim.batches.training_rollouts import RolloutPool
 from ast_sim.dataset.reader import Dataset
 from ast_sim.models.node_inputs import with_proximity
@@ -36,7 +36,7 @@ from ast_sim.training.optimizer import Optimizer
 from ast_sim.training.parallel.processes import Processes
 from ast_sim.training.profile import profile, table
 from ast_sim.training.rates import learning_rate, step_seed
-from ast_sim.training.saving import Saver
+from ast_sim.training.resuming import Saver
 from ast_sim.training.validation import Validated, error_share, validate, verdict
 
 OFTEN = 16  # passes over the data, from which on little is gained (docs/log.md, 2026-11-26)
@@ -109,7 +109,7 @@ class Training:
     def __exit__(self, *error: object) -> None:
         self.ahead.__exit__(*error)
 
-    def _pool(self, largest: float) -> Pool | None:
+    def _pool(self, largest: float) -> TrainingPool | None:
         """The pool of scenes that go on from the model's own answers; None: each batch is drawn anew."""
         options = self.options
         if self.config.model.scheme.jumps:

@@ -26,8 +26,8 @@ from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.errors import CheckpointError, ConfigError, TrainingError
 from ast_sim.support.progress import ShowProgress
 from ast_sim.support.stop_signals import StopSignals
-from ast_sim.training.asked_settings import changes_of, configure, differences, path_of
 from ast_sim.training.callbacks import Callback
+from ast_sim.training.configure import changes_of, configure, differences, path_of
 from ast_sim.training.data_lengths import DataScales, measure, scope_of
 from ast_sim.training.defaults_from_data import resolve
 from ast_sim.training.loop import Training, fit_statistics, sampler_of

@@ -11,12 +11,11 @@ import numpy as np
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.effort import (
     FIRST_CALL,
-    MOST_NEWTON_STEPS,
     Effort,
     EffortErrors,
-    can_make_newton_steps,
     cheapest_good,
     mean_errors,
+    to_measure,
 )
 from ast_sim.inference.evaluation.deepest_frames import errors_by_effort
 from ast_sim.inference.evaluation.measures import SquaredError, rmse_sequence
@@ -127,7 +126,6 @@ def _by_jumps(
     asked = zip(names, truths, frames, strict=True)
     questions = [Question.of(truth, name, numbers.tolist()) for name, truth, numbers in asked]
     ways = answer_steps(model, questions, Effort(corrections + MORE_CALLS if corrections else 0))
-    newton_steps = MOST_NEWTON_STEPS if can_make_newton_steps(model.config) else 0
     validated = []
     for index, truth, numbers, way in zip(indices, truths, frames, ways, strict=True):
         hold = _motion_error(truth.position[0], truth, numbers)
@@ -135,8 +133,8 @@ def _by_jumps(
             validated.append(Validated(index, [], hold, way, []))
             continue
         errors = [_motion_error(position, truth, numbers) for position in way.position]
-        measures = efforts and index < EFFORT_SCENES
-        by_effort = errors_by_effort(model, truth, Effort(corrections, newton_steps)) if measures else []
+        measured = to_measure(model.config, corrections) if efforts and index < EFFORT_SCENES else ()
+        by_effort = errors_by_effort(model, truth, measured)
         validated.append(Validated(index, errors, hold, None, by_effort))
     return validated
 

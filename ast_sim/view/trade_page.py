@@ -67,14 +67,16 @@ def _lead(figures: TradeFigures) -> str:
 
 def _note(figures: TradeFigures) -> str:
     text = (
-        f"Of each side the fastest setting counts that keeps the error in {100 * WITHIN:g} % of the scenes, by its"
-        " median time. A ratio is the median over the scenes, with an interval of 95 % by bootstrap. Errors are"
-        " relative, at the deepest frame; the stress is the largest one. Times are processor time on one thread, with"
-        " all that is prepared for a mesh."
+        "For the run and for the solver, the fastest setting counts that keeps the error in"
+        f" {100 * WITHIN:g} % of the scenes, by its median time. A ratio is the median over the scenes, with an"
+        " interval of 95 % by bootstrap. Errors are relative, at the deepest frame; the stress is the largest one."
+        " Times are processor time on one thread, with all that is prepared for a mesh."
     )
     if figures.invested is not None:
         spent = duration(figures.invested)
-        text += f" Simulation and training took {spent} of a core; after so many questions they are repaid."
+        text += (
+            f" Simulation and training took {spent} of a core; the last column says which number of answers repays it."
+        )
     return text + (f" The solver was not run: {figures.no_solver}." if figures.no_solver else "")
 
 

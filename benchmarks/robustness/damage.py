@@ -116,7 +116,7 @@ def run_command(name: str, folder: Path) -> tuple[str, Results, str]:
     words = {
         INFO_DATA: ["info", "--json", data],
         INFO_RUN: ["info", "--json", run],
-        EVALUATE: ["evaluate", run, data, "--rivals", "0", "--out", out, "--overwrite"],
+        EVALUATE: ["evaluate", run, data, "--solver-scenes", "0", "--out", out, "--overwrite"],
         TRAIN: ["train", "--out", run, "--resume"],
     }[name]
     said, told = io.StringIO(), io.StringIO()

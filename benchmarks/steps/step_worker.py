@@ -24,7 +24,7 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.ops import library
 from ast_sim.runs.folder import RunFolder
 from ast_sim.support.stop_signals import StopSignals
-from ast_sim.training.asked_settings import configure
+from ast_sim.training.configure import configure
 from ast_sim.training.data_lengths import measure
 from ast_sim.training.defaults_from_data import resolve
 from ast_sim.training.loop import Training

@@ -22,7 +22,7 @@ from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.inference.effort import Effort
 from ast_sim.inference.evaluation.deepest_frames import deepest_frames
 from ast_sim.inference.quantities.relative_errors import relative_error
-from ast_sim.simulate.jobs.rival import deepest_frame
+from ast_sim.simulate.jobs.fastest_solver import deepest_frame
 from ast_sim.support.provenance import provenance
 from benchmarks.studies.phrases import beside_solver, over_the_scenes, settings_tried, times_as_long
 from benchmarks.studies.rows import study_rows

@@ -21,7 +21,7 @@ from scipy.stats import betabinom
 import ast_sim
 from ast_sim.inference.promises.familiarity import UNUSUAL
 from ast_sim.inference.quantities.band import LEVEL, compared
-from ast_sim.simulate.jobs.rival import deepest_frame
+from ast_sim.simulate.jobs.fastest_solver import deepest_frame
 from ast_sim.support.disk import write_json
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.provenance import provenance

@@ -17,7 +17,7 @@ import ast_sim
 from ast_sim.planning.forecast import DAMPING, SPREAD, forecast
 from ast_sim.planning.trials import GROWTH, LONGEST, WIDER, Trials, candidates
 from ast_sim.support.provenance import provenance
-from ast_sim.training.asked_settings import configure
+from ast_sim.training.configure import configure
 from benchmarks.studies.rows import study_rows
 
 RESULTS = Path(__file__).parents[1] / "results" / "forecasts.json"

@@ -1,7 +1,7 @@
 """The solver at its best, with nested iteration and without it, beside the run of plates that comes with the package.
 
 `python -m benchmarks.studies.nested [NODES ...]` generates a few plates of each size, goes to the deepest frame of each
-in every way of `ast_sim.simulate.jobs.rival`, and asks the run for the same frame. It writes
+in every way of `ast_sim.simulate.jobs.fastest_solver`, and asks the run for the same frame. It writes
 benchmarks/results/nested.json and docs/results/nested.md. The scenes lie in `--folder`. Everything runs on one thread.
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 import ast_sim
 from ast_sim.inference.effort import MOST_NEWTON_STEPS, Effort
 from ast_sim.inference.evaluation.trade import timed_answer
-from ast_sim.simulate.jobs.rival import WAYS, rivals
+from ast_sim.simulate.jobs.fastest_solver import VARIANTS, solver_outcomes
 from ast_sim.support.provenance import provenance
 from ast_sim.trade_figures import TOLERANCES
 from benchmarks.studies.phrases import median_error
@@ -28,7 +28,7 @@ from benchmarks.studies.rows import study_rows
 RESULTS = Path(__file__).parents[1] / "results" / "nested.json"
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "nested.md"
 EFFORTS = (Effort(0), Effort(0, 1), Effort(0, MOST_NEWTON_STEPS))
-NESTED = frozenset(way.name for way in WAYS if way.newton)
+NESTED = frozenset(way.name for way in VARIANTS if way.newton)
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def measured(plates: Plates, folder: Path) -> dict[str, Any]:
     scenes: list[dict[str, Any]] = [{"ways": {}, "answers": {}} for _ in range(plates.scenes)]
     for turn in range(plates.rounds):
         for index, scene in enumerate(scenes):
-            (solved,) = rivals(data, plates.split, [index], progress=False)
+            (solved,) = solver_outcomes(data, plates.split, [index], progress=False)
             scene |= {"frame": solved.frame, "displacement": solved.displacement}
             for outcome in solved.outcomes:
                 figures = {
@@ -78,7 +78,7 @@ def measured(plates: Plates, folder: Path) -> dict[str, Any]:
                     "mesh_seconds": outcome.mesh_seconds,
                     "failure": outcome.failure or None,
                 }
-                _keep_faster(scene["ways"], outcome.way.name, figures)
+                _keep_faster(scene["ways"], outcome.variant.name, figures)
             if model is not None:
                 with ast_sim.Dataset(data) as dataset:
                     _ask(model, dataset, plates.split, index, scene["answers"])

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ast_sim.simulate.jobs.rival import WAYS
+from ast_sim.simulate.jobs.fastest_solver import VARIANTS
 
 SHOWN_WORST = 5
 RESAMPLES = 2000
@@ -48,7 +48,9 @@ def settings_tried(rows: Iterable[dict[str, Any]]) -> str:
         ways = {name for scene in row["scenes"] if scene["solver"] for name in scene["solver"]["ways"]}
         if ways:
             titles.setdefault(_settings(ways), []).append(row["row"]["title"])
-    first, *others = sorted(titles, key=lambda text: int(text.split()[0])) or [_settings({way.name for way in WAYS})]
+    first, *others = sorted(titles, key=lambda text: int(text.split()[0])) or [
+        _settings({way.name for way in VARIANTS})
+    ]
     if not others:
         return first
     later = "; ".join(f"{text.replace(' settings', '')} for {', '.join(titles[text])}" for text in others)
@@ -56,7 +58,7 @@ def settings_tried(rows: Iterable[dict[str, Any]]) -> str:
 
 
 def _settings(ways: set[str]) -> str:
-    nested = any(way.name in ways for way in WAYS if way.newton)
+    nested = any(way.name in ways for way in VARIANTS if way.newton)
     return f"{len(ways)} settings" + (", nested iteration among them," if nested else "")
 
 

@@ -13,7 +13,7 @@ from ast_sim.batches.carry import Carrier
 from ast_sim.batches.mirror_and_shift import Placement
 from ast_sim.batches.pairs import PairSampler
 from ast_sim.batches.scheme import Scheme
-from ast_sim.batches.training_jumps import JumpPool
+from ast_sim.batches.training_corrections import JumpPool
 from ast_sim.batches.turning_points import jump_sources
 from ast_sim.dataset.reader import Dataset
 from ast_sim.named_field import NamedField, Output

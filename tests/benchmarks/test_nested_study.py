@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from ast_sim.simulate.jobs.rival import WAYS
+from ast_sim.simulate.jobs.fastest_solver import VARIANTS
 from benchmarks.studies import nested
 from benchmarks.studies.phrases import settings_tried
 
@@ -66,8 +66,8 @@ def test_rows_say_in_how_many_settings_the_solver_was_run():
     def row(title, *names):
         return {"row": {"title": title}, "scenes": [{"solver": {"ways": dict.fromkeys(names)}}, {"solver": None}]}
 
-    plain = [way.name for way in WAYS[:13]]
-    every = [way.name for way in WAYS]
+    plain = [way.name for way in VARIANTS[:13]]
+    every = [way.name for way in VARIANTS]
     old = [row("A", *plain), row("B", *plain)]
     assert settings_tried(old) == "13 settings"
     assert settings_tried([row("C", *every)]) == settings_tried([]) == "35 settings, nested iteration among them,"

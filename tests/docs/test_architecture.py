@@ -13,7 +13,7 @@ import ast_sim
 from ast_sim.batches.batch_builder import Batch, State, Target
 from ast_sim.batches.carry import Carrier
 from ast_sim.batches.mirror_and_shift import Placement
-from ast_sim.batches.training_jumps import JumpPool
+from ast_sim.batches.training_corrections import JumpPool
 from ast_sim.inference.predicting.question import Question
 from ast_sim.models.registry import build_model
 from ast_sim.runs import checkpoint

@@ -334,7 +334,7 @@ WRONG = {
         {},
         "1.vtu: tetra [0-9] refers to node 7, but the nodes are 0 to 6",
     ),
-    "another mesh": (frame(elements=ONE.elements[:5]), {}, "1.vtu: its elements are not"),
+    "another mesh": (frame(elements=ONE.elements[:5]), {}, "1.vtu: its elements differ from 0.vtu"),
     "more points": (frame(points=np.ones((9, 3), np.float32)), {}, "1.vtu: has 9 points, 0.vtu 8"),
     "no stress": (frame(), {"stress": "s"}, "1.vtu: there is no point field 's'; there are: none"),
     "no displacement": (frame(point={"s": np.ones(8)}), {}, "frame 1 has no displacement, others have"),

@@ -182,7 +182,7 @@ def test_a_mesh_that_changes_is_refused(tmp_path):
     repeated[5, 0] = repeated[5, 1]
     changes = features("deforming_plate", cells={"type": "dynamic", "shape": [FRAMES, -1, 4], "dtype": "int32"})
     source = written(tmp_path, "deforming_plate", {**arrays, "cells": repeated}, {"features": changes})
-    with pytest.raises(DatasetError, match="record 0: cells in frame 5 is not that of frame 0: the mesh changes, but"):
+    with pytest.raises(DatasetError, match="record 0: cells in frame 5 differs from frame 0: the mesh changes, but"):
         convert_deepmind(source, tmp_path / "d.h5")
 
     rows = len(arrays["cells"][0])

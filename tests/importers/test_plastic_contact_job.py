@@ -95,7 +95,7 @@ def test_plastic_strain_and_forces_are_predicted(data, tmp_path, capsys):
     again = ast_sim.Run(run).predict(truth)
     np.testing.assert_allclose(again.reaction()[:, 2], [float(row["force_z"]) for row in told[1::2]], rtol=1e-5)
     capsys.readouterr()
-    assert cli.main(["evaluate", str(run), str(data), "--split", "train", "--rivals", "0"]) == 0
+    assert cli.main(["evaluate", str(run), str(data), "--split", "train", "--solver-scenes", "0"]) == 0
     share = re.search(r"relative: (\S+) % of the root mean square of PEEQ", capsys.readouterr().out)
     assert float(share[1]) == pytest.approx(
         100 * relative(answer.fields["PEEQ"].values, truth.fields["PEEQ"].values), rel=0.05

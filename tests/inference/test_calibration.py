@@ -1,5 +1,6 @@
 """Bands: the quantile of scores, what a calibrated run says, and when it says nothing."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ import ast_sim
 from ast_sim.inference.effort import Effort
 from ast_sim.inference.promises.calibration import Calibration, quantile
 from ast_sim.inference.promises.kept_errors import KeptErrors
-from ast_sim.inference.quantities.band import Comparison, compared
+from ast_sim.inference.quantities.band import VALUES, Comparison, compared
 from ast_sim.support.errors import ConfigError
 
 
@@ -184,3 +185,17 @@ def test_a_prediction_that_asks_for_an_error_makes_the_chosen_effort(calibrated)
     assert answer.how_far[0] == f"effort: {kept} and 2 % of the reaction {where}"
     assert same.how_far[0] == f"effort: {kept} {where}"
     assert np.array_equal(answer.position, run.predict(truth, effort=Effort()).position)
+
+
+def test_a_quantity_that_is_added_gets_a_band(calibrated, tmp_path, monkeypatch):
+    """docs/how-to/new-dial-or-band.md: one function is enough."""
+    run, data, result = calibrated
+    copy = ast_sim.Run(shutil.copytree(run.path, tmp_path / "run"))
+    monkeypatch.setitem(VALUES, "height", lambda answer: answer.position[:, :, 2:].max(axis=1, keepdims=True))
+    again = ast_sim.calibrate(copy, data, "test")
+    assert set(again.quantiles) == {*result.quantiles, "height"}
+    with ast_sim.Dataset(data) as dataset:
+        answer = next(answer for truth in dataset["test"] if not (answer := copy.predict(truth)).notes)
+    highest = np.abs(answer.position[1:, :, 2].max(axis=1).astype(float))
+    width = again.quantiles["height"][again.efforts.index(copy.effort)]
+    assert answer.band("height")[1:] == pytest.approx(width * (highest + again.typical["height"]))

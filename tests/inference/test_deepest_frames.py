@@ -10,18 +10,18 @@ import toy
 from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import Dataset, generate
-from ast_sim.figures import WayFigures
+from ast_sim.figures import VariantFigures
 from ast_sim.inference.answering import answers
-from ast_sim.inference.effort import Effort, EffortErrors, cheapest_good, mean_errors, newton_steps
+from ast_sim.inference.effort import Effort, EffortErrors, cheapest_good, mean_errors
 from ast_sim.inference.evaluation.deepest_frames import deepest_frames, errors_by_effort, lines
 from ast_sim.inference.predicting import jump, jumping_scene
 from ast_sim.inference.predicting.jump import answer_steps
-from ast_sim.inference.predicting.question import Question
+from ast_sim.inference.predicting.question import Question, law_of
 from ast_sim.mechanics.linearised_contact import STILL, NewtonSteps
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.registry import find_preset
 from ast_sim.models.simulator import Prediction, Simulator
-from ast_sim.simulate.jobs.rival import deepest_frame
+from ast_sim.simulate.jobs.fastest_solver import deepest_frame
 from ast_sim.support.errors import ConfigError, SimulationError
 from ast_sim.support.progress import Patience
 from ast_sim.training.data_lengths import measure
@@ -66,10 +66,10 @@ def test_errors_are_shares_of_the_displacement(one):
 def test_a_failure_and_a_dataset_without_a_solver_are_told(one):
     truth = one.load("test", 0)
     model = Share(replace(toy.config(toy.info()), jumps=True), truth, 3, float("nan"))
-    found = deepest_frames(model, one, "test", Effort(1), rival_scenes=1)
+    found = deepest_frames(model, one, "test", Effort(1), solver_scenes=1)
     assert found.relative_error is None and lines(found) == ["the deepest frame: every prediction failed"]
     model.share = 0.5
-    found = deepest_frames(model, one, "test", Effort(1), rival_scenes=1)
+    found = deepest_frames(model, one, "test", Effort(1), solver_scenes=1)
     assert found.solver is None and "the solver was not run:" in lines(found)[-1]
     json.dumps(asdict(found), allow_nan=False)
 
@@ -112,7 +112,7 @@ def test_newton_steps_lead_from_the_answer_to_equilibrium(pressed, monkeypatch):
     (answer,) = answers(model, [Question.of(truth, "plate", [frame])], Effort(1, 3))
     held = truth.scene.prescribed
     assert np.array_equal(answer.position[0][held], truth.position[frame][held])
-    measured = errors_by_effort(model, truth, Effort(1, 3))
+    measured = errors_by_effort(model, truth, [Effort(0, 3), Effort(1, 3)])
     assert [one.effort for one in measured] == [Effort(c, k) for c in (0, 1) for k in range(4)]
     assert [one.unsettled for one in measured] == [0, 1, 1, 0] * 2
     assert [one.steps for one in measured] == [0, 1, 2, 3] * 2
@@ -120,7 +120,7 @@ def test_newton_steps_lead_from_the_answer_to_equilibrium(pressed, monkeypatch):
     assert measured[5].stress_error > 1.1 * measured[7].stress_error
     assert tuple(one.error for one in measured[4:]) == errors[1:] and measured[0].error == errors[0]
     monkeypatch.setattr(NewtonSteps, "step", collapse)
-    fallen = errors_by_effort(model, truth, Effort(1, 3))
+    fallen = errors_by_effort(model, truth, [Effort(0, 3), Effort(1, 3)])
     assert [one.error for one in fallen] == [errors[0], None, None, None, errors[1], None, None, None]
     assert [EffortErrors.from_json(json.loads(json.dumps(asdict(one)))) for one in fallen] == fallen
 
@@ -193,10 +193,8 @@ def test_newton_steps_end_when_one_is_small(pressed, monkeypatch):
     question = [Question.of(truth, "plate", [deepest_frame(truth)])]
     monkeypatch.setattr(jumping_scene, "STILL", 0.0)
     (all_steps,) = answer_steps(model, question, Effort(1, 6))
-    sizes = [
-        newton_steps(model.config, truth.scene).size(*(all_steps.position[i, 0].astype(float) for i in (k, k + 1)))
-        for k in range(1, 7)
-    ]
+    newton = law_of(model.config).newton_steps(truth.scene)
+    sizes = [newton.size(*all_steps.position[k : k + 2, 0].astype(float)) for k in range(1, 7)]
     assert sizes == sorted(sizes, reverse=True) and sizes[0] > STILL > sizes[-1]
     assert all_steps.steps == [6] and all_steps.last_step[0] == pytest.approx(sizes[-1], abs=1e-5)
     monkeypatch.undo()
@@ -286,7 +284,7 @@ def test_beside_the_solver(tmp_path):
         frame = deepest_frame(truth)
         config = replace(toy.config(dataset.info), jumps=True)
         config = replace(config, data=replace(config.data, stress="node"))
-        found = deepest_frames(Share(config, truth, frame, 0.99), dataset, "test", Effort(), rival_scenes=1)
+        found = deepest_frames(Share(config, truth, frame, 0.99), dataset, "test", Effort(), solver_scenes=1)
     solver = found.scenes[0].solver
     assert found.relative_error == pytest.approx(0.01, rel=1e-3)
     assert solver.ways["own stop test"].relative_error < 1e-3
@@ -297,7 +295,7 @@ def test_beside_the_solver(tmp_path):
     assert not any("coarser mesh" in line for line in lines(found))
     halves = {name: way for name, way in solver.ways.items() if "1/2 nodes" in name}
     assert len(halves) == 14
-    unmeshed = {name: WayFigures(failure="could not be meshed: too thin") for name in halves}
+    unmeshed = {name: VariantFigures(failure="could not be meshed: too thin") for name in halves}
     scene = replace(found.scenes[0], solver=replace(solver, ways={**solver.ways, **unmeshed}))
     assert lines(replace(found, scenes=(scene,)))[-1] == (
         "  in 1 of 1 scenes the solver has no coarser mesh to begin on, also not for nested iteration: could not be"

@@ -168,7 +168,7 @@ def test_data_of_another_kind_are_refused(run, data, tmp_path):
         for split in ("train", "test"):
             writer.add(split, with_fields(toy.plate(0, frames=4), unit="J/mm2"))
     for ask in (
-        lambda: run.evaluate(other, rival_scenes=0),
+        lambda: run.evaluate(other, solver_scenes=0),
         lambda: ast_sim.train(other, tmp_path / "r", from_run=run.path),
     ):
         with pytest.raises(
@@ -178,7 +178,7 @@ def test_data_of_another_kind_are_refused(run, data, tmp_path):
 
 
 def test_an_evaluation_has_their_errors(run, data):
-    figures = run.evaluate(data, rival_scenes=0).figures
+    figures = run.evaluate(data, solver_scenes=0).figures
     with Dataset(data) as dataset:
         truth = dataset["test"][0]
     answer = run.predict(truth, effort=ast_sim.Effort(**figures.effort))

@@ -13,7 +13,7 @@ from ast_sim.inference.trained_run import Run
 from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.support.errors import DatasetError
 from ast_sim.support.sealed_line import seal
-from ast_sim.training.asked_settings import configure
+from ast_sim.training.configure import configure
 from ast_sim.training.start import start_training
 
 SETTINGS = ["train.steps=2", "model.hidden=16", "model.blocks=2", "train.validate_every=1"]

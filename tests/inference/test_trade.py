@@ -8,7 +8,7 @@ from toy import one_thread  # noqa: F401 (used by being imported)
 
 import ast_sim
 from ast_sim.cli import main
-from ast_sim.simulate.jobs.rival import WAYS
+from ast_sim.simulate.jobs.fastest_solver import VARIANTS
 from ast_sim.support.errors import ConfigError
 
 
@@ -27,7 +27,7 @@ def test_efforts_and_ways_are_measured_on_the_same_scene(plates, tmp_path, capsy
     by_quantity = json.loads((tmp_path / "pages" / "trade.json").read_text())
     assert list(by_quantity) == ["displacement", "reaction", "stress"]
     figures = by_quantity["displacement"]
-    assert [len(figures[side]) for side in ("run", "solver")] == [5, len(WAYS)]
+    assert [len(figures[side]) for side in ("run", "solver")] == [5, len(VARIANTS)]
     own = next(one for one in figures["solver"] if one["name"] == "own stop test")
     assert own["errors"][0] < 1e-3 and own["seconds"][0] > 0
     (mesh,) = figures["mesh_errors"]  # a plate of 200 nodes is thin, and too stiff

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ast_sim.mechanics.elements.cloth import Cloth, ClothMaterial, bending_matrix
 from ast_sim.simulate.families.sphere_simple import sheet
@@ -31,9 +32,7 @@ def dense(sheet_: Cloth, position: np.ndarray, project: bool = False) -> np.ndar
 
 
 def rotation(axis: tuple[float, float, float], angle: float) -> np.ndarray:
-    axis = np.array(axis) / np.linalg.norm(axis)
-    cross = np.cross(np.eye(3), -axis)
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    return Rotation.from_rotvec(angle * np.array(axis) / np.linalg.norm(axis)).as_matrix()
 
 
 @pytest.mark.parametrize("compression", [1.0, 0.1, 0.0])

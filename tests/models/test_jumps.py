@@ -29,7 +29,7 @@ from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.scene import Trajectory
 from ast_sim.support.errors import ConfigError, RolloutError
 from ast_sim.support.toml_settings import from_values, to_toml
-from ast_sim.training.asked_settings import configure
+from ast_sim.training.configure import configure
 from ast_sim.training.start import start_training
 
 

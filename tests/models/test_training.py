@@ -12,7 +12,7 @@ from ast_sim.models.registry import find_model, find_preset
 from ast_sim.runs.config_toml import read_config
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.metrics import Metrics
-from ast_sim.training.asked_settings import configure
+from ast_sim.training.configure import configure
 from ast_sim.training.start import start_training
 
 SMALL = {"mgn": "model.blocks=2", "bsms": "model.levels=2", "hcmt": "model.levels=2"}

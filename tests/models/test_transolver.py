@@ -27,7 +27,7 @@ from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.scene import NodeType, Scene
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.toml_settings import from_values, to_toml
-from ast_sim.training.asked_settings import configure
+from ast_sim.training.configure import configure
 from ast_sim.training.start import start_training
 
 SMALL = {"hidden": 32, "blocks": 2, "heads": 2, "slices": 5, "mlp_ratio": 2}

@@ -16,7 +16,7 @@ from ast_sim.models.node_inputs import node_features, normalizer_of, with_proxim
 from ast_sim.ops import proximity
 from ast_sim.ops._body_distance import FINE, _proximity, signed_gap
 from ast_sim.scene import Scene
-from ast_sim.training.asked_settings import configure
+from ast_sim.training.configure import configure
 from ast_sim.training.start import start_training
 
 

@@ -15,7 +15,7 @@ from ast_sim.planning.plan import planned
 from ast_sim.planning.trials import Trial, Trials, candidates, round_sizes
 from ast_sim.runs.config_toml import read_config
 from ast_sim.support.errors import ConfigError
-from ast_sim.training.asked_settings import configure
+from ast_sim.training.configure import configure
 
 SMALL = {"hidden": 16, "decoder_hidden": 16, "d_token": 32, "heads": 2, "head_dim": 16, "ffn_inner": 16}
 QUICK = {"batch_size": 2, "statistics_pairs": 4}

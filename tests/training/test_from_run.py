@@ -20,7 +20,7 @@ from ast_sim.runs.config_toml import read_changes, read_config, read_origin
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.metrics import Metrics
 from ast_sim.support.errors import CheckpointError, ConfigError
-from ast_sim.training.asked_settings import configure
+from ast_sim.training.configure import configure
 from ast_sim.training.rates import step_seed
 from ast_sim.training.start import start_training
 

@@ -19,7 +19,7 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.runs import checkpoint
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.metrics import Metrics
-from ast_sim.training.asked_settings import configure
+from ast_sim.training.configure import configure
 from ast_sim.training.parallel import launch
 
 SETTINGS = [

@@ -625,9 +625,9 @@ def test_metrics_without_their_last_lines_give_a_warning(linear, data, tmp_path)
     assert RunFolder(run).describe()["best_validation"]["step"] == 20
     lines = (run / "metrics.jsonl").read_text().splitlines(keepends=True)
     (run / "metrics.jsonl").write_text("".join(lines[:3]))
-    with pytest.warns(UserWarning, match=r"metrics.jsonl has lost 3 of 6 lines"):
+    with pytest.warns(UserWarning, match=r"metrics.jsonl misses 3 of 6 lines"):
         RunFolder(run).load_model()
-    with pytest.warns(UserWarning, match="metrics.jsonl has lost the validation after step 20, the best one"):
+    with pytest.warns(UserWarning, match="metrics.jsonl misses the validation after step 20, the best one"):
         assert RunFolder(run).describe()["best_validation"] is None
 
 

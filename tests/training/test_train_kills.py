@@ -142,7 +142,7 @@ def test_an_interrupt_in_python_is_a_keyboard_interrupt_after_a_checkpoint(undis
     run = tmp_path / "run"
     code = f"""
 import ast_sim
-from ast_sim.training.asked_settings import configure
+from ast_sim.training.configure import configure
 from ast_sim.training.start import start_training
 try:
     start_training({str(run)!r}, configure({str(data)!r}, "tiny", {SMALL!r}))

@@ -8,7 +8,7 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.evaluation.evaluate import one_step_predictions
 from ast_sim.named_field import STRESS
 from ast_sim.runs.folder import RunFolder
-from ast_sim.training.asked_settings import configure
+from ast_sim.training.configure import configure
 from ast_sim.training.start import start_training
 
 

@@ -27,7 +27,7 @@ def order_of_cells(frame: SourceMesh, first: SourceMesh) -> np.ndarray | None:
             place = np.empty(len(order), np.int64)
             place[wanted] = order
             return place
-    raise DatasetError(f"{frame.path}: its elements are not those of {first.path.name}; the mesh must not change")
+    raise DatasetError(f"{frame.path}: its elements differ from {first.path.name}; the mesh must not change")
 
 
 def _keys(mesh: SourceMesh) -> np.ndarray:

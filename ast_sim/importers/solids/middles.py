@@ -47,8 +47,8 @@ def require_near(mesh: SourceMesh, corners: np.ndarray, middles: np.ndarray, row
         element, edge = np.argwhere(wrong)[0]
         raise DatasetError(
             f"{mesh.path}: element {rows[element]} has its node {middles[element, edge]} far from the middle of the"
-            f" edge from {corners[element, MIDDLES[edge][0]]} to {corners[element, MIDDLES[edge][1]]}: is the order of"
-            " its nodes that of VTK? With --corners, only the corners are taken"
+            f" edge from {corners[element, MIDDLES[edge][0]]} to {corners[element, MIDDLES[edge][1]]}: are its nodes"
+            " in the order of VTK? With --corners, only the corners are taken"
         )
 
 

@@ -10,13 +10,13 @@ from __future__ import annotations
 import dataclasses
 import os
 import statistics
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 import torch
 
 from ast_sim.dataset.reader import Dataset
-from ast_sim.figures import Beside, DeepestFrame, DeepestFrames, SolverFigures, WayFigures
+from ast_sim.figures import Beside, DeepestFrame, DeepestFrames, SolverFigures, VariantFigures
 from ast_sim.inference.answering import answers
 from ast_sim.inference.effort import Effort, EffortErrors
 from ast_sim.inference.predicting.jump import answer_steps
@@ -25,7 +25,7 @@ from ast_sim.inference.quantities.relative_errors import relative_error, rms, st
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.models.simulator import Simulator
 from ast_sim.scene import Trajectory
-from ast_sim.simulate.jobs.rival import UNMESHED, Rivals, cheapest, deepest_frame, rivals
+from ast_sim.simulate.jobs.fastest_solver import UNMESHED, SolverOutcomes, cheapest, deepest_frame, solver_outcomes
 from ast_sim.support.errors import ConfigError, SimulationError
 
 
@@ -34,7 +34,7 @@ def deepest_frames(
     dataset: Dataset,
     split: str,
     effort: Effort,
-    rival_scenes: int = 0,
+    solver_scenes: int = 0,
     advance: Callable[[str], None] = lambda name: None,
     made_from: str | os.PathLike[str] | None = None,
     most_scenes: int | None = None,
@@ -43,7 +43,8 @@ def deepest_frames(
 
     Args:
         effort: what follows the first call of a model that jumps.
-        rival_scenes: in so many scenes the solver goes to the same frame, in several ways; see `simulate.jobs.rival`.
+        solver_scenes: in so many scenes the solver goes to the same frame, in several variants; see
+            `simulate.jobs.fastest_solver`.
         made_from: the specification or the parts of which the dataset was made, if any; the solver needs them.
         most_scenes: only the first scenes of the split are predicted, at most so many; None: all.
     """
@@ -59,10 +60,10 @@ def deepest_frames(
         torch.set_num_threads(threads)
     why = None
     try:
-        numbers = [scene.frame for scene in scenes[:rival_scenes]]
-        outcomes = _rivals(dataset, split, indices[:rival_scenes], numbers, made_from)
-        for number, rival in enumerate(outcomes):
-            solver = _solver(rival, scenes[number].relative_error)
+        numbers = [scene.frame for scene in scenes[:solver_scenes]]
+        outcomes = _solved(dataset, split, indices[:solver_scenes], numbers, made_from)
+        for number, one in enumerate(outcomes):
+            solver = _solver(one, scenes[number].relative_error)
             scenes[number] = dataclasses.replace(scenes[number], solver=solver)
             advance(scenes[number].name)
     except (ConfigError, SimulationError) as error:
@@ -82,11 +83,11 @@ def deepest_frames(
     )
 
 
-def _rivals(
+def _solved(
     dataset: Dataset, split: str, indices: list[int], frames: list[int], made_from: str | os.PathLike[str] | None
-) -> Iterable[Rivals]:
+) -> Iterable[SolverOutcomes]:
     """What the solver took to these frames; nothing, where none is asked for."""
-    return rivals(dataset.path, split, indices, frames, made_from=made_from, progress=False) if indices else ()
+    return solver_outcomes(dataset.path, split, indices, frames, made_from=made_from, progress=False) if indices else ()
 
 
 def deepest_predicted(model: Simulator, truth: Trajectory) -> int:
@@ -94,29 +95,28 @@ def deepest_predicted(model: Simulator, truth: Trajectory) -> int:
     return max(deepest_frame(truth), model.config.data.given_frames)
 
 
-def errors_by_effort(model: Simulator, truth: Trajectory, most: Effort) -> list[EffortErrors]:
-    """The errors at the deepest frame after each number of corrections and of Newton steps, up to `most`; empty where
+def errors_by_effort(model: Simulator, truth: Trajectory, efforts: Sequence[Effort]) -> list[EffortErrors]:
+    """The errors at the deepest frame after each number of Newton steps up to the one of each effort; empty where
     nothing is displaced."""
     frame = deepest_predicted(model, truth)
     if not rms(truth.position[frame] - truth.position[0], ~truth.scene.prescribed):
         return []
-    efforts = range(most.corrections + 1)
-    return [errors for corrections in efforts for errors in _after(model, truth, frame, corrections, most.newton_steps)]
+    return [errors for effort in efforts for errors in _after(model, truth, frame, effort)]
 
 
-def _after(model: Simulator, truth: Trajectory, frame: int, corrections: int, most: int) -> list[EffortErrors]:
-    """The errors after so many corrections and 0 to `most` Newton steps."""
+def _after(model: Simulator, truth: Trajectory, frame: int, most: Effort) -> list[EffortErrors]:
+    """The errors after 0 Newton steps up to the number of an effort."""
+    efforts = [dataclasses.replace(most, newton_steps=steps) for steps in range(most.newton_steps + 1)]
     question = Question.of(truth, "validation", [frame])
-    (way,) = answer_steps(model, [question], Effort(corrections, most))
-    if isinstance(way, str) and most:  # a Newton step failed; the calls before it still count
-        (way,) = answer_steps(model, [question], Effort(corrections))
+    (way,) = answer_steps(model, [question], most)
+    if isinstance(way, str) and most.newton_steps:  # a Newton step failed; the calls before it still count
+        (way,) = answer_steps(model, [question], efforts[0])
     if isinstance(way, str):
-        return [EffortErrors(Effort(corrections, steps), None, None, 0, 0) for steps in range(most + 1)]
-    positions = way.position[corrections:]
+        return [EffortErrors(effort, None, None, 0, 0) for effort in efforts]
+    positions = way.position[most.corrections :]
     needed = int(way.steps[0]) + bool(way.last_step[0] > STILL)
     measured = []
-    for steps in range(most + 1):
-        effort = Effort(corrections, steps)
+    for steps, effort in enumerate(efforts):
         if steps >= len(positions):
             measured.append(EffortErrors(effort, None, None, 0, 0))
             continue
@@ -160,9 +160,9 @@ def lines(frames: DeepestFrames) -> list[str]:
 
 
 def _unmeshed(scenes: Iterable[DeepestFrame]) -> list[str]:
-    """In how many scenes the solver has no coarser mesh, so that ways which begin on one are missing, and why."""
+    """In how many scenes the solver has no coarser mesh, so that variants which begin on one are missing, and why."""
     solvers = [scene.solver for scene in scenes if scene.solver is not None]
-    failures = [[way.failure for way in solver.ways.values() if way.failure is not None] for solver in solvers]
+    failures = [[one.failure for one in solver.ways.values() if one.failure is not None] for solver in solvers]
     reasons = [next((why for why in each if why.startswith(UNMESHED)), None) for each in failures]
     without = [why for why in reasons if why is not None]
     if not without:
@@ -202,10 +202,10 @@ def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: E
     )
 
 
-def _solver(rival: Rivals, error: float | None) -> SolverFigures:
-    """What the solver took: at its own stop test, and in each way; the cheapest has at most the model's error."""
+def _solver(scene: SolverOutcomes, error: float | None) -> SolverFigures:
+    """What the solver took: at its own stop test, and in each variant; the cheapest has at most the model's error."""
     ways = {
-        outcome.way.name: WayFigures(
+        outcome.variant.name: VariantFigures(
             seconds=outcome.whole_seconds,
             setup_seconds=outcome.setup_seconds,
             relative_error=outcome.relative_error,
@@ -213,14 +213,14 @@ def _solver(rival: Rivals, error: float | None) -> SolverFigures:
             newton_iterations=outcome.newton_iterations,
         )
         if outcome.converged
-        else WayFigures(failure=outcome.failure)
-        for outcome in rival.outcomes
+        else VariantFigures(failure=outcome.failure)
+        for outcome in scene.outcomes
     }
-    best = None if error is None else cheapest(rival.outcomes, error)
-    own = rival.outcomes[0]
+    best = None if error is None else cheapest(scene.outcomes, error)
+    own = scene.outcomes[0]
     return SolverFigures(
         seconds=own.whole_seconds if own.converged else None,
-        cheapest=None if best is None else best.way.name,
+        cheapest=None if best is None else best.variant.name,
         cheapest_seconds=None if best is None else best.whole_seconds,
         ways=ways,
     )

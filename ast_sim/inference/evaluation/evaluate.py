@@ -45,7 +45,7 @@ def evaluate(
     split: str = "test",
     advance: Callable[[str], None] = lambda name: None,
     effort: Effort = FIRST_CALL,
-    rival_scenes: int = 0,
+    solver_scenes: int = 0,
     made_from: str | os.PathLike[str] | None = None,
 ) -> Figures:
     """Predict all trajectories of a split and compare.
@@ -54,7 +54,7 @@ def evaluate(
     its frames and once for its deepest frame, and of each scene that the solver has solved.
 
     Args:
-        rival_scenes: in how many scenes the solver goes to the deepest frame, to compare.
+        solver_scenes: in how many scenes the solver goes to the deepest frame, to compare.
         made_from: as in `deepest_frames`.
 
     Raises:
@@ -88,7 +88,7 @@ def evaluate(
         failures=sum(scene.failure is not None for scene in scenes),
         jumps=scheme.jumps,
         effort=dataclasses.asdict(effort),
-        deepest=deepest_frames.deepest_frames(model, dataset, split, effort, rival_scenes, advance, made_from),
+        deepest=deepest_frames.deepest_frames(model, dataset, split, effort, solver_scenes, advance, made_from),
         speedup=_speedup(scenes),
         length_unit=dataset.info.length_unit,
         stress_unit="Pa",

@@ -1,4 +1,4 @@
-"""What an error costs: efforts of a run and ways of the solver on the same scenes, timed in turns on one thread."""
+"""What an error costs: efforts of a run and variants of the solver on the same scenes, timed in turns on one thread."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ import torch
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.inference.answering import answers
-from ast_sim.inference.effort import Effort, choices
+from ast_sim.inference.effort import Effort, choices, options_of
 from ast_sim.inference.evaluation.deepest_frames import deepest_predicted
 from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.quantities.relative_errors import errors_of, moves
 from ast_sim.models.simulator import Simulator
-from ast_sim.simulate.jobs.rival import FINER, OWN_STOP_TEST, Outcome, rivals
+from ast_sim.simulate.jobs.fastest_solver import FINER, OWN_STOP_TEST, Outcome, solver_outcomes
 from ast_sim.support.disk import write_json
 from ast_sim.support.errors import ConfigError, SimulationError
 from ast_sim.support.progress import Progress, ShowProgress
@@ -88,7 +88,7 @@ def trade(
     command: str = "ast_sim.trade",
     progress: ShowProgress = True,
 ) -> Trade:
-    """Measure what each error costs: by every effort of a run, and by the solver in every way that it can be run.
+    """Measure what each error costs: by every effort of a run, and by the solver in all its variants.
 
     Each answer is of the deepest frame of a scene, alone, on one thread. Times are processor seconds, and count what is
     prepared for a mesh.
@@ -133,7 +133,7 @@ def _measured(
 ) -> dict[str, TradeFigures]:
     efforts = choices(run.settings.model, run.settings.train.corrections) or (run.effort,)
     own: dict[Effort, list[_Timed]] = {effort: [] for effort in efforts}
-    ways: dict[str, list[_Timed]] = {}
+    variants: dict[str, list[_Timed]] = {}
     no_solver = ""
     solved = _outcomes(dataset, split, indices, made_from) if stated is None else None
     with Progress(len(indices), "scenes", progress) as bar:
@@ -145,16 +145,16 @@ def _measured(
             try:
                 for outcome in next(solved) if solved is not None else ():
                     one = _Timed(outcome.errors, outcome.whole_seconds) if outcome.converged else _NONE
-                    ways.setdefault(outcome.way.name, []).append(one)
+                    variants.setdefault(outcome.variant.name, []).append(one)
             except (ConfigError, SimulationError) as error:
                 no_solver = str(error)
                 solved = None
-                ways = {}
+                variants = {}
             bar.advance(f"{split}/{index:06d}")
     quantities = _quantities(one for timed in own.values() for one in timed)
     if stated is not None:
-        ways = {"as stated": [_Timed(dict.fromkeys(quantities, 0.0), stated)] * len(indices)}
-    finer = _on_finer_mesh(dataset, split, indices[:MESH_SCENES], made_from, ways)
+        variants = {"as stated": [_Timed(dict.fromkeys(quantities, 0.0), stated)] * len(indices)}
+    finer = _on_finer_mesh(dataset, split, indices[:MESH_SCENES], made_from, variants)
     commands = {effort: _command(run, dataset, split, effort) for effort in efforts}
     shared = {
         "scenes": tuple(f"{split}/{index:06d}" for index in indices),
@@ -165,7 +165,7 @@ def _measured(
     return {
         quantity: TradeFigures(
             run=tuple(_setting(effort.text, timed, quantity, commands[effort]) for effort, timed in own.items()),
-            solver=tuple(_setting(name, timed, quantity) for name, timed in ways.items()),
+            solver=tuple(_setting(name, timed, quantity) for name, timed in variants.items()),
             mesh_errors=tuple(outcome.errors[quantity] for outcome in finer),
             quantity=quantity,
             **shared,
@@ -198,8 +198,8 @@ def _setting(name: str, timed: Sequence[_Timed], quantity: str, command: str = "
 def _outcomes(
     dataset: Dataset, split: str, indices: Sequence[int], made_from: str | os.PathLike[str] | None
 ) -> Iterator[tuple[Outcome, ...]]:
-    """What the solver took for each scene in every way. It begins with the first one, where all its errors come up."""
-    for solved in rivals(dataset.path, split, indices, made_from=made_from, progress=False):
+    """What each variant of the solver took for each scene. It begins with the first one, where all errors come up."""
+    for solved in solver_outcomes(dataset.path, split, indices, made_from=made_from, progress=False):
         yield solved.outcomes
 
 
@@ -208,7 +208,7 @@ def _on_finer_mesh(
     split: str,
     indices: Sequence[int],
     made_from: str | os.PathLike[str] | None,
-    ways: Mapping[str, Sequence[_Timed]],
+    variants: Mapping[str, Sequence[_Timed]],
 ) -> list[Outcome]:
     """Frames of the dataset on a mesh of 8 times the nodes.
 
@@ -216,10 +216,12 @@ def _on_finer_mesh(
     """
     from ast_sim.simulate.jobs.mesh_error import LONGER, MOST_SECONDS  # takes 0.2 s
 
-    own = [one.seconds for one in ways.get(OWN_STOP_TEST, ())]
+    own = [one.seconds for one in variants.get(OWN_STOP_TEST, ())]
     if not own or LONGER * max(own[: len(indices)]) > MOST_SECONDS:
         return []
-    solved = rivals(dataset.path, split, indices, ways=(FINER,), starts=(1,), made_from=made_from, progress=False)
+    solved = solver_outcomes(
+        dataset.path, split, indices, variants=(FINER,), starts=(1,), made_from=made_from, progress=False
+    )
     return [outcome for scene in solved for outcome in scene.outcomes if outcome.converged]
 
 
@@ -244,9 +246,7 @@ def timed_answer(
 
 def _command(run: Run, dataset: Dataset, split: str, effort: Effort) -> str:
     """What predicts the first scene with this effort."""
-    counts = ["--corrections", str(effort.corrections), "--newton-steps", str(effort.newton_steps)]
-    asked = ["--exact"] if effort == Effort.exact() else counts
-    what = asked if run.settings.model.scheme.corrects else []
+    what = options_of(effort) if run.settings.model.scheme.corrects else []
     scene = [dataset.path.name, "--split", split, "--index", "0"]
     return shlex.join(["ast-sim", "predict", run.path.name, *scene, "--out", "answer.h5", *what])
 

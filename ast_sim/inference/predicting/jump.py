@@ -11,7 +11,8 @@ an answer (`Effort.solved`).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import cache, partial
+from dataclasses import replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -19,10 +20,10 @@ import torch
 
 from ast_sim.batches.carry import Carrier
 from ast_sim.inference.answer import Answer
-from ast_sim.inference.effort import AGAIN, MOST_NEWTON_STEPS, Effort, newton_steps
+from ast_sim.inference.effort import AGAIN, MOST_NEWTON_STEPS, Effort
 from ast_sim.inference.predicting.jumping_scene import JumpingFrame, JumpingScene
 from ast_sim.inference.predicting.predicted_frames import predict_frames
-from ast_sim.inference.predicting.question import Question, not_finite, too_far
+from ast_sim.inference.predicting.question import Question, law_of, not_finite, too_far
 from ast_sim.models.simulator import Simulator
 from ast_sim.named_field import STRESS
 from ast_sim.support.errors import RolloutError
@@ -106,12 +107,12 @@ def _predicted(
     for question in questions:
         question.check(model.config.data.given_frames)
     # Several questions may share a scene.
-    graph, carrier, solver = cache(model.graph), cache(Carrier), cache(partial(newton_steps, model.config))
+    graph, carrier, solver = cache(model.graph), cache(Carrier), cache(law_of(model.config).newton_steps)
     scenes = [JumpingScene(model, q, graph(q.scene), carrier(q.scene), solver) for q in questions]
     frames = [frame for scene in scenes for frame in scene.frames]
     with model.predicting(), Progress(len(frames), "frames", progress) as bar:
         for group in (group for wave in _waves(scenes) for group in _groups(model, wave)):
-            _predict(model, group, effort.corrections)
+            _predict(model, group, effort)
             if not effort.newton_steps and not effort.solved:
                 bar.advance(group[-1].name, len(group))
         # In ascending order, whatever the domains: with friction a frame needs to know the one before.
@@ -130,7 +131,7 @@ def _predicted(
 def _start_again(model: Simulator, frame: JumpingFrame, effort: Effort, progress: Progress) -> None:
     """Newton steps need a nearly right start: more corrections give a better one."""
     first, spent = (frame.positions, frame.fields, frame.last_step), frame.seconds
-    _predict(model, [frame], effort.corrections + AGAIN)
+    _predict(model, [frame], replace(effort, corrections=effort.corrections + AGAIN))
     frame.refine(effort.newton_steps, False, progress)
     frame.seconds += spent
     if frame.failure is not None:  # the first answer at least says that it has not converged
@@ -168,14 +169,14 @@ def _groups(model: Simulator, frames: Sequence[JumpingFrame]) -> Iterator[list[J
         yield group
 
 
-def _predict(model: Simulator, group: list[JumpingFrame], corrections: int) -> None:
+def _predict(model: Simulator, group: list[JumpingFrame], effort: Effort) -> None:
     """Predict the frames of a batch."""
     try:
-        predicted = predict_frames(model, [frame.start for frame in group], corrections)
+        predicted = predict_frames(model, [frame.start for frame in group], effort)
     except RolloutError as error:
         if len(group) > 1:  # one frame must not spoil the others
             for frame in group:
-                _predict(model, [frame], corrections)
+                _predict(model, [frame], effort)
         else:
             group[0].failure = f"{group[0].name}: {error}"
         return

@@ -16,9 +16,8 @@ from ast_sim.batches.batch_builder import State
 from ast_sim.batches.carry import Carrier
 from ast_sim.batches.graph import Graph
 from ast_sim.inference.answer import Answer
-from ast_sim.inference.effort import law_of
 from ast_sim.inference.predicting.predicted_frames import Start
-from ast_sim.inference.predicting.question import Question
+from ast_sim.inference.predicting.question import Question, law_of
 from ast_sim.mechanics.equilibria import Equilibria
 from ast_sim.mechanics.linearised_contact import STILL, NewtonSteps
 from ast_sim.models.simulator import Simulator

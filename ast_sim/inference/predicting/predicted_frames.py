@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ast_sim.batches.batch_builder import Batch, State
 from ast_sim.batches.graph import Graph
+from ast_sim.inference.effort import FIRST_CALL, Effort
 from ast_sim.models.simulator import Simulator
 
 
@@ -47,9 +48,9 @@ class PredictedFrame(NamedTuple):
     seconds: float
 
 
-def predict_frames(model: Simulator, starts: Sequence[Start], corrections: int = 0) -> list[PredictedFrame]:
-    """Predict the frames by one call, then by corrections, each of which corrects the answer before it. Fields on
-    elements are predicted by the last call only."""
+def predict_frames(model: Simulator, starts: Sequence[Start], effort: Effort = FIRST_CALL) -> list[PredictedFrame]:
+    """Predict the frames by one call, then by the corrections of the effort, each of which corrects the answer before
+    it. Fields on elements are predicted by the last call only."""
     began = time.perf_counter()
     names, graphs, states, prescribed_position = zip(*starts, strict=True)
     graph = Graph.concatenate(graphs)
@@ -58,8 +59,8 @@ def predict_frames(model: Simulator, starts: Sequence[Start], corrections: int =
     sizes = graph.node_offsets.diff().tolist()
     positions = []
     predictions = []
-    for call in range(corrections + 1):
-        last_call = call == corrections
+    for call in range(effort.corrections + 1):
+        last_call = call == effort.corrections
         position, prediction = model.advance(replace(batch, wants_elements=last_call), prescribed_position)
         positions.append(position.split(sizes))
         predictions.append(prediction)

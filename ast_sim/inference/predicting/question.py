@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from ast_sim.inference.answer import Answer
-from ast_sim.inference.effort import law_of
 from ast_sim.mechanics.driven import Driven
+from ast_sim.mechanics.physics_check import Law
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.named_field import STRESS, NamedField
@@ -137,6 +137,11 @@ class Question:
             source=dict(source),
             latents={number: row for number in numbers if (row := latents.get(number)) is not None},
         )
+
+
+def law_of(config: ModelConfig) -> Law:
+    """The law of the training scenes, which is the one of all answers."""
+    return Law(config.data.material, config.data.contact_range)
 
 
 def fields_of(trajectory: Trajectory) -> dict[str, np.ndarray]:

@@ -31,7 +31,7 @@ from ast_sim.inference.quantities.band import LEVEL, Band, Comparison, compared
 from ast_sim.inference.quantities.relative_errors import moves
 from ast_sim.runs.scope import LEEWAY, spacing_of
 from ast_sim.scene import Scene, Trajectory
-from ast_sim.simulate.jobs.rival import deepest_frame
+from ast_sim.simulate.jobs.fastest_solver import deepest_frame
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.progress import Progress, ShowProgress
 

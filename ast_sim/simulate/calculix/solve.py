@@ -281,7 +281,7 @@ def _check(case: SolidCase, position: np.ndarray) -> tuple[list[float], str]:
             return jacobian, f"an element is inverted (det F = {smallest:.3g})"
         for body, contact in enumerate(contacts):
             if contact.intersects(frame.astype(np.float64)):
-                return jacobian, f"body {body} intersects itself, which CalculiX is not asked to prevent"
+                return jacobian, f"body {body} intersects itself, which CalculiX does not prevent here"
         jacobian.append(smallest)
     return jacobian, ""
 

@@ -17,7 +17,7 @@ from ast_sim.material import ELASTIC, YOUNG, Material
 from ast_sim.mechanics.case import NEXT_NOTE, NOTES, SolidCase
 from ast_sim.mechanics.contact_and_friction import ContactSettings
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
-from ast_sim.motion_course import Course, MovedNodes
+from ast_sim.motion_between_frames import Course, MovedNodes
 from ast_sim.number_arrays import point
 from ast_sim.scene import AttributeValue, NodeType, Scene
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec, PartSpec

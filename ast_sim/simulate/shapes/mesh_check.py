@@ -64,7 +64,7 @@ def check_mesh(position: np.ndarray, elements: np.ndarray, name: str, smallest_a
         first = int(np.argmin(angle))
         raise BadMesh(
             f"{name}: {_count(sharp, 'tetrahedron', 'tetrahedra')} with a dihedral angle below {smallest_angle:g}"
-            f" degrees, the sharpest with {angle[first]:.2g}: {_at(first, elements, centre)}; mesh it anew"
+            f" degrees, the sharpest with {angle[first]:.2g}: {_at(first, elements, centre)}; mesh it again"
         )
     check_no_intersections(position, boundary(elements), name)
 

@@ -11,9 +11,9 @@ from simulate.own_assembly.assemblies import SPEC, write_assembly, write_box
 from ast_sim.dataset.reader import Dataset
 from ast_sim.scene import NodeType
 from ast_sim.simulate.families import assembly
+from ast_sim.simulate.jobs.fastest_solver import VARIANTS, SolverVariant, solver_outcomes
 from ast_sim.simulate.jobs.generate import generate
 from ast_sim.simulate.jobs.recipe import recipe_of
-from ast_sim.simulate.jobs.rival import WAYS, Way, rivals
 from ast_sim.simulate.jobs.samples import draw_sample
 from ast_sim.simulate.own_assembly.parameters import completed
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
@@ -298,14 +298,14 @@ def test_the_solver_goes_straight_to_a_frame(tmp_path):
     (tmp_path / "made.py").write_text("def make(gmsh):\n    gmsh.model.occ.addBox(0, 0, 0, 10, 10, 5)\n")
     out = tmp_path / "study.h5"
     generate("assembly", out, spec=path, train=0, valid=0, test=1, workers=1, progress=False)
-    ways = (WAYS[0], Way("half", nodes=0.5))
-    (found,) = rivals(out, "test", [0], ways=ways, starts=(1,), made_from=path, progress=False)
+    ways = (VARIANTS[0], SolverVariant("half", nodes=0.5))
+    (found,) = solver_outcomes(out, "test", [0], variants=ways, starts=(1,), made_from=path, progress=False)
     own, coarse = found.outcomes
     assert found.frame == 2 and own.converged and coarse.converged, (own.failure, coarse.failure)
     assert own.relative_error < 0.02 and own.relative_error < coarse.relative_error < 0.8
     assert coarse.nodes < 0.75 * own.nodes
     with pytest.raises(ConfigError, match="was made of a specification: say where to find that"):
-        rivals(out, "test", [0], progress=False)
+        solver_outcomes(out, "test", [0], progress=False)
 
 
 def test_a_draw_that_cannot_stand_is_drawn_again(tmp_path):

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from torch import Tensor, nn
 
-from ast_sim.batches.training_pool import Pool
+from ast_sim.batches.training_pool import TrainingPool
 from ast_sim.dataset.reader import Dataset
 from ast_sim.runs import checkpoint
 from ast_sim.runs.folder import RunFolder
@@ -25,7 +25,7 @@ class Saver:
         dataset: Dataset,
         model: nn.Module,
         optimizer: Optimizer,
-        pool: Pool | None,
+        pool: TrainingPool | None,
         processes: Processes,
         tell: Callable[[str], None],
     ) -> None:

@@ -1,4 +1,4 @@
-"""The solver at one frame, as the rival of a model: real solves of tiny scenes in real worker processes."""
+"""The solver at one frame, beside which a model is judged: real solves of tiny scenes in real worker processes."""
 
 from dataclasses import replace
 
@@ -8,22 +8,30 @@ import pytest
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.mechanics.solver import SolverSettings
+from ast_sim.simulate.jobs.fastest_solver import (
+    FINER,
+    VARIANTS,
+    Outcome,
+    SolverVariant,
+    cheapest,
+    deepest_frame,
+    solver_outcomes,
+)
+from ast_sim.simulate.jobs.fastest_solver_worker import VariantSolver
 from ast_sim.simulate.jobs.generate import generate
 from ast_sim.simulate.jobs.recipe import recipe_of
-from ast_sim.simulate.jobs.rival import FINER, WAYS, Outcome, Way, cheapest, deepest_frame, rivals
-from ast_sim.simulate.jobs.rival_worker import WaySolver
 from ast_sim.simulate.jobs.samples import Recipe, draw_sample
 from ast_sim.simulate.shapes.mesh_check import BadMesh
 from ast_sim.support.errors import ConfigError, DatasetError, SimulationError
 
-OWN, LOOSER = Way("own stop test"), Way("10x looser", tolerance=10)
+OWN, LOOSER = SolverVariant("own stop test"), SolverVariant("10x looser", tolerance=10)
 SETTINGS = {"seed": 5, "nodes": 150, "frames": 9, "workers": 1, "progress": False}
 
 
 @pytest.fixture(scope="module")
 def plates(tmp_path_factory):
     return generate(
-        "deforming_plate", tmp_path_factory.mktemp("rival") / "a.h5", train=2, valid=0, test=0, **SETTINGS
+        "deforming_plate", tmp_path_factory.mktemp("solver") / "a.h5", train=2, valid=0, test=0, **SETTINGS
     ).path
 
 
@@ -49,8 +57,8 @@ def changed(plates, path, generator=None, **changes):
 def test_other_meshes_of_second_order_plates_are_of_second_order_too(tmp_path):
     settings = {**SETTINGS, "nodes": 600, "order": 2, "keep": (5,)}
     ten = generate("deforming_plate", tmp_path / "ten.h5", train=1, valid=0, test=0, **settings).path
-    half, nested = Way("half", nodes=0.5), Way("nested", nodes=0.5, linearised=6, newton=2)
-    (scene,) = rivals(ten, "train", [0], ways=(OWN, half, nested, FINER), starts=(1,), progress=False)
+    half, nested = SolverVariant("half", nodes=0.5), SolverVariant("nested", nodes=0.5, linearised=6, newton=2)
+    (scene,) = solver_outcomes(ten, "train", [0], variants=(OWN, half, nested, FINER), starts=(1,), progress=False)
     own, coarse, kept, finer = scene.outcomes
     with Dataset(ten) as data:
         assert data.element_size == 10 and own.nodes == data.scene("train", 0).num_nodes == 497
@@ -63,7 +71,7 @@ def test_other_meshes_of_second_order_plates_are_of_second_order_too(tmp_path):
 
 def test_every_way_is_solved_and_compared_with_the_dataset(plates, no_torch, capsys):
     told = []
-    found = list(rivals(plates, "train", [0, 1], repeats=2, progress=lambda *values: told.append(values)))
+    found = list(solver_outcomes(plates, "train", [0, 1], repeats=2, progress=lambda *values: told.append(values)))
     assert [values[:2] for values in told] == [(1, 2), (2, 2)] and capsys.readouterr().err == ""
     assert [(scene.split, scene.index) for scene in found] == [("train", 0), ("train", 1)]
     with Dataset(plates) as data:
@@ -73,7 +81,7 @@ def test_every_way_is_solved_and_compared_with_the_dataset(plates, no_torch, cap
             assert scene.frame == deepest_frame(truth) and scene.draw_seconds > 0 and scene.processor
             moved = frame - truth.position[0]
             assert scene.displacement == pytest.approx(np.sqrt((moved[free] ** 2).sum(axis=1).mean()), rel=1e-6)
-            assert [outcome.way for outcome in scene.outcomes] == list(WAYS)
+            assert [outcome.variant for outcome in scene.outcomes] == list(VARIANTS)
             for outcome in scene.outcomes:
                 assert outcome.converged and outcome.position.dtype == np.float64
                 # Prescribed nodes are exact, up to the float32 of the dataset.
@@ -81,39 +89,39 @@ def test_every_way_is_solved_and_compared_with_the_dataset(plates, no_torch, cap
                 error = np.sqrt(((outcome.position - frame)[free] ** 2).sum(axis=1).mean())
                 assert outcome.error == pytest.approx(error) and outcome.relative_error == error / scene.displacement
                 assert 0 < outcome.seconds < 30 and outcome.setup_seconds > 0 and outcome.newton_iterations > 0
-                if outcome.way.linearised:
-                    steps = outcome.way.linearised
+                if outcome.variant.linearised:
+                    steps = outcome.variant.linearised
                     assert (outcome.start, outcome.load_steps) == (steps, steps)
-                    counted = steps + 1 + outcome.way.newton
-                    assert (outcome.newton_iterations > counted) == outcome.way.finished
+                    counted = steps + 1 + outcome.variant.newton
+                    assert (outcome.newton_iterations > counted) == outcome.variant.finished
                     assert outcome.newton_iterations >= counted
-                    assert outcome.way.nodes < 1 or outcome.relative_error < 0.03
-                if outcome.way.newton:
-                    assert outcome.relative_error < {1: 0.03, 2: 0.005, 3: 0.005}[outcome.way.newton]
-                if outcome.way.linearised:
+                    assert outcome.variant.nodes < 1 or outcome.relative_error < 0.03
+                if outcome.variant.newton:
+                    assert outcome.relative_error < {1: 0.03, 2: 0.005, 3: 0.005}[outcome.variant.newton]
+                if outcome.variant.linearised:
                     continue
                 assert outcome.load_steps >= {1: 1, 2: 2, 4: 3, 0: scene.frame}[outcome.start]
-                assert (outcome.nodes < truth.scene.num_nodes) == (outcome.way.nodes < 1)
+                assert (outcome.nodes < truth.scene.num_nodes) == (outcome.variant.nodes < 1)
 
 
 def test_the_own_stop_test_gives_the_frame_of_the_dataset(plates):
     """Without friction there is one equilibrium here. Both solves leave forces of at most 1e-4 of the mean force of an
     element, so their positions differ by about that share of the displacement; looser tests by as much more.
     """
-    for scene in rivals(plates, "train", [0, 1], lambda _: 5, ways=WAYS[:3], progress=False):
+    for scene in solver_outcomes(plates, "train", [0, 1], lambda _: 5, variants=VARIANTS[:3], progress=False):
         assert scene.frame == 5
         for outcome, most in zip(scene.outcomes, (1e-4, 1e-3, 1e-2), strict=True):
-            assert outcome.relative_error <= 3 * most, outcome.way
+            assert outcome.relative_error <= 3 * most, outcome.variant
 
 
 def test_frame_by_frame_every_frame_is_a_load_step(plates):
-    (scene,) = rivals(plates, "train", [0], [5], ways=[OWN], starts=[0], progress=False)
+    (scene,) = solver_outcomes(plates, "train", [0], [5], variants=[OWN], starts=[0], progress=False)
     (outcome,) = scene.outcomes
     assert outcome.start == 0 and outcome.load_steps >= 5 and outcome.relative_error <= 3e-4
 
 
 def test_coarser_meshes_and_a_longer_range_of_contact_differ_but_resemble_it(plates):
-    (scene,) = rivals(plates, "train", [0], ways=WAYS[3:7], starts=[1], progress=False)
+    (scene,) = solver_outcomes(plates, "train", [0], variants=VARIANTS[3:7], starts=[1], progress=False)
     doubled, fourfold, half, quarter = (outcome.relative_error for outcome in scene.outcomes)
     assert 1e-3 < doubled < fourfold < 0.3
     assert 1e-3 < half < quarter < 0.6
@@ -122,27 +130,27 @@ def test_coarser_meshes_and_a_longer_range_of_contact_differ_but_resemble_it(pla
 def test_nested_iteration_counts_the_coarse_solution_and_corrects_it(plates):
     """Without friction there is one equilibrium at the clearance with which contact is linearised. Newton's method ends
     there, from a coarser mesh and from load steps on the mesh itself."""
-    coarse = Way("coarse", nodes=0.5, linearised=6)
-    ways = [coarse, *(Way(f"{n} after", nodes=0.5, linearised=6, newton=n) for n in (1, 2, 6))]
-    ways.append(Way("straight", linearised=6, newton=6))
-    (scene,) = rivals(plates, "train", [0], ways=ways, progress=False)
+    coarse = SolverVariant("coarse", nodes=0.5, linearised=6)
+    ways = [coarse, *(SolverVariant(f"{n} after", nodes=0.5, linearised=6, newton=n) for n in (1, 2, 6))]
+    ways.append(SolverVariant("straight", linearised=6, newton=6))
+    (scene,) = solver_outcomes(plates, "train", [0], variants=ways, progress=False)
     before, one, two, six, straight = scene.outcomes
     assert before.nodes == one.nodes == six.nodes < straight.nodes
     for after in (one, two, six):
         assert after.seconds > before.seconds and after.setup_seconds > before.setup_seconds
-        assert after.newton_iterations == before.newton_iterations + after.way.newton
+        assert after.newton_iterations == before.newton_iterations + after.variant.newton
     assert before.relative_error > 5 * one.relative_error > 10 * two.relative_error
     np.testing.assert_allclose(six.position, straight.position, rtol=0, atol=1e-5 * scene.displacement)
 
 
 def test_the_solver_finishes_what_began_nearly_right(plates):
     """It ends where it ends from rest, in fewer iterations there; from overlaps it does not begin."""
-    coarse = Way("coarse", nodes=0.5, linearised=6, newton=1)
-    straight = Way("straight", linearised=6)
+    coarse = SolverVariant("coarse", nodes=0.5, linearised=6, newton=1)
+    straight = SolverVariant("straight", linearised=6)
     finished = [replace(way, finished=True) for way in (coarse, straight)]
-    overlapping = Way("overlapping", nodes=0.5, linearised=6, finished=True)
+    overlapping = SolverVariant("overlapping", nodes=0.5, linearised=6, finished=True)
     ways = [OWN, coarse, straight, *finished, overlapping]
-    (scene,) = rivals(plates, "train", [0], ways=ways, progress=False)
+    (scene,) = solver_outcomes(plates, "train", [0], variants=ways, progress=False)
     own, *begun, from_coarse, from_straight, refused = scene.outcomes
     for start, end in zip(begun, (from_coarse, from_straight), strict=True):
         assert end.relative_error < 1e-4 < start.relative_error
@@ -152,7 +160,7 @@ def test_the_solver_finishes_what_began_nearly_right(plates):
 
 
 def test_what_fails_is_said_and_not_raised(plates):
-    (scene,) = rivals(plates, "train", [0], [5], ways=[OWN, LOOSER], most_iterations=2, progress=False)
+    (scene,) = solver_outcomes(plates, "train", [0], [5], variants=[OWN, LOOSER], most_iterations=2, progress=False)
     for outcome in scene.outcomes:
         assert outcome.failure == "more than 2 Newton iterations" and outcome.position is None and outcome.seconds > 0
     assert cheapest(scene.outcomes, 1.0) is None
@@ -163,12 +171,14 @@ def test_what_fails_is_said_and_not_raised(plates):
 
     asked, drawn = [], draw_sample(Recipe("deforming_plate", 5, 150, 9), "train", 0)
     effort = {"starts": [1], "repeats": 1, "most_iterations": 9}
-    solver = WaySolver(replace(drawn, remesh=refuse), 5, drawn.case.prescribed_position[5], SolverSettings(), effort)
-    outcomes = [solver.outcome(way) for way in WAYS[5:]]
+    solver = VariantSolver(
+        replace(drawn, remesh=refuse), 5, drawn.case.prescribed_position[5], SolverSettings(), effort
+    )
+    outcomes = [solver.outcome(way) for way in VARIANTS[5:]]
     assert outcomes[0].failure == "could not be meshed: no mesh with 0.5 of the nodes"
     assert outcomes[3].failure == "could not be meshed: no mesh with 0.25 of the nodes"
     for outcome in outcomes:
-        assert outcome.converged == (outcome.way.nodes == 1), outcome.way
+        assert outcome.converged == (outcome.variant.nodes == 1), outcome.variant
     assert not outcomes[0].converged and outcomes[0].relative_error == outcomes[0].seconds == np.inf
     assert asked[:2] == [0.5, 0.475] and len(asked) == 10  # each share is meshed once, with sizes near it
 
@@ -184,13 +194,13 @@ def test_the_cheapest_is_the_fastest_that_is_as_accurate():
 
 def test_kept_frames_are_frames_of_the_whole_motion(plates, tmp_path):
     kept = generate("deforming_plate", tmp_path / "b.h5", train=1, valid=0, test=0, keep=(3, 6), **SETTINGS).path
-    (scene,) = rivals(kept, "train", [0], [2], ways=[OWN], starts=[1], progress=False)
-    (whole,) = rivals(plates, "train", [0], [6], ways=[OWN], starts=[1], progress=False)
+    (scene,) = solver_outcomes(kept, "train", [0], [2], variants=[OWN], starts=[1], progress=False)
+    (whole,) = solver_outcomes(plates, "train", [0], [6], variants=[OWN], starts=[1], progress=False)
     assert scene.outcomes[0].relative_error <= 3e-4
     np.testing.assert_array_equal(scene.outcomes[0].position, whole.outcomes[0].position)
 
 
-def test_only_datasets_of_the_bundled_solver_have_a_rival(plates, tmp_path):
+def test_only_datasets_of_the_bundled_solver_are_solved_again(plates, tmp_path):
     with Dataset(plates) as data:
         generator = data.info.generator
         assert recipe_of("a.h5", data.info).nodes == 150
@@ -202,30 +212,30 @@ def test_only_datasets_of_the_bundled_solver_have_a_rival(plates, tmp_path):
     for name, changes in cases.items():
         path = changed(plates, tmp_path / f"{name}.h5", **changes)
         with pytest.raises(ConfigError, match="was not generated by the bundled solver"):
-            rivals(path, "train", [0])
+            solver_outcomes(path, "train", [0])
     broken = changed(plates, tmp_path / "broken.h5", {**generator, "nodes": "many"})
     with pytest.raises(ConfigError, match="its settings cannot be read"):
-        rivals(broken, "train", [0])
+        solver_outcomes(broken, "train", [0])
     other = changed(plates, tmp_path / "other.h5", {**generator, "seed": 6})
     with pytest.raises(SimulationError, match="train/000000: drawing the scene again gives another one"):
-        list(rivals(other, "train", [0], progress=False))
+        list(solver_outcomes(other, "train", [0], progress=False))
     with pytest.raises(ConfigError, match="was made without parts of your own or a specification: leave .* out"):
-        rivals(plates, "train", [0], made_from=tmp_path)
+        solver_outcomes(plates, "train", [0], made_from=tmp_path)
 
 
 def test_frames_and_trajectories_that_are_not_there(plates):
     for frames in ([0], [9], lambda _: 9):
         with pytest.raises(ConfigError, match="train/000000 has no frame [09]: 1 to 8"):
-            rivals(plates, "train", [0], frames)
+            solver_outcomes(plates, "train", [0], frames)
     with pytest.raises(ConfigError, match="1 frames are too few"):
-        rivals(plates, "train", [0, 1], [3])
+        solver_outcomes(plates, "train", [0, 1], [3])
     with pytest.raises(DatasetError, match="no sample 2 in train"):
-        rivals(plates, "train", [2])
+        solver_outcomes(plates, "train", [2])
     with pytest.raises(ConfigError, match="must be at least 0"):
-        rivals(plates, "train", [0], starts=[-1])
+        solver_outcomes(plates, "train", [0], starts=[-1])
 
 
 def test_a_process_that_ends_before_its_time_is_named(plates, monkeypatch):
-    monkeypatch.setattr("ast_sim.simulate.jobs.rival.RIVAL_MODULE", "ast_sim.no_such_module")
+    monkeypatch.setattr("ast_sim.simulate.jobs.fastest_solver.SOLVER_MODULE", "ast_sim.no_such_module")
     with pytest.raises(SimulationError, match="train/000000: its worker process"):
-        list(rivals(plates, "train", [0], progress=False))
+        list(solver_outcomes(plates, "train", [0], progress=False))

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from ast_sim.batches.batch_builder import Target
 from ast_sim.batches.pairs import Jump, PairSampler
-from ast_sim.batches.training_pool import Pool
+from ast_sim.batches.training_pool import TrainingPool
 
 MEMORY = 0.99  # share of the running mean square that stays when a scene is added
 UNSEEN = 0.3  # the first guess of the errors of later calls, relative to that of the first
@@ -44,8 +44,8 @@ class _Guess(Jump):
         self.source, self.frame, self.then = self.frame, self.then, None
 
 
-class JumpPool(Pool):
-    """Jumps that are corrected side by side; see `Pool` for the other arguments.
+class JumpPool(TrainingPool):
+    """Jumps that are corrected side by side; see `TrainingPool` for the other arguments.
 
     A jump leads from `PairSampler.source`, or in some cases from a later frame, to a frame that is drawn; after
     `calls` calls another jump follows at its place. Where the source is not the first frame, half of the jumps start
@@ -74,7 +74,7 @@ class JumpPool(Pool):
         return [(g.call, float(np.square(m.numpy()[free(g.index)]).mean(dtype=np.float64))) for g, m in motions]
 
     def weights(self, number: int, errors: list[tuple[int, float]]) -> Tensor:
-        """See `Pool`. The errors are added to the running means, so that all parts have the same means."""
+        """See `TrainingPool`. The errors are added to the running means, so that all parts have the same means."""
         for call, square in errors:
             before = self._squares[call]
             self._squares[call] = square if np.isnan(before) else MEMORY * before + (1 - MEMORY) * square

@@ -1,10 +1,10 @@
-"""A process that solves one frame of one scene in several ways, and times each.
+"""A process that solves one frame of one scene in several variants, and times each.
 
-    python -m ast_sim.simulate.jobs.rival_worker FOLDER PARENT
+    python -m ast_sim.simulate.jobs.fastest_solver_worker FOLDER PARENT
 
-It reads one line from its standard input, a task as JSON: `dataset`, `recipe`, `split`, `index`, `frame`, `ways`,
-`starts`, `repeats`, `most_iterations` (see `rival`). It writes the outcomes to FOLDER and answers with a line of JSON:
-`done`, or `error`. Like every worker it has one thread, never imports torch, and ends when its parent has ended.
+It reads one line from its standard input, a task as JSON: `dataset`, `recipe`, `split`, `index`, `frame`, `variants`,
+`starts`, `repeats`, `most_iterations` (see `fastest_solver`). It writes the outcomes to FOLDER and answers with a line
+of JSON: `done`, or `error`. Like every worker it has one thread, never imports torch, and ends with its parent.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from ast_sim.mechanics.reaction import Reaction
 from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.scene import Scene
 from ast_sim.simulate.families.known_families import family_module
-from ast_sim.simulate.jobs.rival import OUTCOMES, POSITIONS, UNMESHED, Outcome, Way
+from ast_sim.simulate.jobs.fastest_solver import OUTCOMES, POSITIONS, UNMESHED, Outcome, SolverVariant
 from ast_sim.simulate.jobs.samples import Recipe, draw_sample
 from ast_sim.simulate.jobs.worker import answers_for
 from ast_sim.simulate.shapes.mesh_transfer import transferred
@@ -69,8 +69,8 @@ def outcomes_of(task: dict[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndar
     drawn = draw_sample(recipe, task["split"], task["index"])
     draw_seconds = _seconds() - started
     _require_same(drawn.case.scene, scene)
-    solver = WaySolver(drawn, frame, truth, family_module(recipe.family).SETTINGS, task)
-    outcomes = [solver.outcome(Way(**way)) for way in task["ways"]]
+    solver = VariantSolver(drawn, frame, truth, family_module(recipe.family).SETTINGS, task)
+    outcomes = [solver.outcome(SolverVariant(**variant)) for variant in task["variants"]]
     facts = {
         "displacement": solver.displacement,
         "draw_seconds": draw_seconds,
@@ -98,8 +98,8 @@ def _require_same(drawn: Scene, stored: Scene) -> None:
         )
 
 
-class WaySolver:
-    """Solves one frame of a drawn scene in one way after another.
+class VariantSolver:
+    """Solves one frame of a drawn scene in one variant after another.
 
     Args:
         drawn: the scene.
@@ -118,31 +118,31 @@ class WaySolver:
         self.displacement = _root_mean_square((truth - self.rest)[self.free])
         self._loads: dict[float, _Loads] = {}
         self._meshes: dict[float, tuple[SolidCase | str, float]] = {1.0: (drawn.case, 0.0)}
-        self._solved: dict[Way, tuple[int, OneFrame]] = {}
+        self._solved: dict[SolverVariant, tuple[int, OneFrame]] = {}
         # The libraries are loaded in the first solution; nobody's time should hold that.
         solve_frame(drawn.case, frame, settings, most_iterations=1)
         self._linearised(drawn.case, 1)
         self._on_own_mesh(drawn.case, self.rest)
 
-    def outcome(self, way: Way) -> Outcome:
-        """Mesh and solve in this way; the cheapest of all starts that converge."""
-        if way.nodes not in self._meshes:
-            self._meshes[way.nodes] = self._meshed(way.nodes)
-        case, mesh_seconds = self._meshes[way.nodes]
+    def outcome(self, variant: SolverVariant) -> Outcome:
+        """Mesh and solve with this variant; the cheapest of all starts that converge."""
+        if variant.nodes not in self._meshes:
+            self._meshes[variant.nodes] = self._meshed(variant.nodes)
+        case, mesh_seconds = self._meshes[variant.nodes]
         if not isinstance(case, SolidCase):
-            return Outcome(way, f"{UNMESHED}: {case}", mesh_seconds=mesh_seconds)
-        start, first = self._solution(case, way)
-        more = way.newton or way.finished
-        solved = self._best(lambda: self._continued(case, first, way)) if more else first
+            return Outcome(variant, f"{UNMESHED}: {case}", mesh_seconds=mesh_seconds)
+        start, first = self._solution(case, variant)
+        more = variant.newton or variant.finished
+        solved = self._best(lambda: self._continued(case, first, variant)) if more else first
         position, error = None, np.inf
         load_errors = np.inf, np.inf
         if solved.position is not None:
-            own = way.nodes == 1 or more
+            own = variant.nodes == 1 or more
             position = solved.position if own else self._on_own_mesh(case, solved.position)
             error = _root_mean_square((position - self.truth)[self.free])
-            load_errors = self._load_errors(1.0 if own else way.nodes, solved.position)
+            load_errors = self._load_errors(1.0 if own else variant.nodes, solved.position)
         return Outcome(
-            way,
+            variant,
             solved.failure,
             case.scene.num_nodes,
             start,
@@ -187,14 +187,14 @@ class WaySolver:
             coarser = str(error)
         return coarser, _seconds() - started
 
-    def _solution(self, case: SolidCase, way: Way) -> tuple[int, OneFrame]:
-        """The start and the solution on the mesh of a way; ways that differ in what follows share it."""
-        alone = replace(way, name="", newton=0, finished=False)
+    def _solution(self, case: SolidCase, variant: SolverVariant) -> tuple[int, OneFrame]:
+        """The start and the solution on the mesh of a variant; variants that differ in what follows share it."""
+        alone = replace(variant, name="", newton=0, finished=False)
         if alone not in self._solved:
-            case = replace(case, contact=replace(case.contact, dhat=way.dhat * case.contact.dhat))
-            settings = replace(self.settings, force_tolerance=way.tolerance * self.settings.force_tolerance)
-            if way.linearised:
-                solved = way.linearised, self._best(lambda: self._linearised(case, way.linearised))
+            case = replace(case, contact=replace(case.contact, dhat=variant.dhat * case.contact.dhat))
+            settings = replace(self.settings, force_tolerance=variant.tolerance * self.settings.force_tolerance)
+            if variant.linearised:
+                solved = variant.linearised, self._best(lambda: self._linearised(case, variant.linearised))
             else:
                 solved = self._fastest(case, settings)
             self._solved[alone] = solved
@@ -240,7 +240,7 @@ class WaySolver:
             setup = 0.0
         return OneFrame(position, failure, process_time() - began - setup, setup, steps, steps + 1, 0)
 
-    def _continued(self, case: SolidCase, solved: OneFrame, way: Way) -> OneFrame:
+    def _continued(self, case: SolidCase, solved: OneFrame, variant: SolverVariant) -> OneFrame:
         """A solution, carried over to the mesh of the dataset, and what follows there: Newton steps, and the solver."""
         if solved.position is None:
             return solved
@@ -250,10 +250,10 @@ class WaySolver:
         iterations = 0
         try:
             newton = _newton_steps(self.drawn.case)
-            equilibria = Equilibria(self.drawn.case, newton, self.settings) if way.finished else None
+            equilibria = Equilibria(self.drawn.case, newton, self.settings) if variant.finished else None
             setup = process_time() - began
-            position = solved.position if way.nodes == 1 else self._on_own_mesh(case, solved.position)
-            for step in range(way.newton):
+            position = solved.position if variant.nodes == 1 else self._on_own_mesh(case, solved.position)
+            for step in range(variant.newton):
                 position = newton.step(position, from_afar=step == 0)
             if equilibria is not None:
                 position = equilibria.finish(self.frame, position)
@@ -267,7 +267,7 @@ class WaySolver:
             failure=failure,
             seconds=solved.seconds + process_time() - began - setup,
             setup_seconds=solved.setup_seconds + setup,
-            newton_iterations=solved.newton_iterations + way.newton + iterations,
+            newton_iterations=solved.newton_iterations + variant.newton + iterations,
         )
 
     def _on_own_mesh(self, case: SolidCase, position: np.ndarray) -> np.ndarray:

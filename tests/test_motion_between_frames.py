@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 
-from ast_sim.motion_course import Course, MovedNodes
+from ast_sim.motion_between_frames import Course, MovedNodes
 from ast_sim.prescribed_motion import Motion, RigidMotion
 from ast_sim.scene import NodeType, Scene
 

@@ -7,11 +7,11 @@ import pytest
 import torch
 from data_samples import block, mesh_graph, trajectory, write
 
-from ast_sim.batches import training_jumps
+from ast_sim.batches import training_corrections
 from ast_sim.batches.carry import Carrier
 from ast_sim.batches.pairs import PairSampler
 from ast_sim.batches.scheme import Scheme
-from ast_sim.batches.training_jumps import LEAST, UNSEEN, JumpPool
+from ast_sim.batches.training_corrections import LEAST, UNSEEN, JumpPool
 from ast_sim.dataset.reader import Dataset
 
 CALLS, LARGEST = 3, 1.0
@@ -62,7 +62,7 @@ def numbers_of(name: str) -> tuple[int, int]:
 
 
 def test_a_jump_starts_from_a_frame_carried_along_and_then_from_the_answer_before(dataset, monkeypatch):
-    monkeypatch.setattr(training_jumps, "ELSEWHERE", 0.0)
+    monkeypatch.setattr(training_corrections, "ELSEWHERE", 0.0)
     jumps, before, first_calls, corrections = pool(dataset, mirror=()), {}, 0, 0
     for number in range(60):
         batch, target = jumps.batch(number)
@@ -90,7 +90,7 @@ def test_a_jump_starts_from_a_frame_carried_along_and_then_from_the_answer_befor
 
 
 def test_some_jumps_start_from_a_later_frame(dataset, monkeypatch):
-    monkeypatch.setattr(training_jumps, "ELSEWHERE", 1.0)
+    monkeypatch.setattr(training_corrections, "ELSEWHERE", 1.0)
     jumps, sources = pool(dataset, calls=1, mirror=()), Counter()
     for number in range(100):
         batch, target = jumps.batch(number)

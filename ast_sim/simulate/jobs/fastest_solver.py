@@ -1,10 +1,10 @@
-"""What the solver takes for one frame: the rival of a learned model whose user wants the answer at one frame.
+"""What the solver takes for one frame, at its fastest: a learned model whose user wants one frame is compared with it.
 
 Such a user need not solve all frames before. The solver goes from rest to the wanted frame, straight, in a few load
-steps, and frame by frame; the fastest counts. It is run in several ways that trade accuracy for time: looser stop
+steps, and frame by frame; the fastest counts. It is run in several variants, which trade accuracy for time: looser stop
 tests, a longer range of contact, coarser meshes, Newton steps with linearised contact, and nested iteration: a coarse
 solution is carried over to the mesh of the dataset and Newton steps correct it there, which the solver may finish.
-`cheapest` finds the fastest way that is as accurate as the model.
+`cheapest` finds the fastest variant that is as accurate as the model.
 Each scene is solved in a process of its own, on one thread and without torch.
 """
 
@@ -31,15 +31,15 @@ from ast_sim.simulate.jobs.samples import sample_name
 from ast_sim.support.errors import ConfigError, SimulationError
 from ast_sim.support.progress import ShowProgress
 
-RIVAL_MODULE = "ast_sim.simulate.jobs.rival_worker"
+SOLVER_MODULE = "ast_sim.simulate.jobs.fastest_solver_worker"
 OUTCOMES, POSITIONS = "outcomes.json", "positions.npz"
 MOST_ITERATIONS = 1000
-UNMESHED = "could not be meshed"  # with why, of ways that need a coarser mesh where there is none
+UNMESHED = "could not be meshed"  # with why, of variants that need a coarser mesh where there is none
 
 
 @dataclass(frozen=True)
-class Way:
-    """A way to run the solver, relative to how it made the dataset.
+class SolverVariant:
+    """Settings with which the solver is run, relative to those with which it made the dataset.
 
     Attributes:
         name: what it is called.
@@ -64,7 +64,7 @@ class Way:
 
 
 _NESTED = tuple(
-    Way(
+    SolverVariant(
         f"{share} nodes, {solution}, {newton} Newton step{'s' * (newton > 1)}",
         nodes=nodes,
         linearised=linearised,
@@ -75,38 +75,42 @@ _NESTED = tuple(
     for newton in (1, 2, 3)
 )
 OWN_STOP_TEST = "own stop test"
-WAYS = (
-    Way(OWN_STOP_TEST),
-    Way("10x looser", tolerance=10),
-    Way("100x looser", tolerance=100),
-    Way("2x dhat", dhat=2),
-    Way("4x dhat", dhat=4),
-    Way("1/2 nodes", nodes=0.5),
-    Way("1/4 nodes", nodes=0.25),
-    Way("1/2 nodes, 10x looser", nodes=0.5, tolerance=10),
-    Way("1/4 nodes, 10x looser", nodes=0.25, tolerance=10),
-    Way("6 linearised steps", linearised=6),
-    Way("12 linearised steps", linearised=12),
-    Way("1/2 nodes, 6 linearised steps", nodes=0.5, linearised=6),
-    Way("1/2 nodes, 12 linearised steps", nodes=0.5, linearised=12),
-    Way("24 linearised steps", linearised=24),
+VARIANTS = (
+    SolverVariant(OWN_STOP_TEST),
+    SolverVariant("10x looser", tolerance=10),
+    SolverVariant("100x looser", tolerance=100),
+    SolverVariant("2x dhat", dhat=2),
+    SolverVariant("4x dhat", dhat=4),
+    SolverVariant("1/2 nodes", nodes=0.5),
+    SolverVariant("1/4 nodes", nodes=0.25),
+    SolverVariant("1/2 nodes, 10x looser", nodes=0.5, tolerance=10),
+    SolverVariant("1/4 nodes, 10x looser", nodes=0.25, tolerance=10),
+    SolverVariant("6 linearised steps", linearised=6),
+    SolverVariant("12 linearised steps", linearised=12),
+    SolverVariant("1/2 nodes, 6 linearised steps", nodes=0.5, linearised=6),
+    SolverVariant("1/2 nodes, 12 linearised steps", nodes=0.5, linearised=12),
+    SolverVariant("24 linearised steps", linearised=24),
     *_NESTED,
-    Way("6 linearised steps, then own stop test", linearised=6, finished=True),
+    SolverVariant("6 linearised steps, then own stop test", linearised=6, finished=True),
     *(
-        Way(f"{name} nodes, 6 linearised steps, 1 Newton step, then own stop test", share, 1.0, 1.0, 6, 1, True)
+        SolverVariant(
+            f"{name} nodes, 6 linearised steps, 1 Newton step, then own stop test", share, 1.0, 1.0, 6, 1, True
+        )
         for name, share in (("1/2", 0.5), ("1/4", 0.25))
     ),
 )
-FINER = Way("8 times the nodes", nodes=8.0)  # no rival: it shows what the mesh of the dataset gets wrong
+FINER = SolverVariant(
+    "8 times the nodes", nodes=8.0
+)  # not compared with a model: it shows what the mesh of the dataset gets wrong
 STARTS = (1, 2, 4, 0)
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What one way gave in one scene, of its cheapest start.
+    """What one variant gave in one scene, of its cheapest start.
 
     Attributes:
-        way: how the solver was run.
+        variant: how the solver was run.
         failure: why there is no solution, such as "could not be meshed: ..."; empty if there is one.
         nodes: nodes of the mesh that was solved, obstacles included; of nested iteration, of the coarse one.
         start: the load steps that were planned, 0: one for each frame. A step that did not converge was halved, and
@@ -127,7 +131,7 @@ class Outcome:
             without a solution, or where they are 0 there.
     """
 
-    way: Way
+    variant: SolverVariant
     failure: str = ""
     nodes: int = 0
     start: int = 0
@@ -160,7 +164,7 @@ class Outcome:
 
 
 @dataclass(frozen=True, eq=False)
-class Rivals:
+class SolverOutcomes:
     """All outcomes of one scene.
 
     Attributes:
@@ -169,7 +173,7 @@ class Rivals:
         displacement: root of the mean square of the displacement in this frame in metres, over the free nodes.
         draw_seconds: processor time in which the scene was drawn and meshed as in the dataset.
         processor: where the times were measured.
-        outcomes: one for each way, in their order.
+        outcomes: one for each variant, in their order.
     """
 
     split: str
@@ -194,27 +198,27 @@ def deepest_frame(trajectory: Trajectory) -> int:
     return int(np.square(moved[:, free], dtype=np.float64).sum(axis=(1, 2)).argmax())
 
 
-def rivals(
+def solver_outcomes(
     dataset: str | os.PathLike[str],
     split: str,
     indices: Sequence[int],
     frame_of: Callable[[Trajectory], int] | Sequence[int] = deepest_frame,
     *,
-    ways: Sequence[Way] = WAYS,
+    variants: Sequence[SolverVariant] = VARIANTS,
     starts: Sequence[int] = STARTS,
     repeats: int = 1,
     made_from: str | os.PathLike[str] | None = None,
     most_iterations: int = MOST_ITERATIONS,
     progress: ShowProgress = True,
-) -> Iterator[Rivals]:
-    """Solve one frame of each scene in every way; one scene after another, each in a process of its own.
+) -> Iterator[SolverOutcomes]:
+    """Solve one frame of each scene with every variant; one scene after another, each in a process of its own.
 
     Args:
         dataset: a dataset that `generate` made with the bundled solver.
         split, indices: which trajectories.
         frame_of: the number of the frame of each trajectory, from 1: a function of it, or one number for each index.
-        ways: how the solver is run.
-        starts: in how many load steps each way is tried; 0: frame by frame. The cheapest that converges counts.
+        variants: how the solver is run.
+        starts: in how many load steps each variant is tried; 0: frame by frame. The cheapest that converges counts.
         repeats: how often each is timed. The smallest time counts.
         made_from: where the parts or the specification lie, if the dataset was made of the user's own.
         most_iterations: Newton iterations after which a try is given up.
@@ -234,7 +238,7 @@ def rivals(
     request = {
         "dataset": str(Path(dataset).resolve()),
         "recipe": asdict(recipe),
-        "ways": [asdict(way) for way in ways],
+        "variants": [asdict(variant) for variant in variants],
         "starts": list(starts),
         "repeats": repeats,
         "most_iterations": most_iterations,
@@ -256,21 +260,21 @@ def _frame(
     return int(frame)
 
 
-def _all(tasks: list[dict[str, Any]], progress: ShowProgress) -> Iterator[Rivals]:
+def _all(tasks: list[dict[str, Any]], progress: ShowProgress) -> Iterator[SolverOutcomes]:
     with SceneProgress(len(tasks), "scenes", progress) as bar:
         for task in tasks:
             name = sample_name(task["split"], task["index"])
             bar.begin(name)
-            rivals = _one(task, name, bar)
+            outcomes = _one(task, name, bar)
             bar.end(name)
             bar.advance(name)
-            yield rivals
+            yield outcomes
 
 
-def _one(task: dict[str, Any], name: str, bar: SceneProgress) -> Rivals:
+def _one(task: dict[str, Any], name: str, bar: SceneProgress) -> SolverOutcomes:
     """Have a process solve a scene; read what it leaves in a folder."""
     with tempfile.TemporaryDirectory(prefix="ast_sim-") as folder, selectors.DefaultSelector() as selector:
-        process = Process(RIVAL_MODULE, folder)
+        process = Process(SOLVER_MODULE, folder)
         try:
             process.say(json.dumps(task))
             selector.register(process, selectors.EVENT_READ)
@@ -285,7 +289,7 @@ def _one(task: dict[str, Any], name: str, bar: SceneProgress) -> Rivals:
         with np.load(Path(folder) / POSITIONS, allow_pickle=False) as file:
             positions = {int(key): file[key] for key in file.files}
     outcomes = (
-        Outcome(**{**values, "way": Way(**values["way"]), "position": positions.get(place)})
+        Outcome(**{**values, "variant": SolverVariant(**values["variant"]), "position": positions.get(place)})
         for place, values in enumerate(facts.pop("outcomes"))
     )
-    return Rivals(task["split"], task["index"], task["frame"], **facts, outcomes=tuple(outcomes))
+    return SolverOutcomes(task["split"], task["index"], task["frame"], **facts, outcomes=tuple(outcomes))
