@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from ast_sim.trade_figures import Setting, TradeFigures, front
+from ast_sim.trade_figures import Setting, Side, TradeFigures, front
 
 SCENES = tuple(f"test/{index:06d}" for index in range(10))
 
@@ -88,3 +88,19 @@ def test_the_error_of_the_mesh_is_the_median_of_its_scenes():
     assert known.mesh_error == 0.034
     assert known.lines()[-1].startswith("The mesh alone makes the displacement 3.4 % wrong (median of 3 scenes, ")
     assert TradeFigures.from_json(known.to_json()) == known
+
+
+def test_other_sides_stand_in_the_rows_with_their_fastest_setting():
+    other = Side("mgn", (setting("one call", 0.02, 0.06), setting("two calls", 0.06, 0.03), setting("no", 0, 0.01, 2)))
+    known = figures(others=(other, Side("none", ())))
+    assert known.columns[:5] == ["error at most", "the run", "the solver", "mgn", "none"]
+    rows = known.rows()
+    names = [one and one.name for one in (row.others["mgn"] for row in rows)]
+    assert names == ["two calls", "one call", "one call", None, None, None]
+    assert rows[0].cells[1:6] == ["20 ms: call", "50 ms: coarse", "30 ms: two calls", "none", "2.50 (2.50 to 2.50)"]
+    assert len(rows[0].cells) == len(known.columns)
+    assert known.lines()[1].startswith("10 %: run: 20 ms (call); solver: 50 ms (coarse); mgn: 30 ms (two calls); none")
+    values = known.to_json()
+    assert values["rows"][0]["others"] == {"mgn": "two calls", "none": None}
+    assert values["others"][0]["settings"][2]["errors"][-1] is None
+    assert TradeFigures.from_json(values) == known
