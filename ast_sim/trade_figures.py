@@ -107,6 +107,7 @@ class TradeFigures:
         origin: command, commit, processor, run and dataset.
         quantity: what the errors are of: "displacement", "reaction" or "stress".
         others: what else was measured on the same scenes.
+        no_process: why no Gaussian process is among them, or none of this quantity.
     """
 
     scenes: tuple[str, ...]
@@ -118,6 +119,7 @@ class TradeFigures:
     origin: dict[str, Any] = field(default_factory=dict)
     quantity: str = "displacement"
     others: tuple[Side, ...] = ()
+    no_process: str = ""
 
     @property
     def columns(self) -> list[str]:
@@ -182,12 +184,13 @@ class TradeFigures:
                 parts.append(f"pays after {row.pays_after:,} questions")
             told.append(f"{100 * row.tolerance:g} %: {'; '.join(parts)}")
         told += [self.mesh_line] if self.mesh_line else []
+        told += [f"no Gaussian process: {self.no_process}"] if self.no_process else []
         return told + ([f"the solver was not run: {self.no_solver}"] if self.no_solver else [])
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self:
         """From what `to_json` gave."""
-        known = {key: values[key] for key in ("no_solver", "invested", "origin", "quantity")}
+        known = {key: values[key] for key in ("no_solver", "no_process", "invested", "origin", "quantity")}
         known["mesh_errors"] = tuple(values["mesh_errors"])
         known["others"] = tuple(Side(side["name"], _settings(side["settings"])) for side in values["others"])
         run, solver = (_settings(values[side]) for side in ("run", "solver"))

@@ -104,3 +104,9 @@ def test_other_sides_stand_in_the_rows_with_their_fastest_setting():
     assert values["rows"][0]["others"] == {"mgn": "two calls", "none": None}
     assert values["others"][0]["settings"][2]["errors"][-1] is None
     assert TradeFigures.from_json(values) == known
+
+
+def test_why_there_is_no_gaussian_process_is_told():
+    known = figures(no_process="each scene has a mesh of its own")
+    assert known.lines()[-1] == "no Gaussian process: each scene has a mesh of its own"
+    assert TradeFigures.from_json(known.to_json()) == known

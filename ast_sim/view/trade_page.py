@@ -45,7 +45,9 @@ def _table(figures: TradeFigures) -> dict[str, Any]:
     others = {side.name for side in figures.others}
     columns = [name if name in others else name.capitalize() for name in figures.columns]
     rows = [row.cells for row in figures.rows()]
-    return {"name": figures.quantity.capitalize(), "columns": columns, "rows": rows, "mesh": figures.mesh_line}
+    process = f"No Gaussian process: {figures.no_process}" if figures.no_process else ""
+    notes = [f"{line}." for line in (figures.mesh_line, process) if line]
+    return {"name": figures.quantity.capitalize(), "columns": columns, "rows": rows, "notes": notes}
 
 
 def _settings(figures: Sequence[TradeFigures]) -> dict[str, Any]:

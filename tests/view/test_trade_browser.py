@@ -25,7 +25,9 @@ def path(tmp_path_factory):
     figures = TradeFigures(("test/000000", "test/000001"), run, solver, others=(other,), **more)
     path = tmp_path_factory.mktemp("trade") / "trade.html"
     bare = Setting("call", (0.3, 0.4), (0.02, 0.02))
-    force = TradeFigures(figures.scenes, (bare, *run[1:]), solver, quantity="reaction", others=(failed,))
+    force = TradeFigures(
+        figures.scenes, (bare, *run[1:]), solver, quantity="reaction", others=(failed,), no_process=HOSTILE
+    )
     trade_page.write(path, [figures, force], HOSTILE)
     return path
 
@@ -55,7 +57,8 @@ def test_the_table_and_the_chart_show_the_settings(browser, path):
     head = texts(browser, "#trade-tables .table-card:first-child thead th")
     assert head[2:5] == ["The solver", HOSTILE, "Solver / run"]
     assert texts(browser, "#trade-tables h3") == ["Displacement", "Reaction"]
-    (mesh,) = texts(browser, "#trade-tables p")
+    mesh, process = texts(browser, "#trade-tables p")
+    assert process == f"No Gaussian process: {HOSTILE}."
     assert mesh.startswith("The mesh alone makes the displacement 3 % wrong (median of 3 scenes, against 8 times")
     call = ["the run", "call", "8 %", "40 %", "20 ms", f"ast-sim predict '{HOSTILE}'"]
     assert texts(browser, "#trade-settings tbody tr:first-child td, #trade-settings tbody tr:first-child th") == call

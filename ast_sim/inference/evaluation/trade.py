@@ -19,6 +19,7 @@ from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.inference.answering import answers
 from ast_sim.inference.effort import Effort, choices
 from ast_sim.inference.evaluation.deepest_frames import deepest_predicted
+from ast_sim.inference.evaluation.gaussian_process import process_beside
 from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.quantities.relative_errors import errors_of, moves
 from ast_sim.models.simulator import Simulator
@@ -89,8 +90,8 @@ def trade(
     command: str = "ast_sim.trade",
     progress: ShowProgress = True,
 ) -> Trade:
-    """Measure what each error costs: by every effort of a run, by the solver in every way that it can be run, and by
-    other runs.
+    """Measure what each error costs: by every effort of a run, by the solver in every way that it can be run, by other
+    runs, and by a Gaussian process that learns the training scenes of the dataset, where it applies.
 
     Each answer is of the deepest frame of a scene, alone, on one thread. Times are processor seconds, and count what is
     prepared for a mesh.
@@ -181,6 +182,7 @@ def _measured(
                 solved = None
                 ways = {}
             bar.advance(scene)
+        process = process_beside(run.model, scenes.dataset, scenes.split, scenes.indices, bar.line)
     quantities = _quantities(one for timed in answered[name].values() for one in timed)
     if stated is not None:
         ways = {"as stated": [_Timed(dict.fromkeys(quantities, 0.0), stated)] * len(scenes.indices)}
@@ -197,7 +199,11 @@ def _measured(
             solver=tuple(_setting(way, timed, quantity) for way, timed in ways.items()),
             mesh_errors=tuple(outcome.errors[quantity] for outcome in finer),
             quantity=quantity,
-            others=tuple(Side(other, _of_run(runs[other], scenes, answered[other], quantity)) for other in others),
+            others=(
+                *(Side(other, _of_run(runs[other], scenes, answered[other], quantity)) for other in others),
+                *process.sides(quantity),
+            ),
+            no_process=process.why_not(quantity),
             **shared,
         )
         for quantity in quantities
