@@ -80,7 +80,9 @@ class TradeRow:
     def verdict(self) -> str:
         """Who is faster, by the interval."""
         if self.run is None or self.solver is None:
-            return "none keeps it" if self.run is self.solver else ("only the run" if self.run else "the solver alone")
+            if self.run is self.solver:
+                return "neither keeps it"
+            return "only the run" if self.run else "the solver alone"
         assert self.low is not None and self.high is not None
         return "the run" if self.low > 1 else "the solver" if self.high < 1 else "level"
 
@@ -147,13 +149,29 @@ class TradeFigures:
         others = {side.name: _fastest(side.settings, tolerance) for side in self.others}
         if run is None or solver is None:
             return TradeRow(tolerance, run, solver, others=others)
-        ratios = np.array(solver.seconds) / np.array(run.seconds)
-        drawn = np.random.default_rng(0).integers(len(ratios), size=(RESAMPLES, len(ratios)))
-        low, high = np.quantile(np.median(ratios[drawn], axis=1), (0.025, 0.975))
+        ratio, low, high = _ratio(solver, run)
         saved = solver.middle - run.middle
         known = self.invested is not None and saved > 0
         pays = math.ceil(self.invested / saved) if known and self.invested is not None else None
-        return TradeRow(tolerance, run, solver, float(np.median(ratios)), float(low), float(high), pays, others)
+        return TradeRow(tolerance, run, solver, ratio, low, high, pays, others)
+
+    @property
+    def ahead_of_run(self) -> dict[str, list[float]]:
+        """The other sides that are faster than the run by the interval, or keep an error that it does not, and the
+        errors at which they are."""
+        ahead: dict[str, list[float]] = {}
+        for row in self.rows():
+            for name, setting in row.others.items():
+                if setting is not None and (row.run is None or _ratio(setting, row.run)[2] < 1):
+                    ahead.setdefault(name, []).append(row.tolerance)
+        return ahead
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences below a table, without full stops."""
+        told = [f"{name} is ahead of the run at {_at(errors)}" for name, errors in self.ahead_of_run.items()]
+        told += [self.mesh_line] if self.mesh_line else []
+        return told + ([f"No Gaussian process: {self.no_process}"] if self.no_process else [])
 
     @property
     def mesh_error(self) -> float | None:
@@ -183,8 +201,7 @@ class TradeFigures:
             if row.pays_after is not None:
                 parts.append(f"pays after {row.pays_after:,} questions")
             told.append(f"{100 * row.tolerance:g} %: {'; '.join(parts)}")
-        told += [self.mesh_line] if self.mesh_line else []
-        told += [f"no Gaussian process: {self.no_process}"] if self.no_process else []
+        told += self.notes
         return told + ([f"the solver was not run: {self.no_solver}"] if self.no_solver else [])
 
     @classmethod
@@ -228,6 +245,20 @@ def front(settings: Sequence[Setting]) -> list[Setting]:
 def _fastest(settings: Sequence[Setting], tolerance: float) -> Setting | None:
     fit = [one for one in settings if one.kept <= tolerance and math.isfinite(one.middle)]
     return min(fit, key=lambda one: one.middle, default=None)
+
+
+def _ratio(one: Setting, other: Setting) -> tuple[float, float, float]:
+    """The median over the scenes of the seconds of one over those of the other, and its interval of 95 %. Where neither
+    has an answer they are level."""
+    seconds, others = np.array(one.seconds), np.array(other.seconds)
+    ratios = np.divide(seconds, others, out=np.ones(len(seconds)), where=np.isfinite(seconds) | np.isfinite(others))
+    drawn = np.random.default_rng(0).integers(len(ratios), size=(RESAMPLES, len(ratios)))
+    low, high = np.quantile(np.median(ratios[drawn], axis=1), (0.025, 0.975))
+    return float(np.median(ratios)), float(low), float(high)
+
+
+def _at(errors: Sequence[float]) -> str:
+    return " and ".join(f"{100 * error:g} %" for error in errors)
 
 
 def _told(who: str, setting: Setting | None) -> str:

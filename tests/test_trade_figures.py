@@ -108,5 +108,21 @@ def test_other_sides_stand_in_the_rows_with_their_fastest_setting():
 
 def test_why_there_is_no_gaussian_process_is_told():
     known = figures(no_process="each scene has a mesh of its own")
-    assert known.lines()[-1] == "no Gaussian process: each scene has a mesh of its own"
+    assert known.lines()[-1] == known.notes[-1] == "No Gaussian process: each scene has a mesh of its own"
     assert TradeFigures.from_json(known.to_json()) == known
+
+
+def test_a_side_that_is_ahead_of_the_run_is_named():
+    fast = Side("Gaussian process", (setting("40 scenes", 0.004, 0.001),))  # keeps 0.36 %, the run keeps 0.9 % at best
+    mixed = Setting("one call", (0.0,) * 10, (0.01,) * 5 + (0.03,) * 5)  # level with the call of the run
+    known = figures(others=(fast, Side("mgn", (mixed,))))
+    assert known.ahead_of_run["Gaussian process"] == [0.1, 0.05, 0.025, 0.01, 0.005]
+    assert known.ahead_of_run["mgn"] == [0.05, 0.025, 0.01, 0.005, 0.002]
+    assert known.notes[0] == "Gaussian process is ahead of the run at 10 % and 5 % and 2.5 % and 1 % and 0.5 %"
+    assert known.notes[0] in known.lines() and figures().notes == []
+
+
+def test_a_scene_that_neither_answers_speaks_for_nobody():
+    slow, fast = (Side(name, (setting(name, 0.01, seconds, 1),)) for name, seconds in (("slow", 0.2), ("fast", 0.01)))
+    known = TradeFigures(SCENES, (setting("run", 0.01, 0.1, 1),), (), others=(slow, fast))
+    assert known.ahead_of_run == {"fast": [0.1, 0.05, 0.025, 0.01]}

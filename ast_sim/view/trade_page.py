@@ -45,8 +45,7 @@ def _table(figures: TradeFigures) -> dict[str, Any]:
     others = {side.name for side in figures.others}
     columns = [name if name in others else name.capitalize() for name in figures.columns]
     rows = [row.cells for row in figures.rows()]
-    process = f"No Gaussian process: {figures.no_process}" if figures.no_process else ""
-    notes = [f"{line}." for line in (figures.mesh_line, process) if line]
+    notes = [f"{note}." for note in figures.notes]
     return {"name": figures.quantity.capitalize(), "columns": columns, "rows": rows, "notes": notes}
 
 

@@ -119,8 +119,7 @@ def _table(figures: TradeFigures) -> list[str]:
         *(f"| {' | '.join(row.cells)} |" for row in rows),
         "",
         f"The run is ahead in {len(figures.ahead)} of {len(rows)} cells, the solver in {len(figures.behind)}.",
-        *([f"{figures.mesh_line}."] if figures.mesh_line else []),
-        *([f"No Gaussian process: {figures.no_process}."] if figures.no_process else []),
+        *(f"{note}." for note in figures.notes),
     ]
 
 

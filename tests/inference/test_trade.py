@@ -1,6 +1,7 @@
 """A trade, measured for real: the run that comes with the package and the solver on a small plate."""
 
 import json
+from pathlib import Path
 
 import pytest
 import toy
@@ -56,6 +57,15 @@ def test_another_program_is_represented_by_its_seconds(plates):
     assert rows[0].verdict == "the run" and rows[0].ratio > 100
     with pytest.raises(ConfigError, match="seconds are -1; they must be above 0"):
         ast_sim.trade(ast_sim.example_run("plates"), plates, solver_seconds=-1)
+
+
+def test_the_force_of_metal_that_yields_is_judged_by_what_the_dataset_holds():
+    """No law gives it from positions."""
+    clips = Path(__file__).parents[2] / "examples" / "clip" / "test_scenes.h5"
+    by_quantity = ast_sim.trade(ast_sim.example_run("clip"), clips, scenes=2, solver_seconds=14.0).by_quantity
+    assert list(by_quantity) == ["displacement", "reaction", "stress"]
+    assert 1e-4 < max(by_quantity["reaction"].run[0].errors) < 0.1
+    assert by_quantity["stress"].no_process == "it needs at least 10 training scenes, and the dataset has 0"
 
 
 def test_where_our_solver_did_not_make_the_scenes_it_says_so(tmp_path):
