@@ -1,7 +1,7 @@
-"""Speed against accuracy on the same scenes: the settings of a run and of the solver, and who is faster at an error.
+"""Speed against accuracy on the same scenes: the settings of a run, of the solver and of others, and who is faster.
 
 A setting keeps an error if at least `WITHIN` of the scenes are within it. At each tolerance the setting that keeps it
-and has the smallest median time counts, on both sides. Errors are relative and at the deepest frame: of the
+and has the smallest median time counts, on every side. Errors are relative and at the deepest frame: of the
 displacement, of the reaction (the force on the driven nodes) or of the largest stress.
 """
 
@@ -17,7 +17,6 @@ import numpy as np
 
 TOLERANCES = (0.1, 0.05, 0.025, 0.01, 0.005, 0.002)
 WITHIN = 0.9
-COLUMNS = ("error at most", "the run", "the solver", "solver / run", "faster", "pays after")  # of `TradeRow.cells`
 RESAMPLES = 2000  # of the bootstrap over scenes
 
 
@@ -48,6 +47,14 @@ class Setting:
 
 
 @dataclass(frozen=True)
+class Side:
+    """What stands beside the run and the solver, such as another run that has learned from the same dataset."""
+
+    name: str
+    settings: tuple[Setting, ...]
+
+
+@dataclass(frozen=True)
 class TradeRow:
     """What an error costs.
 
@@ -57,6 +64,7 @@ class TradeRow:
         ratio: the median over the scenes of the solver's seconds over those of the run; None: one of them is missing.
         low, high: an interval of 95 % of the ratio, by bootstrap over the scenes.
         pays_after: the questions after which simulation and training are repaid; None: never, or not known.
+        others: the same setting of each other side, by its name.
     """
 
     tolerance: float
@@ -66,22 +74,26 @@ class TradeRow:
     low: float | None = None
     high: float | None = None
     pays_after: int | None = None
+    others: Mapping[str, Setting | None] = field(default_factory=dict)
 
     @property
     def verdict(self) -> str:
         """Who is faster, by the interval."""
         if self.run is None or self.solver is None:
-            return "none keeps it" if self.run is self.solver else ("only the run" if self.run else "the solver alone")
+            if self.run is self.solver:
+                return "neither keeps it"
+            return "only the run" if self.run else "the solver alone"
         assert self.low is not None and self.high is not None
         return "the run" if self.low > 1 else "the solver" if self.high < 1 else "level"
 
     @property
     def cells(self) -> list[str]:
-        """The error, both settings, the ratio, the verdict and when it pays, as texts of a table."""
-        both = ["none" if one is None else f"{1000 * one.middle:.3g} ms: {one.name}" for one in (self.run, self.solver)]
+        """The error, the setting of each side, the ratio, the verdict and when it pays, as texts of a table."""
+        sides = (self.run, self.solver, *self.others.values())
+        settings = ["none" if one is None else f"{1000 * one.middle:.3g} ms: {one.name}" for one in sides]
         ratio = "–" if self.ratio is None else f"{self.ratio:.2f} ({self.low:.2f} to {self.high:.2f})"
         pays = "–" if self.pays_after is None else f"{self.pays_after:,} questions"
-        return [f"{100 * self.tolerance:g} %", *both, ratio, self.verdict, pays]
+        return [f"{100 * self.tolerance:g} %", *settings, ratio, self.verdict, pays]
 
 
 @dataclass(frozen=True)
@@ -96,6 +108,8 @@ class TradeFigures:
         invested: the seconds of simulation and training before the first answer; None: not known.
         origin: command, commit, processor, run and dataset.
         quantity: what the errors are of: "displacement", "reaction" or "stress".
+        others: what else was measured on the same scenes.
+        no_process: why no Gaussian process is among them, or none of this quantity.
     """
 
     scenes: tuple[str, ...]
@@ -106,6 +120,14 @@ class TradeFigures:
     invested: float | None = None
     origin: dict[str, Any] = field(default_factory=dict)
     quantity: str = "displacement"
+    others: tuple[Side, ...] = ()
+    no_process: str = ""
+
+    @property
+    def columns(self) -> list[str]:
+        """What stands above `TradeRow.cells`."""
+        sides = ["the run", "the solver", *(side.name for side in self.others)]
+        return ["error at most", *sides, "solver / run", "faster", "pays after"]
 
     def rows(self) -> list[TradeRow]:
         """A row for each of `TOLERANCES`."""
@@ -124,15 +146,32 @@ class TradeFigures:
     def _row(self, tolerance: float) -> TradeRow:
         run = _fastest(self.run, tolerance)
         solver = _fastest(self.solver, tolerance)
+        others = {side.name: _fastest(side.settings, tolerance) for side in self.others}
         if run is None or solver is None:
-            return TradeRow(tolerance, run, solver)
-        ratios = np.array(solver.seconds) / np.array(run.seconds)
-        drawn = np.random.default_rng(0).integers(len(ratios), size=(RESAMPLES, len(ratios)))
-        low, high = np.quantile(np.median(ratios[drawn], axis=1), (0.025, 0.975))
+            return TradeRow(tolerance, run, solver, others=others)
+        ratio, low, high = _ratio(solver, run)
         saved = solver.middle - run.middle
         known = self.invested is not None and saved > 0
         pays = math.ceil(self.invested / saved) if known and self.invested is not None else None
-        return TradeRow(tolerance, run, solver, float(np.median(ratios)), float(low), float(high), pays)
+        return TradeRow(tolerance, run, solver, ratio, low, high, pays, others)
+
+    @property
+    def ahead_of_run(self) -> dict[str, list[float]]:
+        """The other sides that are faster than the run by the interval, or keep an error that it does not, and the
+        errors at which they are."""
+        ahead: dict[str, list[float]] = {}
+        for row in self.rows():
+            for name, setting in row.others.items():
+                if setting is not None and (row.run is None or _ratio(setting, row.run)[2] < 1):
+                    ahead.setdefault(name, []).append(row.tolerance)
+        return ahead
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences below a table, without full stops."""
+        told = [f"{name} is ahead of the run at {_at(errors)}" for name, errors in self.ahead_of_run.items()]
+        told += [self.mesh_line] if self.mesh_line else []
+        return told + ([f"No Gaussian process: {self.no_process}"] if self.no_process else [])
 
     @property
     def mesh_error(self) -> float | None:
@@ -155,37 +194,38 @@ class TradeFigures:
         counts = f"{len(self.scenes)} scenes, deepest frame, one thread"
         told = [f"{counts}; error of the {self.quantity} kept in {100 * WITHIN:g} % of them"]
         for row in self.rows():
-            parts = [_told("run", row.run), _told("solver", row.solver)]
+            sides = {"run": row.run, "solver": row.solver, **row.others}
+            parts = [_told(who, setting) for who, setting in sides.items()]
             if row.ratio is not None:
                 parts.append(f"ratio {row.ratio:.2f} ({row.low:.2f} to {row.high:.2f}): {row.verdict}")
             if row.pays_after is not None:
                 parts.append(f"pays after {row.pays_after:,} questions")
             told.append(f"{100 * row.tolerance:g} %: {'; '.join(parts)}")
-        told += [self.mesh_line] if self.mesh_line else []
+        told += self.notes
         return told + ([f"the solver was not run: {self.no_solver}"] if self.no_solver else [])
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self:
         """From what `to_json` gave."""
-        known = {key: values[key] for key in ("no_solver", "invested", "origin", "quantity")}
+        known = {key: values[key] for key in ("no_solver", "no_process", "invested", "origin", "quantity")}
         known["mesh_errors"] = tuple(values["mesh_errors"])
-        run, solver = (tuple(map(_setting, values[side])) for side in ("run", "solver"))
+        known["others"] = tuple(Side(side["name"], _settings(side["settings"])) for side in values["others"])
+        run, solver = (_settings(values[side]) for side in ("run", "solver"))
         return cls(tuple(values["scenes"]), run, solver, **known)
 
     def to_json(self) -> dict[str, Any]:
         """All figures; an infinite number is null."""
         settings = {
-            side: [
-                {**asdict(one), "errors": _finite(one.errors), "seconds": _finite(one.seconds)}
-                for one in getattr(self, side)
-            ]
-            for side in ("run", "solver")
+            "run": _as_json(self.run),
+            "solver": _as_json(self.solver),
+            "others": [{"name": side.name, "settings": _as_json(side.settings)} for side in self.others],
         }
         rows = [
             {
                 **asdict(row),
-                "run": None if row.run is None else row.run.name,
-                "solver": None if row.solver is None else row.solver.name,
+                "run": _name(row.run),
+                "solver": _name(row.solver),
+                "others": {name: _name(setting) for name, setting in row.others.items()},
                 "verdict": row.verdict,
             }
             for row in self.rows()
@@ -207,13 +247,40 @@ def _fastest(settings: Sequence[Setting], tolerance: float) -> Setting | None:
     return min(fit, key=lambda one: one.middle, default=None)
 
 
+def _ratio(one: Setting, other: Setting) -> tuple[float, float, float]:
+    """The median over the scenes of the seconds of one over those of the other, and its interval of 95 %. Where neither
+    has an answer they are level."""
+    seconds, others = np.array(one.seconds), np.array(other.seconds)
+    ratios = np.divide(seconds, others, out=np.ones(len(seconds)), where=np.isfinite(seconds) | np.isfinite(others))
+    drawn = np.random.default_rng(0).integers(len(ratios), size=(RESAMPLES, len(ratios)))
+    low, high = np.quantile(np.median(ratios[drawn], axis=1), (0.025, 0.975))
+    return float(np.median(ratios)), float(low), float(high)
+
+
+def _at(errors: Sequence[float]) -> str:
+    return " and ".join(f"{100 * error:g} %" for error in errors)
+
+
 def _told(who: str, setting: Setting | None) -> str:
     return f"{who}: none" if setting is None else f"{who}: {1000 * setting.middle:.3g} ms ({setting.name})"
 
 
-def _setting(values: Mapping[str, Any]) -> Setting:
-    errors, seconds = (tuple(math.inf if one is None else one for one in values[key]) for key in ("errors", "seconds"))
-    return Setting(values["name"], errors, seconds, values["command"])
+def _settings(values: Sequence[Mapping[str, Any]]) -> tuple[Setting, ...]:
+    return tuple(
+        Setting(one["name"], _numbers(one["errors"]), _numbers(one["seconds"]), one["command"]) for one in values
+    )
+
+
+def _as_json(settings: Sequence[Setting]) -> list[dict[str, Any]]:
+    return [{**asdict(one), "errors": _finite(one.errors), "seconds": _finite(one.seconds)} for one in settings]
+
+
+def _name(setting: Setting | None) -> str | None:
+    return None if setting is None else setting.name
+
+
+def _numbers(values: Sequence[float | None]) -> tuple[float, ...]:
+    return tuple(math.inf if value is None else value for value in values)
 
 
 def _finite(values: Sequence[float]) -> list[float | None]:

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from ast_sim.trade_figures import Setting, TradeFigures, front
+from ast_sim.trade_figures import Setting, Side, TradeFigures, front
 
 SCENES = tuple(f"test/{index:06d}" for index in range(10))
 
@@ -88,3 +88,41 @@ def test_the_error_of_the_mesh_is_the_median_of_its_scenes():
     assert known.mesh_error == 0.034
     assert known.lines()[-1].startswith("The mesh alone makes the displacement 3.4 % wrong (median of 3 scenes, ")
     assert TradeFigures.from_json(known.to_json()) == known
+
+
+def test_other_sides_stand_in_the_rows_with_their_fastest_setting():
+    other = Side("mgn", (setting("one call", 0.02, 0.06), setting("two calls", 0.06, 0.03), setting("no", 0, 0.01, 2)))
+    known = figures(others=(other, Side("none", ())))
+    assert known.columns[:5] == ["error at most", "the run", "the solver", "mgn", "none"]
+    rows = known.rows()
+    names = [one and one.name for one in (row.others["mgn"] for row in rows)]
+    assert names == ["two calls", "one call", "one call", None, None, None]
+    assert rows[0].cells[1:6] == ["20 ms: call", "50 ms: coarse", "30 ms: two calls", "none", "2.50 (2.50 to 2.50)"]
+    assert len(rows[0].cells) == len(known.columns)
+    assert known.lines()[1].startswith("10 %: run: 20 ms (call); solver: 50 ms (coarse); mgn: 30 ms (two calls); none")
+    values = known.to_json()
+    assert values["rows"][0]["others"] == {"mgn": "two calls", "none": None}
+    assert values["others"][0]["settings"][2]["errors"][-1] is None
+    assert TradeFigures.from_json(values) == known
+
+
+def test_why_there_is_no_gaussian_process_is_told():
+    known = figures(no_process="each scene has a mesh of its own")
+    assert known.lines()[-1] == known.notes[-1] == "No Gaussian process: each scene has a mesh of its own"
+    assert TradeFigures.from_json(known.to_json()) == known
+
+
+def test_a_side_that_is_ahead_of_the_run_is_named():
+    fast = Side("Gaussian process", (setting("40 scenes", 0.004, 0.001),))  # keeps 0.36 %, the run keeps 0.9 % at best
+    mixed = Setting("one call", (0.0,) * 10, (0.01,) * 5 + (0.03,) * 5)  # level with the call of the run
+    known = figures(others=(fast, Side("mgn", (mixed,))))
+    assert known.ahead_of_run["Gaussian process"] == [0.1, 0.05, 0.025, 0.01, 0.005]
+    assert known.ahead_of_run["mgn"] == [0.05, 0.025, 0.01, 0.005, 0.002]
+    assert known.notes[0] == "Gaussian process is ahead of the run at 10 % and 5 % and 2.5 % and 1 % and 0.5 %"
+    assert known.notes[0] in known.lines() and figures().notes == []
+
+
+def test_a_scene_that_neither_answers_speaks_for_nobody():
+    slow, fast = (Side(name, (setting(name, 0.01, seconds, 1),)) for name, seconds in (("slow", 0.2), ("fast", 0.01)))
+    known = TradeFigures(SCENES, (setting("run", 0.01, 0.1, 1),), (), others=(slow, fast))
+    assert known.ahead_of_run == {"fast": [0.1, 0.05, 0.025, 0.01]}

@@ -60,6 +60,8 @@ def add_trade(trade: Parser) -> None:
     trade.add_argument("data", type=path, metavar="DATA", help="dataset with scenes new to RUN (.h5)")
     add_out(trade, "FILE.html", "page to write; all figures lie beside it (.json)")
     trade.add_argument("--split", choices=SPLITS, default="test", help="split (default: test)")
+    about = "other runs that have learned from the same dataset as RUN"
+    add_each(trade, {"--beside OTHER_RUN": about}, type=path, nargs="+", default=[])
     add_each(trade, {"--scenes N": "scenes, at most (default: 20)"}, type=at_least(1), default=20)
     about = "seconds that another program takes for such a scene; our solver is not run then"
     add_each(trade, {"--solver-seconds S": about}, type=float)
@@ -67,7 +69,7 @@ def add_trade(trade: Parser) -> None:
 
 
 def trade(args: argparse.Namespace) -> None:
-    """Measure what each error costs, by the run and by the solver: a table and a page."""
+    """Measure what each error costs, by the run, the solver and other runs: a table and a page."""
     from ast_sim import trade as measure
     from ast_sim.view.page import check_suffix
 
@@ -79,6 +81,7 @@ def trade(args: argparse.Namespace) -> None:
         open_run(args.run_folder),
         args.data,
         args.split,
+        beside=[open_run(other) for other in args.beside],
         scenes=args.scenes,
         solver_seconds=args.solver_seconds,
         made_from=args.made_from,

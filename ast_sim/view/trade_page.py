@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ast_sim.support.progress import duration
-from ast_sim.trade_figures import COLUMNS, WITHIN, Setting, TradeFigures, front
+from ast_sim.trade_figures import WITHIN, Setting, TradeFigures, front
 from ast_sim.view import page
 from ast_sim.view.encode import finite_json
 
@@ -28,13 +28,10 @@ def page_data(figures: TradeFigures, *others: TradeFigures) -> dict[str, Any]:
             "sides": [
                 {"name": "The run", "points": _points(figures.run)},
                 {"name": "The solver", "points": _points(figures.solver)},
+                *({"name": side.name, "points": _points(side.settings)} for side in figures.others),
             ],
             "mesh": figures.mesh_error,
-            "columns": [name.capitalize() for name in COLUMNS],
-            "tables": [
-                {"name": one.quantity.capitalize(), "rows": [row.cells for row in one.rows()], "mesh": one.mesh_line}
-                for one in (figures, *others)
-            ],
+            "tables": [_table(one) for one in (figures, *others)],
             "note": _note(figures),
             "settings": _settings([figures, *others]),
             "facts": [[key.capitalize(), str(value)] for key, value in figures.origin.items()],
@@ -43,16 +40,35 @@ def page_data(figures: TradeFigures, *others: TradeFigures) -> dict[str, Any]:
     )
 
 
+def _table(figures: TradeFigures) -> dict[str, Any]:
+    """What each error of a quantity costs."""
+    others = {side.name for side in figures.others}
+    columns = [name if name in others else name.capitalize() for name in figures.columns]
+    rows = [row.cells for row in figures.rows()]
+    notes = [f"{note}." for note in figures.notes]
+    return {"name": figures.quantity.capitalize(), "columns": columns, "rows": rows, "notes": notes}
+
+
 def _settings(figures: Sequence[TradeFigures]) -> dict[str, Any]:
     """A table of all settings that have an answer, with the error of each quantity that they keep."""
     columns = ["Side", "Setting", *(f"{one.quantity.capitalize()} kept" for one in figures), "Median time", "Command"]
     rows = []
-    for side, of_side in (("the run", lambda one: one.run), ("the solver", lambda one: one.solver)):
-        kept = [{setting.name: setting.kept for setting in of_side(one)} for one in figures]
-        for setting in _answered(of_side(figures[0])):
-            errors = [f"{100 * by_name[setting.name]:.3g} %" for by_name in kept]
-            rows.append([side, setting.name, *errors, f"{1000 * setting.middle:.3g} ms", setting.command or "–"])
+    sides = [_sides(one) for one in figures]
+    for side in sides[0]:
+        of_quantities = (of_side[side] for of_side in sides)
+        for same in sorted(zip(*of_quantities, strict=True), key=lambda same: same[0].middle):
+            kept = [setting.kept for setting in same]
+            if any(map(math.isfinite, kept)):
+                errors = [f"{100 * error:.3g} %" if math.isfinite(error) else "–" for error in kept]
+                time = f"{1000 * same[0].middle:.3g} ms"
+                rows.append([side, same[0].name, *errors, time, same[0].command or "–"])
     return {"columns": columns, "rows": rows}
+
+
+def _sides(figures: TradeFigures) -> dict[str, tuple[Setting, ...]]:
+    """The settings of each side by its name."""
+    others = {side.name: side.settings for side in figures.others}
+    return {"the run": figures.run, "the solver": figures.solver, **others}
 
 
 def _lead(figures: TradeFigures) -> str:

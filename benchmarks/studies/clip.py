@@ -12,8 +12,7 @@ from __future__ import annotations
 import argparse
 import os
 import time
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ import numpy as np
 import ast_sim
 from ast_sim.dataset.solver_seconds import SolverSeconds, read_seconds, write_seconds
 from ast_sim.dataset.writer import DatasetWriter
+from ast_sim.inference.evaluation.gaussian_process import features, gaussian_process
 from ast_sim.inference.quantities.relative_errors import relative_error
 from ast_sim.named_field import REACTION
 from ast_sim.simulate.own_assembly.parameters import values_of
@@ -37,7 +37,6 @@ ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "benchmarks" / "results" / "clip.json"
 PAGE = ROOT / "docs" / "results" / "clip.md"
 SHARED = SPEC.with_name("test_scenes.h5")
-FOLDS = 5  # of the cross-validation that chooses the scale of a Gaussian process
 STATE = ("PEEQ", REACTION)
 
 
@@ -59,49 +58,6 @@ class Plan:
     steps: int = 3600
     settings: tuple[tuple[str, Any], ...] = (("mirror", ("y",)), ("stress_weight", 0.3))
     seeds: tuple[int, ...] = (0, 1)
-
-
-def features(drawn: Sequence[dict[str, Any]], known: Sequence[dict[str, Any]]) -> np.ndarray:
-    """[n, f]: the parameters as a Gaussian process takes them. Numbers are scaled by those that are `known`; of a text,
-    such as the name of a variant, each value has a column; what never varies has none."""
-    columns = []
-    for name in known[0]:
-        values = [one[name] for one in known]
-        if isinstance(values[0], str):
-            columns += [[float(one[name] == value) for one in drawn] for value in sorted(set(values))]
-        elif np.ptp(values) > 0:
-            columns.append([(one[name] - np.mean(values)) / np.std(values) for one in drawn])
-    return np.array(columns).T
-
-
-def gaussian_process(x: np.ndarray, y: np.ndarray, asked: np.ndarray) -> np.ndarray:
-    """[m]: what a Gaussian process says of the points `asked` [m, f] after the points x [n, f] with values y [n] > 0.
-
-    The kernel is a squared exponential with a length for each feature, and white noise; maximum likelihood chooses. It
-    models y or log y, whichever has the lower median relative error in a cross-validation.
-    """
-    scales: tuple[tuple[Callable, Callable], ...] = ((np.asarray, np.asarray), (np.log, np.exp))
-    fold = np.arange(len(x)) % FOLDS
-    errors = []
-    for scale, back in scales:
-        guess = np.empty_like(y)
-        for part in range(FOLDS):
-            guess[fold == part] = back(_fitted(x[fold != part], scale(y[fold != part])).predict(x[fold == part]))
-        errors.append(np.median(np.abs(guess / y - 1)))
-    scale, back = scales[int(np.argmin(errors))]
-    return back(_fitted(x, scale(y)).predict(asked))
-
-
-def _fitted(x: np.ndarray, y: np.ndarray) -> Any:
-    from sklearn.gaussian_process import GaussianProcessRegressor  # takes a second
-    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
-
-    lengths = RBF(np.full(x.shape[1], 2.0), (0.1, 1e3))
-    kernel = ConstantKernel(1.0, (1e-2, 1e3)) * lengths + WhiteKernel(1e-3, (1e-8, 1.0))
-    process = GaussianProcessRegressor(kernel, normalize_y=True, n_restarts_optimizer=2, random_state=0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a length at its bound, or a search that ends early: the best of three counts
-        return process.fit(x, y)
 
 
 def trained(plan: Plan, folder: Path, seed: int = 0) -> tuple[ast_sim.Run, Path]:
@@ -130,10 +86,10 @@ def measured(plan: Plan, folder: Path) -> dict[str, Any]:
     )
     drawn, outcomes = [values_of(truth.attributes) for _, truth in known], [true_outcome(truth) for _, truth in known]
     for key in Outcome._fields:
-        values = np.array([getattr(one, key) for one in outcomes])
+        law = gaussian_process(features(drawn, drawn), np.array([getattr(one, key) for one in outcomes]))
         for asked in (scenes, unseen):
             points = features([scene["parameters"] for scene in asked], drawn)
-            for scene, value in zip(asked, gaussian_process(features(drawn, drawn), values, points), strict=True):
+            for scene, value in zip(asked, law(points), strict=True):
                 scene["gaussian_process"] = {**scene.get("gaussian_process", {}), key: float(value)}
     beside = [scene["parameters"] for scene in scenes if scene["name"] in clip_ways.SCENES]
     return {

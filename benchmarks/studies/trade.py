@@ -15,7 +15,7 @@ from typing import Any
 
 import ast_sim
 from ast_sim.support.progress import duration
-from ast_sim.trade_figures import COLUMNS, TradeFigures
+from ast_sim.trade_figures import TradeFigures
 from benchmarks.studies import jumps
 from benchmarks.studies.rows import study_rows
 
@@ -114,12 +114,12 @@ def _table(figures: TradeFigures) -> list[str]:
         "",
         f"### {figures.quantity.capitalize()}",
         "",
-        f"| {' | '.join(COLUMNS)} |",
-        "| ---: | --- | --- | --- | --- | ---: |",
+        f"| {' | '.join(figures.columns)} |",
+        f"| ---: |{' --- |' * (len(figures.columns) - 2)} ---: |",
         *(f"| {' | '.join(row.cells)} |" for row in rows),
         "",
         f"The run is ahead in {len(figures.ahead)} of {len(rows)} cells, the solver in {len(figures.behind)}.",
-        *([f"{figures.mesh_line}."] if figures.mesh_line else []),
+        *(f"{note}." for note in figures.notes),
     ]
 
 

@@ -16,7 +16,7 @@ from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.simulate.own_assembly.parameters import completed
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from benchmarks.studies import clip, clip_ways
-from benchmarks.studies.clip import Plan, features, gaussian_process
+from benchmarks.studies.clip import Plan
 from benchmarks.studies.clip_outcome import SPEC, Outcome, outcome
 from benchmarks.studies.clip_page import page
 from benchmarks.studies.clip_ways import FINER, OWN, Way
@@ -32,19 +32,6 @@ def test_the_set_is_that_of_the_upper_face_and_the_peak_that_of_the_ram():
     reaction = np.zeros((3, 6, 3), np.float32)
     reaction[1, 5], reaction[2, 5], reaction[1, 0] = (3, 4, 0), (1, 0, 0), (100, 0, 0)
     assert outcome(scene, rest, last, reaction) == Outcome(4.0, 5.0)
-
-
-def test_a_gaussian_process_takes_numbers_and_names():
-    known = [{"a": 1.0, "b": "x", "c": 2.0}, {"a": 3.0, "b": "y", "c": 2.0}]
-    assert features(known, known).tolist() == [[-1, 1, 0], [1, 0, 1]]
-    assert features([{"a": 2.0, "b": "y", "c": 9.0}], known).tolist() == [[0, 0, 1]]
-
-
-@pytest.mark.parametrize("law", [lambda x: 3 + np.sin(x[:, 0]) + x[:, 1], lambda x: np.exp(3 * x[:, 0] - x[:, 1])])
-def test_a_gaussian_process_learns_a_smooth_law(law):
-    points = np.random.default_rng(0).uniform(-1, 1, (70, 2))
-    said = gaussian_process(points[:50], law(points[:50]), points[50:])
-    np.testing.assert_allclose(said, law(points[50:]), rtol=0.02)
 
 
 def metal(depth: float) -> Trajectory:

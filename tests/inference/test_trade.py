@@ -1,6 +1,7 @@
 """A trade, measured for real: the run that comes with the package and the solver on a small plate."""
 
 import json
+from pathlib import Path
 
 import pytest
 import toy
@@ -58,6 +59,15 @@ def test_another_program_is_represented_by_its_seconds(plates):
         ast_sim.trade(ast_sim.example_run("plates"), plates, solver_seconds=-1)
 
 
+def test_the_force_of_metal_that_yields_is_judged_by_what_the_dataset_holds():
+    """No law gives it from positions."""
+    clips = Path(__file__).parents[2] / "examples" / "clip" / "test_scenes.h5"
+    by_quantity = ast_sim.trade(ast_sim.example_run("clip"), clips, scenes=2, solver_seconds=14.0).by_quantity
+    assert list(by_quantity) == ["displacement", "reaction", "stress"]
+    assert 1e-4 < max(by_quantity["reaction"].run[0].errors) < 0.1
+    assert by_quantity["stress"].no_process == "it needs at least 10 training scenes, and the dataset has 0"
+
+
 def test_where_our_solver_did_not_make_the_scenes_it_says_so(tmp_path):
     data = toy.write(tmp_path / "toy.h5", (3, 1, 2))
     small = {"hidden": 8, "blocks": 1}
@@ -68,3 +78,42 @@ def test_where_our_solver_did_not_make_the_scenes_it_says_so(tmp_path):
     assert str(result).splitlines()[-1].startswith("the solver was not run: ")
     with pytest.raises(ConfigError, match="split valid moves|no scene"):
         ast_sim.trade(run, toy.write(tmp_path / "none.h5", (1, 0, 1)), "valid")
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory):
+    """Plates, and two models that have learned from them."""
+    folder = tmp_path_factory.mktemp("learned")
+    data = folder / "plates.h5"
+    ast_sim.generate("deforming_plate", data, train=2, valid=1, test=1, nodes=200, frames=41, keep=(24,), seed=5)
+    for name, model, settings in (("tokens", "ast", {"hidden": 16, "L_SA": 1}), ("messages", "mgn", {"blocks": 1})):
+        ast_sim.train(
+            data, folder / name, steps=2, batch_size=2, preset="tiny", model=model, model_settings=settings,
+            progress=False,
+        )  # fmt: skip
+    return data, folder / "tokens", folder / "messages"
+
+
+def test_another_model_of_the_same_data_stands_beside_the_run(learned, tmp_path, capsys):
+    data, run, other = map(str, learned)
+    assert main(["trade", run, data, "--beside", other, "--out", str(tmp_path / "trade.html")]) == 0
+    assert "; messages: " in capsys.readouterr().out
+    by_quantity = json.loads((tmp_path / "trade.json").read_text())
+    for figures in by_quantity.values():
+        (side,) = figures["others"]
+        assert side["name"] == "messages" and figures["rows"][0]["others"].keys() == {"messages"}
+        assert [one["name"] for one in side["settings"]] == [one["name"] for one in figures["run"]]
+        assert 0 < side["settings"][-1]["errors"][0] < 2e-3  # the solver goes on from its answer, too
+        assert all(" messages " in one["command"] for one in side["settings"])
+    own, theirs = figures["run"][0], by_quantity["displacement"]["others"][0]["settings"][0]
+    assert own["errors"] != theirs["errors"] and own["seconds"] != theirs["seconds"]
+    assert "messages" in (tmp_path / "trade.html").read_text()
+
+
+def test_only_runs_of_the_same_data_stand_beside_each_other(learned, tmp_path):
+    data, run, other = learned
+    strange = ast_sim.example_run("plates")
+    with pytest.raises(ConfigError, match=r"plates.ast has learned from another dataset \(.*h5\) than .*tokens "):
+        ast_sim.trade(ast_sim.Run(run), data, beside=[ast_sim.Run(other), strange])
+    with pytest.raises(ConfigError, match="two runs are called tokens: rename one"):
+        ast_sim.trade(ast_sim.Run(run), data, beside=[ast_sim.Run(run)])

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 from on_screen import HOSTILE, show, texts
 
-from ast_sim.trade_figures import Setting, TradeFigures
+from ast_sim.trade_figures import Setting, Side, TradeFigures
 from ast_sim.view import trade_page
 
 
@@ -17,11 +19,15 @@ def path(tmp_path_factory):
         Setting("no use", (0.05, 0.2), (0.06, 0.06)),
     )
     solver = (Setting("own", (0.0, 0.0), (0.1, 0.1)), Setting("coarse", (0.04, 0.03), (0.05, 0.05)))
+    other = Side(HOSTILE, (Setting("one call", (0.02, 0.02), (0.03, 0.03)),))
+    failed = Side(HOSTILE, (Setting("one call", (math.inf, math.inf), (0.03, 0.03)),))
     more = {"mesh_errors": (0.02, 0.03, 0.07), "invested": 600.0, "origin": {"run": HOSTILE}}
-    figures = TradeFigures(("test/000000", "test/000001"), run, solver, **more)
+    figures = TradeFigures(("test/000000", "test/000001"), run, solver, others=(other,), **more)
     path = tmp_path_factory.mktemp("trade") / "trade.html"
     bare = Setting("call", (0.3, 0.4), (0.02, 0.02))
-    force = TradeFigures(figures.scenes, (bare, *run[1:]), solver, quantity="reaction")
+    force = TradeFigures(
+        figures.scenes, (bare, *run[1:]), solver, quantity="reaction", others=(failed,), no_process=HOSTILE
+    )
     trade_page.write(path, [figures, force], HOSTILE)
     return path
 
@@ -29,11 +35,12 @@ def path(tmp_path_factory):
 def test_the_table_and_the_chart_show_the_settings(browser, path):
     show(browser, path, still=False)
     assert browser.errors == [] and browser.requests == [path.as_uri()]
-    first = ["10 %", "20 mscall", "50 mscoarse", "2.50 (2.50 to 2.50)", "the run", "20,000 questions"]
+    first = ["10 %", "20 mscall", "50 mscoarse", "30 msone call", "2.50 (2.50 to 2.50)", "the run", "20,000 questions"]
     assert texts(browser, "#trade-tables .table-card:first-child tbody tr:first-child > *") == first
-    assert texts(browser, "#trade-tables .table-card:first-child tbody tr:last-child > *")[1:5] == [
+    assert texts(browser, "#trade-tables .table-card:first-child tbody tr:last-child > *")[1:6] == [
         "none",
         "100 msown",
+        "none",
         "–",
         "the solver alone",
     ]
@@ -44,14 +51,21 @@ def test_the_table_and_the_chart_show_the_settings(browser, path):
     drawn = browser.evaluate("document.querySelector('#trade-chart .plot').data.map(({ x, y }) => [x, y])")
     assert drawn[0] == [[60], [20]] and drawn[1] == [[20, 40], [8, 1]]
     assert drawn[3][0] == [50, 100] and drawn[3][1][0] == 4
-    assert drawn[4] == [[20, 100], [3, 3]]  # the mesh itself, over all times
-    assert texts(browser, "#trade-chart .legend li") == ["The run", "The solver", "The mesh itself"]
+    assert drawn[5] == [[30], [2]]
+    assert drawn[6] == [[20, 100], [3, 3]]  # the mesh itself, over all times
+    assert texts(browser, "#trade-chart .legend li") == ["The run", "The solver", HOSTILE, "The mesh itself"]
+    head = texts(browser, "#trade-tables .table-card:first-child thead th")
+    assert head[2:5] == ["The solver", HOSTILE, "Solver / run"]
     assert texts(browser, "#trade-tables h3") == ["Displacement", "Reaction"]
-    (mesh,) = texts(browser, "#trade-tables p")
+    ahead, mesh, process = texts(browser, "#trade-tables p")
+    assert ahead == f"{HOSTILE} is ahead of the run at 5 % and 2.5 %."
+    assert process == f"No Gaussian process: {HOSTILE}."
     assert mesh.startswith("The mesh alone makes the displacement 3 % wrong (median of 3 scenes, against 8 times")
     call = ["the run", "call", "8 %", "40 %", "20 ms", f"ast-sim predict '{HOSTILE}'"]
     assert texts(browser, "#trade-settings tbody tr:first-child td, #trade-settings tbody tr:first-child th") == call
-    assert len(texts(browser, "#trade-settings tbody tr")) == 5
+    last = [HOSTILE, "one call", "2 %", "–", "30 ms", "–"]
+    assert texts(browser, "#trade-settings tbody tr:last-child td, #trade-settings tbody tr:last-child th") == last
+    assert len(texts(browser, "#trade-settings tbody tr")) == 6
     assert texts(browser, "#facts-tables td") == [HOSTILE]
     assert not texts(browser, "#gallery, #scenes, #training")  # what belongs to other pages is gone
 

@@ -1,4 +1,4 @@
-"""What an error costs: efforts of a run and variants of the solver on the same scenes, timed in turns on one thread."""
+"""What an error costs: efforts of runs and variants of the solver on the same scenes, timed in turns on one thread."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.inference.answering import answers
 from ast_sim.inference.effort import Effort, choices, options_of
 from ast_sim.inference.evaluation.deepest_frames import deepest_predicted
+from ast_sim.inference.evaluation.gaussian_process import process_beside
 from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.quantities.relative_errors import errors_of, moves
 from ast_sim.models.simulator import Simulator
@@ -27,7 +28,7 @@ from ast_sim.support.disk import write_json
 from ast_sim.support.errors import ConfigError, SimulationError
 from ast_sim.support.progress import Progress, ShowProgress
 from ast_sim.support.provenance import provenance
-from ast_sim.trade_figures import Setting, TradeFigures
+from ast_sim.trade_figures import Setting, Side, TradeFigures
 from ast_sim.view import trade_page
 from ast_sim.view.files import make_folder
 
@@ -82,13 +83,15 @@ def trade(
     data: str | os.PathLike[str] | Dataset | None = None,
     split: str = "test",
     *,
+    beside: Sequence[Run] = (),
     scenes: int = SCENES,
     solver_seconds: float | None = None,
     made_from: str | os.PathLike[str] | None = None,
     command: str = "ast_sim.trade",
     progress: ShowProgress = True,
 ) -> Trade:
-    """Measure what each error costs: by every effort of a run, and by the solver in all its variants.
+    """Measure what each error costs: by every effort of a run, by the solver in all its variants, by other runs, and by
+    a Gaussian process that learns the training scenes of the dataset, where it applies.
 
     Each answer is of the deepest frame of a scene, alone, on one thread. Times are processor seconds, and count what is
     prepared for a mesh.
@@ -96,6 +99,8 @@ def trade(
     Args:
         data: a dataset, its path or open; by default the one that the run was trained on.
         split: whose scenes are asked. They must be new to the run, or its errors are too small.
+        beside: other runs that have learned from the same dataset, such as other models. Each stands in the tables with
+            its fastest effort, by the name of its folder.
         scenes: at most so many, the first of the split.
         solver_seconds: what another program takes for such a scene, to the error of its mesh; our solver is not run.
         made_from: the specification or the parts of your own of which the dataset was made; the solver needs them.
@@ -103,11 +108,13 @@ def trade(
         progress: as in `generate`.
 
     Raises:
-        ConfigError: no scene of the split moves, or the solver's seconds are not above 0.
+        ConfigError: no scene of the split moves, the solver's seconds are not above 0, or a run beside has learned from
+            another dataset or has the name of another run.
         DatasetError: the dataset cannot be read.
     """
     if solver_seconds is not None and not 0 < solver_seconds < math.inf:
         raise ConfigError(f"the solver's seconds are {solver_seconds}; they must be above 0")
+    runs = _by_name([run, *beside])
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -116,32 +123,56 @@ def trade(
             indices = list(islice(moving, scenes))
             if not indices:
                 raise ConfigError(f"{dataset.path}: no scene of the split {split} moves")
-            return Trade(_measured(run, dataset, split, indices, solver_seconds, made_from, command, progress))
+            return Trade(
+                _measured(runs, _Scenes(dataset, split, indices, made_from), solver_seconds, command, progress)
+            )
     finally:
         torch.set_num_threads(threads)
 
 
+class _Scenes(NamedTuple):
+    """The scenes on which all is measured, and of what they were made."""
+
+    dataset: Dataset
+    split: str
+    indices: Sequence[int]
+    made_from: str | os.PathLike[str] | None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(f"{self.split}/{index:06d}" for index in self.indices)
+
+
+def _by_name(runs: Sequence[Run]) -> dict[str, Run]:
+    """The runs by the names of their folders or files, after a check."""
+    first = runs[0]
+    named: dict[str, Run] = {}
+    for run in runs:
+        if run.folder.origin["data"] != first.folder.origin["data"]:
+            raise ConfigError(
+                f"{run.path} has learned from another dataset ({Path(run.settings.data).name}) than {first.path}"
+                f" ({Path(first.settings.data).name}): only runs of one dataset stand beside each other"
+            )
+        if run.path.name in named:
+            raise ConfigError(f"two runs are called {run.path.name}: rename one, so that each has its column")
+        named[run.path.name] = run
+    return named
+
+
 def _measured(
-    run: Run,
-    dataset: Dataset,
-    split: str,
-    indices: Sequence[int],
-    stated: float | None,
-    made_from: str | os.PathLike[str] | None,
-    command: str,
-    progress: ShowProgress,
+    runs: Mapping[str, Run], scenes: _Scenes, stated: float | None, command: str, progress: ShowProgress
 ) -> dict[str, TradeFigures]:
-    efforts = choices(run.settings.model, run.settings.train.corrections) or (run.effort,)
-    own: dict[Effort, list[_Timed]] = {effort: [] for effort in efforts}
+    """The figures by quantity; the first run is the one beside which all others stand."""
+    answered = _unanswered(runs)
+    name, *others = answered
+    run = runs[name]
     variants: dict[str, list[_Timed]] = {}
     no_solver = ""
-    solved = _outcomes(dataset, split, indices, made_from) if stated is None else None
-    with Progress(len(indices), "scenes", progress) as bar:
-        for effort in efforts:
-            timed_answer(run.model, dataset, split, indices[0], effort)  # the first takes longer; it does not count
-        for index in indices:
-            for effort in efforts:
-                own[effort].append(_Timed(*timed_answer(run.model, dataset, split, index, effort)[:2]))
+    solved = _outcomes(scenes) if stated is None else None
+    with Progress(len(scenes.indices), "scenes", progress) as bar:
+        _answer(runs, scenes, scenes.indices[0], _unanswered(runs))  # takes longer, so it does not count
+        for index, scene in zip(scenes.indices, scenes.names, strict=True):
+            _answer(runs, scenes, index, answered)
             try:
                 for outcome in next(solved) if solved is not None else ():
                     one = _Timed(outcome.errors, outcome.whole_seconds) if outcome.converged else _NONE
@@ -150,28 +181,62 @@ def _measured(
                 no_solver = str(error)
                 solved = None
                 variants = {}
-            bar.advance(f"{split}/{index:06d}")
-    quantities = _quantities(one for timed in own.values() for one in timed)
+            bar.advance(scene)
+        process = process_beside(run.model, scenes.dataset, scenes.split, scenes.indices, bar.line)
+    quantities = _quantities(one for timed in answered[name].values() for one in timed)
     if stated is not None:
-        variants = {"as stated": [_Timed(dict.fromkeys(quantities, 0.0), stated)] * len(indices)}
-    finer = _on_finer_mesh(dataset, split, indices[:MESH_SCENES], made_from, variants)
-    commands = {effort: _command(run, dataset, split, effort) for effort in efforts}
+        variants = {"as stated": [_Timed(dict.fromkeys(quantities, 0.0), stated)] * len(scenes.indices)}
+    finer = _on_finer_mesh(scenes, variants)
     shared = {
-        "scenes": tuple(f"{split}/{index:06d}" for index in indices),
+        "scenes": scenes.names,
         "no_solver": no_solver,
-        "invested": _invested(run, dataset),
-        "origin": {**provenance(command), "run": str(run.path), "step": run.step, "data": str(dataset.path)},
+        "invested": _invested(run, scenes.dataset),
+        "origin": {**provenance(command), "run": str(run.path), "step": run.step, "data": str(scenes.dataset.path)},
     }
     return {
         quantity: TradeFigures(
-            run=tuple(_setting(effort.text, timed, quantity, commands[effort]) for effort, timed in own.items()),
-            solver=tuple(_setting(name, timed, quantity) for name, timed in variants.items()),
+            run=_of_run(run, scenes, answered[name], quantity),
+            solver=tuple(_setting(variant, timed, quantity) for variant, timed in variants.items()),
             mesh_errors=tuple(outcome.errors[quantity] for outcome in finer),
             quantity=quantity,
+            others=(
+                *(Side(other, _of_run(runs[other], scenes, answered[other], quantity)) for other in others),
+                *process.sides(quantity),
+            ),
+            no_process=process.why_not(quantity),
             **shared,
         )
         for quantity in quantities
     }
+
+
+def _unanswered(runs: Mapping[str, Run]) -> dict[str, dict[Effort, list[_Timed]]]:
+    """The efforts of each run among which one is chosen; of a run that predicts step by step, the only one."""
+    return {
+        name: {effort: [] for effort in choices(run.settings.model, run.settings.train.corrections) or (run.effort,)}
+        for name, run in runs.items()
+    }
+
+
+def _answer(
+    runs: Mapping[str, Run], scenes: _Scenes, index: int, answered: Mapping[str, Mapping[Effort, list[_Timed]]]
+) -> None:
+    """Add what each effort of each run gives for a scene. All are judged by the fields that the first run predicts."""
+    first, *_ = runs.values()
+    fields = [name for name, *_ in first.settings.model.data.fields]
+    for name, of_run in answered.items():
+        for effort, timed in of_run.items():
+            answer = timed_answer(runs[name].model, scenes.dataset, scenes.split, index, effort, fields)
+            timed.append(_Timed(*answer[:2]))
+
+
+def _of_run(
+    run: Run, scenes: _Scenes, answered: Mapping[Effort, Sequence[_Timed]], quantity: str
+) -> tuple[Setting, ...]:
+    """The efforts of a run as settings."""
+    return tuple(
+        _setting(effort.text, timed, quantity, _command(run, scenes, effort)) for effort, timed in answered.items()
+    )
 
 
 class _Timed(NamedTuple):
@@ -195,21 +260,14 @@ def _setting(name: str, timed: Sequence[_Timed], quantity: str, command: str = "
     return Setting(name, errors, tuple(one.seconds for one in timed), command)
 
 
-def _outcomes(
-    dataset: Dataset, split: str, indices: Sequence[int], made_from: str | os.PathLike[str] | None
-) -> Iterator[tuple[Outcome, ...]]:
+def _outcomes(scenes: _Scenes) -> Iterator[tuple[Outcome, ...]]:
     """What each variant of the solver took for each scene. It begins with the first one, where all errors come up."""
+    dataset, split, indices, made_from = scenes
     for solved in solver_outcomes(dataset.path, split, indices, made_from=made_from, progress=False):
         yield solved.outcomes
 
 
-def _on_finer_mesh(
-    dataset: Dataset,
-    split: str,
-    indices: Sequence[int],
-    made_from: str | os.PathLike[str] | None,
-    variants: Mapping[str, Sequence[_Timed]],
-) -> list[Outcome]:
+def _on_finer_mesh(scenes: _Scenes, variants: Mapping[str, Sequence[_Timed]]) -> list[Outcome]:
     """Frames of the dataset on a mesh of 8 times the nodes.
 
     Scenes that cannot be solved there are left out. None is tried if our solver has not run or would take too long.
@@ -217,23 +275,26 @@ def _on_finer_mesh(
     from ast_sim.simulate.jobs.mesh_error import LONGER, MOST_SECONDS  # takes 0.2 s
 
     own = [one.seconds for one in variants.get(OWN_STOP_TEST, ())]
-    if not own or LONGER * max(own[: len(indices)]) > MOST_SECONDS:
+    if not own or LONGER * max(own[:MESH_SCENES]) > MOST_SECONDS:
         return []
+    dataset, split, indices, made_from = scenes
+    some = indices[:MESH_SCENES]
     solved = solver_outcomes(
-        dataset.path, split, indices, variants=(FINER,), starts=(1,), made_from=made_from, progress=False
+        dataset.path, split, some, variants=(FINER,), starts=(1,), made_from=made_from, progress=False
     )
     return [outcome for scene in solved for outcome in scene.outcomes if outcome.converged]
 
 
 def timed_answer(
-    model: Simulator, dataset: Dataset, split: str, index: int, effort: Effort
+    model: Simulator, dataset: Dataset, split: str, index: int, effort: Effort, fields: Sequence[str] = ()
 ) -> tuple[dict[str, float], float, str | None]:
     """The errors of an answer at the deepest frame by quantity, its processor seconds, and why it failed: it has no
     errors and infinite seconds then.
 
-    The scene is loaded anew, so nothing is prepared for its mesh.
+    The scene is loaded anew, so nothing is prepared for its mesh; with these named fields, by which the force is
+    judged.
     """
-    truth = dataset.load(split, index)
+    truth = dataset.load(split, index, fields)
     frame = deepest_predicted(model, truth)
     question = Question.of(truth, f"{split}/{index:06d}", [frame])
     began = time.process_time()
@@ -244,10 +305,10 @@ def timed_answer(
     return errors_of(replace(answer, info=dataset.info), truth), seconds, None
 
 
-def _command(run: Run, dataset: Dataset, split: str, effort: Effort) -> str:
+def _command(run: Run, scenes: _Scenes, effort: Effort) -> str:
     """What predicts the first scene with this effort."""
     what = options_of(effort) if run.settings.model.scheme.corrects else []
-    scene = [dataset.path.name, "--split", split, "--index", "0"]
+    scene = [scenes.dataset.path.name, "--split", scenes.split, "--index", "0"]
     return shlex.join(["ast-sim", "predict", run.path.name, *scene, "--out", "answer.h5", *what])
 
 

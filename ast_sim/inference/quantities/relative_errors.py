@@ -60,14 +60,14 @@ def errors_of(answer: Answer, truth: Trajectory) -> dict[str, float]:
     ours = dataclasses.replace(answer, position=answer.position[[row]], frames=(frame,), fields=last)
     true = dataclasses.replace(answer, position=truth.position[[frame]], frames=(frame,), fields=fields)
     with contextlib.suppress(ConfigError):  # a figure that this scene has not
-        errors["reaction"] = _between(ours.reaction(), true.reaction())
+        errors["reaction"] = relative_distance(ours.reaction(), true.reaction())
     stress = None if answer.stress is None else answer.stress[row]
     _, largest = stress_errors(truth, stress, frame, answer.stress_location or "node")
     return errors if largest is None else {**errors, "stress": largest}
 
 
-def _between(ours: np.ndarray, true: np.ndarray) -> float:
-    """The distance of two forces over the true one: 0 where both are 0, infinite where only the true one is."""
+def relative_distance(ours: np.ndarray, true: np.ndarray) -> float:
+    """The distance of two vectors over the true one: 0 where both are 0, infinite where only the true one is."""
     size = float(np.linalg.norm(true))
     distance = float(np.linalg.norm(ours - true))
     return distance / size if size else (math.inf if distance else 0.0)

@@ -37,8 +37,8 @@ function textRows(rows, cell = (text) => element("td", {}, text)) {
 
 function showTrade(data) {
   byId("trade-note").textContent = data.note;
-  data.tables.forEach(({ name, rows, mesh }) => byId("trade-tables").append(
-    table(data.columns, textRows(rows, textCell), { title: name, className: "prices" }), mesh ? element("p", {}, `${mesh}.`) : "",
+  data.tables.forEach(({ name, columns, rows, notes }) => byId("trade-tables").append(
+    table(columns, textRows(rows, textCell), { title: name, className: "prices" }), ...notes.map((note) => element("p", {}, note)),
   ));
   tradeChart(byId("trade-chart"), data.sides.filter(({ points }) => points.length), data.mesh);
   const all = table(data.settings.columns, textRows(data.settings.rows), { className: "dense words" });
