@@ -68,9 +68,6 @@ ROWS = {
     "bumper": Row("Bumper, 1,600 nodes", _BUMPER, nodes=1600, train=100, steps=1700, settings=_SETTINGS),
     "bumper_50": Row("Bumper, 50 scenes", _BUMPER, nodes=1600, train=50, steps=1700, settings=_SETTINGS, rivals=0),
     "snap_hook": Row("Snap hook, second-order elements", _HOOK, nodes=None, train=200, steps=1000, settings=_SETTINGS),
-    "snap_hook_100": Row(
-        "Snap hook, 100 scenes", _HOOK, nodes=None, train=100, steps=1000, settings=_SETTINGS, rivals=0
-    ),
     "bumper_6000": Row(
         "Bumper, 6,000 nodes, after the small ones",
         _BUMPER,
