@@ -168,3 +168,19 @@ def assert_same_everywhere(code: str) -> None:
     prints = {isa: run_forked(code, AST_SIM_ISA=isa) for isa in instruction_sets()}
     prints["torch"] = run_forked(code, AST_SIM_BACKEND="torch")
     assert "base" in prints and len(set(prints.values())) == 1 and len(prints["base"].strip()) == 64, prints
+
+
+def assert_mirroring_turns_errors_back(plain, mirrored, error_of: Callable) -> None:
+    """Two pools of the same scenes, of which one mirrors them, go on alike from the errors error_of(number, batch,
+    target) of the plain one, turned as its scenes are."""
+    turned = 0
+    for number in range(12):
+        (a, x), (b, y) = plain.batch(number), mirrored.batch(number)
+        assert a.names == b.names
+        sign = torch.where((x.motion * y.motion < 0) & (x.motion.abs() > 1e-9), -1.0, 1.0)
+        torch.testing.assert_close(x.motion * sign, y.motion, atol=1e-6, rtol=1e-4)
+        turned += int((sign < 0).any())
+        error = error_of(number, a, x)
+        plain.advance(number, error)
+        mirrored.advance(number, error * sign)
+    assert turned > 6

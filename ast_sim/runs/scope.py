@@ -15,6 +15,7 @@ from ast_sim.prescribed_motion import Motion
 from ast_sim.scene import Scene
 
 LEEWAY = 0.05  # a value up to 5 % outside a range counts as inside
+_SPACINGS: WeakKeyDictionary[Scene, float] = WeakKeyDictionary()  # of the scenes that are in use
 
 
 @dataclass(frozen=True)
@@ -94,9 +95,6 @@ def spacing_of(scene: Scene) -> float:
         lengths = edge_lengths(scene)
         _SPACINGS[scene] = float(lengths.mean(dtype=np.float64)) if len(lengths) else 0.0
     return _SPACINGS[scene]
-
-
-_SPACINGS: WeakKeyDictionary[Scene, float] = WeakKeyDictionary()
 
 
 def edge_lengths(scene: Scene) -> np.ndarray:

@@ -4,6 +4,7 @@ from collections import Counter
 
 import pytest
 import torch
+from checks import assert_mirroring_turns_errors_back
 from data_samples import block, mesh_graph, trajectory, write
 
 from ast_sim.batches.pairs import PairSampler
@@ -114,18 +115,11 @@ def test_with_inertia_a_faultless_model_leads_an_error_back_without_overshoot(tm
 
 def test_mirroring_turns_errors_back(dataset):
     """Mirrored and not, the same scene has the same errors: those of the state are told from the truth."""
-    plain, mirrored = pool(dataset, mirror=()), pool(dataset)
-    turned = 0
-    for number in range(12):
-        (a, x), (b, y) = plain.batch(number), mirrored.batch(number)
-        assert a.names == b.names
-        sign = torch.where((x.motion * y.motion < 0) & (x.motion.abs() > 1e-9), -1.0, 1.0)
-        torch.testing.assert_close(x.motion * sign, y.motion, atol=1e-6, rtol=1e-4)
-        turned += int((sign < 0).any())
-        error = residual(x, number) * normal(a)[:, None]
-        plain.advance(number, error)
-        mirrored.advance(number, error * sign)
-    assert turned > 6
+    assert_mirroring_turns_errors_back(
+        pool(dataset, mirror=()),
+        pool(dataset),
+        lambda number, batch, target: residual(target, number) * normal(batch)[:, None],
+    )
 
 
 def test_each_scene_runs_to_its_end_and_all_pairs_are_as_frequent(dataset):

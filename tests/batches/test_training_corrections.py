@@ -5,6 +5,7 @@ from collections import Counter
 import numpy as np
 import pytest
 import torch
+from checks import assert_mirroring_turns_errors_back
 from data_samples import block, mesh_graph, trajectory, write
 
 from ast_sim.batches import training_corrections
@@ -181,15 +182,6 @@ def test_two_parts_are_the_whole(dataset):
 
 def test_mirroring_turns_errors_back(dataset):
     """Mirrored and not, the same scene has the same guesses."""
-    plain, mirrored = pool(dataset, mirror=()), pool(dataset)
-    turned = 0
-    for number in range(12):
-        (a, x), (b, y) = plain.batch(number), mirrored.batch(number)
-        assert a.names == b.names
-        sign = torch.where((x.motion * y.motion < 0) & (x.motion.abs() > 1e-9), -1.0, 1.0)
-        torch.testing.assert_close(x.motion * sign, y.motion, atol=1e-6, rtol=1e-4)
-        turned += int((sign < 0).any())
-        error = residual(a, number)
-        plain.advance(number, error)
-        mirrored.advance(number, error * sign)
-    assert turned > 6
+    assert_mirroring_turns_errors_back(
+        pool(dataset, mirror=()), pool(dataset), lambda number, batch, _: residual(batch, number)
+    )
