@@ -80,6 +80,13 @@ def test_a_name_means_one_thing():
     assert not [name for name, count in names.items() if count > 1]
 
 
+def test_test_modules_have_names_of_their_own():
+    """Pytest imports a test module by the name of its file alone: of two with one name, the second is an error."""
+    tests = Path(__file__).parent
+    names = Counter(path.name for path in tests.rglob("*.py") if path.name != "conftest.py")
+    assert not [name for name, count in names.items() if count > 1]
+
+
 @pytest.mark.parametrize("module", [WORKER_MODULE, SOLVER_MODULE, MESHING_MODULE, READING_MODULE, *MODULES.values()])
 def test_modules_named_by_strings_are_there(module):
     """The check of imports does not see them."""
