@@ -124,7 +124,7 @@ def refuse(args: argparse.Namespace, groups: tuple[Any, ...], what: str) -> None
 
 
 def check_output(args: argparse.Namespace, out: Path, inputs: Iterable[Path], what: str = "", *suffixes: str) -> None:
-    """Raise ConfigError if the name of the output does not end as that of `what` must, or if the output is an input,
+    """Raise ConfigError if the name of the output does not end as a name of `what` must, or if the output is an input,
     lies in a run, or exists and --overwrite was not given."""
     if suffixes and out.suffix not in suffixes:
         one_of = "one of " if len(suffixes) > 1 else ""

@@ -14,11 +14,11 @@ With the factorization K = L L^T, B is the product of L^-1 C^T with itself.
 
 With Coulomb friction each pair has tangential forces, too, at most the coefficient times the normal force. They resist
 slip from where the surfaces stuck to each other. A single step does not know the load path. If nothing else is
-given, its surfaces have slid along the last fiftieth of a straight way from rest: those that slide get the whole
-friction against their way, and those that stick hardly feel it (docs/log.md, 2026-11-25). Bodies may overlap at x, and
-elements may be turned over: these get the forces and the stiffness of the nearest upright shape (Irving, Teran and
-Fedkiw 2004). Pairs of edges are left out, so edges may cross by a little. A node is on the side of a surface where it
-is nearest: the start must be nearly right.
+given, its surfaces have slid along the last fiftieth of a straight path from rest: surfaces that slide get the whole
+friction against their motion, and surfaces that stick hardly feel it (docs/log.md, 2026-11-25). Bodies may overlap at
+x, and elements may be turned over: these get the forces and the stiffness of the nearest upright shape (Irving, Teran
+and Fedkiw 2004). Pairs of edges are left out, so edges may cross by a little. A node is on the side of a surface where
+it is nearest: the start must be nearly right.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ CLEARANCE = (
 NEAR = 0.5  # pairs with a gap below this may touch, in mean edge lengths of the surfaces
 DEEP = 2.0  # a node deeper inside another body than this is not taken for one in contact with it, in the same
 OVERLAP = 1e-6  # pairs may overlap by this much at the end of a step, in the same
-FEW = 8  # a round takes so many of the pairs that would overlap,
+FEW = 8  # a round takes at least this number of the pairs that would overlap,
 SHARE = 4  # or this part of them,
 MORE = 16  # or this part of all that were taken before, if that is more
-SLID = 0.02  # surfaces have slid along this last part of the way from rest to x, if nothing else is known
+SLID = 0.02  # surfaces have slid along this last part of the path from rest to x, if nothing else is known
 SWEEPS, CHANGE = 100, 1e-3  # forces of friction are found when a sweep over the pairs changes them by less
 FLATTEST = 0.2  # the least stretch of an element that forces and stiffness follow
 TINY = 1e-300  # instead of zero in a denominator
@@ -146,10 +146,10 @@ class NewtonSteps:
         return self._shortened(position, self._constrained(factor, force, self.near_pairs(position, stuck)))
 
     def size(self, before: np.ndarray, after: np.ndarray) -> float:
-        """The size of the last step, between positions [N, 3]: the largest component of a move, in mean edge lengths of
-        the surfaces, or the root mean square of the moves over that of the displacements from rest, if that is larger.
-        Displacements below `SLIGHT` count as `SLIGHT`. A step that was shortened has the size of the whole one: where
-        elements stop it, it has not converged."""
+        """The size of the last step, between positions [N, 3]: the larger of the largest component of a move, in mean
+        edge lengths of the surfaces, and the root mean square of the moves over the root mean square of the
+        displacements from rest. Displacements below `SLIGHT` count as `SLIGHT`. A step that was shortened has the size
+        of the whole one: where elements stop it, it has not converged."""
         free = self.system.free
         move, displacement = ((after - start).ravel()[free] for start in (before, self._rest))
         slight = SLIGHT * self._length * math.sqrt(len(free))
@@ -182,8 +182,8 @@ class NewtonSteps:
     ) -> tuple[np.ndarray, np.ndarray]:
         """The pairs [A] that may press on each other and their forces [A] >= 0, without friction.
 
-        The compliance of a pair costs half a solution with the stiffness. So pairs get one in rounds, those first that
-        would overlap most with the forces so far. At the end no pair overlaps: these are the forces of all pairs.
+        The compliance of a pair costs half a solution with the stiffness. So pairs get one in rounds, first the pairs
+        that would overlap most with the forces so far. At the end no pair overlaps: these are the forces of all pairs.
         """
         chosen = np.zeros(0, int)
         forces = np.zeros(0)
@@ -262,7 +262,7 @@ class NewtonSteps:
         return NearPairs(directions, gaps[movable], slip)
 
     def _shortened(self, position: np.ndarray, way: np.ndarray) -> np.ndarray:
-        """`position` [N, 3] moved by the largest of 1, 1/2, 1/4, ... of the way [F] that turns no element over."""
+        """`position` [N, 3] moved by the largest of 1, 1/2, 1/4, ... of `way` [F] that turns no element over."""
         share = 1.0
         while True:
             self._shortening = share
@@ -307,7 +307,7 @@ def _pressed(compliance: np.ndarray, offset: np.ndarray) -> np.ndarray:
 
 
 def _rubbed(compliance: np.ndarray, offset: np.ndarray, forces: np.ndarray, friction: float) -> np.ndarray:
-    """The forces [3, P] of contact with Coulomb friction, from those [P] without, by nonlinear block Gauss-Seidel
+    """The forces [3, P] of contact with Coulomb friction, from the forces [P] without, by block Gauss-Seidel
     (Jourdan, Alart and Jean 1998): each pair in turn gets the force that is right if the others stay.
 
     Args:

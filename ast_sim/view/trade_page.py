@@ -97,7 +97,7 @@ def _note(figures: TradeFigures) -> str:
 
 
 def _points(settings: Sequence[Setting]) -> list[dict[str, Any]]:
-    """The settings as points; `front` marks those that none beats."""
+    """The settings as points; `front` marks the settings that no other beats."""
     best = {one.name for one in front(settings)}
     return [
         {"name": one.name, "error": one.kept, "seconds": one.middle, "front": one.name in best, "command": one.command}

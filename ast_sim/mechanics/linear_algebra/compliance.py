@@ -9,7 +9,7 @@ import scipy.sparse
 
 from ast_sim.mechanics.linear_algebra.factorization import Factorization
 
-COLUMNS, NUMBERS = 64, 2**23  # so many right sides are solved for together, more if they have fewer numbers
+COLUMNS, NUMBERS = 64, 2**23  # right sides that are solved for together: 64, or more while they have fewer numbers
 ROUNDING = 1e-10  # is added to the diagonal of B, relative to its mean: equal pairs make B singular
 
 
@@ -17,7 +17,7 @@ class Compliance:
     """B of directions that come one after another, and the displacement by forces along them.
 
     With the factorization K = L L^T, B is the product of L^-1 C^T with itself. A column of it is zero but for the
-    unknowns that are eliminated after those of the direction and depend on them: a tenth of all if the directions lie
+    unknowns that are eliminated after the unknowns of the direction and depend on them: a tenth if the directions lie
     side by side. Only the rows with other numbers are kept, and multiplied.
 
     Args:

@@ -168,8 +168,8 @@ class LinearSystem:
         return solution.reshape(-1, 3)
 
     def factorise(self, values: np.ndarray) -> Factorization | None:
-        """Factorise the sum of the elements' values [P] alone, without contact. The unknowns of the factorization are
-        those of `free`. None if the matrix is not positive definite."""
+        """Factorise the sum of the elements' values [P] alone, without contact. `free` has the unknowns of the
+        factorization. None if the matrix is not positive definite."""
         matrix = self._assemble(values, (np.zeros(0, int), np.zeros(0, int), np.zeros(0)))
         self.factorizations += 1
         self._has_factor = self._factorization.factorise(matrix, self._is_new)
