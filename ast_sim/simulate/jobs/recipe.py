@@ -127,7 +127,7 @@ def recipe_of(name: str, info: DatasetInfo, made_from: str | os.PathLike[str] | 
     except TypeError as error:
         raise ConfigError(f"{name}: its settings cannot be read ({error!r})") from error
     if parts is not None and _source(parts).describe().get("parts") != made["parts"]:
-        raise ConfigError(f"{parts} holds other parts than those that {name} was made of")
+        raise ConfigError(f"{parts} does not hold the parts that {name} was made of")
     if spec is not None and read_spec(spec).describe() != made["spec"]:
         raise ConfigError(f"{spec} or a file that it names differs from what {name} was made of")
     return recipe
