@@ -33,7 +33,7 @@ def convert(source: Path | str, out: Path | str, **options: Any) -> dict[str, in
     """Import simulations as a dataset: PVD, VTU and VTKHDF files, or a folder of a MeshGraphNets data set.
 
     Args:
-        options: the options of `convert_deepmind` if the source holds .tfrecord files, else those of `convert_series`.
+        options: the options of `convert_deepmind` if the source holds .tfrecord files, else of `convert_series`.
             Both have `progress`, as in `generate`.
 
     Returns:
@@ -72,7 +72,7 @@ def convert_series(
         names: the names of the fields.
         splits: for each split the names of its simulations (others are left out), or its share, drawn with `seed`.
             Shares add up to 1; each above 0 gets one simulation at least. The default is 0.8, 0.1, 0.1; it needs three.
-        calibration: so many simulations are drawn first for the split "calibration"; shares divide the others.
+        calibration: simulations that are drawn first for the split "calibration"; shares divide the others.
         integration, contact_radius, time_step, length_unit: as in `DatasetInfo`; no unit is "m", but a deck needs one.
         deck: the deck of CalculiX (`.inp`) whose results the source is; see `read_job` and `decks_of`.
         corners: take only the corners of second-order tetrahedra: no force of such a mesh is right.

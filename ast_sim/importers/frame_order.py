@@ -16,7 +16,7 @@ _NUMBER = re.compile(r"([0-9]+(?:\.[0-9]+)?(?:[eE][-+]?[0-9]+)?)")
 
 
 class FrameFiles(NamedTuple):
-    """The files of a simulation, those of one frame together, and the time of each frame where a PVD file says it."""
+    """The files of a simulation, grouped by frame, and the time of each frame where a PVD file says it."""
 
     files: list[list[Path]]
     times: list[float] | None = None
@@ -95,7 +95,7 @@ def _whole_numbers(path: Path) -> list[tuple[int, str]]:
 
 
 def _collection(source: Path) -> FrameFiles:
-    """The files that a PVD file lists, by their time; those of one time are the parts of one frame."""
+    """The files that a PVD file lists, by their time; files of one time are the parts of one frame."""
     try:
         root = ElementTree.parse(source).getroot()
         entries = [

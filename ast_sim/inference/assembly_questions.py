@@ -63,11 +63,11 @@ def ask(
         rows: values by name; parameters that a row leaves out are in the middle of their ranges.
         scope: what the model was trained on.
         trained: the specification of the training, as `AssemblySpec.describe` gives it; None: there was none.
-        frames: frames of the motion; None: those of the specification.
+        frames: the number of frames of the motion; None: as in the specification.
         nodes: about how many nodes a scene has; None: by the sizes of the specification.
 
     Raises:
-        ConfigError: the specification has a mistake, there is no such parameter, or its unit is not that of the run.
+        ConfigError: the specification has a mistake, there is no such parameter, or its unit is not the run's.
         SimulationError: a scene cannot be made; the text names the values.
     """
     read = read_spec(spec)

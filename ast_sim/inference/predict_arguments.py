@@ -98,7 +98,7 @@ def _require_whole(trajectory: Trajectory, config: ModelConfig, scope: Scope, na
     if place not in ("none", config.data.stress):
         needs = "predicts none" if config.data.stress == "none" else f"predicts it at each {config.data.stress}"
         raise ConfigError(f"{name} has a stress at each {place}, but the run {needs}: leave it out, or convert it")
-    named = [one for one in config.data.fields if one[0] in trajectory.fields]  # those that are missing start at zero
+    named = [one for one in config.data.fields if one[0] in trajectory.fields]  # missing ones start at zero
     require_fields(name, trajectory.fields, named)
 
 
@@ -129,7 +129,7 @@ def _given_stress(config: ModelConfig, scene: Scene, stress: np.ndarray | None, 
     """The stress of the given frames as float32.
 
     Raises:
-        ConfigError: its shape is not that of the model's stress.
+        ConfigError: its shape is not the shape of the model's stress.
     """
     if stress is None:
         return None

@@ -223,8 +223,8 @@ class Run:
         throw: bool = True,
         progress: ShowProgress = True,
     ) -> list[Answer]:
-        """Predict several scenes, each under a motion, as one batch. `progress` is as in `generate`; errors
-        and other arguments are those of `predict`."""
+        """Predict several scenes, each under a motion, as one batch. `progress` is as in `generate`; errors and other
+        arguments are as in `predict`."""
         began = time.perf_counter()
         names = [f"scene {number}" for number in range(len(scenes))] if names is None else names
         config, scope = self.settings.model, self.scope
@@ -249,7 +249,7 @@ class Run:
         progress: ShowProgress = True,
     ) -> list[Answer]:
         """Predict one scene under several motions, as one batch; the answers have the order of the motions. Arguments
-        and errors are those of `predict_scenes`."""
+        and errors are as in `predict_scenes`."""
         names = [f"{name}, motion {number}" for number in range(len(motions))]
         scenes = [(scene, motion) for motion in motions]
         shared = {"frames": frames, "effort": effort, "error": error, "num_frames": num_frames}
@@ -303,8 +303,8 @@ class Run:
 
         Raises:
             DatasetError: the dataset cannot be read.
-            ConfigError: the run is a file, and no dataset is named; or its integration, stress location, material
-                columns or elements differ from those of the training data.
+            ConfigError: the run is a file, and no dataset is named; or the dataset and the training data differ in
+                integration, stress location, material columns or elements.
         """
         if data is None and self.path.is_file():
             raise ConfigError(f"{self.path} holds no dataset: name one; the run learned from {self.settings.data}")
@@ -331,7 +331,7 @@ class Run:
         Args:
             data: a dataset, its path or open; by default the one that the run was trained on.
             command: the command that is recorded beside the figures.
-            solver_scenes: in so many scenes the solver solves the deepest frame, in several ways, to compare.
+            solver_scenes: the number of scenes in which the solver solves the deepest frame, too, in several variants.
             made_from: the specification or the parts of your own of which the dataset was made; the solver needs them.
             progress: as in `generate`; it counts scenes, once for all frames, once for the deepest, once solved.
         """

@@ -1,4 +1,4 @@
-"""The settings that a training is asked for: of a preset or of a run, changed by a file and by assignments."""
+"""The settings that a training is given: of a preset or of a run, changed by a file and by assignments."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def configure(
     """The settings of a preset or of a run, changed by a file, then by assignments `key=value` and by `changes`, values
     by dotted key. Unset settings are filled in when training starts.
 
-    Arguments and errors are those of `train`.
+    Arguments and errors are as for `train`.
     """
     file = None if config is None else Path(config)
     given = {} if file is None else read_changes(file)

@@ -98,10 +98,10 @@ def trade(
 
     Args:
         data: a dataset, its path or open; by default the one that the run was trained on.
-        split: whose scenes are asked. They must be new to the run, or its errors are too small.
+        split: whose scenes are predicted. They must be new to the run, or its errors are too small.
         beside: other runs that have learned from the same dataset, such as other models. Each stands in the tables with
             its fastest effort, by the name of its folder.
-        scenes: at most so many, the first of the split.
+        scenes: the number of scenes, at most: the first ones of the split that move.
         solver_seconds: what another program takes for such a scene, to the error of its mesh; our solver is not run.
         made_from: the specification or the parts of your own of which the dataset was made; the solver needs them.
         command: what is recorded as the origin of the figures.
@@ -291,7 +291,7 @@ def timed_answer(
     """The errors of an answer at the deepest frame by quantity, its processor seconds, and why it failed: it has no
     errors and infinite seconds then.
 
-    The scene is loaded anew, so nothing is prepared for its mesh; with these named fields, by which the force is
+    The scene is loaded again, so nothing is prepared for its mesh; with these named fields, by which the force is
     judged.
     """
     truth = dataset.load(split, index, fields)
@@ -313,8 +313,8 @@ def _command(run: Run, scenes: _Scenes, effort: Effort) -> str:
 
 
 def _invested(run: Run, dataset: Dataset) -> float | None:
-    """The processor seconds of the solver for the training scenes, if the dataset is that of the training, and the
-    seconds of the training."""
+    """The processor seconds of the solver for the training scenes and the seconds of the training, if the run has
+    learned from this dataset."""
     steps = run.settings.train.steps
     step = run.folder.metrics.seconds_per_step()
     samples = read_seconds(dataset).samples

@@ -1,8 +1,8 @@
-"""The most accurate effort that takes no longer than an asked time, as measured on this machine.
+"""The most accurate effort that takes no longer than a wanted time, as measured on this machine.
 
-What an effort takes follows from the processor, the threads, the nodes of the scene and the frames that are asked. At
-the first question of its kind each effort is made once to warm up and then timed; the times are kept in the user's
-cache folder, outside the run, since they say nothing on another machine.
+The time of an effort depends on the processor, the threads, the nodes of the scene and the wanted frames. At the first
+question of its kind each effort is made once to warm up and then timed. The times are kept in the user's cache folder,
+outside the run, since they say nothing on another machine.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ SIMILAR = 0.1  # scenes whose numbers of nodes differ by at most this share take
 
 
 def effort_within(run: Run, question: Question, ms: float) -> tuple[Effort, str]:
-    """The effort with the smallest error in the validation scenes among those that take at most `ms` milliseconds for
-    such a question, and what is said of the choice.
+    """The effort with the smallest error in the validation scenes, of all efforts that take at most `ms` milliseconds
+    for such a question, and what is said of the choice.
 
     Raises:
         ConfigError: the fastest takes longer; the run has one effort, since it predicts step by step; or no errors of

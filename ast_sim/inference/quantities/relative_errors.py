@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 
 def relative_error(position: np.ndarray, truth: Trajectory, frame: int) -> float:
-    """The root mean square error of the free nodes at positions [N, 3] in a frame, over that of their displacement,
-    which must not be 0."""
+    """The root mean square error of the free nodes at positions [N, 3] in a frame, divided by the root mean square of
+    their displacement, which must not be 0."""
     free = ~truth.scene.prescribed
     true = truth.position[frame]
     return rms(position - true, free) / rms(true - truth.position[0], free)

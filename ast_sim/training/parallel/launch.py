@@ -63,7 +63,7 @@ def _is_from_a_script(config: RunConfig) -> bool:
 
 @contextmanager
 def together(count: int, config: RunConfig | None, arguments: Mapping[str, Any]) -> Iterator[None]:
-    """Within the block, so many processes make the training; 1: only this one.
+    """Within the block, `count` processes train together; 1: only this one.
 
     Args:
         config: the settings, if there are any.
