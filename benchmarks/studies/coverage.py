@@ -114,8 +114,8 @@ def _beam(height: float) -> tuple[ast_sim.Scene, np.ndarray]:
 
 
 def unusual(run: ast_sim.Run, questions: Sequence[tuple[ast_sim.Scene, np.ndarray]]) -> dict[str, int]:
-    """Of so many questions, at the last frame by one call: those outside the ranges of the training, those that the
-    network finds unlike the calibration scenes, and those that are told by either."""
+    """How many questions there are, at the last frame by one call, and how many of them lie outside the ranges of the
+    training, are unlike the calibration scenes by the network, or are told by either."""
     answers = [run.predict(*one, frames=[-1], effort=ast_sim.Effort(), throw=False) for one in questions]
     unlike = [one.p_value is not None and one.p_value <= UNUSUAL for one in answers]
     outside = [len(one.notes) > alike for one, alike in zip(answers, unlike, strict=True)]
