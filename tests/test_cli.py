@@ -258,7 +258,7 @@ def test_a_series_of_another_program_becomes_a_dataset(tmp_path, capsys):
         assert dataset.num_frames("test", 0) == 7
 
 
-def test_resume_without_a_dataset_takes_that_of_the_run(trained, capsys):
+def test_resume_without_a_dataset_takes_the_dataset_of_the_run(trained, capsys):
     _, run = trained
     assert main(["train", "--out", str(run), "--resume"]) == 0
     assert "going on after step 6" in capsys.readouterr().out

@@ -10,7 +10,7 @@ SCENES = tuple(f"test/{index:06d}" for index in range(10))
 
 
 def setting(name, error, seconds, failed=0):
-    """A setting with errors of 0.1 to 1 times `error`, and so many scenes without an answer."""
+    """A setting with errors of 0.1 to 1 times `error`, and `failed` scenes without an answer."""
     errors = [error * (k + 1) / 10 for k in range(10 - failed)] + [math.inf] * failed
     return Setting(name, tuple(errors), (seconds,) * (10 - failed) + (math.inf,) * failed)
 

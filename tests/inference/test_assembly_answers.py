@@ -153,7 +153,7 @@ def test_what_differs_from_the_specification_of_the_training_is_told(change, tra
     assert line in answer.notes and answer.expected_error is None
 
 
-def test_a_specification_within_that_of_the_training_has_no_notes(trained, tmp_path):
+def test_a_specification_within_the_ranges_of_the_training_has_no_notes(trained, tmp_path):
     """Other comments, another place, one value instead of a range tell nothing."""
     spec, run = trained
     path = write_assembly(tmp_path, "# a copy\n" + SPEC.replace("[0.5, 1.5]", "1.2").replace("[1e6, 2e6]", "1.4e6"))

@@ -142,7 +142,7 @@ def test_what_cannot_be_calibrated_is_refused(calibrated):
     assert Calibration.from_json(calibrated[2].to_json()) == calibrated[2]
 
 
-def test_the_kept_errors_are_those_of_answers_to_each_effort(calibrated):
+def test_the_kept_errors_are_the_errors_of_answers_to_each_effort(calibrated):
     """The errors of an effort, worked out by hand, scene by scene."""
     run, data, result = calibrated
     assert result.kept.efforts == (Effort(),) and set(result.kept.errors) == {"displacement", "stress"}

@@ -1,4 +1,4 @@
-"""What an asked time chooses, with the run that comes with the package: times are measured once and kept."""
+"""What a wanted time chooses, with the run that comes with the package: times are measured once and kept."""
 
 import json
 from dataclasses import replace
@@ -21,7 +21,7 @@ def cache(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory):
-    """A plate like those of the training, in its deepest frame."""
+    """A plate like the training plates, in its deepest frame."""
     data = tmp_path_factory.mktemp("plate") / "plate.h5"
     ast_sim.generate("deforming_plate", data, train=0, valid=0, test=1, nodes=400, frames=41, keep=(24,), seed=123)
     with ast_sim.Dataset(data) as dataset:
@@ -54,7 +54,7 @@ def test_the_most_accurate_effort_within_the_time_is_made(cache, truth):
         run.predict(truth, frames=[1], ms=9.9)
 
 
-def test_other_questions_are_timed_anew_and_a_damaged_file_is_no_obstacle(cache, truth):
+def test_other_questions_are_timed_again_and_a_damaged_file_is_no_obstacle(cache, truth):
     run = ast_sim.example_run("plates")
     cache.parent.mkdir()
     cache.write_text("{")

@@ -118,7 +118,7 @@ def test_increments_of_fixed_nodes_couple_as_in_the_dense_matrix(problem):
     np.testing.assert_allclose(found, expected, atol=1e-10 * np.abs(expected).max())
 
 
-def test_the_pattern_is_analysed_anew_only_when_contact_adds_to_it(problem, monkeypatch):
+def test_the_pattern_is_analysed_again_only_when_contact_adds_to_it(problem, monkeypatch):
     system, values, _, fixed = problem
     news, factorise = [], system._factorization.factorise
     monkeypatch.setattr(

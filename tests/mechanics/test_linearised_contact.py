@@ -57,7 +57,7 @@ def test_steps_lead_to_the_solution_of_the_solver(squeezed):
     assert left[0.92][0] < 0.017 and left[0.92][-1] < 0.016 and left[0.0][-1] > 0.05
 
 
-def test_the_stress_is_that_of_the_solver(squeezed):
+def test_the_stress_is_the_solvers(squeezed):
     case, truth, *_ = squeezed
     stored = quasi_static(case).stress[-1]
     stress = NewtonSteps(case.scene, case.material, 0.8 * DHAT).von_mises(truth, "element")
@@ -157,7 +157,7 @@ def test_positions_that_lead_nowhere_are_refused(squeezed, size):
             position = solver.step(position, from_afar=True)
 
 
-def test_forces_found_in_rounds_are_those_of_all_pairs_at_once(squeezed, monkeypatch):
+def test_forces_found_in_rounds_are_the_same_as_of_all_pairs_at_once(squeezed, monkeypatch):
     case, truth, free, size = squeezed
     start, found = nearly(truth, free, 0.1 * size), []
     for few in (2, 1000):
@@ -213,7 +213,7 @@ def test_what_slides_feels_friction_against_its_way(monkeypatch):
 
 
 def test_what_is_not_looked_at_is_not_near(squeezed, monkeypatch):
-    """Only what comes near the box around the other body is compared; the pairs are those of whole surfaces."""
+    """Only what comes near the box around the other body is compared; the pairs are the same as of whole surfaces."""
     case, truth, *_ = squeezed
     solver = NewtonSteps(case.scene, case.material, 0.0)
     pairs = solver.near_pairs(truth)

@@ -130,7 +130,7 @@ def test_a_worker_that_is_killed_costs_its_sample_only(undisturbed, tmp_path, mo
     assert last["train/000001"]["state"] == "failed" and "SIGKILL" in last["train/000001"]["reason"]
     assert last["valid/000000"]["bytes"] == sample_path(folder, "valid", 0).stat().st_size
     assert [values["state"] for values in states(folder)["valid/000000"]] == ["pending", "running", "done"]
-    sample_path(folder, "test", 0).write_bytes(b"PK\x03\x04 not a sample")  # made anew, not trusted
+    sample_path(folder, "test", 0).write_bytes(b"PK\x03\x04 not a sample")  # made again, not trusted
     asked, run = [], pool.run_all
     monkeypatch.setattr(pool, "run_all", lambda samples, *rest: asked.extend(samples) or run(samples, *rest))
     plates(out, progress=True)
@@ -251,7 +251,7 @@ def test_a_patient_solve_is_recorded_and_reaches_every_frame(tmp_path, monkeypat
     assert make_sample(patient, "train", 0).num_frames == FRAMES
 
 
-def test_kept_frames_are_those_of_the_whole_motion_and_recorded(undisturbed, tmp_path):
+def test_kept_frames_are_frames_of_the_whole_motion_and_recorded(undisturbed, tmp_path):
     kept = (3, 7)
     out = plates(tmp_path / "kept.h5", keep=kept, workers=1).path
     with Dataset(undisturbed) as whole, Dataset(out) as some:
