@@ -85,8 +85,8 @@ ROWS = {
 }
 
 
-def measured(name: str, folder: Path) -> dict[str, Any]:
-    """Generate, train and measure a row; what is there already is not made again."""
+def trained(name: str, folder: Path) -> tuple[ast_sim.Run, Path]:
+    """The run of a row and its dataset; what is there already is not made again."""
     row = ROWS[name]
     data = ast_sim.generate(
         "assembly", folder / f"{name}.h5", spec=row.spec, train=row.train, valid=row.valid, test=row.test,
@@ -96,6 +96,13 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
     run = ast_sim.train(
         data, row.run_folder(name, folder), from_run=start, steps=row.steps, resume=True, **row.settings
     )
+    return run, data
+
+
+def measured(name: str, folder: Path) -> dict[str, Any]:
+    """Generate, train and measure a row."""
+    row = ROWS[name]
+    run, data = trained(name, folder)
     with run.open(data) as dataset:
         found = deepest_frames(run.model, dataset, "test", run.effort, row.solver_scenes, made_from=row.spec)
         curves = [_curve(run, dataset, index) for index in range(row.test)]

@@ -1,17 +1,17 @@
-"""Do bands and asked errors hold? In how many fresh plates all errors lie within the band, how many
-keep an error that an effort was chosen for, and how many strange plates are told.
+"""Do bands and asked errors hold? In how many fresh scenes all errors lie within the band, how many keep an error that
+an effort was chosen for, and how many strange scenes are told.
 
-`python -m benchmarks.studies.coverage` calibrates the run of plates that comes with the package on a hundred plates,
-and predicts 300 others, and changed ones, with each effort. It writes benchmarks/results/coverage.json. The
-scenes lie in `--folder`; a second call goes on with what is there.
+`python -m benchmarks.studies.coverage [ROW ...]` calibrates the run of each row (the plates' comes with the package,
+the products' are of `benchmarks.studies.assembly`) on a hundred scenes, and predicts fresh ones, and changed ones, with
+each effort. It writes benchmarks/results/coverage.json and docs/results/coverage.md. Scenes and runs lie in `--folder`;
+a second call goes on with what is there. Everything runs on one thread.
 """
 
 from __future__ import annotations
 
-import argparse
 import warnings
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,23 +22,87 @@ import ast_sim
 from ast_sim.inference.promises.familiarity import UNUSUAL
 from ast_sim.inference.quantities.band import LEVEL, compared
 from ast_sim.simulate.jobs.fastest_solver import deepest_frame
-from ast_sim.support.disk import write_json
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.provenance import provenance
+from benchmarks.studies import assembly
+from benchmarks.studies.coverage_page import page
+from benchmarks.studies.rows import study_rows
 
 RESULTS = Path(__file__).parents[1] / "results" / "coverage.json"
-PLATES = {"train": 0, "valid": 0, "nodes": 400, "frames": 41, "keep": (14, 24, 34)}
-SETS = {"calibration": {"seed": 911, "test": 100}, "fresh": {"seed": 912, "test": 300}}
+PAGE = Path(__file__).parents[2] / "docs" / "results" / "coverage.md"
+SEEDS = {"calibration": 911, "fresh": 912}
+STRANGE = 40  # fresh scenes that are changed
 ASKED = {
     "displacement": (0.1, 0.08, 0.05, 0.025, 0.02, 0.015, 0.01),
     "reaction": (0.5, 0.2, 0.1, 0.05, 0.02),
     "stress": (0.2, 0.1, 0.05, 0.02, 0.01),
 }
+Question = tuple[ast_sim.Scene, np.ndarray]
 
 
-def plates(folder: Path, name: str) -> Path:
-    """The dataset with the plates `name`, made if it is not there yet."""
-    return ast_sim.generate("deforming_plate", folder / f"{name}.h5", **SETS[name], **PLATES).path
+@dataclass(frozen=True)
+class Row:
+    """A run and its scenes.
+
+    Attributes:
+        title: what the page calls them.
+        run: gives the run; data of its own lie in the folder.
+        generate: the settings of `generate`.
+        fresh: the number of fresh scenes.
+        calibration: the number of calibration scenes.
+    """
+
+    title: str
+    run: Callable[[Path], ast_sim.Run]
+    generate: dict[str, Any]
+    fresh: int
+    calibration: int = 100
+
+
+def _product(name: str) -> Row:
+    """The row of a product of `benchmarks.studies.assembly`."""
+    product = assembly.ROWS[name]
+    scenes = {"family": "assembly", "spec": product.spec, "nodes": product.nodes}
+    return Row(product.title, lambda folder: assembly.trained(name, folder)[0], scenes, fresh=100)
+
+
+_PLATES = {"family": "deforming_plate", "nodes": 400, "frames": 41, "keep": (14, 24, 34)}
+ROWS = {
+    "plates": Row("Plates, 400 nodes", lambda _: ast_sim.example_run("plates"), _PLATES, fresh=300),
+    "snap_hook": _product("snap_hook"),
+    "bumper": _product("bumper"),
+}
+
+
+def scenes(name: str, folder: Path, which: str) -> Path:
+    """The dataset with the scenes of a row, `which` of "calibration" and "fresh", in its split "test"; it is made if it
+    is not there yet."""
+    row = ROWS[name]
+    return ast_sim.generate(
+        out=folder / f"{name}_{which}.h5", train=0, valid=0, test=getattr(row, which), seed=SEEDS[which], **row.generate
+    ).path
+
+
+def measured(name: str, folder: Path) -> dict[str, Any]:
+    """The figures of a row."""
+    run = ROWS[name].run(folder)
+    truths = _loaded(scenes(name, folder, "fresh"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what they tell is counted
+        calibration = ast_sim.calibrate(run, scenes(name, folder, "calibration"), "test")
+        rows = [row for effort in calibration.efforts for row in bands(run, truths, effort)]
+        asked = promises(run, truths)
+        ordinary = [(truth.scene, truth.position) for truth in truths]
+        kinds = {"fresh scenes": ordinary, **strange(name, truths[:STRANGE], folder)}
+        told = {kind: unusual(run, questions) for kind, questions in kinds.items()}
+    known = {"title": ROWS[name].title, "calibration_scenes": calibration.scenes, "spacing": list(calibration.spacing)}
+    origin = provenance(f"python -m benchmarks.studies.coverage {name}")
+    return {**origin, **known, "rows": rows, **asked, "told": told}
+
+
+def _loaded(path: Path) -> list[ast_sim.Trajectory]:
+    with ast_sim.Dataset(path) as data:
+        return [data["test"][index] for index in range(data.count("test"))]
 
 
 def bands(run: ast_sim.Run, truths: Sequence[ast_sim.Trajectory], effort: ast_sim.Effort) -> list[dict[str, Any]]:
@@ -69,22 +133,37 @@ def bands(run: ast_sim.Run, truths: Sequence[ast_sim.Trajectory], effort: ast_si
     return rows
 
 
-def strange(truths: Sequence[ast_sim.Trajectory]) -> dict[str, list[tuple[ast_sim.Scene, np.ndarray]]]:
-    """Questions by what is strange about them: each of these plates, changed."""
+def strange(name: str, truths: Sequence[ast_sim.Trajectory], folder: Path) -> dict[str, list[Question]]:
+    """Questions to the run of a row, by what is strange about them."""
+    kinds = {"twice the travel": [(one.scene, 2 * one.position - one.position[:1]) for one in truths]}
+    if truths[0].scene.material is not None:
+        kinds["three times the stiffness"] = [(_stiffer(one.scene), one.position) for one in truths]
+    if name == "plates":
+        return kinds | _changed_plates(truths)
+    (other,) = {"snap_hook", "bumper"} - {name}
+    strangers = _loaded(scenes(other, folder, "fresh"))[:STRANGE]
+    return kinds | {f"{ROWS[other].title} in its place": [(one.scene, one.position) for one in strangers]}
+
+
+def _stiffer(scene: ast_sim.Scene) -> ast_sim.Scene:
+    """Young's modulus is the first column of the material."""
+    assert scene.material is not None
+    return replace(scene, material=scene.material * np.float32([3, *[1] * (scene.material.shape[1] - 1)]))
+
+
+def _changed_plates(truths: Sequence[ast_sim.Trajectory]) -> dict[str, list[Question]]:
     quarter = np.float32([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
     upside_down = np.float32([[1, 0, 0], [0, -1, 0], [0, 0, -1]])
-    kinds: dict[str, list[tuple[ast_sim.Scene, np.ndarray]]] = {}
+    kinds: dict[str, list[Question]] = {}
     for truth in truths:
         scene, motion = truth.scene, truth.position
-        way = motion - motion[:1]
         held = scene.node_type == ast_sim.NodeType.HANDLE
         one_end = held & (scene.rest_position[:, 0] > scene.rest_position[held, 0].mean())
         for kind, question in {
             "turned by 180 degrees: nothing strange": _turned(scene, motion, quarter @ quarter),
             "turned by 90 degrees in its plane": _turned(scene, motion, quarter),
             "pressed from below": _turned(scene, motion, upside_down),
-            "pressed sideways": (scene, motion[:1] + way[..., [2, 1, 0]]),
-            "twice the travel": (scene, motion[:1] + 2 * way),
+            "pressed sideways": (scene, motion[:1] + (motion - motion[:1])[..., [2, 1, 0]]),
             "held at one end": (_free(scene, one_end), motion),
             "held by nothing": (_free(scene, held), motion),
         }.items():
@@ -93,7 +172,7 @@ def strange(truths: Sequence[ast_sim.Trajectory]) -> dict[str, list[tuple[ast_si
     return kinds
 
 
-def _turned(scene: ast_sim.Scene, motion: np.ndarray, turn: np.ndarray) -> tuple[ast_sim.Scene, np.ndarray]:
+def _turned(scene: ast_sim.Scene, motion: np.ndarray, turn: np.ndarray) -> Question:
     return replace(scene, rest_position=scene.rest_position @ turn.T), motion @ turn.T
 
 
@@ -101,7 +180,7 @@ def _free(scene: ast_sim.Scene, nodes: np.ndarray) -> ast_sim.Scene:
     return replace(scene, node_type=np.where(nodes, ast_sim.NodeType.NORMAL, scene.node_type).astype(np.uint8))
 
 
-def _beam(height: float) -> tuple[ast_sim.Scene, np.ndarray]:
+def _beam(height: float) -> Question:
     """A beam that is held at one end and pressed at the other, within the ranges of the plates."""
     body = ast_sim.box((0, 0, 0), (0.5, 0.1, height), cells=(13, 3, 3))
     kinds = np.where(body.rest_position[:, 0] == 0, ast_sim.NodeType.HANDLE, body.node_type).astype(np.uint8)
@@ -113,9 +192,9 @@ def _beam(height: float) -> tuple[ast_sim.Scene, np.ndarray]:
     return scene, motion
 
 
-def unusual(run: ast_sim.Run, questions: Sequence[tuple[ast_sim.Scene, np.ndarray]]) -> dict[str, int]:
-    """How many questions there are, at the last frame by one call, and how many of them lie outside the ranges of the
-    training, are unlike the calibration scenes by the network, or are told by either."""
+def unusual(run: ast_sim.Run, questions: Sequence[Question]) -> dict[str, int]:
+    """The number of questions, asked at the last frame by one call; of them the number outside the ranges of the
+    training, the number that the network finds unlike the calibration scenes, and the number told by either."""
     answers = [run.predict(*one, frames=[-1], effort=ast_sim.Effort(), throw=False) for one in questions]
     unlike = [one.p_value is not None and one.p_value <= UNUSUAL for one in answers]
     outside = [len(one.notes) > alike for one, alike in zip(answers, unlike, strict=True)]
@@ -163,30 +242,16 @@ def promises(run: ast_sim.Run, truths: Sequence[ast_sim.Trajectory]) -> dict[str
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--folder", type=Path, default=Path("build/coverage"), help="scenes (default: build/coverage)")
-    folder = parser.parse_args(arguments).folder
-    run = ast_sim.example_run("plates")
-    with ast_sim.Dataset(plates(folder, "fresh")) as data:
-        truths = [data["test"][index] for index in range(data.count("test"))]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what they tell is counted
-        calibration = ast_sim.calibrate(run, plates(folder, "calibration"), "test")
-        rows = [row for effort in calibration.efforts for row in bands(run, truths, effort)]
-        asked = promises(run, truths)
-        ordinary = [(truth.scene, truth.position) for truth in truths]
-        kinds = {"fresh plates": ordinary, **strange(truths[:40])}
-        told = {kind: unusual(run, questions) for kind, questions in kinds.items()}
-    for row in rows:
-        print(f"{row['quantity']}, {row['effort']}: held in {row['held']} of {row['fresh_scenes']}")
-    for one in asked["promises"]:
-        print(f"{one['quantity']} {one['error']:g}: {one.get('effort', one.get('refused'))}: {one.get('held')}")
-    for kind, counts in told.items():
-        print(f"{kind}: {counts['told']} of {counts['questions']} told, {counts['unlike']} by the network")
-    known = {"calibration_scenes": calibration.scenes, "spacing": list(calibration.spacing)}
-    write_json(
-        RESULTS, {**provenance("python -m benchmarks.studies.coverage"), **known, "rows": rows, **asked, "told": told}
+    study_rows(__doc__, ROWS, arguments, measured, _said, (RESULTS, PAGE), page)
+
+
+def _said(result: dict[str, Any]) -> str:
+    least = min(result["rows"], key=lambda row: row["held"] / row["fresh_scenes"])
+    told = "; ".join(
+        f"{kind}: {counts['told']} of {counts['questions']} told" for kind, counts in result["told"].items()
     )
+    held = f"bands held in {least['held']} of {least['fresh_scenes']} at least ({least['quantity']}, {least['effort']})"
+    return f"{held}; {told}"
 
 
 if __name__ == "__main__":

@@ -83,7 +83,7 @@ ROWS = {
         "Plates, 400 nodes, third seed", steps=10_000, settings={**_MIRRORED, "seed": 2}, **_PLATES_400
     ),
     "plates400_long": Row(
-        "Plates, 400 nodes, 30,000 steps, with reactions", steps=30_000, settings=_MIRRORED, solver_scenes=10,
+        "Plates, 400 nodes, 20,000 steps, with reactions", steps=20_000, settings=_MIRRORED, solver_scenes=10,
         model_settings={"state": ("reaction",)}, **_PLATES_400,
     ),
     "plates400_transolver": Row(

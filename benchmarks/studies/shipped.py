@@ -22,7 +22,7 @@ LICENCE = "CC0 1.0: do with it what you like."
 def plates_run(folder: Path) -> tuple[ast_sim.Run, Path, str]:
     """The run, and the dataset and the split whose scenes calibrate it."""
     run, _ = jumps.trained("plates400", folder)
-    return run, coverage.plates(folder, "calibration"), "test"
+    return run, coverage.scenes("plates", folder, "calibration"), "test"
 
 
 def clip_run(folder: Path) -> tuple[ast_sim.Run, Path, str]:

@@ -1,8 +1,9 @@
 """What an error costs: runs and the solver at fixed errors, on scenes that no training has seen.
 
 `python -m benchmarks.studies.trade [ROW ...]` makes the scenes of each row, takes the run that comes with the package
-or trains the one of `benchmarks.studies.jumps`, and measures both sides with `ast_sim.trade`. It writes
-benchmarks/results/trade.json and docs/results/trade.md. Data and runs lie in `--folder`. Everything runs on one thread.
+or trains one of `benchmarks.studies.jumps` or `benchmarks.studies.assembly`, and measures both sides with
+`ast_sim.trade`. It writes benchmarks/results/trade.json and docs/results/trade.md. Data and runs lie in `--folder`.
+Everything runs on one thread.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import Any
 import ast_sim
 from ast_sim.support.progress import duration
 from ast_sim.trade_figures import TradeFigures
-from benchmarks.studies import jumps
+from benchmarks.studies import assembly, jumps
 from benchmarks.studies.rows import study_rows
 
 RESULTS = Path(__file__).parents[1] / "results" / "trade.json"
@@ -30,7 +31,7 @@ class Row:
 
     Attributes:
         title: what the page calls them.
-        run: the name of an example run, or of a row of `benchmarks.studies.jumps`.
+        run: the name of an example run, or of a row of `benchmarks.studies.jumps` or `benchmarks.studies.assembly`.
         scenes: how many are measured.
         plates: the settings of `generate` for fresh plates, which chose nothing; None: the test scenes of the row.
     """
@@ -46,6 +47,8 @@ ROWS = {
     "plates1300": Row("Plates, 1,300 nodes", "plates1300", 15),
     "plates1300_second_order": Row("Plates, 1,300 nodes, second-order", "plates1300_second_order", 15),
     "parts400": Row("Pairs of parts, 400 nodes, with friction", "parts400", 15),
+    "snap_hook": Row("Snap hook, second-order elements, with friction", "snap_hook", 15),
+    "bumper": Row("Bumper, 1,600 nodes, with friction", "bumper", 15),
 }
 
 
@@ -53,7 +56,8 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
     """The figures of a row."""
     row = ROWS[name]
     if row.plates is None:
-        run, data = jumps.trained(row.run, folder)
+        study = jumps if row.run in jumps.ROWS else assembly
+        run, data = study.trained(row.run, folder)
     else:
         run = ast_sim.example_run(row.run)
         data = ast_sim.generate(out=folder / f"{name}_fresh.h5", train=0, valid=0, test=row.scenes, **row.plates).path

@@ -14,9 +14,8 @@ def test_a_run_is_simulated_trained_calibrated_and_saved(tmp_path, monkeypatch, 
         settings={"mirror": ("x", "y"), "corrections": 0, "batch_size": 2, "statistics_pairs": 4},
     )  # fmt: skip
     monkeypatch.setitem(jumps.ROWS, "plates400", row)
-    small = {"train": 0, "valid": 0, "nodes": 100, "frames": 5, "keep": None}
-    monkeypatch.setattr(coverage, "PLATES", small)
-    monkeypatch.setitem(coverage.SETS, "calibration", {"seed": 911, "test": 24})
+    small = {"family": "deforming_plate", "nodes": 100, "frames": 5}
+    monkeypatch.setitem(coverage.ROWS, "plates", replace(coverage.ROWS["plates"], generate=small, calibration=24))
     monkeypatch.setattr(shipped, "SHIPPED", tmp_path)
     shipped.main(["plates", "--folder", str(tmp_path / "data")])
     assert "plates: bands by " in capsys.readouterr().out

@@ -1,0 +1,71 @@
+"""The page of `benchmarks.studies.coverage`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+_INTRODUCTION = """# Do bands and asked errors hold?
+
+Made by `python -m benchmarks.studies.coverage` from `benchmarks/results/coverage.json`; do not edit.
+
+Each run is calibrated on scenes that neither trained nor chose it, and is then asked for scenes that nobody has used.
+A band holds in a scene if no free node of any frame is farther from the simulated position than it says (or no force
+or largest stress of any frame is farther from the simulated one). It is made to hold in 95 of 100 scenes. How many of
+the fresh scenes it holds in varies by chance, with the calibration scenes and with the fresh ones: "expected" is the
+interval that contains this number in 99 of 100 such trials (beta-binomial). "Width" is the median over the scenes of
+the widest band divided by the median of the largest error. Where the run warns that a scene is outside its training or
+unlike its calibration scenes, there is no band.
+
+An asked error (`predict(error=...)`) is kept if the answer at the deepest frame is at most so far off. It is promised
+for 90 of 100 scenes, among those without a warning.
+
+"Told" counts questions with a warning: those outside the ranges of the training, and those that the network finds
+unlike the calibration scenes (p-value at most 0.05: by chance one ordinary scene in twenty).
+"""
+
+
+def page(results: dict[str, Any]) -> str:
+    """The page of all rows."""
+    return "\n".join([_INTRODUCTION.rstrip(), *(line for result in results.values() for line in _section(result))])
+
+
+def _section(result: dict[str, Any]) -> list[str]:
+    bands = [
+        [
+            row["effort"],
+            row["quantity"],
+            f"{row['held']} of {row['fresh_scenes']}",
+            "{} to {}".format(*row["held_interval_99"]),
+            f"{row['median_band'] / row['median_largest_error']:.1f} times",
+        ]
+        for row in result["rows"]
+    ]
+    inside = [row["held_interval_99"][0] <= row["held"] <= row["held_interval_99"][1] for row in result["rows"]]
+    promises = [
+        [
+            promise["quantity"],
+            f"{100 * promise['error']:g} %",
+            promise.get("effort", "refused"),
+            f"{promise['held']} of {result['promised_scenes']}" if "held" in promise else "-",
+        ]
+        for promise in result["promises"]
+    ]
+    told = [
+        [kind, *(str(counts[key]) for key in ("questions", "outside", "unlike", "told"))]
+        for kind, counts in result["told"].items()
+    ]
+    return [
+        "",
+        f"## {result['title']}",
+        "",
+        f"{result['calibration_scenes']} calibration scenes. {sum(inside)} of {len(inside)} numbers are as expected.",
+        *_table(["effort", "band of", "held", "expected", "width"], bands, texts=2),
+        *_table(["error of", "asked", "effort", "kept"], promises, texts=1),
+        *_table(["questions", "asked", "outside", "unlike", "told"], told, texts=1),
+    ]
+
+
+def _table(columns: list[str], rows: list[list[str]], texts: int) -> list[str]:
+    """A table whose first `texts` columns are aligned to the left."""
+    line = "|" + " --- |" * texts + " ---: |" * (len(columns) - texts)
+    return ["", f"| {' | '.join(columns)} |", line, *(f"| {' | '.join(row)} |" for row in rows)]

@@ -1,0 +1,62 @@
+"""The study of bands and asked errors, from end to end on plates of 100 nodes."""
+
+import json
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import ast_sim
+from benchmarks.studies import coverage
+
+FRESH = 3
+
+
+@pytest.fixture
+def small(monkeypatch, tmp_path):
+    """A row of plates whose run had four steps; results in a folder apart."""
+    plates = {"family": "deforming_plate", "nodes": 100, "frames": 4}
+
+    def trained(folder):
+        data = ast_sim.generate(out=folder / "small.h5", train=30, valid=1, test=1, **plates).path
+        settings = {"corrections": 0, "batch_size": 2, "statistics_pairs": 4}
+        return ast_sim.train(data, folder / "run", steps=4, resume=True, **settings)
+
+    row = replace(coverage.ROWS["plates"], run=trained, generate=plates, fresh=FRESH, calibration=24)
+    monkeypatch.setitem(coverage.ROWS, "plates", row)
+    monkeypatch.setattr(coverage, "RESULTS", tmp_path / "coverage.json")
+    monkeypatch.setattr(coverage, "PAGE", tmp_path / "coverage.md")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    threads = torch.get_num_threads()
+    yield tmp_path
+    torch.set_num_threads(threads)
+
+
+def test_a_run_is_calibrated_and_asked_for_fresh_and_strange_scenes(small):
+    coverage.main(["plates", "--folder", str(small / "data")])
+    result = json.loads(coverage.RESULTS.read_text())["plates"]
+    row = result["rows"][0]
+    assert (row["effort"], row["quantity"]) == ("0 corrections", "displacement")
+    run = ast_sim.Run(small / "data" / "run")
+    with ast_sim.Dataset(small / "data" / "plates_fresh.h5") as data, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        truths = [data["test"][index] for index in range(FRESH)]
+        answers = [run.predict(truth, effort=ast_sim.Effort()) for truth in truths]
+    held = 0
+    for answer, truth in zip(answers, truths, strict=True):
+        if answer.bands:
+            distance = np.linalg.norm(answer.position - truth.position, axis=-1)[:, ~truth.scene.prescribed]
+            held += bool((distance.max(axis=1) <= answer.band()).all())
+    assert row["held"] == held
+    assert (
+        row["fresh_scenes"] + row["without_band"]
+        == FRESH
+        == row["fresh_scenes"] + result["told"]["fresh scenes"]["told"]
+    )
+    told = result["told"]
+    assert told["fresh scenes"]["questions"] == told["twice the travel"]["questions"] == FRESH
+    assert told["held by nothing"]["told"] <= FRESH and told["a beam in place of a plate"]["outside"] == FRESH
+    page = coverage.PAGE.read_text()
+    assert "## Plates, 400 nodes" in page and f"| displacement | {held} of {row['fresh_scenes']} |" in page
