@@ -171,7 +171,7 @@ def _add_convert(convert: Parser) -> None:
         fields, {"--stress-order XX,YY,...": about}, type=read_by("ast_sim.importers.stress:parse_order"), default=()
     )
     about = "cell fields with one number each; young=E takes the field E as the column young"
-    add_each(fields, {"--material NAME": about}, nargs="+", default=[])
+    add_each(fields, {"--material NAME": about}, nargs="+", action="extend", default=[])
     about = "a further field that the dataset keeps by its name, such as PEEQ or CPRESS=MPa; may be repeated"
     add_each(fields, {"--field NAME[=UNIT]": about}, action="append", default=[])
     about = "point field with the forces on the nodes, such as RF, in newton (in the unit of force of a deck)"
@@ -195,7 +195,8 @@ def _add_convert(convert: Parser) -> None:
     about = "unit of stress and of Young's modulus: Pa, kPa, MPa, GPa or psi (default: Pa; a deck needs it)"
     add_each(kind, {"--stress-unit UNIT": about})
     records = convert.add_argument_group("selection from .tfrecord files (meta.json has all other facts)")
-    records.add_argument("--split", nargs="+", choices=commands.SPLITS, help="convert only these files (default: all)")
+    about = "convert only these files (default: all)"
+    records.add_argument("--split", nargs="+", action="extend", choices=commands.SPLITS, help=about)
     add_each(records, {"--limit N": "first N trajectories of each file (default: all)"}, type=at_least(1))
     add_each(records, {"--every K": "keep every K-th frame (default: 1)"}, type=at_least(1), default=1)
     convert.set_defaults(of_series=(fields, kind), of_records=(records,))

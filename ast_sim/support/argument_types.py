@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import argparse
 import pkgutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from ast_sim.support.errors import ConfigError, printable
+
+Key = TypeVar("Key")
+Value = TypeVar("Value")
 
 
 class Parser(argparse.ArgumentParser):
@@ -71,6 +74,20 @@ def at_least(least: int) -> Any:
 
     number.__name__ = "whole number"
     return number
+
+
+def by_name(option: str, pairs: Iterable[tuple[Key, Value]]) -> dict[Key, Value]:
+    """The values of an option that may be repeated, such as --move BODY=X,Y,Z, by what each is for.
+
+    Raises:
+        ConfigError: two are for the same.
+    """
+    values: dict[Key, Value] = {}
+    for key, value in pairs:
+        if key in values:
+            raise ConfigError(f"{option} is given twice for {key}: leave one out")
+        values[key] = value
+    return values
 
 
 def read_by(place: str) -> Callable[[str], Any]:
