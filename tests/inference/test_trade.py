@@ -1,6 +1,7 @@
 """A trade, measured for real: the run that comes with the package and the solver on a small plate."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -117,3 +118,15 @@ def test_only_runs_of_the_same_data_stand_beside_each_other(learned, tmp_path):
         ast_sim.trade(ast_sim.Run(run), data, beside=[ast_sim.Run(other), strange])
     with pytest.raises(ConfigError, match="two runs are called tokens: rename one"):
         ast_sim.trade(ast_sim.Run(run), data, beside=[ast_sim.Run(run)])
+
+
+@pytest.mark.parametrize("split", ["train", "valid"])
+def test_scenes_of_the_training_are_known_in_a_copy_of_the_dataset_and_to_a_file_of_the_run(learned, tmp_path, split):
+    data, run, _ = learned
+    copy = shutil.copy(data, tmp_path / "copy.h5")
+    ast_sim.Run(run).save(tmp_path / "run.ast")
+    for known in (run, tmp_path / "run.ast"):
+        with pytest.raises(ConfigError, match=f"the scenes of {split} have trained or chosen the run"):
+            ast_sim.trade(ast_sim.Run(known), copy, split)
+        with pytest.raises(ConfigError, match=f"the scenes of {split} have trained or chosen the run"):
+            ast_sim.calibrate(ast_sim.Run(known), copy, split)

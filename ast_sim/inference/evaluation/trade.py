@@ -21,6 +21,7 @@ from ast_sim.inference.effort import Effort, choices, options_of
 from ast_sim.inference.evaluation.deepest_frames import deepest_predicted
 from ast_sim.inference.evaluation.gaussian_process import process_beside
 from ast_sim.inference.predicting.question import Question
+from ast_sim.inference.promises.calibration import require_new_scenes
 from ast_sim.inference.quantities.relative_errors import errors_of, moves
 from ast_sim.models.simulator import Simulator
 from ast_sim.simulate.jobs.fastest_solver import FINER, OWN_STOP_TEST, Outcome, solver_outcomes
@@ -98,7 +99,7 @@ def trade(
 
     Args:
         data: a dataset, its path or open; by default the one that the run was trained on.
-        split: whose scenes are asked. They must be new to the run, or its errors are too small.
+        split: whose scenes are asked.
         beside: other runs that have learned from the same dataset, such as other models. Each stands in the tables with
             its fastest effort, by the name of its folder.
         scenes: at most so many, the first of the split.
@@ -108,8 +109,8 @@ def trade(
         progress: as in `generate`.
 
     Raises:
-        ConfigError: no scene of the split moves, the solver's seconds are not above 0, or a run beside has learned from
-            another dataset or has the name of another run.
+        ConfigError: the split has trained or chosen the run, or none of its scenes moves; the solver's seconds are not
+            above 0; or a run beside has learned from another dataset or has the name of another run.
         DatasetError: the dataset cannot be read.
     """
     if solver_seconds is not None and not 0 < solver_seconds < math.inf:
@@ -119,6 +120,7 @@ def trade(
     torch.set_num_threads(1)
     try:
         with run.open(data) as dataset:
+            require_new_scenes(run, dataset, split)
             moving = (index for index in range(dataset.count(split)) if moves(dataset.load(split, index)))
             indices = list(islice(moving, scenes))
             if not indices:
@@ -308,7 +310,7 @@ def timed_answer(
 def _command(run: Run, scenes: _Scenes, effort: Effort) -> str:
     """What predicts the first scene with this effort."""
     what = options_of(effort) if run.settings.model.scheme.corrects else []
-    scene = [scenes.dataset.path.name, "--split", scenes.split, "--index", "0"]
+    scene = [scenes.dataset.path.name, "--split", scenes.split, "--index", str(scenes.indices[0])]
     return shlex.join(["ast-sim", "predict", run.path.name, *scene, "--out", "answer.h5", *what])
 
 
