@@ -56,8 +56,12 @@ def test_another_program_is_represented_by_its_seconds(plates):
     assert (stated.errors, stated.seconds) == ((0.0,), (95.0,))
     rows = figures.rows()
     assert rows[0].verdict == "the run" and rows[0].ratio > 100
-    with pytest.raises(ConfigError, match="seconds are -1; they must be above 0"):
-        ast_sim.trade(ast_sim.example_run("plates"), plates, solver_seconds=-1)
+    for seconds in (-1, "95"):
+        with pytest.raises(ConfigError, match=f"seconds are {seconds!r}; they must be a number above 0"):
+            ast_sim.trade(ast_sim.example_run("plates"), plates, solver_seconds=seconds)
+    for scenes in (0, -1, 2.5, "3"):
+        with pytest.raises(ConfigError, match=f"scenes is {scenes!r}; it must be a whole number above 0"):
+            ast_sim.trade(ast_sim.example_run("plates"), plates, scenes=scenes)
 
 
 def test_the_force_of_metal_that_yields_is_judged_by_what_the_dataset_holds():

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
+from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -113,8 +114,10 @@ def trade(
             above 0; or a run beside has learned from another dataset or has the name of another run.
         DatasetError: the dataset cannot be read.
     """
-    if solver_seconds is not None and not 0 < solver_seconds < math.inf:
-        raise ConfigError(f"the solver's seconds are {solver_seconds}; they must be above 0")
+    if not isinstance(scenes, Integral) or isinstance(scenes, bool) or scenes < 1:
+        raise ConfigError(f"scenes is {scenes!r}; it must be a whole number above 0")
+    if solver_seconds is not None and not (isinstance(solver_seconds, Real) and 0 < solver_seconds < math.inf):
+        raise ConfigError(f"the solver's seconds are {solver_seconds!r}; they must be a number above 0")
     runs = _by_name([run, *beside])
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
