@@ -450,6 +450,9 @@ def test_what_is_given_twice_for_one_thing_is_refused(trained, tmp_path, capsys)
     moved = (*out, "--move=1=0,0,1")
     errors = ("--error=2%", "--error=displacement=5%")
     assert "--error is given twice for displacement: leave one out" in fails(capsys, *moved, *errors)
+    convert = ("convert", "results", "--out", tmp_path / "x.h5")
+    for option in ("--obstacle", "--handle", "--stress", "--reaction"):
+        assert f"{option} is given twice: leave one out" in fails(capsys, *convert, option, "a", option, "b")
     materials = ("--material=0=1e6,0.3", "--material=0=2e6,0.3")
     assert "--material is given twice for 0: leave one out" in fails(capsys, *moved, *materials)
     assert os.listdir(tmp_path) == ["scene.vtu"]

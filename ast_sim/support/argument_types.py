@@ -27,6 +27,15 @@ class Parser(argparse.ArgumentParser):
         return super().format_help() + "".join(f"{line}\n" for line in self.more())
 
 
+class Once(argparse.Action):
+    """An option that takes one value and may be taken for one that may be repeated: a second value is an error."""
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: Any, values: Any, option: str | None = None) -> None:
+        if getattr(namespace, self.dest) is not None:
+            parser.error(f"{option} is given twice: leave one out")
+        setattr(namespace, self.dest, values)
+
+
 def add_each(to: Any, options: Mapping[str, str], **shared: Any) -> None:
     """Add options that differ only in their names and helps: a key is "--name METAVAR", its value is the help."""
     for option, text in options.items():
