@@ -85,7 +85,7 @@ def ordered(files: list[Path], times: list[float | None]) -> tuple[list[int], li
 
 
 def _doubts(files: list[Path]) -> list[str]:
-    """A note if the numbers in the names of files, in order of time, may be of several simulations, or leave one out."""
+    """A note if the numbers in the names of files, in order of time, may be of two simulations, or leave one out."""
     columns = zip(*(_NUMBER.split(file.stem)[1::2] for file in files), strict=True)
     varied = [column for column in columns if len(set(column)) > 1]
     if len(varied) > 1:

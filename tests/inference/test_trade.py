@@ -25,7 +25,7 @@ def test_efforts_and_ways_are_measured_on_the_same_scene(plates, tmp_path, capsy
     ast_sim.example_run("plates").save(tmp_path / "plates.ast")
     told = [str(tmp_path / "plates.ast"), str(plates), "--out", str(tmp_path / "pages" / "trade.html")]
     assert main(["trade", *told]) == 0
-    assert "10 %: run: " in capsys.readouterr().out
+    assert "10 %: the run: " in capsys.readouterr().out
     by_quantity = json.loads((tmp_path / "pages" / "trade.json").read_text())
     assert list(by_quantity) == ["displacement", "reaction", "stress"]
     figures = by_quantity["displacement"]
@@ -120,8 +120,11 @@ def test_only_runs_of_the_same_data_stand_beside_each_other(learned, tmp_path):
     strange = ast_sim.example_run("plates")
     with pytest.raises(ConfigError, match=r"plates.ast has learned from another dataset \(.*h5\) than .*tokens "):
         ast_sim.trade(ast_sim.Run(run), data, beside=[ast_sim.Run(other), strange])
-    with pytest.raises(ConfigError, match="two runs are called tokens: rename one"):
+    with pytest.raises(ConfigError, match="two runs are called tokens: rename the run"):
         ast_sim.trade(ast_sim.Run(run), data, beside=[ast_sim.Run(run)])
+    process = shutil.copytree(run, tmp_path / "Gaussian process")
+    with pytest.raises(ConfigError, match="a Gaussian process is called Gaussian process: rename the run"):
+        ast_sim.trade(ast_sim.Run(run), data, beside=[ast_sim.Run(process)])
 
 
 @pytest.mark.parametrize("split", ["train", "valid"])

@@ -20,7 +20,7 @@ from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.inference.answering import answers
 from ast_sim.inference.effort import Effort, choices, options_of
 from ast_sim.inference.evaluation.deepest_frames import deepest_predicted
-from ast_sim.inference.evaluation.gaussian_process import process_beside
+from ast_sim.inference.evaluation.gaussian_process import PROCESS, process_beside
 from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.promises.calibration import require_new_scenes
 from ast_sim.inference.quantities.relative_errors import errors_of, moves
@@ -158,8 +158,9 @@ def _by_name(runs: Sequence[Run]) -> dict[str, Run]:
                 f"{run.path} has learned from another dataset ({Path(run.settings.data).name}) than {first.path}"
                 f" ({Path(first.settings.data).name}): only runs of one dataset stand beside each other"
             )
-        if run.path.name in named:
-            raise ConfigError(f"two runs are called {run.path.name}: rename one, so that each has its column")
+        if run.path.name in (*named, PROCESS):
+            other = "a Gaussian process is" if run.path.name == PROCESS else "two runs are"
+            raise ConfigError(f"{other} called {run.path.name}: rename the run, so that each has its column")
         named[run.path.name] = run
     return named
 
