@@ -194,8 +194,8 @@ class TradeFigures:
         counts = f"{len(self.scenes)} scenes, deepest frame, one thread"
         told = [f"{counts}; error of the {self.quantity} kept in {100 * WITHIN:g} % of them"]
         for row in self.rows():
-            sides = {"run": row.run, "solver": row.solver, **row.others}
-            parts = [_told(who, setting) for who, setting in sides.items()]
+            sides = (("the run", row.run), ("the solver", row.solver), *row.others.items())
+            parts = [_told(who, setting) for who, setting in sides]
             if row.ratio is not None:
                 parts.append(f"ratio {row.ratio:.2f} ({row.low:.2f} to {row.high:.2f}): {row.verdict}")
             if row.pays_after is not None:

@@ -179,6 +179,19 @@ def test_a_body_without_prescribed_nodes_and_positions_that_are_not_finite_are_n
         Motion.of_positions(SCENE, position)
 
 
+@pytest.mark.parametrize("value", [(0, 0, 1j), ("0", "0", "1"), "001", (0, 0), (0, 0, None), {1: 2}])
+@pytest.mark.parametrize("name", ["translation", "axis", "point"])
+def test_what_are_no_three_real_numbers_is_refused(name, value):
+    with pytest.raises(ConfigError, match=f"^{name} of a motion must be three numbers"):
+        RigidMotion(**{name: value})
+
+
+@pytest.mark.parametrize("value", [[(0, 0, 1), (0, 0)], [], [[]], np.zeros((0, 3)), np.zeros((2, 2, 3))])
+def test_a_path_has_triples_alone(value):
+    with pytest.raises(ConfigError, match="^translation of a motion must be three numbers or a list of triples"):
+        RigidMotion(value)
+
+
 def test_motions_that_are_too_far_or_too_long_are_refused():
     scene = toy.plate().scene
     for wrong in ({"translation": (1e300, 0, 0)}, {"rotation": 1e300}, {"rotation": 30, "axis": (1e-300, 0, 0)}):

@@ -25,6 +25,7 @@ from ast_sim.support.errors import DatasetError, LooksWrong, nearest_name
 from ast_sim.support.progress import Progress, ShowProgress
 
 SHARES = {"train": 0.8, "valid": 0.1, "test": 0.1}
+EVEN = 0.05  # of a time step: explicit solvers write a frame after the step in which its time is reached
 
 Splits = Mapping[str, float] | Mapping[str, Sequence[str]]
 
@@ -97,7 +98,8 @@ def convert_series(
     findings: list[tuple[str, Finding]] = []
     opened = FittedWriter(out, stress_location="none", **facts)
     with opened as writer, Progress(len(chosen), "simulations", progress) as bar:
-        for split, name, trajectory in _trajectories(series, decks, chosen, names, corners, incomplete):
+        dynamic = integration == "dynamic"
+        for split, name, trajectory in _trajectories(series, decks, chosen, names, corners, incomplete, dynamic):
             if not any(writer.counts.values()):
                 made_by |= _facts_of_the_first(trajectory)
                 writer.info = replace(writer.info, stress_location=trajectory.stress_at, generator=made_by)
@@ -123,6 +125,7 @@ def _trajectories(
     names: FieldNames,
     corners: bool,
     incomplete: bool,
+    dynamic: bool,
 ) -> Iterator[tuple[str, str, Trajectory]]:
     """The split, the name and the trajectory of each chosen simulation; all have the origin of the first."""
     origin = None
@@ -132,9 +135,23 @@ def _trajectories(
             doubt_modulus(decks[name], trajectory, names.stress_unit or "Pa")
         if not incomplete:
             require_complete(series[name], trajectory, names)
+        if dynamic:
+            _require_even_times(series[name], trajectory)
         if origin is None:
             origin = np.array(trajectory.attributes.get("origin", [0.0, 0.0, 0.0]))
         yield split, name, trajectory
+
+
+def _require_even_times(source: Path, trajectory: Trajectory) -> None:
+    """Raise DatasetError if known times are not evenly spaced: with inertia, positions stand for velocities."""
+    steps = np.diff(trajectory.times or ())
+    uneven = np.flatnonzero(np.abs(steps - np.median(steps)) > EVEN * np.median(steps)) if len(steps) else steps
+    if len(uneven):
+        first = int(uneven[0])
+        raise DatasetError(
+            f"{source}: from frame {first} to {first + 1} {steps[first]:.4g} s pass, from most frames to the next"
+            f" {np.median(steps):.4g} s: with inertia all time steps must be equal"
+        )
 
 
 def _facts_of_the_first(trajectory: Trajectory) -> dict[str, Any]:

@@ -270,12 +270,15 @@ class Answer:
         """Relative errors of the last frame of the answer, where a simulation is known.
 
         Args:
-            truth: all frames of the same motion; something must be displaced in the frame.
+            truth: a simulation of the same motion, which has frame 0 and this one; something is displaced in it.
 
         Returns:
             "displacement": the root mean square error of the free nodes over the root mean square displacement;
             "reaction": the distance of the forces on the moved body over the true force; "stress": by how much the
             largest stress is off, over the true one. The last two are missing where there is none.
+
+        Raises:
+            AstSimError: the truth is of another scene, motion or unit, or lacks a frame; or nothing is displaced.
         """
         return errors_of(self, truth)
 

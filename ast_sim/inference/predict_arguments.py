@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from numbers import Integral
 
 import numpy as np
 
@@ -108,6 +109,8 @@ def _completed(
     """The motion of the prescribed nodes in every frame."""
     if motion is None or (isinstance(motion, Mapping) and not motion):
         raise ConfigError(f"{name}: say how its prescribed nodes move: {{BODY: (x, y, z)}} (--move BODY=X,Y,Z)")
+    if frames is not None and (isinstance(frames, bool) or not isinstance(frames, Integral)):
+        raise ConfigError(f"{name}: num_frames is {frames!r}; it must be a whole number")
     if isinstance(motion, Mapping):
         least = config.data.given_frames + 1
         if frames is None and not scope.usual_increment:

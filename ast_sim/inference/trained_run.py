@@ -6,7 +6,7 @@ import dataclasses
 import os
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ from ast_sim.support.errors import ConfigError, RolloutError
 from ast_sim.support.notebook_table import html_table, one_line
 from ast_sim.support.progress import Progress, ShowProgress
 from ast_sim.support.provenance import provenance
-from ast_sim.support.toml_settings import NOTHING
+from ast_sim.support.toml_settings import NOTHING, require_range
 
 
 class Run:
@@ -213,7 +213,7 @@ class Run:
 
     def predict_scenes(
         self,
-        scenes: Sequence[tuple[Scene, Motions]],
+        scenes: Iterable[tuple[Scene, Motions]],
         *,
         names: Sequence[str] | None = None,
         frames: Frames | None = None,
@@ -226,6 +226,7 @@ class Run:
         """Predict several scenes, each under a motion, as one batch. `progress` is as in `generate`; errors and other
         arguments are as in `predict`."""
         began = time.perf_counter()
+        scenes = list(scenes)
         names = [f"scene {number}" for number in range(len(scenes))] if names is None else names
         config, scope = self.settings.model, self.scope
         questions = [
@@ -238,7 +239,7 @@ class Run:
     def predict_motions(
         self,
         scene: Scene,
-        motions: Sequence[Motions],
+        motions: Iterable[Motions],
         *,
         frames: Frames | None = None,
         effort: Effort | None = None,
@@ -250,8 +251,8 @@ class Run:
     ) -> list[Answer]:
         """Predict one scene under several motions, as one batch; the answers have the order of the motions. Arguments
         and errors are as in `predict_scenes`."""
-        names = [f"{name}, motion {number}" for number in range(len(motions))]
         scenes = [(scene, motion) for motion in motions]
+        names = [f"{name}, motion {number}" for number in range(len(scenes))]
         shared = {"frames": frames, "effort": effort, "error": error, "num_frames": num_frames}
         return self.predict_scenes(scenes, names=names, throw=throw, progress=progress, **shared)
 
@@ -335,6 +336,7 @@ class Run:
             made_from: the specification or the parts of your own of which the dataset was made; the solver needs them.
             progress: as in `generate`; it counts scenes, once for all frames, once for the deepest, once solved.
         """
+        require_range("solver_scenes", solver_scenes, 0)
         with self.open(data) as dataset:
             with Progress(2 * dataset.count(split) + solver_scenes, "scenes", progress) as bar:
                 figures = evaluate(self.model, dataset, split, bar.advance, self.effort, solver_scenes, made_from)

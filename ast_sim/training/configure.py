@@ -76,7 +76,13 @@ def path_of(data: str | os.PathLike[str] | Dataset) -> Path:
 def changes_of(
     state: Sequence[str], model_settings: Mapping[str, Any] | None, train_settings: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The changes of settings that the arguments of `train` ask for, by dotted key."""
+    """The changes of settings that the arguments of `train` ask for, by dotted key.
+
+    Raises:
+        ConfigError: `state` is one text.
+    """
+    if isinstance(state, str):
+        raise ConfigError(f"state is {state!r}; it must be a list of names, such as [{state!r}]")
     of_model = {**({"state": tuple(state)} if state else {}), **(model_settings or {})}
     changes = {f"model.{key}": value for key, value in of_model.items()}
     return changes | {f"train.{key}": value for key, value in train_settings.items()}

@@ -31,6 +31,7 @@ from ast_sim.simulate.own_assembly.parameters import Values, values_of
 from ast_sim.support.errors import ConfigError, MissingExtra, require
 from ast_sim.trade_figures import Setting, Side
 
+PROCESS = "Gaussian process"  # the name of its column
 FOLDS = 5  # of the cross-validation that chooses a scale
 MOST_SCENES = 200  # of the training; a fit takes time with the cube of their number
 FEWEST_SCENES = 2 * FOLDS
@@ -146,7 +147,7 @@ class Process:
         if not self.errors:
             return ()
         errors = self.errors.get(quantity, [math.inf] * len(self.seconds))
-        return (Side("Gaussian process", (Setting(self.name, tuple(errors), tuple(self.seconds)),)),)
+        return (Side(PROCESS, (Setting(self.name, tuple(errors), tuple(self.seconds)),)),)
 
     def why_not(self, quantity: str) -> str:
         """Why it does not give the quantity; empty if it does."""

@@ -200,9 +200,7 @@ def calibrate(
         ConfigError: the split has trained or chosen the run, there are fewer than 19 scenes, or too many fail.
     """
     with run.open(data) as dataset:
-        known = Path(run.settings.data).resolve() == dataset.path.resolve()
-        if known and split in ("train", "valid"):
-            raise ConfigError(f"the scenes of {split} have trained or chosen the run: calibrate with other scenes")
+        require_new_scenes(run, dataset, split)
         before, run.calibration = run.calibration, None  # it has no say in which scenes count
         try:
             result, left_out = _measured(run, dataset, split, progress)
@@ -217,6 +215,15 @@ def calibrate(
     if run.path.is_file():
         warnings.warn(f"{run.path} is a file, which is not changed: Run.save writes one with the band", stacklevel=2)
     return result
+
+
+def require_new_scenes(run: Run, dataset: Dataset, split: str) -> None:
+    """Raise ConfigError if the scenes of a split have trained or chosen the run. A copy of its dataset is known."""
+    if split in ("train", "valid") and (
+        Path(run.settings.data).resolve() == dataset.path.resolve()
+        or run.folder.origin.get("data") == dataset.fingerprint()
+    ):
+        raise ConfigError(f"the scenes of {split} have trained or chosen the run: take other scenes")
 
 
 class _Measured(NamedTuple):

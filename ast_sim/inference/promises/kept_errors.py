@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from numbers import Real
 from typing import Any, Self
 
 import numpy as np
@@ -64,8 +65,11 @@ class KeptErrors:
         """The cheapest effort that keeps all wanted errors, by quantity, in 90 % of fresh scenes.
 
         Raises:
-            ConfigError: no effort keeps them, which names the smallest that can be had; or a quantity is not known.
+            ConfigError: no effort keeps them, which names the smallest that can be had; a quantity is not known; or
+                none is asked for.
         """
+        if not asked:
+            raise ConfigError("no error is asked for: give one, such as 0.02 or {'reaction': 0.05}")
         for quantity, error in asked.items():
             self._require(quantity, error)
         limits = np.array(list(asked.values()))[:, None, None]
@@ -90,6 +94,8 @@ class KeptErrors:
             )
         if quantity not in self.errors:
             raise ConfigError(f"an error of {quantity} is not known; known are {', '.join(self.errors)}")
+        if not isinstance(error, Real):
+            raise ConfigError(f"the error of the {quantity} is {error!r}; it must be a number, as 0.02 for 2 %")
         if not 0 < error < 1:
             raise ConfigError(f"the error of the {quantity} is {error}; it must lie between 0 and 1, as 0.02 for 2 %")
         scenes = len(self.errors[quantity][0])

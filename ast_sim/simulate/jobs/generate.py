@@ -31,7 +31,7 @@ from ast_sim.simulate.families.known_families import family_module
 from ast_sim.simulate.jobs import cluster, pool
 from ast_sim.simulate.jobs.display import SceneProgress
 from ast_sim.simulate.jobs.manifest import Manifest, Watch
-from ast_sim.simulate.jobs.recipe import check_parts, checked_recipe, difference, recorded
+from ast_sim.simulate.jobs.recipe import check_parts, checked_recipe, difference, recorded, whole
 from ast_sim.simulate.jobs.samples import (
     Recipe,
     Sample,
@@ -197,7 +197,12 @@ def checked_workers(workers: int | None, scheduler: str | None) -> int:
 
 
 def checked_counts(train: int, valid: int | None, test: int | None, calibration: int = 0) -> dict[str, int]:
-    """The number of scenes of each split; a tenth of `train` where None."""
+    """The number of scenes of each split; a tenth of `train` where None.
+
+    Raises:
+        ConfigError: one is no whole number, all are 0, or there are too many.
+    """
+    train, valid, test, calibration = whole(train=train, valid=valid, test=test, calibration=calibration)
     tenth = -(-train // 10)
     counts = {
         "train": train,

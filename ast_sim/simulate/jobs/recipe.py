@@ -149,7 +149,10 @@ def whole(**numbers: Any) -> list[Any]:
 
 def _checked_keep(keep: Sequence[int], last: int) -> tuple[int, ...]:
     """The numbers of the frames to keep, after a check; `last` is the number of the last frame."""
-    kept = tuple(map(index, keep))
+    try:
+        kept = tuple(map(index, keep))
+    except TypeError as error:
+        raise ConfigError(f"keep is {keep!r}; must be a list of whole numbers") from error
     if not kept or not all(1 <= frame <= last for frame in kept):
         raise ConfigError(f"keep is {list(kept)}; must be numbers of frames from 1 to {last}, beside frame 0")
     if any(later <= earlier for earlier, later in pairwise(kept)):
