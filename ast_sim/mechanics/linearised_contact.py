@@ -183,7 +183,7 @@ class NewtonSteps:
     def _pressed_pairs(self, compliance: Compliance, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The pairs [A] that may press on each other and their forces [A] >= 0, without friction.
 
-        Where the compliance of a pair costs half a solution with the stiffness, pairs get one in rounds, first the pairs
+        Where the compliance of a pair costs half a solution with the stiffness, pairs get one in rounds, first those
         that would overlap most with the forces so far. At the end no pair overlaps: these are the forces of all pairs.
         """
         chosen = np.zeros(0, int)

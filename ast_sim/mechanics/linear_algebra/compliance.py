@@ -85,8 +85,8 @@ def condensation_pays(directions: int, touched: int, unknowns: int) -> bool:
 
 class ByColumns:
     """By columns of L^-1 C^T. A column is zero but for the unknowns that are eliminated after the unknowns of the
-    direction and depend on them: a tenth of all if the directions lie side by side. Only the rows with other numbers are kept,
-    and multiplied. For the arguments see `compliance_of`."""
+    direction and depend on them: a tenth of all if the directions lie side by side. Only the rows with other numbers
+    are kept, and multiplied. For the arguments see `compliance_of`."""
 
     is_whole = False
 
