@@ -231,6 +231,17 @@ def test_report_is_one_page(trained, tmp_path, capsys):
     assert "test/000001" in page
 
 
+def test_a_page_compares_runs_on_one_dataset(trained, tmp_path, capsys):
+    """Scenes of two datasets have the same names; the page would show the truth of one and the answers to the other."""
+    data, run = trained
+    other = toy.write(tmp_path / "other.h5", (3, 1, 1))
+    assert main(["train", str(other), "--out", str(tmp_path / "second"), *SET]) == 0
+    error = fails(capsys, "report", run, tmp_path / "second", "--out", tmp_path / "page.html")
+    assert "second was evaluated on other scenes (other.h5) than" in error and "--data" in error
+    shown = ("report", str(run), str(tmp_path / "second"), "--data", str(data), "--out", str(tmp_path / "page.html"))
+    assert main(list(shown)) == 0 and (tmp_path / "page.html").is_file()
+
+
 def test_what_looks_wrong_is_a_table(tmp_path, capsys):
     from ast_sim.view import export
 

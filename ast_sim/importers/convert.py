@@ -93,11 +93,10 @@ def convert_series(
     names = with_units(decks, names, length_unit)
     chosen = _assign(source, list(series), splits, calibration, seed)
     made_by = {"program": "ast_sim convert", "source": str(source), "names": asdict(names), "seed": seed}
-    facts: dict[str, Any] = {"family": source.stem, "integration": integration, "generator": made_by}
-    facts |= {"contact_radius": contact_radius, "time_step": time_step, "length_unit": length_unit or "m"}
+    facts: dict[str, Any] = {"family": source.stem, "integration": integration, "length_unit": length_unit or "m"}
+    facts |= {"generator": made_by, "contact_radius": contact_radius, "time_step": time_step, "stress_location": "none"}
     findings: list[tuple[str, Finding]] = []
-    opened = FittedWriter(out, stress_location="none", **facts)
-    with opened as writer, Progress(len(chosen), "simulations", progress) as bar:
+    with FittedWriter(out, **facts) as writer, Progress(len(chosen), "simulations", progress) as bar:
         dynamic = integration == "dynamic"
         for split, name, trajectory in _trajectories(series, decks, chosen, names, corners, incomplete, dynamic):
             if not any(writer.counts.values()):
