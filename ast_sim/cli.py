@@ -19,6 +19,7 @@ from ast_sim import __version__
 from ast_sim.command_line import commands, help_lines, judging_commands, planning_commands
 from ast_sim.command_line.effort_options import add_effort
 from ast_sim.support.argument_types import (
+    Once,
     Parser,
     add_each,
     add_out,
@@ -165,17 +166,17 @@ def _add_convert(convert: Parser) -> None:
         "--handle NAME": "the same for prescribed nodes of deforming bodies; a place is written BODY:PLACE, as 0:zmin",
         "--body NAME": "point or cell field with the numbers of the bodies",
     }
-    add_each(fields, names)
+    add_each(fields, names, action=Once)
     about = "components of the stress, such as xx,xy,xz,yy,yz,zz (default: as the file names them, else xx,yy,zz,...)"
     add_each(
         fields, {"--stress-order XX,YY,...": about}, type=read_by("ast_sim.importers.stress:parse_order"), default=()
     )
     about = "cell fields with one number each; young=E takes the field E as the column young"
-    add_each(fields, {"--material NAME": about}, nargs="+", default=[])
+    add_each(fields, {"--material NAME": about}, nargs="+", action="extend", default=[])
     about = "a further field that the dataset keeps by its name, such as PEEQ or CPRESS=MPa; may be repeated"
     add_each(fields, {"--field NAME[=UNIT]": about}, action="append", default=[])
     about = "point field with the forces on the nodes, such as RF, in newton (in the unit of force of a deck)"
-    add_each(fields, {"--reaction NAME": about})
+    add_each(fields, {"--reaction NAME": about}, action=Once)
     kind = convert.add_argument_group("properties of a dataset made from such files")
     about = "shares of the simulations, drawn at random (default: 0.8 0.1 0.1 of three or more)"
     kind.add_argument("--shares", nargs=3, type=float, metavar=("TRAIN", "VALID", "TEST"), help=about)
@@ -195,7 +196,8 @@ def _add_convert(convert: Parser) -> None:
     about = "unit of stress and of Young's modulus: Pa, kPa, MPa, GPa or psi (default: Pa; a deck needs it)"
     add_each(kind, {"--stress-unit UNIT": about})
     records = convert.add_argument_group("selection from .tfrecord files (meta.json has all other facts)")
-    records.add_argument("--split", nargs="+", choices=commands.SPLITS, help="convert only these files (default: all)")
+    about = "convert only these files (default: all)"
+    records.add_argument("--split", nargs="+", action="extend", choices=commands.SPLITS, help=about)
     add_each(records, {"--limit N": "first N trajectories of each file (default: all)"}, type=at_least(1))
     add_each(records, {"--every K": "keep every K-th frame (default: 1)"}, type=at_least(1), default=1)
     convert.set_defaults(of_series=(fields, kind), of_records=(records,))

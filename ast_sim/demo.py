@@ -28,7 +28,7 @@ from ast_sim.view import export, picture, report
 FAMILY = "deforming_plate"
 NODES, FRAMES = 400, 41  # fewer than the family's defaults, so that the demonstration takes minutes
 KEPT = (14, 24, 34)  # of a training scene: many scenes of few frames teach more than few scenes of all frames
-SOLVER_SCENES = 3  # in so many test scenes the solver solves the deepest frame
+SOLVER_SCENES = 3  # test scenes in which the solver solves the deepest frame, too
 
 
 @dataclass(frozen=True)

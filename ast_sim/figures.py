@@ -102,7 +102,7 @@ class SolverFigures:
 
 @dataclass(frozen=True)
 class DeepestFrame:
-    """The deepest frame of a scene, asked for alone and on one thread.
+    """The deepest frame of a scene, predicted alone and on one thread.
 
     Attributes:
         name, nodes: of the scene.

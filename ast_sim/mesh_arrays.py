@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class NodeType(IntEnum):
-    """How a node moves. The numbers are those of the MeshGraphNets data sets."""
+    """How a node moves. The numbers are the same as in the data sets of MeshGraphNets."""
 
     NORMAL = 0  # a free node: it follows the mechanics, and models predict it
     OBSTACLE = 1  # a node of a rigid body with a prescribed motion
@@ -42,7 +42,7 @@ def scene_arrays(
     obstacles: Iterable[int],
     handles: Any,
 ) -> dict[str, Any]:
-    """The arrays of a scene by name; arguments and errors are those of `Scene.of`."""
+    """The arrays of a scene by name; arguments and errors are as in `Scene.of`."""
     position = real_numbers(name, "points", points)
     if position.ndim == 2 and position.shape[1] == 2:
         position = np.pad(position, ((0, 0), (0, 1)))
@@ -77,7 +77,7 @@ def _nodes(name: str, handles: Any, count: int) -> np.ndarray:
 
 
 def joined_arrays(scenes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The arrays of one scene, from the arrays of several; errors are those of `Scene.join`."""
+    """The arrays of one scene, from the arrays of several; errors are as in `Scene.join`."""
     kinds = {
         (scene["elements"].shape[1], 0 if scene["material"] is None else scene["material"].shape[1]) for scene in scenes
     }
@@ -100,7 +100,7 @@ def joined_arrays(scenes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def arrays_of_mesh(mesh: meshio.Mesh) -> tuple[Any, np.ndarray, dict[str, Any]]:
-    """Points, cells, and the fields of the scene that the mesh has; errors are those of `Scene.from_meshio`."""
+    """Points, cells, and the fields of the scene that the mesh has; errors are as in `Scene.from_meshio`."""
     blocks = [index for index, block in enumerate(mesh.cells) if len(block.data)]
     kinds = sorted({mesh.cells[index].type for index in blocks})
     if len(kinds) != 1 or kinds[0] not in CELL_KINDS.values():

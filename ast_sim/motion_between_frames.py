@@ -15,7 +15,7 @@ import numpy as np
 
 from ast_sim.prescribed_motion import ROUNDING, RigidMotion
 
-# A leg turns nodes by at most so many degrees: a load step takes them along the chord of their arc.
+# The largest turn of nodes in a leg, in degrees: a load step takes them along the chord of their arc.
 LARGEST_TURN = 30.0
 
 
@@ -78,7 +78,7 @@ class Course:
 
     @classmethod
     def of(cls, rest: np.ndarray, prescribed: np.ndarray, moved: tuple[MovedNodes, ...], frames: int) -> Course:
-        """The course of nodes at `rest` [N,3] float64 that these motions move through so many frames."""
+        """The course of nodes at `rest` [N,3] float64 that these motions move through `frames` frames."""
         position = np.repeat(rest[None], frames, axis=0)
         for group in moved:
             for frame in range(1, frames):

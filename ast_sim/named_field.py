@@ -93,7 +93,7 @@ def require_same_fields(
     """The place, the unit and the columns of each field.
 
     Raises:
-        DatasetError: they are not those of the other trajectories of the dataset, where these are `known`.
+        DatasetError: they differ from the other trajectories of the dataset, where these are `known`.
     """
     facts = {key: (one.location, one.unit, one.values.shape[2]) for key, one in sorted(fields.items())}
     if known not in (None, facts):

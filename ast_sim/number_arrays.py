@@ -9,7 +9,7 @@ import numpy as np
 
 from ast_sim.support.errors import ConfigError, DatasetError
 
-# The search for connected parts makes pairs of nodes from so many elements at a time, which limits its memory.
+# Elements from which the search for connected parts makes pairs of nodes at a time. This limits its memory.
 _ELEMENTS_AT_ONCE = 1 << 13
 
 

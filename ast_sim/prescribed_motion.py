@@ -54,16 +54,18 @@ class RigidMotion:
     point: Vector = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        path = np.shape(self.translation)
-        turns = np.shape(self.axis) == (3,) and np.any(np.abs(self.axis) > 1 / LARGEST)
-        for name, wanted, fits in (
-            ("translation", "three numbers or a list of triples", path == (3,) or (len(path) == 2 and path[1] == 3)),
-            ("rotation", "one number", np.ndim(self.rotation) == 0),
-            ("axis", "three numbers, not all zero", turns),
-            ("point", "three numbers", np.shape(self.point) == (3,)),
+        for name, wanted, shape in (
+            ("translation", "three numbers or a list of triples", (3,)),
+            ("rotation", "one number", ()),
+            ("axis", "three numbers, not all zero", (3,)),
+            ("point", "three numbers", (3,)),
         ):
             value = getattr(self, name)
-            if not fits or not np.size(value) or not (np.abs(np.asarray(value, np.float64)) <= LARGEST).all():
+            numbers = _numbers(value)
+            is_path = name == "translation" and numbers.ndim == 2 and len(numbers) and numbers.shape[1:] == shape
+            fits = numbers.shape == shape or is_path
+            fits = fits and (name != "axis" or np.any(np.abs(numbers) > 1 / LARGEST))
+            if not fits or not (np.abs(numbers) <= LARGEST).all():
                 raise ConfigError(
                     f"{name} of a motion must be {wanted}, all finite and at most {LARGEST:g}, not {value}"
                 )
@@ -292,6 +294,15 @@ def _moved(scene: Scene, motions: Mapping[int, RigidMotion | Vector]) -> Iterato
                 f" of it with --clamp {body}:PLACE"
             )
         yield nodes, motion if isinstance(motion, RigidMotion) else RigidMotion(motion)
+
+
+def _numbers(value: object) -> np.ndarray:
+    """Real numbers as float64; NaN in place of what is none."""
+    try:
+        given = np.asarray(value)
+        return given.astype(np.float64) if given.dtype.kind in "fiubO" else np.full(given.shape, np.nan)
+    except (TypeError, ValueError, OverflowError):  # rows of different lengths, or objects that are no numbers
+        return np.array(np.nan)
 
 
 def _largest(vectors: np.ndarray) -> float:

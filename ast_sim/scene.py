@@ -77,7 +77,7 @@ class Scene:
 
     @classmethod
     def join(cls, *scenes: Scene) -> Scene:
-        """One scene with the bodies of several, side by side: their numbers, and those of the nodes, count on.
+        """One scene with the bodies of several, side by side: the numbers of bodies and of nodes count on.
 
         Raises:
             DatasetError: the elements have different numbers of nodes, or the materials different columns.
@@ -266,7 +266,7 @@ class Trajectory:
         """The frames with these numbers, ascending, as a trajectory.
 
         Raises:
-            DatasetError: a frame is missing; the text names those that are there.
+            DatasetError: a frame is missing; the text names the frames that are there.
         """
         chosen = sorted(set(frames))
         missing = [number for number in chosen if number not in self.numbers]

@@ -22,7 +22,7 @@ RESAMPLES = 2000  # of the bootstrap over scenes
 
 @dataclass(frozen=True)
 class Setting:
-    """An effort of the run, or a way to run the solver.
+    """An effort of the run, or a variant of the solver.
 
     Attributes:
         name: such as "0 corrections, up to 1 Newton step".
@@ -61,7 +61,7 @@ class TradeRow:
     Attributes:
         tolerance: the error.
         run, solver: the fastest setting that keeps it; None: none does.
-        ratio: the median over the scenes of the solver's seconds over those of the run; None: one of them is missing.
+        ratio: the median over the scenes of the solver's seconds over the run's; None: one of them is missing.
         low, high: an interval of 95 % of the ratio, by bootstrap over the scenes.
         pays_after: the questions after which simulation and training are repaid; None: never, or not known.
         others: the same setting of each other side, by its name.
@@ -194,8 +194,8 @@ class TradeFigures:
         counts = f"{len(self.scenes)} scenes, deepest frame, one thread"
         told = [f"{counts}; error of the {self.quantity} kept in {100 * WITHIN:g} % of them"]
         for row in self.rows():
-            sides = {"run": row.run, "solver": row.solver, **row.others}
-            parts = [_told(who, setting) for who, setting in sides.items()]
+            sides = (("the run", row.run), ("the solver", row.solver), *row.others.items())
+            parts = [_told(who, setting) for who, setting in sides]
             if row.ratio is not None:
                 parts.append(f"ratio {row.ratio:.2f} ({row.low:.2f} to {row.high:.2f}): {row.verdict}")
             if row.pays_after is not None:
@@ -248,8 +248,8 @@ def _fastest(settings: Sequence[Setting], tolerance: float) -> Setting | None:
 
 
 def _ratio(one: Setting, other: Setting) -> tuple[float, float, float]:
-    """The median over the scenes of the seconds of one over those of the other, and its interval of 95 %. Where neither
-    has an answer they are level."""
+    """The median over the scenes of one's seconds over the other's, and its interval of 95 %. Where neither has an
+    answer they are level."""
     seconds, others = np.array(one.seconds), np.array(other.seconds)
     ratios = np.divide(seconds, others, out=np.ones(len(seconds)), where=np.isfinite(seconds) | np.isfinite(others))
     drawn = np.random.default_rng(0).integers(len(ratios), size=(RESAMPLES, len(ratios)))

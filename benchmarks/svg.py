@@ -15,7 +15,7 @@ from matplotlib.figure import Figure  # noqa: E402
 
 
 def axes_of_picture(width: float, height: float) -> tuple[Figure, Axes]:
-    """A figure of so many inches and its axes."""
+    """A figure of these sizes in inches and its axes."""
     return pyplot.subplots(figsize=(width, height), layout="constrained")
 
 

@@ -128,7 +128,7 @@ typedef struct {
   int64_t *keys, *offsets; /* [C], [B+1] as in octree_build */
   int64_t *families;       /* [C+1]: first child << 8 | set of the octants 4x+2y+z of all children */
   uint8_t *near;           /* [C]: whether the scene has a cell at P - (i,j,k) for any (i,j,k) of 0 and 1 but (0,0,0) */
-  int32_t (*before)[8];    /* [C,8]: where it has, those cells by 4i+2j+k, or -1 */
+  int32_t (*before)[8];    /* [C,8]: where it has, these cells by 4i+2j+k, or -1 */
   uint64_t *others; /* [C]: the fine cells that pair with P and are no children of it, as bits 8 (4i+2j+k) + octant */
   int64_t *pairs;   /* where the pairs of each chunk go; of octree_write_level alone */
   int64_t pair_offsets[28]; /* of the pairs with the finer level, by kernel offset */

@@ -1,7 +1,7 @@
 /* Attention: out = dropout(softmax(scale Q K^T)) V for each scene and head, without a Tq x Tk array.
  *
  * Keys come in blocks. With x_j the scores of one query against a block, m their running maximum, l the running sum of
- * the weights and o that of the weighted values,
+* the weights and o the running sum of the weighted values,
  *
  *   m' = max(m, max_j x_j),   p_j = exp(x_j - m'),
  *   l' = l exp(m - m') + sum_j p_j,   o' = o exp(m - m') + sum_j p_j v_j,   and out = o / l at the end.
@@ -23,7 +23,7 @@
 enum {
   QUERIES = 512,     /* of a task, which share the copies of its keys; the panels stay in the second cache */
   PARTED_TASKS = 16, /* a scene with fewer tasks is cut over its keys as well, */
-  PART_KEYS = 1024,  /* into parts of at least so many */
+  PART_KEYS = 1024,  /* into parts of at least this number */
 };
 _Static_assert(QUERIES % LANES == 0 && (int)KEYS == DROPOUT_KEYS,
                "tasks hold whole panels, blocks one group of the dropout");
@@ -78,7 +78,7 @@ AST_INLINE void weights(float *x, int64_t n, const vf base[2], int32_t shift, vf
   }
 }
 
-/* The same, with those weights that are dropped 0; the sums are of all. */
+/* The same, with dropped weights 0; the sums are of all. */
 AST_INLINE void dropped_weights(float *x, int64_t n, const vf base[2], int32_t shift, const dropout *d,
                                 dropout_words words[2], vf sum[2]) {
   const vu threshold = (vu){0} + (d->threshold << 16);

@@ -27,7 +27,7 @@ enum {
   SQUARE = 128,        /* of these, against a block of keys; */
   GROUP = 24,          /* of these, whose scores stay in the first cache: whole tiles */
   BACKWARD_TASKS = 16, /* a scene with fewer tasks is cut */
-  BACKWARD_PART = 512, /* into parts of at least so many keys or queries */
+  BACKWARD_PART = 512, /* into parts of at least this number of keys or queries */
 };
 _Static_assert(CHUNK % SQUARE == 0 && GROUP % (int)GEMM_ROWS == 0 && KEYS % (int)LANES == 0,
                "chunks hold whole squares, groups tiles");
@@ -84,8 +84,7 @@ typedef struct {
 
 /* ---- a square of queries against a block of keys ---- */
 
-/* Score x and gain y V^T become P . keep and dS. Words NULL: all are kept; so are those of a row that is NaN, as 0 NaN
- * is NaN. */
+/* Score x and gain y V^T become P . keep and dS. Words NULL: all are kept; so is a row that is NaN, as 0 NaN is NaN. */
 AST_INLINE void gradient(float *x, float *dx, vf maximum, vf share, vf delta, const vu *words, int slot, vu threshold) {
   const vf p = share * vexp(vload(x) - maximum, 0), dp = vload(dx);
   threshold &= (vu)(maximum == maximum);
@@ -109,7 +108,7 @@ static float sum_of(const float *x, int64_t n) {
   return vsum(sum);
 }
 
-/* Weights and their gradients of the queries i..i+rows of those in the scratch; k0 the first of n keys of the scene. */
+/* Weights and their gradients of the queries i..i+rows in the scratch; k0 the first of n keys of the scene. */
 static void backward_group(backward_scratch *t, int64_t i, int64_t rows, int64_t query, int64_t k0, int64_t n,
                            int64_t D, const dropout *d) {
   float *x = t->weights + i % SQUARE * ROW, *dx = t->dscores + i % SQUARE * ROW;

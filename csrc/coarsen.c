@@ -1,6 +1,6 @@
 /* The coarser levels of an octree, all at once, and which of their cells are neighbours.
  *
- * Level 0 holds the given cells, level j+1 the parents of those of level j, the root R one cell a scene. Legend: P a
+* Level 0 holds the given cells, level j+1 the parents of the cells of level j, the root R one cell a scene. Legend: P a
  * cell, o = 4x+2y+z its octant (the low three bits of its key), d = 4i+2j+k a step of 0 or 1 along each axis.
  *
  * Cells. Cell i of level 0 starts new cells at levels 1..q, where q is the highest octal digit in which its key differs
@@ -106,7 +106,7 @@ static void octree_places(octree_chunk *chunks, int64_t num, int root, int64_t C
   }
 }
 
-/* The first cell of each scene: of the cells above those of the finer level. */
+/* The first cell of each scene: of the cells above the cells of the finer level. */
 static void octree_scene_offsets(const ast_octree_level *level, const int64_t *fine_offsets) {
   for (int64_t b = 0, cell = 0; b <= level->B; b++)
     level->offsets[b] = cell = lower_bound(level->families, cell, level->C, fine_offsets[b] << 8);

@@ -17,8 +17,8 @@
  *
  * N nodes, E elements. About 350 operations an element forward, 80 of them in double, and 530 in a direction, on 4 x 24
  * bytes of coordinates: arithmetic is the limit. VW elements are computed at once: their corners are transposed into
- * one vector per coordinate, and the forces back into 16 floats per element. Then each node adds those of its corners
- * in stored order, so that the result depends on neither threads nor batch.
+ * one vector per coordinate, and the forces back into 16 floats per element. Then each node adds the forces of its
+ * corners in stored order, so that the result depends on neither threads nor batch.
  */
 #include "ast.h"
 #include "simd.h"
@@ -45,8 +45,8 @@ typedef struct {
 
 /* ---- corners of VW elements <-> one vector per coordinate ---- */
 
-/* Of vectors in blocks of four: a0 b0 a1 b1, a2 b2 a3 b3, a0 a1 b0 b1, a2 a3 b2 b3 of each block; then those at even
- * and odd places. */
+/* Of vectors in blocks of four: a0 b0 a1 b1, a2 b2 a3 b3, a0 a1 b0 b1, a2 a3 b2 b3 of each block; then the numbers at
+ * even and odd places. */
 #if AST_VECTOR_BYTES == 64
 #define BLOCKS(a, b, i, j, k, l) \
   VSHUFFLE(a, b, i, j, k, l, i + 4, j + 4, k + 4, l + 4, i + 8, j + 8, k + 8, l + 8, i + 12, j + 12, k + 12, l + 12)
@@ -174,7 +174,7 @@ AST_INLINE elastic_rest elastic_measure(const float *rest, const int64_t *elemen
 AST_INLINE void elastic_block(const bool directed, const elastic_job *job, int64_t first, int64_t n) {
   const int64_t *elements = job->mesh->elements + 4 * first;
   int64_t some[4 * VW];
-  if (n < VW) { /* the last one stands in for those beyond, whose forces are not read */
+  if (n < VW) { /* the last one stands in for the missing ones, whose forces are not read */
     for (int64_t k = 0; k < 4 * VW; k++) some[k] = elements[4 * min64(k / 4, n - 1) + k % 4];
     elements = some;
   }

@@ -5,8 +5,8 @@
  *
  * Distances only fall as samples come. So a block of consecutive points may stop looking at new samples: the largest
  * distance that it had then stays an upper bound. The next sample lies in the block with the largest bound, once that
- * block has seen all samples; until then it looks at those it missed, its bound falls, and another block may lead. Of
- * the missed samples only those matter whose distance from the bounding box of the block is less than the bound.
+ * block has seen all samples; until then it looks at the samples it missed, its bound falls, and another block may
+ * lead. A missed sample matters only if its distance from the bounding box of the block is less than the bound.
  * (Bounding boxes and deferred samples: Han et al., "QuickFPS", IEEE TCAD 2023; there the blocks are the leaves of a KD
  * tree, here the points come in Morton order and any cut gives small blocks.)
  *

@@ -6,7 +6,7 @@
 typedef struct {
   int64_t size, blocks;   /* points of a block, a multiple of FPS_TILE */
   int64_t *seen;          /* [blocks] the number of samples that the block has seen */
-  T *distances;           /* [blocks,size] from those */
+  T *distances;           /* [blocks,size] from these */
   COORDINATE *points;     /* [blocks,3,size] */
   COORDINATE *boxes;      /* [blocks,6]: lowest x, y, z, highest x, y, z */
   COORDINATE *samples[3]; /* x, y, z of all samples so far, then FPS_TILE items that are read but do not matter */
@@ -83,7 +83,7 @@ AST_INLINE uint32_t FPS(near)(const FPS(scene) * scene, const COORDINATE *box, T
   return bits;
 }
 
-/* Shows block b those of the first `taken` samples that it has not seen; `bound` is its bound; returns the new one. */
+/* Shows block b the new ones of the first `taken` samples; `bound` is its bound; returns the new bound. */
 static T FPS(update)(const FPS(scene) * scene, int64_t b, T bound, int64_t taken) {
   const COORDINATE *box = scene->boxes + 6 * b;
   int64_t list[128];

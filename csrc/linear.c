@@ -8,7 +8,7 @@
  *
  * Forward, a task owns a block of rows and some panels of columns. The gradient of W is a sum over rows, cut by the
  * shapes alone, in one of two ways. By rows: a task owns a chunk of rows, and while a block of them lies in the cache
- * takes dz, dx and its part of dW from it; the parts are added in order. By tiles, where those parts would be larger
+ * takes dz, dx and its part of dW from it; the parts are added in order. By tiles, where the parts would be larger
  * than x and dz: dz by blocks of rows, unless it is dout itself, then side by side dW by tiles of W, each over all
  * rows, and dx as a product like the forward one.
  *
@@ -101,7 +101,7 @@ typedef struct {
   const ast_linear *sizes;
   const float *dout, *x, *z;
   float *dx, *dweight, *dbias;
-  dense_layer layers[2]; /* that of z, if z is recomputed, and W^T, if dx is wanted */
+  dense_layer layers[2]; /* of z, if z is recomputed, and with W^T, if dx is wanted */
   int64_t columns;       /* of dout */
   int64_t dz_row, x_row; /* floats of a row of the copies */
   dense_chunks chunks;

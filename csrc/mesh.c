@@ -119,7 +119,7 @@ static ast_status mesh_edges(const int64_t *restrict elements, int64_t E, int64_
 
 /* ---- faces ---- */
 
-/* A face of which only the smallest corner is known to be that of others. */
+/* A face of which only the smallest corner is known to be the same as another's. */
 typedef struct {
   int64_t upper, number; /* middle N + largest of its corners; e Q + q */
 } mesh_face;

@@ -10,9 +10,9 @@
  * Edges come in rounds. First the tasks of a round, each a run of tiles, put dz into a buffer and add to weight
  * gradients of their own, of which there are at most ROUND_TASKS. Then other tasks add the rows of the buffer to dQ,
  * each for a run of receivers, and to dP, each for the senders with the same index modulo PARTS. All go through their
- * edges in stored order, and count those of a node with many edges, so that each sum runs in stored order and by the
- * same chains whatever the rounds, tasks, threads and other scenes. At the end the weight gradients of the tasks are
- * added up in order.
+ * edges in stored order, and count the edges of a node with many, so that each sum runs in stored order and by the same
+ * chains whatever the rounds, tasks, threads and other scenes. At the end the weight gradients of the tasks are added
+ * up in order.
  *
  * Cost per edge: the forward flops again, and twice as many for the two products per layer (but E H once, unless de is
  * wanted). Memory: at most ROUND_TASKS sums of weight gradients and ROUND_TASKS * TASK_TILES * MESSAGE_TILE rows of dz,
@@ -27,7 +27,7 @@ enum {
   ROWS_AHEAD = 6 /* edges by which prefetching runs ahead */
 };
 
-/* The gradients that are sums over all edges; that of A1 is transposed, [E,H]. */
+/* The gradients that are sums over all edges; dA1 is transposed, [E,H]. */
 enum { MESSAGE_DW2, MESSAGE_DA2, MESSAGE_DA1, MESSAGE_DB2, MESSAGE_DGAMMA, MESSAGE_DBETA, MESSAGE_Da1, MESSAGE_SUMS };
 
 /* The sums over the edges of each of some nodes. One of more than MESSAGE_CHAIN edges has a chain of its own. */
@@ -64,7 +64,7 @@ static void message_sort_by_part(const message_backward_job *job, int64_t begin,
   for (int64_t m = begin; m < end; m++) job->by_part[next[senders[m] % PARTS]++] = (int32_t)(m - job->begin);
 }
 
-/* y becomes dy. Sums over the tile are added to those of the task at its end: shorter sums are more exact. */
+/* y becomes dy. Sums over the tile are added to the sums of the task at its end: shorter sums are more exact. */
 AST_INLINE void message_norm_backward(const message_backward_job *job, int64_t first, int64_t n, const message_tile *t,
                                       float *partials, const bool whole) {
   const ast_message *step = job->w.step;
@@ -84,7 +84,7 @@ AST_INLINE void message_norm_backward(const message_backward_job *job, int64_t f
   dense_add_rows(t->y, row, n, F2, partials + sums[MESSAGE_DB2].at);
 }
 
-/* dz of the tile into the buffer, and the weight gradients added to the partial sums, or put there if those of the
+/* dz of the tile into the buffer, and the weight gradients added to the partial sums, or put there if the sums of the
  * matrices are `fresh`. */
 static void message_tile_backward(const message_backward_job *job, int64_t first, int64_t n, bool fresh,
                                   const message_tile *t, float *partials) {
@@ -189,8 +189,8 @@ static void message_add_to_senders(const message_backward_job *job, int64_t part
   }
 }
 
-/* dQ of the receivers whose first edge is in a part of this round, in the last part of all of those behind it, too, and
- * in the first part of that whose edges the round before has begun. */
+/* dQ of the receivers whose first edge is in a part of this round; in the last part, of all receivers behind it, too;
+ * in the first part, of the receiver whose edges the round before has begun, too. */
 static void message_add_to_receivers(const message_backward_job *job, int64_t part) {
   const ast_message *step = job->w.step;
   const int64_t F = step->F, edges = job->end - job->begin, *offsets = step->receiver_offsets;

@@ -149,7 +149,7 @@ AST_INLINE void mlp_norm_backward(const mlp_backward_job *job, int64_t first, in
   }
 }
 
-/* One block: its dx and dbeside, and its part of all sums, added to those of the chunk. Rows that do not end with a
+/* One block: its dx and dbeside, and its part of all sums, added to the sums of the chunk. Rows that do not end with a
  * vector are copied. */
 static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_t rows, float *input, float *hidden,
                               float *y, float *partials, bool add) {

@@ -46,8 +46,8 @@ static PyObject *freeze(PyObject *self, PyObject *const *objects, Py_ssize_t num
 
 static PyMethodDef kernel_methods[sizeof bindings / sizeof *bindings];
 
-/* declare(name, names, numbers) adds the function of a kernel to the module: the names of its parameters are those that
- * the call of the kernel reads, "x, weight, out", and the numbers are its spec. */
+/* declare(name, names, numbers) adds the function of a kernel to the module: the names of the parameters that the call
+ * of the kernel reads, "x, weight, out", and the numbers of its spec. */
 static PyObject *declare(PyObject *module, PyObject *arguments) {
   const char *name, *names, *numbers;
   Py_ssize_t bytes;
@@ -101,7 +101,7 @@ static PyMethodDef methods[] = {
     {"declare", declare, METH_VARARGS,
      "declare(name, names, numbers): adds the kernel of this name, which takes what the numbers of its spec say."},
     {"freeze", (PyCFunction)(void (*)(void))freeze, METH_FASTCALL,
-     "freeze(*indices): copies that kernels trust, or those that are such."},
+     "freeze(*indices): copies that kernels trust, or the arrays themselves if they are such."},
     {"set_pool", set_pool, METH_VARARGS,
      "set_pool(parallel_for, num_threads): addresses of torch's thread pool, 0 for serial."},
     {"keep_memory", keep_memory, METH_NOARGS, "Let the C library keep freed blocks; whether it had an effect."},

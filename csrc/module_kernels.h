@@ -423,7 +423,7 @@ static bool attention_block_check(const call *c) {
   const int64_t I = c->size['I'], H = a->heads.integer, D = I / H;
   const bool rotated = a->rotations.data || a->context_rotations.data;
   return (I % H == 0 && D % 16 == 0 && D >= 16 && D <= 128 && (!rotated || c->size['E'] == D)) ||
-         fail(c, "the head dimension must be a multiple of 16 up to 128, and that of the rotations");
+         fail(c, "the head dimension must be a multiple of 16 up to 128, and the dimension of the rotations");
 }
 
 /* ---- all kernels ---- */

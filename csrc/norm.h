@@ -3,8 +3,8 @@
  *   u = (y - mean(y)) / sd,   sd = sqrt(var(y) + eps),   out = gamma . u + beta
  *   p = gamma . dout,   dy = (p - mean(p) - u mean(p . u)) / sd,   dgamma = sum of dout . u,   dbeta = sum of dout
  *
- * The mean is that of the differences y - y_0 to the first value, the variance that of their squared differences to it,
- * in a second pass over a row in the cache. Of nearly equal values the differences are exact; of a large mean the
+ * The mean is taken of the differences y - y_0 to the first value, the variance of their squared differences to the
+ * mean, in a second pass over a row in the cache. Of nearly equal values the differences are exact; of a large mean the
  * rounding would stay in all of them. No difference is larger than twice the largest one to the mean, so none loses
  * digits that count.
  *

@@ -204,7 +204,7 @@ typedef struct {
   int64_t *keys, *starts; /* of each run */
 } octree_run_job;
 
-/* Of the rows begin..end-1, in one scene, those that start a run; the scene starts at `first`. */
+/* The rows of begin..end-1, in one scene, that start a run; the scene starts at `first`. */
 AST_INLINE int octree_heads(const octree_run_job *job, int64_t begin, int64_t end, int64_t first, int32_t *heads) {
   int num = 0;
   for (int64_t i = begin; i < end; i++) {

@@ -1,14 +1,14 @@
 /* Where the surface of the nearest other body is.
  *
- * Each body has a tree of bounding boxes over its triangles, but only over those that are within the radius of a box
- * around the nodes of the other bodies. Triangles stand in the order of the Morton keys of their middles, and eight of
- * them are a leaf. A branch of the tree is a run of leaves, and its halves are its branches. A node looks for the nearest point branch by branch, the
- * nearer one first, and at no box that is farther away than what it has seen. The triangles of a leaf are computed side
- * by side, without branches: a processor would guess each second one wrong.
+ * Each body has a tree of bounding boxes over its triangles, but only over triangles within the radius of a box around
+ * the nodes of the other bodies. Triangles stand in the order of the Morton keys of their middles, and eight of them
+ * are a leaf. A branch of the tree is a run of leaves, and its halves are its branches. A node looks for the nearest
+ * point branch by branch, the nearer one first, and at no box that is farther away than what it has seen. The triangles
+ * of a leaf are computed side by side, without branches: a processor would guess each second one wrong.
  *
- * The sign is that of Baerentzen and Aanaes (IEEE TVCG 2005): behind the pseudonormal of the nearest point. That is the
- * normal of the triangle, of both triangles at an edge, or of all at a corner, weighted by their angles there. Where a
- * triangle is kept, so are all around each of its points that is within the radius of a node.
+ * The sign follows Baerentzen and Aanaes (IEEE TVCG 2005): the gap is negative behind the pseudonormal of the nearest
+ * point, which is the normal of the triangle, of both triangles at an edge, or of all at a corner, weighted by their
+ * angles there. Where a triangle is kept, so are all around each of its points that is within the radius of a node.
  *
  * Coordinates are float32 and computed with in double: their fourth powers, of which the tests below consist, neither
  * overflow nor vanish. Of equally near points that on the body with the lowest number counts, then that on the first
@@ -23,14 +23,14 @@ enum {
   PROXIMITY_LEAF = 8,        /* triangles */
   PROXIMITY_CHUNK = 256,     /* nodes a task */
   PROXIMITY_DEPTH = 64,      /* of a tree at most */
-  PROXIMITY_INDEX_BITS = 34, /* of a sorted word; those above are the Morton key of 3 x 10 bits */
+  PROXIMITY_INDEX_BITS = 34, /* of a sorted word; the bits above are the Morton key of 3 x 10 bits */
   PROXIMITY_CELLS = 1024
 };
 
 static const double PROXIMITY_FLAT = 0x1p-48;     /* a triangle whose sine is below 2^-24 is a line: it has no normal */
 static const double PROXIMITY_TOUCHING = 1e-9;    /* a gap below this share of the radius has no direction */
 static const double PROXIMITY_FINE = 0.1;         /* the share of the radius where the last column saturates */
-static const double PROXIMITY_ROUNDING = 0x1p-40; /* more than that of the square of a distance */
+static const double PROXIMITY_ROUNDING = 0x1p-40; /* more than the rounding of the square of a distance */
 
 typedef struct {
   double low[3], high[3];
@@ -40,7 +40,7 @@ typedef struct {
   double corner[3][3], normal[3]; /* the normal is as long as twice the area */
 } proximity_triangle;
 
-/* Triangles side by side; those behind the last one are NaN, and nothing is near them. */
+/* Triangles side by side; places behind the last one are NaN, and nothing is near them. */
 typedef struct {
   double corner[3][3][PROXIMITY_LEAF], normal[3][PROXIMITY_LEAF];
   double of_edge[3][PROXIMITY_LEAF], of_normal[PROXIMITY_LEAF]; /* 1 over their squared lengths */
@@ -62,7 +62,7 @@ typedef struct {
   const ast_proximity *s;
   float *out;
   int64_t *num_surfaces, *leaf_offsets; /* [B], [B+1]: where there is room for the leaves of each scene */
-  proximity_surface *surfaces;          /* [F]: those of a scene start where its triangles start */
+  proximity_surface *surfaces;          /* [F]: the surfaces of a scene start where its triangles start */
   proximity_leaf *leaves;
   proximity_branch *branches;
   double *middles;          /* [F,3], times 3 */

@@ -81,7 +81,7 @@ AST_INLINE vf vmax(vf a, vf b) {
 #endif
 }
 
-/* The lanes with these numbers, VW constants: 0 to VW - 1 are those of a, VW to 2 VW - 1 those of b. */
+/* The lanes with these numbers, VW constants: 0 to VW - 1 are the lanes of a, VW to 2 VW - 1 the lanes of b. */
 #ifdef __clang__
 #define VSHUFFLE(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
 #else /* GCC 11 has only this one */
@@ -151,7 +151,7 @@ AST_INLINE vf vexp(vf x, int32_t shift) {
   return (vf)((vi)(vexp_near(r) * power) & ~(x < (float)(shift - 125) * 0x1.62e430p-1f));
 }
 
-/* e^(-x^2/2): the square in two parts, as that of the upper half of x is exact; rounded, it would cost 40 ULP. */
+/* e^(-x^2/2): the square in two parts, as the upper half of x has an exact square; rounded, it would cost 40 ULP. */
 AST_INLINE vf vgauss(vf x) {
   const vf high = (vf)((vi)x & ~0xfff), half = -0.5f * high, s = half * high, rest = (half - 0.5f * x) * (x - high);
   vf n;

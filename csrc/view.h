@@ -56,7 +56,7 @@ typedef struct {
   const void *stream;
 } dlpack_exchange;
 
-/* The exchange of a type and of those derived from it, kept from call to call; NULL for what is no tensor. */
+/* The exchange of a type and of types derived from it, kept from call to call; NULL for what is no tensor. */
 static const dlpack_exchange *exchange_of(PyTypeObject *type) {
   static PyTypeObject *known;
   static const dlpack_exchange *exchange;

@@ -202,7 +202,7 @@ AST_INLINE void dense_tile(const int rows, const int vectors, const dense_layer 
   dense_finish(l, e, rows, vectors, i0, j, l->N - j, sums, bias);
 }
 
-/* Of the rows first.. those parts that panel p of `panels` fetches. */
+/* The parts of the rows first.. that panel p of `panels` fetches. */
 AST_INLINE void dense_fetch(const dense_next *next, int64_t p, int64_t panels, int64_t first, int64_t rows) {
   const int64_t lines = (next->columns + 15) / 16, begin = lines * p / panels, end = lines * (p + 1) / panels;
   for (int64_t i = first; i < min64(first + rows, next->rows); i++)
@@ -274,7 +274,7 @@ static dense_chunks dense_cut(int64_t M, int64_t floats) {
 
 /* One of the gradients that are sums over rows: to [rows,n], or NULL if it is not wanted. Each chunk has a partial sum
  * of it, `at` in the memory of the chunk, rows of whole vectors `row` floats apart. Blocks add to vectors; to matrices
- * only those behind the first one, which sets them. */
+* only the blocks behind the first one, which sets them. */
 typedef struct {
   float *to;
   int64_t rows, n, at, row;

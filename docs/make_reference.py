@@ -33,7 +33,7 @@ def api() -> str:
 
 
 def described(name: str, value: Any) -> list[str]:
-    """Signature and docstring of a function or a class, and those of its public members."""
+    """Signature and docstring of a function or a class, and of its public members."""
     if not (inspect.isclass(value) or inspect.isroutine(value)):
         return [f"A `{type(value).__name__}`."]
     parts = [signature(name, value), markdown(inspect.getdoc(value) or "")]

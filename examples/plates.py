@@ -2,7 +2,7 @@
 
     python examples/plates.py [FOLDER]
 
-takes about three minutes on two cores and prints the error of the prediction beside that of holding still.
+takes about three minutes on two cores and prints the error of the prediction beside the error of holding still.
 """
 
 import sys

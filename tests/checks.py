@@ -87,7 +87,7 @@ def misaligned_read_only(x: Tensor) -> Tensor:
 
 
 def instruction_sets() -> list[str]:
-    """The instruction sets that this processor supports, of those compiled in."""
+    """The compiled instruction sets that this processor supports."""
     from ast_sim.ops.library import configuration
 
     return configuration()["supported"]

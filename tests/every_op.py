@@ -1,8 +1,8 @@
 """Every op on the same few scenes, for the tests that hold for all of them.
 
 A new op is one function and one entry of OPS. The function takes scene numbers and returns, for the batch of these
-scenes, the results of each scene (outputs and gradients of its rows) and those that the scenes share (gradients of
-weights).
+scenes, the results of each scene (outputs and gradients of its rows) and the results that the scenes share (gradients
+of weights).
 """
 
 from collections.abc import Callable, Sequence
@@ -40,7 +40,7 @@ SIZES = [700, 1, 0, 2500, 130]  # rows of scene 0, 1, ...
 
 
 def rows(scenes: Sequence[int], *width: int, key: int = 0, sizes: Sequence[int] = SIZES) -> Tensor:
-    """Random rows of these scenes; those of a scene are the same in every batch."""
+    """Random rows of these scenes; a scene has the same rows in every batch."""
     parts = []
     for s in scenes:
         g = torch.Generator().manual_seed(1000 * key + s)
@@ -168,7 +168,7 @@ def dropout_results(scenes: Sequence[int]) -> Results:
 
 
 def block_results(scenes: Sequence[int]) -> Results:
-    """Without gradients: those are of the composition."""
+    """Without gradients: the composition gives them."""
     keys = [90, 300, 7, 40, 600]
     q_offsets, k_offsets = offsets_of(scenes), offsets_of(scenes, keys)
     turns = (rows(scenes, 16, key=3), rows(scenes, 16, key=4, sizes=keys))
@@ -283,7 +283,7 @@ def breadth_first_results(scenes: Sequence[int]) -> Results:
 
 
 def sort_results(scenes: Sequence[int]) -> Results:
-    """The places in each scene, which are those of its corners."""
+    """The places in each scene, which are the places of its corners."""
     tets, offsets = tets_of(scenes), offsets_of(scenes)
     order, ends = counting_sort(tets.elements.flatten(), tets.num_nodes)
     starts = ends[offsets]

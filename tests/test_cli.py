@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -14,7 +15,7 @@ import toy
 from data_samples import sign
 from toy import one_thread  # noqa: F401 (used by being imported)
 
-from ast_sim.cli import main
+from ast_sim.cli import build_parser, main
 from ast_sim.dataset.reader import Dataset
 from ast_sim.support.errors import AstSimError
 from ast_sim.support.toml_settings import settings
@@ -230,6 +231,17 @@ def test_report_is_one_page(trained, tmp_path, capsys):
     assert "test/000001" in page
 
 
+def test_a_page_compares_runs_on_one_dataset(trained, tmp_path, capsys):
+    """Scenes of two datasets have the same names; the page would show the truth of one and the answers to the other."""
+    data, run = trained
+    other = toy.write(tmp_path / "other.h5", (3, 1, 1))
+    assert main(["train", str(other), "--out", str(tmp_path / "second"), *SET]) == 0
+    error = fails(capsys, "report", run, tmp_path / "second", "--out", tmp_path / "page.html")
+    assert "second was evaluated on other scenes (other.h5) than" in error and "--data" in error
+    shown = ("report", str(run), str(tmp_path / "second"), "--data", str(data), "--out", str(tmp_path / "page.html"))
+    assert main(list(shown)) == 0 and (tmp_path / "page.html").is_file()
+
+
 def test_what_looks_wrong_is_a_table(tmp_path, capsys):
     from ast_sim.view import export
 
@@ -258,7 +270,7 @@ def test_a_series_of_another_program_becomes_a_dataset(tmp_path, capsys):
         assert dataset.num_frames("test", 0) == 7
 
 
-def test_resume_without_a_dataset_takes_that_of_the_run(trained, capsys):
+def test_resume_without_a_dataset_takes_the_dataset_of_the_run(trained, capsys):
     _, run = trained
     assert main(["train", "--out", str(run), "--resume"]) == 0
     assert "going on after step 6" in capsys.readouterr().out
@@ -437,6 +449,34 @@ def test_arguments_out_of_range(tmp_path, capsys):
     error = fails(capsys, *plates, "--parts", tmp_path)
     assert "deforming_plate has no option parts; these families have it: abcd, abcd_xl" in error
     assert os.listdir(tmp_path) == []
+
+
+def test_what_is_given_twice_for_one_thing_is_refused(trained, tmp_path, capsys):
+    data, run = trained
+    scene = tmp_path / "scene.vtu"
+    with Dataset(data) as dataset:
+        dataset["test"][0].scene.to_meshio().write(scene)
+    out = ("predict", run, scene, "--out", tmp_path / "x.h5")
+    assert "--move is given twice for 1: leave one out" in fails(capsys, *out, "--move=1=0,0,1", "--move=1=0,0,2")
+    moved = (*out, "--move=1=0,0,1")
+    errors = ("--error=2%", "--error=displacement=5%")
+    assert "--error is given twice for displacement: leave one out" in fails(capsys, *moved, *errors)
+    convert = ("convert", "results", "--out", tmp_path / "x.h5")
+    for option in ("--obstacle", "--handle", "--stress", "--reaction"):
+        assert f"{option} is given twice: leave one out" in fails(capsys, *convert, option, "a", option, "b")
+    materials = ("--material=0=1e6,0.3", "--material=0=2e6,0.3")
+    assert "--material is given twice for 0: leave one out" in fails(capsys, *moved, *materials)
+    assert os.listdir(tmp_path) == ["scene.vtu"]
+
+
+def test_options_with_several_values_may_be_repeated():
+    parser = build_parser()
+    columns = ("--material", "young=E", "--material", "poisson=nu", "--split", "train", "--split", "test")
+    given = parser.parse_args(["convert", "source", "--out", "data.h5", *columns])
+    assert given.material == ["young=E", "poisson=nu"] and given.split == ["train", "test"]
+    runs = ("--beside", "a", "--beside", "b", "c")
+    given = parser.parse_args(["trade", "run", "data.h5", "--out", "page.html", *runs])
+    assert given.beside == [Path(name) for name in "abc"]
 
 
 def test_a_report_is_html_and_its_name_says_so(trained, tmp_path, capsys):

@@ -35,7 +35,7 @@ def test_the_options_of_an_effort_ask_for_it(effort):
     assert asked(*options_of(effort)) == effort
 
 
-def test_the_error_of_an_effort_is_that_of_the_most_newton_steps_that_were_measured():
+def test_an_effort_has_the_error_of_the_most_newton_steps_that_were_measured():
     measured = [EffortErrors(Effort(c, steps), 10 * c + steps, None, steps, 0) for c in (0, 1) for steps in range(3)]
     assert error_with(Effort(1, 1), measured) == 11
     assert error_with(Effort(1, 9), measured) == 12

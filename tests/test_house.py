@@ -115,8 +115,8 @@ def alike(values: list[ast.expr]) -> bool:
 
 
 def folded(source: str) -> list[str]:
-    """The assignments of several values to several names in which a call stands beside something unlike it, and those
-    to a name that says nothing."""
+    """The assignments of several values to several names in which a call stands beside something unlike it, and the
+    assignments to a name that says nothing."""
     bad = []
     for node in ast.walk(ast.parse(source)):
         if (

@@ -51,7 +51,7 @@ def test_bodies_move_rigidly_and_all_else_stands_still():
     assert np.array_equal(Motion.of_bodies(SCENE, {}, 3).position, np.repeat(SCENE.rest_position[None], 3, axis=0))
 
 
-def test_positions_of_all_nodes_or_of_those_that_are_prescribed():
+def test_positions_of_all_nodes_or_of_the_prescribed_ones():
     given = np.random.default_rng(1).standard_normal((3, 5, 3)).astype(np.float32)
     assert np.array_equal(Motion.of_positions(SCENE, given).position, given)
     found = Motion.of_positions(SCENE, given[:, [0, 4]].tolist())
@@ -59,7 +59,7 @@ def test_positions_of_all_nodes_or_of_those_that_are_prescribed():
     assert np.array_equal(found.position[:, 1:4], np.repeat(SCENE.rest_position[None, 1:4], 3, axis=0))
 
 
-def test_increments_and_travel_are_those_of_prescribed_nodes():
+def test_increments_and_travel_are_of_prescribed_nodes():
     position = np.repeat(SCENE.rest_position[None], 4, axis=0)
     position[:, 4, 0] += [0, 3, 3, 1]
     position[:, 4, 1] += [0, 4, 4, 4]
@@ -177,6 +177,19 @@ def test_a_body_without_prescribed_nodes_and_positions_that_are_not_finite_are_n
     position[2, 1, 0] = np.inf
     with pytest.raises(ConfigError, match=r"not finite in frame 2 at node 4: \[inf, 0.0, 0.0\]"):
         Motion.of_positions(SCENE, position)
+
+
+@pytest.mark.parametrize("value", [(0, 0, 1j), ("0", "0", "1"), "001", (0, 0), (0, 0, None), {1: 2}])
+@pytest.mark.parametrize("name", ["translation", "axis", "point"])
+def test_what_are_no_three_real_numbers_is_refused(name, value):
+    with pytest.raises(ConfigError, match=f"^{name} of a motion must be three numbers"):
+        RigidMotion(**{name: value})
+
+
+@pytest.mark.parametrize("value", [[(0, 0, 1), (0, 0)], [], [[]], np.zeros((0, 3)), np.zeros((2, 2, 3))])
+def test_a_path_has_triples_alone(value):
+    with pytest.raises(ConfigError, match="^translation of a motion must be three numbers or a list of triples"):
+        RigidMotion(value)
 
 
 def test_motions_that_are_too_far_or_too_long_are_refused():

@@ -59,7 +59,7 @@ def test_legs_end_where_a_path_turns_between_frames():
     assert (first.end[0, 2], last.end[0, 2], only.end[0, 2]) == pytest.approx((-1, 1, -0.6))
 
 
-def test_positions_between_frames_are_those_of_the_motion():
+def test_positions_between_frames_follow_the_motion():
     both = course(RigidMotion((0, 0, -2), 90, point=ORIGIN), 2)
     np.testing.assert_allclose(both.at(0.5)[0], [0.5**0.5, 0.5**0.5, -1], rtol=0, atol=1e-12)
     np.testing.assert_allclose(both.direct(1).along(0.25)[0, 2], -0.5, rtol=0, atol=1e-12)

@@ -149,7 +149,7 @@ def test_a_wrong_trajectory_is_named():
             value.check("x", location)
 
 
-def test_node_types_are_those_of_meshgraphnets():
+def test_node_types_have_the_numbers_of_meshgraphnets():
     assert {kind.name: kind.value for kind in NodeType} == {"NORMAL": 0, "OBSTACLE": 1, "HANDLE": 3}
 
 

@@ -5,12 +5,13 @@ import math
 import pytest
 
 from ast_sim.trade_figures import Setting, Side, TradeFigures, front
+from ast_sim.view import trade_page
 
 SCENES = tuple(f"test/{index:06d}" for index in range(10))
 
 
 def setting(name, error, seconds, failed=0):
-    """A setting with errors of 0.1 to 1 times `error`, and so many scenes without an answer."""
+    """A setting with errors of 0.1 to 1 times `error`, and `failed` scenes without an answer."""
     errors = [error * (k + 1) / 10 for k in range(10 - failed)] + [math.inf] * failed
     return Setting(name, tuple(errors), (seconds,) * (10 - failed) + (math.inf,) * failed)
 
@@ -69,7 +70,8 @@ def test_the_front_holds_what_nothing_beats():
 
 def test_the_text_and_the_json_say_it():
     told = figures(no_solver="it was not made here", origin={"run": "r"})
-    assert told.lines()[1] == ("10 %: run: 20 ms (call); solver: 50 ms (coarse); ratio 2.50 (2.50 to 2.50): the run")
+    line = "10 %: the run: 20 ms (call); the solver: 50 ms (coarse); ratio 2.50 (2.50 to 2.50): the run"
+    assert told.lines()[1] == line
     assert told.lines()[-1] == "the solver was not run: it was not made here"
     values = told.to_json()
     assert values["rows"][0]["solver"] == "coarse" and values["rows"][4]["run"] is None
@@ -99,11 +101,23 @@ def test_other_sides_stand_in_the_rows_with_their_fastest_setting():
     assert names == ["two calls", "one call", "one call", None, None, None]
     assert rows[0].cells[1:6] == ["20 ms: call", "50 ms: coarse", "30 ms: two calls", "none", "2.50 (2.50 to 2.50)"]
     assert len(rows[0].cells) == len(known.columns)
-    assert known.lines()[1].startswith("10 %: run: 20 ms (call); solver: 50 ms (coarse); mgn: 30 ms (two calls); none")
+    line = "10 %: the run: 20 ms (call); the solver: 50 ms (coarse); mgn: 30 ms (two calls); none"
+    assert known.lines()[1].startswith(line)
     values = known.to_json()
     assert values["rows"][0]["others"] == {"mgn": "two calls", "none": None}
     assert values["others"][0]["settings"][2]["errors"][-1] is None
     assert TradeFigures.from_json(values) == known
+
+
+@pytest.mark.parametrize("name", ["run", "the run", "solver", "the solver"])
+def test_another_run_may_have_any_name(name):
+    """Its figures stand beside the figures of the run and the solver, not in their place."""
+    known = figures(others=(Side(name, (setting("slow call", 0.05, 0.04),)),))
+    line = f"10 %: the run: 20 ms (call); the solver: 50 ms (coarse); {name}: 40 ms (slow call); ratio 2.50"
+    assert known.lines()[1].startswith(line)
+    rows = trade_page.page_data(known)["settings"]["rows"]
+    both = [(side, row[1]) for side in ("the run", "the solver", name) for row in rows if row[0] == side]
+    assert {("the run", "call"), ("the solver", "coarse"), (name, "slow call")} <= set(both)
 
 
 def test_why_there_is_no_gaussian_process_is_told():

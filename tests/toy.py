@@ -84,7 +84,7 @@ def info(dynamic: bool = False, stress: bool = True) -> DatasetInfo:
 
 
 def write(path: Path, counts: tuple[int, int, int] = (3, 2, 2), **kind: bool) -> Path:
-    """A dataset with so many trajectories for training, validation and test."""
+    """A dataset with `counts` trajectories for training, validation and test."""
     with DatasetWriter(path, info(**kind)) as writer:
         seed = 0
         for split, count in zip(("train", "valid", "test"), counts, strict=True):

@@ -7,7 +7,7 @@ from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
 
 
 def read(path: Path) -> tuple[list[float], list[pyvista.DataSet]]:
-    """The times and the meshes of a series, with VTK's own readers, which are those of ParaView."""
+    """The times and the meshes of a series, with VTK's own readers, which ParaView uses."""
     reader = pyvista.get_reader(path)
     meshes = []
     if path.suffix == ".pvd":

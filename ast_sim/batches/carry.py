@@ -88,7 +88,7 @@ def rigid_motion(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def harmonic_extension(scene: Scene, held: np.ndarray, free: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """A function from the displacements [H, 3] of the held nodes of a body to those [F, 3] of its free nodes.
+    """A function from displacements [H, 3] of the held nodes of a body to displacements [F, 3] of its free nodes.
 
     Nodes of an element are near each other in the order of the free nodes, so their matrix has a narrow band. Its
     Cholesky factor takes a quarter of the time of a sparse LU factor. The LU factor keeps fewer numbers; it is taken
@@ -123,7 +123,7 @@ def harmonic_extension(scene: Scene, held: np.ndarray, free: np.ndarray) -> Call
 def _solver_of_band(
     diagonal: np.ndarray, low: np.ndarray, high: np.ndarray, values: np.ndarray, width: int
 ) -> Callable[[np.ndarray], np.ndarray] | None:
-    """Solves with a symmetric matrix of so many diagonals; None if it is not positive definite.
+    """Solves with a symmetric matrix of `width` diagonals; None if it is not positive definite.
 
     Args:
         diagonal: [F].

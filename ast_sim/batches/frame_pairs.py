@@ -16,7 +16,7 @@ from ast_sim.support.errors import DatasetError
 
 
 def target_counts(dataset: Dataset, split: str) -> list[int]:
-    """How many frames of each trajectory of a split can be predicted: all but those that are given."""
+    """How many frames of each trajectory of a split can be predicted: all but the given ones."""
     given = GIVEN_FRAMES[dataset.info.integration]
     return [max(0, dataset.num_frames(split, index) - given) for index in range(dataset.count(split))]
 

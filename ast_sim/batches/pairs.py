@@ -73,10 +73,10 @@ class Jump:
     """Two frames of a trajectory, the later of which is predicted at once, and how they are mirrored and moved.
 
     Attributes:
-        source, frame: the frame that is carried along, and the frame to predict.
+        source, frame: the frame that is carried along to be the start, and the frame to predict.
         error: [N, 3] float32, the error of a guess of the frame to predict, which is to be corrected, before the scene
             is mirrored; None: there is no guess yet, and the jump starts from the source.
-        share: without a guess, the state has this share of the error of the source, carried along.
+        share: without a guess, the jump starts with this share of the error of the carried-along start.
         source_error: [N, 3] float32, the error of the source, as a prediction of it has; None: the source is true.
     """
 
@@ -115,8 +115,8 @@ class PairSampler:
 
     Targets have the stress, if there is one, and the named fields that `fields` tells of as in `Output`.
 
-    With `part` = (i, n), `batch` returns the i-th of n equal parts of the whole batch. With `scenes` = k, the pairs are
-    those of the first k scenes of the split.
+    With `part` = (i, n), `batch` returns the i-th of n equal parts of the whole batch. With `scenes` = k, all pairs
+    come from the first k scenes of the split.
 
     Raises:
         DatasetError: the split has no pair, or a sample cannot be read.

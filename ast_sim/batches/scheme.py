@@ -62,7 +62,7 @@ class Scheme:
         """[S] int64: the frame that each frame is predicted from; of the given frames it means nothing.
 
         Args:
-            position: [S, N, 3], the positions in each frame; only those of prescribed nodes are read.
+            position: [S, N, 3], the positions in each frame; only prescribed nodes are read.
             prescribed: [N] bool.
         """
         if not self.jumps:

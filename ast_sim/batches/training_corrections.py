@@ -24,7 +24,7 @@ from ast_sim.batches.pairs import Jump, PairSampler
 from ast_sim.batches.training_pool import TrainingPool
 
 MEMORY = 0.99  # share of the running mean square that stays when a scene is added
-UNSEEN = 0.3  # the first guess of the errors of later calls, relative to that of the first
+UNSEEN = 0.3  # the first guess of the errors of later calls, relative to the error of the first call
 LEAST = 0.02  # what later calls leave, relative to what the first leaves, counts as at least this
 OWN = 0.5  # share of the jumps from a later frame than the first that start from the model's own answer for it
 ELSEWHERE = 0.1  # share of the jumps that start from a later frame than `PairSampler.source` says

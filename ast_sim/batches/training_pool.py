@@ -66,7 +66,7 @@ class TrainingPool:
         """[B]: how much the squared error of each scene of a batch counts; asked for only if the pool `weighs`.
 
         Args:
-            errors: those of all parts of the batch, in their order.
+            errors: of all parts of the batch, in their order.
         """
         raise NotImplementedError
 

@@ -6,7 +6,7 @@ the position is in the state of the next step, and each step is trained to lead 
 additional prediction.
 
 With inertia a state is two positions, so it has two errors. To undo an error of the velocity in one step would take
-accelerations far above those of the data. So targets undo errors like a critically damped spring:
+accelerations far above the accelerations in the data. So targets undo errors like a critically damped spring:
 
     e_{t+1} = 2 r e_t - r^2 e_{t-1},    r = 1 - gamma.
 """

@@ -1,8 +1,8 @@
 """The load path: where the motion of the prescribed nodes turns back.
 
-Metal that yields keeps a set, so a frame depends on the way there, not only on where the prescribed nodes end. On a way
-that never turns back, the plastic strain follows from its two ends. So a jump starts from the last frame in which the
-motion turned back, not always from the first one, and knows the plastic strain there.
+Metal that yields keeps a set, so a frame depends on the load path, not only on where the prescribed nodes end. On a
+path that never turns back, the plastic strain follows from its two ends. So a jump starts from the last frame in which
+the motion turned back, not always from the first one, and knows the plastic strain there.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ def jump_sources(position: np.ndarray, prescribed: np.ndarray) -> np.ndarray:
     prescribed nodes. Frames in which nothing moves do not count as steps.
 
     Args:
-        position: [S, N, 3], the positions in each frame; only those of prescribed nodes are read.
+        position: [S, N, 3], the positions in each frame; only prescribed nodes are read.
         prescribed: [N] bool.
 
     Returns:

@@ -12,8 +12,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from ast_sim.command_line.effort_options import effort_of
+from ast_sim.command_line.effort_options import effort_of, error_of
 from ast_sim.runs import CONFIG, SCOPE
+from ast_sim.support.argument_types import by_name
 from ast_sim.support.disk import output_file
 from ast_sim.support.errors import ConfigError, DatasetError, RolloutError, printable
 
@@ -124,7 +125,7 @@ def refuse(args: argparse.Namespace, groups: tuple[Any, ...], what: str) -> None
 
 
 def check_output(args: argparse.Namespace, out: Path, inputs: Iterable[Path], what: str = "", *suffixes: str) -> None:
-    """Raise ConfigError if the name of the output does not end as that of `what` must, or if the output is an input,
+    """Raise ConfigError if the name of the output does not end as a name of `what` must, or if the output is an input,
     lies in a run, or exists and --overwrite was not given."""
     if suffixes and out.suffix not in suffixes:
         one_of = "one of " if len(suffixes) > 1 else ""
@@ -190,10 +191,10 @@ def predict(args: argparse.Namespace) -> None:
     check_output(args, args.out, [args.scene], "a prediction", *SUFFIXES)
     if args.forces is not None:
         check_output(args, args.forces, [args.scene, args.out], "a table of forces", ".csv")
-    moves = dict(map(parse_move, args.move))
+    moves = by_name("--move", map(parse_move, args.move))
     run = open_run(args.run_folder)
     effort = effort_of(args, run.effort)
-    wanted = {"frames": args.frames, "effort": effort, "error": dict(args.error) or None, "ms": args.ms, "throw": False}
+    wanted = {"frames": args.frames, "effort": effort, "error": error_of(args), "ms": args.ms, "throw": False}
     if args.scene.suffix == ".toml":
         _predict_spec(run, args, wanted)
         return
@@ -249,7 +250,7 @@ def sweep(args: argparse.Namespace) -> None:
         table=args.table,
         nodes=args.nodes,
         effort=effort_of(args, run.effort),
-        error=dict(args.error) or None,
+        error=error_of(args),
     )
     swept.save(args.out)
     print(f"{args.out}: {len(swept.rows)} rows, {1000 * swept.seconds / len(swept.rows):.3g} ms each")
@@ -271,7 +272,7 @@ def _save(answer: Any, args: argparse.Namespace, truth: Any) -> None:
     if args.forces is not None:
         answer.save_forces(args.forces)
     if args.check:
-        print(printable(str(answer.check())))
+        print("\n".join(map(printable, str(answer.check()).splitlines())))
 
 
 def _truth(run: Any, args: argparse.Namespace) -> Any:
@@ -291,7 +292,8 @@ def _scene(args: argparse.Namespace) -> Any:
 
     marks = {"obstacles": args.obstacle, "clamps": args.clamp, "corners": args.corners}
     fields = {"body_field": args.body_field, "type_field": args.type_field}
-    read = read_scene(args.scene, **marks, **fields, materials=dict(map(parse_material, args.material)) or None)
+    materials = by_name("--material", map(parse_material, args.material))
+    read = read_scene(args.scene, **marks, **fields, materials=materials or None)
     print("\n".join(map(printable, read.description)))
     return read.scene
 

@@ -6,7 +6,7 @@ import argparse
 from dataclasses import replace
 
 from ast_sim.inference.effort import DIALS, Effort, option
-from ast_sim.support.argument_types import Parser, add_each, at_least, read_by
+from ast_sim.support.argument_types import Parser, add_each, at_least, by_name, read_by
 from ast_sim.support.errors import ConfigError
 
 EXACT = "let the solver continue from the answer of the run (with friction: from rest) until its stop test holds"
@@ -38,3 +38,12 @@ def effort_of(args: argparse.Namespace, default: Effort) -> Effort | None:
     if args.exact:
         return Effort.exact()
     return replace(default, **{"newton_steps": 0, "solved": False, **numbers}) if numbers else None
+
+
+def error_of(args: argparse.Namespace) -> dict[str, float] | None:
+    """The errors that --error asks for, by quantity; None: none is given.
+
+    Raises:
+        ConfigError: two are given for a quantity.
+    """
+    return by_name("--error", args.error) or None

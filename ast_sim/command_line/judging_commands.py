@@ -61,7 +61,7 @@ def add_trade(trade: Parser) -> None:
     add_out(trade, "FILE.html", "page to write; all figures lie beside it (.json)")
     trade.add_argument("--split", choices=SPLITS, default="test", help="split (default: test)")
     about = "other runs that have learned from the same dataset as RUN"
-    add_each(trade, {"--beside OTHER_RUN": about}, type=path, nargs="+", default=[])
+    add_each(trade, {"--beside OTHER_RUN": about}, type=path, nargs="+", action="extend", default=[])
     add_each(trade, {"--scenes N": "scenes, at most (default: 20)"}, type=at_least(1), default=20)
     about = "seconds that another program takes for such a scene; our solver is not run then"
     add_each(trade, {"--solver-seconds S": about}, type=float)

@@ -151,7 +151,7 @@ def require_kind(name: str, scene: Scene, known: tuple[int, int] | None) -> tupl
     """The nodes per element and the number of material columns of a scene.
 
     Raises:
-        DatasetError: they are not those of the other scenes of the dataset, where these are `known`.
+        DatasetError: they differ from the other scenes of the dataset, where these are `known`.
     """
     kind = scene.elements.shape[1], 0 if scene.material is None else scene.material.shape[1]
     if known not in (None, kind):

@@ -188,7 +188,7 @@ class Dataset:
         return position[start:stop], None if stress is None else stress[start:stop]
 
     def load(self, split: str, index: int, fields: Collection[str] = ()) -> Trajectory:
-        """A trajectory without its `cauchy_stress`, and with those `fields` that are named, if it has them: all are
+        """A trajectory without its `cauchy_stress`, and with these `fields`, if it has them: all are
         large; `dataset[split][index]` has all."""
         position, stress = self.frames(split, index, 0, self.num_frames(split, index))
         frames, times = self._numbering(split, index)
@@ -223,7 +223,7 @@ class Dataset:
         return digest.hexdigest()
 
     def with_frames(self, split: str, least: int) -> list[int]:
-        """The trajectories of a split with at least so many frames. Where a solver gave up in the first, only the start
+        """The trajectories of a split with at least `least` frames. Where a solver gave up in the first, only the start
         is there."""
         return [index for index in range(self.count(split)) if self.num_frames(split, index) >= least]
 
@@ -246,7 +246,7 @@ class Dataset:
         return self._finite(self._name(split, index), "element", array, start, stop)
 
     def fields(self, split: str, index: int, names: Collection[str] | None = None) -> dict[str, NamedField]:
-        """The named fields of a trajectory, all frames of them; with `names`, those of these that it has."""
+        """The named fields of a trajectory, in all frames; with `names`, only these, where it has them."""
         group, count = self._group(split, index), self.num_frames(split, index)
         if not self._file.has(group, FIELDS):
             return {}

@@ -27,7 +27,7 @@ Seconds = dict[str, Any]  # attributes that end in SUFFIX, and `processor`
 
 
 def split_seconds(attributes: dict[str, AttributeValue]) -> tuple[dict[str, AttributeValue], Seconds]:
-    """Divide the attributes of a trajectory: first those that follow from its settings, then those that are times."""
+    """Divide the attributes of a trajectory into what follows from its settings, and times."""
     kept = {key: value for key, value in attributes.items() if not key.endswith(SUFFIX)}
     return kept, {key: value for key, value in attributes.items() if key.endswith(SUFFIX)}
 

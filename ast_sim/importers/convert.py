@@ -25,6 +25,7 @@ from ast_sim.support.errors import DatasetError, LooksWrong, nearest_name
 from ast_sim.support.progress import Progress, ShowProgress
 
 SHARES = {"train": 0.8, "valid": 0.1, "test": 0.1}
+EVEN = 0.05  # of a time step: explicit solvers write a frame after the step in which its time is reached
 
 Splits = Mapping[str, float] | Mapping[str, Sequence[str]]
 
@@ -33,7 +34,7 @@ def convert(source: Path | str, out: Path | str, **options: Any) -> dict[str, in
     """Import simulations as a dataset: PVD, VTU and VTKHDF files, or a folder of a MeshGraphNets data set.
 
     Args:
-        options: the options of `convert_deepmind` if the source holds .tfrecord files, else those of `convert_series`.
+        options: the options of `convert_deepmind` if the source holds .tfrecord files, else of `convert_series`.
             Both have `progress`, as in `generate`.
 
     Returns:
@@ -72,7 +73,7 @@ def convert_series(
         names: the names of the fields.
         splits: for each split the names of its simulations (others are left out), or its share, drawn with `seed`.
             Shares add up to 1; each above 0 gets one simulation at least. The default is 0.8, 0.1, 0.1; it needs three.
-        calibration: so many simulations are drawn first for the split "calibration"; shares divide the others.
+        calibration: simulations that are drawn first for the split "calibration"; shares divide the others.
         integration, contact_radius, time_step, length_unit: as in `DatasetInfo`; no unit is "m", but a deck needs one.
         deck: the deck of CalculiX (`.inp`) whose results the source is; see `read_job` and `decks_of`.
         corners: take only the corners of second-order tetrahedra: no force of such a mesh is right.
@@ -92,12 +93,12 @@ def convert_series(
     names = with_units(decks, names, length_unit)
     chosen = _assign(source, list(series), splits, calibration, seed)
     made_by = {"program": "ast_sim convert", "source": str(source), "names": asdict(names), "seed": seed}
-    facts: dict[str, Any] = {"family": source.stem, "integration": integration, "generator": made_by}
-    facts |= {"contact_radius": contact_radius, "time_step": time_step, "length_unit": length_unit or "m"}
+    facts: dict[str, Any] = {"family": source.stem, "integration": integration, "length_unit": length_unit or "m"}
+    facts |= {"generator": made_by, "contact_radius": contact_radius, "time_step": time_step, "stress_location": "none"}
     findings: list[tuple[str, Finding]] = []
-    opened = FittedWriter(out, stress_location="none", **facts)
-    with opened as writer, Progress(len(chosen), "simulations", progress) as bar:
-        for split, name, trajectory in _trajectories(series, decks, chosen, names, corners, incomplete):
+    with FittedWriter(out, **facts) as writer, Progress(len(chosen), "simulations", progress) as bar:
+        dynamic = integration == "dynamic"
+        for split, name, trajectory in _trajectories(series, decks, chosen, names, corners, incomplete, dynamic):
             if not any(writer.counts.values()):
                 made_by |= _facts_of_the_first(trajectory)
                 writer.info = replace(writer.info, stress_location=trajectory.stress_at, generator=made_by)
@@ -123,6 +124,7 @@ def _trajectories(
     names: FieldNames,
     corners: bool,
     incomplete: bool,
+    dynamic: bool,
 ) -> Iterator[tuple[str, str, Trajectory]]:
     """The split, the name and the trajectory of each chosen simulation; all have the origin of the first."""
     origin = None
@@ -132,9 +134,23 @@ def _trajectories(
             doubt_modulus(decks[name], trajectory, names.stress_unit or "Pa")
         if not incomplete:
             require_complete(series[name], trajectory, names)
+        if dynamic:
+            _require_even_times(series[name], trajectory)
         if origin is None:
             origin = np.array(trajectory.attributes.get("origin", [0.0, 0.0, 0.0]))
         yield split, name, trajectory
+
+
+def _require_even_times(source: Path, trajectory: Trajectory) -> None:
+    """Raise DatasetError if known times are not evenly spaced: with inertia, positions stand for velocities."""
+    steps = np.diff(trajectory.times or ())
+    uneven = np.flatnonzero(np.abs(steps - np.median(steps)) > EVEN * np.median(steps)) if len(steps) else steps
+    if len(uneven):
+        first = int(uneven[0])
+        raise DatasetError(
+            f"{source}: from frame {first} to {first + 1} {steps[first]:.4g} s pass, from most frames to the next"
+            f" {np.median(steps):.4g} s: with inertia all time steps must be equal"
+        )
 
 
 def _facts_of_the_first(trajectory: Trajectory) -> dict[str, Any]:

@@ -55,7 +55,7 @@ def convert_deepmind(
     Args:
         source: the folder.
         out: the dataset file; it is written whole or not at all.
-        splits: the splits to import; by default those that have a file.
+        splits: the splits to import; by default all that have a file.
         limit: import only the first `limit` trajectories of each split (published results on deforming_plate train on
             the first 1,000 of 1,200).
         every: keep the frames 0, `every`, 2 `every`, ...; the time step grows accordingly.

@@ -115,7 +115,7 @@ def _take(where: Path | str, values: Any, key: str, kind: type) -> Any:
         raise DatasetError(f"{where}: {key} is missing")
     value = values[key]
     fits = isinstance(value, (int, float) if kind is float else kind) and not isinstance(value, bool)
-    # A whole number in JSON may have so many digits that no float can hold it.
+    # A whole number in JSON may be too large for a float.
     if not fits or (kind is float and not abs(value) <= sys.float_info.max):
         raise DatasetError(f"{where}: {key} is {_shown(value)}; must be {_KINDS[kind]}")
     return kind(value)

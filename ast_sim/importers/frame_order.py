@@ -16,7 +16,7 @@ _NUMBER = re.compile(r"([0-9]+(?:\.[0-9]+)?(?:[eE][-+]?[0-9]+)?)")
 
 
 class FrameFiles(NamedTuple):
-    """The files of a simulation, those of one frame together, and the time of each frame where a PVD file says it."""
+    """The files of a simulation, grouped by frame, and the time of each frame where a PVD file says it."""
 
     files: list[list[Path]]
     times: list[float] | None = None
@@ -65,7 +65,7 @@ def ordered(files: list[Path], times: list[float | None]) -> tuple[list[int], li
     """The order of files that are a frame each, and a note where it is not certain.
 
     The times inside the files decide, if each has one and no two are equal. Else the numbers in the names decide, read
-    as numbers: 0.0005, 1e-03, 10.
+    as numbers: 0.0005, 1e-03, 10. If several of them vary, or they do not count evenly, a note says so.
 
     Args:
         files: in natural order.
@@ -81,7 +81,23 @@ def ordered(files: list[Path], times: list[float | None]) -> tuple[list[int], li
         return as_named, [_said(files, as_named, "their names, which differ in more than a number")]
     whole = sorted(as_named, key=lambda index: _whole_numbers(files[index]))
     by_number = "the numbers in their names, read with their decimal points"
-    return as_named, [] if whole == as_named else [_said(files, as_named, by_number)]
+    return as_named, _doubts(files) if whole == as_named else [_said(files, as_named, by_number)]
+
+
+def _doubts(files: list[Path]) -> list[str]:
+    """A note if the numbers in the names of files, in order of time, may be of two simulations, or leave one out."""
+    columns = zip(*(_NUMBER.split(file.stem)[1::2] for file in files), strict=True)
+    varied = [column for column in columns if len(set(column)) > 1]
+    if len(varied) > 1:
+        told = _said(files, list(range(len(files))), f"{len(varied)} numbers in their names")
+        return [f"{told}; if these are several simulations, give each a folder of its own"]
+    if not varied or not all(text.isdigit() for text in varied[0]):
+        return []
+    steps = np.diff([float(text) for text in varied[0]])
+    if steps.min() == steps.max():
+        return []
+    wide = int(np.argmax(steps > steps.min()))
+    return [f"{files[wide + 1].name} follows {files[wide].name}: is a frame missing between them?"]
 
 
 def _said(files: list[Path], order: list[int], by_what: str) -> str:
@@ -95,7 +111,7 @@ def _whole_numbers(path: Path) -> list[tuple[int, str]]:
 
 
 def _collection(source: Path) -> FrameFiles:
-    """The files that a PVD file lists, by their time; those of one time are the parts of one frame."""
+    """The files that a PVD file lists, by their time; files of one time are the parts of one frame."""
     try:
         root = ElementTree.parse(source).getroot()
         entries = [

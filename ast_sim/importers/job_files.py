@@ -22,8 +22,8 @@ _STIFFEST = 2e12
 
 
 def decks_of(source: Path, series: Mapping[str, Path], deck: Path | str | None, names: FieldNames) -> dict[str, Path]:
-    """The decks of the simulations that have one: `deck`, or in a folder those with the names of `.frd` files, unless
-    the field of the displacement is named: then the results are read alone.
+    """The decks of the simulations that have one: `deck`, or in a folder the decks with the names of `.frd` files,
+    unless the field of the displacement is named: then the results are read alone.
 
     Raises:
         DatasetError: there is a deck, but the source is no file of CalculiX.

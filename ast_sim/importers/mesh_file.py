@@ -35,8 +35,8 @@ class MeshFile:
 
     Attributes:
         source: what the file holds.
-        points: [n, 3] float64: the points of the file, after them those behind its shells, and at last those in the
-            middles of edges that have no node in the file.
+        points: [n, 3] float64: the points of the file, then the points behind its shells, at last the middles of edges
+            that have no node there in the file.
         elements: [E, 3, 4 or 10] int64; tetrahedra have a positive volume.
         node_rows: [n] the point of the file that a point stands for: itself, the one in front of it, or an end of its
             edge.
@@ -70,7 +70,7 @@ class MeshFile:
 
     @property
     def shell_nodes(self) -> np.ndarray:
-        """[n] bool: the nodes of shells and those behind them."""
+        """[n] bool: the nodes of shells and the nodes behind them."""
         nodes = np.zeros(len(self.points), bool)
         if self.shells is not None:
             nodes[self.shells.nodes] = nodes[len(self.source.points) : len(nodes) - len(self.edges)] = True

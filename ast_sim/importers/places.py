@@ -80,14 +80,13 @@ class Place(NamedTuple):
             points: [k, 3] where the nodes are.
             field, group: functions of a name: at which of the nodes the field is not zero, which belong to the group.
             shortest: the shortest edge of the body. Nodes that are off the end by less than a hundredth of it belong
-                to the end. 0: only those that are off by rounding.
+                to the end. 0: only nodes that are off by rounding.
         """
         return np.all([rule.holds(points, field, group, shortest) for rule in self.rules], axis=0)
 
 
 def marked(values: np.ndarray) -> np.ndarray:
-    """Which values of a field are a mark: those that are not zero. NaN is no mark: it stands where there is no
-    value."""
+    """Which values of a field are a mark: all but zero. NaN is no mark: it stands where there is no value."""
     return ~np.isnan(values) & (values != 0)
 
 

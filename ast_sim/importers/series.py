@@ -108,8 +108,8 @@ def read_series(
 ) -> Trajectory:
     """Read the simulation in a `.pvd` file, in a folder with a file for each frame, or in one file.
 
-    The elements are those of `read_mesh`: nodes that belong to no element are left out, shells beside tetrahedra become
-    rigid obstacles. The mesh must be the same in all frames; its elements may stand in another order.
+    The elements are made as in `read_mesh`: nodes that belong to no element are left out, shells beside tetrahedra
+    become rigid obstacles. The mesh must be the same in all frames; its elements may stand in another order.
 
     Args:
         origin: [3] float64, subtracted from all points before they are rounded to float32. None: zero if the mesh lies
@@ -291,7 +291,7 @@ def _rest_and_position(source: Path, mesh: MeshFile, kept: _Frames, used: np.nda
 
 
 def _node_type(mesh: MeshFile, names: FieldNames, scene: Scene, used: np.ndarray) -> np.ndarray:
-    """The types of the used nodes; those that are marked as handles and obstacles are replaced."""
+    """The types of the used nodes, replaced where nodes are marked as handles and obstacles."""
     types = scene.node_type.copy()
     for name, kind in ((names.handle, NodeType.HANDLE), (names.obstacle, NodeType.OBSTACLE)):
         if name is not None:

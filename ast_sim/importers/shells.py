@@ -15,7 +15,7 @@ import numpy as np
 from ast_sim.element_topology import LOCAL_FACES
 from ast_sim.number_arrays import connected_parts
 
-# The layer is so many mean edge lengths thick.
+# The thickness of the layer, in mean edge lengths.
 _THICKNESS = 0.5
 
 # The share of a wall, and of the way to tetrahedra behind a shell, that the layer takes where it would take more than
@@ -31,7 +31,7 @@ _NEAREST = 0.1
 # The edges of a rigid shell keep their lengths up to this share of the mean edge length.
 _RIGID = 0.05
 
-# The triangles that a cell with so many corners is split into.
+# The triangles that a cell is split into, by the number of its corners.
 _TRIANGLES = {3: ((0, 1, 2),), 4: ((0, 1, 2), (0, 2, 3))}
 
 
@@ -81,7 +81,7 @@ class Shells:
 
 
 def find_shells(points: np.ndarray, tetrahedra: np.ndarray, cells: list[np.ndarray]) -> Shells | None:
-    """The shells among the `cells`, blocks of [c, 3] or [c, 4] corners: those that touch no tetrahedron, not even
+    """The shells among the `cells`, blocks of [c, 3] or [c, 4] corners: all cells that touch no tetrahedron, not even
     through other cells. None if there are none."""
     import igl  # takes 0.2 s
     from scipy.spatial import KDTree
@@ -178,8 +178,8 @@ def _way_to(points: np.ndarray, triangles: np.ndarray, start: np.ndarray, direct
 
 
 def _normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """[n, 3]: unit normals at the points; that of a point is the mean of its triangles, weighted with their angles.
-    Weighted with their areas, a long triangle could turn it out of the others."""
+    """[n, 3]: unit normals at the points, each the mean over the triangles at the point, weighted with their angles.
+    Weighted with their areas, a long triangle could turn it away from the others."""
     normals = np.zeros_like(points)
     for corner in range(3):
         a, b, c = (points[triangles[:, (corner + i) % 3]] for i in range(3))

@@ -43,7 +43,7 @@ class AnsweredFrame(NamedTuple):
     """One frame of an answer.
 
     Attributes:
-        number: its number in the motion that was asked.
+        number: its number in the motion of the question.
         time: in seconds; None: it is not known.
         position: [N, 3].
         displacement: [N, 3], from the positions at rest.
@@ -73,7 +73,7 @@ class Answer:
         info: the units and the kind of the data; it is written into files of the answer.
         source: the origin of the answer: attributes that `trajectory` gets.
         stress_location: where the rows of the stress are: "node" or "element".
-        frames: the numbers of the S frames in the motion that was asked.
+        frames: the numbers of the S frames in the motion of the question.
         seconds: the wall seconds from the question to the answer, with all that is prepared for the mesh. Several
             questions that are asked together share their time equally.
         notes: what is unusual about the scene for the run, as sentences; they are warnings as well.
@@ -156,7 +156,7 @@ class Answer:
         return self.position - self.scene.rest_position
 
     def frame(self, number: int) -> AnsweredFrame:
-        """The frame with this number in the motion that was asked.
+        """The frame with this number in the motion of the question.
 
         Raises:
             RolloutError: the answer does not have it; the text names the frames that it has.
@@ -270,12 +270,15 @@ class Answer:
         """Relative errors of the last frame of the answer, where a simulation is known.
 
         Args:
-            truth: all frames of the same motion; something must be displaced in the frame.
+            truth: a simulation of the same motion, which has frame 0 and this one; something is displaced in it.
 
         Returns:
             "displacement": the root mean square error of the free nodes over the root mean square displacement;
             "reaction": the distance of the forces on the moved body over the true force; "stress": by how much the
             largest stress is off, over the true one. The last two are missing where there is none.
+
+        Raises:
+            AstSimError: the truth is of another scene, motion or unit, or lacks a frame; or nothing is displaced.
         """
         return errors_of(self, truth)
 

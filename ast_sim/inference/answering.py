@@ -40,7 +40,7 @@ def answers(
 def in_domain(
     model: Simulator, questions: Sequence[Question], effort: Effort, progress: ShowProgress = False
 ) -> list[Answer]:
-    """Predict scenes where they lie; those that may be moved and leave the domain in the middle of the domain."""
+    """Predict scenes where they lie. A scene that leaves the domain is predicted in its middle, if it may be moved."""
     shifts = [_way_into_domain(model.config, question) for question in questions]
     there = [q if shift is None else _moved_question(q, shift) for q, shift in zip(questions, shifts, strict=True)]
     predicted = zip(questions, shifts, answers(model, there, effort, progress), strict=True)

@@ -16,10 +16,12 @@ from ast_sim.prescribed_motion import Motion
 from ast_sim.runs.scope import Scope
 from ast_sim.scene import Scene
 from ast_sim.simulate.families.assembly import scene_of
+from ast_sim.simulate.jobs.recipe import whole
 from ast_sim.simulate.own_assembly.parameters import Values, completed, recorded
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.simulate.own_assembly.standing import reference
 from ast_sim.support.errors import ConfigError
+from ast_sim.support.toml_settings import require_range
 
 NOT_TRAINED = "the run was not trained on a specification, so it is not known how this one differs from its training"
 
@@ -63,13 +65,17 @@ def ask(
         rows: values by name; parameters that a row leaves out are in the middle of their ranges.
         scope: what the model was trained on.
         trained: the specification of the training, as `AssemblySpec.describe` gives it; None: there was none.
-        frames: frames of the motion; None: those of the specification.
+        frames: the number of frames of the motion; None: as in the specification.
         nodes: about how many nodes a scene has; None: by the sizes of the specification.
 
     Raises:
-        ConfigError: the specification has a mistake, there is no such parameter, or its unit is not that of the run.
+        ConfigError: the specification has a mistake, there is no such parameter, its unit is not the run's, or frames
+            or nodes are no such number.
         SimulationError: a scene cannot be made; the text names the values.
     """
+    frames, nodes = whole(num_frames=frames, nodes=nodes)
+    require_range("num_frames", frames, 2)
+    require_range("nodes", nodes, 1)
     read = read_spec(spec)
     if read.unit != scope.length_unit:
         raise ConfigError(
@@ -81,7 +87,7 @@ def ask(
     notes = {}
     for row in rows:
         values = completed(read.parameters, row)
-        case = scene_of(read, values, nodes, frames or read.frames, shared).case
+        case = scene_of(read, values, nodes, read.frames if frames is None else frames, shared).case
         notes |= dict.fromkeys(case.notes())
         arrays = (case.scene.rest_position, case.scene.elements, case.scene.node_type, case.scene.material)
         scene = known.setdefault(tuple(np.asarray(array).tobytes() for array in arrays), case.scene)

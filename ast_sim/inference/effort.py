@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 GOOD = 0.02  # a relative error that most users call exact
 GOOD_STRESS = 0.1  # the same of the stress, relative to the error of its mean
 MOST_NEWTON_STEPS = 10  # by default; they end earlier where one is small
-AGAIN = 2  # a frame in which so many Newton steps did not end is begun anew with so many more corrections
+AGAIN = 2  # corrections that are added where Newton steps did not end: the frame is then predicted again
 STEPS_BEFORE_SOLVER = 1  # more hardly bring it nearer to equilibrium (docs/log.md, 2026-11-27)
 CHOSEN_STEPS = (0, 1, 2, MOST_NEWTON_STEPS)  # among these numbers of Newton steps an effort is chosen
 WORTH = 0.05  # a correction or a Newton step must lower an error that is not good by this share
@@ -39,10 +39,10 @@ class Effort:
     Attributes:
         corrections: how many further calls of the model correct its answer.
         newton_steps: at most how many Newton steps of the solver then lead towards equilibrium. They end when a step is
-            at most `STILL`. Where `MOST_NEWTON_STEPS` or more do not end, they begin anew after more corrections.
+            at most `STILL`. Where `MOST_NEWTON_STEPS` or more do not end, they begin again after more corrections.
             Stress then follows from the material.
         solved: the bundled solver then goes on to its own stop test; with friction, and where bodies still overlap, it
-            goes the load path from rest, frame by frame, as if there were no model.
+            follows the load path from rest, frame by frame, as if there were no model.
 
     Raises:
         ConfigError: a number is not whole or negative.
@@ -185,9 +185,9 @@ def can_be_solved(config: ModelConfig) -> bool:
 
 
 def choices(config: ModelConfig, corrections: int) -> tuple[Effort, ...]:
-    """The efforts among which one is chosen for an asked error or time, from the cheapest to the dearest, for a model
-    that was trained for so many corrections: a Newton step costs more than a correction, and the solver most. With
-    friction the solver is left to be asked for: it takes its whole way. None for a model that does not jump."""
+    """The efforts among which one is chosen for a wanted error or time, from the cheapest to the dearest, for a model
+    that was trained for this number of corrections: a Newton step costs more than a correction, and the solver most.
+    With friction the solver is not among them: it follows the whole load path. None for a model that does not jump."""
     if not config.scheme.corrects:
         return ()
     steps = CHOSEN_STEPS if can_make_newton_steps(config) else (0,)
@@ -196,8 +196,8 @@ def choices(config: ModelConfig, corrections: int) -> tuple[Effort, ...]:
 
 
 def to_measure(config: ModelConfig, corrections: int) -> tuple[Effort, ...]:
-    """The efforts whose errors validation measures, each with up to so many Newton steps, for a model that was trained
-    for so many corrections."""
+    """The efforts whose errors validation measures, each with up to `MOST_NEWTON_STEPS` Newton steps if the model can
+    make them, for a model that was trained for this number of corrections."""
     steps = MOST_NEWTON_STEPS if can_make_newton_steps(config) else 0
     return tuple(Effort(made, steps) for made in range(corrections + 1))
 
@@ -207,8 +207,8 @@ def cheapest_good(measured: Sequence[EffortErrors]) -> Effort:
 
     Stress tells more than the displacement: it follows from strains, and a step that leaves single elements distorted
     hardly moves their nodes. So an effort is good if both errors are small, or nearly the smallest that were measured;
-    if no effort is good in both, the error of the displacement decides. Of the good efforts those count whose Newton
-    steps ended in most scenes. The one with the fewest corrections and Newton steps together is taken.
+    if no effort is good in both, the error of the displacement decides. Among the good efforts, the ones whose Newton
+    steps ended in most scenes go first. Of these, the effort with the fewest corrections and Newton steps is taken.
 
     Args:
         measured: means over validation scenes, by effort. If all predictions failed, the first call alone is returned.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from numbers import Integral
 
 import numpy as np
 
@@ -98,7 +99,7 @@ def _require_whole(trajectory: Trajectory, config: ModelConfig, scope: Scope, na
     if place not in ("none", config.data.stress):
         needs = "predicts none" if config.data.stress == "none" else f"predicts it at each {config.data.stress}"
         raise ConfigError(f"{name} has a stress at each {place}, but the run {needs}: leave it out, or convert it")
-    named = [one for one in config.data.fields if one[0] in trajectory.fields]  # those that are missing start at zero
+    named = [one for one in config.data.fields if one[0] in trajectory.fields]  # missing ones start at zero
     require_fields(name, trajectory.fields, named)
 
 
@@ -108,6 +109,8 @@ def _completed(
     """The motion of the prescribed nodes in every frame."""
     if motion is None or (isinstance(motion, Mapping) and not motion):
         raise ConfigError(f"{name}: say how its prescribed nodes move: {{BODY: (x, y, z)}} (--move BODY=X,Y,Z)")
+    if frames is not None and (isinstance(frames, bool) or not isinstance(frames, Integral)):
+        raise ConfigError(f"{name}: num_frames is {frames!r}; it must be a whole number")
     if isinstance(motion, Mapping):
         least = config.data.given_frames + 1
         if frames is None and not scope.usual_increment:
@@ -129,7 +132,7 @@ def _given_stress(config: ModelConfig, scene: Scene, stress: np.ndarray | None, 
     """The stress of the given frames as float32.
 
     Raises:
-        ConfigError: its shape is not that of the model's stress.
+        ConfigError: its shape is not the shape of the model's stress.
     """
     if stress is None:
         return None

@@ -21,7 +21,7 @@ from ast_sim.support.progress import Progress, ShowProgress
 from ast_sim.view import sweep_files
 from ast_sim.view.files import make_folder
 
-TOGETHER = 64  # so many scenes are prepared and predicted at a time
+TOGETHER = 64  # scenes that are prepared and predicted at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class Sweep:
     """What a sweep has found.
 
     Attributes:
-        rows: one for each set of values: the parameters by name, then `travel_of_nodes` (the largest way of a
+        rows: one for each set of values: the parameters by name, then `travel_of_nodes` (the largest travel of a
             prescribed node), `reaction` (newton) with its components, `largest_stress` (pascal) and where it is
             (`stress_at_x`, ...), and `last_newton_step` (see `Answer.last_steps`).
         varied: the names of the parameters that differ between rows.
@@ -82,14 +82,14 @@ def sweep(
     """Predict the last frame for each row of values.
 
     With friction a body may be in equilibrium in two places. So the frame before is predicted, too: Newton steps from
-    there find the place that the way leads to. A model of metal that yields must see where the motion turns back. Other
-    models that jump need no frame between.
+    there find the place that the load path leads to. A model of metal that yields must see where the motion turns back.
+    Other models that jump need no frame between.
 
     Args:
         predict_scenes: of a `Run`.
         config, scope, trained: of its model, and the scenes and the specification that it was trained on.
-        spec, rows, error, nodes, progress: those of `Run.sweep`.
-        effort: as it is asked, or as the error has chosen it.
+        spec, rows, error, nodes, progress: as in `Run.sweep`.
+        effort: as it is given, or as the error has chosen it.
     """
     if not rows:
         raise ConfigError("a sweep needs at least one row of values")

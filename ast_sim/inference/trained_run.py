@@ -6,7 +6,7 @@ import dataclasses
 import os
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ from ast_sim.support.errors import ConfigError, RolloutError
 from ast_sim.support.notebook_table import html_table, one_line
 from ast_sim.support.progress import Progress, ShowProgress
 from ast_sim.support.provenance import provenance
-from ast_sim.support.toml_settings import NOTHING
+from ast_sim.support.toml_settings import NOTHING, require_range
 
 
 class Run:
@@ -213,7 +213,7 @@ class Run:
 
     def predict_scenes(
         self,
-        scenes: Sequence[tuple[Scene, Motions]],
+        scenes: Iterable[tuple[Scene, Motions]],
         *,
         names: Sequence[str] | None = None,
         frames: Frames | None = None,
@@ -223,9 +223,10 @@ class Run:
         throw: bool = True,
         progress: ShowProgress = True,
     ) -> list[Answer]:
-        """Predict several scenes, each under a motion, as one batch. `progress` is as in `generate`; errors
-        and other arguments are those of `predict`."""
+        """Predict several scenes, each under a motion, as one batch. `progress` is as in `generate`; errors and other
+        arguments are as in `predict`."""
         began = time.perf_counter()
+        scenes = list(scenes)
         names = [f"scene {number}" for number in range(len(scenes))] if names is None else names
         config, scope = self.settings.model, self.scope
         questions = [
@@ -238,7 +239,7 @@ class Run:
     def predict_motions(
         self,
         scene: Scene,
-        motions: Sequence[Motions],
+        motions: Iterable[Motions],
         *,
         frames: Frames | None = None,
         effort: Effort | None = None,
@@ -249,9 +250,9 @@ class Run:
         progress: ShowProgress = True,
     ) -> list[Answer]:
         """Predict one scene under several motions, as one batch; the answers have the order of the motions. Arguments
-        and errors are those of `predict_scenes`."""
-        names = [f"{name}, motion {number}" for number in range(len(motions))]
+        and errors are as in `predict_scenes`."""
         scenes = [(scene, motion) for motion in motions]
+        names = [f"{name}, motion {number}" for number in range(len(scenes))]
         shared = {"frames": frames, "effort": effort, "error": error, "num_frames": num_frames}
         return self.predict_scenes(scenes, names=names, throw=throw, progress=progress, **shared)
 
@@ -303,8 +304,8 @@ class Run:
 
         Raises:
             DatasetError: the dataset cannot be read.
-            ConfigError: the run is a file, and no dataset is named; or its integration, stress location, material
-                columns or elements differ from those of the training data.
+            ConfigError: the run is a file, and no dataset is named; or the dataset and the training data differ in
+                integration, stress location, material columns or elements.
         """
         if data is None and self.path.is_file():
             raise ConfigError(f"{self.path} holds no dataset: name one; the run learned from {self.settings.data}")
@@ -331,10 +332,11 @@ class Run:
         Args:
             data: a dataset, its path or open; by default the one that the run was trained on.
             command: the command that is recorded beside the figures.
-            solver_scenes: in so many scenes the solver solves the deepest frame, in several ways, to compare.
+            solver_scenes: the number of scenes in which the solver solves the deepest frame, too, in several variants.
             made_from: the specification or the parts of your own of which the dataset was made; the solver needs them.
             progress: as in `generate`; it counts scenes, once for all frames, once for the deepest, once solved.
         """
+        require_range("solver_scenes", solver_scenes, 0)
         with self.open(data) as dataset:
             with Progress(2 * dataset.count(split) + solver_scenes, "scenes", progress) as bar:
                 figures = evaluate(self.model, dataset, split, bar.advance, self.effort, solver_scenes, made_from)

@@ -70,7 +70,7 @@ class SolidCase:
         return self.prescribed_position[0] + share * (leg.end - self.prescribed_position[0])
 
     def followed(self) -> tuple[SolidCase, list[int]]:
-        """The same case with a frame wherever a leg ends, and which of its frames are those of this case."""
+        """The same case with a frame wherever a leg ends, and the numbers that the frames of this case have there."""
         ends, stored = [self.prescribed_position[0]], [0]
         for frame in range(1, len(self.prescribed_position)):
             ends += [leg.end for leg in self.legs(frame)]
@@ -89,7 +89,7 @@ class SolidCase:
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """A drawn scene and the way to its other meshes.
+    """A drawn scene, and a function that meshes it in other sizes.
 
     Attributes:
         case: the scene as the generator meshes it.

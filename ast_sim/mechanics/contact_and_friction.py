@@ -39,7 +39,7 @@ class ContactSettings:
         dhat: distance in metres below which surfaces repel each other.
         stiffness: barrier stiffness in pascal, about Young's modulus.
         friction: Coulomb's coefficient of friction. At 0 no term of friction is computed.
-        self_contact: whether bodies are kept from passing through themselves, or the numbers of those that are. At
+        self_contact: whether bodies are kept from passing through themselves, or the numbers of bodies that are. At
             rest, nodes of them that do not share an element must be further apart than dhat.
         pair_friction: other coefficients of friction between two bodies: (body, body, coefficient).
 
@@ -157,7 +157,7 @@ class Contact:
         self._mesh = ipctk.CollisionMesh(vertices, edges, local_faces)
         self._skin = (SELF_CONTACT_SKIN if settings.self_contact else SKIN) * self._dhat
         self._whole_mesh = ipctk.CollisionMesh(vertices, edges, local_faces)
-        # Nodes of one number do not touch each other: those of a body, and those of all rigid bodies.
+        # Nodes of one number do not touch each other: the nodes of a body, and the nodes of all rigid bodies.
         fixed = np.zeros(len(rest), bool) if rigid is None else rigid
         whole = np.zeros(len(rest), bool) if rigid is None else ~np.isin(body, body[~rigid])
         together = np.where(whole, -1, body)
@@ -178,7 +178,7 @@ class Contact:
         self.restart()
 
     def restart(self) -> None:
-        """Forget candidate pairs and friction. What follows then depends only on positions, not on the way to them."""
+        """Forget candidate pairs and friction. What follows then depends only on positions, not on the load path."""
         self._candidates = self._ipctk.Candidates()
         self._reference = np.full((len(self.nodes), 3), np.inf)
         self._sliding: tuple[object, np.ndarray] | None = None
@@ -195,10 +195,10 @@ class Contact:
         return np.einsum("ij,ij->i", difference, difference).max() <= self._skin**2
 
     def _collect(self, start: np.ndarray, end: np.ndarray) -> None:
-        """Collect all candidate pairs that can come closer than dhat on the straight way from start to end.
+        """Collect all candidate pairs that can come closer than dhat on the straight path from start to end.
 
-        The search covers the way and a skin around its end. Later steps inside that skin need no new search. Both boxes
-        of a pair are inflated, so each needs only half the distance.
+        The search covers the path and a skin around its end. Later steps inside that skin need no new search. Both
+        boxes of a pair are inflated, so each needs only half the distance.
         """
         if self._is_near_reference(start) and self._is_near_reference(end):
             return

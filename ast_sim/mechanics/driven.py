@@ -1,4 +1,4 @@
-"""The nodes on which the reaction of a scene acts: those prescribed nodes of one body that move farthest together.
+"""The nodes on which the reaction of a scene acts: the prescribed nodes of one body that move farthest together.
 
 A body may have several sets of prescribed nodes: one end is held, the other is moved or turned. The forces on all of
 them add up to nearly nothing, so the reaction is the force on one set. It starts with the node that goes farthest, and
@@ -91,7 +91,7 @@ class Driven:
 
 @dataclass(frozen=True, eq=False)
 class RigidMotions:
-    """The rigid motions x R^T + shift that fit the ways of some points from frame 0 to each frame best (Kabsch 1976).
+    """The rigid motions x R^T + shift that fit the motion of some points from frame 0 to each frame best (Kabsch 1976).
 
     Attributes:
         rotation, shift: R [S,3,3] and shift [S,3].

@@ -1,9 +1,9 @@
 """Frames to the stop test of the bundled solver, for an answer that must be exact.
 
-Without friction an equilibrium does not depend on the way to it, unless something snaps. So the solver may start from
-positions that are nearly right, such as those of a model after a Newton step: a few iterations are left of the many
-from rest. Where bodies overlap there or an element is turned over, and always with friction, it goes the load path from
-rest, frame by frame.
+Without friction an equilibrium does not depend on the load path, unless something snaps. So the solver may start from
+positions that are nearly right, such as a model's answer after a Newton step: a few iterations are left of the many
+from rest. Where bodies overlap there or an element is turned over, and always with friction, it follows the load path
+from rest, frame by frame.
 """
 
 from __future__ import annotations

@@ -14,11 +14,11 @@ With the factorization K = L L^T, B is the product of L^-1 C^T with itself.
 
 With Coulomb friction each pair has tangential forces, too, at most the coefficient times the normal force. They resist
 slip from where the surfaces stuck to each other. A single step does not know the load path. If nothing else is
-given, its surfaces have slid along the last fiftieth of a straight way from rest: those that slide get the whole
-friction against their way, and those that stick hardly feel it (docs/log.md, 2026-11-25). Bodies may overlap at x, and
-elements may be turned over: these get the forces and the stiffness of the nearest upright shape (Irving, Teran and
-Fedkiw 2004). Pairs of edges are left out, so edges may cross by a little. A node is on the side of a surface where it
-is nearest: the start must be nearly right.
+given, its surfaces have slid along the last fiftieth of a straight path from rest: surfaces that slide get the whole
+friction against their motion, and surfaces that stick hardly feel it (docs/log.md, 2026-11-25). Bodies may overlap at
+x, and elements may be turned over: these get the forces and the stiffness of the nearest upright shape (Irving, Teran
+and Fedkiw 2004). Pairs of edges are left out, so edges may cross by a little. A node is on the side of a surface where
+it is nearest: the start must be nearly right.
 """
 
 from __future__ import annotations
@@ -29,13 +29,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
-from scipy.optimize import nnls
 
 from ast_sim.mechanics.elements.elasticity import Deformation
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean, cofactor, determinant
 from ast_sim.mechanics.elements.second_order import elastic_body
-from ast_sim.mechanics.linear_algebra.compliance import Compliance
-from ast_sim.mechanics.linear_algebra.linear_system import Factorization, LinearSystem
+from ast_sim.mechanics.linear_algebra.compliance import Compliance, compliance_of
+from ast_sim.mechanics.linear_algebra.linear_system import LinearSystem
 from ast_sim.scene import Scene
 from ast_sim.support.errors import SimulationError
 from ast_sim.support.nearest_surface import nearest_surface
@@ -46,10 +45,12 @@ CLEARANCE = (
 NEAR = 0.5  # pairs with a gap below this may touch, in mean edge lengths of the surfaces
 DEEP = 2.0  # a node deeper inside another body than this is not taken for one in contact with it, in the same
 OVERLAP = 1e-6  # pairs may overlap by this much at the end of a step, in the same
-FEW = 8  # a round takes so many of the pairs that would overlap,
+FEW = 8  # a round takes at least this number of the pairs that would overlap,
 SHARE = 4  # or this part of them,
 MORE = 16  # or this part of all that were taken before, if that is more
-SLID = 0.02  # surfaces have slid along this last part of the way from rest to x, if nothing else is known
+ROUNDED = 1e-12  # an overlap of this part of the deepest is rounding
+PATIENCE, MOST_PIVOTS = 3, 30  # turns of all wrong pairs without fewer of them; turns in all, for each pair
+SLID = 0.02  # surfaces have slid along this last part of the path from rest to x, if nothing else is known
 SWEEPS, CHANGE = 100, 1e-3  # forces of friction are found when a sweep over the pairs changes them by less
 FLATTEST = 0.2  # the least stretch of an element that forces and stiffness follow
 TINY = 1e-300  # instead of zero in a denominator
@@ -137,32 +138,34 @@ class NewtonSteps:
         """See `step`."""
         deformation = _upright(self.elasticity.evaluate(position))
         force = self.elasticity.gradient(deformation)[0].ravel()[self.system.free]
+        pairs = self.near_pairs(position, stuck)
+        directions = pairs.directions if self._friction else pairs.directions[: len(pairs.gap)]
         for project in (True,) if from_afar else (False, True):
-            factor = self.system.factorise(self.elasticity.hessian(deformation, project))
-            if factor is not None:
+            values = self.elasticity.hessian(deformation, project)
+            compliance = compliance_of(self.system, values, directions, self.watch)
+            if compliance is not None:
                 break
         else:
             raise SimulationError("the stiffness is singular: nothing holds a body, or an element has collapsed")
-        return self._shortened(position, self._constrained(factor, force, self.near_pairs(position, stuck)))
+        return self._shortened(position, self._constrained(compliance, force, pairs))
 
     def size(self, before: np.ndarray, after: np.ndarray) -> float:
-        """The size of the last step, between positions [N, 3]: the largest component of a move, in mean edge lengths of
-        the surfaces, or the root mean square of the moves over that of the displacements from rest, if that is larger.
-        Displacements below `SLIGHT` count as `SLIGHT`. A step that was shortened has the size of the whole one: where
-        elements stop it, it has not converged."""
+        """The size of the last step, between positions [N, 3]: the larger of the largest component of a move, in mean
+        edge lengths of the surfaces, and the root mean square of the moves over the root mean square of the
+        displacements from rest. Displacements below `SLIGHT` count as `SLIGHT`. A step that was shortened has the size
+        of the whole one: where elements stop it, it has not converged."""
         free = self.system.free
         move, displacement = ((after - start).ravel()[free] for start in (before, self._rest))
         slight = SLIGHT * self._length * math.sqrt(len(free))
         share = np.linalg.norm(move) / max(np.linalg.norm(displacement), slight)
         return float(max(np.abs(move).max() / self._length, share)) / self._shortening
 
-    def _constrained(self, factor: Factorization, force: np.ndarray, pairs: NearPairs) -> np.ndarray:
+    def _constrained(self, compliance: Compliance, force: np.ndarray, pairs: NearPairs) -> np.ndarray:
         """The displacement [F] of the free dofs; see the head of this file."""
-        unconstrained = factor.other_half(factor.halves(-force[None])[1][0])
+        unconstrained = compliance.solution(-force)
         count = len(pairs.gap)
         offset = pairs.directions @ unconstrained + np.concatenate([pairs.gap - self._clearance, pairs.slip])
-        compliance = Compliance(factor, pairs.directions, self.watch)
-        chosen, forces = self._pressed_pairs(compliance, offset[:count], pairs.directions[:count])
+        chosen, forces = self._pressed_pairs(compliance, offset[:count])
         if not self._friction or not forces.any():
             return unconstrained + (compliance.displacement(forces) if forces.any() else 0)
         active = np.flatnonzero(forces)
@@ -177,13 +180,11 @@ class NewtonSteps:
         )
         return unconstrained + compliance.displacement(all_forces)
 
-    def _pressed_pairs(
-        self, compliance: Compliance, offset: np.ndarray, normals: scipy.sparse.csr_array
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _pressed_pairs(self, compliance: Compliance, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The pairs [A] that may press on each other and their forces [A] >= 0, without friction.
 
-        The compliance of a pair costs half a solution with the stiffness. So pairs get one in rounds, those first that
-        would overlap most with the forces so far. At the end no pair overlaps: these are the forces of all pairs.
+        Where the compliance of a pair costs half a solution with the stiffness, pairs get one in rounds, first those
+        that would overlap most with the forces so far. At the end no pair overlaps: these are the forces of all pairs.
         """
         chosen = np.zeros(0, int)
         forces = np.zeros(0)
@@ -192,12 +193,12 @@ class NewtonSteps:
             missing = np.flatnonzero(gap < -OVERLAP * self._length)
             if not len(missing):
                 return chosen, forces
-            most = max(FEW, len(missing) // SHARE, len(chosen) // MORE)
+            most = len(missing) if compliance.is_whole else max(FEW, len(missing) // SHARE, len(chosen) // MORE)
             deepest = missing[np.argsort(gap[missing], kind="stable")][:most]
             chosen = np.concatenate([chosen, deepest])
             compliance.want(deepest)
             forces = _pressed(compliance.matrix, offset[chosen])
-            gap = offset + normals @ compliance.displacement(forces)
+            gap = offset + compliance.along(forces)[: len(offset)]
             gap[chosen] = 0
 
     def von_mises(self, position: np.ndarray, location: str) -> np.ndarray:
@@ -262,7 +263,7 @@ class NewtonSteps:
         return NearPairs(directions, gaps[movable], slip)
 
     def _shortened(self, position: np.ndarray, way: np.ndarray) -> np.ndarray:
-        """`position` [N, 3] moved by the largest of 1, 1/2, 1/4, ... of the way [F] that turns no element over."""
+        """`position` [N, 3] moved by the largest of 1, 1/2, 1/4, ... of `way` [F] that turns no element over."""
         share = 1.0
         while True:
             self._shortening = share
@@ -298,16 +299,28 @@ def _tangents(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _pressed(compliance: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """The forces [P] >= 0 of contact without friction: with B = L L^T they minimise |L^T l + L^-1 b|."""
-    try:
-        lower = np.linalg.cholesky(compliance)
-        return nnls(lower.T, -np.linalg.solve(lower, offset), maxiter=30 * len(offset))[0]
-    except (np.linalg.LinAlgError, RuntimeError) as error:
-        raise SimulationError(f"the forces of contact were not found: {error}") from error
+    """The forces l >= 0 [P] of contact without friction, which minimise 1/2 l B l + b l, by block principal pivoting
+    (Kim and Park 2011): pairs that pull let go, pairs that overlap press, all at once. Where this does not leave fewer
+    and fewer wrong pairs, one pair at a time, the last: this ends (Murty 1974)."""
+    pressing = offset < 0
+    slack = ROUNDED * np.abs(offset).max()
+    fewest, patience = len(offset) + 1, PATIENCE
+    for _ in range(MOST_PIVOTS * len(offset)):
+        rows = np.flatnonzero(pressing)
+        forces = np.zeros(len(offset))
+        forces[rows] = np.linalg.solve(compliance[np.ix_(rows, rows)], -offset[rows])
+        wrong = np.flatnonzero(np.where(pressing, forces < 0, offset + compliance @ forces < -slack))
+        if not len(wrong):
+            return forces
+        patience = PATIENCE if len(wrong) < fewest else patience - 1
+        fewest = min(fewest, len(wrong))
+        turned = wrong if patience > 0 else wrong[-1:]
+        pressing[turned] = ~pressing[turned]
+    raise SimulationError("the forces of contact were not found")
 
 
 def _rubbed(compliance: np.ndarray, offset: np.ndarray, forces: np.ndarray, friction: float) -> np.ndarray:
-    """The forces [3, P] of contact with Coulomb friction, from those [P] without, by nonlinear block Gauss-Seidel
+    """The forces [3, P] of contact with Coulomb friction, from the forces [P] without, by block Gauss-Seidel
     (Jourdan, Alart and Jean 1998): each pair in turn gets the force that is right if the others stay.
 
     Args:

@@ -47,7 +47,7 @@ class QuasiStatic:
         self.newton = Newton(elasticity, contact, prescribed, position, settings, system)
         self._damped: Newton | None = None
         self.halvings = 0
-        self.load_steps = 0  # those that converged
+        self.load_steps = 0  # that converged
 
     @property
     def iterations(self) -> int:
@@ -69,8 +69,8 @@ class QuasiStatic:
     ) -> None:
         """Bring the prescribed nodes to `target` [N,3] (rows of free nodes are ignored) and the others to equilibrium.
 
-        The first load step goes that share of the way; at 1 the whole way is tried in one step. `along` gives the
-        positions at a share of the way; without it, the way is straight.
+        The first load step goes the share `first` of the path; at 1 the whole path is tried in one step. `along` gives
+        the positions at a share of the path; without it, the path is straight.
 
         Raises:
             NotConverged: there is no equilibrium after the allowed halvings and damped steps.
@@ -103,7 +103,7 @@ class QuasiStatic:
             inertia = Inertia(elasticity, np.zeros(len(volume)), 1.0)
             self._damped = Newton(inertia, newton.contact, newton.prescribed, newton.position, newton.settings)
         extent = np.linalg.norm(np.ptp(newton.position, axis=0))
-        # This inertia resists a motion as large as the bodies with forces as large as those of strains of order one.
+        # This inertia resists a motion as large as the bodies with forces as large as strains of order one give.
         weight = elasticity.unit_energy / volume.sum() / extent**2 * volume
         self._damped.watch = newton.watch
         self._damped.restart(newton.position)

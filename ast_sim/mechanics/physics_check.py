@@ -1,9 +1,10 @@
 """Is an answer physics? What can be said of positions alone, without a truth.
 
-At equilibrium the elastic forces f on the free nodes are those of contact, C^T l with l >= 0, where a row of C is the
-direction of the force of a near pair (`linearised_contact`). On positions that are nearly right the l >= 0 are taken
-that leave least, min |f - C^T l|; what is left is the residual. With friction a pair of a node and a face has four
-directions, the corners of a pyramid inside Coulomb's cone. Where nothing overlaps, pairs of edges push, too (ipctk).
+At equilibrium the elastic forces f on the free nodes are the forces of contact, C^T l with l >= 0, where a row of C is
+the direction of the force of a near pair (`linearised_contact`). On positions that are nearly right the l >= 0 are
+taken that leave least, min |f - C^T l|; what is left is the residual. With friction a pair of a node and a face has
+four directions, the corners of a pyramid inside Coulomb's cone. Where nothing overlaps, pairs of edges push, too
+(ipctk).
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from ast_sim.plausibility.overlaps import nodes_inside
 from ast_sim.scene import Scene
 from ast_sim.support.errors import ConfigError, MissingExtra, SimulationError
 
-SLIGHT_STRAIN = 1e-3  # forces below that of this strain are hardly any: the balance is relative to it at least
+SLIGHT_STRAIN = 1e-3  # the balance is relative to the force of this strain at least: smaller ones are hardly any
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class Law:
     """The law of scenes: the material of their elements, and their contact.
 
     Attributes:
-        material: names what the numbers of a scene's material are, and has those that all scenes share.
+        material: names the numbers of a scene's material, and has the ones that all scenes share.
         contact_range: the distance in the scene's unit of length below which surfaces repel each other.
     """
 
@@ -130,7 +131,7 @@ class PhysicsCheck:
 def check_physics(
     scene: Scene, positions: np.ndarray, frames: Sequence[int], law: Law | None, unit: str
 ) -> PhysicsCheck:
-    """Check frames [S, N, 3] with these numbers; `law` None: it is not known. `unit` is that of lengths."""
+    """Check frames [S, N, 3] with these numbers; `law` None: it is not known. `unit` is the unit of length."""
     turned = [turned_over(scene, position) for position in positions]
     overlaps = [_overlap(scene, position.astype(np.float64)) for position in positions]
     why = "the law of the material is not known: no forces are"
@@ -283,7 +284,7 @@ class _Balance:
         return nodes, np.array(pair.compute_distance_gradient(pair.dof(vertices, *self._edges_and_faces)))
 
     def _left(self, forces: np.ndarray, cone: scipy.sparse.csr_array) -> tuple[np.ndarray, float]:
-        """The forces [F] that contact does not explain, and the sum of those of contact; see the head of this file."""
+        """The forces [F] that contact does not explain, and the sum of the contact forces; see the head of the file."""
         touched = np.unique(cone.nonzero()[1])
         if not len(touched):
             return forces, 0.0

@@ -69,7 +69,7 @@ class OneFrame:
     Attributes:
         position: [N,3] float64; None if there is no solution.
         failure: why there is none; empty if there is one.
-        seconds: processor time of the solution on one thread, with that of steps that did not converge.
+        seconds: processor time of the solution on one thread, with the steps that did not converge.
         setup_seconds: processor time in which the solver was set up for the mesh.
         load_steps, newton_iterations, halvings: how many of them the solution took.
     """
@@ -97,7 +97,7 @@ def solve_frame(
         case: what to solve.
         frame: number of the frame.
         settings: tolerances.
-        first: share of the way that the first load step goes; 0: each frame before is solved, too. A step that does not
+        first: share of the path in the first load step; 0: each frame before is solved, too. A step that does not
             converge is halved.
         most_iterations, most_seconds: Newton iterations and processor time after which the solution is given up.
     """

@@ -21,7 +21,7 @@ from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.elements.second_order import elastic_body
 from ast_sim.scene import Scene
 
-REACH = 1.0  # a node counts as touched if another body is nearer than so many mean edge lengths
+REACH = 1.0  # a node counts as touched if another body is nearer than this, in mean edge lengths
 OPPOSITE = 0.5  # cosine between opposite normals, at most; at an edge, a normal is the mean of its faces
 SMOOTH = 1e-3  # residual to which the smooth field is computed; every field is exact at equilibrium
 
@@ -33,7 +33,7 @@ class Reaction:
 
     Args:
         driven: the moved nodes.
-        law: of all elements; that of rigid ones is ignored.
+        law: of all elements; rigid ones ignore it.
     """
 
     def __init__(self, scene: Scene, driven: Driven, law: NeoHookean) -> None:

@@ -1,6 +1,6 @@
 """Newton's method for the positions at which the energy of a potential and of contact is smallest.
 
-A step brings the prescribed nodes to new positions and finds those of the free nodes:
+A step brings the prescribed nodes to new positions and finds the positions of the free nodes:
 
 1. move: the Newton direction with the whole remaining increment of the prescribed nodes, shortened so that nothing
    collides (CCD) and no element inverts, until the prescribed nodes are at their targets;

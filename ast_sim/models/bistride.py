@@ -1,8 +1,8 @@
 """Coarser and coarser meshes by bi-stride pooling (Cao et al. 2023, arXiv 2210.02573), made once for each mesh.
 
-In each connected component a breadth-first search starts near the middle. It gives every node a depth, and either the
-nodes of even depth or those of odd depth are kept, whichever are fewer. Two kept nodes are joined if a path of at most
-two edges joins them, so that a component stays connected:
+In each connected component a breadth-first search starts near the middle. It gives every node a depth. The nodes of
+even depth are kept or the nodes of odd depth, whichever are fewer. Two kept nodes are joined if a path of at most two
+edges joins them, so that a component stays connected:
 
     A' = (A + I)^2, rows and columns of kept nodes, without the diagonal.
 
@@ -68,7 +68,7 @@ class Pooling:
         return segment_sum(sent, *self.edges.by_sender)
 
     def pool_contacts(self, contacts: EdgeSet) -> EdgeSet:
-        """The contact edges of the coarser mesh, from those of the finer mesh.
+        """The contact edges of the coarser mesh, from the contact edges of the finer mesh.
 
         Two kept nodes are in contact if they, or neighbours of theirs, are in contact on the finer mesh. As matrices:
         (A + I) A_c (A + I) of the contacts A_c, rows and columns of kept nodes, without the diagonal.

@@ -29,9 +29,9 @@ def _states(names: tuple[str, ...], batch: Batch) -> list[Tensor]:
 
 
 def node_features(config: ModelConfig, batch: Batch) -> Tensor:
-    """[N, *]: node type (one-hot), displacement and velocity, material, proximity, forces out of balance, the way from
-    the source and what is known there, and boundary motion, as far as they are inputs. docs/reference/model.md explains
-    them."""
+    """[N, *]: node type (one-hot), displacement and velocity, material, proximity, forces out of balance, the
+    displacement from the source and what is known there, and boundary motion, as far as they are inputs.
+    docs/reference/model.md explains them."""
     values = [batch.graph.one_hot, *_states(config.node_inputs, batch)]
     if "material" in config.node_inputs:
         values.append(batch.graph.node_material)

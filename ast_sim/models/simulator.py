@@ -63,8 +63,8 @@ class Prediction:
     def of(
         data: DataFacts, on_nodes: Tensor, on_elements: Tensor | None = None, latent: Latent | None = None
     ) -> Prediction:
-        """From the columns of all outputs at the nodes, motion first, and of those at the elements, in the order of
-        `data.outputs`; without `on_elements` the latter are left out."""
+        """From the columns of all outputs at the nodes, motion first, and of all outputs at the elements, in the order
+        of `data.outputs`; without `on_elements` the latter are left out."""
         fields = {}
         ends = {"node": 3, "element": 0}
         for output in data.outputs:
@@ -89,7 +89,7 @@ class Simulator(nn.Module):
         self.motion_normalizer = Normalizer("vector")
         self.strain_normalizer = Normalizer("vector")
         self.stress_normalizer = Normalizer("scalar") if config.data.stress != "none" else None
-        # The components of a field with several columns share one scale, as those of a vector do.
+        # The components of a field with several columns share one scale, like the components of a vector.
         kinds = ("scalar" if columns == 1 else "vector" for _, _, columns, _ in config.data.fields)
         self.field_normalizers = nn.ModuleList(map(Normalizer, kinds))
         reactions = any(name == REACTION for name, *_ in config.data.fields)
@@ -163,8 +163,8 @@ class Simulator(nn.Module):
         """What the network should say for these values [N or E, *].
 
         The reactions r of the nodes of a body add up to the force F on it. Small errors that are alike at many nodes
-        would make it wrong. So the mean of what the network says is F, and the deviations from the mean are those of r,
-        each with its own scale.
+        would make it wrong. So the mean of what the network says is F, and the deviations from the mean are the
+        deviations of r, each with its own scale.
         """
         if output.name != REACTION:
             return normalizer(values)
@@ -181,7 +181,7 @@ class Simulator(nn.Module):
 
     @torch.no_grad()
     def fit_statistics(self, batches: Iterable[tuple[Batch, Target]]) -> None:
-        """Fix the statistics of inputs and targets, in float64, from batches like those of training, with noise."""
+        """Fix the statistics of inputs and targets, in float64, from batches as in training, with noise."""
         for batch, target in batches:
             self.observe(batch)
             self.motion_normalizer.observe(target.motion[batch.graph.normal_nodes])

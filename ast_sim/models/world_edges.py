@@ -20,8 +20,8 @@ def world_edges(batch: Batch, radius: float, most: int | None) -> EdgeSet:
     Args:
         batch: its positions, and the mesh edges `m2m` of its graph.
         radius: in the unit of length; 0 gives no edges.
-        most: the most pairs of a scene. The shortest pairs are kept; of equally long pairs, those with the lowest node
-            numbers. A warning says so once. None keeps all.
+        most: the most pairs of a scene. The shortest pairs are kept; of equally long pairs, the pairs with the lowest
+            node numbers. A warning says so once. None keeps all.
     """
     graph = batch.graph
     offsets = graph.node_offsets.tolist()

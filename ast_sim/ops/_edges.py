@@ -28,7 +28,7 @@ def offsets_of(index: Tensor, num: int) -> Tensor:
 
 
 def join_indices(parts: Sequence[Tensor], sizes: Sequence[int]) -> Tensor:
-    """The indices of several scenes as one: those of a scene are shifted by the sizes of the scenes before it."""
+    """The indices of several scenes as one: each scene's indices are shifted by the sizes of the scenes before it."""
     return torch.cat([index + shift for index, shift in zip(parts, accumulate(sizes, initial=0), strict=False)])
 
 
@@ -175,7 +175,7 @@ def outer_faces(elements: Tensor, num_nodes: int) -> Tensor:
     return outer
 
 
-WALKS = 3
+SEARCHES = 3
 
 
 def _breadth_first_reference(elements: Tensor, wanted: Tensor) -> Tensor:
@@ -185,7 +185,7 @@ def _breadth_first_reference(elements: Tensor, wanted: Tensor) -> Tensor:
         for node in nodes:
             at_node[node].append(number)
 
-    def walk(start: int) -> list[int]:
+    def search(start: int) -> list[int]:
         reached, seen = [start], {start}
         for node in reached:
             for other in (other for number in at_node[node] for other in of_elements[number]):
@@ -199,8 +199,8 @@ def _breadth_first_reference(elements: Tensor, wanted: Tensor) -> Tensor:
     for start in range(len(free)):
         if free[start] and rank[start] < 0:
             reached = [start]
-            for _ in range(WALKS):
-                reached = walk(reached[-1])
+            for _ in range(SEARCHES):
+                reached = search(reached[-1])
             for node in reached:
                 rank[node] = len(order)
                 order.append(node)
@@ -214,15 +214,15 @@ _breadth_first = Op(
 
 
 def breadth_first(elements: Tensor, wanted: Tensor) -> Tensor:
-    """[N] int64: the places of the wanted nodes in an order in which those of each element are near each other; -1 for
-    the other nodes.
+    """[N] int64: the places of the wanted nodes in an order in which the nodes of an element are near each other; -1
+    for the other nodes.
 
-    After a node come those of its elements that are new. A walk starts at the lowest node that is left, the next one
-    from its end, and the last one from there. Then follow the nodes that no element joins to these.
+    After a node come the new nodes of its elements. A search starts at the lowest node that is left, the next search at
+    the end of the first, and the last at the end of the second. Then follow the nodes that no element joins to these.
 
     Args:
         elements: [E, K] int64, nodes.
-        wanted: [N] int64, 1 or 0. The walk takes no way through other nodes.
+        wanted: [N] int64, 1 or 0. The search does not pass through other nodes.
 
     Raises:
         ValueError: a node is out of range, or `wanted` is neither 1 nor 0.

@@ -2,8 +2,8 @@
 
     F = Ds Dm^-1,  G = (F^T F - I) / 2,  S = lambda tr(G) I + 2 mu G,  H = -V F S Dm^-T,  V = |det Dm| / 6
 
-Dm has the edges x1 - x0, x2 - x0, x3 - x0 of an element at rest as columns, Ds those of the guess. The columns of H are
-the forces on nodes 1 to 3; node 0 gets minus their sum. They are f = -dE/dx of the energy
+Dm has the edges x1 - x0, x2 - x0, x3 - x0 of an element at rest as columns, Ds has its edges in the guess. The columns
+of H are the forces on nodes 1 to 3; node 0 gets minus their sum. They are f = -dE/dx of the energy
 E = sum of V (lambda/2 tr(G)^2 + mu G:G), a polynomial of the positions: they are finite for any guess.
 
 Legend: N nodes, E elements.
@@ -144,8 +144,8 @@ _forces_backward = gradient_op(
 def elastic_forces(position: Tensor, rest_position: Tensor, lame: Tensor, tets: TetrahedronSet) -> Tensor:
     """The elastic force on each node of St. Venant-Kirchhoff tetrahedra, added over its elements in stored order.
 
-    An element contributes exactly nothing, even where positions are infinite or NaN, if its Lame constants are both 0,
-    as those of a rigid body, if a rest position is not finite, or if its rest volume is 0 or no more than rounding.
+    An element contributes exactly nothing, even where positions are infinite or NaN, if its Lame constants are both 0
+    (it is rigid), if a rest position is not finite, or if its rest volume is 0 or no more than rounding.
 
     Args:
         position: [N, 3], a guess; the forces can be differentiated by it.

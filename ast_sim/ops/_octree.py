@@ -208,7 +208,7 @@ def _after_reference(keys: Tensor, scenes: Tensor) -> Tensor:
 
 
 def _level_by_level(once: Callable, keys: Tensor, cell_offsets: Tensor, levels: int) -> list[Tensor]:
-    """The outputs of all levels, where `once` gives those of one."""
+    """The outputs of all levels, where `once` gives the outputs of one."""
     parts: list[Tensor] = []
     for _ in range(levels):
         parts += once(keys, cell_offsets, 1)

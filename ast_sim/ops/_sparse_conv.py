@@ -16,8 +16,8 @@ from ast_sim.ops.library import Kernel, Op
 OFFSETS = 27
 
 
-# The pairs come twice. (source, destination) are sorted by destination. The gradient with respect to x goes the other
-# way: (back_source, back_destination) are the destinations and sources of the same pairs, sorted by source.
+# The pairs come twice. (source, destination) are sorted by destination. The gradient with respect to x goes from
+# destinations to sources: (back_source, back_destination) are the same pairs exchanged, sorted by source.
 _PAIRS = "pair_offsets[28] offsets(P), source[P] index(N)"
 _SPEC = (
     f"x[N,I], weight[27,I,O], bias?[O], transposed flag integer(0,0), {_PAIRS}, destination[P] index(R)"
@@ -103,7 +103,7 @@ def sparse_conv(x: Tensor, weight: Tensor, map: CellMap, bias: Tensor | None = N
 
 
 def sparse_conv_transposed(x: Tensor, weight: Tensor, map: CellMap, bias: Tensor | None = None) -> Tensor:
-    """The way back, along the same pairs: out[2 X + (a, b, c)] = bias + sum over the coarse cells X of x[X] W_k.
+    """From coarse to fine, by the same pairs: out[2 X + (a, b, c)] = bias + sum over the coarse cells X of x[X] W_k.
 
     Args:
         x: [C_coarse, I], features of the cells of the coarser level.

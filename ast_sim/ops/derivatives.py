@@ -17,7 +17,7 @@ from ast_sim.ops.spec import Parameter
 
 
 def gradient_op(op: Op, kernel: Kernel, known: dict[str, Callable[[dict], Any]] | None = None) -> Op:
-    """The gradient of an op as an op of its own. Torch derives its composition from that of the op.
+    """The gradient of an op as an op of its own. Torch derives its composition from the op's.
 
     Args:
         op: gets this gradient.
@@ -95,7 +95,7 @@ def _kept(ctx) -> list:
 def pull_back(
     function: Callable, xs: Sequence, wanted: Sequence[int], dys: Sequence[Tensor | None]
 ) -> Sequence[Tensor]:
-    """The gradients of function(*xs) by the arguments `wanted`, given those of its outputs; None counts as 0."""
+    """The gradients of function(*xs) by the arguments `wanted`, from `dys` by its outputs; None counts as 0."""
     given = [i for i, dy in enumerate(dys) if dy is not None]
 
     def part(*some: Tensor) -> tuple[Tensor, ...]:
@@ -107,7 +107,7 @@ def pull_back(
 
 
 def differentiate_by_composition(op: Op, kept: Sequence[int] = ()) -> None:
-    """Register the derivatives of the composition as those of an op.
+    """Register the derivatives of the composition as the derivatives of an op.
 
     Args:
         op: the op.

@@ -4,7 +4,7 @@ Every op has two bodies that compute the same: a C kernel for float32 on the CPU
 composition is the reference in the tests. It runs for every other device and dtype, and with AST_SIM_BACKEND=torch
 everywhere.
 
-Kernels know the first derivative, backwards. All others are those of the composition: higher ones
+Kernels know the first derivative, backwards. The composition gives all others: higher ones
 (`create_graph=True`), tangents (`torch.autograd.forward_ad`) and everything in `torch.func`. With `vmap` the indices of
 an op must be the same for every sample.
 """

@@ -1,4 +1,4 @@
-"""What an op takes and gives, said once: its schema, its outputs, the checks here and those of the core follow from it.
+"""What an op takes and gives, said once: its schema, its outputs, and the checks here and in the core follow from it.
 
     x[M,I] rows, weight[O,I] rows filled, bias?[O], source[P] index(M), depth integer(0,21); save switch
     -> out[M,O], z[M,O] if(save)
@@ -166,7 +166,7 @@ class Spec:
 
     @cached_property
     def arguments(self) -> Callable[..., tuple]:
-        """The kernel's arguments from those of the op: what it takes, and new outputs, None where one is not wanted.
+        """The kernel's arguments from the op's: what it takes, and new outputs, None where one is not wanted.
 
         It is written out as Python, like the methods of a dataclass, for it runs in every call.
         """

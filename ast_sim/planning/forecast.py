@@ -1,4 +1,4 @@
-"""The error of a long training from those of shorter ones, by a power law.
+"""The error of a long training from the errors of shorter ones, by a power law.
 
 The error of whole trainings, each with a learning rate that falls to zero at its end, falls about as a power of the
 number of their steps (Hestness et al. 2017, arXiv:1712.00409). The power gets smaller as trainings get longer, so the
@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 DAMPING = 0.9  # of the slope, beyond the longest trial
-SPREAD = 0.25  # the interval reaches so far around the expected error, relative to it
+SPREAD = 0.25  # the interval reaches from 1 / 1.25 to 1.25 times the expected error
 
 
 class Forecast(NamedTuple):
@@ -31,7 +31,7 @@ def slope(points: Sequence[tuple[int, float]]) -> float:
 
 
 def forecast(points: Sequence[tuple[int, float]], steps: int) -> Forecast:
-    """The error after so many steps.
+    """The error after `steps` steps.
 
     Args:
         points: steps and error of two trainings or more, the longest one last.

@@ -37,7 +37,7 @@ class Plan:
         minutes, steps: of the training that is planned; the steps follow from the longest trial.
         trials: in the order in which they were made; the last one has half of the training scenes, the one before it is
             the longest of the best settings.
-        settings: of the training, by dotted key, where they differ from those that were asked for.
+        settings: of the training, by dotted key, where they differ from the given ones.
         expected: the error of the network alone on validation scenes, relative to their displacement.
         passes: how often the training will see each of its frames.
         more_minutes, more_scenes: the share of the error that twice the minutes and twice the scenes leave, as the
@@ -88,8 +88,8 @@ def plan(
     progress: ShowProgress = True,
     **settings: Any,
 ) -> Plan:
-    """Find good settings for a training of so many minutes by short trials, and say what it will give. The trials take
-    about half of the minutes; each is a run in a folder, and a second call goes on with what is there.
+    """Find good settings for a training of `minutes` minutes by short trials, and say what it will give. The trials
+    take about half of the minutes; each is a run in a folder, and a second call goes on with what is there.
 
     Three learning rates and a wider model are tried. All trials are judged by the network alone, on validation scenes.
 

@@ -18,7 +18,7 @@ from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.errors import ConfigError, TrainingError
 from ast_sim.training.start import start_training
 
-GROWTH = 3  # a trial of the next round has so many times the steps
+GROWTH = 3  # steps of a trial, as a multiple of a trial's steps in the round before
 ROUNDS = 3
 LONGEST = 1 / 6  # of the minutes of the training that is planned, for a trial of the last round
 RATES = {"": 1.0, ", half the rate": 0.5, ", twice the rate": 2.0}
@@ -88,7 +88,7 @@ class Trials:
         self.valid = min(valid, VALIDATION_SCENES)
 
     def trained(self, name: str, config: RunConfig, steps: int, scenes: int | None = None) -> Trial:
-        """Train a candidate for so many steps, on all training scenes or on the first ones.
+        """Train a candidate for `steps` steps, on all training scenes or on the first ones.
 
         Raises:
             TrainingError: the validation failed, or as `start_training`.

@@ -34,7 +34,7 @@ class Worth:
     Attributes:
         spec: the specification.
         minutes, steps: of the training.
-        scenes: so many of them that the training sees each frame `OFTEN` times.
+        scenes: of the training, which sees each frame `OFTEN` times.
         workers: processes that solve scenes side by side.
         solve_seconds: processor time of the solver for a scene with all its frames, the median of `SOLVED`.
         answer_seconds: the median processor time of one call of the model for all frames of such a scene.

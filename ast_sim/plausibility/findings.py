@@ -9,7 +9,7 @@ import numpy as np
 
 from ast_sim.number_arrays import point
 
-_PLACES = 3  # so many places are named
+_PLACES = 3  # places that are named, at most
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from ast_sim.scene import Scene, Trajectory
 # Edges of an obstacle keep their lengths up to this share of the longest edge.
 _RIGID = 0.02
 
-# A displacement of so many times the size of the scene cannot be one.
+# A displacement above this multiple of the size of the scene cannot be one.
 _FAR = 10.0
 
 # A node moves if it moves by more than this share of the size of its scene.
@@ -30,7 +30,7 @@ _STILL = 1e-6
 _MOST_WORLD_EDGES = 60
 _DEEPEST = 14
 
-# World edges are counted in so many frames.
+# Frames in which world edges are counted.
 _FRAMES = 5
 
 

@@ -14,7 +14,7 @@ from ast_sim.scene import Scene
 # Depths below this share of the mean edge of the surfaces are left to rounding and to the softness of contact.
 _TOLERATED = 0.02
 
-# Of so many bodies at most each pair is looked at.
+# The largest number of bodies of which each pair is looked at.
 _MOST_BODIES = 60
 
 

@@ -27,7 +27,7 @@ def at_rest(scene: Scene) -> list[Finding]:
 
 
 def turned_over(scene: Scene) -> np.ndarray | None:
-    """[E, 4]: the elements with the last two nodes of those that are inside out exchanged; None if there are none."""
+    """[E, 4]: the elements; if inside out, with their last two nodes exchanged. None if none is inside out."""
     if scene.elements.shape[1] != 4:
         return None
     wrong = signed_volumes(scene.rest_position, scene.elements) < 0

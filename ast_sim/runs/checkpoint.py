@@ -329,6 +329,6 @@ def _discard(path: Path) -> None:
 
 
 def _remove_temporary(parent: Path) -> None:
-    """Remove the folders of checkpoints that are not finished or no longer wanted, also those of a killed process."""
+    """Remove the folders of checkpoints that are not finished or no longer wanted, also after a killed process."""
     for path in parent.glob(f"{_TEMPORARY}*"):
         shutil.rmtree(path, ignore_errors=True)

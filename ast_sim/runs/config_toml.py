@@ -157,6 +157,6 @@ def _text(settings: RunConfig | Scope) -> str:
 
 
 def _hash(values: Mapping[str, Any]) -> str:
-    """The SHA-256 of all values but that of the key `sha256`."""
+    """The SHA-256 of all values but the value of the key `sha256`."""
     hashed = {key: value for key, value in values.items() if key != "sha256"}
     return hashlib.sha256(json.dumps(hashed, sort_keys=True).encode()).hexdigest()

@@ -111,10 +111,19 @@ class RunFolder:
         checkpoint.mark_best(self.path, validation["step"], validation["valid_rmse"], answers)
 
     def keep_calibration(self, calibration: Mapping[str, Any]) -> None:
-        """Keep what was measured of the answers of the best checkpoint beside it, until a better one is marked."""
+        """Keep what was measured of the answers of the chosen checkpoint beside it, until a better one is marked.
+
+        Raises:
+            CheckpointError: none was validated, or a training has marked a better one since this folder was read.
+        """
         best = checkpoint.read_best(self.path)
         if best is None:
             raise CheckpointError(f"{self.path} has no best checkpoint yet: train it until it is validated")
+        if best.step != self.chosen.step:
+            raise CheckpointError(
+                f"{self.path} was opened at step {self.chosen.step:,}, and step {best.step:,} is better: open it again"
+                " and calibrate it when its training has ended"
+            )
         answers = {**best.answers, "calibration": dict(calibration)}
         checkpoint.mark_best(self.path, best.step, best.error, answers)
         self.chosen = self.chosen._replace(answers=answers)

@@ -12,8 +12,8 @@ from ast_sim.runs.train_config import RunConfig
 
 _TEXT = """# {name}
 
-A trained model of `ast_sim` {version}. It predicts how deforming bodies in contact move, for scenes like those that it
-learned from (family `{family}`, lengths in {unit}). It warns of a scene outside the ranges below. {familiar}
+A trained model of `ast_sim` {version}. It predicts how deforming bodies in contact move, for scenes like its training
+scenes (family `{family}`, lengths in {unit}). It warns of a scene outside the ranges below. {familiar}
 
 ```
 import ast_sim

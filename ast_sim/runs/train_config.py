@@ -94,7 +94,7 @@ def _model_class(table: Mapping[str, Any]) -> type[ModelConfig]:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """All settings of a run: those of its model, those of its training, and the path of its dataset."""
+    """All settings of a run: of its model, of its training, and the path of its dataset."""
 
     model: ModelConfig = field(metadata={"class_of": _model_class})
     train: TrainConfig

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import argparse
 import pkgutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from ast_sim.support.errors import ConfigError, printable
+
+Key = TypeVar("Key")
+Value = TypeVar("Value")
 
 
 class Parser(argparse.ArgumentParser):
@@ -22,6 +25,15 @@ class Parser(argparse.ArgumentParser):
 
     def format_help(self) -> str:
         return super().format_help() + "".join(f"{line}\n" for line in self.more())
+
+
+class Once(argparse.Action):
+    """An option that takes one value and may be taken for one that may be repeated: a second value is an error."""
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: Any, values: Any, option: str | None = None) -> None:
+        if getattr(namespace, self.dest) is not None:
+            parser.error(f"{option} is given twice: leave one out")
+        setattr(namespace, self.dest, values)
 
 
 def add_each(to: Any, options: Mapping[str, str], **shared: Any) -> None:
@@ -71,6 +83,20 @@ def at_least(least: int) -> Any:
 
     number.__name__ = "whole number"
     return number
+
+
+def by_name(option: str, pairs: Iterable[tuple[Key, Value]]) -> dict[Key, Value]:
+    """The values of an option that may be repeated, such as --move BODY=X,Y,Z, by what each is for.
+
+    Raises:
+        ConfigError: two are for the same.
+    """
+    values: dict[Key, Value] = {}
+    for key, value in pairs:
+        if key in values:
+            raise ConfigError(f"{option} is given twice for {key}: leave one out")
+        values[key] = value
+    return values
 
 
 def read_by(place: str) -> Callable[[str], Any]:

@@ -38,7 +38,7 @@ class ByteCache(Generic[V]):
         self._values: OrderedDict[Hashable, tuple[V, int]] = OrderedDict()
 
     def get(self, key: Hashable, make: Callable[[], V]) -> V:
-        """The value of a key; `make` makes a missing one. Each call measures the value anew: it may have grown."""
+        """The value of a key; `make` makes a missing one. Each call measures the value again: it may have grown."""
         value, counted = self._values.pop(key, None) or (make(), 0)
         size = array_bytes(value)
         self._values[key] = value, size

@@ -1,5 +1,5 @@
-"""The nearest points of a closed surface, for those of many points that are near it. A positive gap is the distance, a
-negative one the depth inside."""
+"""The nearest places of a closed surface, for all points that are near it. A positive gap is the distance, a negative
+one the depth inside."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ class Nearest(NamedTuple):
     Attributes:
         rows: [n] which of the points they are.
         gap: [n].
-        normal: [n, 3], outward unit normals at the nearest points.
-        triangles: [n, 3], the corners of the triangles that the nearest points are on.
-        place: [n, 3], the nearest points.
+        normal: [n, 3], outward unit normals at the nearest places.
+        triangles: [n, 3], the corners of the triangles that the nearest places are on.
+        place: [n, 3], the nearest places.
     """
 
     rows: np.ndarray
@@ -46,7 +46,7 @@ def nearest_surface(
     low, high = corners.min(axis=1), corners.max(axis=1)
     across = np.ascontiguousarray(points.T)
     close = np.flatnonzero(beside(across, across, low, high, margin))
-    # All triangles around a nearest point are kept, so the sign is that of the whole surface.
+    # All triangles around a nearest place are kept, so the sign is right for the whole surface.
     triangles = triangles[beside(low, high, across[:, close], across[:, close], margin)]
     if not len(triangles):
         return Nearest(close[:0], np.zeros(0), np.zeros((0, 3)), triangles, np.zeros((0, 3)))

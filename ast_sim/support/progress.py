@@ -92,7 +92,7 @@ class Progress:
     Args:
         unit: what is counted, such as "scenes".
         progress: how it is shown, see above.
-        done: so many were made before; rate and time to go are those of the others.
+        done: the number that was made before; rate and time to go do not count these.
 
     Raises:
         ConfigError: `progress` is neither True, False nor a function.

@@ -15,6 +15,7 @@ import math
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import MISSING, dataclass
+from numbers import Integral, Real
 from types import MappingProxyType, NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -63,6 +64,8 @@ def to_values(value: Any) -> Any:
         return {name: to_values(getattr(value, name)) for name in chosen}
     if isinstance(value, tuple):
         return [to_values(member) for member in value]
+    if isinstance(value, Real) and not isinstance(value, int | float):  # a scalar of NumPy
+        return int(value) if isinstance(value, Integral) else float(value)
     return NONE if value is None else value
 
 
@@ -77,7 +80,9 @@ def from_values(cls: type[T], values: Mapping[str, Any]) -> T:
 
 
 def require_range(key: str, value: float | None, least: float, most: float = LARGEST) -> None:
-    """Raise ConfigError if the value is set and lies below `least` or above `most`."""
+    """Raise ConfigError if the value is set, and is no number, below `least` or above `most`."""
+    if value is not None and (isinstance(value, bool) or not isinstance(value, Real)):
+        raise ConfigError(f"{key} is {value!r}; it must be a number")
     if value is not None and not least <= value <= most:
         limit = f"least {least}" if value < least else f"most {most}"
         raise ConfigError(f"{key} is {value}; it must be at {limit}")

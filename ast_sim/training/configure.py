@@ -1,4 +1,4 @@
-"""The settings that a training is asked for: of a preset or of a run, changed by a file and by assignments."""
+"""The settings that a training is given: of a preset or of a run, changed by a file and by assignments."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def configure(
     """The settings of a preset or of a run, changed by a file, then by assignments `key=value` and by `changes`, values
     by dotted key. Unset settings are filled in when training starts.
 
-    Arguments and errors are those of `train`.
+    Arguments and errors are as for `train`.
     """
     file = None if config is None else Path(config)
     given = {} if file is None else read_changes(file)
@@ -76,7 +76,13 @@ def path_of(data: str | os.PathLike[str] | Dataset) -> Path:
 def changes_of(
     state: Sequence[str], model_settings: Mapping[str, Any] | None, train_settings: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The changes of settings that the arguments of `train` ask for, by dotted key."""
+    """The changes of settings that the arguments of `train` ask for, by dotted key.
+
+    Raises:
+        ConfigError: `state` is one text.
+    """
+    if isinstance(state, str):
+        raise ConfigError(f"state is {state!r}; it must be a list of names, such as [{state!r}]")
     of_model = {**({"state": tuple(state)} if state else {}), **(model_settings or {})}
     changes = {f"model.{key}": value for key, value in of_model.items()}
     return changes | {f"train.{key}": value for key, value in train_settings.items()}

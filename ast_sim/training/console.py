@@ -22,7 +22,7 @@ from ast_sim.training.callbacks import Listener
 from ast_sim.training.data_lengths import DataScales
 from ast_sim.training.rates import learning_rate
 
-# The output counts as constant if its standard deviation over the nodes, divided by that of the targets, is below this.
+# The output counts as constant if its standard deviation over the nodes, relative to the targets', is below this.
 CONSTANT = 1e-3
 
 
@@ -72,7 +72,7 @@ class Console(Progress):
         self._text = ""
 
     def begin(self, done: int) -> Console:
-        """The steps begin; so many were made before."""
+        """The steps begin; `done` steps were made before."""
         self.done = done
         self.began = True
         return self

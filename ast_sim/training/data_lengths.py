@@ -19,7 +19,7 @@ from ast_sim.support.errors import TrainingError
 
 # Facts of the data (`DataFacts`), and the attributes of trajectories that hold them.
 RECORDED = {"young": "young", "poisson": "poisson", "contact_range": "dhat", "friction": "friction"}
-MEASURED = 100  # at most so many training trajectories are measured
+MEASURED = 100  # training trajectories, at most, that are measured
 
 
 @dataclasses.dataclass(frozen=True)

@@ -29,12 +29,12 @@ _RANGES = {
     **dict.fromkeys(("stress_weight", "strain_weight"), (0, 1e6)),
     "noise_gamma": (0, 1),
 }
-ROLLOUT_BATCHES = 16  # an unset pool of rollouts holds the scenes of so many batches
+ROLLOUT_BATCHES = 16  # batches whose scenes an unset pool of rollouts holds
 
 
 def resolve(config: RunConfig, dataset: Dataset, scales: DataScales, keep_model: bool = False) -> RunConfig:
-    """Fill in all unset settings: first those of the model, then those of the training. With `keep_model`, the model
-    has none, and stays as it is.
+    """Fill in all unset settings, first of the model, then of the training. With `keep_model`, the model has none, and
+    stays as it is.
 
     Raises:
         ConfigError: a setting is out of its range, or the data does not fit it; the text names the setting.

@@ -40,10 +40,8 @@ from ast_sim.training.resuming import Saver
 from ast_sim.training.validation import Validated, error_share, validate, verdict
 
 OFTEN = 16  # passes over the data, from which on little is gained (docs/log.md, 2026-11-26)
-APART = (
-    1.25  # validation scenes have so many times the error of training scenes: the training knows its scenes by heart
-)
-JUMP_BATCHES = 64  # the pool of jumps holds so many batches; with 8, steps learn less: the calls of a jump are alike
+APART = 1.25  # error of validation scenes, relative to training scenes, above which the model knows its scenes by heart
+JUMP_BATCHES = 64  # in the pool of jumps; with 8, steps learn less: the calls of a jump are alike
 
 
 def sampler_of(model: Simulator, dataset: Dataset, options: TrainConfig, part: tuple[int, int] = (0, 1)) -> PairSampler:
@@ -110,7 +108,7 @@ class Training:
         self.ahead.__exit__(*error)
 
     def _pool(self, largest: float) -> TrainingPool | None:
-        """The pool of scenes that go on from the model's own answers; None: each batch is drawn anew."""
+        """The pool of scenes that go on from the model's own answers; None: each batch is a new draw."""
         options = self.options
         if self.config.model.scheme.jumps:
             return JumpPool(self.sampler, JUMP_BATCHES * options.batch_size, 1 + options.corrections, largest)

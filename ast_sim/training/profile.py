@@ -15,7 +15,7 @@ from torch.profiler import profile as torch_profile
 from ast_sim.ops import library
 
 WARM_UP = 3  # the first steps fill caches and are not counted
-TORCH_OPS = 15  # so many of torch's ops are listed by name, the slowest first
+TORCH_OPS = 15  # ops of torch that are listed by name, the slowest first
 
 
 @dataclass(frozen=True)

@@ -60,9 +60,9 @@ def train(
         preset: the settings to start from; by default "tiny".
         config: a TOML file with settings, such as `config.toml` of a run. It may leave settings out. It does not
             name the dataset. Other arguments win over it.
-        from_run: a run. The new run starts with the weights and scales of its best checkpoint, and with its settings;
-            those of the model stay. If `steps` or `minutes` differs, warm-up, decay, validations and checkpoints are
-            chosen anew.
+        from_run: a run. The new run starts with the weights and scales of its best checkpoint, and with its settings.
+            The settings of the model stay. If `steps` or `minutes` differs, warm-up, decay, validations and checkpoints
+            are chosen again.
         state: fields of the dataset that are predicted beside motion and stress, such as ("PEEQ", "reaction").
         model_settings: changes of the model's settings, such as {"hidden": 32}.
         resume: continue after the newest checkpoint, if there is one.
@@ -123,15 +123,15 @@ def start_training(
     """Train a model in the run folder `run`, or resume the training of the run in it.
 
     Args:
-        config: the settings; with `resume` they must equal those of the run, and None takes those of the run.
+        config: the settings; with `resume` they must equal the settings of the run, and None takes these.
         resume: continue after the newest checkpoint, if there is one.
-        profile_steps: if above 0, print how the time of so many steps divides, instead of training.
+        profile_steps: if above 0, print how the time of this number of steps divides, instead of training.
         from_run, callback, progress: as for `train`; `config` has the model of that run. The leading process calls.
 
     Raises:
         TrainingError: a loss or a gradient is not finite, the disk is full, or the folder already holds a run.
-        ConfigError: settings are out of range, or differ from those of the run that is resumed, or the data does not
-            fit the model of `from_run`.
+        ConfigError: settings are out of range, or differ from the settings of the run that is resumed, or the data does
+            not fit the model of `from_run`.
         CheckpointError: another process trains in this folder, or no checkpoint in it can be read.
         KeyboardInterrupt: SIGINT, SIGTERM or SIGHUP was received, or nobody reads the output; a checkpoint of the
             finished step was written. The error is an `Interrupted`, which has the number of the signal.
@@ -248,7 +248,7 @@ def _told_by_leader(processes: Processes) -> Iterator[None]:
 
 
 def _process_count(folder: RunFolder, config: RunConfig | None, resume: bool) -> int:
-    """The number of processes to train in: as asked, as the run that is resumed had it, or as usual. A process that is
+    """The number of processes to train in: as set, as the run that is resumed had it, or as usual. A process that is
     one of several already starts no others."""
     if Processes().count > 1:
         return 1

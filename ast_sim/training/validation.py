@@ -26,10 +26,10 @@ from ast_sim.models.simulator import Simulator
 from ast_sim.scene import Trajectory
 from ast_sim.support.progress import ShowProgress
 
-MORE_CALLS = 2  # a model that is trained to correct its answers is validated with so many more calls
+MORE_CALLS = 2  # further calls in the validation of a model that is trained to correct its answers
 ENOUGH = 0.01  # a further call must lower the error by this share
-EFFORT_SCENES = 10  # the default effort is chosen on at most so many validation scenes, at the deepest frame
-JUMPS = 4  # a model that jumps is validated at so many frames of a scene, evenly spread, the last one included
+EFFORT_SCENES = 10  # validation scenes, at most, on which the default effort is chosen, at the deepest frame
+JUMPS = 4  # frames of a scene at which a model that jumps is validated, evenly spread, the last one included
 
 
 class Validated(NamedTuple):
@@ -140,7 +140,7 @@ def _by_jumps(
 
 
 def frames_asked(count: int) -> np.ndarray:
-    """The numbers of up to `JUMPS` frames that are evenly spread over so many; never the first, which is given."""
+    """The numbers of up to `JUMPS` frames, evenly spread over `count` frames; never the first, which is given."""
     spread = np.unique(np.linspace(0, count - 1, JUMPS + 1).round().astype(int)[1:])
     return spread[spread > 0]
 

@@ -56,7 +56,7 @@ class Surface:
         return trajectory.stress[:, nodes if trajectory.stress_at == "node" else elements, 0]
 
     def motion(self, trajectory: Trajectory, frames: np.ndarray) -> Json:
-        """Displacements and stresses of a trajectory. They cover those of `frames` that it has and that are finite."""
+        """Displacements and stresses of a trajectory in all of `frames` that it has and that are finite."""
         frames = frames[frames < finite_frames(trajectory)]
         encoded: Json = {"frames": len(frames)}
         for name, (_, nodes, _) in self.groups.items():
@@ -99,9 +99,9 @@ def encode_scene(truth: Trajectory, frames: np.ndarray, predictions: Sequence[Tr
 def encode_curves(truth: Trajectory, predictions: Sequence[Trajectory | None]) -> Json:
     """For each frame, the error of each run and of a predictor that learns nothing.
 
-    Displacement errors are those of NORMAL nodes; the predictor that learns nothing holds the first frame still. Stress
-    errors are those outside the obstacles; the predictor that learns nothing gives the mean of the true stress in the
-    frame.
+    Displacement errors are measured at NORMAL nodes; the predictor that learns nothing holds the first frame still.
+    Stress errors are measured outside the obstacles; the predictor that learns nothing gives the mean of the true
+    stress in the frame.
     """
     frames = [0 if p is None else min(finite_frames(p), truth.num_frames) for p in predictions]
     held = np.broadcast_to(truth.position[0], truth.position.shape)

@@ -54,7 +54,7 @@ def write(
 
 
 def _draw(axes, scene: Scene, last: np.ndarray) -> None:
-    """The surfaces from far to near, then the prescribed nodes, then arrows along their ways."""
+    """The surfaces from far to near, then the prescribed nodes, then arrows along their paths."""
     from matplotlib.collections import PolyCollection
     from matplotlib.colors import to_rgb
 

@@ -106,7 +106,7 @@ def tiles(evaluation: Figures | None) -> list[Json]:
 
 
 def _deepest_tiles(frames: DeepestFrames) -> list[Json]:
-    """The deepest frame, asked for alone, beside the solver."""
+    """The deepest frame, predicted alone, beside the solver."""
     if frames.relative_error is None or frames.seconds is None:
         return []
     detail = f"of the displacement, {1000 * frames.seconds:.3g} ms on one thread"
@@ -146,7 +146,7 @@ def _scope_tiles(evaluation: Figures) -> list[Json]:
 
 
 def median_of(evaluation: Figures | None, key: str) -> float | None:
-    """The median of a number of the scenes, over those that have it."""
+    """The median of a number, over the scenes that have it."""
     values = [getattr(scene, key) for scene in (evaluation.scenes if evaluation else ())]
     known = [value for value in values if value is not None]
     return float(np.median(known)) if known else None

@@ -54,8 +54,8 @@ def _settings(figures: Sequence[TradeFigures]) -> dict[str, Any]:
     columns = ["Side", "Setting", *(f"{one.quantity.capitalize()} kept" for one in figures), "Median time", "Command"]
     rows = []
     sides = [_sides(one) for one in figures]
-    for side in sides[0]:
-        of_quantities = (of_side[side] for of_side in sides)
+    for place, (side, _) in enumerate(sides[0]):
+        of_quantities = (of_side[place][1] for of_side in sides)
         for same in sorted(zip(*of_quantities, strict=True), key=lambda same: same[0].middle):
             kept = [setting.kept for setting in same]
             if any(map(math.isfinite, kept)):
@@ -65,10 +65,10 @@ def _settings(figures: Sequence[TradeFigures]) -> dict[str, Any]:
     return {"columns": columns, "rows": rows}
 
 
-def _sides(figures: TradeFigures) -> dict[str, tuple[Setting, ...]]:
-    """The settings of each side by its name."""
-    others = {side.name: side.settings for side in figures.others}
-    return {"the run": figures.run, "the solver": figures.solver, **others}
+def _sides(figures: TradeFigures) -> list[tuple[str, tuple[Setting, ...]]]:
+    """The name and the settings of each side; the folder of another run may be called "the run"."""
+    others = ((side.name, side.settings) for side in figures.others)
+    return [("the run", figures.run), ("the solver", figures.solver), *others]
 
 
 def _lead(figures: TradeFigures) -> str:
@@ -97,7 +97,7 @@ def _note(figures: TradeFigures) -> str:
 
 
 def _points(settings: Sequence[Setting]) -> list[dict[str, Any]]:
-    """The settings as points; `front` marks those that none beats."""
+    """The settings as points; `front` marks the settings that no other beats."""
     best = {one.name for one in front(settings)}
     return [
         {"name": one.name, "error": one.kept, "seconds": one.middle, "front": one.name in best, "command": one.command}

@@ -1,8 +1,8 @@
 """Writes docs/results/accuracy.md: the worst error of every float op, and the worst error of its torch composition.
 
-`python -m benchmarks.kernels.accuracy`. Each op gets many random inputs of many sizes and magnitudes. The exact result
-is that of float64. e(C) is the largest error of the op, and e(T) is the largest error of the float32 composition. Both
-are relative to the largest magnitude of the exact result. Every op must keep the rule e(C) <= 2 e(T) + 1e-6.
+`python -m benchmarks.kernels.accuracy`. Each op gets many random inputs of many sizes and magnitudes. Float64 gives the
+exact result. e(C) is the largest error of the op, and e(T) is the largest error of the float32 composition. Both are
+relative to the largest magnitude of the exact result. Every op must keep the rule e(C) <= 2 e(T) + 1e-6.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ def main() -> None:
         "# Accuracy",
         "",
         f"Made by `python -m benchmarks.kernels.accuracy`: the worst of {SEEDS} random inputs an op, relative to the",
-        "largest magnitude of the exact (float64) result. e(C) is the error of the C kernel, e(T) that of the float32",
+        "largest magnitude of the exact (float64) result. e(C) is the error of the C kernel, e(T) of the float32",
         "torch composition on the same input. The rule is e(C) <= 2 e(T) + 1e-6: the share of the bound is at most 1.",
         f"Instruction set {facts['instruction_set']}, torch {facts['torch']}. Octree, neighbours, pairs and farthest",
         "point sampling are exact. Layers have 16 to 258 inputs, hidden units and outputs: with fewer hidden units",

@@ -11,7 +11,7 @@ from torch import Tensor
 from ast_sim.ops import linear, mlp
 from benchmarks.kernels.case import Case
 
-# rows, inputs, outputs; the small ones are those of the demo's model
+# rows, inputs, outputs; the small ones occur in the demo's model
 LINEAR = [(100_000, 128, 128), (512, 512, 1024), (1600, 128, 128), (360, 128, 128), (90, 128, 128)]
 GEGLU = [(512, 256, 1024), (360, 128, 512)]
 MLP = [100_000, 1600, 90]

@@ -22,7 +22,7 @@ class Target:
         least: lower bounds by name of the number.
         most: upper bounds.
         peers: pattern of the peers that the ratio counts; the best of them decides.
-        nodes: at least so many nodes, where a preset is timed at several sizes.
+        nodes: the least number of nodes, where a preset is timed at several sizes.
     """
 
     name: str

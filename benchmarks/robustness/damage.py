@@ -5,10 +5,10 @@ is trained on it up to the middle. Then, again and again, one bit of one file is
 random place, and the commands that read the file are run: `info`, `evaluate`, and `train --resume` to the end. The
 worst of their outcomes counts:
 
-- `same`: the results are those of the intact files;
+- `same`: the results are the same as with the intact files;
 - `warned`: the command ends, and a warning tells of the damage;
 - `refused`: one line tells what is wrong, and the exit code is 2;
-- `silent`: other results than those of the intact files, without a word;
+- `silent`: other results than with the intact files, without a word;
 - `traceback`: an exception that a user cannot act on, or an error of several lines.
 
 Results are all numbers and texts of `info` and `evaluate` without times, and every bit of the last checkpoint, of

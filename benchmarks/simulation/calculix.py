@@ -34,10 +34,10 @@ def compare(case: SolidCase, ours: Trajectory, referee: Trajectory) -> dict[str,
 
     Returns:
         `frames` compared; at the last of them the L2 norm over the free nodes of the difference of the positions
-        relative to that of the referee's displacements (`displacement`; `displacement_all` over all frames at once;
-        `displacement_by_frame` without that at rest: where solutions part at an instability), the correlation of the
-        von Mises stresses of the deforming elements, or nodes (`stress_correlation`), the ratio of the means of those
-        (`mean_stress_ratio`) and of the reactions (`reaction_ratio`), ours by the referee's.
+        relative to the norm of the referee's displacements (`displacement`; `displacement_all` over all frames at once;
+        `displacement_by_frame` for each frame but the first: where solutions part at an instability), the correlation
+        of the von Mises stresses of the deforming elements, or nodes (`stress_correlation`), the ratio of the means of
+        these stresses (`mean_stress_ratio`) and of the reactions (`reaction_ratio`), ours by the referee's.
     """
     frames = min(ours.num_frames, referee.num_frames)
     free = case.scene.node_type == NodeType.NORMAL

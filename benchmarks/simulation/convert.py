@@ -47,7 +47,7 @@ FEATURES = {
 
 
 def make(folder: Path, megabytes: int) -> Path:
-    """Write `meta.json` and `train.tfrecord` of about so many megabytes; returns the latter."""
+    """Write `meta.json` and `train.tfrecord` of about `megabytes` megabytes; returns the latter."""
     folder.mkdir(parents=True, exist_ok=True)
     features = {
         name: {"type": kind, "shape": [FRAMES if kind == "dynamic" else 1, -1, width], "dtype": dtype}

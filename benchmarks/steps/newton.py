@@ -1,7 +1,7 @@
 """Times Newton steps of another state of this repository beside today's, in turns, by the size of the mesh.
 
 `python -m benchmarks.steps.newton --before FOLDER [--json FILE]`. FOLDER holds the other state. Each sample is a
-process of its own, with one thread; times are those of the processor. The first step is one from afar. A state that has
+process of its own, with one thread; times are processor times. The first step is one from afar. A state that has
 not ended after `--limit` seconds by the clock is given up.
 """
 

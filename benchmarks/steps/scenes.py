@@ -24,7 +24,7 @@ class Case:
     Attributes:
         preset: of the model.
         settings: as for `ast-sim train --set`.
-        data: the dataset; a rollout step is that of its first test scene.
+        data: the dataset; a rollout step is of its first test scene.
         nodes: in a batch.
         shape, rollout_shape: the sizes of a batch and of the test scene, in words.
         steps: of one sample.

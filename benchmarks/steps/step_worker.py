@@ -104,7 +104,7 @@ def nodes(counted: dict[str, int]) -> dict[str, int]:
 
 
 def counts(step: Callable[[], object]) -> dict[str, int]:
-    """What one step runs: nodes of autograd (without those that accumulate gradients), those that accumulate, torch's
+    """What one step runs: nodes of autograd (without nodes that accumulate gradients), nodes that accumulate, torch's
     ops, and the ops of the C core, forward and backward."""
     counted = events(step)
     of_autograd = nodes(counted)

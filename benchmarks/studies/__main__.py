@@ -1,7 +1,7 @@
 """Compares models under one protocol: equal scenes, splits and budget, each with its own best learning rate.
 
 `python -m benchmarks.studies STUDY.toml [--workers W]` writes benchmarks/results/study_NAME.json. After each run it
-also writes docs/results/study.md anew, which shows all studies that have a result.
+also writes docs/results/study.md, which shows all studies that have a result.
 
 A study can be stopped and resumed: a finished run is not made again, and a run that was cut off goes on from its last
 checkpoint. Runs and data lie in build/study. If they are gone, the runs in the result file stay valid, and runs of new
@@ -48,7 +48,7 @@ def dataset(data: Data, folder: Path) -> Path:
 def finished(file: Path, study: Study, entries: dict[str, Entry]) -> dict[str, Any]:
     """The rows of a result file that stand: entries and budget, data and settings of the study are what they were.
 
-    Runs of other seeds than those of the entry, and those that failed, are left out.
+    Runs of other seeds than the entry's, and failed runs, are left out.
     """
     if not file.exists():
         return {}

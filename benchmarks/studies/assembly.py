@@ -42,7 +42,7 @@ class Row:
         spec: its specification.
         nodes, train, valid, test: of the dataset; nodes None: the sizes of the specification.
         steps, settings: of the training.
-        rivals: in so many test scenes the solver is run.
+        solver_scenes: the number of test scenes in which the solver is run.
         after: the row whose run this training starts from.
     """
 
@@ -54,7 +54,7 @@ class Row:
     valid: int = 10
     test: int = 50
     settings: dict[str, Any] = field(default_factory=dict)
-    rivals: int = 10
+    solver_scenes: int = 10
     after: str | None = None
 
     def run_folder(self, name: str, folder: Path) -> Path:
@@ -66,7 +66,9 @@ _SETTINGS = {"peak_rate": 2e-3, "validate_scenes": 10, "validate_every": 500, "c
 _BUMPER, _HOOK = (ROOT / "examples" / name / "SPEC.toml" for name in ("bumper", "snap_hook"))
 ROWS = {
     "bumper": Row("Bumper, 1,600 nodes", _BUMPER, nodes=1600, train=100, steps=1700, settings=_SETTINGS),
-    "bumper_50": Row("Bumper, 50 scenes", _BUMPER, nodes=1600, train=50, steps=1700, settings=_SETTINGS, rivals=0),
+    "bumper_50": Row(
+        "Bumper, 50 scenes", _BUMPER, nodes=1600, train=50, steps=1700, settings=_SETTINGS, solver_scenes=0
+    ),
     "snap_hook": Row("Snap hook, second-order elements", _HOOK, nodes=None, train=200, steps=1000, settings=_SETTINGS),
     "bumper_6000": Row(
         "Bumper, 6,000 nodes, after the small ones",
@@ -77,7 +79,7 @@ ROWS = {
         test=10,
         steps=300,
         settings={"validate_scenes": 3, "validate_every": 150, "checkpoint_every": 100},
-        rivals=1,
+        solver_scenes=1,
         after="bumper",
     ),
 }
@@ -102,7 +104,7 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
     row = ROWS[name]
     run, data = trained(name, folder)
     with run.open(data) as dataset:
-        found = deepest_frames(run.model, dataset, "test", run.effort, row.rivals, made_from=row.spec)
+        found = deepest_frames(run.model, dataset, "test", run.effort, row.solver_scenes, made_from=row.spec)
         curves = [_curve(run, dataset, index) for index in range(row.test)]
         solver_seconds = read_seconds(dataset).samples.values()
     return {
@@ -113,7 +115,7 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
         "effort": asdict(run.effort),
         "training": validation_curve(run),
         "curves": curves,
-        "solver_curves": _solver_curves(row) if row.rivals else [],
+        "solver_curves": _solver_curves(row) if row.solver_scenes else [],
         **asdict(found),
     }
 
@@ -144,12 +146,12 @@ def _solver_curves(row: Row) -> list[float]:
     """The seconds in which the solver finds all frames of the first test scenes, one after the other."""
     with tempfile.TemporaryDirectory() as folder:
         again = ast_sim.generate(
-            "assembly", Path(folder) / "again.h5", spec=row.spec, train=1, valid=1, test=row.rivals, nodes=row.nodes,
-            workers=1,
+            "assembly", Path(folder) / "again.h5", spec=row.spec, train=1, valid=1, test=row.solver_scenes,
+            nodes=row.nodes, workers=1,
         ).path  # fmt: skip
         with ast_sim.Dataset(again) as dataset:
             found = read_seconds(dataset).samples
-    return [sum(found[f"test/{index:06d}"]) for index in range(row.rivals)]
+    return [sum(found[f"test/{index:06d}"]) for index in range(row.solver_scenes)]
 
 
 def page(results: dict[str, Any]) -> str:
@@ -164,7 +166,7 @@ def page(results: dict[str, Any]) -> str:
         "largest stress",
         "answer",
         "solver",
-        "fastest way",
+        "fastest setting",
         "pays after",
     ]
     together = ["product", "frames", "error", "reaction", "answer", "solver"]
@@ -202,19 +204,20 @@ Each product of `examples` was generated, trained and asked for frames of test s
 error of the displacement on the free nodes at the deepest frame, relative to the displacement (mean and standard
 error). "Reaction" is the error of the force that moves the tool, in the last frame. "Largest stress" is the error of
 the largest von Mises stress. The solver goes to the same frame at its own stop test: straight in one, two or four load
-steps and frame by frame, whichever is fastest. "Fastest way" is the fastest of {settings} whose error is at most the
-answer's: looser stop tests, coarser meshes, and the same Newton steps without a model. All times count what is prepared
-for a mesh. An answer's time is the median over the test scenes; the solver's are medians over the scenes where it was
-run (ten; one of 6,000 nodes). "Pays after" so many questions, the time that the answers saved is the time of the
-simulations and the training.
+steps and frame by frame, whichever is fastest. "Fastest setting" is the fastest of {settings} whose error is at most
+the answer's: looser stop tests, coarser meshes, and the same Newton steps without a model. All times count what is
+prepared for a mesh. An answer's time is the median over the test scenes; the solver's are medians over the scenes where
+it was run (ten; one of 6,000 nodes). "Pays after" is the number of questions whose answers save as much time as the
+simulations and the training took.
 """
 
 _TOGETHER = """
 ## All frames of a scene at once
 
 With friction, a frame depends on the frames before. If all are asked for, Newton steps know the slip from each frame to
-the next, and find the place of equilibrium to which the way leads. So forces over the travel are more accurate than the
-same frame alone. "Error" and "reaction" are of the same frames as above. The solver finds one frame after the other.
+the next, and find the place of equilibrium to which the load path leads. So forces over the travel are more accurate
+than the same frame alone. "Error" and "reaction" are of the same frames as above. The solver finds one frame after the
+other.
 """
 
 

@@ -31,7 +31,7 @@ Made by `python -m benchmarks.studies.clip` from `benchmarks/results/clip.json`;
 and kind of the cutout, travel and yield stress are drawn. The set is the length of the mean displacement of the arm's
 free end in the last frame, the peak force the largest force on the ram in all frames. Errors are relative to what
 CalculiX found on the same mesh, in scenes that no training has seen. The run predicts all frames of a scene,
-those after the turn from its own answer for the turn
+the frames after the turn from its own answer for the turn
 ([the load path](../reference/model.md#jumps-and-corrections)). The Gaussian process (scikit-learn, a squared
 exponential with a length for each parameter) maps the drawn parameters to both numbers; it knows nothing else of a
 scene, and can be asked for nothing else. Times are processor times of one thread ({processor}), beside other work.
@@ -40,10 +40,11 @@ scene, and can be asked for nothing else. Times are processor times of one threa
 _WAYS = """
 ## CalculiX on coarser meshes and with larger increments
 
-The same scenes solved in other ways, {count} of the test scenes ({first} to {last}). Errors are those against the
-scene's own mesh, as the run's are. A frame of the dataset is solved in at least 4 increments; two steps are the ram's
-way out and back, which is all that both numbers need. Where CalculiX finds no solution on a coarser mesh, or does not
-end, meshes of nearly that size are tried, and the failed tries cost nothing here. Meshing is counted on neither side.
+The same scenes solved with other settings, {count} of the test scenes ({first} to {last}). Errors are relative to
+the scene's own mesh, as the run's are. A frame of the dataset is solved in at least 4 increments; two steps are the
+ram's way out and back, which is all that both numbers need. Where CalculiX finds no solution on a coarser mesh, or does
+not end, meshes of nearly that size are tried, and the failed tries cost nothing here. Meshing is counted on neither
+side.
 """
 
 _FINER = """
@@ -106,7 +107,7 @@ def _figures(found: dict[str, Any]) -> list[str]:
 
 
 def _beside_process(scenes: Sequence[dict[str, Any]], title: str) -> str:
-    """How large the median errors of the run are beside those of the Gaussian process, with intervals of 95 % by
+    """How large the median errors of the run are beside the errors of the Gaussian process, with intervals of 95 % by
     bootstrap over the scenes, and who is ahead by them."""
     drawn = np.random.default_rng(0).integers(len(scenes), size=(RESAMPLES, len(scenes)))
     told = []
@@ -116,9 +117,7 @@ def _beside_process(scenes: Sequence[dict[str, Any]], title: str) -> str:
         ahead = "the Gaussian process is ahead" if low > 1 else "the run is ahead" if high < 1 else "both are level"
         ratio = np.median(ours) / np.median(theirs)
         told.append(f"in {what} {ratio:.2g} ({low:.2g} to {high:.2g}) times as large, {ahead}")
-    return (
-        f"{len(scenes)} {title}: the median error of the run beside that of the Gaussian process is {'; '.join(told)}."
-    )
+    return f"{len(scenes)} {title}: beside the Gaussian process, the median error of the run is {'; '.join(told)}."
 
 
 def _median(scenes: Sequence[dict[str, Any]], key: str) -> str:
@@ -138,8 +137,8 @@ def _worst(scenes: Sequence[dict[str, Any]]) -> str:
 
 
 def settings(found: dict[str, Any], number: str) -> dict[str, Setting]:
-    """The errors and the seconds of the run, of the Gaussian process and of every way of CalculiX in the scenes that
-    were solved in other ways, by their names; infinite where there is no solution."""
+    """The errors and the seconds of the run, of the Gaussian process and of every setting of CalculiX in the scenes
+    that were solved with other settings, by their names; infinite where there is no solution."""
     scenes = [scene for scene in found["scenes"] if scene["name"] in clip_ways.SCENES]
     seconds = {"run": "seconds", "run_two_frames": "seconds_of_two"}
     made = {}
@@ -159,7 +158,7 @@ def settings(found: dict[str, Any], number: str) -> dict[str, Setting]:
 
 
 def _ways(found: dict[str, Any]) -> list[str]:
-    """The table of the ways, who is as accurate as the run, and after how many questions each answer pays."""
+    """The table of the settings, who is as accurate as the run, and after how many questions each answer pays."""
     off = {number: settings(found, number) for number in Outcome._fields}
     count = len(off["set"][OWN.name].errors)
     within = f"{math.ceil(0.9 * count)} of {count} below"
@@ -188,7 +187,7 @@ def _time(seconds: float) -> str:
 
 
 def _verdicts(found: dict[str, Any], off: dict[str, dict[str, Setting]]) -> list[str]:
-    """The fastest way that is as accurate as the run, and the questions after which the run pays."""
+    """The fastest setting that is as accurate as the run, and the questions after which the run pays."""
     run = off["set"][ANSWERS[1][0]]
     simulated = found["simulation_seconds"]
     invested = simulated["train"] + simulated["valid"] + found["training_seconds"]
@@ -208,8 +207,8 @@ def _verdicts(found: dict[str, Any], off: dict[str, dict[str, Setting]]) -> list
         ratios = np.array(best.seconds) / np.array(run.seconds)
         spread = median_error(ratios[np.isfinite(ratios)])  # without scenes in which it finds no solution
         lines.append(
-            f"- The fastest way of CalculiX that is as accurate as the run {what}, in 90 % of the scenes: {best.name},"
-            f" {_time(best.middle)}, {np.median(ratios):.0f} ± {spread:.0f} times as long as the frames 3"
+            f"- The fastest setting of CalculiX that is as accurate as the run {what}, in 90 % of the scenes:"
+            f" {best.name}, {_time(best.middle)}, {np.median(ratios):.0f} ± {spread:.0f} times as long as the frames 3"
             f" and 6 of the run. Beside it the run pays after {_questions(invested, best, run)}."
         )
     return lines
@@ -221,7 +220,7 @@ def _questions(invested: float, solver: Setting, run: Setting | None = None) -> 
 
 
 def _finer(found: dict[str, Any]) -> list[str]:
-    """The error of the mesh beside that of the run."""
+    """The error of the mesh beside the error of the run."""
     solved = found["ways"][FINER.name]
     lines = [
         _FINER.format(nodes=round(FINER.share * found["plan"]["nodes"])),

@@ -81,8 +81,9 @@ def solved(drawn: Sequence[Values], nodes: int, file: Path) -> dict[str, list[di
 
 
 def _solved(way: Way, spec: AssemblySpec, values: Values, nodes: int) -> dict[str, Any]:
-    """The nodes, the outcome and the processor seconds of the first solve that ends, and why those before it failed. If
-    a coarser mesh fails, others of nearly that size are tried, as a user would do; failed solves cost nothing."""
+    """The nodes, the outcome and the processor seconds of the first solve that ends, and why the solves before it
+    failed. If a coarser mesh fails, others of nearly that size are tried, as a user would do; failed solves cost
+    nothing."""
     failures = []
     for nearby in NEARBY if way.share < 1 else NEARBY[:1]:
         try:

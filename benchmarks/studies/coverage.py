@@ -1,5 +1,5 @@
-"""Do bands and asked errors hold? In how many fresh scenes all errors lie within the band, how many keep an error that
-an effort was chosen for, and how many strange scenes are told.
+"""Do bands and promised errors hold? In how many fresh scenes all errors lie within the band, how many keep an error
+that an effort was chosen for, and how many strange scenes are told.
 
 `python -m benchmarks.studies.coverage [ROW ...]` calibrates the run of each row (the plates' comes with the package,
 the products' are of `benchmarks.studies.assembly`) on a hundred scenes, and predicts fresh ones, and changed ones, with
@@ -31,7 +31,7 @@ from benchmarks.studies.rows import study_rows
 RESULTS = Path(__file__).parents[1] / "results" / "coverage.json"
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "coverage.md"
 SEEDS = {"calibration": 911, "fresh": 912}
-STRANGE = 40  # so many fresh scenes are changed
+STRANGE = 40  # fresh scenes that are changed
 ASKED = {
     "displacement": (0.1, 0.08, 0.05, 0.025, 0.02, 0.015, 0.01),
     "reaction": (0.5, 0.2, 0.1, 0.05, 0.02),
@@ -193,7 +193,7 @@ def _beam(height: float) -> Question:
 
 
 def unusual(run: ast_sim.Run, questions: Sequence[Question]) -> dict[str, int]:
-    """The number of questions, asked at the last frame by one call; of them the number outside the ranges of the
+    """The number of questions, for the last frame by one call; of them the number outside the ranges of the
     training, the number that the network finds unlike the calibration scenes, and the number told by either."""
     answers = [run.predict(*one, frames=[-1], effort=ast_sim.Effort(), throw=False) for one in questions]
     unlike = [one.p_value is not None and one.p_value <= UNUSUAL for one in answers]
@@ -207,7 +207,7 @@ def unusual(run: ast_sim.Run, questions: Sequence[Question]) -> dict[str, int]:
 
 
 def promises(run: ast_sim.Run, truths: Sequence[ast_sim.Trajectory]) -> dict[str, Any]:
-    """The errors that each effort of a calibrated run keeps; for asked ones the effort that is chosen, and in how many
+    """The errors that each effort of a calibrated run keeps; for wanted ones the effort that is chosen, and in how many
     of the fresh scenes within its ranges it keeps them."""
     assert run.calibration is not None
     kept = run.calibration.kept

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-_INTRODUCTION = """# Do bands and asked errors hold?
+_INTRODUCTION = """# Do bands and promised errors hold?
 
 Made by `python -m benchmarks.studies.coverage` from `benchmarks/results/coverage.json`; do not edit.
 
@@ -16,10 +16,10 @@ interval that contains this number in 99 of 100 such trials (beta-binomial). "Wi
 the widest band divided by the median of the largest error. Where the run warns that a scene is outside its training or
 unlike its calibration scenes, there is no band.
 
-An asked error (`predict(error=...)`) is kept if the answer at the deepest frame is at most so far off. It is promised
-for 90 of 100 scenes, among those without a warning.
+A wanted error (`predict(error=...)`) is kept if the error of the answer at the deepest frame is no larger. It is
+promised for 90 of 100 scenes, among the scenes without a warning.
 
-"Told" counts questions with a warning: those outside the ranges of the training, and those that the network finds
+"Told" counts questions with a warning: scenes outside the ranges of the training, and scenes that the network finds
 unlike the calibration scenes (p-value at most 0.05: by chance one ordinary scene in twenty).
 """
 
@@ -60,7 +60,7 @@ def _section(result: dict[str, Any]) -> list[str]:
         "",
         f"{result['calibration_scenes']} calibration scenes. {sum(inside)} of {len(inside)} numbers are as expected.",
         *_table(["effort", "band of", "held", "expected", "width"], bands, texts=2),
-        *_table(["error of", "asked", "effort", "kept"], promises, texts=1),
+        *_table(["error of", "wanted", "effort", "kept"], promises, texts=1),
         *_table(["questions", "asked", "outside", "unlike", "told"], told, texts=1),
     ]
 

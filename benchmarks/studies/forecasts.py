@@ -90,7 +90,7 @@ Made by `python -m benchmarks.studies.forecasts` from `benchmarks/results/foreca
 `ast-sim plan` forecasts the error of a training from shorter ones ([how](../how-to/plan-training.md)). Here each
 forecast is checked by the training itself, which has {1 / LONGEST:g} times the steps of the longest trial. The trials
 are whole trainings of `tiny` at three learning rates and of a model that is {WIDER:g} times as wide; in each of three
-rounds the better half goes on, with {GROWTH} times the steps. Errors are those of the network alone on validation
+rounds the better half goes on, with {GROWTH} times the steps. Errors are measured with the network alone on validation
 scenes, relative to their displacement. The forecast goes on along the power of the two longest trials, times
 {DAMPING:g}; its interval reaches {100 * SPREAD:.0f} % above it and as far below as a factor. Both numbers were chosen
 after these trainings, so other data may do worse. The steps of each trial are given, not measured, so that other work

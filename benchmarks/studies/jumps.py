@@ -25,7 +25,7 @@ from benchmarks.studies.validation_curve import curve_line, minutes_per_step, va
 
 RESULTS = Path(__file__).parents[1] / "results" / "jumps.json"
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "jumps.md"
-MORE_CALLS = 2  # the page shows so many corrections more than the model was trained for
+MORE_CALLS = 2  # corrections on the page beyond the number that the model was trained for
 TRAINING_SCENES = 100  # of the training split, whose error stands beside the one of test scenes
 WITH_NEWTON = tuple((corrections, steps) for corrections in (0, 1) for steps in (1, 2, MOST_NEWTON_STEPS))
 
@@ -42,7 +42,7 @@ class Row:
         model: a registered model, in its preset `tiny`.
         model_settings: settings of the model, beyond the preset.
         settings: settings of the training.
-        rivals: in so many test scenes the solver is run.
+        solver_scenes: the number of test scenes in which the solver is run.
     """
 
     title: str
@@ -60,7 +60,7 @@ class Row:
     model: str = "ast"
     model_settings: dict[str, Any] = field(default_factory=dict)
     settings: dict[str, Any] = field(default_factory=dict)
-    rivals: int = 0
+    solver_scenes: int = 0
 
 
 _PLATES = {"family": "deforming_plate", "frames": 41}
@@ -74,7 +74,7 @@ _MIRRORED = {"mirror": ("x", "y"), "validate_scenes": 20}
 _TURNED = {"mirror": ("x", "y", "z"), "validate_scenes": 60}
 ROWS = {
     "plates400": Row(
-        "Plates, 400 nodes, 10,000 steps", steps=10_000, settings=_MIRRORED, rivals=10, **_PLATES_400
+        "Plates, 400 nodes, 10,000 steps", steps=10_000, settings=_MIRRORED, solver_scenes=10, **_PLATES_400
     ),
     "plates400_seed1": Row(
         "Plates, 400 nodes, second seed", steps=10_000, settings={**_MIRRORED, "seed": 1}, **_PLATES_400
@@ -83,7 +83,7 @@ ROWS = {
         "Plates, 400 nodes, third seed", steps=10_000, settings={**_MIRRORED, "seed": 2}, **_PLATES_400
     ),
     "plates400_long": Row(
-        "Plates, 400 nodes, 20,000 steps, with reactions", steps=20_000, settings=_MIRRORED, rivals=10,
+        "Plates, 400 nodes, 20,000 steps, with reactions", steps=20_000, settings=_MIRRORED, solver_scenes=10,
         model_settings={"state": ("reaction",)}, **_PLATES_400,
     ),
     "plates400_transolver": Row(
@@ -98,14 +98,16 @@ ROWS = {
         settings={**_MIRRORED, "batch_size": 4, "peak_rate": 1e-3, "validate_every": 1500, "checkpoint_every": 1500},
         **_PLATES,
     ),
-    "plates1300": Row("Plates, 1,300 nodes, 12,000 steps", steps=12_000, settings=_MIRRORED, rivals=10, **_PLATES_1300),
+    "plates1300": Row(
+        "Plates, 1,300 nodes, 12,000 steps", steps=12_000, settings=_MIRRORED, solver_scenes=10, **_PLATES_1300
+    ),
     "plates1300_transolver": Row(
         "Plates, 1,300 nodes, Transolver", steps=14_100, model="transolver", settings=_MIRRORED, **_PLATES_1300
     ),
     "plates1300_second_order": Row(
-        "Plates, 1,300 nodes, second-order", steps=12_000, settings=_MIRRORED, rivals=10, **_SECOND_ORDER
+        "Plates, 1,300 nodes, second-order", steps=12_000, settings=_MIRRORED, solver_scenes=10, **_SECOND_ORDER
     ),
-    "parts400": Row("Pairs of parts, 400 nodes", steps=10_000, settings=_TURNED, rivals=5, **_PARTS),
+    "parts400": Row("Pairs of parts, 400 nodes", steps=10_000, settings=_TURNED, solver_scenes=5, **_PARTS),
     "parts400_transolver": Row(
         "Pairs of parts, 400 nodes, Transolver", steps=11_800, model="transolver", settings=_TURNED, **_PARTS
     ),
@@ -131,7 +133,7 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
     row = ROWS[name]
     run, data = trained(name, folder)
     with run.open(data) as dataset:
-        found = deepest_frames(run.model, dataset, "test", run.effort, row.rivals)
+        found = deepest_frames(run.model, dataset, "test", run.effort, row.solver_scenes)
         known = deepest_frames(run.model, dataset, "train", run.effort, most_scenes=TRAINING_SCENES).relative_error
         dial = [_turned(run, dataset, effort) for effort in _efforts(run)]
     return {

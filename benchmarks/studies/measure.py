@@ -53,7 +53,7 @@ def phases(truth: Trajectory) -> dict[str, np.ndarray] | None:
 
 
 def repeated(truth: Trajectory, horizons: int) -> Trajectory:
-    """The trajectory with its frames forward, backward, forward ... for so many times its length."""
+    """The trajectory with its frames forward, backward, forward ... for `horizons` times its length."""
     there, last = np.arange(1, truth.num_frames), truth.num_frames - 1
     order = np.concatenate([[0], *(there if i % 2 == 0 else last - there for i in range(horizons))])
     stress = None if truth.stress is None else truth.stress[order]

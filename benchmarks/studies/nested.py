@@ -33,12 +33,12 @@ NESTED = frozenset(way.name for way in VARIANTS if way.newton)
 
 @dataclass(frozen=True)
 class Plates:
-    """Plates that no training has seen; those of the same seed and split are scenes of the study of jumps.
+    """Plates that no training has seen; plates of the same seed and split are scenes of the study of jumps.
 
     Attributes:
         title: what the page calls them.
         nodes, split, scenes, frames, keep: of the dataset.
-        rounds: so often are the scenes measured; the smallest time of each way and of each answer counts.
+        rounds: how often the scenes are measured; the smallest time of each setting and of each answer counts.
         run: whether the run that comes with the package is for plates of this size.
     """
 
@@ -59,7 +59,7 @@ SETS = (
 
 
 def measured(plates: Plates, folder: Path) -> dict[str, Any]:
-    """Each scene with the figures of all ways and answers."""
+    """Each scene with the figures of all settings and answers."""
     counts = {"train": 0, "valid": 0, "test": 0, plates.split: plates.scenes}
     data = ast_sim.generate(
         "deforming_plate", folder / f"plates{plates.nodes}.h5", seed=11, nodes=plates.nodes, frames=plates.frames,
@@ -110,7 +110,7 @@ def _keep_faster(known: dict[str, dict[str, Any]], name: str, figures: dict[str,
 
 
 def cheapest(scene: dict[str, Any], error: float, nested: bool) -> tuple[str, float] | None:
-    """The name and the seconds of the fastest way with at most this error; with nested iteration or without it."""
+    """The name and the seconds of the fastest setting with at most this error; with nested iteration or without it."""
     fit = [
         (way["seconds"], name)
         for name, way in scene["ways"].items()
@@ -137,8 +137,8 @@ family or a specification has one. A mesh from a file has none, so there the sol
 
 Each scene is solved to its deepest frame in {both} settings. In each scene the fastest counts whose error is at most
 the error asked for; who does not know the truth cannot choose so well. Without nested iteration there are {plain}
-settings: stop tests, ranges of contact, coarser meshes, 6, 12 and 24 linearised steps. The error is that of the
-positions of the free nodes to the frame of the dataset, a share of their displacement. Times are medians over the
+settings: stop tests, ranges of contact, coarser meshes, 6, 12 and 24 linearised steps. The error compares the
+positions of the free nodes with the frame of the dataset, as a share of their displacement. Times are medians over the
 scenes of processor time on one thread, on a shared machine ({processor}); where scenes were measured several times, the
 smallest time counts. Times count what is prepared for both meshes, the coarse solution and the transfer, but no
 meshing. A ratio is the median over the scenes, with its standard error.
@@ -208,7 +208,7 @@ def _head(names: Sequence[str]) -> list[str]:
 
 
 def _compared(scenes: Sequence[dict[str, Any]], errors: Sequence[float]) -> list[str]:
-    """The cells of a level: median seconds without and with, their ratio, and the ways that were the fastest."""
+    """The cells of a level: median seconds without and with, their ratio, and the fastest settings."""
     pairs = [(cheapest(*each, nested=False), cheapest(*each, nested=True)) for each in zip(scenes, errors, strict=True)]
     both = [(plain, best) for plain, best in pairs if plain is not None and best is not None]
     if not both:

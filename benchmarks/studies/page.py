@@ -20,18 +20,18 @@ INTRODUCTION = """# The models compared
 
 Made by `python -m benchmarks.studies STUDY.toml`; the studies lie in `benchmarks/studies`. All runs of a study have the
 same scenes, splits and budget, and the same training but for what is said to be set otherwise; the state noise, of
-which a model that is trained along its own rollouts needs less, stands in the tables. Each has the learning rate of
-those tried with which its rollouts of the validation scenes are best, and the checkpoint that is evaluated is chosen
-by such rollouts, too. The budget is so many steps as fit in it at the speeds that were measured in turns before, those
-of rows that came later in turns with a row that was there and in proportion to its speed; what the training then took
-by the clock, beside other work, is told, too. Errors are those of the test scenes, on nodes that the model moves: root
-mean squares over coordinates, by sequence (`rmse_sequence`, as in the AST paper) or pooled over everything
-(`rmse_pooled`, as in MeshGraphNets); means over the seeds, with the least and the largest in brackets. All
-models go step by step here (`model.jumps=false`).
+which a model that is trained along its own rollouts needs less, stands in the tables. Each model has the learning rate,
+of several, with which its rollouts of the validation scenes are best. Such rollouts also choose the checkpoint that is
+evaluated. A training has as many steps as fit in the budget at the speed of the model. The speeds were measured in
+turns before; rows that came later were measured in turns with a row that was there, and in proportion to its speed.
+What the training then took by the clock, beside other work, is told, too. Errors are measured on the test scenes, on
+nodes that the model moves: root mean squares over coordinates, by sequence (`rmse_sequence`, as in the AST paper) or
+pooled over everything (`rmse_pooled`, as in MeshGraphNets); means over the seeds, with the least and the largest in
+brackets. All models go step by step here (`model.jumps=false`).
 """
 
-AIM = 0.5  # AST's rollout error over that of the best baseline; the paper reports 0.38 on deforming_plate
-BASELINES = ("mgn", "bsms", "hcmt")  # those of the paper
+AIM = 0.5  # AST's rollout error over the best baseline's; the paper reports 0.38 on deforming_plate
+BASELINES = ("mgn", "bsms", "hcmt")  # of the paper
 
 Run = dict[str, Any]
 
@@ -87,7 +87,7 @@ def scenes(counts: dict[str, Any], data: dict[str, Any]) -> str:
 
 
 def seeds(models: dict[str, Any]) -> str:
-    """The seeds of the runs: of most rows, then of those that have others."""
+    """The seeds of the runs: of most rows, then of rows that have others."""
     rows = {name: ", ".join(str(run["seed"]) for run in model["runs"]) for name, model in models.items()}
     (common, _), *others = Counter(rows.values()).most_common()
     told = "; ".join(f"{', '.join(name for name in rows if rows[name] == theirs)}: {theirs}" for theirs, _ in others)
@@ -174,8 +174,8 @@ def opponents(models: dict[str, Any]) -> tuple[str, str] | None:
     errors = rollout_errors(models)
     known = [name for name in models if errors[name] is not None]
     ours = next((name for name in known if models[name]["model"] == "ast"), None)
-    rivals = [name for name in known if models[name]["model"] in BASELINES]
-    return (ours, min(rivals, key=errors.__getitem__)) if ours and rivals else None
+    baselines = [name for name in known if models[name]["model"] in BASELINES]
+    return (ours, min(baselines, key=errors.__getitem__)) if ours and baselines else None
 
 
 def verdict(models: dict[str, Any]) -> list[str]:
@@ -187,7 +187,8 @@ def verdict(models: dict[str, Any]) -> list[str]:
     errors = rollout_errors(models)
     ratio = errors[ours] / errors[best]
     text = (
-        f"**The rollout error of {ours} is {number(ratio)} of that of the best baseline, {best}** (the aim is {AIM:g}"
+        f"**The rollout error of {ours} is {number(ratio)} times the error of the best baseline, {best}**"
+        f" (the aim is {AIM:g}"
     )
     text += ", reached)" if ratio <= AIM else ", not reached)"
     if "MGN" in models:
@@ -203,7 +204,7 @@ def verdict(models: dict[str, Any]) -> list[str]:
 
 
 def glance(studies: dict[str, Any]) -> list[str]:
-    """All studies in one table: AST's errors beside those of the best baseline of each, and over them."""
+    """All studies in one table: AST's errors beside the errors of the best baseline of each, and over them."""
     columns = {
         "rollout, mm": ERRORS["rollout, mm"],
         "first contact, mm": BY_PHASE["first contact"],
@@ -229,7 +230,7 @@ def glance(studies: dict[str, Any]) -> list[str]:
 
 
 def own_settings(study: dict[str, Any], models: dict[str, Any]) -> list[str]:
-    """What was set beyond the presets: in all runs, then in those of a row."""
+    """What was set beyond the presets: in all runs, then in the runs of a row."""
     rows = [("all", study["settings"]), *((name, model["settings"]) for name, model in models.items())]
     told = [f"{name}: `{' '.join(settings)}`" for name, settings in rows if settings]
     return [f"Set beyond the presets. {'; '.join(told)}.", ""] if told else []

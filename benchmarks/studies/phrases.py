@@ -15,7 +15,7 @@ RESAMPLES = 2000
 
 def beside_solver(scenes: Sequence[dict[str, Any]], errors: Sequence[float | None], seconds: Sequence[float]) -> str:
     """The solver's time and its ratio to the answers', where the solver was run and the answer did not fail. In each
-    scene the fastest way counts that is as accurate as the answer; the own stop test always is."""
+    scene the fastest setting counts that is as accurate as the answer; the own stop test always is."""
     taken, ratios = [], []
     for scene, error, answer in zip(scenes, errors, seconds, strict=True):
         solver = scene["solver"]
@@ -42,7 +42,7 @@ def over_the_scenes(scenes: Sequence[dict[str, Any]]) -> str:
 
 
 def settings_tried(rows: Iterable[dict[str, Any]]) -> str:
-    """In how many settings the solver was run, such as "13 settings": rows may be older than some of its ways."""
+    """In how many settings the solver was run, such as "13 settings": rows may be older than some of them."""
     titles: dict[str, list[str]] = {}
     for row in rows:
         ways = {name for scene in row["scenes"] if scene["solver"] for name in scene["solver"]["ways"]}
@@ -63,13 +63,13 @@ def _settings(ways: set[str]) -> str:
 
 
 def times_as_long(taken: Sequence[float], ratios: Sequence[float]) -> str:
-    """The median of the solver's seconds, and the median of its times over those of the answers, with its standard
+    """The median of the solver's seconds, and the median of its times over the answers' times, with its standard
     error."""
     spread = f" ± {median_error(ratios):.1g}" if len(ratios) > 1 else ""
     return f"{1000 * np.median(taken):.0f} ms, {np.median(ratios):.2g}{spread} times as long"
 
 
 def median_error(values: Sequence[float]) -> float:
-    """The standard error of the median, by drawing the values anew with replacement (bootstrap)."""
+    """The standard error of the median, by drawing the values again with replacement (bootstrap)."""
     drawn = np.random.default_rng(0).choice(np.asarray(values), (RESAMPLES, len(values)))
     return float(np.median(drawn, axis=1).std())

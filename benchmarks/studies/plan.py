@@ -28,7 +28,7 @@ from ast_sim.support.toml_settings import from_values
 
 @dataclass(frozen=True)
 class Data:
-    """The scenes: generated, `train`, `valid` and `test` of them, or those of the file `path`."""
+    """The scenes: generated, `train`, `valid` and `test` of them, or the scenes of the file `path`."""
 
     path: str | None = None
     family: str | None = None
@@ -64,7 +64,7 @@ class Study:
         search: share of the budget with which the rates are compared; 1: the best of these runs is the first one.
         settings: of every run, beyond its preset.
         validations: rollouts of the validation scenes during a training; the checkpoint of the best is evaluated.
-        horizons: test scenes are rolled out for so many times their length.
+        horizons: how long test scenes are rolled out, in lengths of a scene.
     """
 
     title: str

@@ -29,7 +29,7 @@ def study_rows(
     Args:
         about: the docstring of the study; its first line is the help.
         rows: the names of all rows.
-        arguments: of the command line; None: those of the process.
+        arguments: of the command line; None: the arguments of the process.
         measured: gives the result of a row; it keeps data and runs in the folder.
         said: what is printed of a result.
         kept: the files of the results (JSON, by row) and of the page.

@@ -128,8 +128,8 @@ def measure_speeds(jobs: list[Job]) -> None:
     """Measure, in turns, the seconds of a training step of each model, without validations and checkpoints.
 
     The least of all turns counts: what else the machine does must not give one model more steps than another. Neither
-    must the hour: where the speed of an entry is known, it is measured once more beside those that are missing, and
-    these are told as they would have been then.
+    must the hour: where the speed of an entry is known, it is measured once more beside the missing ones, and these are
+    told as they would have been then.
 
     Raises:
         ConfigError: a model does not train, with its name and the reason.

@@ -1,4 +1,4 @@
-"""How the errors of a run fell while it was trained: those of its validations, at the deepest frame."""
+"""How the errors of a run fell while it was trained, by its validations, at the deepest frame."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ PROBLEMS: dict[str, Problem] = {problem.name: problem for theme in THEMES.values
 INTRODUCTION = """# Verification
 
 Problems with known answers, solved by the solver that makes the datasets: its energies, its contact and its Newton
-iteration, unchanged. Written by `python -m benchmarks.verification`; those that take seconds run with the tests.
+iteration, unchanged. Written by `python -m benchmarks.verification`; problems that take seconds run with the tests.
 
 How to read a row: *error* is the difference to the expected value, relative to it, or absolute where the quantity says
 what it is relative to. *Tolerance* is not chosen after the fact but follows from what is written beside it: the order

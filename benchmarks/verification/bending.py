@@ -45,11 +45,11 @@ def timoshenko(poisson: float) -> float:
 
 
 def cantilever_study(poisson: float, layers: list[int]) -> tuple[list[Row], Picture, list[float]]:
-    """Rows, convergence plot and relative errors on the meshes with so many layers."""
+    """Rows, convergence plot and relative errors on the meshes with these numbers of layers."""
     expected, forces = timoshenko(poisson), [tip_force(n, poisson) for n in layers]
     errors = [force / expected - 1 for force in forces]
     order, limit = observed_order([1 / n for n in layers], forces)
-    # How far the next term, of order h^4, moves the limit: that of the two finest meshes, with the order 2, beside it.
+    # How far the next term, of order h^4, moves the limit: beside it the limit of the two finest meshes, with order 2.
     uncertainty = abs(forces[-1] + (forces[-1] - forces[-2]) / 3 - limit) / expected
     # The clamp keeps the root section from warping, and from contracting over about h / 2 where nu > 0: there the
     # stiffness is up to EI / (1 - nu^2), and that length takes part in the deflection by its share times 3.

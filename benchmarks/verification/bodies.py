@@ -104,7 +104,7 @@ def box(size, cells, jitter: float = 0.0, seed: int = 0) -> tuple[np.ndarray, np
     Args:
         size: along x, y, z.
         cells: along x, y, z.
-        jitter: inner nodes are moved at random by up to this share of a cell, those of a face within the face.
+        jitter: inner nodes are moved at random by up to this share of a cell, nodes of a face within the face.
         seed: of the random numbers.
     """
     coordinates, elements = mesh.hexahedral_grid(tuple(cells))

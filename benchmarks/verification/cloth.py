@@ -84,7 +84,7 @@ def cloth_case(
 
 
 def march(case: ClothCase, steps: int) -> tuple[BackwardEuler, np.ndarray, np.ndarray, float]:
-    """The solver after so many steps, all energy [steps + 1] in joule, momentum [steps + 1,3], and the smallest gap."""
+    """The solver after `steps` steps, all energy [steps + 1] in joule, momentum [steps + 1,3], and the smallest gap."""
     solver = BackwardEuler(case, DynamicSettings(acceleration_tolerance=1e-6, max_iterations=200))
     mass = solver.mass[:, None]
 

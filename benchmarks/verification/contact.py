@@ -102,7 +102,7 @@ def stacked_rows(cells: tuple[int, int], dhat: float) -> list[Row]:
     bottom, top = reactions[blocks.bottom].sum(), reactions[blocks.top].sum()
     return [
         relative(
-            f"{name}: pressure on the top / that of uniaxial strain",
+            f"{name}: pressure on the top, as in uniaxial strain",
             pressure,
             abs(top),
             modulus * dhat / (2 * SIZE[2] * pressure),

@@ -65,7 +65,7 @@ def drag() -> Outcome:
     ratio = np.array(tangential) / np.array(normal)
     sliding = ratio[-4:]
     # In a sliding step every point slips by `step`, more than the sticking slip: friction is full. Its normal forces
-    # are those of one pass before; they change over the length of the block, so in a step by step / length.
+    # come from one pass before; they change over the length of the block, so in a step by step / length.
     lag = step / SIZE[0]
     source = f"normal forces of one pass before: step / length of the block = {lag:.0e}"
     way = step * np.arange(1, steps + 1)
@@ -137,7 +137,7 @@ def slide(tangent: float, friction: float, time_step: float, steps: int) -> np.n
 
 
 def slope(shares: tuple[float, ...]) -> Outcome:
-    """With tan(theta) so many times mu: below and above the angle of friction."""
+    """With tan(theta) these shares of mu: below and above the angle of friction."""
     friction, time_step, steps = 0.5, 0.02, 15
     n = np.arange(steps + 1)
     rows, curves = [], []

@@ -196,7 +196,7 @@ def _pressure_picture(title: str, end: Indentation, p0: float, a: float, shape, 
         Curve("closed form", line * a, shape(line), "k-"),
         Curve("contact force / nodal area", end.radius[near], end.pressure[near] / p0, "."),
     ]
-    return Picture(title, "distance from the axis / a", "pressure / that of the closed form in the centre", curves)
+    return Picture(title, "distance from the axis / a", "pressure / closed form in the centre", curves)
 
 
 def _axis_picture(end: Indentation, p0: float, a: float) -> Picture:

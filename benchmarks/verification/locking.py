@@ -167,7 +167,7 @@ def cook() -> Outcome:
     found = {kind: [cook_tip(kind, n, 1 / 3, False) for n in sizes] for kind in ELEMENTS}
     source = "what is asked for: 10 %"
     rows.append(relative("nu = 1/3, second-order, 4 cells: rise", 23.96, found["second-order"][0], 0.1, source))
-    source = "that of 4 cells / 4^1.5: the stress is singular at a clamped corner"
+    source = "tolerance of 4 cells / 4^1.5: the stress is singular at a clamped corner"
     rows.append(relative("nu = 1/3, second-order, 16 cells: rise", 23.96, found["second-order"][-1], 0.0125, source))
     rows += same_as_calculix(sizes, found["second-order"], found["C3D10"], "cells")
     remarks.append("Plane stress, nu = 1/3, relative to 23.96:\n\n" + table("cells", sizes, divided(found, 23.96)))
@@ -209,7 +209,7 @@ def cost() -> Outcome:
             second.append(seconds)
             assert same == nodes
         ratio = float(np.median(second) / np.median(linear))
-        what = f"{nodes} nodes: time of an iteration / that of linear elements (< 2)"
+        what = f"{nodes} nodes: time of an iteration, relative to linear elements (< 2)"
         rows.append(Row(what, None, ratio, ratio, 2.0, "what is asked for: twice"))
         least, median = ([1e3 * float(of(one)) for one in (linear, second)] for of in (np.min, np.median))
         lines.append(
@@ -233,8 +233,8 @@ PROBLEMS = [
         "A bonded rubber pad",
         "A square pad, 10 x 10 x 1, between two rigid plates, nu = 0.499, pressed by 0.1 %. Pressure over strain"
         " against E + 6.748 G S^2 with the shape factor S = side / (4 thickness) = 2.5 (Gent and Meinecke; Kelly), in"
-        " series with the bulk modulus. An eighth is solved, on so many cells. The table gives all moduli relative to"
-        " the formula.",
+        " series with the bulk modulus. An eighth is solved; the table has the numbers of its cells, and all moduli"
+        " relative to the formula.",
         rubber,
         quick=rubber,
     ),

@@ -100,8 +100,8 @@ class Problem:
         title: its heading.
         text: set-up, closed form and where it comes from.
         solve: gives the outcome.
-        quick: gives, within a few seconds, the same or that of coarser meshes: it runs with the tests. None if there
-            is nothing quick to be said.
+        quick: gives, within a few seconds, the same outcome or the outcome of coarser meshes: it runs with the tests.
+            None if there is nothing quick to be said.
     """
 
     name: str

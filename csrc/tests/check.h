@@ -37,7 +37,7 @@ static float random_float(void) { return (float)(2 * random_unit() - 1); }
 #include "buffers.h"
 #include "pool.h"
 
-/* Largest errors against the exact values: at most twice that of plain float plus 1e-6 of the largest value. */
+/* Largest errors against the exact values: at most twice the error of plain float plus 1e-6 of the largest value. */
 static void check_accuracy(const char *what, const float *got, const double *exact, const float *plain, int64_t n) {
   double error = 0, plain_error = 0, largest = 0;
   for (int64_t i = 0; i < n; i++) {
@@ -50,8 +50,8 @@ static void check_accuracy(const char *what, const float *got, const double *exa
         plain_error);
 }
 
-/* What the formula gives for a problem, in double and in float. Every table is posed the same problems, and most of the
- * time of a test is that of its formula, so the latest results are kept, under the bits of all that makes a problem. */
+/* What the formula gives for a problem, in double and in float. Every table is posed the same problems, and the formula
+ * takes most of the time of a test, so the latest results are kept, under the bits of all that makes a problem. */
 enum { MOST_RESULTS = 12, MOST_KEPT = 1024 };
 typedef struct {
   uint64_t key;

@@ -1,4 +1,4 @@
-/* The formula of one row of mlp and its gradients; those of the weights are added to. Included by test_mlp.c once per
+/* The formula of one row of mlp and its gradients; weight gradients are added to. Included by test_mlp.c once per
  * type `real` of its arithmetic: as FORMULA in double, the exact values, and in float, whose errors are the measure. */
 #include <tgmath.h> /* exp, sqrt and others of the type of their argument */
 #undef I            /* of complex.h */

@@ -1,6 +1,6 @@
-/* Fuzzes attention and its gradients: a scene alone gives the bits that it gives in its batch, rows apart those of
- * dense ones, and where the scores are moderate,
- * results are those of the formula in double within the rounding of the scores, and not finite where those are not. */
+/* Fuzzes attention and its gradients: a scene alone gives the bits that it gives in its batch, rows apart give the bits
+ * of dense rows. Where the scores are moderate, results agree with the formula in double within the rounding of the
+ * scores, and are not finite where the formula is not. */
 #define main tests_of_attention
 #include "test_attention.c"
 #undef main
@@ -24,7 +24,7 @@ static void check_alone(const ast_kernels *kernels, const problem *a, const answ
   free_answer(alone);
 }
 
-/* Whether rows of n floats, `stride` apart, are those of x, with NaN as in new buffers between them. */
+/* Whether rows of n floats, `stride` apart, equal the rows of x, with NaN as in new buffers between them. */
 static bool same_apart(const float *got, const float *x, int64_t rows, int64_t n, int64_t stride) {
   float *expected = apart(x, rows, n, stride);
   const bool same = same_floats(got, expected, rows ? (rows - 1) * stride + n : 0);
@@ -56,7 +56,7 @@ static void compare_values(const char *what, const float *got, const double *exa
           "%s[%lld] is %g, not %g within %g", what, (long long)i, (double)got[i], exact[i], bound);
 }
 
-/* error: that of a weight, relative, from the rounding of its score */
+/* error: of a weight, relative, from the rounding of its score */
 static void check_values(const problem *a, const answer *r) {
   const int64_t row = a->H * a->D, queries = a->Tq * row, keys = a->Tk * row;
   const double q = largest_finite(a->q, queries), k = largest_finite(a->k, keys), v = largest_finite(a->v, keys);

@@ -1,5 +1,5 @@
 /* Fuzzes linear and its gradients: rows alone give the bits that they give among others, nothing depends on the rows'
- * strides or on which gradients are wanted, and where all sums are moderate the results are those of the formula in
+ * strides or on which gradients are wanted, and where all sums are moderate the results agree with the formula in
  * double within the rounding of their terms. */
 #define main tests_of_linear
 #include "test_linear.c"

@@ -1,5 +1,5 @@
-/* Fuzzes message and its gradients: the gradients that are not sums over edges, and the messages, of a scene alone are
- * those in a batch to the bit; where all values are moderate, sum and messages are those of the formula in double
+/* Fuzzes message and its gradients: the gradients that are not sums over edges, and the messages, have the same bits
+ * for a scene alone and in a batch; where all values are moderate, sum and messages agree with the formula in double
  * within a loose bound. */
 #define main tests_of_message
 #include "test_message.c"

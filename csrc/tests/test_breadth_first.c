@@ -1,4 +1,4 @@
-/* breadth_first against its definition, with a search through all elements for those of a node. */
+/* breadth_first against its definition, with a search through all elements for the elements of a node. */
 #include "problems.h"
 
 typedef struct {
@@ -6,8 +6,8 @@ typedef struct {
   const int64_t *elements, *wanted;
 } mesh;
 
-/* The nodes of a walk, each of which is marked. */
-static int64_t walk_from(const mesh *m, int64_t start, bool *marked, int64_t *nodes) {
+/* The nodes of a search, each of which is marked. */
+static int64_t search_from(const mesh *m, int64_t start, bool *marked, int64_t *nodes) {
   int64_t num = 0;
   nodes[num++] = start, marked[start] = true;
   for (int64_t i = 0; i < num; i++)
@@ -35,7 +35,7 @@ static void check_order(const ast_kernels *kernels, const mesh *m) {
     int64_t start = n, num = 0;
     for (int i = 0; i < 3; i++) {
       for (int64_t j = 0; j < num; j++) marked[nodes[j]] = false;
-      num = walk_from(m, start, marked, nodes);
+      num = search_from(m, start, marked, nodes);
       start = nodes[num - 1];
     }
     for (int64_t j = 0; j < num; j++, done++)

@@ -1,6 +1,6 @@
 /* linear and linear_backward against the formula in double, on every instruction set, serial and on a pool.
  *
- * Accuracy: the largest error is at most twice that of the same formula in plain float plus 1e-6 of the largest value.
+* Accuracy: the largest error is at most twice the error of the formula in plain float plus 1e-6 of the largest value.
  */
 #include "check.h"
 
@@ -91,7 +91,7 @@ static void test_accuracy(const ast_kernels *kernels) {
     }
 }
 
-/* A row's results are the same bits wherever it stands and whoever computes it; those of the weight for any threads. */
+/* A row's results are the same bits wherever it stands and whoever computes it; dW has the same for any threads. */
 static void test_same_bits(const ast_kernels *kernels) {
   static const int64_t sizes[2][2] = {{40, 70}, {299, 14}}; /* GEGLU of 14 has few outputs in each half */
   for (int i = 0; i < 6; i++) {

@@ -101,7 +101,7 @@ def equal(first, second) -> bool:
 
 
 def test_a_loader_makes_the_batches_of_the_model(data):
-    """Without noise they are those that the training itself would make of these pairs."""
+    """Without noise they are the batches that the training itself would make of these pairs."""
     model = new_model(data, "mgn", model_settings={"hidden": 8, "blocks": 1, "jumps": False})
     pairs = model.pairs(data)
     order = [4, 17, 0, 9]

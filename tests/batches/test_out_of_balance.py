@@ -47,7 +47,7 @@ def waves(rest: np.ndarray, size: float) -> np.ndarray:
 
 @pytest.mark.parametrize("order", [1, 2])
 def test_small_strains_give_the_forces_of_the_solver(order):
-    """Its law and that of St. Venant and Kirchhoff have one stiffness at rest."""
+    """Its law and the law of St. Venant and Kirchhoff have one stiffness at rest."""
     made = scene(order)
     rest = made.rest_position.astype(float)
     position = waves(rest, 2e-3)

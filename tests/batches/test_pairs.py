@@ -1,4 +1,4 @@
-"""The sampler: every pair once an epoch, noise where and as strong as asked, targets by hand."""
+"""The sampler: every pair once an epoch, noise where and as strong as wanted, targets by hand."""
 
 import math
 import weakref

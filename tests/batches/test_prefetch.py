@@ -1,4 +1,4 @@
-"""Batches drawn ahead are those of the sampler, in any order, and errors come with the batch that they belong to."""
+"""Batches drawn ahead are the sampler's, in any order, and errors come with the batch that they belong to."""
 
 import threading
 from dataclasses import replace
@@ -30,7 +30,7 @@ def dataset(tmp_path):
         yield dataset
 
 
-def test_batches_are_those_of_the_sampler_in_any_order(dataset):
+def test_batches_are_the_samplers_in_any_order(dataset):
     with Ahead(PairSampler(dataset, "train", **OPTIONS)) as ahead:
         for step in (0, 1, 2, 2, 7, 0, 1):
             batch, target = ahead.batch(step)

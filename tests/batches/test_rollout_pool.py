@@ -114,7 +114,7 @@ def test_with_inertia_a_faultless_model_leads_an_error_back_without_overshoot(tm
 
 
 def test_mirroring_turns_errors_back(dataset):
-    """Mirrored and not, the same scene has the same errors: those of the state are told from the truth."""
+    """Mirrored and not, the same scene has the same errors: the errors of the state are told from the truth."""
     assert_mirroring_turns_errors_back(
         pool(dataset, mirror=()),
         pool(dataset),

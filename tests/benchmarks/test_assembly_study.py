@@ -14,10 +14,10 @@ from benchmarks.studies import assembly
 def small(monkeypatch, tmp_path):
     """A row of three training scenes and four steps, and one that goes on from its run; results in a folder apart."""
     row = replace(
-        assembly.ROWS["bumper"], spec=write_assembly(tmp_path), nodes=100, train=3, valid=1, test=2, steps=4, rivals=1,
-        settings={"corrections": 1, "batch_size": 2, "statistics_pairs": 4},
+        assembly.ROWS["bumper"], spec=write_assembly(tmp_path), nodes=100, train=3, valid=1, test=2, steps=4,
+        solver_scenes=1, settings={"corrections": 1, "batch_size": 2, "statistics_pairs": 4},
     )  # fmt: skip
-    later = replace(row, title="Later", steps=2, settings={"batch_size": 2}, after="small", rivals=0)
+    later = replace(row, title="Later", steps=2, settings={"batch_size": 2}, after="small", solver_scenes=0)
     monkeypatch.setattr(assembly, "ROWS", {"small": row, "later": later})
     monkeypatch.setattr(assembly, "RESULTS", tmp_path / "results" / "assembly.json")
     monkeypatch.setattr(assembly, "PAGE", tmp_path / "assembly.md")

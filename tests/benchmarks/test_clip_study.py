@@ -22,7 +22,7 @@ from benchmarks.studies.clip_page import page
 from benchmarks.studies.clip_ways import FINER, OWN, Way
 
 
-def test_the_set_is_that_of_the_upper_face_and_the_peak_that_of_the_ram():
+def test_the_set_is_of_the_upper_face_and_the_peak_of_the_ram():
     rest = np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 10], [1, 0, 10], [0, 0, 12]])
     elements, kinds = np.int32([[0, 1, 2, 3]]), np.uint8([3, 3, 3, 0, 0, 1])
     assert NodeType.HANDLE == 3 and NodeType.OBSTACLE == 1

@@ -15,10 +15,12 @@ def small(monkeypatch, tmp_path):
     """One row of two training scenes and four steps, and the same row step by step; results in a folder of its own."""
     row = replace(
         jumps.ROWS["plates400"], data="small", nodes=100, frames=5, keep=None, train=2, valid=1, test=2,
-        steps=4, rivals=1,
+        steps=4, solver_scenes=1,
         settings={"mirror": ("x", "y"), "corrections": 1, "batch_size": 2, "statistics_pairs": 4},
     )  # fmt: skip
-    walk = replace(row, model_settings={"jumps": False}, settings={"batch_size": 2, "statistics_pairs": 4}, rivals=0)
+    walk = replace(
+        row, model_settings={"jumps": False}, settings={"batch_size": 2, "statistics_pairs": 4}, solver_scenes=0
+    )
     monkeypatch.setattr(jumps, "ROWS", {"small": row, "walk": walk})
     monkeypatch.setattr(jumps, "RESULTS", tmp_path / "results" / "jumps.json")
     monkeypatch.setattr(jumps, "PAGE", tmp_path / "jumps.md")
@@ -48,7 +50,7 @@ def test_a_row_is_trained_measured_and_shown_and_found_again(small):
     text = jumps.PAGE.read_text()
     assert f"{100 * row['relative_error']:.1f} ±" in text and "times as long" in text and "every frame" in text
     assert text.count("\n## ") == 2 and "Worst: test/" in text
-    jumps.main(["walk", "--folder", str(small / "data")])  # nothing is trained anew
+    jumps.main(["walk", "--folder", str(small / "data")])  # nothing is trained again
     assert json.loads(jumps.RESULTS.read_text())["walk"]["relative_error"] == walk["relative_error"]
 
 

@@ -39,7 +39,7 @@ def step(preset: str, what: str, ours: float, torch: float | None, **numbers) ->
     return {"preset": preset, "what": what, "shape": "a batch", "threads": 2, "samples": samples, **numbers}
 
 
-def test_the_ratio_is_that_of_the_best_peer():
+def test_the_ratio_is_to_the_best_peer():
     record = targets.judge(kernel("segment_sum", "7 rows", 1.0, slow=5.0, quick=3.0))
     assert record["peer"] == {"name": "quick", "min": 3.0} and record["ratio"] == 3.0
     assert "target" not in record and "reached" not in record

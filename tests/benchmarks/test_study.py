@@ -88,7 +88,7 @@ def test_phases_follow_contact_and_the_deepest_frame():
     assert phases(toy.plate(0)) is None
 
 
-def test_errors_of_a_phase_are_those_of_its_frames():
+def test_errors_of_a_phase_come_from_its_frames():
     truth = touching(0, 0, 1, 2, 2, 3, 2, 2, 1, 0, 0)
     position = truth.position.copy()
     position[3] += 0.5
@@ -271,7 +271,7 @@ def test_a_result_stands_for_the_same_entry_and_study(tmp_path):
     assert study.finished(file, plan, changed) == {}
 
 
-def test_a_failure_is_tried_anew(tmp_path, monkeypatch):
+def test_a_failure_is_tried_again(tmp_path, monkeypatch):
     data = toy.write(tmp_path / "toy.h5")
     plan, entries = read(written(tmp_path, TOML.replace("toy.h5", str(data))))
     with monkeypatch.context() as patch:
@@ -294,7 +294,7 @@ def page(folder, found, summary) -> None:
     text = (folder / "pages/study.md").read_text()
     assert f"{1e3 * summary:.3g}" in text and "every model stays finite" in text and "16 frame pairs" in text
     assert "all: `train.statistics_pairs=4`; ast: `model.hidden=16 model.L_SA=1 model.L_cell=3`." in text
-    assert "seeds 0; commit " in text  # not those that are still to come
+    assert "seeds 0; commit " in text  # not the ones that are still to come
     assert "by learning rate; the best in bold:\n\n| model | 0.0001 | 0.001 |\n| --- | ---: | ---: |\n| ast |" in text
     assert (folder / "pages/study/toy.svg").read_text().startswith("<?xml")
 
@@ -343,7 +343,7 @@ def test_the_verdict_names_the_best_baseline_and_who_is_better():
         "AST, other": {"model": "ast", "runs": [run_of(1.2e-3, 5.0)]},
     }
     (text, _) = study_page.verdict(models)
-    assert "0.6 of that of the best baseline, BSMS" in text and "0.5, not reached" in text
+    assert "0.6 times the error of the best baseline, BSMS" in text and "0.5, not reached" in text
     assert "0.25 of MGN's time" in text and text.endswith("Better: AST, other (0.48).")
     head, rule, line = [line for line in study_page.glance({"Toy": models, "no AST": {}}) if line.startswith("|")]
     assert line == "| Toy | AST | BSMS | 1.5 : 2.5 = **0.6** | - | - |"
@@ -351,10 +351,14 @@ def test_the_verdict_names_the_best_baseline_and_who_is_better():
     assert study_page.glance({"no AST": {"MGN": models["MGN"]}}) == []
     models["AST"]["runs"] = [run_of(1e-3, 5.0)]
     (text, _) = study_page.verdict(models)
-    assert "0.4 of that of" in text and "0.5, reached" in text and text.endswith("No other row has a smaller error.")
+    assert (
+        "0.4 times the error of" in text
+        and "0.5, reached" in text
+        and text.endswith("No other row has a smaller error.")
+    )
     del models["AST"]
     (text, _) = study_page.verdict(models)
-    assert text.startswith("**The rollout error of AST, other is 0.48 of that of the best baseline, BSMS**")
+    assert text.startswith("**The rollout error of AST, other is 0.48 times the error of the best baseline, BSMS**")
     assert (
         study_page.verdict({"AST, other": models["AST, other"]}) == []
         and study_page.verdict({"MGN": models["MGN"]}) == []

@@ -1,4 +1,4 @@
-"""Links lead somewhere: those of every Markdown page and notebook, and the pages that the code names."""
+"""Links lead somewhere: in every Markdown page and notebook, and from the code to its pages."""
 
 import json
 import re

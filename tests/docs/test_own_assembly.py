@@ -54,7 +54,7 @@ def test_the_python_of_the_page_gives_answers(walk):
         assert (folder / name).stat().st_size > 0, name
 
 
-def test_the_scenes_are_those_of_the_page(walk):
+def test_the_scenes_are_the_same_as_on_the_page(walk):
     from ast_sim.dataset.reader import Dataset
 
     with Dataset(walk[0] / "study.h5") as data:

@@ -20,7 +20,7 @@ FAMILIES = ("deforming_plate", "sphere_simple")
 
 
 def meta(family: str) -> dict[str, Any]:
-    """As the files of these names; that of sphere_simple as its paper describes it."""
+    """As the files of these names; for sphere_simple as its paper describes it."""
     plate = family == "deforming_plate"
     features = {
         "cells": {"type": "static", "shape": [1, -1, 4 if plate else 3], "dtype": "int32"},

@@ -115,6 +115,42 @@ def test_a_collection_orders_by_time_and_finds_files_in_folders(tmp_path):
     assert np.array_equal(read(path).position, given.position)
 
 
+@pytest.mark.parametrize(
+    ("names", "note"),
+    [
+        ("f0 f1 f2 f3 f4", None),
+        ("f10 f20 f30 f40 f50", None),
+        ("f0 f1 f3 f4 f5", "f3.vtu follows f1.vtu: is a frame missing between them?"),
+        ("f0 f10 f30 f40 f50", "f30.vtu follows f10.vtu: is a frame missing between them?"),
+        (
+            "press1_0 press1_1 press2_0 press2_1 press2_2",
+            "the frames stand in the order of 2 numbers in their names: press1_0.vtu, press1_1.vtu, press2_0.vtu, ...;"
+            " if these are several simulations, give each a folder of its own",
+        ),
+    ],
+)
+def test_names_that_may_mean_something_else_are_told(tmp_path, names, note):
+    given = starting_at_rest(block(1, 1, 1), 5)
+    write_series(tmp_path / "run", given, True)
+    for frame, name in enumerate(names.split()):
+        (tmp_path / "run" / f"frame_{frame}.vtu").rename(tmp_path / "run" / f"{name}.vtu")
+    found = read(tmp_path / "run")
+    assert np.array_equal(found.position, given.position) and found.attributes.get("notes") == note
+
+
+def test_with_inertia_all_time_steps_are_equal(tmp_path):
+    given = starting_at_rest(block(1, 1, 1), 4)
+    write_series(tmp_path / "frames", given, True, node_type=given.scene.node_type)
+    files = [f"frames/frame_{frame}.vtu" for frame in range(4)]
+    options = {"splits": {"train": 1}, "integration": "dynamic", "time_step": 0.1}
+    path = write_pvd(tmp_path / "run.pvd", files, [0, 0.1, 0.2005, 0.3])  # as an explicit solver writes them
+    assert convert(path, tmp_path / "a.h5", **options)["train"] == 1
+    write_pvd(path, files, [0, 0.1, 0.2, 0.4])
+    with pytest.raises(DatasetError, match="from frame 2 to 3 0.2 s pass, from most frames to the next 0.1 s"):
+        convert(path, tmp_path / "b.h5", **options)
+    assert convert(path, tmp_path / "b.h5", splits={"train": 1})["train"] == 1  # without inertia any times will do
+
+
 @pytest.mark.parametrize("options", [{"binary": False}, {"compression": None}, {"compression": "lzma"}, {}])
 def test_every_encoding_of_vtu(tmp_path, options):
     given = starting_at_rest(block(1, 1, 1), 1)

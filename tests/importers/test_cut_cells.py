@@ -43,7 +43,7 @@ def test_hexahedra_prisms_and_pyramids_are_cut_so_that_neighbours_fit(seed):
     volumes = signed_volumes(scene.rest_position, scene.elements)
     assert volumes.min() > 0 and volumes.sum() == pytest.approx(4) and len(np.unique(scene.body)) == 1
     a, b, c = np.moveaxis(scene.rest_position[scene.surface()].astype(float), 1, 0)
-    # Diagonals that do not fit leave faces within the body: then the surface is larger than that of the box.
+    # Diagonals that do not fit leave faces within the body: then the surface is larger than the box's.
     assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 == pytest.approx(2 * 4 + 4 * 2)
     assert not at_rest(scene)
     kinds = {"hexahedron": 2, "wedge": 2, "pyramid": 6}

@@ -140,7 +140,7 @@ def peak_of(call) -> int:
 def outcome(path: Path, meta, data: bytes) -> str | None:
     """The error that reading these bytes gives, None if they are read; the memory that it took is bounded."""
     path.touch()
-    with open(path, "r+b") as file:  # written over, not anew: some file systems wait for the disk then
+    with open(path, "r+b") as file:  # written over, not replaced: some file systems wait for the disk then
         file.write(data)
         file.truncate()
     errors = []

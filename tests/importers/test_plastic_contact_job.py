@@ -91,7 +91,7 @@ def test_plastic_strain_and_forces_are_predicted(data, tmp_path, capsys):
     pushed = truth.fields["reaction"].values[:, top].sum(axis=1)[:, 2]
     np.testing.assert_allclose([float(row["force_z"]) for row in told[1::2]], pushed, atol=0.1 * abs(pushed[-1]))
     assert -30 < pushed[-1] < -15
-    # The law of a body that yields is not known, so the force on the driven nodes is that of the predicted reactions.
+    # The law of a body that yields is not known, so the predicted reactions give the force on the driven nodes.
     again = ast_sim.Run(run).predict(truth)
     np.testing.assert_allclose(again.reaction()[:, 2], [float(row["force_z"]) for row in told[1::2]], rtol=1e-5)
     capsys.readouterr()

@@ -15,7 +15,7 @@ def values(payload: bytes, *names: str) -> dict[str, bytes]:
     return {name: payload[slice(*span)] for name, span in find_values(payload, names, "here").items()}
 
 
-def test_checksums_are_those_of_the_definition():
+def test_checksums_follow_the_definition():
     """RFC 3720, B.4; and the checksum of TFRecord that TensorFlow's own tests give for no bytes at all."""
     assert crc32c(b"123456789") == 0xE3069283
     assert crc32c(bytes(32)) == 0x8A9136AA

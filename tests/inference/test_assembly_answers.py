@@ -153,7 +153,7 @@ def test_what_differs_from_the_specification_of_the_training_is_told(change, tra
     assert line in answer.notes and answer.expected_error is None
 
 
-def test_a_specification_within_that_of_the_training_has_no_notes(trained, tmp_path):
+def test_a_specification_within_the_ranges_of_the_training_has_no_notes(trained, tmp_path):
     """Other comments, another place, one value instead of a range tell nothing."""
     spec, run = trained
     path = write_assembly(tmp_path, "# a copy\n" + SPEC.replace("[0.5, 1.5]", "1.2").replace("[1e6, 2e6]", "1.4e6"))
@@ -194,6 +194,11 @@ def test_wrong_questions(trained, tmp_path):
         (lambda: run.predict(scene, spec=spec), "leave scene, motion and stress out"),
         (lambda: run.predict(), "give a scene, or a specification"),
         (lambda: run.sweep(spec, {"travel": 2}, table=[{"travel": 1}]), "a table has the values of all parameters"),
+        (lambda: run.predict(spec=spec, num_frames=0), "num_frames is 0; it must be at least 2"),
+        (lambda: run.predict(spec=spec, num_frames=1), "num_frames is 1; it must be at least 2"),
+        (lambda: run.predict(spec=spec, num_frames=3.0), "num_frames is 3.0; must be a whole number"),
+        (lambda: run.predict(spec=spec, nodes=-5), "nodes is -5; it must be at least 1"),
+        (lambda: run.sweep(spec, {"travel": 2}, nodes="5"), "nodes is '5'; must be a whole number"),
         (lambda: run.sweep(spec, table=[]), "a sweep needs at least one row of values"),
         (
             lambda: run.predict(spec=write_assembly(metres, SPEC.replace('"mm"', '"m"'))),

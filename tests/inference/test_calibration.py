@@ -13,7 +13,8 @@ from ast_sim.inference.effort import Effort
 from ast_sim.inference.promises.calibration import Calibration, quantile
 from ast_sim.inference.promises.kept_errors import KeptErrors
 from ast_sim.inference.quantities.band import VALUES, Comparison, compared
-from ast_sim.support.errors import ConfigError
+from ast_sim.runs import checkpoint
+from ast_sim.support.errors import CheckpointError, ConfigError
 
 
 def test_the_quantile_is_the_score_of_the_rank():
@@ -113,6 +114,19 @@ def test_the_calibration_of_another_version_does_not_count(calibrated, tmp_path)
         run.folder.keep_calibration(result.to_json())
 
 
+def test_a_calibration_is_not_kept_beside_a_checkpoint_that_was_marked_since(calibrated, tmp_path):
+    """It would promise the errors of other weights."""
+    run, _, result = calibrated
+    opened = ast_sim.Run(shutil.copytree(run.path, tmp_path / "run"))
+    before = checkpoint.read_best(opened.path)
+    newer = checkpoint.at_step(opened.path, before.step + 1)
+    shutil.copytree(checkpoint.at_step(opened.path, before.step), newer)
+    checkpoint.mark_best(opened.path, before.step + 1, before.error / 2)
+    with pytest.raises(CheckpointError, match=f"at step {before.step}, and step {before.step + 1} is better"):
+        opened.folder.keep_calibration(result.to_json())
+    assert checkpoint.read_best(opened.path).answers == {}
+
+
 def test_no_band_where_nothing_is_known(calibrated):
     run, data, result = calibrated
     with ast_sim.Dataset(data) as dataset:
@@ -142,7 +156,7 @@ def test_what_cannot_be_calibrated_is_refused(calibrated):
     assert Calibration.from_json(calibrated[2].to_json()) == calibrated[2]
 
 
-def test_the_kept_errors_are_those_of_answers_to_each_effort(calibrated):
+def test_the_kept_errors_are_the_errors_of_answers_to_each_effort(calibrated):
     """The errors of an effort, worked out by hand, scene by scene."""
     run, data, result = calibrated
     assert result.kept.efforts == (Effort(),) and set(result.kept.errors) == {"displacement", "stress"}

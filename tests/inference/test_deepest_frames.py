@@ -125,7 +125,7 @@ def test_newton_steps_lead_from_the_answer_to_equilibrium(pressed, monkeypatch):
     assert [EffortErrors.from_json(json.loads(json.dumps(asdict(one)))) for one in fallen] == fallen
 
 
-def test_newton_steps_that_do_not_end_begin_anew_after_more_corrections(pressed, monkeypatch):
+def test_newton_steps_that_do_not_end_begin_again_after_more_corrections(pressed, monkeypatch):
     truth, model = pressing(pressed, 0.4)
     frame = deepest_frame(truth)
     question, free = [Question.of(truth, "plate", [frame])], ~truth.scene.prescribed

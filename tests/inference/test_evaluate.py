@@ -113,7 +113,7 @@ def test_stress_errors_by_hand():
     assert errors["model"]["one_step"]["deforming"].total == 1 + 0 + 1 + 1
 
 
-def test_stress_of_elements_leaves_out_those_with_an_obstacle_node():
+def test_stress_of_elements_leaves_out_elements_with_an_obstacle_node():
     scene = Scene(
         np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], np.float32),
         np.array([[0, 1, 2], [1, 2, 3]], np.int32),

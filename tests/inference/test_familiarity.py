@@ -25,7 +25,7 @@ def an_answer(latents):
     )
 
 
-def test_the_distance_is_that_of_mahalanobis_with_a_ridge():
+def test_the_distance_is_mahalanobis_with_a_ridge():
     rng = np.random.default_rng(0)
     scenes = [rng.normal(size=(3, 4)) @ rng.normal(size=(4, 4)) + 5 for _ in range(25)]
     known = Familiarity.of(scenes)

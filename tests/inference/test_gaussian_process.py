@@ -91,7 +91,7 @@ def test_on_one_mesh_it_needs_no_specification(pressed, tmp_path):
 
 
 def test_with_parameters_but_meshes_of_their_own_it_gives_no_displacement(tmp_path):
-    """Toy plates have one of two meshes; the stress is that of a law."""
+    """Toy plates have one of two meshes; the stress follows a law."""
 
     def drawn(truth):
         low = 1.0 + truth.attributes["seed"] / 10

@@ -1,4 +1,4 @@
-"""The effort that an asked error chooses: ranks, nested misses, and how often a promise is broken."""
+"""The effort that a wanted error chooses: ranks, nested misses, and how often a promise is broken."""
 
 import math
 
@@ -74,7 +74,7 @@ def test_what_cannot_be_asked_is_refused():
 
 @pytest.mark.parametrize("nested", [False, True])
 def test_a_promise_is_broken_in_at_most_a_tenth_of_fresh_scenes_and_not_far_less(nested):
-    """92 % of the scenes keep the asked error after the first of three efforts, which are equal, or ever better."""
+    """92 % of the scenes keep the wanted error after the first of three efforts, which are equal, or ever better."""
     rng = np.random.default_rng(6)
     shares = np.array([[1.0], [0.5], [0.3]])
     limit = 0.1 * float(np.exp(0.5 * norm.ppf(0.92)))

@@ -1,6 +1,7 @@
-"""What an asked time chooses, with the run that comes with the package: times are measured once and kept."""
+"""What a wanted time chooses, with the run that comes with the package: times are measured once and kept."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,8 @@ from toy import one_thread  # noqa: F401 (used by being imported)
 
 import ast_sim
 from ast_sim.inference.effort import Effort
-from ast_sim.support.errors import ConfigError
+from ast_sim.scene import Trajectory
+from ast_sim.support.errors import AstSimError, ConfigError
 
 
 @pytest.fixture
@@ -21,7 +23,7 @@ def cache(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory):
-    """A plate like those of the training, in its deepest frame."""
+    """A plate like the training plates, in its deepest frame."""
     data = tmp_path_factory.mktemp("plate") / "plate.h5"
     ast_sim.generate("deforming_plate", data, train=0, valid=0, test=1, nodes=400, frames=41, keep=(24,), seed=123)
     with ast_sim.Dataset(data) as dataset:
@@ -54,7 +56,7 @@ def test_the_most_accurate_effort_within_the_time_is_made(cache, truth):
         run.predict(truth, frames=[1], ms=9.9)
 
 
-def test_other_questions_are_timed_anew_and_a_damaged_file_is_no_obstacle(cache, truth):
+def test_other_questions_are_timed_again_and_a_damaged_file_is_no_obstacle(cache, truth):
     run = ast_sim.example_run("plates")
     cache.parent.mkdir()
     cache.write_text("{")
@@ -63,10 +65,32 @@ def test_other_questions_are_timed_anew_and_a_damaged_file_is_no_obstacle(cache,
     with pytest.raises(ConfigError, match="no effort takes at most"):
         run.predict(truth, frames=[1], ms=1e6)
     assert run.predict(truth, ms=1e6).frames == (0, 1)  # both frames: another question
+    kept = json.loads(cache.read_text())
+    ((where, _),) = kept.items()
+    for of_another_version in ([1], {"frames": 1}, [{"nodes": 1, "frames": 1, "times": [{"effort": {"x": 1}}]}]):
+        cache.write_text(json.dumps({where: of_another_version}))
+        assert run.predict(truth, frames=[1], ms=1e6).converged
     cache.unlink()
     cache.parent.rmdir()
     cache.parent.write_text("no folder")
     assert run.predict(truth, frames=[1], ms=1e6).converged
+
+
+@pytest.mark.parametrize(
+    ("asked", "text"),
+    [
+        ({"ms": "50"}, "ms is '50'; it must be a number above 0"),
+        ({"ms": float("nan")}, "ms is nan; it must be a number above 0"),
+        ({"ms": 0}, "ms is 0; it must be a number above 0"),
+        ({"error": "2%"}, "the error of the displacement is '2%'; it must be a number, as 0.02 for 2 %"),
+        ({"error": {}}, "no error is asked for"),
+        ({"num_frames": 3.0}, "num_frames is 3.0; it must be a whole number"),
+        ({"num_frames": True}, "num_frames is True; it must be a whole number"),
+    ],
+)
+def test_what_is_no_such_number_is_refused_by_name(cache, truth, asked, text):
+    with pytest.raises(ConfigError, match=re.escape(text)):
+        ast_sim.example_run("plates").predict(truth.scene, {1: (0, 0, -0.02)}, **asked)
 
 
 def test_a_model_without_known_errors_cannot_choose(cache, truth, tmp_path):
@@ -90,3 +114,26 @@ def test_the_errors_of_an_answer_beside_the_truth(truth):
     wrong = np.linalg.norm((answer.position[1] - truth.position[1])[free])
     moved = np.linalg.norm((truth.position[1] - truth.position[0])[free])
     assert errors["displacement"] == pytest.approx(wrong / moved, rel=1e-4)
+
+
+def test_an_answer_is_compared_with_the_frame_of_the_same_number(truth):
+    """The frames of a truth may have gaps; what is no truth of this answer is refused by name."""
+    run = ast_sim.example_run("plates")
+    start, pressed = truth.scene.rest_position, truth.position[1]
+    way = np.stack([start, (start + pressed) / 2, pressed])
+    answer = run.predict(truth.scene, way, effort=Effort())
+    last = Trajectory(truth.scene, truth.position, truth.stress, frames=(0, 2), stress_location="node")
+    whole = Trajectory(truth.scene, way, stress_location="node")
+    assert answer.errors(last)["displacement"] == answer.errors(whole)["displacement"] > 0
+    cube = ast_sim.box((0, 0, 0), (1, 1, 1), (1, 1, 1))
+    for wrong, text in (
+        (replace(last, frames=(0, 1)), "there is no frame 2; there are the frames 0 to 1"),
+        (replace(last, length_unit="mm"), "is in m, but the truth is in mm"),
+        (replace(whole, position=way[[0, 1, 1]]), "prescribed nodes and the ones of the truth are up to"),
+        (Trajectory(cube, np.zeros((3, 8, 3), np.float32)), "but the truth has 8 and 6"),
+    ):
+        with pytest.raises(AstSimError, match=text):
+            answer.errors(wrong)
+    still = run.predict(truth.scene, way[[0, 0]], effort=Effort())
+    with pytest.raises(ConfigError, match="in frame 1 of the truth nothing is displaced"):
+        still.errors(replace(whole, position=way[[0, 0]]))

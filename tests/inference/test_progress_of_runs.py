@@ -55,9 +55,11 @@ def test_scenes_that_are_predicted_together_count_frames(trained, capfd):
     answers = run.predict_scenes(scenes, progress=told)
     assert [done for done, _, _ in told][-1] == told[0][1] == sum(len(answer.position) - 1 for answer in answers) == 12
     told.clear()
-    run.predict_motions(*scenes[0][:1], [truths[0].position] * 3, frames=[-1], progress=told)
+    run.predict_motions(*scenes[0][:1], (one.position for one in truths[:1] * 3), frames=[-1], progress=told)
     assert told[-1][:2] == (3, 3)
-    run.predict_scenes(scenes, progress=False)
+    assert len(run.predict_scenes(iter(scenes), progress=False)) == len(scenes)
+    with pytest.raises(ConfigError, match="solver_scenes is -1; it must be at least 0"):
+        run.evaluate(data, solver_scenes=-1)
     assert capfd.readouterr() == ("", "")
 
 

@@ -19,7 +19,7 @@ from ast_sim.support.errors import RolloutError
 class Constant(Simulator):
     """Every node moves (or accelerates) by the same vector; `spoil` may change the motion of a given call.
 
-    Its domain is that of AST.
+    It has AST's domain.
     """
 
     domain = AST.domain

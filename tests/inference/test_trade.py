@@ -1,6 +1,7 @@
 """A trade, measured for real: the run that comes with the package and the solver on a small plate."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -24,7 +25,7 @@ def test_efforts_and_ways_are_measured_on_the_same_scene(plates, tmp_path, capsy
     ast_sim.example_run("plates").save(tmp_path / "plates.ast")
     told = [str(tmp_path / "plates.ast"), str(plates), "--out", str(tmp_path / "pages" / "trade.html")]
     assert main(["trade", *told]) == 0
-    assert "10 %: run: " in capsys.readouterr().out
+    assert "10 %: the run: " in capsys.readouterr().out
     by_quantity = json.loads((tmp_path / "pages" / "trade.json").read_text())
     assert list(by_quantity) == ["displacement", "reaction", "stress"]
     figures = by_quantity["displacement"]
@@ -55,8 +56,12 @@ def test_another_program_is_represented_by_its_seconds(plates):
     assert (stated.errors, stated.seconds) == ((0.0,), (95.0,))
     rows = figures.rows()
     assert rows[0].verdict == "the run" and rows[0].ratio > 100
-    with pytest.raises(ConfigError, match="seconds are -1; they must be above 0"):
-        ast_sim.trade(ast_sim.example_run("plates"), plates, solver_seconds=-1)
+    for seconds in (-1, "95"):
+        with pytest.raises(ConfigError, match=f"seconds are {seconds!r}; they must be a number above 0"):
+            ast_sim.trade(ast_sim.example_run("plates"), plates, solver_seconds=seconds)
+    for scenes in (0, -1, 2.5, "3"):
+        with pytest.raises(ConfigError, match=f"scenes is {scenes!r}; it must be a whole number above 0"):
+            ast_sim.trade(ast_sim.example_run("plates"), plates, scenes=scenes)
 
 
 def test_the_force_of_metal_that_yields_is_judged_by_what_the_dataset_holds():
@@ -115,5 +120,20 @@ def test_only_runs_of_the_same_data_stand_beside_each_other(learned, tmp_path):
     strange = ast_sim.example_run("plates")
     with pytest.raises(ConfigError, match=r"plates.ast has learned from another dataset \(.*h5\) than .*tokens "):
         ast_sim.trade(ast_sim.Run(run), data, beside=[ast_sim.Run(other), strange])
-    with pytest.raises(ConfigError, match="two runs are called tokens: rename one"):
+    with pytest.raises(ConfigError, match="two runs are called tokens: rename the run"):
         ast_sim.trade(ast_sim.Run(run), data, beside=[ast_sim.Run(run)])
+    process = shutil.copytree(run, tmp_path / "Gaussian process")
+    with pytest.raises(ConfigError, match="a Gaussian process is called Gaussian process: rename the run"):
+        ast_sim.trade(ast_sim.Run(run), data, beside=[ast_sim.Run(process)])
+
+
+@pytest.mark.parametrize("split", ["train", "valid"])
+def test_scenes_of_the_training_are_known_in_a_copy_of_the_dataset_and_to_a_file_of_the_run(learned, tmp_path, split):
+    data, run, _ = learned
+    copy = shutil.copy(data, tmp_path / "copy.h5")
+    ast_sim.Run(run).save(tmp_path / "run.ast")
+    for known in (run, tmp_path / "run.ast"):
+        with pytest.raises(ConfigError, match=f"the scenes of {split} have trained or chosen the run"):
+            ast_sim.trade(ast_sim.Run(known), copy, split)
+        with pytest.raises(ConfigError, match=f"the scenes of {split} have trained or chosen the run"):
+            ast_sim.calibrate(ast_sim.Run(known), copy, split)

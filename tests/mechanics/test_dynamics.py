@@ -72,7 +72,7 @@ def mirrored(position: np.ndarray, cloth_nodes: int) -> np.ndarray:
     return position[:cloth_nodes].reshape(side, side, 3)[::-1].reshape(-1, 3) * [-1, 1, 1]
 
 
-def test_free_fall_is_that_of_backward_euler():
+def test_free_fall_follows_backward_euler():
     trajectory = implicit_euler(case(21))
     n = np.arange(21)
     fallen = trajectory.position[:, :, 2]

@@ -4,15 +4,16 @@ import sys
 
 import numpy as np
 import pytest
+import scipy.sparse
 
 from ast_sim.mechanics.elements.elasticity import Elasticity
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
-from ast_sim.mechanics.linear_algebra import factorization, linear_system
+from ast_sim.mechanics.linear_algebra import compliance, factorization, linear_system
 from ast_sim.mechanics.linear_algebra.factorization import Cholmod, Pardiso
-from ast_sim.mechanics.linear_algebra.linear_system import LinearSystem
+from ast_sim.mechanics.linear_algebra.linear_system import NO_CONTACT, LinearSystem
 from ast_sim.simulate.shapes import mesh
 
-NO_CONTACT = (np.zeros(0, int), np.zeros(0, int), np.zeros(0))
+REST, ELEMENTS = mesh.plate((0.5, 0.3, 0.03), (5, 4, 2), np.array([[0.0, 0.0, 0.06]]))
 
 
 @pytest.fixture(params=[Pardiso, Cholmod])
@@ -20,11 +21,10 @@ def problem(request, monkeypatch):
     """A plate with fixed ends: system, values of its entries, dense matrix, fixed nodes."""
     monkeypatch.setattr(linear_system, "factorization", request.param)
     monkeypatch.setattr(linear_system, "ITERATE_FROM", 0)
-    rest, elements = mesh.plate((0.5, 0.3, 0.03), (5, 4, 2), np.array([[0.0, 0.0, 0.06]]))
-    elasticity, fixed = Elasticity(rest, elements, NeoHookean(1e6, 0.4)), np.abs(rest[:, 0]) > 0.25 - 1e-9
+    elasticity, fixed = Elasticity(REST, ELEMENTS, NeoHookean(1e6, 0.4)), np.abs(REST[:, 0]) > 0.25 - 1e-9
     rows, columns = elasticity.entry_dofs()
-    values = elasticity.hessian(elasticity.evaluate(rest * [1.02, 1.0, 1.01]))
-    dense = np.zeros((rest.size, rest.size))
+    values = elasticity.hessian(elasticity.evaluate(REST * [1.02, 1.0, 1.01]))
+    dense = np.zeros((REST.size, REST.size))
     np.add.at(dense, (rows, columns), values)
     np.add.at(dense, (columns[rows != columns], rows[rows != columns]), values[rows != columns])
     return LinearSystem(rows, columns, fixed), values, dense, fixed
@@ -82,6 +82,67 @@ def test_the_halves_of_solutions_make_the_dense_inverse(problem):
     assert system.factorise(-values) is None
 
 
+@pytest.mark.parametrize("condensed", [True, False])
+def test_compliances_are_those_of_the_dense_inverse(problem, monkeypatch, condensed):
+    """Of some directions, then of others, by columns and by condensation, with a whole factorization between."""
+    monkeypatch.setattr(compliance, "condensation_pays", lambda *_: condensed)
+    system, values, dense, fixed = problem
+    free, random = np.flatnonzero(np.repeat(~fixed, 3)), np.random.default_rng(7)
+    inverse, told = np.linalg.inv(dense[np.ix_(free, free)]), []
+    for first in (20, 90):
+        directions = np.zeros((6, len(free)))
+        directions[:, first : first + 15] = random.normal(size=(6, 15))
+        made = compliance.compliance_of(system, values, scipy.sparse.csr_array(directions), told.append)
+        assert made.is_whole == (condensed and system.condenses)
+        for wanted in ([4, 1], [5, 0, 2]):
+            made.want(np.array(wanted))
+        between, forces = inverse @ directions.T, random.normal(size=5)
+        products = (directions @ between)[np.ix_([4, 1, 5, 0, 2], [4, 1, 5, 0, 2])]
+        regular = products + 1e-10 * products.trace() / 5 * np.eye(5)
+        displacement = between[:, [4, 1, 5, 0, 2]] @ forces
+        assert np.array_equal(made.matrix, made.matrix.T)
+        np.testing.assert_allclose(made.matrix, regular, atol=1e-12 * abs(regular).max())
+        np.testing.assert_allclose(made.displacement(forces), displacement, atol=1e-10 * abs(displacement).max())
+        np.testing.assert_allclose(made.along(forces), directions @ displacement, rtol=1e-8)
+        load = random.normal(size=len(free))
+        np.testing.assert_allclose(made.solution(load), inverse @ load, atol=1e-10 * abs(inverse @ load).max())
+        assert compliance.compliance_of(system, -values, scipy.sparse.csr_array(directions), told.append) is None
+        assert_solves(system, values, NO_CONTACT, dense, fixed, 1e-11)
+    assert told == [0, 2, 0, 2]
+
+
+@pytest.mark.parametrize(
+    ("directions", "touched", "unknowns", "pays"),
+    [
+        (54, 141, 3_519, False),  # a plate that a box presses
+        (2_610, 7_812, 461_748, False),
+        (486, 564, 3_888, True),  # two blocks
+        (2_910, 3_030, 76_176, True),
+        (900, 300, 300, False),  # PARDISO does not eliminate nothing
+    ],
+)
+def test_condensation_is_chosen_where_it_was_measured_to_be_faster(directions, touched, unknowns, pays):
+    assert compliance.condensation_pays(directions, touched, unknowns) == pays
+
+
+def test_a_schur_complement_that_is_not_positive_definite_is_told(problem, monkeypatch):
+    """One node is eliminated, whose own part of the matrix is positive definite; with all others it is not."""
+    monkeypatch.setattr(compliance, "condensation_pays", lambda *_: True)
+    system, values, _, fixed = problem
+    rows, columns = Elasticity(REST, ELEMENTS, NeoHookean(1e6, 0.4)).entry_dofs()
+    coupled = np.where(rows // 3 == columns // 3, values, 2 * values)
+    directions = scipy.sparse.csr_array((np.arange(3 * np.count_nonzero(~fixed)) >= 3)[None].astype(float))
+    assert compliance.compliance_of(system, values, directions, lambda _: None) is not None
+    assert compliance.compliance_of(system, coupled, directions, lambda _: None) is None
+
+
+def test_the_inverse_of_bodies_that_are_not_coupled_is_that_of_each():
+    matrix = np.zeros((4, 4))
+    matrix[np.ix_([0, 2], [0, 2])] = [[2.0, 1.0], [1.0, 3.0]]
+    matrix[np.ix_([1, 3], [1, 3])] = [[1.0, 2.0], [2.0, 5.0]]
+    np.testing.assert_allclose(compliance._inverse(matrix), np.linalg.inv(matrix), rtol=1e-14, atol=1e-15)
+
+
 def test_a_factor_that_serves_no_more_is_replaced(problem):
     system, values, dense, fixed = problem
     assert_solves(system, values, NO_CONTACT, dense, fixed, 1e-11)
@@ -118,7 +179,7 @@ def test_increments_of_fixed_nodes_couple_as_in_the_dense_matrix(problem):
     np.testing.assert_allclose(found, expected, atol=1e-10 * np.abs(expected).max())
 
 
-def test_the_pattern_is_analysed_anew_only_when_contact_adds_to_it(problem, monkeypatch):
+def test_the_pattern_is_analysed_again_only_when_contact_adds_to_it(problem, monkeypatch):
     system, values, _, fixed = problem
     news, factorise = [], system._factorization.factorise
     monkeypatch.setattr(

@@ -47,7 +47,7 @@ def test_a_block_in_uniaxial_strain():
 
 
 @pytest.mark.parametrize("who_moves", ["the rigid punch", "the block"])
-def test_the_force_is_that_of_the_solver(tmp_path, who_moves):
+def test_the_force_is_the_solvers(tmp_path, who_moves):
     spec = SPEC
     if who_moves == "the block":
         spec = spec.replace('fixed = "zmin"', 'move = {where="zmin", translation=[0.2, 0, "travel"]}')

@@ -57,7 +57,7 @@ def test_two_free_bodies_carry_the_same_load(two_blocks):
         assert moment == pytest.approx(held[1][2] * height, rel=0.15)
 
 
-def test_von_mises_is_that_of_the_tensor(two_blocks):
+def test_von_mises_follows_from_the_tensor(two_blocks):
     _, trajectory = two_blocks
     xx, yy, zz, xy, yz, zx = np.moveaxis(trajectory.cauchy_stress.astype(float), 2, 0)
     mises = np.sqrt(0.5 * ((xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2) + 3 * (xy**2 + yz**2 + zx**2))

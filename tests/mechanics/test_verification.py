@@ -59,7 +59,7 @@ def test_the_document_shows_a_row_that_fails():
     assert "Not solved yet at this state: `derivatives`" in text
 
 
-def test_the_document_in_the_tree_is_that_of_the_records():
+def test_the_document_in_the_tree_follows_from_the_records():
     records = json.loads(verification.RECORDS.read_text())
     assert records and list(records) == [name for name in verification.PROBLEMS if name in records]
     assert verification.DOCUMENT.read_text(encoding="utf-8") == verification.document(records)

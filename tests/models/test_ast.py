@@ -371,7 +371,7 @@ def test_random_weight_factorization():
 
 
 def test_position_embedding_drops_constant_frequencies():
-    """At cell centres of level 3 the frequencies 2^j pi with j >= 3 are constant; those below are not."""
+    """At cell centres of level 3 the frequencies 2^j pi with j >= 3 are constant; lower ones are not."""
     centers = (torch.arange(8) + 0.5) / 4 - 1
     for j in range(8):
         wave = torch.stack([torch.sin(2.0**j * torch.pi * centers), torch.cos(2.0**j * torch.pi * centers)])

@@ -60,7 +60,7 @@ def test_a_path_by_hand():
     torch.testing.assert_close(path.rest_edges[1], torch.tensor([[8 / 3, 0, 0, 8 / 3], [-8 / 3, 0, 0, 8 / 3]]))
 
 
-def test_weights_of_the_second_level_start_from_those_of_the_first():
+def test_weights_of_the_second_level_start_from_the_weights_of_the_first():
     """Nine nodes in a row: depths 4 3 2 1 0 1 2 3 4, the odd class; of these four, with w' = 3/2 1 1 3/2, every other.
 
     The second start is the first of the two in the middle: depths 1 0 1 2, a tie, so 1 and 3 of the four are kept.
@@ -215,7 +215,7 @@ def test_it_is_the_same_every_time():
 
 
 @pytest.mark.parametrize("pooled", [True, False])
-def test_that_of_a_mirror_image_is_the_same_with_mirrored_edges(pooled):
+def test_the_hierarchy_of_a_mirror_image_has_mirrored_edges(pooled):
     graph = meshes()[0]
     mirror = Placement(np.float32([-1, 1, -1]), np.float32([0.25, 0, 0.5]), np.zeros(3, np.float32))
     there = mirror.points(graph.rest_position)

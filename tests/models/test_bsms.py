@@ -150,7 +150,7 @@ def test_levels_below_one_are_refused():
         BSMSConfig(levels=0)
 
 
-def test_the_presets_are_those_of_the_papers():
+def test_the_presets_come_from_the_papers():
     original, paper = PRESETS["original"], PRESETS["paper"]
     for preset in (original, paper):
         assert (preset.model.hidden, preset.model.levels, preset.train["peak_rate"]) == (128, 6, 1e-4)

@@ -163,7 +163,7 @@ def test_settings_out_of_range_are_refused(changes, message):
         HCMTConfig(**changes)
 
 
-def test_the_presets_are_those_of_the_papers():
+def test_the_presets_come_from_the_papers():
     original, paper = PRESETS["original"], PRESETS["paper"]
     for preset in (original, paper):
         c = preset.model

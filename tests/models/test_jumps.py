@@ -134,7 +134,7 @@ def test_only_the_wanted_frames_are_computed(monkeypatch):
 
 
 @pytest.mark.parametrize("model", ["ast", "transolver"])
-def test_frames_that_are_spaced_anew_have_the_same_answers(model):
+def test_frames_with_another_spacing_have_the_same_answers(model):
     """A model is told where the prescribed nodes are, never the number of a frame."""
     truth, built = toy.plate(0), model_of(model)
     order = [0, 0, 1, 3, 3, 6]

@@ -83,7 +83,7 @@ def test_a_scene_alone_equals_a_scene_in_a_batch():
     assert torch.equal(model(both).motion, alone)
 
 
-def test_the_presets_are_those_of_the_papers():
+def test_the_presets_come_from_the_papers():
     original, paper = PRESETS["original"], PRESETS["paper"]
     for preset in (original, paper):
         assert (preset.model.hidden, preset.model.blocks, preset.train["noise"]) == (128, 15, 0.003)

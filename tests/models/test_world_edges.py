@@ -83,7 +83,7 @@ def test_the_shortest_are_kept_with_a_warning_in_every_scene():
     assert pairs_of(edges) == expected
 
 
-def test_of_equally_long_ones_those_of_the_lowest_nodes_are_kept():
+def test_of_equally_long_edges_the_ones_of_the_lowest_nodes_are_kept():
     batch = batch_of(block(1, 1, 1))  # face diagonals that are no edges all have length sqrt 2
     lowest = sorted(pair for pair in all_pairs(batch, 1.5) if pair[0] < pair[1])[:2]
     with pytest.warns(UserWarning):

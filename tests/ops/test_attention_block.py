@@ -12,7 +12,7 @@ HEADS, WIDTH = 2, 16
 
 
 def case(queries: list[int], keys: list[int], width: int, context: int, rotated: bool = True) -> list:
-    """The arguments for scenes of so many queries and keys."""
+    """The arguments for scenes of these numbers of queries and keys."""
     g = torch.Generator().manual_seed(0)
     inner, hidden = HEADS * WIDTH, 20
     q_offsets, k_offsets = (torch.tensor([0, *sizes]).cumsum(0) for sizes in (queries, keys))

@@ -11,7 +11,7 @@ from ast_sim.ops._edges import _breadth_first
 
 
 def test_values_by_hand():
-    """A path 3 - 0 - 4 - 1, of which 0 is the lowest node: walks start there, at its end 1, and at 3."""
+    """A path 3 - 0 - 4 - 1, of which 0 is the lowest node: searches start there, at its end 1, and at 3."""
     path = torch.tensor([[3, 0], [0, 4], [4, 1]])
     assert breadth_first(path, torch.tensor([1, 1, 1, 1, 1])).tolist() == [1, 3, 4, 0, 2]
     assert breadth_first(path, torch.tensor([1, 1, 1, 1, 0])).tolist() == [0, 2, 3, 1, -1]

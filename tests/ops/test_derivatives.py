@@ -1,4 +1,4 @@
-"""Derivatives of every order and direction, of every op: those of its composition in float64, or one clear error."""
+"""Derivatives of every order and direction, of every op, against its composition in float64, or one clear error."""
 
 from collections.abc import Callable
 from functools import cache

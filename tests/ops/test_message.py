@@ -134,7 +134,7 @@ def test_messages_of_equal_channels_are_beta(out, value):
 
 
 def test_latents_are_added_as_they_are():
-    """With one edge a receiver they and their gradient are those of the receiver's share, to the bit."""
+    """With one edge a receiver they and their gradient equal the receiver's share and its gradient, to the bit."""
     edges = EdgeSet.from_pairs(torch.arange(500) % 7, torch.arange(500), 7, 500)
     P, Q, e, *_, W2, b2, gamma, beta = inputs_of(edges, 40, 0, 40)
     layer, zero, dsum = (W2, b2, gamma, beta), torch.zeros(500, 40), torch.randn(500, 40)
@@ -344,7 +344,7 @@ def test_gradients_in_float64():
 
 
 def test_the_op_without_edge_features_has_no_latents():
-    """On both paths; the composition is that of other dtypes."""
+    """On both paths; the composition also serves other dtypes."""
     edges = random_edges(30, 4, 5)
     lists = (edges.senders, edges.receivers, edges.receiver_offsets)
     inputs = op_inputs_of(edges, 6, 0, 0)
@@ -419,7 +419,7 @@ def test_unusual_layouts_and_unchanged_inputs(width, hidden, raw):
 
 
 def test_gradients_of_strange_latents():
-    """Cotangents of any layout, and latents that are a view: their gradient is that of dense ones."""
+    """Cotangents of any layout, and latents that are a view: their gradient is the same as for dense ones."""
     edges = random_edges(200, 30, 40)
     P, Q, e, *rest = inputs_of(edges, 24, 0, 24)
     wide = torch.cat([e, e], 1).requires_grad_()

@@ -21,7 +21,7 @@ NAMES = ("x", "weight1", "bias1", "weight2", "bias2", "beside", "gamma", "beta",
 
 
 def case(rows, inputs, hidden, outputs, beside=0, seed=0, amplitude=1.0):
-    """All arguments; those named in `without` of the functions below are left out."""
+    """All arguments; the names in `without` of the functions below are left out."""
     g = torch.Generator().manual_seed(seed)
     shapes = [(rows, inputs), (hidden, inputs + beside), (hidden,), (outputs, hidden), (outputs,), (rows, beside)]
     shapes += [(outputs,), (outputs,), (rows, outputs)]
@@ -101,7 +101,7 @@ def test_accuracy_of_small_and_large_values(amplitude, norm):
 
 
 def test_accuracy_of_a_mean_far_above_the_spread():
-    """The variance is that of the centred row: E[y^2] - E[y]^2 would lose all digits."""
+    """The variance is taken of the centred row: E[y^2] - E[y]^2 would lose all digits."""
     inputs = case(200, 24, 40, 20)
     inputs[4] = inputs[4] + 3000
     x, keep = chosen(inputs, residual=False)
@@ -194,8 +194,8 @@ def test_a_row_of_equal_values_is_beta(outputs, value):
 @pytest.mark.parametrize("amplitude", [1e18, 1e19, 1e25, 1e35])
 @pytest.mark.parametrize("saved", [0, ops.SAVED])
 def test_layer_norm_of_large_values(outputs, amplitude, saved, monkeypatch):
-    """Their squares are too large for a float; the composition is 0 or NaN there. The bound is that of the accuracy
-    rule where the composition errs by 5e-7, as it does at 1."""
+    """Their squares are too large for a float; the composition is 0 or NaN there. The bound is the accuracy rule's
+    where the composition errs by 5e-7, as it does at 1."""
     monkeypatch.setattr(ops, "SAVED", saved)
     inputs, keep = chosen(case(40, 12, 16, outputs, amplitude=amplitude), beside=False, residual=False)
     inputs[4] *= amplitude

@@ -56,7 +56,7 @@ def gap_to_box(points: np.ndarray, half: np.ndarray) -> np.ndarray:
 
 @both_bodies
 @pytest.mark.parametrize("cells", [(1, 1, 1), (4, 2, 3)])
-def test_the_gap_to_a_box_is_that_of_the_closed_form(cells, gap_of, close):
+def test_the_gap_to_a_box_has_its_closed_form(cells, gap_of, close):
     half = np.array([0.5, 0.25, 0.125])
     points = single(4000, 3, seed=0)
     gap, normal = gap_of(points, *surface_of(cells, 2 * half), radius=10.0)

@@ -46,7 +46,7 @@ def test_accuracy(nodes, channels):
 
 @pytest.mark.parametrize("channels", [(4096, 8), (8, 4096)])
 def test_accuracy_of_many_channels(channels):
-    """A sum over channels is cut into chains, forward over those of x and backward over those of the output."""
+    """A sum over channels is cut into chains, forward over x's channels and backward over the output's."""
     map = level(60)
     assert_accurate(lambda x, w: sparse_conv(x, w, map), composed(map), features(map.num_fine, channels))
     inputs = features(len(map.coarse.keys), channels)

@@ -15,7 +15,7 @@ WORTH = Worth(
 )  # fmt: skip
 
 
-def test_a_model_pays_when_the_saved_seconds_are_those_of_its_making():
+def test_a_model_pays_when_it_has_saved_the_seconds_of_its_making():
     """100 scenes of 6 s and 600 s of training are 1,200 s; an answer saves 5.5 s: 218.2 questions."""
     assert WORTH.pays_after == 219
     assert "the model pays after 219 questions; for fewer the solver alone is the better choice" in str(WORTH)

@@ -88,7 +88,7 @@ def test_the_dataset_stays_behind(saved):
     found = Run(file)
     with pytest.raises(ConfigError, match=r"toy.ast holds no dataset: name one; the run learned from toy.h5"):
         found.evaluate()
-    with Dataset(run.settings.data, "mm") as data:  # an open one; lengths become those of the run
+    with Dataset(run.settings.data, "mm") as data:  # an open one; lengths get the run's unit
         evaluation = found.evaluate(data)
     error = evaluation.figures.error("displacement").rmse_sequence
     assert f"Evaluation(run: toy.ast, data: toy.h5, scenes: 1, displacement error: {error:.4g} m, " in repr(evaluation)

@@ -1,4 +1,4 @@
-"""A cache of so many bytes: what is counted, what is let go, what is kept."""
+"""A cache with a limit of bytes: what is counted, what is let go, what is kept."""
 
 from dataclasses import dataclass
 

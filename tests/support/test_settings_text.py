@@ -4,12 +4,22 @@ import tomllib
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ast_sim.support.errors import ConfigError
-from ast_sim.support.toml_settings import FROM_DATA, Setting, assigned, change, from_values, settings, to_toml
+from ast_sim.support.toml_settings import (
+    FROM_DATA,
+    Setting,
+    assigned,
+    change,
+    from_values,
+    require_range,
+    settings,
+    to_toml,
+)
 
 
 @dataclass(frozen=True)
@@ -218,3 +228,18 @@ def test_the_class_of_a_group_follows_from_its_table():
         override(drawing, ["figure.radius=4"])
     with pytest.raises(ConfigError, match="figure.shape is 'box'; must be one of \"circle\""):
         override(Drawing(Circle()), ["figure.shape=box"])
+
+
+def test_scalars_of_numpy_are_numbers():
+    center = (np.float32(1.5), np.int64(2), 3)
+    changed = change(RUN, {"model.hidden": np.int32(64), "rate": np.float32(0.5), "model.center": center})
+    assert (changed.model.hidden, changed.rate, changed.model.center) == (64, 0.5, (1.5, 2.0, 3.0))
+    assert type(changed.model.hidden) is int and "hidden = 64" in to_toml(changed)
+    with pytest.raises(ConfigError, match="model.hidden is 2.5; must be an integer"):
+        change(RUN, {"model.hidden": np.float32(2.5)})
+
+
+@pytest.mark.parametrize("value", ["3", True, [3], 3j])
+def test_what_is_no_number_lies_in_no_range(value):
+    with pytest.raises(ConfigError, match=r"minutes is .*; it must be a number"):
+        require_range("minutes", value, 1, 5)

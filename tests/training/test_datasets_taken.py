@@ -5,7 +5,7 @@ import torch
 import toy
 
 from ast_sim import Dataset, new_model, train
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import ConfigError, DatasetError
 from ast_sim.training import start
 
 
@@ -35,3 +35,9 @@ def test_an_open_dataset_in_another_unit_is_refused(tmp_path):
     ):
         train(data, tmp_path / "run", steps=2)
     assert not (tmp_path / "run").exists()
+
+
+def test_the_state_is_a_list_of_names(tmp_path):
+    """One text would be taken for its letters."""
+    with pytest.raises(ConfigError, match=r"state is 'reaction'; it must be a list of names, such as \['reaction'\]"):
+        train(toy.write(tmp_path / "toy.h5"), tmp_path / "run", steps=2, state="reaction")

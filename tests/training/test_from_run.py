@@ -50,7 +50,7 @@ def started(data, source, out, *assignments):
 # Another run to start from
 
 
-def test_the_first_loss_is_that_of_the_weights_of_the_source(folder, tmp_path):
+def test_the_first_loss_comes_from_the_weights_of_the_source(folder, tmp_path):
     trained = RunFolder(folder / "source")
     model, settings = trained.load_model(), trained.settings
     run = started(folder / "toy.h5", folder / "source", tmp_path / "run", "train.steps=2", "train.seed=5")
@@ -71,13 +71,13 @@ def test_the_first_loss_is_that_of_the_weights_of_the_source(folder, tmp_path):
 def test_more_steps_lower_the_error(folder, tmp_path):
     run = ast_sim.train(folder / "toy.h5", tmp_path / "run", from_run=folder / "source", steps=300)
     source, longer = validations(folder / "source"), validations(run.path)
-    assert len(longer) == 10  # chosen anew for another number of steps
+    assert len(longer) == 10  # chosen again for another number of steps
     assert min(longer) < 0.95 * min(source)
     train = run.settings.train
     assert (train.steps, train.decay, train.warmup, train.mirror) == (300, 300, 15, ("y",))
 
 
-def test_normalizers_are_those_of_the_source_on_other_data(folder, tmp_path):
+def test_normalizers_come_from_the_source_on_other_data(folder, tmp_path):
     other = toy.write(tmp_path / "other.h5", counts=(1, 1, 0))
     run = started(other, folder / "source", tmp_path / "run", "train.steps=1")
     theirs, ours = RunFolder(folder / "source").load_model(), RunFolder(run).load_model()
@@ -116,7 +116,7 @@ def test_before_its_first_checkpoint_a_run_needs_the_source_as_it_was(folder, tm
         start_training(run, resume=True)
 
 
-def test_a_source_that_was_trained_anew_is_noticed(folder, tmp_path):
+def test_a_source_that_was_trained_again_is_noticed(folder, tmp_path):
     source = shutil.copytree(folder / "source", tmp_path / "source")
     run = started(folder / "toy.h5", source, tmp_path / "run", "train.steps=2")
     step = RunFolder(source).chosen.step
@@ -142,7 +142,7 @@ def test_a_resumed_run_keeps_its_source(folder, tmp_path):
 
 
 def changed(path, trajectory, **facts):
-    """A dataset of this one trajectory for training; `facts` replace those of the toy."""
+    """A dataset of this one trajectory for training; `facts` replace the toy's."""
     with DatasetWriter(path, ast_sim.DatasetInfo(**{**vars(toy.info()), **facts})) as writer:
         writer.add("train", trajectory)
     return path
@@ -189,7 +189,7 @@ def test_a_source_that_is_no_run_is_one_line(folder, tmp_path, capsys):
 # Settings from a file
 
 
-def test_the_settings_of_a_run_are_those_of_its_file(folder):
+def test_the_settings_of_a_run_come_from_its_file(folder):
     file = folder / "source" / "config.toml"
     asked = configure(folder / "toy.h5", config=file)
     facts = read_config(folder / "source").model.data

@@ -19,6 +19,7 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.runs import checkpoint
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.metrics import Metrics
+from ast_sim.support.errors import ConfigError
 from ast_sim.training.configure import configure
 from ast_sim.training.parallel import launch
 
@@ -156,6 +157,13 @@ def test_a_batch_that_cannot_be_cut_is_refused(data, tmp_path):
     done = train(2, data, tmp_path / "run", 4, "--set", "train.batch_size=3", check=False)
     assert done.returncode != 0 and "train.batch_size = 3 cannot be cut for 2 processes" in done.stderr
     assert not (tmp_path / "run/config.toml").exists()  # else the corrected command would be refused, too
+
+
+@pytest.mark.parametrize("count", [0, -1])
+def test_fewer_than_one_process_is_refused(data, tmp_path, count):
+    with pytest.raises(ConfigError, match=f"train.processes is {count}; it must be at least 1"):
+        ast_sim.train(data, tmp_path / "run", steps=1, processes=count)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_signal_to_one_process_stops_both_after_the_step(data, tmp_path):

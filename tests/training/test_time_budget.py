@@ -1,4 +1,4 @@
-"""Training for so many minutes, and the word that more scenes would help more."""
+"""Training for a number of minutes, and the word that more scenes would help more."""
 
 from types import SimpleNamespace
 

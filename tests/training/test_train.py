@@ -256,7 +256,7 @@ def test_training_writes_settings_metrics_and_checkpoints(linear, data, tmp_path
     assert "to go" in shown
 
 
-def test_validation_error_is_that_of_the_rollouts(linear, data, tmp_path):
+def test_validation_error_is_the_error_of_the_rollouts(linear, data, tmp_path):
     start.start_training(tmp_path / "run", settings(data, "train.keep=10"))
     record = next(r for r in Metrics(tmp_path / "run") if "valid_rmse" in r and r["step"] == 20)
     model = RunFolder(tmp_path / "run").load_model()

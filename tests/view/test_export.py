@@ -74,7 +74,7 @@ def test_prediction_carries_its_errors(tmp_path, suffix, stress):
 
 
 @pytest.mark.parametrize("suffix", [".pvd", ".vtkhdf"])
-def test_errors_are_those_of_the_frames_with_the_same_numbers(tmp_path, suffix):
+def test_errors_compare_the_frames_with_the_same_numbers(tmp_path, suffix):
     """A prediction of the frames 2 and 4 is compared with these frames of the truth, not with its first two."""
     truth, path = plate(5), tmp_path / f"some{suffix}"
     predicted = truth.position[[2, 4]] + np.float32(0.5)

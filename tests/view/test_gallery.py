@@ -61,7 +61,7 @@ def fails(capsys, *arguments):
 # Figures
 
 
-def test_figures_are_those_of_the_deforming_bodies():
+def test_figures_count_the_deforming_bodies():
     truth = plate(9, stress="element")
     truth.stress[3, -1] = 1e9  # in the obstacle
     free = truth.scene.node_type != NodeType.OBSTACLE

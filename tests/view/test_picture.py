@@ -53,7 +53,7 @@ def test_errors_are_seen_and_a_perfect_prediction_is_the_truth(tmp_path):
     assert (np.abs(left - right).max(axis=2) > 60).mean() > 0.05
 
 
-def test_the_frame_is_that_of_the_largest_displacement(tmp_path, monkeypatch):
+def test_the_frame_has_the_largest_displacement(tmp_path, monkeypatch):
     frames, figure = [], picture._figure
     monkeypatch.setattr(picture, "_figure", lambda *given: frames.append(given[2]) or figure(*given))
     truth, prediction = plate(9), plate(9, seed=1)

@@ -41,7 +41,7 @@ class Section:
         return end
 
     def require(self, count: int, size: int) -> None:
-        """Raise ValueError if so many numbers cannot stand in what is left of the file."""
+        """Raise ValueError if the rest of the file is too short for `count` numbers."""
         left = len(self.content) - self.place if self.tokens is None else len(self.tokens) - self.next_token
         if count < 0 or count * (size if self.order else 1) > left:
             raise ValueError(f"it declares {count} entries, but the file does not hold them")

@@ -12,7 +12,7 @@ from ast_sim.importers.formats.source_mesh import SourceMesh
 
 def together(meshes: Sequence[SourceMesh]) -> SourceMesh:
     """One mesh of several, with all points of the first, then of the second, and so on. A field that one of them lacks
-    is NaN there, and a note says so. The path and the time are those of the first."""
+    is NaN there, and a note says so. The path and the time come from the first."""
     if len(meshes) == 1:
         return meshes[0]
     starts = np.cumsum([0, *(len(mesh.points) for mesh in meshes)])

@@ -138,7 +138,7 @@ class Stitching:
             self.disagree[what] = self.disagree.get(what, np.zeros(len(rows), bool)) | rows
 
     def joined(self) -> tuple[np.ndarray, list[str]]:
-        """[n]: the point that stands for each point of the file, the first of those that are one; and notes.
+        """[n]: the point that stands for each point of the file, the first of all that are one; and notes.
 
         Raises:
             DatasetError: each element has points of its own, and fields differ at points of one place.

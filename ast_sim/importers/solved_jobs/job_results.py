@@ -36,7 +36,7 @@ def job_frames(job: Job, results: Path, pascals: float, wanted: Sequence[str] = 
         wanted: further fields at the nodes, by their names in the deck (PEEQ, RF) or in the results (PE, FORC).
 
     Raises:
-        DatasetError: the results are those of another deck, hold no displacement or not a wanted field, or start after
+        DatasetError: the results belong to another deck, hold no displacement or not a wanted field, or start after
             the rest with a temperature, which is not known at rest.
     """
     materials = {

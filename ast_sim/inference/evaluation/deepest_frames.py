@@ -1,8 +1,8 @@
-"""The deepest frame of every scene, asked for alone: errors, times, and what the solver takes for the same answer.
+"""The deepest frame of every scene, predicted alone: errors, times, and what the solver takes for the same answer.
 
-In the deepest frame the free nodes are displaced most. The relative error is the root mean square of the error over
-that of the displacement, over the free nodes in this frame. Times are of one thread, and count what is prepared for a
-mesh, for the model and for the solver.
+In the deepest frame the free nodes are displaced most. The relative error is the root mean square of the error, divided
+by the root mean square of the displacement, over the free nodes in this frame. Times are of one thread, and count what
+is prepared for a mesh, for the model and for the solver.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ def deepest_frames(
 
     Args:
         effort: what follows the first call of a model that jumps.
-        solver_scenes: in so many scenes the solver goes to the same frame, in several variants; see
+        solver_scenes: the number of scenes in which the solver goes to the same frame, in several variants; see
             `simulate.jobs.fastest_solver`.
         made_from: the specification or the parts of which the dataset was made, if any; the solver needs them.
-        most_scenes: only the first scenes of the split are predicted, at most so many; None: all.
+        most_scenes: the number of scenes that are predicted, at most: the first ones of the split; None: all.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -86,7 +86,7 @@ def deepest_frames(
 def _solved(
     dataset: Dataset, split: str, indices: list[int], frames: list[int], made_from: str | os.PathLike[str] | None
 ) -> Iterable[SolverOutcomes]:
-    """What the solver took to these frames; nothing, where none is asked for."""
+    """What the solver took to these frames; nothing, where none is wanted."""
     return solver_outcomes(dataset.path, split, indices, frames, made_from=made_from, progress=False) if indices else ()
 
 

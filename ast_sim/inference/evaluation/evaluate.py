@@ -35,8 +35,8 @@ from ast_sim.named_field import STRESS, Output, require_fields
 from ast_sim.scene import Trajectory
 from ast_sim.support.errors import DatasetError
 
-ONE_STEP_NODES = 8192  # frames are predicted together as long as they have at most about so many nodes
-MEAN_TRAJECTORIES = 100  # `stress_constant` is the mean of at most so many training trajectories
+ONE_STEP_NODES = 8192  # at most, of frames that are predicted together, unless a single one has more
+MEAN_TRAJECTORIES = 100  # training trajectories, at most, of whose stress `stress_constant` is the mean
 
 
 def evaluate(

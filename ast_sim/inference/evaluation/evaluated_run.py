@@ -17,6 +17,7 @@ from ast_sim.inference.answering import answers
 from ast_sim.inference.evaluation.evaluate import table
 from ast_sim.inference.predicting.question import Question
 from ast_sim.support.disk import write_json
+from ast_sim.support.errors import ConfigError
 from ast_sim.support.notebook_table import html_table, one_line
 from ast_sim.view import report
 from ast_sim.view.files import make_folder
@@ -64,6 +65,11 @@ class Evaluation:
         """Write a page with moving scenes, errors, times and settings."""
         report_evaluations(path, [self], title)
 
+    def content(self) -> tuple[str, str]:
+        """What the dataset holds, as a hash, and the split."""
+        with self.run.open(self.data) as dataset:
+            return dataset.fingerprint(), self.figures.origin["split"]
+
     def shown(self) -> report.ReportRun:
         """The content of the page: the best, the median and the worst scene, the curves of the training, facts."""
         errors = {}
@@ -108,9 +114,27 @@ class Evaluation:
 
 
 def report_evaluations(path: str | os.PathLike[str], evaluations: list[Evaluation], title: str) -> None:
-    """Write one page that shows several runs side by side; a missing folder is made."""
+    """Write one page that shows several runs side by side; a missing folder is made.
+
+    Raises:
+        ConfigError: the runs were evaluated on different scenes, which have the same names.
+    """
+    _require_one_dataset(evaluations)
     make_folder(Path(path).parent)
     report.write(path, [evaluation.shown() for evaluation in evaluations], title)
+
+
+def _require_one_dataset(evaluations: Sequence[Evaluation]) -> None:
+    if len(evaluations) == 1:
+        return
+    first, *others = evaluations
+    known = first.content()
+    for one in others:
+        if one.content() != known:
+            raise ConfigError(
+                f"{one.run.path} was evaluated on other scenes ({one.data.name}) than {first.run.path}"
+                f" ({first.data.name}), or in another unit: a page compares runs on one dataset (--data)"
+            )
 
 
 def _choice(metrics: Sequence[dict[str, Any]]) -> str:

@@ -31,6 +31,7 @@ from ast_sim.simulate.own_assembly.parameters import Values, values_of
 from ast_sim.support.errors import ConfigError, MissingExtra, require
 from ast_sim.trade_figures import Setting, Side
 
+PROCESS = "Gaussian process"  # the name of its column
 FOLDS = 5  # of the cross-validation that chooses a scale
 MOST_SCENES = 200  # of the training; a fit takes time with the cube of their number
 FEWEST_SCENES = 2 * FOLDS
@@ -40,8 +41,8 @@ Law = Callable[[np.ndarray], np.ndarray]  # values of points [m, f]
 
 
 def features(drawn: Sequence[Mapping[str, Any]], known: Sequence[Mapping[str, Any]]) -> np.ndarray:
-    """[n, f]: the parameters as a Gaussian process takes them. Numbers are scaled by those that are `known`; of a text,
-    such as the name of a variant, each value has a column; what never varies has none."""
+    """[n, f]: the parameters as a Gaussian process takes them. Numbers are scaled by the `known` ones; of a text, such
+    as the name of a variant, each value has a column; what never varies has none."""
     columns = []
     for name in known[0]:
         values = [one[name] for one in known]
@@ -127,11 +128,11 @@ class Sample(NamedTuple):
 
 @dataclass(frozen=True)
 class Process:
-    """What a Gaussian process gave for the asked scenes.
+    """What a Gaussian process gave for the scenes of a split.
 
     Attributes:
         name: what it has learned from.
-        errors: the relative error of each scene, by quantity; without those that it does not give.
+        errors: the relative error of each scene, by quantity; without quantities that it does not give.
         seconds: processor time of each prediction.
         missing: why it gives nothing, or no displacement; empty if it does.
     """
@@ -146,7 +147,7 @@ class Process:
         if not self.errors:
             return ()
         errors = self.errors.get(quantity, [math.inf] * len(self.seconds))
-        return (Side("Gaussian process", (Setting(self.name, tuple(errors), tuple(self.seconds)),)),)
+        return (Side(PROCESS, (Setting(self.name, tuple(errors), tuple(self.seconds)),)),)
 
     def why_not(self, quantity: str) -> str:
         """Why it does not give the quantity; empty if it does."""
@@ -172,7 +173,7 @@ def process_beside(
 
 
 def _learned(known: Sequence[Sample], asked: Sequence[Sample], tell: Callable[[str], None]) -> Process:
-    """What a process gives for samples after those that are known.
+    """What a process gives for the samples `asked`, after it has learned from the `known` ones.
 
     Raises:
         ConfigError: it does not apply; the text says why.
@@ -221,7 +222,7 @@ def _same_mesh(one: Scene, other: Scene) -> bool:
 
 
 def _points(samples: Sequence[Sample], known: Sequence[Sample]) -> np.ndarray:
-    """[n, f]: the samples as points, by parameters or principal components of those that are known."""
+    """[n, f]: the samples as points, by parameters or principal components of the known ones."""
     if known[0].values:
         return features([one.values for one in samples], [one.values for one in known])
     parts = [_components([one.prescribed.ravel() for one in samples], [one.prescribed.ravel() for one in known])]
@@ -233,7 +234,7 @@ def _points(samples: Sequence[Sample], known: Sequence[Sample]) -> np.ndarray:
 
 
 def _components(rows: Sequence[np.ndarray], known: Sequence[np.ndarray]) -> np.ndarray:
-    """[n, f]: rows by the principal components of those that are known, of which each has a deviation of 1."""
+    """[n, f]: rows by the principal components of the known rows, of which each has a deviation of 1."""
     base = np.stack(known).astype(np.float64)
     middle = base.mean(axis=0)
     _, size, modes = np.linalg.svd(base - middle, full_matrices=False)

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
+from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,8 +20,9 @@ from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.inference.answering import answers
 from ast_sim.inference.effort import Effort, choices, options_of
 from ast_sim.inference.evaluation.deepest_frames import deepest_predicted
-from ast_sim.inference.evaluation.gaussian_process import process_beside
+from ast_sim.inference.evaluation.gaussian_process import PROCESS, process_beside
 from ast_sim.inference.predicting.question import Question
+from ast_sim.inference.promises.calibration import require_new_scenes
 from ast_sim.inference.quantities.relative_errors import errors_of, moves
 from ast_sim.models.simulator import Simulator
 from ast_sim.simulate.jobs.fastest_solver import FINER, OWN_STOP_TEST, Outcome, solver_outcomes
@@ -98,27 +100,30 @@ def trade(
 
     Args:
         data: a dataset, its path or open; by default the one that the run was trained on.
-        split: whose scenes are asked. They must be new to the run, or its errors are too small.
+        split: whose scenes are predicted.
         beside: other runs that have learned from the same dataset, such as other models. Each stands in the tables with
             its fastest effort, by the name of its folder.
-        scenes: at most so many, the first of the split.
+        scenes: the number of scenes, at most: the first ones of the split that move.
         solver_seconds: what another program takes for such a scene, to the error of its mesh; our solver is not run.
         made_from: the specification or the parts of your own of which the dataset was made; the solver needs them.
         command: what is recorded as the origin of the figures.
         progress: as in `generate`.
 
     Raises:
-        ConfigError: no scene of the split moves, the solver's seconds are not above 0, or a run beside has learned from
-            another dataset or has the name of another run.
+        ConfigError: the split has trained or chosen the run, or none of its scenes moves; the solver's seconds are not
+            above 0; or a run beside has learned from another dataset or has the name of another run.
         DatasetError: the dataset cannot be read.
     """
-    if solver_seconds is not None and not 0 < solver_seconds < math.inf:
-        raise ConfigError(f"the solver's seconds are {solver_seconds}; they must be above 0")
+    if not isinstance(scenes, Integral) or isinstance(scenes, bool) or scenes < 1:
+        raise ConfigError(f"scenes is {scenes!r}; it must be a whole number above 0")
+    if solver_seconds is not None and not (isinstance(solver_seconds, Real) and 0 < solver_seconds < math.inf):
+        raise ConfigError(f"the solver's seconds are {solver_seconds!r}; they must be a number above 0")
     runs = _by_name([run, *beside])
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         with run.open(data) as dataset:
+            require_new_scenes(run, dataset, split)
             moving = (index for index in range(dataset.count(split)) if moves(dataset.load(split, index)))
             indices = list(islice(moving, scenes))
             if not indices:
@@ -153,8 +158,9 @@ def _by_name(runs: Sequence[Run]) -> dict[str, Run]:
                 f"{run.path} has learned from another dataset ({Path(run.settings.data).name}) than {first.path}"
                 f" ({Path(first.settings.data).name}): only runs of one dataset stand beside each other"
             )
-        if run.path.name in named:
-            raise ConfigError(f"two runs are called {run.path.name}: rename one, so that each has its column")
+        if run.path.name in (*named, PROCESS):
+            other = "a Gaussian process is" if run.path.name == PROCESS else "two runs are"
+            raise ConfigError(f"{other} called {run.path.name}: rename the run, so that each has its column")
         named[run.path.name] = run
     return named
 
@@ -291,7 +297,7 @@ def timed_answer(
     """The errors of an answer at the deepest frame by quantity, its processor seconds, and why it failed: it has no
     errors and infinite seconds then.
 
-    The scene is loaded anew, so nothing is prepared for its mesh; with these named fields, by which the force is
+    The scene is loaded again, so nothing is prepared for its mesh; with these named fields, by which the force is
     judged.
     """
     truth = dataset.load(split, index, fields)
@@ -308,13 +314,13 @@ def timed_answer(
 def _command(run: Run, scenes: _Scenes, effort: Effort) -> str:
     """What predicts the first scene with this effort."""
     what = options_of(effort) if run.settings.model.scheme.corrects else []
-    scene = [scenes.dataset.path.name, "--split", scenes.split, "--index", "0"]
+    scene = [scenes.dataset.path.name, "--split", scenes.split, "--index", str(scenes.indices[0])]
     return shlex.join(["ast-sim", "predict", run.path.name, *scene, "--out", "answer.h5", *what])
 
 
 def _invested(run: Run, dataset: Dataset) -> float | None:
-    """The processor seconds of the solver for the training scenes, if the dataset is that of the training, and the
-    seconds of the training."""
+    """The processor seconds of the solver for the training scenes and the seconds of the training, if the run has
+    learned from this dataset."""
     steps = run.settings.train.steps
     step = run.folder.metrics.seconds_per_step()
     samples = read_seconds(dataset).samples

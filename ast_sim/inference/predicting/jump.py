@@ -29,7 +29,7 @@ from ast_sim.named_field import STRESS
 from ast_sim.support.errors import RolloutError
 from ast_sim.support.progress import Progress, ShowProgress
 
-BATCH_NODES = 4096  # frames are predicted together as long as they have at most about so many nodes
+BATCH_NODES = 4096  # at most, of frames that are predicted together, unless a single one has more
 
 
 def jumps(
@@ -72,7 +72,7 @@ class AnswerSteps(NamedTuple):
 
 
 def answer_steps(model: Simulator, questions: Sequence[Question], effort: Effort) -> list[AnswerSteps | str]:
-    """For each scene the way to its answer, or a text that says why a frame failed. Arguments and errors as for
+    """For each scene the steps to its answer, or a text that says why a frame failed. Arguments and errors as for
     `jumps`."""
     ways: list[AnswerSteps | str] = []
     for scene in _predicted(model, questions, effort, whole_way=True):
@@ -91,7 +91,7 @@ def answer_steps(model: Simulator, questions: Sequence[Question], effort: Effort
 
 
 def _stacked(rows: list, count: int) -> np.ndarray:
-    """The rows, and the last one again until they are so many."""
+    """The rows, and the last one again until there are `count`."""
     return torch.stack([*rows, *[rows[-1]] * (count - len(rows))]).numpy()
 
 
@@ -139,8 +139,8 @@ def _start_again(model: Simulator, frame: JumpingFrame, effort: Effort, progress
 
 
 def _waves(scenes: Sequence[JumpingScene]) -> Iterator[list[JumpingFrame]]:
-    """The frames of all scenes with their starts: those that start from a given frame, then, when these are predicted,
-    those that start from one of these, and so on."""
+    """The frames of all scenes with their starts: first the frames that start from a given frame, then, when these are
+    predicted, the frames that start from one of these, and so on."""
     frames = [frame for scene in scenes for frame in scene.frames]
     for depth in range(1 + max((frame.depth for frame in frames), default=-1)):
         wave = [frame for frame in frames if frame.depth == depth]

@@ -38,7 +38,7 @@ class JumpingFrame:
         fields: after the last call and after Newton steps, which change the stress alone.
         last_step: the size of the last Newton step.
         latent: what the network made of it in the first call.
-        walked: whether the solver went the load path; None: it was not asked.
+        walked: whether the solver followed the load path; None: it did not solve the frame.
     """
 
     scene: JumpingScene
@@ -80,10 +80,11 @@ class JumpingFrame:
         return self.failure is None and self.last_step is not None and self.last_step > STILL
 
     def refine(self, most: int, every_stress: bool, progress: Progress) -> None:
-        """Make Newton steps from the answer of the model until one is `STILL`; the stress then is that of the material.
+        """Make Newton steps from the answer of the model until one is `STILL`. The law of the material then gives the
+        stress.
 
-        Friction resists slip from the frame before, where that is wanted, too. The stress is that of the last step, or
-        of every one. `progress` tells of those that take long.
+        Friction resists slip from the frame before, where that is wanted, too. There is a stress for the last step, or
+        for every one. `progress` tells of steps that take long.
         """
         if self.failure is not None:
             return
@@ -133,7 +134,7 @@ class JumpingFrame:
 
 @dataclass(eq=False)
 class JumpingScene:
-    """A scene and the frames of it that are predicted, in ascending order: those that are wanted, and those that they
+    """A scene and the frames of it that are predicted, in ascending order: the wanted frames, and the frames that they
     start from."""
 
     model: Simulator
@@ -202,7 +203,7 @@ class JumpingScene:
 
 
 def _solved(frames: Sequence[JumpingFrame]) -> dict[str, str]:
-    """How the solver reached the frames, as a fact of an answer; empty if it was not asked."""
+    """How the solver reached the frames, as a fact of an answer; empty if it solved none."""
     ways = {frame.walked for frame in frames} - {None}
     if not ways:
         return {}

@@ -31,8 +31,8 @@ class Question:
         scene: the scene.
         prescribed_position: [S, N, 3] float32, the positions of the prescribed nodes in each frame; in the given
             frames, of all nodes. Other entries are not read.
-        fields: [frames, N or E, *] float32, the stress and named fields of at least the given frames, by name; those
-            that are missing are zero.
+        fields: [frames, N or E, *] float32, the stress and named fields of at least the given frames, by name; missing
+            ones are zero.
         frames: the numbers of the frames that are wanted, in the order in which they are asked for; None: all of them,
             the given ones too.
         movable: the scene may be moved into the domain of the model.
@@ -109,7 +109,7 @@ class Question:
         source: Mapping[str, str] = NOTHING,
     ) -> Answer:
         """The answer with the wanted ones of these frames: positions and fields, by number of the frame; and the
-        `latents` of those that were predicted. The other arguments are as in `Answer`."""
+        `latents` of the predicted ones. The other arguments are as in `Answer`."""
         numbers = tuple(number for number in self.wanted() if number in frames)
         position = np.array([frames[number][0].numpy() for number in numbers], np.float32)
         fields = {

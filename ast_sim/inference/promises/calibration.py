@@ -8,7 +8,7 @@ a probability of at least LEVEL, whatever the model is (Vovk, Gammerman, Shafer 
 and for each quantity alone. The calibration scenes must not have trained or chosen the model; so nothing needs to be
 crossed, and n scores are enough from the n on for which the rank is at most n.
 
-What errors the answers keep, and which effort is enough for an asked one: `kept_errors`. Whether a scene is like the
+What errors the answers keep, and which effort is enough for a wanted one: `kept_errors`. Whether a scene is like the
 calibration scenes: `familiarity`.
 """
 
@@ -140,7 +140,7 @@ class Calibration:
         spacing = spacing_of(scene)
         low, high = self.spacing
         if notes:
-            return "the scene is unlike those that the run knows"
+            return "the scene is unlike the scenes that the run knows"
         if not (1 - LEEWAY) * low <= spacing <= (1 + LEEWAY) * high:
             return f"the mesh edges are {spacing:.3g} long, in the calibration scenes {low:.3g} to {high:.3g}"
         return ""
@@ -184,10 +184,10 @@ def calibrate(
     progress: ShowProgress = True,
 ) -> Calibration:
     """Measure how far the answers of a run are from the truth, after its default effort and each effort among which one
-    is chosen for an asked error; then answers with these efforts have a band.
+    is chosen for a wanted error; then answers with these efforts have a band.
 
     The scenes must be new to the run: they have neither trained nor chosen it. Scenes outside the ranges of the
-    training do not count, since no band is given there; neither do those without motion. A warning says how many. The
+    training do not count, since no band is given there; neither do scenes without motion. A warning says how many. The
     folder of a run keeps the result beside its best checkpoint, and `Run.save` takes it along.
 
     Args:
@@ -200,9 +200,7 @@ def calibrate(
         ConfigError: the split has trained or chosen the run, there are fewer than 19 scenes, or too many fail.
     """
     with run.open(data) as dataset:
-        known = Path(run.settings.data).resolve() == dataset.path.resolve()
-        if known and split in ("train", "valid"):
-            raise ConfigError(f"the scenes of {split} have trained or chosen the run: calibrate with other scenes")
+        require_new_scenes(run, dataset, split)
         before, run.calibration = run.calibration, None  # it has no say in which scenes count
         try:
             result, left_out = _measured(run, dataset, split, progress)
@@ -217,6 +215,15 @@ def calibrate(
     if run.path.is_file():
         warnings.warn(f"{run.path} is a file, which is not changed: Run.save writes one with the band", stacklevel=2)
     return result
+
+
+def require_new_scenes(run: Run, dataset: Dataset, split: str) -> None:
+    """Raise ConfigError if the scenes of a split have trained or chosen the run. A copy of its dataset is known."""
+    if split in ("train", "valid") and (
+        Path(run.settings.data).resolve() == dataset.path.resolve()
+        or run.folder.origin.get("data") == dataset.fingerprint()
+    ):
+        raise ConfigError(f"the scenes of {split} have trained or chosen the run: take other scenes")
 
 
 class _Measured(NamedTuple):
@@ -236,7 +243,7 @@ class _Measured(NamedTuple):
 
 
 def _measured(run: Run, dataset: Dataset, split: str, progress: ShowProgress) -> tuple[Calibration, list[str]]:
-    """The calibration by the scenes of a split, and the names of those that do not count."""
+    """The calibration by the scenes of a split, and the names of the scenes that do not count."""
     to_choose = choices(run.settings.model, run.settings.train.corrections)
     efforts = to_choose if run.effort in to_choose else (*to_choose, run.effort)
     scenes: list[_Measured] = []

@@ -1,4 +1,4 @@
-"""The effort of answers for which an error or a time is asked in place of an effort."""
+"""The effort of answers for which an error or a time is given in place of an effort."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Is a scene like those that a run knows? How far what the network makes of it lies from the calibration scenes.
+"""Is a scene like the scenes that a run knows? How far what the network makes of it lies from the calibration scenes.
 
 A frame is known by the mean x [D] of its latent rows in the first call: tokens of AST, nodes of other models. With the
 means m and the standard deviations s of all frames of the calibration scenes, let z = (x - m) / s, and let C be the

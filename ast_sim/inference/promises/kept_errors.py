@@ -1,7 +1,7 @@
 """The errors of calibration scenes after each effort, and the cheapest effort that keeps an error.
 
-A scene misses an effort if its error is above the asked one after this effort or after a dearer one: so the scenes that
-miss an effort hold those that miss a dearer one. Of n scenes let m miss an effort. The cheapest effort with
+A scene misses an effort if its error is above the wanted one after this effort or after a dearer one: so the scenes
+that miss an effort hold all that miss a dearer one. Of n scenes let m miss an effort. The cheapest effort with
 m + 1 <= (1 - KEPT) (n + 1) is taken; where there is none, nothing is promised. Then a fresh scene of the same kind is
 given a promise that is broken with a probability of at most 1 - KEPT, over calibrations and fresh scenes (conformal
 risk control: Angelopoulos, Bates, Fisch, Lei, Schuster 2024, theorem 1). That efforts are compared costs nothing.
@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from numbers import Real
 from typing import Any, Self
 
 import numpy as np
@@ -57,15 +58,18 @@ class KeptErrors:
         """For each effort the smallest error of a quantity that it keeps; infinite if it keeps none."""
         errors = np.array(self.errors[quantity])
         worst = np.sort(np.maximum.accumulate(errors[::-1])[::-1], axis=1)
-        spared = _allowed(worst.shape[1])  # so many scenes may lie above the bound
+        spared = _allowed(worst.shape[1])  # the number of scenes that may lie above the bound
         return worst[:, -1 - spared].tolist() if spared >= 0 else [math.inf] * len(worst)
 
     def effort_for(self, asked: Mapping[str, float]) -> Effort:
-        """The cheapest effort that keeps all asked errors, by quantity, in 90 % of fresh scenes.
+        """The cheapest effort that keeps all wanted errors, by quantity, in 90 % of fresh scenes.
 
         Raises:
-            ConfigError: no effort keeps them, which names the smallest that can be had; or a quantity is not known.
+            ConfigError: no effort keeps them, which names the smallest that can be had; a quantity is not known; or
+                none is asked for.
         """
+        if not asked:
+            raise ConfigError("no error is asked for: give one, such as 0.02 or {'reaction': 0.05}")
         for quantity, error in asked.items():
             self._require(quantity, error)
         limits = np.array(list(asked.values()))[:, None, None]
@@ -90,6 +94,8 @@ class KeptErrors:
             )
         if quantity not in self.errors:
             raise ConfigError(f"an error of {quantity} is not known; known are {', '.join(self.errors)}")
+        if not isinstance(error, Real):
+            raise ConfigError(f"the error of the {quantity} is {error!r}; it must be a number, as 0.02 for 2 %")
         if not 0 < error < 1:
             raise ConfigError(f"the error of the {quantity} is {error}; it must lie between 0 and 1, as 0.02 for 2 %")
         scenes = len(self.errors[quantity][0])
@@ -105,7 +111,7 @@ def in_words(asked: Mapping[str, float]) -> str:
 
 
 def _allowed(scenes: int) -> int:
-    """How many of so many calibration scenes may miss an effort; negative: there are too few scenes."""
+    """How many of `scenes` calibration scenes may miss an effort; negative: there are too few scenes."""
     return math.floor((1 - KEPT) * (scenes + 1) + 1e-9) - 1
 
 

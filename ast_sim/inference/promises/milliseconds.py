@@ -1,8 +1,8 @@
-"""The most accurate effort that takes no longer than an asked time, as measured on this machine.
+"""The most accurate effort that takes no longer than a wanted time, as measured on this machine.
 
-What an effort takes follows from the processor, the threads, the nodes of the scene and the frames that are asked. At
-the first question of its kind each effort is made once to warm up and then timed; the times are kept in the user's
-cache folder, outside the run, since they say nothing on another machine.
+The time of an effort depends on the processor, the threads, the nodes of the scene and the wanted frames. At the first
+question of its kind each effort is made once to warm up and then timed. The times are kept in the user's cache folder,
+outside the run, since they say nothing on another machine.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import hashlib
 import json
 import statistics
 import time
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,13 +34,15 @@ SIMILAR = 0.1  # scenes whose numbers of nodes differ by at most this share take
 
 
 def effort_within(run: Run, question: Question, ms: float) -> tuple[Effort, str]:
-    """The effort with the smallest error in the validation scenes among those that take at most `ms` milliseconds for
-    such a question, and what is said of the choice.
+    """The effort with the smallest error in the validation scenes, of all efforts that take at most `ms` milliseconds
+    for such a question, and what is said of the choice.
 
     Raises:
-        ConfigError: the fastest takes longer; the run has one effort, since it predicts step by step; or no errors of
-            its efforts were measured.
+        ConfigError: `ms` is no number above 0; the fastest takes longer; the run has one effort, since it predicts
+            step by step; or no errors of its efforts were measured.
     """
+    if not isinstance(ms, Real) or isinstance(ms, bool) or not ms > 0:
+        raise ConfigError(f"ms is {ms!r}; it must be a number above 0")
     efforts = choices(run.settings.model, run.settings.train.corrections)
     errors = {effort: run.expected_error(effort) for effort in efforts}
     known = {effort: error for effort, error in errors.items() if error is not None}
@@ -67,10 +70,13 @@ def _times(run: Run, question: Question, efforts: tuple[Effort, ...]) -> dict[Ef
     where = f"{_identity(run.model)} on {processor()}, {torch.get_num_threads()} threads"
     frames = len(question.wanted())
     nodes = question.scene.num_nodes
-    for one in kept.get(where, []):
-        times = {Effort(**each["effort"]): each["ms"] for each in one["times"]}
-        if one["frames"] == frames and abs(one["nodes"] - nodes) <= SIMILAR * nodes and set(efforts) <= set(times):
-            return times
+    try:
+        for one in kept.get(where, []):
+            times = {Effort(**each["effort"]): float(each["ms"]) for each in one["times"]}
+            if one["frames"] == frames and abs(one["nodes"] - nodes) <= SIMILAR * nodes and set(efforts) <= set(times):
+                return times
+    except (AstSimError, AttributeError, KeyError, TypeError):  # another version has written it
+        del kept[where]
     times = {effort: _timed(run, question, effort) for effort in efforts}
     told = [{"effort": vars(effort), "ms": ms} for effort, ms in times.items()]
     kept.setdefault(where, []).append({"nodes": nodes, "frames": frames, "times": told})

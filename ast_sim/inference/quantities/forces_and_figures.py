@@ -29,7 +29,7 @@ class BodyForce(NamedTuple):
     """What acts on the prescribed nodes of a body in one frame.
 
     Attributes:
-        frame: the number of the frame in the motion that was asked.
+        frame: the number of the frame in the motion of the question.
         time: in seconds; None: it is not known.
         body: the number of the body.
         force: [3] in newton.

@@ -11,14 +11,17 @@ import numpy as np
 
 from ast_sim.scene import Trajectory
 from ast_sim.support.errors import ConfigError
+from ast_sim.view.fields import require_same_scene
 
 if TYPE_CHECKING:
     from ast_sim.inference.answer import Answer
 
+SAME = 1e-4  # of the size of a scene: positions that are no farther apart differ by rounding
+
 
 def relative_error(position: np.ndarray, truth: Trajectory, frame: int) -> float:
-    """The root mean square error of the free nodes at positions [N, 3] in a frame, over that of their displacement,
-    which must not be 0."""
+    """The root mean square error of the free nodes at positions [N, 3] in a frame, divided by the root mean square of
+    their displacement, which must not be 0."""
     free = ~truth.scene.prescribed
     true = truth.position[frame]
     return rms(position - true, free) / rms(true - truth.position[0], free)
@@ -52,18 +55,43 @@ def stress_errors(
 
 def errors_of(answer: Answer, truth: Trajectory) -> dict[str, float]:
     """See `Answer.errors`."""
+    if not answer.frames:
+        raise ConfigError(f"{answer.name}: the answer has no frame to compare")
     row = len(answer.frames) - 1
-    frame = answer.frames[row]
+    number = answer.frames[row]
+    truth = truth.select([0, number])  # by their numbers: frames between may be missing
+    frame = truth.num_frames - 1
+    _require_same_question(answer, row, truth)
     errors = {"displacement": relative_error(answer.position[row], truth, frame)}
     fields = {name: dataclasses.replace(one, values=one.values[[frame]]) for name, one in truth.fields.items()}
     last = {name: dataclasses.replace(one, values=one.values[[row]]) for name, one in answer.fields.items()}
-    ours = dataclasses.replace(answer, position=answer.position[[row]], frames=(frame,), fields=last)
-    true = dataclasses.replace(answer, position=truth.position[[frame]], frames=(frame,), fields=fields)
+    ours = dataclasses.replace(answer, position=answer.position[[row]], frames=(number,), fields=last)
+    true = dataclasses.replace(answer, position=truth.position[[frame]], frames=(number,), fields=fields)
     with contextlib.suppress(ConfigError):  # a figure that this scene has not
         errors["reaction"] = relative_distance(ours.reaction(), true.reaction())
     stress = None if answer.stress is None else answer.stress[row]
     _, largest = stress_errors(truth, stress, frame, answer.stress_location or "node")
     return errors if largest is None else {**errors, "stress": largest}
+
+
+def _require_same_question(answer: Answer, row: int, truth: Trajectory) -> None:
+    """Raise AstSimError unless the last frame of `truth` and a row of the answer have the same scene, unit and
+    prescribed positions; ConfigError if nothing is displaced there."""
+    require_same_scene(truth, answer.trajectory)
+    number = truth.numbers[-1]
+    unit = None if answer.info is None else answer.info.length_unit
+    if unit is not None and truth.length_unit not in (None, unit):
+        raise ConfigError(f"{answer.name} is in {unit}, but the truth is in {truth.length_unit}")
+    there = truth.position[-1]
+    away = np.abs(answer.position[row] - there)[truth.scene.prescribed].max(initial=0.0)
+    if away > SAME * np.ptp(there, axis=0).max():
+        raise ConfigError(
+            f"{answer.name}: its prescribed nodes and the ones of the truth are up to {away:.3g} apart in frame {number}:"
+            " compare with a simulation of the same motion"
+        )
+    free = ~truth.scene.prescribed
+    if not (there - truth.position[0])[free].any():
+        raise ConfigError(f"{answer.name}: in frame {number} of the truth nothing is displaced: there is no share of 0")
 
 
 def relative_distance(ours: np.ndarray, true: np.ndarray) -> float:

@@ -139,7 +139,7 @@ class Elasticity:
         arguments = material.mu, material.pressure_factor(J), material.lam * J * J
         for elements, way, value in negative_directions(deformation, *arguments, self.gradients):
             b = way.reshape(12, -1)
-            # Of all elements: to pick those that have any takes twice as long.
+            # Of all elements: to pick the elements that have any takes twice as long.
             whole = np.zeros((12, entries.shape[1]))
             whole[:, elements] = b * np.sqrt(value * self.volume[elements])
             first = 0

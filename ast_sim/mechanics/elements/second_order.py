@@ -78,7 +78,7 @@ def points_at_rest(rest: np.ndarray, elements: np.ndarray) -> tuple[np.ndarray, 
 class SecondOrder(Elasticity):
     """Elastic body of tetrahedra `elements` [E,10] with rest positions [N,3]; as `Elasticity` otherwise.
 
-    Its deformations are those at the P = 4 E points: the first points of all elements, then the second ones, ...
+    It has deformations at the P = 4 E points: the first points of all elements, then the second ones, ...
 
     Raises:
         SimulationError: an element is turned over at rest at one of its points.

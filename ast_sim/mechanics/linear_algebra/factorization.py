@@ -21,9 +21,15 @@ class Factorization(Protocol):
     """Cholesky factorization K = L L^T of symmetric matrices that are given by their upper triangles."""
 
     name: str
+    condenses: bool  # whether it can `condense`
 
     def factorise(self, upper: scipy.sparse.csr_array, is_new_pattern: bool) -> bool:
         """Factorise; return False if the matrix is not positive definite."""
+
+    def condense(self, upper: scipy.sparse.csr_array, kept: np.ndarray, is_new_pattern: bool) -> np.ndarray | None:
+        """Eliminate all unknowns but those `kept` [m], ascending, and return what is left of the matrix, the Schur
+        complement [m, m]; None if the matrix is not positive definite. `halves` of solutions then stop at the kept
+        unknowns, and `other_half` goes on from where these are solved for."""
 
     def solve(self, right_side: np.ndarray) -> np.ndarray:
         """Solution for the matrix last factorised, to the last bits."""
@@ -56,25 +62,49 @@ def _pypardiso() -> tuple[ModuleType, str]:
 class Pardiso:
     """PARDISO in Intel's MKL; the symbolic factorization is made for new patterns only."""
 
+    condenses = True
     _NOT_POSITIVE_DEFINITE = -4
 
     def __init__(self) -> None:
-        pypardiso, self.name = _pypardiso()
-        self._error = pypardiso.pardiso_wrapper.PyPardisoError
-        self._solver = pypardiso.PyPardisoSolver(mtype=2)  # real, symmetric, positive definite
-        weakref.finalize(self, self._solver.free_memory, everything=True)  # MKL keeps the factor until it is told
+        self._pypardiso, self.name = _pypardiso()
+        self._error = self._pypardiso.pardiso_wrapper.PyPardisoError
+        self._kept: np.ndarray | None = None  # unknowns that the symbolic factorization leaves
 
     def factorise(self, upper: scipy.sparse.csr_array, is_new_pattern: bool) -> bool:
+        return self._factorised(upper, np.zeros(0, int), is_new_pattern) is not None
+
+    def condense(self, upper: scipy.sparse.csr_array, kept: np.ndarray, is_new_pattern: bool) -> np.ndarray | None:
+        return self._factorised(upper, kept, is_new_pattern)
+
+    def _factorised(self, upper: scipy.sparse.csr_array, kept: np.ndarray, is_new_pattern: bool) -> np.ndarray | None:
+        """See `condense`; without kept unknowns there is nothing in the array."""
         self._matrix = upper
+        is_new = is_new_pattern or self._kept is None or not np.array_equal(kept, self._kept)
         try:
-            for phase in (11, 22) if is_new_pattern else (22,):
-                self._solver.set_phase(phase)
-                self._solver._call_pardiso(upper, np.zeros(upper.shape[0]))
+            if is_new:
+                self._analyse(upper, kept)
+            # PARDISO writes the Schur complement where it writes solutions, in the shape of the right sides.
+            return self._called(22, np.zeros((len(kept), len(kept))) if len(kept) else np.zeros(upper.shape[0]))
         except self._error as error:
             if error.value == self._NOT_POSITIVE_DEFINITE:
-                return False
+                return None
             raise SimulationError(f"PARDISO failed with error {error.value} ({upper.shape[0]} unknowns)") from error
-        return True
+
+    def _analyse(self, upper: scipy.sparse.csr_array, kept: np.ndarray) -> None:
+        """Symbolic factorization, by a solver of its own: one that has left unknowns crashes when it leaves others."""
+        if self._kept is not None:
+            self._free()
+        self._kept = kept
+        self._solver = self._pypardiso.PyPardisoSolver(mtype=2)  # real, symmetric, positive definite
+        # MKL keeps the factor until it is told.
+        self._free = weakref.finalize(self, self._solver.free_memory, everything=True)
+        if len(kept):
+            # What PARDISO sets by itself, and two levels, and a Schur complement.
+            for parameter, value in ((1, 1), (2, 3), (34, 1), (24, 1), (36, 2)):
+                self._solver.set_iparm(parameter, value)
+            self._solver.perm = np.zeros(upper.shape[0], np.int32)
+            self._solver.perm[kept] = 1
+        self._called(11, np.zeros(upper.shape[0]))
 
     def solve(self, right_side: np.ndarray) -> np.ndarray:
         # PARDISO refines it twice, which triples the time: barriers make the matrices of the solver stiff.
@@ -88,15 +118,19 @@ class Pardiso:
         return self._applied(333, rights)  # L^-T
 
     def _applied(self, phase: int, columns: np.ndarray, refinements: int = 0) -> np.ndarray:
-        self._solver.set_phase(phase)
         self._solver.set_iparm(8, refinements)
-        return self._solver._call_pardiso(self._matrix, np.asfortranarray(columns))
+        return self._called(phase, np.asfortranarray(columns))
+
+    def _called(self, phase: int, right_sides: np.ndarray) -> np.ndarray:
+        self._solver.set_phase(phase)
+        return self._solver._call_pardiso(self._matrix, right_sides)
 
 
 class Cholmod:
     """CHOLMOD through cholespy, which factorises symbolically each time."""
 
     name = "CHOLMOD (cholespy)"
+    condenses = False
 
     def factorise(self, upper: scipy.sparse.csr_array, is_new_pattern: bool) -> bool:
         import cholespy
@@ -113,6 +147,9 @@ class Cholmod:
         except ValueError:
             return False
         return True
+
+    def condense(self, upper: scipy.sparse.csr_array, kept: np.ndarray, is_new_pattern: bool) -> np.ndarray | None:
+        raise SimulationError(f"{self.name} makes no Schur complement")
 
     def solve(self, right_side: np.ndarray) -> np.ndarray:
         solution = np.zeros_like(right_side)

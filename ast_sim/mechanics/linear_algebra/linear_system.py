@@ -24,6 +24,8 @@ ITERATE_FROM = 50_000  # systems with at least this many unknowns keep a factor 
 RELATIVE_RESIDUAL = 1e-3  # of conjugate gradients, to the right side; a Newton step reduces the error by as much
 MAX_ITERATIONS = 40  # then a new factor is cheaper
 
+NO_CONTACT = np.zeros(0, int), np.zeros(0, int), np.zeros(0)
+
 
 def conjugate_gradients(
     upper: scipy.sparse.csr_array, right_side: np.ndarray, precondition: Callable[[np.ndarray], np.ndarray]
@@ -168,13 +170,24 @@ class LinearSystem:
         return solution.reshape(-1, 3)
 
     def factorise(self, values: np.ndarray) -> Factorization | None:
-        """Factorise the sum of the elements' values [P] alone, without contact. The unknowns of the factorization are
-        those of `free`. None if the matrix is not positive definite."""
-        matrix = self._assemble(values, (np.zeros(0, int), np.zeros(0, int), np.zeros(0)))
+        """Factorise the sum of the elements' values [P] alone, without contact. `free` has the unknowns of the
+        factorization. None if the matrix is not positive definite."""
         self.factorizations += 1
-        self._has_factor = self._factorization.factorise(matrix, self._is_new)
+        self._has_factor = self._factorization.factorise(self._assemble(values, NO_CONTACT), self._is_new)
         self._is_new = False
         return self._factorization if self._has_factor else None
+
+    @property
+    def condenses(self) -> bool:
+        """Whether the library that factorises can `condense`."""
+        return self._factorization.condenses
+
+    def condense(self, values: np.ndarray, kept: np.ndarray) -> tuple[Factorization, np.ndarray] | None:
+        """As `factorise`, but the unknowns `kept` [m] are left: also the Schur complement [m, m]."""
+        self.factorizations += 1
+        schur = self._factorization.condense(self._assemble(values, NO_CONTACT), kept, self._is_new)
+        self._is_new = self._has_factor = False
+        return None if schur is None else (self._factorization, schur)
 
     def _assemble(
         self, values: np.ndarray, contact: tuple[np.ndarray, np.ndarray, np.ndarray]

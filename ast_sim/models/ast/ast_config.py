@@ -1,4 +1,4 @@
-"""The settings of AST. The defaults are those of the paper."""
+"""The settings of AST. The defaults come from the paper."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The presets of AST: those of the paper's table "Model hyperparameter", and `tiny` for any dataset."""
+"""The presets of AST, from the paper's table "Model hyperparameter", and `tiny` for any dataset."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ class Results:
         displacement: [S,N,3] metres; 0 at nodes of no element.
         stress: [S,E,6] Cauchy stress in pascal: xx, yy, zz, xy, yz, zx; the mean over the integration points.
         reaction: [S,3] force in newton on the driven nodes.
-        iterations: [S] iterations of each frame, including those of repeated increments.
+        iterations: [S] iterations of each frame, also of repeated increments.
         cutbacks: [S] increments of each frame that were repeated with a shorter length.
         nodal_forces: [S,N,3] newton, the forces from outside on each node; None: they were not asked for.
         plastic_strain: [S,N,1] equivalent plastic strain, extrapolated to the nodes; None: it was not asked for.
@@ -57,7 +57,7 @@ class Results:
 
     @classmethod
     def none(cls, nodes: int, elements: int, yields: bool) -> Results:
-        """Those of a run without a frame."""
+        """The results of a job without a frame."""
         frames = np.zeros((0, nodes, 3)), np.zeros((0, elements, 6)), np.zeros((0, 3))
         counts = np.zeros(0, int), np.zeros(0, int)
         return cls(*frames, *counts, *((frames[0], frames[0][:, :, :1]) if yields else ()))
@@ -66,7 +66,7 @@ class Results:
 def read_results(
     folder: Path, job: str, frames: int, nodes: int, elements: int, points: int = 1, yields: bool = False
 ) -> Results:
-    """Read the output of `job` in `folder`: the converged ones among frames 1 to `frames`; elements have so many
+    """Read the output of `job` in `folder`: the converged ones among frames 1 to `frames`. Elements have `points`
     integration points. Nodal forces and plastic strains are read if a material `yields`.
 
     Raises:

@@ -1,6 +1,6 @@
 """The input deck of a quasi-static case for CalculiX: mesh, materials, contact, prescribed motion, output.
 
-Nodes and elements keep their order and are numbered from 1. The keywords are those of the CalculiX CrunchiX manual.
+Nodes and elements keep their order and are numbered from 1. The CalculiX CrunchiX manual explains the keywords.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ast_sim.mechanics.driven import Driven
 from ast_sim.scene import Scene
 from ast_sim.support.errors import ConfigError, SimulationError
 
-# The elements by their number of nodes; the order of the nodes is that of a scene.
+# The elements by their number of nodes. Their nodes have the same order as in a scene.
 ELEMENT_TYPES = {4: "C3D4", 10: "C3D10"}
 # The corners of the faces S1 to S4.
 CALCULIX_FACES = ((0, 1, 2), (0, 1, 3), (1, 2, 3), (0, 2, 3))

@@ -33,7 +33,7 @@ INCREMENTS = 20
 FRAMES = INCREMENTS + 1
 DEFAULT_NODES = 4000
 MINIMUM_NODES = 200
-COARSE_ANGLE = 1.0  # smallest dihedral angle in degrees of pairs that are meshed anew: enough for the solver
+COARSE_ANGLE = 1.0  # smallest dihedral angle in degrees of pairs that are meshed again: enough for the solver
 DRAWS = 30  # draws of parts and placements before a sample is given up
 # Without friction, parts slide off each other, and that costs most iterations. Bent flanges touch their own webs.
 CONTACT = ContactSettings(dhat=1e-3, stiffness=1e6, friction=0.15, self_contact=True)
@@ -104,7 +104,7 @@ def draw_geometry(rng: np.random.Generator, nodes: int = DEFAULT_NODES, parts: P
 def _remeshed(
     mesh: Mesher, nodes: int, drawn: tuple[Part, Part], pair: Pair, squeeze: _Squeeze, share: float
 ) -> SolidCase:
-    """The case on a mesh with that share of the nodes. Its clamps end where those of the drawn pair end.
+    """The case on a mesh with that share of the nodes. Its clamps end where the clamps of the drawn pair end.
 
     Raises:
         BadMesh, MeshingFailed, Unsuitable: there is no such mesh.

@@ -30,16 +30,16 @@ from ast_sim.simulate.shapes.mesh_check import BadMesh
 from ast_sim.support.errors import ConfigError, SimulationError
 
 DRAWS = 10  # draws of the parameters before a sample is given up
-MESHES, NODE_TOLERANCE = 4, 0.1  # so many meshes are made to come this near to a wanted number of nodes
-# Elements are longer by this power of the factor by which nodes are fewer: between those of surfaces and of volumes. It
-# is larger where elements are about as long as the part: its shape then sets the number of nodes.
+MESHES, NODE_TOLERANCE = 4, 0.1  # further meshes, at most, are made to come this near to a wanted number of nodes
+# Elements are longer by this power of the factor by which nodes are fewer: between the powers for surfaces and for
+# volumes. It is larger where elements are about as long as the part: its shape then sets the number of nodes.
 USUAL_POWER, LARGEST_POWER = 0.4, 2.0
 LEAST_SHARE = 0.97  # a coarser mesh has at most this share of the nodes, or there is none
 SETTINGS = SolverSettings(force_tolerance=1e-3, max_iterations=200)
 DEFAULT_NODES = None
 MINIMUM_NODES = 20
 MINIMUM_FRAMES = 2
-# Units of the solver, pascal and the unit of length, in newton and joule: so many lengths are in a product.
+# Units of the solver, pascal and the unit of length, in newton and joule: the power of the length in each product.
 _POWERS = {"reaction": 2, "torque": 3, "elastic_energy": 3, "contact_energy": 3, "dissipation": 3, "work": 3}
 
 
@@ -112,7 +112,7 @@ def resized(spec: AssemblySpec, values: Values, nodes: int | None, frames: int, 
 
 
 def check_spec(spec: AssemblySpec, nodes: int | None, frames: int, keep: tuple[int, ...] | None = None) -> None:
-    """Make, but do not solve, the scene in the middle of all ranges and those at the ends of each range.
+    """Make, but do not solve, the scene in the middle of all ranges and the scenes at the ends of each range.
 
     Warnings tell each of their notes, and for each part the worst that linear elements get wrong in it.
 
@@ -133,7 +133,7 @@ def check_spec(spec: AssemblySpec, nodes: int | None, frames: int, keep: tuple[i
 
 
 def ends_of_ranges(spec: AssemblySpec) -> Iterator[Values]:
-    """Values in the middle of all ranges, then those with one parameter at an end of its range."""
+    """Values in the middle of all ranges, then values with one parameter at an end of its range."""
     yield completed(spec.parameters, {})
     for name, one in spec.parameters.items():
         for end in one.ends if one.is_drawn else ():

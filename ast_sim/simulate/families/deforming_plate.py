@@ -1,9 +1,8 @@
 """Scene family `deforming_plate`: a clamped plate that a rigid obstacle presses in and lets go.
 
 The plate lies in the plane z = 0 around the origin. Both ends are clamped (HANDLE); in half of the scenes the clamps
-drift. The obstacle (all of its nodes are OBSTACLE) starts above the plate, moves down along a straight slanted way, and
-returns to its start. Meanwhile it follows the drift. Every draw comes from the generator that is passed in, in a fixed
-order.
+drift. The obstacle (all of its nodes are OBSTACLE) starts above the plate, moves down along a slanted line, and returns
+to its start. Meanwhile it follows the drift. Every draw comes from the generator that is passed in, in a fixed order.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ ACROSS = 3
 OBSTACLE_SHARE = 0.16  # share of the nodes that belong to the obstacle
 SECOND_ORDER_CELLS = 4  # at least, along each side of an obstacle of second-order elements, which are two cells long
 SMALLEST_ANGLE = np.radians(22)  # smallest angle of a triangle of the middle plane
-COARSE_ANGLE = np.radians(10)  # the same where the plate is meshed anew: the mesh need not be that good, but must exist
+COARSE_ANGLE = np.radians(10)  # the same for other meshes of the plate: they need not be that good, but must exist
 CLAMP_MARGIN = 0.05  # distance in metres, seen from above, between the obstacle and the clamps
 INFO = DatasetInfo(
     family="deforming_plate",
@@ -55,7 +54,7 @@ INFO = DatasetInfo(
 
 
 def solve(case: SolidCase, checkpoint: Checkpoint | None = None, patient: bool = False) -> Trajectory:
-    """All frames of a drawn scene, or those up to the first that cannot be solved."""
+    """All frames of a drawn scene, or all before the first that cannot be solved."""
     return quasi_static(case, SETTINGS, checkpoint, patient)
 
 
@@ -65,7 +64,7 @@ class _Shape:
 
     Attributes:
         outline: the middle plane.
-        columns: about how many nodes the mesh of the middle plane has, those within its edges too.
+        columns: about how many nodes the mesh of the middle plane has, with the nodes within its edges.
         area, perimeter: of the middle plane.
         length: distance between the clamps of the unsheared plate.
         thickness: where x = 0.
@@ -139,7 +138,7 @@ def draw_geometry(rng: np.random.Generator, nodes: int = DEFAULT_NODES, frames: 
         nodes: about how many nodes a scene of the dataset has, obstacle included. The drawn scene has 0.5 to 1.7 times
             as many.
         frames: how many frames the press and the release take.
-        order: 1 for linear tetrahedra, 2 for those of ten nodes.
+        order: 1 for linear tetrahedra, 2 for tetrahedra of ten nodes.
 
     Raises:
         ConfigError: there are too few frames for a press and a release.
@@ -252,7 +251,7 @@ def _remeshed(shape: _Shape, share: float) -> _Plate:
 def _draw_touch(rng: np.random.Generator, plate: _Plate, obstacle: np.ndarray, press: np.ndarray) -> np.ndarray | None:
     """The point [2] where the obstacle's lowest point meets the plate. None if it does not fit, or meets a hole.
 
-    The plate is solid at this point, and the obstacle stays well between the clamps on all of its way. A clamped node
+    The plate is solid at this point, and the obstacle stays well between the clamps on its whole path. A clamped node
     could not give way under it.
     """
     x, y = obstacle[:, :2].T - obstacle[np.argmin(obstacle[:, 2]), :2][:, None]

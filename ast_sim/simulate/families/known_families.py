@@ -3,7 +3,7 @@
 Such a module has `INFO` (DatasetInfo), `DEFAULT_NODES`, `MINIMUM_NODES`, `FRAMES` (frames of a scene, unless it is an
 option), `draw(rng, nodes, ...) -> case`, which takes all of its draws from `rng`, and
 `solve(case, checkpoint) -> Trajectory`. One without inertia also has `SETTINGS` (SolverSettings) and
-`draw_geometry(rng, nodes, ...) -> Drawn`, which draws the same and can be meshed anew. One with the option order also
+`draw_geometry(rng, nodes, ...) -> Drawn`, which draws the same and can be meshed again. One with the option order also
 has `SECOND_ORDER_NODES`, the `MINIMUM_NODES` of such scenes. The family `assembly` has
 `info`, `check_spec` and `draw_scene` instead of `INFO` and the two: they depend on a specification.
 docs/how-to/new-family.md shows a family.

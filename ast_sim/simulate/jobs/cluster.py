@@ -5,7 +5,7 @@ it, with the same environment as a local worker process and without torch. A clu
 one machine of its kind.
 If a Dask worker dies, no sample is lost: the scheduler gives its tasks to other workers, and this process stores each
 result once. If the workers see the parts folder too, an interrupted sample goes on from its last stored frame.
-Otherwise it begins anew.
+Otherwise it begins again.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ MOST_INSIDE = 8  # at most this many scenes report at once
 
 @dataclass
 class Inside:
-    """How far one scene is. An earlier run may have made the first frames; those took no time in this run."""
+    """How far one scene is. An earlier run may have made the first frames; they took no time in this run."""
 
     started: float
     first: int | None = None
@@ -36,7 +36,7 @@ class Inside:
 
 
 class SceneProgress(Progress):
-    """Counts scenes; of the unfinished ones, those that have run longest tell how far they are."""
+    """Counts scenes, and tells how far the unfinished scenes are that have run longest."""
 
     def __enter__(self) -> Self:
         super().__enter__()

@@ -39,17 +39,17 @@ UNMESHED = "could not be meshed"  # with why, of variants that need a coarser me
 
 @dataclass(frozen=True)
 class SolverVariant:
-    """Settings with which the solver is run, relative to those with which it made the dataset.
+    """Settings with which the solver is run, relative to the settings with which it made the dataset.
 
     Attributes:
         name: what it is called.
         nodes: share of the nodes of the deforming bodies; above 1 a finer mesh.
         dhat: factor of the range of contact.
         tolerance: factor of the stop test, `SolverSettings.force_tolerance`.
-        linearised: so many load steps, each of one Newton step with linearised contact, and one more step at the end.
-            0: the bundled solver, with barriers and to its stop test.
-        newton: the solution is carried over to the mesh of the dataset, and so many Newton steps with linearised
-            contact follow there, as after a model. In them, surfaces have slid as `NewtonSteps.step` supposes.
+        linearised: the number of load steps, each of one Newton step with linearised contact; one more step follows at
+            the end. 0: the bundled solver, with barriers and to its stop test.
+        newton: the number of Newton steps with linearised contact that follow on the mesh of the dataset, as after a
+            model. In them, surfaces have slid as `NewtonSteps.step` supposes.
         finished: the bundled solver then goes on there to its own stop test, as it may after a model. Where bodies
             overlap or an element is turned over, it cannot.
     """
@@ -115,9 +115,9 @@ class Outcome:
         nodes: nodes of the mesh that was solved, obstacles included; of nested iteration, of the coarse one.
         start: the load steps that were planned, 0: one for each frame. A step that did not converge was halved, and
             steps then grew again.
-        seconds: processor time of the solution on one thread, with that of the steps that did not converge, but
-            without meshing and setting up. The smallest of all repeats; infinite without a mesh. Nested iteration: with
-            the transfer and the Newton steps that follow.
+        seconds: processor time of the solution on one thread, with the steps that did not converge, but without meshing
+            and setting up. The smallest of all repeats; infinite without a mesh. Nested iteration: with the transfer
+            and the Newton steps that follow.
         setup_seconds: processor time in which the solver was set up for the mesh; of nested iteration, for both.
         mesh_seconds: processor time of the meshing; 0 for the mesh of the dataset.
         load_steps, newton_iterations, halvings: how many of them the solution took, on all its meshes.
@@ -127,8 +127,8 @@ class Outcome:
         relative_error: `error` over the same root of the displacement of the dataset's frame. It says little where
             hardly anything has moved.
         reaction_error, stress_error: of the force on the driven nodes and of the largest von Mises stress on the mesh
-            that was solved (nested iteration: on the dataset's), relative to those of the dataset's frame; infinite
-            without a solution, or where they are 0 there.
+            that was solved (nested iteration: on the dataset's), relative to the force and the stress of the dataset's
+            frame; infinite without a solution, or where they are 0 there.
     """
 
     variant: SolverVariant

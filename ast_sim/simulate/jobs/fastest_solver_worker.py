@@ -81,7 +81,7 @@ def outcomes_of(task: dict[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndar
 
 
 def _seconds() -> float:
-    """Processor time of this process and of those that it has started, such as gmsh."""
+    """Processor time of this process and of the processes that it has started, such as gmsh."""
     return sum(os.times()[:4])
 
 
@@ -159,8 +159,8 @@ class VariantSolver:
         )
 
     def _load_errors(self, share: float, position: np.ndarray) -> tuple[float, float]:
-        """Of the force and of the largest stress of positions on the mesh with this share of the nodes, relative to
-        those of the dataset's frame."""
+        """The errors of the force and of the largest stress of positions on the mesh with this share of the nodes,
+        relative to the force and the stress of the dataset's frame."""
         true_force, true_stress = self._true_loads
         force, stress = self._loads_on(share).at(position)
         size = float(np.linalg.norm(true_force))
@@ -271,7 +271,7 @@ class VariantSolver:
         )
 
     def _on_own_mesh(self, case: SolidCase, position: np.ndarray) -> np.ndarray:
-        """Positions of the nodes of the dataset's mesh, from those of another mesh of the same bodies."""
+        """Positions of the nodes of the dataset's mesh, from the positions of another mesh of the same bodies."""
         scene = case.scene
         rest = scene.rest_position.astype(np.float64)
         result = self.drawn.case.prescribed_position[self.frame].copy()

@@ -31,7 +31,7 @@ from ast_sim.simulate.families.known_families import family_module
 from ast_sim.simulate.jobs import cluster, pool
 from ast_sim.simulate.jobs.display import SceneProgress
 from ast_sim.simulate.jobs.manifest import Manifest, Watch
-from ast_sim.simulate.jobs.recipe import check_parts, checked_recipe, difference, recorded
+from ast_sim.simulate.jobs.recipe import check_parts, checked_recipe, difference, recorded, whole
 from ast_sim.simulate.jobs.samples import (
     Recipe,
     Sample,
@@ -91,7 +91,7 @@ def generate(
         family, out: scene family, such as "deforming_plate"; dataset file. One with these settings gets what it lacks.
         train, valid, test, calibration: scenes of each split. `valid` and `test` are a tenth of `train` if None.
         seed: of all random draws. A sample depends only on the seed, its split, its index and the settings.
-        nodes, frames: of a scene, about so many nodes; None: the default of the family or of the specification.
+        nodes, frames: about how many nodes and how many frames a scene has; None: as the family or specification has.
         keep: ascending numbers of the frames to solve, straight from one to the next, and store; all frames if None.
         order: of the tetrahedra, 1 (four nodes) or 2 (ten nodes), for families that have this option; 1 if None.
         workers: number of processes; one per available core if None.
@@ -197,7 +197,12 @@ def checked_workers(workers: int | None, scheduler: str | None) -> int:
 
 
 def checked_counts(train: int, valid: int | None, test: int | None, calibration: int = 0) -> dict[str, int]:
-    """The number of scenes of each split; a tenth of `train` where None."""
+    """The number of scenes of each split; a tenth of `train` where None.
+
+    Raises:
+        ConfigError: one is no whole number, all are 0, or there are too many.
+    """
+    train, valid, test, calibration = whole(train=train, valid=valid, test=test, calibration=calibration)
     tenth = -(-train // 10)
     counts = {
         "train": train,
@@ -289,7 +294,7 @@ def _locked(folder: Path, settings: dict[str, Any]) -> Iterator[None]:
             differs = difference(_read_settings(path), settings)
             if differs:
                 raise ConfigError(
-                    f"{folder} holds samples of other settings ({differs}): give those settings, or remove the folder"
+                    f"{folder} holds samples of other settings ({differs}): give its settings, or remove the folder"
                 )
         else:
             try:

@@ -26,7 +26,7 @@ NAME = "manifest.jsonl"
 
 
 class Manifest:
-    """The manifest of a parts folder. It begins anew, from the sample files that are there.
+    """The manifest of a parts folder. It is written again, from the sample files that are there.
 
     Args:
         folder: the parts folder.

@@ -50,7 +50,7 @@ class MeshError:
     Attributes:
         quantity: "force" or "torque".
         value: on the mesh of the scene, in newton or newton metres.
-        relative: how long the elements of the other mesh are, relative to those of the scene's mesh: 1/2 or 2.
+        relative: the length of the elements of the other mesh, relative to the scene's mesh: 1/2 or 2.
         other: the same force on that mesh.
     """
 
@@ -84,7 +84,7 @@ def mesh_error(
         spec: the specification.
         case, solved: the scene, and its frames as `ast_sim generate` makes them.
         values: of the parameters in it.
-        nodes: about how many nodes the scene was asked to have; None: as the sizes give.
+        nodes: about how many nodes the scene should have; None: as the sizes give.
         solver: of the scene, "own" or "calculix". CalculiX solves it on a mesh of twice the size.
 
     Raises:

@@ -127,7 +127,7 @@ def recipe_of(name: str, info: DatasetInfo, made_from: str | os.PathLike[str] | 
     except TypeError as error:
         raise ConfigError(f"{name}: its settings cannot be read ({error!r})") from error
     if parts is not None and _source(parts).describe().get("parts") != made["parts"]:
-        raise ConfigError(f"{parts} holds other parts than those that {name} was made of")
+        raise ConfigError(f"{parts} does not hold the parts that {name} was made of")
     if spec is not None and read_spec(spec).describe() != made["spec"]:
         raise ConfigError(f"{spec} or a file that it names differs from what {name} was made of")
     return recipe
@@ -149,7 +149,10 @@ def whole(**numbers: Any) -> list[Any]:
 
 def _checked_keep(keep: Sequence[int], last: int) -> tuple[int, ...]:
     """The numbers of the frames to keep, after a check; `last` is the number of the last frame."""
-    kept = tuple(map(index, keep))
+    try:
+        kept = tuple(map(index, keep))
+    except TypeError as error:
+        raise ConfigError(f"keep is {keep!r}; must be a list of whole numbers") from error
     if not kept or not all(1 <= frame <= last for frame in kept):
         raise ConfigError(f"keep is {list(kept)}; must be numbers of frames from 1 to {last}, beside frame 0")
     if any(later <= earlier for earlier, later in pairwise(kept)):

@@ -110,11 +110,11 @@ class AssemblySpec:
         path, text: its file and what stands in it.
         unit: unit of all lengths.
         frames: frames of a scene; the first is at rest.
-        order: of the elements: 2 for tetrahedra of ten nodes, 1 for those of four.
+        order: of the elements: 2 for tetrahedra of ten nodes, 1 for tetrahedra of four.
         contact_distance: distance below which surfaces repel each other; None: it follows from the size.
         pair_friction: friction between two parts, by their numbers; all others have the parameter `friction`.
         parameters: all parameters by name.
-        parts: the parts; the number of a part is that of its body.
+        parts: the parts; a part and its body have the same number.
     """
 
     path: Path

@@ -20,7 +20,7 @@ from ast_sim.simulate.own_assembly.rest_check import surface_of
 ENOUGH = 3  # elements across a wall that bends
 LARGEST_POISSON = 0.45
 OPPOSITE = -0.9  # cosine between the normals of the two sides of a wall, at most
-SLENDER = 4  # a wall bends if it is so many times as long as thick
+SLENDER = 4  # a wall bends if its length is at least this multiple of its thickness
 INWARD = 1e-6  # rays start that far inside, as a share of the size of the part
 CURE = "leave out order = 1"
 
@@ -32,7 +32,7 @@ class Limit:
     Attributes:
         part: its name.
         kind: "thin" or "rubber".
-        badness: the larger, the worse, among those of one kind.
+        badness: the larger, the worse, among limits of one kind.
         text: a sentence.
     """
 

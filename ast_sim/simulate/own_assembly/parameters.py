@@ -25,7 +25,7 @@ class Parameter:
     """What a parameter may be: one value, a range, one of several texts, or an expression over other parameters.
 
     Attributes:
-        name: the name; that of a quantity of a part is `PART.QUANTITY`.
+        name: the name; for a quantity of a part, `PART.QUANTITY`.
         low, high: the ends of the range; equal for a constant.
         log: whether its logarithm is drawn evenly.
         choices: the texts, one of which is drawn; empty for a number.
@@ -137,7 +137,7 @@ def drawn(parameters: Mapping[str, Parameter], seed: int, split: int, index: int
 
 
 def completed(parameters: Mapping[str, Parameter], given: Mapping[str, Any]) -> Values:
-    """The values of all parameters; those that are not given are in the middle of their ranges.
+    """The values of all parameters; parameters that are not given are in the middle of their ranges.
 
     Args:
         given: values by name. `{"young": {"bumper": 1e6}}` is the same as `{"bumper.young": 1e6}`.

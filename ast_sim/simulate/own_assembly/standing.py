@@ -56,7 +56,7 @@ class PlacedPart:
         part: what the specification says of it.
         position: [N,3] float64, in the assembly.
         cells: [E,4] or [E,10] tetrahedra, [F,3] triangles of a rigid surface.
-        moves: [N] 0 for nodes that stand still, k + 1 for those of the k-th move, -1 for free nodes.
+        moves: [N] 0 for nodes that stand still, k + 1 for the nodes of the k-th move, -1 for free nodes.
         notes: what a user should know of it, a sentence each.
     """
 
@@ -118,7 +118,7 @@ def _placed(part: PartSpec, mesh: PartMesh, values: Values) -> PlacedPart:
 
 
 def case(spec: AssemblySpec, values: Values, frames: int, parts: list[PlacedPart], shared: Reference) -> SolidCase:
-    """The case of the parts as they stand, with their motion in so many frames.
+    """The case of the parts as they stand, with their motion in `frames` frames.
 
     Raises:
         ConfigError: a motion cannot be computed, a material is not allowed, or friction is negative.

@@ -14,7 +14,7 @@ import numpy as np
 from ast_sim.mechanics.contact_and_friction import load_ipctk
 from ast_sim.plausibility import overlaps
 
-CREASE = np.radians(50)  # facets that meet at a larger angle are not those of a curved surface
+CREASE = np.radians(50)  # facets that meet at a larger angle do not belong to a curved surface
 
 Pair = tuple[int, int]
 
@@ -78,8 +78,8 @@ class Surfaces:
         return np.flatnonzero(self.body[self.faces[:, 0]] == part)
 
     def opposed(self, group: list[int], other: list[int]) -> tuple[int, int]:
-        """Of the triangles that hold all nodes of a group, and of those of the other, the two that face each other
-        most."""
+        """A triangle with all nodes of one group, and a triangle with all nodes of the other: the two that face each
+        other most."""
         mine, theirs = (sorted(set.intersection(*(self.at_node[node] for node in nodes))) for nodes in (group, other))
         cosine = self.normals[mine] @ self.normals[theirs].T
         row, column = np.unravel_index(cosine.argmin(), cosine.shape)
@@ -104,7 +104,7 @@ class Near:
 
     @classmethod
     def of(cls, surfaces: Surfaces, group: list[int], other: list[int], gap: float) -> Near:
-        """The place where these nodes are near to those."""
+        """The place where these two groups of nodes are near to each other."""
         return cls(tuple(group), tuple(other), *surfaces.opposed(group, other), gap)
 
     def pair(self, surfaces: Surfaces) -> Pair:

@@ -1,9 +1,8 @@
-"""Parts that touch at rest, as those of CAD assemblies do: their surfaces are set back until contact can begin there.
+"""Parts that touch at rest, as in CAD assemblies: their surfaces are set back until contact can begin there.
 
 The solver keeps surfaces apart by the contact distance, so faces at one place move into their parts: each by half of
-what is missing, beside a rigid part by all of it. Surfaces that are curved alike, as those of a pin and its bore,
-overlap once they are facets, by no more than the arcs over the facets are high; this is set back, too. A larger overlap
-stays.
+what is missing, beside a rigid part by all of it. Surfaces that are curved alike, such as a pin and its bore, overlap
+once they are facets, by no more than the arcs over the facets are high; this is set back, too. A larger overlap stays.
 
 Legend: N nodes, K constraints.
 """
@@ -24,7 +23,7 @@ MARGIN = 1.02  # of the contact distance: float32 rounds positions
 ROUNDS = 50  # in which surfaces are set back: what is moved may come near to something else
 FACING = -0.5  # cosine between the normals of triangles that lie on each other
 ALIKE = 0.2  # directions of constraints whose combinations are this short are one direction
-ARCS = 1.5  # an overlap of so many heights of arcs may come from facets
+ARCS = 1.5  # overlap that may come from facets, in heights of arcs
 SMALLEST_ANGLE = 1.0  # degrees between two faces of a tetrahedron that is left
 
 
@@ -89,7 +88,7 @@ def _turned(cells: np.ndarray, before: np.ndarray, after: np.ndarray) -> bool:
 
 
 def _overlaps(surfaces: Surfaces, distance: float) -> dict[Pair, float]:
-    """How deep each two parts lie in each other; without those that overlap more than facets do."""
+    """How deep each two parts lie in each other, without pairs that overlap more than facets do."""
     depths: dict[Pair, float] = {}
     for pair in combinations(range(len(surfaces.rigid)), 2):
         inside = list(nodes_inside(surfaces, pair))
@@ -100,7 +99,7 @@ def _overlaps(surfaces: Surfaces, distance: float) -> dict[Pair, float]:
 
 
 def _way(surfaces: Surfaces, near: list[Near], wanted: float) -> np.ndarray:
-    """[N,3]: how nodes move, so that all these places are as far apart as wanted: the shortest way of each that goes
+    """[N,3]: how nodes move, so that all these places are as far apart as wanted: the shortest vector of each that goes
     far enough against the normal of each of its triangles that face another part."""
     constraints: dict[int, list[np.ndarray]] = {}
     for one in near:
@@ -125,7 +124,7 @@ def _way(surfaces: Surfaces, near: list[Near], wanted: float) -> np.ndarray:
 
 
 def _between(near: Near, normal: np.ndarray, opposite: np.ndarray) -> np.ndarray:
-    """[3]: the way in which the first group leaves the other, of length one."""
+    """[3]: the direction in which the first group leaves the other, of length one."""
     way = opposite if len(near.other) == 3 else -normal if len(near.group) == 3 else opposite - normal
     return way / max(np.linalg.norm(way), np.finfo(float).tiny)
 

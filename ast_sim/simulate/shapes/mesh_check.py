@@ -34,7 +34,7 @@ def check_mesh(position: np.ndarray, elements: np.ndarray, name: str, smallest_a
         BadMesh: the text names the part, what is wrong and where: no tetrahedra, too many nodes, numbers that are not
             finite, two nodes at one place, elements that are inverted, flat or with a dihedral angle below
             `smallest_angle` degrees, no volume, several pieces, or a surface that cuts itself. Angles and volumes are
-            those between the corners.
+            measured between the corners.
     """
     if len(elements) == 0:
         raise BadMesh(f"{name}: it holds no tetrahedra")

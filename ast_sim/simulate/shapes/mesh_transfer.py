@@ -6,7 +6,7 @@ import numpy as np
 
 from ast_sim.mechanics.elements.second_order import shape_functions
 
-_NEAREST = 32  # so many elements are tried for a point outside of all: those whose centres are nearest
+_NEAREST = 32  # elements that are tried for a point outside of all: the elements with the nearest centres
 
 
 def transferred(rest: np.ndarray, elements: np.ndarray, displacement: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 Nodes lie at equal steps on the curves, so the rims are exact. A hexagonal lattice fills the inside and is smoothed:
 each inner node moves to the mean of the centroids of its triangles, weighted by their areas, and then Delaunay's
-criterion connects all nodes anew. No mesh generator is needed. Lengths in metres.
+criterion connects all nodes again. No mesh generator is needed. Lengths in metres.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ def _smoothed(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def _has_rim(triangles: np.ndarray, edges: np.ndarray) -> bool:
-    """Whether the given edges are exactly those that belong to only one triangle."""
+    """Whether the given edges are exactly the edges that belong to only one triangle."""
     sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     outline, count = np.unique(sides, axis=0, return_counts=True)
     return np.array_equal(outline[count == 1], np.unique(np.sort(edges, axis=1), axis=0))

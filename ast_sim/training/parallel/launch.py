@@ -20,6 +20,7 @@ import torch
 from ast_sim.dataset.reader import Dataset
 from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.errors import ConfigError, TrainingError
+from ast_sim.support.toml_settings import require_range
 
 LEAST_NODES = 3000  # of a process in a step; below, two processes are no faster than one (docs/log.md, 2026-11-27)
 SMALL = 2e6  # nodes times samples; so small trainings end before other processes are ready
@@ -63,16 +64,17 @@ def _is_from_a_script(config: RunConfig) -> bool:
 
 @contextmanager
 def together(count: int, config: RunConfig | None, arguments: Mapping[str, Any]) -> Iterator[None]:
-    """Within the block, so many processes make the training; 1: only this one.
+    """Within the block, `count` processes train together; 1: only this one.
 
     Args:
         config: the settings, if there are any.
         arguments: of `start_training`, for the other processes.
 
     Raises:
-        ConfigError: another process cannot import the model.
+        ConfigError: the count is below 1, or another process cannot import the model.
         TrainingError: another process could not start, or ended.
     """
+    require_range("train.processes", count, 1)
     if count == 1:
         yield
         return

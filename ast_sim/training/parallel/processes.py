@@ -82,7 +82,7 @@ class Processes:
         return values[0]
 
     def spread(self, tensors: Iterable[Tensor]) -> None:
-        """Overwrite the tensors of all processes with those of the leading process."""
+        """Overwrite the tensors of all processes with the tensors of the leading process."""
         if self.count > 1:
             for tensor in tensors:
                 distributed.broadcast(tensor.detach(), 0)

@@ -32,7 +32,7 @@ from benchmarks.robustness.dialects.draws import DIALECTS, draw, draws_of_fenics
 from benchmarks.robustness.dialects.random_simulation import Simulation
 
 OUTCOMES = ("right", "refused", "silent", "crash")
-OF_FENICS = 14  # one of so many draws, if there is FEniCS
+OF_FENICS = 14  # draws, one of which goes to FEniCS, if it is installed
 
 
 def outcome(case: Case, simulation: Simulation) -> tuple[str, str]:

@@ -27,7 +27,7 @@ class FileContent:
     point_of: np.ndarray
 
     def values(self, of_simulation: np.ndarray) -> np.ndarray:
-        """Values at the points of the simulation [n, ...] at those of the file [m, ...]; 0 at points of none."""
+        """Values at the points of the simulation [n, ...], at the points of the file [m, ...]; 0 at points of none."""
         there = (self.point_of >= 0).reshape(-1, *[1] * (of_simulation.ndim - 1))
         return np.where(there, of_simulation[self.point_of], 0)
 

@@ -43,7 +43,7 @@ class Simulation:
 
     Attributes:
         bodies: each with points of its own.
-        displacement: [S, n, 3] of all points, those of the first body first; the first frame is at rest.
+        displacement: [S, n, 3] of all points, body by body; the first frame is at rest.
         stress: [S, n] at the points; the corners of cells have whole numbers.
         times: [S].
         fixed: [n] bool, prescribed points of bodies that deform.

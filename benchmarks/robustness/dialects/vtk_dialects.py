@@ -31,7 +31,7 @@ NAMES = FieldNames("U", "S", None, "tool", "fixed")
 def grid(
     rng: np.random.Generator, content: FileContent, simulation: Simulation, frame: int, moved: bool, bits: bool = True
 ) -> Any:
-    """An unstructured grid of a frame, with fields that nobody needs beside those that are read."""
+    """An unstructured grid of a frame, with fields that nobody needs beside the fields that are read."""
     data = vtkUnstructuredGrid()
     at, real = vtkPoints(), np.float64 if rng.random() < 0.7 else np.float32
     shift = content.values(simulation.displacement[frame])
@@ -192,7 +192,7 @@ def _write_pvtu(path: Path, files: list[str]) -> None:
 
 
 def _write_pieces(path: Path, grids: list[Any]) -> None:
-    """One file of several pieces: those that VTK writes for each grid alone."""
+    """One file of several pieces: the pieces that VTK writes for each grid alone."""
     texts = []
     for data in grids:
         writer = vtkXMLUnstructuredGridWriter()

@@ -156,7 +156,7 @@ def test_plates_of_second_order_elements():
     assert 1000 < np.median(sizes) < 1600
 
 
-def test_the_force_of_second_order_plates_is_nearly_that_of_a_finer_mesh():
+def test_the_force_of_second_order_plates_is_nearly_the_force_of_a_finer_mesh():
     drawn = draw_geometry(np.random.default_rng(7), DEFAULT_NODES, 9, order=2)
     forces = []
     for case in (drawn.case, drawn.remesh_nearly(4.0)):

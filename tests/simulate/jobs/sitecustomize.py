@@ -1,7 +1,7 @@
 """Runs when Python starts with this folder in PYTHONPATH: stops a generator at a chosen moment, to be killed there.
 
 AST_SIM_TEST_PAUSE names the moment and AST_SIM_TEST_MARK a file. The first process that comes to the moment writes its
-number there and sleeps. Checkpoints are written at every frame, and those that are gone on from leave a file "resumed".
+number there and sleeps. Checkpoints are written at every frame, and a file "resumed" tells that one was continued.
 """
 
 import contextlib

@@ -23,7 +23,7 @@ SETTINGS = {"seed": 5, "nodes": 80, "frames": 9, "progress": False}
 
 
 def start(program: str, *arguments: str, **stop) -> subprocess.Popen:
-    """`dask scheduler` or `dask worker`; its threads are not those of the solver."""
+    """`dask scheduler` or `dask worker`; its threads are not the solver's."""
     command = [sys.executable, "-m", f"distributed.cli.dask_{program}", *arguments]
     variables = environment(**stop, OMP_NUM_THREADS="2")
     return subprocess.Popen(command, env=variables, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -71,7 +71,7 @@ def running(folder) -> list[int]:
 
 
 @pytest.mark.parametrize("workers", ["solving"], indirect=True)
-def test_a_killed_worker_costs_nothing_and_the_bytes_are_those_of_one_machine(scheduler, workers, tmp_path):
+def test_a_killed_worker_costs_nothing_and_the_bytes_are_the_same_as_on_one_machine(scheduler, workers, tmp_path):
     out, folder = tmp_path / "plates.h5", tmp_path / "plates.h5.parts"
     solver, manifest = [], []
 

@@ -130,7 +130,7 @@ def test_a_worker_that_is_killed_costs_its_sample_only(undisturbed, tmp_path, mo
     assert last["train/000001"]["state"] == "failed" and "SIGKILL" in last["train/000001"]["reason"]
     assert last["valid/000000"]["bytes"] == sample_path(folder, "valid", 0).stat().st_size
     assert [values["state"] for values in states(folder)["valid/000000"]] == ["pending", "running", "done"]
-    sample_path(folder, "test", 0).write_bytes(b"PK\x03\x04 not a sample")  # made anew, not trusted
+    sample_path(folder, "test", 0).write_bytes(b"PK\x03\x04 not a sample")  # made again, not trusted
     asked, run = [], pool.run_all
     monkeypatch.setattr(pool, "run_all", lambda samples, *rest: asked.extend(samples) or run(samples, *rest))
     plates(out, progress=True)
@@ -251,7 +251,7 @@ def test_a_patient_solve_is_recorded_and_reaches_every_frame(tmp_path, monkeypat
     assert make_sample(patient, "train", 0).num_frames == FRAMES
 
 
-def test_kept_frames_are_those_of_the_whole_motion_and_recorded(undisturbed, tmp_path):
+def test_kept_frames_are_frames_of_the_whole_motion_and_recorded(undisturbed, tmp_path):
     kept = (3, 7)
     out = plates(tmp_path / "kept.h5", keep=kept, workers=1).path
     with Dataset(undisturbed) as whole, Dataset(out) as some:
@@ -346,6 +346,11 @@ def test_two_runs_on_one_file_exclude_each_other(tmp_path):
         ({"frames": 9, "keep": [3, 9]}, r"keep is \[3, 9\]; must be numbers of frames from 1 to 8"),
         ({"family": "abcd", "keep": [21]}, r"keep is \[21\]; must be numbers of frames from 1 to 20"),
         ({"keep": [3, 2]}, r"keep is \[3, 2\]; the numbers of frames must ascend"),
+        ({"keep": 3}, r"keep is 3; must be a list of whole numbers"),
+        ({"keep": [3.5]}, r"keep is \[3.5\]; must be a list of whole numbers"),
+        ({"train": 2.0}, r"train is 2.0; must be a whole number"),
+        ({"train": "2"}, r"train is '2'; must be a whole number"),
+        ({"valid": 1.0}, r"valid is 1.0; must be a whole number"),
         ({"keep": [3, 3]}, "must ascend"),
         ({"order": 3}, r"order is 3; must be 2 \(tetrahedra of ten nodes\) or 1 \(of four nodes\)"),
         ({"order": "2"}, "order is '2'; must be a whole number"),

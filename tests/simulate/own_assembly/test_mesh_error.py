@@ -38,7 +38,7 @@ def write_strip(folder, friction=0.0):
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.3])
-def test_the_force_at_half_the_size_is_that_of_the_solver(tmp_path, friction):
+def test_the_force_at_half_the_size_is_the_solvers(tmp_path, friction):
     """A strip of one linear element over its thickness: its force is more than twice the one with two."""
     spec, case, coarse, values = solved(write_strip(tmp_path, friction), down=2)
     found = mesh_error(spec, case, coarse, values, None)

@@ -78,7 +78,7 @@ def test_an_order_is_one_or_two(tmp_path, capsys, order):
     assert re.search("order is .*; must be 2 .tetrahedra of ten nodes. or 1", capsys.readouterr().err)
 
 
-def test_the_reaction_of_a_strip_that_bends_is_that_of_a_beam(tmp_path):
+def test_the_reaction_of_a_strip_that_bends_is_the_same_as_of_a_beam(tmp_path):
     """Elements of 2 mm, one over the thickness of 1 mm. As a beam 3 E I d / L^3, 0.0400 N; as a plate 10 % more. Linear
     elements of this mesh give nine times as much."""
     for name, (low, high, cells) in {

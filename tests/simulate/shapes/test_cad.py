@@ -259,7 +259,7 @@ def test_a_crash_and_a_hang_of_gmsh_are_told(monkeypatch):
         monkeypatch.setattr(gmsh_process, "WORKER", [sys.executable, "-c", code])
         with pytest.raises(SimulationError) as caught:
             gmsh_process.mesh_parts([HOLED], ["holed"], 500, seconds)
-        # Only what would happen again is drawn anew.
+        # Only what would happen again needs another draw.
         assert isinstance(caught.value, gmsh_process.MeshingFailed) == again
         return str(caught.value)
 

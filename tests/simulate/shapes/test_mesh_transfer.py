@@ -1,4 +1,4 @@
-"""Displacements carried from one mesh of a body to another."""
+"""Displacements transferred from one mesh of a body to another."""
 
 from time import process_time
 

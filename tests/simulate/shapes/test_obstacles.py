@@ -7,7 +7,7 @@ from test_mesh import as_scene, volumes
 from ast_sim.simulate.shapes.obstacles import SHAPES, draw_obstacle
 
 SIZE = np.array([0.05, 0.06, 0.04])
-VOLUMES = {  # as drawn from SIZE; those of round shapes are approached from below
+VOLUMES = {  # as drawn from SIZE; meshes of round shapes approach them from below
     "ball": 4 / 3 * np.pi * 0.05**3,
     "cylinder": np.pi * 0.05**2 * 0.12,
     "block": 8 * 0.05 * 0.06 * 0.04,

@@ -54,7 +54,7 @@ def test_the_spacing_gives_the_number_of_nodes():
         assert len(mesh.points) == pytest.approx(points, rel=0.12)
 
 
-def test_the_nodes_of_a_piece_are_those_on_it():
+def test_the_nodes_of_a_piece_lie_on_it():
     mesh = triangulate(RECTANGLE, [], 0.03)
     for piece, (axis, value) in zip(mesh.pieces, [(1, -0.15), (0, 0.25), (1, 0.15), (0, -0.25)], strict=True):
         assert set(piece) == set(np.flatnonzero(np.isclose(mesh.points[:, axis], value, atol=1e-12)))
@@ -65,7 +65,7 @@ def test_curves_that_cross_are_refused():
     assert triangulate(RECTANGLE, [circle([0.0, 0.0], 0.1)], 0.05) is not None
 
 
-def test_the_smallest_angle_is_that_of_the_worst_triangle():
+def test_the_smallest_angle_is_in_the_worst_triangle():
     points = np.array([[0.0, 0.0], [1.0, 0.0], [0.5, np.sqrt(3) / 2], [1.0, 0.1]])
     mesh = plate_mesh.PlaneMesh(points, np.array([[0, 1, 2], [0, 1, 3]]), [])
     assert smallest_angle(mesh) == pytest.approx(np.arctan(0.1))

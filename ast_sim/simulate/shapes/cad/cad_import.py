@@ -29,7 +29,7 @@ class BadPart(Exception):
 
 
 def start(gmsh) -> None:
-    """Start gmsh anew (6 ms), with no models, options or constants of scripts, and without the settings of the user."""
+    """Start gmsh again (6 ms), without models, options and constants of scripts and without settings of the user."""
     if gmsh.isInitialized():
         gmsh.finalize()
     gmsh.initialize(readConfigFiles=False, interruptible=False)
@@ -40,7 +40,7 @@ def start(gmsh) -> None:
 def import_step(gmsh, path: str, mend: bool = True) -> None:
     """Import all shapes. If there is no solid among them, sew their faces together and make one solid of them.
 
-    To mend is to remove degenerate edges and those that are very small. The pole of a sphere is such an edge: without
+    To mend is to remove degenerate and very small edges. The pole of a sphere is such an edge: without
     it, gmsh cannot mesh the sphere.
     """
     for name in MENDED:
@@ -82,7 +82,7 @@ def pick_solid(gmsh, solid: str | int | None) -> None:
     between two "/"; case does not matter.
 
     Raises:
-        BadPart: there is no such solid, or several and none is chosen; the text describes those that there are.
+        BadPart: there is no such solid, or several and none is chosen; the text describes the solids that there are.
     """
     volumes = gmsh.model.getEntities(3)
     if not volumes or (solid is None and len(volumes) == 1):
@@ -135,7 +135,7 @@ def solid_of_surface(gmsh, surface: Surface, crease_angle: float = CREASE_ANGLE)
 
 
 def _joined_faces(gmsh) -> list[list[int]]:
-    """The faces of the model in groups that share edges: first the largest group, then those in its cavities."""
+    """The faces of the model in groups that share edges: first the largest group, then the groups in its cavities."""
     groups: list[tuple[set[int], list[int]]] = []
     for _, face in gmsh.model.getEntities(2):
         curves = {abs(curve) for _, curve in gmsh.model.getBoundary([(2, face)], combined=False)}

@@ -164,7 +164,7 @@ def _slab(occ, at: list[float], size: list[float], corner: float) -> int:
 
 
 def _load_stl(gmsh, name: str, part: dict[str, Any]) -> Model:
-    """A closed surface of triangles, cut along its creases into faces. gmsh meshes these faces anew."""
+    """A closed surface of triangles, cut along its creases into faces. gmsh meshes these faces again."""
     surface = stl_surface(Path(part["stl"]))
     scale = surface.diagonal
     solid_of_surface(gmsh, surface)

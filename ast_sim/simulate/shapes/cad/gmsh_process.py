@@ -93,8 +93,8 @@ def mesh_own_scale(requests: list[dict[str, Any]]) -> list[dict[str, np.ndarray]
 
     Returns:
         For each part `position` [N,3], `elements` [E,4] or [F,3], `notes` (texts: what was mended), `factor` (the size
-        of its elements over the one that was asked for), `failure` (a text: why the first attempt to mesh it failed;
-        empty if it did not), and `group NAME`: the numbers of the nodes of each named group.
+        of its elements over the wanted one), `failure` (a text: why the first attempt to mesh it failed; empty if it
+        did not), and `group NAME`: the numbers of the nodes of each named group.
 
     Raises:
         MeshingFailed, SimulationError: as `mesh_parts`; the text names the part or the parts.

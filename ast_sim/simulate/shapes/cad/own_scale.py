@@ -12,8 +12,8 @@ file that holds several) and one of
 With "order" 2, tetrahedra have ten nodes, the middles on the surface of the part. With "surface", a file without a
 solid gives triangles. If a part cannot be meshed well, `ATTEMPTS` are made from
 "first" on. The answer has own_position_i, own_elements_i, own_notes_i (texts: what was mended), own_factor_i (the size
-that was taken, over the one that was asked for), own_failure_i (why the first attempt failed; empty if it did not) and,
-for each physical group of a script, own_group_i_NAME: the numbers of its nodes.
+that was taken, over the wanted one), own_failure_i (why the first attempt failed; empty if it did not) and, for each
+physical group of a script, own_group_i_NAME: the numbers of its nodes.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ from ast_sim.simulate.shapes.cad.surface_mend import stl_surface
 from ast_sim.simulate.shapes.parts import smallest_dihedral
 
 MOST_NODES = 200_000  # of one part
-TRANSITION = 2.0  # around a finer box the elements grow to the usual size over so many of these
+TRANSITION = 2.0  # length over which elements around a finer box grow to the usual size, in usual sizes
 SMALLEST_ANGLE = 1.0  # degrees between two faces of a tetrahedron: enough for the solver
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """A way to mesh a part.
+    """Settings to mesh a part with.
 
     Attributes:
-        factor: the size of the elements, over the one that was asked for.
+        factor: the size of the elements, over the wanted one.
         mend: whether very small edges and faces of a CAD file are removed first.
         crease: smallest angle at an edge of a surface that becomes an edge of the part, in degrees.
         algorithm: gmsh's number of the mesher of the faces.
@@ -84,7 +84,7 @@ class Meshed:
         elements: [E,4], [E,10] of the order 2, or [F,3] of a surface.
         tags: [N] gmsh's numbers of the nodes.
         notes: what was mended, a sentence each.
-        factor: the size of the elements, over the one that was asked for.
+        factor: the size of the elements, over the wanted one.
         failure: why the first attempt failed; empty if it did not.
     """
 
@@ -150,7 +150,7 @@ def _mesh(gmsh, part: dict[str, Any]) -> Meshed:
 
 
 def _attempts(part: dict[str, Any]) -> Iterator[tuple[int, Attempt]]:
-    """The attempts from "first" on, with their numbers, but for those that differ in nothing that this part has."""
+    """The attempts from "first" on, with their numbers, without attempts that differ in nothing that this part has."""
     known = set()
     for number, attempt in enumerate(ATTEMPTS):
         way = (

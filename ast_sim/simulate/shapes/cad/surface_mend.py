@@ -145,7 +145,7 @@ def _exactly_joined(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _without_needles(position: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, int]:
-    """The triangles without those whose corners lie on a line, and how many went.
+    """The triangles without needles, whose corners lie on a line, and the number of needles.
 
     The needle a, b, c with b between a and c would leave a gap: its neighbour a, c, d has a side that its other
     neighbours cut at b. So the neighbour is cut there, too, into a, b, d and b, c, d.
@@ -173,7 +173,7 @@ def _without_needles(position: np.ndarray, triangles: np.ndarray) -> tuple[np.nd
 
 
 def _without_folds(triangles: np.ndarray) -> np.ndarray:
-    """The triangles without those that stand twice: of two alike one stays, of two that look apart none."""
+    """Each triangle at most once: of two alike one stays, of two that look apart none."""
     same, which = np.unique(np.sort(triangles, axis=1), axis=0, return_inverse=True)
     if len(same) == len(triangles):
         return triangles
