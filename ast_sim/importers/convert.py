@@ -98,8 +98,7 @@ def convert_series(
     findings: list[tuple[str, Finding]] = []
     opened = FittedWriter(out, stress_location="none", **facts)
     with opened as writer, Progress(len(chosen), "simulations", progress) as bar:
-        dynamic = integration == "dynamic"
-        for split, name, trajectory in _trajectories(series, decks, chosen, names, corners, incomplete, dynamic):
+        for split, name, trajectory in _trajectories(series, decks, chosen, names, corners, incomplete, integration):
             if not any(writer.counts.values()):
                 made_by |= _facts_of_the_first(trajectory)
                 writer.info = replace(writer.info, stress_location=trajectory.stress_at, generator=made_by)
@@ -125,7 +124,7 @@ def _trajectories(
     names: FieldNames,
     corners: bool,
     incomplete: bool,
-    dynamic: bool,
+    integration: str,
 ) -> Iterator[tuple[str, str, Trajectory]]:
     """The split, the name and the trajectory of each chosen simulation; all have the origin of the first."""
     origin = None
@@ -135,7 +134,7 @@ def _trajectories(
             doubt_modulus(decks[name], trajectory, names.stress_unit or "Pa")
         if not incomplete:
             require_complete(series[name], trajectory, names)
-        if dynamic:
+        if integration == "dynamic":
             _require_even_times(series[name], trajectory)
         if origin is None:
             origin = np.array(trajectory.attributes.get("origin", [0.0, 0.0, 0.0]))
