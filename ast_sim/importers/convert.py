@@ -97,8 +97,7 @@ def convert_series(
     facts |= {"generator": made_by, "contact_radius": contact_radius, "time_step": time_step, "stress_location": "none"}
     findings: list[tuple[str, Finding]] = []
     with FittedWriter(out, **facts) as writer, Progress(len(chosen), "simulations", progress) as bar:
-        dynamic = integration == "dynamic"
-        for split, name, trajectory in _trajectories(series, decks, chosen, names, corners, incomplete, dynamic):
+        for split, name, trajectory in _trajectories(series, decks, chosen, names, corners, incomplete, integration):
             if not any(writer.counts.values()):
                 made_by |= _facts_of_the_first(trajectory)
                 writer.info = replace(writer.info, stress_location=trajectory.stress_at, generator=made_by)
@@ -124,7 +123,7 @@ def _trajectories(
     names: FieldNames,
     corners: bool,
     incomplete: bool,
-    dynamic: bool,
+    integration: str,
 ) -> Iterator[tuple[str, str, Trajectory]]:
     """The split, the name and the trajectory of each chosen simulation; all have the origin of the first."""
     origin = None
@@ -134,7 +133,7 @@ def _trajectories(
             doubt_modulus(decks[name], trajectory, names.stress_unit or "Pa")
         if not incomplete:
             require_complete(series[name], trajectory, names)
-        if dynamic:
+        if integration == "dynamic":
             _require_even_times(series[name], trajectory)
         if origin is None:
             origin = np.array(trajectory.attributes.get("origin", [0.0, 0.0, 0.0]))
