@@ -86,7 +86,8 @@ def _require_same_question(answer: Answer, row: int, truth: Trajectory) -> None:
     away = np.abs(answer.position[row] - there)[truth.scene.prescribed].max(initial=0.0)
     if away > SAME * np.ptp(there, axis=0).max():
         raise ConfigError(
-            f"{answer.name}: its prescribed nodes and the ones of the truth are up to {away:.3g} apart in frame {number}:"
+            f"{answer.name}: its prescribed nodes and the ones of the truth are up to {away:.3g} apart in frame"
+            f" {number}:"
             " compare with a simulation of the same motion"
         )
     free = ~truth.scene.prescribed
