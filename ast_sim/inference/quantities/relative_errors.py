@@ -87,8 +87,7 @@ def _require_same_question(answer: Answer, row: int, truth: Trajectory) -> None:
     if away > SAME * np.ptp(there, axis=0).max():
         raise ConfigError(
             f"{answer.name}: its prescribed nodes and the ones of the truth are up to {away:.3g} apart in frame"
-            f" {number}:"
-            " compare with a simulation of the same motion"
+            f" {number}: compare with a simulation of the same motion"
         )
     free = ~truth.scene.prescribed
     if not (there - truth.position[0])[free].any():
