@@ -90,7 +90,7 @@ def test_a_sweep_sees_where_the_ram_turns():
 
 def test_it_says_where_it_comes_from_and_an_unknown_name_is_one_line():
     run = ast_sim.example_run("plates")
-    assert (run.step, run.settings.train.corrections, run.settings.data) == (10_000, 0, "plates400.h5")
+    assert (run.step, run.settings.train.corrections, run.settings.data) == (20_000, 0, "plates400.h5")
     assert run.effort == ast_sim.Effort(0, 10) and run.scope.family == "deforming_plate"
     with pytest.raises(ConfigError, match="there is no example run 'plate'; did you mean 'plates'"):
         ast_sim.example_run("plate")

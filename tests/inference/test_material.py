@@ -62,7 +62,8 @@ def test_plates_have_the_reaction_of_the_solver(tmp_path):
         truth = data["train"][0]
     assert truth.scene.material is None
     with pytest.warns(UserWarning, match="in training"):
-        answer = replace(example_run("plates").predict(truth, effort=Effort()), position=truth.position)
+        answer = example_run("plates").predict(truth, effort=Effort(newton_steps=1), throw=False)
+    answer = replace(answer, position=truth.position)  # after Newton steps the force is of the positions, not predicted
     forces = np.linalg.norm(answer.reaction(), axis=1)
     np.testing.assert_allclose(forces, truth.attributes["reaction"], rtol=0.05, atol=1e-3)
     assert forces[1] > 1
