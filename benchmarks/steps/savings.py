@@ -22,10 +22,11 @@ from typing import Any
 import ast_sim
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
+from benchmarks.steps import predictions
 
 RESULTS = Path(__file__).parents[1] / "results" / "savings.json"
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "savings.md"
-PLATES = {"train": 0, "valid": 0, "test": 1, "seed": 912, "nodes": 400, "frames": 41, "keep": (14, 24, 34)}
+PLATES = {**predictions.PLATES, "nodes": 400}
 TRAVELS = tuple(-0.002 * (number + 1) for number in range(20))  # metres, of as many questions about one plate
 CALL, NEWTON, EXACT = ast_sim.Effort(), ast_sim.Effort(newton_steps=1), ast_sim.Effort.exact()
 Answers = ast_sim.Answer | list[ast_sim.Answer]

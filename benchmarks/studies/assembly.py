@@ -24,7 +24,14 @@ from ast_sim.inference.evaluation.deepest_frames import deepest_frames
 from ast_sim.inference.quantities.relative_errors import relative_error
 from ast_sim.simulate.jobs.fastest_solver import deepest_frame
 from ast_sim.support.provenance import provenance
-from benchmarks.studies.phrases import beside_solver, over_the_scenes, settings_tried, times_as_long
+from benchmarks.studies.phrases import (
+    beside_solver,
+    over_the_scenes,
+    settings_tried,
+    table_head,
+    table_line,
+    times_as_long,
+)
 from benchmarks.studies.rows import study_rows
 from benchmarks.studies.validation_curve import curve_line, minutes_per_step, validation_curve
 
@@ -171,17 +178,9 @@ def page(results: dict[str, Any]) -> str:
     ]
     together = ["product", "frames", "error", "reaction", "answer", "solver"]
     introduction = _INTRODUCTION.format(settings=settings_tried(shown))
-    lines = [introduction, *_head(alone, texts=2), *map(_alone, shown)]
-    lines += [_TOGETHER, *_head(together, texts=1), *map(_together, shown)]
+    lines = [introduction, *table_head(alone, texts=2), *map(_alone, shown)]
+    lines += [_TOGETHER, *table_head(together, texts=1), *map(_together, shown)]
     return "\n".join([*lines, *(line for found in shown for line in _section(found))])
-
-
-def _head(columns: list[str], texts: int) -> list[str]:
-    return [_table_line(columns), "|" + " --- |" * texts + " ---: |" * (len(columns) - texts)]
-
-
-def _table_line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
 
 
 def _section(found: dict[str, Any]) -> list[str]:
@@ -227,7 +226,7 @@ def _alone(found: dict[str, Any]) -> str:
     spent = 60 * (found["generation_minutes"] + found["minutes"])
     seconds = [scene["seconds"] for scene in found["scenes"]]
     saved = 0.0 if solver is None else solver["seconds"] - solver["model_seconds"]
-    return _table_line([
+    return table_line([
         row["title"],
         f"{row['train']} scenes ({found['generation_minutes']:.1f} min), {row['steps']:,} steps",
         f"{found['minutes']:.0f}",
@@ -244,7 +243,7 @@ def _alone(found: dict[str, Any]) -> str:
 def _together(found: dict[str, Any]) -> str:
     curves, solver = found["curves"], found["solver_curves"]
     ratios = [theirs / ours["seconds"] for theirs, ours in zip(solver, curves, strict=False)]
-    return _table_line([
+    return table_line([
         found["row"]["title"],
         str(curves[0]["frames"]),
         _percent([curve["relative_error"] for curve in curves]),

@@ -27,6 +27,7 @@ from ast_sim.support.provenance import provenance
 from benchmarks.studies import assembly
 from benchmarks.studies.coverage_page import page
 from benchmarks.studies.rows import study_rows
+from benchmarks.studies.trade import DEEP_PLATES
 
 RESULTS = Path(__file__).parents[1] / "results" / "coverage.json"
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "coverage.md"
@@ -66,7 +67,7 @@ def _product(name: str) -> Row:
     return Row(product.title, lambda folder: assembly.trained(name, folder)[0], scenes, fresh=100)
 
 
-_PLATES = {"family": "deforming_plate", "nodes": 400, "frames": 41, "keep": (14, 24, 34)}
+_PLATES = {**DEEP_PLATES, "nodes": 400}
 ROWS = {
     "plates": Row("Plates, 400 nodes", lambda _: ast_sim.example_run("plates"), _PLATES, fresh=300),
     "snap_hook": _product("snap_hook"),

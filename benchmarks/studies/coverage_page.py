@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from benchmarks.studies.phrases import table_head, table_line
+
 _INTRODUCTION = """# Do bands and promised errors hold?
 
 Made by `python -m benchmarks.studies.coverage` from `benchmarks/results/coverage.json`; do not edit.
@@ -66,6 +68,4 @@ def _section(result: dict[str, Any]) -> list[str]:
 
 
 def _table(columns: list[str], rows: list[list[str]], texts: int) -> list[str]:
-    """A table whose first `texts` columns are aligned to the left."""
-    line = "|" + " --- |" * texts + " ---: |" * (len(columns) - texts)
-    return ["", f"| {' | '.join(columns)} |", line, *(f"| {' | '.join(row)} |" for row in rows)]
+    return ["", *table_head(columns, texts), *map(table_line, rows)]

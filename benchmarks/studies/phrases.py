@@ -1,4 +1,4 @@
-"""What the pages of deepest frames and of own assemblies say in the same words."""
+"""What the pages of studies say in the same words, and their tables."""
 
 from __future__ import annotations
 
@@ -73,3 +73,12 @@ def median_error(values: Sequence[float]) -> float:
     """The standard error of the median, by drawing the values again with replacement (bootstrap)."""
     drawn = np.random.default_rng(0).choice(np.asarray(values), (RESAMPLES, len(values)))
     return float(np.median(drawn, axis=1).std())
+
+
+def table_head(columns: Sequence[str], texts: int) -> list[str]:
+    """The first two lines of a table; its first `texts` columns are aligned to the left."""
+    return [table_line(columns), "|" + " --- |" * texts + " ---: |" * (len(columns) - texts)]
+
+
+def table_line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"

@@ -4,14 +4,13 @@ import json
 from dataclasses import replace
 
 import pytest
-import torch
 from simulate.own_assembly.assemblies import write_assembly
 
 from benchmarks.studies import assembly
 
 
 @pytest.fixture
-def small(monkeypatch, tmp_path):
+def small(monkeypatch, tmp_path, one_thread):
     """A row of three training scenes and four steps, and one that goes on from its run; results in a folder apart."""
     row = replace(
         assembly.ROWS["bumper"], spec=write_assembly(tmp_path), nodes=100, train=3, valid=1, test=2, steps=4,
@@ -21,10 +20,7 @@ def small(monkeypatch, tmp_path):
     monkeypatch.setattr(assembly, "ROWS", {"small": row, "later": later})
     monkeypatch.setattr(assembly, "RESULTS", tmp_path / "results" / "assembly.json")
     monkeypatch.setattr(assembly, "PAGE", tmp_path / "assembly.md")
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    threads = torch.get_num_threads()
-    yield tmp_path
-    torch.set_num_threads(threads)
+    return tmp_path
 
 
 def test_a_product_is_simulated_learned_and_measured(small):

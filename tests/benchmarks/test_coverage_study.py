@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 import ast_sim
 from benchmarks.studies import coverage
@@ -15,7 +14,7 @@ FRESH = 3
 
 
 @pytest.fixture
-def small(monkeypatch, tmp_path):
+def small(monkeypatch, tmp_path, one_thread):
     """A row of plates whose run had four steps; results in a folder apart."""
     plates = {"family": "deforming_plate", "nodes": 100, "frames": 4}
 
@@ -28,10 +27,7 @@ def small(monkeypatch, tmp_path):
     monkeypatch.setitem(coverage.ROWS, "plates", row)
     monkeypatch.setattr(coverage, "RESULTS", tmp_path / "coverage.json")
     monkeypatch.setattr(coverage, "PAGE", tmp_path / "coverage.md")
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    threads = torch.get_num_threads()
-    yield tmp_path
-    torch.set_num_threads(threads)
+    return tmp_path
 
 
 def test_a_run_is_calibrated_and_asked_for_fresh_and_strange_scenes(small):

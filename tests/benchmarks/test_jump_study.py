@@ -5,13 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from benchmarks.studies import jumps
 
 
 @pytest.fixture
-def small(monkeypatch, tmp_path):
+def small(monkeypatch, tmp_path, one_thread):
     """One row of two training scenes and four steps, and the same row step by step; results in a folder of its own."""
     row = replace(
         jumps.ROWS["plates400"], data="small", nodes=100, frames=5, keep=None, train=2, valid=1, test=2,
@@ -24,10 +23,7 @@ def small(monkeypatch, tmp_path):
     monkeypatch.setattr(jumps, "ROWS", {"small": row, "walk": walk})
     monkeypatch.setattr(jumps, "RESULTS", tmp_path / "results" / "jumps.json")
     monkeypatch.setattr(jumps, "PAGE", tmp_path / "jumps.md")
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    threads = torch.get_num_threads()
-    yield tmp_path
-    torch.set_num_threads(threads)
+    return tmp_path
 
 
 def test_a_row_is_trained_measured_and_shown_and_found_again(small):
