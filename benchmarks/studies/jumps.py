@@ -86,6 +86,10 @@ ROWS = {
         "Plates, 400 nodes, 20,000 steps, with reactions", steps=20_000, settings=_MIRRORED, solver_scenes=10,
         model_settings={"state": ("reaction",)}, **_PLATES_400,
     ),
+    "plates400_long_transolver": Row(
+        "Plates, 400 nodes, Transolver, 23,600 steps, with reactions", steps=23_600, model="transolver",
+        settings=_MIRRORED, model_settings={"state": ("reaction",)}, **_PLATES_400,
+    ),
     "plates400_transolver": Row(
         "Plates, 400 nodes, Transolver", steps=11_800, model="transolver", settings=_MIRRORED, **_PLATES_400
     ),

@@ -200,6 +200,12 @@ EDITS = {
     ),
     "no set": (("FLOOR, 1, 3", "FLOR, 1, 3"), r"job.inp:\d+: \*BOUNDARY: there is no set of nodes 'FLOR'"),
     "no material": (("MATERIAL=SOFT", "MATERIAL=HARD"), "there is no material 'HARD'"),
+    "decimal comma in a motion": (
+        ("9001, 3, 3, -0.11", "9001, 3, 3, -0,11"),
+        r"'9001, 3, 3, -0,11' has more entries than a target, two directions and a value, and no decimal point",
+    ),
+    "decimal comma in Poisson's ratio": (("210000., 0.3", "210000, 0,3"), "'210000, 0,3' has more entries"),
+    "decimal comma in the yield stress": (("30., 0.", "30,5, 0"), "its first plastic strain is 5, and it must be 0"),
     "parts": (("*HEADING", "*PART, NAME=A\n*END PART"), "has parts and instances, which CalculiX does not know"),
 }
 

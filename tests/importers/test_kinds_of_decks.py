@@ -169,3 +169,20 @@ def test_convert_tells_of_bodies_in_each_other_and_strict_refuses_them(tmp_path,
     assert "body 1 lies 0.2 inside body 0" in capsys.readouterr().err and not (tmp_path / "d.h5").exists()
     assert cli.main(command) == 0
     assert "body 1 lies 0.2 inside body 0 at the start" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("line", ["18, 4,2, 0,5, 0", "18, 4,2, 0, 0", "18, -4,2E+00, 0, 1"])
+def test_a_decimal_comma_in_a_coordinate_is_refused(tmp_path, line):
+    path = deck(tmp_path)
+    lines = path.read_text().splitlines()
+    lines[18] = line
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(DatasetError, match="more entries than a number and three coordinates, and no decimal point"):
+        read_mesh(path)
+
+
+def test_normals_after_the_coordinates_are_no_decimal_commas(tmp_path):
+    path = deck(tmp_path)
+    lines = [f"{line}, 0., 0., 1." if 0 < row <= 18 else line for row, line in enumerate(path.read_text().splitlines())]
+    path.write_text("\n".join(lines) + "\n")
+    assert np.array_equal(read_mesh(path).points, PAD.rest_position)

@@ -40,8 +40,18 @@ def whole(text: str, line: Line) -> int:
     return int(text)
 
 
+def refuse_decimal_commas(line: Line, most: int, what: str) -> None:
+    """Raise DatasetError if a line has more than `most` entries and none of them has a decimal point."""
+    if len(tokens(line)) > most and "." not in line.text:
+        raise DatasetError(
+            f"{line.place}: {line.text.strip()!r} has more entries than {what}, and no decimal point: write 4.2 for a"
+            " number, not 4,2, and 1. for a whole one"
+        )
+
+
 def nodes_of(keyword: Keyword) -> tuple[np.ndarray, np.ndarray]:
-    """The numbers [n] and coordinates [n, 3] of a block of nodes; coordinates that are left out are 0."""
+    """The numbers [n] and coordinates [n, 3] of a block of nodes; coordinates that are left out are 0. What follows
+    them is the normal of a shell."""
     table = _table(keyword.data, 4, np.float64)
     if table is not None and np.array_equal(table[:, 0], np.round(table[:, 0])) and (abs(table[:, 0]) < 2**53).all():
         return table[:, 0].astype(np.int64), table[:, 1:]
@@ -49,6 +59,7 @@ def nodes_of(keyword: Keyword) -> tuple[np.ndarray, np.ndarray]:
     points = np.zeros((len(keyword.data), 3))
     for row, line in enumerate(keyword.data):
         entries = tokens(line)
+        refuse_decimal_commas(line, 4, "a number and three coordinates")
         numbers[row] = whole(entries[0] if entries else "", line)
         for axis, text in enumerate(entries[1:4]):
             points[row, axis] = real(text, line)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ast_sim.importers.decks.deck_content import Deck, read_deck
 from ast_sim.importers.decks.deck_mesh import mesh_of_deck
-from ast_sim.importers.decks.deck_numbers import real, tokens, whole
+from ast_sim.importers.decks.deck_numbers import real, refuse_decimal_commas, tokens, whole
 from ast_sim.importers.decks.keyword_lines import Keyword, Line
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.solved_jobs.job_materials import MATERIAL_KEYWORDS, material_columns
@@ -123,6 +123,7 @@ def _prescribe(
     keyword: Keyword, line: Line, state: _Conditions, mesh: SourceMesh, groups: dict[str, np.ndarray]
 ) -> None:
     """A data line of *BOUNDARY: `node or set, first direction, last direction, value`, or `node or set, ENCASTRE`."""
+    refuse_decimal_commas(line, 4, "a target, two directions and a value")
     target, first, last, value = [*tokens(line), "", "", "", ""][:4]
     rows = _rows(keyword, target, mesh, groups)
     if first.upper() in _NAMED:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ast_sim.importers.decks.deck_content import Deck
-from ast_sim.importers.decks.deck_numbers import real, tokens
+from ast_sim.importers.decks.deck_numbers import real, refuse_decimal_commas, tokens
 from ast_sim.importers.decks.keyword_lines import Keyword
 from ast_sim.material import ELASTIC, YIELD_STRESS
 
@@ -66,11 +66,23 @@ def _materials(deck: Deck) -> tuple[dict[str, _Material], list[str]]:
             current = materials[keyword.required("NAME").upper()] = _Material()
         elif keyword.name == "ELASTIC" and keyword.options.get("TYPE", "ISO").upper() in ("ISO", "ISOTROPIC"):
             current.young, current.poisson = _first(keyword, 2)
+            if current.poisson == 0:  # 0,3
+                refuse_decimal_commas(keyword.data[0], 2, "Young's modulus and a Poisson's ratio of 0")
             if len(keyword.data) > 1:
                 notes.append("*ELASTIC depends on the temperature: its first line is taken")
         elif keyword.name == "PLASTIC":
             (current.yield_stress,) = _first(keyword, 1)
+            _require_no_strain(keyword)
     return materials, notes
+
+
+def _require_no_strain(keyword: Keyword) -> None:
+    """A table of stress and plastic strain begins at the strain 0; else 30,5 was meant as one number."""
+    if keyword.options.get("HARDENING", "ISOTROPIC").upper() in ("ISOTROPIC", "KINEMATIC"):
+        line = keyword.data[0]
+        strain = real([*tokens(line), ""][1], line)
+        if strain:
+            raise keyword.error(f"its first plastic strain is {strain:g}, and it must be 0: write 4.2, not 4,2")
 
 
 def _first(keyword: Keyword, count: int) -> Sequence[float]:
