@@ -169,7 +169,8 @@ class TradeFigures:
     @property
     def notes(self) -> list[str]:
         """Sentences below a table, without full stops."""
-        told = [f"{name} is ahead of the run at {_at(errors)}" for name, errors in self.ahead_of_run.items()]
+        told = [f"The solver was not run: {self.no_solver}"] if self.no_solver else []
+        told += [f"{name} is ahead of the run at {_at(errors)}" for name, errors in self.ahead_of_run.items()]
         told += [self.mesh_line] if self.mesh_line else []
         return told + ([f"No Gaussian process: {self.no_process}"] if self.no_process else [])
 
@@ -201,8 +202,7 @@ class TradeFigures:
             if row.pays_after is not None:
                 parts.append(f"pays after {row.pays_after:,} questions")
             told.append(f"{100 * row.tolerance:g} %: {'; '.join(parts)}")
-        told += self.notes
-        return told + ([f"the solver was not run: {self.no_solver}"] if self.no_solver else [])
+        return told + self.notes
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self:

@@ -72,7 +72,7 @@ def test_the_text_and_the_json_say_it():
     told = figures(no_solver="it was not made here", origin={"run": "r"})
     line = "10 %: the run: 20 ms (call); the solver: 50 ms (coarse); ratio 2.50 (2.50 to 2.50): the run"
     assert told.lines()[1] == line
-    assert told.lines()[-1] == "the solver was not run: it was not made here"
+    assert told.lines()[-1] == "The solver was not run: it was not made here"
     values = told.to_json()
     assert values["rows"][0]["solver"] == "coarse" and values["rows"][4]["run"] is None
     assert values["solver"][2]["errors"][-1] is None and values["origin"] == {"run": "r"}

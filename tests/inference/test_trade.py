@@ -80,7 +80,7 @@ def test_where_our_solver_did_not_make_the_scenes_it_says_so(tmp_path):
     result = ast_sim.trade(run, data)
     assert result.figures.solver == () and result.figures.invested is None
     assert len(result.figures.scenes) == 2
-    assert str(result).splitlines()[-1].startswith("the solver was not run: ")
+    assert result.figures.notes[0].startswith("The solver was not run: ") and result.figures.notes[0] in str(result)
     with pytest.raises(ConfigError, match="split valid moves|no scene"):
         ast_sim.trade(run, toy.write(tmp_path / "none.h5", (1, 0, 1)), "valid")
 
