@@ -48,7 +48,7 @@ def make(name: str, folder: Path) -> Case:
     data = folder / f"{name}.h5"
     if name.startswith("abcd_xl"):
         side = 55 if name.endswith("12k") else 158
-        _write_plates(data, side)
+        write_plates(data, side)
         return _case("abcd_xl", data, 1, steps=1, most_repeats=20 if side == 55 else 3, every_thread=False)
     nodes, batch = (400, 4) if name == "tiny" else (1300, 8)
     generate("deforming_plate", data, train=batch, valid=0, test=1, seed=0, nodes=nodes, frames=41)
@@ -67,7 +67,7 @@ def _case(preset: str, data: Path, batch: int, **options) -> Case:
     return Case(preset, settings, data, nodes, shape, f"{test.num_nodes:,} nodes", **options)
 
 
-def _write_plates(path: Path, side: int) -> None:
+def write_plates(path: Path, side: int) -> None:
     """Two plates of side x side x 2 nodes, the upper one sagging onto the lower; stress and material on elements."""
     info = DatasetInfo(
         family="abcd_xl",
