@@ -91,13 +91,13 @@ class SolverFigures:
         seconds: at its own stop test; None: it did not converge.
         cheapest: the name of its fastest variant that is at least as accurate as the model; None: there is none.
         cheapest_seconds: of that variant.
-        ways: all variants by name.
+        variants: the figures of all variants, by name.
     """
 
     seconds: float | None
     cheapest: str | None
     cheapest_seconds: float | None
-    ways: Mapping[str, VariantFigures]
+    variants: Mapping[str, VariantFigures]
 
 
 @dataclass(frozen=True)

@@ -79,9 +79,9 @@ class RigidMotion:
     def corners(self) -> list[float]:
         """The values of s between 0 and 1 at which the path turns back or turns off."""
         shares, corners = self._path()
-        ways = np.diff(corners, axis=0)
-        ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), np.finfo(float).tiny)
-        turns = np.linalg.norm(np.diff(ways, axis=0), axis=1) > ROUNDING
+        directions = np.diff(corners, axis=0)
+        directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), np.finfo(float).tiny)
+        turns = np.linalg.norm(np.diff(directions, axis=0), axis=1) > ROUNDING
         return shares[1:-1][turns].tolist()
 
     def notes(self, name: str, frames: Sequence[int], last: int) -> Iterator[str]:

@@ -84,7 +84,7 @@ static void free_stack(void *p) {
 
 static void create_key(void) { key_status = pthread_key_create(&key, free_stack); }
 
-/* That of the calling thread; NULL if it has none yet. */
+/* The stack of the calling thread; NULL if it has none yet. */
 static stack *own_stack(void) {
   pthread_once(&once, create_key);
   return key_status ? NULL : pthread_getspecific(key);

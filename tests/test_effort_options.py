@@ -13,26 +13,26 @@ PREDICT = ("predict", "run", "scene.vtu", "--out", "answer.h5")
 SWEEP = ("sweep", "run", "SPEC.toml", "--out", "forces.csv")
 
 
-def asked(*options: str, command: tuple[str, ...] = PREDICT) -> Effort | None:
+def parsed(*options: str, command: tuple[str, ...] = PREDICT) -> Effort | None:
     return effort_of(build_parser().parse_args([*command, *options]), DEFAULT)
 
 
 @pytest.mark.parametrize("command", [PREDICT, SWEEP])
 def test_options_change_the_default_effort(command):
-    assert asked(command=command) is None
-    assert asked("--corrections", "1", command=command) == Effort(1, 0)  # no Newton steps where none are asked for
-    assert asked("--newton-steps", "2", command=command) == Effort(3, 2)
-    assert asked("--exact", command=command) == Effort.exact()
+    assert parsed(command=command) is None
+    assert parsed("--corrections", "1", command=command) == Effort(1, 0)  # no Newton steps where none are asked for
+    assert parsed("--newton-steps", "2", command=command) == Effort(3, 2)
+    assert parsed("--exact", command=command) == Effort.exact()
 
 
 def test_an_exact_answer_takes_no_numbers():
     with pytest.raises(ConfigError, match="needs no numbers: leave --newton-steps out"):
-        asked("--exact", "--newton-steps", "1")
+        parsed("--exact", "--newton-steps", "1")
 
 
 @pytest.mark.parametrize("effort", [Effort(), Effort(2, 0), Effort(0, 10), Effort.exact()])
 def test_the_options_of_an_effort_ask_for_it(effort):
-    assert asked(*options_of(effort)) == effort
+    assert parsed(*options_of(effort)) == effort
 
 
 def test_an_effort_has_the_error_of_the_most_newton_steps_that_were_measured():

@@ -19,7 +19,8 @@ from ast_sim.simulate.jobs.fastest_solver import SOLVER_MODULE
 from ast_sim.simulate.jobs.pool import WORKER_MODULE
 from ast_sim.simulate.shapes.cad.gmsh_process import MESHING_MODULE
 
-ROOT = Path(__file__).parent.parent / "ast_sim"
+REPOSITORY = Path(__file__).parent.parent
+ROOT = REPOSITORY / "ast_sim"
 MODULE_FILES = sorted(ROOT.rglob("*.py"))
 FOLDERS = sorted({path.parent for path in MODULE_FILES})
 
@@ -102,6 +103,7 @@ def test_modules_are_named_by_strings_only_where_a_test_looks():
     assert starting <= known, "resolve the module it names in the test above"
 
 
+NO_NOUNS = {"found", "asked", "walked", "ways"}  # names that do not say what they hold
 MODULES_OF_NUMBERS = {"np", "torch", "math", "time", "nn", "igl", "ipctk"}
 
 
@@ -128,13 +130,14 @@ def folded(source: str) -> list[str]:
             if any(isinstance(value, ast.Call) for value in values) and not alike(values):
                 bad.append(f"{node.lineno}: {ast.unparse(node)}")
         named = node.arg if isinstance(node, ast.arg) else node.id if isinstance(node, ast.Name) else ""
-        if named == "found":
-            bad.append(f"{node.lineno}: found")
+        if named in NO_NOUNS:
+            bad.append(f"{node.lineno}: {named}")
     return bad
 
 
 def test_what_is_folded_is_seen():
-    for line in ("a, b = f(x), g(y)", "a, b = 1, g(y)", "a, b = np.zeros(3), np.ones(3)", "found = 1", "a = found"):
+    named = ("found = 1", "a = found", "def f(ways): 0")
+    for line in ("a, b = f(x), g(y)", "a, b = 1, g(y)", "a, b = np.zeros(3), np.ones(3)", *named):
         assert len(folded(line)) == 1, line
     for line in ("a, b = f(x), f(y)", "low, high = x.min(), x.max()", "a, b = b, a", "a, b = f(x)", "a = f(x), g(y)"):
         assert not folded(line), line
@@ -142,7 +145,33 @@ def test_what_is_folded_is_seen():
 
 @pytest.mark.parametrize("path", MODULE_FILES, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_each_line_says_one_thing(path):
-    assert not folded(path.read_text(encoding="utf-8")), "one assignment a line; a noun in place of `found`"
+    assert not folded(path.read_text(encoding="utf-8")), f"one assignment a line; a noun in place of {NO_NOUNS}"
+
+
+# Pronouns for which a reader must look back, and private words that the field's terms have replaced; the names of old
+# options and functions may be quoted.
+UNCLEAR = re.compile(
+    r"\b(so many|that of|those of|anew|walked|(?<![`-])rivals?)\b|\"ways\"".replace(" ", r"[\s*#]+"), re.I
+)
+TEXTS = {".c", ".css", ".h", ".html", ".ipynb", ".js", ".json", ".md", ".py", ".pyi", ".toml"}
+
+
+def test_unclear_words_are_seen():
+    for text in ("So many scenes", "that\n * of a plate", "# those\n# of", "Anew.", "a rival", '{"ways": 1}'):
+        assert UNCLEAR.search(text), text
+    for text in ("it was `rivals`", "`--rivals N`", "so much", "what of", "the body that offers", "in two ways"):
+        assert not UNCLEAR.search(text), text
+
+
+def test_texts_name_the_noun():
+    """The log keeps the words of its time."""
+    folders = [REPOSITORY / name for name in ("ast_sim", "benchmarks", "csrc", "docs", "examples", "tests")]
+    paths = [*REPOSITORY.glob("*.md"), *(path for folder in folders for path in folder.rglob("*"))]
+    read = {path for path in paths if path.suffix in TEXTS} - {REPOSITORY / "docs" / "log.md", Path(__file__)}
+    assert len(read) > 500
+    texts = {path.relative_to(REPOSITORY).as_posix(): path.read_text(encoding="utf-8") for path in read}
+    bad = [f"{path}: {match[0]}" for path, text in sorted(texts.items()) for match in UNCLEAR.finditer(text)]
+    assert not bad, "say the noun, or the term of the field"
 
 
 if __name__ == "__main__":

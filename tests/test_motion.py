@@ -78,7 +78,7 @@ def test_increments_and_travel_are_of_prescribed_nodes():
         ((0, 0, -2.1), 0.3, 8),  # 2.1 / 0.3 is 7 and a little more in float64
         ((0, 0, 0), 0.1, 2),
         ((0, 0, -0.01), 1.0, 2),
-        (RigidMotion([(0, 0, -0.01), (0, 0, 0)]), 0.001, 21),  # comes back: 20 ways of 0.001
+        (RigidMotion([(0, 0, -0.01), (0, 0, 0)]), 0.001, 21),  # comes back: 20 times 0.001
         (RigidMotion(rotation=360), 0.1, 1 + 89),  # a circle of the radius sqrt(2): 8.886
         (RigidMotion(rotation=-90, point=(1, 1, 7)), 0.1, 2),  # the node lies on the axis
     ],

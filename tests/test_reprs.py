@@ -18,9 +18,9 @@ TRUTH = toy.plate()
 
 
 def answer(**changes) -> Answer:
-    asked = {"given": 1, "step_seconds": [0.1], "info": toy.info(), "stress_location": "node", "frames": (0, 3)}
-    asked |= {"position": TRUTH.position[[0, 3]], "stress": TRUTH.stress[[0, 3]]}
-    return Answer("<b>toy</b>", TRUTH.scene, **{**asked, **changes})
+    values = {"given": 1, "step_seconds": [0.1], "info": toy.info(), "stress_location": "node", "frames": (0, 3)}
+    values |= {"position": TRUTH.position[[0, 3]], "stress": TRUTH.stress[[0, 3]]}
+    return Answer("<b>toy</b>", TRUTH.scene, **{**values, **changes})
 
 
 def test_lines():

@@ -226,8 +226,8 @@ def _predict_spec(run: Any, args: argparse.Namespace, wanted: dict[str, Any]) ->
     rows = grid(parse_settings(args.set))
     if len(rows) > 1:
         raise ConfigError("--set gives several values: ast-sim sweep predicts them all")
-    asked = {"nodes": args.nodes, "num_frames": args.num_frames, "name": str(args.scene)}
-    answer = run.predict(spec=args.scene, parameters=rows[0], **asked, **wanted)
+    options = {"nodes": args.nodes, "num_frames": args.num_frames, "name": str(args.scene)}
+    answer = run.predict(spec=args.scene, parameters=rows[0], **options, **wanted)
     _save(answer, args, None)
     units = {"travel_of_nodes": run.scope.length_unit, "reaction": "N", "largest_stress": "Pa"}
     for frame, row in zip(answer.frames, answer.figures(answer.source["origin"]), strict=True):

@@ -27,7 +27,7 @@ NOT_TRAINED = "the run was not trained on a specification, so it is not known ho
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
+class AssemblyQuestion:
     """A scene of an assembly that is to be predicted.
 
     Attributes:
@@ -56,7 +56,7 @@ def ask(
     trained: Mapping[str, Any] | None,
     frames: int | None = None,
     nodes: int | None = None,
-) -> list[Asked]:
+) -> list[AssemblyQuestion]:
     """The scenes with these values of the parameters; equal scenes are one object, which is prepared once. A warning
     tells each of their notes.
 
@@ -82,7 +82,7 @@ def ask(
             f"{Path(spec).name} has lengths in {read.unit}, but the run was trained in {scope.length_unit}"
         )
     shared = reference(read)
-    asked = []
+    questions = []
     known = {}
     notes = {}
     for row in rows:
@@ -92,9 +92,8 @@ def ask(
         arrays = (case.scene.rest_position, case.scene.elements, case.scene.node_type, case.scene.material)
         scene = known.setdefault(tuple(np.asarray(array).tobytes() for array in arrays), case.scene)
         told = tuple(differences(read, values, trained)) if trained else (NOT_TRAINED,)
-        asked.append(
-            Asked(scene, Motion(case.prescribed_position.astype(np.float32)), values, list(shared.origin), told)
-        )
+        motion = Motion(case.prescribed_position.astype(np.float32))
+        questions.append(AssemblyQuestion(scene, motion, values, list(shared.origin), told))
     for note in notes:
         warnings.warn(note, stacklevel=2)
-    return asked
+    return questions

@@ -16,25 +16,25 @@ from ast_sim.simulate.own_assembly.spec_reader import parse_spec
 _TOLD_ELSEWHERE = {"size", "finer", "file", "young", "poisson"}
 
 
-def differences(asked: AssemblySpec, values: Values, trained: Mapping[str, Any]) -> Iterator[str]:
+def differences(spec: AssemblySpec, values: Values, trained: Mapping[str, Any]) -> Iterator[str]:
     """One sentence for each difference.
 
     Args:
-        asked, values: the specification of the question, and the values of its parameters.
+        spec, values: the specification of the question, and the values of its parameters.
         trained: the specification of the training, as `AssemblySpec.describe` gives it.
     """
     known = parse_spec(Path(trained["name"]), trained["text"])
     names = {part.name: part for part in known.parts}
-    for part in asked.parts:
+    for part in spec.parts:
         if part.name not in names:
             yield f"the run was trained without the part {part.name}"
-        elif not _hashes(asked.describe(), _in_use(part, values)) <= _hashes(trained, names[part.name].files):
+        elif not _hashes(spec.describe(), _in_use(part, values)) <= _hashes(trained, names[part.name].files):
             files = ", ".join(names[part.name].files)
             yield f"the run was trained on another file of part {part.name}: {files}, whose content was not this one"
-    for name in names.keys() - {part.name for part in asked.parts}:
+    for name in names.keys() - {part.name for part in spec.parts}:
         yield f"the run was trained with a part {name}"
-    yield from _values(asked, values, known)
-    mine, theirs = tomllib.loads(asked.text), tomllib.loads(trained["text"])
+    yield from _values(spec, values, known)
+    mine, theirs = tomllib.loads(spec.text), tomllib.loads(trained["text"])
     for name in sorted(names.keys() & mine["parts"].keys()):
         yield from _keys(f"parts.{name}.", mine["parts"][name], theirs["parts"][name], _TOLD_ELSEWHERE)
     other = {*mine, *theirs} - {"contact", "contact_distance"}
@@ -51,14 +51,14 @@ def _hashes(described: Mapping[str, Any], files: tuple[str, ...]) -> set[tuple[s
     return {(described["files"][file], function) for file, function in split}
 
 
-def _values(asked: AssemblySpec, values: Values, known: AssemblySpec) -> Iterator[str]:
+def _values(spec: AssemblySpec, values: Values, known: AssemblySpec) -> Iterator[str]:
     """Values outside of the ranges of the training."""
     for name, value in values.items():
         one = known.parameters.get(name)
         if one is None or isinstance(value, str) or one.choices:
             continue
         if one.formula is not None:
-            now = asked.parameters[name].formula
+            now = spec.parameters[name].formula
             if now is None or now.text != one.formula.text:
                 yield f"{name} is {value:.4g}; in training {one.formula.text!r}"
         elif not one.low - LEEWAY * abs(one.low) <= value <= one.high + LEEWAY * abs(one.high):

@@ -12,7 +12,7 @@ from typing import Any
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.assembly_questions import ask
 from ast_sim.inference.effort import Effort
-from ast_sim.inference.promises.chosen_effort import AskedError
+from ast_sim.inference.promises.chosen_effort import ErrorLimit
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.runs.scope import Scope
@@ -75,7 +75,7 @@ def sweep(
     spec: str | os.PathLike[str],
     rows: Sequence[Mapping[str, Any]],
     effort: Effort,
-    error: AskedError | None,
+    error: ErrorLimit | None,
     nodes: int | None,
     progress: ShowProgress,
 ) -> Sweep:
@@ -93,25 +93,25 @@ def sweep(
     """
     if not rows:
         raise ConfigError("a sweep needs at least one row of values")
-    needs_way = config.data.rubs and effort.newton_steps > 0
-    frames = None if needs_way or config.scheme.follows_motion else 2
-    asked_for = {"effort": effort} if error is None else {"error": error}
+    needs_load_path = config.data.rubs and effort.newton_steps > 0
+    frames = None if needs_load_path or config.scheme.follows_motion else 2
+    choice = {"effort": effort} if error is None else {"error": error}
     table, seconds, notes, unpromised = [], 0.0, [], 0
     with Progress(len(rows), "rows", progress) as bar:
         for start in range(0, len(rows), TOGETHER):
-            asked = ask(spec, rows[start : start + TOGETHER], scope, trained, frames, nodes)
-            names = [f"row {start + number}" for number in range(len(asked))]
-            wanted = [-2, -1] if needs_way and len(asked[0].motion.position) > 2 else [-1]
-            scenes = [(one.scene, one.motion) for one in asked]
+            questions = ask(spec, rows[start : start + TOGETHER], scope, trained, frames, nodes)
+            names = [f"row {start + number}" for number in range(len(questions))]
+            wanted = [-2, -1] if needs_load_path and len(questions[0].motion.position) > 2 else [-1]
+            scenes = [(one.scene, one.motion) for one in questions]
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # told once for all rows
-                answers = predict_scenes(scenes, names=names, frames=wanted, throw=False, progress=False, **asked_for)
-            told = [(*one.notes, *answer.notes) for one, answer in zip(asked, answers, strict=True)]
+                answers = predict_scenes(scenes, names=names, frames=wanted, throw=False, progress=False, **choice)
+            told = [(*one.notes, *answer.notes) for one, answer in zip(questions, answers, strict=True)]
             notes += [f"{name}: {note}" for name, row in zip(names, told, strict=True) for note in row]
-            table += [_row(one.values, answer, one.origin) for one, answer in zip(asked, answers, strict=True)]
+            table += [_row(one.values, answer, one.origin) for one, answer in zip(questions, answers, strict=True)]
             unpromised += sum(error is not None and "promise" not in answer.source for answer in answers)
             seconds += sum(answer.seconds for answer in answers)
-            bar.advance(names[-1], len(asked))
+            bar.advance(names[-1], len(questions))
     outside = {note.partition(":")[0] for note in notes}
     if outside:
         warnings.warn(

@@ -24,7 +24,7 @@ from ast_sim.inference.evaluation.evaluated_run import Evaluation
 from ast_sim.inference.predict_arguments import Motions, new_question
 from ast_sim.inference.predicting.question import Frames, Question
 from ast_sim.inference.promises.calibration import Calibration
-from ast_sim.inference.promises.chosen_effort import AskedError, chosen_effort
+from ast_sim.inference.promises.chosen_effort import ErrorLimit, chosen_effort
 from ast_sim.inference.sweep import Sweep, sweep
 from ast_sim.runs import run_file
 from ast_sim.scene import Scene, Trajectory
@@ -128,7 +128,7 @@ class Run:
         nodes: int | None = None,
         frames: Frames | None = None,
         effort: Effort | None = None,
-        error: AskedError | None = None,
+        error: ErrorLimit | None = None,
         ms: float | None = None,
         num_frames: int | None = None,
         stress: np.ndarray | None = None,
@@ -171,8 +171,8 @@ class Run:
         if spec is not None:
             if not (scene is None and motion is None and stress is None):
                 raise ConfigError("a specification gives the scene and the motion: leave scene, motion and stress out")
-            (asked,) = ask(spec, [parameters or {}], self.scope, self.folder.specification, num_frames, nodes)
-            scene, motion, num_frames, facts, notes = asked.scene, asked.motion, None, asked.facts, asked.notes
+            (built,) = ask(spec, [parameters or {}], self.scope, self.folder.specification, num_frames, nodes)
+            scene, motion, num_frames, facts, notes = built.scene, built.motion, None, built.facts, built.notes
         elif parameters is not None or nodes is not None or scene is None:
             raise ConfigError("give a scene, or a specification with its parameters and nodes")
         question = new_question(self.settings.model, self.scope, scene, motion, num_frames, name, frames, stress, notes)
@@ -186,7 +186,7 @@ class Run:
         *,
         table: str | os.PathLike[str] | Sequence[Mapping[str, Any]] | None = None,
         effort: Effort | None = None,
-        error: AskedError | None = None,
+        error: ErrorLimit | None = None,
         nodes: int | None = None,
         progress: ShowProgress = True,
     ) -> Sweep:
@@ -218,7 +218,7 @@ class Run:
         names: Sequence[str] | None = None,
         frames: Frames | None = None,
         effort: Effort | None = None,
-        error: AskedError | None = None,
+        error: ErrorLimit | None = None,
         num_frames: int | None = None,
         throw: bool = True,
         progress: ShowProgress = True,
@@ -243,7 +243,7 @@ class Run:
         *,
         frames: Frames | None = None,
         effort: Effort | None = None,
-        error: AskedError | None = None,
+        error: ErrorLimit | None = None,
         num_frames: int | None = None,
         name: str = "scene",
         throw: bool = True,

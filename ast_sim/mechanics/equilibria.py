@@ -32,7 +32,7 @@ class Equilibria:
 
     def __init__(self, case: SolidCase, prepared: NewtonSteps, settings: SolverSettings | None = None) -> None:
         self._frames = SolidFrames(case, settings, prepared)
-        self._walked = 0
+        self._last_frame = 0  # that is solved along the load path
         self._reached = case.scene.rest_position.astype(np.float64)
         self._before = 0
         self._frames.watch(self._require_patience)
@@ -67,12 +67,12 @@ class Equilibria:
         """
         if start is not None and not self._frames.case.contact.has_friction and self._stands_free(start):
             return self._finished(frame, start), False
-        while self._walked < frame:
+        while self._last_frame < frame:
             self._restart(self._reached)
-            for leg in self._frames.case.legs(self._walked + 1):
+            for leg in self._frames.case.legs(self._last_frame + 1):
                 self._frames.solver.advance(leg.end, along=leg.along)
             self._reached = self._checked()
-            self._walked += 1
+            self._last_frame += 1
         return self._reached, True
 
     def finish(self, frame: int, start: np.ndarray) -> np.ndarray:

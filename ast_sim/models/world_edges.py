@@ -15,7 +15,8 @@ from ast_sim.ops import EdgeSet, mesh_edges
 def world_edges(batch: Batch, radius: float, most: int | None) -> EdgeSet:
     """Edges in both directions between all nodes of a scene that are at most `radius` apart and share no mesh edge.
 
-    They are found for the positions of the batch in O(N log N + pairs). Those of a scene do not depend on other scenes.
+    They are found for the positions of the batch in O(N log N + pairs). The edges of a scene do not depend on other
+    scenes.
 
     Args:
         batch: its positions, and the mesh edges `m2m` of its graph.

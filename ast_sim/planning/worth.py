@@ -24,7 +24,7 @@ from ast_sim.training.loop import OFTEN
 from ast_sim.view.files import make_folder
 
 SOLVED = 4  # scenes
-ASKED = 3  # answers that are timed, after a first one
+TIMED_ANSWERS = 3  # after a first one
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def worth(
     seconds = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # its weights are of no use; only its time counts
-        for _ in range(1 + ASKED):
+        for _ in range(1 + TIMED_ANSWERS):
             began = time.process_time()
             run.predict(truth, effort=Effort(), throw=False, progress=False)
             seconds.append(time.process_time() - began)

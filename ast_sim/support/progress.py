@@ -130,7 +130,7 @@ class Progress:
             self._bar = None
 
     def advance(self, text: str = "", count: int = 1) -> None:
-        """So many more are done; the text says what was."""
+        """`count` more are done; the text says what was."""
         self.done += count
         if self._bar is not None:
             self._bar.update(count)

@@ -149,7 +149,7 @@ class Training:
             if self.step and self._due(options.validate_every) and not validated:
                 self._validate()
                 self._heed_callback()
-                self._stop_if_asked()
+                self._stop_if_requested()
             self.clock.restart()
             while self.step < options.steps:
                 self.advance()
@@ -162,12 +162,12 @@ class Training:
                 if validates or self._due(options.checkpoint_every) or self.stopping:
                     self.ahead.wait()
                     self.saver.save(self.step, self.log.sums, options.keep)
-                self._stop_if_asked()
+                self._stop_if_requested()
                 self.clock.step()
                 if validates:
                     self._validate()
                     self._heed_callback()
-                    self._stop_if_asked()
+                    self._stop_if_requested()
 
     def _introduce(self) -> None:
         for line in introduction(self.model, self.config, self.dataset, self.scales, self.sampler.num_pairs):
@@ -184,14 +184,14 @@ class Training:
         if self.processes.any(self.listener.error is not None):
             self.stopping = signal.SIGTERM
 
-    def _stop_if_asked(self) -> None:
+    def _stop_if_requested(self) -> None:
         if self.stopping:
             self.progress.line(f"stopped after step {self.step:,}: go on with --resume")
             if self.listener.error is not None:
                 raise self.listener.error
             raise Interrupted(self.stopping)
 
-    def end_if_asked(self) -> None:
+    def end_if_requested(self) -> None:
         """End a training that is only timed, if a signal asks for it."""
         self._heed_signals()
         if self.stopping:
@@ -303,4 +303,4 @@ class Training:
 
     def _stop_at_once(self, *_: object) -> None:
         self._heed_signals()
-        self._stop_if_asked()
+        self._stop_if_requested()

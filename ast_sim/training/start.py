@@ -149,17 +149,17 @@ def start_training(
         saved = processes.of_leader(folder.settings if has_config(folder.path) else None)
         if saved is not None and not resume:
             raise TrainingError(f"{run} already holds a run: go on with --resume, or choose another folder")
-        asked = config or saved
-        if asked is None:
+        wanted = config or saved
+        if wanted is None:
             raise TrainingError(f"{run} holds no run to resume: name the dataset to start one")
         source = None if from_run is None else RunFolder(Path(from_run))
-        with Dataset(asked.data) as dataset:
+        with Dataset(wanted.data) as dataset:
             scales = measure(dataset)
             fit = partial(resolve, dataset=dataset, scales=scales, keep_model=source is not None)
             shared = {"signals": signals, "processes": processes, "progress": progress}
             begin = partial(Training, folder, dataset=dataset, scales=scales, **shared)
-            asked = _with_steps(asked, saved, fit, begin)
-            resolved = _cut(asked if config is None else fit(asked), processes.count)
+            wanted = _with_steps(wanted, saved, fit, begin)
+            resolved = _cut(wanted if config is None else fit(wanted), processes.count)
             if source is not None:
                 _require_fit(source, resolved, dataset, scales)
             if saved is not None:
@@ -184,20 +184,20 @@ def train_along() -> None:
 
 
 def _with_steps(
-    asked: RunConfig, saved: RunConfig | None, fit: Callable[[RunConfig], RunConfig], begin: Callable[..., Training]
+    config: RunConfig, saved: RunConfig | None, fit: Callable[[RunConfig], RunConfig], begin: Callable[..., Training]
 ) -> RunConfig:
     """The settings; if they have minutes and no steps, with the number of steps that fits into the minutes: of the run
     that is resumed, or measured."""
-    minutes = asked.train.minutes
-    if minutes is None or asked.train.steps is not None:
-        return asked
+    minutes = config.train.minutes
+    if minutes is None or config.train.steps is not None:
+        return config
     if saved is not None and saved.train.minutes == minutes:
         steps = saved.train.steps
     else:
-        timed = fit(dataclasses.replace(asked, train=dataclasses.replace(asked.train, steps=UNKNOWN_STEPS)))
+        timed = fit(dataclasses.replace(config, train=dataclasses.replace(config.train, steps=UNKNOWN_STEPS)))
         with begin(config=timed) as training:
             steps = steps_within(minutes, training)
-    return dataclasses.replace(asked, train=dataclasses.replace(asked.train, steps=steps))
+    return dataclasses.replace(config, train=dataclasses.replace(config.train, steps=steps))
 
 
 @contextmanager
@@ -273,10 +273,10 @@ def _require_fit(source: RunFolder, config: RunConfig, dataset: Dataset, scales:
         raise ConfigError(f"{dataset.path} leaves the plane z = 0, in which {source.path} keeps all nodes")
 
 
-def _require_same(run: RunFolder, saved: RunConfig, asked: RunConfig, source: RunFolder | None) -> None:
+def _require_same(run: RunFolder, saved: RunConfig, config: RunConfig, source: RunFolder | None) -> None:
     """Raise ConfigError if a setting or the run to start from differs, naming the first one; only the path of the
     dataset and the number of processes may differ."""
-    for key, old, new in differences(saved, asked, "model", "train"):
+    for key, old, new in differences(saved, config, "model", "train"):
         if key == "train.processes":
             continue
         raise ConfigError(

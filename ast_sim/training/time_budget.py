@@ -44,7 +44,7 @@ def _seconds_per_step(training: Training, most: float) -> float:
     while len(seconds) < WARM_UP + TIMED:
         start = time.perf_counter()
         training.advance()
-        training.end_if_asked()
+        training.end_if_requested()
         seconds.append(time.perf_counter() - start)
         late = time.perf_counter() - began > most and len(seconds) > WARM_UP
         if training.processes.any(late):

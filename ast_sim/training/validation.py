@@ -122,24 +122,24 @@ def _by_jumps(
     corrections: int,
     efforts: bool,
 ) -> list[Validated]:
-    frames = [frames_asked(truth.num_frames) for truth in truths]
-    asked = zip(names, truths, frames, strict=True)
-    questions = [Question.of(truth, name, numbers.tolist()) for name, truth, numbers in asked]
-    ways = answer_steps(model, questions, Effort(corrections + MORE_CALLS if corrections else 0))
+    frames = [validation_frames(truth.num_frames) for truth in truths]
+    scenes = zip(names, truths, frames, strict=True)
+    questions = [Question.of(truth, name, numbers.tolist()) for name, truth, numbers in scenes]
+    outcomes = answer_steps(model, questions, Effort(corrections + MORE_CALLS if corrections else 0))
     validated = []
-    for index, truth, numbers, way in zip(indices, truths, frames, ways, strict=True):
+    for index, truth, numbers, outcome in zip(indices, truths, frames, outcomes, strict=True):
         hold = _motion_error(truth.position[0], truth, numbers)
-        if isinstance(way, str):
-            validated.append(Validated(index, [], hold, way, []))
+        if isinstance(outcome, str):
+            validated.append(Validated(index, [], hold, outcome, []))
             continue
-        errors = [_motion_error(position, truth, numbers) for position in way.position]
+        errors = [_motion_error(position, truth, numbers) for position in outcome.position]
         measured = to_measure(model.config, corrections) if efforts and index < EFFORT_SCENES else ()
         by_effort = errors_by_effort(model, truth, measured)
         validated.append(Validated(index, errors, hold, None, by_effort))
     return validated
 
 
-def frames_asked(count: int) -> np.ndarray:
+def validation_frames(count: int) -> np.ndarray:
     """The numbers of up to `JUMPS` frames, evenly spread over `count` frames; never the first, which is given."""
     spread = np.unique(np.linspace(0, count - 1, JUMPS + 1).round().astype(int)[1:])
     return spread[spread > 0]

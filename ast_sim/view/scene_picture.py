@@ -18,7 +18,7 @@ COLUMNS = 2
 BODY_COLORS = ("#4c8bc9", "#e0a03c", "#5aa876", "#b07cc6", "#c96a5a", "#7f8c99")
 GHOST = (0.85, 0.2, 0.15, 0.10)  # where a moving body goes
 STILL, MOVING = "#16202c", "#d5301f"
-WAYS = 12  # arrows of a scene
+ARROWS = 12  # of a scene
 
 
 def write(
@@ -76,7 +76,7 @@ def _draw(axes, scene: Scene, last: np.ndarray) -> None:
         dots, _ = view.project(rest[nodes])
         axes.plot(dots[:, 0], dots[:, 1], ".", color=color, markersize=1.5)
     driven = np.flatnonzero(moved & scene.prescribed)
-    for node in driven[:: max(1, len(driven) // WAYS)]:
+    for node in driven[:: max(1, len(driven) // ARROWS)]:
         (start, end), _ = view.project(np.stack([rest[node], last[node]]))
         axes.annotate("", end, start, arrowprops={"arrowstyle": "->", "color": MOVING, "lw": 0.9})
     every, _ = view.project(corners.reshape(-1, 3))

@@ -23,8 +23,8 @@ def box(cells: tuple[int, int, int]) -> tuple[torch.Tensor, torch.Tensor]:
     nodes = torch.stack(torch.meshgrid(*(torch.arange(n + 1) for n in cells), indexing="ij"), -1).reshape(-1, 3)
     stride = torch.tensor([(cells[1] + 1) * (cells[2] + 1), cells[2] + 1, 1])
     first = nodes[(nodes < torch.tensor(cells)).all(1)] @ stride
-    ways = torch.tensor(list(itertools.permutations(stride.tolist())))  # along the edges to the opposite corner
-    corners = torch.cat([torch.zeros(6, 1, dtype=torch.int64), ways.cumsum(1)], 1)
+    paths = torch.tensor(list(itertools.permutations(stride.tolist())))  # along the edges to the opposite corner
+    corners = torch.cat([torch.zeros(6, 1, dtype=torch.int64), paths.cumsum(1)], 1)
     return nodes.float(), (first[:, None, None] + corners).reshape(-1, 4)
 
 

@@ -100,7 +100,7 @@ def prepare(folder: Path) -> None:
 
 
 def damages(folder: Path, flips: int, cuts: int, seed: int) -> Iterator[Damage]:
-    """So many random damages, the groups in turn."""
+    """Random damages, the groups in turn: first `flips` bits that flip, then `cuts` files that are cut off."""
     draw = random.Random(seed)
     for number in range(flips + cuts):
         group = list(GROUPS)[number % len(GROUPS)]

@@ -144,7 +144,7 @@ def _rounded(run: ast_sim.Run) -> None:
         values.data = values.data.bfloat16().to(values.dtype)
 
 
-def asked(case: Case, effort: ast_sim.Effort) -> dict[str, Any]:
+def outcome_of(case: Case, effort: ast_sim.Effort) -> dict[str, Any]:
     """What became of a question."""
     run = ast_sim.example_run("plates")
     case.prepare(run)
@@ -216,7 +216,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     torch.set_num_threads(1)
     cases = []
     for case in _cases(folder):
-        outcomes = {name: asked(case, effort) for name, effort in EFFORTS.items()}
+        outcomes = {name: outcome_of(case, effort) for name, effort in EFFORTS.items()}
         cases.append({"group": case.group, "title": case.title, **outcomes})
         print(case.title, {name: row["outcome"] for name, row in outcomes.items()}, flush=True)
     efforts = {name: asdict(effort) for name, effort in EFFORTS.items()}

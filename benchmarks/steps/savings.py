@@ -49,7 +49,7 @@ class Saving:
 def savings(run: ast_sim.Run, scene: ast_sim.Scene) -> list[Saving]:
     """All that is left out, by what a question requires."""
 
-    def asked(effort: ast_sim.Effort, frames: list[int] | None = None) -> Callable[[], Answers]:
+    def answer(effort: ast_sim.Effort, frames: list[int] | None = None) -> Callable[[], Answers]:
         motion = {1: (0, 0, -0.02)}
         return lambda: run.predict(scene, motion, num_frames=41, frames=frames, effort=effort, progress=False)
 
@@ -63,10 +63,10 @@ def savings(run: ast_sim.Run, scene: ast_sim.Scene) -> list[Saving]:
 
     many = f"{len(TRAVELS)} questions about one mesh"
     return [
-        Saving("frames that are not asked for: 39 of 40, by one call", asked(CALL), asked(CALL, [-1])),
-        Saving("the same, with a Newton step each", asked(NEWTON), asked(NEWTON, [-1])),
-        Saving("a Newton step and all that it needs: one call instead", asked(NEWTON, [-1]), asked(CALL, [-1])),
-        Saving("the solver's own stop test: one Newton step instead", asked(EXACT, [-1]), asked(NEWTON, [-1])),
+        Saving("frames that are not asked for: 39 of 40, by one call", answer(CALL), answer(CALL, [-1])),
+        Saving("the same, with a Newton step each", answer(NEWTON), answer(NEWTON, [-1])),
+        Saving("a Newton step and all that it needs: one call instead", answer(NEWTON, [-1]), answer(CALL, [-1])),
+        Saving("the solver's own stop test: one Newton step instead", answer(EXACT, [-1]), answer(NEWTON, [-1])),
         Saving(f"{many} as if it were as many, by one call: as one batch instead", each(CALL, True), each(CALL, False)),
         Saving("the same, with a Newton step each", each(NEWTON, True), each(NEWTON, False)),
     ]
@@ -112,8 +112,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repeats", type=int, default=10, help="samples of each question (default: %(default)s)")
     parser.add_argument("--page", action="store_true", help="write the page from the results that are there")
-    asked = parser.parse_args(arguments)
-    if not asked.page:
+    options = parser.parse_args(arguments)
+    if not options.page:
         import torch  # after ast_sim, which says how its threads wait
 
         torch.set_num_threads(1)
@@ -122,7 +122,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             path = ast_sim.generate("deforming_plate", Path(folder) / "plate.h5", progress=False, **PLATES).path
             with ast_sim.Dataset(path) as data:
                 scene = data["test"][0].scene
-            rows = [measured(one, asked.repeats) for one in savings(ast_sim.example_run("plates"), scene)]
+            rows = [measured(one, options.repeats) for one in savings(ast_sim.example_run("plates"), scene)]
         write_json(RESULTS, {**provenance("python -m benchmarks.steps.savings"), "rows": rows})
     write_text(PAGE, page(json.loads(RESULTS.read_text(encoding="utf-8"))) + "\n")
 

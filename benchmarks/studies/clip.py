@@ -28,7 +28,7 @@ from ast_sim.named_field import REACTION
 from ast_sim.simulate.own_assembly.parameters import values_of
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
-from benchmarks.studies import clip_ways
+from benchmarks.studies import clip_variants
 from benchmarks.studies.clip_outcome import LAST, SPEC, TURN, Outcome, outcome, true_outcome
 from benchmarks.studies.clip_page import page
 from benchmarks.studies.validation_curve import minutes_per_step
@@ -79,19 +79,19 @@ def measured(plan: Plan, folder: Path) -> dict[str, Any]:
         taken = read_seconds(dataset)
         seconds = {name: sum(frames) for name, frames in taken.samples.items()}
         known, tests, calibration = (_solved(dataset, split) for split in ("train", "test", "calibration"))
-        share_scenes(dataset, [(name, truth) for name, truth in tests if name in clip_ways.SCENES], taken)
+        share_scenes(dataset, [(name, truth) for name, truth in tests if name in clip_variants.SCENES], taken)
     scenes, unseen = (
-        [{"name": name, "solver_seconds": seconds[name], **_asked(run, truth, others)} for name, truth in asked]
-        for asked in (tests, calibration)
+        [{"name": name, "solver_seconds": seconds[name], **_scene_figures(run, truth, others)} for name, truth in group]
+        for group in (tests, calibration)
     )
     drawn, outcomes = [values_of(truth.attributes) for _, truth in known], [true_outcome(truth) for _, truth in known]
     for key in Outcome._fields:
         law = gaussian_process(features(drawn, drawn), np.array([getattr(one, key) for one in outcomes]))
-        for asked in (scenes, unseen):
-            points = features([scene["parameters"] for scene in asked], drawn)
-            for scene, value in zip(asked, law(points), strict=True):
+        for group in (scenes, unseen):
+            points = features([scene["parameters"] for scene in group], drawn)
+            for scene, value in zip(group, law(points), strict=True):
                 scene["gaussian_process"] = {**scene.get("gaussian_process", {}), key: float(value)}
-    beside = [scene["parameters"] for scene in scenes if scene["name"] in clip_ways.SCENES]
+    beside = [scene["parameters"] for scene in scenes if scene["name"] in clip_variants.SCENES]
     return {
         **provenance("python -m benchmarks.studies.clip"),
         "plan": {**plan.__dict__, "settings": dict(plan.settings)},
@@ -103,7 +103,7 @@ def measured(plan: Plan, folder: Path) -> dict[str, Any]:
         "parameters": sum(weights.numel() for weights in run.model.parameters()),
         "scenes": scenes,
         "unseen": unseen,
-        "ways": clip_ways.solved(beside, plan.nodes, folder / "ways.json"),
+        "variants": clip_variants.solved(beside, plan.nodes, folder / "variants.json"),
     }
 
 
@@ -134,7 +134,7 @@ def _solved(dataset: ast_sim.Dataset, split: str) -> list[tuple[str, ast_sim.Tra
     return [(name, truth) for name, truth in scenes if truth.num_frames == LAST + 1]
 
 
-def _asked(run: ast_sim.Run, truth: ast_sim.Trajectory, others: dict[str, ast_sim.Run]) -> dict[str, Any]:
+def _scene_figures(run: ast_sim.Run, truth: ast_sim.Trajectory, others: dict[str, ast_sim.Run]) -> dict[str, Any]:
     """A test scene: its parameters, the outcomes, relative errors, and the seconds of an answer with all frames and of
     one with the two frames that the outcomes need."""
     answer, seconds = _timed(run, truth, None)
@@ -180,13 +180,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     default = Path("build/clip")
     parser.add_argument("--folder", type=Path, default=default, help=f"data and run (default: {default})")
-    asked = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     import torch  # after ast_sim, which says how its threads wait
 
     torch.set_num_threads(1)
     os.environ["OMP_NUM_THREADS"] = "1"  # of the generator's processes
     ast_sim.keep_memory()
-    found = measured(Plan(), asked.folder)
+    found = measured(Plan(), options.folder)
     write_json(RESULTS, found)
     write_text(PAGE, page(found) + "\n")
     print(page(found))

@@ -10,9 +10,9 @@ import numpy as np
 
 from ast_sim.support.progress import duration
 from ast_sim.trade_figures import Setting
-from benchmarks.studies import clip_ways
+from benchmarks.studies import clip_variants
 from benchmarks.studies.clip_outcome import Outcome, errors
-from benchmarks.studies.clip_ways import FINER, OWN
+from benchmarks.studies.clip_variants import FINER, OWN
 from benchmarks.studies.phrases import RESAMPLES, median_error
 
 ANSWERS = (
@@ -37,7 +37,7 @@ exponential with a length for each parameter) maps the drawn parameters to both 
 scene, and can be asked for nothing else. Times are processor times of one thread ({processor}), beside other work.
 """
 
-_WAYS = """
+_VARIANTS = """
 ## CalculiX on coarser meshes and with larger increments
 
 The same scenes solved with other settings, {count} of the test scenes ({first} to {last}). Errors are relative to
@@ -62,7 +62,7 @@ def page(found: dict[str, Any]) -> str:
         if found[key]:
             lines += [*_answers(found[key], f"{len(found[key])} {title}"), ""]
     lines += _figures(found)
-    lines += _ways(found)
+    lines += _variants(found)
     return "\n".join([*lines, *_finer(found)])
 
 
@@ -139,13 +139,13 @@ def _worst(scenes: Sequence[dict[str, Any]]) -> str:
 def settings(found: dict[str, Any], number: str) -> dict[str, Setting]:
     """The errors and the seconds of the run, of the Gaussian process and of every setting of CalculiX in the scenes
     that were solved with other settings, by their names; infinite where there is no solution."""
-    scenes = [scene for scene in found["scenes"] if scene["name"] in clip_ways.SCENES]
+    scenes = [scene for scene in found["scenes"] if scene["name"] in clip_variants.SCENES]
     seconds = {"run": "seconds", "run_two_frames": "seconds_of_two"}
     made = {}
     for name, key in ANSWERS:
         spent = [scene[seconds[key]] if key in seconds else 0.0 for scene in scenes]
         made[name] = Setting(name, tuple(errors(scenes, key, number).tolist()), tuple(spent))
-    for name, solved in found["ways"].items():
+    for name, solved in found["variants"].items():
         if name != FINER.name:
             pairs = [
                 (abs(one[number] / scene["true"][number] - 1), one["seconds"])
@@ -157,18 +157,18 @@ def settings(found: dict[str, Any], number: str) -> dict[str, Setting]:
     return made
 
 
-def _ways(found: dict[str, Any]) -> list[str]:
+def _variants(found: dict[str, Any]) -> list[str]:
     """The table of the settings, who is as accurate as the run, and after how many questions each answer pays."""
     off = {number: settings(found, number) for number in Outcome._fields}
     count = len(off["set"][OWN.name].errors)
     within = f"{math.ceil(0.9 * count)} of {count} below"
     lines = [
-        _WAYS.format(count=count, first=clip_ways.SCENES[0], last=clip_ways.SCENES[-1]),
+        _VARIANTS.format(count=count, first=clip_variants.SCENES[0], last=clip_variants.SCENES[-1]),
         f"| answer | nodes | failed tries | set: median | set: {within} | force: median | force: {within} | time |",
         "| --- |" + " ---: |" * 7,
     ]
     for name, of_set in off["set"].items():
-        solved = found["ways"].get(name, [])
+        solved = found["variants"].get(name, [])
         nodes = f"{np.median([one['nodes'] for one in solved if 'nodes' in one]):,.0f}" if solved else "-"
         failed = str(sum(len(one["failures"]) for one in solved)) if solved else "-"
         cells = [
@@ -200,7 +200,7 @@ def _verdicts(found: dict[str, Any], off: dict[str, dict[str, Setting]]) -> list
     for numbers, what in ((("set",), "in the set"), (("peak",), "in the force"), (("set", "peak"), "in both numbers")):
         fit = [
             off["set"][name]
-            for name in found["ways"]
+            for name in found["variants"]
             if name != FINER.name and all(off[n][name].kept <= off[n][run.name].kept for n in numbers)
         ]
         best = min(fit, key=lambda one: one.middle)
@@ -221,14 +221,14 @@ def _questions(invested: float, solver: Setting, run: Setting | None = None) -> 
 
 def _finer(found: dict[str, Any]) -> list[str]:
     """The error of the mesh beside the error of the run."""
-    solved = found["ways"][FINER.name]
+    solved = found["variants"][FINER.name]
     lines = [
         _FINER.format(nodes=round(FINER.share * found["plan"]["nodes"])),
         "| scene | nodes | set: own mesh off | run off own mesh | run off finer mesh | force: own mesh off"
         " | run off own mesh | run off finer mesh | time |",
         "| --- |" + " ---: |" * 8,
     ]
-    scenes = [scene for scene in found["scenes"] if scene["name"] in clip_ways.SCENES]
+    scenes = [scene for scene in found["scenes"] if scene["name"] in clip_variants.SCENES]
     for scene, one in zip(scenes, solved, strict=False):
         if "set" not in one:
             continue

@@ -33,7 +33,7 @@ RESULTS = Path(__file__).parents[1] / "results" / "coverage.json"
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "coverage.md"
 SEEDS = {"calibration": 911, "fresh": 912}
 STRANGE = 40  # fresh scenes that are changed
-ASKED = {
+WANTED = {
     "displacement": (0.1, 0.08, 0.05, 0.025, 0.02, 0.015, 0.01),
     "reaction": (0.5, 0.2, 0.1, 0.05, 0.02),
     "stress": (0.2, 0.1, 0.05, 0.02, 0.01),
@@ -92,13 +92,13 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
         warnings.simplefilter("ignore")  # what they tell is counted
         calibration = ast_sim.calibrate(run, scenes(name, folder, "calibration"), "test")
         rows = [row for effort in calibration.efforts for row in bands(run, truths, effort)]
-        asked = promises(run, truths)
+        promised = promises(run, truths)
         ordinary = [(truth.scene, truth.position) for truth in truths]
         kinds = {"fresh scenes": ordinary, **strange(name, truths[:STRANGE], folder)}
         told = {kind: unusual(run, questions) for kind, questions in kinds.items()}
     known = {"title": ROWS[name].title, "calibration_scenes": calibration.scenes, "spacing": list(calibration.spacing)}
     origin = provenance(f"python -m benchmarks.studies.coverage {name}")
-    return {**origin, **known, "rows": rows, **asked, "told": told}
+    return {**origin, **known, "rows": rows, **promised, "told": told}
 
 
 def _loaded(path: Path) -> list[ast_sim.Trajectory]:
@@ -217,9 +217,9 @@ def promises(run: ast_sim.Run, truths: Sequence[ast_sim.Trajectory]) -> dict[str
         frame = deepest_frame(truth)
         answers = [run.predict(truth, frames=frame, effort=effort, throw=False) for effort in kept.efforts]
         if not answers[0].notes:
-            errors.append([dict.fromkeys(ASKED, np.inf) if one.failure else one.errors(truth) for one in answers])
+            errors.append([dict.fromkeys(WANTED, np.inf) if one.failure else one.errors(truth) for one in answers])
     told = []
-    for quantity, levels in ASKED.items():
+    for quantity, levels in WANTED.items():
         for level in levels:
             one: dict[str, Any] = {"quantity": quantity, "error": level}
             try:
@@ -231,11 +231,11 @@ def promises(run: ast_sim.Run, truths: Sequence[ast_sim.Trajectory]) -> dict[str
             told.append({**one, "effort": chosen.text, "held": sum(row[number][quantity] <= level for row in errors)})
     middle = {
         quantity: [float(np.median([row[number][quantity] for row in errors])) for number in range(len(kept.efforts))]
-        for quantity in ASKED
+        for quantity in WANTED
     }
     return {
         "efforts": [effort.text for effort in kept.efforts],
-        "kept": {quantity: kept.bounds(quantity) for quantity in ASKED},
+        "kept": {quantity: kept.bounds(quantity) for quantity in WANTED},
         "median_error": middle,
         "promises": told,
         "promised_scenes": len(errors),

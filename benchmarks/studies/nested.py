@@ -1,7 +1,7 @@
 """The solver at its best, with nested iteration and without it, beside the run of plates that comes with the package.
 
 `python -m benchmarks.studies.nested [NODES ...]` generates a few plates of each size, goes to the deepest frame of each
-in every way of `ast_sim.simulate.jobs.fastest_solver`, and asks the run for the same frame. It writes
+in every variant of `ast_sim.simulate.jobs.fastest_solver`, and asks the run for the same frame. It writes
 benchmarks/results/nested.json and docs/results/nested.md. The scenes lie in `--folder`. Everything runs on one thread.
 """
 
@@ -28,7 +28,7 @@ from benchmarks.studies.rows import study_rows
 RESULTS = Path(__file__).parents[1] / "results" / "nested.json"
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "nested.md"
 EFFORTS = (Effort(0), Effort(0, 1), Effort(0, MOST_NEWTON_STEPS))
-NESTED = frozenset(way.name for way in VARIANTS if way.newton)
+NESTED = frozenset(variant.name for variant in VARIANTS if variant.newton)
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def measured(plates: Plates, folder: Path) -> dict[str, Any]:
         keep=plates.keep, **counts,
     ).path  # fmt: skip
     model = ast_sim.example_run("plates").model if plates.run else None
-    scenes: list[dict[str, Any]] = [{"ways": {}, "answers": {}} for _ in range(plates.scenes)]
+    scenes: list[dict[str, Any]] = [{"variants": {}, "answers": {}} for _ in range(plates.scenes)]
     for turn in range(plates.rounds):
         for index, scene in enumerate(scenes):
             (solved,) = solver_outcomes(data, plates.split, [index], progress=False)
@@ -78,7 +78,7 @@ def measured(plates: Plates, folder: Path) -> dict[str, Any]:
                     "mesh_seconds": outcome.mesh_seconds,
                     "failure": outcome.failure or None,
                 }
-                _keep_faster(scene["ways"], outcome.variant.name, figures)
+                _keep_faster(scene["variants"], outcome.variant.name, figures)
             if model is not None:
                 with ast_sim.Dataset(data) as dataset:
                     _ask(model, dataset, plates.split, index, scene["answers"])
@@ -112,16 +112,16 @@ def _keep_faster(known: dict[str, dict[str, Any]], name: str, figures: dict[str,
 def cheapest(scene: dict[str, Any], error: float, nested: bool) -> tuple[str, float] | None:
     """The name and the seconds of the fastest setting with at most this error; with nested iteration or without it."""
     fit = [
-        (way["seconds"], name)
-        for name, way in scene["ways"].items()
-        if way["seconds"] is not None and way["relative_error"] <= error and (nested or name not in NESTED)
+        (figures["seconds"], name)
+        for name, figures in scene["variants"].items()
+        if figures["seconds"] is not None and figures["relative_error"] <= error and (nested or name not in NESTED)
     ]
     return min(fit)[::-1] if fit else None
 
 
 def page(results: dict[str, Any]) -> str:
     shown = [results[str(plates.nodes)] for plates in SETS if str(plates.nodes) in results]
-    names = set(shown[0]["measured"][0]["ways"])
+    names = set(shown[0]["measured"][0]["variants"])
     introduction = _INTRODUCTION.format(both=len(names), plain=len(names - NESTED), processor=shown[0]["processor"])
     return "\n".join([introduction.rstrip(), *(line for plates in shown for line in _section(plates))])
 
@@ -192,7 +192,8 @@ def _run_at(scenes: Sequence[dict[str, Any]], level: float) -> tuple[str, int]:
     answered = [min(seconds) for seconds in own if seconds]
     best = [cheapest(scene, level, nested=True) for scene in scenes]
     wins = sum(
-        way is not None and (not seconds or way[1] < min(seconds)) for way, seconds in zip(best, own, strict=True)
+        fastest is not None and (not seconds or fastest[1] < min(seconds))
+        for fastest, seconds in zip(best, own, strict=True)
     )
     reached = f"{_milliseconds(answered)} in {len(answered)}" if answered else "none"
     return reached, wins
@@ -228,10 +229,11 @@ def _meshing(scenes: Sequence[dict[str, Any]]) -> list[str]:
     """What meshing takes, and in how many scenes a coarser mesh is missing."""
     lines = []
     for share in ("1/2", "1/4"):
-        ways = [scene["ways"][f"{share} nodes"] for scene in scenes]
-        failures = [way["failure"] for way in ways if way["failure"] is not None]
+        solved = [scene["variants"][f"{share} nodes"] for scene in scenes]
+        meshing = [figures["mesh_seconds"] for figures in solved]
+        failures = [figures["failure"] for figures in solved if figures["failure"] is not None]
         lines.append(
-            f"Meshing {share} of the nodes takes {_milliseconds([way['mesh_seconds'] for way in ways])}, not counted."
+            f"Meshing {share} of the nodes takes {_milliseconds(meshing)}, not counted."
             + (f" In {len(failures)} of {len(scenes)} scenes it is not solved: {failures[0]}." if failures else "")
         )
     return ["", *lines]
@@ -243,7 +245,7 @@ def _beside(scenes: Sequence[dict[str, Any]], effort: str) -> str:
     errors = [scene["answers"][effort]["relative_error"] for scene in known]
     seconds = [scene["answers"][effort]["seconds"] for scene in known]
     best = [cheapest(scene, error, nested=True) for scene, error in zip(known, errors, strict=True)]
-    ratios = [way[1] / answer for way, answer in zip(best, seconds, strict=True) if way is not None]
+    ratios = [fastest[1] / answer for fastest, answer in zip(best, seconds, strict=True) if fastest is not None]
     without, with_nested, *_ = _compared(known, errors)
     middle, spread = np.median(ratios), median_error(ratios)
     faster = "neither, within two standard errors"

@@ -21,8 +21,8 @@ def beside_solver(scenes: Sequence[dict[str, Any]], errors: Sequence[float | Non
         solver = scene["solver"]
         if solver is None or solver["seconds"] is None or error is None:
             continue
-        ways = [way for way in solver["ways"].values() if way["failure"] is None]
-        fit = [way["seconds"] for way in ways if way["relative_error"] <= error]
+        solved = [figures for figures in solver["variants"].values() if figures["failure"] is None]
+        fit = [figures["seconds"] for figures in solved if figures["relative_error"] <= error]
         taken.append(min([*fit, solver["seconds"]]))
         ratios.append(taken[-1] / answer)
     if not taken:
@@ -45,11 +45,11 @@ def settings_tried(rows: Iterable[dict[str, Any]]) -> str:
     """In how many settings the solver was run, such as "13 settings": rows may be older than some of them."""
     titles: dict[str, list[str]] = {}
     for row in rows:
-        ways = {name for scene in row["scenes"] if scene["solver"] for name in scene["solver"]["ways"]}
-        if ways:
-            titles.setdefault(_settings(ways), []).append(row["row"]["title"])
+        names = {name for scene in row["scenes"] if scene["solver"] for name in scene["solver"]["variants"]}
+        if names:
+            titles.setdefault(_settings(names), []).append(row["row"]["title"])
     first, *others = sorted(titles, key=lambda text: int(text.split()[0])) or [
-        _settings({way.name for way in VARIANTS})
+        _settings({variant.name for variant in VARIANTS})
     ]
     if not others:
         return first
@@ -57,9 +57,9 @@ def settings_tried(rows: Iterable[dict[str, Any]]) -> str:
     return f"{first} ({later})"
 
 
-def _settings(ways: set[str]) -> str:
-    nested = any(way.name in ways for way in VARIANTS if way.newton)
-    return f"{len(ways)} settings" + (", nested iteration among them," if nested else "")
+def _settings(names: set[str]) -> str:
+    nested = any(variant.name in names for variant in VARIANTS if variant.newton)
+    return f"{len(names)} settings" + (", nested iteration among them," if nested else "")
 
 
 def times_as_long(taken: Sequence[float], ratios: Sequence[float]) -> str:

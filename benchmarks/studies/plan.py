@@ -91,7 +91,7 @@ class Study:
             raise ConfigError("data: name either the path of a dataset or the family that is generated")
 
     def seeds_of(self, entry: Entry) -> tuple[int, ...]:
-        """Those of all runs of an entry."""
+        """The seeds of all runs of an entry."""
         return entry.seeds or self.seeds
 
 

@@ -40,8 +40,8 @@ def study_rows(
     parser = argparse.ArgumentParser(description=about.splitlines()[0])
     parser.add_argument("rows", nargs="*", metavar="ROW", help=f"of {', '.join(rows)} (default: all)")
     parser.add_argument("--folder", type=Path, default=default, help=f"data and runs (default: {default})")
-    asked = parser.parse_args(arguments)
-    unknown = set(asked.rows) - set(rows)
+    options = parser.parse_args(arguments)
+    unknown = set(options.rows) - set(rows)
     if unknown:
         parser.error(f"there is no row {', '.join(sorted(unknown))}")
     import torch  # after ast_sim, which says how its threads wait
@@ -50,8 +50,8 @@ def study_rows(
     os.environ["OMP_NUM_THREADS"] = "1"  # of the generator's and the solver's processes
     ast_sim.keep_memory()
     results = json.loads(results_file.read_text(encoding="utf-8")) if results_file.exists() else {}
-    for name in asked.rows or rows:
-        results[name] = measured(name, asked.folder)
+    for name in options.rows or rows:
+        results[name] = measured(name, options.folder)
         write_json(results_file, results)
         write_text(page_file, page(results) + "\n")
         print(f"{name}: {said(results[name])}", flush=True)

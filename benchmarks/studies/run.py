@@ -47,7 +47,7 @@ class Job:
 
     @property
     def seeds(self) -> tuple[int, ...]:
-        """Those of all runs of the entry."""
+        """The seeds of all runs of the entry."""
         return self.study.seeds_of(self.entry)
 
     @property
@@ -151,9 +151,9 @@ def _measured_speeds(jobs: list[Job]) -> tuple[dict[str, float], dict[str, int]]
             setup = Setup(str(job.data), job.entry.model, job.entry.preset, job.settings, str(job.place))
             workers[job.name] = Worker("c", job.study.threads, setup, job.place / "speed.log")
             stack.callback(workers[job.name].close)
-        turns = [{name: _asked(name, workers[name], "step", STEPS) for name in workers} for _ in range(1 + REPEATS)]
+        turns = [{name: _reply(name, workers[name], "step", STEPS) for name in workers} for _ in range(1 + REPEATS)]
         seconds = {name: min(turn[name] for turn in turns[1:]) for name in workers}  # the first one warms up
-        return seconds, {name: _asked(name, workers[name], "batch") for name in workers}
+        return seconds, {name: _reply(name, workers[name], "batch") for name in workers}
 
 
 def _speed(job: Job) -> dict[str, Any]:
@@ -166,7 +166,7 @@ def keep_speed(job: Job, record: dict[str, Any]) -> None:
     write_json(job.speed, {name: record[name] for name in ("seconds_per_step", "batch")})
 
 
-def _asked(name: str, worker: Worker, *request: Any) -> Any:
+def _reply(name: str, worker: Worker, *request: Any) -> Any:
     try:
         return worker.ask(*request)
     except RuntimeError as error:

@@ -39,12 +39,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--folder", type=Path, default=Path("build/shipped"), help="data, runs (default: build/shipped)"
     )
-    asked = parser.parse_args(arguments)
-    unknown = set(asked.names) - set(RUNS)
+    options = parser.parse_args(arguments)
+    unknown = set(options.names) - set(RUNS)
     if unknown:
         parser.error(f"there is no run {sorted(unknown)}: choose from {list(RUNS)}")
-    for name in asked.names or RUNS:
-        run, data, split = RUNS[name](asked.folder)
+    for name in options.names or RUNS:
+        run, data, split = RUNS[name](options.folder)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # scenes outside the training do not count
             calibration = ast_sim.calibrate(run, data, split)

@@ -117,9 +117,9 @@ def rubber() -> Outcome:
     found = {kind: [pad_stress(kind, cells) for cells in meshes] for kind in ELEMENTS}
     rows = []
     for name, ours, theirs in zip(names, found["second-order"], found["C3D20R"], strict=True):
-        asked = "what is asked for: 10 %"
-        rows.append(relative(f"second-order, {name} cells: modulus / E, formula", expected, ours, 0.1, asked))
-        rows.append(relative(f"second-order, {name} cells: modulus / E, C3D20R", theirs, ours, 0.1, asked))
+        limit = "what is asked for: 10 %"
+        rows.append(relative(f"second-order, {name} cells: modulus / E, formula", expected, ours, 0.1, limit))
+        rows.append(relative(f"second-order, {name} cells: modulus / E, C3D20R", theirs, ours, 0.1, limit))
     shares = {kind: np.divide(values, expected) for kind, values in found.items()}
     return Outcome(rows, {}, [table("cells", names, shares)])
 

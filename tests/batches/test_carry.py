@@ -58,8 +58,8 @@ def test_the_extension_has_the_least_energy():
     way = Carrier(scene)(scene.rest_position, moved) - rest
 
     def energy(u: np.ndarray) -> float:
-        edges, ways = (np.diff(x[scene.elements], axis=1) for x in (rest, u))
-        gradient = np.linalg.solve(edges, ways)
+        edges, differences = (np.diff(x[scene.elements], axis=1) for x in (rest, u))
+        gradient = np.linalg.solve(edges, differences)
         return float((np.abs(np.linalg.det(edges)) / 6 * np.square(gradient).sum(axis=(1, 2))).sum())
 
     least = energy(way)

@@ -15,11 +15,11 @@ from ast_sim.named_field import REACTION, NamedField
 from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.simulate.own_assembly.parameters import completed
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
-from benchmarks.studies import clip, clip_ways
+from benchmarks.studies import clip, clip_variants
 from benchmarks.studies.clip import Plan
 from benchmarks.studies.clip_outcome import SPEC, Outcome, outcome
 from benchmarks.studies.clip_page import page
-from benchmarks.studies.clip_ways import FINER, OWN, Way
+from benchmarks.studies.clip_variants import FINER, OWN, Variant
 
 
 def test_the_set_is_of_the_upper_face_and_the_peak_of_the_ram():
@@ -65,7 +65,7 @@ def made(_family, path, **_counts):
     return type("Made", (), {"path": path})()
 
 
-def ways_by_hand(drawn, _nodes, _file):
+def variants_by_hand(drawn, _nodes, _file):
     """In place of CalculiX: the coarse mesh is 1 % off, another one 20 %; the largest increments fail in one scene."""
     true = [{"set": 0.6 * one["depth"] * np.hypot(0.3, 1), "peak": 16 * one["depth"]} for one in drawn]
     found = {}
@@ -81,8 +81,8 @@ def test_from_scenes_to_the_page(tmp_path, monkeypatch):
     for name in ("RESULTS", "PAGE", "SHARED"):
         monkeypatch.setattr(clip, name, tmp_path / getattr(clip, name).name)
     monkeypatch.setattr(clip, "Plan", lambda: Plan(steps=2, settings=(("batch_size", 2),), seeds=(0, 1)))
-    monkeypatch.setattr(clip_ways, "SCENES", ("test/000000", "test/000001"))
-    monkeypatch.setattr(clip_ways, "solved", ways_by_hand)
+    monkeypatch.setattr(clip_variants, "SCENES", ("test/000000", "test/000001"))
+    monkeypatch.setattr(clip_variants, "solved", variants_by_hand)
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     clip.main(["--folder", str(tmp_path / "data")])
     found = json.loads(clip.RESULTS.read_text())
@@ -117,10 +117,10 @@ def found_by_hand():
         true = {"set": 0.6 * depth * np.hypot(0.3, 1), "peak": 16 * depth}
         said = {"set": of_set * true["set"], "peak": of_peak * true["peak"]}
         process = {key: 1.01 * value for key, value in true.items()}
-        asked = {"run": said, "run_two_frames": said, "gaussian_process": process, "solver_seconds": 10.0}
+        answers = {"run": said, "run_two_frames": said, "gaussian_process": process, "solver_seconds": 10.0}
         fields = dict.fromkeys(("turn_error", "last_error", "strain_error", "force_error"), 0.1)
         seconds = {"seconds": 0.02, "seconds_of_two": 0.01}
-        scenes.append({"name": name, "true": true, "parameters": {"depth": depth}, **asked, **fields, **seconds})
+        scenes.append({"name": name, "true": true, "parameters": {"depth": depth}, **answers, **fields, **seconds})
     return {
         "processor": "a processor",
         "plan": {"nodes": 1400, "train": 6, "steps": 2},
@@ -129,12 +129,12 @@ def found_by_hand():
         "parameters": 7,
         "scenes": scenes,
         "unseen": [],
-        "ways": ways_by_hand([scene["parameters"] for scene in scenes], 0, None),
+        "variants": variants_by_hand([scene["parameters"] for scene in scenes], 0, None),
     }
 
 
-def test_the_page_says_which_way_of_calculix_is_as_accurate_and_when_the_run_pays(monkeypatch):
-    monkeypatch.setattr(clip_ways, "SCENES", ("test/000000", "test/000001"))
+def test_the_page_says_which_variant_of_calculix_is_as_accurate_and_when_the_run_pays(monkeypatch):
+    monkeypatch.setattr(clip_variants, "SCENES", ("test/000000", "test/000001"))
     told = page(found_by_hand())
     # Of two scenes a bootstrap draws one twice as often as not; the Gaussian process is 1 % off in both.
     ahead = (
@@ -154,26 +154,26 @@ def test_the_page_says_which_way_of_calculix_is_as_accurate_and_when_the_run_pay
 
 
 def test_calculix_on_a_coarse_mesh_is_solved_once(tmp_path, monkeypatch):
-    coarse = Way("coarse", 0.15, clip_ways.YIELDING[0], True)
-    monkeypatch.setattr(clip_ways, "WAYS", (coarse, Way("never", 1.0, scenes=0)))
+    coarse = Variant("coarse", 0.15, clip_variants.YIELDING[0], True)
+    monkeypatch.setattr(clip_variants, "VARIANTS", (coarse, Variant("never", 1.0, scenes=0)))
     values = completed(read_spec(SPEC).parameters, {"travel": 2.0})
-    found = clip_ways.solved([values], 1400, tmp_path / "ways.json")
+    found = clip_variants.solved([values], 1400, tmp_path / "variants.json")
     (one,) = found["coarse"]
     assert found["never"] == [] and 100 < one["nodes"] < 400
     assert 0.5 < one["set"] < 2 and 20 < one["peak"] < 120 and one["seconds"] > 0.1
-    monkeypatch.setattr(clip_ways, "quasi_static", None)
-    assert clip_ways.solved([values], 1400, tmp_path / "ways.json") == found
+    monkeypatch.setattr(clip_variants, "quasi_static", None)
+    assert clip_variants.solved([values], 1400, tmp_path / "variants.json") == found
 
 
 def test_a_mesh_that_fails_is_followed_by_others_of_nearly_that_size(monkeypatch, tmp_path):
-    asked = []
+    tried = []
 
     def no_mesh(_spec, _values, nodes, _frames):
-        asked.append(nodes)
-        raise clip_ways.SimulationError("no mesh")
+        tried.append(nodes)
+        raise clip_variants.SimulationError("no mesh")
 
-    monkeypatch.setattr(clip_ways.assembly, "scene_of", no_mesh)
-    monkeypatch.setattr(clip_ways, "WAYS", (Way("half", 0.5), OWN))
-    found = clip_ways.solved([{}], 1000, tmp_path / "ways.json")
-    assert asked == [500, 475, 525, 450, 550, 1000]
+    monkeypatch.setattr(clip_variants.assembly, "scene_of", no_mesh)
+    monkeypatch.setattr(clip_variants, "VARIANTS", (Variant("half", 0.5), OWN))
+    found = clip_variants.solved([{}], 1000, tmp_path / "variants.json")
+    assert tried == [500, 475, 525, 450, 550, 1000]
     assert found == {"half": [{"failures": ["no mesh"] * 5}], OWN.name: [{"failures": ["no mesh"]}]}

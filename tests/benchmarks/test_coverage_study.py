@@ -1,4 +1,4 @@
-"""The study of bands and asked errors, from end to end on plates of 100 nodes."""
+"""The study of bands and wanted errors, from end to end on plates of 100 nodes."""
 
 import json
 import warnings

@@ -17,7 +17,7 @@ def test_a_scene_from_end_to_end(tmp_path, monkeypatch, one_thread):
     nested.main(["100", "--folder", str(tmp_path)])
     (scene,) = json.loads(nested.RESULTS.read_text())["100"]["measured"]
     assert (
-        len(scene["ways"]) == 35
+        len(scene["variants"]) == 35
         and len(nested.NESTED) == 20
         and list(scene["answers"]) == [effort.text for effort in nested.EFFORTS]
     )
@@ -31,25 +31,25 @@ def test_a_scene_from_end_to_end(tmp_path, monkeypatch, one_thread):
 
 def test_the_cheapest_of_a_scene():
     name = min(nested.NESTED)
-    ways = {
+    variants = {
         "own stop test": {"seconds": 3.0, "relative_error": 0.0},
         "1/2 nodes": {"seconds": 1.0, "relative_error": 0.08},
         name: {"seconds": 2.0, "relative_error": 0.004},
         "6 linearised steps": {"seconds": None, "relative_error": None},
     }
-    scene = {"ways": ways}
+    scene = {"variants": variants}
     assert nested.cheapest(scene, 0.1, nested=True) == ("1/2 nodes", 1.0)
     assert nested.cheapest(scene, 0.01, nested=True) == (name, 2.0)
     assert nested.cheapest(scene, 0.01, nested=False) == ("own stop test", 3.0)
-    assert nested.cheapest({"ways": {"1/2 nodes": ways["1/2 nodes"]}}, 0.01, nested=True) is None
+    assert nested.cheapest({"variants": {"1/2 nodes": variants["1/2 nodes"]}}, 0.01, nested=True) is None
     without, with_nested, ratio, names = nested._compared([scene, scene], [0.01, 0.01])
     assert (without, with_nested, ratio, names) == ("3000 ms", "2000 ms", "1.50 ± 0.00", f"{name}: 2")
 
 
 def test_the_solver_wins_where_the_run_is_slower_or_not_as_accurate():
-    ways = {"own stop test": {"seconds": 0.03, "relative_error": 0.0}}
+    variants = {"own stop test": {"seconds": 0.03, "relative_error": 0.0}}
     answers = {"0": {"seconds": 0.02, "relative_error": 0.04}, "1": {"seconds": 0.04, "relative_error": 0.01}}
-    scenes = [{"ways": ways, "answers": answers}, {"ways": ways, "answers": {"0": answers["1"]}}]
+    scenes = [{"variants": variants, "answers": answers}, {"variants": variants, "answers": {"0": answers["1"]}}]
     assert nested._run_at(scenes, 0.05) == ("30 ms in 2", 1)
     assert nested._run_at(scenes, 0.02) == ("40 ms in 2", 2)
     assert nested._run_at(scenes, 0.005) == ("none", 2)
@@ -64,10 +64,10 @@ def test_a_faster_time_is_kept():
 
 def test_rows_say_in_how_many_settings_the_solver_was_run():
     def row(title, *names):
-        return {"row": {"title": title}, "scenes": [{"solver": {"ways": dict.fromkeys(names)}}, {"solver": None}]}
+        return {"row": {"title": title}, "scenes": [{"solver": {"variants": dict.fromkeys(names)}}, {"solver": None}]}
 
-    plain = [way.name for way in VARIANTS[:13]]
-    every = [way.name for way in VARIANTS]
+    plain = [variant.name for variant in VARIANTS[:13]]
+    every = [variant.name for variant in VARIANTS]
     old = [row("A", *plain), row("B", *plain)]
     assert settings_tried(old) == "13 settings"
     assert settings_tried([row("C", *every)]) == settings_tried([]) == "35 settings, nested iteration among them,"

@@ -56,7 +56,7 @@ def huge_record(data: bytes, dice: random.Random) -> bytes:
 
 
 def frame_header(length: int) -> bytes:
-    """That of a record which has as its payload the eight bytes of the length: the checksum is the same."""
+    """The header of a record which has as its payload the eight bytes of the length: the checksum is the same."""
     packed = struct.pack("<Q", length)
     return packed + frame(packed)[-4:]
 

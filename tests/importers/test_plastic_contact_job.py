@@ -73,8 +73,8 @@ def test_plastic_strain_and_forces_are_predicted(data, tmp_path, capsys):
     settings = [part for setting in chosen for part in ("--set", setting)]
     states = ["--state", "PEEQ", "--state", "reaction"]
     assert cli.main(["train", str(data), "--out", str(run), "--model", "transolver", *states, *settings]) == 0
-    asked = ["--split", "train", "--index", "0", "--out", str(out), "--forces", str(forces)]
-    assert cli.main(["predict", str(run), str(data), *asked]) == 0
+    options = ["--split", "train", "--index", "0", "--out", str(out), "--forces", str(forces)]
+    assert cli.main(["predict", str(run), str(data), *options]) == 0
     with Dataset(data) as dataset, Dataset(out) as answers:
         truth, answer = dataset["train"][0], answers["test"][0]
     scene = truth.scene

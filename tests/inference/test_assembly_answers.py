@@ -106,11 +106,11 @@ def test_with_friction_a_sweep_knows_the_frame_before(tmp_path, rubs):
     )
     assert row["reaction"] == pytest.approx(after_another, rel=1e-6)
     assert alone != pytest.approx(after_another, rel=1e-5)
-    asked, predict_scenes = [], run.predict_scenes
-    run.predict_scenes = lambda scenes, **given: asked.append(given["frames"]) or predict_scenes(scenes, **given)
+    wanted, predict_scenes = [], run.predict_scenes
+    run.predict_scenes = lambda scenes, **given: wanted.append(given["frames"]) or predict_scenes(scenes, **given)
     run.sweep(spec, {"travel": 1.5}, effort=ast_sim.Effort())
     run.sweep(spec, {"travel": 1.5}, effort=effort)
-    assert asked == [[-1], [-2, -1]]  # without Newton steps, the frame before changes nothing
+    assert wanted == [[-1], [-2, -1]]  # without Newton steps, the frame before changes nothing
 
 
 def test_rows_outside_the_training_are_told_once(trained):

@@ -63,8 +63,8 @@ def by_hand(answer, truth):
 def test_the_calibration_is_the_score_of_the_rank(calibrated):
     run, data, result = calibrated
     with ast_sim.Dataset(data) as dataset:
-        asked = [dataset["test"][index] for index in range(24)]
-    pairs = [(answer, truth) for truth in asked if not (answer := run.predict(truth)).notes]
+        trajectories = [dataset["test"][index] for index in range(24)]
+    pairs = [(answer, truth) for truth in trajectories if not (answer := run.predict(truth)).notes]
     answers, truths = zip(*pairs, strict=True)
     assert 19 <= len(pairs) == result.scenes <= 24 and set(result.quantiles) == {"displacement", "stress"}
     sizes, true_sizes, errors = (np.array(each) for each in zip(*(by_hand(a, t) for a, t in pairs), strict=True))
@@ -130,8 +130,8 @@ def test_a_calibration_is_not_kept_beside_a_checkpoint_that_was_marked_since(cal
 def test_no_band_where_nothing_is_known(calibrated):
     run, data, result = calibrated
     with ast_sim.Dataset(data) as dataset:
-        asked = [dataset["test"][index] for index in range(24)]
-    answer = next(answer for truth in asked if not (answer := run.predict(truth)).notes)
+        trajectories = [dataset["test"][index] for index in range(24)]
+    answer = next(answer for truth in trajectories if not (answer := run.predict(truth)).notes)
     assert set(result.bands(answer, run.effort, ())) == {"displacement", "stress"}
     assert not result.bands(answer, run.effort, ("it is large",))  # which is told already
     for other, words in (

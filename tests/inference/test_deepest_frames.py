@@ -1,4 +1,4 @@
-"""The deepest frame: relative errors, stress, times, and the solver's ways to the same frame."""
+"""The deepest frame: relative errors, stress, times, and the solver's variants for the same frame."""
 
 import json
 from dataclasses import asdict, replace
@@ -277,7 +277,7 @@ def test_means_over_scenes_lack_what_one_scene_lacks():
 
 
 def test_beside_the_solver(tmp_path):
-    """A model that gives the truth: only ways as accurate as that count, so the own stop test is the cheapest."""
+    """A model that gives the truth: only variants as accurate as it count, so the own stop test is the cheapest."""
     made = generate("deforming_plate", tmp_path / "d.h5", train=1, valid=0, test=1, nodes=100, frames=5, workers=1)
     with Dataset(made.path) as dataset:
         truth = dataset.load("test", 0)
@@ -287,16 +287,16 @@ def test_beside_the_solver(tmp_path):
         found = deepest_frames(Share(config, truth, frame, 0.99), dataset, "test", Effort(), solver_scenes=1)
     solver = found.scenes[0].solver
     assert found.relative_error == pytest.approx(0.01, rel=1e-3)
-    assert solver.ways["own stop test"].relative_error < 1e-3
+    assert solver.variants["own stop test"].relative_error < 1e-3
     assert solver.cheapest_seconds <= solver.seconds
-    assert solver.ways[solver.cheapest].relative_error <= 0.01
+    assert solver.variants[solver.cheapest].relative_error <= 0.01
     assert found.solver.ratio == pytest.approx(solver.seconds / found.scenes[0].seconds)
     assert any("the solver for this frame" in line for line in lines(found))
     assert not any("coarser mesh" in line for line in lines(found))
-    halves = {name: way for name, way in solver.ways.items() if "1/2 nodes" in name}
+    halves = {name: figures for name, figures in solver.variants.items() if "1/2 nodes" in name}
     assert len(halves) == 14
     unmeshed = {name: VariantFigures(failure="could not be meshed: too thin") for name in halves}
-    scene = replace(found.scenes[0], solver=replace(solver, ways={**solver.ways, **unmeshed}))
+    scene = replace(found.scenes[0], solver=replace(solver, variants={**solver.variants, **unmeshed}))
     assert lines(replace(found, scenes=(scene,)))[-1] == (
         "  in 1 of 1 scenes the solver has no coarser mesh to begin on, also not for nested iteration: could not be"
         " meshed: too thin"

@@ -12,7 +12,7 @@ from ast_sim.mechanics.equilibria import Equilibria
 from ast_sim.support.errors import ConfigError
 
 FROM_MODEL = "solved to the stop test of the solver, from the answer of the model"
-WALKED = "solved to the stop test of the solver, along the load path, frame by frame"
+ALONG_LOAD_PATH = "solved to the stop test of the solver, along the load path, frame by frame"
 
 
 @pytest.fixture(scope="module")
@@ -49,8 +49,8 @@ def test_an_exact_answer_ends_where_the_solver_ended(plates):
         force = np.linalg.norm(answer.reaction(), axis=1)[1:]
         assert force == pytest.approx(truth.attributes["reaction"][1:], rel=1e-3)
     assert len(others) == 1
-    walked, along = equilibria_of(others[0].scene, answer.law, others[0].position).solve(2, None)
-    assert along and np.abs(walked - others[0].position[2]).max() < 1e-6
+    position, along_load_path = equilibria_of(others[0].scene, answer.law, others[0].position).solve(2, None)
+    assert along_load_path and np.abs(position - others[0].position[2]).max() < 1e-6
 
 
 def test_a_poor_start_makes_the_solver_go_the_way_of_the_load(plates, monkeypatch):
@@ -58,13 +58,13 @@ def test_a_poor_start_makes_the_solver_go_the_way_of_the_load(plates, monkeypatc
     run = ast_sim.example_run("plates")
     run.calibration = None
     truth = loaded(plates)[0]
-    walked = []
+    solved = []
     solve = Equilibria.solve
     monkeypatch.setattr(
-        Equilibria, "solve", lambda self, frame, start: walked.append(frame) or solve(self, frame, None)
+        Equilibria, "solve", lambda self, frame, start: solved.append(frame) or solve(self, frame, None)
     )
     answer = run.predict(truth, frames=[2], effort=ast_sim.Effort.exact())
-    assert walked == [2] and answer.source["solved"] == WALKED
+    assert solved == [2] and answer.source["solved"] == ALONG_LOAD_PATH
     assert answer.errors(truth)["displacement"] < 1e-5
 
 
@@ -74,11 +74,11 @@ def test_only_a_start_without_overlap_is_taken(plates):
     law = run.predict(truth, effort=ast_sim.Effort()).law
     there = truth.position.astype(float)
     equilibria = equilibria_of(truth.scene, law, there)
-    position, walked = equilibria.solve(2, there[2])
-    assert not walked and np.abs(position - there[2]).max() < 1e-6
+    position, along_load_path = equilibria.solve(2, there[2])
+    assert not along_load_path and np.abs(position - there[2]).max() < 1e-6
     inside = np.where(truth.scene.prescribed[:, None], there[2], there[0])  # the plate at rest, the obstacle in it
-    position, walked = equilibria.solve(2, inside)
-    assert walked and np.abs(position - there[2]).max() < 1e-4
+    position, along_load_path = equilibria.solve(2, inside)
+    assert along_load_path and np.abs(position - there[2]).max() < 1e-4
     assert equilibria_of(truth.scene, law, there).solve(1, None)[1]
 
 
@@ -89,14 +89,14 @@ def test_with_friction_the_solver_goes_the_way_of_the_load(plates):
     law = run.predict(truth, effort=ast_sim.Effort()).law
     rough = replace(law, material=replace(law.material, constants={**law.material.constants, "friction": 0.4}))
     equilibria = equilibria_of(truth.scene, rough, truth.position)
-    position, walked = equilibria.solve(2, truth.position[2].astype(float))
+    position, along_load_path = equilibria.solve(2, truth.position[2].astype(float))
     again, _ = equilibria_of(truth.scene, rough, truth.position).solve(2, None)
-    assert walked and np.array_equal(position, again)
+    assert along_load_path and np.array_equal(position, again)
     smooth, _ = equilibria_of(truth.scene, law, truth.position).solve(2, None)
     assert np.abs(position - smooth).max() > 1e-5
 
 
-def test_an_asked_error_below_all_others_is_given_to_the_solver(plates):
+def test_a_wanted_error_below_all_others_is_given_to_the_solver(plates):
     run = ast_sim.example_run("plates")
     truth = loaded(plates)[0]
     assert choices(run.settings.model, 0)[-1] == ast_sim.Effort.exact()

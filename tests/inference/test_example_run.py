@@ -13,7 +13,7 @@ from ast_sim.named_field import REACTION
 from ast_sim.support.errors import ConfigError
 from benchmarks.studies.clip import RESULTS
 from benchmarks.studies.clip_outcome import LAST, SPEC, outcome, true_outcome
-from benchmarks.studies.clip_ways import SCENES
+from benchmarks.studies.clip_variants import SCENES
 
 
 def test_it_predicts_a_new_plate_by_one_call_and_better_with_newton_steps(tmp_path, capsys):
@@ -57,9 +57,10 @@ def test_a_clip_that_is_asked_for_by_its_parameters_has_the_set_and_the_force_of
     run = ast_sim.example_run("clip")
     assert run.scope.length_unit == "mm" and run.calibration.scenes == 40 and run.settings.model.history is not None
     for known in json.loads(RESULTS.read_text())["scenes"][:2]:
-        asked = {key: known["parameters"][key] for key in ("length", "thickness", "place", "travel", "yield_stress")}
-        asked["file"] = {"clip": known["parameters"]["clip.file"]}
-        answer = run.predict(spec=SPEC, parameters=asked, nodes=1400)
+        names = ("length", "thickness", "place", "travel", "yield_stress")
+        parameters = {name: known["parameters"][name] for name in names}
+        parameters["file"] = {"clip": known["parameters"]["clip.file"]}
+        answer = run.predict(spec=SPEC, parameters=parameters, nodes=1400)
         said = outcome(answer.scene, answer.position[0], answer.position[-1], answer.fields[REACTION].values)
         assert said == pytest.approx(tuple(known["true"].values()), rel=0.1)
         assert answer.fields["PEEQ"].values[-1].max() > 0.01 and answer.frames == tuple(range(LAST + 1))

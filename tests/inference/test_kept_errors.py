@@ -35,8 +35,8 @@ def test_of_19_scenes_one_may_miss_and_of_9_none():
 
 def test_the_cheapest_effort_that_keeps_the_error_is_chosen():
     known = of([0.08] * 9, [0.03] * 9, [0.01] * 9)
-    asked = {0.08: Effort(), 0.05: Effort(0, 1), 0.01: Effort(0, 10)}
-    assert {error: known.effort_for({"displacement": error}) for error in asked} == asked
+    cheapest = {0.08: Effort(), 0.05: Effort(0, 1), 0.01: Effort(0, 10)}
+    assert {error: known.effort_for({"displacement": error}) for error in cheapest} == cheapest
 
 
 def test_a_scene_that_a_dearer_effort_spoils_misses_the_cheaper_one_too():

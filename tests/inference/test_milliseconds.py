@@ -84,7 +84,7 @@ def test_other_questions_are_timed_again_and_a_damaged_file_is_no_obstacle(cache
 
 
 @pytest.mark.parametrize(
-    ("asked", "text"),
+    ("options", "text"),
     [
         ({"ms": "50"}, "ms is '50'; it must be a number above 0"),
         ({"ms": float("nan")}, "ms is nan; it must be a number above 0"),
@@ -95,9 +95,9 @@ def test_other_questions_are_timed_again_and_a_damaged_file_is_no_obstacle(cache
         ({"num_frames": True}, "num_frames is True; it must be a whole number"),
     ],
 )
-def test_what_is_no_such_number_is_refused_by_name(cache, truth, asked, text):
+def test_what_is_no_such_number_is_refused_by_name(cache, truth, options, text):
     with pytest.raises(ConfigError, match=re.escape(text)):
-        ast_sim.example_run("plates").predict(truth.scene, {1: (0, 0, -0.02)}, **asked)
+        ast_sim.example_run("plates").predict(truth.scene, {1: (0, 0, -0.02)}, **options)
 
 
 def test_a_model_without_known_errors_cannot_choose(cache, truth, tmp_path):

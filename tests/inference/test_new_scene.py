@@ -154,24 +154,24 @@ def test_a_scene_far_away_gets_the_same_answer_there(run, tmp_path):
 
 
 def test_only_a_scene_that_leaves_the_domain_is_moved(run, monkeypatch):
-    asked = []
+    predicted = []
 
     answers = answering.answers
 
     def kept(model, questions, effort, progress):
-        asked.extend(questions)
+        predicted.extend(questions)
         return answers(model, questions, effort, progress)
 
     monkeypatch.setattr(answering, "answers", kept)
     scene = scene_of()
     scene = with_positions(scene, scene.rest_position + [0.7, 0.1, 0.0])  # up to x = 0.94 of 1
     run.predict(scene, PRESS, num_frames=3)
-    assert asked[-1].scene is scene
+    assert predicted[-1].scene is scene
     with pytest.warns(UserWarning, match="prescribed nodes move"):  # its motion counts, too: up to x = 1.15
         run.predict(scene, {1: (0.4, 0.0, 0.0)}, num_frames=3)
-    x = asked[-1].prescribed_position[:, scene.prescribed, 0]
+    x = predicted[-1].prescribed_position[:, scene.prescribed, 0]
     assert (x.min(), x.max()) == pytest.approx((-0.345, 0.345))
-    assert asked[-1].scene.rest_position[:, 0].min() == pytest.approx(-0.345)
+    assert predicted[-1].scene.rest_position[:, 0].min() == pytest.approx(-0.345)
 
 
 def test_several_motions_of_a_scene_are_answered_together(run):

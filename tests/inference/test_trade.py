@@ -21,7 +21,7 @@ def plates(tmp_path_factory):
     return data
 
 
-def test_efforts_and_ways_are_measured_on_the_same_scene(plates, tmp_path, capsys):
+def test_efforts_and_variants_are_measured_on_the_same_scene(plates, tmp_path, capsys):
     ast_sim.example_run("plates").save(tmp_path / "plates.ast")
     told = [str(tmp_path / "plates.ast"), str(plates), "--out", str(tmp_path / "pages" / "trade.html")]
     assert main(["trade", *told]) == 0

@@ -187,7 +187,7 @@ def test_forces_by_condensation_are_those_by_columns(squeezed, monkeypatch):
 
 
 def test_forces_of_contact_are_those_of_least_squares():
-    """Of random bodies, some with more pairs than they have ways to give way; and of one whose pairs take turns for
+    """Of random bodies, some with more pairs than degrees of freedom; and of one whose pairs take turns for
     ever if all that are wrong turn at once."""
     random, problems = np.random.default_rng(0), []
     for count in (1, 2, 5, 20, 20, 40):

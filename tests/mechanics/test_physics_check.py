@@ -22,8 +22,8 @@ def law_of(young: float, poisson: float) -> Law:
     return Law(Material((), {"young": young, "poisson": poisson, "friction": 0.0}), 1e-3)
 
 
-def values(*asked) -> list:
-    return [row.value for row in check_physics(*asked, "m").rows]
+def values(*arguments) -> list:
+    return [row.value for row in check_physics(*arguments, "m").rows]
 
 
 def test_a_frame_of_the_solver_is_physics(squeezed):

@@ -501,8 +501,8 @@ def test_what_the_dataset_decides():
     assert dynamic.node_inputs == ("displacement", "velocity") and dynamic.element_inputs == ("displacement",)
     assert (dynamic.places, dynamic.exchanges) == ("absolute", 0)
     assert replace(tiny, places="absolute").resolve(DataFacts.of(info, (), 0.1)).exchanges == 0
-    asked = replace(tiny, places="relative", exchanges=1, node_inputs=(), element_inputs=("velocity",))
-    found = asked.resolve(moving)
+    chosen = replace(tiny, places="relative", exchanges=1, node_inputs=(), element_inputs=("velocity",))
+    found = chosen.resolve(moving)
     assert (found.places, found.exchanges) == ("relative", 1)
     assert found.node_inputs == () and found.element_inputs == ("velocity",)
 

@@ -221,9 +221,9 @@ def test_the_preset_tiny_jumps_where_there_is_no_inertia_and_the_papers_presets_
 
 
 def test_forces_need_tetrahedra():
-    asked = replace(find_preset("ast", "tiny").model, node_inputs=("out_of_balance",))
+    chosen = replace(find_preset("ast", "tiny").model, node_inputs=("out_of_balance",))
     with pytest.raises(ConfigError, match="out_of_balance needs tetrahedra"):
-        asked.resolve(DataFacts.of(toy.info(), (), 0.1, tetrahedra=False))
+        chosen.resolve(DataFacts.of(toy.info(), (), 0.1, tetrahedra=False))
 
 
 @pytest.mark.parametrize("model", ["ast", "transolver"])

@@ -46,8 +46,8 @@ def test_the_world_radius_is_the_mesh_spacing_where_the_contact_radius_joins_no_
     for contact, expected in ((0.003, 0.1), (0.05, 0.05), (0.3, 0.3), (0.0, 0.1)):
         info = replace(toy.info(), contact_radius=contact)
         assert tiny.resolve(DataFacts.of(info, (), 0.1)).world_radius == expected
-    asked = replace(tiny, world_radius=0.003)
-    assert asked.resolve(DataFacts.of(toy.info(), (), 0.1)).world_radius == 0.003
+    chosen = replace(tiny, world_radius=0.003)
+    assert chosen.resolve(DataFacts.of(toy.info(), (), 0.1)).world_radius == 0.003
     data, few = toy.write(tmp_path / "toy.h5"), [SMALL["mgn"], "train.steps=1", "train.statistics_pairs=4"]
     start_training(tmp_path / "blind", configure(data, "tiny", [*few, "model.world_radius=1e-6"], "mgn"))
     assert "warning: no node has a world edge of at most 1e-06 in 4 scenes" in capsys.readouterr().out

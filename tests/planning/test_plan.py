@@ -26,7 +26,7 @@ def data(tmp_path_factory):
     return toy.write(tmp_path_factory.mktemp("data") / "toy.h5", (6, 3, 1))
 
 
-def asked(data, **train):
+def run_config(data, **train):
     changes = {f"model.{key}": value for key, value in SMALL.items()}
     return configure(data, changes=changes | {f"train.{key}": value for key, value in {**QUICK, **train}.items()})
 
@@ -64,7 +64,7 @@ def test_a_plan_of_real_trainings(short, data, tmp_path, capsys, monkeypatch):
 
 
 def test_its_settings_train(short, data, tmp_path):
-    made = planned(asked(data), tmp_path / "plan", 0.3)
+    made = planned(run_config(data), tmp_path / "plan", 0.3)
     settings = tmp_path / "plan" / "best.toml"
     run = ast_sim.train(data, tmp_path / "run", config=settings, steps=2)
     assert str(settings) in made.command
@@ -74,7 +74,7 @@ def test_its_settings_train(short, data, tmp_path):
 
 
 def test_candidates_vary_the_rate_and_the_width(data):
-    tried = candidates(asked(data), "tiny")
+    tried = candidates(run_config(data), "tiny")
     rates = [config.train.peak_rate for config in tried.values()]
     assert rates == [3e-3, 1.5e-3, 6e-3, 3e-3]
     wider = tried["tiny, wider"].model
@@ -83,7 +83,7 @@ def test_candidates_vary_the_rate_and_the_width(data):
 
 
 def test_a_trial_with_some_of_the_scenes_sees_no_other(data, tmp_path):
-    trial = Trials(tmp_path, 3, 1).trained("tiny", asked(data), 4, scenes=1)
+    trial = Trials(tmp_path, 3, 1).trained("tiny", run_config(data), 4, scenes=1)
     assert (trial.scenes, trial.steps) == (1, 4)
     assert read_config(tmp_path / trial.run).train.scenes == 1
 
@@ -95,7 +95,7 @@ def test_better_candidates_go_on(data, tmp_path, monkeypatch):
     monkeypatch.setattr(
         Trials, "trained", lambda _, name, config, steps: Trial(name, steps, 4, seconds[name], errors[name], "run")
     )
-    trials, tried = Trials(tmp_path, 4, 1), candidates(asked(data), "tiny")
+    trials, tried = Trials(tmp_path, 4, 1), candidates(run_config(data), "tiny")
     made = list(trials.rounds(tried, trials.first_steps(tried, 2.0)))
     assert [(trial.name, trial.steps) for trial in made] == [
         ("tiny", 222), ("tiny, half the rate", 222), ("tiny, twice the rate", 222), ("tiny, wider", 111),
@@ -116,20 +116,20 @@ def test_better_candidates_go_on(data, tmp_path, monkeypatch):
 )
 def test_what_cannot_be_planned_is_refused(data, tmp_path, train, match):
     with pytest.raises(ConfigError, match=match):
-        planned(asked(data, **train), tmp_path / "plan", 1.0)
+        planned(run_config(data, **train), tmp_path / "plan", 1.0)
     assert not (tmp_path / "plan").exists()
 
 
 def test_a_dataset_without_validation_scenes_is_refused(tmp_path):
     alone = toy.write(tmp_path / "alone.h5", (6, 0, 1))
     with pytest.raises(ConfigError, match="has no validation scenes"):
-        planned(asked(alone), tmp_path / "plan", 1.0)
+        planned(run_config(alone), tmp_path / "plan", 1.0)
 
 
 def test_a_trial_whose_validation_failed_is_told(data, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "RunFolder", lambda _: SimpleNamespace(metrics=Failed()))
     with pytest.raises(ast_sim.AstSimError, match="the trial tiny, 4 steps has no error: it exploded"):
-        Trials(tmp_path, 3, 1).trained("tiny", asked(data), 4)
+        Trials(tmp_path, 3, 1).trained("tiny", run_config(data), 4)
 
 
 class Failed:
@@ -144,13 +144,13 @@ class Failed:
 
 def test_the_trials_have_the_processes_of_the_whole_training(data, monkeypatch):
     monkeypatch.setattr(plan_module, "usual_processes", lambda config: 2 if config.train.minutes == 30 else 1)
-    assert plan_module._with_processes(asked(data), 30).train.processes == 2
-    assert plan_module._with_processes(asked(data, processes=1), 30).train.processes == 1
+    assert plan_module._with_processes(run_config(data), 30).train.processes == 2
+    assert plan_module._with_processes(run_config(data, processes=1), 30).train.processes == 1
 
 
 @pytest.mark.parametrize("minutes", [0, -1, float("inf"), float("nan")])
 def test_minutes_that_are_none_are_refused(data, tmp_path, minutes):
     with pytest.raises(ConfigError, match="minutes"):
-        planned(asked(data), tmp_path / "plan", minutes)
+        planned(run_config(data), tmp_path / "plan", minutes)
     with pytest.raises(ConfigError, match="minutes"):
         ast_sim.worth(tmp_path / "SPEC.toml", tmp_path / "worth", minutes)

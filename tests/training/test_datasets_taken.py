@@ -11,13 +11,13 @@ from ast_sim.training import start
 
 def test_a_path_or_an_open_dataset(tmp_path, monkeypatch):
     path = toy.write(tmp_path / "toy.h5")
-    asked = []
-    monkeypatch.setattr(start, "start_training", lambda run, config, **_: asked.append((run, config)))
+    started = []
+    monkeypatch.setattr(start, "start_training", lambda run, config, **_: started.append((run, config)))
     monkeypatch.setattr(start, "Run", lambda run: run)
     with Dataset(path) as data:
         for one in (path, str(path), data):
             assert train(one, tmp_path / "run", steps=2) == tmp_path / "run"
-        assert asked[0] == asked[1] == asked[2] and asked[0][1].data == str(path)
+        assert started[0] == started[1] == started[2] and started[0][1].data == str(path)
         models = []
         for one in (path, str(path), data):
             torch.manual_seed(0)

@@ -13,7 +13,7 @@ from ast_sim.inference.trained_run import Run
 from ast_sim.scene import NodeType, Trajectory
 from ast_sim.support.errors import DatasetError
 from ast_sim.training import start
-from ast_sim.training.validation import frames_asked
+from ast_sim.training.validation import validation_frames
 
 SMALL = ["train.steps=2", "train.batch_size=2", "train.statistics_pairs=4", "train.rollout_pool=0", "model.hidden=16"]
 MORE = {"ast": ["model.d_token=16", "model.L_SA=1"], "mgn": ["model.blocks=1"]}
@@ -108,8 +108,8 @@ def test_coincident_nodes_of_an_element_are_trained_and_predicted_without_nan(tr
 
 
 @pytest.mark.parametrize(
-    ("count", "asked"), [(2, [1]), (3, [1, 2]), (4, [1, 2, 3]), (5, [1, 2, 3, 4]), (41, [10, 20, 30, 40])]
+    ("count", "frames"), [(2, [1]), (3, [1, 2]), (4, [1, 2, 3]), (5, [1, 2, 3, 4]), (41, [10, 20, 30, 40])]
 )
-def test_a_validation_asks_for_no_given_frame(count, asked):
+def test_a_validation_asks_for_no_given_frame(count, frames):
     """Scenes of two or three frames are too short for four different ones."""
-    assert frames_asked(count).tolist() == asked
+    assert validation_frames(count).tolist() == frames

@@ -130,15 +130,15 @@ def test_a_source_that_was_trained_again_is_noticed(folder, tmp_path):
 def test_a_resumed_run_keeps_its_source(folder, tmp_path):
     copy = shutil.copytree(folder / "source", tmp_path / "copy")
     run = started(folder / "toy.h5", folder / "source", tmp_path / "run", "train.steps=2")
-    asked = configure(folder / "toy.h5", None, ["train.steps=2"], from_run=folder / "source")
-    start_training(run, asked, resume=True, from_run=folder / "source")
+    config = configure(folder / "toy.h5", None, ["train.steps=2"], from_run=folder / "source")
+    start_training(run, config, resume=True, from_run=folder / "source")
     with pytest.raises(ConfigError, match=rf"was started from {folder / 'source'}, not from {copy}"):
-        start_training(run, asked, resume=True, from_run=copy)
+        start_training(run, config, resume=True, from_run=copy)
     plain = tmp_path / "plain"
     same = [setting for setting in SMALL if "validate_every" not in setting]
     start_training(plain, configure(folder / "toy.h5", None, [*same, "train.steps=2"], "mgn"))
     with pytest.raises(ConfigError, match="was started without another run"):
-        start_training(plain, asked, resume=True, from_run=folder / "source")
+        start_training(plain, config, resume=True, from_run=folder / "source")
 
 
 def changed(path, trajectory, **facts):
@@ -191,9 +191,9 @@ def test_a_source_that_is_no_run_is_one_line(folder, tmp_path, capsys):
 
 def test_the_settings_of_a_run_come_from_its_file(folder):
     file = folder / "source" / "config.toml"
-    asked = configure(folder / "toy.h5", config=file)
+    config = configure(folder / "toy.h5", config=file)
     facts = read_config(folder / "source").model.data
-    assert asked.knowing(facts) == read_config(folder / "source") and asked.model.data != facts
+    assert config.knowing(facts) == read_config(folder / "source") and config.model.data != facts
     longer = configure("other.h5", None, ["train.steps=300", "train.warmup=7"], config=file)
     assert longer.data == "other.h5" and longer.knowing(facts).model == read_config(folder / "source").model
     assert (longer.train.steps, longer.train.warmup, longer.train.decay) == (300, 7, None)

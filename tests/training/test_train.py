@@ -507,8 +507,8 @@ def test_scenes_that_are_moved_out_of_the_domain_are_an_error(data, tmp_path):
 )
 def test_a_pool_that_is_of_no_use_is_refused(data, tmp_path, setting, message):
     with pytest.raises(ConfigError, match=f"of no use here: .*{message}"):
-        asked = ["model.jumps=false", "train.rollout_pool=8", setting]
-        start.start_training(tmp_path / "run", start.configure(data, "tiny", asked))
+        settings = ["model.jumps=false", "train.rollout_pool=8", setting]
+        start.start_training(tmp_path / "run", start.configure(data, "tiny", settings))
 
 
 @pytest.mark.parametrize(
@@ -542,8 +542,8 @@ def test_settings_without_effect_are_refused(data, tmp_path, settings, message):
 def test_resolved_settings_are_themselves_settings_to_start_from(data, tmp_path, jumps):
     """What had no effect is unset in them, so nothing in them is refused; the facts of the data are not among them."""
     with Dataset(data) as dataset:
-        asked = start.configure(data, "tiny", [f"model.jumps={str(jumps).lower()}", "train.steps=9"])
-        resolved = resolve(asked, dataset, measure(dataset))
+        config = start.configure(data, "tiny", [f"model.jumps={str(jumps).lower()}", "train.steps=9"])
+        resolved = resolve(config, dataset, measure(dataset))
         write_config(tmp_path, resolved, scope_of(dataset, resolved.model.data), dataset.fingerprint())
         again = resolve(start.configure(data, config=tmp_path / "config.toml"), dataset, measure(dataset))
     assert again == resolved == read_config(tmp_path)

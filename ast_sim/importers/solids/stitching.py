@@ -24,7 +24,7 @@ _SAME_PLACE = 1e-6
 # Fields agree if they differ by less than this share of their largest value.
 _SAME_VALUE = 1e-5
 
-# So many separate parts that all hold the same number of elements are patches of one mesh.
+# Separate parts, at least this many, that all hold the same number of elements are patches of one mesh.
 _PATCHES = 4
 
 # Names of fields that number points or processes: they differ at a point that stands several times.

@@ -108,20 +108,20 @@ def _after(model: Simulator, truth: Trajectory, frame: int, most: Effort) -> lis
     """The errors after 0 Newton steps up to the number of an effort."""
     efforts = [dataclasses.replace(most, newton_steps=steps) for steps in range(most.newton_steps + 1)]
     question = Question.of(truth, "validation", [frame])
-    (way,) = answer_steps(model, [question], most)
-    if isinstance(way, str) and most.newton_steps:  # a Newton step failed; the calls before it still count
-        (way,) = answer_steps(model, [question], efforts[0])
-    if isinstance(way, str):
+    (outcome,) = answer_steps(model, [question], most)
+    if isinstance(outcome, str) and most.newton_steps:  # a Newton step failed; the calls before it still count
+        (outcome,) = answer_steps(model, [question], efforts[0])
+    if isinstance(outcome, str):
         return [EffortErrors(effort, None, None, 0, 0) for effort in efforts]
-    positions = way.position[most.corrections :]
-    needed = int(way.steps[0]) + bool(way.last_step[0] > STILL)
+    positions = outcome.position[most.corrections :]
+    needed = int(outcome.steps[0]) + bool(outcome.last_step[0] > STILL)
     measured = []
     for steps, effort in enumerate(efforts):
         if steps >= len(positions):
             measured.append(EffortErrors(effort, None, None, 0, 0))
             continue
         error = relative_error(positions[steps][0], truth, frame)
-        stress = None if way.stress is None else way.stress[steps][0]
+        stress = None if outcome.stress is None else outcome.stress[steps][0]
         stress_error, _ = stress_errors(truth, stress, frame, model.config.data.stress)
         measured.append(EffortErrors(effort, error, stress_error, min(steps, needed), float(0 < steps < needed)))
     return measured
@@ -162,7 +162,7 @@ def lines(frames: DeepestFrames) -> list[str]:
 def _unmeshed(scenes: Iterable[DeepestFrame]) -> list[str]:
     """In how many scenes the solver has no coarser mesh, so that variants which begin on one are missing, and why."""
     solvers = [scene.solver for scene in scenes if scene.solver is not None]
-    failures = [[one.failure for one in solver.ways.values() if one.failure is not None] for solver in solvers]
+    failures = [[one.failure for one in solver.variants.values() if one.failure is not None] for solver in solvers]
     reasons = [next((why for why in each if why.startswith(UNMESHED)), None) for each in failures]
     without = [why for why in reasons if why is not None]
     if not without:
@@ -204,7 +204,7 @@ def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: E
 
 def _solver(scene: SolverOutcomes, error: float | None) -> SolverFigures:
     """What the solver took: at its own stop test, and in each variant; the cheapest has at most the model's error."""
-    ways = {
+    variants = {
         outcome.variant.name: VariantFigures(
             seconds=outcome.whole_seconds,
             setup_seconds=outcome.setup_seconds,
@@ -222,7 +222,7 @@ def _solver(scene: SolverOutcomes, error: float | None) -> SolverFigures:
         seconds=own.whole_seconds if own.converged else None,
         cheapest=None if best is None else best.variant.name,
         cheapest_seconds=None if best is None else best.whole_seconds,
-        ways=ways,
+        variants=variants,
     )
 
 

@@ -71,7 +71,7 @@ def gaussian_process(x: np.ndarray, y: np.ndarray) -> Law:
         errors.append(np.median(np.abs(guess / y - 1)))
     scale, back = scales[int(np.argmin(errors)) if errors else 0]
     process = _fitted(x, scale(y))
-    return lambda asked: back(process.predict(asked))
+    return lambda points: back(process.predict(points))
 
 
 def modal_process(x: np.ndarray, y: np.ndarray) -> Law:
@@ -82,7 +82,7 @@ def modal_process(x: np.ndarray, y: np.ndarray) -> Law:
     sign = np.where(left.mean(axis=0) < 0, -1, 1)  # so that the first coefficient, mostly, is positive
     laws = [gaussian_process(x, coefficient) for coefficient in (left * size * sign).T[:kept]]
     shapes = (sign[:, None] * modes)[:kept]
-    return lambda asked: np.stack([law(asked) for law in laws], axis=1) @ shapes
+    return lambda points: np.stack([law(points) for law in laws], axis=1) @ shapes
 
 
 def _fitted(x: np.ndarray, y: np.ndarray) -> Any:
@@ -166,33 +166,33 @@ def process_beside(
     try:
         require("compare", "sklearn")
         known = list(islice(_complete(model, dataset), MOST_SCENES))
-        asked = [_sample(model, dataset, split, index) for index in indices]
-        return _learned(known, asked, tell)
+        wanted = [_sample(model, dataset, split, index) for index in indices]
+        return _learned(known, wanted, tell)
     except (ConfigError, MissingExtra) as error:
         return Process(missing=str(error))
 
 
-def _learned(known: Sequence[Sample], asked: Sequence[Sample], tell: Callable[[str], None]) -> Process:
-    """What a process gives for the samples `asked`, after it has learned from the `known` ones.
+def _learned(known: Sequence[Sample], wanted: Sequence[Sample], tell: Callable[[str], None]) -> Process:
+    """What a process gives for the samples `wanted`, after it has learned from the `known` ones.
 
     Raises:
         ConfigError: it does not apply; the text says why.
     """
     if len(known) < FEWEST_SCENES:
         raise ConfigError(f"it needs at least {FEWEST_SCENES} training scenes, and the dataset has {len(known)}")
-    one_mesh = all(_same_mesh(known[0].scene, one.scene) for one in (*known, *asked))
+    one_mesh = all(_same_mesh(known[0].scene, one.scene) for one in (*known, *wanted))
     if not known[0].values and not one_mesh:
         raise ConfigError("each scene has a mesh of its own, and no specification has drawn parameters")
     x = _points(known, known)
     if not x.shape[1]:
         raise ConfigError("nothing that describes a scene differs in the training scenes")
-    shared = (quantity for quantity in known[0].sizes if all(quantity in one.sizes for one in (*known, *asked)))
+    shared = (quantity for quantity in known[0].sizes if all(quantity in one.sizes for one in (*known, *wanted)))
     quantities = [quantity for quantity in shared if one_mesh or quantity != "displacement"]
     tell(f"a Gaussian process learns {', '.join(quantities)} of {len(known)} training scenes")
     laws = {one: modal_process(x, np.stack([sample.sizes[one] for sample in known])) for one in quantities}
     errors: dict[str, list[float]] = {quantity: [] for quantity in quantities}
     seconds = []
-    for sample, point in zip(asked, _points(asked, known), strict=True):
+    for sample, point in zip(wanted, _points(wanted, known), strict=True):
         began = time.process_time()
         predicted = {quantity: law(point[None])[0] for quantity, law in laws.items()}
         seconds.append(time.process_time() - began)

@@ -74,10 +74,10 @@ class AnswerSteps(NamedTuple):
 def answer_steps(model: Simulator, questions: Sequence[Question], effort: Effort) -> list[AnswerSteps | str]:
     """For each scene the steps to its answer, or a text that says why a frame failed. Arguments and errors as for
     `jumps`."""
-    ways: list[AnswerSteps | str] = []
+    outcomes: list[AnswerSteps | str] = []
     for scene in _predicted(model, questions, effort, whole_way=True):
         if scene.failure is not None:
-            ways.append(scene.failure)
+            outcomes.append(scene.failure)
             continue
         count = 1 + effort.corrections + effort.newton_steps
         wanted = scene.wanted
@@ -86,8 +86,9 @@ def answer_steps(model: Simulator, questions: Sequence[Question], effort: Effort
         stress = [_stacked([one[STRESS] for one in frame.fields], 1 + effort.newton_steps) for frame in known]
         steps = np.array([len(frame.positions) - 1 - effort.corrections for frame in wanted])
         last = np.array([np.nan if frame.last_step is None else frame.last_step for frame in wanted])
-        ways.append(AnswerSteps(np.stack(position, axis=1), np.stack(stress, axis=1) if stress else None, steps, last))
-    return ways
+        stresses = np.stack(stress, axis=1) if stress else None
+        outcomes.append(AnswerSteps(np.stack(position, axis=1), stresses, steps, last))
+    return outcomes
 
 
 def _stacked(rows: list, count: int) -> np.ndarray:

@@ -38,7 +38,7 @@ class JumpingFrame:
         fields: after the last call and after Newton steps, which change the stress alone.
         last_step: the size of the last Newton step.
         latent: what the network made of it in the first call.
-        walked: whether the solver followed the load path; None: it did not solve the frame.
+        along_load_path: whether the solver followed the load path; None: it did not solve the frame.
     """
 
     scene: JumpingScene
@@ -49,7 +49,7 @@ class JumpingFrame:
     fields: list[dict[str, Tensor]] = field(default_factory=list)
     last_step: float | None = None
     latent: np.ndarray | None = None
-    walked: bool | None = None
+    along_load_path: bool | None = None
     seconds: float = 0.0
     failure: str | None = None
 
@@ -121,7 +121,7 @@ class JumpingFrame:
         location = self.scene.model.config.data.stress
         start = _array(self.positions[-1]) if self.failure is None else None
         try:
-            position, self.walked = self.scene.equilibria.solve(self.number, start)
+            position, self.along_load_path = self.scene.equilibria.solve(self.number, start)
             self.failure, self.last_step = None, 0.0
             self.positions.append(torch.from_numpy(position.astype(np.float32)))
             if location != "none":
@@ -204,11 +204,11 @@ class JumpingScene:
 
 def _solved(frames: Sequence[JumpingFrame]) -> dict[str, str]:
     """How the solver reached the frames, as a fact of an answer; empty if it solved none."""
-    ways = {frame.walked for frame in frames} - {None}
-    if not ways:
+    solved = [frame.along_load_path for frame in frames if frame.along_load_path is not None]
+    if not solved:
         return {}
-    way = "along the load path, frame by frame" if True in ways else "from the answer of the model"
-    return {"solved": f"solved to the stop test of the solver, {way}"}
+    path = "along the load path, frame by frame" if any(solved) else "from the answer of the model"
+    return {"solved": f"solved to the stop test of the solver, {path}"}
 
 
 def _array(positions: Tensor) -> np.ndarray:

@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from ast_sim.inference.predicting.question import Question
     from ast_sim.inference.trained_run import Run
 
-AskedError = float | Mapping[str, float]  # of the displacement, or by quantity: {"reaction": 0.05}
+ErrorLimit = float | Mapping[str, float]  # of the displacement, or by quantity: {"reaction": 0.05}
 
 
 def chosen_effort(
-    run: Run, questions: Sequence[Question], effort: Effort | None, error: AskedError | None, ms: float | None = None
+    run: Run, questions: Sequence[Question], effort: Effort | None, error: ErrorLimit | None, ms: float | None = None
 ) -> tuple[Effort, list[dict[str, str]]]:
     """The effort, and for each question what its answer keeps of the choice; see `Run.predict`.
 
@@ -38,13 +38,13 @@ def chosen_effort(
 
 
 def _keeping(
-    run: Run, questions: Sequence[Question], asked: Mapping[str, float]
+    run: Run, questions: Sequence[Question], wanted: Mapping[str, float]
 ) -> tuple[Effort, list[dict[str, str]]]:
     """The cheapest effort that keeps errors; a question unlike the calibration scenes is told, and promised nothing."""
     if run.calibration is None:
         raise ConfigError(f"{run.path} promises no error before it is calibrated: ast-sim calibrate RUN DATA")
-    effort = run.calibration.kept.effort_for(asked)
-    promise = f"the cheapest that keeps {in_words(asked)} at the deepest frame in {100 * KEPT:g} % of scenes like it"
+    effort = run.calibration.kept.effort_for(wanted)
+    promise = f"the cheapest that keeps {in_words(wanted)} at the deepest frame in {100 * KEPT:g} % of scenes like it"
     facts = []
     for question in questions:
         why = run.calibration.unlike(question.scene, question.notes)

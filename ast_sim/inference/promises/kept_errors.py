@@ -61,28 +61,29 @@ class KeptErrors:
         spared = _allowed(worst.shape[1])  # the number of scenes that may lie above the bound
         return worst[:, -1 - spared].tolist() if spared >= 0 else [math.inf] * len(worst)
 
-    def effort_for(self, asked: Mapping[str, float]) -> Effort:
+    def effort_for(self, wanted: Mapping[str, float]) -> Effort:
         """The cheapest effort that keeps all wanted errors, by quantity, in 90 % of fresh scenes.
 
         Raises:
             ConfigError: no effort keeps them, which names the smallest that can be had; a quantity is not known; or
                 none is asked for.
         """
-        if not asked:
+        if not wanted:
             raise ConfigError("no error is asked for: give one, such as 0.02 or {'reaction': 0.05}")
-        for quantity, error in asked.items():
+        for quantity, error in wanted.items():
             self._require(quantity, error)
-        limits = np.array(list(asked.values()))[:, None, None]
-        errors = np.array([self.errors[quantity] for quantity in asked])
+        limits = np.array(list(wanted.values()))[:, None, None]
+        errors = np.array([self.errors[quantity] for quantity in wanted])
         above: np.ndarray = np.any(errors > limits, axis=0)
         missed = np.logical_or.accumulate(above[::-1])[::-1].sum(axis=1)
         kept = np.flatnonzero(missed <= _allowed(above.shape[1]))
         if len(kept):
             return self.efforts[kept[0]]
-        smallest = [f"{quantity} {_percent(self.bounds(quantity)[-1])}" for quantity in asked]
+        smallest = [f"{quantity} {_percent(self.bounds(quantity)[-1])}" for quantity in wanted]
         raise ConfigError(
-            f"no effort of this run keeps an error of {in_words(asked)} in {_percent(KEPT)} of the scenes; the smallest"
-            f"{' are, each alone,' if len(asked) > 1 else ' is'} {', '.join(smallest)}, with {self.efforts[-1].text}"
+            f"no effort of this run keeps an error of {in_words(wanted)} in {_percent(KEPT)} of the scenes; the"
+            f" smallest{' are, each alone,' if len(wanted) > 1 else ' is'} {', '.join(smallest)}, with"
+            f" {self.efforts[-1].text}"
         )
 
     def _require(self, quantity: str, error: float) -> None:
@@ -105,9 +106,9 @@ class KeptErrors:
             )
 
 
-def in_words(asked: Mapping[str, float]) -> str:
-    """Asked errors by quantity, such as "2 % of the displacement and 5 % of the reaction"."""
-    return " and ".join(f"{_percent(error)} of the {quantity}" for quantity, error in asked.items())
+def in_words(errors: Mapping[str, float]) -> str:
+    """Errors by quantity, such as "2 % of the displacement and 5 % of the reaction"."""
+    return " and ".join(f"{_percent(error)} of the {quantity}" for quantity, error in errors.items())
 
 
 def _allowed(scenes: int) -> int:

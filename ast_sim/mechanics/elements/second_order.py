@@ -169,14 +169,14 @@ class SecondOrder(Elasticity):
         g = np.einsum("ijp,ajp->aip", deformation.cofactor / J, self.gradients).reshape(30, 4, -1)
         b = np.einsum("npe,pe->ne", g, (self.volume * J).reshape(4, -1))
         stiff = self._mean_lam * (1 + 1 / (mean * mean)) / 2 / self._element_volume
-        ways = np.ascontiguousarray(np.concatenate([g, b[:, None]], axis=1).transpose(2, 0, 1))  # [E, 30, 5]
+        directions = np.ascontiguousarray(np.concatenate([g, b[:, None]], axis=1).transpose(2, 0, 1))  # [E, 30, 5]
         direct = np.concatenate([(self.volume * spread).reshape(4, -1), stiff[None]]).T  # [E, 5]
         turned = -(self.volume * c).reshape(4, -1).T  # [E, 4]
         entries = np.empty((self._count, len(_ROW)))
         for start in range(0, self._count, _ELEMENTS_AT_ONCE):
             chunk = slice(start, start + _ELEMENTS_AT_ONCE)
-            blocks = (ways[chunk] * direct[chunk, None]) @ ways[chunk].transpose(0, 2, 1)  # [n, 30, 30]
-            at_points = ways[chunk, :, :4]
+            blocks = (directions[chunk] * direct[chunk, None]) @ directions[chunk].transpose(0, 2, 1)  # [n, 30, 30]
+            at_points = directions[chunk, :, :4]
             crossed = (at_points * turned[chunk, None]) @ at_points.transpose(0, 2, 1)
             blocks += crossed.reshape(-1, 10, 3, 10, 3).swapaxes(2, 4).reshape(blocks.shape)
             for i in range(3):

@@ -221,7 +221,7 @@ class VariantSolver:
         return best
 
     def _linearised(self, case: SolidCase, steps: int) -> OneFrame:
-        """So many load steps of one Newton step with linearised contact, and one Newton step more."""
+        """`steps` load steps of one Newton step with linearised contact, and one Newton step more."""
         held = case.scene.prescribed[:, None]
         began = process_time()
         position = before = case.prescribed_position[0]

@@ -117,9 +117,9 @@ def draw_simulation(rng: np.random.Generator, kinds: tuple[str, ...], frames: in
     n = sum(len(body.points) for body in bodies)
     points = np.concatenate([body.points for body in bodies])
     tool = np.repeat([body.tool for body in bodies], [len(body.points) for body in bodies])
-    ways = 0.1 * scale * np.linspace(0, 1, frames)[:, None, None]
+    travel = 0.1 * scale * np.linspace(0, 1, frames)[:, None, None]
     bent = points / scale @ rng.normal(0, 0.2, (3, 3)) + np.sin(points[:, ::-1] / scale)
-    displacement = np.where(tool[:, None], np.array([0.2, 0.0, -1.0]), bent) * ways
+    displacement = np.where(tool[:, None], np.array([0.2, 0.0, -1.0]), bent) * travel
     stress = np.arange(frames)[:, None] * 100.0 + rng.permutation(n) % 89
     times = np.cumsum(rng.uniform(0.01, 1, frames)) - 0.01
     fixed = (points[:, 0] <= points[:, 0].min() + 1e-6 * scale) & ~tool

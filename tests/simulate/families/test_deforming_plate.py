@@ -241,7 +241,7 @@ def test_a_scene_solved_end_to_end(trajectory):
     scene, attributes = trajectory.scene, trajectory.attributes
     trajectory.check("sample", "node")
     assert attributes["status"] == "complete" and trajectory.position.shape == (SHORT, scene.num_nodes, 3)
-    # Anew, by other means than the generator's own checks.
+    # Computed again, by other means than the generator's own checks.
     rest, position = scene.rest_position.astype(float), trajectory.position.astype(float)
     contact = Contact(rest, scene.surface(), scene.body, CONTACT)
     corners = position[:, scene.elements]

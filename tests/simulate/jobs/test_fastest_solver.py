@@ -131,9 +131,9 @@ def test_nested_iteration_counts_the_coarse_solution_and_corrects_it(plates):
     """Without friction there is one equilibrium at the clearance with which contact is linearised. Newton's method ends
     there, from a coarser mesh and from load steps on the mesh itself."""
     coarse = SolverVariant("coarse", nodes=0.5, linearised=6)
-    ways = [coarse, *(SolverVariant(f"{n} after", nodes=0.5, linearised=6, newton=n) for n in (1, 2, 6))]
-    ways.append(SolverVariant("straight", linearised=6, newton=6))
-    (scene,) = solver_outcomes(plates, "train", [0], variants=ways, progress=False)
+    variants = [coarse, *(SolverVariant(f"{n} after", nodes=0.5, linearised=6, newton=n) for n in (1, 2, 6))]
+    variants.append(SolverVariant("straight", linearised=6, newton=6))
+    (scene,) = solver_outcomes(plates, "train", [0], variants=variants, progress=False)
     before, one, two, six, straight = scene.outcomes
     assert before.nodes == one.nodes == six.nodes < straight.nodes
     for after in (one, two, six):
@@ -147,10 +147,10 @@ def test_the_solver_finishes_what_began_nearly_right(plates):
     """It ends where it ends from rest, in fewer iterations there; from overlaps it does not begin."""
     coarse = SolverVariant("coarse", nodes=0.5, linearised=6, newton=1)
     straight = SolverVariant("straight", linearised=6)
-    finished = [replace(way, finished=True) for way in (coarse, straight)]
+    finished = [replace(variant, finished=True) for variant in (coarse, straight)]
     overlapping = SolverVariant("overlapping", nodes=0.5, linearised=6, finished=True)
-    ways = [OWN, coarse, straight, *finished, overlapping]
-    (scene,) = solver_outcomes(plates, "train", [0], variants=ways, progress=False)
+    variants = [OWN, coarse, straight, *finished, overlapping]
+    (scene,) = solver_outcomes(plates, "train", [0], variants=variants, progress=False)
     own, *begun, from_coarse, from_straight, refused = scene.outcomes
     for start, end in zip(begun, (from_coarse, from_straight), strict=True):
         assert end.relative_error < 1e-4 < start.relative_error
@@ -166,21 +166,21 @@ def test_what_fails_is_said_and_not_raised(plates):
     assert cheapest(scene.outcomes, 1.0) is None
 
     def refuse(share):
-        asked.append(share)
+        shares.append(share)
         raise BadMesh(f"no mesh with {share:g} of the nodes")
 
-    asked, drawn = [], draw_sample(Recipe("deforming_plate", 5, 150, 9), "train", 0)
+    shares, drawn = [], draw_sample(Recipe("deforming_plate", 5, 150, 9), "train", 0)
     effort = {"starts": [1], "repeats": 1, "most_iterations": 9}
     solver = VariantSolver(
         replace(drawn, remesh=refuse), 5, drawn.case.prescribed_position[5], SolverSettings(), effort
     )
-    outcomes = [solver.outcome(way) for way in VARIANTS[5:]]
+    outcomes = [solver.outcome(variant) for variant in VARIANTS[5:]]
     assert outcomes[0].failure == "could not be meshed: no mesh with 0.5 of the nodes"
     assert outcomes[3].failure == "could not be meshed: no mesh with 0.25 of the nodes"
     for outcome in outcomes:
         assert outcome.converged == (outcome.variant.nodes == 1), outcome.variant
     assert not outcomes[0].converged and outcomes[0].relative_error == outcomes[0].seconds == np.inf
-    assert asked[:2] == [0.5, 0.475] and len(asked) == 10  # each share is meshed once, with sizes near it
+    assert shares[:2] == [0.5, 0.475] and len(shares) == 10  # each share is meshed once, with sizes near it
 
 
 def test_the_cheapest_is_the_fastest_that_is_as_accurate():

@@ -131,12 +131,12 @@ def test_a_worker_that_is_killed_costs_its_sample_only(undisturbed, tmp_path, mo
     assert last["valid/000000"]["bytes"] == sample_path(folder, "valid", 0).stat().st_size
     assert [values["state"] for values in states(folder)["valid/000000"]] == ["pending", "running", "done"]
     sample_path(folder, "test", 0).write_bytes(b"PK\x03\x04 not a sample")  # made again, not trusted
-    asked, run = [], pool.run_all
-    monkeypatch.setattr(pool, "run_all", lambda samples, *rest: asked.extend(samples) or run(samples, *rest))
+    remade, run = [], pool.run_all
+    monkeypatch.setattr(pool, "run_all", lambda samples, *rest: remade.extend(samples) or run(samples, *rest))
     plates(out, progress=True)
     shown = capfd.readouterr().err
     assert "2 of 4 scenes are there already" in shown and "train/000001 failed before: its worker process was" in shown
-    assert asked == [("train", 1), ("test", 0)]  # finished samples are not made again
+    assert remade == [("train", 1), ("test", 0)]  # finished samples are not made again
     assert out.read_bytes() == undisturbed.read_bytes()
 
 

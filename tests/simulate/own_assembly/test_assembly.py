@@ -298,8 +298,8 @@ def test_the_solver_goes_straight_to_a_frame(tmp_path):
     (tmp_path / "made.py").write_text("def make(gmsh):\n    gmsh.model.occ.addBox(0, 0, 0, 10, 10, 5)\n")
     out = tmp_path / "study.h5"
     generate("assembly", out, spec=path, train=0, valid=0, test=1, workers=1, progress=False)
-    ways = (VARIANTS[0], SolverVariant("half", nodes=0.5))
-    (found,) = solver_outcomes(out, "test", [0], variants=ways, starts=(1,), made_from=path, progress=False)
+    variants = (VARIANTS[0], SolverVariant("half", nodes=0.5))
+    (found,) = solver_outcomes(out, "test", [0], variants=variants, starts=(1,), made_from=path, progress=False)
     own, coarse = found.outcomes
     assert found.frame == 2 and own.converged and coarse.converged, (own.failure, coarse.failure)
     assert own.relative_error < 0.02 and own.relative_error < coarse.relative_error < 0.8

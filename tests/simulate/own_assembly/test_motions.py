@@ -52,7 +52,7 @@ def test_a_turn_between_two_frames_is_the_turn_that_was_asked_for(degrees, tmp_p
     np.testing.assert_array_equal(turned.position[-1], in_steps.position[-1])
 
 
-def test_a_path_that_comes_back_between_frames_is_walked(tmp_path):
+def test_a_path_that_comes_back_between_frames_is_followed(tmp_path):
     """Down, sideways with friction, up again, in one frame: what is left of it is what steps there would leave."""
     at_once = solved(tmp_path, BACK.replace("FRAMES", "2"))
     assert at_once.attributes["dissipation"][-1] > 1e-5 * at_once.attributes["elastic_energy"][-1] > 0

@@ -37,7 +37,7 @@ def volume(surface) -> float:
     return float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6
 
 
-WAYS = {
+CUBES = {
     "text": text(cube()),
     "capitals": text(cube()).upper(),
     "mixed case": text(cube()).title(),
@@ -55,9 +55,9 @@ WAYS = {
 }
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_every_way_to_write_a_cube_gives_the_cube(way, tmp_path):
-    data = WAYS[way]
+@pytest.mark.parametrize("name", CUBES)
+def test_every_way_to_write_a_cube_gives_the_cube(name, tmp_path):
+    data = CUBES[name]
     (tmp_path / "cube.stl").write_bytes(data if isinstance(data, bytes) else data.encode())
     surface = stl_surface(tmp_path / "cube.stl")
     assert (len(surface.position), len(surface.triangles), surface.notes) == (26, 48, ())

@@ -25,8 +25,8 @@ TIMEOUT = 600.0  # seconds; the search for contact of CalculiX 2.20 does not end
 
 
 @dataclass(frozen=True)
-class Way:
-    """A way to run CalculiX.
+class Variant:
+    """Settings of CalculiX, and the size of its mesh.
 
     Attributes:
         name: what it is called.
@@ -43,26 +43,26 @@ class Way:
 
 
 _HALVES, _WHOLE = Increments(1.0, 0.5, 0.1), Increments()
-OWN = Way("own mesh, as in the dataset", 1.0)
-FINER = Way("finer mesh", 3400 / 1400, scenes=3)
-WAYS = (
+OWN = Variant("own mesh, as in the dataset", 1.0)
+FINER = Variant("finer mesh", 3400 / 1400, scenes=3)
+VARIANTS = (
     FINER,
     OWN,
-    Way("own mesh, increments twice as large", 1.0, _HALVES),
-    Way("own mesh, two steps of 4 increments", 1.0, YIELDING[0], True),
-    Way("5/7 of the nodes, two steps of 4 increments", 5 / 7, YIELDING[0], True),
-    Way("1/2 of the nodes, as in the dataset", 1 / 2),
-    Way("1/2 of the nodes, two steps of 4 increments", 1 / 2, YIELDING[0], True),
-    Way("1/2 of the nodes, two steps of 2 increments", 1 / 2, _HALVES, True),
-    Way("1/2 of the nodes, two steps of 1 increment", 1 / 2, _WHOLE, True),
-    Way("1/4 of the nodes, as in the dataset", 1 / 4),
-    Way("1/4 of the nodes, two steps of 2 increments", 1 / 4, _HALVES, True),
-    Way("1/4 of the nodes, two steps of 1 increment", 1 / 4, _WHOLE, True),
+    Variant("own mesh, increments twice as large", 1.0, _HALVES),
+    Variant("own mesh, two steps of 4 increments", 1.0, YIELDING[0], True),
+    Variant("5/7 of the nodes, two steps of 4 increments", 5 / 7, YIELDING[0], True),
+    Variant("1/2 of the nodes, as in the dataset", 1 / 2),
+    Variant("1/2 of the nodes, two steps of 4 increments", 1 / 2, YIELDING[0], True),
+    Variant("1/2 of the nodes, two steps of 2 increments", 1 / 2, _HALVES, True),
+    Variant("1/2 of the nodes, two steps of 1 increment", 1 / 2, _WHOLE, True),
+    Variant("1/4 of the nodes, as in the dataset", 1 / 4),
+    Variant("1/4 of the nodes, two steps of 2 increments", 1 / 4, _HALVES, True),
+    Variant("1/4 of the nodes, two steps of 1 increment", 1 / 4, _WHOLE, True),
 )
 
 
 def solved(drawn: Sequence[Values], nodes: int, file: Path) -> dict[str, list[dict[str, Any]]]:
-    """For each way, by its name, what it gave in the first of the scenes.
+    """For each variant, by its name, what it gave in the first of the scenes.
 
     Args:
         drawn: the parameters of the scenes.
@@ -72,24 +72,24 @@ def solved(drawn: Sequence[Values], nodes: int, file: Path) -> dict[str, list[di
     results: dict[str, list[dict[str, Any]]] = json.loads(file.read_text()) if file.exists() else {}
     spec = read_spec(SPEC)
     for scene, values in enumerate(drawn):
-        for way in WAYS:
-            known = results.setdefault(way.name, [])
-            if len(known) == scene < way.scenes:
-                known.append(_solved(way, spec, values, nodes))
+        for variant in VARIANTS:
+            known = results.setdefault(variant.name, [])
+            if len(known) == scene < variant.scenes:
+                known.append(_solved(variant, spec, values, nodes))
                 write_json(file, results)
     return results
 
 
-def _solved(way: Way, spec: AssemblySpec, values: Values, nodes: int) -> dict[str, Any]:
+def _solved(variant: Variant, spec: AssemblySpec, values: Values, nodes: int) -> dict[str, Any]:
     """The nodes, the outcome and the processor seconds of the first solve that ends, and why the solves before it
     failed. If a coarser mesh fails, others of nearly that size are tried, as a user would do; failed solves cost
     nothing."""
     failures = []
-    for nearby in NEARBY if way.share < 1 else NEARBY[:1]:
+    for nearby in NEARBY if variant.share < 1 else NEARBY[:1]:
         try:
-            case = assembly.scene_of(spec, values, round(nearby * way.share * nodes), LAST + 1).case
-            case = case.keeping((TURN, LAST)) if way.two_frames else case
-            answer = quasi_static(case, CalculixSettings((way.increments,), TIMEOUT))
+            case = assembly.scene_of(spec, values, round(nearby * variant.share * nodes), LAST + 1).case
+            case = case.keeping((TURN, LAST)) if variant.two_frames else case
+            answer = quasi_static(case, CalculixSettings((variant.increments,), TIMEOUT))
         except SimulationError as error:
             failures.append(str(error))
             continue
