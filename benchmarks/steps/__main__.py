@@ -1,7 +1,7 @@
 """Training steps, predictions and Newton steps beside what was aimed at: a record for each number.
 
 `python -m benchmarks.steps --before FOLDER [--json FILE] [ROW ...]`. FOLDER holds the state of this repository that
-today's is compared with, built in place. Without `--json` the records go to benchmarks/results/steps.json, where those
+today's is compared with, built in place. Without `--json` the records go to benchmarks/results/steps.json, where the records
 of other rows stay, and the page docs/results/steps.md is made of them.
 """
 
