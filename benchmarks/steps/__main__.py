@@ -1,8 +1,8 @@
 """Training steps, predictions and Newton steps beside what was aimed at: a record for each number.
 
 `python -m benchmarks.steps --before FOLDER [--json FILE] [ROW ...]`. FOLDER holds the state of this repository that
-today's is compared with, built in place. Without `--json` the records go to benchmarks/results/steps.json, where the records
-of other rows stay, and the page docs/results/steps.md is made of them.
+today's is compared with, built in place. Without `--json` the records go to benchmarks/results/steps.json, which keeps
+the records of other rows, and the page docs/results/steps.md is made of them.
 """
 
 from __future__ import annotations
